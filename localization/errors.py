@@ -1,0 +1,19 @@
+"""Errors of logs, references and outputs that a user can mend (exit code 2 on the command line)."""
+
+from motion_models.errors import SkidlocError
+
+
+class LogError(SkidlocError):
+    """A log that cannot be used: not there, not a bag, nothing readable in it, only one message."""
+
+
+class TopicError(LogError):
+    """A topic that is not in the log, or that carries another type of message than is needed."""
+
+
+class EvaluationError(SkidlocError):
+    """A reference that cannot be used: missing, malformed, or not overlapping the trajectory in time."""
+
+
+class OutputError(SkidlocError):
+    """An output path that already holds something, or that cannot be written."""

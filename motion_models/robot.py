@@ -1,0 +1,267 @@
+"""A robot is one TOML file: geometry, mounts, topics, joint names, noise and the coefficients of its motion models."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from motion_models.errors import RobotError
+from motion_models.se2 import FloatArray
+
+Section = TypeVar("Section")
+
+
+@dataclass(frozen=True)
+class Geometry:
+    wheel_radius_m: float
+    """Radius of the wheels, times the gear ratio where the wheel rates are those of the motor."""
+    track_width_m: float
+    """Distance between the left and the right wheels' contacts."""
+    wheelbase_m: float
+    """Distance between the front and the rear wheels' contacts."""
+    mass_kg: float
+    """Mass of the whole vehicle with its arms and sensors."""
+    cg_height_m: float = 0.2
+    """Height of the centre of gravity above the floor."""
+    cg_x_m: float = 0.0
+    """Centre of gravity ahead of the wheelbase's centre, used where the log does not tell it."""
+    cg_y_m: float = 0.0
+    """Centre of gravity left of the wheelbase's centre, used where the log does not tell it."""
+
+
+@dataclass(frozen=True)
+class Driver:
+    """How the robot's own driver turns wheel rates into the odometry that it publishes (needed to invert it)."""
+
+    wheel_radius_m: float
+    track_width_m: float
+    wheel_separation_multiplier: float = 1.0
+    """The one hand-tuned number of a diff-drive driver; 1.875 on a stock Husky."""
+
+
+@dataclass(frozen=True)
+class Topics:
+    joint_states: str = "/joint_states"
+    odometry: str = "/odom"
+    scan: str = "/scan"
+    points: str = "/points"
+    imu: str = "/imu/data"
+    center_of_gravity: str = "/center_of_gravity"
+    reference: str = "/ground_truth/odom"
+
+
+@dataclass(frozen=True)
+class Joints:
+    """Names in the joint states. The rate of a side is the mean over its wheels."""
+
+    left: tuple[str, ...] = ("front_left_wheel", "rear_left_wheel")
+    right: tuple[str, ...] = ("front_right_wheel", "rear_right_wheel")
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Where a sensor's frame sits in the body frame: x, y, z [m], then roll, pitch, yaw [rad] (fixed axes, as in URDF)."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    roll: float = 0.0
+    pitch: float = 0.0
+    yaw: float = 0.0
+
+    def rotation(self) -> FloatArray:
+        """(3, 3) matrix that takes vectors of the sensor's frame into the body frame."""
+        cr, sr = math.cos(self.roll), math.sin(self.roll)
+        cp, sp = math.cos(self.pitch), math.sin(self.pitch)
+        cy, sy = math.cos(self.yaw), math.sin(self.yaw)
+        return np.array(
+            [
+                [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+                [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+                [-sp, cp * sr, cp * cr],
+            ]
+        )
+
+
+@dataclass(frozen=True)
+class WheelNoise:
+    """How wrong wheels are: variances that grow with the motion, as slip does, and a floor for what no model has."""
+
+    longitudinal_m2_per_m: float = 4e-4
+    """Variance of the distance, per metre driven (4e-4: 2 cm after one metre)."""
+    lateral_m2_per_m: float = 1e-4
+    """Variance of the sideways displacement, per metre driven."""
+    lateral_m2_per_rad: float = 4e-4
+    """Variance of the sideways displacement, per radian turned: the unknown centre of rotation."""
+    longitudinal_m2_per_rad: float = 4e-4
+    """Variance of the distance, per radian turned."""
+    yaw_rad2_per_rad: float = 4e-3
+    """Variance of the yaw, per radian turned: scrubbing."""
+    yaw_rad2_per_m: float = 4e-4
+    """Variance of the yaw, per metre driven."""
+    floor_m2_per_s: float = 1e-6
+    """Variance of each position component, per second of motion: the floor for model discrepancy."""
+    floor_rad2_per_s: float = 1e-6
+    """Variance of the yaw, per second of motion."""
+
+
+@dataclass(frozen=True)
+class GyroNoise:
+    white_rad_per_sqrt_s: float = 2e-3
+    """Angle random walk of the yaw gyro."""
+    bias_sigma_rad_per_s: float = 2e-2
+    """How large the bias may be at switch-on."""
+    bias_walk_rad_per_s_sqrt_s: float = 3e-5
+    """Random walk of the bias."""
+    scale_sigma: float = 5e-3
+    """Relative error of the scale factor, as sigma per turned angle."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """Everything that is particular to one robot. Frames and axes as in ROS REP-103; `base` is the wheelbase's centre."""
+
+    name: str
+    geometry: Geometry
+    driver: Driver
+    topics: Topics = Topics()
+    joints: Joints = Joints()
+    mounts: Mapping[str, Mount] = field(default_factory=dict)
+    wheel_noise: WheelNoise = WheelNoise()
+    gyro_noise: GyroNoise = GyroNoise()
+    models: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Coefficients by model name, then by parameter name; what is not named keeps the model's own default."""
+
+    @property
+    def center_of_gravity(self) -> FloatArray:
+        """(2,) nominal x, y of the centre of gravity in the body frame [m]."""
+        return np.array([self.geometry.cg_x_m, self.geometry.cg_y_m])
+
+    def coefficients(self, model: str, names: tuple[str, ...], defaults: FloatArray) -> FloatArray:
+        """(k,) parameters of ``model``: the robot's coefficients where it names them, else ``defaults`` (k,).
+
+        Raises `RobotError` for a coefficient that the model does not have.
+        """
+        table = self.models.get(model, {})
+        unknown = sorted(set(table) - set(names))
+        if unknown:
+            raise RobotError(
+                f"robot '{self.name}': models.{model} has no parameter {', '.join(unknown)}; it has {', '.join(names)}."
+            )
+        return np.array([table.get(name, default) for name, default in zip(names, defaults, strict=True)])
+
+
+def robot_names() -> list[str]:
+    """Names of the robots that are shipped."""
+    return sorted(f.name.removesuffix(".toml") for f in (resources.files(__package__) / "robots").iterdir() if f.name.endswith(".toml"))
+
+
+def load_robot(robot: str | Path) -> Robot:
+    """The robot of a shipped name (`robot_names`) or of a path to a TOML file. Raises `RobotError`."""
+    path = Path(robot)
+    if path.suffix == ".toml":
+        try:
+            text = path.read_text(encoding="utf-8")
+        except OSError as error:
+            raise RobotError(f"robot file '{path}' cannot be read: {error.strerror}.") from error
+        return parse_robot(text, source=str(path))
+    if str(robot) not in robot_names():
+        raise RobotError(f"no robot '{robot}'; shipped are {', '.join(robot_names())}. Name one of them or a path to a .toml file.")
+    text = (resources.files(__package__) / "robots" / f"{robot}.toml").read_text(encoding="utf-8")
+    return parse_robot(text, source=f"{robot}.toml")
+
+
+def parse_robot(text: str, source: str) -> Robot:
+    """The robot of a TOML text; ``source`` names it in errors. Raises `RobotError`."""
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise RobotError(f"{source}: not valid TOML: {error}.") from error
+    known = {f.name for f in dataclasses.fields(Robot)}
+    _refuse_unknown(data, known, source)
+    if not isinstance(data.get("name"), str):
+        raise RobotError(f'{source}: needs a line name = "...".')
+    geometry = _section(Geometry, data, "geometry", source)
+    for name in ("wheel_radius_m", "track_width_m", "wheelbase_m", "mass_kg"):
+        if not getattr(geometry, name) > 0:
+            raise RobotError(f"{source}: geometry.{name} is {getattr(geometry, name)}; it must be positive.")
+    if "driver" in data:
+        driver = _section(Driver, data, "driver", source)
+    else:
+        driver = Driver(geometry.wheel_radius_m, geometry.track_width_m)
+    if min(driver.wheel_radius_m, driver.track_width_m, driver.wheel_separation_multiplier) <= 0:
+        raise RobotError(f"{source}: every number of [driver] must be positive.")
+    mounts = {frame: _build(Mount, table, f"mounts.{frame}", source) for frame, table in _table(data, "mounts", source).items()}
+    models = {
+        model: {name: _number(value, f"models.{model}.{name}", source) for name, value in _table(tables, model, source).items()}
+        for tables in [_table(data, "models", source)]
+        for model in tables
+    }
+    return Robot(
+        name=data["name"],
+        geometry=geometry,
+        driver=driver,
+        topics=_section(Topics, data, "topics", source),
+        joints=_section(Joints, data, "joints", source),
+        mounts=mounts,
+        wheel_noise=_section(WheelNoise, data, "wheel_noise", source),
+        gyro_noise=_section(GyroNoise, data, "gyro_noise", source),
+        models=models,
+    )
+
+
+def _table(data: Mapping[str, Any], name: str, source: str) -> Mapping[str, Any]:
+    table = data.get(name, {})
+    if not isinstance(table, Mapping):
+        raise RobotError(f"{source}: '{name}' must be a table ([{name}]), found {table!r}.")
+    return table
+
+
+def _section(kind: type[Section], data: Mapping[str, Any], name: str, source: str) -> Section:
+    return _build(kind, _table(data, name, source), name, source)
+
+
+def _build(kind: type[Section], table: Any, name: str, source: str) -> Section:
+    if not isinstance(table, Mapping):
+        raise RobotError(f"{source}: '{name}' must be a table, found {table!r}.")
+    fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    _refuse_unknown(table, set(fields), f"{source}, [{name}]")
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        declared = str(fields[key].type)
+        if declared == "float":
+            values[key] = _number(value, f"{name}.{key}", source)
+        elif declared == "str":
+            if not isinstance(value, str):
+                raise RobotError(f"{source}: {name}.{key} must be text, found {value!r}.")
+            values[key] = value
+        else:
+            if not isinstance(value, list) or not value or not all(isinstance(v, str) for v in value):
+                raise RobotError(f"{source}: {name}.{key} must be a list of names, found {value!r}.")
+            values[key] = tuple(value)
+    missing = [
+        f.name for f in fields.values() if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING and f.name not in values
+    ]
+    if missing:
+        raise RobotError(f"{source}: [{name}] lacks {', '.join(missing)}.")
+    return kind(**values)
+
+
+def _refuse_unknown(table: Mapping[str, Any], known: set[str], where: str) -> None:
+    unknown = sorted(set(table) - known)
+    if unknown:
+        raise RobotError(f"{where}: unknown entry {', '.join(unknown)}; known are {', '.join(sorted(known))}.")
+
+
+def _number(value: Any, name: str, source: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise RobotError(f"{source}: {name} must be a finite number, found {value!r}.")
+    return float(value)
