@@ -153,9 +153,7 @@ class Robot:
         table = self.models.get(model, {})
         unknown = sorted(set(table) - set(names))
         if unknown:
-            raise RobotError(
-                f"robot '{self.name}': models.{model} has no parameter {', '.join(unknown)}; it has {', '.join(names)}."
-            )
+            raise RobotError(f"robot '{self.name}': models.{model} has no parameter {', '.join(unknown)}; it has {', '.join(names)}.")
         return np.array([table.get(name, default) for name, default in zip(names, defaults, strict=True)])
 
 
@@ -193,10 +191,7 @@ def parse_robot(text: str, source: str) -> Robot:
     for name in ("wheel_radius_m", "track_width_m", "wheelbase_m", "mass_kg"):
         if not getattr(geometry, name) > 0:
             raise RobotError(f"{source}: geometry.{name} is {getattr(geometry, name)}; it must be positive.")
-    if "driver" in data:
-        driver = _section(Driver, data, "driver", source)
-    else:
-        driver = Driver(geometry.wheel_radius_m, geometry.track_width_m)
+    driver = _section(Driver, data, "driver", source) if "driver" in data else Driver(geometry.wheel_radius_m, geometry.track_width_m)
     if min(driver.wheel_radius_m, driver.track_width_m, driver.wheel_separation_multiplier) <= 0:
         raise RobotError(f"{source}: every number of [driver] must be positive.")
     mounts = {frame: _build(Mount, table, f"mounts.{frame}", source) for frame, table in _table(data, "mounts", source).items()}
@@ -248,7 +243,9 @@ def _build(kind: type[Section], table: Any, name: str, source: str) -> Section:
                 raise RobotError(f"{source}: {name}.{key} must be a list of names, found {value!r}.")
             values[key] = tuple(value)
     missing = [
-        f.name for f in fields.values() if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING and f.name not in values
+        f.name
+        for f in fields.values()
+        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING and f.name not in values
     ]
     if missing:
         raise RobotError(f"{source}: [{name}] lacks {', '.join(missing)}.")

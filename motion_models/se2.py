@@ -131,8 +131,7 @@ def right_jacobian(tangent: ArrayLike) -> FloatArray:
 
 def right_jacobian_inverse(tangent: ArrayLike) -> FloatArray:
     """Inverse of `right_jacobian`: ``log(compose(exp(t), exp(d))) = t + Jinv d`` to first order in d."""
-    inverse_matrix: FloatArray = np.linalg.inv(right_jacobian(tangent))
-    return inverse_matrix
+    return np.asarray(np.linalg.inv(right_jacobian(tangent)), dtype=np.float64)
 
 
 def interpolate(world_T_a: ArrayLike, world_T_b: ArrayLike, fraction: ArrayLike) -> FloatArray:

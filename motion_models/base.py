@@ -1,0 +1,82 @@
+"""The seam of this project: what a motion model is, and the one type in which wheels and LiDAR both speak of motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
+
+
+@dataclass(frozen=True)
+class Twist:
+    """Body twist that a model predicts, with its exact derivatives. Leading axes broadcast."""
+
+    value: FloatArray
+    """(..., 3) vx, vy, wz [m/s, m/s, rad/s]."""
+    d_wheels: FloatArray
+    """(..., 3, 2) by the left and right wheel rate."""
+    d_cg: FloatArray
+    """(..., 3, 2) by the x and y of the centre of gravity."""
+    d_params: FloatArray
+    """(..., 3, k) by the model's parameters, in the order of `MotionModel.param_names`."""
+
+    @classmethod
+    def from_kernel(
+        cls, kernel: Callable[..., None], constants: FloatArray, wheels: FloatArray, cg: FloatArray, params: FloatArray
+    ) -> Twist:
+        """Run a compiled loop over all samples, whatever their leading axes.
+
+        ``kernel(wheels (n, 2), cg (n, 2), params (k,), constants, value, d_wheels, d_cg, d_params)`` fills the last four, which start
+        at zero, for each of n samples.
+        """
+        lead = np.broadcast_shapes(wheels.shape[:-1], cg.shape[:-1])
+        n, k = math.prod(lead), params.shape[0]
+        value, d_params = np.zeros((n, 3)), np.zeros((n, 3, k))
+        d_wheels, d_cg = np.zeros((n, 3, 2)), np.zeros((n, 3, 2))
+        flat = [np.broadcast_to(a, (*lead, 2)).reshape(n, 2) for a in (wheels, cg)]
+        kernel(np.ascontiguousarray(flat[0]), np.ascontiguousarray(flat[1]), params, constants, value, d_wheels, d_cg, d_params)
+        return cls(value.reshape(*lead, 3), d_wheels.reshape(*lead, 3, 2), d_cg.reshape(*lead, 3, 2), d_params.reshape(*lead, 3, k))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A relative motion with its covariance: what wheels predict, and what a LiDAR measures, between two moments."""
+
+    delta: FloatArray
+    """(3,) pose of the end seen from the start [m, m, rad]."""
+    cov: FloatArray
+    """(3, 3) of the right perturbation of ``delta``."""
+    d_params: FloatArray = field(default_factory=lambda: np.zeros((3, 0)))
+    """(3, k) change of ``delta`` (right perturbation) by the model's parameters."""
+
+
+class MotionModel(Protocol):
+    """From wheel rates and centre of gravity to a body twist. A frozen dataclass; add it to `motion_models.registry`."""
+
+    @property
+    def name(self) -> str:
+        """Id of the model, as on the command line and in robot files."""
+
+    @property
+    def param_names(self) -> tuple[str, ...]:
+        """Names of the k parameters."""
+
+    @property
+    def nominal(self) -> FloatArray:
+        """(k,) the robot's own values of the parameters."""
+
+    @classmethod
+    def from_robot(cls, robot: Robot) -> MotionModel:
+        """The model with the coefficients of ``robot``."""
+
+    def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
+        """Body twist for wheel rates ``wheels`` (..., 2) [rad/s] left, right; ``cg`` (..., 2) [m]; ``params`` (k,)."""
+
+    def wheels(self, command: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+        """Wheel rates (..., 2) [rad/s] for a wanted ``command`` (..., 2): vx [m/s] and wz [rad/s]; vy cannot be commanded."""
