@@ -26,7 +26,9 @@ _SMALL_ANGLE = 1e-4
 def wrap_angle(angle: ArrayLike) -> FloatArray:
     """Angles brought into [-pi, pi), any shape [rad]."""
     a = np.asarray(angle, dtype=float)
-    return (a + math.pi) % (2.0 * math.pi) - math.pi
+    wrapped = (a + math.pi) % (2.0 * math.pi) - math.pi
+    # rounding can carry an angle just below -pi up to +pi
+    return np.where(wrapped >= math.pi, -math.pi, wrapped)
 
 
 def _sinc_terms(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -35,7 +37,8 @@ def _sinc_terms(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
     safe = np.where(small, 1.0, theta)
     t2 = theta * theta
     a = np.where(small, 1.0 - t2 / 6.0, np.sin(safe) / safe)
-    b = np.where(small, theta * (0.5 - t2 / 24.0), (1.0 - np.cos(safe)) / safe)
+    # 1 - cos t is written 2 sin^2(t/2): it does not cancel
+    b = np.where(small, theta * (0.5 - t2 / 24.0), 2.0 * np.sin(0.5 * safe) ** 2 / safe)
     return a, b
 
 
@@ -119,7 +122,7 @@ def right_jacobian(tangent: ArrayLike) -> FloatArray:
     safe = np.where(small, 1.0, theta)
     # (t - sin t)/t^2 and (1 - cos t)/t^2, smooth through zero
     f = np.where(small, theta / 6.0, (safe - np.sin(safe)) / (safe * safe))
-    g = np.where(small, 0.5 - theta * theta / 24.0, (1.0 - np.cos(safe)) / (safe * safe))
+    g = np.where(small, 0.5 - theta * theta / 24.0, 2.0 * (np.sin(0.5 * safe) / safe) ** 2)
     zero, one = np.zeros_like(theta), np.ones_like(theta)
     rows = [
         np.stack([a, b, f * v[..., 0] - g * v[..., 1]], axis=-1),
@@ -146,5 +149,5 @@ def scalar_exp(vx: float, vy: float, wz: float) -> tuple[float, float, float]:  
     if abs(wz) < 1e-4:
         a, b = 1.0 - wz * wz / 6.0, wz * (0.5 - wz * wz / 24.0)
     else:
-        a, b = math.sin(wz) / wz, (1.0 - math.cos(wz)) / wz
+        a, b = math.sin(wz) / wz, 2.0 * math.sin(0.5 * wz) ** 2 / wz
     return a * vx - b * vy, b * vx + a * vy, wz
