@@ -5,12 +5,16 @@ from __future__ import annotations
 from motion_models.base import MotionModel
 from motion_models.diff_drive import DiffDrive
 from motion_models.errors import ModelError
+from motion_models.full_linear import FullLinear
+from motion_models.icr import Icr
 from motion_models.robot import Robot
 from motion_models.skid_steer import SkidSteer
 
 MODELS: dict[str, type[MotionModel]] = {
     DiffDrive.name: DiffDrive,
     SkidSteer.name: SkidSteer,
+    Icr.name: Icr,
+    FullLinear.name: FullLinear,
 }
 
 

@@ -1,0 +1,158 @@
+"""The full linear model, and the few nonlinear terms that a real skid-steer robot on real ground asks for.
+
+Sources of the linear part: G. Anousaki, K. J. Kyriakopoulos, "A dead-reckoning scheme for skid-steered vehicles in outdoor
+environments", ICRA 2004; T. Okawara et al., "Tightly-coupled LiDAR-IMU-wheel odometry with online calibration of a kinematic model for
+skid-steering robots", IEEE Access 2024. The lateral slip by v wz is that of D. Baril et al., "DRIVE: data-driven robot input vector
+exploration", ICRA 2024; the share of turning is this project's way to make a loss depend on the arc and not on the speed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numba
+import numpy as np
+
+from motion_models.base import Twist
+from motion_models.errors import ModelError
+from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
+
+_NEWTON_STEPS = 50
+_CONVERGED = 1e-12
+
+
+@dataclass(frozen=True)
+class FullLinear:
+    """A 3x2 matrix from wheel rates to twist, then six optional terms, all 0 unless the robot's file or a fit says otherwise.
+
+    u = vx_left q_l + vx_right q_r     b = vy_left q_l + vy_right q_r     w = wz_left q_l + wz_right q_r
+    vx = u (1 - longitudinal_slip_turning |w| - longitudinal_slip_curvature T)
+    vy = b + lateral_slip_speed u w
+    wz = w (1 - rotation_slip_speed |u| - rotation_slip_rate |w| - rotation_slip_curvature (1 - T))
+    T  = (q_r - q_l)^2 / (2 (q_l^2 + q_r^2))
+
+    T is the share of turning in the wheels' motion: 0 straight ahead, 1/2 with one side standing, 1 turning in place; it is free of
+    scale. So the `_curvature` losses are those of friction that does not care for speed, the others grow with speed. Units: m for
+    the rows of vx and vy, 1 for those of wz; s for `_turning`, `_rate` and lateral_slip_speed; s/m for rotation_slip_speed.
+
+    |u| and |w| have no derivative at 0; the mean of both sides (0) is returned there. At standstill T = 0 and the derivative is
+    the matrix's, although with `_curvature` terms it depends on the direction in which the wheels set off.
+    """
+
+    nominal: FloatArray
+    """(12,) the matrix by rows, then the terms, in the order of `param_names`."""
+    name: ClassVar[str] = "full_linear"
+    param_names: ClassVar[tuple[str, ...]] = (
+        *("vx_left", "vx_right", "vy_left", "vy_right", "wz_left", "wz_right"),
+        *("lateral_slip_speed", "longitudinal_slip_turning", "longitudinal_slip_curvature"),
+        *("rotation_slip_speed", "rotation_slip_rate", "rotation_slip_curvature"),
+    )
+
+    @classmethod
+    def from_robot(cls, robot: Robot) -> FullLinear:
+        """For what [models.full_linear] does not name, the matrix of the robot's own diff-drive driver."""
+        driver = robot.driver
+        half = driver.wheel_radius_m / 2.0
+        turn = driver.wheel_radius_m / (driver.wheel_separation_multiplier * driver.track_width_m)
+        defaults = np.array([half, half, 0.0, 0.0, -turn, turn, *(0.0,) * 6])
+        return cls(robot.coefficients(cls.name, cls.param_names, defaults))
+
+    def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
+        """See `MotionModel.twist`."""
+        return Twist.from_kernel(_twist, np.empty(0), wheels, cg, params)
+
+    def wheels(self, command: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+        """See `MotionModel.wheels`; a linear solve, then Newton steps for the terms.
+
+        Raises `ModelError` for a command that no wheel rates give, which the losses make possible.
+        """
+        command, cg = np.broadcast_arrays(command, cg)
+        wanted = command.reshape(-1, 2)
+        cgs = cg.reshape(-1, 2)
+        matrix = params[[0, 1, 4, 5]].reshape(2, 2)
+        if abs(np.linalg.det(matrix)) < 1e-12:
+            raise ModelError("full_linear: the rows of vx and wz are the same direction, so that no wheel rates steer the robot.")
+        rates: FloatArray = np.asarray(np.linalg.solve(matrix, wanted.T).T, dtype=np.float64)
+        error = self._off(rates, wanted, cgs, params)
+        for _ in range(_NEWTON_STEPS):
+            if np.all(np.abs(error) <= _CONVERGED * (1.0 + np.abs(wanted))):
+                return rates.reshape(command.shape)
+            jacobian = self.twist(rates, cgs, params).d_wheels[:, [0, 2], :]
+            step = np.linalg.pinv(jacobian) @ error[..., None]
+            # Halve the step of each command until it helps: the losses bend the way.
+            scale = np.ones((len(rates), 1))
+            for _ in range(30):
+                tried = rates - scale * step[..., 0]
+                off = self._off(tried, wanted, cgs, params)
+                worse = np.linalg.norm(off, axis=1) > np.linalg.norm(error, axis=1)
+                if not worse.any():
+                    break
+                scale[worse] /= 2.0
+            rates, error = tried, off
+        worst = wanted[np.argmax(np.abs(error).max(axis=1))]
+        raise ModelError(f"full_linear: no wheel rates give vx = {worst[0]:.4g} m/s with wz = {worst[1]:.4g} rad/s; ask for a gentler arc.")
+
+    def _off(self, rates: FloatArray, wanted: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+        return np.asarray(self.twist(rates, cg, params).value[:, [0, 2]] - wanted)
+
+
+@numba.njit(cache=True)
+def _sign(value: float) -> float:  # pragma: no cover
+    return 1.0 if value > 0.0 else (-1.0 if value < 0.0 else 0.0)
+
+
+@numba.njit(cache=True)
+def _twist(
+    wheels: FloatArray,
+    cg: FloatArray,
+    params: FloatArray,
+    constants: FloatArray,
+    value: FloatArray,
+    d_wheels: FloatArray,
+    d_cg: FloatArray,
+    d_params: FloatArray,
+) -> None:  # pragma: no cover
+    """See `Twist.from_kernel`; ``constants`` is empty."""
+    lateral, loss_w, loss_t = params[6], params[7], params[8]
+    slip_u, slip_w, slip_t = params[9], params[10], params[11]
+    for i in range(wheels.shape[0]):
+        q_l, q_r = wheels[i, 0], wheels[i, 1]
+        u = params[0] * q_l + params[1] * q_r
+        b = params[2] * q_l + params[3] * q_r
+        w = params[4] * q_l + params[5] * q_r
+        difference, energy = q_r - q_l, 2.0 * (q_l * q_l + q_r * q_r)
+        moving = energy > 0.0
+        turning = difference * difference / energy if moving else 0.0
+
+        forward = 1.0 - loss_w * abs(w) - loss_t * turning
+        rotation = 1.0 - slip_u * abs(u) - slip_w * abs(w) - slip_t * (1.0 - turning)
+        value[i, 0] = u * forward
+        value[i, 1] = b + lateral * u * w
+        value[i, 2] = w * rotation
+
+        sign_u, sign_w = _sign(u), _sign(w)
+        vx_by_u, vx_by_w = forward, -u * loss_w * sign_w
+        wz_by_u, wz_by_w = -w * slip_u * sign_u, rotation - w * slip_w * sign_w
+        for j in range(2):
+            u_j, b_j, w_j, q_j = params[j], params[2 + j], params[4 + j], wheels[i, j]
+            side = -1.0 if j == 0 else 1.0
+            t_j = (2.0 * side * difference - 4.0 * q_j * turning) / energy if moving else 0.0
+            d_wheels[i, 0, j] = vx_by_u * u_j + vx_by_w * w_j - u * loss_t * t_j
+            d_wheels[i, 1, j] = b_j + lateral * (u_j * w + u * w_j)
+            d_wheels[i, 2, j] = wz_by_u * u_j + wz_by_w * w_j + w * slip_t * t_j
+
+            d_params[i, 0, j] = vx_by_u * q_j
+            d_params[i, 1, j] = lateral * w * q_j
+            d_params[i, 2, j] = wz_by_u * q_j
+            d_params[i, 1, 2 + j] = q_j
+            d_params[i, 0, 4 + j] = vx_by_w * q_j
+            d_params[i, 1, 4 + j] = lateral * u * q_j
+            d_params[i, 2, 4 + j] = wz_by_w * q_j
+        d_params[i, 1, 6] = u * w
+        d_params[i, 0, 7] = -u * abs(w)
+        d_params[i, 0, 8] = -u * turning
+        d_params[i, 2, 9] = -w * abs(u)
+        d_params[i, 2, 10] = -w * abs(w)
+        d_params[i, 2, 11] = -w * (1.0 - turning)
