@@ -1,0 +1,243 @@
+"""What a URDF says about masses: links with mass and centre of mass, and the joints between them.
+
+Read with the standard library: of a URDF's content only names, origins, axes, limits, mimics and masses matter here, and the readers
+that there are bring mesh loaders with them. Format: http://wiki.ros.org/urdf/XML. Errors are `RobotError`s that name file and element.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from motion_models.errors import RobotError
+from motion_models.robot import Mount
+from motion_models.se2 import FloatArray
+
+_MOVING = ("revolute", "continuous", "prismatic")
+_XACRO = "it is a xacro file, not a URDF; expand it first: xacro FILE.xacro > FILE.urdf"
+
+
+@dataclass(frozen=True)
+class Link:
+    name: str
+    mass: float
+    """[kg]; 0 where the link has no <inertial>."""
+    com: FloatArray
+    """(3,) centre of mass in the link's frame [m]."""
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """position = multiplier * position of ``joint`` + offset"""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class Joint:
+    name: str
+    kind: str
+    """fixed, revolute, continuous or prismatic."""
+    parent: str
+    child: str
+    rotation: FloatArray
+    """(3, 3) takes vectors of the child's frame, at position 0, into the parent's frame."""
+    translation: FloatArray
+    """(3,) origin of the child's frame in the parent's frame [m]."""
+    axis: FloatArray
+    """(3,) unit vector in the child's frame."""
+    lower: float
+    """Least position [rad or m]; -inf where there is none."""
+    upper: float
+    """Greatest position [rad or m]; inf where there is none."""
+    mimic: Mimic | None
+
+    @property
+    def moves(self) -> bool:
+        return self.kind != "fixed"
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """A tree of links. ``joints`` are ordered depth first: every parent comes before its children, and an arm stays together."""
+
+    source: str
+    root: str
+    links: Mapping[str, Link]
+    joints: tuple[Joint, ...] = field(default_factory=tuple)
+
+    def with_mass(self, link: str, mass: float, position: FloatArray) -> Urdf:
+        """This tree with one more ``mass`` [kg] fixed at ``position`` (3,) [m] of ``link``. Raises `RobotError` for an unknown link."""
+        if link not in self.links:
+            raise RobotError(f"{self.source}: no link '{link}'; links are {', '.join(self.links)}.")
+        old = self.links[link]
+        total = old.mass + mass
+        com = (old.mass * old.com + mass * np.asarray(position, dtype=float)) / total if total > 0.0 else old.com
+        return dataclasses.replace(self, links={**self.links, link: Link(link, total, com)})
+
+
+def load_urdf(path: str | Path) -> Urdf:
+    """The URDF of a file. Raises `RobotError`."""
+    path = Path(path)
+    if path.suffix == ".xacro":
+        raise RobotError(f"'{path}' cannot be used: {_XACRO}.")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise RobotError(f"URDF '{path}' cannot be read: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise RobotError(f"URDF '{path}' is not text (byte {error.start} is not UTF-8).") from error
+    return parse_urdf(text, source=str(path))
+
+
+def parse_urdf(text: str, source: str) -> Urdf:
+    """The URDF of an XML text; ``source`` names it in errors. Raises `RobotError`."""
+    try:
+        # ElementTree wants bytes where the XML declares an encoding.
+        root = ET.fromstring(text.encode())
+    except ET.ParseError as error:
+        # An old xacro file may not declare its namespace, which is an error of XML already.
+        raise RobotError(f"{source}: {_XACRO if '<xacro:' in text else f'not valid XML: {error}'}.") from error
+    if root.tag != "robot":
+        raise RobotError(f"{source}: the outermost element is <{root.tag}>; a URDF has <robot>.")
+    if any("xacro}" in e.tag or any("${" in v or "$(" in v for v in e.attrib.values()) for e in root.iter()):
+        raise RobotError(f"{source}: {_XACRO}.")
+
+    links: dict[str, Link] = {}
+    for element in root.findall("link"):
+        link = _link(element, source)
+        if link.name in links:
+            raise RobotError(f"{source}: two links are called '{link.name}'.")
+        links[link.name] = link
+    if not links:
+        raise RobotError(f"{source}: no <link> in it.")
+    joints = [_joint(element, source, links) for element in root.findall("joint")]
+    return Urdf(source, *_tree(links, joints, source))
+
+
+def _tree(links: dict[str, Link], joints: list[Joint], source: str) -> tuple[str, dict[str, Link], tuple[Joint, ...]]:
+    """Root, links, and joints with parents first; refuses what is not one tree, and mimics that lead nowhere."""
+    by_name: dict[str, Joint] = {}
+    by_child: dict[str, Joint] = {}
+    for joint in joints:
+        if joint.name in by_name:
+            raise RobotError(f"{source}: two joints are called '{joint.name}'.")
+        if joint.child in by_child:
+            raise RobotError(f"{source}: link '{joint.child}' has two parents: joints '{by_child[joint.child].name}' and '{joint.name}'.")
+        by_name[joint.name] = by_child[joint.child] = joint
+    roots = [name for name in links if name not in by_child]
+    if len(roots) > 1:
+        raise RobotError(f"{source}: links {', '.join(roots)} hang on no joint; only one link, the root, may.")
+
+    children: dict[str, list[Joint]] = {name: [] for name in links}
+    for joint in joints:
+        children[joint.parent].append(joint)
+    order: list[Joint] = []
+    stack = [joint for name in roots for joint in reversed(children[name])]
+    while stack:
+        order.append(stack.pop())
+        stack += reversed(children[order[-1].child])
+    if len(order) < len(joints):
+        loop = sorted(set(by_name) - {joint.name for joint in order})
+        raise RobotError(f"{source}: joints {', '.join(loop)} form a loop; a URDF is a tree.")
+
+    for joint in joints:
+        seen, follower = {joint.name}, joint
+        while follower.mimic is not None:
+            if follower.mimic.joint not in by_name or not by_name[follower.mimic.joint].moves:
+                raise RobotError(f"{source}: joint '{follower.name}' mimics '{follower.mimic.joint}', which is not a moving joint of it.")
+            follower = by_name[follower.mimic.joint]
+            if follower.name in seen:
+                raise RobotError(f"{source}: joint '{joint.name}' mimics itself, by way of '{follower.name}'.")
+            seen.add(follower.name)
+    return roots[0], links, tuple(order)
+
+
+def _link(element: ET.Element, source: str) -> Link:
+    name = _name(element, source)
+    inertial = element.find("inertial")
+    if inertial is None:
+        return Link(name, 0.0, np.zeros(3))
+    where = f"{source}: <inertial> of link '{name}'"
+    mass_element = inertial.find("mass")
+    if mass_element is None:
+        raise RobotError(f"{where} has no <mass>.")
+    mass = _numbers(mass_element, "value", 1, None, where)[0]
+    if mass < 0.0:
+        raise RobotError(f"{where}: mass is {mass} kg; it cannot be negative.")
+    return Link(name, mass, _origin(inertial, where)[1])
+
+
+def _joint(element: ET.Element, source: str, links: Mapping[str, Link]) -> Joint:
+    name, kind = _name(element, source), element.get("type", "")
+    where = f"{source}: joint '{name}'"
+    if kind not in (*_MOVING, "fixed"):
+        raise RobotError(f"{where} is of type '{kind}'; a centre of gravity can be had for fixed, {', '.join(_MOVING)}.")
+    ends: list[str] = []
+    for end in ("parent", "child"):
+        reference = element.find(end)
+        link = "" if reference is None else reference.get("link", "")
+        if link not in links:
+            raise RobotError(f"{where}: its {end} is {f'link {link!r}, which is not there' if link else 'not given'}.")
+        ends.append(link)
+    rotation, translation = _origin(element, where)
+
+    axis = np.array([1.0, 0.0, 0.0])
+    given = element.find("axis")
+    if given is not None and kind != "fixed":
+        axis = np.array(_numbers(given, "xyz", 3, "1 0 0", where))
+        if np.linalg.norm(axis) < 1e-9:
+            raise RobotError(f"{where}: its axis has no length.")
+        axis /= np.linalg.norm(axis)
+
+    lower, upper = -math.inf, math.inf
+    limit = element.find("limit")
+    if limit is not None and kind in ("revolute", "prismatic"):
+        # The format's default of a missing bound is 0; a limit with neither bound tells of effort and velocity only.
+        if "lower" in limit.attrib or "upper" in limit.attrib:
+            lower, upper = (_numbers(limit, bound, 1, "0", where)[0] for bound in ("lower", "upper"))
+        if lower > upper:
+            raise RobotError(f"{where}: its lower limit {lower} is above the upper {upper}.")
+
+    mimic = None
+    follows = element.find("mimic")
+    if follows is not None and kind != "fixed":
+        multiplier, offset = (_numbers(follows, key, 1, default, where)[0] for key, default in (("multiplier", "1"), ("offset", "0")))
+        mimic = Mimic(follows.get("joint", ""), multiplier, offset)
+    return Joint(name, kind, ends[0], ends[1], rotation, translation, axis, lower, upper, mimic)
+
+
+def _name(element: ET.Element, source: str) -> str:
+    name = element.get("name")
+    if not name:
+        raise RobotError(f"{source}: a <{element.tag}> has no name.")
+    return name
+
+
+def _origin(element: ET.Element, where: str) -> tuple[FloatArray, FloatArray]:
+    """(3, 3) rotation and (3,) translation of the element's <origin>; identity where it has none."""
+    origin = element.find("origin")
+    if origin is None:
+        return np.eye(3), np.zeros(3)
+    roll, pitch, yaw = _numbers(origin, "rpy", 3, "0 0 0", where)
+    return Mount(roll=roll, pitch=pitch, yaw=yaw).rotation(), np.array(_numbers(origin, "xyz", 3, "0 0 0", where))
+
+
+def _numbers(element: ET.Element, attribute: str, count: int, default: str | None, where: str) -> list[float]:
+    text = element.get(attribute, default)
+    try:
+        numbers = [float(word) for word in (text or "").split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
+        wanted = "a finite number" if count == 1 else f"{count} finite numbers"
+        raise RobotError(f"{where}: {attribute} of <{element.tag}> must be {wanted}, found {text!r}.")
+    return numbers
