@@ -11,3 +11,15 @@ class RobotError(SkidlocError):
 
 class ModelError(SkidlocError):
     """A motion model that does not exist or was given parameters that it cannot use."""
+
+
+class CalibrationError(SkidlocError):
+    """Data that cannot be fitted: malformed, too little motion, or parameters that this drive does not reveal."""
+
+
+class CalibrationError(SkidlocError):
+    """Data that cannot tell what is asked of them: malformed tables, too few rows, too little motion."""
+
+
+class CgError(SkidlocError):
+    """A centre of gravity that cannot be had from what was given, or that lies where the robot would tip over."""
