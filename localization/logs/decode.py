@@ -1,0 +1,177 @@
+"""Messages to events: what a driver wrote, in this project's types. Stateless; what needs the message before is in `wheels`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+from localization.events import CgSample, ImuSample, Scan
+from localization.logs.chunks import Channel, RawMessage
+from localization.logs.tally import Oddity
+from motion_models.se2 import FloatArray
+
+
+class UnusableError(Exception):
+    """A message that says nothing. Never leaves this package."""
+
+    def __init__(self, oddity: Oddity) -> None:
+        super().__init__(oddity.value)
+        self.oddity = oddity
+
+
+@dataclass(frozen=True)
+class JointReading:
+    """Wheel joints at one instant."""
+
+    stamp_ns: int
+    position: FloatArray
+    """(n,) [rad], NaN where absent."""
+    velocity: FloatArray
+    """(n,) [rad/s], NaN where absent."""
+
+
+@dataclass(frozen=True)
+class OdometryReading:
+    """A driver's odometry at one instant."""
+
+    stamp_ns: int
+    pose: FloatArray
+    """(3,) x, y, yaw."""
+    twist: FloatArray
+    """(3,) vx, vy, wz in the body frame."""
+
+
+class Decoder:
+    """Raw messages to rosbags' message objects, by the definitions that the log carries, else by those of ROS 2 Humble."""
+
+    def __init__(self, channels: Iterable[Channel], *, is_ros1: bool) -> None:
+        fallback = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+        self._store = get_typestore(Stores.EMPTY)
+        types = {}
+        for channel in channels:
+            definition = channel.definition
+            try:
+                if definition.format == MessageDefinitionFormat.MSG:
+                    types.update(get_types_from_msg(definition.data, channel.type))
+                elif definition.format == MessageDefinitionFormat.IDL:
+                    for part in definition.data.split("=" * 80 + "\n"):
+                        text = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
+                        types.update(get_types_from_idl(text) if text.strip() else {})
+            except Exception:  # the parser knows no bounds for what it lets out; the standard definition will do
+                types.update(fallback.fielddefs)
+            if channel.type not in types:
+                types.update({name: fields for name, fields in fallback.fielddefs.items() if name not in types})
+        self._store.register(types)
+        self._deserialize = self._store.deserialize_ros1 if is_ros1 else self._store.deserialize_cdr
+
+    def __call__(self, raw: RawMessage) -> Any:
+        """The message. Raises `UnusableError`."""
+        try:
+            return self._deserialize(raw.data, raw.type)
+        except Exception as error:  # struct.error, SerdeError, UnicodeDecodeError, ... : the bytes are not such a message
+            raise UnusableError(Oddity.UNDECODABLE) from error
+
+
+def stamp_ns(message: Any) -> int:
+    """Header stamp [ns], 0 where the driver did not set it."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def frame_name(frame_id: str) -> str:
+    """A frame's name without the slash that tf (1) put before it."""
+    return frame_id.strip().lstrip("/")
+
+
+def decode_imu(message: Any, stamp: int) -> ImuSample:
+    w, a = message.angular_velocity, message.linear_acceleration
+    rate, force = np.array([w.x, w.y, w.z], dtype=float), np.array([a.x, a.y, a.z], dtype=float)
+    if not (np.isfinite(rate).all() and np.isfinite(force).all()):
+        raise UnusableError(Oddity.NOT_FINITE)
+    return ImuSample(stamp, rate, force, frame_name(message.header.frame_id))
+
+
+def decode_cg(message: Any, stamp: int) -> CgSample:
+    position = np.array([message.point.x, message.point.y], dtype=float)
+    if not np.isfinite(position).all():
+        raise UnusableError(Oddity.NOT_FINITE)
+    return CgSample(stamp, position)
+
+
+def yaw_of(q: Any) -> float:
+    """Heading of a quaternion [rad]; NaN if it is none (all zeros)."""
+    if q.x == 0 and q.y == 0 and q.z == 0 and q.w == 0:
+        return math.nan
+    return math.atan2(2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
+
+
+def decode_odometry(message: Any, stamp: int) -> OdometryReading:
+    pose, twist = message.pose.pose, message.twist.twist
+    where = np.array([pose.position.x, pose.position.y, yaw_of(pose.orientation)], dtype=float)
+    rate = np.array([twist.linear.x, twist.linear.y, twist.angular.z], dtype=float)
+    if not (np.isfinite(where).all() or np.isfinite(rate).all()):
+        raise UnusableError(Oddity.NOT_FINITE)
+    return OdometryReading(stamp, where, rate)
+
+
+def joint_decoder(joints: tuple[str, ...]) -> Callable[[Any, int], JointReading | None]:
+    """Decoder of joint states for these joints; None for a message that has none of them (an arm's, say)."""
+    places: dict[tuple[str, ...], NDArray[np.intp]] = {}
+
+    def decode(message: Any, stamp: int) -> JointReading | None:
+        names = tuple(message.name)
+        place = places.get(names)
+        if place is None:
+            place = np.array([names.index(joint) if joint in names else -1 for joint in joints], dtype=np.intp)
+            places[names] = place
+        if (place < 0).any():
+            return None
+        position, velocity = _at(message.position, place), _at(message.velocity, place)
+        if not (np.isfinite(position).all() or np.isfinite(velocity).all()):
+            raise UnusableError(Oddity.NOT_FINITE)
+        return JointReading(stamp, position, velocity)
+
+    return decode
+
+
+def _at(values: Any, place: NDArray[np.intp]) -> FloatArray:
+    array = np.asarray(values, dtype=float)
+    return array[place] if len(array) > int(place.max()) else np.full(len(place), np.nan)
+
+
+def scan_decoder() -> Callable[[Any, int], Scan]:
+    """Decoder of LaserScans; it keeps the beams' directions between scans."""
+    directions: dict[tuple[int, float, float], FloatArray] = {}
+
+    def decode(message: Any, stamp: int) -> Scan:
+        ranges = np.asarray(message.ranges, dtype=float)
+        first, step = float(message.angle_min), float(message.angle_increment)
+        if step == 0.0 and len(ranges) > 1:
+            step = (float(message.angle_max) - first) / (len(ranges) - 1)
+        if not (math.isfinite(first) and math.isfinite(step)):
+            raise UnusableError(Oddity.MALFORMED)
+        key = (len(ranges), first, step)
+        direction = directions.get(key)
+        if direction is None:
+            angle = first + step * np.arange(len(ranges))
+            direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(ranges))], axis=1)
+            directions.clear()  # a scanner whose beams change with every scan must not fill the memory
+            directions[key] = direction
+        # A comparison with NaN is false. A range at the maximum is a beam that came back from nowhere.
+        shortest, longest = float(message.range_min), float(message.range_max)
+        hit = (ranges > 0.0) & ~(ranges < shortest) & (ranges < (longest if longest > 0.0 else np.inf))
+        points = ranges[hit, None] * direction[hit]
+        beam_s = float(message.time_increment)
+        offsets: FloatArray = np.empty(0)
+        if math.isfinite(beam_s) and beam_s != 0.0:
+            offsets = np.asarray(np.flatnonzero(hit) * beam_s, dtype=float)
+        return Scan(stamp, points, offsets, frame_name(message.header.frame_id), is_planar=True)
+
+    return decode

@@ -1,0 +1,267 @@
+"""A log as the rest of the library sees it: events, references, mounts, and what was odd."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from localization.errors import LogError, TopicError
+from localization.events import Event, Reference
+from localization.logs.chunks import Source
+from localization.logs.decode import (
+    Decoder,
+    JointReading,
+    OdometryReading,
+    UnusableError,
+    decode_cg,
+    decode_imu,
+    decode_odometry,
+    frame_name,
+    joint_decoder,
+    scan_decoder,
+    stamp_ns,
+)
+from localization.logs.merge import ClockPlan, Item, merge, plan_clocks
+from localization.logs.mounts import FixedTransforms
+from localization.logs.references import reference_decoder
+from localization.logs.source import open_source
+from localization.logs.tally import Tally
+from localization.logs.topics import REFERENCE_TYPES, TYPES, Sources, TopicChooser, TopicOverrides, TopicSource
+from localization.logs.wheels import joints_to_wheels, odometry_to_wheels
+from motion_models.robot import Mount, Robot
+
+_RANKS = {"joint_states": 0, "odometry": 0, "center_of_gravity": 1, "imu": 2, "scan": 3, "points": 3}
+_SCAN_WEIGHT = 100
+_TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_TF_WATCHED_NS = 10_000_000_000
+_JOINT_STATES_SEEN = 500
+
+Payload = Callable[[Any, int], Any]
+
+
+def open_log(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> Log:  # noqa: B008 (frozen)
+    """Open a ROS 1 bag, a ROS 2 bag folder or a bare .mcap of ``robot``.
+
+    Nothing but the index and a few messages is read. Raises `LogError` if it cannot be used at all, `TopicError` if ``topics``
+    names one that is not there or carries something else.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise LogError(f"no log '{path}': there is no such file or folder.")
+    return Log(path, open_source(path), robot, topics)
+
+
+class Log:
+    """A log of a robot; made by `open_log`. Its iterators read the file anew each time and hold about a second of it."""
+
+    def __init__(self, path: Path, source: Source, robot: Robot, topics: TopicOverrides) -> None:
+        self.path, self.robot = path, robot
+        self._source = source
+        count = sum(channel.count for channel in source.channels)
+        if count < 2:
+            found = "no message" if count == 0 else "only one message"
+            raise LogError(" ".join([f"log '{path}' holds {found}; motion needs more.", *source.notes]))
+        self.start_ns, self.end_ns = source.start_ns, source.end_ns
+        """Time of recording of the first and the last message."""
+        self._types = {channel.topic: channel.type for channel in source.channels}
+        self._joints: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+        self._wheels_error: TopicError | None = None
+        self._choice_notes: list[str] = []
+        self._tallies: dict[str, Tally] = {}
+        self._chooser = TopicChooser(path.name, source.channels, robot, topics)
+        self._overrides = topics
+        self.sources = Sources(self._choose_wheels(), self._choose_lidar(), self._choose("imu"), self._choose("center_of_gravity"))
+        self._frames: dict[str, str] = {}
+        self._clocks = self._watch_clocks()
+
+    @property
+    def duration_s(self) -> float:
+        return (self.end_ns - self.start_ns) * 1e-9
+
+    def events(self) -> Iterator[Event]:
+        """Wheel, CG, IMU samples and scans by header stamp, never decreasing; within a topic always increasing.
+
+        Raises `TopicError` if the joint states, the only source of wheels, lack the robot's wheel joints.
+        """
+        if self._wheels_error is not None:
+            raise self._wheels_error
+        tally = self._tallies["events"] = Tally()
+        return self._events(tally)
+
+    def references(self, topic: str) -> Iterator[Reference]:
+        """Reference poses of a pose, odometry, transform or GPS topic, by header stamp. GPS: east and north of the first fix.
+
+        Raises `TopicError` if the log has no such topic or if it carries something else.
+        """
+        self._chooser.require(topic, REFERENCE_TYPES, "--reference")
+        tally = self._tallies[topic] = Tally()
+        decode = reference_decoder(self._types[topic])
+        clocks = self._clock_plan([*(s.topic for s in self.sources.used()), topic])
+        return merge(self._items({topic: (0, decode)}, tally), clocks, tally)
+
+    @cached_property
+    def mounts(self) -> Mapping[str, Mount]:
+        """Pose of each sensor's frame in the body frame: the log's, and the robot file's for frames which the log lacks."""
+        transforms = FixedTransforms()
+        tf = [channel for channel in self._source.channels if channel.type in _TF_TYPES]
+        static = [channel for channel in tf if channel.topic.endswith("tf_static")]
+        decode = Decoder(tf, is_ros1=self._source.is_ros1)
+        left = sum(channel.count for channel in static)
+        for raw in self._source.messages([channel.topic for channel in static]) if left else ():
+            left -= 1
+            _try(lambda raw=raw: transforms.add(decode(raw), is_static=True))  # type: ignore[misc]
+            if left == 0:
+                break
+        if self._source.is_ros1:
+            moving = [channel.topic for channel in tf if not channel.topic.endswith("tf_static")]
+            for raw in self._source.messages(moving) if moving else ():
+                if raw.log_ns > self.start_ns + _TF_WATCHED_NS:
+                    break
+                _try(lambda raw=raw: transforms.add(decode(raw), is_static=False))  # type: ignore[misc]
+        return {**self.robot.mounts, **transforms.mounts()}
+
+    def notes(self) -> list[str]:
+        """Sentences about everything that was lost, mended or chosen without being told, so far."""
+        said = [*self._source.notes, *self._chooser.notes, *self._choice_notes]
+        for tally in self._tallies.values():
+            said += tally.sentences()
+        return list(dict.fromkeys(said))
+
+    def _events(self, tally: Tally) -> Iterator[Event]:
+        parts: dict[str, tuple[int, Payload]] = {}
+        for source in self.sources.used():
+            parts[source.topic] = (_RANKS[source.kind], self._payload_decoder(source))
+        wheels = self.sources.wheels
+        topic = "" if wheels is None else wheels.topic
+        left, right = self._joints
+        from_joints = joints_to_wheels(len(left), len(right), self.robot.geometry.wheel_radius_m, topic, tally)
+        from_odometry = odometry_to_wheels(self.robot.driver, topic, tally)
+        for payload in merge(self._items(parts, tally), self._clocks, tally):
+            if isinstance(payload, JointReading):
+                yield from_joints(payload)
+            elif isinstance(payload, OdometryReading):
+                yield from_odometry(payload)
+            else:
+                yield payload
+
+    def _payload_decoder(self, source: TopicSource) -> Payload:
+        if source.kind == "joint_states":
+            return joint_decoder((*self._joints[0], *self._joints[1]))
+        if source.kind == "scan":
+            return scan_decoder()
+        return {"odometry": decode_odometry, "imu": decode_imu, "center_of_gravity": decode_cg}[source.kind]
+
+    def _items(self, parts: Mapping[str, tuple[int, Payload]], tally: Tally) -> Iterator[Item]:
+        decode = Decoder([c for c in self._source.channels if c.topic in parts], is_ros1=self._source.is_ros1)
+        for raw in self._source.messages(parts.keys()):
+            rank, payload_of = parts[raw.topic]
+            try:
+                message = decode(raw)
+                stamp = stamp_ns(message)
+                payload = payload_of(message, stamp)
+            except UnusableError as reason:
+                tally.count(raw.topic, reason.oddity)
+                continue
+            if payload is not None:
+                yield Item(raw.log_ns, stamp, raw.topic, rank, _SCAN_WEIGHT if rank == 3 else 1, payload)
+
+    def _first_messages(self, topic: str, most: int) -> Iterator[tuple[int, Any]]:
+        """The first decodable messages of a topic, with their time of recording."""
+        decode = Decoder([c for c in self._source.channels if c.topic == topic], is_ros1=self._source.is_ros1)
+        for number, raw in enumerate(self._source.messages([topic])):
+            if number >= most:
+                return
+            try:
+                yield raw.log_ns, decode(raw)
+            except UnusableError:
+                continue
+
+    def _watch_clocks(self) -> ClockPlan:
+        return self._clock_plan([source.topic for source in self.sources.used()])
+
+    def _clock_plan(self, topics: list[str]) -> ClockPlan:
+        first: dict[str, tuple[int, int]] = {}
+        for topic in topics:
+            for log_ns, message in self._first_messages(topic, 10):
+                self._frames.setdefault(topic, frame_name(message.header.frame_id))
+                if stamp_ns(message):
+                    first[topic] = log_ns, stamp_ns(message)
+                    break
+        return plan_clocks(first)
+
+    def _choose(self, kind: str) -> TopicSource | None:
+        named = self._chooser.named(kind)
+        return named if named is not None else self._noted(self._chooser.only(kind))
+
+    def _noted(self, source: TopicSource | None) -> TopicSource | None:
+        if source is not None and source.chosen_by == "only":
+            wanted = getattr(self.robot.topics, source.kind)
+            part = source.kind.replace("_", " ")
+            self._choice_notes.append(
+                f"{source.topic} is used as {part}: it is the only topic of its type, and the log has no {wanted} of that type."
+            )
+        return source
+
+    def _choose_lidar(self) -> TopicSource | None:
+        if self._overrides.points and not self._overrides.scan:
+            return self._chooser.named("points")
+        return self._chooser.named("scan") or self._chooser.named("points") or self._choose("scan") or self._choose("points")
+
+    def _choose_wheels(self) -> TopicSource | None:
+        if self._overrides.odometry and not self._overrides.joint_states:
+            return self._chooser.named("odometry")
+        named = self._chooser.named("joint_states")
+        if named is not None:
+            candidates = [named.topic]
+        else:
+            candidates = self._chooser.of_type(TYPES["joint_states"]) if self._overrides.joint_states is None else []
+        known: set[str] = set()
+        fitting = []
+        for topic in candidates:
+            names, joints = self._wheel_joints(topic)
+            known |= names
+            if joints is not None:
+                fitting.append((topic, joints))
+        if len(fitting) == 1:
+            topic, self._joints = fitting[0]
+            absent = [j for j in (*self.robot.joints.left, *self.robot.joints.right) if j not in (*self._joints[0], *self._joints[1])]
+            if absent:
+                self._choice_notes.append(f"{topic} lacks the joints {', '.join(absent)}; their sides are the mean of the others.")
+            return named if named is not None else self._noted(TopicSource(topic, "joint_states", "only"))
+        robot = f"robot '{self.robot.name}' names {', '.join((*self.robot.joints.left, *self.robot.joints.right))}"
+        lacking = f"no joint states of {self.path.name} have the wheel joints: {robot}; joints in it: {', '.join(sorted(known)) or 'none'}"
+        if named is not None and named.chosen_by == "option":
+            raise TopicError(f"{lacking}. Name them in the robot file's [joints].")
+        odometry = self._choose("odometry")
+        if candidates and not fitting:
+            if odometry is not None:
+                self._choice_notes.append(f"{lacking}; the wheels are taken from {odometry.topic}.")
+            else:
+                self._wheels_error = TopicError(
+                    f"{lacking}. Name them in the robot file's [joints], or go without wheels by an empty --topic.joint-states."
+                )
+        return odometry
+
+    def _wheel_joints(self, topic: str) -> tuple[set[str], tuple[tuple[str, ...], tuple[str, ...]] | None]:
+        """All joint names of a topic's first messages, and the left and right wheels' among them if both sides have some."""
+        seen: set[str] = set()
+        best: tuple[tuple[str, ...], tuple[str, ...]] | None = None
+        wanted = self.robot.joints
+        for _, message in self._first_messages(topic, _JOINT_STATES_SEEN):
+            names = set(message.name)
+            seen |= names
+            left, right = tuple(j for j in wanted.left if j in names), tuple(j for j in wanted.right if j in names)
+            if left and right and (best is None or len(left) + len(right) > len(best[0]) + len(best[1])):
+                best = left, right
+                if len(left) + len(right) == len(wanted.left) + len(wanted.right):
+                    break
+        return seen, best
+
+
+def _try(action: Callable[[], None]) -> None:
+    try:
+        action()
+    except UnusableError:
+        return

@@ -1,0 +1,197 @@
+"""Several topics in order of their header stamps, within bounded memory, whatever their clocks do.
+
+Messages come in the order in which they were recorded; their headers say when they were measured, which is earlier by an unknown
+latency, and now and then nonsense. Three things happen here:
+
+- Each topic's clock is watched (`TopicClock`). A stamp is trusted if it lies within a second of the stamp before it, or if it is as
+  far from the time of recording as the stamps before it were, to a second. (The first holds when the recorder stalls, the second
+  when the driver pauses.) One or two that are neither are outliers, and dropped; three in a row that agree are a clock that was
+  set, and from there on the topic is moved back by the jump.
+- A topic without stamps gets the time of recording, and so does, by a constant shift, one whose clock is far from all others'.
+- Trusted messages wait in a heap until nothing older can come: one second after the slowest topic's usual latency.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import heapq
+import statistics
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from localization.logs.tally import Oddity, Tally
+
+_SECOND = 1_000_000_000
+_TRUSTED_STEP = _SECOND
+_WAIT = _SECOND
+_FOREIGN = 10 * _SECOND
+_SAME_JUMP = _SECOND // 4
+_JUMP_AFTER = 3
+_LONGEST_PENDING = 10 * _SECOND
+_MOST_HELD = 20_000
+
+
+@dataclass(frozen=True)
+class Item:
+    """An event on its way, with what it is ordered by."""
+
+    log_ns: int
+    stamp_ns: int
+    topic: str
+    rank: int
+    """Order among equal stamps."""
+    weight: int
+    """How much memory it takes, in units of a small event."""
+    payload: Any
+    """An event, or a reading that becomes one; a dataclass with the field `stamp_ns`."""
+
+
+@dataclass(frozen=True)
+class ClockPlan:
+    """How far the headers' clock is from the recorder's, and which topics have another one."""
+
+    offset_ns: int = 0
+    """Header stamp minus time of recording, where that is more than latency (a log that was recorded while another was played)."""
+    shifts_ns: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    """To be added to the stamps of a topic whose clock is far from the others'."""
+    latency_ns: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    """First header stamp, shifted, minus its time of recording."""
+
+
+def plan_clocks(first: Mapping[str, tuple[int, int]]) -> ClockPlan:
+    """Clocks by the first (log stamp, header stamp) of each topic; topics with a zero stamp say nothing.
+
+    If any topic agrees with the recorder to 10 s, that is the common clock; else the median of all.
+    """
+    offsets = {topic: stamp - log for topic, (log, stamp) in first.items() if stamp != 0}
+    if not offsets or any(abs(offset) <= _FOREIGN for offset in offsets.values()):
+        common = 0
+    else:
+        common = statistics.median_low(sorted(offsets.values()))
+    shifts = {topic: common - offset for topic, offset in offsets.items() if abs(offset - common) > _FOREIGN}
+    return ClockPlan(common, shifts, {topic: offset + shifts.get(topic, 0) for topic, offset in offsets.items()})
+
+
+class TopicClock:
+    """The stamps of one topic, brought onto the common clock."""
+
+    def __init__(self, topic: str, plan: ClockPlan, jumps: list[int], tally: Tally) -> None:
+        self._topic, self._tally = topic, tally
+        self._common = plan.offset_ns
+        self._shift = plan.shifts_ns.get(topic, 0)
+        self._foreign = self._shift != 0
+        self._jumps = jumps
+        self._rebased = False
+        self._last: int | None = None
+        self._newest: int | None = None
+        self.offset_ns = plan.latency_ns.get(topic, plan.offset_ns)
+        """Stamp minus time of recording, of the last trusted message."""
+        self._pending: list[Item] = []
+
+    def horizon(self, log_ns: int) -> int:
+        """No message recorded after ``log_ns`` is expected to have an older stamp than this."""
+        while self._pending and log_ns - self._pending[0].log_ns > _LONGEST_PENDING:
+            del self._pending[0]
+            self._tally.count(self._topic, Oddity.OUTLIER)
+        since = min(log_ns, self._pending[0].log_ns) if self._pending else log_ns
+        return since + self.offset_ns - _WAIT
+
+    def put(self, item: Item) -> list[Item]:
+        """Messages that have become trusted by this one, with their final stamps."""
+        if item.stamp_ns == 0:
+            self._tally.count(self._topic, Oddity.NO_STAMP)
+            return [_restamped(item, item.log_ns + self._common)]
+        if self._is_trusted(item):
+            self.close()
+            return [self._trust(item)]
+        if self._pending and not _agree(self._pending[-1], item):
+            self.close()
+        self._pending.append(item)
+        if len(self._pending) < _JUMP_AFTER:
+            return []
+        self._set_clock()
+        released, self._pending = self._pending, []
+        return [self._trust(i) for i in released]
+
+    def close(self) -> None:
+        """Give up what is pending."""
+        if self._pending:
+            self._tally.count(self._topic, Oddity.OUTLIER, len(self._pending))
+            self._pending = []
+
+    def _is_trusted(self, item: Item) -> bool:
+        stamp = item.stamp_ns + self._shift
+        return self._last is None or abs(stamp - self._last) <= _TRUSTED_STEP or abs(stamp - item.log_ns - self.offset_ns) <= _TRUSTED_STEP
+
+    def _trust(self, item: Item) -> Item:
+        stamp = item.stamp_ns + self._shift
+        self._last, self.offset_ns = stamp, stamp - item.log_ns
+        if self._rebased:
+            self._tally.count(self._topic, Oddity.REBASED)
+        elif self._foreign:
+            self._tally.count(self._topic, Oddity.FOREIGN_CLOCK)
+        if self._newest is not None and stamp < self._newest:
+            self._tally.count(self._topic, Oddity.OUT_OF_ORDER)
+        self._newest = stamp if self._newest is None else max(stamp, self._newest)
+        return _restamped(item, stamp)
+
+    def _set_clock(self) -> None:
+        """The clock was set: shift the topic so that it is as far from the time of recording as it was before."""
+        deviation = statistics.median_low([i.stamp_ns + self._shift - i.log_ns - self.offset_ns for i in self._pending])
+        shift = self._shift - deviation
+        # The latency jitters. Where another topic made the same jump, or this one a jump back, the same shift keeps them aligned.
+        same = [known for known in (0, *self._jumps) if abs(known - shift) <= _SAME_JUMP]
+        self._shift = same[0] if same else shift
+        self._rebased = self._shift != 0
+        if not same:
+            self._jumps.append(shift)
+
+
+def merge(items: Iterable[Item], plan: ClockPlan, tally: Tally) -> Iterator[Any]:
+    """The payloads of ``items`` (which come in order of ``log_ns``) by stamp: never decreasing, and within a topic always increasing."""
+    clocks: dict[str, TopicClock] = {}
+    jumps: list[int] = []
+    held: list[tuple[int, int, int, Item]] = []
+    held_weight = serial = now = 0
+    emitted: dict[str, int] = {}
+    newest = -(2**63)
+
+    def release(horizon: int, most: int) -> Iterator[Any]:
+        nonlocal held_weight, newest
+        while held and (held[0][0] <= horizon or held_weight > most):
+            stamp, _, _, item = heapq.heappop(held)
+            held_weight -= item.weight
+            if emitted.get(item.topic) == stamp:
+                tally.count(item.topic, Oddity.REPEATED)
+                continue
+            emitted[item.topic] = newest = stamp
+            yield item.payload
+
+    for item in items:
+        clock = clocks.get(item.topic)
+        if clock is None:
+            clock = clocks[item.topic] = TopicClock(item.topic, plan, jumps, tally)
+        now = max(now, item.log_ns)
+        for trusted in clock.put(item):
+            if trusted.stamp_ns < newest:
+                tally.count(item.topic, Oddity.LATE)
+                continue
+            heapq.heappush(held, (trusted.stamp_ns, trusted.rank, serial, trusted))
+            serial += 1
+            held_weight += trusted.weight
+        yield from release(min(c.horizon(now) for c in clocks.values()), _MOST_HELD)
+    for clock in clocks.values():
+        clock.close()
+    yield from release(2**63 - 1, 0)
+
+
+def _restamped(item: Item, stamp_ns: int) -> Item:
+    if stamp_ns == item.stamp_ns:
+        return item
+    return dataclasses.replace(item, stamp_ns=stamp_ns, payload=dataclasses.replace(item.payload, stamp_ns=stamp_ns))
+
+
+def _agree(one: Item, other: Item) -> bool:
+    step = other.stamp_ns - one.stamp_ns
+    return abs(step) <= _TRUSTED_STEP or abs(step - (other.log_ns - one.log_ns)) <= _TRUSTED_STEP

@@ -1,0 +1,108 @@
+"""Where the sensors sit: the log's fixed transforms, chained down from the body frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from localization.logs.decode import frame_name
+from motion_models.robot import Mount
+from motion_models.se2 import FloatArray
+
+_ROOTS = ("base_link", "base_footprint")
+_WORLDS = {"map", "odom", "world", "earth"}
+_SAME = 1e-6
+
+Edges = dict[tuple[str, str], FloatArray]
+
+
+class FixedTransforms:
+    """Collects transforms and keeps those that never change."""
+
+    def __init__(self) -> None:
+        self._edges: Edges = {}
+        self._fixed: set[tuple[str, str]] = set()
+        self._moving: set[tuple[str, str]] = set()
+
+    def add(self, message: Any, *, is_static: bool) -> None:
+        """Take in a TFMessage. On a static topic the last word counts, on /tf what changes is no mount."""
+        for transform in message.transforms:
+            edge = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
+            matrix = _matrix(transform.transform)
+            if matrix is None:
+                continue
+            before = self._edges.get(edge)
+            if is_static:
+                self._fixed.add(edge)
+            elif edge in self._fixed:
+                continue
+            elif before is not None and np.abs(before - matrix).max() > _SAME:
+                self._moving.add(edge)
+            self._edges[edge] = matrix
+
+    def mounts(self) -> dict[str, Mount]:
+        """Pose in the body frame of every frame that is fixed to it, by name."""
+        neighbours: dict[str, list[tuple[str, FloatArray]]] = {}
+        for (parent, child), parent_T_child in sorted(self._edges.items(), key=lambda e: e[0]):
+            if (parent, child) not in self._moving:
+                neighbours.setdefault(parent, []).append((child, parent_T_child))
+                upwards = neighbours.setdefault(child, [])
+                if (parent, child) in self._fixed:  # what only seems fixed may be a robot that stands still in the world
+                    upwards.append((parent, np.asarray(np.linalg.inv(parent_T_child), dtype=float)))
+        root = _root(neighbours)
+        if root is None:
+            return {}
+        poses = {root: np.eye(4)}
+        queue = [root]
+        while queue:
+            frame = queue.pop(0)
+            for other, frame_T_other in neighbours[frame]:
+                if other not in poses and other not in _WORLDS:
+                    poses[other] = poses[frame] @ frame_T_other
+                    queue.append(other)
+        return {frame: mount_of(pose) for frame, pose in poses.items()}
+
+
+def _root(frames: Iterable[str]) -> str | None:
+    """The body frame; of a robot with a name before its frames, its own."""
+    names = sorted(frames)
+    for wanted in _ROOTS:
+        if wanted in names:
+            return wanted
+    for wanted in _ROOTS:
+        prefixed = [name for name in names if name.endswith("/" + wanted)]
+        if len(prefixed) == 1:
+            return prefixed[0]
+    return None
+
+
+def _matrix(transform: Any) -> FloatArray | None:
+    """(4, 4) of a geometry_msgs/Transform; None if it is none."""
+    t, q = transform.translation, transform.rotation
+    values = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w], dtype=float)
+    norm = np.linalg.norm(values[3:])
+    if not np.isfinite(values).all() or norm < 0.5:
+        return None
+    x, y, z, w = values[3:] / norm
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, 3] = values[:3]
+    return matrix
+
+
+def mount_of(pose: FloatArray) -> Mount:
+    """The mount of a pose (4, 4). At a pitch of a right angle, where roll and yaw are one, the roll is zero."""
+    r = pose[:3, :3]
+    pitch = math.atan2(-r[2, 0], math.hypot(r[0, 0], r[1, 0]))
+    if math.hypot(r[0, 0], r[1, 0]) > 1e-9:
+        roll, yaw = math.atan2(r[2, 1], r[2, 2]), math.atan2(r[1, 0], r[0, 0])
+    else:
+        roll, yaw = 0.0, math.atan2(-r[0, 1], r[1, 1])
+    return Mount(float(pose[0, 3]), float(pose[1, 3]), float(pose[2, 3]), roll, pitch, yaw)

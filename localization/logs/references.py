@@ -1,0 +1,87 @@
+"""Reference poses from pose, odometry, transform and GPS topics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from localization.events import Reference
+from localization.logs.decode import UnusableError, yaw_of
+from localization.logs.tally import Oddity
+from motion_models.se2 import FloatArray
+
+_SEMI_MAJOR_M = 6_378_137.0
+_FLATTENING = 1.0 / 298.257223563
+_ECCENTRICITY2 = _FLATTENING * (2.0 - _FLATTENING)
+_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+
+
+def reference_decoder(kind: str) -> Callable[[Any, int], Reference]:
+    """Decoder of messages of type ``kind`` (one of `topics.REFERENCE_TYPES`); that of NavSatFix remembers the first fix."""
+    if kind == "sensor_msgs/msg/NavSatFix":
+        return _fix_decoder()
+    return {
+        "nav_msgs/msg/Odometry": lambda m, stamp: _reference(stamp, m.pose.pose.position, m.pose.pose.orientation, m.pose.covariance),
+        "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m, stamp: _reference(
+            stamp, m.pose.pose.position, m.pose.pose.orientation, m.pose.covariance
+        ),
+        "geometry_msgs/msg/PoseStamped": lambda m, stamp: _reference(stamp, m.pose.position, m.pose.orientation, None),
+        "geometry_msgs/msg/TransformStamped": lambda m, stamp: _reference(stamp, m.transform.translation, m.transform.rotation, None),
+    }[kind]
+
+
+def _reference(stamp: int, position: Any, orientation: Any, covariance: Any) -> Reference:
+    where = np.array([position.x, position.y], dtype=float)
+    yaw = yaw_of(orientation)
+    if not (np.isfinite(where).all() and math.isfinite(yaw)):
+        raise UnusableError(Oddity.NOT_FINITE)
+    cov = np.full((3, 3), np.nan)
+    if covariance is not None:
+        planar = np.asarray(covariance, dtype=float).reshape(6, 6)[_PLANAR]
+        # All zeros is how drivers say that they do not know.
+        if np.isfinite(planar).all() and (np.diag(planar) >= 0).all() and planar.any():
+            cov = planar
+    return Reference(stamp, where, yaw, cov)
+
+
+def _fix_decoder() -> Callable[[Any, int], Reference]:
+    origin: tuple[FloatArray, FloatArray] | None = None
+
+    def decode(message: Any, stamp: int) -> Reference:
+        nonlocal origin
+        degrees = np.array([message.latitude, message.longitude], dtype=float)
+        if int(message.status.status) < 0 or not np.isfinite(degrees).all() or abs(degrees[0]) > 90.0:
+            raise UnusableError(Oddity.NO_FIX)
+        height = float(message.altitude) if math.isfinite(message.altitude) else 0.0
+        latitude, longitude = np.radians(degrees)
+        here = geodetic_to_ecef(latitude, longitude, height)
+        if origin is None:
+            origin = here, east_north(latitude, longitude)
+        cov = np.full((3, 3), np.nan)
+        if int(message.position_covariance_type) > 0:
+            cov[:2, :2] = np.asarray(message.position_covariance, dtype=float).reshape(3, 3)[:2, :2]
+        return Reference(stamp, origin[1] @ (here - origin[0]), None, cov)
+
+    return decode
+
+
+def geodetic_to_ecef(latitude: float, longitude: float, height: float) -> FloatArray:
+    """(3,) earth-centred position [m] of a point on or above the WGS84 ellipsoid [rad, rad, m]."""
+    normal = _SEMI_MAJOR_M / math.sqrt(1.0 - _ECCENTRICITY2 * math.sin(latitude) ** 2)
+    ring = (normal + height) * math.cos(latitude)
+    return np.array(
+        [
+            ring * math.cos(longitude),
+            ring * math.sin(longitude),
+            (normal * (1.0 - _ECCENTRICITY2) + height) * math.sin(latitude),
+        ]
+    )
+
+
+def east_north(latitude: float, longitude: float) -> FloatArray:
+    """(2, 3) unit vectors to the east and to the north, in the earth-centred frame."""
+    sin_lat, cos_lat, sin_lon, cos_lon = math.sin(latitude), math.cos(latitude), math.sin(longitude), math.cos(longitude)
+    return np.array([[-sin_lon, cos_lon, 0.0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]])

@@ -1,0 +1,263 @@
+"""ROS 1 bags, chunk by chunk.
+
+rosbags keeps 160 bytes of index for every message and refuses bags whose index is missing, as that of any recording that was cut
+off is. This reader keeps one entry per chunk instead, takes it from the bag's own index where that is whole, and makes it anew
+from the records where it is not. Format: http://wiki.ros.org/Bags/Format/2.0.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+from rosbags.typesys.msg import normalize_msgtype
+
+from localization.errors import LogError
+from localization.logs.chunks import Channel, Chunk, DamagedError, RawMessage, decompress, decompress_head, in_log_order
+
+MAGIC = b"#ROSBAG V"
+
+_MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
+_LONGEST_HEADER = 1 << 24
+
+Fields = dict[bytes, bytes]
+
+
+class _Connection(NamedTuple):
+    topic: str
+    type: str
+    definition: str
+
+
+class Ros1Bag:
+    """A ROS 1 bag of format 2.0, whole or cut off. Raises `LogError` if nothing in it can be read."""
+
+    is_ros1 = True
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._connections: dict[int, _Connection] = {}
+        self._chunks: list[Chunk] = []
+        self.notes: list[str] = []
+        self._reported: set[int] = set()
+        with path.open("rb") as file:
+            version = file.readline(32).removeprefix(MAGIC).strip()
+            if version != b"2.0":
+                raise LogError(f"'{path}' is a ROS bag of version {version.decode(errors='replace')}; only 2.0 can be read.")
+            first = file.tell()
+            try:
+                self._read_index(file)
+            except DamagedError as reason:
+                self._rebuild_index(file, first, str(reason))
+        totals: Counter[int] = Counter()
+        for chunk in self._chunks:
+            totals.update(chunk.counts)
+        self.channels = [
+            Channel(c.topic, c.type, MessageDefinition(MessageDefinitionFormat.MSG, c.definition), totals[key])
+            for key, c in sorted(self._connections.items())
+        ]
+        filled = [c for c in self._chunks if c.counts]
+        self.start_ns = min((c.start_ns for c in filled), default=0)
+        self.end_ns = max((c.end_ns for c in filled), default=0)
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        wanted = {key: c for key, c in self._connections.items() if c.topic in topics}
+        with self._path.open("rb") as file:
+
+            def load(chunk: Chunk) -> list[RawMessage]:
+                try:
+                    return list(_messages(self._chunk_bytes(file, chunk), wanted))
+                except DamagedError as reason:
+                    if chunk.position not in self._reported:
+                        self._reported.add(chunk.position)
+                        lost = sum(chunk.counts.values())
+                        self.notes.append(f"A chunk of {lost} messages at byte {chunk.position} was left out: {reason}.")
+                    return []
+
+            yield from in_log_order((c for c in self._chunks if not wanted.keys().isdisjoint(c.counts)), load)
+
+    def _chunk_bytes(self, file: BinaryIO, chunk: Chunk) -> bytes:
+        file.seek(chunk.position)
+        header, size = _record_start(file)
+        if header.get(b"op") != bytes([_CHUNK]):
+            raise DamagedError("there is no chunk where the index says")
+        data = file.read(size)
+        compression = header.get(b"compression", b"none").decode(errors="replace")
+        # The last chunk of a bag that was cut off is the only one that may be short, and its messages are known to be readable.
+        return decompress_head(data, compression)[0] if len(data) < size else decompress(data, compression)
+
+    def _read_index(self, file: BinaryIO) -> None:
+        """Connections and chunks as the end of the bag lists them. Raises `DamagedError`."""
+        header, size = _record_start(file)
+        if header.get(b"op") != bytes([_BAG]):
+            raise DamagedError("its first record is not a bag header")
+        if header.get(b"encryptor"):
+            raise LogError(f"'{self._path}' is encrypted ({header[b'encryptor'].decode(errors='replace')}); decrypt it first.")
+        position = _u64(header, b"index_pos")
+        if position == 0:
+            raise DamagedError("it was never closed, and so has no index")
+        file.seek(0, 2)
+        if position > file.tell():
+            raise DamagedError("it ends before its index")
+        file.seek(position)
+        connections: dict[int, _Connection] = {}
+        chunks: list[Chunk] = []
+        for _ in range(_u32(header, b"conn_count")):
+            record, size = _record_start(file)
+            key, connection = _connection(record, _exactly(file, size))
+            connections[key] = connection
+        for _ in range(_u32(header, b"chunk_count")):
+            record, size = _record_start(file)
+            if record.get(b"op") != bytes([_CHUNK_INFO]):
+                raise DamagedError("its index breaks off")
+            pairs = struct.iter_unpack("<II", _exactly(file, size // 8 * 8))
+            start, end = _time(record, b"start_time"), _time(record, b"end_time")
+            chunks.append(Chunk(_u64(record, b"chunk_pos"), start, end, {k: n for k, n in pairs if n}))
+        self._connections, self._chunks = connections, chunks
+
+    def _rebuild_index(self, file: BinaryIO, first: int, reason: str) -> None:
+        """Walk through the records as far as they go, and note what that gave."""
+        file.seek(0, 2)
+        end = file.tell()
+        file.seek(first)
+        whole = first
+        loose = 0
+        try:
+            while file.tell() < end:
+                position = file.tell()
+                header, size = _record_start(file)
+                body = file.tell()
+                data = file.read(size) if header.get(b"op") in (bytes([_CHUNK]), bytes([_CONNECTION])) else b""
+                if header.get(b"op") == bytes([_CHUNK]):
+                    self._add_chunk(position, header, data)
+                elif header.get(b"op") == bytes([_CONNECTION]) and len(data) == size:
+                    key, connection = _connection(header, data)
+                    self._connections[key] = connection
+                elif header.get(b"op") == bytes([_MESSAGE]):
+                    loose += 1
+                file.seek(body + size)
+                if file.tell() <= end:
+                    whole = file.tell()
+        except DamagedError as error:
+            reason = f"{reason}; {error}"
+        count = sum(sum(c.counts.values()) for c in self._chunks)
+        lost = end - whole
+        self.notes.append(
+            f"{self._path.name} is damaged: {reason}. Its {count} readable messages are used; of its last {lost} bytes only what is"
+            " whole could be read."
+            if lost
+            else f"{self._path.name} is damaged: {reason}. All of its {count} messages could be read."
+        )
+        if loose:
+            self.notes.append(f"{loose} messages of {self._path.name} lie outside of chunks and were left out.")
+
+    def _add_chunk(self, position: int, header: Fields, data: bytes) -> None:
+        try:
+            plain, _ = decompress_head(data, header.get(b"compression", b"none").decode(errors="replace"))
+        except DamagedError as reason:
+            self.notes.append(f"A chunk at byte {position} of {self._path.name} was left out: {reason}.")
+            return
+        counts: Counter[int] = Counter()
+        start, end = 2**63 - 1, 0
+        for op, record, body in _records(plain):
+            if op == _CONNECTION:
+                key, connection = _connection(record, body)
+                self._connections.setdefault(key, connection)
+            elif op == _MESSAGE:
+                stamp = _time(record, b"time")
+                start, end = min(start, stamp), max(end, stamp)
+                counts[_u32(record, b"conn")] += 1
+        if counts:
+            self._chunks.append(Chunk(position, start, end, dict(counts)))
+
+
+def _messages(plain: bytes, wanted: dict[int, _Connection]) -> Iterator[RawMessage]:
+    for op, record, body in _records(plain):
+        if op == _MESSAGE:
+            connection = wanted.get(_u32(record, b"conn"))
+            if connection is not None:
+                yield RawMessage(_time(record, b"time"), connection.topic, connection.type, body)
+
+
+def _records(plain: bytes) -> Iterator[tuple[int, Fields, bytes]]:
+    """The whole records of a chunk's bytes; a last one that breaks off is left out."""
+    position, end = 0, len(plain)
+    while position + 8 <= end:
+        header_size = int.from_bytes(plain[position : position + 4], "little")
+        body = position + 8 + header_size
+        if body > end:
+            return
+        size = int.from_bytes(plain[body - 4 : body], "little")
+        if body + size > end:
+            return
+        fields = _fields(plain[position + 4 : body - 4])
+        op = fields.get(b"op", b"")
+        if len(op) != 1:
+            raise DamagedError("a record has no kind")
+        yield op[0], fields, plain[body : body + size]
+        position = body + size
+
+
+def _record_start(file: BinaryIO) -> tuple[Fields, int]:
+    """A record's header and the size of its body, with the file standing at the body."""
+    size = int.from_bytes(_exactly(file, 4), "little")
+    if size > _LONGEST_HEADER:
+        raise DamagedError(f"byte {file.tell() - 4} is not the start of a record")
+    header = _fields(_exactly(file, size))
+    return header, int.from_bytes(_exactly(file, 4), "little")
+
+
+def _fields(header: bytes) -> Fields:
+    fields: Fields = {}
+    position = 0
+    while position + 4 <= len(header):
+        size = int.from_bytes(header[position : position + 4], "little")
+        name, equals, value = header[position + 4 : position + 4 + size].partition(b"=")
+        if not equals or position + 4 + size > len(header):
+            raise DamagedError("a record's header is not one")
+        fields[name] = value
+        position += 4 + size
+    return fields
+
+
+def _connection(header: Fields, body: bytes) -> tuple[int, _Connection]:
+    if header.get(b"op") != bytes([_CONNECTION]) or b"topic" not in header:
+        raise DamagedError("a connection record is not one")
+    fields = _fields(body)
+    if not {b"type", b"message_definition"} <= fields.keys():
+        raise DamagedError("a connection record lacks its type")
+    topic = "/".join(part for part in header[b"topic"].decode(errors="replace").split("/") if part)
+    kind = fields[b"type"].decode(errors="replace")
+    return _u32(header, b"conn"), _Connection(f"/{topic}", normalize_msgtype(kind), fields[b"message_definition"].decode(errors="replace"))
+
+
+def _exactly(file: BinaryIO, size: int) -> bytes:
+    data = file.read(size)
+    if len(data) != size:
+        raise DamagedError("it breaks off in the middle of a record")
+    return data
+
+
+def _u32(fields: Fields, name: bytes) -> int:
+    value = fields.get(name, b"")
+    if len(value) != 4:
+        raise DamagedError(f"a record's '{name.decode()}' is missing")
+    return int.from_bytes(value, "little")
+
+
+def _u64(fields: Fields, name: bytes) -> int:
+    value = fields.get(name, b"")
+    if len(value) != 8:
+        raise DamagedError(f"a record's '{name.decode()}' is missing")
+    return int.from_bytes(value, "little")
+
+
+def _time(fields: Fields, name: bytes) -> int:
+    value = fields.get(name, b"")
+    if len(value) != 8:
+        raise DamagedError(f"a record's '{name.decode()}' is missing")
+    return int.from_bytes(value[:4], "little") * 1_000_000_000 + int.from_bytes(value[4:], "little")
