@@ -14,10 +14,6 @@ class ModelError(SkidlocError):
 
 
 class CalibrationError(SkidlocError):
-    """Data that cannot be fitted: malformed, too little motion, or parameters that this drive does not reveal."""
-
-
-class CalibrationError(SkidlocError):
     """Data that cannot tell what is asked of them: malformed tables, too few rows, too little motion."""
 
 
