@@ -34,17 +34,17 @@ def flatten(urdf: Urdf, base_link: str = "base_link", joints: tuple[str, ...] | 
     if unknown:
         raise RobotError(f"{urdf.source}: no joint {', '.join(unknown)} to tell positions of; there are {', '.join(told) or 'none'}.")
 
-    idle = _idle_joints(urdf)
+    idle, carried = _idle_joints(urdf)
+    heavy = {masters[joint.name] for joint in moving if carried[joint.name] > 0.0}
     needed = {masters[joint.name] for joint in moving if joint.name not in idle}
     names = tuple(name for name in told if name in needed and (joints is None or name in joints))
     below = _moving_links(urdf)
     massless = tuple(name for name in urdf.links if name in below and urdf.links[name].mass == 0.0)
-    useless = sorted(set(joints or ()) - set(names))
+    useless = sorted(name for name in joints or () if name not in heavy)
     if useless or (not names and massless):
-        culprits = f"joint {', '.join(useless)}" if useless else "any of its joints"
+        culprits = f"joint {', '.join(useless)} carries" if useless else "none of its joints moves"
         raise RobotError(
-            f"{urdf.source}: {culprits} cannot move the centre of mass; moving links without an <inertial> with a mass: "
-            f"{', '.join(massless) or 'none'}."
+            f"{urdf.source}: {culprits} no mass; moving links without an <inertial> with a mass: {', '.join(massless) or 'none'}."
         )
     active = {name: names.index(master) for name, master in masters.items() if master in names}
     return _chain(urdf, base_link, names, active, massless)
@@ -132,13 +132,15 @@ def _moving_links(urdf: Urdf) -> set[str]:
     return moving
 
 
-def _idle_joints(urdf: Urdf) -> set[str]:
-    """Joints that move no mass, or that turn one about its own centre, as a wheel's joint does."""
+def _idle_joints(urdf: Urdf) -> tuple[set[str], dict[str, float]]:
+    """Joints that move no mass, or that turn one about its own centre, as a wheel's joint does; and the mass behind every joint [kg]."""
     idle: set[str] = set()
+    carried: dict[str, float] = {}
     restless: set[str] = set()  # links with a joint below them that is not idle
     moments = {name: (link.mass, link.mass * link.com) for name, link in urdf.links.items()}
     for joint in reversed(urdf.joints):
         mass, moment = moments[joint.child]
+        carried[joint.name] = mass
         lever = mass if joint.kind == "prismatic" else float(np.linalg.norm(np.cross(joint.axis, moment)))
         if joint.child in restless or (joint.moves and lever > _NO_LEVER):
             restless.add(joint.parent)
@@ -147,7 +149,7 @@ def _idle_joints(urdf: Urdf) -> set[str]:
         rotation, translation = _pose(joint, _rest(urdf, joint))
         parent_mass, parent_moment = moments[joint.parent]
         moments[joint.parent] = (parent_mass + mass, parent_moment + rotation @ moment + mass * translation)
-    return idle
+    return idle, carried
 
 
 def _turn_to_z(axis: FloatArray) -> FloatArray:

@@ -1,0 +1,83 @@
+"""From files to centres of gravity: a robot file's arms, tables of weighings, URDFs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from motion_models.center_of_gravity import CgModel, cg_model
+from motion_models.cg_parts import TYPICAL, Arms, CgEstimate, Payload, StaticPart, Tolerances, require_support
+from motion_models.errors import CgError, RobotError
+from motion_models.postures import Posture, parse_postures
+from motion_models.urdf import Urdf, load_urdf, parse_urdf
+from motion_models.weighing import Scales, WeighedCg, cg_from_scales, read_weighings, wheel_contacts
+
+
+def arms_model(arms: Arms, folder: Path | None = None, payload: Payload | None = None) -> CgModel:
+    """The model that a robot file's ``arms`` describe. ``folder`` is where that file is; None for a robot that is shipped.
+
+    Raises `RobotError` for files that are missing or malformed, `CgError` for masses that cannot be.
+    """
+    urdf = _urdf(arms, folder)
+    static = None
+    if arms.static_mass_kg > 0.0:
+        sigmas = np.array([arms.static_mass_sigma_kg, arms.static_sigma_m, arms.static_sigma_m])
+        weighed_at = _named(arms_postures(arms, folder), arms.weighed_posture) if arms.weighed_posture else None
+        static = StaticPart(arms.static_mass_kg, np.array([arms.static_x_m, arms.static_y_m]), np.diag(sigmas**2), weighed_at)
+    tolerances = Tolerances(arms.mass_sigma_fraction, arms.com_sigma_m, arms.joint_sigma)
+    return cg_model(urdf, arms.base_link, arms.joints or None, static, payload, tolerances)
+
+
+def arms_postures(arms: Arms, folder: Path | None = None) -> Mapping[str, Posture]:
+    """Named postures of a robot file's ``arms``; empty where it has no SRDF. Raises `RobotError`."""
+    return parse_postures(_text(arms.postures, folder), arms.postures) if arms.postures else {}
+
+
+def weighed_cg(table: str | Path, wheelbase: float, track_width: float, scales: Scales | None = None) -> WeighedCg:
+    """Centre of gravity from a CSV file of weighings (see `read_weighings`) and the wheels' distances [m]. Raises `CgError`."""
+    return cg_from_scales(read_weighings(table), wheel_contacts(wheelbase, track_width), scales or Scales())
+
+
+def urdf_cg(
+    urdf: str | Path | Urdf,
+    joints: Mapping[str, float],
+    base_link: str = "base_link",
+    static: StaticPart | None = None,
+    payload: Payload | None = None,
+    tolerances: Tolerances = TYPICAL,
+    support: tuple[float, float] | None = None,
+) -> CgEstimate:
+    """Centre of gravity of a URDF (or its path) at ``joints`` positions by name [rad or m]; every joint that moves mass must be named.
+
+    With ``support``, wheelbase and track width [m], a centre of gravity that does not lie between the wheels is an error. Raises
+    `RobotError` and `CgError`.
+    """
+    model = cg_model(urdf if isinstance(urdf, Urdf) else load_urdf(urdf), base_link, None, static, payload, tolerances)
+    estimate = model.estimate(model.chain.posture(joints))
+    if support is not None:
+        require_support(estimate.position, *support)
+    return estimate
+
+
+def _urdf(arms: Arms, folder: Path | None) -> Urdf:
+    return load_urdf(folder / arms.urdf) if folder is not None else parse_urdf(_text(arms.urdf, None), arms.urdf)
+
+
+def _text(name: str, folder: Path | None) -> str:
+    try:
+        if folder is not None:
+            return (folder / name).read_text(encoding="utf-8")
+        return (resources.files(__package__) / "robots" / name).read_text(encoding="utf-8")
+    except OSError as error:
+        raise RobotError(f"'{name}', which the robot file names, cannot be read: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise RobotError(f"'{name}', which the robot file names, is not text (byte {error.start} is not UTF-8).") from error
+
+
+def _named(postures: Mapping[str, Posture], name: str) -> Posture:
+    if name not in postures:
+        raise CgError(f"no posture '{name}'; postures are {', '.join(postures) or 'none'}.")
+    return postures[name]
