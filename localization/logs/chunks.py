@@ -11,6 +11,7 @@ import heapq
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import lz4.frame  # type: ignore[import-untyped]
@@ -78,6 +79,8 @@ class Chunk:
     end_ns: int
     counts: dict[int, int]
     """Messages of each channel id in it."""
+    size: int = 0
+    """Bytes of it in the file, where the file itself does not say."""
 
 
 class DamagedError(Exception):
@@ -123,3 +126,27 @@ def decompress_head(data: bytes, compression: str) -> tuple[bytes, bool]:
     except (OSError, EOFError, RuntimeError, ValueError, zstd.ZstdError) as error:
         raise DamagedError(f"a chunk does not decompress: {error}") from error
     return plain, bool(decoder.eof)
+
+
+def inflate_message(data: bytes) -> bytes:
+    """A ROS 2 message, decompressed where the recorder compressed it by itself (that is told in metadata.yaml, which may be lost)."""
+    if data[:4] != b"\x28\xb5\x2f\xfd":
+        return data
+    try:
+        return zstd.decompress(data)
+    except zstd.ZstdError:
+        return data  # which the decoder will refuse, and count
+
+
+def inflate_file(path: Path, target: Path) -> str:
+    """Decompress a zstd file into ``target`` as far as it goes; the reason why it went no further, or nothing."""
+    with path.open("rb") as packed, target.open("wb") as plain:
+        decoder = zstd.ZstdDecompressor()
+        try:
+            while block := packed.read(1 << 20):
+                if decoder.eof:  # a file may hold several frames
+                    block, decoder = decoder.unused_data + block, zstd.ZstdDecompressor()
+                plain.write(decoder.decompress(block))
+        except zstd.ZstdError as error:
+            return str(error)
+    return "" if decoder.eof else "it was cut off"

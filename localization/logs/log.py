@@ -10,6 +10,7 @@ from typing import Any
 from localization.errors import LogError, TopicError
 from localization.events import Event, Reference
 from localization.logs.chunks import Source
+from localization.logs.clouds import decode_cloud
 from localization.logs.decode import (
     Decoder,
     JointReading,
@@ -23,6 +24,7 @@ from localization.logs.decode import (
     scan_decoder,
     stamp_ns,
 )
+from localization.logs.inspect import LogInfo, inspect_log
 from localization.logs.merge import ClockPlan, Item, merge, plan_clocks
 from localization.logs.mounts import FixedTransforms
 from localization.logs.references import reference_decoder
@@ -58,7 +60,8 @@ class Log:
 
     def __init__(self, path: Path, source: Source, robot: Robot, topics: TopicOverrides) -> None:
         self.path, self.robot = path, robot
-        self._source = source
+        self.source = source
+        """The file itself: its channels and raw messages."""
         count = sum(channel.count for channel in source.channels)
         if count < 2:
             found = "no message" if count == 0 else "only one message"
@@ -67,26 +70,39 @@ class Log:
         """Time of recording of the first and the last message."""
         self._types = {channel.topic: channel.type for channel in source.channels}
         self._joints: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
-        self._wheels_error: TopicError | None = None
+        self.wheels_error: TopicError | None = None
+        """Why `events` will refuse, if it will."""
         self._choice_notes: list[str] = []
         self._tallies: dict[str, Tally] = {}
         self._chooser = TopicChooser(path.name, source.channels, robot, topics)
         self._overrides = topics
         self.sources = Sources(self._choose_wheels(), self._choose_lidar(), self._choose("imu"), self._choose("center_of_gravity"))
-        self._frames: dict[str, str] = {}
+        """Which topic plays which part."""
+        self.frames: dict[str, str] = {}
+        """Frame of the first message of each topic that is used."""
         self._clocks = self._watch_clocks()
 
     @property
     def duration_s(self) -> float:
         return (self.end_ns - self.start_ns) * 1e-9
 
+    @property
+    def reference_topic(self) -> str | None:
+        """The option's or the robot file's reference, if the log has it and if it can be one."""
+        topic = self._overrides.reference if self._overrides.reference is not None else self.robot.topics.reference
+        return topic if self._types.get(topic) in REFERENCE_TYPES else None
+
+    def info(self) -> LogInfo:
+        """What is in the log, what will be used of it, and what is missing or suspect. Reads it once."""
+        return inspect_log(self)
+
     def events(self) -> Iterator[Event]:
         """Wheel, CG, IMU samples and scans by header stamp, never decreasing; within a topic always increasing.
 
         Raises `TopicError` if the joint states, the only source of wheels, lack the robot's wheel joints.
         """
-        if self._wheels_error is not None:
-            raise self._wheels_error
+        if self.wheels_error is not None:
+            raise self.wheels_error
         tally = self._tallies["events"] = Tally()
         return self._events(tally)
 
@@ -105,26 +121,26 @@ class Log:
     def mounts(self) -> Mapping[str, Mount]:
         """Pose of each sensor's frame in the body frame: the log's, and the robot file's for frames which the log lacks."""
         transforms = FixedTransforms()
-        tf = [channel for channel in self._source.channels if channel.type in _TF_TYPES]
+        tf = [channel for channel in self.source.channels if channel.type in _TF_TYPES]
         static = [channel for channel in tf if channel.topic.endswith("tf_static")]
-        decode = Decoder(tf, is_ros1=self._source.is_ros1)
+        decode = Decoder(tf, is_ros1=self.source.is_ros1)
         left = sum(channel.count for channel in static)
-        for raw in self._source.messages([channel.topic for channel in static]) if left else ():
+        for raw in self.source.messages([channel.topic for channel in static]) if left else ():
             left -= 1
             _try(lambda raw=raw: transforms.add(decode(raw), is_static=True))  # type: ignore[misc]
             if left == 0:
                 break
-        if self._source.is_ros1:
+        if self.source.is_ros1:
             moving = [channel.topic for channel in tf if not channel.topic.endswith("tf_static")]
-            for raw in self._source.messages(moving) if moving else ():
+            for raw in self.source.messages(moving) if moving else ():
                 if raw.log_ns > self.start_ns + _TF_WATCHED_NS:
                     break
                 _try(lambda raw=raw: transforms.add(decode(raw), is_static=False))  # type: ignore[misc]
-        return {**self.robot.mounts, **transforms.mounts()}
+        return {"base_link": Mount(), **self.robot.mounts, **transforms.mounts()}
 
     def notes(self) -> list[str]:
         """Sentences about everything that was lost, mended or chosen without being told, so far."""
-        said = [*self._source.notes, *self._chooser.notes, *self._choice_notes]
+        said = [*self.source.notes, *self._chooser.notes, *self._choice_notes]
         for tally in self._tallies.values():
             said += tally.sentences()
         return list(dict.fromkeys(said))
@@ -151,11 +167,17 @@ class Log:
             return joint_decoder((*self._joints[0], *self._joints[1]))
         if source.kind == "scan":
             return scan_decoder()
-        return {"odometry": decode_odometry, "imu": decode_imu, "center_of_gravity": decode_cg}[source.kind]
+        decoders: dict[str, Payload] = {
+            "odometry": decode_odometry,
+            "imu": decode_imu,
+            "center_of_gravity": decode_cg,
+            "points": decode_cloud,
+        }
+        return decoders[source.kind]
 
     def _items(self, parts: Mapping[str, tuple[int, Payload]], tally: Tally) -> Iterator[Item]:
-        decode = Decoder([c for c in self._source.channels if c.topic in parts], is_ros1=self._source.is_ros1)
-        for raw in self._source.messages(parts.keys()):
+        decode = Decoder([c for c in self.source.channels if c.topic in parts], is_ros1=self.source.is_ros1)
+        for raw in self.source.messages(parts.keys()):
             rank, payload_of = parts[raw.topic]
             try:
                 message = decode(raw)
@@ -169,8 +191,8 @@ class Log:
 
     def _first_messages(self, topic: str, most: int) -> Iterator[tuple[int, Any]]:
         """The first decodable messages of a topic, with their time of recording."""
-        decode = Decoder([c for c in self._source.channels if c.topic == topic], is_ros1=self._source.is_ros1)
-        for number, raw in enumerate(self._source.messages([topic])):
+        decode = Decoder([c for c in self.source.channels if c.topic == topic], is_ros1=self.source.is_ros1)
+        for number, raw in enumerate(self.source.messages([topic])):
             if number >= most:
                 return
             try:
@@ -185,7 +207,7 @@ class Log:
         first: dict[str, tuple[int, int]] = {}
         for topic in topics:
             for log_ns, message in self._first_messages(topic, 10):
-                self._frames.setdefault(topic, frame_name(message.header.frame_id))
+                self.frames.setdefault(topic, frame_name(message.header.frame_id))
                 if stamp_ns(message):
                     first[topic] = log_ns, stamp_ns(message)
                     break
@@ -239,7 +261,7 @@ class Log:
             if odometry is not None:
                 self._choice_notes.append(f"{lacking}; the wheels are taken from {odometry.topic}.")
             else:
-                self._wheels_error = TopicError(
+                self.wheels_error = TopicError(
                     f"{lacking}. Name them in the robot file's [joints], or go without wheels by an empty --topic.joint-states."
                 )
         return odometry

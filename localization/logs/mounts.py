@@ -105,4 +105,5 @@ def mount_of(pose: FloatArray) -> Mount:
         roll, yaw = math.atan2(r[2, 1], r[2, 2]), math.atan2(r[1, 0], r[0, 0])
     else:
         roll, yaw = 0.0, math.atan2(-r[0, 1], r[1, 1])
-    return Mount(float(pose[0, 3]), float(pose[1, 3]), float(pose[2, 3]), roll, pitch, yaw)
+    # Adding zero turns -0.0 into 0.0.
+    return Mount(*(float(value) + 0.0 for value in (*pose[:3, 3], roll, pitch, yaw)))

@@ -7,23 +7,23 @@ from enum import Enum
 
 
 class Oddity(Enum):
-    """What can be odd about a message; the value completes the sentence "N messages of TOPIC ..."."""
+    """What can be odd about messages; the value completes the sentence "TOPIC: N messages ..."."""
 
-    UNDECODABLE = "could not be decoded and were dropped"
-    NOT_FINITE = "were not finite (NaN or inf) and were dropped"
-    MALFORMED = "were malformed and were dropped"
-    NO_STAMP = "have no header stamp; the time of their recording was used"
-    OUT_OF_ORDER = "came out of order and were sorted"
-    REPEATED = "repeat the stamp of the one before and were dropped"
-    LATE = "came too late to be sorted in and were dropped"
-    OUTLIER = "have a stamp that fits neither their neighbours nor the time of recording, and were dropped"
-    REBASED = "were stamped after a jump of their clock and were moved back by it"
-    FOREIGN_CLOCK = "are stamped by another clock than the rest and were moved onto the time of recording"
-    POSE_JUMP = "report a pose that the wheels cannot have reached; the increment was taken from their rates"
-    NO_POSE = "report no pose change while they report motion; the increment was taken from their rates"
-    WHEEL_JUMP = "report a wheel angle that jumped (reset or wrapped); the increment was taken from their rates"
-    NO_TWIST = "leave their rates at zero while their pose moves; the rates were taken from the pose"
-    NO_FIX = "have no GPS fix and were left out"
+    UNDECODABLE = "dropped, for their bytes are not those of their type"
+    MALFORMED = "dropped, for their fields contradict each other"
+    NOT_FINITE = "dropped, for they hold NaN or inf"
+    NO_FIX = "left out, for they have no GPS fix"
+    NO_STAMP = "without a header stamp, placed by the time of their recording"
+    FOREIGN_CLOCK = "stamped by another clock than the other topics', moved to the time of their recording"
+    OUT_OF_ORDER = "recorded out of order, and sorted"
+    REPEATED = "dropped, for they repeat a stamp of their topic"
+    LATE = "dropped, for they were recorded more than a second after newer ones"
+    OUTLIER = "dropped, for their stamps fit neither their neighbours' nor the time of their recording"
+    REBASED = "stamped after a jump of their clock, moved back by it"
+    POSE_JUMP = "with a pose that wheels cannot reach (a reset), whose increment was taken from their rates"
+    NO_POSE = "whose pose never moves while their rates do, so that increments were taken from these"
+    NO_TWIST = "with a moving pose and no rates, which were taken from the pose"
+    WHEEL_JUMP = "with a wheel angle that wheels cannot reach (a reset or a wrap), whose increment was taken from their rates"
 
 
 class Tally:
@@ -40,4 +40,4 @@ class Tally:
 
     def sentences(self) -> list[str]:
         ordered = sorted(self._counts.items(), key=lambda entry: (entry[0][0], list(Oddity).index(entry[0][1])))
-        return [f"{n} message{'s' if n > 1 else ''} of {topic} {oddity.value}." for (topic, oddity), n in ordered if n]
+        return [f"{topic}: {n} message{'s' if n > 1 else ''} {oddity.value}." for (topic, oddity), n in ordered if n]
