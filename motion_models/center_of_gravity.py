@@ -62,10 +62,14 @@ class CgModel:
     payload: Payload | None
     arms: FloatArray
     """(b, 18) `Chain.constants` without the payload."""
-    load: FloatArray
-    """(7,) payload: body, place (3) in the body's frame [m], mass [kg], sigma of mass [kg], of place [m]; zeros where there is none."""
+    numbers: FloatArray
+    """(19,) payload: body, place (3) in the body's frame [m], mass [kg], sigma of mass [kg] and of place [m], zeros where there is none;
+    then the three `Tolerances`, then the static part's covariance (9)."""
     weighed_poses: FloatArray
     """(b, 3, 4) rotations and translations of the bodies at the weighing, or (0, 3, 4)."""
+
+    mass: float
+    """Of the whole robot with its payload [kg]."""
 
     def cg(self, positions: FloatArray) -> FloatArray:
         """(..., 2) centre of gravity in the base's frame [m]."""
@@ -77,11 +81,10 @@ class CgModel:
 
     def estimate(self, positions: FloatArray) -> CgEstimate:
         """Centre of gravity at ``positions`` (n,) with its covariance."""
-        cg, cov = np.zeros(2), np.zeros((2, 2))
-        chain, q = self.chain, np.ascontiguousarray(positions, dtype=float)
-        tolerances = np.array([self.tolerances.mass_fraction, self.tolerances.com_m, self.tolerances.joint])
-        _estimate(chain.layout, chain.constants, self.arms, self.load, self.static.covariance, tolerances, self.weighed_poses, q, cg, cov)
-        return CgEstimate(cg, cov, self.chain.mass)
+        chain, found = self.chain, np.zeros((3, 2))
+        q = np.ascontiguousarray(positions, dtype=float)
+        _estimate(chain.layout, chain.constants, self.arms, self.numbers, self.weighed_poses, q, found)
+        return CgEstimate(found[0], found[1:], self.mass)
 
 
 def cg_model(
@@ -124,7 +127,9 @@ def cg_model(
     if payload is not None:
         body, point = chain.point(payload.link, np.array(payload.position))
         load = np.array([body, *point, payload.mass, *sigmas])
-    return CgModel(chain, static, tolerances, payload, _without(chain, load), load, _poses_at(chain, static.weighed_at))
+    numbers = np.array([*load, tolerances.mass_fraction, tolerances.com_m, tolerances.joint, *static.covariance.ravel()])
+    poses = _poses_at(chain, static.weighed_at)
+    return CgModel(chain, static, tolerances, payload, _without(chain, load), numbers, poses, chain.mass)
 
 
 def _without(chain: Chain, load: FloatArray) -> FloatArray:
@@ -152,19 +157,17 @@ def _estimate(
     layout: IntArray,
     constants: FloatArray,
     arms: FloatArray,
-    load: FloatArray,
-    static_cov: FloatArray,
-    tolerances: FloatArray,
+    numbers: FloatArray,
     weighed_poses: FloatArray,
     positions: FloatArray,
-    cg: FloatArray,
-    cov: FloatArray,
+    found: FloatArray,
 ) -> None:  # pragma: no cover
-    """`CgModel.estimate` at ``positions`` (n,), into ``cg`` (2,) and ``cov`` (2, 2), which starts at zero.
+    """`CgModel.estimate` at ``positions`` (n,), into ``found`` (3, 2), which starts at zero: the CG, and its covariance below it.
 
-    ``tolerances`` (3,) are those of `Tolerances`. First order: the CG is a quotient of sums, and each error moves it by (its moment -
-    the CG times its mass) / total mass.
+    First order: the CG is a quotient of sums, and each error moves it by (its moment - the CG times its mass) / total mass.
     """
+    cg, cov = found[0], found[1:]
+    load, tolerances, static_cov = numbers[:7], numbers[7:10], numbers[10:].reshape(3, 3)
     bodies, joints = layout.shape[0], positions.shape[0]
     rotations, translations = np.empty((bodies, 3, 3)), np.empty((bodies, 3))
     forward(layout, constants, positions, rotations, translations)

@@ -151,12 +151,12 @@ def test_an_evaluation_takes_less_than_10_microseconds(function):
     evaluate, q = getattr(chain, function), np.linspace(-1, 1, 10)
     evaluate(q)
     times = []
-    for _ in range(20):
-        start = time.perf_counter()
-        for _ in range(200):
+    for _ in range(50):
+        start = time.thread_time()
+        for _ in range(100):
             evaluate(q)
-        times.append((time.perf_counter() - start) / 200)
-    assert min(times) < 10e-6  # the least: other work on the machine is not its fault
+        times.append((time.thread_time() - start) / 100)
+    assert min(times) < 10e-6  # the least, of this thread's own time: other work on the machine is not its fault
 
 
 SIMPLE = """<robot name="r">
