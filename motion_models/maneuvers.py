@@ -87,7 +87,7 @@ def make_batch(maneuvers: Sequence[Maneuver]) -> Batch:
     if not maneuvers:
         raise CalibrationError("nothing to calibrate on: there is no maneuver.")
     for i, m in enumerate(maneuvers):
-        _check(m, f"maneuver {i}" + (f" (group '{m.group}')" if m.group else ""))
+        _check(m, i)
     lengths = np.array([len(m.dt) for m in maneuvers])
     first = np.concatenate([[0], np.cumsum(lengths)])
     lead = np.array([m.lead for m in maneuvers])
@@ -96,7 +96,7 @@ def make_batch(maneuvers: Sequence[Maneuver]) -> Batch:
     names = {m.group: i for i, m in reversed(list(enumerate(maneuvers)))}
     groups = tuple(sorted(names, key=lambda name: names[name]))
     index = {name: i for i, name in enumerate(groups)}
-    return Batch(
+    batch = Batch(
         dt=np.concatenate([m.dt for m in maneuvers]),
         wheels=np.ascontiguousarray(np.concatenate([m.wheels for m in maneuvers])),
         cg=np.ascontiguousarray(np.concatenate([np.broadcast_to(m.cg, m.wheels.shape) for m in maneuvers])),
@@ -109,9 +109,30 @@ def make_batch(maneuvers: Sequence[Maneuver]) -> Batch:
         group=np.array([index[m.group] for m in maneuvers])[owner],
         groups=groups,
     )
+    interval_owner = np.repeat(np.arange(len(maneuvers)), lengths)
+    for what, array, whose in (
+        ("dt", batch.dt, interval_owner),
+        ("wheels", batch.wheels, interval_owner),
+        ("cg", batch.cg, interval_owner),
+        ("measured", batch.measured, owner),
+        ("cov", batch.cov, owner),
+    ):
+        bad = ~np.isfinite(array).reshape(len(array), -1).all(axis=1)
+        if bad.any():
+            i = int(whose[np.argmax(bad)])
+            raise CalibrationError(f"{_called(maneuvers[i], i)}: {what} has values that are not finite; leave such samples out.")
+    if batch.dt.min() <= 0.0:
+        i = int(interval_owner[np.argmin(batch.dt)])
+        raise CalibrationError(f"{_called(maneuvers[i], i)}: an interval is {batch.dt.min():g} s long; all must be positive.")
+    return batch
 
 
-def _check(m: Maneuver, name: str) -> None:
+def _called(m: Maneuver, index: int) -> str:
+    return f"maneuver {index}" + (f" (group '{m.group}')" if m.group else "")
+
+
+def _check(m: Maneuver, index: int) -> None:
+    """Refuse shapes that do not fit together."""
     n, poses = len(m.dt), len(m.ends)
     shapes: list[tuple[str, NDArray[Any], list[tuple[int, ...]]]] = [
         ("dt", m.dt, [(n,)]),
@@ -123,13 +144,14 @@ def _check(m: Maneuver, name: str) -> None:
     for what, array, allowed in shapes:
         if array.shape not in allowed:
             wanted = " or ".join(str(shape) for shape in allowed)
-            raise CalibrationError(f"{name}: {what} has shape {array.shape}; with {n} intervals and {poses} poses it must be {wanted}.")
-        if not np.all(np.isfinite(array)):
-            raise CalibrationError(f"{name}: {what} has values that are not finite; leave such samples out.")
-    if np.any(m.dt <= 0.0):
-        raise CalibrationError(f"{name}: an interval is {m.dt.min():g} s long; all must be positive.")
-    if poses == 0 or not 0 <= m.lead < n or np.any(np.diff(m.ends) <= 0) or m.ends[0] < 1 or m.ends[-1] > n - m.lead:
-        raise CalibrationError(f"{name}: 'ends' must increase from at least 1 to at most the {n - m.lead} intervals after the start.")
+            raise CalibrationError(
+                f"{_called(m, index)}: {what} has shape {array.shape}; with {n} intervals and {poses} poses it must be {wanted}."
+            )
+    ends = m.ends.tolist()
+    if not ends or not 0 <= m.lead < n or ends != sorted(set(ends)) or ends[0] < 1 or ends[-1] > n - m.lead:
+        raise CalibrationError(
+            f"{_called(m, index)}: 'ends' must increase from at least 1 to at most the {n - m.lead} intervals after the start."
+        )
 
 
 def predict(
