@@ -143,10 +143,12 @@ def inflate_file(path: Path, target: Path) -> str:
     with path.open("rb") as packed, target.open("wb") as plain:
         decoder = zstd.ZstdDecompressor()
         try:
-            while block := packed.read(1 << 20):
+            pending = packed.read(1 << 20)
+            while pending:
                 if decoder.eof:  # a file may hold several frames
-                    block, decoder = decoder.unused_data + block, zstd.ZstdDecompressor()
-                plain.write(decoder.decompress(block))
+                    decoder = zstd.ZstdDecompressor()
+                plain.write(decoder.decompress(pending))
+                pending = (decoder.unused_data if decoder.eof else b"") or packed.read(1 << 20)
         except zstd.ZstdError as error:
             return str(error)
     return "" if decoder.eof else "it was cut off"

@@ -20,7 +20,8 @@ _LONGEST_SWEEP_S = 2.0
 def decode_cloud(message: Any, stamp: int) -> Scan:
     """Raises `UnusableError` if it has no x, y, z or if its sizes contradict each other."""
     table = _table(message)
-    points = np.stack([table[name].astype(float).ravel() for name in ("x", "y", "z")], axis=1)
+    with np.errstate(invalid="ignore"):  # signalling NaNs
+        points = np.stack([table[name].astype(float).ravel() for name in ("x", "y", "z")], axis=1)
     good = np.isfinite(points).all(axis=1) & points.any(axis=1)  # the origin is how drivers say that nothing came back
     offsets: FloatArray = np.empty(0)
     time_fields = [name for name in table.dtype.names or () if name not in ("x", "y", "z")]

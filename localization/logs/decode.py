@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -49,34 +50,46 @@ class OdometryReading:
 
 
 class Decoder:
-    """Raw messages to rosbags' message objects, by the definitions that the log carries, else by those of ROS 2 Humble."""
+    """Raw messages to rosbags' message objects, by the definitions that the log carries, else by those of ROS 2 Humble (ROS 1: Noetic).
+
+    A type is looked at when its first message comes: definitions that make no sense hurt only those who use them.
+    """
 
     def __init__(self, channels: Iterable[Channel], *, is_ros1: bool) -> None:
-        fallback = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-        self._store = get_typestore(Stores.EMPTY)
-        types = {}
-        for channel in channels:
-            definition = channel.definition
-            try:
-                if definition.format == MessageDefinitionFormat.MSG:
-                    types.update(get_types_from_msg(definition.data, channel.type))
-                elif definition.format == MessageDefinitionFormat.IDL:
-                    for part in definition.data.split("=" * 80 + "\n"):
-                        text = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
-                        types.update(get_types_from_idl(text) if text.strip() else {})
-            except Exception:  # the parser knows no bounds for what it lets out; the standard definition will do
-                types.update(fallback.fielddefs)
-            if channel.type not in types:
-                types.update({name: fields for name, fields in fallback.fielddefs.items() if name not in types})
-        self._store.register(types)
-        self._deserialize = self._store.deserialize_ros1 if is_ros1 else self._store.deserialize_cdr
+        self._definitions = {channel.type: channel.definition for channel in channels}
+        self._is_ros1 = is_ros1
+        self._deserializers: dict[str, Callable[[bytes], Any]] = {}
 
     def __call__(self, raw: RawMessage) -> Any:
         """The message. Raises `UnusableError`."""
+        deserialize = self._deserializers.get(raw.type)
+        if deserialize is None:
+            definition = self._definitions[raw.type]
+            deserialize = _deserializer(raw.type, definition.format, definition.data, self._is_ros1)
+            self._deserializers[raw.type] = deserialize
         try:
-            return self._deserialize(raw.data, raw.type)
+            return deserialize(raw.data)
         except Exception as error:  # struct.error, SerdeError, UnicodeDecodeError, ... : the bytes are not such a message
             raise UnusableError(Oddity.UNDECODABLE) from error
+
+
+@lru_cache(maxsize=64)
+def _deserializer(kind: str, form: MessageDefinitionFormat, text: str, is_ros1: bool) -> Callable[[bytes], Any]:
+    store = get_typestore(Stores.EMPTY)
+    try:
+        if form == MessageDefinitionFormat.MSG:
+            types = get_types_from_msg(text, kind)
+        else:
+            types = {}
+            for part in text.split("=" * 80 + "\n"):
+                idl = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
+                types.update(get_types_from_idl(idl) if idl.strip() else {})
+        store.register(types)
+        store.get_msgdef(kind)
+    except Exception:  # no definition, or one that the parser does not understand (it lets out anything): the standard one will do
+        store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+    return lambda data: deserialize(data, kind)
 
 
 def stamp_ns(message: Any) -> int:
@@ -151,7 +164,8 @@ def scan_decoder() -> Callable[[Any, int], Scan]:
     directions: dict[tuple[int, float, float], FloatArray] = {}
 
     def decode(message: Any, stamp: int) -> Scan:
-        ranges = np.asarray(message.ranges, dtype=float)
+        with np.errstate(invalid="ignore"):  # signalling NaNs
+            ranges = np.asarray(message.ranges, dtype=float)
         first, step = float(message.angle_min), float(message.angle_increment)
         if step == 0.0 and len(ranges) > 1:
             step = (float(message.angle_max) - first) / (len(ranges) - 1)

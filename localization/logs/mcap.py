@@ -1,4 +1,4 @@
-"""MCAP files that rosbags refuses: cut off, without a summary out of order, or of ROS 1. Read record by record.
+"""MCAP files that rosbags refuses: cut off, out of order without an index, or of ROS 1. Read record by record.
 
 Format: https://mcap.dev/spec. The index is made anew by going through the file once; messages outside of chunks are taken together
 in runs of a megabyte, which then are chunks like the others.
@@ -21,7 +21,7 @@ from localization.logs.chunks import Channel, Chunk, DamagedError, RawMessage, d
 
 MAGIC = b"\x89MCAP0\r\n"
 
-_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 2, 3, 4, 5, 6
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _CHUNK_INDEX = 2, 3, 4, 5, 6, 8
 _RUN = 1 << 20
 _FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
@@ -68,7 +68,7 @@ class RecoveredMcap:
         self.start_ns = min((c.start_ns for c in self._chunks), default=0)
         self.end_ns = max((c.end_ns for c in self._chunks), default=0)
         lost = f"; of its last {unread} bytes only what is whole could be read" if unread else ""
-        self.notes.insert(0, f"{path.name} is damaged ({reason}): {totals.total()} messages of it are used{lost}.")
+        self.notes.insert(0, f"{path.name} was read record by record ({reason}): {totals.total()} messages of it are used{lost}.")
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         wanted = {key: t for key, t in self._topics.items() if t.name in topics}
@@ -112,13 +112,17 @@ class RecoveredMcap:
         self._end_run()
         file.seek(position)
         try:
-            plain, _ = _plain(file.read(size))
+            plain, is_whole = _plain(file.read(size))
         except DamagedError as reason:
             self.notes.append(f"A chunk at byte {position} of {self._path.name} was left out: {reason}.")
             return
+        left = len(plain)
         for op, record in _records(plain):
+            left -= 9 + len(record)
             if op in (_SCHEMA, _CHANNEL):
                 self._describe(op, record)
+        if is_whole and left:
+            self.notes.append(f"A chunk at byte {position} of {self._path.name} is damaged: its last {left} bytes were left out.")
         counts: Counter[int] = Counter()
         start, end = 2**63 - 1, 0
         for key, log_ns, _ in _messages(plain):
@@ -160,6 +164,28 @@ class RecoveredMcap:
                 self._topics[key] = _Topic(topic, normalize_msgtype(kind) if "/" in kind else kind, definition, encoding)
         except struct.error:
             self.notes.append(f"A description of a topic in {self._path.name} is damaged.")
+
+
+def has_chunk_index(path: Path) -> bool:
+    """Whether rosbags can read the file in order of time: its summary lists the chunks. True where there is no telling."""
+    with path.open("rb") as file:
+        try:
+            file.seek(-37, 2)
+            tail = file.read(37)
+            if not tail.endswith(MAGIC) or tail[0] != _FOOTER:
+                return True
+            (position,) = struct.unpack_from("<Q", tail, 9)
+            while position:
+                file.seek(position)
+                op, size = struct.unpack("<BQ", file.read(9))
+                if op == _CHUNK_INDEX:
+                    return True
+                if op == _FOOTER:
+                    return False
+                position += 9 + size
+        except (OSError, struct.error, OverflowError):
+            return True
+    return False
 
 
 def _plain(record: bytes) -> tuple[bytes, bool]:

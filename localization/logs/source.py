@@ -93,6 +93,9 @@ class Ros2Bag:
         self._path = path
         self._rest: Source | None = None
         self._held: Reader | None = None
+        files = path.glob("*.mcap") if path.is_dir() else [path] if path.suffix == ".mcap" else []
+        if any(not mcap.has_chunk_index(file) for file in files):
+            raise DamagedError("it has no index of chunks")
         try:
             reader = Reader(path)
             reader.open()
