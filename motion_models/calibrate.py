@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,36 +12,12 @@ from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.errors import CalibrationError
 from motion_models.identifiability import Weakness, weaknesses
-from motion_models.maneuvers import WITNESS_NAMES, Batch, IntArray, Maneuver, make_batch, predict
-from motion_models.robot import Robot, WheelNoise
+from motion_models.least_squares import KNEE, FitConfig, Loss, Problem, indices, robust_weights
+from motion_models.maneuvers import IntArray, Maneuver, make_batch, predict
+from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
-Loss = Literal["linear", "huber", "cauchy"]
-
-_STEPS = 60
 _MEDIAN_OF_CHI_3 = 1.5382  # median length of a 3-vector of unit normal numbers
-# Of such lengths 10 % are above Huber's knee, and a quarter of a far outlier's pull is left at Cauchy's.
-_KNEE: dict[Loss, float] = {"linear": np.inf, "huber": 2.5, "cauchy": 4.0}
-_LEAST_MOTION = (0.05, 0.05)  # m, rad
-_SMALL = 0.1  # SI; what counts as large for a parameter whose nominal value is 0
-
-
-@dataclass(frozen=True)
-class FitConfig:
-    """How to fit; what to fit are the names given to `fit`."""
-
-    loss: Loss = "huber"
-    """How far residuals are weighed down beyond the knee: not at all, to a constant pull, or to none."""
-    noise: WheelNoise = field(default_factory=WheelNoise)
-    """Slip of the wheels, added to the measurements' own covariance: it sets how much a long maneuver counts against a short one."""
-    ties: Mapping[str, tuple[str, float]] = field(default_factory=dict)
-    """Parameters that follow another: name -> (free name, factor), as wz_right -> (wz_left, -1) of a robot that is symmetric."""
-    prior_sigma: Mapping[str, float] = field(default_factory=dict)
-    """How far free parameters may be from where they start, as one sigma; those not named may be anywhere."""
-    sizes: Mapping[str, float] = field(default_factory=dict)
-    """What counts as large for a parameter, and so as not revealed when its sigma is larger; else its nominal value, or 0.1 (SI)."""
-    strict: bool = True
-    """Refuse to return numbers that the drive does not reveal."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +38,7 @@ class Fit:
     scale: float
     """Robust size of the whitened residuals: how many times larger than the noise model said the errors are."""
     cost: float
+    """Half the robust sum of squares over the squared scale, prior included."""
     weaknesses: tuple[Weakness, ...]
     """What the drive does not reveal; empty where all is well."""
     seconds: float
@@ -73,7 +49,7 @@ class Fit:
     def values(self) -> FloatArray:
         """(c,) the free parameters."""
         everything = np.concatenate([self.params, self.witness])
-        return np.asarray(everything[_indices(self.model, self.names)])
+        return np.asarray(everything[indices(self.model, self.names)])
 
     @property
     def sigmas(self) -> dict[str, float]:
@@ -109,15 +85,17 @@ def fit(
     """
     config = config or FitConfig()
     batch = make_batch(maneuvers)
-    problem = _Problem(model, batch, tuple(free), config, model.nominal if start is None else start)
+    problem = Problem(model, batch, tuple(free), config, model.nominal if start is None else start)
     x, scale = problem.start, 1.0
-    for loss in ("linear", config.loss, config.loss) if config.loss != "linear" else ("linear",):
-        x = problem.solve(x, _KNEE[loss] * scale)
+    stages: tuple[Loss, ...] = ("linear",) if config.loss == "linear" and not config.prior_sigma else ("linear", config.loss, config.loss)
+    for loss in stages:
+        x = problem.solve(x, KNEE[loss] * scale, scale)
         lengths = np.linalg.norm(problem.residuals(x)[0], axis=1)
-        scale = max(float(np.median(lengths)) / _MEDIAN_OF_CHI_3, 1e-9)
+        spare = max(3 * len(lengths) - len(x), 1)  # what is fitted is no longer seen in the residuals
+        scale = max(float(np.median(lengths)) / _MEDIAN_OF_CHI_3 * np.sqrt(3 * len(lengths) / spare), 1e-9)
 
     r, J = problem.residuals(x)
-    weights = _weights(r, _KNEE[config.loss] * scale, config.loss)
+    weights = robust_weights(r, KNEE[config.loss] * scale, config.loss)
     # Residuals smaller than the noise model says are luck or simulation: the model's word then counts.
     information = np.einsum("nri,nrj->ij", J, J) / max(scale, 1.0) ** 2
     rate = float(np.sqrt(np.mean(batch.wheels**2)))
@@ -134,135 +112,11 @@ def fit(
         cov=cov,
         is_sandwich=is_sandwich,
         scale=scale,
-        cost=problem.cost(r, x, _KNEE[config.loss] * scale),
+        cost=problem.cost(r, x, KNEE[config.loss] * scale, scale) / scale**2,
         weaknesses=lost,
         seconds=float(batch.dt.sum()),
         config=config,
     )
-
-
-def _indices(model: MotionModel, names: Sequence[str]) -> IntArray:
-    known = (*model.param_names, *WITNESS_NAMES)
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise CalibrationError(f"{model.name} has no parameter {', '.join(unknown)}; it has {', '.join(known)}.")
-    return np.array([known.index(name) for name in names], dtype=np.int64)
-
-
-class _Problem:
-    """Residuals, derivatives and robust cost as functions of the free parameters x (c,)."""
-
-    def __init__(self, model: MotionModel, batch: Batch, names: tuple[str, ...], config: FitConfig, start: FloatArray) -> None:
-        self.model, self.batch, self.names, self.config = model, batch, names, config
-        self.columns = _indices(model, names)
-        tied = list(config.ties)
-        masters = [name for name, _ in config.ties.values()]
-        if not names or len(set(names)) != len(names) or set(masters) - set(names) or set(tied) & set(names):
-            raise CalibrationError("name each free parameter once; what is tied to another must not be free, and that other must be.")
-        self.all_columns = np.concatenate([self.columns, _indices(model, tied)])
-        self.combine = np.eye(len(names), len(names) + len(tied))
-        for i, (master, factor) in enumerate(config.ties.values()):
-            self.combine[names.index(master), len(names) + i] = factor
-        self.everything = np.concatenate([start, np.zeros(len(WITNESS_NAMES))])
-        self.start = self.everything[self.columns]
-        nominal = dict(zip(model.param_names, np.abs(model.nominal), strict=True))
-        self.sizes = np.array([config.sizes.get(name) or nominal.get(name) or _SMALL for name in names])
-        sigmas = np.array([config.prior_sigma.get(name, np.inf) for name in names])
-        self.prior = 1.0 / sigmas**2
-        if 3 * len(batch.ends) < len(names):
-            raise CalibrationError(f"{len(batch.ends)} measured poses cannot tell {len(names)} parameters; drive more, or fit fewer.")
-
-        full = self._full(self.start)
-        k = len(start)
-        # Whitened once, at the start: weights that follow the fit would reward parameters that call everything noise.
-        _, _, slip = predict(model, batch, full[:k], full[k:], np.empty(0, dtype=np.int64), config.noise)
-        twist = model.twist(batch.wheels, batch.cg, full[:k]).value
-        driven = float(np.sum(np.hypot(twist[:, 0], twist[:, 1]) * batch.dt))
-        turned = float(np.sum(np.abs(twist[:, 2]) * batch.dt))
-        if driven < _LEAST_MOTION[0] and turned < _LEAST_MOTION[1]:
-            raise CalibrationError(
-                f"too little motion to fit: the wheels drove {driven:.3g} m and turned {turned:.3g} rad in {batch.dt.sum():.3g} s; "
-                "drive a few metres and some turns."
-            )
-        noise = slip + batch.cov + 1e-12 * np.eye(3)  # the last: a maneuver without motion and without noise
-        self.whiten = np.linalg.inv(np.linalg.cholesky(noise))
-
-    def _full(self, x: FloatArray) -> FloatArray:
-        full = self.everything.copy()
-        full[self.all_columns] = x @ self.combine
-        return full
-
-    def params(self, x: FloatArray) -> FloatArray:
-        return self._full(x)[: -len(WITNESS_NAMES)]
-
-    def witness(self, x: FloatArray) -> FloatArray:
-        return self._full(x)[-len(WITNESS_NAMES) :]
-
-    def derive(self, batch: Batch, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """See `identifiability.Derive`."""
-        _, d, cov = predict(self.model, batch, self.params(x), self.witness(x), self.all_columns, self.config.noise)
-        return d @ self.combine.T, cov
-
-    def residuals(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Whitened residuals (M, 3) and their derivatives (M, 3, c)."""
-        poses, d, _ = predict(self.model, self.batch, self.params(x), self.witness(x), self.all_columns, self.config.noise)
-        off = se2.between(self.batch.measured, poses)
-        # `off` moves by its own rotation of what its end moves.
-        c, s = np.cos(off[:, 2]), np.sin(off[:, 2])
-        d = d @ self.combine.T
-        J = np.stack(
-            [c[:, None] * d[:, 0] - s[:, None] * d[:, 1], s[:, None] * d[:, 0] + c[:, None] * d[:, 1], d[:, 2]],
-            axis=1,
-        )
-        return np.einsum("nij,nj->ni", self.whiten, off), self.whiten @ J
-
-    def cost(self, r: FloatArray, x: FloatArray, knee: float) -> float:
-        """Half the robust sum of squares, and of the prior."""
-        length = np.linalg.norm(r, axis=1)
-        prior = float(np.sum(self.prior * (x - self.start) ** 2))
-        if not np.isfinite(knee):
-            robust = length**2
-        elif self.config.loss == "huber":
-            robust = np.where(length <= knee, length**2, knee * (2.0 * length - knee))
-        else:
-            robust = knee**2 * np.log1p((length / knee) ** 2)
-        return 0.5 * (float(np.sum(robust)) + prior)
-
-    def solve(self, x: FloatArray, knee: float) -> FloatArray:
-        """Levenberg-Marquardt with Marquardt's scaling and Nielsen's damping."""
-        r, J = self.residuals(x)
-        cost, damping, grow = self.cost(r, x, knee), 1e-4, 2.0
-        for _ in range(_STEPS):
-            w = _weights(r, knee, self.config.loss)
-            A = np.einsum("n,nri,nrj->ij", w, J, J) + np.diag(self.prior)
-            g = np.einsum("n,nri,nr->i", w, J, r) + self.prior * (x - self.start)
-            diagonal = np.maximum(np.diag(A), 1e-12 * np.max(np.diag(A)) + 1e-300)
-            step = -np.linalg.solve(A + np.diag(damping * diagonal), g)
-            tried = x + step
-            r_tried, J_tried = self.residuals(tried)
-            cost_tried = self.cost(r_tried, tried, knee) if np.all(np.isfinite(r_tried)) else np.inf
-            gained = cost - cost_tried
-            expected = 0.5 * float(step @ (damping * diagonal * step - g))
-            if gained > 0.0:
-                x, r, J, cost = tried, r_tried, J_tried, cost_tried
-                damping *= max(1.0 / 3.0, 1.0 - (2.0 * gained / max(expected, 1e-300) - 1.0) ** 3)
-                grow = 2.0
-            else:
-                damping *= grow
-                grow *= 2.0
-            if expected <= 1e-10 * cost + 1e-20 or damping > 1e12:
-                break
-        return x
-
-
-def _weights(r: FloatArray, knee: float, loss: Loss) -> FloatArray:
-    """(M,) how much each measured pose counts."""
-    length = np.linalg.norm(r, axis=1)
-    if not np.isfinite(knee):
-        return np.ones(len(r))
-    if loss == "cauchy":
-        return np.asarray(1.0 / (1.0 + (length / knee) ** 2))
-    return np.asarray(knee / np.maximum(length, knee))
 
 
 def _covariance(
