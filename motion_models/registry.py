@@ -5,6 +5,7 @@ from __future__ import annotations
 from motion_models.base import MotionModel
 from motion_models.diff_drive import DiffDrive
 from motion_models.errors import ModelError
+from motion_models.friction import FrictionModel
 from motion_models.full_linear import FullLinear
 from motion_models.icr import Icr
 from motion_models.robot import Robot
@@ -15,6 +16,7 @@ MODELS: dict[str, type[MotionModel]] = {
     SkidSteer.name: SkidSteer,
     Icr.name: Icr,
     FullLinear.name: FullLinear,
+    FrictionModel.name: FrictionModel,
 }
 
 

@@ -1,0 +1,179 @@
+"""The full physics of Ebersole 2016, Ch. 3, solved forward: wheel rates and centre of gravity in, twist out, in microseconds.
+
+The thesis asked for wheel rates and four loads at a wanted twist: six equations that took its solver 70 s, for three equations do not
+determine four loads. Here the chassis closes that gap (equally stiff wheels), and what is solved are the three balances of a motion
+without accelerations. Twice the wheel rates are twice the twist: neither speed nor mass matters.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numba
+import numpy as np
+
+from motion_models.base import Twist
+from motion_models.errors import CgError, ModelError
+from motion_models.friction_inverse import rolls_for
+from motion_models.friction_kernel import loads
+from motion_models.friction_solve import Floor, Loads, motion, sensitivities
+from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
+
+_POSITIVE = slice(0, 6)
+
+
+@dataclass(frozen=True)
+class FrictionModel:
+    """Quasi-static skidding on four wheels. Parameters, in the order of `param_names`:
+
+    wheel_radius [m]; track_width, wheelbase [m]: distances between the contacts; mu [-]: friction along x; mu_ratio [-]: across / along;
+    slip_stiffness [-]: K of 3.15; rolling_resistance [-]: f_r of 3.17; scrub [m]: yaw moment that the contact patches oppose to any turn,
+    over mu m g; warp [-]: load that a twisted chassis moves onto the front left and rear right wheels, over m g / 4; tread [-]: how much
+    more the wheels grip when they slide to the left than to the right (half the difference over the mean); tracked_x, tracked_y [m]: the
+    point whose motion is reported, 0 for the wheelbase's centre. Only rolling_resistance depends on mu itself.
+
+    The twist at exactly still wheels is exactly zero. Its derivative there is that of the rounded law (see `friction_kernel`), as no other
+    exists. Where soft tyres (slip_stiffness below about 3) allow several motions for one pair of wheel rates, it is one of them.
+    """
+
+    nominal: FloatArray
+    """(12,) the parameters."""
+    name: ClassVar[str] = "friction"
+    param_names: ClassVar[tuple[str, ...]] = (
+        *("wheel_radius", "track_width", "wheelbase", "mu", "mu_ratio", "slip_stiffness"),
+        *("rolling_resistance", "scrub", "warp", "tread", "tracked_x", "tracked_y"),
+    )
+
+    @classmethod
+    def from_robot(cls, robot: Robot) -> FrictionModel:
+        """The robot's geometry with the constants of Ebersole 2016, Appendix A, where its file has no [models.friction]."""
+        g = robot.geometry
+        defaults = np.array([g.wheel_radius_m, g.track_width_m, g.wheelbase_m, 0.9, 1.0, 13.333, 0.0263, 0.0, 0.0, 0.0, 0.0, 0.0])
+        return cls(robot.coefficients(cls.name, cls.param_names, defaults))
+
+    def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
+        """See `MotionModel.twist`.
+
+        Raises `CgError` for a CG that is not between the wheels and `ModelError` for parameters that no robot can have.
+        """
+        _check(cg, params)
+        twist = Twist.from_kernel(_twist, np.empty(0), wheels, cg, params)
+        lost = np.isnan(twist.value[..., 2]) & np.isfinite(np.asarray(wheels)).all(axis=-1)
+        if np.any(lost):
+            at = {name: float(value) for name, value in zip(self.param_names, params, strict=True)}
+            raise ModelError(f"no balance of forces found for {np.count_nonzero(lost)} of {lost.size} samples, with parameters {at}.")
+        return twist
+
+    def wheels(self, command: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+        """See `MotionModel.wheels`: what the thesis could not solve for.
+
+        Raises what `twist` raises, and `ModelError` for a command that no wheel rates lead to.
+        """
+        _check(cg, params)
+        lead = np.broadcast_shapes(command.shape[:-1], cg.shape[:-1])
+        flat = [np.array(np.broadcast_to(a, (*lead, 2)), dtype=np.float64, order="C").reshape(-1, 2) for a in (command, cg)]
+        rates = np.zeros((math.prod(lead), 2))
+        _wheels(*flat, np.array(params, dtype=np.float64), rates)
+        lost = np.isnan(rates).any(axis=-1) & np.isfinite(flat[0]).all(axis=-1)
+        if np.any(lost):
+            (vx, wz), (x, y) = flat[0][lost][0], flat[1][lost][0]
+            raise ModelError(
+                f"no wheel rates found for vx = {vx:.3g} m/s, wz = {wz:.3g} rad/s with the centre of gravity at ({x:.3f}, {y:.3f}) m: "
+                "the floor holds this robot too firmly. Lower mu_ratio or wheelbase, or move the centre of gravity to the middle."
+            )
+        return rates.reshape(*lead, 2)
+
+
+def _check(cg: FloatArray, params: FloatArray) -> None:
+    names = FrictionModel.param_names
+    if not np.isfinite(params).all() or np.any(params[_POSITIVE] <= 0) or abs(params[9]) >= 1:
+        found = ", ".join(f"{name} = {value:.6g}" for name, value in zip(names, params, strict=True))
+        raise ModelError(f"friction: {', '.join(names[_POSITIVE])} must be positive and tread within -1 and 1; found {found}.")
+    half = params[[2, 1]] / 2.0
+    outside = ~(np.abs(cg) < half).all(axis=-1)  # also if it is not a number
+    if np.any(outside):
+        x, y = np.reshape(cg, (-1, 2))[np.reshape(outside, -1)][0]
+        raise CgError(
+            f"centre of gravity at x = {x:.3f}, y = {y:.3f} m, but the wheels stand at x = +-{half[0]:.3f}, y = +-{half[1]:.3f} m: "
+            "this robot tips over. Check the centre of gravity, and wheelbase and track_width."
+        )
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _twist(
+    wheels: FloatArray,
+    cg: FloatArray,
+    params: FloatArray,
+    constants: FloatArray,
+    value: FloatArray,
+    d_wheels: FloatArray,
+    d_cg: FloatArray,
+    d_params: FloatArray,
+) -> None:  # pragma: no cover
+    """See `Twist.from_kernel`; there are no ``constants``. A sample without a solution becomes NaN."""
+    radius, mu, mu_ratio, warp = params[0], params[3], params[4], params[8]
+    tracked_x, tracked_y = params[10], params[11]
+    floor = _floor(params)
+    side_by_stiffness = mu_ratio * math.exp(-floor.slip_stiffness)
+    by = np.empty((3, 12))
+    for i in range(wheels.shape[0]):
+        xi, eta = cg[i, 0] / floor.half_wheelbase, cg[i, 1] / floor.half_track
+        fl, fr, rl, rr, t, t_xi, t_eta = loads(xi, eta, warp)
+        load, tilt = Loads(fl, fr, rl, rr), (t_xi, t_eta, 1.0 if t == warp else 0.0)
+        q_l, q_r = wheels[i, 0], wheels[i, 1]
+        speed = radius * math.hypot(q_l, q_r) * math.sqrt(0.5)
+        roll_l = radius * q_l / speed if speed != 0.0 else 0.0
+        roll_r = radius * q_r / speed if speed != 0.0 else 0.0
+        vx, vy, wz, found = motion(roll_l, roll_r, load, floor)
+        if not found:
+            value[i] = d_wheels[i] = d_cg[i] = d_params[i] = math.nan
+            continue
+        sensitivities(vx, vy, wz, roll_l, roll_r, load, tilt, floor, by)
+
+        # The tracked point moves with the body; so do the derivatives.
+        for j in range(12):
+            by[0, j] -= tracked_y * by[2, j]
+            by[1, j] += tracked_x * by[2, j]
+        point = (vx - wz * tracked_y, vy + wz * tracked_x, wz)
+        d_params[i, 1, 10], d_params[i, 0, 11] = wz * speed, -wz * speed
+
+        # Back from unit speed, which is radius sqrt((q_l^2 + q_r^2) / 2) and so depends on the wheels too.
+        for k in range(3):
+            along = 0.5 * (point[k] - by[k, 0] * roll_l - by[k, 1] * roll_r)
+            value[i, k] = point[k] * speed
+            d_wheels[i, k, 0] = radius * (by[k, 0] + roll_l * along)
+            d_wheels[i, k, 1] = radius * (by[k, 1] + roll_r * along)
+            d_cg[i, k, 0] = by[k, 2] * speed / floor.half_wheelbase
+            d_cg[i, k, 1] = by[k, 3] * speed / floor.half_track
+            d_params[i, k, 0] = point[k] * speed / radius
+            d_params[i, k, 1] = 0.5 * (by[k, 5] * speed - eta * d_cg[i, k, 1])
+            d_params[i, k, 2] = 0.5 * (by[k, 6] * speed - xi * d_cg[i, k, 0])
+            d_params[i, k, 3] = -by[k, 9] * floor.drag / mu * speed
+            d_params[i, k, 4] = by[k, 8] * floor.side / mu_ratio * speed
+            d_params[i, k, 5] = (by[k, 7] + by[k, 8] * side_by_stiffness) * speed
+            d_params[i, k, 6] = by[k, 9] / mu * speed
+            d_params[i, k, 7] = by[k, 10] * speed
+            d_params[i, k, 8] = by[k, 4] * speed
+            d_params[i, k, 9] = by[k, 11] * speed
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _floor(params: FloatArray) -> Floor:  # pragma: no cover
+    mu, mu_ratio, stiffness, rolling_resistance, scrub = params[3], params[4], params[5], params[6], params[7]
+    side = mu_ratio * (1.0 - math.exp(-stiffness))
+    return Floor(params[1] / 2.0, params[2] / 2.0, stiffness, side, rolling_resistance / mu, scrub, params[9])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _wheels(command: FloatArray, cg: FloatArray, params: FloatArray, rates: FloatArray) -> None:  # pragma: no cover
+    """Fill ``rates`` (n, 2) for ``command`` (n, 2) and ``cg`` (n, 2)."""
+    radius, warp, tracked_y = params[0], params[8], params[11]
+    floor = _floor(params)
+    for i in range(command.shape[0]):
+        fl, fr, rl, rr, _, _, _ = loads(cg[i, 0] / floor.half_wheelbase, cg[i, 1] / floor.half_track, warp)
+        wz = command[i, 1]
+        roll_l, roll_r = rolls_for(command[i, 0] + wz * tracked_y, wz, Loads(fl, fr, rl, rr), floor)
+        rates[i, 0], rates[i, 1] = roll_l / radius, roll_r / radius
