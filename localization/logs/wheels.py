@@ -29,7 +29,8 @@ def joints_to_wheels(left: int, right: int, wheel_radius_m: float, topic: str, t
     angle = np.full(left + right, np.nan)
 
     def side_means(values: FloatArray) -> FloatArray:
-        return np.array([values[:left].mean(), values[left:].mean()])
+        numbers = values.tolist()
+        return np.array([sum(numbers[:left]) / left, sum(numbers[left:]) / right])
 
     def convert(reading: JointReading) -> WheelSample:
         nonlocal known, angle
