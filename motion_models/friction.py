@@ -76,7 +76,7 @@ class FrictionModel:
         lead = np.broadcast_shapes(command.shape[:-1], cg.shape[:-1])
         flat = [np.array(np.broadcast_to(a, (*lead, 2)), dtype=np.float64, order="C").reshape(-1, 2) for a in (command, cg)]
         rates = np.zeros((math.prod(lead), 2))
-        _wheels(*flat, np.array(params, dtype=np.float64), rates)
+        _wheels(flat[0], flat[1], np.array(params, dtype=np.float64), rates)
         lost = np.isnan(rates).any(axis=-1) & np.isfinite(flat[0]).all(axis=-1)
         if np.any(lost):
             (vx, wz), (x, y) = flat[0][lost][0], flat[1][lost][0]

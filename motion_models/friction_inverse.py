@@ -15,6 +15,7 @@ from motion_models.friction_solve import Floor, Loads, motion, newton
 
 _ENCLOSING = 40
 _CLOSING = 100
+_CLOSE = 1e-14
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -28,10 +29,10 @@ def rolls_for(vx: float, wz: float, load: Loads, floor: Floor) -> tuple[float, f
     # Enclose: from a robot whose wheels slip away half of the turn, towards the goal until beyond it.
     low = math.atan2(2.0 * floor.half_track * wz, vx)
     error, x, y, w = _miss(low, goal, math.nan, 0.0, 0.0, load, floor)
-    step = 0.05 if error < 0.0 else -0.05
+    step = -math.copysign(min(1.5 * abs(error) + 1e-6, 0.4), error)
     high, error_high = low, error
     for _ in range(_ENCLOSING):
-        if error_high * error <= 0.0 and high != low:
+        if abs(error_high) < _CLOSE or error_high * error < 0.0:
             break
         low, error = high, error_high
         high = low + step
@@ -39,11 +40,15 @@ def rolls_for(vx: float, wz: float, load: Loads, floor: Floor) -> tuple[float, f
         step = math.copysign(min(2.0 * abs(step), 0.4), step)
     else:
         return math.nan, math.nan
+    if abs(error_high) < _CLOSE:
+        low, error = high, error_high
 
     # Close in: secants, and halves where they are slow (Brent's method in the form of Chandrupatla, 1997).
     other, error_other = low, error
     fraction = 0.5
     for _ in range(_CLOSING):
+        if abs(error) < _CLOSE or abs(high - low) < 4e-16 * (1.0 + abs(low)):
+            break
         middle = low + fraction * (high - low)
         error_middle, x, y, w = _miss(middle, goal, x, y, w, load, floor)
         if math.isnan(error_middle):
@@ -55,16 +60,15 @@ def rolls_for(vx: float, wz: float, load: Loads, floor: Floor) -> tuple[float, f
             high, error_high = low, error
         low, error = middle, error_middle
         width = abs(high - low)
-        if abs(error) < 1e-14 or width < 4e-16 * (1.0 + abs(low)):
-            break
         xi, phi = (low - high) / (other - high), (error - error_high) / (error_other - error_high)
         if phi * phi < xi and (1.0 - phi) * (1.0 - phi) < 1.0 - xi:
             fraction = error / (error_high - error) * error_other / (error_high - error_other)
             fraction += (other - low) / (high - low) * error / (error_other - error) * error_high / (error_other - error_high)
-            fraction = min(1.0 - 1e-15 / width, max(1e-15 / width, fraction)) if width > 2e-15 else 0.5
+            least = 1e-15 / width
+            fraction = min(1.0 - least, max(least, fraction)) if least < 0.5 else 0.5
         else:
             fraction = 0.5
-    if abs(error) > 1e-9:
+    if not abs(error) < 1e-9:
         return math.nan, math.nan
     speed = wanted / math.hypot(x, floor.half_track * w)
     return speed * (math.cos(low) - math.sin(low)), speed * (math.cos(low) + math.sin(low))
