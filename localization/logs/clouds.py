@@ -15,6 +15,7 @@ from motion_models.se2 import FloatArray
 _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "offset_time", "time_offset", "stamp", "stamps")
 _LONGEST_SWEEP_S = 2.0
+_LATEST_BEGIN_S = 0.5  # a sweep begins at its header's stamp, or ends there
 
 
 def decode_cloud(message: Any, stamp: int) -> Scan:
@@ -73,7 +74,7 @@ def _offsets(times: Any, good: Any, stamp: int) -> FloatArray:
     if np.issubdtype(times.dtype, np.integer):
         whole = times.astype(np.int64)
         for origin in (0, stamp):
-            if abs(int(whole[good].min()) - origin) <= _LONGEST_SWEEP_S * 1e9:
+            if abs(int(whole[good].min()) - origin) <= _LATEST_BEGIN_S * 1e9:
                 return np.asarray((whole - origin) * 1e-9, dtype=float)
         return np.asarray((whole - int(whole[good].min())) * 1e-9, dtype=float)
     values = times.astype(float)
@@ -85,8 +86,8 @@ def _offsets(times: Any, good: Any, stamp: int) -> FloatArray:
     if unit == 0.0:
         unit = next((u for u in (1.0, 1e-3, 1e-6, 1e-9) if spread * u <= _LONGEST_SWEEP_S), 1e-9)
     seconds, first = values * unit, float(known.min()) * unit
-    if abs(first) <= _LONGEST_SWEEP_S:
+    if abs(first) <= _LATEST_BEGIN_S:
         return np.asarray(seconds, dtype=float)
     # A double holds the seconds since 1970 to a quarter of a microsecond.
-    origin_s = stamp * 1e-9 if abs(first - stamp * 1e-9) <= _LONGEST_SWEEP_S else first
+    origin_s = stamp * 1e-9 if abs(first - stamp * 1e-9) <= _LATEST_BEGIN_S else first
     return np.asarray(seconds - origin_s, dtype=float)
