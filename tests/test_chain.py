@@ -36,7 +36,7 @@ def trees(draw):
     # One joint that surely moves mass: a URDF whose joints move none is refused.
     parts.append('<link name="arm"><inertial><origin xyz="1 0 0"/><mass value="1.5"/></inertial></link>')
     parts.append('<joint name="a" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/></joint>')
-    positions["a"] = draw(number)
+    positions["a"], moving = draw(number), ["a"]
     for i in range(size):
         parent = draw(st.sampled_from(["root", "base", "arm", *(f"l{k}" for k in range(i))]))
         kind = draw(st.sampled_from(["fixed", "revolute", "continuous", "prismatic"]))
@@ -44,11 +44,12 @@ def trees(draw):
         com = draw(triple)
         parts.append(f'<link name="l{i}"><inertial>{origin.format(*com, 0, 0, 0)}<mass value="{mass}"/></inertial></link>')
         mimic = ""
-        if kind != "fixed" and positions and draw(st.booleans()):
-            master = draw(st.sampled_from(sorted(positions)))
+        if kind != "fixed" and draw(st.booleans()):
+            master = draw(st.sampled_from(moving))
             mimic = f'<mimic joint="{master}" multiplier="{draw(number)}" offset="{draw(number)}"/>'
         elif kind != "fixed":
             positions[f"j{i}"] = draw(number)
+        moving += [f"j{i}"] if kind != "fixed" else []
         axis = '<axis xyz="{} {} {}"/>'.format(*draw(axes))
         parts.append(
             f'<joint name="j{i}" type="{kind}"><parent link="{parent}"/><child link="l{i}"/>{axis}{mimic}'
@@ -179,6 +180,21 @@ def test_joints_that_are_left_out_stand_at_the_limit_nearest_to_zero():
     assert chain.joint_names == ("lift",)
     expected, _ = urdf_reference.center_of_mass(text, {"shoulder": 0.2, "lift": 0.7})
     np.testing.assert_allclose(chain.center_of_mass(np.array([0.7])), expected, atol=1e-12)
+
+
+def test_a_joint_that_is_balanced_only_at_rest_matters():
+    """A turret about z with a slide: with the slide at 0 all mass is on the turret's axis."""
+    slide = (
+        '<link name="mast"><inertial><mass value="3"/></inertial></link>'
+        '<joint name="out" type="prismatic"><parent link="tool"/><child link="mast"/></joint></robot>'
+    )
+    text = SIMPLE.replace('xyz="0.5 0 0"', 'xyz="0 0 0"').replace('<origin xyz="1 0 0"/>', '<axis xyz="0 0 1"/>').replace("</robot>", slide)
+    chain = flatten(parse_urdf(text, "r"))
+    assert chain.joint_names == ("shoulder", "wrist", "out")
+    positions = {"shoulder": 0.4, "wrist": 0.8, "out": 0.5}
+    np.testing.assert_allclose(
+        chain.center_of_mass(chain.posture(positions)), urdf_reference.center_of_mass(text, positions)[0], atol=1e-12
+    )
 
 
 def test_a_robot_without_arms_has_a_constant_center_of_mass():
