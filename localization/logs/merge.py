@@ -150,8 +150,8 @@ class TopicClock:
 
 def merge(items: Iterable[Item], plan: ClockPlan, tally: Tally) -> Iterator[Any]:
     """The payloads of ``items`` (which come in order of ``log_ns``) by stamp: never decreasing, and within a topic always increasing."""
-    clocks: dict[str, TopicClock] = {}
     jumps: list[int] = []
+    clocks = {topic: TopicClock(topic, plan, jumps, tally) for topic in plan.latency_ns}
     held: list[tuple[int, int, int, Item]] = []
     held_weight = serial = now = 0
     emitted: dict[str, int] = {}
@@ -170,7 +170,7 @@ def merge(items: Iterable[Item], plan: ClockPlan, tally: Tally) -> Iterator[Any]
 
     for item in items:
         clock = clocks.get(item.topic)
-        if clock is None:
+        if clock is None:  # a topic without stamps
             clock = clocks[item.topic] = TopicClock(item.topic, plan, jumps, tally)
         now = max(now, item.log_ns)
         for trusted in clock.put(item):
