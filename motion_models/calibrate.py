@@ -12,12 +12,10 @@ from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.errors import CalibrationError
 from motion_models.identifiability import Weakness, weaknesses
-from motion_models.least_squares import KNEE, FitConfig, Loss, Problem, indices, robust_weights
+from motion_models.least_squares import KNEE, FitConfig, Loss, Problem, indices
 from motion_models.maneuvers import IntArray, Maneuver, make_batch, predict
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
-
-_MEDIAN_OF_CHI_3 = 1.5382  # median length of a 3-vector of unit normal numbers
 
 
 @dataclass(frozen=True)
@@ -32,8 +30,8 @@ class Fit:
     witness: FloatArray
     """(5,) as `WITNESS_NAMES`."""
     cov: FloatArray
-    """(c, c) of the free parameters. With enough groups the sandwich over groups (CR1), which stands residuals that are correlated
-    within a group and a noise model that is wrong; else the inverse information times the squared scale."""
+    """(c, c) of the free parameters. With more than ten groups beyond c, the sandwich over groups (CR1), which stands residuals that
+    are correlated within a group and a noise model that is wrong; with fewer, the inverse information times the weighted mean square."""
     is_sandwich: bool
     scale: float
     """Robust size of the whitened residuals: how many times larger than the noise model said the errors are."""
@@ -90,12 +88,10 @@ def fit(
     stages: tuple[Loss, ...] = ("linear",) if config.loss == "linear" and not config.prior_sigma else ("linear", config.loss, config.loss)
     for loss in stages:
         x = problem.solve(x, KNEE[loss] * scale, scale)
-        lengths = np.linalg.norm(problem.residuals(x)[0], axis=1)
-        spare = max(3 * len(lengths) - len(x), 1)  # what is fitted is no longer seen in the residuals
-        scale = max(float(np.median(lengths)) / _MEDIAN_OF_CHI_3 * np.sqrt(3 * len(lengths) / spare), 1e-9)
+        scale = problem.scale(problem.residuals(x)[0])
 
     r, J = problem.residuals(x)
-    weights = robust_weights(r, KNEE[config.loss] * scale, config.loss)
+    weights = problem.weights(r, KNEE[config.loss] * scale)
     # Residuals smaller than the noise model says are luck or simulation: the model's word then counts.
     information = np.einsum("nri,nrj->ij", J, J) / max(scale, 1.0) ** 2
     rate = float(np.sqrt(np.mean(batch.wheels**2)))
@@ -103,7 +99,7 @@ def fit(
     if lost and config.strict:
         raise CalibrationError("\n".join(["this drive does not reveal every parameter:", *(w.text for w in lost)]))
 
-    cov, is_sandwich = _covariance(r, J, weights, batch.group, problem.prior, scale)
+    cov, is_sandwich = _covariance(r, J, weights, problem.components, batch.group, problem.prior)
     return Fit(
         model=model,
         names=problem.names,
@@ -120,15 +116,16 @@ def fit(
 
 
 def _covariance(
-    r: FloatArray, J: FloatArray, weights: FloatArray, group: IntArray, prior: FloatArray, scale: float
+    r: FloatArray, J: FloatArray, weights: FloatArray, components: int, group: IntArray, prior: FloatArray
 ) -> tuple[FloatArray, bool]:
     """(c, c), and whether it is the sandwich (see `Fit.cov`)."""
     c, groups = J.shape[2], int(group.max()) + 1
-    A = np.einsum("n,nri,nrj->ij", weights, J, J) / scale**2 + np.diag(prior)
-    bread = np.linalg.pinv(A, hermitian=True)
-    if groups <= 2 * c:
+    spare = max(components - c, 1)
+    dispersion = max(float(np.einsum("n,ni,ni->", weights, r, r)) / spare, 1e-18)
+    bread = np.linalg.pinv(np.einsum("n,nri,nrj->ij", weights, J, J) / dispersion + np.diag(prior), hermitian=True)
+    if groups <= c + 10:
         return bread, False
     scores = np.zeros((groups, c))
-    np.add.at(scores, group, np.einsum("n,nri,nr->ni", weights, J, r) / scale**2)
-    correction = groups / (groups - 1) * (len(r) * 3 - 1) / (len(r) * 3 - c)
+    np.add.at(scores, group, np.einsum("n,nri,nr->ni", weights, J, r) / dispersion)
+    correction = groups / (groups - 1) * (components - 1) / spare
     return correction * bread @ (scores.T @ scores) @ bread, True

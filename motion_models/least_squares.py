@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -19,8 +20,11 @@ Loss = Literal["linear", "huber", "cauchy"]
 
 _STEPS = 60
 _LEAST_MOTION = (0.05, 0.05)  # m, rad
+_UNMEASURED = 1e6  # m^2 or rad^2
 _SMALL = 0.1  # SI; what counts as large for a parameter whose nominal value is 0
-# Of the lengths of 3-vectors of unit normal numbers 10 % are above Huber's knee; a far outlier pulls as little as Cauchy's allows.
+# Median length of vectors of 1, 2 and 3 unit normal numbers. Residual lengths are brought to the last before they meet the knee, beyond
+# which 10 % of them lie with Huber's.
+_MEDIAN_LENGTH = np.array([0.6745, 1.1774, 1.5382])
 KNEE: dict[Loss, float] = {"linear": np.inf, "huber": 2.5, "cauchy": 4.0}
 
 
@@ -72,7 +76,11 @@ class Problem:
         self.sizes = np.array([config.sizes.get(name) or nominal.get(name) or _SMALL for name in names])
         sigmas = np.array([config.prior_sigma.get(name, np.inf) for name in names])
         self.prior = 1.0 / sigmas**2
-        if 3 * len(batch.ends) < len(names):
+        measured = np.isfinite(np.diagonal(batch.cov, axis1=1, axis2=2))
+        self.components = int(measured.sum())
+        """How many numbers were measured."""
+        self.stretch = _MEDIAN_LENGTH[2] / _MEDIAN_LENGTH[np.maximum(measured.sum(axis=1), 1) - 1]
+        if self.components < len(names):
             raise CalibrationError(f"{len(batch.ends)} measured poses cannot tell {len(names)} parameters; drive more, or fit fewer.")
 
         full = self._full(self.start)
@@ -87,8 +95,10 @@ class Problem:
                 f"too little motion to fit: the wheels drove {driven:.3g} m and turned {turned:.3g} rad in {batch.dt.sum():.3g} s; "
                 "drive a few metres and some turns."
             )
-        noise = slip + batch.cov + 1e-12 * np.eye(3)  # the last: a maneuver without motion and without noise
-        self.whiten = np.linalg.inv(np.linalg.cholesky(noise))
+        both = measured[:, :, None] & measured[:, None, :]
+        # The last: a maneuver without motion and without noise, and what was not measured.
+        noise = np.where(both, slip + np.where(both, batch.cov, 0.0), 0.0) + np.eye(3) * np.where(measured, 1e-12, 1.0)[:, :, None]
+        self.whiten = np.where(both, np.linalg.inv(np.linalg.cholesky(noise)), 0.0)
 
     def _full(self, x: FloatArray) -> FloatArray:
         full = self.everything.copy()
@@ -104,7 +114,8 @@ class Problem:
     def derive(self, batch: Batch, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See `identifiability.Derive`."""
         _, d, cov = predict(self.model, batch, self.params(x), self.witness(x), self.all_columns, self.config.noise)
-        return d @ self.combine.T, cov + self.batch.cov.mean(axis=0)
+        usual = self.batch.cov.mean(axis=0)
+        return d @ self.combine.T, cov + np.where(np.isfinite(usual), usual, _UNMEASURED)
 
     def residuals(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Whitened residuals (M, 3) and their derivatives (M, 3, c)."""
@@ -121,7 +132,7 @@ class Problem:
 
     def cost(self, r: FloatArray, x: FloatArray, knee: float, scale: float) -> float:
         """Half the robust sum of squares, with the prior's; residuals are ``scale`` times what whitening made 1."""
-        length = np.linalg.norm(r, axis=1)
+        length = self.lengths(r)
         prior = scale**2 * float(np.sum(self.prior * (x - self.start) ** 2))
         if not np.isfinite(knee):
             robust = length**2
@@ -129,7 +140,26 @@ class Problem:
             robust = np.where(length <= knee, length**2, knee * (2.0 * length - knee))
         else:
             robust = knee**2 * np.log1p((length / knee) ** 2)
-        return 0.5 * (float(np.sum(robust)) + prior)
+        return 0.5 * (float(np.sum(robust / self.stretch**2)) + prior)
+
+    def lengths(self, r: FloatArray) -> FloatArray:
+        """(M,) lengths of the whitened residuals (M, 3), as if all three components of each were measured."""
+        return np.asarray(np.linalg.norm(r, axis=1) * self.stretch)
+
+    def weights(self, r: FloatArray, knee: float) -> FloatArray:
+        """(M,) how much each measured pose counts."""
+        length = self.lengths(r)
+        if not np.isfinite(knee):
+            return np.ones(len(r))
+        if self.config.loss == "cauchy":
+            return np.asarray(1.0 / (1.0 + (length / knee) ** 2))
+        return np.asarray(knee / np.maximum(length, knee))
+
+    def scale(self, r: FloatArray) -> float:
+        """Robust size of the whitened residuals, corrected for the parameters that were fitted to them; never 0."""
+        spare = max(self.components - len(self.names), 1)
+        size = float(np.median(self.lengths(r))) / float(_MEDIAN_LENGTH[2])
+        return max(size * math.sqrt(self.components / spare), 1e-9)
 
     def solve(self, x: FloatArray, knee: float, scale: float) -> FloatArray:
         """Levenberg-Marquardt with Marquardt's scaling and Nielsen's damping."""
@@ -137,7 +167,7 @@ class Problem:
         cost, damping, grow = self.cost(r, x, knee, scale), 1e-4, 2.0
         prior = scale**2 * self.prior
         for _ in range(_STEPS):
-            w = robust_weights(r, knee, self.config.loss)
+            w = self.weights(r, knee)
             A = np.einsum("n,nri,nrj->ij", w, J, J) + np.diag(prior)
             g = np.einsum("n,nri,nr->i", w, J, r) + prior * (x - self.start)
             diagonal = np.maximum(np.diag(A), 1e-12 * np.max(np.diag(A)) + 1e-300)
@@ -161,13 +191,3 @@ class Problem:
             if expected <= 1e-10 * cost + 1e-20 or damping > 1e12:
                 break
         return x
-
-
-def robust_weights(r: FloatArray, knee: float, loss: Loss) -> FloatArray:
-    """(M,) how much each measured pose counts."""
-    length = np.linalg.norm(r, axis=1)
-    if not np.isfinite(knee):
-        return np.ones(len(r))
-    if loss == "cauchy":
-        return np.asarray(1.0 / (1.0 + (length / knee) ** 2))
-    return np.asarray(knee / np.maximum(length, knee))

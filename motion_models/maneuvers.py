@@ -47,7 +47,8 @@ class Maneuver:
     cg: FloatArray = field(default_factory=lambda: np.zeros(2))
     """(2,) or (n, 2) centre of gravity [m]."""
     cov: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
-    """(3, 3) or (m, 3, 3) covariance of the measured poses (right perturbation)."""
+    """(3, 3) or (m, 3, 3) covariance of the measured poses (right perturbation); inf on the diagonal for what is not measured, as
+    the position of a gyro."""
     group: str = ""
     """Maneuvers of one group share their errors (same step, same place): they are resampled and held out together."""
     lead: int = 0
@@ -115,7 +116,7 @@ def make_batch(maneuvers: Sequence[Maneuver]) -> Batch:
         ("wheels", batch.wheels, interval_owner),
         ("cg", batch.cg, interval_owner),
         ("measured", batch.measured, owner),
-        ("cov", batch.cov, owner),
+        ("cov", np.where(np.isposinf(batch.cov) & np.eye(3, dtype=bool), 1.0, batch.cov), owner),
     ):
         bad = ~np.isfinite(array).reshape(len(array), -1).all(axis=1)
         if bad.any():

@@ -1,0 +1,36 @@
+"""The effective track of a real Husky on five grounds, as far as the shipped runs tell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from motion_models.errors import CalibrationError
+from tests.studies.terrain_track import TERRAINS, by_fit, by_seconds, fitted_track, load
+
+TURNING = ("FLOORING", "ASPHALT", "ICE")
+
+
+@pytest.mark.parametrize("terrain", TURNING)
+def test_two_ways_agree_where_the_robot_turns(terrain: str) -> None:
+    run = load(terrain)
+    plain, fitted = by_seconds(run, np.random.default_rng(0)), fitted_track(by_fit(run))
+    assert plain is not None
+    assert plain.low < fitted.high
+    assert fitted.low < plain.high
+    assert fitted.low > 0.571  # wider than where the wheels stand: it skids
+
+
+@pytest.mark.parametrize("terrain", ["ASPHALT", "ICE"])
+def test_one_run_agrees_with_all_runs_of_the_data_set(terrain: str) -> None:
+    track = by_seconds(load(terrain), np.random.default_rng(0))
+    assert track is not None
+    assert track.low <= TERRAINS[terrain] <= track.high
+
+
+@pytest.mark.parametrize("terrain", ["SANDY_LOAM", "SNOW"])
+def test_a_run_without_turns_is_refused_with_what_to_drive(terrain: str) -> None:
+    run = load(terrain)
+    assert by_seconds(run, np.random.default_rng(0)) is None
+    with pytest.raises(CalibrationError, match=r"wheel_separation_multiplier .*turning in place"):
+        by_fit(run)
