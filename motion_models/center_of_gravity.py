@@ -67,7 +67,6 @@ class CgModel:
     then the three `Tolerances`, then the static part's covariance (9)."""
     weighed_poses: FloatArray
     """(b, 3, 4) rotations and translations of the bodies at the weighing, or (0, 3, 4)."""
-
     mass: float
     """Of the whole robot with its payload [kg]."""
 
@@ -80,9 +79,11 @@ class CgModel:
         return self.chain.center_of_mass_jacobian(positions)[..., :2, :]
 
     def estimate(self, positions: FloatArray) -> CgEstimate:
-        """Centre of gravity at ``positions`` (n,) with its covariance."""
+        """Centre of gravity at ``positions`` (n,) with its covariance. Raises `CgError` for another number of joints."""
         chain, found = self.chain, np.zeros((3, 2))
         q = np.ascontiguousarray(positions, dtype=float)
+        if q.shape != chain.lower.shape:
+            raise CgError(f"{chain.source} needs positions of {', '.join(chain.joint_names)}; got an array of shape {q.shape}.")
         _estimate(chain.layout, chain.constants, self.arms, self.numbers, self.weighed_poses, q, found)
         return CgEstimate(found[0], found[1:], self.mass)
 
@@ -112,15 +113,17 @@ def cg_model(
     else:
         links = {name: Link(name, 0.0, np.zeros(3)) if body == 0 else urdf.links[name] for name, (body, _) in chain.links.items()}
         links[base_link] = Link(base_link, static.mass, np.array([*static.position, base[2]]))
-        urdf = dataclasses.replace(urdf, links=links)
+        stiff = tuple(dataclasses.replace(j, kind="fixed", mimic=None) if chain.links[j.child][0] == 0 else j for j in urdf.joints)
+        urdf = dataclasses.replace(urdf, links=links, joints=stiff)
+        joints = None if joints is None else tuple(j.name for j in stiff if j.moves and j.name in joints)
 
     load = np.zeros(7)
     if payload is not None:
         sigmas = np.array([payload.mass_sigma, payload.position_sigma])
         if not (np.isfinite(payload.mass) and payload.mass > 0.0):
             raise CgError(f"payload at {payload.link}: mass is {payload.mass} kg; it must be positive.")
-        if not (np.all(np.isfinite([*payload.position, *sigmas])) and np.all(sigmas >= 0.0)):
-            raise CgError(f"payload at {payload.link}: its place must be finite and its sigmas not below 0, found {payload}.")
+        if not (len(payload.position) == 3 and np.all(np.isfinite([*payload.position, *sigmas])) and np.all(sigmas >= 0.0)):
+            raise CgError(f"payload at {payload.link}: its place must be three finite numbers and its sigmas not below 0, found {payload}.")
         urdf = urdf.with_mass(payload.link, payload.mass, np.array(payload.position))
     # Once more: a payload off the axis can make a joint matter that did not.
     chain = flatten(urdf, base_link, joints)

@@ -42,7 +42,7 @@ def flatten(urdf: Urdf, base_link: str = "base_link", joints: tuple[str, ...] | 
     massless = tuple(name for name in urdf.links if name in below and urdf.links[name].mass == 0.0)
     useless = sorted(name for name in joints or () if name not in heavy)
     if useless or (not names and massless):
-        culprits = f"joint {', '.join(useless)} carries" if useless else "none of its joints moves"
+        culprits = f"joint {', '.join(useless)} moves" if useless else "its joints move"
         raise RobotError(
             f"{urdf.source}: {culprits} no mass; moving links without an <inertial> with a mass: {', '.join(massless) or 'none'}."
         )

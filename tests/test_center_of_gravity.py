@@ -207,6 +207,31 @@ def test_a_payload_on_the_static_part_adds_to_a_weighed_one():
     assert_covariance(np.array(found), with_load.estimate(q).covariance)
 
 
+def test_joints_may_be_named_and_wheels_and_idle_wrists_among_them():
+    names = tuple(POSTURES["ready"])
+    static = StaticPart(50.0, np.array([0.03, -0.01]), np.zeros((3, 3)))
+    named = cg_model(URDF, joints=(*names, "front_left_wheel"), static=static)
+    assert named.chain.joint_names == CHAIN.joint_names
+    np.testing.assert_array_equal(named.cg(np.ones(10)), cg_model(URDF, static=static).cg(np.ones(10)))
+    # With the right arm left out, it stands at 0.
+    left = cg_model(URDF, joints=names[:6])
+    expected, _ = urdf_reference.center_of_mass(TEXT, dict(zip(names[:5], np.ones(5), strict=True)))
+    np.testing.assert_allclose(left.cg(np.ones(5)), expected[:2], atol=1e-12)
+
+
+def test_a_robot_without_arms_that_was_weighed():
+    husky = (
+        '<robot><link name="base_link"><inertial><mass value="46"/></inertial></link>'
+        '<link name="wheel"><inertial><mass value="2.6"/></inertial></link><joint name="w" type="continuous">'
+        '<parent link="base_link"/><child link="wheel"/><axis xyz="0 1 0"/></joint></robot>'
+    )
+    static = StaticPart(50.0, np.array([0.03, -0.01]), np.diag([1.0, 4e-6, 9e-6]))
+    estimate = cg_model(parse_urdf(husky, "husky.urdf"), static=static).estimate(np.empty(0))
+    assert estimate.mass == 50.0
+    np.testing.assert_allclose(estimate.position, [0.03, -0.01], atol=1e-15)
+    np.testing.assert_allclose(estimate.covariance, np.diag([4e-6, 9e-6]), atol=1e-18)
+
+
 def test_jacobian_of_the_center_of_gravity():
     model = cg_model(URDF, payload=Payload("right_gripper", 5.0))
     q, h = np.linspace(-1, 1, 10), 1e-6
@@ -310,7 +335,8 @@ BAD = {
     "payload at no link": (bad_payload(link="hand"), RobotError, r"no link 'hand'; links are base_link, "),
     "negative payload": (bad_payload(mass=-1.0), CgError, r"payload at left_gripper: mass is -1.0 kg; it must be positive"),
     "payload nan": (bad_payload(mass=math.nan), CgError, "mass is nan kg"),
-    "payload at infinity": (bad_payload(position=(0.0, math.inf, 0.0)), CgError, "its place must be finite"),
+    "payload at infinity": (bad_payload(position=(0.0, math.inf, 0.0)), CgError, "its place must be three finite numbers"),
+    "payload in the plane": (bad_payload(position=(0.1, 0.2)), CgError, "its place must be three finite numbers"),
     "payload sigma": (bad_payload(position_sigma=-0.1), CgError, "sigmas not below 0"),
     "static mass": (lambda: cg_model(URDF, static=StaticPart(-3.0, np.zeros(2), np.zeros((3, 3)))), CgError, "its mass must be positive"),
     "no static mass": (lambda: cg_model(NO_BASE), CgError, r"r.urdf: nothing but its arms has a mass; give the static part"),
@@ -326,6 +352,7 @@ BAD = {
         r"no position of joint left_shoulder_pan_joint, left_sh",
     ),
     "degrees": (lambda: urdf_cg(URDF, POSTURES["ready"] | {"left_elbow_joint": 90.0}), RobotError, "position 90 .*radians"),
+    "too few joints": (lambda: cg_model(URDF).estimate(np.zeros(9)), CgError, r"needs positions of left_.*got an array of shape \(9,\)"),
     "no file": (lambda: urdf_cg("none.urdf", {}), RobotError, "'none.urdf' cannot be read"),
     "no shipped file": (lambda: arms_model(Arms("none.urdf")), RobotError, "'none.urdf', which the robot file names, cannot be read"),
     "no posture": (

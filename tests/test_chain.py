@@ -221,8 +221,12 @@ BAD = {
     "no such base": (SIMPLE, {"base_link": "base"}, r"r.urdf: no link 'base'; links are base_link, arm, tool"),
     "moving base": (SIMPLE, {"base_link": "arm"}, r"base link 'arm' hangs on a joint that moves"),
     "unknown joint": (SIMPLE, {"joints": ("shoulder", "elbow")}, r"no joint elbow .*there are shoulder, wrist"),
-    "joint without mass": (SIMPLE, {"joints": ("shoulder", "wrist")}, r"joint wrist carries no mass; .*mass: tool"),
-    "arms without inertia": (SIMPLE.replace('<mass value="2"/>', '<mass value="0"/>'), {}, r"no mass; moving links .*: arm, tool"),
+    "joint without mass": (SIMPLE, {"joints": ("shoulder", "wrist")}, r"joint wrist moves no mass; .*mass: tool"),
+    "arms without inertia": (
+        SIMPLE.replace('<mass value="2"/>', '<mass value="0"/>'),
+        {},
+        r"r.urdf: its joints move no mass; moving links .*: arm, tool",
+    ),
     "no inertia at all": ('<robot><link name="base_link"/></robot>', {}, r"no link has an <inertial> with a mass; links are base_link"),
 }
 
