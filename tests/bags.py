@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 from rosbags import rosbag1, rosbag2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STORE_ROS1 = get_typestore(Stores.ROS1_NOETIC)
+STORE_ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 T = STORE.types
 S = 1_000_000_000
 START = 1_700_000_000 * S
