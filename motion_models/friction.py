@@ -59,7 +59,7 @@ class FrictionModel:
 
         Raises `CgError` for a CG that is not between the wheels and `ModelError` for parameters that no robot can have.
         """
-        _check(cg, params)
+        check_parameters(cg, params)
         twist = Twist.from_kernel(_twist, np.empty(0), wheels, cg, params)
         lost = np.isnan(twist.value[..., 2]) & np.isfinite(np.asarray(wheels)).all(axis=-1)
         if np.any(lost):
@@ -72,7 +72,7 @@ class FrictionModel:
 
         Raises what `twist` raises, and `ModelError` for a command that no wheel rates lead to.
         """
-        _check(cg, params)
+        check_parameters(cg, params)
         lead = np.broadcast_shapes(command.shape[:-1], cg.shape[:-1])
         flat = [np.array(np.broadcast_to(a, (*lead, 2)), dtype=np.float64, order="C").reshape(-1, 2) for a in (command, cg)]
         rates = np.zeros((math.prod(lead), 2))
@@ -87,7 +87,8 @@ class FrictionModel:
         return rates.reshape(*lead, 2)
 
 
-def _check(cg: FloatArray, params: FloatArray) -> None:
+def check_parameters(cg: FloatArray, params: FloatArray) -> None:
+    """Raises `ModelError` for parameters (12,) that no robot can have and `CgError` for a CG in ``cg`` (..., 2) outside its wheels."""
     names = FrictionModel.param_names
     if not np.isfinite(params).all() or np.any(params[_POSITIVE] <= 0) or abs(params[9]) >= 1:
         found = ", ".join(f"{name} = {value:.6g}" for name, value in zip(names, params, strict=True))
@@ -116,7 +117,7 @@ def _twist(
     """See `Twist.from_kernel`; there are no ``constants``. A sample without a solution becomes NaN."""
     radius, mu, mu_ratio, warp = params[0], params[3], params[4], params[8]
     tracked_x, tracked_y = params[10], params[11]
-    floor = _floor(params)
+    floor = floor_of(params)
     side_by_stiffness = mu_ratio * math.exp(-floor.slip_stiffness)
     by = np.empty((3, 12))
     for i in range(wheels.shape[0]):
@@ -161,7 +162,8 @@ def _twist(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _floor(params: FloatArray) -> Floor:  # pragma: no cover
+def floor_of(params: FloatArray) -> Floor:  # pragma: no cover
+    """The parameters (12,) that the balance depends on."""
     mu, mu_ratio, stiffness, rolling_resistance, scrub = params[3], params[4], params[5], params[6], params[7]
     side = mu_ratio * (1.0 - math.exp(-stiffness))
     return Floor(params[1] / 2.0, params[2] / 2.0, stiffness, side, rolling_resistance / mu, scrub, params[9])
@@ -171,7 +173,7 @@ def _floor(params: FloatArray) -> Floor:  # pragma: no cover
 def _wheels(command: FloatArray, cg: FloatArray, params: FloatArray, rates: FloatArray) -> None:  # pragma: no cover
     """Fill ``rates`` (n, 2) for ``command`` (n, 2) and ``cg`` (n, 2)."""
     radius, warp, tracked_y = params[0], params[8], params[11]
-    floor = _floor(params)
+    floor = floor_of(params)
     for i in range(command.shape[0]):
         fl, fr, rl, rr, _, _, _ = loads(cg[i, 0] / floor.half_wheelbase, cg[i, 1] / floor.half_track, warp)
         wz = command[i, 1]

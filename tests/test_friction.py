@@ -225,7 +225,7 @@ def rounded_balance(twist, roll, cg, p):
 
 def test_the_answer_does_not_depend_on_where_the_search_starts():
     """With Appendix A's constants the balance has one solution: searches from eight other twists end at the same."""
-    from motion_models.friction import _floor
+    from motion_models.friction import floor_of
     from motion_models.friction_solve import Loads, newton
 
     rng = np.random.default_rng(5)
@@ -234,7 +234,7 @@ def test_the_answer_does_not_depend_on_where_the_search_starts():
     cg = cg[: len(wheels)]
     speed = np.hypot(wheels[:, 0], wheels[:, 1])[:, None] * 0.164 / math.sqrt(2)
     value = MODEL.twist(wheels, cg, NOMINAL).value / speed
-    floor = _floor(NOMINAL)
+    floor = floor_of(NOMINAL)
     reached = 0
     for u, c, v in zip(0.164 * wheels / speed, cg, value, strict=True):
         load = Loads(*loads(c[0] / HALF[0], c[1] / HALF[1], 0.0)[:4])

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import root
 
-from motion_models.friction import _floor
+from motion_models.friction import floor_of
 from motion_models.friction_kernel import CREEP, loads
 from motion_models.friction_solve import Floor, Loads, balance
 from motion_models.registry import make_model
@@ -50,7 +50,7 @@ def median_time(call: Callable[[], object], n: int, rounds: int) -> float:
 
 def by_scipy(wheels: FloatArray, cg: FloatArray, params: FloatArray, compiled: bool) -> FloatArray:
     """(3,) the twist of one case; the balance in numpy, or the model's own compiled one behind scipy's search."""
-    floor = _floor(params)
+    floor = floor_of(params)
     share = loads(cg[0] / floor.half_wheelbase, cg[1] / floor.half_track, params[8])[:4]
     speed = params[0] * math.hypot(*wheels) / math.sqrt(2.0)
     roll = params[0] * wheels / speed

@@ -1,0 +1,226 @@
+"""The dynamic form of Ebersole 2016, Ch. 3 (eqs. 3.15-3.26, signs mended): accelerations of a skidding robot, for simulation.
+
+Where `friction` asks which motion the wheels settle to, this asks how the robot gets there: with mass, inertia, a CG that arms move, load
+that shifts under acceleration, and a force from outside. Its resting point at constant wheel rates is `friction`'s twist.
+
+Mended against the thesis: (3.17, 3.24) rolling resistance opposes the wheel's rolling; (3.25) m a_y has the sign of (3.24)'s;
+Appendix A's y_ddot_G_B has the signs of (3.19), and its inertia squares 0.43.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from motion_models.friction import FrictionModel, check_parameters, floor_of
+from motion_models.friction_kernel import CREEP, contact, loads, rolling, traction
+from motion_models.friction_solve import Floor
+from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
+
+_THESIS_GYRATION_SQUARED = (0.43**2 + 0.27**2) / 12.0  # m^2; Appendix A's I / m
+_CLOSURE_STEPS = 12
+
+
+class _Body(NamedTuple):
+    mu: float
+    warp: float
+    radius: float
+    mass: float
+    inertia: float
+    height: float
+    gravity: float
+    creep: float
+    rest_speed: float
+
+
+@dataclass(frozen=True)
+class Influence:
+    """What acts on the robot besides its wheels."""
+
+    cg: FloatArray
+    """(2,) CG in the body frame [m]."""
+    cg_velocity: FloatArray
+    """(2,) its velocity in the body frame, by the arms [m/s]."""
+    cg_acceleration: FloatArray
+    """(3,) its acceleration in the body frame, by the arms; z up [m/s^2]."""
+    force: FloatArray
+    """(3,) force from outside, on a gripper say, in the body frame [N]."""
+    at: FloatArray
+    """(3,) where it acts, in the body frame, z above the floor [m]."""
+
+    @classmethod
+    def of_cg(cls, cg: FloatArray) -> Influence:
+        """A CG that rests in the body, and no force."""
+        return cls(np.asarray(cg, dtype=np.float64), np.zeros(2), np.zeros(3), np.zeros(3), np.zeros(3))
+
+
+@dataclass(frozen=True)
+class FrictionDynamics:
+    """The robot as a rigid body on four skidding wheels whose rates are given."""
+
+    params: FloatArray
+    """(12,) as `FrictionModel.param_names`; the tracked point plays no part here."""
+    mass: float
+    """[kg]"""
+    inertia: float
+    """Yaw inertia about the CG [kg m^2]."""
+    cg_height: float
+    """z_G above the floor [m]."""
+    gravity: float = 9.81
+    """[m/s^2]"""
+    creep: float = CREEP
+    """Slip at which friction is fully there, as a fraction of the wheels' speed. Ten times the creep allows ten times as long steps."""
+    rest_speed: float = 0.01
+    """Speed that takes the place of the wheels' where they stand still [m/s]."""
+
+    @classmethod
+    def from_robot(cls, robot: Robot, inertia: float | None = None) -> FrictionDynamics:
+        """The robot's friction parameters and mass; its inertia is the thesis's per mass unless given [kg m^2]."""
+        g = robot.geometry
+        inertia = g.mass_kg * _THESIS_GYRATION_SQUARED if inertia is None else inertia
+        return cls(FrictionModel.from_robot(robot).nominal, g.mass_kg, inertia, g.cg_height_m)
+
+    def longest_step(self, speed: float) -> float:
+        """Step [s] beyond which Runge-Kutta may become unstable while the wheels roll at ``speed`` [m/s] or more.
+
+        A wheel without slip resists as stiffly as mu m g / (creep speed) against motion, and with its lever arm against the turn.
+        """
+        mu, track, wheelbase = self.params[3] * max(1.0, self.params[4]), self.params[1], self.params[2]
+        lever = max(1.0, self.mass * (track**2 + wheelbase**2) / 4.0 / self.inertia)
+        return float(2.0 * self.creep * max(speed, self.rest_speed) / (mu * self.gravity * lever))
+
+    def accelerations(self, wheels: FloatArray, twist: FloatArray, influence: Influence) -> tuple[FloatArray, float]:
+        """Rate of change (3,) of ``twist`` (3,), both of the wheelbase's centre in the body frame, at wheel rates ``wheels`` (2,).
+
+        Also the tipping margin: how far the loads are from leaving all wheels of one side or axle, 1 for evenly loaded wheels. Where it
+        is negative the robot tips over and the accelerations, those of a robot held upright, are fiction. Raises what `FrictionModel` does.
+        """
+        check_parameters(influence.cg, self.params)
+        state = np.array([0.0, 0.0, 0.0, *twist])
+        ax, ay, aw, margin = _accelerations(state, wheels[0], wheels[1], self._influence(influence), floor_of(self.params), self._body())
+        return np.array([ax, ay, aw]), margin
+
+    def advance(self, state: FloatArray, dt: float, steps: int, wheels: FloatArray, influence: Influence) -> tuple[FloatArray, float]:
+        """The state (6,), pose in the world and twist in the body, after ``dt`` seconds in ``steps`` Runge-Kutta steps of fourth order.
+
+        Wheel rates and the CG's acceleration are constant meanwhile; the CG moves on by them. Also the smallest tipping margin.
+        """
+        check_parameters(influence.cg, self.params)
+        after = np.array(state, dtype=np.float64)
+        margin = _advance(after, dt, steps, wheels[0], wheels[1], self._influence(influence), floor_of(self.params), self._body())
+        return after, margin
+
+    def _body(self) -> _Body:
+        mu, warp, radius = float(self.params[3]), float(self.params[8]), float(self.params[0])
+        return _Body(mu, warp, radius, self.mass, self.inertia, self.cg_height, self.gravity, self.creep, self.rest_speed)
+
+    def _influence(self, influence: Influence) -> FloatArray:
+        return np.concatenate([influence.cg, influence.cg_velocity, influence.cg_acceleration, influence.force, influence.at]).astype(float)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _accelerations(
+    state: FloatArray, q_l: float, q_r: float, influence: FloatArray, floor: Floor, body: _Body
+) -> tuple[float, float, float, float]:  # pragma: no cover
+    """Rates of vx, vy, wz and the tipping margin. ``influence`` (13,) holds the fields of `Influence` in their order."""
+    mu, warp, mass, inertia = body.mu, body.warp, body.mass, body.inertia
+    height, gravity, creep, rest, radius = body.height, body.gravity, body.creep, body.rest_speed, body.radius
+    x_g, y_g, dx_g, dy_g = influence[0], influence[1], influence[2], influence[3]
+    ddx_g, ddy_g, ddz_g = influence[4], influence[5], influence[6]
+    f_x, f_y, f_z, p_x, p_y, p_z = influence[7], influence[8], influence[9], influence[10], influence[11], influence[12]
+    speed = math.sqrt(0.5 * radius * radius * (q_l * q_l + q_r * q_r) + rest * rest)
+    vx, vy, wz = state[3] / speed, state[4] / speed, state[5] / speed
+
+    # Forces of each wheel per mu and load, summed up with the signs in which the loads depend on xi, eta and the diagonal term.
+    x_0 = x_xi = x_eta = x_t = y_0 = y_xi = y_eta = y_t = m_0 = m_xi = m_eta = m_t = 0.0
+    for left in (True, False):
+        sign_y, roll = (1.0, radius * q_l / speed) if left else (-1.0, radius * q_r / speed)
+        y = sign_y * floor.half_track
+        slip = vx - y * wz - roll
+        taken, by_slip, _, _ = traction(slip, roll, floor.slip_stiffness, creep)
+        for ahead in (True, False):
+            sign_x = 1.0 if ahead else -1.0
+            x = sign_x * floor.half_wheelbase
+            fx, fy, _, _, _, _ = contact(slip, vy + x * wz, taken, by_slip, floor.side, floor.tread, creep)
+            fx -= floor.drag * rolling(roll)[0]  # 3.17
+            m = (x - x_g) * fy - (y - y_g) * fx
+            x_0, x_xi, x_eta, x_t = x_0 + fx, x_xi + sign_x * fx, x_eta + sign_y * fx, x_t + sign_x * sign_y * fx
+            y_0, y_xi, y_eta, y_t = y_0 + fy, y_xi + sign_x * fy, y_eta + sign_y * fy, y_t + sign_x * sign_y * fy
+            m_0, m_xi, m_eta, m_t = m_0 + m, m_xi + sign_x * m, m_eta + sign_y * m, m_t + sign_x * sign_y * m
+
+    # Loads hang on the accelerations, and these on the loads: 3.21-3.23 with 3.24 and 3.25, linear until a wheel lifts.
+    weight = mass * (gravity + ddz_g)
+    load = weight - f_z  # 3.21
+    xi_0 = (weight * x_g + (p_z - height) * f_x - p_x * f_z) / (load * floor.half_wheelbase)  # 3.23, a_x without friction
+    eta_0 = (weight * y_g + (p_z - height) * f_y - p_y * f_z) / (load * floor.half_track)  # 3.22
+    lean_x, lean_y = 0.25 * mu * height / floor.half_wheelbase, 0.25 * mu * height / floor.half_track
+    xi, eta = _inside(xi_0), _inside(eta_0)
+    for _ in range(_CLOSURE_STEPS):
+        _, _, _, _, t, t_xi, t_eta = loads(xi, eta, warp)
+        off_x = xi - xi_0 + lean_x * (x_0 + x_xi * xi + x_eta * eta + x_t * t)
+        off_y = eta - eta_0 + lean_y * (y_0 + y_xi * xi + y_eta * eta + y_t * t)
+        a, b = 1.0 + lean_x * (x_xi + x_t * t_xi), lean_x * (x_eta + x_t * t_eta)
+        c, d = lean_y * (y_xi + y_t * t_xi), 1.0 + lean_y * (y_eta + y_t * t_eta)
+        whole = 1.0 / (a * d - b * c)
+        new_xi = _inside(xi - whole * (d * off_x - b * off_y))
+        new_eta = _inside(eta - whole * (a * off_y - c * off_x))
+        moved = abs(new_xi - xi) + abs(new_eta - eta)
+        xi, eta = new_xi, new_eta
+        if moved < 1e-14:
+            break
+    _, _, _, _, t, _, _ = loads(xi, eta, warp)
+    grip = 0.25 * mu * load
+    force_x = grip * (x_0 + x_xi * xi + x_eta * eta + x_t * t)
+    force_y = grip * (y_0 + y_xi * xi + y_eta * eta + y_t * t)
+    moment = grip * (m_0 + m_xi * xi + m_eta * eta + m_t * t)
+    spin = wz * floor.half_track
+    moment -= mu * load * floor.scrub * spin / math.sqrt(spin * spin + creep * creep)
+    margin = 1.0 - max(
+        abs(xi_0 - height * force_x / (load * floor.half_wheelbase)), abs(eta_0 - height * force_y / (load * floor.half_track))
+    )
+
+    w = state[5]
+    a_x, a_y = (force_x + f_x) / mass, (force_y + f_y) / mass  # 3.24, 3.25
+    alpha = (moment + (p_x - x_g) * f_y - (p_y - y_g) * f_x) / inertia  # 3.26
+    base_x = a_x - ddx_g + y_g * alpha + 2.0 * dy_g * w + x_g * w * w  # 3.18
+    base_y = a_y - ddy_g - x_g * alpha - 2.0 * dx_g * w + y_g * w * w  # 3.19
+    return base_x + state[4] * w, base_y - state[3] * w, alpha, margin
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _inside(share: float) -> float:  # pragma: no cover
+    """``share``, or the edge of the wheelbase where it lies beyond."""
+    return min(1.0, max(-1.0, share))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _advance(
+    state: FloatArray, dt: float, steps: int, q_l: float, q_r: float, influence: FloatArray, floor: Floor, body: _Body
+) -> float:  # pragma: no cover
+    """Change ``state`` (6,) in place; the smallest tipping margin."""
+    h, margin = dt / steps, math.inf
+    now, trial, total, rate = influence.copy(), np.empty(6), np.empty(6), np.zeros(6)
+    for i in range(steps):
+        total[:] = 0.0
+        for stage in range(4):
+            ahead = 0.0 if stage == 0 else (h if stage == 3 else 0.5 * h)
+            for j in range(6):
+                trial[j] = state[j] + ahead * rate[j]
+            t = i * h + ahead
+            for j in range(2):  # the CG moves on
+                now[j] = influence[j] + t * (influence[2 + j] + 0.5 * t * influence[4 + j])
+                now[2 + j] = influence[2 + j] + t * influence[4 + j]
+            c, s = math.cos(trial[2]), math.sin(trial[2])
+            rate[0], rate[1], rate[2] = c * trial[3] - s * trial[4], s * trial[3] + c * trial[4], trial[5]
+            rate[3], rate[4], rate[5], left = _accelerations(trial, q_l, q_r, now, floor, body)
+            margin = min(margin, left)
+            for j in range(6):
+                total[j] += rate[j] * (1.0 if stage == 0 or stage == 3 else 2.0)
+        for j in range(6):
+            state[j] += h / 6.0 * total[j]
+    return margin
