@@ -34,17 +34,18 @@ def write_ros1_bag(path: Path, records: Iterable[Record], compression: str | Non
     if chunk_bytes:
         writer.chunk_threshold = chunk_bytes
     with writer:
-        connections: dict[str, Any] = {}
+        connections: dict[tuple[str, str], Any] = {}
         for topic, message, log_ns in records:
             if isinstance(message, Unknown):
-                if topic not in connections:
-                    connections[topic] = writer.add_connection(topic, message.type, msgdef=message.definition, md5sum="0" * 32)
-                writer.write(connections[topic], log_ns, message.data)
+                kind = message.type
+                if (topic, kind) not in connections:
+                    connections[topic, kind] = writer.add_connection(topic, message.type, msgdef=message.definition, md5sum="0" * 32)
+                writer.write(connections[topic, kind], log_ns, message.data)
                 continue
             kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=STORE_ROS1)
-            writer.write(connections[topic], log_ns, STORE.cdr_to_ros1(STORE.serialize_cdr(message, kind), kind))
+            if (topic, kind) not in connections:
+                connections[topic, kind] = writer.add_connection(topic, kind, typestore=STORE_ROS1)
+            writer.write(connections[topic, kind], log_ns, STORE.cdr_to_ros1(STORE.serialize_cdr(message, kind), kind))
     return path
 
 
@@ -54,17 +55,20 @@ def write_ros2_bag(path: Path, records: Iterable[Record], storage: str = "mcap",
     if compression:
         writer.set_compression(rosbag2.CompressionMode[compression.upper()], rosbag2.CompressionFormat.ZSTD)
     with writer:
-        connections: dict[str, Any] = {}
+        connections: dict[tuple[str, str], Any] = {}
         for topic, message, log_ns in records:
             if isinstance(message, Unknown):
-                if topic not in connections:
-                    connections[topic] = writer.add_connection(topic, message.type, msgdef=message.definition, rihs01="RIHS01_" + "0" * 64)
-                writer.write(connections[topic], log_ns, message.data)
+                kind = message.type
+                if (topic, kind) not in connections:
+                    connections[topic, kind] = writer.add_connection(
+                        topic, message.type, msgdef=message.definition, rihs01="RIHS01_" + "0" * 64
+                    )
+                writer.write(connections[topic, kind], log_ns, message.data)
                 continue
             kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
-            writer.write(connections[topic], log_ns, STORE.serialize_cdr(message, kind))
+            if (topic, kind) not in connections:
+                connections[topic, kind] = writer.add_connection(topic, kind, typestore=STORE)
+            writer.write(connections[topic, kind], log_ns, STORE.serialize_cdr(message, kind))
     return path
 
 

@@ -137,6 +137,12 @@ def test_sqlite_that_was_cut_off(tmp_path: Path, compression: str | None, bare: 
     assert "run.db3 was read page by page" in said(log)
 
 
+def test_rows_that_wait_beside_the_file_are_told_of(tmp_path: Path) -> None:
+    path = bags.write_ros2_bag(tmp_path / "run", records(20), "sqlite3")
+    (path / "run.db3-wal").write_bytes(b"x")
+    assert "run.db3-wal holds rows" in said(open_log(path, ROBOT))
+
+
 def test_sqlite_rows_longer_than_a_page_survive_a_cut(tmp_path: Path) -> None:
     """Point clouds overflow onto further pages; one whose last page is missing is left out."""
     rng = np.random.default_rng(5)

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rosbags import rosbag1
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.logs import Log, open_log
@@ -234,11 +236,17 @@ def test_missing_positions_or_velocities_are_nan(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("wrapped", [lambda a: (a + np.pi) % (2 * np.pi) - np.pi, lambda a: a % (2 * np.pi)])
-def test_wheel_angles_that_wrap_are_unwrapped(tmp_path: Path, wrapped: Any) -> None:
+@pytest.mark.parametrize("with_rates", [True, False])
+def test_wheel_angles_that_wrap_are_unwrapped(tmp_path: Path, wrapped: Any, with_rates: bool) -> None:
     """A mean of wrapped angles would be nonsense: the wheels of a side wrap one after the other."""
     rates = np.array([3.0, 4.0, 3.5, 4.5])
-    messages = [bags.joint_state(START + i * S // 20, position=wrapped(rates * i / 20 + [0, 1, 2, 3]), velocity=rates) for i in range(200)]
-    wheels = wheels_of(log_of(tmp_path, "/joint_states", messages, S // 20))
+    messages = [
+        bags.joint_state(START + i * S // 20, position=wrapped(rates * i / 20 + [0, 1, 2, 3]), velocity=1.02 * rates if with_rates else ())
+        for i in range(200)
+    ]
+    log = log_of(tmp_path, "/joint_states", messages, S // 20)
+    wheels = wheels_of(log)
+    assert log.notes() == []
     moved = wheels[-1].position - wheels[0].position
     np.testing.assert_allclose(moved, np.array([3.25, 4.25]) * 199 / 20, rtol=1e-9)
 
@@ -392,3 +400,39 @@ def test_events_are_ours_alone(tmp_path: Path) -> None:
     poses, twists = drive(RNG_RATES, 0.1, ROBOT.driver)
     events: list[Event] = list(odometry_log(tmp_path, poses, twists).events())
     assert {type(event) for event in events} == {WheelSample}
+
+
+def test_a_type_that_the_log_defines_otherwise_is_dropped_and_counted(tmp_path: Path) -> None:
+    """The bytes are those of the log's definition, but there is nothing in them that an IMU would tell."""
+    definition = "std_msgs/Header header\nfloat64 temperature\n" + "=" * 80 + "\n"
+    definition += "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n" + "=" * 80 + "\n"
+    definition += "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(definition, "sensor_msgs/msg/Imu"))
+    types = store.types
+    header = types["std_msgs/msg/Header"](stamp=types["builtin_interfaces/msg/Time"](sec=START // S, nanosec=0), frame_id="imu_link")
+    data = bytes(store.serialize_cdr(types["sensor_msgs/msg/Imu"](header=header, temperature=20.0), "sensor_msgs/msg/Imu"))
+    log = log_of(tmp_path, "/imu/data", [bags.Unknown("sensor_msgs/msg/Imu", definition, data)] * 3)
+    assert list(log.events()) == []
+    assert log.notes() == ["/imu/data: 3 messages dropped, for their fields contradict each other."]
+
+
+def test_two_types_and_two_publishers_on_one_topic(tmp_path: Path) -> None:
+    """The more frequent type is the topic's; its publishers are one."""
+    records: list[Any] = [("/scan", bags.laser_scan(START + i * S // 10), START + i * S // 10) for i in range(10)]
+    records.insert(5, ("/scan", bags.imu(START + S // 2), START + S // 2))
+    log = open_log(bags.write_ros1_bag(tmp_path / "run.bag", records), ROBOT)
+    assert len(list(log.events())) == 10
+    assert [(t.topic, t.type, t.count) for t in log.info().topics] == [
+        ("/scan", "sensor_msgs/LaserScan", 10),
+        ("/scan", "sensor_msgs/Imu", 1),
+    ]
+    writer = rosbag1.Writer(tmp_path / "two.bag")
+    with writer:
+        connections = [
+            writer.add_connection("/scan", "sensor_msgs/msg/LaserScan", typestore=bags.STORE_ROS1, callerid=name) for name in ("/a", "/b")
+        ]
+        for i in range(10):
+            data = bags.STORE.cdr_to_ros1(bags.STORE.serialize_cdr(records[0][1], "sensor_msgs/msg/LaserScan"), "sensor_msgs/msg/LaserScan")
+            writer.write(connections[i % 2], START + i * S // 10, data)
+    assert [(t.topic, t.count) for t in open_log(tmp_path / "two.bag", ROBOT).info().topics] == [("/scan", 10)]

@@ -274,6 +274,18 @@ def test_info_of_a_log_that_was_cut_off_says_so(tmp_path: Path) -> None:
     json.dumps(info.to_dict(), allow_nan=False)
 
 
+def test_info_tells_which_sensor_ends_early(tmp_path: Path) -> None:
+    records: list[Record] = []
+    for i in range(300):
+        t = START + i * S // 10
+        records.append(("/odom", bags.odometry(t), t))
+        if 50 <= i < 200:
+            records.append(("/scan", bags.laser_scan(t), t))
+    said = "\n".join(log_of(tmp_path, records).info().problems)
+    assert "/scan begins 5.0 s after the other sensors" in said
+    assert "/scan ends 10.0 s before the other sensors" in said
+
+
 def test_info_names_the_reference_that_will_be_used(tmp_path: Path) -> None:
     records = pad([("/ground_truth/odom", bags.odometry(START + i * S), START + i * S) for i in range(5)])
     info = log_of(tmp_path, records).info()

@@ -10,7 +10,7 @@ import bz2
 import heapq
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -43,6 +43,15 @@ class Channel:
     definition: MessageDefinition
     count: int
     """Messages of it in the log."""
+
+
+def merge_channels(channels: Iterable[Channel]) -> list[Channel]:
+    """One channel for each topic and type, where every publisher or every file has one."""
+    merged: dict[tuple[str, str], Channel] = {}
+    for channel in channels:
+        before = merged.get((channel.topic, channel.type))
+        merged[channel.topic, channel.type] = channel if before is None else replace(before, count=before.count + channel.count)
+    return list(merged.values())
 
 
 class Source(Protocol):

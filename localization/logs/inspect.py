@@ -18,6 +18,7 @@ _STAMPED = {*TYPES.values(), *REFERENCE_TYPES}
 _GAP_PERIODS, _SHORTEST_GAP_S, _MOST_GAPS = 5.0, 0.25, 10
 _TYPICAL_OF = 200
 _CLOCK_LIMIT_S = 10.0
+_UNEVEN_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -123,9 +124,11 @@ class _Statistics:
 
 def inspect_log(log: Log) -> LogInfo:
     """Go through the log once, reading no more of a message than its header."""
-    stamped = [channel.topic for channel in log.source.channels if channel.type in _STAMPED]
+    stamped = [channel.topic for channel in log.channels if channel.type in _STAMPED]
     statistics_of = {topic: _Statistics() for topic in stamped}
     for raw in log.source.messages(stamped) if stamped else ():
+        if raw.type not in _STAMPED:
+            continue
         statistics_of[raw.topic].add(raw.log_ns, header_stamp_ns(raw.data, is_ros1=log.source.is_ros1))
     parts = {
         "wheels": log.sources.wheels,
@@ -137,7 +140,7 @@ def inspect_log(log: Log) -> LogInfo:
     if log.reference_topic is not None:
         played.setdefault(log.reference_topic, "reference")
     topics = []
-    for channel in sorted(log.source.channels, key=lambda c: c.topic):
+    for channel in sorted(log.channels, key=lambda c: c.topic):
         known = statistics_of.get(channel.topic, _Statistics())
         rate = known.rate_hz() if known.count else (channel.count / log.duration_s if log.duration_s > 0 else None)
         topics.append(
@@ -163,10 +166,10 @@ def inspect_log(log: Log) -> LogInfo:
         log.start_ns,
         log.end_ns,
         log.duration_s,
-        sum(channel.count for channel in log.source.channels),
+        sum(channel.count for channel in log.channels),
         topics,
         {part: None if source is None else dataclasses.asdict(source) for part, source in parts.items()},
-        sorted(c.topic for c in log.source.channels if c.type in REFERENCE_TYPES and c.count and played.get(c.topic) != "wheels"),
+        sorted(c.topic for c in log.channels if c.type in REFERENCE_TYPES and c.count and played.get(c.topic) != "wheels"),
         {frame: dataclasses.asdict(mount) for frame, mount in sorted(mounts.items())},
         _problems(log, topics),
         log.notes(),
@@ -205,6 +208,7 @@ def _problems(log: Log, topics: list[TopicInfo]) -> list[str]:
                 f"{source.topic} is measured in frame '{frame}', whose place on the robot neither the log's /tf_static nor the robot"
                 f" file tells; add [mounts.{frame}] to the robot file."
             )
+    said += _uneven(log, topics)
     used = [topic for topic in topics if topic.used_as in ("wheels", "lidar", "imu", "center_of_gravity")]
     for topic in used:
         for count, what in (
@@ -223,4 +227,21 @@ def _problems(log: Log, topics: list[TopicInfo]) -> list[str]:
                 f"{topic.topic}: {len(topic.gaps)} gap{'s' if len(topic.gaps) > 1 else ''}, the longest {longest.duration_s:.2f} s long,"
                 f" {longest.at_s:.1f} s after its first message."
             )
+    return said
+
+
+def _uneven(log: Log, topics: list[TopicInfo]) -> list[str]:
+    """Sensors that begin after or end before the others."""
+    spans = [(t, t.first_stamp_ns, t.last_stamp_ns) for t in topics if t.used_as in ("wheels", "lidar", "imu")]
+    known = [(t, first, last) for t, first, last in spans if first is not None and last is not None]
+    if len(known) < 2:
+        return []
+    begin, end = min(first for _, first, _ in known), max(last for _, _, last in known)
+    if end - begin > (log.end_ns - log.start_ns) + _CLOCK_LIMIT_S * 1e9:
+        return []  # their clocks differ, which is told elsewhere
+    said = []
+    for topic, first, last in known:
+        for apart_s, what in (((first - begin) * 1e-9, "begins {:.1f} s after"), ((end - last) * 1e-9, "ends {:.1f} s before")):
+            if apart_s > _UNEVEN_S:
+                said.append(f"{topic.topic} {what.format(apart_s)} the other sensors.")
     return said

@@ -9,7 +9,7 @@ from typing import Any
 
 from localization.errors import LogError, TopicError
 from localization.events import Event, Reference
-from localization.logs.chunks import Source
+from localization.logs.chunks import Source, merge_channels
 from localization.logs.clouds import decode_cloud
 from localization.logs.decode import (
     Decoder,
@@ -29,7 +29,7 @@ from localization.logs.merge import ClockPlan, Item, merge, plan_clocks
 from localization.logs.mounts import FixedTransforms
 from localization.logs.references import reference_decoder
 from localization.logs.source import open_source
-from localization.logs.tally import Tally
+from localization.logs.tally import Oddity, Tally
 from localization.logs.topics import REFERENCE_TYPES, TYPES, Sources, TopicChooser, TopicOverrides, TopicSource
 from localization.logs.wheels import joints_to_wheels, odometry_to_wheels
 from motion_models.robot import Mount, Robot
@@ -50,8 +50,6 @@ def open_log(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverr
     names one that is not there or carries something else.
     """
     path = Path(path)
-    if not path.exists():
-        raise LogError(f"no log '{path}': there is no such file or folder.")
     return Log(path, open_source(path), robot, topics)
 
 
@@ -62,19 +60,23 @@ class Log:
         self.path, self.robot = path, robot
         self.source = source
         """The file itself: its channels and raw messages."""
-        count = sum(channel.count for channel in source.channels)
+        self.channels = merge_channels(source.channels)
+        """Topics and types in the log."""
+        count = sum(channel.count for channel in self.channels)
         if count < 2:
             found = "no message" if count == 0 else "only one message"
             raise LogError(" ".join([f"log '{path}' holds {found}; motion needs more.", *source.notes]))
         self.start_ns, self.end_ns = source.start_ns, source.end_ns
         """Time of recording of the first and the last message."""
-        self._types = {channel.topic: channel.type for channel in source.channels}
+        self._types: dict[str, str] = {}
+        for channel in sorted(self.channels, key=lambda c: -c.count):  # of a topic with two types, the more frequent one counts
+            self._types.setdefault(channel.topic, channel.type)
         self._joints: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
         self.wheels_error: TopicError | None = None
         """Why `events` will refuse, if it will."""
         self._choice_notes: list[str] = []
         self._tallies: dict[str, Tally] = {}
-        self._chooser = TopicChooser(path.name, source.channels, robot, topics)
+        self._chooser = TopicChooser(path.name, self._types, robot, topics)
         self._overrides = topics
         self.sources = Sources(self._choose_wheels(), self._choose_lidar(), self._choose("imu"), self._choose("center_of_gravity"))
         """Which topic plays which part."""
@@ -121,7 +123,7 @@ class Log:
     def mounts(self) -> Mapping[str, Mount]:
         """Pose of each sensor's frame in the body frame: the log's, and the robot file's for frames which the log lacks."""
         transforms = FixedTransforms()
-        tf = [channel for channel in self.source.channels if channel.type in _TF_TYPES]
+        tf = [channel for channel in self.channels if channel.type in _TF_TYPES]
         static = [channel for channel in tf if channel.topic.endswith("tf_static")]
         decode = Decoder(tf, is_ros1=self.source.is_ros1)
         left = sum(channel.count for channel in static)
@@ -176,8 +178,10 @@ class Log:
         return decoders[source.kind]
 
     def _items(self, parts: Mapping[str, tuple[int, Payload]], tally: Tally) -> Iterator[Item]:
-        decode = Decoder([c for c in self.source.channels if c.topic in parts], is_ros1=self.source.is_ros1)
+        decode = Decoder([c for c in self.channels if c.topic in parts], is_ros1=self.source.is_ros1)
         for raw in self.source.messages(parts.keys()):
+            if raw.type != self._types[raw.topic]:
+                continue
             rank, payload_of = parts[raw.topic]
             try:
                 message = decode(raw)
@@ -186,19 +190,24 @@ class Log:
             except UnusableError as reason:
                 tally.count(raw.topic, reason.oddity)
                 continue
+            except (AttributeError, TypeError, ValueError):  # the log's own definition of the type lacks what the type has
+                tally.count(raw.topic, Oddity.MALFORMED)
+                continue
             if payload is not None:
                 yield Item(raw.log_ns, stamp, raw.topic, rank, _SCAN_WEIGHT if rank == 3 else 1, payload)
 
     def _first_messages(self, topic: str, most: int) -> Iterator[tuple[int, Any]]:
         """The first decodable messages of a topic, with their time of recording."""
-        decode = Decoder([c for c in self.source.channels if c.topic == topic], is_ros1=self.source.is_ros1)
+        decode = Decoder([c for c in self.channels if c.topic == topic], is_ros1=self.source.is_ros1)
         for number, raw in enumerate(self.source.messages([topic])):
             if number >= most:
                 return
             try:
-                yield raw.log_ns, decode(raw)
+                message = decode(raw)
             except UnusableError:
                 continue
+            if raw.type == self._types[topic] and hasattr(message, "header"):
+                yield raw.log_ns, message
 
     def _watch_clocks(self) -> ClockPlan:
         return self._clock_plan([source.topic for source in self.sources.used()])

@@ -13,14 +13,17 @@ from rosbags.rosbag2 import Reader
 
 from localization.errors import LogError
 from localization.logs import mcap, ros1, sqlite
-from localization.logs.chunks import Channel, DamagedError, RawMessage, Source, inflate_file
+from localization.logs.chunks import Channel, DamagedError, RawMessage, Source, inflate_file, merge_channels
 
 
 def open_source(path: Path) -> Source:
     """The log at ``path``. Raises `LogError` if it is not there, not a log, or nothing in it can be read."""
     if not path.exists():
         raise LogError(f"no log '{path}': there is no such file or folder.")
-    return _open_folder(path) if path.is_dir() else _open_file(path)
+    try:
+        return _open_folder(path) if path.is_dir() else _open_file(path)
+    except OSError as error:
+        raise LogError(f"log '{path}' cannot be read: {error.strerror}.") from error
 
 
 def _open_folder(path: Path) -> Source:
@@ -57,11 +60,8 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 
 def _open_file(path: Path) -> Source:
-    try:
-        with path.open("rb") as file:
-            head = file.read(16)
-    except OSError as error:
-        raise LogError(f"log '{path}' cannot be read: {error.strerror}.") from error
+    with path.open("rb") as file:
+        head = file.read(16)
     if not head:
         raise LogError(f"log '{path}' is empty.")
     if head.startswith(ros1.MAGIC):
@@ -91,6 +91,12 @@ class Ros2Bag:
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        self._notes = [
+            f"{wal.name} holds rows that the recorder had not yet moved into {wal.name.removesuffix('-wal')}; they are not read."
+            " Opening that file once with SQLite's own shell moves them."
+            for wal in sorted(path.glob("*.db3-wal") if path.is_dir() else path.parent.glob(path.name + "-wal"))
+            if wal.stat().st_size > 0
+        ]
         self._rest: Source | None = None
         self._held: Reader | None = None
         files = path.glob("*.mcap") if path.is_dir() else [path] if path.suffix == ".mcap" else []
@@ -111,7 +117,7 @@ class Ros2Bag:
 
     @property
     def notes(self) -> list[str]:
-        return [] if self._rest is None else self._rest.notes
+        return self._notes if self._rest is None else [*self._notes, *self._rest.notes]
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         last = self.start_ns - 1
@@ -165,12 +171,7 @@ class Parts:
     def __init__(self, parts: list[Source], notes: list[str]) -> None:
         self._parts, self._notes = parts, notes
         self.is_ros1 = False
-        counts: dict[tuple[str, str], Channel] = {}
-        for channel in chain.from_iterable(part.channels for part in parts):
-            before = counts.get((channel.topic, channel.type))
-            total = channel.count + (before.count if before else 0)
-            counts[channel.topic, channel.type] = Channel(channel.topic, channel.type, channel.definition, total)
-        self.channels = list(counts.values())
+        self.channels = merge_channels(chain.from_iterable(part.channels for part in parts))
         filled = [part for part in parts if any(channel.count for channel in part.channels)]
         self.start_ns = min((part.start_ns for part in filled), default=0)
         self.end_ns = max((part.end_ns for part in filled), default=0)

@@ -23,7 +23,7 @@ class Oddity(Enum):
     POSE_JUMP = "with a pose that wheels cannot reach (a reset), whose increment was taken from their rates"
     NO_POSE = "whose pose never moves while their rates do, so that increments were taken from these"
     NO_TWIST = "with a moving pose and no rates, which were taken from the pose"
-    WHEEL_JUMP = "with a wheel angle that wheels cannot reach (a reset or a wrap), whose increment was taken from their rates"
+    WHEEL_JUMP = "with a wheel angle that wheels cannot reach (a reset), whose increment was taken from their rates"
 
 
 class Tally:

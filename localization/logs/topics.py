@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from localization.errors import TopicError
-from localization.logs.chunks import Channel
 from motion_models.robot import Robot
 
 TYPES: Mapping[str, str] = {
@@ -73,12 +72,10 @@ class Sources:
 class TopicChooser:
     """The topics of one log, and the choice among them."""
 
-    def __init__(self, log: str, channels: Iterable[Channel], robot: Robot, overrides: TopicOverrides) -> None:
+    def __init__(self, log: str, types: Mapping[str, str], robot: Robot, overrides: TopicOverrides) -> None:
+        """``types``: of each topic."""
         self._log, self._robot, self._overrides = log, robot, overrides
-        self._types: dict[str, str] = {}
-        for channel in channels:
-            if channel.count > 0:
-                self._types.setdefault(channel.topic, channel.type)
+        self._types = types
         self.notes: list[str] = []
 
     def of_type(self, *types: str) -> list[str]:

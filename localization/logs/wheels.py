@@ -1,7 +1,7 @@
 """Readings of joints or of a driver's odometry, in order of time, to wheel samples: side means, and angles that lose nothing.
 
-Angles are sums of increments, so that a reading that the wheels cannot have made (an encoder or an odometry that was reset, an angle
-that wrapped) costs its own increment only; that is then taken from the rates.
+Angles are sums of increments, so that a reading that the wheels cannot have made (an encoder or an odometry that was reset) costs its
+own increment only, which is then taken from the rates. An angle that wrapped costs nothing.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ _FASTEST_M_PER_S = 5.0
 _FASTEST_RAD_PER_S = 10.0
 _SHORTEST_S = 0.05  # stamps jitter: over shorter times than this a speed means nothing
 _STILL_M, _STILL_RAD = 1e-9, 1e-9
+_WRAP_RAD, _WRAP_WITHOUT_RATE_RAD = 0.3, 1.0
 
 
 def joints_to_wheels(left: int, right: int, wheel_radius_m: float, topic: str, tally: Tally) -> Callable[[JointReading], WheelSample]:
@@ -43,8 +44,12 @@ def joints_to_wheels(left: int, right: int, wheel_radius_m: float, topic: str, t
             step = reading.position - known.position
             jumped = np.abs(step) * wheel_radius_m > _FASTEST_M_PER_S * max(dt, _SHORTEST_S)
             if jumped.any():
-                tally.count(topic, Oddity.WHEEL_JUMP)
-                step = np.where(jumped, np.nan_to_num(reading.velocity) * dt, step)
+                expected = np.nan_to_num(reading.velocity) * dt
+                wrapped = np.remainder(step + math.pi, math.tau) - math.pi
+                is_wrap = np.abs(wrapped - expected) < np.where(np.isfinite(reading.velocity), _WRAP_RAD, _WRAP_WITHOUT_RATE_RAD)
+                if (jumped & ~is_wrap).any():
+                    tally.count(topic, Oddity.WHEEL_JUMP)
+                step = np.where(jumped, np.where(is_wrap, wrapped, expected), step)
             angle = angle + step
         known = reading
         return WheelSample(reading.stamp_ns, side_means(reading.velocity), side_means(angle))
