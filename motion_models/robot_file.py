@@ -1,0 +1,57 @@
+"""Robots written as the TOML files that `load_robot` reads."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from motion_models.robot import Robot
+
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+
+
+def robot_toml(robot: Robot, sigmas: Mapping[str, Mapping[str, float]] | None = None, remarks: str = "") -> str:
+    """The whole of ``robot`` as TOML; `parse_robot` of it is equal to ``robot``.
+
+    ``sigmas``: model -> parameter -> standard deviation, written as a comment beside the value. ``remarks`` (any number of lines)
+    come first, as comments: what it was calibrated on.
+    """
+    sigmas = sigmas or {}
+    lines = [f"# {line}".rstrip() for line in remarks.splitlines()]
+    lines.append(f"name = {_value(robot.name)}")
+    for name in ("geometry", "driver", "topics", "joints", "wheel_noise", "gyro_noise"):
+        lines += _table(name, dataclasses.asdict(getattr(robot, name)))
+    for frame, mount in robot.mounts.items():
+        lines += _table(f"mounts.{_key(frame)}", dataclasses.asdict(mount))
+    for model, coefficients in robot.models.items():
+        lines += _table(f"models.{_key(model)}", coefficients, sigmas.get(model, {}))
+    return "\n".join(lines) + "\n"
+
+
+def _table(header: str, values: Mapping[str, Any], sigmas: Mapping[str, float] | None = None) -> list[str]:
+    lines = ["", f"[{header}]"]
+    for name, value in values.items():
+        sigma = (sigmas or {}).get(name)
+        remark = "" if sigma is None else f"  # +- {sigma:.2g}"
+        lines.append(f"{_key(name)} = {_value(value)}{remark}")
+    return lines
+
+
+def _key(name: str) -> str:
+    return name if _BARE_KEY.fullmatch(name) else _text(name)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, str):
+        return _text(value)
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(_text(v) for v in value) + "]"
+    return repr(float(value))
+
+
+def _text(value: str) -> str:
+    # JSON's strings are TOML's, but for the one control character that JSON leaves alone.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
