@@ -182,7 +182,7 @@ def _broken_clouds() -> dict[str, Any]:
 def test_clouds_that_contradict_themselves_are_dropped_and_counted(tmp_path: Path, name: str) -> None:
     scans, log = scans_of(tmp_path, [_broken_clouds()[name]], "/points")
     assert scans == []
-    assert log.notes() == ["/points: 1 message dropped, for their fields contradict each other."]
+    assert log.notes() == ["/points: 1 message dropped (fields that contradict each other)."]
 
 
 def test_an_empty_cloud_is_a_scan(tmp_path: Path) -> None:
@@ -202,7 +202,7 @@ def test_samples_that_are_not_finite_are_dropped_and_counted(tmp_path: Path) -> 
     ]
     log = log_of(tmp_path, "/imu/data", messages)
     assert [e.stamp_ns - START for e in log.events() if isinstance(e, ImuSample)] == [0, 3000]
-    assert log.notes() == ["/imu/data: 2 messages dropped, for they hold NaN or inf."]
+    assert log.notes() == ["/imu/data: 2 messages dropped (NaN or inf)."]
     (tmp_path / "cg").mkdir()
     log = log_of(tmp_path / "cg", "/center_of_gravity", [bags.point_stamped(START, np.nan, 0.0), bags.point_stamped(START + S, 0.1, 0.2)])
     assert len(list(log.events())) == 1
@@ -215,7 +215,7 @@ def test_bytes_that_are_not_the_message_are_dropped_and_counted(tmp_path: Path) 
     ]
     log = log_of(tmp_path, "/imu/data", messages)
     assert list(log.events()) == []
-    assert log.notes() == ["/imu/data: 3 messages dropped, for their bytes are not those of their type."]
+    assert log.notes() == ["/imu/data: 3 messages dropped (bytes that are not of the type)."]
 
 
 # Joint states
@@ -232,7 +232,7 @@ def test_missing_positions_or_velocities_are_nan(tmp_path: Path) -> None:
     wheels = wheels_of(log)
     np.testing.assert_array_equal([w.velocity for w in wheels], [(2, 3), (np.nan, np.nan), (2, np.nan)])
     np.testing.assert_allclose([w.position for w in wheels], [(np.nan, np.nan), (0.2, 0.3), (0.6, 0.7)])
-    assert log.notes() == ["/joint_states: 1 message dropped, for they hold NaN or inf."]
+    assert log.notes() == ["/joint_states: 1 message dropped (NaN or inf)."]
 
 
 @pytest.mark.parametrize("wrapped", [lambda a: (a + np.pi) % (2 * np.pi) - np.pi, lambda a: a % (2 * np.pi)])
@@ -311,14 +311,14 @@ def test_a_driver_without_twist_is_understood_from_its_pose(tmp_path: Path) -> N
     wheels = wheels_of(log)
     np.testing.assert_allclose([w.velocity for w in wheels[1:]], RNG_RATES, atol=1e-9)
     np.testing.assert_allclose(np.diff([w.position for w in wheels], axis=0), RNG_RATES * 0.1, atol=1e-9)
-    assert any("60 messages with a moving pose and no rates" in note for note in log.notes())
+    assert any("60 messages with a moving pose but no rates" in note for note in log.notes())
 
 
 def test_a_driver_without_pose_is_understood_from_its_twist(tmp_path: Path) -> None:
     poses, twists = drive(RNG_RATES, 0.1, ROBOT.driver)
     log = odometry_log(tmp_path, 0.0 * poses, twists)
     np.testing.assert_allclose(np.diff([w.position for w in wheels_of(log)], axis=0), RNG_RATES * 0.1, atol=1e-9)
-    assert any("pose never moves" in note for note in log.notes())
+    assert any("pose that never moves" in note for note in log.notes())
 
 
 def test_an_odometry_that_is_reset_costs_one_increment(tmp_path: Path) -> None:
@@ -414,7 +414,7 @@ def test_a_type_that_the_log_defines_otherwise_is_dropped_and_counted(tmp_path: 
     data = bytes(store.serialize_cdr(types["sensor_msgs/msg/Imu"](header=header, temperature=20.0), "sensor_msgs/msg/Imu"))
     log = log_of(tmp_path, "/imu/data", [bags.Unknown("sensor_msgs/msg/Imu", definition, data)] * 3)
     assert list(log.events()) == []
-    assert log.notes() == ["/imu/data: 3 messages dropped, for their fields contradict each other."]
+    assert log.notes() == ["/imu/data: 3 messages dropped (fields that contradict each other)."]
 
 
 def test_two_types_and_two_publishers_on_one_topic(tmp_path: Path) -> None:

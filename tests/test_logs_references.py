@@ -73,7 +73,7 @@ def test_poses_that_are_none_are_dropped_and_counted(tmp_path: Path) -> None:
     nothing.pose.orientation = type(q)(x=0.0, y=0.0, z=0.0, w=0.0)
     references, log = references_of(tmp_path, [bags.pose_stamped(START), nothing, bags.pose_stamped(START + 2 * S, np.nan)])
     assert len(references) == 1
-    assert log.notes() == ["/ref: 2 messages dropped, for they hold NaN or inf."]
+    assert log.notes() == ["/ref: 2 messages dropped (NaN or inf)."]
 
 
 def test_gps_is_east_and_north_of_the_first_fix_in_metres(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_gps_without_a_fix_is_left_out_and_cannot_be_the_origin(tmp_path: Path) 
     np.testing.assert_array_equal(references[0].covariance[:2, :2], [[1.0, 0.0], [0.0, 4.0]])
     assert np.isnan(references[0].covariance[2]).all()
     assert np.isnan(references[1].covariance).all()
-    assert log.notes() == ["/ref: 2 messages left out, for they have no GPS fix."]
+    assert log.notes() == ["/ref: 2 messages left out (no GPS fix)."]
 
 
 def test_the_huskys_gps_covers_the_ground_that_its_source_tells() -> None:

@@ -100,6 +100,29 @@ def test_a_missing_topic_is_named_with_those_that_fit(tmp_path: Path) -> None:
         log_of(tmp_path, {"/joint_states": "joints", "/ouster/points": "points"}, TopicOverrides(points="/points"))
 
 
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_topic_without_messages_plays_no_part(tmp_path: Path, storage: str) -> None:
+    """Recorders list the topics that they subscribed to, whether anything came or not."""
+    from rosbags import rosbag2
+
+    with rosbag2.Writer(tmp_path / "run", version=9, storage_plugin=rosbag2.StoragePlugin[storage.upper()]) as writer:
+        writer.add_connection("/scan", "sensor_msgs/msg/LaserScan", typestore=bags.STORE)
+        points = writer.add_connection("/points", "sensor_msgs/msg/PointCloud2", typestore=bags.STORE)
+        for i in range(5):
+            writer.write(points, START + i * S, bags.STORE.serialize_cdr(bags.cloud(START + i * S, POINTS), "sensor_msgs/msg/PointCloud2"))
+    log = open_log(tmp_path / "run", ROBOT)
+    assert parts(log)["lidar"] == ("/points", "robot")
+    assert len(list(log.events())) == 5
+    with pytest.raises(TopicError, match=r"topic '/scan' of run has no messages.*no topic of type sensor_msgs/LaserScan"):
+        open_log(tmp_path / "run", ROBOT, TopicOverrides(scan="/scan"))
+
+
+def test_two_topics_with_the_wheel_joints_are_not_guessed_between(tmp_path: Path) -> None:
+    log = log_of(tmp_path, {"/a/joints": "joints", "/b/joints": "joints", "/odom": "odom"})
+    assert parts(log)["wheels"] == ("/odom", "robot")
+    assert any("/a/joints, /b/joints" in note for note in log.notes())
+
+
 def test_a_topic_of_the_wrong_type_says_so(tmp_path: Path) -> None:
     with pytest.raises(
         TopicError, match=r"'/pose' in run\.mcap carries geometry_msgs/PoseStamped, not sensor_msgs/Imu.*no topic of type.*--topic\.imu"

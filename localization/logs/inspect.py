@@ -149,7 +149,7 @@ def inspect_log(log: Log) -> LogInfo:
                 short_type(channel.type),
                 channel.count,
                 rate,
-                played.get(channel.topic),
+                played.get(channel.topic) if log.types[channel.topic] == channel.type else None,
                 log.frames.get(channel.topic),
                 known.first,
                 known.last if known.first is not None else None,

@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from localization.errors import LogError, TopicError
+from localization.errors import LogError
 from localization.events import Event, Reference
 from localization.logs.chunks import Source, merge_channels
 from localization.logs.clouds import decode_cloud
@@ -27,10 +27,11 @@ from localization.logs.decode import (
 from localization.logs.inspect import LogInfo, inspect_log
 from localization.logs.merge import ClockPlan, Item, merge, plan_clocks
 from localization.logs.mounts import FixedTransforms
+from localization.logs.parts import choose_parts
 from localization.logs.references import reference_decoder
 from localization.logs.source import open_source
 from localization.logs.tally import Oddity, Tally
-from localization.logs.topics import REFERENCE_TYPES, TYPES, Sources, TopicChooser, TopicOverrides, TopicSource
+from localization.logs.topics import REFERENCE_TYPES, TopicChooser, TopicOverrides, TopicSource
 from localization.logs.wheels import joints_to_wheels, odometry_to_wheels
 from motion_models.robot import Mount, Robot
 
@@ -59,7 +60,7 @@ class Log:
     def __init__(self, path: Path, source: Source, robot: Robot, topics: TopicOverrides) -> None:
         self.path, self.robot = path, robot
         self.source = source
-        """The file itself: its channels and raw messages."""
+        """The file itself, with its raw messages."""
         self.channels = merge_channels(source.channels)
         """Topics and types in the log."""
         count = sum(channel.count for channel in self.channels)
@@ -68,18 +69,19 @@ class Log:
             raise LogError(" ".join([f"log '{path}' holds {found}; motion needs more.", *source.notes]))
         self.start_ns, self.end_ns = source.start_ns, source.end_ns
         """Time of recording of the first and the last message."""
-        self._types: dict[str, str] = {}
+        self.types: dict[str, str] = {}
+        """Type of each topic."""
         for channel in sorted(self.channels, key=lambda c: -c.count):  # of a topic with two types, the more frequent one counts
-            self._types.setdefault(channel.topic, channel.type)
-        self._joints: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
-        self.wheels_error: TopicError | None = None
-        """Why `events` will refuse, if it will."""
-        self._choice_notes: list[str] = []
+            self.types.setdefault(channel.topic, channel.type)
         self._tallies: dict[str, Tally] = {}
-        self._chooser = TopicChooser(path.name, self._types, robot, topics)
         self._overrides = topics
-        self.sources = Sources(self._choose_wheels(), self._choose_lidar(), self._choose("imu"), self._choose("center_of_gravity"))
+        self._chooser = TopicChooser(path.name, self.channels, robot, topics)
+        parts = choose_parts(path.name, self._chooser, robot, topics, self._joint_names)
+        self.sources = parts.sources
         """Which topic plays which part."""
+        self.wheels_error = parts.wheels_error
+        """Why `events` will refuse, if it will."""
+        self._joints, self._choice_notes = parts.joints, parts.notes
         self.frames: dict[str, str] = {}
         """Frame of the first message of each topic that is used."""
         self._clocks = self._watch_clocks()
@@ -92,7 +94,7 @@ class Log:
     def reference_topic(self) -> str | None:
         """The option's or the robot file's reference, if the log has it and if it can be one."""
         topic = self._overrides.reference if self._overrides.reference is not None else self.robot.topics.reference
-        return topic if self._types.get(topic) in REFERENCE_TYPES else None
+        return topic if topic in self._chooser.of_type(*REFERENCE_TYPES) else None
 
     def info(self) -> LogInfo:
         """What is in the log, what will be used of it, and what is missing or suspect. Reads it once."""
@@ -115,7 +117,7 @@ class Log:
         """
         self._chooser.require(topic, REFERENCE_TYPES, "--reference")
         tally = self._tallies[topic] = Tally()
-        decode = reference_decoder(self._types[topic])
+        decode = reference_decoder(self.types[topic])
         clocks = self._clock_plan([*(s.topic for s in self.sources.used()), topic])
         return merge(self._items({topic: (0, decode)}, tally), clocks, tally)
 
@@ -142,7 +144,7 @@ class Log:
 
     def notes(self) -> list[str]:
         """Sentences about everything that was lost, mended or chosen without being told, so far."""
-        said = [*self.source.notes, *self._chooser.notes, *self._choice_notes]
+        said = [*self.source.notes, *self._choice_notes]
         for tally in self._tallies.values():
             said += tally.sentences()
         return list(dict.fromkeys(said))
@@ -180,7 +182,7 @@ class Log:
     def _items(self, parts: Mapping[str, tuple[int, Payload]], tally: Tally) -> Iterator[Item]:
         decode = Decoder([c for c in self.channels if c.topic in parts], is_ros1=self.source.is_ros1)
         for raw in self.source.messages(parts.keys()):
-            if raw.type != self._types[raw.topic]:
+            if raw.type != self.types[raw.topic]:
                 continue
             rank, payload_of = parts[raw.topic]
             try:
@@ -206,8 +208,11 @@ class Log:
                 message = decode(raw)
             except UnusableError:
                 continue
-            if raw.type == self._types[topic] and hasattr(message, "header"):
+            if raw.type == self.types[topic] and hasattr(message, "header"):
                 yield raw.log_ns, message
+
+    def _joint_names(self, topic: str) -> Iterator[list[str]]:
+        return (message.name for _, message in self._first_messages(topic, _JOINT_STATES_SEEN))
 
     def _watch_clocks(self) -> ClockPlan:
         return self._clock_plan([source.topic for source in self.sources.used()])
@@ -221,74 +226,6 @@ class Log:
                     first[topic] = log_ns, stamp_ns(message)
                     break
         return plan_clocks(first)
-
-    def _choose(self, kind: str) -> TopicSource | None:
-        named = self._chooser.named(kind)
-        return named if named is not None else self._noted(self._chooser.only(kind))
-
-    def _noted(self, source: TopicSource | None) -> TopicSource | None:
-        if source is not None and source.chosen_by == "only":
-            wanted = getattr(self.robot.topics, source.kind)
-            part = source.kind.replace("_", " ")
-            self._choice_notes.append(
-                f"{source.topic} is used as {part}: it is the only topic of its type, and the log has no {wanted} of that type."
-            )
-        return source
-
-    def _choose_lidar(self) -> TopicSource | None:
-        if self._overrides.points and not self._overrides.scan:
-            return self._chooser.named("points")
-        return self._chooser.named("scan") or self._chooser.named("points") or self._choose("scan") or self._choose("points")
-
-    def _choose_wheels(self) -> TopicSource | None:
-        if self._overrides.odometry and not self._overrides.joint_states:
-            return self._chooser.named("odometry")
-        named = self._chooser.named("joint_states")
-        if named is not None:
-            candidates = [named.topic]
-        else:
-            candidates = self._chooser.of_type(TYPES["joint_states"]) if self._overrides.joint_states is None else []
-        known: set[str] = set()
-        fitting = []
-        for topic in candidates:
-            names, joints = self._wheel_joints(topic)
-            known |= names
-            if joints is not None:
-                fitting.append((topic, joints))
-        if len(fitting) == 1:
-            topic, self._joints = fitting[0]
-            absent = [j for j in (*self.robot.joints.left, *self.robot.joints.right) if j not in (*self._joints[0], *self._joints[1])]
-            if absent:
-                self._choice_notes.append(f"{topic} lacks the joints {', '.join(absent)}; their sides are the mean of the others.")
-            return named if named is not None else self._noted(TopicSource(topic, "joint_states", "only"))
-        robot = f"robot '{self.robot.name}' names {', '.join((*self.robot.joints.left, *self.robot.joints.right))}"
-        lacking = f"no joint states of {self.path.name} have the wheel joints: {robot}; joints in it: {', '.join(sorted(known)) or 'none'}"
-        if named is not None and named.chosen_by == "option":
-            raise TopicError(f"{lacking}. Name them in the robot file's [joints].")
-        odometry = self._choose("odometry")
-        if candidates and not fitting:
-            if odometry is not None:
-                self._choice_notes.append(f"{lacking}; the wheels are taken from {odometry.topic}.")
-            else:
-                self.wheels_error = TopicError(
-                    f"{lacking}. Name them in the robot file's [joints], or go without wheels by an empty --topic.joint-states."
-                )
-        return odometry
-
-    def _wheel_joints(self, topic: str) -> tuple[set[str], tuple[tuple[str, ...], tuple[str, ...]] | None]:
-        """All joint names of a topic's first messages, and the left and right wheels' among them if both sides have some."""
-        seen: set[str] = set()
-        best: tuple[tuple[str, ...], tuple[str, ...]] | None = None
-        wanted = self.robot.joints
-        for _, message in self._first_messages(topic, _JOINT_STATES_SEEN):
-            names = set(message.name)
-            seen |= names
-            left, right = tuple(j for j in wanted.left if j in names), tuple(j for j in wanted.right if j in names)
-            if left and right and (best is None or len(left) + len(right) > len(best[0]) + len(best[1])):
-                best = left, right
-                if len(left) + len(right) == len(wanted.left) + len(wanted.right):
-                    break
-        return seen, best
 
 
 def _try(action: Callable[[], None]) -> None:

@@ -90,7 +90,10 @@ class TopicClock:
         self._pending: list[Item] = []
 
     def horizon(self, log_ns: int) -> int:
-        """No message recorded after ``log_ns`` is expected to have an older stamp than this."""
+        """No message recorded after ``log_ns`` is expected to have an older stamp than this.
+
+        What has been pending for ten seconds is given up, so that it does not hold all others.
+        """
         while self._pending and log_ns - self._pending[0].log_ns > _LONGEST_PENDING:
             del self._pending[0]
             self._tally.count(self._topic, Oddity.OUTLIER)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from localization.errors import TopicError
+from localization.logs.chunks import Channel
 from motion_models.robot import Robot
 
 TYPES: Mapping[str, str] = {
@@ -72,10 +73,15 @@ class Sources:
 class TopicChooser:
     """The topics of one log, and the choice among them."""
 
-    def __init__(self, log: str, types: Mapping[str, str], robot: Robot, overrides: TopicOverrides) -> None:
-        """``types``: of each topic."""
+    def __init__(self, log: str, channels: Iterable[Channel], robot: Robot, overrides: TopicOverrides) -> None:
         self._log, self._robot, self._overrides = log, robot, overrides
-        self._types = types
+        self._types: dict[str, str] = {}
+        self._empty: set[str] = set()
+        for channel in sorted(channels, key=lambda c: -c.count):
+            if channel.count:
+                self._types.setdefault(channel.topic, channel.type)
+            elif channel.topic not in self._types:
+                self._empty.add(channel.topic)
         self.notes: list[str] = []
 
     def of_type(self, *types: str) -> list[str]:
@@ -110,7 +116,7 @@ class TopicChooser:
         if have in types:
             return
         short = " or ".join(short_type(t) for t in types)
-        found = f"no topic '{topic}' in {self._log}"
+        found = f"topic '{topic}' of {self._log} has no messages" if topic in self._empty else f"no topic '{topic}' in {self._log}"
         if have is not None:
             found = f"'{topic}' in {self._log} carries {short_type(have)}, not {short}"
         others = self.of_type(*types)
