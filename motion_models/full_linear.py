@@ -38,7 +38,8 @@ class FullLinear:
     the rows of vx and vy, 1 for those of wz; s for `_turning`, `_rate` and lateral_slip_speed; s/m for rotation_slip_speed.
 
     |u| and |w| have no derivative at 0; the mean of both sides (0) is returned there. At standstill T = 0 and the derivative is
-    the matrix's, although with `_curvature` terms it depends on the direction in which the wheels set off.
+    the matrix's, although with `_curvature` terms it depends on the direction in which the wheels set off. The terms are the first of
+    a series: believe them where the brackets stay well above 0.
     """
 
     nominal: FloatArray
@@ -78,6 +79,10 @@ class FullLinear:
         error = self._off(rates, wanted, cgs, params)
         for _ in range(_NEWTON_STEPS):
             if np.all(np.abs(error) <= _CONVERGED * (1.0 + np.abs(wanted))):
+                # Where a loss is beyond all there is, the formulas have the wheels run backwards to go forward.
+                against = np.any((rates @ matrix.T) * wanted < -1e-9, axis=1)
+                if against.any():
+                    raise self._no_rates(wanted[np.argmax(against)])
                 return rates.reshape(command.shape)
             jacobian = self.twist(rates, cgs, params).d_wheels[:, [0, 2], :]
             step = np.linalg.pinv(jacobian) @ error[..., None]
@@ -91,8 +96,13 @@ class FullLinear:
                     break
                 scale[worse] /= 2.0
             rates, error = tried, off
-        worst = wanted[np.argmax(np.abs(error).max(axis=1))]
-        raise ModelError(f"full_linear: no wheel rates give vx = {worst[0]:.4g} m/s with wz = {worst[1]:.4g} rad/s; ask for a gentler arc.")
+        raise self._no_rates(wanted[np.argmax(np.abs(error).max(axis=1))])
+
+    @staticmethod
+    def _no_rates(wanted: FloatArray) -> ModelError:
+        return ModelError(
+            f"full_linear: no wheel rates give vx = {wanted[0]:.4g} m/s with wz = {wanted[1]:.4g} rad/s; ask for a gentler arc."
+        )
 
     def _off(self, rates: FloatArray, wanted: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
         return np.asarray(self.twist(rates, cg, params).value[:, [0, 2]] - wanted)

@@ -24,7 +24,10 @@ _UNUSED = 1e3  # variance of what no wheel tells (z, roll, pitch)
 
 @dataclass(frozen=True)
 class Multipliers:
-    """The diff-drive controller that turns in place and drives straight on as the model does. In between it cannot follow it."""
+    """The diff-drive controller that drives straight on as the model does, and turns in place at its yaw rate.
+
+    It can follow the model no further: not on arcs, and not in the vx and vy of a centre of rotation that is not in the middle.
+    """
 
     wheel_separation: float
     left_radius: float
@@ -75,8 +78,8 @@ def diff_drive_controller_yaml(
     m = multipliers(model, robot, robot.center_of_gravity, params)
     twist = _diagonal(twist_variances(model, robot, params, publish_rate_hz))
     lines = [
-        f"# {robot.name}: calibrated with the model '{model.name}'. Exact straight ahead and turning in place, between them as near as",
-        "# this controller comes. Goes into its parameter file; keep what else is there.",
+        f"# {robot.name}: calibrated with the model '{model.name}'. Exact straight ahead and in the yaw rate of turning in place; on arcs",
+        "# as near as this controller comes. Goes into its parameter file; keep what else is there.",
         f"{node}:",
         "  ros__parameters:",
         f"    wheel_separation: {_float(robot.driver.track_width_m)}",
