@@ -13,7 +13,8 @@ from motion_models.base import MotionModel
 from motion_models.errors import CalibrationError
 from motion_models.identifiability import Weakness, weaknesses
 from motion_models.least_squares import KNEE, FitConfig, Loss, Problem, indices
-from motion_models.maneuvers import IntArray, Maneuver, make_batch, predict
+from motion_models.maneuvers import IntArray, Maneuver, make_batch
+from motion_models.prediction import predict
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 

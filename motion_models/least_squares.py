@@ -12,7 +12,8 @@ import numpy as np
 from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.errors import CalibrationError, ModelError
-from motion_models.maneuvers import WITNESS_NAMES, Batch, IntArray, predict
+from motion_models.maneuvers import Batch, IntArray
+from motion_models.prediction import WITNESS_NAMES, predict
 from motion_models.robot import WheelNoise
 from motion_models.se2 import FloatArray
 

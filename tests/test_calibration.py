@@ -15,7 +15,8 @@ from motion_models.errors import CalibrationError
 from motion_models.identifiability import candidates
 from motion_models.integrate import preintegrate
 from motion_models.least_squares import FitConfig
-from motion_models.maneuvers import WITNESS_NAMES, Maneuver, make_batch, predict
+from motion_models.maneuvers import Maneuver, make_batch
+from motion_models.prediction import WITNESS_NAMES, predict
 from motion_models.registry import make_model
 from motion_models.robot import WheelNoise, load_robot
 from motion_models.se2 import FloatArray
@@ -24,6 +25,7 @@ ROBOT = load_robot("vaultbot")
 NOISE = 1e-3
 WHEEL_FREE = {
     "diff_drive": ("wheel_radius", "wheel_separation_multiplier"),
+    "friction": ("wheel_radius", "mu_ratio", "tracked_x"),
     "skid_steer": ("k_0", "x_cr_0", "y_cr_0"),
     "icr": ("y_icr_left", "y_icr_right", "x_icr", "alpha_left", "alpha_right"),
     "full_linear": ("vx_left", "vx_right", "vy_left", "vy_right", "wz_left", "wz_right", "longitudinal_slip_curvature"),
