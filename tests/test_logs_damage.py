@@ -14,6 +14,7 @@ import pytest
 from localization.errors import LogError
 from localization.events import Event, Scan, WheelSample
 from localization.logs import Log, open_log
+from localization.logs.sqlite import RecoveredSqlite
 from motion_models.robot import load_robot
 from tests import bags
 from tests.bags import START, Record, S
@@ -141,6 +142,17 @@ def test_rows_that_wait_beside_the_file_are_told_of(tmp_path: Path) -> None:
     path = bags.write_ros2_bag(tmp_path / "run", records(20), "sqlite3")
     (path / "run.db3-wal").write_bytes(b"x")
     assert "run.db3-wal holds rows" in said(open_log(path, ROBOT))
+
+
+def test_sqlite_pages_give_the_rows_that_sqlite_gives(tmp_path: Path) -> None:
+    """Of every length from a tenth of a page to four pages, for what stays on the page depends on it in three ways."""
+    messages = [bags.laser_scan(START + i * S // 10, np.linspace(1.0, 9.0, n)) for i, n in enumerate(range(100, 4000, 13))]
+    path = bags.write_ros2_bag(tmp_path / "run", [("/scan", m, START + i * S // 10) for i, m in enumerate(messages)], "sqlite3") / "run.db3"
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        rows = database.execute("SELECT timestamp, data FROM messages ORDER BY id").fetchall()
+    recovered = RecoveredSqlite(path, "a test")
+    assert [(message.log_ns, message.data) for message in recovered.messages(["/scan"])] == rows
+    assert recovered.channels[0].count == len(rows) == 300
 
 
 def test_sqlite_rows_longer_than_a_page_survive_a_cut(tmp_path: Path) -> None:
