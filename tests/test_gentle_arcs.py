@@ -1,0 +1,110 @@
+"""Claims about gentle arcs (tests/studies/gentle_arcs.py): what the friction model predicts of them, and what the thesis measured."""
+
+import numpy as np
+import pytest
+
+from motion_models import se2
+from motion_models.registry import make_model
+from motion_models.robot import load_robot
+from tests.studies.friction_grid import fitted, friction
+from tests.studies.gentle_arcs import (
+    GENTLE,
+    TRAJECTORIES,
+    compare,
+    configurations,
+    losses,
+    path,
+    share_left,
+    table_5_2,
+    vision_error,
+)
+
+FITTED = fitted()[0].params
+ROBOTS = pytest.mark.parametrize("robot", [FITTED, friction().nominal], ids=["four fitted", "nothing fitted"])
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return compare(FITTED, configurations(FITTED))
+
+
+@ROBOTS
+def test_k_falls_by_about_a_quarter_on_a_gentle_arc_and_the_slope_of_x_cr_by_about_a_third(robot):
+    by_arc = {(loss.vx, loss.wz): loss for loss in losses(robot)}
+    gentle = by_arc[0.5, 0.1]
+    assert gentle.k_centred == pytest.approx(0.75, abs=0.03)
+    assert gentle.x_cr == pytest.approx(0.65, abs=0.05)
+    # The gentler, the more; a rotation in place does not care how fast it is.
+    assert by_arc[0.0, 0.1].k == pytest.approx(1.0, abs=1e-6)
+    k = [by_arc[0.5, wz].k for wz in (0.5, 0.2, 0.1, 0.05)]
+    assert k == sorted(k, reverse=True)
+
+
+@ROBOTS
+def test_the_heuristic_must_lose_on_the_gentle_arcs_and_only_there(robot):
+    predicted = {row.trajectory: row.predicted_loss for row in compare(robot, configurations(FITTED))}
+    assert {name for name, loss in predicted.items() if loss > 0} == set(GENTLE)
+
+
+def test_it_must_lose_there_wherever_the_centres_of_gravity_were():
+    """Not only at the configurations' inferred CGs: as a mean over the thesis's whole grid too."""
+    from tests.studies.thesis_regressions import grid
+
+    skid, diff = (make_model(name, load_robot("vaultbot")) for name in ("skid_steer", "diff_drive"))
+    cg = grid().cg
+    losing = {name for name in TRAJECTORIES if np.mean(vision_error(name, cg, skid, FITTED) - vision_error(name, cg, diff, FITTED)) > 0}
+    assert losing == set(GENTLE)
+
+
+def test_what_it_lost_and_won_of_the_six(rows):
+    measured = {row.trajectory: row.measured_loss for row in rows}
+    assert {name for name, (loss, _) in measured.items() if loss > 0} == {"arc_1", "arc_4"}
+    # arc_2 is the prediction's one miss; on the two that it lost, it lost by less than the scatter over configurations.
+    assert measured["arc_2"][0] == pytest.approx(-0.012, abs=5e-4)
+    for name in ("arc_1", "arc_4"):
+        assert measured[name][0] < 2 * measured[name][1]
+    # Beyond doubt is this: two fifths of the error goes on sharp turns, none of it on gentle arcs.
+    assert share_left(rows, gentle=False) == pytest.approx(0.59, abs=0.01)
+    assert share_left(rows, gentle=True) == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_means_of_table_5_2_are_those_of_the_model_reference(rows):
+    means = {row.trajectory: row.measured.mean(axis=0).round(3).tolist() for row in rows}
+    assert means == {
+        "arc_1": [0.038, 0.031],
+        "arc_2": [0.028, 0.040],
+        "arc_3": [0.022, 0.052],
+        "arc_4": [0.042, 0.037],
+        "rotate": [0.033, 0.108],
+        "s_curve": [0.137, 0.163],
+    }
+    assert len(table_5_2()) == 84
+
+
+def test_the_inferred_centres_of_gravity_agree_with_what_the_text_says_of_one():
+    """Sec. 5.2: under diff-drive the ready configuration turned by 133.39 degrees where 86.70 were wanted: a ratio of 1.54."""
+    ready = configurations(FITTED)["ready"]
+    diff = make_model("diff_drive", load_robot("vaultbot"))
+    wheels = diff.wheels(np.array([0.0, 0.3]), ready, diff.nominal)
+    assert friction().twist(wheels, ready, FITTED).value[2] / 0.3 == pytest.approx(133.39 / 86.70, rel=0.05)
+
+
+def test_which_configurations_win_in_reverse_is_predicted(rows):
+    """arc_4 is driven backwards: a CG ahead, which wins forwards, loses there, and the other way round."""
+    row = next(r for r in rows if r.trajectory == "arc_4")
+    loss = [r[:, 0] - r[:, 1] for r in (row.predicted, row.measured)]
+    assert np.corrcoef(loss[0], loss[1])[0, 1] > 0.7
+    rotate = next(r for r in rows if r.trajectory == "rotate")
+    assert np.corrcoef(*(r[:, 0] - r[:, 1] for r in (rotate.predicted, rotate.measured)))[0, 1] > 0.95
+
+
+def test_a_path_is_the_composition_of_its_steps():
+    twist = np.random.default_rng(0).normal(size=(40, 3))
+    pose = np.zeros(3)
+    for i, step in enumerate(twist):
+        pose = se2.compose(pose, se2.exp(step * 0.05))
+        np.testing.assert_allclose(path(twist)[i], pose[:2], atol=1e-12)
+
+
+def test_odometry_of_the_robot_itself_has_no_error():
+    assert float(vision_error("arc_1", np.zeros(2), friction(), friction().nominal)) < 1e-12
