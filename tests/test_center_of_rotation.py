@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from motion_models.center_of_rotation import _final_point, center_from_end_poses, center_of_arc
@@ -33,6 +33,7 @@ angle = st.floats(0.05, 3.0).flatmap(lambda a: st.sampled_from([a, -a]))
 
 
 @given(coordinate, coordinate, coordinate, angle)
+@settings(deadline=None)
 def test_both_rules_find_the_centre_of_a_perfect_arc(x, y, heading, turn):
     poses = arc((x, y), [0.3, -1.2, heading], np.linspace(0, turn, 12))
     by_ends = center_from_end_poses(poses[0], poses[-1], COV, COV)
@@ -45,6 +46,7 @@ def test_both_rules_find_the_centre_of_a_perfect_arc(x, y, heading, turn):
 
 
 @given(coordinate, coordinate, angle)
+@settings(deadline=None)
 def test_two_poses_are_an_arc(x, y, turn):
     poses = arc((x, y), [0.0, 0.0, 0.0], [0, turn])
     by_ends, by_all = center_from_end_poses(*poses, COV, COV), center_of_arc(poses, COV)
@@ -62,6 +64,7 @@ def test_the_thesis_formula_as_printed():
 
 
 @given(coordinate, coordinate, angle)
+@settings(deadline=None)
 def test_the_derivative_is_that_of_differences(x, y, turn):
     delta = arc((x, y), [0, 0, 0], [turn])[0]
     _, jacobian = _final_point(delta)

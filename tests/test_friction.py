@@ -73,6 +73,7 @@ def test_the_motion_solves_the_equations_as_the_thesis_prints_them(wheels, cg):
 
 
 @given(inside, inside, st.floats(-0.9, 0.9))
+@settings(deadline=None)
 def test_loads_balance_and_never_pull(xi, eta, warp):
     n = np.array(loads(xi, eta, warp)[:4])
     sx, sy = np.array([1, 1, -1, -1]), np.array([1, -1, 1, -1])
@@ -81,7 +82,7 @@ def test_loads_balance_and_never_pull(xi, eta, warp):
 
 
 @given(inside, inside, st.floats(-2, 2))
-@settings(max_examples=50)
+@settings(max_examples=50, deadline=None)
 def test_loads_are_those_of_the_chassis_that_stays_closest_to_its_own_warp(xi, eta, warp):
     """Second way: the diagonal term nearest to the warp among all loads that balance and do not pull, by linear programming."""
     sx, sy = np.array([1.0, 1, -1, -1]), np.array([1.0, -1, 1, -1])
@@ -132,6 +133,7 @@ def test_without_grip_across_it_is_a_diff_drive():
 
 
 @given(st.floats(1e-12, 1e12), st.floats(0.1, 6.2), inside, inside)
+@settings(deadline=None)
 def test_speed_scales(scale, direction, xi, eta):
     wheels, cg = np.array([math.cos(direction), math.sin(direction)]), np.array([xi, eta]) * HALF
     one, other = MODEL.twist(wheels, cg, NOMINAL), MODEL.twist(scale * wheels, cg, NOMINAL)
@@ -140,6 +142,7 @@ def test_speed_scales(scale, direction, xi, eta):
 
 
 @given(st.floats(-6, 6), st.floats(-6, 6), inside, inside)
+@settings(deadline=None)
 def test_backwards_is_forwards_mirrored_at_the_y_axis(q_l, q_r, xi, eta):
     """A robot cannot tell its front from its rear."""
     here = move([q_l, q_r], np.array([xi, eta]) * HALF)
