@@ -70,7 +70,8 @@ class FrictionModel:
     def wheels(self, command: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
         """See `MotionModel.wheels`: what the thesis could not solve for.
 
-        Raises what `twist` raises, and `ModelError` for a command that no wheel rates lead to.
+        A robot that the floor holds still creeps around at absurdly high rates, and these are then returned. Raises what `twist` raises,
+        and `ModelError` for a command that no wheel rates lead to.
         """
         check_parameters(cg, params)
         lead = np.broadcast_shapes(command.shape[:-1], cg.shape[:-1])
@@ -82,7 +83,7 @@ class FrictionModel:
             (vx, wz), (x, y) = flat[0][lost][0], flat[1][lost][0]
             raise ModelError(
                 f"no wheel rates found for vx = {vx:.3g} m/s, wz = {wz:.3g} rad/s with the centre of gravity at ({x:.3f}, {y:.3f}) m: "
-                "the floor holds this robot too firmly. Lower mu_ratio or wheelbase, or move the centre of gravity to the middle."
+                "the floor holds this robot too firmly. Is rolling_resistance above mu, mu_ratio or scrub too large, the CG over a side?"
             )
         return rates.reshape(*lead, 2)
 

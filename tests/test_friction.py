@@ -253,14 +253,14 @@ def test_the_answer_does_not_depend_on_where_the_search_starts():
 @settings(max_examples=300, deadline=None)
 def test_the_inverse_finds_wheel_rates_for_any_command(vx, wz, xi, eta):
     command, cg = np.array([vx, wz]), np.array([xi, eta]) * HALF
-    try:
-        wheels = MODEL.wheels(command, cg, NOMINAL)
-    except ModelError:
-        # Only where the floor holds the robot: a turn on the spot with nearly all load on one side or in one corner.
-        assert max(abs(xi), abs(eta)) > 0.5
-        return
+    wheels = MODEL.wheels(command, cg, NOMINAL)
     got = MODEL.twist(wheels, cg, NOMINAL).value[[0, 2]]
     np.testing.assert_allclose(got, command, atol=1e-7 * (1 + np.abs(command).max()))
+
+
+def test_a_robot_that_cannot_roll_is_refused_by_the_inverse():
+    with pytest.raises(ModelError, match=r"no wheel rates found for vx = 0\.5 m/s, wz = 0\.1 rad/s .* rolling_resistance above mu"):
+        MODEL.wheels(np.array([0.5, 0.1]), np.zeros(2), with_params(rolling_resistance=1.5))
 
 
 def test_a_solution_takes_microseconds():
