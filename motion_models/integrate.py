@@ -86,8 +86,8 @@ def _integrate(
         if abs(wz) < 1e-4:
             ja, jb, jf, jg = 1.0 - wz * wz / 6.0, wz * (0.5 - wz * wz / 24.0), wz / 6.0, 0.5 - wz * wz / 24.0
         else:
-            ja, jb = s / wz, (1.0 - c) / wz
-            jf, jg = (wz - s) / (wz * wz), (1.0 - c) / (wz * wz)
+            ja, jb, jf = s / wz, 2.0 * math.sin(0.5 * wz) ** 2 / wz, (wz - s) / (wz * wz)
+            jg = jb / wz
         jx, jy = jf * vx - jg * vy, jg * vx + jf * vy
         for j in range(m):
             d0, d1, d2 = d[0, j], d[1, j], d[2, j]

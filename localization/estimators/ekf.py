@@ -1,0 +1,139 @@
+"""The extended Kalman filter: wheels predict, gyro and LiDAR correct, on the manifold.
+
+The mean lives on SE(2); filterpy carries the covariance of the error state, whose mean is zero before every update.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+from scipy.stats import chi2
+
+from localization.residuals import motion_residual, turn_residual
+from localization.steps import Step, Turn
+from motion_models import se2
+from motion_models.base import Motion
+from motion_models.robot import GyroNoise
+from motion_models.se2 import FloatArray
+
+# Error state: the pose now, at the start of this step, and at the last scan (stochastic cloning); then what is learned on the way.
+POSE, START, ANCHOR = slice(0, 3), slice(3, 6), slice(6, 9)
+BIAS, CLOCK = 9, 10
+_SIZE = 11
+
+
+@dataclass(frozen=True)
+class EkfConfig:
+    """What the filter believes before it has seen anything."""
+
+    clock_sigma_s: float = 0.05
+    """How far the clocks of wheels and LiDAR may be apart [s]; 0 takes them as one."""
+    clock_walk_s_per_sqrt_s: float = 1e-4
+    """Random walk of the clock offset."""
+    standing_sigma_m: float = 2e-4
+    """How still standing still is, per step [m]."""
+    standing_sigma_rad: float = 1e-4
+    """The same for the yaw [rad]."""
+    gate_probability: float = 0.9999
+    """A measurement that is less likely than one in 1 / (1 - this) says that one of the witnesses is wrong."""
+
+
+class Ekf:
+    """State in, state out by `predict` and the `measure_...` methods; each returns the normalised innovation squared (NIS)."""
+
+    def __init__(self, gyro: GyroNoise, config: EkfConfig | None = None, pose: FloatArray | None = None) -> None:
+        self.config = config or EkfConfig()
+        self._gyro = gyro
+        self.pose = np.zeros(3) if pose is None else np.array(pose, dtype=float)
+        self._start, self._anchor = self.pose.copy(), self.pose.copy()
+        self.bias, self.clock_offset = 0.0, 0.0
+        self._gate = float(chi2.ppf(self.config.gate_probability, 3))
+        self._filter = ExtendedKalmanFilter(dim_x=_SIZE, dim_z=3)
+        self._filter.P = np.zeros((_SIZE, _SIZE))
+        self._filter.P[BIAS, BIAS] = gyro.bias_sigma_rad_per_s**2
+        self._filter.P[CLOCK, CLOCK] = self.config.clock_sigma_s**2
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(11, 11) of the error state."""
+        return np.asarray(self._filter.P)
+
+    @property
+    def anchor(self) -> FloatArray:
+        """(3,) estimate of the pose at the last scan."""
+        return self._anchor
+
+    def predict(self, step: Step) -> None:
+        """Move by what the wheels say; the error follows e' = Ad(delta^-1) e + (d delta / d clock) e_clock + slip."""
+        F = np.eye(_SIZE)
+        F[POSE, POSE] = se2.adjoint(se2.inverse(step.predicted.delta))
+        F[POSE, CLOCK] = step.d_clock
+        F[START, START], F[START, POSE] = np.zeros((3, 3)), np.eye(3)
+        P = F @ self._filter.P @ F.T
+        P[POSE, POSE] += step.predicted.cov
+        P[BIAS, BIAS] += self._gyro.bias_walk_rad_per_s_sqrt_s**2 * step.duration
+        if self.config.clock_sigma_s:
+            P[CLOCK, CLOCK] += self.config.clock_walk_s_per_sqrt_s**2 * step.duration
+        self._filter.P = P
+        self._start = self.pose
+        self.pose = se2.compose(self.pose, step.predicted.delta)
+
+    def measure_turn(self, turn: Turn) -> float:
+        """The gyro's turn since the start of the step."""
+        error = turn_residual(self._start, self.pose, turn.angle, self.bias, turn.duration)
+        H = np.zeros((1, _SIZE))
+        H[0, POSE.start + 2], H[0, START.start + 2], H[0, BIAS] = 1.0, -1.0, turn.duration
+        return self._update(np.array([error]), H, np.array([[turn.variance]]))
+
+    def measure_standing(self) -> float:
+        """The robot did not move since the start of the step."""
+        c = self.config
+        still = np.diag([c.standing_sigma_m**2, c.standing_sigma_m**2, c.standing_sigma_rad**2])
+        error, d_start, d_pose = motion_residual(self._start, self.pose, np.zeros(3))
+        H = np.zeros((3, _SIZE))
+        H[:, START], H[:, POSE] = d_start, d_pose
+        return self._update(error, H, still)
+
+    def measure_motion(self, measured: Motion, can_slip: bool) -> float:
+        """The LiDAR's motion since the last scan.
+
+        Where it contradicts the prediction, one of the two is wrong. ``can_slip``: the LiDAR is sure of itself, so the wheels slipped, and
+        the prediction's covariance grows until both agree; else the LiDAR is, and its measurement's grows.
+        """
+        error, d_anchor, d_pose = motion_residual(self._anchor, self.pose, measured.delta)
+        H = np.zeros((3, _SIZE))
+        H[:, ANCHOR], H[:, POSE] = d_anchor, d_pose
+        R = d_pose @ measured.cov @ d_pose.T
+        S = H @ self._filter.P @ H.T + R
+        nis = float(error @ np.linalg.solve(S, error))
+        limit = self._gate
+        if nis > limit:
+            if can_slip:
+                self._filter.P[POSE, POSE] += (nis / limit) * np.outer(error, error)
+            else:
+                R = R * (nis / limit) ** 2
+        self._update(error, H, R)
+        return nis
+
+    def set_anchor(self) -> None:
+        """From here on, the LiDAR measures from the pose as it is now."""
+        G = np.eye(_SIZE)
+        G[ANCHOR, ANCHOR], G[ANCHOR, POSE] = np.zeros((3, 3)), np.eye(3)
+        self._filter.P = G @ self._filter.P @ G.T
+        self._anchor = self.pose
+
+    def _update(self, error: FloatArray, H: FloatArray, R: FloatArray) -> float:
+        """``error`` is prediction minus measurement; the error state's mean is zero, so the innovation is its negative."""
+        f = self._filter
+        f.x = np.zeros((_SIZE, 1))
+        f.update(np.zeros((len(error), 1)), lambda x: H, lambda x: error[:, None], R=R)
+        f.P = 0.5 * (f.P + f.P.T)
+        correction = f.x[:, 0]
+        self.pose = se2.compose(self.pose, se2.exp(correction[POSE]))
+        self._start = se2.compose(self._start, se2.exp(correction[START]))
+        self._anchor = se2.compose(self._anchor, se2.exp(correction[ANCHOR]))
+        self.bias += float(correction[BIAS])
+        self.clock_offset += float(correction[CLOCK])
+        return float((f.y.T @ f.SI @ f.y)[0, 0])

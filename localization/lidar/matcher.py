@@ -1,0 +1,133 @@
+"""Scan-to-map matching in three moves: KISS-ICP searches, point-to-line steps refine, the curvature of their cost says how sure it is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from localization.lidar.kiss import Kiss
+from localization.lidar.lines import FitOptions, LineMap
+from localization.lidar.sweep import walls
+from motion_models import se2
+from motion_models.se2 import FloatArray
+
+_FEW_POINTS = 10
+# Where the scene holds nothing, the measurement's sigma: metres, metres, radians. It decides nothing, it only keeps numbers finite.
+_KNOWS_NOTHING = np.array([10.0, 10.0, 3.0])
+
+
+@dataclass(frozen=True)
+class LidarConfig:
+    """How scans are matched."""
+
+    voxel_size_m: float = 0.0
+    """Voxel of KISS-ICP's map [m]; 0 takes a 15th of the first scan's median range, within 0.1 and 1 m."""
+    min_range_m: float = 0.1
+    """Nearer points are the robot itself [m]."""
+    max_range_m: float = 50.0
+    """Farther points are left out [m]."""
+    sigma_point_m: float = 0.03
+    """Noise of one LiDAR point [m]."""
+    sigma_line_m: float = 0.02
+    """Error of a line in the map, shared by all points of a scan that meet it in one cell [m]."""
+    iterations: int = 6
+    """Point-to-line steps at most."""
+
+
+@dataclass(frozen=True)
+class Registration:
+    """What one scan says about the pose: the most likely one and its covariance, by the scan and the map alone."""
+
+    pose: FloatArray
+    """(3,) ``world_T_body``."""
+    cov: FloatArray
+    """(3, 3) of its right perturbation; wide open along directions that the scene does not hold."""
+    n_points: int
+    """Points that could match."""
+    n_matched: int
+    """Points that did."""
+    residual_rms_m: float
+    """RMS distance of the matched points from the map's lines."""
+
+    @property
+    def is_trusted(self) -> bool:
+        """Most of what is seen is in the map: the pose is not a wild guess."""
+        return self.n_matched >= _FEW_POINTS and self.n_matched >= 0.4 * self.n_points
+
+
+class LidarMatcher:
+    """A map of what was seen so far, and where scans fit into it. The caller says where each scan was taken (`insert`)."""
+
+    def __init__(self, config: LidarConfig | None = None) -> None:
+        self.config = config or LidarConfig()
+        self._kiss: Kiss | None = None
+        self._lines: LineMap | None = None
+        self._downsampled = np.empty((0, 3))
+        self._planar = np.empty((0, 2))
+
+    def register(self, points: FloatArray, is_planar: bool, guess: FloatArray, guess_cov: FloatArray) -> Registration | None:
+        """Where ``points`` (N, 3) of the body frame fit, searched around ``guess`` (3,) with its covariance (3, 3).
+
+        The guess starts the search and holds it along directions that the scene leaves free; the result's covariance knows nothing
+        of it. None for the first scan, and for one with hardly a point.
+        """
+        points = self._in_range(points)
+        self._prepare(points, is_planar)
+        if self._kiss is None or self._lines is None:
+            return None
+        if len(self._planar) < _FEW_POINTS:
+            self._downsampled, self._planar = np.empty((0, 3)), np.empty((0, 2))
+            return None
+        found, self._downsampled = self._kiss.align(points, _matrix(guess))
+        prior = np.linalg.inv(9.0 * guess_cov + np.diag([1e-6, 1e-6, 1e-8]))
+        fit = self._lines.fit(self._planar, _pose(found), self._options, prior, guess)
+        cov = np.linalg.inv(fit.information + np.diag(_KNOWS_NOTHING**-2))
+        pose = se2.compose(fit.pose, se2.exp(cov @ fit.gradient))
+        return Registration(pose, cov, len(self._planar), fit.n_matched, fit.residual_rms)
+
+    def insert(self, pose: FloatArray) -> None:
+        """Add the scan that was last given to `register` to the map, as seen from ``pose`` (3,) ``world_T_body``."""
+        if self._kiss is None or self._lines is None:
+            return
+        self._kiss.insert(self._downsampled, _matrix(pose))
+        self._lines.insert(self._planar, pose)
+
+    def point_cloud(self) -> FloatArray:
+        """(M, 2) the map."""
+        return np.empty((0, 2)) if self._lines is None else self._lines.point_cloud()
+
+    def _in_range(self, points: FloatArray) -> FloatArray:
+        r2 = np.einsum("ij,ij->i", points, points)
+        keep = (r2 > self.config.min_range_m**2) & (r2 < self.config.max_range_m**2)
+        return np.ascontiguousarray(points[keep])
+
+    def _prepare(self, points: FloatArray, is_planar: bool) -> None:
+        if self._kiss is None:
+            if len(points) < _FEW_POINTS:
+                return
+            voxel = self.config.voxel_size_m or voxel_size(points)
+            self._kiss = Kiss(voxel, 0.0, self.config.max_range_m)
+            self._lines = LineMap(2.0 * voxel, 0.1 * voxel, 2.0 * self.config.max_range_m)
+            self._options = FitOptions(
+                2.0 * voxel, self.config.sigma_point_m, self.config.sigma_line_m, 0.5 * voxel, self.config.iterations
+            )
+            self._voxel = voxel
+            self._downsampled = points
+        self._planar = np.ascontiguousarray(points[:, :2]) if is_planar else walls(points, 0.5 * self._voxel)
+
+
+def voxel_size(points: FloatArray) -> float:
+    """A voxel [m] that suits the scene of the first scan ``points`` (N, 3): KISS-ICP's own default, a hundredth of the maximal range,
+    fails indoors, where scanners see far less than they could."""
+    return float(np.clip(np.median(np.linalg.norm(points, axis=1)) / 15.0, 0.1, 1.0))
+
+
+def _matrix(pose: FloatArray) -> FloatArray:
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.array([[c, -s, 0.0, pose[0]], [s, c, 0.0, pose[1]], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+def _pose(matrix: FloatArray) -> FloatArray:
+    return np.array([matrix[0, 3], matrix[1, 3], math.atan2(matrix[1, 0], matrix[0, 0])])

@@ -1,0 +1,57 @@
+"""From a scan to points in the body frame at one moment, and from a 3D cloud to the walls in it."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from localization.events import Scan
+from motion_models import se2
+from motion_models.robot import Mount
+from motion_models.se2 import FloatArray
+
+
+def body_points(scan: Scan, mount: Mount, twist: FloatArray) -> FloatArray:
+    """(N, 3) points of ``scan`` in the body frame as it was at the scan's stamp.
+
+    Each point is moved from where the body was when it was measured, at constant ``twist`` (3,) from the stamp on: the true time
+    of each point is used, so a sweep that fills only part of the scan period is not over-corrected.
+    """
+    points = scan.points @ mount.rotation().T + np.array([mount.x, mount.y, mount.z])
+    if len(scan.offsets) and np.any(twist):
+        stamp_T_point = se2.exp(scan.offsets[:, None] * twist)
+        points[:, :2] = se2.transform(stamp_T_point, points[:, :2])
+    return points
+
+
+def walls(points: FloatArray, cell: float, min_height: float = 0.3) -> FloatArray:
+    """(M, 2) the upright structure in a 3D cloud ``points`` (N, 3): one mean point for each ``cell`` [m] that spans ``min_height`` [m].
+
+    Floors and ceilings span no height in a cell; walls, trees and poles do. What is left is a planar scan.
+    """
+    if len(points) == 0:
+        return np.empty((0, 2))
+    index = np.floor(points[:, :2] / cell).astype(np.int64)
+    order = np.lexsort((index[:, 1], index[:, 0]))
+    out = np.empty((len(points), 2))
+    n = _walls(points, index, order, min_height, out)
+    return out[:n]
+
+
+@numba.njit(cache=True)
+def _walls(points: FloatArray, index: np.ndarray, order: np.ndarray, min_height: float, out: FloatArray) -> int:  # type: ignore[type-arg]  # pragma: no cover
+    n, i = 0, 0
+    while i < order.shape[0]:
+        first = order[i]
+        low, high, x, y, count = math.inf, -math.inf, 0.0, 0.0, 0
+        while i < order.shape[0] and index[order[i], 0] == index[first, 0] and index[order[i], 1] == index[first, 1]:
+            p = order[i]
+            low, high = min(low, points[p, 2]), max(high, points[p, 2])
+            x, y, count = x + points[p, 0], y + points[p, 1], count + 1
+            i += 1
+        if high - low >= min_height:
+            out[n, 0], out[n, 1] = x / count, y / count
+            n += 1
+    return n

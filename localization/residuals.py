@@ -1,0 +1,25 @@
+"""What measurements say of poses: values and exact Jacobians, the same for every estimator. Perturbations act on the right."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from motion_models import se2
+from motion_models.se2 import FloatArray
+
+
+def motion_residual(world_T_a: FloatArray, world_T_b: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """How far the motion from a to b is off the ``measured`` one: log(measured^-1 (a^-1 b)), (3,), with its Jacobians (3, 3) by a and b."""
+    a_T_b = se2.between(world_T_a, world_T_b)
+    error = se2.log(se2.between(measured, a_T_b))
+    d_b = se2.right_jacobian_inverse(error)
+    d_a = -d_b @ se2.adjoint(se2.inverse(a_T_b))
+    return error, d_a, d_b
+
+
+def turn_residual(world_T_a: FloatArray, world_T_b: FloatArray, angle: float, bias: float, duration: float) -> float:
+    """How far the turn from a to b is off a gyro's ``angle`` less what its ``bias`` [rad/s] added in ``duration`` [s].
+
+    [rad]; its derivative by the yaw of b is 1, by the yaw of a -1, by the bias ``duration``.
+    """
+    return float(se2.wrap_angle(np.asarray(world_T_b[2] - world_T_a[2] + bias * duration - angle)))
