@@ -1,0 +1,49 @@
+"""The command `skidloc`. Only here are errors turned into messages and exit codes."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from localization.commands.info import Info
+from localization.commands.replay import Replay
+from motion_models.errors import SkidlocError
+
+_BAD_INPUT = 2
+_INTERRUPTED = 130
+
+Command = (
+    Annotated[Info, tyro.conf.subcommand("info", prefix_name=False)] | Annotated[Replay, tyro.conf.subcommand("replay", prefix_name=False)]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code: 0, 2 for bad input."""
+    command = tyro.cli(
+        Command,  # type: ignore[arg-type]  # a union is what tyro takes for subcommands
+        prog="skidloc",
+        description="Probabilistic odometry for skid-steer robots whose centre of gravity moves.",
+        args=arguments,
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+    complaints = Console(stderr=True, soft_wrap=True, highlight=False)
+    try:
+        command.run(Console(highlight=False))
+    except SkidlocError as error:
+        complaints.print(f"skidloc: {error}", markup=False)
+        return _BAD_INPUT
+    except KeyboardInterrupt:
+        complaints.print("skidloc: interrupted.")
+        return _INTERRUPTED
+    except BrokenPipeError:  # `skidloc info LOG | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,38 @@
+"""What several commands share: opening a log of a robot, writing what is printed as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from localization.errors import OutputError
+
+
+def check_new(path: Path) -> None:
+    """Refuse an output that would overwrite something. Raises `OutputError`."""
+    if path.exists():
+        kind = "folder" if path.is_dir() else "file"
+        raise OutputError(f"{kind} '{path}' exists already; nothing is overwritten. Choose another name or remove it.")
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write ``content`` as JSON, sorted as given, not finite numbers as null. Raises `OutputError` rather than overwrite."""
+    check_new(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("x", encoding="utf-8") as file:
+            file.write(json.dumps(_finite(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    except OSError as error:
+        raise OutputError(f"cannot write '{path}': {error.strerror}.") from None
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_finite(value) for value in content]
+    if isinstance(content, float):
+        return content if math.isfinite(content) else None
+    return content

@@ -1,0 +1,65 @@
+"""From runs to results: each run scored against the reference, and told in the format of `metrics.json`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from localization.accuracy import Accuracy
+from localization.consistency import pose_consistency
+from localization.evaluate import evaluate
+from localization.references import ReferenceTrack, Relations
+from localization.run import Run
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A run and its scores."""
+
+    run: Run
+    accuracy: Accuracy | None
+    """None without a reference."""
+    nees_mean: float | None
+    """Mean of the pose's normalised error squared since the first match, 3 expected; None where the reference has no headings."""
+
+    @property
+    def name(self) -> str:
+        return f"{self.run.model}_{self.run.estimator}"
+
+    @property
+    def nis_mean(self) -> float | None:
+        """Mean of the LiDAR's normalised innovation squared, 3 expected; None without a LiDAR."""
+        known = self.run.nis[np.isfinite(self.run.nis)]
+        return float(known.mean()) if known.size else None
+
+    def metrics(self, duration_s: float, with_timing: bool) -> dict[str, Any]:
+        """One entry of the results in `metrics.json`. Computing time differs from run to run, so it is null unless asked for."""
+        numbers = self.accuracy.numbers() if self.accuracy else Accuracy().numbers()
+        first = ("ate_rmse_m", "ate_rmse_deg", "rpe_translation_percent", "rpe_rotation_deg_per_m", "end_error_m")
+        return {
+            "model": self.run.model,
+            "estimator": self.run.estimator,
+            **{name: numbers.pop(name) for name in first},
+            "nees_mean": self.nees_mean,
+            "nis_mean": self.nis_mean,
+            "real_time_factor": duration_s / self.run.seconds if with_timing and self.run.seconds > 0 else None,
+            "parameters": {name: list(value) for name, value in self.run.parameters.items()},
+            "counts": dict(self.run.counts),
+            **{name: number for name, number in numbers.items() if self.accuracy or not name.startswith("n_")},
+        }
+
+
+def score(runs: Sequence[Run], reference: ReferenceTrack | Relations | None) -> list[Result]:
+    """Score every run. Raises `EvaluationError` if the reference shares no time with them."""
+    return [_score(run, reference) for run in runs]
+
+
+def _score(run: Run, reference: ReferenceTrack | Relations | None) -> Result:
+    if reference is None:
+        return Result(run, None, None)
+    accuracy = evaluate(run.trajectory, reference)
+    found = None if isinstance(reference, Relations) else pose_consistency(run.trajectory, reference)
+    return Result(run, accuracy, None if found is None else found.mean)
