@@ -24,11 +24,13 @@ __all__ = [
     "ErrorSeries",
     "EvaluateConfig",
     "RelationErrors",
+    "RelationSeries",
     "RelationsScore",
     "RpeAtLength",
     "align",
     "evaluate",
     "match",
+    "relation_errors",
     "relative_pose_errors",
     "score_relations",
 ]
@@ -146,6 +148,34 @@ def score_relations(motions: FloatArray, relations: FloatArray) -> RelationError
     )
 
 
+@dataclass(frozen=True, eq=False)
+class RelationSeries:
+    """The estimate's motions between the instants of those relations that it covers."""
+
+    index: IntArray
+    """(N,) which of the relations."""
+    spans_s: FloatArray
+    """(N,) time from instant to instant, positive [s]."""
+    motions: FloatArray
+    """(N, 3) estimated ``start_T_end``."""
+    translation_m: FloatArray
+    """(N,) error of the translation, as in `score_relations`."""
+    rotation_rad: FloatArray
+    """(N,) absolute error of the rotation."""
+
+
+def relation_errors(trajectory: Trajectory, relations: Relations, max_gap_s: float = 1.0) -> RelationSeries:
+    """The error of every relation that a trajectory covers. Raises `EvaluationError` if it covers none."""
+    starts, ends = relations.starts_ns, relations.ends_ns
+    use = np.flatnonzero(trajectory.covers(starts, max_gap_s) & trajectory.covers(ends, max_gap_s))
+    if not use.size:
+        raise EvaluationError(no_overlap_message(trajectory.stamps_ns, np.sort(np.concatenate([starts, ends])), relations.source, 0))
+    motions = se2.between(trajectory.at(starts[use]), trajectory.at(ends[use]))
+    error = se2.between(relations.motions[use], motions)
+    spans = np.abs(ends[use] - starts[use]) * 1e-9
+    return RelationSeries(use, spans, motions, np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2]))
+
+
 def _evaluate_track(trajectory: Trajectory, reference: ReferenceTrack, config: EvaluateConfig) -> Accuracy:
     estimate, part = match(trajectory, reference, config.max_gap_s)
     alignment = align(estimate, part.positions, part.yaws)
@@ -184,20 +214,18 @@ def _evaluate_track(trajectory: Trajectory, reference: ReferenceTrack, config: E
 
 
 def _evaluate_relations(trajectory: Trajectory, relations: Relations, config: EvaluateConfig) -> Accuracy:
-    starts, ends = relations.starts_ns, relations.ends_ns
-    use = trajectory.covers(starts, config.max_gap_s) & trajectory.covers(ends, config.max_gap_s)
-    stamps = np.concatenate([starts[use], ends[use]])
-    if not stamps.size:
-        raise EvaluationError(no_overlap_message(trajectory.stamps_ns, np.sort(np.concatenate([starts, ends])), relations.source, 0))
-    motions, truth = se2.between(trajectory.at(starts[use]), trajectory.at(ends[use])), relations.motions[use]
-    short = np.abs(ends[use] - starts[use]) < config.short_span_s * 1e9
+    found = relation_errors(trajectory, relations, config.max_gap_s)
+    use = found.index
+    stamps = np.concatenate([relations.starts_ns[use], relations.ends_ns[use]])
+    motions, truth = found.motions, relations.motions[use]
+    short = found.spans_s < config.short_span_s
     score = RelationsScore(
         all=score_relations(motions, truth),
         short=score_relations(motions[short], truth[short]) if short.any() else None,
         long=score_relations(motions[~short], truth[~short]) if not short.all() else None,
     )
     return Accuracy(
-        relations=score, n_reference=len(starts), n_matched=int(np.count_nonzero(use)), overlap=_overlap(trajectory, np.sort(stamps))
+        relations=score, n_reference=len(relations.starts_ns), n_matched=len(use), overlap=_overlap(trajectory, np.sort(stamps))
     )
 
 
