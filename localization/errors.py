@@ -17,3 +17,7 @@ class EvaluationError(SkidlocError):
 
 class OutputError(SkidlocError):
     """An output path that already holds something, or that cannot be written."""
+
+
+class EstimatorError(SkidlocError):
+    """An estimator that does not exist, that lacks what it needs from the log, or whose state is no longer finite."""

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import shutil
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +19,26 @@ def check_new(path: Path) -> None:
     if path.exists():
         kind = "folder" if path.is_dir() else "file"
         raise OutputError(f"{kind} '{path}' exists already; nothing is overwritten. Choose another name or remove it.")
+
+
+@contextlib.contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """A folder to write into that gets its name ``path`` once all is written: it is complete, or it is not there. Raises `OutputError`."""
+    check_new(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}-"))
+    except OSError as error:
+        raise OutputError(f"cannot write into '{path.parent}': {error.strerror}.") from None
+    try:
+        yield folder
+        check_new(path)
+        folder.chmod(0o755)  # mkdtemp's folders are for their owner only
+        folder.rename(path)
+    except OSError as error:
+        raise OutputError(f"cannot write '{path}': {error.strerror}.") from None
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -65,6 +65,16 @@ class Ekf:
         """(3,) estimate of the pose at the last scan."""
         return self._anchor
 
+    @property
+    def start(self) -> FloatArray:
+        """(3,) estimate of the pose at the start of this step."""
+        return self._start
+
+    @property
+    def gate(self) -> float:
+        """The NIS beyond which a measurement contradicts the prediction."""
+        return self._gate
+
     def predict(self, step: Step) -> None:
         """Move by what the wheels say; the error follows e' = Ad(delta^-1) e + (d delta / d clock) e_clock + slip."""
         F = np.eye(_SIZE)

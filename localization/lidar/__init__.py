@@ -1,5 +1,7 @@
 """LiDAR scan matching: KISS-ICP finds the pose, point-to-line steps refine it and say how sure it is."""
 
 from localization.lidar.matcher import LidarConfig, LidarMatcher, Registration
+from localization.lidar.odometry import LidarOdometry
+from localization.lidar.sweep import body_points
 
-__all__ = ["LidarConfig", "LidarMatcher", "Registration"]
+__all__ = ["LidarConfig", "LidarMatcher", "LidarOdometry", "Registration", "body_points"]

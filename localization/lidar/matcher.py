@@ -73,7 +73,7 @@ class LidarMatcher:
         The guess starts the search and holds it along directions that the scene leaves free; the result's covariance knows nothing
         of it. None for the first scan, and for one with hardly a point.
         """
-        points = self._in_range(points)
+        points = in_range(points, self.config)
         self._prepare(points, is_planar)
         if self._kiss is None or self._lines is None:
             return None
@@ -82,7 +82,7 @@ class LidarMatcher:
             return None
         found, self._downsampled = self._kiss.align(points, _matrix(guess))
         prior = np.linalg.inv(9.0 * guess_cov + np.diag([1e-6, 1e-6, 1e-8]))
-        fit = self._lines.fit(self._planar, _pose(found), self._options, prior, guess)
+        fit = self._lines.fit(self._planar, pose_of_matrix(found), self._options, prior, guess)
         cov = np.linalg.inv(fit.information + np.diag(_KNOWS_NOTHING**-2))
         pose = se2.compose(fit.pose, se2.exp(cov @ fit.gradient))
         return Registration(pose, cov, len(self._planar), fit.n_matched, fit.residual_rms)
@@ -97,11 +97,6 @@ class LidarMatcher:
     def point_cloud(self) -> FloatArray:
         """(M, 2) the map."""
         return np.empty((0, 2)) if self._lines is None else self._lines.point_cloud()
-
-    def _in_range(self, points: FloatArray) -> FloatArray:
-        r2 = np.einsum("ij,ij->i", points, points)
-        keep = (r2 > self.config.min_range_m**2) & (r2 < self.config.max_range_m**2)
-        return np.ascontiguousarray(points[keep])
 
     def _prepare(self, points: FloatArray, is_planar: bool) -> None:
         if self._kiss is None:
@@ -118,6 +113,12 @@ class LidarMatcher:
         self._planar = np.ascontiguousarray(points[:, :2]) if is_planar else walls(points, 0.5 * self._voxel)
 
 
+def in_range(points: FloatArray, config: LidarConfig) -> FloatArray:
+    """(M, 3) those of ``points`` (N, 3) that are neither the robot itself nor too far."""
+    r2 = np.einsum("ij,ij->i", points, points)
+    return np.ascontiguousarray(points[(r2 > config.min_range_m**2) & (r2 < config.max_range_m**2)])
+
+
 def voxel_size(points: FloatArray) -> float:
     """A voxel [m] that suits the scene of the first scan ``points`` (N, 3): KISS-ICP's own default, a hundredth of the maximal range,
     fails indoors, where scanners see far less than they could."""
@@ -129,5 +130,6 @@ def _matrix(pose: FloatArray) -> FloatArray:
     return np.array([[c, -s, 0.0, pose[0]], [s, c, 0.0, pose[1]], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
-def _pose(matrix: FloatArray) -> FloatArray:
+def pose_of_matrix(matrix: FloatArray) -> FloatArray:
+    """(3,) the planar part of a pose (4, 4)."""
     return np.array([matrix[0, 3], matrix[1, 3], math.atan2(matrix[1, 0], matrix[0, 0])])

@@ -1,0 +1,56 @@
+"""The accuracy table on the terminal: a row for each model and estimator, only the columns that something is known of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from rich.table import Table
+
+from localization.accuracy import Accuracy, RelationErrors
+from localization.score import Result
+
+_Number = Callable[[Result], float | None]
+
+
+def _of(name: str) -> _Number:
+    return lambda result: getattr(result.accuracy, name, None)
+
+
+def _relation(group: str, name: str) -> _Number:
+    def number(result: Result) -> float | None:
+        accuracy: Accuracy | None = result.accuracy
+        errors: RelationErrors | None = getattr(accuracy.relations, group, None) if accuracy else None
+        return getattr(errors, name, None)
+
+    return number
+
+
+_COLUMNS: tuple[tuple[str, str, _Number], ...] = (
+    ("ATE m", ".3f", _of("ate_rmse_m")),
+    ("ATE deg", ".2f", _of("ate_rmse_deg")),
+    ("RPE %", ".2f", _of("rpe_translation_percent")),
+    ("RPE deg/m", ".3f", _of("rpe_rotation_deg_per_m")),
+    ("end m", ".2f", _of("end_error_m")),
+    ("drift %", ".2f", _of("drift_percent")),
+    ("relations m", ".4f", _relation("all", "translation_m")),
+    ("deg", ".3f", _relation("all", "rotation_deg")),
+    ("< 20 s m", ".4f", _relation("short", "translation_m")),
+    ("deg", ".3f", _relation("short", "rotation_deg")),
+    ("NEES", ".2f", lambda result: result.nees_mean),
+    ("NIS", ".2f", lambda result: result.nis_mean),
+)
+
+
+def accuracy_table(results: Sequence[Result], duration_s: float) -> Table:
+    """For rich's console."""
+    columns = [column for column in _COLUMNS if any(column[2](result) is not None for result in results)]
+    table = Table("model", "estimator", box=None, header_style="bold", pad_edge=False)
+    for title, *_ in columns:
+        table.add_column(title, justify="right")
+    table.add_column("x real time", justify="right")
+    for result in results:
+        numbers = [(number(result), form) for _, form, number in columns]
+        cells = ["–" if number is None else format(number, form) for number, form in numbers]
+        speed = duration_s / result.run.seconds if result.run.seconds > 0 else None
+        table.add_row(result.run.model, result.run.estimator, *cells, "–" if speed is None else f"{speed:.0f}")
+    return table

@@ -1,0 +1,61 @@
+"""`skidloc info`: what is in a log, what would be used of it, and what is missing or suspect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from localization.commands.common import write_json
+from localization.logs import LogInfo, TopicOverrides, open_log
+from motion_models.robot import load_robot
+
+
+@dataclass(frozen=True)
+class Info:
+    """Topics, rates and duration of a log, what the robot file will use, what is missing or suspect."""
+
+    log: tyro.conf.Positional[Path]
+    """ROS 1 .bag, ROS 2 bag folder, or bare .mcap."""
+    robot: str = "husky_a200"
+    """Name of a shipped robot, or path of a robot TOML file."""
+    topic: TopicOverrides = field(default_factory=TopicOverrides)
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write what is printed to this file as well."""
+
+    def run(self, console: Console) -> None:
+        with console.status("reading the log"):
+            info = open_log(self.log, load_robot(self.robot), self.topic).info()
+        if self.json is not None:
+            write_json(self.json, info.to_dict())
+        _print(console, info)
+
+
+def _print(console: Console, info: LogInfo) -> None:
+    console.print(f"[bold]{escape(info.log)}[/]: {info.messages} messages in {info.duration_s:.1f} s, read as robot {info.robot}")
+    table = Table("topic", "type", "messages", "Hz", "used as", "frame", "gaps", box=None, header_style="bold", pad_edge=False)
+    for column in (2, 3):
+        table.columns[column].justify = "right"
+    for topic in info.topics:
+        gaps = ", ".join(f"{gap.duration_s:.1f} s at {gap.at_s:.1f} s" for gap in topic.gaps[:3])
+        more = f" and {len(topic.gaps) - 3} more" if len(topic.gaps) > 3 else ""
+        rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.1f}"
+        cells = (topic.topic, topic.type, str(topic.count), rate, topic.used_as or "", topic.frame_id or "", gaps + more)
+        table.add_row(*map(escape, cells))
+    console.print(table)
+    for part, used in info.parts.items():
+        said = "nothing" if used is None else f"{used['topic']} (chosen by {used['chosen_by']})"
+        console.print(f"{part.replace('_', ' ')}: {said}", markup=False)
+    console.print(f"can be scored against: {', '.join(info.references) or 'nothing in the log'}", markup=False)
+    for frame, mount in info.mounts.items():
+        at = ", ".join(f"{value:.3f}" for value in list(mount.values())[:3])
+        console.print(f"mount of {frame}: [{at}] m", markup=False)
+    for problem in info.problems:
+        console.print(f"[yellow]![/] {escape(problem)}", soft_wrap=True)
+    for note in info.notes:
+        console.print(f"  {note}", markup=False, soft_wrap=True)

@@ -1,0 +1,206 @@
+"""`skidloc replay`: the main job. All pairs of motion model and estimator over one log, scored, drawn and written."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import datetime
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from localization.commands.accuracy_table import accuracy_table
+from localization.commands.common import check_new, new_folder, write_json
+from localization.errors import EvaluationError
+from localization.estimators import check_estimator
+from localization.events import Event
+from localization.logs import Log, TopicOverrides, open_log
+from localization.logs.fused import FusedEstimate, write_fused
+from localization.provenance import fingerprint, versions
+from localization.references import ReferenceTrack, Relations, read_reference_file, reference_track
+from localization.report import ReportHead, verdict, write_report
+from localization.run import Pair, ReplayConfig, Run, replay
+from localization.score import Result, score
+from localization.timespans import no_overlap_message
+from localization.trajectory import write_tum
+from motion_models.registry import make_model
+from motion_models.robot import load_robot
+
+_WHEELLESS = "lidar"
+_PROGRESS_NS = 500_000_000
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Run motion models and estimators over a log and show how well each of them knows where the robot was."""
+
+    log: tyro.conf.Positional[Path]
+    """ROS 1 .bag, ROS 2 bag folder, or bare .mcap."""
+    robot: str
+    """Name of a shipped robot, or path of a robot TOML file."""
+    out: Path
+    """New folder for metrics.json, report.html, trajectories (TUM) and fused.mcap, whose /tf is that of the last model and estimator."""
+    model: str = "diff_drive,skid_steer"
+    """Motion models, separated by commas."""
+    estimator: str = "odometry,lidar,ekf"
+    """Estimators, separated by commas; `lidar` is left out where the log has no scans, unless asked for."""
+    reference: str | None = None
+    """Topic of the log, or file (.tum, .relations), to score against; `none` for no score. Default: the robot file's topic if the log has it."""
+    topic: TopicOverrides = field(default_factory=TopicOverrides)
+    config: ReplayConfig = field(default_factory=ReplayConfig)
+    timing: bool = False
+    """Put computing time into metrics.json (`real_time_factor`). It differs from run to run; without this the file does not."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write a copy of metrics.json to this file as well."""
+
+    def run(self, console: Console) -> None:
+        robot = load_robot(self.robot)
+        check_new(self.out)
+        if self.json is not None:
+            check_new(self.json)
+        log = open_log(self.log, robot, self.topic)
+        has_lidar = log.sources.lidar is not None
+        models = [make_model(name, robot) for name in _names(self.model)]
+        pairs = [Pair(model, estimator) for estimator in self._estimators(has_lidar) for model in models]
+        reference = self._reference(log)
+        # the LiDAR alone asks no motion model: it runs once, and counts for each
+        once = [p for p in pairs if p.estimator != _WHEELLESS or p.model is models[0]]
+        with _progress(console, log) as (events, on_event):
+            found = replay(events, once, robot, log.mounts, has_lidar, self.config, on_event)
+        by_pair = {(run.model, run.estimator): run for run in found}
+        runs = [by_pair.get((p.model.name, p.estimator)) or _as(by_pair[models[0].name, p.estimator], p.model.name) for p in pairs]
+        results = score(runs, reference)
+        head = ReportHead(
+            log=log.path.name,
+            robot=robot.name,
+            start=_date(log.start_ns),
+            duration_s=log.duration_s,
+            notes=log.notes(),
+            versions=versions(),
+            log_fingerprint=fingerprint(log.path),
+        )
+        metrics = self._metrics(head, results)
+        with new_folder(self.out) as folder:
+            write_json(folder / "metrics.json", metrics)
+            for result in results:
+                write_tum(folder / f"{result.name}.tum", result.run.trajectory)
+            write_fused(folder / "fused.mcap", {r.name: _estimates(r.run) for r in results}, results[-1].name)
+            write_report(folder / "report.html", head, results, reference)
+        if self.json is not None:
+            write_json(self.json, metrics)
+        self._print(console, head, results, reference)
+
+    def _estimators(self, has_lidar: bool) -> list[str]:
+        names = _names(self.estimator)
+        for name in names:
+            check_estimator(name, has_lidar or self.estimator == type(self).estimator)
+        if self.estimator == type(self).estimator and not has_lidar:
+            names.remove(_WHEELLESS)
+        return names
+
+    def _reference(self, log: Log) -> ReferenceTrack | Relations | None:
+        """By topic or by file; read before the run, so that a wrong name costs no time."""
+        name = self.reference if self.reference is not None else log.reference_topic
+        if name is None or name == "none":
+            return None
+        if name in log.types:
+            found: ReferenceTrack | Relations = reference_track(log.references(name), name)
+        elif Path(name).exists():
+            found = read_reference_file(name)
+        elif name.startswith("/") and not Path(name).parent.is_dir():
+            found = reference_track(log.references(name), name)  # raises, and lists what there is
+        else:
+            raise EvaluationError(f"no reference '{name}': neither a topic of {log.path.name} nor a file. `skidloc info` lists the topics.")
+        check_overlap(found, log)
+        return found
+
+    def _metrics(self, head: ReportHead, results: Sequence[Result]) -> dict[str, Any]:
+        return {
+            "log": head.log,
+            "robot": head.robot,
+            "duration_s": head.duration_s,
+            "distance_m": _distance(results),
+            "results": [result.metrics(head.duration_s, self.timing) for result in results],
+            "notes": list(head.notes),
+            "provenance": {
+                "log_fingerprint": head.log_fingerprint,
+                "versions": dict(head.versions),
+                "config": dataclasses.asdict(self.config),
+            },
+        }
+
+    def _print(self, console: Console, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
+        for note in head.notes:
+            console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
+        console.print(accuracy_table(results, head.duration_s))
+        console.print(verdict(results, reference), markup=False, soft_wrap=True)
+        console.print(f"report: {self.out / 'report.html'}", markup=False, soft_wrap=True)
+
+
+def check_overlap(reference: ReferenceTrack | Relations, log: Log) -> None:
+    """Refuse a reference from another time before the log is replayed. Raises `EvaluationError`."""
+    stamps = reference.stamps_ns if isinstance(reference, ReferenceTrack) else np.sort(np.r_[reference.starts_ns, reference.ends_ns])
+    first = next(iter(log.events()), None)
+    if first is None:
+        return
+    span = np.array([first.stamp_ns, first.stamp_ns + log.end_ns - log.start_ns])
+    slack = 10_000_000_000  # recording may begin later and end earlier than the stamps
+    if stamps[0] > span[1] + slack or stamps[-1] < span[0] - slack:
+        raise EvaluationError(no_overlap_message(span, stamps, reference.source, 0))
+
+
+def _names(text: str) -> list[str]:
+    return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+
+
+def _as(run: Run, model: str) -> Run:
+    return dataclasses.replace(run, model=model)
+
+
+def _distance(results: Sequence[Result]) -> float | None:
+    """By the reference; without one, by the estimate that uses most of what is known, in steps that a standing robot's jitter does not make."""
+    known = [r.accuracy.distance_m for r in results if r.accuracy and r.accuracy.distance_m is not None]
+    return known[-1] if known else results[-1].run.trajectory.distance(0.05)
+
+
+def _estimates(run: Run) -> Iterator[FusedEstimate]:
+    t = run.trajectory
+    for i in range(len(t)):
+        twist_cov = run.twist_covariances[i]
+        yield FusedEstimate(
+            int(t.stamps_ns[i]),
+            t.poses[i],
+            run.twists[i],
+            None if t.covariances is None else t.covariances[i],
+            twist_cov if np.isfinite(twist_cov).all() else None,
+        )
+
+
+def _date(stamp_ns: int) -> str:
+    return datetime.datetime.fromtimestamp(stamp_ns // 10**9, datetime.UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+@contextlib.contextmanager
+def _progress(console: Console, log: Log) -> Iterator[tuple[Iterator[Event], Callable[[int], None]]]:
+    """The log's events, and what moves the bar as they are used."""
+    events = log.events()
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task(f"replaying {escape(log.path.name)}", total=max(log.duration_s, 1e-9))
+        begin = shown = None
+
+        def on_event(stamp_ns: int) -> None:
+            nonlocal begin, shown
+            begin = stamp_ns if begin is None else begin
+            if shown is None or stamp_ns - shown > _PROGRESS_NS:
+                shown = stamp_ns
+                progress.update(task, completed=(stamp_ns - begin) * 1e-9)
+
+        yield events, on_event

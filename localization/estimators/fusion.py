@@ -1,0 +1,105 @@
+"""Wheels, gyro and LiDAR in one filter, with the map that the filter itself draws.
+
+The wheels say where to look for the scan in the map; what the scan then says of the pose, its covariance included, comes from scan and
+map alone, so nothing is counted twice. The scan enters the map where the fused estimate puts it: a place seen again pulls the robot back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from localization.estimators.base import Estimate, mean_twist
+from localization.estimators.ekf import POSE, START, Ekf, EkfConfig
+from localization.lidar import LidarConfig, LidarMatcher, body_points
+from localization.residuals import motion_residual
+from localization.steps import Step
+from motion_models import se2
+from motion_models.base import Motion
+from motion_models.robot import Mount, Robot
+from motion_models.se2 import FloatArray
+
+
+class EkfFusion:
+    """The filter's steps in their order, and the counts of what happened."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        mounts: Mapping[str, Mount],
+        has_lidar: bool,
+        config: EkfConfig | None = None,
+        lidar: LidarConfig | None = None,
+    ) -> None:
+        config = config or EkfConfig()
+        # without a LiDAR there is no second clock to compare with
+        self._ekf = Ekf(robot.gyro_noise, config if has_lidar else replace(config, clock_sigma_s=0.0))
+        self._matcher = LidarMatcher(lidar) if has_lidar else None
+        self._mounts, self._has_gyro = mounts, False
+        self._counts = dict.fromkeys(("scans", "matched", "contradictions", "standing"), 0)
+        self._has_map = False
+
+    @property
+    def clock_offset_s(self) -> float:
+        return self._ekf.clock_offset
+
+    def step(self, step: Step) -> Estimate:
+        ekf, nis = self._ekf, None
+        ekf.predict(step)
+        if step.turn is not None:
+            self._has_gyro = True
+            ekf.measure_turn(step.turn)
+        if step.is_standing:
+            self._counts["standing"] += 1
+            ekf.measure_standing()
+        if step.scan is not None and self._matcher is not None:
+            nis = self._look(step, self._matcher)
+        twist, twist_cov = self._twist(step)
+        return Estimate(step.end_ns, ekf.pose, ekf.covariance[POSE, POSE], twist, twist_cov, nis)
+
+    def _look(self, step: Step, matcher: LidarMatcher) -> float | None:
+        assert step.scan is not None
+        ekf, nis = self._ekf, None
+        self._counts["scans"] += 1
+        points = body_points(step.scan, self._mounts.get(step.scan.frame_id, Mount()), step.twist)
+        found = matcher.register(points, step.scan.is_planar, ekf.pose, step.predicted.cov)
+        if found is not None:
+            self._counts["matched"] += 1
+            seen = Motion(se2.between(ekf.anchor, found.pose), found.cov)
+            nis = ekf.measure_motion(seen, found.is_trusted)
+            self._counts["contradictions"] += nis > ekf.gate
+        if not step.is_standing or not self._has_map:  # a robot that stands sees nothing new, and would only thicken its lines
+            matcher.insert(ekf.pose)
+            self._has_map = True
+        ekf.set_anchor()
+        return nis
+
+    def _twist(self, step: Step) -> tuple[FloatArray, FloatArray | None]:
+        """Mean twist of the step as all witnesses see it."""
+        if step.duration <= 0:
+            return step.twist, None
+        ekf = self._ekf
+        delta = se2.between(ekf.start, ekf.pose)
+        _, d_start, d_pose = motion_residual(ekf.start, ekf.pose, delta)
+        J, both = np.hstack([d_pose, d_start]), np.r_[POSE, START]
+        return mean_twist(delta, J @ ekf.covariance[np.ix_(both, both)] @ J.T, step.duration)
+
+    def finish(self) -> None:
+        return None
+
+    def parameters(self) -> Mapping[str, tuple[float, float]]:
+        found = {}
+        if self._has_gyro:
+            found["gyro_bias_rad_per_s"] = self._ekf.bias, math.sqrt(self._ekf.covariance[9, 9])
+        if self._matcher is not None:
+            found["wheel_clock_offset_s"] = self._ekf.clock_offset, math.sqrt(self._ekf.covariance[10, 10])
+        return found
+
+    def counts(self) -> Mapping[str, int]:
+        return self._counts
+
+    def map_points(self) -> FloatArray:
+        return np.empty((0, 2)) if self._matcher is None else self._matcher.point_cloud()
