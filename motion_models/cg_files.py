@@ -19,6 +19,8 @@ from motion_models.weighing import Scales, WeighedCg, cg_from_scales, read_weigh
 def arms_model(arms: Arms, folder: Path | None = None, payload: Payload | None = None) -> CgModel:
     """The model that a robot file's ``arms`` describe. ``folder`` is where that file is; None for a robot that is shipped.
 
+    A name that is not in the folder may be that of a file that is shipped: robots derived from one can be kept anywhere.
+
     Raises `RobotError` for files that are missing or malformed, `CgError` for masses that cannot be.
     """
     urdf = _urdf(arms, folder)
@@ -63,13 +65,26 @@ def urdf_cg(
 
 
 def _urdf(arms: Arms, folder: Path | None) -> Urdf:
-    return load_urdf(folder / arms.urdf) if folder is not None else parse_urdf(_text(arms.urdf, None), arms.urdf)
+    found = _beside(arms.urdf, folder)
+    return load_urdf(found) if found is not None else parse_urdf(_text(arms.urdf, None), arms.urdf)
+
+
+def _beside(name: str, folder: Path | None) -> Path | None:
+    """The file that a robot file in ``folder`` means by ``name``; None for one that is shipped."""
+    if folder is None or (not (folder / name).exists() and name in _shipped()):
+        return None
+    return folder / name
+
+
+def _shipped() -> list[str]:
+    return [file.name for file in (resources.files(__package__) / "robots").iterdir()]
 
 
 def _text(name: str, folder: Path | None) -> str:
     try:
-        if folder is not None:
-            return (folder / name).read_text(encoding="utf-8")
+        found = _beside(name, folder)
+        if found is not None:
+            return found.read_text(encoding="utf-8")
         return (resources.files(__package__) / "robots" / name).read_text(encoding="utf-8")
     except OSError as error:
         raise RobotError(f"'{name}', which the robot file names, cannot be read: {error.strerror}.") from error

@@ -89,13 +89,13 @@ class Arms:
     """What a robot file says of its arms."""
 
     urdf: str
-    """URDF with the arms' masses, a path from the robot file's folder. xacro must be expanded first."""
+    """URDF with the arms' masses: a path from the robot file's folder, or a file that is shipped. xacro must be expanded first."""
     base_link: str = "base_link"
     """Link of the URDF whose frame is the body frame: its origin below or above the wheelbase's centre, x forward, y left."""
     joints: tuple[str, ...] = ()
     """Joints whose positions the log tells; by default all that can move the centre of gravity. Others are taken to stand at 0."""
     postures: str = ""
-    """SRDF with named postures, a path from the robot file's folder."""
+    """SRDF with named postures, a path in the same way."""
     static_mass_kg: float = 0.0
     """Mass of everything but the arms; 0 where the URDF's masses are to be used for that too."""
     static_x_m: float = 0.0

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from motion_models.cg_parts import Arms
 from motion_models.errors import RobotError
 from motion_models.se2 import FloatArray
 
@@ -139,6 +140,10 @@ class Robot:
     gyro_noise: GyroNoise = GyroNoise()
     models: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Coefficients by model name, then by parameter name; what is not named keeps the model's own default."""
+    arms: Arms | None = None
+    """Arms that move the centre of gravity; None where it stays where `Geometry` says."""
+    folder: Path | None = field(default=None, compare=False)
+    """Where the robot's file is, from which the paths in it start; None for a robot that is shipped. Not in the file."""
 
     @property
     def center_of_gravity(self) -> FloatArray:
@@ -170,20 +175,22 @@ def load_robot(robot: str | Path) -> Robot:
             text = path.read_text(encoding="utf-8")
         except OSError as error:
             raise RobotError(f"robot file '{path}' cannot be read: {error.strerror}.") from error
-        return parse_robot(text, source=str(path))
+        except UnicodeDecodeError as error:
+            raise RobotError(f"robot file '{path}' is not text (byte {error.start} is not UTF-8).") from error
+        return parse_robot(text, source=str(path), folder=path.parent)
     if str(robot) not in robot_names():
         raise RobotError(f"no robot '{robot}'; shipped are {', '.join(robot_names())}. Name one of them or a path to a .toml file.")
     text = (resources.files(__package__) / "robots" / f"{robot}.toml").read_text(encoding="utf-8")
     return parse_robot(text, source=f"{robot}.toml")
 
 
-def parse_robot(text: str, source: str) -> Robot:
-    """The robot of a TOML text; ``source`` names it in errors. Raises `RobotError`."""
+def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
+    """The robot of a TOML text; ``source`` names it in errors, ``folder`` is where paths in it start. Raises `RobotError`."""
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise RobotError(f"{source}: not valid TOML: {error}.") from error
-    known = {f.name for f in dataclasses.fields(Robot)}
+    known = {f.name for f in dataclasses.fields(Robot)} - {"folder"}
     _refuse_unknown(data, known, source)
     if not isinstance(data.get("name"), str):
         raise RobotError(f'{source}: needs a line name = "...".')
@@ -210,7 +217,19 @@ def parse_robot(text: str, source: str) -> Robot:
         wheel_noise=_section(WheelNoise, data, "wheel_noise", source),
         gyro_noise=_section(GyroNoise, data, "gyro_noise", source),
         models=models,
+        arms=_arms(data, source) if "arms" in data else None,
+        folder=folder,
     )
+
+
+def _arms(data: Mapping[str, Any], source: str) -> Arms:
+    arms = _section(Arms, data, "arms", source)
+    for name, value in dataclasses.asdict(arms).items():
+        if ("sigma" in name or name == "static_mass_kg") and value < 0.0:
+            raise RobotError(f"{source}: arms.{name} is {value:g}; it must not be below 0.")
+    if arms.weighed_posture and not arms.postures:
+        raise RobotError(f"{source}: arms.weighed_posture names '{arms.weighed_posture}', but arms.postures names no SRDF that has it.")
+    return arms
 
 
 def _table(data: Mapping[str, Any], name: str, source: str) -> Mapping[str, Any]:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from motion_models.robot import Robot
@@ -24,11 +26,22 @@ def robot_toml(robot: Robot, sigmas: Mapping[str, Mapping[str, float]] | None = 
     lines.append(f"name = {_value(robot.name)}")
     for name in ("geometry", "driver", "topics", "joints", "wheel_noise", "gyro_noise"):
         lines += _table(name, dataclasses.asdict(getattr(robot, name)))
+    if robot.arms is not None:
+        lines += _table("arms", {name: value for name, value in dataclasses.asdict(robot.arms).items() if value != ()})
     for frame, mount in robot.mounts.items():
         lines += _table(f"mounts.{_key(frame)}", dataclasses.asdict(mount))
     for model, coefficients in robot.models.items():
         lines += _table(f"models.{_key(model)}", coefficients, sigmas.get(model, {}))
     return "\n".join(lines) + "\n"
+
+
+def relocated(robot: Robot, folder: Path) -> Robot:
+    """``robot`` as a file in ``folder`` says it: the paths in it start there. Those of shipped robots hold everywhere."""
+    if robot.arms is None or robot.folder is None:
+        return dataclasses.replace(robot, folder=folder)
+    start, names = robot.folder, (robot.arms.urdf, robot.arms.postures)
+    urdf, postures = (os.path.relpath(start / name, folder) if name and (start / name).exists() else name for name in names)
+    return dataclasses.replace(robot, arms=dataclasses.replace(robot.arms, urdf=urdf, postures=postures), folder=folder)
 
 
 def _table(header: str, values: Mapping[str, Any], sigmas: Mapping[str, float] | None = None) -> list[str]:
