@@ -21,3 +21,7 @@ class OutputError(SkidlocError):
 
 class EstimatorError(SkidlocError):
     """An estimator that does not exist, that lacks what it needs from the log, or whose state is no longer finite."""
+
+
+class SimulationError(SkidlocError):
+    """A simulation that does not exist or cannot be driven: an unknown experiment or effect, a robot that tips over or hits a wall."""
