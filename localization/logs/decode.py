@@ -39,6 +39,18 @@ class JointReading:
 
 
 @dataclass(frozen=True)
+class ArmReading:
+    """Joints of the arms at one instant, those of one message."""
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    position: FloatArray
+    """(n,) [rad or m], NaN where absent."""
+    wheels: JointReading | None = None
+    """What the same message says of the wheels; its stamp may be older than this one, which counts."""
+
+
+@dataclass(frozen=True)
 class OdometryReading:
     """A driver's odometry at one instant."""
 
@@ -151,6 +163,30 @@ def joint_decoder(joints: tuple[str, ...]) -> Callable[[Any, int], JointReading 
         if not (np.isfinite(position).all() or np.isfinite(velocity).all()):
             raise UnusableError(Oddity.NOT_FINITE)
         return JointReading(stamp, position, velocity)
+
+    return decode
+
+
+def arm_decoder(
+    joints: frozenset[str], wheels: Callable[[Any, int], JointReading | None] | None
+) -> Callable[[Any, int], ArmReading | JointReading | None]:
+    """Decoder of joint states for the arms' ``joints``, and by ``wheels`` for those of the wheels where one topic tells both.
+
+    A message without positions, which ROS allows, tells nothing of the arms.
+    """
+
+    def decode(message: Any, stamp: int) -> ArmReading | JointReading | None:
+        reading = None if wheels is None else wheels(message, stamp)
+        names = tuple(message.name)
+        columns = [i for i, name in enumerate(names) if name in joints]
+        position = np.asarray(message.position, dtype=float)
+        if not columns or not len(position):
+            return reading
+        if len(position) != len(names):
+            if reading is None:
+                raise UnusableError(Oddity.MALFORMED)
+            return reading
+        return ArmReading(stamp, tuple(names[i] for i in columns), position[columns], reading)
 
     return decode
 

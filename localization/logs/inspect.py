@@ -9,7 +9,7 @@ import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from localization.logs.topics import REFERENCE_TYPES, TYPES, short_type
+from localization.logs.topics import REFERENCE_TYPES, TYPES, TopicSource, short_type
 
 if TYPE_CHECKING:
     from localization.logs.log import Log
@@ -39,7 +39,7 @@ class TopicInfo:
     count: int
     rate_hz: float | None
     used_as: str | None
-    """The part that it plays: wheels, lidar, imu, center_of_gravity, reference; or null."""
+    """The part that it plays: wheels, lidar, imu, center_of_gravity, arms, reference; or null."""
     frame_id: str | None
     first_stamp_ns: int | None
     last_stamp_ns: int | None
@@ -63,7 +63,8 @@ class LogInfo:
     messages: int
     topics: list[TopicInfo]
     parts: dict[str, dict[str, str] | None]
-    """By part (wheels, lidar, imu, center_of_gravity): topic, kind, and what chose it; null where nothing plays it."""
+    """By part (wheels, lidar, imu, center_of_gravity): topic, kind, and what chose it; null where nothing plays it. A centre of gravity
+    that is computed from the arms has their joint states' topics, and is chosen by "arms"."""
     references: list[str]
     """Topics that a result can be scored against."""
     mounts: dict[str, dict[str, float]]
@@ -137,6 +138,11 @@ def inspect_log(log: Log) -> LogInfo:
         "center_of_gravity": log.sources.center_of_gravity,
     }
     played = {source.topic: part for part, source in parts.items() if source is not None}
+    for source in log.sources.arms:
+        played.setdefault(source.topic, "arms")
+    if log.sources.arms:
+        topics_of_arms = ", ".join(source.topic for source in log.sources.arms)
+        parts["center_of_gravity"] = TopicSource(topics_of_arms, "joint_states", "arms")
     if log.reference_topic is not None:
         played.setdefault(log.reference_topic, "reference")
     topics = []
@@ -208,8 +214,13 @@ def _problems(log: Log, topics: list[TopicInfo]) -> list[str]:
                 f"{source.topic} is measured in frame '{frame}', whose place on the robot neither the log's /tf_static nor the robot"
                 f" file tells; add [mounts.{frame}] to the robot file."
             )
+    if log.robot.arms is not None and log.sources.center_of_gravity is None and not log.sources.arms:
+        said.append(
+            f"robot '{log.robot.name}' has arms, but no joint states tell how they stand: the centre of gravity stays at"
+            f" ({log.robot.geometry.cg_x_m:g}, {log.robot.geometry.cg_y_m:g}) m."
+        )
     said += _uneven(log, topics)
-    used = [topic for topic in topics if topic.used_as in ("wheels", "lidar", "imu", "center_of_gravity")]
+    used = [topic for topic in topics if topic.used_as in ("wheels", "lidar", "imu", "center_of_gravity", "arms")]
     for topic in used:
         for count, what in (
             (topic.zero_stamps, "have no stamp"),

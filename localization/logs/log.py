@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
@@ -9,13 +10,16 @@ from typing import Any
 
 from localization.errors import LogError
 from localization.events import Event, Reference
+from localization.logs.arms import arms_to_cg
 from localization.logs.chunks import Source, merge_channels
 from localization.logs.clouds import decode_cloud
 from localization.logs.decode import (
+    ArmReading,
     Decoder,
     JointReading,
     OdometryReading,
     UnusableError,
+    arm_decoder,
     decode_cg,
     decode_imu,
     decode_odometry,
@@ -81,7 +85,7 @@ class Log:
         """Which topic plays which part."""
         self.wheels_error = parts.wheels_error
         """Why `events` will refuse, if it will."""
-        self._joints, self._choice_notes = parts.joints, parts.notes
+        self._joints, self._arms, self._choice_notes = parts.joints, parts.arms, parts.notes
         self.frames: dict[str, str] = {}
         """Frame of the first message of each topic that is used."""
         self._clocks = self._watch_clocks()
@@ -158,9 +162,16 @@ class Log:
         left, right = self._joints
         from_joints = joints_to_wheels(len(left), len(right), self.robot.geometry.wheel_radius_m, topic, tally)
         from_odometry = odometry_to_wheels(self.robot.driver, topic, tally)
+        arms = " and ".join(source.topic for source in self.sources.arms)
+        from_arms = None if self._arms is None else arms_to_cg(self._arms, self.robot.geometry, arms, tally)
         for payload in merge(self._items(parts, tally), self._clocks, tally):
             if isinstance(payload, JointReading):
                 yield from_joints(payload)
+            elif isinstance(payload, ArmReading):
+                if payload.wheels is not None:
+                    yield from_joints(dataclasses.replace(payload.wheels, stamp_ns=payload.stamp_ns))
+                if from_arms is not None:
+                    yield from from_arms(payload)
             elif isinstance(payload, OdometryReading):
                 yield from_odometry(payload)
             else:
@@ -168,7 +179,13 @@ class Log:
 
     def _payload_decoder(self, source: TopicSource) -> Payload:
         if source.kind == "joint_states":
-            return joint_decoder((*self._joints[0], *self._joints[1]))
+            wheels = self.sources.wheels
+            is_wheels = wheels is not None and wheels.topic == source.topic
+            of_wheels = joint_decoder((*self._joints[0], *self._joints[1])) if is_wheels else None
+            if self._arms is not None and any(arm.topic == source.topic for arm in self.sources.arms):
+                return arm_decoder(frozenset(self._arms.chain.joint_names), of_wheels)
+            assert of_wheels is not None
+            return of_wheels
         if source.kind == "scan":
             return scan_decoder()
         decoders: dict[str, Payload] = {
@@ -196,6 +213,8 @@ class Log:
                 tally.count(raw.topic, Oddity.MALFORMED)
                 continue
             if payload is not None:
+                if isinstance(payload, ArmReading) and payload.wheels is None:
+                    rank = _RANKS["center_of_gravity"]
                 yield Item(raw.log_ns, stamp, raw.topic, rank, _SCAN_WEIGHT if rank == 3 else 1, payload)
 
     def _first_messages(self, topic: str, most: int) -> Iterator[tuple[int, Any]]:

@@ -157,7 +157,7 @@ def merge(items: Iterable[Item], plan: ClockPlan, tally: Tally) -> Iterator[Any]
     clocks = {topic: TopicClock(topic, plan, jumps, tally) for topic in plan.latency_ns}
     held: list[tuple[int, int, int, Item]] = []
     held_weight = serial = now = 0
-    emitted: dict[str, int] = {}
+    emitted: dict[tuple[str, int], int] = {}  # two drivers may share a topic, as wheels and arms do, and a stamp
     newest = -(2**63)
 
     def release(horizon: int, most: int) -> Iterator[Any]:
@@ -165,10 +165,10 @@ def merge(items: Iterable[Item], plan: ClockPlan, tally: Tally) -> Iterator[Any]
         while held and (held[0][0] <= horizon or held_weight > most):
             stamp, _, _, item = heapq.heappop(held)
             held_weight -= item.weight
-            if emitted.get(item.topic) == stamp:
+            if emitted.get((item.topic, item.rank)) == stamp:
                 tally.count(item.topic, Oddity.REPEATED)
                 continue
-            emitted[item.topic] = newest = stamp
+            emitted[item.topic, item.rank] = newest = stamp
             yield item.payload
 
     for item in items:

@@ -6,7 +6,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from localization.errors import TopicError
+from localization.logs.arms import covering
 from localization.logs.topics import TYPES, Sources, TopicChooser, TopicOverrides, TopicSource
+from motion_models.center_of_gravity import CgModel
+from motion_models.cg_files import arms_model
 from motion_models.robot import Robot
 
 JointNames = Callable[[str], Iterable[Iterable[str]]]
@@ -25,11 +28,13 @@ class Parts:
     """Wheel joints that the log has; empty where the wheels are not joint states."""
     wheels_error: TopicError | None
     """Why the wheels cannot be used although they seem to be meant."""
+    arms: CgModel | None
+    """What turns the joint states of `Sources.arms` into centres of gravity."""
     notes: list[str]
 
 
 def choose_parts(log: str, chooser: TopicChooser, robot: Robot, overrides: TopicOverrides, joint_names: JointNames) -> Parts:
-    """Who plays the parts. Raises `TopicError` if an option names a topic that does not fit."""
+    """Who plays the parts. Raises `TopicError` if an option names a topic that does not fit, and what `arms_model` does."""
     return _Choice(log, chooser, robot, overrides, joint_names).parts()
 
 
@@ -42,8 +47,33 @@ class _Choice:
         self._notes: list[str] = []
 
     def parts(self) -> Parts:
-        sources = Sources(self._wheels(), self._lidar(), self._choose("imu"), self._choose("center_of_gravity"))
-        return Parts(sources, self._joints, self._error, [*self._chooser.notes, *self._notes])
+        wheels, lidar, imu, center_of_gravity = self._wheels(), self._lidar(), self._choose("imu"), self._choose("center_of_gravity")
+        arms, model = self._arms() if center_of_gravity is None else ((), None)
+        sources = Sources(wheels, lidar, imu, center_of_gravity, arms)
+        return Parts(sources, self._joints, self._error, model, [*self._chooser.notes, *self._notes])
+
+    def _arms(self) -> tuple[tuple[TopicSource, ...], CgModel | None]:
+        """Joint states that tell how the arms stand. An empty option for the centre of gravity leaves it where the robot file says."""
+        robot = self._robot
+        if robot.arms is None or self._overrides.center_of_gravity is not None:
+            return (), None
+        model = arms_model(robot.arms, robot.folder)
+        joints = model.chain.joint_names
+        told: dict[str, set[str]] = {}
+        for topic in self._chooser.of_type(TYPES["joint_states"]):
+            names = {name for message_names in self._joint_names(topic) for name in message_names}
+            told[topic] = names
+        topics, missing = covering(joints, told)
+        strange = sorted(set().union(*told.values()) - set(joints) - {*robot.joints.left, *robot.joints.right})
+        if missing and (topics or strange):
+            unknown = f" Joints in it that the robot does not have: {', '.join(strange)}." if strange else ""
+            self._notes.append(
+                f"{', '.join(topics or told)} lacks {', '.join(missing)} of the arms; until told, the centre of gravity stays where the"
+                f" robot file says.{unknown} Name the joints as the log does, or list those that it has in the robot file's [arms] joints."
+            )
+        if not topics:
+            return (), None
+        return tuple(TopicSource(topic, "joint_states", "robot") for topic in topics), model
 
     def _choose(self, kind: str) -> TopicSource | None:
         named = self._chooser.named(kind)

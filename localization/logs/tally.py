@@ -23,6 +23,7 @@ class Oddity(Enum):
     POSE_JUMP = "with a pose that wheels cannot reach (a reset); the increment was taken from the rates"
     NO_POSE = "with rates but a pose that never moves; the increment was taken from the rates"
     NO_TWIST = "with a moving pose but no rates; these were taken from the pose"
+    TIPPING = "with arms at which the robot would tip over (joints in degrees?); their centre of gravity was left out"
     WHEEL_JUMP = "with a wheel angle that wheels cannot reach (a reset); the increment was taken from the rates"
 
 

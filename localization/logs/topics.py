@@ -65,9 +65,13 @@ class Sources:
     lidar: TopicSource | None
     imu: TopicSource | None
     center_of_gravity: TopicSource | None
+    arms: tuple[TopicSource, ...] = ()
+    """Joint states of the arms, from which the centre of gravity is computed where no topic tells it; one may be the wheels' too."""
 
     def used(self) -> list[TopicSource]:
-        return [s for s in (self.wheels, self.center_of_gravity, self.imu, self.lidar) if s is not None]
+        """Each topic once."""
+        others = [s for s in (self.wheels, self.center_of_gravity, self.imu, self.lidar) if s is not None]
+        return others + [arm for arm in self.arms if all(arm.topic != other.topic for other in others)]
 
 
 class TopicChooser:
