@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numba
 
 from motion_models.friction_kernel import contact, loads, rolling, traction
-from motion_models.se2 import FloatArray
 
 GAMMA = 1.0 - math.sqrt(0.5)
 """The method's coefficient: its stages are at GAMMA h and at h."""

@@ -121,18 +121,24 @@ class VehicleState:
 
 
 def advance(
-    state: VehicleState, body: Body, config: VehicleConfig, wheels: FloatArray, cg: FloatArray, payload: tuple[float, float], patches: FloatArray
+    state: VehicleState,
+    body: Body,
+    config: VehicleConfig,
+    wheels: FloatArray,
+    cg: FloatArray,
+    payload: tuple[float, float],
+    patches: FloatArray,
 ) -> FloatArray:
     """Drive on by n steps; the records (n, 13) at their ends.
 
     ``wheels`` (n, 2) commanded rates [rad/s]; ``cg`` (n, 7) CG x, y, its velocity and its acceleration (z too) at the start of each step;
-    ``payload`` mass [kg] and distance from the robot's axis [m]; ``patches`` (k, 5) floor rectangles x0, y0, x1, y1 with a factor of the
+    ``payload`` mass [kg] and distance from the CG of all [m]; ``patches`` (k, 5) floor rectangles x0, y0, x1, y1 with a factor of the
     friction. Raises `SimulationError` where the robot tips over, `CgError` for a CG outside of the wheels.
     """
     cg = cg + np.array([*body.cg_offset, 0.0, 0.0, 0.0, 0.0, 0.0])
     check_parameters(cg[:, :2], body.params)
     mass = body.mass + payload[0]
-    inertia = body.inertia + payload[0] * payload[1] ** 2
+    inertia = body.inertia + payload[0] * payload[1] ** 2 * (1.0 + payload[0] / body.mass)
     out = np.empty((len(wheels), COLUMNS))
     ramp = config.acceleration_m_s2 / (0.5 * (body.radius_left + body.radius_right))
     chassis = body.chassis(config)

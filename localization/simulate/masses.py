@@ -1,0 +1,146 @@
+"""Where the mass is while arms move: joint motions, a payload, and the centre of gravity with its velocity and acceleration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from localization.errors import SimulationError
+from motion_models.center_of_gravity import CgModel
+from motion_models.cg_files import arms_model, arms_postures
+from motion_models.cg_parts import Payload
+from motion_models.errors import CgError
+from motion_models.postures import Posture, posture_for
+from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
+
+_DIFFERENCE_S = 1e-3
+_FASTEST_RAD_S = 1.0
+_GRIPPERS = ("left_gripper", "gripper", "tool0", "left_tool0")
+
+
+class Masses:
+    """The robot's arms, or, on a robot without any, a ballast that is pushed about on its top.
+
+    Joints move along minimum-jerk profiles (Flash & Hogan 1985): velocity and acceleration start and end at zero.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self._empty: CgModel | None = None
+        self.postures: Mapping[str, Posture] = {}
+        start = robot.center_of_gravity
+        if robot.arms is not None:
+            self._empty = arms_model(robot.arms, robot.folder)
+            self.postures = arms_postures(robot.arms, robot.folder)
+            known = self.postures.get(robot.arms.weighed_posture) or next(iter(self.postures.values()), {})
+            names = self._empty.chain.joint_names
+            start = np.clip([known.get(name, 0.0) for name in names], self._empty.chain.lower, self._empty.chain.upper)
+        self._model = self._empty
+        self._from, self._to = start.astype(float), start.astype(float)
+        self._start_s, self._duration_s = 0.0, 1.0
+        self.payload_kg = 0.0
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Joints of the arms; empty for a robot without."""
+        return self._empty.chain.joint_names if self._empty is not None else ()
+
+    def reach(self, cg: FloatArray) -> FloatArray:
+        """Positions that put the nominal CG at ``cg`` (2,) [m]. Raises `CgError` where no posture does."""
+        if self._empty is None:
+            return np.asarray(cg, dtype=float)
+        found = posture_for(self._empty, cg, self.postures)
+        return np.array([found[name] for name in self.joint_names])
+
+    def posture(self, name: str) -> FloatArray:
+        """Positions of a named posture. Raises `SimulationError`."""
+        if self._empty is None or name not in self.postures:
+            known = ", ".join(self.postures) or "none"
+            raise SimulationError(f"robot '{self._robot.name}' has no arm posture '{name}'; its postures: {known}.")
+        return self._empty.chain.posture(self.postures[name])
+
+    def time_to(self, target: FloatArray) -> float:
+        """Seconds that a motion to ``target`` takes at the joints' speed, 1 at least; half a second per 5 cm for a ballast."""
+        far = float(np.abs(target - self._to).max(initial=0.0))
+        return max(1.0, 1.875 * far / _FASTEST_RAD_S if self._empty is not None else 10.0 * far)
+
+    def move(self, target: FloatArray, start_s: float, duration_s: float) -> None:
+        """Begin a motion to ``target``; the one before must have ended."""
+        self._from, self._to = self._to, np.asarray(target, dtype=float)
+        self._start_s, self._duration_s = start_s, max(duration_s, 1e-3)
+
+    def pick_up(self, payload_kg: float) -> None:
+        """Take a payload into the (left) gripper; without arms it is set down at the front edge, between the wheels. 0 puts it down."""
+        self.payload_kg = payload_kg
+        if self._empty is None or self._robot.arms is None:
+            return
+        if payload_kg <= 0.0:
+            self._model = self._empty
+            return
+        link = next((name for name in _GRIPPERS if name in self._empty.chain.links), None)
+        if link is None:
+            raise SimulationError(f"robot '{self._robot.name}' has no link {' or '.join(_GRIPPERS)} to hold a payload.")
+        self._model = arms_model(self._robot.arms, self._robot.folder, Payload(link, payload_kg))
+
+    def joints(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Positions and velocities (n, k) of the joints at ``times_s`` (n,)."""
+        u = np.clip((times_s - self._start_s) / self._duration_s, 0.0, 1.0)[:, None]
+        far = self._to - self._from
+        position = self._from + far * u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
+        velocity = far * 30.0 * u**2 * (1.0 - u) ** 2 / self._duration_s
+        return position, velocity
+
+    def cg(self, times_s: FloatArray) -> FloatArray:
+        """(n, 7) CG x, y, its velocity, and its acceleration (z too) in the body frame, payload included, at ``times_s`` (n,).
+
+        Differences over 2 ms of the chain's exact CG: off by 1e-6 of the motion.
+        """
+        out = np.zeros((len(times_s), 7))
+        moving = (times_s > self._start_s - 0.01) & (times_s < self._start_s + self._duration_s + 0.01)
+        before = ~moving & (times_s < self._start_s + 0.5 * self._duration_s)
+        after = ~moving & ~before
+        for resting in (before, after):
+            if resting.any():
+                out[resting, :2] = self._at(times_s[resting][:1])[:, :2]
+        if moving.any():
+            t, d = times_s[moving], _DIFFERENCE_S
+            early, now, late = self._at(t - d), self._at(t), self._at(t + d)
+            out[moving, :2] = now[:, :2]
+            out[moving, 2:4] = (late - early)[:, :2] / (2.0 * d)
+            out[moving, 4:7] = (late - 2.0 * now + early) / (d * d)
+        return out
+
+    def nominal_cg(self, times_s: FloatArray) -> FloatArray:
+        """(n, 2) CG as the robot file and the joints tell it, without payload."""
+        position, _ = self.joints(times_s)
+        return position if self._empty is None else self._empty.cg(position)
+
+    def payload_distance(self, time_s: float) -> float:
+        """How far the payload is from the CG of all [m]."""
+        if self.payload_kg <= 0.0:
+            return 0.0
+        at = np.array([time_s])
+        nominal, loaded = self.nominal_cg(at)[0], self._at(at)[0, :2]
+        mass = self._robot.geometry.mass_kg
+        # From the payload to the CG of all, and from there to the rest, as the masses: m p = (M + m) g - M n
+        return float(np.hypot(*(loaded - nominal)) * mass / self.payload_kg)
+
+    def _at(self, times_s: FloatArray) -> FloatArray:
+        """(n, 3) CG with its payload."""
+        position, _ = self.joints(times_s)
+        if self._model is not None:
+            return self._model.chain.center_of_mass(position)
+        mass, load = self._robot.geometry.mass_kg, self.payload_kg
+        edge = np.array([0.5 * self._robot.geometry.wheelbase_m, 0.0])
+        planar = (mass * position + load * edge) / (mass + load)
+        return np.column_stack([planar, np.zeros(len(planar))])
+
+
+def require_reachable(masses: Masses, targets: FloatArray) -> list[FloatArray]:
+    """`Masses.reach` for all ``targets`` (n, 2). Raises `SimulationError` naming the CG that no posture reaches."""
+    try:
+        return [masses.reach(target) for target in targets]
+    except CgError as error:
+        raise SimulationError(f"this experiment needs a CG that the robot's arms cannot give it: {error}") from error

@@ -1,0 +1,342 @@
+"""The simulation: phases drive the vehicle, sensors read its track, messages come out in order of time."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from localization.errors import SimulationError
+from localization.logs import forms
+from localization.logs.forms import Message
+from localization.logs.write import write_bag
+from localization.simulate.drives import MoveArms, OpenLoop, Phase, PickUp, Pursuit, Rest, Route, turning
+from localization.simulate.effects import Reality, changed
+from localization.simulate.experiments import Experiment, ExperimentConfig, find_experiment
+from localization.simulate.masses import Masses
+from localization.simulate.raycast import clearance
+from localization.simulate.scanners import Scanner, ScannerConfig, SpinningConfig, SpinningScanner
+from localization.simulate.sensors import EncoderConfig, Encoders, Gps, GpsConfig, Imu, ImuConfig, Truth
+from localization.simulate.track import Track
+from localization.simulate.vehicle import CG, COLUMNS, POSE, Body, VehicleConfig, VehicleState, advance
+from motion_models.cg_parts import require_support
+from motion_models.errors import CgError
+from motion_models.registry import make_model
+from motion_models.robot import Mount, Robot
+from motion_models.se2 import FloatArray
+
+START_NS = 1_000_000_000
+"""Stamp of the simulation's beginning."""
+_CONTROL_S = 0.02
+_LOOK_S = 0.1
+_FLUSH_S = 2.0
+_KEEP_S = 1.0
+_SETTLE_S = 1.0
+_RUN_HZ = 20.0
+_LASER, _CLOUD, _IMU, _GPS = "laser", "velodyne", "imu_link", "gps_link"
+_MOUNTS = {_LASER: Mount(x=0.4, z=0.2), _CLOUD: Mount(x=0.0, z=0.8), _IMU: Mount(z=0.1), _GPS: Mount(z=1.0)}
+
+
+@dataclass(frozen=True)
+class SimulationConfig:
+    """Everything that can be set about a simulation."""
+
+    lidar: Literal["2d", "3d", "none"] = "2d"
+    """Planar scanner on /scan, spinning scanner on /points, or none."""
+    center_of_gravity: bool = False
+    """Publish the nominal CG, which arms and robot file tell, on its topic."""
+    truth_hz: float = 25.0
+    """Rate of the truth."""
+    experiment: ExperimentConfig = field(default_factory=ExperimentConfig)
+    vehicle: VehicleConfig = field(default_factory=VehicleConfig)
+    encoders: EncoderConfig = field(default_factory=EncoderConfig)
+    scanner: ScannerConfig = field(default_factory=ScannerConfig)
+    spinning: SpinningConfig = field(default_factory=SpinningConfig)
+    imu: ImuConfig = field(default_factory=ImuConfig)
+    gps: GpsConfig = field(default_factory=GpsConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class RunRecord:
+    """What truly happened in one named phase, 20 times a second from the body's rest before it to its rest after it."""
+
+    name: str
+    start_s: float
+    """[s] since the simulation's beginning."""
+    poses: FloatArray
+    """(n, 3) of the body in the world."""
+    wheel_angles: FloatArray
+    """(n, 2) left and right, exact [rad]."""
+    cg: FloatArray
+    """(n, 2) true CG [m]."""
+    nominal_cg: FloatArray
+    """(2,) as the robot knew it [m]."""
+    command: OpenLoop | Route
+
+    @property
+    def times_s(self) -> FloatArray:
+        """(n,) since the start of the run."""
+        return np.asarray(np.arange(len(self.poses)) / _RUN_HZ)
+
+
+class Simulation:
+    """One experiment with one robot; `messages` drives it, once."""
+
+    def __init__(
+        self, experiment: Experiment, robot: Robot, seed: int, effects: Mapping[str, float], config: SimulationConfig | None = None
+    ) -> None:
+        self.config = config or SimulationConfig()
+        self.experiment, self.robot = experiment, robot
+        self.world = experiment.make_world()
+        self.runs: list[RunRecord] = []
+        """Named phases that are over."""
+        self.mounts = {name: robot.mounts.get(name, mount) for name, mount in _MOUNTS.items()}
+        lidar = self.mounts[_LASER if self.config.lidar == "2d" else _CLOUD]
+        self.reality = changed(Reality(Body.from_robot(robot), lidar), effects)
+        self._body = self.reality.body
+        self._masses = Masses(robot)
+        self._masses.pick_up(self.reality.payload_kg)
+        self._state = VehicleState.at(np.array(experiment.start))
+        first = np.zeros(COLUMNS)
+        first[POSE], first[-1] = experiment.start, 1.0
+        first[CG] = self._masses.cg(np.zeros(1))[0, :2] + np.array(self._body.cg_offset)
+        self._check_support(first[CG])
+        self._track = Track(first, self.config.vehicle.step_s)
+        self._sensors = self._make_sensors(np.random.SeedSequence(seed))
+        self._controllers = {name: make_model(name, robot) for name in ("diff_drive", "skid_steer")}
+        self._half_width = 0.5 * robot.geometry.track_width_m + 0.06
+        self._half_length = 0.5 * robot.geometry.wheelbase_m
+
+    @property
+    def time_s(self) -> float:
+        """Simulated so far [s]."""
+        return self._state.steps * self.config.vehicle.step_s
+
+    def messages(self) -> Iterator[Message]:
+        """All messages, in order of their time of recording. Raises `SimulationError` where the drive cannot go on."""
+        yield self._transforms()
+        phases = list(self._phases()) if self.experiment.name != "soak" else self._phases()
+        half = len(phases) // 2 if isinstance(phases, list) else -1
+        flushed = 0.0
+        for number, phase in enumerate(phases):
+            if number == half or (half < 0 and self.time_s > 0.5 * self._limit_s):
+                self._later()
+            for _ in self._drive(phase):
+                if self.time_s > flushed + _FLUSH_S:
+                    flushed = self.time_s
+                    yield from self._flush()
+            yield from self._flush()
+            if self.time_s >= self._limit_s:
+                return
+
+    @property
+    def _limit_s(self) -> float:
+        return 3600.0 * self.config.experiment.hours if self.experiment.name == "soak" else np.inf
+
+    def _phases(self) -> Iterator[Phase]:
+        return self.experiment.phases(self.robot, self.config.experiment)
+
+    def _later(self) -> None:
+        """The second half of the drive begins."""
+        if self.reality.side_friction_later != 1.0 and self._body is self.reality.body:
+            self._body = self._body.with_param("mu_ratio", self._body.param("mu_ratio") * self.reality.side_friction_later)
+
+    # --- driving
+
+    def _drive(self, phase: Phase) -> Iterator[None]:
+        """Drive one phase, coming back every now and then so that messages can be written."""
+        if isinstance(phase, Rest):
+            yield from self._blind(np.zeros((self._control_steps(phase.duration_s), 2)), "diff_drive")
+        elif isinstance(phase, MoveArms):
+            target = self._masses.posture(phase.target) if isinstance(phase.target, str) else self._reach(phase.target)
+            duration = phase.duration_s or self._masses.time_to(target)
+            self._masses.move(target, self.time_s, duration)
+            yield from self._blind(np.zeros((self._control_steps(duration), 2)), "diff_drive")
+            self._check_support(self._track.rows[-1, CG])
+        elif isinstance(phase, PickUp):
+            self._masses.pick_up(phase.mass_kg + self.reality.payload_kg)
+            self._check_support(self._masses.cg(np.array([self.time_s]))[0, :2] + np.array(self._body.cg_offset))
+        elif isinstance(phase, OpenLoop):
+            n = self._control_steps(phase.duration_s)
+            commands = np.vstack([phase.profile(_CONTROL_S * np.arange(n)), np.zeros((self._control_steps(_SETTLE_S), 2))])
+            yield from self._recorded(phase, self._blind(commands, phase.controller))
+        elif isinstance(phase, Route):
+            yield from self._recorded(phase, self._seeing(Pursuit(self._state.pose, phase).command, self._route_limit(phase)))
+        else:
+            heading = phase.heading
+            yield from self._seeing(lambda pose: turning(pose, heading), 60.0)
+
+    def _recorded(self, phase: OpenLoop | Route, drive: Iterator[None]) -> Iterator[None]:
+        """Keep what happens in a phase that has a name."""
+        start_s, cg = self.time_s, self._masses.nominal_cg(np.array([self.time_s]))[0]
+        kept: list[FloatArray] = []
+        taken = 0
+        every = 1.0 / _RUN_HZ
+
+        def take() -> None:
+            nonlocal taken
+            last = int((self.time_s - start_s) / every + 1e-6)
+            kept.append(self._track.at(start_s + every * np.arange(taken, last + 1)))
+            taken = last + 1
+
+        for _ in drive:
+            take()
+            yield
+        take()
+        if phase.name:
+            rows = np.concatenate(kept)
+            self.runs.append(RunRecord(phase.name, start_s, rows[:, POSE], rows[:, 8:10], rows[:, CG], cg, phase))
+
+    def _blind(self, commands: FloatArray, controller: str) -> Iterator[None]:
+        """Commands (n, 2), one for each control period."""
+        chunk = max(1, round(1.0 / _CONTROL_S))
+        for first in range(0, len(commands), chunk):
+            self._advance(commands[first : first + chunk], controller)
+            yield
+
+    def _seeing(self, steer: Callable[[FloatArray], FloatArray | None], limit_s: float) -> Iterator[None]:
+        """Commands that depend on the true pose, ten times a second; then stop."""
+        until = self.time_s + limit_s
+        periods = round(_LOOK_S / _CONTROL_S)
+        while (command := steer(self._state.pose)) is not None:
+            if self.time_s > until:
+                x, y, _ = self._state.pose
+                raise SimulationError(
+                    f"the robot does not get where it is sent: after {limit_s:.0f} s it is at x = {x:.2f}, y = {y:.2f} m, "
+                    f"{self.time_s:.1f} s into the drive. Its wheels may slip too much; make the effects smaller."
+                )
+            self._advance(np.tile(command, (periods, 1)), "diff_drive")
+            yield
+        yield from self._blind(np.zeros((self._control_steps(0.6), 2)), "diff_drive")
+
+    def _route_limit(self, route: Route) -> float:
+        return 30.0 + 4.0 * Pursuit(self._state.pose, route).length / route.speed_m_s
+
+    def _advance(self, commands: FloatArray, controller: str) -> None:
+        """Drive on by one control period for each of ``commands`` (n, 2)."""
+        config = self.config.vehicle
+        times = self.time_s + config.step_s * np.arange(len(commands) * self._steps_per_control())
+        model = self._controllers[controller]
+        nominal = self._masses.nominal_cg(times[:1])[0]
+        wheels = np.repeat(model.wheels(commands, nominal, model.nominal), self._steps_per_control(), axis=0)
+        payload = self._masses.payload_kg, self._masses.payload_distance(float(times[0]))
+        rows = advance(self._state, self._body, config, wheels, self._masses.cg(times), payload, self.world.patches)
+        self._track.append(rows)
+        self._check_walls(rows[-1, POSE])
+
+    def _steps_per_control(self) -> int:
+        steps = round(_CONTROL_S / self.config.vehicle.step_s)
+        if steps < 1 or abs(steps * self.config.vehicle.step_s - _CONTROL_S) > 1e-9:
+            raise SimulationError(
+                f"vehicle.step_s is {self.config.vehicle.step_s:g} s; it must divide the control period of {_CONTROL_S} s."
+            )
+        return steps
+
+    @staticmethod
+    def _control_steps(duration_s: float) -> int:
+        return max(1, round(duration_s / _CONTROL_S))
+
+    def _reach(self, cg: FloatArray) -> FloatArray:
+        try:
+            return self._masses.reach(cg)
+        except CgError as error:
+            raise SimulationError(
+                f"experiment {self.experiment.name} needs a CG that robot '{self.robot.name}' cannot have: {error}"
+            ) from error
+
+    def _check_support(self, cg: FloatArray) -> None:
+        try:
+            require_support(cg, self._body.param("wheelbase"), self._body.param("track_width"))
+        except CgError as error:
+            raise SimulationError(f"{self.time_s:.1f} s into the drive: {error}") from error
+
+    def _check_walls(self, pose: FloatArray) -> None:
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        for ahead in (-self._half_length, 0.0, self._half_length):
+            x, y = pose[0] + ahead * c, pose[1] + ahead * s
+            if clearance(x, y, self.world.walls) < self._half_width:
+                raise SimulationError(
+                    f"the robot hits a wall of '{self.experiment.world}' at x = {x:.2f}, y = {y:.2f} m, {self.time_s:.1f} s into "
+                    f"{self.experiment.name}. Drive more slowly, or make the effects smaller."
+                )
+
+    # --- sensing
+
+    def _make_sensors(self, seeds: np.random.SeedSequence) -> list[Scanner | SpinningScanner | Encoders | Imu | Gps | Truth]:
+        """Each with a generator of its own: one sensor more leaves the noise of the others as it is."""
+        c, real, robot = self.config, self.reality, self.robot
+        rngs = [np.random.default_rng(seed) for seed in seeds.spawn(4)]
+        topics = robot.topics
+        sensors: list[Scanner | SpinningScanner | Encoders | Imu | Gps | Truth] = [
+            Truth(c.truth_hz, robot, self._masses, c.center_of_gravity, START_NS),
+            Encoders(c.encoders, robot, self._masses, real.wheels_late_s, real.encoder_lost, START_NS, rngs[0]),
+        ]
+        if c.imu.rate_hz > 0.0:
+            mount = self.mounts[_IMU]
+            sensors.append(Imu(c.imu, topics.imu, _IMU, mount, real.gyro_bias, real.body.slope, START_NS, rngs[1]))
+        gps = c.gps
+        if self.experiment.with_gps and gps.rate_hz == 0.0:
+            gps = dataclasses.replace(gps, rate_hz=1.0)
+        if gps.rate_hz > 0.0:
+            sensors.append(Gps(gps, "/fix", _GPS, START_NS, rngs[2]))
+        late = real.lidar_late_s
+        if c.lidar == "2d":
+            sensors.append(Scanner(c.scanner, topics.scan, _LASER, real.lidar, self.world, late, START_NS, rngs[3]))
+        elif c.lidar == "3d":
+            above = real.lidar.z + 0.13
+            sensors.append(SpinningScanner(c.spinning, topics.points, _CLOUD, real.lidar, above, self.world, late, START_NS, rngs[3]))
+        return sensors
+
+    def _flush(self) -> list[Message]:
+        """The messages that are ready, in order."""
+        ready = [message for sensor in self._sensors for message in sensor.messages(self._track)]
+        ready.sort(key=lambda message: message.log_ns)
+        self._track.forget(self._track.end_s - _KEEP_S)
+        return ready
+
+    def _transforms(self) -> Message:
+        """The nominal mounts, whatever effects have done to the real ones."""
+        used = {_LASER: self.config.lidar == "2d", _CLOUD: self.config.lidar == "3d", _GPS: True, _IMU: True}
+        edges = [("base_link", name, (m.x, m.y, m.z), quaternion(m)) for name, m in self.mounts.items() if used[name]]
+        return Message(forms.transforms("/tf_static", edges), START_NS, START_NS, ())
+
+
+def quaternion(mount: Mount) -> tuple[float, float, float, float]:
+    """x, y, z, w of a mount's rotation (fixed axes)."""
+    (cr, sr), (cp, sp), (cy, sy) = ((np.cos(0.5 * a), np.sin(0.5 * a)) for a in (mount.roll, mount.pitch, mount.yaw))
+    return (
+        float(sr * cp * cy - cr * sp * sy),
+        float(cr * sp * cy + sr * cp * sy),
+        float(cr * cp * sy - sr * sp * cy),
+        float(cr * cp * cy + sr * sp * sy),
+    )
+
+
+def simulate(
+    experiment: str, robot: Robot, seed: int = 0, effects: Mapping[str, float] | None = None, config: SimulationConfig | None = None
+) -> Simulation:
+    """An experiment by name, ready to be driven. Raises `SimulationError` for names that do not exist and robots that cannot stand."""
+    return Simulation(find_experiment(experiment), robot, seed, effects or {}, config)
+
+
+def write_simulation(path: str | Path, simulation: Simulation, on_message: Callable[[int], None] | None = None) -> int:
+    """Drive ``simulation`` and write its messages to ``path`` as they come (see `write_bag`); their number."""
+    return write_bag(path, simulation.messages(), on_message)
+
+
+def runs_as_json(simulation: Simulation) -> str:
+    """Name, start and end of each run [ns]: what was driven when."""
+    runs = [
+        {
+            "name": run.name,
+            "start_ns": START_NS + round(run.start_s * 1e9),
+            "end_ns": START_NS + round((run.start_s + run.times_s[-1]) * 1e9),
+        }
+        for run in simulation.runs
+    ]
+    return json.dumps(runs)
