@@ -1,0 +1,218 @@
+"""One self-contained page that tells what a replay found: words first, then the numbers, then the pictures, then where it all came from.
+
+The page loads nothing, runs no script and has the same bytes for the same results.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import chi2
+
+from localization import plots
+from localization.errors import OutputError
+from localization.references import ReferenceTrack, Relations
+from localization.report_data import MapView, map_view, nis_means, spans, timeline
+from localization.report_lines import Line, best_line, make_lines
+from localization.report_page import TERMS, style_sheet
+from localization.report_tables import accuracy_table, count_table, definition_table, parameter_table, swatch
+from localization.report_verdict import equally_good, verdict
+from localization.score import Result
+
+__all__ = ["ReportHead", "overview_png", "verdict", "write_report"]
+
+
+@dataclass(frozen=True)
+class ReportHead:
+    """What a report says of the log and of itself."""
+
+    log: str
+    """Name of the log."""
+    robot: str
+    start: str
+    """When the log begins, as a reader wants to see it."""
+    duration_s: float
+    notes: Sequence[str]
+    """What was lost or mended when the log was read."""
+    versions: Mapping[str, str]
+    """Of the libraries that made the numbers."""
+    log_fingerprint: str
+    """Hash of the log."""
+
+
+def write_report(path: str | Path, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
+    """Write the page. Raises `OutputError` if there is such a file already or it cannot be written."""
+    _write(path, page(head, results, reference).encode())
+
+
+def overview_png(path: str | Path, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
+    """Write one picture: trajectories over the map beside a bar for each error. Raises `OutputError` as `write_report` does."""
+    lines = make_lines(results)
+    measure = "mean error of the relations [m]" if isinstance(reference, Relations) else "position error, ATE [m]"
+    _write(path, plots.overview(lines, map_view(lines, reference), measure, head.log))
+
+
+def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> str:
+    """The whole page."""
+    lines = make_lines(results)
+    best = best_line(lines) if reference is not None else None
+    equals = equally_good(lines, best, reference) if best is not None and reference is not None else []
+    words = escape(verdict(results, reference))
+    parts = [
+        f"<h1>Replay of {escape(head.log)}</h1>",
+        f'<p class="facts">{escape(head.robot)} · {head.duration_s:,.1f} s from {escape(head.start)}</p>',
+        f'<p class="verdict">{words}</p>',
+    ]
+    if lines:
+        parts += [
+            _section("Accuracy", accuracy_table(lines, best, equals) + _about_reference(lines, reference)),
+            _section("Trajectories", _map_figure(lines, map_view(lines, reference))),
+            _section("Errors", _error_figure(lines, reference)),
+            _section("Innovations: does the filter know how wrong it is?", _nis_figure(lines)),
+            _section("Estimated parameters", _with_note(parameter_table(lines), "Mean ± sigma at the end of the drive.")),
+            _section("Counts", count_table(lines)),
+        ]
+    notes = "".join(f"<li>{escape(note)}</li>" for note in head.notes)
+    terms = "".join(f"<dt>{term}</dt><dd>{text}</dd>" for term, text in TERMS)
+    parts += [
+        _section("About the log", f"<ul>{notes}</ul>" if notes else "<p>Nothing was lost and nothing had to be mended.</p>"),
+        _section("How to read this", f'<dl class="terms">{terms}</dl>'),
+        _section("Where this comes from", definition_table(_provenance(head, reference))),
+        _section("In short", f"<p>{words}</p>"),
+    ]
+    body = "\n".join(part for part in parts if part)
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; img-src data:\">\n"
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>Replay of {escape(head.log)}</title>\n<style>\n{style_sheet(lines)}</style>\n</head>\n<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
+    )
+
+
+def _section(title: str, content: str) -> str:
+    return f"<section>\n<h2>{title}</h2>\n{content}\n</section>" if content else ""
+
+
+def _with_note(table: str, note: str) -> str:
+    return f"{table}<p><small>{note}</small></p>" if table else ""
+
+
+def _about_reference(lines: Sequence[Line], reference: ReferenceTrack | Relations | None) -> str:
+    if reference is None:
+        return "<p><small>No reference: nothing here is an error, and columns that need one are left out.</small></p>"
+    scored = [line.result.accuracy for line in lines if line.result.accuracy is not None]
+    sayings = []
+    if scored:
+        a = scored[0]
+        what = "relations" if isinstance(reference, Relations) else "samples"
+        sayings.append(
+            f"Scored against {reference.source}: {a.n_matched:,} of {a.n_reference:,} {what}, over {100 * a.overlap:.0f} % of the drive."
+        )
+    if isinstance(reference, ReferenceTrack) and reference.yaws is None:
+        sayings.append(
+            "It knows positions only, so there are no heading errors, no RPE and no NEES; its own noise and the distance of its antenna from the "
+            "robot's base are part of the errors."
+        )
+    if len(lines) > 1:
+        sayings.append("Bold: the smallest error of its column.")
+    sayings += dict.fromkeys(note for a in scored for note in a.notes)
+    return "<p><small>" + " ".join(escape(saying) for saying in sayings) + "</small></p>"
+
+
+def _map_figure(lines: Sequence[Line], view: MapView) -> str:
+    sayings = []
+    if view.reference is not None:
+        sayings.append("Each run is laid onto the reference as a whole.")
+    else:
+        sayings.append("All runs start at the same pose.")
+    if view.map_of is not None:
+        sayings.append(f"The map is what {escape(view.map_of.words)} made of the scans.")
+    drawn = {number: max(e.semi_axes[0] for e in found) for number, found in view.ellipses.items()}
+    if drawn:
+        sizes = " and ".join(f"{escape(lines[number].label)} (at most ±{size:.2g} m)" for number, size in drawn.items())
+        sayings.append(f"Ellipses: two sigmas of the position since the start, for {sizes}.")
+    if view.n_cut:
+        sayings.append(f"{view.n_cut} of the runs leave{'s' if view.n_cut == 1 else ''} the picture.")
+    more = ['<li><span class="ring"></span>start</li>']
+    if view.reference is not None:
+        more.insert(
+            0, '<li><svg class="swatch" viewBox="0 0 30 8" aria-hidden="true"><path d="M1 4H29" stroke="var(--ink)"/></svg>reference</li>'
+        )
+    if len(view.points):
+        more.append('<li><span class="dots"></span>LiDAR map</li>')
+    pictures = [plots.map_svg(lines, view, size) for size in (plots.WIDE, plots.NARROW)]
+    return _legend(lines, boxes=True, more="".join(more)) + _figure(pictures, "Trajectories seen from above", " ".join(sayings))
+
+
+def _error_figure(lines: Sequence[Line], reference: ReferenceTrack | Relations | None) -> str:
+    if isinstance(reference, Relations):
+        scored = [line for line in lines if line.result.accuracy is not None]
+        if not scored:
+            return ""
+        binned = [spans(line, reference) for line in scored]
+        numbers = ", ".join(f"{n:,}" for n in binned[0].n)
+        caption = f"Mean errors of the relations by the time that they span; both axes are logarithmic. Relations in each point, from left: {numbers}."
+        pictures = [plots.spans_svg(scored, binned, size) for size in (plots.WIDE, plots.NARROW)]
+        return _legend(scored) + _figure(pictures, "Errors of the relations by the time that they span", caption)
+    known = [(line, found) for line in lines if (found := timeline(line)) is not None]
+    if not known:
+        return ""
+    shown, series = [line for line, _ in known], [found for _, found in known]
+    pictures = [plots.timeline_svg(shown, series, size) for size in (plots.WIDE, plots.NARROW)]
+    caption = "Distance from the reference over time, each run laid onto it as a whole: what is large at both ends and small between is a bent path."
+    return _legend(shown) + _figure(pictures, "Errors over time", caption)
+
+
+def _nis_figure(lines: Sequence[Line]) -> str:
+    shown, means = nis_means(lines, float(chi2.ppf(0.95, 3)))
+    if not shown:
+        return ""
+    inside = ", ".join(f"{escape(line.label)} {100 * mean.fraction_inside:.0f} %" for line, mean in zip(shown, means, strict=True))
+    band = '<li><span class="dots" style="background:var(--band);opacity:1"></span>95 % band of an honest filter</li>'
+    caption = (
+        f"Each point is the mean of {means[0].group} successive scans. Above the band the scans disagree with the prediction more than the filter "
+        f"believes possible; below it, less. Single scans within their own 95 % limit: {inside} (95 % expected)."
+    )
+    pictures = [plots.nis_svg(shown, means, size) for size in (plots.WIDE, plots.NARROW)]
+    return _legend(shown, more=band) + _figure(pictures, "Normalised innovations over time", caption)
+
+
+def _legend(lines: Sequence[Line], boxes: bool = False, more: str = "") -> str:
+    """Labels hide and show their line in every picture; the boxes themselves stand in one legend only."""
+    items = []
+    for line in lines:
+        box = f'<input type="checkbox" id="show-{line.number}" checked>' if boxes and len(lines) > 1 else ""
+        items.append(f'<li>{box}<label for="show-{line.number}">{swatch(line)}{escape(line.label)}</label></li>')
+    return f'<ul class="legend">{"".join(items)}{more}</ul>\n'
+
+
+def _figure(pictures: Sequence[str], title: str, caption: str) -> str:
+    drawn = [
+        svg.replace("<svg", f'<svg class="{size.name}" role="img" aria-label="{title}"', 1)
+        for svg, size in zip(pictures, (plots.WIDE, plots.NARROW), strict=True)
+    ]
+    return f"<figure>\n{drawn[0]}\n{drawn[1]}\n<figcaption>{caption}</figcaption>\n</figure>"
+
+
+def _provenance(head: ReportHead, reference: ReferenceTrack | Relations | None) -> dict[str, str]:
+    return {
+        "log": head.log,
+        "log's SHA-256": head.log_fingerprint,
+        "robot": head.robot,
+        "reference": "none" if reference is None else reference.source,
+        **head.versions,
+    }
+
+
+def _write(path: str | Path, content: bytes) -> None:
+    try:
+        with open(path, "xb") as file:
+            file.write(content)
+    except FileExistsError as error:
+        raise OutputError(f"'{path}' exists already. Remove it or choose another name.") from error
+    except OSError as error:
+        raise OutputError(f"'{path}' cannot be written: {error.strerror}.") from error

@@ -1,0 +1,118 @@
+"""The report's page around its parts: style sheet and words that are the same in every report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from localization.report_lines import Line
+from localization.report_svg import COLOURS, DARK_COLOURS
+
+_PAPER = {"paper": "#ffffff", "card": "#f6f7f8", "accent": "#005a8c"}
+_DARK_PAPER = {"paper": "#14171a", "card": "#1d2125", "accent": "#7cc4f5"}
+
+_RULES = """
+*{box-sizing:border-box}
+html{-webkit-text-size-adjust:100%}
+body{margin:0;background:var(--paper);color:var(--ink);font:16px/1.55 system-ui,-apple-system,"Segoe UI",Roboto,"DejaVu Sans",sans-serif}
+main{max-width:62rem;margin:0 auto;padding:1.5rem 1rem 3rem}
+h1{font-size:1.55rem;line-height:1.25;margin:0;overflow-wrap:anywhere}
+h2{font-size:1.15rem;margin:2.4rem 0 .6rem}
+p{margin:.5rem 0;max-width:46rem}
+small,figcaption,.facts{color:var(--soft);font-size:.86rem}
+.facts{margin:.35rem 0 0;overflow-wrap:anywhere}
+.verdict{font-size:1.12rem;line-height:1.5;border-left:4px solid var(--accent);background:var(--card);padding:.8rem 1rem;margin:1.2rem 0;max-width:none}
+figure{margin:0}
+figcaption{max-width:46rem;margin-top:.4rem}
+figure>svg{display:block;width:100%;height:auto}
+figure>svg text{font-family:inherit!important}
+.narrow{display:none!important}
+.scroll{overflow-x:auto;border-top:1px solid var(--rule);border-bottom:1px solid var(--rule)}
+table{border-collapse:collapse;font-size:.92rem;font-variant-numeric:tabular-nums;min-width:100%}
+th,td{padding:.4rem .7rem;text-align:right;vertical-align:top;border-bottom:1px solid var(--rule);font-weight:400;white-space:nowrap}
+thead th{vertical-align:bottom;font-weight:600;white-space:normal;min-width:5rem}
+tbody tr:last-child>*{border-bottom:0}
+th:first-child,td:first-child{text-align:left;padding-left:0;position:sticky;left:0;background:var(--paper)}
+.bar{display:block;height:4px;margin:3px 0 0 auto;min-width:2px}
+.badge{background:var(--accent);color:var(--paper);border-radius:3px;padding:0 .35rem;font-size:.75rem;vertical-align:.1em}
+.badge.soft{background:none;color:var(--accent);box-shadow:inset 0 0 0 1px}
+.swatch{width:30px;height:8px;margin-right:.45rem;vertical-align:.12em}
+.legend{display:flex;flex-wrap:wrap;gap:.15rem 1.1rem;margin:.2rem 0 .5rem;padding:0;list-style:none;font-size:.9rem}
+.legend input{accent-color:var(--accent);margin:0 .4rem 0 0;vertical-align:-.1em}
+.legend label{cursor:pointer;white-space:nowrap}
+.ring{width:9px;height:9px;border:1.6px solid var(--ink);border-radius:50%;display:inline-block;margin-right:.45rem}
+.dots{width:24px;height:8px;display:inline-block;margin-right:.45rem;background:#767d84;opacity:.8}
+dl{display:grid;grid-template-columns:minmax(7rem,max-content) 1fr;gap:.2rem 1rem;margin:.5rem 0;font-size:.92rem}
+dt{color:var(--soft)}
+dd{margin:0;overflow-wrap:anywhere}
+.terms{grid-template-columns:minmax(3.5rem,max-content) 1fr;max-width:50rem}
+.terms dt{color:var(--ink);font-weight:600}
+ul{padding-left:1.2rem;margin:.5rem 0}
+li{overflow-wrap:anywhere}
+.legend li{overflow-wrap:normal}
+@media (max-width:40rem){
+.wide{display:none!important}.narrow{display:block!important}
+main{padding:1rem .9rem 2rem}
+.verdict{font-size:1.03rem}
+thead th{min-width:4.2rem}th,td{padding:.4rem .5rem}
+th small,td small{white-space:normal}
+dl{grid-template-columns:minmax(5rem,36%) 1fr}.terms{grid-template-columns:3.4rem 1fr}
+}
+@media print{
+.wide{display:block!important}.narrow{display:none!important}
+body{font-size:10pt}main{max-width:none;padding:0}
+h2{break-after:avoid}figure,tr,.verdict{break-inside:avoid}
+.scroll{overflow:visible}table{font-size:8pt}th,td{padding:.25rem .35rem}thead th{min-width:0}
+.legend input{display:none}*{print-color-adjust:exact;-webkit-print-color-adjust:exact}
+}
+"""
+
+TERMS = (
+    (
+        "ATE",
+        "Absolute trajectory error: the whole path is laid onto the reference as well as a rigid motion can, then the root mean square of what "
+        "remains is taken. It tells how good the shape of the whole path is.",
+    ),
+    (
+        "RPE",
+        "Relative pose error: over pieces of path of 1, 2, 5, 10 m and so on, the error at the end of each piece per metre driven. It tells how "
+        "fast errors grow, wherever they began.",
+    ),
+    (
+        "Relations",
+        "Pairs of moments whose relative pose was verified by hand. The error is that of the estimated motion between them; relations that span "
+        "little time test the odometry, long ones that close a loop test the whole path.",
+    ),
+    (
+        "NEES",
+        "Normalised estimation error squared: the true error measured in the sigmas that the estimator claims. The mean of an honest one is 3, for "
+        "x, y and heading; much more is overconfident, much less is timid. Errors along one drive hang together, so one drive between "
+        "0.2 and 9 proves nothing.",
+    ),
+    (
+        "NIS",
+        "Normalised innovation squared: how far each scan disagrees with the prediction, in the sigmas of both. It needs no reference, and its "
+        "mean should be 3, too. A good NIS alone does not prove the path right: errors that scan and wheels share do not show in it.",
+    ),
+    (
+        "Ellipses",
+        "Two sigmas of the position since the start, as the estimator claims it. The robot should be inside in 86 of 100 cases.",
+    ),
+)
+
+
+def style_sheet(lines: Sequence[Line]) -> str:
+    """Light, dark and paper, and the rules by which a legend's box hides its line."""
+    light, dark = _variables({**_PAPER, **COLOURS}), _variables({**_DARK_PAPER, **DARK_COLOURS})
+    hide = "".join(
+        f"body:has(#show-{n}:not(:checked)) .series-{n}{{display:none}}"
+        f"body:has(#show-{n}:not(:checked)) label[for=show-{n}]{{opacity:.45;text-decoration:line-through}}\n"
+        for n in (line.number for line in lines)
+    )
+    return (
+        f":root{{color-scheme:light dark;{light}}}\n@media screen and (prefers-color-scheme:dark){{:root{{{dark}}}}}\n"
+        f"{_RULES.strip()}\n{hide}"
+    )
+
+
+def _variables(colours: dict[str, str]) -> str:
+    return "".join(f"--{name}:{value};" for name, value in colours.items())

@@ -1,0 +1,164 @@
+"""The report's tables as HTML: accuracy, parameters, counts. Every text from outside is escaped here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+
+from localization.report_lines import Line
+from localization.score import Result
+
+MISSING = "–"
+_UNITS = (("_rad_per_s", "rad/s"), ("_deg_per_s", "deg/s"), ("_m_per_s", "m/s"), ("_rad", "rad"), ("_deg", "deg"), ("_m", "m"), ("_s", "s"))
+
+
+@dataclass(frozen=True)
+class Column:
+    title: str
+    unit: str
+    digits: int
+    value: Callable[[Result], float | None]
+    is_error: bool = True
+    """The smaller the better."""
+
+
+def _accuracy(name: str) -> Callable[[Result], float | None]:
+    return lambda result: getattr(result.accuracy, name, None)
+
+
+def _relations(group: str, name: str) -> Callable[[Result], float | None]:
+    return lambda result: getattr(getattr(getattr(result.accuracy, "relations", None), group, None), name, None)
+
+
+_TRACK = (
+    Column("ATE", "m", 3, _accuracy("ate_rmse_m")),
+    Column("ATE heading", "deg", 2, _accuracy("ate_rmse_deg")),
+    Column("RPE", "%", 2, _accuracy("rpe_translation_percent")),
+    Column("RPE heading", "deg/m", 3, _accuracy("rpe_rotation_deg_per_m")),
+    Column("End error", "m", 2, _accuracy("end_error_m")),
+    Column("Drift", "%", 2, _accuracy("drift_percent")),
+)
+_RELATIONS = tuple(
+    column
+    for group, which in (("all", "all relations"), ("short", "under 20 s"), ("long", "20 s and more"))
+    for column in (
+        Column(f"Translation, {which}", "m", 4, _relations(group, "translation_m")),
+        Column("squared", "m²", 4, _relations(group, "translation_m2")),
+        Column("Rotation", "deg", 3, _relations(group, "rotation_deg")),
+        Column("squared", "deg²", 3, _relations(group, "rotation_deg2")),
+    )
+)
+_CONSISTENCY = (
+    Column("NEES", "3 expected", 2, lambda result: result.nees_mean, is_error=False),
+    Column("NIS", "3 expected", 2, lambda result: result.nis_mean, is_error=False),
+)
+_DRIVEN = Column("Driven", "m, by its own estimate", 1, lambda result: result.run.trajectory.distance(0.05), is_error=False)
+
+
+def number(value: float | None, digits: int) -> str:
+    """Fixed digits with thousands parted; an en dash for what is not known, and never a rounded zero for what is not zero."""
+    if value is None or math.isnan(value):
+        return MISSING
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    if value and abs(value) < 0.5 * 10.0**-digits:
+        return f"&lt; {10.0**-digits:.{digits}f}" if value > 0 else f"{value:.1e}"
+    return f"{value:,.{digits}f}".replace("-", "−")
+
+
+def accuracy_table(lines: Sequence[Line], best: Line | None, equals: Sequence[Line]) -> str:
+    """A row for each line; columns that nothing is known of are left out. The smallest error of a column is bold."""
+    results = [line.result for line in lines]
+    columns = [c for c in (*_TRACK, *_RELATIONS, *_CONSISTENCY) if any(c.value(r) is not None for r in results)]
+    if not any(c.is_error for c in columns):
+        columns = [_DRIVEN, *columns]
+    smallest = {i: min((v for r in results if (v := c.value(r)) is not None), default=None) for i, c in enumerate(columns) if c.is_error}
+    widest = max((line.error or 0.0 for line in lines), default=0.0)
+    rows = []
+    for line in lines:
+        cells = []
+        for i, column in enumerate(columns):
+            value = column.value(line.result)
+            text = number(value, column.digits)
+            if len(lines) > 1 and value is not None and value == smallest.get(i):
+                text = f"<b>{text}</b>"
+            if i == 0 and widest > 0.0 and line.error is not None and column.is_error:
+                text += f'<span class="bar" style="width:{100.0 * line.error / widest:.1f}%;background:var(--{line.colour})"></span>'
+            cells.append(f"<td>{text}</td>")
+        mark = "best" if line is best else "equal" if line in equals else ""
+        badge = {"best": ' <span class="badge">best</span>', "equal": ' <span class="badge soft">tied</span>', "": ""}[mark]
+        model = "any: it asks no wheels" if line.model is None else escape(line.model)
+        name = f"{swatch(line)}<b>{escape(line.result.run.estimator)}</b>{badge}<br><small>{model}</small>"
+        rows.append(f'<tr><th scope="row">{name}</th>{"".join(cells)}</tr>')
+    heads = "".join(f'<th scope="col">{c.title}<br><small>{c.unit}</small></th>' for c in columns)
+    return _table(f'<th scope="col">Estimator<br><small>motion model</small></th>{heads}', rows)
+
+
+def parameter_table(lines: Sequence[Line]) -> str:
+    """Mean and sigma of what was estimated besides the pose; "" if nothing was."""
+    cells = {line.number: {name: plus_minus(*value) for name, value in line.result.run.parameters.items()} for line in lines}
+    return _by_name(lines, cells, unit_of)
+
+
+def count_table(lines: Sequence[Line]) -> str:
+    """How often what happened; "" if nothing was counted."""
+    cells = {line.number: {name: f"{count:,}" for name, count in line.result.run.counts.items()} for line in lines}
+    return _by_name(lines, cells, None)
+
+
+def plus_minus(mean: float, sigma: float) -> str:
+    """``mean ± sigma`` to two digits of sigma, small numbers with a power of ten."""
+    if not (math.isfinite(mean) and math.isfinite(sigma)):
+        return f"{number(mean, 4)} ± {number(sigma, 4)}"
+    largest = max(abs(mean), abs(sigma))
+    power = math.floor(math.log10(largest)) if 0.0 < largest < 1e-3 or largest >= 1e6 else 0
+    mean, sigma = mean / 10.0**power, sigma / 10.0**power
+    digits = min(max(1 - math.floor(math.log10(abs(sigma))), 0), 9) if sigma else 4
+    text = f"{mean:.{digits}f} ± {sigma:.{digits}f}".replace("-", "−")
+    return f"({text}) · 10<sup>{str(power).replace('-', '−')}</sup>" if power else text
+
+
+def unit_of(name: str) -> str:
+    """From the end of a name, as everywhere in this project; "" where it has none."""
+    return next((unit for ending, unit in _UNITS if name.endswith(ending)), "")
+
+
+def definition_table(entries: Mapping[str, str]) -> str:
+    return "<dl>" + "".join(f"<dt>{escape(str(key))}</dt><dd>{escape(str(value))}</dd>" for key, value in entries.items()) + "</dl>"
+
+
+def swatch(line: Line) -> str:
+    """A piece of the line as it is drawn."""
+    dashes = f' stroke-dasharray="{" ".join(f"{1.8 * d:g}" for d in line.dashes)}"' if line.dashes else ""
+    return (
+        '<svg class="swatch" viewBox="0 0 30 8" aria-hidden="true">'
+        f'<path d="M1 4H29" fill="none" stroke="var(--{line.colour})" stroke-width="2.4"{dashes}/></svg>'
+    )
+
+
+def _by_name(lines: Sequence[Line], cells: Mapping[int, Mapping[str, str]], unit: Callable[[str], str] | None) -> str:
+    names = list(dict.fromkeys(name for line in lines for name in cells[line.number]))
+    shown = [line for line in lines if cells[line.number]]
+    if not names:
+        return ""
+    heads = "".join(f'<th scope="col">{swatch(line)}{escape(line.label)}</th>' for line in shown)
+    rows = []
+    for name in names:
+        unit_text = unit(name) if unit else ""
+        title = escape(name.replace("_", " ")) if not unit_text else escape(_without_unit(name, unit_text))
+        title += f"<br><small>{unit_text}</small>" if unit_text else ""
+        values = "".join(f"<td>{cells[line.number].get(name, MISSING)}</td>" for line in shown)
+        rows.append(f'<tr><th scope="row">{title}</th>{values}</tr>')
+    return _table(f"<td></td>{heads}", rows)
+
+
+def _without_unit(name: str, unit: str) -> str:
+    ending = next(ending for ending, of in _UNITS if of == unit)
+    return name.removesuffix(ending).replace("_", " ")
+
+
+def _table(head: str, rows: Sequence[str]) -> str:
+    body = "\n".join(rows)
+    return f'<div class="scroll" tabindex="0"><table><thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table></div>'
