@@ -12,13 +12,16 @@ from rich.console import Console
 
 from localization.commands.info import Info
 from localization.commands.replay import Replay
+from localization.commands.simulate import Simulate
 from motion_models.errors import SkidlocError
 
 _BAD_INPUT = 2
 _INTERRUPTED = 130
 
 Command = (
-    Annotated[Info, tyro.conf.subcommand("info", prefix_name=False)] | Annotated[Replay, tyro.conf.subcommand("replay", prefix_name=False)]
+    Annotated[Info, tyro.conf.subcommand("info", prefix_name=False)]
+    | Annotated[Replay, tyro.conf.subcommand("replay", prefix_name=False)]
+    | Annotated[Simulate, tyro.conf.subcommand("simulate", prefix_name=False)]
 )
 
 

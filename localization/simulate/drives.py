@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
 from motion_models import se2
@@ -85,7 +86,7 @@ class Pursuit:
     def __init__(self, start: FloatArray, route: Route, look_ahead_m: float = 0.8, turn_limit: float = 0.6) -> None:
         points = np.vstack([start[:2], route.points])
         keep = np.concatenate([[True], np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-6])
-        self._points = points[keep]
+        self._points = np.ascontiguousarray(points[keep])
         lengths = np.linalg.norm(np.diff(self._points, axis=0), axis=1)
         self._along = np.concatenate([[0.0], np.cumsum(lengths)])
         self._speed, self._ahead, self._limit = route.speed_m_s, look_ahead_m, turn_limit
@@ -98,28 +99,49 @@ class Pursuit:
 
     def command(self, pose: FloatArray) -> FloatArray | None:
         """vx, wz from ``pose`` (3,); None at the end."""
-        span = np.linspace(self._done, min(self._done + 1.0, self.length), 21)
-        off = np.hypot(*(self._at(span) - pose[:2]).T)
-        self._done = float(span[int(np.argmin(off))])
-        left = self.length - self._done
-        if left < 0.05 or (left < 0.4 and se2.transform(se2.inverse(pose), self._points[-1])[0] < 0.02):
+        if len(self._points) < 2:
             return None
-        goal = se2.transform(se2.inverse(pose), self._at(np.array([self._done + self._ahead]))[0])
-        bearing = math.atan2(goal[1], goal[0])
-        if abs(bearing) > 1.0:  # turn first
-            return np.array([0.0, math.copysign(self._limit, bearing)])
-        speed = min(self._speed, 0.15 + 0.8 * left)
-        wz = 2.0 * speed * math.sin(bearing) / max(math.hypot(*goal), 0.2)
-        if abs(wz) > self._limit:
-            speed, wz = speed * self._limit / abs(wz), math.copysign(self._limit, wz)
-        return np.array([speed, wz])
+        self._done, vx, wz = _pursue(pose, self._points, self._along, self._done, self._speed, self._ahead, self._limit)
+        return None if math.isnan(vx) else np.array([vx, wz])
 
-    def _at(self, along: FloatArray) -> FloatArray:
-        """(n, 2) points of the way; beyond its end it goes straight on."""
-        x, y = (np.interp(along, self._along, self._points[:, k]) for k in range(2))
-        over = np.maximum(along - self.length, 0.0)[:, None]
-        last = self._points[-1] - self._points[-2]
-        return np.column_stack([x, y]) + over * last / np.linalg.norm(last)
+
+@numba.njit(cache=True)
+def _pursue(
+    pose: FloatArray, points: FloatArray, along: FloatArray, done: float, speed: float, ahead: float, limit: float
+) -> tuple[float, float, float]:  # pragma: no cover
+    """How much of the way is done, and vx and wz; NaN at its end."""
+    length = along[-1]
+    reach, best, here = min(1.0, length - done), math.inf, done
+    for i in range(21):  # the nearest point of the way, of the next metre
+        x, y = _on_way(done + reach * i / 20.0, points, along)
+        off = math.hypot(x - pose[0], y - pose[1])
+        if off < best:
+            best, here = off, done + reach * i / 20.0
+    left = length - here
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    past = c * (points[-1, 0] - pose[0]) + s * (points[-1, 1] - pose[1]) < 0.02
+    if left < 0.05 or (left < 0.4 and past):
+        return here, math.nan, math.nan
+    x, y = _on_way(here + ahead, points, along)
+    gx, gy = c * (x - pose[0]) + s * (y - pose[1]), -s * (x - pose[0]) + c * (y - pose[1])
+    bearing = math.atan2(gy, gx)
+    if abs(bearing) > 1.0:  # turn first
+        return here, 0.0, math.copysign(limit, bearing)
+    vx = min(speed, 0.15 + 0.8 * left)
+    wz = 2.0 * vx * math.sin(bearing) / max(math.hypot(gx, gy), 0.2)
+    if abs(wz) > limit:
+        vx, wz = vx * limit / abs(wz), math.copysign(limit, wz)
+    return here, vx, wz
+
+
+@numba.njit(cache=True)
+def _on_way(at: float, points: FloatArray, along: FloatArray) -> tuple[float, float]:  # pragma: no cover
+    """The point ``at`` [m] along the way; beyond its end it goes straight on."""
+    k = 0
+    while k < len(along) - 2 and along[k + 1] < at:
+        k += 1
+    f = (at - along[k]) / (along[k + 1] - along[k])
+    return points[k, 0] + f * (points[k + 1, 0] - points[k, 0]), points[k, 1] + f * (points[k + 1, 1] - points[k, 1])
 
 
 def turning(pose: FloatArray, heading: float, limit: float = 0.4) -> FloatArray | None:

@@ -39,8 +39,9 @@ class Masses:
             start = np.clip([known.get(name, 0.0) for name in names], self._empty.chain.lower, self._empty.chain.upper)
         self._model = self._empty
         self._from, self._to = start.astype(float), start.astype(float)
-        self._start_s, self._duration_s = 0.0, 1.0
+        self._start_s, self._duration_s = -1.0, 1e-3  # at rest
         self.payload_kg = 0.0
+        self._rest: tuple[FloatArray, FloatArray] | None = None
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -70,10 +71,11 @@ class Masses:
         """Begin a motion to ``target``; the one before must have ended."""
         self._from, self._to = self._to, np.asarray(target, dtype=float)
         self._start_s, self._duration_s = start_s, max(duration_s, 1e-3)
+        self._rest = None
 
     def pick_up(self, payload_kg: float) -> None:
         """Take a payload into the (left) gripper; without arms it is set down at the front edge, between the wheels. 0 puts it down."""
-        self.payload_kg = payload_kg
+        self.payload_kg, self._rest = payload_kg, None
         if self._empty is None or self._robot.arms is None:
             return
         if payload_kg <= 0.0:
@@ -98,6 +100,9 @@ class Masses:
         Differences over 2 ms of the chain's exact CG: off by 1e-6 of the motion.
         """
         out = np.zeros((len(times_s), 7))
+        if times_s[0] >= self._start_s + self._duration_s + 0.01:  # mostly they rest
+            out[:, :2] = self._resting()[0]
+            return out
         moving = (times_s > self._start_s - 0.01) & (times_s < self._start_s + self._duration_s + 0.01)
         before = ~moving & (times_s < self._start_s + 0.5 * self._duration_s)
         after = ~moving & ~before
@@ -114,8 +119,18 @@ class Masses:
 
     def nominal_cg(self, times_s: FloatArray) -> FloatArray:
         """(n, 2) CG as the robot file and the joints tell it, without payload."""
+        if times_s[0] >= self._start_s + self._duration_s:
+            return np.broadcast_to(self._resting()[1], (len(times_s), 2))
         position, _ = self.joints(times_s)
         return position if self._empty is None else self._empty.cg(position)
+
+    def _resting(self) -> tuple[FloatArray, FloatArray]:
+        """CG (2,) with and without payload once the arms have come to rest."""
+        if self._rest is None:
+            end = np.array([self._start_s + self._duration_s])
+            empty = self._to if self._empty is None else self._empty.cg(self._to)
+            self._rest = self._at(end)[0, :2], empty
+        return self._rest
 
     def payload_distance(self, time_s: float) -> float:
         """How far the payload is from the CG of all [m]."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -92,12 +91,16 @@ class Simulation:
     ) -> None:
         self.config = config or SimulationConfig()
         self.experiment, self.robot = experiment, robot
+        self._steps_per_control = round(_CONTROL_S / self.config.vehicle.step_s)
+        if abs(self._steps_per_control * self.config.vehicle.step_s - _CONTROL_S) > 1e-9:
+            raise SimulationError(f"vehicle.step_s is {self.config.vehicle.step_s:g} s; it must divide the control period, {_CONTROL_S} s.")
         self.world = experiment.make_world()
         self.runs: list[RunRecord] = []
         """Named phases that are over."""
         self.mounts = {name: robot.mounts.get(name, mount) for name, mount in _MOUNTS.items()}
-        lidar = self.mounts[_LASER if self.config.lidar == "2d" else _CLOUD]
-        self.reality = changed(Reality(Body.from_robot(robot), lidar), effects)
+        self.lidar_mount = self.mounts[_CLOUD if self.config.lidar == "3d" else _LASER]
+        """Where the log says that the LiDAR sits."""
+        self.reality = changed(Reality(Body.from_robot(robot), self.lidar_mount), effects)
         self._body = self.reality.body
         self._masses = Masses(robot)
         self._masses.pick_up(self.reality.payload_kg)
@@ -210,32 +213,25 @@ class Simulation:
                     f"the robot does not get where it is sent: after {limit_s:.0f} s it is at x = {x:.2f}, y = {y:.2f} m, "
                     f"{self.time_s:.1f} s into the drive. Its wheels may slip too much; make the effects smaller."
                 )
-            self._advance(np.tile(command, (periods, 1)), "diff_drive")
+            self._advance(command[None], "diff_drive", periods)
             yield
         yield from self._blind(np.zeros((self._control_steps(0.6), 2)), "diff_drive")
 
     def _route_limit(self, route: Route) -> float:
         return 30.0 + 4.0 * Pursuit(self._state.pose, route).length / route.speed_m_s
 
-    def _advance(self, commands: FloatArray, controller: str) -> None:
-        """Drive on by one control period for each of ``commands`` (n, 2)."""
+    def _advance(self, commands: FloatArray, controller: str, periods: int = 1) -> None:
+        """Drive on by so many control ``periods`` for each of ``commands`` (n, 2)."""
         config = self.config.vehicle
-        times = self.time_s + config.step_s * np.arange(len(commands) * self._steps_per_control())
+        steps = self._steps_per_control * periods
+        times = self.time_s + config.step_s * np.arange(len(commands) * steps)
         model = self._controllers[controller]
         nominal = self._masses.nominal_cg(times[:1])[0]
-        wheels = np.repeat(model.wheels(commands, nominal, model.nominal), self._steps_per_control(), axis=0)
+        wheels = model.wheels(commands, nominal, model.nominal).repeat(steps, axis=0)
         payload = self._masses.payload_kg, self._masses.payload_distance(float(times[0]))
         rows = advance(self._state, self._body, config, wheels, self._masses.cg(times), payload, self.world.patches)
         self._track.append(rows)
         self._check_walls(rows[-1, POSE])
-
-    def _steps_per_control(self) -> int:
-        steps = round(_CONTROL_S / self.config.vehicle.step_s)
-        if steps < 1 or abs(steps * self.config.vehicle.step_s - _CONTROL_S) > 1e-9:
-            raise SimulationError(
-                f"vehicle.step_s is {self.config.vehicle.step_s:g} s; it must divide the control period of {_CONTROL_S} s."
-            )
-        return steps
 
     @staticmethod
     def _control_steps(duration_s: float) -> int:
@@ -327,16 +323,3 @@ def simulate(
 def write_simulation(path: str | Path, simulation: Simulation, on_message: Callable[[int], None] | None = None) -> int:
     """Drive ``simulation`` and write its messages to ``path`` as they come (see `write_bag`); their number."""
     return write_bag(path, simulation.messages(), on_message)
-
-
-def runs_as_json(simulation: Simulation) -> str:
-    """Name, start and end of each run [ns]: what was driven when."""
-    runs = [
-        {
-            "name": run.name,
-            "start_ns": START_NS + round(run.start_s * 1e9),
-            "end_ns": START_NS + round((run.start_s + run.times_s[-1]) * 1e9),
-        }
-        for run in simulation.runs
-    ]
-    return json.dumps(runs)

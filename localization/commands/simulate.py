@@ -1,0 +1,98 @@
+"""`skidloc simulate`: drive a simulated robot through an experiment and write what it would have logged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from localization.commands.common import check_new, write_json
+from localization.simulate.effects import EFFECTS, parse_effects
+from localization.simulate.evaluation import Score, mean_by_trajectory, score_runs
+from localization.simulate.experiments import EXPERIMENTS
+from localization.simulate.simulator import START_NS, Simulation, SimulationConfig, simulate, write_simulation
+from motion_models.robot import load_robot
+
+_EXPERIMENTS = "; ".join(f"{e.name}: {e.meaning}" for e in EXPERIMENTS.values())
+_EFFECTS = "; ".join(f"{e.id} [{e.unit}]: {e.meaning}" for e in EFFECTS.values())
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """Simulate a skid-steer robot by its physics and write a log: wheels, arms, IMU, LiDAR, GPS, and the truth."""
+
+    experiment: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help=_EXPERIMENTS)]
+    """What is driven."""
+    out: Path
+    """New log: .bag (ROS 1), .mcap, or any other name for a ROS 2 folder (SQLite)."""
+    robot: str = "vaultbot"
+    """Name of a shipped robot, or path of a robot TOML file."""
+    seed: int = 0
+    """Of all noise. The same seed gives the same log, byte for byte."""
+    effect: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="ID=SIZE", help=_EFFECTS)] = ()
+    """What is different about the robot than its file says; may be given several times."""
+    config: SimulationConfig = field(default_factory=SimulationConfig)
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write what is printed, and when each run began and ended, to this file as well."""
+
+    def run(self, console: Console) -> None:
+        check_new(self.out)
+        if self.json is not None:
+            check_new(self.json)
+        robot, effects = load_robot(self.robot), parse_effects(self.effect)
+        simulation = simulate(self.experiment, robot, self.seed, effects, self.config)
+        with console.status("driving") as status:
+            shown = 0
+
+            def on_message(log_ns: int) -> None:
+                nonlocal shown
+                second = (log_ns - START_NS) // 10**9
+                if second >= shown + 20:
+                    shown = second
+                    status.update(f"driving: {second} s")
+
+            count = write_simulation(self.out, simulation, on_message)
+        scores = score_runs(simulation)
+        if self.json is not None:
+            write_json(self.json, _content(simulation, self.seed, effects, count, scores))
+        _print(console, simulation, self.out, count, scores)
+
+
+def _content(simulation: Simulation, seed: int, effects: dict[str, float], count: int, scores: list[Score]) -> dict[str, Any]:
+    runs = [
+        {
+            "name": run.name,
+            "start_ns": START_NS + round(run.start_s * 1e9),
+            "end_ns": START_NS + round((run.start_s + float(run.times_s[-1])) * 1e9),
+            "cg": run.cg[0].tolist(),
+        }
+        for run in simulation.runs
+    ]
+    return {
+        "experiment": simulation.experiment.name,
+        "robot": simulation.robot.name,
+        "seed": seed,
+        "effects": effects,
+        "duration_s": simulation.time_s,
+        "messages": count,
+        "runs": runs,
+        "scores": [score.to_dict() for score in scores],
+    }
+
+
+def _print(console: Console, simulation: Simulation, out: Path, count: int, scores: list[Score]) -> None:
+    what, who = simulation.experiment.name, simulation.robot.name
+    console.print(f"{escape(str(out))}: {what} with {who}, {simulation.time_s:.1f} s, {count} messages, {len(simulation.runs)} named runs")
+    if simulation.experiment.name != "controller_evaluation":
+        return
+    table = Table("trajectory", "controller", "drive m", "correction s", "vision m", box=None, header_style="bold", pad_edge=False)
+    for trajectory, by_controller in mean_by_trajectory(scores).items():
+        for controller, mean in by_controller.items():
+            numbers = f"{mean.drive_error_m:.3f}", f"{mean.correction_time_s:.2f}", f"{mean.vision_error_m:.3f}"
+            table.add_row(trajectory, controller, *numbers)
+    console.print(table)
