@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from localization.commands.calibrate import Calibrate
 from localization.commands.info import Info
 from localization.commands.replay import Replay
 from localization.commands.simulate import Simulate
@@ -21,6 +22,7 @@ _INTERRUPTED = 130
 Command = (
     Annotated[Info, tyro.conf.subcommand("info", prefix_name=False)]
     | Annotated[Replay, tyro.conf.subcommand("replay", prefix_name=False)]
+    | Annotated[Calibrate, tyro.conf.subcommand("calibrate", prefix_name=False)]
     | Annotated[Simulate, tyro.conf.subcommand("simulate", prefix_name=False)]
 )
 

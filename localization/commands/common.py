@@ -41,6 +41,17 @@ def new_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write ``text``. Raises `OutputError` rather than overwrite."""
+    check_new(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except OSError as error:
+        raise OutputError(f"cannot write '{path}': {error.strerror}.") from None
+
+
 def write_json(path: Path, content: Any) -> None:
     """Write ``content`` as JSON, sorted as given, not finite numbers as null. Raises `OutputError` rather than overwrite."""
     check_new(path)

@@ -1,0 +1,183 @@
+"""`skidloc calibrate`: parameters of a motion model from logs or tables, with what they mean, how sure they are, and what they gain."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from localization.calibration import Calibrated, Cut, Turning, WitnessName, calibrated, cut_log, turning
+from localization.commands.calibration_tables import numbers, print_by_source, print_cuts, print_fit, print_rotation_errors
+from localization.commands.common import check_new, write_json, write_text
+from localization.commands.regression_tables import print_regressions, regression_numbers
+from localization.logs import TopicOverrides
+from localization.maneuver_windows import WindowConfig
+from motion_models.base import MotionModel
+from motion_models.cg_files import arms_model, arms_postures
+from motion_models.errors import CalibrationError
+from motion_models.registry import make_model
+from motion_models.regressions import RotationTable, read_rotation_table, skid_steer_fit
+from motion_models.robot import Robot, load_robot
+from motion_models.robot_file import relocated, robot_toml
+from motion_models.ros_export import diff_drive_controller_yaml, robot_localization_yaml
+from motion_models.rotations import rotations_as_maneuvers
+from motion_models.se2 import FloatArray
+from motion_models.skid_steer import SkidSteer
+from motion_models.windows_table import read_windows, table_columns, windows_text
+
+_TABLE = ".csv"
+_USUAL_ROBOT = "husky_a200"
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Fit a motion model to what logs or tables say of the robot's real motion, and write the robot file."""
+
+    source: tyro.conf.Positional[tuple[Path, ...]]
+    """Logs (.bag, folder, .mcap), or tables (.csv): rotations in place at many centres of gravity (cg_x_m, cg_y_m, rotation_ratio, cor_x_m,
+    cor_y_m), or windows of wheel motion (window, dt_s, left_rad_per_s, right_rad_per_s, x_m, y_m, yaw_rad, ...; see --windows)."""
+    robot: str = _USUAL_ROBOT
+    """Name of a shipped robot, or path of a robot TOML file: where the fit starts."""
+    model: str = "skid_steer"
+    """Motion model to fit."""
+    fit: str = ""
+    """Parameters to fit, separated by commas; all of them must show. Default: the model's usual ones, as far as the drive reveals them."""
+    witness: WitnessName = "auto"
+    """What measured the real motion in logs: the reference if one is named, else the LiDAR, else the gyro (headings alone)."""
+    reference: str | None = None
+    """Topic or TUM file with positions and headings, as the witness. Never used unless named."""
+    window_s: float = 2.0
+    """Length of the maneuvers that logs are cut into [s]."""
+    topic: TopicOverrides = field(default_factory=TopicOverrides)
+    out: Annotated[Path | None, tyro.conf.arg(metavar="ROBOT.toml")] = None
+    """Write the robot with its new parameters to this file; every command takes it as --robot."""
+    export: Literal["diff_drive_controller", "robot_localization"] | None = None
+    """Print the calibration as parameters of this ROS package."""
+    export_out: Annotated[Path | None, tyro.conf.arg(metavar="FILE.yaml")] = None
+    """Write them to this file instead."""
+    windows: Annotated[Path | None, tyro.conf.arg(metavar="FILE.csv")] = None
+    """Write the maneuvers that were fitted to this table, which `calibrate` reads."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write what is printed to this file as well."""
+
+    def run(self, console: Console) -> None:
+        self._check()
+        robot = load_robot(self.robot)
+        model = make_model(self.model, robot)
+        kinds = {_kind(path) for path in self.source}
+        if len(kinds) > 1:
+            raise CalibrationError(f"logs, tables of windows and tables of rotations cannot be calibrated on together: {', '.join(kinds)}.")
+        (kind,) = kinds
+        if kind == "rotations" and self.model == "skid_steer" and not self.fit:
+            new, sigmas, told = self._regressions(console, robot)
+        else:
+            new, sigmas, told = self._fit(console, robot, model, kind)
+        self._write(console, robot, new, sigmas, told)
+
+    def _check(self) -> None:
+        if not self.source:
+            raise CalibrationError("nothing to calibrate on: name at least one log or table.")
+        if self.window_s < 0.5 or self.window_s > 20.0:
+            raise CalibrationError(f"--window-s is {self.window_s:g}; maneuvers of 0.5 to 20 s make sense.")
+        if self.export_out is not None and self.export is None:
+            raise CalibrationError("--export-out names a file, but --export does not say for which package.")
+        for path in (self.out, self.export_out, self.windows, self.json):
+            if path is not None:
+                check_new(path)
+        if self.out is not None and self.out.suffix != ".toml":
+            raise CalibrationError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")
+
+    def _fit(self, console: Console, robot: Robot, model: MotionModel, kind: str) -> tuple[Robot, dict[str, float], dict[str, Any]]:
+        of_rotations = kind == "rotations"
+        with console.status("cutting into maneuvers"):
+            cuts = [self._cut(path, robot, kind) for path in self.source]
+        free = [name.strip() for name in self.fit.split(",") if name.strip()]
+        found = calibrated(model, cuts, robot, free, of_rotations)
+        about = turning(found, robot)
+        print_cuts(console, robot, cuts)
+        print_fit(console, found, about, cuts)
+        if of_rotations:
+            print_rotation_errors(console, found, _rotations(self.source), robot)
+        by_source = _each(found, cuts, robot) if len(cuts) > 1 else []
+        print_by_source(console, by_source)
+        if self.windows is not None:
+            write_text(self.windows, windows_text([m for each in cuts for m in each.maneuvers]))
+        told = {"robot": robot.name, "model": model.name, **numbers(found, about, cuts, by_source)}
+        return found.fit.robot(robot), found.sigmas, told
+
+    def _cut(self, path: Path, robot: Robot, kind: str) -> Cut:
+        if kind == "log":
+            return cut_log(path, robot, self.topic, self.witness, self.reference, WindowConfig(window_s=self.window_s))
+        if kind == "rotations":
+            table = read_rotation_table(path)
+            return Cut(path.name, tuple(rotations_as_maneuvers(table, robot)), f"the table of {len(table.ratio)} rotations")
+        maneuvers = read_windows(path)
+        return Cut(path.name, tuple(maneuvers), f"the table of {len(maneuvers)} windows")
+
+    def _regressions(self, console: Console, robot: Robot) -> tuple[Robot, dict[str, float], dict[str, Any]]:
+        """The thesis's regressions; what is written are the coefficients by all rows at once, with their sigmas."""
+        table = _rotations(self.source)
+        multiplier = robot.driver.wheel_separation_multiplier
+        found = skid_steer_fit(table, multiplier)
+        print_regressions(console, table, found, robot)
+        sigmas = dict(zip(SkidSteer.param_names, (float(s) for s in np.sqrt(np.diagonal(found.cov))), strict=True))
+        values = dict(zip(SkidSteer.param_names, (float(c) for c in found.coefficients), strict=True))
+        told = {"robot": robot.name, "model": "skid_steer", **regression_numbers(table, found, values, sigmas, multiplier)}
+        return dataclasses.replace(robot, models={**robot.models, "skid_steer": values}), sigmas, told
+
+    def _write(self, console: Console, robot: Robot, new: Robot, sigmas: dict[str, float], told: dict[str, Any]) -> None:
+        model = make_model(self.model, new)
+        if self.out is not None:
+            remarks = f"Calibrated by skidloc: {self.model} on {', '.join(path.name for path in self.source)}, from {robot.name}."
+            write_text(self.out, robot_toml(relocated(new, self.out.parent), {self.model: sigmas}, remarks))
+            console.print(f"robot file: {self.out}", markup=False, soft_wrap=True)
+        if self.export is not None:
+            text = (
+                diff_drive_controller_yaml(model, new, model.nominal, _postures(new))
+                if self.export == "diff_drive_controller"
+                else robot_localization_yaml(model, new, model.nominal)
+            )
+            if self.export_out is not None:
+                write_text(self.export_out, text)
+                console.print(f"{self.export}: {self.export_out}", markup=False, soft_wrap=True)
+            else:
+                console.print(text, markup=False, soft_wrap=True)
+        if self.json is not None:
+            write_json(self.json, {"source": [path.name for path in self.source], **told})
+
+
+def _kind(path: Path) -> str:
+    if path.suffix.lower() != _TABLE:
+        return "log"
+    return "rotations" if {"rotation_ratio"} & set(table_columns(path)) else "windows"
+
+
+def _rotations(paths: Sequence[Path]) -> RotationTable:
+    tables = [read_rotation_table(path) for path in paths]
+    return RotationTable(*(np.concatenate([getattr(table, name) for table in tables]) for name in ("cg", "ratio", "cor")))
+
+
+def _postures(robot: Robot) -> FloatArray | None:
+    """(n, 2) centres of gravity at the robot's named postures, for the table of multipliers."""
+    if robot.arms is None:
+        return None
+    model = arms_model(robot.arms, robot.folder)
+    postures = arms_postures(robot.arms, robot.folder)
+    return np.array([model.cg(model.chain.posture(posture)) for posture in postures.values()]) if postures else None
+
+
+def _each(found: Calibrated, cuts: Sequence[Cut], robot: Robot) -> list[tuple[str, Turning | None]]:
+    """Turning by each log alone: what the floor under it does."""
+    told: list[tuple[str, Turning | None]] = []
+    for each in cuts:
+        try:
+            told.append((each.source, turning(calibrated(found.model, [each], robot, found.fit.names), robot)))
+        except CalibrationError:
+            told.append((each.source, None))
+    return told
