@@ -77,7 +77,7 @@ def map_svg(lines: Sequence[Line], view: MapView, size: Size) -> str:
     low, high = view.low, view.high
     extent = np.maximum(high - low, 1e-6)
     # a tall map would fill three phone screens, a long one be a ribbon: axes are never more unequal than this
-    height = float(np.clip(extent[1] / extent[0], 0.35, 1.25)) * (size.width_in - 0.7) + 0.6
+    height = float(np.clip(extent[1] / extent[0], 0.35, 0.9 if size.is_wide else 1.25)) * (size.width_in - 0.7) + 0.6
 
     def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
@@ -180,19 +180,20 @@ def _draw_map(axes: Axes, lines: Sequence[Line], view: MapView, size: Size) -> N
         # what is better lies on top
         order = 3.0 + 0.9 / (1.0 + view.ranks[line.number])
         _plot(axes, line, kept[:, 0], kept[:, 1], zorder=order)
-    for number, ellipses in view.ellipses.items():
-        for e in ellipses:
+    if view.best is not None:
+        colour = COLOURS[view.best.colour]
+        for e in view.ellipses:
             axes.add_patch(
                 EllipsePatch(
                     e.center,
                     2.0 * e.semi_axes[0],
                     2.0 * e.semi_axes[1],
                     angle=float(np.degrees(e.angle)),
-                    facecolor="none",
-                    edgecolor=COLOURS[lines[number].colour],
-                    linewidth=0.8,
-                    zorder=4,
-                    gid=f"series-{number}",
+                    facecolor=(colour, 0.10),
+                    edgecolor=(colour, 0.9),
+                    linewidth=0.6,
+                    zorder=2.5,
+                    gid=f"series-{view.best.number}",
                 )
             )
     if view.start is not None:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-import numpy as np
 from scipy.stats import chi2
 
 from localization import plots
@@ -19,8 +18,8 @@ from localization.references import ReferenceTrack, Relations
 from localization.report_data import MapView, map_view, nis_means, spans, timeline
 from localization.report_lines import Line, best_line, make_lines
 from localization.report_page import TERMS, style_sheet
-from localization.report_tables import accuracy_table, count_table, definition_table, parameter_table, swatch
-from localization.report_verdict import equally_good, verdict
+from localization.report_tables import REFERENCE_SWATCH, accuracy_table, count_table, definition_table, parameter_table, swatch
+from localization.report_verdict import equally_good, metres, verdict
 from localization.score import Result
 
 __all__ = ["ReportHead", "overview_png", "verdict", "write_report"]
@@ -89,7 +88,8 @@ def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack 
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; img-src data:\">\n"
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>Replay of {escape(head.log)}</title>\n<style>\n{style_sheet(lines)}</style>\n</head>\n<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
+        f"<title>Replay of {escape(head.log)}</title>\n<style>\n{style_sheet(lines)}</style>\n</head>\n"
+        f"<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
     )
 
 
@@ -114,8 +114,8 @@ def _about_reference(lines: Sequence[Line], reference: ReferenceTrack | Relation
         )
     if isinstance(reference, ReferenceTrack) and reference.yaws is None:
         sayings.append(
-            "It knows positions only, so there are no heading errors, no RPE and no NEES; its own noise and the distance of its antenna from the "
-            "robot's base are part of the errors."
+            "It knows positions only, so there are no heading errors, no RPE and no NEES; its own noise and the distance of its antenna "
+            "from the robot's base are part of the errors."
         )
     if len(lines) > 1:
         sayings.append("Bold: the smallest error of its column.")
@@ -131,17 +131,16 @@ def _map_figure(lines: Sequence[Line], view: MapView) -> str:
         sayings.append("All runs start at the same pose.")
     if view.map_of is not None:
         sayings.append(f"The map is what {escape(view.map_of.words)} made of the scans.")
-    drawn = {number: max(e.semi_axes[0] for e in found) for number, found in view.ellipses.items()}
-    if drawn:
-        sizes = " and ".join(f"{escape(lines[number].label)} (at most ±{size:.2g} m)" for number, size in drawn.items())
-        sayings.append(f"Ellipses: two sigmas of the position since the start, for {sizes}.")
+    if view.best is not None and view.ellipses:
+        largest = metres(max(e.semi_axes[0] for e in view.ellipses))
+        sayings.append(
+            f"Ellipses: two sigmas of the position since the start, as {escape(view.best.words)} claims them (at most ±{largest})."
+        )
     if view.n_cut:
         sayings.append(f"{view.n_cut} of the runs leave{'s' if view.n_cut == 1 else ''} the picture.")
     more = ['<li><span class="ring"></span>start</li>']
     if view.reference is not None:
-        more.insert(
-            0, '<li><svg class="swatch" viewBox="0 0 30 8" aria-hidden="true"><path d="M1 4H29" stroke="var(--ink)"/></svg>reference</li>'
-        )
+        more.insert(0, f"<li>{REFERENCE_SWATCH}reference</li>")
     if len(view.points):
         more.append('<li><span class="dots"></span>LiDAR map</li>')
     pictures = [plots.map_svg(lines, view, size) for size in (plots.WIDE, plots.NARROW)]
@@ -155,7 +154,10 @@ def _error_figure(lines: Sequence[Line], reference: ReferenceTrack | Relations |
             return ""
         binned = [spans(line, reference) for line in scored]
         numbers = ", ".join(f"{n:,}" for n in binned[0].n)
-        caption = f"Mean errors of the relations by the time that they span; both axes are logarithmic. Relations in each point, from left: {numbers}."
+        caption = (
+            "Mean errors of the relations by the time that they span; both axes are logarithmic. "
+            f"Relations in each point, from left: {numbers}."
+        )
         pictures = [plots.spans_svg(scored, binned, size) for size in (plots.WIDE, plots.NARROW)]
         return _legend(scored) + _figure(pictures, "Errors of the relations by the time that they span", caption)
     known = [(line, found) for line in lines if (found := timeline(line)) is not None]
@@ -163,7 +165,10 @@ def _error_figure(lines: Sequence[Line], reference: ReferenceTrack | Relations |
         return ""
     shown, series = [line for line, _ in known], [found for _, found in known]
     pictures = [plots.timeline_svg(shown, series, size) for size in (plots.WIDE, plots.NARROW)]
-    caption = "Distance from the reference over time, each run laid onto it as a whole: what is large at both ends and small between is a bent path."
+    caption = (
+        "Each run is laid onto the reference as a whole, so errors at one time depend on those at others: large at both ends and small "
+        "between is a path that bends."
+    )
     return _legend(shown) + _figure(pictures, "Errors over time", caption)
 
 
@@ -174,8 +179,9 @@ def _nis_figure(lines: Sequence[Line]) -> str:
     inside = ", ".join(f"{escape(line.label)} {100 * mean.fraction_inside:.0f} %" for line, mean in zip(shown, means, strict=True))
     band = '<li><span class="dots" style="background:var(--band);opacity:1"></span>95 % band of an honest filter</li>'
     caption = (
-        f"Each point is the mean of {means[0].group} successive scans. Above the band the scans disagree with the prediction more than the filter "
-        f"believes possible; below it, less. Single scans within their own 95 % limit: {inside} (95 % expected)."
+        f"Each point is the mean of {means[0].group} successive scans. Above the band the scans disagree with the prediction more than the "
+        "filter believes possible; below it, less. Single scans within their own 95 % limit: "
+        f"{inside} (95 % expected)."
     )
     pictures = [plots.nis_svg(shown, means, size) for size in (plots.WIDE, plots.NARROW)]
     return _legend(shown, more=band) + _figure(pictures, "Normalised innovations over time", caption)

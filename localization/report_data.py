@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from localization.evaluate import relation_errors
 from localization.references import ReferenceTrack, Relations
-from localization.report_lines import Ellipse, Line, baseline_line, best_line, ellipse, map_line
+from localization.report_lines import Ellipse, Line, best_line, ellipse, map_line
 from localization.trajectory import Trajectory
 from motion_models.se2 import FloatArray
 
-_N_ELLIPSES = 14
+_N_ELLIPSES = 12
+_REACH = 0.2
 _N_MEANS = 90
 _N_BINS = 9
 _LEAST_IN_BIN = 5
@@ -36,8 +37,10 @@ class MapView:
     """(N, 2)"""
     paths: tuple[FloatArray, ...]
     """(N, 2) for each line."""
-    ellipses: Mapping[int, tuple[Ellipse, ...]]
-    """By number of the line, two sigmas, at equal distances along the path."""
+    best: Line | None
+    """The run whose place is sure to be in the picture, with the map and the ellipses of its covariances if it has any."""
+    ellipses: tuple[Ellipse, ...]
+    """Two sigmas of the best run's position, at equal distances along its path."""
     ranks: Mapping[int, int]
     """By number of the line: 0 is the best."""
     start: tuple[float, float] | None
@@ -47,7 +50,9 @@ class MapView:
 
 
 def map_view(lines: Sequence[Line], reference: ReferenceTrack | Relations | None) -> MapView:
-    """Borders hold the reference, the best run, and the map but for its strays; others widen them by no more than 60 %."""
+    """Borders hold the reference, the best run, and the map but for its strays. The others widen them by no more than a fifth: a run that
+    got lost must not make the rest too small to see.
+    """
     best = best_line(lines) or map_line(lines) or (lines[-1] if lines else None)
     mapped = map_line(lines)
     points = np.empty((0, 2))
@@ -58,12 +63,11 @@ def map_view(lines: Sequence[Line], reference: ReferenceTrack | Relations | None
     paths = tuple(line.placed(line.result.run.trajectory.poses)[:, :2] for line in lines)
     core = [part for part in (track, paths[best.number] if best else None, _without_strays(points)) if part is not None and len(part)]
     low, high = _borders(core or [np.zeros((1, 2))])
-    reach = 0.6 * max(float((high - low).max()), 1.0)
+    reach = _REACH * max(float((high - low).max()), 1.0)
     all_low, all_high = _borders([*core, *(path for path in paths if len(path))] or [np.zeros((1, 2))])
     low, high = np.maximum(all_low, low - reach), np.minimum(all_high, high + reach)
     margin = 0.03 * max(float((high - low).max()), 1.0)
     low, high = low - margin, high + margin
-    shown = [line for line in (best, baseline_line(lines)) if line is not None]
     order = sorted(lines, key=lambda line: (line.error is None, line.error or 0.0, line.number))
     return MapView(
         low=low,
@@ -72,7 +76,8 @@ def map_view(lines: Sequence[Line], reference: ReferenceTrack | Relations | None
         map_of=mapped,
         reference=track,
         paths=paths,
-        ellipses={line.number: found for line in shown if (found := _ellipses(line))},
+        best=best,
+        ellipses=() if best is None else _ellipses(best),
         ranks={line.number: rank for rank, line in enumerate(order)},
         start=_start(paths[best.number]) if best else None,
         n_cut=sum(bool(((path < low) | (path > high)).any()) for path in paths),

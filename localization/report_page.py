@@ -20,7 +20,8 @@ h2{font-size:1.15rem;margin:2.4rem 0 .6rem}
 p{margin:.5rem 0;max-width:46rem}
 small,figcaption,.facts{color:var(--soft);font-size:.86rem}
 .facts{margin:.35rem 0 0;overflow-wrap:anywhere}
-.verdict{font-size:1.12rem;line-height:1.5;border-left:4px solid var(--accent);background:var(--card);padding:.8rem 1rem;margin:1.2rem 0;max-width:none}
+.verdict{font-size:1.12rem;line-height:1.5;border-left:4px solid var(--accent);background:var(--card)}
+.verdict{padding:.8rem 1rem;margin:1.2rem 0;max-width:none}
 figure{margin:0}
 figcaption{max-width:46rem;margin-top:.4rem}
 figure>svg{display:block;width:100%;height:auto}
@@ -40,6 +41,8 @@ th:first-child,td:first-child{text-align:left;padding-left:0;position:sticky;lef
 .legend input{accent-color:var(--accent);margin:0 .4rem 0 0;vertical-align:-.1em}
 .legend label{cursor:pointer;white-space:nowrap}
 .ring{width:9px;height:9px;border:1.6px solid var(--ink);border-radius:50%;display:inline-block;margin-right:.45rem}
+code{font-size:.92em}
+summary{cursor:pointer;color:var(--accent);font-size:.9rem;margin:.6rem 0}
 .dots{width:24px;height:8px;display:inline-block;margin-right:.45rem;background:#767d84;opacity:.8}
 dl{display:grid;grid-template-columns:minmax(7rem,max-content) 1fr;gap:.2rem 1rem;margin:.5rem 0;font-size:.92rem}
 dt{color:var(--soft)}
@@ -55,7 +58,7 @@ main{padding:1rem .9rem 2rem}
 .verdict{font-size:1.03rem}
 thead th{min-width:4.2rem}th,td{padding:.4rem .5rem}
 th small,td small{white-space:normal}
-dl{grid-template-columns:minmax(5rem,36%) 1fr}.terms{grid-template-columns:3.4rem 1fr}
+dl{grid-template-columns:minmax(5rem,36%) 1fr}.terms{grid-template-columns:1fr}.terms dd{margin-bottom:.5rem}
 }
 @media print{
 .wide{display:block!important}.narrow{display:none!important}
@@ -69,29 +72,30 @@ h2{break-after:avoid}figure,tr,.verdict{break-inside:avoid}
 TERMS = (
     (
         "ATE",
-        "Absolute trajectory error: the whole path is laid onto the reference as well as a rigid motion can, then the root mean square of what "
-        "remains is taken. It tells how good the shape of the whole path is.",
+        "Absolute trajectory error: the whole path is laid onto the reference as well as a rigid motion can, then the root mean "
+        "square of what remains is taken. It tells how good the shape of the whole path is.",
     ),
     (
         "RPE",
-        "Relative pose error: over pieces of path of 1, 2, 5, 10 m and so on, the error at the end of each piece per metre driven. It tells how "
-        "fast errors grow, wherever they began.",
+        "Relative pose error: over pieces of path of 1, 2, 5, 10 m and so on, the error at the end of each piece per metre "
+        "driven. It tells how fast errors grow, wherever they began.",
     ),
     (
         "Relations",
-        "Pairs of moments whose relative pose was verified by hand. The error is that of the estimated motion between them; relations that span "
-        "little time test the odometry, long ones that close a loop test the whole path.",
+        "Pairs of moments whose relative pose was verified by hand. The error is that of the estimated motion between them; "
+        "relations that span little time test the odometry, long ones that close a loop test the whole path.",
     ),
     (
         "NEES",
-        "Normalised estimation error squared: the true error measured in the sigmas that the estimator claims. The mean of an honest one is 3, for "
-        "x, y and heading; much more is overconfident, much less is timid. Errors along one drive hang together, so one drive between "
-        "0.2 and 9 proves nothing.",
+        "Normalised estimation error squared: the true error measured in the sigmas that the estimator claims. The mean of an "
+        "honest one is 3, for x, y and heading; much more is overconfident, much less is timid. Errors along one drive hang "
+        "together, so one drive between 0.2 and 9 proves nothing.",
     ),
     (
         "NIS",
-        "Normalised innovation squared: how far each scan disagrees with the prediction, in the sigmas of both. It needs no reference, and its "
-        "mean should be 3, too. A good NIS alone does not prove the path right: errors that scan and wheels share do not show in it.",
+        "Normalised innovation squared: how far each scan disagrees with the prediction, in the sigmas of both. It needs no "
+        "reference, and its mean should be 3, too. A good NIS alone does not prove the path right: errors that scan and wheels "
+        "share do not show in it.",
     ),
     (
         "Ellipses",

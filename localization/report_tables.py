@@ -10,7 +10,11 @@ from html import escape
 from localization.report_lines import Line
 from localization.score import Result
 
-MISSING = "–"
+MISSING = "–"  # noqa: RUF001
+_MINUS = "\N{MINUS SIGN}"
+_BEST = ' <span class="badge">best</span>'
+_TIED = ' <span class="badge soft">tied</span>'
+REFERENCE_SWATCH = '<svg class="swatch" viewBox="0 0 30 8" aria-hidden="true"><path d="M1 4H29" stroke="var(--ink)"/></svg>'
 _UNITS = (("_rad_per_s", "rad/s"), ("_deg_per_s", "deg/s"), ("_m_per_s", "m/s"), ("_rad", "rad"), ("_deg", "deg"), ("_m", "m"), ("_s", "s"))
 
 
@@ -40,14 +44,21 @@ _TRACK = (
     Column("End error", "m", 2, _accuracy("end_error_m")),
     Column("Drift", "%", 2, _accuracy("drift_percent")),
 )
+_GROUPS = (("all", "all relations"), ("short", "under 20 s"), ("long", "20 s and more"))
 _RELATIONS = tuple(
     column
-    for group, which in (("all", "all relations"), ("short", "under 20 s"), ("long", "20 s and more"))
+    for group, which in _GROUPS
     for column in (
         Column(f"Translation, {which}", "m", 4, _relations(group, "translation_m")),
-        Column("squared", "m²", 4, _relations(group, "translation_m2")),
         Column("Rotation", "deg", 3, _relations(group, "rotation_deg")),
-        Column("squared", "deg²", 3, _relations(group, "rotation_deg2")),
+    )
+)
+_SQUARES = tuple(
+    column
+    for group, which in _GROUPS
+    for column in (
+        Column(f"Translation², {which}", "m²", 4, _relations(group, "translation_m2")),
+        Column("Rotation²", "deg²", 3, _relations(group, "rotation_deg2")),
     )
 )
 _CONSISTENCY = (
@@ -62,38 +73,54 @@ def number(value: float | None, digits: int) -> str:
     if value is None or math.isnan(value):
         return MISSING
     if math.isinf(value):
-        return "∞" if value > 0 else "−∞"
+        return "∞" if value > 0 else f"{_MINUS}∞"
     if value and abs(value) < 0.5 * 10.0**-digits:
         return f"&lt; {10.0**-digits:.{digits}f}" if value > 0 else f"{value:.1e}"
-    return f"{value:,.{digits}f}".replace("-", "−")
+    return f"{value:,.{digits}f}".replace("-", _MINUS)
 
 
 def accuracy_table(lines: Sequence[Line], best: Line | None, equals: Sequence[Line]) -> str:
     """A row for each line; columns that nothing is known of are left out. The smallest error of a column is bold."""
-    results = [line.result for line in lines]
-    columns = [c for c in (*_TRACK, *_RELATIONS, *_CONSISTENCY) if any(c.value(r) is not None for r in results)]
+    columns = _known([*_TRACK, *_RELATIONS, *_CONSISTENCY], lines)
     if not any(c.is_error for c in columns):
         columns = [_DRIVEN, *columns]
-    smallest = {i: min((v for r in results if (v := c.value(r)) is not None), default=None) for i, c in enumerate(columns) if c.is_error}
-    widest = max((line.error or 0.0 for line in lines), default=0.0)
+    table = _rows(lines, columns, {**{line.number: _TIED for line in equals}, **({best.number: _BEST} if best else {})})
+    squares = _known(_SQUARES, lines)
+    more = (
+        f"<details><summary>Mean squares, as published for the benchmark</summary>{_rows(lines, squares, {})}</details>" if squares else ""
+    )
+    return table + more
+
+
+def _known(columns: Sequence[Column], lines: Sequence[Line]) -> list[Column]:
+    return [c for c in columns if any(c.value(line.result) is not None for line in lines)]
+
+
+def _rows(lines: Sequence[Line], columns: Sequence[Column], badges: Mapping[int, str]) -> str:
+    known = {i: [v for line in lines if (v := c.value(line.result)) is not None] for i, c in enumerate(columns) if c.is_error}
+    smallest = {i: min(values, default=None) for i, values in known.items()} if len(lines) > 1 else {}
     rows = []
     for line in lines:
         cells = []
         for i, column in enumerate(columns):
             value = column.value(line.result)
             text = number(value, column.digits)
-            if len(lines) > 1 and value is not None and value == smallest.get(i):
+            if value is not None and value == smallest.get(i):
                 text = f"<b>{text}</b>"
-            if i == 0 and widest > 0.0 and line.error is not None and column.is_error:
-                text += f'<span class="bar" style="width:{100.0 * line.error / widest:.1f}%;background:var(--{line.colour})"></span>'
-            cells.append(f"<td>{text}</td>")
-        mark = "best" if line is best else "equal" if line in equals else ""
-        badge = {"best": ' <span class="badge">best</span>', "equal": ' <span class="badge soft">tied</span>', "": ""}[mark]
+            cells.append(f"<td>{text}{_bar(line, value, known[0]) if i == 0 and column.is_error else ''}</td>")
         model = "any: it asks no wheels" if line.model is None else escape(line.model)
-        name = f"{swatch(line)}<b>{escape(line.result.run.estimator)}</b>{badge}<br><small>{model}</small>"
+        name = f"{swatch(line)}<b>{escape(line.result.run.estimator)}</b>{badges.get(line.number, '')}<br><small>{model}</small>"
         rows.append(f'<tr><th scope="row">{name}</th>{"".join(cells)}</tr>')
     heads = "".join(f'<th scope="col">{c.title}<br><small>{c.unit}</small></th>' for c in columns)
     return _table(f'<th scope="col">Estimator<br><small>motion model</small></th>{heads}', rows)
+
+
+def _bar(line: Line, value: float | None, values: Sequence[float]) -> str:
+    """The first column as lengths, linear from zero."""
+    widest = max((v for v in values if math.isfinite(v)), default=0.0)
+    if value is None or not math.isfinite(value) or widest <= 0.0:
+        return ""
+    return f'<span class="bar" style="width:{100.0 * value / widest:.1f}%;background:var(--{line.colour})"></span>'
 
 
 def parameter_table(lines: Sequence[Line]) -> str:
@@ -116,8 +143,8 @@ def plus_minus(mean: float, sigma: float) -> str:
     power = math.floor(math.log10(largest)) if 0.0 < largest < 1e-3 or largest >= 1e6 else 0
     mean, sigma = mean / 10.0**power, sigma / 10.0**power
     digits = min(max(1 - math.floor(math.log10(abs(sigma))), 0), 9) if sigma else 4
-    text = f"{mean:.{digits}f} ± {sigma:.{digits}f}".replace("-", "−")
-    return f"({text}) · 10<sup>{str(power).replace('-', '−')}</sup>" if power else text
+    text = f"{mean:.{digits}f} ± {sigma:.{digits}f}".replace("-", _MINUS)
+    return f"({text}) · 10<sup>{str(power).replace('-', _MINUS)}</sup>" if power else text
 
 
 def unit_of(name: str) -> str:
@@ -147,16 +174,10 @@ def _by_name(lines: Sequence[Line], cells: Mapping[int, Mapping[str, str]], unit
     rows = []
     for name in names:
         unit_text = unit(name) if unit else ""
-        title = escape(name.replace("_", " ")) if not unit_text else escape(_without_unit(name, unit_text))
-        title += f"<br><small>{unit_text}</small>" if unit_text else ""
+        title = f"<code>{escape(name)}</code><br><small>{unit_text}</small>" if unit else escape(name.replace("_", " "))
         values = "".join(f"<td>{cells[line.number].get(name, MISSING)}</td>" for line in shown)
         rows.append(f'<tr><th scope="row">{title}</th>{values}</tr>')
     return _table(f"<td></td>{heads}", rows)
-
-
-def _without_unit(name: str, unit: str) -> str:
-    ending = next(ending for ending, of in _UNITS if of == unit)
-    return name.removesuffix(ending).replace("_", " ")
 
 
 def _table(head: str, rows: Sequence[str]) -> str:

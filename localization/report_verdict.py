@@ -97,17 +97,18 @@ def _ranking(lines: Sequence[Line], best: Line, equals: Sequence[Line], referenc
     if len(lines) == 1:
         alone = "Nothing else was run, so nothing tells whether another pair does better."
         return f"{_upper(best.words)}: {metres(best.error)} {measure}. {alone}"
-    scored = [line for line in lines if line.error is not None]
-    compared = _compared(lines, best, equals)
-    if len(equals) == len(scored) - 1 and equals:
-        listed = _and([f"{line.words} ({metres(_error(line))})" for line in [best, *equals]])
-        return f"This log does not tell the runs apart, by {measure}: {listed}."
-    if equals:
-        listed = _and([f"{line.words} ({metres(_error(line))})" for line in equals])
-        return (
-            f"{_upper(best.words)} is best with {metres(best.error)} {measure}{compared}; not shown to be worse by this drive: {listed}."
-        )
-    return f"{_upper(best.words)} is best: {metres(best.error)} {measure}{compared}."
+    near, unproven = [x for x in equals if _is_close(x, best)], [x for x in equals if not _is_close(x, best)]
+    found = "has the smallest error" if equals else "is best"
+    sentences = [f"{_upper(best.words)} {found}: {metres(best.error)} {measure}{_gains(lines, best)}."]
+    if near:
+        sentences.append(f"Within 2 % of it: {_listed(near)}.")
+    if unproven:
+        sentences.append(f"This one drive does not prove worse: {_listed(unproven)}.")
+    return " ".join(sentences)
+
+
+def _listed(lines: Sequence[Line]) -> str:
+    return _and([f"{line.words} ({metres(_error(line))})" for line in lines])
 
 
 def _measure(best: Line, reference: ReferenceTrack | Relations) -> str:
@@ -119,14 +120,14 @@ def _measure(best: Line, reference: ReferenceTrack | Relations) -> str:
     return f"position error (ATE, root mean square) against {reference.source}{driven}"
 
 
-def _compared(lines: Sequence[Line], best: Line, equals: Sequence[Line]) -> str:
-    """What is gained over each of the parts; nothing is said of what is not shown to be worse."""
+def _gains(lines: Sequence[Line], best: Line) -> str:
+    """How much less the error is than that of each of the parts."""
     parts = [baseline_line(lines), next((line for line in lines if line.result.run.estimator == WHEELLESS), None)]
     gains = []
     for part in parts:
-        if part is None or part is best or part in equals or part.error is None or best.error is None or part.error <= 0.0:
+        if part is None or part is best or part.error is None or _is_close(part, best):
             continue
-        less = min(99.9, math.floor(1000.0 * (1.0 - best.error / part.error)) / 10.0)  # never rounded up to all
+        less = min(99.9, math.floor(1000.0 * (1.0 - _error(best) / part.error)) / 10.0)  # never rounded up to all
         gains.append(f"{less:.{1 if less > 99.0 else 0}f} % less than {part.words} ({metres(part.error)})")
     return ", " + _and(gains) if gains else ""
 
@@ -160,7 +161,9 @@ def _honesty(line: Line, whose: str = "Its covariances") -> list[str]:
     if found["under"]:
         also = f" ({_and(found['fits'])})" if found["fits"] else ""
         return [f"{whose} are larger than need be: {_and(found['under'])}{also}; safe to fuse, but given less weight than is due."]
-    return [f"Nothing speaks against {_lower(whose)}: {_and(found['fits'])}."] if found["fits"] else []
+    if found["fits"]:
+        return [f"Nothing speaks against {_lower(whose)}: {_and(found['fits'])}."]
+    return [f"{whose} could not be tested: that takes scans, or a reference with headings."]
 
 
 def _judge(name: str, mean: float, band: tuple[float, float], what: str) -> tuple[str, str]:
@@ -181,11 +184,11 @@ def _advice(lines: Sequence[Line], best: Line, equals: Sequence[Line]) -> list[s
     witnesses = [line for line in lines if line.result.run.estimator != DEAD_RECKONING and len(line.result.run.map_points)]
     if best.result.run.estimator == DEAD_RECKONING and witnesses and not any(line in equals for line in witnesses):
         return ["The LiDAR made no run better than the wheels alone: check its mount, its stamps and its range in the robot file first."]
-    models = [line for line in equals if line.result.run.estimator == best.result.run.estimator]
-    if models:
-        return [f"Use {best.result.run.estimator}; its motion model makes no difference that one drive shows."]
-    if equals:
-        return ["A longer drive with more turns would tell them apart."]
+    base = baseline_line(lines)
+    if base is not None and base in equals:
+        return ["Confirm on another drive, before relying on it, that it is better than dead reckoning."]
+    if any(line.result.run.estimator == best.result.run.estimator for line in equals):
+        return [f"Use {best.result.run.estimator}; which motion model is better in it, this drive does not tell."]
     return [f"Use {best.words}."]
 
 
