@@ -39,6 +39,8 @@ class Run:
     """How often what happened: scans, slips, scans that were not trusted..."""
     map_points: FloatArray
     """(M, 2) what the LiDAR saw, in the world [m]; (0, 2) without a LiDAR."""
+    notes: Sequence[str]
+    """What was found amiss with the sensors on the way."""
     seconds: float
     """Computing time of this pair, without reading the log."""
 
@@ -88,7 +90,7 @@ class _Lane:
     def __init__(self, pair: Pair, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig) -> None:
         self._pair, self._records = pair, _Records()
         self._stepper = Stepper(pair.model, robot, mounts, has_lidar, config.step)
-        self._estimator = make_estimator(pair.estimator, robot, mounts, has_lidar, config.estimator)
+        self._estimator = make_estimator(pair.estimator, pair.model, robot, mounts, has_lidar, config.estimator)
         self._seconds = 0.0
 
     def push(self, event: Event) -> None:
@@ -100,6 +102,8 @@ class _Lane:
         for step in steps:
             self._records.add(self._estimator.step(step))
             self._stepper.clock_offset_s = self._estimator.clock_offset_s
+            if self._estimator.params is not None:
+                self._stepper.params = self._estimator.params
 
     def finish(self) -> Run:
         begin = time.perf_counter()
@@ -121,6 +125,7 @@ class _Lane:
             self._estimator.parameters(),
             self._estimator.counts(),
             self._estimator.map_points(),
+            self._stepper.notes(),
             self._seconds,
         )
 

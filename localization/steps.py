@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -10,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
+from localization.gyro import GyroHistory, Turn
+from localization.wheel_history import WheelHistory
 from motion_models import se2
 from motion_models.base import Motion, MotionModel
 from motion_models.integrate import integrate_twists
@@ -38,18 +39,6 @@ class StepConfig:
 
 
 @dataclass(frozen=True)
-class Turn:
-    """Yaw about the body's z axis, summed up from a gyro; its bias is still in it."""
-
-    angle: float
-    """[rad]"""
-    variance: float
-    """[rad^2], of white noise and scale; without the bias."""
-    duration: float
-    """Time that the bias acted [s]."""
-
-
-@dataclass(frozen=True)
 class Step:
     """The time from ``start_ns`` to ``end_ns``, and what each witness says of it."""
 
@@ -74,113 +63,6 @@ class Step:
         return (self.end_ns - self.start_ns) * _NS
 
 
-class WheelHistory:
-    """The last seconds of wheel motion as intervals of constant rates, with the centre of gravity that held in each."""
-
-    def __init__(self, cg: FloatArray, keep_s: float = 10.0) -> None:
-        self._cg, self._cg_cov = cg, np.zeros((2, 2))
-        self._keep_ns = int(keep_s / _NS)
-        self._last: WheelSample | None = None
-        self._ends: list[int] = []
-        self._intervals: list[tuple[int, float, float, float, float]] = []  # start_ns, q_l, q_r, x_G, y_G
-
-    @property
-    def newest_ns(self) -> int | None:
-        return None if self._last is None else self._last.stamp_ns
-
-    def set_cg(self, sample: CgSample) -> None:
-        self._cg, self._cg_cov = sample.position, sample.covariance
-
-    @property
-    def cg_cov(self) -> FloatArray:
-        return self._cg_cov
-
-    def push(self, sample: WheelSample) -> None:
-        last, self._last = self._last, sample
-        if last is None or sample.stamp_ns <= last.stamp_ns:
-            return
-        rates = (sample.position - last.position) / ((sample.stamp_ns - last.stamp_ns) * _NS)
-        if not np.isfinite(rates).all():
-            rates = np.nanmean([last.velocity, sample.velocity], axis=0)
-        if not np.isfinite(rates).all():
-            return
-        self._ends.append(sample.stamp_ns)
-        self._intervals.append((last.stamp_ns, rates[0], rates[1], self._cg[0], self._cg[1]))
-        if self._ends[0] < sample.stamp_ns - 2 * self._keep_ns:
-            n = bisect.bisect_left(self._ends, sample.stamp_ns - self._keep_ns)
-            del self._ends[:n], self._intervals[:n]
-
-    def window(self, start_ns: int, end_ns: int, max_hold_s: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        """Intervals (n,) [s], rates (n, 2), CG (n, 2) from ``start_ns`` to ``end_ns``, and the seconds that nothing is known of.
-
-        Past the newest sample the last rates hold for at most ``max_hold_s``.
-        """
-        rows: list[tuple[float, float, float, float, float]] = []
-        known = start_ns
-        for i in range(bisect.bisect_right(self._ends, start_ns), len(self._ends)):
-            begin, q_l, q_r, x, y = self._intervals[i]
-            begin, end = max(begin, known), min(self._ends[i], end_ns)
-            if end <= begin:
-                break
-            rows.append(((end - begin) * _NS, q_l, q_r, x, y))
-            known = end
-        covered = sum(row[0] for row in rows)
-        if known < end_ns and self._ends:
-            _, q_l, q_r, x, y = self._intervals[-1]
-            hold = min(end_ns, self._ends[-1] + int(max_hold_s / _NS)) - max(known, self._ends[-1])
-            if hold > 0:
-                rows.append((hold * _NS, q_l, q_r, x, y))
-                covered += hold * _NS
-        table = np.array(rows).reshape(-1, 5)
-        missing = max((end_ns - start_ns) * _NS - covered, 0.0)
-        return table[:, 0], table[:, 1:3], table[:, 3:5], missing if missing > 1e-6 else 0.0
-
-
-class GyroHistory:
-    """The last seconds of the yaw rate, in the body frame."""
-
-    def __init__(self, robot: Robot, mounts: Mapping[str, Mount], keep_s: float = 10.0) -> None:
-        self._noise, self._mounts = robot.gyro_noise, mounts
-        self._keep_ns = int(keep_s / _NS)
-        self._stamps: list[int] = []
-        self._angles: list[float] = []
-
-    def push(self, sample: ImuSample) -> None:
-        mount = self._mounts.get(sample.frame_id)
-        rate = float((mount.rotation() @ sample.angular_velocity)[2]) if mount else float(sample.angular_velocity[2])
-        if self._stamps and sample.stamp_ns - self._stamps[-1] > 0.5 / _NS:
-            self._stamps.clear(), self._angles.clear()
-        if self._stamps:
-            dt = (sample.stamp_ns - self._stamps[-1]) * _NS
-            self._angles.append(self._angles[-1] + 0.5 * (self._rate + rate) * dt)
-        else:
-            self._angles.append(0.0)
-        self._rate = rate
-        self._stamps.append(sample.stamp_ns)
-        if self._stamps[0] < sample.stamp_ns - 2 * self._keep_ns:
-            n = bisect.bisect_left(self._stamps, sample.stamp_ns - self._keep_ns)
-            del self._stamps[:n], self._angles[:n]
-
-    def turn(self, start_ns: int, end_ns: int) -> Turn | None:
-        """The turn from ``start_ns`` to ``end_ns``, or None where the gyro was not heard from before its start to (nearly) its end."""
-        if not self._stamps or start_ns < self._stamps[0] or end_ns > self._stamps[-1] + 0.1 / _NS:
-            return None
-        angle = self._angle(end_ns) - self._angle(start_ns)
-        dt = (end_ns - start_ns) * _NS
-        variance = self._noise.white_rad_per_sqrt_s**2 * dt + (self._noise.scale_sigma * angle) ** 2
-        return Turn(angle, variance, dt)
-
-    def _angle(self, stamp_ns: int) -> float:
-        past = stamp_ns - self._stamps[-1]
-        if past > 0:
-            return self._angles[-1] + self._rate * past * _NS
-        i = max(bisect.bisect_left(self._stamps, stamp_ns), 1)
-        if i >= len(self._stamps):
-            return self._angles[-1]
-        part = (stamp_ns - self._stamps[i - 1]) / (self._stamps[i] - self._stamps[i - 1])
-        return self._angles[i - 1] + part * (self._angles[i] - self._angles[i - 1])
-
-
 class Stepper:
     """Cuts a stream of events into steps. Give it events with `push`; then take all steps that are ready.
 
@@ -189,10 +71,12 @@ class Stepper:
 
     def __init__(self, model: MotionModel, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: StepConfig | None = None):
         self.config = config or StepConfig()
-        self._model, self._robot, self._params = model, robot, model.nominal
+        self._model, self._robot = model, robot
+        self.params = model.nominal
+        """(k,) the model's parameters: estimated by the filter, and used from the next step on."""
         self._wheels = WheelHistory(robot.center_of_gravity)
-        self._gyro = GyroHistory(robot, mounts)
-        self._has_lidar, self._has_gyro = has_lidar, False
+        self._gyro = GyroHistory(robot.gyro_noise, mounts)
+        self._has_lidar = has_lidar
         self._scans: deque[Scan] = deque()
         self._start_ns: int | None = None
         self._now_ns = -(1 << 62)
@@ -208,7 +92,6 @@ class Stepper:
                 self._start_ns = event.stamp_ns
         elif isinstance(event, ImuSample):
             self._gyro.push(event)
-            self._has_gyro = True
         elif isinstance(event, CgSample):
             self._wheels.set_cg(event)
         elif isinstance(event, Scan):
@@ -229,6 +112,10 @@ class Stepper:
             start_ns = scan.stamp_ns if self._start_ns is None else self._start_ns
             self._start_ns = scan.stamp_ns
             yield self._step(start_ns, scan.stamp_ns, scan)
+
+    def notes(self) -> list[str]:
+        """What was found amiss with the sensors on the way."""
+        return self._gyro.notes()
 
     def _next_end(self) -> tuple[int, Scan | None] | None:
         if self._scans:
@@ -251,7 +138,7 @@ class Stepper:
     def _step(self, start_ns: int, end_ns: int, scan: Scan | None) -> Step:
         shift = round(self.clock_offset_s / _NS)
         dt, rates, cg, missing = self._wheels.window(start_ns + shift, end_ns + shift, self.config.max_hold_s)
-        twist = self._model.twist(rates, cg, self._params)
+        twist = self._model.twist(rates, cg, self.params)
         cg_cov = self._wheels.cg_cov
         motion = integrate_twists(dt, twist, self._robot.wheel_noise, cg_cov if cg_cov.any() else None)
         d_clock, last = np.zeros(3), np.zeros(3)
@@ -262,7 +149,7 @@ class Stepper:
             lost = np.array([self.config.lost_speed_m_s, self.config.lost_speed_m_s, self.config.lost_rate_rad_s]) * missing
             motion = Motion(motion.delta, motion.cov + np.diag(lost**2), motion.d_params)
         standing = bool(len(dt)) and missing == 0.0 and not rates.any()
-        turn = self._gyro.turn(start_ns, end_ns) if self._has_gyro and end_ns > start_ns else None
+        turn = self._gyro.turn(start_ns, end_ns, float(motion.delta[2])) if end_ns > start_ns else None
         return Step(start_ns, end_ns, motion, d_clock, last, standing, missing == 0.0, turn, scan)
 
 

@@ -82,7 +82,7 @@ class Replay:
             robot=robot.name,
             start=_date(log.start_ns),
             duration_s=log.duration_s,
-            notes=log.notes(),
+            notes=list(dict.fromkeys([*log.notes(), *(note for run in runs for note in run.notes)])),
             versions=versions(),
             log_fingerprint=fingerprint(log.path),
         )

@@ -44,6 +44,10 @@ class Estimator(Protocol):
     def clock_offset_s(self) -> float:
         """By how much the wheels' stamps are early [s], as far as the estimator knows; steps are cut by it."""
 
+    @property
+    def params(self) -> FloatArray | None:
+        """(k,) the motion model's parameters as they are now believed to be, or None where nothing corrects them."""
+
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         """Mean and sigma of what was estimated besides the pose, by name."""
 

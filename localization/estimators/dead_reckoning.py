@@ -16,6 +16,7 @@ class DeadReckoning:
     """Composes the predicted motions; the covariance follows P' = Ad(delta^-1) P Ad(delta^-1)^T + Q."""
 
     clock_offset_s = 0.0
+    params = None
 
     def __init__(self) -> None:
         self._pose, self._cov = np.zeros(3), np.zeros((3, 3))

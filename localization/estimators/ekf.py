@@ -15,13 +15,14 @@ from localization.residuals import motion_residual, turn_residual
 from localization.steps import Step, Turn
 from motion_models import se2
 from motion_models.base import Motion
+from motion_models.corrections import Corrections
 from motion_models.robot import GyroNoise
 from motion_models.se2 import FloatArray
 
-# Error state: the pose now, at the start of this step, and at the last scan (stochastic cloning); then what is learned on the way.
+# Error state: the pose now, at the start of this step, and at the last scan (stochastic cloning); then what is learned on the way:
+# the gyro's bias, the wheels' clock, and from PARAMS on the corrections of the motion model's parameters.
 POSE, START, ANCHOR = slice(0, 3), slice(3, 6), slice(6, 9)
-BIAS, CLOCK = 9, 10
-_SIZE = 11
+BIAS, CLOCK, PARAMS = 9, 10, 11
 
 
 @dataclass(frozen=True)
@@ -43,21 +44,27 @@ class EkfConfig:
 class Ekf:
     """State in, state out by `predict` and the `measure_...` methods; each returns the normalised innovation squared (NIS)."""
 
-    def __init__(self, gyro: GyroNoise, config: EkfConfig | None = None, pose: FloatArray | None = None) -> None:
+    def __init__(
+        self, gyro: GyroNoise, corrected: Corrections, config: EkfConfig | None = None, pose: FloatArray | None = None
+    ) -> None:
         self.config = config or EkfConfig()
-        self._gyro = gyro
+        self._gyro, self._corrected = gyro, corrected
+        self._size = size = PARAMS + len(corrected.names)
         self.pose = np.zeros(3) if pose is None else np.array(pose, dtype=float)
         self._start, self._anchor = self.pose.copy(), self.pose.copy()
         self.bias, self.clock_offset = 0.0, 0.0
         self._gate = float(chi2.ppf(self.config.gate_probability, 3))
-        self._filter = ExtendedKalmanFilter(dim_x=_SIZE, dim_z=3)
-        self._filter.P = np.zeros((_SIZE, _SIZE))
+        self._filter = ExtendedKalmanFilter(dim_x=size, dim_z=3)
+        self._filter.P = np.zeros((size, size))
         self._filter.P[BIAS, BIAS] = gyro.bias_sigma_rad_per_s**2
         self._filter.P[CLOCK, CLOCK] = self.config.clock_sigma_s**2
+        self._filter.P[PARAMS:, PARAMS:] = np.diag(corrected.sigmas**2)
+        self.correction = np.zeros(len(corrected.names))
+        """(k,) what is added to the model's parameters along the corrections' directions."""
 
     @property
     def covariance(self) -> FloatArray:
-        """(11, 11) of the error state."""
+        """(11 + k, 11 + k) of the error state, k corrections."""
         return np.asarray(self._filter.P)
 
     @property
@@ -76,16 +83,19 @@ class Ekf:
         return self._gate
 
     def predict(self, step: Step) -> None:
-        """Move by what the wheels say; the error follows e' = Ad(delta^-1) e + (d delta / d clock) e_clock + slip."""
-        F = np.eye(_SIZE)
+        """Move by what the wheels say; the error follows e' = Ad(delta^-1) e + (d delta / d clock) e_clock + (d delta / d params) e_params + slip."""
+        F = np.eye(self._size)
         F[POSE, POSE] = se2.adjoint(se2.inverse(step.predicted.delta))
         F[POSE, CLOCK] = step.d_clock
+        F[POSE, PARAMS:] = step.predicted.d_params @ self._corrected.directions
         F[START, START], F[START, POSE] = np.zeros((3, 3)), np.eye(3)
         P = F @ self._filter.P @ F.T
         P[POSE, POSE] += step.predicted.cov
         P[BIAS, BIAS] += self._gyro.bias_walk_rad_per_s_sqrt_s**2 * step.duration
         if self.config.clock_sigma_s:
             P[CLOCK, CLOCK] += self.config.clock_walk_s_per_sqrt_s**2 * step.duration
+        if not step.is_standing:
+            P[PARAMS:, PARAMS:] += np.diag(self._corrected.walks**2 * step.duration)
         self._filter.P = P
         self._start = self.pose
         self.pose = se2.compose(self.pose, step.predicted.delta)
@@ -93,7 +103,7 @@ class Ekf:
     def measure_turn(self, turn: Turn) -> float:
         """The gyro's turn since the start of the step."""
         error = turn_residual(self._start, self.pose, turn.angle, self.bias, turn.duration)
-        H = np.zeros((1, _SIZE))
+        H = np.zeros((1, self._size))
         H[0, POSE.start + 2], H[0, START.start + 2], H[0, BIAS] = 1.0, -1.0, turn.duration
         return self._update(np.array([error]), H, np.array([[turn.variance]]))
 
@@ -102,7 +112,7 @@ class Ekf:
         c = self.config
         still = np.diag([c.standing_sigma_m**2, c.standing_sigma_m**2, c.standing_sigma_rad**2])
         error, d_start, d_pose = motion_residual(self._start, self.pose, np.zeros(3))
-        H = np.zeros((3, _SIZE))
+        H = np.zeros((3, self._size))
         H[:, START], H[:, POSE] = d_start, d_pose
         return self._update(error, H, still)
 
@@ -113,7 +123,7 @@ class Ekf:
         the prediction's covariance grows until both agree; else the LiDAR is, and its measurement's grows.
         """
         error, d_anchor, d_pose = motion_residual(self._anchor, self.pose, measured.delta)
-        H = np.zeros((3, _SIZE))
+        H = np.zeros((3, self._size))
         H[:, ANCHOR], H[:, POSE] = d_anchor, d_pose
         R = d_pose @ measured.cov @ d_pose.T
         S = H @ self._filter.P @ H.T + R
@@ -129,7 +139,7 @@ class Ekf:
 
     def set_anchor(self) -> None:
         """From here on, the LiDAR measures from the pose as it is now."""
-        G = np.eye(_SIZE)
+        G = np.eye(self._size)
         G[ANCHOR, ANCHOR], G[ANCHOR, POSE] = np.zeros((3, 3)), np.eye(3)
         self._filter.P = G @ self._filter.P @ G.T
         self._anchor = self.pose
@@ -137,7 +147,7 @@ class Ekf:
     def _update(self, error: FloatArray, H: FloatArray, R: FloatArray) -> float:
         """``error`` is prediction minus measurement; the error state's mean is zero, so the innovation is its negative."""
         f = self._filter
-        f.x = np.zeros((_SIZE, 1))
+        f.x = np.zeros((self._size, 1))
         f.update(np.zeros((len(error), 1)), lambda x: H, lambda x: error[:, None], R=R)
         f.P = 0.5 * (f.P + f.P.T)
         correction = f.x[:, 0]
@@ -146,4 +156,5 @@ class Ekf:
         self._anchor = se2.compose(self._anchor, se2.exp(correction[ANCHOR]))
         self.bias += float(correction[BIAS])
         self.clock_offset += float(correction[CLOCK])
+        self.correction = self.correction + correction[PARAMS:]
         return float((f.y.T @ f.SI @ f.y)[0, 0])

@@ -13,12 +13,13 @@ from dataclasses import replace
 import numpy as np
 
 from localization.estimators.base import Estimate, mean_twist
-from localization.estimators.ekf import POSE, START, Ekf, EkfConfig
+from localization.estimators.ekf import BIAS, CLOCK, PARAMS, POSE, START, Ekf, EkfConfig
 from localization.lidar import LidarConfig, LidarMatcher, body_points
 from localization.residuals import motion_residual
 from localization.steps import Step
 from motion_models import se2
-from motion_models.base import Motion
+from motion_models.base import Motion, MotionModel
+from motion_models.corrections import Corrections
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
@@ -28,6 +29,8 @@ class EkfFusion:
 
     def __init__(
         self,
+        model: MotionModel,
+        corrected: Corrections,
         robot: Robot,
         mounts: Mapping[str, Mount],
         has_lidar: bool,
@@ -36,8 +39,9 @@ class EkfFusion:
     ) -> None:
         config = config or EkfConfig()
         # without a LiDAR there is no second clock to compare with
-        self._ekf = Ekf(robot.gyro_noise, config if has_lidar else replace(config, clock_sigma_s=0.0))
+        self._ekf = Ekf(robot.gyro_noise, corrected, config if has_lidar else replace(config, clock_sigma_s=0.0))
         self._matcher = LidarMatcher(lidar) if has_lidar else None
+        self._model, self._corrected = model, corrected
         self._mounts, self._has_gyro = mounts, False
         self._counts = dict.fromkeys(("scans", "matched", "contradictions", "standing"), 0)
         self._has_map = False
@@ -45,6 +49,10 @@ class EkfFusion:
     @property
     def clock_offset_s(self) -> float:
         return self._ekf.clock_offset
+
+    @property
+    def params(self) -> FloatArray:
+        return np.asarray(self._model.nominal + self._corrected.directions @ self._ekf.correction)
 
     def step(self, step: Step) -> Estimate:
         ekf, nis = self._ekf, None
@@ -93,9 +101,13 @@ class EkfFusion:
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         found = {}
         if self._has_gyro:
-            found["gyro_bias_rad_per_s"] = self._ekf.bias, math.sqrt(self._ekf.covariance[9, 9])
+            found["gyro_bias_rad_per_s"] = self._ekf.bias, math.sqrt(self._ekf.covariance[BIAS, BIAS])
         if self._matcher is not None:
-            found["wheel_clock_offset_s"] = self._ekf.clock_offset, math.sqrt(self._ekf.covariance[10, 10])
+            found["wheel_clock_offset_s"] = self._ekf.clock_offset, math.sqrt(self._ekf.covariance[CLOCK, CLOCK])
+        nominal = dict(zip(self._model.param_names, self._model.nominal, strict=True))
+        for i, name in enumerate(self._corrected.names):
+            mean = nominal.get(name, 0.0) + self._ekf.correction[i]
+            found[name] = float(mean), math.sqrt(self._ekf.covariance[PARAMS + i, PARAMS + i])
         return found
 
     def counts(self) -> Mapping[str, int]:

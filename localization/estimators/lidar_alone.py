@@ -19,6 +19,7 @@ class LidarAlone:
     """A pose for each scan; between scans it stays where it was. No covariance: KISS-ICP has none."""
 
     clock_offset_s = 0.0
+    params = None
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig | None = None) -> None:
         self._mounts, self._odometry = mounts, LidarOdometry(config)

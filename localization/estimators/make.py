@@ -12,6 +12,8 @@ from localization.estimators.ekf import EkfConfig
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.lidar_alone import LidarAlone
 from localization.lidar import LidarConfig
+from motion_models.base import MotionModel
+from motion_models.corrections import Form, corrections
 from motion_models.robot import Mount, Robot
 
 
@@ -21,14 +23,18 @@ class EstimatorConfig:
 
     ekf: EkfConfig = field(default_factory=EkfConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig)
+    corrections: Form = "constant"
+    """What the filter learns of the motion model: nothing, or its k and centre of rotation as slowly changing constants."""
 
 
-_Maker = Callable[[Robot, Mapping[str, Mount], bool, EstimatorConfig], Estimator]
+_Maker = Callable[[MotionModel, Robot, Mapping[str, Mount], bool, EstimatorConfig], Estimator]
 
 ESTIMATORS: Mapping[str, _Maker] = {
-    "odometry": lambda robot, mounts, has_lidar, config: DeadReckoning(),
-    "lidar": lambda robot, mounts, has_lidar, config: LidarAlone(mounts, config.lidar),
-    "ekf": lambda robot, mounts, has_lidar, config: EkfFusion(robot, mounts, has_lidar, config.ekf, config.lidar),
+    "odometry": lambda model, robot, mounts, has_lidar, config: DeadReckoning(),
+    "lidar": lambda model, robot, mounts, has_lidar, config: LidarAlone(mounts, config.lidar),
+    "ekf": lambda model, robot, mounts, has_lidar, config: EkfFusion(
+        model, corrections(model, config.corrections), robot, mounts, has_lidar, config.ekf, config.lidar
+    ),
 }
 
 
@@ -41,8 +47,8 @@ def check_estimator(name: str, has_lidar: bool) -> None:
 
 
 def make_estimator(
-    name: str, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: EstimatorConfig | None = None
+    name: str, model: MotionModel, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: EstimatorConfig | None = None
 ) -> Estimator:
     """The estimator ``name`` at the origin. Raises what `check_estimator` does."""
     check_estimator(name, has_lidar)
-    return ESTIMATORS[name](robot, mounts, has_lidar, config or EstimatorConfig())
+    return ESTIMATORS[name](model, robot, mounts, has_lidar, config or EstimatorConfig())

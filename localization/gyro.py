@@ -1,0 +1,136 @@
+"""The gyro's yaw rate: about the body's z axis by the IMU's mount, or about gravity where the mount cannot be true."""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from localization.events import ImuSample
+from motion_models.robot import GyroNoise, Mount
+from motion_models.se2 import FloatArray
+
+_NS = 1e-9
+_LONGEST_GAP_NS, _LONGEST_HOLD_NS = 500_000_000, 100_000_000
+_FIRST_SAMPLES = 20
+_LEAST_GRAVITY, _MOST_GRAVITY = 8.0, 12.0  # m/s^2; drivers that publish none, or in other units, tell nothing of the mount
+_MOST_TILT = math.radians(30.0)
+_TELLING_TURN = 0.5  # rad of turning by the wheels, after which they have told which way the gyro's axis points
+
+
+@dataclass(frozen=True)
+class Turn:
+    """Yaw about the body's z axis, summed up from a gyro; its bias is still in it."""
+
+    angle: float
+    """[rad]"""
+    variance: float
+    """[rad^2], of white noise and scale; without the bias."""
+    duration: float
+    """Time that the bias acted [s]."""
+
+
+class GyroHistory:
+    """The last seconds of the yaw rate.
+
+    Gravity shows which axis of the IMU is upright. Where the mount says another one, the rate is that about gravity, and whether this
+    axis points up or down (some drivers publish gravity, not specific force) is seen by the turns of the wheels; until those have told,
+    the gyro is not used.
+    """
+
+    def __init__(self, noise: GyroNoise, mounts: Mapping[str, Mount], keep_s: float = 10.0) -> None:
+        self._noise, self._mounts = noise, mounts
+        self._keep_ns = int(keep_s / _NS)
+        self._stamps: list[int] = []
+        self._angles: list[float] = []
+        self._rate = 0.0
+        self._frame: str | None = None
+        self._force = np.zeros(3)
+        self._axis = np.array([0.0, 0.0, 1.0])
+        self._contradicts, self._sign = False, 1.0
+        self._agreement = self._turned = 0.0
+
+    def push(self, sample: ImuSample) -> None:
+        if sample.frame_id != self._frame:
+            self._begin(sample)
+        self._watch_gravity(sample)
+        rate = float(self._axis @ sample.angular_velocity)
+        if self._stamps and sample.stamp_ns - self._stamps[-1] > _LONGEST_GAP_NS:
+            self._forget()
+        if self._stamps:
+            dt = (sample.stamp_ns - self._stamps[-1]) * _NS
+            self._angles.append(self._angles[-1] + 0.5 * (self._rate + rate) * dt)
+        else:
+            self._angles.append(0.0)
+        self._rate = rate
+        self._stamps.append(sample.stamp_ns)
+        if self._stamps[0] < sample.stamp_ns - 2 * self._keep_ns:
+            n = bisect.bisect_left(self._stamps, sample.stamp_ns - self._keep_ns)
+            del self._stamps[:n], self._angles[:n]
+
+    def turn(self, start_ns: int, end_ns: int, by_wheels: float) -> Turn | None:
+        """The turn from ``start_ns`` to ``end_ns``; ``by_wheels`` [rad] only tells which way is left, where the mount does not.
+
+        None where the gyro was not heard from before the start to (nearly) the end, or while its axis is not known.
+        """
+        if not self._stamps or start_ns < self._stamps[0] or end_ns > self._stamps[-1] + _LONGEST_HOLD_NS:
+            return None
+        angle = self._angle(end_ns) - self._angle(start_ns)
+        if self._contradicts:
+            self._agreement += angle * by_wheels
+            self._turned += abs(by_wheels)
+            if self._turned < _TELLING_TURN:
+                return None
+            self._sign = math.copysign(1.0, self._agreement)
+        dt = (end_ns - start_ns) * _NS
+        variance = self._noise.white_rad_per_sqrt_s**2 * dt + (self._noise.scale_sigma * angle) ** 2
+        return Turn(self._sign * angle, variance, dt)
+
+    def notes(self) -> list[str]:
+        """What a user should know about the mount."""
+        if not self._contradicts:
+            return []
+        if self._turned < _TELLING_TURN:
+            return [f"the mount of IMU '{self._frame}' contradicts gravity, and the robot turned too little to tell its axis: it was not used."]
+        axis = ", ".join(f"{value:+.2f}" for value in self._sign * self._axis)
+        return [
+            f"the mount of IMU '{self._frame}' contradicts gravity: the yaw rate was taken about [{axis}] in the IMU's frame. "
+            "Correct its roll, pitch and yaw in /tf_static or in the robot file's [mounts]."
+        ]
+
+    def _begin(self, sample: ImuSample) -> None:
+        mount = self._mounts.get(sample.frame_id, Mount())
+        self._frame, self._up = sample.frame_id, mount.rotation()[2]
+        self._axis, self._force = self._up, np.zeros(3)
+        self._contradicts, self._sign, self._n_force = False, 1.0, 0
+        self._forget()
+
+    def _watch_gravity(self, sample: ImuSample) -> None:
+        """Judge the mount once, by the mean of the first samples."""
+        if self._n_force >= _FIRST_SAMPLES:
+            return
+        self._force = self._force + sample.linear_acceleration
+        self._n_force += 1
+        strength = float(np.linalg.norm(self._force)) / self._n_force
+        if self._n_force == _FIRST_SAMPLES and _LEAST_GRAVITY < strength < _MOST_GRAVITY:
+            found = self._force / np.linalg.norm(self._force)
+            if found @ self._up < math.cos(_MOST_TILT):
+                self._axis, self._contradicts = found, True
+                self._forget()
+
+    def _forget(self) -> None:
+        self._stamps.clear()
+        self._angles.clear()
+
+    def _angle(self, stamp_ns: int) -> float:
+        past = stamp_ns - self._stamps[-1]
+        if past > 0:
+            return self._angles[-1] + self._rate * past * _NS
+        i = max(bisect.bisect_left(self._stamps, stamp_ns), 1)
+        if i >= len(self._stamps):
+            return self._angles[-1]
+        part = (stamp_ns - self._stamps[i - 1]) / (self._stamps[i] - self._stamps[i - 1])
+        return self._angles[i - 1] + part * (self._angles[i] - self._angles[i - 1])
