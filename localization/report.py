@@ -19,7 +19,7 @@ from localization.report_data import MapView, map_view, nis_means, spans, timeli
 from localization.report_lines import Line, best_line, make_lines
 from localization.report_page import TERMS, style_sheet
 from localization.report_tables import REFERENCE_SWATCH, accuracy_table, count_table, definition_table, parameter_table, swatch
-from localization.report_verdict import equally_good, metres, verdict
+from localization.report_verdict import is_close, metres, verdict, verdict_sentences
 from localization.score import Result
 
 __all__ = ["ReportHead", "overview_png", "verdict", "write_report"]
@@ -59,16 +59,16 @@ def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack 
     """The whole page."""
     lines = make_lines(results)
     best = best_line(lines) if reference is not None else None
-    equals = equally_good(lines, best, reference) if best is not None and reference is not None else []
-    words = escape(verdict(results, reference))
+    near = [line for line in lines if best is not None and line is not best and line.error is not None and is_close(line, best)]
+    sentences = [escape(sentence) for sentence in verdict_sentences(results, reference)]
     parts = [
         f"<h1>Replay of {escape(head.log)}</h1>",
         f'<p class="facts">{escape(head.robot)} · {head.duration_s:,.1f} s from {escape(head.start)}</p>',
-        f'<p class="verdict">{words}</p>',
+        f'<div class="verdict"><p><b>{sentences[0]}</b></p><p>{" ".join(sentences[1:])}</p></div>',
     ]
     if lines:
         parts += [
-            _section("Accuracy", accuracy_table(lines, best, equals) + _about_reference(lines, reference)),
+            _section("Accuracy", accuracy_table(lines, best, near) + _about_reference(lines, reference)),
             _section("Trajectories", _map_figure(lines, map_view(lines, reference))),
             _section("Errors", _error_figure(lines, reference)),
             _section("Innovations: does the filter know how wrong it is?", _nis_figure(lines)),
@@ -81,7 +81,7 @@ def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack 
         _section("About the log", f"<ul>{notes}</ul>" if notes else "<p>Nothing was lost and nothing had to be mended.</p>"),
         _section("How to read this", f'<dl class="terms">{terms}</dl>'),
         _section("Where this comes from", definition_table(_provenance(head, reference))),
-        _section("In short", f"<p>{words}</p>"),
+        _section("In short", f"<p>{' '.join(sentences)}</p>"),
     ]
     body = "\n".join(part for part in parts if part)
     return (

@@ -21,7 +21,8 @@ p{margin:.5rem 0;max-width:46rem}
 small,figcaption,.facts{color:var(--soft);font-size:.86rem}
 .facts{margin:.35rem 0 0;overflow-wrap:anywhere}
 .verdict{font-size:1.12rem;line-height:1.5;border-left:4px solid var(--accent);background:var(--card)}
-.verdict{padding:.8rem 1rem;margin:1.2rem 0;max-width:none}
+.verdict p{max-width:none;margin:.3rem 0}
+.verdict{padding:.6rem 1rem;margin:1.2rem 0;max-width:none}
 figure{margin:0}
 figcaption{max-width:46rem;margin-top:.4rem}
 figure>svg{display:block;width:100%;height:auto}
@@ -57,7 +58,7 @@ li{overflow-wrap:anywhere}
 main{padding:1rem .9rem 2rem}
 .verdict{font-size:1.03rem}
 thead th{min-width:4.2rem}th,td{padding:.4rem .5rem}
-th small,td small{white-space:normal}
+th:first-child{white-space:normal;max-width:9.5rem;padding-right:.4rem}code{font-size:.85em}
 dl{grid-template-columns:minmax(5rem,36%) 1fr}.terms{grid-template-columns:1fr}.terms dd{margin-bottom:.5rem}
 }
 @media print{

@@ -13,7 +13,7 @@ from localization.score import Result
 MISSING = "–"  # noqa: RUF001
 _MINUS = "\N{MINUS SIGN}"
 _BEST = ' <span class="badge">best</span>'
-_TIED = ' <span class="badge soft">tied</span>'
+_NEAR = ' <span class="badge soft">as good</span>'
 REFERENCE_SWATCH = '<svg class="swatch" viewBox="0 0 30 8" aria-hidden="true"><path d="M1 4H29" stroke="var(--ink)"/></svg>'
 _UNITS = (("_rad_per_s", "rad/s"), ("_deg_per_s", "deg/s"), ("_m_per_s", "m/s"), ("_rad", "rad"), ("_deg", "deg"), ("_m", "m"), ("_s", "s"))
 
@@ -79,12 +79,15 @@ def number(value: float | None, digits: int) -> str:
     return f"{value:,.{digits}f}".replace("-", _MINUS)
 
 
-def accuracy_table(lines: Sequence[Line], best: Line | None, equals: Sequence[Line]) -> str:
-    """A row for each line; columns that nothing is known of are left out. The smallest error of a column is bold."""
+def accuracy_table(lines: Sequence[Line], best: Line | None, near: Sequence[Line]) -> str:
+    """A row for each line; columns that nothing is known of are left out. The smallest error of a column is bold.
+
+    ``near``: the runs practically as good as the best.
+    """
     columns = _known([*_TRACK, *_RELATIONS, *_CONSISTENCY], lines)
     if not any(c.is_error for c in columns):
         columns = [_DRIVEN, *columns]
-    table = _rows(lines, columns, {**{line.number: _TIED for line in equals}, **({best.number: _BEST} if best else {})})
+    table = _rows(lines, columns, {**{line.number: _NEAR for line in near}, **({best.number: _BEST} if best else {})})
     squares = _known(_SQUARES, lines)
     more = (
         f"<details><summary>Mean squares, as published for the benchmark</summary>{_rows(lines, squares, {})}</details>" if squares else ""
@@ -143,7 +146,7 @@ def plus_minus(mean: float, sigma: float) -> str:
     power = math.floor(math.log10(largest)) if 0.0 < largest < 1e-3 or largest >= 1e6 else 0
     mean, sigma = mean / 10.0**power, sigma / 10.0**power
     digits = min(max(1 - math.floor(math.log10(abs(sigma))), 0), 9) if sigma else 4
-    text = f"{mean:.{digits}f} ± {sigma:.{digits}f}".replace("-", _MINUS)
+    text = f"{mean:z.{digits}f} ± {sigma:.{digits}f}".replace("-", _MINUS)
     return f"({text}) · 10<sup>{str(power).replace('-', _MINUS)}</sup>" if power else text
 
 
@@ -174,7 +177,9 @@ def _by_name(lines: Sequence[Line], cells: Mapping[int, Mapping[str, str]], unit
     rows = []
     for name in names:
         unit_text = unit(name) if unit else ""
-        title = f"<code>{escape(name)}</code><br><small>{unit_text}</small>" if unit else escape(name.replace("_", " "))
+        title = (
+            f"<code>{escape(name).replace('_', '_<wbr>')}</code><br><small>{unit_text}</small>" if unit else escape(name.replace("_", " "))
+        )
         values = "".join(f"<td>{cells[line.number].get(name, MISSING)}</td>" for line in shown)
         rows.append(f'<tr><th scope="row">{title}</th>{values}</tr>')
     return _table(f"<td></td>{heads}", rows)

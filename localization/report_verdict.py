@@ -31,21 +31,26 @@ _NOTABLE = 1.25
 
 def verdict(results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> str:
     """One paragraph that a person can act on, from the numbers alone."""
+    return " ".join(verdict_sentences(results, reference))
+
+
+def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> list[str]:
+    """The paragraph's sentences, what matters most first."""
     lines = make_lines(results)
     if not lines:
-        return "Nothing was run, so there is nothing to tell."
+        return ["Nothing was run, so there is nothing to tell."]
     best = best_line(lines)
     if best is None or reference is None:
         line = _most_informed(lines)
-        return " ".join([*_unscored(lines), *_honesty(line, f"The covariances of {line.words}")])
+        return [*_unscored(lines), *_honesty(line, f"The covariances of {line.words}")]
     equals = equally_good(lines, best, reference)
-    return " ".join([_ranking(lines, best, equals, reference), *_coverage(best), *_honesty(best), *_advice(lines, best, equals)])
+    return [*_ranking(lines, best, equals, reference), *_coverage(best), *_honesty(best), *_advice(lines, best, equals)]
 
 
 def equally_good(lines: Sequence[Line], best: Line, reference: ReferenceTrack | Relations) -> list[Line]:
     """The scored runs, without ``best``, whose errors this log cannot tell from those of ``best``, or that differ by less than 2 %."""
     others = [line for line in lines if line is not best and line.error is not None]
-    return [line for line in others if _is_close(line, best) or not _is_worse(line, best, reference)]
+    return [line for line in others if is_close(line, best) or not _is_worse(line, best, reference)]
 
 
 def metres(value: float) -> str:
@@ -58,7 +63,8 @@ def metres(value: float) -> str:
     return f"{value:,.{digits}f} m"
 
 
-def _is_close(line: Line, best: Line) -> bool:
+def is_close(line: Line, best: Line) -> bool:
+    """True if the errors differ by less than 2 %, whatever can be shown of that."""
     return _error(line) - _error(best) <= _SAME * _error(best)
 
 
@@ -91,20 +97,20 @@ def _at(values: FloatArray, keys: IntArray, wanted: IntArray) -> FloatArray:
     return found
 
 
-def _ranking(lines: Sequence[Line], best: Line, equals: Sequence[Line], reference: ReferenceTrack | Relations) -> str:
+def _ranking(lines: Sequence[Line], best: Line, equals: Sequence[Line], reference: ReferenceTrack | Relations) -> list[str]:
     assert best.error is not None
     measure = _measure(best, reference)
     if len(lines) == 1:
         alone = "Nothing else was run, so nothing tells whether another pair does better."
-        return f"{_upper(best.words)}: {metres(best.error)} {measure}. {alone}"
-    near, unproven = [x for x in equals if _is_close(x, best)], [x for x in equals if not _is_close(x, best)]
+        return [f"{_upper(best.words)}: {metres(best.error)} {measure}.", alone]
+    near, unproven = [x for x in equals if is_close(x, best)], [x for x in equals if not is_close(x, best)]
     found = "has the smallest error" if equals else "is best"
     sentences = [f"{_upper(best.words)} {found}: {metres(best.error)} {measure}{_gains(lines, best)}."]
     if near:
         sentences.append(f"Within 2 % of it: {_listed(near)}.")
     if unproven:
-        sentences.append(f"This one drive does not prove worse: {_listed(unproven)}.")
-    return " ".join(sentences)
+        sentences.append(f"Not proven worse by this one drive: {_listed(unproven)}.")
+    return sentences
 
 
 def _listed(lines: Sequence[Line]) -> str:
@@ -125,7 +131,7 @@ def _gains(lines: Sequence[Line], best: Line) -> str:
     parts = [baseline_line(lines), next((line for line in lines if line.result.run.estimator == WHEELLESS), None)]
     gains = []
     for part in parts:
-        if part is None or part is best or part.error is None or _is_close(part, best):
+        if part is None or part is best or part.error is None or is_close(part, best):
             continue
         less = min(99.9, math.floor(1000.0 * (1.0 - _error(best) / part.error)) / 10.0)  # never rounded up to all
         gains.append(f"{less:.{1 if less > 99.0 else 0}f} % less than {part.words} ({metres(part.error)})")
@@ -198,16 +204,16 @@ def _unscored(lines: Sequence[Line]) -> list[str]:
     if len(lines) == 1:
         line = lines[0]
         driven = metres(line.result.run.trajectory.distance(0.05))
-        return [f"No reference was given: {line.words} drove {driven}, and nothing here says how accurately. {ask}"]
+        return [f"No reference was given: {line.words} drove {driven}, and nothing here says how accurately.", ask]
     ends = {line.number: _end(line) for line in lines}
     pairs = [(a, b) for i, a in enumerate(lines) for b in lines[i + 1 :] if ends[a.number] is not None and ends[b.number] is not None]
-    apart = ""
+    apart = []
     if pairs:
         gaps = [math.dist(ends[a.number] or (), ends[b.number] or ()) for a, b in pairs]
         far = max(range(len(gaps)), key=gaps.__getitem__)
         driven = metres(max(line.result.run.trajectory.distance(0.05) for line in lines))
-        apart = f" After {driven} at most, {pairs[far][0].words} and {pairs[far][1].words} end farthest apart, by {metres(gaps[far])}."
-    return [f"No reference was given, so nothing here says which run is right.{apart} {ask}"]
+        apart = [f"After {driven} at most, {pairs[far][0].words} and {pairs[far][1].words} end farthest apart, by {metres(gaps[far])}."]
+    return ["No reference was given, so nothing here says which run is right.", *apart, ask]
 
 
 def _most_informed(lines: Sequence[Line]) -> Line:
