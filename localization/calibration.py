@@ -14,6 +14,7 @@ from localization.errors import EvaluationError
 from localization.logs import Log, TopicOverrides, open_log
 from localization.maneuver_windows import WindowConfig, cut
 from localization.references import ReferenceTrack, read_reference_file, reference_track
+from localization.trajectory import BoolArray
 from localization.witnesses import GyroWitness, LidarWitness, ReferenceWitness, Witness
 from motion_models.base import MotionModel
 from motion_models.calibrate import Fit, fit
@@ -55,12 +56,16 @@ class Calibrated:
     """(M, 3) the same by the fit, of the maneuvers that it was fitted to."""
     group: IntArray
     """(M,) group of each."""
-    measures_positions: bool
-    """Whether more than headings was measured."""
+    position_known: BoolArray
+    """(M,) whether the position was measured, not only the heading."""
     heldout: HeldOut | None
     """The same by fits that have not seen the maneuver's group; None for too few groups to leave any out."""
     systematic: dict[str, float]
     """Sigma by parameter that no number of maneuvers averages out: the gyro's scale; empty without a gyro."""
+
+    @property
+    def measures_positions(self) -> bool:
+        return bool(self.position_known.any())
 
     @property
     def fit(self) -> Fit:
@@ -146,9 +151,8 @@ def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequ
     heldout = cross_validate(train, maneuvers, min(_FOLDS, len(names))) if len(names) >= _FEWEST_GROUPS else None
     before = dataclasses.replace(found.fit, params=model.nominal, witness=np.zeros(5)).residuals(maneuvers)
     inside = found.fit.residuals(maneuvers)
-    return Calibrated(
-        model, found, before, inside, group, not _only_turns(maneuvers), heldout, _gyro_scale(train, found.fit, maneuvers, cuts, robot)
-    )
+    systematic = _gyro_scale(train, found.fit, maneuvers, cuts, robot)
+    return Calibrated(model, found, before, inside, group, _position_known(maneuvers), heldout, systematic)
 
 
 _NO_SLIP = WheelNoise(*(0.0,) * 8)
@@ -156,7 +160,11 @@ _UNSEEN = "headings alone were measured, and no distance: record a LiDAR or a re
 
 
 def _only_turns(maneuvers: Sequence[Maneuver]) -> bool:
-    return not any(np.isfinite(m.cov[..., 0, 0]).any() for m in maneuvers)
+    return not _position_known(maneuvers).any()
+
+
+def _position_known(maneuvers: Sequence[Maneuver]) -> BoolArray:
+    return np.concatenate([np.isfinite(np.broadcast_to(m.cov, (len(m.ends), 3, 3))[:, 0, 0]) for m in maneuvers])
 
 
 def _gyro_scale(

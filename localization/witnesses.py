@@ -27,6 +27,7 @@ _LONGEST_SCAN_GAP_S, _LONGEST_REFERENCE_GAP_S = 1.0, 0.5
 _HOLD_S = 0.5
 _LOST = np.array([0.1, 0.1, 0.1])  # sigma of the guess that starts a scan's search, beyond the wheels' slip [m, m, rad]
 _WRONG_TURN = 0.5  # how wrong the nominal model may be about a turn, as sigma over its size
+_HOLDS_M = 0.05  # sigma of a position beyond which a scene counts as a corridor: matching then slides towards no motion at all
 _STANDING = np.diag([1e-12, 1e-12, 1e-12])
 
 
@@ -142,7 +143,7 @@ class LidarWitness:
         self._first: Scan | None = None
         self._start_ns = self._last_ns = 0
         self._pose, self._twist = np.zeros(3), np.zeros(3)
-        self._mistrusted = self._scans = 0
+        self._mistrusted = self._scans = self._slippery = 0
 
     def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
         if not isinstance(event, Scan) or wheels.history.newest_ns is None:
@@ -166,6 +167,9 @@ class LidarWitness:
             self._matcher.insert(np.zeros(3))
         trusted, cov = self._follow(self._matcher, event, wheels.motion(self._last_ns, event.stamp_ns), gap)
         if event.stamp_ns - self._start_ns >= self._window_ns:
+            if trusted and np.linalg.eigvalsh(cov[:2, :2])[1] > _HOLDS_M**2:
+                self._slippery += 1
+                cov = np.diag([math.inf, math.inf, cov[2, 2]])
             yield Span(self._start_ns, event.stamp_ns, self._pose, cov, is_trusted=trusted)
             self._begin(event)
 
@@ -173,8 +177,13 @@ class LidarWitness:
         return list(spans)
 
     def notes(self) -> list[str]:
+        said = []
+        if self._slippery:
+            said.append(
+                f"{self._slippery} windows count by their heading alone: in corridors and along walls, scans do not hold the position."
+            )
         if not self._mistrusted:
-            return []
+            return said
         lost = f"{self._mistrusted} of {self._scans} scans could not be matched with the first of their window"
         return [f"{lost}; windows that end in one were left out."]
 
