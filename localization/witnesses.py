@@ -180,7 +180,7 @@ class LidarWitness:
         said = []
         if self._slippery:
             said.append(
-                f"{self._slippery} windows count by their heading alone: in corridors and along walls, scans do not hold the position."
+                f"{self._slippery} windows count by their heading alone: along corridors and walls, scans do not hold the position."
             )
         if not self._mistrusted:
             return said

@@ -31,6 +31,14 @@ def plain_table(*columns: str, title: str | None = None) -> Table:
     return table
 
 
+def show(console: Console, table: Table) -> None:
+    """Where nobody's screen is in the way, a row stays one line."""
+    if console.is_terminal:
+        console.print(table)
+    else:
+        console.print(table, width=200, crop=False)
+
+
 def say(console: Console, text: str) -> None:
     console.print(text, markup=False, soft_wrap=True)
 
@@ -57,7 +65,7 @@ def print_fit(console: Console, found: Calibrated, about: Turning, cuts: Sequenc
     table.columns[4].justify = "left"
     for name, (before, value, sigma) in _parameters(found).items():
         table.add_row(name, f"{before:.5g}", f"{value:.5g}", f"{sigma:.2g}", MEANING.get(name, ""))
-    console.print(table)
+    show(console, table)
     if found.calibration.held:
         say(console, "\nNot revealed by this drive, and held:")
         for name, why in found.calibration.held:
@@ -72,7 +80,7 @@ def print_fit(console: Console, found: Calibrated, about: Turning, cuts: Sequenc
             "A LiDAR that sits further ahead than its mount says looks like a centre of rotation that far ahead; only measuring the mount,"
             " or turns with the centre of gravity moved, tell them apart.",
         )
-    console.print(_errors_table(found))
+    show(console, _errors_table(found))
     if found.heldout is None:
         say(console, "Too few groups of maneuvers to hold any out: these errors are of the maneuvers that were fitted. Drive longer.")
     if fit.scale > _MANY_TIMES:
@@ -101,18 +109,20 @@ def errors(found: Calibrated) -> dict[str, dict[str, Interval]]:
     for name, pick, unit in (("position_m", slice(0, 2), 1.0), ("heading_deg", slice(2, 3), 180.0 / math.pi)):
         if name == "position_m" and not found.measures_positions:
             continue
-        squares = [np.sum(r[:, pick] ** 2, axis=1) * unit**2 for r in (found.before, after)]
+        scored = found.position_known if name == "position_m" else np.ones(len(after), dtype=bool)
+        squares = [np.sum(r[scored, pick] ** 2, axis=1) * unit**2 for r in (found.before, after)]
+        group = found.group[scored]
         told[name] = {
-            "before": root_mean(squares[0], found.group, np.random.default_rng(0)),
-            "after": root_mean(squares[1], found.group, np.random.default_rng(0)),
-            "gain": root_mean_gain(squares[0], squares[1], found.group, np.random.default_rng(0)),
+            "before": root_mean(squares[0], group, np.random.default_rng(0)),
+            "after": root_mean(squares[1], group, np.random.default_rng(0)),
+            "gain": root_mean_gain(squares[0], squares[1], group, np.random.default_rng(0)),
         }
     return told
 
 
 def _errors_table(found: Calibrated) -> Table:
     kind = "held out" if found.heldout is not None else "as fitted"
-    table = plain_table("error at a maneuver's end (RMS, 95 %)", "before", f"after, {kind}", "gain", title="")
+    table = plain_table("RMS error [95 %]", "before", f"after, {kind}", "gain", title="")
     for name, values in errors(found).items():
         quantity, unit = name.split("_")
         table.add_row(f"{quantity} [{unit}]", str(values["before"]), str(values["after"]), str(values["gain"]))
@@ -130,7 +140,7 @@ def print_by_source(console: Console, by_source: Sequence[tuple[str, Turning | N
         else:
             value, sigma = about.effective_track_m
             table.add_row(source, f"{value:.3f}", f"{value - 1.96 * sigma:.3f} .. {value + 1.96 * sigma:.3f}")
-    console.print(table)
+    show(console, table)
 
 
 def numbers(found: Calibrated, about: Turning, cuts: Sequence[Cut], by_source: Sequence[tuple[str, Turning | None]]) -> dict[str, Any]:
@@ -176,7 +186,7 @@ def print_rotation_errors(console: Console, found: Calibrated, rotations: Rotati
     table = plain_table(f"RMS over {len(rotations.ratio)} rotations", "ratio", "x_CR [m]", "y_CR [m]", title="")
     for what, params in (("before", found.model.nominal), ("fitted", found.fit.params)):
         table.add_row(what, *(f"{e:.4f}" for e in rotation_errors(found.model, params, rotations, robot)))
-    console.print(table)
+    show(console, table)
 
 
 def _pm(value: Pair, digits: int = 3) -> str:
