@@ -15,7 +15,8 @@ from localization.commands.common import check_new, write_json
 from localization.simulate.effects import EFFECTS, parse_effects
 from localization.simulate.evaluation import Score, mean_by_trajectory, score_runs
 from localization.simulate.experiments import EXPERIMENTS
-from localization.simulate.simulator import START_NS, Simulation, SimulationConfig, simulate, write_simulation
+from localization.simulate.simulator import Simulation, SimulationConfig, simulate, write_simulation
+from localization.simulate.suite import START_NS
 from motion_models.robot import load_robot
 
 _EXPERIMENTS = "; ".join(f"{e.name}: {e.meaning}" for e in EXPERIMENTS.values())

@@ -82,17 +82,17 @@ def _header(stamp: Any, frame: str) -> Any:
     return _T["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
 
 
-def _vector(values: Sequence[float]) -> Any:
+def _vector(values: Sequence[float] | Array) -> Any:
     x, y, z = (float(v) for v in values)
     return _T["geometry_msgs/msg/Vector3"](x=x, y=y, z=z)
 
 
-def _point(values: Sequence[float]) -> Any:
+def _point(values: Sequence[float] | Array) -> Any:
     x, y, z = (float(v) for v in values)
     return _T["geometry_msgs/msg/Point"](x=x, y=y, z=z)
 
 
-def _quaternion(values: Sequence[float]) -> Any:
+def _quaternion(values: Sequence[float] | Array) -> Any:
     x, y, z, w = (float(v) for v in values)
     return _T["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
 

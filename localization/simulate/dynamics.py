@@ -1,9 +1,7 @@
-"""The dynamic friction model with a floor under each wheel, and steps of time that its stiffness does not shorten.
+"""The dynamic friction model with a floor under each wheel and a radius for each side, and with its exact derivatives.
 
-The physics are `motion_models.friction_dynamics` (Ebersole 2016, 3.15-3.26), with what a simulator needs besides: friction that differs
-from wheel to wheel, and a radius for each side. Friction turns over within a thousandth of the wheels' speed, so that explicit steps
-(`FrictionDynamics.longest_step`) must stay below some 20 us. Here a step is implicit: Alexander's SDIRK of second order (SIAM J. Numer.
-Anal. 14, 1977), L-stable and stiffly accurate, solved by Newton's method with exact derivatives, through the shift of load as well.
+The physics are those of `motion_models.friction_dynamics` (Ebersole 2016, 3.15-3.26), and so are the numbers where floor and radii are
+the same everywhere. The derivatives go through the shift of load as well; implicit steps (`stepping`) need them.
 """
 
 from __future__ import annotations
@@ -15,12 +13,7 @@ import numba
 
 from motion_models.friction_kernel import contact, loads, rolling, traction
 
-GAMMA = 1.0 - math.sqrt(0.5)
-"""The method's coefficient: its stages are at GAMMA h and at h."""
 _CLOSURE_STEPS = 12
-_NEWTON_STEPS = 25
-_HALVINGS = 8
-_CLOSE = 1e-9  # m/s; the last step of Newton squares it
 
 
 class Chassis(NamedTuple):
@@ -218,46 +211,3 @@ def _with(
     x: float, y: float, m: float, xi: float, eta: float, by_xi: tuple[float, float, float], by_eta: tuple[float, float, float]
 ) -> tuple[float, float, float]:  # pragma: no cover
     return x + by_xi[0] * xi + by_eta[0] * eta, y + by_xi[1] * xi + by_eta[1] * eta, m + by_xi[2] * xi + by_eta[2] * eta
-
-
-@numba.njit(cache=True, error_model="numpy")
-def implicit_stage(
-    guess: tuple[float, float, float], base: tuple[float, float, float], h: float, now: Now, body: Chassis
-) -> tuple[float, float, float, float, bool]:  # pragma: no cover
-    """The twist V = ``base`` + ``h`` change(V), searched from ``guess``; its tipping margin, and whether it was found."""
-    arm2 = body.half_track * body.half_track
-    vx, vy, wz = guess
-    dx = dy = dw = 0.0
-    fraction, left, margin = 1.0, math.inf, 0.0
-    for _ in range(_NEWTON_STEPS):
-        x, y, w = vx + fraction * dx, vy + fraction * dy, wz + fraction * dw
-        k = change(x, y, w, now, body)
-        rx, ry, rw = base[0] + h * k.x - x, base[1] + h * k.y - y, base[2] + h * k.w - w
-        error = rx * rx + ry * ry + rw * rw * arm2
-        if error < (1.0 - 1e-4 * fraction) * left or error < 1e-26:
-            vx, vy, wz, left, margin = x, y, w, error, k.margin
-            a00, a01, a02 = 1.0 - h * k.x_vx, -h * k.x_vy, -h * k.x_wz
-            a10, a11, a12 = -h * k.y_vx, 1.0 - h * k.y_vy, -h * k.y_wz
-            a20, a21, a22 = -h * k.w_vx, -h * k.w_vy, 1.0 - h * k.w_wz
-            c00, c10, c20 = a11 * a22 - a12 * a21, a12 * a20 - a10 * a22, a10 * a21 - a11 * a20
-            over = 1.0 / (a00 * c00 + a01 * c10 + a02 * c20)
-            dx = over * (c00 * rx + (a02 * a21 - a01 * a22) * ry + (a01 * a12 - a02 * a11) * rw)
-            dy = over * (c10 * rx + (a00 * a22 - a02 * a20) * ry + (a02 * a10 - a00 * a12) * rw)
-            dw = over * (c20 * rx + (a01 * a20 - a00 * a21) * ry + (a00 * a11 - a01 * a10) * rw)
-            if max(abs(dx), abs(dy), abs(dw) * body.half_track) < _CLOSE:
-                return vx + dx, vy + dy, wz + dw, margin, True
-            fraction = 1.0
-        else:
-            fraction *= 0.4
-            if fraction < 1e-4:
-                break
-    return vx, vy, wz, margin, False
-
-
-@numba.njit(cache=True, error_model="numpy")
-def follow(q: float, target: float, slope: float, lag: float, t: float) -> tuple[float, float]:  # pragma: no cover
-    """A wheel's rate after ``t`` seconds, and the angle it turned, where its speed loop follows ``target`` + ``slope`` t with a ``lag``."""
-    behind = q - target + slope * lag
-    left = math.exp(-t / lag)
-    rate = target + slope * t - slope * lag + behind * left
-    return rate, target * t + 0.5 * slope * t * t - slope * lag * t + behind * lag * (1.0 - left)

@@ -115,19 +115,18 @@ _ALL = (
     Effect("lidar_yaw", "rad", "the LiDAR is turned to the left against its transform", math.pi, _lidar("yaw")),
     Effect("lidar_time_offset", "s", "the LiDAR's stamps are late by this", 0.5, _plain("lidar_late_s")),
     Effect("wheel_time_offset", "s", "the joint states' stamps are late by this", 0.5, _plain("wheels_late_s")),
-    Effect("friction_anisotropy", "1", "the floor grips sideways more by this share: mu_y/mu_x - 1", 0.9, _param("mu_ratio", scaled=True)),
+    Effect("friction_anisotropy", "1", "the floor grips more sideways by this share", 0.9, _param("mu_ratio", scaled=True)),
     Effect(
         "friction_change",
         "1",
-        "from the middle of the drive on, sideways grip is more by this share",
+        "sideways grip is more by this share in the second half of the drive",
         0.9,
         _plain("side_friction_later", factor=True),
     ),
     Effect("diagonal_load", "1", "a warped chassis loads front left and rear right by this share of m g / 4", 0.9, _param("warp")),
     Effect("tread_asymmetry", "1", "wheels that slide to the left grip more by this share, to the right less", 0.9, _param("tread")),
-    Effect(
-        "rolling_resistance", "1", "rolling resistance of the wheels over their load is more by this", 0.3, _param("rolling_resistance")
-    ),
+    Effect("rolling_resistance", "1", "rolling resistance over load is more by this", 0.3, _param("rolling_resistance")),
+    Effect("scrub", "m", "the contact patches oppose any turn by this, over mu m g, more", 0.1, _param("scrub")),
     Effect("slope", "rad", "the floor rises towards the world's +x by this angle", 0.4, _slope),
     Effect("encoder_dropout", "1", "share of time in which the front left encoder loses its counts", 0.9, _plain("encoder_lost")),
     Effect("gyro_bias", "rad/s", "the gyro turns about the body's z axis while nothing does", 1.0, _plain("gyro_bias")),
@@ -165,6 +164,7 @@ def changed(reality: Reality, effects: Mapping[str, float]) -> Reality:
         if not least <= size <= effect.largest:
             raise SimulationError(f"effect {name} of {size:g} {effect.unit} is out of reason; it may be {least:g} to {effect.largest:g}.")
         reality = effect.apply(reality, size)
-    if reality.body.param("rolling_resistance") < 0.0:
-        raise SimulationError(f"effect rolling_resistance leaves {reality.body.param('rolling_resistance'):g}; it cannot be negative.")
+    for name in ("rolling_resistance", "scrub"):
+        if reality.body.param(name) < 0.0:
+            raise SimulationError(f"effect {name} leaves {reality.body.param(name):g}; it cannot be negative.")
     return reality

@@ -10,7 +10,6 @@ from localization.errors import SimulationError
 from motion_models.center_of_gravity import CgModel
 from motion_models.cg_files import arms_model, arms_postures
 from motion_models.cg_parts import Payload
-from motion_models.errors import CgError
 from motion_models.postures import Posture, posture_for
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -151,11 +150,3 @@ class Masses:
         edge = np.array([0.5 * self._robot.geometry.wheelbase_m, 0.0])
         planar = (mass * position + load * edge) / (mass + load)
         return np.column_stack([planar, np.zeros(len(planar))])
-
-
-def require_reachable(masses: Masses, targets: FloatArray) -> list[FloatArray]:
-    """`Masses.reach` for all ``targets`` (n, 2). Raises `SimulationError` naming the CG that no posture reaches."""
-    try:
-        return [masses.reach(target) for target in targets]
-    except CgError as error:
-        raise SimulationError(f"this experiment needs a CG that the robot's arms cannot give it: {error}") from error

@@ -38,7 +38,7 @@ def make_grid(walls: FloatArray, cell: float = 0.5) -> Grid:
         return Grid(0.0, 0.0, 1.0, 1, 1, np.zeros(2, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 5)))
     ends = walls[:, :4].reshape(-1, 2)
     low, high = ends.min(axis=0) - 0.5 * cell, ends.max(axis=0) + 0.5 * cell
-    columns, rows = (int(math.ceil(span / cell)) for span in high - low)
+    columns, rows = (math.ceil(span / cell) for span in high - low)
     lists: list[list[int]] = [[] for _ in range(rows * columns)]
     for k, (xa, ya, xb, yb, _) in enumerate(walls):
         i0, i1 = sorted(int((x - low[0]) / cell) for x in (xa, xb))

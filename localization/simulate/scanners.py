@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from localization.logs import forms
 from localization.logs.forms import Message
-from localization.simulate.clock import Ticks
+from localization.simulate.clock import Ticks, seconds
 from localization.simulate.raycast import Grid, cast, cast_at_people, make_grid
 from localization.simulate.track import Track, pose_at
 from localization.simulate.world import World
@@ -99,10 +99,8 @@ class Scanner:
             return []
         c = self._config
         ranges = np.empty((len(starts), c.beams))
-        place = track.rows, track.start_s, track.step_s
-        _sweep(
-            starts * 1e-9, self.beam_s, self._first, self._step, self._mount, *place, self._grid, self._world.people, c.max_range_m, ranges
-        )
+        beams, place = (self.beam_s, self._first, self._step, self._mount), (track.rows, track.start_s, track.step_s)
+        _sweep(seconds(starts), *beams, *place, self._grid, self._world.people, c.max_range_m, ranges)
         ranges += self._rng.normal(0.0, c.noise_m, ranges.shape) if c.noise_m > 0.0 else 0.0
         if c.resolution_m > 0.0:
             ranges = np.round(ranges / c.resolution_m) * c.resolution_m
@@ -185,11 +183,8 @@ class SpinningScanner:
         c = self._config
         level = np.empty((1, c.columns))
         column_s, step = 1.0 / c.rate_hz / c.columns, -2.0 * math.pi / c.columns  # clockwise, as they turn
-        place = track.rows, track.start_s, track.step_s
-        _sweep(
-            *(np.array([start_s]), column_s, math.pi, step, self._mount),
-            *(*place, self._grid, self._world.people, 2.0 * c.max_range_m, level),
-        )
+        beams, place = (column_s, math.pi, step, self._mount), (track.rows, track.start_s, track.step_s)
+        _sweep(np.array([start_s]), *beams, *place, self._grid, self._world.people, 2.0 * c.max_range_m, level)
         # Walls reach from floor to ceiling: each ring meets the wall, or the floor or the ceiling before it.
         up = np.tan(self._elevation)[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):

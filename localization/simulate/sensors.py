@@ -9,7 +9,7 @@ import numpy as np
 
 from localization.logs import forms
 from localization.logs.forms import Message
-from localization.simulate.clock import Ticks
+from localization.simulate.clock import Ticks, seconds
 from localization.simulate.masses import Masses
 from localization.simulate.track import Track
 from localization.simulate.vehicle import ANGLES, POSE, TWIST
@@ -79,8 +79,8 @@ class Encoders:
         ticks = self._ticks.due(track.end_s)
         if not len(ticks):
             return []
-        rows = track.at(ticks * 1e-9)
-        arms, arm_rates = self._masses.joints(ticks * 1e-9) if self._masses.joint_names else (np.zeros((len(ticks), 0)),) * 2
+        rows = track.at(seconds(ticks))
+        arms, arm_rates = self._masses.joints(seconds(ticks)) if self._masses.joint_names else (np.zeros((len(ticks), 0)),) * 2
         angles = rows[:, ANGLES][:, self._sides]
         unit = 2.0 * math.pi / self._config.counts if self._config.counts else 0.0
         counts = np.floor(angles / unit + self._phase) if unit else angles
@@ -135,7 +135,7 @@ class Imu:
         if not len(ticks):
             return []
         n, period = len(ticks), 1.0 / self._config.rate_hz
-        now, before = track.at(ticks * 1e-9), track.at(ticks * 1e-9 - period)
+        now, before = track.at(seconds(ticks)), track.at(seconds(ticks) - period)
         vx, vy, wz = now[:, TWIST].T
         ax, ay, alpha = ((now - before)[:, TWIST] / period).T  # over its own period, as an IMU does
         x, y, theta = self._mount.x, self._mount.y, now[:, 2]
@@ -170,7 +170,7 @@ class Gps:
         c, found = self._config, []
         ticks = self._ticks.due(track.end_s)
         keep = math.exp(-1.0 / (c.rate_hz * c.drift_s))
-        for tick, row in zip(ticks, track.at(ticks * 1e-9), strict=True):
+        for tick, row in zip(ticks, track.at(seconds(ticks)), strict=True):
             self._drift = keep * self._drift + math.sqrt(1.0 - keep * keep) * self._rng.normal(0.0, c.drift_m, 2)
             east, north = row[:2] + self._drift + self._rng.normal(0.0, c.noise_m, 2)
             stamp = self._start_ns + int(tick)
@@ -207,7 +207,7 @@ class Truth:
         ticks = self._ticks.due(track.end_s)
         if not len(ticks):
             return []
-        rows = track.at(ticks * 1e-9)
+        rows = track.at(seconds(ticks))
         half = 0.5 * rows[:, 2]
         heading = np.column_stack([np.sin(half), np.cos(half)])
         found = []
@@ -215,7 +215,7 @@ class Truth:
             stamp = self._start_ns + int(tick)
             found.append(Message(self.form, stamp, stamp, (rows[i, POSE][:2], heading[i], rows[i, TWIST][:2], rows[i, TWIST][2:])))
         if self.cg_form is not None:
-            for tick, cg in zip(ticks, self._masses.nominal_cg(ticks * 1e-9), strict=True):
+            for tick, cg in zip(ticks, self._masses.nominal_cg(seconds(ticks)), strict=True):
                 stamp = self._start_ns + int(tick)
                 found.append(Message(self.cg_form, stamp, stamp, (np.array([cg[0], cg[1], 0.0]),)))
         return found

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from localization.errors import SimulationError
-from localization.logs import forms
 from localization.logs.forms import Message
 from localization.logs.write import write_bag
 from localization.simulate.drives import MoveArms, OpenLoop, Phase, PickUp, Pursuit, Rest, Route, turning
@@ -19,68 +16,30 @@ from localization.simulate.effects import Reality, changed
 from localization.simulate.experiments import Experiment, ExperimentConfig, find_experiment
 from localization.simulate.masses import Masses
 from localization.simulate.raycast import clearance
-from localization.simulate.scanners import Scanner, ScannerConfig, SpinningConfig, SpinningScanner
-from localization.simulate.sensors import EncoderConfig, Encoders, Gps, GpsConfig, Imu, ImuConfig, Truth
+from localization.simulate.runs import RUN_HZ, RunRecord
+from localization.simulate.suite import SensorConfig, make_sensors, nominal_mounts, transforms
 from localization.simulate.track import Track
 from localization.simulate.vehicle import CG, COLUMNS, POSE, Body, VehicleConfig, VehicleState, advance
 from motion_models.cg_parts import require_support
 from motion_models.errors import CgError
 from motion_models.registry import make_model
-from motion_models.robot import Mount, Robot
+from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
-START_NS = 1_000_000_000
-"""Stamp of the simulation's beginning."""
 _CONTROL_S = 0.02
 _LOOK_S = 0.1
 _FLUSH_S = 2.0
 _KEEP_S = 1.0
 _SETTLE_S = 1.0
-_RUN_HZ = 20.0
-_LASER, _CLOUD, _IMU, _GPS = "laser", "velodyne", "imu_link", "gps_link"
-_MOUNTS = {_LASER: Mount(x=0.4, z=0.2), _CLOUD: Mount(x=0.0, z=0.8), _IMU: Mount(z=0.1), _GPS: Mount(z=1.0)}
 
 
 @dataclass(frozen=True)
 class SimulationConfig:
     """Everything that can be set about a simulation."""
 
-    lidar: Literal["2d", "3d", "none"] = "2d"
-    """Planar scanner on /scan, spinning scanner on /points, or none."""
-    center_of_gravity: bool = False
-    """Publish the nominal CG, which arms and robot file tell, on its topic."""
-    truth_hz: float = 25.0
-    """Rate of the truth."""
     experiment: ExperimentConfig = field(default_factory=ExperimentConfig)
     vehicle: VehicleConfig = field(default_factory=VehicleConfig)
-    encoders: EncoderConfig = field(default_factory=EncoderConfig)
-    scanner: ScannerConfig = field(default_factory=ScannerConfig)
-    spinning: SpinningConfig = field(default_factory=SpinningConfig)
-    imu: ImuConfig = field(default_factory=ImuConfig)
-    gps: GpsConfig = field(default_factory=GpsConfig)
-
-
-@dataclass(frozen=True, eq=False)
-class RunRecord:
-    """What truly happened in one named phase, 20 times a second from the body's rest before it to its rest after it."""
-
-    name: str
-    start_s: float
-    """[s] since the simulation's beginning."""
-    poses: FloatArray
-    """(n, 3) of the body in the world."""
-    wheel_angles: FloatArray
-    """(n, 2) left and right, exact [rad]."""
-    cg: FloatArray
-    """(n, 2) true CG [m]."""
-    nominal_cg: FloatArray
-    """(2,) as the robot knew it [m]."""
-    command: OpenLoop | Route
-
-    @property
-    def times_s(self) -> FloatArray:
-        """(n,) since the start of the run."""
-        return np.asarray(np.arange(len(self.poses)) / _RUN_HZ)
+    sensors: SensorConfig = field(default_factory=SensorConfig)
 
 
 class Simulation:
@@ -97,8 +56,7 @@ class Simulation:
         self.world = experiment.make_world()
         self.runs: list[RunRecord] = []
         """Named phases that are over."""
-        self.mounts = {name: robot.mounts.get(name, mount) for name, mount in _MOUNTS.items()}
-        self.lidar_mount = self.mounts[_CLOUD if self.config.lidar == "3d" else _LASER]
+        self.lidar_mount = nominal_mounts(robot)[self.config.sensors.lidar_frame]
         """Where the log says that the LiDAR sits."""
         self.reality = changed(Reality(Body.from_robot(robot), self.lidar_mount), effects)
         self._body = self.reality.body
@@ -110,7 +68,9 @@ class Simulation:
         first[CG] = self._masses.cg(np.zeros(1))[0, :2] + np.array(self._body.cg_offset)
         self._check_support(first[CG])
         self._track = Track(first, self.config.vehicle.step_s)
-        self._sensors = self._make_sensors(np.random.SeedSequence(seed))
+        self._sensors = make_sensors(
+            self.config.sensors, robot, self._masses, self.reality, self.world, np.random.SeedSequence(seed), experiment.with_gps
+        )
         self._controllers = {name: make_model(name, robot) for name in ("diff_drive", "skid_steer")}
         self._half_width = 0.5 * robot.geometry.track_width_m + 0.06
         self._half_length = 0.5 * robot.geometry.wheelbase_m
@@ -122,7 +82,7 @@ class Simulation:
 
     def messages(self) -> Iterator[Message]:
         """All messages, in order of their time of recording. Raises `SimulationError` where the drive cannot go on."""
-        yield self._transforms()
+        yield transforms(self.config.sensors, self.robot)
         phases = list(self._phases()) if self.experiment.name != "soak" else self._phases()
         half = len(phases) // 2 if isinstance(phases, list) else -1
         flushed = 0.0
@@ -149,8 +109,6 @@ class Simulation:
         if self.reality.side_friction_later != 1.0 and self._body is self.reality.body:
             self._body = self._body.with_param("mu_ratio", self._body.param("mu_ratio") * self.reality.side_friction_later)
 
-    # --- driving
-
     def _drive(self, phase: Phase) -> Iterator[None]:
         """Drive one phase, coming back every now and then so that messages can be written."""
         if isinstance(phase, Rest):
@@ -166,7 +124,9 @@ class Simulation:
             self._check_support(self._masses.cg(np.array([self.time_s]))[0, :2] + np.array(self._body.cg_offset))
         elif isinstance(phase, OpenLoop):
             n = self._control_steps(phase.duration_s)
-            commands = np.vstack([phase.profile(_CONTROL_S * np.arange(n)), np.zeros((self._control_steps(_SETTLE_S), 2))])
+            commands = np.vstack(
+                [phase.profile(np.asarray(_CONTROL_S * np.arange(n), dtype=np.float64)), np.zeros((self._control_steps(_SETTLE_S), 2))]
+            )
             yield from self._recorded(phase, self._blind(commands, phase.controller))
         elif isinstance(phase, Route):
             yield from self._recorded(phase, self._seeing(Pursuit(self._state.pose, phase).command, self._route_limit(phase)))
@@ -179,12 +139,12 @@ class Simulation:
         start_s, cg = self.time_s, self._masses.nominal_cg(np.array([self.time_s]))[0]
         kept: list[FloatArray] = []
         taken = 0
-        every = 1.0 / _RUN_HZ
+        every = 1.0 / RUN_HZ
 
         def take() -> None:
             nonlocal taken
             last = int((self.time_s - start_s) / every + 1e-6)
-            kept.append(self._track.at(start_s + every * np.arange(taken, last + 1)))
+            kept.append(self._track.at(np.asarray(start_s + every * np.arange(taken, last + 1), dtype=np.float64)))
             taken = last + 1
 
         for _ in drive:
@@ -224,7 +184,7 @@ class Simulation:
         """Drive on by so many control ``periods`` for each of ``commands`` (n, 2)."""
         config = self.config.vehicle
         steps = self._steps_per_control * periods
-        times = self.time_s + config.step_s * np.arange(len(commands) * steps)
+        times = self.time_s + np.linspace(0.0, config.step_s * (len(commands) * steps - 1), len(commands) * steps)
         model = self._controllers[controller]
         nominal = self._masses.nominal_cg(times[:1])[0]
         wheels = model.wheels(commands, nominal, model.nominal).repeat(steps, axis=0)
@@ -261,56 +221,12 @@ class Simulation:
                     f"{self.experiment.name}. Drive more slowly, or make the effects smaller."
                 )
 
-    # --- sensing
-
-    def _make_sensors(self, seeds: np.random.SeedSequence) -> list[Scanner | SpinningScanner | Encoders | Imu | Gps | Truth]:
-        """Each with a generator of its own: one sensor more leaves the noise of the others as it is."""
-        c, real, robot = self.config, self.reality, self.robot
-        rngs = [np.random.default_rng(seed) for seed in seeds.spawn(4)]
-        topics = robot.topics
-        sensors: list[Scanner | SpinningScanner | Encoders | Imu | Gps | Truth] = [
-            Truth(c.truth_hz, robot, self._masses, c.center_of_gravity, START_NS),
-            Encoders(c.encoders, robot, self._masses, real.wheels_late_s, real.encoder_lost, START_NS, rngs[0]),
-        ]
-        if c.imu.rate_hz > 0.0:
-            mount = self.mounts[_IMU]
-            sensors.append(Imu(c.imu, topics.imu, _IMU, mount, real.gyro_bias, real.body.slope, START_NS, rngs[1]))
-        gps = c.gps
-        if self.experiment.with_gps and gps.rate_hz == 0.0:
-            gps = dataclasses.replace(gps, rate_hz=1.0)
-        if gps.rate_hz > 0.0:
-            sensors.append(Gps(gps, "/fix", _GPS, START_NS, rngs[2]))
-        late = real.lidar_late_s
-        if c.lidar == "2d":
-            sensors.append(Scanner(c.scanner, topics.scan, _LASER, real.lidar, self.world, late, START_NS, rngs[3]))
-        elif c.lidar == "3d":
-            above = real.lidar.z + 0.13
-            sensors.append(SpinningScanner(c.spinning, topics.points, _CLOUD, real.lidar, above, self.world, late, START_NS, rngs[3]))
-        return sensors
-
     def _flush(self) -> list[Message]:
         """The messages that are ready, in order."""
         ready = [message for sensor in self._sensors for message in sensor.messages(self._track)]
         ready.sort(key=lambda message: message.log_ns)
         self._track.forget(self._track.end_s - _KEEP_S)
         return ready
-
-    def _transforms(self) -> Message:
-        """The nominal mounts, whatever effects have done to the real ones."""
-        used = {_LASER: self.config.lidar == "2d", _CLOUD: self.config.lidar == "3d", _GPS: True, _IMU: True}
-        edges = [("base_link", name, (m.x, m.y, m.z), quaternion(m)) for name, m in self.mounts.items() if used[name]]
-        return Message(forms.transforms("/tf_static", edges), START_NS, START_NS, ())
-
-
-def quaternion(mount: Mount) -> tuple[float, float, float, float]:
-    """x, y, z, w of a mount's rotation (fixed axes)."""
-    (cr, sr), (cp, sp), (cy, sy) = ((np.cos(0.5 * a), np.sin(0.5 * a)) for a in (mount.roll, mount.pitch, mount.yaw))
-    return (
-        float(sr * cp * cy - cr * sp * sy),
-        float(cr * sp * cy + sr * cp * sy),
-        float(cr * cp * sy - sr * sp * cy),
-        float(cr * cp * cy + sr * sp * sy),
-    )
 
 
 def simulate(

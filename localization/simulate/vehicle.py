@@ -6,11 +6,11 @@ import dataclasses
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from localization.errors import SimulationError
-from localization.simulate.dynamics import GAMMA, Chassis, Now, change, follow, implicit_stage
+from localization.simulate.dynamics import Chassis, Now, change
+from localization.simulate.stepping import drive
 from motion_models.friction import FrictionModel, check_parameters
 from motion_models.friction_dynamics import FrictionDynamics
 from motion_models.robot import Robot
@@ -18,7 +18,7 @@ from motion_models.se2 import FloatArray
 
 POSE, TWIST, RATES, ANGLES, CG, MARGIN, COLUMNS = slice(0, 3), slice(3, 6), slice(6, 8), slice(8, 10), slice(10, 12), 12, 13
 """Columns of a record: pose in the world (heading not wrapped), body twist, rates and angles of left and right, CG, tipping margin."""
-_HALVINGS = 10
+_FALLS_S = 0.1  # a robot that its own jerk lifts for less than about sqrt(z_G / g) / 2 falls back onto its wheels
 
 
 @dataclass(frozen=True)
@@ -106,6 +106,8 @@ class VehicleState:
     """Steps since the start of the simulation."""
     numbers: FloatArray
     """(12,) pose, twist of the contacts, wheel rates, wheel angles, the speed controller's set points of left and right."""
+    on_two_wheels: int = 0
+    """For how many steps now the tipping margin has been negative."""
 
     @classmethod
     def at(cls, pose: FloatArray) -> VehicleState:
@@ -144,167 +146,39 @@ def advance(
     chassis = body.chassis(config)
     start = state.steps * config.step_s
     along = config.gravity * math.sin(body.slope)
-    failed = _advance(
-        *(state.numbers, np.ascontiguousarray(wheels), np.ascontiguousarray(cg), out, config.step_s),
-        *(mass, inertia, along, np.array(body.yields), patches, chassis, config.motor_lag_s, ramp),
+    failed = drive(
+        state.numbers,
+        np.ascontiguousarray(wheels),
+        np.ascontiguousarray(cg),
+        out,
+        config.step_s,
+        mass,
+        inertia,
+        along,
+        np.array(body.yields),
+        patches,
+        chassis,
+        config.motor_lag_s,
+        ramp,
     )
     if failed >= 0:
         raise SimulationError(
             f"the forces on the robot could not be balanced {start + failed * config.step_s:.2f} s into the drive (CG at x = "
             f"{cg[failed, 0]:.3f}, y = {cg[failed, 1]:.3f} m). Take a smaller vehicle.step_s, or a larger vehicle.creep."
         )
-    tipped = np.flatnonzero(out[:, MARGIN] < 0.0)
-    if tipped.size:
-        i = int(tipped[0])
+    lifted = out[:, MARGIN] < 0.0
+    for i in range(len(out)) if lifted.any() else ():
+        state.on_two_wheels = state.on_two_wheels + 1 if lifted[i] else 0
+        if state.on_two_wheels * config.step_s <= _FALLS_S:
+            continue
         raise SimulationError(
             f"the robot tips over {start + i * config.step_s:.2f} s into the drive: its CG, at x = {cg[i, 0]:.3f}, y = {cg[i, 1]:.3f}, "
             f"z = {body.cg_height:.2f} m, takes the load off both wheels of a side or an axle at a wheel speed of "
             f"{out[i, 6] * body.radius_left:.2f} and {out[i, 7] * body.radius_right:.2f} m/s. Drive more gently or lower the CG."
         )
+    state.on_two_wheels = state.on_two_wheels if lifted[-1] else 0
     state.steps += len(wheels)
     return out
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _grip(x: float, y: float, patches: FloatArray) -> float:  # pragma: no cover
-    for i in range(patches.shape[0] - 1, -1, -1):
-        if patches[i, 0] <= x <= patches[i, 2] and patches[i, 1] <= y <= patches[i, 3]:
-            return float(patches[i, 4])
-    return 1.0
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _advance(
-    state: FloatArray,
-    wheels: FloatArray,
-    cg: FloatArray,
-    out: FloatArray,
-    h: float,
-    mass: float,
-    inertia: float,
-    along: float,
-    yields: FloatArray,
-    patches: FloatArray,
-    body: Chassis,
-    lag: float,
-    ramp: float,
-) -> int:  # pragma: no cover
-    """Change ``state`` (12,), fill ``out`` (n, 13); the index of the step that failed, or -1."""
-    targets, slopes = np.empty(2), np.empty(2)
-    for k in range(wheels.shape[0]):
-        for j in range(2):
-            targets[j] = state[10 + j]
-            slopes[j] = min(ramp, max(-ramp, (wheels[k, j] - targets[j]) / h))
-        c, s = math.cos(state[2]), math.sin(state[2])
-        grips = 1.0, 1.0, 1.0, 1.0
-        if patches.shape[0] > 0:
-            fx, fy, lx, ly = c * body.half_wheelbase, s * body.half_wheelbase, -s * body.half_track, c * body.half_track
-            grips = (
-                _grip(state[0] + fx + lx, state[1] + fy + ly, patches),
-                _grip(state[0] + fx - lx, state[1] + fy - ly, patches),
-                _grip(state[0] - fx + lx, state[1] - fy + ly, patches),
-                _grip(state[0] - fx - lx, state[1] - fy - ly, patches),
-            )
-        # Where Newton's method does not settle, the step is cut in pieces.
-        pieces, margin = 1, -2.0
-        for _ in range(_HALVINGS):
-            margin = _step(state, targets, slopes, cg[k], h, pieces, mass, inertia, along, yields, grips, body, lag)
-            if margin > -2.0:
-                break
-            pieces *= 2
-        if not margin > -2.0:
-            return k
-        for j in range(2):
-            state[10 + j] = targets[j] + slopes[j] * h
-        out[k, :10] = state[:10]
-        vx, vy, wz = state[3], state[4], state[5]
-        out[k, 3], out[k, 4], out[k, 5] = _sheared(vx, vy, wz, yields)
-        out[k, 10] = cg[k, 0] + h * (cg[k, 2] + 0.5 * h * cg[k, 4])
-        out[k, 11] = cg[k, 1] + h * (cg[k, 3] + 0.5 * h * cg[k, 5])
-        out[k, 12] = margin
-    return -1
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _sheared(vx: float, vy: float, wz: float, yields: FloatArray) -> tuple[float, float, float]:  # pragma: no cover
-    return vx - yields[2] * vx * abs(wz), vy + yields[0] * vx * wz, wz * (1.0 - yields[1] * abs(vx))
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _step(
-    state: FloatArray,
-    targets: FloatArray,
-    slopes: FloatArray,
-    cg: FloatArray,
-    whole: float,
-    pieces: int,
-    mass: float,
-    inertia: float,
-    along: float,
-    yields: FloatArray,
-    grips: tuple[float, float, float, float],
-    body: Chassis,
-    lag: float,
-) -> float:  # pragma: no cover
-    """One step in ``pieces``: changes the first ten of ``state`` and returns the least tipping margin; -3 and no change on failure."""
-    h, least = whole / pieces, 1.0
-    x, y, theta, vx, vy, wz = state[0], state[1], state[2], state[3], state[4], state[5]
-    q_l, q_r, a_l, a_r = state[6], state[7], state[8], state[9]
-    for i in range(pieces):
-        v_0 = (vx, vy, wz)
-        base, guess = v_0, v_0
-        rate_x = rate_y = rate_w = 0.0
-        from_x, from_y, from_theta = x, y, theta
-        by_x = by_y = by_theta = 0.0
-        for stage in range(2):
-            share = GAMMA if stage == 0 else 1.0
-            t = i * h + share * h
-            roll_l = follow(state[6], targets[0], slopes[0], lag, t)[0]
-            roll_r = follow(state[7], targets[1], slopes[1], lag, t)[0]
-            ahead = theta + share * h * guess[2]
-            push_x, push_y = -along * mass * math.cos(ahead), along * mass * math.sin(ahead)
-            now = Now(
-                body.radius_left * roll_l,
-                body.radius_right * roll_r,
-                grips[0],
-                grips[1],
-                grips[2],
-                grips[3],
-                mass,
-                inertia,
-                cg[0] + t * (cg[2] + 0.5 * t * cg[4]),
-                cg[1] + t * (cg[3] + 0.5 * t * cg[5]),
-                cg[2] + t * cg[4],
-                cg[3] + t * cg[5],
-                cg[4],
-                cg[5],
-                cg[6],
-                push_x,
-                push_y,
-            )
-            if stage == 1:
-                more = (1.0 - GAMMA) * h
-                base = v_0[0] + more * rate_x, v_0[1] + more * rate_y, v_0[2] + more * rate_w
-            u, v, w, margin, found = implicit_stage(guess, base, GAMMA * h, now, body)
-            if not found or not margin > -2.0:
-                return -3.0
-            least = min(least, margin)
-            rate_x, rate_y, rate_w = (u - base[0]) / (GAMMA * h), (v - base[1]) / (GAMMA * h), (w - base[2]) / (GAMMA * h)
-            if stage == 1:
-                more = (1.0 - GAMMA) * h
-                from_x, from_y, from_theta = x + more * by_x, y + more * by_y, theta + more * by_theta
-            su, sv, by_theta = _sheared(u, v, w, yields)
-            heading = from_theta + GAMMA * h * by_theta
-            c, s = math.cos(heading), math.sin(heading)
-            by_x, by_y = c * su - s * sv, s * su + c * sv
-            guess = (u, v, w)
-        vx, vy, wz = guess
-        x, y, theta = from_x + GAMMA * h * by_x, from_y + GAMMA * h * by_y, from_theta + GAMMA * h * by_theta
-    state[0], state[1], state[2], state[3], state[4], state[5] = x, y, theta, vx, vy, wz
-    q_l, turned_l = follow(state[6], targets[0], slopes[0], lag, whole)
-    q_r, turned_r = follow(state[7], targets[1], slopes[1], lag, whole)
-    state[6], state[7], state[8], state[9] = q_l, q_r, a_l + turned_l, a_r + turned_r
-    return least
 
 
 def accelerations(body: Body, config: VehicleConfig, wheels: FloatArray, twist: FloatArray, cg: FloatArray) -> tuple[FloatArray, float]:
