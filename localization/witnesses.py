@@ -179,9 +179,7 @@ class LidarWitness:
     def notes(self) -> list[str]:
         said = []
         if self._slippery:
-            said.append(
-                f"{self._slippery} windows count by their heading alone: along corridors and walls, scans do not hold the position."
-            )
+            said.append(f"{self._slippery} windows count by their heading alone: along walls and corridors scans do not hold the place.")
         if not self._mistrusted:
             return said
         lost = f"{self._mistrusted} of {self._scans} scans could not be matched with the first of their window"

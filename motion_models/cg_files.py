@@ -16,16 +16,17 @@ from motion_models.urdf import Urdf, load_urdf, parse_urdf
 from motion_models.weighing import Scales, WeighedCg, cg_from_scales, read_weighings, wheel_contacts
 
 
-def arms_model(arms: Arms, folder: Path | None = None, payload: Payload | None = None) -> CgModel:
+def arms_model(arms: Arms, folder: Path | None = None, payload: Payload | None = None, static: StaticPart | None = None) -> CgModel:
     """The model that a robot file's ``arms`` describe. ``folder`` is where that file is; None for a robot that is shipped.
+
+    ``static`` goes before what ``arms`` say of everything else.
 
     A name that is not in the folder may be that of a file that is shipped: robots derived from one can be kept anywhere.
 
     Raises `RobotError` for files that are missing or malformed, `CgError` for masses that cannot be.
     """
     urdf = _urdf(arms, folder)
-    static = None
-    if arms.static_mass_kg > 0.0:
+    if static is None and arms.static_mass_kg > 0.0:
         sigmas = np.array([arms.static_mass_sigma_kg, arms.static_sigma_m, arms.static_sigma_m])
         weighed_at = _named(arms_postures(arms, folder), arms.weighed_posture) if arms.weighed_posture else None
         static = StaticPart(arms.static_mass_kg, np.array([arms.static_x_m, arms.static_y_m]), np.diag(sigmas**2), weighed_at)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from localization.calibration import Calibrated, Cut, Turning
@@ -25,10 +26,17 @@ _MANY_TIMES = 1.5  # a noise model that is wrong by less is right
 
 
 def plain_table(*columns: str, title: str | None = None) -> Table:
-    table = Table(*columns, box=None, header_style="bold", pad_edge=False, title=title, title_justify="left", title_style="")
+    """With its first column to the left and all others to the right; texts are no markup."""
+    names = [escape(name) for name in columns]
+    heading = None if title is None else escape(title)
+    table = Table(*names, box=None, header_style="bold", pad_edge=False, title=heading, title_justify="left", title_style="")
     for column in table.columns[1:]:
         column.justify = "right"
     return table
+
+
+def row(table: Table, *cells: str) -> None:
+    table.add_row(*map(escape, cells))
 
 
 def show(console: Console, table: Table) -> None:
@@ -36,7 +44,7 @@ def show(console: Console, table: Table) -> None:
     if console.is_terminal:
         console.print(table)
     else:
-        console.print(table, width=200, crop=False)
+        Console(file=console.file, width=200, highlight=False).print(table)
 
 
 def say(console: Console, text: str) -> None:
@@ -64,7 +72,7 @@ def print_fit(console: Console, found: Calibrated, about: Turning, cuts: Sequenc
     )
     table.columns[4].justify = "left"
     for name, (before, value, sigma) in _parameters(found).items():
-        table.add_row(name, f"{before:.5g}", f"{value:.5g}", f"{sigma:.2g}", MEANING.get(name, ""))
+        row(table, name, f"{before:.5g}", f"{value:.5g}", f"{sigma:.2g}", MEANING.get(name, ""))
     show(console, table)
     if found.calibration.held:
         say(console, "\nNot revealed by this drive, and held:")
@@ -125,7 +133,7 @@ def _errors_table(found: Calibrated) -> Table:
     table = plain_table("RMS error [95 %]", "before", f"after, {kind}", "gain", title="")
     for name, values in errors(found).items():
         quantity, unit = name.split("_")
-        table.add_row(f"{quantity} [{unit}]", str(values["before"]), str(values["after"]), str(values["gain"]))
+        row(table, f"{quantity} [{unit}]", str(values["before"]), str(values["after"]), str(values["gain"]))
     return table
 
 
@@ -136,10 +144,10 @@ def print_by_source(console: Console, by_source: Sequence[tuple[str, Turning | N
     table = plain_table("by each alone", "effective track [m]", "95 %", title="")
     for source, about in by_source:
         if about is None:
-            table.add_row(source, "-", "not revealed")
+            row(table, source, "-", "not revealed")
         else:
             value, sigma = about.effective_track_m
-            table.add_row(source, f"{value:.3f}", f"{value - 1.96 * sigma:.3f} .. {value + 1.96 * sigma:.3f}")
+            row(table, source, f"{value:.3f}", f"{value - 1.96 * sigma:.3f} .. {value + 1.96 * sigma:.3f}")
     show(console, table)
 
 
@@ -185,7 +193,7 @@ def print_rotation_errors(console: Console, found: Calibrated, rotations: Rotati
     """Errors over the table, before and after."""
     table = plain_table(f"RMS over {len(rotations.ratio)} rotations", "ratio", "x_CR [m]", "y_CR [m]", title="")
     for what, params in (("before", found.model.nominal), ("fitted", found.fit.params)):
-        table.add_row(what, *(f"{e:.4f}" for e in rotation_errors(found.model, params, rotations, robot)))
+        row(table, what, *(f"{e:.4f}" for e in rotation_errors(found.model, params, rotations, robot)))
     show(console, table)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from localization.commands.calibration_tables import plain_table, say, show
+from localization.commands.calibration_tables import plain_table, row, say, show
 from motion_models.calibration_plan import MEANING
 from motion_models.regressions import (
     Regression,
@@ -42,16 +42,16 @@ def print_regressions(console: Console, table: RotationTable, found: SkidSteerFi
     _print_plane(console, plane)
     lines = plain_table("Table 4-7  x_G [m]", "slope", "intercept [m]")
     for at, by, constant in zip(*cor_y_lines(table), strict=True):
-        lines.add_row(f"{at:.2f}", f"{by:.4f}", f"{constant:.4f}")
+        row(lines, f"{at:.2f}", f"{by:.4f}", f"{constant:.4f}")
     show(console, lines)
     rms = plain_table("RMS error", "ratio", "x_CR [m]", "y_CR [m]", title="")
     for what, values in variant_errors(table, found, multiplier).items():
-        rms.add_row(what, *(f"{value:.4f}" for value in values))
+        row(rms, what, *(f"{value:.4f}" for value in values))
     show(console, rms)
     free = plain_table("skid_steer, all rows at once", "value", "sigma", "meaning", title="")
     free.columns[3].justify = "left"
     for name, value, sigma in zip(SkidSteer.param_names, found.coefficients, np.sqrt(np.diagonal(found.cov)), strict=True):
-        free.add_row(name, f"{value:.5g}", f"{sigma:.2g}", MEANING.get(name, ""))
+        row(free, name, f"{value:.5g}", f"{sigma:.2g}", MEANING.get(name, ""))
     show(console, free)
 
 
@@ -68,11 +68,17 @@ def _print_plane(console: Console, plane: Regression) -> None:
     variance = plain_table("Table 4-5", "df", "SS", "MS", "F", "significance")
     explained = plane.total_ss - plane.residual_ss
     mean = explained / plane.regression_df
-    variance.add_row(
-        "regression", str(plane.regression_df), f"{explained:.9f}", f"{mean:.5f}", f"{plane.f_statistic:.6f}", f"{plane.significance:.5E}"
+    row(
+        variance,
+        "regression",
+        str(plane.regression_df),
+        f"{explained:.9f}",
+        f"{mean:.5f}",
+        f"{plane.f_statistic:.6f}",
+        f"{plane.significance:.5E}",
     )
-    variance.add_row("residual", str(plane.residual_df), f"{plane.residual_ss:.9f}", f"{plane.residual_ss / plane.residual_df:.6f}", "", "")
-    variance.add_row("total", str(plane.observations - 1), f"{plane.total_ss:.9f}", "", "", "")
+    row(variance, "residual", str(plane.residual_df), f"{plane.residual_ss:.9f}", f"{plane.residual_ss / plane.residual_df:.6f}", "", "")
+    row(variance, "total", str(plane.observations - 1), f"{plane.total_ss:.9f}", "", "", "")
     show(console, variance)
     console.print()
     coefficients = plain_table("Table 4-6", "coefficient", "standard error", "t", "p", "lower 95 %", "upper 95 %")
@@ -80,7 +86,7 @@ def _print_plane(console: Console, plane: Regression) -> None:
         plane.names, plane.coefficients, plane.sigma, plane.t_statistics, plane.p_values, plane.interval(), strict=True
     ):
         what = "intercept" if name == "1" else name
-        coefficients.add_row(what, f"{value:.9f}", f"{sigma:.9f}", f"{t:.5f}", f"{p:.5G}", f"{low:.9f}", f"{high:.9f}")
+        row(coefficients, what, f"{value:.9f}", f"{sigma:.9f}", f"{t:.5f}", f"{p:.5G}", f"{low:.9f}", f"{high:.9f}")
     show(console, coefficients)
     console.print()
 

@@ -1,0 +1,229 @@
+"""`skidloc cg`: the centre of gravity from scales, arms and payload, how sure it is, and what it does to the robot."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from localization.commands.calibration_tables import plain_table, row, say, show
+from localization.commands.common import check_new, write_json
+from motion_models.center_of_gravity import static_part_from_weighing
+from motion_models.cg_files import arms_model, arms_postures, weighed_cg
+from motion_models.cg_parts import Arms, CgEstimate, Payload, StaticPart, require_support
+from motion_models.errors import CgError
+from motion_models.friction import FrictionModel
+from motion_models.friction_kernel import loads
+from motion_models.postures import Posture, parse_postures
+from motion_models.robot import Robot, load_robot
+from motion_models.se2 import FloatArray
+from motion_models.skid_steer import SkidSteer
+from motion_models.weighing import WHEELS, WeighedCg, read_weighings
+
+
+@dataclass(frozen=True)
+class Cg:
+    """Where the centre of gravity is: by four scales, by the arms' posture, with a payload."""
+
+    weighings: tyro.conf.Positional[Path | None] = None
+    """CSV of weighings, one a line: front_left_kg, front_right_kg, rear_left_kg, rear_right_kg."""
+    robot: str = "vaultbot"
+    """Name of a shipped robot, or path of a robot TOML file: wheelbase, track, arms and models."""
+    urdf: Path | None = None
+    """URDF with the masses, instead of the one that the robot file names."""
+    base_link: str = "base_link"
+    """Link of --urdf whose frame is the body frame."""
+    srdf: Path | None = None
+    """SRDF with named postures, instead of the one that the robot file names."""
+    posture: str = ""
+    """Named posture of the arms."""
+    joint: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME=VALUE [rad or m], again for each joint; goes before --posture. All joints that move mass must be named by one of both."""
+    weighed_posture: str = ""
+    """Named posture of the arms on the scales. Then the arms are taken off the weighing, and put back as they stand now."""
+    payload: float = 0.0
+    """Mass held at --at [kg]."""
+    payload_sigma: float = 0.0
+    """Its standard deviation [kg]."""
+    at: str = ""
+    """Link that holds the payload, such as a gripper."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Centre of mass of the payload in that link's frame [m]."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write what is printed to this file as well."""
+
+    def run(self, console: Console) -> None:
+        robot = load_robot(self.robot)
+        if self.json is not None:
+            check_new(self.json)
+        g = robot.geometry
+        weighed = None if self.weighings is None else weighed_cg(self.weighings, g.wheelbase_m, g.track_width_m)
+        wants_arms = bool(self.posture or self.joint or self.payload or self.urdf or self.weighed_posture)
+        if weighed is None and not wants_arms:
+            raise CgError("nothing to find a centre of gravity by: name a CSV of weighings, a --posture, or joints by --joint NAME=VALUE.")
+        source, static = [], None
+        if weighed is not None:
+            source.append(f"{weighed.weighings} weighing{'s' if weighed.weighings > 1 else ''}")
+        if weighed is not None and not wants_arms:
+            estimate = CgEstimate(weighed.position, weighed.covariance[1:, 1:], weighed.mass)
+        else:
+            estimate, static, said = self._with_arms(robot, weighed)
+            source += said
+        require_support(estimate.position, g.wheelbase_m, g.track_width_m)
+        told = self._told(robot, estimate, weighed, static, source)
+        _print(console, robot, estimate, weighed, static, told)
+        if self.json is not None:
+            write_json(self.json, told)
+
+    def _with_arms(self, robot: Robot, weighed: WeighedCg | None) -> tuple[CgEstimate, StaticPart | None, list[str]]:
+        arms, folder = robot.arms, robot.folder
+        if self.urdf is not None:
+            arms, folder = Arms(urdf=str(self.urdf), base_link=self.base_link), Path()
+        if arms is None:
+            raise CgError(f"robot '{robot.name}' has no arms; name a URDF with --urdf, or give its file a section [arms].")
+        postures = self._postures(arms, folder)
+        payload, said = self._payload(), []
+        model = arms_model(arms, folder, payload)
+        static = None
+        if weighed is not None:
+            if not self.weighed_posture:
+                raise CgError("to move the arms after a weighing, say how they stood on the scales: --weighed-posture NAME.")
+            chain = arms_model(arms, folder).chain
+            static = static_part_from_weighing(weighed, chain, _named(postures, self.weighed_posture))
+            model = arms_model(arms, folder, payload, static)
+            said.append(f"the arms of {Path(chain.source).name} off at '{self.weighed_posture}'")
+        at: dict[str, float] = dict(_named(postures, self.posture)) if self.posture else {}
+        at |= self._joints(model.chain.joint_names)
+        estimate = model.estimate(model.chain.posture({name: q for name, q in at.items() if name in model.chain.joint_names}))
+        if self.posture or self.joint:
+            said.append("arms at " + " with ".join([*([f"'{self.posture}'"] if self.posture else []), *self.joint]))
+        if payload is not None:
+            said.append(f"{payload.mass:g} kg at {payload.link}")
+        return estimate, static, said or [f"the masses of {Path(model.chain.source).name}"]
+
+    def _postures(self, arms: Arms, folder: Path | None) -> dict[str, Posture]:
+        if self.srdf is not None:
+            try:
+                return dict(parse_postures(self.srdf.read_text(encoding="utf-8"), str(self.srdf)))
+            except (OSError, UnicodeDecodeError) as error:
+                raise CgError(f"SRDF '{self.srdf}' cannot be read: {error}.") from error
+        return dict(arms_postures(arms, folder))
+
+    def _joints(self, known: tuple[str, ...]) -> dict[str, float]:
+        found = {}
+        for text in self.joint:
+            name, _, value = text.partition("=")
+            try:
+                found[name.strip()] = float(value)
+            except ValueError:
+                found[name.strip()] = math.nan
+            if not math.isfinite(found[name.strip()]):
+                raise CgError(f"--joint {text}: must be NAME=VALUE with a number [rad or m].")
+        unknown = sorted(set(found) - set(known))
+        if unknown:
+            raise CgError(f"no joint {', '.join(unknown)} that moves mass; such joints are {', '.join(known) or 'none'}.")
+        return found
+
+    def _payload(self) -> Payload | None:
+        if not self.payload and not self.at:
+            return None
+        if not self.at:
+            raise CgError(f"--payload {self.payload:g} hangs in the air: name the link that holds it with --at.")
+        return Payload(self.at, self.payload, self.offset, self.payload_sigma)
+
+    def _told(
+        self, robot: Robot, estimate: CgEstimate, weighed: WeighedCg | None, static: StaticPart | None, source: list[str]
+    ) -> dict[str, Any]:
+        g, cg = robot.geometry, estimate.position
+        sigma = np.sqrt(np.diagonal(estimate.covariance))
+        told: dict[str, Any] = {
+            "robot": robot.name,
+            "source": source,
+            "mass_kg": estimate.mass,
+            "cg_m": cg.tolist(),
+            "sigma_m": sigma.tolist(),
+            "covariance_m2": estimate.covariance.tolist(),
+            "margin_m": estimate.margin(g.wheelbase_m, g.track_width_m),
+            "tipping_slope_deg": math.degrees(math.atan2(estimate.margin(g.wheelbase_m, g.track_width_m), g.cg_height_m)),
+            "wheel_loads_kg": wheel_loads(robot, estimate),
+            "skid_steer": effect(robot, estimate),
+        }
+        if weighed is not None and self.weighings is not None:
+            readings = read_weighings(self.weighings).mean(axis=0)
+            told["weighed_loads_kg"] = dict(zip(WHEELS, readings.tolist(), strict=True))
+            told["warp"] = float(readings @ [1.0, -1.0, -1.0, 1.0] / readings.sum())
+        if static is not None:
+            told["static_part"] = {"mass_kg": static.mass, "position_m": static.position.tolist(), "covariance": static.covariance.tolist()}
+        return told
+
+
+def wheel_loads(robot: Robot, estimate: CgEstimate) -> dict[str, float]:
+    """What each wheel carries [kg] on equally stiff wheels, with the chassis' warp by the robot's friction model."""
+    g = robot.geometry
+    warp = float(FrictionModel.from_robot(robot).nominal[FrictionModel.param_names.index("warp")])
+    x, y = estimate.position / np.array([g.wheelbase_m / 2.0, g.track_width_m / 2.0])
+    return dict(zip(WHEELS, (estimate.mass * share for share in loads(float(x), float(y), warp)[:4]), strict=True))
+
+
+def effect(robot: Robot, estimate: CgEstimate) -> dict[str, dict[str, float]]:
+    """k and centre of rotation by the robot's skid_steer model (Ebersole 2016, 4.21-4.25): at the nominal CG, here, and the sigma that the
+    CG's covariance alone gives them."""
+    model = SkidSteer.from_robot(robot)
+    here = np.array(model.rotation(estimate.position, model.nominal))
+    nominal = np.array(model.rotation(robot.center_of_gravity, model.nominal))
+    J = _by_cg(model, estimate.position)
+    sigma = np.sqrt(np.diagonal(J @ estimate.covariance @ J.T))
+    names = ("k", "x_cr_m", "y_cr_m")
+    return {n: {"nominal": float(a), "here": float(b), "sigma": float(s)} for n, a, b, s in zip(names, nominal, here, sigma, strict=True)}
+
+
+def _by_cg(model: SkidSteer, cg: FloatArray) -> FloatArray:
+    """(3, 2) derivative of k, x_CR and y_CR by the CG."""
+    _, k_1, k_2, _, x_cr_1, _, c_1, c_2, s_0, s_1, s_2 = model.nominal
+    x, y = cg
+    return np.array([[k_1 + 2 * k_2 * x, 0.0], [x_cr_1, 0.0], [c_1 + 2 * c_2 * x + (s_1 + 2 * s_2 * x) * y, s_0 + (s_1 + s_2 * x) * x]])
+
+
+def _named(postures: dict[str, Posture], name: str) -> Posture:
+    if name not in postures:
+        raise CgError(f"no posture '{name}'; postures are {', '.join(postures) or 'none'}.")
+    return postures[name]
+
+
+def _print(
+    console: Console, robot: Robot, estimate: CgEstimate, weighed: WeighedCg | None, static: StaticPart | None, told: dict[str, Any]
+) -> None:
+    (x, y), (sx, sy) = estimate.position, told["sigma_m"]
+    say(console, f"{robot.name}, by {', '.join(told['source'])}: {estimate.mass:.2f} kg")
+    say(console, f"centre of gravity: x {x:+.4f} +- {sx:.4f} m, y {y:+.4f} +- {sy:.4f} m")
+    margin = told["margin_m"]
+    across = sx if robot.geometry.wheelbase_m / 2.0 - abs(x) == margin else sy
+    say(console, f"tipping margin: {margin:.3f} m ({margin / max(across, 1e-9):.0f} sigma), a slope of {told['tipping_slope_deg']:.0f} deg")
+    if weighed is not None and weighed.scatter > 1.5:
+        say(
+            console, f"The weighings differ {weighed.scatter:.1f} times more than scales of 0.1 kg should: lift the robot off between them."
+        )
+    if static is not None:
+        mass, (at_x, at_y), s = static.mass, static.position, np.sqrt(np.diagonal(static.covariance))
+        say(console, "static part, for [arms] of the robot file:")
+        say(console, f"  static_mass_kg = {mass:.3f}  # +- {s[0]:.2g}")
+        say(console, f"  static_x_m = {at_x:.5f}  # +- {s[1]:.2g}")
+        say(console, f"  static_y_m = {at_y:.5f}  # +- {s[2]:.2g}")
+    table = plain_table("load [kg]", *(wheel.replace("_", " ") for wheel in WHEELS), title="")
+    row(table, "equally stiff wheels", *(f"{load:.2f}" for load in told["wheel_loads_kg"].values()))
+    if "weighed_loads_kg" in told:
+        row(table, "on the scales", *(f"{load:.2f}" for load in told["weighed_loads_kg"].values()))
+    show(console, table)
+    if "warp" in told:
+        say(console, f"A twisted chassis puts {told['warp']:+.3f} of m g / 4 on the front left and rear right wheels (friction's warp).")
+    own = "skid_steer" in robot.models or robot.name == "vaultbot"
+    title = "\nskid_steer (4.21-4.25)" + ("" if own else ", with VaultBot's coefficients: the robot file has none")
+    what = plain_table("", f"nominal ({robot.geometry.cg_x_m:g}, {robot.geometry.cg_y_m:g}) m", "here", "sigma by the CG", title=title)
+    for name, value in told["skid_steer"].items():
+        row(what, name.replace("_m", " [m]"), f"{value['nominal']:+.4f}", f"{value['here']:+.4f}", f"{value['sigma']:.4f}")
+    show(console, what)
