@@ -144,7 +144,7 @@ def _map_figure(lines: Sequence[Line], view: MapView) -> str:
     if len(view.points):
         more.append('<li><span class="dots"></span>LiDAR map</li>')
     pictures = [plots.map_svg(lines, view, size) for size in (plots.WIDE, plots.NARROW)]
-    return _legend(lines, boxes=True, more="".join(more)) + _figure(pictures, "Trajectories seen from above", " ".join(sayings))
+    return _figure(_legend(lines, boxes=True, more="".join(more)), pictures, "Trajectories seen from above", " ".join(sayings))
 
 
 def _error_figure(lines: Sequence[Line], reference: ReferenceTrack | Relations | None) -> str:
@@ -159,7 +159,7 @@ def _error_figure(lines: Sequence[Line], reference: ReferenceTrack | Relations |
             f"Relations in each point, from left: {numbers}."
         )
         pictures = [plots.spans_svg(scored, binned, size) for size in (plots.WIDE, plots.NARROW)]
-        return _legend(scored) + _figure(pictures, "Errors of the relations by the time that they span", caption)
+        return _figure(_legend(scored), pictures, "Errors of the relations by the time that they span", caption)
     known = [(line, found) for line in lines if (found := timeline(line)) is not None]
     if not known:
         return ""
@@ -169,7 +169,7 @@ def _error_figure(lines: Sequence[Line], reference: ReferenceTrack | Relations |
         "Each run is laid onto the reference as a whole, so errors at one time depend on those at others: large at both ends and small "
         "between is a path that bends."
     )
-    return _legend(shown) + _figure(pictures, "Errors over time", caption)
+    return _figure(_legend(shown), pictures, "Errors over time", caption)
 
 
 def _nis_figure(lines: Sequence[Line]) -> str:
@@ -184,7 +184,7 @@ def _nis_figure(lines: Sequence[Line]) -> str:
         f"{inside} (95 % expected)."
     )
     pictures = [plots.nis_svg(shown, means, size) for size in (plots.WIDE, plots.NARROW)]
-    return _legend(shown, more=band) + _figure(pictures, "Normalised innovations over time", caption)
+    return _figure(_legend(shown, more=band), pictures, "Normalised innovations over time", caption)
 
 
 def _legend(lines: Sequence[Line], boxes: bool = False, more: str = "") -> str:
@@ -196,12 +196,12 @@ def _legend(lines: Sequence[Line], boxes: bool = False, more: str = "") -> str:
     return f'<ul class="legend">{"".join(items)}{more}</ul>\n'
 
 
-def _figure(pictures: Sequence[str], title: str, caption: str) -> str:
+def _figure(legend: str, pictures: Sequence[str], title: str, caption: str) -> str:
     drawn = [
         svg.replace("<svg", f'<svg class="{size.name}" role="img" aria-label="{title}"', 1)
         for svg, size in zip(pictures, (plots.WIDE, plots.NARROW), strict=True)
     ]
-    return f"<figure>\n{drawn[0]}\n{drawn[1]}\n<figcaption>{caption}</figcaption>\n</figure>"
+    return f"<figure>\n{legend}{drawn[0]}\n{drawn[1]}\n<figcaption>{caption}</figcaption>\n</figure>"
 
 
 def _provenance(head: ReportHead, reference: ReferenceTrack | Relations | None) -> dict[str, str]:

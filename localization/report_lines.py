@@ -144,10 +144,9 @@ def thin_path(positions: FloatArray, resolution_m: float, most: int = 2500) -> I
     if n < 3:
         return np.arange(n)
     length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(positions, axis=0).T))])
-    cell = np.floor(length / max(resolution_m, length[-1] / most, 1e-12)).astype(np.int64)
+    cell = np.floor(length / max(resolution_m, length[-1] / (most - 2), 1e-12)).astype(np.int64)
     kept = np.flatnonzero(np.diff(cell, prepend=-1) > 0)
-    kept = kept if kept[-1] == n - 1 else np.append(kept, n - 1)
-    return kept if len(kept) <= most else kept[np.unique(np.linspace(0, len(kept) - 1, most).round().astype(np.int64))]
+    return kept if kept[-1] == n - 1 else np.append(kept, n - 1)
 
 
 def thin_series(values: FloatArray, most: int = 700) -> IntArray:

@@ -35,6 +35,7 @@ thead th{vertical-align:bottom;font-weight:600;white-space:normal;min-width:5rem
 tbody tr:last-child>*{border-bottom:0}
 th:first-child,td:first-child{text-align:left;padding-left:0;position:sticky;left:0;background:var(--paper)}
 .bar{display:block;height:4px;margin:3px 0 0 auto;min-width:2px}
+.name{white-space:nowrap}
 .badge{background:var(--accent);color:var(--paper);border-radius:3px;padding:0 .35rem;font-size:.75rem;vertical-align:.1em}
 .badge.soft{background:none;color:var(--accent);box-shadow:inset 0 0 0 1px}
 .swatch{width:30px;height:8px;margin-right:.45rem;vertical-align:.12em}
@@ -65,7 +66,7 @@ dl{grid-template-columns:minmax(5rem,36%) 1fr}.terms{grid-template-columns:1fr}.
 .wide{display:block!important}.narrow{display:none!important}
 body{font-size:10pt}main{max-width:none;padding:0}
 h2{break-after:avoid}figure,tr,.verdict{break-inside:avoid}
-.scroll{overflow:visible}table{font-size:8pt}th,td{padding:.25rem .35rem}thead th{min-width:0}
+.scroll{overflow:visible}table,th small,td small{font-size:8pt}th,td{padding:.25rem .35rem}thead th{min-width:0}
 .legend input{display:none}*{print-color-adjust:exact;-webkit-print-color-adjust:exact}
 }
 """

@@ -112,7 +112,8 @@ def _rows(lines: Sequence[Line], columns: Sequence[Column], badges: Mapping[int,
                 text = f"<b>{text}</b>"
             cells.append(f"<td>{text}{_bar(line, value, known[0]) if i == 0 and column.is_error else ''}</td>")
         model = "any: it asks no wheels" if line.model is None else escape(line.model)
-        name = f"{swatch(line)}<b>{escape(line.result.run.estimator)}</b>{badges.get(line.number, '')}<br><small>{model}</small>"
+        title = f'<span class="name">{swatch(line)}<b>{escape(line.result.run.estimator)}</b></span>'
+        name = f"{title}{badges.get(line.number, '')}<br><small>{model}</small>"
         rows.append(f'<tr><th scope="row">{name}</th>{"".join(cells)}</tr>')
     heads = "".join(f'<th scope="col">{c.title}<br><small>{c.unit}</small></th>' for c in columns)
     return _table(f'<th scope="col">Estimator<br><small>motion model</small></th>{heads}', rows)

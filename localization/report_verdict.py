@@ -133,8 +133,9 @@ def _gains(lines: Sequence[Line], best: Line) -> str:
     for part in parts:
         if part is None or part is best or part.error is None or is_close(part, best):
             continue
-        less = min(99.9, math.floor(1000.0 * (1.0 - _error(best) / part.error)) / 10.0)  # never rounded up to all
-        gains.append(f"{less:.{1 if less > 99.0 else 0}f} % less than {part.words} ({metres(part.error)})")
+        less = 100.0 * (1.0 - _error(best) / part.error)
+        rounded = f"{math.floor(less)}" if less < 99.0 else f"{math.floor(10.0 * min(less, 99.9)) / 10.0:.1f}"  # never up to all of it
+        gains.append(f"{rounded} % less than {part.words} ({metres(part.error)})")
     return ", " + _and(gains) if gains else ""
 
 
