@@ -33,8 +33,12 @@ class EkfConfig:
     """How far the clocks of wheels and LiDAR may be apart [s]; 0 takes them as one."""
     clock_walk_s_per_sqrt_s: float = 1e-4
     """Random walk of the clock offset."""
+    nudge_m2_per_s: float = 1e-6
+    """Variance of the position while the wheels stand, per second: a push, a slope [m^2/s]."""
+    nudge_rad2_per_s: float = 1e-6
+    """The same for the yaw [rad^2/s]."""
     standing_sigma_m: float = 2e-4
-    """How still standing still is, per step [m]."""
+    """How still standing still is, per step: sigma of the zero-velocity update [m]."""
     standing_sigma_rad: float = 1e-4
     """The same for the yaw [rad]."""
     gate_probability: float = 0.9999
@@ -94,7 +98,10 @@ class Ekf:
         P[BIAS, BIAS] += self._gyro.bias_walk_rad_per_s_sqrt_s**2 * step.duration
         if self.config.clock_sigma_s:
             P[CLOCK, CLOCK] += self.config.clock_walk_s_per_sqrt_s**2 * step.duration
-        if not step.is_standing:
+        if step.is_standing:
+            c = self.config
+            P[POSE, POSE] += np.diag([c.nudge_m2_per_s, c.nudge_m2_per_s, c.nudge_rad2_per_s]) * step.duration
+        else:
             P[PARAMS:, PARAMS:] += np.diag(self._corrected.walks**2 * step.duration)
         self._filter.P = P
         self._start = self.pose

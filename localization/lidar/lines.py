@@ -80,6 +80,7 @@ class LineMap:
             options.sigma_point,
             options.sigma_line,
             options.kernel,
+            options.wide_kernel,
             options.iterations,
             prior,
             center,
@@ -104,6 +105,8 @@ class FitOptions:
     """Error of a line of the map, shared by all points that meet it in one cell [m]."""
     kernel: float
     """Scale of the Geman-McClure kernel [m]."""
+    wide_kernel: float
+    """The same for the first half of the steps: it sees farther, and is not so easily caught by the wrong line [m]."""
     iterations: int
     """Gauss-Newton steps at most."""
 
@@ -175,7 +178,8 @@ def _fit(
     radius: float,
     sigma_point: float,
     sigma_line: float,
-    kernel: float,
+    final_kernel: float,
+    wide_kernel: float,
     iterations: int,
     prior: FloatArray,
     center: FloatArray,
@@ -186,7 +190,9 @@ def _fit(
     n_matched, squares = 0, 0.0
     hits = np.zeros(cells.shape[0], np.int32)
     home = np.empty(source.shape[0], np.int64)
+    wide = iterations // 2
     for iteration in range(iterations + 1):
+        kernel = wide_kernel if iteration < wide else final_kernel
         H[:], g[:] = 0.0, 0.0
         n_matched, squares = 0, 0.0
         c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -245,7 +251,7 @@ def _fit(
         for i in range(source.shape[0]):
             if home[i] >= 0:
                 hits[home[i]] = 0
-        if iteration == iterations or n_matched == 0:
+        if iteration >= iterations or n_matched == 0:
             break
 
         dx, dy = center[0] - pose[0], center[1] - pose[1]
@@ -266,5 +272,7 @@ def _fit(
         pose[1] += s * d0 + c * d1
         pose[2] += d2
         if abs(d0) + abs(d1) + abs(d2) < 1e-4:
-            iterations = iteration + 1
+            if iteration >= wide:
+                iterations = iteration + 1
+            wide = min(wide, iteration + 1)
     return n_matched, squares

@@ -106,7 +106,7 @@ class LidarMatcher:
             self._kiss = Kiss(voxel, 0.0, self.config.max_range_m)
             self._lines = LineMap(2.0 * voxel, 0.1 * voxel, 2.0 * self.config.max_range_m)
             self._options = FitOptions(
-                2.0 * voxel, self.config.sigma_point_m, self.config.sigma_line_m, 0.5 * voxel, self.config.iterations
+                2.0 * voxel, self.config.sigma_point_m, self.config.sigma_line_m, 0.5 * voxel, 1.5 * voxel, self.config.iterations
             )
             self._voxel = voxel
             self._downsampled = points

@@ -41,6 +41,7 @@ from motion_models.robot import Mount, Robot
 
 _RANKS = {"joint_states": 0, "odometry": 0, "center_of_gravity": 1, "imu": 2, "scan": 3, "points": 3}
 _SCAN_WEIGHT = 100
+_GPS = "/fix"
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _TF_WATCHED_NS = 10_000_000_000
 _JOINT_STATES_SEEN = 500
@@ -96,9 +97,11 @@ class Log:
 
     @property
     def reference_topic(self) -> str | None:
-        """The option's or the robot file's reference, if the log has it and if it can be one."""
-        topic = self._overrides.reference if self._overrides.reference is not None else self.robot.topics.reference
-        return topic if topic in self._chooser.of_type(*REFERENCE_TYPES) else None
+        """The option's reference, else the robot file's, else GPS by its usual name; if the log has it and if it can be one."""
+        asked = self._overrides.reference
+        names = (self.robot.topics.reference, _GPS) if asked is None else (asked,)
+        there = self._chooser.of_type(*REFERENCE_TYPES)
+        return next((name for name in names if name in there), None)
 
     def info(self) -> LogInfo:
         """What is in the log, what will be used of it, and what is missing or suspect. Reads it once."""
