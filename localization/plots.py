@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 
 import matplotlib
 import numpy as np
@@ -18,9 +17,11 @@ from matplotlib.patches import Ellipse as EllipsePatch
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from localization.consistency import mean_band
-from localization.report_data import MapView, NisMeans, Spans, Timeline
+from localization.report_data import MapView, NisMeans, Spans, Timeline, raster
 from localization.report_lines import Line, thin_path, thin_series
-from localization.report_svg import COLOURS, for_page
+from localization.report_svg import COLOURS, NARROW, WIDE, Size, for_page
+
+__all__ = ["NARROW", "WIDE", "map_svg", "nis_svg", "overview", "spans_svg", "timeline_svg"]
 
 _STYLE = {
     "svg.fonttype": "none",
@@ -51,25 +52,6 @@ _STYLE = {
     "path.simplify": True,
     "path.simplify_threshold": 0.2,
 }
-_MAP_GREY = (118, 125, 132)  # half-way between white and black paper: the map is a raster and cannot ask the page
-
-
-@dataclass(frozen=True)
-class Size:
-    """A picture is drawn once for wide pages and once for phones, so that letters have one size on both."""
-
-    name: str
-    width_in: float
-    pixels: int
-    """Across the raster of the map."""
-
-    @property
-    def is_wide(self) -> bool:
-        return self.width_in > 5.0
-
-
-WIDE = Size("wide", 8.2, 900)
-NARROW = Size("narrow", 3.9, 520)
 
 
 def map_svg(lines: Sequence[Line], view: MapView, size: Size) -> str:
@@ -164,14 +146,8 @@ def _draw_map(axes: Axes, lines: Sequence[Line], view: MapView, size: Size) -> N
     low, high = view.low, view.high
     resolution = float((high - low).max()) / size.pixels
     if len(view.points):
-        axes.imshow(
-            _raster(view, resolution),
-            extent=_raster_extent(view, resolution),
-            origin="upper",
-            interpolation="none",
-            aspect="equal",
-            zorder=1,
-        )
+        image, extent = raster(view, resolution)
+        axes.imshow(image, extent=extent, origin="upper", interpolation="none", aspect="equal", zorder=1)
     if view.reference is not None and len(view.reference):
         path = view.reference[thin_path(view.reference, resolution)]
         axes.plot(path[:, 0], path[:, 1], color=COLOURS["ink"], linewidth=0.9, zorder=2, gid="reference")
@@ -215,23 +191,6 @@ def _draw_bars(axes: Axes, lines: Sequence[Line], measure: str) -> None:
     )
     axes.grid(visible=False, axis="y")
     axes.spines["left"].set_visible(False)
-
-
-def _raster(view: MapView, resolution: float) -> np.ndarray:
-    """(H, W, 4) uint8: the map's points as grey of more or less alpha, top row first."""
-    width, height = np.maximum(np.ceil((view.high - view.low) / resolution).astype(int), 1)
-    column, row = np.floor((view.points - view.low) / resolution).astype(int).T
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    counts = np.bincount(row[inside] * width + column[inside], minlength=width * height).reshape(height, width)
-    alpha = np.where(counts > 0, np.minimum(150 + 60 * np.log2(np.maximum(counts, 1)), 255), 0)
-    image = np.zeros((height, width, 4), dtype=np.uint8)
-    image[..., :3], image[..., 3] = _MAP_GREY, alpha.astype(np.uint8)
-    return image[::-1]
-
-
-def _raster_extent(view: MapView, resolution: float) -> tuple[float, float, float, float]:
-    width, height = np.maximum(np.ceil((view.high - view.low) / resolution), 1.0) * resolution
-    return float(view.low[0]), float(view.low[0] + width), float(view.low[1]), float(view.low[1] + height)
 
 
 def _plot(axes: Axes, line: Line, x: np.ndarray, y: np.ndarray, **more: object) -> None:

@@ -68,7 +68,9 @@ def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack 
     ]
     if lines:
         parts += [
-            _section("Accuracy", accuracy_table(lines, best, near) + _about_reference(lines, reference)),
+            _section(
+                "Accuracy" if reference is not None else "Runs", accuracy_table(lines, best, near) + _about_reference(lines, reference)
+            ),
             _section("Trajectories", _map_figure(lines, map_view(lines, reference))),
             _section("Errors", _error_figure(lines, reference)),
             _section("Innovations: does the filter know how wrong it is?", _nis_figure(lines)),

@@ -16,6 +16,8 @@ from motion_models.se2 import FloatArray
 
 _N_ELLIPSES = 12
 _REACH = 0.2
+# half-way between white and black paper: the map is a raster and cannot ask the page for its colour
+_MAP_GREY = (118, 125, 132)
 _N_MEANS = 90
 _N_BINS = 9
 _LEAST_IN_BIN = 5
@@ -82,6 +84,19 @@ def map_view(lines: Sequence[Line], reference: ReferenceTrack | Relations | None
         start=_start(paths[best.number]) if best else None,
         n_cut=sum(bool(((path < low) | (path > high)).any()) for path in paths),
     )
+
+
+def raster(view: MapView, resolution_m: float) -> tuple[NDArray[np.uint8], tuple[float, float, float, float]]:
+    """The map's points as grey of more or less alpha (H, W, 4), top row first, and its left, right, bottom and top border [m]."""
+    width, height = np.maximum(np.ceil((view.high - view.low) / resolution_m).astype(int), 1)
+    column, row = np.floor((view.points - view.low) / resolution_m).astype(int).T
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    counts = np.bincount(row[inside] * width + column[inside], minlength=width * height).reshape(height, width)
+    image = np.zeros((height, width, 4), dtype=np.uint8)
+    image[..., :3] = _MAP_GREY
+    image[..., 3] = np.where(counts > 0, np.minimum(150.0 + 60.0 * np.log2(np.maximum(counts, 1)), 255.0), 0.0).astype(np.uint8)
+    left, bottom = (float(x) for x in view.low)
+    return image[::-1], (left, left + float(width) * resolution_m, bottom, bottom + float(height) * resolution_m)
 
 
 @dataclass(frozen=True, eq=False)

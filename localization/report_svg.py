@@ -7,6 +7,7 @@ becomes ``var(--name, value)``: the page's style sheet decides for light, dark a
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 
 COLOURS = {
     "ink": "#1c2024",
@@ -38,6 +39,24 @@ DARK_COLOURS = {
     "grey": "#98a0a8",
 }
 """The same hues, light enough for a dark page."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """A picture is drawn once for wide pages and once for phones, so that letters have one size on both."""
+
+    name: str
+    width_in: float
+    pixels: int
+    """Across the raster of the map."""
+
+    @property
+    def is_wide(self) -> bool:
+        return self.width_in > 5.0
+
+
+WIDE = Size("wide", 8.2, 900)
+NARROW = Size("narrow", 3.9, 520)
 
 _KEPT = ("series-", "reference", "band")
 
