@@ -28,7 +28,7 @@ FREE: Mapping[str, tuple[str, ...]] = {
     "friction": ("mu_ratio", "tracked_x", "wheel_radius"),
 }
 """What logs are to tell of a model, dearest first: of those that cannot be told apart, the last is held."""
-FREE_WHERE_CG_MOVES: Mapping[str, tuple[str, ...]] = {"skid_steer": ("k_0", "x_cr_0", "y_cr_0", "x_cr_1", "k_2", "y_cr_s0")}
+FREE_WHERE_CG_MOVES: Mapping[str, tuple[str, ...]] = {"skid_steer": ("k_0", "x_cr_0", "y_cr_0", "x_cr_1", "k_2", "k_1", "y_cr_s0")}
 FREE_OF_TURNS: Mapping[str, tuple[str, ...]] = {
     "diff_drive": ("wheel_separation_multiplier",),
     "skid_steer": ("k_0",),
@@ -45,6 +45,8 @@ FREE_OF_ROTATIONS: Mapping[str, tuple[str, ...]] = {
 }
 """The same for a table of rotations in place."""
 
+_SIZES = {"k_1": 1.0}
+"""What counts as large where the nominal value is small only because the robot is symmetric; see `FitConfig.sizes`."""
 _MIRROR: Mapping[str, tuple[str, float]] = {
     "y_icr_right": ("y_icr_left", -1.0),
     "alpha_right": ("alpha_left", 1.0),
@@ -128,6 +130,7 @@ def calibrate(
         return Calibration(fit(model, maneuvers, free, dataclasses.replace(config, ties={**ties(), **config.ties})), ())
     if CLOCK in free:
         config = dataclasses.replace(config, prior_sigma={CLOCK: CLOCK_SIGMA_S, **config.prior_sigma})
+    config = dataclasses.replace(config, sizes={**{n: s for n, s in _SIZES.items() if n in model.param_names}, **config.sizes})
     reasons: list[Weakness] = []
     while free:
         if any(name != CLOCK for name in free):
