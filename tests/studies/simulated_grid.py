@@ -1,0 +1,193 @@
+"""The thesis's calibration, simulated: 68 rotations in place become a log, the log goes through scan matching, arcs give centres of
+rotation, and a regression gives k and CoR back as functions of the CG. The closed friction model says what they must be.
+
+python -m tests.studies.simulated_grid
+
+The simulator steps the dynamic model; the closed model solves the balance of forces without a notion of time. They share the law of
+friction, and nothing else: masses, motors, sweeping beams, encoders, scan matching and the fit of circles lie between them.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from localization.events import CgSample, Scan, WheelSample
+from localization.lidar.matcher import LidarMatcher
+from localization.lidar.sweep import body_points
+from localization.logs import open_log
+from localization.simulate.experiments import grid_points
+from localization.simulate.runs import RunRecord
+from localization.simulate.simulator import simulate, write_simulation
+from localization.simulate.suite import START_NS
+from localization.simulate.vehicle import TWIST, Body, VehicleConfig, VehicleState, advance
+from motion_models import se2
+from motion_models.center_of_rotation import center_from_end_poses
+from motion_models.registry import make_model
+from motion_models.regressions import Regression, regress
+from motion_models.robot import load_robot
+from motion_models.se2 import FloatArray
+
+_REST_S = 1.2
+_MAPPED_RAD = 0.3
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """What the log tells of one rotation in place, and what the closed model says of it."""
+
+    cg: FloatArray
+    """(2,) as the arms' joints tell [m]."""
+    k: float
+    k_sigma: float
+    cor: FloatArray
+    """(2,) [m]"""
+    cor_cov: FloatArray
+    """(2, 2) [m^2]"""
+    model: FloatArray
+    """(3,) k, x_CR, y_CR of the closed model, which knows no inertia."""
+    settled: FloatArray
+    """(3,) the same of the simulated vehicle at constant wheel rates: what the CG's centripetal force changes is in it."""
+
+
+@dataclass(frozen=True)
+class _Window:
+    """Events of one run."""
+
+    wheels: list[WheelSample]
+    scans: list[Scan]
+    cgs: list[FloatArray]
+
+
+def rotations(folder: Path, seed: int = 0) -> list[Rotation]:
+    """Simulate the grid into ``folder``, read the log, and measure every rotation."""
+    robot = load_robot("vaultbot")
+    simulation = simulate("rotation_grid", robot, seed)
+    path = folder / "grid.mcap"
+    write_simulation(path, simulation)
+    log = open_log(path, robot)
+    mount = log.mounts["laser"]
+    windows = [_Window([], [], []) for _ in simulation.runs]
+    starts = np.array([START_NS + round((run.start_s - _REST_S) * 1e9) for run in simulation.runs])
+    ends = np.array([START_NS + round((run.start_s + float(run.times_s[-1])) * 1e9) for run in simulation.runs])
+    for event in log.events():
+        i = int(np.searchsorted(starts, event.stamp_ns, side="right")) - 1
+        if i < 0 or event.stamp_ns > ends[i]:
+            continue
+        if isinstance(event, WheelSample):
+            windows[i].wheels.append(event)
+        elif isinstance(event, Scan):
+            windows[i].scans.append(event)
+        elif isinstance(event, CgSample):
+            windows[i].cgs.append(event.position)
+    return [_measure(run, window, mount) for run, window in zip(simulation.runs, windows, strict=True)]
+
+
+def _measure(run: RunRecord, window: _Window, mount) -> Rotation:  # type: ignore[no-untyped-def]
+    robot = load_robot("vaultbot")
+    begin = START_NS + round(run.start_s * 1e9)
+    matcher, pose, mapped = LidarMatcher(), np.zeros(3), 0.0
+    step = np.zeros(3)
+    poses, covs, stamps = [], [], []
+    for number, scan in enumerate(window.scans):
+        points = body_points(scan, mount, step * 12.5)
+        found = matcher.register(points, True, se2.compose(pose, se2.exp(step)), np.diag([1e-3, 1e-3, 1e-3]))
+        before = pose
+        if found is not None:
+            pose = found.pose
+            if scan.stamp_ns >= begin:
+                poses.append(pose)
+                covs.append(found.cov)
+                stamps.append(scan.stamp_ns)
+            step = se2.log(se2.between(before, pose)) if number > 1 else np.zeros(3)
+        if number < 6 or abs(pose[2] - mapped) > _MAPPED_RAD:
+            matcher.insert(pose)
+            mapped = pose[2]
+    track, cov = np.array(poses), np.array(covs)
+
+    # k: turned angle over what the wheels turned
+    wheels = np.array([w.position for w in window.wheels])
+    times = np.array([w.stamp_ns for w in window.wheels])
+    difference = np.interp([stamps[0], stamps[-1]], times, wheels[:, 1] - wheels[:, 0])
+    turned = float(np.unwrap(track[:, 2])[-1] - np.unwrap(track[:, 2])[0])
+    g = robot.geometry
+    unit = g.wheel_radius_m * float(difference[1] - difference[0]) / g.track_width_m
+    sigma = float(np.sqrt(cov[0, 2, 2] + cov[-1, 2, 2])) / unit
+
+    turns = np.abs(np.diff(np.unwrap(track[:, 2]), prepend=track[0, 2]))
+    moving = np.flatnonzero(turns > 0.85 * np.median(turns[turns > 0.5 * turns.max()]))  # while starting and stopping it turns elsewhere
+    # The errors of neighbouring scans are alike, as they share the map: only the arc's ends count as independent (4.4, 4.5).
+    first, last = moving[0], moving[-1]
+    centre = center_from_end_poses(track[first], track[last], cov[first], cov[last])
+    cg = np.mean(window.cgs, axis=0)
+    model = make_model("friction", robot)
+    rates = make_model("diff_drive", robot).wheels(np.array([0.0, 0.3]), cg, make_model("diff_drive", robot).nominal)
+    per_wheels = g.wheel_radius_m * (rates[1] - rates[0]) / g.track_width_m
+    said = _centre(model.twist(rates, cg, model.nominal).value, per_wheels)
+    settled = _centre(_settled(rates, cg), per_wheels)
+    return Rotation(cg, turned / unit, sigma, centre.value, centre.cov, said, settled)
+
+
+def _centre(twist: FloatArray, per_wheels: float) -> FloatArray:
+    vx, vy, wz = twist
+    return np.array([wz / per_wheels, -vy / wz, vx / wz])
+
+
+def _settled(rates: FloatArray, cg: FloatArray) -> FloatArray:
+    """Twist (3,) of the simulated vehicle after three seconds at constant wheel rates."""
+    at = np.zeros((600, 7))
+    at[:, :2] = cg
+    state, body = VehicleState.at(np.zeros(3)), Body.from_robot(load_robot("vaultbot"))
+    rows = advance(state, body, VehicleConfig(), np.tile(rates, (600, 1)), at, (0.0, 0.0), np.zeros((0, 5)))
+    return np.asarray(rows[-1, TWIST])
+
+
+TERMS = {
+    "k": ("1", "x", "x^2"),
+    "x_CR": ("1", "x"),
+    "y_CR": ("y", "x y", "x^2 y"),
+}
+"""4.21, 4.22, 4.25."""
+
+
+def fits(found: Sequence[Rotation]) -> dict[str, tuple[Regression, Regression]]:
+    """Regressions 4.21, 4.22 and 4.25 of what was measured, and of what the closed model says at the same CGs."""
+    cg = np.array([r.cg for r in found])
+    x, y = cg.T
+    columns = {"1": np.ones_like(x), "x": x, "x^2": x**2, "y": y, "x y": x * y, "x^2 y": x**2 * y}
+    measured = np.array([[r.k, *r.cor] for r in found])
+    model = np.array([r.model for r in found])
+    return {
+        name: (regress(measured[:, i], {t: columns[t] for t in terms}), regress(model[:, i], {t: columns[t] for t in terms}))
+        for i, (name, terms) in enumerate(TERMS.items())
+    }
+
+
+def sigmas(found: Sequence[Rotation]) -> FloatArray:
+    """(n, 3) stated standard deviations of k, x_CR, y_CR."""
+    return np.array([[r.k_sigma, *np.sqrt(np.diagonal(r.cor_cov))] for r in found])
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        found = rotations(Path(folder))
+    assert len(found) == len(grid_points())
+    measured, sigma = np.array([[r.k, *r.cor] for r in found]), sigmas(found)
+    for title, said in (("the closed model", [r.model for r in found]), ("the vehicle at constant rates", [r.settled for r in found])):
+        off = measured - np.array(said)
+        print(f"measured against {title}\n{'':6} {'bias':>9} {'scatter':>9} {'stated sigma':>13} {'rms of z':>9} {'range':>9}")
+        for i, name in enumerate(TERMS):
+            z = off[:, i] / sigma[:, i]
+            numbers = off[:, i].mean(), off[:, i].std(), sigma[:, i].mean(), np.sqrt(np.mean(z**2)), np.ptp(np.array(said)[:, i])
+            print(f"{name:6} {numbers[0]:9.5f} {numbers[1]:9.5f} {numbers[2]:13.5f} {numbers[3]:9.2f} {numbers[4]:9.3f}")
+    for name, (seen, said) in fits(found).items():
+        for term, a, s, b in zip(seen.names, seen.coefficients, np.sqrt(np.diagonal(seen.cov)), said.coefficients, strict=True):
+            print(f"{name:5} {term:6} measured {a:9.4f} +- {s:.4f}   closed model {b:9.4f}   {(a - b) / s:+.1f} sigma")
+
+
+if __name__ == "__main__":
+    main()
