@@ -189,7 +189,7 @@ class Simulation:
         nominal = self._masses.nominal_cg(times[:1])[0]
         wheels = model.wheels(commands, nominal, model.nominal).repeat(steps, axis=0)
         payload = self._masses.payload_kg, self._masses.payload_distance(float(times[0]))
-        rows = advance(self._state, self._body, config, wheels, self._masses.cg(times), payload, self.world.patches)
+        rows = advance(self._state, self._body, config, wheels, self._masses.cg(times, config.step_s), payload, self.world.patches)
         self._track.append(rows)
         self._check_walls(rows[-1, POSE])
 
