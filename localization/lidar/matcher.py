@@ -32,7 +32,7 @@ class LidarConfig:
     """Noise of one LiDAR point [m]."""
     sigma_line_m: float = 0.02
     """Error of a line in the map, shared by all points of a scan that meet it in one cell [m]."""
-    iterations: int = 6
+    iterations: int = 12
     """Point-to-line steps at most."""
 
 
