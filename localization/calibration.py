@@ -87,6 +87,11 @@ def cut_log(
     """
     config = config or WindowConfig()
     log = open_log(path, robot, topics)
+    if log.sources.wheels is None and log.wheels_error is None:
+        raise CalibrationError(
+            f"{log.path.name} has no wheels: neither joint states ({robot.topics.joint_states}) nor the driver's odometry"
+            f" ({robot.topics.odometry}); name them with --topic.joint-states or --topic.odometry. `skidloc info` lists the topics."
+        )
     seen_by, words = _witness(log, robot, witness, reference, config)
     events = log.events()
     windows = cut(events, seen_by, make_model("diff_drive", robot), robot, config, log.path.name)

@@ -24,8 +24,10 @@ from motion_models.regressions import RotationTable, read_rotation_table, skid_s
 from motion_models.robot import Robot, load_robot, parse_robot, robot_names
 from motion_models.robot_file import robot_toml
 from motion_models.ros_export import diff_drive_controller_yaml, multiplier_table, multipliers, robot_localization_yaml
+from motion_models.rotations import rotations_as_maneuvers
 from motion_models.skid_steer import SkidSteer, thesis_coefficients
 from motion_models.weighing import Scales, WeighedCg, cg_from_scales, read_weighings, wheel_contacts
+from motion_models.windows_table import read_windows, windows_text
 
 __all__ = [
     "MODELS",
@@ -79,11 +81,13 @@ __all__ = [
     "preintegrate",
     "read_rotation_table",
     "read_weighings",
+    "read_windows",
     "robot_localization_yaml",
     "robot_names",
     "robot_toml",
     "root_mean",
     "root_mean_gain",
+    "rotations_as_maneuvers",
     "skid_steer_fit",
     "static_part_from_weighing",
     "support_margin",
@@ -91,4 +95,5 @@ __all__ = [
     "urdf_cg",
     "weighed_cg",
     "wheel_contacts",
+    "windows_text",
 ]

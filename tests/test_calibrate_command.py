@@ -353,6 +353,26 @@ def test_windows_survive_writing(tmp_path: Path) -> None:
         assert a.group == b.group
 
 
+def test_several_tables_are_fitted_together_and_told_one_by_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two floors: one on which the robot turns 20 % less."""
+    paths = []
+    for name, factor in (("floor.csv", 1.0), ("snow.csv", 0.8)):
+        slower = [
+            Maneuver(m.dt, m.wheels, m.measured * [1.0, 1.0, factor], m.ends, cov=np.diag([np.inf, np.inf, 1e-6]), group=m.group)
+            for m in made_windows("diff_drive", n=30, seed=4)
+            if abs(m.measured[0, 2]) < 2.5
+        ]
+        paths.append(tmp_path / name)
+        paths[-1].write_text(windows_text(slower))
+    told = run(tmp_path, *paths, "--robot", "vaultbot", "--model", "diff_drive")
+    floor, snow = (told["by_source"][path.name]["effective_track_m"][0] for path in paths)
+    assert snow / floor == pytest.approx(1.25, rel=0.02)
+    assert floor < told["turning"]["effective_track_m"][0] < snow
+    printed = capsys.readouterr().out
+    assert "by each alone" in printed
+    assert "snow.csv" in printed
+
+
 def test_a_real_husky_s_windows(tmp_path: Path) -> None:
     """The DRIVE data set as a table: as well as the study that knows the data set, within 5 %."""
     path = tmp_path / "drive.csv"
@@ -383,6 +403,8 @@ def test_a_log_without_a_witness_and_references_that_are_none(tmp_path: Path, ca
     wheels, cg, _ = drive([(0.0, 0.0)])
     bag = bags.write_mcap(tmp_path / "run.mcap", wheel_records(wheels, cg))
     assert "neither a LiDAR nor an IMU" in refused(capsys, bag, "--robot", "vaultbot")
+    scans = [("/scan", bags.laser_scan(START + i * S), START + i * S) for i in range(3)]
+    assert "has no wheels" in refused(capsys, bags.write_mcap(tmp_path / "scans.mcap", scans), "--robot", "vaultbot")
     assert "has no LiDAR" in refused(capsys, HUSKY, "--witness", "lidar")
     assert "positions only" in refused(capsys, HUSKY, "--reference", "/fix")
     assert "no topic '/mocap'" in refused(capsys, HUSKY, "--reference", "/mocap")
