@@ -88,7 +88,8 @@ def _content(simulation: Simulation, seed: int, effects: dict[str, float], count
 
 def _print(console: Console, simulation: Simulation, out: Path, count: int, scores: list[Score]) -> None:
     what, who = simulation.experiment.name, simulation.robot.name
-    console.print(f"{escape(str(out))}: {what} with {who}, {simulation.time_s:.1f} s, {count} messages, {len(simulation.runs)} named runs")
+    driven = f"{simulation.time_s:.1f} s, {count} messages, {len(simulation.runs)} named runs"
+    console.print(f"{escape(str(out))}: {what} with {who}, {driven}", soft_wrap=True)
     if simulation.experiment.name != "controller_evaluation":
         return
     table = Table("trajectory", "controller", "drive m", "correction s", "vision m", box=None, header_style="bold", pad_edge=False)

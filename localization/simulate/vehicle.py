@@ -164,7 +164,8 @@ def advance(
     if failed >= 0:
         raise SimulationError(
             f"the forces on the robot could not be balanced {start + failed * config.step_s:.2f} s into the drive (CG at x = "
-            f"{cg[failed, 0]:.3f}, y = {cg[failed, 1]:.3f} m). Take a smaller vehicle.step_s, or a larger vehicle.creep."
+            f"{cg[failed, 0]:.3f}, y = {cg[failed, 1]:.3f} m): one wheel may carry nearly all of it. "
+            "Move the CG inwards, or take a larger vehicle.creep."
         )
     lifted = out[:, MARGIN] < 0.0
     for i in range(len(out)) if lifted.any() else ():
