@@ -12,13 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from localization.estimators.base import Estimate, mean_twist
+from localization.estimators.base import NO_POINTS, Estimate, mean_twist
 from localization.estimators.ekf import BIAS, CLOCK, PARAMS, POSE, START, Ekf, EkfConfig
-from localization.lidar import LidarConfig, LidarMatcher, body_points
+from localization.estimators.witness import ScanWitness, Witness
+from localization.lidar import LidarConfig
 from localization.residuals import motion_residual
 from localization.steps import Step
 from motion_models import se2
-from motion_models.base import Motion, MotionModel
+from motion_models.base import MotionModel
 from motion_models.corrections import Corrections
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
@@ -36,15 +37,16 @@ class EkfFusion:
         has_lidar: bool,
         config: EkfConfig | None = None,
         lidar: LidarConfig | None = None,
+        witness: Witness | None = None,
     ) -> None:
+        """``witness`` measures the motion between scans; if not given, scans are matched as ``lidar`` says."""
         config = config or EkfConfig()
         # without a LiDAR there is no second clock to compare with
         self._ekf = Ekf(robot.gyro_noise, corrected, config if has_lidar else replace(config, clock_sigma_s=0.0))
-        self._matcher = LidarMatcher(lidar) if has_lidar else None
+        self._witness = (witness or ScanWitness(mounts, lidar)) if has_lidar else None
         self._model, self._corrected = model, corrected
-        self._mounts, self._has_gyro = mounts, False
+        self._has_gyro = False
         self._counts = dict.fromkeys(("scans", "matched", "contradictions", "standing"), 0)
-        self._has_map = False
 
     @property
     def clock_offset_s(self) -> float:
@@ -63,25 +65,20 @@ class EkfFusion:
         if step.is_standing:
             self._counts["standing"] += 1
             ekf.measure_standing()
-        if step.scan is not None and self._matcher is not None:
-            nis = self._look(step, self._matcher)
+        if step.scan is not None and self._witness is not None:
+            nis = self._look(step, self._witness)
         twist, twist_cov = self._twist(step)
         return Estimate(step.end_ns, ekf.pose, ekf.covariance[POSE, POSE], twist, twist_cov, nis)
 
-    def _look(self, step: Step, matcher: LidarMatcher) -> float | None:
-        assert step.scan is not None
+    def _look(self, step: Step, witness: Witness) -> float | None:
         ekf, nis = self._ekf, None
         self._counts["scans"] += 1
-        points = body_points(step.scan, self._mounts.get(step.scan.frame_id, Mount()), step.twist)
-        found = matcher.register(points, step.scan.is_planar, ekf.pose, step.predicted.cov)
-        if found is not None:
+        seen = witness.look(step, ekf.anchor, ekf.pose)
+        if seen is not None:
             self._counts["matched"] += 1
-            seen = Motion(se2.between(ekf.anchor, found.pose), found.cov)
-            nis = ekf.measure_motion(seen, found.is_trusted)
+            nis = ekf.measure_motion(seen.motion, seen.is_trusted)
             self._counts["contradictions"] += nis > ekf.gate
-        if not step.is_standing or not self._has_map:  # a robot that stands sees nothing new, and would only thicken its lines
-            matcher.insert(ekf.pose)
-            self._has_map = True
+        witness.remember(step, ekf.pose)
         ekf.set_anchor()
         return nis
 
@@ -102,7 +99,7 @@ class EkfFusion:
         found = {}
         if self._has_gyro:
             found["gyro_bias_rad_per_s"] = self._ekf.bias, math.sqrt(self._ekf.covariance[BIAS, BIAS])
-        if self._matcher is not None:
+        if self._witness is not None:
             found["wheel_clock_offset_s"] = self._ekf.clock_offset, math.sqrt(self._ekf.covariance[CLOCK, CLOCK])
         nominal = dict(zip(self._model.param_names, self._model.nominal, strict=True))
         for i, name in enumerate(self._corrected.names):
@@ -114,4 +111,4 @@ class EkfFusion:
         return self._counts
 
     def map_points(self) -> FloatArray:
-        return np.empty((0, 2)) if self._matcher is None else self._matcher.point_cloud()
+        return NO_POINTS if self._witness is None else self._witness.map_points()

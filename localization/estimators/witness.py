@@ -1,0 +1,76 @@
+"""The LiDAR as a witness of motion: what a scan says about the motion since the last one, by scan and map alone.
+
+Shared by all estimators that fuse. The estimator says where to look and where the last scan was taken (`anchor`), gets a relative motion
+with the covariance that scan and map give it, and says afterwards where the scan belongs in the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from localization.estimators.base import NO_POINTS
+from localization.lidar import LidarConfig, LidarMatcher, body_points
+from localization.steps import Step
+from motion_models import se2
+from motion_models.base import Motion
+from motion_models.robot import Mount
+from motion_models.se2 import FloatArray
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What was seen of the motion since the last scan."""
+
+    motion: Motion
+    is_trusted: bool
+    """The witness is sure of itself: where others contradict it, they are wrong."""
+
+
+class Witness(Protocol):
+    """Something that measures the motion from scan to scan."""
+
+    def look(self, step: Step, anchor: FloatArray, guess: FloatArray) -> Sight | None:
+        """The motion from ``anchor`` (3,), the pose at the last scan, to the scan of ``step``, searched around ``guess`` (3,)."""
+
+    def remember(self, step: Step, pose: FloatArray) -> None:
+        """The scan that was last looked at was taken from ``pose`` (3,)."""
+
+    def map_points(self) -> FloatArray:
+        """(M, 2) what was seen, in the world [m]."""
+
+
+class ScanWitness:
+    """Scan-to-map matching (`LidarMatcher`), and what of it enters the map."""
+
+    def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig | None = None) -> None:
+        self._mounts, self._matcher = mounts, LidarMatcher(config)
+        self._has_map = False
+
+    def look(self, step: Step, anchor: FloatArray, guess: FloatArray) -> Sight | None:
+        assert step.scan is not None
+        points = body_points(step.scan, self._mounts.get(step.scan.frame_id, Mount()), step.twist)
+        found = self._matcher.register(points, step.scan.is_planar, guess, step.predicted.cov)
+        return None if found is None else Sight(Motion(se2.between(anchor, found.pose), found.cov), found.is_trusted)
+
+    def remember(self, step: Step, pose: FloatArray) -> None:
+        if not step.is_standing or not self._has_map:  # a robot that stands sees nothing new, and would only thicken its lines
+            self._matcher.insert(pose)
+            self._has_map = True
+
+    def map_points(self) -> FloatArray:
+        return self._matcher.point_cloud()
+
+
+class NoWitness:
+    """No LiDAR."""
+
+    def look(self, step: Step, anchor: FloatArray, guess: FloatArray) -> Sight | None:
+        return None
+
+    def remember(self, step: Step, pose: FloatArray) -> None:
+        return None
+
+    def map_points(self) -> FloatArray:
+        return NO_POINTS
