@@ -12,13 +12,18 @@ from motion_models.base import MotionModel
 from motion_models.errors import ModelError
 from motion_models.se2 import FloatArray
 
-Form = Literal["none", "constant"]
+Form = Literal["none", "constant", "cg_field"]
 FORMS: tuple[Form, ...] = get_args(Form)
 
 # How differently robots of one type turn on different floors and with other loads: relative for what scales a turn (Clearpath's own
 # multipliers for one Husky range from 1.5 to 1.9; terrains differ by a quarter), absolute [m] for where it turns about.
 _TURNING, _CENTRE_X, _CENTRE_Y = 0.15, 0.05, 0.03
 _FORGOTTEN_AFTER_S = 3600.0
+
+# The rotations of Ebersole 2016, Ch. 4, to which the coefficients of `SkidSteer` were fitted: where the CG was, and the scatter about the
+# fits of k, x_CR and y_CR (`regressions.skid_steer_fit`). The covariance of the fits needs no more.
+_GRID_X, _GRID_Y = np.arange(-3, 7) * 0.02, np.arange(-3, 4) * 0.01
+_SCATTER_K, _SCATTER_X_CR, _SCATTER_Y_CR = 0.014517, 0.011514, 0.0059057
 
 
 @dataclass(frozen=True)
@@ -40,25 +45,63 @@ class Corrections:
     """(k,)"""
     directions: FloatArray
     """(n, k) by the model's n parameters."""
-    sigmas: FloatArray
-    """(k,) at first."""
+    cov: FloatArray
+    """(k, k) at first."""
+    walk_cov: FloatArray
+    """(k, k) growth per second of motion; it may be singular. What does not walk is remembered."""
 
     @property
-    def walks(self) -> FloatArray:
-        """(k,) random walk per square root of a second of motion: after an hour the first uncertainty has come back once more."""
-        return np.asarray(self.sigmas / np.sqrt(_FORGOTTEN_AFTER_S))
+    def sigmas(self) -> FloatArray:
+        """(k,) at first."""
+        return np.asarray(np.sqrt(np.diagonal(self.cov)))
 
 
 def corrections(model: MotionModel, form: Form) -> Corrections:
-    """The corrections of ``form`` to ``model``. Raises `ModelError` for a form that does not exist."""
+    """The corrections of ``form`` to ``model``: none, ``constant``, or ``cg_field``.
+
+    ``constant``: rotation scaling and centre of rotation as numbers that slowly change. ``cg_field``: the coefficients of their regressions
+    on the CG; a model without such regressions has nothing but its constants. Raises `ModelError` for a form that does not exist.
+    """
     if form not in FORMS:
         raise ModelError(f"no form of corrections '{form}'; there are {', '.join(FORMS)}.")
-    found = _constants(model) if form == "constant" else ()
+    if form == "cg_field" and model.name == "skid_steer":
+        return _regressions(model)
+    found = _constants(model) if form != "none" else ()
     directions = np.zeros((len(model.param_names), len(found)))
     for column, correction in enumerate(found):
         for name, rate in correction.along.items():
             directions[model.param_names.index(name), column] = rate
-    return Corrections(tuple(c.name for c in found), directions, np.array([c.sigma for c in found]))
+    sigmas = np.array([c.sigma for c in found])
+    walks = sigmas / np.sqrt(_FORGOTTEN_AFTER_S)  # after an hour the first uncertainty has come back once more
+    return Corrections(tuple(c.name for c in found), directions, np.diag(sigmas**2), np.diag(walks**2))
+
+
+def regression_cov() -> FloatArray:
+    """(11, 11) covariance of the coefficients of `SkidSteer` as the thesis's rotations give them: s^2 (X^T X)^-1 for each regression.
+
+    It is `regressions.skid_steer_fit(table).cov` of its table, of which only the grid of CGs and the scatter are needed.
+    """
+    x, y = (a.ravel() for a in np.meshgrid(_GRID_X, _GRID_Y))
+    reached = ~((x > 0.11) & (np.abs(y) > 0.025))  # the arms did not reach the two outermost corners
+    x, y = x[reached], y[reached]
+    powers = np.stack([np.ones_like(x), x, x**2], axis=-1)
+    designs = (_SCATTER_K, powers), (_SCATTER_X_CR, powers[:, :2]), (_SCATTER_Y_CR, np.hstack([powers, powers * y[:, None]]))
+    cov, at = np.zeros((11, 11)), 0
+    for scatter, design in designs:
+        own = slice(at, at + design.shape[1])
+        cov[own, own] = scatter**2 * np.linalg.inv(design.T @ design)
+        at = own.stop
+    return cov
+
+
+def _regressions(model: MotionModel) -> Corrections:
+    """Every coefficient on its own: what the rotations left open stays learned, what floors and loads change may change again."""
+    n = len(model.param_names)
+    floor = np.zeros((n, 3))
+    floor[0:3, 0] = _TURNING * model.nominal[0:3]  # another floor scales k at every CG
+    floor[3, 1], floor[5, 2] = _CENTRE_X, _CENTRE_Y
+    spread = floor @ floor.T
+    return Corrections(model.param_names, np.eye(n), regression_cov() + spread, spread / _FORGOTTEN_AFTER_S)
 
 
 def _constants(model: MotionModel) -> tuple[Correction, ...]:

@@ -62,7 +62,7 @@ class Ekf:
         self._filter.P = np.zeros((size, size))
         self._filter.P[BIAS, BIAS] = gyro.bias_sigma_rad_per_s**2
         self._filter.P[CLOCK, CLOCK] = self.config.clock_sigma_s**2
-        self._filter.P[PARAMS:, PARAMS:] = np.diag(corrected.sigmas**2)
+        self._filter.P[PARAMS:, PARAMS:] = corrected.cov
         self.correction = np.zeros(len(corrected.names))
         """(k,) what is added to the model's parameters along the corrections' directions."""
 
@@ -102,7 +102,7 @@ class Ekf:
             c = self.config
             P[POSE, POSE] += np.diag([c.nudge_m2_per_s, c.nudge_m2_per_s, c.nudge_rad2_per_s]) * step.duration
         else:
-            P[PARAMS:, PARAMS:] += np.diag(self._corrected.walks**2 * step.duration)
+            P[PARAMS:, PARAMS:] += self._corrected.walk_cov * step.duration
         self._filter.P = P
         self._start = self.pose
         self.pose = se2.compose(self.pose, step.predicted.delta)
