@@ -1,6 +1,6 @@
 """Steps of time that the stiffness of friction does not shorten.
 
-Friction turns over within a thousandth of the wheels' speed: explicit steps (`FrictionDynamics.longest_step`) must stay below some 20 us.
+Friction turns over within a thousandth of the wheels' speed: explicit steps (`FrictionDynamics.longest_step`) must stay below 5 to 20 us.
 These are implicit: Alexander's SDIRK of second order (SIAM J. Numer. Anal. 14, 1977), L-stable and stiffly accurate, solved by Newton's
 method with a line search. Wheels are followed exactly.
 """

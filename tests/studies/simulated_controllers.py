@@ -92,8 +92,8 @@ def main() -> None:
         print(f"{row.trajectory:8} {', '.join(cells)}")
     print(
         "\nWhere it differs: on gentle arcs (arc_1, 2, 4) both controllers of the simulated robot err two to three times as much as the "
-        "real ones:\nthe friction law takes a quarter off k there, and the real floor took less. On the s-curve the simulated robot follows "
-        "its command\nbetter (drive error), while its odometry errs about as much as the real one's (vision error)."
+        "real ones:\nthe friction law takes a quarter off k there, and the real floor took less. On the s-curve the simulated robot "
+        "follows its command\nbetter (drive error), while its odometry errs about as much as the real one's (vision error)."
     )
 
 
