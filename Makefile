@@ -2,6 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := demo-out
+DATA := tests/data
 
 .PHONY: demo test check benchmark clean
 
@@ -10,8 +11,15 @@ DEMO := demo-out
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
+demo: .venv/ready
+	rm -rf $(DEMO)
+	$(BIN)/skidloc replay $(DATA)/husky-outdoor-gps/test1.bag --robot husky_a200 --model diff_drive,skid_steer --out $(DEMO)/husky
+	$(BIN)/skidloc replay $(DATA)/aces/aces.mcap --robot aces --model diff_drive,skid_steer --estimator odometry,lidar,ekf \
+		--reference $(DATA)/aces/aces.relations --out $(DEMO)/aces
+	@echo "Open $(DEMO)/aces/report.html and $(DEMO)/husky/report.html in a browser."
+
 test: .venv/ready
-	$(BIN)/python -m pytest -n 2 -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow"
 
 check: .venv/ready
 	$(BIN)/ruff check .

@@ -32,7 +32,7 @@ Command = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code: 0, 2 for bad input."""
     command = tyro.cli(
-        Command,  # type: ignore[arg-type]  # a union is what tyro takes for subcommands
+        Command,
         prog="skidloc",
         description="Probabilistic odometry for skid-steer robots whose centre of gravity moves.",
         args=arguments,

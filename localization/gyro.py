@@ -11,7 +11,6 @@ import numpy as np
 
 from localization.events import ImuSample
 from motion_models.robot import GyroNoise, Mount
-from motion_models.se2 import FloatArray
 
 _NS = 1e-9
 _LONGEST_GAP_NS, _LONGEST_HOLD_NS = 500_000_000, 100_000_000
@@ -94,7 +93,9 @@ class GyroHistory:
         if not self._contradicts:
             return []
         if self._turned < _TELLING_TURN:
-            return [f"the mount of IMU '{self._frame}' contradicts gravity, and the robot turned too little to tell its axis: it was not used."]
+            return [
+                f"the mount of IMU '{self._frame}' contradicts gravity, and the robot turned too little to tell its axis: it was not used."
+            ]
         axis = ", ".join(f"{value:+.2f}" for value in self._sign * self._axis)
         return [
             f"the mount of IMU '{self._frame}' contradicts gravity: the yaw rate was taken about [{axis}] in the IMU's frame. "

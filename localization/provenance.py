@@ -16,7 +16,7 @@ def versions() -> dict[str, str]:
 
 
 def fingerprint(path: Path) -> str:
-    """Of a log: SHA-256 over names, sizes, and the first and last MiB of each of its files. Reading all of a large bag would take minutes."""
+    """Of a log: SHA-256 over names, sizes, and first and last MiB of its files. Reading all of a large bag would take minutes."""
     digest = hashlib.sha256()
     for file in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
         size = file.stat().st_size

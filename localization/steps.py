@@ -78,6 +78,7 @@ class Stepper:
         self._gyro = GyroHistory(robot.gyro_noise, mounts)
         self._has_lidar = has_lidar
         self._scans: deque[Scan] = deque()
+        self._empty_scans, self._deaf_s = 0, 0.0
         self._start_ns: int | None = None
         self._now_ns = -(1 << 62)
         self.clock_offset_s = 0.0
@@ -95,6 +96,7 @@ class Stepper:
         elif isinstance(event, CgSample):
             self._wheels.set_cg(event)
         elif isinstance(event, Scan):
+            self._empty_scans += not len(event.points)
             self._scans.append(event)
         while (end := self._next_end()) is not None:
             end_ns, scan = end
@@ -115,7 +117,12 @@ class Stepper:
 
     def notes(self) -> list[str]:
         """What was found amiss with the sensors on the way."""
-        return self._gyro.notes()
+        said = self._gyro.notes()
+        if self._empty_scans:
+            said.append(f"{self._empty_scans} scan{'s' * (self._empty_scans > 1)} without a usable point: the wheels carried on alone.")
+        if self._deaf_s > 0.0:
+            said.append(f"no wheels were heard for {self._deaf_s:.1f} s in all: there the motion is a guess with a wide covariance.")
+        return said
 
     def _next_end(self) -> tuple[int, Scan | None] | None:
         if self._scans:
@@ -146,6 +153,7 @@ class Stepper:
             first, last = twist.value[0], twist.value[-1]
             d_clock = last - se2.adjoint(se2.inverse(motion.delta)) @ first
         if missing:
+            self._deaf_s += missing
             lost = np.array([self.config.lost_speed_m_s, self.config.lost_speed_m_s, self.config.lost_rate_rad_s]) * missing
             motion = Motion(motion.delta, motion.cov + np.diag(lost**2), motion.d_params)
         standing = bool(len(dt)) and missing == 0.0 and not rates.any()

@@ -14,7 +14,7 @@ def describe_span(stamps_ns: IntArray) -> str:
     if not len(stamps_ns):
         return "no time at all"
     first, last = int(stamps_ns[0]), int(stamps_ns[-1])
-    return f"{_instant(first)} to {_instant(last)} ({(last - first) * 1e-9:.1f} s)"
+    return f"{describe_instant(first)} to {describe_instant(last)} ({(last - first) * 1e-9:.1f} s)"
 
 
 def no_overlap_message(trajectory_ns: IntArray, reference_ns: IntArray, source: str, n_inside: int) -> str:
@@ -40,7 +40,8 @@ def _cause(trajectory_ns: IntArray, reference_ns: IntArray) -> str:
     return "The reference is probably of another run, or its clock was not set."
 
 
-def _instant(stamp_ns: int) -> str:
+def describe_instant(stamp_ns: int) -> str:
+    """As UTC where the clock is that of the world, else in seconds."""
     seconds = stamp_ns / 1e9
     if _EPOCH_BEGINS_S < seconds < 2e11:
         return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")

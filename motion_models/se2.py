@@ -28,7 +28,7 @@ _SMALL_ANGLE = 1e-4
 def _gufunc(layout: str) -> Callable[[Callable[..., None]], Callable[..., Any]]:
     """A compiled function of pose-like arguments, the last of which is its result, that broadcasts over leading axes."""
     signature = "void(" + ", ".join("float64" + "[:" + ",:" * part.count(",") + "]" for part in _parts(layout)) + ")"
-    decorate = numba.guvectorize([signature], layout, nopython=True, cache=True)
+    decorate: Callable[..., Any] = numba.guvectorize([signature], layout, nopython=True, cache=True)  # type: ignore[no-untyped-call]
     return lambda function: decorate(function).ufunc  # numpy's own object: without numba's Python wrapper around each call
 
 

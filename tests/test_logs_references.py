@@ -235,7 +235,7 @@ def test_info_of_the_husky() -> None:
     by_topic = {topic.topic: topic for topic in info.topics}
     odometry, gps, inertial = by_topic["/husky_velocity_controller/odom"], by_topic["/fix"], by_topic["/imu/data"]
     assert (odometry.count, gps.count, inertial.count) == (3952, 989, 11865)
-    assert (odometry.used_as, gps.used_as, inertial.used_as) == ("wheels", None, "imu")
+    assert (odometry.used_as, gps.used_as, inertial.used_as) == ("wheels", "reference", "imu")
     assert [round(t.rate_hz or 0, 1) for t in (odometry, gps, inertial)] == [10.0, 2.5, 30.0]
     assert info.duration_s == pytest.approx(395.3, abs=0.05)
     assert info.messages == 16806

@@ -9,6 +9,7 @@ from rich.table import Table
 from localization.accuracy import Accuracy, RelationErrors
 from localization.score import Result
 
+_MISSING = "\u2013"  # an en dash
 _Number = Callable[[Result], float | None]
 
 
@@ -44,13 +45,15 @@ _COLUMNS: tuple[tuple[str, str, _Number], ...] = (
 def accuracy_table(results: Sequence[Result], duration_s: float) -> Table:
     """For rich's console."""
     columns = [column for column in _COLUMNS if any(column[2](result) is not None for result in results)]
-    table = Table("model", "estimator", box=None, header_style="bold", pad_edge=False)
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for title in ("model", "estimator"):
+        table.add_column(title, no_wrap=True)
     for title, *_ in columns:
         table.add_column(title, justify="right")
-    table.add_column("x real time", justify="right")
+    table.add_column("speed x", justify="right")
     for result in results:
         numbers = [(number(result), form) for _, form, number in columns]
-        cells = ["–" if number is None else format(number, form) for number, form in numbers]
+        cells = [_MISSING if number is None else format(number, form) for number, form in numbers]
         speed = duration_s / result.run.seconds if result.run.seconds > 0 else None
-        table.add_row(result.run.model, result.run.estimator, *cells, "–" if speed is None else f"{speed:.0f}")
+        table.add_row(result.run.model, result.run.estimator, *cells, _MISSING if speed is None else f"{speed:.0f}")
     return table

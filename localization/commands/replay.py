@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import datetime
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,7 +27,7 @@ from localization.references import ReferenceTrack, Relations, read_reference_fi
 from localization.report import ReportHead, verdict, write_report
 from localization.run import Pair, ReplayConfig, Run, replay
 from localization.score import Result, score
-from localization.timespans import no_overlap_message
+from localization.timespans import describe_instant, no_overlap_message
 from localization.trajectory import write_tum
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
@@ -46,7 +45,7 @@ class Replay:
     robot: str
     """Name of a shipped robot, or path of a robot TOML file."""
     out: Path
-    """New folder for metrics.json, report.html, trajectories (TUM) and fused.mcap, whose /tf is that of the last model and estimator."""
+    """New folder for metrics.json, report.html, trajectories (TUM) and fused.mcap; its /tf is of the last model and estimator."""
     model: str = "diff_drive,skid_steer"
     """Motion models, separated by commas."""
     estimator: str = "odometry,lidar,ekf"
@@ -80,7 +79,7 @@ class Replay:
         head = ReportHead(
             log=log.path.name,
             robot=robot.name,
-            start=_date(log.start_ns),
+            start=describe_instant(log.start_ns),
             duration_s=log.duration_s,
             notes=list(dict.fromkeys([*log.notes(), *(note for run in runs for note in run.notes)])),
             versions=versions(),
@@ -165,7 +164,7 @@ def _as(run: Run, model: str) -> Run:
 
 
 def _distance(results: Sequence[Result]) -> float | None:
-    """By the reference; without one, by the estimate that uses most of what is known, in steps that a standing robot's jitter does not make."""
+    """By the reference; without one, by the last estimate, in steps that a standing robot's jitter does not make."""
     known = [r.accuracy.distance_m for r in results if r.accuracy and r.accuracy.distance_m is not None]
     return known[-1] if known else results[-1].run.trajectory.distance(0.05)
 
@@ -183,16 +182,12 @@ def _estimates(run: Run) -> Iterator[FusedEstimate]:
         )
 
 
-def _date(stamp_ns: int) -> str:
-    return datetime.datetime.fromtimestamp(stamp_ns // 10**9, datetime.UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-
-
 @contextlib.contextmanager
 def _progress(console: Console, log: Log) -> Iterator[tuple[Iterator[Event], Callable[[int], None]]]:
     """The log's events, and what moves the bar as they are used."""
     events = log.events()
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(f"replaying {escape(log.path.name)}", total=max(log.duration_s, 1e-9))
         begin = shown = None
 

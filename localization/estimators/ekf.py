@@ -11,8 +11,9 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from scipy.stats import chi2
 
+from localization.gyro import Turn
 from localization.residuals import motion_residual, turn_residual
-from localization.steps import Step, Turn
+from localization.steps import Step
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.corrections import Corrections
@@ -48,9 +49,7 @@ class EkfConfig:
 class Ekf:
     """State in, state out by `predict` and the `measure_...` methods; each returns the normalised innovation squared (NIS)."""
 
-    def __init__(
-        self, gyro: GyroNoise, corrected: Corrections, config: EkfConfig | None = None, pose: FloatArray | None = None
-    ) -> None:
+    def __init__(self, gyro: GyroNoise, corrected: Corrections, config: EkfConfig | None = None, pose: FloatArray | None = None) -> None:
         self.config = config or EkfConfig()
         self._gyro, self._corrected = gyro, corrected
         self._size = size = PARAMS + len(corrected.names)
@@ -87,7 +86,10 @@ class Ekf:
         return self._gate
 
     def predict(self, step: Step) -> None:
-        """Move by what the wheels say; the error follows e' = Ad(delta^-1) e + (d delta / d clock) e_clock + (d delta / d params) e_params + slip."""
+        """Move by what the wheels say; the error follows
+
+        e' = Ad(delta^-1) e + (d delta / d clock) e_clock + (d delta / d params) e_params + slip.
+        """
         F = np.eye(self._size)
         F[POSE, POSE] = se2.adjoint(se2.inverse(step.predicted.delta))
         F[POSE, CLOCK] = step.d_clock

@@ -81,9 +81,9 @@ class LidarMatcher:
             self._downsampled, self._planar = np.empty((0, 3)), np.empty((0, 2))
             return None
         found, self._downsampled = self._kiss.align(points, _matrix(guess))
-        prior = np.linalg.inv(9.0 * guess_cov + np.diag([1e-6, 1e-6, 1e-8]))
+        prior = np.linalg.inv(9.0 * guess_cov + np.diag([1e-6, 1e-6, 1e-8])).astype(np.float64, copy=False)
         fit = self._lines.fit(self._planar, pose_of_matrix(found), self._options, prior, guess)
-        cov = np.linalg.inv(fit.information + np.diag(_KNOWS_NOTHING**-2))
+        cov = np.linalg.inv(fit.information + np.diag(_KNOWS_NOTHING**-2)).astype(np.float64, copy=False)
         pose = se2.compose(fit.pose, se2.exp(cov @ fit.gradient))
         return Registration(pose, cov, len(self._planar), fit.n_matched, fit.residual_rms)
 

@@ -19,7 +19,7 @@ def body_points(scan: Scan, mount: Mount, twist: FloatArray) -> FloatArray:
     Each point is moved from where the body was when it was measured, at constant ``twist`` (3,) from the stamp on: the true time
     of each point is used, so a sweep that fills only part of the scan period is not over-corrected.
     """
-    points = scan.points @ mount.rotation().T + np.array([mount.x, mount.y, mount.z])
+    points: FloatArray = scan.points @ mount.rotation().T + np.array([mount.x, mount.y, mount.z])
     if len(scan.offsets) and np.any(twist):
         stamp_T_point = se2.exp(scan.offsets[:, None] * twist)
         points[:, :2] = se2.transform(stamp_T_point, points[:, :2])
@@ -41,7 +41,7 @@ def walls(points: FloatArray, cell: float, min_height: float = 0.3) -> FloatArra
 
 
 @numba.njit(cache=True)
-def _walls(points: FloatArray, index: np.ndarray, order: np.ndarray, min_height: float, out: FloatArray) -> int:  # type: ignore[type-arg]  # pragma: no cover
+def _walls(points: FloatArray, index: np.ndarray, order: np.ndarray, min_height: float, out: FloatArray) -> int:  # pragma: no cover
     n, i = 0, 0
     while i < order.shape[0]:
         first = order[i]

@@ -1,0 +1,273 @@
+"""`skidloc replay` from end to end: accuracy on the two real logs, the same bytes twice, and whatever a log may hold."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from localization.cli import main
+from localization.trajectory import read_tum
+from tests import bags, rooms
+
+DATA = Path(__file__).parent / "data"
+ACES, RELATIONS = DATA / "aces" / "aces.mcap", DATA / "aces" / "aces.relations"
+HUSKY = DATA / "husky-outdoor-gps" / "test1.bag"
+
+
+def replay(log, out, *more):
+    return main(["replay", str(log), "--out", str(out), *map(str, more)])
+
+
+def results(out):
+    metrics = json.loads((out / "metrics.json").read_text())
+    return {(r["model"], r["estimator"]): r for r in metrics["results"]}, metrics
+
+
+@pytest.fixture(scope="session")
+def aces(tmp_path_factory):
+    out = tmp_path_factory.mktemp("replay") / "aces"
+    assert replay(ACES, out, "--robot", "aces", "--model", "diff_drive", "--estimator", "odometry,ekf", "--reference", RELATIONS) == 0
+    return out
+
+
+@pytest.fixture(scope="session")
+def husky(tmp_path_factory):
+    out = tmp_path_factory.mktemp("replay") / "husky"
+    assert replay(HUSKY, out, "--robot", "husky_a200") == 0
+    return out
+
+
+@pytest.mark.xdist_group("aces")
+def test_aces_is_better_than_each_of_its_parts(aces):
+    found, metrics = results(aces)
+    odometry, ekf = found["diff_drive", "odometry"], found["diff_drive", "ekf"]
+    assert odometry["relations_all_translation_m"] == pytest.approx(0.549, abs=0.01)  # as measured before this project
+    assert odometry["relations_short_translation_m"] == pytest.approx(0.034, abs=0.001)
+    assert ekf["relations_all_translation_m"] <= 0.085
+    assert ekf["relations_short_translation_m"] <= 0.033
+    assert metrics["duration_s"] == pytest.approx(1365.7, abs=0.2)
+    assert 1.0 < ekf["nis_mean"] < 4.5
+    # no headings in relations and no GPS: numbers that these cannot give are null
+    assert ekf["ate_rmse_m"] is None
+    assert ekf["nees_mean"] is None
+    assert odometry["nis_mean"] is None
+
+
+@pytest.mark.xdist_group("husky")
+def test_husky_with_gyro_beats_its_odometry(husky):
+    found, _ = results(husky)
+    assert set(found) == {(m, e) for m in ("diff_drive", "skid_steer") for e in ("odometry", "ekf")}  # no LiDAR there
+    assert found["diff_drive", "odometry"]["ate_rmse_m"] == pytest.approx(6.99, abs=0.01)
+    for model in ("diff_drive", "skid_steer"):
+        assert found[model, "ekf"]["ate_rmse_m"] <= 2.9
+        assert found[model, "ekf"]["parameters"]["gyro_bias_rad_per_s"][1] > 0.0
+
+
+@pytest.mark.xdist_group("husky")
+def test_two_runs_give_the_same_bytes(husky, tmp_path):
+    again = tmp_path / "again"
+    assert replay(HUSKY, again, "--robot", "husky_a200") == 0
+    names = sorted(path.name for path in husky.iterdir())
+    assert {"metrics.json", "report.html", "fused.mcap", "diff_drive_ekf.tum"} <= set(names)
+    assert names == sorted(path.name for path in again.iterdir())
+    assert [name for name in names if (husky / name).read_bytes() != (again / name).read_bytes()] == []
+
+
+@pytest.mark.xdist_group("husky")
+def test_fused_log_opens_in_two_independent_readers(husky):
+    with AnyReader([husky / "fused.mcap"], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        topics = {c.topic: c.msgcount for c in reader.connections}
+    assert topics["/skid_steer_ekf/odometry"] == topics["/tf"] == len(read_tum(husky / "skid_steer_ekf.tum"))
+    with (husky / "fused.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        message = next(m for _, c, _, m in reader.iter_decoded_messages(topics=["/skid_steer_ekf/odometry"]))
+    assert message.header.frame_id == "odom"
+    assert message.pose.covariance[0] >= 0.0
+
+
+def test_report_needs_nothing_but_itself(tmp_path):
+    log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(5.0))
+    assert replay(log, tmp_path / "out", "--robot", "vaultbot", "--model", "diff_drive", "--estimator", "odometry") == 0
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert "<svg" in report
+    assert 'src="http' not in report
+    assert "log.mcap" in report
+
+
+@pytest.mark.parametrize("form", ["ros1", "sqlite3", "mcap-folder", "mcap"])
+def test_every_format_gives_the_same_estimate(form, tmp_path):
+    log = bags.FORMATS[form](tmp_path / "log", rooms.drive(10.0))
+    assert replay(log, tmp_path / "out", "--robot", "vaultbot", "--model", "diff_drive", "--estimator", "ekf") == 0
+    found, _ = results(tmp_path / "out")
+    assert found["diff_drive", "ekf"]["ate_rmse_m"] < 0.01
+    reference = bags.FORMATS["mcap"](tmp_path / "reference", rooms.drive(10.0))
+    assert replay(reference, tmp_path / "again", "--robot", "vaultbot", "--model", "diff_drive", "--estimator", "ekf") == 0
+    name = "diff_drive_ekf.tum"
+    assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
+
+
+def test_the_filter_learns_how_much_the_wheels_scrub(tmp_path):
+    """The wheels turn 1.5 times as much as the robot; vaultbot's file says 1.875 times."""
+    log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(30.0, multiplier=1.5))
+    assert replay(log, tmp_path / "out", "--robot", "vaultbot", "--model", "diff_drive") == 0
+    found, _ = results(tmp_path / "out")
+    ekf = found["diff_drive", "ekf"]
+    mean, sigma = ekf["parameters"]["wheel_separation_multiplier"]
+    assert abs(mean - 1.5) < 3.0 * sigma
+    assert sigma < 0.1
+    assert ekf["ate_rmse_m"] < 0.1 * found["diff_drive", "odometry"]["ate_rmse_m"]
+    assert ekf["nees_mean"] < 3.0  # these wheels have no noise but their scale: the filter may only be too careful
+
+
+def spoiled(kind):
+    """What may happen to a scan, by name."""
+
+    def spoil(number, scan, log_ns):
+        stamp = scan.header.stamp
+        if kind == "nan" and number % 3 == 0:
+            scan.ranges[::2] = np.nan
+            scan.ranges[1::4] = np.inf
+        elif kind == "all nan" and number % 4 == 1:
+            scan.ranges[:] = np.nan
+        elif kind == "empty" and number % 5 == 2:
+            return bags.laser_scan(log_ns, np.empty(0), frame_id="base_link"), log_ns
+        elif kind == "backwards" and number == 40:
+            stamp.sec -= 3
+        elif kind == "jump" and number == 40:
+            stamp.sec += 7200
+        elif kind == "repeated" and number % 10 == 3:
+            stamp.nanosec, stamp.sec = (log_ns - bags.S // 10) % bags.S, (log_ns - bags.S // 10) // bags.S
+        elif kind == "vanishes" and 30 < number < 70:
+            return None
+        return scan, log_ns
+
+    return spoil
+
+
+@pytest.mark.parametrize("kind", ["nan", "all nan", "empty", "backwards", "jump", "repeated", "vanishes"])
+def test_bad_scans_are_survived(kind, tmp_path, capsys):
+    log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(10.0, multiplier=1.875, spoil=spoiled(kind)))
+    assert replay(log, tmp_path / "out", "--robot", "vaultbot", "--model", "diff_drive", "--estimator", "lidar,ekf") == 0
+    found, _ = results(tmp_path / "out")
+    assert found["diff_drive", "ekf"]["ate_rmse_m"] < 0.05
+    assert np.isfinite(read_tum(tmp_path / "out" / "diff_drive_lidar.tum").poses).all()
+    told = {
+        "backwards": "/scan",
+        "jump": "/scan",
+        "repeated": "/scan",
+        "empty": "without a usable point",
+        "all nan": "without a usable point",
+    }
+    assert told.get(kind, "") in capsys.readouterr().out
+
+
+def test_truncated_bag_is_replayed_as_far_as_it_goes(tmp_path, capsys):
+    log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(20.0))
+    log.write_bytes(log.read_bytes()[: log.stat().st_size * 2 // 3])
+    assert replay(log, tmp_path / "out", "--robot", "vaultbot", "--model", "diff_drive", "--estimator", "ekf") == 0
+    trajectory = read_tum(tmp_path / "out" / "diff_drive_ekf.tum")
+    assert 5.0 < trajectory.duration_s < 19.0
+    assert "left out" in capsys.readouterr().out
+    assert "left out" in " ".join(json.loads((tmp_path / "out" / "metrics.json").read_text())["notes"])
+
+
+def no_such_file(tmp_path):
+    return [str(tmp_path / "nothing.bag"), "--robot", "vaultbot"], "nothing.bag"
+
+
+def not_a_bag(tmp_path):
+    (tmp_path / "text.bag").write_text("hello" * 100)
+    return [str(tmp_path / "text.bag"), "--robot", "vaultbot"], "text.bag"
+
+
+def no_such_topic(tmp_path):
+    log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(2.0))
+    return [str(log), "--robot", "vaultbot", "--topic.scan", "/front/scan"], "/scan"
+
+
+def unknown_joints(tmp_path):
+    records = [
+        ("/joint_states", bags.joint_state(bags.START + i * bags.S, ("a", "b"), (0.0, 0.0)), bags.START + i * bags.S) for i in range(9)
+    ]
+    return [str(bags.write_mcap(tmp_path / "log.mcap", records)), "--robot", "vaultbot"], "front_left_wheel"
+
+
+def one_message(tmp_path):
+    return [str(bags.write_mcap(tmp_path / "log.mcap", rooms.drive(2.0)[:1])), "--robot", "vaultbot"], "one message"
+
+
+def other_times(tmp_path):
+    log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(2.0))
+    (tmp_path / "ref.tum").write_text("".join(f"{i} {i} 0 0 0 0 0 1\n" for i in range(9)))
+    return [str(log), "--robot", "vaultbot", "--reference", str(tmp_path / "ref.tum")], "ref.tum"
+
+
+def no_such_reference(tmp_path):
+    log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(2.0))
+    return [str(log), "--robot", "vaultbot", "--reference", "/mocap/pose"], "/ground_truth/odom"
+
+
+def no_such_model(tmp_path):
+    log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(2.0))
+    return [str(log), "--robot", "vaultbot", "--model", "ackermann"], "skid_steer"
+
+
+def no_such_estimator(tmp_path):
+    log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(2.0))
+    return [str(log), "--robot", "vaultbot", "--estimator", "ukf"], "ekf"
+
+
+def no_such_robot(tmp_path):
+    log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(2.0))
+    return [str(log), "--robot", "r2d2"], "husky_a200"
+
+
+def no_lidar(tmp_path):
+    records = [record for record in rooms.drive(2.0) if record[0] != "/scan"]
+    return [str(bags.write_mcap(tmp_path / "log.mcap", records)), "--robot", "vaultbot", "--estimator", "lidar"], "scans"
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        *(no_such_file, not_a_bag, no_such_topic, unknown_joints, one_message, other_times, no_such_reference),
+        *(no_such_model, no_such_estimator, no_such_robot, no_lidar),
+    ],
+)
+def test_bad_input_is_told_and_nothing_is_written(case, tmp_path, capsys):
+    arguments, hint = case(tmp_path)
+    assert main(["replay", *arguments, "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("skidloc: ")
+    assert hint in said
+    assert not (tmp_path / "out").exists()
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_nothing_is_overwritten(tmp_path, capsys):
+    log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(2.0))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "precious").write_text("1")
+    assert replay(log, tmp_path / "out", "--robot", "vaultbot") == 2
+    assert "exists" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["precious"]
+
+
+def test_without_a_reference_scores_are_null(tmp_path):
+    log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(3.0))
+    assert replay(log, tmp_path / "out", "--robot", "vaultbot", "--model", "diff_drive", "--reference", "none") == 0
+    found, metrics = results(tmp_path / "out")
+    assert metrics["distance_m"] > 0.5
+    for result in found.values():
+        assert result["ate_rmse_m"] is None
+        assert result["end_error_m"] is None
+        assert result["real_time_factor"] is None
+    assert not any(isinstance(v, float) and not math.isfinite(v) for r in found.values() for v in r.values())
