@@ -51,32 +51,34 @@ def drive(wheels, seconds, cg=(0.0, 0.0), body=BODY, config=CONFIG, twist=(0, 0,
 
 @given(st.integers(0, 10**6))
 @settings(max_examples=200, deadline=None)
-def test_on_an_even_floor_its_accelerations_are_those_of_the_friction_dynamics(seed):
+def test_once_its_tyres_have_given_way_its_accelerations_are_those_of_the_rigid_friction_dynamics(seed):
     rng = np.random.default_rng(seed)
     wheels, twist, cg = rng.uniform(-3, 3, 2), rng.uniform(-0.5, 0.5, 3), rng.uniform(-0.1, 0.1, 2)
     expected, margin = PLAIN.accelerations(wheels, twist, Influence.of_cg(cg))
     if margin < 0.02:
-        return  # clipped loads: both are fiction, and which one is arbitrary
-    found, its_margin = accelerations(BODY, CONFIG, wheels, twist, cg)
-    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
-    assert its_margin == pytest.approx(margin, abs=1e-10)
+        return  # clipped loads: a rigid robot's are fiction
+    tilt = cg / [0.26, 0.28]
+    for _ in range(400):
+        found, asked = accelerations(BODY, CONFIG, wheels, twist, cg, tilt)
+        tilt = tilt + 0.2 * (asked - tilt)
+    assert np.abs(asked - tilt).max() < 1e-12
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+    assert 1 - np.abs(tilt).max() == pytest.approx(margin, abs=1e-9)
 
 
 @given(st.integers(0, 10**6))
 @settings(max_examples=100, deadline=None)
-def test_derivatives_are_those_of_differences_while_all_wheels_stand(seed):
+def test_derivatives_are_those_of_differences(seed):
     rng = np.random.default_rng(seed)
-    body = BODY.chassis(CONFIG)._replace(warp=0.1, tread=0.2, creep=0.02, scrub=0.03, height=0.15)
+    body = BODY.chassis(CONFIG)._replace(warp=0.1, tread=0.2, creep=0.02, scrub=0.03)
     now = Now(*rng.uniform(-0.5, 0.5, 2), *rng.uniform(0.5, 1, 4), 118.0, 2.5, *rng.uniform(-0.05, 0.05, 7), 10.0, 5.0)
-    twist, step = rng.uniform(-0.5, 0.5, 3), 1e-7
-    found = change(*twist, now, body)
+    twist, tilt, step = rng.uniform(-0.5, 0.5, 3), rng.uniform(-1.1, 1.1, 2), 1e-7
+    found = change(*twist, *tilt, now, body)
     numeric = np.zeros((3, 3))
     for j in range(3):
-        up, down = (np.array(change(*(twist + sign * step * np.eye(3)[j]), now, body)[:3]) for sign in (1, -1))
+        up, down = (np.array(change(*(twist + sign * step * np.eye(3)[j]), *tilt, now, body)[:3]) for sign in (1, -1))
         numeric[:, j] = (up - down) / (2 * step)
-    if found.margin < 0.2 or np.abs(numeric).max() > 1e5:
-        return
-    np.testing.assert_allclose(np.array(found[4:]).reshape(3, 3), numeric, atol=2e-5 * max(1.0, np.abs(numeric).max()))
+    np.testing.assert_allclose(np.array(found[5:]).reshape(3, 3), numeric, atol=2e-5 * max(1.0, np.abs(numeric).max()))
 
 
 @pytest.mark.parametrize("wheels", [(-1.0, 1.0), (1.0, 2.0), (2.0, 2.0), (0.5, -1.5)])
@@ -93,18 +95,34 @@ def test_the_quasi_static_limit_is_the_closed_solution(wheels, cg):
     assert off[1] < 0.3 * off[0] + 2e-4  # and the rounding of the wheels' rest
 
 
+SMOOTH = {"wheels": (1.0, 3.0), "seconds": 0.2, "cg": (0.05, 0.01), "twist": (0.2, 0.05, 0.4)}
+
+
 def test_steps_converge_with_the_second_order_to_an_explicit_integrator_of_another_order():
-    """Where nothing switches: a robot that slides through its turn on rounded friction."""
-    body, wheels, twist, cg = dataclasses.replace(BODY, cg_height=0.1), (1.0, 3.0), (0.2, 0.05, 0.4), (0.05, 0.01)
-    plain = dataclasses.replace(PLAIN, creep=0.2, cg_height=0.1)
-    exact, _ = plain.advance(np.array([0, 0, 0, *twist]), 0.2, 20_000, np.array(wheels), Influence.of_cg(np.array(cg)))
+    """Where nothing switches: a robot with its CG on the floor that slides through its turn on rounded friction."""
+    body, plain = dataclasses.replace(BODY, cg_height=0.0), dataclasses.replace(PLAIN, creep=0.2, cg_height=0.0)
+    start = np.array([0, 0, 0, *SMOOTH["twist"]])
+    exact, _ = plain.advance(start, 0.2, 20_000, np.array(SMOOTH["wheels"]), Influence.of_cg(np.array(SMOOTH["cg"])))
     steps = np.array([2e-3, 1e-3, 5e-4, 2.5e-4])
-    errors = []
-    for h in steps:
-        config = VehicleConfig(step_s=float(h), creep=0.2)
-        errors.append(np.abs(drive(wheels, 0.2, cg, body, config, twist)[-1, :6] - exact).max())
+    errors = [np.abs(drive(**SMOOTH, body=body, config=VehicleConfig(h, creep=0.2))[-1, :6] - exact).max() for h in steps.tolist()]
     assert np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(2.0, abs=0.15)
     assert errors[-1] < 1e-5
+
+
+def test_steps_converge_with_the_second_order_while_the_loads_shift():
+    exact = drive(**SMOOTH, config=VehicleConfig(1e-5, creep=0.2))[-1, :6]
+    steps = np.array([4e-3, 2e-3, 1e-3, 5e-4])
+    errors = [np.abs(drive(**SMOOTH, config=VehicleConfig(h, creep=0.2))[-1, :6] - exact).max() for h in steps.tolist()]
+    assert np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(2.0, abs=0.2)
+
+
+def test_where_a_rigid_robot_has_no_loads_that_agree_tyres_find_them():
+    """Painleve's paradox: a high CG on a floor that grips much more sideways than along, in a turn that the wheels reverse."""
+    body = BODY.with_param("mu_ratio", 1.5)
+    rows = drive((0.5, 4.4), 3.0, (0.1, 0.0), body, twist=(0.55, -0.1, 0.58))
+    assert np.isfinite(rows).all()
+    rows = drive((3.0, -3.0), 3.0, (0.1, 0.0), body, twist=(0.55, -0.1, 0.58))
+    assert np.isfinite(rows).all()
 
 
 def test_at_the_default_step_a_drive_ends_within_a_millimetre_of_where_it_ends_with_steps_ten_times_smaller():
@@ -222,7 +240,7 @@ def test_a_slope_or_a_payload_beyond_the_wheels_is_refused():
 
 
 def test_a_jerk_that_lifts_wheels_for_a_moment_tips_nobody():
-    rows = drive((0.0, 0.0), 0.3, body=dataclasses.replace(BODY, cg_height=0.31), twist=(0.4, 0.0, 0.0))
+    rows = drive((0.0, 0.0), 0.3, body=dataclasses.replace(BODY, cg_height=0.33), twist=(0.4, 0.0, 0.0))
     assert rows[:, MARGIN].min() < 0.0
     assert np.abs(rows[-1, TWIST]).max() < 1e-3
 

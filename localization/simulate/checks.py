@@ -9,7 +9,18 @@ from typing import Any
 from localization.errors import SimulationError
 
 _POSITIVE = {
-    *("step_s", "motor_lag_s", "acceleration_m_s2", "creep", "gravity", "truth_hz", "hours", "speed_m_s", "field_of_view_deg"),
+    *(
+        "step_s",
+        "motor_lag_s",
+        "acceleration_m_s2",
+        "creep",
+        "gravity",
+        "tyre_lag_s",
+        "truth_hz",
+        "hours",
+        "speed_m_s",
+        "field_of_view_deg",
+    ),
     *("sweep_deg", "max_range_m", "drift_s"),
 }
 _COUNTS = {"beams": 2, "rings": 1, "columns": 2, "laps": 1}

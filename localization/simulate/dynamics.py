@@ -1,7 +1,9 @@
 """The dynamic friction model with a floor under each wheel and a radius for each side, and with its exact derivatives.
 
-The physics are those of `motion_models.friction_dynamics` (Ebersole 2016, 3.15-3.26), and so are the numbers where floor and radii are
-the same everywhere. The derivatives go through the shift of load as well; implicit steps (`stepping`) need them.
+The physics are those of `motion_models.friction_dynamics` (Ebersole 2016, 3.15-3.26), with one thing added: tyres are springs. On a
+rigid robot the loads hang on the forces and the forces on the loads at the same instant, and for a high CG on a grippy floor there may
+be no loads that agree (Painleve's paradox, 1895). Here the loads follow what the forces ask for within a tyre's time; at rest and in
+steady motion they are the same.
 """
 
 from __future__ import annotations
@@ -12,8 +14,6 @@ from typing import NamedTuple
 import numba
 
 from motion_models.friction_kernel import contact, loads, rolling, traction
-
-_CLOSURE_STEPS = 12
 
 
 class Chassis(NamedTuple):
@@ -37,6 +37,8 @@ class Chassis(NamedTuple):
     """Normal to the floor [m/s^2]."""
     creep: float
     rest_speed: float
+    tyre_lag: float
+    """Time in which the loads follow the forces [s]."""
 
 
 class Now(NamedTuple):
@@ -65,12 +67,13 @@ class Now(NamedTuple):
 
 
 class Change(NamedTuple):
-    """Rates of vx, vy, wz, the tipping margin, and the rates' derivatives by vx, vy, wz."""
+    """Rates of vx, vy, wz, the tilts that the forces ask for, and the rates' derivatives by vx, vy, wz at fixed loads."""
 
     x: float
     y: float
     w: float
-    margin: float
+    xi: float
+    eta: float
     x_vx: float
     x_vy: float
     x_wz: float
@@ -83,131 +86,64 @@ class Change(NamedTuple):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def change(vx: float, vy: float, wz: float, now: Now, body: Chassis) -> Change:  # pragma: no cover
-    """Accelerations of the wheelbase's centre in the body frame at the twist ``vx, vy, wz``; see `FrictionDynamics.accelerations`."""
-    mean_square = 0.5 * (now.roll_left * now.roll_left + now.roll_right * now.roll_right)
-    speed = math.sqrt(mean_square + body.rest_speed * body.rest_speed)
-    per = 1.0 / speed
+def change(vx: float, vy: float, wz: float, xi: float, eta: float, now: Now, body: Chassis) -> Change:  # pragma: no cover
+    """Accelerations of the wheelbase's centre in the body frame at the twist ``vx, vy, wz`` and the tilt ``xi, eta``.
 
-    # Of the forces per load: sums over the wheels, plain and with the signs in which the loads depend on xi, eta, t. Rows x, y, m.
-    x_0 = x_xi = x_eta = x_t = y_0 = y_xi = y_eta = y_t = m_0 = m_xi = m_eta = m_t = 0.0
+    The tilt is where the loads' centre lies, as a fraction of the half wheelbase and the half track (see `friction_kernel.loads`);
+    beyond +-1 the wheels of an axle or a side are in the air, and the others carry all.
+    """
+    speed = math.sqrt(0.5 * (now.roll_left * now.roll_left + now.roll_right * now.roll_right) + body.rest_speed * body.rest_speed)
+    per = 1.0 / speed
+    fl, fr, rl, rr, _, _, _ = loads(min(1.0, max(-1.0, xi)), min(1.0, max(-1.0, eta)), body.warp)
+
+    # Forces and yaw moment about the CG per load, and their derivatives by the velocities
+    x = y = m = x_vx = x_vy = x_wz = y_vx = y_vy = y_wz = m_vx = m_vy = m_wz = mean_mu = 0.0
     for left in (True, False):
-        sign_y, roll = (1.0, now.roll_left * per) if left else (-1.0, now.roll_right * per)
-        y = sign_y * body.half_track
-        slip = (vx - y * wz) * per - roll
-        taken, _, _, _ = traction(slip, roll, body.slip_stiffness, body.creep)
+        at_y, roll = (body.half_track, now.roll_left * per) if left else (-body.half_track, now.roll_right * per)
+        slip = (vx - at_y * wz) * per - roll
+        taken, by_slip, _, _ = traction(slip, roll, body.slip_stiffness, body.creep)
         drag = body.rolling_resistance * rolling(roll)[0]  # 3.17
         for ahead in (True, False):
-            sign_x, grip = (1.0, now.grip_fl if left else now.grip_fr) if ahead else (-1.0, now.grip_rl if left else now.grip_rr)
-            x = sign_x * body.half_wheelbase
-            drift = (vy + x * wz) * per
-            whole = 1.0 / math.sqrt(slip * slip + drift * drift + body.creep * body.creep)
-            fx = -body.mu * grip * taken * slip * whole - drag  # 3.15
-            fy = -body.mu * grip * body.side * drift * whole * (1.0 + body.tread * drift * whole)  # 3.16
-            m = (x - now.cg_x) * fy - (y - now.cg_y) * fx
-            x_0, x_xi, x_eta, x_t = x_0 + fx, x_xi + sign_x * fx, x_eta + sign_y * fx, x_t + sign_x * sign_y * fx
-            y_0, y_xi, y_eta, y_t = y_0 + fy, y_xi + sign_x * fy, y_eta + sign_y * fy, y_t + sign_x * sign_y * fy
-            m_0, m_xi, m_eta, m_t = m_0 + m, m_xi + sign_x * m, m_eta + sign_y * m, m_t + sign_x * sign_y * m
-
-    # Loads hang on the accelerations, and these on the loads: 3.21-3.25, linear until a wheel lifts.
-    load = now.mass * (body.gravity + now.cg_az)  # 3.21
-    lean_x, lean_y = 0.25 * body.height / body.half_wheelbase, 0.25 * body.height / body.half_track
-    xi_0, eta_0 = now.cg_x / body.half_wheelbase, now.cg_y / body.half_track  # 3.23, 3.22
-    xi, eta = _inside(xi_0), _inside(eta_0)
-    t = t_xi = t_eta = 0.0
-    for _ in range(_CLOSURE_STEPS):
-        _, _, _, _, t, t_xi, t_eta = loads(xi, eta, body.warp)
-        off_x = xi - xi_0 + lean_x * (x_0 + x_xi * xi + x_eta * eta + x_t * t)
-        off_y = eta - eta_0 + lean_y * (y_0 + y_xi * xi + y_eta * eta + y_t * t)
-        a, b = 1.0 + lean_x * (x_xi + x_t * t_xi), lean_x * (x_eta + x_t * t_eta)
-        c, d = lean_y * (y_xi + y_t * t_xi), 1.0 + lean_y * (y_eta + y_t * t_eta)
-        over = 1.0 / (a * d - b * c)
-        new_xi = _inside(xi - over * (d * off_x - b * off_y))
-        new_eta = _inside(eta - over * (a * off_y - c * off_x))
-        moved = abs(new_xi - xi) + abs(new_eta - eta)
-        xi, eta = new_xi, new_eta
-        if moved < 1e-13:
-            break
-    _, _, _, _, t, t_xi, t_eta = loads(xi, eta, body.warp)
-    share_x = 0.25 * (x_0 + x_xi * xi + x_eta * eta + x_t * t)
-    share_y = 0.25 * (y_0 + y_xi * xi + y_eta * eta + y_t * t)
-    share_m = 0.25 * (m_0 + m_xi * xi + m_eta * eta + m_t * t)
-    mean_mu = 0.25 * body.mu * (now.grip_fl + now.grip_fr + now.grip_rl + now.grip_rr)
+            at_x = body.half_wheelbase if ahead else -body.half_wheelbase
+            if left:
+                share, grip = (fl, now.grip_fl) if ahead else (rl, now.grip_rl)
+            else:
+                share, grip = (fr, now.grip_fr) if ahead else (rr, now.grip_rr)
+            n = share * body.mu * grip
+            fx, fy, xs, xd, ys, yd = contact(slip, (vy + at_x * wz) * per, taken, by_slip, body.side, body.tread, body.creep)
+            fx, fy = n * fx - share * drag, n * fy  # 3.15, 3.16
+            xs, xd, ys, yd = n * per * xs, n * per * xd, n * per * ys, n * per * yd
+            xw, yw = at_x * xd - at_y * xs, at_x * yd - at_y * ys
+            arm_x, arm_y = at_x - now.cg_x, at_y - now.cg_y
+            x, y, m, mean_mu = x + fx, y + fy, m + arm_x * fy - arm_y * fx, mean_mu + n
+            x_vx, x_vy, x_wz = x_vx + xs, x_vy + xd, x_wz + xw
+            y_vx, y_vy, y_wz = y_vx + ys, y_vy + yd, y_wz + yw
+            m_vx, m_vy, m_wz = m_vx + arm_x * ys - arm_y * xs, m_vy + arm_x * yd - arm_y * xd, m_wz + arm_x * yw - arm_y * xw
     spin = wz * body.half_track * per
     whole = 1.0 / math.sqrt(spin * spin + body.creep * body.creep)
-    share_m -= mean_mu * body.scrub * spin * whole
-    margin = 1.0 - max(abs(xi_0 - 4.0 * lean_x * share_x), abs(eta_0 - 4.0 * lean_y * share_y))
+    m -= mean_mu * body.scrub * spin * whole
+    m_wz -= mean_mu * body.scrub * body.half_track * per * body.creep * body.creep * whole * whole * whole
 
-    # Derivatives: of the forces at these loads, then by the loads, which move so that off_x and off_y stay zero.
-    fx_vx = fx_vy = fx_wz = fy_vx = fy_vy = fy_wz = fm_vx = fm_vy = fm_wz = 0.0
-    for left in (True, False):
-        sign_y, roll = (1.0, now.roll_left * per) if left else (-1.0, now.roll_right * per)
-        y = sign_y * body.half_track
-        slip = (vx - y * wz) * per - roll
-        taken, by_slip, _, _ = traction(slip, roll, body.slip_stiffness, body.creep)
-        for ahead in (True, False):
-            sign_x, grip = (1.0, now.grip_fl if left else now.grip_fr) if ahead else (-1.0, now.grip_rl if left else now.grip_rr)
-            x = sign_x * body.half_wheelbase
-            n = 0.25 * (1.0 + sign_x * xi + sign_y * eta + sign_x * sign_y * t) * body.mu * grip * per
-            _, _, xs, xd, ys, yd = contact(slip, (vy + x * wz) * per, taken, by_slip, body.side, body.tread, body.creep)
-            xs, xd, ys, yd = n * xs, n * xd, n * ys, n * yd
-            x_w, y_w = x * xd - y * xs, x * yd - y * ys
-            at_x, at_y = x - now.cg_x, y - now.cg_y
-            fx_vx, fx_vy, fx_wz = fx_vx + xs, fx_vy + xd, fx_wz + x_w
-            fy_vx, fy_vy, fy_wz = fy_vx + ys, fy_vy + yd, fy_wz + y_w
-            fm_vx, fm_vy, fm_wz = fm_vx + at_x * ys - at_y * xs, fm_vy + at_x * yd - at_y * xd, fm_wz + at_x * y_w - at_y * x_w
-    fm_wz -= mean_mu * body.scrub * body.half_track * per * body.creep * body.creep * whole * whole * whole
-    a, b = 1.0 + lean_x * (x_xi + x_t * t_xi), lean_x * (x_eta + x_t * t_eta)
-    c, d = lean_y * (y_xi + y_t * t_xi), 1.0 + lean_y * (y_eta + y_t * t_eta)
-    over = 1.0 / (a * d - b * c)
-    by_xi = 0.25 * (x_xi + x_t * t_xi), 0.25 * (y_xi + y_t * t_xi), 0.25 * (m_xi + m_t * t_xi)
-    by_eta = 0.25 * (x_eta + x_t * t_eta), 0.25 * (y_eta + y_t * t_eta), 0.25 * (m_eta + m_t * t_eta)
-    xi_vx, eta_vx = _tilt(fx_vx, fy_vx, lean_x, lean_y, a, b, c, d, over)
-    xi_vy, eta_vy = _tilt(fx_vy, fy_vy, lean_x, lean_y, a, b, c, d, over)
-    xi_wz, eta_wz = _tilt(fx_wz, fy_wz, lean_x, lean_y, a, b, c, d, over)
-    fx_vx, fy_vx, fm_vx = _with(fx_vx, fy_vx, fm_vx, xi_vx, eta_vx, by_xi, by_eta)
-    fx_vy, fy_vy, fm_vy = _with(fx_vy, fy_vy, fm_vy, xi_vy, eta_vy, by_xi, by_eta)
-    fx_wz, fy_wz, fm_wz = _with(fx_wz, fy_wz, fm_wz, xi_wz, eta_wz, by_xi, by_eta)
-
-    # 3.24-3.26, then 3.18 and 3.19 solved for the base
+    # 3.21-3.23: what the forces ask of the loads. 3.24-3.26, then 3.18 and 3.19 solved for the base.
+    load = now.mass * (body.gravity + now.cg_az)
     p, i = load / now.mass, load / now.inertia
-    alpha = i * share_m
+    alpha = i * m
     x_g, y_g = now.cg_x, now.cg_y
-    base_x = p * share_x + now.force_x / now.mass - now.cg_ax + y_g * alpha + 2.0 * now.cg_vy * wz + x_g * wz * wz + vy * wz
-    base_y = p * share_y + now.force_y / now.mass - now.cg_ay - x_g * alpha - 2.0 * now.cg_vx * wz + y_g * wz * wz - vx * wz
+    base_x = p * x + now.force_x / now.mass - now.cg_ax + y_g * alpha + 2.0 * now.cg_vy * wz + x_g * wz * wz + vy * wz
+    base_y = p * y + now.force_y / now.mass - now.cg_ay - x_g * alpha - 2.0 * now.cg_vx * wz + y_g * wz * wz - vx * wz
     return Change(
         base_x,
         base_y,
         alpha,
-        margin,
-        p * fx_vx + y_g * i * fm_vx,
-        p * fx_vy + y_g * i * fm_vy + wz,
-        p * fx_wz + y_g * i * fm_wz + 2.0 * now.cg_vy + 2.0 * x_g * wz + vy,
-        p * fy_vx - x_g * i * fm_vx - wz,
-        p * fy_vy - x_g * i * fm_vy,
-        p * fy_wz - x_g * i * fm_wz - 2.0 * now.cg_vx + 2.0 * y_g * wz - vx,
-        i * fm_vx,
-        i * fm_vy,
-        i * fm_wz,
+        (x_g - body.height * x) / body.half_wheelbase,
+        (y_g - body.height * y) / body.half_track,
+        p * x_vx + y_g * i * m_vx,
+        p * x_vy + y_g * i * m_vy + wz,
+        p * x_wz + y_g * i * m_wz + 2.0 * now.cg_vy + 2.0 * x_g * wz + vy,
+        p * y_vx - x_g * i * m_vx - wz,
+        p * y_vy - x_g * i * m_vy,
+        p * y_wz - x_g * i * m_wz - 2.0 * now.cg_vx + 2.0 * y_g * wz - vx,
+        i * m_vx,
+        i * m_vy,
+        i * m_wz,
     )
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _inside(share: float) -> float:  # pragma: no cover
-    return min(1.0, max(-1.0, share))
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _tilt(
-    fx: float, fy: float, lean_x: float, lean_y: float, a: float, b: float, c: float, d: float, over: float
-) -> tuple[float, float]:  # pragma: no cover
-    """How xi and eta move with a velocity by which the shares of force change by ``fx`` and ``fy`` at fixed loads."""
-    off_x, off_y = 4.0 * lean_x * fx, 4.0 * lean_y * fy
-    return -over * (d * off_x - b * off_y), -over * (a * off_y - c * off_x)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _with(
-    x: float, y: float, m: float, xi: float, eta: float, by_xi: tuple[float, float, float], by_eta: tuple[float, float, float]
-) -> tuple[float, float, float]:  # pragma: no cover
-    return x + by_xi[0] * xi + by_eta[0] * eta, y + by_xi[1] * xi + by_eta[1] * eta, m + by_xi[2] * xi + by_eta[2] * eta

@@ -24,20 +24,20 @@ _HALVINGS = 10
 
 @numba.njit(cache=True, error_model="numpy")
 def implicit_stage(
-    guess: tuple[float, float, float], base: tuple[float, float, float], h: float, now: Now, body: Chassis
-) -> tuple[float, float, float, float, bool]:  # pragma: no cover
-    """The twist V = ``base`` + ``h`` change(V), searched from ``guess``; its tipping margin, and whether it was found."""
+    guess: tuple[float, float, float], base: tuple[float, float, float], h: float, xi: float, eta: float, now: Now, body: Chassis
+) -> tuple[float, float, float, float, float, bool]:  # pragma: no cover
+    """The twist V = ``base`` + ``h`` change(V), searched from ``guess``; the tilts that its forces ask for, and whether it was found."""
     arm2 = body.half_track * body.half_track
     vx, vy, wz = guess
     dx = dy = dw = 0.0
-    fraction, left, margin = 1.0, math.inf, 0.0
+    fraction, left, to_xi, to_eta = 1.0, math.inf, xi, eta
     for _ in range(_NEWTON_STEPS):
         x, y, w = vx + fraction * dx, vy + fraction * dy, wz + fraction * dw
-        k = change(x, y, w, now, body)
+        k = change(x, y, w, xi, eta, now, body)
         rx, ry, rw = base[0] + h * k.x - x, base[1] + h * k.y - y, base[2] + h * k.w - w
         error = rx * rx + ry * ry + rw * rw * arm2
         if error < (1.0 - 1e-4 * fraction) * left or error < 1e-26:
-            vx, vy, wz, left, margin = x, y, w, error, k.margin
+            vx, vy, wz, left, to_xi, to_eta = x, y, w, error, k.xi, k.eta
             a00, a01, a02 = 1.0 - h * k.x_vx, -h * k.x_vy, -h * k.x_wz
             a10, a11, a12 = -h * k.y_vx, 1.0 - h * k.y_vy, -h * k.y_wz
             a20, a21, a22 = -h * k.w_vx, -h * k.w_vy, 1.0 - h * k.w_wz
@@ -47,13 +47,13 @@ def implicit_stage(
             dy = over * (c10 * rx + (a00 * a22 - a02 * a20) * ry + (a02 * a10 - a00 * a12) * rw)
             dw = over * (c20 * rx + (a01 * a20 - a00 * a21) * ry + (a00 * a11 - a01 * a10) * rw)
             if max(abs(dx), abs(dy), abs(dw) * body.half_track) < _CLOSE:
-                return vx + dx, vy + dy, wz + dw, margin, True
+                return vx + dx, vy + dy, wz + dw, to_xi, to_eta, True
             fraction = 1.0
         else:
             fraction *= 0.4
             if fraction < 1e-4:
                 break
-    return vx, vy, wz, margin, False
+    return vx, vy, wz, to_xi, to_eta, False
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -89,8 +89,10 @@ def drive(
     lag: float,
     ramp: float,
 ) -> int:  # pragma: no cover
-    """Change ``state`` (12,), fill ``out`` (n, 13); the index of the step that failed, or -1."""
+    """Change ``state`` (16,), fill ``out`` (n, 13); the index of the step that failed, or -1."""
     targets, slopes = np.empty(2), np.empty(2)
+    if math.isnan(state[12]):  # at first the loads are those of standing
+        state[12], state[13] = cg[0, 0] / body.half_wheelbase, cg[0, 1] / body.half_track
     for k in range(wheels.shape[0]):
         for j in range(2):
             targets[j] = state[10 + j]
@@ -106,13 +108,13 @@ def drive(
                 _grip(state[0] - fx - lx, state[1] - fy - ly, patches),
             )
         # Where Newton's method does not settle, the step is cut in pieces.
-        pieces, margin = 1, -2.0
+        pieces, found = 1, False
         for _ in range(_HALVINGS):
-            margin = _step(state, targets, slopes, cg[k], h, pieces, mass, inertia, along, yields, grips, body, lag)
-            if margin > -2.0:
+            found = _step(state, targets, slopes, cg[k], h, pieces, mass, inertia, along, yields, grips, body, lag)
+            if found:
                 break
             pieces *= 2
-        if not margin > -2.0:
+        if not found:
             return k
         for j in range(2):
             state[10 + j] = targets[j] + slopes[j] * h
@@ -121,7 +123,7 @@ def drive(
         out[k, 3], out[k, 4], out[k, 5] = _sheared(vx, vy, wz, yields)
         out[k, 10] = cg[k, 0] + h * (cg[k, 2] + 0.5 * h * cg[k, 4])
         out[k, 11] = cg[k, 1] + h * (cg[k, 3] + 0.5 * h * cg[k, 5])
-        out[k, 12] = margin
+        out[k, 12] = 1.0 - max(abs(state[12]), abs(state[13]))
     return -1
 
 
@@ -145,15 +147,21 @@ def _step(
     grips: tuple[float, float, float, float],
     body: Chassis,
     lag: float,
-) -> float:  # pragma: no cover
-    """One step in ``pieces``: changes the first ten of ``state`` and returns the least tipping margin; -3 and no change on failure."""
-    h, least = whole / pieces, 1.0
+) -> bool:  # pragma: no cover
+    """One step in ``pieces``: changes ``state`` but for the set points; or leaves it as it is and says that it failed.
+
+    The tilt follows explicitly (a Runge-Kutta method of second order with the same stages), which its time constant allows.
+    """
+    h = whole / pieces
+    xi, eta, rate_xi, rate_eta = state[12], state[13], state[14], state[15]
+    late = 0.5 / GAMMA
     x, y, theta, vx, vy, wz = state[0], state[1], state[2], state[3], state[4], state[5]
     q_l, q_r, a_l, a_r = state[6], state[7], state[8], state[9]
     for i in range(pieces):
         v_0 = (vx, vy, wz)
         base, guess = v_0, v_0
         rate_x = rate_y = rate_w = 0.0
+        xi_0, eta_0, first_xi, first_eta = xi, eta, rate_xi, rate_eta
         from_x, from_y, from_theta = x, y, theta
         by_x = by_y = by_theta = 0.0
         for stage in range(2):
@@ -185,10 +193,18 @@ def _step(
             if stage == 1:
                 more = (1.0 - GAMMA) * h
                 base = v_0[0] + more * rate_x, v_0[1] + more * rate_y, v_0[2] + more * rate_w
-            u, v, w, margin, found = implicit_stage(guess, base, GAMMA * h, now, body)
-            if not found or not margin > -2.0:
-                return -3.0
-            least = min(least, margin)
+            if math.isnan(first_xi):  # only at the very start: afterwards the rate is known from the step before
+                asked = change(vx, vy, wz, xi, eta, now, body)
+                first_xi, first_eta = (asked.xi - xi) / body.tyre_lag, (asked.eta - eta) / body.tyre_lag
+            if stage == 0:
+                xi, eta = xi_0 + GAMMA * h * first_xi, eta_0 + GAMMA * h * first_eta
+            else:
+                xi = xi_0 + h * ((1.0 - late) * first_xi + late * rate_xi)
+                eta = eta_0 + h * ((1.0 - late) * first_eta + late * rate_eta)
+            u, v, w, to_xi, to_eta, found = implicit_stage(guess, base, GAMMA * h, xi, eta, now, body)
+            if not found:
+                return False
+            rate_xi, rate_eta = (to_xi - xi) / body.tyre_lag, (to_eta - eta) / body.tyre_lag
             rate_x, rate_y, rate_w = (u - base[0]) / (GAMMA * h), (v - base[1]) / (GAMMA * h), (w - base[2]) / (GAMMA * h)
             if stage == 1:
                 more = (1.0 - GAMMA) * h
@@ -201,7 +217,8 @@ def _step(
         vx, vy, wz = guess
         x, y, theta = from_x + GAMMA * h * by_x, from_y + GAMMA * h * by_y, from_theta + GAMMA * h * by_theta
     state[0], state[1], state[2], state[3], state[4], state[5] = x, y, theta, vx, vy, wz
+    state[12], state[13], state[14], state[15] = xi, eta, rate_xi, rate_eta
     q_l, turned_l = follow(state[6], targets[0], slopes[0], lag, whole)
     q_r, turned_r = follow(state[7], targets[1], slopes[1], lag, whole)
     state[6], state[7], state[8], state[9] = q_l, q_r, a_l + turned_l, a_r + turned_r
-    return least
+    return True

@@ -33,6 +33,8 @@ class VehicleConfig:
     """How fast the controller lets the wheels' speed change [m/s^2]."""
     creep: float = 1e-3
     """Slip at which friction is fully there, as a fraction of the wheels' speed [-]."""
+    tyre_lag_s: float = 0.02
+    """Time in which the wheels' loads follow the forces: that of the robot bouncing on its tyres [s]."""
     gravity: float = 9.81
     """[m/s^2]"""
 
@@ -95,6 +97,7 @@ class Body:
             gravity=config.gravity * math.cos(self.slope),
             creep=config.creep,
             rest_speed=0.01,
+            tyre_lag=config.tyre_lag_s,
         )
 
 
@@ -105,13 +108,14 @@ class VehicleState:
     steps: int
     """Steps since the start of the simulation."""
     numbers: FloatArray
-    """(12,) pose, twist of the contacts, wheel rates, wheel angles, the speed controller's set points of left and right."""
+    """(16,) pose, twist of the contacts, wheel rates, wheel angles, the speed controller's set points of left and right, tilt of the
+    loads and its rate (NaN before the first step)."""
     on_two_wheels: int = 0
     """For how many steps now the tipping margin has been negative."""
 
     @classmethod
     def at(cls, pose: FloatArray) -> VehicleState:
-        return cls(0, np.concatenate([pose, np.zeros(9)]).astype(float))
+        return cls(0, np.concatenate([pose, np.zeros(9), np.full(4, np.nan)]).astype(float))
 
     @property
     def pose(self) -> FloatArray:
@@ -182,11 +186,14 @@ def advance(
     return out
 
 
-def accelerations(body: Body, config: VehicleConfig, wheels: FloatArray, twist: FloatArray, cg: FloatArray) -> tuple[FloatArray, float]:
-    """Rate of change (3,) of ``twist`` (3,) at wheel rates ``wheels`` (2,) and a resting CG (2,), and the tipping margin."""
+def accelerations(
+    body: Body, config: VehicleConfig, wheels: FloatArray, twist: FloatArray, cg: FloatArray, tilt: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Rate of change (3,) of ``twist`` (3,) at wheel rates ``wheels`` (2,), a resting CG (2,) and loads tilted by ``tilt`` (2,); and the
+    tilt (2,) that the forces ask for."""
     now = Now(
         *(body.radius_left * wheels[0], body.radius_right * wheels[1], 1.0, 1.0, 1.0, 1.0, body.mass, body.inertia),
         *(cg[0], cg[1], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     )
-    found = change(twist[0], twist[1], twist[2], now, body.chassis(config))
-    return np.array([found.x, found.y, found.w]), found.margin
+    found = change(twist[0], twist[1], twist[2], tilt[0], tilt[1], now, body.chassis(config))
+    return np.array([found.x, found.y, found.w]), np.array([found.xi, found.eta])
