@@ -31,15 +31,15 @@ Command = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code: 0, 2 for bad input."""
-    command = tyro.cli(
-        Command,
-        prog="skidloc",
-        description="Probabilistic odometry for skid-steer robots whose centre of gravity moves.",
-        args=arguments,
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
     complaints = Console(stderr=True, soft_wrap=True, highlight=False)
     try:
+        command = tyro.cli(
+            Command,
+            prog="skidloc",
+            description="Probabilistic odometry for skid-steer robots whose centre of gravity moves.",
+            args=arguments,
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
         command.run(Console(highlight=False))
     except SkidlocError as error:
         complaints.print(f"skidloc: {error}", markup=False)

@@ -10,11 +10,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from localization.errors import LogError
-from localization.estimators import Estimate, EstimatorConfig, make_estimator
+from localization.estimators import CORRECTING, Estimate, EstimatorConfig, make_estimator
 from localization.events import Event
 from localization.steps import Step, StepConfig, Stepper
 from localization.trajectory import IntArray, Trajectory
 from motion_models.base import MotionModel
+from motion_models.corrections import Form
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
@@ -43,6 +44,8 @@ class Run:
     """What was found amiss with the sensors on the way."""
     seconds: float
     """Computing time of this pair, without reading the log."""
+    corrections: str | None = None
+    """Form of the corrections to the motion model, or None where the estimator makes none."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,8 @@ class Pair:
 
     model: MotionModel
     estimator: str
+    corrections: Form = "constant"
+    """What a fusing estimator learns of the motion model: nothing, its k and centre of rotation, or their fields over the CG."""
 
 
 def replay(
@@ -90,7 +95,7 @@ class _Lane:
     def __init__(self, pair: Pair, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig) -> None:
         self._pair, self._records = pair, _Records()
         self._stepper = Stepper(pair.model, robot, mounts, has_lidar, config.step)
-        self._estimator = make_estimator(pair.estimator, pair.model, robot, mounts, has_lidar, config.estimator)
+        self._estimator = make_estimator(pair.estimator, pair.model, pair.corrections, robot, mounts, has_lidar, config.estimator)
         self._seconds = 0.0
 
     def push(self, event: Event) -> None:
@@ -127,6 +132,7 @@ class _Lane:
             self._estimator.map_points(),
             self._stepper.notes(),
             self._seconds,
+            self._pair.corrections if self._pair.estimator in CORRECTING else None,
         )
 
 

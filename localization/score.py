@@ -41,7 +41,8 @@ class Result:
         first = ("ate_rmse_m", "ate_rmse_deg", "rpe_translation_percent", "rpe_rotation_deg_per_m", "end_error_m")
         return {
             "model": self.run.model,
-            "estimator": self.run.estimator,
+            "estimator": self.run.estimator.removesuffix(f"_{self.run.corrections}"),
+            "corrections": self.run.corrections,
             **{name: numbers.pop(name) for name in first},
             "nees_mean": self.nees_mean,
             "nis_mean": self.nis_mean,

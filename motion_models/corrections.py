@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -56,14 +56,21 @@ class Corrections:
         return np.asarray(np.sqrt(np.diagonal(self.cov)))
 
 
+def check_forms(names: Sequence[str]) -> list[Form]:
+    """``names`` as forms. Raises `ModelError` for one that does not exist."""
+    for name in names:
+        if name not in FORMS:
+            raise ModelError(f"no form of corrections '{name}'; there are {', '.join(FORMS)}.")
+    return [form for name in names for form in FORMS if form == name]
+
+
 def corrections(model: MotionModel, form: Form) -> Corrections:
     """The corrections of ``form`` to ``model``: none, ``constant``, or ``cg_field``.
 
     ``constant``: rotation scaling and centre of rotation as numbers that slowly change. ``cg_field``: the coefficients of their regressions
     on the CG; a model without such regressions has nothing but its constants. Raises `ModelError` for a form that does not exist.
     """
-    if form not in FORMS:
-        raise ModelError(f"no form of corrections '{form}'; there are {', '.join(FORMS)}.")
+    check_forms([form])
     if form == "cg_field" and model.name == "skid_steer":
         return _regressions(model)
     found = _constants(model) if form != "none" else ()

@@ -18,7 +18,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from localization.commands.accuracy_table import accuracy_table
 from localization.commands.common import check_new, new_folder, write_json
 from localization.errors import EvaluationError
-from localization.estimators import check_estimator
+from localization.estimators import CORRECTING, check_estimator
 from localization.events import Event
 from localization.logs import Log, TopicOverrides, open_log
 from localization.logs.fused import FusedEstimate, write_fused
@@ -29,6 +29,7 @@ from localization.run import Pair, ReplayConfig, Run, replay
 from localization.score import Result, score
 from localization.timespans import describe_instant, no_overlap_message
 from localization.trajectory import write_tum
+from motion_models.corrections import check_forms
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
 
@@ -50,6 +51,9 @@ class Replay:
     """Motion models, separated by commas."""
     estimator: str = "odometry,lidar,ekf"
     """Estimators, separated by commas; `lidar` is left out where the log has no scans, unless asked for."""
+    corrections: str = "constant"
+    """What ekf and graph learn of the motion model, forms separated by commas: none, constant (k and centre of rotation as slowly
+    changing constants), cg_field (their regressions on the centre of gravity, remembered from posture to posture)."""
     reference: str | None = None
     """Topic of the log, or file (.tum, .relations), to score against; `none` for no score. Default: the robot file's topic if the log has it."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
@@ -67,14 +71,25 @@ class Replay:
         log = open_log(self.log, robot, self.topic)
         has_lidar = log.sources.lidar is not None
         models = [make_model(name, robot) for name in _names(self.model)]
-        pairs = [Pair(model, estimator) for estimator in self._estimators(has_lidar) for model in models]
+        forms = _names(self.corrections)
+        pairs = [
+            Pair(model, estimator, form)
+            for estimator in self._estimators(has_lidar)
+            for model in models
+            for form in check_forms(forms)[: None if estimator in CORRECTING else 1]
+        ]
         reference = self._reference(log)
         # the LiDAR alone asks no motion model: it runs once, and counts for each
         once = [p for p in pairs if p.estimator != _WHEELLESS or p.model is models[0]]
         with _progress(console, log) as (events, on_event):
             found = replay(events, once, robot, log.mounts, has_lidar, self.config, on_event)
-        by_pair = {(run.model, run.estimator): run for run in found}
-        runs = [by_pair.get((p.model.name, p.estimator)) or _as(by_pair[models[0].name, p.estimator], p.model.name) for p in pairs]
+        by_pair = {(p.model.name, p.estimator, p.corrections): run for p, run in zip(once, found, strict=True)}
+        runs = []
+        for p in pairs:
+            run = by_pair.get((p.model.name, p.estimator, p.corrections)) or by_pair[models[0].name, p.estimator, p.corrections]
+            several = run.corrections is not None and len(forms) > 1
+            label = f"{p.estimator}_{p.corrections}" if several else p.estimator
+            runs.append(dataclasses.replace(run, model=p.model.name, estimator=label))
         results = score(runs, reference)
         head = ReportHead(
             log=log.path.name,
@@ -157,10 +172,6 @@ def check_overlap(reference: ReferenceTrack | Relations, log: Log) -> None:
 
 def _names(text: str) -> list[str]:
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
-
-
-def _as(run: Run, model: str) -> Run:
-    return dataclasses.replace(run, model=model)
 
 
 def _distance(results: Sequence[Result]) -> float | None:

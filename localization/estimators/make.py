@@ -10,10 +10,11 @@ from localization.estimators.base import Estimator
 from localization.estimators.dead_reckoning import DeadReckoning
 from localization.estimators.ekf import EkfConfig
 from localization.estimators.fusion import EkfFusion
+from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.estimators.lidar_alone import LidarAlone
 from localization.lidar import LidarConfig
 from motion_models.base import MotionModel
-from motion_models.corrections import Form, corrections
+from motion_models.corrections import Corrections, Form, corrections
 from motion_models.robot import Mount, Robot
 
 
@@ -22,20 +23,25 @@ class EstimatorConfig:
     """Settings of all estimators."""
 
     ekf: EkfConfig = field(default_factory=EkfConfig)
+    graph: GraphConfig = field(default_factory=GraphConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig)
-    corrections: Form = "constant"
-    """What the filter learns of the motion model: nothing, or its k and centre of rotation as slowly changing constants."""
 
 
-_Maker = Callable[[MotionModel, Robot, Mapping[str, Mount], bool, EstimatorConfig], Estimator]
+_Maker = Callable[[MotionModel, Corrections, Robot, Mapping[str, Mount], bool, EstimatorConfig], Estimator]
 
 ESTIMATORS: Mapping[str, _Maker] = {
-    "odometry": lambda model, robot, mounts, has_lidar, config: DeadReckoning(),
-    "lidar": lambda model, robot, mounts, has_lidar, config: LidarAlone(mounts, config.lidar),
-    "ekf": lambda model, robot, mounts, has_lidar, config: EkfFusion(
-        model, corrections(model, config.corrections), robot, mounts, has_lidar, config.ekf, config.lidar
+    "odometry": lambda model, corrected, robot, mounts, has_lidar, config: DeadReckoning(),
+    "lidar": lambda model, corrected, robot, mounts, has_lidar, config: LidarAlone(mounts, config.lidar),
+    "ekf": lambda model, corrected, robot, mounts, has_lidar, config: EkfFusion(
+        model, corrected, robot, mounts, has_lidar, config.ekf, config.lidar
+    ),
+    "graph": lambda model, corrected, robot, mounts, has_lidar, config: GraphFusion(
+        model, corrected, robot, mounts, has_lidar, config.graph, config.ekf, config.lidar
     ),
 }
+
+CORRECTING = ("ekf", "graph")
+"""Those that correct the motion model on the way."""
 
 
 def check_estimator(name: str, has_lidar: bool) -> None:
@@ -43,12 +49,20 @@ def check_estimator(name: str, has_lidar: bool) -> None:
     if name not in ESTIMATORS:
         raise EstimatorError(f"no estimator '{name}'; there are {', '.join(ESTIMATORS)}.")
     if name == "lidar" and not has_lidar:
-        raise EstimatorError("the estimator 'lidar' needs scans, and there are none in this log. Use odometry or ekf, or pass --topic.scan.")
+        raise EstimatorError(
+            "the estimator 'lidar' needs scans, and there are none in this log. Use odometry, ekf or graph, or pass --topic.scan."
+        )
 
 
 def make_estimator(
-    name: str, model: MotionModel, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: EstimatorConfig | None = None
+    name: str,
+    model: MotionModel,
+    form: Form,
+    robot: Robot,
+    mounts: Mapping[str, Mount],
+    has_lidar: bool,
+    config: EstimatorConfig | None = None,
 ) -> Estimator:
-    """The estimator ``name`` at the origin. Raises what `check_estimator` does."""
+    """The estimator ``name`` at the origin, with corrections of ``form``. Raises what `check_estimator` and `corrections` do."""
     check_estimator(name, has_lidar)
-    return ESTIMATORS[name](model, robot, mounts, has_lidar, config or EstimatorConfig())
+    return ESTIMATORS[name](model, corrections(model, form), robot, mounts, has_lidar, config or EstimatorConfig())
