@@ -23,3 +23,11 @@ def turn_residual(world_T_a: FloatArray, world_T_b: FloatArray, angle: float, bi
     [rad]; its derivative by the yaw of b is 1, by the yaw of a -1, by the bias ``duration``.
     """
     return float(se2.wrap_angle(np.asarray(world_T_b[2] - world_T_a[2] + bias * duration - angle)))
+
+
+def position_residual(world_T_a: FloatArray, lever: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How far the point ``lever`` (..., 2) of the body at a is off a measured ``position`` (..., 2) [m]; Jacobian (..., 2, 3) by a."""
+    c, s = np.cos(world_T_a[..., 2]), np.sin(world_T_a[..., 2])
+    R = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    sideways = np.stack([-lever[..., 1], lever[..., 0]], -1)
+    return se2.transform(world_T_a, lever) - position, np.concatenate([R, R @ sideways[..., None]], -1)

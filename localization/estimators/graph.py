@@ -1,0 +1,149 @@
+"""GTSAM behind one door: sparse least squares over all nodes of a graph, their marginal covariances, and iSAM2.
+
+GTSAM gets matrices, never Python functions: its optimisers copy all values at every call back into Python, which makes ten thousand poses
+cost a minute and a half, and a Jacobian of the wrong shape would end the process. So relinearising is ours (`graph_history`),
+and every array is checked before it goes in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from localization.errors import EstimatorError
+from motion_models.se2 import FloatArray
+
+
+class IndeterminateError(EstimatorError):
+    """Nothing says where some node is."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Rows of the linear system ``sum of matrices @ changes = rhs`` in unit variances, about one or two nodes."""
+
+    nodes: tuple[int, ...]
+    matrices: tuple[FloatArray, ...]
+    """Each (r, n)."""
+    rhs: FloatArray
+    """(r,)"""
+
+
+def chain(rows: FloatArray, first: int = 0) -> Iterator[Block]:
+    """The blocks of `graph_factors.linearize`, whose first pair is (``first``, ``first`` + 1)."""
+    n = (rows.shape[-1] - 1) // 2
+    if not np.isfinite(rows).all():
+        bad = first + int(np.argmin(np.isfinite(rows).all(axis=(1, 2))))
+        raise EstimatorError(f"the factors between nodes {bad} and {bad + 1} are not finite.")
+    for i, block in enumerate(rows, start=first):
+        yield Block((i, i + 1), (block[:, :n], block[:, n : 2 * n]), block[:, -1])
+
+
+def solve(blocks: Iterable[Block], count: int, n: int) -> FloatArray:
+    """(count, n) changes of the nodes 0 ... count - 1. Raises `IndeterminateError` and `EstimatorError`."""
+    system = _system(blocks, range(count), n)
+    try:
+        found = system.optimize()
+    except RuntimeError as error:
+        raise _indeterminate(error) from error
+    return _finite(np.array([found.at(i) for i in range(count)]).reshape(count, n))
+
+
+def marginals(blocks: Iterable[Block], nodes: Iterable[int], count: int, n: int) -> FloatArray:
+    """(k, n, n) covariances of ``nodes``. Raises `IndeterminateError` and `EstimatorError`."""
+    system = _system(blocks, range(count), n)
+    try:
+        tree = system.eliminateMultifrontal()
+        return np.array([tree.marginalCovariance(i) for i in nodes]).reshape(-1, n, n)
+    except RuntimeError as error:
+        raise _indeterminate(error) from error
+
+
+class Incremental:
+    """iSAM2 on changes of nodes from fixed points of linearisation; QR, for Cholesky loses too many digits."""
+
+    def __init__(self, n: int) -> None:
+        params = gtsam.ISAM2Params()
+        params.setFactorization("QR")
+        params.enableRelinearization = False
+        self._isam, self._n = gtsam.ISAM2(params), n
+        self._known: set[int] = set()
+
+    def update(self, blocks: Iterable[Block], new: Iterable[int]) -> None:
+        """Add ``blocks`` and ``new`` nodes. Raises `IndeterminateError` and `EstimatorError`; this object is then lost."""
+        nodes = set(new)
+        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for i in sorted(nodes):
+            values.insert(i, np.zeros(self._n))
+        known, touched = self._known | nodes if nodes - self._known else self._known, set[int]()
+        for block in blocks:
+            factors.add(gtsam.LinearContainerFactor(_factor(block, known, self._n)))
+            touched.update(block.nodes)
+        if nodes - touched:
+            raise EstimatorError(f"no factor speaks of node {min(nodes - touched)}.")
+        try:
+            self._isam.update(factors, values)
+        except RuntimeError as error:
+            raise _indeterminate(error) from error
+        self._known |= nodes
+
+    def changes(self, nodes: Iterable[int]) -> FloatArray:
+        """(k, n) of ``nodes`` by all that was added."""
+        estimate = self._isam.calculateBestEstimate()
+        return _finite(np.array([estimate.atVector(i) for i in nodes]).reshape(-1, self._n))
+
+    def marginals(self, nodes: Iterable[int]) -> FloatArray:
+        """(k, n, n) covariances of ``nodes``."""
+        try:
+            return np.array([self._isam.marginalCovariance(i) for i in nodes]).reshape(-1, self._n, self._n)
+        except RuntimeError as error:
+            raise _indeterminate(error) from error
+
+
+def _system(blocks: Iterable[Block], nodes: range, n: int) -> Any:
+    system, touched = gtsam.GaussianFactorGraph(), np.zeros(len(nodes), dtype=bool)
+    for block in blocks:
+        system.add(_factor(block, nodes, n))
+        touched[list(block.nodes)] = True
+    if not touched.all():
+        raise IndeterminateError(f"no factor speaks of node {int(np.argmin(touched))}.")
+    return system
+
+
+def _factor(block: Block, known: range | set[int], n: int) -> Any:
+    rows = len(block.rhs)
+    arguments: list[Any] = []
+    for node, matrix in zip(block.nodes, block.matrices, strict=True):
+        if node not in known:
+            raise EstimatorError(f"a factor speaks of node {node}, which is not in the graph.")
+        if matrix.shape != (rows, n):
+            raise EstimatorError(f"a factor's matrix for node {node} has shape {matrix.shape} instead of {(rows, n)}.")
+        arguments += [node, matrix]
+    if rows == 0 or len(set(block.nodes)) != len(block.nodes):
+        raise EstimatorError(f"a factor between nodes {block.nodes} with {rows} rows says nothing.")
+    return gtsam.JacobianFactor(*arguments, block.rhs, _unit(rows))  # type: ignore[call-overload]
+
+
+_UNITS: dict[int, Any] = {}
+
+
+def _unit(rows: int) -> Any:
+    if rows not in _UNITS:
+        _UNITS[rows] = gtsam.noiseModel.Unit.Create(rows)
+    return _UNITS[rows]
+
+
+def _finite(changes: FloatArray) -> FloatArray:
+    if not np.isfinite(changes).all():
+        bad = int(np.argmin(np.isfinite(changes).all(axis=1)))
+        raise IndeterminateError(f"the solution is not finite from node {bad} on.")
+    return changes
+
+
+def _indeterminate(error: RuntimeError) -> IndeterminateError:
+    text = " ".join(str(error).split())
+    return IndeterminateError(f"the graph is singular: {text[:120]}. Something must say where each node is.")

@@ -1,0 +1,146 @@
+"""Links: all that wheels, gyro and standing still say of the motion between two nodes, preintegrated into one Gaussian.
+
+Given the slow states s (gyro bias, clock offset, corrections of the model), the relative motion is Gaussian: ``delta exp(D (s - s0))`` and
+a covariance. What wheels and gyro say together about s itself (they see the same turn) are rows ``R (s - s0) = r`` of unit variance.
+Links compose, so nodes need not be where samples are (Forster et al., "On-manifold preintegration", TRO 2017, here with wheels).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from localization.errors import EstimatorError
+from motion_models import se2
+from motion_models.se2 import FloatArray
+
+_LEAST_VARIANCE = 1e-12  # m^2, rad^2: below this a motion is as good as certain, and the numbers stay finite
+
+
+@dataclass(frozen=True)
+class Link:
+    """The motion from one moment to a later one, m slow states."""
+
+    delta: FloatArray
+    """(3,) relative pose at the slow states ``at``."""
+    cov: FloatArray
+    """(3, 3) of its right perturbation, given the slow states."""
+    d_slow: FloatArray
+    """(3, m) change of ``delta`` (right perturbation) by the slow states."""
+    at: FloatArray
+    """(m,)"""
+    rows: FloatArray
+    """(r, m) what the witnesses say together about the slow states: ``rows @ (s - at) = rhs`` with unit variances."""
+    rhs: FloatArray
+    """(r,)"""
+    duration: float
+    """[s]"""
+    moving: float
+    """Part of the duration in which wheels moved [s]."""
+
+    @property
+    def n_slow(self) -> int:
+        return len(self.at)
+
+    def observe(self, error: FloatArray, d_delta: FloatArray, d_slow: FloatArray, cov: FloatArray) -> Link:
+        """Condition on a measurement of this motion.
+
+        ``error`` (r,) = measured - predicted = d_delta (r, 3) perturbation + d_slow (r, m) (s - at) + noise of ``cov`` (r, r).
+        """
+        shared = self.cov @ d_delta.T
+        S = d_delta @ shared + cov
+        gain = np.linalg.solve(S, shared.T).T
+        by_slow = d_delta @ self.d_slow + d_slow
+        shift = gain @ error
+        J = se2.right_jacobian(shift)
+        rest = np.eye(3) - gain @ d_delta
+        new = J @ (rest @ self.cov @ rest.T + gain @ cov @ gain.T) @ J.T
+        white = np.linalg.inv(np.linalg.cholesky(S))
+        return replace(
+            self,
+            delta=se2.compose(self.delta, se2.exp(shift)),
+            cov=0.5 * (new + new.T),
+            d_slow=J @ (self.d_slow - gain @ by_slow),
+            rows=np.vstack([self.rows, white @ by_slow]),
+            rhs=np.append(self.rhs, white @ error),
+        )
+
+    def rebased(self, at: FloatArray) -> Link:
+        """The same link expanded at other slow states (m,)."""
+        change = at - self.at
+        if not change.any():
+            return self
+        shift = self.d_slow @ change
+        J = se2.right_jacobian(shift)
+        return replace(
+            self,
+            delta=se2.compose(self.delta, se2.exp(shift)),
+            cov=J @ self.cov @ J.T,
+            d_slow=J @ self.d_slow,
+            at=at,
+            rhs=self.rhs - self.rows @ change,
+        )
+
+    def then(self, later: Link) -> Link:
+        """This motion and the ``later`` one as one, expanded where this one is; the slow states do not walk in between."""
+        later = later.rebased(self.at)
+        A = se2.adjoint(se2.inverse(later.delta))
+        return Link(
+            se2.compose(self.delta, later.delta),
+            A @ self.cov @ A.T + later.cov,
+            A @ self.d_slow + later.d_slow,
+            self.at,
+            np.vstack([self.rows, later.rows]),
+            np.append(self.rhs, later.rhs),
+            self.duration + later.duration,
+            self.moving + later.moving,
+        )
+
+    def compressed(self) -> tuple[FloatArray, FloatArray]:
+        """``rows`` and ``rhs`` as exactly m rows (m, m), (m,) that say the same about the slow states."""
+        m = self.n_slow
+        both = np.column_stack([self.rows, self.rhs])
+        if len(both) > m:
+            both = np.asarray(np.linalg.qr(both, mode="r"))[:m]
+        padded = np.zeros((m, m + 1))
+        padded[: len(both)] = both
+        return padded[:, :m], padded[:, m]
+
+
+def first_link(delta: FloatArray, cov: FloatArray, d_slow: FloatArray, at: FloatArray, duration: float, moving: float) -> Link:
+    """A link of a motion ``delta`` (3,) alone. Raises `EstimatorError` for numbers that are no motion."""
+    check_motion(delta, cov, "the wheels' motion")
+    if not np.isfinite(d_slow).all():
+        raise EstimatorError(
+            "the derivatives of the wheels' motion are not finite: check the log's wheel rates and the model's parameters."
+        )
+    m = len(at)
+    return Link(delta, cov + _LEAST_VARIANCE * np.eye(3), d_slow, at, np.empty((0, m)), np.empty(0), duration, moving)
+
+
+def check_motion(delta: FloatArray, cov: FloatArray, what: str) -> None:
+    """Raises `EstimatorError` unless ``delta`` (3,) is finite and ``cov`` (3, 3) a covariance."""
+    if delta.shape != (3,) or not np.isfinite(delta).all():
+        raise EstimatorError(f"{what} is {delta}: it must be three finite numbers.")
+    check_covariance(cov, 3, what)
+
+
+def check_covariance(cov: FloatArray, n: int, what: str) -> None:
+    """Raises `EstimatorError` unless ``cov`` is an (n, n) covariance, which may be singular."""
+    if cov.shape != (n, n) or not np.isfinite(cov).all():
+        raise EstimatorError(f"the covariance of {what} must be {n} x {n} finite numbers, found {cov.tolist()}.")
+    size = np.sqrt(np.abs(np.diagonal(cov))) + 1e-30
+    shape = cov / np.outer(size, size)
+    # a singular covariance is one too, but not one that admits more than it knows
+    if np.abs(shape - shape.T).max() < 1e-6 and _is_positive(shape + 1e-9 * np.eye(n)):
+        return
+    raise EstimatorError(f"the covariance of {what} is not positive: {cov.tolist()}.")
+
+
+def _is_positive(matrix: FloatArray) -> bool:
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return False
+    return True

@@ -1,0 +1,234 @@
+"""Fixed lag: a window over the newest nodes, solved by square-root information smoothing.
+
+Nodes are eliminated in order of time by Householder reflections. What is left on a node after its predecessors were eliminated is the
+square root of the information that the past has about it: to marginalise the oldest node is to forget it. A new node costs one
+elimination and one back substitution; nodes that have moved far from where they were linearised are linearised anew (as in iSAM2).
+Square roots keep half the digits that the information matrix itself would lose between metres of drift and micrometres of standing
+still (Bierman, "Factorization methods for discrete sequential estimation", 1977, ch. V).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from localization.errors import EstimatorError
+from localization.estimators.graph_factors import Kernel, Pairs, Position, linearize
+from localization.estimators.graph_qr import eliminate, is_regular, substitute, triangularize
+from motion_models import se2
+from motion_models.se2 import FloatArray
+
+_UNARY = 3  # rows that positions leave on the pose of a node
+
+
+class SingularError(EstimatorError):
+    """A system whose solution is not determined, or not finite."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """What is known of one node: a mean, and the square root of the information about it."""
+
+    pose: FloatArray
+    """(3,)"""
+    slow: FloatArray
+    """(m,)"""
+    root: FloatArray
+    """(n, n) R with R^T R = covariance^-1, for right perturbations of the pose and for the slow states."""
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(n, n)"""
+        inverse = np.linalg.inv(self.root)
+        return np.asarray(inverse @ inverse.T)
+
+
+@dataclass(frozen=True)
+class Ahead:
+    """A node that could be added, its predecessor with it."""
+
+    node: Node
+    pair: Pairs
+    conditional: FloatArray
+    """(n, 2n + 1): the predecessor, given this node."""
+
+    def motion_covariance(self) -> FloatArray:
+        """(6, 6) joint covariance of the poses of the predecessor and of this node."""
+        n = self.node.root.shape[0]
+        inverse = np.linalg.inv(self.conditional[:, :n])
+        G, P = -inverse @ self.conditional[:, n : 2 * n], self.node.covariance
+        both = np.empty((6, 6))
+        both[:3, :3] = (inverse @ inverse.T + G @ P @ G.T)[:3, :3]
+        both[:3, 3:] = (G @ P)[:3, :3]
+        both[3:, :3], both[3:, 3:] = both[:3, 3:].T, P[:3, :3]
+        return both
+
+
+class Window:
+    """The newest ``lag`` nodes and what is known of each."""
+
+    def __init__(self, first: Node, lag: int, relinearize_at: float, kernel: Kernel | None = None) -> None:
+        """``relinearize_at`` [m, rad]: how far a node's pose may be off the point where it was linearised."""
+        if lag < 2:
+            raise EstimatorError(f"the lag is {lag} nodes; it must be at least 2.")
+        self._lag, self._relinearize_at, self._kernel = lag, relinearize_at, kernel or Kernel()
+        self._n = n = len(first.root)
+        room = 2 * lag + 2
+        self._poses, self._slow = np.zeros((room, 3)), np.zeros((room, n - 3))
+        self._roots = np.zeros((room, n, n + 1))
+        self._conditionals = np.zeros((room, n, 2 * n + 1))
+        self._unary = np.zeros((room, _UNARY, 4))
+        self._positions: list[list[Position]] = [[] for _ in range(room)]
+        self._change = np.zeros((room, n))
+        self._pairs: Pairs | None = None
+        self._seed(first)
+
+    def _seed(self, node: Node) -> None:
+        self._first_index, self._size = getattr(self, "_first_index", 0), 1
+        self._poses[0], self._slow[0] = node.pose, node.slow
+        self._roots[0, :, :-1], self._roots[0, :, -1] = node.root, 0.0
+        self._change[0] = 0.0
+        self._unary[0], self._positions[0] = 0.0, []
+        if not is_regular(self._roots[0]):
+            raise SingularError("the prior of the first node is singular or not finite.")
+
+    def restart(self, node: Node) -> None:
+        """Forget all but the newest node, of which from now on ``node`` is known."""
+        self._first_index += self._size - 1
+        self._seed(node)
+
+    @property
+    def newest(self) -> Node:
+        i = self._size - 1
+        return Node(self._poses[i].copy(), self._slow[i].copy(), self._roots[i, :, :-1].copy())
+
+    def poses(self) -> FloatArray:
+        """(k, 3) of the nodes from `oldest` on, by all that is known up to now."""
+        here = slice(self._size - min(self._size, self._lag), self._size)
+        return se2.compose(self._poses[here], se2.exp(self._change[here, :3]))
+
+    def extend(self, pair: Pairs) -> Ahead:
+        """The node that ``pair`` leads to. Raises `SingularError`."""
+        n, i = self._n, self._size - 1
+        poses, slow = np.empty((2, 3)), np.empty((2, n - 3))
+        poses[0], slow[0], slow[1] = self._poses[i], self._slow[i], self._slow[i]
+        shift = pair.d_slow[0] @ (slow[0] - pair.at[0])
+        poses[1] = se2.compose(poses[0], se2.compose(pair.delta[0], se2.exp(shift)))
+        roots, conditionals = np.empty((2, n, n + 1)), np.empty((1, n, 2 * n + 1))
+        roots[0] = self._roots[i]
+        eliminate(roots, conditionals, linearize(pair, poses, slow), np.zeros((2, _UNARY, 4)))
+        change = np.empty((2, n))
+        if not is_regular(roots[1]) or not substitute(roots[1], conditionals, change):
+            raise SingularError("the motion to a new node is not determined by what was measured.")
+        J = se2.right_jacobian_inverse(change[1, :3])
+        _move(roots[1], 0, change[1], J)
+        _move(conditionals[0], n, change[1], J)
+        node = Node(se2.compose(poses[1], se2.exp(change[1, :3])), slow[1] + change[1, 3:], roots[1, :, :-1])
+        return Ahead(node, pair, conditionals[0])
+
+    def commit(self, ahead: Ahead) -> None:
+        """Add the node, forget the oldest one if there are too many. Raises `SingularError`."""
+        if self._pairs is None:
+            self._pairs = ahead.pair.resized(len(self._poses))
+        if self._size == len(self._poses):
+            self._drop(self._size - self._lag + 1)
+        i = self._size
+        self._pairs.put(i - 1, ahead.pair)
+        self._poses[i], self._slow[i] = ahead.node.pose, ahead.node.slow
+        self._roots[i, :, :-1], self._roots[i, :, -1] = ahead.node.root, 0.0
+        self._conditionals[i - 1] = ahead.conditional
+        self._unary[i], self._positions[i] = 0.0, []
+        self._size += 1
+        self._solve()
+
+    def add_position(self, index: int, position: Position) -> None:
+        """A position of the node ``index``, counted from the very first. Raises `EstimatorError` if it has left the window."""
+        k = index - self.oldest
+        if not 0 <= k < self._size:
+            raise EstimatorError(f"node {index} is not in the window; it holds {self.oldest} to {self._first_index + self._size - 1}.")
+        self._positions[k].append(position)
+        first = self._size - min(self._size, self._lag)
+        if k == first:
+            rows = np.zeros((2, self._n + 1))
+            block = position.linearize(self._poses[k], self._kernel)
+            rows[:, :3], rows[:, -1] = block[:, :3], block[:, 3]
+            work = np.vstack([self._roots[k], rows])
+            triangularize(work, self._n)
+            self._roots[k] = work[: self._n]
+            self._positions[k] = []
+        self._again(max(k, first))
+
+    @property
+    def oldest(self) -> int:
+        """Number of the oldest node that is still smoothed, counted from the very first. Arrays hold some more, to be moved less often."""
+        return self._first_index + self._size - min(self._size, self._lag)
+
+    def _drop(self, count: int) -> None:
+        assert self._pairs is not None
+        keep = self._size - count
+        for a in (self._poses, self._slow, self._roots, self._conditionals, self._unary, self._change):
+            a[:keep] = a[count : self._size].copy()
+        self._positions = self._positions[count:] + [[] for _ in range(count)]
+        kept = self._pairs[slice(count, self._size - 1)]
+        self._pairs = kept.resized(len(self._poses))
+        self._first_index += count
+        self._size = keep
+
+    def _solve(self) -> None:
+        """All changes by back substitution; nodes that moved far are linearised anew, once."""
+        first = self._size - min(self._size, self._lag)
+        self._back(first)
+        far = np.abs(self._change[first : self._size, :3]).max(axis=1) > self._relinearize_at
+        if far.any():
+            self._again(first + int(np.argmax(far)))
+
+    def _again(self, start: int) -> None:
+        """Linearise the nodes from ``start`` on where they are now, and eliminate from there."""
+        first, last = self._size - min(self._size, self._lag), self._size
+        here = slice(start, last)
+        moved = self._change[here].copy()
+        if start == first:
+            _move(self._roots[start], 0, moved[0], se2.right_jacobian_inverse(moved[0, :3]))
+        self._poses[here] = se2.compose(self._poses[here], se2.exp(moved[:, :3]))
+        self._slow[here] += moved[:, 3:]
+        for k in range(start, last):
+            if self._positions[k]:
+                self._unary[k] = self._position_rows(k)
+        begin = max(start - 1, first)
+        if last - begin > 1:
+            assert self._pairs is not None
+            rows = linearize(self._pairs[slice(begin, last - 1)], self._poses[begin:last], self._slow[begin:last])
+            eliminate(self._roots[begin:last], self._conditionals[begin : last - 1], rows, self._unary[begin:last])
+        self._back(first)
+
+    def _back(self, first: int) -> None:
+        """Changes of all nodes by what is known now; the newest node is always linearised where it is."""
+        n, i = self._n, self._size - 1
+        ok = is_regular(self._roots[i])
+        ok = ok and substitute(self._roots[i], self._conditionals[first:i], self._change[first : i + 1])
+        if not ok:
+            raise SingularError("the window's system is singular or not finite.")
+        newest = self._change[i]
+        if newest.any():
+            J = se2.right_jacobian_inverse(newest[:3])
+            _move(self._roots[i], 0, newest, J)
+            self._roots[i, :, -1] = 0.0
+            if i > first:
+                _move(self._conditionals[i - 1], n, newest, J)
+            self._poses[i] = se2.compose(self._poses[i], se2.exp(newest[:3]))
+            self._slow[i] += newest[3:]
+            self._change[i] = 0.0
+
+    def _position_rows(self, k: int) -> FloatArray:
+        rows = np.vstack([p.linearize(self._poses[k], self._kernel) for p in self._positions[k]])
+        work = np.zeros((max(len(rows), _UNARY), 4))
+        work[: len(rows)] = rows
+        triangularize(work, 3)
+        return work[:_UNARY]
+
+
+def _move(rows: FloatArray, at: int, change: FloatArray, jacobian: FloatArray) -> None:
+    """Expand ``rows`` (r, c + 1) about a node whose columns begin at ``at`` anew, where ``change`` (n,) has moved it."""
+    rows[:, -1] -= rows[:, at : at + len(change)] @ change
+    rows[:, at : at + 3] = rows[:, at : at + 3] @ jacobian
