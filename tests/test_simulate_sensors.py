@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from localization.logs.forms import STORE, Template
 from localization.logs.references import reference_decoder
 from localization.simulate.clock import Ticks
 from localization.simulate.masses import Masses
+from localization.simulate.picture import world_svg
 from localization.simulate.raycast import cast, cast_at_people, clearance, make_grid, person_at
 from localization.simulate.scanners import Scanner, ScannerConfig, SpinningConfig, SpinningScanner
 from localization.simulate.sensors import EncoderConfig, Encoders, Gps, GpsConfig, Imu, ImuConfig, Truth
@@ -311,3 +313,12 @@ def test_quaternions_of_mounts_turn_as_the_mounts_do():
         ]
     )
     np.testing.assert_allclose(matrix, mount.rotation(), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_pictures_of_worlds_show_every_wall_person_and_patch(name):
+    world = WORLDS[name]()
+    root = ElementTree.fromstring(world_svg(world, [np.array([[0.0, 0.0, 0.1], [1.0, 0.5, 0.2]])]))
+    count = {tag: len(root.findall(f"{{http://www.w3.org/2000/svg}}{tag}")) for tag in ("line", "circle", "rect", "polyline")}
+    people = len(world.people)
+    assert count == {"line": len(world.walls) + people, "circle": people, "rect": len(world.patches) + 1, "polyline": 1}

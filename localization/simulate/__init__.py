@@ -3,6 +3,7 @@
 from localization.simulate.effects import EFFECTS, Effect
 from localization.simulate.evaluation import Score, score_runs
 from localization.simulate.experiments import EXPERIMENTS, Experiment, ExperimentConfig
+from localization.simulate.picture import world_svg
 from localization.simulate.runs import RunRecord
 from localization.simulate.simulator import Simulation, SimulationConfig, simulate, write_simulation
 from localization.simulate.suite import SensorConfig
@@ -25,5 +26,6 @@ __all__ = [
     "World",
     "score_runs",
     "simulate",
+    "world_svg",
     "write_simulation",
 ]
