@@ -75,6 +75,7 @@ def test_every_format_is_opened_by_rosbags_and_by_this_library(tmp_path, name, l
         "/fix": "NavSatFix",
         "/tf_static": "TFMessage",
         "/center_of_gravity": "PointStamped",
+        "/experiment": "String",
         **({"/scan": "LaserScan"} if lidar == "2d" else {"/points": "PointCloud2"}),
     }
     log = open_log(tmp_path / name, ROBOT)
@@ -110,6 +111,17 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_other_noise(tmp_pat
     first, again, other = content("a", 7), content("b", 7), content("c", 8)
     assert first == again
     assert first != other
+
+
+def test_the_log_says_when_each_run_begins_and_ends():
+    simulation, messages = driven(
+        short(Rest(0.5), OpenLoop("a", constant(0.3, 0.0), 2.7), Rest(1.0), OpenLoop("b", constant(0.0, 0.3), 2.0))
+    )
+    marks = [(m.log_ns, json.loads(m.parts[0].tobytes())) for m in messages if m.form.topic == "/experiment"]
+    assert [(mark["run"], mark["what"]) for _, mark in marks] == [("a", "begins"), ("a", "ends"), ("b", "begins"), ("b", "ends")]
+    assert [stamp - START_NS for stamp, _ in marks] == [500_000_000, 4_200_000_000, 5_200_000_000, 8_200_000_000]
+    assert [m.log_ns for m in messages] == sorted(m.log_ns for m in messages)
+    assert [run.start_s for run in simulation.runs] == pytest.approx([0.5, 5.2])
 
 
 def test_one_sensor_more_leaves_the_noise_of_the_others_as_it_is():

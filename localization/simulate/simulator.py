@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from localization.errors import SimulationError
-from localization.logs.forms import Message
+from localization.logs.forms import Message, text
 from localization.logs.write import write_bag
 from localization.simulate.checks import check_config
 from localization.simulate.drives import MoveArms, OpenLoop, Phase, PickUp, Pursuit, Rest, Route, turning
@@ -18,7 +19,7 @@ from localization.simulate.experiments import Experiment, ExperimentConfig, find
 from localization.simulate.masses import Masses
 from localization.simulate.raycast import clearance
 from localization.simulate.runs import RUN_HZ, RunRecord
-from localization.simulate.suite import SensorConfig, make_sensors, nominal_mounts, transforms
+from localization.simulate.suite import START_NS, SensorConfig, make_sensors, nominal_mounts, transforms
 from localization.simulate.track import Track
 from localization.simulate.vehicle import CG, COLUMNS, POSE, Body, VehicleConfig, VehicleState, advance
 from motion_models.cg_parts import require_support
@@ -27,6 +28,8 @@ from motion_models.registry import make_model
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
+MARKS_TOPIC = "/experiment"
+"""std_msgs/String: JSON that says which named part of the drive begins or ends."""
 _CONTROL_S = 0.02
 _LOOK_S = 0.1
 _FLUSH_S = 2.0
@@ -58,6 +61,7 @@ class Simulation:
         if abs(self._steps_per_control * self.config.vehicle.step_s - _CONTROL_S) > 1e-9:
             raise SimulationError(f"vehicle.step_s is {self.config.vehicle.step_s:g} s; it must divide the control period, {_CONTROL_S} s.")
         self.world = experiment.make_world()
+        self._marks: list[Message] = []
         self.runs: list[RunRecord] = []
         """Named phases that are over."""
         self.lidar_mount = nominal_mounts(robot)[self.config.sensors.lidar_frame]
@@ -141,6 +145,7 @@ class Simulation:
     def _recorded(self, phase: OpenLoop | Route, drive: Iterator[None]) -> Iterator[None]:
         """Keep what happens in a phase that has a name."""
         start_s, cg = self.time_s, self._masses.nominal_cg(np.array([self.time_s]))[0]
+        self._mark(phase.name, "begins")
         kept: list[FloatArray] = []
         taken = 0
         every = 1.0 / RUN_HZ
@@ -156,6 +161,7 @@ class Simulation:
             yield
         take()
         if phase.name:
+            self._mark(phase.name, "ends")
             rows = np.concatenate(kept)
             self.runs.append(RunRecord(phase.name, start_s, rows[:, POSE], rows[:, 8:10], rows[:, CG], cg, phase))
 
@@ -225,9 +231,17 @@ class Simulation:
                     f"{self.experiment.name}. Drive more slowly, or make the effects smaller."
                 )
 
+    def _mark(self, name: str, what: str) -> None:
+        """Note in the log that a run begins or ends."""
+        if name:
+            data = np.frombuffer(json.dumps({"run": name, "what": what}).encode(), dtype=np.uint8)
+            now = START_NS + round(self.time_s * 1e9)
+            self._marks.append(Message(text(MARKS_TOPIC, len(data)), now, now, (data,)))
+
     def _flush(self) -> list[Message]:
         """The messages that are ready, in order."""
-        ready = [message for sensor in self._sensors for message in sensor.messages(self._track)]
+        marks, self._marks = self._marks, []
+        ready = marks + [message for sensor in self._sensors for message in sensor.messages(self._track)]
         ready.sort(key=lambda message: message.log_ns)
         self._track.forget(self._track.end_s - _KEEP_S)
         return ready

@@ -29,7 +29,7 @@ from motion_models import se2
 from motion_models.center_of_rotation import center_from_end_poses
 from motion_models.registry import make_model
 from motion_models.regressions import Regression, regress
-from motion_models.robot import load_robot
+from motion_models.robot import Mount, load_robot
 from motion_models.se2 import FloatArray
 
 _REST_S = 1.2
@@ -87,7 +87,7 @@ def rotations(folder: Path, seed: int = 0) -> list[Rotation]:
     return [_measure(run, window, mount) for run, window in zip(simulation.runs, windows, strict=True)]
 
 
-def _measure(run: RunRecord, window: _Window, mount) -> Rotation:  # type: ignore[no-untyped-def]
+def _measure(run: RunRecord, window: _Window, mount: Mount) -> Rotation:
     robot = load_robot("vaultbot")
     begin = START_NS + round(run.start_s * 1e9)
     matcher, pose, mapped = LidarMatcher(), np.zeros(3), 0.0
