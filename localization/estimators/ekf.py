@@ -55,6 +55,10 @@ class Ekf:
         self._size = size = PARAMS + len(corrected.names)
         self.pose = np.zeros(3) if pose is None else np.array(pose, dtype=float)
         self._start, self._anchor = self.pose.copy(), self.pose.copy()
+        # Predicted motions up to now, at which the covariance was moved along. Relative measurements must take their Jacobians there too:
+        # taken at the corrected poses, metres of common drift would leak into them as knowledge of the heading that nobody has (Huang,
+        # Mourikis, Roumeliotis, "Observability-based rules for designing consistent EKF SLAM estimators", IJRR 2010).
+        self._since_start, self._since_anchor = np.zeros(3), np.zeros(3)
         self.bias, self.clock_offset = 0.0, 0.0
         self._gate = float(chi2.ppf(self.config.gate_probability, 3))
         self._filter = ExtendedKalmanFilter(dim_x=size, dim_z=3)
@@ -106,7 +110,8 @@ class Ekf:
         else:
             P[PARAMS:, PARAMS:] += self._corrected.walk_cov * step.duration
         self._filter.P = P
-        self._start = self.pose
+        self._start, self._since_start = self.pose, step.predicted.delta
+        self._since_anchor = se2.compose(self._since_anchor, step.predicted.delta)
         self.pose = se2.compose(self.pose, step.predicted.delta)
 
     def measure_turn(self, turn: Turn) -> float:
@@ -120,9 +125,9 @@ class Ekf:
         """The robot did not move since the start of the step."""
         c = self.config
         still = np.diag([c.standing_sigma_m**2, c.standing_sigma_m**2, c.standing_sigma_rad**2])
-        error, d_start, d_pose = motion_residual(self._start, self.pose, np.zeros(3))
+        error, _, d_pose = motion_residual(self._start, self.pose, np.zeros(3))
         H = np.zeros((3, self._size))
-        H[:, START], H[:, POSE] = d_start, d_pose
+        H[:, START], H[:, POSE] = -d_pose @ se2.adjoint(se2.inverse(self._since_start)), d_pose
         return self._update(error, H, still)
 
     def measure_motion(self, measured: Motion, can_slip: bool) -> float:
@@ -131,9 +136,9 @@ class Ekf:
         Where it contradicts the prediction, one of the two is wrong. ``can_slip``: the LiDAR is sure of itself, so the wheels slipped, and
         the prediction's covariance grows until both agree; else the LiDAR is, and its measurement's grows.
         """
-        error, d_anchor, d_pose = motion_residual(self._anchor, self.pose, measured.delta)
+        error, _, d_pose = motion_residual(self._anchor, self.pose, measured.delta)
         H = np.zeros((3, self._size))
-        H[:, ANCHOR], H[:, POSE] = d_anchor, d_pose
+        H[:, ANCHOR], H[:, POSE] = -d_pose @ se2.adjoint(se2.inverse(self._since_anchor)), d_pose
         R = d_pose @ measured.cov @ d_pose.T
         S = H @ self._filter.P @ H.T + R
         nis = float(error @ np.linalg.solve(S, error))
@@ -151,7 +156,7 @@ class Ekf:
         G = np.eye(self._size)
         G[ANCHOR, ANCHOR], G[ANCHOR, POSE] = np.zeros((3, 3)), np.eye(3)
         self._filter.P = G @ self._filter.P @ G.T
-        self._anchor = self.pose
+        self._anchor, self._since_anchor = self.pose, np.zeros(3)
 
     def _update(self, error: FloatArray, H: FloatArray, R: FloatArray) -> float:
         """``error`` is prediction minus measurement; the error state's mean is zero, so the innovation is its negative."""
