@@ -1,7 +1,8 @@
 """Point-to-line registration against a map of points: where lines run through the map's points, and how far a scan is off them.
 
 Compiled scalar loops. The map is a hash grid of square cells with a bounded number of points in each; a point stays where it was first
-seen, so that the map does not creep along with the errors of later poses.
+seen, so that the map does not creep along with the errors of later poses. Each point remembers how far the robot had travelled when it
+was inserted: old and young parts of the map can be told apart where the robot comes back to a place.
 """
 
 from __future__ import annotations
@@ -46,33 +47,56 @@ class LineMap:
         self._allocate(1 << 12)
 
     def _allocate(self, slots: int) -> None:
+        self._used = 0
         self._cells = np.zeros((slots, 3), np.int32)
         self._points = np.zeros((slots, POINTS_PER_CELL, 2), np.float32)
+        self._travels = np.zeros((slots, POINTS_PER_CELL), np.float32)
+        self._hits = np.zeros(slots, np.int32)  # of one step of a fit, all zero between steps
 
-    def insert(self, points: FloatArray, pose: FloatArray) -> None:
-        """Add ``points`` (N, 2) of the body frame, seen from ``pose`` (3,)."""
-        used = _insert(self._cells, self._points, points, pose, self._cell, self._min_distance)
-        if used < 0 or used > self._cells.shape[0] // 2:
-            self._rebuild(pose)
+    def insert(self, points: FloatArray, pose: FloatArray, travel: float = 0.0) -> None:
+        """Add ``points`` (N, 2) of the body frame, seen from ``pose`` (3,) after ``travel`` [m]."""
+        self._used, is_full = _insert(
+            self._cells, self._points, self._travels, points, pose, self._cell, self._min_distance, travel, self._used
+        )
+        if is_full or self._used > self._cells.shape[0] // 2:
+            cells = self._cells
+            near = cells[:, 2] > 0
+            near &= np.hypot(cells[:, 0] * self._cell - pose[0], cells[:, 1] * self._cell - pose[1]) < self._radius
+            self._rebuild(near, cells.shape[0] * (2 if near.sum() > cells.shape[0] // 3 else 1))
 
-    def _rebuild(self, pose: FloatArray) -> None:
-        """Forget what is far from the robot; if that leaves the table too full, double it."""
-        cells, points = self._cells, self._points
-        near = cells[:, 2] > 0
-        near &= np.hypot(cells[:, 0] * self._cell - pose[0], cells[:, 1] * self._cell - pose[1]) < self._radius
-        self._allocate(cells.shape[0] * (2 if near.sum() > cells.shape[0] // 3 else 1))
-        _copy(cells[near], points[near], self._cells, self._points)
+    def forget_since(self, travel: float) -> None:
+        """Remove the points that were inserted after ``travel`` [m]."""
+        _keep_until(self._cells, self._points, self._travels, travel)
+        self._rebuild(self._cells[:, 2] > 0, self._cells.shape[0])
 
-    def fit(self, points: FloatArray, start: FloatArray, options: FitOptions, prior: FloatArray, center: FloatArray) -> LineFit:
+    def _rebuild(self, kept: NDArray[np.bool_], slots: int) -> None:
+        """A new table of ``slots`` with the ``kept`` (S,) slots of the old one."""
+        cells, points, travels = self._cells[kept], self._points[kept], self._travels[kept]
+        self._allocate(slots)
+        self._used = len(cells)
+        _copy(cells, points, travels, self._cells, self._points, self._travels)
+
+    def fit(
+        self,
+        points: FloatArray,
+        start: FloatArray,
+        options: FitOptions,
+        prior: FloatArray,
+        center: FloatArray,
+        before: float = math.inf,
+    ) -> LineFit:
         """Gauss-Newton from ``start`` (3,) for ``points`` (N, 2) of the body frame.
 
         ``prior`` (3, 3) is the information of a pull towards ``center`` (3,), which keeps directions that the scene does not hold
-        where they were; it is no part of the returned quadratic.
+        where they were; it is no part of the returned quadratic. Only points count that were inserted before ``before`` [m] of travel.
         """
         information, gradient, pose = np.zeros((3, 3)), np.zeros(3), np.array(start, dtype=float)
         n, squares = _fit(
             self._cells,
             self._points,
+            self._travels,
+            self._hits,
+            before,
             points,
             pose,
             self._cell,
@@ -89,10 +113,26 @@ class LineMap:
         )
         return LineFit(pose, information, gradient, n, math.sqrt(squares / n) if n else math.nan)
 
+    def compare(self, points: FloatArray, pose: FloatArray, radius: float, before: float = math.inf) -> tuple[FloatArray, FloatArray]:
+        """How far ``points`` (N, 2) of the body frame at ``pose`` (3,) are off the lines within ``radius`` [m] of them, and when those
+        were seen: distances (N,) [m] and travelled distances (N,) [m], NaN for points without a line inserted before ``before`` [m]."""
+        errors, travels = np.empty(len(points)), np.empty(len(points))
+        _compare(self._cells, self._points, self._travels, before, points, pose, self._cell, radius, errors, travels)
+        return errors, travels
+
+    def points_within(self, center: FloatArray, half: float, before: float = math.inf) -> tuple[FloatArray, FloatArray]:
+        """Points (M, 2) inserted before ``before`` [m] in cells whose centre is in a square of ``half`` a side [m] around ``center``
+        (2,), and their travelled distances (M,) [m]."""
+        near = self._cells[:, 2] > 0
+        near &= (np.abs((self._cells[:, :2] + 0.5) * self._cell - center) <= half).all(axis=1)
+        slots = np.flatnonzero(near)
+        use = np.arange(POINTS_PER_CELL) < self._cells[slots, 2][:, None]
+        use &= self._travels[slots] < before
+        return self._points[slots][use].astype(float), self._travels[slots][use].astype(float)
+
     def point_cloud(self) -> FloatArray:
         """(M, 2) all points of the map."""
-        counts = np.where(self._cells[:, 2] > 0, self._cells[:, 2], 0)
-        return self._points[np.arange(POINTS_PER_CELL) < counts[:, None]].astype(float)
+        return self._points[np.arange(POINTS_PER_CELL) < self._cells[:, 2][:, None]].astype(float)
 
 
 @dataclass(frozen=True)
@@ -106,7 +146,7 @@ class FitOptions:
     kernel: float
     """Scale of the Geman-McClure kernel [m]."""
     wide_kernel: float
-    """The same for the first half of the steps: it sees farther, and is not so easily caught by the wrong line [m]."""
+    """The same for the first step: it sees farther, and is not so easily caught by the wrong line [m]."""
     iterations: int
     """Gauss-Newton steps at most."""
 
@@ -114,8 +154,8 @@ class FitOptions:
 @numba.njit(cache=True)
 def _find(cells: NDArray[np.int32], ix: int, iy: int) -> int:  # pragma: no cover
     """Slot of the cell, or -1 - slot of the free place for it."""
-    mask = cells.shape[0] - 1
-    slot = ((ix * 73856093) ^ (iy * 19349663)) & mask
+    mask: int = cells.shape[0] - 1
+    slot: int = ((ix * 73856093) ^ (iy * 19349663)) & mask
     while cells[slot, 2] != 0:
         if cells[slot, 0] == ix and cells[slot, 1] == iy:
             return slot
@@ -125,21 +165,26 @@ def _find(cells: NDArray[np.int32], ix: int, iy: int) -> int:  # pragma: no cove
 
 @numba.njit(cache=True)
 def _insert(
-    cells: NDArray[np.int32], points: NDArray[np.float32], new: FloatArray, pose: FloatArray, cell: float, min_distance: float
-) -> int:  # pragma: no cover
-    """Returns how many slots are used, or -1 when the table is so full that points were left out."""
+    cells: NDArray[np.int32],
+    points: NDArray[np.float32],
+    travels: NDArray[np.float32],
+    new: FloatArray,
+    pose: FloatArray,
+    cell: float,
+    min_distance: float,
+    travel: float,
+    used: int,
+) -> tuple[int, bool]:  # pragma: no cover
+    """Takes how many slots are used; returns how many are then, and whether the table is so full that points were left out."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    used = 0
-    for i in range(cells.shape[0]):
-        used += cells[i, 2] > 0
     for i in range(new.shape[0]):
         x = pose[0] + c * new[i, 0] - s * new[i, 1]
         y = pose[1] + s * new[i, 0] + c * new[i, 1]
-        ix, iy = int(math.floor(x / cell)), int(math.floor(y / cell))
+        ix, iy = math.floor(x / cell), math.floor(y / cell)
         slot = _find(cells, ix, iy)
         if slot < 0:
             if used > cells.shape[0] * 3 // 4:
-                return -1
+                return used, True
             slot = -1 - slot
             used += 1
             cells[slot, 0], cells[slot, 1] = ix, iy
@@ -152,13 +197,34 @@ def _insert(
             near = dx * dx + dy * dy < min_distance * min_distance
         if not near:
             points[slot, n, 0], points[slot, n, 1] = x, y
+            travels[slot, n] = travel
             cells[slot, 2] = n + 1
-    return used
+    return used, False
+
+
+@numba.njit(cache=True)
+def _keep_until(
+    cells: NDArray[np.int32], points: NDArray[np.float32], travels: NDArray[np.float32], travel: float
+) -> None:  # pragma: no cover
+    """The caller must rebuild the table: an emptied cell breaks the search for those behind it."""
+    for slot in range(cells.shape[0]):
+        kept = 0
+        for k in range(cells[slot, 2]):
+            if travels[slot, k] <= travel:
+                points[slot, kept, 0], points[slot, kept, 1] = points[slot, k, 0], points[slot, k, 1]
+                travels[slot, kept] = travels[slot, k]
+                kept += 1
+        cells[slot, 2] = kept
 
 
 @numba.njit(cache=True)
 def _copy(
-    cells: NDArray[np.int32], points: NDArray[np.float32], to_cells: NDArray[np.int32], to_points: NDArray[np.float32]
+    cells: NDArray[np.int32],
+    points: NDArray[np.float32],
+    travels: NDArray[np.float32],
+    to_cells: NDArray[np.int32],
+    to_points: NDArray[np.float32],
+    to_travels: NDArray[np.float32],
 ) -> None:  # pragma: no cover
     for i in range(cells.shape[0]):
         slot = -1 - _find(to_cells, cells[i, 0], cells[i, 1])
@@ -166,12 +232,77 @@ def _copy(
             to_cells[slot, j] = cells[i, j]
         for k in range(cells[i, 2]):
             to_points[slot, k, 0], to_points[slot, k, 1] = points[i, k, 0], points[i, k, 1]
+            to_travels[slot, k] = travels[i, k]
+
+
+@numba.njit(cache=True)
+def _line(
+    cells: NDArray[np.int32],
+    points: NDArray[np.float32],
+    travels: NDArray[np.float32],
+    before: float,
+    x: float,
+    y: float,
+    cell: float,
+    radius: float,
+) -> tuple[int, float, float, float, float, float]:  # pragma: no cover
+    """The line of the points around (x, y): how many they are, 0 where they make none; its normal, the distance of (x, y) from it along
+    the normal, the points' variance across it, and their mean travelled distance."""
+    ix, iy = math.floor(x / cell), math.floor(y / cell)
+    m, sx, sy, sxx, sxy, syy, st = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for jx in range(ix - 1, ix + 2):
+        for jy in range(iy - 1, iy + 2):
+            slot = _find(cells, jx, jy)
+            if slot < 0:
+                continue
+            for k in range(cells[slot, 2]):
+                qx, qy = points[slot, k, 0] - x, points[slot, k, 1] - y
+                if qx * qx + qy * qy < radius * radius and travels[slot, k] < before:
+                    m += 1
+                    sx, sy = sx + qx, sy + qy
+                    sxx, sxy, syy = sxx + qx * qx, sxy + qx * qy, syy + qy * qy
+                    st += travels[slot, k]
+    if m < _MIN_NEIGHBOURS:
+        return 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    mx, my = sx / m, sy / m
+    cxx, cxy, cyy = sxx / m - mx * mx, sxy / m - mx * my, syy / m - my * my
+    trace, split = cxx + cyy, math.hypot(cxx - cyy, 2.0 * cxy)
+    wide, thin = 0.5 * (trace + split), max(0.5 * (trace - split), 0.0)
+    if wide < 1e-4 or thin > _MAX_LINE_RATIO * wide:
+        return 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
+    nx, ny = -math.sin(angle), math.cos(angle)
+    return m, nx, ny, -(nx * mx + ny * my), thin, st / m
+
+
+@numba.njit(cache=True)
+def _compare(
+    cells: NDArray[np.int32],
+    points: NDArray[np.float32],
+    travels: NDArray[np.float32],
+    before: float,
+    source: FloatArray,
+    pose: FloatArray,
+    cell: float,
+    radius: float,
+    errors: FloatArray,
+    seen: FloatArray,
+) -> None:  # pragma: no cover
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for i in range(source.shape[0]):
+        x = pose[0] + c * source[i, 0] - s * source[i, 1]
+        y = pose[1] + s * source[i, 0] + c * source[i, 1]
+        m, _, _, e, _, travel = _line(cells, points, travels, before, x, y, cell, radius)
+        errors[i], seen[i] = (abs(e), travel) if m else (math.nan, math.nan)
 
 
 @numba.njit(cache=True)
 def _fit(
     cells: NDArray[np.int32],
     points: NDArray[np.float32],
+    travels: NDArray[np.float32],
+    hits: NDArray[np.int32],
+    before: float,
     source: FloatArray,
     pose: FloatArray,
     cell: float,
@@ -188,47 +319,24 @@ def _fit(
 ) -> tuple[int, float]:  # pragma: no cover
     """Changes ``pose``, ``H`` and ``g`` in place; returns the matched points and their weighted sum of squares."""
     n_matched, squares = 0, 0.0
-    hits = np.zeros(cells.shape[0], np.int32)
     home = np.empty(source.shape[0], np.int64)
-    wide = iterations // 2
     for iteration in range(iterations + 1):
-        kernel = wide_kernel if iteration < wide else final_kernel
+        kernel = wide_kernel if iteration == 0 else final_kernel
         H[:], g[:] = 0.0, 0.0
         n_matched, squares = 0, 0.0
         c, s = math.cos(pose[2]), math.sin(pose[2])
         for i in range(source.shape[0]):
             x = pose[0] + c * source[i, 0] - s * source[i, 1]
             y = pose[1] + s * source[i, 0] + c * source[i, 1]
-            home[i] = _find(cells, int(math.floor(x / cell)), int(math.floor(y / cell)))
+            home[i] = _find(cells, math.floor(x / cell), math.floor(y / cell))
             if home[i] >= 0:
                 hits[home[i]] += 1
         for i in range(source.shape[0]):
             x = pose[0] + c * source[i, 0] - s * source[i, 1]
             y = pose[1] + s * source[i, 0] + c * source[i, 1]
-            ix, iy = int(math.floor(x / cell)), int(math.floor(y / cell))
-            m, sx, sy, sxx, sxy, syy = 0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for jx in range(ix - 1, ix + 2):
-                for jy in range(iy - 1, iy + 2):
-                    slot = _find(cells, jx, jy)
-                    if slot < 0:
-                        continue
-                    for k in range(cells[slot, 2]):
-                        qx, qy = points[slot, k, 0] - x, points[slot, k, 1] - y
-                        if qx * qx + qy * qy < radius * radius:
-                            m += 1
-                            sx, sy = sx + qx, sy + qy
-                            sxx, sxy, syy = sxx + qx * qx, sxy + qx * qy, syy + qy * qy
-            if m < _MIN_NEIGHBOURS:
+            m, nx, ny, e, thin, _ = _line(cells, points, travels, before, x, y, cell, radius)
+            if m == 0:
                 continue
-            mx, my = sx / m, sy / m
-            cxx, cxy, cyy = sxx / m - mx * mx, sxy / m - mx * my, syy / m - my * my
-            trace, split = cxx + cyy, math.hypot(cxx - cyy, 2.0 * cxy)
-            wide, thin = 0.5 * (trace + split), max(0.5 * (trace - split), 0.0)
-            if wide < 1e-4 or thin > _MAX_LINE_RATIO * wide:
-                continue
-            angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
-            nx, ny = -math.sin(angle), math.cos(angle)
-            e = -(nx * mx + ny * my)
             # All points in one cell meet the same line, whose error they share: together they know no more than it.
             shared = hits[home[i]] if home[i] >= 0 else 1
             robust = 1.0 + e * e / (kernel * kernel)
@@ -271,8 +379,6 @@ def _fit(
         pose[0] += c * d0 - s * d1
         pose[1] += s * d0 + c * d1
         pose[2] += d2
-        if abs(d0) + abs(d1) + abs(d2) < 1e-4:
-            if iteration >= wide:
-                iterations = iteration + 1
-            wide = min(wide, iteration + 1)
+        if iteration > 0 and abs(d0) + abs(d1) + abs(d2) < 1e-4:
+            iterations = iteration + 1
     return n_matched, squares
