@@ -5,19 +5,19 @@ from __future__ import annotations
 import time
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from localization.errors import LogError
-from localization.estimators import CORRECTING, Estimate, EstimatorConfig, make_estimator
+from localization.estimators import CORRECTING, Estimate
 from localization.events import Event
-from localization.steps import Step, StepConfig, Stepper
+from localization.online.core import Core, Pair, ReplayConfig
 from localization.trajectory import IntArray, Trajectory
-from motion_models.base import MotionModel
-from motion_models.corrections import Form
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
+
+__all__ = ["Pair", "ReplayConfig", "Run", "replay"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,24 +48,6 @@ class Run:
     """Form of the corrections to the motion model, or None where the estimator makes none."""
 
 
-@dataclass(frozen=True)
-class ReplayConfig:
-    """Settings of a replay."""
-
-    step: StepConfig = field(default_factory=StepConfig)
-    estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
-
-
-@dataclass(frozen=True)
-class Pair:
-    """A motion model and an estimator to run it in."""
-
-    model: MotionModel
-    estimator: str
-    corrections: Form = "constant"
-    """What a fusing estimator learns of the motion model: nothing, its k and centre of rotation, or their fields over the CG."""
-
-
 def replay(
     events: Iterable[Event],
     pairs: Sequence[Pair],
@@ -94,26 +76,20 @@ class _Lane:
 
     def __init__(self, pair: Pair, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig) -> None:
         self._pair, self._records = pair, _Records()
-        self._stepper = Stepper(pair.model, robot, mounts, has_lidar, config.step)
-        self._estimator = make_estimator(pair.estimator, pair.model, pair.corrections, robot, mounts, has_lidar, config.estimator)
+        self._core = Core(pair, robot, mounts, has_lidar, config)
         self._seconds = 0.0
 
     def push(self, event: Event) -> None:
         begin = time.perf_counter()
-        self._take(self._stepper.push(event))
+        for estimate in self._core.push(event):
+            self._records.add(estimate)
         self._seconds += time.perf_counter() - begin
-
-    def _take(self, steps: Iterable[Step]) -> None:
-        for step in steps:
-            self._records.add(self._estimator.step(step))
-            self._stepper.clock_offset_s = self._estimator.clock_offset_s
-            if self._estimator.params is not None:
-                self._stepper.params = self._estimator.params
 
     def finish(self) -> Run:
         begin = time.perf_counter()
-        self._take(self._stepper.finish())
-        smoothed = self._estimator.finish()
+        for estimate in self._core.finish():
+            self._records.add(estimate)
+        smoothed = self._core.estimator.finish()
         self._seconds += time.perf_counter() - begin
         stamps, table = self._records.stamps(), self._records.table()
         if not len(stamps):
@@ -127,10 +103,10 @@ class _Lane:
             table[:, _TWIST],
             table[:, _TWIST_COV].reshape(-1, 3, 3),
             table[:, _NIS],
-            self._estimator.parameters(),
-            self._estimator.counts(),
-            self._estimator.map_points(),
-            self._stepper.notes(),
+            self._core.estimator.parameters(),
+            self._core.estimator.counts(),
+            self._core.estimator.map_points(),
+            self._core.stepper.notes(),
             self._seconds,
             self._pair.corrections if self._pair.estimator in CORRECTING else None,
         )

@@ -1,0 +1,57 @@
+"""The streaming core: one event in, the estimates that it completes out. Replay and robot use the same one: so their numbers are the same."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from localization.estimators import Estimate, Estimator, EstimatorConfig, make_estimator
+from localization.events import Event
+from localization.steps import Step, StepConfig, Stepper
+from motion_models.base import MotionModel
+from motion_models.corrections import Form
+from motion_models.robot import Mount, Robot
+
+
+@dataclass(frozen=True)
+class ReplayConfig:
+    """Settings of steps and estimators."""
+
+    step: StepConfig = field(default_factory=StepConfig)
+    estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A motion model and an estimator to run it in."""
+
+    model: MotionModel
+    estimator: str
+    corrections: Form = "constant"
+    """What a fusing estimator learns of the motion model: nothing, its k and centre of rotation, or their fields over the CG."""
+
+
+class Core:
+    """Stepper and estimator of one pair. Bounded: it keeps no trajectory."""
+
+    def __init__(self, pair: Pair, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig | None = None) -> None:
+        config = config or ReplayConfig()
+        self.stepper = Stepper(pair.model, robot, mounts, has_lidar, config.step)
+        self.estimator: Estimator = make_estimator(pair.estimator, pair.model, pair.corrections, robot, mounts, has_lidar, config.estimator)
+
+    def push(self, event: Event) -> list[Estimate]:
+        """Take ``event``; the estimates that it completes, none or several. Raises `EstimatorError`."""
+        return self._take(self.stepper.push(event))
+
+    def finish(self) -> list[Estimate]:
+        """The estimates that were still waiting for events when these ended."""
+        return self._take(self.stepper.finish())
+
+    def _take(self, steps: Iterable[Step]) -> list[Estimate]:
+        found = []
+        for step in steps:
+            found.append(self.estimator.step(step))
+            self.stepper.clock_offset_s = self.estimator.clock_offset_s
+            if self.estimator.params is not None:
+                self.stepper.params = self.estimator.params
+        return found
