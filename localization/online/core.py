@@ -1,4 +1,4 @@
-"""The streaming core: one event in, the estimates that it completes out. Replay and robot use the same one: so their numbers are the same."""
+"""The streaming core: one event in, the estimates that it completes out. A replay and a robot use the same one."""
 
 from __future__ import annotations
 
