@@ -53,10 +53,13 @@ class GyroHistory:
         self._agreement = self._turned = 0.0
 
     def push(self, sample: ImuSample) -> None:
+        """Take the next sample; one that does not come after the newest changes nothing."""
         if sample.frame_id != self._frame:
             self._begin(sample)
         self._watch_gravity(sample)
         rate = float(self._axis @ sample.angular_velocity)
+        if self._stamps and sample.stamp_ns <= self._stamps[-1]:
+            return
         if self._stamps and sample.stamp_ns - self._stamps[-1] > _LONGEST_GAP_NS:
             self._forget()
         if self._stamps:

@@ -66,7 +66,7 @@ class Step:
 class Stepper:
     """Cuts a stream of events into steps. Give it events with `push`; then take all steps that are ready.
 
-    Streaming and bounded: a scan waits until the wheels and the gyro around it were heard, or for at most `StepConfig.wait_s`.
+    Streaming and bounded: a scan waits until the wheels were heard up to it, or for at most `StepConfig.wait_s`.
     """
 
     def __init__(self, model: MotionModel, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: StepConfig | None = None):
@@ -78,11 +78,13 @@ class Stepper:
         self._gyro = GyroHistory(robot.gyro_noise, mounts)
         self._has_lidar = has_lidar
         self._scans: deque[Scan] = deque()
-        self._empty_scans, self._deaf_s = 0, 0.0
+        self._empty_scans, self._late_scans, self._deaf_s = 0, 0, 0.0
         self._start_ns: int | None = None
         self._now_ns = -(1 << 62)
         self.clock_offset_s = 0.0
-        """The wheels' stamps are early by this much [s]: estimated by the filter, and used from the next step on."""
+        """The wheels' stamps are late by this much [s], what happened at t bears t + this.
+
+        Estimated by the filter, and used from the next step on."""
 
     def push(self, event: Event) -> Iterator[Step]:
         """Take ``event`` and yield the steps that it completes."""
@@ -98,45 +100,48 @@ class Stepper:
         elif isinstance(event, Scan):
             self._empty_scans += not len(event.points)
             self._scans.append(event)
-        while (end := self._next_end()) is not None:
-            end_ns, scan = end
-            if self._start_ns is None or end_ns <= self._start_ns:
-                self._start_ns = end_ns
-                yield self._step(end_ns, end_ns, scan)
-            else:
-                start_ns, self._start_ns = self._start_ns, end_ns
-                yield self._step(start_ns, end_ns, scan)
+        yield from self._ready(is_last=False)
 
     def finish(self) -> Iterator[Step]:
         """The steps that were still waiting when the log ended."""
-        while self._scans:
-            scan = self._scans.popleft()
-            start_ns = scan.stamp_ns if self._start_ns is None else self._start_ns
-            self._start_ns = scan.stamp_ns
-            yield self._step(start_ns, scan.stamp_ns, scan)
+        yield from self._ready(is_last=True)
 
     def notes(self) -> list[str]:
         """What was found amiss with the sensors on the way."""
         said = self._gyro.notes()
         if self._empty_scans:
             said.append(f"{self._empty_scans} scan{'s' * (self._empty_scans > 1)} without a usable point: the wheels carried on alone.")
+        if self._late_scans:
+            said.append(f"{self._late_scans} scan{'s' * (self._late_scans > 1)} came after later ones and could not be used.")
         if self._deaf_s > 0.0:
             said.append(f"no wheels were heard for {self._deaf_s:.1f} s in all: there the motion is a guess with a wide covariance.")
         return said
 
-    def _next_end(self) -> tuple[int, Scan | None] | None:
+    def _ready(self, is_last: bool) -> Iterator[Step]:
+        while (end := self._next_end(is_last)) is not None:
+            end_ns, scan = end
+            start_ns = end_ns if self._start_ns is None else self._start_ns
+            if end_ns < start_ns:  # a scan of the time before: going back would count the motion since then twice
+                self._late_scans += 1
+                continue
+            self._start_ns = end_ns
+            yield self._step(start_ns, end_ns, scan)
+
+    def _next_end(self, is_last: bool) -> tuple[int, Scan | None] | None:
+        """Where the next step ends, and the scan there; None while there is more to wait for, which ``is_last`` says will not come."""
         if self._scans:
             scan = self._scans[0]
-            if self._is_heard(scan.stamp_ns) or self._now_ns > scan.stamp_ns + self.config.wait_s / _NS:
+            if is_last or self._is_heard(scan.stamp_ns) or self._now_ns > scan.stamp_ns + self.config.wait_s / _NS:
                 return scan.stamp_ns, self._scans.popleft()
             return None
         if self._start_ns is None or self._wheels.newest_ns is None:
             return None
         end_ns = self._wheels.newest_ns - round(self.clock_offset_s / _NS)
-        least = self.config.max_step_s + self.config.wait_s if self._has_lidar else self.config.no_lidar_step_s
-        if end_ns - self._start_ns < least / _NS:
-            return None
-        return (self._start_ns + round(self.config.max_step_s / _NS), None) if self._has_lidar else (end_ns, None)
+        if self._has_lidar:
+            least = self.config.max_step_s + (0.0 if is_last else self.config.wait_s)
+            return None if end_ns - self._start_ns < least / _NS else (self._start_ns + round(self.config.max_step_s / _NS), None)
+        least = _NS if is_last else self.config.no_lidar_step_s
+        return None if end_ns - self._start_ns < least / _NS else (end_ns, None)
 
     def _is_heard(self, stamp_ns: int) -> bool:
         wheels = self._wheels.newest_ns

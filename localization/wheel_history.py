@@ -20,7 +20,7 @@ class WheelHistory:
         self._keep_ns = int(keep_s / _NS)
         self._last: WheelSample | None = None
         self._ends: list[int] = []
-        self._intervals: list[tuple[int, float, float, float, float]] = []  # start_ns, q_l, q_r, x_G, y_G
+        self._intervals: list[tuple[int, float, float, float, float, bool]] = []  # start_ns, q_l, q_r, x_G, y_G, by angles
 
     @property
     def newest_ns(self) -> int | None:
@@ -34,16 +34,25 @@ class WheelHistory:
         return self._cg_cov
 
     def push(self, sample: WheelSample) -> None:
-        last, self._last = self._last, sample
-        if last is None or sample.stamp_ns <= last.stamp_ns:
+        """Take the next sample. One that does not come after the newest, or that tells nothing of a side, changes nothing."""
+        if not (np.isfinite(sample.position) | np.isfinite(sample.velocity)).all():
             return
-        rates = (sample.position - last.position) / ((sample.stamp_ns - last.stamp_ns) * _NS)
-        if not np.isfinite(rates).all():
-            rates = np.nanmean([last.velocity, sample.velocity], axis=0)
+        last = self._last
+        if last is None:
+            self._last = sample
+            return
+        if sample.stamp_ns <= last.stamp_ns:  # what it says of the motion is in the next sample's angles as well
+            return
+        self._last = sample
+        with np.errstate(over="ignore", invalid="ignore"):
+            rates = (sample.position - last.position) / ((sample.stamp_ns - last.stamp_ns) * _NS)
+        by_angles = bool(np.isfinite(rates).all())
+        if not by_angles:
+            rates = _mean_of_known(last.velocity, sample.velocity)
         if not np.isfinite(rates).all():
             return
         self._ends.append(sample.stamp_ns)
-        self._intervals.append((last.stamp_ns, rates[0], rates[1], self._cg[0], self._cg[1]))
+        self._intervals.append((last.stamp_ns, rates[0], rates[1], self._cg[0], self._cg[1], by_angles))
         if self._ends[0] < sample.stamp_ns - 2 * self._keep_ns:
             n = bisect.bisect_left(self._ends, sample.stamp_ns - self._keep_ns)
             del self._ends[:n], self._intervals[:n]
@@ -51,24 +60,34 @@ class WheelHistory:
     def window(self, start_ns: int, end_ns: int, max_hold_s: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
         """Intervals (n,) [s], rates (n, 2), CG (n, 2) from ``start_ns`` to ``end_ns``, and the seconds that nothing is known of.
 
-        Past the newest sample the last rates hold for at most ``max_hold_s``.
+        Without a sample, rates hold for at most ``max_hold_s``, be it past the newest sample or between two of them. Angles on both sides
+        of a longer gap still tell the mean rates in it, but not how they were spread: it counts as unknown, unless no wheel moved.
         """
+        hold_ns = int(max_hold_s / _NS)
         rows: list[tuple[float, float, float, float, float]] = []
-        known = start_ns
+        known, covered = start_ns, 0.0
         for i in range(bisect.bisect_right(self._ends, start_ns), len(self._ends)):
-            begin, q_l, q_r, x, y = self._intervals[i]
-            begin, end = max(begin, known), min(self._ends[i], end_ns)
-            if end <= begin:
+            began, q_l, q_r, x, y, by_angles = self._intervals[i]
+            if began >= end_ns:
                 break
+            heard = min(self._ends[i], end_ns) if by_angles and q_l == q_r == 0.0 else min(self._ends[i], end_ns, began + hold_ns)
+            begin, end = max(began, known), min(self._ends[i], end_ns) if by_angles else heard
+            if end <= begin:
+                continue
             rows.append(((end - begin) * _NS, q_l, q_r, x, y))
+            covered += max(heard - begin, 0) * _NS
             known = end
-        covered = sum(row[0] for row in rows)
         if known < end_ns and self._ends:
-            _, q_l, q_r, x, y = self._intervals[-1]
-            hold = min(end_ns, self._ends[-1] + int(max_hold_s / _NS)) - max(known, self._ends[-1])
+            _, q_l, q_r, x, y, _ = self._intervals[-1]
+            hold = min(end_ns, self._ends[-1] + hold_ns) - max(known, self._ends[-1])
             if hold > 0:
                 rows.append((hold * _NS, q_l, q_r, x, y))
                 covered += hold * _NS
         table = np.array(rows).reshape(-1, 5)
         missing = max((end_ns - start_ns) * _NS - covered, 0.0)
         return table[:, 0], table[:, 1:3], table[:, 3:5], missing if missing > 1e-6 else 0.0
+
+
+def _mean_of_known(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Element by element the mean of those of two that are not NaN; NaN where both are."""
+    return np.where(np.isfinite(one), np.where(np.isfinite(other), 0.5 * (one + other), one), other)
