@@ -151,6 +151,38 @@ class Ekf:
         self._update(error, H, R)
         return nis
 
+    def measure_revisit(self, pose: FloatArray, cov: FloatArray, old_cov: FloatArray, growth: FloatArray) -> float:
+        """The pose (3,) as an old part of the map gives it, with ``cov`` R (3, 3) by scan and map alone; returns the NIS.
+
+        ``old_cov`` P_o (3, 3) is the covariance of the old map: of the pose e_o from which it was drawn, moved here as `predict` moves
+        it; ``growth`` P_g that of this pose against it, P_now - P_o where this pose came from that one. All in the body frame now.
+
+        This is the update with a clone of the old pose, y = e - e_o - v, of which only its covariance was kept. The gain
+        K = P_g (P_g + R)^-1 makes the pose as sure as can be of its place on the old map, e - e_o, and no surer of the world than
+        that map is: e' = (I - K) e + K (e_o + v) has P_o + (I - K) P_g where e = e_o + growth. The way since START and ANCHOR is not
+        touched: they move with the pose as one rigid body. The rest is not corrected, for what the clone shares with it was not kept;
+        taken as what follows from the pose now, cov(x, e_o) = P_xp P_pp^-1 cov(e, e_o), its correlation with the pose shrinks as the
+        pose's own share does, and the covariance stays one.
+        """
+        error = se2.log(se2.between(self.pose, pose))
+        S = growth + cov
+        gain = np.linalg.solve(S, growth).T
+        P = self.covariance
+        shared = 0.5 * (P[POSE, POSE] + old_cov - growth)  # cov(e, e_o)
+        A_start, A_anchor = se2.adjoint(se2.between(self._start, self.pose)), se2.adjoint(se2.between(self._anchor, self.pose))
+        G = np.zeros((self._size, 3))
+        G[POSE], G[START], G[ANCHOR] = gain, A_start @ gain, A_anchor @ gain
+        T = np.eye(self._size)
+        T[:, POSE] -= G
+        cross = T @ P[:, POSE] @ np.linalg.pinv(P[POSE, POSE], rcond=1e-12, hermitian=True) @ shared @ G.T
+        P = T @ P @ T.T + G @ (old_cov + cov) @ G.T + cross + cross.T
+        self._filter.P = 0.5 * (P + P.T)
+        start_T_now, anchor_T_now = se2.between(self._start, self.pose), se2.between(self._anchor, self.pose)
+        self.pose = se2.compose(self.pose, se2.exp(gain @ error))
+        self._start = se2.compose(self.pose, se2.inverse(start_T_now))
+        self._anchor = se2.compose(self.pose, se2.inverse(anchor_T_now))
+        return float(error @ np.linalg.solve(S, error))
+
     def set_anchor(self) -> None:
         """From here on, the LiDAR measures from the pose as it is now."""
         G = np.eye(self._size)

@@ -46,7 +46,7 @@ class EkfFusion:
         self._witness = (witness or ScanWitness(mounts, lidar)) if has_lidar else None
         self._model, self._corrected = model, corrected
         self._has_gyro = False
-        self._counts = dict.fromkeys(("scans", "matched", "contradictions", "standing"), 0)
+        self._counts = dict.fromkeys(("scans", "matched", "contradictions", "standing", "revisits"), 0)
 
     @property
     def clock_offset_s(self) -> float:
@@ -78,6 +78,9 @@ class EkfFusion:
             self._counts["matched"] += 1
             nis = ekf.measure_motion(seen.motion, seen.is_trusted)
             self._counts["contradictions"] += nis > ekf.gate
+            if (known := witness.recall(step, ekf.pose, ekf.covariance[POSE, POSE])) is not None:
+                self._counts["revisits"] += 1
+                ekf.measure_revisit(known.pose, known.cov, known.old_cov, known.growth)
         witness.remember(step, ekf.pose)
         ekf.set_anchor()
         return nis

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from localization.estimators.base import NO_POINTS
-from localization.lidar import LidarConfig, LidarMatcher, body_points
+from localization.lidar import LidarConfig, LidarMatcher, Revisit, body_points
 from localization.steps import Step
 from motion_models import se2
 from motion_models.base import Motion
@@ -34,6 +34,10 @@ class Witness(Protocol):
     def look(self, step: Step, anchor: FloatArray, guess: FloatArray) -> Sight | None:
         """The motion from ``anchor`` (3,), the pose at the last scan, to the scan of ``step``, searched around ``guess`` (3,)."""
 
+    def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
+        """Whether the scan that was last looked at is of a place seen long before, where ``pose`` (3,) with ``cov`` (3, 3) is the
+        estimate by all but this. Correct the pose by it before you `remember` the scan."""
+
     def remember(self, step: Step, pose: FloatArray) -> None:
         """The scan that was last looked at was taken from ``pose`` (3,)."""
 
@@ -54,6 +58,9 @@ class ScanWitness:
         found = self._matcher.register(points, step.scan.is_planar, guess, step.predicted.cov)
         return None if found is None else Sight(Motion(se2.between(anchor, found.pose), found.cov), found.is_trusted)
 
+    def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
+        return self._matcher.recall(pose, cov, step.end_ns)
+
     def remember(self, step: Step, pose: FloatArray) -> None:
         if not step.is_standing or not self._has_map:  # a robot that stands sees nothing new, and would only thicken its lines
             self._matcher.insert(pose)
@@ -67,6 +74,9 @@ class NoWitness:
     """No LiDAR."""
 
     def look(self, step: Step, anchor: FloatArray, guess: FloatArray) -> Sight | None:
+        return None
+
+    def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
         return None
 
     def remember(self, step: Step, pose: FloatArray) -> None:

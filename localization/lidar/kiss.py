@@ -69,6 +69,11 @@ class Kiss:
         """Add ``points`` (M, 3), seen from ``pose`` (4, 4), to the map."""
         self._kiss.local_map.update(points, pose)
 
+    def restart(self, points: FloatArray) -> None:
+        """Forget the map but for ``points`` (M, 3) of it."""
+        self._kiss.local_map.clear()
+        self._kiss.local_map.add_points(points)
+
     def point_cloud(self) -> FloatArray:
         """(M, 3) the map's points."""
         return np.asarray(self._kiss.local_map.point_cloud())

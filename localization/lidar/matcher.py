@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from localization.lidar.kiss import Kiss
 from localization.lidar.lines import FitOptions, LineMap
+from localization.lidar.revisit import Revisit, RevisitConfig, Revisits
 from localization.lidar.sweep import walls
 from motion_models import se2
 from motion_models.se2 import FloatArray
@@ -34,6 +35,7 @@ class LidarConfig:
     """Error of a line in the map, shared by all points of a scan that meet it in one cell [m]."""
     iterations: int = 12
     """Point-to-line steps at most."""
+    revisit: RevisitConfig = field(default_factory=RevisitConfig)
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,9 @@ class LidarMatcher:
         self._kiss: Kiss | None = None
         self._lines: LineMap | None = None
         self._downsampled = np.empty((0, 3))
-        self._planar = np.empty((0, 2))
+        self._planar, self._is_planar = np.empty((0, 2)), True
+        self._revisits: Revisits | None = None
+        self._travel, self._last = 0.0, np.zeros(3)
 
     def register(self, points: FloatArray, is_planar: bool, guess: FloatArray, guess_cov: FloatArray) -> Registration | None:
         """Where ``points`` (N, 3) of the body frame fit, searched around ``guess`` (3,) with its covariance (3, 3).
@@ -91,14 +95,45 @@ class LidarMatcher:
         """Add the scan that was last given to `register` to the map, as seen from ``pose`` (3,) ``world_T_body``."""
         if self._kiss is None or self._lines is None:
             return
+        self._advance(pose)
         self._kiss.insert(self._downsampled, _matrix(pose))
-        self._lines.insert(self._planar, pose)
+        self._lines.insert(self._planar, pose, self._travel)
+
+    def recall(self, pose: FloatArray, cov: FloatArray, stamp_ns: int) -> Revisit | None:
+        """Whether the scan that was last given to `register`, seen from ``pose`` (3,) with ``cov`` (3, 3) after all that is known of
+        the motion, is of a place seen long before. If so, what was mapped since and does not fit is forgotten: correct the pose before
+        you `insert` the scan."""
+        if self._kiss is None or self._lines is None or not self.config.revisit.is_on:
+            return None
+        if self._revisits is None:
+            self._revisits = Revisits(self.config.revisit, self._options, self._voxel)
+        self._advance(pose)
+        found = self._revisits.look(self._planar, self._lines, pose, cov, self._travel, stamp_ns)
+        if found is not None and self._moves_lines(pose, found):
+            self._lines.forget_since(self._travel - self.config.revisit.old_after_m)
+            # KISS-ICP's map does not know when it saw what; of a planar scene, the lines' points are all there is to know
+            old = self._lines.point_cloud()
+            self._kiss.restart(np.column_stack([old, np.zeros(len(old))]) if self._is_planar else np.empty((0, 3)))
+        return found
+
+    def _moves_lines(self, pose: FloatArray, found: Revisit) -> bool:
+        """By more than the error that lines have anyway: they would be drawn twice."""
+        off = se2.log(se2.between(pose, found.pose))
+        shift = found.growth @ np.linalg.solve(found.growth + found.cov, off)
+        points = self._planar
+        moved = se2.transform(se2.exp(shift), points) - points
+        return float(np.sqrt(np.mean(np.sum(moved**2, axis=1)))) > 2.0 * self.config.sigma_line_m
+
+    def _advance(self, pose: FloatArray) -> None:
+        self._travel += float(np.hypot(*(pose - self._last)[:2]))
+        self._last = np.array(pose, dtype=float)
 
     def point_cloud(self) -> FloatArray:
         """(M, 2) the map."""
         return np.empty((0, 2)) if self._lines is None else self._lines.point_cloud()
 
     def _prepare(self, points: FloatArray, is_planar: bool) -> None:
+        self._is_planar = is_planar
         if self._kiss is None:
             if len(points) < _FEW_POINTS:
                 return
