@@ -63,7 +63,7 @@ class WheelHistory:
         Without a sample, rates hold for at most ``max_hold_s``, be it past the newest sample or between two of them. Angles on both sides
         of a longer gap still tell the mean rates in it, but not how they were spread: it counts as unknown, unless no wheel moved.
         """
-        hold_ns = int(max_hold_s / _NS)
+        hold_ns = round(max_hold_s / _NS)
         rows: list[tuple[float, float, float, float, float]] = []
         known, covered = start_ns, 0.0
         for i in range(bisect.bisect_right(self._ends, start_ns), len(self._ends)):

@@ -1,0 +1,482 @@
+"""From events to steps: no motion is lost, none is counted twice, and what was not heard is not claimed."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from localization.events import CgSample, ImuSample, Scan, WheelSample
+from localization.steps import StepConfig, Stepper, steps
+from localization.wheel_history import WheelHistory
+from motion_models import se2
+from motion_models.integrate import preintegrate
+from motion_models.registry import make_model
+from motion_models.robot import load_robot
+from tests import bags
+
+MS, S = 1_000_000, bags.S
+T0 = bags.START
+ROBOT = load_robot("vaultbot")
+NAN = np.full(2, np.nan)
+
+
+def wheel(t_s, position=None, velocity=None, t0=T0):
+    return WheelSample(
+        t0 + round(t_s * S), NAN if velocity is None else np.array(velocity, float), NAN if position is None else np.array(position, float)
+    )
+
+
+def scan(t_s, n=1):
+    return Scan(T0 + round(t_s * S), np.ones((n, 3)))
+
+
+def angles(t):
+    """Smooth wheel angles that turn, stop nowhere and are no straight line."""
+    return 3.0 * t + 0.4 * np.sin(2.0 * t), 3.5 * t - 0.3 * np.cos(1.7 * t)
+
+
+def wheels(until_s, rate=50.0, start_s=0.0, turned=angles):
+    return [wheel(start_s + i / rate, turned(start_s + i / rate)) for i in range(round((until_s - start_s) * rate) + 1)]
+
+
+def in_order(*groups):
+    return sorted((event for group in groups for event in group), key=lambda e: (e.stamp_ns, not isinstance(e, WheelSample)))
+
+
+def stepper(has_lidar=True, model="skid_steer", config=None):
+    return Stepper(make_model(model, ROBOT), ROBOT, {}, has_lidar, config)
+
+
+def cut(events, **kind):
+    """All steps, and the stepper that cut them."""
+    cutter = stepper(**kind)
+    return list(steps(events, cutter)), cutter
+
+
+def composed(found):
+    pose = np.zeros(3)
+    for step in found:
+        pose = se2.compose(pose, step.predicted.delta)
+    return pose
+
+
+def whole(samples, cg=(0.0, 0.0), model="skid_steer"):
+    """The motion of all samples at once, without windows: rates by differences, one preintegration."""
+    stamps = np.array([s.stamp_ns for s in samples])
+    positions = np.array([s.position for s in samples])
+    dt = np.diff(stamps) * 1e-9
+    made = make_model(model, ROBOT)
+    cgs = np.broadcast_to(np.asarray(cg, float), (len(dt), 2))
+    return preintegrate(made, dt, np.diff(positions, axis=0) / dt[:, None], cgs, made.nominal, ROBOT.wheel_noise)
+
+
+# --- windows of the wheels' history
+
+
+def history(samples, cg=(0.0, 0.0)):
+    made = WheelHistory(np.array(cg))
+    for sample in samples:
+        made.push(sample)
+    return made
+
+
+def test_window_inside_one_interval_turns_by_its_share():
+    dt, rates, _, missing = history([wheel(0.0, (0, 0)), wheel(0.4, (2, 4))]).window(T0 + 100 * MS, T0 + 240 * MS, 0.5)
+    assert missing == 0.0
+    assert dt.sum() == pytest.approx(0.14, abs=1e-9)
+    np.testing.assert_allclose(dt @ rates, [0.7, 1.4], atol=1e-9)
+
+
+@given(st.lists(st.integers(1, 400), min_size=1, max_size=30), st.integers(0, 2**31), st.floats(0, 1), st.floats(0, 1))
+@settings(max_examples=60, deadline=None)
+def test_window_is_the_difference_of_interpolated_angles(gaps_ms, seed, one, other):
+    """A window's angles by interpolating the samples: the second way is numpy's."""
+    stamps = np.concatenate([[0], np.cumsum(gaps_ms)]) * MS
+    positions = np.cumsum(np.random.default_rng(seed).normal(size=(len(stamps), 2)), axis=0)
+    past = history([WheelSample(T0 + int(t), NAN, q) for t, q in zip(stamps, positions, strict=True)])
+    start, end = sorted((round(one * stamps[-1]), round(other * stamps[-1])))
+    dt, rates, _, missing = past.window(T0 + start, T0 + end, 0.5)
+    expected = [np.interp(end, stamps, positions[:, i]) - np.interp(start, stamps, positions[:, i]) for i in range(2)]
+    np.testing.assert_allclose(dt @ rates if len(dt) else np.zeros(2), expected, atol=1e-6)
+    assert dt.sum() == pytest.approx((end - start) * 1e-9, abs=1e-9)
+    assert missing == 0.0
+    assert (dt > 0).all()
+
+
+def test_last_rates_hold_for_a_while_and_no_longer():
+    past = history([wheel(0.0, (0, 0)), wheel(0.1, (0.1, 0.2))])
+    dt, rates, _, missing = past.window(T0, T0 + 400 * MS, 0.5)
+    assert missing == 0.0
+    np.testing.assert_allclose(dt @ rates, [0.4, 0.8], atol=1e-9)
+    dt, rates, _, missing = past.window(T0, T0 + 2 * S, 0.5)
+    np.testing.assert_allclose(dt @ rates, [0.6, 1.2], atol=1e-9)
+    assert missing == pytest.approx(1.4)
+    dt, _, _, missing = past.window(T0 + 5 * S, T0 + 6 * S, 0.5)
+    assert len(dt) == 0
+    assert missing == pytest.approx(1.0)
+
+
+def test_before_the_first_sample_nothing_is_known():
+    dt, rates, _, missing = history([wheel(1.0, (0, 0)), wheel(1.2, (0.2, 0.2))]).window(T0, T0 + 1100 * MS, 0.5)
+    assert missing == pytest.approx(1.0)
+    np.testing.assert_allclose(dt @ rates, [0.1, 0.1], atol=1e-9)
+    assert history([]).window(T0, T0 + S, 0.5)[3] == pytest.approx(1.0)
+
+
+def test_rates_are_used_where_there_are_no_angles_and_not_over_a_gap():
+    past = history([wheel(0.0, velocity=(1, 2)), wheel(0.1, velocity=(3, 2)), wheel(9.1, velocity=(3, 2))])
+    dt, rates, _, missing = past.window(T0, T0 + 9100 * MS, 0.5)
+    np.testing.assert_allclose(dt @ rates, [0.2 + 1.5, 0.2 + 1.0], atol=1e-9)  # means of two samples; then held for half a second
+    assert missing == pytest.approx(8.5)
+
+
+def test_angles_over_a_long_gap_give_the_mean_rate_and_no_certainty():
+    dt, rates, _, missing = history([wheel(0.0, (0, 0)), wheel(10.0, (20, 30))]).window(T0, T0 + 10 * S, 0.5)
+    np.testing.assert_allclose(dt @ rates, [20.0, 30.0])
+    assert missing == pytest.approx(9.5)
+    parts = [history([wheel(0.0, (0, 0)), wheel(10.0, (20, 30))]).window(T0 + a * S, T0 + (a + 2) * S, 0.5)[3] for a in range(0, 10, 2)]
+    assert sum(parts) == pytest.approx(9.5)
+
+
+def test_wheels_that_did_not_turn_over_a_gap_stood():
+    dt, rates, _, missing = history([wheel(0.0, (5, 7)), wheel(10.0, (5, 7))]).window(T0, T0 + 10 * S, 0.5)
+    assert missing == 0.0
+    assert dt.sum() == pytest.approx(10.0)
+    assert not rates.any()
+
+
+def test_samples_that_tell_nothing_are_not_there(recwarn):
+    plain = [wheel(0.0, (0, 0)), wheel(0.2, (0.4, 0.4))]
+    deaf = [plain[0], wheel(0.1), wheel(0.15, (np.inf, np.nan)), plain[1]]
+    assert all(
+        np.array_equal(a, b)
+        for a, b in zip(history(plain).window(T0, T0 + 200 * MS, 0.5), history(deaf).window(T0, T0 + 200 * MS, 0.5), strict=True)
+    )
+    assert not recwarn.list
+
+
+def test_one_side_without_angles_is_told_by_the_rates():
+    past = history([wheel(0.0, (0.0, np.nan), (5.0, 1.0)), wheel(0.1, (0.5, np.nan), (5.0, 1.0))])
+    dt, rates, _, missing = past.window(T0, T0 + 100 * MS, 0.5)
+    np.testing.assert_allclose(dt @ rates, [0.5, 0.1], atol=1e-9)
+    assert missing == 0.0
+
+
+@pytest.mark.parametrize("late", [wheel(0.1, (9.0, 9.0)), wheel(0.05, (9.0, 9.0)), wheel(-3.0, (9.0, 9.0))])
+def test_repeated_and_late_samples_change_nothing(late):
+    plain = [wheel(0.0, (0, 0)), wheel(0.1, (0.1, 0.2)), wheel(0.2, (0.3, 0.4))]
+    for window in [(T0, T0 + 200 * MS), (T0 + 50 * MS, T0 + 150 * MS)]:
+        expected, found = history(plain).window(*window, 0.5), history([*plain[:2], late, plain[2]]).window(*window, 0.5)
+        assert all(np.array_equal(a, b) for a, b in zip(expected, found, strict=True))
+
+
+def test_each_interval_keeps_the_centre_of_gravity_that_held_then():
+    past = WheelHistory(np.array([0.0, 0.0]))
+    for i, x in enumerate([0.0, 0.0, 0.1, 0.2]):
+        past.set_cg(CgSample(T0, np.array([x, -x])))
+        past.push(wheel(0.1 * i, (i, i)))
+    _, _, cg, _ = past.window(T0, T0 + 300 * MS, 0.5)
+    np.testing.assert_allclose(cg, [[0.0, 0.0], [0.1, -0.1], [0.2, -0.2]])
+
+
+def test_history_is_bounded():
+    past = WheelHistory(np.zeros(2), keep_s=2.0)
+    for i in range(20_000):
+        past.push(wheel(i / 100.0, (i, i)))
+    assert len(past._ends) == len(past._intervals) <= 401
+    dt, rates, _, missing = past.window(T0 + 198 * S, T0 + 199 * S, 0.5)  # and the last seconds are all there
+    assert missing == 0.0
+    np.testing.assert_allclose(dt @ rates, [100.0, 100.0])
+
+
+# --- steps
+
+
+def check_contiguous(found, first_ns=None):
+    """No gap, no overlap, time never runs back."""
+    assert found
+    if first_ns is not None:
+        assert found[0].start_ns == first_ns
+    for step in found:
+        assert step.start_ns <= step.end_ns
+    for before, after in itertools.pairwise(found):
+        assert before.end_ns == after.start_ns
+
+
+@given(
+    st.lists(st.integers(0, 3000), min_size=2, max_size=25),
+    st.integers(1, 60),
+    st.integers(0, 2**31),
+)
+@settings(max_examples=60, deadline=None)
+def test_steps_sum_up_to_the_whole_motion_wherever_they_are_cut(scan_ms, wheel_ms, seed):
+    """Scans at any moments, wheels at any rate, events in any order of arrival within a tenth of a second."""
+    samples = wheels(3.0, rate=1000.0 / wheel_ms)
+    scans = [scan(t / 1000.0) for t in sorted(set(scan_ms))]
+    rng = np.random.default_rng(seed)
+    due = [(e.stamp_ns + (rng.integers(0, 100) * MS if isinstance(e, Scan) else 0), i, e) for i, e in enumerate([*samples, *scans])]
+    arrivals: list = []
+    newest = 0
+    for _, _, event in sorted(due, key=lambda d: d[:2]):
+        if isinstance(event, Scan):
+            if event.stamp_ns < newest:
+                continue  # scans stay in order among themselves
+            newest = event.stamp_ns
+        arrivals.append(event)
+    found, _ = cut(arrivals)
+    kept = [e for e in arrivals if isinstance(e, Scan)]
+    check_contiguous(found, kept[0].stamp_ns)
+    assert [s.scan.stamp_ns for s in found if s.scan is not None] == [e.stamp_ns for e in kept]
+    assert max(s.duration for s in found) < 3.1
+    start, end = found[0].start_ns, found[-1].end_ns
+    inside = [s for s in samples if start < s.stamp_ns < end]
+    ends = [WheelSample(t, NAN, interpolated(samples, t)) for t in (start, end)]
+    if end > start and end <= samples[-1].stamp_ns:
+        np.testing.assert_allclose(composed(found), whole([ends[0], *inside, ends[1]]).delta, atol=1e-9)
+
+
+def interpolated(samples, stamp_ns):
+    stamps = np.array([s.stamp_ns - T0 for s in samples], float)
+    return np.array([np.interp(stamp_ns - T0, stamps, [s.position[i] for s in samples]) for i in range(2)])
+
+
+@given(st.floats(0.001, 1.0), st.integers(5, 200))
+@settings(max_examples=30, deadline=None)
+def test_without_a_lidar_all_wheels_are_used_to_the_last(step_s, wheel_ms):
+    samples = wheels(3.0, rate=1000.0 / wheel_ms)
+    found, _ = cut(samples, has_lidar=False, config=StepConfig(no_lidar_step_s=step_s))
+    check_contiguous(found, samples[0].stamp_ns)
+    assert found[-1].end_ns == samples[-1].stamp_ns
+    assert all(s.duration >= step_s - 1e-9 for s in found[:-1])
+    total = whole(samples)
+    np.testing.assert_allclose(composed(found), total.delta, atol=1e-9)
+
+
+def test_covariance_and_derivatives_do_not_depend_on_the_cut():
+    samples = wheels(2.0)
+    fine, _ = cut(samples, has_lidar=False, config=StepConfig(no_lidar_step_s=0.02))
+    cov, d = np.zeros((3, 3)), np.zeros((3, 11))
+    for step in fine:
+        A = se2.adjoint(se2.inverse(step.predicted.delta))
+        cov, d = A @ cov @ A.T + step.predicted.cov, A @ d + step.predicted.d_params
+    total = whole(samples)
+    np.testing.assert_allclose(cov, total.cov, rtol=1e-9)
+    np.testing.assert_allclose(d, total.d_params, rtol=1e-9, atol=1e-12)
+
+
+def test_a_scan_waits_for_late_wheels():
+    samples = wheels(1.0)
+    cutter, found = stepper(), []
+    for event in [*samples[:11], scan(0.0), scan(0.3)]:
+        found += cutter.push(event)
+    assert [s.end_ns for s in found] == [T0]  # wheels were heard up to 0.2 s
+    for event in samples[11:]:
+        found += cutter.push(event)
+        if event.stamp_ns >= T0 + 300 * MS:
+            break
+    assert found[-1].end_ns == T0 + 300 * MS
+    assert found[-1].has_wheels
+    np.testing.assert_allclose(composed(found), whole([s for s in samples if s.stamp_ns <= T0 + 300 * MS]).delta, atol=1e-9)
+
+
+def test_wheels_that_vanish_leave_a_wide_covariance_and_a_note():
+    config = StepConfig()
+    scans = [scan(0.1 * i) for i in range(1, 60)]
+    found, cutter = cut(in_order(wheels(2.0), scans), config=config)
+    check_contiguous(found)
+    assert found[-1].end_ns == scans[-1].stamp_ns  # every scan is used, without wheels
+    heard = [s for s in found if s.end_ns <= T0 + 2500 * MS]
+    deaf = [s for s in found if s.start_ns >= T0 + 2500 * MS]
+    assert all(s.has_wheels for s in heard)
+    assert not any(s.has_wheels or s.is_standing for s in deaf)
+    for step in deaf:
+        assert np.sqrt(step.predicted.cov[0, 0]) >= config.lost_speed_m_s * step.duration * 0.999
+        assert np.sqrt(step.predicted.cov[2, 2]) >= config.lost_rate_rad_s * step.duration * 0.999
+        assert not step.predicted.delta.any()
+    (note,) = cutter.notes()
+    assert f"{5.9 - 2.5:.1f} s" in note
+
+
+def test_wheels_that_come_back_are_heard_again():
+    samples = [w for w in wheels(8.0) if not 2.0 < (w.stamp_ns - T0) * 1e-9 < 5.0]
+    found, cutter = cut(in_order(samples, [scan(0.1 * i) for i in range(1, 80)]))
+    check_contiguous(found)
+    assert all(s.has_wheels for s in found if s.start_ns >= T0 + 5 * S or s.end_ns <= T0 + 2 * S)
+    assert not any(s.has_wheels for s in found if s.start_ns >= T0 + 2600 * MS and s.end_ns < T0 + 4900 * MS)
+    assert cutter.notes()
+
+
+def test_a_lidar_that_vanishes_leaves_steps_by_the_wheels():
+    samples = wheels(10.0)
+    found, _ = cut(in_order(samples, [scan(0.1 * i) for i in range(1, 20)]))
+    check_contiguous(found, T0 + 100 * MS)
+    alone = [s for s in found if s.scan is None]
+    assert {s.end_ns - s.start_ns for s in alone} == {250 * MS}
+    assert samples[-1].stamp_ns - found[-1].end_ns < 250 * MS  # `finish` gives all whole steps that were left
+
+
+def test_scans_before_the_wheels_are_steps_that_know_nothing():
+    found, _ = cut(in_order(wheels(3.0, start_s=1.0), [scan(0.1 * i) for i in range(30)]))
+    check_contiguous(found, T0)
+    assert not any(s.has_wheels for s in found[1:] if s.end_ns <= T0 + S)
+    assert all(s.has_wheels for s in found if s.start_ns >= T0 + S)
+
+
+def test_a_log_without_wheels_still_steps_from_scan_to_scan():
+    scans = [scan(0.1 * i) for i in range(20)]
+    found, cutter = cut(scans)
+    assert [s.scan for s in found] == scans
+    assert not any(s.is_standing for s in found)
+    assert "1.9 s" in cutter.notes()[0]
+
+
+def test_scans_that_come_late_or_twice_cannot_turn_time_back():
+    samples = wheels(3.0)
+    scans = [scan(t) for t in (0.1, 0.2, 0.3, 0.25, 0.25, 0.3, 0.4, -1.0, 0.5)]
+    events = [*samples[:30], *scans, *samples[30:]]
+    found, cutter = cut(events)
+    check_contiguous(found, T0 + 100 * MS)
+    assert all(s.duration >= 0.0 for s in found)
+    end = found[-1].end_ns
+    expected = whole(
+        [s for s in samples if T0 + 100 * MS <= s.stamp_ns <= end]
+        + ([] if (end - T0) % (20 * MS) == 0 else [WheelSample(end, NAN, interpolated(samples, end))])
+    )
+    np.testing.assert_allclose(composed(found), expected.delta, atol=1e-9)
+    assert "3 scans came after later ones" in cutter.notes()[0]
+
+
+def test_finish_turns_no_time_back_either():
+    cutter = stepper()
+    found = [s for e in [*wheels(0.1), scan(0.05), scan(0.5), scan(0.4)] for s in cutter.push(e)] + list(cutter.finish())
+    check_contiguous(found, T0 + 50 * MS)
+    assert found[-1].end_ns == T0 + 500 * MS
+
+
+@pytest.mark.parametrize("order", [lambda e: e[::-1], lambda e: e + e, lambda e: [x for x in e for _ in range(2)]])
+def test_any_order_of_events_gives_steps_in_order(order):
+    imus = [ImuSample(T0 + i * 10 * MS, np.array([0.0, 0.0, 0.3]), np.array([0.0, 0.0, 9.81])) for i in range(300)]
+    events = order(in_order(wheels(3.0), [scan(0.1 * i) for i in range(30)], imus))
+    found, _ = cut(events)
+    check_contiguous(found)
+    assert all(np.isfinite(s.predicted.delta).all() and np.isfinite(s.predicted.cov).all() for s in found)
+
+
+@pytest.mark.parametrize("late_s", [0.04, -0.04])
+def test_clock_offset_shifts_what_is_used(late_s):
+    """Wheels whose stamps are late by so much give the same motion once the stepper knows it."""
+    true = [WheelSample(w.stamp_ns, NAN, w.position) for w in wheels(4.0)]
+    late = [WheelSample(w.stamp_ns + round(late_s * S), NAN, w.position) for w in true]
+    scans = [scan(0.5 + 0.1 * i) for i in range(20)]
+    expected, _ = cut(in_order(true, scans))
+    cutter = stepper()
+    cutter.clock_offset_s = late_s
+    found = list(steps(in_order(late, scans), cutter))
+    uncorrected, _ = cut(in_order(late, scans))
+    scanned = [[s.predicted.delta for s in steps_ if s.scan is not None] for steps_ in (expected, found, uncorrected)]
+    np.testing.assert_allclose(scanned[1], scanned[0], atol=1e-12)
+    assert np.abs(np.array(scanned[2]) - scanned[0]).max() > 1e-4
+
+
+@pytest.mark.parametrize("model", ["diff_drive", "skid_steer", "full_linear"])
+def test_derivative_by_the_clock_is_that_of_numerical_differences(model):
+    """Inside the wheels' intervals the motion is smooth in the offset; both ends lie there."""
+    samples, h = wheels(3.0, rate=20.0), 1e-4
+    by_offset = {}
+    for offset in (-h, 0.0, h):
+        cutter = stepper(model=model)
+        cutter.clock_offset_s = offset
+        by_offset[offset] = list(steps(in_order(samples, [scan(0.525), scan(0.875), scan(1.325)]), cutter))[1:3]
+    for minus, at, plus in zip(*(by_offset[o] for o in (-h, 0.0, h)), strict=True):
+        numerical = se2.log(se2.between(minus.predicted.delta, plus.predicted.delta)) / (2.0 * h)
+        np.testing.assert_allclose(at.d_clock, numerical, rtol=1e-5, atol=1e-6)
+        assert np.abs(at.d_clock).max() > 1e-2  # the drive does tell the offset
+
+
+def test_standing_is_said_only_of_wheels_that_were_heard_and_did_not_move():
+    def turned(t):
+        return (0.0, 0.0) if t < 1.0 else (t - 1.0, t - 1.0) if t < 2.0 else (1.0, 1.0)
+
+    found, _ = cut(in_order(wheels(4.0, turned=turned), [scan(0.1 * i) for i in range(46)]))
+    for step in found[1:]:
+        start, end = ((t - T0) * 1e-9 for t in (step.start_ns, step.end_ns))
+        if end <= 0.99 or (start >= 2.01 and end <= 4.4):
+            assert step.is_standing
+            assert not step.predicted.cov.any()
+            assert not step.d_clock.any()
+        elif end > 1.02 and start < 1.98:
+            assert not step.is_standing
+    assert not found[0].is_standing  # of length zero: no wheel was asked
+
+
+def test_twist_is_that_of_the_end():
+    found, _ = cut(in_order(wheels(3.0, rate=200.0), [scan(0.1 * i) for i in range(1, 25)]), model="diff_drive")
+    model = make_model("diff_drive", ROBOT)
+    for step in found[1:]:
+        t = (step.end_ns - T0) * 1e-9
+        rates = (np.array(angles(t)) - np.array(angles(t - 1e-5))) / 1e-5
+        np.testing.assert_allclose(step.twist, model.twist(rates, np.zeros(2), model.nominal).value, atol=0.02)
+
+
+def test_parameters_given_between_steps_hold_from_the_next_one_on():
+    cutter = stepper(model="diff_drive", has_lidar=False)
+    other = make_model("diff_drive", ROBOT).nominal * [1.1, 1.3]
+    found = []
+    for event in wheels(2.0):
+        for step in cutter.push(event):
+            cutter.params = other
+            found.append(step)
+    before, after = stepper(model="diff_drive", has_lidar=False), stepper(model="diff_drive", has_lidar=False)
+    after.params = other
+    expected = list(steps(wheels(2.0), before))[:1] + list(steps(wheels(2.0), after))[1:]
+    for one, two in zip(found, expected, strict=False):
+        np.testing.assert_array_equal(one.predicted.delta, two.predicted.delta)
+    assert len(found) > 10
+
+
+def test_uncertain_centre_of_gravity_widens_the_prediction():
+    events = wheels(1.0)
+    plain, _ = cut(events, has_lidar=False)
+    known = CgSample(T0, np.zeros(2), np.diag([1e-4, 1e-4]))
+    found, _ = cut([known, *events], has_lidar=False)
+    for one, other in zip(plain, found, strict=True):
+        np.testing.assert_array_equal(one.predicted.delta, other.predicted.delta)
+        assert np.linalg.eigvalsh(other.predicted.cov - one.predicted.cov).min() > -1e-15
+        assert np.trace(other.predicted.cov) > np.trace(one.predicted.cov)
+
+
+def test_empty_scans_are_steps_and_are_told():
+    found, cutter = cut(in_order(wheels(2.0), [scan(0.1 * i, n=i % 2) for i in range(1, 15)]))
+    assert sum(s.scan is not None for s in found) == 14
+    assert "7 scans without a usable point" in cutter.notes()[0]
+
+
+def test_a_long_stream_keeps_little():
+    """Ten minutes: what is remembered is seconds, however long it runs."""
+    cutter, most = stepper(), 0
+    for i in range(600 * 20):
+        t = i / 20.0
+        events = [wheel(t, (t, 1.1 * t)), ImuSample(T0 + round(t * S), np.array([0.0, 0.0, 0.1]), np.array([0.0, 0.0, 9.81]))]
+        if i % 2 == 0:
+            events.append(scan(t))
+        for event in events:
+            for _ in cutter.push(event):
+                pass
+        most = max(most, len(cutter._scans))
+    assert most <= 8
+    assert len(cutter._wheels._ends) <= 20 * 20 + 1
+    assert len(cutter._gyro._stamps) <= 20 * 20 + 1
+
+
+def test_step_length_is_zero_only_at_the_first_scan():
+    found, _ = cut(in_order(wheels(2.0), [scan(0.1 * i) for i in range(1, 15)]))
+    assert found[0].duration == 0.0
+    assert found[0].turn is None
+    assert not found[0].predicted.delta.any()
+    assert all(s.duration > 0.0 for s in found[1:])
+    assert math.isclose(sum(s.duration for s in found), (found[-1].end_ns - found[0].start_ns) * 1e-9)
