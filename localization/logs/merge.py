@@ -8,7 +8,8 @@ latency, and now and then nonsense. Three things happen here:
   when the driver pauses.) One or two that are neither are outliers, and dropped; three in a row that agree are a clock that was
   set, and from there on the topic is moved back by the jump.
 - A topic without stamps gets the time of recording, and so does, by a constant shift, one whose clock is far from all others'.
-- Trusted messages wait in a heap until nothing older can come: one second after the slowest topic's usual latency.
+- Trusted messages wait in a heap until nothing older can come: one second after the slowest topic's usual latency. On a robot, where
+  an estimate is wanted now, they do not wait.
 """
 
 from __future__ import annotations
@@ -90,7 +91,7 @@ class TopicClock:
         self._pending: list[Item] = []
 
     def horizon(self, log_ns: int) -> int:
-        """No message recorded after ``log_ns`` is expected to have an older stamp than this.
+        """No message recorded after ``log_ns`` is expected to have an older stamp than this, less some waiting.
 
         What has been pending for ten seconds is given up, so that it does not hold all others.
         """
@@ -98,7 +99,7 @@ class TopicClock:
             del self._pending[0]
             self._tally.count(self._topic, Oddity.OUTLIER)
         since = min(log_ns, self._pending[0].log_ns) if self._pending else log_ns
-        return since + self.offset_ns - _WAIT
+        return since + self.offset_ns
 
     def put(self, item: Item) -> list[Item]:
         """Messages that have become trusted by this one, with their final stamps."""
@@ -151,42 +152,67 @@ class TopicClock:
             self._jumps.append(shift)
 
 
-def merge(items: Iterable[Item], plan: ClockPlan, tally: Tally) -> Iterator[Any]:
-    """The payloads of ``items`` (which come in order of ``log_ns``) by stamp: never decreasing, and within a topic always increasing."""
-    jumps: list[int] = []
-    clocks = {topic: TopicClock(topic, plan, jumps, tally) for topic in plan.latency_ns}
-    held: list[tuple[int, int, int, Item]] = []
-    held_weight = serial = now = 0
-    emitted: dict[tuple[str, int], int] = {}  # two drivers may share a topic, as wheels and arms do, and a stamp
-    newest = -(2**63)
+class Merger:
+    """The payloads of items by stamp, one item in, what has become sure out. A topic's payloads always have increasing stamps.
 
-    def release(horizon: int, most: int) -> Iterator[Any]:
-        nonlocal held_weight, newest
-        while held and (held[0][0] <= horizon or held_weight > most):
-            stamp, _, _, item = heapq.heappop(held)
-            held_weight -= item.weight
-            if emitted.get((item.topic, item.rank)) == stamp:
-                tally.count(item.topic, Oddity.REPEATED)
+    With ``wait_ns`` [ns] (a log) the payloads of all topics come in order of stamps, never decreasing. Without (a robot) each is given
+    out at once, in order of arrival: one that comes after a newer one of its own topic is dropped, and what is late against the other
+    topics is the estimator's to use.
+    """
+
+    def __init__(self, plan: ClockPlan, tally: Tally, wait_ns: int | None = _WAIT) -> None:
+        self._plan, self._tally, self._wait_ns = plan, tally, wait_ns
+        self._jumps: list[int] = []
+        self._clocks = {topic: TopicClock(topic, plan, self._jumps, tally) for topic in plan.latency_ns}
+        self._held: list[tuple[int, int, int, Item]] = []
+        self._held_weight = self._serial = self._now = 0
+        self._emitted: dict[tuple[str, int], int] = {}  # two drivers may share a topic, as wheels and arms do, and a stamp
+        self._newest = -(2**63)
+
+    def push(self, item: Item) -> Iterator[Any]:
+        """Take the next item by time of recording; what is yielded must be taken before the next."""
+        clock = self._clocks.get(item.topic)
+        if clock is None:  # a topic without stamps
+            clock = self._clocks[item.topic] = TopicClock(item.topic, self._plan, self._jumps, self._tally)
+        self._now = max(self._now, item.log_ns)
+        for trusted in clock.put(item):
+            newest = self._newest if self._wait_ns is not None else self._emitted.get((trusted.topic, trusted.rank), trusted.stamp_ns)
+            if trusted.stamp_ns < newest:
+                self._tally.count(item.topic, Oddity.LATE)
                 continue
-            emitted[item.topic, item.rank] = newest = stamp
+            heapq.heappush(self._held, (trusted.stamp_ns, trusted.rank, self._serial, trusted))
+            self._serial += 1
+            self._held_weight += trusted.weight
+        if self._wait_ns is None:
+            clock.horizon(self._now)  # gives up what has been pending for long
+            yield from self._release(2**63 - 1, 0)
+        else:
+            yield from self._release(min(c.horizon(self._now) for c in self._clocks.values()) - self._wait_ns, _MOST_HELD)
+
+    def finish(self) -> Iterator[Any]:
+        """All that is held, for nothing more will come."""
+        for clock in self._clocks.values():
+            clock.close()
+        yield from self._release(2**63 - 1, 0)
+
+    def _release(self, horizon: int, most: int) -> Iterator[Any]:
+        held = self._held
+        while held and (held[0][0] <= horizon or self._held_weight > most):
+            stamp, _, _, item = heapq.heappop(held)
+            self._held_weight -= item.weight
+            if self._emitted.get((item.topic, item.rank)) == stamp:
+                self._tally.count(item.topic, Oddity.REPEATED)
+                continue
+            self._emitted[item.topic, item.rank] = self._newest = stamp
             yield item.payload
 
+
+def merge(items: Iterable[Item], plan: ClockPlan, tally: Tally) -> Iterator[Any]:
+    """The payloads of ``items`` (which come in order of ``log_ns``) by stamp: never decreasing, and within a topic always increasing."""
+    merger = Merger(plan, tally)
     for item in items:
-        clock = clocks.get(item.topic)
-        if clock is None:  # a topic without stamps
-            clock = clocks[item.topic] = TopicClock(item.topic, plan, jumps, tally)
-        now = max(now, item.log_ns)
-        for trusted in clock.put(item):
-            if trusted.stamp_ns < newest:
-                tally.count(item.topic, Oddity.LATE)
-                continue
-            heapq.heappush(held, (trusted.stamp_ns, trusted.rank, serial, trusted))
-            serial += 1
-            held_weight += trusted.weight
-        yield from release(min(c.horizon(now) for c in clocks.values()), _MOST_HELD)
-    for clock in clocks.values():
-        clock.close()
-    yield from release(2**63 - 1, 0)
+        yield from merger.push(item)
+    yield from merger.finish()
 
 
 def _restamped(item: Item, stamp_ns: int) -> Item:
