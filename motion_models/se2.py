@@ -160,9 +160,25 @@ def right_jacobian(tangent: ArrayLike) -> FloatArray:
     return np.asarray(_right_jacobian(tangent))
 
 
+@_gufunc("(n)->(n,n)")
+def _right_jacobian_inverse(v: FloatArray, out: FloatArray) -> None:  # pragma: no cover
+    theta = v[2]
+    a, b = _sinc_terms(theta)
+    if abs(theta) < _SMALL_ANGLE:
+        f, g = theta / 6.0, 0.5 - theta * theta / 24.0
+    else:
+        f, g = (theta - math.sin(theta)) / (theta * theta), b / theta
+    p, q = f * v[0] - g * v[1], g * v[0] + f * v[1]
+    scale = 1.0 / (a * a + b * b)
+    c, s = scale * a, scale * b
+    out[0, 0], out[0, 1], out[0, 2] = c, -s, s * q - c * p
+    out[1, 0], out[1, 1], out[1, 2] = s, c, -s * p - c * q
+    out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
+
+
 def right_jacobian_inverse(tangent: ArrayLike) -> FloatArray:
     """Inverse of `right_jacobian`: ``log(compose(exp(t), exp(d))) = t + Jinv d`` to first order in d."""
-    return np.asarray(np.linalg.inv(right_jacobian(tangent)), dtype=np.float64)
+    return np.asarray(_right_jacobian_inverse(tangent))
 
 
 def interpolate(world_T_a: ArrayLike, world_T_b: ArrayLike, fraction: ArrayLike) -> FloatArray:

@@ -7,12 +7,14 @@ for the filter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import numpy as np
 
+from localization.errors import EstimatorError
 from localization.estimators.graph_link import Link
+from localization.estimators.graph_qr import inverse_root
 from localization.residuals import motion_residual, position_residual
 from motion_models import se2
 from motion_models.base import Motion
@@ -42,12 +44,15 @@ class Pairs:
     """(N, 3, 3), zero where it saw nothing."""
 
     @classmethod
-    def one(cls, link: Link, walk: FloatArray, seen: Motion | None) -> Self:
-        """The table of a single pair."""
+    def one(cls, link: Link, walk: FloatArray) -> Self:
+        """The table of a single pair, without a LiDAR."""
         rows, rhs = link.compressed()
-        motion, white = (np.zeros(3), np.zeros((3, 3))) if seen is None else (seen.delta, whitening(seen.cov))
-        columns = (link.delta, whitening(link.cov), link.d_slow, link.at, rows, rhs, walk, motion, white)
+        columns = (link.delta, whitening(link.cov), link.d_slow, link.at, rows, rhs, walk, np.zeros(3), np.zeros((3, 3)))
         return cls(*(np.asarray(column)[None] for column in columns))
+
+    def seeing(self, motion: Motion) -> Pairs:
+        """The single pair, with the motion that the LiDAR saw."""
+        return replace(self, seen=motion.delta[None], seen_white=whitening(motion.cov)[None])
 
     def __len__(self) -> int:
         return len(self.delta)
@@ -72,8 +77,11 @@ class Pairs:
 
 
 def whitening(cov: FloatArray) -> FloatArray:
-    """W (n, n), lower triangular, with W^T W = ``cov``^-1 (n, n), which is positive definite."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
+    """W (n, n), lower triangular, with W^T W = ``cov``^-1 (n, n). Raises `EstimatorError` if that is not positive definite."""
+    W = inverse_root(cov)
+    if not np.isfinite(W).all():
+        raise EstimatorError(f"a covariance is not positive definite: {cov.tolist()}.")
+    return np.asarray(W)
 
 
 def linearize(pairs: Pairs, poses: FloatArray, slow: FloatArray) -> FloatArray:
@@ -103,10 +111,17 @@ def linearize(pairs: Pairs, poses: FloatArray, slow: FloatArray) -> FloatArray:
     J[:, n : n + m, -1] = (pairs.walk @ (slow_a - slow_b)[..., None])[..., 0]
 
     if pairs.seen_white.any():
-        error, d_a, d_b = motion_residual(pose_a, pose_b, pairs.seen)
-        J[:, n + m :, 0:3] = pairs.seen_white @ d_a
-        J[:, n + m :, n : n + 3] = pairs.seen_white @ d_b
-        J[:, n + m :, -1] = -(pairs.seen_white @ error[..., None])[..., 0]
+        J[:, n + m :] = linearize_seen(pairs, pose_a, pose_b, n)
+    return J
+
+
+def linearize_seen(pairs: Pairs, pose_a: FloatArray, pose_b: FloatArray, n: int) -> FloatArray:
+    """The last three rows (N, 3, 2n + 1) of `linearize`, the LiDAR's."""
+    J = np.zeros((len(pairs), 3, 2 * n + 1))
+    error, d_a, d_b = motion_residual(pose_a, pose_b, pairs.seen)
+    J[:, :, 0:3] = pairs.seen_white @ d_a
+    J[:, :, n : n + 3] = pairs.seen_white @ d_b
+    J[:, :, -1] = -(pairs.seen_white @ error[..., None])[..., 0]
     return J
 
 

@@ -103,13 +103,12 @@ class GraphFusion:
             self._nodes_ns.append(step.start_ns)
         link = self._link(step)
         pending = link if self._pending is None else self._pending.then(link)
-        nis, seen = None, None
-        ahead = self._extend(pending, None)
+        nis = None
+        ahead = self._extend(pending)
         if step.scan is not None and self._has_lidar:
             sight = self._look(step, ahead)
             if sight is not None:
-                nis, pending, seen = self._judge(ahead, pending, sight)
-                ahead = self._extend(pending, seen)
+                nis, ahead = self._judge(ahead, pending, sight)
         before, self._now = self._now, ahead.node
         alone = self._pending is None
         if step.scan is not None or not self._has_lidar:
@@ -217,19 +216,19 @@ class GraphFusion:
             error = se2.wrap_angle(turn.angle - link.delta[2] - link.at[0] * turn.duration)
             by_slow = np.zeros((1, slow.size))
             by_slow[0, 0] = turn.duration
-            link = link.observe(np.array([float(error)]), _YAW, by_slow, np.array([[turn.variance]]))
+            link = link.observe(np.array([float(error)]), _YAW, by_slow, np.array([turn.variance]))
         if step.is_standing:
-            still = np.diag([b.standing_sigma_m**2, b.standing_sigma_m**2, b.standing_sigma_rad**2])
+            still = np.array([b.standing_sigma_m**2, b.standing_sigma_m**2, b.standing_sigma_rad**2])
             link = link.observe(-se2.log(link.delta), np.eye(3), np.zeros((3, slow.size)), still)
         return link
 
-    def _extend(self, link: Link, seen: Motion | None) -> Ahead:
-        walk = self._slow.walk(link.duration, link.moving)
+    def _extend(self, link: Link) -> Ahead:
+        pair = Pairs.one(link, self._slow.walk(link.duration, link.moving))
         try:
-            return self._window.extend(Pairs.one(link, walk, seen))
-        except (SingularError, np.linalg.LinAlgError) as error:
+            return self._window.extend(pair)
+        except SingularError as error:
             self._rebuild(error)
-            return self._window.extend(Pairs.one(link, walk, seen))
+            return self._window.extend(pair)
 
     def _commit(self, ahead: Ahead, stamp_ns: int) -> None:
         self._counts["nodes"] += 1
@@ -259,8 +258,8 @@ class GraphFusion:
             self._counts["matched"] += 1
         return seen
 
-    def _judge(self, ahead: Ahead, pending: Link, sight: Sight) -> tuple[float, Link, Motion]:
-        """Weigh wheels and LiDAR against each other: the normalised innovation squared, and both as they may be believed.
+    def _judge(self, ahead: Ahead, pending: Link, sight: Sight) -> tuple[float, Ahead]:
+        """Weigh wheels and LiDAR against each other: the normalised innovation squared, and the new node by both.
 
         Where they contradict, one is wrong: the covariance of the one that is not sure of itself grows until they agree.
         """
@@ -271,10 +270,14 @@ class GraphFusion:
         if nis > self._gate:
             self._counts["contradictions"] += 1
             if sight.is_trusted:
-                pending = replace(pending, cov=pending.cov + (nis / self._gate) * np.outer(error, error))
+                ahead = self._extend(replace(pending, cov=pending.cov + (nis / self._gate) * np.outer(error, error)))
             else:
                 measured = Motion(measured.delta, measured.cov * (nis / self._gate) ** 2)
-        return nis, pending, measured
+        try:
+            return nis, self._window.see(ahead, measured)
+        except SingularError as error_:
+            self._rebuild(error_)
+            return nis, self._window.see(self._extend(pending), measured)
 
     def _twist(self, step: Step, link: Link, ahead: Ahead, before: Node, alone: bool) -> tuple[FloatArray, FloatArray | None]:
         """Mean twist of the step, by all witnesses where the step is all there is between two nodes, else without the LiDAR."""

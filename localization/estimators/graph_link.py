@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from localization.errors import EstimatorError
+from localization.estimators.graph_qr import condition, is_covariance
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
@@ -43,27 +44,24 @@ class Link:
     def n_slow(self) -> int:
         return len(self.at)
 
-    def observe(self, error: FloatArray, d_delta: FloatArray, d_slow: FloatArray, cov: FloatArray) -> Link:
-        """Condition on a measurement of this motion.
+    def observe(self, error: FloatArray, d_delta: FloatArray, d_slow: FloatArray, variances: FloatArray) -> Link:
+        """Condition on r scalar measurements of this motion.
 
-        ``error`` (r,) = measured - predicted = d_delta (r, 3) perturbation + d_slow (r, m) (s - at) + noise of ``cov`` (r, r).
+        ``error`` (r,) = measured - predicted = d_delta (r, 3) perturbation + d_slow (r, m) (s - at) + noise of ``variances`` (r,).
         """
-        shared = self.cov @ d_delta.T
-        S = d_delta @ shared + cov
-        gain = np.linalg.solve(S, shared.T).T
-        by_slow = d_delta @ self.d_slow + d_slow
-        shift = gain @ error
+        cov, by_slow = self.cov.copy(), self.d_slow.copy()
+        rows, rhs = np.empty((len(error), self.n_slow)), np.empty(len(error))
+        shift = condition(cov, by_slow, error, d_delta, d_slow, variances, rows, rhs)
         J = se2.right_jacobian(shift)
-        rest = np.eye(3) - gain @ d_delta
-        new = J @ (rest @ self.cov @ rest.T + gain @ cov @ gain.T) @ J.T
-        white = np.linalg.inv(np.linalg.cholesky(S))
-        return replace(
-            self,
-            delta=se2.compose(self.delta, se2.exp(shift)),
-            cov=0.5 * (new + new.T),
-            d_slow=J @ (self.d_slow - gain @ by_slow),
-            rows=np.vstack([self.rows, white @ by_slow]),
-            rhs=np.append(self.rhs, white @ error),
+        return Link(
+            se2.compose(self.delta, se2.exp(shift)),
+            J @ (0.5 * (cov + cov.T)) @ J.T,
+            J @ by_slow,
+            self.at,
+            np.vstack([self.rows, rows]),
+            np.append(self.rhs, rhs),
+            self.duration,
+            self.moving,
         )
 
     def rebased(self, at: FloatArray) -> Link:
@@ -128,19 +126,7 @@ def check_motion(delta: FloatArray, cov: FloatArray, what: str) -> None:
 
 def check_covariance(cov: FloatArray, n: int, what: str) -> None:
     """Raises `EstimatorError` unless ``cov`` is an (n, n) covariance, which may be singular."""
-    if cov.shape != (n, n) or not np.isfinite(cov).all():
-        raise EstimatorError(f"the covariance of {what} must be {n} x {n} finite numbers, found {cov.tolist()}.")
-    size = np.sqrt(np.abs(np.diagonal(cov))) + 1e-30
-    shape = cov / np.outer(size, size)
-    # a singular covariance is one too, but not one that admits more than it knows
-    if np.abs(shape - shape.T).max() < 1e-6 and _is_positive(shape + 1e-9 * np.eye(n)):
-        return
-    raise EstimatorError(f"the covariance of {what} is not positive: {cov.tolist()}.")
-
-
-def _is_positive(matrix: FloatArray) -> bool:
-    try:
-        np.linalg.cholesky(matrix)
-    except np.linalg.LinAlgError:
-        return False
-    return True
+    if cov.shape != (n, n):
+        raise EstimatorError(f"the covariance of {what} must be {n} x {n} numbers, found shape {cov.shape}.")
+    if not is_covariance(cov):
+        raise EstimatorError(f"the covariance of {what} is not finite, symmetric and positive: {cov.tolist()}.")

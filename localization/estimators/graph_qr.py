@@ -1,4 +1,7 @@
-"""Least squares along a chain of nodes by Householder reflections: elimination forward, substitution backward. Compiled scalar loops."""
+"""Least squares along a chain of nodes by Householder reflections, and what small matrices need. Compiled scalar loops.
+
+Matrices here are 3 to 20 wide: calls into LAPACK would cost more than the arithmetic.
+"""
 
 from __future__ import annotations
 
@@ -98,5 +101,122 @@ def substitute(root: FloatArray, conditionals: FloatArray, change: FloatArray) -
                     value -= conditionals[p, i, n + j] * change[p + 1, j]
             change[p, i] = value / pivot if pivot != 0.0 else math.nan
             if not math.isfinite(change[p, i]):
+                return False
+    return True
+
+
+@numba.njit(cache=True)
+def inverse_root(cov: FloatArray) -> FloatArray:  # pragma: no cover
+    """W (n, n), lower triangular, with W^T W = ``cov``^-1 (n, n); NaN if that is not positive definite."""
+    n = cov.shape[0]
+    L, W = np.zeros((n, n)), np.zeros((n, n))
+    for j in range(n):
+        rest = cov[j, j]
+        for k in range(j):
+            rest -= L[j, k] * L[j, k]
+        if not rest > 0.0:
+            W[:] = math.nan
+            return W
+        L[j, j] = math.sqrt(rest)
+        for i in range(j + 1, n):
+            value = cov[i, j]
+            for k in range(j):
+                value -= L[i, k] * L[j, k]
+            L[i, j] = value / L[j, j]
+    for j in range(n):
+        W[j, j] = 1.0 / L[j, j]
+        for i in range(j + 1, n):
+            value = 0.0
+            for k in range(j, i):
+                value -= L[i, k] * W[k, j]
+            W[i, j] = value / L[i, i]
+    return W
+
+
+@numba.njit(cache=True)
+def inverse_of_upper(R: FloatArray) -> FloatArray:  # pragma: no cover
+    """(n, n) inverse of the upper triangle of ``R``."""
+    n = R.shape[0]
+    inverse = np.zeros((n, n))
+    for j in range(n):
+        inverse[j, j] = 1.0 / R[j, j]
+        for i in range(j - 1, -1, -1):
+            value = 0.0
+            for k in range(i + 1, j + 1):
+                value -= R[i, k] * inverse[k, j]
+            inverse[i, j] = value / R[i, i]
+    return inverse
+
+
+@numba.njit(cache=True)
+def condition(
+    cov: FloatArray,
+    d_state: FloatArray,
+    error: FloatArray,
+    d_delta: FloatArray,
+    d_slow: FloatArray,
+    variances: FloatArray,
+    rows: FloatArray,
+    rhs: FloatArray,
+) -> FloatArray:  # pragma: no cover
+    """Condition a Gaussian of 3 numbers on r scalar measurements, one after the other.
+
+    ``error`` (r,) = d_delta (r, 3) perturbation + d_slow (r, m) slow + noise; the perturbation's mean depends on the slow states by
+    ``d_state`` (3, m). Changes ``cov`` (3, 3) and ``d_state``; fills ``rows`` (r, m) and ``rhs`` (r,), what the innovations say of the
+    slow states in unit variances; returns the shift (3,) of the mean.
+    """
+    m = d_state.shape[1]
+    shift, gain, shared, by_slow = np.zeros(3), np.empty(3), np.empty(3), np.empty(m)
+    for r in range(error.shape[0]):
+        S, innovation = variances[r], error[r]
+        for i in range(3):
+            shared[i] = 0.0
+            for j in range(3):
+                shared[i] += cov[i, j] * d_delta[r, j]
+        for i in range(3):
+            S += d_delta[r, i] * shared[i]
+            innovation -= d_delta[r, i] * shift[i]
+        for k in range(m):
+            by_slow[k] = d_slow[r, k]
+            for i in range(3):
+                by_slow[k] += d_delta[r, i] * d_state[i, k]
+        for i in range(3):
+            gain[i] = shared[i] / S
+            shift[i] += gain[i] * innovation
+            for k in range(m):
+                d_state[i, k] -= gain[i] * by_slow[k]
+        for i in range(3):
+            for j in range(3):
+                cov[i, j] -= gain[i] * shared[j]
+        root = math.sqrt(S)
+        rhs[r] = innovation / root
+        for k in range(m):
+            rows[r, k] = by_slow[k] / root
+    return shift
+
+
+@numba.njit(cache=True)
+def is_covariance(cov: FloatArray) -> bool:  # pragma: no cover
+    """Finite, symmetric and positive, up to rounding; it may be singular."""
+    n = cov.shape[0]
+    size, L = np.empty(n), np.zeros((n, n))
+    for i in range(n):
+        if not (math.isfinite(cov[i, i]) and cov[i, i] >= 0.0):
+            return False
+        size[i] = math.sqrt(cov[i, i]) + 1e-30
+    for j in range(n):
+        for i in range(j, n):
+            value = cov[i, j] / size[i] / size[j]
+            if not abs(value - cov[j, i] / size[i] / size[j]) < 1e-6:
+                return False
+            if i == j:
+                value += 1e-9
+            for k in range(j):
+                value -= L[i, k] * L[j, k]
+            if i > j:
+                L[i, j] = value / L[j, j]
+            elif value > 0.0:
+                L[j, j] = math.sqrt(value)
+            else:
                 return False
     return True

@@ -10,13 +10,15 @@ still (Bierman, "Factorization methods for discrete sequential estimation", 1977
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from localization.errors import EstimatorError
-from localization.estimators.graph_factors import Kernel, Pairs, Position, linearize
-from localization.estimators.graph_qr import eliminate, is_regular, substitute, triangularize
+from localization.estimators.graph_factors import Kernel, Pairs, Position, linearize, linearize_seen
+from localization.estimators.graph_qr import eliminate, inverse_of_upper, is_regular, substitute, triangularize
 from motion_models import se2
+from motion_models.base import Motion
 from motion_models.se2 import FloatArray
 
 _UNARY = 3  # rows that positions leave on the pose of a node
@@ -37,10 +39,10 @@ class Node:
     root: FloatArray
     """(n, n) R with R^T R = covariance^-1, for right perturbations of the pose and for the slow states."""
 
-    @property
+    @cached_property
     def covariance(self) -> FloatArray:
         """(n, n)"""
-        inverse = np.linalg.inv(self.root)
+        inverse = inverse_of_upper(self.root)
         return np.asarray(inverse @ inverse.T)
 
 
@@ -56,7 +58,7 @@ class Ahead:
     def motion_covariance(self) -> FloatArray:
         """(6, 6) joint covariance of the poses of the predecessor and of this node."""
         n = self.node.root.shape[0]
-        inverse = np.linalg.inv(self.conditional[:, :n])
+        inverse = inverse_of_upper(self.conditional[:, :n])
         G, P = -inverse @ self.conditional[:, n : 2 * n], self.node.covariance
         both = np.empty((6, 6))
         both[:3, :3] = (inverse @ inverse.T + G @ P @ G.T)[:3, :3]
@@ -118,13 +120,26 @@ class Window:
         roots, conditionals = np.empty((2, n, n + 1)), np.empty((1, n, 2 * n + 1))
         roots[0] = self._roots[i]
         eliminate(roots, conditionals, linearize(pair, poses, slow), np.zeros((2, _UNARY, 4)))
+        return self._ahead(pair, poses[1], slow[1], roots[1], conditionals)
+
+    def see(self, ahead: Ahead, motion: Motion) -> Ahead:
+        """``ahead`` with the motion that a LiDAR saw on the way to it. Raises `SingularError`."""
+        n, node, pair = self._n, ahead.node, ahead.pair.seeing(motion)
+        work = np.zeros((2 * n + 3, 2 * n + 1))
+        work[:n], work[n : 2 * n, n : 2 * n] = ahead.conditional, node.root
+        work[2 * n :] = linearize_seen(pair, self._poses[None, self._size - 1], node.pose[None], n)[0]
+        triangularize(work, 2 * n)
+        return self._ahead(pair, node.pose, node.slow, work[n : 2 * n, n:].copy(), work[None, :n].copy())
+
+    def _ahead(self, pair: Pairs, pose: FloatArray, slow: FloatArray, root: FloatArray, conditionals: FloatArray) -> Ahead:
+        n = self._n
         change = np.empty((2, n))
-        if not is_regular(roots[1]) or not substitute(roots[1], conditionals, change):
+        if not is_regular(root) or not substitute(root, conditionals, change):
             raise SingularError("the motion to a new node is not determined by what was measured.")
         J = se2.right_jacobian_inverse(change[1, :3])
-        _move(roots[1], 0, change[1], J)
+        _move(root, 0, change[1], J)
         _move(conditionals[0], n, change[1], J)
-        node = Node(se2.compose(poses[1], se2.exp(change[1, :3])), slow[1] + change[1, 3:], roots[1, :, :-1])
+        node = Node(se2.compose(pose, se2.exp(change[1, :3])), slow + change[1, 3:], root[:, :-1])
         return Ahead(node, pair, conditionals[0])
 
     def commit(self, ahead: Ahead) -> None:

@@ -1,0 +1,164 @@
+"""Steps from an independent generator: a true robot whose parameters, noise and sensors are drawn from what the estimators believe.
+
+Nothing here uses the estimators' own prediction: the truth is composed from small intervals with slip drawn in each, and what a Step says
+comes from `Stepper`'s own parts (`integrate_twists`) at the parameters that the estimator hands back.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from localization.estimators.base import Estimator
+from localization.estimators.witness import Sight
+from localization.events import Scan
+from localization.gyro import Turn
+from localization.steps import Step
+from motion_models import se2
+from motion_models.base import Motion
+from motion_models.corrections import Corrections
+from motion_models.integrate import integrate_twists
+from motion_models.robot import GyroNoise, WheelNoise
+
+DT = 0.1
+_SUB = 4
+NO_POINTS = np.empty((0, 2))
+
+
+@dataclass(frozen=True)
+class Noise:
+    """All noise of the synthetic robot."""
+
+    wheels: WheelNoise = WheelNoise()
+    gyro: GyroNoise = GyroNoise()
+    lidar_m: float = 0.005
+    lidar_rad: float = 0.001
+
+    def scaled(self, factor: float) -> Noise:
+        """Sigmas of wheels and LiDAR times ``factor``."""
+        w = WheelNoise(**{name: value * factor**2 for name, value in vars(self.wheels).items()})
+        return replace(self, wheels=w, lidar_m=self.lidar_m * factor, lidar_rad=self.lidar_rad * factor)
+
+
+class Seer:
+    """A witness that says what it is told: the true motion with noise of a covariance that it knows."""
+
+    def __init__(self) -> None:
+        self.next: Motion | None = None
+
+    def look(self, step, anchor, guess):
+        return None if self.next is None else Sight(self.next, True)
+
+    def recall(self, step, pose, cov):
+        return None
+
+    def remember(self, step, pose):
+        return None
+
+    def map_points(self):
+        return NO_POINTS
+
+
+@dataclass
+class Result:
+    truth: np.ndarray
+    """(3,) last true pose"""
+    slow: np.ndarray
+    """true gyro bias, clock offset (if a LiDAR is on), corrections"""
+    nees_pose: list[float]
+
+
+def weave(t: float) -> tuple[float, float]:
+    """Wheel rates of a drive that turns both ways and changes speed."""
+    forward, turning = 3.0 + 1.5 * math.sin(0.31 * t), 2.5 * math.sin(0.7 * t) + 1.5 * math.sin(0.13 * t)
+    return forward - turning, forward + turning
+
+
+def straight(t: float) -> tuple[float, float]:
+    return 4.0, 4.0
+
+
+class World:
+    """The truth, and the steps that it gives to an estimator."""
+
+    def __init__(self, model, corrected: Corrections, noise: Noise, rng, has_lidar=True, belief=None, wheels=weave, cg=lambda t: (0.0, 0.0)):
+        self.model, self.corrected, self.noise, self.rng = model, corrected, noise, rng
+        self.has_lidar, self.wheels, self.cg = has_lidar, wheels, cg
+        self.pose, self.t, self.k = np.zeros(3), 0.0, 0
+        self.bias = rng.normal(0.0, noise.gyro.bias_sigma_rad_per_s)
+        self.clock = rng.normal(0.0, belief.clock_sigma_s) if has_lidar and belief is not None else 0.0
+        self.belief = belief
+        self.correction = rng.multivariate_normal(np.zeros(len(corrected.names)), corrected.cov)
+        self._walk = np.linalg.cholesky(corrected.walk_cov + 1e-18 * np.eye(len(corrected.names)))
+
+    @property
+    def slow(self) -> np.ndarray:
+        return np.concatenate([[self.bias], [self.clock] if self.has_lidar else [], self.correction])
+
+    def first(self) -> Step:
+        none = Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, len(self.model.param_names))))
+        return Step(0, 0, none, np.zeros(3), np.zeros(3), False, True, None, self._scan(0))
+
+    def _scan(self, stamp_ns: int) -> Scan | None:
+        return Scan(stamp_ns, np.zeros((0, 3))) if self.has_lidar else None
+
+    def _rates(self, begin: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        times = begin + (np.arange(_SUB) + 0.5) * DT / _SUB
+        return np.full(_SUB, DT / _SUB), np.array([self.wheels(t) for t in times]), np.array([self.cg(t) for t in times])
+
+    def step(self, params: np.ndarray, clock_offset: float) -> tuple[Step, Motion]:
+        """The next step as an estimator with these beliefs would be given it, and the LiDAR's motion."""
+        rng, noise = self.rng, self.noise
+        # the wheels' stamps are early by the offset: what really happens at t stands in the log at t + clock (as Stepper reads it)
+        dt, rates, cg = self._rates(self.t)
+        true_params = self.model.nominal + self.corrected.directions @ self.correction
+        twists = self.model.twist(rates, cg, true_params).value
+        delta = np.zeros(3)
+        w = noise.wheels
+        for h, xi in zip(dt, twists, strict=True):
+            driven, turned = math.hypot(*(xi[:2] * h)), abs(xi[2] * h)
+            var = np.array(
+                [
+                    w.longitudinal_m2_per_m * driven + w.longitudinal_m2_per_rad * turned + w.floor_m2_per_s * h,
+                    w.lateral_m2_per_m * driven + w.lateral_m2_per_rad * turned + w.floor_m2_per_s * h,
+                    w.yaw_rad2_per_m * driven + w.yaw_rad2_per_rad * turned + w.floor_rad2_per_s * h,
+                ]
+            )
+            delta = se2.compose(delta, se2.compose(se2.exp(xi * h), se2.exp(rng.normal(size=3) * np.sqrt(var))))
+        self.pose = se2.compose(self.pose, delta)
+
+        # the log's wheels: at stamp s they tell the rates of true time s - clock; the reader adds its own belief
+        shifted = self.t + clock_offset - self.clock
+        dt, rates, cg = self._rates(shifted)
+        twist = self.model.twist(rates, cg, params)
+        predicted = integrate_twists(dt, twist, noise.wheels)
+        d_clock = twist.value[-1] - se2.adjoint(se2.inverse(predicted.delta)) @ twist.value[0]
+
+        g = noise.gyro
+        turned = float(delta[2])
+        variance = g.white_rad_per_sqrt_s**2 * DT + (g.scale_sigma * turned) ** 2
+        turn = Turn(turned + self.bias * DT + rng.normal(0.0, math.sqrt(variance)), variance, DT)
+        R = np.diag([noise.lidar_m, noise.lidar_m, noise.lidar_rad]) ** 2
+        seen = Motion(se2.compose(delta, se2.exp(rng.multivariate_normal(np.zeros(3), R))), R)
+
+        start, self.k = self.k, self.k + 1
+        self.t = self.k * DT
+        stamps = round(start * DT * 1e9), round(self.k * DT * 1e9)
+        self.bias += rng.normal(0.0, g.bias_walk_rad_per_s_sqrt_s * math.sqrt(DT))
+        self.correction = self.correction + self._walk @ rng.normal(size=len(self.correction)) * math.sqrt(DT)
+        if self.has_lidar and self.belief is not None:
+            self.clock += rng.normal(0.0, self.belief.clock_walk_s_per_sqrt_s * math.sqrt(DT))
+        return Step(*stamps, predicted, d_clock, twist.value[-1], False, True, turn, self._scan(stamps[1])), seen
+
+
+def drive(world: World, estimator: Estimator, seer: Seer, steps: int, every: int = 1):
+    """Yield (estimate, true pose) after each step."""
+    if world.has_lidar:
+        estimator.step(world.first())
+    for _ in range(steps):
+        params = world.model.nominal if estimator.params is None else estimator.params
+        step, seen = world.step(params, estimator.clock_offset_s)
+        seer.next = seen
+        yield estimator.step(step), world.pose
