@@ -1,0 +1,231 @@
+"""The gyro's turn: the integral of the rate about the body's upright axis, whichever way the IMU was screwed on."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from localization.events import ImuSample
+from localization.gyro import GyroHistory
+from motion_models.robot import GyroNoise, Mount
+from tests import bags
+
+MS, S, T0 = 1_000_000, bags.S, bags.START
+NOISE = GyroNoise()
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def rate(t):
+    """Yaw rate of the body [rad/s]: both ways, never still."""
+    return 0.6 * math.sin(0.8 * t) + 0.25
+
+
+def turned(t):
+    """Its integral."""
+    return 0.75 * (1.0 - math.cos(0.8 * t)) + 0.25 * t
+
+
+def samples(seconds, body_R_imu=None, gravity=9.81, hz=100.0, start_s=0.0, frame="imu_link", wz=rate):
+    """IMU samples of a robot that turns in the plane, as an IMU sees it whose axes stand in the body like ``body_R_imu`` (3, 3)."""
+    R = np.eye(3) if body_R_imu is None else body_R_imu
+    return [
+        ImuSample(T0 + round((start_s + i / hz) * S), R.T @ (wz(start_s + i / hz) * UP), R.T @ (gravity * UP), frame)
+        for i in range(round(seconds * hz) + 1)
+    ]
+
+
+def history(events, mounts=None, noise=NOISE):
+    made = GyroHistory(noise, mounts or {})
+    for event in events:
+        made.push(event)
+    return made
+
+
+def turns(events, mounts=None, window_s=0.1, wheels=lambda a, b: turned(b) - turned(a)):
+    """(start, end, turn) of windows asked for as the samples come, and the history."""
+    made, found, start = GyroHistory(NOISE, mounts or {}), [], 0.0
+    for event in events:
+        made.push(event)
+        end = start + window_s
+        if event.stamp_ns >= T0 + round(end * S):
+            found.append((start, end, made.turn(T0 + round(start * S), T0 + round(end * S), wheels(start, end))))
+            start = end
+    return found, made
+
+
+def check_all_right(found, from_s=0.3, tolerance=2e-5):
+    """Every turn is there from ``from_s`` on, and true in size and sign."""
+    late = [(a, b, t) for a, b, t in found if a >= from_s]
+    assert late
+    for start, end, turn in late:
+        assert turn is not None
+        assert turn.angle == pytest.approx(turned(end) - turned(start), abs=tolerance)
+
+
+@given(st.integers(1, 5_000), st.integers(1, 5_000))
+@settings(max_examples=50, deadline=None)
+def test_turn_is_the_integral_of_the_rate(one_ms, other_ms):
+    start, end = sorted((one_ms, other_ms))
+    turn = history(samples(5.0, hz=200.0)).turn(T0 + start * MS, T0 + end * MS, 0.0)
+    assert turn.angle == pytest.approx(turned(end / 1e3) - turned(start / 1e3), abs=1e-4)
+    assert turn.duration == pytest.approx((end - start) / 1e3)
+
+
+@given(st.lists(st.tuples(st.integers(1, 400), st.floats(-3, 3)), min_size=2, max_size=40), st.floats(0, 1), st.floats(0, 1))
+@settings(max_examples=60, deadline=None)
+def test_any_rates_at_any_stamps_are_summed_by_trapezes(profile, one, other):
+    """And turns of two windows that touch add up to that of both."""
+    stamps = np.cumsum([dt for dt, _ in profile]) * MS
+    rates = np.array([wz for _, wz in profile])
+    past = history([ImuSample(T0 + int(t), wz * UP, 9.81 * UP) for t, wz in zip(stamps, rates, strict=True)])
+    areas = np.concatenate([[0.0], np.cumsum(0.5 * (rates[1:] + rates[:-1]) * np.diff(stamps) * 1e-9)])
+    span = stamps[-1] - stamps[0]
+    start, end = sorted(int(stamps[0]) + round(float(f * span)) for f in (one, other))
+    middle = (start + end) // 2
+    expected = np.interp(end, stamps, areas) - np.interp(start, stamps, areas)
+    whole, first, second = (past.turn(T0 + a, T0 + b, 0.0) for a, b in ((start, end), (start, middle), (middle, end)))
+    assert whole.angle == pytest.approx(expected, abs=1e-9)
+    assert first.angle + second.angle == pytest.approx(whole.angle, abs=1e-9)
+
+
+def test_variance_grows_with_time_and_turn():
+    past = history(samples(5.0))
+    turn = past.turn(T0 + S, T0 + 3 * S, 0.0)
+    assert turn.variance == pytest.approx(
+        NOISE.white_rad_per_sqrt_s**2 * 2.0 + (NOISE.scale_sigma * (turned(3) - turned(1))) ** 2, rel=1e-3
+    )
+
+
+def test_nothing_is_said_of_times_that_were_not_heard():
+    past = history(samples(1.0, start_s=1.0))
+    assert past.turn(T0 + 900 * MS, T0 + 1500 * MS, 0.0) is None
+    assert past.turn(T0 + 1500 * MS, T0 + 2200 * MS, 0.0) is None
+    assert GyroHistory(NOISE, {}).turn(T0, T0 + S, 0.0) is None
+    held = past.turn(T0 + 1900 * MS, T0 + 2050 * MS, 0.0)  # a sample or two that are still on their way
+    assert held.angle == pytest.approx(turned(2.0) - turned(1.9) + 0.05 * rate(2.0), abs=1e-5)
+
+
+def test_a_gap_is_bridged_if_short_and_forgotten_if_long():
+    constant = samples(4.0, wz=lambda t: 0.3)
+    short = [s for s in constant if not 2.0 < (s.stamp_ns - T0) * 1e-9 < 2.4]
+    assert history(short).turn(T0 + S, T0 + 3 * S, 0.0).angle == pytest.approx(0.6, abs=1e-9)
+    long = [s for s in constant if not 2.0 < (s.stamp_ns - T0) * 1e-9 < 2.6]
+    past = history(long)
+    assert past.turn(T0 + S, T0 + 3 * S, 0.0) is None
+    assert past.turn(T0 + 2500 * MS, T0 + 3 * S, 0.0) is None
+    assert past.turn(T0 + 2600 * MS, T0 + 3 * S, 0.0).angle == pytest.approx(0.12, abs=1e-9)
+
+
+@pytest.mark.parametrize("late", [[100], [100, 100], [0, 100], [37, 12], [4000]])
+def test_late_and_repeated_samples_change_nothing(late):
+    events = samples(1.0)
+    wrong = [ImuSample(T0 + 500 * MS - i * MS, 9.0 * UP, 9.81 * UP, "imu_link") for i in late]
+    found = history([*events[:51], *wrong, *events[51:]]).turn(T0, T0 + S, 0.0)
+    assert found == history(events).turn(T0, T0 + S, 0.0)
+    first = [events[0], events[0], *events[1:]]
+    assert history(first).turn(T0, T0 + S, 0.0) == history(events).turn(T0, T0 + S, 0.0)
+
+
+@given(st.floats(-math.pi, math.pi), st.floats(-1.5, 1.5), st.floats(-math.pi, math.pi))
+@settings(max_examples=40, deadline=None)
+def test_a_mount_that_is_true_gives_the_yaw_rate_however_it_stands(roll, pitch, yaw):
+    """The rotation by an independent library; no turn of the wheels is needed."""
+    R = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
+    found, past = turns(samples(2.0, R), {"imu_link": Mount(roll=roll, pitch=pitch, yaw=yaw)}, wheels=lambda a, b: 0.0)
+    check_all_right(found, 0.0)
+    assert past.notes() == []
+
+
+def test_mounts_are_taken_by_frame():
+    tipped = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    mounts = {"other": Mount(), "imu_link": Mount(roll=math.pi / 2)}
+    check_all_right(turns(samples(2.0, tipped), mounts, wheels=lambda a, b: 0.0)[0], 0.0)
+
+
+WRONG = {
+    "rolled by 90 deg": (Rotation.from_euler("x", 90, degrees=True).as_matrix(), 9.81, Mount()),
+    "pitched by -90 deg": (Rotation.from_euler("y", -90, degrees=True).as_matrix(), 9.81, Mount()),
+    "upside down": (Rotation.from_euler("x", 180, degrees=True).as_matrix(), 9.81, Mount()),
+    "gravity's sign wrong": (np.eye(3), -9.81, Mount()),
+    "rolled, and gravity's sign wrong": (Rotation.from_euler("x", 90, degrees=True).as_matrix(), -9.81, Mount()),
+    "askew": (Rotation.from_euler("xyz", [50, -35, 20], degrees=True).as_matrix(), 9.81, Mount()),
+    "the mount is upside down, the IMU is not": (np.eye(3), 9.81, Mount(roll=math.pi)),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_mount_that_contradicts_gravity_is_set_right(case):
+    body_R_imu, gravity, mount = WRONG[case]
+    found, past = turns(samples(12.0, body_R_imu, gravity), {"imu_link": mount})
+    sworn = [t for _, _, t in found if t is not None]
+    told = next(i for i, (a, _, t) in enumerate(found) if t is not None and a > 0.3)
+    check_all_right(found[told:], 0.0)
+    assert len(sworn) > 80
+    by_then = sum(abs(turned(b) - turned(a)) for a, b, _ in found[2 : told + 1])
+    assert 0.4 < by_then < 0.7  # it waits for half a radian of turning by the wheels, and not longer
+    (note,) = past.notes()
+    assert "imu_link" in note
+    assert "contradicts gravity" in note
+    axis = [float(number) for number in note[note.index("[") + 1 : note.index("]")].split(",")]
+    np.testing.assert_allclose(axis, body_R_imu.T @ UP, atol=0.006)
+
+
+def test_noisy_wheels_still_tell_the_sign():
+    rng = np.random.default_rng(1)
+    body_R_imu, gravity, mount = WRONG["rolled, and gravity's sign wrong"]
+    found, _ = turns(
+        samples(12.0, body_R_imu, gravity), {"imu_link": mount}, wheels=lambda a, b: 1.8 * (turned(b) - turned(a)) + 0.02 * rng.normal()
+    )
+    check_all_right(found, 4.0)
+
+
+def test_before_the_wheels_have_told_the_axis_is_not_used():
+    body_R_imu, _, _ = WRONG["upside down"]
+    found, past = turns(samples(5.0, body_R_imu), wheels=lambda a, b: 0.001)
+    assert all(t is None for a, _, t in found if a > 0.3)
+    (note,) = past.notes()
+    assert "turned too little" in note
+
+
+@pytest.mark.parametrize("gravity", [0.0, 1.0, 981.0])
+def test_without_gravity_the_mount_is_believed(gravity):
+    """Drivers that publish no acceleration, or one in other units, say nothing of the mount."""
+    found, past = turns(samples(3.0, gravity=gravity), {"imu_link": Mount()}, wheels=lambda a, b: 0.0)
+    check_all_right(found, 0.0)
+    assert past.notes() == []
+    tipped = Rotation.from_euler("x", 180, degrees=True).as_matrix()
+    found, past = turns(samples(3.0, tipped, gravity=gravity), {"imu_link": Mount(roll=math.pi)}, wheels=lambda a, b: 0.0)
+    check_all_right(found, 0.0)
+
+
+@pytest.mark.parametrize("degrees", [10.0, -10.0])
+def test_a_slope_of_ten_degrees_is_no_contradiction(degrees):
+    """Gravity alone cannot tell a slope from a mount: the mount holds, and the scale is off by the cosine."""
+    R = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+    found, past = turns(samples(3.0, R), {"imu_link": Mount()}, wheels=lambda a, b: 0.0)
+    assert past.notes() == []
+    for start, end, turn in found:
+        assert turn.angle == pytest.approx(math.cos(math.radians(10.0)) * (turned(end) - turned(start)), abs=2e-5)
+
+
+def test_vibration_and_driving_do_not_look_like_another_mount():
+    rng = np.random.default_rng(0)
+    shaken = [
+        ImuSample(s.stamp_ns, s.angular_velocity, s.linear_acceleration + rng.normal([1.5, 0.0, 0.0], 2.0), s.frame_id)
+        for s in samples(3.0)
+    ]
+    assert history(shaken).notes() == []
+
+
+def test_history_is_bounded():
+    past = GyroHistory(NOISE, {}, keep_s=2.0)
+    for sample in samples(120.0):
+        past.push(sample)
+    assert len(past._stamps) == len(past._angles) <= 401
+    turn = past.turn(T0 + 118_100 * MS, T0 + 119 * S, 0.0)
+    assert turn.angle == pytest.approx(turned(119.0) - turned(118.1), abs=1e-4)
