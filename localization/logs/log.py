@@ -2,51 +2,30 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator, Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 from localization.errors import LogError
 from localization.events import Event, Reference
-from localization.logs.arms import arms_to_cg
 from localization.logs.chunks import Source, merge_channels
-from localization.logs.clouds import decode_cloud
-from localization.logs.decode import (
-    ArmReading,
-    Decoder,
-    JointReading,
-    OdometryReading,
-    UnusableError,
-    arm_decoder,
-    decode_cg,
-    decode_imu,
-    decode_odometry,
-    frame_name,
-    joint_decoder,
-    scan_decoder,
-    stamp_ns,
-)
+from localization.logs.decode import Decoder, UnusableError, frame_name, stamp_ns
 from localization.logs.inspect import LogInfo, inspect_log
+from localization.logs.intake import Intake, Part, read_item
 from localization.logs.merge import ClockPlan, Item, merge, plan_clocks
 from localization.logs.mounts import FixedTransforms
 from localization.logs.parts import choose_parts
 from localization.logs.references import reference_decoder
 from localization.logs.source import open_source
-from localization.logs.tally import Oddity, Tally
-from localization.logs.topics import REFERENCE_TYPES, TopicChooser, TopicOverrides, TopicSource
-from localization.logs.wheels import joints_to_wheels, odometry_to_wheels
+from localization.logs.tally import Tally
+from localization.logs.topics import REFERENCE_TYPES, TopicChooser, TopicOverrides
 from motion_models.robot import Mount, Robot
 
-_RANKS = {"joint_states": 0, "odometry": 0, "center_of_gravity": 1, "imu": 2, "scan": 3, "points": 3}
-_SCAN_WEIGHT = 100
 _GPS = "/fix"
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _TF_WATCHED_NS = 10_000_000_000
 _JOINT_STATES_SEEN = 500
-
-Payload = Callable[[Any, int], Any]
 
 
 def open_log(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> Log:  # noqa: B008 (frozen)
@@ -157,68 +136,17 @@ class Log:
         return list(dict.fromkeys(said))
 
     def _events(self, tally: Tally) -> Iterator[Event]:
-        parts: dict[str, tuple[int, Payload]] = {}
-        for source in self.sources.used():
-            parts[source.topic] = (_RANKS[source.kind], self._payload_decoder(source))
-        wheels = self.sources.wheels
-        topic = "" if wheels is None else wheels.topic
-        left, right = self._joints
-        from_joints = joints_to_wheels(len(left), len(right), self.robot.geometry.wheel_radius_m, topic, tally)
-        from_odometry = odometry_to_wheels(self.robot.driver, topic, tally)
-        arms = " and ".join(source.topic for source in self.sources.arms)
-        from_arms = None if self._arms is None else arms_to_cg(self._arms, self.robot.geometry, arms, tally)
-        for payload in merge(self._items(parts, tally), self._clocks, tally):
-            if isinstance(payload, JointReading):
-                yield from_joints(payload)
-            elif isinstance(payload, ArmReading):
-                if payload.wheels is not None:
-                    yield from_joints(dataclasses.replace(payload.wheels, stamp_ns=payload.stamp_ns))
-                if from_arms is not None:
-                    yield from from_arms(payload)
-            elif isinstance(payload, OdometryReading):
-                yield from_odometry(payload)
-            else:
-                yield payload
+        intake = Intake(self.sources, self._joints, self._arms, self.robot, tally)
+        for payload in merge(self._items(intake.parts, tally), self._clocks, tally):
+            yield from intake.events(payload)
 
-    def _payload_decoder(self, source: TopicSource) -> Payload:
-        if source.kind == "joint_states":
-            wheels = self.sources.wheels
-            is_wheels = wheels is not None and wheels.topic == source.topic
-            of_wheels = joint_decoder((*self._joints[0], *self._joints[1])) if is_wheels else None
-            if self._arms is not None and any(arm.topic == source.topic for arm in self.sources.arms):
-                return arm_decoder(frozenset(self._arms.chain.joint_names), of_wheels)
-            assert of_wheels is not None
-            return of_wheels
-        if source.kind == "scan":
-            return scan_decoder()
-        decoders: dict[str, Payload] = {
-            "odometry": decode_odometry,
-            "imu": decode_imu,
-            "center_of_gravity": decode_cg,
-            "points": decode_cloud,
-        }
-        return decoders[source.kind]
-
-    def _items(self, parts: Mapping[str, tuple[int, Payload]], tally: Tally) -> Iterator[Item]:
+    def _items(self, parts: Mapping[str, Part], tally: Tally) -> Iterator[Item]:
         decode = Decoder([c for c in self.channels if c.topic in parts], is_ros1=self.source.is_ros1)
         for raw in self.source.messages(parts.keys()):
-            if raw.type != self.types[raw.topic]:
-                continue
-            rank, payload_of = parts[raw.topic]
-            try:
-                message = decode(raw)
-                stamp = stamp_ns(message)
-                payload = payload_of(message, stamp)
-            except UnusableError as reason:
-                tally.count(raw.topic, reason.oddity)
-                continue
-            except (AttributeError, TypeError, ValueError):  # the log's own definition of the type lacks what the type has
-                tally.count(raw.topic, Oddity.MALFORMED)
-                continue
-            if payload is not None:
-                if isinstance(payload, ArmReading) and payload.wheels is None:
-                    rank = _RANKS["center_of_gravity"]
-                yield Item(raw.log_ns, stamp, raw.topic, rank, _SCAN_WEIGHT if rank == 3 else 1, payload)
+            if raw.type == self.types[raw.topic]:
+                item = read_item(raw.topic, raw.log_ns, partial(decode, raw), parts[raw.topic], tally)
+                if item is not None:
+                    yield item
 
     def _first_messages(self, topic: str, most: int) -> Iterator[tuple[int, Any]]:
         """The first decodable messages of a topic, with their time of recording."""

@@ -7,7 +7,6 @@ own increment only, which is then taken from the rates. An angle that wrapped co
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 
@@ -24,60 +23,61 @@ _STILL_M, _STILL_RAD = 1e-9, 1e-9
 _WRAP_RAD, _WRAP_WITHOUT_RATE_RAD = 0.3, 1.0
 
 
-def joints_to_wheels(left: int, right: int, wheel_radius_m: float, topic: str, tally: Tally) -> Callable[[JointReading], WheelSample]:
+class JointsToWheels:
     """Converter of readings whose first ``left`` joints are the left side's and the next ``right`` the right side's."""
-    known: JointReading | None = None
-    angle = np.full(left + right, np.nan)
 
-    def side_means(values: FloatArray) -> FloatArray:
-        numbers = values.tolist()
-        return np.array([sum(numbers[:left]) / left, sum(numbers[left:]) / right])
+    def __init__(self, left: int, right: int, wheel_radius_m: float, topic: str, tally: Tally) -> None:
+        self._left, self._right, self._radius, self._topic, self._tally = left, right, wheel_radius_m, topic, tally
+        self._known: JointReading | None = None
+        self._angle = np.full(left + right, np.nan)
 
-    def convert(reading: JointReading) -> WheelSample:
-        nonlocal known, angle
+    def __call__(self, reading: JointReading) -> WheelSample:
         if not np.isfinite(reading.position).all():
-            return WheelSample(reading.stamp_ns, side_means(reading.velocity), np.full(2, np.nan))
+            return WheelSample(reading.stamp_ns, self._side_means(reading.velocity), np.full(2, np.nan))
+        known = self._known
         if known is None:
-            angle = reading.position
+            self._angle = reading.position
         else:
             dt = (reading.stamp_ns - known.stamp_ns) * 1e-9
             step = reading.position - known.position
-            jumped = np.abs(step) * wheel_radius_m > _FASTEST_M_PER_S * max(dt, _SHORTEST_S)
+            jumped = np.abs(step) * self._radius > _FASTEST_M_PER_S * max(dt, _SHORTEST_S)
             if jumped.any():
                 expected = np.nan_to_num(reading.velocity) * dt
                 wrapped = np.remainder(step + math.pi, math.tau) - math.pi
                 is_wrap = np.abs(wrapped - expected) < np.where(np.isfinite(reading.velocity), _WRAP_RAD, _WRAP_WITHOUT_RATE_RAD)
                 if (jumped & ~is_wrap).any():
-                    tally.count(topic, Oddity.WHEEL_JUMP)
+                    self._tally.count(self._topic, Oddity.WHEEL_JUMP)
                 step = np.where(jumped, np.where(is_wrap, wrapped, expected), step)
-            angle = angle + step
-        known = reading
-        return WheelSample(reading.stamp_ns, side_means(reading.velocity), side_means(angle))
+            self._angle = self._angle + step
+        self._known = reading
+        return WheelSample(reading.stamp_ns, self._side_means(reading.velocity), self._side_means(self._angle))
 
-    return convert
+    def _side_means(self, values: FloatArray) -> FloatArray:
+        numbers = values.tolist()
+        return np.array([sum(numbers[: self._left]) / self._left, sum(numbers[self._left :]) / self._right])
 
 
-def odometry_to_wheels(driver: Driver, topic: str, tally: Tally) -> Callable[[OdometryReading], WheelSample]:
+class OdometryToWheels:
     """Converter by the driver's own geometry, inverted: q = (vx -+ wz w_s d/2)/r (Ebersole 2016, eq. 1.4-1.8).
 
     Angles come from the pose, of which messages that were lost take nothing away, rates from the twist. A driver that fills only
     one of the two is understood.
     """
-    radius = driver.wheel_radius_m
-    half_track = 0.5 * driver.wheel_separation_multiplier * driver.track_width_m
-    previous: OdometryReading | None = None
-    angle = np.zeros(2)
-    pose_has_moved = twist_has_moved = False
 
-    def wheels(forward: float, turn: float) -> FloatArray:
-        return np.array([forward - turn * half_track, forward + turn * half_track]) / radius
+    def __init__(self, driver: Driver, topic: str, tally: Tally) -> None:
+        self._radius = driver.wheel_radius_m
+        self._half_track = 0.5 * driver.wheel_separation_multiplier * driver.track_width_m
+        self._topic, self._tally = topic, tally
+        self._previous: OdometryReading | None = None
+        self._angle = np.zeros(2)
+        self._pose_has_moved = self._twist_has_moved = False
 
-    def convert(reading: OdometryReading) -> WheelSample:
-        nonlocal previous, angle, pose_has_moved, twist_has_moved
+    def __call__(self, reading: OdometryReading) -> WheelSample:
         vx, _, wz = reading.twist
         twist_is_known = math.isfinite(vx) and math.isfinite(wz)
-        twist_has_moved |= twist_is_known and (vx != 0.0 or wz != 0.0)
-        rate = wheels(vx, wz) if twist_is_known else np.full(2, np.nan)
+        self._twist_has_moved |= twist_is_known and bool(vx != 0.0 or wz != 0.0)
+        rate = self._wheels(vx, wz) if twist_is_known else np.full(2, np.nan)
+        previous = self._previous
         if previous is not None:
             dt = (reading.stamp_ns - previous.stamp_ns) * 1e-9
             forward, turn = arc(previous.pose, reading.pose)
@@ -85,23 +85,24 @@ def odometry_to_wheels(driver: Driver, topic: str, tally: Tally) -> Callable[[Od
             moved = abs(forward) > _STILL_M or abs(turn) > _STILL_RAD
             longest = max(dt, _SHORTEST_S)
             if not (abs(forward) <= _FASTEST_M_PER_S * longest and abs(turn) <= _FASTEST_RAD_PER_S * longest):
-                tally.count(topic, Oddity.POSE_JUMP)
+                self._tally.count(self._topic, Oddity.POSE_JUMP)
                 forward, turn = from_twist
             elif moved:
-                pose_has_moved = True
-            elif not pose_has_moved and twist_has_moved:
+                self._pose_has_moved = True
+            elif not self._pose_has_moved and self._twist_has_moved:
                 if from_twist != (0.0, 0.0):
-                    tally.count(topic, Oddity.NO_POSE)
+                    self._tally.count(self._topic, Oddity.NO_POSE)
                 forward, turn = from_twist
-            increment = wheels(forward, turn)
-            if not twist_has_moved and moved and dt > 0.0:
-                tally.count(topic, Oddity.NO_TWIST)
+            increment = self._wheels(forward, turn)
+            if not self._twist_has_moved and moved and dt > 0.0:
+                self._tally.count(self._topic, Oddity.NO_TWIST)
                 rate = increment / dt
-            angle = angle + increment
-        previous = reading
-        return WheelSample(reading.stamp_ns, rate, angle)
+            self._angle = self._angle + increment
+        self._previous = reading
+        return WheelSample(reading.stamp_ns, rate, self._angle)
 
-    return convert
+    def _wheels(self, forward: float, turn: float) -> FloatArray:
+        return np.array([forward - turn * self._half_track, forward + turn * self._half_track]) / self._radius
 
 
 def arc(world_T_a: FloatArray, world_T_b: FloatArray) -> tuple[float, float]:
