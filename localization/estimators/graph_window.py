@@ -84,10 +84,12 @@ class Window:
         self._positions: list[list[Position]] = [[] for _ in range(room)]
         self._change = np.zeros((room, n))
         self._pairs: Pairs | None = None
+        self._newest: Node | None = None
+        self._first_index = 0
         self._seed(first)
 
     def _seed(self, node: Node) -> None:
-        self._first_index, self._size = getattr(self, "_first_index", 0), 1
+        self._size, self._newest = 1, node
         self._poses[0], self._slow[0] = node.pose, node.slow
         self._roots[0, :, :-1], self._roots[0, :, -1] = node.root, 0.0
         self._change[0] = 0.0
@@ -102,8 +104,11 @@ class Window:
 
     @property
     def newest(self) -> Node:
-        i = self._size - 1
-        return Node(self._poses[i].copy(), self._slow[i].copy(), self._roots[i, :, :-1].copy())
+        """The newest node by all that is known up to now."""
+        if self._newest is None:
+            i = self._size - 1
+            self._newest = Node(self._poses[i].copy(), self._slow[i].copy(), self._roots[i, :, :-1].copy())
+        return self._newest
 
     def poses(self) -> FloatArray:
         """(k, 3) of the nodes from `oldest` on, by all that is known up to now."""
@@ -155,6 +160,7 @@ class Window:
         self._conditionals[i - 1] = ahead.conditional
         self._unary[i], self._positions[i] = 0.0, []
         self._size += 1
+        self._newest = ahead.node
         self._solve()
 
     def add_position(self, index: int, position: Position) -> None:
@@ -201,6 +207,7 @@ class Window:
     def _again(self, start: int) -> None:
         """Linearise the nodes from ``start`` on where they are now, and eliminate from there."""
         first, last = self._size - min(self._size, self._lag), self._size
+        self._newest = None
         here = slice(start, last)
         moved = self._change[here].copy()
         if start == first:
@@ -226,6 +233,7 @@ class Window:
             raise SingularError("the window's system is singular or not finite.")
         newest = self._change[i]
         if newest.any():
+            self._newest = None
             J = se2.right_jacobian_inverse(newest[:3])
             _move(self._roots[i], 0, newest, J)
             self._roots[i, :, -1] = 0.0
