@@ -8,11 +8,13 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from kiss_icp.config import load_config
 from kiss_icp.kiss_icp import KissICP
 
+from localization.lidar.threshold import AdaptiveThreshold
 from motion_models.se2 import FloatArray
 
 _NO_STAMPS = np.empty(0)
@@ -34,15 +36,16 @@ class Kiss:
     """One KISS-ICP pipeline and its local map. Poses are ``map_T_body`` (4, 4), points (N, 3) in the body frame [m]."""
 
     def __init__(self, voxel_size: float, min_range: float, max_range: float) -> None:
+        self._made = voxel_size, min_range, max_range
         with _without_environment():
             config = load_config(None)
         config.data.deskew = False
         config.data.min_range, config.data.max_range = min_range, max_range
         config.mapping.voxel_size = voxel_size
-        config.adaptive_threshold.initial_threshold = 0.5
-        config.adaptive_threshold.min_motion_th = 0.01
         config.registration.max_num_threads = 1  # two threads are not bit-identical from run to run
         self._kiss = KissICP(config)
+        self._threshold = AdaptiveThreshold(0.5, 0.01, max_range)
+        self._kiss.adaptive_threshold = self._threshold
 
     def register_frame(self, points: FloatArray) -> FloatArray:
         """The pose (4, 4) of the next frame as KISS-ICP alone finds it, from its own constant-velocity guess; the map grows."""
@@ -77,3 +80,21 @@ class Kiss:
     def point_cloud(self) -> FloatArray:
         """(M, 3) the map's points."""
         return np.asarray(self._kiss.local_map.point_cloud())
+
+    def __getstate__(self) -> dict[str, Any]:
+        kiss = self._kiss
+        return {
+            "made": self._made,
+            "threshold": self._threshold,
+            "last_pose": kiss.last_pose,
+            "last_delta": kiss.last_delta,
+            "points": self.point_cloud(),
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """The map is made anew: within a voxel the points come in the order in which they were added, so that it is the same voxel."""
+        self.__init__(*state["made"])  # type: ignore[misc]
+        kiss = self._kiss
+        self._threshold = kiss.adaptive_threshold = state["threshold"]
+        kiss.last_pose, kiss.last_delta = state["last_pose"], state["last_delta"]
+        kiss.local_map.add_points(state["points"])

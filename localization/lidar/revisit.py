@@ -10,7 +10,7 @@ drift can explain, if no other place explains the scan about as well, and if the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,10 @@ from motion_models import se2
 from motion_models.se2 import FloatArray
 
 _KNOWS_NOTHING = np.array([10.0, 10.0, 3.0])
-_MOST_POINTS, _MOST_RIVALS = 180, 8
+_MOST_POINTS = 180  # of a scan, in the search
+_STARTS, _MOST_RIVALS = 6, 24
+_RIVAL_SCORE = 0.7  # whose score in the coarse search is below this part of the best fit's explains far less
+_FEW_NEW = 0.02  # part of a place's points that may be added in passing
 
 
 @dataclass(frozen=True)
@@ -111,66 +114,56 @@ class Revisits:
         return travel - last.travel >= self.config.keyframe_m or turn >= self.config.keyframe_rad
 
     def _find(self, scan: FloatArray, lines: LineMap, pose: FloatArray, travel: float) -> tuple[_Fit | None, int]:
-        c, before = self.config, travel - self.config.old_after_m
-        if before <= self.track[0].travel or len(scan) < 10:
+        """Where the scan fits into the old map, and the place from which that part of it was drawn."""
+        c = self.config
+        if travel - c.old_after_m <= self.track[0].travel or len(scan) < 10:
             return None, -1
-        limits = np.array([c.max_search_m, c.max_search_m, c.max_search_rad])
         reach = float(np.quantile(np.hypot(scan[:, 0], scan[:, 1]), 0.9))
-        points, travels = lines.points_within(pose[:2], reach + c.max_search_m, before)
+        points, travels = lines.points_within(pose[:2], reach + c.max_search_m)
+        before = _last_absence(travels, travel, c.old_after_m)
+        points, travels = points[travels < before], travels[travels < before]
         if len(points) < c.min_matched * len(scan):
             return None, -1
-        then = self.track.at_travel(float(np.median(travels)))
-        growth = self.track.growth(then)
+        growth = self.track.growth(self.track.at_travel(float(np.median(travels))))
+        resolution = np.diag([self._voxel, self._voxel, self._voxel / max(reach, 1.0)]) ** 2
         if 9.0 * np.linalg.eigvalsh(growth[:2, :2])[-1] < self._voxel**2:
             return None, -1  # the scan matcher itself sees that far
-        floor = np.diag([self._voxel, self._voxel, self._voxel / max(reach, 1.0)]) ** 2 / 9.0
-        prior = growth + floor
+        search = _Search(scan, lines, before, pose, growth + resolution / 9.0, resolution, self._options)
         few = scan[:: math.ceil(len(scan) / _MOST_POINTS)]
-        scores = correlate(few, points, pose, prior, limits, self._voxel, self._gate)
+        limits = np.array([c.max_search_m, c.max_search_m, c.max_search_rad])
+        scores = correlate(few, points, pose, search.prior, limits, self._voxel, self._gate)
         if len(scores.poses) == 0 or scores.fractions.max() < c.min_matched:
             return None, -1
-        fits = self._peaks(scan, lines, scores.poses, scores.fractions - 0.5 * scores.distances / len(few), prior, pose, before)
-        fits = [f for f in fits if f.on_map.any()]
-        if not fits:
-            return None, -1
-        best = max(fits, key=lambda f: f.score)
+        left = scores.fractions - 0.5 * scores.distances / len(few)
+        best = search.best(scores.poses, left)
         if best.on_map.mean() < c.min_matched:
             return None, -1
-        if any(self._rivals(best, other, scan) for other in fits if other is not best):
-            return None, -1
+        best = self._doubted(best, search, scores.poses, left)
         then = self.track.at_travel(float(np.median(best.travels[best.on_map])))
         off = se2.log(se2.between(pose, best.pose))
-        if off @ np.linalg.solve(self.track.growth(then) + best.cov + floor, off) > self._gate:
+        if off @ np.linalg.solve(self.track.growth(then) + best.cov + resolution / 9.0, off) > self._gate:
             return None, -1
         return best, then
 
-    def _peaks(
-        self, scan: FloatArray, lines: LineMap, poses: FloatArray, scores: FloatArray, prior: FloatArray, pose: FloatArray, before: float
-    ) -> list[_Fit]:
-        """The best places and their rivals, each distinct from the others in directions that its own fit holds."""
-        fits: list[_Fit] = []
-        information = np.asarray(np.linalg.inv(prior), dtype=float)
-        left = scores > 0.6 * scores.max()
+    def _doubted(self, best: _Fit, search: _Search, poses: FloatArray, scores: FloatArray) -> _Fit:
+        """``best`` with a covariance that is open towards every other place that explains the scan about as well."""
+        cov = best.cov
+        left = scores > _RIVAL_SCORE * best.score
         poses, scores = poses[left], scores[left]
-        reach = max(float(np.quantile(np.hypot(scan[:, 0], scan[:, 1]), 0.8)), 1.0)
-        grid = np.diag([self._voxel, self._voxel, self._voxel / reach]) ** 2
-        for _ in range(4 * _MOST_RIVALS):
-            if not len(poses) or len(fits) == _MOST_RIVALS:
-                break
+        for _ in range(_MOST_RIVALS):
+            far = _distances(best.peak, poses, cov + search.resolution * (4.0 / self._gate)) > self._gate
+            poses, scores = poses[far], scores[far]
+            if not len(poses):
+                return replace(best, cov=cov)
             start = poses[np.argmax(scores)]
-            found = lines.fit(scan, start, self._options, information, pose, before)
-            cov = np.asarray(np.linalg.inv(found.information + np.diag(_KNOWS_NOTHING**-2)), dtype=float)
-            if not any(_distance(f.peak, found.pose, f.cov + cov) < self._gate for f in fits):
-                errors, travels = lines.compare(scan, found.pose, self._options.radius, before)
-                on_map = errors < self._options.kernel
-                off = se2.log(se2.between(pose, found.pose))
-                score = float(on_map.mean()) - 0.5 * float(off @ information @ off) / len(scan)
-                full = se2.compose(found.pose, se2.exp(cov @ found.gradient))
-                fits.append(_Fit(full, found.pose, cov, on_map, travels, score))
-            # steps of the search that this start stands for
-            near = _distances(start, poses, grid + cov if fits and fits[-1].peak is found.pose else grid) < 4.0
-            poses, scores = poses[~near], scores[~near]
-        return fits
+            other = search.fit(start)
+            is_distinct = _distances(best.peak, other.peak, cov + search.resolution / self._gate) > self._gate
+            if is_distinct and self._rivals(best, other, search.scan):
+                off = 3.0 * se2.log(se2.between(best.peak, other.peak))
+                cov = cov + np.outer(off, off)
+            tried = _distances(start, poses, search.resolution) < 4.0
+            poses, scores = poses[~tried], scores[~tried]
+        return replace(best, cov=cov + np.diag(_KNOWS_NOTHING**2))  # too many to try
 
     def _rivals(self, best: _Fit, other: _Fit, scan: FloatArray) -> bool:
         """Whether ``other`` explains the scan about as well: McNemar's test of the points that only one of them explains, where those of
@@ -192,12 +185,53 @@ class Revisits:
         return bool(off @ np.linalg.solve(cov, off) < self._gate)
 
 
-def _distance(a: FloatArray, b: FloatArray, cov: FloatArray) -> float:
-    d = se2.log(se2.between(a, b))
-    return float(d @ np.linalg.solve(cov, d))
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """One scan against the map as it was before some travelled distance."""
+
+    scan: FloatArray
+    lines: LineMap
+    before: float
+    pose: FloatArray
+    prior: FloatArray  # (3, 3) covariance of ``pose`` against that map
+    resolution: FloatArray  # (3, 3) what the search cannot tell apart
+    options: FitOptions
+
+    def best(self, poses: FloatArray, scores: FloatArray) -> _Fit:
+        """The best of fits from the best ``poses`` (K, 3), each start some way from the others."""
+        fits = []
+        for _ in range(_STARTS):
+            start = poses[np.argmax(scores)]
+            fits.append(self.fit(start))
+            far = _distances(start, poses, self.resolution) > 4.0
+            poses, scores = poses[far], scores[far]
+            if not len(poses):
+                break
+        return max(fits, key=lambda f: f.score)
+
+    def fit(self, start: FloatArray) -> _Fit:
+        information = np.asarray(np.linalg.inv(self.prior), dtype=float)
+        found = self.lines.fit(self.scan, start, self.options, information, self.pose, self.before)
+        cov = np.asarray(np.linalg.inv(found.information + np.diag(_KNOWS_NOTHING**-2)), dtype=float)
+        errors, travels = self.lines.compare(self.scan, found.pose, self.options.radius, self.before)
+        on_map = errors < self.options.kernel
+        off = se2.log(se2.between(self.pose, found.pose))
+        score = float(on_map.mean()) - 0.5 * float(off @ information @ off) / len(self.scan)
+        return _Fit(se2.compose(found.pose, se2.exp(cov @ found.gradient)), found.pose, cov, on_map, travels, score)
+
+
+def _last_absence(travels: FloatArray, travel: float, length: float) -> float:
+    """The travelled distance [m] at which the robot last began to see nothing new around here for ``length`` [m]; -inf if it never did.
+
+    ``travels`` (M,): when the points around here were mapped; ``travel``: now. What was mapped before is an earlier visit's.
+    """
+    ordered = np.sort(travels)
+    since = np.searchsorted(ordered, ordered + length) - np.arange(1, len(ordered) + 1)
+    is_end = (since <= _FEW_NEW * len(ordered)) & (ordered <= travel - length)
+    return float(ordered[is_end][-1]) + 1e-3 if is_end.any() else -math.inf
 
 
 def _distances(center: FloatArray, poses: FloatArray, cov: FloatArray) -> FloatArray:
     d = se2.log(se2.between(center, poses))
-    found: FloatArray = np.einsum("ki,ij,kj->k", d, np.linalg.inv(cov), d)
+    found: FloatArray = np.einsum("...i,ij,...j->...", d, np.linalg.inv(cov), d)
     return found
