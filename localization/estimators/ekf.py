@@ -6,11 +6,13 @@ The mean lives on SE(2); filterpy carries the covariance of the error state, who
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from scipy.stats import chi2
 
+from localization.errors import EstimatorError
 from localization.gyro import Turn
 from localization.residuals import motion_residual, turn_residual
 from localization.steps import Step
@@ -61,13 +63,18 @@ class Ekf:
         self._since_start, self._since_anchor = np.zeros(3), np.zeros(3)
         self.bias, self.clock_offset = 0.0, 0.0
         self._gate = float(chi2.ppf(self.config.gate_probability, 3))
-        self._filter = ExtendedKalmanFilter(dim_x=size, dim_z=3)
-        self._filter.P = np.zeros((size, size))
+        self._filter = _filter(np.zeros((size, size)))
         self._filter.P[BIAS, BIAS] = gyro.bias_sigma_rad_per_s**2
         self._filter.P[CLOCK, CLOCK] = self.config.clock_sigma_s**2
         self._filter.P[PARAMS:, PARAMS:] = corrected.cov
         self.correction = np.zeros(len(corrected.names))
         """(k,) what is added to the model's parameters along the corrections' directions."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_filter": self._filter.P}  # all that filterpy's filter knows between two updates
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update({**state, "_filter": _filter(state["_filter"])})
 
     @property
     def covariance(self) -> FloatArray:
@@ -99,7 +106,8 @@ class Ekf:
         F[POSE, CLOCK] = step.d_clock
         F[POSE, PARAMS:] = step.predicted.d_params @ self._corrected.directions
         F[START, START], F[START, POSE] = np.zeros((3, 3)), np.eye(3)
-        P = F @ self._filter.P @ F.T
+        with np.errstate(over="ignore", invalid="ignore"):
+            P = F @ self._filter.P @ F.T
         P[POSE, POSE] += step.predicted.cov
         P[BIAS, BIAS] += self._gyro.bias_walk_rad_per_s_sqrt_s**2 * step.duration
         if self.config.clock_sigma_s:
@@ -109,10 +117,12 @@ class Ekf:
             P[POSE, POSE] += np.diag([c.nudge_m2_per_s, c.nudge_m2_per_s, c.nudge_rad2_per_s]) * step.duration
         else:
             P[PARAMS:, PARAMS:] += self._corrected.walk_cov * step.duration
+        moved = se2.compose(self.pose, step.predicted.delta)
+        _check(f"the motion that the wheels predict until stamp {step.end_ns} ns", moved, P)
         self._filter.P = P
         self._start, self._since_start = self.pose, step.predicted.delta
         self._since_anchor = se2.compose(self._since_anchor, step.predicted.delta)
-        self.pose = se2.compose(self.pose, step.predicted.delta)
+        self.pose = moved
 
     def measure_turn(self, turn: Turn) -> float:
         """The gyro's turn since the start of the step."""
@@ -141,7 +151,8 @@ class Ekf:
         H[:, ANCHOR], H[:, POSE] = -d_pose @ se2.adjoint(se2.inverse(self._since_anchor)), d_pose
         R = d_pose @ measured.cov @ d_pose.T
         S = H @ self._filter.P @ H.T + R
-        nis = float(error @ np.linalg.solve(S, error))
+        _check("the motion that the LiDAR measured", error, S)
+        nis = float(error @ _solve(S, error))
         limit = self._gate
         if nis > limit:
             if can_slip:
@@ -192,10 +203,18 @@ class Ekf:
 
     def _update(self, error: FloatArray, H: FloatArray, R: FloatArray) -> float:
         """``error`` is prediction minus measurement; the error state's mean is zero, so the innovation is its negative."""
-        f = self._filter
+        f, before = self._filter, self._filter.P
         f.x = np.zeros((self._size, 1))
-        f.update(np.zeros((len(error), 1)), lambda x: H, lambda x: error[:, None], R=R)
-        f.P = 0.5 * (f.P + f.P.T)
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                f.update(np.zeros((len(error), 1)), lambda x: H, lambda x: error[:, None], R=R)
+                f.P = 0.5 * (f.P + f.P.T)
+            _check("a measurement", f.x, f.P)
+        except np.linalg.LinAlgError as singular:
+            raise EstimatorError(_CERTAIN) from singular
+        except EstimatorError:
+            f.P = before
+            raise
         correction = f.x[:, 0]
         self.pose = se2.compose(self.pose, se2.exp(correction[POSE]))
         self._start = se2.compose(self._start, se2.exp(correction[START]))
@@ -204,3 +223,25 @@ class Ekf:
         self.clock_offset += float(correction[CLOCK])
         self.correction = self.correction + correction[PARAMS:]
         return float((f.y.T @ f.SI @ f.y)[0, 0])
+
+
+def _filter(P: FloatArray) -> ExtendedKalmanFilter:
+    found = ExtendedKalmanFilter(dim_x=len(P), dim_z=3)
+    found.P = P
+    return found
+
+
+_CERTAIN = "a measurement without any noise meets a prediction without any: give the sensors of the robot file some noise."
+
+
+def _check(what: str, *arrays: FloatArray) -> None:
+    """A state that is not finite is never taken over: everything after it would be lost without a word."""
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise EstimatorError(f"{what} has numbers that are not finite, or too large to compute with. Look at its source in the log.")
+
+
+def _solve(S: FloatArray, error: FloatArray) -> FloatArray:
+    try:
+        return np.asarray(np.linalg.solve(S, error))
+    except np.linalg.LinAlgError as singular:
+        raise EstimatorError(_CERTAIN) from singular
