@@ -1,0 +1,134 @@
+"""A state on disk: written as a whole or not at all, and resumed by another process to the last bit.
+
+The file: a line with the format's name and version, one with the SHA-256 of all that follows, a line of JSON (what made the state, and how
+far it had come), then the state (`freeze`). It is written beside its place, forced to disk, and moved there: whoever kills the process
+at any moment finds the old state or the new one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from localization.errors import DumpError
+from localization.online.freeze import freeze, thaw
+from localization.provenance import versions
+from motion_models.robot import Robot
+
+_MAGIC = b"skidloc state 1\n"
+
+
+@dataclass(frozen=True)
+class Dump:
+    """What `read_dump` found."""
+
+    head: Mapping[str, Any]
+    """What the writer told of the state."""
+    value: Any
+
+
+def fingerprints(**objects: Any) -> dict[str, str]:
+    """What must be the same where a state is resumed: the libraries whose rounding enters results, and these objects."""
+    found = {f"version of {name}": version for name, version in versions().items()}
+    for name, value in objects.items():
+        if isinstance(value, Robot):
+            value = dataclasses.replace(value, folder=None)  # the same robot wherever its file is
+        found[name] = value if isinstance(value, str) else hashlib.sha256(b"".join(freeze(value))).hexdigest()[:12]
+    return found
+
+
+def write_dump(path: Path, value: Any, head: Mapping[str, Any], made_by: Mapping[str, str], shared: Mapping[str, Any]) -> None:
+    """Replace the file ``path`` by one of ``value``; ``shared`` objects are the resumer's to bring, for ``made_by`` says that they must
+    be the same (`fingerprints`).
+
+    Raises `DumpError` if the state or the file cannot be written.
+    """
+    try:
+        text, blob = freeze(value, shared)
+    except DumpError as error:
+        raise DumpError(f"no state can be dumped: {error}.") from error
+    about = json.dumps({**head, "made_by": made_by, "state_bytes": len(text)}).encode()
+    body = b"".join((about, b"\n", text, blob))
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with beside.open("wb") as file:
+            file.write(_MAGIC + hashlib.sha256(body).hexdigest().encode() + b"\n")
+            file.write(body)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            beside.unlink()
+        raise DumpError(f"the state cannot be written to '{path}': {error.strerror}.") from error
+
+
+def read_head(path: Path) -> Mapping[str, Any]:
+    """What the state's writer told of it. Raises `DumpError`."""
+    return _read(path)[0]
+
+
+def read_dump(path: Path, made_by: Mapping[str, str], shared: Mapping[str, Any]) -> Dump:
+    """The state in ``path``, with the ``shared`` objects in their places.
+
+    Raises `DumpError` for a file that is not there, damaged or foreign, or if it was made by something else than ``made_by``.
+    """
+    head, text, blob = _read(path)
+    then = head.get("made_by", {})
+    different = [name for name in made_by if then.get(name) != made_by[name]]
+    if different:
+        told = ", ".join(f"{name} ({then.get(name, 'unknown')} then, {made_by[name]} now)" for name in different)
+        raise DumpError(
+            f"the state in '{path}' was made with another {told}: resume with what it was made with, or remove it to start anew."
+        )
+    try:
+        return Dump(head, thaw(text, blob, shared))
+    except DumpError as error:
+        raise DumpError(f"the state in '{path}' cannot be used: {error}. Remove it to start anew.") from error
+
+
+def _read(path: Path) -> tuple[dict[str, Any], bytes, bytes]:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise DumpError(f"no state can be read from '{path}': {error.strerror}.") from error
+    if not content.startswith(_MAGIC):
+        of_another = content.startswith(_MAGIC[: _MAGIC.rindex(b" ")])
+        what = "of another version of its format" if of_another else "no state of an estimator"
+        raise DumpError(f"'{path}' is {what}. Remove it, or name another file.")
+    digest, _, body = content[len(_MAGIC) :].partition(b"\n")
+    if hashlib.sha256(body).hexdigest().encode() != digest:
+        raise DumpError(f"the state in '{path}' is damaged: its check sum is not that of its content. Remove it to start anew.")
+    about, _, rest = body.partition(b"\n")
+    try:
+        head = json.loads(about)
+        size = int(head["state_bytes"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise DumpError(f"the state in '{path}' has no readable head. Remove it to start anew.") from error
+    return head, rest[:size], rest[size:]
+
+
+class Dumper:
+    """Writes a state at most once every ``every_s`` [s] of the clock on the wall."""
+
+    def __init__(self, path: Path, made_by: Mapping[str, str], shared: Mapping[str, Any], every_s: float = 1.0) -> None:
+        self.path, self._made_by, self._shared, self._every_s = path, made_by, shared, every_s
+        self._last = -float("inf")
+        self.n_written = 0
+
+    def is_due(self) -> bool:
+        return time.monotonic() - self._last >= self._every_s
+
+    def write(self, value: Any, head: Mapping[str, Any]) -> None:
+        """Now. Raises `DumpError`."""
+        write_dump(self.path, value, head, self._made_by, self._shared)
+        self._last = time.monotonic()  # from the end of writing: a slow disk must not take all the time
+        self.n_written += 1

@@ -1,0 +1,245 @@
+"""Objects as numbers and names: what a state holds, without pickle, so that a foreign file can only be refused and never run code.
+
+Understood are plain values, numpy arrays and numbers, the usual containers, and objects of this project's own classes, which are made
+without calling them (``__setstate__`` where a class has one). What is held twice is written once and held twice again. Arrays keep their
+layout in memory, and a view of another array stays one: linear algebra rounds by layout, and results are to be the same to the last bit.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from array import array
+from collections import deque
+from collections.abc import Mapping
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localization.errors import DumpError
+
+_PACKAGES = ("localization.", "motion_models.")
+_KINDS = "biufc"
+_PACKED_AT_LEAST = 8
+
+Json = Any
+
+
+def freeze(value: Any, shared: Mapping[str, Any] | None = None) -> tuple[bytes, bytes]:
+    """``value`` as JSON and the bytes of its arrays. ``shared`` objects, by name, are not written: `thaw` is given them again.
+
+    Raises `DumpError` for an object that cannot be written.
+    """
+    writer = _Writer(shared or {})
+    root = writer.put(value)
+    text = json.dumps({"root": root, "objects": writer.objects, "arrays": writer.arrays}, separators=(",", ":"), allow_nan=False)
+    return text.encode(), b"".join(writer.blobs)
+
+
+def thaw(text: bytes, blob: bytes, shared: Mapping[str, Any] | None = None) -> Any:
+    """The value of `freeze`. Raises `DumpError` for bytes that are none of its."""
+    try:
+        content = json.loads(text)
+        return _Reader(content, blob, shared or {}).get(content["root"])
+    except DumpError:
+        raise
+    except (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, UnicodeDecodeError, ValueError) as error:
+        raise DumpError(f"it does not hold what this version writes ({type(error).__name__}: {error})") from error
+
+
+class _Writer:
+    def __init__(self, shared: Mapping[str, Any]) -> None:
+        self._shared = {id(value): name for name, value in shared.items()}
+        self._known: dict[int, int] = {}
+        self._kept: list[Any] = []  # so that no id is given twice while writing
+        self._place = 0
+        self.objects: list[Json] = []
+        self.arrays: list[Json] = []
+        self.blobs: list[bytes] = []
+
+    def put(self, value: Any) -> Json:
+        if value is None or value is True or value is False or type(value) is str or type(value) is int:
+            return value
+        if type(value) is float:
+            return value if math.isfinite(value) else ["f", repr(value)]
+        if id(value) in self._shared:
+            return ["x", self._shared[id(value)]]
+        if isinstance(value, np.generic):
+            return ["n", self._array(np.asarray(value))]
+        if type(value) is tuple:
+            return ["t", *map(self.put, value)]
+        if id(value) not in self._known:
+            self._known[id(value)] = index = len(self.objects)
+            self._kept.append(value)
+            self.objects.append(None)
+            self.objects[index] = self._object(value)
+        return ["o", self._known[id(value)]]
+
+    def _object(self, value: Any) -> Json:
+        kind = type(value)
+        if kind is np.ndarray:
+            return self._ndarray(value)
+        if kind is list:
+            packed = self._packed(value)
+            return ["p", *packed] if packed else ["l", *map(self.put, value)]
+        if kind is dict:
+            return ["d", *([self.put(k), self.put(v)] for k, v in value.items())]
+        if kind is deque:
+            return ["q", value.maxlen, *map(self.put, value)]
+        if kind is array:
+            return ["a", value.typecode, self._array(np.array(value))]
+        if kind is slice:
+            return ["s", value.start, value.stop, value.step]
+        if kind.__module__.startswith(_PACKAGES) and not isinstance(value, Enum):
+            return ["c", kind.__module__, kind.__qualname__, self.put(_state(value))]
+        raise DumpError(f"the state holds a {kind.__module__}.{kind.__qualname__}, which cannot be written down")
+
+    def _packed(self, values: list[Any]) -> list[Json] | None:
+        """Long lists of numbers, or of equal rows of numbers, as arrays: the last seconds of wheels are thousands."""
+        if len(values) < _PACKED_AT_LEAST:
+            return None
+        kinds = set(map(type, values))
+        if kinds == {tuple}:
+            lengths = set(map(len, values))
+            if len(lengths) != 1 or lengths == {0}:
+                return None
+            columns = [self._column(column) for column in zip(*values, strict=True)]
+            return None if None in columns else ["rows", *columns]
+        column = self._column(values)
+        return None if column is None else ["column", column]
+
+    def _column(self, values: Any) -> Json:
+        kinds = set(map(type, values))
+        for kind, dtype in ((float, "<f8"), (int, "<i8"), (bool, "|b1"), (np.float64, "<f8")):
+            if kinds == {kind}:
+                try:
+                    return [kind.__name__, self._array(np.array(values, dtype=dtype))]
+                except OverflowError:
+                    return None
+        return None
+
+    def _ndarray(self, value: NDArray[Any]) -> Json:
+        if value.dtype.kind not in _KINDS:
+            raise DumpError(f"the state holds an array of {value.dtype}, which cannot be written down")
+        base = value
+        while isinstance(base.base, np.ndarray):
+            base = base.base
+        if base is not value and not (value.flags.c_contiguous or value.flags.f_contiguous) and base.flags.c_contiguous:
+            offset = value.__array_interface__["data"][0] - base.__array_interface__["data"][0]
+            return ["v", self.put(base), value.dtype.str, offset, list(value.shape), list(value.strides)]
+        return ["m", self._array(value)]
+
+    def _array(self, value: NDArray[Any]) -> int:
+        order = "F" if value.flags.f_contiguous and not value.flags.c_contiguous else "C"
+        self.arrays.append([value.dtype.str, list(value.shape), order, self._place])
+        self.blobs.append(value.tobytes(order))  # type: ignore[arg-type]
+        self._place += len(self.blobs[-1])
+        return len(self.arrays) - 1
+
+
+class _Reader:
+    def __init__(self, content: Json, blob: bytes, shared: Mapping[str, Any]) -> None:
+        self._objects, self._arrays = content["objects"], content["arrays"]
+        self._blob, self._shared = blob, shared
+        self._made: dict[int, Any] = {}
+
+    def get(self, code: Json) -> Any:
+        if not isinstance(code, list):
+            return code
+        kind, *rest = code
+        if kind == "o":
+            return self._object(rest[0])
+        if kind == "t":
+            return tuple(map(self.get, rest))
+        if kind == "f":
+            return float(rest[0])
+        if kind == "x":
+            return self._shared[rest[0]]
+        if kind == "n":
+            return self._array(rest[0])[()]
+        raise ValueError(f"unknown code {kind!r}")
+
+    def _object(self, index: int) -> Any:
+        if index not in self._made:
+            self._make(index, self._objects[index])
+        return self._made[index]
+
+    def _make(self, index: int, code: Json) -> None:
+        """Containers are known before they are filled, for they may hold themselves."""
+        kind, *rest = code
+        if kind == "c":
+            self._instance(index, *rest)
+        elif kind == "l":
+            made: list[Any] = []
+            self._made[index] = made
+            made.extend(map(self.get, rest))
+        elif kind == "d":
+            table: dict[Any, Any] = {}
+            self._made[index] = table
+            table.update((self.get(k), self.get(v)) for k, v in rest)
+        elif kind == "q":
+            queue: deque[Any] = deque(maxlen=rest[0])
+            self._made[index] = queue
+            queue.extend(map(self.get, rest[1:]))
+        elif kind == "p":
+            columns = [self._column(*column) for column in rest[1:]]
+            self._made[index] = list(zip(*columns, strict=True)) if rest[0] == "rows" else columns[0]
+        elif kind == "m":
+            self._made[index] = self._array(rest[0])
+        elif kind == "v":
+            self._made[index] = self._view(*rest)
+        elif kind == "a":
+            self._made[index] = array(rest[0], self._array(rest[1]).tobytes())
+        elif kind == "s":
+            self._made[index] = slice(*rest)
+        else:
+            raise ValueError(f"unknown object {kind!r}")
+
+    def _instance(self, index: int, module: str, name: str, state: Json) -> None:
+        home = sys.modules.get(module) if module.startswith(_PACKAGES) else None
+        found: Any = home
+        for part in name.split("."):
+            found = getattr(found, part, None)
+        # of our modules, loaded already, and defined there: an imported name would be somebody else's class
+        if not isinstance(found, type) or found.__module__ != module:
+            raise DumpError(f"it holds a {module}.{name}, which this version does not have")
+        made: Any = object.__new__(found)
+        self._made[index] = made
+        content = self.get(state)
+        if hasattr(found, "__setstate__"):
+            made.__setstate__(content)
+        else:
+            for key, value in content.items():
+                object.__setattr__(made, key, value)
+
+    def _column(self, kind: str, place: int) -> list[Any]:
+        values = self._array(place)
+        return list(values) if kind == "float64" else values.tolist()
+
+    def _view(self, base: Json, dtype: str, offset: int, shape: list[int], strides: list[int]) -> NDArray[Any]:
+        return np.ndarray(tuple(shape), _dtype(dtype), self.get(base), offset, tuple(strides))
+
+    def _array(self, place: int) -> NDArray[Any]:
+        dtype, shape, order, offset = self._arrays[place]
+        count = math.prod(shape)
+        flat = np.frombuffer(self._blob, _dtype(dtype), count, offset) if count else np.empty(0, _dtype(dtype))
+        return flat.copy().reshape(shape, order=order)
+
+
+def _dtype(name: str) -> np.dtype[Any]:
+    dtype = np.dtype(name)
+    if dtype.kind not in _KINDS:
+        raise ValueError(f"arrays of {name} are not written")
+    return dtype
+
+
+def _state(value: Any) -> Any:
+    state = value.__getstate__()
+    if state is None:
+        return {}
+    if isinstance(state, tuple):  # slots
+        return {**(state[0] or {}), **(state[1] or {})}
+    return state
