@@ -6,11 +6,13 @@ here, so that a fit does not push it into the model's parameters.
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numba
 import numpy as np
 
 from motion_models import se2
-from motion_models.base import MotionModel
+from motion_models.base import Twist
 from motion_models.integrate import _integrate, noise_vector
 from motion_models.maneuvers import Batch, IntArray
 from motion_models.robot import WheelNoise
@@ -25,8 +27,14 @@ lidar_offset_x, lidar_offset_y [m], lidar_yaw [rad]: pose of the tracked point i
 """
 
 
+class HasTwist(Protocol):
+    """As much of a `MotionModel` as a prediction asks for."""
+
+    def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist: ...
+
+
 def predict(
-    model: MotionModel,
+    model: HasTwist,
     batch: Batch,
     params: FloatArray,
     witness: FloatArray,

@@ -1,0 +1,330 @@
+"""The diagnosis: discrepancies, causes, what they gain, and what is left."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from localization.diagnosis import residue
+from localization.diagnosis.attribution import (
+    Regression,
+    best_subset,
+    likeness,
+    max_statistic,
+    p_value,
+    regression,
+    statistic,
+)
+from localization.diagnosis.drive import Drive
+from localization.diagnosis.effects import EFFECTS, EXTRA, Belief, Effect, friction_change, slope_across
+from localization.diagnosis.findings import Component, Diagnosis, Finding, Verdict
+from localization.diagnosis.heldout import heldout_gain
+from localization.diagnosis.next_drive import general_advice, separating_drive
+from localization.diagnosis.noise import Noise, estimated_noise, plain_noise, regressors
+from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, Pipeline, with_sizes
+from localization.diagnosis.words import evidence, sentence
+from motion_models.base import MotionModel
+from motion_models.se2 import FloatArray
+
+_PRIOR = 4.0  # sigma of a size before looking, over the usual one
+_ALIKE = 0.7  # signatures less alike than this are no aliases, however short the drive
+_CLOSE = 7.0  # twice the log-likelihood by which a rival may be worse: odds of 1 to 33
+_CLOSE_SHARE = 0.02  # or this share of what the cause explains, which no model is right about
+_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class DiagnosisConfig:
+    """How sure a diagnosis must be."""
+
+    significance: float = 0.01
+    """Family-wise probability of naming any cause where there is none."""
+    fewest_windows: int = 8
+    """Fewer measured windows than this decide nothing."""
+    moments: int = 9
+    """At how many moments a change of the floor is looked for."""
+    seed: int = 0
+    """Of the random numbers in tests and intervals."""
+
+
+@dataclass(frozen=True)
+class _State:
+    """One linearisation: everything about the drive around a belief."""
+
+    effects: tuple[Effect, ...]
+    rows: FloatArray
+    """(M, 6) at the belief."""
+    linear: FloatArray
+    """(M, 6) the same, as if nothing were believed yet."""
+    signatures: FloatArray
+    """(M, 6, p)"""
+    nuisances: FloatArray
+    """(M, 6, q)"""
+    noise: Noise
+    problem: Regression
+
+
+def diagnose(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None) -> Diagnosis:
+    """What is wrong with ``model`` on ``drive``, why, and what saying so gains."""
+    config = config or DiagnosisConfig()
+    if len(drive.maneuvers) < config.fewest_windows:
+        return _undecidable(drive, model, f"only {len(drive.maneuvers)} windows of motion were measured; it takes {config.fewest_windows}.")
+    rng = np.random.default_rng(config.seed)
+    pipeline = _pipeline(drive, model)
+    effects = _candidates(pipeline, config)
+    state = _linearise(pipeline, effects, {}, None)
+    first = state
+    sizes: dict[Effect, float] = {}
+    seen: list[frozenset[str]] = []
+    for _ in range(_ROUNDS):
+        chosen = _choose(state, rng, config)
+        found = state.problem.fit(chosen)[0]
+        sizes = {state.effects[i]: _bounded(state.effects[i], float(v)) for i, v in zip(chosen, found, strict=True)}
+        keys = frozenset(e.key for e in sizes)
+        if not sizes or keys in seen:
+            break
+        seen.append(keys)
+        state = _linearise(pipeline, effects, sizes, state)
+    chosen = _choose(state, rng, config, tuple(i for i, e in enumerate(state.effects) if e.key in {s.key for s in sizes}))
+    return _conclude(pipeline, first, state, chosen, rng, config)
+
+
+def _pipeline(drive: Drive, model: MotionModel) -> Pipeline:
+    """With inertia where that describes the drive better (or is what the friction model leaves out by its nature)."""
+    plain = Pipeline(drive, model, settling=False)
+    if drive.kind != "log":
+        return plain
+    with_inertia = Pipeline(drive, model, settling=True)
+    squares = []
+    for pipeline in (plain, with_inertia):
+        rows = pipeline.discrepancies(Belief())[:, :3]
+        squares.append(np.nanmedian(np.abs(rows), axis=0))
+    better = np.nansum(np.log(np.maximum(squares[0], 1e-9)) - np.log(np.maximum(squares[1], 1e-9))) > 0.0
+    return with_inertia if better or model.name == "friction" else plain
+
+
+def _candidates(pipeline: Pipeline, config: DiagnosisConfig) -> tuple[Effect, ...]:
+    drive = pipeline.drive
+    out = set()
+    if drive.gyro is None and not drive.gyro_is_witness:
+        out.add("gyro_bias")
+    if not pipeline.dropout_seen:
+        out.add("encoder_dropout")
+    if drive.gyro_is_witness:
+        out |= {"lidar_offset_x", "lidar_offset_y", "lidar_yaw", "lateral_slip_speed", "longitudinal_slip_turning"}
+    if drive.kind == "rotations":
+        out |= {"lidar_time_offset", "wheel_time_offset", "slope", "lateral_slip_speed", "rotation_slip_speed", "longitudinal_slip_turning"}
+    found = [e for e in EFFECTS.values() if e.id not in out]
+    if drive.kind == "log" and not drive.gyro_is_witness:
+        found.append(slope_across())
+        length = float(drive.starts_s[-1])
+        if len(drive.maneuvers) >= 24:
+            found += [friction_change(length * q) for q in np.linspace(0.1, 0.9, config.moments)]
+    if drive.kind == "windows":
+        found += list(EXTRA.values())
+    return tuple(found)
+
+
+def _linearise(pipeline: Pipeline, effects: tuple[Effect, ...], sizes: dict[Effect, float], before: _State | None) -> _State:
+    belief = with_sizes(sizes)
+    rows = pipeline.discrepancies(belief)
+    signatures = np.stack([pipeline.signature(belief, e, rows) for e in effects], axis=-1)
+    linear = rows.copy()
+    for effect, size in sizes.items():
+        linear += signatures[..., [e.key for e in effects].index(effect.key)] * size
+    nuisances = _nuisances(rows)
+    noise = _noise(pipeline, linear, signatures, nuisances, effects)
+    return _State(effects, rows, linear, signatures, nuisances, noise, _normal(linear, signatures, nuisances, noise, effects))
+
+
+def _nuisances(rows: FloatArray) -> FloatArray:
+    """(M, 6, 2) accelerometers and the floor under the IMU are never quite level."""
+    found = np.zeros((*rows.shape, 2))
+    found[:, 4, 0] = found[:, 5, 1] = 1.0
+    return np.where(np.isfinite(rows)[..., None], found, np.nan)
+
+
+def _normal(linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, noise: Noise, effects: tuple[Effect, ...]) -> Regression:
+    y = noise.whiten(linear).ravel()
+    s = noise.whiten(signatures).reshape(len(y), -1)
+    z = noise.whiten(nuisances).reshape(len(y), -1)
+    return regression(y, s, z, _PRIOR * np.array([e.usual for e in effects]))
+
+
+def _noise(pipeline: Pipeline, linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, effects: tuple[Effect, ...]) -> Noise:
+    """Estimated from what all causes together leave, in a few rounds as sizes and noise hang on each other."""
+    batch, drive = pipeline.batch, pipeline.drive
+    g = drive.robot.geometry
+    features = regressors(batch, g.wheel_radius_m, g.track_width_m)
+    starts = np.r_[True, batch.owner[1:] != batch.owner[:-1]]
+    follows = ~starts
+    if len(drive.spans_ns):
+        follows = np.r_[False, drive.spans_ns[1:, 0] - drive.spans_ns[:-1, 1] < 10_000_000]
+    given = np.sqrt(np.where(np.isfinite(np.diagonal(batch.cov, axis1=1, axis2=2)), np.diagonal(batch.cov, axis1=1, axis2=2), 1.0))
+    sigmas = np.ones_like(linear)
+    sigmas[:, :3] = given
+    sigmas[:, 3] = np.hypot(given[:, 2], 1e-3)
+    sigmas[:, 4:] = 0.05
+    noise = plain_noise(linear, sigmas, follows)
+    scale = _PRIOR * np.array([e.usual for e in effects])
+    known = np.isfinite(linear)
+    for _ in range(3):
+        y = noise.whiten(linear).ravel()
+        design = np.hstack([noise.whiten(signatures).reshape(len(y), -1) * scale, noise.whiten(nuisances).reshape(len(y), -1) * 1e3])
+        gram = design.T @ design
+        x = np.linalg.solve(gram + np.eye(len(gram)), design.T @ y)
+        spent = float(np.trace(np.linalg.solve(gram + np.eye(len(gram)), gram)))
+        p = len(effects)
+        left = linear - signatures @ (x[:p] * scale) - nuisances @ (x[p:] * 1e3)
+        noise = estimated_noise(np.where(known, left, np.nan), features, follows, spent)
+    return noise
+
+
+def _choose(state: _State, rng: np.random.Generator, config: DiagnosisConfig, start: tuple[int, ...] | None = None) -> tuple[int, ...]:
+    """The best subset, less what does not stand up to the test."""
+    problem, effects = state.problem, state.effects
+    if start is None:
+        bounds = np.array([(0.0 if e.one_sided else -10.0 * e.usual, 10.0 * e.usual) for e in effects])
+        start = best_subset(problem, [_group(e) for e in effects], bounds)
+    df = max(int(np.isfinite(state.rows).sum()) - len(effects), 10)
+    chosen = start
+    while chosen:
+        p = []
+        for i in chosen:
+            others = tuple(j for j in chosen if j != i)
+            p.append(p_value(statistic(problem, others, i), max_statistic(problem, others, rng, df)))
+        worst = int(np.argmax(p))
+        if p[worst] <= config.significance:
+            break
+        chosen = tuple(i for n, i in enumerate(chosen) if n != worst)
+    return chosen
+
+
+def _group(effect: Effect) -> str:
+    return effect.id if effect.id != "slope" else effect.key
+
+
+def _bounded(effect: Effect, size: float) -> float:
+    return max(size, 0.0) if effect.one_sided else size
+
+
+def _conclude(
+    pipeline: Pipeline, first: _State, state: _State, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig
+) -> Diagnosis:
+    drive, problem, effects = pipeline.drive, state.problem, state.effects
+    sizes, cov, gained = problem.fit(chosen)
+    df = max(int(np.isfinite(state.rows).sum()) - len(effects), 10)
+    findings, within = [], {}
+    for n, i in enumerate(chosen):
+        effect, size, sigma = effects[i], float(sizes[n]), float(math.sqrt(cov[n, n]))
+        others = tuple(j for j in chosen if j != i)
+        gain = heldout_gain(state.linear, state.signatures, state.nuisances, state.noise, problem.scale, chosen, others, rng)
+        if abs(size) < effect.negligible or gain.after >= gain.before:
+            within[effect.id] = (size, sigma)
+            continue
+        p = p_value(statistic(problem, others, i), max_statistic(problem, others, rng, df))
+        aliases = _aliases(problem, effects, chosen, i)
+        told = evidence(effect, state.signatures[..., i] * size, state.noise, problem.gain(chosen) - problem.gain(others))
+        findings.append(Finding(effect, size, sigma, p, aliases, told, gain))
+    findings.sort(key=lambda f: f.gain.relative, reverse=True)
+    findings = _merged(findings)
+    explained = np.concatenate([state.signatures[..., list(chosen)], state.nuisances], axis=-1)
+    left = state.linear - state.signatures[..., list(chosen)] @ sizes
+    found_shapes, left_gain, _ = residue.shapes(pipeline, state.noise, left, explained, rng)
+    share = left_gain / max(left_gain + gained, 1e-9) if found_shapes else 0.0
+    visible: dict[str, float] = {}
+    for i, effect in enumerate(effects):
+        size = 3.0 * problem.scale[i] / math.sqrt(problem.gram[i, i] + 1.0)
+        visible[effect.id] = min(visible.get(effect.id, math.inf), float(size))
+    blind = [e for e in effects if visible[e.id] > e.usual]
+    verdict: Verdict
+    if found_shapes and (not findings or share > 0.3):
+        verdict = "unexplained"
+    elif any(f.aliases for f in findings):
+        verdict = "ambiguous"
+    elif findings:
+        verdict = "explained"
+    elif len(blind) > 0.5 * len(effects):
+        verdict = "undecidable"
+    else:
+        verdict = "consistent"
+    discrepancy = _components(first, state, left)
+    drive_next = separating_drive(pipeline, findings, state, chosen) if findings else general_advice(verdict, [e.id for e in blind])
+    belief = with_sizes({f.effect: f.size for f in findings})
+    result = Diagnosis(
+        *(drive.name, drive.robot.name, pipeline.model.name, drive.witness, verdict, discrepancy, tuple(findings), found_shapes),
+        left_share=share,
+        next_drive=drive_next,
+        sentence="",
+        within=within,
+        visible=visible,
+        windows=len(drive.maneuvers),
+        notes=drive.notes,
+        belief=belief,
+    )
+    return dataclasses.replace(result, sentence=sentence(result))
+
+
+def _aliases(problem: Regression, effects: tuple[Effect, ...], chosen: tuple[int, ...], i: int) -> tuple[tuple[str, float], ...]:
+    """Causes that could stand in for ``i`` and explain the drive about as well."""
+    others = tuple(j for j in chosen if j != i)
+    base, own = problem.gain(others), problem.gain(chosen)
+    tolerance = max(_CLOSE, _CLOSE_SHARE * (own - base))
+    found: dict[str, tuple[float, float]] = {}
+    for j, effect in enumerate(effects):
+        if j in chosen or _group(effect) == _group(effects[i]) or any(_group(effect) == _group(effects[k]) for k in others):
+            continue
+        if abs(likeness(problem, others, i, j)) < _ALIKE:
+            continue
+        subset = (*others, j)
+        gain = problem.gain(subset)
+        size = float(problem.fit(subset)[0][-1])
+        if own - gain > tolerance or (effect.one_sided and size < 0.0) or abs(size) > 10.0 * effect.usual:
+            continue
+        if effect.id not in found or gain > found[effect.id][0]:
+            found[effect.id] = gain, size
+    ranked = sorted(found.items(), key=lambda item: -item[1][0])
+    return tuple((name, size) for name, (_, size) in ranked)
+
+
+def _merged(findings: list[Finding]) -> list[Finding]:
+    """Both directions of a slope are one finding."""
+    slopes = [f for f in findings if f.cause == "slope"]
+    if len(slopes) < 2:
+        return findings
+    size = math.hypot(slopes[0].size, slopes[1].size)
+    whole = dataclasses.replace(slopes[0], size=math.copysign(size, slopes[0].size))
+    return [whole if f is slopes[0] else f for f in findings if f is not slopes[1]]
+
+
+def _components(first: _State, state: _State, left: FloatArray) -> dict[str, Component]:
+    """Per channel: what there was, what noise alone makes, and what is left."""
+    found = {}
+    white = state.noise.whiten(first.rows)
+    for c, name in enumerate(CHANNELS):
+        known = np.isfinite(first.rows[:, c])
+        if not known.any():
+            continue
+        rms, left_rms = (float(np.sqrt(np.mean(r[known, c] ** 2))) for r in (first.rows, left))
+        expected = float(np.sqrt(np.mean(state.noise.sigmas[known, c] ** 2)))
+        if c >= 4:
+            rms, left_rms = (float(np.std(r[known, c])) for r in (first.rows, left))
+        squares = float(np.sum(white[known, c] ** 2)) if c < 4 else float(known.sum())
+        found[name] = Component(CHANNEL_UNITS[c], rms, expected, float(chi2.sf(squares, int(known.sum()))), left_rms)
+    return found
+
+
+def _undecidable(drive: Drive, model: MotionModel, why: str) -> Diagnosis:
+    advice = general_advice("undecidable", [])
+    return Diagnosis(
+        *(drive.name, drive.robot.name, model.name, drive.witness, "undecidable", {}, (), ()),
+        left_share=0.0,
+        next_drive=advice,
+        sentence=f"Nothing can be said of {model.name} on this drive: {why} {advice}",
+        windows=len(drive.maneuvers),
+        notes=drive.notes,
+    )

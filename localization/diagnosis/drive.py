@@ -1,0 +1,219 @@
+"""What a diagnosis looks at: windows of wheel motion, and what LiDAR, gyro and accelerometers measured of the same seconds."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from localization.calibration import WitnessName, _witness
+from localization.events import Event, ImuSample
+from localization.gyro import GyroHistory
+from localization.logs.log import Log
+from localization.maneuver_windows import WindowConfig, cut
+from localization.witnesses import GyroWitness, Span, Wheels, Witness
+from motion_models.cg_files import arms_model
+from motion_models.cg_parts import Payload
+from motion_models.errors import CalibrationError, SkidlocError
+from motion_models.maneuvers import IntArray, Maneuver
+from motion_models.registry import make_model
+from motion_models.robot import Mount, Robot
+from motion_models.se2 import FloatArray
+
+_NS = 1e-9
+_FOREVER_S = 1e6
+_GRIPPERS = ("left_gripper", "gripper", "tool0", "left_tool0")
+_LEAST_GRAVITY, _MOST_GRAVITY = 8.0, 12.0
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Maneuvers in order of time, and the further witnesses of each; all arrays follow the maneuvers."""
+
+    name: str
+    robot: Robot
+    maneuvers: tuple[Maneuver, ...]
+    witness: str
+    """What measured the motion, in words."""
+    kind: str = "log"
+    """log, windows or rotations."""
+    starts_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """(W,) when each maneuver began; for tables, how much was driven before."""
+    spans_ns: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    """(W, 2) start and end stamps; (0, 2) for tables."""
+    gyro: GyroHistory | None = None
+    """All of the gyro; None without one, or where it is itself the witness."""
+    gyro_is_witness: bool = False
+    forces: FloatArray | None = None
+    """(W, 2) mean specific force along the body's x and y over each maneuver [m/s^2]; None without accelerometers."""
+    payload_arms: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    """(N, 2) from the CG to where a payload would be held, in each interval of the maneuvers end to end [m]."""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def poses(self) -> int:
+        return sum(len(m.ends) for m in self.maneuvers)
+
+
+@dataclass
+class _Recorder:
+    """A witness that remembers which stretches of time became maneuvers."""
+
+    inner: Witness
+    used: list[Span] = field(default_factory=list)
+
+    def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
+        yield from self.inner.spans(event, wheels)
+
+    def correct(self, spans: Sequence[Span], still: Sequence[Span]) -> list[Span]:
+        self.used = list(spans)
+        return self.inner.correct(spans, still)
+
+    def notes(self) -> list[str]:
+        return self.inner.notes()
+
+
+class _Imu:
+    """Keeps the gyro's and the accelerometers' whole story."""
+
+    def __init__(self, robot: Robot, mounts: Any) -> None:
+        self._mounts = mounts
+        self.gyro = GyroHistory(robot.gyro_noise, mounts, keep_s=_FOREVER_S)
+        self.stamps: list[int] = []
+        self.forces: list[FloatArray] = []
+
+    def push(self, sample: ImuSample) -> None:
+        self.gyro.push(sample)
+        self.stamps.append(sample.stamp_ns)
+        self.forces.append(self._mounts.get(sample.frame_id, Mount()).rotation() @ sample.linear_acceleration)
+
+    def means(self, spans: IntArray) -> FloatArray | None:
+        """(W, 2) mean force in each span; None where gravity is not upright, or missing."""
+        if not self.stamps:
+            return None
+        stamps, forces = np.array(self.stamps), np.array(self.forces)
+        if not _LEAST_GRAVITY < float(np.median(forces[:, 2])) < _MOST_GRAVITY:
+            return None
+        total = np.vstack([np.zeros(3), np.cumsum(forces, axis=0)])
+        a, b = np.searchsorted(stamps, spans[:, 0]), np.searchsorted(stamps, spans[:, 1])
+        if np.any(b - a < 3):
+            return None
+        return np.asarray(((total[b] - total[a]) / (b - a)[:, None])[:, :2])
+
+
+class _Postures:
+    """Stands in for the log's model of the arms, and remembers the joints of each centre of gravity."""
+
+    def __init__(self, model: Any) -> None:
+        self._model, self.chain = model, model.chain
+        self.joints: dict[tuple[float, float], FloatArray] = {}
+
+    def estimate(self, positions: FloatArray) -> Any:
+        found = self._model.estimate(positions)
+        self.joints.setdefault((float(found.position[0]), float(found.position[1])), np.array(positions))
+        return found
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._model, name)
+
+
+def drive_of_log(log: Log, witness: WitnessName = "auto", reference: str | None = None, config: WindowConfig | None = None) -> Drive:
+    """Read ``log`` once. Raises `CalibrationError` where it has no wheels or no witness of what they do."""
+    config = config or WindowConfig()
+    robot = log.robot
+    if log.sources.wheels is None and log.wheels_error is None:
+        raise CalibrationError(f"{log.path.name} has no wheels: name their topic with --topic.joint-states or --topic.odometry.")
+    inner, words = _witness(log, robot, witness, reference, config)
+    recorder = _Recorder(inner)
+    imu = _Imu(robot, log.mounts)
+    postures = None
+    if log._arms is not None:
+        postures = _Postures(log._arms)
+        log._arms = postures  # type: ignore[assignment]
+
+    def watched() -> Iterable[Event]:
+        for event in log.events():
+            if isinstance(event, ImuSample):
+                imu.push(event)
+            yield event
+
+    windows = cut(watched(), recorder, make_model("diff_drive", robot), robot, config, log.path.name)
+    spans = np.array([(s.start_ns, s.end_ns) for s in recorder.used], dtype=np.int64).reshape(-1, 2)
+    left = f"{len(windows.maneuvers)} windows of {config.window_s:g} s; left out: {windows.standing} standing, {windows.lost} not measured."
+    by_gyro = isinstance(inner, GyroWitness)
+    heard = bool(imu.stamps) and not by_gyro
+    return Drive(
+        name=log.path.name,
+        robot=robot,
+        maneuvers=windows.maneuvers,
+        witness=words,
+        starts_s=(spans[:, 0] - spans[0, 0]) * _NS if len(spans) else np.zeros(0),
+        spans_ns=spans,
+        gyro=imu.gyro if heard else None,
+        gyro_is_witness=by_gyro,
+        forces=imu.means(spans) if heard and len(spans) else None,
+        payload_arms=_payload_arms(robot, windows.maneuvers, postures),
+        notes=(left, *windows.notes, *log.notes()),
+    )
+
+
+def drive_of_table(name: str, robot: Robot, maneuvers: Sequence[Maneuver], kind: str) -> Drive:
+    """Maneuvers that were measured by somebody else."""
+    seconds = np.array([float(m.dt.sum()) for m in maneuvers])
+    return Drive(
+        name=name,
+        robot=robot,
+        maneuvers=tuple(maneuvers),
+        witness=f"the table of {len(maneuvers)} {kind}",
+        kind=kind,
+        starts_s=np.asarray(np.cumsum(seconds) - seconds),
+        payload_arms=_payload_arms(robot, maneuvers, None),
+    )
+
+
+def _payload_arms(robot: Robot, maneuvers: Sequence[Maneuver], postures: _Postures | None) -> FloatArray:
+    """(N, 2) lever of a payload about the CG: in the (left) gripper, or over the front edge of a robot without arms."""
+    if not maneuvers:
+        return np.zeros((0, 2))
+    cg = np.concatenate([np.broadcast_to(m.cg, m.wheels.shape) for m in maneuvers])
+    edge = np.array([robot.geometry.wheelbase_m / 2.0, 0.0])
+    if postures is None or robot.arms is None:
+        return np.asarray(edge - cg)
+    link = next((name for name in _GRIPPERS if name in postures.chain.links), None)
+    if link is None:
+        return np.asarray(edge - cg)
+    try:
+        loaded = arms_model(robot.arms, robot.folder, Payload(link, 1.0))
+    except SkidlocError:
+        return np.asarray(edge - cg)
+    unique, inverse = np.unique(cg, axis=0, return_inverse=True)
+    levers = np.zeros_like(unique)
+    known: dict[bytes, FloatArray] = {}
+    for i, (x, y) in enumerate(unique):
+        joints = postures.joints.get((float(x), float(y)))
+        if joints is None:
+            levers[i] = edge - unique[i]
+            continue
+        key = np.round(joints, 3).tobytes()
+        if key not in known:
+            estimate = loaded.estimate(joints)
+            known[key] = (estimate.position - unique[i]) * estimate.mass
+        levers[i] = known[key]
+    return np.asarray(levers[np.ravel(inverse)])
+
+
+def shortened(drive: Drive, keep: IntArray) -> Drive:
+    """The drive's maneuvers of indices ``keep`` alone."""
+    firsts = np.concatenate([[0], np.cumsum([len(m.dt) for m in drive.maneuvers])])
+    rows = np.concatenate([np.arange(firsts[i], firsts[i + 1]) for i in keep]) if len(keep) else np.zeros(0, dtype=int)
+    return dataclasses.replace(
+        drive,
+        maneuvers=tuple(drive.maneuvers[i] for i in keep),
+        starts_s=drive.starts_s[keep],
+        spans_ns=drive.spans_ns[keep] if len(drive.spans_ns) else drive.spans_ns,
+        forces=None if drive.forces is None else drive.forces[keep],
+        payload_arms=drive.payload_arms[rows],
+    )

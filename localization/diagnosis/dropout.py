@@ -1,0 +1,54 @@
+"""Wheels that jump as no wheel can: one side's rate drops at once and comes back at once, while the other rolls on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from motion_models.maneuvers import Batch
+from motion_models.se2 import FloatArray
+
+_DROP = (0.35, 0.65)  # one of two encoders silent; the rate of a side is their mean
+_LEAST_RATE = 0.5  # rad/s
+_LONGEST_S = 3.0
+
+
+def lost_share(batch: Batch) -> FloatArray:
+    """(N, 2) what would have to be added to each rate, as a share of it: 1 where half of a side's counts are missing, else 0.
+
+    A spell begins where a side's rate falls to about half between two samples while the other's stays, and ends where it doubles.
+    """
+    found = np.zeros_like(batch.wheels)
+    for w in range(len(batch.first) - 1):
+        inside = slice(batch.first[w], batch.first[w + 1])
+        for side in (0, 1):
+            found[inside, side] = _spells(batch.wheels[inside, side], batch.wheels[inside, 1 - side], batch.dt[inside])
+    return found
+
+
+def _spells(rate: FloatArray, other: FloatArray, dt: FloatArray) -> FloatArray:
+    share = np.zeros_like(rate)
+    n = len(rate)
+    if n < 3:
+        return share
+    jumps = []  # (index, +1 for a rise, -1 for a fall)
+    for i in range(1, n):
+        before, after = rate[max(i - 2, 0)], rate[min(i + 1, n - 1)]
+        if abs(other[min(i + 1, n - 1)] - other[max(i - 2, 0)]) > 0.2 * max(abs(other[i]), _LEAST_RATE):
+            continue
+        if abs(before) > _LEAST_RATE and before * after > 0.0 and _DROP[0] < after / before < _DROP[1]:
+            jumps.append((i, -1))
+        elif abs(after) > _LEAST_RATE and before * after > 0.0 and _DROP[0] < before / after < _DROP[1]:
+            jumps.append((i, 1))
+    start = None
+    if jumps and jumps[0][1] == 1 and dt[: jumps[0][0]].sum() < _LONGEST_S:
+        start = 0  # it was silent when the window began
+    for i, kind in jumps:
+        if kind == -1 and start is None:
+            start = i
+        elif kind == 1 and start is not None:
+            if dt[start:i].sum() < _LONGEST_S:
+                share[start:i] = 1.0
+            start = None
+    if start is not None and dt[start:].sum() < _LONGEST_S:
+        share[start:] = 1.0
+    return share

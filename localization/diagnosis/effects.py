@@ -1,0 +1,177 @@
+"""Causes: each says what would be different about robot, floor or sensors. Its signature follows by predicting again.
+
+A `Belief` holds everything that may be otherwise than the robot file says; a cause adds its size to one place of it. The pipeline that
+predicts motions from a belief is in `localization.diagnosis.prediction`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Belief:
+    """How things may be; all 0 as the robot file says."""
+
+    radius_left: float = 0.0
+    """Relative."""
+    radius_right: float = 0.0
+    friction: Mapping[str, float] = field(default_factory=dict)
+    """Additions to parameters of `FrictionModel`."""
+    cg: tuple[float, float] = (0.0, 0.0)
+    payload_kg: float = 0.0
+    lidar: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lidar_late_s: float = 0.0
+    wheels_late_s: float = 0.0
+    gyro_bias: float = 0.0
+    encoder_lost: float = 0.0
+    yields: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """vy += a vx wz; wz *= 1 - b |vx|; vx -= c vx |wz|."""
+    slope: tuple[float, float] = (0.0, 0.0)
+    """Rise of the floor along the axes of the drive's first heading [rad]."""
+    change: float = 0.0
+    """Sideways grip is more by this share from `change_s` on."""
+    change_s: float = 0.0
+    mixed: float = 0.0
+    """Longitudinal slip by the share of turning, see `FullLinear.longitudinal_slip_curvature`."""
+    wheel_lag_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One cause, as a direction in which things may differ."""
+
+    id: str
+    unit: str
+    meaning: str
+    usual: float
+    """A size that a robot may well have: what the drive must be able to show, and the step by which signatures are differenced."""
+    negligible: float
+    """Smaller sizes are within what robot files, mounts and clocks are ever known to."""
+    inject: Callable[[Belief, float], Belief] = field(repr=False)
+    one_sided: bool = False
+    is_floor: bool = False
+    """It acts through friction, and needs the friction model."""
+    at_s: float | None = None
+    """For a change: when."""
+
+    @property
+    def key(self) -> str:
+        """Unique also among several moments of one change."""
+        return self.id if self.at_s is None else f"{self.id}@{self.at_s:g}"
+
+
+def _plain(name: str) -> Callable[[Belief, float], Belief]:
+    return lambda b, s: dataclasses.replace(b, **{name: getattr(b, name) + s})
+
+
+def _item(name: str, index: int) -> Callable[[Belief, float], Belief]:
+    def inject(b: Belief, s: float) -> Belief:
+        old = getattr(b, name)
+        changed: dict[str, Any] = {name: tuple(v + s if i == index else v for i, v in enumerate(old))}
+        return dataclasses.replace(b, **changed)
+
+    return inject
+
+
+def _radii(left: float, right: float) -> Callable[[Belief, float], Belief]:
+    return lambda b, s: dataclasses.replace(b, radius_left=b.radius_left + left * s, radius_right=b.radius_right + right * s)
+
+
+def _friction(name: str) -> Callable[[Belief, float], Belief]:
+    return lambda b, s: dataclasses.replace(b, friction={**b.friction, name: b.friction.get(name, 0.0) + s})
+
+
+_ALL = (
+    Effect("wheel_radius_scale", "1", "all wheels roll farther by this share than the robot file says", 0.02, 0.002, _radii(1.0, 1.0)),
+    Effect(
+        "wheel_radius_difference",
+        "1",
+        "the left wheels are larger by half of this share, the right ones smaller",
+        0.02,
+        0.001,
+        _radii(0.5, -0.5),
+    ),
+    Effect(
+        "track_width", "m", "the left and right contacts are farther apart by this", 0.03, 0.003, _friction("track_width"), is_floor=True
+    ),
+    Effect(
+        "payload", "kg", "the robot carries a mass that it does not know of", 8.0, 1.0, _plain("payload_kg"), one_sided=True, is_floor=True
+    ),
+    Effect("cg_offset_x", "m", "the centre of gravity lies farther ahead than told", 0.03, 0.003, _item("cg", 0), is_floor=True),
+    Effect("cg_offset_y", "m", "the centre of gravity lies farther left than told", 0.02, 0.003, _item("cg", 1), is_floor=True),
+    Effect("lidar_offset_x", "m", "the tracked sensor sits farther ahead than its transform says", 0.05, 0.005, _item("lidar", 0)),
+    Effect("lidar_offset_y", "m", "the tracked sensor sits farther left than its transform says", 0.05, 0.005, _item("lidar", 1)),
+    Effect("lidar_yaw", "rad", "the tracked sensor is turned to the left against its transform", 0.03, 0.003, _item("lidar", 2)),
+    Effect("lidar_time_offset", "s", "the LiDAR's stamps are late by this", 0.05, 0.008, _plain("lidar_late_s")),
+    Effect("wheel_time_offset", "s", "the wheels' stamps are late by this", 0.05, 0.008, _plain("wheels_late_s")),
+    Effect(
+        "friction_anisotropy",
+        "1",
+        "the floor grips more sideways by this share (mu_y / mu_x)",
+        0.2,
+        0.03,
+        _friction("mu_ratio"),
+        is_floor=True,
+    ),
+    Effect(
+        "diagonal_load",
+        "1",
+        "a warped chassis loads front left and rear right by this share of m g / 4",
+        0.15,
+        0.02,
+        _friction("warp"),
+        is_floor=True,
+    ),
+    Effect("tread_asymmetry", "1", "wheels that slide to the left grip more by this share", 0.15, 0.02, _friction("tread"), is_floor=True),
+    Effect(
+        "rolling_resistance",
+        "1",
+        "rolling resistance over load is more by this",
+        0.03,
+        0.004,
+        _friction("rolling_resistance"),
+        is_floor=True,
+    ),
+    Effect("scrub", "m", "the contact patches oppose any turn by this moment, over mu m g", 0.02, 0.002, _friction("scrub"), is_floor=True),
+    Effect("slope", "rad", "the floor rises along the drive's first heading", 0.05, 0.005, _item("slope", 0), is_floor=True),
+    Effect("encoder_dropout", "1", "share of time in which an encoder loses its counts", 0.1, 0.01, _plain("encoder_lost"), one_sided=True),
+    Effect("gyro_bias", "rad/s", "the gyro turns while nothing does", 0.02, 0.006, _plain("gyro_bias")),
+    Effect("lateral_slip_speed", "s", "the robot slides sideways in curves: vy += s vx wz", 0.05, 0.005, _item("yields", 0)),
+    Effect("rotation_slip_speed", "s/m", "the robot turns less at speed: wz *= 1 - s |vx|", 0.1, 0.01, _item("yields", 1)),
+    Effect("longitudinal_slip_turning", "s/rad", "the robot goes less far in turns: vx *= 1 - s |wz|", 0.1, 0.01, _item("yields", 2)),
+)
+EFFECTS: Mapping[str, Effect] = {effect.id: effect for effect in _ALL}
+"""All causes that hold for the whole of a drive, by id."""
+
+
+def friction_change(at_s: float) -> Effect:
+    """The sideways grip changes ``at_s`` after the drive's beginning."""
+
+    def inject(b: Belief, s: float) -> Belief:
+        return dataclasses.replace(b, change=b.change + s, change_s=at_s)
+
+    return Effect(
+        "friction_change", "1", f"sideways grip is more by this share from {at_s:.0f} s on", 0.3, 0.04, inject, is_floor=True, at_s=at_s
+    )
+
+
+EXTRA: Mapping[str, Effect] = {
+    "longitudinal_slip_curvature": Effect(
+        "longitudinal_slip_curvature", "1", "the robot goes less far on tight arcs, at any speed: vx *= 1 - s T", 0.2, 0.02, _plain("mixed")
+    ),
+    "wheel_lag": Effect(
+        "wheel_lag", "s", "the body follows the wheels with this time constant", 0.05, 0.008, _plain("wheel_lag_s"), one_sided=True
+    ),
+}
+"""What other people's data taught: causes beyond the simulator's."""
+
+
+def slope_across() -> Effect:
+    """The floor rises to the left of the drive's first heading."""
+    return Effect(
+        "slope", "rad", "the floor rises to the left of the drive's first heading", 0.05, 0.005, _item("slope", 1), is_floor=True, at_s=-1.0
+    )

@@ -1,0 +1,202 @@
+"""From a belief to discrepancies: the real pipeline, run again with something otherwise."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from localization.diagnosis.drive import Drive
+from localization.diagnosis.dropout import lost_share
+from localization.diagnosis.effects import Belief, Effect
+from localization.diagnosis.settling import TRACKED, settling_twists
+from motion_models import se2
+from motion_models.base import MotionModel, Twist
+from motion_models.friction import FrictionModel
+from motion_models.maneuvers import Batch, IntArray, make_batch
+from motion_models.prediction import predict
+from motion_models.se2 import FloatArray
+
+CHANNELS = ("x", "y", "yaw", "gyro", "force_x", "force_y")
+CHANNEL_UNITS = ("m", "m", "rad", "rad", "m/s^2", "m/s^2")
+_GRAVITY = 9.81
+_NO_COLUMNS: IntArray = np.empty(0, dtype=np.int64)
+
+
+@dataclass
+class Pipeline:
+    """Predicts a drive's motions with one model; discrepancies are measured minus predicted.
+
+    Causes of the floor act through the friction model whatever the model is: what they change there is added to what the model says.
+    ``settling`` adds what constant-rate models leave out by their nature: inertia, and the load that accelerations shift.
+    """
+
+    drive: Drive
+    model: MotionModel
+    settling: bool
+    batch: Batch = field(init=False)
+    headings: FloatArray = field(init=False)
+    """(W,) at the start of each maneuver, counted from the first [rad]."""
+
+    def __post_init__(self) -> None:
+        self.batch = make_batch(self.drive.maneuvers)
+        self._friction = FrictionModel.from_robot(self.drive.robot)
+        self._lost = lost_share(self.batch)
+        self._lost_time = float(np.sum(self._lost.max(axis=1) * self.batch.dt) / self.batch.dt.sum())
+        self.headings = self._headings()
+        first, lead = self.batch.first, self.batch.lead
+        self._times = np.empty(len(self.batch.dt))
+        for w, start in enumerate(self.drive.starts_s):
+            inside = slice(first[w], first[w + 1])
+            dt = self.batch.dt[inside]
+            self._times[inside] = start + np.cumsum(dt) - dt - dt[: lead[w]].sum()
+        self._base = self._friction.twist(self.batch.wheels, self.batch.cg, self._friction.nominal).value
+        self._kinematic_forces = self._accelerations()
+
+    @property
+    def dropout_seen(self) -> bool:
+        return bool(self._lost.any())
+
+    def _headings(self) -> FloatArray:
+        """By the gyro less its mean difference to the witness; else by the witness's own turns, one after the other."""
+        batch, drive = self.batch, self.drive
+        last = np.r_[batch.owner[1:] != batch.owner[:-1], True]
+        yaw = batch.measured[last, 2]
+        if drive.gyro is not None:
+            turns = [drive.gyro.turn(int(a), int(b), float(t)) for (a, b), t in zip(drive.spans_ns, yaw, strict=True)]
+            known = [(t.angle - y, t.duration) for t, y in zip(turns, yaw, strict=True) if t is not None]
+            if known:
+                bias = sum(k[0] for k in known) / sum(k[1] for k in known)
+                origin = int(drive.spans_ns[0, 0])
+                found = [drive.gyro.turn(origin, int(a), 0.0) for a in drive.spans_ns[:, 0]]
+                return np.array([0.0 if t is None else t.angle - bias * t.duration for t in found])
+        return np.asarray(np.cumsum(yaw) - yaw)
+
+    def _accelerations(self) -> FloatArray:
+        """(W, 2) mean of what accelerometers feel of the motion itself, by the wheels [m/s^2]."""
+        batch = self.batch
+        found = np.zeros((len(batch.first) - 1, 2))
+        for w in range(len(found)):
+            a = batch.first[w] + batch.lead[w]
+            inside = slice(a, a + int(self.drive.maneuvers[w].ends[-1]))
+            t, dt = self._base[inside], batch.dt[inside]
+            whole = dt.sum()
+            found[w, 0] = (t[-1, 0] - t[0, 0]) / whole - (t[:, 1] * t[:, 2]) @ dt / whole
+            found[w, 1] = (t[-1, 1] - t[0, 1]) / whole + (t[:, 0] * t[:, 2]) @ dt / whole
+        return found
+
+    def discrepancies(self, belief: Belief) -> FloatArray:
+        """(M, 6) measured minus predicted, as `CHANNELS`: motion in the predicted end's frame; NaN where nothing was measured."""
+        batch, drive = self.batch, self.drive
+        out = np.full((len(batch.ends), len(CHANNELS)), np.nan)
+        witness = np.array([belief.wheels_late_s - belief.lidar_late_s, belief.wheel_lag_s, *belief.lidar])
+        if drive.gyro_is_witness:
+            witness[2:] = 0.0
+        changed = _Changed(self, belief)
+        poses, _, _ = predict(changed, batch, changed.nominal, witness, _NO_COLUMNS, drive.robot.wheel_noise)
+        off = se2.between(poses, batch.measured)
+        known = np.isfinite(np.diagonal(batch.cov, axis1=1, axis2=2))
+        out[:, :3] = np.where(known, off, np.nan)
+        if drive.gyro_is_witness:
+            out[:, 2] -= belief.gyro_bias * np.array([float(m.dt[m.lead : m.lead + int(m.ends[-1])].sum()) for m in drive.maneuvers])
+        if drive.gyro is not None:
+            late = round(belief.lidar_late_s * 1e9)
+            for i, (a, b) in enumerate(drive.spans_ns):
+                turn = drive.gyro.turn(int(a) - late, int(b) - late, float(batch.measured[i, 2]))
+                if turn is not None:
+                    out[i, 3] = turn.angle - batch.measured[i, 2] - belief.gyro_bias * turn.duration
+        if drive.forces is not None:
+            middle = self.headings + 0.5 * batch.measured[:, 2]
+            c, s = np.cos(middle), np.sin(middle)
+            sx, sy = _GRAVITY * math.sin(belief.slope[0]), _GRAVITY * math.sin(belief.slope[1])
+            out[:, 4] = drive.forces[:, 0] - self._kinematic_forces[:, 0] - (c * sx + s * sy)
+            out[:, 5] = drive.forces[:, 1] - self._kinematic_forces[:, 1] - (-s * sx + c * sy)
+        return out
+
+    def signature(self, belief: Belief, effect: Effect, base: FloatArray | None = None) -> FloatArray:
+        """(M, 6) change of the discrepancy per unit of ``effect`` around ``belief``, where its sign says what correcting it removes."""
+        step = 0.1 * effect.usual
+        ahead = self.discrepancies(effect.inject(belief, step))
+        if effect.one_sided or base is not None:
+            behind = self.discrepancies(belief) if base is None else base
+            return np.asarray((behind - ahead) / step)
+        return np.asarray((self.discrepancies(effect.inject(belief, -step)) - ahead) / (2.0 * step))
+
+
+class _Changed:
+    """The model with a belief's changes: a `MotionModel` for the length of one batch."""
+
+    def __init__(self, pipeline: Pipeline, belief: Belief) -> None:
+        self._p, self._b = pipeline, belief
+        self.name, self.param_names = pipeline.model.name, pipeline.model.param_names
+        self.nominal = pipeline.model.nominal
+
+    def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
+        p, b = self._p, self._b
+        rates = wheels * (1.0 + np.array([b.radius_left, b.radius_right]))
+        if b.encoder_lost:
+            rates = rates * (1.0 + b.encoder_lost / max(p._lost_time, 1e-9) * p._lost)
+        value = p.model.twist(rates, cg, params).value
+        value = value + self._floor(rates, cg)
+        if b.mixed:
+            energy = 2.0 * np.maximum(np.sum(rates**2, axis=-1), 1e-12)
+            value = value * np.stack([1.0 - b.mixed * (rates[:, 1] - rates[:, 0]) ** 2 / energy, *(np.ones(len(rates)),) * 2], axis=-1)
+        if any(b.yields):
+            vx, vy, wz = value.T
+            lateral, rotation, forward = b.yields
+            value = np.stack([vx * (1.0 - forward * np.abs(wz)), vy + lateral * vx * wz, wz * (1.0 - rotation * np.abs(vx))], axis=-1)
+        n, k = len(value), len(params)
+        return Twist(np.ascontiguousarray(value), np.zeros((n, 3, 2)), np.zeros((n, 3, 2)), np.zeros((n, 3, k)))
+
+    def _floor(self, rates: FloatArray, cg: FloatArray) -> FloatArray:
+        """(N, 3) what the friction model says is otherwise: causes of the floor, and inertia."""
+        p, b = self._p, self._b
+        is_otherwise = b.friction or any(b.cg) or b.payload_kg or b.change
+        if not (is_otherwise or any(b.slope) or p.settling):
+            return np.zeros((len(rates), 3))
+        friction = p._friction
+        nominal = friction.twist(rates, cg, friction.nominal).value
+        params = friction.nominal.copy()
+        for name, more in b.friction.items():
+            i = friction.param_names.index(name)
+            params[i] = max(params[i] * (1.0 + more), 0.05) if name == "mu_ratio" else params[i] + more
+        params[6], params[7] = max(params[6], 0.0), max(params[7], 0.0)
+        moved = cg + np.array(b.cg)
+        if b.payload_kg:
+            mass = p.drive.robot.geometry.mass_kg
+            moved = moved + p.drive.payload_arms * (b.payload_kg / (mass + b.payload_kg))
+        half = 0.49 * np.array([params[2], params[1]])
+        moved = np.clip(moved, -half, half)
+        if not b.change:
+            return self._moved(rates, moved, params) - nominal
+        later = params.copy()
+        later[4] = max(later[4] * (1.0 + b.change), 0.05)
+        is_later = (p._times >= b.change_s)[:, None]
+        return np.asarray(np.where(is_later, self._moved(rates, moved, later), self._moved(rates, moved, params)) - nominal)
+
+    def _moved(self, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+        """(N, 3) twists of the tracked point."""
+        p, b = self._p, self._b
+        settled = p._friction.twist(rates, cg, params).value
+        if not (p.settling or any(b.slope)):
+            return settled
+        x, y = params[TRACKED[0]], params[TRACKED[1]]
+        middle = settled + settled[:, 2:] * np.array([y, -x, 0.0])
+        batch = p.batch
+        twists = settling_twists(p.drive.robot, params, batch.dt, rates, cg, batch.first, p.headings, b.slope, middle)
+        return np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
+
+
+def with_sizes(sizes: dict[Effect, float]) -> Belief:
+    """What is believed once the named causes have these sizes."""
+    belief = Belief()
+    for effect, size in sizes.items():
+        belief = effect.inject(belief, size)
+    return belief
+
+
+def replaced(pipeline: Pipeline, **changes: object) -> Pipeline:
+    """The same pipeline with other fields."""
+    return dataclasses.replace(pipeline, **changes)  # type: ignore[arg-type]

@@ -1,0 +1,170 @@
+"""Friction with inertia: how the robot follows its wheels when it accelerates, shifts its load, or stands on a slope.
+
+`motion_models.friction` gives the motion that constant wheel rates settle to. Here each wheel sample is one implicit (backward Euler)
+step of `motion_models.friction_dynamics`: stiff contact forces cannot make it unstable, and a long step lands on the settled motion.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from motion_models.friction import FrictionModel, check_parameters, floor_of
+from motion_models.friction_dynamics import FrictionDynamics, _accelerations, _Body
+from motion_models.friction_solve import Floor
+from motion_models.maneuvers import IntArray
+from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
+
+_CREEP = 3e-3
+_NEWTON = 12
+
+
+def settling_twists(
+    robot: Robot,
+    params: FloatArray,
+    dt: FloatArray,
+    wheels: FloatArray,
+    cg: FloatArray,
+    first: IntArray,
+    headings: FloatArray,
+    slope: tuple[float, float],
+    settled: FloatArray,
+) -> FloatArray:
+    """Body twists (N, 3) of the wheelbase's centre for wheel rates (N, 2) in intervals ``dt`` (N,), CG (N, 2), friction ``params`` (12,).
+
+    Maneuvers begin at ``first`` (W + 1,), with the ``headings`` (W,) [rad]; ``slope`` is by how much the floor rises along the x and y
+    axes in which headings count [rad]. ``settled`` (N, 3) are the twists without inertia: where each maneuver starts, and what stands in
+    where no step is found. Raises `CgError` and `ModelError` as `FrictionModel` does.
+    """
+    check_parameters(cg, params)
+    dynamics = FrictionDynamics.from_robot(robot)
+    body = _Body(
+        float(params[3]),
+        float(params[8]),
+        float(params[0]),
+        dynamics.mass,
+        dynamics.inertia,
+        dynamics.cg_height,
+        dynamics.gravity,
+        _CREEP,
+        dynamics.rest_speed,
+    )
+    out = np.empty((len(dt), 3))
+    _settle(dt, wheels, cg, first, headings, np.array(slope), settled, floor_of(params), body, out)
+    return out
+
+
+TRACKED = tuple(FrictionModel.param_names.index(name) for name in ("tracked_x", "tracked_y"))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _settle(
+    dt: FloatArray,
+    wheels: FloatArray,
+    cg: FloatArray,
+    first: IntArray,
+    headings: FloatArray,
+    slope: FloatArray,
+    settled: FloatArray,
+    floor: Floor,
+    body: _Body,
+    out: FloatArray,
+) -> None:  # pragma: no cover
+    state, influence = np.zeros(6), np.zeros(13)
+    influence[12] = body.height
+    jacobian, off, tried = np.empty((3, 3)), np.empty(3), np.empty(3)
+    weight = body.mass * body.gravity
+    for w in range(first.shape[0] - 1):
+        heading = headings[w]
+        before = settled[first[w]].copy()
+        for i in range(first[w], first[w + 1]):
+            q_l, q_r, h = wheels[i, 0], wheels[i, 1], dt[i]
+            if q_l == 0.0 and q_r == 0.0:
+                before[:] = 0.0
+                out[i] = 0.0
+                continue
+            c, s = math.cos(heading), math.sin(heading)
+            influence[0], influence[1] = cg[i, 0], cg[i, 1]
+            influence[7] = -weight * (c * slope[0] + s * slope[1])
+            influence[8] = -weight * (-s * slope[0] + c * slope[1])
+            influence[10], influence[11] = cg[i, 0], cg[i, 1]
+            # start from whichever is nearer to balance: the settled motion or the one before
+            found = False
+            for start in range(2):
+                now = (settled[i] if start == 0 else before).copy()
+                size = _misfit(now, before, h, q_l, q_r, state, influence, floor, body, off)
+                for _ in range(_NEWTON):
+                    for j in range(3):
+                        tried[:] = now
+                        step = 1e-5
+                        tried[j] += step
+                        base0, base1, base2 = off[0], off[1], off[2]
+                        _misfit(tried, before, h, q_l, q_r, state, influence, floor, body, off)
+                        jacobian[0, j], jacobian[1, j], jacobian[2, j] = (
+                            (off[0] - base0) / step,
+                            (off[1] - base1) / step,
+                            (off[2] - base2) / step,
+                        )
+                        off[0], off[1], off[2] = base0, base1, base2
+                    d0, d1, d2, regular = _solve(jacobian, off)
+                    if not regular:
+                        break
+                    share, better = 1.0, False
+                    for _ in range(8):
+                        tried[0], tried[1], tried[2] = now[0] - share * d0, now[1] - share * d1, now[2] - share * d2
+                        new = _misfit(tried, before, h, q_l, q_r, state, influence, floor, body, off)
+                        if new < size:
+                            better = True
+                            break
+                        share *= 0.4
+                    if not better:
+                        _misfit(now, before, h, q_l, q_r, state, influence, floor, body, off)
+                        break
+                    now[:] = tried
+                    size = new
+                    if size < 1e-7:
+                        break
+                if size < 1e-3:
+                    found = True
+                    break
+            out[i] = now if found else settled[i]
+            before[:] = out[i]
+            heading += out[i, 2] * h
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _misfit(
+    twist: FloatArray,
+    before: FloatArray,
+    h: float,
+    q_l: float,
+    q_r: float,
+    state: FloatArray,
+    influence: FloatArray,
+    floor: Floor,
+    body: _Body,
+    off: FloatArray,
+) -> float:  # pragma: no cover
+    """Fill ``off`` (3,) with how far ``twist`` is off a backward Euler step [m/s, m/s, rad/s]; its length."""
+    state[3], state[4], state[5] = twist[0], twist[1], twist[2]
+    a_x, a_y, a_w, _ = _accelerations(state, q_l, q_r, influence, floor, body)
+    off[0], off[1], off[2] = twist[0] - before[0] - h * a_x, twist[1] - before[1] - h * a_y, twist[2] - before[2] - h * a_w
+    return math.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _solve(a: FloatArray, b: FloatArray) -> tuple[float, float, float, bool]:  # pragma: no cover
+    """x of a x = b, by Cramer's rule."""
+    c0 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
+    c1 = a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2]
+    c2 = a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0]
+    det = a[0, 0] * c0 + a[0, 1] * c1 + a[0, 2] * c2
+    if det == 0.0 or not math.isfinite(det):
+        return 0.0, 0.0, 0.0, False
+    x = b[0] * c0 + a[0, 1] * (a[1, 2] * b[2] - b[1] * a[2, 2]) + a[0, 2] * (b[1] * a[2, 1] - a[1, 1] * b[2])
+    y = a[0, 0] * (b[1] * a[2, 2] - a[1, 2] * b[2]) + b[0] * c1 + a[0, 2] * (a[1, 0] * b[2] - b[1] * a[2, 0])
+    z = a[0, 0] * (a[1, 1] * b[2] - b[1] * a[2, 1]) + a[0, 1] * (b[1] * a[2, 0] - a[1, 0] * b[2]) + b[0] * c2
+    return x / det, y / det, z / det, True
