@@ -55,7 +55,7 @@ class Replay:
     """What ekf and graph learn of the motion model, forms separated by commas: none, constant (k and centre of rotation as slowly
     changing constants), cg_field (their regressions on the centre of gravity, remembered from posture to posture)."""
     reference: str | None = None
-    """Topic of the log, or file (.tum, .relations), to score against; `none` for no score. Default: the robot file's topic if the log has it."""
+    """Topic of the log, or file (.tum, .relations), to score against; `none` for no score. Default: the robot file's topic, if any."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
     config: ReplayConfig = field(default_factory=ReplayConfig)
     timing: bool = False
