@@ -7,7 +7,7 @@ comes from `Stepper`'s own parts (`integrate_twists`) at the parameters that the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -31,8 +31,8 @@ NO_POINTS = np.empty((0, 2))
 class Noise:
     """All noise of the synthetic robot."""
 
-    wheels: WheelNoise = WheelNoise()
-    gyro: GyroNoise = GyroNoise()
+    wheels: WheelNoise = field(default_factory=WheelNoise)
+    gyro: GyroNoise = field(default_factory=GyroNoise)
     lidar_m: float = 0.005
     lidar_rad: float = 0.001
 
@@ -83,7 +83,9 @@ def straight(t: float) -> tuple[float, float]:
 class World:
     """The truth, and the steps that it gives to an estimator."""
 
-    def __init__(self, model, corrected: Corrections, noise: Noise, rng, has_lidar=True, belief=None, wheels=weave, cg=lambda t: (0.0, 0.0)):
+    def __init__(
+        self, model, corrected: Corrections, noise: Noise, rng, has_lidar=True, belief=None, wheels=weave, cg=lambda t: (0.0, 0.0)
+    ):
         self.model, self.corrected, self.noise, self.rng = model, corrected, noise, rng
         self.has_lidar, self.wheels, self.cg = has_lidar, wheels, cg
         self.pose, self.t, self.k = np.zeros(3), 0.0, 0
