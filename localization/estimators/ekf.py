@@ -207,6 +207,7 @@ class Ekf:
         f.x = np.zeros((self._size, 1))
         try:
             with np.errstate(over="ignore", invalid="ignore"):
+                _check("a measurement", error, H @ before @ H.T + R)
                 f.update(np.zeros((len(error), 1)), lambda x: H, lambda x: error[:, None], R=R)
                 f.P = 0.5 * (f.P + f.P.T)
             _check("a measurement", f.x, f.P)
