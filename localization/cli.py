@@ -12,6 +12,7 @@ from rich.console import Console
 
 from localization.commands.calibrate import Calibrate
 from localization.commands.cg import Cg
+from localization.commands.diagnose import Diagnose
 from localization.commands.info import Info
 from localization.commands.replay import Replay
 from localization.commands.simulate import Simulate
@@ -24,6 +25,7 @@ Command = (
     Annotated[Info, tyro.conf.subcommand("info", prefix_name=False)]
     | Annotated[Replay, tyro.conf.subcommand("replay", prefix_name=False)]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate", prefix_name=False)]
+    | Annotated[Diagnose, tyro.conf.subcommand("diagnose", prefix_name=False)]
     | Annotated[Cg, tyro.conf.subcommand("cg", prefix_name=False)]
     | Annotated[Simulate, tyro.conf.subcommand("simulate", prefix_name=False)]
 )

@@ -68,11 +68,43 @@ class _State:
     problem: Regression
 
 
+@dataclass(frozen=True)
+class Residuals:
+    """Discrepancies, for pictures."""
+
+    rows: FloatArray
+    """(M, 6) measured minus predicted, as `CHANNELS`."""
+    left: FloatArray
+    """(M, 6) once all findings are corrected."""
+    sigmas: FloatArray
+    """(M, 6) their noise."""
+    names: tuple[str, ...]
+    """Keys of the causes that were tried."""
+    alike: FloatArray
+    """(p, p) correlations of their signatures on this drive, in its noise."""
+
+
+@dataclass(frozen=True)
+class Examined:
+    """A diagnosis and what it was made of."""
+
+    diagnosis: Diagnosis
+    pipeline: Pipeline | None
+    """None where there was too little to look at."""
+    residuals: Residuals | None
+
+
 def diagnose(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None) -> Diagnosis:
     """What is wrong with ``model`` on ``drive``, why, and what saying so gains."""
+    return examine(drive, model, config).diagnosis
+
+
+def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None) -> Examined:
+    """The same, with what pictures, patches and other methods start from."""
     config = config or DiagnosisConfig()
     if len(drive.maneuvers) < config.fewest_windows:
-        return _undecidable(drive, model, f"only {len(drive.maneuvers)} windows of motion were measured; it takes {config.fewest_windows}.")
+        why = f"only {len(drive.maneuvers)} windows of motion were measured; it takes {config.fewest_windows}."
+        return Examined(_undecidable(drive, model, drive.notes[0] if drive.witness == "none" else why), None, None)
     rng = np.random.default_rng(config.seed)
     pipeline = _pipeline(drive, model)
     effects = _candidates(pipeline, config)
@@ -214,7 +246,7 @@ def _bounded(effect: Effect, size: float) -> float:
 
 def _conclude(
     pipeline: Pipeline, first: _State, state: _State, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig
-) -> Diagnosis:
+) -> Examined:
     drive, problem, effects = pipeline.drive, state.problem, state.effects
     sizes, cov, gained = problem.fit(chosen)
     df = max(int(np.isfinite(state.rows).sum()) - len(effects), 10)
@@ -266,7 +298,10 @@ def _conclude(
         notes=drive.notes,
         belief=belief,
     )
-    return dataclasses.replace(result, sentence=sentence(result))
+    scale = np.sqrt(np.diagonal(problem.gram) + 1e-12)
+    alike = problem.gram / np.outer(scale, scale)
+    residuals = Residuals(first.rows, left, state.noise.sigmas, tuple(e.key for e in effects), alike)
+    return Examined(dataclasses.replace(result, sentence=sentence(result)), pipeline, residuals)
 
 
 def _aliases(problem: Regression, effects: tuple[Effect, ...], chosen: tuple[int, ...], i: int) -> tuple[tuple[str, float], ...]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from localization.calibration import WitnessName, _witness
-from localization.events import Event, ImuSample
+from localization.events import Event, ImuSample, Scan
 from localization.gyro import GyroHistory
 from localization.logs.log import Log
 from localization.maneuver_windows import WindowConfig, cut
@@ -51,6 +51,8 @@ class Drive:
     """(W, 2) mean specific force along the body's x and y over each maneuver [m/s^2]; None without accelerometers."""
     payload_arms: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     """(N, 2) from the CG to where a payload would be held, in each interval of the maneuvers end to end [m]."""
+    lidar_frame: str = ""
+    """Frame of the scans that were matched."""
     notes: tuple[str, ...] = ()
 
     @property
@@ -126,6 +128,9 @@ def drive_of_log(log: Log, witness: WitnessName = "auto", reference: str | None 
     robot = log.robot
     if log.sources.wheels is None and log.wheels_error is None:
         raise CalibrationError(f"{log.path.name} has no wheels: name their topic with --topic.joint-states or --topic.odometry.")
+    if witness == "auto" and reference is None and log.sources.lidar is None and log.sources.imu is None:
+        alone = f"{log.path.name} has neither a LiDAR nor an IMU, and no reference was named: nothing measures what the wheels do."
+        return Drive(log.path.name, robot, (), "none", notes=(alone, *log.notes()))
     inner, words = _witness(log, robot, witness, reference, config)
     recorder = _Recorder(inner)
     imu = _Imu(robot, log.mounts)
@@ -134,10 +139,15 @@ def drive_of_log(log: Log, witness: WitnessName = "auto", reference: str | None 
         postures = _Postures(log._arms)
         log._arms = postures  # type: ignore[assignment]
 
+    frame = ""
+
     def watched() -> Iterable[Event]:
+        nonlocal frame
         for event in log.events():
             if isinstance(event, ImuSample):
                 imu.push(event)
+            elif isinstance(event, Scan):
+                frame = event.frame_id
             yield event
 
     windows = cut(watched(), recorder, make_model("diff_drive", robot), robot, config, log.path.name)
@@ -156,6 +166,7 @@ def drive_of_log(log: Log, witness: WitnessName = "auto", reference: str | None 
         gyro_is_witness=by_gyro,
         forces=imu.means(spans) if heard and len(spans) else None,
         payload_arms=_payload_arms(robot, windows.maneuvers, postures),
+        lidar_frame=frame,
         notes=(left, *windows.notes, *log.notes()),
     )
 

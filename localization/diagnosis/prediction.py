@@ -115,6 +115,11 @@ class Pipeline:
             out[:, 5] = drive.forces[:, 1] - self._kinematic_forces[:, 1] - (-s * sx + c * sy)
         return out
 
+    def corrected_twist(self, belief: Belief) -> FloatArray:
+        """(N, 3) what the model says of every interval once ``belief`` is put in [m/s, m/s, rad/s]."""
+        changed = _Changed(self, belief)
+        return changed.twist(self.batch.wheels, self.batch.cg, changed.nominal).value
+
     def signature(self, belief: Belief, effect: Effect, base: FloatArray | None = None) -> FloatArray:
         """(M, 6) change of the discrepancy per unit of ``effect`` around ``belief``, where its sign says what correcting it removes."""
         step = 0.1 * effect.usual

@@ -1,0 +1,122 @@
+"""`skidloc diagnose`: what a motion model gets wrong on a drive, the cause's name, the corrected robot, and what correcting it gains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from localization.calibration import WitnessName
+from localization.commands.common import check_new, new_folder, write_json, write_text
+from localization.diagnosis.diagnose import DiagnosisConfig, Examined, examine
+from localization.diagnosis.drive import Drive, drive_of_log, drive_of_table
+from localization.diagnosis.findings import Diagnosis
+from localization.diagnosis.patch import patched
+from localization.logs import TopicOverrides, open_log
+from localization.maneuver_windows import WindowConfig
+from localization.report_diagnosis import write_diagnosis_report
+from motion_models.errors import CalibrationError
+from motion_models.registry import make_model
+from motion_models.regressions import read_rotation_table
+from motion_models.robot import Robot, load_robot
+from motion_models.robot_file import relocated, robot_toml
+from motion_models.rotations import rotations_as_maneuvers
+from motion_models.windows_table import read_windows, table_columns
+
+
+@dataclass(frozen=True)
+class Diagnose:
+    """Say what a motion model gets wrong on a log or table, why, how to correct it, and what that gains."""
+
+    source: tyro.conf.Positional[Path]
+    """Log (.bag, folder, .mcap), or table (.csv): rotations in place at many centres of gravity (cg_x_m, cg_y_m, rotation_ratio, cor_x_m,
+    cor_y_m), or windows of wheel motion (window, dt_s, left_rad_per_s, right_rad_per_s, x_m, y_m, yaw_rad, ...)."""
+    robot: str
+    """Name of a shipped robot, or path of a robot TOML file."""
+    model: str = "friction"
+    """Motion model whose predictions are held against what really happened."""
+    out: Path | None = None
+    """New folder for diagnosis.json, diagnosis.html and robot.toml, the robot with the findings in it, which every command takes."""
+    witness: WitnessName = "auto"
+    """What measured the real motion in logs: the reference if one is named, else the LiDAR, else the gyro (headings alone)."""
+    reference: str | None = None
+    """Topic or TUM file with positions and headings, as the witness. Never used unless named."""
+    window_s: float = 2.0
+    """Length of the windows that logs are cut into [s]."""
+    topic: TopicOverrides = field(default_factory=TopicOverrides)
+    config: DiagnosisConfig = field(default_factory=DiagnosisConfig)
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write what is printed to this file as well."""
+
+    def run(self, console: Console) -> None:
+        if self.window_s < 0.5 or self.window_s > 20.0:
+            raise CalibrationError(f"--window-s is {self.window_s:g}; windows of 0.5 to 20 s make sense.")
+        for path in (self.out, self.json):
+            if path is not None:
+                check_new(path)
+        robot = load_robot(self.robot)
+        model = make_model(self.model, robot)
+        with console.status("reading"):
+            drive = self._drive(robot)
+        with console.status("looking for causes"):
+            found = examine(drive, model, self.config)
+        print_diagnosis(console, found.diagnosis)
+        content = found.diagnosis.to_dict()
+        if self.out is not None:
+            with new_folder(self.out) as folder:
+                write_json(folder / "diagnosis.json", content)
+                self._write_robot(folder, found, robot)
+                write_diagnosis_report(folder / "diagnosis.html", found)
+            console.print(f"report: {self.out / 'diagnosis.html'}", markup=False, soft_wrap=True)
+        if self.json is not None:
+            write_json(self.json, content)
+
+    def _drive(self, robot: Robot) -> Drive:
+        name = self.source.name
+        if self.source.suffix.lower() != ".csv":
+            return drive_of_log(
+                open_log(self.source, robot, self.topic), self.witness, self.reference, WindowConfig(window_s=self.window_s)
+            )
+        if "rotation_ratio" in table_columns(self.source):
+            maneuvers = rotations_as_maneuvers(read_rotation_table(self.source), robot)
+            return drive_of_table(name, robot, maneuvers, "rotations")
+        return drive_of_table(name, robot, read_windows(self.source), "windows")
+
+    def _write_robot(self, folder: Path, found: Examined, robot: Robot) -> None:
+        d = found.diagnosis
+        new, by_hand = robot, ()  # type: Robot, tuple[str, ...]
+        if found.pipeline is not None and d.findings:
+            patch = patched(found.pipeline, d.belief)
+            new, by_hand = patch.robot, patch.by_hand
+        named = "; ".join(f"{f.cause} {f.size:+.4g} +- {f.sigma:.2g} {f.effect.unit}".removesuffix(" 1") for f in d.findings) or "nothing"
+        remarks = [f"Diagnosed by skidloc: {d.model} on {d.log}, from {robot.name}.", f"Corrected here: {named}.", *by_hand]
+        # in the folder's parent, paths start where they will start once it has its name
+        text = robot_toml(relocated(new, folder), remarks="\n".join(remarks))
+        write_text(folder / "robot.toml", text)
+
+
+def print_diagnosis(console: Console, d: Diagnosis) -> None:
+    """Verdict and sentence first, then discrepancies and findings."""
+    console.print(f"{d.verdict}: {d.sentence}", markup=False, soft_wrap=True)
+    if d.discrepancy:
+        table = Table("measured - predicted", "unit", "rms", "noise", "left", "p", box=None, header_style="bold", pad_edge=False)
+        for name, c in d.discrepancy.items():
+            table.add_row(name, c.unit, f"{c.rms:.4g}", f"{c.expected_rms:.4g}", f"{c.left_rms:.4g}", f"{c.p_value:.2g}")
+        console.print(table)
+    if d.findings:
+        table = Table("cause", "size", "+-", "unit", "p", "gain", "or", box=None, header_style="bold", pad_edge=False)
+        for f in d.findings:
+            others = ", ".join(f"{name} {size:+.3g}" for name, size in f.aliases)
+            numbers = f"{f.size:+.4g}", f"{f.sigma:.2g}", f.effect.unit, f"{f.p_value:.1g}", f"{100 * f.gain.relative:.1f} %"
+            table.add_row(f.cause, *numbers, others)
+        console.print(table)
+    for shape in d.shapes:
+        console.print(f"unexplained: {shape.text}", markup=False, soft_wrap=True)
+    if d.next_drive:
+        console.print(f"next drive: {d.next_drive}", markup=False, soft_wrap=True)
+    for note in d.notes:
+        console.print(f"! {note}", markup=False, soft_wrap=True)
