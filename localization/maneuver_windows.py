@@ -10,7 +10,7 @@ import numpy as np
 
 from localization.events import CgSample, Event, WheelSample
 from localization.wheel_history import WheelHistory
-from localization.witnesses import Span, Wheels, Witness
+from localization.witnesses import HOLD_S, Span, Wheels, Witness
 from motion_models.base import MotionModel
 from motion_models.maneuvers import Maneuver
 from motion_models.robot import Robot
@@ -108,7 +108,7 @@ def _window(history: WheelHistory, span: Span, around: int) -> tuple[FloatArray,
     """Intervals (n,), rates (n, 2) and CG (n, 2) around a span, how many lie before it, and how many in it; None where some are missing."""
     parts = []
     for begin, end in ((span.start_ns - around, span.start_ns), (span.start_ns, span.end_ns), (span.end_ns, span.end_ns + around)):
-        dt, rates, cg, missing = history.window(begin, end, 0.0)
+        dt, rates, cg, missing = history.window(begin, end, HOLD_S)
         if missing:
             if begin == span.start_ns:
                 return None

@@ -24,7 +24,8 @@ from motion_models.se2 import FloatArray
 
 _NS = 1e-9
 _LONGEST_SCAN_GAP_S, _LONGEST_REFERENCE_GAP_S = 1.0, 0.5
-_HOLD_S = 0.5
+HOLD_S = 0.5
+"""Without a new sample, the wheels' last rates hold for this time [s]."""
 _LOST = np.array([0.1, 0.1, 0.1])  # sigma of the guess that starts a scan's search, beyond the wheels' slip [m, m, rad]
 _WRONG_TURN = 0.5  # how wrong the nominal model may be about a turn, as sigma over its size
 _HOLDS_M = 0.05  # sigma of a position beyond which a scene counts as a corridor: matching then slides towards no motion at all
@@ -54,12 +55,12 @@ class Wheels:
 
     def motion(self, start_ns: int, end_ns: int) -> Motion:
         """What they say of this stretch; the last rates hold for half a second."""
-        dt, rates, cg, _ = self.history.window(start_ns, end_ns, _HOLD_S)
+        dt, rates, cg, _ = self.history.window(start_ns, end_ns, HOLD_S)
         return integrate_twists(dt, self.model.twist(rates, cg, self.model.nominal), self.noise)
 
     def stood(self, start_ns: int, end_ns: int) -> bool:
         """No wheel moved."""
-        dt, rates, _, _ = self.history.window(start_ns, end_ns, _HOLD_S)
+        dt, rates, _, _ = self.history.window(start_ns, end_ns, HOLD_S)
         return len(dt) > 0 and not np.any(rates)
 
 

@@ -162,11 +162,12 @@ class Ekf:
         self._update(error, H, R)
         return nis
 
-    def measure_revisit(self, pose: FloatArray, cov: FloatArray, old_cov: FloatArray, growth: FloatArray) -> float:
+    def measure_revisit(self, pose: FloatArray, cov: FloatArray, old_cov: FloatArray, growth: FloatArray, slip: FloatArray) -> float:
         """The pose (3,) as an old part of the map gives it, with ``cov`` R (3, 3) by scan and map alone; returns the NIS.
 
         ``old_cov`` P_o (3, 3) is the covariance of the old map: of the pose e_o from which it was drawn, moved here as `predict` moves
-        it; ``growth`` P_g that of this pose against it, P_now - P_o where this pose came from that one. All in the body frame now.
+        it; ``growth`` P_g that of this pose against it, P_now - P_o where this pose came from that one, with ``slip``, by which the way was
+        worse than this filter believed. All in the body frame now.
 
         This is the update with a clone of the old pose, y = e - e_o - v, of which only its covariance was kept. The gain
         K = P_g (P_g + R)^-1 makes the pose as sure as can be of its place on the old map, e - e_o, and no surer of the world than
@@ -178,7 +179,8 @@ class Ekf:
         error = se2.log(se2.between(self.pose, pose))
         S = growth + cov
         gain = np.linalg.solve(S, growth).T
-        P = self.covariance
+        P = self.covariance.copy()
+        P[POSE, POSE] += slip
         shared = 0.5 * (P[POSE, POSE] + old_cov - growth)  # cov(e, e_o)
         A_start, A_anchor = se2.adjoint(se2.between(self._start, self.pose)), se2.adjoint(se2.between(self._anchor, self.pose))
         G = np.zeros((self._size, 3))

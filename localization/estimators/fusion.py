@@ -80,7 +80,7 @@ class EkfFusion:
             self._counts["contradictions"] += nis > ekf.gate
             if (known := witness.recall(step, ekf.pose, ekf.covariance[POSE, POSE])) is not None:
                 self._counts["revisits"] += 1
-                ekf.measure_revisit(known.pose, known.cov, known.old_cov, known.growth)
+                ekf.measure_revisit(known.pose, known.cov, known.old_cov, known.growth, known.slip)
         witness.remember(step, ekf.pose)
         ekf.set_anchor()
         return nis

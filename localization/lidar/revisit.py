@@ -10,6 +10,7 @@ drift can explain, if no other place explains the scan about as well, and if the
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,9 +24,11 @@ from motion_models import se2
 from motion_models.se2 import FloatArray
 
 _KNOWS_NOTHING = np.array([10.0, 10.0, 3.0])
-_MOST_POINTS = 180  # of a scan, in the search
-_STARTS, _MOST_RIVALS = 6, 24
-_RIVAL_SCORE = 0.7  # whose score in the coarse search is below this part of the best fit's explains far less
+_MOST_POINTS = 250  # in the search
+_STARTS, _MOST_RIVALS = 6, 100
+_RIVAL_SCORE = 0.8  # whose score in the coarse search is below this part of the best fit's explains far less
+_OPEN = 30.0  # sigma along the way to a rival, over its distance: no guess between rivals moves the robot
+_TELLS = 0.1  # part of the drift's variance that a place seen again must be below, in some direction
 _FEW_NEW = 0.02  # part of a place's points that may be added in passing
 
 
@@ -37,6 +40,8 @@ class RevisitConfig:
     """Look for places seen before."""
     old_after_m: float = 20.0
     """What was mapped this far back on the way is old [m]."""
+    recent_m: float = 8.0
+    """Scans of this last part of the way are searched together: one alone looks the same in many places of a building [m]."""
     keyframe_m: float = 1.0
     """Look again after this way [m]."""
     keyframe_rad: float = 0.5
@@ -64,7 +69,9 @@ class Revisit:
     old_cov: FloatArray
     """(3, 3) of the old map itself: of the pose it was drawn from, moved here."""
     growth: FloatArray
-    """(3, 3) of the pose against the old map before this was seen."""
+    """(3, 3) of the pose against the old map before this was seen, ``slip`` included."""
+    slip: FloatArray
+    """(3, 3) by which the way here was worse than believed: zero unless a verified place contradicts what was believed."""
     then: Place
     """Where the robot was when it drew that part of the map."""
     matched: float
@@ -90,21 +97,36 @@ class Revisits:
         self.track = Track()
         self._gate = float(chi2.ppf(config.gate_probability, 3))
         self._pending: tuple[int, _Fit] | None = None
+        self._recent: deque[tuple[Place, FloatArray]] = deque()
 
     def look(self, scan: FloatArray, lines: LineMap, pose: FloatArray, cov: FloatArray, travel: float, stamp_ns: int) -> Revisit | None:
         """``scan`` (N, 2) of the body frame at ``pose`` (3,) with ``cov`` (3, 3), by all that is known but for old parts of the map."""
         if not self._is_keyframe(pose, travel):
             return None
-        self.track.add(Place(stamp_ns, travel, pose, cov))
-        fit, then = self._find(scan, lines, pose, travel)
+        now = Place(stamp_ns, travel, pose, cov)
+        self.track.add(now)
+        fit, then = self._find(self._seen_recently(now, scan), lines, pose, travel)
         last, self._pending = self._pending, None if fit is None else (len(self.track) - 1, fit)
         if fit is None or last is None or not self._agrees(last, fit):
             return None
         self._pending = None
+        self._recent.clear()  # its poses are about to be corrected
         self.track.tie(then)
-        place = self.track[then]
+        place, growth = self.track[then], self.track.growth(then)
+        off = se2.log(se2.between(pose, fit.pose))
+        nis = float(off @ np.linalg.solve(growth + fit.cov, off))
+        slip = nis / self._gate * np.outer(off, off) if nis > self._gate else np.zeros((3, 3))
         matched = float(fit.on_map.mean())
-        return Revisit(fit.pose, fit.cov, moved(place, pose), self.track.growth(then), place, matched)
+        return Revisit(fit.pose, fit.cov, moved(place, pose), growth + slip, slip, place, matched)
+
+    def _seen_recently(self, now: Place, scan: FloatArray) -> FloatArray:
+        """(N, 2) the last keyframes' points in the body frame ``now``, one per half voxel."""
+        self._recent.append((now, scan))
+        while now.travel - self._recent[0][0].travel > self.config.recent_m:
+            self._recent.popleft()
+        points = np.concatenate([se2.transform(se2.between(now.pose, place.pose), seen) for place, seen in self._recent])
+        _, first = np.unique(np.floor(points / (0.5 * self._voxel)).astype(np.int64), axis=0, return_index=True)
+        return np.ascontiguousarray(points[np.sort(first)])
 
     def _is_keyframe(self, pose: FloatArray, travel: float) -> bool:
         if not len(self.track):
@@ -138,15 +160,19 @@ class Revisits:
         best = search.best(scores.poses, left)
         if best.on_map.mean() < c.min_matched:
             return None, -1
-        best = self._doubted(best, search, scores.poses, left)
+        cov = self._doubted(best, search, scores.poses, left)
+        if cov is None:
+            return None, -1
+        best = replace(best, cov=cov)
         then = self.track.at_travel(float(np.median(best.travels[best.on_map])))
         off = se2.log(se2.between(pose, best.pose))
         if off @ np.linalg.solve(self.track.growth(then) + best.cov + resolution / 9.0, off) > self._gate:
             return None, -1
         return best, then
 
-    def _doubted(self, best: _Fit, search: _Search, poses: FloatArray, scores: FloatArray) -> _Fit:
-        """``best`` with a covariance that is open towards every other place that explains the scan about as well."""
+    def _doubted(self, best: _Fit, search: _Search, poses: FloatArray, scores: FloatArray) -> FloatArray | None:
+        """The covariance of ``best``, open towards every other place that explains the scan about as well; None if these are too many
+        to try, or leave no direction in which the scan says more than drift does."""
         cov = best.cov
         left = scores > _RIVAL_SCORE * best.score
         poses, scores = poses[left], scores[left]
@@ -154,16 +180,16 @@ class Revisits:
             far = _distances(best.peak, poses, cov + search.resolution * (4.0 / self._gate)) > self._gate
             poses, scores = poses[far], scores[far]
             if not len(poses):
-                return replace(best, cov=cov)
+                return cov if np.linalg.eigvals(np.linalg.solve(search.prior, cov)).real.min() < _TELLS else None
             start = poses[np.argmax(scores)]
             other = search.fit(start)
             is_distinct = _distances(best.peak, other.peak, cov + search.resolution / self._gate) > self._gate
             if is_distinct and self._rivals(best, other, search.scan):
-                off = 3.0 * se2.log(se2.between(best.peak, other.peak))
+                off = _OPEN * se2.log(se2.between(best.peak, other.peak))
                 cov = cov + np.outer(off, off)
-            tried = _distances(start, poses, search.resolution) < 4.0
-            poses, scores = poses[~tried], scores[~tried]
-        return replace(best, cov=cov + np.diag(_KNOWS_NOTHING**2))  # too many to try
+            far = np.minimum(_distances(start, poses, search.resolution), _distances(other.peak, poses, search.resolution)) > 4.0
+            poses, scores = poses[far], scores[far]
+        return None
 
     def _rivals(self, best: _Fit, other: _Fit, scan: FloatArray) -> bool:
         """Whether ``other`` explains the scan about as well: McNemar's test of the points that only one of them explains, where those of

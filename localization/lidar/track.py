@@ -9,7 +9,7 @@ share the error of the place where their ways part.
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -53,7 +53,7 @@ class Track:
             self._parents[n], self._next_parent = self._next_parent, None
         is_start = n == 0 or n in self._parents
         self._starts.append(n if is_start else self._starts[-1])
-        self._places.append(place)
+        self._places.append(replace(place, cov=np.array(place.cov)))  # a view would keep all of a filter's covariance alive
         self._travels.append(place.travel)
 
     def tie(self, index: int) -> None:
