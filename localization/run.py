@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import time
-from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from localization.errors import LogError
-from localization.estimators import CORRECTING, Estimate
+from localization.estimators import CORRECTING
 from localization.events import Event
 from localization.online.core import Core, Pair, ReplayConfig
-from localization.trajectory import IntArray, Trajectory
+from localization.online.records import NIS, TWIST, TWIST_COV, Records, trajectory
+from localization.trajectory import Trajectory
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
@@ -75,7 +73,7 @@ class _Lane:
     """One pair at work."""
 
     def __init__(self, pair: Pair, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig) -> None:
-        self._pair, self._records = pair, _Records()
+        self._pair, self._records = pair, Records()
         self._core = Core(pair, robot, mounts, has_lidar, config)
         self._seconds = 0.0
 
@@ -94,15 +92,14 @@ class _Lane:
         stamps, table = self._records.stamps(), self._records.table()
         if not len(stamps):
             raise LogError("there are wheel samples and scans in the log, but no two that motion could be told from.")
-        covariances = table[:, _COV].reshape(-1, 3, 3)
-        found = Trajectory(stamps, table[:, _POSE], covariances if np.isfinite(covariances).all() else None)
+        found = trajectory(stamps, table)
         return Run(
             self._pair.model.name,
             self._pair.estimator,
             found if smoothed is None else smoothed,
-            table[:, _TWIST],
-            table[:, _TWIST_COV].reshape(-1, 3, 3),
-            table[:, _NIS],
+            table[:, TWIST],
+            table[:, TWIST_COV].reshape(-1, 3, 3),
+            table[:, NIS],
             self._core.estimator.parameters(),
             self._core.estimator.counts(),
             self._core.estimator.map_points(),
@@ -110,35 +107,3 @@ class _Lane:
             self._seconds,
             self._pair.corrections if self._pair.estimator in CORRECTING else None,
         )
-
-
-_POSE, _COV, _TWIST, _TWIST_COV, _NIS = slice(0, 3), slice(3, 12), slice(12, 15), slice(15, 24), 24
-
-
-class _Records:
-    """Estimates as plain numbers, 208 bytes each: a day at 12 Hz is 216 MB."""
-
-    def __init__(self) -> None:
-        self._stamps, self._numbers = array("q"), array("d")
-
-    def add(self, estimate: Estimate) -> None:
-        if self._stamps and estimate.stamp_ns <= self._stamps[-1]:
-            return
-        row = np.full(25, np.nan)
-        row[_POSE], row[_TWIST] = estimate.pose, estimate.twist
-        if estimate.covariance is not None:
-            row[_COV] = estimate.covariance.ravel()
-        if estimate.twist_covariance is not None:
-            row[_TWIST_COV] = estimate.twist_covariance.ravel()
-        if estimate.nis is not None:
-            row[_NIS] = estimate.nis
-        self._stamps.append(estimate.stamp_ns)
-        self._numbers.frombytes(row.tobytes())
-
-    def stamps(self) -> IntArray:
-        """(N,)"""
-        return np.array(self._stamps, dtype=np.int64)
-
-    def table(self) -> FloatArray:
-        """(N, 25)"""
-        return np.array(self._numbers).reshape(-1, 25)

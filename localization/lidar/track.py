@@ -12,6 +12,7 @@ from bisect import bisect_left
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from motion_models import se2
 from motion_models.se2 import FloatArray
@@ -65,6 +66,12 @@ class Track:
         after = min(bisect_left(self._travels, travel), len(self._travels) - 1)
         is_before = after > 0 and travel - self._travels[after - 1] < self._travels[after] - travel
         return after - 1 if is_before else after
+
+    def near(self, pose: FloatArray, radius: float, before: float) -> NDArray[np.intp]:
+        """Places within ``radius`` [m] of ``pose`` (3,), passed before ``before`` [m], in their order."""
+        n = bisect_left(self._travels, before)
+        at = np.array([place.pose[:2] for place in self._places[:n]]).reshape(-1, 2) - pose[:2]
+        return np.flatnonzero(np.hypot(at[:, 0], at[:, 1]) < radius)
 
     def growth(self, index: int) -> FloatArray:
         """(3, 3) covariance of the last place against place ``index``, in the body frame of the last."""

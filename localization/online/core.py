@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 from localization.estimators import Estimate, Estimator, EstimatorConfig, make_estimator
 from localization.events import Event
 from localization.steps import Step, StepConfig, Stepper
+from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.corrections import Form
 from motion_models.robot import Mount, Robot
+from motion_models.se2 import FloatArray
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,8 @@ class Core:
     def __init__(self, pair: Pair, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig | None = None) -> None:
         config = config or ReplayConfig()
         self.stepper = Stepper(pair.model, robot, mounts, has_lidar, config.step)
+        self.wheel_twist: FloatArray | None = None
+        """(3,) mean twist of the last step by the wheels alone; None where they were not heard during all of it."""
         self.estimator: Estimator = make_estimator(pair.estimator, pair.model, pair.corrections, robot, mounts, has_lidar, config.estimator)
 
     def push(self, event: Event) -> list[Estimate]:
@@ -51,6 +55,8 @@ class Core:
         found = []
         for step in steps:
             found.append(self.estimator.step(step))
+            if step.duration > 0.0:
+                self.wheel_twist = se2.log(step.predicted.delta) / step.duration if step.has_wheels else None
             self.stepper.clock_offset_s = self.estimator.clock_offset_s
             if self.estimator.params is not None:
                 self.stepper.params = self.estimator.params

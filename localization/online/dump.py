@@ -13,7 +13,8 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,9 @@ def fingerprints(**objects: Any) -> dict[str, str]:
     for name, value in objects.items():
         if isinstance(value, Robot):
             value = dataclasses.replace(value, folder=None)  # the same robot wherever its file is
-        found[name] = value if isinstance(value, str) else hashlib.sha256(b"".join(freeze(value))).hexdigest()[:12]
+        name_of = getattr(value, "name", None)
+        known = f"'{name_of}' " if isinstance(name_of, str) else ""
+        found[name] = value if isinstance(value, str) else known + hashlib.sha256(b"".join(freeze(value))).hexdigest()[:12]
     return found
 
 
@@ -51,14 +54,24 @@ def write_dump(path: Path, value: Any, head: Mapping[str, Any], made_by: Mapping
 
     Raises `DumpError` if the state or the file cannot be written.
     """
+    _store(path, dump_bytes(value, head, made_by, shared), ())
+
+
+def dump_bytes(value: Any, head: Mapping[str, Any], made_by: Mapping[str, str], shared: Mapping[str, Any]) -> bytes:
+    """What `write_dump` writes. Raises `DumpError`."""
     try:
         text, blob = freeze(value, shared)
     except DumpError as error:
         raise DumpError(f"no state can be dumped: {error}.") from error
     about = json.dumps({**head, "made_by": made_by, "state_bytes": len(text)}).encode()
-    body = b"".join((about, b"\n", text, blob))
+    return b"".join((about, b"\n", text, blob))
+
+
+def _store(path: Path, body: bytes, after: Sequence[int]) -> None:
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
+        for file_number in after:
+            os.fsync(file_number)
         with beside.open("wb") as file:
             file.write(_MAGIC + hashlib.sha256(body).hexdigest().encode() + b"\n")
             file.write(body)
@@ -117,18 +130,40 @@ def _read(path: Path) -> tuple[dict[str, Any], bytes, bytes]:
 
 
 class Dumper:
-    """Writes a state at most once every ``every_s`` [s] of the clock on the wall."""
+    """Writes a state at most once every ``every_s`` [s] of the clock on the wall.
 
-    def __init__(self, path: Path, made_by: Mapping[str, str], shared: Mapping[str, Any], every_s: float = 1.0) -> None:
+    The state is written down at once, in milliseconds; the disk is waited for in a thread, so that no estimate waits for it.
+    """
+
+    def __init__(self, path: Path, made_by: Mapping[str, str], shared: Mapping[str, Any], every_s: float = 0.5) -> None:
         self.path, self._made_by, self._shared, self._every_s = path, made_by, shared, every_s
         self._last = -float("inf")
-        self.n_written = 0
+        self._disk = ThreadPoolExecutor(1)
+        self._writing: Future[None] | None = None
 
     def is_due(self) -> bool:
-        return time.monotonic() - self._last >= self._every_s
+        is_idle = self._writing is None or self._writing.done()
+        return is_idle and time.monotonic() - self._last >= self._every_s
 
-    def write(self, value: Any, head: Mapping[str, Any]) -> None:
-        """Now. Raises `DumpError`."""
-        write_dump(self.path, value, head, self._made_by, self._shared)
-        self._last = time.monotonic()  # from the end of writing: a slow disk must not take all the time
-        self.n_written += 1
+    def write(self, value: Any, head: Mapping[str, Any], after: Sequence[int] = ()) -> None:
+        """Now. The files ``after`` (descriptors) are on disk before the state is, which may count on what is in them.
+
+        Raises `DumpError`, be it for the state before.
+        """
+        self.wait()
+        self._last = time.monotonic()
+        content = dump_bytes(value, head, self._made_by, self._shared)
+        self._writing = self._disk.submit(_store, self.path, content, tuple(after))
+
+    def wait(self) -> None:
+        """Until the state is on disk. Raises `DumpError`."""
+        if self._writing is not None:
+            writing, self._writing = self._writing, None
+            writing.result()
+
+    def close(self) -> None:
+        """Raises `DumpError`."""
+        try:
+            self.wait()
+        finally:
+            self._disk.shutdown()

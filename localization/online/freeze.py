@@ -7,12 +7,13 @@ layout in memory, and a view of another array stays one: linear algebra rounds b
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import sys
 from array import array
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import Any
 
@@ -98,10 +99,16 @@ class _Writer:
         raise DumpError(f"the state holds a {kind.__module__}.{kind.__qualname__}, which cannot be written down")
 
     def _packed(self, values: list[Any]) -> list[Json] | None:
-        """Long lists of numbers, or of equal rows of numbers, as arrays: the last seconds of wheels are thousands."""
+        """A long list of numbers, of equal rows of numbers, or of frozen dataclasses: the last seconds of wheels are thousands."""
         if len(values) < _PACKED_AT_LEAST:
             return None
         kinds = set(map(type, values))
+        if len(kinds) == 1 and (names := _frozen_fields(values[0])):
+            if any(len(vars(value)) != len(names) for value in values):  # something is cached in it
+                return None
+            columns = [self._column([getattr(value, name) for value in values]) for name in names]
+            kind = type(values[0])
+            return None if None in columns else ["objects", kind.__module__, kind.__qualname__, names, *columns]
         if kinds == {tuple}:
             lengths = set(map(len, values))
             if len(lengths) != 1 or lengths == {0}:
@@ -111,8 +118,13 @@ class _Writer:
         column = self._column(values)
         return None if column is None else ["column", column]
 
-    def _column(self, values: Any) -> Json:
+    def _column(self, values: Sequence[Any]) -> Json:
         kinds = set(map(type, values))
+        if kinds == {np.ndarray}:
+            alike = {(v.dtype, v.shape, v.flags.c_contiguous, v.base is None) for v in values}
+            dtype, _, is_contiguous, is_own = next(iter(alike))
+            is_plain = len(alike) == 1 and is_contiguous and is_own and dtype.kind in _KINDS
+            return ["ndarray", self._array(np.stack(values))] if is_plain else None
         for kind, dtype in ((float, "<f8"), (int, "<i8"), (bool, "|b1"), (np.float64, "<f8")):
             if kinds == {kind}:
                 try:
@@ -185,8 +197,7 @@ class _Reader:
             self._made[index] = queue
             queue.extend(map(self.get, rest[1:]))
         elif kind == "p":
-            columns = [self._column(*column) for column in rest[1:]]
-            self._made[index] = list(zip(*columns, strict=True)) if rest[0] == "rows" else columns[0]
+            self._made[index] = self._list(*rest)
         elif kind == "m":
             self._made[index] = self._array(rest[0])
         elif kind == "v":
@@ -198,14 +209,20 @@ class _Reader:
         else:
             raise ValueError(f"unknown object {kind!r}")
 
+    def _list(self, kind: str, *rest: Json) -> list[Any]:
+        if kind != "objects":
+            columns = [self._column(*column) for column in rest]
+            return list(zip(*columns, strict=True)) if kind == "rows" else columns[0]
+        module, name, names, *coded = rest
+        found, made = _class(module, name), []
+        for values in zip(*(self._column(*column) for column in coded), strict=True):
+            value = object.__new__(found)
+            vars(value).update(zip(names, values, strict=True))
+            made.append(value)
+        return made
+
     def _instance(self, index: int, module: str, name: str, state: Json) -> None:
-        home = sys.modules.get(module) if module.startswith(_PACKAGES) else None
-        found: Any = home
-        for part in name.split("."):
-            found = getattr(found, part, None)
-        # of our modules, loaded already, and defined there: an imported name would be somebody else's class
-        if not isinstance(found, type) or found.__module__ != module:
-            raise DumpError(f"it holds a {module}.{name}, which this version does not have")
+        found = _class(module, name)
         made: Any = object.__new__(found)
         self._made[index] = made
         content = self.get(state)
@@ -217,6 +234,8 @@ class _Reader:
 
     def _column(self, kind: str, place: int) -> list[Any]:
         values = self._array(place)
+        if kind == "ndarray":
+            return [row.copy() for row in values]
         return list(values) if kind == "float64" else values.tolist()
 
     def _view(self, base: Json, dtype: str, offset: int, shape: list[int], strides: list[int]) -> NDArray[Any]:
@@ -227,6 +246,25 @@ class _Reader:
         count = math.prod(shape)
         flat = np.frombuffer(self._blob, _dtype(dtype), count, offset) if count else np.empty(0, _dtype(dtype))
         return flat.copy().reshape(shape, order=order)
+
+
+def _class(module: str, name: str) -> type[Any]:
+    """One of our modules, loaded already, and defined there: an imported name would be somebody else's class."""
+    found: Any = sys.modules.get(module) if module.startswith(_PACKAGES) else None
+    for part in name.split("."):
+        found = getattr(found, part, None)
+    if not isinstance(found, type) or found.__module__ != module:
+        raise DumpError(f"it holds a {module}.{name}, which this version does not have")
+    return found
+
+
+def _frozen_fields(value: Any) -> list[str]:
+    """Names of the fields of an instance of one of our frozen dataclasses that has nothing to say about its state; else none."""
+    kind = type(value)
+    if not kind.__module__.startswith(_PACKAGES) or not dataclasses.is_dataclass(kind) or hasattr(kind, "__setstate__"):
+        return []
+    is_frozen = kind.__dataclass_params__.frozen  # type: ignore[attr-defined]
+    return [f.name for f in dataclasses.fields(kind)] if is_frozen and hasattr(value, "__dict__") else []
 
 
 def _dtype(name: str) -> np.dtype[Any]:

@@ -1,0 +1,136 @@
+"""Estimates as rows of plain numbers: in memory, or in a file beside the output that outlives the process which writes it."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from localization.errors import DumpError, OutputError
+from localization.estimators import Estimate
+from localization.logs.fused import FusedEstimate
+from localization.trajectory import IntArray, Trajectory
+from motion_models.se2 import FloatArray
+
+POSE, COV, TWIST, TWIST_COV, NIS = slice(0, 3), slice(3, 12), slice(12, 15), slice(15, 24), 24
+_COLUMNS = 25
+_ROW = np.dtype([("stamp_ns", "<i8"), ("numbers", "<f8", (_COLUMNS,))])
+
+
+def row_of(estimate: Estimate) -> FloatArray:
+    """(25,) pose, covariance, twist, its covariance, NIS; NaN where nothing is known."""
+    row = np.full(_COLUMNS, np.nan)
+    row[POSE], row[TWIST] = estimate.pose, estimate.twist
+    if estimate.covariance is not None:
+        row[COV] = estimate.covariance.ravel()
+    if estimate.twist_covariance is not None:
+        row[TWIST_COV] = estimate.twist_covariance.ravel()
+    if estimate.nis is not None:
+        row[NIS] = estimate.nis
+    return row
+
+
+class Records:
+    """In memory, 208 bytes each: a day at 12 Hz is 216 MB. Stamps rise; an estimate that does not come after the last is left out."""
+
+    def __init__(self) -> None:
+        self._stamps, self._numbers = array("q"), array("d")
+
+    def add(self, estimate: Estimate) -> None:
+        if self._stamps and estimate.stamp_ns <= self._stamps[-1]:
+            return
+        self._stamps.append(estimate.stamp_ns)
+        self._numbers.frombytes(row_of(estimate).tobytes())
+
+    def stamps(self) -> IntArray:
+        """(N,)"""
+        return np.array(self._stamps, dtype=np.int64)
+
+    def table(self) -> FloatArray:
+        """(N, 25)"""
+        return np.array(self._numbers).reshape(-1, _COLUMNS)
+
+
+class Spool:
+    """The same in a file that grows. What was flushed survives the process; a state says how many rows it counts on (`open`)."""
+
+    def __init__(self, path: Path, file: BinaryIO, count: int, last_ns: int) -> None:
+        self.path, self._file, self.count, self._last_ns = path, file, count, last_ns
+
+    @classmethod
+    def create(cls, path: Path) -> Spool:
+        """A new file. Raises `OutputError`, also where a run that was killed has left one."""
+        if path.exists():
+            raise OutputError(
+                f"'{path}' is left from a run that was killed: pass that run's --state to go on from there, or remove the file."
+            )
+        try:
+            return cls(path, path.open("xb"), 0, -(1 << 63))
+        except OSError as error:
+            raise OutputError(f"'{path}' cannot be written: {error.strerror}.") from error
+
+    @classmethod
+    def resume(cls, path: Path, count: int) -> Spool:
+        """The first ``count`` rows of a file; what came after them is dropped, to be written anew. Raises `DumpError`."""
+        try:
+            file = path.open("r+b")
+            size = file.seek(0, 2)
+            if size < count * _ROW.itemsize:
+                file.close()
+                raise DumpError(
+                    f"'{path}' holds {size // _ROW.itemsize} estimates where the state counts on {count}. Remove both to start anew."
+                )
+            file.truncate(count * _ROW.itemsize)
+            last_ns = -(1 << 63)
+            if count:
+                file.seek((count - 1) * _ROW.itemsize)
+                last_ns = int(np.frombuffer(file.read(_ROW.itemsize), _ROW)["stamp_ns"][0])
+            file.seek(0, 2)
+        except OSError as error:
+            raise DumpError(f"'{path}', the estimates up to the state, cannot be read: {error.strerror}. Remove the state.") from error
+        return cls(path, file, count, last_ns)
+
+    def add(self, estimate: Estimate) -> None:
+        if estimate.stamp_ns <= self._last_ns:
+            return
+        self._last_ns = estimate.stamp_ns
+        self._file.write(np.array([(estimate.stamp_ns, row_of(estimate))], _ROW).tobytes())
+        self.count += 1
+
+    def flush(self) -> int:
+        """To the operating system; returns the file's descriptor."""
+        self._file.flush()
+        return self._file.fileno()
+
+    def rows(self) -> tuple[IntArray, FloatArray]:
+        """Stamps (N,) and numbers (N, 25), mapped from the file."""
+        self.flush()
+        if not self.count:
+            return np.empty(0, np.int64), np.empty((0, _COLUMNS))
+        table = np.memmap(self.path, _ROW, "r", shape=(self.count,))
+        return table["stamp_ns"], table["numbers"]
+
+    def close(self) -> None:
+        self._file.close()
+
+    def remove(self) -> None:
+        self.close()
+        self.path.unlink(missing_ok=True)
+
+
+def fused_estimates(stamps_ns: IntArray, table: FloatArray) -> Iterator[FusedEstimate]:
+    """What `write_fused` takes, of stamps (N,) and rows (N, 25). Without covariances unless all poses have one."""
+    has_cov = bool(np.isfinite(table[:, COV]).all())
+    for stamp, row in zip(stamps_ns, table, strict=True):
+        twist_cov = row[TWIST_COV].reshape(3, 3)
+        known = np.isfinite(twist_cov).all()
+        yield FusedEstimate(int(stamp), row[POSE], row[TWIST], row[COV].reshape(3, 3) if has_cov else None, twist_cov if known else None)
+
+
+def trajectory(stamps_ns: IntArray, table: FloatArray) -> Trajectory:
+    """Of stamps (N,) and rows (N, 25), with covariances if all poses have one."""
+    covariances = np.array(table[:, COV]).reshape(-1, 3, 3)
+    return Trajectory(np.array(stamps_ns), np.array(table[:, POSE]), covariances if np.isfinite(covariances).all() else None)

@@ -1,0 +1,241 @@
+"""A state on disk: cut anywhere and resumed, elsewhere too, the results are the same to the last bit; no other file is taken for one."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import pickle
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from localization.errors import DumpError
+from localization.lidar.track import Place
+from localization.online.core import Core, Pair, ReplayConfig
+from localization.online.dump import Dumper, fingerprints, read_dump, read_head, write_dump
+from localization.online.freeze import freeze, thaw
+from localization.steps import StepConfig
+from motion_models.registry import make_model
+from motion_models.robot import load_robot
+from tests.online_help import ROBOT, drive_events, new_core, numbers
+
+ESTIMATORS = [("odometry", "diff_drive", "none"), ("lidar", "skid_steer", "none"), ("ekf", "skid_steer", "constant")]
+ESTIMATORS += [("ekf", "friction", "none"), ("graph", "skid_steer", "cg_field")]
+AHEAD = 400  # events after a cut that are compared: some 30 scans
+
+
+@pytest.mark.parametrize("kind", ESTIMATORS, ids="-".join)
+def test_cut_anywhere_and_resumed_the_results_are_the_same_to_the_last_bit(kind):
+    events, _ = drive_events()
+    cuts = {0, 1, 2, 60, *np.random.default_rng(3).integers(3, len(events), 12).tolist(), len(events)}
+    core, whole, states, made = new_core(*kind), [], {}, []
+    for i in range(len(events) + 1):
+        if i in cuts:
+            states[i] = freeze(core)
+        made.append(len(whole))
+        whole += map(numbers, core.push(events[i]) if i < len(events) else core.finish())
+    for cut, state in states.items():
+        resumed, found = thaw(*state), []
+        end = min(cut + AHEAD, len(events))
+        for event in events[cut:end]:
+            found += map(numbers, resumed.push(event))
+        if end == len(events):
+            found += map(numbers, resumed.finish())
+            assert dict(resumed.estimator.parameters()) == dict(core.estimator.parameters())
+            assert dict(resumed.estimator.counts()) == dict(core.estimator.counts())
+            assert resumed.stepper.notes() == core.stepper.notes()
+            a, b = resumed.estimator.map_points(), core.estimator.map_points()
+            assert np.array_equal(a[np.lexsort(a.T)], b[np.lexsort(b.T)])
+        expected = whole[made[cut] : made[end] if end < len(events) else len(whole)]
+        assert found == expected, cut
+    assert len(whole) > 200
+
+
+_RESUME = """
+import hashlib, sys
+from pathlib import Path
+from localization.online.dump import read_dump
+from tests.online_help import drive_events, numbers, new_core
+core = read_dump(Path(sys.argv[1]), {}, {}).value
+events, _ = drive_events()
+found = [numbers(e) for event in events[int(sys.argv[2]):] for e in core.push(event)]
+print(len(found), hashlib.sha256(repr(found).encode()).hexdigest())
+"""
+
+
+def test_another_process_resumes_it(tmp_path):
+    events, _ = drive_events()
+    cut, core = 1500, new_core("ekf")
+    for event in events[:cut]:
+        core.push(event)
+    write_dump(tmp_path / "state", core, {"events": cut}, {}, {})
+    rest = [numbers(e) for event in events[cut:] for e in core.push(event)]
+    said = subprocess.run([sys.executable, "-c", _RESUME, tmp_path / "state", str(cut)], check=True, capture_output=True, text=True).stdout
+    assert said.split() == [str(len(rest)), hashlib.sha256(repr(rest).encode()).hexdigest()]
+
+
+def test_a_filter_that_went_on_for_hours_is_written_down_in_milliseconds():
+    rng = np.random.default_rng(0)
+    places = [Place(i, float(i), rng.normal(size=3), rng.normal(size=(3, 3))) for i in range(20_000)]
+    begin = time.process_time()
+    text, blob = freeze(places)
+    seconds = time.process_time() - begin
+    again = thaw(text, blob)
+    assert seconds < 0.5  # 0.03 s on an idle core; one by one they would take seconds
+    assert len(text) < 1000
+    assert all(a.stamp_ns == b.stamp_ns and a.travel == b.travel for a, b in zip(again, places, strict=True))
+    assert all(np.array_equal(a.pose, b.pose) and np.array_equal(a.cov, b.cov) for a, b in zip(again, places, strict=True))
+    assert again[0].pose.base is None
+
+
+scalars = st.none() | st.booleans() | st.integers(-(2**70), 2**70) | st.floats() | st.text(max_size=5)
+values = st.recursive(
+    scalars, lambda inner: st.lists(inner, max_size=12) | st.tuples(inner, inner) | st.dictionaries(st.text(max_size=3), inner, max_size=3)
+)
+
+
+@given(values)
+@settings(max_examples=150, deadline=None)
+def test_plain_values_come_back_as_they_were(value):
+    assert repr(thaw(*freeze(value))) == repr(value)
+
+
+def test_what_is_held_twice_stays_one_and_views_stay_views():
+    base = np.arange(24.0).reshape(4, 6).copy()
+    a, b, view, turned = thaw(*freeze([base, base, base[1:, ::2], np.asfortranarray(base)]))
+    assert a is b
+    assert view.base is not None
+    view[0, 0] = 99.0
+    assert a[1, 0] == 99.0
+    assert turned.flags.f_contiguous
+    assert not turned.flags.c_contiguous
+
+
+@pytest.mark.parametrize("strange", [print, object(), {1, 2}, np.array([object()]), sys])
+def test_what_cannot_be_written_down_is_named(strange):
+    with pytest.raises(DumpError, match="holds a"):
+        freeze([strange])
+
+
+@pytest.fixture
+def state(tmp_path):
+    path = tmp_path / "state"
+    write_dump(path, new_core("ekf"), {"events": 0}, made_by(), {})
+    return path
+
+
+def made_by(robot=ROBOT, model="skid_steer", config=None):
+    return fingerprints(robot=robot, model=make_model(model, robot), estimator="ekf", configuration=config or ReplayConfig())
+
+
+def test_damage_anywhere_is_noticed(state):
+    content = bytearray(state.read_bytes())
+    rng = np.random.default_rng(1)
+    for at in [0, 8, 20, 90, 200, len(content) - 1, *rng.integers(0, len(content), 30)]:
+        damaged = bytearray(content)
+        damaged[at] ^= 0x20
+        state.write_bytes(damaged)
+        with pytest.raises(DumpError, match=r"damaged|no state of an estimator|another version"):
+            read_dump(state, made_by(), {})
+    for length in (0, 5, 16, 50, len(content) // 2, len(content) - 1):
+        state.write_bytes(content[:length])
+        with pytest.raises(DumpError, match=r"damaged|no state of an estimator"):
+            read_dump(state, made_by(), {})
+
+
+def test_foreign_files_are_refused_and_run_no_code(tmp_path):
+    path, trap = tmp_path / "x", tmp_path / "trap"
+
+    class Trap:
+        def __reduce__(self):
+            return os.mkdir, (str(trap),)
+
+    for content in (pickle.dumps(Trap()), b"PK\3\4", b"", b"{}", os.urandom(1000)):
+        path.write_bytes(content)
+        with pytest.raises(DumpError, match="no state of an estimator"):
+            read_dump(path, {}, {})
+    assert not trap.exists()
+    with pytest.raises(DumpError, match="No such file"):
+        read_dump(tmp_path / "absent", {}, {})
+    path.write_bytes(b"skidloc state 9\nabc\n")
+    with pytest.raises(DumpError, match="another version of its format"):
+        read_head(path)
+
+
+@pytest.mark.parametrize("kind", [["c", "os", "system", {}], ["c", "subprocess", "Popen", {}], ["c", "localization.run", "Nobody", {}]])
+def test_only_classes_of_this_project_are_made(kind):
+    text = json.dumps({"root": ["o", 0], "objects": [kind], "arrays": []}).encode()
+    with pytest.raises(DumpError, match="does not have"):
+        thaw(text, b"")
+    packed = ["p", "objects", kind[1], kind[2], ["a"], ["int", 0]]
+    text = json.dumps({"root": ["o", 0], "objects": [packed], "arrays": [["<i8", [1], "C", 0]]}).encode()
+    with pytest.raises(DumpError, match="does not have"):
+        thaw(text, bytes(8))
+
+
+@given(st.binary(max_size=60), st.binary(max_size=20))
+def test_bytes_that_mean_nothing_are_refused_whatever_they_are(text, blob):
+    with pytest.raises(DumpError):
+        thaw(text, blob)
+
+
+def test_the_state_of_another_robot_model_or_configuration_is_refused(state):
+    assert isinstance(read_dump(state, made_by(), {}).value, Core)
+    heavier = dataclasses.replace(ROBOT, geometry=dataclasses.replace(ROBOT.geometry, mass_kg=120.0))
+    for other, told in [
+        (made_by(load_robot("husky_a200")), r"another .*robot \('vaultbot' \w+ then, 'husky_a200' \w+ now\)"),
+        (made_by(heavier), "another robot"),
+        (made_by(model="diff_drive"), "another model"),
+        (made_by(config=ReplayConfig(step=StepConfig(wait_s=0.2))), "another configuration"),
+        ({**made_by(), "version of numpy": "1.0"}, "another version of numpy"),
+    ]:
+        with pytest.raises(DumpError, match=told):
+            read_dump(state, other, {})
+    moved = dataclasses.replace(ROBOT, folder=state.parent)
+    assert isinstance(read_dump(state, made_by(moved), {}).value, Core)
+
+
+def test_the_old_state_stays_until_the_new_one_is_whole(state, monkeypatch):
+    before = state.read_bytes()
+
+    def full_disk(number):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(DumpError, match="No space left"):
+        write_dump(state, [1], {}, {}, {})
+    assert state.read_bytes() == before
+    assert [path.name for path in state.parent.iterdir()] == ["state"]
+
+
+def test_dumper_writes_no_more_often_than_it_is_told_and_reports_a_full_disk(tmp_path, monkeypatch):
+    dumper = Dumper(tmp_path / "state", {}, {}, every_s=30.0)
+    assert dumper.is_due()
+    dumper.write([1.5], {"events": 7})
+    assert not dumper.is_due()
+    dumper.wait()
+    assert not dumper.is_due()
+    assert read_dump(tmp_path / "state", {}, {}).value == [1.5]
+    assert read_head(tmp_path / "state")["events"] == 7
+
+    def full_disk(number):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    dumper.write([2.5], {})
+    with pytest.raises(DumpError, match="No space left"):
+        dumper.close()
+    assert read_dump(tmp_path / "state", {}, {}).value == [1.5]
+
+
+def test_pair_is_shared_not_written():
+    model = make_model("skid_steer", ROBOT)
+    pair = Pair(model, "ekf")
+    assert thaw(*freeze([pair, model], {"model": model}), {"model": model})[1] is model
