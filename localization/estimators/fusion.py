@@ -80,7 +80,9 @@ class EkfFusion:
             self._counts["contradictions"] += nis > ekf.gate
             if (known := witness.recall(step, ekf.pose, ekf.covariance[POSE, POSE])) is not None:
                 self._counts["revisits"] += 1
+                before = ekf.pose
                 ekf.measure_revisit(known.pose, known.cov, known.old_cov, known.growth, known.slip)
+                witness.correct(before, ekf.pose)
         witness.remember(step, ekf.pose)
         ekf.set_anchor()
         return nis

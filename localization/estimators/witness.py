@@ -36,7 +36,10 @@ class Witness(Protocol):
 
     def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
         """Whether the scan that was last looked at is of a place seen long before, where ``pose`` (3,) with ``cov`` (3, 3) is the
-        estimate by all but this. Correct the pose by it before you `remember` the scan."""
+        estimate by all but this. Correct the pose by it, and say so, before you `remember` the scan."""
+
+    def correct(self, before: FloatArray, after: FloatArray) -> None:
+        """What was recalled made ``before`` (3,) to ``after`` (3,)."""
 
     def remember(self, step: Step, pose: FloatArray) -> None:
         """The scan that was last looked at was taken from ``pose`` (3,)."""
@@ -61,6 +64,9 @@ class ScanWitness:
     def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
         return self._matcher.recall(pose, cov, step.end_ns)
 
+    def correct(self, before: FloatArray, after: FloatArray) -> None:
+        self._matcher.correct(before, after)
+
     def remember(self, step: Step, pose: FloatArray) -> None:
         if not step.is_standing or not self._has_map:  # a robot that stands sees nothing new, and would only thicken its lines
             self._matcher.insert(pose)
@@ -77,6 +83,9 @@ class NoWitness:
         return None
 
     def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
+        return None
+
+    def correct(self, before: FloatArray, after: FloatArray) -> None:
         return None
 
     def remember(self, step: Step, pose: FloatArray) -> None:

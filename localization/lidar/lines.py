@@ -2,7 +2,8 @@
 
 Compiled scalar loops. The map is a hash grid of square cells with a bounded number of points in each; a point stays where it was first
 seen, so that the map does not creep along with the errors of later poses. Each point remembers how far the robot had travelled when it
-was inserted: old and young parts of the map can be told apart where the robot comes back to a place.
+was inserted: old and young parts of the map can be told apart where the robot comes back to a place, and every use of the map says
+which ages it means.
 """
 
 from __future__ import annotations
@@ -16,9 +17,29 @@ from numpy.typing import NDArray
 
 from motion_models.se2 import FloatArray
 
-POINTS_PER_CELL = 40
+POINTS_PER_CELL = 64
+_IN_USE_PER_CELL = 40  # of the ages that are in use; the rest is for older visits
+_AGE_M = 0.25
 _MIN_NEIGHBOURS = 4
 _MAX_LINE_RATIO = 0.1  # smaller over larger eigenvalue of the neighbours' spread: beyond this it is a corner or clutter
+
+
+Ages = NDArray[np.uint8]
+"""(A,) by travelled distance in steps of 0.25 m: 1 where points that were inserted then are in use. The last holds for all later ones."""
+ALL_AGES: Ages = np.ones(1, np.uint8)
+
+
+def ages_until(travel: float) -> Ages:
+    """Points inserted up to ``travel`` [m], and no later ones."""
+    return np.append(np.ones(max(round(travel / _AGE_M), 0), np.uint8), np.uint8(0))
+
+
+def ages_between(spans: FloatArray) -> Ages:
+    """Points inserted within any of ``spans`` (S, 2) [m], and all that come after the last one's end."""
+    found = np.zeros(round(float(spans[:, 1].max()) / _AGE_M) + 1, np.uint8)
+    for start, end in spans:
+        found[max(round(start / _AGE_M), 0) : round(end / _AGE_M) + 1] = 1
+    return found
 
 
 @dataclass(frozen=True)
@@ -53,10 +74,13 @@ class LineMap:
         self._travels = np.zeros((slots, POINTS_PER_CELL), np.float32)
         self._hits = np.zeros(slots, np.int32)  # of one step of a fit, all zero between steps
 
-    def insert(self, points: FloatArray, pose: FloatArray, travel: float = 0.0) -> None:
-        """Add ``points`` (N, 2) of the body frame, seen from ``pose`` (3,) after ``travel`` [m]."""
+    def insert(self, points: FloatArray, pose: FloatArray, travel: float = 0.0, ages: Ages = ALL_AGES) -> None:
+        """Add ``points`` (N, 2) of the body frame, seen from ``pose`` (3,) after ``travel`` [m], to what is in use."""
+        self._insert(points, np.full(len(points), travel, np.float32), pose, ages)
+
+    def _insert(self, points: FloatArray, travels: NDArray[np.float32], pose: FloatArray, ages: Ages) -> None:
         self._used, is_full = _insert(
-            self._cells, self._points, self._travels, points, pose, self._cell, self._min_distance, travel, self._used
+            self._cells, self._points, self._travels, ages, points, travels, pose, self._cell, self._min_distance, self._used
         )
         if is_full or self._used > self._cells.shape[0] // 2:
             cells = self._cells
@@ -64,10 +88,14 @@ class LineMap:
             near &= np.hypot(cells[:, 0] * self._cell - pose[0], cells[:, 1] * self._cell - pose[1]) < self._radius
             self._rebuild(near, cells.shape[0] * (2 if near.sum() > cells.shape[0] // 3 else 1))
 
-    def forget_since(self, travel: float) -> None:
-        """Remove the points that were inserted after ``travel`` [m]."""
+    def move_since(self, travel: float, world_T_world: FloatArray) -> None:
+        """Move the points that were inserted after ``travel`` [m] by ``world_T_world`` (3,)."""
+        use = np.arange(POINTS_PER_CELL) < self._cells[:, 2][:, None]
+        use &= self._travels > travel
+        points, travels = self._points[use].astype(float), self._travels[use]
         _keep_until(self._cells, self._points, self._travels, travel)
         self._rebuild(self._cells[:, 2] > 0, self._cells.shape[0])
+        self._insert(points, travels, world_T_world, ages_between(np.array([[travel, travel + 1.0]])))
 
     def _rebuild(self, kept: NDArray[np.bool_], slots: int) -> None:
         """A new table of ``slots`` with the ``kept`` (S,) slots of the old one."""
@@ -83,12 +111,12 @@ class LineMap:
         options: FitOptions,
         prior: FloatArray,
         center: FloatArray,
-        before: float = math.inf,
+        ages: Ages = ALL_AGES,
     ) -> LineFit:
         """Gauss-Newton from ``start`` (3,) for ``points`` (N, 2) of the body frame.
 
         ``prior`` (3, 3) is the information of a pull towards ``center`` (3,), which keeps directions that the scene does not hold
-        where they were; it is no part of the returned quadratic. Only points count that were inserted before ``before`` [m] of travel.
+        where they were; it is no part of the returned quadratic. Only points of these ``ages`` count.
         """
         information, gradient, pose = np.zeros((3, 3)), np.zeros(3), np.array(start, dtype=float)
         n, squares = _fit(
@@ -96,7 +124,7 @@ class LineMap:
             self._points,
             self._travels,
             self._hits,
-            before,
+            ages,
             points,
             pose,
             self._cell,
@@ -113,21 +141,20 @@ class LineMap:
         )
         return LineFit(pose, information, gradient, n, math.sqrt(squares / n) if n else math.nan)
 
-    def compare(self, points: FloatArray, pose: FloatArray, radius: float, before: float = math.inf) -> tuple[FloatArray, FloatArray]:
+    def compare(self, points: FloatArray, pose: FloatArray, radius: float, ages: Ages = ALL_AGES) -> tuple[FloatArray, FloatArray]:
         """How far ``points`` (N, 2) of the body frame at ``pose`` (3,) are off the lines within ``radius`` [m] of them, and when those
-        were seen: distances (N,) [m] and travelled distances (N,) [m], NaN for points without a line inserted before ``before`` [m]."""
+        were seen: distances (N,) [m] and travelled distances (N,) [m], NaN for points without a line of these ``ages``."""
         errors, travels = np.empty(len(points)), np.empty(len(points))
-        _compare(self._cells, self._points, self._travels, before, points, pose, self._cell, radius, errors, travels)
+        _compare(self._cells, self._points, self._travels, ages, points, pose, self._cell, radius, errors, travels)
         return errors, travels
 
-    def points_within(self, center: FloatArray, half: float, before: float = math.inf) -> tuple[FloatArray, FloatArray]:
-        """Points (M, 2) inserted before ``before`` [m] in cells whose centre is in a square of ``half`` a side [m] around ``center``
-        (2,), and their travelled distances (M,) [m]."""
+    def points_within(self, center: FloatArray, half: float) -> tuple[FloatArray, FloatArray]:
+        """Points (M, 2) in cells whose centre is in a square of ``half`` a side [m] around ``center`` (2,), and their travelled distances
+        (M,) [m]."""
         near = self._cells[:, 2] > 0
         near &= (np.abs((self._cells[:, :2] + 0.5) * self._cell - center) <= half).all(axis=1)
         slots = np.flatnonzero(near)
         use = np.arange(POINTS_PER_CELL) < self._cells[slots, 2][:, None]
-        use &= self._travels[slots] < before
         return self._points[slots][use].astype(float), self._travels[slots][use].astype(float)
 
     def point_cloud(self) -> FloatArray:
@@ -164,15 +191,21 @@ def _find(cells: NDArray[np.int32], ix: int, iy: int) -> int:  # pragma: no cove
 
 
 @numba.njit(cache=True)
+def _is_used(ages: Ages, travel: float) -> bool:  # pragma: no cover
+    return bool(ages[min(int(travel / _AGE_M + 0.5), ages.shape[0] - 1)])
+
+
+@numba.njit(cache=True)
 def _insert(
     cells: NDArray[np.int32],
     points: NDArray[np.float32],
     travels: NDArray[np.float32],
+    ages: Ages,
     new: FloatArray,
+    new_travels: NDArray[np.float32],
     pose: FloatArray,
     cell: float,
     min_distance: float,
-    travel: float,
     used: int,
 ) -> tuple[int, bool]:  # pragma: no cover
     """Takes how many slots are used; returns how many are then, and whether the table is so full that points were left out."""
@@ -188,17 +221,20 @@ def _insert(
             slot = -1 - slot
             used += 1
             cells[slot, 0], cells[slot, 1] = ix, iy
-        n = cells[slot, 2]
-        near = n >= points.shape[1]
+        n, n_used, unused, near = cells[slot, 2], 0, -1, False
         for k in range(n):
-            if near:
-                break
+            if not _is_used(ages, travels[slot, k]):
+                unused = k
+                continue
+            n_used += 1
             dx, dy = points[slot, k, 0] - x, points[slot, k, 1] - y
-            near = dx * dx + dy * dy < min_distance * min_distance
-        if not near:
-            points[slot, n, 0], points[slot, n, 1] = x, y
-            travels[slot, n] = travel
-            cells[slot, 2] = n + 1
+            near = near or dx * dx + dy * dy < min_distance * min_distance
+        if near or n_used >= _IN_USE_PER_CELL or (n >= points.shape[1] and unused < 0):
+            continue
+        k = n if n < points.shape[1] else unused
+        points[slot, k, 0], points[slot, k, 1] = x, y
+        travels[slot, k] = new_travels[i]
+        cells[slot, 2] = max(n, k + 1)
     return used, False
 
 
@@ -240,7 +276,7 @@ def _line(
     cells: NDArray[np.int32],
     points: NDArray[np.float32],
     travels: NDArray[np.float32],
-    before: float,
+    ages: Ages,
     x: float,
     y: float,
     cell: float,
@@ -257,7 +293,7 @@ def _line(
                 continue
             for k in range(cells[slot, 2]):
                 qx, qy = points[slot, k, 0] - x, points[slot, k, 1] - y
-                if qx * qx + qy * qy < radius * radius and travels[slot, k] < before:
+                if qx * qx + qy * qy < radius * radius and _is_used(ages, travels[slot, k]):
                     m += 1
                     sx, sy = sx + qx, sy + qy
                     sxx, sxy, syy = sxx + qx * qx, sxy + qx * qy, syy + qy * qy
@@ -280,7 +316,7 @@ def _compare(
     cells: NDArray[np.int32],
     points: NDArray[np.float32],
     travels: NDArray[np.float32],
-    before: float,
+    ages: Ages,
     source: FloatArray,
     pose: FloatArray,
     cell: float,
@@ -292,7 +328,7 @@ def _compare(
     for i in range(source.shape[0]):
         x = pose[0] + c * source[i, 0] - s * source[i, 1]
         y = pose[1] + s * source[i, 0] + c * source[i, 1]
-        m, _, _, e, _, travel = _line(cells, points, travels, before, x, y, cell, radius)
+        m, _, _, e, _, travel = _line(cells, points, travels, ages, x, y, cell, radius)
         errors[i], seen[i] = (abs(e), travel) if m else (math.nan, math.nan)
 
 
@@ -302,7 +338,7 @@ def _fit(
     points: NDArray[np.float32],
     travels: NDArray[np.float32],
     hits: NDArray[np.int32],
-    before: float,
+    ages: Ages,
     source: FloatArray,
     pose: FloatArray,
     cell: float,
@@ -334,7 +370,7 @@ def _fit(
         for i in range(source.shape[0]):
             x = pose[0] + c * source[i, 0] - s * source[i, 1]
             y = pose[1] + s * source[i, 0] + c * source[i, 1]
-            m, nx, ny, e, thin, _ = _line(cells, points, travels, before, x, y, cell, radius)
+            m, nx, ny, e, thin, _ = _line(cells, points, travels, ages, x, y, cell, radius)
             if m == 0:
                 continue
             # All points in one cell meet the same line, whose error they share: together they know no more than it.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from localization.lidar.kiss import Kiss
-from localization.lidar.lines import FitOptions, LineMap
+from localization.lidar.lines import ALL_AGES, Ages, FitOptions, LineMap
 from localization.lidar.revisit import Revisit, RevisitConfig, Revisits
 from localization.lidar.sweep import walls
 from motion_models import se2
@@ -86,7 +86,7 @@ class LidarMatcher:
             return None
         found, self._downsampled = self._kiss.align(points, _matrix(guess))
         prior = np.linalg.inv(9.0 * guess_cov + np.diag([1e-6, 1e-6, 1e-8])).astype(np.float64, copy=False)
-        fit = self._lines.fit(self._planar, pose_of_matrix(found), self._options, prior, guess)
+        fit = self._lines.fit(self._planar, pose_of_matrix(found), self._options, prior, guess, self._ages)
         cov = np.linalg.inv(fit.information + np.diag(_KNOWS_NOTHING**-2)).astype(np.float64, copy=False)
         pose = se2.compose(fit.pose, se2.exp(cov @ fit.gradient))
         return Registration(pose, cov, len(self._planar), fit.n_matched, fit.residual_rms)
@@ -97,32 +97,34 @@ class LidarMatcher:
             return
         self._advance(pose)
         self._kiss.insert(self._downsampled, _matrix(pose))
-        self._lines.insert(self._planar, pose, self._travel)
+        self._lines.insert(self._planar, pose, self._travel, self._ages)
 
     def recall(self, pose: FloatArray, cov: FloatArray, stamp_ns: int) -> Revisit | None:
         """Whether the scan that was last given to `register`, seen from ``pose`` (3,) with ``cov`` (3, 3) after all that is known of
-        the motion, is of a place seen long before. If so, what was mapped since and does not fit is forgotten: correct the pose before
-        you `insert` the scan."""
+        the motion, is of a place seen long before. If so, correct the pose by it and say so (`correct`) before you `insert` the scan."""
         if self._kiss is None or self._lines is None or not self.config.revisit.is_on:
             return None
         if self._revisits is None:
             self._revisits = Revisits(self.config.revisit, self._options, self._voxel)
         self._advance(pose)
-        found = self._revisits.look(self._planar, self._lines, pose, cov, self._travel, stamp_ns)
-        if found is not None and self._moves_lines(pose, found):
-            self._lines.forget_since(self._travel - self.config.revisit.old_after_m)
-            # KISS-ICP's map does not know when it saw what; of a planar scene, the lines' points are all there is to know
-            old = self._lines.point_cloud()
-            self._kiss.restart(np.column_stack([old, np.zeros(len(old))]) if self._is_planar else np.empty((0, 3)))
-        return found
+        return self._revisits.look(self._planar, self._lines, pose, cov, self._travel, stamp_ns)
 
-    def _moves_lines(self, pose: FloatArray, found: Revisit) -> bool:
-        """By more than the error that lines have anyway: they would be drawn twice."""
-        off = se2.log(se2.between(pose, found.pose))
-        shift = found.growth @ np.linalg.solve(found.growth + found.cov, off)
-        points = self._planar
-        moved = se2.transform(se2.exp(shift), points) - points
-        return float(np.sqrt(np.mean(np.sum(moved**2, axis=1)))) > 2.0 * self.config.sigma_line_m
+    def correct(self, before: FloatArray, after: FloatArray) -> None:
+        """By a revisit the pose became ``after`` (3,) instead of ``before`` (3,): what was seen of late was seen from elsewhere, too."""
+        if self._kiss is None or self._lines is None or self._revisits is None:
+            return
+        world_T_world = se2.compose(after, se2.inverse(before))
+        self._lines.move_since(self._travel - self.config.revisit.old_after_m, world_T_world)
+        self._revisits.correct(world_T_world)
+        self._last = se2.compose(world_T_world, self._last)
+        # KISS-ICP's map does not know when it saw what; of a planar scene, the lines' points are all there is to know
+        points = self._lines.point_cloud()
+        self._kiss.restart(np.column_stack([points, np.zeros(len(points))]) if self._is_planar else np.empty((0, 3)))
+
+    @property
+    def _ages(self) -> Ages:
+        """Those parts of the map that are drawn from where the robot believes to be; others tell of other times' errors."""
+        return ALL_AGES if self._revisits is None else self._revisits.ages
 
     def _advance(self, pose: FloatArray) -> None:
         self._travel += float(np.hypot(*(pose - self._last)[:2]))

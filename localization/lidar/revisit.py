@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from localization.lidar.correlate import correlate
-from localization.lidar.lines import FitOptions, LineMap
+from localization.lidar.lines import ALL_AGES, Ages, FitOptions, LineMap, ages_between, ages_until
 from localization.lidar.track import Place, Track, moved
 from motion_models import se2
 from motion_models.se2 import FloatArray
@@ -29,6 +29,7 @@ _STARTS, _MOST_RIVALS = 6, 100
 _RIVAL_SCORE = 0.8  # whose score in the coarse search is below this part of the best fit's explains far less
 _OPEN = 30.0  # sigma along the way to a rival, over its distance: no guess between rivals moves the robot
 _TELLS = 0.1  # part of the drift's variance that a place seen again must be below, in some direction
+_MOST_PLACES = 24  # whose drift is looked at for one keyframe
 _FEW_NEW = 0.02  # part of a place's points that may be added in passing
 
 
@@ -98,6 +99,8 @@ class Revisits:
         self._gate = float(chi2.ppf(config.gate_probability, 3))
         self._pending: tuple[int, _Fit] | None = None
         self._recent: deque[tuple[Place, FloatArray]] = deque()
+        self.ages: Ages = ALL_AGES
+        """Parts of the map against which the pose is known as well as scan matching needs it: the latest way, and what it is tied to."""
 
     def look(self, scan: FloatArray, lines: LineMap, pose: FloatArray, cov: FloatArray, travel: float, stamp_ns: int) -> Revisit | None:
         """``scan`` (N, 2) of the body frame at ``pose`` (3,) with ``cov`` (3, 3), by all that is known but for old parts of the map."""
@@ -105,12 +108,13 @@ class Revisits:
             return None
         now = Place(stamp_ns, travel, pose, cov)
         self.track.add(now)
-        fit, then = self._find(self._seen_recently(now, scan), lines, pose, travel)
+        reach = float(np.quantile(np.hypot(scan[:, 0], scan[:, 1]), 0.9)) if len(scan) else 0.0
+        self.ages = ages_between(self._known(now, reach))
+        fit, then = self._find(self._seen_recently(now, scan), lines, pose, travel, reach)
         last, self._pending = self._pending, None if fit is None else (len(self.track) - 1, fit)
         if fit is None or last is None or not self._agrees(last, fit):
             return None
         self._pending = None
-        self._recent.clear()  # its poses are about to be corrected
         self.track.tie(then)
         place, growth = self.track[then], self.track.growth(then)
         off = se2.log(se2.between(pose, fit.pose))
@@ -118,6 +122,23 @@ class Revisits:
         slip = nis / self._gate * np.outer(off, off) if nis > self._gate else np.zeros((3, 3))
         matched = float(fit.on_map.mean())
         return Revisit(fit.pose, fit.cov, moved(place, pose), growth + slip, slip, place, matched)
+
+    def correct(self, world_T_world: FloatArray) -> None:
+        """The latest way lies elsewhere by ``world_T_world`` (3,)."""
+        self._recent = deque((replace(place, pose=se2.compose(world_T_world, place.pose)), seen) for place, seen in self._recent)
+
+    def _known(self, now: Place, reach: float) -> FloatArray:
+        """(S, 2) stretches of the way [m] whose part of the map can be matched with as it is; ``reach`` [m] of the LiDAR."""
+        old = now.travel - self.config.old_after_m
+        near = self.track.near(now.pose, 2.0 * reach, old)
+        stride = math.ceil(len(near) / _MOST_PLACES)
+        around = 0.6 * max(stride, 1) * self.config.keyframe_m
+        travels = [self.track[int(i)].travel for i in near[::stride] if self._sees(self.track.growth(int(i)))] if stride else []
+        return np.array([*((t - around, t + around) for t in travels), (old, now.travel)])
+
+    def _sees(self, growth: FloatArray) -> bool:
+        """The scan matcher itself sees as far as that."""
+        return 9.0 * float(np.linalg.eigvalsh(growth[:2, :2])[-1]) < self._voxel**2
 
     def _seen_recently(self, now: Place, scan: FloatArray) -> FloatArray:
         """(N, 2) the last keyframes' points in the body frame ``now``, one per half voxel."""
@@ -135,12 +156,11 @@ class Revisits:
         turn = abs(float(se2.between(last.pose, pose)[2]))
         return travel - last.travel >= self.config.keyframe_m or turn >= self.config.keyframe_rad
 
-    def _find(self, scan: FloatArray, lines: LineMap, pose: FloatArray, travel: float) -> tuple[_Fit | None, int]:
+    def _find(self, scan: FloatArray, lines: LineMap, pose: FloatArray, travel: float, reach: float) -> tuple[_Fit | None, int]:
         """Where the scan fits into the old map, and the place from which that part of it was drawn."""
         c = self.config
         if travel - c.old_after_m <= self.track[0].travel or len(scan) < 10:
             return None, -1
-        reach = float(np.quantile(np.hypot(scan[:, 0], scan[:, 1]), 0.9))
         points, travels = lines.points_within(pose[:2], reach + c.max_search_m)
         before = _last_absence(travels, travel, c.old_after_m)
         points, travels = points[travels < before], travels[travels < before]
@@ -148,9 +168,9 @@ class Revisits:
             return None, -1
         growth = self.track.growth(self.track.at_travel(float(np.median(travels))))
         resolution = np.diag([self._voxel, self._voxel, self._voxel / max(reach, 1.0)]) ** 2
-        if 9.0 * np.linalg.eigvalsh(growth[:2, :2])[-1] < self._voxel**2:
-            return None, -1  # the scan matcher itself sees that far
-        search = _Search(scan, lines, before, pose, growth + resolution / 9.0, resolution, self._options)
+        if self._sees(growth):
+            return None, -1
+        search = _Search(scan, lines, ages_until(before), pose, growth + resolution / 9.0, resolution, self._options)
         few = scan[:: math.ceil(len(scan) / _MOST_POINTS)]
         limits = np.array([c.max_search_m, c.max_search_m, c.max_search_rad])
         scores = correlate(few, points, pose, search.prior, limits, self._voxel, self._gate)
@@ -217,7 +237,7 @@ class _Search:
 
     scan: FloatArray
     lines: LineMap
-    before: float
+    ages: Ages
     pose: FloatArray
     prior: FloatArray  # (3, 3) covariance of ``pose`` against that map
     resolution: FloatArray  # (3, 3) what the search cannot tell apart
@@ -237,9 +257,9 @@ class _Search:
 
     def fit(self, start: FloatArray) -> _Fit:
         information = np.asarray(np.linalg.inv(self.prior), dtype=float)
-        found = self.lines.fit(self.scan, start, self.options, information, self.pose, self.before)
+        found = self.lines.fit(self.scan, start, self.options, information, self.pose, self.ages)
         cov = np.asarray(np.linalg.inv(found.information + np.diag(_KNOWS_NOTHING**-2)), dtype=float)
-        errors, travels = self.lines.compare(self.scan, found.pose, self.options.radius, self.before)
+        errors, travels = self.lines.compare(self.scan, found.pose, self.options.radius, self.ages)
         on_map = errors < self.options.kernel
         off = se2.log(se2.between(self.pose, found.pose))
         score = float(on_map.mean()) - 0.5 * float(off @ information @ off) / len(self.scan)
