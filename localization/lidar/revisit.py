@@ -24,8 +24,8 @@ from motion_models import se2
 from motion_models.se2 import FloatArray
 
 _KNOWS_NOTHING = np.array([10.0, 10.0, 3.0])
-_MOST_POINTS = 250  # in the search
-_STARTS, _MOST_RIVALS = 6, 100
+_MOST_POINTS = 150  # in the search
+_STARTS, _MOST_RIVALS = 4, 100
 _RIVAL_SCORE = 0.8  # whose score in the coarse search is below this part of the best fit's explains far less
 _OPEN = 30.0  # sigma along the way to a rival, over its distance: no guess between rivals moves the robot
 _TELLS = 0.1  # part of the drift's variance that a place seen again must be below, in some direction
@@ -44,9 +44,11 @@ class RevisitConfig:
     recent_m: float = 8.0
     """Scans of this last part of the way are searched together: one alone looks the same in many places of a building [m]."""
     keyframe_m: float = 1.0
-    """Look again after this way [m]."""
+    """Remember what is seen after this way [m]."""
     keyframe_rad: float = 0.5
     """Or after this turn [rad]."""
+    search_m: float = 2.0
+    """Search again after this way [m]."""
     max_search_m: float = 8.0
     """Never search farther than this, however uncertain the pose [m]."""
     max_search_rad: float = 0.35
@@ -99,6 +101,7 @@ class Revisits:
         self._gate = float(chi2.ppf(config.gate_probability, 3))
         self._pending: tuple[int, _Fit] | None = None
         self._recent: deque[tuple[Place, FloatArray]] = deque()
+        self._searched = -math.inf
         self.ages: Ages = ALL_AGES
         """Parts of the map against which the pose is known as well as scan matching needs it: the latest way, and what it is tied to."""
 
@@ -110,7 +113,11 @@ class Revisits:
         self.track.add(now)
         reach = float(np.quantile(np.hypot(scan[:, 0], scan[:, 1]), 0.9)) if len(scan) else 0.0
         self.ages = ages_between(self._known(now, reach))
-        fit, then = self._find(self._seen_recently(now, scan), lines, pose, travel, reach)
+        recent = self._seen_recently(now, scan)
+        if self._pending is None and travel - self._searched < self.config.search_m:
+            return None
+        self._searched = travel
+        fit, then = self._find(recent, lines, pose, travel, reach)
         last, self._pending = self._pending, None if fit is None else (len(self.track) - 1, fit)
         if fit is None or last is None or not self._agrees(last, fit):
             return None
@@ -170,14 +177,18 @@ class Revisits:
         resolution = np.diag([self._voxel, self._voxel, self._voxel / max(reach, 1.0)]) ** 2
         if self._sees(growth):
             return None, -1
-        search = _Search(scan, lines, ages_until(before), pose, growth + resolution / 9.0, resolution, self._options)
-        few = scan[:: math.ceil(len(scan) / _MOST_POINTS)]
+        few = np.ascontiguousarray(scan[:: math.ceil(len(scan) / _MOST_POINTS)])
+        rough = _Search(few, lines, ages_until(before), pose, growth + resolution / 9.0, resolution, self._options)
+        search = replace(rough, scan=scan)
         limits = np.array([c.max_search_m, c.max_search_m, c.max_search_rad])
         scores = correlate(few, points, pose, search.prior, limits, self._voxel, self._gate)
         if len(scores.poses) == 0 or scores.fractions.max() < c.min_matched:
             return None, -1
         left = scores.fractions - 0.5 * scores.distances / len(few)
-        best = search.best(scores.poses, left)
+        best = rough.best(scores.poses, left)
+        if best.on_map.mean() < _RIVAL_SCORE * c.min_matched:
+            return None, -1
+        best = search.fit(best.peak)
         if best.on_map.mean() < c.min_matched:
             return None, -1
         cov = self._doubted(best, search, scores.poses, left)
@@ -246,6 +257,8 @@ class _Search:
     def best(self, poses: FloatArray, scores: FloatArray) -> _Fit:
         """The best of fits from the best ``poses`` (K, 3), each start some way from the others."""
         fits = []
+        good = scores > _RIVAL_SCORE * scores.max()
+        poses, scores = poses[good], scores[good]
         for _ in range(_STARTS):
             start = poses[np.argmax(scores)]
             fits.append(self.fit(start))
