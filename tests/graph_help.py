@@ -34,6 +34,33 @@ def make_world(estimator, seed, noise=None, has_lidar=True, wheels=weave, **more
     )
 
 
+def run(estimator, seer, seed=0, steps=60, **world):
+    """All estimates of a drive, and the true poses (steps, 3)."""
+    found, truth = [], []
+    for estimate, pose in drive(make_world(estimator, seed, **world), estimator, seer, steps):
+        found.append(estimate)
+        truth.append(pose)
+    return found, np.array(truth)
+
+
+def recorded(seed=0, steps=60, model="skid_steer", form="constant", **world):
+    """The steps of a drive and what the LiDAR saw, as a fixed lag was given them: for back ends that are to get the very same."""
+    seer, found = Seer(), []
+    estimator = make("graph", seer, model, form)
+    inner = estimator.step
+    estimator.step = lambda step: (found.append((step, seer.next)), inner(step))[1]  # type: ignore[method-assign]
+    run(estimator, seer, seed, steps, **world)
+    return found
+
+
+def feed(estimator, seer, steps):
+    """The estimates of recorded steps."""
+    found = []
+    for step, seer.next in steps:
+        found.append(estimator.step(step))
+    return found
+
+
 def beliefs(estimator):
     """Mean (m,) of the slow states, and the joint covariance (3 + m, 3 + m) of pose and slow states."""
     if isinstance(estimator, GraphFusion):

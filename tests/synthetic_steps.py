@@ -84,14 +84,24 @@ class World:
     """The truth, and the steps that it gives to an estimator."""
 
     def __init__(
-        self, model, corrected: Corrections, noise: Noise, rng, has_lidar=True, belief=None, wheels=weave, cg=lambda t: (0.0, 0.0)
+        self,
+        model,
+        corrected: Corrections,
+        noise: Noise,
+        rng,
+        has_lidar=True,
+        belief=None,
+        wheels=weave,
+        cg=lambda t: (0.0, 0.0),
+        mount=(0.0, 0.0, 0.0),
     ):
+        """``mount`` (3,): how far the LiDAR truly sits off where its transform says, a left perturbation in the body frame."""
         self.model, self.corrected, self.noise, self.rng = model, corrected, noise, rng
         self.has_lidar, self.wheels, self.cg = has_lidar, wheels, cg
         self.pose, self.t, self.k = np.zeros(3), 0.0, 0
         self.bias = rng.normal(0.0, noise.gyro.bias_sigma_rad_per_s)
         self.clock = rng.normal(0.0, belief.clock_sigma_s) if has_lidar and belief is not None else 0.0
-        self.belief = belief
+        self.belief, self.mount = belief, se2.exp(np.array(mount, dtype=float))
         self.correction = rng.multivariate_normal(np.zeros(len(corrected.names)), corrected.cov)
         self._walk = np.linalg.cholesky(corrected.walk_cov + 1e-18 * np.eye(len(corrected.names)))
 
@@ -142,8 +152,9 @@ class World:
         turned = float(delta[2])
         variance = g.white_rad_per_sqrt_s**2 * DT + (g.scale_sigma * turned) ** 2
         turn = Turn(turned + self.bias * DT + rng.normal(0.0, math.sqrt(variance)), variance, DT)
-        R = np.diag([noise.lidar_m, noise.lidar_m, noise.lidar_rad]) ** 2
-        seen = Motion(se2.compose(delta, se2.exp(rng.multivariate_normal(np.zeros(3), R))), R)
+        sigmas = np.array([noise.lidar_m, noise.lidar_m, noise.lidar_rad])
+        by_lidar = se2.compose(se2.inverse(self.mount), se2.compose(delta, self.mount))
+        seen = Motion(se2.compose(by_lidar, se2.exp(sigmas * rng.normal(size=3))), np.diag(sigmas**2))
 
         start, self.k = self.k, self.k + 1
         self.t = self.k * DT

@@ -47,7 +47,9 @@ def whitened(pair: Pairs, pose_a, slow_a, pose_b, slow_b):
     moved = white @ se2.log(se2.between(measured, se2.between(pose_a, pose_b)))
     about = pair.rows[0] @ (slow_a - at) - pair.rhs[0]
     walk = pair.walk[0] @ (slow_b - slow_a)
-    seen = pair.seen_white[0] @ se2.log(se2.between(pair.seen[0], se2.between(pose_a, pose_b)))
+    body_T_believed = se2.exp(pair.mount[0] @ slow_a)
+    by_lidar = se2.between(se2.compose(pose_a, body_T_believed), se2.compose(pose_b, body_T_believed))
+    seen = pair.seen_white[0] @ se2.log(se2.between(pair.seen[0], by_lidar))
     return np.concatenate([moved, about, walk, seen])
 
 
@@ -56,7 +58,7 @@ def whitened(pair: Pairs, pose_a, slow_a, pose_b, slow_b):
 def test_rows_are_the_derivatives_of_the_residuals(seed, m):
     rng = np.random.default_rng(seed)
     pair = Pairs.one(random_link(rng, m), np.tril(rng.normal(size=(m, m))) + 2 * np.eye(m)).seeing(
-        Motion(rng.normal(size=3), random_cov(rng, 3))
+        Motion(rng.normal(size=3), random_cov(rng, 3)), rng.integers(0, 2) * rng.normal(size=(3, m))
     )
     poses, slow = rng.normal(size=(2, 3)), rng.normal(size=(2, m)) * 0.1
     poses[1] = se2.compose(poses[0], se2.compose(pair.delta[0], se2.exp(rng.normal(size=3) * 0.3)))

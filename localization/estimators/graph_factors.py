@@ -43,17 +43,21 @@ class Pairs:
     """(N, 3) motion by the LiDAR."""
     seen_white: FloatArray
     """(N, 3, 3), zero where it saw nothing."""
+    mount: FloatArray
+    """(N, 3, m): the LiDAR's mount is off by ``exp(mount @ slow)`` in the body frame, where this motion shows it."""
 
     @classmethod
     def one(cls, link: Link, walk: FloatArray) -> Self:
         """The table of a single pair, without a LiDAR."""
         rows, rhs = link.compressed()
-        columns = (link.delta, whitening(link.cov), link.d_slow, link.at, rows, rhs, walk, np.zeros(3), np.zeros((3, 3)))
+        none = np.zeros(3), np.zeros((3, 3)), np.zeros_like(link.d_slow)
+        columns = (link.delta, whitening(link.cov), link.d_slow, link.at, rows, rhs, walk, *none)
         return cls(*(np.asarray(column)[None] for column in columns))
 
-    def seeing(self, motion: Motion) -> Pairs:
-        """The single pair, with the motion that the LiDAR saw."""
-        return replace(self, seen=motion.delta[None], seen_white=whitening(motion.cov)[None])
+    def seeing(self, motion: Motion, mount: FloatArray | None = None) -> Pairs:
+        """The single pair, with the motion that the LiDAR saw, and what of its ``mount`` (3, m) that shows."""
+        seen = replace(self, seen=motion.delta[None], seen_white=whitening(motion.cov)[None])
+        return seen if mount is None else replace(seen, mount=mount[None])
 
     def __len__(self) -> int:
         return len(self.delta)
@@ -112,18 +116,36 @@ def linearize(pairs: Pairs, poses: FloatArray, slow: FloatArray) -> FloatArray:
     J[:, n : n + m, -1] = (pairs.walk @ (slow_a - slow_b)[..., None])[..., 0]
 
     if pairs.seen_white.any():
-        J[:, n + m :] = linearize_seen(pairs, pose_a, pose_b, n)
+        J[:, n + m :] = linearize_seen(pairs, pose_a, pose_b, slow_a)
     return J
 
 
-def linearize_seen(pairs: Pairs, pose_a: FloatArray, pose_b: FloatArray, n: int) -> FloatArray:
+def linearize_seen(pairs: Pairs, pose_a: FloatArray, pose_b: FloatArray, slow_a: FloatArray) -> FloatArray:
     """The last three rows (N, 3, 2n + 1) of `linearize`, the LiDAR's."""
+    n = 3 + slow_a.shape[-1]
     J = np.zeros((len(pairs), 3, 2 * n + 1))
-    error, d_a, d_b = motion_residual(pose_a, pose_b, pairs.seen)
+    if pairs.mount.any():
+        error, d_a, d_b, d_mount = seen_residual(pose_a, pose_b, pairs.seen, (pairs.mount @ slow_a[..., None])[..., 0])
+        J[:, :, 3:n] = pairs.seen_white @ d_mount @ pairs.mount
+    else:
+        error, d_a, d_b = motion_residual(pose_a, pose_b, pairs.seen)
     J[:, :, 0:3] = pairs.seen_white @ d_a
     J[:, :, n : n + 3] = pairs.seen_white @ d_b
     J[:, :, -1] = -(pairs.seen_white @ error[..., None])[..., 0]
     return J
+
+
+def seen_residual(
+    world_T_a: FloatArray, world_T_b: FloatArray, seen: FloatArray, mount: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """`motion_residual` for a LiDAR that sits ``exp(mount)`` (3,) off where it is believed to sit, and its Jacobian by ``mount`` too.
+
+    Points are brought into the body by the believed mount, so what it measures is the motion of that frame, C^-1 (a^-1 b) C.
+    """
+    body_T_believed = se2.exp(mount)
+    error, d_a, d_b = motion_residual(se2.compose(world_T_a, body_T_believed), se2.compose(world_T_b, body_T_believed), seen)
+    A = se2.adjoint(se2.inverse(body_T_believed))
+    return error, d_a @ A, d_b @ A, (d_a + d_b) @ se2.right_jacobian(mount)
 
 
 @dataclass(frozen=True)

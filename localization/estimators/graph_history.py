@@ -8,8 +8,9 @@ from typing import Literal
 
 import numpy as np
 
+from localization.errors import EstimatorError
 from localization.estimators.graph import Block, Incremental, IndeterminateError, chain, marginals, solve
-from localization.estimators.graph_factors import Closure, Kernel, Pairs, Position, linearize, whitening
+from localization.estimators.graph_factors import Closure, Kernel, Pairs, Position, linearize
 from localization.estimators.graph_link import Link
 from localization.estimators.graph_window import Node
 from localization.trajectory import Trajectory
@@ -72,17 +73,29 @@ class History:
         self._stamps.append(stamp_ns)
         self._node_of.append(self._count - 1)
 
-    def add_position(self, node: int, position: Position) -> None:
+    def add_position(self, node: int, position: Position) -> bool:
+        """Returns whether the graph was singular and begun anew."""
         self._positions.append((node, position))
-        if self._isam is not None and node >= self._frozen:
-            self._isam.update([self._position_block(node, position)], [])
+        return node >= self._frozen and self._add_block(self._position_block(node, position))
 
-    def add_closure(self, a: int, b: int, delta: FloatArray, white: FloatArray) -> None:
-        """Raises `EstimatorError` for a closure of a node with itself."""
-        closure = Closure(a, b, delta, white)
-        if self._isam is not None and min(a, b) >= self._frozen:
-            self._isam.update([self._closure_block(closure)], [])
+    def add_closure(self, closure: Closure) -> bool:
+        """Returns whether the graph was singular and begun anew. Raises `EstimatorError` for a closure of a node with itself."""
+        if closure.a == closure.b:
+            raise EstimatorError(f"a loop closure of node {closure.a} with itself says nothing.")
         self._closures.append(closure)
+        return min(closure.a, closure.b) >= self._frozen and self._add_block(self._closure_block(closure))
+
+    def _add_block(self, block: Block) -> bool:
+        if self._isam is None:
+            return False
+        last = self._count - 1
+        known = Node.known(self._poses[last].copy(), self._slow[last].copy(), self._isam.marginals([last])[0])
+        try:
+            self._isam.update([block], [])
+        except IndeterminateError:
+            self._begin_anew(known)
+            return True
+        return False
 
     def newest(self) -> Node | None:
         """iSAM2's newest node by all that is known now; None for the batch, which waits for the end."""
@@ -90,7 +103,7 @@ class History:
             return None
         self._settle()
         k = self._count - 1
-        return Node(self._poses[k].copy(), self._slow[k].copy(), whitening(self._isam.marginals([k])[0]))
+        return Node.known(self._poses[k].copy(), self._slow[k].copy(), self._isam.marginals([k])[0])
 
     def solve(self) -> float:
         """Move all nodes to where the cost (half the sum of squares, which is returned) is least.

@@ -9,18 +9,21 @@ still (Bierman, "Factorization methods for discrete sequential estimation", 1977
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
 from localization.errors import EstimatorError
-from localization.estimators.graph_factors import Kernel, Pairs, Position, linearize, linearize_seen
+from localization.estimators.graph import Block, chain, marginals, solve
+from localization.estimators.graph_factors import Closure, Kernel, Pairs, Position, linearize, linearize_seen, whitening
 from localization.estimators.graph_qr import eliminate, inverse_of_upper, is_regular, substitute, triangularize
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.se2 import FloatArray
 
+_ITERATIONS = 10
 _UNARY = 3  # rows that positions leave on the pose of a node
 
 
@@ -37,7 +40,14 @@ class Node:
     slow: FloatArray
     """(m,)"""
     root: FloatArray
-    """(n, n) R with R^T R = covariance^-1, for right perturbations of the pose and for the slow states."""
+    """(n, n) R, upper triangular, with R^T R = covariance^-1, for right perturbations of the pose and for the slow states."""
+
+    @classmethod
+    def known(cls, pose: FloatArray, slow: FloatArray, cov: FloatArray) -> Self:
+        """With the covariance ``cov`` (n, n). Raises `EstimatorError` if that is not positive definite."""
+        root = whitening(cov)
+        triangularize(root, len(root))
+        return cls(pose, slow, root)
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -127,12 +137,12 @@ class Window:
         eliminate(roots, conditionals, linearize(pair, poses, slow), np.zeros((2, _UNARY, 4)))
         return self._ahead(pair, poses[1], slow[1], roots[1], conditionals)
 
-    def see(self, ahead: Ahead, motion: Motion) -> Ahead:
-        """``ahead`` with the motion that a LiDAR saw on the way to it. Raises `SingularError`."""
-        n, node, pair = self._n, ahead.node, ahead.pair.seeing(motion)
+    def see(self, ahead: Ahead, motion: Motion, mount: FloatArray | None = None) -> Ahead:
+        """``ahead`` with the motion that a LiDAR saw on the way to it, and what of its ``mount`` (3, m) shows. Raises `SingularError`."""
+        n, node, pair, i = self._n, ahead.node, ahead.pair.seeing(motion, mount), self._size - 1
         work = np.zeros((2 * n + 3, 2 * n + 1))
         work[:n], work[n : 2 * n, n : 2 * n] = ahead.conditional, node.root
-        work[2 * n :] = linearize_seen(pair, self._poses[None, self._size - 1], node.pose[None], n)[0]
+        work[2 * n :] = linearize_seen(pair, self._poses[None, i], node.pose[None], self._slow[None, i])[0]
         triangularize(work, 2 * n)
         return self._ahead(pair, node.pose, node.slow, work[n : 2 * n, n:].copy(), work[None, :n].copy())
 
@@ -179,6 +189,41 @@ class Window:
             self._roots[k] = work[: self._n]
             self._positions[k] = []
         self._again(max(k, first))
+
+    def close(self, closure: Closure) -> None:
+        """A motion between two nodes of the window, counted from the very first. Raises `EstimatorError`.
+
+        It ties nodes that are no neighbours: the window is solved once as a whole, and begins anew from what is then known of the newest.
+        """
+        first, last = self._size - min(self._size, self._lag), self._size
+        a, b = closure.a - self._first_index, closure.b - self._first_index
+        if not (first <= min(a, b) and max(a, b) < last) or a == b:
+            raise EstimatorError(f"no motion between nodes {closure.a} and {closure.b} in a window from {self.oldest} on.")
+        poses, slow, fixed = self._poses[first:last].copy(), self._slow[first:last].copy(), self._poses[first]
+        n, count = self._n, last - first
+        for _ in range(_ITERATIONS):
+            off = se2.log(se2.between(fixed, poses[0]))
+            J = np.eye(n)
+            J[:3, :3] = se2.right_jacobian_inverse(off)
+            moved = np.concatenate([off, slow[0] - self._slow[first]])
+            root, rhs = self._roots[first, :, :-1], self._roots[first, :, -1]
+            blocks = [Block((0,), (root @ J,), rhs - root @ moved)]
+            if count > 1:
+                assert self._pairs is not None
+                blocks += chain(linearize(self._pairs[slice(first, last - 1)], poses, slow))
+            for k in range(first + 1, last):
+                blocks += [self._block((k - first,), p.linearize(poses[k - first], self._kernel)) for p in self._positions[k]]
+            rows = replace(closure, a=a - first, b=b - first).linearize(poses, self._kernel)
+            blocks.append(self._block((a - first, b - first), rows))
+            changes = solve(blocks, count, n)
+            poses, slow = se2.compose(poses, se2.exp(changes[:, :3])), slow + changes[:, 3:]
+            if np.abs(changes[:, :3]).max() < 1e-9:
+                break
+        self.restart(Node.known(poses[-1], slow[-1], marginals(blocks, [count - 1], count, n)[0]))
+
+    def _block(self, nodes: tuple[int, ...], rows: FloatArray) -> Block:
+        wide = np.zeros((len(rows), self._n - 3))
+        return Block(nodes, tuple(np.hstack([rows[:, 3 * i : 3 * i + 3], wide]) for i in range(len(nodes))), rows[:, -1])
 
     @property
     def oldest(self) -> int:
