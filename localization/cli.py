@@ -14,6 +14,7 @@ from localization.commands.calibrate import Calibrate
 from localization.commands.cg import Cg
 from localization.commands.diagnose import Diagnose
 from localization.commands.info import Info
+from localization.commands.online import Online
 from localization.commands.replay import Replay
 from localization.commands.simulate import Simulate
 from motion_models.errors import SkidlocError
@@ -27,6 +28,7 @@ Command = (
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate", prefix_name=False)]
     | Annotated[Diagnose, tyro.conf.subcommand("diagnose", prefix_name=False)]
     | Annotated[Cg, tyro.conf.subcommand("cg", prefix_name=False)]
+    | Annotated[Online, tyro.conf.subcommand("online", prefix_name=False)]
     | Annotated[Simulate, tyro.conf.subcommand("simulate", prefix_name=False)]
 )
 

@@ -112,9 +112,9 @@ def _write_bag(bag: Path, path: Path, results: Mapping[str, Iterable[FusedEstima
         count = 0
         for name, estimate in heapq.merge(*(_checked(*item) for item in results.items()), key=lambda item: item[1].stamp_ns):
             count += 1
-            messages = [(connections[name], _STORE.serialize_cdr(_odometry(estimate), _ODOMETRY))]
+            messages = [(connections[name], _STORE.serialize_cdr(odometry_message(estimate), _ODOMETRY))]
             if name == tf_of:
-                messages.append((tf, _STORE.serialize_cdr(_transform(estimate), _TF)))
+                messages.append((tf, _STORE.serialize_cdr(transform_message(estimate), _TF)))
             with _output_errors(path):
                 for connection, data in messages:
                     writer.write(connection, estimate.stamp_ns, data)
@@ -127,7 +127,8 @@ def _write_bag(bag: Path, path: Path, results: Mapping[str, Iterable[FusedEstima
         raise
 
 
-def _odometry(estimate: FusedEstimate) -> Odometry:
+def odometry_message(estimate: FusedEstimate) -> Odometry:
+    """nav_msgs/Odometry."""
     x, y, theta = (float(v) for v in estimate.pose)
     vx, vy, wz = (float(v) for v in estimate.twist)
     return Odometry(
@@ -144,7 +145,8 @@ def _odometry(estimate: FusedEstimate) -> Odometry:
     )
 
 
-def _transform(estimate: FusedEstimate) -> TFMessage:
+def transform_message(estimate: FusedEstimate) -> TFMessage:
+    """tf2_msgs/TFMessage, `odom` -> `base_link`."""
     x, y, theta = (float(v) for v in estimate.pose)
     transform = Transform(translation=Vector3(x=x, y=y, z=0.0), rotation=_heading(theta))
     return TFMessage(transforms=[TransformStamped(header=_header(estimate.stamp_ns), child_frame_id=BODY_FRAME, transform=transform)])

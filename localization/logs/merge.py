@@ -90,6 +90,11 @@ class TopicClock:
         """Stamp minus time of recording, of the last trusted message."""
         self._pending: list[Item] = []
 
+    @property
+    def shift_ns(self) -> int:
+        """What is added to the stamps of this topic now."""
+        return self._shift
+
     def horizon(self, log_ns: int) -> int:
         """No message recorded after ``log_ns`` is expected to have an older stamp than this, less some waiting.
 
@@ -188,6 +193,10 @@ class Merger:
             yield from self._release(2**63 - 1, 0)
         else:
             yield from self._release(min(c.horizon(self._now) for c in self._clocks.values()) - self._wait_ns, _MOST_HELD)
+
+    def shift_ns(self, topic: str) -> int:
+        """What is added to the stamps of ``topic`` now, because its clock was set or is not the others'."""
+        return self._clocks[topic].shift_ns if topic in self._clocks else 0
 
     def finish(self) -> Iterator[Any]:
         """All that is held, for nothing more will come."""

@@ -1,0 +1,186 @@
+"""`skidloc online`: the estimator live, from ROS 2, ROS 1, or a log at a rate."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import math
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from types import FrameType
+from typing import Literal
+
+import tyro
+from rich.console import Console
+from rich.live import Live
+from rich.markup import escape
+
+from localization.commands.online_line import live_line
+from localization.errors import OutputError
+from localization.estimators import check_estimator
+from localization.logs import TopicOverrides, open_log
+from localization.online.core import Core, Pair, ReplayConfig
+from localization.online.node import Node, NodeConfig
+from localization.online.pace import Pace
+from localization.online.session import Files, Session, made_by
+from localization.online.transport import Transport
+from localization.provenance import fingerprint
+from motion_models.corrections import check_forms
+from motion_models.registry import make_model
+from motion_models.robot import Robot, load_robot
+
+_LINE_S = 0.25
+
+
+@dataclass(frozen=True)
+class Online:
+    """Run one motion model and estimator live, on ROS topics or on a log as it was recorded; Ctrl-C ends it."""
+
+    robot: str
+    """Name of a shipped robot, or path of a robot TOML file."""
+    log: tyro.conf.Positional[Path | None] = None
+    """A log to run from, instead of live topics."""
+    rate: str = "1"
+    """Of the log: times as fast as it was recorded, or `max`."""
+    model: str = "skid_steer"
+    """Motion model."""
+    estimator: str = "ekf"
+    """Estimator."""
+    corrections: str = "constant"
+    """What ekf and graph learn of the motion model: none, constant or cg_field."""
+    out: Path | None = None
+    """New trajectory file, .tum, or .mcap with Odometry, TF and covariances. It gets its name at the end."""
+    state: Path | None = None
+    """File of the estimator's state, at most a second old; resumed at the start if it is there. Removed at the end of a log."""
+    door: Literal["auto", "dds", "rclpy", "rospy"] = "auto"
+    """Of live topics: ROS 2 by DDS itself (extra `ros2`), ROS 2 by rclpy, ROS 1 by rospy. `auto`: rclpy where it is sourced, else DDS."""
+    domain: int = 0
+    """ROS 2 domain (door dds)."""
+    interface: str = "lo"
+    """Network interface or address (door dds). `lo`: this machine only, nobody else is listened to; `default`: as Cyclone DDS is set."""
+    node: NodeConfig = field(default_factory=NodeConfig)
+    topic: TopicOverrides = field(default_factory=TopicOverrides)
+    config: ReplayConfig = field(default_factory=ReplayConfig)
+
+    def run(self, console: Console) -> None:
+        rate, files, robot = parse_rate(self.rate), Files(self.out, self.state), load_robot(self.robot)
+        with _terminated_as_interrupted():
+            if self.log is not None:
+                self._play(console, self.log, rate, files, robot)
+            else:
+                self._spin(console, files, robot)
+
+    def _play(self, console: Console, path: Path, rate: float, files: Files, robot: Robot) -> None:
+        log = open_log(path, robot, self.topic)
+        has_lidar = log.sources.lidar is not None
+        pair = self._pair(robot, has_lidar)
+        made = made_by(pair, robot, log.mounts, has_lidar, self.config, f"log {fingerprint(path)[:12]}")
+        core = Core(pair, robot, log.mounts, has_lidar, self.config)
+        session = Session.start(files, core, f"{pair.model.name}_{pair.estimator}", made)
+        if session.head:
+            console.print(f"resumed from {files.state} after {session.count} events", markup=False, soft_wrap=True)
+        pace, began, first_ns, shown, seconds, is_done = Pace(rate), time.monotonic(), None, -math.inf, 0.0, False
+        try:
+            with Live(console=console, auto_refresh=False, transient=True) as live:
+                for event in islice(log.events(), session.count, None):
+                    pace.wait(event.stamp_ns)
+                    session.push(event)
+                    session.dump()
+                    first_ns = event.stamp_ns if first_ns is None else first_ns
+                    seconds, now = (event.stamp_ns - first_ns) * 1e-9, time.monotonic()
+                    if console.is_terminal:
+                        session.health.saw(event)
+                        if now - shown >= _LINE_S:
+                            shown, speed = now, f"  {seconds / max(now - began, 1e-9):.1f}x"
+                            live.update(live_line(session, seconds, session.health.statuses(session.core), speed), refresh=True)
+            session.finish()
+            count = session.write_out()
+            is_done = True
+        finally:
+            if not is_done:
+                session.dump(now=True)
+            session.close(forget=is_done)
+        for note in dict.fromkeys([*log.notes(), *session.core.stepper.notes()]):
+            console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
+        self._summarize(console, session, seconds, count)
+
+    def _spin(self, console: Console, files: Files, robot: Robot) -> None:
+        def tell(said: str) -> None:
+            console.print(f"[yellow]![/] {escape(said)}", soft_wrap=True)
+
+        transport = self._transport()
+        try:
+            node = Node.start(
+                transport, robot, lambda has_lidar: self._pair(robot, has_lidar), files, tell, self.topic, self.config, self.node
+            )
+            console.print(f"running {self.model} in {self.estimator} on {', '.join(node.topics)}", markup=False, soft_wrap=True)
+            try:
+                with contextlib.suppress(KeyboardInterrupt), Live(console=console, auto_refresh=False, transient=True) as live:
+                    node.spin(on_line=lambda n: self._show(console, live, n))
+            finally:
+                count = node.finish()
+        finally:
+            transport.close()
+        for said in node.notes():
+            tell(said)
+        self._summarize(console, node.session, node.seconds, count)
+
+    def _transport(self) -> Transport:
+        """Raises `DoorError`. Each is imported only where it is wanted."""
+        door = self.door
+        if door == "auto":
+            door = "dds" if importlib.util.find_spec("rclpy") is None else "rclpy"
+        if door == "rospy":
+            from localization.online.ros1 import RospyTransport
+
+            return RospyTransport()
+        if door == "rclpy":
+            from localization.online.ros2 import RclpyTransport
+
+            return RclpyTransport()
+        from localization.online.dds import DdsTransport
+
+        return DdsTransport(self.domain, self.interface)
+
+    def _pair(self, robot: Robot, has_lidar: bool) -> Pair:
+        check_estimator(self.estimator, has_lidar)
+        (form,) = check_forms([self.corrections])
+        return Pair(make_model(self.model, robot), self.estimator, form)
+
+    def _show(self, console: Console, live: Live, node: Node) -> None:
+        if console.is_terminal:
+            live.update(live_line(node.session, node.seconds, node.statuses), refresh=True)
+
+    def _summarize(self, console: Console, session: Session, seconds: float, count: int | None) -> None:
+        console.print(live_line(session, seconds, []), soft_wrap=True)
+        if count is not None:
+            console.print(f"{self.out}: {count} estimates", markup=False, soft_wrap=True)
+
+
+def parse_rate(text: str) -> float:
+    """Times real time; infinite for `max`. Raises `OutputError`."""
+    try:
+        rate = math.inf if text == "max" else float(text)
+    except ValueError:
+        rate = math.nan
+    if not rate > 0.0:
+        raise OutputError(f"--rate is '{text}'; it must be a number above 0 (1 is real time), or max.")
+    return rate
+
+
+@contextlib.contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """What stops services (SIGTERM) ends as Ctrl-C does: with the state and the output on disk."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

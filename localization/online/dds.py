@@ -1,0 +1,207 @@
+"""ROS 2 topics without a ROS installation: DDS through cyclonedds (extra `ros2`).
+
+A ROS 2 topic `/scan` is DDS's `rt/scan`, a type `pkg/msg/Type` is `pkg::msg::dds_::Type_`. Messages pass as bytes, which `logs.wire`
+reads and writes as it does those of logs; cyclonedds is only told the types' fields, for peers that ask.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import re
+import socket
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+from localization.errors import DoorError
+from localization.logs.wire import Shape, fields
+from localization.online.transport import Received
+
+try:
+    import cyclonedds.core as dds
+    from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+    from cyclonedds.domain import Domain, DomainParticipant
+    from cyclonedds.idl import make_idl_struct, types
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.qos import Policy, Qos
+    from cyclonedds.sub import DataReader
+    from cyclonedds.topic import Topic
+    from cyclonedds.util import duration
+except ImportError as error:
+    raise DoorError(f"ROS 2 topics without a ROS installation need the extra 'ros2': pip install 'skidloc[ros2]' ({error}).") from error
+
+LOOPBACK = "lo"
+DEFAULT = "default"
+_LATEST, _DEPTH, _LATCHED_DEPTH = 50, 10, 100
+_TYPE = re.compile(r"(\w+)::(?:msg::)dds_::(\w+)_")
+
+
+class DdsTransport:
+    """See `Transport`. ``interface``: a network interface's name or address; `lo` leaves nothing open to other machines."""
+
+    is_ros1 = False
+
+    def __init__(self, domain: int = 0, interface: str = LOOPBACK) -> None:
+        """Raises `DoorError`."""
+        if not 0 <= domain <= 230:
+            raise DoorError(f"the domain is {domain}; ROS 2's domains are 0 to 230.")
+        try:
+            with _only_heard_on(interface):
+                self._domain = None if interface == DEFAULT else Domain(domain, _configuration(interface))
+                self._participant = DomainParticipant(domain)
+        except dds.DDSException as error:
+            raise DoorError(f"DDS cannot be used on interface '{interface}', domain {domain}: {error}.") from error
+        self._waiting = dds.WaitSet(self._participant)
+        self._readers: list[tuple[str, DataReader[Any]]] = []
+        self._writers: dict[str, tuple[DataWriter[Any], type[Any]]] = {}
+        self._found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+
+    def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
+        quality = _latched() if is_latched else _sensor_data()
+        reader = DataReader(self._participant, Topic(self._participant, _dds_name(topic), _bytes_type(kind), quality), quality)
+        self._waiting.attach(dds.ReadCondition(reader, dds.ViewState.Any | dds.InstanceState.Any | dds.SampleState.NotRead))
+        self._readers.append((topic, reader))
+
+    def advertise(self, topic: str, kind: str) -> None:
+        made, quality = _bytes_type(kind), _reliable()
+        self._writers[topic] = DataWriter(self._participant, Topic(self._participant, _dds_name(topic), made, quality), quality), made
+
+    def publish(self, topic: str, data: bytes) -> None:
+        writer, made = self._writers[topic]
+        sample = object.__new__(made)
+        vars(sample)["data_"] = data
+        with contextlib.suppress(dds.DDSException):  # a reader that is too slow must not stop the robot
+            writer.write(sample)
+
+    def take(self, timeout_s: float) -> list[Received]:
+        found = self._take()
+        if not found:
+            self._waiting.wait(round(timeout_s * 1e9))
+            found = self._take()
+        return found
+
+    def _take(self) -> list[Received]:
+        now = time.monotonic_ns()
+        return [
+            Received(topic, now, bytes(sample))
+            for topic, reader in self._readers
+            for sample in reader.take(100)
+            if isinstance(sample, bytes)
+        ]
+
+    def publishers(self) -> Mapping[str, set[str]]:
+        found: dict[str, set[str]] = {}
+        for publication in self._found.read(1000):
+            info = publication.sample_info
+            name, kind = publication.topic_name, _TYPE.fullmatch(publication.type_name)
+            if info.instance_state == dds.InstanceState.Alive and name.startswith("rt/") and name[2:] not in self._writers:
+                found.setdefault(name[2:], set()).add(f"{kind[1]}/msg/{kind[2]}" if kind else publication.type_name)
+        return found
+
+    def close(self) -> None:
+        self._readers.clear()
+        self._writers.clear()
+        del self._waiting, self._found, self._participant, self._domain
+
+
+def _sensor_data() -> Qos:
+    return Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(_LATEST), *_COMMON)
+
+
+def _latched() -> Qos:
+    reliable = Policy.Reliability.Reliable(duration(milliseconds=100))
+    return Qos(reliable, Policy.Durability.TransientLocal, Policy.History.KeepLast(_LATCHED_DEPTH), *_COMMON)
+
+
+def _reliable() -> Qos:
+    reliable = Policy.Reliability.Reliable(duration(milliseconds=1))  # never wait for a slow reader
+    return Qos(reliable, Policy.Durability.Volatile, Policy.History.KeepLast(_DEPTH), *_COMMON)
+
+
+_COMMON = (Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),)
+
+
+def _dds_name(topic: str) -> str:
+    return "rt/" + topic.lstrip("/")
+
+
+class _Bytes(bytes):
+    """What a reader gives out; cyclonedds sets an attribute on it."""
+
+
+@functools.cache
+def _struct(kind: str) -> type[Any]:
+    package, _, name = kind.split("/")
+    described = {field: _idl(shape) for field, shape in fields(kind)}
+    made: type[Any] = make_idl_struct(f"{name}_", f"{package}.msg.dds_.{name}_", described)
+    return made
+
+
+def _idl(shape: Shape) -> Any:
+    what, inside, *rest = shape
+    if what == "message":
+        return _struct(inside)
+    if what == "array":
+        return types.array[_idl(inside), rest[0]]
+    if what == "sequence":
+        return types.sequence[_idl(inside)]
+    return {"string": str, "bool": bool, "byte": types.uint8, "char": types.uint8}.get(inside) or getattr(types, inside)
+
+
+@functools.cache
+def _bytes_type(kind: str) -> type[Any]:
+    """The DDS type ``kind``, whose samples are bytes as they are on the wire."""
+    made = _struct(kind)
+    made.deserialize = classmethod(lambda cls, data, has_header=True, use_version_2=None: _Bytes(data))
+    made.serialize = lambda self, buffer=None, endianness=None, use_version_2=None: self.data_
+    return made
+
+
+def _configuration(interface: str) -> str:
+    """XML. Loopback has no multicast: peers are looked for on the ports of the domain's first participants."""
+    try:
+        socket.inet_aton(interface)
+        chosen = f"address={quoteattr(interface)}"
+    except OSError:
+        chosen = f"name={quoteattr(interface)}"
+    general = f"<Interfaces><NetworkInterface {chosen}/></Interfaces>"
+    discovery = "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>"
+    if interface == LOOPBACK:
+        general += "<AllowMulticast>false</AllowMulticast>"
+        discovery += '<Peers><Peer address="127.0.0.1"/></Peers>'
+    return f"<CycloneDDS><Domain><General>{general}</General><Discovery>{discovery}</Discovery></Domain></CycloneDDS>"
+
+
+@contextlib.contextmanager
+def _only_heard_on(interface: str) -> Any:
+    """Cyclone sends from the chosen interface, but hears on all of them: bind the sockets that it opens to the loopback device.
+
+    Raises `DoorError` where that cannot be done.
+    """
+    before = _sockets()
+    yield
+    if interface != LOOPBACK:
+        return
+    for number in _sockets() - before:
+        with socket.socket(fileno=number) as opened:
+            try:
+                if opened.type == socket.SOCK_DGRAM:
+                    opened.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, LOOPBACK.encode() + b"\0")
+            except (AttributeError, OSError) as error:
+                raise DoorError(
+                    f"DDS cannot be kept from hearing other machines ({error}). If that does no harm: --interface default."
+                ) from error
+            finally:
+                opened.detach()  # it stays Cyclone's
+
+
+def _sockets() -> set[int]:
+    found = set()
+    for entry in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):
+            if str(entry.readlink()).startswith("socket:"):
+                found.add(int(entry.name))
+    return found

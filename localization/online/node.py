@@ -1,0 +1,159 @@
+"""The estimator on a robot: a transport's messages in, estimates and diagnostics out. ROS 2 and ROS 1 differ in the transport alone."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from localization.errors import DumpError
+from localization.estimators import Estimate
+from localization.events import Event, Scan
+from localization.logs.tally import Tally
+from localization.logs.topics import TopicOverrides
+from localization.online.core import Core, Pair, ReplayConfig
+from localization.online.dump import read_head
+from localization.online.health import Status
+from localization.online.listen import Listener
+from localization.online.live import Memory, Stream, check_age
+from localization.online.session import Files, Session, made_by
+from localization.online.tell import Teller
+from localization.online.transport import Received, Transport
+from localization.online.warm import warm_up
+from motion_models.robot import Robot
+
+_TELL_S, _POLL_S = 1.0, 0.2
+
+
+@dataclass(frozen=True)
+class NodeConfig:
+    """How a node behaves."""
+
+    wait_s: float = 5.0
+    """How long topics that somebody publishes are waited for before a start without them, and how often silence is told [s]."""
+    tf: bool = True
+    """Publish `odom` -> `base_link`; leave it to another node if one does."""
+
+
+class Node:
+    """Made by `start`; `spin` until the end, then `finish`."""
+
+    def __init__(self, transport: Transport, stream: Stream, session: Session, teller: Teller, robot: Robot) -> None:
+        self._transport, self._stream, self.session, self._teller = transport, stream, session, teller
+        self._hardware = robot.name
+        self._told = -float("inf")
+        self._newest_ns = 0
+        self._began_ns: int | None = None
+        self.statuses: list[Status] = []
+        """Of the last second."""
+
+    @classmethod
+    def start(
+        cls,
+        transport: Transport,
+        robot: Robot,
+        make_pair: Callable[[bool], Pair],
+        files: Files,
+        tell: Callable[[str], None],
+        topics: TopicOverrides | None = None,
+        config: ReplayConfig | None = None,
+        node: NodeConfig | None = None,
+    ) -> Node:
+        """Listen, then begin, or go on from the state on disk. ``make_pair`` is told whether there is a LiDAR; ``tell`` hears what a
+        person should know meanwhile. Raises `DoorError`, `TopicError`, `EstimatorError`, `DumpError` and `OutputError`.
+        """
+        config, node = config or ReplayConfig(), node or NodeConfig()
+        epoch_ns = time.time_ns() - time.monotonic_ns()
+        listener = Listener(transport, robot, topics or TopicOverrides())
+        needed = read_head(files.state).get("topics", []) if files.state is not None and files.state.exists() else []
+        heard = listener.listen(node.wait_s, needed, tell, epoch_ns)
+        for note in heard.parts.notes:
+            tell(note)
+        has_lidar = heard.parts.sources.lidar is not None
+        pair = make_pair(has_lidar)
+        lidar = heard.parts.sources.lidar
+        warm_up(pair, robot, heard.mounts, has_lidar, lidar is None or lidar.kind == "scan", config)
+        gc.collect()
+        gc.freeze()  # what is here now stays: later collections need not look at it
+        tally = Tally()
+        stream = Stream(heard, robot, tally, epoch_ns, is_ros1=transport.is_ros1)
+        made = made_by(pair, robot, heard.mounts, has_lidar, config, "live topics")
+        core = Core(pair, robot, heard.mounts, has_lidar, config)
+        session = Session.start(files, core, f"{pair.model.name}_{pair.estimator}", made, stream.memory, {"tally": tally})
+        teller = Teller(transport, with_tf=node.tf)
+        made_node = cls(transport, stream, session, teller, robot)
+        if session.head:
+            if not isinstance(session.kept, Memory):
+                raise DumpError(f"the state in '{files.state}' is of a log. Remove it to start anew.")
+            age = check_age(session.head, heard.start_ns, str(files.state))
+            stream.remember(session.kept)
+            tell(f"resumed from {files.state}, {age:.1f} s later.")
+        for received in heard.backlog:
+            made_node._push(received, time_it=False)
+        return made_node
+
+    def spin(self, is_over: Callable[[], bool] = lambda: False, on_line: Callable[[Node], None] = lambda node: None) -> None:
+        """Until ``is_over``; ``on_line`` is called about every fifth of a second."""
+        shown = 0.0
+        while not is_over():
+            for received in self._transport.take(_POLL_S):
+                self._push(received, time_it=True)
+            now = time.monotonic()
+            if now - self._told >= _TELL_S:
+                self._told = now
+                self._tell()
+            if now - shown >= _POLL_S:
+                shown = now
+                on_line(self)
+
+    def finish(self) -> int | None:
+        """Write the output and the last state; returns how many estimates there were, if an output was wanted."""
+        try:
+            self.session.dump(self._head, now=True)
+            return self.session.write_out()
+        finally:
+            self.session.close()
+
+    @property
+    def topics(self) -> list[str]:
+        """Those in use."""
+        return [source.topic for source in self._stream.sources.used()]
+
+    def notes(self) -> list[str]:
+        """Sentences about everything that was lost or mended."""
+        return list(dict.fromkeys([*self._stream.dropped(), *self.session.core.stepper.notes()]))
+
+    @property
+    def seconds(self) -> float:
+        """Since the first event [s]."""
+        return 0.0 if self._began_ns is None else (self._newest_ns - self._began_ns) * 1e-9
+
+    def _push(self, received: Received, *, time_it: bool) -> None:
+        for event in self._stream.push(received):
+            self._newest_ns = max(self._newest_ns, event.stamp_ns)
+            self._began_ns = event.stamp_ns if self._began_ns is None else self._began_ns
+            for estimate in self.session.push(event):
+                self._publish(estimate, event)
+                if time_it and isinstance(event, Scan):
+                    self.session.health.took((time.monotonic_ns() - received.received_ns) * 1e-9)
+            self.session.health.saw(event)
+        self.session.dump(self._head)
+
+    def _head(self) -> Mapping[str, Any]:
+        return {"stamp_ns": self._newest_ns, "topics": self.topics}
+
+    def _publish(self, estimate: Estimate, event: Event) -> None:
+        by_lidar = estimate.nis is not None or isinstance(event, Scan)
+        self._teller.estimate(estimate, self._stream.sender_stamp_ns(estimate.stamp_ns, by_lidar=by_lidar))
+
+    def _tell(self) -> None:
+        health = self.session.health
+        silent = self._stream.silent(time.monotonic_ns())
+        self.statuses = health.statuses(self.session.core, self._stream.dropped(), silent)
+        stamp_ns = self._stream.sender_stamp_ns(self._newest_ns, by_lidar=True)
+        self._teller.diagnostics(self.statuses, self._hardware, stamp_ns)
+        parameters = self.session.core.estimator.parameters()
+        if parameters:
+            self._teller.corrections(parameters, stamp_ns)

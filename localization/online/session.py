@@ -1,0 +1,143 @@
+"""A core at work: events in, estimates recorded, its health watched, its state on disk at most a second old."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from localization.errors import DumpError, OutputError
+from localization.estimators import Estimate
+from localization.events import Event
+from localization.logs.fused import write_fused
+from localization.online.core import Core, Pair, ReplayConfig
+from localization.online.dump import Dumper, fingerprints, read_dump
+from localization.online.health import Health
+from localization.online.records import Spool, fused_estimates, trajectory
+from localization.trajectory import write_tum
+from motion_models.robot import Mount, Robot
+
+_SUFFIXES = (".mcap", ".tum")
+
+
+@dataclass(frozen=True)
+class Files:
+    """What a session writes."""
+
+    out: Path | None = None
+    """Trajectory, .mcap or .tum, written at the end."""
+    state: Path | None = None
+    """Resumed at the start if it is there."""
+
+    def __post_init__(self) -> None:
+        if self.out is not None and self.out.suffix not in _SUFFIXES:
+            raise OutputError(f"output '{self.out}': its name must end in {' or '.join(_SUFFIXES)}.")
+
+    @property
+    def spool(self) -> Path | None:
+        """Where the estimates are until the end."""
+        return None if self.out is None else self.out.with_name(f".{self.out.name}.part")
+
+
+def made_by(pair: Pair, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig, source: str) -> dict[str, str]:
+    """What must be the same where a state is resumed."""
+    return fingerprints(
+        robot=robot,
+        model=pair.model,
+        estimator=pair.estimator,
+        corrections=pair.corrections,
+        configuration=config,
+        mounts=dict(mounts),
+        LiDAR="used" if has_lidar else "not used",
+        source=source,
+    )
+
+
+class Session:
+    """Made by `start`."""
+
+    def __init__(
+        self, core: Core, kept: Any, name: str, files: Files, spool: Spool | None, dumper: Dumper | None, head: Mapping[str, Any]
+    ) -> None:
+        self.core, self.name, self.health = core, name, Health()
+        self.kept = kept
+        """What is dumped with the core; of a resumed session, what had been."""
+        self.head = head
+        """Of the state that was resumed; empty for a new one."""
+        self._files, self._spool, self._dumper = files, spool, dumper
+        self.count = int(head.get("events", 0))
+        """Events so far, those before the state included."""
+
+    @classmethod
+    def start(
+        cls, files: Files, core: Core, name: str, made: Mapping[str, str], kept: Any = None, shared: Mapping[str, Any] | None = None
+    ) -> Session:
+        """A new session with ``core``, or one that goes on from the state on disk, if there is one that was ``made`` by the same.
+
+        ``kept`` is dumped with the core; ``shared`` is what it holds that is not to be dumped. Raises `DumpError` and `OutputError`.
+        """
+        shared = shared or {}
+        dumper = None if files.state is None else Dumper(files.state, made, shared)
+        if files.out is not None and files.out.exists():
+            raise OutputError(f"'{files.out}' exists already; nothing is overwritten. Choose another name or remove it.")
+        if files.state is None or not files.state.exists():
+            return cls(core, kept, name, files, None if files.spool is None else Spool.create(files.spool), dumper, {})
+        found = read_dump(files.state, made, shared)
+        records = found.head.get("records")
+        if (records is None) != (files.spool is None):
+            with_or_without = "without an --out" if records is None else "with an --out"
+            raise DumpError(f"the state in '{files.state}' is of a run {with_or_without}: resume it so, or remove it to start anew.")
+        if not (isinstance(found.value, list) and len(found.value) == 2 and isinstance(found.value[0], Core)):
+            raise DumpError(f"the state in '{files.state}' holds no estimator. Remove it to start anew.")
+        spool = None if files.spool is None else Spool.resume(files.spool, int(records or 0))
+        core, kept = found.value
+        return cls(core, kept, name, files, spool, dumper, found.head)
+
+    def push(self, event: Event) -> list[Estimate]:
+        """Raises `EstimatorError`."""
+        self.count += 1
+        return self._take(self.core.push(event))
+
+    def finish(self) -> list[Estimate]:
+        """No more events will come. Raises `EstimatorError`."""
+        return self._take(self.core.finish())
+
+    def _take(self, estimates: list[Estimate]) -> list[Estimate]:
+        for estimate in estimates:
+            self.health.made(estimate, self.core)
+            if self._spool is not None:
+                self._spool.add(estimate)
+        return estimates
+
+    def dump(self, extra: Callable[[], Mapping[str, Any]] = dict, now: bool = False) -> None:
+        """The state to disk, if it is due or wanted ``now``. What ``extra`` tells enters its head. Raises `DumpError`."""
+        if self._dumper is None or not (now or self._dumper.is_due()):
+            return
+        on_disk = () if self._spool is None else (self._spool.flush(),)
+        records = None if self._spool is None else self._spool.count
+        self._dumper.write([self.core, self.kept], {**extra(), "events": self.count, "records": records}, on_disk)
+
+    def write_out(self) -> int | None:
+        """The output, if one is wanted; returns how many estimates it holds. Raises `OutputError` where there are none."""
+        if self._spool is None or self._files.out is None:
+            return None
+        stamps, table = self._spool.rows()
+        if not len(stamps):
+            self._spool.remove()
+            raise OutputError(f"output '{self._files.out}': there is nothing to write, no motion could be told from what was heard.")
+        if self._files.out.suffix == ".tum":
+            write_tum(self._files.out, trajectory(stamps, table))
+        else:
+            write_fused(self._files.out, {self.name: fused_estimates(stamps, table)}, self.name)
+        self._spool.remove()
+        return len(stamps)
+
+    def close(self, forget: bool = False) -> None:
+        """End; ``forget`` removes the state, for there is nothing to go on with. Raises `DumpError`."""
+        if self._dumper is not None:
+            self._dumper.close()
+            if forget:
+                self._dumper.path.unlink(missing_ok=True)
+        if self._spool is not None:
+            self._spool.close()

@@ -1,0 +1,71 @@
+"""What is published: where the robot is, what was learned of it, and how well it goes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from localization.estimators import Estimate
+from localization.logs.fused import FusedEstimate, odometry_message, transform_message
+from localization.logs.wire import encode, make
+from localization.online.health import Status
+from localization.online.transport import Transport
+
+ODOMETRY, CORRECTIONS, TF, DIAGNOSTICS = "/skidloc/odometry", "/skidloc/corrections", "/tf", "/diagnostics"
+
+_TYPES = {
+    ODOMETRY: "nav_msgs/msg/Odometry",
+    CORRECTIONS: "sensor_msgs/msg/JointState",
+    TF: "tf2_msgs/msg/TFMessage",
+    DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
+}
+
+
+class Teller:
+    """Publishes on a transport. Odometry and TF with every estimate; corrections and diagnostics when asked."""
+
+    def __init__(self, transport: Transport, *, with_tf: bool) -> None:
+        self._transport, self._with_tf = transport, with_tf
+        for topic, kind in _TYPES.items():
+            if topic != TF or with_tf:
+                transport.advertise(topic, kind)
+
+    def estimate(self, estimate: Estimate, stamp_ns: int) -> None:
+        """nav_msgs/Odometry with the true vy, and `odom` -> `base_link`, at ``stamp_ns``."""
+        covariance = estimate.covariance
+        fused = FusedEstimate(stamp_ns, estimate.pose, estimate.twist, covariance, estimate.twist_covariance)
+        self._publish(ODOMETRY, odometry_message(fused))
+        if self._with_tf:
+            self._publish(TF, transform_message(fused))
+
+    def corrections(self, parameters: Mapping[str, tuple[float, float]], stamp_ns: int) -> None:
+        """Named numbers as sensor_msgs/JointState: ``position`` is the mean, ``effort`` its sigma."""
+        means, sigmas = (np.array([value[i] for value in parameters.values()], dtype=float) for i in (0, 1))
+        message = make(
+            _TYPES[CORRECTIONS], header=_header(stamp_ns), name=list(parameters), position=means, velocity=np.zeros(0), effort=sigmas
+        )
+        self._publish(CORRECTIONS, message)
+
+    def diagnostics(self, statuses: Sequence[Status], hardware: str, stamp_ns: int) -> None:
+        """diagnostic_msgs/DiagnosticArray, one status for each of ``statuses``."""
+        entries = [
+            make(
+                "diagnostic_msgs/msg/DiagnosticStatus",
+                level=status.level,
+                name=f"skidloc: {status.name}",
+                message=status.message,
+                hardware_id=hardware,
+                values=[make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in status.values.items()],
+            )
+            for status in statuses
+        ]
+        self._publish(DIAGNOSTICS, make(_TYPES[DIAGNOSTICS], header=_header(stamp_ns), status=entries))
+
+    def _publish(self, topic: str, message: object) -> None:
+        self._transport.publish(topic, encode(message, is_ros1=self._transport.is_ros1))
+
+
+def _header(stamp_ns: int) -> object:
+    time = make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    return make("std_msgs/msg/Header", stamp=time, frame_id="odom")
