@@ -24,7 +24,7 @@ from localization.logs import Log, TopicOverrides, open_log
 from localization.logs.fused import FusedEstimate, write_fused
 from localization.provenance import fingerprint, versions
 from localization.references import ReferenceTrack, Relations, read_reference_file, reference_track
-from localization.report import ReportHead, verdict, write_report
+from localization.report import ReportHead, overview_png, verdict, write_report
 from localization.run import Pair, ReplayConfig, Run, replay
 from localization.score import Result, score
 from localization.timespans import describe_instant, no_overlap_message
@@ -46,7 +46,7 @@ class Replay:
     robot: str
     """Name of a shipped robot, or path of a robot TOML file."""
     out: Path
-    """New folder for metrics.json, report.html, trajectories (TUM) and fused.mcap; its /tf is of the last model and estimator."""
+    """New folder for metrics.json, report.html, overview.png, trajectories (TUM) and fused.mcap; its /tf is of the last pair."""
     model: str = "diff_drive,skid_steer"
     """Motion models, separated by commas."""
     estimator: str = "odometry,lidar,ekf"
@@ -107,6 +107,7 @@ class Replay:
                 write_tum(folder / f"{result.name}.tum", result.run.trajectory)
             write_fused(folder / "fused.mcap", {r.name: _estimates(r.run) for r in results}, results[-1].name)
             write_report(folder / "report.html", head, results, reference)
+            overview_png(folder / "overview.png", head, results, reference)
         if self.json is not None:
             write_json(self.json, metrics)
         self._print(console, head, results, reference)
