@@ -102,8 +102,9 @@ class World:
         self.bias = rng.normal(0.0, noise.gyro.bias_sigma_rad_per_s)
         self.clock = rng.normal(0.0, belief.clock_sigma_s) if has_lidar and belief is not None else 0.0
         self.belief, self.mount = belief, se2.exp(np.array(mount, dtype=float))
-        self.correction = rng.multivariate_normal(np.zeros(len(corrected.names)), corrected.cov)
-        self._walk = np.linalg.cholesky(corrected.walk_cov + 1e-18 * np.eye(len(corrected.names)))
+        k = len(corrected.names)
+        self.correction = rng.multivariate_normal(np.zeros(k), corrected.cov) if k else np.zeros(0)
+        self._walk = np.linalg.cholesky(corrected.walk_cov + 1e-18 * np.eye(k))
 
     @property
     def slow(self) -> np.ndarray:

@@ -7,7 +7,7 @@ and every array is checked before it goes in.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,19 +45,14 @@ def chain(rows: FloatArray, first: int = 0) -> Iterator[Block]:
 
 def solve(blocks: Iterable[Block], count: int, n: int) -> FloatArray:
     """(count, n) changes of the nodes 0 ... count - 1. Raises `IndeterminateError` and `EstimatorError`."""
-    system = _system(blocks, range(count), n)
-    try:
-        found = system.optimize()
-    except RuntimeError as error:
-        raise _indeterminate(error) from error
+    found = _tree(list(blocks), range(count), n).optimize()
     return _finite(np.array([found.at(i) for i in range(count)]).reshape(count, n))
 
 
 def marginals(blocks: Iterable[Block], nodes: Iterable[int], count: int, n: int) -> FloatArray:
     """(k, n, n) covariances of ``nodes``. Raises `IndeterminateError` and `EstimatorError`."""
-    system = _system(blocks, range(count), n)
+    tree = _tree(list(blocks), range(count), n)
     try:
-        tree = system.eliminateMultifrontal()
         return np.array([tree.marginalCovariance(i) for i in nodes]).reshape(-1, n, n)
     except RuntimeError as error:
         raise _indeterminate(error) from error
@@ -104,17 +99,28 @@ class Incremental:
             raise _indeterminate(error) from error
 
 
-def _system(blocks: Iterable[Block], nodes: range, n: int) -> Any:
+def _tree(blocks: Sequence[Block], nodes: range, n: int) -> Any:
+    """The Bayes tree, by Cholesky, which is fast; where that runs out of digits, by QR."""
+    try:
+        return _system(blocks, nodes, n, _unit).eliminateMultifrontal()
+    except RuntimeError:
+        try:
+            return _system(blocks, nodes, n, _unit_by_qr).eliminateMultifrontal()
+        except RuntimeError as error:
+            raise _indeterminate(error) from error
+
+
+def _system(blocks: Sequence[Block], nodes: range, n: int, noise: Callable[[int], Any]) -> Any:
     system, touched = gtsam.GaussianFactorGraph(), np.zeros(len(nodes), dtype=bool)
     for block in blocks:
-        system.add(_factor(block, nodes, n))
+        system.add(_factor(block, nodes, n, noise))
         touched[list(block.nodes)] = True
     if not touched.all():
         raise IndeterminateError(f"no factor speaks of node {int(np.argmin(touched))}.")
     return system
 
 
-def _factor(block: Block, known: range | set[int], n: int) -> Any:
+def _factor(block: Block, known: range | set[int], n: int, noise: Callable[[int], Any] | None = None) -> Any:
     rows = len(block.rhs)
     arguments: list[Any] = []
     for node, matrix in zip(block.nodes, block.matrices, strict=True):
@@ -125,7 +131,7 @@ def _factor(block: Block, known: range | set[int], n: int) -> Any:
         arguments += [node, matrix]
     if rows == 0 or len(set(block.nodes)) != len(block.nodes):
         raise EstimatorError(f"a factor between nodes {block.nodes} with {rows} rows says nothing.")
-    return gtsam.JacobianFactor(*arguments, block.rhs, _unit(rows))  # type: ignore[call-overload]
+    return gtsam.JacobianFactor(*arguments, block.rhs, (noise or _unit)(rows))  # type: ignore[call-overload]
 
 
 _UNITS: dict[int, Any] = {}
@@ -135,6 +141,11 @@ def _unit(rows: int) -> Any:
     if rows not in _UNITS:
         _UNITS[rows] = gtsam.noiseModel.Unit.Create(rows)
     return _UNITS[rows]
+
+
+def _unit_by_qr(rows: int) -> Any:
+    """Unit noise of the kind that might hold constraints, for which GTSAM always takes QR."""
+    return gtsam.noiseModel.Constrained.MixedSigmas(1.0, np.ones(rows))
 
 
 def _finite(changes: FloatArray) -> FloatArray:

@@ -52,7 +52,7 @@ class GraphConfig:
     """Nodes that the window smooths."""
     relinearize_at: float = 0.01
     """A node whose pose has moved this far from where it was linearised is linearised anew [m, rad]."""
-    kernel: Literal["none", "huber", "cauchy"] = "huber"
+    kernel: Literal["none", "huber", "cauchy"] = "cauchy"
     """Robust kernel of positions and loop closures; a LiDAR that contradicts the wheels is judged when it comes."""
     kernel_scale: float = 3.0
     """Where the kernel begins [sigmas]."""

@@ -106,7 +106,7 @@ class History:
         return Node.known(self._poses[k].copy(), self._slow[k].copy(), self._isam.marginals([k])[0])
 
     def solve(self) -> float:
-        """Move all nodes to where the cost (half the sum of squares, which is returned) is least.
+        """Move all nodes to where the cost (half the sum of squares, less where the kernel doubts; it is returned) is least.
 
         Gauss-Newton; where a step does not help, damped after Levenberg and Marquardt. Raises `EstimatorError` if the graph is singular.
         """
@@ -161,7 +161,10 @@ class History:
             if self._pairs is None
             else linearize(self._pairs[f : k - 1], self._poses[f:k], self._slow[f:k])
         )
-        cost = float(np.sum(rows[..., -1] ** 2)) + sum(float(b.rhs @ b.rhs) for b in self._others())
+        prior = self._prior().rhs
+        cost = float(np.sum(rows[..., -1] ** 2)) + float(prior @ prior)
+        cost += sum(p.cost(self._poses[node], self._kernel) for node, p in self._positions if node >= f)
+        cost += sum(c.cost(self._poses, self._kernel) for c in self._closures if min(c.a, c.b) >= f)
         return rows, 0.5 * cost
 
     def _blocks(self, rows: FloatArray) -> Iterator[Block]:
