@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -53,8 +54,10 @@ def _print(console: Console, info: LogInfo) -> None:
         console.print(f"{part.replace('_', ' ')}: {said}", markup=False)
     console.print(f"can be scored against: {', '.join(info.references) or 'nothing in the log'}", markup=False)
     for frame, mount in info.mounts.items():
-        at = ", ".join(f"{value:.3f}" for value in list(mount.values())[:3])
-        console.print(f"mount of {frame}: [{at}] m", markup=False)
+        values = list(mount.values())
+        at = ", ".join(f"{value:.3f}" for value in values[:3])
+        turned = ", ".join(f"{math.degrees(value):.1f}" for value in values[3:])
+        console.print(f"mount of {frame}: [{at}] m, roll, pitch and yaw [{turned}] deg", markup=False)
     for problem in info.problems:
         console.print(f"[yellow]![/] {escape(problem)}", soft_wrap=True)
     for note in info.notes:
