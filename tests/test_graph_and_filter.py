@@ -1,0 +1,119 @@
+"""Filter and graph on the same steps: they agree, they are honest, and what they learn is worth having."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from localization.consistency import mean_band
+from localization.logs import open_log
+from localization.run import Pair, replay
+from motion_models import se2
+from motion_models.registry import MODELS, make_model
+from motion_models.robot import load_robot
+from tests.graph_help import BOTH, make, run, squared_errors
+from tests.synthetic_steps import Noise, Seer
+
+DATA = Path(__file__).parent / "data"
+LEVELS = (0.3, 1.0, 2.0, 4.0)
+
+
+def apart(a, covariance_a, b):
+    """Largest distance of poses (N, 3) from others, in sigmas of the first's marginals; 0.1 mm and 0.1 mrad count as none."""
+    sigmas = np.sqrt(np.maximum(covariance_a.diagonal(axis1=1, axis2=2), 1e-8))
+    return np.abs(se2.log(se2.between(a, b)) / sigmas).max()
+
+
+# --- they agree
+
+
+@pytest.mark.parametrize(("model", "form"), [("skid_steer", "constant"), ("skid_steer", "cg_field"), ("diff_drive", "constant")])
+@pytest.mark.parametrize("has_lidar", [True, False])
+def test_filter_and_fixed_lag_agree_on_synthetic_drives(model, form, has_lidar):
+    for seed in range(3):
+        found = []
+        for kind in BOTH:
+            seer = Seer()
+            found.append(run(make(kind, seer, model, form, has_lidar=has_lidar), seer, seed, 120, has_lidar=has_lidar)[0])
+        ekf, graph = found
+        poses, others = (np.array([e.pose for e in part]) for part in (ekf, graph))
+        covariances = np.array([e.covariance for e in ekf])
+        assert apart(poses, covariances, others) < 1.0
+        # one linearises where it was, the other where it is: about as sure of themselves
+        theirs = np.array([e.covariance for e in graph]).diagonal(axis1=1, axis2=2)[10:]
+        np.testing.assert_allclose(np.sqrt(theirs), np.sqrt(covariances.diagonal(axis1=1, axis2=2)[10:]), rtol=0.25)
+
+
+@pytest.mark.parametrize(
+    ("log", "robot", "seconds"), [("aces/aces.mcap", "aces", 40.0), ("husky-outdoor-gps/test1.bag", "husky_a200", 60.0)]
+)
+def test_filter_and_fixed_lag_agree_on_real_logs(log, robot, seconds):
+    """On the first part of each; the whole of both is in the benchmark."""
+    robot = load_robot(robot)
+    opened = open_log(DATA / log, robot)
+    events = opened.events()
+    first = next(events)
+    until = first.stamp_ns + round(seconds * 1e9)
+    part = itertools.takewhile(lambda e: e.stamp_ns < until, itertools.chain([first], events))
+    model = make_model("diff_drive", robot)
+    ekf, graph = replay(part, [Pair(model, kind) for kind in BOTH], robot, opened.mounts, has_lidar="aces" in log)
+    assert len(ekf.trajectory) > 100
+    assert apart(ekf.trajectory.poses, ekf.trajectory.covariances, graph.trajectory.poses) < 1.0
+    for name, (mean, sigma) in ekf.parameters.items():
+        other, its = graph.parameters[name]
+        assert abs(mean - other) < sigma
+        assert its == pytest.approx(sigma, rel=0.15)
+
+
+# --- every model, every form
+
+
+@pytest.mark.parametrize("form", ["constant", "cg_field"])
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("kind", BOTH)
+def test_every_model_learns_in_every_form(kind, name, form):
+    """What a drive both ways shows is known better than at first, and is where the truth is."""
+    seer = Seer()
+    estimator = make(kind, seer, name, form)
+    names, sigmas = estimator._corrected.names, estimator._corrected.sigmas
+    assert names
+    run(estimator, seer, 3, 100)
+    found = estimator.parameters()
+    after = np.array([found[n][1] for n in names])
+    assert (after <= 1.02 * sigmas).all()
+    assert (after < 0.8 * sigmas).any()
+    assert np.isfinite(estimator.params).all()
+
+
+# --- they are honest: NEES at four levels of noise
+
+
+@pytest.fixture(scope="module", params=BOTH)
+def honesty(request):
+    """Squared errors (levels, seeds, 3) of pose, slow states and all, insides (levels, seeds, m), and degrees of freedom, after 10 s."""
+    found = [[squared_errors(request.param, 1000 * i + s, 100, Noise().scaled(f)) for s in range(SEEDS)] for i, f in enumerate(LEVELS)]
+    return np.array([[r[0] for r in level] for level in found]), np.array([[r[1] for r in level] for level in found]), found[0][0][2]
+
+
+SEEDS = 12
+
+
+@pytest.mark.parametrize("level", range(len(LEVELS)))
+def test_errors_are_as_large_as_is_said(honesty, level):
+    """Twelve means of pose, parameters and all, for each estimator: the band holds all of them together with 95 %."""
+    values, _, dof = honesty
+    for part, d in enumerate(dof):
+        low, high = mean_band(SEEDS, d, 1.0 - 0.05 / 24)
+        assert low < values[level, :, part].mean() < high
+
+
+def test_and_over_all_levels_closer_still(honesty):
+    values, inside, dof = honesty
+    for part, d in enumerate(dof):
+        low, high = mean_band(SEEDS * len(LEVELS), d, 1.0 - 0.05 / 6)
+        assert low < values[..., part].mean() < high
+    # 90 % intervals, of 4 x 12 runs: all but a few
+    assert 0.8 < inside[..., 2:].mean() < 0.98
