@@ -12,13 +12,18 @@ from motion_models.se2 import FloatArray
 
 MOST_CAUSES = 4
 _DRAWS = 4000
-_TRIPLES = 40
+_KEPT = 12
 
 
 @dataclass(frozen=True)
 class Regression:
     """Whitened discrepancies and signatures in normal form; nuisances are already projected out, sizes are in units of their sigma
-    before looking (the prior)."""
+    before looking (the prior).
+
+    Every cause is there all the time, if only within its tolerance: robot files, mounts and clocks are never known better. To name a cause
+    is to let it have any size. So subsets are weighed by their evidence (marginal likelihood), in which causes outside of the subset
+    are noise of a known shape.
+    """
 
     gram: FloatArray
     """(p, p)"""
@@ -30,41 +35,80 @@ class Regression:
     """How many numbers were measured."""
     scale: FloatArray
     """(p,) prior sigma of each cause in its own unit."""
+    tolerance: FloatArray
+    """(p,) sigma of each cause that is not named, in units of its prior's."""
+
+    def _variances(self, subset: tuple[int, ...]) -> FloatArray:
+        variances = np.square(self.tolerance)
+        variances[list(subset)] = 1.0
+        return variances
+
+    def _evidence(self, subset: tuple[int, ...]) -> tuple[FloatArray, FloatArray, float]:
+        """Factor of the posterior's information, mean of all sizes, and twice the log-evidence but for a constant."""
+        variances = self._variances(subset)
+        factor = np.linalg.cholesky(self.gram + np.diag(1.0 / variances))
+        half = np.linalg.solve(factor, self.moment)
+        twice = float(half @ half) - 2.0 * float(np.log(np.diagonal(factor)).sum()) - float(np.log(variances).sum())
+        return factor, half, twice
 
     def fit(self, subset: tuple[int, ...]) -> tuple[FloatArray, FloatArray, float]:
-        """Sizes in own units, their covariance, and twice the log-likelihood gained, prior included."""
+        """Sizes in own units, their covariance, and twice the log-evidence gained over naming nothing."""
         if not subset:
             return np.zeros(0), np.zeros((0, 0)), 0.0
-        i = np.array(subset)
-        a = self.gram[np.ix_(i, i)] + np.eye(len(i))
-        x = np.linalg.solve(a, self.moment[i])
-        cov = np.linalg.inv(a)
-        return x * self.scale[i], cov * np.outer(self.scale[i], self.scale[i]), float(self.moment[i] @ x)
+        i = list(subset)
+        factor, half, twice = self._evidence(subset)
+        sizes = np.linalg.solve(factor.T, half)[i]
+        inverse = np.linalg.solve(factor, np.eye(len(factor))[:, i])
+        scale = self.scale[i]
+        return sizes * scale, (inverse.T @ inverse) * np.outer(scale, scale), twice - self._evidence(())[2]
 
     def gain(self, subset: tuple[int, ...]) -> float:
-        return self.fit(subset)[2]
+        """Twice the log-evidence gained over naming nothing."""
+        return self._evidence(subset)[2] - self._evidence(())[2] if subset else 0.0
+
+    def misfit(self) -> float:
+        """Sum of squares that is left where every cause keeps within its tolerance."""
+        half = self._evidence(())[1]
+        return self.rest - float(half @ half)
+
+    def scores(self, given: tuple[int, ...], wanted: list[int]) -> tuple[FloatArray, FloatArray]:
+        """(n,) scores of the ``wanted`` causes with those ``given`` free and all others within tolerance, and their (n, n) covariance if
+        they were zero."""
+        others = [i for i in range(len(self.moment)) if i not in wanted or i in given]
+        variances = self._variances(given)[others]
+        variances[[n for n, i in enumerate(others) if i in given]] = 1e6
+        a = self.gram[np.ix_(others, others)] + np.diag(1.0 / variances)
+        across = np.linalg.solve(a, self.gram[np.ix_(others, wanted)])
+        cov = self.gram[np.ix_(wanted, wanted)] - self.gram[np.ix_(wanted, others)] @ across
+        return self.moment[wanted] - across.T @ self.moment[others], cov
 
 
-def regression(y: FloatArray, signatures: FloatArray, nuisances: FloatArray, scale: FloatArray) -> Regression:
-    """From whitened rows (K,), signatures (K, p) and nuisances (K, q)."""
+def regression(
+    y: FloatArray, signatures: FloatArray, nuisances: FloatArray, scale: FloatArray, tolerance: FloatArray | None = None
+) -> Regression:
+    """From whitened rows (K,), signatures (K, p) and nuisances (K, q); ``scale`` and ``tolerance`` (p,) in the causes' own units."""
     s = signatures * scale
     used = np.linalg.norm(nuisances, axis=0) > 1e-9 if nuisances.size else np.zeros(0, dtype=bool)
     if used.any():
         q, r = np.linalg.qr(nuisances[:, used])
         q = q[:, np.abs(np.diag(r)) > 1e-9 * np.abs(np.diag(r)).max()]
         y, s = y - q @ (q.T @ y), s - q @ (q.T @ s)
-    return Regression(s.T @ s, s.T @ y, float(y @ y), int(np.count_nonzero(np.abs(signatures).sum(axis=1) + np.abs(y))), scale)
+    count = int(np.count_nonzero(np.abs(signatures).sum(axis=1) + np.abs(y)))
+    within = np.full(len(scale), 1e-6) if tolerance is None else np.maximum(tolerance / scale, 1e-6)
+    return Regression(s.T @ s, s.T @ y, float(y @ y), count, scale, within)
 
 
-def best_subset(problem: Regression, groups: list[str], allowed: FloatArray, gamma: float = 0.5) -> tuple[int, ...]:
-    """The causes that the extended BIC (Chen & Chen 2008) prefers. Causes of one group exclude each other; ``allowed`` (p, 2) bounds
-    their sizes in own units."""
+def cost(problem: Regression, groups: list[str], subset: tuple[int, ...]) -> float:
+    """Twice the negative log-odds of ``subset`` against naming nothing: every number of causes is as likely as the next, and so are all
+    sets of one number (the prior of the extended BIC of Chen & Chen 2008, with gamma = 1)."""
+    k = len(subset)
+    return 2.0 * math.log(math.comb(len(set(groups)), k)) + k * math.log(max(problem.count, 2)) - problem.gain(subset)
+
+
+def ranked_subsets(problem: Regression, groups: list[str], allowed: FloatArray, kept: int = _KEPT) -> list[tuple[float, tuple[int, ...]]]:
+    """The best sets of causes by `cost`, best first, the empty one among them. Causes of one group exclude each other; ``allowed`` (p, 2)
+    bounds sizes in own units."""
     p = len(groups)
-
-    def cost(subset: tuple[int, ...]) -> float:
-        k = len(subset)
-        penalty = k * math.log(max(problem.count, 2)) + 2.0 * gamma * math.log(math.comb(len(set(groups)), k))
-        return penalty - problem.gain(subset)
 
     def fits(subset: tuple[int, ...]) -> bool:
         if len({groups[i] for i in subset}) < len(subset):
@@ -72,29 +116,31 @@ def best_subset(problem: Regression, groups: list[str], allowed: FloatArray, gam
         sizes = problem.fit(subset)[0]
         return all(allowed[i, 0] <= size <= allowed[i, 1] for i, size in zip(subset, sizes, strict=True))
 
-    best: tuple[int, ...] = ()
-    best_cost = 0.0
+    found: list[tuple[float, tuple[int, ...]]] = [(0.0, ())]
     layer: list[tuple[int, ...]] = [()]
     for k in range(1, MOST_CAUSES + 1):
         # all pairs; beyond that, what extends the best sets of the size before
-        tried = itertools.combinations(range(p), k) if k <= 2 else {tuple(sorted({*s, i})) for s in layer for i in range(p) if i not in s}
-        scored = sorted((cost(s), s) for s in tried if len(s) == k)
+        tried = (
+            set(itertools.combinations(range(p), k)) if k <= 2 else {tuple(sorted({*s, i})) for s in layer for i in range(p) if i not in s}
+        )
+        scored = sorted((cost(problem, groups, s), s) for s in tried if len({groups[i] for i in s}) == k)
         layer = []
         for c, s in scored:
-            if not fits(s):
-                continue
-            layer.append(s)
-            if c < best_cost - 1e-9:
-                best, best_cost = s, c
-            if len(layer) >= _TRIPLES:
-                break
-    return best
+            if fits(s):
+                layer.append(s)
+                found.append((c, s))
+                if len(layer) >= kept:
+                    break
+        if not layer or found[-len(layer)][0] > min(c for c, _ in found) + 30.0:
+            break
+    return sorted(found)
 
 
-def max_statistic(problem: Regression, given: tuple[int, ...], rng: np.random.Generator, df: int) -> FloatArray:
-    """(draws,) largest |t| over all causes not ``given`` that noise alone would show, as correlated as their signatures are."""
-    left = [i for i in range(len(problem.moment)) if i not in given]
-    cov = _projected(problem.gram, given, left)
+def max_statistic(problem: Regression, given: tuple[int, ...], rng: np.random.Generator, df: int, among: int | None = None) -> FloatArray:
+    """(draws,) largest |t| over all causes (or the first ``among``) not ``given`` that noise alone would show, as correlated as their
+    signatures are."""
+    left = [i for i in range(len(problem.moment) if among is None else among) if i not in given]
+    cov = problem.scores(given, left)[1]
     sigma = np.sqrt(np.maximum(np.diag(cov), 1e-12))
     seen = np.diag(cov) > 1e-6
     correlation = cov[np.ix_(seen, seen)] / np.outer(sigma[seen], sigma[seen])
@@ -108,12 +154,8 @@ def max_statistic(problem: Regression, given: tuple[int, ...], rng: np.random.Ge
 
 def statistic(problem: Regression, given: tuple[int, ...], cause: int) -> float:
     """t of ``cause`` beside those ``given``."""
-    cov = _projected(problem.gram, given, [cause])
-    moment = problem.moment[cause]
-    if given:
-        g = np.array(given)
-        moment = moment - problem.gram[cause, g] @ np.linalg.solve(problem.gram[np.ix_(g, g)] + 1e-9 * np.eye(len(g)), problem.moment[g])
-    return float(moment / math.sqrt(max(cov[0, 0], 1e-12)))
+    score, cov = problem.scores(given, [cause])
+    return float(score[0] / math.sqrt(max(float(cov[0, 0]), 1e-12)))
 
 
 def p_value(t: float, draws: FloatArray) -> float:
@@ -126,16 +168,7 @@ def p_value(t: float, draws: FloatArray) -> float:
     return float(min(0.01 * math.exp(-slope * (t**2 - q[1] ** 2)), 1.0))
 
 
-def _projected(gram: FloatArray, given: tuple[int, ...], left: list[int]) -> FloatArray:
-    cov = gram[np.ix_(left, left)]
-    if given:
-        g = np.array(given)
-        across = gram[np.ix_(left, list(given))]
-        cov = cov - across @ np.linalg.solve(gram[np.ix_(g, g)] + 1e-9 * np.eye(len(g)), across.T)
-    return np.asarray(cov)
-
-
 def likeness(problem: Regression, given: tuple[int, ...], a: int, b: int) -> float:
     """Correlation of two signatures once those ``given`` are taken out of both."""
-    cov = _projected(problem.gram, given, [a, b])
-    return float(cov[0, 1] / math.sqrt(max(cov[0, 0] * cov[1, 1], 1e-18)))
+    cov = problem.scores(given, [a, b])[1]
+    return float(cov[0, 1] / math.sqrt(max(float(cov[0, 0] * cov[1, 1]), 1e-18)))

@@ -11,11 +11,12 @@ from scipy.stats import chi2
 
 from localization.diagnosis import residue
 from localization.diagnosis.attribution import (
+    MOST_CAUSES,
     Regression,
-    best_subset,
     likeness,
     max_statistic,
     p_value,
+    ranked_subsets,
     regression,
     statistic,
 )
@@ -26,15 +27,22 @@ from localization.diagnosis.heldout import heldout_gain
 from localization.diagnosis.next_drive import general_advice, separating_drive
 from localization.diagnosis.noise import Noise, estimated_noise, plain_noise, regressors
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, Pipeline, with_sizes
+from localization.diagnosis.sweep_lag import sweep_lag
 from localization.diagnosis.words import evidence, sentence
 from motion_models.base import MotionModel
+from motion_models.errors import CgError, ModelError
 from motion_models.se2 import FloatArray
 
 _PRIOR = 4.0  # sigma of a size before looking, over the usual one
 _ALIKE = 0.7  # signatures less alike than this are no aliases, however short the drive
 _CLOSE = 7.0  # twice the log-likelihood by which a rival may be worse: odds of 1 to 33
 _CLOSE_SHARE = 0.02  # or this share of what the cause explains, which no model is right about
-_ROUNDS = 3
+_ROUNDS = 5
+_TOLERANCE = 0.5  # sigma of causes that nobody names, over what is negligible
+_REFINED = 3  # sets of each number of causes that are tried for real
+_SURE = 200.0  # lead in twice the log-evidence that needs no trial
+_STEPS = 3
+_HONEST = 0.5  # a witness may be better than it says, but not by more than this
 
 
 @dataclass(frozen=True)
@@ -108,21 +116,73 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
     rng = np.random.default_rng(config.seed)
     pipeline = _pipeline(drive, model)
     effects = _candidates(pipeline, config)
-    state = _linearise(pipeline, effects, {}, None)
+    state = _linearise(pipeline, effects, {})
     first = state
-    sizes: dict[Effect, float] = {}
+    current: dict[Effect, float] = {}
     seen: list[frozenset[str]] = []
     for _ in range(_ROUNDS):
-        chosen = _choose(state, rng, config)
-        found = state.problem.fit(chosen)[0]
-        sizes = {state.effects[i]: _bounded(state.effects[i], float(v)) for i, v in zip(chosen, found, strict=True)}
+        sizes = _search(pipeline, state)
         keys = frozenset(e.key for e in sizes)
-        if not sizes or keys in seen:
+        if keys == frozenset(e.key for e in current):
+            break
+        current = sizes
+        state = _linearise(pipeline, effects, current)
+        if keys in seen:
             break
         seen.append(keys)
-        state = _linearise(pipeline, effects, sizes, state)
-    chosen = _choose(state, rng, config, tuple(i for i, e in enumerate(state.effects) if e.key in {s.key for s in sizes}))
+    index = {e.key: i for i, e in enumerate(effects)}
+    chosen = _tested(state, tuple(sorted(index[e.key] for e in current)), rng, config)
     return _conclude(pipeline, first, state, chosen, rng, config)
+
+
+def _search(pipeline: Pipeline, state: _State) -> dict[Effect, float]:
+    """The best set of causes. The best few by signatures around the state compete with what they really explain, at their own sizes."""
+    effects, problem = state.effects, state.problem
+    groups = [_group(e) for e in effects]
+    ranked = ranked_subsets(problem, groups, _bounds(effects))
+    least = ranked[0][0]
+    sure = ranked[1][0] - least > _SURE if len(ranked) > 1 else True
+    tried: dict[tuple[int, ...], None] = {ranked[0][1]: None, (): None}
+    if not sure:
+        for size in range(1, MOST_CAUSES):
+            best = [s for _, s in ranked if len(s) == size][:_REFINED]
+            tried.update(dict.fromkeys(best))
+    results = []
+    for subset in tried:
+        start = {effects[i]: float(v) for i, v in zip(subset, problem.fit(subset)[0], strict=True)}
+        try:
+            sizes, rows = _refined(pipeline, state, start)
+        except (CgError, ModelError):
+            continue  # sizes that no robot can have
+        whole = _normal(rows, state.signatures, state.nuisances, state.noise, effects)
+        misfit = whole.misfit()
+        k = len(subset)
+        penalty = k * math.log(max(problem.count, 2)) + 2.0 * math.log(math.comb(len(set(groups)), k))
+        results.append((misfit + penalty, subset, sizes))
+    return min(results, key=lambda r: r[0])[2]
+
+
+def _refined(pipeline: Pipeline, state: _State, sizes: dict[Effect, float]) -> tuple[dict[Effect, float], FloatArray]:
+    """Gauss-Newton on the sizes by the real pipeline; and the discrepancies (M, 6) that they leave."""
+    order = list(sizes)
+    values = np.array([_bounded(e, sizes[e]) for e in order])
+    rows = pipeline.discrepancies(with_sizes(dict(zip(order, values, strict=True))))
+    for _ in range(_STEPS if order else 0):
+        belief = with_sizes(dict(zip(order, values, strict=True)))
+        own = np.stack([pipeline.signature(belief, e, rows) for e in order], axis=-1)
+        problem = _normal(rows, own, state.nuisances, state.noise, tuple(order))
+        change = np.linalg.solve(problem.gram + 1e-9 * np.eye(len(order)), problem.moment) * problem.scale
+        limits = _bounds(tuple(order))
+        new = np.clip(values + change, limits[:, 0], limits[:, 1])
+        values, moved = new, np.abs(new - values) / np.array([e.usual for e in order])
+        rows = pipeline.discrepancies(with_sizes(dict(zip(order, values, strict=True))))
+        if moved.max() < 0.02:
+            break
+    return dict(zip(order, (float(v) for v in values), strict=True)), rows
+
+
+def _bounds(effects: tuple[Effect, ...]) -> FloatArray:
+    return np.array([(0.0 if e.one_sided else -10.0 * e.usual, 10.0 * e.usual) for e in effects])
 
 
 def _pipeline(drive: Drive, model: MotionModel) -> Pipeline:
@@ -161,22 +221,23 @@ def _candidates(pipeline: Pipeline, config: DiagnosisConfig) -> tuple[Effect, ..
     return tuple(found)
 
 
-def _linearise(pipeline: Pipeline, effects: tuple[Effect, ...], sizes: dict[Effect, float], before: _State | None) -> _State:
+def _linearise(pipeline: Pipeline, effects: tuple[Effect, ...], sizes: dict[Effect, float]) -> _State:
     belief = with_sizes(sizes)
     rows = pipeline.discrepancies(belief)
     signatures = np.stack([pipeline.signature(belief, e, rows) for e in effects], axis=-1)
     linear = rows.copy()
     for effect, size in sizes.items():
         linear += signatures[..., [e.key for e in effects].index(effect.key)] * size
-    nuisances = _nuisances(rows)
+    nuisances = _nuisances(pipeline, rows)
     noise = _noise(pipeline, linear, signatures, nuisances, effects)
     return _State(effects, rows, linear, signatures, nuisances, noise, _normal(linear, signatures, nuisances, noise, effects))
 
 
-def _nuisances(rows: FloatArray) -> FloatArray:
-    """(M, 6, 2) accelerometers and the floor under the IMU are never quite level."""
-    found = np.zeros((*rows.shape, 2))
-    found[:, 4, 0] = found[:, 5, 1] = 1.0
+def _nuisances(pipeline: Pipeline, rows: FloatArray) -> FloatArray:
+    """(M, 6, 4) accelerometers and the floor under the IMU are never quite level, and sweeps lag."""
+    level = np.zeros((*rows.shape, 2))
+    level[:, 4, 0] = level[:, 5, 1] = 1.0
+    found = np.concatenate([level, sweep_lag(pipeline)], axis=-1)
     return np.where(np.isfinite(rows)[..., None], found, np.nan)
 
 
@@ -184,7 +245,7 @@ def _normal(linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, n
     y = noise.whiten(linear).ravel()
     s = noise.whiten(signatures).reshape(len(y), -1)
     z = noise.whiten(nuisances).reshape(len(y), -1)
-    return regression(y, s, z, _PRIOR * np.array([e.usual for e in effects]))
+    return regression(y, s, z, _PRIOR * np.array([e.usual for e in effects]), _TOLERANCE * np.array([e.negligible for e in effects]))
 
 
 def _noise(pipeline: Pipeline, linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, effects: tuple[Effect, ...]) -> Noise:
@@ -212,18 +273,14 @@ def _noise(pipeline: Pipeline, linear: FloatArray, signatures: FloatArray, nuisa
         spent = float(np.trace(np.linalg.solve(gram + np.eye(len(gram)), gram)))
         p = len(effects)
         left = linear - signatures @ (x[:p] * scale) - nuisances @ (x[p:] * 1e3)
-        noise = estimated_noise(np.where(known, left, np.nan), features, follows, spent)
+        noise = estimated_noise(np.where(known, left, np.nan), features, follows, spent, _HONEST * sigmas)
     return noise
 
 
-def _choose(state: _State, rng: np.random.Generator, config: DiagnosisConfig, start: tuple[int, ...] | None = None) -> tuple[int, ...]:
-    """The best subset, less what does not stand up to the test."""
+def _tested(state: _State, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig) -> tuple[int, ...]:
+    """``chosen``, less what does not stand up to the test."""
     problem, effects = state.problem, state.effects
-    if start is None:
-        bounds = np.array([(0.0 if e.one_sided else -10.0 * e.usual, 10.0 * e.usual) for e in effects])
-        start = best_subset(problem, [_group(e) for e in effects], bounds)
     df = max(int(np.isfinite(state.rows).sum()) - len(effects), 10)
-    chosen = start
     while chosen:
         p = []
         for i in chosen:
@@ -264,9 +321,9 @@ def _conclude(
         findings.append(Finding(effect, size, sigma, p, aliases, told, gain))
     findings.sort(key=lambda f: f.gain.relative, reverse=True)
     findings = _merged(findings)
-    explained = np.concatenate([state.signatures[..., list(chosen)], state.nuisances], axis=-1)
     left = state.linear - state.signatures[..., list(chosen)] @ sizes
-    found_shapes, left_gain, _ = residue.shapes(pipeline, state.noise, left, explained, rng)
+    spreads = problem.scale * np.where(np.isin(np.arange(len(effects)), chosen), 1.0, problem.tolerance)
+    found_shapes, left_gain = residue.shapes(pipeline, state.noise, left, state.signatures, state.nuisances, spreads, rng)
     share = left_gain / max(left_gain + gained, 1e-9) if found_shapes else 0.0
     visible: dict[str, float] = {}
     for i, effect in enumerate(effects):

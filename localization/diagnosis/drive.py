@@ -53,6 +53,8 @@ class Drive:
     """(N, 2) from the CG to where a payload would be held, in each interval of the maneuvers end to end [m]."""
     lidar_frame: str = ""
     """Frame of the scans that were matched."""
+    lidar_at: tuple[float, float] = (0.0, 0.0)
+    """Where it sits, by its transform [m]."""
     notes: tuple[str, ...] = ()
 
     @property
@@ -153,6 +155,7 @@ def drive_of_log(log: Log, witness: WitnessName = "auto", reference: str | None 
     windows = cut(watched(), recorder, make_model("diff_drive", robot), robot, config, log.path.name)
     spans = np.array([(s.start_ns, s.end_ns) for s in recorder.used], dtype=np.int64).reshape(-1, 2)
     left = f"{len(windows.maneuvers)} windows of {config.window_s:g} s; left out: {windows.standing} standing, {windows.lost} not measured."
+    mount = log.mounts.get(frame, Mount())
     by_gyro = isinstance(inner, GyroWitness)
     heard = bool(imu.stamps) and not by_gyro
     return Drive(
@@ -167,6 +170,7 @@ def drive_of_log(log: Log, witness: WitnessName = "auto", reference: str | None 
         forces=imu.means(spans) if heard and len(spans) else None,
         payload_arms=_payload_arms(robot, windows.maneuvers, postures),
         lidar_frame=frame,
+        lidar_at=(mount.x, mount.y),
         notes=(left, *windows.notes, *log.notes()),
     )
 

@@ -139,7 +139,7 @@ _ALL = (
     Effect("scrub", "m", "the contact patches oppose any turn by this moment, over mu m g", 0.02, 0.002, _friction("scrub"), is_floor=True),
     Effect("slope", "rad", "the floor rises along the drive's first heading", 0.05, 0.005, _item("slope", 0), is_floor=True),
     Effect("encoder_dropout", "1", "share of time in which an encoder loses its counts", 0.1, 0.01, _plain("encoder_lost"), one_sided=True),
-    Effect("gyro_bias", "rad/s", "the gyro turns while nothing does", 0.02, 0.006, _plain("gyro_bias")),
+    Effect("gyro_bias", "rad/s", "the gyro turns while nothing does", 0.02, 0.0075, _plain("gyro_bias")),
     Effect("lateral_slip_speed", "s", "the robot slides sideways in curves: vy += s vx wz", 0.05, 0.005, _item("yields", 0)),
     Effect("rotation_slip_speed", "s/m", "the robot turns less at speed: wz *= 1 - s |vx|", 0.1, 0.01, _item("yields", 1)),
     Effect("longitudinal_slip_turning", "s/rad", "the robot goes less far in turns: vx *= 1 - s |wz|", 0.1, 0.01, _item("yields", 2)),

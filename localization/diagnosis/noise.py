@@ -58,8 +58,9 @@ def plain_noise(rows: FloatArray, sigmas: FloatArray, follows: NDArray[np.bool_]
     return Noise(np.where(np.isfinite(rows), sigmas, 1.0), np.eye(rows.shape[1]), np.zeros(rows.shape[1]), follows, np.ones(len(rows)))
 
 
-def estimated_noise(left: FloatArray, features: FloatArray, follows: NDArray[np.bool_], spent: float) -> Noise:
-    """By ``left`` (M, 6), what the richest explanation leaves, which has used up ``spent`` degrees of freedom."""
+def estimated_noise(left: FloatArray, features: FloatArray, follows: NDArray[np.bool_], spent: float, least: FloatArray) -> Noise:
+    """By ``left`` (M, 6), what the richest explanation leaves, which has used up ``spent`` degrees of freedom; never below ``least``
+    (M, 6)."""
     known = np.isfinite(left)
     count = int(known.sum())
     inflate = count / max(count - spent, 0.25 * count)
@@ -75,7 +76,7 @@ def estimated_noise(left: FloatArray, features: FloatArray, follows: NDArray[np.
             clipped = np.minimum(squares, _CLIP * variance)
             found = nnls(f / variance[:, None], clipped / variance)[0]
             variance = np.maximum(f @ found, 0.2 * float(np.median(variance)))
-        sigmas[use, channel] = np.sqrt(variance)
+        sigmas[use, channel] = np.maximum(np.sqrt(variance), least[use, channel])
     z = np.nan_to_num(left * np.sqrt(inflate) / sigmas, nan=0.0)
     lengths = np.abs(z).max(axis=1)
     weights = np.minimum(1.0, 4.0 / np.maximum(lengths, 1e-9))

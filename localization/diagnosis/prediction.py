@@ -22,6 +22,7 @@ from motion_models.se2 import FloatArray
 CHANNELS = ("x", "y", "yaw", "gyro", "force_x", "force_y")
 CHANNEL_UNITS = ("m", "m", "rad", "rad", "m/s^2", "m/s^2")
 _GRAVITY = 9.81
+_REMEMBERED = 100
 _NO_COLUMNS: IntArray = np.empty(0, dtype=np.int64)
 
 
@@ -54,6 +55,12 @@ class Pipeline:
             self._times[inside] = start + np.cumsum(dt) - dt - dt[: lead[w]].sum()
         self._base = self._friction.twist(self.batch.wheels, self.batch.cg, self._friction.nominal).value
         self._kinematic_forces = self._accelerations()
+        self._known: dict[tuple[object, ...], FloatArray] = {}
+
+    @property
+    def nominal_twist(self) -> FloatArray:
+        """(N, 3) by the friction model as the robot file has it, settled [m/s, m/s, rad/s]."""
+        return self._base
 
     @property
     def dropout_seen(self) -> bool:
@@ -91,7 +98,7 @@ class Pipeline:
         """(M, 6) measured minus predicted, as `CHANNELS`: motion in the predicted end's frame; NaN where nothing was measured."""
         batch, drive = self.batch, self.drive
         out = np.full((len(batch.ends), len(CHANNELS)), np.nan)
-        witness = np.array([belief.wheels_late_s - belief.lidar_late_s, belief.wheel_lag_s, *belief.lidar])
+        witness = np.array([belief.wheels_late_s - belief.lidar_late_s, belief.wheel_lag_s, *self._tracked(belief)])
         if drive.gyro_is_witness:
             witness[2:] = 0.0
         changed = _Changed(self, belief)
@@ -114,6 +121,12 @@ class Pipeline:
             out[:, 4] = drive.forces[:, 0] - self._kinematic_forces[:, 0] - (c * sx + s * sy)
             out[:, 5] = drive.forces[:, 1] - self._kinematic_forces[:, 1] - (-s * sx + c * sy)
         return out
+
+    def _tracked(self, belief: Belief) -> tuple[float, float, float]:
+        """Real pose of the frame that the LiDAR believes to be the body's: it turns about the sensor, not about the body."""
+        (x, y), (dx, dy, yaw) = self.drive.lidar_at, belief.lidar
+        c, s = math.cos(yaw), math.sin(yaw)
+        return dx + x - (c * x - s * y), dy + y - (s * x + c * y), yaw
 
     def corrected_twist(self, belief: Belief) -> FloatArray:
         """(N, 3) what the model says of every interval once ``belief`` is put in [m/s, m/s, rad/s]."""
@@ -140,7 +153,7 @@ class _Changed:
 
     def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
         p, b = self._p, self._b
-        rates = wheels * (1.0 + np.array([b.radius_left, b.radius_right]))
+        rates = wheels * np.maximum(1.0 + np.array([b.radius_left, b.radius_right]), 0.1)
         if b.encoder_lost:
             rates = rates * (1.0 + b.encoder_lost / max(p._lost_time, 1e-9) * p._lost)
         value = p.model.twist(rates, cg, params).value
@@ -162,18 +175,20 @@ class _Changed:
         if not (is_otherwise or any(b.slope) or p.settling):
             return np.zeros((len(rates), 3))
         friction = p._friction
-        nominal = friction.twist(rates, cg, friction.nominal).value
         params = friction.nominal.copy()
         for name, more in b.friction.items():
             i = friction.param_names.index(name)
             params[i] = max(params[i] * (1.0 + more), 0.05) if name == "mu_ratio" else params[i] + more
         params[6], params[7] = max(params[6], 0.0), max(params[7], 0.0)
-        moved = cg + np.array(b.cg)
-        if b.payload_kg:
+        params[9] = min(max(params[9], -0.9), 0.9)
+        params[1] = max(params[1], 0.2 * friction.nominal[1])
+        nominal = self._settled(rates, cg, friction.nominal)
+        moved = cg
+        if any(b.cg) or b.payload_kg:
             mass = p.drive.robot.geometry.mass_kg
-            moved = moved + p.drive.payload_arms * (b.payload_kg / (mass + b.payload_kg))
-        half = 0.49 * np.array([params[2], params[1]])
-        moved = np.clip(moved, -half, half)
+            moved = cg + np.array(b.cg) + (p.drive.payload_arms * (b.payload_kg / (mass + b.payload_kg)) if b.payload_kg else 0.0)
+            half = 0.49 * np.array([params[2], params[1]])
+            moved = np.clip(moved, -half, half)
         if not b.change:
             return self._moved(rates, moved, params) - nominal
         later = params.copy()
@@ -181,17 +196,34 @@ class _Changed:
         is_later = (p._times >= b.change_s)[:, None]
         return np.asarray(np.where(is_later, self._moved(rates, moved, later), self._moved(rates, moved, params)) - nominal)
 
-    def _moved(self, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
-        """(N, 3) twists of the tracked point."""
+    def _settled(self, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+        """(N, 3) twists of the tracked point without inertia; remembered, as many beliefs share them."""
         p, b = self._p, self._b
-        settled = p._friction.twist(rates, cg, params).value
+        key = (*self._rates_key(), params.tobytes(), *((b.cg, b.payload_kg) if cg is not p.batch.cg else ()))
+        if key not in p._known:
+            if len(p._known) > _REMEMBERED:
+                p._known.clear()
+            p._known[key] = p._friction.twist(rates, cg, params).value
+        return p._known[key]
+
+    def _rates_key(self) -> tuple[object, ...]:
+        b = self._b
+        return b.radius_left, b.radius_right, b.encoder_lost, b.wheels_late_s - b.lidar_late_s, b.wheel_lag_s
+
+    def _moved(self, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+        """(N, 3) twists of the tracked point, with inertia where that counts."""
+        p, b = self._p, self._b
+        settled = self._settled(rates, cg, params)
         if not (p.settling or any(b.slope)):
             return settled
-        x, y = params[TRACKED[0]], params[TRACKED[1]]
-        middle = settled + settled[:, 2:] * np.array([y, -x, 0.0])
-        batch = p.batch
-        twists = settling_twists(p.drive.robot, params, batch.dt, rates, cg, batch.first, p.headings, b.slope, middle)
-        return np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
+        key = (*self._rates_key(), params.tobytes(), b.slope, *((b.cg, b.payload_kg) if cg is not p.batch.cg else ()), "inertia")
+        if key not in p._known:
+            x, y = params[TRACKED[0]], params[TRACKED[1]]
+            middle = settled + settled[:, 2:] * np.array([y, -x, 0.0])
+            batch = p.batch
+            twists = settling_twists(p.drive.robot, params, batch.dt, rates, cg, batch.first, p.headings, b.slope, middle)
+            p._known[key] = np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
+        return p._known[key]
 
 
 def with_sizes(sizes: dict[Effect, float]) -> Belief:

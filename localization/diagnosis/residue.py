@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from localization.diagnosis.attribution import Regression, max_statistic, p_value, regression, statistic
+from localization.diagnosis.attribution import max_statistic, p_value, regression, statistic
 from localization.diagnosis.findings import Shape
 from localization.diagnosis.noise import Noise
 from localization.diagnosis.prediction import CHANNELS, Pipeline
@@ -52,10 +52,16 @@ def features(pipeline: Pipeline) -> dict[str, FloatArray]:
 
 
 def shapes(
-    pipeline: Pipeline, noise: Noise, left: FloatArray, explained: FloatArray, rng: np.random.Generator
-) -> tuple[tuple[Shape, ...], float, Regression]:
-    """Significant trends of ``left`` (M, 6), strongest first, once what ``explained`` (M, 6, q) spans is out; and the likelihood that
-    they would gain."""
+    pipeline: Pipeline,
+    noise: Noise,
+    left: FloatArray,
+    signatures: FloatArray,
+    nuisances: FloatArray,
+    spreads: FloatArray,
+    rng: np.random.Generator,
+) -> tuple[tuple[Shape, ...], float]:
+    """Significant trends of ``left`` (M, 6), strongest first, beyond what causes of ``signatures`` (M, 6, p) make within their ``spreads``
+    (p,) and ``nuisances`` (M, 6, q) at any size; and twice the log-likelihood that they would gain."""
     found = features(pipeline)
     measured = [c for c in range(_COMPONENTS) if np.isfinite(left[:, c]).any()]
     columns, names = [], []
@@ -66,20 +72,23 @@ def shapes(
             columns.append(np.where(np.isfinite(left), column, np.nan))
             names.append((CHANNELS[channel], name))
     y = noise.whiten(left).ravel()
-    s = noise.whiten(np.stack(columns, axis=-1)).reshape(len(y), -1)
-    z = noise.whiten(explained).reshape(len(y), -1) if explained.shape[-1] else np.zeros((len(y), 0))
-    problem = regression(y, s, z, np.ones(s.shape[1]))
-    df = max(int(np.isfinite(left).sum()) - s.shape[1] - z.shape[1], 10)
+    trends = np.stack(columns, axis=-1)
+    s = noise.whiten(np.concatenate([trends, signatures], axis=-1)).reshape(len(y), -1)
+    z = noise.whiten(nuisances).reshape(len(y), -1)
+    n = len(names)
+    scale = np.r_[np.ones(n), spreads]
+    problem = regression(y, s, z, scale, np.r_[np.zeros(n), spreads])
+    df = max(int(np.isfinite(left).sum()) - n - z.shape[1], 10)
     given: tuple[int, ...] = ()
     result = []
     gained = 0.0
     for _ in range(3):
-        t = np.array([0.0 if i in given else statistic(problem, given, i) for i in range(len(names))])
+        t = np.array([0.0 if i in given else statistic(problem, given, i) for i in range(n)])
         best = int(np.argmax(np.abs(t)))
-        p = p_value(float(t[best]), max_statistic(problem, given, rng, df))
+        p = p_value(float(t[best]), max_statistic(problem, given, rng, df, n))
         if p > _SIGNIFICANT:
             break
         gained += float(t[best]) ** 2
         result.append(Shape(*names[best], float(t[best]), p))
         given = (*given, best)
-    return tuple(result), gained, problem
+    return tuple(result), gained
