@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import functools
+import math
 import tempfile
+import time
+from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from rosbags.typesys import Stores, get_typestore
 
 from localization.estimators import Estimate
 from localization.logs import open_log
+from localization.logs.source import open_source
 from localization.online.core import Core, Pair
+from localization.online.node import Node, NodeConfig
+from localization.online.session import Files
+from localization.online.tell import DIAGNOSTICS, ODOMETRY, TF
+from localization.online.transport import Received
 from localization.simulate.drives import MoveArms, OpenLoop, Rest, constant
 from localization.simulate.experiments import Experiment
 from localization.simulate.sensors import EncoderConfig
@@ -60,3 +70,85 @@ def numbers(estimate: Estimate) -> tuple:
     """All of an estimate, to the last bit."""
     arrays = (estimate.pose, estimate.covariance, estimate.twist, estimate.twist_covariance)
     return estimate.stamp_ns, *(None if a is None else np.asarray(a).tobytes() for a in arrays), estimate.nis
+
+
+class LogTransport:
+    """A robot made of a log: its messages as bytes, as fast as they are taken; ``spoil`` may lose, double, delay or change them."""
+
+    is_ros1 = False
+
+    def __init__(self, path: Path, spoil: Callable[[list[Received]], list[Received]] = list, types: dict[str, str] | None = None) -> None:
+        source = open_source(path)
+        self.types = {channel.topic: channel.type for channel in source.channels} | (types or {})
+        base = time.monotonic_ns() - (source.end_ns - source.start_ns)
+        messages = [Received(m.topic, base + m.log_ns - source.start_ns, m.data) for m in source.messages(list(self.types))]
+        self._left = deque(spoil(messages))
+        self._begin: int | None = None
+        self.subscribed: dict[str, bool] = {}
+        self.published: dict[str, list[bytes]] = {}
+        self.is_closed = False
+
+    def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
+        self.subscribed[topic] = is_latched
+
+    def advertise(self, topic: str, kind: str) -> None:
+        self.published[topic] = []
+
+    def publish(self, topic: str, data: bytes) -> None:
+        self.published[topic].append(data)
+
+    def publishers(self) -> dict[str, set[str]]:
+        return {topic: {kind} for topic, kind in self.types.items()}
+
+    def take(self, timeout_s: float) -> list[Received]:
+        """The first two seconds at once, then a tenth of a second at a time."""
+        if not self._left:
+            return []
+        span = 100_000_000 if self._begin is not None else 2_000_000_000
+        self._begin = end = (self._left[0].received_ns if self._begin is None else self._begin) + span
+        found = []
+        while self._left and self._left[0].received_ns < end:
+            found.append(self._left.popleft())
+        return [message for message in found if message.topic in self.subscribed]
+
+    def is_empty(self) -> bool:
+        return not self._left
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+def run_node(transport: LogTransport, estimator: str = "ekf", files: Files | None = None, **options) -> tuple[Node, list[str]]:
+    """A node over all that ``transport`` holds, and what it told."""
+    told: list[str] = []
+    node = Node.start(
+        transport,
+        ROBOT,
+        lambda has_lidar: Pair(make_model("skid_steer", ROBOT), estimator),
+        files or Files(),
+        told.append,
+        node=NodeConfig(wait_s=0.0),
+        **options,
+    )
+    node.spin(transport.is_empty)
+    return node, told
+
+
+def published(transport: LogTransport, topic: str) -> list:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kinds = {ODOMETRY: "nav_msgs/msg/Odometry", TF: "tf2_msgs/msg/TFMessage", DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray"}
+    return [store.deserialize_cdr(data, kinds.get(topic, "sensor_msgs/msg/JointState")) for data in transport.published[topic]]
+
+
+def stamp_of(message) -> int:
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+
+
+def track(transport: LogTransport) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Pose and sigmas (x, y, yaw) that were published, by stamp."""
+    found = {}
+    for m in published(transport, ODOMETRY):
+        q, p = m.pose.pose.orientation, m.pose.pose.position
+        pose = np.array([p.x, p.y, 2.0 * math.atan2(q.z, q.w)])
+        found[stamp_of(m)] = pose, np.sqrt(m.pose.covariance[[0, 7, 35]])
+    return found

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
 import math
 import signal
+import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from types import FrameType
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 from rich.console import Console
@@ -68,26 +67,29 @@ class Online:
 
     def run(self, console: Console) -> None:
         rate, files, robot = parse_rate(self.rate), Files(self.out, self.state), load_robot(self.robot)
-        with _terminated_as_interrupted():
+        with Stop() as stop:
             if self.log is not None:
-                self._play(console, self.log, rate, files, robot)
+                self._play(console, self.log, rate, files, robot, stop)
             else:
-                self._spin(console, files, robot)
+                self._spin(console, files, robot, stop)
 
-    def _play(self, console: Console, path: Path, rate: float, files: Files, robot: Robot) -> None:
+    def _play(self, console: Console, path: Path, rate: float, files: Files, robot: Robot, stop: Stop) -> None:
         log = open_log(path, robot, self.topic)
         has_lidar = log.sources.lidar is not None
-        pair = self._pair(robot, has_lidar)
+        pair = self._pair(has_lidar)
         made = made_by(pair, robot, log.mounts, has_lidar, self.config, f"log {fingerprint(path)[:12]}")
         core = Core(pair, robot, log.mounts, has_lidar, self.config)
         session = Session.start(files, core, f"{pair.model.name}_{pair.estimator}", made)
         if session.head:
             console.print(f"resumed from {files.state} after {session.count} events", markup=False, soft_wrap=True)
-        pace, began, first_ns, shown, seconds, is_done = Pace(rate), time.monotonic(), None, -math.inf, 0.0, False
+        pace, began, first_ns, shown, seconds, is_done = Pace(rate, sleep=stop.sleep), time.monotonic(), None, -math.inf, 0.0, False
         try:
             with Live(console=console, auto_refresh=False, transient=True) as live:
                 for event in islice(log.events(), session.count, None):
                     pace.wait(event.stamp_ns)
+                    if stop.is_set():
+                        session.dump(now=True)
+                        raise KeyboardInterrupt
                     session.push(event)
                     session.dump()
                     first_ns = event.stamp_ns if first_ns is None else first_ns
@@ -101,28 +103,22 @@ class Online:
             count = session.write_out()
             is_done = True
         finally:
-            if not is_done:
-                session.dump(now=True)
             session.close(forget=is_done)
         for note in dict.fromkeys([*log.notes(), *session.core.stepper.notes()]):
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         self._summarize(console, session, seconds, count)
 
-    def _spin(self, console: Console, files: Files, robot: Robot) -> None:
+    def _spin(self, console: Console, files: Files, robot: Robot, stop: Stop) -> None:
         def tell(said: str) -> None:
             console.print(f"[yellow]![/] {escape(said)}", soft_wrap=True)
 
         transport = self._transport()
         try:
-            node = Node.start(
-                transport, robot, lambda has_lidar: self._pair(robot, has_lidar), files, tell, self.topic, self.config, self.node
-            )
+            node = Node.start(transport, robot, self._pair, files, tell, self.topic, self.config, self.node, stop.is_set)
             console.print(f"running {self.model} in {self.estimator} on {', '.join(node.topics)}", markup=False, soft_wrap=True)
-            try:
-                with contextlib.suppress(KeyboardInterrupt), Live(console=console, auto_refresh=False, transient=True) as live:
-                    node.spin(on_line=lambda n: self._show(console, live, n))
-            finally:
-                count = node.finish()
+            with Live(console=console, auto_refresh=False, transient=True) as live:
+                node.spin(stop.is_set, lambda n: self._show(console, live, n))
+            count = node.finish()
         finally:
             transport.close()
         for said in node.notes():
@@ -146,10 +142,10 @@ class Online:
 
         return DdsTransport(self.domain, self.interface)
 
-    def _pair(self, robot: Robot, has_lidar: bool) -> Pair:
+    def _pair(self, has_lidar: bool) -> Pair:
         check_estimator(self.estimator, has_lidar)
         (form,) = check_forms([self.corrections])
-        return Pair(make_model(self.model, robot), self.estimator, form)
+        return Pair(make_model(self.model, load_robot(self.robot)), self.estimator, form)
 
     def _show(self, console: Console, live: Live, node: Node) -> None:
         if console.is_terminal:
@@ -172,15 +168,30 @@ def parse_rate(text: str) -> float:
     return rate
 
 
-@contextlib.contextmanager
-def _terminated_as_interrupted() -> Iterator[None]:
-    """What stops services (SIGTERM) ends as Ctrl-C does: with the state and the output on disk."""
+class Stop:
+    """Ctrl-C, and what stops services (SIGTERM): noted, and obeyed between two events, for half an event is no state. The second
+    Ctrl-C does not wait."""
 
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
+    def __init__(self) -> None:
+        self._asked = threading.Event()
+        self._before: dict[int, Any] = {}
 
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    def __enter__(self) -> Stop:
+        self._before = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        if self._asked.is_set():
+            raise KeyboardInterrupt
+        self._asked.set()
+
+    def is_set(self) -> bool:
+        return self._asked.is_set()
+
+    def sleep(self, seconds: float) -> None:
+        """Until then, or until asked to stop."""
+        self._asked.wait(seconds)

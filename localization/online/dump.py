@@ -68,7 +68,7 @@ def dump_bytes(value: Any, head: Mapping[str, Any], made_by: Mapping[str, str], 
 
 
 def _store(path: Path, body: bytes, after: Sequence[int]) -> None:
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    beside = _beside(path)
     try:
         for file_number in after:
             os.fsync(file_number)
@@ -82,6 +82,17 @@ def _store(path: Path, body: bytes, after: Sequence[int]) -> None:
         with contextlib.suppress(OSError):
             beside.unlink()
         raise DumpError(f"the state cannot be written to '{path}': {error.strerror}.") from error
+
+
+def _beside(path: Path) -> Path:
+    """Where a state is until it is whole; what a process that was killed has left there is written over."""
+    return path.with_name(f".{path.name}.new")
+
+
+def remove_dump(path: Path) -> None:
+    """The state, and what is left of one."""
+    for left in (path, _beside(path)):
+        left.unlink(missing_ok=True)
 
 
 def read_head(path: Path) -> Mapping[str, Any]:

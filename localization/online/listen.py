@@ -60,7 +60,9 @@ class Listener:
         self._counts: Counter[str] = Counter()
         self._first: dict[str, tuple[int, int]] = {}
 
-    def listen(self, wait_s: float, needed: Iterable[str], tell: Callable[[str], None], epoch_ns: int) -> Heard:
+    def listen(
+        self, wait_s: float, needed: Iterable[str], tell: Callable[[str], None], epoch_ns: int, is_over: Callable[[], bool]
+    ) -> Heard:
         """Wait for wheels or a LiDAR, for the topics ``needed``, and for at most ``wait_s`` [s] for others that somebody publishes.
 
         Those that are silent are told, again and again. ``epoch_ns`` makes times of the wall of times of receiving. Raises `DoorError`
@@ -69,7 +71,7 @@ class Listener:
         needed = {*needed, *self._asked}
         begin = told = time.monotonic()
         said = ""
-        while True:
+        while not is_over():
             for received in self._transport.take(_POLL_S):
                 self._hear(received, epoch_ns)
             now = time.monotonic()
@@ -86,6 +88,7 @@ class Listener:
             if now - begin > wait_s and ((now_said := self._silence(published, silent)) != said or now - told > _TELL_AGAIN_S):
                 said, told = now_said, now
                 tell(said)
+        raise KeyboardInterrupt
 
     def _hear(self, received: Received, epoch_ns: int) -> None:
         if received.topic == TF_STATIC:

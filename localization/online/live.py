@@ -15,7 +15,7 @@ from localization.errors import DumpError
 from localization.events import Event
 from localization.logs.intake import Intake, read_item
 from localization.logs.merge import Merger
-from localization.logs.tally import Tally
+from localization.logs.tally import Oddity, Tally
 from localization.logs.topics import TYPES, Sources
 from localization.logs.wheels import JointsToWheels, OdometryToWheels
 from localization.logs.wire import decoder
@@ -25,6 +25,7 @@ from motion_models.robot import Robot
 
 _NS = 1e-9
 _OLDEST_S, _NEWEST_S = 3600.0, 1.0
+_LATE = "dropped (came after newer ones)"
 _SILENT_S, _PERIODS = 1.0, 5.0
 
 
@@ -80,7 +81,13 @@ class Stream:
 
     def dropped(self) -> list[str]:
         """Sentences of what was mended or dropped."""
-        return self._tally.sentences()
+        found = []
+        for topic in self._watches:
+            for oddity in Oddity:
+                if (count := self._tally.of(topic, oddity)) and oddity is not Oddity.OUT_OF_ORDER:
+                    what = _LATE if oddity is Oddity.LATE else oddity.value
+                    found.append(f"{topic}: {count} message{'s' * (count > 1)} {what}.")
+        return found
 
 
 class _Watch:

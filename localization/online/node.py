@@ -60,15 +60,18 @@ class Node:
         topics: TopicOverrides | None = None,
         config: ReplayConfig | None = None,
         node: NodeConfig | None = None,
+        is_over: Callable[[], bool] = lambda: False,
     ) -> Node:
         """Listen, then begin, or go on from the state on disk. ``make_pair`` is told whether there is a LiDAR; ``tell`` hears what a
-        person should know meanwhile. Raises `DoorError`, `TopicError`, `EstimatorError`, `DumpError` and `OutputError`.
+        person should know meanwhile; ``is_over`` ends it (`KeyboardInterrupt`).
+
+        Raises `DoorError`, `TopicError`, `EstimatorError`, `DumpError` and `OutputError`.
         """
         config, node = config or ReplayConfig(), node or NodeConfig()
         epoch_ns = time.time_ns() - time.monotonic_ns()
         listener = Listener(transport, robot, topics or TopicOverrides())
         needed = read_head(files.state).get("topics", []) if files.state is not None and files.state.exists() else []
-        heard = listener.listen(node.wait_s, needed, tell, epoch_ns)
+        heard = listener.listen(node.wait_s, needed, tell, epoch_ns, is_over)
         for note in heard.parts.notes:
             tell(note)
         has_lidar = heard.parts.sources.lidar is not None
@@ -110,11 +113,10 @@ class Node:
 
     def finish(self) -> int | None:
         """Write the output and the last state; returns how many estimates there were, if an output was wanted."""
-        try:
-            self.session.dump(self._head, now=True)
-            return self.session.write_out()
-        finally:
-            self.session.close()
+        self.session.dump(self._head, now=True)
+        count = self.session.write_out()
+        self.session.close()
+        return count
 
     @property
     def topics(self) -> list[str]:

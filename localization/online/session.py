@@ -12,7 +12,7 @@ from localization.estimators import Estimate
 from localization.events import Event
 from localization.logs.fused import write_fused
 from localization.online.core import Core, Pair, ReplayConfig
-from localization.online.dump import Dumper, fingerprints, read_dump
+from localization.online.dump import Dumper, fingerprints, read_dump, remove_dump
 from localization.online.health import Health
 from localization.online.records import Spool, fused_estimates, trajectory
 from localization.trajectory import write_tum
@@ -138,6 +138,6 @@ class Session:
         if self._dumper is not None:
             self._dumper.close()
             if forget:
-                self._dumper.path.unlink(missing_ok=True)
+                remove_dump(self._dumper.path)
         if self._spool is not None:
             self._spool.close()

@@ -1,0 +1,374 @@
+"""The estimator live: the same numbers as a replay's, whatever happens to messages, clocks and sensors on the way."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import sys
+import types
+
+import numpy as np
+import pytest
+
+from localization.errors import DoorError, DumpError, TopicError
+from localization.events import Scan
+from localization.logs import TopicOverrides, open_log
+from localization.logs.wire import encode
+from localization.online.health import ERROR, OK, WARN, degeneracy
+from localization.online.pace import Pace
+from localization.online.session import Files
+from localization.online.tell import CORRECTIONS, DIAGNOSTICS, ODOMETRY, TF
+from localization.run import Pair, replay
+from localization.trajectory import read_tum
+from motion_models.registry import make_model
+from tests import bags
+from tests.online_help import ROBOT, LogTransport, drive_events, drive_log, published, run_node, stamp_of, track
+
+S = 1_000_000_000
+pytestmark = pytest.mark.xdist_group("online")
+
+
+@functools.cache
+def undisturbed(estimator):
+    transport = LogTransport(drive_log())
+    node, told = run_node(transport, estimator)
+    return transport, node, told
+
+
+@pytest.fixture
+def calm():
+    return undisturbed("ekf")
+
+
+def worst(faulty, calm):
+    """Largest change of the pose at any common stamp, in sigmas, and the pair of final poses."""
+    a, b = track(calm), track(faulty)
+    common = sorted(set(a) & set(b))
+    ratios = [np.abs(_wrapped(b[s][0] - a[s][0])) / np.maximum(a[s][1], 1e-9) for s in common if a[s][1].min() > 0.0]
+    return float(np.max(ratios)), len(common) / len(a)
+
+
+def _wrapped(difference):
+    return np.array([difference[0], difference[1], math.remainder(difference[2], math.tau)])
+
+
+def test_live_and_replay_give_the_same_numbers(calm):
+    transport, node, told = calm
+    log = open_log(drive_log(), ROBOT)
+    run = replay(log.events(), [Pair(make_model("skid_steer", ROBOT), "ekf")], ROBOT, log.mounts, True)[0]
+    live = track(transport)
+    assert list(live) == run.trajectory.stamps_ns.tolist()
+    for stamp, pose, covariance in zip(live, run.trajectory.poses, run.trajectory.covariances, strict=True):
+        assert np.abs(_wrapped(live[stamp][0] - pose)).max() < 1e-12  # the heading passed through a quaternion
+        turn = np.array([[math.cos(pose[2]), -math.sin(pose[2])], [math.sin(pose[2]), math.cos(pose[2])]])
+        in_odom = np.diag(turn @ covariance[:2, :2] @ turn.T)  # ROS's covariance is in the axes of odom
+        np.testing.assert_allclose(live[stamp][1] ** 2, [*in_odom, covariance[2, 2]], rtol=1e-9, atol=1e-18)
+    assert told == []
+    assert node.notes() == []
+
+
+def test_what_is_published(calm):
+    transport, node, _ = calm
+    odometry, tf = published(transport, ODOMETRY), published(transport, TF)
+    assert len(odometry) == len(tf) > 250
+    turning = [m for m in odometry if abs(m.twist.twist.angular.z) > 0.3]
+    lateral = np.array([m.twist.twist.linear.y / m.twist.twist.angular.z for m in turning])
+    assert np.median(np.abs(lateral)) > 0.005  # a skid-steer turns about a point that is not its centre: vy is not 0
+    last = tf[-1].transforms[0]
+    assert (last.header.frame_id, last.child_frame_id) == ("odom", "base_link")
+    assert last.transform.translation.x == odometry[-1].pose.pose.position.x
+    corrections = published(transport, CORRECTIONS)[-1]
+    assert {"gyro_bias_rad_per_s", "wheel_clock_offset_s", "k_0"} <= set(corrections.name)
+    assert len(corrections.position) == len(corrections.effort) == len(corrections.name)
+    assert (corrections.effort > 0.0).all()
+    statuses = {s.name: s for s in published(transport, DIAGNOSTICS)[-1].status}
+    assert set(statuses) == {"skidloc: estimate", "skidloc: lidar", "skidloc: wheels", "skidloc: messages"}
+    values = {v.key: v.value for v in statuses["skidloc: lidar"].values}
+    assert {"degeneracy", "nis_mean", "contradictions"} <= set(values)
+    assert float(values["degeneracy"]) > 0.2
+    assert "slip_wz_rad_s" in {v.key for v in statuses["skidloc: wheels"].values}
+    assert node.session.health.latency_p99_s > 0.0
+
+
+def test_subscriptions_are_of_sensor_data_but_for_static_transforms(calm):
+    subscribed = calm[0].subscribed
+    assert [topic for topic, is_latched in subscribed.items() if is_latched] == ["/tf_static"]
+    assert {"/joint_states", "/scan", "/points", "/imu/data", "/center_of_gravity"} <= set(subscribed)
+
+
+@pytest.mark.parametrize(("estimator", "seed"), [("ekf", 0), ("ekf", 1), ("graph", 2)])
+def test_loss_duplicates_and_reordering_change_the_pose_by_less_than_its_sigma(estimator, seed):
+    faulty = LogTransport(drive_log(), lambda messages: shaken(messages, seed))
+    node, _ = run_node(faulty, estimator)
+    ratio, share = worst(faulty, undisturbed(estimator)[0])
+    assert share > 0.97
+    assert ratio < 1.0
+    assert any("stamp repeated" in note for note in node.notes())
+    assert any("came after newer ones" in note for note in node.notes())
+
+
+def shaken(messages, seed, loss=0.01, doubled=0.05, late_s=0.05):
+    rng = np.random.default_rng(seed)
+    found = []
+    for m in messages:
+        if m.topic == "/tf_static" or rng.random() >= loss:
+            copies = 2 if rng.random() < doubled else 1
+            found += [m._replace(received_ns=m.received_ns + int(rng.uniform(0.0, late_s * S))) for _ in range(copies)]
+    return sorted(found, key=lambda m: m.received_ns)
+
+
+def restamped(message, shift_ns, kinds={"/scan": "LaserScan", "/joint_states": "JointState", "/imu/data": "Imu"}):  # noqa: B006
+    if message.topic not in kinds:
+        return message
+    kind = f"sensor_msgs/msg/{kinds[message.topic]}"
+    content = bags.STORE.deserialize_cdr(message.data, kind)
+    stamp = stamp_of(content) + shift_ns
+    content.header.stamp.sec, content.header.stamp.nanosec = stamp // S, stamp % S
+    return message._replace(data=encode(content))
+
+
+@pytest.mark.parametrize("jump_s", [500.0, -0.9, 3.0])
+def test_the_clock_of_all_sensors_jumps(jump_s, calm):
+    """Set forward, back, and by little: the pose hardly notices, and what is published bears the sender's new stamps."""
+
+    def jumping(messages):
+        half = messages[len(messages) // 2].received_ns
+        return [restamped(m, int(jump_s * S)) if m.received_ns >= half else m for m in messages]
+
+    transport = LogTransport(drive_log(), jumping)
+    node, _ = run_node(transport)
+    stamps = [stamp_of(m) for m in published(transport, ODOMETRY)]
+    truth, found = list(track(calm[0]).values())[-1], list(track(transport).values())[-1]
+    if abs(jump_s) > 1.0:
+        assert stamps[-1] - stamps[0] == pytest.approx((20.0 + jump_s) * S, abs=2 * S)
+        assert any("jump of the clock" in note for note in node.notes())
+    assert np.all(np.abs(_wrapped(found[0] - truth[0])) < 3.0 * truth[1] + 0.02)
+
+
+def silenced(topic, begin_s, end_s):
+    def spoil(messages):
+        first = messages[0].received_ns
+        return [m for m in messages if m.topic != topic or not begin_s * S <= m.received_ns - first < end_s * S]
+
+    return spoil
+
+
+@pytest.mark.parametrize("topic", ["/scan", "/imu/data", "/joint_states"])
+def test_a_sensor_vanishes_and_returns(topic, calm):
+    transport = LogTransport(drive_log(), silenced(topic, 6.0, 10.0))
+    node, _ = run_node(transport)
+    a, b = track(calm[0]), track(transport)
+    stamps = np.array(list(b))
+    assert np.diff(stamps).max() < 0.7 * S  # the others carry on
+    common = sorted(set(a) & set(b))
+    gap = [s for s in common if 7.0 * S < s - common[0] < 9.8 * S]
+    if gap and topic == "/scan":
+        assert b[gap[-1]][1][0] > a[gap[-1]][1][0]  # and it is less sure meanwhile
+    truth, found = a[common[-1]], b[common[-1]]
+    assert np.all(np.abs(_wrapped(found[0] - truth[0])) < 3.0 * np.maximum(found[1], truth[1]) + 0.01)
+    assert node.session.core.estimator.counts()["matched"] > 150
+
+
+def test_diagnostics_say_which_topic_is_silent(calm):
+    _, node, _ = calm
+    watches = node._stream._watches
+    assert node._stream.silent(max(w._last_ns for w in watches.values())) == {}
+    later = node._stream.silent(max(w._last_ns for w in watches.values()) + 3 * S)
+    assert set(later) == {"/joint_states", "/scan", "/imu/data"}
+    status = node.session.health.statuses(node.session.core, [], later)[-1]
+    assert status.level == ERROR
+    assert "/scan" in status.message
+
+
+def test_degeneracy_tells_corridors_from_rooms(calm):
+    rng = np.random.default_rng(0)
+    angle = np.radians(np.linspace(-135.0, 135.0, 760))
+
+    def scan(distance):
+        r = np.minimum(distance, 30.0) + rng.normal(0.0, 0.02, 760)
+        return np.column_stack([r * np.cos(angle), r * np.sin(angle)])[r < 29.0]
+
+    with np.errstate(divide="ignore"):
+        for turn in (0.0, 0.4):
+            assert degeneracy(scan(1.5 / np.abs(np.sin(angle + turn)))) < 0.02
+        assert degeneracy(scan(np.minimum(3.0 / np.abs(np.sin(angle)), 4.0 / np.abs(np.cos(angle))))) > 0.2
+    assert degeneracy(np.zeros((5, 2))) is None
+    _, node, _ = calm
+    health = node.session.health
+    health._degeneracy = 0.01
+    assert health.statuses(node.session.core)[1].level == WARN
+    health._degeneracy = 0.3
+    assert health.statuses(node.session.core)[1].level == OK
+
+
+def test_silence_is_told_and_then_the_run_begins():
+    quiet = LogTransport(drive_log())
+    polls = 0
+    take = quiet.take
+
+    def late(timeout_s):
+        nonlocal polls
+        polls += 1
+        return take(timeout_s) if polls > 3 else []
+
+    quiet.take = late
+    quiet.types = {}
+    _, told = run_node(quiet)
+    assert "nothing comes on /joint_states (sensor_msgs/JointState)" in told[0]
+    assert "/scan (sensor_msgs/LaserScan)" in told[0]
+    assert len(told) == 1  # it is not said again and again
+    named = LogTransport(drive_log(), silenced("/scan", 0.0, 5.0))
+    named.types.pop("/scan")
+    _, told = run_node(named, topics=TopicOverrides(scan="/scan"))
+    assert told[0] == "waiting for /scan (nobody publishes it)."
+
+
+def test_a_topic_of_another_type_is_refused():
+    transport = LogTransport(drive_log(), silenced("/scan", 0.0, 99.0), types={"/scan": "sensor_msgs/msg/PointCloud2"})
+    with pytest.raises(DoorError, match=r"'/scan' carries sensor_msgs/PointCloud2, not sensor_msgs/LaserScan. Pass --topic.points /scan"):
+        run_node(transport)
+
+
+def test_joint_states_without_the_wheels_are_refused():
+    robot = dataclasses.replace(ROBOT, joints=dataclasses.replace(ROBOT.joints, left=("no_wheel",)))
+    from localization.online.node import Node, NodeConfig
+
+    with pytest.raises(TopicError, match="no joint states of the live topics have the wheel joints"):
+        Node.start(LogTransport(drive_log()), robot, lambda has_lidar: None, Files(), print, node=NodeConfig(wait_s=0.0))
+
+
+def test_bytes_that_are_no_message_are_dropped_and_counted():
+    def garbled(messages):
+        return [m._replace(data=m.data[: len(m.data) // 2]) if m.topic == "/scan" and i % 50 == 0 else m for i, m in enumerate(messages)]
+
+    node, _ = run_node(LogTransport(drive_log(), garbled))
+    assert any("/scan" in note and "not of the type" in note for note in node.notes())
+    assert node.session.core.estimator.counts()["matched"] > 200
+
+
+def test_a_node_that_is_killed_goes_on_where_it_was(tmp_path, calm):
+    """Without its core, by the state on disk alone; the second node hears only what comes after."""
+    files = Files(tmp_path / "run.tum", tmp_path / "state")
+
+    def part(begin, end):
+        return lambda messages: [
+            m for i, m in enumerate(messages) if m.topic == "/tf_static" or begin <= (m.received_ns - messages[0].received_ns) / S < end
+        ]
+
+    first = LogTransport(drive_log(), part(0.0, 10.0))
+    node, _ = run_node(first, files=files)
+    node.session.dump(node._head, now=True)
+    node.session._dumper.wait()  # kill -9 from here: no finish, no close
+    second = LogTransport(drive_log(), part(10.5, 99.0))
+    node, told = run_node(second, files=files)
+    assert node.finish() == len(read_tum(tmp_path / "run.tum"))
+    assert "resumed from" in told[-1]
+    a, b = track(calm[0]), track(second)
+    common = sorted(set(a) & set(b))
+    for s in (common[10], common[-1]):
+        assert np.all(np.abs(_wrapped(b[s][0] - a[s][0])) < 3.0 * np.maximum(a[s][1], b[s][1]))
+    assert np.hypot(*b[common[0]][0][:2]) > 0.3  # and not from the origin
+    assert (tmp_path / "state").exists()
+    assert len(read_tum(tmp_path / "run.tum")) > 0.9 * len(a)
+
+
+def test_a_state_of_another_time_is_refused(tmp_path):
+    files = Files(state=tmp_path / "state")
+    for shift_s, said in ((7200.0, "2.0 h old"), (-60.0, "ahead of the robot's clock")):
+        node, _ = run_node(LogTransport(drive_log(), lambda messages: messages[:1000]), files=files)
+        node.finish()
+        later = LogTransport(
+            drive_log(), lambda messages, by=shift_s: [messages[0]] + [restamped(m, int((by + 30.0) * S)) for m in messages[1000:]]
+        )
+        with pytest.raises(DumpError, match=said):
+            run_node(later, files=files)
+        (tmp_path / "state").unlink()
+
+
+def test_pace_keeps_the_logs_time_and_skips_its_pauses():
+    now, slept = [100.0], []
+
+    def sleep(seconds):
+        slept.append(seconds)
+        now[0] += seconds
+
+    pace = Pace(2.0, lambda: now[0], sleep)
+    for stamp in (0, S, S, 3 * S, 1003 * S):
+        pace.wait(stamp)
+    assert now[0] == pytest.approx(100.0 + 0.5 + 1.0 + 2.5)
+    now[0] += 1.0  # whoever is late catches up
+    pace.wait(1004 * S)
+    pace.wait(1006 * S)
+    assert now[0] == pytest.approx(104.0 + 0.5 + 1.0)
+    slept.clear()
+    Pace(math.inf, sleep=sleep).wait(0)
+    assert slept == []
+
+
+def test_scans_of_the_drive_are_what_the_tests_believe():
+    events, _ = drive_events()
+    scans = [e for e in events if isinstance(e, Scan)]
+    assert len(scans) > 250
+    assert 8.0 * S < scans[-1].stamp_ns - scans[0].stamp_ns < 30.0 * S
+
+
+class _FakeRclpy(types.ModuleType):
+    """What of rclpy the door uses, as its documentation has it."""
+
+    def __init__(self):
+        super().__init__("rclpy")
+        self.subscriptions, self.sent, self.waiting = {}, [], []
+
+    def init(self, args=None): ...
+
+    def try_shutdown(self): ...
+
+    def create_node(self, name):
+        return self
+
+    def destroy_node(self): ...
+
+    def create_subscription(self, kind, topic, callback, quality, raw):
+        assert raw
+        self.subscriptions[topic] = kind, callback, quality
+
+    def create_publisher(self, kind, topic, depth):
+        return types.SimpleNamespace(publish=lambda data: self.sent.append((topic, data)))
+
+    def get_publishers_info_by_topic(self, topic):
+        return [types.SimpleNamespace(topic_type="sensor_msgs/msg/LaserScan")]
+
+    def spin_once(self, node, timeout_sec):
+        if self.waiting:
+            topic, data = self.waiting.pop(0)
+            self.subscriptions[topic][1](data)
+
+
+def test_rclpy_door_by_its_documented_interface(monkeypatch):
+    fake, quality = _FakeRclpy(), types.ModuleType("rclpy.qos")
+    quality.QoSProfile = lambda **fields: types.SimpleNamespace(**fields)
+    quality.ReliabilityPolicy = types.SimpleNamespace(RELIABLE="reliable", BEST_EFFORT="best effort")
+    quality.DurabilityPolicy = types.SimpleNamespace(TRANSIENT_LOCAL="transient local", VOLATILE="volatile")
+    for name, module in {"rclpy": fake, "rclpy.qos": quality}.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    for package, kinds in {"sensor_msgs": ["LaserScan"], "tf2_msgs": ["TFMessage"], "nav_msgs": ["Odometry"]}.items():
+        messages = types.ModuleType(f"{package}.msg")
+        for kind in kinds:
+            setattr(messages, kind, type(kind, (), {}))
+        monkeypatch.setitem(sys.modules, f"{package}.msg", messages)
+    from localization.online.ros2 import RclpyTransport
+
+    transport = RclpyTransport()
+    transport.subscribe("/scan", "sensor_msgs/msg/LaserScan", is_latched=False)
+    transport.subscribe("/tf_static", "tf2_msgs/msg/TFMessage", is_latched=True)
+    transport.advertise("/skidloc/odometry", "nav_msgs/msg/Odometry")
+    assert (fake.subscriptions["/scan"][2].reliability, fake.subscriptions["/scan"][2].durability) == ("best effort", "volatile")
+    latched = fake.subscriptions["/tf_static"][2]
+    assert (latched.reliability, latched.durability) == ("reliable", "transient local")
+    fake.waiting = [("/scan", b"one"), ("/tf_static", b"two")]
+    assert [(r.topic, r.data) for r in transport.take(0.1)] == [("/scan", b"one"), ("/tf_static", b"two")]
+    transport.publish("/skidloc/odometry", b"three")
+    assert fake.sent == [("/skidloc/odometry", b"three")]
+    assert transport.publishers()["/scan"] == {"sensor_msgs/msg/LaserScan"}
+    transport.close()

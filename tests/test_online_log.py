@@ -1,0 +1,166 @@
+"""`skidloc online` on a log: the bytes of a replay, also after kill -9; files that cannot be gone on from are refused."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from localization.cli import main
+from localization.online.dump import read_head
+from tests.online_help import drive_log
+
+COMMAND = (sys.executable, "-m", "localization.cli", "online")
+
+
+pytestmark = pytest.mark.xdist_group("online")
+
+
+@pytest.fixture(scope="module")
+def replayed(tmp_path_factory):
+    out = tmp_path_factory.mktemp("online") / "replayed"
+    options = ("--robot", "vaultbot", "--model", "skid_steer", "--estimator", "ekf", "--reference", "none")
+    assert main(["replay", str(drive_log()), *options, "--out", str(out)]) == 0
+    return out
+
+
+def online(*arguments):
+    return main(["online", str(drive_log()), "--robot", "vaultbot", *map(str, arguments)])
+
+
+def test_its_output_is_the_replays_to_the_last_byte(replayed, tmp_path, capsys):
+    assert online("--rate", "max", "--out", tmp_path / "fused.mcap") == 0  # a bag's name is written in it
+    assert (tmp_path / "fused.mcap").read_bytes() == (replayed / "fused.mcap").read_bytes()
+    assert online("--rate", "max", "--out", tmp_path / "run.tum") == 0
+    assert (tmp_path / "run.tum").read_bytes() == (replayed / "skid_steer_ekf.tum").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fused.mcap", "run.tum"]
+    assert "estimates" in capsys.readouterr().out
+
+
+def start(tmp_path, rate):
+    files = ("--out", tmp_path / "fused.mcap", "--state", tmp_path / "state")
+    return subprocess.Popen(
+        [*COMMAND, drive_log(), "--robot", "vaultbot", "--rate", rate, *files], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def wait_for_state(tmp_path, process, events):
+    end = time.monotonic() + 60.0
+    while time.monotonic() < end and process.poll() is None:
+        if (tmp_path / "state").exists() and read_head(tmp_path / "state")["events"] > events:
+            return
+        time.sleep(0.02)
+    pytest.fail(f"no state: {process.stdout.read() if process.poll() is not None else 'still running'}")
+
+
+def kill_after(tmp_path, events):
+    process = start(tmp_path, "4")
+    wait_for_state(tmp_path, process, events)
+    oldest = 0.0
+    for _ in range(20):  # a state on disk is whole, and never older than a second
+        oldest = max(oldest, time.time() - (tmp_path / "state").stat().st_mtime)
+        assert read_head(tmp_path / "state")["records"] >= 0
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert oldest < 1.0
+    assert not (tmp_path / "fused.mcap").exists()
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("killed")
+    kill_after(folder, 200)
+    return folder
+
+
+def test_killed_twice_and_resumed_it_writes_the_same_bytes(replayed, killed, tmp_path, capsys):
+    shutil.copytree(killed, tmp_path, dirs_exist_ok=True)
+    kill_after(tmp_path, 1500)
+    assert online("--rate", "max", "--out", tmp_path / "fused.mcap", "--state", tmp_path / "state") == 0
+    assert "resumed from" in capsys.readouterr().out
+    assert (tmp_path / "fused.mcap").read_bytes() == (replayed / "fused.mcap").read_bytes()
+    assert [path.name for path in tmp_path.iterdir()] == ["fused.mcap"]
+
+
+def test_a_service_that_is_stopped_leaves_its_last_state(replayed, tmp_path):
+    process = start(tmp_path, "4")
+    wait_for_state(tmp_path, process, 100)
+    process.send_signal(signal.SIGTERM)
+    said, _ = process.communicate()
+    assert process.returncode == 130
+    assert "interrupted" in said
+    assert "Traceback" not in said
+    assert online("--rate", "max", "--out", tmp_path / "fused.mcap", "--state", tmp_path / "state") == 0
+    assert (tmp_path / "fused.mcap").read_bytes() == (replayed / "fused.mcap").read_bytes()
+
+
+def test_real_time_takes_its_time(tmp_path):
+    begin = time.monotonic()
+    assert online("--rate", "40", "--estimator", "odometry", "--out", tmp_path / "a.tum") == 0
+    assert time.monotonic() - begin > 20.0 / 40.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--rate", "0"], "--rate is '0'"),
+        (["--rate", "fast"], "--rate is 'fast'"),
+        (["--estimator", "magic"], "no estimator 'magic'"),
+        (["--model", "magic"], "magic"),
+        (["--corrections", "magic"], "no form of corrections 'magic'"),
+        (["--out", "a.csv"], "must end in .mcap or .tum"),
+        (["--robot", "nobody"], "nobody"),
+        (["--topic.scan", "/nowhere"], "no topic '/nowhere'"),
+    ],
+)
+def test_bad_arguments_are_explained(arguments, said, capsys):
+    assert online(*arguments) == 2
+    shown = capsys.readouterr()
+    assert said in shown.err
+    assert "Traceback" not in shown.err
+
+
+def test_states_that_do_not_fit_are_refused(killed, tmp_path, capsys):
+    shutil.copytree(killed, tmp_path, dirs_exist_ok=True)
+    state, out = tmp_path / "state", tmp_path / "a.tum"
+    for arguments, said in [
+        (["--estimator", "graph", "--state", state, "--out", tmp_path / "fused.mcap"], "made with another estimator (ekf then, graph now)"),
+        (["--model", "diff_drive", "--state", state, "--out", tmp_path / "fused.mcap"], "made with another model"),
+        (["--state", state], "with an --out"),
+        (["--state", state, "--out", out], "the estimates up to the state, cannot be read"),
+        (["--out", tmp_path / "fused.mcap"], "left from a run that was killed"),
+        (["--state", drive_log(), "--out", out], "no state of an estimator"),
+    ]:
+        assert online("--rate", "max", *arguments) == 2
+        assert said in capsys.readouterr().err.replace("\n", " ")
+    other_log = drive_log(seed=1)
+    assert main(["online", str(other_log), "--robot", "vaultbot", "--state", str(state), "--out", str(tmp_path / "fused.mcap")]) == 2
+    assert "made with another source" in capsys.readouterr().err
+    os.truncate(tmp_path / ".fused.mcap.part", 208)
+    assert online("--rate", "max", "--state", state, "--out", tmp_path / "fused.mcap") == 2
+    assert "estimates where the state counts on" in capsys.readouterr().err
+    out.write_text("precious")
+    assert online("--rate", "max", "--out", out) == 2
+    assert out.read_text() == "precious"
+
+
+def test_doors_whose_libraries_are_missing_name_them(tmp_path):
+    """In a process in which nothing of the extras can be imported."""
+    code = (
+        "import sys, importlib.util\n"
+        "for name in ('cyclonedds', 'cyclonedds.core', 'rclpy', 'rospy', 'rosgraph', 'distributed'): sys.modules[name] = None\n"
+        "from localization.cli import main\n"
+        "print([main(['online', '--robot', 'vaultbot', '--door', door]) for door in ('dds', 'rclpy', 'rospy')])\n"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[2, 2, 2]"
+    assert "pip install 'skidloc[ros2]'" in found.stderr
+    assert "source a ROS 2 installation" in found.stderr
+    assert "apt install python3-rospy" in found.stderr
+    assert "Traceback" not in found.stderr
