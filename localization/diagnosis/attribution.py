@@ -49,7 +49,7 @@ class Regression:
         factor = np.linalg.cholesky(self.gram + np.diag(1.0 / variances))
         half = np.linalg.solve(factor, self.moment)
         twice = float(half @ half) - 2.0 * float(np.log(np.diagonal(factor)).sum()) - float(np.log(variances).sum())
-        return factor, half, twice
+        return np.asarray(factor), np.asarray(half), twice
 
     def fit(self, subset: tuple[int, ...]) -> tuple[FloatArray, FloatArray, float]:
         """Sizes in own units, their covariance, and twice the log-evidence gained over naming nothing."""
@@ -156,6 +156,12 @@ def statistic(problem: Regression, given: tuple[int, ...], cause: int) -> float:
     """t of ``cause`` beside those ``given``."""
     score, cov = problem.scores(given, [cause])
     return float(score[0] / math.sqrt(max(float(cov[0, 0]), 1e-12)))
+
+
+def statistics(problem: Regression, given: tuple[int, ...], wanted: list[int]) -> FloatArray:
+    """(n,) t of each of the ``wanted`` causes beside those ``given``, without the other wanted ones."""
+    score, cov = problem.scores(given, wanted)
+    return np.asarray(score / np.sqrt(np.maximum(np.diagonal(cov), 1e-12)))
 
 
 def p_value(t: float, draws: FloatArray) -> float:

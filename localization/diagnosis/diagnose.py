@@ -144,9 +144,9 @@ def _search(pipeline: Pipeline, state: _State) -> dict[Effect, float]:
     sure = ranked[1][0] - least > _SURE if len(ranked) > 1 else True
     tried: dict[tuple[int, ...], None] = {ranked[0][1]: None, (): None}
     if not sure:
+        near = [s for c, s in ranked if c - least < _SURE]
         for size in range(1, MOST_CAUSES):
-            best = [s for _, s in ranked if len(s) == size][:_REFINED]
-            tried.update(dict.fromkeys(best))
+            tried.update(dict.fromkeys([s for s in near if len(s) == size][:_REFINED]))
     results = []
     for subset in tried:
         start = {effects[i]: float(v) for i, v in zip(subset, problem.fit(subset)[0], strict=True)}

@@ -7,7 +7,7 @@ import numpy as np
 from motion_models.maneuvers import Batch
 from motion_models.se2 import FloatArray
 
-_DROP = (0.35, 0.65)  # one of two encoders silent; the rate of a side is their mean
+_DROP = (0.4, 0.62)  # one of two encoders silent; the rate of a side is their mean
 _LEAST_RATE = 0.5  # rad/s
 _LONGEST_S = 3.0
 
@@ -32,12 +32,16 @@ def _spells(rate: FloatArray, other: FloatArray, dt: FloatArray) -> FloatArray:
         return share
     jumps = []  # (index, +1 for a rise, -1 for a fall)
     for i in range(1, n):
-        before, after = rate[max(i - 2, 0)], rate[min(i + 1, n - 1)]
-        if abs(other[min(i + 1, n - 1)] - other[max(i - 2, 0)]) > 0.2 * max(abs(other[i]), _LEAST_RATE):
+        before, after = rate[i - 1], rate[i]
+        earlier, later = rate[max(i - 2, 0)], rate[min(i + 1, n - 1)]
+        if abs(other[i] - other[i - 1]) > 0.15 * max(abs(other[i]), _LEAST_RATE) or before * after <= 0.0:
             continue
-        if abs(before) > _LEAST_RATE and before * after > 0.0 and _DROP[0] < after / before < _DROP[1]:
+        # a step between two samples, level on both sides of it: no wheel accelerates so
+        falls, rises = after / before, before / after
+        level = _like(before, earlier) and _like(after, later)
+        if level and abs(before) > _LEAST_RATE and _DROP[0] < falls < _DROP[1]:
             jumps.append((i, -1))
-        elif abs(after) > _LEAST_RATE and before * after > 0.0 and _DROP[0] < before / after < _DROP[1]:
+        elif level and abs(after) > _LEAST_RATE and _DROP[0] < rises < _DROP[1]:
             jumps.append((i, 1))
     start = None
     if jumps and jumps[0][1] == 1 and dt[: jumps[0][0]].sum() < _LONGEST_S:
@@ -52,3 +56,8 @@ def _spells(rate: FloatArray, other: FloatArray, dt: FloatArray) -> FloatArray:
     if start is not None and dt[start:].sum() < _LONGEST_S:
         share[start:] = 1.0
     return share
+
+
+def _like(a: float, b: float) -> bool:
+    """Nearly the same rate."""
+    return abs(a - b) < 0.12 * max(abs(a), abs(b)) + 0.05

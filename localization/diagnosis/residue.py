@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from localization.diagnosis.attribution import max_statistic, p_value, regression, statistic
+from localization.diagnosis.attribution import max_statistic, p_value, regression, statistics
 from localization.diagnosis.findings import Shape
 from localization.diagnosis.noise import Noise
 from localization.diagnosis.prediction import CHANNELS, Pipeline
@@ -83,7 +83,9 @@ def shapes(
     result = []
     gained = 0.0
     for _ in range(3):
-        t = np.array([0.0 if i in given else statistic(problem, given, i) for i in range(n)])
+        t = np.zeros(n)
+        free = [i for i in range(n) if i not in given]
+        t[free] = statistics(problem, given, free)
         best = int(np.argmax(np.abs(t)))
         p = p_value(float(t[best]), max_statistic(problem, given, rng, df, n))
         if p > _SIGNIFICANT:

@@ -1,4 +1,4 @@
-"""What scan matching itself gets wrong: a sweep is put right by the motion of the sweep before, so that its pose lags while that changes."""
+"""What scan matching itself gets wrong: a sweep is put right by the motion of the one before, so that its pose lags while that changes."""
 
 from __future__ import annotations
 
