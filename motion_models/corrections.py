@@ -19,6 +19,7 @@ FORMS: tuple[Form, ...] = get_args(Form)
 # multipliers for one Husky range from 1.5 to 1.9; terrains differ by a quarter), absolute [m] for where it turns about.
 _TURNING, _CENTRE_X, _CENTRE_Y = 0.15, 0.05, 0.03
 _FORGOTTEN_AFTER_S = 3600.0
+_WARP = 0.15  # VaultBot's chassis, as its rotations show it, moves 13 % of m g / 4 to two opposite wheels
 
 # The rotations of Ebersole 2016, Ch. 4, to which the coefficients of `SkidSteer` were fitted: where the CG was, and the scatter about the
 # fits of k, x_CR and y_CR (`regressions.skid_steer_fit`). The covariance of the fits needs no more.
@@ -68,12 +69,15 @@ def corrections(model: MotionModel, form: Form) -> Corrections:
     """The corrections of ``form`` to ``model``: none, ``constant``, or ``cg_field``.
 
     ``constant``: rotation scaling and centre of rotation as numbers that slowly change. ``cg_field``: the coefficients of their regressions
-    on the CG; a model without such regressions has nothing but its constants. Raises `ModelError` for a form that does not exist.
+    on the CG; for the friction model, whose field is its physics, the chassis' warp besides; a model without such regressions has nothing
+    but its constants. Raises `ModelError` for a form that does not exist.
     """
     check_forms([form])
     if form == "cg_field" and model.name == "skid_steer":
         return _regressions(model)
     found = _constants(model) if form != "none" else ()
+    if form == "cg_field" and model.name == "friction":
+        found += (Correction("warp", _WARP, {"warp": 1.0}),)
     directions = np.zeros((len(model.param_names), len(found)))
     for column, correction in enumerate(found):
         for name, rate in correction.along.items():
@@ -83,10 +87,13 @@ def corrections(model: MotionModel, form: Form) -> Corrections:
     return Corrections(tuple(c.name for c in found), directions, np.diag(sigmas**2), np.diag(walks**2))
 
 
-def regression_cov() -> FloatArray:
+def regression_cov(with_misfit: bool = False) -> FloatArray:
     """(11, 11) covariance of the coefficients of `SkidSteer` as the thesis's rotations give them: s^2 (X^T X)^-1 for each regression.
 
     It is `regressions.skid_steer_fit(table).cov` of its table, of which only the grid of CGs and the scatter are needed.
+
+    ``with_misfit``: the scatter is no noise that more rotations would average out. A posture lies off the regression by so much, and
+    stays there; so each block grows by samples over coefficients, until on the mean over the grid a posture's value has that scatter.
     """
     x, y = (a.ravel() for a in np.meshgrid(_GRID_X, _GRID_Y))
     reached = ~((x > 0.11) & (np.abs(y) > 0.025))  # the arms did not reach the two outermost corners
@@ -96,7 +103,8 @@ def regression_cov() -> FloatArray:
     cov, at = np.zeros((11, 11)), 0
     for scatter, design in designs:
         own = slice(at, at + design.shape[1])
-        cov[own, own] = scatter**2 * np.linalg.inv(design.T @ design)
+        misfit = len(x) / design.shape[1] if with_misfit else 1.0
+        cov[own, own] = misfit * scatter**2 * np.linalg.inv(design.T @ design)
         at = own.stop
     return cov
 
@@ -108,7 +116,7 @@ def _regressions(model: MotionModel) -> Corrections:
     floor[0:3, 0] = _TURNING * model.nominal[0:3]  # another floor scales k at every CG
     floor[3, 1], floor[5, 2] = _CENTRE_X, _CENTRE_Y
     spread = floor @ floor.T
-    return Corrections(model.param_names, np.eye(n), regression_cov() + spread, spread / _FORGOTTEN_AFTER_S)
+    return Corrections(model.param_names, np.eye(n), regression_cov(with_misfit=True) + spread, spread / _FORGOTTEN_AFTER_S)
 
 
 def _constants(model: MotionModel) -> tuple[Correction, ...]:
