@@ -212,6 +212,25 @@ def test_what_comes_after_the_lag_is_counted_and_changes_nothing(steps):
     assert kept.counts()["late"] == 0
 
 
+def test_a_fixed_lag_forgets_what_it_does_not_smooth(steps):
+    """All that it holds is bounded by the lag, and numbers of nodes still mean the same."""
+    estimator, _ = fed(steps, lag_nodes=4)
+    again, shift = estimator, steps[-1][0].end_ns
+    seer = estimator._witness
+    sizes = []
+    for lap in range(1, 6):
+        feed(again, seer, [(replace(s, start_ns=s.start_ns + lap * shift, end_ns=s.end_ns + lap * shift), seen) for s, seen in steps[1:]])
+        arrays = [v for part in (again, again._window) for v in vars(part).values() if isinstance(v, (np.ndarray, list))]
+        sizes.append((sum(len(v) for v in arrays) - len(again._nodes_ns), len(again._nodes_ns) <= 16))
+    assert set(sizes) == {(sizes[0][0], True)}
+    now = 6 * shift
+    node = again._node_at(now, 1000)
+    assert node == again._counts["nodes"]
+    assert not again.add_closure(shift, now, Motion(np.zeros(3), SURE))
+    assert again.counts()["late"] == 1
+    assert again.add_closure(steps[-3][0].end_ns + 5 * shift, now, Motion(np.array([0.1, 0.0, 0.0]), SURE))
+
+
 def test_a_closure_inside_the_window_is_that_of_the_batch(steps):
     stamps = moments(steps)
     batch, _ = fed(steps, backend="batch")

@@ -40,6 +40,7 @@ from motion_models.se2 import FloatArray
 _CERTAIN = 1e-6  # m, rad: sigma of the first pose, which is the origin by definition
 _COUNTED = ("scans", "matched", "contradictions", "standing", "revisits", "nodes", "rebuilt", "positions", "closures", "late")
 _NEAR_NS = 50_000_000  # a loop closure is between nodes, this near
+_FAR_NS = 1_000_000_000  # a position may be this far from its node: the body moves on in between
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,7 @@ class GraphFusion:
         self._now = first
         self._pending: Link | None = None
         self._nodes_ns: list[int] = []
+        self._first_node = 0  # number of the node whose stamp is the first in that list: a fixed lag forgets the others
         self._gate = float(chi2.ppf(self._belief.gate_probability, 3))
         self._has_gyro, self._twist_now = False, np.zeros(3)
         self._counts = dict.fromkeys(_COUNTED, 0)
@@ -150,12 +152,12 @@ class GraphFusion:
         if xy.shape != (2,) or not np.isfinite(xy).all() or lever.shape != (2,) or not np.isfinite(lever).all():
             raise EstimatorError(f"the position {xy} or its lever arm {lever} is not two finite numbers.")
         check_covariance(cov, 2, "a position")
-        node = self._node_at(stamp_ns, 1_000_000_000)
+        node = self._node_at(stamp_ns, _FAR_NS)
         if node is None or (node < self._window.oldest and self._history is None):
             self._counts["late"] += 1
             return False
         # between nodes the body moves on with its last twist, about as well known as a tenth of the way
-        away = se2.exp((stamp_ns - self._nodes_ns[node]) * 1e-9 * self._twist_now)
+        away = se2.exp((stamp_ns - self._nodes_ns[node - self._first_node]) * 1e-9 * self._twist_now)
         cov = cov + (0.1 * np.linalg.norm(away[:2])) ** 2 * np.eye(2) + 1e-12 * np.eye(2)
         position = Position(xy, whitening(cov), se2.transform(away, lever))
         if node >= self._window.oldest:
@@ -174,6 +176,9 @@ class GraphFusion:
         """
         check_motion(motion.delta, motion.cov, "the loop closure")
         a, b = self._node_at(from_ns, _NEAR_NS), self._node_at(to_ns, _NEAR_NS)
+        if self._first_node and from_ns < self._nodes_ns[0] and b is not None:
+            self._counts["late"] += 1
+            return False
         if a is None or b is None or a == b:
             raise EstimatorError(f"a loop closure from {from_ns} to {to_ns} ns, where there are no two nodes to close.")
         closure = Closure(a, b, motion.delta, whitening(motion.cov + 1e-12 * np.eye(3)))
@@ -196,12 +201,12 @@ class GraphFusion:
         return True
 
     def _node_at(self, stamp_ns: int, within_ns: int) -> int | None:
-        """The node that is nearest to a moment, if it is near."""
+        """Number of the node that is nearest to a moment, if it is near."""
         if not self._nodes_ns:
             return None
         i = bisect.bisect_left(self._nodes_ns, stamp_ns)
         near = min((k for k in (i - 1, i) if 0 <= k < len(self._nodes_ns)), key=lambda k: abs(self._nodes_ns[k] - stamp_ns))
-        return near if abs(self._nodes_ns[near] - stamp_ns) <= within_ns else None
+        return near + self._first_node if abs(self._nodes_ns[near] - stamp_ns) <= within_ns else None
 
     def finish(self) -> Trajectory | None:
         """None for the fixed lag; else all poses as the whole log tells them, with covariances."""
@@ -251,6 +256,10 @@ class GraphFusion:
         self._nodes_ns.append(stamp_ns)
         if self._history is not None:
             self._counts["rebuilt"] += self._history.add(ahead.pair, self._now)
+        elif len(self._nodes_ns) > 4 * self.config.lag_nodes:
+            forgotten = self._window.oldest - self._first_node
+            del self._nodes_ns[:forgotten]
+            self._first_node += forgotten
 
     def _rebuild(self, error: Exception) -> None:
         """Begin the window anew from the last marginal that was sound. Raises `EstimatorError` if that is what is singular."""
