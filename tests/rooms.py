@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numba
 import numpy as np
+from scipy.signal import lfilter
 
+from localization.events import Event, Scan, WheelSample
+from localization.run import Pair, ReplayConfig, Run, replay
+from localization.simulate.raycast import Grid, cast, make_grid
+from motion_models import se2
+from motion_models.registry import make_model
+from motion_models.robot import Mount, WheelNoise, load_robot
 from tests import bags
 
 TRACK, RADIUS = 0.56, 0.164  # vaultbot
@@ -61,3 +70,173 @@ def drive(
                 records.append(("/scan", *spoiled))
             records.append(("/ground_truth/odom", bags.odometry(stamp, *pose), stamp))
     return records
+
+
+# Drives through any floor plan, as events: what the estimators are given, without a log in between.
+
+WALL_START_NS = 1_000_000_000
+_STEP_S = 0.002
+_WHEEL_EVERY = 10  # steps: 50 Hz
+_SLIP_S = 0.5  # slip lasts for about so long: wheels meet one patch of floor, then another
+ROBOT = load_robot("vaultbot")
+
+
+@dataclass(frozen=True)
+class Beams:
+    """A planar scanner: a SICK LMS511 at its full resolution, whose mirror turns on where it does not look."""
+
+    beams: int = 760
+    view: float = math.radians(190.0)
+    """From the first to the last beam [rad]."""
+    rate_hz: float = 12.5
+    noise: float = 0.012
+    """Sigma of a range [m]."""
+    longest: float = 40.0
+    mount: Mount = Mount(x=0.4)
+    fill: float | None = None
+    """Part of the time from scan to scan that the beams take; None: as the mirror turns evenly."""
+
+    @property
+    def offsets(self) -> np.ndarray:
+        """(beams,) time of each after the first [s]."""
+        fill = self.view / (2.0 * math.pi) if self.fill is None else self.fill
+        return np.arange(self.beams) / max(self.beams - 1, 1) * fill / self.rate_hz
+
+    @property
+    def angles(self) -> np.ndarray:
+        return -0.5 * self.view + self.view * np.arange(self.beams) / max(self.beams - 1, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """What a robot's sensors said, and where it really was at the stamp of each scan."""
+
+    events: list[Event]
+    stamps: np.ndarray
+    """(n,) [ns]"""
+    poses: np.ndarray
+    """(n, 3) from the first one on, which is the origin"""
+    start: np.ndarray
+    """(3,) where the first one is in the world"""
+
+    @property
+    def mounts(self) -> dict[str, Mount]:
+        return {"laser": self.mount}
+
+    mount: Mount = Mount()
+
+    def until(self, stamp_ns: int) -> Drive:
+        n = int(np.searchsorted(self.stamps, stamp_ns, side="right"))
+        return replace(self, events=[e for e in self.events if e.stamp_ns <= stamp_ns], stamps=self.stamps[:n], poses=self.poses[:n])
+
+
+def path(*legs: tuple[float, float, float]) -> np.ndarray:
+    """(n, 3) twists, 500 a second, of ``legs``: duration [s], speed [m/s], turn rate [rad/s]; a third of a second from one to the next."""
+    rows = np.concatenate([np.tile([v, 0.0, w], (round(t / _STEP_S), 1)) for t, v, w in legs])
+    n = round(0.3 / _STEP_S)
+    smooth = np.column_stack([np.convolve(np.pad(c, (n, n), "edge"), np.full(n, 1.0 / n), "same")[n:-n] for c in rows.T])
+    return smooth
+
+
+def drive_through(
+    walls: np.ndarray,
+    twists: np.ndarray,
+    seed: int = 0,
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    scanner: Beams | None = None,
+    noise: WheelNoise | None = None,
+    wheels: Callable[[np.ndarray, np.ndarray], np.ndarray] = lambda t, twists: twists,
+) -> Drive:
+    """Drive with ``twists`` (see `path`) among ``walls`` (n, 5). The robot slips as ``noise`` says; ``wheels`` (times, twists) gives what
+    its wheels turn for if that is not what it does."""
+    scanner = scanner or Beams()
+    rng = np.random.default_rng(seed)
+    times = _STEP_S * np.arange(len(twists) + 1)
+    true = twists + _slip(twists, noise or WheelNoise(), rng)
+    poses = _integrate(np.array(start), true)
+    half = 0.5 * ROBOT.geometry.track_width_m * ROBOT.driver.wheel_separation_multiplier
+    turned = wheels(times[:-1], twists)
+    rates = np.column_stack([turned[:, 0] - half * turned[:, 2], turned[:, 0] + half * turned[:, 2]]) / ROBOT.geometry.wheel_radius_m
+    angles = np.vstack([np.zeros(2), np.cumsum(rates * _STEP_S, axis=0)])
+    none = np.full(2, np.nan)
+    events: list[Event] = [WheelSample(_ns(times[i]), none, np.round(angles[i] / 1e-4) * 1e-4) for i in range(0, len(times), _WHEEL_EVERY)]
+    grid, stamps = make_grid(walls), []
+    offsets, aims = scanner.offsets, scanner.angles
+    m = np.array([scanner.mount.x, scanner.mount.y, scanner.mount.yaw])
+    for k in range(int((times[-1] - offsets[-1]) * scanner.rate_hz + 1e-9) + 1):
+        at = (k / scanner.rate_hz + offsets) / _STEP_S
+        i = np.minimum(at.astype(int), len(times) - 2)
+        f = (at - i)[:, None]
+        eyes = se2.compose((1.0 - f) * poses[i] + f * poses[i + 1], m)
+        ranges = np.empty(len(eyes))
+        _cast(eyes, aims, scanner.longest, grid, ranges)
+        ranges = np.round(ranges + scanner.noise * rng.normal(size=len(ranges)), 3)
+        seen = np.isfinite(ranges) & (ranges > 0.0)
+        points = np.column_stack([ranges * np.cos(aims), ranges * np.sin(aims), np.zeros(len(ranges))])[seen]
+        stamps.append(_ns(k / scanner.rate_hz))
+        events.append(Scan(stamps[-1], points, offsets[seen], "laser"))
+    events.sort(key=lambda e: e.stamp_ns)
+    at = np.round((np.array(stamps) - WALL_START_NS) * 1e-9 / _STEP_S).astype(int)
+    return Drive(events, np.array(stamps), se2.between(poses[0], poses[at]), poses[0], scanner.mount)
+
+
+def _ns(t: float) -> int:
+    return WALL_START_NS + round(t * 1e9)
+
+
+def _slip(twists: np.ndarray, w: WheelNoise, rng: np.random.Generator) -> np.ndarray:
+    """(n, 3) what the robot does besides: correlated over half a second, of the variance that ``w`` says over longer times."""
+    driven, turned = np.abs(twists[:, 0]), np.abs(twists[:, 2])
+    floor = (driven + turned) > 0.0
+    density = np.column_stack(
+        [
+            w.longitudinal_m2_per_m * driven + w.longitudinal_m2_per_rad * turned + w.floor_m2_per_s * floor,
+            w.lateral_m2_per_m * driven + w.lateral_m2_per_rad * turned + w.floor_m2_per_s * floor,
+            w.yaw_rad2_per_m * driven + w.yaw_rad2_per_rad * turned + w.floor_rad2_per_s * floor,
+        ]
+    )
+    a = math.exp(-_STEP_S / _SLIP_S)
+    unit = lfilter([math.sqrt(1.0 - a * a)], [1.0, -a], rng.normal(size=twists.shape), axis=0)
+    return np.sqrt(density / (2.0 * _SLIP_S)) * unit
+
+
+def _integrate(start: np.ndarray, twists: np.ndarray) -> np.ndarray:
+    """(n + 1, 3) poses."""
+    yaw = start[2] + np.concatenate([[0.0], np.cumsum(twists[:, 2] * _STEP_S)])
+    moved = se2.exp(twists * _STEP_S)
+    c, s = np.cos(yaw[:-1]), np.sin(yaw[:-1])
+    x = start[0] + np.concatenate([[0.0], np.cumsum(c * moved[:, 0] - s * moved[:, 1])])
+    y = start[1] + np.concatenate([[0.0], np.cumsum(s * moved[:, 0] + c * moved[:, 1])])
+    return np.column_stack([x, y, yaw])
+
+
+@numba.njit(cache=True)
+def _cast(eyes: np.ndarray, aims: np.ndarray, longest: float, grid: Grid, ranges: np.ndarray) -> None:
+    for i in range(eyes.shape[0]):
+        ranges[i] = cast(eyes[i, 0], eyes[i, 1], eyes[i, 2] + aims[i], longest, grid)
+
+
+def results(drive: Drive, *estimators: str, config: ReplayConfig | None = None, model: str = "diff_drive") -> dict[str, Run]:
+    """What estimators make of ``drive``, by name; trajectories at the scans' stamps."""
+    pairs = [Pair(make_model(model, ROBOT), name) for name in estimators]
+    found = replay(drive.events, pairs, ROBOT, drive.mounts, True, config)
+    return {run.estimator: run for run in found}
+
+
+def at_scans(drive: Drive, run: Run) -> tuple[np.ndarray, np.ndarray | None]:
+    """(n, 3) poses and (n, 3, 3) covariances of ``run`` at the scans."""
+    i = np.searchsorted(run.trajectory.stamps_ns, drive.stamps)
+    assert (run.trajectory.stamps_ns[i] == drive.stamps).all()
+    covs = run.trajectory.covariances
+    return run.trajectory.poses[i], None if covs is None else covs[i]
+
+
+def second_errors(drive: Drive, poses: np.ndarray, seconds: float = 1.0, rate_hz: float = 12.5) -> np.ndarray:
+    """(m, 3) errors of the motions over ``seconds``."""
+    k = round(seconds * rate_hz)
+    return se2.log(se2.between(se2.between(drive.poses[:-k], drive.poses[k:]), se2.between(poses[:-k], poses[k:])))
+
+
+def ate(drive: Drive, poses: np.ndarray) -> float:
+    """RMS distance from the truth, both from the origin on [m]."""
+    return float(np.sqrt(np.mean(np.sum((poses - drive.poses)[:, :2] ** 2, axis=1))))

@@ -10,8 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from localization.estimators.base import NO_POINTS
-from localization.lidar import LidarConfig, LidarMatcher, Revisit, body_points
+from localization.lidar import LidarConfig, LidarMatcher, Revisit, Slip, Sweep
 from localization.steps import Step
 from motion_models import se2
 from motion_models.base import Motion
@@ -53,13 +55,23 @@ class ScanWitness:
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig | None = None) -> None:
         self._mounts, self._matcher = mounts, LidarMatcher(config)
-        self._has_map = False
+        self._has_map, self._slip, self._last_ns = False, Slip(), -1
 
     def look(self, step: Step, anchor: FloatArray, guess: FloatArray) -> Sight | None:
         assert step.scan is not None
-        points = body_points(step.scan, self._mounts.get(step.scan.frame_id, Mount()), step.twist)
-        found = self._matcher.register(points, step.scan.is_planar, guess, step.predicted.cov)
-        return None if found is None else Sight(Motion(se2.between(anchor, found.pose), found.cov), found.is_trusted)
+        sweep = Sweep.of(step.scan, self._mounts.get(step.scan.frame_id, Mount()))
+        slip = self._slip
+        slip.advance(step.duration, step.predicted.cov)
+        rate = slip.rate
+        found = self._matcher.register(sweep.at_stamp(step.twist + rate), sweep.is_planar, guess, step.predicted.cov)
+        if found is None:
+            return None
+        if found.is_trusted and step.start_ns == self._last_ns and step.duration > 0.0:
+            off = se2.log(se2.between(se2.compose(anchor, step.predicted.delta), found.pose))
+            slip.measure(off / step.duration, np.diag(found.cov) / step.duration**2)
+            if sweep.shift(slip.rate - rate) > self._matcher.config.max_shift_m:  # the sweep looked otherwise than was thought
+                found = self._matcher.refine(sweep.at_stamp(step.twist + slip.rate), sweep.is_planar, found.pose) or found
+        return Sight(Motion(se2.between(anchor, found.pose), found.cov), found.is_trusted)
 
     def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
         return self._matcher.recall(pose, cov, step.end_ns)
@@ -68,6 +80,7 @@ class ScanWitness:
         self._matcher.correct(before, after)
 
     def remember(self, step: Step, pose: FloatArray) -> None:
+        self._last_ns = step.end_ns
         if not step.is_standing or not self._has_map:  # a robot that stands sees nothing new, and would only thicken its lines
             self._matcher.insert(pose)
             self._has_map = True

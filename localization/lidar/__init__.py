@@ -3,6 +3,7 @@
 from localization.lidar.matcher import LidarConfig, LidarMatcher, Registration
 from localization.lidar.odometry import LidarOdometry
 from localization.lidar.revisit import Revisit, RevisitConfig
-from localization.lidar.sweep import body_points
+from localization.lidar.slip import Slip
+from localization.lidar.sweep import Sweep, body_points
 
-__all__ = ["LidarConfig", "LidarMatcher", "LidarOdometry", "Registration", "Revisit", "RevisitConfig", "body_points"]
+__all__ = ["LidarConfig", "LidarMatcher", "LidarOdometry", "Registration", "Revisit", "RevisitConfig", "Slip", "Sweep", "body_points"]

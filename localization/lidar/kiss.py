@@ -68,6 +68,12 @@ class Kiss:
         kiss.adaptive_threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
         return pose, frame_downsample
 
+    def downsampled(self, points: FloatArray) -> FloatArray:
+        """(M, 3) of ``points`` (N, 3), to `insert`."""
+        kiss = self._kiss
+        found: FloatArray = kiss.voxelize(kiss.preprocessor.preprocess(points, _NO_STAMPS, np.eye(4)))[1]
+        return found
+
     def insert(self, points: FloatArray, pose: FloatArray) -> None:
         """Add ``points`` (M, 3), seen from ``pose`` (4, 4), to the map."""
         self._kiss.local_map.update(points, pose)

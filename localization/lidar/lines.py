@@ -21,6 +21,8 @@ POINTS_PER_CELL = 64
 _IN_USE_PER_CELL = 40  # of the ages that are in use; the rest is for older visits
 _AGE_M = 0.25
 _MIN_NEIGHBOURS = 4
+_STALE = 0.02  # of the neighbourhood's radius: points that moved farther look for their lines again
+_SAME = 0.05  # of the same: points that are nearer to each other look once for both
 _MAX_LINE_RATIO = 0.1  # smaller over larger eigenvalue of the neighbours' spread: beyond this it is a corner or clutter
 
 
@@ -333,6 +335,88 @@ def _compare(
 
 
 @numba.njit(cache=True)
+def _associate(
+    cells: NDArray[np.int32],
+    points: NDArray[np.float32],
+    travels: NDArray[np.float32],
+    hits: NDArray[np.int32],
+    ages: Ages,
+    source: FloatArray,
+    pose: FloatArray,
+    cell: float,
+    radius: float,
+    home: NDArray[np.int64],
+    lines: FloatArray,
+) -> None:  # pragma: no cover
+    """Fills ``lines`` (N, 7) for the points ``source`` (N, 2) at ``pose``: how many points make the line (0: none), its normal, a point on
+    it, the variance of its place, and how many of ``source`` are in its cell, ``home`` (N,), below 0 where the map has none."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    last_x, last_y, near = math.inf, math.inf, (_SAME * radius) ** 2
+    for i in range(source.shape[0]):
+        x = pose[0] + c * source[i, 0] - s * source[i, 1]
+        y = pose[1] + s * source[i, 0] + c * source[i, 1]
+        if (x - last_x) ** 2 + (y - last_y) ** 2 < near:  # beside the point before, as beams are: it meets the same line
+            lines[i, :6] = lines[i - 1, :6]
+        else:
+            last_x, last_y = x, y
+            m, nx, ny, e, thin, _ = _line(cells, points, travels, ages, x, y, cell, radius)
+            lines[i, 0] = m
+            if m:
+                lines[i, 1], lines[i, 2], lines[i, 3], lines[i, 4], lines[i, 5] = nx, ny, x - e * nx, y - e * ny, thin / m
+        home[i] = _find(cells, math.floor(x / cell), math.floor(y / cell))
+        if home[i] >= 0:
+            hits[home[i]] += 1
+    for i in range(source.shape[0]):
+        lines[i, 6] = hits[home[i]] if home[i] >= 0 else 1.0
+    for i in range(source.shape[0]):
+        if home[i] >= 0:
+            hits[home[i]] = 0
+
+
+@numba.njit(cache=True)
+def _sum_up(
+    source: FloatArray,
+    lines: FloatArray,
+    pose: FloatArray,
+    sigma_point: float,
+    sigma_line: float,
+    kernel: float,
+    H: FloatArray,
+    g: FloatArray,
+) -> tuple[int, float]:  # pragma: no cover
+    """The quadratic of the cost around ``pose``, into ``H`` and ``g``; returns the matched points and their weighted sum of squares."""
+    H[:], g[:] = 0.0, 0.0
+    n_matched, squares = 0, 0.0
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for i in range(source.shape[0]):
+        if lines[i, 0] == 0.0:
+            continue
+        nx, ny = lines[i, 1], lines[i, 2]
+        x = pose[0] + c * source[i, 0] - s * source[i, 1]
+        y = pose[1] + s * source[i, 0] + c * source[i, 1]
+        e = nx * (x - lines[i, 3]) + ny * (y - lines[i, 4])
+        robust = 1.0 + e * e / (kernel * kernel)
+        # All points in one cell meet the same line, whose error they share: together they know no more than it.
+        w = 1.0 / ((sigma_point * sigma_point + lines[i, 6] * (sigma_line * sigma_line + lines[i, 5])) * robust * robust)
+        # e changes by n . R (dx, dy) and by the lever arm of the point
+        jx, jy = nx * c + ny * s, ny * c - nx * s
+        jt = jy * source[i, 0] - jx * source[i, 1]
+        H[0, 0] += w * jx * jx
+        H[0, 1] += w * jx * jy
+        H[0, 2] += w * jx * jt
+        H[1, 1] += w * jy * jy
+        H[1, 2] += w * jy * jt
+        H[2, 2] += w * jt * jt
+        g[0] -= w * jx * e
+        g[1] -= w * jy * e
+        g[2] -= w * jt * e
+        n_matched += 1
+        squares += e * e / (robust * robust)
+    H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
+    return n_matched, squares
+
+
+@numba.njit(cache=True)
 def _fit(
     cells: NDArray[np.int32],
     points: NDArray[np.float32],
@@ -353,51 +437,23 @@ def _fit(
     H: FloatArray,
     g: FloatArray,
 ) -> tuple[int, float]:  # pragma: no cover
-    """Changes ``pose``, ``H`` and ``g`` in place; returns the matched points and their weighted sum of squares."""
-    n_matched, squares = 0, 0.0
-    home = np.empty(source.shape[0], np.int64)
+    """Changes ``pose``, ``H`` and ``g`` in place; returns the matched points and their weighted sum of squares.
+
+    Lines are looked up again where the points have moved by a part of the neighbourhood since they were: near the end, they stay.
+    """
+    home, lines = np.empty(source.shape[0], np.int64), np.empty((source.shape[0], 7))
+    reach, moved, n_matched, squares = 0.0, math.inf, 0, 0.0
+    for i in range(source.shape[0]):
+        reach = max(reach, math.hypot(source[i, 0], source[i, 1]))
     for iteration in range(iterations + 1):
+        if moved > _STALE * radius:
+            _associate(cells, points, travels, hits, ages, source, pose, cell, radius, home, lines)
+            moved = 0.0
         kernel = wide_kernel if iteration == 0 else final_kernel
-        H[:], g[:] = 0.0, 0.0
-        n_matched, squares = 0, 0.0
-        c, s = math.cos(pose[2]), math.sin(pose[2])
-        for i in range(source.shape[0]):
-            x = pose[0] + c * source[i, 0] - s * source[i, 1]
-            y = pose[1] + s * source[i, 0] + c * source[i, 1]
-            home[i] = _find(cells, math.floor(x / cell), math.floor(y / cell))
-            if home[i] >= 0:
-                hits[home[i]] += 1
-        for i in range(source.shape[0]):
-            x = pose[0] + c * source[i, 0] - s * source[i, 1]
-            y = pose[1] + s * source[i, 0] + c * source[i, 1]
-            m, nx, ny, e, thin, _ = _line(cells, points, travels, ages, x, y, cell, radius)
-            if m == 0:
-                continue
-            # All points in one cell meet the same line, whose error they share: together they know no more than it.
-            shared = hits[home[i]] if home[i] >= 0 else 1
-            robust = 1.0 + e * e / (kernel * kernel)
-            w = 1.0 / ((sigma_point * sigma_point + shared * (sigma_line * sigma_line + thin / m)) * robust * robust)
-            # e changes by n . R (dx, dy) and by the lever arm of the point
-            jx_, jy_ = nx * c + ny * s, ny * c - nx * s
-            jt = jy_ * source[i, 0] - jx_ * source[i, 1]
-            H[0, 0] += w * jx_ * jx_
-            H[0, 1] += w * jx_ * jy_
-            H[0, 2] += w * jx_ * jt
-            H[1, 1] += w * jy_ * jy_
-            H[1, 2] += w * jy_ * jt
-            H[2, 2] += w * jt * jt
-            g[0] -= w * jx_ * e
-            g[1] -= w * jy_ * e
-            g[2] -= w * jt * e
-            n_matched += 1
-            squares += e * e / (robust * robust)
-        H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
-        for i in range(source.shape[0]):
-            if home[i] >= 0:
-                hits[home[i]] = 0
+        n_matched, squares = _sum_up(source, lines, pose, sigma_point, sigma_line, kernel, H, g)
         if iteration >= iterations or n_matched == 0:
             break
-
+        c, s = math.cos(pose[2]), math.sin(pose[2])
         dx, dy = center[0] - pose[0], center[1] - pose[1]
         turn = (center[2] - pose[2] + math.pi) % (2.0 * math.pi) - math.pi
         px, py = c * dx + s * dy, c * dy - s * dx
@@ -415,6 +471,7 @@ def _fit(
         pose[0] += c * d0 - s * d1
         pose[1] += s * d0 + c * d1
         pose[2] += d2
+        moved += math.hypot(d0, d1) + abs(d2) * reach
         if iteration > 0 and abs(d0) + abs(d1) + abs(d2) < 1e-4:
             iterations = iteration + 1
     return n_matched, squares

@@ -35,6 +35,8 @@ class LidarConfig:
     """Error of a line in the map, shared by all points of a scan that meet it in one cell [m]."""
     iterations: int = 12
     """Point-to-line steps at most."""
+    max_shift_m: float = 0.002
+    """Where the motion within a sweep turns out otherwise than expected, and moves points by more than this, they are matched again [m]."""
     revisit: RevisitConfig = field(default_factory=RevisitConfig)
 
 
@@ -68,6 +70,7 @@ class LidarMatcher:
         self._lines: LineMap | None = None
         self._downsampled = np.empty((0, 3))
         self._planar, self._is_planar = np.empty((0, 2)), True
+        self._guess: tuple[FloatArray, FloatArray] | None = None  # and its information
         self._revisits: Revisits | None = None
         self._travel, self._last = 0.0, np.zeros(3)
 
@@ -85,8 +88,24 @@ class LidarMatcher:
             self._downsampled, self._planar = np.empty((0, 3)), np.empty((0, 2))
             return None
         found, self._downsampled = self._kiss.align(points, _matrix(guess))
-        prior = np.linalg.inv(9.0 * guess_cov + np.diag([1e-6, 1e-6, 1e-8])).astype(np.float64, copy=False)
-        fit = self._lines.fit(self._planar, pose_of_matrix(found), self._options, prior, guess, self._ages)
+        self._guess = guess, np.linalg.inv(9.0 * guess_cov + np.diag([1e-6, 1e-6, 1e-8])).astype(np.float64, copy=False)
+        return self._fit(self._lines, pose_of_matrix(found))
+
+    def refine(self, points: FloatArray, is_planar: bool, start: FloatArray) -> Registration | None:
+        """The same scan once more, as other ``points`` (N, 3), close to where it was found, ``start`` (3,)."""
+        if self._kiss is None or self._lines is None:
+            return None
+        points = in_range(points, self.config)
+        self._prepare(points, is_planar)
+        if len(self._planar) < _FEW_POINTS:
+            return None
+        self._downsampled = self._kiss.downsampled(points)
+        return self._fit(self._lines, start)
+
+    def _fit(self, lines: LineMap, start: FloatArray) -> Registration:
+        assert self._guess is not None
+        guess, prior = self._guess
+        fit = lines.fit(self._planar, start, self._options, prior, guess, self._ages)
         cov = np.linalg.inv(fit.information + np.diag(_KNOWS_NOTHING**-2)).astype(np.float64, copy=False)
         pose = se2.compose(fit.pose, se2.exp(cov @ fit.gradient))
         return Registration(pose, cov, len(self._planar), fit.n_matched, fit.residual_rms)

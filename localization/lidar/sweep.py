@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -13,17 +14,46 @@ from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
 
-def body_points(scan: Scan, mount: Mount, twist: FloatArray) -> FloatArray:
-    """(N, 3) points of ``scan`` in the body frame as it was at the scan's stamp.
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """A scan's points (N, 3), each in the body frame of its own moment, ``offsets`` (N,) [s] after the stamp, or (0,) if all are of it."""
 
-    Each point is moved from where the body was when it was measured, at constant ``twist`` (3,) from the stamp on: the true time
-    of each point is used, so a sweep that fills only part of the scan period is not over-corrected.
-    """
-    points: FloatArray = scan.points @ mount.rotation().T + np.array([mount.x, mount.y, mount.z])
-    if len(scan.offsets) and np.any(twist):
-        stamp_T_point = se2.exp(scan.offsets[:, None] * twist)
-        points[:, :2] = se2.transform(stamp_T_point, points[:, :2])
-    return points
+    points: FloatArray
+    offsets: FloatArray
+    is_planar: bool = True
+
+    @classmethod
+    def of(cls, scan: Scan, mount: Mount) -> Sweep:
+        """Points that are not finite are left out."""
+        points: FloatArray = scan.points @ mount.rotation().T + np.array([mount.x, mount.y, mount.z])
+        is_finite = np.isfinite(points).all(axis=1)
+        if is_finite.all():
+            return cls(points, scan.offsets, scan.is_planar)
+        return cls(points[is_finite], scan.offsets[is_finite] if len(scan.offsets) else scan.offsets, scan.is_planar)
+
+    def at_stamp(self, twist: FloatArray) -> FloatArray:
+        """(N, 3) in the body frame as it was at the stamp.
+
+        Each point is moved from where the body was when it was measured, at constant ``twist`` (3,) from the stamp on: the true time of
+        each point is used, so a sweep that fills only part of the scan period is not over-corrected.
+        """
+        if not len(self.offsets) or not np.any(twist):
+            return self.points
+        points = self.points.copy()
+        points[:, :2] = se2.transform(se2.exp(self.offsets[:, None] * twist), points[:, :2])
+        return points
+
+    def shift(self, twist: FloatArray) -> float:
+        """How far an error of the motion by ``twist`` (3,) moves the points against each other [m]."""
+        if not len(self.offsets):
+            return 0.0
+        reach = float(np.median(np.hypot(self.points[:, 0], self.points[:, 1])))
+        return float(np.ptp(self.offsets)) * (math.hypot(twist[0], twist[1]) + abs(float(twist[2])) * reach)
+
+
+def body_points(scan: Scan, mount: Mount, twist: FloatArray) -> FloatArray:
+    """(N, 3) points of ``scan`` in the body frame as it was at the scan's stamp, if it has moved with ``twist`` (3,) since."""
+    return Sweep.of(scan, mount).at_stamp(twist)
 
 
 def walls(points: FloatArray, cell: float, min_height: float = 0.3) -> FloatArray:
