@@ -21,7 +21,7 @@ from localization.report_data import MapView, NisMeans, Spans, Timeline, raster
 from localization.report_lines import Line, thin_path, thin_series
 from localization.report_svg import COLOURS, NARROW, WIDE, Size, for_page
 
-__all__ = ["NARROW", "WIDE", "map_svg", "nis_svg", "overview", "spans_svg", "timeline_svg"]
+__all__ = ["NARROW", "WIDE", "Axes", "Figure", "map_svg", "nis_svg", "overview", "picture", "spans_svg", "timeline_svg"]
 
 _STYLE = {
     "svg.fonttype": "none",
@@ -135,9 +135,14 @@ def overview(lines: Sequence[Line], view: MapView, measure: str, title: str) -> 
         _draw_bars(right, lines, measure)
 
     extent = np.maximum(view.high - view.low, 1e-6)
-    figure = _figure(size.width_in, float(np.clip(extent[1] / extent[0], 0.5, 0.9)) * 6.0 + 0.7, draw)
+    return picture(size.width_in, float(np.clip(extent[1] / extent[0], 0.5, 0.9)) * 6.0 + 0.7, draw)
+
+
+def picture(width_in: float, height_in: float, draw: Callable[[Figure], None]) -> bytes:
+    """A PNG on white of what ``draw`` puts on a figure of this size [in], in this module's style."""
+    figure = _figure(width_in, height_in, draw)
     out = io.BytesIO()
-    with _style("overview"):
+    with _style("picture"):
         figure.savefig(out, format="png", dpi=150, facecolor="white", metadata={"Software": None})
     return out.getvalue()
 
