@@ -1,14 +1,18 @@
 """A robot on DDS, in a process of its own: plays a log's messages in real time by ROS 2's names, and hears what is published of it.
 
-Its types are written out by hand in cyclonedds' own IDL and serialised by it, so that it shares nothing with what it talks to but the
-wire. Prints one JSON line: what it heard, and how long after each scan.
+Its latched transforms are sent at once; for each number read from the standard input, the next so many seconds of the log. At the end of
+the input it prints one JSON line: what it heard, and how long after each scan.
 
-python -m tests.dds_peer LOG DOMAIN [SECONDS [RATE]]
+Its types are written out by hand in cyclonedds' own IDL and serialised by it, so that it shares nothing with what it talks to but the
+wire.
+
+python -m tests.dds_peer LOG DOMAIN
 """
 
 import json
 import sys
 import time
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -196,11 +200,10 @@ def stamp(header) -> int:
     return header.stamp.sec * 10**9 + header.stamp.nanosec
 
 
-def main(path: str, domain: int, seconds: float = 1e9, rate: float = 1.0) -> None:
+def main(path: str, domain: int) -> None:
     with AnyReader([Path(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         connections = [c for c in reader.connections if c.topic in SENT]
         records = [(t, c.topic, typed(SENT[c.topic], reader.deserialize(d, c.msgtype))) for c, t, d in reader.messages(connections)]
-    records = [record for record in records if record[0] - records[0][0] < seconds * 1e9]
     config = Domain(domain, XML)
     participant = DomainParticipant(domain)
     writers = {
@@ -220,18 +223,26 @@ def main(path: str, domain: int, seconds: float = 1e9, rate: float = 1.0) -> Non
                     latencies.append(time.monotonic() - scans_sent[stamp(sample.header)])
                 heard[topic].append(sample)
 
-    begin, first = time.monotonic(), records[0][0]
-    for log_ns, topic, message in records:
-        while time.monotonic() < begin + (log_ns - first) * 1e-9 / rate:
+    for _, topic, message in records:
+        if topic == "/tf_static":
+            writers[topic].write(message)
+    left = deque(record for record in records if record[1] != "/tf_static")
+    print("up", flush=True)
+    for line in sys.stdin:
+        begin, first = time.monotonic(), left[0][0] if left else 0
+        while left and left[0][0] < first + float(line) * 1e9:
+            log_ns, topic, message = left.popleft()
+            while time.monotonic() < begin + (log_ns - first) * 1e-9:
+                listen()
+                time.sleep(0.0003)
+            if topic == "/scan":
+                scans_sent[stamp(message.header)] = time.monotonic()
+            writers[topic].write(message)
+        end = time.monotonic() + 1.5
+        while time.monotonic() < end:
             listen()
-            time.sleep(0.0003)
-        if topic == "/scan":
-            scans_sent[stamp(message.header)] = time.monotonic()
-        writers[topic].write(message)
-    end = time.monotonic() + 1.5
-    while time.monotonic() < end:
-        listen()
-        time.sleep(0.001)
+            time.sleep(0.001)
+        print("played", flush=True)
     odometry = heard["/skidloc/odometry"]
     print(
         json.dumps(
@@ -256,4 +267,4 @@ def main(path: str, domain: int, seconds: float = 1e9, rate: float = 1.0) -> Non
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), *map(float, sys.argv[3:]))
+    main(sys.argv[1], int(sys.argv[2]))

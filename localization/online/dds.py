@@ -35,7 +35,7 @@ except ImportError as error:
 
 LOOPBACK = "lo"
 DEFAULT = "default"
-_LATEST, _DEPTH, _LATCHED_DEPTH = 50, 10, 100
+_LATEST, _DEPTH, _LATCHED_DEPTH = 200, 10, 100
 _TYPE = re.compile(r"(\w+)::(?:msg::)dds_::(\w+)_")
 
 
@@ -84,13 +84,11 @@ class DdsTransport:
         return found
 
     def _take(self) -> list[Received]:
+        """In the order in which it was sent: after a pause, one topic's must not all come before another's."""
         now = time.monotonic_ns()
-        return [
-            Received(topic, now, bytes(sample))
-            for topic, reader in self._readers
-            for sample in reader.take(100)
-            if isinstance(sample, bytes)
-        ]
+        found = [(sample.sample_info.source_timestamp, topic, sample) for topic, reader in self._readers for sample in reader.take(1000)]
+        found.sort(key=lambda entry: entry[0])
+        return [Received(topic, now, bytes(sample)) for _, topic, sample in found if isinstance(sample, bytes)]
 
     def publishers(self) -> Mapping[str, set[str]]:
         found: dict[str, set[str]] = {}

@@ -18,7 +18,7 @@ from localization.online.transport import Received, Transport
 from motion_models.robot import Mount, Robot
 
 TF_STATIC, TF_TYPE = "/tf_static", "tf2_msgs/msg/TFMessage"
-_POLL_S, _TELL_AGAIN_S = 0.1, 30.0
+_POLL_S, _SETTLE_S, _TELL_AGAIN_S = 0.1, 1.0, 30.0
 _MOST_KEPT = 20_000
 """What is heard before the start is used, but nobody's memory shall be filled by it."""
 
@@ -70,20 +70,23 @@ class Listener:
         """
         needed = {*needed, *self._asked}
         begin = told = time.monotonic()
-        said = ""
+        said, first = "", None
         while not is_over():
             for received in self._transport.take(_POLL_S):
                 self._hear(received, epoch_ns)
             now = time.monotonic()
             published = self._transport.publishers()
             self._check_types(published)
-            late = now - begin > wait_s
+            if first is None and any(self.candidates[topic] in _MOVING for topic in self._counts):
+                first = now
+            late = first is not None and now - first >= wait_s
             waited_for = {*needed, *(() if late else published)} & set(self.candidates)
             silent = sorted(waited_for - set(self._counts))
-            can_move = any(self.candidates[topic] in _MOVING for topic in self._counts if topic in self.candidates)
-            settled = now - begin > min(wait_s, 1.0)
+            settled = first is not None and now - first >= min(wait_s, _SETTLE_S)
             has_mounts = bool(self._transforms.mounts()) or TF_STATIC not in published or late
-            if can_move and not silent and settled and has_mounts:
+            if settled and not silent and has_mounts:
+                for topic in sorted(set(published) & set(self.candidates) - set(self._counts)):
+                    tell(f"begun without {topic}: it is published, but nothing comes.")
                 return self._heard(epoch_ns)
             if now - begin > wait_s and ((now_said := self._silence(published, silent)) != said or now - told > _TELL_AGAIN_S):
                 said, told = now_said, now

@@ -69,6 +69,7 @@ class Node:
         """
         config, node = config or ReplayConfig(), node or NodeConfig()
         epoch_ns = time.time_ns() - time.monotonic_ns()
+        warm_up(make_pair(True), robot, robot.mounts, has_lidar=True, is_planar=True, config=config)
         listener = Listener(transport, robot, topics or TopicOverrides())
         needed = read_head(files.state).get("topics", []) if files.state is not None and files.state.exists() else []
         heard = listener.listen(node.wait_s, needed, tell, epoch_ns, is_over)
@@ -77,7 +78,8 @@ class Node:
         has_lidar = heard.parts.sources.lidar is not None
         pair = make_pair(has_lidar)
         lidar = heard.parts.sources.lidar
-        warm_up(pair, robot, heard.mounts, has_lidar, lidar is None or lidar.kind == "scan", config)
+        if lidar is None or lidar.kind != "scan":
+            warm_up(pair, robot, heard.mounts, has_lidar, is_planar=False, config=config)
         gc.collect()
         gc.freeze()  # what is here now stays: later collections need not look at it
         tally = Tally()

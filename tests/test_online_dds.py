@@ -1,0 +1,155 @@
+"""ROS 2 without ROS: a robot in another process, whose messages are its own, over DDS."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from localization.cli import main
+from localization.logs import open_log
+from localization.run import Pair, replay
+from localization.trajectory import read_tum
+from motion_models.registry import make_model
+from tests.online_help import ROBOT, drive_log
+
+pytest.importorskip("cyclonedds", reason="the extra 'ros2' (cyclonedds) is not installed")
+pytestmark = pytest.mark.xdist_group("online")
+S = 1_000_000_000
+DOMAIN = 100 + os.getpid() % 100  # not that of another run of these tests
+
+
+def start_node(*arguments):
+    command = [sys.executable, "-m", "localization.cli", "online", "--robot", "vaultbot", "--door", "dds", "--domain", str(DOMAIN)]
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    return subprocess.Popen([*command, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
+
+
+class Peer:
+    """The robot: `tests.dds_peer`."""
+
+    def __init__(self):
+        command = [sys.executable, "-m", "tests.dds_peer", str(drive_log()), str(DOMAIN)]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[1])
+        assert self.process.stdout.readline() == "up\n"
+
+    def play(self, seconds):
+        self.process.stdin.write(f"{seconds}\n")
+        self.process.stdin.flush()
+        assert self.process.stdout.readline() == "played\n"
+
+    def heard(self):
+        return json.loads(self.process.communicate(timeout=30)[0])
+
+
+def ended(process, number=signal.SIGINT):
+    process.send_signal(number)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        return process.communicate(timeout=30)[0]
+    process.kill()
+    pytest.fail(f"does not end: {process.communicate()[0]}")
+
+
+def addresses_listened_to(pid):
+    """Local UDP addresses of a process, and the device each is bound to, as the kernel has them."""
+    said = subprocess.run(["ss", "-ulnp"], capture_output=True, text=True, check=True).stdout
+    return [line.split()[3] for line in said.splitlines() if f"pid={pid}," in line]
+
+
+def test_a_robot_in_another_process_is_followed_killed_and_followed_on(tmp_path):
+    """The robot (its latched transforms first) is there before the estimator, which is killed on the way and started again."""
+    files = ("--state", tmp_path / "state", "--out", tmp_path / "live.tum", "--node.wait-s", "1")
+    peer = Peer()
+    node = start_node(*files)
+    waiting = node.stdout.readline()
+    peer.play(8.0)
+    listening = addresses_listened_to(node.pid)
+    node.kill()
+    said = waiting + node.communicate()[0]
+    assert (tmp_path / "state").exists(), said
+    node = start_node(*files)
+    waiting = node.stdout.readline()
+    peer.play(99.0)
+    said = waiting + ended(node)
+    heard = peer.heard()
+    assert "resumed from" in said, said
+    assert node.returncode == 0
+
+    # nobody else is listened to
+    assert listening
+    assert all("%lo:" in address or address.startswith("127.0.0.1") for address in listening)
+
+    log = open_log(drive_log(), ROBOT)
+    run = replay(log.events(), [Pair(make_model("skid_steer", ROBOT), "ekf")], ROBOT, log.mounts, True)[0].trajectory
+    by_stamp = dict(zip(run.stamps_ns.tolist(), run.poses, strict=True))
+    stamps = heard["stamps"]
+    assert len(stamps) > 0.8 * heard["sent_scans"]
+    shared = [i for i, stamp in enumerate(stamps) if stamp in by_stamp]
+    assert len(shared) > 0.95 * len(stamps)  # they bear the scans' stamps, but where one was lost
+    assert heard["frames"] == [["odom", "base_link"]]
+    assert heard["tf"] >= 0.9 * len(stamps)
+    # what it says of the motion between its first and its last estimate, whatever it missed at its start, is what a replay says
+    poses = np.array([[x, y, 2.0 * np.arcsin(z)] for x, y, z in heard["poses"]])
+    poses = poses[shared]
+    there = np.array([by_stamp[stamps[i]] for i in (shared[0], shared[-1])])
+    distance = np.hypot(*(poses[-1] - poses[0])[:2])
+    assert distance == pytest.approx(np.hypot(*(there[1] - there[0])[:2]), abs=0.1)
+    assert np.hypot(*poses[-1][:2] - there[1][:2]) < 0.1  # not from the origin again
+    assert (np.array(heard["pose_variances"])[5:] > 0.0).all()
+    turning = [t for t in heard["twists"] if abs(t[2]) > 0.3]
+    assert np.median([abs(t[1] / t[2]) for t in turning]) > 0.003  # true vy
+    (names, means, sigmas) = heard["corrections"][0]
+    assert "k_0" in names
+    assert len(names) == len(means) == len(sigmas)
+    last = heard["diagnostics"][-2]
+    assert {"skidloc: estimate", "skidloc: lidar", "skidloc: wheels", "skidloc: messages"} == set(last)
+    assert float(last["skidloc: lidar"]["degeneracy"]) > 0.1
+    assert float(last["skidloc: lidar"]["nis_mean"]) < 8.0
+    # and the whole way is in one file
+    live = read_tum(tmp_path / "live.tum")
+    assert (np.diff(live.stamps_ns) > 0).all()
+    assert len(live) >= 0.9 * len(stamps)
+
+
+def test_nobody_there_is_told_and_interrupted_without_a_word_too_many(tmp_path):
+    node = start_node("--node.wait-s", "0.5")
+    line = node.stdout.readline()
+    said = line + ended(node, signal.SIGTERM)
+    assert "nothing comes on /joint_states (sensor_msgs/JointState)" in " ".join(said.split())
+    assert node.returncode == 130
+    assert "Traceback" not in said
+
+
+def test_another_type_is_refused_by_what_the_robot_says_of_itself(capsys):
+    """A robot whose /scan is a cloud: DDS itself would only be silent."""
+    code = (
+        "import sys, time\n"
+        "from tests.dds_peer import *\n"
+        "d = Domain(int(sys.argv[1]), XML); p = DomainParticipant(int(sys.argv[1]))\n"
+        "w = [DataWriter(p, Topic(p, n, k), SENSOR) for n, k in (('rt/scan', Imu), ('rt/joint_states', JointState))]\n"
+        "print('up', flush=True); time.sleep(60)\n"
+    )
+    peer = subprocess.Popen([sys.executable, "-c", code, str(DOMAIN)], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[1])
+    try:
+        assert peer.stdout.readline() == "up\n"
+        assert main(["online", "--robot", "vaultbot", "--door", "dds", "--domain", str(DOMAIN), "--node.wait-s", "20"]) == 2
+        assert "'/scan' carries sensor_msgs/Imu, not sensor_msgs/LaserScan." in " ".join(capsys.readouterr().err.split())
+    finally:
+        peer.kill()
+        peer.wait()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [(["--domain", "999"], "the domain is 999"), (["--interface", "no_such_device", "--domain", "98"], "interface 'no_such_device'")],
+)
+def test_bad_domains_and_interfaces_are_explained(arguments, said, capsys):
+    assert main(["online", "--robot", "vaultbot", "--door", "dds", *arguments]) == 2
+    assert said in capsys.readouterr().err
