@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from rich.console import Console
 from rich.table import Table
 
 from localization.accuracy import Accuracy, RelationErrors
@@ -42,18 +43,33 @@ _COLUMNS: tuple[tuple[str, str, _Number], ...] = (
 )
 
 
-def accuracy_table(results: Sequence[Result], duration_s: float) -> Table:
-    """For rich's console."""
-    columns = [column for column in _COLUMNS if any(column[2](result) is not None for result in results)]
+_FIRST_TO_GO = ("RPE deg/m", "speed x", "drift %", "ATE deg", "end m", "NEES")
+
+
+def accuracy_table(results: Sequence[Result], duration_s: float, width: int) -> Table:
+    """For rich's console: on one of fewer than ``width`` characters, numbers would be cut; rather, whole columns are left out."""
+    columns = [column for column in (*_COLUMNS, ("speed x", ".0f", _speed(duration_s))) if any(column[2](r) is not None for r in results)]
+    table = _table(results, columns)
+    for title in _FIRST_TO_GO:
+        if Console(width=1000).measure(table).maximum <= width:
+            break
+        columns = [column for column in columns if column[0] != title]
+        table = _table(results, columns)
+    return table
+
+
+def _speed(duration_s: float) -> _Number:
+    return lambda result: duration_s / result.run.seconds if result.run.seconds > 0 else None
+
+
+def _table(results: Sequence[Result], columns: Sequence[tuple[str, str, _Number]]) -> Table:
     table = Table(box=None, header_style="bold", pad_edge=False)
     for title in ("model", "estimator"):
         table.add_column(title, no_wrap=True)
     for title, *_ in columns:
-        table.add_column(title, justify="right")
-    table.add_column("speed x", justify="right")
+        table.add_column(title, justify="right", no_wrap=True)
     for result in results:
         numbers = [(number(result), form) for _, form, number in columns]
         cells = [_MISSING if number is None else format(number, form) for number, form in numbers]
-        speed = duration_s / result.run.seconds if result.run.seconds > 0 else None
-        table.add_row(result.run.model, result.run.estimator, *cells, _MISSING if speed is None else f"{speed:.0f}")
+        table.add_row(result.run.model, result.run.estimator, *cells)
     return table

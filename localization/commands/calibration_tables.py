@@ -25,6 +25,10 @@ Pair = tuple[float, float]
 _MANY_TIMES = 1.5  # a noise model that is wrong by less is right
 
 
+WIDE = 200
+"""Characters a line where nobody's screen is in the way."""
+
+
 def plain_table(*columns: str, title: str | None = None) -> Table:
     """With its first column to the left and all others to the right; texts are no markup."""
     names = [escape(name) for name in columns]
@@ -44,7 +48,7 @@ def show(console: Console, table: Table) -> None:
     if console.is_terminal:
         console.print(table)
     else:
-        Console(file=console.file, width=200, highlight=False).print(table)
+        Console(file=console.file, width=WIDE, highlight=False).print(table)
 
 
 def say(console: Console, text: str) -> None:

@@ -16,6 +16,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from localization.commands.accuracy_table import accuracy_table
+from localization.commands.calibration_tables import WIDE, show
 from localization.commands.common import check_new, new_folder, write_json
 from localization.errors import EvaluationError
 from localization.estimators import CORRECTING, check_estimator
@@ -154,7 +155,7 @@ class Replay:
     def _print(self, console: Console, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
         for note in head.notes:
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
-        console.print(accuracy_table(results, head.duration_s))
+        show(console, accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
         console.print(verdict(results, reference), markup=False, soft_wrap=True)
         console.print(f"report: {self.out / 'report.html'}", markup=False, soft_wrap=True)
 
