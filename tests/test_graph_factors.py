@@ -145,7 +145,8 @@ def test_observing_is_conditioning_the_joint_gaussian(seed, m, r):
     assert slow_cov == pytest.approx(cov[3:, 3:], rel=1e-5, abs=1e-14)
     x = se2.log(found.delta) + found.d_slow @ slow
     assert x == pytest.approx(mean[:3], rel=1e-3, abs=3e-7)
-    assert found.cov + found.d_slow @ slow_cov @ found.d_slow.T == pytest.approx(cov[:3, :3], rel=2e-3, abs=1e-12)
+    scale = np.sqrt(np.outer(np.diag(cov), np.diag(cov))[:3, :3])  # of each entry: small correlations are no smaller to round
+    assert (found.cov + found.d_slow @ slow_cov @ found.d_slow.T) / scale == pytest.approx(cov[:3, :3] / scale, abs=2e-3)
 
 
 @given(seeds, st.integers(1, 4))

@@ -286,12 +286,15 @@ class GraphFusion:
 
         Where they contradict, one is wrong: the covariance of the one that is not sure of itself grows until they agree.
         """
-        measured, slow = sight.motion, self._slow
-        mount = slow.shown(measured) if slow.mount_names else None
-        off = np.zeros(3) if mount is None else mount @ ahead.node.slow
-        error, _, d_b, d_mount = seen_residual(self._newest.pose, ahead.node.pose, measured.delta, off)
-        by_slow = d_b @ pending.d_slow + (0.0 if mount is None else d_mount @ mount)
-        d_seen = se2.right_jacobian_inverse(error)
+        measured, mount, slow = sight.motion, None, ahead.node.slow
+        if self._slow.mount_names:
+            mount = self._slow.shown(measured)
+            error, _, d_b, d_mount = seen_residual(self._newest.pose, ahead.node.pose, measured.delta, mount @ slow)
+            by_slow = d_b @ pending.d_slow + d_mount @ mount
+            d_seen = se2.right_jacobian_inverse(error)
+        else:
+            error, _, d_b = motion_residual(self._newest.pose, ahead.node.pose, measured.delta)
+            by_slow, d_seen = d_b @ pending.d_slow, d_b
         S = d_b @ pending.cov @ d_b.T + by_slow @ ahead.node.covariance[3:, 3:] @ by_slow.T + d_seen @ measured.cov @ d_seen.T
         nis = float(error @ np.linalg.solve(S, error))
         if nis > self._gate:
