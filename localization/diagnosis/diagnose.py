@@ -22,7 +22,7 @@ from localization.diagnosis.attribution import (
 )
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.effects import EFFECTS, EXTRA, Belief, Effect, friction_change, slope_across
-from localization.diagnosis.findings import Component, Diagnosis, Finding, Verdict
+from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain, Verdict
 from localization.diagnosis.heldout import heldout_gain
 from localization.diagnosis.next_drive import general_advice, separating_drive
 from localization.diagnosis.noise import Noise, estimated_noise, plain_noise, regressors
@@ -42,6 +42,8 @@ _TOLERANCE = 0.5  # sigma of causes that nobody names, over what is negligible
 _REFINED = 3  # sets of each number of causes that are tried for real
 _SURE = 200.0  # lead in twice the log-evidence that needs no trial
 _STEPS = 3
+_UNSURE = 1.0 / 3.0  # systematic part of a size's sigma, over what is negligible: clocks, mounts and physics are no better
+_PAYS = 0.01  # least held-out gain of a finding
 _HONEST = 0.5  # a witness may be better than it says, but not by more than this
 
 
@@ -194,8 +196,9 @@ def _pipeline(drive: Drive, model: MotionModel) -> Pipeline:
     squares = []
     for pipeline in (plain, with_inertia):
         rows = pipeline.discrepancies(Belief())[:, :3]
-        squares.append(np.nanmedian(np.abs(rows), axis=0))
-    better = np.nansum(np.log(np.maximum(squares[0], 1e-9)) - np.log(np.maximum(squares[1], 1e-9))) > 0.0
+        known = np.isfinite(rows).any(axis=0)
+        squares.append(np.nanmedian(np.abs(rows[:, known]), axis=0))
+    better = np.sum(np.log(np.maximum(squares[0], 1e-9)) - np.log(np.maximum(squares[1], 1e-9))) > 0.0
     return with_inertia if better or model.name == "friction" else plain
 
 
@@ -207,7 +210,7 @@ def _candidates(pipeline: Pipeline, config: DiagnosisConfig) -> tuple[Effect, ..
     if not pipeline.dropout_seen:
         out.add("encoder_dropout")
     if drive.gyro_is_witness:
-        out |= {"lidar_offset_x", "lidar_offset_y", "lidar_yaw", "lateral_slip_speed", "longitudinal_slip_turning"}
+        out |= {"lidar_offset_x", "lidar_offset_y", "lidar_yaw", "lidar_time_offset", "lateral_slip_speed", "longitudinal_slip_turning"}
     if drive.kind == "rotations":
         out |= {"lidar_time_offset", "wheel_time_offset", "slope", "lateral_slip_speed", "rotation_slip_speed", "longitudinal_slip_turning"}
     found = [e for e in EFFECTS.values() if e.id not in out]
@@ -305,21 +308,36 @@ def _conclude(
     pipeline: Pipeline, first: _State, state: _State, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig
 ) -> Examined:
     drive, problem, effects = pipeline.drive, state.problem, state.effects
-    sizes, cov, gained = problem.fit(chosen)
     df = max(int(np.isfinite(state.rows).sum()) - len(effects), 10)
-    findings, within = [], {}
+
+    def held(with_these: tuple[int, ...], without: tuple[int, ...]) -> Gain:
+        data = state.linear, state.signatures, state.nuisances, state.noise, problem.scale
+        return heldout_gain(*data, with_these, without, np.random.default_rng(config.seed))
+
+    within: dict[str, tuple[float, float]] = {}
+    while chosen:  # what nobody would correct, or does not pay where its size was not fitted to, is not named
+        sizes, cov, _ = problem.fit(chosen)
+        gains = [held(chosen, tuple(j for j in chosen if j != i)) for i in chosen]
+        small = [
+            n for n, i in enumerate(chosen) if abs(sizes[n]) < effects[i].negligible or gains[n].low <= 0.0 or gains[n].relative < _PAYS
+        ]
+        if not small:
+            break
+        worst = min(small, key=lambda n: gains[n].relative)
+        within[effects[chosen[worst]].id] = float(sizes[worst]), float(math.sqrt(cov[worst, worst]))
+        chosen = tuple(i for n, i in enumerate(chosen) if n != worst)
+    sizes, cov, gained = problem.fit(chosen)
+    findings = []
     for n, i in enumerate(chosen):
-        effect, size, sigma = effects[i], float(sizes[n]), float(math.sqrt(cov[n, n]))
+        effect, size = effects[i], float(sizes[n])
+        sigma = math.hypot(math.sqrt(cov[n, n]), _UNSURE * effect.negligible)
         others = tuple(j for j in chosen if j != i)
-        gain = heldout_gain(state.linear, state.signatures, state.nuisances, state.noise, problem.scale, chosen, others, rng)
-        if abs(size) < effect.negligible or gain.after >= gain.before:
-            within[effect.id] = (size, sigma)
-            continue
         p = p_value(statistic(problem, others, i), max_statistic(problem, others, rng, df))
         aliases = _aliases(problem, effects, chosen, i)
         told = evidence(effect, state.signatures[..., i] * size, state.noise, problem.gain(chosen) - problem.gain(others))
-        findings.append(Finding(effect, size, sigma, p, aliases, told, gain))
+        findings.append(Finding(effect, size, sigma, p, aliases, told, gains[n]))
     findings.sort(key=lambda f: f.gain.relative, reverse=True)
+    total = held(chosen, ()) if chosen else None
     findings = _merged(findings)
     left = state.linear - state.signatures[..., list(chosen)] @ sizes
     spreads = problem.scale * np.where(np.isin(np.arange(len(effects)), chosen), 1.0, problem.tolerance)
@@ -351,6 +369,7 @@ def _conclude(
         sentence="",
         within=within,
         visible=visible,
+        gain=total,
         windows=len(drive.maneuvers),
         notes=drive.notes,
         belief=belief,

@@ -53,6 +53,8 @@ class Effect:
     """Smaller sizes are within what robot files, mounts and clocks are ever known to."""
     inject: Callable[[Belief, float], Belief] = field(repr=False)
     one_sided: bool = False
+    is_clock: bool = False
+    """It shifts samples in time, between which rates have kinks: signatures are differenced to both sides, over a larger step."""
     is_floor: bool = False
     """It acts through friction, and needs the friction model."""
     at_s: float | None = None
@@ -106,8 +108,8 @@ _ALL = (
     Effect("lidar_offset_x", "m", "the tracked sensor sits farther ahead than its transform says", 0.05, 0.005, _item("lidar", 0)),
     Effect("lidar_offset_y", "m", "the tracked sensor sits farther left than its transform says", 0.05, 0.005, _item("lidar", 1)),
     Effect("lidar_yaw", "rad", "the tracked sensor is turned to the left against its transform", 0.03, 0.003, _item("lidar", 2)),
-    Effect("lidar_time_offset", "s", "the LiDAR's stamps are late by this", 0.05, 0.008, _plain("lidar_late_s")),
-    Effect("wheel_time_offset", "s", "the wheels' stamps are late by this", 0.05, 0.008, _plain("wheels_late_s")),
+    Effect("lidar_time_offset", "s", "the LiDAR's stamps are late by this", 0.05, 0.008, _plain("lidar_late_s"), is_clock=True),
+    Effect("wheel_time_offset", "s", "the wheels' stamps are late by this", 0.05, 0.008, _plain("wheels_late_s"), is_clock=True),
     Effect(
         "friction_anisotropy",
         "1",

@@ -121,6 +121,8 @@ class Diagnosis:
     """Causes that show, but are smaller than anyone would correct: size and sigma."""
     visible: Mapping[str, float] = field(default_factory=dict)
     """Smallest size of each cause that this drive would show (three sigma, alone)."""
+    gain: Gain | None = None
+    """By all findings together."""
     windows: int = 0
     notes: tuple[str, ...] = ()
     belief: Belief = field(default_factory=Belief)
@@ -134,6 +136,7 @@ class Diagnosis:
             "verdict": self.verdict,
             "discrepancy": {name: c.to_dict() for name, c in self.discrepancy.items()},
             "findings": [f.to_dict() for f in self.findings],
+            "gain": None if self.gain is None else self.gain.to_dict(),
             "left_unexplained": left if self.shapes else {},
             "next_drive": self.next_drive,
             "sentence": self.sentence,

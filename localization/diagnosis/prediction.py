@@ -135,12 +135,13 @@ class Pipeline:
 
     def signature(self, belief: Belief, effect: Effect, base: FloatArray | None = None) -> FloatArray:
         """(M, 6) change of the discrepancy per unit of ``effect`` around ``belief``, where its sign says what correcting it removes."""
+        if effect.is_clock:
+            step = 0.5 * effect.usual
+            behind, ahead = (self.discrepancies(effect.inject(belief, s)) for s in (-step, step))
+            return np.asarray((behind - ahead) / (2.0 * step))
         step = 0.1 * effect.usual
         ahead = self.discrepancies(effect.inject(belief, step))
-        if effect.one_sided or base is not None:
-            behind = self.discrepancies(belief) if base is None else base
-            return np.asarray((behind - ahead) / step)
-        return np.asarray((self.discrepancies(effect.inject(belief, -step)) - ahead) / (2.0 * step))
+        return np.asarray(((self.discrepancies(belief) if base is None else base) - ahead) / step)
 
 
 class _Changed:

@@ -45,7 +45,8 @@ def sentence(d: Diagnosis) -> str:
         f"Correct {first.cause} by {first.size:+.3g} {first.effect.unit if first.effect.unit != '1' else ''}".rstrip()
         + f" (+- {first.sigma:.1g})"
     )
-    said += f": {first.effect.meaning}; held-out discrepancies fall by {100 * first.gain.relative:.0f} %"
+    whole = d.gain or first.gain
+    said += f": {first.effect.meaning}; held-out discrepancies fall by {100 * whole.relative:.0f} %"
     if first.aliases:
         said += f". This drive cannot tell it from {', '.join(name for name, _ in first.aliases)}"
     if len(d.findings) > 1:
