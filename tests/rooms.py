@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numba
@@ -92,7 +92,7 @@ class Beams:
     noise: float = 0.012
     """Sigma of a range [m]."""
     longest: float = 40.0
-    mount: Mount = Mount(x=0.4)
+    mount: Mount = field(default_factory=lambda: Mount(x=0.4))
     fill: float | None = None
     """Part of the time from scan to scan that the beams take; None: as the mirror turns evenly."""
 
@@ -118,12 +118,11 @@ class Drive:
     """(n, 3) from the first one on, which is the origin"""
     start: np.ndarray
     """(3,) where the first one is in the world"""
+    mount: Mount
 
     @property
     def mounts(self) -> dict[str, Mount]:
         return {"laser": self.mount}
-
-    mount: Mount = Mount()
 
     def until(self, stamp_ns: int) -> Drive:
         n = int(np.searchsorted(self.stamps, stamp_ns, side="right"))
@@ -134,8 +133,7 @@ def path(*legs: tuple[float, float, float]) -> np.ndarray:
     """(n, 3) twists, 500 a second, of ``legs``: duration [s], speed [m/s], turn rate [rad/s]; a third of a second from one to the next."""
     rows = np.concatenate([np.tile([v, 0.0, w], (round(t / _STEP_S), 1)) for t, v, w in legs])
     n = round(0.3 / _STEP_S)
-    smooth = np.column_stack([np.convolve(np.pad(c, (n, n), "edge"), np.full(n, 1.0 / n), "same")[n:-n] for c in rows.T])
-    return smooth
+    return np.column_stack([np.convolve(np.pad(c, (n, n), "edge"), np.full(n, 1.0 / n), "same")[n:-n] for c in rows.T])
 
 
 def drive_through(

@@ -60,6 +60,9 @@ class Seer:
     def map_points(self):
         return NO_POINTS
 
+    def counts(self):
+        return {}
+
 
 @dataclass
 class Result:

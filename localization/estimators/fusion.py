@@ -14,6 +14,7 @@ import numpy as np
 
 from localization.estimators.base import NO_POINTS, Estimate, mean_twist
 from localization.estimators.ekf import BIAS, CLOCK, PARAMS, POSE, START, Ekf, EkfConfig
+from localization.estimators.teaching import teaching
 from localization.estimators.witness import ScanWitness, Witness
 from localization.lidar import LidarConfig
 from localization.residuals import motion_residual
@@ -44,7 +45,7 @@ class EkfFusion:
         # without a LiDAR there is no second clock to compare with
         self._ekf = Ekf(robot.gyro_noise, corrected, config if has_lidar else replace(config, clock_sigma_s=0.0))
         self._witness = (witness or ScanWitness(mounts, lidar)) if has_lidar else None
-        self._model, self._corrected = model, corrected
+        self._model, self._corrected, self._track_m = model, corrected, robot.geometry.track_width_m
         self._has_gyro = False
         self._counts = dict.fromkeys(("scans", "matched", "contradictions", "standing", "revisits"), 0)
 
@@ -58,7 +59,7 @@ class EkfFusion:
 
     def step(self, step: Step) -> Estimate:
         ekf, nis = self._ekf, None
-        ekf.predict(step)
+        ekf.predict(teaching(step, self._track_m, self._corrected.directions, ekf.covariance[PARAMS:, PARAMS:]))
         if step.turn is not None:
             self._has_gyro = True
             ekf.measure_turn(step.turn)
@@ -113,7 +114,7 @@ class EkfFusion:
         return found
 
     def counts(self) -> Mapping[str, int]:
-        return self._counts
+        return self._counts if self._witness is None else {**self._counts, **self._witness.counts()}
 
     def map_points(self) -> FloatArray:
         return NO_POINTS if self._witness is None else self._witness.map_points()

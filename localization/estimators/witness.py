@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from localization.estimators.base import NO_POINTS
-from localization.lidar import LidarConfig, LidarMatcher, Revisit, Slip, Sweep
+from localization.lidar import LidarConfig, LidarMatcher, Revisit, ScanCheck, Slip, Sweep
 from localization.steps import Step
 from motion_models import se2
 from motion_models.base import Motion
@@ -49,6 +49,9 @@ class Witness(Protocol):
     def map_points(self) -> FloatArray:
         """(M, 2) what was seen, in the world [m]."""
 
+    def counts(self) -> Mapping[str, int]:
+        """How many scans could not be used, or not in all directions, by what was amiss."""
+
 
 class ScanWitness:
     """Scan-to-map matching (`LidarMatcher`), and what of it enters the map."""
@@ -56,9 +59,13 @@ class ScanWitness:
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig | None = None) -> None:
         self._mounts, self._matcher = mounts, LidarMatcher(config)
         self._has_map, self._slip, self._last_ns = False, Slip(), -1
+        self._check, self._is_good = ScanCheck(self._matcher.config), True
 
     def look(self, step: Step, anchor: FloatArray, guess: FloatArray) -> Sight | None:
         assert step.scan is not None
+        self._is_good = not self._check.is_stale(step.scan, step.is_standing)
+        if not self._is_good:
+            return None
         sweep = Sweep.of(step.scan, self._mounts.get(step.scan.frame_id, Mount()))
         slip = self._slip
         slip.advance(step.duration, step.predicted.cov)
@@ -71,7 +78,9 @@ class ScanWitness:
             slip.measure(off / step.duration, np.diag(found.cov) / step.duration**2)
             if sweep.shift(slip.rate - rate) > self._matcher.config.max_shift_m:  # the sweep looked otherwise than was thought
                 found = self._matcher.refine(sweep.at_stamp(step.twist + slip.rate), sweep.is_planar, found.pose) or found
-        return Sight(Motion(se2.between(anchor, found.pose), found.cov), found.is_trusted)
+        since_s = (step.end_ns - self._last_ns) * 1e-9 if self._last_ns >= 0 else 0.0
+        self._is_good = not self._check.is_jump(se2.between(guess, found.pose), found, since_s)
+        return Sight(Motion(se2.between(anchor, found.pose), found.cov), found.is_trusted) if self._is_good else None
 
     def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
         return self._matcher.recall(pose, cov, step.end_ns)
@@ -81,12 +90,17 @@ class ScanWitness:
 
     def remember(self, step: Step, pose: FloatArray) -> None:
         self._last_ns = step.end_ns
-        if not step.is_standing or not self._has_map:  # a robot that stands sees nothing new, and would only thicken its lines
+        if self._is_good and (
+            not step.is_standing or not self._has_map
+        ):  # a robot that stands sees nothing new, and would only thicken its lines
             self._matcher.insert(pose)
             self._has_map = True
 
     def map_points(self) -> FloatArray:
         return self._matcher.point_cloud()
+
+    def counts(self) -> Mapping[str, int]:
+        return self._check.counts
 
 
 class NoWitness:
@@ -106,3 +120,6 @@ class NoWitness:
 
     def map_points(self) -> FloatArray:
         return NO_POINTS
+
+    def counts(self) -> Mapping[str, int]:
+        return {}

@@ -1,9 +1,21 @@
 """LiDAR scan matching: KISS-ICP finds the pose, point-to-line steps refine it and say how sure it is."""
 
+from localization.lidar.check import ScanCheck
 from localization.lidar.matcher import LidarConfig, LidarMatcher, Registration
 from localization.lidar.odometry import LidarOdometry
 from localization.lidar.revisit import Revisit, RevisitConfig
 from localization.lidar.slip import Slip
 from localization.lidar.sweep import Sweep, body_points
 
-__all__ = ["LidarConfig", "LidarMatcher", "LidarOdometry", "Registration", "Revisit", "RevisitConfig", "Slip", "Sweep", "body_points"]
+__all__ = [
+    "LidarConfig",
+    "LidarMatcher",
+    "LidarOdometry",
+    "Registration",
+    "Revisit",
+    "RevisitConfig",
+    "ScanCheck",
+    "Slip",
+    "Sweep",
+    "body_points",
+]

@@ -21,6 +21,7 @@ POINTS_PER_CELL = 64
 _IN_USE_PER_CELL = 40  # of the ages that are in use; the rest is for older visits
 _AGE_M = 0.25
 _MIN_NEIGHBOURS = 4
+_MAX_SIGMAS = 3.0  # of a point's noise: neighbours that scatter more across their line are of two
 _STALE = 0.02  # of the neighbourhood's radius: points that moved farther look for their lines again
 _SAME = 0.05  # of the same: points that are nearer to each other look once for both
 _MAX_LINE_RATIO = 0.1  # smaller over larger eigenvalue of the neighbours' spread: beyond this it is a corner or clutter
@@ -45,6 +46,18 @@ def ages_between(spans: FloatArray) -> Ages:
 
 
 @dataclass(frozen=True)
+class Spread:
+    """How far the points are off their lines: the sums of an analysis of variance, where points in one cell of the map are a group."""
+
+    within: float = 0.0
+    """Squares of the points' distances from their group's mean [m^2]."""
+    within_freedom: float = 0.0
+    between: float = 0.0
+    """Squares of the groups' means, less what the noise of their points and of the map's points makes of them [m^2]."""
+    between_freedom: float = 0.0
+
+
+@dataclass(frozen=True)
 class LineFit:
     """The point-to-line cost around one pose, as a quadratic in its right perturbation d: const - gradient d + d H d / 2."""
 
@@ -58,6 +71,7 @@ class LineFit:
     """Points that lie by a line of the map."""
     residual_rms: float
     """RMS distance of the matched points from their lines [m], robustly weighted."""
+    spread: Spread
 
 
 class LineMap:
@@ -120,7 +134,7 @@ class LineMap:
         ``prior`` (3, 3) is the information of a pull towards ``center`` (3,), which keeps directions that the scene does not hold
         where they were; it is no part of the returned quadratic. Only points of these ``ages`` count.
         """
-        information, gradient, pose = np.zeros((3, 3)), np.zeros(3), np.array(start, dtype=float)
+        information, gradient, pose, spread = np.zeros((3, 3)), np.zeros(3), np.array(start, dtype=float), np.zeros(4)
         n, squares = _fit(
             self._cells,
             self._points,
@@ -140,14 +154,15 @@ class LineMap:
             center,
             information,
             gradient,
+            spread,
         )
-        return LineFit(pose, information, gradient, n, math.sqrt(squares / n) if n else math.nan)
+        return LineFit(pose, information, gradient, n, math.sqrt(squares / n) if n else math.nan, Spread(*spread.tolist()))
 
     def compare(self, points: FloatArray, pose: FloatArray, radius: float, ages: Ages = ALL_AGES) -> tuple[FloatArray, FloatArray]:
         """How far ``points`` (N, 2) of the body frame at ``pose`` (3,) are off the lines within ``radius`` [m] of them, and when those
         were seen: distances (N,) [m] and travelled distances (N,) [m], NaN for points without a line of these ``ages``."""
         errors, travels = np.empty(len(points)), np.empty(len(points))
-        _compare(self._cells, self._points, self._travels, ages, points, pose, self._cell, radius, errors, travels)
+        _compare(self._cells, self._points, self._travels, ages, points, pose, self._cell, radius, math.inf, errors, travels)
         return errors, travels
 
     def points_within(self, center: FloatArray, half: float) -> tuple[FloatArray, FloatArray]:
@@ -283,6 +298,7 @@ def _line(
     y: float,
     cell: float,
     radius: float,
+    most_thin: float,
 ) -> tuple[int, float, float, float, float, float]:  # pragma: no cover
     """The line of the points around (x, y): how many they are, 0 where they make none; its normal, the distance of (x, y) from it along
     the normal, the points' variance across it, and their mean travelled distance."""
@@ -306,7 +322,7 @@ def _line(
     cxx, cxy, cyy = sxx / m - mx * mx, sxy / m - mx * my, syy / m - my * my
     trace, split = cxx + cyy, math.hypot(cxx - cyy, 2.0 * cxy)
     wide, thin = 0.5 * (trace + split), max(0.5 * (trace - split), 0.0)
-    if wide < 1e-4 or thin > _MAX_LINE_RATIO * wide:
+    if wide < 1e-4 or thin > min(_MAX_LINE_RATIO * wide, most_thin):
         return 0, 0.0, 0.0, 0.0, 0.0, 0.0
     angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
     nx, ny = -math.sin(angle), math.cos(angle)
@@ -323,6 +339,7 @@ def _compare(
     pose: FloatArray,
     cell: float,
     radius: float,
+    most_thin: float,
     errors: FloatArray,
     seen: FloatArray,
 ) -> None:  # pragma: no cover
@@ -330,7 +347,7 @@ def _compare(
     for i in range(source.shape[0]):
         x = pose[0] + c * source[i, 0] - s * source[i, 1]
         y = pose[1] + s * source[i, 0] + c * source[i, 1]
-        m, _, _, e, _, travel = _line(cells, points, travels, ages, x, y, cell, radius)
+        m, _, _, e, _, travel = _line(cells, points, travels, ages, x, y, cell, radius, most_thin)
         errors[i], seen[i] = (abs(e), travel) if m else (math.nan, math.nan)
 
 
@@ -345,6 +362,7 @@ def _associate(
     pose: FloatArray,
     cell: float,
     radius: float,
+    most_thin: float,
     home: NDArray[np.int64],
     lines: FloatArray,
 ) -> None:  # pragma: no cover
@@ -359,7 +377,7 @@ def _associate(
             lines[i, :6] = lines[i - 1, :6]
         else:
             last_x, last_y = x, y
-            m, nx, ny, e, thin, _ = _line(cells, points, travels, ages, x, y, cell, radius)
+            m, nx, ny, e, thin, _ = _line(cells, points, travels, ages, x, y, cell, radius, most_thin)
             lines[i, 0] = m
             if m:
                 lines[i, 1], lines[i, 2], lines[i, 3], lines[i, 4], lines[i, 5] = nx, ny, x - e * nx, y - e * ny, thin / m
@@ -436,18 +454,20 @@ def _fit(
     center: FloatArray,
     H: FloatArray,
     g: FloatArray,
+    spread: FloatArray,
 ) -> tuple[int, float]:  # pragma: no cover
     """Changes ``pose``, ``H`` and ``g`` in place; returns the matched points and their weighted sum of squares.
 
     Lines are looked up again where the points have moved by a part of the neighbourhood since they were: near the end, they stay.
     """
+    most_thin = (_MAX_SIGMAS * sigma_point) ** 2
     home, lines = np.empty(source.shape[0], np.int64), np.empty((source.shape[0], 7))
     reach, moved, n_matched, squares = 0.0, math.inf, 0, 0.0
     for i in range(source.shape[0]):
         reach = max(reach, math.hypot(source[i, 0], source[i, 1]))
     for iteration in range(iterations + 1):
         if moved > _STALE * radius:
-            _associate(cells, points, travels, hits, ages, source, pose, cell, radius, home, lines)
+            _associate(cells, points, travels, hits, ages, source, pose, cell, radius, most_thin, home, lines)
             moved = 0.0
         kernel = wide_kernel if iteration == 0 else final_kernel
         n_matched, squares = _sum_up(source, lines, pose, sigma_point, sigma_line, kernel, H, g)
@@ -474,4 +494,42 @@ def _fit(
         moved += math.hypot(d0, d1) + abs(d2) * reach
         if iteration > 0 and abs(d0) + abs(d1) + abs(d2) < 1e-4:
             iterations = iteration + 1
+    _spread(source, lines, home, pose, sigma_point, sigma_line, spread)
     return n_matched, squares
+
+
+@numba.njit(cache=True)
+def _spread(
+    source: FloatArray,
+    lines: FloatArray,
+    home: NDArray[np.int64],
+    pose: FloatArray,
+    sigma_point: float,
+    sigma_line: float,
+    spread: FloatArray,
+) -> None:  # pragma: no cover
+    """Fills ``spread`` (4,), see `Spread`. Points beyond three sigmas are of something else. A group ends where the scan leaves a cell."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    limit = 9.0 * (sigma_point * sigma_point + sigma_line * sigma_line)
+    spread[:] = 0.0
+    n, total, squares, place = 0, 0.0, 0.0, 0.0
+    for i in range(source.shape[0] + 1):
+        is_end = i == source.shape[0]
+        if n and (is_end or home[i] != home[i - 1]):
+            if n >= _MIN_NEIGHBOURS:
+                within = squares - total * total / n
+                spread[0] += within
+                spread[1] += n - 1
+                spread[2] += (total / n) ** 2 - within / (n - 1) / n - place / n
+                spread[3] += 1.0
+            n, total, squares, place = 0, 0.0, 0.0, 0.0
+        if is_end or lines[i, 0] == 0.0:
+            continue
+        x = pose[0] + c * source[i, 0] - s * source[i, 1]
+        y = pose[1] + s * source[i, 0] + c * source[i, 1]
+        e = lines[i, 1] * (x - lines[i, 3]) + lines[i, 2] * (y - lines[i, 4])
+        if e * e < limit + 9.0 * lines[i, 5]:
+            n += 1
+            total += e
+            squares += e * e
+            place += lines[i, 5]

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from localization.lidar.kiss import Kiss
 from localization.lidar.lines import ALL_AGES, Ages, FitOptions, LineMap
+from localization.lidar.noise import Noise
 from localization.lidar.revisit import Revisit, RevisitConfig, Revisits
 from localization.lidar.sweep import walls
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
 _FEW_POINTS = 10
+_DEGENERATE = 0.02  # smaller over larger variance of the position; rooms: 0.2 and more
 # Where the scene holds nothing, the measurement's sigma: metres, metres, radians. It decides nothing, it only keeps numbers finite.
 _KNOWS_NOTHING = np.array([10.0, 10.0, 3.0])
 
@@ -30,13 +32,19 @@ class LidarConfig:
     max_range_m: float = 50.0
     """Farther points are left out [m]."""
     sigma_point_m: float = 0.03
-    """Noise of one LiDAR point [m]."""
+    """Noise of one LiDAR point, until scans have shown it [m]."""
     sigma_line_m: float = 0.02
-    """Error of a line in the map, shared by all points of a scan that meet it in one cell [m]."""
+    """Error of a line in the map, shared by all points of a scan that meet it in one cell, until scans have shown it [m]."""
     iterations: int = 12
     """Point-to-line steps at most."""
     max_shift_m: float = 0.002
     """Where the motion within a sweep turns out otherwise than expected, and moves points by more than this, they are matched again [m]."""
+    max_jump_m_s: float = 2.0
+    """Nothing moves the robot faster than this against its wheels: a scan that says so is left out [m/s]."""
+    max_jump_rad_s: float = 3.0
+    """Nor turns it faster [rad/s]."""
+    max_jumps: int = 5
+    """So many scans that jump one after the other are right: the robot was carried elsewhere."""
     revisit: RevisitConfig = field(default_factory=RevisitConfig)
 
 
@@ -60,6 +68,12 @@ class Registration:
         """Most of what is seen is in the map: the pose is not a wild guess."""
         return self.n_matched >= _FEW_POINTS and self.n_matched >= 0.4 * self.n_points
 
+    @property
+    def is_degenerate(self) -> bool:
+        """The scene holds the position in one direction only, as a corridor or a single wall does."""
+        low, high = np.linalg.eigvalsh(self.cov[:2, :2])
+        return bool(low < _DEGENERATE * high)
+
 
 class LidarMatcher:
     """A map of what was seen so far, and where scans fit into it. The caller says where each scan was taken (`insert`)."""
@@ -68,6 +82,7 @@ class LidarMatcher:
         self.config = config or LidarConfig()
         self._kiss: Kiss | None = None
         self._lines: LineMap | None = None
+        self._noise = Noise(self.config.sigma_point_m, self.config.sigma_line_m)
         self._downsampled = np.empty((0, 3))
         self._planar, self._is_planar = np.empty((0, 2)), True
         self._guess: tuple[FloatArray, FloatArray] | None = None  # and its information
@@ -105,7 +120,9 @@ class LidarMatcher:
     def _fit(self, lines: LineMap, start: FloatArray) -> Registration:
         assert self._guess is not None
         guess, prior = self._guess
-        fit = lines.fit(self._planar, start, self._options, prior, guess, self._ages)
+        options = replace(self._options, sigma_point=self._noise.sigma_point, sigma_line=self._noise.sigma_line)
+        fit = lines.fit(self._planar, start, options, prior, guess, self._ages)
+        self._noise.see(fit.spread)
         cov = np.linalg.inv(fit.information + np.diag(_KNOWS_NOTHING**-2)).astype(np.float64, copy=False)
         pose = se2.compose(fit.pose, se2.exp(cov @ fit.gradient))
         return Registration(pose, cov, len(self._planar), fit.n_matched, fit.residual_rms)
