@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from localization.logs import open_log
 from localization.simulate.drives import MoveArms, OpenLoop, Phase, Rest, constant, sine
 from localization.simulate.experiments import Experiment, ExperimentConfig
 from localization.simulate.scanners import ScannerConfig
+from localization.simulate.sensors import ImuConfig
 from localization.simulate.simulator import Simulation, SimulationConfig, write_simulation
 from localization.simulate.suite import SensorConfig
 from motion_models.registry import make_model
@@ -64,12 +66,21 @@ def _tour(robot: Robot, config: ExperimentConfig) -> Iterator[Phase]:
 
 
 TOUR = Experiment("tour", "all kinds of motion in a hall", "hall", (-4.0, 0.0, 0.0), _tour)
-QUICK = SimulationConfig(sensors=SensorConfig(scanner=ScannerConfig(beams=191)))
 
 
-def bag(path: Path, effects: Mapping[str, float], seed: int, robot: str = "vaultbot", experiment: Experiment = TOUR) -> Path:
-    """A bag in which ``effects`` (size by id) are hidden."""
-    write_simulation(path, Simulation(experiment, load_robot(robot), seed, effects, QUICK))
+def bag(
+    path: Path,
+    effects: Mapping[str, float],
+    seed: int,
+    robot: str = "vaultbot",
+    experiment: Experiment = TOUR,
+    lidar: Literal["2d", "none"] = "2d",
+    imu_hz: float = 50.0,
+) -> Path:
+    """A bag in which ``effects`` (size by id) are hidden; half of the usual beams save half of the time."""
+    sensors = SensorConfig(lidar=lidar, scanner=ScannerConfig(beams=191), imu=ImuConfig(rate_hz=imu_hz))
+    simulation = Simulation(experiment, load_robot(robot), seed, effects, SimulationConfig(sensors=sensors))
+    write_simulation(path, simulation)
     return path
 
 
