@@ -12,6 +12,7 @@ from rich.console import Console
 
 from localization.commands.calibrate import Calibrate
 from localization.commands.cg import Cg
+from localization.commands.compare import Compare
 from localization.commands.diagnose import Diagnose
 from localization.commands.info import Info
 from localization.commands.online import Online
@@ -25,6 +26,7 @@ _INTERRUPTED = 130
 Command = (
     Annotated[Info, tyro.conf.subcommand("info", prefix_name=False)]
     | Annotated[Replay, tyro.conf.subcommand("replay", prefix_name=False)]
+    | Annotated[Compare, tyro.conf.subcommand("compare", prefix_name=False)]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate", prefix_name=False)]
     | Annotated[Diagnose, tyro.conf.subcommand("diagnose", prefix_name=False)]
     | Annotated[Cg, tyro.conf.subcommand("cg", prefix_name=False)]

@@ -1,0 +1,49 @@
+"""Jobs on an existing Dask cluster (extra `dask`). Its workers need this library, and the logs under the same paths."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from localization.compare_job import Job, Row, failed_rows, run_job
+from localization.errors import DoorError
+
+try:
+    import distributed
+except ImportError as error:
+    raise DoorError(f"a Dask cluster needs the extra 'dask': pip install 'skidloc[dask]' ({error}).") from error
+
+_TIMEOUT_S = 10
+
+
+def run_on_cluster(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, list[Row]]]:
+    """Each job with its rows, as it ends. What a lost worker had is done by another. Raises `DoorError`."""
+    try:
+        client = distributed.Client(address, timeout=_TIMEOUT_S, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise DoorError(
+            f"no Dask scheduler answers at {address} ({_short(error)}). Start `dask scheduler` there, or leave --dask out."
+        ) from error
+    try:
+        if not client.scheduler_info()["workers"]:
+            try:
+                client.wait_for_workers(1, timeout=_TIMEOUT_S)
+            except TimeoutError as error:
+                raise DoorError(f"the Dask scheduler at {address} has no workers. Start some: dask worker {address}.") from error
+        futures = {client.submit(run_job, job, pure=False, retries=1): job for job in jobs}
+        for future in distributed.as_completed(list(futures), loop=client.loop):
+            job = futures.pop(future)
+            if future.status == "finished":
+                yield job, future.result()
+            else:
+                yield job, failed_rows(job, f"on the cluster: {_short(future.exception())}")
+            future.release()
+    except (distributed.comm.CommClosedError, distributed.client.FutureCancelledError) as error:
+        raise DoorError(
+            f"the Dask scheduler at {address} went away ({_short(error)}). What was done is kept: run the same again."
+        ) from error
+    finally:
+        client.close(timeout=_TIMEOUT_S)
+
+
+def _short(error: BaseException | None) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())[:200]

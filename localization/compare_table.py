@@ -1,0 +1,129 @@
+"""The table of a comparison on disk: CSV or Parquet, rewritten as a whole after each log, so that what is done is never lost."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from localization.compare_job import OK, Job, Row, Trial
+from localization.errors import OutputError
+from localization.estimators import CORRECTING
+
+_HEAD = ("log", "robot", "model", "estimator", "corrections", "key", "status", "error")
+_SUFFIXES = (".csv", ".parquet")
+
+Name = tuple[str, str, str, str]
+"""Log, model, estimator and corrections."""
+
+
+class Table:
+    """Rows by what was run. Reads what is there; `put` and `save`."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises `OutputError` for a file that is no table of a comparison, or a format that cannot be written here."""
+        if path.suffix not in _SUFFIXES:
+            raise OutputError(f"table '{path}': its name must end in {' or '.join(_SUFFIXES)}.")
+        self.path = path
+        self._read, self._write = (_read_csv, _write_csv) if path.suffix == ".csv" else _parquet(path)
+        self._rows: dict[Name, Row] = {}
+        if path.exists():
+            for row in self._load():
+                self._rows[_name(row)] = row
+
+    def _load(self) -> list[Row]:
+        try:
+            rows = self._read(self.path)
+        except OSError as error:
+            raise OutputError(f"table '{self.path}' cannot be read: {error.strerror or error}.") from error
+        except (ValueError, csv.Error) as error:
+            raise OutputError(f"'{self.path}' is no table of a comparison ({error}). Name another file.") from error
+        if any(set(_HEAD) - set(row) for row in rows) or not rows:
+            raise OutputError(f"'{self.path}' is no table of a comparison: it lacks its columns. Name another file.")
+        return rows
+
+    def missing(self, job: Job) -> tuple[Trial, ...]:
+        """The job's trials that have no row yet, or one of another configuration, log or version, or one that failed."""
+        return tuple(trial for trial in job.trials if not self._is_done(self._rows.get(_name_of(job, trial)), job))
+
+    def _is_done(self, row: Row | None, job: Job) -> bool:
+        return row is not None and row["key"] == job.key and row["status"] == OK
+
+    def put(self, rows: Iterable[Row]) -> None:
+        for row in rows:
+            self._rows[_name(row)] = row
+
+    def rows(self, jobs: Sequence[Job]) -> list[Row]:
+        """Those of ``jobs``, in their order, whatever the order in which they ended."""
+        names = [_name_of(job, trial) for job in jobs for trial in job.trials]
+        return [self._rows[name] for name in names if name in self._rows]
+
+    def save(self, jobs: Sequence[Job]) -> None:
+        """The rows of ``jobs``, then those that were there before of others. Raises `OutputError`."""
+        first = self.rows(jobs)
+        known = {_name(row) for row in first}
+        rows = first + [row for name, row in self._rows.items() if name not in known]
+        beside = self.path.with_name(f".{self.path.name}.new")
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._write(beside, rows)
+            beside.replace(self.path)
+        except OSError as error:
+            raise OutputError(f"table '{self.path}' cannot be written: {error.strerror or error}.") from error
+
+
+def _name(row: Mapping[str, Any]) -> Name:
+    return row["log"], row["model"], row["estimator"], row["corrections"]
+
+
+def _name_of(job: Job, trial: Trial) -> Name:
+    return job.log, trial.model, trial.estimator, trial.corrections if trial.estimator in CORRECTING else ""
+
+
+def _columns(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys([*_HEAD, *(name for row in rows for name in row)]))
+
+
+def _write_csv(path: Path, rows: Sequence[Row]) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, _columns(rows), restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: "" if value is None else value for name, value in row.items()} for row in rows)
+    with path.open("w", encoding="utf-8") as file:
+        file.write(text.getvalue())
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _read_csv(path: Path) -> list[Row]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return [{name: value if name in _HEAD else _number(value) for name, value in row.items()} for row in csv.DictReader(file)]
+
+
+def _number(text: str) -> float | int | None:
+    if text == "":
+        return None
+    return int(text) if text.lstrip("-").isdigit() else float(text)
+
+
+def _parquet(path: Path) -> tuple[Callable[[Path], list[Row]], Callable[[Path, Sequence[Row]], None]]:
+    try:
+        import pyarrow
+        import pyarrow.parquet as parquet
+    except ImportError as error:
+        raise OutputError(f"table '{path}': Parquet needs pyarrow (pip install pyarrow). Or name a .csv.") from error
+
+    def read(path: Path) -> list[Row]:
+        try:
+            return [dict(row) for row in parquet.read_table(path).to_pylist()]
+        except pyarrow.ArrowInvalid as error:
+            raise ValueError(str(error)) from error
+
+    def write(path: Path, rows: Sequence[Row]) -> None:
+        columns = _columns(rows)
+        parquet.write_table(pyarrow.Table.from_pylist([{name: row.get(name) for name in columns} for row in rows]), path)
+
+    return read, write

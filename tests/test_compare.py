@@ -1,0 +1,345 @@
+"""Many logs: the same table whatever the processes, whatever dies on the way; statistics that hold what they promise."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from scipy.stats import ttest_rel
+
+from localization import compare_job
+from localization.cli import main
+from localization.compare_job import Job, failed_rows, job_key, run_job, trials
+from localization.compare_pool import run_local
+from localization.compare_stats import differences, means, sign_flip_p
+from localization.compare_table import Table
+from localization.errors import OutputError
+from localization.logs import TopicOverrides
+from localization.run import ReplayConfig
+from tests.compare_help import killing, logs, quick
+from tests.online_help import ROBOT
+
+pytestmark = pytest.mark.xdist_group("compare")
+
+
+def jobs(count=3, estimators=("odometry",)):
+    wanted = tuple(trials(["diff_drive", "skid_steer"], estimators, ["none"]))
+    nothing, config = TopicOverrides(), ReplayConfig()
+    return [Job(str(path), ROBOT, wanted, job_key(path, ROBOT, None, nothing, config)) for path in logs(count)]
+
+
+def compare(out, *arguments, of=None):
+    chosen = logs(3) if of is None else of
+    return main(["compare", *map(str, chosen), "--robot", "vaultbot", "--out", str(out), *map(str, arguments)])
+
+
+@pytest.fixture(autouse=True)
+def asked(monkeypatch, table):
+    """The jobs that were run, here and not in other processes, which take seconds to start."""
+    found = []
+
+    def run_here(jobs, processes):
+        for job in jobs:
+            found.append(job)
+            yield job, run_job(job)
+
+    monkeypatch.setattr("localization.commands.compare.run_local", run_here)
+    return found
+
+
+def rows_of(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    """Made by two processes."""
+    out = tmp_path_factory.mktemp("compare") / "table.csv"
+    assert compare(out, "--processes", "2", "--json", out.with_suffix(".json")) == 0
+    return out
+
+
+def test_its_numbers_are_those_of_replay(table, tmp_path):
+    assert main(["replay", str(logs(3)[1]), "--robot", "vaultbot", "--estimator", "odometry,ekf", "--out", str(tmp_path / "replayed")]) == 0
+    metrics = json.loads((tmp_path / "replayed" / "metrics.json").read_text())
+    expected = {(r["model"], r["estimator"]): r for r in metrics["results"]}
+    found = {(r["model"], r["estimator"]): r for r in rows_of(table) if r["log"] == str(logs(3)[1])}
+    assert set(found) == set(expected)
+    for name, row in found.items():
+        assert float(row["ate_rmse_m"]) == expected[name]["ate_rmse_m"]
+        assert float(row["nees_mean"]) == expected[name]["nees_mean"]
+        assert row["status"] == "ok"
+
+
+def test_the_table_does_not_depend_on_the_processes(table, tmp_path):
+    assert compare(tmp_path / "one.csv") == 0
+    assert (tmp_path / "one.csv").read_bytes() == table.read_bytes()
+
+
+def test_means_and_differences_are_told(table, capsys, tmp_path):
+    content = json.loads(table.with_suffix(".json").read_text())
+    found = {m["name"]: m for m in content["means"]}
+    assert set(found) == {"diff_drive odometry", "skid_steer odometry", "diff_drive ekf (constant)", "skid_steer ekf (constant)"}
+    odometry = found["diff_drive odometry"]
+    assert odometry["n"] == 3
+    assert odometry["low"] <= odometry["mean"] <= odometry["high"]
+    assert len(content["differences"]) == 6
+    assert compare(tmp_path / "t.csv", "--estimator", "odometry") == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert re.search(r"(skid_steer|diff_drive) odometry and (skid_steer|diff_drive) odometry are not told apart", said)
+    assert "3 logs cannot show it: p is at least 0.25" in said
+
+
+def test_what_is_done_is_not_done_again(table, tmp_path, asked, capsys):
+    out = tmp_path / "table.csv"
+    out.write_bytes(table.read_bytes())
+    assert compare(out) == 0
+    assert asked == []
+    assert out.read_bytes() == table.read_bytes()
+    assert "12 results are in" in capsys.readouterr().out
+    # a log more: it alone is run; another configuration: all
+    assert compare(out, of=logs(4)) == 0
+    assert [job.log for job in asked] == [str(logs(4)[3])]
+    asked.clear()
+    kept = [row for row in rows_of(out) if row["log"] != str(logs(4)[3])]
+    assert kept == rows_of(table)
+    assert compare(out, "--estimator", "odometry", "--config.step.wait-s", "0.2") == 0
+    assert len(asked) == 3
+
+
+def test_half_a_table_is_completed(table, tmp_path):
+    lines = table.read_text().splitlines(keepends=True)
+    out = tmp_path / "table.csv"
+    out.write_text("".join(lines[:4]))  # the first log, three of its four trials
+    assert compare(out) == 0
+    assert out.read_bytes() == table.read_bytes()
+
+
+def test_a_log_that_is_broken_is_reported_and_the_others_finished(table, tmp_path, capsys):
+    broken, absent = tmp_path / "broken.mcap", tmp_path / "absent.mcap"
+    broken.write_bytes(logs(3)[0].read_bytes()[:40])
+    assert compare(tmp_path / "t.csv", of=[broken, *logs(3), absent]) == 0
+    rows = rows_of(tmp_path / "t.csv")
+    assert [r["status"] for r in rows] == ["failed"] * 4 + ["ok"] * 12 + ["failed"] * 4
+    assert "no such file" in rows[-1]["error"]
+    said = " ".join(capsys.readouterr().out.split())
+    assert "absent.mcap" in said
+    assert "8 results of 2 logs failed" in said
+    assert {r["ate_rmse_m"] for r in rows[4:16]} == {r["ate_rmse_m"] for r in rows_of(table)}
+    assert compare(tmp_path / "u.csv", of=[absent]) == 2
+    assert "none of 1 logs could be compared" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_bug_in_one_log_does_not_end_the_others(monkeypatch):
+    def bug(*arguments):
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(compare_job, "replay", bug)
+    rows = run_job(jobs(1)[0])
+    assert {row["error"] for row in rows} == {"ZeroDivisionError: a bug"}
+
+
+def test_a_process_that_is_killed_takes_no_other_log_with_it(table):
+    """The second log always kills its process, the third does it once."""
+    found = {job.log: rows for job, rows in run_local(jobs(3), 1, killing)}
+    first, second, third = (found[str(path)] for path in logs(3))
+    assert "killed by signal 9, 2 times over" in second[0]["error"]
+    assert [row["status"] for row in (*first, *second, *third)] == ["ok", "ok", "failed", "failed", "ok", "ok"]
+    expected = {(r["log"], r["model"]): float(r["ate_rmse_m"]) for r in rows_of(table) if r["estimator"] == "odometry"}
+    assert all(row["ate_rmse_m"] == expected[row["log"], row["model"]] for row in (*first, *third))
+
+
+def test_no_process_is_left_behind_when_it_is_interrupted():
+    running = run_local(jobs(2), 1, quick)
+    next(running)
+    running.close()
+    children = subprocess.run(["ps", "--ppid", str(os.getpid()), "-o", "args="], capture_output=True, text=True).stdout
+    assert "spawn_main" not in children
+    assert list(run_local([], 2)) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--estimator", "magic"], "no estimator 'magic'"),
+        (["--model", "magic"], "magic"),
+        (["--out", "table.txt"], "must end in .csv or .parquet"),
+        (["--robot", "nobody"], "nobody"),
+    ],
+)
+def test_bad_arguments_are_explained(arguments, said, tmp_path, capsys):
+    assert compare(tmp_path / "t.csv", *arguments) == 2
+    shown = capsys.readouterr().err
+    assert said in shown
+    assert "Traceback" not in shown
+
+
+def test_metrics_that_do_not_exist_are_explained(table, capsys):
+    assert compare(table, "--metric", "beauty") == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "no result has a number 'beauty'" in said
+    assert "ate_rmse_m" in said
+
+
+def test_files_that_are_no_tables_are_not_overwritten(tmp_path, capsys):
+    for content in (b"precious,data\n1,2\n", b"", b"\x89MCAP0\r\n\x00\x01\xff"):
+        (tmp_path / "t.csv").write_bytes(content)
+        assert compare(tmp_path / "t.csv") == 2
+        assert (tmp_path / "t.csv").read_bytes() == content
+        assert "is no table of a comparison" in capsys.readouterr().err
+
+
+def test_parquet_holds_the_same(table, tmp_path):
+    job = jobs(2)
+    rows = [row for j in job for row in failed_rows(j, "why")]
+    try:
+        import pyarrow.parquet
+    except ImportError:
+        with pytest.raises(OutputError, match="Parquet needs pyarrow"):
+            Table(tmp_path / "t.parquet")
+        return
+    out = Table(tmp_path / "t.parquet")
+    out.put(rows)
+    out.put([dict(row, status="ok", ate_rmse_m=0.1, n_matched=3) for row in rows[:1]])
+    out.save(job)
+    assert Table(tmp_path / "t.parquet").rows(job) == out.rows(job) or pyarrow.parquet.read_table(tmp_path / "t.parquet").num_rows == 4
+    (tmp_path / "u.parquet").write_bytes(b"nonsense")
+    with pytest.raises(OutputError, match="is no table"):
+        Table(tmp_path / "u.parquet")
+
+
+def made_up(table):
+    """Rows of numbers: {combination: {log: value}}."""
+    return [
+        {"log": log, "model": name, "estimator": "ekf", "corrections": "", "status": "ok", "score": value}
+        for name, values in table.items()
+        for log, value in values.items()
+    ]
+
+
+def test_intervals_cover_the_truth_about_as_often_as_they_say():
+    rng = np.random.default_rng(7)
+    hits = 0
+    for _ in range(200):
+        (mean,) = means(made_up({"a": {str(i): v for i, v in enumerate(rng.gamma(4.0, 1.0, 20))}}), "score")
+        hits += mean.low <= 4.0 <= mean.high
+    assert 0.87 < hits / 200 < 0.98  # percentile intervals of 20 skewed numbers are a little short
+
+
+def test_p_values_are_uniform_where_nothing_differs_and_small_where_something_does():
+    rng = np.random.default_rng(3)
+    p = np.array([sign_flip_p(rng.normal(size=8), rng) for _ in range(400)])
+    assert np.mean(p <= 0.05) == pytest.approx(0.047, abs=0.035)
+    assert np.mean(p <= 0.5) == pytest.approx(0.5, abs=0.08)
+    off = rng.normal(0.5, 1.0, 40)
+    assert sign_flip_p(off, rng) == pytest.approx(ttest_rel(off, np.zeros(40)).pvalue, abs=0.01)  # another test of the same
+    assert sign_flip_p(np.full(5, 1.0), rng) == 2.0 / 2**5  # exact
+    assert sign_flip_p(np.zeros(4), rng) == 1.0
+
+
+def test_differences_are_paired_and_corrected():
+    rng = np.random.default_rng(5)
+    hard = rng.gamma(2.0, 5.0, 12)  # logs differ far more than models do
+    a = {str(i): float(h) for i, h in enumerate(hard)}
+    b = {str(i): float(h + 0.5 + 0.05 * rng.normal()) for i, h in enumerate(hard)}
+    c = {str(i): float(h + 0.5 * rng.normal()) for i, h in enumerate(hard)}
+    found = differences(made_up({"b": b, "a": a, "c": c}), "score")
+    first = found[0]
+    assert (first.better, first.worse, first.n) == ("a ekf", "b ekf", 12)
+    assert first.mean == pytest.approx(np.mean([b[log] - a[log] for log in a]))
+    assert 0.4 < first.low < first.mean < first.high < 0.6
+    assert first.p_value == pytest.approx(3 * 2.0 / 2**12)  # Holm: times three
+    assert [d.p_value for d in found] == sorted(d.p_value for d in found)
+    missing = differences(made_up({"a": {"1": 1.0, "2": 2.0}, "b": {"2": 3.0}}), "score")
+    assert missing == []  # one log in common
+
+
+def test_the_key_changes_with_whatever_the_results_depend_on(tmp_path):
+    path, other = logs(2)
+    keys = {job_key(path, ROBOT, None, TopicOverrides(), ReplayConfig())}
+    keys.add(job_key(other, ROBOT, None, TopicOverrides(), ReplayConfig()))
+    keys.add(job_key(path, dataclasses.replace(ROBOT, name="other"), None, TopicOverrides(), ReplayConfig()))
+    keys.add(job_key(path, ROBOT, "/ground_truth/odom", TopicOverrides(), ReplayConfig()))
+    keys.add(job_key(path, ROBOT, None, TopicOverrides(imu=""), ReplayConfig()))
+    reference = tmp_path / "drive_0.tum"
+    for content in ("1 0 0 0 0 0 0 1\n", "2 0 0 0 0 0 0 1\n"):
+        reference.write_text(content)
+        keys.add(job_key(path, ROBOT, str(tmp_path / "{stem}.tum"), TopicOverrides(), ReplayConfig()))
+    assert len(keys) == 7
+    moved = dataclasses.replace(ROBOT, folder=tmp_path)
+    assert job_key(path, moved, None, TopicOverrides(), ReplayConfig()) in keys
+
+
+def start(*command):
+    return subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def read_until(process, pattern, seconds=90.0):
+    end, said = time.monotonic() + seconds, ""
+    while time.monotonic() < end:
+        line = process.stdout.readline()
+        said += line
+        if (found := re.search(pattern, line)) is not None:
+            return found
+        if not line and process.poll() is not None:
+            break
+    pytest.fail(said)
+
+
+def test_a_cluster_whose_worker_is_killed_gives_the_same_table(table, tmp_path):
+    """A scheduler and two workers as processes of their own."""
+    pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
+    dask = (sys.executable, "-m", "distributed.cli")
+    options = ("--host", "127.0.0.1", "--no-dashboard")
+    scheduler = start(*dask[:2], "distributed.cli.dask_scheduler", *options, "--port", "0")
+    processes = [scheduler]
+    try:
+        address = read_until(scheduler, r"Scheduler at:\s+(tcp://\S+)")[1]
+        worker = (*dask[:2], "distributed.cli.dask_worker", address, *options, "--nthreads", "1", "--no-nanny")
+        workers = [start(*worker), start(*worker)]
+        processes += workers
+        for process in workers:
+            read_until(process, "Registered to")
+        out = tmp_path / "table.csv"
+        command = (sys.executable, "-m", "localization.cli", "compare", *logs(3), "--robot", "vaultbot", "--out", out, "--dask", address)
+        running = start(*command)
+        end = time.monotonic() + 120.0
+        while not out.exists() and time.monotonic() < end and running.poll() is None:
+            time.sleep(0.02)
+        workers[0].send_signal(signal.SIGKILL)
+        said = running.communicate(timeout=120)[0]
+        assert running.returncode == 0, said
+        assert out.read_bytes() == table.read_bytes()
+    finally:
+        for process in reversed(processes):
+            process.kill()
+            process.wait()
+
+
+def test_a_scheduler_that_is_not_there_is_explained(tmp_path, capsys, monkeypatch):
+    pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
+    from localization import compare_dask
+
+    monkeypatch.setattr(compare_dask, "_TIMEOUT_S", 1)
+    for address in ("tcp://127.0.0.1:1", "nonsense://x"):
+        assert compare(tmp_path / "t.csv", "--dask", address) == 2
+        said = " ".join(capsys.readouterr().err.split())
+        assert f"no Dask scheduler answers at {address}" in said
+        assert "Traceback" not in said
+
+
+def test_the_extra_is_named_where_it_is_missing(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    monkeypatch.delitem(sys.modules, "localization.compare_dask", raising=False)
+    assert compare(tmp_path / "t.csv", "--dask", "tcp://127.0.0.1:1") == 2
+    assert "pip install 'skidloc[dask]'" in " ".join(capsys.readouterr().err.split())
