@@ -50,6 +50,8 @@ class Corrections:
     """(k, k) at first."""
     walk_cov: FloatArray
     """(k, k) growth per second of motion; it may be singular. What does not walk is remembered."""
+    of_turns: bool = False
+    """The model's turning was measured on turns in place; on gentle arcs tyres creep, and these say nothing of it."""
 
     @property
     def sigmas(self) -> FloatArray:
@@ -84,7 +86,7 @@ def corrections(model: MotionModel, form: Form) -> Corrections:
             directions[model.param_names.index(name), column] = rate
     sigmas = np.array([c.sigma for c in found])
     walks = sigmas / np.sqrt(_FORGOTTEN_AFTER_S)  # after an hour the first uncertainty has come back once more
-    return Corrections(tuple(c.name for c in found), directions, np.diag(sigmas**2), np.diag(walks**2))
+    return Corrections(tuple(c.name for c in found), directions, np.diag(sigmas**2), np.diag(walks**2), model.name == "skid_steer")
 
 
 def regression_cov(with_misfit: bool = False) -> FloatArray:
@@ -116,7 +118,7 @@ def _regressions(model: MotionModel) -> Corrections:
     floor[0:3, 0] = _TURNING * model.nominal[0:3]  # another floor scales k at every CG
     floor[3, 1], floor[5, 2] = _CENTRE_X, _CENTRE_Y
     spread = floor @ floor.T
-    return Corrections(model.param_names, np.eye(n), regression_cov(with_misfit=True) + spread, spread / _FORGOTTEN_AFTER_S)
+    return Corrections(model.param_names, np.eye(n), regression_cov(with_misfit=True) + spread, spread / _FORGOTTEN_AFTER_S, True)
 
 
 def _constants(model: MotionModel) -> tuple[Correction, ...]:

@@ -8,9 +8,11 @@ import time
 PARTS = (
     "tests.benchmarks.replay_cost",
     "tests.benchmarks.friction_solve",
+    "tests.benchmarks.graph",
     "tests.studies.thesis_regressions",
     "tests.studies.friction_grid",
     "tests.studies.gentle_arcs",
+    "tests.studies.graph_corrections",
     "tests.studies.terrain_track",
     "tests.studies.real_husky",
 )

@@ -171,3 +171,16 @@ def test_what_was_learned_at_a_posture_is_there_when_the_arms_return(kind):
     assert (k[3:, 0] < k[:3, 1] + 0.005).all()
     again = np.array([k for _, k in found["constant"]]).mean(axis=0)[3:, 0]
     assert (k[3:, 0] < 0.75 * again).all()
+
+
+@pytest.mark.parametrize("kind", BOTH)
+def test_gentle_arcs_do_not_teach_what_was_measured_on_turns(kind):
+    """And an arc whose turning is not believed is as uncertain as that: what is not known counts as slip."""
+    sigmas = {}
+    for turning in (0.2, 2.5):
+        seer = Seer()
+        estimator = make(kind, seer)
+        run(estimator, seer, 2, 60, wheels=lambda t: (5.0 - turning, 5.0 + turning))  # noqa: B023
+        sigmas[turning] = estimator.parameters()["k_0"][1] / estimator._corrected.sigmas[0]
+    assert sigmas[0.2] > 0.99
+    assert sigmas[2.5] < 0.7

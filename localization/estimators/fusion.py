@@ -59,7 +59,7 @@ class EkfFusion:
 
     def step(self, step: Step) -> Estimate:
         ekf, nis = self._ekf, None
-        ekf.predict(teaching(step, self._track_m, self._corrected.directions, ekf.covariance[PARAMS:, PARAMS:]))
+        ekf.predict(teaching(step, self._track_m, self._corrected, ekf.covariance[PARAMS:, PARAMS:]))
         if step.turn is not None:
             self._has_gyro = True
             ekf.measure_turn(step.turn)

@@ -26,6 +26,7 @@ from localization.estimators.graph_link import Link, check_covariance, check_mot
 from localization.estimators.graph_revisit import revisited
 from localization.estimators.graph_slow import Learned, SlowStates
 from localization.estimators.graph_window import Ahead, Node, SingularError, Window
+from localization.estimators.teaching import teaching
 from localization.estimators.witness import NoWitness, ScanWitness, Sight, Witness
 from localization.lidar import LidarConfig
 from localization.residuals import motion_residual
@@ -84,6 +85,7 @@ class GraphFusion:
         """``belief``: as the filter's. ``witness`` measures the motion between scans; if not given, scans are matched as ``lidar`` says."""
         self.config, self._belief = config or GraphConfig(), belief or EkfConfig()
         self._model, self._corrected, self._has_lidar = model, corrected, has_lidar
+        self._track_m = robot.geometry.track_width_m
         self._witness: Witness = (witness or ScanWitness(mounts, lidar)) if has_lidar else NoWitness()
         c = self.config
         learn = c.learn if has_lidar else ()  # without a LiDAR there is no second clock to compare with
@@ -115,7 +117,8 @@ class GraphFusion:
         """See `Estimator.step`. Raises `EstimatorError` for measurements that are not finite or have no covariance."""
         if not self._nodes_ns:
             self._nodes_ns.append(step.start_ns)
-        link = self._slow.link(step, self._now.slow)
+        known = self._now.covariance[3:, 3:][self._slow.corrections, self._slow.corrections]
+        link = self._slow.link(teaching(step, self._track_m, self._corrected, known), self._now.slow)
         self._has_gyro |= step.turn is not None
         self._counts["standing"] += step.is_standing
         pending = link if self._pending is None else self._pending.then(link)
