@@ -238,3 +238,10 @@ def second_errors(drive: Drive, poses: np.ndarray, seconds: float = 1.0, rate_hz
 def ate(drive: Drive, poses: np.ndarray) -> float:
     """RMS distance from the truth, both from the origin on [m]."""
     return float(np.sqrt(np.mean(np.sum((poses - drive.poses)[:, :2] ** 2, axis=1))))
+
+
+def look_around(walls: np.ndarray, pose: np.ndarray, angles: np.ndarray, longest: float = 100.0) -> np.ndarray:
+    """Distances to ``walls`` (n, 5) from ``pose`` (3,) along ``angles`` (m,) of its frame."""
+    ranges = np.empty(len(angles))
+    _cast(np.tile(np.asarray(pose, dtype=float), (len(angles), 1)), angles, longest, make_grid(walls), ranges)
+    return ranges

@@ -73,14 +73,16 @@ class ScanWitness:
         found = self._matcher.register(sweep.at_stamp(step.twist + rate), sweep.is_planar, guess, step.predicted.cov)
         if found is None:
             return None
+        since_s = (step.end_ns - self._last_ns) * 1e-9 if self._last_ns >= 0 else 0.0
+        self._is_good = not self._check.is_jump(se2.between(guess, found.pose), found, since_s)
+        if not self._is_good:
+            return None
         if found.is_trusted and step.start_ns == self._last_ns and step.duration > 0.0:
             off = se2.log(se2.between(se2.compose(anchor, step.predicted.delta), found.pose))
             slip.measure(off / step.duration, np.diag(found.cov) / step.duration**2)
             if sweep.shift(slip.rate - rate) > self._matcher.config.max_shift_m:  # the sweep looked otherwise than was thought
                 found = self._matcher.refine(sweep.at_stamp(step.twist + slip.rate), sweep.is_planar, found.pose) or found
-        since_s = (step.end_ns - self._last_ns) * 1e-9 if self._last_ns >= 0 else 0.0
-        self._is_good = not self._check.is_jump(se2.between(guess, found.pose), found, since_s)
-        return Sight(Motion(se2.between(anchor, found.pose), found.cov), found.is_trusted) if self._is_good else None
+        return Sight(Motion(se2.between(anchor, found.pose), found.cov), found.is_trusted)
 
     def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
         return self._matcher.recall(pose, cov, step.end_ns)
@@ -90,9 +92,8 @@ class ScanWitness:
 
     def remember(self, step: Step, pose: FloatArray) -> None:
         self._last_ns = step.end_ns
-        if self._is_good and (
-            not step.is_standing or not self._has_map
-        ):  # a robot that stands sees nothing new, and would only thicken its lines
+        # a robot that stands sees nothing new, and would only thicken its lines
+        if self._is_good and (not step.is_standing or not self._has_map):
             self._matcher.insert(pose)
             self._has_map = True
 

@@ -69,6 +69,8 @@ class LineFit:
     """(3,) downhill direction at ``pose``."""
     n_matched: int
     """Points that lie by a line of the map."""
+    n_on: int
+    """Those of them that are on it, within three sigmas."""
     residual_rms: float
     """RMS distance of the matched points from their lines [m], robustly weighted."""
     spread: Spread
@@ -135,7 +137,7 @@ class LineMap:
         where they were; it is no part of the returned quadratic. Only points of these ``ages`` count.
         """
         information, gradient, pose, spread = np.zeros((3, 3)), np.zeros(3), np.array(start, dtype=float), np.zeros(4)
-        n, squares = _fit(
+        n, n_on, squares = _fit(
             self._cells,
             self._points,
             self._travels,
@@ -156,7 +158,7 @@ class LineMap:
             gradient,
             spread,
         )
-        return LineFit(pose, information, gradient, n, math.sqrt(squares / n) if n else math.nan, Spread(*spread.tolist()))
+        return LineFit(pose, information, gradient, n, n_on, math.sqrt(squares / n) if n else math.nan, Spread(*spread.tolist()))
 
     def compare(self, points: FloatArray, pose: FloatArray, radius: float, ages: Ages = ALL_AGES) -> tuple[FloatArray, FloatArray]:
         """How far ``points`` (N, 2) of the body frame at ``pose`` (3,) are off the lines within ``radius`` [m] of them, and when those
@@ -455,8 +457,8 @@ def _fit(
     H: FloatArray,
     g: FloatArray,
     spread: FloatArray,
-) -> tuple[int, float]:  # pragma: no cover
-    """Changes ``pose``, ``H`` and ``g`` in place; returns the matched points and their weighted sum of squares.
+) -> tuple[int, int, float]:  # pragma: no cover
+    """Changes ``pose``, ``H`` and ``g`` in place; returns the matched points, those on their lines, and the weighted sum of squares.
 
     Lines are looked up again where the points have moved by a part of the neighbourhood since they were: near the end, they stay.
     """
@@ -494,8 +496,8 @@ def _fit(
         moved += math.hypot(d0, d1) + abs(d2) * reach
         if iteration > 0 and abs(d0) + abs(d1) + abs(d2) < 1e-4:
             iterations = iteration + 1
-    _spread(source, lines, home, pose, sigma_point, sigma_line, spread)
-    return n_matched, squares
+    n_on = _spread(source, lines, home, pose, sigma_point, sigma_line, spread)
+    return n_matched, n_on, squares
 
 
 @numba.njit(cache=True)
@@ -507,12 +509,13 @@ def _spread(
     sigma_point: float,
     sigma_line: float,
     spread: FloatArray,
-) -> None:  # pragma: no cover
-    """Fills ``spread`` (4,), see `Spread`. Points beyond three sigmas are of something else. A group ends where the scan leaves a cell."""
+) -> int:  # pragma: no cover
+    """Fills ``spread`` (4,), see `Spread`; returns how many points are on their lines: those beyond three sigmas are of something else.
+    A group ends where the scan leaves a cell."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     limit = 9.0 * (sigma_point * sigma_point + sigma_line * sigma_line)
     spread[:] = 0.0
-    n, total, squares, place = 0, 0.0, 0.0, 0.0
+    n_on, n, total, squares, place = 0, 0, 0.0, 0.0, 0.0
     for i in range(source.shape[0] + 1):
         is_end = i == source.shape[0]
         if n and (is_end or home[i] != home[i - 1]):
@@ -529,7 +532,9 @@ def _spread(
         y = pose[1] + s * source[i, 0] + c * source[i, 1]
         e = lines[i, 1] * (x - lines[i, 3]) + lines[i, 2] * (y - lines[i, 4])
         if e * e < limit + 9.0 * lines[i, 5]:
+            n_on += 1
             n += 1
             total += e
             squares += e * e
             place += lines[i, 5]
+    return n_on

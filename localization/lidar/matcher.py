@@ -59,7 +59,7 @@ class Registration:
     n_points: int
     """Points that could match."""
     n_matched: int
-    """Points that did."""
+    """Points that did: they are on lines of the map, within their noise."""
     residual_rms_m: float
     """RMS distance of the matched points from the map's lines."""
 
@@ -125,7 +125,7 @@ class LidarMatcher:
         self._noise.see(fit.spread)
         cov = np.linalg.inv(fit.information + np.diag(_KNOWS_NOTHING**-2)).astype(np.float64, copy=False)
         pose = se2.compose(fit.pose, se2.exp(cov @ fit.gradient))
-        return Registration(pose, cov, len(self._planar), fit.n_matched, fit.residual_rms)
+        return Registration(pose, cov, len(self._planar), fit.n_on, fit.residual_rms)
 
     def insert(self, pose: FloatArray) -> None:
         """Add the scan that was last given to `register` to the map, as seen from ``pose`` (3,) ``world_T_body``."""

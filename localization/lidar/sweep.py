@@ -25,11 +25,12 @@ class Sweep:
     @classmethod
     def of(cls, scan: Scan, mount: Mount) -> Sweep:
         """Points that are not finite are left out."""
-        points: FloatArray = scan.points @ mount.rotation().T + np.array([mount.x, mount.y, mount.z])
-        is_finite = np.isfinite(points).all(axis=1)
-        if is_finite.all():
-            return cls(points, scan.offsets, scan.is_planar)
-        return cls(points[is_finite], scan.offsets[is_finite] if len(scan.offsets) else scan.offsets, scan.is_planar)
+        measured, offsets = scan.points, scan.offsets
+        is_finite = np.isfinite(measured).all(axis=1)
+        if not is_finite.all():
+            measured, offsets = measured[is_finite], offsets[is_finite] if len(offsets) else offsets
+        points: FloatArray = measured @ mount.rotation().T + np.array([mount.x, mount.y, mount.z])
+        return cls(points, offsets, scan.is_planar)
 
     def at_stamp(self, twist: FloatArray) -> FloatArray:
         """(N, 3) in the body frame as it was at the stamp.

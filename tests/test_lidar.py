@@ -1,0 +1,406 @@
+"""Scan matching: what it claims of itself, against second differences, the truth of simulated rooms, and scans that are spoilt."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from localization.estimators.base import Estimate
+from localization.events import Scan
+from localization.lidar import LidarMatcher, Slip, Sweep, body_points
+from localization.lidar.lines import FitOptions, LineMap, Spread
+from localization.lidar.noise import Noise
+from localization.online.core import Core, Pair, ReplayConfig
+from localization.simulate import world
+from motion_models import se2
+from motion_models.registry import make_model
+from motion_models.robot import Mount, WheelNoise
+from tests import rooms
+
+NO_SLIP = WheelNoise(*[0.0] * 8)
+LAB = world.lab().walls
+HALL = world.hall().walls
+CORRIDOR = np.concatenate([world.line(-60, -1.2, 60, -1.2), world.line(-60, 1.2, 60, 1.2)])
+WALL = world.line(-60, 2.0, 60, 2.0)
+SURE = np.diag([1e-4, 1e-4, 1e-4])
+HARDLY = np.diag([0.5, 0.5, 0.2]) ** 2
+TOUR = rooms.path((1, 0, 0), (9, 0.4, 0.5), (9, 0.4, -0.5), (4, 0, 0.5), (1, 0, 0))
+
+
+def scans_of(drive: rooms.Drive) -> list[Scan]:
+    return [event for event in drive.events if isinstance(event, Scan)]
+
+
+def mapped(walls: np.ndarray, twists: np.ndarray, seed: int = 0, start=(0.0, 0.0, 0.0), scanner: rooms.Beams | None = None):
+    """A matcher whose map is drawn from the true poses of a drive; the drive, and its last registration."""
+    drive = rooms.drive_through(walls, twists, seed, start, scanner, NO_SLIP)
+    rng, matcher, found = np.random.default_rng(seed), LidarMatcher(), None
+    twist = se2.log(se2.between(drive.poses[:-1], drive.poses[1:])) * 12.5
+    for scan, pose, t in zip(scans_of(drive), drive.poses, [*twist, twist[-1]], strict=True):
+        guess = se2.compose(pose, se2.exp(0.01 * rng.normal(size=3)))
+        found = matcher.register(body_points(scan, drive.mount, t), True, guess, SURE)
+        matcher.insert(pose)
+    return matcher, drive, found
+
+
+# --- the quadratic -----------------------------------------------------------------------------------------------------------------
+
+
+def test_the_information_is_the_curvature_of_the_cost() -> None:
+    """Straight walls, points without noise: the cost is sum w e^2 / 2 with e the distance from the walls, computed here by hand."""
+    x, y = np.arange(-3.0, 3.0, 0.05), np.arange(-2.0, 2.0, 0.05)
+    walls = np.concatenate([np.column_stack([x, np.full(len(x), 2.0)]), np.column_stack([np.full(len(y), 3.0), y])])
+    lines = LineMap(0.4, 0.01, 50.0)
+    lines.insert(walls, np.zeros(3))
+    points = np.concatenate([walls[10:100:3], walls[130:190:3]])
+    options = FitOptions(0.2, 0.03, 0.0, 1e3, 1e3, 0)  # a kernel that is plainly quadratic, lines without errors of their own
+    pose = np.array([0.004, -0.003, 0.001])
+    here = se2.transform(se2.inverse(pose), points)
+
+    def cost(d: np.ndarray) -> float:
+        at = se2.transform(se2.compose(pose, se2.exp(d)), here)
+        is_top = np.abs(points[:, 1] - 2.0) < 1e-9
+        return float(0.5 * np.sum(np.where(is_top, at[:, 1] - 2.0, at[:, 0] - 3.0) ** 2) / 0.03**2)
+
+    fit = lines.fit(here, pose, options, np.zeros((3, 3)), pose)
+    assert fit.n_matched == len(points)
+    h = 1e-4
+    eye = h * np.eye(3)
+    H = np.array([[(cost(a + b) - cost(a - b) - cost(b - a) + cost(-a - b)) / (4 * h * h) for b in eye] for a in eye])
+    g = np.array([(cost(a) - cost(-a)) / (2 * h) for a in eye])
+    np.testing.assert_allclose(fit.information, H, rtol=2e-3, atol=2e-3 * np.abs(H).max())
+    np.testing.assert_allclose(fit.gradient, -g, rtol=2e-3, atol=1e-3 * np.abs(H).max() * 1e-3)
+
+
+def test_points_of_one_cell_know_no_more_than_their_line() -> None:
+    """A thousand points against lines that are wrong by 2 cm each are no better than the lines."""
+    x = np.arange(0.0, 0.4, 0.01)
+    lines = LineMap(0.5, 0.001, 50.0)
+    lines.insert(np.column_stack([np.arange(-1.0, 1.4, 0.01), np.full(240, 0.25)]), np.zeros(3))
+    variances = []
+    for copies in (1, 100):
+        points = np.tile(np.column_stack([x, np.full(len(x), 0.25)]), (copies, 1))
+        fit = lines.fit(points, np.zeros(3), FitOptions(0.3, 0.03, 0.02, 1.0, 1.0, 0), np.zeros((3, 3)), np.zeros(3))
+        variances.append(1.0 / fit.information[1, 1])
+    assert variances[0] > 0.02**2
+    assert 0.02**2 <= variances[1] < 1.05 * 0.02**2 + variances[0] / 50
+
+
+# --- what the covariance says ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("walls", "start", "free"), [(CORRIDOR, (0.0, 0.2, 0.4), True), (WALL, (0.0, 0.0, 0.3), True), (LAB, (0.0, 0.0, 0.4), False)]
+)
+def test_the_covariance_opens_along_what_the_scene_does_not_hold(walls: np.ndarray, start, free: bool) -> None:
+    _, _, found = mapped(walls, rooms.path((1.5, 0.0, 0.0)), start=start, scanner=rooms.Beams(longest=20.0))
+    heading = start[2]
+    R = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]])
+    along, across = np.sqrt(np.diag(R @ found.cov[:2, :2] @ R.T))
+    assert found.is_trusted
+    assert found.is_degenerate == free
+    assert across < 0.01
+    if free:
+        assert along > 10.0 * across  # noise makes normals look as if they varied: never wholly open
+        assert along > 0.02
+    else:
+        assert along < 0.01
+
+
+def test_registrations_are_as_good_as_they_say() -> None:
+    """One registration a run, against a map drawn from true poses: mean NEES of 3 at most, and not beyond all measure safe."""
+    drive = rooms.path((0.5, 0.4, 0.0), (1.5, 0.4, 0.4), (1.5, 0.4, -0.3))
+    total = []
+    for seed in range(24):
+        rng = np.random.default_rng(seed)
+        start = (rng.uniform(-2, 0), rng.uniform(-1, 1), rng.uniform(-3, 3))
+        _, driven, found = mapped(HALL, drive, seed, start)
+        error = se2.log(se2.between(driven.poses[-1], found.pose))
+        total.append(error @ np.linalg.solve(found.cov, error))
+    assert 1.0 < np.mean(total) < 4.55  # 3 +- 3.1 sigma of the mean of 24 chi-squares above; below, errors of lines count as independent
+
+
+# --- where the search begins -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("off", [(0.5, 0.0, 0.0), (-0.35, 0.35, 0.0), (0.0, 0.0, 0.2), (0.35, -0.35, -0.2)])
+def test_a_guess_half_a_metre_off_converges(off) -> None:
+    matcher, drive, _ = mapped(LAB, TOUR[:2500])
+    scan, pose = scans_of(drive)[-1], drive.poses[-1]
+    twist = se2.log(se2.between(drive.poses[-2], pose)) * 12.5
+    found = matcher.register(body_points(scan, drive.mount, twist), True, se2.compose(pose, se2.exp(np.array(off))), HARDLY)
+    error = se2.log(se2.between(pose, found.pose))
+    assert found.is_trusted
+    assert np.hypot(*error[:2]) < 0.01
+    assert abs(error[2]) < 0.003
+
+
+@pytest.mark.parametrize("off", [(4.0, 2.0, 0.8), (0.0, 0.0, 1.6), (30.0, 0.0, 0.0)])
+def test_a_hopeless_guess_is_no_confident_wrong_pose(off) -> None:
+    matcher, drive, _ = mapped(LAB, TOUR[:2500])
+    pose = drive.poses[-1]
+    found = matcher.register(
+        body_points(scans_of(drive)[-1], drive.mount, np.zeros(3)), True, se2.compose(pose, se2.exp(np.array(off))), HARDLY
+    )
+    error = se2.log(se2.between(pose, found.pose))
+    is_right = np.hypot(*error[:2]) < 0.05
+    is_wide = np.sqrt(np.linalg.eigvalsh(found.cov)[-1]) > 0.3
+    assert is_right or is_wide or not found.is_trusted
+
+
+# --- motion within the sweep -------------------------------------------------------------------------------------------------------------
+
+
+def _second_error(drive: rooms.Drive, poses: np.ndarray) -> tuple[float, float]:
+    error = rooms.second_errors(drive, poses)
+    return float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean())), float(np.sqrt((error[:, 2] ** 2).mean()))
+
+
+def test_points_are_moved_by_their_own_times() -> None:
+    """Against the truth of a turning robot in a room: with the sweep's own times the walls are straight; with none, or as if the sweep
+    filled all of the scan's period, they are not."""
+    drive = rooms.drive_through(world.box(-4, -3, 5, 3), rooms.path((1.0, 0.3, 1.0)), 0, noise=NO_SLIP, scanner=rooms.Beams(noise=0.0))
+    scan, pose = scans_of(drive)[3], se2.compose(drive.start, drive.poses[3])
+    twist = np.array([0.3, 0.0, 1.0])
+    fill = rooms.Beams().view / (2.0 * math.pi)
+
+    def off(offsets: np.ndarray) -> float:
+        points = se2.transform(pose, body_points(replace(scan, offsets=offsets), drive.mount, twist)[:, :2])
+        from_walls = np.min(np.abs(np.stack([points[:, 0] + 4, points[:, 0] - 5, points[:, 1] + 3, points[:, 1] - 3])), axis=0)
+        return float(np.sqrt(np.mean(from_walls**2)))
+
+    assert off(scan.offsets) < 0.002
+    assert off(np.empty(0)) > 0.02
+    assert off(scan.offsets / fill) > 0.02
+
+
+def test_deskewing_pays(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = rooms.drive_through(LAB, TOUR, 0)
+    with_it = _second_error(drive, rooms.at_scans(drive, rooms.results(drive, "ekf")["ekf"])[0])
+    blind = replace(drive, events=[replace(e, offsets=np.empty(0)) if isinstance(e, Scan) else e for e in drive.events])
+    without = _second_error(drive, rooms.at_scans(drive, rooms.results(blind, "ekf")["ekf"])[0])
+    monkeypatch.setattr(Slip, "measure", lambda self, rate, variance: None)
+    by_wheels = _second_error(drive, rooms.at_scans(drive, rooms.results(drive, "ekf")["ekf"])[0])
+    assert with_it[1] < 0.2 * without[1]
+    assert with_it[0] < 0.5 * without[0]
+    assert with_it[1] < 0.6 * by_wheels[1]  # what the wheels say of the sweep is wrong where they slip; what lasts, is learned
+
+
+def test_slip_is_followed_and_forgotten() -> None:
+    slip = Slip()
+    usual = np.diag([1e-5, 1e-5, 1e-4])
+    for _ in range(10):  # wheels that spin on the spot at 0.5 m/s
+        slip.advance(0.08, usual)
+        slip.measure(np.array([-0.5, 0.0, 0.0]), np.full(3, 0.02**2))
+    assert slip.rate[0] == pytest.approx(-0.5, abs=0.05)
+    assert abs(slip.rate[1:]).max() < 1e-12
+    slip.advance(2.0, 25.0 * usual)
+    assert abs(slip.rate[0]) < 0.01
+    slip.advance(0.08, np.zeros((3, 3)))
+    slip.measure(np.array([0.3, 0.0, 0.0]), np.full(3, 10.0**2))  # along a corridor nothing was measured
+    assert abs(slip.rate[0]) < 0.02
+
+
+# --- noise -------------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sigma", [0.005, 0.012, 0.03])
+def test_the_noise_of_the_scanner_is_learned(sigma: float) -> None:
+    matcher, _, _ = mapped(HALL, rooms.path((4.0, 0.4, 0.2)), scanner=rooms.Beams(noise=sigma))
+    assert matcher._noise.sigma_point == pytest.approx(sigma, rel=0.15)
+    assert matcher._noise.sigma_line < 0.005
+
+
+def test_parts_of_the_variance_are_told_apart() -> None:
+    rng, noise = np.random.default_rng(0), Noise(0.03, 0.02)
+    for _ in range(200):
+        groups = 0.01 * rng.normal(size=(30, 1)) + 0.02 * rng.normal(size=(30, 20))
+        means = groups.mean(axis=1)
+        within = float(((groups - means[:, None]) ** 2).sum())
+        noise.see(Spread(within, 570.0, float((means**2).sum()) - within / 570 / 20 * 30, 30.0))
+    assert noise.sigma_point == pytest.approx(0.02, rel=0.03)
+    assert noise.sigma_line == pytest.approx(0.01 * math.sqrt(30 / 27), rel=0.1)
+
+
+# --- clouds ------------------------------------------------------------------------------------------------------------------------------
+
+
+def cloud(walls: np.ndarray, pose: np.ndarray, seed: int, tilt: float = 0.0) -> np.ndarray:
+    """(N, 3) 16 rings 0.8 m above a floor, in the body frame, which is pitched by ``tilt`` [rad]."""
+    rng = np.random.default_rng(seed)
+    azimuth = np.linspace(-math.pi, math.pi, 400, endpoint=False)
+    found = []
+    for elevation in np.radians(np.linspace(-15.0, 15.0, 16)):
+        c, s = math.cos(tilt), math.sin(tilt)
+        ray = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.full(400, math.sin(elevation))])
+        level = np.stack([c * ray[0] + s * ray[2], ray[1], -s * ray[0] + c * ray[2]])
+        across = np.hypot(level[0], level[1])
+        to_wall = rooms.look_around(walls, pose, np.arctan2(level[1], level[0])) / across
+        with np.errstate(divide="ignore"):
+            to_floor = np.where(level[2] < 0.0, -0.8 / level[2], np.inf)
+        r = np.minimum(to_wall, to_floor) + 0.02 * rng.normal(size=400)
+        found.append((r * ray).T)
+    points = np.concatenate(found) + np.array([0.0, 0.0, 0.8])
+    return points[np.isfinite(points).all(axis=1)]
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.03])
+def test_clouds_come_by_the_same_door(tilt: float) -> None:
+    """The floor is most of a cloud and says nothing of the pose; a robot that pitches by 2 degrees is still where it is."""
+    matcher = LidarMatcher()
+    rng = np.random.default_rng(1)
+    for k in range(12):
+        pose = np.array([0.05 * k, 0.02 * k, 0.03 * k])
+        guess = se2.compose(pose, se2.exp(np.array([0.02, 0.02, 0.01]) * rng.normal(size=3)))
+        found = matcher.register(cloud(LAB, pose, k, tilt * math.sin(k)), False, guess, SURE)
+        matcher.insert(pose)
+    error = se2.log(se2.between(pose, found.pose))
+    assert found.is_trusted
+    assert np.hypot(*error[:2]) < (0.01 if tilt == 0.0 else 0.04)
+    assert abs(error[2]) < 0.005
+    assert found.cov[0, 0] < 0.03**2
+
+
+# --- spoilt scans ------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["empty", "one point", "nan", "inf", "all the same point"])
+def test_scans_with_nothing_in_them_are_survived(kind: str) -> None:
+    matcher, drive, _ = mapped(LAB, rooms.path((1.5, 0.3, 0.2)))
+    n = 200
+    points = {
+        "empty": np.empty((0, 3)),
+        "one point": np.array([[1.0, 0.0, 0.0]]),
+        "nan": np.full((n, 3), np.nan),
+        "inf": np.full((n, 3), np.inf),
+        "all the same point": np.tile([[1.0, 1.0, 0.0]], (n, 1)),
+    }[kind]
+    before = matcher.point_cloud()
+    scan = Scan(0, points, np.zeros(len(points)), "laser")
+    sweep = Sweep.of(scan, Mount())
+    assert np.isfinite(sweep.points).all()
+    found = matcher.register(sweep.at_stamp(np.array([0.3, 0.0, 0.2])), True, drive.poses[-1], SURE)
+    if found is not None:
+        assert np.isfinite(found.pose).all()
+        assert np.isfinite(found.cov).all()
+        assert not found.is_trusted or np.sqrt(np.linalg.eigvalsh(found.cov)[-1]) > 0.1
+    matcher.insert(drive.poses[-1])
+    assert len(matcher.point_cloud()) <= len(before) + 1
+
+
+def run(drive: rooms.Drive, spoil) -> tuple[list[Estimate], dict[str, int]]:
+    """The filter's estimates of ``drive`` whose scan k is ``spoil`` (k, scan), None for one that never comes."""
+    core = Core(Pair(make_model("diff_drive", rooms.ROBOT), "ekf"), rooms.ROBOT, drive.mounts, True, ReplayConfig())
+    found, k = [], 0
+    for event in drive.events:
+        if isinstance(event, Scan):
+            event, k = spoil(k, event), k + 1
+        if event is not None:
+            found += core.push(event)
+    return found + core.finish(), dict(core.estimator.counts())
+
+
+def worst(drive: rooms.Drive, estimates: list[Estimate], first: int, last: int) -> float:
+    """[m] at scans ``first`` to ``last``."""
+    at = {e.stamp_ns: e.pose for e in estimates}
+    return max(float(np.hypot(*(at[int(s)] - p)[:2])) for s, p in zip(drive.stamps[first:last], drive.poses[first:last], strict=True))
+
+
+SPOILT = range(60, 85)  # two seconds
+
+
+@pytest.fixture(scope="module")
+def driven() -> rooms.Drive:
+    return rooms.drive_through(LAB, TOUR[:6000], 3)
+
+
+def test_a_frozen_scanner_is_found_out(driven: rooms.Drive) -> None:
+    frozen = scans_of(driven)[SPOILT.start]
+    estimates, counts = run(driven, lambda k, s: replace(s, points=frozen.points, offsets=frozen.offsets) if k in SPOILT else s)
+    assert counts["stale"] == len(SPOILT) - 1
+    assert worst(driven, estimates, SPOILT.start, SPOILT.stop) < 0.1  # by wheels
+    assert worst(driven, estimates, SPOILT.stop + 5, len(driven.poses)) < 0.02  # the old map is found again
+
+
+def test_a_scan_from_elsewhere_is_left_out(driven: rooms.Drive) -> None:
+    off = np.array([0.9, 0.4, 0.3])
+
+    def jump(k: int, scan: Scan) -> Scan:
+        if k not in (60, 61, 90):
+            return scan
+        return replace(scan, points=np.column_stack([se2.transform(off, scan.points[:, :2]), scan.points[:, 2]]))
+
+    estimates, counts = run(driven, jump)
+    assert counts["jumps"] == 3
+    assert worst(driven, estimates, 0, len(driven.poses)) < 0.03
+
+
+def test_a_robot_that_was_carried_is_believed_at_last(driven: rooms.Drive) -> None:
+    """Half a second is cut out of a log: 3 m/s from one scan to the next, against wheels that know nothing of it."""
+    at, gap = int(driven.stamps[60]) + 1, 480_000_000
+    before = [e for e in driven.events if e.stamp_ns < at]
+    after = [e for e in driven.events if e.stamp_ns > at + gap]
+    lost = [next(e for e in events if not isinstance(e, Scan)).position for events in (after, before[::-1])]
+    after = [replace(e, stamp_ns=e.stamp_ns - gap) for e in after]
+    after = [e if isinstance(e, Scan) else replace(e, position=e.position - lost[0] + lost[1]) for e in after]
+    core = Core(Pair(make_model("diff_drive", rooms.ROBOT), "ekf"), rooms.ROBOT, driven.mounts, True, ReplayConfig())
+    found = [estimate for event in before + after for estimate in core.push(event)] + core.finish()
+    assert core.estimator.counts()["jumps"] == 5
+    poses = np.array([e.pose for e in found if e.stamp_ns + gap in set(driven.stamps[70:].tolist())])
+    np.testing.assert_allclose(poses[-20:, :2], driven.poses[-20:, :2], atol=0.02)
+
+
+def test_without_scans_the_wheels_carry_on(driven: rooms.Drive) -> None:
+    nothing = np.empty((0, 3))
+    for spoil in (
+        lambda k, s: None if k in SPOILT else s,
+        lambda k, s: replace(s, points=nothing, offsets=nothing[:, 0]) if k in SPOILT else s,
+    ):
+        estimates, counts = run(driven, spoil)
+        assert worst(driven, estimates, SPOILT.stop + 5, len(driven.poses)) < 0.02
+        assert counts["matched"] >= len(driven.stamps) - len(SPOILT) - 2
+
+
+def test_a_degenerate_scene_is_counted() -> None:
+    drive = rooms.drive_through(CORRIDOR, rooms.path((3.0, 0.5, 0.0)), 0, noise=NO_SLIP, scanner=rooms.Beams(longest=20.0))
+    _, counts = run(drive, lambda k, s: s)
+    assert counts["degenerate"] > 0.9 * counts["matched"]
+    _, counts = run(rooms.drive_through(LAB, rooms.path((3.0, 0.3, 0.0)), 0), lambda k, s: s)
+    assert counts["degenerate"] < 0.1 * counts["matched"]
+
+
+# --- figures -----------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("walls", [LAB, HALL])
+def test_errors_of_a_second(walls: np.ndarray) -> None:
+    """Also under wheels that slip by a fifth of their turning, changing twice a second."""
+    for noise, most_rad in ((NO_SLIP, math.radians(0.03)), (WheelNoise(), math.radians(0.05))):
+        drive = rooms.drive_through(walls, TOUR, 1, noise=noise)
+        metres, radians = _second_error(drive, rooms.at_scans(drive, rooms.results(drive, "ekf")["ekf"])[0])
+        assert metres < 0.0025
+        assert radians < most_rad
+
+
+def test_a_bare_corridor_is_as_long_as_the_wheels_say() -> None:
+    noise = WheelNoise(lateral_m2_per_m=1e-6, yaw_rad2_per_m=1e-5)
+    drive = rooms.drive_through(CORRIDOR, rooms.path((1, 0, 0), (30, 0.5, 0.0), (1, 0, 0)), 0, (0.0, 0.1, 0.02), noise=noise)
+    found = {name: np.hypot(*rooms.at_scans(drive, r)[0][-1, :2]) for name, r in rooms.results(drive, "lidar", "ekf").items()}
+    length = np.hypot(*drive.poses[-1, :2])
+    assert found["ekf"] == pytest.approx(length, rel=0.02)
+    assert found["lidar"] < 0.9 * length  # or the corridor were no test
+
+
+def test_wheels_that_spin_on_the_spot_do_no_harm() -> None:
+    def spinning(t: np.ndarray, twists: np.ndarray) -> np.ndarray:
+        return twists + np.where((t > 6) & (t < 10), 0.5, 0.0)[:, None] * [1.0, 0.0, 0.0]
+
+    way = rooms.path((1, 0, 0), (4, 0.4, 0.3), (6, 0, 0), (6, 0.3, 0.4), (1, 0, 0))
+    drive = rooms.drive_through(HALL, way, 0, wheels=spinning)
+    off = {name: rooms.ate(drive, rooms.at_scans(drive, r)[0]) for name, r in rooms.results(drive, "odometry", "lidar", "ekf").items()}
+    assert off["odometry"] > 0.5
+    assert off["ekf"] < 1.1 * off["lidar"]
+    assert off["ekf"] < 0.02
