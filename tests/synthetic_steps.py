@@ -150,7 +150,9 @@ class World:
         dt, rates, cg = self._rates(shifted)
         twist = self.model.twist(rates, cg, params)
         predicted = integrate_twists(dt, twist, noise.wheels)
-        d_clock = twist.value[-1] - se2.adjoint(se2.inverse(predicted.delta)) @ twist.value[0]
+        ends = shifted + np.array([0.0, DT])  # the very ends: the middles of the intervals would leave out a part of the change
+        first, last = self.model.twist(np.array([self.wheels(s) for s in ends]), np.array([self.cg(s) for s in ends]), params).value
+        d_clock = last - se2.adjoint(se2.inverse(predicted.delta)) @ first
 
         g = noise.gyro
         turned = float(delta[2])
