@@ -10,7 +10,7 @@ import numpy as np
 
 from motion_models.se2 import FloatArray
 
-MOST_CAUSES = 4
+MOST_CAUSES = 7
 _DRAWS = 4000
 _KEPT = 12
 

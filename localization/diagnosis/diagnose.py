@@ -38,12 +38,12 @@ _ALIKE = 0.7  # signatures less alike than this are no aliases, however short th
 _CLOSE = 7.0  # twice the log-likelihood by which a rival may be worse: odds of 1 to 33
 _CLOSE_SHARE = 0.02  # or this share of what the cause explains, which no model is right about
 _ROUNDS = 5
-_TOLERANCE = 0.5  # sigma of causes that nobody names, over what is negligible
+_TOLERANCE = 0.35  # sigma of causes that nobody names, over what is negligible
 _REFINED = 3  # sets of each number of causes that are tried for real
 _SURE = 200.0  # lead in twice the log-evidence that needs no trial
 _STEPS = 3
 _UNSURE = 1.0 / 3.0  # systematic part of a size's sigma, over what is negligible: clocks, mounts and physics are no better
-_PAYS = 0.01  # least held-out gain of a finding
+_PAYS = 0.003  # least held-out gain of a finding
 _HONEST = 0.5  # a witness may be better than it says, but not by more than this
 
 
@@ -221,6 +221,8 @@ def _candidates(pipeline: Pipeline, config: DiagnosisConfig) -> tuple[Effect, ..
             found += [friction_change(length * q) for q in np.linspace(0.1, 0.9, config.moments)]
     if drive.kind == "windows":
         found += list(EXTRA.values())
+    elif pipeline.model.name != "friction":  # its own number for how far it turns is not the floor's
+        found.append(EXTRA["rotation_scale"])
     return tuple(found)
 
 

@@ -15,6 +15,7 @@ from localization.gyro import GyroHistory
 from localization.logs.log import Log
 from localization.maneuver_windows import WindowConfig, cut
 from localization.witnesses import GyroWitness, Span, Wheels, Witness
+from motion_models import se2
 from motion_models.cg_files import arms_model
 from motion_models.cg_parts import Payload
 from motion_models.errors import CalibrationError, SkidlocError
@@ -176,8 +177,11 @@ def drive_of_log(log: Log, witness: WitnessName = "auto", reference: str | None 
 
 
 def drive_of_table(name: str, robot: Robot, maneuvers: Sequence[Maneuver], kind: str) -> Drive:
-    """Maneuvers that were measured by somebody else."""
-    seconds = np.array([float(m.dt.sum()) for m in maneuvers])
+    """Maneuvers that were measured by somebody else. Windows with several poses are cut at them, so that each counts for itself and the
+    wheels before it are known."""
+    if kind == "windows":
+        maneuvers = [piece for m in maneuvers for piece in _pieces(m)]
+    seconds = np.array([float(m.dt[m.lead : m.lead + int(m.ends[-1])].sum()) for m in maneuvers])
     return Drive(
         name=name,
         robot=robot,
@@ -187,6 +191,17 @@ def drive_of_table(name: str, robot: Robot, maneuvers: Sequence[Maneuver], kind:
         starts_s=np.asarray(np.cumsum(seconds) - seconds),
         payload_arms=_payload_arms(robot, maneuvers, None),
     )
+
+
+def _pieces(m: Maneuver) -> Iterator[Maneuver]:
+    """From pose to pose; what came before is lead."""
+    before, driven = np.zeros(3), 0
+    covs = np.broadcast_to(m.cov, (len(m.ends), 3, 3))
+    for pose, end, cov in zip(m.measured, m.ends, covs, strict=True):
+        both = cov if driven == 0 else 2.0 * cov  # two poses that err independently
+        seen = se2.between(before, pose)[None]
+        yield dataclasses.replace(m, measured=seen, ends=np.array([end - driven]), cov=both, lead=m.lead + driven)
+        before, driven = pose, int(end)
 
 
 def _payload_arms(robot: Robot, maneuvers: Sequence[Maneuver], postures: _Postures | None) -> FloatArray:

@@ -35,6 +35,8 @@ class Belief:
     change: float = 0.0
     """Sideways grip is more by this share from `change_s` on."""
     change_s: float = 0.0
+    turns: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """wz *= 1 + a - b |wz| - c (1 - T), T the share of turning, see `FullLinear`."""
     mixed: float = 0.0
     """Longitudinal slip by the share of turning, see `FullLinear.longitudinal_slip_curvature`."""
     wheel_lag_s: float = 0.0
@@ -167,6 +169,20 @@ EXTRA: Mapping[str, Effect] = {
     ),
     "wheel_lag": Effect(
         "wheel_lag", "s", "the body follows the wheels with this time constant", 0.05, 0.008, _plain("wheel_lag_s"), one_sided=True
+    ),
+    "rotation_scale": Effect(
+        "rotation_scale", "1", "the robot turns farther than the model says by this share, at any speed", 0.1, 0.01, _item("turns", 0)
+    ),
+    "rotation_slip_rate": Effect(
+        "rotation_slip_rate", "s/rad", "the robot turns less the faster it turns: wz *= 1 - s |wz|", 0.1, 0.01, _item("turns", 1)
+    ),
+    "rotation_slip_curvature": Effect(
+        "rotation_slip_curvature",
+        "1",
+        "the robot turns less on gentle arcs, at any speed: wz *= 1 - s (1 - T)",
+        0.2,
+        0.02,
+        _item("turns", 2),
     ),
 }
 """What other people's data taught: causes beyond the simulator's."""

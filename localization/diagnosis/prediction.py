@@ -159,6 +159,13 @@ class _Changed:
             rates = rates * (1.0 + b.encoder_lost / max(p._lost_time, 1e-9) * p._lost)
         value = p.model.twist(rates, cg, params).value
         value = value + self._floor(rates, cg)
+        if any(b.turns):
+            energy = 2.0 * np.maximum(np.sum(rates**2, axis=-1), 1e-12)
+            straight = 1.0 - (rates[:, 1] - rates[:, 0]) ** 2 / energy
+            more, rate, gentle = b.turns
+            value = value * np.stack(
+                [np.ones(len(rates)), np.ones(len(rates)), 1.0 + more - rate * np.abs(value[:, 2]) - gentle * straight], axis=-1
+            )
         if b.mixed:
             energy = 2.0 * np.maximum(np.sum(rates**2, axis=-1), 1e-12)
             value = value * np.stack([1.0 - b.mixed * (rates[:, 1] - rates[:, 0]) ** 2 / energy, *(np.ones(len(rates)),) * 2], axis=-1)
