@@ -13,7 +13,9 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.stats import chi2
 
 from localization.errors import EstimatorError
+from localization.estimators.revisit_update import revisit_update
 from localization.gyro import Turn
+from localization.lidar import Revisit
 from localization.residuals import motion_residual, turn_residual
 from localization.steps import Step
 from motion_models import se2
@@ -162,39 +164,15 @@ class Ekf:
         self._update(error, H, R)
         return nis
 
-    def measure_revisit(self, pose: FloatArray, cov: FloatArray, old_cov: FloatArray, growth: FloatArray, slip: FloatArray) -> float:
-        """The pose (3,) as an old part of the map gives it, with ``cov`` R (3, 3) by scan and map alone; returns the NIS.
-
-        ``old_cov`` P_o (3, 3) is the covariance of the old map: of the pose e_o from which it was drawn, moved here as `predict` moves
-        it; ``growth`` P_g that of this pose against it, P_now - P_o where this pose came from that one, with ``slip``, by which the way was
-        worse than this filter believed. All in the body frame now.
-
-        This is the update with a clone of the old pose, y = e - e_o - v, of which only its covariance was kept. The gain
-        K = P_g (P_g + R)^-1 makes the pose as sure as can be of its place on the old map, e - e_o, and no surer of the world than
-        that map is: e' = (I - K) e + K (e_o + v) has P_o + (I - K) P_g where e = e_o + growth. The way since START and ANCHOR is not
-        touched: they move with the pose as one rigid body. The rest is not corrected, for what the clone shares with it was not kept;
-        taken as what follows from the pose now, cov(x, e_o) = P_xp P_pp^-1 cov(e, e_o), its correlation with the pose shrinks as the
-        pose's own share does, and the covariance stays one.
-        """
-        error = se2.log(se2.between(self.pose, pose))
-        S = growth + cov
-        gain = np.linalg.solve(S, growth).T
-        P = self.covariance.copy()
-        P[POSE, POSE] += slip
-        shared = 0.5 * (P[POSE, POSE] + old_cov - growth)  # cov(e, e_o)
-        A_start, A_anchor = se2.adjoint(se2.between(self._start, self.pose)), se2.adjoint(se2.between(self._anchor, self.pose))
-        G = np.zeros((self._size, 3))
-        G[POSE], G[START], G[ANCHOR] = gain, A_start @ gain, A_anchor @ gain
-        T = np.eye(self._size)
-        T[:, POSE] -= G
-        cross = T @ P[:, POSE] @ np.linalg.pinv(P[POSE, POSE], rcond=1e-12, hermitian=True) @ shared @ G.T
-        P = T @ P @ T.T + G @ (old_cov + cov) @ G.T + cross + cross.T
-        self._filter.P = 0.5 * (P + P.T)
+    def measure_revisit(self, known: Revisit) -> None:
+        """A place seen again (`revisit_update`). START and ANCHOR move with the pose as one rigid body: the way since then stays."""
         start_T_now, anchor_T_now = se2.between(self._start, self.pose), se2.between(self._anchor, self.pose)
-        self.pose = se2.compose(self.pose, se2.exp(gain @ error))
+        tied = np.zeros((self._size, 3))
+        tied[POSE], tied[START], tied[ANCHOR] = np.eye(3), se2.adjoint(start_T_now), se2.adjoint(anchor_T_now)
+        shift, self._filter.P = revisit_update(self.covariance, POSE, tied, known, self.pose)
+        self.pose = se2.compose(self.pose, se2.exp(shift))
         self._start = se2.compose(self.pose, se2.inverse(start_T_now))
         self._anchor = se2.compose(self.pose, se2.inverse(anchor_T_now))
-        return float(error @ np.linalg.solve(S, error))
 
     def set_anchor(self) -> None:
         """From here on, the LiDAR measures from the pose as it is now."""

@@ -82,7 +82,7 @@ class EkfFusion:
             if (known := witness.recall(step, ekf.pose, ekf.covariance[POSE, POSE])) is not None:
                 self._counts["revisits"] += 1
                 before = ekf.pose
-                ekf.measure_revisit(known.pose, known.cov, known.old_cov, known.growth, known.slip)
+                ekf.measure_revisit(known)
                 witness.correct(before, ekf.pose)
         witness.remember(step, ekf.pose)
         ekf.set_anchor()
