@@ -150,7 +150,7 @@ def drive_through(
     scanner = scanner or Beams()
     rng = np.random.default_rng(seed)
     times = _STEP_S * np.arange(len(twists) + 1)
-    true = twists + _slip(twists, noise or WheelNoise(), rng)
+    true = twists + slip(twists, noise or WheelNoise(), rng)
     poses = _integrate(np.array(start), true)
     half = 0.5 * ROBOT.geometry.track_width_m * ROBOT.driver.wheel_separation_multiplier
     turned = wheels(times[:-1], twists)
@@ -170,6 +170,7 @@ def drive_through(
         _cast(eyes, aims, scanner.longest, grid, ranges)
         ranges = np.round(ranges + scanner.noise * rng.normal(size=len(ranges)), 3)
         seen = np.isfinite(ranges) & (ranges > 0.0)
+        ranges[~seen] = 1.0
         points = np.column_stack([ranges * np.cos(aims), ranges * np.sin(aims), np.zeros(len(ranges))])[seen]
         stamps.append(_ns(k / scanner.rate_hz))
         events.append(Scan(stamps[-1], points, offsets[seen], "laser"))
@@ -182,7 +183,7 @@ def _ns(t: float) -> int:
     return WALL_START_NS + round(t * 1e9)
 
 
-def _slip(twists: np.ndarray, w: WheelNoise, rng: np.random.Generator) -> np.ndarray:
+def slip(twists: np.ndarray, w: WheelNoise, rng: np.random.Generator) -> np.ndarray:
     """(n, 3) what the robot does besides: correlated over half a second, of the variance that ``w`` says over longer times."""
     driven, turned = np.abs(twists[:, 0]), np.abs(twists[:, 2])
     floor = (driven + turned) > 0.0

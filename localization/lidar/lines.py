@@ -39,9 +39,10 @@ def ages_until(travel: float) -> Ages:
 
 def ages_between(spans: FloatArray) -> Ages:
     """Points inserted within any of ``spans`` (S, 2) [m], and all that come after the last one's end."""
-    found = np.zeros(round(float(spans[:, 1].max()) / _AGE_M) + 1, np.uint8)
+    found = np.zeros(max(round(float(spans[:, 1].max()) / _AGE_M), 0) + 1, np.uint8)
+    found[-1] = 1
     for start, end in spans:
-        found[max(round(start / _AGE_M), 0) : round(end / _AGE_M) + 1] = 1
+        found[max(round(start / _AGE_M), 0) : max(round(end / _AGE_M), 0) + 1] = 1
     return found
 
 

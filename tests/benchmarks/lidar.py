@@ -1,0 +1,145 @@
+"""What scan matching reaches in simulated rooms, beside KISS-ICP as it comes and the wheels alone; all with the same default settings.
+
+python -m tests.benchmarks.lidar
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from localization.consistency import mean_band
+from localization.events import Scan
+from localization.lidar import LidarMatcher, body_points
+from localization.lidar.kiss import Kiss
+from localization.lidar.matcher import in_range
+from localization.simulate import world
+from motion_models import se2
+from motion_models.robot import WheelNoise
+from tests import rooms
+
+ESTIMATORS = ("odometry", "lidar", "ekf")
+NO_SLIP = WheelNoise(*[0.0] * 8)
+TOUR = rooms.path((2, 0, 0), (12, 0.4, 0.5), (12, 0.4, -0.5), (6, 0, 0.5), (2, 0, 0))
+ROOM = np.concatenate([world.box(-6, -4, 6, 4), world.box(-6, -4, -5, -3), world.pillar(4.5, 2.8)])
+PLACES = {"room 12 x 8 m": ROOM, "lab": world.lab().walls, "hall": world.hall().walls}
+CORRIDOR = np.concatenate([world.line(-60, -1.2, 80, -1.2), world.line(-60, 1.2, 80, 1.2)])
+
+
+def second_error(drive: rooms.Drive, poses: np.ndarray) -> tuple[float, float]:
+    """RMS errors of the motion in a second [mm, deg]."""
+    error = rooms.second_errors(drive, poses)
+    return 1e3 * math.sqrt((error[:, :2] ** 2).sum(axis=1).mean()), math.degrees(math.sqrt((error[:, 2] ** 2).mean()))
+
+
+def accuracy(walls: np.ndarray, noise: WheelNoise, seeds: int = 3) -> dict[str, np.ndarray]:
+    """(seeds, 3) by estimator: error of a second [mm, deg], RMS distance from the truth [mm]."""
+    found: dict[str, list[tuple[float, float, float]]] = {name: [] for name in ESTIMATORS}
+    for seed in range(seeds):
+        drive = rooms.drive_through(walls, TOUR, seed, noise=noise)
+        for name, run in rooms.results(drive, *ESTIMATORS).items():
+            poses, _ = rooms.at_scans(drive, run)
+            found[name].append((*second_error(drive, poses), 1e3 * rooms.ate(drive, poses)))
+    return {name: np.array(rows) for name, rows in found.items()}
+
+
+def matching(walls: np.ndarray, twists: np.ndarray, seed: int, start=(0.0, 0.0, 0.0), guess_m: float = 0.01):
+    """Yield milliseconds of register and insert, of KISS-ICP alone, registration, true pose of each scan; the map is drawn truly."""
+    drive = rooms.drive_through(walls, twists, seed, start, noise=NO_SLIP)
+    rng, matcher, kiss = np.random.default_rng(seed), LidarMatcher(), None
+    twist = se2.log(se2.between(drive.poses[:-1], drive.poses[1:])) * 12.5
+    scans = [event for event in drive.events if isinstance(event, Scan)]
+    for scan, pose, t in zip(scans, drive.poses, [*twist, twist[-1]], strict=True):
+        points = body_points(scan, drive.mount, t)
+        guess = se2.compose(pose, se2.exp(guess_m * rng.normal(size=3)))
+        begin = time.perf_counter()
+        found = matcher.register(points, True, guess, np.diag([1e-4, 1e-4, 1e-4]))
+        matcher.insert(pose)
+        middle = time.perf_counter()
+        if kiss is None:
+            kiss = Kiss(matcher._voxel, 0.0, matcher.config.max_range_m)
+        kiss.register_frame(in_range(points, matcher.config))
+        yield 1e3 * (middle - begin), 1e3 * (time.perf_counter() - middle), found, pose
+
+
+def costs(walls: np.ndarray) -> tuple[float, float, float]:
+    """Median over scans of the fastest of three drives [ms]: ours, KISS-ICP alone; and the median of their ratio."""
+    rows = np.min([[row[:2] for row in matching(walls, TOUR, 0)] for _ in range(3)], axis=0)[10:]
+    return float(np.median(rows[:, 0])), float(np.median(rows[:, 1])), float(np.median(rows[:, 0] / rows[:, 1]))
+
+
+def registration_nees(walls: np.ndarray, runs: int = 100) -> np.ndarray:
+    """(runs,) one a run, of the last scan of a drive of its own."""
+    way, found = rooms.path((0.5, 0.4, 0.0), (1.5, 0.4, 0.4), (1.5, 0.4, -0.3)), []
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        *_, (_, _, last, pose) = matching(walls, way, seed, (rng.uniform(-2, 0), rng.uniform(-1, 1), rng.uniform(-3, 3)))
+        error = se2.log(se2.between(pose, last.pose))
+        found.append(float(error @ np.linalg.solve(last.cov, error)))
+    return np.array(found)
+
+
+def pose_nees(walls: np.ndarray, runs: int = 100) -> np.ndarray:
+    """(runs,) of the filter's pose after 10 s."""
+    way, found = rooms.path((1, 0, 0), (5, 0.4, 0.4), (4, 0.4, -0.5)), []
+    for seed in range(runs):
+        drive = rooms.drive_through(walls, way, seed, scanner=rooms.Beams(beams=240, rate_hz=6.25))
+        poses, covs = rooms.at_scans(drive, rooms.results(drive, "ekf")["ekf"])
+        error = se2.log(se2.between(drive.poses[-1], poses[-1]))
+        assert covs is not None
+        found.append(float(error @ np.linalg.solve(covs[-1], error)))
+    return np.array(found)
+
+
+def corridor(seed: int) -> dict[str, float]:
+    """Distance after 15 m of a bare corridor, by estimator, relative error in percent."""
+    noise = WheelNoise(lateral_m2_per_m=1e-6, yaw_rad2_per_m=1e-5)
+    drive = rooms.drive_through(CORRIDOR, rooms.path((1, 0, 0), (30, 0.5, 0.0), (1, 0, 0)), seed, (10.0, 0.1, 0.02), noise=noise)
+    length = np.hypot(*drive.poses[-1, :2])
+    runs = rooms.results(drive, *ESTIMATORS)
+    return {name: float(100.0 * (np.hypot(*rooms.at_scans(drive, run)[0][-1, :2]) / length - 1.0)) for name, run in runs.items()}
+
+
+def patch(walls: np.ndarray, seed: int) -> dict[str, float]:
+    """RMS distance from the truth [mm], by estimator, where wheels spin for 4 s at 0.5 m/s and 2 s at 0.8 rad/s while the robot stands."""
+
+    def wheels(t: np.ndarray, twists: np.ndarray) -> np.ndarray:
+        spun = twists + np.where((t > 6) & (t < 10), 0.5, 0.0)[:, None] * [1.0, 0.0, 0.0]
+        return np.asarray(spun + np.where((t > 12) & (t < 14), 0.8, 0.0)[:, None] * [0.0, 0.0, 1.0])
+
+    way = rooms.path((1, 0, 0), (4, 0.4, 0.3), (6, 0, 0), (1, 0.3, 0.4), (3, 0, 0), (6, 0.3, 0.4), (1, 0, 0))
+    drive = rooms.drive_through(walls, way, seed, wheels=wheels)
+    return {name: 1e3 * rooms.ate(drive, rooms.at_scans(drive, run)[0]) for name, run in rooms.results(drive, *ESTIMATORS).items()}
+
+
+def row(what: str, values: dict[str, str], wanted: str) -> None:
+    print(f"{what:44}" + "".join(f"{values.get(name, ''):>22}" for name in ESTIMATORS) + f"   {wanted}", flush=True)
+
+
+def main() -> None:
+    row("760 beams at 12.5 Hz, 12 mm of noise", {"odometry": "wheels alone", "lidar": "KISS-ICP as it comes", "ekf": "ekf"}, "wanted")
+    text: Callable[[np.ndarray], str] = lambda rows: "{:.2f} mm {:.3f} deg".format(*np.sqrt((rows[:, :2] ** 2).mean(axis=0)))  # noqa: E731
+    for name, walls in PLACES.items():
+        for how, noise in (("", NO_SLIP), (", slipping", WheelNoise())):
+            found = accuracy(walls, noise)
+            row(f"a second in {name}{how}", {k: text(v) for k, v in found.items()}, "2.5 mm 0.03 deg" if not how else "")
+    for seed in range(3):
+        row(f"15 m of bare corridor, seed {seed}", {k: f"{v:+.2f} %" for k, v in corridor(seed).items()}, "within 2 %")
+    for name, walls in PLACES.items():
+        found = {k: f"{v:.1f} mm" for k, v in patch(walls, 0).items()}
+        row(f"wheels spin on the spot in {name}", found, "ekf at most 1.1 of KISS-ICP")
+    for name, walls in PLACES.items():
+        ours, kiss, ratio = costs(walls)
+        row(f"a scan in {name}", {"lidar": f"{kiss:.2f} ms", "ekf": f"{ours:.2f} ms ({ratio:.1f} x)"}, "1.0 ms to register and insert")
+    low, high = mean_band(100, 3.0)
+    for name, walls in PLACES.items():
+        matched, poses = registration_nees(walls), pose_nees(walls)
+        said = f"{matched.mean():.2f} / {poses.mean():.2f}"
+        row(f"NEES of a scan / of the pose in {name}", {"ekf": said}, f"{low:.2f} to {high:.2f}, 100 runs")
+
+
+if __name__ == "__main__":
+    main()
