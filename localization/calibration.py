@@ -133,6 +133,14 @@ def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequ
 
     Raises `CalibrationError` where there is too little motion, and for names in ``free`` that are unknown or that the drive does not
     reveal, saying what to drive.
+
+    >>> from motion_models import load_robot, read_rotation_table, rotations_as_maneuvers
+    >>> robot = load_robot("vaultbot")
+    >>> rotations = rotations_as_maneuvers(read_rotation_table("tests/data/vaultbot/rotation_grid.csv"), robot)
+    >>> cut = Cut("rotation_grid.csv", tuple(rotations), "the table")
+    >>> found = calibrated(make_model("friction", robot), [cut], robot, of_rotations=True)
+    >>> found.fit.names
+    ('tracked_x', 'warp', 'track_width', 'scrub')
     """
     maneuvers = [m for each in cuts for m in each.maneuvers]
     if not maneuvers:

@@ -54,7 +54,17 @@ class Result:
 
 
 def score(runs: Sequence[Run], reference: ReferenceTrack | Relations | None) -> list[Result]:
-    """Score every run. Raises `EvaluationError` if the reference shares no time with them."""
+    """Score every run. Raises `EvaluationError` if the reference shares no time with them.
+
+    >>> from localization import Pair, open_log, reference_track, replay
+    >>> from motion_models import load_robot, make_model
+    >>> robot = load_robot("husky_a200")
+    >>> log = open_log("tests/data/husky-outdoor-gps/test1.bag", robot)
+    >>> runs = replay(log.events(), [Pair(make_model("diff_drive", robot), "odometry")], robot, log.mounts, has_lidar=False)
+    >>> (result,) = score(runs, reference_track(log.references("/fix"), "/fix"))
+    >>> f"{result.name}: {result.accuracy.ate_rmse_m:.1f} m, {100 * result.accuracy.overlap:.0f} % of the drive"
+    'diff_drive_odometry: 7.0 m, 100 % of the drive'
+    """
     return [_score(run, reference) for run in runs]
 
 

@@ -43,6 +43,11 @@ def center_from_end_poses(
 
     Poses (3,); covariances (3, 3) of their right perturbations, independent of each other, zero where not given. Raises
     `CalibrationError` if the heading did not change (whole turns count as none: use `center_of_arc`).
+
+    >>> from motion_models import se2
+    >>> turned_about_its_front = se2.exp([0.0, -0.3, 1.0])  # wz = 1 and vy = -wz x_CR
+    >>> center_from_end_poses([0.0, 0.0, 0.0], turned_about_its_front).value.round(6).tolist()
+    [0.3, 0.0]
     """
     start_T_end = between(world_T_start, world_T_end)
     value, jacobian = _final_point(start_T_end)

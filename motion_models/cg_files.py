@@ -24,6 +24,12 @@ def arms_model(arms: Arms, folder: Path | None = None, payload: Payload | None =
     A name that is not in the folder may be that of a file that is shipped: robots derived from one can be kept anywhere.
 
     Raises `RobotError` for files that are missing or malformed, `CgError` for masses that cannot be.
+
+    >>> from motion_models import load_robot
+    >>> robot = load_robot("vaultbot")
+    >>> model, postures = arms_model(robot.arms), arms_postures(robot.arms)
+    >>> {name: model.cg(model.chain.posture(postures[name])).round(3).tolist() for name in sorted(postures)[:2]}
+    {'back_left': [-0.03, 0.02], 'back_right': [-0.03, -0.02]}
     """
     urdf = _urdf(arms, folder)
     if static is None and arms.static_mass_kg > 0.0:

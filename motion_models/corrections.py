@@ -73,6 +73,11 @@ def corrections(model: MotionModel, form: Form) -> Corrections:
     ``constant``: rotation scaling and centre of rotation as numbers that slowly change. ``cg_field``: the coefficients of their regressions
     on the CG; for the friction model, whose field is its physics, the chassis' warp besides; a model without such regressions has nothing
     but its constants. Raises `ModelError` for a form that does not exist.
+
+    >>> from motion_models import load_robot, make_model
+    >>> found = corrections(make_model("skid_steer", load_robot("vaultbot")), "constant")
+    >>> dict(zip(found.names, found.sigmas.round(3).tolist()))
+    {'k_0': 0.076, 'x_cr_0': 0.05, 'y_cr_0': 0.03}
     """
     check_forms([form])
     if form == "cg_field" and model.name == "skid_steer":

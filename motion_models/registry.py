@@ -21,7 +21,16 @@ MODELS: dict[str, type[MotionModel]] = {
 
 
 def make_model(name: str, robot: Robot) -> MotionModel:
-    """The motion model ``name`` with the coefficients of ``robot``. Raises `ModelError` for a name that does not exist."""
+    """The motion model ``name`` with the coefficients of ``robot``. Raises `ModelError` for a name that does not exist.
+
+    >>> import numpy as np
+    >>> from motion_models import load_robot
+    >>> model = make_model("skid_steer", load_robot("vaultbot"))
+    >>> wheels, arms_ahead = np.array([-2.0, 2.0]), np.array([0.1, 0.0])
+    >>> vx, vy, wz = model.twist(wheels, arms_ahead, model.nominal).value
+    >>> print(f"turns at {wz:.3f} rad/s about a point {-vy / wz:.3f} m ahead")
+    turns at 0.896 rad/s about a point 0.154 m ahead
+    """
     if name not in MODELS:
         raise ModelError(f"no motion model '{name}'; there are {', '.join(MODELS)}.")
     return MODELS[name].from_robot(robot)

@@ -172,7 +172,12 @@ def robot_names() -> list[str]:
 
 
 def load_robot(robot: str | Path) -> Robot:
-    """The robot of a shipped name (`robot_names`) or of a path to a TOML file. Raises `RobotError`."""
+    """The robot of a shipped name (`robot_names`) or of a path to a TOML file. Raises `RobotError`.
+
+    >>> robot = load_robot("vaultbot")
+    >>> robot.geometry.track_width_m, robot.driver.wheel_separation_multiplier
+    (0.56, 1.875)
+    """
     path = Path(robot)
     if path.suffix == ".toml":
         try:

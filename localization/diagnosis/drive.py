@@ -178,7 +178,17 @@ def drive_of_log(log: Log, witness: WitnessName = "auto", reference: str | None 
 
 def drive_of_table(name: str, robot: Robot, maneuvers: Sequence[Maneuver], kind: str) -> Drive:
     """Maneuvers that were measured by somebody else. Windows with several poses are cut at them, so that each counts for itself and the
-    wheels before it are known."""
+    wheels before it are known.
+
+    >>> from localization.diagnosis.diagnose import diagnose
+    >>> from motion_models import load_robot, make_model, read_rotation_table, rotations_as_maneuvers
+    >>> robot = load_robot("vaultbot")
+    >>> rotations = rotations_as_maneuvers(read_rotation_table("tests/data/vaultbot/rotation_grid.csv"), robot)
+    >>> found = diagnose(drive_of_table("rotation_grid.csv", robot, rotations, "rotations"), make_model("friction", robot))
+    >>> strongest = found.findings[0]
+    >>> strongest.cause, round(strongest.size, 2), strongest.effect.unit
+    ('lidar_offset_x', 0.07, 'm')
+    """
     if kind == "windows":
         maneuvers = [piece for m in maneuvers for piece in _pieces(m)]
     seconds = np.array([float(m.dt[m.lead : m.lead + int(m.ends[-1])].sum()) for m in maneuvers])

@@ -33,6 +33,11 @@ def open_log(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverr
 
     Nothing but the index and a few messages is read. Raises `LogError` if it cannot be used at all, `TopicError` if ``topics``
     names one that is not there or carries something else.
+
+    >>> from motion_models import load_robot
+    >>> log = open_log("tests/data/aces/aces.mcap", load_robot("aces"))
+    >>> f"{log.duration_s:.0f} s, wheels {log.sources.wheels.topic}, LiDAR {log.sources.lidar.topic}"
+    '1366 s, wheels /odom, LiDAR /scan'
     """
     path = Path(path)
     return Log(path, open_source(path), robot, topics)
