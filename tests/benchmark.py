@@ -8,6 +8,9 @@ import time
 PARTS = (
     "tests.benchmarks.replay_cost",
     "tests.benchmarks.friction_solve",
+    "tests.benchmarks.online",
+    "tests.benchmarks.compare",
+    "tests.benchmarks.lidar",
     "tests.benchmarks.graph",
     "tests.studies.thesis_regressions",
     "tests.studies.friction_grid",

@@ -20,21 +20,22 @@ from localization.errors import DumpError
 from localization.lidar.track import Place
 from localization.online.core import Core, Pair, ReplayConfig
 from localization.online.dump import Dumper, fingerprints, read_dump, read_head, write_dump
-from localization.online.freeze import freeze, thaw
+from localization.online.freeze import freeze
+from localization.online.thaw import thaw
 from localization.steps import StepConfig
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
 from tests.online_help import ROBOT, drive_events, new_core, numbers
 
 ESTIMATORS = [("odometry", "diff_drive", "none"), ("lidar", "skid_steer", "none"), ("ekf", "skid_steer", "constant")]
-ESTIMATORS += [("ekf", "friction", "none"), ("graph", "skid_steer", "cg_field")]
-AHEAD = 400  # events after a cut that are compared: some 30 scans
+ESTIMATORS += [("graph", "skid_steer", "cg_field")]
+AHEAD = 300  # events after a cut that are compared: some 30 scans
 
 
 @pytest.mark.parametrize("kind", ESTIMATORS, ids="-".join)
 def test_cut_anywhere_and_resumed_the_results_are_the_same_to_the_last_bit(kind):
     events, _ = drive_events()
-    cuts = {0, 1, 2, 60, *np.random.default_rng(3).integers(3, len(events), 12).tolist(), len(events)}
+    cuts = {0, 1, 2, 60, *np.random.default_rng(3).integers(3, len(events), 9).tolist(), len(events)}
     core, whole, states, made = new_core(*kind), [], {}, []
     for i in range(len(events) + 1):
         if i in cuts:
@@ -102,7 +103,7 @@ values = st.recursive(
 
 
 @given(values)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_plain_values_come_back_as_they_were(value):
     assert repr(thaw(*freeze(value))) == repr(value)
 

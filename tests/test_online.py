@@ -16,6 +16,7 @@ from localization.events import Scan
 from localization.logs import TopicOverrides, open_log
 from localization.logs.wire import encode
 from localization.online.health import ERROR, OK, WARN, degeneracy
+from localization.online.node import Node, NodeConfig
 from localization.online.pace import Pace
 from localization.online.session import Files
 from localization.online.tell import CORRECTIONS, DIAGNOSTICS, ODOMETRY, TF
@@ -130,7 +131,10 @@ def restamped(message, shift_ns, kinds={"/scan": "LaserScan", "/joint_states": "
 
 @pytest.mark.parametrize("jump_s", [500.0, -0.9, 3.0])
 def test_the_clock_of_all_sensors_jumps(jump_s, calm):
-    """Set forward, back, and by little: the pose hardly notices, and what is published bears the sender's new stamps."""
+    """Set forward and back: the pose hardly notices, and what is published bears the sender's new stamps.
+
+    Set back by less than a second, which nothing tells from jitter, it costs no more than was driven in that time.
+    """
 
     def jumping(messages):
         half = messages[len(messages) // 2].received_ns
@@ -143,7 +147,8 @@ def test_the_clock_of_all_sensors_jumps(jump_s, calm):
     if abs(jump_s) > 1.0:
         assert stamps[-1] - stamps[0] == pytest.approx((20.0 + jump_s) * S, abs=2 * S)
         assert any("jump of the clock" in note for note in node.notes())
-    assert np.all(np.abs(_wrapped(found[0] - truth[0])) < 3.0 * truth[1] + 0.02)
+    most = 3.0 * truth[1] + 0.02 if abs(jump_s) > 1.0 else 0.5 * abs(jump_s)  # 0.5 m/s, 0.5 rad/s
+    assert np.all(np.abs(_wrapped(found[0] - truth[0])) < most)
 
 
 def silenced(topic, begin_s, end_s):
@@ -232,10 +237,9 @@ def test_a_topic_of_another_type_is_refused():
 
 def test_joint_states_without_the_wheels_are_refused():
     robot = dataclasses.replace(ROBOT, joints=dataclasses.replace(ROBOT.joints, left=("no_wheel",)))
-    from localization.online.node import Node, NodeConfig
-
+    pair = Pair(make_model("skid_steer", ROBOT), "ekf")
     with pytest.raises(TopicError, match="no joint states of the live topics have the wheel joints"):
-        Node.start(LogTransport(drive_log()), robot, lambda has_lidar: None, Files(), print, node=NodeConfig(wait_s=0.0))
+        Node.start(LogTransport(drive_log()), robot, lambda has_lidar: pair, Files(), print, node=NodeConfig(wait_s=0.0))
 
 
 def test_bytes_that_are_no_message_are_dropped_and_counted():
@@ -260,7 +264,7 @@ def test_a_node_that_is_killed_goes_on_where_it_was(tmp_path, calm):
     node, _ = run_node(first, files=files)
     node.session.dump(node._head, now=True)
     node.session._dumper.wait()  # kill -9 from here: no finish, no close
-    second = LogTransport(drive_log(), part(10.5, 99.0))
+    second = LogTransport(drive_log(), part(10.5, 17.0))
     node, told = run_node(second, files=files)
     assert node.finish() == len(read_tum(tmp_path / "run.tum"))
     assert "resumed from" in told[-1]
@@ -270,7 +274,12 @@ def test_a_node_that_is_killed_goes_on_where_it_was(tmp_path, calm):
         assert np.all(np.abs(_wrapped(b[s][0] - a[s][0])) < 3.0 * np.maximum(a[s][1], b[s][1]))
     assert np.hypot(*b[common[0]][0][:2]) > 0.3  # and not from the origin
     assert (tmp_path / "state").exists()
-    assert len(read_tum(tmp_path / "run.tum")) > 0.9 * len(a)
+    assert len(read_tum(tmp_path / "run.tum")) > 0.65 * len(a)
+    # it ended in order: what goes on from here has an output of its own
+    third = LogTransport(drive_log(), part(17.5, 99.0))
+    node, told = run_node(third, files=Files(tmp_path / "more.tum", tmp_path / "state"))
+    assert "resumed from" in told[-1]
+    assert 20 < node.finish() < 0.4 * len(a)
 
 
 def test_a_state_of_another_time_is_refused(tmp_path):

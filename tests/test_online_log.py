@@ -81,7 +81,7 @@ def killed(tmp_path_factory):
 
 def test_killed_twice_and_resumed_it_writes_the_same_bytes(replayed, killed, tmp_path, capsys):
     shutil.copytree(killed, tmp_path, dirs_exist_ok=True)
-    kill_after(tmp_path, 1500)
+    kill_after(tmp_path, 1000)
     assert online("--rate", "max", "--out", tmp_path / "fused.mcap", "--state", tmp_path / "state") == 0
     assert "resumed from" in capsys.readouterr().out
     assert (tmp_path / "fused.mcap").read_bytes() == (replayed / "fused.mcap").read_bytes()

@@ -3,6 +3,10 @@
 Understood are plain values, numpy arrays and numbers, the usual containers, and objects of this project's own classes, which are made
 without calling them (``__setstate__`` where a class has one). What is held twice is written once and held twice again. Arrays keep their
 layout in memory, and a view of another array stays one: linear algebra rounds by layout, and results are to be the same to the last bit.
+
+Long lists of numbers, and of frozen dataclasses of numbers and arrays, are written as columns: hours of them must not take longer than
+a scan. What the entries of such a list share with each other or with the rest, each then holds by itself; of what is never changed nobody
+can tell.
 """
 
 from __future__ import annotations
@@ -10,7 +14,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import sys
 from array import array
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -22,15 +25,16 @@ from numpy.typing import NDArray
 
 from localization.errors import DumpError
 
-_PACKAGES = ("localization.", "motion_models.")
-_KINDS = "biufc"
+PACKAGES = ("localization.", "motion_models.")
+KINDS = "biufc"
+"""Of numpy's types, those that are numbers."""
 _PACKED_AT_LEAST = 8
 
 Json = Any
 
 
 def freeze(value: Any, shared: Mapping[str, Any] | None = None) -> tuple[bytes, bytes]:
-    """``value`` as JSON and the bytes of its arrays. ``shared`` objects, by name, are not written: `thaw` is given them again.
+    """``value`` as JSON and the bytes of its arrays. ``shared`` objects, by name, are not written: `thaw.thaw` is given them again.
 
     Raises `DumpError` for an object that cannot be written.
     """
@@ -38,17 +42,6 @@ def freeze(value: Any, shared: Mapping[str, Any] | None = None) -> tuple[bytes, 
     root = writer.put(value)
     text = json.dumps({"root": root, "objects": writer.objects, "arrays": writer.arrays}, separators=(",", ":"), allow_nan=False)
     return text.encode(), b"".join(writer.blobs)
-
-
-def thaw(text: bytes, blob: bytes, shared: Mapping[str, Any] | None = None) -> Any:
-    """The value of `freeze`. Raises `DumpError` for bytes that are none of its."""
-    try:
-        content = json.loads(text)
-        return _Reader(content, blob, shared or {}).get(content["root"])
-    except DumpError:
-        raise
-    except (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, UnicodeDecodeError, ValueError) as error:
-        raise DumpError(f"it does not hold what this version writes ({type(error).__name__}: {error})") from error
 
 
 class _Writer:
@@ -94,7 +87,7 @@ class _Writer:
             return ["a", value.typecode, self._array(np.array(value))]
         if kind is slice:
             return ["s", value.start, value.stop, value.step]
-        if kind.__module__.startswith(_PACKAGES) and not isinstance(value, Enum):
+        if kind.__module__.startswith(PACKAGES) and not isinstance(value, Enum):
             return ["c", kind.__module__, kind.__qualname__, self.put(_state(value))]
         raise DumpError(f"the state holds a {kind.__module__}.{kind.__qualname__}, which cannot be written down")
 
@@ -123,7 +116,7 @@ class _Writer:
         if kinds == {np.ndarray}:
             alike = {(v.dtype, v.shape, v.flags.c_contiguous, v.base is None) for v in values}
             dtype, _, is_contiguous, is_own = next(iter(alike))
-            is_plain = len(alike) == 1 and is_contiguous and is_own and dtype.kind in _KINDS
+            is_plain = len(alike) == 1 and is_contiguous and is_own and dtype.kind in KINDS
             return ["ndarray", self._array(np.stack(values))] if is_plain else None
         for kind, dtype in ((float, "<f8"), (int, "<i8"), (bool, "|b1"), (np.float64, "<f8")):
             if kinds == {kind}:
@@ -134,7 +127,7 @@ class _Writer:
         return None
 
     def _ndarray(self, value: NDArray[Any]) -> Json:
-        if value.dtype.kind not in _KINDS:
+        if value.dtype.kind not in KINDS:
             raise DumpError(f"the state holds an array of {value.dtype}, which cannot be written down")
         base = value
         while isinstance(base.base, np.ndarray):
@@ -152,126 +145,13 @@ class _Writer:
         return len(self.arrays) - 1
 
 
-class _Reader:
-    def __init__(self, content: Json, blob: bytes, shared: Mapping[str, Any]) -> None:
-        self._objects, self._arrays = content["objects"], content["arrays"]
-        self._blob, self._shared = blob, shared
-        self._made: dict[int, Any] = {}
-
-    def get(self, code: Json) -> Any:
-        if not isinstance(code, list):
-            return code
-        kind, *rest = code
-        if kind == "o":
-            return self._object(rest[0])
-        if kind == "t":
-            return tuple(map(self.get, rest))
-        if kind == "f":
-            return float(rest[0])
-        if kind == "x":
-            return self._shared[rest[0]]
-        if kind == "n":
-            return self._array(rest[0])[()]
-        raise ValueError(f"unknown code {kind!r}")
-
-    def _object(self, index: int) -> Any:
-        if index not in self._made:
-            self._make(index, self._objects[index])
-        return self._made[index]
-
-    def _make(self, index: int, code: Json) -> None:
-        """Containers are known before they are filled, for they may hold themselves."""
-        kind, *rest = code
-        if kind == "c":
-            self._instance(index, *rest)
-        elif kind == "l":
-            made: list[Any] = []
-            self._made[index] = made
-            made.extend(map(self.get, rest))
-        elif kind == "d":
-            table: dict[Any, Any] = {}
-            self._made[index] = table
-            table.update((self.get(k), self.get(v)) for k, v in rest)
-        elif kind == "q":
-            queue: deque[Any] = deque(maxlen=rest[0])
-            self._made[index] = queue
-            queue.extend(map(self.get, rest[1:]))
-        elif kind == "p":
-            self._made[index] = self._list(*rest)
-        elif kind == "m":
-            self._made[index] = self._array(rest[0])
-        elif kind == "v":
-            self._made[index] = self._view(*rest)
-        elif kind == "a":
-            self._made[index] = array(rest[0], self._array(rest[1]).tobytes())
-        elif kind == "s":
-            self._made[index] = slice(*rest)
-        else:
-            raise ValueError(f"unknown object {kind!r}")
-
-    def _list(self, kind: str, *rest: Json) -> list[Any]:
-        if kind != "objects":
-            columns = [self._column(*column) for column in rest]
-            return list(zip(*columns, strict=True)) if kind == "rows" else columns[0]
-        module, name, names, *coded = rest
-        found, made = _class(module, name), []
-        for values in zip(*(self._column(*column) for column in coded), strict=True):
-            value = object.__new__(found)
-            vars(value).update(zip(names, values, strict=True))
-            made.append(value)
-        return made
-
-    def _instance(self, index: int, module: str, name: str, state: Json) -> None:
-        found = _class(module, name)
-        made: Any = object.__new__(found)
-        self._made[index] = made
-        content = self.get(state)
-        if hasattr(found, "__setstate__"):
-            made.__setstate__(content)
-        else:
-            for key, value in content.items():
-                object.__setattr__(made, key, value)
-
-    def _column(self, kind: str, place: int) -> list[Any]:
-        values = self._array(place)
-        if kind == "ndarray":
-            return [row.copy() for row in values]
-        return list(values) if kind == "float64" else values.tolist()
-
-    def _view(self, base: Json, dtype: str, offset: int, shape: list[int], strides: list[int]) -> NDArray[Any]:
-        return np.ndarray(tuple(shape), _dtype(dtype), self.get(base), offset, tuple(strides))
-
-    def _array(self, place: int) -> NDArray[Any]:
-        dtype, shape, order, offset = self._arrays[place]
-        count = math.prod(shape)
-        flat = np.frombuffer(self._blob, _dtype(dtype), count, offset) if count else np.empty(0, _dtype(dtype))
-        return flat.copy().reshape(shape, order=order)
-
-
-def _class(module: str, name: str) -> type[Any]:
-    """One of our modules, loaded already, and defined there: an imported name would be somebody else's class."""
-    found: Any = sys.modules.get(module) if module.startswith(_PACKAGES) else None
-    for part in name.split("."):
-        found = getattr(found, part, None)
-    if not isinstance(found, type) or found.__module__ != module:
-        raise DumpError(f"it holds a {module}.{name}, which this version does not have")
-    return found
-
-
 def _frozen_fields(value: Any) -> list[str]:
     """Names of the fields of an instance of one of our frozen dataclasses that has nothing to say about its state; else none."""
     kind = type(value)
-    if not kind.__module__.startswith(_PACKAGES) or not dataclasses.is_dataclass(kind) or hasattr(kind, "__setstate__"):
+    if not kind.__module__.startswith(PACKAGES) or not dataclasses.is_dataclass(kind) or hasattr(kind, "__setstate__"):
         return []
     is_frozen = kind.__dataclass_params__.frozen  # type: ignore[attr-defined]
     return [f.name for f in dataclasses.fields(kind)] if is_frozen and hasattr(value, "__dict__") else []
-
-
-def _dtype(name: str) -> np.dtype[Any]:
-    dtype = np.dtype(name)
-    if dtype.kind not in _KINDS:
-        raise ValueError(f"arrays of {name} are not written")
-    return dtype
 
 
 def _state(value: Any) -> Any:

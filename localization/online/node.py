@@ -86,7 +86,7 @@ class Node:
         stream = Stream(heard, robot, tally, epoch_ns, is_ros1=transport.is_ros1)
         made = made_by(pair, robot, heard.mounts, has_lidar, config, "live topics")
         core = Core(pair, robot, heard.mounts, has_lidar, config)
-        session = Session.start(files, core, f"{pair.model.name}_{pair.estimator}", made, stream.memory, {"tally": tally})
+        session = Session.start(files, core, f"{pair.model.name}_{pair.estimator}", made, stream.memory, {"tally": tally}, is_whole=False)
         teller = Teller(transport, with_tf=node.tf)
         made_node = cls(transport, stream, session, teller, robot)
         if session.head:
@@ -115,10 +115,11 @@ class Node:
 
     def finish(self) -> int | None:
         """Write the output and the last state; returns how many estimates there were, if an output was wanted."""
-        self.session.dump(self._head, now=True)
-        count = self.session.write_out()
-        self.session.close()
-        return count
+        try:
+            return self.session.write_out()
+        finally:
+            self.session.dump(self._head, now=True)
+            self.session.close()
 
     @property
     def topics(self) -> list[str]:
@@ -135,15 +136,18 @@ class Node:
         return 0.0 if self._began_ns is None else (self._newest_ns - self._began_ns) * 1e-9
 
     def _push(self, received: Received, *, time_it: bool) -> None:
+        has_estimate = False
         for event in self._stream.push(received):
             self._newest_ns = max(self._newest_ns, event.stamp_ns)
             self._began_ns = event.stamp_ns if self._began_ns is None else self._began_ns
             for estimate in self.session.push(event):
+                has_estimate = True
                 self._publish(estimate, event)
                 if time_it and isinstance(event, Scan):
                     self.session.health.took((time.monotonic_ns() - received.received_ns) * 1e-9)
             self.session.health.saw(event)
-        self.session.dump(self._head)
+        if has_estimate:  # the next scan is far now, and does not wait
+            self.session.dump(self._head)
 
     def _head(self) -> Mapping[str, Any]:
         return {"stamp_ns": self._newest_ns, "topics": self.topics}

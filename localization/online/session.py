@@ -71,11 +71,20 @@ class Session:
 
     @classmethod
     def start(
-        cls, files: Files, core: Core, name: str, made: Mapping[str, str], kept: Any = None, shared: Mapping[str, Any] | None = None
+        cls,
+        files: Files,
+        core: Core,
+        name: str,
+        made: Mapping[str, str],
+        kept: Any = None,
+        shared: Mapping[str, Any] | None = None,
+        *,
+        is_whole: bool = True,
     ) -> Session:
         """A new session with ``core``, or one that goes on from the state on disk, if there is one that was ``made`` by the same.
 
-        ``kept`` is dumped with the core; ``shared`` is what it holds that is not to be dumped. Raises `DumpError` and `OutputError`.
+        ``kept`` is dumped with the core; ``shared`` is what it holds that is not to be dumped. ``is_whole``: an output must hold the
+        estimates from the very first on, not from the state on. Raises `DumpError` and `OutputError`.
         """
         shared = shared or {}
         dumper = None if files.state is None else Dumper(files.state, made, shared)
@@ -85,12 +94,14 @@ class Session:
             return cls(core, kept, name, files, None if files.spool is None else Spool.create(files.spool), dumper, {})
         found = read_dump(files.state, made, shared)
         records = found.head.get("records")
-        if (records is None) != (files.spool is None):
+        if (records is not None and files.spool is None) or (records is None and files.spool is not None and is_whole):
             with_or_without = "without an --out" if records is None else "with an --out"
             raise DumpError(f"the state in '{files.state}' is of a run {with_or_without}: resume it so, or remove it to start anew.")
         if not (isinstance(found.value, list) and len(found.value) == 2 and isinstance(found.value[0], Core)):
             raise DumpError(f"the state in '{files.state}' holds no estimator. Remove it to start anew.")
-        spool = None if files.spool is None else Spool.resume(files.spool, int(records or 0))
+        spool = None
+        if files.spool is not None:
+            spool = Spool.create(files.spool) if records is None else Spool.resume(files.spool, int(records))
         core, kept = found.value
         return cls(core, kept, name, files, spool, dumper, found.head)
 
@@ -123,14 +134,16 @@ class Session:
         if self._spool is None or self._files.out is None:
             return None
         stamps, table = self._spool.rows()
-        if not len(stamps):
-            self._spool.remove()
-            raise OutputError(f"output '{self._files.out}': there is nothing to write, no motion could be told from what was heard.")
-        if self._files.out.suffix == ".tum":
+        if len(stamps) and self._files.out.suffix == ".tum":
             write_tum(self._files.out, trajectory(stamps, table))
-        else:
+        elif len(stamps):
             write_fused(self._files.out, {self.name: fused_estimates(stamps, table)}, self.name)
+        if self._dumper is not None:
+            self._dumper.wait()  # it may count on the rows being there
         self._spool.remove()
+        self._spool = None
+        if not len(stamps):
+            raise OutputError(f"output '{self._files.out}': there is nothing to write, no motion could be told from what was heard.")
         return len(stamps)
 
     def close(self, forget: bool = False) -> None:
