@@ -12,6 +12,7 @@ PARTS = (
     "tests.benchmarks.compare",
     "tests.benchmarks.lidar",
     "tests.benchmarks.graph",
+    "tests.benchmarks.diagnosis",
     "tests.studies.thesis_regressions",
     "tests.studies.friction_grid",
     "tests.studies.gentle_arcs",

@@ -31,8 +31,8 @@ def test_a_hidden_cause_is_named_with_its_size(diagnosed: Diagnosed, cause: str,
     first = found.findings[0]
     named = {first.cause: first.size, **dict(first.aliases)}
     assert cause in named
-    # to a quarter: sizes of causes that are told apart are better, but a spell of silence is not exactly as long as its share says
-    assert named[cause] == pytest.approx(size, rel=0.25)
+    # to a fifth, as a spell of silence is not exactly as long as its share says, or else within what the diagnosis itself claims
+    assert abs(named[cause] - size) < max(0.2 * abs(size), 3.0 * first.sigma)
     assert first.p_value < 1e-3
     assert first.gain.relative > 0.05
     assert found.gain is not None

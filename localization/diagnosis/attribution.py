@@ -11,6 +11,8 @@ import numpy as np
 from motion_models.se2 import FloatArray
 
 MOST_CAUSES = 7
+_MANY = 1500  # as many numbers must be measured for sets of more than _FEW causes
+_FEW = 4
 _DRAWS = 4000
 _KEPT = 12
 
@@ -118,7 +120,7 @@ def ranked_subsets(problem: Regression, groups: list[str], allowed: FloatArray, 
 
     found: list[tuple[float, tuple[int, ...]]] = [(0.0, ())]
     layer: list[tuple[int, ...]] = [()]
-    for k in range(1, MOST_CAUSES + 1):
+    for k in range(1, (MOST_CAUSES if problem.count >= _MANY else _FEW) + 1):
         # all pairs; beyond that, what extends the best sets of the size before
         tried = (
             set(itertools.combinations(range(p), k)) if k <= 2 else {tuple(sorted({*s, i})) for s in layer for i in range(p) if i not in s}

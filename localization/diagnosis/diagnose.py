@@ -121,6 +121,7 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
     state = _linearise(pipeline, effects, {})
     first = state
     current: dict[Effect, float] = {}
+    visited: list[dict[Effect, float]] = []
     seen: list[frozenset[str]] = []
     for _ in range(_ROUNDS):
         sizes = _search(pipeline, state)
@@ -128,10 +129,16 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
         if keys == frozenset(e.key for e in current):
             break
         current = sizes
+        visited.append(sizes)
         state = _linearise(pipeline, effects, current)
         if keys in seen:
             break
         seen.append(keys)
+    if len(visited) > 1:  # later looks need not be better: all that were preferred once are compared by one noise
+        best = min(visited, key=lambda sizes: _true_cost(pipeline, state, sizes))
+        if set(best) != set(current):
+            current = best
+            state = _linearise(pipeline, effects, current)
     index = {e.key: i for i, e in enumerate(effects)}
     chosen = _tested(state, tuple(sorted(index[e.key] for e in current)), rng, config)
     return _conclude(pipeline, first, state, chosen, rng, config)
@@ -156,12 +163,23 @@ def _search(pipeline: Pipeline, state: _State) -> dict[Effect, float]:
             sizes, rows = _refined(pipeline, state, start)
         except (CgError, ModelError):
             continue  # sizes that no robot can have
-        whole = _normal(rows, state.signatures, state.nuisances, state.noise, effects)
-        misfit = whole.misfit()
-        k = len(subset)
-        penalty = k * math.log(max(problem.count, 2)) + 2.0 * math.log(math.comb(len(set(groups)), k))
-        results.append((misfit + penalty, subset, sizes))
+        found = _cost(state, sizes, rows)
+        results.append((found, subset, sizes))
     return min(results, key=lambda r: r[0])[2]
+
+
+def _cost(state: _State, sizes: dict[Effect, float], rows: FloatArray) -> float:
+    """What ``rows`` (M, 6), which ``sizes`` leave, are off beyond all tolerances, and the price of so many causes."""
+    whole = _normal(rows, state.signatures, state.nuisances, state.noise, state.effects)
+    k, groups = len(sizes), len({_group(e) for e in state.effects})
+    return whole.misfit() + k * math.log(max(whole.count, 2)) + 2.0 * math.log(math.comb(groups, k))
+
+
+def _true_cost(pipeline: Pipeline, state: _State, sizes: dict[Effect, float]) -> float:
+    try:
+        return _cost(state, *_refined(pipeline, state, sizes))
+    except (CgError, ModelError):
+        return math.inf
 
 
 def _refined(pipeline: Pipeline, state: _State, sizes: dict[Effect, float]) -> tuple[dict[Effect, float], FloatArray]:
