@@ -231,7 +231,7 @@ class GraphFusion:
         return found
 
     def counts(self) -> Mapping[str, int]:
-        return self._counts
+        return {**self._counts, **self._witness.counts()}
 
     def map_points(self) -> FloatArray:
         return self._witness.map_points() if self._has_lidar else NO_POINTS
@@ -329,8 +329,10 @@ class GraphFusion:
                 self._close(Closure(a, b, motion, whitening(known.cov + 1e-12 * np.eye(3))))
             if self.config.backend == "isam2":
                 return
-        self._window.restart(revisited(node, known, self._believed(node)))
+        believed = self._believed(node)
+        self._window.restart(revisited(node, known, believed))
         self._newest = self._now = self._window.newest
+        self._witness.correct(believed, self._believed(self._now))
 
     def _twist(self, step: Step, link: Link, ahead: Ahead, before: Node, alone: bool) -> tuple[FloatArray, FloatArray | None]:
         """Mean twist of the step, by all witnesses where the step is all there is between two nodes, else without the LiDAR."""
