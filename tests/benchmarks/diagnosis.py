@@ -76,7 +76,9 @@ def rivals(drive: Drive, config: engine.DiagnosisConfig) -> tuple[dict[str, tupl
     stlsq = _stlsq(y, s, thresholds)
     found = {}
     for name, subset in (("stepwise", stepwise), ("stlsq", stlsq)):
-        strongest = max(subset, key=lambda i: float(np.linalg.norm(s[:, i]))) if subset else None
+        x = np.linalg.lstsq(s[:, subset], y, rcond=None)[0] if subset else np.zeros(0)
+        parts = {i: float(np.linalg.norm(s[:, i] * v)) for i, v in zip(subset, x, strict=True)}  # what each explains by its own size
+        strongest = max(parts, key=lambda i: parts[i]) if parts else None
         found[name] = (NONE if strongest is None else effects[strongest].id, gain(tuple(subset)))
     found["gp"] = (NONE, _gp_gain(drive, state))
     found["noise"] = (NONE, 0.0)
