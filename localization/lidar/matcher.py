@@ -7,8 +7,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from localization.lidar.cells import ALL_AGES, Ages
 from localization.lidar.kiss import Kiss
-from localization.lidar.lines import ALL_AGES, Ages, FitOptions, LineMap
+from localization.lidar.lines import FitOptions, LineMap
 from localization.lidar.noise import Noise
 from localization.lidar.revisit import Revisit, RevisitConfig, Revisits
 from localization.lidar.sweep import walls

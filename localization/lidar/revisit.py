@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from localization.lidar.cells import ALL_AGES, Ages, ages_between, ages_until
 from localization.lidar.correlate import correlate
-from localization.lidar.lines import ALL_AGES, Ages, FitOptions, LineMap, ages_between, ages_until
+from localization.lidar.lines import FitOptions, LineMap
 from localization.lidar.track import Place, Track, moved
 from motion_models import se2
 from motion_models.se2 import FloatArray

@@ -1,0 +1,268 @@
+"""Lines through a map's points, and how well a scan falls onto them, as compiled loops (see `lines`)."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from localization.lidar.cells import Ages, find_cell, is_used
+from motion_models.se2 import FloatArray
+
+_MIN_NEIGHBOURS = 4
+_MAX_SIGMAS = 3.0  # of a point's noise: neighbours that scatter more across their line are of two
+_STALE = 0.02  # of the neighbourhood's radius: points that moved farther look for their lines again
+_SAME = 0.05  # of the same: points that are nearer to each other look once for both
+_MAX_LINE_RATIO = 0.1  # smaller over larger eigenvalue of the neighbours' spread: beyond this it is a corner or clutter
+
+
+@numba.njit(cache=True)
+def _line(
+    cells: NDArray[np.int32],
+    points: NDArray[np.float32],
+    travels: NDArray[np.float32],
+    ages: Ages,
+    x: float,
+    y: float,
+    cell: float,
+    radius: float,
+    most_thin: float,
+) -> tuple[int, float, float, float, float, float]:  # pragma: no cover
+    """The line of the points around (x, y): how many they are, 0 where they make none; its normal, the distance of (x, y) from it along
+    the normal, the points' variance across it, and their mean travelled distance."""
+    ix, iy = math.floor(x / cell), math.floor(y / cell)
+    m, sx, sy, sxx, sxy, syy, st = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for jx in range(ix - 1, ix + 2):
+        for jy in range(iy - 1, iy + 2):
+            slot = find_cell(cells, jx, jy)
+            if slot < 0:
+                continue
+            for k in range(cells[slot, 2]):
+                qx, qy = points[slot, k, 0] - x, points[slot, k, 1] - y
+                if qx * qx + qy * qy < radius * radius and is_used(ages, travels[slot, k]):
+                    m += 1
+                    sx, sy = sx + qx, sy + qy
+                    sxx, sxy, syy = sxx + qx * qx, sxy + qx * qy, syy + qy * qy
+                    st += travels[slot, k]
+    if m < _MIN_NEIGHBOURS:
+        return 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    mx, my = sx / m, sy / m
+    cxx, cxy, cyy = sxx / m - mx * mx, sxy / m - mx * my, syy / m - my * my
+    trace, split = cxx + cyy, math.hypot(cxx - cyy, 2.0 * cxy)
+    wide, thin = 0.5 * (trace + split), max(0.5 * (trace - split), 0.0)
+    if wide < 1e-4 or thin > min(_MAX_LINE_RATIO * wide, most_thin):
+        return 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
+    nx, ny = -math.sin(angle), math.cos(angle)
+    return m, nx, ny, -(nx * mx + ny * my), thin, st / m
+
+
+@numba.njit(cache=True)
+def compare_points(
+    cells: NDArray[np.int32],
+    points: NDArray[np.float32],
+    travels: NDArray[np.float32],
+    ages: Ages,
+    source: FloatArray,
+    pose: FloatArray,
+    cell: float,
+    radius: float,
+    most_thin: float,
+    errors: FloatArray,
+    seen: FloatArray,
+) -> None:  # pragma: no cover
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for i in range(source.shape[0]):
+        x = pose[0] + c * source[i, 0] - s * source[i, 1]
+        y = pose[1] + s * source[i, 0] + c * source[i, 1]
+        m, _, _, e, _, travel = _line(cells, points, travels, ages, x, y, cell, radius, most_thin)
+        errors[i], seen[i] = (abs(e), travel) if m else (math.nan, math.nan)
+
+
+@numba.njit(cache=True)
+def _associate(
+    cells: NDArray[np.int32],
+    points: NDArray[np.float32],
+    travels: NDArray[np.float32],
+    hits: NDArray[np.int32],
+    ages: Ages,
+    source: FloatArray,
+    pose: FloatArray,
+    cell: float,
+    radius: float,
+    most_thin: float,
+    home: NDArray[np.int64],
+    lines: FloatArray,
+) -> None:  # pragma: no cover
+    """Fills ``lines`` (N, 7) for the points ``source`` (N, 2) at ``pose``: how many points make the line (0: none), its normal, a point on
+    it, the variance of its place, and how many of ``source`` are in its cell, ``home`` (N,), below 0 where the map has none."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    last_x, last_y, near = math.inf, math.inf, (_SAME * radius) ** 2
+    for i in range(source.shape[0]):
+        x = pose[0] + c * source[i, 0] - s * source[i, 1]
+        y = pose[1] + s * source[i, 0] + c * source[i, 1]
+        if (x - last_x) ** 2 + (y - last_y) ** 2 < near:  # beside the point before, as beams are: it meets the same line
+            lines[i, :6] = lines[i - 1, :6]
+        else:
+            last_x, last_y = x, y
+            m, nx, ny, e, thin, _ = _line(cells, points, travels, ages, x, y, cell, radius, most_thin)
+            lines[i, 0] = m
+            if m:
+                lines[i, 1], lines[i, 2], lines[i, 3], lines[i, 4], lines[i, 5] = nx, ny, x - e * nx, y - e * ny, thin / m
+        home[i] = find_cell(cells, math.floor(x / cell), math.floor(y / cell))
+        if home[i] >= 0:
+            hits[home[i]] += 1
+    for i in range(source.shape[0]):
+        lines[i, 6] = hits[home[i]] if home[i] >= 0 else 1.0
+    for i in range(source.shape[0]):
+        if home[i] >= 0:
+            hits[home[i]] = 0
+
+
+@numba.njit(cache=True)
+def _sum_up(
+    source: FloatArray,
+    lines: FloatArray,
+    pose: FloatArray,
+    sigma_point: float,
+    sigma_line: float,
+    kernel: float,
+    H: FloatArray,
+    g: FloatArray,
+) -> tuple[int, float]:  # pragma: no cover
+    """The quadratic of the cost around ``pose``, into ``H`` and ``g``; returns the matched points and their weighted sum of squares."""
+    H[:], g[:] = 0.0, 0.0
+    n_matched, squares = 0, 0.0
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for i in range(source.shape[0]):
+        if lines[i, 0] == 0.0:
+            continue
+        nx, ny = lines[i, 1], lines[i, 2]
+        x = pose[0] + c * source[i, 0] - s * source[i, 1]
+        y = pose[1] + s * source[i, 0] + c * source[i, 1]
+        e = nx * (x - lines[i, 3]) + ny * (y - lines[i, 4])
+        robust = 1.0 + e * e / (kernel * kernel)
+        # All points in one cell meet the same line, whose error they share: together they know no more than it.
+        w = 1.0 / ((sigma_point * sigma_point + lines[i, 6] * (sigma_line * sigma_line + lines[i, 5])) * robust * robust)
+        # e changes by n . R (dx, dy) and by the lever arm of the point
+        jx, jy = nx * c + ny * s, ny * c - nx * s
+        jt = jy * source[i, 0] - jx * source[i, 1]
+        H[0, 0] += w * jx * jx
+        H[0, 1] += w * jx * jy
+        H[0, 2] += w * jx * jt
+        H[1, 1] += w * jy * jy
+        H[1, 2] += w * jy * jt
+        H[2, 2] += w * jt * jt
+        g[0] -= w * jx * e
+        g[1] -= w * jy * e
+        g[2] -= w * jt * e
+        n_matched += 1
+        squares += e * e / (robust * robust)
+    H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
+    return n_matched, squares
+
+
+@numba.njit(cache=True)
+def fit_points(
+    cells: NDArray[np.int32],
+    points: NDArray[np.float32],
+    travels: NDArray[np.float32],
+    hits: NDArray[np.int32],
+    ages: Ages,
+    source: FloatArray,
+    pose: FloatArray,
+    cell: float,
+    radius: float,
+    sigma_point: float,
+    sigma_line: float,
+    final_kernel: float,
+    wide_kernel: float,
+    iterations: int,
+    prior: FloatArray,
+    center: FloatArray,
+    H: FloatArray,
+    g: FloatArray,
+    spread: FloatArray,
+) -> tuple[int, int, float]:  # pragma: no cover
+    """Changes ``pose``, ``H`` and ``g`` in place; returns the matched points, those on their lines, and the weighted sum of squares.
+
+    Lines are looked up again where the points have moved by a part of the neighbourhood since they were: near the end, they stay.
+    """
+    most_thin = (_MAX_SIGMAS * sigma_point) ** 2
+    home, lines = np.empty(source.shape[0], np.int64), np.empty((source.shape[0], 7))
+    reach, moved, n_matched, squares = 0.0, math.inf, 0, 0.0
+    for i in range(source.shape[0]):
+        reach = max(reach, math.hypot(source[i, 0], source[i, 1]))
+    for iteration in range(iterations + 1):
+        if moved > _STALE * radius:
+            _associate(cells, points, travels, hits, ages, source, pose, cell, radius, most_thin, home, lines)
+            moved = 0.0
+        kernel = wide_kernel if iteration == 0 else final_kernel
+        n_matched, squares = _sum_up(source, lines, pose, sigma_point, sigma_line, kernel, H, g)
+        if iteration >= iterations or n_matched == 0:
+            break
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        dx, dy = center[0] - pose[0], center[1] - pose[1]
+        turn = (center[2] - pose[2] + math.pi) % (2.0 * math.pi) - math.pi
+        px, py = c * dx + s * dy, c * dy - s * dx
+        b0 = g[0] + prior[0, 0] * px + prior[0, 1] * py + prior[0, 2] * turn
+        b1 = g[1] + prior[1, 0] * px + prior[1, 1] * py + prior[1, 2] * turn
+        b2 = g[2] + prior[2, 0] * px + prior[2, 1] * py + prior[2, 2] * turn
+        a00, a01, a02 = H[0, 0] + prior[0, 0], H[0, 1] + prior[0, 1], H[0, 2] + prior[0, 2]
+        a11, a12, a22 = H[1, 1] + prior[1, 1], H[1, 2] + prior[1, 2], H[2, 2] + prior[2, 2]
+        i00, i01, i02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
+        i11, i12, i22 = a00 * a22 - a02 * a02, a01 * a02 - a00 * a12, a00 * a11 - a01 * a01
+        det = a00 * i00 + a01 * i01 + a02 * i02
+        d0 = (i00 * b0 + i01 * b1 + i02 * b2) / det
+        d1 = (i01 * b0 + i11 * b1 + i12 * b2) / det
+        d2 = (i02 * b0 + i12 * b1 + i22 * b2) / det
+        pose[0] += c * d0 - s * d1
+        pose[1] += s * d0 + c * d1
+        pose[2] += d2
+        moved += math.hypot(d0, d1) + abs(d2) * reach
+        if iteration > 0 and abs(d0) + abs(d1) + abs(d2) < 1e-4:
+            iterations = iteration + 1
+    n_on = _spread(source, lines, home, pose, sigma_point, sigma_line, spread)
+    return n_matched, n_on, squares
+
+
+@numba.njit(cache=True)
+def _spread(
+    source: FloatArray,
+    lines: FloatArray,
+    home: NDArray[np.int64],
+    pose: FloatArray,
+    sigma_point: float,
+    sigma_line: float,
+    spread: FloatArray,
+) -> int:  # pragma: no cover
+    """Fills ``spread`` (4,), see `Spread`; returns how many points are on their lines: those beyond three sigmas are of something else.
+    A group ends where the scan leaves a cell."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    limit = 9.0 * (sigma_point * sigma_point + sigma_line * sigma_line)
+    spread[:] = 0.0
+    n_on, n, total, squares, place = 0, 0, 0.0, 0.0, 0.0
+    for i in range(source.shape[0] + 1):
+        is_end = i == source.shape[0]
+        if n and (is_end or home[i] != home[i - 1]):
+            if n >= _MIN_NEIGHBOURS:
+                within = squares - total * total / n
+                spread[0] += within
+                spread[1] += n - 1
+                spread[2] += (total / n) ** 2 - within / (n - 1) / n - place / n
+                spread[3] += 1.0
+            n, total, squares, place = 0, 0.0, 0.0, 0.0
+        if is_end or lines[i, 0] == 0.0:
+            continue
+        x = pose[0] + c * source[i, 0] - s * source[i, 1]
+        y = pose[1] + s * source[i, 0] + c * source[i, 1]
+        e = lines[i, 1] * (x - lines[i, 3]) + lines[i, 2] * (y - lines[i, 4])
+        if e * e < limit + 9.0 * lines[i, 5]:
+            n_on += 1
+            n += 1
+            total += e
+            squares += e * e
+            place += lines[i, 5]
+    return n_on
