@@ -62,13 +62,13 @@ def kill_after(tmp_path, events):
     process = start(tmp_path, "4")
     wait_for_state(tmp_path, process, events)
     ages = []
-    for _ in range(30):  # a state on disk is whole, and no older than a second, but where the machine is so busy that nothing runs
+    for _ in range(20):  # a state on disk is whole, and never older than a second
         ages.append(time.time() - (tmp_path / "state").stat().st_mtime)
         assert read_head(tmp_path / "state")["records"] >= 0
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    assert sorted(ages)[len(ages) // 2] < 1.0
+    assert max(ages) < 1.0
     assert not (tmp_path / "fused.mcap").exists()
 
 
@@ -81,7 +81,7 @@ def killed(tmp_path_factory):
 
 def test_killed_twice_and_resumed_it_writes_the_same_bytes(replayed, killed, tmp_path, capsys):
     shutil.copytree(killed, tmp_path, dirs_exist_ok=True)
-    kill_after(tmp_path, 1000)
+    kill_after(tmp_path, read_head(tmp_path / "state")["events"] + 50)  # written by this process, not left by the one before
     assert online("--rate", "max", "--out", tmp_path / "fused.mcap", "--state", tmp_path / "state") == 0
     assert "resumed from" in capsys.readouterr().out
     assert (tmp_path / "fused.mcap").read_bytes() == (replayed / "fused.mcap").read_bytes()
