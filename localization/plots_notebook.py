@@ -60,6 +60,8 @@ class Panel:
     title: str = ""
     is_map: bool = False
     """One metre is as long along x as along y."""
+    whole_x: bool = False
+    """x counts things: its ticks are whole numbers."""
     log_x: bool = False
     log_y: bool = False
     band: tuple[float, float] | None = None
@@ -176,7 +178,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
     if panel.log_x:
         axes.set_xscale("log")
     else:
-        axes.locator_params(axis="x", nbins=6)
+        axes.locator_params(axis="x", nbins=6, integer=panel.whole_x)
     if panel.log_y:
         axes.set_yscale("log")
     if panel.is_map:

@@ -98,6 +98,8 @@ pictured = picture(
         "drift of the wheels per lap [m]",
         by_lap,
         log_y=True,
+        whole_x=True,
+        y_range=(0.08, 20.0),
         moments=rounds,
         legend="lower left",
     ),
@@ -132,7 +134,8 @@ for title in ("skid_steer, constant", "skid_steer, cg_field"):
             [Series(name, laps, believed[:, i], CYCLE[i], MARKERS[i]) for i, name in enumerate(POSTURES)],
             title,
             moments=rounds,
-            y_range=(0.3, 0.8),
+            y_range=(0.25, 0.95),
+            whole_x=True,
             legend="lower right",
         )
     )
