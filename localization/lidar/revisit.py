@@ -25,6 +25,7 @@ from motion_models import se2
 from motion_models.se2 import FloatArray
 
 _KNOWS_NOTHING = np.array([10.0, 10.0, 3.0])
+_MOST_RECENT = 40  # keyframes, where the robot turns and goes nowhere
 _MOST_POINTS = 150  # in the search
 _STARTS, _MOST_RIVALS = 4, 100
 _RIVAL_SCORE = 0.8  # whose score in the coarse search is below this part of the best fit's explains far less
@@ -101,7 +102,7 @@ class Revisits:
         self.track = Track()
         self._gate = float(chi2.ppf(config.gate_probability, 3))
         self._pending: tuple[int, _Fit] | None = None
-        self._recent: deque[tuple[Place, FloatArray]] = deque()
+        self._recent: deque[tuple[Place, FloatArray]] = deque(maxlen=_MOST_RECENT)
         self._searched = -math.inf
         self.ages: Ages = ALL_AGES
         """Parts of the map against which the pose is known as well as scan matching needs it: the latest way, and what it is tied to."""
@@ -114,11 +115,11 @@ class Revisits:
         self.track.add(now)
         reach = float(np.quantile(np.hypot(scan[:, 0], scan[:, 1]), 0.9)) if len(scan) else 0.0
         self.ages = ages_between(self._known(now, reach))
-        recent = self._seen_recently(now, scan)
+        self._recent.append((now, _thinned(scan, 0.5 * self._voxel)))
         if self._pending is None and travel - self._searched < self.config.search_m:
             return None
         self._searched = travel
-        fit, then = self._find(recent, lines, pose, travel, reach)
+        fit, then = self._find(self._seen_recently(now), lines, pose, travel, reach)
         last, self._pending = self._pending, None if fit is None else (len(self.track) - 1, fit)
         if fit is None or last is None or not self._agrees(last, fit):
             return None
@@ -133,7 +134,8 @@ class Revisits:
 
     def correct(self, world_T_world: FloatArray) -> None:
         """The latest way lies elsewhere by ``world_T_world`` (3,)."""
-        self._recent = deque((replace(place, pose=se2.compose(world_T_world, place.pose)), seen) for place, seen in self._recent)
+        moved_along = [(replace(place, pose=se2.compose(world_T_world, place.pose)), seen) for place, seen in self._recent]
+        self._recent = deque(moved_along, maxlen=_MOST_RECENT)
 
     def _known(self, now: Place, reach: float) -> FloatArray:
         """(S, 2) stretches of the way [m] whose part of the map can be matched with as it is; ``reach`` [m] of the LiDAR."""
@@ -148,14 +150,12 @@ class Revisits:
         """The scan matcher itself sees as far as that."""
         return 9.0 * float(np.linalg.eigvalsh(growth[:2, :2])[-1]) < self._voxel**2
 
-    def _seen_recently(self, now: Place, scan: FloatArray) -> FloatArray:
+    def _seen_recently(self, now: Place) -> FloatArray:
         """(N, 2) the last keyframes' points in the body frame ``now``, one per half voxel."""
-        self._recent.append((now, scan))
         while now.travel - self._recent[0][0].travel > self.config.recent_m:
             self._recent.popleft()
         points = np.concatenate([se2.transform(se2.between(now.pose, place.pose), seen) for place, seen in self._recent])
-        _, first = np.unique(np.floor(points / (0.5 * self._voxel)).astype(np.int64), axis=0, return_index=True)
-        return np.ascontiguousarray(points[np.sort(first)])
+        return _thinned(points, 0.5 * self._voxel)
 
     def _is_keyframe(self, pose: FloatArray, travel: float) -> bool:
         if not len(self.track):
@@ -279,6 +279,13 @@ class _Search:
         off = se2.log(se2.between(self.pose, found.pose))
         score = float(on_map.mean()) - 0.5 * float(off @ information @ off) / len(self.scan)
         return _Fit(se2.compose(found.pose, se2.exp(cov @ found.gradient)), found.pose, cov, on_map, travels, score)
+
+
+def _thinned(points: FloatArray, cell: float) -> FloatArray:
+    """The first of ``points`` (N, 2) in each square ``cell`` [m], in their order."""
+    ix, iy = np.floor(points / cell).astype(np.int64).T
+    _, first = np.unique(ix * (1 << 32) + iy, return_index=True)
+    return np.ascontiguousarray(points[np.sort(first)])
 
 
 def _last_absence(travels: FloatArray, travel: float, length: float) -> float:

@@ -8,6 +8,7 @@ share the error of the place where their ways part.
 
 from __future__ import annotations
 
+from array import array
 from bisect import bisect_left
 from dataclasses import dataclass, replace
 
@@ -37,6 +38,7 @@ class Track:
     def __init__(self) -> None:
         self._places: list[Place] = []
         self._travels: list[float] = []
+        self._xs, self._ys = array("d"), array("d")
         self._starts: list[int] = []  # of each place: the first of those that follow each other up to it
         self._parents: dict[int, int] = {}  # of each start but the first: the place that its way goes on from
         self._next_parent: int | None = None
@@ -56,6 +58,8 @@ class Track:
         self._starts.append(n if is_start else self._starts[-1])
         self._places.append(replace(place, cov=np.array(place.cov)))  # a view would keep all of a filter's covariance alive
         self._travels.append(place.travel)
+        self._xs.append(float(place.pose[0]))
+        self._ys.append(float(place.pose[1]))
 
     def tie(self, index: int) -> None:
         """The pose was corrected by what was seen at place ``index``: the way goes on from there."""
@@ -70,8 +74,7 @@ class Track:
     def near(self, pose: FloatArray, radius: float, before: float) -> NDArray[np.intp]:
         """Places within ``radius`` [m] of ``pose`` (3,), passed before ``before`` [m], in their order."""
         n = bisect_left(self._travels, before)
-        at = np.array([place.pose[:2] for place in self._places[:n]]).reshape(-1, 2) - pose[:2]
-        return np.flatnonzero(np.hypot(at[:, 0], at[:, 1]) < radius)
+        return np.flatnonzero(np.hypot(np.array(self._xs[:n]) - pose[0], np.array(self._ys[:n]) - pose[1]) < radius)
 
     def growth(self, index: int) -> FloatArray:
         """(3, 3) covariance of the last place against place ``index``, in the body frame of the last."""
