@@ -89,6 +89,9 @@ class Bars:
     level: float | None = None
     """A thin vertical line."""
     colours: Sequence[str] = CYCLE
+    legend: Place = "best"
+    room: float = 0.14
+    """Kept free beyond the longest bar, as a share of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +222,7 @@ def _draw_bars(axes: Axes, bars: Bars) -> None:
     if bars.level is not None:
         axes.axvline(bars.level, color=COLOURS["soft"], linewidth=0.8)
     axes.set(xlabel=bars.x_label, title=bars.title, yticks=rows, yticklabels=bars.names, ylim=(len(rows) - 0.5, -0.5))
-    axes.margins(x=0.14)
+    axes.margins(x=bars.room)
     axes.grid(visible=False, axis="y")
     if len(bars.groups) > 1:
-        axes.legend(fontsize=8.0, frameon=True, framealpha=0.8, edgecolor="none", loc="best")
+        axes.legend(fontsize=8.0, frameon=True, framealpha=0.8, edgecolor="none", loc=bars.legend)

@@ -114,14 +114,25 @@ def center_of_gravity() -> Picture:
     def seen(values: np.ndarray) -> Series:
         return Series("68 rotations, measured", x, values, "grey", "o", None)
 
-    over_y = [*n["over_x"]]
     return picture(
-        Panel("CG ahead of the middle [m]", "k [-]", [seen(grid.ratio / multiplier), *curves(k, 0, 1.0 / multiplier)], "How much it turns"),
-        Panel("CG ahead of the middle [m]", "m", [seen(grid.cor[:, 0]), *curves(x_cr, 1)], "Centre of rotation, ahead", legend=None),
-        Panel("CG ahead of the middle [m]", "m", over_y, "Centre of rotation, to the left"),
+        Panel(
+            "CG ahead of the middle [m]",
+            "rotation scaling k [-]",
+            [seen(grid.ratio / multiplier), *curves(k, 0, 1.0 / multiplier)],
+            "How much it turns",
+        ),
+        Panel("CG ahead of the middle [m]", "x_CR [m]", [seen(grid.cor[:, 0]), *curves(x_cr, 1)], "Centre of rotation, ahead", legend=None),
+        Panel(
+            "CG ahead of the middle [m]",
+            "y_CR [m]",
+            n["over_x"],
+            "Centre of rotation, to the left",
+            y_range=(-0.065, 0.095),
+            legend="upper right",
+        ),
         columns=3,
         row_in=3.3,
-        width_in=11.5,
+        width_in=10.5,
     )
 
 
@@ -139,6 +150,7 @@ def corrections() -> Picture:
             title,
             "{:.1f}",
             colours=("red", "grey", "purple", "blue"),
+            room=0.42,
         ),
         columns=1,
         row_in=4.2,

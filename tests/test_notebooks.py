@@ -54,6 +54,13 @@ def test_what_is_shown_is_what_was_run(source):
     assert not PLACE.search(source.with_suffix(".ipynb").read_text(encoding="utf-8"))
 
 
+@pytest.mark.parametrize("name", ["worlds.svg", "cg.png", "corrections.png"])
+def test_the_readmes_pictures_are_small(name):
+    picture = (FOLDER / "figures" / name).read_bytes()
+    assert 10_000 < len(picture) < 150_000
+    assert picture.startswith((b"<svg", b"\x89PNG"))
+
+
 def test_the_test_of_places_finds_places():
     assert PLACE.search("File /home/me/x.py")
     assert PLACE.search(r'"C:\\Users"')
