@@ -20,8 +20,10 @@ import numpy as np
 from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import drive_of_table
 from localization.plots_notebook import CYCLE, MARKERS, Bars, Panel, Series, picture, table
-from motion_models import fit, load_robot, make_model, read_rotation_table, rotations_as_maneuvers
+from localization.simulate import SensorConfig, SimulationConfig, simulate
+from motion_models import center_from_end_poses, fit, load_robot, make_model, read_rotation_table, rotations_as_maneuvers
 from motion_models.least_squares import FitConfig
+from motion_models.regressions import rotation_ratio
 from motion_models.robot import WheelNoise
 
 robot = load_robot("vaultbot")
@@ -130,8 +132,37 @@ table(
 # %% [markdown]
 # ## Step 5. The thesis's own explanations
 #
-# It blamed the constant offset of the centre of rotation on rotational inertia, and the asymmetry on the tyres' treads. Inertia matters
-# while the robot speeds up: a tenth of a second in five. Treads can be tried in place of the warp.
+# It blamed the constant offset of the centre of rotation on rotational inertia, and the asymmetry on the tyres' treads. The simulated
+# vehicle has inertia, and motors that take half a second to reach their speed: that leaves its centre of rotation where the quasi-static
+# model says.
+
+# %%
+vehicle = simulate("rotation_grid", robot, config=SimulationConfig(sensors=SensorConfig(lidar="none")))
+for _ in vehicle.messages():
+    pass
+with_inertia = np.array([center_from_end_poses(run.poses[0], run.poses[-1]).value[0] for run in vehicle.runs])
+driven_x = np.array([run.nominal_cg[0] for run in vehicle.runs])
+rates = np.array([[-1.0, 1.0]])
+vx, vy, wz = np.moveaxis(friction.twist(rates, grid.cg, friction.nominal).value, -1, 0)
+middle = grid.cg[:, 1] == 0.0
+picture(
+    Panel(
+        "x_G [m]",
+        "x_CR [m]",
+        [
+            Series("measured", x, grid.cor[:, 0], "grey", "o", None),
+            Series("quasi-static physics, y_G = 0", x[middle], (-vy / wz)[middle], "blue"),
+            Series("simulated vehicle with inertia", driven_x, with_inertia, "red", "s", None),
+        ],
+        "Centre of rotation, nothing fitted",
+    ),
+    columns=1,
+    row_in=3.2,
+    width_in=6.5,
+)
+
+# %% [markdown]
+# Treads can be tried in place of the warp.
 
 # %%
 pairs = {
@@ -146,8 +177,14 @@ picture(
 )
 
 # %% [markdown]
-# A wrong centre of gravity is ruled out by where the robot turns least: that would move with it, and stays at x_G = 0 (notebook 2, figure
-# 4-5).
+# A wrong centre of gravity is ruled out by where the robot turns least: that would move with it by as much.
+
+# %%
+_, b, a = rotation_ratio(grid).coefficients
+f"turns least at x_G = {-500.0 * b / a:+.1f} mm; its centre of rotation is off by {1000.0 * (grid.cor[:, 0] + vy / wz).mean():+.0f} mm"
+
+# %% [markdown]
+# ## What is left
 
 # %%
 if d.shapes:
