@@ -21,7 +21,7 @@ from localization.report_data import MapView, NisMeans, Spans, Timeline, raster
 from localization.report_lines import Line, thin_path, thin_series
 from localization.report_svg import COLOURS, NARROW, WIDE, Size, for_page
 
-__all__ = ["NARROW", "WIDE", "Axes", "Figure", "map_svg", "nis_svg", "overview", "picture", "spans_svg", "timeline_svg"]
+__all__ = ["NARROW", "WIDE", "Axes", "Figure", "map_svg", "nis_svg", "overview", "picture", "plain_logs", "spans_svg", "timeline_svg"]
 
 _STYLE = {
     "svg.fonttype": "none",
@@ -99,7 +99,7 @@ def spans_svg(lines: Sequence[Line], spans: Sequence[Spans], size: Size) -> str:
                 _plot(axes, line, span.seconds, np.maximum(values, 1e-6), marker="o", markersize=3.0)
         for axes, name in zip(panels, ("translation error [m]", "rotation error [deg]"), strict=True):
             axes.set(xscale="log", yscale="log", ylabel=f"mean {name}")
-            _plain_logs(axes)
+            plain_logs(axes)
             if size.is_wide or axes is panels[-1]:
                 axes.set_xlabel("time from first to second pose [s]")
 
@@ -119,7 +119,7 @@ def nis_svg(lines: Sequence[Line], means: Sequence[NisMeans], size: Size) -> str
         axes.set(
             yscale="log", xlabel="time since the first pose [s]", ylabel=f"NIS, means of {means[0].group}" if means[0].group > 1 else "NIS"
         )
-        _plain_logs(axes)
+        plain_logs(axes)
 
     return _svg(f"nis-{size.name}", size.width_in, 2.6, draw)
 
@@ -209,7 +209,7 @@ def _dashes(line: Line) -> tuple[float, ...]:
     return line.dashes or (1.0, 0.0)
 
 
-def _plain_logs(axes: Axes) -> None:
+def plain_logs(axes: Axes) -> None:
     """Powers of ten as people write them, and 2 and 5 between them where there are few."""
     plain = FuncFormatter(lambda value, _: f"{value:,.0f}" if value >= 1 else f"{value:g}")
     between = FuncFormatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")

@@ -190,6 +190,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         axes.set_xlim(*panel.x_range)
     if panel.y_range is not None:
         axes.set_ylim(*panel.y_range)
+    plots.plain_logs(axes)
     if panel.legend is not None and any(s.label for s in panel.series):
         axes.legend(fontsize=8.0, frameon=True, framealpha=0.8, edgecolor="none", handlelength=2.2, loc=panel.legend)
 
