@@ -34,7 +34,7 @@ def test_every_rotation_is_measured_within_its_stated_sigma(measured):
     assert z.shape == (68, 3)
     assert np.sqrt(np.mean(z**2, axis=0)).max() < 1.3
     # and the sigmas are small enough to mean something: k and CoR vary by 0.38 and 0.38 m over the grid
-    assert simulated_grid.sigmas(measured).mean(axis=0) == pytest.approx([0.001, 0.006, 0.006], rel=0.5)
+    assert (simulated_grid.sigmas(measured).mean(axis=0) < [0.001, 0.004, 0.004]).all()
 
 
 def test_what_separates_the_closed_model_from_the_vehicle_is_less_than_a_percent(measured):

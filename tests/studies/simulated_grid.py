@@ -93,6 +93,7 @@ def _measure(run: RunRecord, window: _Window, mount: Mount) -> Rotation:
     matcher, pose, mapped = LidarMatcher(), np.zeros(3), 0.0
     step = np.zeros(3)
     poses, covs, stamps = [], [], []
+    drawn = np.zeros((3, 3))  # of the map: what is drawn farther on has the errors of all scans from which it was drawn
     for number, scan in enumerate(window.scans):
         points = body_points(scan, mount, step * 12.5)
         found = matcher.register(points, True, se2.compose(pose, se2.exp(step)), np.diag([1e-3, 1e-3, 1e-3]))
@@ -101,12 +102,14 @@ def _measure(run: RunRecord, window: _Window, mount: Mount) -> Rotation:
             pose = found.pose
             if scan.stamp_ns >= begin:
                 poses.append(pose)
-                covs.append(found.cov)
+                covs.append(found.cov + drawn)
                 stamps.append(scan.stamp_ns)
             step = se2.log(se2.between(before, pose)) if number > 1 else np.zeros(3)
         if number < 6 or abs(pose[2] - mapped) > _MAPPED_RAD:
             matcher.insert(pose)
             mapped = pose[2]
+            if found is not None and number >= 6:
+                drawn = drawn + found.cov
     track, cov = np.array(poses), np.array(covs)
 
     # k: turned angle over what the wheels turned
