@@ -17,8 +17,13 @@ generalised ufuncs (`_exp` and so on), which numpy broadcasts: a single pose cos
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import math
-from collections.abc import Callable
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -35,7 +40,23 @@ def _gufunc(layout: str) -> Callable[[Callable[..., None]], Callable[..., Any]]:
     """A compiled function of pose-like arguments, the last of which is its result, that broadcasts over leading axes."""
     signature = "void(" + ", ".join("float64" + "[:" + ",:" * part.count(",") + "]" for part in _parts(layout)) + ")"
     decorate: Callable[..., Any] = numba.guvectorize([signature], layout, nopython=True, cache=True)  # type: ignore[no-untyped-call]
-    return lambda function: decorate(function).ufunc  # numpy's own object: without numba's Python wrapper around each call
+
+    def compiled(function: Callable[..., None]) -> Any:
+        with _one_process_at_a_time():
+            return decorate(function).ufunc  # numpy's own object: without numba's Python wrapper around each call
+
+    return compiled
+
+
+@contextlib.contextmanager
+def _one_process_at_a_time() -> Iterator[None]:
+    """Numba caches a gufunc in two files that name each other. Two processes that compile it at the same time leave one file of each, and
+    whoever loads these crashes."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # no place for a lock is no reason not to work
+            lock = stack.enter_context((Path(tempfile.gettempdir()) / f"skidloc-{os.getuid()}.lock").open("a"))
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
 
 
 def _parts(layout: str) -> list[str]:

@@ -4,6 +4,10 @@ The second way to every number is the matrix group: `scipy.linalg.expm` of the 3
 """
 
 import math
+import os
+import shutil
+import subprocess
+import sys
 from fractions import Fraction
 from functools import partial
 from math import factorial
@@ -205,3 +209,15 @@ def test_inputs_are_left_alone(a, b):
     se2.compose(a, b), se2.interpolate(a, b, 0.3), se2.log(a), se2.exp(a), se2.right_jacobian(a), se2.transform(a, b[:2])
     assert np.array_equal(a, before[0])
     assert np.array_equal(b, before[1])
+
+
+def test_processes_that_compile_at_the_same_time_leave_what_others_can_load(tmp_path):
+    """Without a lock, two in three such starts end with a crash, and so does every later one."""
+    shutil.copy(se2.__file__, tmp_path / "se2.py")
+    code = "import numpy as np, se2; print(se2.compose(np.ones(3), np.ones(3)).tolist(), se2.log(np.ones(3)).tolist())"
+    command, environment = [sys.executable, "-c", code], {**os.environ, "PYTHONPATH": str(tmp_path)}
+    first = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    told = [process.communicate(timeout=120)[0] for process in first]
+    told.append(subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, timeout=120, check=False).stdout)
+    expected = f"{se2.compose(np.ones(3), np.ones(3)).tolist()} {se2.log(np.ones(3)).tolist()}\n"
+    assert told == [expected] * 4
