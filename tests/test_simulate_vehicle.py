@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from localization.errors import SimulationError
@@ -50,6 +50,7 @@ def drive(wheels, seconds, cg=(0.0, 0.0), body=BODY, config=CONFIG, twist=(0, 0,
 
 
 @given(st.integers(0, 10**6))
+@example(64649)  # converges slowly
 @settings(max_examples=200, deadline=None)
 def test_once_its_tyres_have_given_way_its_accelerations_are_those_of_the_rigid_friction_dynamics(seed):
     rng = np.random.default_rng(seed)
@@ -58,9 +59,11 @@ def test_once_its_tyres_have_given_way_its_accelerations_are_those_of_the_rigid_
     if margin < 0.02:
         return  # clipped loads: a rigid robot's are fiction
     tilt = cg / [0.26, 0.28]
-    for _ in range(400):
+    for _ in range(4000):
         found, asked = accelerations(BODY, CONFIG, wheels, twist, cg, tilt)
         tilt = tilt + 0.2 * (asked - tilt)
+        if np.abs(asked - tilt).max() < 1e-13:
+            break
     assert np.abs(asked - tilt).max() < 1e-12
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
     assert 1 - np.abs(tilt).max() == pytest.approx(margin, abs=1e-9)
