@@ -18,7 +18,6 @@ import math
 import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,6 +39,7 @@ from rosbags.typesys.stores.ros2_humble import std_msgs__msg__Header as Header
 from rosbags.typesys.stores.ros2_humble import tf2_msgs__msg__TFMessage as TFMessage
 
 from localization.errors import OutputError
+from localization.logs.output import output_errors, refuse_existing
 from motion_models.se2 import FloatArray
 
 UNKNOWN_VARIANCE = 1e6
@@ -87,14 +87,14 @@ def write_fused(path: str | Path, results: Mapping[str, Iterable[FusedEstimate]]
     tf_of = _checked_names(results, tf_of)
     if path.suffix != ".mcap":
         raise OutputError(f"output '{path}': the fused log is an MCAP file; give it a name that ends in .mcap.")
-    _refuse_existing(path)
-    with _output_errors(path):
+    refuse_existing(path)
+    with output_errors(path):
         folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=".fused-")
     try:
         bag = Path(folder.name) / path.stem  # rosbags writes folders; the file in it, named alike, is what we are after
         _write_bag(bag, path, results, tf_of)
-        _refuse_existing(path)
-        with _output_errors(path):
+        refuse_existing(path)
+        with output_errors(path):
             (bag / path.name).replace(path)
     finally:
         folder.cleanup()
@@ -103,8 +103,8 @@ def write_fused(path: str | Path, results: Mapping[str, Iterable[FusedEstimate]]
 def _write_bag(bag: Path, path: Path, results: Mapping[str, Iterable[FusedEstimate]], tf_of: str) -> None:
     writer = Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP)
     writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-    # Only the writing is inside `_output_errors`: what a lazy result raises while it is computed passes as it is.
-    with _output_errors(path):
+    # Only the writing is inside `output_errors`: what a lazy result raises while it is computed passes as it is.
+    with output_errors(path):
         writer.open()
     try:
         connections = {name: writer.add_connection(f"/{name}/odometry", _ODOMETRY, typestore=_STORE) for name in results}
@@ -115,12 +115,12 @@ def _write_bag(bag: Path, path: Path, results: Mapping[str, Iterable[FusedEstima
             messages = [(connections[name], _STORE.serialize_cdr(odometry_message(estimate), _ODOMETRY))]
             if name == tf_of:
                 messages.append((tf, _STORE.serialize_cdr(transform_message(estimate), _TF)))
-            with _output_errors(path):
+            with output_errors(path):
                 for connection, data in messages:
                     writer.write(connection, estimate.stamp_ns, data)
         if not count:
             raise OutputError(f"output '{path}': there is nothing to write: no estimates in {', '.join(results)}.")
-        with _output_errors(path):
+        with output_errors(path):
             writer.close()
     except BaseException:
         writer.abort()
@@ -224,16 +224,3 @@ def _checked_names(results: Mapping[str, Iterable[FusedEstimate]], tf_of: str | 
     if tf_of not in results:
         raise OutputError(f"no result '{tf_of}' for /tf; there are {', '.join(results)}.")
     return tf_of
-
-
-def _refuse_existing(path: Path) -> None:
-    if path.exists() or path.is_symlink():
-        raise OutputError(f"output '{path}' exists already; nothing is overwritten. Remove it or choose another name.")
-
-
-@contextmanager
-def _output_errors(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(f"output '{path}' cannot be written: {error.strerror or error}.") from error

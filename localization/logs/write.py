@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from rosbags import rosbag1, rosbag2
 
-from localization.errors import OutputError
 from localization.logs.forms import STORE, STORE_ROS1, Form, Message, Template
+from localization.logs.output import output_errors, refuse_existing, unwritable
 
 _LATCHED_TOPIC = "/tf_static"
 
@@ -23,16 +22,16 @@ def write_bag(path: str | Path, messages: Iterable[Message], on_message: Callabl
     number. Raises `OutputError`, and leaves nothing behind, where ``path`` exists or cannot be written; what ``messages`` raises passes.
     """
     path = Path(path)
-    _refuse_existing(path)
-    with _output_errors(path):
+    refuse_existing(path)
+    with output_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=".writing-")
     try:
         # rosbags names the file in a ROS 2 folder after the folder: the name must be right from the start.
         inner = Path(folder.name) / (path.stem if path.suffix == ".mcap" else path.name)
         count = _write(inner, path, messages, on_message)
-        _refuse_existing(path)
-        with _output_errors(path):
+        refuse_existing(path)
+        with output_errors(path):
             (inner / path.name if path.suffix == ".mcap" else inner).replace(path)
     finally:
         folder.cleanup()
@@ -47,8 +46,8 @@ def _write(inner: Path, path: Path, messages: Iterable[Message], on_message: Cal
     else:
         plugin = rosbag2.StoragePlugin.MCAP if path.suffix == ".mcap" else rosbag2.StoragePlugin.SQLITE3
         writer = rosbag2.Writer(inner, version=9, storage_plugin=plugin)
-    # Only the writing is inside `_output_errors`: what a simulation raises meanwhile passes as it is.
-    with _output_errors(path):
+    # Only the writing is inside `output_errors`: what a simulation raises meanwhile passes as it is.
+    with output_errors(path):
         writer.open()
     try:
         connections: dict[str, Any] = {}
@@ -60,17 +59,17 @@ def _write(inner: Path, path: Path, messages: Iterable[Message], on_message: Cal
             if known is None:
                 known = templates[id(form)] = (form, Template(form, is_ros1=is_ros1))
                 if form.topic not in connections:
-                    with _output_errors(path):
+                    with output_errors(path):
                         connections[form.topic] = _connect(writer, form, is_ros1)
             data = known[1].fill(message)
             try:
                 writer.write(connections[form.topic], message.log_ns, data)
             except OSError as error:
-                raise _unwritable(path, error) from error
+                raise unwritable(path, error) from error
             count += 1
             if on_message is not None:
                 on_message(message.log_ns)
-        with _output_errors(path):
+        with output_errors(path):
             writer.close()
     except BaseException:
         writer.abort()
@@ -83,20 +82,3 @@ def _connect(writer: Any, form: Form, is_ros1: bool) -> Any:
         latched = 1 if form.topic == _LATCHED_TOPIC else None
         return writer.add_connection(form.topic, form.type, typestore=STORE_ROS1, latching=latched)
     return writer.add_connection(form.topic, form.type, typestore=STORE)
-
-
-def _refuse_existing(path: Path) -> None:
-    if path.exists() or path.is_symlink():
-        raise OutputError(f"output '{path}' exists already; nothing is overwritten. Remove it or choose another name.")
-
-
-def _unwritable(path: Path, error: OSError) -> OutputError:
-    return OutputError(f"output '{path}' cannot be written: {error.strerror or error}.")
-
-
-@contextmanager
-def _output_errors(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise _unwritable(path, error) from error
