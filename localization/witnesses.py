@@ -214,7 +214,7 @@ class ReferenceWitness:
     def __init__(self, track: ReferenceTrack, window_s: float, sigma_m: float = 0.02, sigma_rad: float = 0.01) -> None:
         """Raises `EvaluationError` for a reference of positions only."""
         self._track = Trajectory(track.stamps_ns, track.poses)
-        self._source, self._notes = track.source, track.notes
+        self._notes = track.notes
         self._window_ns = round(window_s / _NS)
         # Of the motion between two poses that err independently.
         self._cov = 2.0 * np.diag([sigma_m**2, sigma_m**2, sigma_rad**2])

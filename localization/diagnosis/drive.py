@@ -243,17 +243,3 @@ def _payload_arms(robot: Robot, maneuvers: Sequence[Maneuver], postures: _Postur
             known[key] = (estimate.position - unique[i]) * estimate.mass
         levers[i] = known[key]
     return np.asarray(levers[np.ravel(inverse)])
-
-
-def shortened(drive: Drive, keep: IntArray) -> Drive:
-    """The drive's maneuvers of indices ``keep`` alone."""
-    firsts = np.concatenate([[0], np.cumsum([len(m.dt) for m in drive.maneuvers])])
-    rows = np.concatenate([np.arange(firsts[i], firsts[i + 1]) for i in keep]) if len(keep) else np.zeros(0, dtype=int)
-    return dataclasses.replace(
-        drive,
-        maneuvers=tuple(drive.maneuvers[i] for i in keep),
-        starts_s=drive.starts_s[keep],
-        spans_ns=drive.spans_ns[keep] if len(drive.spans_ns) else drive.spans_ns,
-        forces=None if drive.forces is None else drive.forces[keep],
-        payload_arms=drive.payload_arms[rows],
-    )

@@ -57,8 +57,6 @@ class Effect:
     one_sided: bool = False
     is_clock: bool = False
     """It shifts samples in time, between which rates have kinks: signatures are differenced to both sides, over a larger step."""
-    is_floor: bool = False
-    """It acts through friction, and needs the friction model."""
     at_s: float | None = None
     """For a change: when."""
 
@@ -99,14 +97,10 @@ _ALL = (
         0.001,
         _radii(0.5, -0.5),
     ),
-    Effect(
-        "track_width", "m", "the left and right contacts are farther apart by this", 0.03, 0.003, _friction("track_width"), is_floor=True
-    ),
-    Effect(
-        "payload", "kg", "the robot carries a mass that it does not know of", 8.0, 1.0, _plain("payload_kg"), one_sided=True, is_floor=True
-    ),
-    Effect("cg_offset_x", "m", "the centre of gravity lies farther ahead than told", 0.03, 0.003, _item("cg", 0), is_floor=True),
-    Effect("cg_offset_y", "m", "the centre of gravity lies farther left than told", 0.02, 0.003, _item("cg", 1), is_floor=True),
+    Effect("track_width", "m", "the left and right contacts are farther apart by this", 0.03, 0.003, _friction("track_width")),
+    Effect("payload", "kg", "the robot carries a mass that it does not know of", 8.0, 1.0, _plain("payload_kg"), one_sided=True),
+    Effect("cg_offset_x", "m", "the centre of gravity lies farther ahead than told", 0.03, 0.003, _item("cg", 0)),
+    Effect("cg_offset_y", "m", "the centre of gravity lies farther left than told", 0.02, 0.003, _item("cg", 1)),
     Effect("lidar_offset_x", "m", "the tracked sensor sits farther ahead than its transform says", 0.05, 0.005, _item("lidar", 0)),
     Effect("lidar_offset_y", "m", "the tracked sensor sits farther left than its transform says", 0.05, 0.005, _item("lidar", 1)),
     Effect("lidar_yaw", "rad", "the tracked sensor is turned to the left against its transform", 0.03, 0.003, _item("lidar", 2)),
@@ -119,7 +113,6 @@ _ALL = (
         0.2,
         0.03,
         _friction("mu_ratio"),
-        is_floor=True,
     ),
     Effect(
         "diagonal_load",
@@ -128,9 +121,8 @@ _ALL = (
         0.15,
         0.02,
         _friction("warp"),
-        is_floor=True,
     ),
-    Effect("tread_asymmetry", "1", "wheels that slide to the left grip more by this share", 0.15, 0.02, _friction("tread"), is_floor=True),
+    Effect("tread_asymmetry", "1", "wheels that slide to the left grip more by this share", 0.15, 0.02, _friction("tread")),
     Effect(
         "rolling_resistance",
         "1",
@@ -138,10 +130,9 @@ _ALL = (
         0.03,
         0.004,
         _friction("rolling_resistance"),
-        is_floor=True,
     ),
-    Effect("scrub", "m", "the contact patches oppose any turn by this moment, over mu m g", 0.02, 0.002, _friction("scrub"), is_floor=True),
-    Effect("slope", "rad", "the floor rises along the drive's first heading", 0.05, 0.005, _item("slope", 0), is_floor=True),
+    Effect("scrub", "m", "the contact patches oppose any turn by this moment, over mu m g", 0.02, 0.002, _friction("scrub")),
+    Effect("slope", "rad", "the floor rises along the drive's first heading", 0.05, 0.005, _item("slope", 0)),
     Effect("encoder_dropout", "1", "share of time in which an encoder loses its counts", 0.1, 0.01, _plain("encoder_lost"), one_sided=True),
     Effect("gyro_bias", "rad/s", "the gyro turns while nothing does", 0.02, 0.0075, _plain("gyro_bias")),
     Effect("lateral_slip_speed", "s", "the robot slides sideways in curves: vy += s vx wz", 0.05, 0.005, _item("yields", 0)),
@@ -158,9 +149,7 @@ def friction_change(at_s: float) -> Effect:
     def inject(b: Belief, s: float) -> Belief:
         return dataclasses.replace(b, change=b.change + s, change_s=at_s)
 
-    return Effect(
-        "friction_change", "1", f"sideways grip is more by this share from {at_s:.0f} s on", 0.3, 0.04, inject, is_floor=True, at_s=at_s
-    )
+    return Effect("friction_change", "1", f"sideways grip is more by this share from {at_s:.0f} s on", 0.3, 0.04, inject, at_s=at_s)
 
 
 EXTRA: Mapping[str, Effect] = {
@@ -190,6 +179,4 @@ EXTRA: Mapping[str, Effect] = {
 
 def slope_across() -> Effect:
     """The floor rises to the left of the drive's first heading."""
-    return Effect(
-        "slope", "rad", "the floor rises to the left of the drive's first heading", 0.05, 0.005, _item("slope", 1), is_floor=True, at_s=-1.0
-    )
+    return Effect("slope", "rad", "the floor rises to the left of the drive's first heading", 0.05, 0.005, _item("slope", 1), at_s=-1.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass, field
 
@@ -240,8 +239,3 @@ def with_sizes(sizes: dict[Effect, float]) -> Belief:
     for effect, size in sizes.items():
         belief = effect.inject(belief, size)
     return belief
-
-
-def replaced(pipeline: Pipeline, **changes: object) -> Pipeline:
-    """The same pipeline with other fields."""
-    return dataclasses.replace(pipeline, **changes)  # type: ignore[arg-type]
