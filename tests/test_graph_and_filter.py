@@ -10,6 +10,8 @@ import pytest
 
 from localization.consistency import mean_band
 from localization.estimators.ekf import EkfConfig
+from localization.lidar import Revisit
+from localization.lidar.track import Place, moved
 from localization.logs import open_log
 from localization.run import Pair, replay
 from motion_models import se2
@@ -21,6 +23,7 @@ from tests.synthetic_steps import DT, Noise, Seer, World
 
 DATA = Path(__file__).parent / "data"
 LEVELS = (0.3, 1.0, 2.0, 4.0)
+SURE = np.diag([0.01, 0.01, 0.002]) ** 2
 
 
 def apart(a, covariance_a, b):
@@ -184,3 +187,50 @@ def test_gentle_arcs_do_not_teach_what_was_measured_on_turns(kind):
         sigmas[turning] = estimator.parameters()["k_0"][1] / estimator._corrected.sigmas[0]
     assert sigmas[0.2] > 0.99
     assert sigmas[2.5] < 0.7
+
+
+class Remembering(Seer):
+    """A witness that says once, at its ``at``-th look, that the place is the one of the beginning, off from where it is believed to be."""
+
+    OFF = np.array([0.3, -0.2, 0.02])
+
+    def __init__(self, at):
+        super().__init__()
+        self.at, self.n, self.then, self.told, self.known, self.kept = at, 0, None, [], None, []
+
+    def recall(self, step, pose, cov):
+        self.n += 1
+        if self.then is None:
+            self.then = Place(step.end_ns, 0.0, pose.copy(), cov.copy())
+        if self.n != self.at:
+            return None
+        old_cov = moved(self.then, pose)
+        growth = cov - old_cov + 0.5**2 * np.eye(3)  # some more drift than the way could have: the place is to be believed
+        self.known = Revisit(se2.compose(pose, se2.exp(self.OFF)), SURE, old_cov, growth, 0.5**2 * np.eye(3), self.then, 1.0)
+        return self.known
+
+    def correct(self, before, after):
+        self.told.append((self.n, before.copy(), after.copy()))
+
+    def remember(self, step, pose):
+        self.kept.append((self.n, pose.copy()))
+
+
+@pytest.mark.parametrize(("kind", "config"), [("ekf", {}), *(("graph", {"backend": b}) for b in ("fixed_lag", "batch", "isam2"))])
+def test_a_place_seen_again_moves_the_robot_and_what_it_drew_of_late(kind, config):
+    """The map is told of exactly the step that the pose made, before the scan enters it; and the pose goes where the old map has it."""
+    seer = Remembering(at=25)
+    estimator = make(kind, seer, **config)
+    estimates, _ = run(estimator, seer, seed=3, steps=40)
+    ((n, before, after),) = seer.told
+    assert n == 25
+    np.testing.assert_allclose(dict(seer.kept)[25], after, atol=1e-12)
+    gone = se2.log(se2.between(before, after))
+    if config.get("backend") == "isam2":
+        # it closes the loop over the whole way, whose drift it knows to be small: it goes some of the way, and no farther
+        assert gone @ Remembering.OFF > 0.0
+        assert np.linalg.norm(gone) < np.linalg.norm(Remembering.OFF)
+    else:
+        np.testing.assert_allclose(gone, Remembering.OFF, atol=0.01)
+    assert estimator.counts()["revisits"] == 1
+    assert all(np.linalg.eigvalsh(e.covariance).min() > 0.0 for e in estimates)

@@ -317,8 +317,8 @@ class GraphFusion:
 
         The window keeps no node of that time, only the covariance of the old map: see there for what follows from it.
         """
-        node = self._now
-        known = self._witness.recall(step, self._believed(node), node.covariance[:3, :3])
+        node, believed = self._now, self._believed(self._now)
+        known = self._witness.recall(step, believed, node.covariance[:3, :3])
         if known is None:
             return
         self._counts["revisits"] += 1
@@ -327,11 +327,9 @@ class GraphFusion:
             if a is not None and b is not None and a != b:
                 motion = se2.between(known.then.pose, known.pose)
                 self._close(Closure(a, b, motion, whitening(known.cov + 1e-12 * np.eye(3))))
-            if self.config.backend == "isam2":
-                return
-        believed = self._believed(node)
-        self._window.restart(revisited(node, known, believed))
-        self._newest = self._now = self._window.newest
+        if self.config.backend != "isam2":  # which has taken the closure in already
+            self._window.restart(revisited(node, known, believed))
+            self._newest = self._now = self._window.newest
         self._witness.correct(believed, self._believed(self._now))
 
     def _twist(self, step: Step, link: Link, ahead: Ahead, before: Node, alone: bool) -> tuple[FloatArray, FloatArray | None]:
