@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from localization.errors import EstimatorError
 from localization.estimators.revisit_update import revisit_update
 from localization.gyro import Turn
-from localization.lidar import Revisit
+from localization.lidar import MapTie, Revisit
 from localization.residuals import motion_residual, turn_residual
 from localization.steps import Step
 from motion_models import se2
@@ -24,10 +24,11 @@ from motion_models.corrections import Corrections
 from motion_models.robot import GyroNoise
 from motion_models.se2 import FloatArray
 
-# Error state: the pose now, at the start of this step, and at the last scan (stochastic cloning); then what is learned on the way:
-# the gyro's bias, the wheels' clock, and from PARAMS on the corrections of the motion model's parameters.
-POSE, START, ANCHOR = slice(0, 3), slice(3, 6), slice(6, 9)
-BIAS, CLOCK, PARAMS = 9, 10, 11
+# Error state: the pose now, at the start of this step, and at the last scan (stochastic cloning); the map, as its error at the pose of the
+# last scan; then what is learned on the way: the gyro's bias, the wheels' clock, and from PARAMS on the corrections of the motion model's
+# parameters.
+POSE, START, ANCHOR, MAP = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+BIAS, CLOCK, PARAMS = 12, 13, 14
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class Ekf:
 
     @property
     def covariance(self) -> FloatArray:
-        """(11 + k, 11 + k) of the error state, k corrections."""
+        """(14 + k, 14 + k) of the error state, k corrections."""
         return np.asarray(self._filter.P)
 
     @property
@@ -142,15 +143,17 @@ class Ekf:
         H[:, START], H[:, POSE] = -d_pose @ se2.adjoint(se2.inverse(self._since_start)), d_pose
         return self._update(error, H, still)
 
-    def measure_motion(self, measured: Motion, can_slip: bool) -> float:
+    def measure_motion(self, measured: Motion, can_slip: bool, tie: MapTie | None = None) -> float:
         """The LiDAR's motion since the last scan.
 
         Where it contradicts the prediction, one of the two is wrong. ``can_slip``: the LiDAR is sure of itself, so the wheels slipped, and
-        the prediction's covariance grows until both agree; else the LiDAR is, and its measurement's grows.
+        the prediction's covariance grows until both agree; else the LiDAR is, and its measurement's grows. ``tie``: the map by which it
+        was measured, whose errors later scans share; None if they do not.
         """
+        self._meet(tie)
         error, _, d_pose = motion_residual(self._anchor, self.pose, measured.delta)
         H = np.zeros((3, self._size))
-        H[:, ANCHOR], H[:, POSE] = -d_pose @ se2.adjoint(se2.inverse(self._since_anchor)), d_pose
+        H[:, MAP], H[:, POSE] = -d_pose @ se2.adjoint(se2.inverse(self._since_anchor)), d_pose
         R = d_pose @ measured.cov @ d_pose.T
         S = H @ self._filter.P @ H.T + R
         _check("the motion that the LiDAR measured", error, S)
@@ -164,11 +167,23 @@ class Ekf:
         self._update(error, H, R)
         return nis
 
+    def _meet(self, tie: MapTie | None) -> None:
+        """The map as the scan now meets it: in part what the scan before met, in part what that one added, drawn from its pose."""
+        A = se2.adjoint(self._since_anchor)
+        kept = np.zeros((3, 3)) if tie is None else A @ tie.kept @ se2.adjoint(se2.inverse(self._since_anchor))
+        G = np.eye(self._size)
+        G[MAP, MAP], G[MAP, ANCHOR] = kept, np.eye(3) - kept
+        P = G @ self._filter.P @ G.T
+        if tie is not None:
+            P[MAP, MAP] += A @ tie.fresh @ A.T
+        self._filter.P = P
+
     def measure_revisit(self, known: Revisit) -> None:
-        """A place seen again (`revisit_update`). START and ANCHOR move with the pose as one rigid body: the way since then stays."""
+        """A place seen again (`revisit_update`). START, ANCHOR and MAP move with the pose as one rigid body: the way since then stays."""
         start_T_now, anchor_T_now = se2.between(self._start, self.pose), se2.between(self._anchor, self.pose)
         tied = np.zeros((self._size, 3))
         tied[POSE], tied[START], tied[ANCHOR] = np.eye(3), se2.adjoint(start_T_now), se2.adjoint(anchor_T_now)
+        tied[MAP] = tied[ANCHOR]
         shift, self._filter.P = revisit_update(self.covariance, POSE, tied, known, self.pose)
         self.pose = se2.compose(self.pose, se2.exp(shift))
         self._start = se2.compose(self.pose, se2.inverse(start_T_now))
@@ -178,6 +193,7 @@ class Ekf:
         """From here on, the LiDAR measures from the pose as it is now."""
         G = np.eye(self._size)
         G[ANCHOR, ANCHOR], G[ANCHOR, POSE] = np.zeros((3, 3)), np.eye(3)
+        G[MAP, MAP] = se2.adjoint(se2.inverse(self._since_anchor))
         self._filter.P = G @ self._filter.P @ G.T
         self._anchor, self._since_anchor = self.pose, np.zeros(3)
 
@@ -190,6 +206,8 @@ class Ekf:
                 _check("a measurement", error, H @ before @ H.T + R)
                 f.update(np.zeros((len(error), 1)), lambda x: H, lambda x: error[:, None], R=R)
                 f.P = 0.5 * (f.P + f.P.T)
+                # the map stays as it is drawn, so its error stays too (Schmidt, "Application of state-space methods", 1966)
+                f.P[MAP, MAP] = before[MAP, MAP]
             _check("a measurement", f.x, f.P)
         except np.linalg.LinAlgError as singular:
             raise EstimatorError(_CERTAIN) from singular

@@ -77,7 +77,7 @@ class EkfFusion:
         seen = witness.look(step, ekf.anchor, ekf.pose)
         if seen is not None:
             self._counts["matched"] += 1
-            nis = ekf.measure_motion(seen.motion, seen.is_trusted)
+            nis = ekf.measure_motion(seen.motion, seen.is_trusted, seen.tie)
             self._counts["contradictions"] += nis > ekf.gate
             if (known := witness.recall(step, ekf.pose, ekf.covariance[POSE, POSE])) is not None:
                 self._counts["revisits"] += 1

@@ -278,6 +278,8 @@ class GraphFusion:
         if seen is not None:
             check_motion(seen.motion.delta, seen.motion.cov, f"the LiDAR's motion that ends at {step.end_ns} ns")
             self._counts["matched"] += 1
+            if seen.tie is not None:  # nodes do not know of the map, so its errors count anew with each scan
+                seen = replace(seen, motion=replace(seen.motion, cov=seen.motion.cov + seen.tie.cov))
         return seen
 
     def _believed(self, node: Node) -> FloatArray:

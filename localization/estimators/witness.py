@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from localization.estimators.base import NO_POINTS
-from localization.lidar import LidarConfig, LidarMatcher, Revisit, ScanCheck, Slip, Sweep
+from localization.lidar import LidarConfig, LidarMatcher, MapTie, Revisit, ScanCheck, Slip, Sweep
 from localization.steps import Step
 from motion_models import se2
 from motion_models.base import Motion
@@ -28,6 +28,8 @@ class Sight:
     motion: Motion
     is_trusted: bool
     """The witness is sure of itself: where others contradict it, they are wrong."""
+    tie: MapTie | None = None
+    """The map by which it was measured, whose errors are not in the motion's covariance; None where there is none."""
 
 
 class Witness(Protocol):
@@ -82,7 +84,7 @@ class ScanWitness:
             slip.measure(off / step.duration, np.diag(found.cov) / step.duration**2)
             if sweep.shift(slip.rate - rate) > self._matcher.config.max_shift_m:  # the sweep looked otherwise than was thought
                 found = self._matcher.refine(sweep.at_stamp(step.twist + slip.rate), sweep.is_planar, found.pose) or found
-        return Sight(Motion(se2.between(anchor, found.pose), found.cov), found.is_trusted)
+        return Sight(Motion(se2.between(anchor, found.pose), found.cov - found.tie.cov), found.is_trusted, found.tie)
 
     def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
         return self._matcher.recall(pose, cov, step.end_ns)

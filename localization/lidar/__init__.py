@@ -1,7 +1,7 @@
 """LiDAR scan matching: KISS-ICP finds the pose, point-to-line steps refine it and say how sure it is."""
 
 from localization.lidar.check import ScanCheck
-from localization.lidar.matcher import LidarConfig, LidarMatcher, Registration
+from localization.lidar.matcher import LidarConfig, LidarMatcher, MapTie, Registration
 from localization.lidar.odometry import LidarOdometry
 from localization.lidar.revisit import Revisit, RevisitConfig
 from localization.lidar.slip import Slip
@@ -11,6 +11,7 @@ __all__ = [
     "LidarConfig",
     "LidarMatcher",
     "LidarOdometry",
+    "MapTie",
     "Registration",
     "Revisit",
     "RevisitConfig",

@@ -29,11 +29,12 @@ def _line(
     cell: float,
     radius: float,
     most_thin: float,
-) -> tuple[int, float, float, float, float, float]:  # pragma: no cover
+    since: float,
+) -> tuple[int, float, float, float, float, float, float]:  # pragma: no cover
     """The line of the points around (x, y): how many they are, 0 where they make none; its normal, the distance of (x, y) from it along
-    the normal, the points' variance across it, and their mean travelled distance."""
+    the normal, the points' variance across it, their mean travelled distance, and the part of them that came ``since``."""
     ix, iy = math.floor(x / cell), math.floor(y / cell)
-    m, sx, sy, sxx, sxy, syy, st = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    m, new, sx, sy, sxx, sxy, syy, st = 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for jx in range(ix - 1, ix + 2):
         for jy in range(iy - 1, iy + 2):
             slot = find_cell(cells, jx, jy)
@@ -46,17 +47,18 @@ def _line(
                     sx, sy = sx + qx, sy + qy
                     sxx, sxy, syy = sxx + qx * qx, sxy + qx * qy, syy + qy * qy
                     st += travels[slot, k]
+                    new += travels[slot, k] >= since
     if m < _MIN_NEIGHBOURS:
-        return 0, 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     mx, my = sx / m, sy / m
     cxx, cxy, cyy = sxx / m - mx * mx, sxy / m - mx * my, syy / m - my * my
     trace, split = cxx + cyy, math.hypot(cxx - cyy, 2.0 * cxy)
     wide, thin = 0.5 * (trace + split), max(0.5 * (trace - split), 0.0)
     if wide < 1e-4 or thin > min(_MAX_LINE_RATIO * wide, most_thin):
-        return 0, 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
     nx, ny = -math.sin(angle), math.cos(angle)
-    return m, nx, ny, -(nx * mx + ny * my), thin, st / m
+    return m, nx, ny, -(nx * mx + ny * my), thin, st / m, new / m
 
 
 @numba.njit(cache=True)
@@ -77,7 +79,7 @@ def compare_points(
     for i in range(source.shape[0]):
         x = pose[0] + c * source[i, 0] - s * source[i, 1]
         y = pose[1] + s * source[i, 0] + c * source[i, 1]
-        m, _, _, e, _, travel = _line(cells, points, travels, ages, x, y, cell, radius, most_thin)
+        m, _, _, e, _, travel, _ = _line(cells, points, travels, ages, x, y, cell, radius, most_thin, math.inf)
         errors[i], seen[i] = (abs(e), travel) if m else (math.nan, math.nan)
 
 
@@ -93,24 +95,27 @@ def _associate(
     cell: float,
     radius: float,
     most_thin: float,
+    since: float,
     home: NDArray[np.int64],
     lines: FloatArray,
 ) -> None:  # pragma: no cover
-    """Fills ``lines`` (N, 7) for the points ``source`` (N, 2) at ``pose``: how many points make the line (0: none), its normal, a point on
-    it, the variance of its place, and how many of ``source`` are in its cell, ``home`` (N,), below 0 where the map has none."""
+    """Fills ``lines`` (N, 8) for the points ``source`` (N, 2) at ``pose``: how many points make the line (0: none), its normal, a point on
+    it, the variance of its place, how many of ``source`` are in its cell, ``home`` (N,), below 0 where the map has none, and the part of
+    the line's points that came ``since``."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     last_x, last_y, near = math.inf, math.inf, (_SAME * radius) ** 2
     for i in range(source.shape[0]):
         x = pose[0] + c * source[i, 0] - s * source[i, 1]
         y = pose[1] + s * source[i, 0] + c * source[i, 1]
         if (x - last_x) ** 2 + (y - last_y) ** 2 < near:  # beside the point before, as beams are: it meets the same line
-            lines[i, :6] = lines[i - 1, :6]
+            lines[i] = lines[i - 1]
         else:
             last_x, last_y = x, y
-            m, nx, ny, e, thin, _ = _line(cells, points, travels, ages, x, y, cell, radius, most_thin)
+            m, nx, ny, e, thin, _, new = _line(cells, points, travels, ages, x, y, cell, radius, most_thin, since)
             lines[i, 0] = m
             if m:
                 lines[i, 1], lines[i, 2], lines[i, 3], lines[i, 4], lines[i, 5] = nx, ny, x - e * nx, y - e * ny, thin / m
+                lines[i, 7] = new
         home[i] = find_cell(cells, math.floor(x / cell), math.floor(y / cell))
         if home[i] >= 0:
             hits[home[i]] += 1
@@ -182,22 +187,25 @@ def fit_points(
     iterations: int,
     prior: FloatArray,
     center: FloatArray,
+    since: float,
     H: FloatArray,
     g: FloatArray,
     spread: FloatArray,
-) -> tuple[int, int, float]:  # pragma: no cover
-    """Changes ``pose``, ``H`` and ``g`` in place; returns the matched points, those on their lines, and the weighted sum of squares.
+    old: FloatArray,
+) -> tuple[int, int, float, float]:  # pragma: no cover
+    """Changes ``pose``, ``H`` and ``g`` in place; returns the matched points, those on their lines, the weighted sum of squares, and what
+    `_old_part` says.
 
     Lines are looked up again where the points have moved by a part of the neighbourhood since they were: near the end, they stay.
     """
     most_thin = (_MAX_SIGMAS * sigma_point) ** 2
-    home, lines = np.empty(source.shape[0], np.int64), np.empty((source.shape[0], 7))
+    home, lines = np.empty(source.shape[0], np.int64), np.empty((source.shape[0], 8))
     reach, moved, n_matched, squares = 0.0, math.inf, 0, 0.0
     for i in range(source.shape[0]):
         reach = max(reach, math.hypot(source[i, 0], source[i, 1]))
     for iteration in range(iterations + 1):
         if moved > _STALE * radius:
-            _associate(cells, points, travels, hits, ages, source, pose, cell, radius, most_thin, home, lines)
+            _associate(cells, points, travels, hits, ages, source, pose, cell, radius, most_thin, since, home, lines)
             moved = 0.0
         kernel = wide_kernel if iteration == 0 else final_kernel
         n_matched, squares = _sum_up(source, lines, pose, sigma_point, sigma_line, kernel, H, g)
@@ -225,7 +233,40 @@ def fit_points(
         if iteration > 0 and abs(d0) + abs(d1) + abs(d2) < 1e-4:
             iterations = iteration + 1
     n_on = _spread(source, lines, home, pose, sigma_point, sigma_line, spread)
-    return n_matched, n_on, squares
+    return n_matched, n_on, squares, _old_part(source, lines, pose, sigma_point, sigma_line, final_kernel, old)
+
+
+@numba.njit(cache=True)
+def _old_part(
+    source: FloatArray, lines: FloatArray, pose: FloatArray, sigma_point: float, sigma_line: float, kernel: float, H: FloatArray
+) -> float:  # pragma: no cover
+    """Fills ``H`` (3, 3) with the information of what is not new of the lines; returns which part of all variance is the lines'."""
+    H[:] = 0.0
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    total, of_lines = 0.0, 0.0
+    for i in range(source.shape[0]):
+        if lines[i, 0] == 0.0:
+            continue
+        nx, ny = lines[i, 1], lines[i, 2]
+        x = pose[0] + c * source[i, 0] - s * source[i, 1]
+        y = pose[1] + s * source[i, 0] + c * source[i, 1]
+        e = nx * (x - lines[i, 3]) + ny * (y - lines[i, 4])
+        robust = 1.0 + e * e / (kernel * kernel)
+        line = lines[i, 6] * (sigma_line * sigma_line + lines[i, 5])
+        w = 1.0 / ((sigma_point * sigma_point + line) * robust * robust)
+        jx, jy = nx * c + ny * s, ny * c - nx * s
+        jt = jy * source[i, 0] - jx * source[i, 1]
+        total += w
+        of_lines += w * line / (sigma_point * sigma_point + line)
+        w *= 1.0 - lines[i, 7]
+        H[0, 0] += w * jx * jx
+        H[0, 1] += w * jx * jy
+        H[0, 2] += w * jx * jt
+        H[1, 1] += w * jy * jy
+        H[1, 2] += w * jy * jt
+        H[2, 2] += w * jt * jt
+    H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
+    return of_lines / total if total > 0.0 else 0.0
 
 
 @numba.njit(cache=True)

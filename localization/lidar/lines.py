@@ -45,6 +45,10 @@ class LineFit:
     residual_rms: float
     """RMS distance of the matched points from their lines [m], robustly weighted."""
     spread: Spread
+    old: FloatArray
+    """(3, 3) the part of `information` that comes from points of the map that were not added by the last scan."""
+    map_part: float
+    """Which part of the variance of the pose is the error of the map's lines, not of the scan's points."""
 
 
 class LineMap:
@@ -101,14 +105,17 @@ class LineMap:
         prior: FloatArray,
         center: FloatArray,
         ages: Ages = ALL_AGES,
+        since: float = math.inf,
     ) -> LineFit:
         """Gauss-Newton from ``start`` (3,) for ``points`` (N, 2) of the body frame.
 
         ``prior`` (3, 3) is the information of a pull towards ``center`` (3,), which keeps directions that the scene does not hold
-        where they were; it is no part of the returned quadratic. Only points of these ``ages`` count.
+        where they were; it is no part of the returned quadratic. Only points of these ``ages`` count. Those added at a travelled distance
+        of ``since`` [m] or later are the new ones.
         """
         information, gradient, pose, spread = np.zeros((3, 3)), np.zeros(3), np.array(start, dtype=float), np.zeros(4)
-        n, n_on, squares = fit_points(
+        old = np.zeros((3, 3))
+        n, n_on, squares, map_part = fit_points(
             self._cells,
             self._points,
             self._travels,
@@ -125,11 +132,15 @@ class LineMap:
             options.iterations,
             prior,
             center,
+            since,
             information,
             gradient,
             spread,
+            old,
         )
-        return LineFit(pose, information, gradient, n, n_on, math.sqrt(squares / n) if n else math.nan, Spread(*spread.tolist()))
+        return LineFit(
+            pose, information, gradient, n, n_on, math.sqrt(squares / n) if n else math.nan, Spread(*spread.tolist()), old, map_part
+        )
 
     def compare(self, points: FloatArray, pose: FloatArray, radius: float, ages: Ages = ALL_AGES) -> tuple[FloatArray, FloatArray]:
         """How far ``points`` (N, 2) of the body frame at ``pose`` (3,) are off the lines within ``radius`` [m] of them, and when those

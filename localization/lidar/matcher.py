@@ -18,6 +18,8 @@ from motion_models.se2 import FloatArray
 
 _FEW_POINTS = 10
 _DEGENERATE = 0.02  # smaller over larger variance of the position; rooms: 0.2 and more
+_SURPRISE = 0.05
+_APART_M = 1e-4  # scans drawn on one spot are told apart by this
 # Where the scene holds nothing, the measurement's sigma: metres, metres, radians. It decides nothing, it only keeps numbers finite.
 _KNOWS_NOTHING = np.array([10.0, 10.0, 3.0])
 
@@ -50,6 +52,26 @@ class LidarConfig:
 
 
 @dataclass(frozen=True)
+class MapTie:
+    """How the map that a scan meets hangs together with the map that the scan before met.
+
+    Both are drawn with errors, which all scans that meet the same part of the map share: e' = ``kept`` e + (1 - ``kept``) e_drawn + noise,
+    where e_drawn is the error of the pose from which the scan before was drawn. In a room that is known already, ``kept`` is the identity,
+    and however long the robot stays, it learns no more of its place and forgets nothing of it.
+    """
+
+    kept: FloatArray
+    """(3, 3) how much of what fixes the pose the map had before the last scan was drawn into it, by direction; zero for a first map."""
+    cov: FloatArray
+    """(3, 3) the part of the registration's covariance that is the map's error."""
+
+    @property
+    def fresh(self) -> FloatArray:
+        """(3, 3) covariance of the noise with which what is not ``kept`` was drawn: the map's errors are as large as before."""
+        return np.asarray(self.cov - self.kept @ self.cov @ self.kept.T)
+
+
+@dataclass(frozen=True)
 class Registration:
     """What one scan says about the pose: the most likely one and its covariance, by the scan and the map alone."""
 
@@ -63,6 +85,8 @@ class Registration:
     """Points that did: they are on lines of the map, within their noise."""
     residual_rms_m: float
     """RMS distance of the matched points from the map's lines."""
+    tie: MapTie
+    """What of the covariance is the map's, and since when."""
 
     @property
     def is_trusted(self) -> bool:
@@ -89,6 +113,7 @@ class LidarMatcher:
         self._guess: tuple[FloatArray, FloatArray] | None = None  # and its information
         self._revisits: Revisits | None = None
         self._travel, self._last = 0.0, np.zeros(3)
+        self._drawn_at = math.inf  # travelled distance at which the last scan was drawn
 
     def register(self, points: FloatArray, is_planar: bool, guess: FloatArray, guess_cov: FloatArray) -> Registration | None:
         """Where ``points`` (N, 3) of the body frame fit, searched around ``guess`` (3,) with its covariance (3, 3).
@@ -121,12 +146,18 @@ class LidarMatcher:
     def _fit(self, lines: LineMap, start: FloatArray) -> Registration:
         assert self._guess is not None
         guess, prior = self._guess
-        options = replace(self._options, sigma_point=self._noise.sigma_point, sigma_line=self._noise.sigma_line)
-        fit = lines.fit(self._planar, start, options, prior, guess, self._ages)
+        believed = self._noise.sigma_line
+        fit = lines.fit(self._planar, start, self._fit_options(), prior, guess, self._ages, self._drawn_at)
         self._noise.see(fit.spread)
+        if abs(self._noise.sigma_line - believed) > _SURPRISE * believed:
+            # the first scans show that the map is better or worse than was guessed; what they say of it will be believed for long
+            fit = lines.fit(self._planar, fit.pose, self._fit_options(), prior, guess, self._ages, self._drawn_at)
         cov = np.linalg.inv(fit.information + np.diag(_KNOWS_NOTHING**-2)).astype(np.float64, copy=False)
         pose = se2.compose(fit.pose, se2.exp(cov @ fit.gradient))
-        return Registration(pose, cov, len(self._planar), fit.n_on, fit.residual_rms)
+        return Registration(pose, cov, len(self._planar), fit.n_on, fit.residual_rms, MapTie(cov @ fit.old, fit.map_part * cov))
+
+    def _fit_options(self) -> FitOptions:
+        return replace(self._options, sigma_point=self._noise.sigma_point, sigma_line=self._noise.sigma_line)
 
     def insert(self, pose: FloatArray) -> None:
         """Add the scan that was last given to `register` to the map, as seen from ``pose`` (3,) ``world_T_body``."""
@@ -134,6 +165,8 @@ class LidarMatcher:
             return
         self._advance(pose)
         self._kiss.insert(self._downsampled, _matrix(pose))
+        self._travel += _APART_M
+        self._drawn_at = float(np.float32(self._travel))  # as the map remembers it
         self._lines.insert(self._planar, pose, self._travel, self._ages)
 
     def recall(self, pose: FloatArray, cov: FloatArray, stamp_ns: int) -> Revisit | None:

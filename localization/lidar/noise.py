@@ -14,7 +14,7 @@ import numpy as np
 from localization.lidar.lines import Spread
 
 _KEPT = 0.98  # of what is known, from scan to scan: the last 50 count
-_POINTS, _CELLS = 500.0, 20.0  # as much as is known beforehand, in degrees of freedom: about one scan
+_POINTS, _CELLS = 500.0, 5.0  # as much as is known beforehand, in degrees of freedom: about one scan
 _POSE = 3.0  # degrees of freedom that go into the pose
 _LEAST_M = 1e-3
 
