@@ -102,6 +102,8 @@ class Examined:
     pipeline: Pipeline | None
     """None where there was too little to look at."""
     residuals: Residuals | None
+    state: _State | None = None
+    """The last look at the drive: its signatures, and its noise."""
 
 
 def diagnose(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None) -> Diagnosis:
@@ -397,7 +399,7 @@ def _conclude(
     scale = np.sqrt(np.diagonal(problem.gram) + 1e-12)
     alike = problem.gram / np.outer(scale, scale)
     residuals = Residuals(first.rows, left, state.noise.sigmas, tuple(e.key for e in effects), alike)
-    return Examined(dataclasses.replace(result, sentence=sentence(result)), pipeline, residuals)
+    return Examined(dataclasses.replace(result, sentence=sentence(result)), pipeline, residuals, state)
 
 
 def _aliases(problem: Regression, effects: tuple[Effect, ...], chosen: tuple[int, ...], i: int) -> tuple[tuple[str, float], ...]:
