@@ -11,6 +11,7 @@ from localization.diagnosis.drive import Drive
 from localization.diagnosis.dropout import lost_share
 from localization.diagnosis.effects import Belief, Effect
 from localization.diagnosis.settling import TRACKED, settling_twists
+from localization.diagnosis.steady import steady_twists
 from motion_models import se2
 from motion_models.base import MotionModel, Twist
 from motion_models.friction import FrictionModel
@@ -52,7 +53,7 @@ class Pipeline:
             inside = slice(first[w], first[w + 1])
             dt = self.batch.dt[inside]
             self._times[inside] = start + np.cumsum(dt) - dt - dt[: lead[w]].sum()
-        self._base = self._friction.twist(self.batch.wheels, self.batch.cg, self._friction.nominal).value
+        self._base = steady_twists(self._friction.nominal, self.batch.wheels, self.batch.cg)
         self._kinematic_forces = self._accelerations()
         self._known: dict[tuple[object, ...], FloatArray] = {}
 
@@ -156,8 +157,10 @@ class _Changed:
         rates = wheels * np.maximum(1.0 + np.array([b.radius_left, b.radius_right]), 0.1)
         if b.encoder_lost:
             rates = rates * (1.0 + b.encoder_lost / max(p._lost_time, 1e-9) * p._lost)
-        value = p.model.twist(rates, cg, params).value
-        value = value + self._floor(rates, cg)
+        key = (*self._rates_key(), "model")
+        if key not in p._known:
+            p._known[key] = p.model.twist(rates, cg, params).value
+        value = p._known[key] + self._floor(rates, cg)
         if any(b.turns):
             energy = 2.0 * np.maximum(np.sum(rates**2, axis=-1), 1e-12)
             straight = 1.0 - (rates[:, 1] - rates[:, 0]) ** 2 / energy
@@ -210,7 +213,7 @@ class _Changed:
         if key not in p._known:
             if len(p._known) > _REMEMBERED:
                 p._known.clear()
-            p._known[key] = p._friction.twist(rates, cg, params).value
+            p._known[key] = steady_twists(params, rates, cg)
         return p._known[key]
 
     def _rates_key(self) -> tuple[object, ...]:
