@@ -17,7 +17,7 @@ from localization import plots
 from tests.diagnosis_drives import TYPICAL
 from tests.diagnosis_rivals import NONE
 
-COLUMNS = ("key", "kind", "truth", "alike", "verdict", "findings", "seconds", "rivals", "gain", "oracle", "significance")
+COLUMNS = ("key", "kind", "truth", "alike", "verdict", "findings", "seconds", "rivals", "gain", "oracle", "significance", "rms")
 STRONG = 3.0
 METHODS = ("diagnosis", "stepwise", "stlsq", "gp", "noise")
 
@@ -27,6 +27,7 @@ class Row:
     """One case, as read."""
 
     kind: str
+    verdict: str
     truth: dict[str, float]
     alike: tuple[str, ...]
     findings: list[dict[str, Any]]
@@ -35,6 +36,8 @@ class Row:
     oracle: float
     significance: float
     """The weakest hidden cause's; inf for a cause that the drive should show and whose traces were not found."""
+    rms: float
+    """Of the weakest hidden cause over its channels' noise, in the channel where it shows most."""
     seconds: float
 
     @property
@@ -63,11 +66,12 @@ def read(path: Path) -> list[Row]:
 def _row(r: dict[str, str]) -> Row:
     strengths = json.loads(r["significance"] or "{}").values()
     return Row(
-        *(r["kind"], json.loads(r["truth"]), tuple(json.loads(r["alike"])), json.loads(r["findings"])),
+        *(r["kind"], r["verdict"], json.loads(r["truth"]), tuple(json.loads(r["alike"])), json.loads(r["findings"])),
         rivals={name: (said, gain) for name, (said, gain) in json.loads(r["rivals"] or "{}").items()},
         gain=float(r["gain"] or 0.0),
         oracle=float(r["oracle"] or 0.0),
         significance=min((np.inf if s is None else s for s in strengths), default=0.0),
+        rms=min((np.inf if s is None else s for s in json.loads(r["rms"] or "{}").values()), default=0.0),
         seconds=float(r["seconds"]),
     )
 
@@ -90,7 +94,7 @@ def report(path: Path, picture: Path | None = None) -> str:
     for method in METHODS:
         lines.append(
             f"| {method} | {share([_right(r, method) for r in strong])} | {share([_right(r, method) for r in single])} "
-            f"| {share([_name(r, method) != NONE for r in nulls])} | {_gains(strong, method)} |"
+            f"| {share([_alarms(r, method) for r in nulls])} | {_gains(strong, method)} |"
         )
     lines += ["", "| predicted significance | named first | named among aliases only | something else | nothing |", "|---|---|---|---|---|"]
     for low, high in ((0.0, 3.0), (3.0, 5.0), (5.0, 10.0), (10.0, 30.0), (30.0, np.inf)):
@@ -102,6 +106,11 @@ def report(path: Path, picture: Path | None = None) -> str:
             [r.first == NONE for r in some],
         )
         lines.append(f"| {low:g} to {high:g} | {' | '.join(share(p) for p in parts)} |")
+    loud = [r for r in single if r.rms >= STRONG]
+    lines += [
+        "",
+        f"right name first where the effect's RMS is 3 times the noise of a window or more: {share([r.cause in r.open for r in loud])}",
+    ]
     hits = [(f, r.truth[f["cause"]]) for r in rows if r.kind in ("single", "pair") for f in r.findings if f["cause"] in r.truth]
     covered = [abs(f["size"] - size) <= 1.96 * f["sigma"] for f, size in hits]
     clear = [c for c, (f, _) in zip(covered, hits, strict=True) if f["cause"] not in ("encoder_dropout",)]
@@ -124,6 +133,11 @@ def report(path: Path, picture: Path | None = None) -> str:
 
 def _name(r: Row, method: str) -> str:
     return r.first if method == "diagnosis" else r.rivals.get(method, (NONE, 0.0))[0]
+
+
+def _alarms(r: Row, method: str) -> bool:
+    """It says that something is wrong, with a name or without."""
+    return r.verdict not in ("consistent", "undecidable") if method == "diagnosis" else _name(r, method) != NONE
 
 
 def _right(r: Row, method: str) -> bool:

@@ -44,7 +44,6 @@ _SURE = 200.0  # lead in twice the log-evidence that needs no trial
 _STEPS = 3
 _UNSURE = 1.0 / 3.0  # systematic part of a size's sigma, over what is negligible: clocks, mounts and physics are no better
 _PAYS = 0.003  # least held-out gain of a finding
-_HONEST = 0.5  # a witness may be better than it says, but not by more than this
 
 
 @dataclass(frozen=True)
@@ -293,29 +292,32 @@ def _noise(pipeline: Pipeline, linear: FloatArray, signatures: FloatArray, nuisa
     for _ in range(3):
         y = noise.whiten(linear).ravel()
         design = np.hstack([noise.whiten(signatures).reshape(len(y), -1) * scale, noise.whiten(nuisances).reshape(len(y), -1) * 1e3])
-        gram = design.T @ design
-        x = np.linalg.solve(gram + np.eye(len(gram)), design.T @ y)
-        spent = float(np.trace(np.linalg.solve(gram + np.eye(len(gram)), gram)))
+        inverse = np.linalg.inv(design.T @ design + np.eye(design.shape[1]))
+        x = inverse @ (design.T @ y)
+        spent = np.sum((design @ inverse) * design, axis=1).reshape(linear.shape).sum(axis=0)
         p = len(effects)
         left = linear - signatures @ (x[:p] * scale) - nuisances @ (x[p:] * 1e3)
-        noise = estimated_noise(np.where(known, left, np.nan), features, follows, spent, _HONEST * sigmas)
+        noise = estimated_noise(np.where(known, left, np.nan), features, follows, spent, sigmas)
     return noise
 
 
 def _tested(state: _State, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig) -> tuple[int, ...]:
     """``chosen``, less what does not stand up to the test."""
-    problem, effects = state.problem, state.effects
-    df = max(int(np.isfinite(state.rows).sum()) - len(effects), 10)
     while chosen:
         p = []
         for i in chosen:
             others = tuple(j for j in chosen if j != i)
-            p.append(p_value(statistic(problem, others, i), max_statistic(problem, others, rng, df)))
+            p.append(_p_value(state, others, i, rng))
         worst = int(np.argmax(p))
         if p[worst] <= config.significance:
             break
         chosen = tuple(i for n, i in enumerate(chosen) if n != worst)
     return chosen
+
+
+def _p_value(state: _State, others: tuple[int, ...], i: int, rng: np.random.Generator) -> float:
+    df = state.noise.freedom
+    return p_value(statistic(state.problem, others, i), max_statistic(state.problem, others, rng, df), df)
 
 
 def _group(effect: Effect) -> str:
@@ -330,7 +332,6 @@ def _conclude(
     pipeline: Pipeline, first: _State, state: _State, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig
 ) -> Examined:
     drive, problem, effects = pipeline.drive, state.problem, state.effects
-    df = max(int(np.isfinite(state.rows).sum()) - len(effects), 10)
 
     def held(with_these: tuple[int, ...], without: tuple[int, ...]) -> Gain:
         data = state.linear, state.signatures, state.nuisances, state.noise, problem.scale
@@ -354,7 +355,7 @@ def _conclude(
         effect, size = effects[i], float(sizes[n])
         sigma = math.hypot(math.sqrt(cov[n, n]), _UNSURE * effect.negligible)
         others = tuple(j for j in chosen if j != i)
-        p = p_value(statistic(problem, others, i), max_statistic(problem, others, rng, df))
+        p = _p_value(state, others, i, rng)
         aliases = _aliases(problem, effects, chosen, i)
         told = evidence(effect, state.signatures[..., i] * size, state.noise, problem.gain(chosen) - problem.gain(others))
         findings.append(Finding(effect, size, sigma, p, aliases, told, gains[n]))

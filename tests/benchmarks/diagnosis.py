@@ -153,6 +153,7 @@ def run(case: Case) -> dict[str, Any]:
     if case.effects:
         row["oracle"] = round(oracle(pipeline, nominal, dict(case.effects)), 5)
         row["significance"] = json.dumps({name: significance(nominal, case.effects, name) for name in case.effects})
+        row["rms"] = json.dumps({name: loudness(nominal, name, size) for name, size in case.effects.items()})
     return row
 
 
@@ -160,16 +161,26 @@ def significance(state: engine._State, effects: Mapping[str, float], name: str) 
     """Of effect ``name``: its size over the sigma with which this drive can measure it, while the other hidden causes are free and all
     others keep within their tolerance. None if the drive does not show the cause at all."""
     problem = state.problem
-
-    def columns(wanted: str) -> list[int]:
-        return [i for i, e in enumerate(state.effects) if e.id == wanted and _is_true(e, state)]
-
-    own = columns(name)
+    own = _columns(state, name)
     if not own:
         return None
-    given = tuple(i for other in effects if other != name for i in columns(other)[:1])
-    cov = problem.scores(given, own[:1])[1]
+    given = tuple(i for other in effects if other != name for i in _columns(state, other))
+    cov = problem.scores(given, own)[1]
     return round(float(np.sqrt(cov[0, 0]) * abs(effects[name]) / problem.scale[own[0]]), 2)
+
+
+def loudness(state: engine._State, name: str, size: float) -> float | None:
+    """Root mean square over the windows of what the effect does, over their noise, in the channel where that is most."""
+    own = _columns(state, name)
+    if not own:
+        return None
+    part = np.nan_to_num(state.signatures[..., own[0]] * size / state.noise.sigmas)
+    return round(float(np.sqrt(np.mean(part**2, axis=0)).max()), 2)
+
+
+def _columns(state: engine._State, name: str) -> list[int]:
+    """Where the cause is among the state's, at most one."""
+    return [i for i, e in enumerate(state.effects) if e.id == name and _is_true(e, state)]
 
 
 def _is_true(effect: Effect, state: engine._State) -> bool:
