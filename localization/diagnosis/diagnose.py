@@ -40,6 +40,8 @@ _CLOSE_SHARE = 0.02  # or this share of what the cause explains, which no model 
 _ROUNDS = 5
 _TOLERANCE = 0.35  # sigma of causes that nobody names, over what is negligible
 _REFINED = 2  # sets of each number of causes that are tried for real
+_FORETOLD = 0.1  # share of what signatures promise that may be missing
+_PLAIN, _TRIED = 2, 4  # then so many sets of up to so many causes are tried whatever signatures say
 _SURE = 200.0  # lead in twice the log-evidence that needs no trial
 _STEPS = 3
 _UNSURE = 1.0 / 3.0  # systematic part of a size's sigma, over what is negligible: clocks, mounts and physics are no better
@@ -150,23 +152,32 @@ def _search(pipeline: Pipeline, state: _State) -> dict[Effect, float]:
     effects, problem = state.effects, state.problem
     groups = [_group(e) for e in effects]
     ranked = ranked_subsets(problem, groups, _bounds(effects))
-    least = ranked[0][0]
-    sure = ranked[1][0] - least > _SURE if len(ranked) > 1 else True
-    tried: dict[tuple[int, ...], None] = {ranked[0][1]: None, (): None}
-    if not sure:
-        near = [s for c, s in ranked if c - least < _SURE]
-        for size in range(1, MOST_CAUSES):
-            tried.update(dict.fromkeys([s for s in near if len(s) == size][:_REFINED]))
-    results = []
-    for subset in tried:
-        start = {effects[i]: float(v) for i, v in zip(subset, problem.fit(subset)[0], strict=True)}
-        try:
-            sizes, rows = _refined(pipeline, state, start)
-        except (CgError, ModelError):
-            continue  # sizes that no robot can have
-        found = _cost(state, sizes, rows)
-        results.append((found, subset, sizes))
-    return min(results, key=lambda r: r[0])[2]
+    least, best = ranked[0]
+    nothing = problem.misfit()
+    results: dict[tuple[int, ...], tuple[float, dict[Effect, float]]] = {}
+
+    def real(subset: tuple[int, ...]) -> float:
+        """Twice the log-odds by the pipeline itself; inf for sizes that no robot can have."""
+        if subset not in results:
+            start = {effects[i]: float(v) for i, v in zip(subset, problem.fit(subset)[0], strict=True)}
+            try:
+                sizes, rows = _refined(pipeline, state, start)
+            except (CgError, ModelError):
+                return math.inf
+            results[subset] = _cost(state, sizes, rows), sizes
+        return results[subset][0]
+
+    is_sure = len(ranked) < 2 or ranked[1][0] - least > _SURE
+    as_foretold = real(best) < nothing + least + max(_FORETOLD * abs(least), _CLOSE)
+    real(())
+    near = [s for c, s in ranked if c - least < _SURE]
+    for size in range(1, MOST_CAUSES):
+        alike = [s for s in near if len(s) == size][:_REFINED] if not is_sure else []
+        if not as_foretold and size <= _PLAIN:  # where signatures bend, few causes may do what many seem to
+            alike += [s for _, s in ranked if len(s) == size][:_TRIED]
+        for subset in alike:
+            real(subset)
+    return min(results.values(), key=lambda r: r[0])[1]
 
 
 def _cost(state: _State, sizes: dict[Effect, float], rows: FloatArray) -> float:
