@@ -159,12 +159,8 @@ def _search(pipeline: Pipeline, state: _State) -> dict[Effect, float]:
     def real(subset: tuple[int, ...]) -> float:
         """Twice the log-odds by the pipeline itself; inf for sizes that no robot can have."""
         if subset not in results:
-            start = {effects[i]: float(v) for i, v in zip(subset, problem.fit(subset)[0], strict=True)}
-            try:
-                sizes, rows = _refined(pipeline, state, start)
-            except (CgError, ModelError):
-                return math.inf
-            results[subset] = _cost(state, sizes, rows), sizes
+            sizes, cost = _tried(pipeline, state, _linear_sizes(state, subset))
+            results[subset] = cost, sizes
         return results[subset][0]
 
     is_sure = len(ranked) < 2 or ranked[1][0] - least > _SURE
@@ -187,11 +183,17 @@ def _cost(state: _State, sizes: dict[Effect, float], rows: FloatArray) -> float:
     return whole.misfit() + k * math.log(max(whole.count, 2)) + 2.0 * math.log(math.comb(groups, k))
 
 
-def _true_cost(pipeline: Pipeline, state: _State, sizes: dict[Effect, float]) -> float:
+def _tried(pipeline: Pipeline, state: _State, start: dict[Effect, float]) -> tuple[dict[Effect, float], float]:
+    """Sizes by the pipeline itself, and what they cost; inf for sizes that no robot can have."""
     try:
-        return _cost(state, *_refined(pipeline, state, sizes))
+        sizes, rows = _refined(pipeline, state, start)
+        return sizes, _cost(state, sizes, rows)
     except (CgError, ModelError):
-        return math.inf
+        return start, math.inf
+
+
+def _true_cost(pipeline: Pipeline, state: _State, sizes: dict[Effect, float]) -> float:
+    return _tried(pipeline, state, sizes)[1]
 
 
 def _refined(pipeline: Pipeline, state: _State, sizes: dict[Effect, float]) -> tuple[dict[Effect, float], FloatArray]:
@@ -367,7 +369,7 @@ def _conclude(
         sigma = math.hypot(math.sqrt(cov[n, n]), _UNSURE * effect.negligible)
         others = tuple(j for j in chosen if j != i)
         p = _p_value(state, others, i, rng)
-        aliases = _aliases(problem, effects, chosen, i)
+        aliases = _aliases(pipeline, state, chosen, i)
         told = evidence(effect, state.signatures[..., i] * size, state.noise, problem.gain(chosen) - problem.gain(others))
         findings.append(Finding(effect, size, sigma, p, aliases, told, gains[n]))
     findings.sort(key=lambda f: f.gain.relative, reverse=True)
@@ -414,12 +416,13 @@ def _conclude(
     return Examined(dataclasses.replace(result, sentence=sentence(result)), pipeline, residuals, state)
 
 
-def _aliases(problem: Regression, effects: tuple[Effect, ...], chosen: tuple[int, ...], i: int) -> tuple[tuple[str, float], ...]:
-    """Causes that could stand in for ``i`` and explain the drive about as well."""
+def _aliases(pipeline: Pipeline, state: _State, chosen: tuple[int, ...], i: int) -> tuple[tuple[str, float], ...]:
+    """Causes that could stand in for ``i`` and explain the drive about as well: by their signatures, and then by the pipeline itself."""
+    problem, effects = state.problem, state.effects
     others = tuple(j for j in chosen if j != i)
     base, own = problem.gain(others), problem.gain(chosen)
     tolerance = max(_CLOSE, _CLOSE_SHARE * (own - base))
-    found: dict[str, tuple[float, float]] = {}
+    found: dict[str, tuple[float, int]] = {}
     for j, effect in enumerate(effects):
         if j in chosen or _group(effect) == _group(effects[i]) or any(_group(effect) == _group(effects[k]) for k in others):
             continue
@@ -431,9 +434,20 @@ def _aliases(problem: Regression, effects: tuple[Effect, ...], chosen: tuple[int
         if own - gain > tolerance or (effect.one_sided and size < 0.0) or abs(size) > 10.0 * effect.usual:
             continue
         if effect.id not in found or gain > found[effect.id][0]:
-            found[effect.id] = gain, size
-    ranked = sorted(found.items(), key=lambda item: -item[1][0])
-    return tuple((name, size) for name, (_, size) in ranked)
+            found[effect.id] = gain, j
+    if not found:
+        return ()
+    best = _true_cost(pipeline, state, _linear_sizes(state, chosen))
+    costs = []
+    for _, j in found.values():
+        sizes, cost = _tried(pipeline, state, _linear_sizes(state, (*others, j)))
+        if cost - best <= tolerance:
+            costs.append((cost, effects[j].id, sizes[effects[j]]))
+    return tuple((name, size) for _, name, size in sorted(costs))
+
+
+def _linear_sizes(state: _State, subset: tuple[int, ...]) -> dict[Effect, float]:
+    return {state.effects[i]: float(v) for i, v in zip(subset, state.problem.fit(subset)[0], strict=True)}
 
 
 def _merged(findings: list[Finding]) -> list[Finding]:
