@@ -411,6 +411,21 @@ def drawn(data, *shape):
     return np.array(data.draw(st.lists(HOSTILE, min_size=count, max_size=count))).reshape(shape)
 
 
+@pytest.mark.parametrize("size", [math.nan, math.inf, 1e150, 1e300])
+@pytest.mark.parametrize("where", ["matrix", "right side"])
+def test_a_factor_too_large_to_compute_with_is_our_error(size, where):
+    good = [Block((0,), (np.eye(2),), np.zeros(2)), Block((0, 1), (-np.eye(2), np.eye(2)), np.ones(2))]
+    row = np.array([[size, 0.0]]) if where == "matrix" else np.array([[1.0, 0.0]])
+    bad = Block((1,), (row,), np.array([1e300 if where == "matrix" else size]))
+    with contextlib.suppress(EstimatorError):
+        assert np.isfinite(solve([*good, bad], 2, 2)).all()
+    if not math.isfinite(size):
+        with pytest.raises(EstimatorError, match="finite"):
+            solve([*good, bad], 2, 2)
+        with pytest.raises(EstimatorError, match="finite"):
+            Incremental(2).update([bad], [1])
+
+
 @given(st.data())
 @settings(max_examples=100, deadline=None)
 def test_no_numbers_in_factors_end_the_process(data):

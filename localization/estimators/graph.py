@@ -45,7 +45,11 @@ def chain(rows: FloatArray, first: int = 0) -> Iterator[Block]:
 
 def solve(blocks: Iterable[Block], count: int, n: int) -> FloatArray:
     """(count, n) changes of the nodes 0 ... count - 1. Raises `IndeterminateError` and `EstimatorError`."""
-    found = _tree(list(blocks), range(count), n).optimize()
+    tree = _tree(list(blocks), range(count), n)
+    try:
+        found = tree.optimize()
+    except RuntimeError as error:
+        raise _indeterminate(error) from error
     return _finite(np.array([found.at(i) for i in range(count)]).reshape(count, n))
 
 
