@@ -367,6 +367,8 @@ def _conclude(
     for n, i in enumerate(chosen):
         effect, size = effects[i], float(sizes[n])
         sigma = math.hypot(math.sqrt(cov[n, n]), _UNSURE * effect.negligible)
+        if effect.id == "encoder_dropout":  # a share that comes in spells of random length is as sure as there were many
+            sigma = math.hypot(sigma, size * math.sqrt(2.0 / max(pipeline.dropout_spells, 2)))
         others = tuple(j for j in chosen if j != i)
         p = _p_value(state, others, i, rng)
         aliases = _aliases(pipeline, state, chosen, i)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.dropout import lost_share
+from localization.diagnosis.dropout import RESTS, lost_share
 from localization.diagnosis.effects import Belief, Effect
 from localization.diagnosis.settling import TRACKED, settling_twists
 from localization.diagnosis.steady import steady_twists
@@ -45,7 +45,8 @@ class Pipeline:
         self.batch = make_batch(self.drive.maneuvers)
         self._friction = FrictionModel.from_robot(self.drive.robot)
         self._lost = lost_share(self.batch)
-        self._lost_time = float(np.sum(self._lost.max(axis=1) * self.batch.dt) / self.batch.dt.sum())
+        rolls = np.abs(self.batch.wheels).max(axis=1) > RESTS
+        self._lost_time = float((self._lost.max(axis=1) * rolls) @ self.batch.dt / max(float(rolls @ self.batch.dt), 1e-9))
         self.headings = self._headings()
         first, lead = self.batch.first, self.batch.lead
         self._times = np.empty(len(self.batch.dt))
@@ -65,6 +66,11 @@ class Pipeline:
     @property
     def dropout_seen(self) -> bool:
         return bool(self._lost.any())
+
+    @property
+    def dropout_spells(self) -> int:
+        """How often a side fell silent, as far as it was seen."""
+        return int(np.count_nonzero(np.diff(self._lost, axis=0) > 0.0))
 
     def _headings(self) -> FloatArray:
         """By the gyro less its mean difference to the witness; else by the witness's own turns, one after the other."""
