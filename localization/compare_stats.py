@@ -45,6 +45,12 @@ class Difference:
     """Of worse minus better, per log."""
     low: float
     high: float
+    wins: int
+    """Logs on which the better one has the smaller number."""
+    relative: float
+    """By what part of the worse one's mean the better one is smaller; NaN where that mean is 0."""
+    relative_low: float
+    relative_high: float
     p_value: float
     """Of a mean as far from zero if neither were better; corrected for all differences of the table."""
 
@@ -84,10 +90,14 @@ def differences(rows: Sequence[Row], metric: str, seed: int = 0) -> list[Differe
         shared = [log for log in a_table if log in b_table]
         if len(shared) < 2:
             continue
-        off = np.array([b_table[log] - a_table[log] for log in shared])
-        better, worse, off = (a, b, off) if off.mean() >= 0.0 else (b, a, -off)
+        less, more = (np.array([table[log] for log in shared]) for table in (a_table, b_table))
+        better, worse = a, b
+        if more.mean() < less.mean():
+            better, worse, less, more = b, a, more, less
+        off = more - less
         low, high = _interval(off, rng)
-        found.append(Difference(better, worse, len(off), float(off.mean()), low, high, sign_flip_p(off, rng)))
+        wins, part = int((off > 0.0).sum()), _relative(less, more, rng)
+        found.append(Difference(better, worse, len(off), float(off.mean()), low, high, wins, *part, sign_flip_p(off, rng)))
     return _holm(sorted(found, key=lambda d: d.p_value))
 
 
@@ -97,6 +107,17 @@ def _interval(values: FloatArray, rng: np.random.Generator) -> tuple[float, floa
     drawn = values[rng.integers(0, len(values), (_DRAWS, len(values)))].mean(axis=1)
     low, high = np.quantile(drawn, [0.025, 0.975])
     return float(low), float(high)
+
+
+def _relative(less: FloatArray, more: FloatArray, rng: np.random.Generator) -> tuple[float, float, float]:
+    """1 - mean(less) / mean(more) of numbers (n,) of the same logs, and its interval."""
+    drawn = rng.integers(0, len(less), (_DRAWS, len(less)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        parts = 1.0 - less[drawn].mean(axis=1) / more[drawn].mean(axis=1)
+    if not (more.mean() > 0.0 and np.isfinite(parts).all()):
+        return math.nan, math.nan, math.nan
+    low, high = np.quantile(parts, [0.025, 0.975])
+    return float(1.0 - less.mean() / more.mean()), float(low), float(high)
 
 
 def sign_flip_p(off: FloatArray, rng: np.random.Generator) -> float:

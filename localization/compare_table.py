@@ -114,16 +114,27 @@ def _parquet(path: Path) -> tuple[Callable[[Path], list[Row]], Callable[[Path, S
         import pyarrow
         import pyarrow.parquet as parquet
     except ImportError as error:
-        raise OutputError(f"table '{path}': Parquet needs pyarrow (pip install pyarrow). Or name a .csv.") from error
+        raise OutputError(
+            f"table '{path}': Parquet needs the extra 'parquet': pip install 'skidloc[parquet]' ({error}). Or name a .csv."
+        ) from error
 
     def read(path: Path) -> list[Row]:
         try:
             return [dict(row) for row in parquet.read_table(path).to_pylist()]
-        except pyarrow.ArrowInvalid as error:
-            raise ValueError(str(error)) from error
+        except pyarrow.ArrowException as error:
+            raise ValueError(" ".join(str(error).split())) from error
 
     def write(path: Path, rows: Sequence[Row]) -> None:
-        columns = _columns(rows)
-        parquet.write_table(pyarrow.Table.from_pylist([{name: row.get(name) for name in columns} for row in rows]), path)
+        """What no row has a number of is a column of numbers, too: the file's types do not depend on what has been run so far."""
+        columns = {}
+        for name in _columns(rows):
+            values = [row.get(name) for row in rows]
+            is_whole = any(type(value) is int for value in values) and all(value is None or type(value) is int for value in values)
+            kind = pyarrow.string() if name in _HEAD else pyarrow.int64() if is_whole else pyarrow.float64()
+            columns[name] = pyarrow.array(values, kind)
+        with path.open("wb") as file:
+            parquet.write_table(pyarrow.table(columns), file)
+            file.flush()
+            os.fsync(file.fileno())
 
     return read, write

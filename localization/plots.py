@@ -21,7 +21,20 @@ from localization.report_data import MapView, NisMeans, Spans, Timeline, raster
 from localization.report_lines import Line, thin_path, thin_series
 from localization.report_svg import COLOURS, NARROW, WIDE, Size, for_page
 
-__all__ = ["NARROW", "WIDE", "Axes", "Figure", "map_svg", "nis_svg", "overview", "picture", "plain_logs", "spans_svg", "timeline_svg"]
+__all__ = [
+    "NARROW",
+    "WIDE",
+    "Axes",
+    "Figure",
+    "map_svg",
+    "nis_svg",
+    "overview",
+    "picture",
+    "plain_logs",
+    "spans_svg",
+    "svg",
+    "timeline_svg",
+]
 
 _STYLE = {
     "svg.fonttype": "none",
@@ -65,7 +78,7 @@ def map_svg(lines: Sequence[Line], view: MapView, size: Size) -> str:
         axes = figure.add_subplot()
         _draw_map(axes, lines, view, size)
 
-    return _svg(f"map-{size.name}", size.width_in, height, draw)
+    return svg(f"map-{size.name}", size.width_in, height, draw)
 
 
 def timeline_svg(lines: Sequence[Line], timelines: Sequence[Timeline], size: Size) -> str:
@@ -86,7 +99,7 @@ def timeline_svg(lines: Sequence[Line], timelines: Sequence[Timeline], size: Siz
             panels[1].set_ylabel("heading error [deg]")
         panels[-1].set_xlabel("time since the first pose [s]")
 
-    return _svg(f"time-{size.name}", size.width_in, (2.2 if size.is_wide else 2.0) * rows + 0.4, draw)
+    return svg(f"time-{size.name}", size.width_in, (2.2 if size.is_wide else 2.0) * rows + 0.4, draw)
 
 
 def spans_svg(lines: Sequence[Line], spans: Sequence[Spans], size: Size) -> str:
@@ -103,7 +116,7 @@ def spans_svg(lines: Sequence[Line], spans: Sequence[Spans], size: Size) -> str:
             if size.is_wide or axes is panels[-1]:
                 axes.set_xlabel("time from first to second pose [s]")
 
-    return _svg(f"spans-{size.name}", size.width_in, 3.1 if size.is_wide else 4.6, draw)
+    return svg(f"spans-{size.name}", size.width_in, 3.1 if size.is_wide else 4.6, draw)
 
 
 def nis_svg(lines: Sequence[Line], means: Sequence[NisMeans], size: Size) -> str:
@@ -121,7 +134,7 @@ def nis_svg(lines: Sequence[Line], means: Sequence[NisMeans], size: Size) -> str
         )
         plain_logs(axes)
 
-    return _svg(f"nis-{size.name}", size.width_in, 2.6, draw)
+    return svg(f"nis-{size.name}", size.width_in, 2.6, draw)
 
 
 def overview(lines: Sequence[Line], view: MapView, measure: str, title: str) -> bytes:
@@ -236,7 +249,8 @@ def _figure(width: float, height: float, draw: Callable[[Figure], None]) -> Figu
     return figure
 
 
-def _svg(name: str, width: float, height: float, draw: Callable[[Figure], None]) -> str:
+def svg(name: str, width: float, height: float, draw: Callable[[Figure], None]) -> str:
+    """An SVG for a page, ``name`` unique in it, of what ``draw`` puts on a figure of this size [in], in this module's style."""
     figure = _figure(width, height, draw)
     out = io.StringIO()
     with _style(name):

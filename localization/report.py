@@ -13,16 +13,49 @@ from pathlib import Path
 from scipy.stats import chi2
 
 from localization import plots
-from localization.errors import OutputError
 from localization.references import ReferenceTrack, Relations
 from localization.report_data import MapView, map_view, nis_means, spans, timeline
 from localization.report_lines import Line, best_line, make_lines
-from localization.report_page import TERMS, style_sheet
+from localization.report_page import bullets, figure, glossary, html_page, opening, section, write_new
 from localization.report_tables import REFERENCE_SWATCH, accuracy_table, count_table, definition_table, parameter_table, swatch
 from localization.report_verdict import is_close, metres, verdict, verdict_sentences
 from localization.score import Result
 
 __all__ = ["ReportHead", "overview_png", "verdict", "write_report"]
+
+_TERMS = (
+    (
+        "ATE",
+        "Absolute trajectory error: the whole path is laid onto the reference as well as a rigid motion can, then the root mean "
+        "square of what remains is taken. It tells how good the shape of the whole path is.",
+    ),
+    (
+        "RPE",
+        "Relative pose error: over pieces of path of 1, 2, 5, 10 m and so on, the error at the end of each piece per metre "
+        "driven. It tells how fast errors grow, wherever they began.",
+    ),
+    (
+        "Relations",
+        "Pairs of moments whose relative pose was verified by hand. The error is that of the estimated motion between them; "
+        "relations that span little time test the odometry, long ones that close a loop test the whole path.",
+    ),
+    (
+        "NEES",
+        "Normalised estimation error squared: the true error measured in the sigmas that the estimator claims. The mean of an "
+        "honest one is 3, for x, y and heading; much more is overconfident, much less is timid. Errors along one drive hang "
+        "together, so one drive between 0.2 and 9 proves nothing.",
+    ),
+    (
+        "NIS",
+        "Normalised innovation squared: how far each scan disagrees with the prediction, in the sigmas of both. It needs no "
+        "reference, and its mean should be 3, too. A good NIS alone does not prove the path right: errors that scan and wheels "
+        "share do not show in it.",
+    ),
+    (
+        "Ellipses",
+        "Two sigmas of the position since the start, as the estimator claims it. The robot should be inside in 86 of 100 cases.",
+    ),
+)
 
 
 @dataclass(frozen=True)
@@ -45,14 +78,14 @@ class ReportHead:
 
 def write_report(path: str | Path, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
     """Write the page. Raises `OutputError` if there is such a file already or it cannot be written."""
-    _write(path, page(head, results, reference).encode())
+    write_new(path, page(head, results, reference).encode())
 
 
 def overview_png(path: str | Path, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
     """Write one picture: trajectories over the map beside a bar for each error. Raises `OutputError` as `write_report` does."""
     lines = make_lines(results)
     measure = "mean error of the relations [m]" if isinstance(reference, Relations) else "position error, ATE [m]"
-    _write(path, plots.overview(lines, map_view(lines, reference), measure, head.log))
+    write_new(path, plots.overview(lines, map_view(lines, reference), measure, head.log))
 
 
 def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> str:
@@ -60,43 +93,27 @@ def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack 
     lines = make_lines(results)
     best = best_line(lines) if reference is not None else None
     near = [line for line in lines if best is not None and line is not best and line.error is not None and is_close(line, best)]
-    sentences = [escape(sentence) for sentence in verdict_sentences(results, reference)]
-    parts = [
-        f"<h1>Replay of {escape(head.log)}</h1>",
-        f'<p class="facts">{escape(head.robot)} · {head.duration_s:,.1f} s from {escape(head.start)}</p>',
-        f'<div class="verdict"><p><b>{sentences[0]}</b></p><p>{" ".join(sentences[1:])}</p></div>',
-    ]
+    sentences = verdict_sentences(results, reference)
+    facts = f"{head.robot} · {head.duration_s:,.1f} s from {head.start}"
+    parts = opening(f"Replay of {head.log}", facts, sentences)
     if lines:
         parts += [
-            _section(
+            section(
                 "Accuracy" if reference is not None else "Runs", accuracy_table(lines, best, near) + _about_reference(lines, reference)
             ),
-            _section("Trajectories", _map_figure(lines, map_view(lines, reference))),
-            _section("Errors", _error_figure(lines, reference)),
-            _section("Innovations: does the filter know how wrong it is?", _nis_figure(lines)),
-            _section("Estimated parameters", _with_note(parameter_table(lines), "Mean ± sigma at the end of the drive.")),
-            _section("Counts", count_table(lines)),
+            section("Trajectories", _map_figure(lines, map_view(lines, reference))),
+            section("Errors", _error_figure(lines, reference)),
+            section("Innovations: does the filter know how wrong it is?", _nis_figure(lines)),
+            section("Estimated parameters", _with_note(parameter_table(lines), "Mean ± sigma at the end of the drive.")),
+            section("Counts", count_table(lines)),
         ]
-    notes = "".join(f"<li>{escape(note)}</li>" for note in head.notes)
-    terms = "".join(f"<dt>{term}</dt><dd>{text}</dd>" for term, text in TERMS)
     parts += [
-        _section("About the log", f"<ul>{notes}</ul>" if notes else "<p>Nothing was lost and nothing had to be mended.</p>"),
-        _section("How to read this", f'<dl class="terms">{terms}</dl>'),
-        _section("Where this comes from", definition_table(_provenance(head, reference))),
-        _section("In short", f"<p>{' '.join(sentences)}</p>"),
+        section("About the log", bullets(head.notes) or "<p>Nothing was lost and nothing had to be mended.</p>"),
+        glossary(_TERMS),
+        section("Where this comes from", definition_table(_provenance(head, reference))),
+        section("In short", f"<p>{escape(' '.join(sentences))}</p>"),
     ]
-    body = "\n".join(part for part in parts if part)
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; img-src data:\">\n"
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>Replay of {escape(head.log)}</title>\n<style>\n{style_sheet(lines)}</style>\n</head>\n"
-        f"<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
-    )
-
-
-def _section(title: str, content: str) -> str:
-    return f"<section>\n<h2>{title}</h2>\n{content}\n</section>" if content else ""
+    return html_page(f"Replay of {head.log}", parts, lines)
 
 
 def _with_note(table: str, note: str) -> str:
@@ -146,7 +163,7 @@ def _map_figure(lines: Sequence[Line], view: MapView) -> str:
     if len(view.points):
         more.append('<li><span class="dots"></span>LiDAR map</li>')
     pictures = [plots.map_svg(lines, view, size) for size in (plots.WIDE, plots.NARROW)]
-    return _figure(_legend(lines, boxes=True, more="".join(more)), pictures, "Trajectories seen from above", " ".join(sayings))
+    return figure(_legend(lines, boxes=True, more="".join(more)), pictures, "Trajectories seen from above", " ".join(sayings))
 
 
 def _error_figure(lines: Sequence[Line], reference: ReferenceTrack | Relations | None) -> str:
@@ -161,7 +178,7 @@ def _error_figure(lines: Sequence[Line], reference: ReferenceTrack | Relations |
             f"Relations in each point, from left: {numbers}."
         )
         pictures = [plots.spans_svg(scored, binned, size) for size in (plots.WIDE, plots.NARROW)]
-        return _figure(_legend(scored), pictures, "Errors of the relations by the time that they span", caption)
+        return figure(_legend(scored), pictures, "Errors of the relations by the time that they span", caption)
     known = [(line, found) for line in lines if (found := timeline(line)) is not None]
     if not known:
         return ""
@@ -171,7 +188,7 @@ def _error_figure(lines: Sequence[Line], reference: ReferenceTrack | Relations |
         "Each run is laid onto the reference as a whole, so errors at one time depend on those at others: large at both ends and small "
         "between is a path that bends."
     )
-    return _figure(_legend(shown), pictures, "Errors over time", caption)
+    return figure(_legend(shown), pictures, "Errors over time", caption)
 
 
 def _nis_figure(lines: Sequence[Line]) -> str:
@@ -186,7 +203,7 @@ def _nis_figure(lines: Sequence[Line]) -> str:
         f"{inside} (95 % expected)."
     )
     pictures = [plots.nis_svg(shown, means, size) for size in (plots.WIDE, plots.NARROW)]
-    return _figure(_legend(shown, more=band), pictures, "Normalised innovations over time", caption)
+    return figure(_legend(shown, more=band), pictures, "Normalised innovations over time", caption)
 
 
 def _legend(lines: Sequence[Line], boxes: bool = False, more: str = "") -> str:
@@ -198,14 +215,6 @@ def _legend(lines: Sequence[Line], boxes: bool = False, more: str = "") -> str:
     return f'<ul class="legend">{"".join(items)}{more}</ul>\n'
 
 
-def _figure(legend: str, pictures: Sequence[str], title: str, caption: str) -> str:
-    drawn = [
-        svg.replace("<svg", f'<svg class="{size.name}" role="img" aria-label="{title}"', 1)
-        for svg, size in zip(pictures, (plots.WIDE, plots.NARROW), strict=True)
-    ]
-    return f"<figure>\n{legend}{drawn[0]}\n{drawn[1]}\n<figcaption>{caption}</figcaption>\n</figure>"
-
-
 def _provenance(head: ReportHead, reference: ReferenceTrack | Relations | None) -> dict[str, str]:
     return {
         "log": head.log,
@@ -214,13 +223,3 @@ def _provenance(head: ReportHead, reference: ReferenceTrack | Relations | None) 
         "reference": "none" if reference is None else reference.source,
         **head.versions,
     }
-
-
-def _write(path: str | Path, content: bytes) -> None:
-    try:
-        with open(path, "xb") as file:
-            file.write(content)
-    except FileExistsError as error:
-        raise OutputError(f"'{path}' exists already. Remove it or choose another name.") from error
-    except OSError as error:
-        raise OutputError(f"'{path}' cannot be written: {error.strerror}.") from error

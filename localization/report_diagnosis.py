@@ -9,10 +9,9 @@ from pathlib import Path
 from localization import plots
 from localization.diagnosis.diagnose import Examined
 from localization.diagnosis.findings import Diagnosis
-from localization.report import _figure, _section, _write
 from localization.report_diagnosis_plots import dependence_svg, discrepancy_svg, gain_svg
-from localization.report_page import style_sheet
-from localization.report_tables import _table
+from localization.report_page import bullets, figure, glossary, html_page, opening, section, write_new
+from localization.report_tables import header, row, table
 
 _VERDICTS = {
     "consistent": "Wheels and witness agree within their noise.",
@@ -32,50 +31,41 @@ _TERMS = (
 
 def write_diagnosis_report(path: str | Path, found: Examined) -> None:
     """Write the page. Raises `OutputError` if there is such a file already or it cannot be written."""
-    _write(path, diagnosis_page(found).encode())
+    write_new(path, diagnosis_page(found).encode())
 
 
 def diagnosis_page(found: Examined) -> str:
     """The whole page."""
     d = found.diagnosis
+    facts = f"{d.robot} · model {d.model} · held against {d.witness} · {d.windows:,} windows"
     parts = [
-        f"<h1>Diagnosis of {escape(d.log)}</h1>",
-        f'<p class="facts">{escape(d.robot)} · model {escape(d.model)} · held against {escape(d.witness)} · {d.windows:,} windows</p>',
-        f'<div class="verdict"><p><b>{escape(d.sentence)}</b></p><p>{_VERDICTS[d.verdict]}</p></div>',
-        _section("Findings", _findings(d)),
-        _section("Next drive", f"<p>{escape(d.next_drive)}</p>" if d.next_drive else ""),
+        *opening(f"Diagnosis of {d.log}", facts, [d.sentence, _VERDICTS[d.verdict]]),
+        section("Findings", _findings(d)),
+        section("Next drive", f"<p>{escape(d.next_drive)}</p>" if d.next_drive else ""),
     ]
     if found.residuals is not None:
         legend = '<p><small><b style="color:var(--red)">●</b> as found &nbsp; <b style="color:var(--blue)">●</b> once corrected</small></p>'
         over_time = [discrepancy_svg(found, size) for size in (plots.WIDE, plots.NARROW)]
         by_motion = [dependence_svg(found, size) for size in (plots.WIDE, plots.NARROW)]
         parts += [
-            _section(
+            section(
                 "Discrepancies over time",
-                legend + _figure("", over_time, "Discrepancies over time", "Measured minus predicted; the band is two sigmas of noise."),
+                legend + figure("", over_time, "Discrepancies over time", "Measured minus predicted; the band is two sigmas of noise."),
             ),
-            _section("Discrepancies by motion", legend + _figure("", by_motion, "Discrepancies by motion", "One point for each window.")),
-            _section("Components", _components(d)),
+            section("Discrepancies by motion", legend + figure("", by_motion, "Discrepancies by motion", "One point for each window.")),
+            section("Components", _components(d)),
         ]
     if d.findings:
         gains = [gain_svg(d, size) for size in (plots.WIDE, plots.NARROW)]
         caption = "Each finding beside all others; the line is its 95 % interval, by bootstrap over blocks of windows."
-        parts.append(_section("Held-out gain", _figure("", gains, "Held-out gain of each finding", caption)))
-    left = "".join(f"<li>{escape(s.text)}</li>" for s in d.shapes)
+        parts.append(section("Held-out gain", figure("", gains, "Held-out gain of each finding", caption)))
     parts += [
-        _section("Left unexplained", f"<ul>{left}</ul>" if left else ""),
-        _section("What this drive would show", _visible(d)),
-        _section("About the log", "<ul>" + "".join(f"<li>{escape(note)}</li>" for note in d.notes) + "</ul>" if d.notes else ""),
-        _section("How to read this", '<dl class="terms">' + "".join(f"<dt>{t}</dt><dd>{x}</dd>" for t, x in _TERMS) + "</dl>"),
+        section("Left unexplained", bullets(s.text for s in d.shapes)),
+        section("What this drive would show", _visible(d)),
+        section("About the log", bullets(d.notes)),
+        glossary(_TERMS),
     ]
-    body = "\n".join(part for part in parts if part)
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; img-src data:\">\n"
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>Diagnosis of {escape(d.log)}</title>\n<style>\n{style_sheet([])}</style>\n</head>\n"
-        f"<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
-    )
+    return html_page(f"Diagnosis of {d.log}", parts)
 
 
 def _findings(d: Diagnosis) -> str:
@@ -87,29 +77,21 @@ def _findings(d: Diagnosis) -> str:
         others = ", ".join(f"{escape(name)} {size:+.3g}" for name, size in f.aliases) or "–"  # noqa: RUF001
         gain = f"{100 * f.gain.relative:.0f} % ({100 * f.gain.low:.0f} to {100 * f.gain.high:.0f})"
         words = f"<small>{escape(f.effect.meaning)}; {escape(f.evidence)}</small>"
-        rows.append(_row(f"<code>{f.cause}</code><br>{words}", f"{f.size:+.4g} ± {f.sigma:.2g}{unit}", gain, f"{f.p_value:.1g}", others))
-    return _table(_head("Cause", "Size", "Held-out gain", "p", "Or"), rows)
+        rows.append(row(f"<code>{f.cause}</code><br>{words}", f"{f.size:+.4g} ± {f.sigma:.2g}{unit}", gain, f"{f.p_value:.1g}", others))
+    return table(header("Cause", "Size", "Held-out gain", "p", "Or"), rows)
 
 
 def _components(d: Diagnosis) -> str:
     rows = [
-        _row(name, c.unit, f"{c.rms:.4g}", f"{c.expected_rms:.4g}", f"{c.left_rms:.4g}", f"{c.p_value:.2g}")
+        row(name, c.unit, f"{c.rms:.4g}", f"{c.expected_rms:.4g}", f"{c.left_rms:.4g}", f"{c.p_value:.2g}")
         for name, c in d.discrepancy.items()
     ]
-    return _table(_head("Component", "Unit", "RMS", "Noise", "RMS once corrected", "p"), rows)
+    return table(header("Component", "Unit", "RMS", "Noise", "RMS once corrected", "p"), rows)
 
 
 def _visible(d: Diagnosis) -> str:
-    rows = [_row(f"<code>{name}</code>", f"{size:.3g}") for name, size in d.visible.items()]
-    return _table(_head("Cause", "Smallest size that this drive would show (3 sigma)"), rows) if rows else ""
-
-
-def _head(*cells: str) -> str:
-    return "<tr>" + "".join(f'<th scope="col">{cell}</th>' for cell in cells) + "</tr>"
-
-
-def _row(first: str, *cells: str) -> str:
-    return f'<tr><th scope="row">{first}</th>' + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+    rows = [row(f"<code>{name}</code>", f"{size:.3g}") for name, size in d.visible.items()]
+    return table(header("Cause", "Smallest size that this drive would show (3 sigma)"), rows) if rows else ""
 
 
 __all__: Sequence[str] = ["diagnosis_page", "write_diagnosis_report"]

@@ -7,7 +7,7 @@ import numpy as np
 from localization.diagnosis.diagnose import Examined
 from localization.diagnosis.findings import Diagnosis
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS
-from localization.plots import Axes, Figure, _svg
+from localization.plots import Axes, Figure, svg
 from localization.report_svg import COLOURS, Size
 from motion_models.se2 import FloatArray
 
@@ -33,7 +33,7 @@ def discrepancy_svg(found: Examined, size: Size) -> str:
             axes.set_ylabel(f"{_NAMES[CHANNELS[c]]} [{CHANNEL_UNITS[c]}]")
         panels[-1].set_xlabel("time since the first window [s]" if found.diagnosis.windows and seconds.any() else "maneuver")
 
-    return _svg(f"discrepancy-{size.name}", size.width_in, 1.35 * len(shown) + 0.5, draw)
+    return svg(f"discrepancy-{size.name}", size.width_in, 1.35 * len(shown) + 0.5, draw)
 
 
 def dependence_svg(found: Examined, size: Size) -> str:
@@ -54,7 +54,7 @@ def dependence_svg(found: Examined, size: Size) -> str:
         panels[-1][0].set_xlabel("driven in the window [m]")
         panels[-1][1].set_xlabel("turned in the window [rad]")
 
-    return _svg(f"dependence-{size.name}", size.width_in, 1.6 * len(shown) + 0.5, draw)
+    return svg(f"dependence-{size.name}", size.width_in, 1.6 * len(shown) + 0.5, draw)
 
 
 def gain_svg(d: Diagnosis, size: Size) -> str:
@@ -69,7 +69,7 @@ def gain_svg(d: Diagnosis, size: Size) -> str:
         axes.set(yticks=range(len(d.findings)), yticklabels=[f.cause for f in d.findings], xlabel="held-out discrepancy taken off [%]")
         axes.invert_yaxis()
 
-    return _svg(f"gain-{size.name}", size.width_in, 0.4 * len(d.findings) + 0.7, draw)
+    return svg(f"gain-{size.name}", size.width_in, 0.4 * len(d.findings) + 0.7, draw)
 
 
 def _band(axes: Axes, seconds: FloatArray, width: FloatArray) -> None:

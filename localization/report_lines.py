@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,9 +49,7 @@ class Line:
     @property
     def words(self) -> str:
         """As a sentence says it."""
-        estimator = self.result.run.estimator
-        name = _WORDS.get(estimator, estimator)
-        return name if self.model is None else f"{name} with {self.model}"
+        return words_of(self.result.run.estimator, self.result.run.model)
 
     @property
     def error(self) -> float | None:
@@ -73,18 +71,41 @@ class Line:
         return points if alignment is None else se2.transform(alignment, points)
 
 
+def words_of(estimator: str, model: str) -> str:
+    """An estimator and its motion model as a sentence says them."""
+    name = _WORDS.get(estimator, estimator)
+    return name if estimator == WHEELLESS else f"{name} with {model}"
+
+
+def capitalised(text: str) -> str:
+    """The first letter of a sentence, but for names that are what one types."""
+    return "Dead" + text[4:] if text.startswith("dead ") else text
+
+
+def joined(parts: Sequence[str], last: str = "and") -> str:
+    """a, b and c."""
+    return f"{', '.join(parts[:-1])} {last} {parts[-1]}" if len(parts) > 1 else "".join(parts)
+
+
+def estimator_colours(estimators: Iterable[str]) -> dict[str, str]:
+    """Names of colours: usual estimators always have the same one."""
+    colours = dict(_COLOURS)
+    spare = iter(_SPARE_COLOURS)
+    for estimator in estimators:
+        if estimator not in colours:
+            colours[estimator] = next(spare, "grey")
+    return colours
+
+
 def make_lines(results: Sequence[Result]) -> list[Line]:
     """Lines in the order of the results; of estimators that use no wheels only the first run is kept, the others are its copies."""
     models: list[str] = []
-    colours = dict(_COLOURS)
-    spare = iter(_SPARE_COLOURS)
+    colours = estimator_colours(result.run.estimator for result in results)
     lines: list[Line] = []
     for result in results:
         run = result.run
         if run.estimator == WHEELLESS and any(line.result.run.estimator == WHEELLESS for line in lines):
             continue
-        if run.estimator not in colours:
-            colours[run.estimator] = next(spare, "grey")
         if run.estimator != WHEELLESS and run.model not in models:
             models.append(run.model)
         style = 0 if run.estimator == WHEELLESS else models.index(run.model)

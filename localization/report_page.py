@@ -1,11 +1,14 @@
-"""The report's page around its parts: style sheet and words that are the same in every report."""
+"""What all reports have in common: the page around the parts, its style sheet, sections and figures, and how it gets onto the disk."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from html import escape
+from pathlib import Path
 
+from localization.errors import OutputError
 from localization.report_lines import Line
-from localization.report_svg import COLOURS, DARK_COLOURS
+from localization.report_svg import COLOURS, DARK_COLOURS, NARROW, WIDE
 
 _PAPER = {"paper": "#ffffff", "card": "#f6f7f8", "accent": "#005a8c"}
 _DARK_PAPER = {"paper": "#14171a", "card": "#1d2125", "accent": "#7cc4f5"}
@@ -24,6 +27,7 @@ small,figcaption,.facts{color:var(--soft);font-size:.86rem}
 .verdict p{max-width:none;margin:.3rem 0}
 .verdict{padding:.6rem 1rem;margin:1.2rem 0;max-width:none}
 figure{margin:0}
+figure+.scroll{margin-top:1.2rem}
 figcaption{max-width:46rem;margin-top:.4rem}
 figure>svg{display:block;width:100%;height:auto}
 figure>svg text{font-family:inherit!important}
@@ -37,6 +41,7 @@ th:first-child,td:first-child{text-align:left;padding-left:0;position:sticky;lef
 .bar{display:block;height:4px;margin:3px 0 0 auto;min-width:2px}
 .name{white-space:nowrap}
 .badge{background:var(--accent);color:var(--paper);border-radius:3px;padding:0 .35rem;font-size:.75rem;vertical-align:.1em}
+.badge{white-space:nowrap}
 .badge.soft{background:none;color:var(--accent);box-shadow:inset 0 0 0 1px}
 .swatch{width:30px;height:8px;margin-right:.45rem;vertical-align:.12em}
 .legend{display:flex;flex-wrap:wrap;gap:.15rem 1.1rem;margin:.2rem 0 .5rem;padding:0;list-style:none;font-size:.9rem}
@@ -71,39 +76,64 @@ h2{break-after:avoid}figure,tr,.verdict{break-inside:avoid}
 }
 """
 
-TERMS = (
-    (
-        "ATE",
-        "Absolute trajectory error: the whole path is laid onto the reference as well as a rigid motion can, then the root mean "
-        "square of what remains is taken. It tells how good the shape of the whole path is.",
-    ),
-    (
-        "RPE",
-        "Relative pose error: over pieces of path of 1, 2, 5, 10 m and so on, the error at the end of each piece per metre "
-        "driven. It tells how fast errors grow, wherever they began.",
-    ),
-    (
-        "Relations",
-        "Pairs of moments whose relative pose was verified by hand. The error is that of the estimated motion between them; "
-        "relations that span little time test the odometry, long ones that close a loop test the whole path.",
-    ),
-    (
-        "NEES",
-        "Normalised estimation error squared: the true error measured in the sigmas that the estimator claims. The mean of an "
-        "honest one is 3, for x, y and heading; much more is overconfident, much less is timid. Errors along one drive hang "
-        "together, so one drive between 0.2 and 9 proves nothing.",
-    ),
-    (
-        "NIS",
-        "Normalised innovation squared: how far each scan disagrees with the prediction, in the sigmas of both. It needs no "
-        "reference, and its mean should be 3, too. A good NIS alone does not prove the path right: errors that scan and wheels "
-        "share do not show in it.",
-    ),
-    (
-        "Ellipses",
-        "Two sigmas of the position since the start, as the estimator claims it. The robot should be inside in 86 of 100 cases.",
-    ),
-)
+
+def html_page(title: str, parts: Iterable[str], lines: Sequence[Line] = ()) -> str:
+    """The whole page of its parts, of which empty ones are left out. It loads nothing and runs no script. ``lines``: those that a legend
+    can hide."""
+    body = "\n".join(part for part in parts if part)
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; img-src data:\">\n"
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(title)}</title>\n<style>\n{style_sheet(lines)}</style>\n</head>\n"
+        f"<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
+    )
+
+
+def opening(title: str, facts: str, sentences: Sequence[str]) -> list[str]:
+    """What every report begins with: its title, one line of facts, and the verdict, its first sentence first."""
+    first, rest = escape(sentences[0]), " ".join(map(escape, sentences[1:]))
+    return [
+        f"<h1>{escape(title)}</h1>",
+        f'<p class="facts">{escape(facts)}</p>',
+        f'<div class="verdict"><p><b>{first}</b></p><p>{rest}</p></div>',
+    ]
+
+
+def section(title: str, content: str) -> str:
+    """Nothing at all where there is no ``content``."""
+    return f"<section>\n<h2>{title}</h2>\n{content}\n</section>" if content else ""
+
+
+def figure(legend: str, pictures: Sequence[str], title: str, caption: str) -> str:
+    """``pictures``: the SVG for wide pages and the one for phones."""
+    drawn = [
+        svg.replace("<svg", f'<svg class="{size.name}" role="img" aria-label="{title}"', 1)
+        for svg, size in zip(pictures, (WIDE, NARROW), strict=True)
+    ]
+    return f"<figure>\n{legend}{drawn[0]}\n{drawn[1]}\n<figcaption>{caption}</figcaption>\n</figure>"
+
+
+def bullets(items: Iterable[str]) -> str:
+    """A list of plain texts; "" if there are none."""
+    listed = "".join(f"<li>{escape(item)}</li>" for item in items)
+    return f"<ul>{listed}</ul>" if listed else ""
+
+
+def glossary(terms: Iterable[tuple[str, str]]) -> str:
+    """How to read a report."""
+    return section("How to read this", '<dl class="terms">' + "".join(f"<dt>{term}</dt><dd>{text}</dd>" for term, text in terms) + "</dl>")
+
+
+def write_new(path: str | Path, content: bytes) -> None:
+    """Raises `OutputError` if there is such a file already or it cannot be written."""
+    try:
+        with open(path, "xb") as file:
+            file.write(content)
+    except FileExistsError as error:
+        raise OutputError(f"'{path}' exists already. Remove it or choose another name.") from error
+    except OSError as error:
+        raise OutputError(f"'{path}' cannot be written: {error.strerror}.") from error
 
 
 def style_sheet(lines: Sequence[Line]) -> str:

@@ -15,7 +15,19 @@ _MINUS = "\N{MINUS SIGN}"
 _BEST = ' <span class="badge">best</span>'
 _NEAR = ' <span class="badge soft">as good</span>'
 REFERENCE_SWATCH = '<svg class="swatch" viewBox="0 0 30 8" aria-hidden="true"><path d="M1 4H29" stroke="var(--ink)"/></svg>'
-_UNITS = (("_rad_per_s", "rad/s"), ("_deg_per_s", "deg/s"), ("_m_per_s", "m/s"), ("_rad", "rad"), ("_deg", "deg"), ("_m", "m"), ("_s", "s"))
+_UNITS = (
+    ("_percent", "%"),
+    ("_deg_per_m", "deg/m"),
+    ("_rad_per_s", "rad/s"),
+    ("_deg_per_s", "deg/s"),
+    ("_m_per_s", "m/s"),
+    ("_rad", "rad"),
+    ("_deg", "deg"),
+    ("_m2", "m²"),
+    ("_deg2", "deg²"),
+    ("_m", "m"),
+    ("_s", "s"),
+)
 
 
 @dataclass(frozen=True)
@@ -87,12 +99,12 @@ def accuracy_table(lines: Sequence[Line], best: Line | None, near: Sequence[Line
     columns = _known([*_TRACK, *_RELATIONS, *_CONSISTENCY], lines)
     if not any(c.is_error for c in columns):
         columns = [_DRIVEN, *columns]
-    table = _rows(lines, columns, {**{line.number: _NEAR for line in near}, **({best.number: _BEST} if best else {})})
+    errors = _rows(lines, columns, {**{line.number: _NEAR for line in near}, **({best.number: _BEST} if best else {})})
     squares = _known(_SQUARES, lines)
     more = (
         f"<details><summary>Mean squares, as published for the benchmark</summary>{_rows(lines, squares, {})}</details>" if squares else ""
     )
-    return table + more
+    return errors + more
 
 
 def _known(columns: Sequence[Column], lines: Sequence[Line]) -> list[Column]:
@@ -110,13 +122,13 @@ def _rows(lines: Sequence[Line], columns: Sequence[Column], badges: Mapping[int,
             text = number(value, column.digits)
             if value is not None and value == smallest.get(i):
                 text = f"<b>{text}</b>"
-            cells.append(f"<td>{text}{_bar(line, value, known[0]) if i == 0 and column.is_error else ''}</td>")
+            cells.append(text + (_bar(line, value, known[0]) if i == 0 and column.is_error else ""))
         model = "any: it asks no wheels" if line.model is None else escape(line.model)
         title = f'<span class="name">{swatch(line)}<b>{escape(line.result.run.estimator)}</b></span>'
         name = f"{title}{badges.get(line.number, '')}<br><small>{model}</small>"
-        rows.append(f'<tr><th scope="row">{name}</th>{"".join(cells)}</tr>')
-    heads = "".join(f'<th scope="col">{c.title}<br><small>{c.unit}</small></th>' for c in columns)
-    return _table(f'<th scope="col">Estimator<br><small>motion model</small></th>{heads}', rows)
+        rows.append(row(name, *cells))
+    heads = [f"{c.title}<br><small>{c.unit}</small>" for c in columns]
+    return table(header("Estimator<br><small>motion model</small>", *heads), rows)
 
 
 def _bar(line: Line, value: float | None, values: Sequence[float]) -> str:
@@ -174,18 +186,28 @@ def _by_name(lines: Sequence[Line], cells: Mapping[int, Mapping[str, str]], unit
     shown = [line for line in lines if cells[line.number]]
     if not names:
         return ""
-    heads = "".join(f'<th scope="col">{swatch(line)}{escape(line.label)}</th>' for line in shown)
+    heads = header(*(swatch(line) + escape(line.label) for line in shown))
     rows = []
     for name in names:
         unit_text = unit(name) if unit else ""
         title = (
             f"<code>{escape(name).replace('_', '_<wbr>')}</code><br><small>{unit_text}</small>" if unit else escape(name.replace("_", " "))
         )
-        values = "".join(f"<td>{cells[line.number].get(name, MISSING)}</td>" for line in shown)
-        rows.append(f'<tr><th scope="row">{title}</th>{values}</tr>')
-    return _table(f"<td></td>{heads}", rows)
+        rows.append(row(title, *(cells[line.number].get(name, MISSING) for line in shown)))
+    return table(f"<td></td>{heads}", rows)
 
 
-def _table(head: str, rows: Sequence[str]) -> str:
+def header(*cells: str) -> str:
+    """A table's first row, of HTML."""
+    return "".join(f'<th scope="col">{cell}</th>' for cell in cells)
+
+
+def row(first: str, *cells: str) -> str:
+    """A row of HTML, the first cell its title."""
+    return f'<tr><th scope="row">{first}</th>' + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+
+
+def table(head: str, rows: Sequence[str]) -> str:
+    """Of a `header` and rows (`row`)."""
     body = "\n".join(rows)
     return f'<div class="scroll" tabindex="0"><table><thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table></div>'

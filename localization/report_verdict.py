@@ -17,7 +17,7 @@ from scipy.stats import chi2, wilcoxon
 from localization.consistency import mean_band
 from localization.evaluate import relation_errors
 from localization.references import ReferenceTrack, Relations
-from localization.report_lines import DEAD_RECKONING, WHEELLESS, Line, baseline_line, best_line, make_lines
+from localization.report_lines import DEAD_RECKONING, WHEELLESS, Line, baseline_line, best_line, capitalised, joined, make_lines
 from localization.score import Result
 from localization.trajectory import IntArray
 from motion_models.se2 import FloatArray
@@ -102,10 +102,10 @@ def _ranking(lines: Sequence[Line], best: Line, equals: Sequence[Line], referenc
     measure = _measure(best, reference)
     if len(lines) == 1:
         alone = "Nothing else was run, so nothing tells whether another pair does better."
-        return [f"{_upper(best.words)}: {metres(best.error)} {measure}.", alone]
+        return [f"{capitalised(best.words)}: {metres(best.error)} {measure}.", alone]
     near, unproven = [x for x in equals if is_close(x, best)], [x for x in equals if not is_close(x, best)]
     found = "has the smallest error" if equals else "is best"
-    sentences = [f"{_upper(best.words)} {found}: {metres(best.error)} {measure}{_gains(lines, best)}."]
+    sentences = [f"{capitalised(best.words)} {found}: {metres(best.error)} {measure}{_gains(lines, best)}."]
     if near:
         sentences.append(f"Within 2 % of it: {_listed(near)}.")
     if unproven:
@@ -114,7 +114,7 @@ def _ranking(lines: Sequence[Line], best: Line, equals: Sequence[Line], referenc
 
 
 def _listed(lines: Sequence[Line]) -> str:
-    return _and([f"{line.words} ({metres(_error(line))})" for line in lines])
+    return joined([f"{line.words} ({metres(_error(line))})" for line in lines])
 
 
 def _measure(best: Line, reference: ReferenceTrack | Relations) -> str:
@@ -136,7 +136,7 @@ def _gains(lines: Sequence[Line], best: Line) -> str:
         less = 100.0 * (1.0 - _error(best) / part.error)
         rounded = f"{math.floor(less)}" if less < 99.0 else f"{math.floor(10.0 * min(less, 99.9)) / 10.0:.1f}"  # never up to all of it
         gains.append(f"{rounded} % less than {part.words} ({metres(part.error)})")
-    return ", " + _and(gains) if gains else ""
+    return ", " + joined(gains) if gains else ""
 
 
 def _coverage(best: Line) -> list[str]:
@@ -150,7 +150,7 @@ def _honesty(line: Line, whose: str = "Its covariances") -> list[str]:
     """Does the run know how wrong it is? By NIS over many scans; by NEES only where even a single drive is enough to say no."""
     run, nees = line.result.run, line.result.nees_mean
     if run.trajectory.covariances is None:
-        return [f"{_upper(line.words)} gives no covariance."]
+        return [f"{capitalised(line.words)} gives no covariance."]
     known = run.nis[np.isfinite(run.nis)]
     sayings = []
     if len(known) >= 20:
@@ -163,13 +163,13 @@ def _honesty(line: Line, whose: str = "Its covariances") -> list[str]:
         sayings.append(_judge("NEES", nees, mean_band(1, _DOF), "errors"))
     found = {word: [text for verdict_, text in sayings if verdict_ == word] for word in ("over", "under", "fits")}
     if found["over"]:
-        also = f" ({_and([*found['under'], *found['fits']])})" if found["under"] or found["fits"] else ""
-        return [f"{whose} are overconfident: {_and(found['over'])}{also}. Enlarge them before anything trusts them."]
+        also = f" ({joined([*found['under'], *found['fits']])})" if found["under"] or found["fits"] else ""
+        return [f"{whose} are overconfident: {joined(found['over'])}{also}. Enlarge them before anything trusts them."]
     if found["under"]:
-        also = f" ({_and(found['fits'])})" if found["fits"] else ""
-        return [f"{whose} are larger than need be: {_and(found['under'])}{also}; safe to fuse, but given less weight than is due."]
+        also = f" ({joined(found['fits'])})" if found["fits"] else ""
+        return [f"{whose} are larger than need be: {joined(found['under'])}{also}; safe to fuse, but given less weight than is due."]
     if found["fits"]:
-        return [f"Nothing speaks against {_lower(whose)}: {_and(found['fits'])}."]
+        return [f"Nothing speaks against {_lower(whose)}: {joined(found['fits'])}."]
     return [f"{whose} could not be tested: that takes scans, or a reference with headings."]
 
 
@@ -230,15 +230,6 @@ def _end(line: Line) -> tuple[float, float] | None:
 def _error(line: Line) -> float:
     assert line.error is not None
     return line.error
-
-
-def _and(parts: Sequence[str]) -> str:
-    return ", ".join(parts[:-1]) + " and " + parts[-1] if len(parts) > 1 else "".join(parts)
-
-
-def _upper(text: str) -> str:
-    """The first letter of a sentence, but for names that are what one types."""
-    return "Dead" + text[4:] if text.startswith("dead ") else text
 
 
 def _lower(text: str) -> str:

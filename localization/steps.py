@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -99,7 +100,8 @@ class Stepper:
             self._wheels.set_cg(event)
         elif isinstance(event, Scan):
             self._empty_scans += not len(event.points)
-            self._scans.append(event)
+            # one that was overtaken goes where it belongs, if that still waits
+            self._scans.insert(bisect.bisect_right(self._scans, event.stamp_ns, key=lambda scan: scan.stamp_ns), event)
         yield from self._ready(is_last=False)
 
     def finish(self) -> Iterator[Step]:

@@ -1,30 +1,46 @@
-"""Which directions in a model's parameters an estimator may correct on the way, and how far they may be off."""
+"""Which directions in a model's parameters an estimator may correct on the way, and how far they may be off.
+
+What is corrected is named by a form: ``none``, ``constant``, ``cg_field``, or names of single corrections joined by ``+`` (where
+``constant`` may be one of them): ``mu_ratio+warp``, ``constant+cg_offset_x+cg_offset_y``.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 
 from motion_models.base import MotionModel
 from motion_models.errors import ModelError
+from motion_models.friction import FrictionModel
+from motion_models.friction_corrected import CorrectedFriction
 from motion_models.se2 import FloatArray
 
-Form = Literal["none", "constant", "cg_field"]
-FORMS: tuple[Form, ...] = get_args(Form)
+Form = str
+FORMS: tuple[Form, ...] = ("none", "constant", "cg_field")
 
 # How differently robots of one type turn on different floors and with other loads: relative for what scales a turn (Clearpath's own
 # multipliers for one Husky range from 1.5 to 1.9; terrains differ by a quarter), absolute [m] for where it turns about.
 _TURNING, _CENTRE_X, _CENTRE_Y = 0.15, 0.05, 0.03
 _FORGOTTEN_AFTER_S = 3600.0
 _WARP = 0.15  # VaultBot's chassis, as its rotations show it, moves 13 % of m g / 4 to two opposite wheels
+_MU_RATIO = 0.3
+
+# Least turn that teaches, as track over radius. On gentler arcs tyres creep, of which what was measured in place says nothing; physics
+# does, but where a robot drives straight the two sides differ by their noise alone, and that would pass for knowledge.
+_IN_PLACE, _NOT_STRAIGHT = 0.25, 0.02
 
 # The rotations of Ebersole 2016, Ch. 4, to which the coefficients of `SkidSteer` were fitted: where the CG was, and the scatter about the
 # fits of k, x_CR and y_CR (`regressions.skid_steer_fit`). The covariance of the fits needs no more.
 _GRID_X, _GRID_Y = np.arange(-3, 7) * 0.02, np.arange(-3, 4) * 0.01
 _SCATTER_K, _SCATTER_X_CR, _SCATTER_Y_CR = 0.014517, 0.011514, 0.0059057
+
+_SINGLE = (
+    *("wheel_separation_multiplier", "k_0", "x_cr_0", "y_cr_0", "y_icr_left", "y_icr_right", "x_icr", "rotation_scale", "x_cr"),
+    *("mu_ratio", "tracked_x", "tracked_y", "warp", "cg_offset_x", "cg_offset_y"),
+)
+_ONLY_BY_NAME = ("warp", "cg_offset_x", "cg_offset_y")
 
 
 @dataclass(frozen=True)
@@ -50,8 +66,8 @@ class Corrections:
     """(k, k) at first."""
     walk_cov: FloatArray
     """(k, k) growth per second of motion; it may be singular. What does not walk is remembered."""
-    of_turns: bool = False
-    """The model's turning was measured on turns in place; on gentle arcs tyres creep, and these say nothing of it."""
+    least_turn: float = 0.0
+    """Track over radius below which a motion says nothing of the corrections."""
 
     @property
     def sigmas(self) -> FloatArray:
@@ -60,19 +76,27 @@ class Corrections:
 
 
 def check_forms(names: Sequence[str]) -> list[Form]:
-    """``names`` as forms. Raises `ModelError` for one that does not exist."""
+    """``names`` as forms, each once. Raises `ModelError` for one that does not exist."""
     for name in names:
-        if name not in FORMS:
-            raise ModelError(f"no form of corrections '{name}'; there are {', '.join(FORMS)}.")
-    return [form for name in names for form in FORMS if form == name]
+        parts = name.split("+")
+        if name not in FORMS and not all(part in _SINGLE or (part == "constant" and len(parts) > 1) for part in parts):
+            raise ModelError(
+                f"no form of corrections '{name}'; there are {', '.join(FORMS)}, and names joined by + of {', '.join(_SINGLE)}."
+            )
+    return list(dict.fromkeys(names))
+
+
+def correctable(model: MotionModel, form: Form) -> MotionModel:
+    """``model`` with all parameters that corrections of ``form`` may change: the friction model's CG may be off, too."""
+    return CorrectedFriction(model) if isinstance(model, FrictionModel) and form != "none" else model
 
 
 def corrections(model: MotionModel, form: Form) -> Corrections:
-    """The corrections of ``form`` to ``model``: none, ``constant``, or ``cg_field``.
+    """The corrections of ``form`` to ``model``: none, ``constant``, ``cg_field``, or names joined by ``+``.
 
     ``constant``: rotation scaling and centre of rotation as numbers that slowly change. ``cg_field``: the coefficients of their regressions
     on the CG; for the friction model, whose field is its physics, the chassis' warp besides; a model without such regressions has nothing
-    but its constants. Raises `ModelError` for a form that does not exist.
+    but its constants. Raises `ModelError` for a form that does not exist, or not for this model.
 
     >>> from motion_models import load_robot, make_model
     >>> found = corrections(make_model("skid_steer", load_robot("vaultbot")), "constant")
@@ -82,16 +106,29 @@ def corrections(model: MotionModel, form: Form) -> Corrections:
     check_forms([form])
     if form == "cg_field" and model.name == "skid_steer":
         return _regressions(model)
-    found = _constants(model) if form != "none" else ()
-    if form == "cg_field" and model.name == "friction":
-        found += (Correction("warp", _WARP, {"warp": 1.0}),)
+    found = _named(model, form)
     directions = np.zeros((len(model.param_names), len(found)))
     for column, correction in enumerate(found):
         for name, rate in correction.along.items():
             directions[model.param_names.index(name), column] = rate
     sigmas = np.array([c.sigma for c in found])
     walks = sigmas / np.sqrt(_FORGOTTEN_AFTER_S)  # after an hour the first uncertainty has come back once more
-    return Corrections(tuple(c.name for c in found), directions, np.diag(sigmas**2), np.diag(walks**2), model.name == "skid_steer")
+    least = {"skid_steer": _IN_PLACE, "friction": _NOT_STRAIGHT}.get(model.name, 0.0)
+    return Corrections(tuple(c.name for c in found), directions, np.diag(sigmas**2), np.diag(walks**2), least)
+
+
+def _named(model: MotionModel, form: Form) -> tuple[Correction, ...]:
+    """The single corrections that ``form`` stands for."""
+    available = {c.name: c for c in _singles(model)}
+    constant = [name for name in available if name not in _ONLY_BY_NAME]
+    whole = {"none": [], "constant": constant, "cg_field": [*constant, *(["warp"] if "warp" in available else [])]}
+    names = whole.get(form, [name for part in form.split("+") for name in (constant if part == "constant" else [part])])
+    for name in names:
+        if name not in available:
+            raise ModelError(f"no correction '{name}' of {model.name}; there are {', '.join(available) or 'none'}.")
+        if lost := [p for p in available[name].along if p not in model.param_names]:
+            raise ModelError(f"{model.name} has no parameter '{lost[0]}' as it is: pass it through `correctable` first.")
+    return tuple(available[name] for name in dict.fromkeys(names))
 
 
 def regression_cov(with_misfit: bool = False) -> FloatArray:
@@ -123,11 +160,11 @@ def _regressions(model: MotionModel) -> Corrections:
     floor[0:3, 0] = _TURNING * model.nominal[0:3]  # another floor scales k at every CG
     floor[3, 1], floor[5, 2] = _CENTRE_X, _CENTRE_Y
     spread = floor @ floor.T
-    return Corrections(model.param_names, np.eye(n), regression_cov(with_misfit=True) + spread, spread / _FORGOTTEN_AFTER_S, True)
+    return Corrections(model.param_names, np.eye(n), regression_cov(with_misfit=True) + spread, spread / _FORGOTTEN_AFTER_S, _IN_PLACE)
 
 
-def _constants(model: MotionModel) -> tuple[Correction, ...]:
-    """Rotation scaling, and the centre of rotation where the model has one."""
+def _singles(model: MotionModel) -> tuple[Correction, ...]:
+    """Rotation scaling, the centre of rotation where the model has one; for the friction model its physics."""
     of = dict(zip(model.param_names, model.nominal, strict=True))
 
     def own(name: str, sigma: float) -> Correction:
@@ -145,5 +182,6 @@ def _constants(model: MotionModel) -> tuple[Correction, ...]:
         sideways = {name: -of["wz_" + name[3:]] for name in ("vy_left", "vy_right")}
         return Correction("rotation_scale", _TURNING, turning), Correction("x_cr", _CENTRE_X, sideways)
     if model.name == "friction":
-        return own("mu_ratio", 0.3), own("tracked_x", _CENTRE_X), own("tracked_y", _CENTRE_Y)
+        centre = own("tracked_x", _CENTRE_X), own("tracked_y", _CENTRE_Y)
+        return own("mu_ratio", _MU_RATIO), *centre, own("warp", _WARP), own("cg_offset_x", _CENTRE_X), own("cg_offset_y", _CENTRE_Y)
     return ()

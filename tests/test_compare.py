@@ -99,8 +99,11 @@ def test_means_and_differences_are_told(table, capsys, tmp_path):
     assert len(content["differences"]) == 1
     assert compare(tmp_path / "t.csv", "--estimator", "odometry", "--model", "diff_drive,skid_steer") == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert re.search(r"(skid_steer|diff_drive) odometry and (skid_steer|diff_drive) odometry are not told apart", said)
-    assert "3 logs cannot show it: p is at least 0.25" in said
+    assert re.search(
+        r"Dead reckoning with (\w+) and dead reckoning with (\w+) are not told apart: the first is better on \d of 3 logs", said
+    )
+    assert "3 logs cannot show it: p is at least 0.25 for one pair. Take at least 6." in said
+    assert (tmp_path / "t.html").read_text().startswith("<!DOCTYPE html>")
 
 
 def test_what_is_done_is_not_done_again(table, tmp_path, asked, capsys):
@@ -137,7 +140,10 @@ def test_a_log_that_is_broken_is_reported_and_the_others_finished(table, tmp_pat
     assert "no such file" in rows[-1]["error"]
     said = " ".join(capsys.readouterr().out.split())
     assert "absent.mcap" in said
-    assert "4 results of 2 logs failed" in said
+    assert "4 of 10 runs failed, on 2 logs." in said
+    report = (tmp_path / "t.html").read_text()
+    assert "no such file" in report
+    assert report.count("failed</td>") == 4
     assert {r["ate_rmse_m"] for r in rows[2:8]} == {r["ate_rmse_m"] for r in rows_of(table)}
     assert compare(tmp_path / "u.csv", of=[absent]) == 2
     assert "none of 1 logs could be compared" in " ".join(capsys.readouterr().err.split())
@@ -202,23 +208,64 @@ def test_files_that_are_no_tables_are_not_overwritten(tmp_path, capsys):
         assert "is no table of a comparison" in capsys.readouterr().err
 
 
-def test_parquet_holds_the_same(table, tmp_path):
+def test_parquet_holds_the_same_and_is_gone_on_with(table, tmp_path, asked):
+    parquet = pytest.importorskip("pyarrow.parquet", reason="the extra 'parquet' is not installed")
+    out = tmp_path / "table.parquet"
+    assert compare(out, of=logs(2)) == 0
+    assert compare(out) == 0  # a log more: it alone is run
+    assert [job.log for job in asked] == [str(path) for path in logs(3)]
+    asked.clear()
+    content = out.read_bytes()
+    assert compare(out) == 0
+    assert asked == []
+    assert out.read_bytes() == content
+    found = parquet.read_table(out)  # as others read it
+    for row, expected in zip(found.to_pylist(), rows_of(table), strict=True):
+        assert {name: "" if value is None else str(value) for name, value in row.items()} == expected  # floats to the last digit
+    assert str(found.schema.field("ate_rmse_m").type) == "double"
+    assert str(found.schema.field("n_matched").type) == "int64"
+    assert str(found.schema.field("error").type) == "string"
+    assert (tmp_path / "table.html").exists()
+
+
+def test_parquet_with_failures_is_read_again(tmp_path):
+    pytest.importorskip("pyarrow", reason="the extra 'parquet' is not installed")
     job = jobs(2)
-    rows = [row for j in job for row in failed_rows(j, "why")]
-    try:
-        import pyarrow.parquet
-    except ImportError:
-        with pytest.raises(OutputError, match="Parquet needs pyarrow"):
-            Table(tmp_path / "t.parquet")
-        return
     out = Table(tmp_path / "t.parquet")
-    out.put(rows)
-    out.put([dict(row, status="ok", ate_rmse_m=0.1, n_matched=3) for row in rows[:1]])
+    out.put([row for j in job for row in failed_rows(j, "why")])
+    out.save(job)  # no number yet
+    assert [row["error"] for row in Table(tmp_path / "t.parquet").rows(job)] == ["why"] * 2
+    out.put([dict(row, status="ok", ate_rmse_m=0.1, n_matched=3) for row in out.rows(job)[:1]])
     out.save(job)
-    assert Table(tmp_path / "t.parquet").rows(job) == out.rows(job) or pyarrow.parquet.read_table(tmp_path / "t.parquet").num_rows == 4
-    (tmp_path / "u.parquet").write_bytes(b"nonsense")
-    with pytest.raises(OutputError, match="is no table"):
-        Table(tmp_path / "u.parquet")
+    again = Table(tmp_path / "t.parquet").rows(job)
+    assert again == [dict(row, ate_rmse_m=row.get("ate_rmse_m"), n_matched=row.get("n_matched")) for row in out.rows(job)]
+    for content in (b"nonsense", b"PAR1" + bytes(20) + b"PAR1", out.path.read_bytes()[:-9]):
+        (tmp_path / "u.parquet").write_bytes(content)
+        with pytest.raises(OutputError, match=r"u\.parquet"):
+            Table(tmp_path / "u.parquet")
+
+
+def test_parquet_names_its_extra_where_it_is_missing(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    assert compare(tmp_path / "t.parquet") == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "pip install 'skidloc[parquet]'" in said
+    assert "Or name a .csv." in said
+
+
+def test_a_folder_gets_table_and_report(table, tmp_path, capsys):
+    out = tmp_path / "results"
+    assert compare(out) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["report.html", "table.csv"]
+    assert (out / "table.csv").read_bytes() == table.read_bytes()
+    report = (out / "report.html").read_bytes()
+    assert compare(out) == 0
+    assert (out / "report.html").read_bytes() == report
+    capsys.readouterr()
+    (out / "report.html").write_text("<title>Replay of a log</title>")
+    assert compare(out) == 2
+    assert "is no report of a comparison" in capsys.readouterr().err
+    assert (out / "report.html").read_text() == "<title>Replay of a log</title>"
 
 
 def made_up(table):

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from localization.diagnosis.findings import Diagnosis
-from tests.diagnosis_drives import TYPICAL, bag, look
+from tests.diagnosis_drives import ONE_SIDED, TYPICAL, bag, look
 
-ONE_SIDED = ("payload", "encoder_dropout", "scrub", "rolling_resistance")
 CASES = [(cause, size if cause in ONE_SIDED or i % 2 == 0 else -size, 300 + i) for i, (cause, size) in enumerate(TYPICAL.items())]
 
 Diagnosed = Callable[[Mapping[str, float], int, str], Diagnosis]

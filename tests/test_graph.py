@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 from localization.errors import EstimatorError
@@ -398,6 +401,86 @@ def test_positions_and_closures_that_are_none_are_refused(steps):
         graph()[0].add_closure(0, 1, Motion(np.zeros(3), SURE))
     with pytest.raises(EstimatorError, match="lidar_z"):
         graph(learn=("lidar_z",))
+
+
+HOSTILE = st.sampled_from([math.nan, math.inf, -math.inf, 1e300, -1e300, 1e150, 0.0, 1e-300, -1.0, 0.1])
+
+
+def drawn(data, *shape):
+    count = int(np.prod(shape))
+    return np.array(data.draw(st.lists(HOSTILE, min_size=count, max_size=count))).reshape(shape)
+
+
+@pytest.mark.parametrize("size", [math.nan, math.inf, 1e150, 1e300])
+@pytest.mark.parametrize("where", ["matrix", "right side"])
+def test_a_factor_too_large_to_compute_with_is_our_error(size, where):
+    good = [Block((0,), (np.eye(2),), np.zeros(2)), Block((0, 1), (-np.eye(2), np.eye(2)), np.ones(2))]
+    row = np.array([[size, 0.0]]) if where == "matrix" else np.array([[1.0, 0.0]])
+    bad = Block((1,), (row,), np.array([1e300 if where == "matrix" else size]))
+    with contextlib.suppress(EstimatorError):
+        assert np.isfinite(solve([*good, bad], 2, 2)).all()
+    if not math.isfinite(size):
+        with pytest.raises(EstimatorError, match="finite"):
+            solve([*good, bad], 2, 2)
+        with pytest.raises(EstimatorError, match="finite"):
+            Incremental(2).update([bad], [1])
+
+
+@given(st.data())
+@settings(max_examples=100, deadline=None)
+def test_no_numbers_in_factors_end_the_process(data):
+    """GTSAM takes matrices only, and gives finite numbers or our error."""
+    good = [Block((0,), (np.eye(2),), np.zeros(2)), Block((0, 1), (-np.eye(2), np.eye(2)), np.ones(2))]
+    bad = data.draw(
+        st.sampled_from(
+            [
+                Block((0, 1), (drawn(data, 2, 2), drawn(data, 2, 2)), drawn(data, 2)),
+                Block((1,), (drawn(data, 1, 2),), drawn(data, 1)),
+                Block((0,), (np.eye(2),), drawn(data, 2)),
+            ]
+        )
+    )
+    with contextlib.suppress(EstimatorError):
+        assert np.isfinite(solve([*good, bad], 2, 2)).all()
+    with contextlib.suppress(EstimatorError):
+        assert np.isfinite(marginals([*good, bad], [0, 1], 2, 2)).all()
+    isam = Incremental(2)
+    isam.update(good, [0, 1])
+    with contextlib.suppress(EstimatorError):
+        isam.update([bad], [])
+        assert np.isfinite(isam.changes([0, 1])).all()
+        assert np.isfinite(isam.marginals([0, 1])).all()
+
+
+@given(st.data())
+@settings(max_examples=60, deadline=None)
+def test_no_input_makes_the_graph_non_finite(steps, data):
+    """Whatever the witnesses say, for every back end: our error, or a finite state, from which good steps go on."""
+    backend = data.draw(st.sampled_from(["fixed_lag", "batch", "isam2"]))
+    estimator, seer = graph(backend=backend, lag_nodes=5)
+    feed(estimator, seer, steps[:8])
+    step, seen = steps[8]
+    now, p = steps[7][0].end_ns, step.predicted
+    calls = {
+        "motion": lambda: estimator.step(replace(step, predicted=replace(p, delta=drawn(data, 3)))),
+        "covariance": lambda: estimator.step(replace(step, predicted=replace(p, cov=np.diag(drawn(data, 3))))),
+        "derivatives": lambda: estimator.step(replace(step, predicted=replace(p, d_params=drawn(data, *p.d_params.shape)))),
+        "clock": lambda: estimator.step(replace(step, d_clock=drawn(data, 3))),
+        "turn": lambda: estimator.step(replace(step, turn=Turn(*drawn(data, 3).tolist()))),
+        "lidar": lambda: estimator.step(step),
+        "position": lambda: estimator.add_position(now, drawn(data, 2), np.diag(drawn(data, 2))),
+        "closure": lambda: estimator.add_closure(steps[3][0].end_ns, now, Motion(drawn(data, 3), np.diag(drawn(data, 3)))),
+    }
+    for name in data.draw(st.lists(st.sampled_from(sorted(calls)), min_size=1, max_size=3)):
+        seer.next = Motion(drawn(data, 3), np.diag(drawn(data, 3))) if name == "lidar" else seen
+        with contextlib.suppress(EstimatorError):
+            calls[name]()
+        assert np.isfinite(estimator._now.pose).all()
+        assert np.isfinite(estimator._now.slow).all()
+        assert np.isfinite(estimator.params).all()
+    for step, seer.next in steps[9:12]:
+        with contextlib.suppress(EstimatorError):
+            assert np.isfinite(estimator.step(step).pose).all()
 
 
 # --- rebuilt from marginals

@@ -18,17 +18,17 @@ from rich.table import Table as Grid
 from localization.commands.common import check_new, write_json
 from localization.compare_job import OK, Job, Row, job_key, trials
 from localization.compare_pool import run_local
-from localization.compare_stats import Difference, Mean, differences, means
 from localization.compare_table import Table
+from localization.compare_verdict import Findings, against_best, closing, find, headline
 from localization.errors import EvaluationError, LogError
 from localization.estimators import check_estimator
 from localization.logs import TopicOverrides
+from localization.provenance import versions
+from localization.report_compare import CompareHead, check_report, write_comparison_report
 from localization.run import ReplayConfig
 from motion_models.corrections import check_forms
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
-
-_CERTAIN = 0.05
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,8 @@ class Compare:
     robot: str
     """Name of a shipped robot, or path of a robot TOML file."""
     out: Path
-    """Table, .csv or .parquet, one row per log and combination. What is in it already, and unchanged, is not computed again."""
+    """Folder for table.csv and report.html; or the table itself, .csv or .parquet, with the report beside it. What is in the table
+    already, and unchanged, is not computed again."""
     model: str = "diff_drive,skid_steer"
     """Motion models, separated by commas."""
     estimator: str = "odometry,ekf"
@@ -63,11 +64,13 @@ class Compare:
     def run(self, console: Console) -> None:
         if self.json is not None:
             check_new(self.json)
-        jobs, table = self._jobs(), Table(self.out)
+        table_path, report_path = places(self.out)
+        check_report(report_path)
+        jobs, table = self._jobs(), Table(table_path)
         left = [dataclasses.replace(job, trials=missing) for job in jobs if (missing := table.missing(job))]
         done = sum(len(job.trials) for job in jobs) - sum(len(job.trials) for job in left)
         if done:
-            console.print(f"{done} results are in {self.out} already", markup=False, soft_wrap=True)
+            console.print(f"{done} results are in {table_path} already", markup=False, soft_wrap=True)
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
         with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
             task = progress.add_task("logs", total=len(left))
@@ -79,7 +82,7 @@ class Compare:
                     console.print(f"[yellow]![/] {escape(job.log)}: {escape(reason)}", soft_wrap=True)
         if not left:
             table.save(jobs)
-        self._report(console, jobs, table.rows(jobs))
+        self._report(console, table, report_path, table.rows(jobs))
 
     def _jobs(self) -> list[Job]:
         robot, forms = load_robot(self.robot), check_forms(_names(self.corrections))
@@ -112,49 +115,45 @@ class Compare:
             return run_on_cluster(jobs, self.dask)
         return run_local(jobs, self.processes or os.cpu_count() or 1)
 
-    def _report(self, console: Console, jobs: Sequence[Job], rows: Sequence[Row]) -> None:
+    def _report(self, console: Console, table: Table, report: Path, rows: Sequence[Row]) -> None:
         failed = [row for row in rows if row["status"] != OK]
         if len(failed) == len(rows):
-            raise LogError(f"none of {len(jobs)} logs could be compared; the reasons are in {self.out}.")
-        found = means(rows, self.metric)
-        if not found:
+            logs = len({row["log"] for row in rows})
+            raise LogError(f"none of {logs} logs could be compared; the reasons are in {table.path}.")
+        found = find(rows, self.metric)
+        if not found.means:
             known = ", ".join(sorted({name for row in rows for name, value in row.items() if isinstance(value, float)}))
             raise EvaluationError(f"no result has a number '{self.metric}'; there are {known}.")
-        tested = differences(rows, self.metric)
         grid = Grid("", "logs", f"mean {self.metric}", "95 %", box=None, header_style="bold", pad_edge=False)
-        for m in sorted(found, key=lambda m: m.mean):
+        for m in found.means:
             grid.add_row(m.name, str(m.n), f"{m.mean:.4g}", f"{m.low:.4g} to {m.high:.4g}" if m.n > 1 else "")
         console.print(grid)
-        for sentence in sentences(found, tested, self.metric):
+        for sentence in (headline(found), *(against_best(mean, found) for mean in found.means[2:]), *closing(found)):
             console.print(sentence, markup=False, soft_wrap=True)
         if failed:
-            logs = len({row["log"] for row in failed})
-            console.print(f"{len(failed)} results of {logs} logs failed; the reasons are in {self.out}.", markup=False, soft_wrap=True)
+            console.print(f"The reasons of what failed are in {table.path}.", markup=False, soft_wrap=True)
+        head = CompareHead(load_robot(self.robot).name, self.reference or "the robot file's topic", table.path.name, versions())
+        write_comparison_report(report, head, found)
+        console.print(f"report: {report}", markup=False, soft_wrap=True)
         if self.json is not None:
-            write_json(self.json, self._content(found, tested, failed))
-
-    def _content(self, found: Sequence[Mean], tested: Sequence[Difference], failed: Sequence[Row]) -> dict[str, Any]:
-        return {
-            "metric": self.metric,
-            "means": [dataclasses.asdict(m) for m in found],
-            "differences": [dataclasses.asdict(d) for d in tested],
-            "failed": [{name: row[name] for name in ("log", "model", "estimator", "corrections", "error")} for row in failed],
-        }
+            write_json(self.json, _content(found))
 
 
-def sentences(found: Sequence[Mean], tested: Sequence[Difference], metric: str) -> list[str]:
-    """What can be said of the best, and what not."""
-    best = min(found, key=lambda m: m.mean).name
-    said = []
-    for d in (d for d in tested if best in (d.better, d.worse)):
-        other = d.worse if d.better == best else d.better
-        gap = f"{d.mean:.3g} ({d.low:.3g} to {d.high:.3g}) over {d.n} logs, p = {d.p_value:.2g}"
-        if d.better == best and d.p_value < _CERTAIN:
-            said.append(f"{best} is better than {other}: {metric} smaller by {gap}.")
-        else:
-            few = f" {d.n} logs cannot show it: p is at least {2.0 ** (1 - d.n):.2g}." if 2.0 ** (1 - d.n) > _CERTAIN else ""
-            said.append(f"{best} and {other} are not told apart: {gap}.{few}")
-    return said
+def places(out: Path) -> tuple[Path, Path]:
+    """Of the table and of the report: in the folder ``out``, or ``out`` itself and beside it."""
+    if out.is_dir() or not out.suffix:
+        return out / "table.csv", out / "report.html"
+    return out, out.with_suffix(".html")
+
+
+def _content(found: Findings) -> dict[str, Any]:
+    return {
+        "metric": found.metric,
+        "verdict": " ".join([headline(found), *closing(found)]),
+        "means": [dataclasses.asdict(m) for m in found.means],
+        "differences": [dataclasses.asdict(d) for d in found.tested],
+        "failed": [{name: row[name] for name in ("log", "model", "estimator", "corrections", "error")} for row in found.failed],
+    }
 
 
 def _names(text: str) -> list[str]:

@@ -25,7 +25,7 @@ from localization.logs import TopicOverrides, open_log
 from localization.online.core import Core, Pair, ReplayConfig
 from localization.online.node import Node, NodeConfig
 from localization.online.pace import Pace
-from localization.online.session import Files, Session, made_by
+from localization.online.session import Files, Session, View, made_by
 from localization.online.transport import Transport
 from localization.provenance import fingerprint
 from motion_models.corrections import check_forms
@@ -55,6 +55,10 @@ class Online:
     """New trajectory file, .tum, or .mcap with Odometry, TF and covariances. It gets its name at the end."""
     state: Path | None = None
     """File of the estimator's state, at most a second old; resumed at the start if it is there. Removed at the end of a log."""
+    view: Literal["terminal", "rerun"] = "terminal"
+    """Live picture: a line in the terminal, or rerun's viewer as well (extra `viz`)."""
+    view_file: Path | None = None
+    """New .rrd file to record rerun's picture to, instead of opening its viewer."""
     door: Literal["auto", "dds", "rclpy", "rospy"] = "auto"
     """Of live topics: ROS 2 by DDS itself (extra `ros2`), ROS 2 by rclpy, ROS 1 by rospy. `auto`: rclpy where it is sourced, else DDS."""
     domain: int = 0
@@ -67,19 +71,27 @@ class Online:
 
     def run(self, console: Console) -> None:
         rate, files, robot = parse_rate(self.rate), Files(self.out, self.state), load_robot(self.robot)
-        with Stop() as stop:
-            if self.log is not None:
-                self._play(console, self.log, rate, files, robot, stop)
-            else:
-                self._spin(console, files, robot, stop)
+        view = self._view()
+        try:
+            with Stop() as stop:
+                if self.log is not None:
+                    self._play(console, self.log, rate, files, robot, stop, view)
+                else:
+                    self._spin(console, files, robot, stop, view)
+        finally:
+            if view is not None:
+                view.close()
 
-    def _play(self, console: Console, path: Path, rate: float, files: Files, robot: Robot, stop: Stop) -> None:
+    def _play(self, console: Console, path: Path, rate: float, files: Files, robot: Robot, stop: Stop, view: View | None) -> None:
         log = open_log(path, robot, self.topic)
         has_lidar = log.sources.lidar is not None
         pair = self._pair(has_lidar)
         made = made_by(pair, robot, log.mounts, has_lidar, self.config, f"log {fingerprint(path)[:12]}")
         core = Core(pair, robot, log.mounts, has_lidar, self.config)
         session = Session.start(files, core, f"{pair.model.name}_{pair.estimator}", made)
+        if view is not None:
+            view.begin(robot, log.mounts)
+            session.view = view
         if session.head:
             console.print(f"resumed from {files.state} after {session.count} events", markup=False, soft_wrap=True)
         pace, began, first_ns, shown, seconds, is_done = Pace(rate, sleep=stop.sleep), time.monotonic(), None, -math.inf, 0.0, False
@@ -94,11 +106,11 @@ class Online:
                     session.dump()
                     first_ns = event.stamp_ns if first_ns is None else first_ns
                     seconds, now = (event.stamp_ns - first_ns) * 1e-9, time.monotonic()
-                    if console.is_terminal:
-                        session.health.saw(event)
-                        if now - shown >= _LINE_S:
-                            shown, speed = now, f"  {seconds / max(now - began, 1e-9):.1f}x"
-                            live.update(live_line(session, seconds, session.health.statuses(session.core), speed), refresh=True)
+                    if console.is_terminal or view is not None:
+                        session.saw(event)
+                    if console.is_terminal and now - shown >= _LINE_S:
+                        shown, speed = now, f"  {seconds / max(now - began, 1e-9):.1f}x"
+                        live.update(live_line(session, seconds, session.health.statuses(session.core), speed), refresh=True)
             session.finish()
             count = session.write_out()
             is_done = True
@@ -108,13 +120,13 @@ class Online:
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         self._summarize(console, session, seconds, count)
 
-    def _spin(self, console: Console, files: Files, robot: Robot, stop: Stop) -> None:
+    def _spin(self, console: Console, files: Files, robot: Robot, stop: Stop, view: View | None) -> None:
         def tell(said: str) -> None:
             console.print(f"[yellow]![/] {escape(said)}", soft_wrap=True)
 
         transport = self._transport()
         try:
-            node = Node.start(transport, robot, self._pair, files, tell, self.topic, self.config, self.node, stop.is_set)
+            node = Node.start(transport, robot, self._pair, files, tell, self.topic, self.config, self.node, stop.is_set, view)
             console.print(f"running {self.model} in {self.estimator} on {', '.join(node.topics)}", markup=False, soft_wrap=True)
             with Live(console=console, auto_refresh=False, transient=True) as live:
                 node.spin(stop.is_set, lambda n: self._show(console, live, n))
@@ -141,6 +153,14 @@ class Online:
         from localization.online.dds import DdsTransport
 
         return DdsTransport(self.domain, self.interface)
+
+    def _view(self) -> View | None:
+        """Raises `DoorError` and `OutputError`. Imported only where it is wanted."""
+        if self.view == "terminal" and self.view_file is None:
+            return None
+        from localization.online.view import RerunView
+
+        return RerunView(self.view_file)
 
     def _pair(self, has_lidar: bool) -> Pair:
         check_estimator(self.estimator, has_lidar)

@@ -54,7 +54,8 @@ class Replay:
     """Estimators, separated by commas; `lidar` is left out where the log has no scans, unless asked for."""
     corrections: str = "constant"
     """What ekf and graph learn of the motion model, forms separated by commas: none, constant (k and centre of rotation as slowly
-    changing constants), cg_field (their regressions on the centre of gravity, remembered from posture to posture)."""
+    changing constants), cg_field (their regressions on the centre of gravity, remembered from posture to posture), or single ones by name,
+    joined by + (the friction model's: mu_ratio, tracked_x, tracked_y, warp, cg_offset_x, cg_offset_y; as constant+cg_offset_x)."""
     reference: str | None = None
     """Topic of the log, or file (.tum, .relations), to score against; `none` for no score. Default: the robot file's topic, if any."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
@@ -89,7 +90,7 @@ class Replay:
         for p in pairs:
             run = by_pair.get((p.model.name, p.estimator, p.corrections)) or by_pair[models[0].name, p.estimator, p.corrections]
             several = run.corrections is not None and len(forms) > 1
-            label = f"{p.estimator}_{p.corrections}" if several else p.estimator
+            label = f"{p.estimator}_{p.corrections.replace('+', '_')}" if several else p.estimator
             runs.append(dataclasses.replace(run, model=p.model.name, estimator=label))
         results = score(runs, reference)
         head = ReportHead(

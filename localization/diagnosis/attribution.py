@@ -138,7 +138,7 @@ def ranked_subsets(problem: Regression, groups: list[str], allowed: FloatArray, 
     return sorted(found)
 
 
-def max_statistic(problem: Regression, given: tuple[int, ...], rng: np.random.Generator, df: int, among: int | None = None) -> FloatArray:
+def max_statistic(problem: Regression, given: tuple[int, ...], rng: np.random.Generator, df: float, among: int | None = None) -> FloatArray:
     """(draws,) largest |t| over all causes (or the first ``among``) not ``given`` that noise alone would show, as correlated as their
     signatures are."""
     left = [i for i in range(len(problem.moment) if among is None else among) if i not in given]
@@ -166,14 +166,14 @@ def statistics(problem: Regression, given: tuple[int, ...], wanted: list[int]) -
     return np.asarray(score / np.sqrt(np.maximum(np.diagonal(cov), 1e-12)))
 
 
-def p_value(t: float, draws: FloatArray) -> float:
-    """Family-wise; beyond the draws, by the tail that their upper part has (log-linear in t^2)."""
+def p_value(t: float, draws: FloatArray, df: float) -> float:
+    """Family-wise; beyond the ``draws`` (of ``df`` degrees of freedom) by the tail that their upper part has."""
     above = float(np.mean(draws >= abs(t)))
     if above >= 20.0 / len(draws):
         return above
-    q = np.quantile(draws, [0.9, 0.99])
-    slope = math.log(10.0) / max(q[1] ** 2 - q[0] ** 2, 1e-9)
-    return float(min(0.01 * math.exp(-slope * (t**2 - q[1] ** 2)), 1.0))
+    q = df * np.log1p(np.quantile(draws, [0.9, 0.99]) ** 2 / df)  # in which tails of Student's t are straight
+    slope = math.log(10.0) / max(q[1] - q[0], 1e-9)
+    return float(min(0.01 * math.exp(-slope * (df * math.log1p(t**2 / df) - q[1])), 1.0))
 
 
 def likeness(problem: Regression, given: tuple[int, ...], a: int, b: int) -> float:

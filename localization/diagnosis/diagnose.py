@@ -40,11 +40,14 @@ _CLOSE_SHARE = 0.02  # or this share of what the cause explains, which no model 
 _ROUNDS = 5
 _TOLERANCE = 0.35  # sigma of causes that nobody names, over what is negligible
 _REFINED = 2  # sets of each number of causes that are tried for real
+_FORETOLD = 0.1  # share of what signatures promise that may be missing
+_PLAIN, _TRIED = 2, 4  # then so many sets of up to so many causes are tried whatever signatures say
 _SURE = 200.0  # lead in twice the log-evidence that needs no trial
 _STEPS = 3
 _UNSURE = 1.0 / 3.0  # systematic part of a size's sigma, over what is negligible: clocks, mounts and physics are no better
 _PAYS = 0.003  # least held-out gain of a finding
-_HONEST = 0.5  # a witness may be better than it says, but not by more than this
+_CLEAR = 0.05
+_FEW_WINDOWS = 64
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,8 @@ class Examined:
     pipeline: Pipeline | None
     """None where there was too little to look at."""
     residuals: Residuals | None
+    state: _State | None = None
+    """The last look at the drive: its signatures, and its noise."""
 
 
 def diagnose(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None) -> Diagnosis:
@@ -149,23 +154,28 @@ def _search(pipeline: Pipeline, state: _State) -> dict[Effect, float]:
     effects, problem = state.effects, state.problem
     groups = [_group(e) for e in effects]
     ranked = ranked_subsets(problem, groups, _bounds(effects))
-    least = ranked[0][0]
-    sure = ranked[1][0] - least > _SURE if len(ranked) > 1 else True
-    tried: dict[tuple[int, ...], None] = {ranked[0][1]: None, (): None}
-    if not sure:
-        near = [s for c, s in ranked if c - least < _SURE]
-        for size in range(1, MOST_CAUSES):
-            tried.update(dict.fromkeys([s for s in near if len(s) == size][:_REFINED]))
-    results = []
-    for subset in tried:
-        start = {effects[i]: float(v) for i, v in zip(subset, problem.fit(subset)[0], strict=True)}
-        try:
-            sizes, rows = _refined(pipeline, state, start)
-        except (CgError, ModelError):
-            continue  # sizes that no robot can have
-        found = _cost(state, sizes, rows)
-        results.append((found, subset, sizes))
-    return min(results, key=lambda r: r[0])[2]
+    least, best = ranked[0]
+    nothing = problem.misfit()
+    results: dict[tuple[int, ...], tuple[float, dict[Effect, float]]] = {}
+
+    def real(subset: tuple[int, ...]) -> float:
+        """Twice the log-odds by the pipeline itself; inf for sizes that no robot can have."""
+        if subset not in results:
+            sizes, cost = _tried(pipeline, state, _linear_sizes(state, subset))
+            results[subset] = cost, sizes
+        return results[subset][0]
+
+    is_sure = len(ranked) < 2 or ranked[1][0] - least > _SURE
+    as_foretold = real(best) < nothing + least + max(_FORETOLD * abs(least), _CLOSE)
+    real(())
+    near = [s for c, s in ranked if c - least < _SURE]
+    for size in range(1, MOST_CAUSES):
+        alike = [s for s in near if len(s) == size][:_REFINED] if not is_sure else []
+        if not as_foretold and size <= _PLAIN:  # where signatures bend, few causes may do what many seem to
+            alike += [s for _, s in ranked if len(s) == size][:_TRIED]
+        for subset in alike:
+            real(subset)
+    return min(results.values(), key=lambda r: r[0])[1]
 
 
 def _cost(state: _State, sizes: dict[Effect, float], rows: FloatArray) -> float:
@@ -175,11 +185,17 @@ def _cost(state: _State, sizes: dict[Effect, float], rows: FloatArray) -> float:
     return whole.misfit() + k * math.log(max(whole.count, 2)) + 2.0 * math.log(math.comb(groups, k))
 
 
-def _true_cost(pipeline: Pipeline, state: _State, sizes: dict[Effect, float]) -> float:
+def _tried(pipeline: Pipeline, state: _State, start: dict[Effect, float]) -> tuple[dict[Effect, float], float]:
+    """Sizes by the pipeline itself, and what they cost; inf for sizes that no robot can have."""
     try:
-        return _cost(state, *_refined(pipeline, state, sizes))
+        sizes, rows = _refined(pipeline, state, start)
+        return sizes, _cost(state, sizes, rows)
     except (CgError, ModelError):
-        return math.inf
+        return start, math.inf
+
+
+def _true_cost(pipeline: Pipeline, state: _State, sizes: dict[Effect, float]) -> float:
+    return _tried(pipeline, state, sizes)[1]
 
 
 def _refined(pipeline: Pipeline, state: _State, sizes: dict[Effect, float]) -> tuple[dict[Effect, float], FloatArray]:
@@ -291,29 +307,32 @@ def _noise(pipeline: Pipeline, linear: FloatArray, signatures: FloatArray, nuisa
     for _ in range(3):
         y = noise.whiten(linear).ravel()
         design = np.hstack([noise.whiten(signatures).reshape(len(y), -1) * scale, noise.whiten(nuisances).reshape(len(y), -1) * 1e3])
-        gram = design.T @ design
-        x = np.linalg.solve(gram + np.eye(len(gram)), design.T @ y)
-        spent = float(np.trace(np.linalg.solve(gram + np.eye(len(gram)), gram)))
+        inverse = np.linalg.inv(design.T @ design + np.eye(design.shape[1]))
+        x = inverse @ (design.T @ y)
+        spent = np.sum((design @ inverse) * design, axis=1).reshape(linear.shape).sum(axis=0)
         p = len(effects)
         left = linear - signatures @ (x[:p] * scale) - nuisances @ (x[p:] * 1e3)
-        noise = estimated_noise(np.where(known, left, np.nan), features, follows, spent, _HONEST * sigmas)
+        noise = estimated_noise(np.where(known, left, np.nan), features, follows, spent, sigmas)
     return noise
 
 
 def _tested(state: _State, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig) -> tuple[int, ...]:
     """``chosen``, less what does not stand up to the test."""
-    problem, effects = state.problem, state.effects
-    df = max(int(np.isfinite(state.rows).sum()) - len(effects), 10)
     while chosen:
         p = []
         for i in chosen:
             others = tuple(j for j in chosen if j != i)
-            p.append(p_value(statistic(problem, others, i), max_statistic(problem, others, rng, df)))
+            p.append(_p_value(state, others, i, rng))
         worst = int(np.argmax(p))
         if p[worst] <= config.significance:
             break
         chosen = tuple(i for n, i in enumerate(chosen) if n != worst)
     return chosen
+
+
+def _p_value(state: _State, others: tuple[int, ...], i: int, rng: np.random.Generator) -> float:
+    df = state.noise.freedom
+    return p_value(statistic(state.problem, others, i), max_statistic(state.problem, others, rng, df), df)
 
 
 def _group(effect: Effect) -> str:
@@ -328,7 +347,6 @@ def _conclude(
     pipeline: Pipeline, first: _State, state: _State, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig
 ) -> Examined:
     drive, problem, effects = pipeline.drive, state.problem, state.effects
-    df = max(int(np.isfinite(state.rows).sum()) - len(effects), 10)
 
     def held(with_these: tuple[int, ...], without: tuple[int, ...]) -> Gain:
         data = state.linear, state.signatures, state.nuisances, state.noise, problem.scale
@@ -338,9 +356,7 @@ def _conclude(
     while chosen:  # what nobody would correct, or does not pay where its size was not fitted to, is not named
         sizes, cov, _ = problem.fit(chosen)
         gains = [held(chosen, tuple(j for j in chosen if j != i)) for i in chosen]
-        small = [
-            n for n, i in enumerate(chosen) if abs(sizes[n]) < effects[i].negligible or gains[n].low <= 0.0 or gains[n].relative < _PAYS
-        ]
+        small = [n for n, i in enumerate(chosen) if abs(sizes[n]) < effects[i].negligible or not _pays(gains[n], len(state.rows))]
         if not small:
             break
         worst = min(small, key=lambda n: gains[n].relative)
@@ -351,9 +367,11 @@ def _conclude(
     for n, i in enumerate(chosen):
         effect, size = effects[i], float(sizes[n])
         sigma = math.hypot(math.sqrt(cov[n, n]), _UNSURE * effect.negligible)
+        if effect.id == "encoder_dropout":  # a share that comes in spells of random length is as sure as there were many
+            sigma = math.hypot(sigma, size * math.sqrt(2.0 / max(pipeline.dropout_spells, 2)))
         others = tuple(j for j in chosen if j != i)
-        p = p_value(statistic(problem, others, i), max_statistic(problem, others, rng, df))
-        aliases = _aliases(problem, effects, chosen, i)
+        p = _p_value(state, others, i, rng)
+        aliases = _aliases(pipeline, state, chosen, i)
         told = evidence(effect, state.signatures[..., i] * size, state.noise, problem.gain(chosen) - problem.gain(others))
         findings.append(Finding(effect, size, sigma, p, aliases, told, gains[n]))
     findings.sort(key=lambda f: f.gain.relative, reverse=True)
@@ -397,15 +415,16 @@ def _conclude(
     scale = np.sqrt(np.diagonal(problem.gram) + 1e-12)
     alike = problem.gram / np.outer(scale, scale)
     residuals = Residuals(first.rows, left, state.noise.sigmas, tuple(e.key for e in effects), alike)
-    return Examined(dataclasses.replace(result, sentence=sentence(result)), pipeline, residuals)
+    return Examined(dataclasses.replace(result, sentence=sentence(result)), pipeline, residuals, state)
 
 
-def _aliases(problem: Regression, effects: tuple[Effect, ...], chosen: tuple[int, ...], i: int) -> tuple[tuple[str, float], ...]:
-    """Causes that could stand in for ``i`` and explain the drive about as well."""
+def _aliases(pipeline: Pipeline, state: _State, chosen: tuple[int, ...], i: int) -> tuple[tuple[str, float], ...]:
+    """Causes that could stand in for ``i`` and explain the drive about as well: by their signatures, and then by the pipeline itself."""
+    problem, effects = state.problem, state.effects
     others = tuple(j for j in chosen if j != i)
     base, own = problem.gain(others), problem.gain(chosen)
     tolerance = max(_CLOSE, _CLOSE_SHARE * (own - base))
-    found: dict[str, tuple[float, float]] = {}
+    found: dict[str, tuple[float, int]] = {}
     for j, effect in enumerate(effects):
         if j in chosen or _group(effect) == _group(effects[i]) or any(_group(effect) == _group(effects[k]) for k in others):
             continue
@@ -417,9 +436,25 @@ def _aliases(problem: Regression, effects: tuple[Effect, ...], chosen: tuple[int
         if own - gain > tolerance or (effect.one_sided and size < 0.0) or abs(size) > 10.0 * effect.usual:
             continue
         if effect.id not in found or gain > found[effect.id][0]:
-            found[effect.id] = gain, size
-    ranked = sorted(found.items(), key=lambda item: -item[1][0])
-    return tuple((name, size) for name, (_, size) in ranked)
+            found[effect.id] = gain, j
+    if not found:
+        return ()
+    best = _true_cost(pipeline, state, _linear_sizes(state, chosen))
+    costs = []
+    for _, j in found.values():
+        sizes, cost = _tried(pipeline, state, _linear_sizes(state, (*others, j)))
+        if cost - best <= tolerance:
+            costs.append((cost, effects[j].id, sizes[effects[j]]))
+    return tuple((name, size) for _, name, size in sorted(costs))
+
+
+def _linear_sizes(state: _State, subset: tuple[int, ...]) -> dict[Effect, float]:
+    return {state.effects[i]: float(v) for i, v in zip(subset, state.problem.fit(subset)[0], strict=True)}
+
+
+def _pays(gain: Gain, windows: int) -> bool:
+    """On windows that sizes were not fitted to. An interval from a few blocks of windows is wider than it says: there a clear gain does."""
+    return gain.relative >= _PAYS and (gain.low > 0.0 or (windows < _FEW_WINDOWS and gain.relative > _CLEAR))
 
 
 def _merged(findings: list[Finding]) -> list[Finding]:

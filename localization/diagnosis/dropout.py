@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from motion_models.maneuvers import Batch
+from motion_models.maneuvers import Batch, IntArray
 from motion_models.se2 import FloatArray
 
 _DROP = (0.4, 0.62)  # one of two encoders silent; the rate of a side is their mean
 _LEAST_RATE = 0.5  # rad/s
+RESTS = 0.25  # rad/s
 _LONGEST_S = 3.0
 
 
@@ -43,19 +44,29 @@ def _spells(rate: FloatArray, other: FloatArray, dt: FloatArray) -> FloatArray:
             jumps.append((i, -1))
         elif level and abs(after) > _LEAST_RATE and _DROP[0] < rises < _DROP[1]:
             jumps.append((i, 1))
+    # steps cannot be read while wheels hardly turn, so that no spell is believed to outlast a rest
+    rests = np.flatnonzero(np.abs(rate) < RESTS)
+    spells = []
     start = None
-    if jumps and jumps[0][1] == 1 and dt[: jumps[0][0]].sum() < _LONGEST_S:
-        start = 0  # it was silent when the window began
+    if jumps and jumps[0][1] == 1:
+        before = rests[rests < jumps[0][0]]
+        start = int(before[-1]) + 1 if len(before) else 0  # it was silent when the window began, or when the wheels began to turn
     for i, kind in jumps:
-        if kind == -1 and start is None:
-            start = i
-        elif kind == 1 and start is not None:
-            if dt[start:i].sum() < _LONGEST_S:
-                share[start:i] = 1.0
-            start = None
-    if start is not None and dt[start:].sum() < _LONGEST_S:
-        share[start:] = 1.0
+        if start is not None:
+            spells.append((start, _until(rests, start, i)))
+        start = i if kind == -1 else None
+    if start is not None:
+        spells.append((start, _until(rests, start, n)))
+    for a, b in spells:
+        if dt[a:b].sum() < _LONGEST_S:
+            share[a:b] = 1.0
     return share
+
+
+def _until(rests: IntArray, start: int, end: int) -> int:
+    """``end``, or the first rest between it and ``start``."""
+    between = rests[(rests > start) & (rests < end)]
+    return int(between[0]) if len(between) else end
 
 
 def _like(a: float, b: float) -> bool:

@@ -12,6 +12,10 @@ from motion_models.maneuvers import Batch
 from motion_models.se2 import FloatArray
 
 _ROUNDS = 8
+_MOTION = 3  # channels of the motion itself
+_LEAST_FREE = 0.1  # of all numbers, however many causes there are
+_CLAIM = 4.0  # windows that a witness's own covariance is worth
+_HONEST = 0.5  # a witness may be better than it says, but not by more than this
 _CLIP = 9.0  # squares beyond this many variances are outliers, and count as this much
 
 
@@ -29,6 +33,8 @@ class Noise:
     """(M,) whether a window begins where the one before ended."""
     weights: FloatArray
     """(M,) below 1 for windows with outliers."""
+    freedom: float = 1e6
+    """Degrees of freedom that the noise is known with, in that channel of the motion which has fewest."""
 
     def whiten(self, rows: FloatArray) -> FloatArray:
         """(M, 6, ...) rows as independent numbers of unit variance; 0 where they are NaN."""
@@ -58,25 +64,31 @@ def plain_noise(rows: FloatArray, sigmas: FloatArray, follows: NDArray[np.bool_]
     return Noise(np.where(np.isfinite(rows), sigmas, 1.0), np.eye(rows.shape[1]), np.zeros(rows.shape[1]), follows, np.ones(len(rows)))
 
 
-def estimated_noise(left: FloatArray, features: FloatArray, follows: NDArray[np.bool_], spent: float, least: FloatArray) -> Noise:
-    """By ``left`` (M, 6), what the richest explanation leaves, which has used up ``spent`` degrees of freedom; never below ``least``
-    (M, 6)."""
+def estimated_noise(left: FloatArray, features: FloatArray, follows: NDArray[np.bool_], spent: FloatArray, claimed: FloatArray) -> Noise:
+    """By ``left`` (M, 6), what the richest explanation leaves, which has used up ``spent`` (6,) degrees of freedom in each channel.
+
+    What the witnesses say of themselves, ``claimed`` (M, 6), counts as much as a few windows: short drives show little of their noise. They
+    may be better than they say, but not by much.
+    """
     known = np.isfinite(left)
-    count = int(known.sum())
-    inflate = count / max(count - spent, 0.25 * count)
+    counts = known.sum(axis=0)
+    free = np.maximum(counts - spent, np.maximum(_LEAST_FREE * counts, 1.0))
+    inflate = np.where(counts > 0, counts / free, 1.0)
     sigmas = np.ones_like(left)
     for channel in range(left.shape[1]):
         use = known[:, channel]
         if use.sum() < 4:
             continue
-        squares = left[use, channel] ** 2 * inflate
+        squares = left[use, channel] ** 2 * inflate[channel]
         f = features[use]
         variance = np.full(len(squares), max(float(np.median(squares)) / 0.455, 1e-14))
         for _ in range(_ROUNDS):
             clipped = np.minimum(squares, _CLIP * variance)
             found = nnls(f / variance[:, None], clipped / variance)[0]
             variance = np.maximum(f @ found, 0.2 * float(np.median(variance)))
-        sigmas[use, channel] = np.maximum(np.sqrt(variance), least[use, channel])
+        said = claimed[use, channel]
+        pooled = (free[channel] * variance + _CLAIM * said**2) / (free[channel] + _CLAIM)
+        sigmas[use, channel] = np.maximum(np.sqrt(pooled), _HONEST * said)
     z = np.nan_to_num(left * np.sqrt(inflate) / sigmas, nan=0.0)
     lengths = np.abs(z).max(axis=1)
     weights = np.minimum(1.0, 4.0 / np.maximum(lengths, 1e-9))
@@ -90,7 +102,8 @@ def estimated_noise(left: FloatArray, features: FloatArray, follows: NDArray[np.
             a, b = z[1:, channel][pairs], z[:-1, channel][pairs]
             rho = float(a @ b / max(np.sqrt((a @ a) * (b @ b)), 1e-12))
             memory[channel] = min(max(rho - 1.0 / np.sqrt(pairs.sum()), 0.0), 0.8)
-    return Noise(sigmas, mixing, memory, follows, weights)
+    motion = [float(free[c]) for c in range(_MOTION) if counts[c]]
+    return Noise(sigmas, mixing, memory, follows, weights, min(motion, default=1.0) + _CLAIM)
 
 
 def _mixing(z: FloatArray, known: NDArray[np.bool_]) -> FloatArray:

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.dropout import lost_share
+from localization.diagnosis.dropout import RESTS, lost_share
 from localization.diagnosis.effects import Belief, Effect
 from localization.diagnosis.settling import TRACKED, settling_twists
+from localization.diagnosis.steady import steady_twists
 from motion_models import se2
 from motion_models.base import MotionModel, Twist
 from motion_models.friction import FrictionModel
@@ -44,7 +45,8 @@ class Pipeline:
         self.batch = make_batch(self.drive.maneuvers)
         self._friction = FrictionModel.from_robot(self.drive.robot)
         self._lost = lost_share(self.batch)
-        self._lost_time = float(np.sum(self._lost.max(axis=1) * self.batch.dt) / self.batch.dt.sum())
+        rolls = np.abs(self.batch.wheels).max(axis=1) > RESTS
+        self._lost_time = float((self._lost.max(axis=1) * rolls) @ self.batch.dt / max(float(rolls @ self.batch.dt), 1e-9))
         self.headings = self._headings()
         first, lead = self.batch.first, self.batch.lead
         self._times = np.empty(len(self.batch.dt))
@@ -52,7 +54,7 @@ class Pipeline:
             inside = slice(first[w], first[w + 1])
             dt = self.batch.dt[inside]
             self._times[inside] = start + np.cumsum(dt) - dt - dt[: lead[w]].sum()
-        self._base = self._friction.twist(self.batch.wheels, self.batch.cg, self._friction.nominal).value
+        self._base = steady_twists(self._friction.nominal, self.batch.wheels, self.batch.cg)
         self._kinematic_forces = self._accelerations()
         self._known: dict[tuple[object, ...], FloatArray] = {}
 
@@ -64,6 +66,11 @@ class Pipeline:
     @property
     def dropout_seen(self) -> bool:
         return bool(self._lost.any())
+
+    @property
+    def dropout_spells(self) -> int:
+        """How often a side fell silent, as far as it was seen."""
+        return int(np.count_nonzero(np.diff(self._lost, axis=0) > 0.0))
 
     def _headings(self) -> FloatArray:
         """By the gyro less its mean difference to the witness; else by the witness's own turns, one after the other."""
@@ -156,8 +163,10 @@ class _Changed:
         rates = wheels * np.maximum(1.0 + np.array([b.radius_left, b.radius_right]), 0.1)
         if b.encoder_lost:
             rates = rates * (1.0 + b.encoder_lost / max(p._lost_time, 1e-9) * p._lost)
-        value = p.model.twist(rates, cg, params).value
-        value = value + self._floor(rates, cg)
+        key = (*self._rates_key(), "model")
+        if key not in p._known:
+            p._known[key] = p.model.twist(rates, cg, params).value
+        value = p._known[key] + self._floor(rates, cg)
         if any(b.turns):
             energy = 2.0 * np.maximum(np.sum(rates**2, axis=-1), 1e-12)
             straight = 1.0 - (rates[:, 1] - rates[:, 0]) ** 2 / energy
@@ -210,7 +219,7 @@ class _Changed:
         if key not in p._known:
             if len(p._known) > _REMEMBERED:
                 p._known.clear()
-            p._known[key] = p._friction.twist(rates, cg, params).value
+            p._known[key] = steady_twists(params, rates, cg)
         return p._known[key]
 
     def _rates_key(self) -> tuple[object, ...]:

@@ -78,7 +78,6 @@ def shapes(
     n = len(names)
     scale = np.r_[np.ones(n), spreads]
     problem = regression(y, s, z, scale, np.r_[np.zeros(n), spreads])
-    df = max(int(np.isfinite(left).sum()) - n - z.shape[1], 10)
     given: tuple[int, ...] = ()
     result = []
     gained = 0.0
@@ -87,7 +86,7 @@ def shapes(
         free = [i for i in range(n) if i not in given]
         t[free] = statistics(problem, given, free)
         best = int(np.argmax(np.abs(t)))
-        p = p_value(float(t[best]), max_statistic(problem, given, rng, df, n))
+        p = p_value(float(t[best]), max_statistic(problem, given, rng, noise.freedom, n), noise.freedom)
         if p > _SIGNIFICANT:
             break
         gained += float(t[best]) ** 2

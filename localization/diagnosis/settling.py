@@ -20,6 +20,9 @@ from motion_models.se2 import FloatArray
 
 _CREEP = 3e-3
 _NEWTON = 12
+_BALANCED = 1e-7  # m/s and rad/s
+_GOOD = 0.2  # slopes are good for as long as a step leaves no more than this
+_DIFFERENCE = 1e-5
 
 
 def settling_twists(
@@ -75,11 +78,12 @@ def _settle(
 ) -> None:  # pragma: no cover
     state, influence = np.zeros(6), np.zeros(13)
     influence[12] = body.height
-    jacobian, off, tried = np.empty((3, 3)), np.empty(3), np.empty(3)
+    jacobian, off, off_tried, tried = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     weight = body.mass * body.gravity
     for w in range(first.shape[0] - 1):
         heading = headings[w]
         before = settled[first[w]].copy()
+        fresh = True  # the slopes are of another drive, or of none
         for i in range(first[w], first[w + 1]):
             q_l, q_r, h = wheels[i, 0], wheels[i, 1], dt[i]
             if q_l == 0.0 and q_r == 0.0:
@@ -91,45 +95,52 @@ def _settle(
             influence[7] = -weight * (c * slope[0] + s * slope[1])
             influence[8] = -weight * (-s * slope[0] + c * slope[1])
             influence[10], influence[11] = cg[i, 0], cg[i, 1]
-            # start from whichever is nearer to balance: the settled motion or the one before
+            # start as far from the settled motion as the sample before was, or from it; by the slopes of the sample before, if they do
             found = False
             for start in range(2):
-                now = (settled[i] if start == 0 else before).copy()
+                now = settled[i].copy()
+                if start == 0 and i > first[w]:
+                    now += before - settled[i - 1]
                 size = _misfit(now, before, h, q_l, q_r, state, influence, floor, body, off)
                 for _ in range(_NEWTON):
+                    if size < _BALANCED:
+                        break
+                    if not fresh:
+                        d0, d1, d2, regular = _solve(jacobian, off)
+                        tried[0], tried[1], tried[2] = now[0] - d0, now[1] - d1, now[2] - d2
+                        new = _misfit(tried, before, h, q_l, q_r, state, influence, floor, body, off_tried) if regular else math.inf
+                        if new < _GOOD * size:
+                            now[:] = tried
+                            off[:] = off_tried
+                            size = new
+                            continue
                     for j in range(3):
                         tried[:] = now
-                        step = 1e-5
-                        tried[j] += step
-                        base0, base1, base2 = off[0], off[1], off[2]
-                        _misfit(tried, before, h, q_l, q_r, state, influence, floor, body, off)
-                        jacobian[0, j], jacobian[1, j], jacobian[2, j] = (
-                            (off[0] - base0) / step,
-                            (off[1] - base1) / step,
-                            (off[2] - base2) / step,
-                        )
-                        off[0], off[1], off[2] = base0, base1, base2
+                        tried[j] += _DIFFERENCE
+                        _misfit(tried, before, h, q_l, q_r, state, influence, floor, body, off_tried)
+                        for k in range(3):
+                            jacobian[k, j] = (off_tried[k] - off[k]) / _DIFFERENCE
+                    fresh = False
                     d0, d1, d2, regular = _solve(jacobian, off)
                     if not regular:
                         break
                     share, better = 1.0, False
                     for _ in range(8):
                         tried[0], tried[1], tried[2] = now[0] - share * d0, now[1] - share * d1, now[2] - share * d2
-                        new = _misfit(tried, before, h, q_l, q_r, state, influence, floor, body, off)
+                        new = _misfit(tried, before, h, q_l, q_r, state, influence, floor, body, off_tried)
                         if new < size:
                             better = True
                             break
                         share *= 0.4
                     if not better:
-                        _misfit(now, before, h, q_l, q_r, state, influence, floor, body, off)
                         break
                     now[:] = tried
+                    off[:] = off_tried
                     size = new
-                    if size < 1e-7:
-                        break
                 if size < 1e-3:
                     found = True
                     break
+                fresh = True
             out[i] = now if found else settled[i]
             before[:] = out[i]
             heading += out[i, 2] * h

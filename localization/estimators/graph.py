@@ -45,7 +45,11 @@ def chain(rows: FloatArray, first: int = 0) -> Iterator[Block]:
 
 def solve(blocks: Iterable[Block], count: int, n: int) -> FloatArray:
     """(count, n) changes of the nodes 0 ... count - 1. Raises `IndeterminateError` and `EstimatorError`."""
-    found = _tree(list(blocks), range(count), n).optimize()
+    tree = _tree(list(blocks), range(count), n)
+    try:
+        found = tree.optimize()
+    except RuntimeError as error:
+        raise _indeterminate(error) from error
     return _finite(np.array([found.at(i) for i in range(count)]).reshape(count, n))
 
 
@@ -53,7 +57,7 @@ def marginals(blocks: Iterable[Block], nodes: Iterable[int], count: int, n: int)
     """(k, n, n) covariances of ``nodes``. Raises `IndeterminateError` and `EstimatorError`."""
     tree = _tree(list(blocks), range(count), n)
     try:
-        return np.array([tree.marginalCovariance(i) for i in nodes]).reshape(-1, n, n)
+        return _finite_covariances(np.array([tree.marginalCovariance(i) for i in nodes]).reshape(-1, n, n))
     except RuntimeError as error:
         raise _indeterminate(error) from error
 
@@ -88,13 +92,16 @@ class Incremental:
 
     def changes(self, nodes: Iterable[int]) -> FloatArray:
         """(k, n) of ``nodes`` by all that was added."""
-        estimate = self._isam.calculateBestEstimate()
+        try:
+            estimate = self._isam.calculateBestEstimate()
+        except RuntimeError as error:
+            raise _indeterminate(error) from error
         return _finite(np.array([estimate.atVector(i) for i in nodes]).reshape(-1, self._n))
 
     def marginals(self, nodes: Iterable[int]) -> FloatArray:
         """(k, n, n) covariances of ``nodes``."""
         try:
-            return np.array([self._isam.marginalCovariance(i) for i in nodes]).reshape(-1, self._n, self._n)
+            return _finite_covariances(np.array([self._isam.marginalCovariance(i) for i in nodes]).reshape(-1, self._n, self._n))
         except RuntimeError as error:
             raise _indeterminate(error) from error
 
@@ -128,9 +135,13 @@ def _factor(block: Block, known: range | set[int], n: int, noise: Callable[[int]
             raise EstimatorError(f"a factor speaks of node {node}, which is not in the graph.")
         if matrix.shape != (rows, n):
             raise EstimatorError(f"a factor's matrix for node {node} has shape {matrix.shape} instead of {(rows, n)}.")
+        if not np.isfinite(matrix).all():
+            raise EstimatorError(f"a factor's matrix for node {node} is not finite: {matrix.tolist()}.")
         arguments += [node, matrix]
     if rows == 0 or len(set(block.nodes)) != len(block.nodes):
         raise EstimatorError(f"a factor between nodes {block.nodes} with {rows} rows says nothing.")
+    if not np.isfinite(block.rhs).all():
+        raise EstimatorError(f"a factor's right side for nodes {block.nodes} is not finite: {block.rhs.tolist()}.")
     return gtsam.JacobianFactor(*arguments, block.rhs, (noise or _unit)(rows))  # type: ignore[call-overload]
 
 
@@ -153,6 +164,12 @@ def _finite(changes: FloatArray) -> FloatArray:
         bad = int(np.argmin(np.isfinite(changes).all(axis=1)))
         raise IndeterminateError(f"the solution is not finite from node {bad} on.")
     return changes
+
+
+def _finite_covariances(found: FloatArray) -> FloatArray:
+    if not np.isfinite(found).all():
+        raise IndeterminateError("the graph's factors are so unlike in size that its covariances are not finite.")
+    return found
 
 
 def _indeterminate(error: RuntimeError) -> IndeterminateError:

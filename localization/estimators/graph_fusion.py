@@ -301,7 +301,7 @@ class GraphFusion:
             error, _, d_b = motion_residual(self._newest.pose, ahead.node.pose, measured.delta)
             by_slow, d_seen = d_b @ pending.d_slow, d_b
         S = d_b @ pending.cov @ d_b.T + by_slow @ ahead.node.covariance[3:, 3:] @ by_slow.T + d_seen @ measured.cov @ d_seen.T
-        nis = float(error @ np.linalg.solve(S, error))
+        nis = _normalized(error, S)
         if nis > self._gate:
             self._counts["contradictions"] += 1
             if sight.is_trusted:
@@ -350,3 +350,14 @@ class GraphFusion:
         twist, twist_cov = mean_twist(delta, cov, step.duration)
         self._twist_now = twist
         return twist, twist_cov
+
+
+def _normalized(error: FloatArray, S: FloatArray) -> float:
+    """``error^T S^-1 error``. Raises `EstimatorError` where there is no such number: it would be lost in the state without a word."""
+    try:
+        found = float(error @ np.linalg.solve(S, error))
+    except np.linalg.LinAlgError:
+        found = math.nan
+    if not math.isfinite(found):
+        raise EstimatorError("wheels and LiDAR cannot be weighed: numbers are not finite, or too large to compute with. Look at the log.")
+    return found

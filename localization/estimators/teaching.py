@@ -16,16 +16,14 @@ from motion_models.base import Motion
 from motion_models.corrections import Corrections
 from motion_models.se2 import FloatArray
 
-_GENTLE = 0.25  # track over radius: below this tyres hold the robot back
-
 
 def teaching(step: Step, track_m: float, corrected: Corrections, cov: FloatArray) -> Step:
-    """``step``, or, if it is of a gentle arc and the model's turning is that in place, the same without derivatives by the parameters.
+    """``step``, or, if it turns less than what teaches these corrections, the same without derivatives by the parameters.
 
     ``cov`` (k, k) of the corrections as they are known now.
     """
     d = step.predicted.delta
-    if not corrected.of_turns or abs(d[2]) * track_m >= _GENTLE * np.hypot(d[0], d[1]):
+    if abs(d[2]) * track_m >= corrected.least_turn * np.hypot(d[0], d[1]):
         return step
     D = step.predicted.d_params @ corrected.directions
     slip = step.predicted.cov + D @ cov @ D.T

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from localization.estimators import Estimate, Estimator, EstimatorConfig, make_estimator
+from localization.estimators import CORRECTING, Estimate, Estimator, EstimatorConfig, make_estimator
 from localization.events import Event
 from localization.steps import Step, StepConfig, Stepper
 from motion_models import se2
 from motion_models.base import MotionModel
-from motion_models.corrections import Form
+from motion_models.corrections import Form, correctable
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
@@ -30,7 +30,7 @@ class Pair:
     model: MotionModel
     estimator: str
     corrections: Form = "constant"
-    """What a fusing estimator learns of the motion model: nothing, its k and centre of rotation, or their fields over the CG."""
+    """What a fusing estimator learns of the motion model: a form of `motion_models.corrections`."""
 
 
 class Core:
@@ -38,10 +38,11 @@ class Core:
 
     def __init__(self, pair: Pair, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig | None = None) -> None:
         config = config or ReplayConfig()
-        self.stepper = Stepper(pair.model, robot, mounts, has_lidar, config.step)
+        model = correctable(pair.model, pair.corrections) if pair.estimator in CORRECTING else pair.model
+        self.stepper = Stepper(model, robot, mounts, has_lidar, config.step)
         self.wheel_twist: FloatArray | None = None
         """(3,) mean twist of the last step by the wheels alone; None where they were not heard during all of it."""
-        self.estimator: Estimator = make_estimator(pair.estimator, pair.model, pair.corrections, robot, mounts, has_lidar, config.estimator)
+        self.estimator: Estimator = make_estimator(pair.estimator, model, pair.corrections, robot, mounts, has_lidar, config.estimator)
 
     def push(self, event: Event) -> list[Estimate]:
         """Take ``event``; the estimates that it completes, none or several. Raises `EstimatorError`."""

@@ -18,7 +18,7 @@ from localization.online.dump import read_head
 from localization.online.health import Status
 from localization.online.listen import Listener
 from localization.online.live import Memory, Stream, check_age
-from localization.online.session import Files, Session, made_by
+from localization.online.session import Files, Session, View, made_by
 from localization.online.tell import Teller
 from localization.online.transport import Received, Transport
 from localization.online.warm import warm_up
@@ -61,6 +61,7 @@ class Node:
         config: ReplayConfig | None = None,
         node: NodeConfig | None = None,
         is_over: Callable[[], bool] = lambda: False,
+        view: View | None = None,
     ) -> Node:
         """Listen, then begin, or go on from the state on disk. ``make_pair`` is told whether there is a LiDAR; ``tell`` hears what a
         person should know meanwhile; ``is_over`` ends it (`KeyboardInterrupt`).
@@ -87,6 +88,9 @@ class Node:
         made = made_by(pair, robot, heard.mounts, has_lidar, config, "live topics")
         core = Core(pair, robot, heard.mounts, has_lidar, config)
         session = Session.start(files, core, f"{pair.model.name}_{pair.estimator}", made, stream.memory, {"tally": tally}, is_whole=False)
+        if view is not None:
+            view.begin(robot, heard.mounts)
+            session.view = view
         teller = Teller(transport, with_tf=node.tf)
         made_node = cls(transport, stream, session, teller, robot)
         if session.head:
@@ -145,7 +149,7 @@ class Node:
                 self._publish(estimate, event)
                 if time_it and isinstance(event, Scan):
                     self.session.health.took((time.monotonic_ns() - received.received_ns) * 1e-9)
-            self.session.health.saw(event)
+            self.session.saw(event)
         if has_estimate:  # the next scan is far now, and does not wait
             self.session.dump(self._head)
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from localization.errors import DumpError, OutputError
 from localization.estimators import Estimate
@@ -40,6 +40,16 @@ class Files:
         return None if self.out is None else self.out.with_name(f".{self.out.name}.part")
 
 
+class View(Protocol):
+    """Shows a session while it runs. It is asked after estimates are out, so that none waits for it."""
+
+    def begin(self, robot: Robot, mounts: Mapping[str, Mount]) -> None: ...
+
+    def show(self, event: Event | None, estimates: Sequence[Estimate], core: Core) -> None: ...
+
+    def close(self) -> None: ...
+
+
 def made_by(pair: Pair, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig, source: str) -> dict[str, str]:
     """What must be the same where a state is resumed."""
     return fingerprints(
@@ -68,6 +78,8 @@ class Session:
         self._files, self._spool, self._dumper = files, spool, dumper
         self.count = int(head.get("events", 0))
         """Events so far, those before the state included."""
+        self.view: View | None = None
+        self._unseen: list[Estimate] = []
 
     @classmethod
     def start(
@@ -110,13 +122,27 @@ class Session:
         self.count += 1
         return self._take(self.core.push(event))
 
+    def saw(self, event: Event) -> None:
+        """After `push`, for whoever watches: its health, and a view."""
+        self.health.saw(event)
+        self._show(event)
+
+    def _show(self, event: Event | None) -> None:
+        if self.view is not None:
+            self.view.show(event, self._unseen, self.core)
+            self._unseen.clear()
+
     def finish(self) -> list[Estimate]:
         """No more events will come. Raises `EstimatorError`."""
-        return self._take(self.core.finish())
+        estimates = self._take(self.core.finish())
+        self._show(None)
+        return estimates
 
     def _take(self, estimates: list[Estimate]) -> list[Estimate]:
         for estimate in estimates:
             self.health.made(estimate, self.core)
+            if self.view is not None:
+                self._unseen.append(estimate)
             if self._spool is not None:
                 self._spool.add(estimate)
         return estimates

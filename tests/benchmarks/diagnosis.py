@@ -1,252 +1,216 @@
 """How often the diagnosis is right: every cause at three sizes, pairs and nulls, beside other methods.
 
-`SKIDLOC_SEEDS=3 SKIDLOC_EVERY=1 python -m tests.benchmarks.diagnosis`: seeds of each case, and one case in how many is run.
-Rivals see the same whitened discrepancies and signatures:
-
-- stepwise: forward selection by BIC on the linear signatures, no tolerances, no test, no second look through the pipeline;
-- stlsq: sequentially thresholded least squares (Brunton et al., "SINDy", 2016) on them, threshold half of a usual size;
-- gp: a Gaussian process on the windows' motion, which predicts but names nothing;
-- noise: the nominal model with its noise scaled to fit, which gains nothing by construction.
+`SKIDLOC_SEEDS=3 python -m tests.benchmarks.diagnosis [FOLDER]` runs so many seeds of each case and keeps a row for each in FOLDER/rows.csv
+as it goes (default: diagnosis-benchmark); started again, it goes on where it was. Tables and confusion.png come from the rows.
+With SKIDLOC_DRIVES=FOLDER the drives are kept, so that another method can be tried on them without simulating anew.
 """
 
 from __future__ import annotations
 
+import csv
+import dataclasses
+import json
 import os
+import pickle
+import sys
 import tempfile
-from collections import Counter, defaultdict
+import time
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
-from localization import plots
 from localization.diagnosis import diagnose as engine
 from localization.diagnosis.drive import Drive, drive_of_log
-from localization.diagnosis.effects import EFFECTS
-from localization.diagnosis.findings import Diagnosis
-from localization.diagnosis.heldout import heldout_gain
-from localization.diagnosis.prediction import with_sizes
+from localization.diagnosis.effects import Effect
 from localization.logs import open_log
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
-from motion_models.se2 import FloatArray
-from tests.diagnosis_drives import TYPICAL, bag
+from tests.diagnosis_drives import ONE_SIDED, TYPICAL, bag, drive, robot_named
+from tests.diagnosis_rivals import NONE, oracle, rivals
+from tests.diagnosis_scores import COLUMNS, report
 
+Kind = Literal["single", "null", "pair", "alike"]
 SIZES = (0.5, 1.0, 2.0)
-ONE_SIDED = ("payload", "encoder_dropout", "scrub", "rolling_resistance")
-PAIRS = (("cg_offset_x", "lidar_yaw"), ("wheel_radius_difference", "friction_anisotropy"), ("track_width", "lidar_time_offset"))
-NONE = "nothing"
+PAIRS = (
+    ("cg_offset_x", "lidar_yaw"),
+    ("wheel_radius_difference", "friction_anisotropy"),
+    ("track_width", "lidar_time_offset"),
+    ("lidar_offset_x", "slope"),
+    ("payload", "gyro_bias"),
+    ("wheel_radius_scale", "tread_asymmetry"),
+)
+ALIKE: tuple[tuple[tuple[str, str], str, str, float], ...] = (
+    (("payload", "cg_offset_x"), "husky_a200", "tour", 50.0),
+    (("lidar_time_offset", "wheel_time_offset"), "vaultbot", "tour", 0.0),
+    (("track_width", "friction_anisotropy"), "husky_a200", "spin", 50.0),
+)
+"""Causes that cannot be told apart: without arms a payload over the front edge is a shift of the CG; without a gyro only the clocks'
+difference shows; turns in place with one CG show one number, by how much the robot turns less."""
+NULLS = (
+    ("vaultbot", "tour"),
+    ("husky_a200", "tour"),
+    ("vaultbot", "random_1"),
+    ("jackal", "tour"),
+    ("vaultbot", "laps"),
+    ("husky_a200", "random_2"),
+    ("vaultbot", "payload_pickup"),
+    ("vaultbot", "40s"),
+    ("jackal", "random_3"),
+    ("vaultbot", "20s"),
+)
 
 
-@dataclass
-class Tally:
-    """Of one method."""
+@dataclass(frozen=True)
+class Case:
+    """What is hidden in which drive."""
 
-    right: int = 0
-    of: int = 0
-    false_alarms: int = 0
-    nulls: int = 0
-    gains: list[float] | None = None
+    kind: Kind
+    effects: Mapping[str, float]
+    robot: str
+    drive: str
+    seed: int
+    imu_hz: float = 50.0
+    alike: tuple[str, ...] = ()
+
+    @property
+    def key(self) -> str:
+        said = "+".join(f"{name}={size:g}" for name, size in self.effects.items()) or NONE
+        return f"{self.kind} {self.robot} {self.drive} {said} {self.seed}" + ("" if self.imu_hz else " no IMU")
 
 
-def seeds() -> int:
-    return int(os.environ.get("SKIDLOC_SEEDS", "3"))
+def cases(seeds: int) -> Iterator[Case]:
+    """Seed by seed, so that wherever it is stopped every kind has had its share."""
+    for k in range(seeds):
+        singles = []
+        for n, (cause, typical) in enumerate(TYPICAL.items()):
+            for j, factor in enumerate(SIZES):
+                sign = 1.0 if cause in ONE_SIDED or (n + j + k) % 2 == 0 else -1.0
+                singles.append(Case("single", {cause: sign * factor * typical}, "vaultbot", "tour", 6000 + 1000 * k + 10 * n + j))
+        others = [
+            Case("null", {}, *NULLS[i % len(NULLS)], seed=20_000 + 100 * k + i)
+            for i in range(20)  # the same drives with other noise
+        ]
+        others += [
+            Case("pair", {name: TYPICAL[name] * (1.0 if name in ONE_SIDED or (i + k + m) % 2 else -1.0) for m, name in enumerate(pair)},
+                 "vaultbot", "tour", 30_000 + 100 * k + i)
+            for i, pair in enumerate(PAIRS)
+        ]  # fmt: skip
+        for i, (pair, robot, route, imu_hz) in enumerate(ALIKE):
+            name = pair[k % 2]
+            others.append(Case("alike", {name: TYPICAL[name]}, robot, route, 40_000 + 100 * k + i, imu_hz, pair))
+        # three of the one, then one of the other
+        while singles or others:
+            yield from singles[:3]
+            yield from others[:1]
+            singles, others = singles[3:], others[1:]
 
 
-def drive_with(effects: dict[str, float], seed: int, robot: str = "vaultbot") -> Drive:
+def drive_of(case: Case) -> Drive:
+    """As the diagnosis sees it."""
+    keep = os.environ.get("SKIDLOC_DRIVES")
+    kept = Path(keep) / f"{case.key}.pickle" if keep else None
+    if kept is not None and kept.exists():
+        return pickle.loads(kept.read_bytes())  # type: ignore[no-any-return]
+    robot = robot_named(case.robot)
     with tempfile.TemporaryDirectory() as folder:
-        return drive_of_log(open_log(bag(Path(folder) / "drive.mcap", effects, seed, robot), load_robot(robot)))
+        log = bag(Path(folder) / "drive.mcap", case.effects, case.seed, case.robot, drive(case.drive), imu_hz=case.imu_hz)
+        found = drive_of_log(open_log(log, robot))
+    if kept is not None:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        kept.write_bytes(pickle.dumps(found))
+    return found
 
 
-def rivals(drive: Drive, config: engine.DiagnosisConfig) -> tuple[dict[str, tuple[str, float]], float]:
-    """Name and held-out gain of the first cause by each rival; and what all at once are judged by, the windows' noise."""
-    pipeline = engine._pipeline(drive, make_model("friction", drive.robot))
-    effects = engine._candidates(pipeline, config)
-    state = engine._linearise(pipeline, effects, {})
-    y = state.noise.whiten(state.linear).ravel()
-    scale = state.problem.scale
-    s = state.noise.whiten(state.signatures).reshape(len(y), -1) * scale
-
-    def gain(subset: tuple[int, ...]) -> float:
-        data = state.linear, state.signatures, state.nuisances, state.noise, scale
-        return heldout_gain(*data, subset, (), np.random.default_rng(0)).relative if subset else 0.0
-
-    stepwise = _stepwise(y, s)
-    thresholds = 0.5 / 4.0 * np.ones(len(effects))
-    stlsq = _stlsq(y, s, thresholds)
-    found = {}
-    for name, subset in (("stepwise", stepwise), ("stlsq", stlsq)):
-        x = np.linalg.lstsq(s[:, subset], y, rcond=None)[0] if subset else np.zeros(0)
-        parts = {i: float(np.linalg.norm(s[:, i] * v)) for i, v in zip(subset, x, strict=True)}  # what each explains by its own size
-        strongest = max(parts, key=lambda i: parts[i]) if parts else None
-        found[name] = (NONE if strongest is None else effects[strongest].id, gain(tuple(subset)))
-    found["gp"] = (NONE, _gp_gain(drive, state))
-    found["noise"] = (NONE, 0.0)
-    return found, float(np.sqrt(np.mean(y**2)))
-
-
-def _stepwise(y: FloatArray, s: FloatArray) -> list[int]:
-    chosen: list[int] = []
-    best = float(y @ y)
-    while len(chosen) < 7:
-        costs = {i: _rest(y, s[:, [*chosen, i]]) + np.log(len(y)) * (len(chosen) + 1) for i in range(s.shape[1]) if i not in chosen}
-        i = min(costs, key=lambda j: costs[j])
-        if costs[i] >= best:
-            break
-        best = costs[i]
-        chosen.append(i)
-    return chosen
+def run(case: Case) -> dict[str, Any]:
+    """One row."""
+    seen = drive_of(case)
+    begin = time.process_time()
+    found = engine.examine(seen, make_model("friction", seen.robot))
+    seconds = time.process_time() - begin
+    d = found.diagnosis
+    row: dict[str, Any] = {
+        "key": case.key,
+        "kind": case.kind,
+        "truth": json.dumps(dict(case.effects)),
+        "alike": json.dumps(case.alike),
+        "verdict": d.verdict,
+        "findings": json.dumps(
+            [{"cause": f.cause, "size": f.size, "sigma": f.sigma, "p": f.p_value, "aliases": dict(f.aliases)} for f in d.findings]
+        ),
+        "seconds": round(seconds, 2),
+    }
+    if found.pipeline is None or found.state is None:
+        return row
+    pipeline, state = found.pipeline, found.state
+    looked = engine._linearise(pipeline, state.effects, {})
+    problem = engine._normal(looked.linear, looked.signatures, looked.nuisances, state.noise, looked.effects)
+    nominal = dataclasses.replace(looked, noise=state.noise, problem=problem)
+    said = {name: [name_, round(gain, 5)] for name, (name_, gain) in rivals(seen, pipeline, nominal).items()}
+    row["rivals"] = json.dumps(said)
+    row["gain"] = round(d.gain.relative, 5) if d.gain is not None else 0.0
+    if case.effects:
+        row["oracle"] = round(oracle(pipeline, nominal, dict(case.effects)), 5)
+        row["significance"] = json.dumps({name: significance(nominal, case.effects, name) for name in case.effects})
+        row["rms"] = json.dumps({name: loudness(nominal, name, size) for name, size in case.effects.items()})
+    return row
 
 
-def _rest(y: FloatArray, a: FloatArray) -> float:
-    return float(np.sum((y - a @ np.linalg.lstsq(a, y, rcond=None)[0]) ** 2))
+def significance(state: engine._State, effects: Mapping[str, float], name: str) -> float | None:
+    """Of effect ``name``: its size over the sigma with which this drive can measure it, while the other hidden causes are free and all
+    others keep within their tolerance. None if the drive does not show the cause at all."""
+    problem = state.problem
+    own = _columns(state, name)
+    if not own:
+        return None
+    given = tuple(i for other in effects if other != name for i in _columns(state, other))
+    cov = problem.scores(given, own)[1]
+    return round(float(np.sqrt(cov[0, 0]) * abs(effects[name]) / problem.scale[own[0]]), 2)
 
 
-def _stlsq(y: FloatArray, s: FloatArray, thresholds: FloatArray) -> list[int]:
-    keep = np.ones(s.shape[1], dtype=bool)
-    for _ in range(10):
-        x = np.zeros(s.shape[1])
-        if keep.any():
-            x[keep] = np.linalg.lstsq(s[:, keep], y, rcond=None)[0]
-        new = keep & (np.abs(x) > thresholds)
-        if (new == keep).all():
-            break
-        keep = new
-    return [int(i) for i in np.flatnonzero(keep)]
+def loudness(state: engine._State, name: str, size: float) -> float | None:
+    """Root mean square over the windows of what the effect does, over their noise, in the channel where that is most."""
+    own = _columns(state, name)
+    if not own:
+        return None
+    part = np.nan_to_num(state.signatures[..., own[0]] * size / state.noise.sigmas)
+    return round(float(np.sqrt(np.mean(part**2, axis=0)).max()), 2)
 
 
-def _gp_gain(drive: Drive, state: engine._State) -> float:
-    """Held-out gain of a squared-exponential Gaussian process on (distance, turn, CG) of each window, one for each channel."""
-    inputs = []
-    for m in drive.maneuvers:
-        inside = slice(m.lead, m.lead + int(m.ends[-1]))
-        ways = m.wheels[inside] * m.dt[inside, None]
-        inputs.append(
-            [ways.mean(axis=1).sum(), (ways[:, 1] - ways[:, 0]).sum(), *np.broadcast_to(m.cg, m.wheels.shape)[inside].mean(axis=0)]
-        )
-    x = np.array(inputs)
-    x = (x - x.mean(axis=0)) / np.maximum(x.std(axis=0), 1e-9)
-    distance = np.sum((x[:, None] - x[None]) ** 2, axis=-1)
-    y = state.noise.whiten(state.linear)[:, :4]
-    fold = (np.arange(len(y)) // 4) % 5
-    before = after = 0.0
-    for c in range(y.shape[1]):
-        kernel = max(float(np.var(y[:, c])) - 1.0, 0.01) * np.exp(-0.5 * distance)
-        for f in range(5):
-            held = fold == f
-            if not held.any() or held.all():
-                continue
-            weights = np.linalg.solve(kernel[np.ix_(~held, ~held)] + np.eye(int((~held).sum())), y[~held, c])
-            before += float(np.sum(y[held, c] ** 2))
-            after += float(np.sum((y[held, c] - kernel[np.ix_(held, ~held)] @ weights) ** 2))
-    return 1.0 - float(np.sqrt(after / before))
+def _columns(state: engine._State, name: str) -> list[int]:
+    """Where the cause is among the state's, at most one."""
+    return [i for i, e in enumerate(state.effects) if e.id == name and _is_true(e, state)]
 
 
-def oracle_gain(drive: Drive, effects: dict[str, float], found: engine.Examined) -> float:
-    """Relative gain of the very causes at their very sizes, in the noise of the diagnosis."""
-    assert found.pipeline is not None
-    assert found.residuals is not None
-    sizes = {EFFECTS[name]: size for name, size in effects.items() if name in EFFECTS}
-    rows = found.pipeline.discrepancies(with_sizes(sizes)) / found.residuals.sigmas
-    nominal = found.residuals.rows / found.residuals.sigmas
-    return 1.0 - float(np.sqrt(np.nanmean(rows[:, :4] ** 2) / np.nanmean(nominal[:, :4] ** 2)))
-
-
-def named(d: Diagnosis) -> tuple[str, set[str]]:
-    if not d.findings:
-        return NONE, {NONE}
-    first = d.findings[0]
-    return first.cause, {first.cause, *(name for name, _ in first.aliases)}
+def _is_true(effect: Effect, state: engine._State) -> bool:
+    """Of many moments the middle one; of two slopes the one along the first heading, which is the world's x."""
+    if effect.id == "friction_change":
+        moments = [e.at_s for e in state.effects if e.id == "friction_change" and e.at_s is not None]
+        return effect.at_s == moments[len(moments) // 2]
+    return effect.id != "slope" or effect.at_s is None
 
 
 def main() -> None:
-    config = engine.DiagnosisConfig()
-    tallies: dict[str, Tally] = defaultdict(lambda: Tally(gains=[]))
-    confusion: Counter[tuple[str, str]] = Counter()
-    covered, shares, by_size = [], [], defaultdict(list)
-    cases = [({}, 5000 + k) for k in range(4 * seeds())]
-    for n, (cause, typical) in enumerate(TYPICAL.items()):
-        for j, factor in enumerate(SIZES):
-            for k in range(seeds()):
-                sign = 1.0 if cause in ONE_SIDED or (j + k) % 2 == 0 else -1.0
-                cases.append(({cause: sign * factor * typical}, 6000 + 100 * n + 10 * j + k))
-    for effects, seed in cases[:: int(os.environ.get("SKIDLOC_EVERY", "1"))]:
-        drive = drive_with(effects, seed)
-        found = engine.examine(drive, make_model("friction", drive.robot), config)
-        top, alias_set = named(found.diagnosis)
-        truth = next(iter(effects), NONE)
-        others, _ = rivals(drive, config)
-        others["diagnosis"] = top, found.diagnosis.gain.relative if found.diagnosis.gain is not None else 0.0
-        for method, (name, gain) in others.items():
-            tally = tallies[method]
-            right = truth in alias_set if method == "diagnosis" else name == truth
-            if truth == NONE:
-                tally.nulls += 1
-                tally.false_alarms += name != NONE
-            else:
-                tally.of += 1
-                tally.right += right
-                assert tally.gains is not None
-                tally.gains.append(gain)
-        confusion[truth, top if truth not in alias_set else truth] += 1
-        if truth != NONE:
-            factor = abs(effects[truth]) / TYPICAL[truth]
-            by_size[factor].append(truth in alias_set)
-            hit = next((f for f in found.diagnosis.findings if f.cause == truth), None)
-            if hit is not None:
-                covered.append(abs(hit.size - effects[truth]) < 1.96 * hit.sigma)
-            best = oracle_gain(drive, effects, found)
-            if best > 0.1 and truth != "friction_change":
-                shares.append(min(others["diagnosis"][1] / best, 1.5))
-        print(f"{truth:28s} {effects.get(truth, 0.0):+9.4f}  ->  {found.diagnosis.verdict:12s} {top}", flush=True)
-    print(f"\n{'method':12s} {'top-1':>8s} {'false alarms':>14s} {'mean held-out gain':>20s}")
-    for method, tally in tallies.items():
-        print(
-            f"{method:12s} {100 * tally.right / max(tally.of, 1):7.1f}% {100 * tally.false_alarms / max(tally.nulls, 1):13.1f}% "
-            f"{100 * float(np.mean(tally.gains or [0.0])):19.1f}%"
-        )
-    for factor, hits in sorted(by_size.items()):
-        print(f"size x {factor:g}: {100 * np.mean(hits):.1f} % of {len(hits)} named")
-    print(f"95 % intervals that cover: {100 * np.mean(covered):.1f} % of {len(covered)}")
-    print(f"held-out gain over the oracle's, median: {100 * float(np.median(shares)):.0f} %")
-    _pairs(config)
-    path = Path("diagnosis-confusion.png")
-    path.write_bytes(_picture(confusion))
-    print(f"confusion matrix: {path}")
-
-
-def _pairs(config: engine.DiagnosisConfig) -> None:
-    both = abstained = 0
-    runs = [(pair, k) for pair in PAIRS for k in range(seeds())]
-    for n, (pair, k) in enumerate(runs):
-        effects = {name: TYPICAL[name] for name in pair}
-        drive = drive_with(effects, 9000 + 10 * n + k)
-        found = engine.diagnose(drive, make_model("friction", drive.robot), config)
-        said = {f.cause for f in found.findings} | {name for f in found.findings for name, _ in f.aliases}
-        both += set(pair) <= said
-    for k in range(2 * seeds()):
-        drive = drive_with({"payload" if k % 2 else "cg_offset_x": 8.0 if k % 2 else 0.03}, 9500 + k, "husky_a200")
-        found = engine.diagnose(drive, make_model("friction", drive.robot), config)
-        abstained += {"payload", "cg_offset_x"} <= named(found)[1]
-    print(f"pairs of causes, both named: {both} of {len(runs)}; indistinguishable causes left open: {abstained} of {2 * seeds()}")
-
-
-def _picture(confusion: Counter[tuple[str, str]]) -> bytes:
-    names = [*TYPICAL, NONE]
-    extra = sorted({said for _, said in confusion} - set(names))
-    columns = [*names, *extra]
-    table = np.array([[confusion[truth, said] for said in columns] for truth in names], dtype=float)
-    table /= np.maximum(table.sum(axis=1, keepdims=True), 1.0)
-
-    def draw(figure: plots.Figure) -> None:
-        axes = figure.add_subplot()
-        axes.imshow(table, cmap="Blues", vmin=0.0, vmax=1.0)
-        axes.set_xticks(range(len(columns)), columns, rotation=90)
-        axes.set_yticks(range(len(names)), names)
-        axes.set(xlabel="named first (or the truth, where it is among the aliases)", ylabel="hidden")
-        axes.grid(visible=False)
-
-    return plots.picture(9.0, 9.0, draw)
+    folder = Path(sys.argv[1] if len(sys.argv) > 1 and __name__ == "__main__" else "diagnosis-benchmark")
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = folder / "rows.csv"
+    done = set()
+    if rows.exists():
+        with rows.open(newline="") as file:
+            done = {row["key"] for row in csv.DictReader(file)}
+    for case in cases(int(os.environ.get("SKIDLOC_SEEDS", "1"))):
+        if case.key in done:
+            continue
+        row = run(case)
+        with rows.open("a", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            if file.tell() == 0:
+                writer.writeheader()
+            writer.writerow(row)
+        said = ", ".join(f"{f['cause']} {f['size']:+.3g}" for f in json.loads(row["findings"]))
+        print(f"{case.key:60s} -> {row['verdict']:12s} {said}", flush=True)
+    print(report(rows, folder / "confusion.png"))
 
 
 if __name__ == "__main__":

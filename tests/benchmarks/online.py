@@ -1,13 +1,12 @@
 """The estimator live: how long after a scan its estimate is out, what part of a core it takes, and whether its memory stays flat.
 
-python -m tests.benchmarks.online [HOURS]
+python -m tests.benchmarks.online [latency | soak [HOURS [BEAMS]]]
 """
 
 from __future__ import annotations
 
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -18,8 +17,6 @@ import numpy as np
 
 from localization.logs import open_log
 from localization.online.core import Core, Pair
-from localization.online.records import Spool
-from localization.online.session import Files, Session, made_by
 from localization.online.warm import warm_up
 from localization.run import ReplayConfig
 from localization.simulate.experiments import ExperimentConfig
@@ -28,6 +25,7 @@ from localization.simulate.simulator import SimulationConfig, simulate, write_si
 from localization.simulate.suite import SensorConfig
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
+from tests.benchmarks.online_soak import soak
 
 BEAMS = 760
 _SETTLED_S = 3.0
@@ -43,7 +41,7 @@ def write_laps(path: Path, laps: int = 1) -> Path:
 
 
 def in_process(path: Path, estimator: str) -> tuple[np.ndarray, float]:
-    """Seconds from each event that completes an estimate, and CPU per second of the log; state dumped twice a second of the wall."""
+    """Seconds from each event that completes an estimate, and CPU per second of the log."""
     robot = load_robot("vaultbot")
     log = open_log(path, robot)
     pair, config = Pair(make_model("skid_steer", robot), estimator), ReplayConfig()
@@ -90,68 +88,7 @@ def _cpu_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def soak(path: Path, hours: float, estimator: str = "ekf") -> list[tuple[float, float, float, float]]:
-    """Hours driven, resident memory [MB], milliseconds to write the state down, and its size [MB]: now and then.
-
-    The log is driven over and over, each time later and from where it ended, as `--rate max` with a state and an output does.
-    """
-    robot = load_robot("vaultbot")
-    log = open_log(path, robot)
-    pair, config = Pair(make_model("skid_steer", robot), estimator), ReplayConfig()
-    found: list[tuple[float, float, float, float]] = []
-    with tempfile.TemporaryDirectory() as folder:
-        files = Files(Path(folder) / "soak.mcap", Path(folder) / "state")
-        made = made_by(pair, robot, log.mounts, True, config, "soak")
-        session = Session.start(files, Core(pair, robot, log.mounts, True, config), "soak", made)
-        lap, driven = 0, 0.0
-        step = max(hours / 10.0, 0.02)
-        while driven < hours:
-            for event in _repeated(log, lap):
-                session.push(event)
-                session.health.saw(event)
-                session.dump()
-            lap += 1
-            driven = lap * log.duration_s / 3600.0
-            if not found or driven >= found[-1][0] + step or driven >= hours:
-                begin = time.perf_counter()
-                session.dump(now=True)
-                took = time.perf_counter() - begin
-                assert session._dumper is not None
-                session._dumper.wait()
-                found.append((driven, _resident_mb(), 1e3 * took, (Path(folder) / "state").stat().st_size / 2**20))
-                print(f"{found[-1][0]:8.2f} h {found[-1][1]:10.1f} MB {found[-1][2]:10.1f} ms {found[-1][3]:8.2f} MB", flush=True)
-        assert isinstance(session._spool, Spool)
-        session._spool.remove()
-        session.close(forget=True)
-    return found
-
-
-def _repeated(log, lap):
-    """The log's events ``lap`` times its duration later; wheels go on from the angles where they were."""
-    import dataclasses
-
-    from localization.events import WheelSample
-
-    shift = lap * (round(log.duration_s * 1e9) + 40_000_000)
-    first = last = None
-    for event in log.events():
-        if isinstance(event, WheelSample):
-            first = event.position if first is None else first
-            last = event.position
-            event = dataclasses.replace(event, position=event.position + lap * _repeated.turn)
-        yield dataclasses.replace(event, stamp_ns=event.stamp_ns + shift)
-    _repeated.turn = last - first
-
-
-_repeated.turn = 0.0
-
-
-def _resident_mb() -> float:
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * resource.getpagesize() / 2**20
-
-
-def main(hours: float = 10.0) -> None:
+def latency() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         path = write_laps(folder / "laps.mcap")
@@ -168,10 +105,13 @@ def main(hours: float = 10.0) -> None:
                 took, cpu = over_dds(path, estimator, folder)
                 _print(f"{estimator}: scan written, odometry heard, over DDS", took, cpu)
         print("wanted: p99 <= 5 ms, less than 0.10 of a core\n")
-        print(f"soak of {hours:g} h: driven, resident memory, time to write the state down, its size")
-        found = soak(path, hours)
-        half = found[len(found) // 2]
-        print(f"memory from {half[0]:.1f} h to {found[-1][0]:.1f} h: {found[-1][1] - half[1]:+.1f} MB")
+
+
+def main(part: str = "all", hours: str = "10", beams: str = str(BEAMS)) -> None:
+    if part in ("all", "latency"):
+        latency()
+    if part in ("all", "soak"):
+        soak(float(hours), int(beams))
 
 
 def _print(what: str, took: np.ndarray, cpu: float) -> None:
@@ -180,4 +120,4 @@ def _print(what: str, took: np.ndarray, cpu: float) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(float, sys.argv[1:]))
+    main(*sys.argv[1:])

@@ -29,7 +29,7 @@ from localization.steps import Stepper
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion
-from motion_models.corrections import Form, corrections
+from motion_models.corrections import Form, correctable, corrections
 from motion_models.registry import make_model
 from motion_models.robot import Mount, load_robot
 from motion_models.se2 import FloatArray
@@ -87,7 +87,7 @@ def laps(seed: int = 0, count: int = 2 * POSTURES, effects: Mapping[str, float] 
 def drift(drive: Laps, model_name: str, form: Form, kind: str = "ekf", seed: int = 0) -> Drift:
     """Odometry with the parameters that the estimator ``kind`` learns with corrections of ``form``."""
     robot, seer, rng = load_robot("vaultbot"), Seer(), np.random.default_rng(seed)
-    model = make_model(model_name, robot)
+    model = correctable(make_model(model_name, robot), form)
     corrected = corrections(model, form)
     estimator: EkfFusion | GraphFusion
     if kind == "ekf":
