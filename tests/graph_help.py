@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from localization.estimators.ekf import EkfConfig
+from localization.estimators.ekf import BIAS, CLOCK, PARAMS, EkfConfig
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from motion_models import se2
@@ -69,7 +69,7 @@ def beliefs(estimator):
     if isinstance(estimator, GraphFusion):
         return estimator._now.slow, estimator.covariance()
     ekf, has_lidar = estimator._ekf, estimator._witness is not None
-    index = [0, 1, 2, 9, *([10] if has_lidar else []), *range(11, len(ekf.covariance))]
+    index = [0, 1, 2, BIAS, *([CLOCK] if has_lidar else []), *range(PARAMS, len(ekf.covariance))]
     return np.concatenate([[ekf.bias], [ekf.clock_offset] if has_lidar else [], ekf.correction]), ekf.covariance[np.ix_(index, index)]
 
 

@@ -20,7 +20,7 @@ from scipy.stats import chi2
 from localization.errors import EstimatorError
 from localization.estimators.base import NO_POINTS, Estimate, mean_twist
 from localization.estimators.ekf import EkfConfig
-from localization.estimators.graph_factors import Closure, Kernel, Pairs, Position, seen_residual, whitening
+from localization.estimators.graph_factors import Closure, Kernel, Pairs, Position, map_residual, seen_residual, whitening
 from localization.estimators.graph_history import History
 from localization.estimators.graph_link import Link, check_covariance, check_motion
 from localization.estimators.graph_revisit import revisited
@@ -39,6 +39,7 @@ from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
 _CERTAIN = 1e-6  # m, rad: sigma of the first pose, which is the origin by definition
+_AS_IT_WAS = 1e-12 * np.eye(3)  # m^2, rad^2: covariance of what does not change from node to node
 _COUNTED = ("scans", "matched", "contradictions", "standing", "revisits", "nodes", "rebuilt", "positions", "closures", "late")
 _NEAR_NS = 50_000_000  # a loop closure is between nodes, this near
 _FAR_NS = 1_000_000_000  # a position may be this far from its node: the body moves on in between
@@ -89,7 +90,8 @@ class GraphFusion:
         self._witness: Witness = (witness or ScanWitness(mounts, lidar)) if has_lidar else NoWitness()
         c = self.config
         learn = c.learn if has_lidar else ()  # without a LiDAR there is no second clock to compare with
-        self._slow = SlowStates(robot.gyro_noise, corrected, self._belief, learn, c.mount_sigma_m, c.mount_sigma_rad)
+        has_map = has_lidar and witness is None
+        self._slow = SlowStates(robot.gyro_noise, corrected, self._belief, learn, c.mount_sigma_m, c.mount_sigma_rad, has_map)
         self._mounts, self._mount = mounts, Mount()
         self._kernel = Kernel(self.config.kernel, self.config.kernel_scale)
         cov = block_diag(_CERTAIN**2 * np.eye(3), self._slow.cov)
@@ -98,6 +100,8 @@ class GraphFusion:
         self._history = None if self.config.backend == "fixed_lag" else History(first, self.config.backend, self._kernel)
         self._newest = first
         self._now = first
+        self._drawn = first.pose  # where the newest scan was drawn into the map, and how far behind where it was found in it
+        self._behind = np.zeros(3) if has_map else None
         self._pending: Link | None = None
         self._nodes_ns: list[int] = []
         self._first_node = 0  # number of the node whose stamp is the first in that list: a fixed lag forgets the others
@@ -129,15 +133,21 @@ class GraphFusion:
             sight = self._look(step, ahead)
             if sight is not None:
                 nis, ahead = self._judge(ahead, pending, sight)
+            elif self._behind is not None:
+                ahead = self._window.see(ahead, self._unseen(ahead))
         before, self._now = self._now, ahead.node
         alone = self._pending is None
         if step.scan is not None or not self._has_lidar:
             self._commit(ahead, step.end_ns)
             self._pending = None
             if step.scan is not None and self._has_lidar:
-                if sight is not None:
-                    self._recall(step)
-                self._witness.remember(step, self._believed(self._now))
+                believed = self._believed(self._now)
+                if self._behind is not None:
+                    self._behind = se2.log(se2.between(se2.compose(self._drawn, ahead.pair.seen[0]), believed))
+                if sight is not None and self._recall(step):
+                    believed = self._believed(self._now)
+                self._witness.remember(step, believed)
+                self._drawn = believed
         else:
             self._pending = pending
         if self._history is not None:
@@ -241,7 +251,7 @@ class GraphFusion:
         return self._now.covariance
 
     def _extend(self, link: Link) -> Ahead:
-        pair = Pairs.one(link, self._slow.walk(link.duration, link.moving))
+        pair = Pairs.one(link, self._slow.walk(link.duration, link.moving), self._behind)
         try:
             return self._window.extend(pair)
         except SingularError as error:
@@ -274,13 +284,22 @@ class GraphFusion:
 
     def _look(self, step: Step, ahead: Ahead) -> Sight | None:
         self._counts["scans"] += 1
-        seen = self._witness.look(step, self._believed(self._newest), self._believed(ahead.node))
+        seen = self._witness.look(step, self._drawn, se2.compose(self._drawn, self._expected(ahead)))
         if seen is not None:
             check_motion(seen.motion.delta, seen.motion.cov, f"the LiDAR's motion that ends at {step.end_ns} ns")
             self._counts["matched"] += 1
-            if seen.tie is not None:  # nodes do not know of the map, so its errors count anew with each scan
-                seen = replace(seen, motion=replace(seen.motion, cov=seen.motion.cov + seen.tie.cov))
         return seen
+
+    def _expected(self, ahead: Ahead) -> FloatArray:
+        """(3,) where the next scan is expected in the map, seen from where the newest was drawn into it."""
+        start = self._believed(self._newest)
+        if self._behind is not None:
+            start = se2.compose(start, se2.exp(self._newest.slow[-3:] + self._behind))
+        return se2.between(start, self._believed(ahead.node))
+
+    def _unseen(self, ahead: Ahead) -> Pairs:
+        """What goes on where the LiDAR saw nothing: the map is as it was."""
+        return ahead.pair.seeing(Motion(self._expected(ahead), _AS_IT_WAS))
 
     def _believed(self, node: Node) -> FloatArray:
         """(3,) where the LiDAR's points say that the body is: they are brought into it by the mount that the log or robot file tells."""
@@ -291,16 +310,27 @@ class GraphFusion:
 
         Where they contradict, one is wrong: the covariance of the one that is not sure of itself grows until they agree.
         """
-        measured, mount, slow = sight.motion, None, ahead.node.slow
-        if self._slow.mount_names:
-            mount = self._slow.shown(measured)
-            error, _, d_b, d_mount = seen_residual(self._newest.pose, ahead.node.pose, measured.delta, mount @ slow)
+        measured, tie, P = sight.motion, sight.tie, ahead.node.covariance[3:, 3:]
+        mount = self._slow.shown(measured) if self._slow.mount_names else None
+        before, after = self._newest, ahead.node
+        noise = measured.cov if tie is None else measured.cov + tie.fresh
+        if self._behind is not None and tie is not None:
+            there = se2.adjoint(measured.delta)
+            kept = there @ tie.kept @ np.linalg.inv(there)
+            off = kept @ (before.slow[-3:] + self._behind)
+            shown = self._slow.mount if mount is None else mount
+            error, by = map_residual(before.pose, after.pose, measured.delta, shown @ after.slow, off, np.zeros(3))
+            by_slow = by.pose_b @ pending.d_slow + by.mount @ shown
+            by_slow[:, -3:] += by.map_a @ kept
+            d_b, d_seen, P = by.pose_b, se2.right_jacobian_inverse(error), before.covariance[3:, 3:]
+        elif mount is not None:
+            error, _, d_b, d_mount = seen_residual(before.pose, after.pose, measured.delta, mount @ after.slow)
             by_slow = d_b @ pending.d_slow + d_mount @ mount
             d_seen = se2.right_jacobian_inverse(error)
         else:
-            error, _, d_b = motion_residual(self._newest.pose, ahead.node.pose, measured.delta)
+            error, _, d_b = motion_residual(before.pose, after.pose, measured.delta)
             by_slow, d_seen = d_b @ pending.d_slow, d_b
-        S = d_b @ pending.cov @ d_b.T + by_slow @ ahead.node.covariance[3:, 3:] @ by_slow.T + d_seen @ measured.cov @ d_seen.T
+        S = d_b @ pending.cov @ d_b.T + by_slow @ P @ by_slow.T + d_seen @ noise @ d_seen.T
         nis = _normalized(error, S)
         if nis > self._gate:
             self._counts["contradictions"] += 1
@@ -308,21 +338,30 @@ class GraphFusion:
                 ahead = self._extend(replace(pending, cov=pending.cov + (nis / self._gate) * np.outer(error, error)))
             else:
                 measured = Motion(measured.delta, measured.cov * (nis / self._gate) ** 2)
+
+        def seen(pair: Pairs) -> Pairs:
+            if self._behind is None or tie is None:
+                return pair.seeing(measured, mount)
+            pair = pair.seeing(Motion(measured.delta, tie.fresh + _AS_IT_WAS), mount)
+            return pair.meeting(kept, whitening(measured.cov))
+
         try:
-            return nis, self._window.see(ahead, measured, mount)
+            return nis, self._window.see(ahead, seen(ahead.pair))
         except SingularError as error_:
             self._rebuild(error_)
-            return nis, self._window.see(self._extend(pending), measured, mount)
+            ahead = self._extend(pending)
+            return nis, self._window.see(ahead, seen(ahead.pair))
 
-    def _recall(self, step: Step) -> None:
+    def _recall(self, step: Step) -> bool:
         """A place seen long before pulls the newest node there, as `Ekf.measure_revisit` does; a history gets the motion since then.
+        Returns whether there was one.
 
         The window keeps no node of that time, only the covariance of the old map: see there for what follows from it.
         """
         node, believed = self._now, self._believed(self._now)
         known = self._witness.recall(step, believed, node.covariance[:3, :3])
         if known is None:
-            return
+            return False
         self._counts["revisits"] += 1
         if self._history is not None:
             a, b = self._node_at(known.then.stamp_ns, _NEAR_NS), self._node_at(step.end_ns, _NEAR_NS)
@@ -333,6 +372,7 @@ class GraphFusion:
             self._window.restart(revisited(node, known, believed))
             self._newest = self._now = self._window.newest
         self._witness.correct(believed, self._believed(self._now))
+        return True
 
     def _twist(self, step: Step, link: Link, ahead: Ahead, before: Node, alone: bool) -> tuple[FloatArray, FloatArray | None]:
         """Mean twist of the step, by all witnesses where the step is all there is between two nodes, else without the LiDAR."""
