@@ -61,11 +61,10 @@ class Pairs:
         """The table of a single pair, before a LiDAR looked; ``behind`` (3,) where it has a map."""
         rows, rhs = link.compressed()
         none = np.zeros(3), np.zeros((3, 3)), np.zeros_like(link.d_slow)
-        c = 0 if behind is None else 3
-        columns = (link.delta, whitening(link.cov), link.d_slow, link.at, rows, rhs, walk, *none)
-        return cls(
-            *(np.asarray(column)[None] for column in (*columns, np.eye(c), np.zeros(c) if behind is None else behind, np.zeros((c, c))))
-        )
+        behind = np.zeros(0) if behind is None else behind
+        of_map = np.eye(len(behind)), behind, np.zeros((len(behind), len(behind)))
+        columns = (link.delta, whitening(link.cov), link.d_slow, link.at, rows, rhs, walk, *none, *of_map)
+        return cls(*(np.asarray(column)[None] for column in columns))
 
     def seeing(self, motion: Motion, mount: FloatArray | None = None) -> Pairs:
         """The single pair, with the motion that the LiDAR saw, and what of its ``mount`` (3, m) that shows."""
@@ -79,7 +78,7 @@ class Pairs:
     @property
     def seen_rows(self) -> int:
         """Rows of the LiDAR."""
-        return 3 + self.kept.shape[1]
+        return 3 + int(self.kept.shape[1])
 
     def __len__(self) -> int:
         return len(self.delta)

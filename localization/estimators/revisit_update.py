@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from localization.lidar import Revisit
+from localization.lidar.track import positive_part
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
@@ -30,9 +31,12 @@ def revisit_update(P: FloatArray, pose: slice, tied: FloatArray, known: Revisit,
     P = P.copy()
     P[pose, pose] += known.slip
     shared = 0.5 * (P[pose, pose] + known.old_cov - known.growth)  # cov(e, e_o)
+    shares = np.linalg.pinv(P[pose, pose], rcond=1e-12, hermitian=True) @ shared
+    # no surer than what it has in common with the pose now: of what is measured again and again, the newer may be the surer
+    old_cov = known.old_cov + positive_part(shared.T @ shares - known.old_cov)
     G = tied @ gain
     T = np.eye(len(P))
     T[:, pose] -= G
-    cross = T @ P[:, pose] @ np.linalg.pinv(P[pose, pose], rcond=1e-12, hermitian=True) @ shared @ G.T
-    P = T @ P @ T.T + G @ (known.old_cov + known.cov) @ G.T + cross + cross.T
+    cross = T @ P[:, pose] @ shares @ G.T
+    P = T @ P @ T.T + G @ (old_cov + known.cov) @ G.T + cross + cross.T
     return gain @ error, 0.5 * (P + P.T)

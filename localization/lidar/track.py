@@ -80,7 +80,8 @@ class Track:
         """(3, 3) covariance of the last place against place ``index``, in the body frame of the last."""
         now, then = self._places[-1], self._places[index]
         shared = moved(self._places[self._fork(index)], now.pose)
-        return _psd(now.cov - shared) + _psd(moved(then, now.pose) - shared)
+        # increments are only nearly independent
+        return positive_part(now.cov - shared) + positive_part(moved(then, now.pose) - shared)
 
     def _fork(self, then: int) -> int:
         """Where the ways to the last place and to ``then`` part."""
@@ -99,8 +100,8 @@ def moved(place: Place, pose: FloatArray) -> FloatArray:
     return found
 
 
-def _psd(matrix: FloatArray) -> FloatArray:
-    """The nearest (3, 3) that is a covariance: increments are only nearly independent."""
+def positive_part(matrix: FloatArray) -> FloatArray:
+    """The nearest (3, 3) to ``matrix`` that is a covariance."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     found: FloatArray = (vectors * np.maximum(values, 0.0)) @ vectors.T
     return found
