@@ -24,9 +24,9 @@ from motion_models.corrections import Corrections
 from motion_models.robot import GyroNoise
 from motion_models.se2 import FloatArray
 
-# Error state: the pose now, at the start of this step, and at the last scan (stochastic cloning); the map, as its error at the pose of the
-# last scan; then what is learned on the way: the gyro's bias, the wheels' clock, and from PARAMS on the corrections of the motion model's
-# parameters.
+# Error state: the pose now, at the start of this step, and where the last scan was drawn (stochastic cloning); the map, as its error where
+# the last scan was taken; then what is learned on the way: the gyro's bias, the wheels' clock, and from PARAMS on the corrections of the
+# motion model's parameters.
 POSE, START, ANCHOR, MAP = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 BIAS, CLOCK, PARAMS = 12, 13, 14
 
@@ -189,11 +189,12 @@ class Ekf:
         self._start = se2.compose(self.pose, se2.inverse(start_T_now))
         self._anchor = se2.compose(self.pose, se2.inverse(anchor_T_now))
 
-    def set_anchor(self) -> None:
-        """From here on, the LiDAR measures from the pose as it is now."""
+    def set_anchor(self, is_drawn: bool = True) -> None:
+        """From here on, the LiDAR measures from the pose as it is now. ``is_drawn``: by what it sees from here; else by what it knows."""
         G = np.eye(self._size)
-        G[ANCHOR, ANCHOR], G[ANCHOR, POSE] = np.zeros((3, 3)), np.eye(3)
-        G[MAP, MAP] = se2.adjoint(se2.inverse(self._since_anchor))
+        G[MAP, MAP] = G[ANCHOR, ANCHOR] = se2.adjoint(se2.inverse(self._since_anchor))
+        if is_drawn:
+            G[ANCHOR, ANCHOR], G[ANCHOR, POSE] = np.zeros((3, 3)), np.eye(3)
         self._filter.P = G @ self._filter.P @ G.T
         self._anchor, self._since_anchor = self.pose, np.zeros(3)
 

@@ -84,8 +84,7 @@ class EkfFusion:
                 before = ekf.pose
                 ekf.measure_revisit(known)
                 witness.correct(before, ekf.pose)
-        witness.remember(step, ekf.pose)
-        ekf.set_anchor()
+        ekf.set_anchor(witness.remember(step, ekf.pose))
         return nis
 
     def _twist(self, step: Step) -> tuple[FloatArray, FloatArray | None]:

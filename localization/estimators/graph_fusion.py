@@ -101,7 +101,7 @@ class GraphFusion:
         self._newest = first
         self._now = first
         self._drawn = first.pose  # where the newest scan was drawn into the map, and how far behind where it was found in it
-        self._behind = np.zeros(3) if has_map else None
+        self._behind, self._is_drawn = np.zeros(3) if has_map else None, False
         self._pending: Link | None = None
         self._nodes_ns: list[int] = []
         self._first_node = 0  # number of the node whose stamp is the first in that list: a fixed lag forgets the others
@@ -146,8 +146,7 @@ class GraphFusion:
                     self._behind = se2.log(se2.between(se2.compose(self._drawn, ahead.pair.seen[0]), believed))
                 if sight is not None and self._recall(step):
                     believed = self._believed(self._now)
-                self._witness.remember(step, believed)
-                self._drawn = believed
+                self._is_drawn, self._drawn = self._witness.remember(step, believed), believed
         else:
             self._pending = pending
         if self._history is not None:
@@ -316,7 +315,7 @@ class GraphFusion:
         noise = measured.cov if tie is None else measured.cov + tie.fresh
         if self._behind is not None and tie is not None:
             there = se2.adjoint(measured.delta)
-            kept = there @ tie.kept @ np.linalg.inv(there)
+            kept = there @ tie.kept @ np.linalg.inv(there) if self._is_drawn else np.eye(3)
             off = kept @ (before.slow[-3:] + self._behind)
             shown = self._slow.mount if mount is None else mount
             error, by = map_residual(before.pose, after.pose, measured.delta, shown @ after.slow, off, np.zeros(3))

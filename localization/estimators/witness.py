@@ -20,7 +20,6 @@ from motion_models.base import Motion
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
-
 _STAYS = 0.5  # of the variance of the map's lines: that from scan to scan is the same; the rest is new as beams wander along them
 
 
@@ -48,8 +47,8 @@ class Witness(Protocol):
     def correct(self, before: FloatArray, after: FloatArray) -> None:
         """What was recalled made ``before`` (3,) to ``after`` (3,)."""
 
-    def remember(self, step: Step, pose: FloatArray) -> None:
-        """The scan that was last looked at was taken from ``pose`` (3,)."""
+    def remember(self, step: Step, pose: FloatArray) -> bool:
+        """The scan that was last looked at was taken from ``pose`` (3,). Returns whether the next motion is measured by it, too."""
 
     def map_points(self) -> FloatArray:
         """(M, 2) what was seen, in the world [m]."""
@@ -95,12 +94,14 @@ class ScanWitness:
     def correct(self, before: FloatArray, after: FloatArray) -> None:
         self._matcher.correct(before, after)
 
-    def remember(self, step: Step, pose: FloatArray) -> None:
+    def remember(self, step: Step, pose: FloatArray) -> bool:
         self._last_ns = step.end_ns
         # a robot that stands sees nothing new, and would only thicken its lines
-        if self._is_good and (not step.is_standing or not self._has_map):
-            self._matcher.insert(pose)
-            self._has_map = True
+        if not self._is_good or (step.is_standing and self._has_map):
+            return False
+        self._matcher.insert(pose)
+        self._has_map = True
+        return True
 
     def map_points(self) -> FloatArray:
         return self._matcher.point_cloud()
@@ -121,8 +122,8 @@ class NoWitness:
     def correct(self, before: FloatArray, after: FloatArray) -> None:
         return None
 
-    def remember(self, step: Step, pose: FloatArray) -> None:
-        return None
+    def remember(self, step: Step, pose: FloatArray) -> bool:
+        return False
 
     def map_points(self) -> FloatArray:
         return NO_POINTS

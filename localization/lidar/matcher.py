@@ -56,7 +56,7 @@ class MapTie:
     """How the map that a scan meets hangs together with the map that the scan before met.
 
     Both are drawn with errors, which all scans that meet the same part of the map share: e' = ``kept`` e + (1 - ``kept``) e_drawn + noise,
-    where e_drawn is the error of the pose from which the scan before was drawn. In a room that is known already, ``kept`` is the identity,
+    where e_drawn is the error of the pose from which the last scan was drawn. In a room that is known already, ``kept`` is the identity,
     and however long the robot stays, it learns no more of its place and forgets nothing of it.
     """
 
@@ -113,7 +113,7 @@ class LidarMatcher:
         self._guess: tuple[FloatArray, FloatArray] | None = None  # and its information
         self._revisits: Revisits | None = None
         self._travel, self._last = 0.0, np.zeros(3)
-        self._drawn_at = math.inf  # travelled distance at which the last scan was drawn
+        self._drawn_at, self._is_met = math.inf, False  # travelled distance at which the last scan was drawn; a scan has met it since
 
     def register(self, points: FloatArray, is_planar: bool, guess: FloatArray, guess_cov: FloatArray) -> Registration | None:
         """Where ``points`` (N, 3) of the body frame fit, searched around ``guess`` (3,) with its covariance (3, 3).
@@ -125,6 +125,8 @@ class LidarMatcher:
         self._prepare(points, is_planar)
         if self._kiss is None or self._lines is None:
             return None
+        if self._is_met:
+            self._drawn_at = math.inf
         if len(self._planar) < _FEW_POINTS:
             self._downsampled, self._planar = np.empty((0, 3)), np.empty((0, 2))
             return None
@@ -146,6 +148,7 @@ class LidarMatcher:
     def _fit(self, lines: LineMap, start: FloatArray) -> Registration:
         assert self._guess is not None
         guess, prior = self._guess
+        self._is_met = True
         believed = self._noise.sigma_line
         fit = lines.fit(self._planar, start, self._fit_options(), prior, guess, self._ages, self._drawn_at)
         self._noise.see(fit.spread)
@@ -166,7 +169,7 @@ class LidarMatcher:
         self._advance(pose)
         self._kiss.insert(self._downsampled, _matrix(pose))
         self._travel += _APART_M
-        self._drawn_at = float(np.float32(self._travel))  # as the map remembers it
+        self._drawn_at, self._is_met = float(np.float32(self._travel)), False  # as the map remembers it
         self._lines.insert(self._planar, pose, self._travel, self._ages)
 
     def recall(self, pose: FloatArray, cov: FloatArray, stamp_ns: int) -> Revisit | None:
