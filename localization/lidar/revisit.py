@@ -170,7 +170,8 @@ class Revisits:
         if travel - c.old_after_m <= self.track[0].travel or len(scan) < 10:
             return None, -1
         drift = math.sqrt(self._gate * float(np.linalg.eigvalsh(self.track.growth(0)[:2, :2])[-1]))
-        points, travels = lines.points_within(pose[:2], reach + min(drift, c.max_search_m) + self._voxel)
+        whole = float(np.hypot(scan[:, 0], scan[:, 1]).max())
+        points, travels = lines.points_within(pose[:2], whole + min(drift, c.max_search_m) + self._voxel)
         before = _last_absence(travels, travel, c.old_after_m)
         points, travels = points[travels < before], travels[travels < before]
         if len(points) < c.min_matched * len(scan):
