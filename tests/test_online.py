@@ -201,10 +201,12 @@ def test_degeneracy_tells_corridors_from_rooms(calm):
     assert degeneracy(np.zeros((5, 2))) is None
     _, node, _ = calm
     health = node.session.health
-    health._degeneracy = 0.01
-    assert health.statuses(node.session.core)[1].level == WARN
-    health._degeneracy = 0.3
+    last = health._scan
     assert health.statuses(node.session.core)[1].level == OK
+    corridor = scan(1.5 / np.abs(np.sin(angle)))
+    health.saw(dataclasses.replace(last, points=np.column_stack([corridor, np.zeros(len(corridor))])))
+    assert health.statuses(node.session.core)[1].level == WARN
+    health.saw(last)
 
 
 def test_silence_is_told_and_then_the_run_begins():
