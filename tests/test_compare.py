@@ -184,6 +184,7 @@ def test_no_process_is_left_behind_when_it_is_interrupted():
         (["--model", "magic"], "magic"),
         (["--out", "table.txt"], "must end in .csv or .parquet"),
         (["--robot", "nobody"], "nobody"),
+        (["--processes", "-3"], "--processes is -3"),
     ],
 )
 def test_bad_arguments_are_explained(arguments, said, tmp_path, capsys):
@@ -394,7 +395,7 @@ def test_a_scheduler_that_is_not_there_is_explained(tmp_path, capsys, monkeypatc
     from localization import compare_dask
 
     monkeypatch.setattr(compare_dask, "_TIMEOUT_S", 1)
-    for address in ("tcp://127.0.0.1:1", "nonsense://x"):
+    for address in ("tcp://127.0.0.1:1", "nonsense", "nonsense://x:1", "tcp://127.0.0.1"):
         assert compare(tmp_path / "t.csv", "--dask", address) == 2
         said = " ".join(capsys.readouterr().err.split())
         assert f"no Dask scheduler answers at {address}" in said

@@ -231,6 +231,14 @@ def test_silence_is_told_and_then_the_run_begins():
     assert told[0] == "waiting for /scan (nobody publishes it)."
 
 
+def test_topics_of_other_names_are_offered():
+    other = LogTransport(drive_log(), silenced("/scan", 0.0, 5.0), types={"/front/laser": "sensor_msgs/msg/LaserScan"})
+    other.types.pop("/scan")
+    _, told = run_node(other, topics=TopicOverrides(scan="/scan"))
+    said = "waiting for /scan (nobody publishes it). But /front/laser is sensor_msgs/LaserScan (--topic.scan /front/laser)."
+    assert told[0] == said
+
+
 def test_a_topic_of_another_type_is_refused():
     transport = LogTransport(drive_log(), silenced("/scan", 0.0, 99.0), types={"/scan": "sensor_msgs/msg/PointCloud2"})
     with pytest.raises(DoorError, match=r"'/scan' carries sensor_msgs/PointCloud2, not sensor_msgs/LaserScan. Pass --topic.points /scan"):

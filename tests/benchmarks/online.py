@@ -58,8 +58,8 @@ def in_process(path: Path, estimator: str) -> tuple[np.ndarray, float]:
 
 
 def over_dds(path: Path, estimator: str, folder: Path) -> tuple[np.ndarray, np.ndarray, float]:
-    """Seconds from each scan on the wire to its odometry on the wire; the same from another process's (slow) point of view, which writes the
-    one and reads the other in Python; and the estimator's part of a core."""
+    """Seconds from each scan on the wire to its odometry on the wire; the same as another process sees it, which writes the one and reads
+    the other in Python; and the estimator's part of a core."""
     domain = "97"
     node_command = (sys.executable, "-m", "localization.cli", "online", "--robot", "vaultbot", "--door", "dds", "--domain", domain)
     options = ("--estimator", estimator, "--node.wait-s", "1", "--state", folder / f"{estimator}.state")
