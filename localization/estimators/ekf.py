@@ -112,7 +112,7 @@ class Ekf:
             P = F @ self._filter.P @ F.T
         P[POSE, POSE] += step.predicted.cov
         P[BIAS, BIAS] += self._gyro.bias_walk_rad_per_s_sqrt_s**2 * step.duration
-        if self.config.clock_sigma_s:
+        if P[CLOCK, CLOCK]:
             P[CLOCK, CLOCK] += self.config.clock_walk_s_per_sqrt_s**2 * step.duration
         if step.is_standing:
             c = self.config
@@ -125,6 +125,10 @@ class Ekf:
         self._start, self._since_start = self.pose, step.predicted.delta
         self._since_anchor = se2.compose(self._since_anchor, step.predicted.delta)
         self.pose = moved
+
+    def meet_clock(self, sigma_s: float) -> None:
+        """A second clock is heard for the first time, and the wheels' may be off it by ``sigma_s`` [s]."""
+        self._filter.P[CLOCK, CLOCK] += sigma_s**2
 
     def measure_turn(self, turn: Turn) -> float:
         """The gyro's turn since the start of the step."""

@@ -24,7 +24,7 @@ from localization.estimators.graph_factors import Closure, Kernel, Pairs, Positi
 from localization.estimators.graph_history import History
 from localization.estimators.graph_link import Link, check_covariance, check_motion
 from localization.estimators.graph_revisit import revisited
-from localization.estimators.graph_slow import Learned, SlowStates
+from localization.estimators.graph_slow import ONE_CLOCK, Learned, SlowStates
 from localization.estimators.graph_window import Ahead, Node, SingularError, Window
 from localization.estimators.teaching import teaching
 from localization.estimators.witness import NoWitness, ScanWitness, Sight, Witness
@@ -88,8 +88,8 @@ class GraphFusion:
         self._track_m = robot.geometry.track_width_m
         self._witness: Witness = (witness or ScanWitness(mounts, lidar)) if has_lidar else NoWitness()
         c = self.config
-        learn = c.learn if has_lidar else ()  # without a LiDAR there is no second clock to compare with
-        self._slow = SlowStates(robot.gyro_noise, corrected, self._belief, learn, c.mount_sigma_m, c.mount_sigma_rad)
+        self._slow = SlowStates(robot.gyro_noise, corrected, self._belief, c.learn, c.mount_sigma_m, c.mount_sigma_rad, has_lidar)
+        self._clock_walk = None if has_lidar else ONE_CLOCK
         self._mounts, self._mount = mounts, Mount()
         self._kernel = Kernel(self.config.kernel, self.config.kernel_scale)
         cov = block_diag(_CERTAIN**2 * np.eye(3), self._slow.cov)
@@ -119,6 +119,9 @@ class GraphFusion:
             self._nodes_ns.append(step.start_ns)
         known = self._now.covariance[3:, 3:][self._slow.corrections, self._slow.corrections]
         link = self._slow.link(teaching(step, self._track_m, self._corrected, known), self._now.slow)
+        if not self._has_lidar:
+            has_turn = step.turn is not None
+            self._clock_walk = None if self._has_gyro else self._belief.clock_sigma_s**2 if has_turn else ONE_CLOCK
         self._has_gyro |= step.turn is not None
         self._counts["standing"] += step.is_standing
         pending = link if self._pending is None else self._pending.then(link)
@@ -219,7 +222,7 @@ class GraphFusion:
         found, cov = {}, self._now.covariance[3:, 3:]
         if self._has_gyro:
             found["gyro_bias_rad_per_s"] = float(self._now.slow[0]), math.sqrt(cov[0, 0])
-        if self._slow.has_clock:
+        if self._slow.has_clock and (self._has_lidar or self._has_gyro):
             found["wheel_clock_offset_s"] = float(self._now.slow[1]), math.sqrt(cov[1, 1])
         for i, name in enumerate(self._slow.mount_names, start=1 + self._slow.has_clock):
             row = ("lidar_x", "lidar_y", "lidar_yaw").index(name)
@@ -241,7 +244,7 @@ class GraphFusion:
         return self._now.covariance
 
     def _extend(self, link: Link) -> Ahead:
-        pair = Pairs.one(link, self._slow.walk(link.duration, link.moving))
+        pair = Pairs.one(link, self._slow.walk(link.duration, link.moving, self._clock_walk))
         try:
             return self._window.extend(pair)
         except SingularError as error:
