@@ -169,7 +169,7 @@ def _picture(strong: Sequence[Row], nulls: Sequence[Row]) -> bytes:
         axes.set(xlabel="named first (or the truth, where it is among the aliases)", ylabel="hidden")
         axes.grid(visible=False)
 
-    return plots.picture(8.0, 7.5, draw)
+    return plots.picture(7.0, 6.6, draw)
 
 
 if __name__ == "__main__":

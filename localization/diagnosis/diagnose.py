@@ -15,7 +15,7 @@ from localization.diagnosis.drive import Drive
 from localization.diagnosis.effects import Effect
 from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain, Verdict
 from localization.diagnosis.heldout import heldout_gain
-from localization.diagnosis.look import Look, candidates, look, make_pipeline
+from localization.diagnosis.look import Look, candidates, held_to, look, make_pipeline
 from localization.diagnosis.next_drive import general_advice, separating_drive
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, Pipeline, with_sizes
 from localization.diagnosis.search import aliases_of, search, true_cost
@@ -86,19 +86,20 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
         return Examined(_undecidable(drive, model, drive.notes[0] if drive.witness == "none" else why), None, None)
     pipeline = make_pipeline(drive, model)
     effects = candidates(pipeline, config.moments)
-    found = _examined(pipeline, effects, _TOLERANCES[0], config)
+    first = look(pipeline, effects, {}, _TOLERANCES[0])
+    found = _examined(pipeline, first, config)
     if found.diagnosis.verdict == "consistent":  # within what robots are: is it what their files say?
-        strict = _examined(pipeline, effects, _TOLERANCES[1], config)
+        strict = _examined(pipeline, held_to(first, _TOLERANCES[1]), config)
         if strict.diagnosis.verdict != "consistent":
             return strict
     return found
 
 
-def _examined(pipeline: Pipeline, effects: tuple[Effect, ...], tolerance: float, config: DiagnosisConfig) -> Examined:
-    """With everything that is not named within ``tolerance``."""
+def _examined(pipeline: Pipeline, first: Look, config: DiagnosisConfig) -> Examined:
+    """With everything that is not named within the tolerance of the ``first`` look."""
     rng = np.random.default_rng(config.seed)
-    state = look(pipeline, effects, {}, tolerance)
-    first = state
+    effects, tolerance = first.effects, first.tolerance
+    state = first
     current: dict[Effect, float] = {}
     visited: list[dict[Effect, float]] = []
     seen: list[frozenset[str]] = []

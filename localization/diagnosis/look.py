@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,6 +90,12 @@ def look(pipeline: Pipeline, effects: tuple[Effect, ...], sizes: dict[Effect, fl
     noise = _noise(pipeline, linear, signatures, nuisances, effects)
     problem = normal_form(linear, signatures, nuisances, noise, effects, tolerance)
     return Look(effects, rows, linear, signatures, nuisances, noise, tolerance, problem)
+
+
+def held_to(state: Look, tolerance: float) -> Look:
+    """The same look, with what is not named within another ``tolerance``."""
+    problem = normal_form(state.linear, state.signatures, state.nuisances, state.noise, state.effects, tolerance)
+    return dataclasses.replace(state, tolerance=tolerance, problem=problem)
 
 
 def normal_form(

@@ -19,8 +19,10 @@ _CLOSE_SHARE = 0.02  # or this share of what the cause explains, which no model 
 _REFINED = 2  # sets of each number of causes that are tried for real
 _FORETOLD = 0.1  # share of what signatures promise that may be missing
 _PLAIN, _TRIED = 2, 4  # then so many sets of up to so many causes are tried whatever signatures say
+_NEAR = 30.0
 _SURE = 200.0  # lead in twice the log-evidence that needs no trial
-_STEPS = 3
+_STEPS = 4
+_SHORT, _LONG = 0.02, 0.2  # steps, over usual sizes: one that ends, and one after which signatures are taken anew
 
 
 def search(pipeline: Pipeline, state: Look) -> dict[Effect, float]:
@@ -42,7 +44,8 @@ def search(pipeline: Pipeline, state: Look) -> dict[Effect, float]:
     is_sure = len(ranked) < 2 or ranked[1][0] - least > _SURE
     as_foretold = real(best) < nothing + least + max(_FORETOLD * abs(least), _CLOSE)
     real(())
-    near = [s for c, s in ranked if c - least < _SURE]
+    margin = max(_NEAR, _FORETOLD * abs(least)) if as_foretold else _SURE
+    near = [s for c, s in ranked if c - least < margin]
     for size in range(1, MOST_CAUSES):
         alike = [s for s in near if len(s) == size][:_REFINED] if not is_sure else []
         if not as_foretold and size <= _PLAIN:  # where signatures bend, few causes may do what many seem to
@@ -103,21 +106,26 @@ def _tried(pipeline: Pipeline, state: Look, start: dict[Effect, float]) -> tuple
 
 
 def _refined(pipeline: Pipeline, state: Look, sizes: dict[Effect, float]) -> tuple[dict[Effect, float], FloatArray]:
-    """Gauss-Newton on the sizes by the real pipeline; and the discrepancies (M, 6) that they leave."""
+    """Gauss-Newton on the sizes by the real pipeline, with the signatures that are at hand until a step is long; and the discrepancies
+    (M, 6) that they leave."""
     order = list(sizes)
+    limits = _bounds(tuple(order))
     values = np.array([_bounded(e, sizes[e]) for e in order])
     rows = pipeline.discrepancies(with_sizes(dict(zip(order, values, strict=True))))
+    own = state.signatures[..., [state.effects.index(e) for e in order]]
+    usual = np.array([e.usual for e in order])
     for _ in range(_STEPS if order else 0):
-        belief = with_sizes(dict(zip(order, values, strict=True)))
-        own = np.stack([pipeline.signature(belief, e, rows) for e in order], axis=-1)
         problem = normal_form(rows, own, state.nuisances, state.noise, tuple(order), state.tolerance)
         change = np.linalg.solve(problem.gram + 1e-9 * np.eye(len(order)), problem.moment) * problem.scale
-        limits = _bounds(tuple(order))
         new = np.clip(values + change, limits[:, 0], limits[:, 1])
-        values, moved = new, np.abs(new - values) / np.array([e.usual for e in order])
-        rows = pipeline.discrepancies(with_sizes(dict(zip(order, values, strict=True))))
-        if moved.max() < 0.02:
+        moved = float(np.max(np.abs(new - values) / usual))
+        if moved < _SHORT:
             break
+        values = new
+        belief = with_sizes(dict(zip(order, values, strict=True)))
+        rows = pipeline.discrepancies(belief)
+        if moved > _LONG:
+            own = np.stack([pipeline.signature(belief, e, rows) for e in order], axis=-1)
     return dict(zip(order, (float(v) for v in values), strict=True)), rows
 
 
