@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import html
 import json
 import os
 import re
@@ -147,6 +148,18 @@ def test_a_log_that_is_broken_is_reported_and_the_others_finished(table, tmp_pat
     assert {r["ate_rmse_m"] for r in rows[2:8]} == {r["ate_rmse_m"] for r in rows_of(table)}
     assert compare(tmp_path / "u.csv", of=[absent]) == 2
     assert "none of 1 logs could be compared" in " ".join(capsys.readouterr().err.split())
+
+
+def test_what_was_amiss_with_a_log_is_told(tmp_path):
+    """A log that is cut off still counts: whoever reads the means must know."""
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(logs(1)[0].read_bytes()[:-4000])
+    assert compare(tmp_path / "t.csv", of=[cut, *logs(1)]) == 0
+    by_log = {row["log"]: row["notes"] for row in rows_of(tmp_path / "t.csv")}
+    assert by_log[str(logs(1)[0])] == ""
+    assert by_log[str(cut)]
+    assert html.escape(by_log[str(cut)]) in (tmp_path / "t.html").read_text()
+    assert compare(tmp_path / "t.csv", of=[cut, *logs(1)]) == 0  # and it is read again
 
 
 def test_a_bug_in_one_log_does_not_end_the_others(monkeypatch):
