@@ -25,6 +25,7 @@ from motion_models.se2 import FloatArray
 
 _ROUNDS = 5
 _TOLERANCES = (0.35, 0.1)  # sigma of causes that nobody names, over what is negligible: first as robots are, then as files say
+_STRICT = 2.0  # with the stricter of them, sizes must be so many times what is negligible
 _UNSURE = 1.0 / 3.0  # systematic part of a size's sigma, over what is negligible: clocks, mounts and physics are no better
 _PAYS = 0.003  # least held-out gain of a finding
 _CLEAR = 0.05
@@ -153,10 +154,11 @@ def _conclude(
         return heldout_gain(*data, with_these, without, np.random.default_rng(config.seed))
 
     within: dict[str, tuple[float, float]] = {}
+    least = 1.0 if state.tolerance >= _TOLERANCES[0] else _STRICT
     while chosen:  # what nobody would correct, or does not pay where its size was not fitted to, is not named
         sizes, cov, _ = problem.fit(chosen)
         gains = [held(chosen, tuple(j for j in chosen if j != i)) for i in chosen]
-        small = [n for n, i in enumerate(chosen) if abs(sizes[n]) < effects[i].negligible or not _pays(gains[n], len(state.rows))]
+        small = [n for n, i in enumerate(chosen) if abs(sizes[n]) < least * effects[i].negligible or not _pays(gains[n], len(state.rows))]
         if not small:
             break
         worst = min(small, key=lambda n: gains[n].relative)
