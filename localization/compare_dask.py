@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 
 from localization.compare_job import Job, Row, failed_rows, run_job
@@ -13,10 +14,13 @@ except ImportError as error:
     raise DoorError(f"a Dask cluster needs the extra 'dask': pip install 'skidloc[dask]' ({error}).") from error
 
 _TIMEOUT_S = 10
+_ADDRESS = re.compile(r"((tcp|tls|wss?|ucxx?)://)?(\[[^\]]+\]|[^/:\[\]\s]+):\d+")
 
 
 def run_on_cluster(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, list[Row]]]:
     """Each job with its rows, as it ends. What a lost worker had is done by another. Raises `DoorError`."""
+    if not _ADDRESS.fullmatch(address):  # which distributed would look for until it gives up, with a traceback
+        raise DoorError(f"no Dask scheduler answers at {address}: that is no address. One looks like tcp://host:8786.")
     try:
         client = distributed.Client(address, timeout=_TIMEOUT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:

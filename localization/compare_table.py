@@ -14,6 +14,7 @@ from localization.errors import OutputError
 from localization.estimators import CORRECTING
 
 _HEAD = ("log", "robot", "model", "estimator", "corrections", "key", "status", "error")
+_TEXTS = (*_HEAD, "notes")
 _SUFFIXES = (".csv", ".parquet")
 
 Name = tuple[str, str, str, str]
@@ -100,7 +101,7 @@ def _write_csv(path: Path, rows: Sequence[Row]) -> None:
 
 def _read_csv(path: Path) -> list[Row]:
     with path.open(encoding="utf-8", newline="") as file:
-        return [{name: value if name in _HEAD else _number(value) for name, value in row.items()} for row in csv.DictReader(file)]
+        return [{name: value if name in _TEXTS else _number(value) for name, value in row.items()} for row in csv.DictReader(file)]
 
 
 def _number(text: str) -> float | int | None:
@@ -130,7 +131,7 @@ def _parquet(path: Path) -> tuple[Callable[[Path], list[Row]], Callable[[Path, S
         for name in _columns(rows):
             values = [row.get(name) for row in rows]
             is_whole = any(type(value) is int for value in values) and all(value is None or type(value) is int for value in values)
-            kind = pyarrow.string() if name in _HEAD else pyarrow.int64() if is_whole else pyarrow.float64()
+            kind = pyarrow.string() if name in _TEXTS else pyarrow.int64() if is_whole else pyarrow.float64()
             columns[name] = pyarrow.array(values, kind)
         with path.open("wb") as file:
             parquet.write_table(pyarrow.table(columns), file)

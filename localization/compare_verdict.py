@@ -99,16 +99,16 @@ def closing(found: Findings) -> list[str]:
 
 def _of(d: Difference, found: Findings) -> str:
     better, worse = found.words[d.better], found.words[d.worse]
-    gap = f"by {percent(d)} of {found.measure}, p = {p_words(d.p_value)}"
+    gap = f"by {percent(d, found.unit)} of {found.measure}, p = {p_words(d.p_value)}"
     if found.is_shown(d):
         return f"{capitalised(better)} beats {worse} on {d.wins} of {_logs(d.n)}, {gap}."
     return f"{capitalised(better)} and {worse} are not told apart: the first is better on {d.wins} of {_logs(d.n)}, {gap}."
 
 
-def percent(d: Difference) -> str:
-    """By how much the better one is smaller, with its interval: of the worse one's mean where that can be said."""
+def percent(d: Difference, unit: str = "") -> str:
+    """By how much the better one is smaller, with its interval: of the worse one's mean where that can be said, else in the ``unit``."""
     if math.isnan(d.relative):
-        return f"{d.mean:.3g} [{d.low:.3g}, {d.high:.3g}]"
+        return f"{d.mean:.3g} {unit}".rstrip() + f" [{d.low:.3g}, {d.high:.3g}]"
     return f"{_part(d.relative)} % [{_part(d.relative_low)}, {_part(d.relative_high)}]"
 
 

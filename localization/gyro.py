@@ -73,6 +73,10 @@ class GyroHistory:
             n = bisect.bisect_left(self._stamps, sample.stamp_ns - self._keep_ns)
             del self._stamps[:n], self._angles[:n]
 
+    @property
+    def newest_ns(self) -> int | None:
+        return self._stamps[-1] if self._stamps else None
+
     def turn(self, start_ns: int, end_ns: int, by_wheels: float) -> Turn | None:
         """The turn from ``start_ns`` to ``end_ns``; ``by_wheels`` [rad] only tells which way is left, where the mount does not.
 

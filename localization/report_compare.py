@@ -84,6 +84,7 @@ def comparison_page(head: CompareHead, found: Findings) -> str:
         section("The best against the others", _gains_figure(found, others, styles) + _tests(found, styles)),
         section("Every log", _by_log(found, styles)),
         section("What failed", _failures(found)),
+        section("What was amiss with logs that did not fail", _notes(found)),
         glossary(_TERMS),
         section("Where this comes from", definition_table(_provenance(head, found))),
     ]
@@ -126,7 +127,7 @@ def _tests(found: Findings, styles: Mapping[str, tuple[str, int]]) -> str:
 
 def _cells(d: Difference, found: Findings) -> tuple[str, str, str]:
     reverse = "" if d.better == found.best.name else "the other: "
-    return f"{reverse}{percent(d)}", f"{d.wins} of {d.n}", p_words(d.p_value)
+    return f"{reverse}{percent(d, found.unit)}", f"{d.wins} of {d.n}", p_words(d.p_value)
 
 
 def _all_pairs(found: Findings) -> str:
@@ -135,7 +136,7 @@ def _all_pairs(found: Findings) -> str:
     rows = [
         row(
             escape(f"{capitalised(found.words[d.better])} before {found.words[d.worse]}"),
-            percent(d),
+            percent(d, found.unit),
             f"{d.wins} of {d.n}",
             p_words(d.p_value),
         )
@@ -171,6 +172,12 @@ def _failures(found: Findings) -> str:
         which = "everything" if len(names) == len(found.words) else ", ".join(names)
         rows.append(f"<li><b>{escape(_short(log, found))}</b> ({escape(which)}): {escape(reason)}</li>")
     return f"<ul>{''.join(rows)}</ul>" if rows else ""
+
+
+def _notes(found: Findings) -> str:
+    notes = {r["log"]: r["notes"] for r in found.rows if r.get("notes")}
+    listed = "".join(f"<li><b>{escape(_short(log, found))}</b>: {escape(said)}</li>" for log, said in notes.items())
+    return f"<ul>{listed}</ul>" if listed else ""
 
 
 def _name(name: str, found: Findings, styles: Mapping[str, tuple[str, int]], badge: str = "") -> str:

@@ -71,7 +71,8 @@ dl{grid-template-columns:minmax(5rem,36%) 1fr}.terms{grid-template-columns:1fr}.
 .wide{display:block!important}.narrow{display:none!important}
 body{font-size:10pt}main{max-width:none;padding:0}
 h2{break-after:avoid}figure,tr,.verdict{break-inside:avoid}
-.scroll{overflow:visible}table,th small,td small{font-size:8pt}th,td{padding:.25rem .35rem}thead th{min-width:0}
+.scroll{overflow:visible}th:first-child,td:first-child{position:static}
+table,th small,td small{font-size:8pt}th,td{padding:.25rem .35rem}thead th{min-width:0}
 .legend input{display:none}*{print-color-adjust:exact;-webkit-print-color-adjust:exact}
 }
 """

@@ -28,9 +28,9 @@ class StepConfig:
     max_step_s: float = 0.25
     """A step ends at a scan; where none comes for this long, it ends without one [s]."""
     no_lidar_step_s: float = 0.05
-    """Length of steps in a log without a LiDAR, at least [s]; they end at wheel samples."""
+    """Length of steps in a log without a LiDAR, at least [s]; they end where wheels and gyro both were heard up to."""
     wait_s: float = 0.3
-    """How long a scan waits for the wheel samples around it before it is used without them [s]."""
+    """How long a scan waits for the wheel samples around it before it is used without them, and wheels for the gyro [s]."""
     max_hold_s: float = 0.5
     """For how long the last wheel rates are believed when no more come [s]."""
     lost_speed_m_s: float = 0.5
@@ -142,6 +142,10 @@ class Stepper:
         if self._has_lidar:
             least = self.config.max_step_s + (0.0 if is_last else self.config.wait_s)
             return None if end_ns - self._start_ns < least / _NS else (self._start_ns + round(self.config.max_step_s / _NS), None)
+        # the gyro's clock may be ahead of the wheels': where its last rate stood for what it has not said yet, the two could not tell
+        gyro_ns = self._gyro.newest_ns
+        if gyro_ns is not None and not is_last and self._now_ns <= gyro_ns + self.config.wait_s / _NS:
+            end_ns = min(end_ns, gyro_ns)
         least = _NS if is_last else self.config.no_lidar_step_s
         return None if end_ns - self._start_ns < least / _NS else (end_ns, None)
 

@@ -1,7 +1,8 @@
 """A robot on DDS, in a process of its own: plays a log's messages in real time by ROS 2's names, and hears what is published of it.
 
 Its latched transforms are sent at once; for each number read from the standard input, the next so many seconds of the log. At the end of
-the input it prints one JSON line: what it heard, and how long after each scan.
+the input it prints one JSON line: what it heard, how long after each scan ("latencies_s": from before this process serialised the scan
+until it had read the answer), and when that was sent ("out_s": from the scan on the wire to the answer on the wire).
 
 Its types are written out by hand in cyclonedds' own IDL and serialised by it, so that it shares nothing with what it talks to but the
 wire.
@@ -212,7 +213,7 @@ def main(path: str, domain: int) -> None:
     hear = {"/skidloc/odometry": Odometry, "/tf": TFMessage, "/diagnostics": DiagnosticArray, "/skidloc/corrections": JointState}
     readers = {topic: DataReader(participant, Topic(participant, f"rt{topic}", kind), VOLATILE) for topic, kind in hear.items()}
     heard = {topic: [] for topic in hear}
-    scans_sent, latencies = {}, []
+    scans_sent, latencies, out = {}, [], []
 
     def listen() -> None:
         for topic, reader in readers.items():
@@ -220,7 +221,9 @@ def main(path: str, domain: int) -> None:
                 if not isinstance(sample, hear[topic]):
                     continue
                 if topic == "/skidloc/odometry" and stamp(sample.header) in scans_sent:
-                    latencies.append(time.monotonic() - scans_sent[stamp(sample.header)])
+                    before, after_ns = scans_sent[stamp(sample.header)]
+                    latencies.append(time.monotonic() - before)
+                    out.append((sample.sample_info.source_timestamp - after_ns) * 1e-9)
                 heard[topic].append(sample)
 
     for _, topic, message in records:
@@ -235,9 +238,10 @@ def main(path: str, domain: int) -> None:
             while time.monotonic() < begin + (log_ns - first) * 1e-9:
                 listen()
                 time.sleep(0.0003)
-            if topic == "/scan":
-                scans_sent[stamp(message.header)] = time.monotonic()
+            before = time.monotonic()
             writers[topic].write(message)
+            if topic == "/scan":
+                scans_sent[stamp(message.header)] = before, time.time_ns()
         end = time.monotonic() + 1.5
         while time.monotonic() < end:
             listen()
@@ -249,6 +253,7 @@ def main(path: str, domain: int) -> None:
             {
                 "sent_scans": len(scans_sent),
                 "latencies_s": latencies,
+                "out_s": out,
                 "stamps": [stamp(o.header) for o in odometry],
                 "poses": [[o.pose.pose.position.x, o.pose.pose.position.y, o.pose.pose.orientation.z] for o in odometry],
                 "twists": [[o.twist.twist.linear.x, o.twist.twist.linear.y, o.twist.twist.angular.z] for o in odometry],

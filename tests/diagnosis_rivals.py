@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from localization.diagnosis import diagnose as engine
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.effects import EFFECTS, Effect, friction_change
 from localization.diagnosis.heldout import _heldout, heldout_gain
+from localization.diagnosis.look import Look
 from localization.diagnosis.prediction import Pipeline, with_sizes
 from motion_models.se2 import FloatArray
 
@@ -25,7 +25,7 @@ _MOST = 7
 _BLOCK, _FOLDS = 4, 5
 
 
-def rivals(drive: Drive, pipeline: Pipeline, state: engine._State) -> dict[str, tuple[str, float]]:
+def rivals(drive: Drive, pipeline: Pipeline, state: Look) -> dict[str, tuple[str, float]]:
     """Name and relative held-out gain by each; ``state`` is the nominal one, in the noise by which all are measured."""
     y = state.noise.whiten(state.linear).ravel()
     scale = state.problem.scale
@@ -46,7 +46,7 @@ def rivals(drive: Drive, pipeline: Pipeline, state: engine._State) -> dict[str, 
     return found
 
 
-def oracle(pipeline: Pipeline, state: engine._State, truth: dict[str, float]) -> float:
+def oracle(pipeline: Pipeline, state: Look, truth: dict[str, float]) -> float:
     """Relative held-out gain of the very causes at their very sizes."""
     moment = [friction_change(float(at)) for at in np.linspace(0.2, 0.8, 31) * float(pipeline.drive.starts_s[-1])]
     options: list[dict[Effect, float]] = [{}]
@@ -89,7 +89,7 @@ def _stlsq(y: FloatArray, s: FloatArray, threshold: float) -> list[int]:
     return [int(i) for i in np.flatnonzero(keep)]
 
 
-def _gp_gain(drive: Drive, state: engine._State) -> float:
+def _gp_gain(drive: Drive, state: Look) -> float:
     """A squared-exponential Gaussian process on (distance, turn, CG) of each window and a constant, one for each channel."""
     inputs = []
     for m in drive.maneuvers:

@@ -164,12 +164,12 @@ def _picture(strong: Sequence[Row], nulls: Sequence[Row]) -> bytes:
         for i, j in np.argwhere(table > 0):
             colour = "white" if table[i, j] > 0.6 * whole[i, 0] else "black"
             axes.text(j, i, f"{table[i, j]:.0f}", ha="center", va="center", fontsize=7, color=colour)
-        axes.set_xticks(range(len(columns)), columns, rotation=90)
-        axes.set_yticks(range(len(names)), names)
+        axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=8)
+        axes.set_yticks(range(len(names)), names, fontsize=8)
         axes.set(xlabel="named first (or the truth, where it is among the aliases)", ylabel="hidden")
         axes.grid(visible=False)
 
-    return plots.picture(8.0, 7.5, draw)
+    return plots.picture(6.4, 6.0, draw)
 
 
 if __name__ == "__main__":

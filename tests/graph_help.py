@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from localization.estimators.ekf import BIAS, CLOCK, PARAMS, EkfConfig
+from localization.estimators.ekf import BIAS, EkfConfig
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from motion_models import se2
@@ -68,9 +68,9 @@ def beliefs(estimator):
     """Mean (m,) of the slow states, and the joint covariance (3 + m, 3 + m) of pose and slow states."""
     if isinstance(estimator, GraphFusion):
         return estimator._now.slow, estimator.covariance()
-    ekf, has_lidar = estimator._ekf, estimator._witness is not None
-    index = [0, 1, 2, BIAS, *([CLOCK] if has_lidar else []), *range(PARAMS, len(ekf.covariance))]
-    return np.concatenate([[ekf.bias], [ekf.clock_offset] if has_lidar else [], ekf.correction]), ekf.covariance[np.ix_(index, index)]
+    ekf = estimator._ekf
+    index = [0, 1, 2, *range(BIAS, len(ekf.covariance))]
+    return np.concatenate([[ekf.bias, ekf.clock_offset], ekf.correction]), ekf.covariance[np.ix_(index, index)]
 
 
 def squared_errors(kind, seed, steps, noise, model="skid_steer", form="constant", has_lidar=True):

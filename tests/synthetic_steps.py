@@ -69,7 +69,7 @@ class Result:
     truth: np.ndarray
     """(3,) last true pose"""
     slow: np.ndarray
-    """true gyro bias, clock offset (if a LiDAR is on), corrections"""
+    """true gyro bias, clock offset, corrections"""
     nees_pose: list[float]
 
 
@@ -103,7 +103,7 @@ class World:
         self.has_lidar, self.wheels, self.cg = has_lidar, wheels, cg
         self.pose, self.t, self.k = np.zeros(3), 0.0, 0
         self.bias = rng.normal(0.0, noise.gyro.bias_sigma_rad_per_s)
-        self.clock = rng.normal(0.0, belief.clock_sigma_s) if has_lidar and belief is not None else 0.0
+        self.clock = rng.normal(0.0, belief.clock_sigma_s) if belief is not None else 0.0
         self.belief, self.mount = belief, se2.exp(np.array(mount, dtype=float))
         k = len(corrected.names)
         self.correction = rng.multivariate_normal(np.zeros(k), corrected.cov) if k else np.zeros(0)
@@ -111,7 +111,7 @@ class World:
 
     @property
     def slow(self) -> np.ndarray:
-        return np.concatenate([[self.bias], [self.clock] if self.has_lidar else [], self.correction])
+        return np.concatenate([[self.bias, self.clock], self.correction])
 
     def first(self) -> Step:
         none = Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, len(self.model.param_names))))
@@ -167,7 +167,7 @@ class World:
         stamps = round(start * DT * 1e9), round(self.k * DT * 1e9)
         self.bias += rng.normal(0.0, g.bias_walk_rad_per_s_sqrt_s * math.sqrt(DT))
         self.correction = self.correction + self._walk @ rng.normal(size=len(self.correction)) * math.sqrt(DT)
-        if self.has_lidar and self.belief is not None:
+        if self.belief is not None:
             self.clock += rng.normal(0.0, self.belief.clock_walk_s_per_sqrt_s * math.sqrt(DT))
         return Step(*stamps, predicted, d_clock, twist.value[-1], False, True, turn, self._scan(stamps[1])), seen
 

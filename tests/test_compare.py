@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import html
 import json
 import os
 import re
@@ -149,6 +150,18 @@ def test_a_log_that_is_broken_is_reported_and_the_others_finished(table, tmp_pat
     assert "none of 1 logs could be compared" in " ".join(capsys.readouterr().err.split())
 
 
+def test_what_was_amiss_with_a_log_is_told(tmp_path):
+    """A log that is cut off still counts: whoever reads the means must know."""
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(logs(1)[0].read_bytes()[:-4000])
+    assert compare(tmp_path / "t.csv", of=[cut, *logs(1)]) == 0
+    by_log = {row["log"]: row["notes"] for row in rows_of(tmp_path / "t.csv")}
+    assert by_log[str(logs(1)[0])] == ""
+    assert by_log[str(cut)]
+    assert html.escape(by_log[str(cut)]) in (tmp_path / "t.html").read_text()
+    assert compare(tmp_path / "t.csv", of=[cut, *logs(1)]) == 0  # and it is read again
+
+
 def test_a_bug_in_one_log_does_not_end_the_others(monkeypatch):
     def bug(*arguments):
         raise ZeroDivisionError("a bug")
@@ -184,6 +197,7 @@ def test_no_process_is_left_behind_when_it_is_interrupted():
         (["--model", "magic"], "magic"),
         (["--out", "table.txt"], "must end in .csv or .parquet"),
         (["--robot", "nobody"], "nobody"),
+        (["--processes", "-3"], "--processes is -3"),
     ],
 )
 def test_bad_arguments_are_explained(arguments, said, tmp_path, capsys):
@@ -394,7 +408,7 @@ def test_a_scheduler_that_is_not_there_is_explained(tmp_path, capsys, monkeypatc
     from localization import compare_dask
 
     monkeypatch.setattr(compare_dask, "_TIMEOUT_S", 1)
-    for address in ("tcp://127.0.0.1:1", "nonsense://x"):
+    for address in ("tcp://127.0.0.1:1", "nonsense", "nonsense://x:1", "tcp://127.0.0.1"):
         assert compare(tmp_path / "t.csv", "--dask", address) == 2
         said = " ".join(capsys.readouterr().err.split())
         assert f"no Dask scheduler answers at {address}" in said

@@ -8,17 +8,17 @@ from pathlib import Path
 import pytest
 
 from localization.diagnosis.findings import Diagnosis
-from tests.diagnosis_drives import ONE_SIDED, TYPICAL, bag, look
+from tests.diagnosis_drives import ONE_SIDED, TYPICAL, bag, drive, look
 
 CASES = [(cause, size if cause in ONE_SIDED or i % 2 == 0 else -size, 300 + i) for i, (cause, size) in enumerate(TYPICAL.items())]
 
-Diagnosed = Callable[[Mapping[str, float], int, str], Diagnosis]
+Diagnosed = Callable[..., Diagnosis]
 
 
 @pytest.fixture
 def diagnosed(tmp_path: Path) -> Diagnosed:
-    def run(effects: Mapping[str, float], seed: int, robot: str = "vaultbot") -> Diagnosis:
-        return look(bag(tmp_path / "drive.mcap", effects, seed, robot), robot).diagnosis
+    def run(effects: Mapping[str, float], seed: int, robot: str = "vaultbot", route: str = "tour", imu_hz: float = 50.0) -> Diagnosis:
+        return look(bag(tmp_path / "drive.mcap", effects, seed, robot, drive(route), imu_hz=imu_hz), robot).diagnosis
 
     return run
 
@@ -38,9 +38,9 @@ def test_a_hidden_cause_is_named_with_its_size(diagnosed: Diagnosed, cause: str,
     assert found.gain.low > 0.0
 
 
-@pytest.mark.parametrize("seed", [400, 401])
-def test_where_nothing_is_hidden_nothing_is_found(diagnosed: Diagnosed, seed: int) -> None:
-    found = diagnosed({}, seed, "vaultbot")
+@pytest.mark.parametrize(("robot", "route", "seed"), [("vaultbot", "tour", 400), ("jackal", "random_4", 401), ("vaultbot", "20s", 20_009)])
+def test_where_nothing_is_hidden_nothing_is_found(diagnosed: Diagnosed, robot: str, route: str, seed: int) -> None:
+    found = diagnosed({}, seed, robot, route)
     assert found.verdict == "consistent"
     assert not found.findings
 
@@ -65,3 +65,46 @@ def test_causes_that_a_robot_cannot_tell_apart_are_one_finding(diagnosed: Diagno
     first = found.findings[0]
     assert {first.cause, *dict(first.aliases)} >= {"payload", "cg_offset_x"}
     assert {"payload", "cg_offset_x"} <= set(found.next_drive.replace(",", "").split())
+
+
+def test_without_a_gyro_only_the_clocks_difference_shows(diagnosed: Diagnosed) -> None:
+    found = diagnosed({"lidar_time_offset": 0.05}, 430, imu_hz=0.0)
+    assert found.verdict == "ambiguous"
+    first = found.findings[0]
+    sizes = {first.cause: first.size, **dict(first.aliases)}
+    assert sizes["lidar_time_offset"] == pytest.approx(0.05, abs=0.01)
+    assert sizes["wheel_time_offset"] == pytest.approx(-0.05, abs=0.01)
+
+
+def test_turns_in_place_alone_show_one_number(diagnosed: Diagnosed) -> None:
+    """How much less the robot turns: by its track, by the floor, or by scrubbing, who knows."""
+    found = diagnosed({"track_width": 0.04}, 431, "husky_a200", "spin")
+    assert found.verdict == "ambiguous"
+    first = found.findings[0]
+    assert {first.cause, *dict(first.aliases)} >= {"track_width", "friction_anisotropy", "scrub"}
+    assert found.next_drive
+
+
+def test_a_cause_whose_signature_bends_is_found_at_its_size(diagnosed: Diagnosed) -> None:
+    """3 cm are a quarter of the way to a small robot's axle: how much it turns goes with the square of that."""
+    found = diagnosed({"cg_offset_x": 0.03}, 432, "jackal")
+    first = found.findings[0]
+    sizes = {first.cause: first.size, **dict(first.aliases)}
+    assert sizes["cg_offset_x"] == pytest.approx(0.03, abs=0.003)
+    assert len(found.findings) == 1
+
+
+def test_a_wet_patch_of_floor_has_no_name(diagnosed: Diagnosed) -> None:
+    found = diagnosed({}, 433, route="slippery_patch")
+    assert found.verdict == "unexplained"
+    assert not found.findings
+    assert found.shapes
+    assert all(shape.component == "yaw" for shape in found.shapes)
+
+
+def test_a_minor_second_cause_does_not_hide_the_first(diagnosed: Diagnosed) -> None:
+    """The second is no larger than robots ever differ from their files."""
+    found = diagnosed({"diagonal_load": 0.15, "cg_offset_y": 0.003}, 434)
+    assert found.verdict in ("explained", "ambiguous")
+    assert [f.cause for f in found.findings] == ["diagonal_load"]
+    assert found.findings[0].size == pytest.approx(0.15, abs=3.0 * found.findings[0].sigma)

@@ -16,6 +16,9 @@ from motion_models.registry import make_model
 from motion_models.regressions import read_rotation_table
 from motion_models.robot import load_robot
 from motion_models.rotations import rotations_as_maneuvers
+from tests import diagnosis_clocks as drive_husky_clocks
+from tests.diagnosis_rotations import known
+from tests.diagnosis_rotations import rotations as rotations_driven
 from tests.studies import drive_husky
 
 DATA = Path(__file__).parent / "data"
@@ -96,3 +99,28 @@ def test_what_is_corrected_is_not_found_again() -> None:
     moved = dataclasses.replace(robot, models={**robot.models, "friction": {"tracked_x": 0.066}})
     found = diagnose(dataclasses.replace(drive, robot=moved), make_model("friction", moved))
     assert "lidar_offset_x" not in {f.cause for f in found.findings}
+
+
+def test_what_clockwise_rotations_would_add() -> None:
+    """Treads, and little else: the warp is told from them already by how its traces change with the centre of gravity."""
+    one, both = (known(rotations_driven(rates, 0)) for rates in ((0.3, 0.3), (0.3, -0.3)))
+    better = {name: one.sigma[name] / both.sigma[name] for name in one.sigma}
+    assert better.pop("tread_asymmetry") > 10.0
+    assert max(better.values()) < 2.0
+    for table in (one, both):
+        assert {f.cause for f in table.diagnosis.findings} == {"lidar_offset_x", "diagonal_load", "track_width"}
+
+
+def test_poses_and_wheels_of_a_real_husky_are_both_late() -> None:
+    """A clock between them is named; the gyro, which the diagnosis did not see, shows that both are late, and the wheels are more so."""
+    robot = drive_husky.robot()
+    windows = drive_husky.maneuvers(mended=True)
+    found = diagnose(drive_of_table("husky", robot, windows, "windows"), make_model("diff_drive", robot))
+    clock = next(f for f in found.findings if f.cause in ("lidar_time_offset", "wheel_time_offset"))
+    assert {clock.cause, *dict(clock.aliases)} == {"lidar_time_offset", "wheel_time_offset"}
+    assert clock.gain.low > 0.0
+    wheels_later = clock.size if clock.cause == "wheel_time_offset" else dict(clock.aliases)["wheel_time_offset"]
+    poses, wheels = drive_husky_clocks.late_poses(), drive_husky_clocks.late_wheels()
+    assert poses.late_s == pytest.approx(0.17, abs=0.02)
+    assert poses.heldout_share > 0.7
+    assert wheels_later == pytest.approx(wheels.late_s - poses.late_s, abs=0.03)

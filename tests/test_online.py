@@ -201,10 +201,12 @@ def test_degeneracy_tells_corridors_from_rooms(calm):
     assert degeneracy(np.zeros((5, 2))) is None
     _, node, _ = calm
     health = node.session.health
-    health._degeneracy = 0.01
-    assert health.statuses(node.session.core)[1].level == WARN
-    health._degeneracy = 0.3
+    last = health._scan
     assert health.statuses(node.session.core)[1].level == OK
+    corridor = scan(1.5 / np.abs(np.sin(angle)))
+    health.saw(dataclasses.replace(last, points=np.column_stack([corridor, np.zeros(len(corridor))])))
+    assert health.statuses(node.session.core)[1].level == WARN
+    health.saw(last)
 
 
 def test_silence_is_told_and_then_the_run_begins():
@@ -227,6 +229,14 @@ def test_silence_is_told_and_then_the_run_begins():
     named.types.pop("/scan")
     _, told = run_node(named, topics=TopicOverrides(scan="/scan"))
     assert told[0] == "waiting for /scan (nobody publishes it)."
+
+
+def test_topics_of_other_names_are_offered():
+    other = LogTransport(drive_log(), silenced("/scan", 0.0, 5.0), types={"/front/laser": "sensor_msgs/msg/LaserScan"})
+    other.types.pop("/scan")
+    _, told = run_node(other, topics=TopicOverrides(scan="/scan"))
+    said = "waiting for /scan (nobody publishes it). But /front/laser is sensor_msgs/LaserScan (--topic.scan /front/laser)."
+    assert told[0] == said
 
 
 def test_a_topic_of_another_type_is_refused():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -16,11 +17,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table as Grid
 
 from localization.commands.common import check_new, write_json
-from localization.compare_job import OK, Job, Row, job_key, trials
+from localization.compare_job import OK, Job, Row, job_key, run_job, trials
 from localization.compare_pool import run_local
 from localization.compare_table import Table
 from localization.compare_verdict import Findings, against_best, closing, find, headline
-from localization.errors import EvaluationError, LogError
+from localization.errors import EvaluationError, LogError, OutputError
 from localization.estimators import check_estimator
 from localization.logs import TopicOverrides
 from localization.provenance import versions
@@ -64,6 +65,8 @@ class Compare:
     def run(self, console: Console) -> None:
         if self.json is not None:
             check_new(self.json)
+        if self.processes < 0:
+            raise OutputError(f"--processes is {self.processes}; it must be 1 or more, or 0 for as many as there are cores.")
         table_path, report_path = places(self.out)
         check_report(report_path)
         jobs, table = self._jobs(), Table(table_path)
@@ -113,7 +116,9 @@ class Compare:
             from localization.compare_dask import run_on_cluster
 
             return run_on_cluster(jobs, self.dask)
-        return run_local(jobs, self.processes or os.cpu_count() or 1)
+        absent = [job for job in jobs if not Path(job.log).exists()]  # no process need be started to say so
+        there = [job for job in jobs if job not in absent]
+        return itertools.chain(((job, run_job(job)) for job in absent), run_local(there, self.processes or os.cpu_count() or 1))
 
     def _report(self, console: Console, table: Table, report: Path, rows: Sequence[Row]) -> None:
         failed = [row for row in rows if row["status"] != OK]

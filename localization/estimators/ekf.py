@@ -60,6 +60,8 @@ class Ekf:
         self._size = size = PARAMS + len(corrected.names)
         self.pose = np.zeros(3) if pose is None else np.array(pose, dtype=float)
         self._start, self._anchor = self.pose.copy(), self.pose.copy()
+        # the pose at the last scan as the map has it by what is known of its error, and where it is in the map as that was drawn
+        self._map, self._drawn = self.pose.copy(), self.pose.copy()
         # Predicted motions up to now, at which the covariance was moved along. Relative measurements must take their Jacobians there too:
         # taken at the corrected poses, metres of common drift would leak into them as knowledge of the heading that nobody has (Huang,
         # Mourikis, Roumeliotis, "Observability-based rules for designing consistent EKF SLAM estimators", IJRR 2010).
@@ -86,8 +88,12 @@ class Ekf:
 
     @property
     def anchor(self) -> FloatArray:
-        """(3,) estimate of the pose at the last scan."""
+        """(3,) estimate of the pose where the last scan was drawn."""
         return self._anchor
+
+    def in_map(self, pose: FloatArray) -> FloatArray:
+        """(3,) where ``pose`` (3,) is in the map as it was drawn."""
+        return se2.compose(self._drawn, se2.between(self._map, pose))
 
     @property
     def start(self) -> FloatArray:
@@ -113,7 +119,7 @@ class Ekf:
             P = F @ self._filter.P @ F.T
         P[POSE, POSE] += step.predicted.cov
         P[BIAS, BIAS] += self._gyro.bias_walk_rad_per_s_sqrt_s**2 * step.duration
-        if self.config.clock_sigma_s:
+        if P[CLOCK, CLOCK]:
             P[CLOCK, CLOCK] += self.config.clock_walk_s_per_sqrt_s**2 * step.duration
         if step.is_standing:
             c = self.config
@@ -126,6 +132,10 @@ class Ekf:
         self._start, self._since_start = self.pose, step.predicted.delta
         self._since_anchor = se2.compose(self._since_anchor, step.predicted.delta)
         self.pose = moved
+
+    def meet_clock(self, sigma_s: float) -> None:
+        """A second clock is heard for the first time, and the wheels' may be off it by ``sigma_s`` [s]."""
+        self._filter.P[CLOCK, CLOCK] += sigma_s**2
 
     def measure_turn(self, turn: Turn) -> float:
         """The gyro's turn since the start of the step."""
@@ -150,8 +160,8 @@ class Ekf:
         the prediction's covariance grows until both agree; else the LiDAR is, and its measurement's grows. ``tie``: the map by which it
         was measured, whose errors later scans share; None if they do not.
         """
-        self._meet(tie)
-        error, _, d_pose = motion_residual(self._anchor, self.pose, measured.delta)
+        seen = se2.compose(self._meet(tie), measured.delta)
+        error, _, d_pose = motion_residual(self._map, self.pose, seen)
         H = np.zeros((3, self._size))
         H[:, MAP], H[:, POSE] = -d_pose @ se2.adjoint(se2.inverse(self._since_anchor)), d_pose
         R = d_pose @ measured.cov @ d_pose.T
@@ -167,8 +177,9 @@ class Ekf:
         self._update(error, H, R)
         return nis
 
-    def _meet(self, tie: MapTie | None) -> None:
-        """The map as the scan now meets it: in part what the scan before met, in part what that one added, drawn from its pose."""
+    def _meet(self, tie: MapTie | None) -> FloatArray:
+        """The map as the scan now meets it: in part what the scan before met, in part what that one added, drawn from its pose.
+        Returns where the scan before is, seen from where the map had it (3,)."""
         A = se2.adjoint(self._since_anchor)
         kept = np.zeros((3, 3)) if tie is None else A @ tie.kept @ se2.adjoint(se2.inverse(self._since_anchor))
         G = np.eye(self._size)
@@ -177,10 +188,14 @@ class Ekf:
         if tie is not None:
             P[MAP, MAP] += A @ tie.fresh @ A.T
         self._filter.P = P
+        off = se2.between(self._anchor, self._map)
+        self._map = se2.compose(self._anchor, se2.exp(kept @ se2.log(off)))
+        return np.zeros(3) if tie is None else se2.inverse(off)
 
     def measure_revisit(self, known: Revisit) -> None:
         """A place seen again (`revisit_update`). START, ANCHOR and MAP move with the pose as one rigid body: the way since then stays."""
         start_T_now, anchor_T_now = se2.between(self._start, self.pose), se2.between(self._anchor, self.pose)
+        map_T_now, drawn_T_now = se2.between(self._map, self.pose), se2.between(self._drawn, self.pose)
         tied = np.zeros((self._size, 3))
         tied[POSE], tied[START], tied[ANCHOR] = np.eye(3), se2.adjoint(start_T_now), se2.adjoint(anchor_T_now)
         tied[MAP] = tied[ANCHOR]
@@ -188,6 +203,8 @@ class Ekf:
         self.pose = se2.compose(self.pose, se2.exp(shift))
         self._start = se2.compose(self.pose, se2.inverse(start_T_now))
         self._anchor = se2.compose(self.pose, se2.inverse(anchor_T_now))
+        self._map = se2.compose(self.pose, se2.inverse(map_T_now))
+        self._drawn = se2.compose(self.pose, se2.inverse(drawn_T_now))  # the witness moves its map likewise
 
     def set_anchor(self, is_drawn: bool = True) -> None:
         """From here on, the LiDAR measures from the pose as it is now. ``is_drawn``: by what it sees from here; else by what it knows."""
@@ -196,7 +213,10 @@ class Ekf:
         if is_drawn:
             G[ANCHOR, ANCHOR], G[ANCHOR, POSE] = np.zeros((3, 3)), np.eye(3)
         self._filter.P = G @ self._filter.P @ G.T
-        self._anchor, self._since_anchor = self.pose, np.zeros(3)
+        on = se2.between(self._drawn, self.pose)
+        self._map = se2.compose(self._map, on)
+        self._anchor = self.pose if is_drawn else se2.compose(self._anchor, on)
+        self._drawn, self._since_anchor = self.pose, np.zeros(3)
 
     def _update(self, error: FloatArray, H: FloatArray, R: FloatArray) -> float:
         """``error`` is prediction minus measurement; the error state's mean is zero, so the innovation is its negative."""
@@ -207,8 +227,6 @@ class Ekf:
                 _check("a measurement", error, H @ before @ H.T + R)
                 f.update(np.zeros((len(error), 1)), lambda x: H, lambda x: error[:, None], R=R)
                 f.P = 0.5 * (f.P + f.P.T)
-                # the map stays as it is drawn, so its error stays too (Schmidt, "Application of state-space methods", 1966)
-                f.P[MAP, MAP] = before[MAP, MAP]
             _check("a measurement", f.x, f.P)
         except np.linalg.LinAlgError as singular:
             raise EstimatorError(_CERTAIN) from singular
@@ -219,6 +237,7 @@ class Ekf:
         self.pose = se2.compose(self.pose, se2.exp(correction[POSE]))
         self._start = se2.compose(self._start, se2.exp(correction[START]))
         self._anchor = se2.compose(self._anchor, se2.exp(correction[ANCHOR]))
+        self._map = se2.compose(self._map, se2.exp(correction[MAP]))
         self.bias += float(correction[BIAS])
         self.clock_offset += float(correction[CLOCK])
         self.correction = self.correction + correction[PARAMS:]

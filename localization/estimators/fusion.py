@@ -42,8 +42,9 @@ class EkfFusion:
     ) -> None:
         """``witness`` measures the motion between scans; if not given, scans are matched as ``lidar`` says."""
         config = config or EkfConfig()
-        # without a LiDAR there is no second clock to compare with
+        # without a LiDAR there is no second clock until a gyro is heard
         self._ekf = Ekf(robot.gyro_noise, corrected, config if has_lidar else replace(config, clock_sigma_s=0.0))
+        self._clock_sigma_s = 0.0 if has_lidar else config.clock_sigma_s
         self._witness = (witness or ScanWitness(mounts, lidar)) if has_lidar else None
         self._model, self._corrected, self._track_m = model, corrected, robot.geometry.track_width_m
         self._has_gyro = False
@@ -61,8 +62,10 @@ class EkfFusion:
         ekf, nis = self._ekf, None
         ekf.predict(teaching(step, self._track_m, self._corrected, ekf.covariance[PARAMS:, PARAMS:]))
         if step.turn is not None:
-            self._has_gyro = True
             ekf.measure_turn(step.turn)
+            if not self._has_gyro:
+                self._has_gyro = True
+                ekf.meet_clock(self._clock_sigma_s)
         if step.is_standing:
             self._counts["standing"] += 1
             ekf.measure_standing()
@@ -74,7 +77,7 @@ class EkfFusion:
     def _look(self, step: Step, witness: Witness) -> float | None:
         ekf, nis = self._ekf, None
         self._counts["scans"] += 1
-        seen = witness.look(step, ekf.anchor, ekf.pose)
+        seen = witness.look(step, ekf.in_map(ekf.anchor), ekf.in_map(ekf.pose))
         if seen is not None:
             self._counts["matched"] += 1
             nis = ekf.measure_motion(seen.motion, seen.is_trusted, seen.tie)
@@ -104,7 +107,7 @@ class EkfFusion:
         found = {}
         if self._has_gyro:
             found["gyro_bias_rad_per_s"] = self._ekf.bias, math.sqrt(self._ekf.covariance[BIAS, BIAS])
-        if self._witness is not None:
+        if self._witness is not None or self._has_gyro:
             found["wheel_clock_offset_s"] = self._ekf.clock_offset, math.sqrt(self._ekf.covariance[CLOCK, CLOCK])
         nominal = dict(zip(self._model.param_names, self._model.nominal, strict=True))
         for i, name in enumerate(self._corrected.names):

@@ -24,7 +24,7 @@ from localization.estimators.graph_factors import Closure, Kernel, Pairs, Positi
 from localization.estimators.graph_history import History
 from localization.estimators.graph_link import Link, check_covariance, check_motion
 from localization.estimators.graph_revisit import revisited
-from localization.estimators.graph_slow import Learned, SlowStates
+from localization.estimators.graph_slow import ONE_CLOCK, Learned, SlowStates
 from localization.estimators.graph_window import Ahead, Node, SingularError, Window
 from localization.estimators.teaching import teaching
 from localization.estimators.witness import NoWitness, ScanWitness, Sight, Witness
@@ -89,9 +89,10 @@ class GraphFusion:
         self._track_m = robot.geometry.track_width_m
         self._witness: Witness = (witness or ScanWitness(mounts, lidar)) if has_lidar else NoWitness()
         c = self.config
-        learn = c.learn if has_lidar else ()  # without a LiDAR there is no second clock to compare with
         has_map = has_lidar and witness is None
-        self._slow = SlowStates(robot.gyro_noise, corrected, self._belief, learn, c.mount_sigma_m, c.mount_sigma_rad, has_map)
+        sigmas = c.mount_sigma_m, c.mount_sigma_rad
+        self._slow = SlowStates(robot.gyro_noise, corrected, self._belief, c.learn, *sigmas, has_lidar, has_map)
+        self._clock_walk = None if has_lidar else ONE_CLOCK
         self._mounts, self._mount = mounts, Mount()
         self._kernel = Kernel(self.config.kernel, self.config.kernel_scale)
         cov = block_diag(_CERTAIN**2 * np.eye(3), self._slow.cov)
@@ -123,6 +124,9 @@ class GraphFusion:
             self._nodes_ns.append(step.start_ns)
         known = self._now.covariance[3:, 3:][self._slow.corrections, self._slow.corrections]
         link = self._slow.link(teaching(step, self._track_m, self._corrected, known), self._now.slow)
+        if not self._has_lidar:
+            has_turn = step.turn is not None
+            self._clock_walk = None if self._has_gyro else self._belief.clock_sigma_s**2 if has_turn else ONE_CLOCK
         self._has_gyro |= step.turn is not None
         self._counts["standing"] += step.is_standing
         pending = link if self._pending is None else self._pending.then(link)
@@ -228,7 +232,7 @@ class GraphFusion:
         found, cov = {}, self._now.covariance[3:, 3:]
         if self._has_gyro:
             found["gyro_bias_rad_per_s"] = float(self._now.slow[0]), math.sqrt(cov[0, 0])
-        if self._slow.has_clock:
+        if self._slow.has_clock and (self._has_lidar or self._has_gyro):
             found["wheel_clock_offset_s"] = float(self._now.slow[1]), math.sqrt(cov[1, 1])
         for i, name in enumerate(self._slow.mount_names, start=1 + self._slow.has_clock):
             row = ("lidar_x", "lidar_y", "lidar_yaw").index(name)
@@ -250,7 +254,7 @@ class GraphFusion:
         return self._now.covariance
 
     def _extend(self, link: Link) -> Ahead:
-        pair = Pairs.one(link, self._slow.walk(link.duration, link.moving), self._behind)
+        pair = Pairs.one(link, self._slow.walk(link.duration, link.moving, self._clock_walk), self._behind)
         try:
             return self._window.extend(pair)
         except SingularError as error:
@@ -283,22 +287,26 @@ class GraphFusion:
 
     def _look(self, step: Step, ahead: Ahead) -> Sight | None:
         self._counts["scans"] += 1
-        seen = self._witness.look(step, self._drawn, se2.compose(self._drawn, self._expected(ahead)))
+        seen = self._witness.look(step, self._in_map(self._newest), self._in_map(ahead.node))
         if seen is not None:
             check_motion(seen.motion.delta, seen.motion.cov, f"the LiDAR's motion that ends at {step.end_ns} ns")
             self._counts["matched"] += 1
         return seen
 
-    def _expected(self, ahead: Ahead) -> FloatArray:
-        """(3,) where the next scan is expected in the map, seen from where the newest was drawn into it."""
+    def _in_map(self, node: Node) -> FloatArray:
+        """(3,) where the LiDAR is expected to find itself at ``node`` in the map as it was drawn."""
+        return se2.compose(self._drawn, self._from_map(node))
+
+    def _from_map(self, node: Node) -> FloatArray:
+        """(3,) ``node``, as the LiDAR believes it, seen from where the map has the newest node."""
         start = self._believed(self._newest)
         if self._behind is not None:
             start = se2.compose(start, se2.exp(self._newest.slow[-3:] + self._behind))
-        return se2.between(start, self._believed(ahead.node))
+        return se2.between(start, self._believed(node))
 
     def _unseen(self, ahead: Ahead) -> Pairs:
         """What goes on where the LiDAR saw nothing: the map is as it was."""
-        return ahead.pair.seeing(Motion(self._expected(ahead), _AS_IT_WAS))
+        return ahead.pair.seeing(Motion(self._from_map(ahead.node), _AS_IT_WAS))
 
     def _believed(self, node: Node) -> FloatArray:
         """(3,) where the LiDAR's points say that the body is: they are brought into it by the mount that the log or robot file tells."""
@@ -314,6 +322,7 @@ class GraphFusion:
         before, after = self._newest, ahead.node
         noise = measured.cov if tie is None else measured.cov + tie.fresh
         if self._behind is not None and tie is not None:
+            measured = Motion(se2.compose(self._from_map(self._newest), measured.delta), measured.cov)
             there = se2.adjoint(measured.delta)
             kept = there @ tie.kept @ np.linalg.inv(there) if self._is_drawn else np.eye(3)
             off = kept @ (before.slow[-3:] + self._behind)

@@ -28,6 +28,7 @@ _MOUNT = ("lidar_x", "lidar_y", "lidar_yaw")
 _YAW = np.array([[0.0, 0.0, 1.0]])
 _STILL = 1e-4  # part of the random walk that is left while the wheels stand: zero would be infinite information
 _FREE = 1e3  # m, rad
+ONE_CLOCK = 1e-14  # s^2: nothing tells another one
 _SHOWN = 3.0  # sigmas: a turn or a way below this is noise, and its derivatives would pass for knowledge of the mount
 
 
@@ -42,14 +43,18 @@ class SlowStates:
         learn: Sequence[str],
         mount_sigma_m: float,
         mount_sigma_rad: float,
-        has_map: bool,
+        has_lidar: bool = True,
+        has_map: bool = False,
     ) -> None:
-        """``learn``: names of `Learned`; the mount's error is that of a left perturbation, in the body frame. Raises `EstimatorError`."""
+        """``learn``: names of `Learned`; the mount's error is that of a left perturbation, in the body frame. Raises `EstimatorError`.
+
+        Without a LiDAR there is no mount, and no second clock until a gyro is heard (`walk`).
+        """
         for name in learn:
             if name not in get_args(Learned):
                 raise EstimatorError(f"a graph cannot learn '{name}'; there are {', '.join(get_args(Learned))}.")
         self.has_clock = "clock" in learn and belief.clock_sigma_s > 0.0
-        self.mount_names = tuple(name for name in _MOUNT if name in learn)
+        self.mount_names = tuple(name for name in _MOUNT if name in learn and has_lidar)
         """Those of the LiDAR's x, y, yaw that are learned."""
         at = 1 + self.has_clock
         begin = at + len(self.mount_names)
@@ -61,7 +66,8 @@ class SlowStates:
         cov, walk = np.zeros((self.size, self.size)), np.zeros((self.size, self.size))
         cov[0, 0], walk[0, 0] = gyro.bias_sigma_rad_per_s**2, gyro.bias_walk_rad_per_s_sqrt_s**2
         if self.has_clock:
-            cov[1, 1], walk[1, 1] = belief.clock_sigma_s**2, belief.clock_walk_s_per_sqrt_s**2
+            cov[1, 1] = belief.clock_sigma_s**2 if has_lidar else ONE_CLOCK
+            walk[1, 1] = belief.clock_walk_s_per_sqrt_s**2
         for i, name in enumerate(self.mount_names, start=at):
             self.mount[_MOUNT.index(name), i] = 1.0
             cov[i, i] = (mount_sigma_rad if name == "lidar_yaw" else mount_sigma_m) ** 2
@@ -78,12 +84,19 @@ class SlowStates:
         self._belief, self._directions = belief, corrected.directions
         self._walk = whitening(walk)
 
-    def walk(self, duration: float, moving: float) -> FloatArray:
-        """(m, m) whitening of the random walk over ``duration`` [s], of which wheels moved for ``moving``."""
+    def walk(self, duration: float, moving: float, clock: float | None = None) -> FloatArray:
+        """(m, m) whitening of the random walk over ``duration`` [s], of which wheels moved for ``moving``.
+
+        ``clock``: variance by which the clock offset walks meanwhile [s^2], if not as it usually does: `ONE_CLOCK` before a second clock is
+        heard, the square of what is believed at first when it is.
+        """
         scale = np.full(self.size, max(duration, 1e-6) ** -0.5)
         scale[self.corrections] = max(moving, 1e-6 * max(duration, 1e-3)) ** -0.5
         scale[self.corrections.stop :] = 1.0
-        return np.asarray(self._walk * scale[:, None])
+        found = np.asarray(self._walk * scale[:, None])
+        if self.has_clock and clock is not None:
+            found[1, 1] = clock**-0.5
+        return found
 
     def shown(self, seen: Motion) -> FloatArray:
         """(3, m) `mount`, without what a motion ``seen`` by the LiDAR cannot show: where it sits without a turn, its yaw without a way."""

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from localization.errors import DumpError
-from localization.online.freeze import freeze
+from localization.online.freeze import freeze, freeze_apart
 from localization.online.thaw import thaw
 from localization.provenance import versions
 from motion_models.robot import Robot
@@ -55,27 +55,29 @@ def write_dump(path: Path, value: Any, head: Mapping[str, Any], made_by: Mapping
 
     Raises `DumpError` if the state or the file cannot be written.
     """
-    _store(path, dump_bytes(value, head, made_by, shared), ())
+    _store(path, _body(value, head, made_by, shared), ())
 
 
-def dump_bytes(value: Any, head: Mapping[str, Any], made_by: Mapping[str, str], shared: Mapping[str, Any]) -> bytes:
-    """What `write_dump` writes. Raises `DumpError`."""
+def _body(value: Any, head: Mapping[str, Any], made_by: Mapping[str, str], shared: Mapping[str, Any]) -> list[bytes]:
+    """What `write_dump` writes after its first two lines, in parts. Raises `DumpError`."""
     try:
-        text, blob = freeze(value, shared)
+        text, blobs = freeze_apart(value, shared)
     except DumpError as error:
         raise DumpError(f"no state can be dumped: {error}.") from error
     about = json.dumps({**head, "made_by": made_by, "state_bytes": len(text)}).encode()
-    return b"".join((about, b"\n", text, blob))
+    return [about, b"\n", text, *blobs]
 
 
-def _store(path: Path, body: bytes, after: Sequence[int]) -> None:
-    beside = _beside(path)
+def _store(path: Path, body: Sequence[bytes], after: Sequence[int]) -> None:
+    beside, digest = _beside(path), hashlib.sha256()
+    for part in body:
+        digest.update(part)
     try:
         for file_number in after:
             os.fsync(file_number)
         with beside.open("wb") as file:
-            file.write(_MAGIC + hashlib.sha256(body).hexdigest().encode() + b"\n")
-            file.write(body)
+            file.write(_MAGIC + digest.hexdigest().encode() + b"\n")
+            file.writelines(body)
             file.flush()
             os.fsync(file.fileno())
         beside.replace(path)
@@ -164,7 +166,7 @@ class Dumper:
         """
         self.wait()
         self._last = time.monotonic()
-        content = dump_bytes(value, head, self._made_by, self._shared)
+        content = _body(value, head, self._made_by, self._shared)
         self._writing = self._disk.submit(_store, self.path, content, tuple(after))
 
     def wait(self) -> None:

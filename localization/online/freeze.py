@@ -38,10 +38,16 @@ def freeze(value: Any, shared: Mapping[str, Any] | None = None) -> tuple[bytes, 
 
     Raises `DumpError` for an object that cannot be written.
     """
+    text, blobs = freeze_apart(value, shared)
+    return text, b"".join(blobs)
+
+
+def freeze_apart(value: Any, shared: Mapping[str, Any] | None = None) -> tuple[bytes, list[bytes]]:
+    """The same with the bytes array by array: who writes megabytes of them need not copy them once more."""
     writer = _Writer(shared or {})
     root = writer.put(value)
     text = json.dumps({"root": root, "objects": writer.objects, "arrays": writer.arrays}, separators=(",", ":"), allow_nan=False)
-    return text.encode(), b"".join(writer.blobs)
+    return text.encode(), writer.blobs
 
 
 class _Writer:

@@ -40,7 +40,7 @@ class Health:
     def __init__(self) -> None:
         self._nis: deque[float] = deque(maxlen=_KEPT)
         self._latencies: deque[float] = deque(maxlen=_KEPT)
-        self._degeneracy: float | None = None
+        self._scan: Scan | None = None
         self._slip = np.zeros(3)
         self.estimate: Estimate | None = None
         """The last one."""
@@ -48,7 +48,7 @@ class Health:
     def saw(self, event: Event) -> None:
         """``event`` has gone in."""
         if isinstance(event, Scan):
-            self._degeneracy = degeneracy(event.points[:, :2]) if event.is_planar else None
+            self._scan = event
 
     def made(self, estimate: Estimate, core: Core) -> None:
         """``estimate`` has come out."""
@@ -66,6 +66,11 @@ class Health:
     def nis(self) -> float | None:
         """Mean over the last scans; 3 expected."""
         return float(np.mean(self._nis)) if self._nis else None
+
+    @property
+    def degeneracy(self) -> float | None:
+        """Of the last scan (`degeneracy`); worked out when somebody asks, for it takes longer than all the rest here."""
+        return degeneracy(self._scan.points[:, :2]) if self._scan is not None and self._scan.is_planar else None
 
     @property
     def slip(self) -> FloatArray:
@@ -94,13 +99,14 @@ class Health:
 
     def _of_lidar(self, core: Core) -> Status:
         values = {name: str(count) for name, count in core.estimator.counts().items()}
-        if self._degeneracy is not None:
-            values["degeneracy"] = f"{self._degeneracy:.4f}"
+        scene = self.degeneracy
+        if scene is not None:
+            values["degeneracy"] = f"{scene:.4f}"
         above = 0.0
         if self._nis:
             above = sum(n > _NIS_95 for n in self._nis) / len(self._nis)
             values |= {"nis_mean": f"{self.nis:.2f}", "nis_last": f"{self._nis[-1]:.2f}", "nis_above_95": f"{above:.2f}"}
-        if self._degeneracy is not None and self._degeneracy < _DEGENERATE:
+        if scene is not None and scene < _DEGENERATE:
             return Status("lidar", WARN, "the scene holds no position along one direction (a corridor, one wall)", values)
         if above > _MOST_ABOVE:
             return Status(

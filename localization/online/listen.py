@@ -124,9 +124,21 @@ class Listener:
         there = sorted(topic for topic in published if topic in self.candidates)
         if silent:
             said = [f"{topic} ({'published, but nothing comes' if topic in published else 'nobody publishes it'})" for topic in silent]
-            return f"waiting for {', '.join(said)}."
+            return f"waiting for {', '.join(said)}." + self._others(published, {self.candidates[topic] for topic in silent})
         wanted = ", ".join(f"{topic} ({short_type(kind)})" for topic, kind in self.candidates.items() if kind in _MOVING)
-        return f"waiting for wheels or a LiDAR: nothing comes on {wanted}." + (f" Published are {', '.join(there)}." if there else "")
+        known = f" Published are {', '.join(there)}." if there else ""
+        return f"waiting for wheels or a LiDAR: nothing comes on {wanted}.{known}" + (
+            self._others(published, _MOVING) or ("" if published else " Nobody publishes anything here.")
+        )
+
+    def _others(self, published: Mapping[str, set[str]], kinds: set[str]) -> str:
+        """What is published under other names than the robot file's, and how to have it used."""
+        found = []
+        for topic, there in sorted(published.items()):
+            for kind in sorted(there & kinds if topic not in self.candidates else ()):
+                part = next(part for part, its_type in TYPES.items() if its_type == kind)
+                found.append(f"{topic} is {short_type(kind)} (--topic.{part.replace('_', '-')} {topic})")
+        return f" But {', '.join(found)}." if found else ""
 
     def _heard(self, epoch_ns: int) -> Heard:
         channels = [live_channel(topic, self.candidates[topic], count) for topic, count in self._counts.items()]

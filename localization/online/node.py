@@ -107,10 +107,11 @@ class Node:
         """Until ``is_over``; ``on_line`` is called about every fifth of a second."""
         shown = 0.0
         while not is_over():
+            has_estimate = False
             for received in self._transport.take(_POLL_S):
-                self._push(received, time_it=True)
+                has_estimate |= self._push(received, time_it=True)
             now = time.monotonic()
-            if now - self._told >= _TELL_S:
+            if now - self._told >= (_TELL_S if has_estimate else 1.5 * _TELL_S):  # after an estimate the next scan is far
                 self._told = now
                 self._tell()
             if now - shown >= _POLL_S:
@@ -139,7 +140,8 @@ class Node:
         """Since the first event [s]."""
         return 0.0 if self._began_ns is None else (self._newest_ns - self._began_ns) * 1e-9
 
-    def _push(self, received: Received, *, time_it: bool) -> None:
+    def _push(self, received: Received, *, time_it: bool) -> bool:
+        """True if it made an estimate."""
         has_estimate = False
         for event in self._stream.push(received):
             self._newest_ns = max(self._newest_ns, event.stamp_ns)
@@ -152,6 +154,7 @@ class Node:
             self.session.saw(event)
         if has_estimate:  # the next scan is far now, and does not wait
             self.session.dump(self._head)
+        return has_estimate
 
     def _head(self) -> Mapping[str, Any]:
         return {"stamp_ns": self._newest_ns, "topics": self.topics}

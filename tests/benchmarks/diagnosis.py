@@ -22,9 +22,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from localization.diagnosis import diagnose as engine
+from localization.diagnosis.diagnose import _TOLERANCES, examine
 from localization.diagnosis.drive import Drive, drive_of_log
 from localization.diagnosis.effects import Effect
+from localization.diagnosis.look import Look, look, normal_form
 from localization.logs import open_log
 from motion_models.registry import make_model
 from tests.diagnosis_drives import ONE_SIDED, TYPICAL, bag, drive, robot_named
@@ -88,18 +89,18 @@ def cases(seeds: int) -> Iterator[Case]:
             for j, factor in enumerate(SIZES):
                 sign = 1.0 if cause in ONE_SIDED or (n + j + k) % 2 == 0 else -1.0
                 singles.append(Case("single", {cause: sign * factor * typical}, "vaultbot", "tour", 6000 + 1000 * k + 10 * n + j))
-        others = [
-            Case("null", {}, *NULLS[i % len(NULLS)], seed=20_000 + 100 * k + i)
-            for i in range(20)  # the same drives with other noise
-        ]
-        others += [
-            Case("pair", {name: TYPICAL[name] * (1.0 if name in ONE_SIDED or (i + k + m) % 2 else -1.0) for m, name in enumerate(pair)},
-                 "vaultbot", "tour", 30_000 + 100 * k + i)
-            for i, pair in enumerate(PAIRS)
-        ]  # fmt: skip
+        nulls = [Case("null", {}, *NULLS[i % len(NULLS)], seed=20_000 + 100 * k + i) for i in range(20)]  # the same drives, other noise
+        several = []
+        for i, pair in enumerate(PAIRS):
+            sizes = {name: TYPICAL[name] * (1.0 if name in ONE_SIDED or (i + k + m) % 2 else -1.0) for m, name in enumerate(pair)}
+            several.append(Case("pair", sizes, "vaultbot", "tour", 30_000 + 100 * k + i))
         for i, (pair, robot, route, imu_hz) in enumerate(ALIKE):
             name = pair[k % 2]
-            others.append(Case("alike", {name: TYPICAL[name]}, robot, route, 40_000 + 100 * k + i, imu_hz, pair))
+            several.append(Case("alike", {name: TYPICAL[name]}, robot, route, 40_000 + 100 * k + i, imu_hz, pair))
+        others = []
+        while nulls or several:
+            others += nulls[:2] + several[:1]
+            nulls, several = nulls[2:], several[1:]
         # three of the one, then one of the other
         while singles or others:
             yield from singles[:3]
@@ -127,7 +128,7 @@ def run(case: Case) -> dict[str, Any]:
     """One row."""
     seen = drive_of(case)
     begin = time.process_time()
-    found = engine.examine(seen, make_model("friction", seen.robot))
+    found = examine(seen, make_model("friction", seen.robot))
     seconds = time.process_time() - begin
     d = found.diagnosis
     row: dict[str, Any] = {
@@ -144,8 +145,8 @@ def run(case: Case) -> dict[str, Any]:
     if found.pipeline is None or found.state is None:
         return row
     pipeline, state = found.pipeline, found.state
-    looked = engine._linearise(pipeline, state.effects, {})
-    problem = engine._normal(looked.linear, looked.signatures, looked.nuisances, state.noise, looked.effects)
+    looked = look(pipeline, state.effects, {}, _TOLERANCES[0])
+    problem = normal_form(looked.linear, looked.signatures, looked.nuisances, state.noise, looked.effects, _TOLERANCES[0])
     nominal = dataclasses.replace(looked, noise=state.noise, problem=problem)
     said = {name: [name_, round(gain, 5)] for name, (name_, gain) in rivals(seen, pipeline, nominal).items()}
     row["rivals"] = json.dumps(said)
@@ -157,7 +158,7 @@ def run(case: Case) -> dict[str, Any]:
     return row
 
 
-def significance(state: engine._State, effects: Mapping[str, float], name: str) -> float | None:
+def significance(state: Look, effects: Mapping[str, float], name: str) -> float | None:
     """Of effect ``name``: its size over the sigma with which this drive can measure it, while the other hidden causes are free and all
     others keep within their tolerance. None if the drive does not show the cause at all."""
     problem = state.problem
@@ -169,7 +170,7 @@ def significance(state: engine._State, effects: Mapping[str, float], name: str) 
     return round(float(np.sqrt(cov[0, 0]) * abs(effects[name]) / problem.scale[own[0]]), 2)
 
 
-def loudness(state: engine._State, name: str, size: float) -> float | None:
+def loudness(state: Look, name: str, size: float) -> float | None:
     """Root mean square over the windows of what the effect does, over their noise, in the channel where that is most."""
     own = _columns(state, name)
     if not own:
@@ -178,12 +179,12 @@ def loudness(state: engine._State, name: str, size: float) -> float | None:
     return round(float(np.sqrt(np.mean(part**2, axis=0)).max()), 2)
 
 
-def _columns(state: engine._State, name: str) -> list[int]:
+def _columns(state: Look, name: str) -> list[int]:
     """Where the cause is among the state's, at most one."""
     return [i for i, e in enumerate(state.effects) if e.id == name and _is_true(e, state)]
 
 
-def _is_true(effect: Effect, state: engine._State) -> bool:
+def _is_true(effect: Effect, state: Look) -> bool:
     """Of many moments the middle one; of two slopes the one along the first heading, which is the world's x."""
     if effect.id == "friction_change":
         moments = [e.at_s for e in state.effects if e.id == "friction_change" and e.at_s is not None]

@@ -84,7 +84,7 @@ def size_of(estimator: GraphFusion) -> int:
 
 
 def soak(hours: float = 10.0) -> None:
-    """The same two minutes, both ways round, over and over: costs and sizes at the end of each hour."""
+    """The same two minutes, both ways round, over and over: costs of each hour, and the most numbers held at the end of a lap."""
     steps = recorded(steps=1200)
     seer = Seer()
     estimator = make("graph", seer)
@@ -93,13 +93,13 @@ def soak(hours: float = 10.0) -> None:
     print(f"{'hour':>4} {'median ms':>10} {'p99 ms':>8} {'numbers held':>13} {'peak MB':>8}")
     per_hour = round(3600.0 / DT / (len(steps) - 1))
     for hour in range(1, round(hours) + 1):
-        each = []
+        each, held = [], 0
         for _ in range(per_hour):
             moved = [(replace(s, start_ns=s.start_ns + lap * shift, end_ns=s.end_ns + lap * shift), seen) for s, seen in steps[1:]]
             each.append(seconds_each(estimator, seer, moved))
-            lap += 1
+            lap, held = lap + 1, max(held, size_of(estimator))
         taken, peak = 1e3 * np.concatenate(each), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-        print(f"{hour:4d} {np.median(taken):10.3f} {np.percentile(taken, 99):8.3f} {size_of(estimator):13d} {peak:8.1f}", flush=True)
+        print(f"{hour:4d} {np.median(taken):10.3f} {np.percentile(taken, 99):8.3f} {held:13d} {peak:8.1f}", flush=True)
     print(f"after {estimator.counts()['nodes']} nodes the covariance is finite: {bool(np.isfinite(estimator.covariance()).all())}")
 
 

@@ -49,6 +49,7 @@ class SimulatedRobot:
     def __init__(self, hours: float, beams: int) -> None:
         sensors = SensorConfig(scanner=ScannerConfig(beams=beams))
         simulation = simulate("soak", load_robot("vaultbot"), 0, {}, SimulationConfig(ExperimentConfig(hours=hours), sensors=sensors))
+        self._runs = simulation.runs
         self._messages = simulation.messages()
         self._templates: dict[int, tuple[Form, Template]] = {}
         self._types: dict[str, str] = {}
@@ -97,6 +98,7 @@ class SimulatedRobot:
 
     def _received(self) -> Iterator[Received]:
         for message in self._messages:
+            self._runs.clear()  # what the simulator keeps of its laps would be taken for the estimator's
             topic = message.form.topic
             self._types.setdefault(topic, message.form.type)
             self.seconds = (message.log_ns - 1_000_000_000) * 1e-9

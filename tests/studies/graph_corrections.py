@@ -5,10 +5,19 @@ python -m tests.studies.graph_corrections
 The robot is simulated by the physics of its tyres; the LiDAR is stood in for by the truth with 5 mm and 1 mrad of noise per scan, so that
 only the models differ. Odometry here is what the wheels predict with the parameters that were learned up to that moment, without any
 other help: what the robot would fall back on. `round 2` is the second time that each posture is driven.
+
+python -m tests.studies.graph_corrections husky
+
+The same odometry on a real Husky outdoors, where the gyro is all that it can be learned from, against GPS.
+
+python -m tests.studies.graph_corrections hidden
+
+The friction model on laps of a robot whose CG is not where it is said to be.
 """
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,8 +28,10 @@ import numpy as np
 from localization.estimators.ekf import EkfConfig
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
+from localization.evaluate import evaluate
 from localization.events import Event
 from localization.logs import open_log
+from localization.online.core import Core, Pair
 from localization.references import ReferenceTrack, reference_track
 from localization.simulate.experiments import ExperimentConfig
 from localization.simulate.simulator import SimulationConfig, simulate, write_simulation
@@ -126,7 +137,44 @@ def drift(drive: Laps, model_name: str, form: Form, kind: str = "ekf", seed: int
     return Drift(np.hypot(errors[:, 0], errors[:, 1]), np.degrees(errors[:, 2]), believed)
 
 
+def husky() -> None:
+    robot, path = load_robot("husky_a200"), Path(__file__).parents[1] / "data" / "husky-outdoor-gps" / "test1.bag"
+    log = open_log(path, robot)
+    topic = log.reference_topic
+    assert topic is not None
+    reference, events = reference_track(log.references(topic), topic), list(log.events())
+    print(f"{'odometry by':12} {'learning':10} {'ATE [m]':>8}")
+    for name in ("diff_drive", "skid_steer", "icr", "friction"):
+        for form in ("none", "constant"):
+            core = Core(Pair(make_model(name, robot), "ekf", form), robot, log.mounts, has_lidar=False)
+            pose, found = np.zeros(3), {}
+            for event in events:
+                for step in core.stepper.push(event):
+                    pose = se2.compose(pose, step.predicted.delta)
+                    found[step.end_ns] = pose
+                    core.estimator.step(step)
+                    core.stepper.clock_offset_s = core.estimator.clock_offset_s
+                    if core.estimator.params is not None:
+                        core.stepper.params = core.estimator.params
+            odometry = Trajectory(np.array(list(found)), np.array(list(found.values())))
+            print(f"{name:12} {form:10} {evaluate(odometry, reference).ate_rmse_m:8.2f}", flush=True)
+
+
+def hidden() -> None:
+    drive = laps(count=POSTURES, effects={"cg_offset_x": 0.04, "cg_offset_y": -0.02})
+    for form in ("none", "mu_ratio+cg_offset_x+cg_offset_y"):
+        d = drift(drive, "friction", form)
+        x, y = d.params[-1, 12:] if form != "none" else (0.0, 0.0)
+        print(
+            f"friction, {form}: {d.metres.mean():.2f} m/lap; believed of the CG: {x:+.4f} m, {y:+.4f} m, truly +0.0400 m, -0.0200 m",
+            flush=True,
+        )
+
+
 def main() -> None:
+    if sys.argv[1:] in (["husky"], ["hidden"]):
+        {"husky": husky, "hidden": hidden}[sys.argv[1]]()
+        return
     drive = laps()
     found = {}
     print(f"{'odometry by':12} {'learning':10} {'by':6} {'round 1 [m/lap]':>16} {'round 2 [m/lap]':>16} {'round 2 [deg/lap]':>18}")
