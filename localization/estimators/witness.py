@@ -20,8 +20,6 @@ from motion_models.base import Motion
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
-_STAYS = 0.5  # of the variance of the map's lines: that from scan to scan is the same; the rest is new as beams wander along them
-
 
 @dataclass(frozen=True)
 class Sight:
@@ -31,7 +29,8 @@ class Sight:
     is_trusted: bool
     """The witness is sure of itself: where others contradict it, they are wrong."""
     tie: MapTie | None = None
-    """The map by which it was measured, whose lasting errors are not in the motion's covariance; None where there is none."""
+    """The map by which it was measured; None where there is none. Its lines' errors are in the motion's covariance, for they are new in
+    part as the beams wander along the lines, and in `MapTie.cov`, for they last in part."""
 
 
 class Witness(Protocol):
@@ -86,7 +85,7 @@ class ScanWitness:
             slip.measure(off / step.duration, np.diag(found.cov) / step.duration**2)
             if sweep.shift(slip.rate - rate) > self._matcher.config.max_shift_m:  # the sweep looked otherwise than was thought
                 found = self._matcher.refine(sweep.at_stamp(step.twist + slip.rate), sweep.is_planar, found.pose) or found
-        return Sight(Motion(se2.between(anchor, found.pose), found.cov - _STAYS * found.tie.cov), found.is_trusted, found.tie)
+        return Sight(Motion(se2.between(anchor, found.pose), found.cov), found.is_trusted, found.tie)
 
     def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
         return self._matcher.recall(pose, cov, step.end_ns)
