@@ -46,6 +46,7 @@ class EkfFusion:
         self._ekf = Ekf(robot.gyro_noise, corrected, config if has_lidar else replace(config, clock_sigma_s=0.0))
         self._clock_sigma_s = 0.0 if has_lidar else config.clock_sigma_s
         self._witness = (witness or ScanWitness(mounts, lidar)) if has_lidar else None
+        self._has_map = has_lidar and witness is None and (lidar or LidarConfig()).map_is_state
         self._model, self._corrected, self._track_m = model, corrected, robot.geometry.track_width_m
         self._has_gyro = False
         self._counts = dict.fromkeys(("scans", "matched", "contradictions", "standing", "revisits"), 0)
@@ -77,7 +78,8 @@ class EkfFusion:
     def _look(self, step: Step, witness: Witness) -> float | None:
         ekf, nis = self._ekf, None
         self._counts["scans"] += 1
-        seen = witness.look(step, ekf.in_map(ekf.anchor), ekf.in_map(ekf.pose))
+        anchor, guess = (ekf.in_map(ekf.anchor), ekf.in_map(ekf.pose)) if self._has_map else (ekf.anchor, ekf.pose)
+        seen = witness.look(step, anchor, guess)
         if seen is not None:
             self._counts["matched"] += 1
             nis = ekf.measure_motion(seen.motion, seen.is_trusted, seen.tie)
@@ -87,7 +89,8 @@ class EkfFusion:
                 before = ekf.pose
                 ekf.measure_revisit(known)
                 witness.correct(before, ekf.pose)
-        ekf.set_anchor(witness.remember(step, ekf.pose))
+        is_drawn = witness.remember(step, ekf.pose)
+        ekf.set_anchor(is_drawn or not self._has_map)
         return nis
 
     def _twist(self, step: Step) -> tuple[FloatArray, FloatArray | None]:

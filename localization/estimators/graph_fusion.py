@@ -89,7 +89,7 @@ class GraphFusion:
         self._track_m = robot.geometry.track_width_m
         self._witness: Witness = (witness or ScanWitness(mounts, lidar)) if has_lidar else NoWitness()
         c = self.config
-        has_map = has_lidar and witness is None
+        has_map = has_lidar and witness is None and (lidar or LidarConfig()).map_is_state
         sigmas = c.mount_sigma_m, c.mount_sigma_rad
         self._slow = SlowStates(robot.gyro_noise, corrected, self._belief, c.learn, *sigmas, has_lidar, has_map)
         self._clock_walk = None if has_lidar else ONE_CLOCK
@@ -295,7 +295,7 @@ class GraphFusion:
 
     def _in_map(self, node: Node) -> FloatArray:
         """(3,) where the LiDAR is expected to find itself at ``node`` in the map as it was drawn."""
-        return se2.compose(self._drawn, self._from_map(node))
+        return self._believed(node) if self._behind is None else se2.compose(self._drawn, self._from_map(node))
 
     def _from_map(self, node: Node) -> FloatArray:
         """(3,) ``node``, as the LiDAR believes it, seen from where the map has the newest node."""

@@ -18,6 +18,7 @@ from motion_models.se2 import FloatArray
 
 _FEW_POINTS = 10
 _DEGENERATE = 0.02  # smaller over larger variance of the position; rooms: 0.2 and more
+_CELLS, _FEW_CELLS = 20.0, 5.0  # how many lines the belief about them counts for: about as many as one scan meets
 _SURPRISE = 0.05
 _APART_M = 1e-4  # scans drawn on one spot are told apart by this
 # Where the scene holds nothing, the measurement's sigma: metres, metres, radians. It decides nothing, it only keeps numbers finite.
@@ -48,6 +49,9 @@ class LidarConfig:
     """Nor turns it faster [rad/s]."""
     max_jumps: int = 5
     """So many scans that jump one after the other are right: the robot was carried elsewhere."""
+    map_is_state: bool = False
+    """Estimate the error of the map besides the pose, as all scans share it that meet the same part of the map. Else each scan counts it
+    anew: then covariances grow with every scan, and where the robot stays in one place they are several times too large."""
     revisit: RevisitConfig = field(default_factory=RevisitConfig)
 
 
@@ -107,7 +111,7 @@ class LidarMatcher:
         self.config = config or LidarConfig()
         self._kiss: Kiss | None = None
         self._lines: LineMap | None = None
-        self._noise = Noise(self.config.sigma_point_m, self.config.sigma_line_m)
+        self._noise = Noise(self.config.sigma_point_m, self.config.sigma_line_m, _FEW_CELLS if self.config.map_is_state else _CELLS)
         self._downsampled = np.empty((0, 3))
         self._planar, self._is_planar = np.empty((0, 2)), True
         self._guess: tuple[FloatArray, FloatArray] | None = None  # and its information
@@ -152,7 +156,7 @@ class LidarMatcher:
         believed = self._noise.sigma_line
         fit = lines.fit(self._planar, start, self._fit_options(), prior, guess, self._ages, self._drawn_at)
         self._noise.see(fit.spread)
-        if abs(self._noise.sigma_line - believed) > _SURPRISE * believed:
+        if self.config.map_is_state and abs(self._noise.sigma_line - believed) > _SURPRISE * believed:
             # the first scans show that the map is better or worse than was guessed; what they say of it will be believed for long
             fit = lines.fit(self._planar, fit.pose, self._fit_options(), prior, guess, self._ages, self._drawn_at)
         cov = np.linalg.inv(fit.information + np.diag(_KNOWS_NOTHING**-2)).astype(np.float64, copy=False)

@@ -14,7 +14,7 @@ import numpy as np
 from localization.lidar.lines import Spread
 
 _KEPT = 0.98  # of what is known, from scan to scan: the last 50 count
-_POINTS, _CELLS = 500.0, 5.0  # as much as is known beforehand, in degrees of freedom: about one scan
+_POINTS = 500.0  # as much as is known beforehand, in degrees of freedom: about one scan
 _POSE = 3.0  # degrees of freedom that go into the pose
 _LEAST_M = 1e-3
 
@@ -22,9 +22,9 @@ _LEAST_M = 1e-3
 class Noise:
     """Begins with what is usual, and follows what is seen."""
 
-    def __init__(self, sigma_point: float, sigma_line: float) -> None:
-        """Sigmas [m]."""
-        self._sums = np.array([_POINTS * sigma_point**2, _POINTS, _CELLS * sigma_line**2, _CELLS])
+    def __init__(self, sigma_point: float, sigma_line: float, cells: float = 20.0) -> None:
+        """Sigmas [m]; the second is believed as if ``cells`` lines had shown it."""
+        self._sums = np.array([_POINTS * sigma_point**2, _POINTS, cells * sigma_line**2, cells])
 
     @property
     def sigma_point(self) -> float:
