@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from array import array
 from bisect import bisect_left
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,30 +36,32 @@ class Track:
     """Places in the order of time, about one a metre."""
 
     def __init__(self) -> None:
-        self._places: list[Place] = []
-        self._travels: list[float] = []
-        self._xs, self._ys = array("d"), array("d")
-        self._starts: list[int] = []  # of each place: the first of those that follow each other up to it
+        # columns of numbers: the way is kept for as long as the robot drives
+        self._stamps, self._travels = array("q"), array("d")
+        self._xs, self._ys, self._yaws, self._covs = array("d"), array("d"), array("d"), array("d")
+        self._starts = array("q")  # of each place: the first of those that follow each other up to it
         self._parents: dict[int, int] = {}  # of each start but the first: the place that its way goes on from
         self._next_parent: int | None = None
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._stamps)
 
     def __getitem__(self, index: int) -> Place:
-        return self._places[index]
+        pose = np.array([self._xs[index], self._ys[index], self._yaws[index]])
+        return Place(self._stamps[index], self._travels[index], pose, np.array(self._covs[9 * index : 9 * index + 9]).reshape(3, 3))
 
     def add(self, place: Place) -> None:
         """The robot is here now."""
-        n = len(self._places)
+        n = len(self)
         if self._next_parent is not None:
             self._parents[n], self._next_parent = self._next_parent, None
         is_start = n == 0 or n in self._parents
         self._starts.append(n if is_start else self._starts[-1])
-        self._places.append(replace(place, cov=np.array(place.cov)))  # a view would keep all of a filter's covariance alive
+        self._stamps.append(place.stamp_ns)
         self._travels.append(place.travel)
-        self._xs.append(float(place.pose[0]))
-        self._ys.append(float(place.pose[1]))
+        for column, value in zip((self._xs, self._ys, self._yaws), place.pose.tolist(), strict=True):
+            column.append(value)
+        self._covs.extend(place.cov.ravel().tolist())
 
     def tie(self, index: int) -> None:
         """The pose was corrected by what was seen at place ``index``: the way goes on from there."""
@@ -78,14 +80,14 @@ class Track:
 
     def growth(self, index: int) -> FloatArray:
         """(3, 3) covariance of the last place against place ``index``, in the body frame of the last."""
-        now, then = self._places[-1], self._places[index]
-        shared = moved(self._places[self._fork(index)], now.pose)
+        now, then = self[len(self) - 1], self[index]
+        shared = moved(self[self._fork(index)], now.pose)
         # increments are only nearly independent
         return positive_part(now.cov - shared) + positive_part(moved(then, now.pose) - shared)
 
     def _fork(self, then: int) -> int:
         """Where the ways to the last place and to ``then`` part."""
-        now = len(self._places) - 1
+        now = len(self) - 1
         while now != then:
             ahead, behind = max(now, then), min(now, then)
             start = self._starts[ahead]
