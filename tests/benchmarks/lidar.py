@@ -12,10 +12,12 @@ from collections.abc import Callable
 import numpy as np
 
 from localization.consistency import mean_band
+from localization.estimators.make import EstimatorConfig
 from localization.events import Scan
-from localization.lidar import LidarMatcher, body_points
+from localization.lidar import LidarConfig, LidarMatcher, body_points
 from localization.lidar.kiss import Kiss
 from localization.lidar.matcher import in_range
+from localization.run import ReplayConfig
 from localization.simulate import world
 from motion_models import se2
 from motion_models.robot import WheelNoise
@@ -82,12 +84,13 @@ def registration_nees(walls: np.ndarray, runs: int = 100) -> np.ndarray:
     return np.array(found)
 
 
-def pose_nees(walls: np.ndarray, runs: int = 100) -> np.ndarray:
-    """(runs,) of the filter's pose after 10 s."""
+def pose_nees(walls: np.ndarray, kind: str, *, map_is_state: bool, runs: int = 100) -> np.ndarray:
+    """(runs,) of the estimator's pose after 10 s."""
+    config = ReplayConfig(estimator=EstimatorConfig(lidar=LidarConfig(map_is_state=map_is_state)))
     way, found = rooms.path((1, 0, 0), (5, 0.4, 0.4), (4, 0.4, -0.5)), []
     for seed in range(runs):
         drive = rooms.drive_through(walls, way, seed, scanner=rooms.Beams(beams=240, rate_hz=6.25))
-        poses, covs = rooms.at_scans(drive, rooms.results(drive, "ekf")["ekf"])
+        poses, covs = rooms.at_scans(drive, rooms.results(drive, kind, config=config)[kind])
         error = se2.log(se2.between(drive.poses[-1], poses[-1]))
         assert covs is not None
         found.append(float(error @ np.linalg.solve(covs[-1], error)))
@@ -136,9 +139,10 @@ def main() -> None:
         row(f"a scan in {name}", {"lidar": f"{kiss:.2f} ms", "ekf": f"{ours:.2f} ms ({ratio:.1f} x)"}, "1.0 ms to register and insert")
     low, high = mean_band(100, 3.0)
     for name, walls in PLACES.items():
-        matched, poses = registration_nees(walls), pose_nees(walls)
-        said = f"{matched.mean():.2f} / {poses.mean():.2f}"
+        said = f"{registration_nees(walls).mean():.2f} / {pose_nees(walls, 'ekf', map_is_state=False).mean():.2f}"
         row(f"NEES of a scan / of the pose in {name}", {"ekf": said}, f"{low:.2f} to {high:.2f}, 100 runs")
+        ekf, graph = (pose_nees(walls, kind, map_is_state=True).mean() for kind in ("ekf", "graph"))
+        row("  of the pose, the map's error a state", {"ekf": f"{ekf:.2f} (graph {graph:.2f})"}, f"{low:.2f} to {high:.2f}, 100 runs")
 
 
 if __name__ == "__main__":
