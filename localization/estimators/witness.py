@@ -85,9 +85,7 @@ class ScanWitness:
             slip.measure(off / step.duration, np.diag(found.cov) / step.duration**2)
             if sweep.shift(slip.rate - rate) > self._matcher.config.max_shift_m:  # the sweep looked otherwise than was thought
                 found = self._matcher.refine(sweep.at_stamp(step.twist + slip.rate), sweep.is_planar, found.pose) or found
-        return Sight(
-            Motion(se2.between(anchor, found.pose), found.cov), found.is_trusted, found.tie if self._matcher.config.map_is_state else None
-        )
+        return Sight(Motion(se2.between(anchor, found.pose), found.cov), found.is_trusted, found.tie)
 
     def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
         return self._matcher.recall(pose, cov, step.end_ns)

@@ -127,6 +127,29 @@ def _associate(
 
 
 @numba.njit(cache=True)
+def _residual(
+    source: FloatArray, lines: FloatArray, i: int, pose: FloatArray, c: float, s: float
+) -> tuple[float, float, float, float]:  # pragma: no cover
+    """The distance of point ``i`` from its line, and its derivatives: e changes by n . R (dx, dy) and by the lever arm of the point."""
+    nx, ny = lines[i, 1], lines[i, 2]
+    x = pose[0] + c * source[i, 0] - s * source[i, 1]
+    y = pose[1] + s * source[i, 0] + c * source[i, 1]
+    jx, jy = nx * c + ny * s, ny * c - nx * s
+    return nx * (x - lines[i, 3]) + ny * (y - lines[i, 4]), jx, jy, jy * source[i, 0] - jx * source[i, 1]
+
+
+@numba.njit(cache=True)
+def _add(H: FloatArray, w: float, jx: float, jy: float, jt: float) -> None:  # pragma: no cover
+    """One point's information to the upper triangle of ``H``."""
+    H[0, 0] += w * jx * jx
+    H[0, 1] += w * jx * jy
+    H[0, 2] += w * jx * jt
+    H[1, 1] += w * jy * jy
+    H[1, 2] += w * jy * jt
+    H[2, 2] += w * jt * jt
+
+
+@numba.njit(cache=True)
 def _sum_up(
     source: FloatArray,
     lines: FloatArray,
@@ -144,22 +167,11 @@ def _sum_up(
     for i in range(source.shape[0]):
         if lines[i, 0] == 0.0:
             continue
-        nx, ny = lines[i, 1], lines[i, 2]
-        x = pose[0] + c * source[i, 0] - s * source[i, 1]
-        y = pose[1] + s * source[i, 0] + c * source[i, 1]
-        e = nx * (x - lines[i, 3]) + ny * (y - lines[i, 4])
+        e, jx, jy, jt = _residual(source, lines, i, pose, c, s)
         robust = 1.0 + e * e / (kernel * kernel)
         # All points in one cell meet the same line, whose error they share: together they know no more than it.
         w = 1.0 / ((sigma_point * sigma_point + lines[i, 6] * (sigma_line * sigma_line + lines[i, 5])) * robust * robust)
-        # e changes by n . R (dx, dy) and by the lever arm of the point
-        jx, jy = nx * c + ny * s, ny * c - nx * s
-        jt = jy * source[i, 0] - jx * source[i, 1]
-        H[0, 0] += w * jx * jx
-        H[0, 1] += w * jx * jy
-        H[0, 2] += w * jx * jt
-        H[1, 1] += w * jy * jy
-        H[1, 2] += w * jy * jt
-        H[2, 2] += w * jt * jt
+        _add(H, w, jx, jy, jt)
         g[0] -= w * jx * e
         g[1] -= w * jy * e
         g[2] -= w * jt * e
@@ -233,7 +245,9 @@ def fit_points(
         if iteration > 0 and abs(d0) + abs(d1) + abs(d2) < 1e-4:
             iterations = iteration + 1
     n_on = _spread(source, lines, home, pose, sigma_point, sigma_line, spread)
-    return n_matched, n_on, squares, _old_part(source, lines, pose, sigma_point, sigma_line, final_kernel, old)
+    # NaN: nobody asks what of the map is new
+    map_part = 0.0 if math.isnan(since) else _old_part(source, lines, pose, sigma_point, sigma_line, final_kernel, old)
+    return n_matched, n_on, squares, map_part
 
 
 @numba.njit(cache=True)
@@ -247,24 +261,13 @@ def _old_part(
     for i in range(source.shape[0]):
         if lines[i, 0] == 0.0:
             continue
-        nx, ny = lines[i, 1], lines[i, 2]
-        x = pose[0] + c * source[i, 0] - s * source[i, 1]
-        y = pose[1] + s * source[i, 0] + c * source[i, 1]
-        e = nx * (x - lines[i, 3]) + ny * (y - lines[i, 4])
+        e, jx, jy, jt = _residual(source, lines, i, pose, c, s)
         robust = 1.0 + e * e / (kernel * kernel)
         line = lines[i, 6] * (sigma_line * sigma_line + lines[i, 5])
         w = 1.0 / ((sigma_point * sigma_point + line) * robust * robust)
-        jx, jy = nx * c + ny * s, ny * c - nx * s
-        jt = jy * source[i, 0] - jx * source[i, 1]
         total += w
         of_lines += w * line / (sigma_point * sigma_point + line)
-        w *= 1.0 - lines[i, 7]
-        H[0, 0] += w * jx * jx
-        H[0, 1] += w * jx * jy
-        H[0, 2] += w * jx * jt
-        H[1, 1] += w * jy * jy
-        H[1, 2] += w * jy * jt
-        H[2, 2] += w * jt * jt
+        _add(H, w * (1.0 - lines[i, 7]), jx, jy, jt)
     H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
     return of_lines / total if total > 0.0 else 0.0
 
@@ -297,9 +300,7 @@ def _spread(
             n, total, squares, place = 0, 0.0, 0.0, 0.0
         if is_end or lines[i, 0] == 0.0:
             continue
-        x = pose[0] + c * source[i, 0] - s * source[i, 1]
-        y = pose[1] + s * source[i, 0] + c * source[i, 1]
-        e = lines[i, 1] * (x - lines[i, 3]) + lines[i, 2] * (y - lines[i, 4])
+        e, _, _, _ = _residual(source, lines, i, pose, c, s)
         if e * e < limit + 9.0 * lines[i, 5]:
             n_on += 1
             n += 1

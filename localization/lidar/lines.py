@@ -105,13 +105,13 @@ class LineMap:
         prior: FloatArray,
         center: FloatArray,
         ages: Ages = ALL_AGES,
-        since: float = math.inf,
+        since: float = math.nan,
     ) -> LineFit:
         """Gauss-Newton from ``start`` (3,) for ``points`` (N, 2) of the body frame.
 
         ``prior`` (3, 3) is the information of a pull towards ``center`` (3,), which keeps directions that the scene does not hold
         where they were; it is no part of the returned quadratic. Only points of these ``ages`` count. Those added at a travelled distance
-        of ``since`` [m] or later are the new ones.
+        of ``since`` [m] or later are the new ones; with NaN, nobody asks, and `LineFit.old` and `LineFit.map_part` are zero.
         """
         information, gradient, pose, spread = np.zeros((3, 3)), np.zeros(3), np.array(start, dtype=float), np.zeros(4)
         old = np.zeros((3, 3))

@@ -18,7 +18,7 @@ from motion_models.se2 import FloatArray
 
 _FEW_POINTS = 10
 _DEGENERATE = 0.02  # smaller over larger variance of the position; rooms: 0.2 and more
-_CELLS, _FEW_CELLS = 20.0, 5.0  # how many lines the belief about them counts for: about as many as one scan meets
+_FEW_CELLS = 5.0  # so many lines the belief about them counts for, where what it says stays in the map's error
 _SURPRISE = 0.05
 _APART_M = 1e-4  # scans drawn on one spot are told apart by this
 # Where the scene holds nothing, the measurement's sigma: metres, metres, radians. It decides nothing, it only keeps numbers finite.
@@ -89,8 +89,8 @@ class Registration:
     """Points that did: they are on lines of the map, within their noise."""
     residual_rms_m: float
     """RMS distance of the matched points from the map's lines."""
-    tie: MapTie
-    """What of the covariance is the map's, and since when."""
+    tie: MapTie | None
+    """What of the covariance is the map's, and since when; None if the map is no state."""
 
     @property
     def is_trusted(self) -> bool:
@@ -111,7 +111,8 @@ class LidarMatcher:
         self.config = config or LidarConfig()
         self._kiss: Kiss | None = None
         self._lines: LineMap | None = None
-        self._noise = Noise(self.config.sigma_point_m, self.config.sigma_line_m, _FEW_CELLS if self.config.map_is_state else _CELLS)
+        sigmas = self.config.sigma_point_m, self.config.sigma_line_m
+        self._noise = Noise(*sigmas, _FEW_CELLS) if self.config.map_is_state else Noise(*sigmas)
         self._downsampled = np.empty((0, 3))
         self._planar, self._is_planar = np.empty((0, 2)), True
         self._guess: tuple[FloatArray, FloatArray] | None = None  # and its information
@@ -154,14 +155,17 @@ class LidarMatcher:
         guess, prior = self._guess
         self._is_met = True
         believed = self._noise.sigma_line
-        fit = lines.fit(self._planar, start, self._fit_options(), prior, guess, self._ages, self._drawn_at)
+        is_state = self.config.map_is_state
+        since = self._drawn_at if is_state else math.nan
+        fit = lines.fit(self._planar, start, self._fit_options(), prior, guess, self._ages, since)
         self._noise.see(fit.spread)
-        if self.config.map_is_state and abs(self._noise.sigma_line - believed) > _SURPRISE * believed:
+        if is_state and abs(self._noise.sigma_line - believed) > _SURPRISE * believed:
             # the first scans show that the map is better or worse than was guessed; what they say of it will be believed for long
-            fit = lines.fit(self._planar, fit.pose, self._fit_options(), prior, guess, self._ages, self._drawn_at)
+            fit = lines.fit(self._planar, fit.pose, self._fit_options(), prior, guess, self._ages, since)
         cov = np.linalg.inv(fit.information + np.diag(_KNOWS_NOTHING**-2)).astype(np.float64, copy=False)
         pose = se2.compose(fit.pose, se2.exp(cov @ fit.gradient))
-        return Registration(pose, cov, len(self._planar), fit.n_on, fit.residual_rms, MapTie(cov @ fit.old, fit.map_part * cov))
+        tie = MapTie(cov @ fit.old, fit.map_part * cov) if is_state else None
+        return Registration(pose, cov, len(self._planar), fit.n_on, fit.residual_rms, tie)
 
     def _fit_options(self) -> FitOptions:
         return replace(self._options, sigma_point=self._noise.sigma_point, sigma_line=self._noise.sigma_line)

@@ -14,7 +14,7 @@ import numpy as np
 from localization.lidar.lines import Spread
 
 _KEPT = 0.98  # of what is known, from scan to scan: the last 50 count
-_POINTS = 500.0  # as much as is known beforehand, in degrees of freedom: about one scan
+_POINTS, _CELLS = 500.0, 20.0  # as much as is known beforehand, in degrees of freedom: about one scan
 _POSE = 3.0  # degrees of freedom that go into the pose
 _LEAST_M = 1e-3
 
@@ -22,7 +22,7 @@ _LEAST_M = 1e-3
 class Noise:
     """Begins with what is usual, and follows what is seen."""
 
-    def __init__(self, sigma_point: float, sigma_line: float, cells: float = 20.0) -> None:
+    def __init__(self, sigma_point: float, sigma_line: float, cells: float = _CELLS) -> None:
         """Sigmas [m]; the second is believed as if ``cells`` lines had shown it."""
         self._sums = np.array([_POINTS * sigma_point**2, _POINTS, cells * sigma_line**2, cells])
 
