@@ -19,35 +19,52 @@ _MAX_LINE_RATIO = 0.1  # smaller over larger eigenvalue of the neighbours' sprea
 
 
 @numba.njit(cache=True)
-def _line(
-    cells: NDArray[np.int32],
-    points: NDArray[np.float32],
-    travels: NDArray[np.float32],
-    ages: Ages,
-    x: float,
-    y: float,
-    cell: float,
-    radius: float,
-    most_thin: float,
-    since: float,
-) -> tuple[int, float, float, float, float, float, float]:  # pragma: no cover
-    """The line of the points around (x, y): how many they are, 0 where they make none; its normal, the distance of (x, y) from it along
-    the normal, the points' variance across it, their mean travelled distance, and the part of them that came ``since``."""
-    ix, iy = math.floor(x / cell), math.floor(y / cell)
-    m, new, sx, sy, sxx, sxy, syy, st = 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+def _gather(
+    cells: NDArray[np.int32], points: NDArray[np.float32], travels: NDArray[np.float32], ages: Ages, ix: int, iy: int, near: FloatArray
+) -> int:  # pragma: no cover
+    """Fills ``near`` (3, K) with place and travelled distance of the points of these ``ages`` in a cell and the eight around it; returns
+    how many they are."""
+    n = 0
     for jx in range(ix - 1, ix + 2):
         for jy in range(iy - 1, iy + 2):
             slot = find_cell(cells, jx, jy)
             if slot < 0:
                 continue
             for k in range(cells[slot, 2]):
-                qx, qy = points[slot, k, 0] - x, points[slot, k, 1] - y
-                if qx * qx + qy * qy < radius * radius and is_used(ages, travels[slot, k]):
-                    m += 1
-                    sx, sy = sx + qx, sy + qy
-                    sxx, sxy, syy = sxx + qx * qx, sxy + qx * qy, syy + qy * qy
-                    st += travels[slot, k]
-                    new += travels[slot, k] >= since
+                if is_used(ages, travels[slot, k]):
+                    near[0, n], near[1, n], near[2, n] = points[slot, k, 0], points[slot, k, 1], travels[slot, k]
+                    n += 1
+    return n
+
+
+@numba.njit(cache=True, fastmath={"reassoc", "nsz", "contract"})  # sums in any order: several points at once
+def _sums(
+    px: FloatArray, py: FloatArray, travels: FloatArray, x: float, y: float, radius: float, since: float
+) -> tuple[float, float, float, float, float, float, float, float]:  # pragma: no cover
+    """Of the points within ``radius`` of (x, y): how many, how many of them since, and sums of x, y, xx, xy, yy and travelled distance."""
+    m, new, sx, sy, sxx, sxy, syy, st = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(px.shape[0]):
+        qx, qy = px[k] - x, py[k] - y
+        w = 1.0 if qx * qx + qy * qy < radius * radius else 0.0
+        wx, wy = w * qx, w * qy
+        m += w
+        sx += wx
+        sy += wy
+        sxx += wx * qx
+        sxy += wx * qy
+        syy += wy * qy
+        st += w * travels[k]
+        new += w if travels[k] >= since else 0.0
+    return m, new, sx, sy, sxx, sxy, syy, st
+
+
+@numba.njit(cache=True)
+def _line(
+    near: FloatArray, n_near: int, x: float, y: float, radius: float, most_thin: float, since: float
+) -> tuple[int, float, float, float, float, float, float]:  # pragma: no cover
+    """The line of the points around (x, y): how many they are, 0 where they make none; its normal, the distance of (x, y) from it along
+    the normal, the points' variance across it, their mean travelled distance, and the part of them that came ``since``."""
+    m, new, sx, sy, sxx, sxy, syy, st = _sums(near[0, :n_near], near[1, :n_near], near[2, :n_near], x, y, radius, since)
     if m < _MIN_NEIGHBOURS:
         return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     mx, my = sx / m, sy / m
@@ -58,7 +75,7 @@ def _line(
         return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
     nx, ny = -math.sin(angle), math.cos(angle)
-    return m, nx, ny, -(nx * mx + ny * my), thin, st / m, new / m
+    return int(m), nx, ny, -(nx * mx + ny * my), thin, st / m, new / m
 
 
 @numba.njit(cache=True)
@@ -75,11 +92,16 @@ def compare_points(
     errors: FloatArray,
     seen: FloatArray,
 ) -> None:  # pragma: no cover
+    near, n_near = np.empty((3, 9 * points.shape[1])), 0
+    at_x, at_y = math.inf, math.inf
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(source.shape[0]):
         x = pose[0] + c * source[i, 0] - s * source[i, 1]
         y = pose[1] + s * source[i, 0] + c * source[i, 1]
-        m, _, _, e, _, travel, _ = _line(cells, points, travels, ages, x, y, cell, radius, most_thin, math.inf)
+        ix, iy = math.floor(x / cell), math.floor(y / cell)
+        if ix != at_x or iy != at_y:
+            at_x, at_y, n_near = ix, iy, _gather(cells, points, travels, ages, ix, iy, near)
+        m, _, _, e, _, travel, _ = _line(near, n_near, x, y, radius, most_thin, math.inf)
         errors[i], seen[i] = (abs(e), travel) if m else (math.nan, math.nan)
 
 
@@ -102,23 +124,29 @@ def _associate(
     """Fills ``lines`` (N, 8) for the points ``source`` (N, 2) at ``pose``: how many points make the line (0: none), its normal, a point on
     it, the variance of its place, how many of ``source`` are in its cell, ``home`` (N,), below 0 where the map has none, and the part of
     the line's points that came ``since``."""
+    near, n_near, slot = np.empty((3, 9 * points.shape[1])), 0, -1
+    at_x, at_y = math.inf, math.inf
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    last_x, last_y, near = math.inf, math.inf, (_SAME * radius) ** 2
+    last_x, last_y, same = math.inf, math.inf, (_SAME * radius) ** 2
     for i in range(source.shape[0]):
         x = pose[0] + c * source[i, 0] - s * source[i, 1]
         y = pose[1] + s * source[i, 0] + c * source[i, 1]
-        if (x - last_x) ** 2 + (y - last_y) ** 2 < near:  # beside the point before, as beams are: it meets the same line
+        ix, iy = math.floor(x / cell), math.floor(y / cell)
+        if ix != at_x or iy != at_y:  # beams that follow one another mostly end in the same cell
+            at_x, at_y, n_near = ix, iy, _gather(cells, points, travels, ages, ix, iy, near)
+            slot = find_cell(cells, ix, iy)
+        if (x - last_x) ** 2 + (y - last_y) ** 2 < same:  # beside the point before, as beams are: it meets the same line
             lines[i] = lines[i - 1]
         else:
             last_x, last_y = x, y
-            m, nx, ny, e, thin, _, new = _line(cells, points, travels, ages, x, y, cell, radius, most_thin, since)
+            m, nx, ny, e, thin, _, new = _line(near, n_near, x, y, radius, most_thin, since)
             lines[i, 0] = m
             if m:
                 lines[i, 1], lines[i, 2], lines[i, 3], lines[i, 4], lines[i, 5] = nx, ny, x - e * nx, y - e * ny, thin / m
                 lines[i, 7] = new
-        home[i] = find_cell(cells, math.floor(x / cell), math.floor(y / cell))
-        if home[i] >= 0:
-            hits[home[i]] += 1
+        home[i] = slot
+        if slot >= 0:
+            hits[slot] += 1
     for i in range(source.shape[0]):
         lines[i, 6] = hits[home[i]] if home[i] >= 0 else 1.0
     for i in range(source.shape[0]):
