@@ -35,7 +35,10 @@ class Estimator(Protocol):
     """State inside; one `step` after the other, then `finish`."""
 
     def step(self, step: Step) -> Estimate:
-        """The estimate at the end of ``step``."""
+        """The estimate at the end of ``step``. What of the work can wait until that is out, waits for `settle`."""
+
+    def settle(self) -> None:
+        """Do what waits, if anything does; else `step` and `finish` do it first. What it finds out, the next estimate tells."""
 
     def finish(self) -> Trajectory | None:
         """A trajectory that later measurements have smoothed, or None where the estimates of each moment are all there is."""

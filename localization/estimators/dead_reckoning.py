@@ -29,6 +29,9 @@ class DeadReckoning:
         twist, twist_cov = mean_twist(motion.delta, motion.cov, step.duration) if step.duration > 0 else (step.twist, None)
         return Estimate(step.end_ns, self._pose, self._cov, twist, twist_cov)
 
+    def settle(self) -> None:
+        return None
+
     def finish(self) -> None:
         return None
 

@@ -49,6 +49,7 @@ class EkfFusion:
         self._has_map = has_lidar and witness is None and (lidar or LidarConfig()).map_is_state
         self._model, self._corrected, self._track_m = model, corrected, robot.geometry.track_width_m
         self._has_gyro = False
+        self._to_settle: tuple[Step, bool] | None = None  # a step with a scan, and whether that was matched
         self._counts = dict.fromkeys(("scans", "matched", "contradictions", "standing", "revisits"), 0)
 
     @property
@@ -60,6 +61,7 @@ class EkfFusion:
         return np.asarray(self._model.nominal + self._corrected.directions @ self._ekf.correction)
 
     def step(self, step: Step) -> Estimate:
+        self.settle()
         ekf, nis = self._ekf, None
         ekf.predict(teaching(step, self._track_m, self._corrected, ekf.covariance[PARAMS:, PARAMS:]))
         if step.turn is not None:
@@ -84,14 +86,22 @@ class EkfFusion:
             self._counts["matched"] += 1
             nis = ekf.measure_motion(seen.motion, seen.is_trusted, seen.tie)
             self._counts["contradictions"] += nis > ekf.gate
-            if (known := witness.recall(step, ekf.pose, ekf.covariance[POSE, POSE])) is not None:
-                self._counts["revisits"] += 1
-                before = ekf.pose
-                ekf.measure_revisit(known)
-                witness.correct(before, ekf.pose)
+        self._to_settle = step, seen is not None
+        return nis
+
+    def settle(self) -> None:
+        """Whether the place was seen long before; the last scan enters the map."""
+        if self._to_settle is None or self._witness is None:
+            return
+        ekf, witness, (step, is_matched) = self._ekf, self._witness, self._to_settle
+        self._to_settle = None
+        if is_matched and (known := witness.recall(step, ekf.pose, ekf.covariance[POSE, POSE])) is not None:
+            self._counts["revisits"] += 1
+            before = ekf.pose
+            ekf.measure_revisit(known)
+            witness.correct(before, ekf.pose)
         is_drawn = witness.remember(step, ekf.pose)
         ekf.set_anchor(is_drawn or not self._has_map)
-        return nis
 
     def _twist(self, step: Step) -> tuple[FloatArray, FloatArray | None]:
         """Mean twist of the step as all witnesses see it."""
@@ -104,7 +114,7 @@ class EkfFusion:
         return mean_twist(delta, J @ ekf.covariance[np.ix_(both, both)] @ J.T, step.duration)
 
     def finish(self) -> None:
-        return None
+        self.settle()
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         found = {}

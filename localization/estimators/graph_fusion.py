@@ -104,6 +104,7 @@ class GraphFusion:
         self._drawn = first.pose  # where the newest scan was drawn into the map, and how far behind where it was found in it
         self._behind, self._is_drawn = np.zeros(3) if has_map else None, False
         self._pending: Link | None = None
+        self._to_settle: tuple[Step, FloatArray | None, bool] | None = None  # a step with a scan, what was seen of it, if it was matched
         self._nodes_ns: list[int] = []
         self._first_node = 0  # number of the node whose stamp is the first in that list: a fixed lag forgets the others
         self._gate = float(chi2.ppf(self._belief.gate_probability, 3))
@@ -120,6 +121,7 @@ class GraphFusion:
 
     def step(self, step: Step) -> Estimate:
         """See `Estimator.step`. Raises `EstimatorError` for measurements that are not finite or have no covariance."""
+        self.settle()
         if not self._nodes_ns:
             self._nodes_ns.append(step.start_ns)
         known = self._now.covariance[3:, 3:][self._slow.corrections, self._slow.corrections]
@@ -145,12 +147,7 @@ class GraphFusion:
             self._commit(ahead, step.end_ns)
             self._pending = None
             if step.scan is not None and self._has_lidar:
-                believed = self._believed(self._now)
-                if self._behind is not None:
-                    self._behind = se2.log(se2.between(se2.compose(self._drawn, ahead.pair.seen[0]), believed))
-                if sight is not None and self._recall(step):
-                    believed = self._believed(self._now)
-                self._is_drawn, self._drawn = self._witness.remember(step, believed), believed
+                self._to_settle = step, None if self._behind is None else ahead.pair.seen[0], sight is not None
         else:
             self._pending = pending
         if self._history is not None:
@@ -158,12 +155,25 @@ class GraphFusion:
         twist, twist_cov = self._twist(step, link, ahead, before, alone)
         return Estimate(step.end_ns, self._now.pose, self._now.covariance[:3, :3], twist, twist_cov, nis)
 
+    def settle(self) -> None:
+        """Whether the place was seen long before; the last scan enters the map."""
+        if self._to_settle is None:
+            return
+        (step, seen, is_matched), self._to_settle = self._to_settle, None
+        believed = self._believed(self._now)
+        if seen is not None:
+            self._behind = se2.log(se2.between(se2.compose(self._drawn, seen), believed))
+        if is_matched and self._recall(step):
+            believed = self._believed(self._now)
+        self._is_drawn, self._drawn = self._witness.remember(step, believed), believed
+
     def add_position(self, stamp_ns: int, xy: FloatArray, cov: FloatArray, lever: FloatArray | None = None) -> bool:
         """A measured position ``xy`` (2,) with ``cov`` (2, 2) of the body's point ``lever`` (2,) at a moment, in this estimator's world.
 
         As by GPS. Late ones are used as long as their node is kept: in the window, or, by ``batch`` and ``isam2``, anywhere. Returns
         whether it was; the others are counted as late. Raises `EstimatorError`.
         """
+        self.settle()
         lever = np.zeros(2) if lever is None else lever
         if xy.shape != (2,) or not np.isfinite(xy).all() or lever.shape != (2,) or not np.isfinite(lever).all():
             raise EstimatorError(f"the position {xy} or its lever arm {lever} is not two finite numbers.")
@@ -190,6 +200,7 @@ class GraphFusion:
         Used if both nodes are kept: in the window, or, by ``batch`` and ``isam2``, anywhere. Returns whether it was; the others are counted
         as late. Raises `EstimatorError` for what is no motion, or where there is no node.
         """
+        self.settle()
         check_motion(motion.delta, motion.cov, "the loop closure")
         a, b = self._node_at(from_ns, _NEAR_NS), self._node_at(to_ns, _NEAR_NS)
         if self._first_node and from_ns < self._nodes_ns[0] and b is not None:
@@ -226,6 +237,7 @@ class GraphFusion:
 
     def finish(self) -> Trajectory | None:
         """None for the fixed lag; else all poses as the whole log tells them, with covariances."""
+        self.settle()
         return None if self._history is None else self._history.trajectory()
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:

@@ -38,6 +38,9 @@ class LidarAlone:
             self._n_scans += 1
         return Estimate(step.end_ns, self._pose, None, self._twist, None)
 
+    def settle(self) -> None:
+        return None
+
     def finish(self) -> None:
         return None
 

@@ -48,9 +48,15 @@ class Core:
         """Take ``event``; the estimates that it completes, none or several. Raises `EstimatorError`."""
         return self._take(self.stepper.push(event))
 
+    def settle(self) -> None:
+        """After `push`, when its estimates are out: the work that they need not wait for. Left out, the next `push` does it first."""
+        self.estimator.settle()
+
     def finish(self) -> list[Estimate]:
         """The estimates that were still waiting for events when these ended."""
-        return self._take(self.stepper.finish())
+        estimates = self._take(self.stepper.finish())
+        self.settle()
+        return estimates
 
     def _take(self, steps: Iterable[Step]) -> list[Estimate]:
         found = []

@@ -153,6 +153,7 @@ class Node:
                     self.session.health.took((time.monotonic_ns() - received.received_ns) * 1e-9)
             self.session.saw(event)
         if has_estimate:  # the next scan is far now, and does not wait
+            self.session.core.settle()
             self.session.dump(self._head)
         return has_estimate
 

@@ -53,6 +53,7 @@ def in_process(path: Path, estimator: str) -> tuple[np.ndarray, float]:
         start = time.perf_counter()
         if core.push(event):
             took.append(time.perf_counter() - start)
+            core.settle()
     cpu = time.process_time() - begin
     return np.array(took), cpu / ((events[-1].stamp_ns - events[0].stamp_ns) * 1e-9)
 
