@@ -147,13 +147,15 @@ def between(world_T_a: ArrayLike, world_T_b: ArrayLike) -> FloatArray:
     return compose(inverse(world_T_a), world_T_b)
 
 
+@_gufunc("(n),(m)->(m)")
+def _transform(p: FloatArray, q: FloatArray, out: FloatArray) -> None:  # pragma: no cover
+    c, s = math.cos(p[2]), math.sin(p[2])
+    out[0], out[1] = p[0] + c * q[0] - s * q[1], p[1] + s * q[0] + c * q[1]
+
+
 def transform(a_T_b: ArrayLike, points_b: ArrayLike) -> FloatArray:
     """Points (..., 2) of frame b in frame a."""
-    p, q = np.asarray(a_T_b, dtype=float), np.asarray(points_b, dtype=float)
-    c, s = np.cos(p[..., 2]), np.sin(p[..., 2])
-    x = p[..., 0] + c * q[..., 0] - s * q[..., 1]
-    y = p[..., 1] + s * q[..., 0] + c * q[..., 1]
-    return np.stack([x, y], axis=-1)
+    return np.asarray(_transform(a_T_b, points_b))
 
 
 @_gufunc("(n)->(n,n)")
