@@ -147,20 +147,20 @@ def decode_odometry(message: Any, stamp: int) -> OdometryReading:
 
 def joint_decoder(joints: tuple[str, ...]) -> Callable[[Any, int], JointReading | None]:
     """Decoder of joint states for these joints; None for a message that has none of them (an arm's, say)."""
-    places: dict[tuple[str, ...], NDArray[np.intp]] = {}
+    places: dict[tuple[str, ...], NDArray[np.intp] | None] = {}
 
     def decode(message: Any, stamp: int) -> JointReading | None:
         names = tuple(message.name)
-        place = places.get(names)
-        if place is None:
-            place = np.array([names.index(joint) if joint in names else -1 for joint in joints], dtype=np.intp)
+        if names not in places:
             if len(places) >= 100:  # nobody's joints change that often, but the memory must not grow
                 places.clear()
-            places[names] = place
-        if (place < 0).any():
+            has_all = set(joints) <= set(names)
+            places[names] = np.array([names.index(joint) for joint in joints], dtype=np.intp) if has_all else None
+        place = places[names]
+        if place is None:
             return None
         position, velocity = _at(message.position, place), _at(message.velocity, place)
-        if not (np.isfinite(position).all() or np.isfinite(velocity).all()):
+        if not (_all_finite(position) or _all_finite(velocity)):
             raise UnusableError(Oddity.NOT_FINITE)
         return JointReading(stamp, position, velocity)
 
@@ -175,25 +175,39 @@ def arm_decoder(
     A message without positions, which ROS allows, tells nothing of the arms.
     """
 
+    known: dict[tuple[str, ...], tuple[NDArray[np.intp], tuple[str, ...]]] = {}
+
     def decode(message: Any, stamp: int) -> ArmReading | JointReading | None:
         reading = None if wheels is None else wheels(message, stamp)
         names = tuple(message.name)
-        columns = [i for i, name in enumerate(names) if name in joints]
+        if names not in known:
+            if len(known) >= 100:
+                known.clear()
+            found = [i for i, name in enumerate(names) if name in joints]
+            known[names] = np.array(found, dtype=np.intp), tuple(names[i] for i in found)
+        columns, told = known[names]
         position = np.asarray(message.position, dtype=float)
-        if not columns or not len(position):
+        if not told or not len(position):
             return reading
         if len(position) != len(names):
             if reading is None:
                 raise UnusableError(Oddity.MALFORMED)
             return reading
-        return ArmReading(stamp, tuple(names[i] for i in columns), position[columns], reading)
+        return ArmReading(stamp, told, position[columns], reading)
 
     return decode
 
 
 def _at(values: Any, place: NDArray[np.intp]) -> FloatArray:
     array = np.asarray(values, dtype=float)
-    return array[place] if len(array) > int(place.max()) else np.full(len(place), np.nan)
+    try:
+        return array[place]
+    except IndexError:
+        return np.full(len(place), np.nan)
+
+
+def _all_finite(values: FloatArray) -> bool:
+    return all(map(math.isfinite, values.tolist()))  # quicker than numpy's, on a handful
 
 
 def scan_decoder() -> Callable[[Any, int], Scan]:

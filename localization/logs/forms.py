@@ -61,7 +61,7 @@ class Template:
     def fill(self, message: Message) -> bytes:
         """The bytes of ``message``."""
         data = bytearray(self._bytes)
-        stamp = struct.pack("<II", message.stamp_ns // _NS, message.stamp_ns % _NS)
+        stamp = struct.pack("<iI", message.stamp_ns // _NS, message.stamp_ns % _NS)
         for at in self._stamps:
             data[at : at + 8] = stamp
         for (at, size, kind), part in zip(self._places, message.parts, strict=True):

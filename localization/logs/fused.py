@@ -54,6 +54,7 @@ _STORE = get_typestore(Stores.ROS2_HUMBLE)
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _STAMP_END = 2**31 * 10**9  # seconds of a ROS stamp are an int32
 _ROUNDING = 1e-12  # below this a negative variance is that of a filter that has failed, not of its last digit
+_UNKNOWN = np.diag(np.full(6, UNKNOWN_VARIANCE))
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))  # x, y, yaw among x, y, z, roll, pitch, yaw
 
 
@@ -136,11 +137,11 @@ def odometry_message(estimate: FusedEstimate) -> Odometry:
         child_frame_id=BODY_FRAME,
         pose=PoseWithCovariance(
             pose=Pose(position=Point(x=x, y=y, z=0.0), orientation=_heading(theta)),
-            covariance=_six_by_six(odom_axes(estimate.covariance, theta) if estimate.covariance is not None else None),
+            covariance=six_by_six(odom_axes(estimate.covariance, theta) if estimate.covariance is not None else None),
         ),
         twist=TwistWithCovariance(
             twist=Twist(linear=Vector3(x=vx, y=vy, z=0.0), angular=Vector3(x=0.0, y=0.0, z=wz)),
-            covariance=_six_by_six(estimate.twist_covariance),
+            covariance=six_by_six(estimate.twist_covariance),
         ),
     )
 
@@ -163,9 +164,9 @@ def odom_axes(covariance: FloatArray, theta: float) -> FloatArray:
     return (turned + turned.T) / 2
 
 
-def _six_by_six(planar: FloatArray | None) -> FloatArray:
+def six_by_six(planar: FloatArray | None) -> FloatArray:
     """(36,) row-major covariance of x, y, z, roll, pitch, yaw, from the (3, 3) of x, y, yaw."""
-    full = np.diag(np.full(6, UNKNOWN_VARIANCE))
+    full = _UNKNOWN.copy()
     if planar is not None:
         full[_PLANAR] = planar
     return full.ravel()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -64,8 +63,8 @@ class Intake:
         if isinstance(payload, JointReading):
             yield self.from_joints(payload)
         elif isinstance(payload, ArmReading):
-            if payload.wheels is not None:
-                yield self.from_joints(dataclasses.replace(payload.wheels, stamp_ns=payload.stamp_ns))
+            if (wheels := payload.wheels) is not None:
+                yield self.from_joints(JointReading(payload.stamp_ns, wheels.position, wheels.velocity))
             if self._from_arms is not None:
                 yield from self._from_arms(payload)
         elif isinstance(payload, OdometryReading):

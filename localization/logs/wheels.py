@@ -32,7 +32,7 @@ class JointsToWheels:
         self._angle = np.full(left + right, np.nan)
 
     def __call__(self, reading: JointReading) -> WheelSample:
-        if not np.isfinite(reading.position).all():
+        if not all(map(math.isfinite, reading.position.tolist())):
             return WheelSample(reading.stamp_ns, self._side_means(reading.velocity), np.full(2, np.nan))
         known = self._known
         if known is None:

@@ -11,6 +11,7 @@ from rosbags.typesys.store import Typestore
 from localization.logs.chunks import Channel
 from localization.logs.decode import UnusableError
 from localization.logs.forms import STORE, STORE_ROS1
+from localization.logs.quick import quick_reader
 from localization.logs.tally import Oddity
 
 Shape = tuple[Any, ...]
@@ -25,12 +26,15 @@ def encode(message: Any, *, is_ros1: bool = False) -> bytes:
 
 
 def decoder(kind: str, *, is_ros1: bool = False) -> Callable[[bytes], Any]:
-    """What makes message objects of type ``kind`` (package/msg/Type) of bytes; it raises `UnusableError`."""
+    """What makes message objects of type ``kind`` (package/msg/Type) of bytes, or, of some types, what is used of them (`quick`); it raises
+    `UnusableError`."""
     deserialize = STORE_ROS1.deserialize_ros1 if is_ros1 else STORE.deserialize_cdr
+    quick = None if is_ros1 else quick_reader(kind)
 
     def decode(data: bytes) -> Any:
         try:
-            return deserialize(data, kind)
+            message = None if quick is None else quick(data)
+            return deserialize(data, kind) if message is None else message
         except Exception as error:  # struct.error, SerdeError, UnicodeDecodeError, ... : the bytes are not such a message
             raise UnusableError(Oddity.UNDECODABLE) from error
 

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from localization.estimators import Estimate
-from localization.logs.fused import FusedEstimate, odometry_message, transform_message
+from localization.logs.fused import FusedEstimate
+from localization.logs.quick import FusedWriter
 from localization.logs.wire import encode, make
 from localization.online.health import Status
 from localization.online.transport import Transport
@@ -27,6 +28,7 @@ class Teller:
 
     def __init__(self, transport: Transport, *, with_tf: bool) -> None:
         self._transport, self._with_tf = transport, with_tf
+        self._fused = FusedWriter(is_ros1=transport.is_ros1)
         for topic, kind in _TYPES.items():
             if topic != TF or with_tf:
                 transport.advertise(topic, kind)
@@ -35,9 +37,9 @@ class Teller:
         """nav_msgs/Odometry with the true vy, and `odom` -> `base_link`, at ``stamp_ns``."""
         covariance = estimate.covariance
         fused = FusedEstimate(stamp_ns, estimate.pose, estimate.twist, covariance, estimate.twist_covariance)
-        self._publish(ODOMETRY, odometry_message(fused))
+        self._transport.publish(ODOMETRY, self._fused.odometry(fused))
         if self._with_tf:
-            self._publish(TF, transform_message(fused))
+            self._transport.publish(TF, self._fused.transform(fused))
 
     def corrections(self, parameters: Mapping[str, tuple[float, float]], stamp_ns: int) -> None:
         """Named numbers as sensor_msgs/JointState: ``position`` is the mean, ``effort`` its sigma."""
