@@ -85,11 +85,15 @@ class LogTransport:
         self._left = deque(spoil(messages))
         self._begin: int | None = None
         self.subscribed: dict[str, bool] = {}
+        self.kept: set[str] | None = None
         self.published: dict[str, list[bytes]] = {}
         self.is_closed = False
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         self.subscribed[topic] = is_latched
+
+    def keep(self, topics) -> None:
+        self.kept = set(topics)
 
     def advertise(self, topic: str, kind: str) -> None:
         self.published[topic] = []
@@ -109,7 +113,8 @@ class LogTransport:
         found = []
         while self._left and self._left[0].received_ns < end:
             found.append(self._left.popleft())
-        return [message for message in found if message.topic in self.subscribed]
+        wanted = self.subscribed if self.kept is None else self.kept
+        return [message for message in found if message.topic in wanted]
 
     def is_empty(self) -> bool:
         return not self._left

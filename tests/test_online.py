@@ -96,6 +96,7 @@ def test_subscriptions_are_of_sensor_data_but_for_static_transforms(calm):
     subscribed = calm[0].subscribed
     assert [topic for topic, is_latched in subscribed.items() if is_latched] == ["/tf_static"]
     assert {"/joint_states", "/scan", "/points", "/imu/data", "/center_of_gravity"} <= set(subscribed)
+    assert calm[0].kept == {"/joint_states", "/scan", "/imu/data"}  # what is not used costs nothing from the start on
 
 
 @pytest.mark.parametrize(("estimator", "seed"), [("ekf", 0), ("ekf", 1), ("graph", 2)])
@@ -348,9 +349,13 @@ class _FakeRclpy(types.ModuleType):
 
     def destroy_node(self): ...
 
+    def destroy_subscription(self, subscription):
+        del self.subscriptions[subscription]
+
     def create_subscription(self, kind, topic, callback, quality, raw):
         assert raw
         self.subscriptions[topic] = kind, callback, quality
+        return topic
 
     def create_publisher(self, kind, topic, depth):
         return types.SimpleNamespace(publish=lambda data: self.sent.append((topic, data)))
@@ -390,4 +395,6 @@ def test_rclpy_door_by_its_documented_interface(monkeypatch):
     transport.publish("/skidloc/odometry", b"three")
     assert fake.sent == [("/skidloc/odometry", b"three")]
     assert transport.publishers()["/scan"] == {"sensor_msgs/msg/LaserScan"}
+    transport.keep(["/scan"])
+    assert set(fake.subscriptions) == set(transport.publishers()) == {"/scan"}
     transport.close()

@@ -11,7 +11,7 @@ import functools
 import re
 import socket
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -65,6 +65,12 @@ class DdsTransport:
         is_new = dds.ReadCondition(reader, dds.ViewState.Any | dds.InstanceState.Any | dds.SampleState.NotRead)
         self._waiting.attach(is_new)
         self._readers.append((topic, reader, is_new))
+
+    def keep(self, topics: Collection[str]) -> None:
+        for topic, _, is_new in self._readers:
+            if topic not in topics:
+                self._waiting.detach(is_new)
+        self._readers = [entry for entry in self._readers if entry[0] in topics]
 
     def advertise(self, topic: str, kind: str) -> None:
         made, quality = _bytes_type(kind), _reliable()

@@ -6,6 +6,7 @@ import gc
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from localization.errors import DumpError
@@ -83,6 +84,7 @@ class Node:
             warm_up(pair, robot, heard.mounts, has_lidar, is_planar=False, config=config)
         gc.collect()
         gc.freeze()  # what is here now stays: later collections need not look at it
+        transport.keep([source.topic for source in heard.parts.sources.used()])
         tally = Tally()
         stream = Stream(heard, robot, tally, epoch_ns, is_ros1=transport.is_ros1)
         made = made_by(pair, robot, heard.mounts, has_lidar, config, "live topics")
@@ -146,11 +148,8 @@ class Node:
         for event in self._stream.push(received):
             self._newest_ns = max(self._newest_ns, event.stamp_ns)
             self._began_ns = event.stamp_ns if self._began_ns is None else self._began_ns
-            for estimate in self.session.push(event):
-                has_estimate = True
-                self._publish(estimate, event)
-                if time_it and isinstance(event, Scan):
-                    self.session.health.took((time.monotonic_ns() - received.received_ns) * 1e-9)
+            arrived_ns = received.received_ns if time_it and isinstance(event, Scan) else None
+            has_estimate |= bool(self.session.push(event, partial(self._publish, event, arrived_ns)))
             self.session.saw(event)
         if has_estimate:  # the next scan is far now, and does not wait
             self.session.core.settle()
@@ -160,9 +159,11 @@ class Node:
     def _head(self) -> Mapping[str, Any]:
         return {"stamp_ns": self._newest_ns, "topics": self.topics}
 
-    def _publish(self, estimate: Estimate, event: Event) -> None:
+    def _publish(self, event: Event, arrived_ns: int | None, estimate: Estimate) -> None:
         by_lidar = estimate.nis is not None or isinstance(event, Scan)
         self._teller.estimate(estimate, self._stream.sender_stamp_ns(estimate.stamp_ns, by_lidar=by_lidar))
+        if arrived_ns is not None:
+            self.session.health.took((time.monotonic_ns() - arrived_ns) * 1e-9)
 
     def _tell(self) -> None:
         health = self.session.health

@@ -8,7 +8,7 @@ import os
 import queue
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
@@ -52,13 +52,18 @@ class RospyTransport:
         self._master = graph.Master(f"/{node}")
         self._rospy.init_node(node, disable_signals=True, anonymous=True)
         self._heard: queue.SimpleQueue[Received] = queue.SimpleQueue()
+        self._subscribers: dict[str, Any] = {}
         self._writers: dict[str, tuple[Any, type[Any]]] = {}
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         def on_message(message: Any) -> None:
             self._heard.put(Received(topic, time.monotonic_ns(), message._buff))
 
-        self._rospy.Subscriber(topic, self._bytes_type(kind), on_message, queue_size=_LATEST, tcp_nodelay=True)
+        self._subscribers[topic] = self._rospy.Subscriber(topic, self._bytes_type(kind), on_message, queue_size=_LATEST, tcp_nodelay=True)
+
+    def keep(self, topics: Collection[str]) -> None:
+        for topic in set(self._subscribers) - set(topics):
+            self._subscribers.pop(topic).unregister()
 
     def advertise(self, topic: str, kind: str) -> None:
         made = self._bytes_type(kind)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from localization.errors import DoorError
@@ -28,7 +28,7 @@ class RclpyTransport:
         self._rclpy.init(args=[])
         self._node = self._rclpy.create_node(node)
         self._heard: list[Received] = []
-        self._topics: list[str] = []
+        self._subscriptions: dict[str, Any] = {}
         self._writers: dict[str, Any] = {}
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
@@ -42,8 +42,11 @@ class RclpyTransport:
         def on_message(data: bytes) -> None:
             self._heard.append(Received(topic, time.monotonic_ns(), bytes(data)))
 
-        self._topics.append(topic)
-        self._node.create_subscription(_message_class(kind), topic, on_message, quality, raw=True)
+        self._subscriptions[topic] = self._node.create_subscription(_message_class(kind), topic, on_message, quality, raw=True)
+
+    def keep(self, topics: Collection[str]) -> None:
+        for topic in set(self._subscriptions) - set(topics):
+            self._node.destroy_subscription(self._subscriptions.pop(topic))
 
     def advertise(self, topic: str, kind: str) -> None:
         self._writers[topic] = self._node.create_publisher(_message_class(kind), topic, _DEPTH)
@@ -62,7 +65,7 @@ class RclpyTransport:
         return found
 
     def publishers(self) -> Mapping[str, set[str]]:
-        return {topic: {info.topic_type for info in self._node.get_publishers_info_by_topic(topic)} for topic in self._topics}
+        return {topic: {info.topic_type for info in self._node.get_publishers_info_by_topic(topic)} for topic in self._subscriptions}
 
     def close(self) -> None:
         self._node.destroy_node()

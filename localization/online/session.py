@@ -117,10 +117,13 @@ class Session:
         core, kept = found.value
         return cls(core, kept, name, files, spool, dumper, found.head)
 
-    def push(self, event: Event) -> list[Estimate]:
-        """Raises `EstimatorError`."""
+    def push(self, event: Event, out: Callable[[Estimate], None] = lambda estimate: None) -> list[Estimate]:
+        """``out`` is given each estimate before anything else is done with it. Raises `EstimatorError`."""
         self.count += 1
-        return self._take(self.core.push(event))
+        estimates = self.core.push(event)
+        for estimate in estimates:
+            out(estimate)
+        return self._take(estimates)
 
     def saw(self, event: Event) -> None:
         """After `push`, for whoever watches: its health, and a view."""

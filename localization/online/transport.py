@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple, Protocol
 
 
@@ -23,6 +23,9 @@ class Transport(Protocol):
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         """Hear ``topic``. ``is_latched``: messages sent before matter too (tf_static); else as sensor data, the newest only."""
+
+    def keep(self, topics: Collection[str]) -> None:
+        """Hear only these of what was subscribed to, from now on."""
 
     def advertise(self, topic: str, kind: str) -> None:
         """Will publish on ``topic``."""

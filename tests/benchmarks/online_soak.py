@@ -7,7 +7,7 @@ from __future__ import annotations
 import resource
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,6 +68,9 @@ class SimulatedRobot:
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         self._topics.add(topic)
+
+    def keep(self, topics: Collection[str]) -> None:
+        self._topics = set(topics)
 
     def advertise(self, topic: str, kind: str) -> None: ...
 
