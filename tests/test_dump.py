@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from localization.errors import DumpError
+from localization.lidar.lines import LineMap
 from localization.lidar.track import Place
 from localization.online.core import Core, Pair, ReplayConfig
 from localization.online.dump import Dumper, fingerprints, read_dump, read_head, write_dump
@@ -231,6 +232,17 @@ def test_dumper_writes_no_more_often_than_it_is_told_and_reports_a_full_disk(tmp
     with pytest.raises(DumpError, match="No space left"):
         dumper.close()
     assert read_dump(tmp_path / "state", {}, {}).value == [1.5]
+
+
+def test_a_map_of_lines_is_written_by_its_points_not_by_its_table():
+    lines = LineMap(0.4, 0.01, 50.0)
+    for travel in range(3):
+        lines.insert(np.random.default_rng(travel).uniform(-4.0, 4.0, (400, 2)), np.array([travel, 0.5, 0.3]), float(travel))
+    text, blob = freeze(lines)
+    assert len(text) + len(blob) < 30 * len(lines.point_cloud()) + 20 * np.count_nonzero(lines._cells[:, 2]) + 1000
+    again = thaw(text, blob)
+    assert vars(again).keys() == vars(lines).keys()
+    assert all(np.array_equal(vars(again)[name], value) for name, value in vars(lines).items())
 
 
 def test_pair_is_shared_not_written():

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +67,28 @@ class LineMap:
         self._points = np.zeros((slots, POINTS_PER_CELL, 2), np.float32)
         self._travels = np.zeros((slots, POINTS_PER_CELL), np.float32)
         self._hits = np.zeros(slots, np.int32)  # of one step of a fit, all zero between steps
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The points and their cells' places: most of the table is empty."""
+        slots = np.flatnonzero(self._cells[:, 2])
+        use = np.arange(POINTS_PER_CELL) < self._cells[slots, 2][:, None]
+        return {
+            "made": (self._cell, self._min_distance, self._radius),
+            "size": (len(self._cells), self._used),
+            "slots": slots,
+            "cells": self._cells[slots],
+            "points": self._points[slots][use],
+            "travels": self._travels[slots][use],
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(*state["made"])  # type: ignore[misc]
+        slots, used = state["size"]
+        self._allocate(slots)
+        self._used = used
+        self._cells[state["slots"]] = state["cells"]
+        use = np.arange(POINTS_PER_CELL) < self._cells[:, 2][:, None]
+        self._points[use], self._travels[use] = state["points"], state["travels"]
 
     def insert(self, points: FloatArray, pose: FloatArray, travel: float = 0.0, ages: Ages = ALL_AGES) -> None:
         """Add ``points`` (N, 2) of the body frame, seen from ``pose`` (3,) after ``travel`` [m], to what is in use."""
