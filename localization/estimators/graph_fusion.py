@@ -54,7 +54,7 @@ class GraphConfig:
     lag_nodes: int = 50
     """Nodes that the window smooths."""
     relinearize_at: float = 0.01
-    """A node whose pose has moved this far from where it was linearised is linearised anew [m, rad]."""
+    """Where the way between two nodes has changed this far since it was linearised, it is linearised anew [m, rad]."""
     kernel: Literal["none", "huber", "cauchy"] = "cauchy"
     """Robust kernel of positions and loop closures; a LiDAR that contradicts the wheels is judged when it comes."""
     kernel_scale: float = 3.0

@@ -2,7 +2,8 @@
 
 Nodes are eliminated in order of time by Householder reflections. What is left on a node after its predecessors were eliminated is the
 square root of the information that the past has about it: to marginalise the oldest node is to forget it. A new node costs one
-elimination and one back substitution; nodes that have moved far from where they were linearised are linearised anew (as in iSAM2).
+elimination and one back substitution; where the way between two nodes is not as it was when it was linearised, the window is linearised
+anew (as parts of the graph are in iSAM2).
 Square roots keep half the digits that the information matrix itself would lose between metres of drift and micrometres of standing
 still (Bierman, "Factorization methods for discrete sequential estimation", 1977, ch. V).
 """
@@ -24,6 +25,7 @@ from motion_models.se2 import FloatArray
 
 _ITERATIONS = 10
 _UNARY = 3  # rows that positions leave on the pose of a node
+_TURNED = 0.1  # rad
 
 
 class SingularError(EstimatorError):
@@ -80,7 +82,7 @@ class Window:
     """The newest ``lag`` nodes and what is known of each."""
 
     def __init__(self, first: Node, lag: int, relinearize_at: float, kernel: Kernel | None = None) -> None:
-        """``relinearize_at`` [m, rad]: how far a node's pose may be off the point where it was linearised."""
+        """``relinearize_at`` [m, rad]: how far the way between two nodes may be off that at which it was linearised."""
         if lag < 2:
             raise EstimatorError(f"the lag is {lag} nodes; it must be at least 2.")
         self._lag, self._relinearize_at, self._kernel = lag, relinearize_at, kernel or Kernel()
@@ -92,6 +94,7 @@ class Window:
         self._unary = np.zeros((room, _UNARY, 4))
         self._positions: list[list[Position]] = [[] for _ in range(room)]
         self._change = np.zeros((room, n))
+        self._ways = np.zeros((room, 3))  # from each node to the next, as it was when it was linearised
         self._pairs: Pairs | None = None
         self._newest: Node | None = None
         self._first_index = 0
@@ -187,7 +190,7 @@ class Window:
             triangularize(work, self._n)
             self._roots[k] = work[: self._n]
             self._positions[k] = []
-        self._again(max(k, first))
+        self._again()
 
     def close(self, closure: Closure) -> None:
         """A motion between two nodes of the window, counted from the very first. Raises `EstimatorError`.
@@ -232,7 +235,7 @@ class Window:
     def _drop(self, count: int) -> None:
         assert self._pairs is not None
         keep = self._size - count
-        for a in (self._poses, self._slow, self._roots, self._conditionals, self._unary, self._change):
+        for a in (self._poses, self._slow, self._roots, self._conditionals, self._unary, self._change, self._ways):
             a[:keep] = a[count : self._size].copy()
         self._positions = self._positions[count:] + [[] for _ in range(count)]
         kept = self._pairs[slice(count, self._size - 1)]
@@ -241,31 +244,40 @@ class Window:
         self._size = keep
 
     def _solve(self) -> None:
-        """All changes by back substitution; nodes that moved far are linearised anew, once."""
-        first = self._size - min(self._size, self._lag)
-        self._back(first)
-        far = np.abs(self._change[first : self._size, :3]).max(axis=1) > self._relinearize_at
-        if far.any():
-            self._again(first + int(np.argmax(far)))
+        """All changes by back substitution; where a way between two nodes has changed, all are linearised anew, once.
 
-    def _again(self, start: int) -> None:
-        """Linearise the nodes from ``start`` on where they are now, and eliminate from there."""
+        Nodes that move together as one rigid body need not be, however far: what ties them is relative, and for a motion of the world by
+        xi their changes are Ad(pose^-1) xi exactly. After hours, whatever is learned of a slow state moves all that was ever driven with
+        it, at every step. Positions alone are of the world, and a turn by much is more than their changes' curvature allows.
+        """
+        first, last = self._size - min(self._size, self._lag), self._size
+        self._back(first)
+        change = self._change[first:last, :3]
+        poses = se2.compose(self._poses[first:last], se2.exp(change))
+        ways = se2.between(poses[:-1], poses[1:])
+        self._ways[last - 2] = ways[-1]
+        is_far = np.abs(se2.log(se2.between(self._ways[first : last - 1], ways))).max() > self._relinearize_at
+        is_far |= np.abs(change[:, 2]).max() > _TURNED
+        if is_far or (any(self._positions[first:last]) and np.abs(change).max() > self._relinearize_at):
+            self._again()
+
+    def _again(self) -> None:
+        """Linearise the nodes where they are now, and eliminate them."""
         first, last = self._size - min(self._size, self._lag), self._size
         self._newest = None
-        here = slice(start, last)
+        here = slice(first, last)
         moved = self._change[here].copy()
-        if start == first:
-            _move(self._roots[start], 0, moved[0], se2.right_jacobian_inverse(moved[0, :3]))
+        _move(self._roots[first], 0, moved[0], se2.right_jacobian_inverse(moved[0, :3]))
         self._poses[here] = se2.compose(self._poses[here], se2.exp(moved[:, :3]))
         self._slow[here] += moved[:, 3:]
-        for k in range(start, last):
+        for k in range(first, last):
             if self._positions[k]:
                 self._unary[k] = self._position_rows(k)
-        begin = max(start - 1, first)
-        if last - begin > 1:
+        if last - first > 1:
             assert self._pairs is not None
-            rows = linearize(self._pairs[slice(begin, last - 1)], self._poses[begin:last], self._slow[begin:last])
-            eliminate(self._roots[begin:last], self._conditionals[begin : last - 1], rows, self._unary[begin:last])
+            self._ways[first : last - 1] = se2.between(self._poses[first : last - 1], self._poses[first + 1 : last])
+            rows = linearize(self._pairs[slice(first, last - 1)], self._poses[here], self._slow[here])
+            eliminate(self._roots[here], self._conditionals[first : last - 1], rows, self._unary[here])
         self._back(first)
 
     def _back(self, first: int) -> None:

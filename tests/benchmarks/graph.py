@@ -26,6 +26,7 @@ from tests.synthetic_steps import DT, Noise, Seer
 Recorded = list[tuple[Step, Motion | None]]
 LEVELS = (0.3, 1.0, 2.0, 4.0)
 SEEDS, STEPS = 100, 150
+_NEW_EVERY, _SETTLED = 5, 100
 
 
 def seconds_each(estimator: GraphFusion, seer: Seer, steps: Recorded) -> np.ndarray:
@@ -84,22 +85,29 @@ def size_of(estimator: GraphFusion) -> int:
 
 
 def soak(hours: float = 10.0) -> None:
-    """The same two minutes, both ways round, over and over: costs of each hour, and the most numbers held at the end of a lap."""
+    """The same two minutes over and over: costs of each hour beside those of a new graph that drives some of the laps with it, for no
+    host is equally fast all the time; and the most numbers held at the end of a lap."""
     steps = recorded(steps=1200)
     seer = Seer()
     estimator = make("graph", seer)
     estimator.step(steps[0][0])
     lap, shift = 0, steps[-1][0].end_ns
-    print(f"{'hour':>4} {'median ms':>10} {'p99 ms':>8} {'numbers held':>13} {'peak MB':>8}")
+    print(f"{'hour':>4} {'median ms':>10} {'p99 ms':>8} {'a new one':>10} {'ratio':>6} {'numbers held':>13} {'peak MB':>8}")
     per_hour = round(3600.0 / DT / (len(steps) - 1))
     for hour in range(1, round(hours) + 1):
-        each, held = [], 0
-        for _ in range(per_hour):
+        each, anew, held = [], [], 0
+        for i in range(per_hour):
             moved = [(replace(s, start_ns=s.start_ns + lap * shift, end_ns=s.end_ns + lap * shift), seen) for s, seen in steps[1:]]
             each.append(seconds_each(estimator, seer, moved))
+            if i % _NEW_EVERY == 0:
+                new = make("graph", seer)
+                new.step(replace(steps[0][0], start_ns=moved[0][0].start_ns, end_ns=moved[0][0].start_ns))
+                anew.append((each[-1][_SETTLED:], seconds_each(new, seer, moved)[_SETTLED:]))
             lap, held = lap + 1, max(held, size_of(estimator))
         taken, peak = 1e3 * np.concatenate(each), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-        print(f"{hour:4d} {np.median(taken):10.3f} {np.percentile(taken, 99):8.3f} {held:13d} {peak:8.1f}", flush=True)
+        beside, new_ms = (1e3 * float(np.median(np.concatenate(half))) for half in zip(*anew, strict=True))
+        costs = f"{np.median(taken):10.3f} {np.percentile(taken, 99):8.3f} {new_ms:10.3f} {beside / new_ms:6.3f}"
+        print(f"{hour:4d} {costs} {held:13d} {peak:8.1f}", flush=True)
     print(f"after {estimator.counts()['nodes']} nodes the covariance is finite: {bool(np.isfinite(estimator.covariance()).all())}")
 
 
