@@ -136,6 +136,34 @@ def test_a_lag_that_forgets_nothing_is_the_batch(steps):
     np.testing.assert_allclose(window._window.poses(), history.poses(), atol=1e-5)
 
 
+def test_a_world_that_moves_as_one_is_not_linearised_anew(monkeypatch):
+    """After hours each bit that is learned of k moves all that was driven: by far more than a way may be off, but it moves as one."""
+    anew, again = [], Window._again
+    monkeypatch.setattr(Window, "_again", lambda window: (anew.append(1), again(window))[1])
+    long = recorded(steps=200)
+
+    def as_after_hours(at):
+        anew.clear()
+        seer = Seer()
+        estimator = make("graph", seer, relinearize_at=at)
+        feed(estimator, seer, long[:60])
+        drift = np.eye(estimator._window._n)
+        drift[:3, 3 + estimator._slow.corrections.start] = 30.0, 15.0, 3.0  # m and rad for an error of 1 in k
+        node = estimator._now
+        estimator._window.restart(Node.known(node.pose, node.slow, drift @ node.covariance @ drift.T))
+        estimator._newest = estimator._now = estimator._window.newest
+        return feed(estimator, seer, long[60:]), len(anew)
+
+    found, times = as_after_hours(0.01)
+    exact, always = as_after_hours(1e-9)
+    assert times < 5
+    assert always > 100
+    for one, other in zip(found, exact, strict=True):
+        sigmas = np.sqrt(np.diag(other.covariance))
+        assert (np.abs(se2.log(se2.between(other.pose, one.pose))) < 0.2 * sigmas).all()
+        np.testing.assert_allclose(np.sqrt(np.diag(one.covariance)), sigmas, rtol=0.05)
+
+
 @pytest.mark.parametrize("lag", [2, 5, 20])
 def test_a_short_lag_loses_little(steps, lag):
     short, _ = fed(steps, lag_nodes=lag)
