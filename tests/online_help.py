@@ -92,7 +92,7 @@ class LogTransport:
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         self.subscribed[topic] = is_latched
 
-    def keep(self, topics) -> None:
+    def keep(self, topics, urgent=()) -> None:
         self.kept = set(topics)
 
     def advertise(self, topic: str, kind: str) -> None:
@@ -104,7 +104,7 @@ class LogTransport:
     def publishers(self) -> dict[str, set[str]]:
         return {topic: {kind} for topic, kind in self.types.items()}
 
-    def take(self, timeout_s: float) -> list[Received]:
+    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
         """The first two seconds at once, then a tenth of a second at a time."""
         if not self._left:
             return []

@@ -176,6 +176,20 @@ def test_a_sensor_vanishes_and_returns(topic, calm):
     assert node.session.core.estimator.counts()["matched"] > 150
 
 
+def test_messages_wait_for_others_while_no_scan_is_near(calm):
+    """Twice between two scans they are looked at, and at once when the next may come, or if there is no LiDAR."""
+    stream = calm[1]._stream
+    scans = stream._watches["/scan"]
+    period, last = scans._period_s, scans._last_ns
+    assert period == pytest.approx(0.08, rel=0.1)
+    rests = [stream.patience_s(last + int(part * period * S)) / period for part in (0.0, 0.3, 0.48, 0.9, 0.95, 1.0, 50.0)]
+    assert rests == pytest.approx([0.47, 0.17, 0.46, 0.04, 0.0, 0.0, 0.0], abs=1e-6)
+    alone = LogTransport(drive_log(), silenced("/scan", 0.0, 99.0))
+    alone.types.pop("/scan")
+    node, _ = run_node(alone)
+    assert node._stream.patience_s(node._stream._watches["/joint_states"]._last_ns) == 0.0
+
+
 def test_diagnostics_say_which_topic_is_silent(calm):
     _, node, _ = calm
     watches = node._stream._watches
@@ -215,10 +229,10 @@ def test_silence_is_told_and_then_the_run_begins():
     polls = 0
     take = quiet.take
 
-    def late(timeout_s):
+    def late(timeout_s, patience_s=0.0):
         nonlocal polls
         polls += 1
-        return take(timeout_s) if polls > 3 else []
+        return take(timeout_s, patience_s) if polls > 3 else []
 
     quiet.take = late
     quiet.types = {}

@@ -150,22 +150,7 @@ def test_another_type_is_refused_by_what_the_robot_says_of_itself(capsys):
 
 def test_topics_that_are_not_kept_are_heard_no_more():
     """And what is heard comes in the order in which it was sent."""
-    dds = importlib.import_module("localization.online.dds")
-    here = dds.DdsTransport(DOMAIN)
-    code = (
-        "import sys, time\n"
-        "from localization.online.dds import DdsTransport\n"
-        "t = DdsTransport(int(sys.argv[1]))\n"
-        "for name in 'abc': t.advertise('/' + name, 'std_msgs/msg/String')\n"
-        "while True:\n"
-        "    for name in 'abc': t.publish('/' + name, b'\\0\\1\\0\\0\\2\\0\\0\\0' + name.encode() + b'\\0')\n"
-        "    time.sleep(0.01)\n"
-    )
-    for name in "abc":
-        here.subscribe(f"/{name}", "std_msgs/msg/String", is_latched=False)
-    peer = subprocess.Popen([sys.executable, "-c", code, str(DOMAIN)], cwd=Path(__file__).parents[1])
-    try:
-        assert heard_topics(here, {"/a", "/b", "/c"})
+    with chatter("abc") as here:
         here.keep(["/c", "/a"])
         here.take(0.1)
         time.sleep(0.5)
@@ -175,18 +160,47 @@ def test_topics_that_are_not_kept_are_heard_no_more():
         assert said.strip("ac") == ""
         assert said.replace("ac", "") in ("", "a", "c", "ca")  # in turn, not one topic's after the other's
         assert all(received.data[8:9].decode() == received.topic[1] for received in found)
+
+
+def test_patience_ends_where_something_urgent_comes():
+    """Twenty messages of /a to one of /b; without patience each is heard when it comes."""
+    with chatter("a" * 20 + "b") as here:
+        here.keep(["/a", "/b"], ["/b"])
+        here.take(1.0, 20.0)
+        found = here.take(1.0, 20.0)
+        assert len(found) < 100  # it did not wait for 20 s, after which the last 200 would be there
+        assert "/b" in {received.topic for received in found}
+        alone = [here.take(1.0) for _ in range(30)]
+        assert any({received.topic for received in found} == {"/a"} for found in alone)
+
+
+@contextlib.contextmanager
+def chatter(names):
+    """A transport that hears the topics of these names from another process, one message every 5 ms, each saying its name."""
+    here = importlib.import_module("localization.online.dds").DdsTransport(DOMAIN)
+    code = (
+        "import sys, time\n"
+        "from localization.online.dds import DdsTransport\n"
+        "t = DdsTransport(int(sys.argv[1]))\n"
+        "for name in set(sys.argv[2]): t.advertise('/' + name, 'std_msgs/msg/String')\n"
+        "while True:\n"
+        "    for name in sys.argv[2]:\n"
+        "        t.publish('/' + name, b'\\0\\1\\0\\0\\2\\0\\0\\0' + name.encode() + b'\\0')\n"
+        "        time.sleep(0.005)\n"
+    )
+    for name in set(names):
+        here.subscribe(f"/{name}", "std_msgs/msg/String", is_latched=False)
+    peer = subprocess.Popen([sys.executable, "-c", code, str(DOMAIN), names], cwd=Path(__file__).parents[1])
+    try:
+        wanted, end = {f"/{name}" for name in names}, time.monotonic() + 30.0
+        while wanted and time.monotonic() < end:
+            wanted -= {received.topic for received in here.take(0.2)}
+        assert not wanted
+        yield here
     finally:
         peer.kill()
         peer.wait()
         here.close()
-
-
-def heard_topics(transport, wanted):
-    """Whether all these were heard before half a minute was over."""
-    end = time.monotonic() + 30.0
-    while wanted and time.monotonic() < end:
-        wanted = wanted - {received.topic for received in transport.take(0.2)}
-    return not wanted
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ class DdsTransport:
                 self._participant = DomainParticipant(domain)
         except dds.DDSException as error:
             raise DoorError(f"DDS cannot be used on interface '{interface}', domain {domain}: {error}.") from error
-        self._waiting = dds.WaitSet(self._participant)
+        self._waiting, self._urgent = dds.WaitSet(self._participant), dds.WaitSet(self._participant)
         self._readers: list[tuple[str, DataReader[Any], dds.ReadCondition]] = []
         self._writers: dict[str, tuple[DataWriter[Any], type[Any]]] = {}
         self._found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
@@ -66,10 +66,12 @@ class DdsTransport:
         self._waiting.attach(is_new)
         self._readers.append((topic, reader, is_new))
 
-    def keep(self, topics: Collection[str]) -> None:
+    def keep(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
         for topic, _, is_new in self._readers:
             if topic not in topics:
                 self._waiting.detach(is_new)
+            elif topic in urgent:
+                self._urgent.attach(is_new)
         self._readers = [entry for entry in self._readers if entry[0] in topics]
 
     def advertise(self, topic: str, kind: str) -> None:
@@ -83,8 +85,10 @@ class DdsTransport:
         with contextlib.suppress(dds.DDSException):  # a reader that is too slow must not stop the robot
             writer.write(sample)
 
-    def take(self, timeout_s: float) -> list[Received]:
+    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
         """In the order in which it was sent: after a pause, one topic's must not all come before another's."""
+        if patience_s > 0.0:
+            self._urgent.wait(round(patience_s * 1e9))
         if not self._waiting.wait(round(timeout_s * 1e9)):
             return []
         now = time.monotonic_ns()
@@ -109,7 +113,7 @@ class DdsTransport:
     def close(self) -> None:
         self._readers.clear()
         self._writers.clear()
-        del self._waiting, self._found, self._participant, self._domain
+        del self._waiting, self._urgent, self._found, self._participant, self._domain
 
 
 def _sensor_data() -> Qos:

@@ -149,7 +149,7 @@ class Dumper:
     The state is written down at once, in milliseconds; the disk is waited for in a thread, so that no estimate waits for it.
     """
 
-    def __init__(self, path: Path, made_by: Mapping[str, str], shared: Mapping[str, Any], every_s: float = 0.5) -> None:
+    def __init__(self, path: Path, made_by: Mapping[str, str], shared: Mapping[str, Any], every_s: float = 0.75) -> None:
         self.path, self._made_by, self._shared, self._every_s = path, made_by, shared, every_s
         self._last = -float("inf")
         self._disk = ThreadPoolExecutor(1)

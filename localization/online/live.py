@@ -27,6 +27,7 @@ _NS = 1e-9
 _OLDEST_S, _NEWEST_S = 3600.0, 1.0
 _LATE = "dropped (came after newer ones)"
 _SILENT_S, _PERIODS = 1.0, 5.0
+_PARTS, _LONGEST_S = (0.47, 0.94), 0.05
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,11 @@ class Stream:
         found = {topic: watch.silence(now_ns) for topic, watch in self._watches.items()}
         return {topic: seconds for topic, seconds in found.items() if seconds is not None}
 
+    def patience_s(self, now_ns: int) -> float:
+        """How long messages may wait for others [s]: while no scan is near, nobody waits for what they say. 0 without a LiDAR."""
+        lidar = self.sources.lidar
+        return 0.0 if lidar is None else self._watches[lidar.topic].rest(now_ns)
+
     def dropped(self) -> list[str]:
         """Sentences of what was mended or dropped."""
         found = []
@@ -102,6 +108,11 @@ class _Watch:
             gap = (now_ns - self._last_ns) * _NS
             self._period_s += (min(gap, 10.0 * self._period_s + 0.01) - self._period_s) * 0.1
         self._last_ns = now_ns
+
+    def rest(self, now_ns: int) -> float:
+        """Until half the time to the next message is over, or almost all of it [s]; 0 from then on."""
+        since = self._period_s if self._last_ns is None else (now_ns - self._last_ns) * _NS
+        return next((min(part * self._period_s - since, _LONGEST_S) for part in _PARTS if since < part * self._period_s), 0.0)
 
     def silence(self, now_ns: int) -> float | None:
         if self._last_ns is None:

@@ -84,7 +84,7 @@ class Node:
             warm_up(pair, robot, heard.mounts, has_lidar, is_planar=False, config=config)
         gc.collect()
         gc.freeze()  # what is here now stays: later collections need not look at it
-        transport.keep([source.topic for source in heard.parts.sources.used()])
+        transport.keep([source.topic for source in heard.parts.sources.used()], [] if lidar is None else [lidar.topic])
         tally = Tally()
         stream = Stream(heard, robot, tally, epoch_ns, is_ros1=transport.is_ros1)
         made = made_by(pair, robot, heard.mounts, has_lidar, config, "live topics")
@@ -110,7 +110,7 @@ class Node:
         shown = 0.0
         while not is_over():
             has_estimate = False
-            for received in self._transport.take(_POLL_S):
+            for received in self._transport.take(_POLL_S, self._stream.patience_s(time.monotonic_ns())):
                 has_estimate |= self._push(received, time_it=True)
             now = time.monotonic()
             if now - self._told >= (_TELL_S if has_estimate else 1.5 * _TELL_S):  # after an estimate the next scan is far

@@ -61,7 +61,7 @@ class RospyTransport:
 
         self._subscribers[topic] = self._rospy.Subscriber(topic, self._bytes_type(kind), on_message, queue_size=_LATEST, tcp_nodelay=True)
 
-    def keep(self, topics: Collection[str]) -> None:
+    def keep(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
         for topic in set(self._subscribers) - set(topics):
             self._subscribers.pop(topic).unregister()
 
@@ -75,7 +75,7 @@ class RospyTransport:
         message._buff = data
         writer.publish(message)
 
-    def take(self, timeout_s: float) -> list[Received]:
+    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
         found = []
         try:
             found.append(self._heard.get(timeout=timeout_s))

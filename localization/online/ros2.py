@@ -44,7 +44,7 @@ class RclpyTransport:
 
         self._subscriptions[topic] = self._node.create_subscription(_message_class(kind), topic, on_message, quality, raw=True)
 
-    def keep(self, topics: Collection[str]) -> None:
+    def keep(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
         for topic in set(self._subscriptions) - set(topics):
             self._node.destroy_subscription(self._subscriptions.pop(topic))
 
@@ -54,7 +54,7 @@ class RclpyTransport:
     def publish(self, topic: str, data: bytes) -> None:
         self._writers[topic].publish(data)
 
-    def take(self, timeout_s: float) -> list[Received]:
+    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
         self._rclpy.spin_once(self._node, timeout_sec=timeout_s)
         while self._heard:
             before = len(self._heard)

@@ -24,16 +24,19 @@ class Transport(Protocol):
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         """Hear ``topic``. ``is_latched``: messages sent before matter too (tf_static); else as sensor data, the newest only."""
 
-    def keep(self, topics: Collection[str]) -> None:
-        """Hear only these of what was subscribed to, from now on."""
+    def keep(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
+        """Hear only these of what was subscribed to, from now on; ``urgent`` of them are not waited with."""
 
     def advertise(self, topic: str, kind: str) -> None:
         """Will publish on ``topic``."""
 
     def publish(self, topic: str, data: bytes) -> None: ...
 
-    def take(self, timeout_s: float) -> list[Received]:
-        """What has come since the last call; waits for at most ``timeout_s`` if nothing has."""
+    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
+        """What has come since the last call; waits for at most ``timeout_s`` if nothing has.
+
+        For ``patience_s`` it may wait in any case, unless something urgent comes: to be woken for each message costs more than to read it.
+        """
 
     def publishers(self) -> Mapping[str, set[str]]:
         """Types that others publish, by topic, as far as it is known."""

@@ -69,7 +69,7 @@ class SimulatedRobot:
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         self._topics.add(topic)
 
-    def keep(self, topics: Collection[str]) -> None:
+    def keep(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
         self._topics = set(topics)
 
     def advertise(self, topic: str, kind: str) -> None: ...
@@ -80,7 +80,7 @@ class SimulatedRobot:
     def publishers(self) -> Mapping[str, set[str]]:
         return {topic: {kind} for topic, kind in self._types.items()}
 
-    def take(self, timeout_s: float) -> list[Received]:
+    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
         """The first two seconds at once, as a robot that has been there; then message by message."""
         self._busy_s += time.perf_counter() - self._returned
         found = self._first() if not self._is_begun else [received for received in [next(self._received(), None)] if received]
