@@ -13,6 +13,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.stats import chi2
 
 from localization.errors import EstimatorError
+from localization.estimators.account import Account
 from localization.estimators.revisit_update import revisit_update
 from localization.gyro import Turn
 from localization.lidar import MapTie, Revisit
@@ -24,11 +25,10 @@ from motion_models.corrections import Corrections
 from motion_models.robot import GyroNoise
 from motion_models.se2 import FloatArray
 
-# Error state: the pose now, at the start of this step, and where the last scan was drawn (stochastic cloning); the map, as its error where
-# the last scan was taken; then what is learned on the way: the gyro's bias, the wheels' clock, and from PARAMS on the corrections of the
-# motion model's parameters.
-POSE, START, ANCHOR, MAP = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-BIAS, CLOCK, PARAMS = 12, 13, 14
+# Error state: the pose now, at the start of this step, and at the last scan (stochastic cloning); then what is learned on the way:
+# the gyro's bias, the wheels' clock, and from PARAMS on the corrections of the motion model's parameters.
+POSE, START, ANCHOR = slice(0, 3), slice(3, 6), slice(6, 9)
+BIAS, CLOCK, PARAMS = 9, 10, 11
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,6 @@ class Ekf:
         self._size = size = PARAMS + len(corrected.names)
         self.pose = np.zeros(3) if pose is None else np.array(pose, dtype=float)
         self._start, self._anchor = self.pose.copy(), self.pose.copy()
-        # the pose at the last scan as the map has it by what is known of its error, and where it is in the map as that was drawn
-        self._map, self._drawn = self.pose.copy(), self.pose.copy()
         # Predicted motions up to now, at which the covariance was moved along. Relative measurements must take their Jacobians there too:
         # taken at the corrected poses, metres of common drift would leak into them as knowledge of the heading that nobody has (Huang,
         # Mourikis, Roumeliotis, "Observability-based rules for designing consistent EKF SLAM estimators", IJRR 2010).
@@ -72,6 +70,8 @@ class Ekf:
         self._filter.P[BIAS, BIAS] = gyro.bias_sigma_rad_per_s**2
         self._filter.P[CLOCK, CLOCK] = self.config.clock_sigma_s**2
         self._filter.P[PARAMS:, PARAMS:] = corrected.cov
+        self._account: Account | None = None  # until a scan meets a map
+        self._now_ns = 0
         self.correction = np.zeros(len(corrected.names))
         """(k,) what is added to the model's parameters along the corrections' directions."""
 
@@ -83,17 +83,18 @@ class Ekf:
 
     @property
     def covariance(self) -> FloatArray:
-        """(14 + k, 14 + k) of the error state, k corrections."""
+        """(11 + k, 11 + k) of the error state, k corrections."""
         return np.asarray(self._filter.P)
 
     @property
-    def anchor(self) -> FloatArray:
-        """(3,) estimate of the pose where the last scan was drawn."""
-        return self._anchor
+    def errors(self) -> FloatArray:
+        """(11 + k, 11 + k) of the errors that are really made (`Account`): `covariance`, unless scans share a map."""
+        return self.covariance if self._account is None else self._account.covariance
 
-    def in_map(self, pose: FloatArray) -> FloatArray:
-        """(3,) where ``pose`` (3,) is in the map as it was drawn."""
-        return se2.compose(self._drawn, se2.between(self._map, pose))
+    @property
+    def anchor(self) -> FloatArray:
+        """(3,) estimate of the pose at the last scan."""
+        return self._anchor
 
     @property
     def start(self) -> FloatArray:
@@ -117,18 +118,22 @@ class Ekf:
         F[START, START], F[START, POSE] = np.zeros((3, 3)), np.eye(3)
         with np.errstate(over="ignore", invalid="ignore"):
             P = F @ self._filter.P @ F.T
-        P[POSE, POSE] += step.predicted.cov
-        P[BIAS, BIAS] += self._gyro.bias_walk_rad_per_s_sqrt_s**2 * step.duration
+        Q = np.zeros_like(P)
+        Q[POSE, POSE] = step.predicted.cov
+        Q[BIAS, BIAS] = self._gyro.bias_walk_rad_per_s_sqrt_s**2 * step.duration
         if P[CLOCK, CLOCK]:
-            P[CLOCK, CLOCK] += self.config.clock_walk_s_per_sqrt_s**2 * step.duration
+            Q[CLOCK, CLOCK] = self.config.clock_walk_s_per_sqrt_s**2 * step.duration
         if step.is_standing:
             c = self.config
-            P[POSE, POSE] += np.diag([c.nudge_m2_per_s, c.nudge_m2_per_s, c.nudge_rad2_per_s]) * step.duration
+            Q[POSE, POSE] += np.diag([c.nudge_m2_per_s, c.nudge_m2_per_s, c.nudge_rad2_per_s]) * step.duration
         else:
-            P[PARAMS:, PARAMS:] += self._corrected.walk_cov * step.duration
+            Q[PARAMS:, PARAMS:] = self._corrected.walk_cov * step.duration
+        P += Q
         moved = se2.compose(self.pose, step.predicted.delta)
         _check(f"the motion that the wheels predict until stamp {step.end_ns} ns", moved, P)
-        self._filter.P = P
+        self._filter.P, self._now_ns = P, step.end_ns
+        if self._account is not None:
+            self._account.move(F, Q)
         self._start, self._since_start = self.pose, step.predicted.delta
         self._since_anchor = se2.compose(self._since_anchor, step.predicted.delta)
         self.pose = moved
@@ -136,6 +141,8 @@ class Ekf:
     def meet_clock(self, sigma_s: float) -> None:
         """A second clock is heard for the first time, and the wheels' may be off it by ``sigma_s`` [s]."""
         self._filter.P[CLOCK, CLOCK] += sigma_s**2
+        if self._account is not None:
+            self._account.add(slice(CLOCK, CLOCK + 1), sigma_s**2)
 
     def measure_turn(self, turn: Turn) -> float:
         """The gyro's turn since the start of the step."""
@@ -158,67 +165,66 @@ class Ekf:
 
         Where it contradicts the prediction, one of the two is wrong. ``can_slip``: the LiDAR is sure of itself, so the wheels slipped, and
         the prediction's covariance grows until both agree; else the LiDAR is, and its measurement's grows. ``tie``: the map by which it
-        was measured, whose errors later scans share; None if they do not.
+        was measured; without one, errors of scans are taken as independent.
         """
-        seen = se2.compose(self._meet(tie), measured.delta)
-        error, _, d_pose = motion_residual(self._map, self.pose, seen)
+        error, _, d_pose = motion_residual(self._anchor, self.pose, measured.delta)
         H = np.zeros((3, self._size))
-        H[:, MAP], H[:, POSE] = -d_pose @ se2.adjoint(se2.inverse(self._since_anchor)), d_pose
+        H[:, ANCHOR], H[:, POSE] = -d_pose @ se2.adjoint(se2.inverse(self._since_anchor)), d_pose
         R = d_pose @ measured.cov @ d_pose.T
         S = H @ self._filter.P @ H.T + R
         _check("the motion that the LiDAR measured", error, S)
         nis = float(error @ _solve(S, error))
         limit = self._gate
+        if tie is not None and self._account is None:
+            drawn = np.zeros((3, self._size))
+            drawn[:, ANCHOR] = se2.adjoint(se2.inverse(self._since_anchor))
+            self._account = Account(self._filter.P, drawn, self._gate)
+        doubt = 1.0
         if nis > limit:
             if can_slip:
-                self._filter.P[POSE, POSE] += (nis / limit) * np.outer(error, error)
+                slip = (nis / limit) * np.outer(error, error)
+                self._filter.P[POSE, POSE] += slip
+                if self._account is not None:
+                    self._account.add(POSE, slip)
             else:
-                R = R * (nis / limit) ** 2
-        self._update(error, H, R)
+                doubt = (nis / limit) ** 2
+        self._correct(error, H, doubt * R)
+        if self._account is not None and tie is not None:
+            self._account.see(self._filter.K, d_pose, measured.cov, tie, doubt)
+        elif self._account is not None:
+            self._account.correct(self._filter.K, H, doubt * R)
         return nis
 
-    def _meet(self, tie: MapTie | None) -> FloatArray:
-        """The map as the scan now meets it: in part what the scan before met, in part what that one added, drawn from its pose.
-        Returns where the scan before is, seen from where the map had it (3,)."""
-        A = se2.adjoint(self._since_anchor)
-        kept = np.zeros((3, 3)) if tie is None else A @ tie.kept @ se2.adjoint(se2.inverse(self._since_anchor))
-        G = np.eye(self._size)
-        G[MAP, MAP], G[MAP, ANCHOR] = kept, np.eye(3) - kept
-        P = G @ self._filter.P @ G.T
-        if tie is not None:
-            P[MAP, MAP] += A @ tie.fresh @ A.T
-        self._filter.P = P
-        off = se2.between(self._anchor, self._map)
-        self._map = se2.compose(self._anchor, se2.exp(kept @ se2.log(off)))
-        return np.zeros(3) if tie is None else se2.inverse(off)
-
     def measure_revisit(self, known: Revisit) -> None:
-        """A place seen again (`revisit_update`). START, ANCHOR and MAP move with the pose as one rigid body: the way since then stays."""
+        """A place seen again (`revisit_update`). START and ANCHOR move with the pose as one rigid body: the way since then stays."""
         start_T_now, anchor_T_now = se2.between(self._start, self.pose), se2.between(self._anchor, self.pose)
-        map_T_now, drawn_T_now = se2.between(self._map, self.pose), se2.between(self._drawn, self.pose)
         tied = np.zeros((self._size, 3))
         tied[POSE], tied[START], tied[ANCHOR] = np.eye(3), se2.adjoint(start_T_now), se2.adjoint(anchor_T_now)
-        tied[MAP] = tied[ANCHOR]
-        shift, self._filter.P = revisit_update(self.covariance, POSE, tied, known, self.pose)
+        shift, gain, self._filter.P = revisit_update(self.covariance, POSE, tied, known, self.pose)
+        if self._account is not None:
+            self._account.revisit(gain, tied, known, self._now_ns, self.pose)
         self.pose = se2.compose(self.pose, se2.exp(shift))
         self._start = se2.compose(self.pose, se2.inverse(start_T_now))
         self._anchor = se2.compose(self.pose, se2.inverse(anchor_T_now))
-        self._map = se2.compose(self.pose, se2.inverse(map_T_now))
-        self._drawn = se2.compose(self.pose, se2.inverse(drawn_T_now))  # the witness moves its map likewise
 
     def set_anchor(self, is_drawn: bool = True) -> None:
-        """From here on, the LiDAR measures from the pose as it is now. ``is_drawn``: by what it sees from here; else by what it knows."""
+        """From here on, the LiDAR measures from the pose as it is now. ``is_drawn``: its map has got the scan, too."""
         G = np.eye(self._size)
-        G[MAP, MAP] = G[ANCHOR, ANCHOR] = se2.adjoint(se2.inverse(self._since_anchor))
-        if is_drawn:
-            G[ANCHOR, ANCHOR], G[ANCHOR, POSE] = np.zeros((3, 3)), np.eye(3)
+        G[ANCHOR, ANCHOR], G[ANCHOR, POSE] = np.zeros((3, 3)), np.eye(3)
         self._filter.P = G @ self._filter.P @ G.T
-        on = se2.between(self._drawn, self.pose)
-        self._map = se2.compose(self._map, on)
-        self._anchor = self.pose if is_drawn else se2.compose(self._anchor, on)
-        self._drawn, self._since_anchor = self.pose, np.zeros(3)
+        if self._account is not None:
+            self._account.draw(G, is_drawn)
+            self._account.remember(self._now_ns, self.pose)
+        self._anchor, self._since_anchor = self.pose, np.zeros(3)
 
     def _update(self, error: FloatArray, H: FloatArray, R: FloatArray) -> float:
+        """`_correct`, with errors R that have no part in a map."""
+        nis = self._correct(error, H, R)
+        if self._account is not None:
+            self._account.correct(self._filter.K, H, R)
+        return nis
+
+    def _correct(self, error: FloatArray, H: FloatArray, R: FloatArray) -> float:
         """``error`` is prediction minus measurement; the error state's mean is zero, so the innovation is its negative."""
         f, before = self._filter, self._filter.P
         f.x = np.zeros((self._size, 1))
@@ -237,7 +243,6 @@ class Ekf:
         self.pose = se2.compose(self.pose, se2.exp(correction[POSE]))
         self._start = se2.compose(self._start, se2.exp(correction[START]))
         self._anchor = se2.compose(self._anchor, se2.exp(correction[ANCHOR]))
-        self._map = se2.compose(self._map, se2.exp(correction[MAP]))
         self.bias += float(correction[BIAS])
         self.clock_offset += float(correction[CLOCK])
         self.correction = self.correction + correction[PARAMS:]

@@ -46,7 +46,6 @@ class EkfFusion:
         self._ekf = Ekf(robot.gyro_noise, corrected, config if has_lidar else replace(config, clock_sigma_s=0.0))
         self._clock_sigma_s = 0.0 if has_lidar else config.clock_sigma_s
         self._witness = (witness or ScanWitness(mounts, lidar)) if has_lidar else None
-        self._has_map = has_lidar and witness is None and (lidar or LidarConfig()).map_is_state
         self._model, self._corrected, self._track_m = model, corrected, robot.geometry.track_width_m
         self._has_gyro = False
         self._to_settle: tuple[Step, bool] | None = None  # a step with a scan, and whether that was matched
@@ -75,13 +74,12 @@ class EkfFusion:
         if step.scan is not None and self._witness is not None:
             nis = self._look(step, self._witness)
         twist, twist_cov = self._twist(step)
-        return Estimate(step.end_ns, ekf.pose, ekf.covariance[POSE, POSE], twist, twist_cov, nis)
+        return Estimate(step.end_ns, ekf.pose, ekf.errors[POSE, POSE], twist, twist_cov, nis)
 
     def _look(self, step: Step, witness: Witness) -> float | None:
         ekf, nis = self._ekf, None
         self._counts["scans"] += 1
-        anchor, guess = (ekf.in_map(ekf.anchor), ekf.in_map(ekf.pose)) if self._has_map else (ekf.anchor, ekf.pose)
-        seen = witness.look(step, anchor, guess)
+        seen = witness.look(step, ekf.anchor, ekf.pose)
         if seen is not None:
             self._counts["matched"] += 1
             nis = ekf.measure_motion(seen.motion, seen.is_trusted, seen.tie)
@@ -100,8 +98,7 @@ class EkfFusion:
             before = ekf.pose
             ekf.measure_revisit(known)
             witness.correct(before, ekf.pose)
-        is_drawn = witness.remember(step, ekf.pose)
-        ekf.set_anchor(is_drawn or not self._has_map)
+        ekf.set_anchor(witness.remember(step, ekf.pose))
 
     def _twist(self, step: Step) -> tuple[FloatArray, FloatArray | None]:
         """Mean twist of the step as all witnesses see it."""
@@ -111,7 +108,7 @@ class EkfFusion:
         delta = se2.between(ekf.start, ekf.pose)
         _, d_start, d_pose = motion_residual(ekf.start, ekf.pose, delta)
         J, both = np.hstack([d_pose, d_start]), np.r_[POSE, START]
-        return mean_twist(delta, J @ ekf.covariance[np.ix_(both, both)] @ J.T, step.duration)
+        return mean_twist(delta, J @ ekf.errors[np.ix_(both, both)] @ J.T, step.duration)
 
     def finish(self) -> None:
         self.settle()

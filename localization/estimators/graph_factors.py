@@ -3,10 +3,6 @@
 A node is a pose and m slow states, n = 3 + m numbers. Between a node a and the next one b stand the link (`graph_link`), what it says of
 the slow states, their random walk, and the LiDAR's motion. The table is all that every back end needs, and `residuals` is the same
 for the filter.
-
-Where scans are matched to a map, the last three slow states of a node are how far the map is off there, q: a scan taken at the pose X is
-found at X exp(q) and noise, but for a change of the world's frame that the map may have had since. Going on from a to b, the map that is
-met is ``kept`` in part and drawn anew from a in part (`MapTie`), so X_b exp(q_b) = X_a exp(kept (q_a + behind)) seen and noise.
 """
 
 from __future__ import annotations
@@ -44,41 +40,24 @@ class Pairs:
     walk: FloatArray
     """(N, m, m) whitening of the random walk from a to b."""
     seen: FloatArray
-    """(N, 3) motion by the LiDAR; where it has a map, from where the scan of a was drawn to where that of b was found."""
+    """(N, 3) motion by the LiDAR."""
     seen_white: FloatArray
     """(N, 3, 3), zero where it saw nothing."""
     mount: FloatArray
     """(N, 3, m): the LiDAR's mount is off by ``exp(mount @ slow)`` in the body frame, where this motion shows it."""
-    kept: FloatArray
-    """(N, c, c): what b meets of the map that a met, in the frame of a; c is 3, or 0 where there is no map."""
-    behind: FloatArray
-    """(N, c): from where the scan of a was found to where it was drawn."""
-    found_white: FloatArray
-    """(N, c, c) of the scan's own noise, zero where it saw nothing."""
 
     @classmethod
-    def one(cls, link: Link, walk: FloatArray, behind: FloatArray | None = None) -> Self:
-        """The table of a single pair, before a LiDAR looked; ``behind`` (3,) where it has a map."""
+    def one(cls, link: Link, walk: FloatArray) -> Self:
+        """The table of a single pair, without a LiDAR."""
         rows, rhs = link.compressed()
         none = np.zeros(3), np.zeros((3, 3)), np.zeros_like(link.d_slow)
-        behind = np.zeros(0) if behind is None else behind
-        of_map = np.eye(len(behind)), behind, np.zeros((len(behind), len(behind)))
-        columns = (link.delta, whitening(link.cov), link.d_slow, link.at, rows, rhs, walk, *none, *of_map)
+        columns = (link.delta, whitening(link.cov), link.d_slow, link.at, rows, rhs, walk, *none)
         return cls(*(np.asarray(column)[None] for column in columns))
 
     def seeing(self, motion: Motion, mount: FloatArray | None = None) -> Pairs:
         """The single pair, with the motion that the LiDAR saw, and what of its ``mount`` (3, m) that shows."""
         seen = replace(self, seen=motion.delta[None], seen_white=whitening(motion.cov)[None])
         return seen if mount is None else replace(seen, mount=mount[None])
-
-    def meeting(self, kept: FloatArray, found_white: FloatArray) -> Pairs:
-        """The single pair, with what is ``kept`` (3, 3) of the map and the whitening (3, 3) of the scan's own noise."""
-        return replace(self, kept=kept[None], found_white=found_white[None])
-
-    @property
-    def seen_rows(self) -> int:
-        """Rows of the LiDAR."""
-        return 3 + int(self.kept.shape[1])
 
     def __len__(self) -> int:
         return len(self.delta)
@@ -111,14 +90,14 @@ def whitening(cov: FloatArray) -> FloatArray:
 
 
 def linearize(pairs: Pairs, poses: FloatArray, slow: FloatArray) -> FloatArray:
-    """Rows (N, 6 + 2m + c, 2n + 1) of the system ``J (change of a, change of b) = rhs`` in unit variances, the last column its right side.
+    """Rows (N, 6 + 2m, 2n + 1) of the system ``J (change of a, change of b) = rhs`` in unit variances, the last column its right side.
 
     ``poses`` (N + 1, 3) and ``slow`` (N + 1, m) are those of all nodes in order; changes of poses act on the right.
     """
     m = slow.shape[-1]
     n, count = 3 + m, len(pairs)
     pose_a, pose_b, slow_a, slow_b = poses[:-1], poses[1:], slow[:-1], slow[1:]
-    J = np.zeros((count, 3 + 2 * m + pairs.seen_rows, 2 * n + 1))
+    J = np.zeros((count, 6 + 2 * m, 2 * n + 1))
     off = slow_a - pairs.at
 
     shift = (pairs.d_slow @ off[..., None])[..., 0]
@@ -137,17 +116,14 @@ def linearize(pairs: Pairs, poses: FloatArray, slow: FloatArray) -> FloatArray:
     J[:, n : n + m, -1] = (pairs.walk @ (slow_a - slow_b)[..., None])[..., 0]
 
     if pairs.seen_white.any():
-        J[:, n + m :] = linearize_seen(pairs, pose_a, pose_b, slow_a, slow_b)
+        J[:, n + m :] = linearize_seen(pairs, pose_a, pose_b, slow_a)
     return J
 
 
-def linearize_seen(pairs: Pairs, pose_a: FloatArray, pose_b: FloatArray, slow_a: FloatArray, slow_b: FloatArray) -> FloatArray:
-    """The last rows (N, 3 + c, 2n + 1) of `linearize`, the LiDAR's."""
+def linearize_seen(pairs: Pairs, pose_a: FloatArray, pose_b: FloatArray, slow_a: FloatArray) -> FloatArray:
+    """The last three rows (N, 3, 2n + 1) of `linearize`, the LiDAR's."""
     n = 3 + slow_a.shape[-1]
-    J = np.zeros((len(pairs), pairs.seen_rows, 2 * n + 1))
-    if pairs.seen_rows > 3:
-        by_map(pairs, pose_a, pose_b, slow_a, slow_b, J)
-        return J
+    J = np.zeros((len(pairs), 3, 2 * n + 1))
     if pairs.mount.any():
         error, d_a, d_b, d_mount = seen_residual(pose_a, pose_b, pairs.seen, (pairs.mount @ slow_a[..., None])[..., 0])
         J[:, :, 3:n] = pairs.seen_white @ d_mount @ pairs.mount
@@ -170,49 +146,6 @@ def seen_residual(
     error, d_a, d_b = motion_residual(se2.compose(world_T_a, body_T_believed), se2.compose(world_T_b, body_T_believed), seen)
     A = se2.adjoint(se2.inverse(body_T_believed))
     return error, d_a @ A, d_b @ A, (d_a + d_b) @ se2.right_jacobian(mount)
-
-
-def by_map(pairs: Pairs, pose_a: FloatArray, pose_b: FloatArray, slow_a: FloatArray, slow_b: FloatArray, J: FloatArray) -> None:
-    """`linearize_seen` where there is a map: how it went on from a to b, and where the scan fell into it at b."""
-    n, q_b = 3 + slow_a.shape[-1], slow_b[:, -3:]
-    mount = (pairs.mount @ slow_a[..., None])[..., 0]
-    q_a = (pairs.kept @ (slow_a[:, -3:] + pairs.behind)[..., None])[..., 0]
-    error, by = map_residual(pose_a, pose_b, pairs.seen, mount, q_a, q_b)
-    white = pairs.seen_white
-    J[:, :3, 0:3] = white @ by.pose_a
-    J[:, :3, 3:n] = white @ by.mount @ pairs.mount
-    J[:, :3, n - 3 : n] += white @ by.map_a @ pairs.kept
-    J[:, :3, n : n + 3] = white @ by.pose_b
-    J[:, :3, 2 * n - 3 : 2 * n] = white @ by.map_b
-    J[:, :3, -1] = -(white @ error[..., None])[..., 0]
-    J[:, 3:, 2 * n - 3 : 2 * n] = pairs.found_white
-    J[:, 3:, -1] = -(pairs.found_white @ q_b[..., None])[..., 0]
-
-
-@dataclass(frozen=True)
-class ByMap:
-    """Jacobians (..., 3, 3) of `map_residual`."""
-
-    pose_a: FloatArray
-    pose_b: FloatArray
-    mount: FloatArray
-    map_a: FloatArray
-    map_b: FloatArray
-
-
-def map_residual(
-    world_T_a: FloatArray, world_T_b: FloatArray, seen: FloatArray, mount: FloatArray, map_a: FloatArray, map_b: FloatArray
-) -> tuple[FloatArray, ByMap]:
-    """`seen_residual` between the poses as the map has them, ``exp(map_a)`` and ``exp(map_b)`` (3,) off those that the LiDAR believes."""
-    body_T_believed = se2.exp(mount)
-    off_a, off_b = se2.exp(map_a), se2.exp(map_b)
-    a = se2.compose(se2.compose(world_T_a, body_T_believed), off_a)
-    b = se2.compose(se2.compose(world_T_b, body_T_believed), off_b)
-    error, d_a, d_b = motion_residual(a, b, seen)
-    by_a, by_b = d_a @ se2.adjoint(se2.inverse(off_a)), d_b @ se2.adjoint(se2.inverse(off_b))
-    A = se2.adjoint(se2.inverse(body_T_believed))
-    d_mount = (by_a + by_b) @ se2.right_jacobian(mount)
-    return error, ByMap(by_a @ A, by_b @ A, d_mount, d_a @ se2.right_jacobian(map_a), d_b @ se2.right_jacobian(map_b))
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ from scipy.stats import chi2
 from localization.errors import EstimatorError
 from localization.estimators.base import NO_POINTS, Estimate, mean_twist
 from localization.estimators.ekf import EkfConfig
-from localization.estimators.graph_factors import Closure, Kernel, Pairs, Position, map_residual, seen_residual, whitening
+from localization.estimators.graph_errors import GraphErrors
+from localization.estimators.graph_factors import Closure, Kernel, Pairs, Position, seen_residual, whitening
 from localization.estimators.graph_history import History
 from localization.estimators.graph_link import Link, check_covariance, check_motion
 from localization.estimators.graph_revisit import revisited
@@ -39,7 +40,6 @@ from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
 _CERTAIN = 1e-6  # m, rad: sigma of the first pose, which is the origin by definition
-_AS_IT_WAS = 1e-12 * np.eye(3)  # m^2, rad^2: covariance of what does not change from node to node
 _COUNTED = ("scans", "matched", "contradictions", "standing", "revisits", "nodes", "rebuilt", "positions", "closures", "late")
 _NEAR_NS = 50_000_000  # a loop closure is between nodes, this near
 _FAR_NS = 1_000_000_000  # a position may be this far from its node: the body moves on in between
@@ -89,9 +89,7 @@ class GraphFusion:
         self._track_m = robot.geometry.track_width_m
         self._witness: Witness = (witness or ScanWitness(mounts, lidar)) if has_lidar else NoWitness()
         c = self.config
-        has_map = has_lidar and witness is None and (lidar or LidarConfig()).map_is_state
-        sigmas = c.mount_sigma_m, c.mount_sigma_rad
-        self._slow = SlowStates(robot.gyro_noise, corrected, self._belief, c.learn, *sigmas, has_lidar, has_map)
+        self._slow = SlowStates(robot.gyro_noise, corrected, self._belief, c.learn, c.mount_sigma_m, c.mount_sigma_rad, has_lidar)
         self._clock_walk = None if has_lidar else ONE_CLOCK
         self._mounts, self._mount = mounts, Mount()
         self._kernel = Kernel(self.config.kernel, self.config.kernel_scale)
@@ -101,10 +99,11 @@ class GraphFusion:
         self._history = None if self.config.backend == "fixed_lag" else History(first, self.config.backend, self._kernel)
         self._newest = first
         self._now = first
-        self._drawn = first.pose  # where the newest scan was drawn into the map, and how far behind where it was found in it
-        self._behind, self._is_drawn = np.zeros(3) if has_map else None, False
+        # where scans share a map, and nothing is known besides that the filter does not know
+        shares = has_lidar and witness is None and not self._slow.mount_names and self.config.backend != "isam2"
+        self._errors = GraphErrors(robot.gyro_noise, corrected, self._belief, first.pose) if shares else None
         self._pending: Link | None = None
-        self._to_settle: tuple[Step, FloatArray | None, bool] | None = None  # a step with a scan, what was seen of it, if it was matched
+        self._to_settle: tuple[Step, bool] | None = None  # a step with a scan, and whether that was matched
         self._nodes_ns: list[int] = []
         self._first_node = 0  # number of the node whose stamp is the first in that list: a fixed lag forgets the others
         self._gate = float(chi2.ppf(self._belief.gate_probability, 3))
@@ -125,7 +124,10 @@ class GraphFusion:
         if not self._nodes_ns:
             self._nodes_ns.append(step.start_ns)
         known = self._now.covariance[3:, 3:][self._slow.corrections, self._slow.corrections]
-        link = self._slow.link(teaching(step, self._track_m, self._corrected, known), self._now.slow)
+        taught = teaching(step, self._track_m, self._corrected, known)
+        link = self._slow.link(taught, self._now.slow)
+        if self._errors is not None:
+            self._errors.step(taught)
         if not self._has_lidar:
             has_turn = step.turn is not None
             self._clock_walk = None if self._has_gyro else self._belief.clock_sigma_s**2 if has_turn else ONE_CLOCK
@@ -139,33 +141,33 @@ class GraphFusion:
             sight = self._look(step, ahead)
             if sight is not None:
                 nis, ahead = self._judge(ahead, pending, sight)
-            elif self._behind is not None:
-                ahead = self._window.see(ahead, self._unseen(ahead))
+                if self._errors is not None:
+                    self._errors.see(sight)
         before, self._now = self._now, ahead.node
         alone = self._pending is None
         if step.scan is not None or not self._has_lidar:
             self._commit(ahead, step.end_ns)
             self._pending = None
             if step.scan is not None and self._has_lidar:
-                self._to_settle = step, None if self._behind is None else ahead.pair.seen[0], sight is not None
+                self._to_settle = step, sight is not None
         else:
             self._pending = pending
         if self._history is not None:
             self._history.mark(step.end_ns, self._pending)
         twist, twist_cov = self._twist(step, link, ahead, before, alone)
-        return Estimate(step.end_ns, self._now.pose, self._now.covariance[:3, :3], twist, twist_cov, nis)
+        cov = self._now.covariance[:3, :3] if self._errors is None else self._errors.pose
+        return Estimate(step.end_ns, self._now.pose, cov, twist, twist_cov, nis)
 
     def settle(self) -> None:
         """Whether the place was seen long before; the last scan enters the map."""
         if self._to_settle is None:
             return
-        (step, seen, is_matched), self._to_settle = self._to_settle, None
-        believed = self._believed(self._now)
-        if seen is not None:
-            self._behind = se2.log(se2.between(se2.compose(self._drawn, seen), believed))
-        if is_matched and self._recall(step):
-            believed = self._believed(self._now)
-        self._is_drawn, self._drawn = self._witness.remember(step, believed), believed
+        (step, is_matched), self._to_settle = self._to_settle, None
+        if is_matched:
+            self._recall(step)
+        is_drawn = self._witness.remember(step, self._believed(self._now))
+        if self._errors is not None:
+            self._errors.draw(self._now.pose, is_drawn)
 
     def add_position(self, stamp_ns: int, xy: FloatArray, cov: FloatArray, lever: FloatArray | None = None) -> bool:
         """A measured position ``xy`` (2,) with ``cov`` (2, 2) of the body's point ``lever`` (2,) at a moment, in this estimator's world.
@@ -189,6 +191,7 @@ class GraphFusion:
         if node >= self._window.oldest:
             self._window.add_position(node, position)
             self._newest = self._now = self._window.newest
+            self._errors = None
         if self._history is not None:
             self._counts["rebuilt"] += self._history.add_position(node, position)
         self._counts["positions"] += 1
@@ -209,7 +212,10 @@ class GraphFusion:
         if a is None or b is None or a == b:
             raise EstimatorError(f"a loop closure from {from_ns} to {to_ns} ns, where there are no two nodes to close.")
         closure = Closure(a, b, motion.delta, whitening(motion.cov + 1e-12 * np.eye(3)))
-        return self._close(closure)
+        is_used = self._close(closure)
+        if is_used:
+            self._errors = None  # which know nothing of it
+        return is_used
 
     def _close(self, closure: Closure) -> bool:
         in_window = min(closure.a, closure.b) >= self._window.oldest
@@ -266,7 +272,7 @@ class GraphFusion:
         return self._now.covariance
 
     def _extend(self, link: Link) -> Ahead:
-        pair = Pairs.one(link, self._slow.walk(link.duration, link.moving, self._clock_walk), self._behind)
+        pair = Pairs.one(link, self._slow.walk(link.duration, link.moving, self._clock_walk))
         try:
             return self._window.extend(pair)
         except SingularError as error:
@@ -299,26 +305,11 @@ class GraphFusion:
 
     def _look(self, step: Step, ahead: Ahead) -> Sight | None:
         self._counts["scans"] += 1
-        seen = self._witness.look(step, self._in_map(self._newest), self._in_map(ahead.node))
+        seen = self._witness.look(step, self._believed(self._newest), self._believed(ahead.node))
         if seen is not None:
             check_motion(seen.motion.delta, seen.motion.cov, f"the LiDAR's motion that ends at {step.end_ns} ns")
             self._counts["matched"] += 1
         return seen
-
-    def _in_map(self, node: Node) -> FloatArray:
-        """(3,) where the LiDAR is expected to find itself at ``node`` in the map as it was drawn."""
-        return self._believed(node) if self._behind is None else se2.compose(self._drawn, self._from_map(node))
-
-    def _from_map(self, node: Node) -> FloatArray:
-        """(3,) ``node``, as the LiDAR believes it, seen from where the map has the newest node."""
-        start = self._believed(self._newest)
-        if self._behind is not None:
-            start = se2.compose(start, se2.exp(self._newest.slow[-3:] + self._behind))
-        return se2.between(start, self._believed(node))
-
-    def _unseen(self, ahead: Ahead) -> Pairs:
-        """What goes on where the LiDAR saw nothing: the map is as it was."""
-        return ahead.pair.seeing(Motion(self._from_map(ahead.node), _AS_IT_WAS))
 
     def _believed(self, node: Node) -> FloatArray:
         """(3,) where the LiDAR's points say that the body is: they are brought into it by the mount that the log or robot file tells."""
@@ -329,28 +320,16 @@ class GraphFusion:
 
         Where they contradict, one is wrong: the covariance of the one that is not sure of itself grows until they agree.
         """
-        measured, tie, P = sight.motion, sight.tie, ahead.node.covariance[3:, 3:]
-        mount = self._slow.shown(measured) if self._slow.mount_names else None
-        before, after = self._newest, ahead.node
-        noise = measured.cov if tie is None else measured.cov + tie.fresh
-        if self._behind is not None and tie is not None:
-            measured = Motion(se2.compose(self._from_map(self._newest), measured.delta), measured.cov)
-            there = se2.adjoint(measured.delta)
-            kept = there @ tie.kept @ np.linalg.inv(there) if self._is_drawn else np.eye(3)
-            off = kept @ (before.slow[-3:] + self._behind)
-            shown = self._slow.mount if mount is None else mount
-            error, by = map_residual(before.pose, after.pose, measured.delta, shown @ after.slow, off, np.zeros(3))
-            by_slow = by.pose_b @ pending.d_slow + by.mount @ shown
-            by_slow[:, -3:] += by.map_a @ kept
-            d_b, d_seen, P = by.pose_b, se2.right_jacobian_inverse(error), before.covariance[3:, 3:]
-        elif mount is not None:
-            error, _, d_b, d_mount = seen_residual(before.pose, after.pose, measured.delta, mount @ after.slow)
+        measured, mount, slow = sight.motion, None, ahead.node.slow
+        if self._slow.mount_names:
+            mount = self._slow.shown(measured)
+            error, _, d_b, d_mount = seen_residual(self._newest.pose, ahead.node.pose, measured.delta, mount @ slow)
             by_slow = d_b @ pending.d_slow + d_mount @ mount
             d_seen = se2.right_jacobian_inverse(error)
         else:
-            error, _, d_b = motion_residual(before.pose, after.pose, measured.delta)
+            error, _, d_b = motion_residual(self._newest.pose, ahead.node.pose, measured.delta)
             by_slow, d_seen = d_b @ pending.d_slow, d_b
-        S = d_b @ pending.cov @ d_b.T + by_slow @ P @ by_slow.T + d_seen @ noise @ d_seen.T
+        S = d_b @ pending.cov @ d_b.T + by_slow @ ahead.node.covariance[3:, 3:] @ by_slow.T + d_seen @ measured.cov @ d_seen.T
         nis = _normalized(error, S)
         if nis > self._gate:
             self._counts["contradictions"] += 1
@@ -358,31 +337,24 @@ class GraphFusion:
                 ahead = self._extend(replace(pending, cov=pending.cov + (nis / self._gate) * np.outer(error, error)))
             else:
                 measured = Motion(measured.delta, measured.cov * (nis / self._gate) ** 2)
-
-        def seen(pair: Pairs) -> Pairs:
-            if self._behind is None or tie is None:
-                return pair.seeing(measured, mount)
-            pair = pair.seeing(Motion(measured.delta, tie.fresh + _AS_IT_WAS), mount)
-            return pair.meeting(kept, whitening(measured.cov))
-
         try:
-            return nis, self._window.see(ahead, seen(ahead.pair))
+            return nis, self._window.see(ahead, measured, mount)
         except SingularError as error_:
             self._rebuild(error_)
-            ahead = self._extend(pending)
-            return nis, self._window.see(ahead, seen(ahead.pair))
+            return nis, self._window.see(self._extend(pending), measured, mount)
 
-    def _recall(self, step: Step) -> bool:
+    def _recall(self, step: Step) -> None:
         """A place seen long before pulls the newest node there, as `Ekf.measure_revisit` does; a history gets the motion since then.
-        Returns whether there was one.
 
         The window keeps no node of that time, only the covariance of the old map: see there for what follows from it.
         """
         node, believed = self._now, self._believed(self._now)
         known = self._witness.recall(step, believed, node.covariance[:3, :3])
         if known is None:
-            return False
+            return
         self._counts["revisits"] += 1
+        if self._errors is not None:
+            self._errors.revisit(known)
         if self._history is not None:
             a, b = self._node_at(known.then.stamp_ns, _NEAR_NS), self._node_at(step.end_ns, _NEAR_NS)
             if a is not None and b is not None and a != b:
@@ -392,7 +364,6 @@ class GraphFusion:
             self._window.restart(revisited(node, known, believed))
             self._newest = self._now = self._window.newest
         self._witness.correct(believed, self._believed(self._now))
-        return True
 
     def _twist(self, step: Step, link: Link, ahead: Ahead, before: Node, alone: bool) -> tuple[FloatArray, FloatArray | None]:
         """Mean twist of the step, by all witnesses where the step is all there is between two nodes, else without the LiDAR."""
@@ -403,7 +374,7 @@ class GraphFusion:
             delta = se2.between(before.pose, ahead.node.pose)
             _, d_a, d_b = motion_residual(before.pose, ahead.node.pose, delta)
             J = np.hstack([d_a, d_b])
-            cov = J @ ahead.motion_covariance() @ J.T
+            cov = J @ ahead.motion_covariance() @ J.T if self._errors is None else self._errors.motion(before.pose, self._now.pose)
         else:
             delta, at = link.delta, link.d_slow
             cov = link.cov + at @ self._now.covariance[3:, 3:] @ at.T

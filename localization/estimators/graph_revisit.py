@@ -18,6 +18,6 @@ def revisited(node: Node, known: Revisit, believed: FloatArray) -> Node:
     """
     tied = np.zeros((len(node.covariance), 3))
     tied[:3] = np.eye(3)
-    shift, P = revisit_update(node.covariance, slice(0, 3), tied, known, believed)
+    shift, _, P = revisit_update(node.covariance, slice(0, 3), tied, known, believed)
     P[:3, :3] += 1e-12 * np.eye(3)
     return Node.known(se2.compose(node.pose, se2.exp(shift)), node.slow, P)

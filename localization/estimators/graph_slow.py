@@ -1,7 +1,6 @@
 """What a graph learns on the way besides the pose: the slow states, and what one step of wheels and gyro says of them.
 
-In this order: gyro bias, clock offset, the LiDAR's mount, the corrections of the motion model, and how far the map is off. Each but the
-bias and the map is switched on by name.
+In this order: gyro bias, clock offset, the LiDAR's mount, the corrections of the motion model. Each but the bias is switched on by name.
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ Learned = Literal["clock", "lidar_x", "lidar_y", "lidar_yaw"]
 _MOUNT = ("lidar_x", "lidar_y", "lidar_yaw")
 _YAW = np.array([[0.0, 0.0, 1.0]])
 _STILL = 1e-4  # part of the random walk that is left while the wheels stand: zero would be infinite information
-_FREE = 1e3  # m, rad
 ONE_CLOCK = 1e-14  # s^2: nothing tells another one
 _SHOWN = 3.0  # sigmas: a turn or a way below this is noise, and its derivatives would pass for knowledge of the mount
 
@@ -44,7 +42,6 @@ class SlowStates:
         mount_sigma_m: float,
         mount_sigma_rad: float,
         has_lidar: bool = True,
-        has_map: bool = False,
     ) -> None:
         """``learn``: names of `Learned`; the mount's error is that of a left perturbation, in the body frame. Raises `EstimatorError`.
 
@@ -58,9 +55,8 @@ class SlowStates:
         """Those of the LiDAR's x, y, yaw that are learned."""
         at = 1 + self.has_clock
         begin = at + len(self.mount_names)
-        end = begin + len(corrected.names)
-        self.corrections = slice(begin, end)
-        self.size = end + (3 if has_map else 0)
+        self.size = begin + len(corrected.names)
+        self.corrections = slice(begin, self.size)
         self.mount = np.zeros((3, self.size))
         """(3, m): the mount's error is ``mount @ slow`` [m, m, rad]."""
         cov, walk = np.zeros((self.size, self.size)), np.zeros((self.size, self.size))
@@ -73,10 +69,8 @@ class SlowStates:
             cov[i, i] = (mount_sigma_rad if name == "lidar_yaw" else mount_sigma_m) ** 2
             walk[i, i] = 1e-8 * cov[i, i]
         # what does not walk, as it is remembered, walks by a hundredth of a percent of what is not known of it per second
-        cov[begin:end, begin:end] = corrected.cov
-        walk[begin:end, begin:end] = corrected.walk_cov + 1e-8 * corrected.cov
-        # of the map, factors of its own say how it goes on (`graph_factors`): this only keeps the system regular until they do
-        cov[end:, end:], walk[end:, end:] = np.eye(self.size - end), _FREE**2 * np.eye(self.size - end)
+        cov[begin:, begin:] = corrected.cov
+        walk[begin:, begin:] = corrected.walk_cov + 1e-8 * corrected.cov
         for what, matrix in (("first beliefs", cov), ("random walks", walk)):
             check_covariance(matrix, self.size, f"the slow states' {what}")
         self.cov = cov
@@ -92,7 +86,6 @@ class SlowStates:
         """
         scale = np.full(self.size, max(duration, 1e-6) ** -0.5)
         scale[self.corrections] = max(moving, 1e-6 * max(duration, 1e-3)) ** -0.5
-        scale[self.corrections.stop :] = 1.0
         found = np.asarray(self._walk * scale[:, None])
         if self.has_clock and clock is not None:
             found[1, 1] = clock**-0.5

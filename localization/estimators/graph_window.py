@@ -21,6 +21,7 @@ from localization.estimators.graph import Block, chain, marginals, solve
 from localization.estimators.graph_factors import Closure, Kernel, Pairs, Position, linearize, linearize_seen, whitening
 from localization.estimators.graph_qr import eliminate, inverse_of_upper, is_regular, substitute, triangularize
 from motion_models import se2
+from motion_models.base import Motion
 from motion_models.se2 import FloatArray
 
 _ITERATIONS = 10
@@ -139,12 +140,12 @@ class Window:
         eliminate(roots, conditionals, linearize(pair, poses, slow), np.zeros((2, _UNARY, 4)))
         return self._ahead(pair, poses[1], slow[1], roots[1], conditionals)
 
-    def see(self, ahead: Ahead, pair: Pairs) -> Ahead:
-        """``ahead`` with what a LiDAR saw on the way to it, which ``pair`` has besides. Raises `SingularError`."""
-        n, node, i = self._n, ahead.node, self._size - 1
-        work = np.zeros((2 * n + pair.seen_rows, 2 * n + 1))
+    def see(self, ahead: Ahead, motion: Motion, mount: FloatArray | None = None) -> Ahead:
+        """``ahead`` with the motion that a LiDAR saw on the way to it, and what of its ``mount`` (3, m) shows. Raises `SingularError`."""
+        n, node, pair, i = self._n, ahead.node, ahead.pair.seeing(motion, mount), self._size - 1
+        work = np.zeros((2 * n + 3, 2 * n + 1))
         work[:n], work[n : 2 * n, n : 2 * n] = ahead.conditional, node.root
-        work[2 * n :] = linearize_seen(pair, self._poses[None, i], node.pose[None], self._slow[None, i], node.slow[None])[0]
+        work[2 * n :] = linearize_seen(pair, self._poses[None, i], node.pose[None], self._slow[None, i])[0]
         triangularize(work, 2 * n)
         return self._ahead(pair, node.pose, node.slow, work[n : 2 * n, n:].copy(), work[None, :n].copy())
 

@@ -10,8 +10,10 @@ from motion_models import se2
 from motion_models.se2 import FloatArray
 
 
-def revisit_update(P: FloatArray, pose: slice, tied: FloatArray, known: Revisit, believed: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The shift (3,) of the pose in its own frame, and the covariance (n, n) that ``P`` (n, n) becomes.
+def revisit_update(
+    P: FloatArray, pose: slice, tied: FloatArray, known: Revisit, believed: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The shift (3,) of the pose in its own frame, the gain (3, 3), and the covariance (n, n) that ``P`` (n, n) becomes.
 
     ``pose`` are the rows of the pose now; ``tied`` (n, 3) says how each state moves with it: the identity in ``pose``, the adjoint for
     poses that are tied to it as to one rigid body, zero for the rest. ``believed`` (3,) is the pose that the scan matcher was told.
@@ -27,16 +29,31 @@ def revisit_update(P: FloatArray, pose: slice, tied: FloatArray, known: Revisit,
     one.
     """
     error = se2.log(se2.between(believed, known.pose))
-    gain = np.linalg.solve(known.growth + known.cov, known.growth).T
+    gain = np.asarray(np.linalg.solve(known.growth + known.cov, known.growth).T, dtype=float)
+    covariance = revisited_covariance(P, pose, tied, gain, known.cov, known.old_cov, known.growth, known.slip)
+    return np.asarray(gain @ error), gain, covariance
+
+
+def revisited_covariance(
+    P: FloatArray,
+    pose: slice,
+    tied: FloatArray,
+    gain: FloatArray,
+    cov: FloatArray,
+    old_cov: FloatArray,
+    growth: FloatArray,
+    slip: FloatArray,
+) -> FloatArray:
+    """(n, n): what ``P`` (n, n) becomes by a ``gain`` (3, 3), be it the best or not; all else as in `revisit_update`."""
     P = P.copy()
-    P[pose, pose] += known.slip
-    shared = 0.5 * (P[pose, pose] + known.old_cov - known.growth)  # cov(e, e_o)
+    P[pose, pose] += slip
+    shared = 0.5 * (P[pose, pose] + old_cov - growth)  # cov(e, e_o)
     shares = np.linalg.pinv(P[pose, pose], rcond=1e-12, hermitian=True) @ shared
     # no surer than what it has in common with the pose now: of what is measured again and again, the newer may be the surer
-    old_cov = known.old_cov + positive_part(shared.T @ shares - known.old_cov)
+    old_cov = old_cov + positive_part(shared.T @ shares - old_cov)
     G = tied @ gain
     T = np.eye(len(P))
     T[:, pose] -= G
     cross = T @ P[:, pose] @ shares @ G.T
-    P = T @ P @ T.T + G @ (old_cov + known.cov) @ G.T + cross + cross.T
-    return gain @ error, 0.5 * (P + P.T)
+    P = T @ P @ T.T + G @ (old_cov + cov) @ G.T + cross + cross.T
+    return 0.5 * (P + P.T)

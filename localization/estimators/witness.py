@@ -7,7 +7,7 @@ with the covariance that scan and map give it, and says afterwards where the sca
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -29,8 +29,7 @@ class Sight:
     is_trusted: bool
     """The witness is sure of itself: where others contradict it, they are wrong."""
     tie: MapTie | None = None
-    """The map by which it was measured; None where there is none. Its lines' errors are in the motion's covariance, for they are new in
-    part as the beams wander along the lines, and in `MapTie.cov`, for they last in part."""
+    """The map by which it was measured; None where there is none."""
 
 
 class Witness(Protocol):
@@ -62,6 +61,7 @@ class ScanWitness:
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig | None = None) -> None:
         self._mounts, self._matcher = mounts, LidarMatcher(config)
         self._has_map, self._slip, self._last_ns = False, Slip(), -1
+        self._twist = np.zeros(3)  # of the last step with a scan
         self._check, self._is_good = ScanCheck(self._matcher.config), True
 
     def look(self, step: Step, anchor: FloatArray, guess: FloatArray) -> Sight | None:
@@ -73,6 +73,7 @@ class ScanWitness:
         slip = self._slip
         slip.advance(step.duration, step.predicted.cov)
         rate = slip.rate
+        change, self._twist = step.twist - self._twist, step.twist
         found = self._matcher.register(sweep.at_stamp(step.twist + rate), sweep.is_planar, guess, step.predicted.cov)
         if found is None:
             return None
@@ -80,12 +81,30 @@ class ScanWitness:
         self._is_good = not self._check.is_jump(se2.between(guess, found.pose), found, since_s)
         if not self._is_good:
             return None
+        gain = np.zeros(3)
         if found.is_trusted and step.start_ns == self._last_ns and step.duration > 0.0:
             off = se2.log(se2.between(se2.compose(anchor, step.predicted.delta), found.pose))
-            slip.measure(off / step.duration, np.diag(found.cov) / step.duration**2)
+            gain = slip.measure(off / step.duration, np.diag(found.cov) / step.duration**2)
             if sweep.shift(slip.rate - rate) > self._matcher.config.max_shift_m:  # the sweep looked otherwise than was thought
                 found = self._matcher.refine(sweep.at_stamp(step.twist + slip.rate), sweep.is_planar, found.pose) or found
-        return Sight(Motion(se2.between(anchor, found.pose), found.cov), found.is_trusted, found.tie)
+                rate = slip.rate
+        swept = self._swept(step, sweep.lateness, gain, change, slip.rate - rate)
+        tie = replace(found.tie, sweep=swept)
+        return Sight(Motion(se2.between(anchor, found.pose), found.cov), found.is_trusted, tie)
+
+    def _swept(self, step: Step, late: float, gain: FloatArray, change: FloatArray, missed: FloatArray) -> FloatArray:
+        """(3, 3) what a motion within the sweep other than was thought does to the pose.
+
+        Points are seen ``late`` [s] after the stamp in the mean, so a twist that is off by d moves the pose by ``late`` d. It is off as the
+        slip was measured over the step and the sweep's is a later one, as the wheels turn otherwise meanwhile (they did by ``change``
+        within the step), and by what of the slip was ``missed``. But the slip was measured, with ``gain`` (3,), by the way to this very
+        pose, so that d is in it already, by ``late`` over the step's duration.
+        """
+        if step.duration <= 0.0:
+            return np.zeros((3, 3))
+        faster = change * late / step.duration if step.start_ns == self._last_ns else np.zeros(3)
+        unknown = 1.0 - gain * late / step.duration
+        return np.asarray(late**2 * np.diag(unknown**2 * (self._slip.variance_in(0.5 * step.duration + late) + faster**2) + missed**2))
 
     def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
         return self._matcher.recall(pose, cov, step.end_ns)

@@ -63,7 +63,7 @@ def _line(
     near: FloatArray, n_near: int, x: float, y: float, radius: float, most_thin: float, since: float
 ) -> tuple[int, float, float, float, float, float, float]:  # pragma: no cover
     """The line of the points around (x, y): how many they are, 0 where they make none; its normal, the distance of (x, y) from it along
-    the normal, the points' variance across it, their mean travelled distance, and the part of them that came ``since``."""
+    the normal, the variance of its place there, their mean travelled distance, and the part of them that came ``since``."""
     m, new, sx, sy, sxx, sxy, syy, st = _sums(near[0, :n_near], near[1, :n_near], near[2, :n_near], x, y, radius, since)
     if m < _MIN_NEIGHBOURS:
         return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -75,7 +75,10 @@ def _line(
         return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
     nx, ny = -math.sin(angle), math.cos(angle)
-    return int(m), nx, ny, -(nx * mx + ny * my), thin, st / m, new / m
+    along = ny * mx - nx * my
+    # of a regression's residuals, m - 2 are free; beside the points' centre, the line's direction counts, too
+    place = thin / (m - 2.0) * (1.0 + along * along / wide)
+    return int(m), nx, ny, -(nx * mx + ny * my), place, st / m, new / m
 
 
 @numba.njit(cache=True)
@@ -111,6 +114,7 @@ def _associate(
     points: NDArray[np.float32],
     travels: NDArray[np.float32],
     hits: NDArray[np.int32],
+    hit_sums: FloatArray,
     ages: Ages,
     source: FloatArray,
     pose: FloatArray,
@@ -121,9 +125,12 @@ def _associate(
     home: NDArray[np.int64],
     lines: FloatArray,
 ) -> None:  # pragma: no cover
-    """Fills ``lines`` (N, 8) for the points ``source`` (N, 2) at ``pose``: how many points make the line (0: none), its normal, a point on
-    it, the variance of its place, how many of ``source`` are in its cell, ``home`` (N,), below 0 where the map has none, and the part of
-    the line's points that came ``since``."""
+    """Fills ``lines`` (N, 9) for the points ``source`` (N, 2) at ``pose``: how many points make the line (0: none), its normal, a point on
+    it, the variance of its place, how many of ``source`` are in its cell, ``home`` (N,), below 0 where the map has none, the part of
+    the line's points that came ``since``, and how many of ``source`` meet the same line's points.
+
+    Lines are of the map's points within ``radius``, so lines that are d apart along a wall share the part 1 - d / (2 radius) of them, and
+    their errors are as much alike: the points of each neighbouring cell count for that part, from their mean."""
     near, n_near, slot = np.empty((3, 9 * points.shape[1])), 0, -1
     at_x, at_y = math.inf, math.inf
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -139,19 +146,45 @@ def _associate(
             lines[i] = lines[i - 1]
         else:
             last_x, last_y = x, y
-            m, nx, ny, e, thin, _, new = _line(near, n_near, x, y, radius, most_thin, since)
+            m, nx, ny, e, place, _, new = _line(near, n_near, x, y, radius, most_thin, since)
             lines[i, 0] = m
             if m:
-                lines[i, 1], lines[i, 2], lines[i, 3], lines[i, 4], lines[i, 5] = nx, ny, x - e * nx, y - e * ny, thin / m
+                lines[i, 1], lines[i, 2], lines[i, 3], lines[i, 4], lines[i, 5] = nx, ny, x - e * nx, y - e * ny, place
                 lines[i, 7] = new
         home[i] = slot
         if slot >= 0:
             hits[slot] += 1
+            hit_sums[slot, 0] += x
+            hit_sums[slot, 1] += y
+    near_hits, n_near, last = np.empty((9, 3)), 0, -1
     for i in range(source.shape[0]):
-        lines[i, 6] = hits[home[i]] if home[i] >= 0 else 1.0
+        lines[i, 6] = lines[i, 8] = 1.0
+        if home[i] < 0:
+            continue
+        lines[i, 6] = hits[home[i]]
+        if home[i] != last:
+            last, n_near = home[i], 0
+            for jx in range(cells[last, 0] - 1, cells[last, 0] + 2):
+                for jy in range(cells[last, 1] - 1, cells[last, 1] + 2):
+                    slot = find_cell(cells, jx, jy)
+                    if slot >= 0 and hits[slot] > 0:
+                        n = hits[slot]
+                        near_hits[n_near, 0], near_hits[n_near, 1], near_hits[n_near, 2] = hit_sums[slot, 0] / n, hit_sums[slot, 1] / n, n
+                        n_near += 1
+        if lines[i, 0] == 0.0:
+            continue
+        x = pose[0] + c * source[i, 0] - s * source[i, 1]
+        y = pose[1] + s * source[i, 0] + c * source[i, 1]
+        shared = 0.0
+        for k in range(n_near):
+            dx, dy = near_hits[k, 0] - x, near_hits[k, 1] - y
+            if abs(lines[i, 1] * dx + lines[i, 2] * dy) < 0.25 * radius:
+                shared += near_hits[k, 2] * max(1.0 - 0.5 * abs(lines[i, 2] * dx - lines[i, 1] * dy) / radius, 0.0)
+        lines[i, 8] = max(shared, 1.0)
     for i in range(source.shape[0]):
         if home[i] >= 0:
             hits[home[i]] = 0
+            hit_sums[home[i]] = 0.0
 
 
 @numba.njit(cache=True)
@@ -184,6 +217,7 @@ def _sum_up(
     pose: FloatArray,
     sigma_point: float,
     sigma_line: float,
+    place_part: float,
     kernel: float,
     H: FloatArray,
     g: FloatArray,
@@ -197,8 +231,11 @@ def _sum_up(
             continue
         e, jx, jy, jt = _residual(source, lines, i, pose, c, s)
         robust = 1.0 + e * e / (kernel * kernel)
-        # All points in one cell meet the same line, whose error they share: together they know no more than it.
-        w = 1.0 / ((sigma_point * sigma_point + lines[i, 6] * (sigma_line * sigma_line + lines[i, 5])) * robust * robust)
+        # All points in one cell meet the same line, whose error they share: together they know no more than it; and where the map's
+        # points are off, so are all lines that they make.
+        w = 1.0 / (
+            (sigma_point * sigma_point + lines[i, 6] * sigma_line * sigma_line + lines[i, 8] * place_part * lines[i, 5]) * robust * robust
+        )
         _add(H, w, jx, jy, jt)
         g[0] -= w * jx * e
         g[1] -= w * jy * e
@@ -215,6 +252,7 @@ def fit_points(
     points: NDArray[np.float32],
     travels: NDArray[np.float32],
     hits: NDArray[np.int32],
+    hit_sums: FloatArray,
     ages: Ages,
     source: FloatArray,
     pose: FloatArray,
@@ -222,6 +260,7 @@ def fit_points(
     radius: float,
     sigma_point: float,
     sigma_line: float,
+    place_part: float,
     final_kernel: float,
     wide_kernel: float,
     iterations: int,
@@ -239,16 +278,16 @@ def fit_points(
     Lines are looked up again where the points have moved by a part of the neighbourhood since they were: near the end, they stay.
     """
     most_thin = (_MAX_SIGMAS * sigma_point) ** 2
-    home, lines = np.empty(source.shape[0], np.int64), np.empty((source.shape[0], 8))
+    home, lines = np.empty(source.shape[0], np.int64), np.empty((source.shape[0], 9))
     reach, moved, n_matched, squares = 0.0, math.inf, 0, 0.0
     for i in range(source.shape[0]):
         reach = max(reach, math.hypot(source[i, 0], source[i, 1]))
     for iteration in range(iterations + 1):
         if moved > _STALE * radius:
-            _associate(cells, points, travels, hits, ages, source, pose, cell, radius, most_thin, since, home, lines)
+            _associate(cells, points, travels, hits, hit_sums, ages, source, pose, cell, radius, most_thin, since, home, lines)
             moved = 0.0
         kernel = wide_kernel if iteration == 0 else final_kernel
-        n_matched, squares = _sum_up(source, lines, pose, sigma_point, sigma_line, kernel, H, g)
+        n_matched, squares = _sum_up(source, lines, pose, sigma_point, sigma_line, place_part, kernel, H, g)
         if iteration >= iterations or n_matched == 0:
             break
         c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -272,15 +311,22 @@ def fit_points(
         moved += math.hypot(d0, d1) + abs(d2) * reach
         if iteration > 0 and abs(d0) + abs(d1) + abs(d2) < 1e-4:
             iterations = iteration + 1
-    n_on = _spread(source, lines, home, pose, sigma_point, sigma_line, spread)
+    n_on = _spread(source, lines, home, pose, sigma_point, sigma_line, place_part, spread)
     # NaN: nobody asks what of the map is new
-    map_part = 0.0 if math.isnan(since) else _old_part(source, lines, pose, sigma_point, sigma_line, final_kernel, old)
+    map_part = 0.0 if math.isnan(since) else _old_part(source, lines, pose, sigma_point, sigma_line, place_part, final_kernel, old)
     return n_matched, n_on, squares, map_part
 
 
 @numba.njit(cache=True)
 def _old_part(
-    source: FloatArray, lines: FloatArray, pose: FloatArray, sigma_point: float, sigma_line: float, kernel: float, H: FloatArray
+    source: FloatArray,
+    lines: FloatArray,
+    pose: FloatArray,
+    sigma_point: float,
+    sigma_line: float,
+    place_part: float,
+    kernel: float,
+    H: FloatArray,
 ) -> float:  # pragma: no cover
     """Fills ``H`` (3, 3) with the information of what is not new of the lines; returns which part of all variance is the lines'."""
     H[:] = 0.0
@@ -291,7 +337,7 @@ def _old_part(
             continue
         e, jx, jy, jt = _residual(source, lines, i, pose, c, s)
         robust = 1.0 + e * e / (kernel * kernel)
-        line = lines[i, 6] * (sigma_line * sigma_line + lines[i, 5])
+        line = lines[i, 6] * sigma_line * sigma_line + lines[i, 8] * place_part * lines[i, 5]
         w = 1.0 / ((sigma_point * sigma_point + line) * robust * robust)
         total += w
         of_lines += w * line / (sigma_point * sigma_point + line)
@@ -308,6 +354,7 @@ def _spread(
     pose: FloatArray,
     sigma_point: float,
     sigma_line: float,
+    place_part: float,
     spread: FloatArray,
 ) -> int:  # pragma: no cover
     """Fills ``spread`` (4,), see `Spread`; returns how many points are on their lines: those beyond three sigmas are of something else.
@@ -323,8 +370,10 @@ def _spread(
                 within = squares - total * total / n
                 spread[0] += within
                 spread[1] += n - 1
-                spread[2] += (total / n) ** 2 - within / (n - 1) / n - place / n
+                spread[2] += (total / n) ** 2
                 spread[3] += 1.0
+                spread[4] += within / (n - 1) / n
+                spread[5] += place / n
             n, total, squares, place = 0, 0.0, 0.0, 0.0
         if is_end or lines[i, 0] == 0.0:
             continue

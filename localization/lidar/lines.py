@@ -25,8 +25,12 @@ class Spread:
     """Squares of the points' distances from their group's mean [m^2]."""
     within_freedom: float = 0.0
     between: float = 0.0
-    """Squares of the groups' means, less what the noise of their points and of the map's points makes of them [m^2]."""
+    """Squares of the groups' means [m^2]."""
     between_freedom: float = 0.0
+    noise: float = 0.0
+    """What the noise of their points makes of those squares [m^2]."""
+    place: float = 0.0
+    """What the map's points would, if they scattered about their lines by chance [m^2]."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,7 @@ class LineMap:
         self._points = np.zeros((slots, POINTS_PER_CELL, 2), np.float32)
         self._travels = np.zeros((slots, POINTS_PER_CELL), np.float32)
         self._hits = np.zeros(slots, np.int32)  # of one step of a fit, all zero between steps
+        self._hit_sums = np.zeros((slots, 2))  # of their places
 
     def __getstate__(self) -> dict[str, Any]:
         """The points and their cells' places: most of the table is empty."""
@@ -136,13 +141,14 @@ class LineMap:
         where they were; it is no part of the returned quadratic. Only points of these ``ages`` count. Those added at a travelled distance
         of ``since`` [m] or later are the new ones; with NaN, nobody asks, and `LineFit.old` and `LineFit.map_part` are zero.
         """
-        information, gradient, pose, spread = np.zeros((3, 3)), np.zeros(3), np.array(start, dtype=float), np.zeros(4)
+        information, gradient, pose, spread = np.zeros((3, 3)), np.zeros(3), np.array(start, dtype=float), np.zeros(6)
         old = np.zeros((3, 3))
         n, n_on, squares, map_part = fit_points(
             self._cells,
             self._points,
             self._travels,
             self._hits,
+            self._hit_sums,
             ages,
             points,
             pose,
@@ -150,6 +156,7 @@ class LineMap:
             options.radius,
             options.sigma_point,
             options.sigma_line,
+            options.place_part,
             options.kernel,
             options.wide_kernel,
             options.iterations,
@@ -200,3 +207,5 @@ class FitOptions:
     """The same for the first step: it sees farther, and is not so easily caught by the wrong line [m]."""
     iterations: int
     """Gauss-Newton steps at most."""
+    place_part: float = 1.0
+    """Part of `Spread.place` that is there: the map takes no second point beside one that it has, and so evens out its points' noise."""

@@ -18,7 +18,6 @@ from motion_models.se2 import FloatArray
 
 _FEW_POINTS = 10
 _DEGENERATE = 0.02  # smaller over larger variance of the position; rooms: 0.2 and more
-_FEW_CELLS = 5.0  # so many lines the belief about them counts for, where what it says stays in the map's error
 _SURPRISE = 0.05
 _APART_M = 1e-4  # scans drawn on one spot are told apart by this
 # Where the scene holds nothing, the measurement's sigma: metres, metres, radians. It decides nothing, it only keeps numbers finite.
@@ -49,18 +48,15 @@ class LidarConfig:
     """Nor turns it faster [rad/s]."""
     max_jumps: int = 5
     """So many scans that jump one after the other are right: the robot was carried elsewhere."""
-    map_is_state: bool = False
-    """Estimate the error of the map besides the pose, as all scans share it that meet the same part of the map. Else each scan counts it
-    anew: then covariances grow with every scan, and where the robot stays in one place they are several times too large."""
     revisit: RevisitConfig = field(default_factory=RevisitConfig)
 
 
 @dataclass(frozen=True)
 class MapTie:
-    """How the map that a scan meets hangs together with the map that the scan before met.
+    """How the map that a scan meets hangs together with the map that the scan before met, and which errors of the scan are its own.
 
-    Both are drawn with errors, which all scans that meet the same part of the map share: e' = ``kept`` e + (1 - ``kept``) e_drawn + noise,
-    where e_drawn is the error of the pose from which the last scan was drawn. In a room that is known already, ``kept`` is the identity,
+    Maps are drawn with errors, which all scans that meet the same part share: e' = ``kept`` e + (1 - ``kept``) (e_drawn + noise), where
+    e_drawn is the error of the pose from which the last scan was drawn. In a room that is known already, ``kept`` is the identity,
     and however long the robot stays, it learns no more of its place and forgets nothing of it.
     """
 
@@ -68,11 +64,19 @@ class MapTie:
     """(3, 3) how much of what fixes the pose the map had before the last scan was drawn into it, by direction; zero for a first map."""
     cov: FloatArray
     """(3, 3) the part of the registration's covariance that is the map's error."""
+    sweep: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    """(3, 3) the part that comes from a motion within the sweep other than was thought. What the scan adds to the map has no part in it:
+    the points are off one way, and the pose that was found for them the other."""
 
     @property
     def fresh(self) -> FloatArray:
-        """(3, 3) covariance of the noise with which what is not ``kept`` was drawn: the map's errors are as large as before."""
-        return np.asarray(self.cov - self.kept @ self.cov @ self.kept.T)
+        """(3, 3) covariance of the noise with which what is not ``kept`` was drawn.
+
+        With the information of the old lines L_o and of the new ones L_n, C = (L_o + L_n)^-1 and ``kept`` = C L_o, what the new ones add
+        is C L_n C = (1 - ``kept``) C.
+        """
+        found = self.cov - self.kept @ self.cov
+        return np.asarray(0.5 * (found + found.T))
 
 
 @dataclass(frozen=True)
@@ -89,8 +93,8 @@ class Registration:
     """Points that did: they are on lines of the map, within their noise."""
     residual_rms_m: float
     """RMS distance of the matched points from the map's lines."""
-    tie: MapTie | None
-    """What of the covariance is the map's, and since when; None if the map is no state."""
+    tie: MapTie
+    """What of the covariance is the map's, and since when."""
 
     @property
     def is_trusted(self) -> bool:
@@ -112,7 +116,7 @@ class LidarMatcher:
         self._kiss: Kiss | None = None
         self._lines: LineMap | None = None
         sigmas = self.config.sigma_point_m, self.config.sigma_line_m
-        self._noise = Noise(*sigmas, _FEW_CELLS) if self.config.map_is_state else Noise(*sigmas)
+        self._noise = Noise(*sigmas)
         self._downsampled = np.empty((0, 3))
         self._planar, self._is_planar = np.empty((0, 2)), True
         self._guess: tuple[FloatArray, FloatArray] | None = None  # and its information
@@ -155,20 +159,21 @@ class LidarMatcher:
         guess, prior = self._guess
         self._is_met = True
         believed = self._noise.sigma_line
-        is_state = self.config.map_is_state
-        since = self._drawn_at if is_state else math.nan
+        since = self._drawn_at
         fit = lines.fit(self._planar, start, self._fit_options(), prior, guess, self._ages, since)
         self._noise.see(fit.spread)
-        if is_state and abs(self._noise.sigma_line - believed) > _SURPRISE * believed:
-            # the first scans show that the map is better or worse than was guessed; what they say of it will be believed for long
+        if abs(self._noise.sigma_line - believed) > _SURPRISE * believed:
+            # the first scans show that the map is better or worse than was guessed
             fit = lines.fit(self._planar, fit.pose, self._fit_options(), prior, guess, self._ages, since)
         cov = np.linalg.inv(fit.information + np.diag(_KNOWS_NOTHING**-2)).astype(np.float64, copy=False)
         pose = se2.compose(fit.pose, se2.exp(cov @ fit.gradient))
-        tie = MapTie(cov @ fit.old, fit.map_part * cov) if is_state else None
+        tie = MapTie(cov @ fit.old, fit.map_part * cov)
         return Registration(pose, cov, len(self._planar), fit.n_on, fit.residual_rms, tie)
 
     def _fit_options(self) -> FitOptions:
-        return replace(self._options, sigma_point=self._noise.sigma_point, sigma_line=self._noise.sigma_line)
+        return replace(
+            self._options, sigma_point=self._noise.sigma_point, sigma_line=self._noise.sigma_line, place_part=self._noise.place_part
+        )
 
     def insert(self, pose: FloatArray) -> None:
         """Add the scan that was last given to `register` to the map, as seen from ``pose`` (3,) ``world_T_body``."""

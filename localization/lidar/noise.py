@@ -12,32 +12,50 @@ import math
 import numpy as np
 
 from localization.lidar.lines import Spread
+from motion_models.se2 import FloatArray
 
 _KEPT = 0.98  # of what is known, from scan to scan: the last 50 count
-_POINTS, _CELLS = 500.0, 20.0  # as much as is known beforehand, in degrees of freedom: about one scan
+_GUESSED = 0.5  # of what was only guessed, from scan to scan
 _POSE = 3.0  # degrees of freedom that go into the pose
-_LEAST_M = 1e-3
+_LEAST_M, _LEAST_LINE_M, _LEAST_PART = 1e-3, 1e-4, 0.1
 
 
 class Noise:
-    """Begins with what is usual, and follows what is seen."""
+    """Begins with what is usual, worth one point and one line (unit information), and follows what is seen."""
 
-    def __init__(self, sigma_point: float, sigma_line: float, cells: float = _CELLS) -> None:
-        """Sigmas [m]; the second is believed as if ``cells`` lines had shown it."""
-        self._sums = np.array([_POINTS * sigma_point**2, _POINTS, cells * sigma_line**2, cells])
+    def __init__(self, sigma_point: float, sigma_line: float) -> None:
+        """Sigmas [m] that are guessed."""
+        self._guess = np.array([sigma_point**2, 1.0, sigma_line**2, 1.0, 0.0])
+        self._seen = np.zeros(5)
+
+    @property
+    def _sums(self) -> FloatArray:
+        return self._guess + self._seen
 
     @property
     def sigma_point(self) -> float:
         """Of one point about its line [m]."""
-        return max(math.sqrt(self._sums[0] / self._sums[1]), _LEAST_M)
+        squares, freedom, *_ = self._sums
+        return max(math.sqrt(squares / freedom), _LEAST_M)
 
     @property
     def sigma_line(self) -> float:
-        """Of a line of the map, shared by all points that meet it in one cell [m]."""
-        return max(math.sqrt(max(self._sums[2], 0.0) / self._sums[3]), _LEAST_M)
+        """Of a line of the map beyond `place_part`, shared by all points that meet it in one cell [m]."""
+        _, _, squares, freedom, place = self._sums
+        return max(math.sqrt(max(squares - place, 0.0) / freedom), _LEAST_LINE_M)
+
+    @property
+    def place_part(self) -> float:
+        """Which part of the error that a line would have if the map's points scattered by chance it has."""
+        _, _, squares, _, place = self._sums
+        return 1.0 if squares >= place else max(squares / place, _LEAST_PART)
 
     def see(self, spread: Spread) -> None:
         """One more scan."""
-        if spread.between_freedom > 2.0 * _POSE:
-            new = np.array([spread.within, spread.within_freedom, spread.between, spread.between_freedom - _POSE])
-            self._sums = _KEPT * self._sums + new
+        freedom = spread.between_freedom - _POSE
+        if freedom > _POSE:
+            # the pose takes its part of all that moves the groups' means, whatever it comes from
+            left = freedom / spread.between_freedom
+            new = np.array([spread.within, spread.within_freedom, spread.between - left * spread.noise, freedom, left * spread.place])
+            self._seen = _KEPT * self._seen + new
+            self._guess = _GUESSED * self._guess

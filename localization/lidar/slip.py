@@ -20,18 +20,23 @@ class Slip:
     """State in, state out."""
 
     def __init__(self) -> None:
-        self.rate, self._variance = np.zeros(3), np.zeros(3)
+        self.rate, self._variance, self._usual = np.zeros(3), np.zeros(3), np.zeros(3)
 
     def advance(self, duration: float, cov: FloatArray) -> None:
         """``duration`` [s] have passed, in which the wheels' motion had ``cov`` (3, 3)."""
         if duration <= 0.0:
             return
         stays = math.exp(-duration / LASTS_S)
-        usual = np.diag(cov) / (2.0 * LASTS_S * duration)
+        self._usual = usual = np.diag(cov) / (2.0 * LASTS_S * duration)
         self.rate = stays * self.rate
         self._variance = stays**2 * self._variance + (1.0 - stays**2) * usual
 
-    def measure(self, rate: FloatArray, variance: FloatArray) -> None:
+    def variance_in(self, seconds: float) -> FloatArray:
+        """(3,) of `rate` as that of the slip so much later."""
+        stays = math.exp(-2.0 * seconds / LASTS_S)
+        return np.asarray(stays * self._variance + (1.0 - stays) * self._usual)
+
+    def measure(self, rate: FloatArray, variance: FloatArray) -> FloatArray:
         """The mean slip (3,) [m/s, m/s, rad/s] of the time that has passed was ``rate``, with ``variance`` (3,)."""
         off = rate - self.rate
         expected = self._variance + variance
@@ -39,3 +44,4 @@ class Slip:
         gain = self._variance / (self._variance + variance)
         self.rate = self.rate + gain * off
         self._variance = (1.0 - gain) * self._variance
+        return np.asarray(gain)

@@ -44,6 +44,11 @@ class Sweep:
         points[:, :2] = se2.transform(se2.exp(self.offsets[:, None] * twist), points[:, :2])
         return points
 
+    @property
+    def lateness(self) -> float:
+        """How long after the stamp a point is seen, in the mean [s]."""
+        return float(self.offsets.mean()) if len(self.offsets) else 0.0
+
     def shift(self, twist: FloatArray) -> float:
         """How far an error of the motion by ``twist`` (3,) moves the points against each other [m]."""
         if not len(self.offsets):

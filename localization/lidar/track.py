@@ -9,7 +9,7 @@ share the error of the place where their ways part.
 from __future__ import annotations
 
 from array import array
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,6 +72,10 @@ class Track:
         after = min(bisect_left(self._travels, travel), len(self._travels) - 1)
         is_before = after > 0 and travel - self._travels[after - 1] < self._travels[after] - travel
         return after - 1 if is_before else after
+
+    def at_stamp(self, stamp_ns: int) -> int:
+        """The last place up to ``stamp_ns``, or the first of all."""
+        return max(bisect_right(self._stamps, stamp_ns) - 1, 0)
 
     def near(self, pose: FloatArray, radius: float, before: float) -> NDArray[np.intp]:
         """Places within ``radius`` [m] of ``pose`` (3,), passed before ``before`` [m], in their order."""

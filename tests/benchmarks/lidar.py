@@ -8,16 +8,15 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from localization.consistency import mean_band
-from localization.estimators.make import EstimatorConfig
 from localization.events import Scan
-from localization.lidar import LidarConfig, LidarMatcher, body_points
+from localization.lidar import LidarMatcher, body_points
 from localization.lidar.kiss import Kiss
 from localization.lidar.matcher import in_range
-from localization.run import ReplayConfig
 from localization.simulate import world
 from motion_models import se2
 from motion_models.robot import WheelNoise
@@ -28,6 +27,18 @@ NO_SLIP = WheelNoise(*[0.0] * 8)
 TOUR = rooms.path((2, 0, 0), (12, 0.4, 0.5), (12, 0.4, -0.5), (6, 0, 0.5), (2, 0, 0))
 ROOM = np.concatenate([world.box(-6, -4, 6, 4), world.box(-6, -4, -5, -3), world.pillar(4.5, 2.8)])
 PLACES = {"room 12 x 8 m": ROOM, "lab": world.lab().walls, "hall": world.hall().walls}
+FEW = rooms.Beams(beams=240, rate_hz=6.25)
+LARGE = np.concatenate([world.box(-12, -9, 12, 9), world.box(3, 2, 5, 4), world.pillar(-5, 3), world.pillar(-6, -4)])
+SMALL = np.concatenate([world.box(-4, -3, 4, 3), world.box(2, 1.5, 3, 2.5)])
+_CRATES = [world.box(x, y, x + 0.6, y + 0.4) for x, y in ((3, 3), (4, -3), (-5, -3.5), (-4, 3.5), (5.5, 1), (-6, 1.5))]
+CRATES = np.concatenate([world.box(-7, -5, 7, 5), *_CRATES, world.pillar(2, -3.8)])
+# walls, scanner of the registrations, scanner and start of the poses
+NEES_PLACES = {
+    **{name: (walls, rooms.Beams(), FEW, (0.0, 0.0, 0.0)) for name, walls in PLACES.items()},
+    "24 x 18 m": (LARGE, rooms.Beams(), FEW, (0.0, 0.0, 0.0)),
+    "8 x 6 m, 6 mm": (SMALL, rooms.Beams(noise=0.006), replace(FEW, noise=0.006), (-2.0, -1.5, 0.0)),
+    "crates, 360 beams, 20 mm": (CRATES, rooms.Beams(beams=360, noise=0.02), replace(FEW, noise=0.02), (0.0, 0.0, 0.0)),
+}
 CORRIDOR = np.concatenate([world.line(-60, -1.2, 80, -1.2), world.line(-60, 1.2, 80, 1.2)])
 
 
@@ -48,9 +59,9 @@ def accuracy(walls: np.ndarray, noise: WheelNoise, seeds: int = 3) -> dict[str, 
     return {name: np.array(rows) for name, rows in found.items()}
 
 
-def matching(walls: np.ndarray, twists: np.ndarray, seed: int, start=(0.0, 0.0, 0.0), guess_m: float = 0.01):
+def matching(walls: np.ndarray, twists: np.ndarray, seed: int, start=(0.0, 0.0, 0.0), guess_m: float = 0.01, scanner=None):
     """Yield milliseconds of register and insert, of KISS-ICP alone, registration, true pose of each scan; the map is drawn truly."""
-    drive = rooms.drive_through(walls, twists, seed, start, noise=NO_SLIP)
+    drive = rooms.drive_through(walls, twists, seed, start, scanner, noise=NO_SLIP)
     rng, matcher, kiss = np.random.default_rng(seed), LidarMatcher(), None
     twist = se2.log(se2.between(drive.poses[:-1], drive.poses[1:])) * 12.5
     scans = [event for event in drive.events if isinstance(event, Scan)]
@@ -73,24 +84,23 @@ def costs(walls: np.ndarray) -> tuple[float, float, float]:
     return float(np.median(rows[:, 0])), float(np.median(rows[:, 1])), float(np.median(rows[:, 0] / rows[:, 1]))
 
 
-def registration_nees(walls: np.ndarray, runs: int = 100) -> np.ndarray:
+def registration_nees(walls: np.ndarray, scanner: rooms.Beams | None = None, runs: int = 100) -> np.ndarray:
     """(runs,) one a run, of the last scan of a drive of its own."""
     way, found = rooms.path((0.5, 0.4, 0.0), (1.5, 0.4, 0.4), (1.5, 0.4, -0.3)), []
     for seed in range(runs):
         rng = np.random.default_rng(seed)
-        *_, (_, _, last, pose) = matching(walls, way, seed, (rng.uniform(-2, 0), rng.uniform(-1, 1), rng.uniform(-3, 3)))
+        *_, (_, _, last, pose) = matching(walls, way, seed, (rng.uniform(-2, 0), rng.uniform(-1, 1), rng.uniform(-3, 3)), scanner=scanner)
         error = se2.log(se2.between(pose, last.pose))
         found.append(float(error @ np.linalg.solve(last.cov, error)))
     return np.array(found)
 
 
-def pose_nees(walls: np.ndarray, kind: str, *, map_is_state: bool, runs: int = 100) -> np.ndarray:
+def pose_nees(walls: np.ndarray, kind: str, scanner: rooms.Beams = FEW, start=(0.0, 0.0, 0.0), runs: int = 100) -> np.ndarray:
     """(runs,) of the estimator's pose after 10 s."""
-    config = ReplayConfig(estimator=EstimatorConfig(lidar=LidarConfig(map_is_state=map_is_state)))
     way, found = rooms.path((1, 0, 0), (5, 0.4, 0.4), (4, 0.4, -0.5)), []
     for seed in range(runs):
-        drive = rooms.drive_through(walls, way, seed, scanner=rooms.Beams(beams=240, rate_hz=6.25))
-        poses, covs = rooms.at_scans(drive, rooms.results(drive, kind, config=config)[kind])
+        drive = rooms.drive_through(walls, way, seed, start, scanner)
+        poses, covs = rooms.at_scans(drive, rooms.results(drive, kind)[kind])
         error = se2.log(se2.between(drive.poses[-1], poses[-1]))
         assert covs is not None
         found.append(float(error @ np.linalg.solve(covs[-1], error)))
@@ -138,11 +148,10 @@ def main() -> None:
         ours, kiss, ratio = costs(walls)
         row(f"a scan in {name}", {"lidar": f"{kiss:.2f} ms", "ekf": f"{ours:.2f} ms ({ratio:.1f} x)"}, "1.0 ms to register and insert")
     low, high = mean_band(100, 3.0)
-    for name, walls in PLACES.items():
-        said = f"{registration_nees(walls).mean():.2f} / {pose_nees(walls, 'ekf', map_is_state=False).mean():.2f}"
-        row(f"NEES of a scan / of the pose in {name}", {"ekf": said}, f"{low:.2f} to {high:.2f}, 100 runs")
-        ekf, graph = (pose_nees(walls, kind, map_is_state=True).mean() for kind in ("ekf", "graph"))
-        row("  of the pose, the map's error a state", {"ekf": f"{ekf:.2f} (graph {graph:.2f})"}, f"{low:.2f} to {high:.2f}, 100 runs")
+    for name, (walls, scanner, few, start) in NEES_PLACES.items():
+        ekf, graph = (pose_nees(walls, kind, few, start).mean() for kind in ("ekf", "graph"))
+        said = f"{registration_nees(walls, scanner).mean():.2f} / {ekf:.2f} ({graph:.2f})"
+        row(f"NEES of scan / pose (graph) in {name}", {"ekf": said}, f"{low:.2f} to {high:.2f}, 100 runs")
 
 
 if __name__ == "__main__":

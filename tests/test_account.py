@@ -1,0 +1,196 @@
+"""The account of a filter's true errors: covariances as large as the errors where scans share a map, and estimates that do not move."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from localization.consistency import mean_band
+from localization.estimators.account import Account
+from localization.estimators.ekf import Ekf
+from localization.estimators.fusion import EkfFusion
+from localization.estimators.witness import ScanWitness
+from localization.events import Scan
+from localization.lidar import LidarConfig, LidarMatcher, MapTie, body_points
+from localization.lidar.lines import FitOptions, LineMap, Spread
+from localization.lidar.noise import Noise
+from localization.simulate import world
+from localization.steps import Step
+from motion_models import se2
+from motion_models.base import Motion
+from motion_models.corrections import Corrections, corrections
+from motion_models.registry import make_model
+from motion_models.robot import GyroNoise
+from tests import rooms
+
+ROOM = np.concatenate([world.box(-6, -4, 6, 4), world.box(-6, -4, -5, -3), world.pillar(4.5, 2.8)])
+WAY = rooms.path((1, 0, 0), (5, 0.4, 0.4), (4, 0.4, -0.5))
+SCANNER = rooms.Beams(beams=240, rate_hz=6.25)
+RUNS = 24
+
+
+def spd(rng: np.random.Generator, n: int, scale: float = 1.0) -> np.ndarray:
+    A = rng.normal(size=(n, n))
+    return np.asarray(scale * (A @ A.T / n + 0.1 * np.eye(n)))
+
+
+def test_it_is_the_covariance_of_errors_that_are_made() -> None:
+    """Errors of 40 000 filters with gains that are nobody's best, drawn one by one."""
+    rng, n, count = np.random.default_rng(0), 5, 40_000
+    draw = lambda cov: rng.multivariate_normal(np.zeros(len(cov)), cov, count)  # noqa: E731
+    P, rows = spd(rng, n), np.eye(n)[:3]
+    e = draw(P)
+    account, m, drawn = Account(P, rows, 16.0), e[:, :3].copy(), e[:, :3].copy()
+    for k in range(4):
+        F, Q = np.eye(n), spd(rng, n, 0.1)
+        F[:3, :3] = se2.adjoint(rng.normal(size=3))
+        F[:3, 3:] = 0.2 * rng.normal(size=(3, n - 3))
+        e, m, drawn = e @ F.T + draw(Q), m @ F[:3, :3].T, drawn @ F[:3, :3].T
+        account.move(F, Q)
+        total = spd(rng, 3)
+        kept = 0.8 * total @ np.linalg.inv(total + spd(rng, 3))
+        part = 0.4 * (total + total.T) / 2.0
+        tie = MapTie(kept, part, spd(rng, 3, 0.3))
+        fresh = tie.fresh + max(0.0, 1e-9 - np.linalg.eigvalsh(tie.fresh).min()) * np.eye(3)
+        m = m @ kept.T + drawn @ (np.eye(3) - kept).T + draw(fresh)
+        K, d = 0.3 * rng.normal(size=(n, 3)), np.eye(3) + 0.1 * rng.normal(size=(3, 3))
+        swept = draw(tie.sweep)
+        found = m + draw(total - part) + swept
+        e = e - (e[:, :3] - found) @ d.T @ K.T
+        account.see(K, d, total, tie, 1.0)
+        account.draw(np.eye(n), k != 2)
+        if k != 2:
+            drawn = e[:, :3] - swept
+        K, H, R = 0.3 * rng.normal(size=(n, 1)), rng.normal(size=(1, n)), np.array([[0.2]])
+        e = e - (e @ H.T + draw(R)) @ K.T
+        account.correct(K, H, R)
+    W = np.linalg.inv(np.linalg.cholesky(account.covariance))
+    np.testing.assert_allclose(W @ np.cov(e.T) @ W.T, np.eye(n), atol=0.05)
+
+
+def _filter() -> tuple[Ekf, Corrections]:
+    corrected = corrections(make_model("diff_drive", rooms.ROBOT), "constant")
+    return Ekf(GyroNoise(), corrected), corrected
+
+
+def test_where_no_error_is_shared_it_is_the_filters_own() -> None:
+    """A map that is drawn anew by each scan, without errors of its own, is what the filter takes it for."""
+    one, _ = _filter()
+    other, _ = _filter()
+    rng = np.random.default_rng(1)
+    anew = MapTie(np.zeros((3, 3)), np.zeros((3, 3)))
+    size = len(make_model("diff_drive", rooms.ROBOT).param_names)
+    for k in range(30):
+        delta = np.array([0.05, 0.0, 0.1 * np.sin(k)])
+        predicted = Motion(delta, np.diag([1e-4, 1e-5, 1e-4]), 0.01 * rng.normal(size=(3, size)))
+        step = Step(k * 10**8, (k + 1) * 10**8, predicted, delta / 0.1, np.zeros(3), False, True)
+        seen = Motion(se2.compose(delta, se2.exp(1e-2 * rng.normal(size=3))), 1e-5 * np.eye(3))
+        for ekf, tie in ((one, anew), (other, None)):
+            ekf.predict(step)
+            ekf.measure_motion(seen, True, tie)
+            ekf.set_anchor()
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+    np.testing.assert_allclose(one.errors, one.covariance, rtol=1e-6, atol=1e-14)
+    np.testing.assert_array_equal(other.errors, other.covariance)
+
+
+def _drive(seed: int) -> rooms.Drive:
+    return rooms.drive_through(ROOM, WAY, seed, scanner=SCANNER)
+
+
+@pytest.mark.parametrize("kind", ["ekf", "graph"])
+def test_in_a_room_errors_are_as_large_as_is_said(kind: str) -> None:
+    nees, yaw = [], []
+    for seed in range(RUNS):
+        drive = _drive(seed)
+        poses, covs = rooms.at_scans(drive, rooms.results(drive, kind)[kind])
+        assert covs is not None
+        error = se2.log(se2.between(drive.poses[-1], poses[-1]))
+        nees.append(float(error @ np.linalg.solve(covs[-1], error)))
+        yaw.append(error[2] ** 2 / covs[-1][2, 2])
+    low, high = mean_band(RUNS, 3.0)
+    assert low <= np.mean(nees) <= high
+    assert np.mean(yaw) < mean_band(RUNS, 1.0)[1]  # what the sweep adds: without it, some five times too sure of the heading
+
+
+def test_it_moves_no_estimate_and_the_filter_stays_cautious(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[tuple[float, float]] = []
+    step = EkfFusion.step
+
+    def watched(self, s):
+        estimate, ekf = step(self, s), self._ekf
+        if s.scan is not None:
+            said.append((np.trace(ekf.covariance[:2, :2]), np.trace(ekf.errors[:2, :2])))
+        return estimate
+
+    monkeypatch.setattr(EkfFusion, "step", watched)
+    drive = _drive(0)
+    with_it = rooms.results(drive, "ekf")["ekf"].trajectory
+    cautious, errors = said[-1]
+    assert cautious > 2.0 * errors
+    look = ScanWitness.look
+
+    def untied(self, s, anchor, guess):
+        seen = look(self, s, anchor, guess)
+        return None if seen is None else replace(seen, tie=None)
+
+    monkeypatch.setattr(ScanWitness, "look", untied)
+    without = rooms.results(drive, "ekf")["ekf"].trajectory
+    np.testing.assert_array_equal(with_it.poses, without.poses)
+
+
+def test_a_matcher_says_how_much_of_the_map_it_met_before() -> None:
+    drive = rooms.drive_through(ROOM, rooms.path((1, 0, 0), (4, 0.4, 0.0)), 0)
+    scans = [e for e in drive.events if isinstance(e, Scan)]
+    matcher, kept = LidarMatcher(LidarConfig()), []
+    for scan, pose in zip(scans, drive.poses, strict=True):
+        found = matcher.register(body_points(scan, drive.mount, np.zeros(3)), True, pose, 1e-4 * np.eye(3))
+        if found is not None:
+            kept.append(np.trace(found.tie.kept) / 3.0)
+            assert np.linalg.eigvalsh(found.tie.fresh).min() > -1e-12
+        matcher.insert(pose)
+    assert kept[0] < 0.01  # all of it was drawn by the scan before
+    assert 0.9 < kept[-1] <= 1.0
+    again = matcher.register(body_points(scans[-1], drive.mount, np.zeros(3)), True, drive.poses[-1], 1e-4 * np.eye(3))
+    anew = matcher.register(body_points(scans[-1], drive.mount, np.zeros(3)), True, drive.poses[-1], 1e-4 * np.eye(3))
+    assert again is not None
+    assert anew is not None
+    assert np.trace(again.tie.kept) < np.trace(anew.tie.kept)  # what the last scan added is new to one scan only
+    np.testing.assert_allclose(MapTie(np.zeros((3, 3)), found.cov).fresh, found.cov)
+
+
+def test_a_line_is_as_sure_as_the_points_that_make_it() -> None:
+    """Without noise of its own, a scan along a wall is as far off as the map's points are in the mean."""
+    rng, sigma, errors, said = np.random.default_rng(2), 0.01, [], []
+    x = np.linspace(-3.0, 3.0, 400)
+    scan = np.column_stack([np.linspace(-3.0, 3.0, 301), np.full(301, 2.0)])
+    options = FitOptions(0.6, 3.0 * sigma, 0.0, 10.0, 10.0, 10)
+    for _ in range(200):
+        lines = LineMap(0.6, 0.0, 100.0)
+        lines.insert(np.column_stack([x + 0.01 * rng.normal(size=len(x)), 2.0 + sigma * rng.normal(size=len(x))]), np.zeros(3))
+        free = np.diag([1e6, 1e-6, 1e-6])  # the wall leaves its own direction free
+        found = lines.fit(scan, np.zeros(3), options, free, np.zeros(3))
+        errors.append(found.pose[1])
+        # of the said variance, take away what the scan's own points would have
+        said.append(1.0 / found.information[1, 1] - options.sigma_point**2 / len(scan))
+    assert 0.75 < np.var(errors) / np.mean(said) < 1.3
+
+
+def test_noise_is_what_scans_show() -> None:
+    """Groups of 10 points in 40 cells, whose means are off by the lines' errors, and a pose fitted to them."""
+    rng = np.random.default_rng(3)
+    for sigma_line, part in ((0.0, 0.4), (0.004, 1.0)):
+        noise, place = Noise(0.03, 0.02), 4e-6
+        for _ in range(300):
+            off = np.sqrt(sigma_line**2 + part * place) * rng.normal(size=40)
+            points = off[:, None] + 0.012 * rng.normal(size=(40, 10))
+            fit = np.linalg.qr(rng.normal(size=(40, 3)))[0]
+            means = points.mean(axis=1)
+            within = ((points - means[:, None]) ** 2).sum(axis=1)
+            means = means - fit @ (fit.T @ means)
+            noise.see(Spread(within.sum(), 360.0, (means**2).sum(), 40.0, (within / 90.0).sum(), 40.0 * place))
+        assert noise.sigma_point == pytest.approx(0.012, rel=0.02)
+        assert noise.place_part == pytest.approx(part, abs=0.25)
+        assert noise.sigma_line == pytest.approx(sigma_line, abs=5e-4)
