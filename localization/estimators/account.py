@@ -15,6 +15,7 @@ import numpy as np
 
 from localization.estimators.revisit_update import revisited_covariance
 from localization.lidar import MapTie, Revisit
+from localization.lidar.revisit import slip_of
 from localization.lidar.track import Place, Track, moved
 from motion_models import se2
 from motion_models.se2 import FloatArray
@@ -122,8 +123,7 @@ class Account:
         then = self._track.at_stamp(known.then.stamp_ns)
         growth, old_cov = self._track.growth(then), moved(self._track[then], believed)
         off = se2.log(se2.between(believed, known.pose))
-        nis = float(off @ np.linalg.solve(growth + known.cov, off))
-        slip = nis / self._gate * np.outer(off, off) if nis > self._gate else np.zeros((3, 3))
+        slip = slip_of(off, growth + known.cov, self._gate)
         tied = np.vstack([tied, np.eye(3), np.eye(3)])
         self._P = revisited_covariance(self._P, _POSE, tied, gain, known.cov, old_cov, growth + slip, slip)
         self._track.tie(then)

@@ -15,6 +15,7 @@ _MIN_NEIGHBOURS = 4
 _MAX_SIGMAS = 3.0  # of a point's noise: neighbours that scatter more across their line are of two
 _STALE = 0.02  # of the neighbourhood's radius: points that moved farther look for their lines again
 _SAME = 0.05  # of the same: points that are nearer to each other look once for both
+_Noise = tuple[float, float, float]  # sigma of a point, sigma of a line, `FitOptions.place_part`
 _MAX_LINE_RATIO = 0.1  # smaller over larger eigenvalue of the neighbours' spread: beyond this it is a corner or clutter
 
 
@@ -211,16 +212,23 @@ def _add(H: FloatArray, w: float, jx: float, jy: float, jt: float) -> None:  # p
 
 
 @numba.njit(cache=True)
+def _weigh(lines: FloatArray, i: int, e: float, noise: _Noise, kernel: float) -> tuple[float, float, float]:  # pragma: no cover
+    """Of point ``i``, ``e`` off its line: its robust weight, the factor by which the kernel holds it down, and the line's part of its
+    variance.
+
+    All points in one cell meet the same line, whose error they share: together they know no more than it; and where the map's points are
+    off, so are all lines that they make.
+    """
+    sigma_point, sigma_line, place_part = noise
+    line, place = lines[i, 6] * sigma_line * sigma_line, lines[i, 8] * place_part * lines[i, 5]
+    variance = sigma_point * sigma_point + line + place
+    robust = 1.0 + e * e / (kernel * kernel)
+    return 1.0 / (variance * robust * robust), robust, (line + place) / variance
+
+
+@numba.njit(cache=True)
 def _sum_up(
-    source: FloatArray,
-    lines: FloatArray,
-    pose: FloatArray,
-    sigma_point: float,
-    sigma_line: float,
-    place_part: float,
-    kernel: float,
-    H: FloatArray,
-    g: FloatArray,
+    source: FloatArray, lines: FloatArray, pose: FloatArray, noise: _Noise, kernel: float, H: FloatArray, g: FloatArray
 ) -> tuple[int, float]:  # pragma: no cover
     """The quadratic of the cost around ``pose``, into ``H`` and ``g``; returns the matched points and their weighted sum of squares."""
     H[:], g[:] = 0.0, 0.0
@@ -230,12 +238,7 @@ def _sum_up(
         if lines[i, 0] == 0.0:
             continue
         e, jx, jy, jt = _residual(source, lines, i, pose, c, s)
-        robust = 1.0 + e * e / (kernel * kernel)
-        # All points in one cell meet the same line, whose error they share: together they know no more than it; and where the map's
-        # points are off, so are all lines that they make.
-        w = 1.0 / (
-            (sigma_point * sigma_point + lines[i, 6] * sigma_line * sigma_line + lines[i, 8] * place_part * lines[i, 5]) * robust * robust
-        )
+        w, robust, _ = _weigh(lines, i, e, noise, kernel)
         _add(H, w, jx, jy, jt)
         g[0] -= w * jx * e
         g[1] -= w * jy * e
@@ -277,7 +280,7 @@ def fit_points(
 
     Lines are looked up again where the points have moved by a part of the neighbourhood since they were: near the end, they stay.
     """
-    most_thin = (_MAX_SIGMAS * sigma_point) ** 2
+    most_thin, noise = (_MAX_SIGMAS * sigma_point) ** 2, (sigma_point, sigma_line, place_part)
     home, lines = np.empty(source.shape[0], np.int64), np.empty((source.shape[0], 9))
     reach, moved, n_matched, squares = 0.0, math.inf, 0, 0.0
     for i in range(source.shape[0]):
@@ -287,7 +290,7 @@ def fit_points(
             _associate(cells, points, travels, hits, hit_sums, ages, source, pose, cell, radius, most_thin, since, home, lines)
             moved = 0.0
         kernel = wide_kernel if iteration == 0 else final_kernel
-        n_matched, squares = _sum_up(source, lines, pose, sigma_point, sigma_line, place_part, kernel, H, g)
+        n_matched, squares = _sum_up(source, lines, pose, noise, kernel, H, g)
         if iteration >= iterations or n_matched == 0:
             break
         c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -311,22 +314,15 @@ def fit_points(
         moved += math.hypot(d0, d1) + abs(d2) * reach
         if iteration > 0 and abs(d0) + abs(d1) + abs(d2) < 1e-4:
             iterations = iteration + 1
-    n_on = _spread(source, lines, home, pose, sigma_point, sigma_line, place_part, spread)
+    n_on = _spread(source, lines, home, pose, noise, spread)
     # NaN: nobody asks what of the map is new
-    map_part = 0.0 if math.isnan(since) else _old_part(source, lines, pose, sigma_point, sigma_line, place_part, final_kernel, old)
+    map_part = 0.0 if math.isnan(since) else _old_part(source, lines, pose, noise, final_kernel, old)
     return n_matched, n_on, squares, map_part
 
 
 @numba.njit(cache=True)
 def _old_part(
-    source: FloatArray,
-    lines: FloatArray,
-    pose: FloatArray,
-    sigma_point: float,
-    sigma_line: float,
-    place_part: float,
-    kernel: float,
-    H: FloatArray,
+    source: FloatArray, lines: FloatArray, pose: FloatArray, noise: _Noise, kernel: float, H: FloatArray
 ) -> float:  # pragma: no cover
     """Fills ``H`` (3, 3) with the information of what is not new of the lines; returns which part of all variance is the lines'."""
     H[:] = 0.0
@@ -336,11 +332,9 @@ def _old_part(
         if lines[i, 0] == 0.0:
             continue
         e, jx, jy, jt = _residual(source, lines, i, pose, c, s)
-        robust = 1.0 + e * e / (kernel * kernel)
-        line = lines[i, 6] * sigma_line * sigma_line + lines[i, 8] * place_part * lines[i, 5]
-        w = 1.0 / ((sigma_point * sigma_point + line) * robust * robust)
+        w, _, of_line = _weigh(lines, i, e, noise, kernel)
         total += w
-        of_lines += w * line / (sigma_point * sigma_point + line)
+        of_lines += w * of_line
         _add(H, w * (1.0 - lines[i, 7]), jx, jy, jt)
     H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
     return of_lines / total if total > 0.0 else 0.0
@@ -352,14 +346,13 @@ def _spread(
     lines: FloatArray,
     home: NDArray[np.int64],
     pose: FloatArray,
-    sigma_point: float,
-    sigma_line: float,
-    place_part: float,
+    noise: _Noise,
     spread: FloatArray,
 ) -> int:  # pragma: no cover
-    """Fills ``spread`` (4,), see `Spread`; returns how many points are on their lines: those beyond three sigmas are of something else.
+    """Fills ``spread`` (6,), see `Spread`; returns how many points are on their lines: those beyond three sigmas are of something else.
     A group ends where the scan leaves a cell."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
+    sigma_point, sigma_line, _ = noise
     limit = 9.0 * (sigma_point * sigma_point + sigma_line * sigma_line)
     spread[:] = 0.0
     n_on, n, total, squares, place = 0, 0, 0.0, 0.0, 0.0

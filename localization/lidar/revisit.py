@@ -127,8 +127,7 @@ class Revisits:
         self.track.tie(then)
         place, growth = self.track[then], self.track.growth(then)
         off = se2.log(se2.between(pose, fit.pose))
-        nis = float(off @ np.linalg.solve(growth + fit.cov, off))
-        slip = nis / self._gate * np.outer(off, off) if nis > self._gate else np.zeros((3, 3))
+        slip = slip_of(off, growth + fit.cov, self._gate)
         matched = float(fit.on_map.mean())
         return Revisit(fit.pose, fit.cov, moved(place, pose), growth + slip, slip, place, matched)
 
@@ -280,6 +279,13 @@ class _Search:
         off = se2.log(se2.between(self.pose, found.pose))
         score = float(on_map.mean()) - 0.5 * float(off @ information @ off) / len(self.scan)
         return _Fit(se2.compose(found.pose, se2.exp(cov @ found.gradient)), found.pose, cov, on_map, travels, score)
+
+
+def slip_of(off: FloatArray, cov: FloatArray, gate: float) -> FloatArray:
+    """(3, 3) by which the way was worse than ``cov`` (3, 3) says, where a verified place is ``off`` (3,) by more than ``gate``, in squared
+    sigmas; else zero."""
+    nis = float(off @ np.linalg.solve(cov, off))
+    return nis / gate * np.outer(off, off) if nis > gate else np.zeros((3, 3))
 
 
 def _thinned(points: FloatArray, cell: float) -> FloatArray:

@@ -18,6 +18,8 @@ from localization.logs.chunks import Channel, RawMessage
 from localization.logs.tally import Oddity
 from motion_models.se2 import FloatArray
 
+_KNOWN_NAMES = 100  # nobody's joints change that often, but the memory must not grow
+
 
 class UnusableError(Exception):
     """A message that says nothing. Never leaves this package."""
@@ -147,16 +149,13 @@ def decode_odometry(message: Any, stamp: int) -> OdometryReading:
 
 def joint_decoder(joints: tuple[str, ...]) -> Callable[[Any, int], JointReading | None]:
     """Decoder of joint states for these joints; None for a message that has none of them (an arm's, say)."""
-    places: dict[tuple[str, ...], NDArray[np.intp] | None] = {}
+
+    @lru_cache(_KNOWN_NAMES)
+    def place_of(names: tuple[str, ...]) -> NDArray[np.intp] | None:
+        return np.array([names.index(joint) for joint in joints], dtype=np.intp) if set(joints) <= set(names) else None
 
     def decode(message: Any, stamp: int) -> JointReading | None:
-        names = tuple(message.name)
-        if names not in places:
-            if len(places) >= 100:  # nobody's joints change that often, but the memory must not grow
-                places.clear()
-            has_all = set(joints) <= set(names)
-            places[names] = np.array([names.index(joint) for joint in joints], dtype=np.intp) if has_all else None
-        place = places[names]
+        place = place_of(tuple(message.name))
         if place is None:
             return None
         position, velocity = _at(message.position, place), _at(message.velocity, place)
@@ -175,17 +174,15 @@ def arm_decoder(
     A message without positions, which ROS allows, tells nothing of the arms.
     """
 
-    known: dict[tuple[str, ...], tuple[NDArray[np.intp], tuple[str, ...]]] = {}
+    @lru_cache(_KNOWN_NAMES)
+    def columns_of(names: tuple[str, ...]) -> tuple[NDArray[np.intp], tuple[str, ...]]:
+        found = [i for i, name in enumerate(names) if name in joints]
+        return np.array(found, dtype=np.intp), tuple(names[i] for i in found)
 
     def decode(message: Any, stamp: int) -> ArmReading | JointReading | None:
         reading = None if wheels is None else wheels(message, stamp)
         names = tuple(message.name)
-        if names not in known:
-            if len(known) >= 100:
-                known.clear()
-            found = [i for i, name in enumerate(names) if name in joints]
-            known[names] = np.array(found, dtype=np.intp), tuple(names[i] for i in found)
-        columns, told = known[names]
+        columns, told = columns_of(names)
         position = np.asarray(message.position, dtype=float)
         if not told or not len(position):
             return reading
