@@ -55,6 +55,19 @@ def is_used(ages: Ages, travel: float) -> bool:  # pragma: no cover
 
 
 @numba.njit(cache=True)
+def _stride(n: int) -> int:  # pragma: no cover
+    """Near the golden section of ``n`` and without a common divisor, so that all of ``n`` are met, far from each other in turn."""
+    stride = int(0.6180339887498949 * n)
+    while True:
+        a, b = n, stride
+        while b:
+            a, b = b, a % b
+        if a == 1:
+            return stride
+        stride += 1
+
+
+@numba.njit(cache=True)
 def insert_points(
     cells: NDArray[np.int32],
     points: NDArray[np.float32],
@@ -69,7 +82,10 @@ def insert_points(
 ) -> tuple[int, bool]:  # pragma: no cover
     """Takes how many slots are used; returns how many are then, and whether the table is so full that points were left out."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    for i in range(new.shape[0]):
+    stride = _stride(new.shape[0])
+    i = 0
+    for _ in range(new.shape[0]):
+        i = (i + stride) % new.shape[0]
         x = pose[0] + c * new[i, 0] - s * new[i, 1]
         y = pose[1] + s * new[i, 0] + c * new[i, 1]
         ix, iy = math.floor(x / cell), math.floor(y / cell)

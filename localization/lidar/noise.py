@@ -14,8 +14,9 @@ import numpy as np
 from localization.lidar.lines import Spread
 from motion_models.se2 import FloatArray
 
-_KEPT = 0.98  # of what is known, from scan to scan: the last 50 count
+_KEPT = 0.9
 _GUESSED = 0.5  # of what was only guessed, from scan to scan
+_USUAL = 2.0
 _POSE = 3.0  # degrees of freedom that go into the pose
 _LEAST_M, _LEAST_LINE_M, _LEAST_PART = 1e-3, 1e-4, 0.1
 
@@ -56,6 +57,8 @@ class Noise:
         if freedom > _POSE:
             # the pose takes its part of all that moves the groups' means, whatever it comes from
             left = freedom / spread.between_freedom
-            new = np.array([spread.within, spread.within_freedom, spread.between - left * spread.noise, freedom, left * spread.place])
+            expected = left * (spread.noise + self.place_part * spread.place) + freedom * self.sigma_line**2
+            between = min(spread.between, expected * (1.0 + _USUAL * math.sqrt(2.0 / freedom)))
+            new = np.array([spread.within, spread.within_freedom, between - left * spread.noise, freedom, left * spread.place])
             self._seen = _KEPT * self._seen + new
             self._guess = _GUESSED * self._guess
