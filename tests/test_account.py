@@ -191,6 +191,6 @@ def test_noise_is_what_scans_show() -> None:
             within = ((points - means[:, None]) ** 2).sum(axis=1)
             means = means - fit @ (fit.T @ means)
             noise.see(Spread(within.sum(), 360.0, (means**2).sum(), 40.0, (within / 90.0).sum(), 40.0 * place))
-        assert noise.sigma_point == pytest.approx(0.012, rel=0.02)
+        assert noise.sigmas_of_a_point[0] == pytest.approx(0.012, rel=0.02)
         assert noise.place_part == pytest.approx(part, abs=0.25)
         assert noise.sigma_line == pytest.approx(sigma_line, abs=5e-4)

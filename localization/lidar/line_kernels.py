@@ -15,7 +15,9 @@ _MIN_NEIGHBOURS = 4
 _MAX_SIGMAS = 3.0  # of a point's noise: neighbours that scatter more across their line are of two
 _STALE = 0.02  # of the neighbourhood's radius: points that moved farther look for their lines again
 _SAME = 0.05  # of the same: points that are nearer to each other look once for both
-_Noise = tuple[float, float, float]  # sigma of a point, sigma of a line, `FitOptions.place_part`
+_Noise = tuple[float, float, float, float]  # sigma of a point, the same along its beam, sigma of a line, `FitOptions.place_part`
+_LEAST_WIDE = 1e-4  # [m^2] variance of a line's points along it
+_NOISY = 2.0  # of the information that noise in the lines' directions feigns, so much is taken away
 _MAX_LINE_RATIO = 0.1  # smaller over larger eigenvalue of the neighbours' spread: beyond this it is a corner or clutter
 
 
@@ -61,25 +63,23 @@ def _sums(
 
 @numba.njit(cache=True)
 def _line(
-    near: FloatArray, n_near: int, x: float, y: float, radius: float, most_thin: float, since: float
-) -> tuple[int, float, float, float, float, float, float]:  # pragma: no cover
+    near: FloatArray, n_near: int, x: float, y: float, radius: float, most_thin: float, least_wide: float, since: float
+) -> tuple[int, float, float, float, float, float, float, float, float]:  # pragma: no cover
     """The line of the points around (x, y): how many they are, 0 where they make none; its normal, the distance of (x, y) from it along
-    the normal, the variance of its place there, their mean travelled distance, and the part of them that came ``since``."""
+    the normal, the variance of the points across it and along it, how far along it their mean is, their mean travelled distance, and the
+    part of them that came ``since``."""
     m, new, sx, sy, sxx, sxy, syy, st = _sums(near[0, :n_near], near[1, :n_near], near[2, :n_near], x, y, radius, since)
     if m < _MIN_NEIGHBOURS:
-        return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     mx, my = sx / m, sy / m
     cxx, cxy, cyy = sxx / m - mx * mx, sxy / m - mx * my, syy / m - my * my
     trace, split = cxx + cyy, math.hypot(cxx - cyy, 2.0 * cxy)
     wide, thin = 0.5 * (trace + split), max(0.5 * (trace - split), 0.0)
-    if wide < 1e-4 or thin > min(_MAX_LINE_RATIO * wide, most_thin):
-        return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    if wide < least_wide or thin > min(_MAX_LINE_RATIO * wide, most_thin):
+        return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
     nx, ny = -math.sin(angle), math.cos(angle)
-    along = ny * mx - nx * my
-    # of a regression's residuals, m - 2 are free; beside the points' centre, the line's direction counts, too
-    place = thin / (m - 2.0) * (1.0 + along * along / wide)
-    return int(m), nx, ny, -(nx * mx + ny * my), place, st / m, new / m
+    return int(m), nx, ny, -(nx * mx + ny * my), thin, wide, ny * mx - nx * my, st / m, new / m
 
 
 @numba.njit(cache=True)
@@ -92,7 +92,6 @@ def compare_points(
     pose: FloatArray,
     cell: float,
     radius: float,
-    most_thin: float,
     errors: FloatArray,
     seen: FloatArray,
 ) -> None:  # pragma: no cover
@@ -105,7 +104,7 @@ def compare_points(
         ix, iy = math.floor(x / cell), math.floor(y / cell)
         if ix != at_x or iy != at_y:
             at_x, at_y, n_near = ix, iy, _gather(cells, points, travels, ages, ix, iy, near)
-        m, _, _, e, _, travel, _ = _line(near, n_near, x, y, radius, most_thin, math.inf)
+        m, _, _, e, _, _, _, travel, _ = _line(near, n_near, x, y, radius, math.inf, _LEAST_WIDE, math.inf)
         errors[i], seen[i] = (abs(e), travel) if m else (math.nan, math.nan)
 
 
@@ -121,17 +120,21 @@ def _associate(
     pose: FloatArray,
     cell: float,
     radius: float,
-    most_thin: float,
+    noise: _Noise,
     since: float,
     home: NDArray[np.int64],
     lines: FloatArray,
 ) -> None:  # pragma: no cover
-    """Fills ``lines`` (N, 9) for the points ``source`` (N, 2) at ``pose``: how many points make the line (0: none), its normal, a point on
+    """Fills ``lines`` (N, 11) for the points ``source`` (N, 2) at ``pose``: how many points make the line (0: none), its normal, a point on
     it, the variance of its place, how many of ``source`` are in its cell, ``home`` (N,), below 0 where the map has none, the part of
-    the line's points that came ``since``, and how many of ``source`` meet the same line's points.
+    the line's points that came ``since``, how many of ``source`` meet the same line's points, the squared cosine between its normal
+    and the beam, and the variance of its direction.
 
     Lines are of the map's points within ``radius``, so lines that are d apart along a wall share the part 1 - d / (2 radius) of them, and
     their errors are as much alike: the points of each neighbouring cell count for that part, from their mean."""
+    scatter = noise[0] * noise[0] + noise[1] * noise[1]
+    # points that a robot at rest sees on one spot are in line with the beam, not with the wall
+    most_thin, least_wide = _MAX_SIGMAS**2 * scatter, max(_LEAST_WIDE, scatter / _MAX_LINE_RATIO)
     near, n_near, slot = np.empty((3, 9 * points.shape[1])), 0, -1
     at_x, at_y = math.inf, math.inf
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -147,11 +150,14 @@ def _associate(
             lines[i] = lines[i - 1]
         else:
             last_x, last_y = x, y
-            m, nx, ny, e, place, _, new = _line(near, n_near, x, y, radius, most_thin, since)
+            m, nx, ny, e, thin, wide, along, _, new = _line(near, n_near, x, y, radius, most_thin, least_wide, since)
             lines[i, 0] = m
             if m:
-                lines[i, 1], lines[i, 2], lines[i, 3], lines[i, 4], lines[i, 5] = nx, ny, x - e * nx, y - e * ny, place
-                lines[i, 7] = new
+                lines[i, 1], lines[i, 2], lines[i, 3], lines[i, 4] = nx, ny, x - e * nx, y - e * ny
+                facing = (nx * (x - pose[0]) + ny * (y - pose[1])) ** 2 / ((x - pose[0]) ** 2 + (y - pose[1]) ** 2)
+                center = thin / (m - 2.0)
+                turn = center / wide  # of a regression: beside the points' centre, the line's direction counts, too
+                lines[i, 5], lines[i, 7], lines[i, 9], lines[i, 10] = center + along * along * turn, new, facing, turn
         home[i] = slot
         if slot >= 0:
             hits[slot] += 1
@@ -212,6 +218,13 @@ def _add(H: FloatArray, w: float, jx: float, jy: float, jt: float) -> None:  # p
 
 
 @numba.njit(cache=True)
+def _of_point(lines: FloatArray, i: int, noise: _Noise) -> float:  # pragma: no cover
+    """The variance of point ``i`` across its line: most of a LiDAR's noise is along the beam, and a beam that grazes a wall tells well
+    where it is."""
+    return noise[0] * noise[0] + lines[i, 9] * noise[1] * noise[1]
+
+
+@numba.njit(cache=True)
 def _weigh(lines: FloatArray, i: int, e: float, noise: _Noise, kernel: float) -> tuple[float, float, float]:  # pragma: no cover
     """Of point ``i``, ``e`` off its line: its robust weight, the factor by which the kernel holds it down, and the line's part of its
     variance.
@@ -219,9 +232,9 @@ def _weigh(lines: FloatArray, i: int, e: float, noise: _Noise, kernel: float) ->
     All points in one cell meet the same line, whose error they share: together they know no more than it; and where the map's points are
     off, so are all lines that they make.
     """
-    sigma_point, sigma_line, place_part = noise
+    _, _, sigma_line, place_part = noise
     line, place = lines[i, 6] * sigma_line * sigma_line, lines[i, 8] * place_part * lines[i, 5]
-    variance = sigma_point * sigma_point + line + place
+    variance = _of_point(lines, i, noise) + line + place
     robust = 1.0 + e * e / (kernel * kernel)
     return 1.0 / (variance * robust * robust), robust, (line + place) / variance
 
@@ -262,6 +275,7 @@ def fit_points(
     cell: float,
     radius: float,
     sigma_point: float,
+    sigma_beam: float,
     sigma_line: float,
     place_part: float,
     final_kernel: float,
@@ -273,21 +287,22 @@ def fit_points(
     H: FloatArray,
     g: FloatArray,
     spread: FloatArray,
+    information: FloatArray,
     old: FloatArray,
 ) -> tuple[int, int, float, float]:  # pragma: no cover
-    """Changes ``pose``, ``H`` and ``g`` in place; returns the matched points, those on their lines, the weighted sum of squares, and what
-    `_old_part` says.
+    """Changes ``pose``, ``H``, ``g`` and the last three in place; returns the matched points, those on their lines, the weighted sum of squares, and what
+    `_information` says.
 
     Lines are looked up again where the points have moved by a part of the neighbourhood since they were: near the end, they stay.
     """
-    most_thin, noise = (_MAX_SIGMAS * sigma_point) ** 2, (sigma_point, sigma_line, place_part)
-    home, lines = np.empty(source.shape[0], np.int64), np.empty((source.shape[0], 9))
+    noise = sigma_point, sigma_beam, sigma_line, place_part
+    home, lines = np.empty(source.shape[0], np.int64), np.empty((source.shape[0], 11))
     reach, moved, n_matched, squares = 0.0, math.inf, 0, 0.0
     for i in range(source.shape[0]):
         reach = max(reach, math.hypot(source[i, 0], source[i, 1]))
     for iteration in range(iterations + 1):
         if moved > _STALE * radius:
-            _associate(cells, points, travels, hits, hit_sums, ages, source, pose, cell, radius, most_thin, since, home, lines)
+            _associate(cells, points, travels, hits, hit_sums, ages, source, pose, cell, radius, noise, since, home, lines)
             moved = 0.0
         kernel = wide_kernel if iteration == 0 else final_kernel
         n_matched, squares = _sum_up(source, lines, pose, noise, kernel, H, g)
@@ -315,17 +330,23 @@ def fit_points(
         if iteration > 0 and abs(d0) + abs(d1) + abs(d2) < 1e-4:
             iterations = iteration + 1
     n_on = _spread(source, lines, home, pose, noise, spread)
-    # NaN: nobody asks what of the map is new
-    map_part = 0.0 if math.isnan(since) else _old_part(source, lines, pose, noise, final_kernel, old)
+    map_part = _information(source, lines, pose, noise, final_kernel, information, old)
+    if math.isnan(since):  # nobody asks what of the map is new
+        old[:], map_part = 0.0, 0.0
     return n_matched, n_on, squares, map_part
 
 
 @numba.njit(cache=True)
-def _old_part(
-    source: FloatArray, lines: FloatArray, pose: FloatArray, noise: _Noise, kernel: float, H: FloatArray
+def _information(
+    source: FloatArray, lines: FloatArray, pose: FloatArray, noise: _Noise, kernel: float, H: FloatArray, old: FloatArray
 ) -> float:  # pragma: no cover
-    """Fills ``H`` (3, 3) with the information of what is not new of the lines; returns which part of all variance is the lines'."""
-    H[:] = 0.0
+    """Fills ``H`` (3, 3) with the information of the lines, and ``old`` with that of what is not new of them; returns which part of all
+    variance is the lines'.
+
+    A line's direction is estimated. Its noise makes walls that are parallel look as if they were not quite, and in the sum of squares that
+    counts as knowledge along them; what it amounts to by expectation, and more for it scatters, is taken away.
+    """
+    H[:], old[:] = 0.0, 0.0
     c, s = math.cos(pose[2]), math.sin(pose[2])
     total, of_lines = 0.0, 0.0
     for i in range(source.shape[0]):
@@ -335,8 +356,13 @@ def _old_part(
         w, _, of_line = _weigh(lines, i, e, noise, kernel)
         total += w
         of_lines += w * of_line
-        _add(H, w * (1.0 - lines[i, 7]), jx, jy, jt)
+        w_turned, turned = -_NOISY * w * lines[i, 10], jx * source[i, 0] + jy * source[i, 1]
+        _add(H, w, jx, jy, jt)
+        _add(H, w_turned, -jy, jx, turned)
+        _add(old, w * (1.0 - lines[i, 7]), jx, jy, jt)
+        _add(old, w_turned * (1.0 - lines[i, 7]), -jy, jx, turned)
     H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
+    old[1, 0], old[2, 0], old[2, 1] = old[0, 1], old[0, 2], old[1, 2]
     return of_lines / total if total > 0.0 else 0.0
 
 
@@ -349,13 +375,12 @@ def _spread(
     noise: _Noise,
     spread: FloatArray,
 ) -> int:  # pragma: no cover
-    """Fills ``spread`` (6,), see `Spread`; returns how many points are on their lines: those beyond three sigmas are of something else.
+    """Fills ``spread`` (9,), see `Spread`; returns how many points are on their lines: those beyond three sigmas are of something else.
     A group ends where the scan leaves a cell."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    sigma_point, sigma_line, _ = noise
-    limit = 9.0 * (sigma_point * sigma_point + sigma_line * sigma_line)
+    line = noise[2] * noise[2]
     spread[:] = 0.0
-    n_on, n, total, squares, place = 0, 0, 0.0, 0.0, 0.0
+    n_on, n, total, squares, place, facing = 0, 0, 0.0, 0.0, 0.0, 0.0
     for i in range(source.shape[0] + 1):
         is_end = i == source.shape[0]
         if n and (is_end or home[i] != home[i - 1]):
@@ -367,14 +392,18 @@ def _spread(
                 spread[3] += 1.0
                 spread[4] += within / (n - 1) / n
                 spread[5] += place / n
-            n, total, squares, place = 0, 0.0, 0.0, 0.0
+                spread[6] += (n - 1) * (facing / n)
+                spread[7] += (n - 1) * (facing / n) ** 2
+                spread[8] += within * (facing / n)
+            n, total, squares, place, facing = 0, 0.0, 0.0, 0.0, 0.0
         if is_end or lines[i, 0] == 0.0:
             continue
         e, _, _, _ = _residual(source, lines, i, pose, c, s)
-        if e * e < limit + 9.0 * lines[i, 5]:
+        if e * e < 9.0 * (_of_point(lines, i, noise) + line + lines[i, 5]):
             n_on += 1
             n += 1
             total += e
             squares += e * e
             place += lines[i, 5]
+            facing += lines[i, 9]
     return n_on

@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from localization.lidar.cells import ALL_AGES, POINTS_PER_CELL, Ages, ages_between, copy_cells, insert_points, keep_until
 from localization.lidar.line_kernels import compare_points, fit_points
+from localization.lidar.track import positive_part
+from motion_models import se2
 from motion_models.se2 import FloatArray
+
+# Where the scene holds nothing, the measurement's sigma: metres, metres, radians. It decides nothing, it only keeps numbers finite.
+_KNOWS_NOTHING = np.array([10.0, 10.0, 3.0])
+_LEVER_M = 5.0  # by which a turn is compared with a shift
 
 
 @dataclass(frozen=True)
@@ -31,16 +37,24 @@ class Spread:
     """What the noise of their points makes of those squares [m^2]."""
     place: float = 0.0
     """What the map's points would, if they scattered about their lines by chance [m^2]."""
+    facing: float = 0.0
+    """Sum over the points within groups of the squared cosine between beam and normal."""
+    facing_squared: float = 0.0
+    """Sum of its square."""
+    within_facing: float = 0.0
+    """Squares of the points' distances from their group's mean, times it [m^2]."""
 
 
 @dataclass(frozen=True)
 class LineFit:
-    """The point-to-line cost around one pose, as a quadratic in its right perturbation d: const - gradient d + d H d / 2."""
+    """The point-to-line cost around one pose, as a quadratic in its right perturbation d: const - gradient d + d curvature d / 2."""
 
     pose: FloatArray
     """(3,) where the cost was expanded."""
     information: FloatArray
-    """(3, 3) H: the information of the points about the pose, nothing else."""
+    """(3, 3) of the points about the pose, nothing else: the curvature without what the noise of the lines' directions feigns."""
+    curvature: FloatArray
+    """(3, 3) of the cost."""
     gradient: FloatArray
     """(3,) downhill direction at ``pose``."""
     n_matched: int
@@ -54,6 +68,12 @@ class LineFit:
     """(3, 3) the part of `information` that comes from points of the map that were not added by the last scan."""
     map_part: float
     """Which part of the variance of the pose is the error of the map's lines, not of the scan's points."""
+
+    def measurement(self) -> tuple[FloatArray, FloatArray]:
+        """Pose (3,) of the least cost and its covariance (3, 3), wide open along what the points do not hold."""
+        nothing = np.diag(_KNOWS_NOTHING**-2)
+        cov = np.linalg.inv(self.information + nothing).astype(np.float64, copy=False)
+        return se2.compose(self.pose, se2.exp(np.linalg.solve(self.curvature + nothing, self.gradient))), cov
 
 
 class LineMap:
@@ -141,8 +161,8 @@ class LineMap:
         where they were; it is no part of the returned quadratic. Only points of these ``ages`` count. Those added at a travelled distance
         of ``since`` [m] or later are the new ones; with NaN, nobody asks, and `LineFit.old` and `LineFit.map_part` are zero.
         """
-        information, gradient, pose, spread = np.zeros((3, 3)), np.zeros(3), np.array(start, dtype=float), np.zeros(6)
-        old = np.zeros((3, 3))
+        information, gradient, pose, spread = np.zeros((3, 3)), np.zeros(3), np.array(start, dtype=float), np.zeros(9)
+        curvature, old = np.zeros((3, 3)), np.zeros((3, 3))
         n, n_on, squares, map_part = fit_points(
             self._cells,
             self._points,
@@ -155,6 +175,7 @@ class LineMap:
             self._cell,
             options.radius,
             options.sigma_point,
+            options.sigma_beam,
             options.sigma_line,
             options.place_part,
             options.kernel,
@@ -163,20 +184,22 @@ class LineMap:
             prior,
             center,
             since,
-            information,
+            curvature,
             gradient,
             spread,
+            information,
             old,
         )
-        return LineFit(
-            pose, information, gradient, n, n_on, math.sqrt(squares / n) if n else math.nan, Spread(*spread.tolist()), old, map_part
-        )
+        rms = math.sqrt(squares / n) if n else math.nan
+        old = _known(old)
+        information = old + _known(information - old)
+        return LineFit(pose, information, curvature, gradient, n, n_on, rms, Spread(*spread.tolist()), old, map_part)
 
     def compare(self, points: FloatArray, pose: FloatArray, radius: float, ages: Ages = ALL_AGES) -> tuple[FloatArray, FloatArray]:
         """How far ``points`` (N, 2) of the body frame at ``pose`` (3,) are off the lines within ``radius`` [m] of them, and when those
         were seen: distances (N,) [m] and travelled distances (N,) [m], NaN for points without a line of these ``ages``."""
         errors, travels = np.empty(len(points)), np.empty(len(points))
-        compare_points(self._cells, self._points, self._travels, ages, points, pose, self._cell, radius, math.inf, errors, travels)
+        compare_points(self._cells, self._points, self._travels, ages, points, pose, self._cell, radius, errors, travels)
         return errors, travels
 
     def points_within(self, center: FloatArray, half: float) -> tuple[FloatArray, FloatArray]:
@@ -193,12 +216,21 @@ class LineMap:
         return self._points[np.arange(POINTS_PER_CELL) < self._cells[:, 2][:, None]].astype(float)
 
 
+def _known(information: FloatArray) -> FloatArray:
+    """What is left of ``information`` (3, 3) where something was taken away from it: nothing along some directions, never less."""
+    (a, b, c), (_, d, e), (_, _, f) = information.tolist()
+    if a > 0.0 and a * d > b * b and a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d) > 0.0:
+        return information
+    scale = np.array([1.0, 1.0, _LEVER_M])
+    return positive_part(information / np.outer(scale, scale)) * np.outer(scale, scale)
+
+
 @dataclass(frozen=True)
 class FitOptions:
     radius: float
     """Neighbours within this distance of a point make its line [m]."""
     sigma_point: float
-    """Noise of one LiDAR point [m]."""
+    """Noise of one LiDAR point, whichever way its beam came [m]."""
     sigma_line: float
     """Error of a line of the map, shared by all points that meet it in one cell [m]."""
     kernel: float
@@ -207,5 +239,7 @@ class FitOptions:
     """The same for the first step: it sees farther, and is not so easily caught by the wrong line [m]."""
     iterations: int
     """Gauss-Newton steps at most."""
+    sigma_beam: float = 0.0
+    """Further noise of it along its beam [m]."""
     place_part: float = 1.0
     """Part of `Spread.place` that is there: the map takes no second point beside one that it has, and so evens out its points' noise."""

@@ -20,8 +20,6 @@ _FEW_POINTS = 10
 _DEGENERATE = 0.02  # smaller over larger variance of the position; rooms: 0.2 and more
 _SURPRISE = 0.05
 _APART_M = 1e-4  # scans drawn on one spot are told apart by this
-# Where the scene holds nothing, the measurement's sigma: metres, metres, radians. It decides nothing, it only keeps numbers finite.
-_KNOWS_NOTHING = np.array([10.0, 10.0, 3.0])
 
 
 @dataclass(frozen=True)
@@ -165,14 +163,15 @@ class LidarMatcher:
         if abs(self._noise.sigma_line - believed) > _SURPRISE * believed:
             # the first scans show that the map is better or worse than was guessed
             fit = lines.fit(self._planar, fit.pose, self._fit_options(), prior, guess, self._ages, since)
-        cov = np.linalg.inv(fit.information + np.diag(_KNOWS_NOTHING**-2)).astype(np.float64, copy=False)
-        pose = se2.compose(fit.pose, se2.exp(cov @ fit.gradient))
+        pose, cov = fit.measurement()
         tie = MapTie(cov @ fit.old, fit.map_part * cov)
         return Registration(pose, cov, len(self._planar), fit.n_on, fit.residual_rms, tie)
 
     def _fit_options(self) -> FitOptions:
+        noise = self._noise
+        sigma_point, sigma_beam = noise.sigmas_of_a_point
         return replace(
-            self._options, sigma_point=self._noise.sigma_point, sigma_line=self._noise.sigma_line, place_part=self._noise.place_part
+            self._options, sigma_point=sigma_point, sigma_beam=sigma_beam, sigma_line=noise.sigma_line, place_part=noise.place_part
         )
 
     def insert(self, pose: FloatArray) -> None:

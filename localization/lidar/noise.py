@@ -14,9 +14,9 @@ import numpy as np
 from localization.lidar.lines import Spread
 from motion_models.se2 import FloatArray
 
-_KEPT = 0.9
+_KEPT = 0.9  # of what is known, from scan to scan: the last 10 count, for a map grows surer while it is drawn
 _GUESSED = 0.5  # of what was only guessed, from scan to scan
-_USUAL = 2.0
+_RIDGE = 0.002  # where all walls are seen alike, who knows which way points are off
 _POSE = 3.0  # degrees of freedom that go into the pose
 _LEAST_M, _LEAST_LINE_M, _LEAST_PART = 1e-3, 1e-4, 0.1
 
@@ -26,29 +26,35 @@ class Noise:
 
     def __init__(self, sigma_point: float, sigma_line: float) -> None:
         """Sigmas [m] that are guessed."""
-        self._guess = np.array([sigma_point**2, 1.0, sigma_line**2, 1.0, 0.0])
-        self._seen = np.zeros(5)
+        self._guess = np.array([sigma_point**2, 1.0, 0.0, 0.0, 0.0, sigma_line**2, 1.0, 0.0])
+        self._seen = np.zeros(8)
 
     @property
     def _sums(self) -> FloatArray:
         return self._guess + self._seen
 
     @property
-    def sigma_point(self) -> float:
-        """Of one point about its line [m]."""
-        squares, freedom, *_ = self._sums
-        return max(math.sqrt(squares / freedom), _LEAST_M)
+    def sigmas_of_a_point(self) -> tuple[float, float]:
+        """About its line [m]: whichever way its beam came, and further along the beam. By weighted least squares of groups' squares over
+        the squared cosine between beam and normal, neither below zero."""
+        squares, freedom, facing, facing_squared, squares_facing, *_ = self._sums
+        slope = squares_facing - facing * squares / freedom
+        along = max(slope / (facing_squared - facing * facing / freedom + _RIDGE * freedom), 0.0)
+        across = (squares - along * facing) / freedom
+        if across < 0.0:
+            across, along = 0.0, squares_facing / facing_squared
+        return max(math.sqrt(across), _LEAST_M), math.sqrt(along)
 
     @property
     def sigma_line(self) -> float:
         """Of a line of the map beyond `place_part`, shared by all points that meet it in one cell [m]."""
-        _, _, squares, freedom, place = self._sums
+        *_, squares, freedom, place = self._sums
         return max(math.sqrt(max(squares - place, 0.0) / freedom), _LEAST_LINE_M)
 
     @property
     def place_part(self) -> float:
         """Which part of the error that a line would have if the map's points scattered by chance it has."""
-        _, _, squares, _, place = self._sums
+        *_, squares, _, place = self._sums
         return 1.0 if squares >= place else max(squares / place, _LEAST_PART)
 
     def see(self, spread: Spread) -> None:
@@ -57,8 +63,7 @@ class Noise:
         if freedom > _POSE:
             # the pose takes its part of all that moves the groups' means, whatever it comes from
             left = freedom / spread.between_freedom
-            expected = left * (spread.noise + self.place_part * spread.place) + freedom * self.sigma_line**2
-            between = min(spread.between, expected * (1.0 + _USUAL * math.sqrt(2.0 / freedom)))
-            new = np.array([spread.within, spread.within_freedom, between - left * spread.noise, freedom, left * spread.place])
+            of_points = [spread.within, spread.within_freedom, spread.facing, spread.facing_squared, spread.within_facing]
+            new = np.array([*of_points, spread.between - left * spread.noise, freedom, left * spread.place])
             self._seen = _KEPT * self._seen + new
             self._guess = _GUESSED * self._guess

@@ -24,7 +24,6 @@ from localization.lidar.track import Place, Track, moved
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
-_KNOWS_NOTHING = np.array([10.0, 10.0, 3.0])
 _MOST_RECENT = 40  # keyframes, where the robot turns and goes nowhere
 _MOST_POINTS = 150  # in the search
 _STARTS, _MOST_RIVALS = 4, 100
@@ -273,12 +272,12 @@ class _Search:
     def fit(self, start: FloatArray) -> _Fit:
         information = np.asarray(np.linalg.inv(self.prior), dtype=float)
         found = self.lines.fit(self.scan, start, self.options, information, self.pose, self.ages)
-        cov = np.asarray(np.linalg.inv(found.information + np.diag(_KNOWS_NOTHING**-2)), dtype=float)
+        best, cov = found.measurement()
         errors, travels = self.lines.compare(self.scan, found.pose, self.options.radius, self.ages)
         on_map = errors < self.options.kernel
         off = se2.log(se2.between(self.pose, found.pose))
         score = float(on_map.mean()) - 0.5 * float(off @ information @ off) / len(self.scan)
-        return _Fit(se2.compose(found.pose, se2.exp(cov @ found.gradient)), found.pose, cov, on_map, travels, score)
+        return _Fit(best, found.pose, cov, on_map, travels, score)
 
 
 def slip_of(off: FloatArray, cov: FloatArray, gate: float) -> FloatArray:
