@@ -97,16 +97,15 @@ def test_points_of_one_cell_know_no_more_than_their_line() -> None:
 )
 def test_the_covariance_opens_along_what_the_scene_does_not_hold(walls: np.ndarray, start, free: bool) -> None:
     _, _, found = mapped(walls, rooms.path((1.5, 0.0, 0.0)), start=start, scanner=rooms.Beams(longest=20.0))
-    heading = start[2]
-    R = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]])
-    along, across = np.sqrt(np.diag(R @ found.cov[:2, :2] @ R.T))
+    (low, high), axes = np.linalg.eigh(found.cov[:2, :2])
     assert found.is_trusted
     assert found.is_degenerate == free
-    assert across < 0.01
+    assert math.sqrt(low) < 0.01
     if free:
-        assert along > 1.0
+        assert abs(axes[:, 1] @ [math.cos(start[2]), -math.sin(start[2])]) > math.cos(0.01)  # along the walls
+        assert math.sqrt(high) > 1.0
     else:
-        assert along < 0.01
+        assert math.sqrt(high) < 0.01
 
 
 def test_registrations_are_as_good_as_they_say() -> None:

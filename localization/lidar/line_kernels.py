@@ -17,7 +17,7 @@ _STALE = 0.02  # of the neighbourhood's radius: points that moved farther look f
 _SAME = 0.05  # of the same: points that are nearer to each other look once for both
 _Noise = tuple[float, float, float, float]  # sigma of a point, the same along its beam, sigma of a line, `FitOptions.place_part`
 _LEAST_WIDE = 1e-4  # [m^2] variance of a line's points along it
-_NOISY = 2.0  # of the information that noise in the lines' directions feigns, so much is taken away
+_NOISY = 2.0  # the information that noise in the lines' directions feigns scatters about what it amounts to by expectation
 _MAX_LINE_RATIO = 0.1  # smaller over larger eigenvalue of the neighbours' spread: beyond this it is a corner or clutter
 
 
@@ -287,11 +287,12 @@ def fit_points(
     H: FloatArray,
     g: FloatArray,
     spread: FloatArray,
-    information: FloatArray,
+    feigned: FloatArray,
+    of_map: FloatArray,
     old: FloatArray,
-) -> tuple[int, int, float, float]:  # pragma: no cover
-    """Changes ``pose``, ``H``, ``g`` and the last three in place; returns the matched points, those on their lines, the weighted sum of squares, and what
-    `_information` says.
+) -> tuple[int, int, float]:  # pragma: no cover
+    """Changes ``pose``, ``H``, ``g`` and the last four (see `_spread` and `_parts`) in place; returns the matched points, those on their lines,
+    and the weighted sum of squares.
 
     Lines are looked up again where the points have moved by a part of the neighbourhood since they were: near the end, they stay.
     """
@@ -330,40 +331,39 @@ def fit_points(
         if iteration > 0 and abs(d0) + abs(d1) + abs(d2) < 1e-4:
             iterations = iteration + 1
     n_on = _spread(source, lines, home, pose, noise, spread)
-    map_part = _information(source, lines, pose, noise, final_kernel, information, old)
-    if math.isnan(since):  # nobody asks what of the map is new
-        old[:], map_part = 0.0, 0.0
-    return n_matched, n_on, squares, map_part
+    _parts(source, lines, pose, noise, final_kernel, feigned, of_map, old)
+    return n_matched, n_on, squares
 
 
 @numba.njit(cache=True)
-def _information(
-    source: FloatArray, lines: FloatArray, pose: FloatArray, noise: _Noise, kernel: float, H: FloatArray, old: FloatArray
-) -> float:  # pragma: no cover
-    """Fills ``H`` (3, 3) with the information of the lines, and ``old`` with that of what is not new of them; returns which part of all
-    variance is the lines'.
+def _parts(
+    source: FloatArray,
+    lines: FloatArray,
+    pose: FloatArray,
+    noise: _Noise,
+    kernel: float,
+    feigned: FloatArray,
+    of_map: FloatArray,
+    old: FloatArray,
+) -> None:  # pragma: no cover
+    """Fills (3, 3) parts of the cost's curvature: ``feigned`` by the noise of the lines' directions, ``of_map`` the part by which errors
+    of the lines weigh, ``old`` what is not new of the lines.
 
-    A line's direction is estimated. Its noise makes walls that are parallel look as if they were not quite, and in the sum of squares that
-    counts as knowledge along them; what it amounts to by expectation, and more for it scatters, is taken away.
+    A line's direction is estimated. Its noise makes walls that are parallel look as if they were not quite, and in a sum of squares that
+    looks like knowledge of the place along them. What it amounts to is known by expectation; it scatters, so that more of it is feigned.
     """
-    H[:], old[:] = 0.0, 0.0
+    feigned[:], of_map[:], old[:] = 0.0, 0.0, 0.0
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    total, of_lines = 0.0, 0.0
     for i in range(source.shape[0]):
         if lines[i, 0] == 0.0:
             continue
         e, jx, jy, jt = _residual(source, lines, i, pose, c, s)
         w, _, of_line = _weigh(lines, i, e, noise, kernel)
-        total += w
-        of_lines += w * of_line
-        w_turned, turned = -_NOISY * w * lines[i, 10], jx * source[i, 0] + jy * source[i, 1]
-        _add(H, w, jx, jy, jt)
-        _add(H, w_turned, -jy, jx, turned)
+        _add(feigned, _NOISY * w * lines[i, 10], -jy, jx, jx * source[i, 0] + jy * source[i, 1])
+        _add(of_map, w * of_line, jx, jy, jt)
         _add(old, w * (1.0 - lines[i, 7]), jx, jy, jt)
-        _add(old, w_turned * (1.0 - lines[i, 7]), -jy, jx, turned)
-    H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
-    old[1, 0], old[2, 0], old[2, 1] = old[0, 1], old[0, 2], old[1, 2]
-    return of_lines / total if total > 0.0 else 0.0
+    for M in (feigned, of_map, old):
+        M[1, 0], M[2, 0], M[2, 1] = M[0, 1], M[0, 2], M[1, 2]
 
 
 @numba.njit(cache=True)

@@ -19,7 +19,7 @@ from motion_models import se2
 from motion_models.se2 import FloatArray
 
 # Where the scene holds nothing, the measurement's sigma: metres, metres, radians. It decides nothing, it only keeps numbers finite.
-_KNOWS_NOTHING = np.array([10.0, 10.0, 3.0])
+_NOTHING = np.diag([10.0**-2, 10.0**-2, 3.0**-2])
 _LEVER_M = 5.0  # by which a turn is compared with a shift
 
 
@@ -66,14 +66,13 @@ class LineFit:
     spread: Spread
     old: FloatArray
     """(3, 3) the part of `information` that comes from points of the map that were not added by the last scan."""
-    map_part: float
-    """Which part of the variance of the pose is the error of the map's lines, not of the scan's points."""
+    of_map: FloatArray
+    """(3, 3) the part of `information` by which errors of the map's lines, not of the scan's points, enter the pose."""
 
     def measurement(self) -> tuple[FloatArray, FloatArray]:
         """Pose (3,) of the least cost and its covariance (3, 3), wide open along what the points do not hold."""
-        nothing = np.diag(_KNOWS_NOTHING**-2)
-        cov = np.linalg.inv(self.information + nothing).astype(np.float64, copy=False)
-        return se2.compose(self.pose, se2.exp(np.linalg.solve(self.curvature + nothing, self.gradient))), cov
+        cov = np.linalg.inv(self.information + _NOTHING).astype(np.float64, copy=False)
+        return se2.compose(self.pose, se2.exp(np.linalg.solve(self.curvature + _NOTHING, self.gradient))), cov
 
 
 class LineMap:
@@ -159,11 +158,11 @@ class LineMap:
 
         ``prior`` (3, 3) is the information of a pull towards ``center`` (3,), which keeps directions that the scene does not hold
         where they were; it is no part of the returned quadratic. Only points of these ``ages`` count. Those added at a travelled distance
-        of ``since`` [m] or later are the new ones; with NaN, nobody asks, and `LineFit.old` and `LineFit.map_part` are zero.
+        of ``since`` [m] or later are the new ones; with NaN, none is.
         """
-        information, gradient, pose, spread = np.zeros((3, 3)), np.zeros(3), np.array(start, dtype=float), np.zeros(9)
-        curvature, old = np.zeros((3, 3)), np.zeros((3, 3))
-        n, n_on, squares, map_part = fit_points(
+        gradient, pose, spread = np.zeros(3), np.array(start, dtype=float), np.zeros(9)
+        curvature, feigned, of_map, old = np.zeros((4, 3, 3))
+        n, n_on, squares = fit_points(
             self._cells,
             self._points,
             self._travels,
@@ -187,13 +186,18 @@ class LineMap:
             curvature,
             gradient,
             spread,
-            information,
+            feigned,
+            of_map,
             old,
         )
+        information = curvature - feigned
+        shrink = np.eye(3)
+        if n:
+            information = _known(information)
+            shrink = np.linalg.cholesky(information + _NOTHING) @ np.linalg.inv(np.linalg.cholesky(curvature + _NOTHING))
+        of_map, old = shrink @ of_map @ shrink.T, shrink @ old @ shrink.T
         rms = math.sqrt(squares / n) if n else math.nan
-        old = _known(old)
-        information = old + _known(information - old)
-        return LineFit(pose, information, curvature, gradient, n, n_on, rms, Spread(*spread.tolist()), old, map_part)
+        return LineFit(pose, information, curvature, gradient, n, n_on, rms, Spread(*spread.tolist()), old, of_map)
 
     def compare(self, points: FloatArray, pose: FloatArray, radius: float, ages: Ages = ALL_AGES) -> tuple[FloatArray, FloatArray]:
         """How far ``points`` (N, 2) of the body frame at ``pose`` (3,) are off the lines within ``radius`` [m] of them, and when those

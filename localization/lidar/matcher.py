@@ -164,7 +164,7 @@ class LidarMatcher:
             # the first scans show that the map is better or worse than was guessed
             fit = lines.fit(self._planar, fit.pose, self._fit_options(), prior, guess, self._ages, since)
         pose, cov = fit.measurement()
-        tie = MapTie(cov @ fit.old, fit.map_part * cov)
+        tie = MapTie(cov @ fit.old, cov @ fit.of_map @ cov)
         return Registration(pose, cov, len(self._planar), fit.n_on, fit.residual_rms, tie)
 
     def _fit_options(self) -> FitOptions:
