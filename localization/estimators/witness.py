@@ -74,7 +74,7 @@ class ScanWitness:
         slip.advance(step.duration, step.predicted.cov)
         rate = slip.rate
         change, self._twist = step.twist - self._twist, step.twist
-        found = self._matcher.register(sweep.at_stamp(step.twist + rate), sweep.is_planar, guess, step.predicted.cov)
+        found = self._matcher.register(sweep.at_stamp(step.twist + rate), sweep.is_planar, guess, step.predicted.cov, sweep.offsets)
         if found is None:
             return None
         since_s = (step.end_ns - self._last_ns) * 1e-9 if self._last_ns >= 0 else 0.0
@@ -86,25 +86,26 @@ class ScanWitness:
             off = se2.log(se2.between(se2.compose(anchor, step.predicted.delta), found.pose))
             gain = slip.measure(off / step.duration, np.diag(found.cov) / step.duration**2)
             if sweep.shift(slip.rate - rate) > self._matcher.config.max_shift_m:  # the sweep looked otherwise than was thought
-                found = self._matcher.refine(sweep.at_stamp(step.twist + slip.rate), sweep.is_planar, found.pose) or found
+                found = self._matcher.refine(sweep.at_stamp(step.twist + slip.rate), sweep.is_planar, found.pose, sweep.offsets) or found
                 rate = slip.rate
-        swept = self._swept(step, sweep.lateness, gain, change, slip.rate - rate)
+        swept = self._swept(step, found.lateness, sweep.lateness, gain, change, slip.rate - rate)
         tie = replace(found.tie, sweep=swept)
         return Sight(Motion(se2.between(anchor, found.pose), found.cov), found.is_trusted, tie)
 
-    def _swept(self, step: Step, late: float, gain: FloatArray, change: FloatArray, missed: FloatArray) -> FloatArray:
+    def _swept(self, step: Step, B: FloatArray, late: float, gain: FloatArray, change: FloatArray, missed: FloatArray) -> FloatArray:
         """(3, 3) what a motion within the sweep other than was thought does to the pose.
 
-        Points are seen ``late`` [s] after the stamp in the mean, so a twist that is off by d moves the pose by ``late`` d. It is off as the
-        slip was measured over the step and the sweep's is a later one, as the wheels turn otherwise meanwhile (they did by ``change``
-        within the step), and by what of the slip was ``missed``. But the slip was measured, with ``gain`` (3,), by the way to this very
-        pose, so that d is in it already, by ``late`` over the step's duration.
+        A twist that is off by d moves the pose by ``B`` d (`Registration.lateness`). It is off as the slip was measured over the step and
+        the sweep's is a later one, as the wheels turn otherwise ``late`` [s] after the stamp (they did by ``change`` within the step), and
+        by what of the slip was ``missed``. But the slip was measured, with ``gain`` (3,), by the way to this very pose, so that d is in it
+        already, by ``B`` over the step's duration.
         """
         if step.duration <= 0.0:
             return np.zeros((3, 3))
         faster = change * late / step.duration if step.start_ns == self._last_ns else np.zeros(3)
-        unknown = 1.0 - gain * late / step.duration
-        return np.asarray(late**2 * np.diag(unknown**2 * (self._slip.variance_in(0.5 * step.duration + late) + faster**2) + missed**2))
+        unknown = B @ (np.eye(3) - gain[:, None] * B / step.duration)
+        spread = self._slip.variance_in(0.5 * (step.duration + late)) + faster**2
+        return np.asarray((unknown * spread) @ unknown.T + (B * missed**2) @ B.T)
 
     def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
         return self._matcher.recall(pose, cov, step.end_ns)

@@ -271,6 +271,7 @@ def fit_points(
     hit_sums: FloatArray,
     ages: Ages,
     source: FloatArray,
+    offsets: FloatArray,
     pose: FloatArray,
     cell: float,
     radius: float,
@@ -290,9 +291,10 @@ def fit_points(
     feigned: FloatArray,
     of_map: FloatArray,
     old: FloatArray,
+    late: FloatArray,
 ) -> tuple[int, int, float]:  # pragma: no cover
-    """Changes ``pose``, ``H``, ``g`` and the last four (see `_spread` and `_parts`) in place; returns the matched points, those on their lines,
-    and the weighted sum of squares.
+    """Changes ``pose``, ``H``, ``g`` and what follows them in place (see `_spread` and `_parts`); returns the matched points, those on
+    their lines, and the weighted sum of squares.
 
     Lines are looked up again where the points have moved by a part of the neighbourhood since they were: near the end, they stay.
     """
@@ -331,13 +333,14 @@ def fit_points(
         if iteration > 0 and abs(d0) + abs(d1) + abs(d2) < 1e-4:
             iterations = iteration + 1
     n_on = _spread(source, lines, home, pose, noise, spread)
-    _parts(source, lines, pose, noise, final_kernel, feigned, of_map, old)
+    _parts(source, offsets, lines, pose, noise, final_kernel, feigned, of_map, old, late)
     return n_matched, n_on, squares
 
 
 @numba.njit(cache=True)
 def _parts(
     source: FloatArray,
+    offsets: FloatArray,
     lines: FloatArray,
     pose: FloatArray,
     noise: _Noise,
@@ -345,14 +348,16 @@ def _parts(
     feigned: FloatArray,
     of_map: FloatArray,
     old: FloatArray,
+    late: FloatArray,
 ) -> None:  # pragma: no cover
     """Fills (3, 3) parts of the cost's curvature: ``feigned`` by the noise of the lines' directions, ``of_map`` the part by which errors
-    of the lines weigh, ``old`` what is not new of the lines.
+    of the lines weigh, ``old`` what is not new of the lines; ``late`` is each point's part times when it was seen, ``offsets`` (N,), or
+    zero if these are (0,).
 
     A line's direction is estimated. Its noise makes walls that are parallel look as if they were not quite, and in a sum of squares that
     looks like knowledge of the place along them. What it amounts to is known by expectation; it scatters, so that more of it is feigned.
     """
-    feigned[:], of_map[:], old[:] = 0.0, 0.0, 0.0
+    feigned[:], of_map[:], old[:], late[:] = 0.0, 0.0, 0.0, 0.0
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(source.shape[0]):
         if lines[i, 0] == 0.0:
@@ -362,7 +367,9 @@ def _parts(
         _add(feigned, _NOISY * w * lines[i, 10], -jy, jx, jx * source[i, 0] + jy * source[i, 1])
         _add(of_map, w * of_line, jx, jy, jt)
         _add(old, w * (1.0 - lines[i, 7]), jx, jy, jt)
-    for M in (feigned, of_map, old):
+        if offsets.shape[0]:
+            _add(late, w * offsets[i], jx, jy, jt)
+    for M in (feigned, of_map, old, late):
         M[1, 0], M[2, 0], M[2, 1] = M[0, 1], M[0, 2], M[1, 2]
 
 

@@ -19,6 +19,7 @@ from motion_models import se2
 from motion_models.se2 import FloatArray
 
 # Where the scene holds nothing, the measurement's sigma: metres, metres, radians. It decides nothing, it only keeps numbers finite.
+_NO_OFFSETS = np.zeros(0)
 _NOTHING = np.diag([10.0**-2, 10.0**-2, 3.0**-2])
 _LEVER_M = 5.0  # by which a turn is compared with a shift
 
@@ -68,6 +69,8 @@ class LineFit:
     """(3, 3) the part of `information` that comes from points of the map that were not added by the last scan."""
     of_map: FloatArray
     """(3, 3) the part of `information` by which errors of the map's lines, not of the scan's points, enter the pose."""
+    late: FloatArray
+    """(3, 3) `information`, each point's part times when it was seen after the pose [s]."""
 
     def measurement(self) -> tuple[FloatArray, FloatArray]:
         """Pose (3,) of the least cost and its covariance (3, 3), wide open along what the points do not hold."""
@@ -153,15 +156,17 @@ class LineMap:
         center: FloatArray,
         ages: Ages = ALL_AGES,
         since: float = math.nan,
+        offsets: FloatArray = _NO_OFFSETS,
     ) -> LineFit:
         """Gauss-Newton from ``start`` (3,) for ``points`` (N, 2) of the body frame.
 
         ``prior`` (3, 3) is the information of a pull towards ``center`` (3,), which keeps directions that the scene does not hold
         where they were; it is no part of the returned quadratic. Only points of these ``ages`` count. Those added at a travelled distance
-        of ``since`` [m] or later are the new ones; with NaN, none is.
+        of ``since`` [m] or later are the new ones; with NaN, none is. ``offsets``: when the points were seen, (N,) [s] after the pose, or (0,)
+        if all were at once.
         """
         gradient, pose, spread = np.zeros(3), np.array(start, dtype=float), np.zeros(9)
-        curvature, feigned, of_map, old = np.zeros((4, 3, 3))
+        curvature, feigned, of_map, old, late = np.zeros((5, 3, 3))
         n, n_on, squares = fit_points(
             self._cells,
             self._points,
@@ -170,6 +175,7 @@ class LineMap:
             self._hit_sums,
             ages,
             points,
+            offsets,
             pose,
             self._cell,
             options.radius,
@@ -189,15 +195,16 @@ class LineMap:
             feigned,
             of_map,
             old,
+            late,
         )
         information = curvature - feigned
         shrink = np.eye(3)
         if n:
             information = _known(information)
             shrink = np.linalg.cholesky(information + _NOTHING) @ np.linalg.inv(np.linalg.cholesky(curvature + _NOTHING))
-        of_map, old = shrink @ of_map @ shrink.T, shrink @ old @ shrink.T
+        of_map, old, late = shrink @ np.array([of_map, old, late]) @ shrink.T
         rms = math.sqrt(squares / n) if n else math.nan
-        return LineFit(pose, information, curvature, gradient, n, n_on, rms, Spread(*spread.tolist()), old, of_map)
+        return LineFit(pose, information, curvature, gradient, n, n_on, rms, Spread(*spread.tolist()), old, of_map, late)
 
     def compare(self, points: FloatArray, pose: FloatArray, radius: float, ages: Ages = ALL_AGES) -> tuple[FloatArray, FloatArray]:
         """How far ``points`` (N, 2) of the body frame at ``pose`` (3,) are off the lines within ``radius`` [m] of them, and when those

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from localization.lidar.cells import ALL_AGES, Ages
 from localization.lidar.kiss import Kiss
@@ -17,6 +18,7 @@ from motion_models import se2
 from motion_models.se2 import FloatArray
 
 _FEW_POINTS = 10
+AT_ONCE = np.empty(0)
 _DEGENERATE = 0.02  # smaller over larger variance of the position; rooms: 0.2 and more
 _SURPRISE = 0.05
 _APART_M = 1e-4  # scans drawn on one spot are told apart by this
@@ -93,6 +95,9 @@ class Registration:
     """RMS distance of the matched points from the map's lines."""
     tie: MapTie
     """What of the covariance is the map's, and since when."""
+    lateness: FloatArray
+    """(3, 3) [s] how long after the stamp that was seen which fixes the pose: a twist in the sweep that is off by d moves it by this
+    times d."""
 
     @property
     def is_trusted(self) -> bool:
@@ -116,20 +121,22 @@ class LidarMatcher:
         sigmas = self.config.sigma_point_m, self.config.sigma_line_m
         self._noise = Noise(*sigmas)
         self._downsampled = np.empty((0, 3))
-        self._planar, self._is_planar = np.empty((0, 2)), True
+        self._planar, self._is_planar, self._offsets = np.empty((0, 2)), True, np.empty(0)
         self._guess: tuple[FloatArray, FloatArray] | None = None  # and its information
         self._revisits: Revisits | None = None
         self._travel, self._last = 0.0, np.zeros(3)
         self._drawn_at, self._is_met = math.inf, False  # travelled distance at which the last scan was drawn; a scan has met it since
 
-    def register(self, points: FloatArray, is_planar: bool, guess: FloatArray, guess_cov: FloatArray) -> Registration | None:
+    def register(
+        self, points: FloatArray, is_planar: bool, guess: FloatArray, guess_cov: FloatArray, offsets: FloatArray = AT_ONCE
+    ) -> Registration | None:
         """Where ``points`` (N, 3) of the body frame fit, searched around ``guess`` (3,) with its covariance (3, 3).
 
         The guess starts the search and holds it along directions that the scene leaves free; the result's covariance knows nothing
-        of it. None for the first scan, and for one with hardly a point.
+        of it. ``offsets``: when the points were seen, (N,) [s] after the stamp, or (0,). None for the first scan, and for one with hardly
+        a point.
         """
-        points = in_range(points, self.config)
-        self._prepare(points, is_planar)
+        points = self._prepare(points, is_planar, offsets)
         if self._kiss is None or self._lines is None:
             return None
         if self._is_met:
@@ -141,12 +148,11 @@ class LidarMatcher:
         self._guess = guess, np.linalg.inv(9.0 * guess_cov + np.diag([1e-6, 1e-6, 1e-8])).astype(np.float64, copy=False)
         return self._fit(self._lines, pose_of_matrix(found))
 
-    def refine(self, points: FloatArray, is_planar: bool, start: FloatArray) -> Registration | None:
+    def refine(self, points: FloatArray, is_planar: bool, start: FloatArray, offsets: FloatArray = AT_ONCE) -> Registration | None:
         """The same scan once more, as other ``points`` (N, 3), close to where it was found, ``start`` (3,)."""
         if self._kiss is None or self._lines is None:
             return None
-        points = in_range(points, self.config)
-        self._prepare(points, is_planar)
+        points = self._prepare(points, is_planar, offsets)
         if len(self._planar) < _FEW_POINTS:
             return None
         self._downsampled = self._kiss.downsampled(points)
@@ -158,14 +164,14 @@ class LidarMatcher:
         self._is_met = True
         believed = self._noise.sigma_line
         since = self._drawn_at
-        fit = lines.fit(self._planar, start, self._fit_options(), prior, guess, self._ages, since)
+        fit = lines.fit(self._planar, start, self._fit_options(), prior, guess, self._ages, since, self._offsets)
         self._noise.see(fit.spread)
         if abs(self._noise.sigma_line - believed) > _SURPRISE * believed:
             # the first scans show that the map is better or worse than was guessed
-            fit = lines.fit(self._planar, fit.pose, self._fit_options(), prior, guess, self._ages, since)
+            fit = lines.fit(self._planar, fit.pose, self._fit_options(), prior, guess, self._ages, since, self._offsets)
         pose, cov = fit.measurement()
         tie = MapTie(cov @ fit.old, cov @ fit.of_map @ cov)
-        return Registration(pose, cov, len(self._planar), fit.n_on, fit.residual_rms, tie)
+        return Registration(pose, cov, len(self._planar), fit.n_on, fit.residual_rms, tie, cov @ fit.late)
 
     def _fit_options(self) -> FitOptions:
         noise = self._noise
@@ -219,11 +225,14 @@ class LidarMatcher:
         """(M, 2) the map."""
         return np.empty((0, 2)) if self._lines is None else self._lines.point_cloud()
 
-    def _prepare(self, points: FloatArray, is_planar: bool) -> None:
+    def _prepare(self, points: FloatArray, is_planar: bool, offsets: FloatArray) -> FloatArray:
+        """The points in range, which become those to match."""
+        is_near = is_in_range(points, self.config)
+        points, offsets = np.ascontiguousarray(points[is_near]), offsets[is_near] if len(offsets) else offsets
         self._is_planar = is_planar
         if self._kiss is None:
             if len(points) < _FEW_POINTS:
-                return
+                return points
             voxel = self.config.voxel_size_m or voxel_size(points)
             self._kiss = Kiss(voxel, 0.0, self.config.max_range_m)
             self._lines = LineMap(2.0 * voxel, 0.1 * voxel, 2.0 * self.config.max_range_m)
@@ -232,13 +241,23 @@ class LidarMatcher:
             )
             self._voxel = voxel
             self._downsampled = points
-        self._planar = np.ascontiguousarray(points[:, :2]) if is_planar else walls(points, 0.5 * self._voxel)
+        if is_planar:
+            self._planar, self._offsets = np.ascontiguousarray(points[:, :2]), offsets
+        else:  # a wall is seen by many rings and all the sweep long
+            self._planar = walls(points, 0.5 * self._voxel)
+            self._offsets = np.full(len(self._planar), offsets.mean()) if len(offsets) else offsets
+        return points
+
+
+def is_in_range(points: FloatArray, config: LidarConfig) -> NDArray[np.bool_]:
+    """(N,) which of ``points`` (N, 3) are neither the robot itself nor too far."""
+    r2 = np.einsum("ij,ij->i", points, points)
+    return np.asarray((r2 > config.min_range_m**2) & (r2 < config.max_range_m**2))
 
 
 def in_range(points: FloatArray, config: LidarConfig) -> FloatArray:
-    """(M, 3) those of ``points`` (N, 3) that are neither the robot itself nor too far."""
-    r2 = np.einsum("ij,ij->i", points, points)
-    return np.ascontiguousarray(points[(r2 > config.min_range_m**2) & (r2 < config.max_range_m**2)])
+    """(M, 3) those of ``points`` (N, 3)."""
+    return np.ascontiguousarray(points[is_in_range(points, config)])
 
 
 def voxel_size(points: FloatArray) -> float:
