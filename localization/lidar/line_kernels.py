@@ -221,7 +221,8 @@ def _add(H: FloatArray, w: float, jx: float, jy: float, jt: float) -> None:  # p
 def _of_point(lines: FloatArray, i: int, noise: _Noise) -> float:  # pragma: no cover
     """The variance of point ``i`` across its line: most of a LiDAR's noise is along the beam, and a beam that grazes a wall tells well
     where it is."""
-    return noise[0] * noise[0] + lines[i, 9] * noise[1] * noise[1]
+    variance: float = noise[0] * noise[0] + lines[i, 9] * noise[1] * noise[1]
+    return variance
 
 
 @numba.njit(cache=True)

@@ -162,8 +162,8 @@ class LineMap:
 
         ``prior`` (3, 3) is the information of a pull towards ``center`` (3,), which keeps directions that the scene does not hold
         where they were; it is no part of the returned quadratic. Only points of these ``ages`` count. Those added at a travelled distance
-        of ``since`` [m] or later are the new ones; with NaN, none is. ``offsets``: when the points were seen, (N,) [s] after the pose, or (0,)
-        if all were at once.
+        of ``since`` [m] or later are the new ones; with NaN, none is. ``offsets``: when the points were seen, (N,) [s] after the pose, or
+        (0,) if all were at once.
         """
         gradient, pose, spread = np.zeros(3), np.array(start, dtype=float), np.zeros(9)
         curvature, feigned, of_map, old, late = np.zeros((5, 3, 3))
@@ -197,11 +197,8 @@ class LineMap:
             old,
             late,
         )
-        information = curvature - feigned
-        shrink = np.eye(3)
-        if n:
-            information = _known(information)
-            shrink = np.linalg.cholesky(information + _NOTHING) @ np.linalg.inv(np.linalg.cholesky(curvature + _NOTHING))
+        information = _known(curvature - feigned) if n else curvature
+        shrink = np.linalg.cholesky(information + _NOTHING) @ np.linalg.inv(np.linalg.cholesky(curvature + _NOTHING))
         of_map, old, late = shrink @ np.array([of_map, old, late]) @ shrink.T
         rms = math.sqrt(squares / n) if n else math.nan
         return LineFit(pose, information, curvature, gradient, n, n_on, rms, Spread(*spread.tolist()), old, of_map, late)
