@@ -45,6 +45,8 @@ class Noise:
 class Seer:
     """A witness that says what it is told: the true motion with noise of a covariance that it knows."""
 
+    can_begin = True
+
     def __init__(self) -> None:
         self.next: Motion | None = None
 

@@ -194,3 +194,27 @@ def test_noise_is_what_scans_show() -> None:
         assert noise.sigmas_of_a_point[0] == pytest.approx(0.012, rel=0.02)
         assert noise.place_part == pytest.approx(part, abs=0.25)
         assert noise.sigma_line == pytest.approx(sigma_line, abs=5e-4)
+
+
+@pytest.mark.parametrize("kind", ["ekf", "graph"])
+def test_a_scanner_that_comes_back_is_believed_at_once(kind: str) -> None:
+    """It says the same for 2 s while the robot drives: the wheels' drift is known again as soon as the room is seen."""
+    drive = rooms.drive_through(ROOM, rooms.path((1, 0, 0), (10, 0.4, 0.5)), 3)
+    scans = [event for event in drive.events if isinstance(event, Scan)]
+    frozen = {scan.stamp_ns for scan in scans[61:86]}
+    events = [
+        replace(event, points=scans[60].points, offsets=scans[60].offsets)
+        if event.stamp_ns in frozen and isinstance(event, Scan)
+        else event
+        for event in drive.events
+    ]
+    run = rooms.results(replace(drive, events=events), kind)[kind]
+    poses, covs = rooms.at_scans(drive, run)
+    assert covs is not None
+    assert run.counts["stale"] == 25
+    sigma = np.sqrt(covs[:, [0, 1], [0, 1]].sum(axis=1))
+    error = np.hypot(*(poses - drive.poses)[:, :2].T)
+    assert sigma[85] > 5.0 * sigma[59]
+    assert error[85] < 3.0 * sigma[85]
+    assert sigma[90:].max() < 2.0 * sigma[59]
+    assert (error[90:] < 3.5 * sigma[90:]).all()

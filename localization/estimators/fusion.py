@@ -98,7 +98,9 @@ class EkfFusion:
             before = ekf.pose
             ekf.measure_revisit(known)
             witness.correct(before, ekf.pose)
-        ekf.set_anchor(witness.remember(step, ekf.pose))
+        is_drawn = witness.remember(step, ekf.pose)
+        if witness.can_begin:
+            ekf.set_anchor(is_drawn)
 
     def _twist(self, step: Step) -> tuple[FloatArray, FloatArray | None]:
         """Mean twist of the step as all witnesses see it."""

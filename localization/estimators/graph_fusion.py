@@ -145,10 +145,10 @@ class GraphFusion:
                     self._errors.see(sight)
         before, self._now = self._now, ahead.node
         alone = self._pending is None
-        if step.scan is not None or not self._has_lidar:
+        if not self._has_lidar or (step.scan is not None and self._witness.can_begin):
             self._commit(ahead, step.end_ns)
             self._pending = None
-            if step.scan is not None and self._has_lidar:
+            if self._has_lidar:
                 self._to_settle = step, sight is not None
         else:
             self._pending = pending

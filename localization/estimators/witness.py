@@ -35,6 +35,10 @@ class Sight:
 class Witness(Protocol):
     """Something that measures the motion from scan to scan."""
 
+    @property
+    def can_begin(self) -> bool:
+        """The next motion can be measured from the scan that was last looked at. If not, go on measuring from the one before."""
+
     def look(self, step: Step, anchor: FloatArray, guess: FloatArray) -> Sight | None:
         """The motion from ``anchor`` (3,), the pose at the last scan, to the scan of ``step``, searched around ``guess`` (3,)."""
 
@@ -60,12 +64,19 @@ class ScanWitness:
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig | None = None) -> None:
         self._mounts, self._matcher = mounts, LidarMatcher(config)
-        self._has_map, self._slip, self._last_ns = False, Slip(), -1
+        self._is_begun, self._slip, self._last_ns = False, Slip(), -1
         self._twist = np.zeros(3)  # of the last step with a scan
         self._check, self._is_good = ScanCheck(self._matcher.config), True
+        self._drift = np.zeros((3, 3))  # of the wheels, since the last scan that was good
+
+    @property
+    def can_begin(self) -> bool:
+        return self._is_good
 
     def look(self, step: Step, anchor: FloatArray, guess: FloatArray) -> Sight | None:
         assert step.scan is not None
+        A = se2.adjoint(se2.inverse(step.predicted.delta))
+        self._drift = A @ self._drift @ A.T + step.predicted.cov
         self._is_good = not self._check.is_stale(step.scan, step.is_standing)
         if not self._is_good:
             return None
@@ -74,8 +85,9 @@ class ScanWitness:
         slip.advance(step.duration, step.predicted.cov)
         rate = slip.rate
         change, self._twist = step.twist - self._twist, step.twist
-        found = self._matcher.register(sweep.at_stamp(step.twist + rate), sweep.is_planar, guess, step.predicted.cov, sweep.offsets)
+        found = self._matcher.register(sweep.at_stamp(step.twist + rate), sweep.is_planar, guess, self._drift, sweep.offsets)
         if found is None:
+            self._is_good = not self._matcher.has_map
             return None
         since_s = (step.end_ns - self._last_ns) * 1e-9 if self._last_ns >= 0 else 0.0
         self._is_good = not self._check.is_jump(se2.between(guess, found.pose), found, since_s)
@@ -114,12 +126,14 @@ class ScanWitness:
         self._matcher.correct(before, after)
 
     def remember(self, step: Step, pose: FloatArray) -> bool:
-        self._last_ns = step.end_ns
+        if not self._is_good:
+            return False
+        self._last_ns, self._drift = step.end_ns, np.zeros((3, 3))
         # a robot that stands sees nothing new, and would only thicken its lines
-        if not self._is_good or (step.is_standing and self._has_map):
+        if step.is_standing and self._is_begun:
             return False
         self._matcher.insert(pose)
-        self._has_map = True
+        self._is_begun = self._matcher.has_map
         return True
 
     def map_points(self) -> FloatArray:
@@ -131,6 +145,8 @@ class ScanWitness:
 
 class NoWitness:
     """No LiDAR."""
+
+    can_begin = True
 
     def look(self, step: Step, anchor: FloatArray, guess: FloatArray) -> Sight | None:
         return None

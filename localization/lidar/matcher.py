@@ -127,6 +127,11 @@ class LidarMatcher:
         self._travel, self._last = 0.0, np.zeros(3)
         self._drawn_at, self._is_met = math.inf, False  # travelled distance at which the last scan was drawn; a scan has met it since
 
+    @property
+    def has_map(self) -> bool:
+        """There is something to match with."""
+        return self._kiss is not None
+
     def register(
         self, points: FloatArray, is_planar: bool, guess: FloatArray, guess_cov: FloatArray, offsets: FloatArray = AT_ONCE
     ) -> Registration | None:
