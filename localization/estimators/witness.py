@@ -107,16 +107,17 @@ class ScanWitness:
     def _swept(self, step: Step, B: FloatArray, late: float, gain: FloatArray, change: FloatArray, missed: FloatArray) -> FloatArray:
         """(3, 3) what a motion within the sweep other than was thought does to the pose.
 
-        A twist that is off by d moves the pose by ``B`` d (`Registration.lateness`). It is off as the slip was measured over the step and
-        the sweep's is a later one, as the wheels turn otherwise ``late`` [s] after the stamp (they did by ``change`` within the step), and
-        by what of the slip was ``missed``. But the slip was measured, with ``gain`` (3,), by the way to this very pose, so that d is in it
+        A twist that is off by d moves the pose by ``B`` d (`Registration.lateness`). It is off by what of the slip was ``missed``, and as
+        slip and wheels change from the mean over the step, which is known, to that from the stamp until points are seen, ``late`` [s]. If
+        the wheels do as they did, by ``change`` from step to step, that is the time between the middles of both; slip that walks at random
+        has walked for a third of both. But the slip was measured, with ``gain`` (3,), by the way to this very pose, so that d is in it
         already, by ``B`` over the step's duration.
         """
         if step.duration <= 0.0:
             return np.zeros((3, 3))
-        faster = change * late / step.duration if step.start_ns == self._last_ns else np.zeros(3)
+        faster = change * (step.duration + late) / (2.0 * step.duration) if step.start_ns == self._last_ns else np.zeros(3)
         unknown = B @ (np.eye(3) - gain[:, None] * B / step.duration)
-        spread = self._slip.variance_in(0.5 * (step.duration + late)) + faster**2
+        spread = self._slip.variance_in((step.duration + late) / 3.0) + faster**2
         return np.asarray((unknown * spread) @ unknown.T + (B * missed**2) @ B.T)
 
     def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
