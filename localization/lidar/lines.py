@@ -18,8 +18,9 @@ from localization.lidar.track import positive_part
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
+AT_ONCE = np.empty(0)
+"""Offsets in time of points that were all seen at once."""
 # Where the scene holds nothing, the measurement's sigma: metres, metres, radians. It decides nothing, it only keeps numbers finite.
-_NO_OFFSETS = np.zeros(0)
 _NOTHING = np.diag([10.0**-2, 10.0**-2, 3.0**-2])
 _LEVER_M = 5.0  # by which a turn is compared with a shift
 
@@ -156,14 +157,14 @@ class LineMap:
         center: FloatArray,
         ages: Ages = ALL_AGES,
         since: float = math.nan,
-        offsets: FloatArray = _NO_OFFSETS,
+        offsets: FloatArray = AT_ONCE,
     ) -> LineFit:
         """Gauss-Newton from ``start`` (3,) for ``points`` (N, 2) of the body frame.
 
         ``prior`` (3, 3) is the information of a pull towards ``center`` (3,), which keeps directions that the scene does not hold
         where they were; it is no part of the returned quadratic. Only points of these ``ages`` count. Those added at a travelled distance
         of ``since`` [m] or later are the new ones; with NaN, none is. ``offsets``: when the points were seen, (N,) [s] after the pose, or
-        (0,) if all were at once.
+        `AT_ONCE`.
         """
         gradient, pose, spread = np.zeros(3), np.array(start, dtype=float), np.zeros(9)
         curvature, feigned, of_map, old, late = np.zeros((5, 3, 3))

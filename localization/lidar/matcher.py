@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from localization.lidar.cells import ALL_AGES, Ages
 from localization.lidar.kiss import Kiss
-from localization.lidar.lines import FitOptions, LineMap
+from localization.lidar.lines import AT_ONCE, FitOptions, LineMap
 from localization.lidar.noise import Noise
 from localization.lidar.revisit import Revisit, RevisitConfig, Revisits
 from localization.lidar.sweep import walls
@@ -18,7 +18,6 @@ from motion_models import se2
 from motion_models.se2 import FloatArray
 
 _FEW_POINTS = 10
-AT_ONCE = np.empty(0)
 _DEGENERATE = 0.02  # smaller over larger variance of the position; rooms: 0.2 and more
 _SURPRISE = 0.05
 _APART_M = 1e-4  # scans drawn on one spot are told apart by this
@@ -121,7 +120,7 @@ class LidarMatcher:
         sigmas = self.config.sigma_point_m, self.config.sigma_line_m
         self._noise = Noise(*sigmas)
         self._downsampled = np.empty((0, 3))
-        self._planar, self._is_planar, self._offsets = np.empty((0, 2)), True, np.empty(0)
+        self._planar, self._is_planar, self._offsets = np.empty((0, 2)), True, AT_ONCE
         self._guess: tuple[FloatArray, FloatArray] | None = None  # and its information
         self._revisits: Revisits | None = None
         self._travel, self._last = 0.0, np.zeros(3)
@@ -138,8 +137,7 @@ class LidarMatcher:
         """Where ``points`` (N, 3) of the body frame fit, searched around ``guess`` (3,) with its covariance (3, 3).
 
         The guess starts the search and holds it along directions that the scene leaves free; the result's covariance knows nothing
-        of it. ``offsets``: when the points were seen, (N,) [s] after the stamp, or (0,). None for the first scan, and for one with hardly
-        a point.
+        of it. ``offsets``: when the points were seen, (N,) [s] after the stamp, or `AT_ONCE`. None for a scan with hardly a point.
         """
         points = self._prepare(points, is_planar, offsets)
         if self._kiss is None or self._lines is None:
