@@ -64,7 +64,8 @@ class ScanWitness:
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig | None = None) -> None:
         self._mounts, self._matcher = mounts, LidarMatcher(config)
-        self._is_begun, self._slip, self._last_ns = False, Slip(), -1
+        self._is_begun, self._slip = False, Slip()
+        self._seen_ns, self._last_ns = -1, -1  # stamp of the last scan, and of the last that was good
         self._twist = np.zeros(3)  # of the last step with a scan
         self._check, self._is_good = ScanCheck(self._matcher.config), True
         self._drift = np.zeros((3, 3))  # of the wheels, since the last scan that was good
@@ -77,6 +78,8 @@ class ScanWitness:
         assert step.scan is not None
         A = se2.adjoint(se2.inverse(step.predicted.delta))
         self._drift = A @ self._drift @ A.T + step.predicted.cov
+        since_s = (step.end_ns - self._seen_ns) * 1e-9 if self._seen_ns >= 0 else 0.0
+        self._seen_ns = step.end_ns
         self._is_good = not self._check.is_stale(step.scan, step.is_standing)
         if not self._is_good:
             return None
@@ -89,7 +92,6 @@ class ScanWitness:
         if found is None:
             self._is_good = not self._matcher.has_map
             return None
-        since_s = (step.end_ns - self._last_ns) * 1e-9 if self._last_ns >= 0 else 0.0
         self._is_good = not self._check.is_jump(se2.between(guess, found.pose), found, since_s)
         if not self._is_good:
             return None

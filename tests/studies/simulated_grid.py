@@ -18,7 +18,7 @@ import numpy as np
 
 from localization.events import CgSample, Scan, WheelSample
 from localization.lidar.matcher import LidarMatcher
-from localization.lidar.sweep import body_points
+from localization.lidar.sweep import Sweep
 from localization.logs import open_log
 from localization.simulate.experiments import grid_points
 from localization.simulate.runs import RunRecord
@@ -32,8 +32,9 @@ from motion_models.regressions import Regression, regress
 from motion_models.robot import Mount, load_robot
 from motion_models.se2 import FloatArray
 
-_REST_S = 1.2
+_REST_S, _RATE_HZ = 1.2, 12.5
 _MAPPED_RAD = 0.3
+_SETTLING = 5  # scans after the start, and before the end, that are left out: the vehicle's rates follow the wheels' by and by
 
 
 @dataclass(frozen=True)
@@ -92,19 +93,23 @@ def _measure(run: RunRecord, window: _Window, mount: Mount) -> Rotation:
     begin = START_NS + round(run.start_s * 1e9)
     matcher, pose, mapped = LidarMatcher(), np.zeros(3), 0.0
     step = np.zeros(3)
+    own = [np.zeros((3, 3)), np.zeros((3, 3))]  # covariances of the last two scans, between which the motion within a sweep is measured
     poses, covs, stamps = [], [], []
     drawn = np.zeros((3, 3))  # of the map: what is drawn farther on has the errors of all scans from which it was drawn
     for number, scan in enumerate(window.scans):
-        points = body_points(scan, mount, step * 12.5)
-        found = matcher.register(points, True, se2.compose(pose, se2.exp(step)), np.diag([1e-3, 1e-3, 1e-3]))
+        sweep = Sweep.of(scan, mount)
+        guess = se2.compose(pose, se2.exp(step))
+        found = matcher.register(sweep.at_stamp(step * _RATE_HZ), True, guess, np.diag([1e-3, 1e-3, 1e-3]), sweep.offsets)
         before = pose
         if found is not None:
             pose = found.pose
             if scan.stamp_ns >= begin:
                 poses.append(pose)
-                covs.append(found.cov + drawn)
+                late = _RATE_HZ * found.lateness
+                covs.append(found.cov + late @ (own[0] + own[1]) @ late.T + drawn)
                 stamps.append(scan.stamp_ns)
             step = se2.log(se2.between(before, pose)) if number > 1 else np.zeros(3)
+            own = [own[1], found.cov]
         if number < 6 or abs(pose[2] - mapped) > _MAPPED_RAD:
             matcher.insert(pose)
             mapped = pose[2]
@@ -112,19 +117,20 @@ def _measure(run: RunRecord, window: _Window, mount: Mount) -> Rotation:
                 drawn = drawn + found.cov
     track, cov = np.array(poses), np.array(covs)
 
+    yaw = np.unwrap(track[:, 2])
+    turns = np.abs(np.diff(yaw, prepend=yaw[0]))
+    moving = np.flatnonzero(turns > 0.85 * np.median(turns[turns > 0.5 * turns.max()]))  # while starting and stopping it turns elsewhere
+    first, last = moving[0] + _SETTLING, moving[-1] - _SETTLING
+
     # k: turned angle over what the wheels turned
     wheels = np.array([w.position for w in window.wheels])
     times = np.array([w.stamp_ns for w in window.wheels])
-    difference = np.interp([stamps[0], stamps[-1]], times, wheels[:, 1] - wheels[:, 0])
-    turned = float(np.unwrap(track[:, 2])[-1] - np.unwrap(track[:, 2])[0])
+    difference = np.interp([stamps[first], stamps[last]], times, wheels[:, 1] - wheels[:, 0])
     g = robot.geometry
     unit = g.wheel_radius_m * float(difference[1] - difference[0]) / g.track_width_m
-    sigma = float(np.sqrt(cov[0, 2, 2] + cov[-1, 2, 2])) / unit
+    k, sigma = float(yaw[last] - yaw[first]) / unit, float(np.sqrt(cov[first, 2, 2] + cov[last, 2, 2])) / unit
 
-    turns = np.abs(np.diff(np.unwrap(track[:, 2]), prepend=track[0, 2]))
-    moving = np.flatnonzero(turns > 0.85 * np.median(turns[turns > 0.5 * turns.max()]))  # while starting and stopping it turns elsewhere
     # The errors of neighbouring scans are alike, as they share the map: only the arc's ends count as independent (4.4, 4.5).
-    first, last = moving[0], moving[-1]
     centre = center_from_end_poses(track[first], track[last], cov[first], cov[last])
     cg = np.mean(window.cgs, axis=0)
     model = make_model("friction", robot)
@@ -132,7 +138,7 @@ def _measure(run: RunRecord, window: _Window, mount: Mount) -> Rotation:
     per_wheels = g.wheel_radius_m * (rates[1] - rates[0]) / g.track_width_m
     said = _centre(model.twist(rates, cg, model.nominal).value, per_wheels)
     settled = _centre(_settled(rates, cg), per_wheels)
-    return Rotation(cg, turned / unit, sigma, centre.value, centre.cov, said, settled)
+    return Rotation(cg, k, sigma, centre.value, centre.cov, said, settled)
 
 
 def _centre(twist: FloatArray, per_wheels: float) -> FloatArray:
