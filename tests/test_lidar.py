@@ -131,6 +131,7 @@ def test_a_map_is_not_turned_by_which_of_its_points_are_kept() -> None:
         start = (rng.uniform(-2, 0), rng.uniform(-1, 1), rng.uniform(-3, 3))
         _, driven, found = mapped(HALL, rooms.path((1.6, 0.0, 0.3)), seed, start)
         turned.append(se2.log(se2.between(driven.poses[-1], found.pose))[2])
+    assert np.std(turned) < math.radians(0.03)
     assert abs(np.mean(turned)) < 3.5 * np.std(turned) / math.sqrt(24)
 
 
@@ -260,6 +261,39 @@ def test_a_heap_of_points_is_no_line() -> None:
     for _ in range(8):
         lines.insert(spots + 0.012 * rng.normal(size=(8, 1)) * beam, np.zeros(3))
     assert lines.fit(spots, np.zeros(3), options, np.zeros((3, 3)), np.zeros(3)).n_matched == 0
+    lines.insert(np.column_stack([np.arange(2.0, 6.0, 0.02), np.full(200, 2.0)]), np.zeros(3))
+    assert lines.fit(spots, np.zeros(3), options, np.zeros((3, 3)), np.zeros(3)).n_matched == 8
+
+
+def test_a_point_at_the_robots_origin_does_no_harm() -> None:
+    """A mast over the origin of the body, whose points draw a line as the robot drives."""
+    lines, options = LineMap(0.25, 0.0, 50.0), FitOptions(0.25, 0.01, 0.0, 1.0, 1.0, 5)
+    lines.insert(np.column_stack([np.arange(-1.0, 1.0, 0.02), np.zeros(100)]), np.zeros(3))
+    found = lines.fit(np.zeros((1, 2)), np.zeros(3), options, np.eye(3), np.zeros(3))
+    assert found.n_matched == 1
+    assert np.isfinite(found.information).all()
+
+
+def test_a_twist_in_the_sweep_moves_the_pose_as_the_lateness_says() -> None:
+    matcher, drive, _ = mapped(LAB, TOUR[:2500])
+    sweep, pose = Sweep.of(scans_of(drive)[-1], drive.mount), drive.poses[-1]
+    twist = se2.log(se2.between(drive.poses[-2], pose)) * 12.5
+    found = matcher.register(sweep.at_stamp(twist), True, pose, SURE, sweep.offsets)
+    for d in 0.02 * np.eye(3):
+        moved = [matcher.refine(sweep.at_stamp(twist + sign * d), True, found.pose, sweep.offsets).pose for sign in (-1.0, 1.0)]
+        by_difference = 0.5 * se2.log(se2.between(moved[1], moved[0]))
+        np.testing.assert_allclose(found.lateness @ d, by_difference, atol=0.1 * sweep.lateness * 0.02)
+
+
+@pytest.mark.parametrize("walls", [CORRIDOR, WALL, LAB])
+def test_parts_of_a_covariance_are_no_more_than_all_of_it(walls: np.ndarray) -> None:
+    """The map's, and what of it was drawn anew, also along walls that hold nothing."""
+    _, _, found = mapped(walls, rooms.path((1.5, 0.3, 0.0)), start=(0.0, 0.2, 0.4), scanner=rooms.Beams(longest=20.0))
+    scale = np.sqrt(np.diag(found.cov))
+    for part in (found.tie.cov, found.cov - found.tie.cov):
+        assert np.linalg.eigvalsh(part / np.outer(scale, scale)).min() > -1e-9
+    assert (np.linalg.eigvals(found.tie.kept).real > -1e-9).all()
+    assert (np.linalg.eigvals(found.tie.kept).real < 1.0 + 1e-9).all()
 
 
 # --- clouds ------------------------------------------------------------------------------------------------------------------------------

@@ -154,7 +154,8 @@ def _associate(
             lines[i, 0] = m
             if m:
                 lines[i, 1], lines[i, 2], lines[i, 3], lines[i, 4] = nx, ny, x - e * nx, y - e * ny
-                facing = (nx * (x - pose[0]) + ny * (y - pose[1])) ** 2 / ((x - pose[0]) ** 2 + (y - pose[1]) ** 2)
+                bx, by = x - pose[0], y - pose[1]
+                facing = (nx * bx + ny * by) ** 2 / max(bx * bx + by * by, 1e-12)  # a mast on the robot is at its origin
                 center = thin / (m - 2.0)
                 turn = center / wide  # of a regression: beside the points' centre, the line's direction counts, too
                 lines[i, 5], lines[i, 7], lines[i, 9], lines[i, 10] = center + along * along * turn, new, facing, turn
