@@ -93,7 +93,7 @@ class Ekf:
 
     @property
     def anchor(self) -> FloatArray:
-        """(3,) estimate of the pose at the last scan."""
+        """(3,) estimate of the pose at the last scan that could be used."""
         return self._anchor
 
     @property

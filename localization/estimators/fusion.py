@@ -84,7 +84,8 @@ class EkfFusion:
             self._counts["matched"] += 1
             nis = ekf.measure_motion(seen.motion, seen.is_trusted, seen.tie)
             self._counts["contradictions"] += nis > ekf.gate
-        self._to_settle = step, seen is not None
+        if witness.can_begin:
+            self._to_settle = step, seen is not None
         return nis
 
     def settle(self) -> None:
@@ -98,9 +99,7 @@ class EkfFusion:
             before = ekf.pose
             ekf.measure_revisit(known)
             witness.correct(before, ekf.pose)
-        is_drawn = witness.remember(step, ekf.pose)
-        if witness.can_begin:
-            ekf.set_anchor(is_drawn)
+        ekf.set_anchor(witness.remember(step, ekf.pose))
 
     def _twist(self, step: Step) -> tuple[FloatArray, FloatArray | None]:
         """Mean twist of the step as all witnesses see it."""

@@ -40,7 +40,8 @@ class Witness(Protocol):
         """The next motion can be measured from the scan that was last looked at. If not, go on measuring from the one before."""
 
     def look(self, step: Step, anchor: FloatArray, guess: FloatArray) -> Sight | None:
-        """The motion from ``anchor`` (3,), the pose at the last scan, to the scan of ``step``, searched around ``guess`` (3,)."""
+        """The motion from ``anchor`` (3,), the pose at the last scan that could begin one, to the scan of ``step``, searched around
+        ``guess`` (3,)."""
 
     def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
         """Whether the scan that was last looked at is of a place seen long before, where ``pose`` (3,) with ``cov`` (3, 3) is the
@@ -50,7 +51,7 @@ class Witness(Protocol):
         """What was recalled made ``before`` (3,) to ``after`` (3,)."""
 
     def remember(self, step: Step, pose: FloatArray) -> bool:
-        """The scan that was last looked at was taken from ``pose`` (3,). Returns whether the next motion is measured by it, too."""
+        """The scan that was last looked at, and can begin a motion, was taken from ``pose`` (3,). Returns whether it is drawn."""
 
     def map_points(self) -> FloatArray:
         """(M, 2) what was seen, in the world [m]."""
@@ -129,8 +130,6 @@ class ScanWitness:
         self._matcher.correct(before, after)
 
     def remember(self, step: Step, pose: FloatArray) -> bool:
-        if not self._is_good:
-            return False
         self._last_ns, self._drift = step.end_ns, np.zeros((3, 3))
         # a robot that stands sees nothing new, and would only thicken its lines
         if step.is_standing and self._is_begun:

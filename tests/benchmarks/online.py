@@ -97,11 +97,11 @@ def latency() -> None:
         folder = Path(name)
         path = write_laps(folder / "laps.mcap")
         print(f"{BEAMS} beams at 12.5 Hz, IMU and wheels at 50 Hz        p50 ms    p99 ms    max ms    part of a core")
+        took = {}
         for estimator in ("ekf", "graph"):
-            took, cpu = in_process(path, estimator)
-            _print(f"{estimator}: event in, estimate out", took, cpu)
-            if estimator == "ekf":
-                usual = float(np.median(took))
+            took[estimator], cpu = in_process(path, estimator)
+            _print(f"{estimator}: event in, estimate out", took[estimator], cpu)
+        usual = float(np.median(took["ekf"]))
         _print(f"no estimator: a datagram in, {1e3 * usual:.1f} ms of sums", *paced(usual, 0.08, 700))
         try:
             import cyclonedds  # noqa: F401
