@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -43,11 +44,14 @@ class CgTracker:
             self._columns[key] = (np.array([p[0] for p in pairs], dtype=np.intp), np.array([p[1] for p in pairs], dtype=np.intp))
         columns, joints = self._columns[key]
         told = values[columns]
-        finite = np.isfinite(told)
-        if not finite.any():
+        finite = [*map(math.isfinite, told.tolist())]  # quicker than numpy's, on a handful
+        if not any(finite):
             return None
-        self._positions[joints[finite]] = told[finite]
-        if np.isnan(self._positions).any():
+        if all(finite):
+            self._positions[joints] = told
+        else:
+            self._positions[joints[finite]] = told[finite]
+        if any(map(math.isnan, self._positions.tolist())):
             return None
         return self.model.estimate(self._positions)
 
