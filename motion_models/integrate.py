@@ -68,7 +68,7 @@ def _integrate(
     for i in range(dt.shape[0]):
         h = dt[i]
         vx, vy, wz = twist[i, 0] * h, twist[i, 1] * h, twist[i, 2] * h
-        x, y, t = scalar_exp(vx, vy, wz)
+        x, y, t = scalar_exp((vx, vy, wz))
 
         # Adjoint of the inverse step: [[c, s, a], [-s, c, b], [0, 0, 1]]
         c, s = math.cos(t), math.sin(t)

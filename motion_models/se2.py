@@ -6,7 +6,8 @@ broadcast over the leading axes and never change their input. Names of poses rea
 ``compose(world_T_body, body_T_lidar)`` the inner names cancel.
 
 Source: Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics", 2018, appendix A. The maths stands in compiled
-generalised ufuncs (`_exp` and so on), which numpy broadcasts: a single pose costs a microsecond or two, as filters need.
+functions of three numbers, for compiled loops (`scalar_exp`, `fill_adjoint` and so on), and these in generalised ufuncs (`_exp`), which
+numpy broadcasts: a single pose costs a microsecond or two, as filters need.
 
 >>> quarter_turn = exp([0.0, 0.0, math.pi / 2])
 >>> compose([1.0, 2.0, math.pi / 2], [1.0, 0.0, 0.0]).round(6).tolist()
@@ -31,12 +32,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
+Triple = tuple[float, float, float]
+"""A pose or tangent, made in a compiled loop."""
+Three = Triple | FloatArray
+"""A pose or tangent, given to one."""
 
 # Below this angle the closed forms lose digits to cancellation and the series is exact to double precision.
 _SMALL_ANGLE = 1e-4
 
 
-def _gufunc(layout: str) -> Callable[[Callable[..., None]], Callable[..., Any]]:
+def gufunc(layout: str) -> Callable[[Callable[..., None]], Callable[..., Any]]:
     """A compiled function of pose-like arguments, the last of which is its result, that broadcasts over leading axes."""
     signature = "void(" + ", ".join("float64" + "[:" + ",:" * part.count(",") + "]" for part in _parts(layout)) + ")"
     decorate: Callable[..., Any] = numba.guvectorize([signature], layout, nopython=True, cache=True)  # type: ignore[no-untyped-call]
@@ -64,7 +69,8 @@ def _parts(layout: str) -> list[str]:
 
 
 @numba.njit(cache=True)
-def _wrap(angle: float) -> float:  # pragma: no cover
+def scalar_wrap(angle: float) -> float:  # pragma: no cover
+    """`wrap_angle` of one angle."""
     wrapped = (angle + math.pi) % (2.0 * math.pi) - math.pi
     # rounding can carry an angle just below -pi up to +pi
     return -math.pi if wrapped >= math.pi else wrapped
@@ -80,10 +86,79 @@ def _sinc_terms(theta: float) -> tuple[float, float]:  # pragma: no cover
 
 
 @numba.njit(cache=True)
-def scalar_exp(vx: float, vy: float, wz: float) -> tuple[float, float, float]:  # pragma: no cover
+def _curl_terms(theta: float) -> tuple[float, float]:  # pragma: no cover
+    """``(t - sin(t))/t^2`` and ``(1 - cos(t))/t^2``, smooth through t = 0."""
+    if abs(theta) < _SMALL_ANGLE:
+        return theta / 6.0, 0.5 - theta * theta / 24.0
+    return (theta - math.sin(theta)) / (theta * theta), _sinc_terms(theta)[1] / theta
+
+
+@numba.njit(cache=True)
+def scalar_exp(v: Three) -> Triple:  # pragma: no cover
     """`exp` of one tangent vector, for compiled loops."""
-    a, b = _sinc_terms(wz)
-    return a * vx - b * vy, b * vx + a * vy, wz
+    a, b = _sinc_terms(v[2])
+    return a * v[0] - b * v[1], b * v[0] + a * v[1], v[2]
+
+
+@numba.njit(cache=True)
+def scalar_log(p: Three) -> Triple:  # pragma: no cover
+    """`log` of one pose."""
+    x, y, theta = p[0], p[1], scalar_wrap(p[2])
+    a, b = _sinc_terms(theta)
+    scale = 1.0 / (a * a + b * b)
+    return scale * (a * x + b * y), scale * (a * y - b * x), theta
+
+
+@numba.njit(cache=True)
+def scalar_compose(a: Three, b: Three) -> Triple:  # pragma: no cover
+    """`compose` of two poses."""
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], scalar_wrap(a[2] + b[2])
+
+
+@numba.njit(cache=True)
+def scalar_inverse(p: Three) -> Triple:  # pragma: no cover
+    """`inverse` of one pose."""
+    c, s = math.cos(p[2]), math.sin(p[2])
+    return -c * p[0] - s * p[1], s * p[0] - c * p[1], scalar_wrap(-p[2])
+
+
+@numba.njit(cache=True)
+def scalar_between(a: Three, b: Three) -> Triple:  # pragma: no cover
+    """`between` of two poses."""
+    return scalar_compose(scalar_inverse(a), b)
+
+
+@numba.njit(cache=True)
+def fill_adjoint(p: Three, out: FloatArray) -> None:  # pragma: no cover
+    """`adjoint` of one pose into ``out`` (3, 3)."""
+    c, s = math.cos(p[2]), math.sin(p[2])
+    out[0, 0], out[0, 1], out[0, 2] = c, -s, p[1]
+    out[1, 0], out[1, 1], out[1, 2] = s, c, -p[0]
+    out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
+
+
+@numba.njit(cache=True)
+def fill_right_jacobian(v: Three, out: FloatArray) -> None:  # pragma: no cover
+    """`right_jacobian` of one tangent vector into ``out`` (3, 3)."""
+    f, g = _curl_terms(v[2])
+    a, b = _sinc_terms(v[2])
+    out[0, 0], out[0, 1], out[0, 2] = a, b, f * v[0] - g * v[1]
+    out[1, 0], out[1, 1], out[1, 2] = -b, a, g * v[0] + f * v[1]
+    out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
+
+
+@numba.njit(cache=True)
+def fill_right_jacobian_inverse(v: Three, out: FloatArray) -> None:  # pragma: no cover
+    """`right_jacobian_inverse` of one tangent vector into ``out`` (3, 3)."""
+    f, g = _curl_terms(v[2])
+    a, b = _sinc_terms(v[2])
+    p, q = f * v[0] - g * v[1], g * v[0] + f * v[1]
+    scale = 1.0 / (a * a + b * b)
+    c, s = scale * a, scale * b
+    out[0, 0], out[0, 1], out[0, 2] = c, -s, s * q - c * p
+    out[1, 0], out[1, 1], out[1, 2] = s, c, -s * p - c * q
+    out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
 
 
 def wrap_angle(angle: ArrayLike) -> FloatArray:
@@ -93,9 +168,9 @@ def wrap_angle(angle: ArrayLike) -> FloatArray:
     return np.where(wrapped >= math.pi, -math.pi, wrapped)
 
 
-@_gufunc("(n)->(n)")
+@gufunc("(n)->(n)")
 def _exp(v: FloatArray, out: FloatArray) -> None:  # pragma: no cover
-    out[0], out[1], out[2] = scalar_exp(v[0], v[1], v[2])
+    out[0], out[1], out[2] = scalar_exp(v)
 
 
 def exp(tangent: ArrayLike) -> FloatArray:
@@ -106,12 +181,9 @@ def exp(tangent: ArrayLike) -> FloatArray:
     return np.asarray(_exp(tangent))
 
 
-@_gufunc("(n)->(n)")
+@gufunc("(n)->(n)")
 def _log(p: FloatArray, out: FloatArray) -> None:  # pragma: no cover
-    x, y, theta = p[0], p[1], _wrap(p[2])
-    a, b = _sinc_terms(theta)
-    scale = 1.0 / (a * a + b * b)
-    out[0], out[1], out[2] = scale * (a * x + b * y), scale * (a * y - b * x), theta
+    out[0], out[1], out[2] = scalar_log(p)
 
 
 def log(pose: ArrayLike) -> FloatArray:
@@ -119,11 +191,9 @@ def log(pose: ArrayLike) -> FloatArray:
     return np.asarray(_log(pose))
 
 
-@_gufunc("(n),(n)->(n)")
+@gufunc("(n),(n)->(n)")
 def _compose(a: FloatArray, b: FloatArray, out: FloatArray) -> None:  # pragma: no cover
-    c, s = math.cos(a[2]), math.sin(a[2])
-    x, y = a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1]
-    out[0], out[1], out[2] = x, y, _wrap(a[2] + b[2])
+    out[0], out[1], out[2] = scalar_compose(a, b)
 
 
 def compose(a_T_b: ArrayLike, b_T_c: ArrayLike) -> FloatArray:
@@ -131,10 +201,9 @@ def compose(a_T_b: ArrayLike, b_T_c: ArrayLike) -> FloatArray:
     return np.asarray(_compose(a_T_b, b_T_c))
 
 
-@_gufunc("(n)->(n)")
+@gufunc("(n)->(n)")
 def _inverse(p: FloatArray, out: FloatArray) -> None:  # pragma: no cover
-    c, s = math.cos(p[2]), math.sin(p[2])
-    out[0], out[1], out[2] = -c * p[0] - s * p[1], s * p[0] - c * p[1], _wrap(-p[2])
+    out[0], out[1], out[2] = scalar_inverse(p)
 
 
 def inverse(a_T_b: ArrayLike) -> FloatArray:
@@ -147,7 +216,7 @@ def between(world_T_a: ArrayLike, world_T_b: ArrayLike) -> FloatArray:
     return compose(inverse(world_T_a), world_T_b)
 
 
-@_gufunc("(n),(m)->(m)")
+@gufunc("(n),(m)->(m)")
 def _transform(p: FloatArray, q: FloatArray, out: FloatArray) -> None:  # pragma: no cover
     c, s = math.cos(p[2]), math.sin(p[2])
     out[0], out[1] = p[0] + c * q[0] - s * q[1], p[1] + s * q[0] + c * q[1]
@@ -158,12 +227,9 @@ def transform(a_T_b: ArrayLike, points_b: ArrayLike) -> FloatArray:
     return np.asarray(_transform(a_T_b, points_b))
 
 
-@_gufunc("(n)->(n,n)")
+@gufunc("(n)->(n,n)")
 def _adjoint(p: FloatArray, out: FloatArray) -> None:  # pragma: no cover
-    c, s = math.cos(p[2]), math.sin(p[2])
-    out[0, 0], out[0, 1], out[0, 2] = c, -s, p[1]
-    out[1, 0], out[1, 1], out[1, 2] = s, c, -p[0]
-    out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
+    fill_adjoint(p, out)
 
 
 def adjoint(pose: ArrayLike) -> FloatArray:
@@ -171,17 +237,9 @@ def adjoint(pose: ArrayLike) -> FloatArray:
     return np.asarray(_adjoint(pose))
 
 
-@_gufunc("(n)->(n,n)")
+@gufunc("(n)->(n,n)")
 def _right_jacobian(v: FloatArray, out: FloatArray) -> None:  # pragma: no cover
-    theta = v[2]
-    a, b = _sinc_terms(theta)
-    if abs(theta) < _SMALL_ANGLE:
-        f, g = theta / 6.0, 0.5 - theta * theta / 24.0  # (t - sin t)/t^2 and (1 - cos t)/t^2
-    else:
-        f, g = (theta - math.sin(theta)) / (theta * theta), b / theta
-    out[0, 0], out[0, 1], out[0, 2] = a, b, f * v[0] - g * v[1]
-    out[1, 0], out[1, 1], out[1, 2] = -b, a, g * v[0] + f * v[1]
-    out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
+    fill_right_jacobian(v, out)
 
 
 def right_jacobian(tangent: ArrayLike) -> FloatArray:
@@ -189,20 +247,9 @@ def right_jacobian(tangent: ArrayLike) -> FloatArray:
     return np.asarray(_right_jacobian(tangent))
 
 
-@_gufunc("(n)->(n,n)")
+@gufunc("(n)->(n,n)")
 def _right_jacobian_inverse(v: FloatArray, out: FloatArray) -> None:  # pragma: no cover
-    theta = v[2]
-    a, b = _sinc_terms(theta)
-    if abs(theta) < _SMALL_ANGLE:
-        f, g = theta / 6.0, 0.5 - theta * theta / 24.0
-    else:
-        f, g = (theta - math.sin(theta)) / (theta * theta), b / theta
-    p, q = f * v[0] - g * v[1], g * v[0] + f * v[1]
-    scale = 1.0 / (a * a + b * b)
-    c, s = scale * a, scale * b
-    out[0, 0], out[0, 1], out[0, 2] = c, -s, s * q - c * p
-    out[1, 0], out[1, 1], out[1, 2] = s, c, -s * p - c * q
-    out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
+    fill_right_jacobian_inverse(v, out)
 
 
 def right_jacobian_inverse(tangent: ArrayLike) -> FloatArray:

@@ -63,9 +63,9 @@ class Estimator(Protocol):
 
 def mean_twist(delta: FloatArray, cov: FloatArray, duration: float) -> tuple[FloatArray, FloatArray]:
     """Twist (3,) that moves by ``delta`` (3,) in ``duration`` [s], and its covariance (3, 3) by that of ``delta``."""
-    twist = se2.log(delta) / duration
-    J = se2.right_jacobian_inverse(se2.log(delta)) / duration
-    return twist, J @ cov @ J.T
+    way = se2.log(delta)
+    J = se2.right_jacobian_inverse(way) / duration
+    return way / duration, J @ cov @ J.T
 
 
 NO_POINTS = np.empty((0, 2))
