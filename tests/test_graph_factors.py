@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from localization.errors import EstimatorError
-from localization.estimators.graph_factors import Closure, Kernel, Pairs, Position, linearize, whitening
+from localization.estimators.graph_factors import Pairs, linearize, whitening
 from localization.estimators.graph_link import Link, check_covariance, first_link
 from localization.estimators.graph_qr import inverse_of_upper, triangularize
+from localization.estimators.graph_robust import Closure, Kernel, Position
 from localization.residuals import motion_residual, position_residual
 from motion_models import se2
 from motion_models.base import Motion

@@ -36,28 +36,44 @@ class Block:
 def chain(rows: FloatArray, first: int = 0) -> Iterator[Block]:
     """The blocks of `graph_factors.linearize`, whose first pair is (``first``, ``first`` + 1)."""
     n = (rows.shape[-1] - 1) // 2
-    if not np.isfinite(rows).all():
-        bad = first + int(np.argmin(np.isfinite(rows).all(axis=(1, 2))))
-        raise EstimatorError(f"the factors between nodes {bad} and {bad + 1} are not finite.")
+    check_rows(rows, first)
     for i, block in enumerate(rows, start=first):
         yield Block((i, i + 1), (block[:, :n], block[:, n : 2 * n]), block[:, -1])
 
 
-def solve(blocks: Iterable[Block], count: int, n: int) -> FloatArray:
-    """(count, n) changes of the nodes 0 ... count - 1. Raises `IndeterminateError` and `EstimatorError`."""
-    tree = _tree(list(blocks), range(count), n)
+def check_rows(rows: FloatArray, first: int = 0) -> None:
+    """Raises `EstimatorError` unless the rows of `graph_factors.linearize`, whose first pair begins at ``first``, are finite."""
+    if not np.isfinite(rows).all():
+        bad = first + int(np.argmin(np.isfinite(rows).all(axis=(1, 2))))
+        raise EstimatorError(f"the factors between nodes {bad} and {bad + 1} are not finite.")
+
+
+def solve(blocks: Iterable[Block], nodes: Sequence[int], n: int) -> FloatArray:
+    """(k, n) changes of ``nodes``, which are all. Raises `IndeterminateError` and `EstimatorError`."""
+    tree = _tree(list(blocks), nodes, n)
     try:
         found = tree.optimize()
     except RuntimeError as error:
         raise _indeterminate(error) from error
-    return _finite(np.array([found.at(i) for i in range(count)]).reshape(count, n))
+    return checked_changes(np.array([found.at(i) for i in nodes]).reshape(len(nodes), n))
 
 
-def marginals(blocks: Iterable[Block], nodes: Iterable[int], count: int, n: int) -> FloatArray:
-    """(k, n, n) covariances of ``nodes``. Raises `IndeterminateError` and `EstimatorError`."""
-    tree = _tree(list(blocks), range(count), n)
+def marginals(blocks: Iterable[Block], of: Iterable[int], nodes: Sequence[int], n: int) -> FloatArray:
+    """(k, n, n) covariances ``of`` some of all ``nodes``. Raises `IndeterminateError` and `EstimatorError`."""
+    tree = _tree(list(blocks), nodes, n)
     try:
-        return _finite_covariances(np.array([tree.marginalCovariance(i) for i in nodes]).reshape(-1, n, n))
+        return checked_covariances(np.array([tree.marginalCovariance(i) for i in of]).reshape(-1, n, n))
+    except RuntimeError as error:
+        raise _indeterminate(error) from error
+
+
+def joint_marginals(blocks: Iterable[Block], of: Sequence[tuple[int, int]], nodes: Sequence[int], n: int) -> FloatArray:
+    """(k, 2n, 2n) covariances ``of`` some pairs (a, b), a < b, of all ``nodes``. Raises `IndeterminateError` and `EstimatorError`."""
+    if not of:
+        return np.empty((0, 2 * n, 2 * n))
+    tree = _tree(list(blocks), nodes, n)
+    try:
+        return checked_covariances(np.array([tree.jointMarginalCovariance(list(pair)).fullMatrix() for pair in of]))
     except RuntimeError as error:
         raise _indeterminate(error) from error
 
@@ -96,17 +112,17 @@ class Incremental:
             estimate = self._isam.calculateBestEstimate()
         except RuntimeError as error:
             raise _indeterminate(error) from error
-        return _finite(np.array([estimate.atVector(i) for i in nodes]).reshape(-1, self._n))
+        return checked_changes(np.array([estimate.atVector(i) for i in nodes]).reshape(-1, self._n))
 
     def marginals(self, nodes: Iterable[int]) -> FloatArray:
         """(k, n, n) covariances of ``nodes``."""
         try:
-            return _finite_covariances(np.array([self._isam.marginalCovariance(i) for i in nodes]).reshape(-1, self._n, self._n))
+            return checked_covariances(np.array([self._isam.marginalCovariance(i) for i in nodes]).reshape(-1, self._n, self._n))
         except RuntimeError as error:
             raise _indeterminate(error) from error
 
 
-def _tree(blocks: Sequence[Block], nodes: range, n: int) -> Any:
+def _tree(blocks: Sequence[Block], nodes: Sequence[int], n: int) -> Any:
     """The Bayes tree, by Cholesky, which is fast; where that runs out of digits, by QR."""
     try:
         return _system(blocks, nodes, n, _unit).eliminateMultifrontal()
@@ -117,17 +133,17 @@ def _tree(blocks: Sequence[Block], nodes: range, n: int) -> Any:
             raise _indeterminate(error) from error
 
 
-def _system(blocks: Sequence[Block], nodes: range, n: int, noise: Callable[[int], Any]) -> Any:
-    system, touched = gtsam.GaussianFactorGraph(), np.zeros(len(nodes), dtype=bool)
+def _system(blocks: Sequence[Block], nodes: Sequence[int], n: int, noise: Callable[[int], Any]) -> Any:
+    system, known, touched = gtsam.GaussianFactorGraph(), set(nodes), set[int]()
     for block in blocks:
-        system.add(_factor(block, nodes, n, noise))
-        touched[list(block.nodes)] = True
-    if not touched.all():
-        raise IndeterminateError(f"no factor speaks of node {int(np.argmin(touched))}.")
+        system.add(_factor(block, known, n, noise))
+        touched.update(block.nodes)
+    if known - touched:
+        raise IndeterminateError(f"no factor speaks of node {min(known - touched)}.")
     return system
 
 
-def _factor(block: Block, known: range | set[int], n: int, noise: Callable[[int], Any] | None = None) -> Any:
+def _factor(block: Block, known: set[int], n: int, noise: Callable[[int], Any] | None = None) -> Any:
     rows = len(block.rhs)
     arguments: list[Any] = []
     for node, matrix in zip(block.nodes, block.matrices, strict=True):
@@ -159,14 +175,16 @@ def _unit_by_qr(rows: int) -> Any:
     return gtsam.noiseModel.Constrained.MixedSigmas(1.0, np.ones(rows))
 
 
-def _finite(changes: FloatArray) -> FloatArray:
+def checked_changes(changes: FloatArray) -> FloatArray:
+    """``changes`` (k, n) of nodes. Raises `IndeterminateError` unless they are finite."""
     if not np.isfinite(changes).all():
         bad = int(np.argmin(np.isfinite(changes).all(axis=1)))
         raise IndeterminateError(f"the solution is not finite from node {bad} on.")
     return changes
 
 
-def _finite_covariances(found: FloatArray) -> FloatArray:
+def checked_covariances(found: FloatArray) -> FloatArray:
+    """``found`` (k, n, n). Raises `IndeterminateError` unless they are finite."""
     if not np.isfinite(found).all():
         raise IndeterminateError("the graph's factors are so unlike in size that its covariances are not finite.")
     return found

@@ -21,16 +21,17 @@ from localization.errors import EstimatorError
 from localization.estimators.base import NO_POINTS, Estimate, mean_twist
 from localization.estimators.ekf import EkfConfig
 from localization.estimators.graph_errors import GraphErrors
-from localization.estimators.graph_factors import Closure, Kernel, Pairs, Position, seen_residual, whitening
+from localization.estimators.graph_factors import Pairs, whitening
 from localization.estimators.graph_history import History
 from localization.estimators.graph_link import Link, check_covariance, check_motion
+from localization.estimators.graph_node import Ahead, Node, SingularError, innovation
 from localization.estimators.graph_revisit import revisited
+from localization.estimators.graph_robust import Closure, Kernel, Position
 from localization.estimators.graph_slow import ONE_CLOCK, Learned, SlowStates
-from localization.estimators.graph_window import Ahead, Node, SingularError, Window
+from localization.estimators.graph_window import Window
 from localization.estimators.teaching import teaching
 from localization.estimators.witness import NoWitness, ScanWitness, Sight, Witness
 from localization.lidar import LidarConfig
-from localization.residuals import motion_residual
 from localization.steps import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
@@ -39,6 +40,7 @@ from motion_models.corrections import Corrections
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
+_NOT_FINITE = "wheels and LiDAR cannot be weighed: numbers are not finite, or too large to compute with. Look at the log."
 _CERTAIN = 1e-6  # m, rad: sigma of the first pose, which is the origin by definition
 _COUNTED = ("scans", "matched", "contradictions", "standing", "revisits", "nodes", "rebuilt", "positions", "closures", "late")
 _NEAR_NS = 50_000_000  # a loop closure is between nodes, this near
@@ -320,17 +322,12 @@ class GraphFusion:
 
         Where they contradict, one is wrong: the covariance of the one that is not sure of itself grows until they agree.
         """
-        measured, mount, slow = sight.motion, None, ahead.node.slow
-        if self._slow.mount_names:
-            mount = self._slow.shown(measured)
-            error, _, d_b, d_mount = seen_residual(self._newest.pose, ahead.node.pose, measured.delta, mount @ slow)
-            by_slow = d_b @ pending.d_slow + d_mount @ mount
-            d_seen = se2.right_jacobian_inverse(error)
-        else:
-            error, _, d_b = motion_residual(self._newest.pose, ahead.node.pose, measured.delta)
-            by_slow, d_seen = d_b @ pending.d_slow, d_b
-        S = d_b @ pending.cov @ d_b.T + by_slow @ ahead.node.covariance[3:, 3:] @ by_slow.T + d_seen @ measured.cov @ d_seen.T
-        nis = _normalized(error, S)
+        measured, mount = sight.motion, self._slow.shown(sight.motion)
+        error, nis = innovation(self._newest, ahead, pending, measured, mount)
+        if math.isnan(nis):
+            raise EstimatorError(
+                "wheels and LiDAR cannot be weighed: numbers are not finite, or too large to compute with. Look at the log."
+            )
         if nis > self._gate:
             self._counts["contradictions"] += 1
             if sight.is_trusted:
@@ -372,23 +369,10 @@ class GraphFusion:
             return step.twist, None
         if alone:
             delta = se2.between(before.pose, ahead.node.pose)
-            _, d_a, d_b = motion_residual(before.pose, ahead.node.pose, delta)
-            J = np.hstack([d_a, d_b])
-            cov = J @ ahead.motion_covariance() @ J.T if self._errors is None else self._errors.motion(before.pose, self._now.pose)
+            cov = ahead.motion_covariance(before) if self._errors is None else self._errors.motion(before.pose, self._now.pose)
         else:
             delta, at = link.delta, link.d_slow
             cov = link.cov + at @ self._now.covariance[3:, 3:] @ at.T
         twist, twist_cov = mean_twist(delta, cov, step.duration)
         self._twist_now = twist
         return twist, twist_cov
-
-
-def _normalized(error: FloatArray, S: FloatArray) -> float:
-    """``error^T S^-1 error``. Raises `EstimatorError` where there is no such number: it would be lost in the state without a word."""
-    try:
-        found = float(error @ np.linalg.solve(S, error))
-    except np.linalg.LinAlgError:
-        found = math.nan
-    if not math.isfinite(found):
-        raise EstimatorError("wheels and LiDAR cannot be weighed: numbers are not finite, or too large to compute with. Look at the log.")
-    return found

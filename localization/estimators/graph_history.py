@@ -7,12 +7,15 @@ from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
-from localization.estimators.graph import Block, Incremental, IndeterminateError, chain, marginals, solve
-from localization.estimators.graph_factors import Closure, Kernel, Pairs, Position, linearize
+from localization.estimators.graph import Block, Incremental, IndeterminateError, chain
+from localization.estimators.graph_chain import Chain
+from localization.estimators.graph_factors import Pairs, linearize
 from localization.estimators.graph_link import Link
-from localization.estimators.graph_window import Node
+from localization.estimators.graph_node import Node
+from localization.estimators.graph_robust import UNARY, Closure, Kernel, Position, position_rows
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.se2 import FloatArray
@@ -113,7 +116,7 @@ class History:
         rows, cost = self._linear()
         damping = 0.0
         for _ in range(_ITERATIONS):
-            changes = solve([*self._blocks(rows), *self._damped(damping)], self._count, self._n)
+            changes = self._chain(rows, damping).solve()
             before = self._poses.copy(), self._slow.copy()
             self._move(changes)
             new_rows, new_cost = self._linear()
@@ -130,7 +133,7 @@ class History:
         """Poses at all marks by all that is known, with their marginal covariances."""
         if self._isam is None:
             self.solve()
-            covariances = marginals(self._blocks(self._linear()[0]), range(self._count), self._count, self._n)
+            covariances = self._chain(self._linear()[0]).marginals()
         else:
             self._settle()
             alive = self._isam.marginals(range(self._frozen, self._count))
@@ -177,6 +180,25 @@ class History:
         yield from (self._position_block(node, p) for node, p in self._positions if node >= self._frozen)
         yield from (self._closure_block(c) for c in self._closures if min(c.a, c.b) >= self._frozen)
 
+    def _chain(self, rows: FloatArray, damping: float = 0.0) -> Chain:
+        """The same of a batch, none of whose nodes is frozen, each pulled towards where it is with a root weight of ``damping``."""
+        at: dict[int, list[Position]] = {}
+        for node, position in self._positions:
+            at.setdefault(node, []).append(position)
+        n, u, d = self._n, UNARY if at else 0, self._n if damping > 0.0 else 0
+        unary = np.zeros((self._count, u + d, n + 1))
+        for node, positions in at.items():
+            found = position_rows(positions, self._poses[node], self._kernel)
+            unary[node, :u, :3], unary[node, :u, n] = found[:, :3], found[:, 3]
+        if d:
+            unary[:, u:, :n] = np.sqrt(damping) * self._unit
+        return Chain(rows, unary, self._prior(), [self._closure_block(c) for c in self._closures])
+
+    @property
+    def _unit(self) -> FloatArray:
+        """(n, n): a metre, a radian, and what is not known of the slow states at first are one unit each."""
+        return np.asarray(block_diag(np.eye(3), self._first.root[3:, 3:]))
+
     def _prior(self) -> Block:
         node, f = self._first, self._frozen
         off = se2.log(se2.between(node.pose, self._poses[f]))
@@ -194,13 +216,6 @@ class History:
 
     def _wide(self, rows: FloatArray) -> FloatArray:
         return np.hstack([rows, np.zeros((len(rows), self._n - 3))])
-
-    def _damped(self, damping: float) -> Iterator[Block]:
-        if damping > 0.0:
-            scale, zero = np.sqrt(damping) * np.eye(self._n), np.zeros(self._n)
-            # a metre, a radian, and what is not known of the slow states are one unit each
-            scale[3:, 3:] = np.sqrt(damping) * self._first.root[3:, 3:]
-            yield from (Block((i,), (scale,), zero) for i in range(self._count))
 
     def _move(self, changes: FloatArray) -> None:
         here = slice(self._frozen, self._count)

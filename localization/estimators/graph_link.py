@@ -10,14 +10,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 
 from localization.errors import EstimatorError
-from localization.estimators.graph_qr import condition, is_covariance
+from localization.estimators.graph_qr import condition, is_covariance, product, triangularize
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
-_LEAST_VARIANCE = 1e-12  # m^2, rad^2: below this a motion is as good as certain, and the numbers stay finite
+_LEAST = 1e-12 * np.eye(3)  # m^2, rad^2: below this a motion is as good as certain, and the numbers stay finite
 
 
 @dataclass(frozen=True)
@@ -50,20 +51,8 @@ class Link:
 
         ``error`` (r,) = measured - predicted = d_delta (r, 3) perturbation + d_slow (r, m) (s - at) + noise of ``variances`` (r,).
         """
-        cov, by_slow = self.cov.copy(), self.d_slow.copy()
-        rows, rhs = np.empty((len(error), self.n_slow)), np.empty(len(error))
-        shift = condition(cov, by_slow, error, d_delta, d_slow, variances, rows, rhs)
-        J = se2.right_jacobian(shift)
-        return Link(
-            se2.compose(self.delta, se2.exp(shift)),
-            J @ (0.5 * (cov + cov.T)) @ J.T,
-            J @ by_slow,
-            self.at,
-            np.vstack([self.rows, rows]),
-            np.append(self.rhs, rhs),
-            self.duration,
-            self.moving,
-        )
+        delta, cov, by_slow, rows, rhs = _observe(self.delta, self.cov, self.d_slow, self.rows, self.rhs, error, d_delta, d_slow, variances)
+        return Link(delta, cov, by_slow, self.at, rows, rhs, self.duration, self.moving)
 
     def rebased(self, at: FloatArray) -> Link:
         """The same link expanded at other slow states (m,)."""
@@ -99,12 +88,9 @@ class Link:
     def compressed(self) -> tuple[FloatArray, FloatArray]:
         """``rows`` and ``rhs`` as exactly m rows (m, m), (m,) that say the same about the slow states."""
         m = self.n_slow
-        both = np.column_stack([self.rows, self.rhs])
-        if len(both) > m:
-            both = np.asarray(np.linalg.qr(both, mode="r"))[:m]
-        padded = np.zeros((m, m + 1))
-        padded[: len(both)] = both
-        return padded[:, :m], padded[:, m]
+        rows, rhs = np.empty((m, m)), np.empty(m)
+        compress(self.rows, self.rhs, rows, rhs)
+        return rows, rhs
 
 
 def first_link(delta: FloatArray, cov: FloatArray, d_slow: FloatArray, at: FloatArray, duration: float, moving: float) -> Link:
@@ -115,7 +101,42 @@ def first_link(delta: FloatArray, cov: FloatArray, d_slow: FloatArray, at: Float
             "the derivatives of the wheels' motion are not finite: check the log's wheel rates and the model's parameters."
         )
     m = len(at)
-    return Link(delta, cov + _LEAST_VARIANCE * np.eye(3), d_slow, at, np.empty((0, m)), np.empty(0), duration, moving)
+    return Link(delta, np.ascontiguousarray(cov + _LEAST), d_slow, at, np.empty((0, m)), np.empty(0), duration, moving)
+
+
+@numba.njit(cache=True)
+def _observe(
+    delta: FloatArray,
+    cov: FloatArray,
+    d_state: FloatArray,
+    rows: FloatArray,
+    rhs: FloatArray,
+    error: FloatArray,
+    d_delta: FloatArray,
+    d_slow: FloatArray,
+    variances: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:  # pragma: no cover
+    """`Link.observe`: the new delta, cov, d_slow, rows and rhs."""
+    r, old = error.shape[0], rhs.shape[0]
+    cov, d_state = cov.copy(), d_state.copy()
+    all_rows, all_rhs = np.empty((old + r, rows.shape[1])), np.empty(old + r)
+    all_rows[:old], all_rhs[:old] = rows, rhs
+    shift = condition(cov, d_state, error, d_delta, d_slow, variances, all_rows[old:], all_rhs[old:])
+    J = np.empty((3, 3))
+    se2.fill_right_jacobian(shift, J)
+    there: FloatArray = np.array(se2.scalar_compose(delta, se2.scalar_exp(shift)))
+    return there, product(product(J, 0.5 * (cov + cov.T)), J.T), product(J, d_state), all_rows, all_rhs
+
+
+@numba.njit(cache=True)
+def compress(rows: FloatArray, rhs: FloatArray, m_rows: FloatArray, m_rhs: FloatArray) -> None:  # pragma: no cover
+    """Fill ``m_rows`` (m, m) and ``m_rhs`` (m,) with what ``rows`` (r, m) and ``rhs`` (r,) say."""
+    r, m = rows.shape
+    both = np.zeros((max(r, m), m + 1))
+    both[:r, :m], both[:r, m] = rows, rhs
+    if r > m:
+        triangularize(both, m)
+    m_rows[:], m_rhs[:] = both[:m, :m], both[:m, m]
 
 
 def check_motion(delta: FloatArray, cov: FloatArray, what: str) -> None:

@@ -49,19 +49,19 @@ def eliminate(roots: FloatArray, conditionals: FloatArray, rows: FloatArray, una
     """Eliminate nodes 0 .. N - 1 of N + 1 in order.
 
     ``roots`` (N + 1, n, n + 1): the first is given, the others are filled; ``conditionals`` (N, n, 2n + 1) are filled; ``rows``
-    (N, r, 2n + 1) of `graph_factors.linearize`; ``unary`` (N + 1, u, 4) rows about the pose of each node.
+    (N, r, 2n + 1) of `graph_factors.linearize`; ``unary`` (N + 1, u, c + 1) rows about the first c numbers of each node.
     """
     count, r, width = rows.shape
     n = roots.shape[1]
-    u = unary.shape[1]
+    u, c = unary.shape[1], unary.shape[2] - 1
     work = np.empty((n + r + u, width))
     for p in range(count):
         work[:] = 0.0
         work[:n, :n] = roots[p, :, :n]
         work[:n, 2 * n] = roots[p, :, n]
         work[n : n + r] = rows[p]
-        work[n + r :, n : n + 3] = unary[p + 1, :, :3]
-        work[n + r :, 2 * n] = unary[p + 1, :, 3]
+        work[n + r :, n : n + c] = unary[p + 1, :, :c]
+        work[n + r :, 2 * n] = unary[p + 1, :, c]
         triangularize(work, 2 * n)
         conditionals[p] = work[:n]
         roots[p + 1] = work[n : 2 * n, n:]
@@ -69,11 +69,11 @@ def eliminate(roots: FloatArray, conditionals: FloatArray, rows: FloatArray, una
 
 @numba.njit(cache=True)
 def is_regular(root: FloatArray) -> bool:  # pragma: no cover
-    """``root`` (n, n + 1) is finite, and none of its pivots is lost in the rounding of its column."""
+    """``root`` (n, n or more), upper triangular, is finite, and none of its pivots is lost in the rounding of its column."""
     n = root.shape[0]
     for i in range(n):
         size = 0.0
-        for j in range(n + 1):
+        for j in range(root.shape[1]):
             if not math.isfinite(root[i, j]):
                 return False
         for j in range(i + 1):
@@ -85,23 +85,39 @@ def is_regular(root: FloatArray) -> bool:  # pragma: no cover
 
 @numba.njit(cache=True)
 def substitute(root: FloatArray, conditionals: FloatArray, change: FloatArray) -> bool:  # pragma: no cover
-    """Fill ``change`` (N + 1, n) from the ``root`` (n, n + 1) of the last node and the ``conditionals`` (N, n, 2n + 1) before it."""
-    n, last = root.shape[0], change.shape[0] - 1
-    for p in range(last, -1, -1):
-        for i in range(n - 1, -1, -1):
-            if p == last:
-                value, pivot = root[i, n], root[i, i]
-                for j in range(i + 1, n):
-                    value -= root[i, j] * change[p, j]
-            else:
-                value, pivot = conditionals[p, i, 2 * n], conditionals[p, i, i]
-                for j in range(i + 1, n):
-                    value -= conditionals[p, i, j] * change[p, j]
-                for j in range(n):
-                    value -= conditionals[p, i, n + j] * change[p + 1, j]
-            change[p, i] = value / pivot if pivot != 0.0 else math.nan
-            if not math.isfinite(change[p, i]):
-                return False
+    """Fill ``change`` (N + 1, n) from the ``root`` (n, n + 1) of the last node and the ``conditionals`` (N, n, 2n + 1) before it.
+
+    Returns whether there is a solution, as all of these do.
+    """
+    n = root.shape[0]
+    change[-1] = root[:, n]
+    return solve_upper(root, change[-1]) and substitute_given(conditionals, change)
+
+
+@numba.njit(cache=True)
+def substitute_given(conditionals: FloatArray, change: FloatArray) -> bool:  # pragma: no cover
+    """`substitute` where the last of ``change`` is known."""
+    n = change.shape[1]
+    for p in range(change.shape[0] - 2, -1, -1):
+        for i in range(n):
+            value = conditionals[p, i, 2 * n]
+            for j in range(n):
+                value -= conditionals[p, i, n + j] * change[p + 1, j]
+            change[p, i] = value
+        if not solve_upper(conditionals[p], change[p]):
+            return False
+    return True
+
+
+@numba.njit(cache=True)
+def solve_upper(R: FloatArray, x: FloatArray) -> bool:  # pragma: no cover
+    """Make the right side ``x`` (n,) the solution by the upper triangle of ``R`` (n, n or more)."""
+    for i in range(x.shape[0] - 1, -1, -1):
+        for j in range(i + 1, x.shape[0]):
+            x[i] -= R[i, j] * x[j]
+        x[i] = x[i] / R[i, i] if R[i, i] != 0.0 else math.nan
+        if not math.isfinite(x[i]):
+            return False
     return True
 
 
@@ -146,6 +162,26 @@ def inverse_of_upper(R: FloatArray) -> FloatArray:  # pragma: no cover
                 value -= R[i, k] * inverse[k, j]
             inverse[i, j] = value / R[i, i]
     return inverse
+
+
+@numba.njit(cache=True)
+def product(A: FloatArray, B: FloatArray) -> FloatArray:  # pragma: no cover
+    """``A @ B``."""
+    out = np.zeros((A.shape[0], B.shape[1]))
+    add_product(out, 1.0, A, B)
+    return out
+
+
+@numba.njit(cache=True)
+def add_product(out: FloatArray, factor: float, A: FloatArray, B: FloatArray) -> None:  # pragma: no cover
+    """``out += factor * A @ B``; ``out`` is neither of them."""
+    for i in range(A.shape[0]):
+        for k in range(A.shape[1]):
+            f = factor * A[i, k]
+            if f == 0.0:
+                continue
+            for j in range(B.shape[1]):
+                out[i, j] += f * B[k, j]
 
 
 @numba.njit(cache=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from localization.estimators.graph_window import Node
+from localization.estimators.graph_node import Node
 from localization.estimators.revisit_update import revisit_update
 from localization.lidar import Revisit
 from motion_models import se2

@@ -84,15 +84,17 @@ class SlowStates:
         ``clock``: variance by which the clock offset walks meanwhile [s^2], if not as it usually does: `ONE_CLOCK` before a second clock is
         heard, the square of what is believed at first when it is.
         """
-        scale = np.full(self.size, max(duration, 1e-6) ** -0.5)
-        scale[self.corrections] = max(moving, 1e-6 * max(duration, 1e-3)) ** -0.5
-        found = np.asarray(self._walk * scale[:, None])
+        found = self._walk.copy()
+        found[: self.corrections.start] *= max(duration, 1e-6) ** -0.5
+        found[self.corrections] *= max(moving, 1e-6 * max(duration, 1e-3)) ** -0.5
         if self.has_clock and clock is not None:
             found[1, 1] = clock**-0.5
         return found
 
     def shown(self, seen: Motion) -> FloatArray:
         """(3, m) `mount`, without what a motion ``seen`` by the LiDAR cannot show: where it sits without a turn, its yaw without a way."""
+        if not self.mount_names:
+            return self.mount
         turn, way = abs(float(seen.delta[2])), math.hypot(*seen.delta[:2])
         turns = turn > _SHOWN * math.sqrt(seen.cov[2, 2])
         moves = turns or way > _SHOWN * math.sqrt(0.5 * (seen.cov[0, 0] + seen.cov[1, 1]))
@@ -113,10 +115,10 @@ class SlowStates:
             turn = step.turn
             if not (math.isfinite(turn.angle) and turn.variance > 0.0 and math.isfinite(turn.variance)):
                 raise EstimatorError(f"the gyro's turn that ends at {step.end_ns} ns is {turn.angle} rad with variance {turn.variance}.")
-            error = se2.wrap_angle(turn.angle - link.delta[2] - at[0] * turn.duration)
+            error = se2.scalar_wrap(float(turn.angle - link.delta[2] - at[0] * turn.duration))
             by_slow = np.zeros((1, self.size))
             by_slow[0, 0] = turn.duration
-            link = link.observe(np.array([float(error)]), _YAW, by_slow, np.array([turn.variance]))
+            link = link.observe(np.array([error]), _YAW, by_slow, np.array([turn.variance]))
         if step.is_standing:
             still = np.array([b.standing_sigma_m**2, b.standing_sigma_m**2, b.standing_sigma_rad**2])
             link = link.observe(-se2.log(link.delta), np.eye(3), np.zeros((3, self.size)), still)

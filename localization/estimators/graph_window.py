@@ -10,73 +10,23 @@ still (Bierman, "Factorization methods for discrete sequential estimation", 1977
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Self
+from dataclasses import replace
 
+import numba
 import numpy as np
 
 from localization.errors import EstimatorError
 from localization.estimators.graph import Block, chain, marginals, solve
-from localization.estimators.graph_factors import Closure, Kernel, Pairs, Position, linearize, linearize_seen, whitening
-from localization.estimators.graph_qr import eliminate, inverse_of_upper, is_regular, substitute, triangularize
+from localization.estimators.graph_factors import Pairs, linearize
+from localization.estimators.graph_node import Ahead, Node, SingularError, expand_anew, extend, see
+from localization.estimators.graph_qr import eliminate, is_regular, substitute, triangularize
+from localization.estimators.graph_robust import UNARY, Closure, Kernel, Position, position_rows
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.se2 import FloatArray
 
 _ITERATIONS = 10
-_UNARY = 3  # rows that positions leave on the pose of a node
 _TURNED = 0.1  # rad
-
-
-class SingularError(EstimatorError):
-    """A system whose solution is not determined, or not finite."""
-
-
-@dataclass(frozen=True)
-class Node:
-    """What is known of one node: a mean, and the square root of the information about it."""
-
-    pose: FloatArray
-    """(3,)"""
-    slow: FloatArray
-    """(m,)"""
-    root: FloatArray
-    """(n, n) R, upper triangular, with R^T R = covariance^-1, for right perturbations of the pose and for the slow states."""
-
-    @classmethod
-    def known(cls, pose: FloatArray, slow: FloatArray, cov: FloatArray) -> Self:
-        """With the covariance ``cov`` (n, n). Raises `EstimatorError` if that is not positive definite."""
-        root = whitening(cov)
-        triangularize(root, len(root))
-        return cls(pose, slow, root)
-
-    @cached_property
-    def covariance(self) -> FloatArray:
-        """(n, n)"""
-        inverse = inverse_of_upper(self.root)
-        return np.asarray(inverse @ inverse.T)
-
-
-@dataclass(frozen=True)
-class Ahead:
-    """A node that could be added, its predecessor with it."""
-
-    node: Node
-    pair: Pairs
-    conditional: FloatArray
-    """(n, 2n + 1): the predecessor, given this node."""
-
-    def motion_covariance(self) -> FloatArray:
-        """(6, 6) joint covariance of the poses of the predecessor and of this node."""
-        n = self.node.root.shape[0]
-        inverse = inverse_of_upper(self.conditional[:, :n])
-        G, P = -inverse @ self.conditional[:, n : 2 * n], self.node.covariance
-        both = np.empty((6, 6))
-        both[:3, :3] = (inverse @ inverse.T + G @ P @ G.T)[:3, :3]
-        both[:3, 3:] = (G @ P)[:3, :3]
-        both[3:, :3], both[3:, 3:] = both[:3, 3:].T, P[:3, :3]
-        return both
 
 
 class Window:
@@ -92,7 +42,7 @@ class Window:
         self._poses, self._slow = np.zeros((room, 3)), np.zeros((room, n - 3))
         self._roots = np.zeros((room, n, n + 1))
         self._conditionals = np.zeros((room, n, 2 * n + 1))
-        self._unary = np.zeros((room, _UNARY, 4))
+        self._unary = np.zeros((room, UNARY, 4))
         self._positions: list[list[Position]] = [[] for _ in range(room)]
         self._change = np.zeros((room, n))
         self._ways = np.zeros((room, 3))  # from each node to the next, as it was when it was linearised
@@ -130,35 +80,11 @@ class Window:
 
     def extend(self, pair: Pairs) -> Ahead:
         """The node that ``pair`` leads to. Raises `SingularError`."""
-        n, i = self._n, self._size - 1
-        poses, slow = np.empty((2, 3)), np.empty((2, n - 3))
-        poses[0], slow[0], slow[1] = self._poses[i], self._slow[i], self._slow[i]
-        shift = pair.d_slow[0] @ (slow[0] - pair.at[0])
-        poses[1] = se2.compose(poses[0], se2.compose(pair.delta[0], se2.exp(shift)))
-        roots, conditionals = np.empty((2, n, n + 1)), np.empty((1, n, 2 * n + 1))
-        roots[0] = self._roots[i]
-        eliminate(roots, conditionals, linearize(pair, poses, slow), np.zeros((2, _UNARY, 4)))
-        return self._ahead(pair, poses[1], slow[1], roots[1], conditionals)
+        return extend(self.newest, pair)
 
     def see(self, ahead: Ahead, motion: Motion, mount: FloatArray | None = None) -> Ahead:
         """``ahead`` with the motion that a LiDAR saw on the way to it, and what of its ``mount`` (3, m) shows. Raises `SingularError`."""
-        n, node, pair, i = self._n, ahead.node, ahead.pair.seeing(motion, mount), self._size - 1
-        work = np.zeros((2 * n + 3, 2 * n + 1))
-        work[:n], work[n : 2 * n, n : 2 * n] = ahead.conditional, node.root
-        work[2 * n :] = linearize_seen(pair, self._poses[None, i], node.pose[None], self._slow[None, i])[0]
-        triangularize(work, 2 * n)
-        return self._ahead(pair, node.pose, node.slow, work[n : 2 * n, n:].copy(), work[None, :n].copy())
-
-    def _ahead(self, pair: Pairs, pose: FloatArray, slow: FloatArray, root: FloatArray, conditionals: FloatArray) -> Ahead:
-        n = self._n
-        change = np.empty((2, n))
-        if not is_regular(root) or not substitute(root, conditionals, change):
-            raise SingularError("the motion to a new node is not determined by what was measured.")
-        J = se2.right_jacobian_inverse(change[1, :3])
-        _move(root, 0, change[1], J)
-        _move(conditionals[0], n, change[1], J)
-        node = Node(se2.compose(pose, se2.exp(change[1, :3])), slow + change[1, 3:], root[:, :-1])
-        return Ahead(node, pair, conditionals[0])
+        return see(self.newest, ahead, motion, mount)
 
     def commit(self, ahead: Ahead) -> None:
         """Add the node, forget the oldest one if there are too many. Raises `SingularError`."""
@@ -218,11 +144,11 @@ class Window:
                 blocks += [self._block((k - first,), p.linearize(poses[k - first], self._kernel)) for p in self._positions[k]]
             rows = replace(closure, a=a - first, b=b - first).linearize(poses, self._kernel)
             blocks.append(self._block((a - first, b - first), rows))
-            changes = solve(blocks, count, n)
+            changes = solve(blocks, range(count), n)
             poses, slow = se2.compose(poses, se2.exp(changes[:, :3])), slow + changes[:, 3:]
             if np.abs(changes[:, :3]).max() < 1e-9:
                 break
-        self.restart(Node.known(poses[-1], slow[-1], marginals(blocks, [count - 1], count, n)[0]))
+        self.restart(Node.known(poses[-1], slow[-1], marginals(blocks, [count - 1], range(count), n)[0]))
 
     def _block(self, nodes: tuple[int, ...], rows: FloatArray) -> Block:
         wide = np.zeros((len(rows), self._n - 3))
@@ -253,13 +179,8 @@ class Window:
         """
         first, last = self._size - min(self._size, self._lag), self._size
         self._back(first)
-        change = self._change[first:last, :3]
-        poses = se2.compose(self._poses[first:last], se2.exp(change))
-        ways = se2.between(poses[:-1], poses[1:])
-        self._ways[last - 2] = ways[-1]
-        is_far = np.abs(se2.log(se2.between(self._ways[first : last - 1], ways))).max() > self._relinearize_at
-        is_far |= np.abs(change[:, 2]).max() > _TURNED
-        if is_far or (any(self._positions[first:last]) and np.abs(change).max() > self._relinearize_at):
+        bent, turned, moved = _changes(self._poses[first:last], self._change[first:last], self._ways[first:last])
+        if bent > self._relinearize_at or turned > _TURNED or (moved > self._relinearize_at and any(self._positions[first:last])):
             self._again()
 
     def _again(self) -> None:
@@ -267,13 +188,12 @@ class Window:
         first, last = self._size - min(self._size, self._lag), self._size
         self._newest = None
         here = slice(first, last)
-        moved = self._change[here].copy()
-        _move(self._roots[first], 0, moved[0], se2.right_jacobian_inverse(moved[0, :3]))
-        self._poses[here] = se2.compose(self._poses[here], se2.exp(moved[:, :3]))
-        self._slow[here] += moved[:, 3:]
+        expand_anew(self._roots[first], 0, self._change[first])
+        self._poses[here] = se2.compose(self._poses[here], se2.exp(self._change[here, :3]))
+        self._slow[here] += self._change[here, 3:]
         for k in range(first, last):
             if self._positions[k]:
-                self._unary[k] = self._position_rows(k)
+                self._unary[k] = position_rows(self._positions[k], self._poses[k], self._kernel)
         if last - first > 1:
             assert self._pairs is not None
             self._ways[first : last - 1] = se2.between(self._poses[first : last - 1], self._poses[first + 1 : last])
@@ -283,32 +203,57 @@ class Window:
 
     def _back(self, first: int) -> None:
         """Changes of all nodes by what is known now; the newest node is always linearised where it is."""
-        n, i = self._n, self._size - 1
-        ok = is_regular(self._roots[i])
-        ok = ok and substitute(self._roots[i], self._conditionals[first:i], self._change[first : i + 1])
-        if not ok:
+        here = slice(first, self._size)
+        is_sound, is_moved = _substitute(
+            self._poses[here], self._slow[here], self._roots[here], self._conditionals[here], self._change[here]
+        )
+        if not is_sound:
             raise SingularError("the window's system is singular or not finite.")
-        newest = self._change[i]
-        if newest.any():
+        if is_moved:
             self._newest = None
-            J = se2.right_jacobian_inverse(newest[:3])
-            _move(self._roots[i], 0, newest, J)
-            self._roots[i, :, -1] = 0.0
-            if i > first:
-                _move(self._conditionals[i - 1], n, newest, J)
-            self._poses[i] = se2.compose(self._poses[i], se2.exp(newest[:3]))
-            self._slow[i] += newest[3:]
-            self._change[i] = 0.0
-
-    def _position_rows(self, k: int) -> FloatArray:
-        rows = np.vstack([p.linearize(self._poses[k], self._kernel) for p in self._positions[k]])
-        work = np.zeros((max(len(rows), _UNARY), 4))
-        work[: len(rows)] = rows
-        triangularize(work, 3)
-        return work[:_UNARY]
 
 
-def _move(rows: FloatArray, at: int, change: FloatArray, jacobian: FloatArray) -> None:
-    """Expand ``rows`` (r, c + 1) about a node whose columns begin at ``at`` anew, where ``change`` (n,) has moved it."""
-    rows[:, -1] -= rows[:, at : at + len(change)] @ change
-    rows[:, at : at + 3] = rows[:, at : at + 3] @ jacobian
+@numba.njit(cache=True)
+def _substitute(
+    poses: FloatArray, slow: FloatArray, roots: FloatArray, conditionals: FloatArray, change: FloatArray
+) -> tuple[bool, bool]:  # pragma: no cover
+    """Fill ``change`` (k, n), and move the last node by its own, of which nothing is left then.
+
+    Returns whether there is a solution, and whether it moved the last node.
+    """
+    last, n = change.shape[0] - 1, change.shape[1]
+    root, newest = roots[last], change[last]
+    if not (is_regular(root) and substitute(root, conditionals[:last], change)):
+        return False, False
+    if not newest.any():
+        return True, False
+    expand_anew(root, 0, newest)
+    root[:, n] = 0.0
+    if last > 0:
+        expand_anew(conditionals[last - 1], n, newest)
+    poses[last, 0], poses[last, 1], poses[last, 2] = se2.scalar_compose(poses[last], se2.scalar_exp(newest))
+    slow[last] += newest[3:]
+    change[last] = 0.0
+    return True, True
+
+
+@numba.njit(cache=True)
+def _changes(poses: FloatArray, change: FloatArray, ways: FloatArray) -> tuple[float, float, float]:  # pragma: no cover
+    """How far the ways between k nodes are off ``ways`` (k, 3), where they were linearised; that to the last node is filled.
+
+    And how far any node has turned, and moved in any direction [m, rad].
+    """
+    last = poses.shape[0] - 1
+    bent, turned, moved = 0.0, 0.0, 0.0
+    here = se2.scalar_compose(poses[0], se2.scalar_exp(change[0]))
+    for i in range(last + 1):
+        turned = max(turned, abs(change[i, 2]))
+        moved = max(moved, abs(change[i, 0]), abs(change[i, 1]), abs(change[i, 2]))
+        before, here = here, se2.scalar_compose(poses[i], se2.scalar_exp(change[i]))
+        if i > 0:
+            way = se2.scalar_between(before, here)
+            if i == last:
+                ways[i - 1, 0], ways[i - 1, 1], ways[i - 1, 2] = way
+            off = se2.scalar_log(se2.scalar_between(ways[i - 1], way))
+            bent = max(bent, abs(off[0]), abs(off[1]), abs(off[2]))
+    return bent, turned, moved

@@ -7,6 +7,7 @@ spoils the turns, where odometry drifts most. So only turns teach; on all else w
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +24,7 @@ def teaching(step: Step, track_m: float, corrected: Corrections, cov: FloatArray
     ``cov`` (k, k) of the corrections as they are known now.
     """
     d = step.predicted.delta
-    if abs(d[2]) * track_m >= corrected.least_turn * np.hypot(d[0], d[1]):
+    if abs(d[2]) * track_m >= corrected.least_turn * math.hypot(d[0], d[1]):
         return step
     D = step.predicted.d_params @ corrected.directions
     slip = step.predicted.cov + D @ cov @ D.T
