@@ -104,6 +104,11 @@ class Stepper:
             self._scans.insert(bisect.bisect_right(self._scans, event.stamp_ns, key=lambda scan: scan.stamp_ns), event)
         yield from self._ready(is_last=False)
 
+    @property
+    def is_waiting(self) -> bool:
+        """A scan waits until the wheels are heard up to it."""
+        return bool(self._scans)
+
     def finish(self) -> Iterator[Step]:
         """The steps that were still waiting when the log ended."""
         yield from self._ready(is_last=True)

@@ -6,13 +6,14 @@ import dataclasses
 import functools
 import math
 import sys
+import time
 import types
 
 import numpy as np
 import pytest
 
 from localization.errors import DoorError, DumpError, TopicError
-from localization.events import Scan
+from localization.events import Scan, WheelSample
 from localization.logs import TopicOverrides, open_log
 from localization.logs.wire import encode
 from localization.online.health import ERROR, OK, WARN, degeneracy
@@ -177,17 +178,30 @@ def test_a_sensor_vanishes_and_returns(topic, calm):
 
 
 def test_messages_wait_for_others_while_no_scan_is_near(calm):
-    """Twice between two scans they are looked at, and at once when the next may come, or if there is no LiDAR."""
+    """They are looked at once before the next scan is due, and again with it; at once when it is late, or if there is no LiDAR."""
     stream = calm[1]._stream
     scans = stream._watches["/scan"]
     period, last = scans._period_s, scans._last_ns
     assert period == pytest.approx(0.08, rel=0.1)
-    rests = [stream.patience_s(last + int(part * period * S)) / period for part in (0.0, 0.3, 0.48, 0.9, 0.95, 1.0, 50.0)]
-    assert rests == pytest.approx([0.47, 0.17, 0.46, 0.04, 0.0, 0.0, 0.0], abs=1e-6)
+    rests = [stream.patience_s(last + int(part * period * S)) / period for part in (0.0, 0.3, 0.88, 0.92, 1.05, 1.15, 50.0)]
+    assert rests == pytest.approx([0.9, 0.6, 0.02, 0.18, 0.05, 0.0, 0.0], abs=1e-6)
     alone = LogTransport(drive_log(), silenced("/scan", 0.0, 99.0))
     alone.types.pop("/scan")
     node, _ = run_node(alone)
     assert node._stream.patience_s(node._stream._watches["/joint_states"]._last_ns) == 0.0
+
+
+def test_nobody_is_patient_while_a_scan_waits_for_the_wheels():
+    """A scan that is ahead of the wheels is used with the very next message that they send."""
+    node, _ = run_node(LogTransport(drive_log()))
+    scan, newest_ns = node.session.health._scan, node._newest_ns
+    node._stream._watches["/scan"]._last_ns = time.monotonic_ns()
+    assert node._patience_s() > 0.0
+    assert node.session.push(dataclasses.replace(scan, stamp_ns=newest_ns + S)) == []
+    assert node._patience_s() == 0.0
+    assert node.session.push(WheelSample(newest_ns + S, np.zeros(2), np.full(2, np.nan)))
+    node._stream._watches["/scan"]._last_ns = time.monotonic_ns()
+    assert node._patience_s() > 0.0
 
 
 def test_diagnostics_say_which_topic_is_silent(calm):

@@ -87,9 +87,8 @@ class DdsTransport:
 
     def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
         """In the order in which it was sent: after a pause, one topic's must not all come before another's."""
-        if patience_s > 0.0:
-            self._urgent.wait(round(patience_s * 1e9))
-        if not self._waiting.wait(round(timeout_s * 1e9)):
+        is_urgent = patience_s > 0.0 and self._urgent.wait(round(patience_s * 1e9))
+        if not is_urgent and not self._waiting.wait(round(timeout_s * 1e9)):
             return []
         now = time.monotonic_ns()
         found = [

@@ -27,7 +27,7 @@ _NS = 1e-9
 _OLDEST_S, _NEWEST_S = 3600.0, 1.0
 _LATE = "dropped (came after newer ones)"
 _SILENT_S, _PERIODS = 1.0, 5.0
-_PARTS, _LONGEST_S = (0.47, 0.94), 0.05
+_NEAR, _PAST, _LONGEST_S = 0.9, 1.1, 0.1
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,10 @@ class Stream:
         return {topic: seconds for topic, seconds in found.items() if seconds is not None}
 
     def patience_s(self, now_ns: int) -> float:
-        """How long messages may wait for others [s]: while no scan is near, nobody waits for what they say. 0 without a LiDAR."""
+        """How long messages may wait for others [s]: nobody waits for what they say until the next scan. 0 without a LiDAR.
+
+        They are looked at once before it is due, so that it finds little left to do, and then together with it.
+        """
         lidar = self.sources.lidar
         return 0.0 if lidar is None else self._watches[lidar.topic].rest(now_ns)
 
@@ -110,9 +113,9 @@ class _Watch:
         self._last_ns = now_ns
 
     def rest(self, now_ns: int) -> float:
-        """Until half the time to the next message is over, or almost all of it [s]; 0 from then on."""
+        """Until just before the next message is due, from then on until it is late [s]; 0 when it is."""
         since = self._period_s if self._last_ns is None else (now_ns - self._last_ns) * _NS
-        return next((min(part * self._period_s - since, _LONGEST_S) for part in _PARTS if since < part * self._period_s), 0.0)
+        return next((min(part * self._period_s - since, _LONGEST_S) for part in (_NEAR, _PAST) if since < part * self._period_s), 0.0)
 
     def silence(self, now_ns: int) -> float | None:
         if self._last_ns is None:

@@ -110,7 +110,7 @@ class Node:
         shown = 0.0
         while not is_over():
             has_estimate = False
-            for received in self._transport.take(_POLL_S, self._stream.patience_s(time.monotonic_ns())):
+            for received in self._transport.take(_POLL_S, self._patience_s()):
                 has_estimate |= self._push(received, time_it=True)
             now = time.monotonic()
             if now - self._told >= (_TELL_S if has_estimate else 1.5 * _TELL_S):  # after an estimate the next scan is far
@@ -155,6 +155,9 @@ class Node:
             self.session.core.settle()
             self.session.dump(self._head)
         return has_estimate
+
+    def _patience_s(self) -> float:
+        return 0.0 if self.session.core.stepper.is_waiting else self._stream.patience_s(time.monotonic_ns())
 
     def _head(self) -> Mapping[str, Any]:
         return {"stamp_ns": self._newest_ns, "topics": self.topics}
