@@ -6,11 +6,11 @@ import numba
 import numpy as np
 
 from motion_models import se2
-from motion_models.se2 import FloatArray, Three, Triple, gufunc
+from motion_models.se2 import FloatArray, Triple, gufunc, triple
 
 
 @numba.njit(cache=True)
-def fill_motion_residual(a: Three, b: Three, measured: Three, d_a: FloatArray, d_b: FloatArray) -> Triple:  # pragma: no cover
+def fill_motion_residual(a: Triple, b: Triple, measured: Triple, d_a: FloatArray, d_b: FloatArray) -> Triple:  # pragma: no cover
     """`motion_residual` for compiled loops; its Jacobians into ``d_a`` and ``d_b`` (3, 3)."""
     a_T_b = se2.scalar_between(a, b)
     error = se2.scalar_log(se2.scalar_between(measured, a_T_b))
@@ -27,7 +27,7 @@ def fill_motion_residual(a: Three, b: Three, measured: Three, d_a: FloatArray, d
 def _motion_residual(
     a: FloatArray, b: FloatArray, measured: FloatArray, error: FloatArray, d_a: FloatArray, d_b: FloatArray
 ) -> None:  # pragma: no cover
-    error[0], error[1], error[2] = fill_motion_residual(a, b, measured, d_a, d_b)
+    error[0], error[1], error[2] = fill_motion_residual(triple(a), triple(b), triple(measured), d_a, d_b)
 
 
 def motion_residual(world_T_a: FloatArray, world_T_b: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -33,9 +33,7 @@ from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
 Triple = tuple[float, float, float]
-"""A pose or tangent, made in a compiled loop."""
-Three = Triple | FloatArray
-"""A pose or tangent, given to one."""
+"""A pose or tangent in compiled loops."""
 
 # Below this angle the closed forms lose digits to cancellation and the series is exact to double precision.
 _SMALL_ANGLE = 1e-4
@@ -69,6 +67,12 @@ def _parts(layout: str) -> list[str]:
 
 
 @numba.njit(cache=True)
+def triple(v: FloatArray) -> Triple:  # pragma: no cover
+    """``v`` (3,)"""
+    return v[0], v[1], v[2]
+
+
+@numba.njit(cache=True)
 def scalar_wrap(angle: float) -> float:  # pragma: no cover
     """`wrap_angle` of one angle."""
     wrapped = (angle + math.pi) % (2.0 * math.pi) - math.pi
@@ -94,14 +98,14 @@ def _curl_terms(theta: float) -> tuple[float, float]:  # pragma: no cover
 
 
 @numba.njit(cache=True)
-def scalar_exp(v: Three) -> Triple:  # pragma: no cover
+def scalar_exp(v: Triple) -> Triple:  # pragma: no cover
     """`exp` of one tangent vector, for compiled loops."""
     a, b = _sinc_terms(v[2])
     return a * v[0] - b * v[1], b * v[0] + a * v[1], v[2]
 
 
 @numba.njit(cache=True)
-def scalar_log(p: Three) -> Triple:  # pragma: no cover
+def scalar_log(p: Triple) -> Triple:  # pragma: no cover
     """`log` of one pose."""
     x, y, theta = p[0], p[1], scalar_wrap(p[2])
     a, b = _sinc_terms(theta)
@@ -110,27 +114,27 @@ def scalar_log(p: Three) -> Triple:  # pragma: no cover
 
 
 @numba.njit(cache=True)
-def scalar_compose(a: Three, b: Three) -> Triple:  # pragma: no cover
+def scalar_compose(a: Triple, b: Triple) -> Triple:  # pragma: no cover
     """`compose` of two poses."""
     c, s = math.cos(a[2]), math.sin(a[2])
     return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], scalar_wrap(a[2] + b[2])
 
 
 @numba.njit(cache=True)
-def scalar_inverse(p: Three) -> Triple:  # pragma: no cover
+def scalar_inverse(p: Triple) -> Triple:  # pragma: no cover
     """`inverse` of one pose."""
     c, s = math.cos(p[2]), math.sin(p[2])
     return -c * p[0] - s * p[1], s * p[0] - c * p[1], scalar_wrap(-p[2])
 
 
 @numba.njit(cache=True)
-def scalar_between(a: Three, b: Three) -> Triple:  # pragma: no cover
+def scalar_between(a: Triple, b: Triple) -> Triple:  # pragma: no cover
     """`between` of two poses."""
     return scalar_compose(scalar_inverse(a), b)
 
 
 @numba.njit(cache=True)
-def fill_adjoint(p: Three, out: FloatArray) -> None:  # pragma: no cover
+def fill_adjoint(p: Triple, out: FloatArray) -> None:  # pragma: no cover
     """`adjoint` of one pose into ``out`` (3, 3)."""
     c, s = math.cos(p[2]), math.sin(p[2])
     out[0, 0], out[0, 1], out[0, 2] = c, -s, p[1]
@@ -139,7 +143,7 @@ def fill_adjoint(p: Three, out: FloatArray) -> None:  # pragma: no cover
 
 
 @numba.njit(cache=True)
-def fill_right_jacobian(v: Three, out: FloatArray) -> None:  # pragma: no cover
+def fill_right_jacobian(v: Triple, out: FloatArray) -> None:  # pragma: no cover
     """`right_jacobian` of one tangent vector into ``out`` (3, 3)."""
     f, g = _curl_terms(v[2])
     a, b = _sinc_terms(v[2])
@@ -149,7 +153,7 @@ def fill_right_jacobian(v: Three, out: FloatArray) -> None:  # pragma: no cover
 
 
 @numba.njit(cache=True)
-def fill_right_jacobian_inverse(v: Three, out: FloatArray) -> None:  # pragma: no cover
+def fill_right_jacobian_inverse(v: Triple, out: FloatArray) -> None:  # pragma: no cover
     """`right_jacobian_inverse` of one tangent vector into ``out`` (3, 3)."""
     f, g = _curl_terms(v[2])
     a, b = _sinc_terms(v[2])
@@ -170,7 +174,7 @@ def wrap_angle(angle: ArrayLike) -> FloatArray:
 
 @gufunc("(n)->(n)")
 def _exp(v: FloatArray, out: FloatArray) -> None:  # pragma: no cover
-    out[0], out[1], out[2] = scalar_exp(v)
+    out[0], out[1], out[2] = scalar_exp(triple(v))
 
 
 def exp(tangent: ArrayLike) -> FloatArray:
@@ -183,7 +187,7 @@ def exp(tangent: ArrayLike) -> FloatArray:
 
 @gufunc("(n)->(n)")
 def _log(p: FloatArray, out: FloatArray) -> None:  # pragma: no cover
-    out[0], out[1], out[2] = scalar_log(p)
+    out[0], out[1], out[2] = scalar_log(triple(p))
 
 
 def log(pose: ArrayLike) -> FloatArray:
@@ -193,7 +197,7 @@ def log(pose: ArrayLike) -> FloatArray:
 
 @gufunc("(n),(n)->(n)")
 def _compose(a: FloatArray, b: FloatArray, out: FloatArray) -> None:  # pragma: no cover
-    out[0], out[1], out[2] = scalar_compose(a, b)
+    out[0], out[1], out[2] = scalar_compose(triple(a), triple(b))
 
 
 def compose(a_T_b: ArrayLike, b_T_c: ArrayLike) -> FloatArray:
@@ -203,7 +207,7 @@ def compose(a_T_b: ArrayLike, b_T_c: ArrayLike) -> FloatArray:
 
 @gufunc("(n)->(n)")
 def _inverse(p: FloatArray, out: FloatArray) -> None:  # pragma: no cover
-    out[0], out[1], out[2] = scalar_inverse(p)
+    out[0], out[1], out[2] = scalar_inverse(triple(p))
 
 
 def inverse(a_T_b: ArrayLike) -> FloatArray:
@@ -229,7 +233,7 @@ def transform(a_T_b: ArrayLike, points_b: ArrayLike) -> FloatArray:
 
 @gufunc("(n)->(n,n)")
 def _adjoint(p: FloatArray, out: FloatArray) -> None:  # pragma: no cover
-    fill_adjoint(p, out)
+    fill_adjoint(triple(p), out)
 
 
 def adjoint(pose: ArrayLike) -> FloatArray:
@@ -239,7 +243,7 @@ def adjoint(pose: ArrayLike) -> FloatArray:
 
 @gufunc("(n)->(n,n)")
 def _right_jacobian(v: FloatArray, out: FloatArray) -> None:  # pragma: no cover
-    fill_right_jacobian(v, out)
+    fill_right_jacobian(triple(v), out)
 
 
 def right_jacobian(tangent: ArrayLike) -> FloatArray:
@@ -249,7 +253,7 @@ def right_jacobian(tangent: ArrayLike) -> FloatArray:
 
 @gufunc("(n)->(n,n)")
 def _right_jacobian_inverse(v: FloatArray, out: FloatArray) -> None:  # pragma: no cover
-    fill_right_jacobian_inverse(v, out)
+    fill_right_jacobian_inverse(triple(v), out)
 
 
 def right_jacobian_inverse(tangent: ArrayLike) -> FloatArray:

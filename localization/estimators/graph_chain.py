@@ -26,13 +26,16 @@ from localization.estimators.graph import (
     solve,
 )
 from localization.estimators.graph_qr import (
-    add_product,
+    add_spread,
+    add_square,
     eliminate,
     inverse_of_upper,
     is_regular,
+    place,
     product,
     solve_upper,
     substitute_given,
+    take,
     triangularize,
 )
 from motion_models.se2 import FloatArray
@@ -64,7 +67,7 @@ class Chain:
     def marginals(self) -> FloatArray:
         """(N, n, n) covariances of all nodes. Raises `IndeterminateError` and `EstimatorError`."""
         rest, n = self._rest, self._n
-        covariances = np.empty((len(self.unary), n, n))
+        covariances = np.zeros((len(self.unary), n, n))
         if len(rest.nodes) == 1:
             covariances[-1] = marginals(rest.blocks, rest.nodes, rest.nodes, n)[0]
         joints = joint_marginals(rest.blocks, list(pairwise(rest.nodes)), rest.nodes, n)
@@ -147,20 +150,21 @@ def _eliminate_between(rows: FloatArray, unary: FloatArray, conditionals: FloatA
     count, r, width = rows.shape
     n, u, c = width // 2, unary.shape[1], unary.shape[2] - 1
     first = np.zeros((max(r + u, 2 * n), width))
-    first[:r] = rows[0]
-    first[r : r + u, n : n + c], first[r : r + u, 2 * n] = unary[0, :, :c], unary[0, :, c]
+    place(rows[0], 0, 2 * n, first, 0, 0)
+    place(unary[0], 0, c, first, r, n)
     triangularize(first, 2 * n)
-    link[:] = first[: 2 * n]
+    take(link, first, 0, 0)
     work = np.empty((2 * n + r + u, 3 * n + 1))  # columns of node p, node 0, node p + 1
     for p in range(1, count):
         work[:] = 0.0
-        work[: 2 * n, :n], work[: 2 * n, n : 2 * n], work[: 2 * n, 3 * n] = link[:, n : 2 * n], link[:, :n], link[:, 2 * n]
-        at = 2 * n + r
-        work[2 * n : at, :n], work[2 * n : at, 2 * n :] = rows[p, :, :n], rows[p, :, n:]
-        work[at:, 2 * n : 2 * n + c], work[at:, 3 * n] = unary[p, :, :c], unary[p, :, c]
+        place(link, 0, n, work, 0, n)
+        place(link, n, n, work, 0, 0)
+        place(rows[p], 0, n, work, 2 * n, 0)
+        place(rows[p], n, n, work, 2 * n, 2 * n)
+        place(unary[p], 0, c, work, 2 * n + r, 2 * n)
         triangularize(work, 3 * n)
-        conditionals[p - 1] = work[:n]
-        link[:] = work[n : 3 * n, n:]
+        take(conditionals[p - 1], work, 0, 0)
+        take(link, work, n, n)
 
 
 @numba.njit(cache=True)
@@ -181,24 +185,31 @@ def _substitute_between(conditionals: FloatArray, change: FloatArray) -> bool:  
 
 @numba.njit(cache=True)
 def _spread(conditionals: FloatArray, covariances: FloatArray) -> None:  # pragma: no cover
-    """Fill ``covariances`` (N + 1, n, n) from the last one."""
+    """Fill ``covariances`` (N + 1, n, n), zero, from the last one."""
     n = covariances.shape[1]
     for p in range(covariances.shape[0] - 2, -1, -1):
         own = inverse_of_upper(conditionals[p])
-        by_next = product(own, conditionals[p, :, n : 2 * n])
-        covariances[p] = product(own, own.T)
-        add_product(covariances[p], 1.0, product(by_next, covariances[p + 1]), by_next.T)
+        add_square(covariances[p], own)
+        add_spread(covariances[p], product(own, conditionals[p, :, n : 2 * n]), covariances[p + 1])
 
 
 @numba.njit(cache=True)
 def _spread_between(conditionals: FloatArray, joint: FloatArray, covariances: FloatArray) -> None:  # pragma: no cover
-    """Fill ``covariances`` (N + 1, n, n) from the ``joint`` one (2n, 2n) of both ends, which is changed."""
+    """Fill ``covariances`` (N + 1, n, n), zero, from the ``joint`` one (2n, 2n) of both ends, which is changed."""
     n, last = covariances.shape[1], covariances.shape[0] - 1
-    covariances[0], covariances[last] = joint[:n, :n], joint[n:, n:]
+    take(covariances[0], joint, 0, 0)
+    take(covariances[last], joint, n, n)
+    shared = np.empty((n, n))
     for p in range(last - 1, 0, -1):  # joint: that of node 0 and of node p + 1
         own = inverse_of_upper(conditionals[p - 1])
         by_both = product(own, conditionals[p - 1, :, n : 3 * n])
-        shared = -product(joint[:n], by_both.T)
-        covariances[p] = product(own, own.T)
-        add_product(covariances[p], 1.0, product(by_both, joint), by_both.T)
-        joint[:n, n:], joint[n:, :n], joint[n:, n:] = shared, shared.T, covariances[p]
+        add_square(covariances[p], own)
+        add_spread(covariances[p], by_both, joint)
+        for i in range(n):
+            for j in range(n):
+                shared[i, j] = 0.0
+                for k in range(2 * n):
+                    shared[i, j] -= joint[i, k] * by_both[j, k]
+        for i in range(n):
+            for j in range(n):
+                joint[i, n + j], joint[n + j, i], joint[n + i, n + j] = shared[i, j], shared[i, j], covariances[p, i, j]

@@ -14,9 +14,9 @@ import numba
 import numpy as np
 
 from localization.errors import EstimatorError
-from localization.estimators.graph_qr import condition, is_covariance, product, triangularize
+from localization.estimators.graph_qr import add_product, add_spread, is_covariance, triangularize
 from motion_models import se2
-from motion_models.se2 import FloatArray
+from motion_models.se2 import FloatArray, triple
 
 _LEAST = 1e-12 * np.eye(3)  # m^2, rad^2: below this a motion is as good as certain, and the numbers stay finite
 
@@ -51,7 +51,11 @@ class Link:
 
         ``error`` (r,) = measured - predicted = d_delta (r, 3) perturbation + d_slow (r, m) (s - at) + noise of ``variances`` (r,).
         """
-        delta, cov, by_slow, rows, rhs = _observe(self.delta, self.cov, self.d_slow, self.rows, self.rhs, error, d_delta, d_slow, variances)
+        old, new = len(self.rhs), len(self.rhs) + len(error)
+        delta, cov, by_slow = self.delta.copy(), self.cov.copy(), self.d_slow.copy()
+        rows, rhs = np.empty((new, self.n_slow)), np.empty(new)
+        rows[:old], rhs[:old] = self.rows, self.rhs
+        _condition(delta, cov, by_slow, error, d_delta, d_slow, variances, rows[old:], rhs[old:])
         return Link(delta, cov, by_slow, self.at, rows, rhs, self.duration, self.moving)
 
     def rebased(self, at: FloatArray) -> Link:
@@ -88,9 +92,10 @@ class Link:
     def compressed(self) -> tuple[FloatArray, FloatArray]:
         """``rows`` and ``rhs`` as exactly m rows (m, m), (m,) that say the same about the slow states."""
         m = self.n_slow
-        rows, rhs = np.empty((m, m)), np.empty(m)
-        compress(self.rows, self.rhs, rows, rhs)
-        return rows, rhs
+        both = np.zeros((max(len(self.rhs), m), m + 1))
+        both[: len(self.rhs), :m], both[: len(self.rhs), m] = self.rows, self.rhs
+        triangularize(both, m)
+        return both[:m, :m], both[:m, m]
 
 
 def first_link(delta: FloatArray, cov: FloatArray, d_slow: FloatArray, at: FloatArray, duration: float, moving: float) -> Link:
@@ -105,38 +110,58 @@ def first_link(delta: FloatArray, cov: FloatArray, d_slow: FloatArray, at: Float
 
 
 @numba.njit(cache=True)
-def _observe(
+def _condition(
     delta: FloatArray,
     cov: FloatArray,
     d_state: FloatArray,
-    rows: FloatArray,
-    rhs: FloatArray,
     error: FloatArray,
     d_delta: FloatArray,
     d_slow: FloatArray,
     variances: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:  # pragma: no cover
-    """`Link.observe`: the new delta, cov, d_slow, rows and rhs."""
-    r, old = error.shape[0], rhs.shape[0]
-    cov, d_state = cov.copy(), d_state.copy()
-    all_rows, all_rhs = np.empty((old + r, rows.shape[1])), np.empty(old + r)
-    all_rows[:old], all_rhs[:old] = rows, rhs
-    shift = condition(cov, d_state, error, d_delta, d_slow, variances, all_rows[old:], all_rhs[old:])
-    J = np.empty((3, 3))
-    se2.fill_right_jacobian(shift, J)
-    there: FloatArray = np.array(se2.scalar_compose(delta, se2.scalar_exp(shift)))
-    return there, product(product(J, 0.5 * (cov + cov.T)), J.T), product(J, d_state), all_rows, all_rhs
+    rows: FloatArray,
+    rhs: FloatArray,
+) -> None:  # pragma: no cover
+    """Condition a motion on r scalar measurements, one after the other: see `Link.observe`.
 
+    Changes ``delta`` (3,), ``cov`` (3, 3) and ``d_state`` (3, m), the change of the motion by the slow states; fills ``rows`` (r, m) and
+    ``rhs`` (r,), what the innovations say of the slow states in unit variances.
+    """
+    m = d_state.shape[1]
+    shift, gain, shared, by_slow = np.zeros(3), np.empty(3), np.empty(3), np.empty(m)
+    for r in range(error.shape[0]):
+        S, innovation = variances[r], error[r]
+        for i in range(3):
+            shared[i] = 0.0
+            for j in range(3):
+                shared[i] += cov[i, j] * d_delta[r, j]
+        for i in range(3):
+            S += d_delta[r, i] * shared[i]
+            innovation -= d_delta[r, i] * shift[i]
+        for k in range(m):
+            by_slow[k] = d_slow[r, k]
+            for i in range(3):
+                by_slow[k] += d_delta[r, i] * d_state[i, k]
+        for i in range(3):
+            gain[i] = shared[i] / S
+            shift[i] += gain[i] * innovation
+            for k in range(m):
+                d_state[i, k] -= gain[i] * by_slow[k]
+        for i in range(3):
+            for j in range(3):
+                cov[i, j] -= gain[i] * shared[j]
+        root = math.sqrt(S)
+        rhs[r] = innovation / root
+        for k in range(m):
+            rows[r, k] = by_slow[k] / root
 
-@numba.njit(cache=True)
-def compress(rows: FloatArray, rhs: FloatArray, m_rows: FloatArray, m_rhs: FloatArray) -> None:  # pragma: no cover
-    """Fill ``m_rows`` (m, m) and ``m_rhs`` (m,) with what ``rows`` (r, m) and ``rhs`` (r,) say."""
-    r, m = rows.shape
-    both = np.zeros((max(r, m), m + 1))
-    both[:r, :m], both[:r, m] = rows, rhs
-    if r > m:
-        triangularize(both, m)
-    m_rows[:], m_rhs[:] = both[:m, :m], both[:m, m]
+    # the mean has moved, and perturbations with it
+    x, y, t = se2.scalar_compose(triple(delta), se2.scalar_exp(triple(shift)))
+    delta[0], delta[1], delta[2] = x, y, t
+    J, conditioned, moved = np.empty((3, 3)), cov.copy(), d_state.copy()
+    se2.fill_right_jacobian(triple(shift), J)
+    cov[:], d_state[:] = 0.0, 0.0
+    add_product(d_state, J, moved)
+    add_spread(cov, J, conditioned)
 
 
 def check_motion(delta: FloatArray, cov: FloatArray, what: str) -> None:

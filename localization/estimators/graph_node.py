@@ -11,10 +11,13 @@ import numba
 import numpy as np
 
 from localization.errors import EstimatorError
-from localization.estimators.graph_factors import Pairs, apply, linearize_pair, linearize_seen, link_at, seen_residual, whitening
+from localization.estimators.graph_factors import Pairs, linearize, seen_residual, seen_rows, whitening
 from localization.estimators.graph_link import Link
 from localization.estimators.graph_qr import (
     add_product,
+    add_spread,
+    add_square,
+    apply,
     eliminate,
     inverse_of_upper,
     inverse_root,
@@ -26,10 +29,7 @@ from localization.estimators.graph_qr import (
 from localization.residuals import fill_motion_residual
 from motion_models import se2
 from motion_models.base import Motion
-from motion_models.se2 import FloatArray, Triple
-
-Found = tuple[bool, FloatArray, FloatArray, FloatArray, FloatArray]
-"""Whether a node is sound, its pose, slow states and root, and its predecessor's conditional."""
+from motion_models.se2 import FloatArray, triple
 
 
 class SingularError(EstimatorError):
@@ -76,15 +76,36 @@ class Ahead:
 
 def extend(node: Node, pair: Pairs) -> Ahead:
     """The node that ``pair`` leads to from ``node``. Raises `SingularError`."""
-    return _ahead(pair, *_extend(pair.table[0], node.pose, node.slow, node.root))
+    n, delta, shift = len(node.root), pair.delta[0], pair.d_slow[0] @ (node.slow - pair.at[0])
+    poses, slow = np.empty((2, 3)), np.empty((2, n - 3))
+    poses[0], slow[0], slow[1] = node.pose, node.slow, node.slow
+    poses[1] = se2.compose(node.pose, se2.compose(delta, se2.exp(shift)))
+    roots, conditionals = np.zeros((2, n, n + 1)), np.empty((1, n, 2 * n + 1))
+    roots[0, :, :n] = node.root
+    eliminate(roots, conditionals, linearize(pair, poses, slow), np.empty((2, 0, 4)))
+    return _ahead(pair, poses[1], slow[1], roots[1], conditionals)
 
 
 def see(node: Node, ahead: Ahead, motion: Motion, mount: FloatArray | None = None) -> Ahead:
     """What is ``ahead`` of ``node``, with the motion that a LiDAR saw on the way, and what of its ``mount`` (3, m) shows.
 
-    Raises `SingularError`."""
-    pair, there = ahead.pair.seeing(motion, mount), ahead.node
-    return _ahead(pair, *_see(pair.table[0], node.pose, node.slow, there.pose, there.slow, there.root, ahead.conditional))
+    Raises `SingularError`.
+    """
+    n, there, pair = len(node.root), ahead.node, ahead.pair.seeing(motion, mount)
+    work = np.zeros((2 * n + 3, 2 * n + 1))
+    work[:n], work[n : 2 * n, n : 2 * n] = ahead.conditional, there.root
+    seen_rows(pair.table[0], node.pose, node.slow, there.pose, work[2 * n :])
+    triangularize(work, 2 * n)
+    return _ahead(pair, there.pose.copy(), there.slow.copy(), work[n : 2 * n, n:].copy(), work[None, :n].copy())
+
+
+def _ahead(pair: Pairs, pose: FloatArray, slow: FloatArray, root: FloatArray, conditionals: FloatArray) -> Ahead:
+    """The node that was linearised at ``pose`` and ``slow``, where its ``root`` (n, n + 1) says that it is."""
+    change = np.empty((2, len(root)))
+    if not (is_regular(root) and substitute(root, conditionals, change)):
+        raise SingularError("the motion to a new node is not determined by what was measured.")
+    move_newest(pose, slow, root, conditionals[0], change[1])
+    return Ahead(Node(pose, slow, root[:, :-1].copy()), pair, conditionals[0])
 
 
 def innovation(node: Node, ahead: Ahead, link: Link, motion: Motion, mount: FloatArray) -> tuple[FloatArray, float]:
@@ -92,67 +113,28 @@ def innovation(node: Node, ahead: Ahead, link: Link, motion: Motion, mount: Floa
 
     Squared and normalised it is NaN where there is no such number. ``mount`` (3, m): what of the LiDAR's mount shows.
     """
-    there = ahead.node
-    error, nis = _innovation(node.pose, there.pose, there.slow, there.covariance, link.cov, link.d_slow, motion.delta, motion.cov, mount)
-    return np.array(error), nis
-
-
-def _ahead(pair: Pairs, is_sound: bool, pose: FloatArray, slow: FloatArray, root: FloatArray, conditional: FloatArray) -> Ahead:
-    if not is_sound:
-        raise SingularError("the motion to a new node is not determined by what was measured.")
-    return Ahead(Node(pose, slow, root), pair, conditional)
+    there, error = ahead.node, np.empty(3)
+    slow_cov = np.ascontiguousarray(there.covariance[3:, 3:])
+    nis = _innovation(node.pose, there.pose, there.slow, slow_cov, link.cov, link.d_slow, motion.delta, motion.cov, mount, error)
+    return error, nis
 
 
 @numba.njit(cache=True)
-def _extend(pair: FloatArray, pose: FloatArray, slow: FloatArray, root: FloatArray) -> Found:  # pragma: no cover
-    m = slow.shape[0]
-    n = 3 + m
-    rows = np.empty((1, 6 + 2 * m, 2 * n + 1))
-    roots, conditionals = np.zeros((2, n, n + 1)), np.empty((1, n, 2 * n + 1))
-    predicted: FloatArray = np.array(se2.scalar_compose(pose, link_at(pair, slow)[0]))
-    linearize_pair(pair, pose, slow, predicted, slow, rows[0])
-    roots[0, :, :n] = root
-    eliminate(roots, conditionals, rows, np.empty((2, 0, 4)))
-    return _settled(predicted, slow, roots[1], conditionals)
-
-
-@numba.njit(cache=True)
-def _see(
-    pair: FloatArray,
-    pose_a: FloatArray,
-    slow_a: FloatArray,
-    pose_b: FloatArray,
-    slow_b: FloatArray,
-    root: FloatArray,
-    conditional: FloatArray,
-) -> Found:  # pragma: no cover
-    n = root.shape[0]
-    work = np.zeros((2 * n + 3, 2 * n + 1))
-    work[:n], work[n : 2 * n, n : 2 * n] = conditional, root
-    linearize_seen(pair, pose_a, slow_a, pose_b, work[2 * n :])
-    triangularize(work, 2 * n)
-    return _settled(pose_b, slow_b, work[n : 2 * n, n:].copy(), work[:n].copy().reshape(1, n, 2 * n + 1))
-
-
-@numba.njit(cache=True)
-def _settled(pose: FloatArray, slow: FloatArray, root: FloatArray, conditionals: FloatArray) -> Found:  # pragma: no cover
-    """The node that was linearised at ``pose`` and ``slow``, moved to where its ``root`` (n, n + 1) says that it is."""
-    n = root.shape[0]
-    change = np.empty((2, n))
-    is_sound = is_regular(root) and substitute(root, conditionals, change)
-    moved = change[1]
-    if is_sound:
-        expand_anew(root, 0, moved)
-        expand_anew(conditionals[0], n, moved)
-    there: FloatArray = np.array(se2.scalar_compose(pose, se2.scalar_exp(moved)))
-    return is_sound, there, slow + moved[3:], root[:, :n].copy(), conditionals[0]
+def move_newest(pose: FloatArray, slow: FloatArray, root: FloatArray, before: FloatArray, change: FloatArray) -> None:  # pragma: no cover
+    """Move a node by its ``change`` (n,), and expand its ``root`` (n, n + 1) and the conditional ``before`` it (n, 2n + 1) there."""
+    n = change.shape[0]
+    expand_anew(root, 0, change)
+    expand_anew(before, n, change)
+    pose[0], pose[1], pose[2] = se2.scalar_compose(triple(pose), se2.scalar_exp(triple(change)))
+    for k in range(n - 3):
+        slow[k] += change[3 + k]
 
 
 @numba.njit(cache=True)
 def expand_anew(rows: FloatArray, at: int, change: FloatArray) -> None:  # pragma: no cover
     """Expand ``rows`` (r, c + 1) about a node whose columns begin at ``at`` anew, where ``change`` (n,) has moved it."""
     J = np.empty((3, 3))
-    se2.fill_right_jacobian_inverse(change, J)
+    se2.fill_right_jacobian_inverse(triple(change), J)
     for i in range(rows.shape[0]):
         for k in range(change.shape[0]):
             rows[i, -1] -= rows[i, at + k] * change[k]
@@ -164,21 +146,26 @@ def expand_anew(rows: FloatArray, at: int, change: FloatArray) -> None:  # pragm
 @numba.njit(cache=True)
 def covariance_of(root: FloatArray) -> FloatArray:  # pragma: no cover
     """(n, n) ``(root^T root)^-1``."""
-    inverse = inverse_of_upper(root)
-    return product(inverse, inverse.T)
+    found = np.zeros(root.shape)
+    add_square(found, inverse_of_upper(root))
+    return found
 
 
 @numba.njit(cache=True)
 def _motion_covariance(pose_a: FloatArray, pose_b: FloatArray, root: FloatArray, conditional: FloatArray) -> FloatArray:  # pragma: no cover
     n = root.shape[0]
-    d_a, d_b = np.empty((3, 3)), np.empty((3, 3))
-    fill_motion_residual(pose_a, pose_b, se2.scalar_between(pose_a, pose_b), d_a, d_b)
+    d_a, d_b, found = np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3))
+    a, b = triple(pose_a), triple(pose_b)
+    fill_motion_residual(a, b, se2.scalar_between(a, b), d_a, d_b)
     # the predecessor is off by what it is off itself, and by what the node is
     own = product(d_a, inverse_of_upper(conditional)[:3])
-    by_node = -product(own, conditional[:, n : 2 * n])
-    by_node[:, :3] += d_b
-    by_node = product(by_node, inverse_of_upper(root))
-    return product(own, own.T) + product(by_node, by_node.T)
+    by_node = product(own, conditional[:, n : 2 * n])
+    for i in range(3):
+        for j in range(n):
+            by_node[i, j] = (d_b[i, j] if j < 3 else 0.0) - by_node[i, j]
+    add_square(found, own)
+    add_square(found, product(by_node, inverse_of_upper(root)))
+    return found
 
 
 @numba.njit(cache=True)
@@ -186,22 +173,26 @@ def _innovation(
     pose_a: FloatArray,
     pose_b: FloatArray,
     slow: FloatArray,
-    cov: FloatArray,
+    slow_cov: FloatArray,
     link_cov: FloatArray,
     d_slow: FloatArray,
     seen: FloatArray,
     seen_cov: FloatArray,
     mount: FloatArray,
-) -> tuple[Triple, float]:  # pragma: no cover
-    """``cov`` (n, n) of node b, whose ``slow`` states (m,) are."""
+    error: FloatArray,
+) -> float:  # pragma: no cover
+    """Fill ``error`` (3,); ``slow`` (m,) and ``slow_cov`` (m, m) are those of node b."""
     d_a, d_b, d_mount, d_seen = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    error = seen_residual(pose_a, pose_b, seen, apply(mount, slow), d_a, d_b, d_mount)
-    se2.fill_right_jacobian_inverse(error, d_seen)
+    off = seen_residual(triple(pose_a), triple(pose_b), triple(seen), apply(mount, slow), d_a, d_b, d_mount)
+    error[0], error[1], error[2] = off
+    se2.fill_right_jacobian_inverse(off, d_seen)
     by_slow = product(d_b, d_slow)
-    add_product(by_slow, 1.0, d_mount, mount)
-    S = product(product(d_b, link_cov), d_b.T)
-    add_product(S, 1.0, product(by_slow, cov[3:, 3:]), by_slow.T)
-    add_product(S, 1.0, product(d_seen, seen_cov), d_seen.T)
-    normalized = apply(inverse_root(S), np.array(error))
-    nis = normalized[0] ** 2 + normalized[1] ** 2 + normalized[2] ** 2
-    return error, nis if math.isfinite(S.sum()) and math.isfinite(nis) else math.nan
+    add_product(by_slow, d_mount, mount)
+    S = np.zeros((3, 3))
+    add_spread(S, d_b, link_cov)
+    add_spread(S, by_slow, slow_cov)
+    add_spread(S, d_seen, seen_cov)
+    x, y, t = apply(inverse_root(S), error)
+    nis = x * x + y * y + t * t
+    is_number = math.isfinite(S[0, 0] + S[1, 1] + S[2, 2]) and math.isfinite(nis)
+    return nis if is_number else math.nan

@@ -1,6 +1,7 @@
 """Least squares along a chain of nodes by Householder reflections, and what small matrices need. Compiled scalar loops.
 
-Matrices here are 3 to 20 wide: calls into LAPACK would cost more than the arithmetic.
+Matrices here are 3 to 20 wide: calls into LAPACK would cost more than the arithmetic. Slices are not assigned to each other: each such
+line would take the compiler longer than the loop.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import math
 import numba
 import numpy as np
 
-from motion_models.se2 import FloatArray
+from motion_models.se2 import FloatArray, Triple
 
 
 @numba.njit(cache=True)
@@ -52,19 +53,33 @@ def eliminate(roots: FloatArray, conditionals: FloatArray, rows: FloatArray, una
     (N, r, 2n + 1) of `graph_factors.linearize`; ``unary`` (N + 1, u, c + 1) rows about the first c numbers of each node.
     """
     count, r, width = rows.shape
-    n = roots.shape[1]
-    u, c = unary.shape[1], unary.shape[2] - 1
+    n, u, c = roots.shape[1], unary.shape[1], unary.shape[2] - 1
     work = np.empty((n + r + u, width))
     for p in range(count):
         work[:] = 0.0
-        work[:n, :n] = roots[p, :, :n]
-        work[:n, 2 * n] = roots[p, :, n]
-        work[n : n + r] = rows[p]
-        work[n + r :, n : n + c] = unary[p + 1, :, :c]
-        work[n + r :, 2 * n] = unary[p + 1, :, c]
+        place(roots[p], 0, n, work, 0, 0)
+        place(rows[p], 0, 2 * n, work, n, 0)
+        place(unary[p + 1], 0, c, work, n + r, n)
         triangularize(work, 2 * n)
-        conditionals[p] = work[:n]
-        roots[p + 1] = work[n : 2 * n, n:]
+        take(conditionals[p], work, 0, 0)
+        take(roots[p + 1], work, n, n)
+
+
+@numba.njit(cache=True)
+def place(rows: FloatArray, first: int, count: int, work: FloatArray, row: int, column: int) -> None:  # pragma: no cover
+    """Copy ``count`` columns of ``rows`` (r, c) from the ``first`` on into ``work``, and their last, the right side, into its last."""
+    for i in range(rows.shape[0]):
+        for j in range(count):
+            work[row + i, column + j] = rows[i, first + j]
+        work[row + i, -1] = rows[i, -1]
+
+
+@numba.njit(cache=True)
+def take(out: FloatArray, work: FloatArray, row: int, column: int) -> None:  # pragma: no cover
+    """Fill ``out`` (r, c) from ``work``, where it stands at (``row``, ``column``)."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = work[row + i, column + j]
 
 
 @numba.njit(cache=True)
@@ -90,8 +105,10 @@ def substitute(root: FloatArray, conditionals: FloatArray, change: FloatArray) -
     Returns whether there is a solution, as all of these do.
     """
     n = root.shape[0]
-    change[-1] = root[:, n]
-    return solve_upper(root, change[-1]) and substitute_given(conditionals, change)
+    last = change.shape[0] - 1
+    for i in range(n):
+        change[last, i] = root[i, n]
+    return solve_upper(root, change[last]) and substitute_given(conditionals, change)
 
 
 @numba.njit(cache=True)
@@ -166,69 +183,47 @@ def inverse_of_upper(R: FloatArray) -> FloatArray:  # pragma: no cover
 
 @numba.njit(cache=True)
 def product(A: FloatArray, B: FloatArray) -> FloatArray:  # pragma: no cover
-    """``A @ B``."""
+    """``A @ B``"""
     out = np.zeros((A.shape[0], B.shape[1]))
-    add_product(out, 1.0, A, B)
+    add_product(out, A, B)
     return out
 
 
 @numba.njit(cache=True)
-def add_product(out: FloatArray, factor: float, A: FloatArray, B: FloatArray) -> None:  # pragma: no cover
-    """``out += factor * A @ B``; ``out`` is neither of them."""
+def add_product(out: FloatArray, A: FloatArray, B: FloatArray) -> None:  # pragma: no cover
+    """``out += A @ B``; ``out`` is neither of them."""
     for i in range(A.shape[0]):
         for k in range(A.shape[1]):
-            f = factor * A[i, k]
-            if f == 0.0:
-                continue
             for j in range(B.shape[1]):
-                out[i, j] += f * B[k, j]
+                out[i, j] += A[i, k] * B[k, j]
 
 
 @numba.njit(cache=True)
-def condition(
-    cov: FloatArray,
-    d_state: FloatArray,
-    error: FloatArray,
-    d_delta: FloatArray,
-    d_slow: FloatArray,
-    variances: FloatArray,
-    rows: FloatArray,
-    rhs: FloatArray,
-) -> FloatArray:  # pragma: no cover
-    """Condition a Gaussian of 3 numbers on r scalar measurements, one after the other.
+def add_square(out: FloatArray, A: FloatArray) -> None:  # pragma: no cover
+    """``out += A @ A^T``"""
+    for i in range(A.shape[0]):
+        for j in range(A.shape[0]):
+            for k in range(A.shape[1]):
+                out[i, j] += A[i, k] * A[j, k]
 
-    ``error`` (r,) = d_delta (r, 3) perturbation + d_slow (r, m) slow + noise; the perturbation's mean depends on the slow states by
-    ``d_state`` (3, m). Changes ``cov`` (3, 3) and ``d_state``; fills ``rows`` (r, m) and ``rhs`` (r,), what the innovations say of the
-    slow states in unit variances; returns the shift (3,) of the mean.
-    """
-    m = d_state.shape[1]
-    shift, gain, shared, by_slow = np.zeros(3), np.empty(3), np.empty(3), np.empty(m)
-    for r in range(error.shape[0]):
-        S, innovation = variances[r], error[r]
-        for i in range(3):
-            shared[i] = 0.0
-            for j in range(3):
-                shared[i] += cov[i, j] * d_delta[r, j]
-        for i in range(3):
-            S += d_delta[r, i] * shared[i]
-            innovation -= d_delta[r, i] * shift[i]
-        for k in range(m):
-            by_slow[k] = d_slow[r, k]
-            for i in range(3):
-                by_slow[k] += d_delta[r, i] * d_state[i, k]
-        for i in range(3):
-            gain[i] = shared[i] / S
-            shift[i] += gain[i] * innovation
-            for k in range(m):
-                d_state[i, k] -= gain[i] * by_slow[k]
-        for i in range(3):
-            for j in range(3):
-                cov[i, j] -= gain[i] * shared[j]
-        root = math.sqrt(S)
-        rhs[r] = innovation / root
-        for k in range(m):
-            rows[r, k] = by_slow[k] / root
-    return shift
+
+@numba.njit(cache=True)
+def add_spread(out: FloatArray, A: FloatArray, P: FloatArray) -> None:  # pragma: no cover
+    """``out += A @ P @ A^T``"""
+    by_cov = product(A, P)
+    for i in range(A.shape[0]):
+        for j in range(A.shape[0]):
+            for k in range(A.shape[1]):
+                out[i, j] += by_cov[i, k] * A[j, k]
+
+
+@numba.njit(cache=True)
+def apply(D: FloatArray, x: FloatArray) -> Triple:  # pragma: no cover
+    """``D`` (3, m) ``@ x`` (m,)"""
+    a, b, c = 0.0, 0.0, 0.0
+    for k in range(x.shape[0]):
+        a, b, c = a + D[0, k] * x[k], b + D[1, k] * x[k], c + D[2, k] * x[k]
+    return a, b, c
 
 
 @numba.njit(cache=True)

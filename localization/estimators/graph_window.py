@@ -18,12 +18,12 @@ import numpy as np
 from localization.errors import EstimatorError
 from localization.estimators.graph import Block, chain, marginals, solve
 from localization.estimators.graph_factors import Pairs, linearize
-from localization.estimators.graph_node import Ahead, Node, SingularError, expand_anew, extend, see
+from localization.estimators.graph_node import Ahead, Node, SingularError, expand_anew, extend, move_newest, see
 from localization.estimators.graph_qr import eliminate, is_regular, substitute, triangularize
 from localization.estimators.graph_robust import UNARY, Closure, Kernel, Position, position_rows
 from motion_models import se2
 from motion_models.base import Motion
-from motion_models.se2 import FloatArray
+from motion_models.se2 import FloatArray, triple
 
 _ITERATIONS = 10
 _TURNED = 0.1  # rad
@@ -203,38 +203,15 @@ class Window:
 
     def _back(self, first: int) -> None:
         """Changes of all nodes by what is known now; the newest node is always linearised where it is."""
-        here = slice(first, self._size)
-        is_sound, is_moved = _substitute(
-            self._poses[here], self._slow[here], self._roots[here], self._conditionals[here], self._change[here]
-        )
-        if not is_sound:
+        i, here = self._size - 1, slice(first, self._size)
+        root, change = self._roots[i], self._change[here]
+        if not (is_regular(root) and substitute(root, self._conditionals[first:i], change)):
             raise SingularError("the window's system is singular or not finite.")
-        if is_moved:
+        if change[-1].any():
             self._newest = None
-
-
-@numba.njit(cache=True)
-def _substitute(
-    poses: FloatArray, slow: FloatArray, roots: FloatArray, conditionals: FloatArray, change: FloatArray
-) -> tuple[bool, bool]:  # pragma: no cover
-    """Fill ``change`` (k, n), and move the last node by its own, of which nothing is left then.
-
-    Returns whether there is a solution, and whether it moved the last node.
-    """
-    last, n = change.shape[0] - 1, change.shape[1]
-    root, newest = roots[last], change[last]
-    if not (is_regular(root) and substitute(root, conditionals[:last], change)):
-        return False, False
-    if not newest.any():
-        return True, False
-    expand_anew(root, 0, newest)
-    root[:, n] = 0.0
-    if last > 0:
-        expand_anew(conditionals[last - 1], n, newest)
-    poses[last, 0], poses[last, 1], poses[last, 2] = se2.scalar_compose(poses[last], se2.scalar_exp(newest))
-    slow[last] += newest[3:]
-    change[last] = 0.0
-    return True, True
+            # before the first node there is none: what is written there is not read
+            move_newest(self._poses[i], self._slow[i], root, self._conditionals[i - 1], change[-1])
+            root[:, -1], change[-1] = 0.0, 0.0
 
 
 @numba.njit(cache=True)
@@ -245,15 +222,15 @@ def _changes(poses: FloatArray, change: FloatArray, ways: FloatArray) -> tuple[f
     """
     last = poses.shape[0] - 1
     bent, turned, moved = 0.0, 0.0, 0.0
-    here = se2.scalar_compose(poses[0], se2.scalar_exp(change[0]))
+    here = se2.scalar_compose(triple(poses[0]), se2.scalar_exp(triple(change[0])))
     for i in range(last + 1):
         turned = max(turned, abs(change[i, 2]))
         moved = max(moved, abs(change[i, 0]), abs(change[i, 1]), abs(change[i, 2]))
-        before, here = here, se2.scalar_compose(poses[i], se2.scalar_exp(change[i]))
+        before, here = here, se2.scalar_compose(triple(poses[i]), se2.scalar_exp(triple(change[i])))
         if i > 0:
             way = se2.scalar_between(before, here)
             if i == last:
                 ways[i - 1, 0], ways[i - 1, 1], ways[i - 1, 2] = way
-            off = se2.scalar_log(se2.scalar_between(ways[i - 1], way))
+            off = se2.scalar_log(se2.scalar_between(triple(ways[i - 1]), way))
             bent = max(bent, abs(off[0]), abs(off[1]), abs(off[2]))
     return bent, turned, moved
