@@ -16,8 +16,8 @@ from localization.logs.quick import FusedWriter, quick_reader
 from localization.logs.wire import decoder, encode, make
 from tests.bags import STORE
 
-IMU, JOINTS = "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState"
-doubles = st.floats(width=64)
+IMU, JOINTS, SCAN = "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState", "sensor_msgs/msg/LaserScan"
+doubles, singles = st.floats(width=64), st.floats(width=32)
 texts = st.text(max_size=9)
 stamps = st.tuples(st.integers(-(2**31), 2**31 - 1), st.integers(0, 2**32 - 1))
 
@@ -61,11 +61,26 @@ def imus(draw):
     )
 
 
+@st.composite
+def laser_scans(draw):
+    beams, intensities = (draw(arrays(np.float32, draw(st.integers(0, 5)), elements=singles)) for _ in range(2))
+    named = ("angle_min", "angle_max", "angle_increment", "time_increment", "scan_time", "range_min", "range_max")
+    numbers = {name: draw(singles) for name in named}
+    return make(SCAN, header=header(draw(stamps), draw(texts)), **numbers, ranges=beams, intensities=intensities)
+
+
+MESSAGES = {IMU: imus(), JOINTS: joint_states(), SCAN: laser_scans()}
+
+
 def content(message):
     """What is used of a message, comparable: NaNs too."""
     stamp = message.header.stamp.sec, message.header.stamp.nanosec, message.header.frame_id
     if hasattr(message, "name"):
         return (*stamp, tuple(message.name), message.position.tobytes(), message.velocity.tobytes())
+    if hasattr(message, "ranges"):
+        angles = message.angle_min, message.angle_max, message.angle_increment
+        rest = message.time_increment, message.range_min, message.range_max
+        return (*stamp, np.array([*angles, *rest]).tobytes(), message.ranges.tobytes())
     both = message.angular_velocity, message.linear_acceleration
     return (*stamp, np.array([(v.x, v.y, v.z) for v in both]).tobytes())
 
@@ -102,20 +117,23 @@ def test_joint_states_are_read_as_by_rosbags_whole_cut_and_garbled(messages, lon
             assert read(decode, changed) == by_rosbags(changed, JOINTS)
 
 
-@given(imus(), st.integers(-8, 8), st.integers(0, 400))
-def test_imus_are_read_as_by_rosbags_whole_cut_and_garbled(message, longer, where):
-    decode, data = decoder(IMU), encode(message)
-    assert read(decode, data) == content(message)
-    changed = data[:longer] if longer < 0 else data + b"\0" * longer
-    assert read(decode, changed) == by_rosbags(changed, IMU)
-    for changed in garbled(data, where):
-        assert read(decode, changed) == by_rosbags(changed, IMU)
+@pytest.mark.parametrize("kind", [IMU, SCAN])
+@given(data=st.data(), longer=st.integers(-8, 8), where=st.integers(0, 400))
+def test_imus_and_scans_are_read_as_by_rosbags_whole_cut_and_garbled(kind, data, longer, where):
+    message = data.draw(MESSAGES[kind])
+    decode, whole = decoder(kind), encode(message)
+    assert quick_reader(kind)(whole) is not None
+    assert read(decode, whole) == content(message)
+    changed = whole[:longer] if longer < 0 else whole + b"\0" * longer
+    assert read(decode, changed) == by_rosbags(changed, kind)
+    for changed in garbled(whole, where):
+        assert read(decode, changed) == by_rosbags(changed, kind)
 
 
-@pytest.mark.parametrize("kind", [IMU, JOINTS])
+@pytest.mark.parametrize("kind", [IMU, JOINTS, SCAN])
 @given(data=st.data())
 def test_the_other_order_of_bytes_is_left_to_rosbags(kind, data):
-    message = data.draw(imus() if kind == IMU else joint_states())
+    message = data.draw(MESSAGES[kind])
     turned = bytes(STORE.serialize_cdr(message, kind, little_endian=False))
     quick = quick_reader(kind)
     assert quick(turned) is None

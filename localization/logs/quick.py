@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from localization.logs.forms import Form, Message, Template
 from localization.logs.fused import FusedEstimate, odom_axes, odometry_message, six_by_six, transform_message
@@ -19,6 +20,7 @@ from motion_models.se2 import FloatArray
 
 _CDR, _FIRST = b"\0\1\0\0", 4  # little endian; places are counted from behind these bytes
 _UINT, _HEADER, _IMU = struct.Struct("<I"), struct.Struct("<iII"), struct.Struct("<104x3d72x3d72x")
+_LASER_SCAN = struct.Struct("<7fI")
 
 
 class Stamp(NamedTuple):
@@ -54,10 +56,30 @@ class JointState(NamedTuple):
     velocity: FloatArray
 
 
+class LaserScan(NamedTuple):
+    """What is used of sensor_msgs/LaserScan."""
+
+    header: Header
+    angle_min: float
+    angle_max: float
+    angle_increment: float
+    time_increment: float
+    range_min: float
+    range_max: float
+    ranges: NDArray[np.float32]
+
+
+_READERS: dict[str, Callable[[], Callable[[bytes], Any]]] = {
+    "sensor_msgs/msg/Imu": lambda: _imu,
+    "sensor_msgs/msg/JointState": lambda: _joint_states(),
+    "sensor_msgs/msg/LaserScan": lambda: _laser_scan,
+}
+
+
 def quick_reader(kind: str) -> Callable[[bytes], Any] | None:
     """A reader of messages of type ``kind``, or None: it gives what is used of a message, or None for bytes of an unusual kind, which
     rosbags has to look at. It raises (`struct.error`, `ValueError`) where rosbags would."""
-    return {"sensor_msgs/msg/Imu": lambda: _imu, "sensor_msgs/msg/JointState": _joint_states}.get(kind, lambda: None)()
+    return _READERS[kind]() if kind in _READERS else None
 
 
 def _imu(data: bytes) -> Imu | None:
@@ -68,6 +90,22 @@ def _imu(data: bytes) -> Imu | None:
         return None
     wx, wy, wz, ax, ay, az = _IMU.unpack_from(data, at)
     return Imu(Header(Stamp(sec, nanosec), data[16 : end - 1].decode()), Vector(wx, wy, wz), Vector(ax, ay, az))
+
+
+def _laser_scan(data: bytes) -> LaserScan | None:
+    if not data.startswith(_CDR):
+        return None
+    sec, nanosec, length = _HEADER.unpack_from(data, _FIRST)
+    end = 16 + length
+    at = _aligned(end, 4)
+    first, last, step, beam_s, _, shortest, longest, count = _LASER_SCAN.unpack_from(data, at)
+    at += _LASER_SCAN.size
+    intensities = at + 4 * count
+    left = len(data) - intensities - 4 - 4 * _UINT.unpack_from(data, intensities)[0]
+    if not 0 <= left < 4 or not length or data[end - 1]:
+        return None
+    header, ranges = Header(Stamp(sec, nanosec), data[16 : end - 1].decode()), np.frombuffer(data, "<f4", count, at)
+    return LaserScan(header, first, last, step, beam_s, shortest, longest, ranges)
 
 
 def _joint_states() -> Callable[[bytes], JointState | None]:
