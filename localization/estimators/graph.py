@@ -2,7 +2,8 @@
 
 GTSAM gets matrices, never Python functions: its optimisers copy all values at every call back into Python, which makes ten thousand poses
 cost a minute and a half, and a Jacobian of the wrong shape would end the process. So relinearising is ours (`graph_history`),
-and every array is checked before it goes in.
+and every array is checked before it goes in. Each factor costs tens of microseconds on its way: of long chains, only what is left of
+them comes here (`graph_chain`).
 """
 
 from __future__ import annotations
