@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 from scipy.stats import chi2
 
 from localization.lidar import LidarMatcher, Revisit, RevisitConfig, body_points
@@ -99,13 +100,22 @@ def crooked() -> np.ndarray:
     return np.concatenate(walls)
 
 
-def visit_again(walls: np.ndarray, off: tuple[float, float, float], sigma: tuple[float, float, float]) -> tuple[list[Revisit], np.ndarray]:
+def clutter() -> np.ndarray:
+    """A passage full of things that are no walls: legs of chairs and tables, none like another."""
+    rng = np.random.default_rng(5)
+    spots = rng.uniform((-30.0, 0.9), (60.0, 3.5), (420, 2)) * np.where(rng.random(420) < 0.5, 1.0, -1.0)[:, None] ** np.array([0, 1])
+    return np.concatenate([world.box(x, y, x + rng.uniform(0.03, 0.08), y + rng.uniform(0.03, 0.08)) for x, y in spots])
+
+
+def visit_again(
+    walls: np.ndarray, off: tuple[float, float, float], sigma: tuple[float, float, float], is_thorough: bool = False
+) -> tuple[list[Revisit], np.ndarray]:
     """Drive 30 m along x, 25 m elsewhere, and from x = 8 m on again, believing to have come there ``off`` (3,) with ``sigma`` (3,).
 
     Gives what was recognised first, in a list of one or none, and the error (n, 3) of its pose against the first visit."""
     rng = np.random.default_rng(0)
     angles = np.linspace(-2.4, 2.4, 240)
-    lines, revisits = LineMap(0.4, 0.02, 100.0), Revisits(RevisitConfig(), FitOptions(0.4, 0.03, 0.02, 0.1, 0.3, 12), 0.2)
+    lines, revisits = LineMap(0.4, 0.02, 100.0), Revisits(RevisitConfig(), FitOptions(0.4, 0.03, 0.02, 0.1, 0.3, 12), 0.2, is_thorough)
 
     def look(x: float, believed: np.ndarray, cov: np.ndarray, travel: float) -> Revisit | None:
         ranges = rooms.look_around(walls, np.array([x, 0.0, 0.0]), angles, 8.0) + 0.01 * rng.normal(size=len(angles))
@@ -139,9 +149,18 @@ def test_a_place_is_recognised_as_far_as_drift_can_be() -> None:
         assert np.sqrt(revisit.cov[0, 0]) < 0.05
 
 
-def test_a_periodic_corridor_tells_nothing_along_itself() -> None:
+def test_among_clutter_a_place_is_recognised_where_it_is_looked_for_thoroughly() -> None:
+    """Of what lies on no line, the nearest points tell; that is not sure enough to move a robot there and then."""
+    assert not visit_again(clutter(), (0.9, 0.3, 0.05), (0.8, 0.3, 0.06))[0]
+    found, errors = visit_again(clutter(), (0.9, 0.3, 0.05), (0.8, 0.3, 0.06), is_thorough=True)
+    assert [revisit.is_sure for revisit in found] == [False]
+    assert np.abs(errors[:, :2]).max() < 0.1
+
+
+@pytest.mark.parametrize("is_thorough", [False, True])
+def test_a_periodic_corridor_tells_nothing_along_itself(is_thorough: bool) -> None:
     """Doors 1.5 m apart, drift of a metre: any of several doors may be this one."""
-    found, errors = visit_again(periodic(), (0.7, 0.1, 0.02), (1.0, 0.3, 0.06))
+    found, errors = visit_again(periodic(), (0.7, 0.1, 0.02), (1.0, 0.3, 0.06), is_thorough)
     for revisit, error in zip(found, errors, strict=True):
         assert np.sqrt(revisit.cov[0, 0]) > 10.0  # against a drift of 1 m: nothing
         assert abs(error[1]) < 0.05
@@ -149,9 +168,10 @@ def test_a_periodic_corridor_tells_nothing_along_itself() -> None:
         assert abs(gain[0, 0]) < 0.02
 
 
-def test_a_place_that_drift_cannot_reach_is_another() -> None:
+@pytest.mark.parametrize("is_thorough", [False, True])
+def test_a_place_that_drift_cannot_reach_is_another(is_thorough: bool) -> None:
     """The same walls, believed to be 0.9 m and 18 sigma away: it merely looks alike."""
-    found, _ = visit_again(crooked(), (0.9, 0.0, 0.0), (0.05, 0.05, 0.01))
+    found, _ = visit_again(crooked(), (0.9, 0.0, 0.0), (0.05, 0.05, 0.01), is_thorough)
     assert not found
 
 

@@ -83,6 +83,17 @@ def _line(
 
 
 @numba.njit(cache=True)
+def _nearest(near: FloatArray, n_near: int, x: float, y: float, radius: float) -> tuple[float, float]:  # pragma: no cover
+    """Distance and travelled distance of the point that is nearest to (x, y); NaN where none is within ``radius``."""
+    best, found = radius * radius, -1
+    for k in range(n_near):
+        d = (near[0, k] - x) ** 2 + (near[1, k] - y) ** 2
+        if d < best:
+            best, found = d, k
+    return (math.sqrt(best), near[2, found]) if found >= 0 else (math.nan, math.nan)
+
+
+@numba.njit(cache=True)
 def compare_points(
     cells: NDArray[np.int32],
     points: NDArray[np.float32],
@@ -92,6 +103,7 @@ def compare_points(
     pose: FloatArray,
     cell: float,
     radius: float,
+    any_point: bool,
     errors: FloatArray,
     seen: FloatArray,
 ) -> None:  # pragma: no cover
@@ -105,7 +117,7 @@ def compare_points(
         if ix != at_x or iy != at_y:
             at_x, at_y, n_near = ix, iy, _gather(cells, points, travels, ages, ix, iy, near)
         m, _, _, e, _, _, _, travel, _ = _line(near, n_near, x, y, radius, math.inf, _LEAST_WIDE, math.inf)
-        errors[i], seen[i] = (abs(e), travel) if m else (math.nan, math.nan)
+        errors[i], seen[i] = (abs(e), travel) if m else _nearest(near, n_near if any_point else 0, x, y, radius)
 
 
 @numba.njit(cache=True)

@@ -204,11 +204,14 @@ class LineMap:
         rms = math.sqrt(squares / n) if n else math.nan
         return LineFit(pose, information, curvature, gradient, n, n_on, rms, Spread(*spread.tolist()), old, of_map, late)
 
-    def compare(self, points: FloatArray, pose: FloatArray, radius: float, ages: Ages = ALL_AGES) -> tuple[FloatArray, FloatArray]:
+    def compare(
+        self, points: FloatArray, pose: FloatArray, radius: float, ages: Ages = ALL_AGES, any_point: bool = False
+    ) -> tuple[FloatArray, FloatArray]:
         """How far ``points`` (N, 2) of the body frame at ``pose`` (3,) are off the lines within ``radius`` [m] of them, and when those
-        were seen: distances (N,) [m] and travelled distances (N,) [m], NaN for points without a line of these ``ages``."""
+        were seen: distances (N,) [m] and travelled distances (N,) [m], NaN for points without a line of these ``ages``. With ``any_point``,
+        these are held against the nearest point."""
         errors, travels = np.empty(len(points)), np.empty(len(points))
-        compare_points(self._cells, self._points, self._travels, ages, points, pose, self._cell, radius, errors, travels)
+        compare_points(self._cells, self._points, self._travels, ages, points, pose, self._cell, radius, any_point, errors, travels)
         return errors, travels
 
     def points_within(self, center: FloatArray, half: float) -> tuple[FloatArray, FloatArray]:

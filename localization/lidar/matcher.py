@@ -113,8 +113,8 @@ class Registration:
 class LidarMatcher:
     """A map of what was seen so far, and where scans fit into it. The caller says where each scan was taken (`insert`)."""
 
-    def __init__(self, config: LidarConfig | None = None) -> None:
-        self.config = config or LidarConfig()
+    def __init__(self, config: LidarConfig | None = None, is_thorough: bool = False) -> None:
+        self.config, self._is_thorough = config or LidarConfig(), is_thorough
         self._kiss: Kiss | None = None
         self._lines: LineMap | None = None
         sigmas = self.config.sigma_point_m, self.config.sigma_line_m
@@ -199,7 +199,7 @@ class LidarMatcher:
         if self._kiss is None or self._lines is None or not self.config.revisit.is_on:
             return None
         if self._revisits is None:
-            self._revisits = Revisits(self.config.revisit, self._options, self._voxel)
+            self._revisits = Revisits(self.config.revisit, self._options, self._voxel, self._is_thorough)
         self._advance(pose)
         return self._revisits.look(self._planar, self._lines, pose, cov, self._travel, stamp_ns)
 
@@ -208,8 +208,9 @@ class LidarMatcher:
         if self._kiss is None or self._lines is None or self._revisits is None:
             return
         world_T_world = se2.compose(after, se2.inverse(before))
-        self._lines.move_since(self._travel - self.config.revisit.old_after_m, world_T_world)
-        self._revisits.correct(world_T_world)
+        since = self._travel - self.config.revisit.old_after_m
+        self._lines.move_since(since, world_T_world)
+        self._revisits.correct(world_T_world, since)
         self._last = se2.compose(world_T_world, self._last)
         # KISS-ICP's map does not know when it saw what; of a planar scene, the lines' points are all there is to know
         points = self._lines.point_cloud()

@@ -31,6 +31,7 @@ _RIVAL_SCORE = 0.8  # whose score in the coarse search is below this part of the
 _OPEN = 30.0  # sigma along the way to a rival, over its distance: no guess between rivals moves the robot
 _TELLS = 0.1  # part of the drift's variance that a place seen again must be below, in some direction
 _MOST_PLACES = 24  # whose drift is looked at for one keyframe
+_NEAR_PART = 0.9  # of a scan: it is sought around its place among what was drawn near there, not all over the map
 _FEW_NEW = 0.02  # part of a place's points that may be added in passing
 
 
@@ -77,9 +78,11 @@ class Revisit:
     slip: FloatArray
     """(3, 3) by which the way here was worse than believed: zero unless a verified place contradicts what was believed."""
     then: Place
-    """Where the robot was when it drew that part of the map."""
+    """Where the robot was when it drew that part of the map, with the pose that the map has for it now."""
     matched: float
     """Part of the scan's points on old lines."""
+    is_sure: bool = True
+    """Most of them are on lines, few in clutter: sure enough to move a robot by it there and then."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,17 +95,27 @@ class _Fit:
     score: float
 
 
+@dataclass
+class _Watch:
+    """How one of the searches goes on."""
+
+    is_sure: bool
+    pending: tuple[int, _Fit] | None = None
+    searched: float = -math.inf
+
+
 class Revisits:
     """Give it every scan in the order of time; it says when one is of a place seen before, about one in a thousand."""
 
-    def __init__(self, config: RevisitConfig, options: FitOptions, voxel: float) -> None:
-        """``options``: of the scan matcher; ``voxel`` [m]: its resolution."""
+    def __init__(self, config: RevisitConfig, options: FitOptions, voxel: float, is_thorough: bool = False) -> None:
+        """``options``: of the scan matcher; ``voxel`` [m]: its resolution; ``is_thorough``: say it, too, where it is not sure enough to
+        move a robot by it."""
         self.config, self._options, self._voxel = config, options, voxel
         self.track = Track()
         self._gate = float(chi2.ppf(config.gate_probability, 3))
-        self._pending: tuple[int, _Fit] | None = None
+        self._watches = [_Watch(True), _Watch(False)] if is_thorough else [_Watch(True)]
         self._recent: deque[tuple[Place, FloatArray]] = deque(maxlen=_MOST_RECENT)
-        self._searched = -math.inf
+        self._moves: list[tuple[float, float, FloatArray]] = []  # stretches of the way [m] whose part of the map was moved, and how
         self.ages: Ages = ALL_AGES
         """Parts of the map against which the pose is known as well as scan matching needs it: the latest way, and what it is tied to."""
 
@@ -115,23 +128,37 @@ class Revisits:
         reach = float(np.quantile(np.hypot(scan[:, 0], scan[:, 1]), 0.9)) if len(scan) else 0.0
         self.ages = ages_between(self._known(now, reach))
         self._recent.append((now, _thinned(scan, 0.5 * self._voxel)))
-        if self._pending is None and travel - self._searched < self.config.search_m:
-            return None
-        self._searched = travel
-        fit, then = self._find(self._seen_recently(now), lines, pose, travel, reach)
-        last, self._pending = self._pending, None if fit is None else (len(self.track) - 1, fit)
+        found = None
+        for watch in self._watches:
+            if watch.pending is not None or travel - watch.searched >= self.config.search_m:
+                watch.searched = travel
+                found = found or self._watched(watch, now, lines, reach)
+        return found
+
+    def _watched(self, watch: _Watch, now: Place, lines: LineMap, reach: float) -> Revisit | None:
+        fit, then = self._find(self._seen_recently(now), lines, now, reach, watch.is_sure)
+        last, watch.pending = watch.pending, None if fit is None else (len(self.track) - 1, fit)
         if fit is None or last is None or not self._agrees(last, fit):
             return None
-        self._pending = None
-        self.track.tie(then)
+        watch.pending = None
         place, growth = self.track[then], self.track.growth(then)
-        off = se2.log(se2.between(pose, fit.pose))
+        if watch.is_sure:
+            self.track.tie(then)
+        off = se2.log(se2.between(now.pose, fit.pose))
         slip = slip_of(off, growth + fit.cov, self._gate)
         matched = float(fit.on_map.mean())
-        return Revisit(fit.pose, fit.cov, moved(place, pose), growth + slip, slip, place, matched)
+        return Revisit(fit.pose, fit.cov, moved(place, now.pose), growth + slip, slip, self._as_drawn(place), matched, watch.is_sure)
 
-    def correct(self, world_T_world: FloatArray) -> None:
-        """The latest way lies elsewhere by ``world_T_world`` (3,)."""
+    def _as_drawn(self, place: Place) -> Place:
+        """``place`` where the map has it now."""
+        for since, until, world_T_world in self._moves:
+            if since < place.travel <= until:
+                place = replace(place, pose=se2.compose(world_T_world, place.pose))
+        return place
+
+    def correct(self, world_T_world: FloatArray, since: float) -> None:
+        """What was drawn after ``since`` [m] of the way lies elsewhere by ``world_T_world`` (3,)."""
+        self._moves.append((since, self.track[len(self.track) - 1].travel, world_T_world))
         moved_along = [(replace(place, pose=se2.compose(world_T_world, place.pose)), seen) for place, seen in self._recent]
         self._recent = deque(moved_along, maxlen=_MOST_RECENT)
 
@@ -162,13 +189,15 @@ class Revisits:
         turn = abs(float(se2.between(last.pose, pose)[2]))
         return travel - last.travel >= self.config.keyframe_m or turn >= self.config.keyframe_rad
 
-    def _find(self, scan: FloatArray, lines: LineMap, pose: FloatArray, travel: float, reach: float) -> tuple[_Fit | None, int]:
+    def _find(self, scan: FloatArray, lines: LineMap, now: Place, reach: float, is_sure: bool) -> tuple[_Fit | None, int]:
         """Where the scan fits into the old map, and the place from which that part of it was drawn."""
-        c = self.config
+        c, pose, travel = self.config, now.pose, now.travel
         if travel - c.old_after_m <= self.track[0].travel or len(scan) < 10:
             return None, -1
         drift = math.sqrt(self._gate * float(np.linalg.eigvalsh(self.track.growth(0)[:2, :2])[-1]))
-        whole = float(np.hypot(scan[:, 0], scan[:, 1]).max())
+        ranges = np.hypot(scan[:, 0], scan[:, 1])
+        whole = float(ranges.max() if is_sure else np.quantile(ranges, _NEAR_PART))
+        scan = np.ascontiguousarray(scan[ranges <= whole])
         points, travels = lines.points_within(pose[:2], whole + min(drift, c.max_search_m) + self._voxel)
         before = _last_absence(travels, travel, c.old_after_m)
         points, travels = points[travels < before], travels[travels < before]
@@ -176,10 +205,10 @@ class Revisits:
             return None, -1
         growth = self.track.growth(self.track.at_travel(float(np.median(travels))))
         resolution = np.diag([self._voxel, self._voxel, self._voxel / max(reach, 1.0)]) ** 2
-        if self._sees(growth):
+        if is_sure and self._sees(growth):
             return None, -1
         few = np.ascontiguousarray(scan[:: math.ceil(len(scan) / _MOST_POINTS)])
-        rough = _Search(few, lines, ages_until(before), pose, growth + resolution / 9.0, resolution, self._options)
+        rough = _Search(few, lines, ages_until(before), pose, growth + resolution / 9.0, resolution, self._options, not is_sure)
         search = replace(rough, scan=scan)
         limits = np.array([c.max_search_m, c.max_search_m, c.max_search_rad])
         scores = correlate(few, points, pose, search.prior, limits, self._voxel, self._gate)
@@ -192,7 +221,7 @@ class Revisits:
         best = search.fit(best.peak)
         if best.on_map.mean() < c.min_matched:
             return None, -1
-        cov = self._doubted(best, search, scores.poses, left)
+        cov = self._doubted(best, search, scores.poses, left, is_sure)
         if cov is None:
             return None, -1
         best = replace(best, cov=cov)
@@ -202,9 +231,9 @@ class Revisits:
             return None, -1
         return best, then
 
-    def _doubted(self, best: _Fit, search: _Search, poses: FloatArray, scores: FloatArray) -> FloatArray | None:
+    def _doubted(self, best: _Fit, search: _Search, poses: FloatArray, scores: FloatArray, must_tell: bool) -> FloatArray | None:
         """The covariance of ``best``, open towards every other place that explains the scan about as well; None if these are too many
-        to try, or leave no direction in which the scan says more than drift does."""
+        to try, or, where it ``must_tell``, leave no direction in which the scan says more than drift does."""
         cov = best.cov
         left = scores > _RIVAL_SCORE * best.score
         poses, scores = poses[left], scores[left]
@@ -212,7 +241,7 @@ class Revisits:
             far = _distances(best.peak, poses, cov + search.resolution * (4.0 / self._gate)) > self._gate
             poses, scores = poses[far], scores[far]
             if not len(poses):
-                return cov if np.linalg.eigvals(np.linalg.solve(search.prior, cov)).real.min() < _TELLS else None
+                return cov if not must_tell or np.linalg.eigvals(np.linalg.solve(search.prior, cov)).real.min() < _TELLS else None
             start = poses[np.argmax(scores)]
             other = search.fit(start)
             is_distinct = _distances(best.peak, other.peak, cov + search.resolution / self._gate) > self._gate
@@ -254,6 +283,7 @@ class _Search:
     prior: FloatArray  # (3, 3) covariance of ``pose`` against that map
     resolution: FloatArray  # (3, 3) what the search cannot tell apart
     options: FitOptions
+    any_point: bool  # of the map tells, not its lines alone
 
     def best(self, poses: FloatArray, scores: FloatArray) -> _Fit:
         """The best of fits from the best ``poses`` (K, 3), each start some way from the others."""
@@ -273,7 +303,7 @@ class _Search:
         information = np.asarray(np.linalg.inv(self.prior), dtype=float)
         found = self.lines.fit(self.scan, start, self.options, information, self.pose, self.ages)
         best, cov = found.measurement()
-        errors, travels = self.lines.compare(self.scan, found.pose, self.options.radius, self.ages)
+        errors, travels = self.lines.compare(self.scan, found.pose, self.options.radius, self.ages, self.any_point)
         on_map = errors < self.options.kernel
         off = se2.log(se2.between(self.pose, found.pose))
         score = float(on_map.mean()) - 0.5 * float(off @ information @ off) / len(self.scan)
