@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import eigh
 
 from localization.consistency import mean_band
 from localization.estimators.account import Account
@@ -42,18 +43,29 @@ def test_it_is_the_covariance_of_errors_that_are_made() -> None:
     draw = lambda cov: rng.multivariate_normal(np.zeros(len(cov)), cov, count)  # noqa: E731
     P, rows = spd(rng, n), np.eye(n)[:3]
     e = draw(P)
-    account, m, drawn = Account(P, rows, 16.0), e[:, :3].copy(), e[:, :3].copy()
+    account, m, drawn = Account(P, rows, 16.0, has_mark=True), e[:, :3].copy(), e[:, :3].copy()
+    marked, held, restricted = drawn.copy(), None, 0
     for k in range(4):
         F, Q = np.eye(n), spd(rng, n, 0.1)
         F[:3, :3] = se2.adjoint(rng.normal(size=3))
         F[:3, 3:] = 0.2 * rng.normal(size=(3, n - 3))
         e, m, drawn = e @ F.T + draw(Q), m @ F[:3, :3].T, drawn @ F[:3, :3].T
+        marked = marked @ F[:3, :3].T
         account.move(F, Q)
         total = spd(rng, 3)
-        kept = 0.8 * total @ np.linalg.inv(total + spd(rng, 3))
+        old = 0.8 * np.linalg.inv(total + spd(rng, 3))  # information of the old lines
+        known = kept = total @ old
+        if held is not None:  # where it is more than three times that by which the last scan was held, the rest was drawn of late
+            back = np.linalg.inv(F[:3, :3])
+            held = back.T @ held @ back
+            ratios, V = eigh(old, held)
+            restricted += int((ratios > 3.0).any())
+            kept = total @ (held @ V * np.minimum(ratios, 3.0)) @ (held @ V).T
+        held = np.linalg.inv(total)
         part = 0.4 * (total + total.T) / 2.0
-        tie = MapTie(kept, part, spd(rng, 3, 0.3))
-        fresh = tie.fresh + max(0.0, 1e-9 - np.linalg.eigvalsh(tie.fresh).min()) * np.eye(3)
+        tie = MapTie(known, part, spd(rng, 3, 0.3))
+        fresh = replace(tie, kept=kept).fresh
+        fresh += max(0.0, 1e-9 - np.linalg.eigvalsh(fresh).min()) * np.eye(3)
         m = m @ kept.T + drawn @ (np.eye(3) - kept).T + draw(fresh)
         K, d = 0.3 * rng.normal(size=(n, 3)), np.eye(3) + 0.1 * rng.normal(size=(3, 3))
         swept = draw(tie.sweep)
@@ -62,10 +74,16 @@ def test_it_is_the_covariance_of_errors_that_are_made() -> None:
         account.see(K, d, total, tie, 1.0)
         account.draw(np.eye(n), k != 2)
         if k != 2:
-            drawn = e[:, :3] - swept
+            drawn = e[:, :3] - swept @ (K[:3] @ d).T
         K, H, R = 0.3 * rng.normal(size=(n, 1)), rng.normal(size=(1, n)), np.array([[0.2]])
         e = e - (e @ H.T + draw(R)) @ K.T
         account.correct(K, H, R)
+        if k == 1:
+            account.mark()
+            marked = e[:, :3].copy()
+    assert restricted  # or that rule would not have been tried
+    W = np.linalg.inv(np.linalg.cholesky(account.mark()))
+    np.testing.assert_allclose(W @ np.cov((e[:, :3] - marked).T) @ W.T, np.eye(3), atol=0.05)
     W = np.linalg.inv(np.linalg.cholesky(account.covariance))
     np.testing.assert_allclose(W @ np.cov(e.T) @ W.T, np.eye(n), atol=0.05)
 

@@ -54,8 +54,16 @@ class EkfConfig:
 class Ekf:
     """State in, state out by `predict` and the `measure_...` methods; each returns the normalised innovation squared (NIS)."""
 
-    def __init__(self, gyro: GyroNoise, corrected: Corrections, config: EkfConfig | None = None, pose: FloatArray | None = None) -> None:
-        self.config = config or EkfConfig()
+    def __init__(
+        self,
+        gyro: GyroNoise,
+        corrected: Corrections,
+        config: EkfConfig | None = None,
+        pose: FloatArray | None = None,
+        has_mark: bool = False,
+    ) -> None:
+        """``has_mark``: `mark` will be asked for."""
+        self.config, self._has_mark = config or EkfConfig(), has_mark
         self._gyro, self._corrected = gyro, corrected
         self._size = size = PARAMS + len(corrected.names)
         self.pose = np.zeros(3) if pose is None else np.array(pose, dtype=float)
@@ -178,7 +186,7 @@ class Ekf:
         if tie is not None and self._account is None:
             drawn = np.zeros((3, self._size))
             drawn[:, ANCHOR] = se2.adjoint(se2.inverse(self._since_anchor))
-            self._account = Account(self._filter.P, drawn, self._gate)
+            self._account = Account(self._filter.P, drawn, self._gate, self._has_mark)
         doubt = 1.0
         if nis > limit:
             if can_slip:
@@ -206,6 +214,11 @@ class Ekf:
         self.pose = se2.compose(self.pose, se2.exp(shift))
         self._start = se2.compose(self.pose, se2.inverse(start_T_now))
         self._anchor = se2.compose(self.pose, se2.inverse(anchor_T_now))
+
+    def mark(self) -> FloatArray | None:
+        """(3, 3) covariance of the motion since the pose that was last marked, at first that of the first scan, by the errors that are
+        really made; the pose now is marked. None until scans share a map."""
+        return None if self._account is None else self._account.mark()
 
     def set_anchor(self, is_drawn: bool = True) -> None:
         """From here on, the LiDAR measures from the pose as it is now. ``is_drawn``: its map has got the scan, too."""

@@ -22,8 +22,9 @@ from motion_models.se2 import FloatArray
 class GraphErrors:
     """Give it what the graph gets, in the same order."""
 
-    def __init__(self, gyro: GyroNoise, corrected: Corrections, belief: EkfConfig, pose: FloatArray) -> None:
-        self._ekf = Ekf(gyro, corrected, belief, pose)
+    def __init__(self, gyro: GyroNoise, corrected: Corrections, belief: EkfConfig, pose: FloatArray, has_mark: bool = False) -> None:
+        """``has_mark``: `mark` will be asked for."""
+        self._ekf = Ekf(gyro, corrected, belief, pose, has_mark)
 
     def step(self, step: Step) -> None:
         """Wheels, gyro and standing still."""
@@ -43,6 +44,10 @@ class GraphErrors:
         """The graph has ``pose`` (3,) for the scan."""
         self._ekf.pose = pose
         self._ekf.set_anchor(is_drawn)
+
+    def mark(self) -> FloatArray | None:
+        """See `Ekf.mark`."""
+        return self._ekf.mark()
 
     @property
     def pose(self) -> FloatArray:
