@@ -25,7 +25,7 @@ class Run:
     model: str
     estimator: str
     trajectory: Trajectory
-    """Poses, with covariances where the estimator has them."""
+    """Poses as the whole log tells them, with covariances where the estimator has them."""
     twists: FloatArray
     """(N, 3) vx, vy, wz in the body frame at the trajectory's stamps."""
     twist_covariances: FloatArray
@@ -44,6 +44,8 @@ class Run:
     """Computing time of this pair, without reading the log."""
     corrections: str | None = None
     """Form of the corrections to the motion model, or None where the estimator makes none."""
+    moments: Trajectory | None = None
+    """Poses as they were estimated at each moment, and would have been published live, where the whole log tells otherwise."""
 
 
 def replay(
@@ -74,7 +76,7 @@ class _Lane:
 
     def __init__(self, pair: Pair, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig) -> None:
         self._pair, self._records = pair, Records()
-        self._core = Core(pair, robot, mounts, has_lidar, config)
+        self._core = Core(pair, robot, mounts, has_lidar, config, hindsight=True)
         self._seconds = 0.0
 
     def push(self, event: Event) -> None:
@@ -87,16 +89,16 @@ class _Lane:
         begin = time.perf_counter()
         for estimate in self._core.finish():
             self._records.add(estimate)
-        smoothed = self._core.estimator.finish()
-        self._seconds += time.perf_counter() - begin
         stamps, table = self._records.stamps(), self._records.table()
         if not len(stamps):
             raise LogError("there are wheel samples and scans in the log, but no two that motion could be told from.")
-        found = trajectory(stamps, table)
+        moments = trajectory(stamps, table)
+        whole = self._core.estimator.finish(moments)
+        self._seconds += time.perf_counter() - begin
         return Run(
             self._pair.model.name,
             self._pair.estimator,
-            found if smoothed is None else smoothed,
+            moments if whole is None else whole,
             table[:, TWIST],
             table[:, TWIST_COV].reshape(-1, 3, 3),
             table[:, NIS],
@@ -106,4 +108,5 @@ class _Lane:
             self._core.stepper.notes(),
             self._seconds,
             self._pair.corrections if self._pair.estimator in CORRECTING else None,
+            None if whole is None else moments,
         )

@@ -184,7 +184,7 @@ def _distance(results: Sequence[Result]) -> float | None:
 
 
 def _estimates(run: Run) -> Iterator[FusedEstimate]:
-    t = run.trajectory
+    t = run.trajectory if run.moments is None else run.moments  # what would have been published
     for i in range(len(t)):
         twist_cov = run.twist_covariances[i]
         yield FusedEstimate(

@@ -40,8 +40,10 @@ class Estimator(Protocol):
     def settle(self) -> None:
         """Do what waits, if anything does; else `step` and `finish` do it first. What it finds out, the next estimate tells."""
 
-    def finish(self) -> Trajectory | None:
-        """A trajectory that later measurements have smoothed, or None where the estimates of each moment are all there is."""
+    def finish(self, moments: Trajectory | None = None) -> Trajectory | None:
+        """A trajectory that later measurements have smoothed, or None where the estimates of each moment are all there is.
+
+        ``moments``: those estimates, for whoever does not keep them. Raises `EstimatorError`."""
 
     @property
     def clock_offset_s(self) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 
 from localization.estimators.base import NO_POINTS, Estimate, mean_twist
 from localization.steps import Step
+from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
@@ -32,7 +33,7 @@ class DeadReckoning:
     def settle(self) -> None:
         return None
 
-    def finish(self) -> None:
+    def finish(self, moments: Trajectory | None = None) -> None:
         return None
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:

@@ -19,6 +19,7 @@ from localization.estimators.witness import ScanWitness, Witness
 from localization.lidar import LidarConfig
 from localization.residuals import motion_residual
 from localization.steps import Step
+from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.corrections import Corrections
@@ -111,7 +112,7 @@ class EkfFusion:
         J, both = np.hstack([d_pose, d_start]), np.r_[POSE, START]
         return mean_twist(delta, J @ ekf.errors[np.ix_(both, both)] @ J.T, step.duration)
 
-    def finish(self) -> None:
+    def finish(self, moments: Trajectory | None = None) -> None:
         self.settle()
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:

@@ -29,6 +29,7 @@ from localization.estimators.graph_revisit import revisited
 from localization.estimators.graph_robust import Closure, Kernel, Position
 from localization.estimators.graph_slow import ONE_CLOCK, Learned, SlowStates
 from localization.estimators.graph_window import Window
+from localization.estimators.hindsight import Hindsight
 from localization.estimators.teaching import teaching
 from localization.estimators.witness import NoWitness, ScanWitness, Sight, Witness
 from localization.lidar import LidarConfig
@@ -84,14 +85,19 @@ class GraphFusion:
         lidar: LidarConfig | None = None,
         witness: Witness | None = None,
         pose: FloatArray | None = None,
+        hindsight: bool = False,
     ) -> None:
-        """``belief``: as the filter's. ``witness`` measures the motion between scans; if not given, scans are matched as ``lidar`` says."""
+        """``belief``: as the filter's. ``witness`` measures the motion between scans; if not given, scans are matched as ``lidar`` says.
+        ``hindsight``: at the end of the log, `finish` will be asked what the whole of it tells."""
         self.config, self._belief = config or GraphConfig(), belief or EkfConfig()
         self._model, self._corrected, self._has_lidar = model, corrected, has_lidar
         self._track_m = robot.geometry.track_width_m
-        self._witness: Witness = (witness or ScanWitness(mounts, lidar)) if has_lidar else NoWitness()
         c = self.config
         self._slow = SlowStates(robot.gyro_noise, corrected, self._belief, c.learn, c.mount_sigma_m, c.mount_sigma_rad, has_lidar)
+        # where scans share a map, and nothing is known besides that the filter does not know
+        shares = has_lidar and witness is None and not self._slow.mount_names and c.backend != "isam2"
+        self._hindsight = Hindsight() if hindsight and shares and c.backend == "fixed_lag" else None
+        self._witness: Witness = (witness or ScanWitness(mounts, lidar, self._hindsight is not None)) if has_lidar else NoWitness()
         self._clock_walk = None if has_lidar else ONE_CLOCK
         self._mounts, self._mount = mounts, Mount()
         self._kernel = Kernel(self.config.kernel, self.config.kernel_scale)
@@ -101,9 +107,7 @@ class GraphFusion:
         self._history = None if self.config.backend == "fixed_lag" else History(first, self.config.backend, self._kernel)
         self._newest = first
         self._now = first
-        # where scans share a map, and nothing is known besides that the filter does not know
-        shares = has_lidar and witness is None and not self._slow.mount_names and self.config.backend != "isam2"
-        self._errors = GraphErrors(robot.gyro_noise, corrected, self._belief, first.pose) if shares else None
+        self._errors = GraphErrors(robot.gyro_noise, corrected, self._belief, first.pose, self._hindsight is not None) if shares else None
         self._pending: Link | None = None
         self._to_settle: tuple[Step, bool] | None = None  # a step with a scan, and whether that was matched
         self._nodes_ns: list[int] = []
@@ -170,6 +174,8 @@ class GraphFusion:
         is_drawn = self._witness.remember(step, self._believed(self._now))
         if self._errors is not None:
             self._errors.draw(self._now.pose, is_drawn)
+        if self._hindsight is not None and self._hindsight.is_due(self._now.pose):
+            self._mark(step.end_ns)
 
     def add_position(self, stamp_ns: int, xy: FloatArray, cov: FloatArray, lever: FloatArray | None = None) -> bool:
         """A measured position ``xy`` (2,) with ``cov`` (2, 2) of the body's point ``lever`` (2,) at a moment, in this estimator's world.
@@ -193,7 +199,7 @@ class GraphFusion:
         if node >= self._window.oldest:
             self._window.add_position(node, position)
             self._newest = self._now = self._window.newest
-            self._errors = None
+            self._errors = self._hindsight = None
         if self._history is not None:
             self._counts["rebuilt"] += self._history.add_position(node, position)
         self._counts["positions"] += 1
@@ -216,7 +222,7 @@ class GraphFusion:
         closure = Closure(a, b, motion.delta, whitening(motion.cov + 1e-12 * np.eye(3)))
         is_used = self._close(closure)
         if is_used:
-            self._errors = None  # which know nothing of it
+            self._errors = self._hindsight = None  # which know nothing of it
         return is_used
 
     def _close(self, closure: Closure) -> bool:
@@ -243,9 +249,12 @@ class GraphFusion:
         near = min((k for k in (i - 1, i) if 0 <= k < len(self._nodes_ns)), key=lambda k: abs(self._nodes_ns[k] - stamp_ns))
         return near + self._first_node if abs(self._nodes_ns[near] - stamp_ns) <= within_ns else None
 
-    def finish(self) -> Trajectory | None:
-        """None for the fixed lag; else all poses as the whole log tells them, with covariances."""
+    def finish(self, moments: Trajectory | None = None) -> Trajectory | None:
+        """All poses as the whole log tells them, with covariances; None for a fixed lag without hindsight."""
         self.settle()
+        if self._hindsight is not None and moments is not None:
+            self._mark(int(moments.stamps_ns[-1]))
+            return self._hindsight.smooth(moments)
         return None if self._history is None else self._history.trajectory()
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
@@ -264,7 +273,8 @@ class GraphFusion:
         return found
 
     def counts(self) -> Mapping[str, int]:
-        return {**self._counts, **self._witness.counts()}
+        loops = {} if self._hindsight is None else {"loops": len(self._hindsight.loops)}
+        return {**self._counts, **loops, **self._witness.counts()}
 
     def map_points(self) -> FloatArray:
         return self._witness.map_points() if self._has_lidar else NO_POINTS
@@ -349,6 +359,11 @@ class GraphFusion:
         known = self._witness.recall(step, believed, node.covariance[:3, :3])
         if known is None:
             return
+        if self._hindsight is not None:
+            self._mark(step.end_ns)
+            self._hindsight.see(known, step.end_ns)
+        if not known.is_sure:
+            return
         self._counts["revisits"] += 1
         if self._errors is not None:
             self._errors.revisit(known)
@@ -361,6 +376,15 @@ class GraphFusion:
             self._window.restart(revisited(node, known, believed))
             self._newest = self._now = self._window.newest
         self._witness.correct(believed, self._believed(self._now))
+        if self._hindsight is not None and self._errors is not None:
+            self._errors.mark()
+            self._hindsight.jump(step.end_ns, self._now.pose)
+
+    def _mark(self, stamp_ns: int) -> None:
+        """What the motion since the last mark is worth, for later."""
+        growth = None if self._errors is None else self._errors.mark()
+        if self._hindsight is not None and growth is not None:
+            self._hindsight.add(stamp_ns, self._now.pose, growth)
 
     def _twist(self, step: Step, link: Link, ahead: Ahead, before: Node, alone: bool) -> tuple[FloatArray, FloatArray | None]:
         """Mean twist of the step, by all witnesses where the step is all there is between two nodes, else without the LiDAR."""

@@ -10,6 +10,7 @@ from localization.errors import EstimatorError
 from localization.estimators.base import NO_POINTS, Estimate
 from localization.lidar import LidarConfig, LidarOdometry, body_points
 from localization.steps import Step
+from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
@@ -41,7 +42,7 @@ class LidarAlone:
     def settle(self) -> None:
         return None
 
-    def finish(self) -> None:
+    def finish(self, moments: Trajectory | None = None) -> None:
         return None
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:

@@ -27,16 +27,16 @@ class EstimatorConfig:
     lidar: LidarConfig = field(default_factory=LidarConfig)
 
 
-_Maker = Callable[[MotionModel, Corrections, Robot, Mapping[str, Mount], bool, EstimatorConfig], Estimator]
+_Maker = Callable[[MotionModel, Corrections, Robot, Mapping[str, Mount], bool, EstimatorConfig, bool], Estimator]
 
 ESTIMATORS: Mapping[str, _Maker] = {
-    "odometry": lambda model, corrected, robot, mounts, has_lidar, config: DeadReckoning(),
-    "lidar": lambda model, corrected, robot, mounts, has_lidar, config: LidarAlone(mounts, config.lidar),
-    "ekf": lambda model, corrected, robot, mounts, has_lidar, config: EkfFusion(
+    "odometry": lambda model, corrected, robot, mounts, has_lidar, config, hindsight: DeadReckoning(),
+    "lidar": lambda model, corrected, robot, mounts, has_lidar, config, hindsight: LidarAlone(mounts, config.lidar),
+    "ekf": lambda model, corrected, robot, mounts, has_lidar, config, hindsight: EkfFusion(
         model, corrected, robot, mounts, has_lidar, config.ekf, config.lidar
     ),
-    "graph": lambda model, corrected, robot, mounts, has_lidar, config: GraphFusion(
-        model, corrected, robot, mounts, has_lidar, config.graph, config.ekf, config.lidar
+    "graph": lambda model, corrected, robot, mounts, has_lidar, config, hindsight: GraphFusion(
+        model, corrected, robot, mounts, has_lidar, config.graph, config.ekf, config.lidar, hindsight=hindsight
     ),
 }
 
@@ -62,7 +62,9 @@ def make_estimator(
     mounts: Mapping[str, Mount],
     has_lidar: bool,
     config: EstimatorConfig | None = None,
+    hindsight: bool = False,
 ) -> Estimator:
-    """The estimator ``name`` at the origin, with corrections of ``form``. Raises what `check_estimator` and `corrections` do."""
+    """The estimator ``name`` at the origin, with corrections of ``form``; with ``hindsight``, it will be asked for what the whole log
+    tells of each moment (`Estimator.finish`). Raises what `check_estimator` and `corrections` do."""
     check_estimator(name, has_lidar)
-    return ESTIMATORS[name](model, corrections(model, form), robot, mounts, has_lidar, config or EstimatorConfig())
+    return ESTIMATORS[name](model, corrections(model, form), robot, mounts, has_lidar, config or EstimatorConfig(), hindsight)

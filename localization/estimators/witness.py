@@ -63,8 +63,8 @@ class Witness(Protocol):
 class ScanWitness:
     """Scan-to-map matching (`LidarMatcher`), and what of it enters the map."""
 
-    def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig | None = None) -> None:
-        self._mounts, self._matcher = mounts, LidarMatcher(config)
+    def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig | None = None, is_thorough: bool = False) -> None:
+        self._mounts, self._matcher = mounts, LidarMatcher(config, is_thorough)
         self._is_begun, self._slip = False, Slip()
         self._seen_ns, self._last_ns = -1, -1  # stamp of the last scan, and of the last that was good
         self._twist = np.zeros(3)  # of the last step with a scan

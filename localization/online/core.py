@@ -36,13 +36,24 @@ class Pair:
 class Core:
     """Stepper and estimator of one pair. Bounded: it keeps no trajectory."""
 
-    def __init__(self, pair: Pair, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig | None = None) -> None:
+    def __init__(
+        self,
+        pair: Pair,
+        robot: Robot,
+        mounts: Mapping[str, Mount],
+        has_lidar: bool,
+        config: ReplayConfig | None = None,
+        hindsight: bool = False,
+    ) -> None:
+        """``hindsight``: the estimator will be asked at the end what the whole log tells; it changes no estimate of a moment."""
         config = config or ReplayConfig()
         model = correctable(pair.model, pair.corrections) if pair.estimator in CORRECTING else pair.model
         self.stepper = Stepper(model, robot, mounts, has_lidar, config.step)
         self.wheel_twist: FloatArray | None = None
         """(3,) mean twist of the last step by the wheels alone; None where they were not heard during all of it."""
-        self.estimator: Estimator = make_estimator(pair.estimator, model, pair.corrections, robot, mounts, has_lidar, config.estimator)
+        self.estimator: Estimator = make_estimator(
+            pair.estimator, model, pair.corrections, robot, mounts, has_lidar, config.estimator, hindsight
+        )
 
     def push(self, event: Event) -> list[Estimate]:
         """Take ``event``; the estimates that it completes, none or several. Raises `EstimatorError`."""

@@ -1,0 +1,152 @@
+"""What the whole way tells of each of its moments, once places that were seen again tie its ends together.
+
+An estimate of a moment knows nothing of what comes after it: where a place is recognised, the estimate jumps, and all that was driven
+since the place was seen first stays as far off as it had drifted. Seen from the end, the way is a pose graph: between moments stand the
+motions that were estimated, as sure as the estimate's own account says, and between the visits of a place what the scans say.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localization.estimators.graph_factors import Pairs, whitening
+from localization.estimators.graph_history import History
+from localization.estimators.graph_link import Link
+from localization.estimators.graph_node import Node
+from localization.estimators.graph_robust import Closure, Kernel
+from localization.lidar import Revisit
+from localization.lidar.track import positive_part
+from localization.trajectory import Trajectory
+from motion_models import se2
+from motion_models.se2 import FloatArray
+
+_NODE_M, _NODE_RAD = 1.0, 0.5  # of way or turn: the motion within is as it was estimated
+_LEAST = np.diag([0.002, 0.002, 5e-4]) ** 2  # of a motion between two nodes
+_KERNEL = Kernel("cauchy", 3.0)
+# A place is recognised by what was seen along some way, in both visits. Of errors that grow by g a metre, the mean over L metres to both
+# sides of a place has g L / 6 against it, that over L metres behind it g L / 3.
+_AROUND, _BEHIND = 4.0 / 6.0, 8.0 / 3.0
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A place that was seen again."""
+
+    from_ns: int
+    to_ns: int
+    motion: FloatArray
+    """(3,) pose of the second visit in the frame of the first."""
+    cov: FloatArray
+    """(3, 3) of its right perturbation."""
+
+
+@dataclass(frozen=True)
+class Jump:
+    """By a place seen again the estimate moved, the robot did not."""
+
+    stamp_ns: int
+    pose: FloatArray
+    """(3,) the estimate after it."""
+
+
+class Hindsight:
+    """Keeps on the way what its parts are worth, and the places that were seen again; knows at the end what they make of it."""
+
+    def __init__(self) -> None:
+        self.loops: list[Loop] = []
+        self._jumps: list[Jump] = []
+        self._stamps, self._growth = array("q"), array("d")  # of nodes, and of the motion up to each
+        self._last: FloatArray | None = None
+
+    def is_due(self, pose: FloatArray) -> bool:
+        """So far from the last node, there should be one at ``pose`` (3,)."""
+        if self._last is None:
+            return True
+        x, y, turn = se2.between(self._last, pose).tolist()
+        return math.hypot(x, y) >= _NODE_M or abs(turn) >= _NODE_RAD
+
+    def add(self, stamp_ns: int, pose: FloatArray, growth: FloatArray) -> None:
+        """A node at ``pose`` (3,), with the covariance ``growth`` (3, 3) of the motion since the one before."""
+        self._last = pose.copy()
+        if not self._stamps or stamp_ns > self._stamps[-1]:
+            self._stamps.append(stamp_ns)
+            self._growth.extend(positive_part(growth).ravel().tolist())
+
+    def see(self, known: Revisit, stamp_ns: int) -> None:
+        """At the last node the robot was at a place ``known`` from long ago."""
+        self.loops.append(Loop(known.then.stamp_ns, stamp_ns, se2.between(known.then.pose, known.pose), known.cov))
+
+    def jump(self, stamp_ns: int, pose: FloatArray) -> None:
+        """At the last node, the estimate became ``pose`` (3,)."""
+        self._last = pose.copy()
+        self._jumps.append(Jump(stamp_ns, pose.copy()))
+
+    def smooth(self, moments: Trajectory) -> Trajectory | None:
+        """``moments``, the estimates of all moments, as the loops correct them; None where there is nothing to correct them by.
+
+        Raises `EstimatorError` if no solution is found.
+        """
+        if not self.loops or moments.covariances is None:
+            return None
+        poses, stamps = moments.poses, moments.stamps_ns
+        nodes = np.searchsorted(stamps, np.array(self._stamps, dtype=np.int64)).clip(max=len(stamps) - 1)
+        growth = np.array(self._growth).reshape(-1, 3, 3)
+        if nodes[0] > 0:  # from the first moment to the first node it is as it was estimated
+            nodes, growth = np.concatenate([[0], nodes]), np.concatenate([np.zeros((1, 3, 3)), growth])
+        after = poses.copy()
+        for jump in self._jumps:
+            after[np.searchsorted(stamps, jump.stamp_ns)] = jump.pose
+        ways = se2.between(after[nodes[:-1]], poses[nodes[1:]])
+
+        history = History(Node.known(poses[0], np.zeros(0), moments.covariances[0] + _LEAST), "batch", _KERNEL)
+        history.mark(int(stamps[0]), None)
+        last = poses[0]
+        for i, way, cov in zip(nodes[1:], ways, growth[1:] + _LEAST, strict=True):
+            last = se2.compose(last, way)
+            history.add(Pairs.one(_link(way, cov), np.zeros((0, 0))), Node(last, np.zeros(0), np.eye(3)))
+            history.mark(int(stamps[i]), None)
+        for loop in self.loops:
+            # where the robot was then is less than a node's distance behind a node
+            then = int(np.searchsorted(stamps, loop.from_ns))
+            a = int(np.searchsorted(nodes, then, side="right")) - 1
+            b = int(np.searchsorted(nodes, np.searchsorted(stamps, loop.to_ns)))
+            motion = se2.compose(se2.between(after[nodes[a]], poses[then]), loop.motion) if then != nodes[a] else loop.motion
+            if a != b:
+                bent = _AROUND * _near(growth, a) + _BEHIND * _near(growth, b)
+                history.add_closure(Closure(a, b, motion, whitening(loop.cov + bent + _LEAST)))
+        found = history.trajectory()
+        assert found.covariances is not None
+        return Trajectory(stamps, *_between(nodes, found.poses, found.covariances, poses, after))
+
+
+def _near(growth: FloatArray, node: int) -> FloatArray:
+    """(3, 3) mean of the ``growth`` (K, 3, 3) from node to node around a ``node``."""
+    return np.asarray(growth[max(node - 3, 1) : node + 5].mean(axis=0))
+
+
+def _link(way: FloatArray, cov: FloatArray) -> Link:
+    nothing = np.zeros(0)
+    return Link(way, cov, np.zeros((3, 0)), nothing, np.zeros((0, 0)), nothing, 0.0, 0.0)
+
+
+def _between(
+    nodes: NDArray[np.intp], found: FloatArray, covs: FloatArray, poses: FloatArray, after: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Poses (N, 3) and covariances (N, 3, 3) of all moments, where those of the ``nodes`` (K,) were ``found``.
+
+    What the way between two nodes has changed by grows evenly along it.
+    """
+    k = np.clip(np.searchsorted(nodes, np.arange(len(poses)), side="right") - 1, 0, len(nodes) - 2)
+    since = se2.between(after[nodes[k]], poses)
+    since[nodes[k] == np.arange(len(poses))] = 0.0
+    until = se2.between(poses, poses[nodes[k + 1]])
+    part = (np.arange(len(poses)) - nodes[k]) / (nodes[k + 1] - nodes[k])
+    forward, backward = se2.compose(found[k], since), se2.compose(found[k + 1], se2.inverse(until))
+    A, B = se2.adjoint(se2.inverse(since)), se2.adjoint(until)
+    mixed = (1.0 - part)[:, None, None] * (A @ covs[k] @ A.swapaxes(-1, -2)) + part[:, None, None] * (B @ covs[k + 1] @ B.swapaxes(-1, -2))
+    return se2.compose(forward, se2.exp(part[:, None] * se2.log(se2.between(forward, backward)))), mixed
