@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from localization.accuracy import Accuracy
 from localization.score import Result
 from localization.trajectory import IntArray
 from motion_models import se2
@@ -54,11 +55,7 @@ class Line:
     @property
     def error(self) -> float | None:
         """The headline number [m]: mean error of the relations, else ATE; None where there is no (finite) score."""
-        accuracy = self.result.accuracy
-        if accuracy is None:
-            return None
-        value = accuracy.relations.all.translation_m if accuracy.relations else accuracy.ate_rmse_m
-        return value if value is not None and math.isfinite(value) else None
+        return headline(self.result.accuracy)
 
     def placed(self, poses: FloatArray) -> FloatArray:
         """Poses (N, 3) of the run's world in the reference's plane where the alignment is known, else as they are."""
@@ -69,6 +66,14 @@ class Line:
         """The same for points (N, 2)."""
         alignment = self.result.accuracy.reference_T_world if self.result.accuracy else None
         return points if alignment is None else se2.transform(alignment, points)
+
+
+def headline(accuracy: Accuracy | None) -> float | None:
+    """Mean error of the relations, else ATE [m]; None where there is no (finite) score."""
+    if accuracy is None:
+        return None
+    value = accuracy.relations.all.translation_m if accuracy.relations else accuracy.ate_rmse_m
+    return value if value is not None and math.isfinite(value) else None
 
 
 def words_of(estimator: str, model: str) -> str:

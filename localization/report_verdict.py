@@ -17,7 +17,7 @@ from scipy.stats import chi2, wilcoxon
 from localization.consistency import mean_band
 from localization.evaluate import relation_errors
 from localization.references import ReferenceTrack, Relations
-from localization.report_lines import DEAD_RECKONING, WHEELLESS, Line, baseline_line, best_line, capitalised, joined, make_lines
+from localization.report_lines import DEAD_RECKONING, WHEELLESS, Line, baseline_line, best_line, capitalised, headline, joined, make_lines
 from localization.score import Result
 from localization.trajectory import IntArray
 from motion_models.se2 import FloatArray
@@ -44,7 +44,7 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
         line = _most_informed(lines)
         return [*_unscored(lines), *_honesty(line, f"The covariances of {line.words}")]
     equals = equally_good(lines, best, reference)
-    return [*_ranking(lines, best, equals, reference), *_coverage(best), *_honesty(best), *_advice(lines, best, equals)]
+    return [*_ranking(lines, best, equals, reference), *_hindsight(best), *_coverage(best), *_honesty(best), *_advice(lines, best, equals)]
 
 
 def equally_good(lines: Sequence[Line], best: Line, reference: ReferenceTrack | Relations) -> list[Line]:
@@ -137,6 +137,15 @@ def _gains(lines: Sequence[Line], best: Line) -> str:
         rounded = f"{math.floor(less)}" if less < 99.0 else f"{math.floor(10.0 * min(less, 99.9)) / 10.0:.1f}"  # never up to all of it
         gains.append(f"{rounded} % less than {part.words} ({metres(part.error)})")
     return ", " + joined(gains) if gains else ""
+
+
+def _hindsight(best: Line) -> list[str]:
+    """What of the error was only known to be one when the robot came back."""
+    loops, then = best.result.run.counts.get("loops", 0), headline(best.result.moments)
+    if not loops or then is None:
+        return []
+    places = "a place" if loops == 1 else f"{loops} places"
+    return [f"That is with hindsight, by {places} seen again; as it drove, its error was {metres(then)}."]
 
 
 def _coverage(best: Line) -> list[str]:

@@ -24,6 +24,8 @@ class Result:
     """None without a reference."""
     nees_mean: float | None
     """Mean of the pose's normalised error squared since the first match, 3 expected; None where the reference has no headings."""
+    moments: Accuracy | None = None
+    """Of the estimates of each moment, where the run's trajectory is what the whole log tells."""
 
     @property
     def name(self) -> str:
@@ -46,6 +48,7 @@ class Result:
             **{name: numbers.pop(name) for name in first},
             "nees_mean": self.nees_mean,
             "nis_mean": self.nis_mean,
+            "moments": None if self.moments is None else self.moments.numbers(),
             "real_time_factor": duration_s / self.run.seconds if with_timing and self.run.seconds > 0 else None,
             "parameters": {name: list(value) for name, value in self.run.parameters.items()},
             "counts": dict(self.run.counts),
@@ -73,4 +76,5 @@ def _score(run: Run, reference: ReferenceTrack | Relations | None) -> Result:
         return Result(run, None, None)
     accuracy = evaluate(run.trajectory, reference)
     found = None if isinstance(reference, Relations) else pose_consistency(run.trajectory, reference)
-    return Result(run, accuracy, None if found is None else found.mean)
+    moments = None if run.moments is None else evaluate(run.moments, reference)
+    return Result(run, accuracy, None if found is None else found.mean, moments)

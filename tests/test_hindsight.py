@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -12,11 +13,12 @@ from localization import Pair, replay
 from localization.consistency import mean_band
 from localization.estimators.hindsight import Hindsight, Loop
 from localization.online.core import Core
+from localization.run import Run
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.registry import make_model
 from tests import rooms
-from tests.test_revisits import laps
+from tests.test_revisits import START, laps, ring
 
 STEP_COV = np.diag([0.01, 0.004, 0.002]) ** 2
 LOOP_COV = np.diag([0.02, 0.02, 0.004]) ** 2
@@ -143,14 +145,23 @@ def test_moments_keep_their_stamps_and_the_motion_between_them() -> None:
 @pytest.fixture(scope="module")
 def drives() -> list[tuple[rooms.Drive, Trajectory, Trajectory]]:
     """Drives, what the graph said of each moment, and what it says of them at the end."""
+    return [(drive, *_tracks(run)) for drive, run in _runs()]
+
+
+@functools.cache
+def _runs() -> list[tuple[rooms.Drive, Run]]:
     found = []
     for seed in range(4):
         drive = laps(seed)
         (run,) = replay(drive.events, [Pair(make_model("diff_drive", rooms.ROBOT), "graph")], rooms.ROBOT, drive.mounts, has_lidar=True)
         assert run.counts["loops"] > 0
-        assert run.moments is not None
-        found.append((drive, run.moments, run.trajectory))
+        found.append((drive, run))
     return found
+
+
+def _tracks(run: Run) -> tuple[Trajectory, Trajectory]:
+    assert run.moments is not None
+    return run.moments, run.trajectory
 
 
 def errors(drive: rooms.Drive, track: Trajectory) -> tuple[np.ndarray, np.ndarray]:
@@ -185,3 +196,17 @@ def test_hindsight_changes_no_estimate_of_a_moment(drives) -> None:
     known = {estimate.stamp_ns: estimate for estimate in live}
     for stamp, pose in zip(moments.stamps_ns.tolist(), moments.poses, strict=True):
         assert np.array_equal(known[stamp].pose, pose)
+    # and the map is drawn where the robot went, as is known now
+    walls = se2.transform(se2.inverse(np.array(START)), ring()[:, :4].reshape(-1, 2)).reshape(-1, 4)
+    run = _runs()[0][1]
+    off_then, off_now = (_distance(points, walls) for points in (core.estimator.map_points(), run.map_points))
+    assert len(off_then) == len(off_now) > 1000
+    assert np.mean(off_now) < 0.95 * np.mean(off_then), (np.mean(off_now), np.mean(off_then))  # noise of the points is in both
+
+
+def _distance(points: np.ndarray, walls: np.ndarray) -> np.ndarray:
+    """(N,) of ``points`` (N, 2) from the nearest of ``walls`` (W, 4), by their ends."""
+    a, along = walls[:, :2], walls[:, 2:] - walls[:, :2]
+    part = np.einsum("nwi,wi->nw", points[:, None] - a, along) / (along**2).sum(axis=1)
+    nearest = a + np.clip(part, 0.0, 1.0)[:, :, None] * along
+    return np.linalg.norm(points[:, None] - nearest, axis=2).min(axis=1)

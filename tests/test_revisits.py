@@ -20,6 +20,7 @@ from motion_models.robot import WheelNoise
 from tests import rooms
 
 NO_SLIP = WheelNoise(*[0.0] * 8)
+START = (6.0, 1.2, 0.0)
 SCANNER = rooms.Beams(beams=240, view=math.radians(270.0), rate_hz=6.25, longest=6.0)
 
 
@@ -46,7 +47,7 @@ def laps(seed: int) -> rooms.Drive:
     def wheels(t: np.ndarray, twists: np.ndarray) -> np.ndarray:
         return twists + rooms.slip(twists, WheelNoise(), np.random.default_rng(seed)) * (twists[:, :1] > 0.0)
 
-    return rooms.drive_through(ring(), way, seed, (6.0, 1.2, 0.0), SCANNER, NO_SLIP, wheels)
+    return rooms.drive_through(ring(), way, seed, START, SCANNER, NO_SLIP, wheels)
 
 
 def test_the_second_lap_corrects_the_drift_of_the_first() -> None:

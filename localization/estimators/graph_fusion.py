@@ -97,6 +97,7 @@ class GraphFusion:
         # where scans share a map, and nothing is known besides that the filter does not know
         shares = has_lidar and witness is None and not self._slow.mount_names and c.backend != "isam2"
         self._hindsight = Hindsight() if hindsight and shares and c.backend == "fixed_lag" else None
+        self._whole: Trajectory | None = None  # the way as the whole log tells it
         self._witness: Witness = (witness or ScanWitness(mounts, lidar, self._hindsight is not None)) if has_lidar else NoWitness()
         self._clock_walk = None if has_lidar else ONE_CLOCK
         self._mounts, self._mount = mounts, Mount()
@@ -254,7 +255,8 @@ class GraphFusion:
         self.settle()
         if self._hindsight is not None and moments is not None:
             self._mark(int(moments.stamps_ns[-1]))
-            return self._hindsight.smooth(moments)
+            self._whole = self._hindsight.smooth(moments)
+            return self._whole
         return None if self._history is None else self._history.trajectory()
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
@@ -277,7 +279,7 @@ class GraphFusion:
         return {**self._counts, **loops, **self._witness.counts()}
 
     def map_points(self) -> FloatArray:
-        return self._witness.map_points() if self._has_lidar else NO_POINTS
+        return self._witness.map_points(self._whole.at if self._whole is not None else None) if self._has_lidar else NO_POINTS
 
     def covariance(self) -> FloatArray:
         """(3 + m, 3 + m) joint covariance of the pose and the slow states: gyro bias, clock offset if there is a LiDAR, corrections."""

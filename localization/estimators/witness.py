@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from localization.estimators.base import NO_POINTS
-from localization.lidar import LidarConfig, LidarMatcher, MapTie, Revisit, ScanCheck, Slip, Sweep
+from localization.lidar import LidarConfig, LidarMatcher, MapTie, Revisit, ScanCheck, Slip, Sweep, Way
 from localization.steps import Step
 from motion_models import se2
 from motion_models.base import Motion
@@ -53,8 +53,8 @@ class Witness(Protocol):
     def remember(self, step: Step, pose: FloatArray) -> bool:
         """The scan that was last looked at, and can begin a motion, was taken from ``pose`` (3,). Returns whether it is drawn."""
 
-    def map_points(self) -> FloatArray:
-        """(M, 2) what was seen, in the world [m]."""
+    def map_points(self, way: Way | None = None) -> FloatArray:
+        """(M, 2) what was seen, in the world [m]; had the robot come another ``way``, if there is one."""
 
     def counts(self) -> Mapping[str, int]:
         """How many scans could not be used, or not in all directions, by what was amiss."""
@@ -138,8 +138,8 @@ class ScanWitness:
         self._is_begun = self._matcher.has_map
         return True
 
-    def map_points(self) -> FloatArray:
-        return self._matcher.point_cloud()
+    def map_points(self, way: Way | None = None) -> FloatArray:
+        return self._matcher.point_cloud(way)
 
     def counts(self) -> Mapping[str, int]:
         return self._check.counts
@@ -162,7 +162,7 @@ class NoWitness:
     def remember(self, step: Step, pose: FloatArray) -> bool:
         return False
 
-    def map_points(self) -> FloatArray:
+    def map_points(self, way: Way | None = None) -> FloatArray:
         return NO_POINTS
 
     def counts(self) -> Mapping[str, int]:

@@ -3,7 +3,7 @@
 from localization.lidar.check import ScanCheck
 from localization.lidar.matcher import LidarConfig, LidarMatcher, MapTie, Registration
 from localization.lidar.odometry import LidarOdometry
-from localization.lidar.revisit import Revisit, RevisitConfig
+from localization.lidar.revisit import Revisit, RevisitConfig, Way
 from localization.lidar.slip import Slip
 from localization.lidar.sweep import Sweep, body_points
 
@@ -18,5 +18,6 @@ __all__ = [
     "ScanCheck",
     "Slip",
     "Sweep",
+    "Way",
     "body_points",
 ]

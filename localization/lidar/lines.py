@@ -134,8 +134,7 @@ class LineMap:
 
     def move_since(self, travel: float, world_T_world: FloatArray) -> None:
         """Move the points that were inserted after ``travel`` [m] by ``world_T_world`` (3,)."""
-        use = np.arange(POINTS_PER_CELL) < self._cells[:, 2][:, None]
-        use &= self._travels > travel
+        use = self._use & (self._travels > travel)
         points, travels = self._points[use].astype(float), self._travels[use]
         keep_until(self._cells, self._points, self._travels, travel)
         self._rebuild(self._cells[:, 2] > 0, self._cells.shape[0])
@@ -225,7 +224,15 @@ class LineMap:
 
     def point_cloud(self) -> FloatArray:
         """(M, 2) all points of the map."""
-        return self._points[np.arange(POINTS_PER_CELL) < self._cells[:, 2][:, None]].astype(float)
+        return self._points[self._use].astype(float)
+
+    def point_travels(self) -> FloatArray:
+        """(M,) travelled distances [m] at which the points of `point_cloud` were added."""
+        return self._travels[self._use].astype(float)
+
+    @property
+    def _use(self) -> NDArray[np.bool_]:
+        return np.arange(POINTS_PER_CELL) < self._cells[:, 2][:, None]
 
 
 def _known(information: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from localization.lidar.cells import ALL_AGES, Ages
 from localization.lidar.kiss import Kiss
 from localization.lidar.lines import AT_ONCE, FitOptions, LineMap
 from localization.lidar.noise import Noise
-from localization.lidar.revisit import Revisit, RevisitConfig, Revisits
+from localization.lidar.revisit import Revisit, RevisitConfig, Revisits, Way
 from localization.lidar.sweep import walls
 from motion_models import se2
 from motion_models.se2 import FloatArray
@@ -225,9 +225,12 @@ class LidarMatcher:
         self._travel += float(np.hypot(*(pose - self._last)[:2]))
         self._last = np.array(pose, dtype=float)
 
-    def point_cloud(self) -> FloatArray:
-        """(M, 2) the map."""
-        return np.empty((0, 2)) if self._lines is None else self._lines.point_cloud()
+    def point_cloud(self, way: Way | None = None) -> FloatArray:
+        """(M, 2) the map; had it been drawn along another ``way``, if there is one."""
+        if self._lines is None:
+            return np.empty((0, 2))
+        points = self._lines.point_cloud()
+        return points if way is None or self._revisits is None else self._revisits.mend(points, self._lines.point_travels(), way)
 
     def _prepare(self, points: FloatArray, is_planar: bool, offsets: FloatArray) -> FloatArray:
         """The points in range, which become those to match."""

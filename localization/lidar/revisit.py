@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +34,10 @@ _TELLS = 0.1  # part of the drift's variance that a place seen again must be bel
 _MOST_PLACES = 24  # whose drift is looked at for one keyframe
 _NEAR_PART = 0.9  # of a scan: it is sought around its place among what was drawn near there, not all over the map
 _FEW_NEW = 0.02  # part of a place's points that may be added in passing
+
+
+Way = Callable[[NDArray[np.int64]], FloatArray]
+"""Poses (K, 3) at moments (K,) [ns]."""
 
 
 @dataclass(frozen=True)
@@ -161,6 +166,17 @@ class Revisits:
         self._moves.append((since, self.track[len(self.track) - 1].travel, world_T_world))
         moved_along = [(replace(place, pose=se2.compose(world_T_world, place.pose)), seen) for place, seen in self._recent]
         self._recent = deque(moved_along, maxlen=_MOST_RECENT)
+
+    def mend(self, points: FloatArray, travels: FloatArray, way: Way) -> FloatArray:
+        """(M, 2) ``points`` (M, 2) of the map, drawn at ``travels`` (M,) [m], had they been drawn along another ``way``."""
+        places = [self._as_drawn(self.track[i]) for i in range(len(self.track))]
+        if not places:
+            return points
+        there = way(np.array([place.stamp_ns for place in places], dtype=np.int64))
+        mended = se2.compose(there, se2.inverse(np.array([place.pose for place in places])))
+        ends = np.array([place.travel for place in places])
+        before = np.clip(np.searchsorted(ends, travels, side="right") - 1, 0, len(ends) - 1)
+        return se2.transform(mended[before], points)
 
     def _known(self, now: Place, reach: float) -> FloatArray:
         """(S, 2) stretches of the way [m] whose part of the map can be matched with as it is; ``reach`` [m] of the LiDAR."""
