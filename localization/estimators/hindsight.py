@@ -121,7 +121,10 @@ class Hindsight:
                 history.add_closure(Closure(a, b, motion, whitening(loop.cov + bent + _LEAST)))
         found = history.trajectory()
         assert found.covariances is not None
-        return Trajectory(stamps, *_between(nodes, found.poses, found.covariances, poses, after))
+        whole, cov = _between(nodes, found.poses, found.covariances, poses, after)
+        # what was known of a moment when it was there is known at the end
+        known = np.trace(moments.covariances[:, :2, :2], axis1=1, axis2=2) < np.trace(cov[:, :2, :2], axis1=1, axis2=2)
+        return Trajectory(stamps, whole, np.where(known[:, None, None], moments.covariances, cov))
 
 
 def _near(growth: FloatArray, node: int) -> FloatArray:
