@@ -14,7 +14,7 @@ DATA := tests/data
 demo: .venv/ready
 	rm -rf $(DEMO)
 	$(BIN)/skidloc replay $(DATA)/husky-outdoor-gps/test1.bag --robot husky_a200 --model diff_drive,skid_steer --out $(DEMO)/husky
-	$(BIN)/skidloc replay $(DATA)/aces/aces.mcap --robot aces --model diff_drive,skid_steer --estimator odometry,lidar,ekf \
+	$(BIN)/skidloc replay $(DATA)/aces/aces.mcap --robot aces --model diff_drive,skid_steer --estimator odometry,lidar,ekf,graph \
 		--reference $(DATA)/aces/aces.relations --out $(DEMO)/aces
 	@echo "Open $(DEMO)/aces/report.html and $(DEMO)/husky/report.html in a browser."
 
