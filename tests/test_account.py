@@ -47,11 +47,12 @@ def test_it_is_the_covariance_of_errors_that_are_made() -> None:
     marked, held, restricted = drawn.copy(), None, 0
     for k in range(4):
         F, Q = np.eye(n), spd(rng, n, 0.1)
-        F[:3, :3] = se2.adjoint(rng.normal(size=3))
+        delta = rng.normal(size=3)
+        F[:3, :3] = se2.adjoint(se2.inverse(delta))
         F[:3, 3:] = 0.2 * rng.normal(size=(3, n - 3))
         e, m, drawn = e @ F.T + draw(Q), m @ F[:3, :3].T, drawn @ F[:3, :3].T
         marked = marked @ F[:3, :3].T
-        account.move(F, Q)
+        account.move(delta, F[:3, 3:], Q)
         total = spd(rng, 3)
         old = 0.8 * np.linalg.inv(total + spd(rng, 3))  # information of the old lines
         known = kept = total @ old
@@ -72,7 +73,7 @@ def test_it_is_the_covariance_of_errors_that_are_made() -> None:
         found = m + draw(total - part) + swept
         e = e - (e[:, :3] - found) @ d.T @ K.T
         account.see(K, d, total, tie, 1.0)
-        account.draw(np.eye(n), k != 2)
+        account.draw(k != 2)
         if k != 2:
             drawn = e[:, :3] - swept @ (K[:3] @ d).T
         K, H, R = 0.3 * rng.normal(size=(n, 1)), rng.normal(size=(1, n)), np.array([[0.2]])

@@ -9,15 +9,19 @@ it that nobody corrects, as in Schmidt's consider filter. Nothing of this moves 
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from dataclasses import replace
 
+import numba
 import numpy as np
 
+from localization.estimators.error_states import cloned, corrected, eigen, inverse, moved, replace
+from localization.estimators.graph_qr import add_spread
 from localization.estimators.revisit_update import revisited_covariance
 from localization.lidar import MapTie, Revisit
 from localization.lidar.revisit import slip_of
-from localization.lidar.track import Place, Track, moved
+from localization.lidar.track import Place, Track
+from localization.lidar.track import moved as moved_place
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
@@ -39,38 +43,26 @@ class Account:
         all_of = np.vstack([np.eye(n), *[drawn] * self._more])
         self._P = all_of @ P @ all_of.T
         self._held: FloatArray | None = None  # (3, 3) information by which the last scan was held, in the frame of the pose now
-        self._swept: tuple[FloatArray, FloatArray] | None = None
+        self._swept = np.zeros((n, 3))  # covariance of what a sweep's error did to each state with what it did to the pose
         self._track, self._travel = Track(), 0.0
         self._last: FloatArray | None = None
-
-    @property
-    def _map(self) -> slice:
-        return slice(self._n, self._n + 3)
-
-    @property
-    def _drawn(self) -> slice:
-        return slice(self._n + 3, self._n + 6)
-
-    @property
-    def _mark(self) -> slice:
-        return slice(self._n + 6, self._n + 9)
+        self._place: Place | None = None  # the last of the track
 
     @property
     def covariance(self) -> FloatArray:
         """(n, n) of the filter's states."""
         return np.asarray(self._P[: self._n, : self._n])
 
-    def move(self, F: FloatArray, Q: FloatArray) -> None:
-        """The filter's own transition ``F`` and noise ``Q`` (n, n); errors of other poses move on into the frame of the pose now."""
-        n, G = self._n, np.zeros_like(self._P)
-        G[:n, :n] = F
-        for k in range(n, len(G), 3):
-            G[k : k + 3, k : k + 3] = F[_POSE, _POSE]
-        self._P = G @ self._P @ G.T
-        self._P[:n, :n] += Q
+    def move(self, delta: FloatArray, D: FloatArray, Q: FloatArray) -> None:
+        """The filter's pose moved by ``delta``, see `moved`."""
+        self._P = moved(self._P, delta, D, Q)
         if self._held is not None:
-            back = np.linalg.inv(F[_POSE, _POSE])
+            back = se2.adjoint(delta)
             self._held = np.asarray(back.T @ self._held @ back)
+
+    def clone(self, at: int) -> None:
+        """The filter's states from ``at`` on became a copy of the pose."""
+        self._P = cloned(self._P, at)
 
     def add(self, rows: slice, cov: FloatArray | float) -> None:
         """Independent errors of ``cov``."""
@@ -78,92 +70,123 @@ class Account:
 
     def correct(self, K: FloatArray, H: FloatArray, R: FloatArray) -> None:
         """The filter corrected itself with the gain ``K`` (n, r) by what has no part in the map."""
-        self._update(K, np.hstack([H, np.zeros((len(H), 3 * self._more))]), R)
+        self._P = corrected(self._P, K, H, R)
 
     def see(self, K: FloatArray, d_pose: FloatArray, cov: FloatArray, tie: MapTie, doubt: float) -> None:
         """The filter corrected itself with the gain ``K`` (n, 3) by a scan in the map, found with ``cov`` (3, 3) by scan and map.
 
         ``d_pose`` (3, 3): of the residual by the pose; ``doubt``: the factor on the measurement's covariance where it was not believed.
         """
-        information: FloatArray = np.asarray(np.linalg.inv(cov))
+        information = inverse(cov)
         if self._held is not None:
             # old lines that did not hold the last scan were drawn not long ago: the error of the map as it was is none of theirs
-            tie = replace(tie, kept=cov @ _common(information @ tie.kept, self._held))
+            tie = dataclasses.replace(tie, kept=cov @ _common(information @ tie.kept, self._held))
         self._held = information
-        G = np.eye(len(self._P))
-        G[self._map, self._map], G[self._map, self._drawn] = tie.kept, np.eye(3) - tie.kept
-        self._P = G @ self._P @ G.T
-        self._P[self._map, self._map] += tie.fresh
-        H = np.zeros((3, len(self._P)))
-        H[:, _POSE], H[:, self._map] = d_pose, -d_pose
-        self._update(K, H, doubt * d_pose @ (cov - tie.cov + tie.sweep) @ d_pose.T)
-        believed = K[_POSE] @ d_pose  # the part of it that the pose took over: along what the scan does not hold, that is next to nothing
-        self._swept = K @ d_pose @ tie.sweep @ believed.T, believed @ tie.sweep @ believed.T
+        self._P = _seen(self._P, K, d_pose, doubt * (cov - tie.cov + tie.sweep), tie.kept, tie.fresh)
+        believed = K @ d_pose  # the part of it that was taken over: along what the scan does not hold, that is next to nothing
+        self._swept = believed @ tie.sweep @ believed[_POSE].T
 
-    def _update(self, K: FloatArray, H: FloatArray, R: FloatArray) -> None:
-        K = np.vstack([K, np.zeros((3 * self._more, K.shape[1]))])
-        T = np.eye(len(self._P)) - K @ H
-        P = T @ self._P @ T.T + K @ R @ K.T
-        self._P = 0.5 * (P + P.T)
-
-    def draw(self, clone: FloatArray, is_drawn: bool) -> None:
-        """The filter's states became ``clone`` (n, n) times themselves, and the scan was drawn where they have it, if ``is_drawn``."""
-        n, G = self._n, np.eye(len(self._P))
-        if is_drawn:
-            G[self._drawn] = 0.0
-            G[self._drawn, _POSE] = np.eye(3)
-        G[:n, :n] = clone
-        P = G @ self._P @ G.T
-        if is_drawn and self._swept is not None:  # pose and points are off by the sweep in opposite ways: the map is not
-            shared, sweep = np.vstack([self._swept[0], np.zeros((3 * self._more, 3))]), self._swept[1]
-            shared = G @ shared
-            P[:, self._drawn] -= shared
-            P[self._drawn, :] -= shared.T
-            P[self._drawn, self._drawn] += sweep
-        self._P, self._swept = P, None
+    def draw(self, is_drawn: bool) -> None:
+        """The scan was drawn where the filter has the pose, if ``is_drawn``."""
+        if is_drawn:  # pose and points are off by the sweep in opposite ways: the map is not
+            self._P = _drawn(self._P, self._n + 3, self._swept)
+        self._swept = np.zeros((self._n, 3))
 
     def mark(self) -> FloatArray:
         """(3, 3) of the motion since the pose that was marked; the pose now is marked."""
-        n = len(self._P)
-        since, G = np.zeros((3, n)), np.eye(n)
-        since[:, _POSE], since[:, self._mark] = np.eye(3), -np.eye(3)
+        at, since = self._n + 6, np.zeros((3, len(self._P)))
+        since[:, _POSE], since[:, at:] = np.eye(3), -np.eye(3)
         found = since @ self._P @ since.T
-        G[self._mark] = 0.0
-        G[self._mark, _POSE] = np.eye(3)
-        self._P = G @ self._P @ G.T
+        self._P = cloned(self._P, at)
         return np.asarray(0.5 * (found + found.T))
 
     def remember(self, stamp_ns: int, pose: FloatArray) -> None:
         """The robot is at ``pose`` (3,) now."""
         if self._last is not None:
-            self._travel += math.hypot(*(pose - self._last)[:2])
+            self._travel += math.dist(pose[:2], self._last[:2])
         self._last = np.array(pose)
-        if len(self._track):
-            last = self._track[len(self._track) - 1]
-            if self._travel - last.travel < _PLACE_M and abs(float(se2.between(last.pose, pose)[2])) < _PLACE_RAD:
+        if (last := self._place) is not None:
+            turned = se2.scalar_wrap(float(pose[2] - last.pose[2]))
+            if self._travel - last.travel < _PLACE_M and abs(turned) < _PLACE_RAD:
                 return
-        self._track.add(Place(stamp_ns, self._travel, pose, self._P[_POSE, _POSE]))
+        self._add_place(stamp_ns, pose)
+
+    def _add_place(self, stamp_ns: int, pose: FloatArray) -> None:
+        self._place = Place(stamp_ns, self._travel, pose, self._P[_POSE, _POSE].copy())
+        self._track.add(self._place)
 
     def revisit(self, gain: FloatArray, tied: FloatArray, known: Revisit, stamp_ns: int, believed: FloatArray) -> None:
         """The filter moved by ``tied`` (n, 3) @ ``gain`` (3, 3) to a place ``known``, and took what was drawn of late along."""
         if not len(self._track):
             return
-        self._track.add(Place(stamp_ns, self._travel, believed, self._P[_POSE, _POSE]))
+        self._add_place(stamp_ns, believed)
         then = self._track.at_stamp(known.then.stamp_ns)
-        growth, old_cov = self._track.growth(then), moved(self._track[then], believed)
+        growth, old_cov = self._track.growth(then), moved_place(self._track[then], believed)
         off = se2.log(se2.between(believed, known.pose))
         slip = slip_of(off, growth + known.cov, self._gate)
         tied = np.vstack([tied, *[np.eye(3)] * self._more])
         self._P = revisited_covariance(self._P, _POSE, tied, gain, known.cov, old_cov, growth + slip, slip)
         self._track.tie(then)
-        self._swept = None
+        self._swept = np.zeros((self._n, 3))
 
 
-def _common(A: FloatArray, B: FloatArray) -> FloatArray:
-    """(3, 3) of the information ``A`` (3, 3), what ``B`` (3, 3) had of it: where B is far smaller, no more than that."""
-    values, vectors = np.linalg.eigh(0.5 * (B + B.T))
-    root = (vectors * np.sqrt(np.maximum(values, 0.0))).T  # B = root^T root
-    inverse = vectors / np.sqrt(np.maximum(values, 1e-9 * max(values[-1], 1e-300)))
-    ratios, directions = np.linalg.eigh(inverse.T @ (0.5 * (A + A.T)) @ inverse)
-    half = root.T @ directions
-    return np.asarray((half * np.clip(ratios, 0.0, _ALIKE)) @ half.T)
+@numba.njit(cache=True)
+def _seen(
+    P: FloatArray, K: FloatArray, d_pose: FloatArray, noise: FloatArray, kept: FloatArray, fresh: FloatArray
+) -> FloatArray:  # pragma: no cover
+    """A map moves to where the scan meets it, ``kept`` (3, 3) of it, the rest from where the last scan was drawn with noise ``fresh``
+    (3, 3), and corrects the first n states with the gain ``K`` (n, 3) by a motion that was found with ``noise`` (3, 3).
+
+    The map's states are the three after the first n, then come those of where the last scan was drawn. ``d_pose`` as in `Account.see`.
+    """
+    out, n = P.copy(), K.shape[0]
+    mix, H, R = np.empty((3, 6)), np.zeros((3, n + 3)), np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            mix[i, j], mix[i, 3 + j] = kept[i, j], (1.0 if i == j else 0.0) - kept[i, j]
+            H[i, j], H[i, n + j] = d_pose[i, j], -d_pose[i, j]
+    replace(out, n, mix, n, 6)
+    for i in range(3):
+        for j in range(3):
+            out[n + i, n + j] += fresh[i, j]
+    add_spread(R, d_pose, noise)
+    return corrected(out, K, H, R)
+
+
+@numba.njit(cache=True)
+def _drawn(P: FloatArray, at: int, shared: FloatArray) -> FloatArray:  # pragma: no cover
+    """The three states from ``at`` on become the pose now, but for a part of its error, whose covariance with the first n states is
+    ``shared`` (n, 3)."""
+    out, n = cloned(P, at), shared.shape[0]
+    for i in range(n):
+        for j in range(3):
+            out[i, at + j] -= shared[i, j]
+            out[at + j, i] -= shared[i, j]
+    for i in range(3):
+        for j in range(3):
+            out[at + i, at + j] -= 0.5 * (shared[i, j] + shared[j, i])
+    return out
+
+
+@numba.njit(cache=True)
+def _common(A: FloatArray, B: FloatArray) -> FloatArray:  # pragma: no cover
+    """(3, 3) of the information ``A`` (3, 3), what ``B`` (3, 3) had of it: where B is far smaller, no more than `_ALIKE` times that."""
+    values, vectors = eigen(B)
+    root, inverse, ratios_of = np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3))  # B = root^T root
+    floor = 1e-9 * max(values.max(), 1e-300)
+    for i in range(3):
+        for k in range(3):
+            root[k, i] = vectors[i, k] * math.sqrt(max(values[k], 0.0))
+            inverse[k, i] = vectors[i, k] / math.sqrt(max(values[k], floor))
+    add_spread(ratios_of, inverse, A)
+    ratios, directions = eigen(ratios_of)
+    half, out = np.zeros((3, 3)), np.zeros((3, 3))
+    for i in range(3):
+        for k in range(3):
+            for a in range(3):
+                half[i, k] += root[a, i] * directions[a, k]
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                out[i, j] += half[i, k] * min(max(ratios[k], 0.0), _ALIKE) * half[j, k]
+    return out

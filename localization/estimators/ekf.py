@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
+from filterpy.kalman import KalmanFilter
 from scipy.stats import chi2
 
 from localization.errors import EstimatorError
 from localization.estimators.account import Account
+from localization.estimators.error_states import cloned, innovation, inverse, is_finite, motion_covariance, moved, symmetric
 from localization.estimators.revisit_update import revisit_update
 from localization.gyro import Turn
 from localization.lidar import MapTie, Revisit
@@ -119,32 +120,28 @@ class Ekf:
 
         e' = Ad(delta^-1) e + (d delta / d clock) e_clock + (d delta / d params) e_params + slip.
         """
-        F = np.eye(self._size)
-        F[POSE, POSE] = se2.adjoint(se2.inverse(step.predicted.delta))
-        F[POSE, CLOCK] = step.d_clock
-        F[POSE, PARAMS:] = step.predicted.d_params @ self._corrected.directions
-        F[START, START], F[START, POSE] = np.zeros((3, 3)), np.eye(3)
-        with np.errstate(over="ignore", invalid="ignore"):
-            P = F @ self._filter.P @ F.T
-        Q = np.zeros_like(P)
-        Q[POSE, POSE] = step.predicted.cov
+        c, predicted = self.config, step.predicted
+        D = np.empty((3, self._size - CLOCK))
+        D[:, 0], D[:, PARAMS - CLOCK :] = step.d_clock, predicted.d_params @ self._corrected.directions
+        Q = np.zeros((self._size, self._size))
+        Q[POSE, POSE] = predicted.cov
         Q[BIAS, BIAS] = self._gyro.bias_walk_rad_per_s_sqrt_s**2 * step.duration
-        if P[CLOCK, CLOCK]:
-            Q[CLOCK, CLOCK] = self.config.clock_walk_s_per_sqrt_s**2 * step.duration
+        if self._filter.P[CLOCK, CLOCK]:
+            Q[CLOCK, CLOCK] = c.clock_walk_s_per_sqrt_s**2 * step.duration
         if step.is_standing:
-            c = self.config
             Q[POSE, POSE] += np.diag([c.nudge_m2_per_s, c.nudge_m2_per_s, c.nudge_rad2_per_s]) * step.duration
         else:
             Q[PARAMS:, PARAMS:] = self._corrected.walk_cov * step.duration
-        P += Q
-        moved = se2.compose(self.pose, step.predicted.delta)
-        _check(f"the motion that the wheels predict until stamp {step.end_ns} ns", moved, P)
+        P = moved(cloned(self._filter.P, START.start), predicted.delta, D, Q)
+        pose = se2.compose(self.pose, predicted.delta)
+        _check(f"the motion that the wheels predict until stamp {step.end_ns} ns", pose, P)
         self._filter.P, self._now_ns = P, step.end_ns
         if self._account is not None:
-            self._account.move(F, Q)
-        self._start, self._since_start = self.pose, step.predicted.delta
-        self._since_anchor = se2.compose(self._since_anchor, step.predicted.delta)
-        self.pose = moved
+            self._account.clone(START.start)
+            self._account.move(predicted.delta, D, Q)
+        self._start, self._since_start = self.pose, predicted.delta
+        self._since_anchor = se2.compose(self._since_anchor, predicted.delta)
+        self.pose = pose
 
     def meet_clock(self, sigma_s: float) -> None:
         """A second clock is heard for the first time, and the wheels' may be off it by ``sigma_s`` [s]."""
@@ -163,9 +160,7 @@ class Ekf:
         """The robot did not move since the start of the step."""
         c = self.config
         still = np.diag([c.standing_sigma_m**2, c.standing_sigma_m**2, c.standing_sigma_rad**2])
-        error, _, d_pose = motion_residual(self._start, self.pose, np.zeros(3))
-        H = np.zeros((3, self._size))
-        H[:, START], H[:, POSE] = -d_pose @ se2.adjoint(se2.inverse(self._since_start)), d_pose
+        error, H = self._relative(START, self._start, self._since_start, np.zeros(3))
         return self._update(error, H, still)
 
     def measure_motion(self, measured: Motion, can_slip: bool, tie: MapTie | None = None) -> float:
@@ -175,13 +170,12 @@ class Ekf:
         the prediction's covariance grows until both agree; else the LiDAR is, and its measurement's grows. ``tie``: the map by which it
         was measured; without one, errors of scans are taken as independent.
         """
-        error, _, d_pose = motion_residual(self._anchor, self.pose, measured.delta)
-        H = np.zeros((3, self._size))
-        H[:, ANCHOR], H[:, POSE] = -d_pose @ se2.adjoint(se2.inverse(self._since_anchor)), d_pose
+        error, H = self._relative(ANCHOR, self._anchor, self._since_anchor, measured.delta)
+        d_pose = H[:, POSE]
         R = d_pose @ measured.cov @ d_pose.T
-        S = H @ self._filter.P @ H.T + R
+        S = innovation(self._filter.P, H, R)
         _check("the motion that the LiDAR measured", error, S)
-        nis = float(error @ _solve(S, error))
+        nis = float(error @ inverse(S) @ error)
         limit = self._gate
         if tie is not None and self._account is None:
             drawn = np.zeros((3, self._size))
@@ -222,13 +216,23 @@ class Ekf:
 
     def set_anchor(self, is_drawn: bool = True) -> None:
         """From here on, the LiDAR measures from the pose as it is now. ``is_drawn``: its map has got the scan, too."""
-        G = np.eye(self._size)
-        G[ANCHOR, ANCHOR], G[ANCHOR, POSE] = np.zeros((3, 3)), np.eye(3)
-        self._filter.P = G @ self._filter.P @ G.T
+        self._filter.P = cloned(self._filter.P, ANCHOR.start)
         if self._account is not None:
-            self._account.draw(G, is_drawn)
+            self._account.draw(is_drawn)
+            self._account.clone(ANCHOR.start)
             self._account.remember(self._now_ns, self.pose)
         self._anchor, self._since_anchor = self.pose, np.zeros(3)
+
+    def motion_cov(self, delta: FloatArray) -> FloatArray:
+        """(3, 3) of the motion of this step, which is ``delta`` (3,), by the errors that are really made."""
+        return np.asarray(motion_covariance(self.errors, START.start, delta))
+
+    def _relative(self, earlier: slice, pose_then: FloatArray, since: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """`motion_residual` (3,) from the pose of the states ``earlier`` to the pose now, and its H (3, n); ``since`` as is predicted."""
+        error, _, d_pose = motion_residual(pose_then, self.pose, measured)
+        H = np.zeros((3, self._size))
+        H[:, earlier], H[:, POSE] = -d_pose @ se2.adjoint(se2.inverse(since)), d_pose
+        return error, H
 
     def _update(self, error: FloatArray, H: FloatArray, R: FloatArray) -> float:
         """`_correct`, with errors R that have no part in a map."""
@@ -243,42 +247,36 @@ class Ekf:
         f.x = np.zeros((self._size, 1))
         try:
             with np.errstate(over="ignore", invalid="ignore"):
-                _check("a measurement", error, H @ before @ H.T + R)
-                f.update(np.zeros((len(error), 1)), lambda x: H, lambda x: error[:, None], R=R)
-                f.P = 0.5 * (f.P + f.P.T)
-            _check("a measurement", f.x, f.P)
-        except np.linalg.LinAlgError as singular:
-            raise EstimatorError(_CERTAIN) from singular
+                f.update(-error[:, None], R, H)
+            P = symmetric(f.P)
+            _check("a measurement", f.x, P)
         except EstimatorError:
             f.P = before
             raise
-        correction = f.x[:, 0]
-        self.pose = se2.compose(self.pose, se2.exp(correction[POSE]))
-        self._start = se2.compose(self._start, se2.exp(correction[START]))
-        self._anchor = se2.compose(self._anchor, se2.exp(correction[ANCHOR]))
+        f.P, correction = P, f.x[:, 0]
+        self.pose, self._start, self._anchor = se2.compose(
+            np.stack([self.pose, self._start, self._anchor]), se2.exp(correction[: ANCHOR.stop].reshape(3, 3))
+        )
         self.bias += float(correction[BIAS])
         self.clock_offset += float(correction[CLOCK])
         self.correction = self.correction + correction[PARAMS:]
         return float((f.y.T @ f.SI @ f.y)[0, 0])
 
 
-def _filter(P: FloatArray) -> ExtendedKalmanFilter:
-    found = ExtendedKalmanFilter(dim_x=len(P), dim_z=3)
-    found.P = P
+def _filter(P: FloatArray) -> KalmanFilter:
+    """Of the error state, in which all is linear."""
+    found = KalmanFilter(dim_x=len(P), dim_z=3)
+    found.P, found.inv = P, _inverse
     return found
 
 
-_CERTAIN = "a measurement without any noise meets a prediction without any: give the sensors of the robot file some noise."
+def _inverse(S: FloatArray) -> FloatArray:
+    """Of an innovation's covariance, by filterpy, before it changes anything. Raises `EstimatorError`."""
+    _check("a measurement", S)
+    return inverse(S)
 
 
 def _check(what: str, *arrays: FloatArray) -> None:
     """A state that is not finite is never taken over: everything after it would be lost without a word."""
-    if not all(np.isfinite(array).all() for array in arrays):
+    if not all(is_finite(array.ravel()) for array in arrays):
         raise EstimatorError(f"{what} has numbers that are not finite, or too large to compute with. Look at its source in the log.")
-
-
-def _solve(S: FloatArray, error: FloatArray) -> FloatArray:
-    try:
-        return np.asarray(np.linalg.solve(S, error))
-    except np.linalg.LinAlgError as singular:
-        raise EstimatorError(_CERTAIN) from singular

@@ -13,11 +13,10 @@ from dataclasses import replace
 import numpy as np
 
 from localization.estimators.base import NO_POINTS, Estimate, mean_twist
-from localization.estimators.ekf import BIAS, CLOCK, PARAMS, POSE, START, Ekf, EkfConfig
+from localization.estimators.ekf import BIAS, CLOCK, PARAMS, POSE, Ekf, EkfConfig
 from localization.estimators.teaching import teaching
 from localization.estimators.witness import ScanWitness, Witness
 from localization.lidar import LidarConfig
-from localization.residuals import motion_residual
 from localization.steps import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
@@ -106,11 +105,8 @@ class EkfFusion:
         """Mean twist of the step as all witnesses see it."""
         if step.duration <= 0:
             return step.twist, None
-        ekf = self._ekf
-        delta = se2.between(ekf.start, ekf.pose)
-        _, d_start, d_pose = motion_residual(ekf.start, ekf.pose, delta)
-        J, both = np.hstack([d_pose, d_start]), np.r_[POSE, START]
-        return mean_twist(delta, J @ ekf.errors[np.ix_(both, both)] @ J.T, step.duration)
+        delta = se2.between(self._ekf.start, self._ekf.pose)
+        return mean_twist(delta, self._ekf.motion_cov(delta), step.duration)
 
     def finish(self, moments: Trajectory | None = None) -> None:
         self.settle()

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from localization.estimators.ekf import POSE, START, Ekf, EkfConfig
+from localization.estimators.ekf import POSE, Ekf, EkfConfig
 from localization.estimators.witness import Sight
 from localization.lidar import Revisit
-from localization.residuals import motion_residual
 from localization.steps import Step
 from motion_models import se2
 from motion_models.corrections import Corrections
@@ -56,6 +55,4 @@ class GraphErrors:
 
     def motion(self, start: FloatArray, pose: FloatArray) -> FloatArray:
         """(3, 3) of the motion of the last step, from ``start`` (3,) to ``pose`` (3,)."""
-        _, d_start, d_pose = motion_residual(start, pose, se2.between(start, pose))
-        J, both = np.hstack([d_pose, d_start]), np.r_[POSE, START]
-        return np.asarray(J @ self._ekf.errors[np.ix_(both, both)] @ J.T)
+        return self._ekf.motion_cov(se2.between(start, pose))
