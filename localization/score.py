@@ -23,7 +23,8 @@ class Result:
     accuracy: Accuracy | None
     """None without a reference."""
     nees_mean: float | None
-    """Mean of the pose's normalised error squared since the first match, 3 expected; None where the reference has no headings."""
+    """Mean of the pose's normalised error squared since the first match, 3 expected; None where the reference has no headings.
+    Of the estimates of each moment, where the trajectory is what the whole log tells."""
     moments: Accuracy | None = None
     """Of the estimates of each moment, where the run's trajectory is what the whole log tells."""
 
@@ -75,6 +76,7 @@ def _score(run: Run, reference: ReferenceTrack | Relations | None) -> Result:
     if reference is None:
         return Result(run, None, None)
     accuracy = evaluate(run.trajectory, reference)
-    found = None if isinstance(reference, Relations) else pose_consistency(run.trajectory, reference)
+    told = run.trajectory if run.moments is None else run.moments  # whose errors grow by increments, as is assumed there
+    found = None if isinstance(reference, Relations) else pose_consistency(told, reference)
     moments = None if run.moments is None else evaluate(run.moments, reference)
     return Result(run, accuracy, None if found is None else found.mean, moments)

@@ -247,3 +247,28 @@ def test_ways_share_the_errors_of_where_they_part() -> None:
     tied = se2.between(poses[3], poses[3])
     track.add(Place(20, 20.0, se2.compose(poses[3], tied), covs[3] + step))
     np.testing.assert_allclose(track.growth(3), step, rtol=1e-6, atol=1e-12)
+
+
+def test_a_map_is_mended_as_it_was_moved_point_by_point() -> None:
+    """A correction moves what was drawn after 19.4 m, between two keyframes; on the way as it was then, the map is where it was before."""
+    rng = np.random.default_rng(0)
+    lines, revisits = LineMap(0.4, 0.02, 100.0), Revisits(RevisitConfig(), FitOptions(0.4, 0.03, 0.02, 0.1, 0.3, 12), 0.2, is_thorough=True)
+    walls, angles, T = crooked(), np.linspace(-2.4, 2.4, 120), np.array([5.0, 0.0, 0.0])
+    poses = {}
+    for x in np.arange(0.0, 25.0, 0.3):
+        pose = np.array([x, 0.0, 0.0])
+        ranges = rooms.look_around(walls, pose, angles, 8.0) + 0.01 * rng.normal(size=len(angles))
+        seen = np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])[np.isfinite(ranges)]
+        revisits.look(seen, lines, pose, 1e-8 * np.eye(3), x, round(x * 1e9))
+        lines.insert(seen, pose, x, revisits.ages)
+        poses[round(x * 1e9)] = pose
+    lines.move_since(19.4, T)
+    revisits.correct(T, 19.4)
+    travels = lines.point_travels()
+    mended = revisits.mend(lines.point_cloud(), travels, lambda stamps: np.array([poses[s] for s in stamps.tolist()]))
+    late = [i for i, t in enumerate(travels.tolist()) if 19.4 < t < 20.4]
+    assert len(late) > 10
+    clouds = lines.point_cloud()
+    assert np.abs(mended[late] - (clouds[late] - T[:2])).max() < 1e-6
+    early = np.flatnonzero(travels <= 19.4)
+    assert np.abs(mended[early] - clouds[early]).max() < 1e-6

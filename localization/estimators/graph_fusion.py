@@ -53,7 +53,8 @@ class GraphConfig:
     """How the graph is solved. What it believes at first is the filter's (`EkfConfig`)."""
 
     backend: Literal["fixed_lag", "batch", "isam2"] = "fixed_lag"
-    """``fixed_lag``: the estimate of each moment. ``batch``, ``isam2``: all poses as later measurements have smoothed them."""
+    """``fixed_lag``: the estimate of each moment; a replay closes the way at its end where places were seen again (`Hindsight`).
+    ``batch``, ``isam2``: all poses as later measurements have smoothed them."""
     lag_nodes: int = 50
     """Nodes that the window smooths."""
     relinearize_at: float = 0.01
@@ -255,7 +256,10 @@ class GraphFusion:
         self.settle()
         if self._hindsight is not None and moments is not None:
             self._mark(int(moments.stamps_ns[-1]))
-            self._whole = self._hindsight.smooth(moments)
+            try:
+                self._whole = self._hindsight.smooth(moments)
+            except EstimatorError:  # the estimates of each moment stay as they are
+                self._counts["loops_unsolved"] = len(self._hindsight.loops)
             return self._whole
         return None if self._history is None else self._history.trajectory()
 

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import math
 from array import array
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from localization.errors import EstimatorError
 from localization.estimators.graph_factors import Pairs, whitening
 from localization.estimators.graph_history import History
 from localization.estimators.graph_link import Link
@@ -21,7 +23,7 @@ from localization.estimators.graph_node import Node
 from localization.estimators.graph_robust import Closure, Kernel
 from localization.lidar import Revisit
 from localization.lidar.track import positive_part
-from localization.trajectory import Trajectory
+from localization.trajectory import IntArray, Trajectory
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
@@ -43,15 +45,8 @@ class Loop:
     """(3,) pose of the second visit in the frame of the first."""
     cov: FloatArray
     """(3, 3) of its right perturbation."""
-
-
-@dataclass(frozen=True)
-class Jump:
-    """By a place seen again the estimate moved, the robot did not."""
-
-    stamp_ns: int
-    pose: FloatArray
-    """(3,) the estimate after it."""
+    slip: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    """(3, 3) by which the way in between was worse than was thought, in the frame of the second visit."""
 
 
 class Hindsight:
@@ -59,7 +54,7 @@ class Hindsight:
 
     def __init__(self) -> None:
         self.loops: list[Loop] = []
-        self._jumps: list[Jump] = []
+        self._jumps: dict[int, FloatArray] = {}  # by a place seen again the estimate of a moment moved, the robot did not
         self._stamps, self._growth = array("q"), array("d")  # of nodes, and of the motion up to each
         self._last: FloatArray | None = None
 
@@ -75,61 +70,88 @@ class Hindsight:
         self._last = pose.copy()
         if not self._stamps or stamp_ns > self._stamps[-1]:
             self._stamps.append(stamp_ns)
-            self._growth.extend(positive_part(growth).ravel().tolist())
+            self._growth.extend(growth.ravel().tolist())
 
     def see(self, known: Revisit, stamp_ns: int) -> None:
         """At the last node the robot was at a place ``known`` from long ago."""
-        self.loops.append(Loop(known.then.stamp_ns, stamp_ns, se2.between(known.then.pose, known.pose), known.cov))
+        self.loops.append(Loop(known.then.stamp_ns, stamp_ns, se2.between(known.then.pose, known.pose), known.cov, known.slip))
 
     def jump(self, stamp_ns: int, pose: FloatArray) -> None:
         """At the last node, the estimate became ``pose`` (3,)."""
-        self._last = pose.copy()
-        self._jumps.append(Jump(stamp_ns, pose.copy()))
+        self._last = self._jumps[stamp_ns] = pose.copy()
 
     def smooth(self, moments: Trajectory) -> Trajectory | None:
         """``moments``, the estimates of all moments, as the loops correct them; None where there is nothing to correct them by.
 
         Raises `EstimatorError` if no solution is found.
         """
-        if not self.loops or moments.covariances is None:
+        poses, stamps, covs = moments.poses, moments.stamps_ns, moments.covariances
+        loops = [loop for loop in self.loops if stamps[0] <= loop.from_ns and loop.to_ns <= stamps[-1]]
+        if not loops or covs is None:
             return None
-        poses, stamps = moments.poses, moments.stamps_ns
-        nodes = np.searchsorted(stamps, np.array(self._stamps, dtype=np.int64)).clip(max=len(stamps) - 1)
-        growth = np.array(self._growth).reshape(-1, 3, 3)
-        if nodes[0] > 0:  # from the first moment to the first node it is as it was estimated
-            nodes, growth = np.concatenate([[0], nodes]), np.concatenate([np.zeros((1, 3, 3)), growth])
+        nodes, growth = self._nodes(poses, stamps, covs)
         after = poses.copy()
-        for jump in self._jumps:
-            after[np.searchsorted(stamps, jump.stamp_ns)] = jump.pose
+        for stamp_ns, pose in self._jumps.items():
+            after[stamps == stamp_ns] = pose
         ways = se2.between(after[nodes[:-1]], poses[nodes[1:]])
+        tied = [(*_ends(loop, stamps, nodes), loop) for loop in loops]
+        tied = [(a, b, loop) for a, b, loop in tied if a < b]
 
-        history = History(Node.known(poses[0], np.zeros(0), moments.covariances[0] + _LEAST), "batch", _KERNEL)
+        history = History(Node.known(poses[0], np.zeros(0), covs[0] + _LEAST), "batch", _KERNEL)
         history.mark(int(stamps[0]), None)
         last = poses[0]
-        for i, way, cov in zip(nodes[1:], ways, growth[1:] + _LEAST, strict=True):
+        for i, way, cov in zip(nodes[1:], ways, _slipped(growth, poses[nodes], tied)[1:], strict=True):
             last = se2.compose(last, way)
-            history.add(Pairs.one(_link(way, cov), np.zeros((0, 0))), Node(last, np.zeros(0), np.eye(3)))
+            history.add(Pairs.one(_link(way, cov + _LEAST), np.zeros((0, 0))), Node(last, np.zeros(0), np.eye(3)))
             history.mark(int(stamps[i]), None)
-        for loop in self.loops:
+        for a, b, loop in tied:
             # where the robot was then is less than a node's distance behind a node
             then = int(np.searchsorted(stamps, loop.from_ns))
-            a = int(np.searchsorted(nodes, then, side="right")) - 1
-            b = int(np.searchsorted(nodes, np.searchsorted(stamps, loop.to_ns)))
-            motion = se2.compose(se2.between(after[nodes[a]], poses[then]), loop.motion) if then != nodes[a] else loop.motion
-            if a != b:
-                bent = _AROUND * _near(growth, a) + _BEHIND * _near(growth, b)
-                history.add_closure(Closure(a, b, motion, whitening(loop.cov + bent + _LEAST)))
+            motion = loop.motion if then == nodes[a] else se2.compose(se2.between(after[nodes[a]], poses[then]), loop.motion)
+            bent = _AROUND * _each_metre(growth, ways, a) + _BEHIND * _each_metre(growth, ways, b)
+            history.add_closure(Closure(a, b, motion, whitening(loop.cov + bent + _LEAST)))
         found = history.trajectory()
         assert found.covariances is not None
         whole, cov = _between(nodes, found.poses, found.covariances, poses, after)
         # what was known of a moment when it was there is known at the end
-        known = np.trace(moments.covariances[:, :2, :2], axis1=1, axis2=2) < np.trace(cov[:, :2, :2], axis1=1, axis2=2)
-        return Trajectory(stamps, whole, np.where(known[:, None, None], moments.covariances, cov))
+        known = np.trace(covs[:, :2, :2], axis1=1, axis2=2) < np.trace(cov[:, :2, :2], axis1=1, axis2=2)
+        return Trajectory(stamps, whole, np.where(known[:, None, None], covs, cov))
+
+    def _nodes(self, poses: FloatArray, stamps: IntArray, covs: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+        """Which moments (K,) are nodes, the first and the last among them, and (K, 3, 3) of the motion up to each."""
+        known = np.array(self._stamps, dtype=np.int64)
+        growth = np.array(self._growth).reshape(-1, 3, 3)
+        nodes, first = np.unique(np.searchsorted(stamps, known).clip(max=len(stamps) - 1), return_index=True)
+        growth = growth[first]
+        if nodes[0] > 0:  # before scans share a map, nothing is kept of the motion, and the estimates' own covariance is all there is
+            A = se2.adjoint(se2.between(poses[nodes[0]], poses[0]))
+            growth[0] = covs[nodes[0]] - A @ covs[0] @ A.T
+            nodes, growth = np.concatenate([[0], nodes]), np.concatenate([np.zeros((1, 3, 3)), growth])
+        if not np.isfinite(growth).all():
+            raise EstimatorError("what the motion between two places is worth is not finite. Look at the log.")
+        return nodes, np.array([positive_part(cov) for cov in growth])
 
 
-def _near(growth: FloatArray, node: int) -> FloatArray:
-    """(3, 3) mean of the ``growth`` (K, 3, 3) from node to node around a ``node``."""
-    return np.asarray(growth[max(node - 3, 1) : node + 5].mean(axis=0))
+def _ends(loop: Loop, stamps: IntArray, nodes: NDArray[np.intp]) -> tuple[int, int]:
+    """The node at or before the first visit, and that of the second."""
+    a, b = np.searchsorted(stamps, [loop.from_ns, loop.to_ns])
+    return int(np.searchsorted(nodes, a, side="right")) - 1, min(int(np.searchsorted(nodes, b)), len(nodes) - 1)
+
+
+def _slipped(growth: FloatArray, poses: FloatArray, tied: Sequence[tuple[int, int, Loop]]) -> FloatArray:
+    """(K, 3, 3) the ``growth`` up to each of the ``poses`` (K, 3), with the slip that the loops show somewhere on the way between them."""
+    grown = growth.copy()
+    for a, b, loop in tied:
+        if loop.slip.any():
+            A = se2.adjoint(se2.between(poses[a + 1 : b + 1], poses[b]))
+            grown[a + 1 : b + 1] += A @ loop.slip @ A.swapaxes(-1, -2) / (b - a)
+    return grown
+
+
+def _each_metre(growth: FloatArray, ways: FloatArray, node: int) -> FloatArray:
+    """(3, 3) what the ``growth`` (K, 3, 3) up to the nodes around a ``node`` is for a metre of the ``ways`` (K - 1, 3)."""
+    first, last = max(node - 3, 1), node + 5
+    return np.asarray(growth[first:last].sum(axis=0) / max(float(np.hypot(*ways[first - 1 : last - 1, :2].T).sum()), 1.0))
 
 
 def _link(way: FloatArray, cov: FloatArray) -> Link:
@@ -142,13 +164,15 @@ def _between(
 ) -> tuple[FloatArray, FloatArray]:
     """Poses (N, 3) and covariances (N, 3, 3) of all moments, where those of the ``nodes`` (K,) were ``found``.
 
-    What the way between two nodes has changed by grows evenly along it.
+    What the way between two nodes has changed by grows evenly along it, and not where the robot stands.
     """
+    steps = se2.between(poses[:-1], poses[1:])
+    driven = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]) + np.abs(steps[:, 2]) + 1e-9)])
     k = np.clip(np.searchsorted(nodes, np.arange(len(poses)), side="right") - 1, 0, len(nodes) - 2)
     since = se2.between(after[nodes[k]], poses)
     since[nodes[k] == np.arange(len(poses))] = 0.0
     until = se2.between(poses, poses[nodes[k + 1]])
-    part = (np.arange(len(poses)) - nodes[k]) / (nodes[k + 1] - nodes[k])
+    part = (driven - driven[nodes[k]]) / (driven[nodes[k + 1]] - driven[nodes[k]])
     forward, backward = se2.compose(found[k], since), se2.compose(found[k + 1], se2.inverse(until))
     A, B = se2.adjoint(se2.inverse(since)), se2.adjoint(until)
     mixed = (1.0 - part)[:, None, None] * (A @ covs[k] @ A.swapaxes(-1, -2)) + part[:, None, None] * (B @ covs[k + 1] @ B.swapaxes(-1, -2))

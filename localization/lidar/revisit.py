@@ -135,29 +135,30 @@ class Revisits:
         self._recent.append((now, _thinned(scan, 0.5 * self._voxel)))
         found = None
         for watch in self._watches:
-            if watch.pending is not None or travel - watch.searched >= self.config.search_m:
+            if found is None and (watch.pending is not None or travel - watch.searched >= self.config.search_m):
                 watch.searched = travel
-                found = found or self._watched(watch, now, lines, reach)
+                found = self._watched(watch, now, lines, reach)
         return found
 
     def _watched(self, watch: _Watch, now: Place, lines: LineMap, reach: float) -> Revisit | None:
-        fit, then = self._find(self._seen_recently(now), lines, now, reach, watch.is_sure)
+        fit, seen = self._find(self._seen_recently(now), lines, now, reach, watch.is_sure)
         last, watch.pending = watch.pending, None if fit is None else (len(self.track) - 1, fit)
         if fit is None or last is None or not self._agrees(last, fit):
             return None
         watch.pending = None
+        then = self.track.at_travel(seen)
         place, growth = self.track[then], self.track.growth(then)
         if watch.is_sure:
             self.track.tie(then)
         off = se2.log(se2.between(now.pose, fit.pose))
         slip = slip_of(off, growth + fit.cov, self._gate)
         matched = float(fit.on_map.mean())
-        return Revisit(fit.pose, fit.cov, moved(place, now.pose), growth + slip, slip, self._as_drawn(place), matched, watch.is_sure)
+        return Revisit(fit.pose, fit.cov, moved(place, now.pose), growth + slip, slip, self._as_drawn(place, seen), matched, watch.is_sure)
 
-    def _as_drawn(self, place: Place) -> Place:
-        """``place`` where the map has it now."""
+    def _as_drawn(self, place: Place, travel: float) -> Place:
+        """``place`` where the map has what was drawn there at ``travel`` [m]."""
         for since, until, world_T_world in self._moves:
-            if since < place.travel <= until:
+            if travel > since and place.travel <= until:
                 place = replace(place, pose=se2.compose(world_T_world, place.pose))
         return place
 
@@ -166,17 +167,22 @@ class Revisits:
         self._moves.append((since, self.track[len(self.track) - 1].travel, world_T_world))
         moved_along = [(replace(place, pose=se2.compose(world_T_world, place.pose)), seen) for place, seen in self._recent]
         self._recent = deque(moved_along, maxlen=_MOST_RECENT)
+        for watch in self._watches:
+            watch.pending = None  # it was found from where the robot is not any more
 
     def mend(self, points: FloatArray, travels: FloatArray, way: Way) -> FloatArray:
         """(M, 2) ``points`` (M, 2) of the map, drawn at ``travels`` (M,) [m], had they been drawn along another ``way``."""
-        places = [self._as_drawn(self.track[i]) for i in range(len(self.track))]
+        places = [self.track[i] for i in range(len(self.track))]
         if not places:
             return points
-        there = way(np.array([place.stamp_ns for place in places], dtype=np.int64))
-        mended = se2.compose(there, se2.inverse(np.array([place.pose for place in places])))
         ends = np.array([place.travel for place in places])
         before = np.clip(np.searchsorted(ends, travels, side="right") - 1, 0, len(ends) - 1)
-        return se2.transform(mended[before], points)
+        drawn = np.array([place.pose for place in places])[before]
+        for since, until, world_T_world in self._moves:  # as in `_as_drawn`
+            hit = (travels > since) & (ends[before] <= until)
+            drawn[hit] = se2.compose(world_T_world, drawn[hit])
+        there = way(np.array([place.stamp_ns for place in places], dtype=np.int64))[before]
+        return se2.transform(se2.compose(there, se2.inverse(drawn)), points)
 
     def _known(self, now: Place, reach: float) -> FloatArray:
         """(S, 2) stretches of the way [m] whose part of the map can be matched with as it is; ``reach`` [m] of the LiDAR."""
@@ -205,11 +211,11 @@ class Revisits:
         turn = abs(float(se2.between(last.pose, pose)[2]))
         return travel - last.travel >= self.config.keyframe_m or turn >= self.config.keyframe_rad
 
-    def _find(self, scan: FloatArray, lines: LineMap, now: Place, reach: float, is_sure: bool) -> tuple[_Fit | None, int]:
-        """Where the scan fits into the old map, and the place from which that part of it was drawn."""
+    def _find(self, scan: FloatArray, lines: LineMap, now: Place, reach: float, is_sure: bool) -> tuple[_Fit | None, float]:
+        """Where the scan fits into the old map, and the travelled distance [m] at which that part of it was drawn."""
         c, pose, travel = self.config, now.pose, now.travel
         if travel - c.old_after_m <= self.track[0].travel or len(scan) < 10:
-            return None, -1
+            return None, math.nan
         drift = math.sqrt(self._gate * float(np.linalg.eigvalsh(self.track.growth(0)[:2, :2])[-1]))
         ranges = np.hypot(scan[:, 0], scan[:, 1])
         whole = float(ranges.max() if is_sure else np.quantile(ranges, _NEAR_PART))
@@ -218,34 +224,34 @@ class Revisits:
         before = _last_absence(travels, travel, c.old_after_m)
         points, travels = points[travels < before], travels[travels < before]
         if len(points) < c.min_matched * len(scan):
-            return None, -1
+            return None, math.nan
         growth = self.track.growth(self.track.at_travel(float(np.median(travels))))
         resolution = np.diag([self._voxel, self._voxel, self._voxel / max(reach, 1.0)]) ** 2
         if is_sure and self._sees(growth):
-            return None, -1
+            return None, math.nan
         few = np.ascontiguousarray(scan[:: math.ceil(len(scan) / _MOST_POINTS)])
         rough = _Search(few, lines, ages_until(before), pose, growth + resolution / 9.0, resolution, self._options, not is_sure)
         search = replace(rough, scan=scan)
         limits = np.array([c.max_search_m, c.max_search_m, c.max_search_rad])
         scores = correlate(few, points, pose, search.prior, limits, self._voxel, self._gate)
         if len(scores.poses) == 0 or scores.fractions.max() < c.min_matched:
-            return None, -1
+            return None, math.nan
         left = scores.fractions - 0.5 * scores.distances / len(few)
         best = rough.best(scores.poses, left)
         if best.on_map.mean() < _RIVAL_SCORE * c.min_matched:
-            return None, -1
+            return None, math.nan
         best = search.fit(best.peak)
         if best.on_map.mean() < c.min_matched:
-            return None, -1
+            return None, math.nan
         cov = self._doubted(best, search, scores.poses, left, is_sure)
         if cov is None:
-            return None, -1
+            return None, math.nan
         best = replace(best, cov=cov)
-        then = self.track.at_travel(float(np.median(best.travels[best.on_map])))
+        seen = float(np.median(best.travels[best.on_map]))
         off = se2.log(se2.between(pose, best.pose))
-        if off @ np.linalg.solve(self.track.growth(then) + best.cov + resolution / 9.0, off) > self._gate:
-            return None, -1
-        return best, then
+        if off @ np.linalg.solve(self.track.growth(self.track.at_travel(seen)) + best.cov + resolution / 9.0, off) > self._gate:
+            return None, math.nan
+        return best, seen
 
     def _doubted(self, best: _Fit, search: _Search, poses: FloatArray, scores: FloatArray, must_tell: bool) -> FloatArray | None:
         """The covariance of ``best``, open towards every other place that explains the scan about as well; None if these are too many

@@ -34,7 +34,7 @@ class Pair:
 
 
 class Core:
-    """Stepper and estimator of one pair. Bounded: it keeps no trajectory."""
+    """Stepper and estimator of one pair. Bounded, but for hindsight: it keeps no trajectory."""
 
     def __init__(
         self,
