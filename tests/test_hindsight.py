@@ -227,16 +227,18 @@ def test_hindsight_changes_no_estimate_of_a_moment(drives) -> None:
         assert np.array_equal(known[stamp].pose, pose)
     # and the map is drawn where the robot went, as is known now
     walls = se2.transform(se2.inverse(np.array(START)), ring()[:, :4].reshape(-1, 2)).reshape(-1, 4)
-    run = _runs()[0][1]
-    off_then, off_now = (_distance(points, walls) for points in (core.estimator.map_points(), run.map_points))
-    assert len(off_then) == len(off_now) > 1000
-    assert np.mean(off_now) < 0.95 * np.mean(off_then), (np.mean(off_now), np.mean(off_then))  # noise of the points is in both
+    then, now = core.estimator.map_points(), _runs()[0][1].map_points
+    assert len(then) == len(now) > 1000
+    assert np.hypot(*(now - then).T).max() > 0.1
+    assert np.mean(_distance(now, walls)) < 0.03  # of a corridor's walls nothing tells how far along them
 
 
 def test_scans_that_begin_late_leave_the_way_before_as_unsure_as_it_was() -> None:
     """For 12 s the LiDAR sees nothing; what is said of that part of the way is by wheels alone, and says so at the end, too."""
     drive = laps(0)
-    blind = [replace(e, ranges=np.full_like(e.ranges, np.inf)) if isinstance(e, Scan) and e.stamp_ns < 13e9 else e for e in drive.events]
+    blind = [
+        replace(e, points=np.empty((0, 3)), offsets=np.empty(0)) if isinstance(e, Scan) and e.stamp_ns < 13e9 else e for e in drive.events
+    ]
     (run,) = replay(blind, [Pair(make_model("diff_drive", rooms.ROBOT), "graph")], rooms.ROBOT, drive.mounts, has_lidar=True)
     assert run.counts["loops"] > 0
     for track in _tracks(run):
