@@ -9,21 +9,20 @@ it that nobody corrects, as in Schmidt's consider filter. Nothing of this moves 
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numba
 import numpy as np
 
 from localization.estimators.error_states import cloned, corrected, eigen, inverse, moved, replace
-from localization.estimators.graph_qr import add_spread
+from localization.estimators.graph_qr import add_spread, product
 from localization.estimators.revisit_update import revisited_covariance
 from localization.lidar import MapTie, Revisit
 from localization.lidar.revisit import slip_of
 from localization.lidar.track import Place, Track
 from localization.lidar.track import moved as moved_place
 from motion_models import se2
-from motion_models.se2 import FloatArray
+from motion_models.se2 import FloatArray, triple
 
 _POSE = slice(0, 3)
 _PLACE_M, _PLACE_RAD = 1.0, 0.5  # what is remembered of the way
@@ -57,8 +56,7 @@ class Account:
         """The filter's pose moved by ``delta``, see `moved`."""
         self._P = moved(self._P, delta, D, Q)
         if self._held is not None:
-            back = se2.adjoint(delta)
-            self._held = np.asarray(back.T @ self._held @ back)
+            self._held = _carried(self._held, delta)
 
     def clone(self, at: int) -> None:
         """The filter's states from ``at`` on became a copy of the pose."""
@@ -80,11 +78,10 @@ class Account:
         information = inverse(cov)
         if self._held is not None:
             # old lines that did not hold the last scan were drawn not long ago: the error of the map as it was is none of theirs
-            tie = dataclasses.replace(tie, kept=cov @ _common(information @ tie.kept, self._held))
+            tie = MapTie(cov @ _common(information @ tie.kept, self._held), tie.cov, tie.sweep)
         self._held = information
-        self._P = _seen(self._P, K, d_pose, doubt * (cov - tie.cov + tie.sweep), tie.kept, tie.fresh)
-        believed = K @ d_pose  # the part of it that was taken over: along what the scan does not hold, that is next to nothing
-        self._swept = believed @ tie.sweep @ believed[_POSE].T
+        noise = doubt * (cov - tie.cov + tie.sweep)
+        self._P, self._swept = _seen(self._P, K, d_pose, noise, tie.kept, tie.fresh, tie.sweep)
 
     def draw(self, is_drawn: bool) -> None:
         """The scan was drawn where the filter has the pose, if ``is_drawn``."""
@@ -103,8 +100,8 @@ class Account:
     def remember(self, stamp_ns: int, pose: FloatArray) -> None:
         """The robot is at ``pose`` (3,) now."""
         if self._last is not None:
-            self._travel += math.dist(pose[:2], self._last[:2])
-        self._last = np.array(pose)
+            self._travel += math.hypot(pose[0] - self._last[0], pose[1] - self._last[1])
+        self._last = pose
         if (last := self._place) is not None:
             turned = se2.scalar_wrap(float(pose[2] - last.pose[2]))
             if self._travel - last.travel < _PLACE_M and abs(turned) < _PLACE_RAD:
@@ -132,12 +129,14 @@ class Account:
 
 @numba.njit(cache=True)
 def _seen(
-    P: FloatArray, K: FloatArray, d_pose: FloatArray, noise: FloatArray, kept: FloatArray, fresh: FloatArray
-) -> FloatArray:  # pragma: no cover
+    P: FloatArray, K: FloatArray, d_pose: FloatArray, noise: FloatArray, kept: FloatArray, fresh: FloatArray, sweep: FloatArray
+) -> tuple[FloatArray, FloatArray]:  # pragma: no cover
     """A map moves to where the scan meets it, ``kept`` (3, 3) of it, the rest from where the last scan was drawn with noise ``fresh``
     (3, 3), and corrects the first n states with the gain ``K`` (n, 3) by a motion that was found with ``noise`` (3, 3).
 
     The map's states are the three after the first n, then come those of where the last scan was drawn. ``d_pose`` as in `Account.see`.
+    Also returns the covariance (n, 3) of what the ``sweep`` (3, 3) did to all states with what it did to the pose: along what the scan does
+    not hold, that is next to nothing.
     """
     out, n = P.copy(), K.shape[0]
     mix, H, R = np.empty((3, 6)), np.zeros((3, n + 3)), np.zeros((3, 3))
@@ -150,7 +149,13 @@ def _seen(
         for j in range(3):
             out[n + i, n + j] += fresh[i, j]
     add_spread(R, d_pose, noise)
-    return corrected(out, K, H, R)
+    believed, shared = product(K, d_pose), np.zeros((n, 3))
+    by_sweep = product(believed, sweep)
+    for i in range(n):
+        for j in range(3):
+            for k in range(3):
+                shared[i, j] += by_sweep[i, k] * believed[j, k]
+    return corrected(out, K, H, R), shared
 
 
 @numba.njit(cache=True)
@@ -165,6 +170,15 @@ def _drawn(P: FloatArray, at: int, shared: FloatArray) -> FloatArray:  # pragma:
     for i in range(3):
         for j in range(3):
             out[at + i, at + j] -= 0.5 * (shared[i, j] + shared[j, i])
+    return out
+
+
+@numba.njit(cache=True)
+def _carried(information: FloatArray, delta: FloatArray) -> FloatArray:  # pragma: no cover
+    """``information`` (3, 3) about a pose as that about a pose that is ``delta`` (3,) from it and tied to it."""
+    back, out = np.empty((3, 3)), np.zeros((3, 3))
+    se2.fill_adjoint(triple(delta), back)
+    add_spread(out, back.T.copy(), information)
     return out
 
 

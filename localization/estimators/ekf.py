@@ -8,23 +8,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numba
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from scipy.stats import chi2
 
 from localization.errors import EstimatorError
 from localization.estimators.account import Account
-from localization.estimators.error_states import cloned, innovation, inverse, is_finite, motion_covariance, moved, symmetric
+from localization.estimators.error_states import cloned, innovation, inverse, is_usable, motion_covariance, moved, symmetric
 from localization.estimators.revisit_update import revisit_update
 from localization.gyro import Turn
 from localization.lidar import MapTie, Revisit
-from localization.residuals import motion_residual, turn_residual
+from localization.residuals import fill_motion_residual, turn_residual
 from localization.steps import Step
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.corrections import Corrections
 from motion_models.robot import GyroNoise
-from motion_models.se2 import FloatArray
+from motion_models.se2 import FloatArray, triple
 
 # Error state: the pose now, at the start of this step, and at the last scan (stochastic cloning); then what is learned on the way:
 # the gyro's bias, the wheels' clock, and from PARAMS on the corrections of the motion model's parameters.
@@ -75,10 +76,12 @@ class Ekf:
         self._since_start, self._since_anchor = np.zeros(3), np.zeros(3)
         self.bias, self.clock_offset = 0.0, 0.0
         self._gate = float(chi2.ppf(self.config.gate_probability, 3))
+        self._still = np.diag(np.array([self.config.standing_sigma_m, self.config.standing_sigma_m, self.config.standing_sigma_rad]) ** 2)
         self._filter = _filter(np.zeros((size, size)))
         self._filter.P[BIAS, BIAS] = gyro.bias_sigma_rad_per_s**2
         self._filter.P[CLOCK, CLOCK] = self.config.clock_sigma_s**2
         self._filter.P[PARAMS:, PARAMS:] = corrected.cov
+        self._walks = {is_standing: self._walk(is_standing) for is_standing in (False, True)}
         self._account: Account | None = None  # until a scan meets a map
         self._now_ns = 0
         self.correction = np.zeros(len(corrected.names))
@@ -115,23 +118,28 @@ class Ekf:
         """The NIS beyond which a measurement contradicts the prediction."""
         return self._gate
 
+    def _walk(self, is_standing: bool) -> FloatArray:
+        """(11 + k, 11 + k) by which the covariance grows in a second, but for the clock."""
+        c, Q = self.config, np.zeros((self._size, self._size))
+        Q[BIAS, BIAS] = self._gyro.bias_walk_rad_per_s_sqrt_s**2
+        if is_standing:
+            Q[POSE, POSE] = np.diag([c.nudge_m2_per_s, c.nudge_m2_per_s, c.nudge_rad2_per_s])
+        else:
+            Q[PARAMS:, PARAMS:] = self._corrected.walk_cov
+        return Q
+
     def predict(self, step: Step) -> None:
         """Move by what the wheels say; the error follows
 
         e' = Ad(delta^-1) e + (d delta / d clock) e_clock + (d delta / d params) e_params + slip.
         """
-        c, predicted = self.config, step.predicted
+        predicted = step.predicted
         D = np.empty((3, self._size - CLOCK))
         D[:, 0], D[:, PARAMS - CLOCK :] = step.d_clock, predicted.d_params @ self._corrected.directions
-        Q = np.zeros((self._size, self._size))
-        Q[POSE, POSE] = predicted.cov
-        Q[BIAS, BIAS] = self._gyro.bias_walk_rad_per_s_sqrt_s**2 * step.duration
+        Q = self._walks[step.is_standing] * step.duration
         if self._filter.P[CLOCK, CLOCK]:
-            Q[CLOCK, CLOCK] = c.clock_walk_s_per_sqrt_s**2 * step.duration
-        if step.is_standing:
-            Q[POSE, POSE] += np.diag([c.nudge_m2_per_s, c.nudge_m2_per_s, c.nudge_rad2_per_s]) * step.duration
-        else:
-            Q[PARAMS:, PARAMS:] = self._corrected.walk_cov * step.duration
+            Q[CLOCK, CLOCK] = self.config.clock_walk_s_per_sqrt_s**2 * step.duration
+        Q[POSE, POSE] += predicted.cov
         P = moved(cloned(self._filter.P, START.start), predicted.delta, D, Q)
         pose = se2.compose(self.pose, predicted.delta)
         _check(f"the motion that the wheels predict until stamp {step.end_ns} ns", pose, P)
@@ -152,16 +160,15 @@ class Ekf:
     def measure_turn(self, turn: Turn) -> float:
         """The gyro's turn since the start of the step."""
         error = turn_residual(self._start, self.pose, turn.angle, self.bias, turn.duration)
+        _check("the gyro's turn", np.array([error, turn.variance, turn.duration]))
         H = np.zeros((1, self._size))
         H[0, POSE.start + 2], H[0, START.start + 2], H[0, BIAS] = 1.0, -1.0, turn.duration
         return self._update(np.array([error]), H, np.array([[turn.variance]]))
 
     def measure_standing(self) -> float:
         """The robot did not move since the start of the step."""
-        c = self.config
-        still = np.diag([c.standing_sigma_m**2, c.standing_sigma_m**2, c.standing_sigma_rad**2])
-        error, H = self._relative(START, self._start, self._since_start, np.zeros(3))
-        return self._update(error, H, still)
+        error, H = _relative(self._start, self.pose, np.zeros(3), self._since_start, START.start, self._size)
+        return self._update(error, H, self._still)
 
     def measure_motion(self, measured: Motion, can_slip: bool, tie: MapTie | None = None) -> float:
         """The LiDAR's motion since the last scan.
@@ -170,7 +177,7 @@ class Ekf:
         the prediction's covariance grows until both agree; else the LiDAR is, and its measurement's grows. ``tie``: the map by which it
         was measured; without one, errors of scans are taken as independent.
         """
-        error, H = self._relative(ANCHOR, self._anchor, self._since_anchor, measured.delta)
+        error, H = _relative(self._anchor, self.pose, measured.delta, self._since_anchor, ANCHOR.start, self._size)
         d_pose = H[:, POSE]
         R = d_pose @ measured.cov @ d_pose.T
         S = innovation(self._filter.P, H, R)
@@ -227,13 +234,6 @@ class Ekf:
         """(3, 3) of the motion of this step, which is ``delta`` (3,), by the errors that are really made."""
         return np.asarray(motion_covariance(self.errors, START.start, delta))
 
-    def _relative(self, earlier: slice, pose_then: FloatArray, since: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """`motion_residual` (3,) from the pose of the states ``earlier`` to the pose now, and its H (3, n); ``since`` as is predicted."""
-        error, _, d_pose = motion_residual(pose_then, self.pose, measured)
-        H = np.zeros((3, self._size))
-        H[:, earlier], H[:, POSE] = -d_pose @ se2.adjoint(se2.inverse(since)), d_pose
-        return error, H
-
     def _update(self, error: FloatArray, H: FloatArray, R: FloatArray) -> float:
         """`_correct`, with errors R that have no part in a map."""
         nis = self._correct(error, H, R)
@@ -246,21 +246,47 @@ class Ekf:
         f, before = self._filter, self._filter.P
         f.x = np.zeros((self._size, 1))
         try:
-            with np.errstate(over="ignore", invalid="ignore"):
-                f.update(-error[:, None], R, H)
+            f.update(-error[:, None], R, H)
             P = symmetric(f.P)
             _check("a measurement", f.x, P)
         except EstimatorError:
             f.P = before
             raise
         f.P, correction = P, f.x[:, 0]
-        self.pose, self._start, self._anchor = se2.compose(
-            np.stack([self.pose, self._start, self._anchor]), se2.exp(correction[: ANCHOR.stop].reshape(3, 3))
-        )
+        self.pose, self._start, self._anchor = _shifted(self.pose, self._start, self._anchor, correction)
         self.bias += float(correction[BIAS])
         self.clock_offset += float(correction[CLOCK])
         self.correction = self.correction + correction[PARAMS:]
-        return float((f.y.T @ f.SI @ f.y)[0, 0])
+        return float(error @ f.SI @ error)
+
+
+@numba.njit(cache=True)
+def _relative(
+    earlier: FloatArray, pose: FloatArray, measured: FloatArray, since: FloatArray, at: int, size: int
+) -> tuple[FloatArray, FloatArray]:  # pragma: no cover
+    """`motion_residual` (3,) from a pose ``earlier``, whose states begin at ``at``, to the pose now, and its H (3, size).
+
+    ``since`` (3,): the motion in between as it was predicted.
+    """
+    d_earlier, d_pose, A, H = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, size))
+    error = fill_motion_residual(triple(earlier), triple(pose), triple(measured), d_earlier, d_pose)
+    se2.fill_adjoint(se2.scalar_inverse(triple(since)), A)
+    for i in range(3):
+        for j in range(3):
+            H[i, j] = d_pose[i, j]
+            for k in range(3):
+                H[i, at + j] -= d_pose[i, k] * A[k, j]
+    return np.array(error), H
+
+
+@numba.njit(cache=True)
+def _shifted(pose: FloatArray, start: FloatArray, anchor: FloatArray, error: FloatArray) -> FloatArray:  # pragma: no cover
+    """(3, 3) the poses, moved by what was found of their ``error``, in the order of the states."""
+    out = np.empty((3, 3))
+    out[0, 0], out[0, 1], out[0, 2] = se2.scalar_compose(triple(pose), se2.scalar_exp((error[0], error[1], error[2])))
+    out[1, 0], out[1, 1], out[1, 2] = se2.scalar_compose(triple(start), se2.scalar_exp((error[3], error[4], error[5])))
+    out[2, 0], out[2, 1], out[2, 2] = se2.scalar_compose(triple(anchor), se2.scalar_exp((error[6], error[7], error[8])))
+    return out
 
 
 def _filter(P: FloatArray) -> KalmanFilter:
@@ -278,5 +304,6 @@ def _inverse(S: FloatArray) -> FloatArray:
 
 def _check(what: str, *arrays: FloatArray) -> None:
     """A state that is not finite is never taken over: everything after it would be lost without a word."""
-    if not all(is_finite(array.ravel()) for array in arrays):
-        raise EstimatorError(f"{what} has numbers that are not finite, or too large to compute with. Look at its source in the log.")
+    for array in arrays:
+        if not is_usable(array.ravel()):
+            raise EstimatorError(f"{what} has numbers that are not finite, or too large to compute with. Look at its source in the log.")

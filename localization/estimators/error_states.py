@@ -139,16 +139,19 @@ def motion_covariance(P: FloatArray, start: int, delta: FloatArray) -> FloatArra
 def inverse(S: FloatArray) -> FloatArray:
     """Of ``S`` (n, n), a finite covariance. Raises `EstimatorError` if it is singular."""
     found = _inverse(S)
-    if math.isnan(found[0, 0]):
-        raise EstimatorError(
-            "a measurement without any noise meets a prediction without any: give the sensors of the robot file some noise."
-        )
+    if math.isnan(found[0, 0]):  # rounding took a pivot: of what is next to nothing beside a huge slip
+        try:
+            found = np.asarray(np.linalg.inv(S), dtype=float)
+        except np.linalg.LinAlgError as singular:
+            raise EstimatorError(
+                "a measurement without any noise meets a prediction without any: give the sensors of the robot file some noise."
+            ) from singular
     return np.asarray(found)
 
 
 @numba.njit(cache=True)
 def _inverse(S: FloatArray) -> FloatArray:  # pragma: no cover
-    """`inverse`, NaN where there is none."""
+    """`inverse` by Cholesky's factors, NaN where there are none."""
     W, n = inverse_root(S), S.shape[0]
     out = np.zeros((n, n))
     for i in range(n):
@@ -159,10 +162,10 @@ def _inverse(S: FloatArray) -> FloatArray:  # pragma: no cover
 
 
 @numba.njit(cache=True)
-def is_finite(numbers: FloatArray) -> bool:  # pragma: no cover
-    """All of ``numbers`` (n,) are."""
+def is_usable(numbers: FloatArray) -> bool:  # pragma: no cover
+    """All of ``numbers`` (n,) are finite, and so small that their products, as filters form them, are."""
     for x in numbers:  # noqa: SIM110
-        if not math.isfinite(x):
+        if not abs(x) < 1e100:
             return False
     return True
 
