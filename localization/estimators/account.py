@@ -81,7 +81,8 @@ class Account:
             tie = MapTie(cov @ _common(information @ tie.kept, self._held), tie.cov, tie.sweep)
         self._held = information
         noise = doubt * (cov - tie.cov + tie.sweep)
-        self._P, self._swept = _seen(self._P, K, d_pose, noise, tie.kept, tie.fresh, tie.sweep)
+        met, H, R, self._swept = _met(self._P, K, d_pose, noise, tie.kept, tie.fresh, tie.sweep)
+        self._P = corrected(met, K, H, R)
 
     def draw(self, is_drawn: bool) -> None:
         """The scan was drawn where the filter has the pose, if ``is_drawn``."""
@@ -128,15 +129,15 @@ class Account:
 
 
 @numba.njit(cache=True)
-def _seen(
+def _met(
     P: FloatArray, K: FloatArray, d_pose: FloatArray, noise: FloatArray, kept: FloatArray, fresh: FloatArray, sweep: FloatArray
-) -> tuple[FloatArray, FloatArray]:  # pragma: no cover
-    """A map moves to where the scan meets it, ``kept`` (3, 3) of it, the rest from where the last scan was drawn with noise ``fresh``
-    (3, 3), and corrects the first n states with the gain ``K`` (n, 3) by a motion that was found with ``noise`` (3, 3).
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:  # pragma: no cover
+    """The map moves to where the scan meets it, ``kept`` (3, 3) of it, the rest from where the last scan was drawn with noise ``fresh``
+    (3, 3): P (N, N) by then, and for `corrected` H (3, n + 3) and R (3, 3) of a motion that was found with ``noise`` (3, 3).
 
     The map's states are the three after the first n, then come those of where the last scan was drawn. ``d_pose`` as in `Account.see`.
-    Also returns the covariance (n, 3) of what the ``sweep`` (3, 3) did to all states with what it did to the pose: along what the scan does
-    not hold, that is next to nothing.
+    Last the covariance (n, 3) of what the ``sweep`` (3, 3) does by the gain ``K`` (n, 3) to all states with what it does to the pose:
+    along what the scan does not hold, that is next to nothing.
     """
     out, n = P.copy(), K.shape[0]
     mix, H, R = np.empty((3, 6)), np.zeros((3, n + 3)), np.zeros((3, 3))
@@ -155,7 +156,7 @@ def _seen(
         for j in range(3):
             for k in range(3):
                 shared[i, j] += by_sweep[i, k] * believed[j, k]
-    return corrected(out, K, H, R), shared
+    return out, H, R, shared
 
 
 @numba.njit(cache=True)
@@ -187,7 +188,7 @@ def _common(A: FloatArray, B: FloatArray) -> FloatArray:  # pragma: no cover
     """(3, 3) of the information ``A`` (3, 3), what ``B`` (3, 3) had of it: where B is far smaller, no more than `_ALIKE` times that."""
     values, vectors = eigen(B)
     root, inverse, ratios_of = np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3))  # B = root^T root
-    floor = 1e-9 * max(values.max(), 1e-300)
+    floor = 1e-9 * max(values[0], values[1], values[2], 1e-300)
     for i in range(3):
         for k in range(3):
             root[k, i] = vectors[i, k] * math.sqrt(max(values[k], 0.0))

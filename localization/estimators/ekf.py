@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from localization.errors import EstimatorError
 from localization.estimators.account import Account
-from localization.estimators.error_states import cloned, innovation, inverse, is_usable, motion_covariance, moved, symmetric
+from localization.estimators.error_states import cloned, inverse, is_usable, motion_covariance, moved, symmetric
 from localization.estimators.revisit_update import revisit_update
 from localization.gyro import Turn
 from localization.lidar import MapTie, Revisit
@@ -178,9 +178,9 @@ class Ekf:
         was measured; without one, errors of scans are taken as independent.
         """
         error, H = _relative(self._anchor, self.pose, measured.delta, self._since_anchor, ANCHOR.start, self._size)
-        d_pose = H[:, POSE]
+        d_pose = H[:, POSE].copy()
         R = d_pose @ measured.cov @ d_pose.T
-        S = innovation(self._filter.P, H, R)
+        S = H @ self._filter.P @ H.T + R
         _check("the motion that the LiDAR measured", error, S)
         nis = float(error @ inverse(S) @ error)
         limit = self._gate

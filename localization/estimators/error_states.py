@@ -16,6 +16,28 @@ from motion_models import se2
 from motion_models.se2 import FloatArray, triple
 
 
+@numba.njit("void(f8[:, ::1], i8, f8[:, ::1], i8, i8)", cache=True)  # once, instead of anew for each literal
+def replace(P: FloatArray, at: int, M: FloatArray, first: int, m: int) -> None:  # pragma: no cover
+    """In place: the three states from ``at`` on become the first m columns of ``M`` (3, ...) times m states from ``first`` on."""
+    size = P.shape[0]
+    rows, own = np.zeros((3, size)), np.zeros((3, 3))
+    for i in range(3):
+        for k in range(m):
+            for j in range(size):
+                rows[i, j] += M[i, k] * P[first + k, j]
+    for i in range(3):
+        for k in range(m):
+            for j in range(3):
+                own[i, j] += rows[i, first + k] * M[j, k]
+    for i in range(3):
+        for j in range(size):
+            P[at + i, j] = rows[i, j]
+            P[j, at + i] = rows[i, j]
+    for i in range(3):
+        for j in range(3):
+            P[at + i, at + j] = 0.5 * (own[i, j] + own[j, i])
+
+
 @numba.njit(cache=True)
 def moved(P: FloatArray, delta: FloatArray, D: FloatArray, Q: FloatArray) -> FloatArray:  # pragma: no cover
     """The pose moves by ``delta`` (3,), which depends by ``D`` (3, k) on the last k of the first n states, with noise ``Q`` (n, n):
@@ -41,30 +63,14 @@ def moved(P: FloatArray, delta: FloatArray, D: FloatArray, Q: FloatArray) -> Flo
 def cloned(P: FloatArray, at: int) -> FloatArray:  # pragma: no cover
     """The three states from ``at`` on become the pose now."""
     out = P.copy()
-    replace(out, at, np.eye(3), 0, 3)
-    return out
-
-
-@numba.njit(cache=True)
-def replace(P: FloatArray, at: int, M: FloatArray, first: int, m: int) -> None:  # pragma: no cover
-    """In place: the three states from ``at`` on become the first m columns of ``M`` (3, ...) times m states from ``first`` on."""
-    size = P.shape[0]
-    rows, own = np.zeros((3, size)), np.zeros((3, 3))
     for i in range(3):
-        for k in range(m):
-            for j in range(size):
-                rows[i, j] += M[i, k] * P[first + k, j]
-    for i in range(3):
-        for k in range(m):
-            for j in range(3):
-                own[i, j] += rows[i, first + k] * M[j, k]
-    for i in range(3):
-        for j in range(size):
-            P[at + i, j] = rows[i, j]
-            P[j, at + i] = rows[i, j]
+        for j in range(P.shape[0]):
+            out[at + i, j] = P[i, j]
+            out[j, at + i] = P[i, j]
     for i in range(3):
         for j in range(3):
-            P[at + i, at + j] = 0.5 * (own[i, j] + own[j, i])
+            out[at + i, at + j] = P[i, j]
+    return out
 
 
 @numba.njit(cache=True)
@@ -109,14 +115,6 @@ def make_symmetric(P: FloatArray) -> None:  # pragma: no cover
         for j in range(i):
             mean = 0.5 * (P[i, j] + P[j, i])
             P[i, j], P[j, i] = mean, mean
-
-
-@numba.njit(cache=True)
-def innovation(P: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:  # pragma: no cover
-    """H P H^T + R"""
-    out = R.copy()
-    add_spread(out, H, P)
-    return out
 
 
 @numba.njit(cache=True)
@@ -177,8 +175,10 @@ def eigen(A: FloatArray) -> tuple[FloatArray, FloatArray]:  # pragma: no cover
     Jacobi's rotations (Golub, Van Loan, "Matrix computations", 2013, algorithm 8.5.2).
     """
     n = A.shape[0]
-    D, V = A.copy(), np.eye(n)
+    D, V, values = A.copy(), np.zeros((n, n)), np.empty(n)
     make_symmetric(D)
+    for i in range(n):
+        V[i, i] = 1.0
     for _ in range(30):  # each sweep squares what is left; some six do
         is_done = True
         for p in range(n):
@@ -198,4 +198,6 @@ def eigen(A: FloatArray) -> tuple[FloatArray, FloatArray]:  # pragma: no cover
                 D[p, q], D[q, p] = 0.0, 0.0
         if is_done:
             break
-    return np.diag(D).copy(), V
+    for i in range(n):
+        values[i] = D[i, i]
+    return values, V
