@@ -12,6 +12,7 @@ from scipy.stats import chi2
 
 from localization import Pair, replay
 from localization.consistency import mean_band
+from localization.errors import EstimatorError
 from localization.estimators.hindsight import Hindsight, Loop
 from localization.events import Scan
 from localization.online.core import Core
@@ -243,6 +244,18 @@ def test_scans_that_begin_late_leave_the_way_before_as_unsure_as_it_was() -> Non
     assert run.counts["loops"] > 0
     for track in _tracks(run):
         assert errors(drive, track)[1].mean() < chi2.ppf(0.999, 3)
+
+
+def test_where_no_solution_is_found_the_estimates_of_each_moment_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(self: Hindsight, moments: Trajectory) -> Trajectory:
+        raise EstimatorError("the graph is singular")
+
+    drive, kept = _runs()[0]
+    monkeypatch.setattr(Hindsight, "smooth", fails)
+    (run,) = replay(drive.events, [Pair(make_model("diff_drive", rooms.ROBOT), "graph")], rooms.ROBOT, drive.mounts, has_lidar=True)
+    assert run.counts["loops_unsolved"] == kept.counts["loops"]
+    assert run.moments is None
+    assert np.array_equal(run.trajectory.poses, _tracks(kept)[0].poses)
 
 
 def _distance(points: np.ndarray, walls: np.ndarray) -> np.ndarray:

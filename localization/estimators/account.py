@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from localization.estimators.error_states import cloned, corrected, eigen, inverse, moved, replace
-from localization.estimators.graph_qr import add_spread, product
+from localization.estimators.graph_qr import add_outer, add_spread, product
 from localization.estimators.revisit_update import revisited_covariance
 from localization.lidar import MapTie, Revisit
 from localization.lidar.revisit import slip_of
@@ -151,11 +151,7 @@ def _met(
             out[n + i, n + j] += fresh[i, j]
     add_spread(R, d_pose, noise)
     believed, shared = product(K, d_pose), np.zeros((n, 3))
-    by_sweep = product(believed, sweep)
-    for i in range(n):
-        for j in range(3):
-            for k in range(3):
-                shared[i, j] += by_sweep[i, k] * believed[j, k]
+    add_outer(shared, product(believed, sweep), believed[:3])
     return out, H, R, shared
 
 
@@ -187,13 +183,13 @@ def _carried(information: FloatArray, delta: FloatArray) -> FloatArray:  # pragm
 def _common(A: FloatArray, B: FloatArray) -> FloatArray:  # pragma: no cover
     """(3, 3) of the information ``A`` (3, 3), what ``B`` (3, 3) had of it: where B is far smaller, no more than `_ALIKE` times that."""
     values, vectors = eigen(B)
-    root, inverse, ratios_of = np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3))  # B = root^T root
+    root, white, ratios_of = np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3))  # B = root^T root, white B white^T = 1
     floor = 1e-9 * max(values[0], values[1], values[2], 1e-300)
     for i in range(3):
         for k in range(3):
             root[k, i] = vectors[i, k] * math.sqrt(max(values[k], 0.0))
-            inverse[k, i] = vectors[i, k] / math.sqrt(max(values[k], floor))
-    add_spread(ratios_of, inverse, A)
+            white[k, i] = vectors[i, k] / math.sqrt(max(values[k], floor))
+    add_spread(ratios_of, white, A)
     ratios, directions = eigen(ratios_of)
     half, out = np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(3):

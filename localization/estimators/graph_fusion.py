@@ -341,9 +341,7 @@ class GraphFusion:
         measured, mount = sight.motion, self._slow.shown(sight.motion)
         error, nis = innovation(self._newest, ahead, pending, measured, mount)
         if math.isnan(nis):
-            raise EstimatorError(
-                "wheels and LiDAR cannot be weighed: numbers are not finite, or too large to compute with. Look at the log."
-            )
+            raise EstimatorError(_NOT_FINITE)
         if nis > self._gate:
             self._counts["contradictions"] += 1
             if sight.is_trusted:

@@ -199,22 +199,24 @@ def add_product(out: FloatArray, A: FloatArray, B: FloatArray) -> None:  # pragm
 
 
 @numba.njit(cache=True)
+def add_outer(out: FloatArray, A: FloatArray, B: FloatArray) -> None:  # pragma: no cover
+    """``out += A @ B^T``"""
+    for i in range(A.shape[0]):
+        for j in range(B.shape[0]):
+            for k in range(A.shape[1]):
+                out[i, j] += A[i, k] * B[j, k]
+
+
+@numba.njit(cache=True)
 def add_square(out: FloatArray, A: FloatArray) -> None:  # pragma: no cover
     """``out += A @ A^T``"""
-    for i in range(A.shape[0]):
-        for j in range(A.shape[0]):
-            for k in range(A.shape[1]):
-                out[i, j] += A[i, k] * A[j, k]
+    add_outer(out, A, A)
 
 
 @numba.njit(cache=True)
 def add_spread(out: FloatArray, A: FloatArray, P: FloatArray) -> None:  # pragma: no cover
     """``out += A @ P @ A^T``"""
-    by_cov = product(A, P)
-    for i in range(A.shape[0]):
-        for j in range(A.shape[0]):
-            for k in range(A.shape[1]):
-                out[i, j] += by_cov[i, k] * A[j, k]
+    add_outer(out, product(A, P), A)
 
 
 @numba.njit(cache=True)

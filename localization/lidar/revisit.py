@@ -133,15 +133,16 @@ class Revisits:
         reach = float(np.quantile(np.hypot(scan[:, 0], scan[:, 1]), 0.9)) if len(scan) else 0.0
         self.ages = ages_between(self._known(now, reach))
         self._recent.append((now, _thinned(scan, 0.5 * self._voxel)))
-        found = None
-        for watch in self._watches:
-            if found is None and (watch.pending is not None or travel - watch.searched >= self.config.search_m):
-                watch.searched = travel
-                found = self._watched(watch, now, lines, reach)
-        return found
+        due = [watch for watch in self._watches if watch.pending is not None or travel - watch.searched >= self.config.search_m]
+        recent = self._seen_recently(now) if due else scan
+        for watch in due:
+            watch.searched = travel
+            if (found := self._watched(watch, recent, now, lines, reach)) is not None:
+                return found
+        return None
 
-    def _watched(self, watch: _Watch, now: Place, lines: LineMap, reach: float) -> Revisit | None:
-        fit, seen = self._find(self._seen_recently(now), lines, now, reach, watch.is_sure)
+    def _watched(self, watch: _Watch, scan: FloatArray, now: Place, lines: LineMap, reach: float) -> Revisit | None:
+        fit, seen = self._find(scan, lines, now, reach, watch.is_sure)
         last, watch.pending = watch.pending, None if fit is None else (len(self.track) - 1, fit)
         if fit is None or last is None or not self._agrees(last, fit):
             return None
