@@ -12,7 +12,8 @@ from localization.lidar.cells import Ages, find_cell, is_used
 from motion_models.se2 import FloatArray
 
 _MIN_NEIGHBOURS = 4
-_MAX_SIGMAS = 3.0  # of a point's noise: neighbours that scatter more across their line are of two
+_KERNEL_SIGMAS = 5.0  # of a point's distance from its line: the kernel's scale at last, beyond which a point is of something else
+_MAX_SIGMAS = 3.0  # of a point's distance from its line, else it is not of it; of its noise: neighbours that scatter more are of two lines
 _STALE = 0.02  # of the neighbourhood's radius: points that moved farther look for their lines again
 _SAME = 0.05  # of the same: points that are nearer to each other look once for both
 _Noise = tuple[float, float, float, float]  # sigma of a point, the same along its beam, sigma of a line, `FitOptions.place_part`
@@ -239,7 +240,22 @@ def _of_point(lines: FloatArray, i: int, noise: _Noise) -> float:  # pragma: no 
 
 
 @numba.njit(cache=True)
-def _weigh(lines: FloatArray, i: int, e: float, noise: _Noise, kernel: float) -> tuple[float, float, float]:  # pragma: no cover
+def _of_distance(lines: FloatArray, i: int, noise: _Noise) -> float:  # pragma: no cover
+    """The variance of point ``i``'s distance from its line."""
+    variance: float = _of_point(lines, i, noise) + noise[2] * noise[2] + lines[i, 5]
+    return variance
+
+
+@numba.njit(cache=True)
+def _is_on(lines: FloatArray, i: int, e: float, noise: _Noise) -> bool:  # pragma: no cover
+    """Point ``i``, ``e`` off its line, is of it: within three sigmas."""
+    return e * e < _MAX_SIGMAS**2 * _of_distance(lines, i, noise)
+
+
+@numba.njit(cache=True)
+def _weigh(
+    lines: FloatArray, i: int, e: float, noise: _Noise, kernel: float, sigmas: float
+) -> tuple[float, float, float]:  # pragma: no cover
     """Of point ``i``, ``e`` off its line: its robust weight, the factor by which the kernel holds it down, and the line's part of its
     variance.
 
@@ -249,31 +265,33 @@ def _weigh(lines: FloatArray, i: int, e: float, noise: _Noise, kernel: float) ->
     _, _, sigma_line, place_part = noise
     line, place = lines[i, 6] * sigma_line * sigma_line, lines[i, 8] * place_part * lines[i, 5]
     variance = _of_point(lines, i, noise) + line + place
-    robust = 1.0 + e * e / (kernel * kernel)
+    robust = 1.0 + e * e / min(kernel * kernel, sigmas * sigmas * _of_distance(lines, i, noise))
     return 1.0 / (variance * robust * robust), robust, (line + place) / variance
 
 
 @numba.njit(cache=True)
 def _sum_up(
-    source: FloatArray, lines: FloatArray, pose: FloatArray, noise: _Noise, kernel: float, H: FloatArray, g: FloatArray
-) -> tuple[int, float]:  # pragma: no cover
-    """The quadratic of the cost around ``pose``, into ``H`` and ``g``; returns the matched points and their weighted sum of squares."""
+    source: FloatArray, lines: FloatArray, pose: FloatArray, noise: _Noise, kernel: float, sigmas: float, H: FloatArray, g: FloatArray
+) -> tuple[int, int, float]:  # pragma: no cover
+    """The quadratic of the cost around ``pose``, into ``H`` and ``g``; returns the matched points, those on their lines, and the weighted
+    sum of squares."""
     H[:], g[:] = 0.0, 0.0
-    n_matched, squares = 0, 0.0
+    n_matched, n_on, squares = 0, 0, 0.0
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(source.shape[0]):
         if lines[i, 0] == 0.0:
             continue
         e, jx, jy, jt = _residual(source, lines, i, pose, c, s)
-        w, robust, _ = _weigh(lines, i, e, noise, kernel)
+        w, robust, _ = _weigh(lines, i, e, noise, kernel, sigmas)
         _add(H, w, jx, jy, jt)
         g[0] -= w * jx * e
         g[1] -= w * jy * e
         g[2] -= w * jt * e
         n_matched += 1
+        n_on += _is_on(lines, i, e, noise)
         squares += e * e / (robust * robust)
     H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
-    return n_matched, squares
+    return n_matched, n_on, squares
 
 
 @numba.njit(cache=True)
@@ -302,6 +320,7 @@ def fit_points(
     H: FloatArray,
     g: FloatArray,
     spread: FloatArray,
+    information: FloatArray,
     feigned: FloatArray,
     of_map: FloatArray,
     old: FloatArray,
@@ -310,11 +329,13 @@ def fit_points(
     """Changes ``pose``, ``H``, ``g`` and what follows them in place (see `_spread` and `_parts`); returns the matched points, those on
     their lines, and the weighted sum of squares.
 
-    Lines are looked up again where the points have moved by a part of the neighbourhood since they were: near the end, they stay.
+    The kernel narrows: the first steps see far; once most points are on their lines, what is of none but happens to be near one is left
+    out, as a wall around the corner that was not seen before. Lines are looked up again where the points have moved by a part of the
+    neighbourhood since they were: near the end, they stay.
     """
     noise = sigma_point, sigma_beam, sigma_line, place_part
     home, lines = np.empty(source.shape[0], np.int64), np.empty((source.shape[0], 11))
-    reach, moved, n_matched, squares = 0.0, math.inf, 0, 0.0
+    reach, moved, sigmas, n_matched, n_on, squares = 0.0, math.inf, math.inf, 0, 0, 0.0
     for i in range(source.shape[0]):
         reach = max(reach, math.hypot(source[i, 0], source[i, 1]))
     for iteration in range(iterations + 1):
@@ -322,7 +343,7 @@ def fit_points(
             _associate(cells, points, travels, hits, hit_sums, ages, source, pose, cell, radius, noise, since, home, lines)
             moved = 0.0
         kernel = wide_kernel if iteration == 0 else final_kernel
-        n_matched, squares = _sum_up(source, lines, pose, noise, kernel, H, g)
+        n_matched, n_on, squares = _sum_up(source, lines, pose, noise, kernel, sigmas, H, g)
         if iteration >= iterations or n_matched == 0:
             break
         c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -344,10 +365,12 @@ def fit_points(
         pose[1] += s * d0 + c * d1
         pose[2] += d2
         moved += math.hypot(d0, d1) + abs(d2) * reach
-        if iteration > 0 and abs(d0) + abs(d1) + abs(d2) < 1e-4:
+        if sigmas == math.inf and iteration > 0 and 2 * n_on > n_matched:
+            sigmas = _KERNEL_SIGMAS
+        elif iteration > 0 and abs(d0) + abs(d1) + abs(d2) < 1e-4:
             iterations = iteration + 1
     n_on = _spread(source, lines, home, pose, noise, spread)
-    _parts(source, offsets, lines, pose, noise, final_kernel, feigned, of_map, old, late)
+    _parts(source, offsets, lines, pose, noise, final_kernel, sigmas, information, feigned, of_map, old, late)
     return n_matched, n_on, squares
 
 
@@ -359,31 +382,37 @@ def _parts(
     pose: FloatArray,
     noise: _Noise,
     kernel: float,
+    sigmas: float,
+    information: FloatArray,
     feigned: FloatArray,
     of_map: FloatArray,
     old: FloatArray,
     late: FloatArray,
 ) -> None:  # pragma: no cover
-    """Fills (3, 3) parts of the cost's curvature: ``feigned`` by the noise of the lines' directions, ``of_map`` the part by which errors
-    of the lines weigh, ``old`` what is not new of the lines; ``late`` is each point's part times when it was seen, ``offsets`` (N,), or
-    zero if these are (0,).
+    """Fills the ``information`` (3, 3) of the points, and its parts: ``feigned`` by the noise of the lines' directions, ``of_map`` the part
+    by which errors of the lines weigh, ``old`` what is not new of the lines; ``late`` is each point's part times when it was seen,
+    ``offsets`` (N,), or zero if these are (0,).
 
+    From points that follow their noise the kernel takes 7 % of the cost's curvature, but only 2 % of what they tell: they count in full.
     A line's direction is estimated. Its noise makes walls that are parallel look as if they were not quite, and in a sum of squares that
     looks like knowledge of the place along them. What it amounts to is known by expectation; it scatters, so that more of it is feigned.
     """
-    feigned[:], of_map[:], old[:], late[:] = 0.0, 0.0, 0.0, 0.0
+    information[:], feigned[:], of_map[:], old[:], late[:] = 0.0, 0.0, 0.0, 0.0, 0.0
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(source.shape[0]):
         if lines[i, 0] == 0.0:
             continue
         e, jx, jy, jt = _residual(source, lines, i, pose, c, s)
-        w, _, of_line = _weigh(lines, i, e, noise, kernel)
+        w, robust, of_line = _weigh(lines, i, e, noise, kernel, sigmas)
+        if _is_on(lines, i, e, noise):
+            w *= robust * robust
+        _add(information, w, jx, jy, jt)
         _add(feigned, _NOISY * w * lines[i, 10], -jy, jx, jx * source[i, 0] + jy * source[i, 1])
         _add(of_map, w * of_line, jx, jy, jt)
         _add(old, w * (1.0 - lines[i, 7]), jx, jy, jt)
         if offsets.shape[0]:
             _add(late, w * offsets[i], jx, jy, jt)
-    for M in (feigned, of_map, old, late):
+    for M in (information, feigned, of_map, old, late):
         M[1, 0], M[2, 0], M[2, 1] = M[0, 1], M[0, 2], M[1, 2]
 
 
@@ -396,12 +425,13 @@ def _spread(
     noise: _Noise,
     spread: FloatArray,
 ) -> int:  # pragma: no cover
-    """Fills ``spread`` (9,), see `Spread`; returns how many points are on their lines: those beyond three sigmas are of something else.
+    """Fills ``spread`` (10,), see `Spread`; returns how many points are on their lines: those beyond three sigmas are of something else.
     A group ends where the scan leaves a cell."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     line = noise[2] * noise[2]
     spread[:] = 0.0
-    n_on, n, total, squares, place, facing = 0, 0, 0.0, 0.0, 0.0, 0.0
+    n_on, n, total, squares, place, facing, of_points, shared = 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    weights, weights_squared = 0.0, 0.0
     for i in range(source.shape[0] + 1):
         is_end = i == source.shape[0]
         if n and (is_end or home[i] != home[i - 1]):
@@ -409,22 +439,34 @@ def _spread(
                 within = squares - total * total / n
                 spread[0] += within
                 spread[1] += n - 1
-                spread[2] += (total / n) ** 2
-                spread[3] += 1.0
-                spread[4] += within / (n - 1) / n
-                spread[5] += place / n
+                w = n / (of_points / n + n * line + noise[3] * place)
+                weights += w
+                weights_squared += w * w
+                spread[2] += w * (total / n) ** 2
+                spread[4] += w * within / (n - 1) / n
+                spread[5] += w * place / n
+                spread[9] += w * shared / n
                 spread[6] += (n - 1) * (facing / n)
                 spread[7] += (n - 1) * (facing / n) ** 2
                 spread[8] += within * (facing / n)
-            n, total, squares, place, facing = 0, 0.0, 0.0, 0.0, 0.0
+            n, total, squares, place, facing, of_points, shared = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         if is_end or lines[i, 0] == 0.0:
             continue
         e, _, _, _ = _residual(source, lines, i, pose, c, s)
-        if e * e < 9.0 * (_of_point(lines, i, noise) + line + lines[i, 5]):
+        if _is_on(lines, i, e, noise):
+            of_points += _of_point(lines, i, noise)
+            shared += lines[i, 8] / lines[i, 6]
             n_on += 1
             n += 1
             total += e
             squares += e * e
             place += lines[i, 5]
             facing += lines[i, 9]
+    if weights:
+        scale = weights / weights_squared
+        spread[3] = weights * scale
+        spread[2] *= scale
+        spread[4] *= scale
+        spread[5] *= scale
+        spread[9] /= weights
     return n_on

@@ -33,8 +33,9 @@ class Spread:
     """Squares of the points' distances from their group's mean [m^2]."""
     within_freedom: float = 0.0
     between: float = 0.0
-    """Squares of the groups' means [m^2]."""
+    """Squares of the groups' means [m^2], here and below weighted by how well these are known; the weights' squares sum up to their sum."""
     between_freedom: float = 0.0
+    """Sum of these weights: so many groups are worth as much."""
     noise: float = 0.0
     """What the noise of their points makes of those squares [m^2]."""
     place: float = 0.0
@@ -45,6 +46,8 @@ class Spread:
     """Sum of its square."""
     within_facing: float = 0.0
     """Squares of the points' distances from their group's mean, times it [m^2]."""
+    alike: float = 1.0
+    """How many groups a line's error is shared by, in the mean."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class LineFit:
     pose: FloatArray
     """(3,) where the cost was expanded."""
     information: FloatArray
-    """(3, 3) of the points about the pose, nothing else: the curvature without what the noise of the lines' directions feigns."""
+    """(3, 3) of the points about the pose, nothing else: without what the noise of the lines' directions feigns."""
     curvature: FloatArray
     """(3, 3) of the cost."""
     gradient: FloatArray
@@ -165,8 +168,8 @@ class LineMap:
         of ``since`` [m] or later are the new ones; with NaN, none is. ``offsets``: when the points were seen, (N,) [s] after the pose, or
         `AT_ONCE`.
         """
-        gradient, pose, spread = np.zeros(3), np.array(start, dtype=float), np.zeros(9)
-        curvature, feigned, of_map, old, late = np.zeros((5, 3, 3))
+        gradient, pose, spread = np.zeros(3), np.array(start, dtype=float), np.zeros(10)
+        curvature, told, feigned, of_map, old, late = np.zeros((6, 3, 3))
         n, n_on, squares = fit_points(
             self._cells,
             self._points,
@@ -192,13 +195,14 @@ class LineMap:
             curvature,
             gradient,
             spread,
+            told,
             feigned,
             of_map,
             old,
             late,
         )
-        information = _known(curvature - feigned) if n else curvature
-        shrink = np.linalg.cholesky(information + _NOTHING) @ np.linalg.inv(np.linalg.cholesky(curvature + _NOTHING))
+        information = _known(told - feigned) if n else told
+        shrink = np.linalg.cholesky(information + _NOTHING) @ np.linalg.inv(np.linalg.cholesky(told + _NOTHING))
         of_map, old, late = shrink @ np.array([of_map, old, late]) @ shrink.T
         rms = math.sqrt(squares / n) if n else math.nan
         return LineFit(pose, information, curvature, gradient, n, n_on, rms, Spread(*spread.tolist()), old, of_map, late)

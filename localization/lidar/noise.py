@@ -61,9 +61,10 @@ class Noise:
         """One more scan."""
         freedom = spread.between_freedom - _POSE
         if freedom > _POSE:
-            # the pose takes its part of all that moves the groups' means, whatever it comes from
+            # the pose takes its part of all that moves the groups' means, and a larger one of errors that neighbours have in common
             left = freedom / spread.between_freedom
+            left_of_place = max(1.0 - _POSE * spread.alike / spread.between_freedom, 0.0)
             of_points = [spread.within, spread.within_freedom, spread.facing, spread.facing_squared, spread.within_facing]
-            new = np.array([*of_points, spread.between - left * spread.noise, freedom, left * spread.place])
+            new = np.array([*of_points, spread.between - left * spread.noise, freedom, left_of_place * spread.place])
             self._seen = _KEPT * self._seen + new
             self._guess = _GUESSED * self._guess
