@@ -12,6 +12,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from localization.events import Event, Scan, WheelSample
+from localization.lidar import body_points
 from localization.run import Pair, ReplayConfig, Run, replay
 from localization.simulate.raycast import Grid, cast, make_grid
 from motion_models import se2
@@ -116,6 +117,8 @@ class Drive:
     """(n,) [ns]"""
     poses: np.ndarray
     """(n, 3) from the first one on, which is the origin"""
+    track: np.ndarray
+    """(m, 3) the same all the way, 500 a second"""
     start: np.ndarray
     """(3,) where the first one is in the world"""
     mount: Mount
@@ -176,7 +179,19 @@ def drive_through(
         events.append(Scan(stamps[-1], points, offsets[seen], "laser"))
     events.sort(key=lambda e: e.stamp_ns)
     at = np.round((np.array(stamps) - WALL_START_NS) * 1e-9 / _STEP_S).astype(int)
-    return Drive(events, np.array(stamps), se2.between(poses[0], poses[at]), poses[0], scanner.mount)
+    track = se2.between(poses[0], poses)
+    return Drive(events, np.array(stamps), track[at], track, poses[0], scanner.mount)
+
+
+def true_points(drive: Drive, scan: Scan) -> np.ndarray:
+    """(N, 3) points of ``scan`` in the body frame at its stamp, moved there as the robot really moved."""
+    at = ((scan.stamp_ns - WALL_START_NS) * 1e-9 + np.append(0.0, scan.offsets)) / _STEP_S
+    i = np.minimum(at.astype(int), len(drive.track) - 2)
+    f = (at - i)[:, None]
+    poses = (1.0 - f) * drive.track[i] + f * drive.track[i + 1]
+    points = body_points(scan, drive.mount, np.zeros(3))
+    points[:, :2] = se2.transform(se2.between(poses[0], poses[1:]), points[:, :2])
+    return points
 
 
 def _ns(t: float) -> int:
