@@ -14,7 +14,7 @@ import numpy as np
 from localization.lidar.lines import Spread
 from motion_models.se2 import FloatArray
 
-_KEPT = 0.9  # of what is known, from scan to scan: the last 10 count, for a map grows surer while it is drawn
+_KEPT = 0.85  # of what is known, from scan to scan: the last 7 count, for a map grows surer while it is drawn
 _GUESSED = 0.5  # of what was only guessed, from scan to scan
 _RIDGE = 0.002  # where all walls are seen alike, who knows which way points are off
 _POSE = 3.0  # degrees of freedom that go into the pose
