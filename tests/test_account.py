@@ -201,18 +201,41 @@ def test_noise_is_what_scans_show() -> None:
     """Groups of 10 points in 40 cells, whose means are off by the lines' errors, and a pose fitted to them."""
     rng = np.random.default_rng(3)
     for sigma_line, part in ((0.0, 0.4), (0.004, 1.0)):
-        noise, place = Noise(0.03, 0.02), 4e-6
+        noise, place, said = Noise(0.03, 0.02), 4e-6, []
         for _ in range(300):
             off = np.sqrt(sigma_line**2 + part * place) * rng.normal(size=40)
-            points = off[:, None] + 0.012 * rng.normal(size=(40, 10))
+            points = off[:, None] + 0.004 * rng.normal(size=(40, 10))
             fit = np.linalg.qr(rng.normal(size=(40, 3)))[0]
             means = points.mean(axis=1)
             within = ((points - means[:, None]) ** 2).sum(axis=1)
             means = means - fit @ (fit.T @ means)
             noise.see(Spread(within.sum(), 360.0, (means**2).sum(), 40.0, (within / 90.0).sum(), 40.0 * place))
-        assert noise.sigmas_of_a_point[0] == pytest.approx(0.012, rel=0.02)
-        assert noise.place_part == pytest.approx(part, abs=0.25)
-        assert noise.sigma_line == pytest.approx(sigma_line, abs=5e-4)
+            said.append((*noise.sigmas_of_a_point, noise.sigma_line, noise.place_part))
+        point, _, line, its_part = np.mean(said[50:], axis=0)
+        assert point == pytest.approx(0.004, rel=0.02)
+        assert its_part == pytest.approx(part, abs=0.06)
+        assert line == pytest.approx(sigma_line, abs=4e-4)
+
+
+def test_a_pose_takes_more_of_errors_that_neighbours_share() -> None:
+    """40 groups around a room; three in a row share the points that make their lines, and with them their errors."""
+    rng, place, part = np.random.default_rng(4), 4e-6, 0.5
+    around = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
+    fit = np.linalg.qr(np.column_stack([np.ones(40), np.cos(around), np.sin(around)]))[0]
+    found: dict[float, list[float]] = {1.0: [], 3.0: []}
+    for alike, parts in found.items():
+        noise = Noise(0.03, 0.02)
+        for _ in range(2000):
+            white = rng.normal(size=40)
+            off = np.sqrt(part * place / 3.0) * (white + np.roll(white, 1) + np.roll(white, -1))
+            points = off[:, None] + 0.003 * rng.normal(size=(40, 10))
+            means = points.mean(axis=1)
+            within = ((points - means[:, None]) ** 2).sum()
+            means = means - fit @ (fit.T @ means)
+            noise.see(Spread(within, 360.0, (means**2).sum(), 40.0, within / 90.0, 40.0 * place, alike=alike))
+            parts.append(noise.place_part)
+    assert np.mean(found[3.0][50:]) == pytest.approx(part, rel=0.05)
+    assert np.mean(found[1.0][50:]) < 0.9 * part
 
 
 @pytest.mark.parametrize("kind", ["ekf", "graph"])

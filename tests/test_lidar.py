@@ -11,7 +11,7 @@ import pytest
 from localization.estimators.base import Estimate
 from localization.events import Scan
 from localization.lidar import LidarMatcher, Slip, Sweep, body_points
-from localization.lidar.lines import FitOptions, LineMap, Spread
+from localization.lidar.lines import FitOptions, LineFit, LineMap, Spread
 from localization.lidar.noise import Noise
 from localization.online.core import Core, Pair, ReplayConfig
 from localization.simulate import world
@@ -263,6 +263,61 @@ def test_a_heap_of_points_is_no_line() -> None:
     assert lines.fit(spots, np.zeros(3), options, np.zeros((3, 3)), np.zeros(3)).n_matched == 0
     lines.insert(np.column_stack([np.arange(2.0, 6.0, 0.02), np.full(200, 2.0)]), np.zeros(3))
     assert lines.fit(spots, np.zeros(3), options, np.zeros((3, 3)), np.zeros(3)).n_matched == 8
+
+
+ROOM_MAP = np.concatenate(
+    [np.column_stack([np.arange(-3.0, 3.0, 0.02), np.full(300, 2.0)]), np.column_stack([np.full(200, 3.0), np.arange(-2.0, 2.0, 0.02)])]
+)
+
+
+def test_what_is_of_no_line_does_not_pull() -> None:
+    """A wall that was hidden before, 15 cm behind one that is known, seen by a tenth of the points: they are left out of the pose and of
+    its information. Of a scan of which most is from elsewhere, nothing is left out."""
+    rng, options = np.random.default_rng(0), FitOptions(0.3, 0.005, 0.0, 0.15, 0.45, 12)
+    lines = LineMap(0.3, 0.0, 50.0)
+    lines.insert(ROOM_MAP + 0.005 * rng.normal(size=ROOM_MAP.shape), np.zeros(3))
+    seen = ROOM_MAP[::3] + 0.005 * rng.normal(size=ROOM_MAP[::3].shape)
+    behind = np.column_stack([np.arange(-3.0, -2.0, 0.05), np.full(20, 2.15)])
+    free = 1e-3 * np.eye(3)
+
+    def fit(points: np.ndarray) -> LineFit:
+        return lines.fit(points, np.array([0.02, -0.02, 0.01]), options, free, np.zeros(3))
+
+    alone, both = fit(seen), fit(np.concatenate([seen, behind]))
+    assert both.n_matched > alone.n_matched + 10
+    np.testing.assert_allclose(both.pose, alone.pose, atol=5e-4)
+    np.testing.assert_allclose(both.information, alone.information, rtol=0.02, atol=0.02 * np.abs(alone.information).max())
+    lost = fit(np.concatenate([seen[::8], np.repeat(behind, 6, axis=0)]))
+    assert np.hypot(*lost.pose[:2]) > 0.02
+
+
+def test_information_is_not_lost_to_the_kernel() -> None:
+    """Points that follow their noise tell as much as by least squares, also where the kernel is as narrow as it gets."""
+    rng, free = np.random.default_rng(1), 1e-3 * np.eye(3)
+    lines = LineMap(0.3, 0.0, 50.0)
+    lines.insert(ROOM_MAP, np.zeros(3))
+    seen = ROOM_MAP[::3] + 0.01 * rng.normal(size=ROOM_MAP[::3].shape)
+    narrow, plain = (lines.fit(seen, np.zeros(3), FitOptions(0.3, 0.01, 0.0, k, k, n), free, np.zeros(3)) for k, n in ((0.1, 9), (1e3, 0)))
+    np.testing.assert_allclose(narrow.information, plain.information, rtol=0.03, atol=0.01 * np.abs(plain.information).max())
+
+
+def test_lines_that_are_known_badly_tell_little_of_the_others() -> None:
+    """A sixth of the wall is drawn four times as badly. What lines are off counts as much as it is known, so the good ones decide."""
+    rng, noise = np.random.default_rng(2), Noise(0.005, 0.02)
+    x = np.arange(-3.0, 3.0, 0.02)
+    effective = []
+    for _ in range(60):
+        lines = LineMap(0.3, 0.0, 50.0)
+        sigma = np.where(x < -2.0, 0.02, 0.005)
+        lines.insert(np.column_stack([x, 2.0 + sigma * rng.normal(size=len(x))]), np.zeros(3))
+        scan = np.column_stack([x, 2.0 + 0.005 * rng.normal(size=len(x))])
+        options = FitOptions(0.3, 0.01, noise.sigma_line, 1e3, 1e3, 9, place_part=noise.place_part)
+        found = lines.fit(scan, np.zeros(3), options, np.diag([1e6, 1e-3, 1e-3]), np.zeros(3))
+        effective.append(found.spread.between_freedom)
+        noise.see(found.spread)
+    assert 12.0 < np.mean(effective) < 19.0  # of 20 or 21 groups
+    assert noise.place_part > 0.5
+    assert noise.sigma_line < 0.001
 
 
 def test_a_point_at_the_robots_origin_does_no_harm() -> None:
