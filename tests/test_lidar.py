@@ -138,6 +138,17 @@ def test_a_map_is_not_turned_by_which_of_its_points_are_kept() -> None:
 # --- where the search begins -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("y", [0.36, 0.39, 0.41])
+def test_a_wall_along_the_border_of_cells_is_drawn_where_it_is(y: float) -> None:
+    """A scanner so noisy that the map is full before all is drawn: what a wall has on either side of a border counts as one."""
+    rng, lines, x = np.random.default_rng(0), LineMap(0.4, 0.02, 50.0), np.arange(-3.0, 3.0, 0.02)
+    for _ in range(60):
+        lines.insert(np.column_stack([x, y + 0.04 * rng.normal(size=len(x))]), np.zeros(3))
+    drawn = lines.point_cloud()[:, 1]
+    assert abs(drawn.mean() - y) < 0.004
+    assert 0.03 < drawn.std() < 0.08
+
+
 @pytest.mark.parametrize("off", [(0.5, 0.0, 0.0), (-0.35, 0.35, 0.0), (0.0, 0.0, 0.2), (0.35, -0.35, -0.2)])
 def test_a_guess_half_a_metre_off_converges(off) -> None:
     matcher, drive, _ = mapped(LAB, TOUR[:2500])
@@ -346,7 +357,7 @@ def test_parts_of_a_covariance_are_no_more_than_all_of_it(walls: np.ndarray) -> 
     _, _, found = mapped(walls, rooms.path((1.5, 0.3, 0.0)), start=(0.0, 0.2, 0.4), scanner=rooms.Beams(longest=20.0))
     scale = np.sqrt(np.diag(found.cov))
     for part in (found.tie.cov, found.cov - found.tie.cov):
-        assert np.linalg.eigvalsh(part / np.outer(scale, scale)).min() > -1e-9
+        assert np.linalg.eigvalsh(part / np.outer(scale, scale)).min() > -1e-8
     assert (np.linalg.eigvals(found.tie.kept).real > -1e-9).all()
     assert (np.linalg.eigvals(found.tie.kept).real < 1.0 + 1e-9).all()
 

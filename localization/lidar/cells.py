@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from motion_models.se2 import FloatArray
 
 POINTS_PER_CELL = 64
-_IN_USE_PER_CELL = 40  # of the ages that are in use; the rest is for older visits
+_ENOUGH = 40  # points of the ages that are in use, within half a cell of a point
 _AGE_M = 0.25
 
 Ages = NDArray[np.uint8]
@@ -68,6 +68,26 @@ def _stride(n: int) -> int:  # pragma: no cover
 
 
 @numba.njit(cache=True)
+def _count(
+    cells: NDArray[np.int32], points: NDArray[np.float32], travels: NDArray[np.float32], ages: Ages, x: float, y: float, cell: float
+) -> int:  # pragma: no cover
+    """How many points of these ``ages`` are within half a ``cell`` of (x, y).
+
+    Were they counted cell by cell, a wall along the border of two would be drawn as thick on the one side as on the other, wherever it is.
+    """
+    n = 0
+    for jx in range(math.floor(x / cell - 0.5), math.floor(x / cell + 0.5) + 1):
+        for jy in range(math.floor(y / cell - 0.5), math.floor(y / cell + 0.5) + 1):
+            slot = find_cell(cells, jx, jy)
+            if slot < 0:
+                continue
+            for k in range(cells[slot, 2]):
+                dx, dy = points[slot, k, 0] - x, points[slot, k, 1] - y
+                n += dx * dx + dy * dy < 0.25 * cell * cell and is_used(ages, travels[slot, k])
+    return n
+
+
+@numba.njit(cache=True)
 def insert_points(
     cells: NDArray[np.int32],
     points: NDArray[np.float32],
@@ -96,15 +116,14 @@ def insert_points(
             slot = -1 - slot
             used += 1
             cells[slot, 0], cells[slot, 1] = ix, iy
-        n, n_used, unused, near = cells[slot, 2], 0, -1, False
+        n, unused, near = cells[slot, 2], -1, False
         for k in range(n):
             if not is_used(ages, travels[slot, k]):
                 unused = k
                 continue
-            n_used += 1
             dx, dy = points[slot, k, 0] - x, points[slot, k, 1] - y
             near = near or dx * dx + dy * dy < min_distance * min_distance
-        if near or n_used >= _IN_USE_PER_CELL or (n >= points.shape[1] and unused < 0):
+        if near or (n >= points.shape[1] and unused < 0) or _count(cells, points, travels, ages, x, y, cell) >= _ENOUGH:
             continue
         k = n if n < points.shape[1] else unused
         points[slot, k, 0], points[slot, k, 1] = x, y
