@@ -369,7 +369,7 @@ def fit_points(
             sigmas = _KERNEL_SIGMAS
         elif iteration > 0 and abs(d0) + abs(d1) + abs(d2) < 1e-4:
             iterations = iteration + 1
-    n_on = _spread(source, lines, home, pose, noise, spread)
+    _spread(source, lines, home, pose, noise, spread)
     _parts(source, offsets, lines, pose, noise, final_kernel, sigmas, information, feigned, of_map, old, late)
     return n_matched, n_on, squares
 
@@ -424,13 +424,12 @@ def _spread(
     pose: FloatArray,
     noise: _Noise,
     spread: FloatArray,
-) -> int:  # pragma: no cover
-    """Fills ``spread`` (10,), see `Spread`; returns how many points are on their lines: those beyond three sigmas are of something else.
-    A group ends where the scan leaves a cell."""
+) -> None:  # pragma: no cover
+    """Fills ``spread`` (10,), see `Spread`, by the points that are on their lines. A group ends where the scan leaves a cell."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     line = noise[2] * noise[2]
     spread[:] = 0.0
-    n_on, n, total, squares, place, facing, of_points, shared = 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    n, total, squares, place, facing, of_points, shared = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     weights, weights_squared = 0.0, 0.0
     for i in range(source.shape[0] + 1):
         is_end = i == source.shape[0]
@@ -456,7 +455,6 @@ def _spread(
         if _is_on(lines, i, e, noise):
             of_points += _of_point(lines, i, noise)
             shared += lines[i, 8] / lines[i, 6]
-            n_on += 1
             n += 1
             total += e
             squares += e * e
@@ -469,4 +467,3 @@ def _spread(
         spread[4] *= scale
         spread[5] *= scale
         spread[9] /= weights
-    return n_on
