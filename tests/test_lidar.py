@@ -135,9 +135,6 @@ def test_a_map_is_not_turned_by_which_of_its_points_are_kept() -> None:
     assert abs(np.mean(turned)) < 3.5 * np.std(turned) / math.sqrt(24)
 
 
-# --- where the search begins -------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("y", [0.36, 0.39, 0.41])
 def test_a_wall_along_the_border_of_cells_is_drawn_where_it_is(y: float) -> None:
     """A scanner so noisy that the map is full before all is drawn: what a wall has on either side of a border counts as one."""
@@ -147,6 +144,9 @@ def test_a_wall_along_the_border_of_cells_is_drawn_where_it_is(y: float) -> None
     drawn = lines.point_cloud()[:, 1]
     assert abs(drawn.mean() - y) < 0.004
     assert 0.03 < drawn.std() < 0.08
+
+
+# --- where the search begins -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("off", [(0.5, 0.0, 0.0), (-0.35, 0.35, 0.0), (0.0, 0.0, 0.2), (0.35, -0.35, -0.2)])

@@ -114,8 +114,6 @@ def insert_points(
             if used > cells.shape[0] * 3 // 4:
                 return used, True
             slot = -1 - slot
-            used += 1
-            cells[slot, 0], cells[slot, 1] = ix, iy
         n, unused, near = cells[slot, 2], -1, False
         for k in range(n):
             if not is_used(ages, travels[slot, k]):
@@ -125,6 +123,9 @@ def insert_points(
             near = near or dx * dx + dy * dy < min_distance * min_distance
         if near or (n >= points.shape[1] and unused < 0) or _count(cells, points, travels, ages, x, y, cell) >= _ENOUGH:
             continue
+        if n == 0:
+            used += 1
+            cells[slot, 0], cells[slot, 1] = ix, iy
         k = n if n < points.shape[1] else unused
         points[slot, k, 0], points[slot, k, 1] = x, y
         travels[slot, k] = new_travels[i]

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from localization.consistency import mean_band
+from localization.consistency import mean_band, nees
 from localization.events import Scan
 from localization.lidar import LidarMatcher
 from localization.lidar.kiss import Kiss
@@ -89,12 +89,6 @@ def costs(walls: np.ndarray) -> tuple[float, float, float]:
     return float(np.median(rows[:, 0])), float(np.median(rows[:, 1])), float(np.median(rows[:, 0] / rows[:, 1]))
 
 
-def nees(true: np.ndarray, found: np.ndarray, covs: np.ndarray) -> float:
-    """Mean normalised error squared of poses ``found`` (n, 3) with ``covs`` (n, 3, 3)."""
-    error = se2.log(se2.between(true, found))
-    return float(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covs), error).mean())
-
-
 def registration_nees(walls: np.ndarray, scanner: rooms.Beams | None = None, runs: int = 100) -> np.ndarray:
     """(runs,) mean over the scans of a drive, but for the first ten, which show what is to be expected of scanner and map."""
     way = rooms.path((0.5, 0.4, 0.0), (1.5, 0.3, 0.5), (1.5, 0.3, -0.4), (2.0, -0.3, 0.3), (2.0, 0.2, -0.5))
@@ -103,7 +97,8 @@ def registration_nees(walls: np.ndarray, scanner: rooms.Beams | None = None, run
         rng = np.random.default_rng(seed)
         start = (rng.uniform(-2, 0), rng.uniform(-1, 1), rng.uniform(-3, 3))
         rows = [(pose, one.pose, one.cov) for *_, one, pose in matching(walls, way, seed, start, scanner=scanner) if one is not None]
-        found.append(nees(*(np.array(column[9:]) for column in zip(*rows, strict=True))))
+        true, poses, covs = (np.array(column[9:]) for column in zip(*rows, strict=True))
+        found.append(nees(se2.log(se2.between(true, poses)), covs).mean())
     return np.array(found)
 
 
@@ -115,7 +110,7 @@ def pose_nees(walls: np.ndarray, kind: str, scanner: rooms.Beams = FEW, start=(0
         poses, covs = rooms.at_scans(drive, rooms.results(drive, kind)[kind])
         assert covs is not None
         settled = drive.stamps >= drive.stamps[0] + 2_000_000_000
-        found.append(nees(drive.poses[settled], poses[settled], covs[settled]))
+        found.append(nees(se2.log(se2.between(drive.poses, poses))[settled], covs[settled]).mean())
     return np.array(found)
 
 
