@@ -51,7 +51,7 @@ class Seer:
         self.next: Motion | None = None
 
     def look(self, step, anchor, guess):
-        return None if self.next is None else Sight(self.next, True)
+        return None if self.next is None else Sight(self.next, 1.0)
 
     def recall(self, step, pose, cov):
         return None

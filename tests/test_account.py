@@ -70,9 +70,10 @@ def test_it_is_the_covariance_of_errors_that_are_made() -> None:
         m = m @ kept.T + drawn @ (np.eye(3) - kept).T + draw(fresh)
         K, d = 0.3 * rng.normal(size=(n, 3)), np.eye(3) + 0.1 * rng.normal(size=(3, 3))
         swept = draw(tie.sweep)
-        found = m + draw(total - part) + swept
+        doubt = spd(rng, 3, 0.3) if k % 2 else np.zeros((3, 3))
+        found = m + draw(total - part) + swept + draw(doubt)
         e = e - (e[:, :3] - found) @ d.T @ K.T
-        account.see(K, d, total, tie, 1.0)
+        account.see(K, d, total, tie, doubt)
         account.draw(k != 2)
         if k != 2:
             drawn = e[:, :3] - swept @ (K[:3] @ d).T
@@ -108,7 +109,7 @@ def test_where_no_error_is_shared_it_is_the_filters_own() -> None:
         seen = Motion(se2.compose(delta, se2.exp(1e-2 * rng.normal(size=3))), 1e-5 * np.eye(3))
         for ekf, tie in ((one, anew), (other, None)):
             ekf.predict(step)
-            ekf.measure_motion(seen, True, tie)
+            ekf.measure_motion(seen, 1.0, tie)
             ekf.set_anchor()
     np.testing.assert_array_equal(one.covariance, other.covariance)
     np.testing.assert_allclose(one.errors, one.covariance, rtol=1e-6, atol=1e-14)

@@ -19,6 +19,7 @@ from localization.errors import EstimatorError
 from localization.estimators.ekf import ANCHOR, BIAS, CLOCK, PARAMS, POSE, START, Ekf, EkfConfig
 from localization.events import Scan, WheelSample
 from localization.gyro import Turn
+from localization.lidar import MapTie, Registration
 from localization.residuals import motion_residual, turn_residual
 from localization.steps import Step, Stepper, steps
 from motion_models import se2
@@ -186,7 +187,7 @@ def one_step(scale):
     ekf.set_anchor()
     ekf.predict(step)
     ekf.measure_turn(turn)
-    ekf.measure_motion(measured, True)
+    ekf.measure_motion(measured, 1.0)
     a, b, bias, cov = least_squares(step, measured, turn, prior, 8)
     _, _, _, cov_before = least_squares(step, measured, turn, prior, 1)
     np.testing.assert_array_equal(ekf.anchor, ekf.start)
@@ -236,7 +237,7 @@ def test_covariance_stays_one_over_thousands_of_random_steps():
             measured = se2.compose(
                 se2.between(ekf.anchor, ekf.pose), se2.exp(noise * rng.normal(size=3) * (1 if rng.random() < 0.95 else 30))
             )
-            ekf.measure_motion(Motion(measured, np.diag(noise**2)), bool(rng.integers(2)))
+            ekf.measure_motion(Motion(measured, np.diag(noise**2)), rng.random())
             ekf.set_anchor()
         if i % 20 == 0:
             check_covariance(ekf.covariance)
@@ -291,7 +292,7 @@ def test_standing_teaches_nothing_of_the_model():
     for step in standing(20.0):
         ekf.predict(step)
         ekf.measure_standing()
-        ekf.measure_motion(Motion(np.array([1e-3, -1e-3, 1e-3]), LIDAR), True)
+        ekf.measure_motion(Motion(np.array([1e-3, -1e-3, 1e-3]), LIDAR), 1.0)
         ekf.set_anchor()
     np.testing.assert_array_equal(ekf.covariance[PARAMS:, PARAMS:], before)
     assert not ekf.correction.any()
@@ -305,7 +306,7 @@ def test_a_wheel_that_slips_gives_way_to_a_lidar_that_is_sure():
     ekf.set_anchor()
     ekf.predict(step_of([0.3, 0.0, 0.2], np.diag([1e-4, 1e-4, 1e-4])))
     seen = np.array([0.02, 0.0, 0.0])
-    nis = ekf.measure_motion(Motion(seen, LIDAR), True)
+    nis = ekf.measure_motion(Motion(seen, LIDAR), 1.0)
     assert nis > ekf.gate
     off = se2.log(se2.between(seen, ekf.pose))
     assert (np.abs(off) < 3.0 * np.sqrt(np.diag(LIDAR))).all()
@@ -319,7 +320,7 @@ def test_a_lidar_that_is_lost_gives_way_to_wheels():
     told, cov = np.array([0.1, 0.0, 0.02]), np.diag([1e-4, 1e-4, 1e-4])
     ekf.predict(step_of(told, cov))
     before = ekf.covariance[POSE, POSE].copy()
-    nis = ekf.measure_motion(Motion(np.array([2.5, -1.0, 0.8]), LIDAR), False)
+    nis = ekf.measure_motion(Motion(np.array([2.5, -1.0, 0.8]), LIDAR), 0.0)
     assert nis > ekf.gate
     off = se2.log(se2.between(told, ekf.pose))
     assert (np.abs(off) < 3.0 * np.sqrt(np.diag(before))).all()
@@ -328,20 +329,64 @@ def test_a_lidar_that_is_lost_gives_way_to_wheels():
     assert np.trace(ekf.covariance[POSE, POSE]) > 0.9 * np.trace(before)
 
 
-@pytest.mark.parametrize("trusted", [True, False])
-def test_inside_the_gate_both_count_alike(trusted):
-    def run(can_slip):
+def test_inside_the_gate_both_count_alike():
+    def run(trust):
         ekf = filter_at()
         ekf.set_anchor()
         ekf.predict(step_of([0.1, 0.0, 0.02]))
-        nis = ekf.measure_motion(Motion(np.array([0.11, 0.005, 0.01]), LIDAR), can_slip)
+        nis = ekf.measure_motion(Motion(np.array([0.11, 0.005, 0.01]), LIDAR), trust)
         return nis, ekf
 
-    nis, ekf = run(trusted)
+    nis, ekf = run(1.0)
     assert nis < ekf.gate
-    _, other = run(not trusted)
+    _, other = run(0.0)
     np.testing.assert_array_equal(ekf.pose, other.pose)
     np.testing.assert_array_equal(ekf.covariance, other.covariance)
+
+
+def contradicted(metres, trust):
+    """A filter whose LiDAR says ``metres`` [m] more to the left than its wheels."""
+    ekf = filter_at()
+    ekf.set_anchor()
+    ekf.predict(step_of([0.1, 0.0, 0.02], np.diag([4e-5, 4e-5, 4e-6])))
+    told = ekf.pose
+    nis = ekf.measure_motion(Motion(se2.compose(told, np.array([0.0, metres, 0.0])), LIDAR), trust)
+    return nis, se2.between(told, ekf.pose), ekf.covariance[POSE, POSE]
+
+
+@pytest.mark.parametrize("trust", [0.05, 0.3, 0.5, 0.9])
+def test_who_contradicts_is_believed_by_as_much_as_is_known(trust):
+    """Half a metre apart, which of both is right is all there is to know."""
+    nis, off, cov = contradicted(0.5, trust)
+    assert nis > 1000.0
+    np.testing.assert_allclose(off, [0.0, 0.5 * trust, 0.0], atol=0.01)
+    assert math.sqrt(cov[1, 1]) == pytest.approx(0.5 * math.sqrt(trust * (1.0 - trust)), rel=0.03)
+
+
+@pytest.mark.parametrize("trust", [0.0, 0.3, 0.7, 1.0])
+def test_no_edge_decides_between_two_places(trust):
+    """Wherever the LiDAR says that the robot is, and whatever it is trusted, a hair's breadth changes little."""
+    apart = np.linspace(0.01, 0.2, 400)
+    found = np.array([contradicted(metres, trust)[1][1] for metres in apart])
+    nis = contradicted(apart[0], trust)[0], contradicted(apart[-1], trust)[0]
+    assert nis[0] < chi2.ppf(EkfConfig().gate_probability, 3) < nis[1]
+    assert np.abs(np.diff(found)).max() < 4.0 * (apart[1] - apart[0])
+    trusts = np.linspace(0.0, 1.0, 400)
+    found = np.array([contradicted(0.1, t)[1][1] for t in trusts])
+    assert np.abs(np.diff(found)).max() < 0.01
+    assert (np.diff(found) > 0.0).all()
+
+
+def test_how_far_a_scan_is_trusted_has_no_edge():
+    def trust(n_matched, n_points):
+        nothing = np.zeros((3, 3))
+        return Registration(np.zeros(3), np.eye(3), n_points, n_matched, 0.0, MapTie(nothing, nothing), nothing).trust
+
+    found = [trust(n, 1000) for n in range(1001)]
+    assert (np.diff(found) > 0.0).all()
+    assert np.max(np.diff(found)) < 0.01
+    assert found[0] < 0.1 < 0.9 < found[500] < 0.99 < found[1000]
+    assert trust(9, 9) < 0.5  # all of next to nothing
 
 
 # --- what the motion does not show is not learned
@@ -353,7 +398,7 @@ def test_rotation_scaling_is_not_learned_by_driving_straight():
     before = np.diag(ekf.covariance)[PARAMS:].copy()
     for step in drive(30.0, lambda t: (3.0 * t + math.sin(t), 3.0 * t + math.sin(t))):
         ekf.predict(step)
-        ekf.measure_motion(Motion(se2.compose(step.predicted.delta, se2.exp(np.sqrt(np.diag(LIDAR)) * rng.normal(size=3))), LIDAR), True)
+        ekf.measure_motion(Motion(se2.compose(step.predicted.delta, se2.exp(np.sqrt(np.diag(LIDAR)) * rng.normal(size=3))), LIDAR), 1.0)
         ekf.set_anchor()
         ekf.measure_turn(Turn(0.001 * rng.normal(), 4e-7, 0.1))
     assert not ekf.correction.any()
@@ -368,7 +413,7 @@ def test_what_was_learned_in_a_bend_does_not_drift_on_the_straight():
         for step in found:
             ekf.predict(step)
             ekf.measure_motion(
-                Motion(se2.compose(step.predicted.delta, se2.exp(np.sqrt(np.diag(LIDAR)) * rng.normal(size=3))), LIDAR), True
+                Motion(se2.compose(step.predicted.delta, se2.exp(np.sqrt(np.diag(LIDAR)) * rng.normal(size=3))), LIDAR), 1.0
             )
             ekf.set_anchor()
 
@@ -413,7 +458,7 @@ class World:
             turns.append(ekf.measure_turn(Turn(angle + bias * dt + math.sqrt(variance) * rng.normal(), variance, dt)))
             seen = se2.compose(se2.between(anchor, pose), se2.exp(np.sqrt(np.diag(LIDAR)) * rng.normal(size=3)))
             innovations.append(se2.log(se2.between(se2.between(ekf.anchor, ekf.pose), seen)))
-            nis.append(ekf.measure_motion(Motion(seen, LIDAR), True))
+            nis.append(ekf.measure_motion(Motion(seen, LIDAR), 1.0))
             ekf.set_anchor()
             anchor = pose
         error = np.concatenate([se2.log(se2.between(ekf.pose, pose)), [bias - ekf.bias, clock - ekf.clock_offset], params - ekf.correction])
@@ -491,7 +536,7 @@ def test_no_input_makes_the_state_non_finite(data):
         "covariance": lambda: ekf.predict(step_of([0.1, 0, 0], np.diag(np.abs(draw(3))))),
         "clock": lambda: ekf.predict(step_of([0.1, 0, 0], d_clock=draw(3))),
         "turn": lambda: ekf.measure_turn(Turn(*np.abs(draw(3)).tolist())),
-        "lidar": lambda: ekf.measure_motion(Motion(draw(3), np.diag(np.abs(draw(3)))), data.draw(st.booleans())),
+        "lidar": lambda: ekf.measure_motion(Motion(draw(3), np.diag(np.abs(draw(3)))), data.draw(st.floats(0.0, 1.0))),
     }
     for name in data.draw(st.lists(st.sampled_from(sorted(calls)), min_size=1, max_size=4)):
         with contextlib.suppress(EstimatorError):
@@ -505,6 +550,6 @@ def test_nan_is_told_with_its_moment():
     with pytest.raises(EstimatorError, match=str(T0 + S // 10)):
         ekf.predict(step_of([np.nan, 0.0, 0.0]))
     with pytest.raises(EstimatorError, match="LiDAR"):
-        ekf.measure_motion(Motion(np.array([0.0, np.nan, 0.0]), LIDAR), True)
+        ekf.measure_motion(Motion(np.array([0.0, np.nan, 0.0]), LIDAR), 1.0)
     with pytest.raises(EstimatorError, match="noise"):
-        filter_at().measure_motion(Motion(np.zeros(3), np.zeros((3, 3))), True)
+        filter_at().measure_motion(Motion(np.zeros(3), np.zeros((3, 3))), 1.0)

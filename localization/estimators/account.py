@@ -70,17 +70,18 @@ class Account:
         """The filter corrected itself with the gain ``K`` (n, r) by what has no part in the map."""
         self._P = corrected(self._P, K, H, R)
 
-    def see(self, K: FloatArray, d_pose: FloatArray, cov: FloatArray, tie: MapTie, doubt: float) -> None:
+    def see(self, K: FloatArray, d_pose: FloatArray, cov: FloatArray, tie: MapTie, doubt: FloatArray) -> None:
         """The filter corrected itself with the gain ``K`` (n, 3) by a scan in the map, found with ``cov`` (3, 3) by scan and map.
 
-        ``d_pose`` (3, 3): of the residual by the pose; ``doubt``: the factor on the measurement's covariance where it was not believed.
+        ``d_pose`` (3, 3): of the residual by the pose; ``doubt`` (3, 3): what was added to the measurement's
+        covariance where it was not quite believed.
         """
         information = inverse(cov)
         if self._held is not None:
             # old lines that did not hold the last scan were drawn not long ago: the error of the map as it was is none of theirs
             tie = MapTie(cov @ _common(information @ tie.kept, self._held), tie.cov, tie.sweep)
         self._held = information
-        noise = doubt * (cov - tie.cov + tie.sweep)
+        noise = cov - tie.cov + tie.sweep + doubt
         met, H, R, self._swept = _met(self._P, K, d_pose, noise, tie.kept, tie.fresh, tie.sweep)
         self._P = corrected(met, K, H, R)
 

@@ -15,6 +15,7 @@ from scipy.stats import chi2
 
 from localization.errors import EstimatorError
 from localization.estimators.account import Account
+from localization.estimators.contradiction import admit_doubt
 from localization.estimators.error_states import cloned, inverse, is_usable, motion_covariance, moved, symmetric
 from localization.estimators.revisit_update import revisit_update
 from localization.gyro import Turn
@@ -170,38 +171,34 @@ class Ekf:
         error, H = _relative(self._start, self.pose, np.zeros(3), self._since_start, START.start, self._size)
         return self._update(error, H, self._still)
 
-    def measure_motion(self, measured: Motion, can_slip: bool, tie: MapTie | None = None) -> float:
+    def measure_motion(self, measured: Motion, trust: float, tie: MapTie | None = None) -> float:
         """The LiDAR's motion since the last scan.
 
-        Where it contradicts the prediction, one of the two is wrong. ``can_slip``: the LiDAR is sure of itself, so the wheels slipped, and
-        the prediction's covariance grows until both agree; else the LiDAR is, and its measurement's grows. ``tie``: the map by which it
-        was measured; without one, errors of scans are taken as independent.
+        Where it contradicts the prediction, it is right with the probability ``trust``, and the wheels slipped; else it is wrong: see
+        `admit_doubt`. ``tie``: the map by which it was measured; without one, errors of scans are taken as independent.
         """
         error, H = _relative(self._anchor, self.pose, measured.delta, self._since_anchor, ANCHOR.start, self._size)
         d_pose = H[:, POSE].copy()
-        R = d_pose @ measured.cov @ d_pose.T
+        cov = measured.cov
+        R = d_pose @ cov @ d_pose.T
         S = H @ self._filter.P @ H.T + R
         _check("the motion that the LiDAR measured", error, S)
         nis = float(error @ inverse(S) @ error)
-        limit = self._gate
         if tie is not None and self._account is None:
             drawn = np.zeros((3, self._size))
             drawn[:, ANCHOR] = se2.adjoint(se2.inverse(self._since_anchor))
             self._account = Account(self._filter.P, drawn, self._gate, self._has_mark)
-        doubt = 1.0
-        if nis > limit:
-            if can_slip:
-                slip = (nis / limit) * np.outer(error, error)
-                self._filter.P[POSE, POSE] += slip
-                if self._account is not None:
-                    self._account.add(POSE, slip)
-            else:
-                doubt = (nis / limit) ** 2
-        self._correct(error, H, doubt * R)
+        if nis > self._gate:
+            slip, cov = admit_doubt(error, nis, self._gate, trust, S, cov)
+            self._filter.P[POSE, POSE] += slip
+            if self._account is not None:
+                self._account.add(POSE, slip)
+            R = d_pose @ cov @ d_pose.T
+        self._correct(error, H, R)
         if self._account is not None and tie is not None:
-            self._account.see(self._filter.K, d_pose, measured.cov, tie, doubt)
+            self._account.see(self._filter.K, d_pose, measured.cov, tie, cov - measured.cov)
         elif self._account is not None:
-            self._account.correct(self._filter.K, H, doubt * R)
+            self._account.correct(self._filter.K, H, R)
         return nis
 
     def measure_revisit(self, known: Revisit) -> None:

@@ -82,7 +82,7 @@ class EkfFusion:
         seen = witness.look(step, ekf.anchor, ekf.pose)
         if seen is not None:
             self._counts["matched"] += 1
-            nis = ekf.measure_motion(seen.motion, seen.is_trusted, seen.tie)
+            nis = ekf.measure_motion(seen.motion, seen.trust, seen.tie)
             self._counts["contradictions"] += nis > ekf.gate
         if witness.can_begin:
             self._to_settle = step, seen is not None

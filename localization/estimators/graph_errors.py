@@ -34,7 +34,7 @@ class GraphErrors:
             self._ekf.measure_standing()
 
     def see(self, sight: Sight) -> None:
-        self._ekf.measure_motion(sight.motion, sight.is_trusted, sight.tie)
+        self._ekf.measure_motion(sight.motion, sight.trust, sight.tie)
 
     def revisit(self, known: Revisit) -> None:
         self._ekf.measure_revisit(known)

@@ -19,6 +19,7 @@ from scipy.stats import chi2
 
 from localization.errors import EstimatorError
 from localization.estimators.base import NO_POINTS, Estimate, mean_twist
+from localization.estimators.contradiction import admit_doubt
 from localization.estimators.ekf import EkfConfig
 from localization.estimators.graph_errors import GraphErrors
 from localization.estimators.graph_factors import Pairs, whitening
@@ -336,18 +337,16 @@ class GraphFusion:
     def _judge(self, ahead: Ahead, pending: Link, sight: Sight) -> tuple[float, Ahead]:
         """Weigh wheels and LiDAR against each other: the normalised innovation squared, and the new node by both.
 
-        Where they contradict, one is wrong: the covariance of the one that is not sure of itself grows until they agree.
+        Where they contradict, one is wrong: see `admit_doubt`.
         """
         measured, mount = sight.motion, self._slow.shown(sight.motion)
-        error, nis = innovation(self._newest, ahead, pending, measured, mount)
+        error, error_cov, nis = innovation(self._newest, ahead, pending, measured, mount)
         if math.isnan(nis):
             raise EstimatorError(_NOT_FINITE)
         if nis > self._gate:
             self._counts["contradictions"] += 1
-            if sight.is_trusted:
-                ahead = self._extend(replace(pending, cov=pending.cov + (nis / self._gate) * np.outer(error, error)))
-            else:
-                measured = Motion(measured.delta, measured.cov * (nis / self._gate) ** 2)
+            slip, cov = admit_doubt(error, nis, self._gate, sight.trust, error_cov, measured.cov)
+            ahead, measured = self._extend(replace(pending, cov=pending.cov + slip)), Motion(measured.delta, cov)
         try:
             return nis, self._window.see(ahead, measured, mount)
         except SingularError as error_:

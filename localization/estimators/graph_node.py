@@ -108,15 +108,16 @@ def _ahead(pair: Pairs, pose: FloatArray, slow: FloatArray, root: FloatArray, co
     return Ahead(Node(pose, slow, root[:, :-1].copy()), pair, conditionals[0])
 
 
-def innovation(node: Node, ahead: Ahead, link: Link, motion: Motion, mount: FloatArray) -> tuple[FloatArray, float]:
-    """How far the ``motion`` that a LiDAR saw is off the way by ``link`` from ``node`` to what is ``ahead``: (3,), and normalised.
+def innovation(node: Node, ahead: Ahead, link: Link, motion: Motion, mount: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """How far the ``motion`` that a LiDAR saw is off the way by ``link`` from ``node`` to what is ``ahead``: (3,), its covariance (3, 3), and
+    normalised.
 
     Squared and normalised it is NaN where there is no such number. ``mount`` (3, m): what of the LiDAR's mount shows.
     """
-    there, error = ahead.node, np.empty(3)
+    there, error, cov = ahead.node, np.empty(3), np.zeros((3, 3))
     slow_cov = np.ascontiguousarray(there.covariance[3:, 3:])
-    nis = _innovation(node.pose, there.pose, there.slow, slow_cov, link.cov, link.d_slow, motion.delta, motion.cov, mount, error)
-    return error, nis
+    nis = _innovation(node.pose, there.pose, there.slow, slow_cov, link.cov, link.d_slow, motion.delta, motion.cov, mount, error, cov)
+    return error, cov, nis
 
 
 @numba.njit(cache=True)
@@ -180,15 +181,15 @@ def _innovation(
     seen_cov: FloatArray,
     mount: FloatArray,
     error: FloatArray,
+    S: FloatArray,
 ) -> float:  # pragma: no cover
-    """Fill ``error`` (3,); ``slow`` (m,) and ``slow_cov`` (m, m) are those of node b."""
+    """Fill ``error`` (3,) and its covariance ``S`` (3, 3), zero before; ``slow`` (m,) and ``slow_cov`` (m, m) are those of node b."""
     d_a, d_b, d_mount, d_seen = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     off = seen_residual(triple(pose_a), triple(pose_b), triple(seen), apply(mount, slow), d_a, d_b, d_mount)
     error[0], error[1], error[2] = off
     se2.fill_right_jacobian_inverse(off, d_seen)
     by_slow = product(d_b, d_slow)
     add_product(by_slow, d_mount, mount)
-    S = np.zeros((3, 3))
     add_spread(S, d_b, link_cov)
     add_spread(S, by_slow, slow_cov)
     add_spread(S, d_seen, seen_cov)

@@ -26,8 +26,8 @@ class Sight:
     """What was seen of the motion since the last scan."""
 
     motion: Motion
-    is_trusted: bool
-    """The witness is sure of itself: where others contradict it, they are wrong."""
+    trust: float
+    """How probable it is that the witness is right where others contradict it."""
     tie: MapTie | None = None
     """The map by which it was measured; None where there is none."""
 
@@ -97,15 +97,16 @@ class ScanWitness:
         if not self._is_good:
             return None
         gain = np.zeros(3)
-        if found.is_trusted and step.start_ns == self._last_ns and step.duration > 0.0:
+        if step.start_ns == self._last_ns and step.duration > 0.0:
             off = se2.log(se2.between(se2.compose(anchor, step.predicted.delta), found.pose))
-            gain = slip.measure(off / step.duration, np.diag(found.cov) / step.duration**2)
+            variance = np.diag(found.cov) / found.trust + (1.0 - found.trust) * off**2
+            gain = slip.measure(off / step.duration, variance / step.duration**2)
             if sweep.shift(slip.rate - rate) > self._matcher.config.max_shift_m:  # the sweep looked otherwise than was thought
                 found = self._matcher.refine(sweep.at_stamp(step.twist + slip.rate), sweep.is_planar, found.pose, sweep.offsets) or found
                 rate = slip.rate
         swept = self._swept(step, found.lateness, sweep.lateness, gain, change, slip.rate - rate)
         tie = replace(found.tie, sweep=swept)
-        return Sight(Motion(se2.between(anchor, found.pose), found.cov), found.is_trusted, tie)
+        return Sight(Motion(se2.between(anchor, found.pose), found.cov), found.trust, tie)
 
     def _swept(self, step: Step, B: FloatArray, late: float, gain: FloatArray, change: FloatArray, missed: FloatArray) -> FloatArray:
         """(3, 3) what a motion within the sweep other than was thought does to the pose.

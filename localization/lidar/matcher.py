@@ -18,6 +18,7 @@ from motion_models import se2
 from motion_models.se2 import FloatArray
 
 _FEW_POINTS = 10
+_EVEN, _EVEN_SIGMA = 0.25, 0.1  # part of a scan's points on lines of the map with which it is as probable that the pose is right as not
 _DEGENERATE = 0.02  # smaller over larger variance of the position; rooms: 0.2 and more
 _SURPRISE = 0.05
 _APART_M = 1e-4  # scans drawn on one spot are told apart by this
@@ -97,6 +98,13 @@ class Registration:
     lateness: FloatArray
     """(3, 3) [s] how long after the stamp that was seen which fixes the pose: a twist in the sweep that is off by d moves it by this
     times d."""
+
+    @property
+    def trust(self) -> float:
+        """How probable it is that the pose is right where something else contradicts it: that grows with the part of what is seen that is
+        in the map. Within 0 and 1, both excluded."""
+        share = self.n_matched / max(self.n_points, _FEW_POINTS / _EVEN)
+        return 1.0 / (1.0 + math.exp((_EVEN - share) / _EVEN_SIGMA))
 
     @property
     def is_trusted(self) -> bool:
