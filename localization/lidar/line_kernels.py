@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from localization.lidar.cells import Ages, find_cell, is_used
 from motion_models.se2 import FloatArray
 
-_MIN_NEIGHBOURS = 4
+_TOO_FEW = 3  # points make no line, from one more on they do
+_MIN_GROUP = 4
 _KERNEL_SIGMAS = 5.0  # of a point's distance from its line: the kernel's scale at last, beyond which a point is of something else
 _MAX_SIGMAS = 3.0  # of a point's distance from its line, else it is not of it; of its noise: neighbours that scatter more are of two lines
+_EDGE = 0.2  # of the neighbourhood's squared radius: from here on its points count less
 _STALE = 0.02  # of the neighbourhood's radius: points that moved farther look for their lines again
 _SAME = 0.05  # of the same: points that are nearer to each other look once for both
 _Noise = tuple[float, float, float, float]  # sigma of a point, the same along its beam, sigma of a line, `FitOptions.place_part`
@@ -45,11 +47,14 @@ def _gather(
 def _sums(
     px: FloatArray, py: FloatArray, travels: FloatArray, x: float, y: float, radius: float, since: float
 ) -> tuple[float, float, float, float, float, float, float, float]:  # pragma: no cover
-    """Of the points within ``radius`` of (x, y): how many, how many of them since, and sums of x, y, xx, xy, yy and travelled distance."""
+    """Of the points within ``radius`` of (x, y): how many, how many of them since, and sums of x, y, xx, xy, yy and travelled distance.
+
+    Those by the edge count in part, so that none comes in or goes at once where (x, y) moves."""
     m, new, sx, sy, sxx, sxy, syy, st = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    edge, ramp = radius * radius, 1.0 / (_EDGE * radius * radius)
     for k in range(px.shape[0]):
         qx, qy = px[k] - x, py[k] - y
-        w = 1.0 if qx * qx + qy * qy < radius * radius else 0.0
+        w = max(min((edge - (qx * qx + qy * qy)) * ramp, 1.0), 0.0)
         wx, wy = w * qx, w * qy
         m += w
         sx += wx
@@ -65,22 +70,25 @@ def _sums(
 @numba.njit(cache=True)
 def _line(
     near: FloatArray, n_near: int, x: float, y: float, radius: float, most_thin: float, least_wide: float, since: float
-) -> tuple[int, float, float, float, float, float, float, float, float]:  # pragma: no cover
+) -> tuple[float, float, float, float, float, float, float, float, float, float]:  # pragma: no cover
     """The line of the points around (x, y): how many they are, 0 where they make none; its normal, the distance of (x, y) from it along
-    the normal, the variance of the points across it and along it, how far along it their mean is, their mean travelled distance, and the
-    part of them that came ``since``."""
+    the normal, the variance of the points across it and along it, how far along it their mean is, their mean travelled distance, the
+    part of them that came ``since``, and how far they are from making none, from 0 to 1: it is little by little that a line becomes one.
+    """
     m, new, sx, sy, sxx, sxy, syy, st = _sums(near[0, :n_near], near[1, :n_near], near[2, :n_near], x, y, radius, since)
-    if m < _MIN_NEIGHBOURS:
-        return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    if m <= _TOO_FEW:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     mx, my = sx / m, sy / m
     cxx, cxy, cyy = sxx / m - mx * mx, sxy / m - mx * my, syy / m - my * my
     trace, split = cxx + cyy, math.hypot(cxx - cyy, 2.0 * cxy)
     wide, thin = 0.5 * (trace + split), max(0.5 * (trace - split), 0.0)
-    if wide < least_wide or thin > min(_MAX_LINE_RATIO * wide, most_thin):
-        return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    limit = min(_MAX_LINE_RATIO * wide, most_thin)
+    if wide <= least_wide or thin >= limit:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    good = min(m - _TOO_FEW, 1.0) * min(wide / least_wide - 1.0, 1.0) * min(2.0 * (1.0 - thin / limit), 1.0)
     angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
     nx, ny = -math.sin(angle), math.cos(angle)
-    return int(m), nx, ny, -(nx * mx + ny * my), thin, wide, ny * mx - nx * my, st / m, new / m
+    return m, nx, ny, -(nx * mx + ny * my), thin, wide, ny * mx - nx * my, st / m, new / m, good
 
 
 @numba.njit(cache=True)
@@ -117,7 +125,7 @@ def compare_points(
         ix, iy = math.floor(x / cell), math.floor(y / cell)
         if ix != at_x or iy != at_y:
             at_x, at_y, n_near = ix, iy, _gather(cells, points, travels, ages, ix, iy, near)
-        m, _, _, e, _, _, _, travel, _ = _line(near, n_near, x, y, radius, math.inf, _LEAST_WIDE, math.inf)
+        m, _, _, e, _, _, _, travel, _, _ = _line(near, n_near, x, y, radius, math.inf, _LEAST_WIDE, math.inf)
         errors[i], seen[i] = (abs(e), travel) if m else _nearest(near, n_near if any_point else 0, x, y, radius)
 
 
@@ -138,10 +146,10 @@ def _associate(
     home: NDArray[np.int64],
     lines: FloatArray,
 ) -> None:  # pragma: no cover
-    """Fills ``lines`` (N, 11) for the points ``source`` (N, 2) at ``pose``: how many points make the line (0: none), its normal, a point on
+    """Fills ``lines`` (N, 12) for the points ``source`` (N, 2) at ``pose``: how many points make the line (0: none), its normal, a point on
     it, the variance of its place, how many of ``source`` are in its cell, ``home`` (N,), below 0 where the map has none, the part of
     the line's points that came ``since``, how many of ``source`` meet the same line's points, the squared cosine between its normal
-    and the beam, and the variance of its direction.
+    and the beam, the variance of its direction, and how good a line it is, from 0 to 1.
 
     Lines are of the map's points within ``radius``, so lines that are d apart along a wall share the part 1 - d / (2 radius) of them, and
     their errors are as much alike: the points of each neighbouring cell count for that part, from their mean."""
@@ -163,7 +171,7 @@ def _associate(
             lines[i] = lines[i - 1]
         else:
             last_x, last_y = x, y
-            m, nx, ny, e, thin, wide, along, _, new = _line(near, n_near, x, y, radius, most_thin, least_wide, since)
+            m, nx, ny, e, thin, wide, along, _, new, good = _line(near, n_near, x, y, radius, most_thin, least_wide, since)
             lines[i, 0] = m
             if m:
                 lines[i, 1], lines[i, 2], lines[i, 3], lines[i, 4] = nx, ny, x - e * nx, y - e * ny
@@ -172,6 +180,7 @@ def _associate(
                 center = thin / (m - 2.0)
                 turn = center / wide  # of a regression: beside the points' centre, the line's direction counts, too
                 lines[i, 5], lines[i, 7], lines[i, 9], lines[i, 10] = center + along * along * turn, new, facing, turn
+                lines[i, 11] = good
         home[i] = slot
         if slot >= 0:
             hits[slot] += 1
@@ -266,7 +275,7 @@ def _weigh(
     line, place = lines[i, 6] * sigma_line * sigma_line, lines[i, 8] * place_part * lines[i, 5]
     variance = _of_point(lines, i, noise) + line + place
     robust = 1.0 + e * e / min(kernel * kernel, sigmas * sigmas * _of_distance(lines, i, noise))
-    return 1.0 / (variance * robust * robust), robust, (line + place) / variance
+    return lines[i, 11] / (variance * robust * robust), robust, (line + place) / variance
 
 
 @numba.njit(cache=True)
@@ -334,7 +343,7 @@ def fit_points(
     neighbourhood since they were: near the end, they stay.
     """
     noise = sigma_point, sigma_beam, sigma_line, place_part
-    home, lines = np.empty(source.shape[0], np.int64), np.empty((source.shape[0], 11))
+    home, lines = np.empty(source.shape[0], np.int64), np.zeros((source.shape[0], 12))
     reach, moved, sigmas, n_matched, n_on, squares = 0.0, math.inf, math.inf, 0, 0, 0.0
     for i in range(source.shape[0]):
         reach = max(reach, math.hypot(source[i, 0], source[i, 1]))
@@ -434,7 +443,7 @@ def _spread(
     for i in range(source.shape[0] + 1):
         is_end = i == source.shape[0]
         if n and (is_end or home[i] != home[i - 1]):
-            if n >= _MIN_NEIGHBOURS:
+            if n >= _MIN_GROUP:
                 within = squares - total * total / n
                 spread[0] += within
                 spread[1] += n - 1
