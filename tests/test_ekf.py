@@ -412,9 +412,7 @@ def test_what_was_learned_in_a_bend_does_not_drift_on_the_straight():
     def go(found):
         for step in found:
             ekf.predict(step)
-            ekf.measure_motion(
-                Motion(se2.compose(step.predicted.delta, se2.exp(np.sqrt(np.diag(LIDAR)) * rng.normal(size=3))), LIDAR), 1.0
-            )
+            ekf.measure_motion(Motion(se2.compose(step.predicted.delta, se2.exp(np.sqrt(np.diag(LIDAR)) * rng.normal(size=3))), LIDAR), 1.0)
             ekf.set_anchor()
 
     go(winding_steps(20.0))

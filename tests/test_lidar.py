@@ -302,6 +302,30 @@ def test_what_is_of_no_line_does_not_pull() -> None:
     assert np.hypot(*lost.pose[:2]) > 0.02
 
 
+def test_a_fit_does_not_hang_on_single_points_of_the_map() -> None:
+    """Few points, and crates among them: where the pose moves by a hair, what it is drawn to moves little."""
+
+    def points(walls: np.ndarray, n: int) -> np.ndarray:
+        ends, lengths = walls[:, :4], np.hypot(walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1])
+        which = rng.choice(len(walls), n, p=lengths / lengths.sum())
+        on_walls = ends[which, :2] + rng.random((n, 1)) * (ends[which, 2:] - ends[which, :2])
+        return np.asarray(on_walls + 0.02 * rng.normal(size=(n, 2)))
+
+    options, free, jumps = FitOptions(0.6, 0.02, 0.005, 0.15, 0.45, 0), 1e-9 * np.eye(3), []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        crates = [world.box(x, y, x + 0.3, y + 0.3) for x, y in rng.uniform(-1.2, 1.2, (6, 2)) * [6.0, 1.0]]
+        walls, lines, drawn_to = np.concatenate([world.box(-9.0, -1.5, 9.0, 1.5), *crates]), LineMap(0.6, 0.03, 100.0), []
+        lines.insert(points(walls, 300), np.zeros(3))
+        seen = points(walls, 120)
+        for x in np.arange(0.0, 0.02, 2e-5):
+            fit = lines.fit(seen, np.array([x, 0.3 * x, 0.1 * x]), options, free, np.zeros(3))
+            drawn_to.append(np.linalg.solve(fit.curvature, fit.gradient) / np.sqrt(np.diag(np.linalg.inv(fit.information))))
+        jumps.append(np.abs(np.diff(drawn_to, axis=0)).max())
+    assert np.mean(jumps) < 0.15  # sigmas
+    assert np.max(jumps) < 0.5
+
+
 def test_information_is_not_lost_to_the_kernel() -> None:
     """Points that follow their noise tell as much as by least squares, also where the kernel is as narrow as it gets."""
     rng, free = np.random.default_rng(1), 1e-3 * np.eye(3)

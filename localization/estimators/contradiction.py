@@ -1,8 +1,8 @@
 """Two motions that contradict each other: wheels and LiDAR cannot both be right, and which is wrong is known with some probability only.
 
-The estimate is then that of a mixture of both cases: its mean lies between them, and its covariance is as wide as they are apart (Bar-Shalom,
-Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001, sec. 1.4.16). So no threshold decides between two places
-that are far from each other, and the next scan that says the same finds an estimate that is open for it.
+The estimate is then that of a mixture of both cases: its mean lies between them, and its covariance is as wide as they are apart
+(Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001, sec. 1.4). So no threshold decides between
+two places that are far from each other, and the next scan that says the same finds an estimate that is open for it.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ def admit_doubt(
 ) -> tuple[FloatArray, FloatArray]:
     """What is added to the covariance (3, 3) of the wheels' motion, and the covariance (3, 3) to be taken for the LiDAR's.
 
-    The motions are ``error`` (3,) apart, with ``innovation_cov`` (3, 3) if both are right, normalised and squared ``nis``, which is more than
-    the ``gate``; with the probability ``trust`` the LiDAR's is right, whose covariance was said to be ``seen_cov`` (3, 3).
+    The motions are ``error`` (3,) apart, with ``innovation_cov`` (3, 3) if both are right, normalised and squared ``nis``, more than the
+    ``gate``; with the probability ``trust`` the LiDAR's is right, whose covariance was said to be ``seen_cov`` (3, 3).
 
     Covariances of ``trust`` and 1 - ``trust`` times the error's square let an update go that part of the way, and leave the mixture's
     variance, trust (1 - trust) error^2. Along other directions, too, the LiDAR counts by ``trust``: that is what an innovation's

@@ -109,8 +109,8 @@ def _ahead(pair: Pairs, pose: FloatArray, slow: FloatArray, root: FloatArray, co
 
 
 def innovation(node: Node, ahead: Ahead, link: Link, motion: Motion, mount: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """How far the ``motion`` that a LiDAR saw is off the way by ``link`` from ``node`` to what is ``ahead``: (3,), its covariance (3, 3), and
-    normalised.
+    """How far the ``motion`` that a LiDAR saw is off the way by ``link`` from ``node`` to what is ``ahead``: (3,), its covariance (3, 3),
+    and normalised.
 
     Squared and normalised it is NaN where there is no such number. ``mount`` (3, m): what of the LiDAR's mount shows.
     """
