@@ -85,7 +85,7 @@ def _line(
     limit = min(_MAX_LINE_RATIO * wide, most_thin)
     if wide <= least_wide or thin >= limit:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    good = min(m - _TOO_FEW, 1.0) * min(wide / least_wide - 1.0, 1.0) * min(2.0 * (1.0 - thin / limit), 1.0)
+    good = min(m - _TOO_FEW, 1.0) * min(10.0 * (wide / least_wide - 1.0), 1.0) * min(2.0 * (1.0 - thin / limit), 1.0)
     angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
     nx, ny = -math.sin(angle), math.cos(angle)
     return m, nx, ny, -(nx * mx + ny * my), thin, wide, ny * mx - nx * my, st / m, new / m, good

@@ -27,7 +27,7 @@ _NS = 1e-9
 _OLDEST_S, _NEWEST_S = 3600.0, 1.0
 _LATE = "dropped (came after newer ones)"
 _SILENT_S, _PERIODS = 1.0, 5.0
-_NEAR, _PAST, _LONGEST_S, _MANY = 0.9, 1.1, 0.12, 20.0
+_NEAR, _PAST, _LONGEST_S = 0.95, 1.1, 0.12
 
 
 @dataclass(frozen=True)
@@ -83,14 +83,10 @@ class Stream:
     def patience_s(self, now_ns: int) -> float:
         """How long messages may wait for others [s]: nobody waits for what they say until the next scan. 0 without a LiDAR.
 
-        To be woken takes longer than to read a few. Many are looked at once before the scan is due, so that it need not wait for them.
+        To be woken takes longer than to read a few. They are looked at once before the scan is due, so that it need not wait for them.
         """
         lidar = self.sources.lidar
-        if lidar is None:
-            return 0.0
-        scans = self._watches[lidar.topic]
-        others = sum(watch.count_in(scans) for watch in self._watches.values() if watch is not scans)
-        return scans.rest(now_ns, (_NEAR, _PAST) if others > _MANY else (_PAST,))
+        return 0.0 if lidar is None else self._watches[lidar.topic].rest(now_ns, (_NEAR, _PAST))
 
     def dropped(self) -> list[str]:
         """Sentences of what was mended or dropped."""
@@ -115,10 +111,6 @@ class _Watch:
             gap = (now_ns - self._last_ns) * _NS
             self._period_s += (min(gap, 10.0 * self._period_s + 0.01) - self._period_s) * 0.1
         self._last_ns = now_ns
-
-    def count_in(self, other: _Watch) -> float:
-        """How many messages there are for each of ``other``'s."""
-        return other._period_s / self._period_s if self._period_s > 0.0 else 0.0
 
     def rest(self, now_ns: int, parts: Sequence[float]) -> float:
         """Until the next of ``parts`` of the time to the next message is over [s]; 0 when all are."""
