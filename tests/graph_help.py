@@ -43,6 +43,13 @@ def run(estimator, seer, seed=0, steps=60, **world):
     return found, np.array(truth)
 
 
+def apart(poses, covariances, others):
+    """(N,) distances of ``poses`` (N, 3) from ``others``, in sigmas of the former's marginals, by the worst coordinate; 0.1 mm and 0.1 mrad
+    count as none."""
+    sigmas = np.sqrt(np.maximum(covariances.diagonal(axis1=1, axis2=2), 1e-8))
+    return np.abs(se2.log(se2.between(poses, others)) / sigmas).max(axis=1)
+
+
 def recorded(seed=0, steps=60, model="skid_steer", form="constant", learn=("clock",), **world):
     """The steps of a drive and what the LiDAR saw, as a fixed lag was given them: for back ends that are to get the very same.
 

@@ -1,29 +1,39 @@
 """The graph's costs and the honesty of filter and graph. Processor seconds, of one thread.
 
-python -m tests.benchmarks.graph [speed] [soak] [honesty]
+python -m tests.benchmarks.graph [speed] [soak] [honesty] [agreement]
 
-A step of the fixed lag, ten thousand poses in a batch, iSAM2; ten hours of steps; NEES over a hundred seeds at four levels of noise.
+A step of the fixed lag, ten thousand poses in a batch, iSAM2; ten hours of steps; NEES over a hundred seeds at four levels of noise;
+how far filter and fixed lag are apart on whole logs.
 """
 
 from __future__ import annotations
 
 import resource
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from localization.consistency import mean_band
 from localization.estimators.graph_fusion import GraphFusion
 from localization.estimators.graph_history import History
+from localization.logs import open_log
+from localization.run import Pair, replay
 from localization.steps import Step
 from motion_models.base import Motion
-from tests.graph_help import BOTH, make, recorded, squared_errors
+from motion_models.registry import make_model
+from motion_models.robot import load_robot
+from tests.benchmarks.online import write_laps
+from tests.graph_help import BOTH, apart, make, recorded, squared_errors
 from tests.synthetic_steps import DT, Noise, Seer
 
 Recorded = list[tuple[Step, Motion | None]]
+DATA = Path(__file__).parents[1] / "data"
+LOGS = (("aces/aces.mcap", "aces", True), ("husky-outdoor-gps/test1.bag", "husky_a200", False))
 LEVELS = (0.3, 1.0, 2.0, 4.0)
 SEEDS, STEPS = 100, 150
 _NEW_EVERY, _SETTLED = 5, 100
@@ -128,7 +138,24 @@ def honesty(seeds: int = SEEDS, steps: int = STEPS) -> None:
                 print(f"{form:9} {factor:5.1f} {kind:6} {' '.join(cells)} {covered}", flush=True)
 
 
-PARTS: dict[str, Callable[[], None]] = {"speed": speed, "soak": soak, "honesty": honesty}
+def agreement() -> None:
+    """How far the fixed lag, as it drives, is from the filter, all along every log of the tests and simulated laps."""
+    print(f"{'sigmas between filter and fixed lag':36} {'median':>7} {'99 %':>7} {'most':>7} {'at s':>7}")
+    with tempfile.TemporaryDirectory() as folder:
+        laps = write_laps(Path(folder) / "laps.mcap")
+        for path, robot_name, has_lidar in ((laps, "vaultbot", True), *((DATA / log, robot, lidar) for log, robot, lidar in LOGS)):
+            robot = load_robot(robot_name)
+            log = open_log(path, robot)
+            for name in ("diff_drive", "skid_steer", "icr"):
+                ekf, graph = replay(log.events(), [Pair(make_model(name, robot), k) for k in BOTH], robot, log.mounts, has_lidar=has_lidar)
+                one, other = ekf.trajectory, graph.moments or graph.trajectory
+                sigmas = apart(one.poses, one.covariances, other.poses)
+                found = " ".join(f"{v:7.3f}" for v in np.quantile(sigmas, [0.5, 0.99, 1.0]))
+                seconds = (one.stamps_ns[sigmas.argmax()] - one.stamps_ns[0]) * 1e-9
+                print(f"{path.name + ', ' + name:36} {found} {seconds:7.1f}", flush=True)
+
+
+PARTS: dict[str, Callable[[], None]] = {"speed": speed, "soak": soak, "honesty": honesty, "agreement": agreement}
 
 
 def main(names: tuple[str, ...] = ()) -> None:
