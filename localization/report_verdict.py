@@ -161,7 +161,7 @@ def _honesty(line: Line, whose: str = "Its covariances") -> list[str]:
     if run.trajectory.covariances is None:
         return [f"{capitalised(line.words)} gives no covariance."]
     known = run.nis[np.isfinite(run.nis)]
-    sayings = []
+    sayings, judged_by_pose = [], ""
     if len(known) >= 20:
         verdict_, said = _judge("NIS", float(known.mean()), mean_band(len(known), _DOF), "innovations")
         middle, expected = float(np.median(known)), float(chi2.median(_DOF))
@@ -170,13 +170,18 @@ def _honesty(line: Line, whose: str = "Its covariances") -> list[str]:
         sayings.append((verdict_, said))
     if nees is not None and not math.isnan(nees):
         sayings.append(_judge("NEES", nees, mean_band(1, _DOF), "errors"))
+        judged_by_pose = sayings[-1][0]
     found = {word: [text for verdict_, text in sayings if verdict_ == word] for word in ("over", "under", "fits")}
     if found["over"]:
         also = f" ({joined([*found['under'], *found['fits']])})" if found["under"] or found["fits"] else ""
         return [f"{whose} are overconfident: {joined(found['over'])}{also}. Enlarge them before anything trusts them."]
-    if found["under"]:
-        also = f" ({joined(found['fits'])})" if found["fits"] else ""
+    also = f" ({joined(found['fits'])})" if found["fits"] else ""
+    if found["under"] and judged_by_pose == "under":
         return [f"{whose} are larger than need be: {joined(found['under'])}{also}; safe to fuse, but given less weight than is due."]
+    if found["under"]:  # innovations are of one step: they test what is believed of wheels and scans, not what became of it in the pose
+        allowed = f"wheels and scans differ less than they allow for ({found['under'][0]}){also}"
+        unknown = "" if judged_by_pose else "; whether the pose's are too large, only a reference track with headings could tell"
+        return [f"Nothing says that {_lower(whose)} are too small: {allowed}{unknown}."]
     if found["fits"]:
         return [f"Nothing speaks against {_lower(whose)}: {joined(found['fits'])}."]
     return [f"{whose} could not be tested: that takes scans, or a reference with headings."]

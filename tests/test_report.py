@@ -212,7 +212,12 @@ def test_how_often_equal_filters_are_told_apart():
 
 
 @pytest.mark.parametrize(
-    ("scale", "said"), [(4.0, "are overconfident"), (0.25, "are larger than need be"), (1.0, "Nothing speaks against its covariances")]
+    ("scale", "said"),
+    [
+        (4.0, "are overconfident"),
+        (0.25, "Nothing says that its covariances are too small"),
+        (1.0, "Nothing speaks against its covariances"),
+    ],
 )
 def test_nis_decides_what_is_said_of_covariances(scale, said):
     results = score([run(nis=honest(scale=scale), noise=0.01), run(estimator="odometry", noise=0.5, seed=2)], track(yaws=False))
