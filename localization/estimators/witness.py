@@ -13,12 +13,14 @@ from typing import Protocol
 import numpy as np
 
 from localization.estimators.base import NO_POINTS
-from localization.lidar import LidarConfig, LidarMatcher, MapTie, Revisit, ScanCheck, Slip, Sweep, Way
+from localization.lidar import LidarConfig, LidarMatcher, MapTie, Registration, Revisit, ScanCheck, Slip, Sweep, Way
 from localization.steps import Step
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
+
+_VISIBLE_M = 0.002  # points that are moved by less need not be moved for the map
 
 
 @dataclass(frozen=True)
@@ -101,28 +103,35 @@ class ScanWitness:
             off = se2.log(se2.between(se2.compose(anchor, step.predicted.delta), found.pose))
             variance = np.diag(found.cov) / found.trust + (1.0 - found.trust) * off**2
             gain = slip.measure(off / step.duration, variance / step.duration**2)
-            if sweep.shift(slip.rate - rate) > self._matcher.config.max_shift_m:  # the sweep looked otherwise than was thought
-                found = self._matcher.refine(sweep.at_stamp(step.twist + slip.rate), sweep.is_planar, found.pose, sweep.offsets) or found
-                rate = slip.rate
-        swept = self._swept(step, found.lateness, sweep.lateness, gain, change, slip.rate - rate)
+            found = self._amended(found, sweep, step, slip.rate - rate)
+        swept = self._swept(step, found.lateness, sweep.lateness, gain, change)
         tie = replace(found.tie, sweep=swept)
         return Sight(Motion(se2.between(anchor, found.pose), found.cov), found.trust, tie)
 
-    def _swept(self, step: Step, B: FloatArray, late: float, gain: FloatArray, change: FloatArray, missed: FloatArray) -> FloatArray:
+    def _amended(self, found: Registration, sweep: Sweep, step: Step, missed: FloatArray) -> Registration:
+        """The same, had it been known that within the sweep the twist is other by ``missed`` (3,)."""
+        shift = sweep.shift(missed)
+        if shift > _VISIBLE_M:
+            points = sweep.at_stamp(step.twist + self._slip.rate)
+            if shift > self._matcher.config.max_shift_m:
+                return self._matcher.refine(points, sweep.is_planar, found.pose, sweep.offsets) or found
+            self._matcher.replace_points(points, sweep.is_planar, sweep.offsets)
+        return replace(found, pose=se2.compose(found.pose, se2.exp(-found.lateness @ missed)))
+
+    def _swept(self, step: Step, B: FloatArray, late: float, gain: FloatArray, change: FloatArray) -> FloatArray:
         """(3, 3) what a motion within the sweep other than was thought does to the pose.
 
-        A twist that is off by d moves the pose by ``B`` d (`Registration.lateness`). It is off by what of the slip was ``missed``, and as
-        slip and wheels change from the mean over the step, which is known, to that from the stamp until points are seen, ``late`` [s]. If
-        the wheels do as they did, by ``change`` from step to step, that is the time between the middles of both; slip that walks at random
-        has walked for a third of both. But the slip was measured, with ``gain`` (3,), by the way to this very pose, so that d is in it
-        already, by ``B`` over the step's duration.
+        A twist that is off by d moves the pose by ``B`` d (`Registration.lateness`). It is off as slip and wheels change from the mean over
+        the step, which is known, to that from the stamp until points are seen, ``late`` [s]. If the wheels do as they did, by ``change`` from
+        step to step, that is the time between the middles of both; slip that walks at random has walked for a third of both. But the slip
+        was measured, with ``gain`` (3,), by the way to this very pose, so that d is in it already, by ``B`` over the step's duration.
         """
         if step.duration <= 0.0:
             return np.zeros((3, 3))
         faster = change * (step.duration + late) / (2.0 * step.duration) if step.start_ns == self._last_ns else np.zeros(3)
         unknown = B @ (np.eye(3) - gain[:, None] * B / step.duration)
         spread = self._slip.variance_in((step.duration + late) / 3.0) + faster**2
-        return np.asarray((unknown * spread) @ unknown.T + (B * missed**2) @ B.T)
+        return np.asarray((unknown * spread) @ unknown.T)
 
     def recall(self, step: Step, pose: FloatArray, cov: FloatArray) -> Revisit | None:
         return self._matcher.recall(pose, cov, step.end_ns)

@@ -73,8 +73,9 @@ class LineFit:
     """(3, 3) the part of `information` that comes from points of the map that were not added by the last scan."""
     of_map: FloatArray
     """(3, 3) the part of `information` by which errors of the map's lines, not of the scan's points, enter the pose."""
-    late: FloatArray
-    """(3, 3) `information`, each point's part times when it was seen after the pose [s]."""
+    lateness: FloatArray
+    """(3, 3) [s] how long after the pose that was seen which fixes it: the pose of the least cost moves by this times a twist by which the
+    points' motion is off."""
 
     def measurement(self) -> tuple[FloatArray, FloatArray]:
         """Pose (3,) of the least cost and its covariance (3, 3), wide open along what the points do not hold."""
@@ -203,9 +204,10 @@ class LineMap:
         )
         information = _known(told - feigned) if n else told
         shrink = np.linalg.cholesky(information + _NOTHING) @ np.linalg.inv(np.linalg.cholesky(told + _NOTHING))
-        of_map, old, late = shrink @ np.array([of_map, old, late]) @ shrink.T
+        of_map, old = shrink @ np.array([of_map, old]) @ shrink.T
+        lateness = np.linalg.solve(told + _NOTHING, late)  # what the lines' directions feign holds the pose, too
         rms = math.sqrt(squares / n) if n else math.nan
-        return LineFit(pose, information, curvature, gradient, n, n_on, rms, Spread(*spread.tolist()), old, of_map, late)
+        return LineFit(pose, information, curvature, gradient, n, n_on, rms, Spread(*spread.tolist()), old, of_map, lateness)
 
     def compare(
         self, points: FloatArray, pose: FloatArray, radius: float, ages: Ages = ALL_AGES, any_point: bool = False

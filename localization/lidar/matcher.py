@@ -40,8 +40,9 @@ class LidarConfig:
     """Error of a line in the map, shared by all points of a scan that meet it in one cell, until scans have shown it [m]."""
     iterations: int = 12
     """Point-to-line steps at most."""
-    max_shift_m: float = 0.002
-    """Where the motion within a sweep turns out otherwise than expected, and moves points by more than this, they are matched again [m]."""
+    max_shift_m: float = 0.02
+    """Where the motion within a sweep turns out otherwise than expected, and moves points by more than this, they are matched again [m];
+    by less, the pose moves as its derivative by that motion says."""
     max_jump_m_s: float = 2.0
     """Nothing moves the robot faster than this against its wheels: a scan that says so is left out [m/s]."""
     max_jump_rad_s: float = 3.0
@@ -161,13 +162,15 @@ class LidarMatcher:
 
     def refine(self, points: FloatArray, is_planar: bool, start: FloatArray, offsets: FloatArray = AT_ONCE) -> Registration | None:
         """The same scan once more, as other ``points`` (N, 3), close to where it was found, ``start`` (3,)."""
-        if self._kiss is None or self._lines is None:
+        if self._lines is None:
             return None
-        points = self._prepare(points, is_planar, offsets)
-        if len(self._planar) < _FEW_POINTS:
-            return None
-        self._downsampled = self._kiss.downsampled(points)
-        return self._fit(self._lines, start)
+        self.replace_points(points, is_planar, offsets)
+        return self._fit(self._lines, start) if len(self._planar) >= _FEW_POINTS else None
+
+    def replace_points(self, points: FloatArray, is_planar: bool, offsets: FloatArray = AT_ONCE) -> None:
+        """What the scan that was last given to `register` adds to the map: other ``points`` (N, 3), or when they were seen."""
+        if self._kiss is not None:
+            self._downsampled = self._kiss.downsampled(self._prepare(points, is_planar, offsets))
 
     def _fit(self, lines: LineMap, start: FloatArray) -> Registration:
         assert self._guess is not None
@@ -182,7 +185,7 @@ class LidarMatcher:
             fit = lines.fit(self._planar, fit.pose, self._fit_options(), prior, guess, self._ages, since, self._offsets)
         pose, cov = fit.measurement()
         tie = MapTie(cov @ fit.old, cov @ fit.of_map @ cov)
-        return Registration(pose, cov, len(self._planar), fit.n_on, fit.residual_rms, tie, cov @ fit.late)
+        return Registration(pose, cov, len(self._planar), fit.n_on, fit.residual_rms, tie, fit.lateness)
 
     def _fit_options(self) -> FitOptions:
         noise = self._noise
@@ -243,7 +246,10 @@ class LidarMatcher:
     def _prepare(self, points: FloatArray, is_planar: bool, offsets: FloatArray) -> FloatArray:
         """The points in range, which become those to match."""
         is_near = is_in_range(points, self.config)
-        points, offsets = np.ascontiguousarray(points[is_near]), offsets[is_near] if len(offsets) else offsets
+        if is_near.all():
+            points = np.ascontiguousarray(points)
+        else:
+            points, offsets = points[is_near], offsets[is_near] if len(offsets) else offsets
         self._is_planar = is_planar
         if self._kiss is None:
             if len(points) < _FEW_POINTS:

@@ -25,11 +25,10 @@ class Sweep:
     @classmethod
     def of(cls, scan: Scan, mount: Mount) -> Sweep:
         """Points that are not finite are left out."""
-        measured, offsets = scan.points, scan.offsets
-        is_finite = np.isfinite(measured).all(axis=1)
-        if not is_finite.all():
-            measured, offsets = measured[is_finite], offsets[is_finite] if len(offsets) else offsets
-        points: FloatArray = measured @ mount.rotation().T + np.array([mount.x, mount.y, mount.z])
+        points, offsets = np.empty((len(scan.points), 3)), scan.offsets
+        if not _transform(scan.points, mount.rotation(), mount.x, mount.y, mount.z, points):
+            is_finite = np.isfinite(points).all(axis=1)
+            points, offsets = points[is_finite], offsets[is_finite] if len(offsets) else offsets
         return cls(points, offsets, scan.is_planar)
 
     def at_stamp(self, twist: FloatArray) -> FloatArray:
@@ -40,8 +39,8 @@ class Sweep:
         """
         if not len(self.offsets) or not np.any(twist):
             return self.points
-        points = self.points.copy()
-        points[:, :2] = se2.transform(se2.exp(self.offsets[:, None] * twist), points[:, :2])
+        points = np.empty_like(self.points)
+        _carry(self.points, self.offsets, twist, points)
         return points
 
     @property
@@ -75,6 +74,31 @@ def walls(points: FloatArray, cell: float, min_height: float = 0.3) -> FloatArra
     out = np.empty((len(points), 2))
     n = _walls(points, index, order, min_height, out)
     return out[:n]
+
+
+@numba.njit(cache=True)
+def _transform(points: FloatArray, R: FloatArray, x: float, y: float, z: float, out: FloatArray) -> bool:  # pragma: no cover
+    """Fills ``out`` (N, 3) with ``points`` turned by ``R`` and moved; whether all are finite."""
+    checked = 0.0
+    for i in range(points.shape[0]):
+        a, b, c = points[i, 0], points[i, 1], points[i, 2]
+        out[i, 0] = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + x
+        out[i, 1] = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + y
+        out[i, 2] = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c + z
+        checked += 0.0 * (a + b + c)
+    return checked == 0.0
+
+
+@numba.njit(cache=True)
+def _carry(points: FloatArray, offsets: FloatArray, twist: FloatArray, out: FloatArray) -> None:  # pragma: no cover
+    """Fills ``out`` (N, 3) with ``points`` where they are after the motion at ``twist`` (3,) for their ``offsets`` (N,)."""
+    for i in range(points.shape[0]):
+        t = offsets[i]
+        x, y, yaw = se2.scalar_exp((t * twist[0], t * twist[1], t * twist[2]))
+        c, s = math.cos(yaw), math.sin(yaw)
+        out[i, 0] = x + c * points[i, 0] - s * points[i, 1]
+        out[i, 1] = y + s * points[i, 0] + c * points[i, 1]
+        out[i, 2] = points[i, 2]
 
 
 @numba.njit(cache=True)
