@@ -375,6 +375,36 @@ def test_a_twist_in_the_sweep_moves_the_pose_as_the_lateness_says() -> None:
         np.testing.assert_allclose(found.lateness @ d, by_difference, atol=0.1 * sweep.lateness * 0.02)
 
 
+@pytest.mark.parametrize("walls", [LAB, HALL])
+def test_a_pose_moved_by_its_derivative_is_where_a_second_match_finds_it(walls: np.ndarray) -> None:
+    """A sweep that was undone with a twist so wrong that points move by a centimetre: what is left is less than half a sigma."""
+    for seed in range(4):
+        matcher, drive, _ = mapped(walls, TOUR[:2500], seed)
+        sweep, pose = Sweep.of(scans_of(drive)[-1], drive.mount), drive.poses[-1]
+        twist = se2.log(se2.between(drive.poses[-2], pose)) * 12.5
+        missed = np.array([0.1, -0.05, 0.03])
+        assert 0.008 < sweep.shift(missed) < 0.02
+        found = matcher.register(sweep.at_stamp(twist - missed), True, pose, SURE, sweep.offsets)
+        again = matcher.refine(sweep.at_stamp(twist), True, found.pose, sweep.offsets)
+        amended = se2.compose(found.pose, se2.exp(-found.lateness @ missed))
+        moved, left = (se2.log(se2.between(p, again.pose)) for p in (found.pose, amended))
+        sigmas = np.sqrt(np.diag(found.cov))
+        assert np.abs(moved / sigmas).max() > 1.0
+        assert np.abs(left / sigmas).max() < 0.5
+
+
+def test_a_wrong_sweep_moves_no_pose_far_along_walls_that_hold_nothing() -> None:
+    """Wide open as the covariance is there, the pose is held by what the walls' directions feign: the derivative is of that pose."""
+    for seed in range(4):
+        matcher, drive, _ = mapped(CORRIDOR, rooms.path((1.5, 0.3, 0.3)), seed, (0.0, 0.2, 0.4), rooms.Beams(longest=20.0))
+        sweep, pose = Sweep.of(scans_of(drive)[-1], drive.mount), drive.poses[-1]
+        twist = se2.log(se2.between(drive.poses[-2], pose)) * 12.5
+        found = matcher.register(sweep.at_stamp(twist), True, pose, SURE, sweep.offsets)
+        assert math.sqrt(np.linalg.eigvalsh(found.cov[:2, :2])[1]) > 1.0
+        for d in 0.02 * np.eye(3):
+            assert np.hypot(*(found.lateness @ d)[:2]) < 0.02
+
+
 @pytest.mark.parametrize("walls", [CORRIDOR, WALL, LAB])
 def test_parts_of_a_covariance_are_no_more_than_all_of_it(walls: np.ndarray) -> None:
     """The map's, and what of it was drawn anew, also along walls that hold nothing."""

@@ -121,10 +121,11 @@ class ScanWitness:
     def _swept(self, step: Step, B: FloatArray, late: float, gain: FloatArray, change: FloatArray) -> FloatArray:
         """(3, 3) what a motion within the sweep other than was thought does to the pose.
 
-        A twist that is off by d moves the pose by ``B`` d (`Registration.lateness`). It is off as slip and wheels change from the mean over
-        the step, which is known, to that from the stamp until points are seen, ``late`` [s]. If the wheels do as they did, by ``change`` from
-        step to step, that is the time between the middles of both; slip that walks at random has walked for a third of both. But the slip
-        was measured, with ``gain`` (3,), by the way to this very pose, so that d is in it already, by ``B`` over the step's duration.
+        A twist that is off by d moves the pose by ``B`` d (`Registration.lateness`). It is off as slip and wheels change from the mean
+        over the step, which is known, to that from the stamp until points are seen, ``late`` [s]. If the wheels do as they did, by
+        ``change`` from step to step, that is the time between the middles of both; slip that walks at random has walked for a third of
+        both. But the slip was measured, with ``gain`` (3,), by the way to this very pose, so that d is in it already, by ``B`` over the
+        step's duration.
         """
         if step.duration <= 0.0:
             return np.zeros((3, 3))

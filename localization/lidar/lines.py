@@ -205,7 +205,8 @@ class LineMap:
         information = _known(told - feigned) if n else told
         shrink = np.linalg.cholesky(information + _NOTHING) @ np.linalg.inv(np.linalg.cholesky(told + _NOTHING))
         of_map, old = shrink @ np.array([of_map, old]) @ shrink.T
-        lateness = np.linalg.solve(told + _NOTHING, late)  # what the lines' directions feign holds the pose, too
+        # of the pose as it is found: what the lines' directions feign holds it, too
+        lateness = np.linalg.solve(told + _NOTHING, late).astype(np.float64, copy=False)
         rms = math.sqrt(squares / n) if n else math.nan
         return LineFit(pose, information, curvature, gradient, n, n_on, rms, Spread(*spread.tolist()), old, of_map, lateness)
 
