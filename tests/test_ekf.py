@@ -380,7 +380,7 @@ def test_no_edge_decides_between_two_places(trust):
 def test_how_far_a_scan_is_trusted_has_no_edge():
     def trust(n_matched, n_points):
         nothing = np.zeros((3, 3))
-        return Registration(np.zeros(3), np.eye(3), n_points, n_matched, 0.0, MapTie(nothing, nothing), nothing).trust
+        return Registration(np.zeros(3), np.eye(3), n_points, n_matched, 0.0, MapTie(nothing, nothing, nothing), nothing).trust
 
     found = [trust(n, 1000) for n in range(1001)]
     assert (np.diff(found) > 0.0).all()

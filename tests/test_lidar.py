@@ -410,10 +410,12 @@ def test_parts_of_a_covariance_are_no_more_than_all_of_it(walls: np.ndarray) -> 
     """The map's, and what of it was drawn anew, also along walls that hold nothing."""
     _, _, found = mapped(walls, rooms.path((1.5, 0.3, 0.0)), start=(0.0, 0.2, 0.4), scanner=rooms.Beams(longest=20.0))
     scale = np.sqrt(np.diag(found.cov))
-    for part in (found.tie.cov, found.cov - found.tie.cov):
+    by_map = found.cov @ found.tie.of_map @ found.cov
+    for part in (by_map, found.cov - by_map):
         assert np.linalg.eigvalsh(part / np.outer(scale, scale)).min() > -1e-8
-    assert (np.linalg.eigvals(found.tie.kept).real > -1e-9).all()
-    assert (np.linalg.eigvals(found.tie.kept).real < 1.0 + 1e-9).all()
+    root = np.sqrt(np.diag(found.tie.information))
+    for less in (found.tie.old, found.tie.information - found.tie.old):
+        assert np.linalg.eigvalsh(less / np.outer(root, root)).min() > -1e-8
 
 
 # --- clouds ------------------------------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import math
 import numba
 import numpy as np
 
-from localization.estimators.error_states import cloned, corrected, eigen, inverse, moved, replace
+from localization.estimators.error_states import cloned, corrected, eigen, moved, quick_inverse, replace
 from localization.estimators.graph_qr import add_outer, add_spread, product
 from localization.estimators.revisit_update import revisited_covariance
 from localization.lidar import MapTie, Revisit
@@ -26,6 +26,9 @@ from motion_models.se2 import FloatArray, triple
 
 _POSE = slice(0, 3)
 _PLACE_M, _PLACE_RAD = 1.0, 0.5  # what is remembered of the way
+# Where the scene holds nothing, the map is where it was last drawn. Of what it does hold, the scans' error of millimetres is to last.
+_LOOSE = (0.3**-2, 0.3**-2, 0.3**-2)  # [1 / m^2, 1 / m^2, 1 / rad^2]
+_LEVER_M = 5.0  # by which a turn is compared with a shift
 _ALIKE = 3.0  # informations of one scene differ by less, from scan to scan
 
 
@@ -76,13 +79,11 @@ class Account:
         ``d_pose`` (3, 3): of the residual by the pose; ``doubt`` (3, 3): what was added to the measurement's
         covariance where it was not quite believed.
         """
-        information = inverse(cov)
-        if self._held is not None:
-            # old lines that did not hold the last scan were drawn not long ago: the error of the map as it was is none of theirs
-            tie = MapTie(cov @ _common(information @ tie.kept, self._held), tie.cov, tie.sweep)
-        self._held = information
-        noise = cov - tie.cov + tie.sweep + doubt
-        met, H, R, self._swept = _met(self._P, K, d_pose, noise, tie.kept, tie.fresh, tie.sweep)
+        # old lines that did not hold the last scan were drawn not long ago: the error of the map as it was is none of theirs
+        old = tie.old if self._held is None else _common(tie.old, self._held)
+        self._held, kept, fresh = _shared(tie.information, old, tie.of_map)
+        noise = cov - cov @ tie.of_map @ cov + tie.sweep + doubt
+        met, H, R, self._swept = _met(self._P, K, d_pose, noise, kept, fresh, tie.sweep)
         self._P = corrected(met, K, H, R)
 
     def draw(self, is_drawn: bool) -> None:
@@ -127,6 +128,53 @@ class Account:
         self._P = revisited_covariance(self._P, _POSE, tied, gain, known.cov, old_cov, growth + slip, slip)
         self._track.tie(then)
         self._swept = np.zeros((self._n, 3))
+
+
+@numba.njit(cache=True)
+def _shared(information: FloatArray, old: FloatArray, of_map: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:  # pragma: no cover
+    """By what a scan is held (see `MapTie`), with that which holds it where the scene does not: (3, 3) all ``information`` L, how much of
+    the map's error was in it before, L^-1 ``old``, and the covariance of the noise with which the rest was drawn.
+
+    All scans that meet the same part of a map share its error: e' = ``kept`` e + (1 - ``kept``) (e_drawn + noise), where e_drawn is the
+    error of the pose from which the last scan was drawn. In a room that is known already, ``kept`` is the identity, and however long the
+    robot stays, it learns no more of its place and forgets nothing of it. With C = L^-1, what is new of the map adds C (L - old) C, which
+    is (1 - ``kept``) C, and the map's part of that is noise.
+    """
+    held, fresh = information.copy(), np.zeros((3, 3))
+    for i in range(3):
+        held[i, i] += _LOOSE[i]
+    C = quick_inverse(held)
+    kept, by_map = _shrunk(product(C, old)), product(product(C, of_map), C)
+    values, vectors = eigen(by_map - product(kept, by_map))
+    for k in range(3):
+        for i in range(3):
+            for j in range(3):
+                fresh[i, j] += max(values[k], 0.0) * vectors[i, k] * vectors[j, k]
+    return held, kept, fresh
+
+
+@numba.njit(cache=True)
+def _shrunk(kept: FloatArray) -> FloatArray:  # pragma: no cover
+    """``kept`` (3, 3) where it makes no error larger, in a metric that is the same for all scans.
+
+    Walls that are nearly parallel turn an error across them into a larger one along them. One scan is right to do so, but scan by scan
+    the direction along them changes a little, and a product of many such would grow without bound.
+    """
+    scaled, squares, less = kept.copy(), np.zeros((3, 3)), np.zeros((3, 3))
+    for i in range(2):
+        scaled[2, i] *= _LEVER_M
+        scaled[i, 2] /= _LEVER_M
+    add_outer(squares, scaled.T.copy(), scaled.T.copy())
+    values, vectors = eigen(squares)
+    for k in range(3):
+        for i in range(3):
+            for j in range(3):
+                less[i, j] += vectors[i, k] * vectors[j, k] / math.sqrt(max(values[k], 1.0))
+    scaled = product(scaled, less)
+    for i in range(2):
+        scaled[2, i] /= _LEVER_M
+        scaled[i, 2] *= _LEVER_M
+    return scaled
 
 
 @numba.njit(cache=True)

@@ -136,7 +136,7 @@ def motion_covariance(P: FloatArray, start: int, delta: FloatArray) -> FloatArra
 
 def inverse(S: FloatArray) -> FloatArray:
     """Of ``S`` (n, n), a finite covariance. Raises `EstimatorError` if it is singular."""
-    found = _inverse(S)
+    found = quick_inverse(S)
     if math.isnan(found[0, 0]):  # rounding took a pivot: of what is next to nothing beside a huge slip
         try:
             found = np.asarray(np.linalg.inv(S), dtype=float)
@@ -148,7 +148,7 @@ def inverse(S: FloatArray) -> FloatArray:
 
 
 @numba.njit(cache=True)
-def _inverse(S: FloatArray) -> FloatArray:  # pragma: no cover
+def quick_inverse(S: FloatArray) -> FloatArray:  # pragma: no cover
     """`inverse` by Cholesky's factors, NaN where there are none."""
     W, n = inverse_root(S), S.shape[0]
     out = np.zeros((n, n))

@@ -56,28 +56,18 @@ class LidarConfig:
 class MapTie:
     """How the map that a scan meets hangs together with the map that the scan before met, and which errors of the scan are its own.
 
-    Maps are drawn with errors, which all scans that meet the same part share: e' = ``kept`` e + (1 - ``kept``) (e_drawn + noise), where
-    e_drawn is the error of the pose from which the last scan was drawn. In a room that is known already, ``kept`` is the identity,
-    and however long the robot stays, it learns no more of its place and forgets nothing of it.
+    All are parts of what fixes the pose, as information about it.
     """
 
-    kept: FloatArray
-    """(3, 3) how much of what fixes the pose the map had before the last scan was drawn into it, by direction; zero for a first map."""
-    cov: FloatArray
-    """(3, 3) the part of the registration's covariance that is the map's error."""
+    information: FloatArray
+    """(3, 3) all of it."""
+    old: FloatArray
+    """(3, 3) what comes from lines that the map had before the last scan was drawn into it; zero for a first map."""
+    of_map: FloatArray
+    """(3, 3) by which errors of the map's lines, not of the scan's points, enter the pose."""
     sweep: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
-    """(3, 3) the part that comes from a motion within the sweep other than was thought. What the scan adds to the map has no part in it:
-    the points are off one way, and the pose that was found for them the other."""
-
-    @property
-    def fresh(self) -> FloatArray:
-        """(3, 3) covariance of the noise with which what is not ``kept`` was drawn.
-
-        With the information of the old lines L_o and of the new ones L_n, C = (L_o + L_n)^-1 and ``kept`` = C L_o, what the new ones add
-        is C L_n C = (1 - ``kept``) C.
-        """
-        found = self.cov - self.kept @ self.cov
-        return np.asarray(0.5 * (found + found.T))
+    """(3, 3) of the registration's covariance, what comes from a motion within the sweep other than was thought. What the scan adds to
+    the map has no part in it: the points are off one way, and the pose that was found for them the other."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +174,7 @@ class LidarMatcher:
             # the first scans show that the map is better or worse than was guessed
             fit = lines.fit(self._planar, fit.pose, self._fit_options(), prior, guess, self._ages, since, self._offsets)
         pose, cov = fit.measurement()
-        tie = MapTie(cov @ fit.old, cov @ fit.of_map @ cov)
+        tie = MapTie(fit.information, fit.old, fit.of_map)
         return Registration(pose, cov, len(self._planar), fit.n_on, fit.residual_rms, tie, fit.lateness)
 
     def _fit_options(self) -> FitOptions:
