@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterator, Sequence
 
@@ -12,6 +13,8 @@ try:
     import distributed
 except ImportError as error:
     raise DoorError(f"a Dask cluster needs the extra 'dask': pip install 'skidloc[dask]' ({error}).") from error
+
+logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # it tells of a lost scheduler with tracebacks; here it is one sentence
 
 _TIMEOUT_S = 10
 _ADDRESS = re.compile(r"((tcp|tls|wss?|ucxx?)://)?(\[[^\]]+\]|[^/:\[\]\s]+):\d+")
@@ -36,12 +39,9 @@ def run_on_cluster(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, lis
         futures = {client.submit(run_job, job, pure=False, retries=1): job for job in jobs}
         for future in distributed.as_completed(list(futures), loop=client.loop):
             job = futures.pop(future)
-            if future.status == "finished":
-                yield job, future.result()
-            else:
-                yield job, failed_rows(job, f"on the cluster: {_short(future.exception())}")
+            yield job, _rows(future, job)
             future.release()
-    except (distributed.comm.CommClosedError, distributed.client.FutureCancelledError) as error:
+    except (OSError, distributed.client.ClosedClientError, distributed.client.FutureCancelledError) as error:
         raise DoorError(
             f"the Dask scheduler at {address} went away ({_short(error)}). What was done is kept: run the same again."
         ) from error
@@ -49,5 +49,18 @@ def run_on_cluster(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, lis
         client.close(timeout=_TIMEOUT_S)
 
 
-def _short(error: BaseException | None) -> str:
+def _rows(future: distributed.Future, job: Job) -> list[Row]:
+    """Of a future that has ended. Raises what is amiss with the cluster; what is amiss with the job alone becomes rows."""
+    try:
+        rows: list[Row] = future.result()
+    except Exception as error:
+        if future.status != "error":
+            raise
+        return failed_rows(job, f"on the cluster: {_short(error)}")
+    return rows
+
+
+def _short(error: Exception) -> str:
+    if isinstance(error, distributed.client.FutureCancelledError):
+        return str(error.reason)
     return " ".join(f"{type(error).__name__}: {error}".split())[:200]

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -360,47 +361,60 @@ def read_until(process, pattern, seconds=90.0):
     pytest.fail(said)
 
 
-def test_a_cluster_whose_worker_is_killed_gives_the_same_table(table, tmp_path):
-    """A scheduler and two workers as processes of their own."""
+@contextmanager
+def cluster(workers):
+    """A scheduler and so many workers, processes of their own; the scheduler's address, it and they."""
     pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
-    dask = (sys.executable, "-m", "distributed.cli")
     options = ("--host", "127.0.0.1", "--no-dashboard")
-    scheduler = start(*dask[:2], "distributed.cli.dask_scheduler", *options, "--port", "0")
-    processes = [scheduler]
+    processes = [start(sys.executable, "-m", "distributed.cli.dask_scheduler", *options, "--port", "0")]
     try:
-        address = read_until(scheduler, r"Scheduler at:\s+(tcp://\S+)")[1]
-        worker = (*dask[:2], "distributed.cli.dask_worker", address, *options, "--nthreads", "1", "--no-nanny")
-        workers = [start(*worker), start(*worker)]
-        processes += workers
-        for process in workers:
+        address = read_until(processes[0], r"Scheduler at:\s+(tcp://\S+)")[1]
+        worker = (sys.executable, "-m", "distributed.cli.dask_worker", address, *options, "--nthreads", "1", "--no-nanny")
+        processes += [start(*worker) for _ in range(workers)]
+        for process in processes[1:]:
             read_until(process, "Registered to")
-        out = tmp_path / "table.csv"
-        command = (
-            sys.executable,
-            "-m",
-            "localization.cli",
-            "compare",
-            *logs(3),
-            "--robot",
-            "vaultbot",
-            "--out",
-            out,
-            *PAIRS,
-            "--dask",
-            address,
-        )
-        running = start(*command)
-        end = time.monotonic() + 120.0
-        while not out.exists() and time.monotonic() < end and running.poll() is None:
-            time.sleep(0.02)
-        workers[0].send_signal(signal.SIGKILL)
-        said = running.communicate(timeout=120)[0]
-        assert running.returncode == 0, said
-        assert out.read_bytes() == table.read_bytes()
+        yield address, processes[0], processes[1:]
     finally:
         for process in reversed(processes):
             process.kill()
             process.wait()
+
+
+def compare_until_a_log_is_done(out, address):
+    """The command, running, when the first log is in its table."""
+    command = ("compare", *logs(3), "--robot", "vaultbot", "--out", out, *PAIRS, "--dask", address)
+    running = start(sys.executable, "-m", "localization.cli", *command)
+    end = time.monotonic() + 120.0
+    while not out.exists() and time.monotonic() < end and running.poll() is None:
+        time.sleep(0.02)
+    return running
+
+
+def test_a_cluster_whose_worker_is_killed_gives_the_same_table(table, tmp_path):
+    out = tmp_path / "table.csv"
+    with cluster(2) as (address, _, workers):
+        running = compare_until_a_log_is_done(out, address)
+        workers[0].send_signal(signal.SIGKILL)
+        said = running.communicate(timeout=120)[0]
+    assert running.returncode == 0, said
+    assert out.read_bytes() == table.read_bytes()
+
+
+def test_a_scheduler_that_goes_away_ends_the_comparison_and_what_is_done_is_kept(table, tmp_path, asked):
+    out = tmp_path / "table.csv"
+    with cluster(1) as (address, scheduler, _):
+        running = compare_until_a_log_is_done(out, address)
+        scheduler.send_signal(signal.SIGKILL)
+        said = running.communicate(timeout=120)[0]
+    assert running.returncode == 2, said
+    assert re.fullmatch(rf"skidloc: the Dask scheduler at {address} went away \(.+\)\. What was done is kept: run the same again\.\n", said)
+    done = rows_of(out)
+    assert 0 < len(done) < 6
+    assert all(row in rows_of(table) for row in done)
+    assert not out.with_suffix(".html").exists()
+    assert compare(out) == 0
+    assert not {job.log for job in asked} & {row["log"] for row in done}
+    assert out.read_bytes() == table.read_bytes()
 
 
 def test_a_scheduler_that_is_not_there_is_explained(tmp_path, capsys, monkeypatch):
