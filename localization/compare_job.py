@@ -54,6 +54,8 @@ class Job:
     """Topic, or a file in which `{stem}` stands for the log's name; the robot file's topic if None."""
     topics: TopicOverrides = field(default_factory=TopicOverrides)
     config: ReplayConfig = field(default_factory=ReplayConfig)
+    folder: Path = field(default_factory=Path.cwd)
+    """Where relative paths start; a worker of a cluster runs in another one."""
 
 
 def job_key(log: Path, robot: Robot, reference: str | None, topics: TopicOverrides, config: ReplayConfig) -> str:
@@ -90,8 +92,7 @@ def failed_rows(job: Job, reason: str) -> list[Row]:
 
 
 def _run(job: Job) -> list[Row]:
-    path = Path(job.log)
-    log = open_log(path, job.robot, job.topics)
+    log = open_log(job.folder / job.log, job.robot, job.topics)
     has_lidar = log.sources.lidar is not None
     rows, able = [], []
     for trial in job.trials:
@@ -102,7 +103,7 @@ def _run(job: Job) -> list[Row]:
             rows.append({**_head(job, trial), "status": FAILED, "error": str(error)})
     if not able:
         return rows
-    reference = _reference(log, job.reference)
+    reference = _reference(log, job)
     pairs = [Pair(make_model(trial.model, job.robot), trial.estimator, trial.corrections) for trial in able]
     runs = replay(log.events(), pairs, job.robot, log.mounts, has_lidar, job.config)
     notes = " ".join(log.notes())
@@ -130,21 +131,21 @@ def _scores(metrics: Mapping[str, Any]) -> Row:
     return {name: value for name, value in metrics.items() if name not in left_out}
 
 
-def _reference(log: Log, name: str | None) -> ReferenceTrack | Relations:
+def _reference(log: Log, job: Job) -> ReferenceTrack | Relations:
     """Raises `EvaluationError` where there is none: without, there is nothing to compare."""
-    file = _reference_file(log.path, name)
+    file = _reference_file(log.path, job.reference, job.folder)
     if file is not None:
         return read_reference_file(file)
-    topic = name or log.reference_topic
+    topic = job.reference or log.reference_topic
     if topic is None:
         raise EvaluationError(f"{log.path.name} has no reference by the robot file's name; pass --reference.")
     return reference_track(log.references(topic), topic)
 
 
-def _reference_file(log: Path, name: str | None) -> Path | None:
+def _reference_file(log: Path, name: str | None, folder: Path = Path()) -> Path | None:
     if name is None or (name.startswith("/") and not Path(name).parent.is_dir()):
         return None
-    path = Path(name.replace("{stem}", log.stem))
+    path = folder / name.replace("{stem}", log.stem)
     return path if path.exists() or path.suffix in (".tum", ".relations") else None
 
 

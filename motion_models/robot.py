@@ -186,7 +186,7 @@ def load_robot(robot: str | Path) -> Robot:
             raise RobotError(f"robot file '{path}' cannot be read: {error.strerror}.") from error
         except UnicodeDecodeError as error:
             raise RobotError(f"robot file '{path}' is not text (byte {error.start} is not UTF-8).") from error
-        return parse_robot(text, source=str(path), folder=path.parent)
+        return parse_robot(text, source=str(path), folder=path.parent.absolute())
     if str(robot) not in robot_names():
         raise RobotError(f"no robot '{robot}'; shipped are {', '.join(robot_names())}. Name one of them or a path to a .toml file.")
     text = (resources.files(__package__) / "robots" / f"{robot}.toml").read_text(encoding="utf-8")

@@ -172,6 +172,19 @@ def test_a_bug_in_one_log_does_not_end_the_others(monkeypatch):
     assert {row["error"] for row in rows} == {"ZeroDivisionError: a bug"}
 
 
+def test_a_worker_in_another_folder_finds_log_and_reference_and_the_table_names_them_as_told(tmp_path, monkeypatch):
+    """As those of a cluster: log and reference are told relative to where the command is."""
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "run.mcap").symlink_to(logs(1)[0])
+    (tmp_path / "run.tum").write_text("".join(f"{t} 0 0 0 0 0 0 1\n" for t in range(2, 20)))
+    monkeypatch.chdir(tmp_path)
+    asked = [dataclasses.replace(jobs(1)[0], log="run.mcap", reference=reference) for reference in (None, "{stem}.tum")]
+    found = [run_job(job) for job in asked]
+    monkeypatch.chdir("elsewhere")
+    assert [run_job(job) for job in asked] == found
+    assert [(row["log"], row["status"], row["n_reference"]) for (row,) in found] == [("run.mcap", "ok", 539), ("run.mcap", "ok", 18)]
+
+
 def test_a_process_that_is_killed_takes_no_other_log_with_it(table):
     """The second log always kills its process, the third does it once."""
     found = {job.log: rows for job, rows in run_local(jobs(3), 1, killing)}

@@ -55,6 +55,12 @@ def test_a_written_calibration_is_read_back_by_its_model(tmp_path: Path) -> None
     np.testing.assert_array_equal(make_model("icr", load_robot(path)).nominal, list(fitted.values()))
 
 
+def test_paths_in_a_robot_file_start_at_it_wherever_the_process_goes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "robot.toml").write_text(robot_toml(VAULTBOT), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    assert load_robot("robot.toml").folder == tmp_path
+
+
 def _controller(text: str, wheels: np.ndarray) -> np.ndarray:
     """The controller's own odometry (ros2_controllers, diff_drive_controller/src/odometry.cpp) with the written parameters."""
     p = YAML(typ="safe").load(text)["diff_drive_controller"]["ros__parameters"]
