@@ -16,11 +16,14 @@ def versions() -> dict[str, str]:
 
 
 def fingerprint(path: Path) -> str:
-    """Of a log: SHA-256 over names, sizes, and first and last MiB of its files. Reading all of a large bag would take minutes."""
+    """Of a log, whatever it is called: SHA-256 over sizes, and first and last MiB of its files, and over names of those in a folder.
+
+    Reading all of a large bag would take minutes.
+    """
     digest = hashlib.sha256()
     for file in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
         size = file.stat().st_size
-        digest.update(f"{file.name}\0{size}\0".encode())
+        digest.update(f"{file.relative_to(path)}\0{size}\0".encode())
         with file.open("rb") as data:
             digest.update(data.read(_END))
             data.seek(max(size - _END, 0))

@@ -125,6 +125,18 @@ def test_what_is_done_is_not_done_again(table, tmp_path, asked, capsys):
     assert len(asked) == 3
 
 
+def test_a_log_under_several_names_counts_once(table, tmp_path, monkeypatch, capsys):
+    copy, linked = tmp_path / "copy.mcap", tmp_path / "linked.mcap"
+    copy.write_bytes(logs(3)[1].read_bytes())
+    linked.symlink_to(logs(3)[2])
+    monkeypatch.chdir(logs(3)[0].parent)
+    otherwise = [os.path.join("..", logs(3)[0].parent.name, logs(3)[0].name), copy, linked]
+    assert compare(tmp_path / "t.csv", of=[*logs(3), *otherwise, logs(3)[0]]) == 0
+    assert (tmp_path / "t.csv").read_bytes() == table.read_bytes()
+    said = capsys.readouterr().out.splitlines()[:3]
+    assert said == [f"{other} is the same log as {first}: counted once." for other, first in zip(otherwise, logs(3), strict=True)]
+
+
 def test_half_a_table_is_completed(table, tmp_path):
     lines = table.read_text().splitlines(keepends=True)
     out = tmp_path / "table.csv"

@@ -69,7 +69,7 @@ class Compare:
             raise OutputError(f"--processes is {self.processes}; it must be 1 or more, or 0 for as many as there are cores.")
         table_path, report_path = places(self.out)
         check_report(report_path)
-        jobs, table = self._jobs(), Table(table_path)
+        jobs, table = self._jobs(console), Table(table_path)
         left = [dataclasses.replace(job, trials=missing) for job in jobs if (missing := table.missing(job))]
         done = sum(len(job.trials) for job in jobs) - sum(len(job.trials) for job in left)
         if done:
@@ -87,7 +87,8 @@ class Compare:
             table.save(jobs)
         self._report(console, table, report_path, table.rows(jobs))
 
-    def _jobs(self) -> list[Job]:
+    def _jobs(self, console: Console) -> list[Job]:
+        """One for each log; what is the same as another would make intervals narrower than they are."""
         robot, forms = load_robot(self.robot), check_forms(_names(self.corrections))
         models, estimators = _names(self.model), _names(self.estimator)
         for model in models:
@@ -95,21 +96,15 @@ class Compare:
         for estimator in estimators:
             check_estimator(estimator, has_lidar=True)
         wanted = tuple(trials(models, estimators, forms))
-        logs = list(dict.fromkeys(self.logs))
-        if not logs:
+        jobs: dict[str, Job] = {}
+        for path in dict.fromkeys(self.logs):
+            key = job_key(path, robot, self.reference, self.topic, self.config)
+            first = jobs.setdefault(key, Job(str(path), robot, wanted, key, self.reference, self.topic, self.config))
+            if first.log != str(path):
+                console.print(f"{path} is the same log as {first.log}: counted once.", markup=False, soft_wrap=True)
+        if not jobs:
             raise LogError("no logs to compare on; name some.")
-        return [
-            Job(
-                str(path),
-                robot,
-                wanted,
-                job_key(path, robot, self.reference, self.topic, self.config),
-                self.reference,
-                self.topic,
-                self.config,
-            )
-            for path in logs
-        ]
+        return list(jobs.values())
 
     def _run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, list[Row]]]:
         if self.dask is not None:
