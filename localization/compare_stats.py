@@ -61,12 +61,12 @@ def combination(row: Row) -> str:
 
 
 def by_combination(rows: Sequence[Row], metric: str) -> dict[str, dict[str, float]]:
-    """The numbers of ``metric`` by combination and log; rows that failed or lack it are left out."""
+    """The numbers of ``metric`` by combination and log; rows that failed, lack it or have words there are left out."""
     found: dict[str, dict[str, float]] = {}
     for row in rows:
         value = row.get(metric) if row["status"] == OK else None
         table = found.setdefault(combination(row), {})
-        if value is not None and math.isfinite(value):
+        if isinstance(value, int | float) and math.isfinite(value):
             table[row["log"]] = float(value)
     return found
 

@@ -233,10 +233,11 @@ def test_bad_arguments_are_explained(arguments, said, tmp_path, capsys):
     assert "Traceback" not in shown
 
 
-def test_metrics_that_do_not_exist_are_explained(table, capsys):
-    assert compare(table, "--metric", "beauty") == 2
+@pytest.mark.parametrize("metric", ["beauty", "log", "notes", "corrections"])
+def test_metrics_that_do_not_exist_or_are_words_are_explained(metric, table, capsys):
+    assert compare(table, "--metric", metric) == 2
     said = " ".join(capsys.readouterr().err.split())
-    assert "no result has a number 'beauty'" in said
+    assert f"no result has a number '{metric}'" in said
     assert "ate_rmse_m" in said
 
 
