@@ -24,7 +24,7 @@ from motion_models.robot import Robot
 OK, FAILED = "ok", "failed"
 
 Row = dict[str, Any]
-"""Of the table: what was run, `status`, `error`, `notes` on what was amiss with the log, and the scores."""
+"""Of the table: what was run, `status`, `error`, `notes` on what was amiss with the log, of them `damage` to its files, and the scores."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +106,10 @@ def _run(job: Job) -> list[Row]:
     reference = _reference(log, job)
     pairs = [Pair(make_model(trial.model, job.robot), trial.estimator, trial.corrections) for trial in able]
     runs = replay(log.events(), pairs, job.robot, log.mounts, has_lidar, job.config)
-    notes = " ".join(log.notes())
+    amiss = {"notes": " ".join(log.notes()), "damage": " ".join(log.damage())}
     for trial, result in zip(able, score(runs, reference), strict=True):
-        rows.append(
-            {**_head(job, trial), "status": OK, "error": "", "notes": notes, **_scores(result.metrics(log.duration_s, with_timing=False))}
-        )
+        scores = _scores(result.metrics(log.duration_s, with_timing=False))
+        rows.append({**_head(job, trial), "status": OK, "error": "", **amiss, **scores})
     return rows
 
 

@@ -14,7 +14,7 @@ from localization.errors import OutputError
 from localization.estimators import CORRECTING
 
 _HEAD = ("log", "robot", "model", "estimator", "corrections", "key", "status", "error")
-_TEXTS = (*_HEAD, "notes")
+_TEXTS = (*_HEAD, "notes", "damage")
 _SUFFIXES = (".csv", ".parquet")
 
 Name = tuple[str, str, str, str]

@@ -51,6 +51,11 @@ class Findings:
     def failed(self) -> list[Row]:
         return [row for row in self.rows if row["status"] != OK]
 
+    @property
+    def damaged(self) -> dict[str, str]:
+        """What of a log could not be read, by log; of those that count nevertheless."""
+        return {row["log"]: row["damage"] for row in self.rows if row.get("damage")}
+
     def against_best(self, name: str) -> Difference | None:
         """None where the two have fewer than two logs in common."""
         pair = {name, self.best.name}
@@ -134,6 +139,8 @@ def _incomplete(found: Findings) -> list[str]:
     if failed := found.failed:
         logs = len({row["log"] for row in failed})
         said.append(f"{len(failed)} of {len(found.rows)} runs failed, on {_logs(logs)}.")
+    if n := len(found.damaged):
+        said.append(f"{_logs(n)} {'is' if n == 1 else 'are'} not whole: what could be read counts as much as a whole drive.")
     return said
 
 

@@ -163,7 +163,7 @@ def test_a_log_that_is_broken_is_reported_and_the_others_finished(table, tmp_pat
     assert "none of 1 logs could be compared" in " ".join(capsys.readouterr().err.split())
 
 
-def test_what_was_amiss_with_a_log_is_told(tmp_path):
+def test_what_was_amiss_with_a_log_is_told(tmp_path, capsys):
     """A log that is cut off still counts: whoever reads the means must know."""
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(logs(1)[0].read_bytes()[:-4000])
@@ -172,7 +172,15 @@ def test_what_was_amiss_with_a_log_is_told(tmp_path):
     assert by_log[str(logs(1)[0])] == ""
     assert by_log[str(cut)]
     assert html.escape(by_log[str(cut)]) in (tmp_path / "t.html").read_text()
-    assert compare(tmp_path / "t.csv", of=[cut, *logs(1)]) == 0  # and it is read again
+    capsys.readouterr()
+    assert compare(tmp_path / "t.csv", "--json", tmp_path / "t.json", of=[cut, *logs(1)]) == 0  # and it is read again
+    told, page = capsys.readouterr().out, (tmp_path / "t.html").read_text()
+    (line,) = [line for line in told.splitlines() if line.startswith("! ")]
+    damage = json.loads((tmp_path / "t.json").read_text())["damaged"][str(cut)]
+    assert re.search(r"messages of it are used; of its last \d+ bytes only what is whole could be read", damage)
+    assert line == f"! {cut}: {damage}"
+    for text in (told, page):
+        assert "1 log is not whole: what could be read counts as much as a whole drive." in text
 
 
 def test_a_bug_in_one_log_does_not_end_the_others(monkeypatch):

@@ -124,6 +124,8 @@ class Compare:
         if not found.means:
             known = ", ".join(sorted({name for row in rows for name, value in row.items() if isinstance(value, float)}))
             raise EvaluationError(f"no result has a number '{self.metric}'; there are {known}.")
+        for log, damage in found.damaged.items():
+            console.print(f"[yellow]![/] {escape(log)}: {escape(damage)}", soft_wrap=True)
         grid = Grid("", "logs", f"mean {self.metric}", "95 %", box=None, header_style="bold", pad_edge=False)
         for m in found.means:
             grid.add_row(m.name, str(m.n), f"{m.mean:.4g}", f"{m.low:.4g} to {m.high:.4g}" if m.n > 1 else "")
@@ -152,6 +154,7 @@ def _content(found: Findings) -> dict[str, Any]:
         "verdict": " ".join([headline(found), *closing(found)]),
         "means": [dataclasses.asdict(m) for m in found.means],
         "differences": [dataclasses.asdict(d) for d in found.tested],
+        "damaged": found.damaged,
         "failed": [{name: row[name] for name in ("log", "model", "estimator", "corrections", "error")} for row in found.failed],
     }
 

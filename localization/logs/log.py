@@ -133,9 +133,13 @@ class Log:
                 _try(lambda raw=raw: transforms.add(decode(raw), is_static=False))  # type: ignore[misc]
         return {"base_link": Mount(), **self.robot.mounts, **transforms.mounts()}
 
+    def damage(self) -> list[str]:
+        """Sentences about what of its files could not be read, and how much could, so far."""
+        return list(dict.fromkeys(self.source.notes))
+
     def notes(self) -> list[str]:
-        """Sentences about everything that was lost, mended or chosen without being told, so far."""
-        said = [*self.source.notes, *self._choice_notes]
+        """Sentences about everything that was lost, mended or chosen without being told, so far: `damage` first."""
+        said = [*self.damage(), *self._choice_notes]
         for tally in self._tallies.values():
             said += tally.sentences()
         return list(dict.fromkeys(said))
