@@ -15,6 +15,14 @@ class EvaluationError(SkidlocError):
     """A reference that cannot be used: missing, malformed, or not overlapping the trajectory in time."""
 
 
+class SettingError(SkidlocError):
+    """A setting that nothing can be computed with: a number out of its range or not finite, a list of names with none in it."""
+
+
+class EventError(SkidlocError):
+    """An event that no estimator can use: an array of another shape, numbers that are not finite, a matrix that is no covariance."""
+
+
 class OutputError(SkidlocError):
     """An output path that already holds something, or that cannot be written."""
 

@@ -14,6 +14,7 @@ import numpy as np
 from localization.accuracy import Accuracy, ErrorSeries, RelationErrors, RelationsScore, RpeAtLength
 from localization.errors import EvaluationError
 from localization.references import ReferenceTrack, Relations
+from localization.settings import Positive, Settings
 from localization.timespans import no_overlap_message
 from localization.trajectory import IntArray, Trajectory, path_nodes
 from motion_models import se2
@@ -39,8 +40,8 @@ _MIN_MATCHES = 3
 
 
 @dataclass(frozen=True)
-class EvaluateConfig:
-    max_gap_s: float = 1.0
+class EvaluateConfig(Settings):
+    max_gap_s: Positive = 1.0
     """Reference samples between two poses further apart than this [s] are not scored: there the estimate is only interpolation."""
     rpe_distances_m: tuple[float, ...] = ()
     """Lengths of the sub-paths of the relative pose error [m]; without any, 1, 2, 5, 10, 20, 50, ... up to what was driven."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from localization.events import CgSample, Event, WheelSample
+from localization.settings import Count, Positive, Settings
 from localization.wheel_history import WheelHistory
 from localization.witnesses import HOLD_S, Span, Wheels, Witness
 from motion_models.base import MotionModel
@@ -21,16 +22,16 @@ _NOTHING = np.zeros((0,))
 
 
 @dataclass(frozen=True)
-class WindowConfig:
+class WindowConfig(Settings):
     """How a log is cut into maneuvers."""
 
-    window_s: float = 2.0
+    window_s: Positive = 2.0
     """Length of a maneuver [s]: long enough for the wheels to stand out of the witness's noise, short enough not to drift."""
     around_s: float = 0.3
     """Wheel motion kept before and after each, in which a shift between the clocks is looked for [s]."""
     least_m: float = 0.02
     """A window in which no wheel rolls as far as this counts as standing still and is left out [m]."""
-    per_group: int = 3
+    per_group: Count = 3
     """Neighbouring windows that share their errors, and are held out together."""
 
 

@@ -6,11 +6,13 @@ import bisect
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
 from localization.gyro import GyroHistory, Turn
+from localization.settings import Positive, Settings, at_least
 from localization.wheel_history import WheelHistory
 from motion_models import se2
 from motion_models.base import Motion, MotionModel
@@ -22,20 +24,20 @@ _NS = 1e-9
 
 
 @dataclass(frozen=True)
-class StepConfig:
+class StepConfig(Settings):
     """How the time between events is cut into steps."""
 
-    max_step_s: float = 0.25
+    max_step_s: Annotated[float, at_least(0.001)] = 0.25
     """A step ends at a scan; where none comes for this long, it ends without one [s]."""
-    no_lidar_step_s: float = 0.05
+    no_lidar_step_s: Positive = 0.05
     """Length of steps in a log without a LiDAR, at least [s]; they end where wheels and gyro both were heard up to."""
     wait_s: float = 0.3
     """How long a scan waits for the wheel samples around it before it is used without them, and wheels for the gyro [s]."""
     max_hold_s: float = 0.5
     """For how long the last wheel rates are believed when no more come [s]."""
-    lost_speed_m_s: float = 0.5
+    lost_speed_m_s: Positive = 0.5
     """How fast the robot may move while no wheels are heard: sigma [m/s]."""
-    lost_rate_rad_s: float = 0.5
+    lost_rate_rad_s: Positive = 0.5
     """How fast it may turn meanwhile: sigma [rad/s]."""
 
 

@@ -463,6 +463,7 @@ def test_bad_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         ((GRID, "--out", tmp_path / "robot.txt"), "must end in .toml"),
         ((GRID, "--export-out", tmp_path / "x.yaml"), "does not say for which package"),
         ((HUSKY, "--window-s", "0.1"), "maneuvers of 0.5 to 20 s"),
+        ((HUSKY, "--window-s", "nan"), "maneuvers of 0.5 to 20 s"),
     ):
         assert complaint in refused(capsys, *arguments), arguments
     assert list(tmp_path.iterdir()) == [there]

@@ -229,6 +229,8 @@ def test_no_process_is_left_behind_when_it_is_interrupted():
     [
         (["--estimator", "magic"], "no estimator 'magic'"),
         (["--model", "magic"], "magic"),
+        (["--model", ""], "--model is ''"),
+        (["--config.step.max-step-s", "0"], "max_step_s of StepConfig is 0"),
         (["--out", "table.txt"], "must end in .csv or .parquet"),
         (["--robot", "nobody"], "nobody"),
         (["--processes", "-3"], "--processes is -3"),

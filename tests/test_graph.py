@@ -367,8 +367,6 @@ def test_a_covariance_that_is_not_positive_is_no_node():
         Node.known(np.zeros(3), np.zeros(0), np.diag([1.0, -1.0, 1.0]))
     with pytest.raises(SingularError):
         Window(Node(np.zeros(3), np.zeros(0), np.diag([1.0, np.nan, 1.0])), 5, 0.01)
-    with pytest.raises(EstimatorError, match="lag"):
-        Window(Node.known(np.zeros(3), np.zeros(0), np.eye(3)), 1, 0.01)
 
 
 def spoiled_step(step, kind):

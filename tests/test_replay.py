@@ -247,11 +247,23 @@ def no_lidar(tmp_path):
     return [str(bags.write_mcap(tmp_path / "log.mcap", records)), "--robot", "vaultbot", "--estimator", "lidar"], "scans"
 
 
+def nothing_asked(option):
+    def case(tmp_path):
+        return [str(bags.write_mcap(tmp_path / "log.mcap", rooms.drive(2.0))), "--robot", "vaultbot", option, " ,"], f"{option} is ' ,'"
+
+    return case
+
+
+def a_setting_of_no_use(tmp_path):
+    return [str(tmp_path), "--robot", "vaultbot", "--config.estimator.ekf.gate-probability", "0"], "gate_probability of EkfConfig is 0; it"
+
+
 @pytest.mark.parametrize(
     "case",
     [
         *(no_such_file, not_a_bag, no_such_topic, unknown_joints, one_message, other_times, no_such_reference),
-        *(no_such_model, no_such_estimator, no_such_robot, no_lidar),
+        *(no_such_model, no_such_estimator, no_such_robot, no_lidar, a_setting_of_no_use),
+        *(nothing_asked(option) for option in ("--model", "--estimator", "--corrections")),
     ],
 )
 def test_bad_input_is_told_and_nothing_is_written(case, tmp_path, capsys):

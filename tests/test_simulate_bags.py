@@ -22,8 +22,6 @@ from localization.simulate.drives import MoveArms, OpenLoop, PickUp, Rest, Route
 from localization.simulate.effects import EFFECTS, parse_effects
 from localization.simulate.evaluation import correction_time, score_runs
 from localization.simulate.experiments import CONFIGURATION_CGS, EXPERIMENTS, Experiment, ExperimentConfig, grid_points
-from localization.simulate.scanners import ScannerConfig
-from localization.simulate.sensors import EncoderConfig
 from localization.simulate.simulator import Simulation, SimulationConfig, simulate, write_simulation
 from localization.simulate.suite import START_NS, SensorConfig
 from localization.simulate.vehicle import VehicleConfig
@@ -336,27 +334,6 @@ def test_a_robot_that_cannot_get_there_says_so():
 def test_a_step_that_does_not_divide_the_control_period_is_refused():
     with pytest.raises(SimulationError, match=r"step_s is 0.003 s; it must divide the control period, 0.02 s"):
         Simulation(ARC, ROBOT, 0, {}, SimulationConfig(vehicle=VehicleConfig(step_s=0.003)))
-
-
-@pytest.mark.parametrize(
-    ("config", "said"),
-    [
-        (SimulationConfig(vehicle=VehicleConfig(step_s=0.0)), "config vehicle.step_s is 0; it must be positive"),
-        (SimulationConfig(vehicle=VehicleConfig(creep=math.nan)), "config vehicle.creep is nan; it must be a finite number"),
-        (SimulationConfig(experiment=ExperimentConfig(laps=0)), "config experiment.laps is 0; it must be at least 1"),
-        (SimulationConfig(sensors=SensorConfig(truth_hz=-1.0)), "config sensors.truth_hz is -1; it must be positive"),
-        (SimulationConfig(sensors=SensorConfig(encoders=EncoderConfig(rate_hz=0.0))), "sensors.encoders.rate_hz is 0; it must be positive"),
-        (
-            SimulationConfig(sensors=SensorConfig(scanner=ScannerConfig(dropout=1.0))),
-            "scanner.dropout is 1; it must be from 0 to",
-        ),
-        (SimulationConfig(sensors=SensorConfig(scanner=ScannerConfig(noise_m=-0.1))), "noise_m is -0.1; it must be 0 or more"),
-        (SimulationConfig(sensors=SensorConfig(scanner=ScannerConfig(sweep_deg=90.0))), "field_of_view_deg is larger than"),
-    ],
-)
-def test_numbers_that_no_simulation_can_use_are_named(config, said):
-    with pytest.raises(SimulationError, match=said):
-        Simulation(ARC, ROBOT, 0, {}, config)
 
 
 def test_seeds_are_not_negative():

@@ -83,7 +83,7 @@ class Calibrate:
     def _check(self) -> None:
         if not self.source:
             raise CalibrationError("nothing to calibrate on: name at least one log or table.")
-        if self.window_s < 0.5 or self.window_s > 20.0:
+        if not 0.5 <= self.window_s <= 20.0:
             raise CalibrationError(f"--window-s is {self.window_s:g}; maneuvers of 0.5 to 20 s make sense.")
         if self.export_out is not None and self.export is None:
             raise CalibrationError("--export-out names a file, but --export does not say for which package.")

@@ -11,7 +11,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from localization.errors import OutputError
+from localization.errors import OutputError, SettingError
+
+
+def names(text: str, option: str) -> list[str]:
+    """Those in ``text``, separated by commas, each once. Raises `SettingError` where there is none."""
+    found = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    if not found:
+        raise SettingError(f"{option} is '{text}', which names nothing; it must be one name, or several separated by commas.")
+    return found
 
 
 def check_new(path: Path) -> None:

@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table as Grid
 
-from localization.commands.common import check_new, write_json
+from localization.commands.common import check_new, names, write_json
 from localization.compare_job import OK, Job, Row, job_key, run_job, trials
 from localization.compare_pool import run_local
 from localization.compare_table import Table
@@ -89,8 +89,8 @@ class Compare:
 
     def _jobs(self, console: Console) -> list[Job]:
         """One for each log; what is the same as another would make intervals narrower than they are."""
-        robot, forms = load_robot(self.robot), check_forms(_names(self.corrections))
-        models, estimators = _names(self.model), _names(self.estimator)
+        robot, forms = load_robot(self.robot), check_forms(names(self.corrections, "--corrections"))
+        models, estimators = names(self.model, "--model"), names(self.estimator, "--estimator")
         for model in models:
             make_model(model, robot)
         for estimator in estimators:
@@ -157,7 +157,3 @@ def _content(found: Findings) -> dict[str, Any]:
         "damaged": found.damaged,
         "failed": [{name: row[name] for name in ("log", "model", "estimator", "corrections", "error")} for row in found.failed],
     }
-
-
-def _names(text: str) -> list[str]:
-    return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))

@@ -53,7 +53,7 @@ class Diagnose:
     """Write what is printed to this file as well."""
 
     def run(self, console: Console) -> None:
-        if self.window_s < 0.5 or self.window_s > 20.0:
+        if not 0.5 <= self.window_s <= 20.0:
             raise CalibrationError(f"--window-s is {self.window_s:g}; windows of 0.5 to 20 s make sense.")
         for path in (self.out, self.json):
             if path is not None:

@@ -19,7 +19,7 @@ from rich.live import Live
 from rich.markup import escape
 
 from localization.commands.online_line import live_line
-from localization.errors import OutputError
+from localization.errors import DumpError, OutputError
 from localization.estimators import check_estimator
 from localization.logs import TopicOverrides, open_log
 from localization.online.core import Core, Pair, ReplayConfig
@@ -28,6 +28,7 @@ from localization.online.pace import Pace
 from localization.online.session import Files, Session, View, made_by
 from localization.online.transport import Transport
 from localization.provenance import fingerprint
+from localization.settings import check_settings
 from motion_models.corrections import check_forms
 from motion_models.registry import make_model
 from motion_models.robot import Robot, load_robot
@@ -70,6 +71,12 @@ class Online:
     config: ReplayConfig = field(default_factory=ReplayConfig)
 
     def run(self, console: Console) -> None:
+        check_settings(self.node)
+        if self.state is not None and self.estimator == "graph" and self.config.estimator.graph.backend == "isam2":
+            raise DumpError(
+                f"no state can be kept in --state {self.state}: iSAM2's is GTSAM's own and cannot be written down. "
+                "Set --config.estimator.graph.backend to fixed_lag or batch, or leave --state out."
+            )
         rate, files, robot = parse_rate(self.rate), Files(self.out, self.state), load_robot(self.robot)
         view = self._view()
         try:

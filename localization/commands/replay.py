@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from localization.commands.accuracy_table import accuracy_table
 from localization.commands.calibration_tables import WIDE, show
-from localization.commands.common import check_new, new_folder, write_json
+from localization.commands.common import check_new, names, new_folder, write_json
 from localization.errors import EvaluationError
 from localization.estimators import CORRECTING, check_estimator
 from localization.events import Event
@@ -72,8 +72,8 @@ class Replay:
             check_new(self.json)
         log = open_log(self.log, robot, self.topic)
         has_lidar = log.sources.lidar is not None
-        models = [make_model(name, robot) for name in _names(self.model)]
-        forms = _names(self.corrections)
+        models = [make_model(name, robot) for name in names(self.model, "--model")]
+        forms = names(self.corrections, "--corrections")
         pairs = [
             Pair(model, estimator, form)
             for estimator in self._estimators(has_lidar)
@@ -115,12 +115,12 @@ class Replay:
         self._print(console, head, results, reference)
 
     def _estimators(self, has_lidar: bool) -> list[str]:
-        names = _names(self.estimator)
-        for name in names:
+        found = names(self.estimator, "--estimator")
+        for name in found:
             check_estimator(name, has_lidar or self.estimator == type(self).estimator)
         if self.estimator == type(self).estimator and not has_lidar:
-            names.remove(_WHEELLESS)
-        return names
+            found.remove(_WHEELLESS)
+        return found
 
     def _reference(self, log: Log) -> ReferenceTrack | Relations | None:
         """By topic or by file; read before the run, so that a wrong name costs no time."""
@@ -171,10 +171,6 @@ def check_overlap(reference: ReferenceTrack | Relations, log: Log) -> None:
     slack = 10_000_000_000  # recording may begin later and end earlier than the stamps
     if stamps[0] > span[1] + slack or stamps[-1] < span[0] - slack:
         raise EvaluationError(no_overlap_message(span, stamps, reference.source, 0))
-
-
-def _names(text: str) -> list[str]:
-    return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
 def _distance(results: Sequence[Result]) -> float | None:

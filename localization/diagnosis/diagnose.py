@@ -20,6 +20,7 @@ from localization.diagnosis.next_drive import general_advice, separating_drive
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, Pipeline, with_sizes
 from localization.diagnosis.search import aliases_of, search, true_cost
 from localization.diagnosis.words import evidence, sentence
+from localization.settings import Count, Probability, Settings
 from motion_models.base import MotionModel
 from motion_models.se2 import FloatArray
 
@@ -33,14 +34,14 @@ _FEW_WINDOWS = 64
 
 
 @dataclass(frozen=True)
-class DiagnosisConfig:
+class DiagnosisConfig(Settings):
     """How sure a diagnosis must be."""
 
-    significance: float = 0.01
+    significance: Probability = 0.01
     """Family-wise probability of naming any cause where there is none."""
-    fewest_windows: int = 8
+    fewest_windows: Count = 8
     """Fewer measured windows than this decide nothing."""
-    moments: int = 9
+    moments: Count = 9
     """At how many moments a change of the floor is looked for."""
     seed: int = 0
     """Of the random numbers in tests and intervals."""

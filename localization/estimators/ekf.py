@@ -21,6 +21,7 @@ from localization.estimators.revisit_update import revisit_update
 from localization.gyro import Turn
 from localization.lidar import MapTie, Revisit
 from localization.residuals import fill_motion_residual, turn_residual
+from localization.settings import Positive, Probability, Settings
 from localization.steps import Step
 from motion_models import se2
 from motion_models.base import Motion
@@ -35,7 +36,7 @@ BIAS, CLOCK, PARAMS = 9, 10, 11
 
 
 @dataclass(frozen=True)
-class EkfConfig:
+class EkfConfig(Settings):
     """What the filter believes before it has seen anything."""
 
     clock_sigma_s: float = 0.05
@@ -46,11 +47,11 @@ class EkfConfig:
     """Variance of the position while the wheels stand, per second: a push, a slope [m^2/s]."""
     nudge_rad2_per_s: float = 1e-6
     """The same for the yaw [rad^2/s]."""
-    standing_sigma_m: float = 2e-4
+    standing_sigma_m: Positive = 2e-4
     """How still standing still is, per step: sigma of the zero-velocity update [m]."""
-    standing_sigma_rad: float = 1e-4
+    standing_sigma_rad: Positive = 1e-4
     """The same for the yaw [rad]."""
-    gate_probability: float = 0.9999
+    gate_probability: Probability = 0.9999
     """A measurement that is less likely than one in 1 / (1 - this) says that one of the witnesses is wrong."""
 
 

@@ -11,7 +11,7 @@ import bisect
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -34,6 +34,7 @@ from localization.estimators.hindsight import Hindsight
 from localization.estimators.teaching import teaching
 from localization.estimators.witness import NoWitness, ScanWitness, Sight, Witness
 from localization.lidar import LidarConfig
+from localization.settings import Positive, Settings, at_least
 from localization.steps import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
@@ -50,25 +51,25 @@ _FAR_NS = 1_000_000_000  # a position may be this far from its node: the body mo
 
 
 @dataclass(frozen=True)
-class GraphConfig:
+class GraphConfig(Settings):
     """How the graph is solved. What it believes at first is the filter's (`EkfConfig`)."""
 
     backend: Literal["fixed_lag", "batch", "isam2"] = "fixed_lag"
     """``fixed_lag``: the estimate of each moment; a replay closes the way at its end where places were seen again (`Hindsight`).
     ``batch``, ``isam2``: all poses as later measurements have smoothed them."""
-    lag_nodes: int = 50
+    lag_nodes: Annotated[int, at_least(2)] = 50
     """Nodes that the window smooths."""
     relinearize_at: float = 0.01
     """Where the way between two nodes has changed this far since it was linearised, it is linearised anew [m, rad]."""
     kernel: Literal["none", "huber", "cauchy"] = "cauchy"
     """Robust kernel of positions and loop closures; a LiDAR that contradicts the wheels is judged when it comes."""
-    kernel_scale: float = 3.0
+    kernel_scale: Positive = 3.0
     """Where the kernel begins [sigmas]."""
     learn: tuple[Learned, ...] = ("clock",)
     """What is learned of the LiDAR: the wheels' clock against its own, and how far it sits off its transform (x, y, yaw)."""
-    mount_sigma_m: float = 0.05
+    mount_sigma_m: Positive = 0.05
     """How far off the LiDAR's transform may be at first [m]."""
-    mount_sigma_rad: float = 0.03
+    mount_sigma_rad: Positive = 0.03
     """How far its yaw [rad]."""
 
 

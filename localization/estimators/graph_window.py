@@ -34,8 +34,6 @@ class Window:
 
     def __init__(self, first: Node, lag: int, relinearize_at: float, kernel: Kernel | None = None) -> None:
         """``relinearize_at`` [m, rad]: how far the way between two nodes may be off that at which it was linearised."""
-        if lag < 2:
-            raise EstimatorError(f"the lag is {lag} nodes; it must be at least 2.")
         self._lag, self._relinearize_at, self._kernel = lag, relinearize_at, kernel or Kernel()
         self._n = n = len(first.root)
         room = 2 * lag + 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from localization.lidar.lines import AT_ONCE, FitOptions, LineMap
 from localization.lidar.noise import Noise
 from localization.lidar.revisit import Revisit, RevisitConfig, Revisits, Way
 from localization.lidar.sweep import walls
+from localization.settings import Allowed, Below, Count, Positive, Settings
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
@@ -25,27 +27,27 @@ _APART_M = 1e-4  # scans drawn on one spot are told apart by this
 
 
 @dataclass(frozen=True)
-class LidarConfig:
+class LidarConfig(Settings):
     """How scans are matched."""
 
-    voxel_size_m: float = 0.0
+    voxel_size_m: Annotated[float, Allowed("0, or from 0.01 to 10", lambda value: value == 0.0 or 0.01 <= value <= 10.0)] = 0.0
     """Voxel of KISS-ICP's map [m]; 0 takes a 15th of the first scan's median range, within 0.1 and 1 m."""
-    min_range_m: float = 0.1
+    min_range_m: Annotated[float, Below("max_range_m")] = 0.1
     """Nearer points are the robot itself [m]."""
-    max_range_m: float = 50.0
+    max_range_m: Positive = 50.0
     """Farther points are left out [m]."""
-    sigma_point_m: float = 0.03
+    sigma_point_m: Positive = 0.03
     """Noise of one LiDAR point, until scans have shown it [m]."""
-    sigma_line_m: float = 0.02
+    sigma_line_m: Positive = 0.02
     """Error of a line in the map, shared by all points of a scan that meet it in one cell, until scans have shown it [m]."""
-    iterations: int = 12
+    iterations: Count = 12
     """Point-to-line steps at most."""
     max_shift_m: float = 0.02
     """Where the motion within a sweep turns out otherwise than expected, and moves points by more than this, they are matched again [m];
     by less, the pose moves as its derivative by that motion says."""
-    max_jump_m_s: float = 2.0
+    max_jump_m_s: Positive = 2.0
     """Nothing moves the robot faster than this against its wheels: a scan that says so is left out [m/s]."""
-    max_jump_rad_s: float = 3.0
+    max_jump_rad_s: Positive = 3.0
     """Nor turns it faster [rad/s]."""
     max_jumps: int = 5
     """So many scans that jump one after the other are right: the robot was carried elsewhere."""

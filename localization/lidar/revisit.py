@@ -13,6 +13,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from localization.lidar.cells import ALL_AGES, Ages, ages_between, ages_until
 from localization.lidar.correlate import correlate
 from localization.lidar.lines import FitOptions, LineMap
 from localization.lidar.track import Place, Track, moved
+from localization.settings import Positive, Probability, Settings, up_to
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
@@ -41,28 +43,28 @@ Way = Callable[[NDArray[np.int64]], FloatArray]
 
 
 @dataclass(frozen=True)
-class RevisitConfig:
+class RevisitConfig(Settings):
     """When a place counts as seen again."""
 
     is_on: bool = True
     """Look for places seen before."""
-    old_after_m: float = 20.0
+    old_after_m: Positive = 20.0
     """What was mapped this far back on the way is old [m]."""
-    recent_m: float = 8.0
+    recent_m: Positive = 8.0
     """Scans of this last part of the way are searched together: one alone looks the same in many places of a building [m]."""
-    keyframe_m: float = 1.0
+    keyframe_m: Positive = 1.0
     """Remember what is seen after this way [m]."""
-    keyframe_rad: float = 0.5
+    keyframe_rad: Positive = 0.5
     """Or after this turn [rad]."""
     search_m: float = 2.0
     """Search again after this way [m]."""
-    max_search_m: float = 8.0
+    max_search_m: Positive = 8.0
     """Never search farther than this, however uncertain the pose [m]."""
-    max_search_rad: float = 0.35
+    max_search_rad: Positive = 0.35
     """Nor farther than this [rad]."""
-    min_matched: float = 0.7
+    min_matched: Annotated[float, up_to(1)] = 0.7
     """Part of the scan's points that must lie on old lines."""
-    gate_probability: float = 0.999
+    gate_probability: Probability = 0.999
     """Corrections that are less likely than one in 1 / (1 - this) are not believed."""
     rival_sigmas: float = 4.0
     """By how many sigmas the points that only the best place explains must outnumber those that only another one explains."""

@@ -6,10 +6,12 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from localization.errors import SimulationError
+from localization.settings import Count, Positive, Settings, up_to
 from localization.simulate.drives import MoveArms, OpenLoop, Phase, PickUp, Profile, Rest, Route, TurnTo, constant, sine
 from localization.simulate.world import WORLDS, World
 from motion_models.robot import Robot
@@ -17,16 +19,16 @@ from motion_models.se2 import FloatArray
 
 
 @dataclass(frozen=True)
-class ExperimentConfig:
+class ExperimentConfig(Settings):
     """How much of an experiment is driven."""
 
-    laps: int = 3
+    laps: Count = 3
     """Laps of `laps`, `corridor` (to and fro), `slippery_patch` and `payload_pickup` (before and after)."""
-    hours: float = 10.0
+    hours: Positive = 10.0
     """Length of `soak` [h]."""
     payload_kg: float = 8.0
     """What `payload_pickup` takes up [kg]."""
-    speed_m_s: float = 0.6
+    speed_m_s: Annotated[float, up_to(2)] = 0.6
     """Speed along routes [m/s]."""
 
 

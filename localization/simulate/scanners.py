@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numba
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from localization.logs import forms
 from localization.logs.forms import Message
+from localization.settings import Below, Count, Positive, Settings, Share, Signed, at_least
 from localization.simulate.clock import Ticks, seconds
 from localization.simulate.raycast import Grid, cast, cast_at_people, make_grid
 from localization.simulate.track import Track, pose_at
@@ -20,50 +22,50 @@ from motion_models.se2 import FloatArray
 
 
 @dataclass(frozen=True)
-class ScannerConfig:
+class ScannerConfig(Settings):
     """A planar scanner; by default a SICK LMS511 at half its resolution."""
 
-    rate_hz: float = 12.5
+    rate_hz: Positive = 12.5
     """Scans per second."""
-    beams: int = 381
+    beams: Annotated[int, at_least(2)] = 381
     """Beams in a scan."""
-    field_of_view_deg: float = 190.0
+    field_of_view_deg: Annotated[Positive, Below("sweep_deg", or_equal=True)] = 190.0
     """Angle from the first to the last beam, middle ahead [deg]."""
-    sweep_deg: float = 360.0
+    sweep_deg: Positive = 360.0
     """Angle that the mirror turns from scan to scan: the sweep fills field of view / this of the time [deg]."""
     noise_m: float = 0.012
     """Standard deviation of a range [m]."""
     resolution_m: float = 0.001
     """Ranges are rounded to this [m]."""
-    dropout: float = 0.002
+    dropout: Share = 0.002
     """Share of beams that do not come back."""
-    min_range_m: float = 0.1
+    min_range_m: Annotated[float, Below("max_range_m")] = 0.1
     """Nearer things are not seen [m]."""
-    max_range_m: float = 40.0
+    max_range_m: Positive = 40.0
     """Farther things are not seen [m]."""
 
 
 @dataclass(frozen=True)
-class SpinningConfig:
+class SpinningConfig(Settings):
     """A spinning scanner; by default like a Velodyne VLP-16 at a third of its points."""
 
-    rate_hz: float = 10.0
+    rate_hz: Positive = 10.0
     """Turns per second."""
-    rings: int = 16
+    rings: Count = 16
     """Beams above each other."""
-    columns: int = 600
+    columns: Annotated[int, at_least(2)] = 600
     """Firings in a turn."""
-    lowest_deg: float = -15.0
+    lowest_deg: Annotated[Signed, Below("highest_deg", or_equal=True)] = -15.0
     """Elevation of the lowest ring [deg]."""
-    highest_deg: float = 15.0
+    highest_deg: Signed = 15.0
     """Elevation of the highest ring [deg]."""
     noise_m: float = 0.02
     """Standard deviation of a range [m]."""
-    dropout: float = 0.005
+    dropout: Share = 0.005
     """Share of beams that do not come back."""
-    min_range_m: float = 0.5
+    min_range_m: Annotated[float, Below("max_range_m")] = 0.5
     """Nearer things are not seen [m]."""
-    max_range_m: float = 100.0
+    max_range_m: Positive = 100.0
     """Farther things are not seen [m]."""
 
 

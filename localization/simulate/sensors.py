@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from localization.logs import forms
 from localization.logs.forms import Message
+from localization.settings import Allowed, Positive, Settings, Signed
 from localization.simulate.clock import Ticks, seconds
 from localization.simulate.masses import Masses
 from localization.simulate.track import Track
@@ -21,15 +23,15 @@ _GRAVITY = 9.81
 
 
 @dataclass(frozen=True)
-class EncoderConfig:
-    rate_hz: float = 50.0
+class EncoderConfig(Settings):
+    rate_hz: Positive = 50.0
     """Joint states per second."""
     counts: int = 4096
     """Counts of an encoder per turn of the wheel; 0 for exact angles."""
 
 
 @dataclass(frozen=True)
-class ImuConfig:
+class ImuConfig(Settings):
     rate_hz: float = 50.0
     """Samples per second; 0 for no IMU."""
     gyro_noise: float = 5e-4
@@ -43,18 +45,18 @@ class ImuConfig:
 
 
 @dataclass(frozen=True)
-class GpsConfig:
+class GpsConfig(Settings):
     rate_hz: float = 0.0
     """Fixes per second; 0 for no GPS."""
     noise_m: float = 0.3
     """White noise of east and north [m]."""
     drift_m: float = 0.8
     """Slow error of east and north, a Gauss-Markov process [m]."""
-    drift_s: float = 60.0
+    drift_s: Positive = 60.0
     """Its correlation time [s]."""
-    latitude_deg: float = 30.2888
+    latitude_deg: Annotated[float, Allowed("from -89 to 89", lambda value: abs(value) <= 89.0)] = 30.2888
     """Of the world's origin [deg]."""
-    longitude_deg: float = -97.7354
+    longitude_deg: Signed = -97.7354
     """Of the world's origin [deg]."""
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from localization.errors import SimulationError
 from localization.logs.forms import Message, text
 from localization.logs.write import write_bag
-from localization.simulate.checks import check_config
 from localization.simulate.drives import MoveArms, OpenLoop, Phase, PickUp, Pursuit, Rest, Route, turning
 from localization.simulate.effects import Reality, changed
 from localization.simulate.experiments import Experiment, ExperimentConfig, find_experiment
@@ -53,7 +52,6 @@ class Simulation:
         self, experiment: Experiment, robot: Robot, seed: int, effects: Mapping[str, float], config: SimulationConfig | None = None
     ) -> None:
         self.config = config or SimulationConfig()
-        check_config(self.config)
         if seed < 0:
             raise SimulationError(f"seed is {seed}; it must be 0 or more.")
         self.experiment, self.robot = experiment, robot

@@ -11,6 +11,7 @@ import numpy as np
 
 from localization.logs import forms
 from localization.logs.forms import Message
+from localization.settings import Positive, Settings
 from localization.simulate.effects import Reality
 from localization.simulate.masses import Masses
 from localization.simulate.scanners import Scanner, ScannerConfig, SpinningConfig, SpinningScanner
@@ -27,14 +28,14 @@ _BODY_ABOVE_FLOOR_M = 0.13
 
 
 @dataclass(frozen=True)
-class SensorConfig:
+class SensorConfig(Settings):
     """Which sensors there are, and how good they are."""
 
     lidar: Literal["2d", "3d", "none"] = "2d"
     """Planar scanner on /scan, spinning scanner on /points, or none."""
     center_of_gravity: bool = False
     """Publish the nominal CG, which arms and robot file tell, on its topic."""
-    truth_hz: float = 25.0
+    truth_hz: Positive = 25.0
     """Rate of the truth."""
     encoders: EncoderConfig = field(default_factory=EncoderConfig)
     scanner: ScannerConfig = field(default_factory=ScannerConfig)

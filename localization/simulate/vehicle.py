@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from localization.errors import SimulationError
+from localization.settings import Positive, Settings, up_to
 from localization.simulate.dynamics import Chassis, Now, change
 from localization.simulate.stepping import drive
 from motion_models.friction import FrictionModel, check_parameters
@@ -22,20 +24,20 @@ _FALLS_S = 0.1  # a robot that its own jerk lifts for less than about sqrt(z_G /
 
 
 @dataclass(frozen=True)
-class VehicleConfig:
+class VehicleConfig(Settings):
     """How the robot is driven and stepped."""
 
-    step_s: float = 0.005
+    step_s: Annotated[float, up_to(0.02)] = 0.005
     """Length of an integration step [s]."""
-    motor_lag_s: float = 0.08
+    motor_lag_s: Positive = 0.08
     """Time constant of the wheel-speed loop [s]."""
-    acceleration_m_s2: float = 1.5
+    acceleration_m_s2: Positive = 1.5
     """How fast the controller lets the wheels' speed change [m/s^2]."""
-    creep: float = 1e-3
+    creep: Annotated[float, up_to(0.5)] = 1e-3
     """Slip at which friction is fully there, as a fraction of the wheels' speed [-]."""
-    tyre_lag_s: float = 0.02
+    tyre_lag_s: Positive = 0.02
     """Time in which the wheels' loads follow the forces: that of the robot bouncing on its tyres [s]."""
-    gravity: float = 9.81
+    gravity: Positive = 9.81
     """[m/s^2]"""
 
 

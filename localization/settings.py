@@ -1,0 +1,80 @@
+"""Numbers that a user may set: each is held against what makes sense as soon as it is set, on the command line or in code."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from numbers import Real
+from typing import Annotated, Any, get_type_hints
+
+from localization.errors import SettingError
+
+
+@dataclass(frozen=True)
+class Allowed:
+    """What a number may be besides finite."""
+
+    what: str
+    test: Callable[[float], bool]
+
+
+@dataclass(frozen=True)
+class Below:
+    """A number that must be below that of another field, or, if ``or_equal``, at most that."""
+
+    field: str
+    or_equal: bool = False
+
+
+def at_least(low: float) -> Allowed:
+    return Allowed(f"{low:g} or more", lambda value: value >= low)
+
+
+def up_to(high: float) -> Allowed:
+    return Allowed(f"above 0 and at most {high:g}", lambda value: 0.0 < value <= high)
+
+
+Positive = Annotated[float, Allowed("above 0", lambda value: value > 0.0)]
+Signed = Annotated[float, Allowed("a number", lambda value: True)]
+Probability = Annotated[float, Allowed("between 0 and 1, and neither of them", lambda value: 0.0 < value < 1.0)]
+Share = Annotated[float, Allowed("from 0 to below 1", lambda value: 0.0 <= value < 1.0)]
+Count = Annotated[int, at_least(1)]
+_NOT_NEGATIVE = at_least(0)  # where a field does not say otherwise
+
+
+class Settings:
+    """Base of the dataclasses of settings. Their fields say by `Annotated` what they may be; without it, a number is 0 or more.
+
+    Making one raises `SettingError` for the first number that nothing can be computed with.
+    """
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+
+
+def check_settings(settings: object) -> None:
+    """Raises `SettingError` naming the first number of the dataclass ``settings`` that is not what it may be."""
+    rules = _rules(type(settings))
+    numbers = {name: value for name in rules if isinstance(value := getattr(settings, name), Real)}
+    for name, value in numbers.items():
+        allowed = next((rule for rule in rules[name] if isinstance(rule, Allowed)), _NOT_NEGATIVE)
+        if not math.isfinite(value):
+            raise _refusal(settings, name, "a finite number")
+        if not allowed.test(float(value)):
+            raise _refusal(settings, name, allowed.what)
+    for name, value in numbers.items():
+        for bound in (rule for rule in rules[name] if isinstance(rule, Below)):
+            most = numbers[bound.field]
+            if value > most or (value == most and not bound.or_equal):
+                raise _refusal(settings, name, f"{'at most' if bound.or_equal else 'below'} {bound.field}, which is {most:g}")
+
+
+def _refusal(settings: object, name: str, wanted: str) -> SettingError:
+    return SettingError(f"setting {name} of {type(settings).__name__} is {getattr(settings, name):g}; it must be {wanted}.")
+
+
+def _rules(kind: type) -> Mapping[str, tuple[Any, ...]]:
+    """Of each field, what it is annotated with."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}

@@ -1,0 +1,90 @@
+"""Numbers that a user may set are refused by name as soon as they are set, if nothing can be computed with them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+
+from localization.diagnosis.diagnose import DiagnosisConfig
+from localization.errors import SettingError
+from localization.estimators.ekf import EkfConfig
+from localization.estimators.graph_fusion import GraphConfig
+from localization.evaluate import EvaluateConfig
+from localization.lidar import LidarConfig
+from localization.lidar.revisit import RevisitConfig
+from localization.maneuver_windows import WindowConfig
+from localization.run import ReplayConfig
+from localization.simulate.experiments import ExperimentConfig
+from localization.simulate.scanners import ScannerConfig, SpinningConfig
+from localization.simulate.sensors import EncoderConfig, GpsConfig
+from localization.simulate.simulator import SimulationConfig
+from localization.simulate.suite import SensorConfig
+from localization.simulate.vehicle import VehicleConfig
+from localization.steps import StepConfig
+
+ROOTS = (ReplayConfig, SimulationConfig, DiagnosisConfig, WindowConfig, EvaluateConfig)
+
+
+@pytest.mark.parametrize(
+    ("config", "values", "said"),
+    [
+        (StepConfig, {"max_step_s": [0, -1, 1e-12]}, "0.001 or more"),
+        (StepConfig, {"no_lidar_step_s": [0], "lost_speed_m_s": [-1], "lost_rate_rad_s": [0]}, "above 0"),
+        (StepConfig, {"wait_s": [-1], "max_hold_s": [-1]}, "0 or more"),
+        (EkfConfig, {"gate_probability": [0, 1, 2]}, "between 0 and 1, and neither of them"),
+        (EkfConfig, {"clock_sigma_s": [-1], "clock_walk_s_per_sqrt_s": [-1], "nudge_m2_per_s": [-1]}, "0 or more"),
+        (EkfConfig, {"standing_sigma_m": [0], "standing_sigma_rad": [0]}, "above 0"),
+        (GraphConfig, {"kernel_scale": [0], "mount_sigma_m": [0, -1], "mount_sigma_rad": [0]}, "above 0"),
+        (GraphConfig, {"relinearize_at": [-1]}, "0 or more"),
+        (GraphConfig, {"lag_nodes": [1, -5]}, "2 or more"),
+        (LidarConfig, {"voxel_size_m": [-1, 1e-9, 1e3]}, "0, or from 0.01 to 10"),
+        (LidarConfig, {"min_range_m": [60, 50]}, "below max_range_m, which is 50"),
+        (LidarConfig, {"max_range_m": [0], "sigma_point_m": [0, -1], "sigma_line_m": [-1], "max_jump_m_s": [0]}, "above 0"),
+        (LidarConfig, {"iterations": [0, -3]}, "1 or more"),
+        (LidarConfig, {"max_jumps": [-1], "max_shift_m": [-1]}, "0 or more"),
+        (RevisitConfig, {"gate_probability": [1]}, "between 0 and 1"),
+        (RevisitConfig, {"min_matched": [0, 1.01]}, "above 0 and at most 1"),
+        (DiagnosisConfig, {"significance": [0], "fewest_windows": [0], "moments": [0], "seed": [-1]}, ""),
+        (WindowConfig, {"window_s": [0], "around_s": [-1], "per_group": [0]}, ""),
+        (VehicleConfig, {"step_s": [0, 0.05]}, "above 0 and at most 0.02"),
+        (VehicleConfig, {"creep": [0, 1]}, "above 0 and at most 0.5"),
+        (ExperimentConfig, {"laps": [0]}, "1 or more"),
+        (ExperimentConfig, {"speed_m_s": [0, 3]}, "above 0 and at most 2"),
+        (SensorConfig, {"truth_hz": [-1]}, "above 0"),
+        (EncoderConfig, {"rate_hz": [0]}, "above 0"),
+        (ScannerConfig, {"dropout": [1]}, "from 0 to below 1"),
+        (ScannerConfig, {"noise_m": [-0.1]}, "0 or more"),
+        (ScannerConfig, {"beams": [1]}, "2 or more"),
+        (ScannerConfig, {"field_of_view_deg": [361]}, "at most sweep_deg, which is 360"),
+        (SpinningConfig, {"lowest_deg": [20]}, "at most highest_deg, which is 15"),
+        (SpinningConfig, {"min_range_m": [100]}, "below max_range_m, which is 100"),
+        (GpsConfig, {"latitude_deg": [-90]}, "from -89 to 89"),
+    ],
+)
+def test_numbers_that_nothing_can_be_computed_with_are_named(config, values, said):
+    for name, wrong in values.items():
+        for value in wrong:
+            with pytest.raises(SettingError, match=f"{name} of {config.__name__} is {value:g}; it must be {said}"):
+                config(**{name: value})
+
+
+def with_numbers(settings):
+    """``settings`` and all within them, if they hold a number."""
+    inner = [getattr(settings, field.name) for field in dataclasses.fields(settings)]
+    below = [found for value in inner if dataclasses.is_dataclass(value) for found in with_numbers(value)]
+    return [settings, *below] if any(type(value) in (int, float) for value in inner) else below
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [found for root in ROOTS for found in with_numbers(root())],
+    ids=lambda settings: type(settings).__name__,
+)
+def test_no_number_that_can_be_set_is_other_than_finite(settings):
+    numbers = {name: value for name, value in vars(settings).items() if type(value) in (int, float)}
+    for name in numbers:
+        for value in (math.nan, math.inf, -math.inf):
+            with pytest.raises(SettingError, match=f"{name} of {type(settings).__name__} is {value}; it must be a finite number"):
+                dataclasses.replace(settings, **{name: value})
