@@ -1,7 +1,7 @@
 """What a log says, one event at a time, in SI units and header time.
 
 Stamps are integer nanoseconds of the message's header. Arrays are float64 and finite unless a field says otherwise; events are
-never changed after they are made.
+never changed after they are made. Making one that estimators would compute with and that is not so raises `EventError`.
 """
 
 from __future__ import annotations
@@ -10,11 +10,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from localization.errors import EventError
 from motion_models.se2 import FloatArray
 
 
 def _no_floats() -> FloatArray:
     return np.empty(0)
+
+
+_ROUNDING = 1e-9  # of a covariance, over its largest entry
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,10 @@ class WheelSample:
     position: FloatArray
     """(2,) left and right accumulated wheel angle [rad]; NaN where the log does not tell. Preferred over rates: it loses nothing."""
 
+    def __post_init__(self) -> None:
+        _check_shape(self, "velocity", (2,))
+        _check_shape(self, "position", (2,))
+
 
 @dataclass(frozen=True)
 class CgSample:
@@ -37,6 +45,14 @@ class CgSample:
     """(2,) x, y [m]."""
     covariance: FloatArray = field(default_factory=lambda: np.zeros((2, 2)))
     """(2, 2) [m^2]."""
+
+    def __post_init__(self) -> None:
+        _check_finite(self, "position", (2,))
+        _check_finite(self, "covariance", (2, 2))
+        (xx, xy), (yx, yy) = self.covariance.tolist()
+        least = -_ROUNDING * max(abs(xx), abs(xy), abs(yx), abs(yy))
+        if min(xx, yy) < least or abs(xy - yx) > -least or xx * yy - xy * yx < least * max(xx, yy):
+            raise _refusal(self, "covariance", f"is {self.covariance.tolist()}", "symmetric, no variance negative")
 
 
 @dataclass(frozen=True)
@@ -52,6 +68,11 @@ class Scan:
     frame_id: str = ""
     is_planar: bool = True
 
+    def __post_init__(self) -> None:
+        rows = np.shape(self.points)[:1]
+        _check_shape(self, "points", (*rows, 3))
+        _check_finite(self, "offsets", rows if np.size(self.offsets) else (0,))
+
 
 @dataclass(frozen=True)
 class ImuSample:
@@ -63,6 +84,10 @@ class ImuSample:
     linear_acceleration: FloatArray
     """(3,) specific force [m/s^2]."""
     frame_id: str = ""
+
+    def __post_init__(self) -> None:
+        _check_finite(self, "angular_velocity", (3,))
+        _check_finite(self, "linear_acceleration", (3,))
 
 
 @dataclass(frozen=True)
@@ -79,3 +104,21 @@ class Reference:
 
 
 Event = WheelSample | CgSample | Scan | ImuSample | Reference
+
+
+def _check_shape(event: Event, name: str, shape: tuple[int, ...]) -> None:
+    value = getattr(event, name)
+    if not isinstance(value, np.ndarray) or value.shape != shape:
+        found = f"has shape {value.shape}" if isinstance(value, np.ndarray) else f"is a {type(value).__name__}"
+        raise _refusal(event, name, found, f"an array of shape {shape}")
+
+
+def _check_finite(event: Event, name: str, shape: tuple[int, ...]) -> None:
+    _check_shape(event, name, shape)
+    value = getattr(event, name)
+    if not (is_finite := np.isfinite(value)).all():
+        raise _refusal(event, name, f"holds {value[~is_finite][0]}", "finite")
+
+
+def _refusal(event: Event, name: str, found: str, wanted: str) -> EventError:
+    return EventError(f"{type(event).__name__} at {event.stamp_ns} ns: {name} {found}; it must be {wanted}.")

@@ -97,3 +97,8 @@ def test_malformed_tables_are_refused_in_words(tmp_path: Path, capsys: pytest.Ca
 def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["diagnose", str(GRID), "--robot", "vaultbot", "--out", str(tmp_path)]) == 2
     assert "exists already" in capsys.readouterr().err
+
+
+def test_windows_that_are_no_length_of_time_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["diagnose", str(tmp_path / "table.csv"), "--robot", "vaultbot", "--window-s", "nan"]) == 2
+    assert "--window-s is nan; windows of 0.5 to 20 s make sense" in capsys.readouterr().err

@@ -222,7 +222,7 @@ def test_late_positions_in_any_order_count_as_if_they_had_come_in_time(plain_ste
             assert in_time.add_position(stamps[i], gps[i], GPS)
     late, _ = fed(steps, relinearize_at=1e-6, kernel="none", **PLAIN)
     for i in (30, 20, 33, 25):
-        assert late.add_position(stamps[i], gps[i], GPS)
+        assert late.add_position(stamps[i], gps[i].tolist(), GPS.tolist())
     sigmas = np.sqrt(np.diag(in_time.covariance()))
     assert (np.abs(late._now.pose - in_time._now.pose) < 0.02 * sigmas[:3]).all()
     np.testing.assert_allclose(np.sqrt(np.diag(late.covariance())), sigmas, rtol=0.01)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from localization.errors import EventError
 from localization.events import CgSample, ImuSample, Scan, WheelSample
 from localization.steps import StepConfig, Stepper, steps
 from localization.wheel_history import WheelHistory
@@ -480,3 +482,38 @@ def test_step_length_is_zero_only_at_the_first_scan():
     assert not found[0].predicted.delta.any()
     assert all(s.duration > 0.0 for s in found[1:])
     assert math.isclose(sum(s.duration for s in found), (found[-1].end_ns - found[0].start_ns) * 1e-9)
+
+
+# --- events that nobody can use
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: WheelSample(7, NAN, np.zeros(4)), "WheelSample at 7 ns: position has shape (4,); it must be an array of shape (2,)"),
+        (lambda: WheelSample(7, [1.0, 1.0], NAN), "velocity is a list; it must be an array of shape (2,)"),
+        (lambda: CgSample(7, np.array([np.nan, 0.0])), "CgSample at 7 ns: position holds nan; it must be finite"),
+        (lambda: CgSample(7, np.zeros(3)), "position has shape (3,)"),
+        (lambda: CgSample(7, np.zeros(2), np.eye(3)), "covariance has shape (3, 3)"),
+        (lambda: CgSample(7, np.zeros(2), np.diag([np.inf, 1.0])), "covariance holds inf"),
+        (lambda: CgSample(7, np.zeros(2), np.diag([1e-4, -1e-6])), "covariance is [[0.0001, 0.0], [0.0, -1e-06]]; it must be symmetric"),
+        (lambda: CgSample(7, np.zeros(2), np.array([[1e-4, 1e-5], [0.0, 1e-4]])), "it must be symmetric"),
+        (lambda: CgSample(7, np.zeros(2), np.array([[1e-4, 2e-4], [2e-4, 1e-4]])), "symmetric, no variance negative"),
+        (lambda: Scan(7, np.ones((5, 2))), "Scan at 7 ns: points has shape (5, 2); it must be an array of shape (5, 3)"),
+        (lambda: Scan(7, np.ones((5, 3)), np.zeros(4)), "offsets has shape (4,); it must be an array of shape (5,)"),
+        (lambda: Scan(7, np.ones((5, 3)), np.full(5, np.nan)), "offsets holds nan"),
+        (lambda: ImuSample(7, np.full(3, np.nan), np.zeros(3)), "ImuSample at 7 ns: angular_velocity holds nan; it must be finite"),
+        (lambda: ImuSample(7, np.zeros(3), np.array([0.0, 0.0, np.inf])), "linear_acceleration holds inf"),
+    ],
+)
+def test_events_that_no_estimator_can_use_are_refused_where_they_are_made(make, said):
+    with pytest.raises(EventError, match=re.escape(said)):
+        make()
+
+
+@given(st.floats(0.0, math.pi), st.floats(-12.0, 6.0), st.floats(0.0, 1.0))
+def test_a_covariance_is_one_however_it_was_rounded(turn, magnitude, flatness):
+    c, s = math.cos(turn), math.sin(turn)
+    half = np.array([[c, -s], [s, c]]) * 10.0**magnitude * [1.0, flatness]
+    covariance = (half @ half.T) * (1.0 + 1e-12 * np.array([[0.0, 1.0], [-1.0, 0.0]]))
+    assert CgSample(T0, np.zeros(2), covariance).covariance is covariance

@@ -188,7 +188,7 @@ class GraphFusion:
         whether it was; the others are counted as late. Raises `EstimatorError`.
         """
         self.settle()
-        lever = np.zeros(2) if lever is None else lever
+        xy, cov, lever = (np.asarray(value, dtype=float) for value in (xy, cov, np.zeros(2) if lever is None else lever))
         if xy.shape != (2,) or not np.isfinite(xy).all() or lever.shape != (2,) or not np.isfinite(lever).all():
             raise EstimatorError(f"the position {xy} or its lever arm {lever} is not two finite numbers.")
         check_covariance(cov, 2, "a position")

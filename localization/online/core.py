@@ -56,7 +56,11 @@ class Core:
         )
 
     def push(self, event: Event) -> list[Estimate]:
-        """Take ``event``; the estimates that it completes, none or several. Raises `EstimatorError`."""
+        """Take ``event``; the estimates that it completes, none or several. Raises `EstimatorError`.
+
+        Stamps are believed: where wheels of an hour ahead have made a step, scans of before are late. Logs and topics are cleared of
+        such leaps as they are read (`logs.merge`); whoever makes events has to do it.
+        """
         return self._take(self.stepper.push(event))
 
     def settle(self) -> None:
