@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
 from localization.cli import main
+from localization.errors import OutputError
+from localization.estimators import Estimate
 from localization.online.dump import read_head
-from tests.online_help import drive_log
+from localization.online.records import Spool
+from tests.online_help import drive_log, fill_disk
 
 COMMAND = (sys.executable, "-m", "localization.cli", "online")
 
@@ -156,6 +162,44 @@ def test_states_that_do_not_fit_are_refused(killed, tmp_path, capsys):
     out.write_text("precious")
     assert online("--rate", "max", "--out", out) == 2
     assert out.read_text() == "precious"
+
+
+@contextlib.contextmanager
+def files_of_at_most(size):
+    """What a full disk is to a file: a part of what is written goes in, then nothing."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_estimates_on_a_full_disk_are_whole_and_go_on_when_there_is_room(tmp_path):
+    spool = Spool.create(tmp_path / "part")
+    estimates = [Estimate(stamp, np.array([stamp, 0.0, 0.0]), None, np.zeros(3), None) for stamp in range(1, 6)]
+    with files_of_at_most(500):  # two rows and a part
+        for estimate in estimates[:2]:
+            spool.add(estimate)
+        for estimate in estimates[2:4]:
+            with pytest.raises(OutputError, match=r"cannot be written to '.*part': File too large"):
+                spool.add(estimate)
+        assert spool.rows()[0].tolist() == [1, 2]
+    spool.add(estimates[4])
+    assert spool.rows()[0].tolist() == [1, 2, 5]
+    assert spool.rows()[1][:, 0].tolist() == [1.0, 2.0, 5.0]
+    assert spool.missing == 2
+    spool.close()
+    again = Spool.resume(tmp_path / "part", 2)
+    assert again.rows()[0].tolist() == [1, 2]
+    again.remove()
+
+
+def test_a_full_disk_ends_the_run_of_a_log_with_its_reason(tmp_path, monkeypatch, capsys):
+    fill_disk(monkeypatch, 50)
+    assert online("--rate", "max", "--out", tmp_path / "a.tum") == 2
+    assert ".a.tum.part': No space left on device." in capsys.readouterr().err
+    assert not (tmp_path / "a.tum").exists()
 
 
 def test_doors_whose_libraries_are_missing_name_them(tmp_path):

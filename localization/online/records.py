@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from array import array
 from collections.abc import Iterator
+from io import FileIO
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
@@ -55,10 +56,12 @@ class Records:
 
 
 class Spool:
-    """The same in a file that grows. What was flushed survives the process; a state says how many rows it counts on (`open`)."""
+    """The same in a file that grows, at once and by whole rows. They survive the process; a state says how many it counts on (`resume`)."""
 
-    def __init__(self, path: Path, file: BinaryIO, count: int, last_ns: int) -> None:
+    def __init__(self, path: Path, file: FileIO, count: int, last_ns: int) -> None:
         self.path, self._file, self.count, self._last_ns = path, file, count, last_ns
+        self.missing = 0
+        """Estimates for which there was no room."""
 
     @classmethod
     def create(cls, path: Path) -> Spool:
@@ -68,7 +71,7 @@ class Spool:
                 f"'{path}' is left from a run that was killed: pass that run's --state to go on from there, or remove the file."
             )
         try:
-            return cls(path, path.open("xb"), 0, -(1 << 63))
+            return cls(path, path.open("xb", buffering=0), 0, -(1 << 63))
         except OSError as error:
             raise OutputError(f"'{path}' cannot be written: {error.strerror}.") from error
 
@@ -76,7 +79,7 @@ class Spool:
     def resume(cls, path: Path, count: int) -> Spool:
         """The first ``count`` rows of a file; what came after them is dropped, to be written anew. Raises `DumpError`."""
         try:
-            file = path.open("r+b")
+            file = path.open("r+b", buffering=0)
             size = file.seek(0, 2)
             if size < count * _ROW.itemsize:
                 file.close()
@@ -88,26 +91,32 @@ class Spool:
             if count:
                 file.seek((count - 1) * _ROW.itemsize)
                 last_ns = int(np.frombuffer(file.read(_ROW.itemsize), _ROW)["stamp_ns"][0])
-            file.seek(0, 2)
         except OSError as error:
             raise DumpError(f"'{path}', the estimates up to the state, cannot be read: {error.strerror}. Remove the state.") from error
         return cls(path, file, count, last_ns)
 
     def add(self, estimate: Estimate) -> None:
+        """Raises `OutputError` where the file cannot grow: it then lacks this estimate, and the next one may find room again."""
         if estimate.stamp_ns <= self._last_ns:
             return
+        row, at = np.array([(estimate.stamp_ns, row_of(estimate))], _ROW).tobytes(), self.count * _ROW.itemsize
+        try:
+            while row:  # a disk that is nearly full takes a part first: no row, for it is not counted
+                written = os.pwrite(self.descriptor, row, at)
+                row, at = row[written:], at + written
+        except OSError as error:
+            self.missing += 1
+            raise OutputError(f"an estimate cannot be written to '{self.path}': {error.strerror}.") from error
         self._last_ns = estimate.stamp_ns
-        self._file.write(np.array([(estimate.stamp_ns, row_of(estimate))], _ROW).tobytes())
         self.count += 1
 
-    def flush(self) -> int:
-        """To the operating system; returns the file's descriptor."""
-        self._file.flush()
+    @property
+    def descriptor(self) -> int:
+        """Of the file, to have it on disk before a state that counts on its rows."""
         return self._file.fileno()
 
     def rows(self) -> tuple[IntArray, FloatArray]:
         """Stamps (N,) and numbers (N, 25), mapped from the file."""
-        self.flush()
         if not self.count:
             return np.empty(0, np.int64), np.empty((0, _COLUMNS))
         table = np.memmap(self.path, _ROW, "r", shape=(self.count,))

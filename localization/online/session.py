@@ -154,7 +154,7 @@ class Session:
         """The state to disk, if it is due or wanted ``now``. What ``extra`` tells enters its head. Raises `DumpError`."""
         if self._dumper is None or not (now or self._dumper.is_due()):
             return
-        on_disk = () if self._spool is None else (self._spool.flush(),)
+        on_disk = () if self._spool is None else (self._spool.descriptor,)
         records = None if self._spool is None else self._spool.count
         self._dumper.write([self.core, self.kept], {**extra(), "events": self.count, "records": records}, on_disk)
 
