@@ -16,6 +16,7 @@ from localization.errors import DoorError, DumpError, TopicError
 from localization.events import Scan, WheelSample
 from localization.logs import TopicOverrides, open_log
 from localization.logs.wire import encode
+from localization.online.dump import Dumper, read_head
 from localization.online.health import ERROR, OK, WARN, degeneracy
 from localization.online.node import Node, NodeConfig
 from localization.online.pace import Pace
@@ -25,7 +26,7 @@ from localization.run import Pair, replay
 from localization.trajectory import read_tum
 from motion_models.registry import make_model
 from tests import bags
-from tests.online_help import ROBOT, LogTransport, drive_events, drive_log, published, run_node, stamp_of, track
+from tests.online_help import ROBOT, LogTransport, drive_events, drive_log, fill_disk, published, run_node, stamp_of, track
 
 S = 1_000_000_000
 pytestmark = pytest.mark.xdist_group("online")
@@ -85,7 +86,7 @@ def test_what_is_published(calm):
     assert len(corrections.position) == len(corrections.effort) == len(corrections.name)
     assert (corrections.effort > 0.0).all()
     statuses = {s.name: s for s in published(transport, DIAGNOSTICS)[-1].status}
-    assert set(statuses) == {"skidloc: estimate", "skidloc: lidar", "skidloc: wheels", "skidloc: messages"}
+    assert set(statuses) == {"skidloc: estimate", "skidloc: lidar", "skidloc: wheels", "skidloc: files", "skidloc: messages"}
     values = {v.key: v.value for v in statuses["skidloc: lidar"].values}
     assert {"degeneracy", "nis_mean", "contradictions"} <= set(values)
     assert float(values["degeneracy"]) > 0.2
@@ -322,6 +323,31 @@ def test_a_node_that_is_killed_goes_on_where_it_was(tmp_path, calm):
     node, told = run_node(third, files=Files(tmp_path / "more.tum", tmp_path / "state"))
     assert "resumed from" in told[-1]
     assert 20 < node.finish() < 0.4 * len(a)
+
+
+def test_a_full_disk_does_not_stop_the_robot_from_knowing_where_it_is(tmp_path, monkeypatch, calm):
+    files = Files(tmp_path / "run.tum", tmp_path / "state")
+    monkeypatch.setattr(Dumper, "is_due", lambda self: True)
+    full = LogTransport(drive_log())
+    with monkeypatch.context() as disk:
+        fill_disk(disk, after=10, name="fsync")  # two for each state
+        fill_disk(disk, after=100, name="pwrite")
+        node, told = run_node(full, files=files)
+        assert read_head(tmp_path / "state")["records"] <= 5
+    assert len(track(full)) == len(track(calm[0]))
+    assert [said for said in told if "No space left" in said] == [
+        f"the state cannot be written to '{files.state}': No space left on device. The state of before stays; it is tried again.",
+        f"an estimate cannot be written to '{files.spool}': No space left on device. "
+        "The output lacks what is estimated meanwhile; it is tried again.",
+    ]
+    files_status = next(s for s in published(full, DIAGNOSTICS)[-1].status if s.name == "skidloc: files")
+    assert files_status.level == WARN
+    assert files_status.message.count("No space left on device") == 2
+    count = node.finish()
+    assert len(read_tum(tmp_path / "run.tum")) == count
+    assert f"lacks {len(track(full)) - 100} estimates" in told[-1]
+    assert read_head(tmp_path / "state")["events"] == node.session.count
+    assert set(node.session.troubles) == {"output"}
 
 
 def test_a_state_of_another_time_is_refused(tmp_path):

@@ -162,12 +162,14 @@ class Dumper:
     def write(self, value: Any, head: Mapping[str, Any], after: Sequence[int] = ()) -> None:
         """Now. The files ``after`` (descriptors) are on disk before the state is, which may count on what is in them.
 
-        Raises `DumpError`, be it for the state before.
+        Raises `DumpError`, be it for the state before: this one is on its way nevertheless.
         """
-        self.wait()
-        self._last = time.monotonic()
-        content = _body(value, head, self._made_by, self._shared)
-        self._writing = self._disk.submit(_store, self.path, content, tuple(after))
+        try:
+            self.wait()
+        finally:
+            self._last = time.monotonic()
+            content = _body(value, head, self._made_by, self._shared)
+            self._writing = self._disk.submit(_store, self.path, content, tuple(after))
 
     def wait(self) -> None:
         """Until the state is on disk. Raises `DumpError`."""

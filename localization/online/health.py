@@ -81,9 +81,17 @@ class Health:
     def latency_p99_s(self) -> float | None:
         return float(np.quantile(self._latencies, 0.99)) if self._latencies else None
 
-    def statuses(self, core: Core, dropped: Sequence[str] = (), silent: Mapping[str, float] | None = None) -> list[Status]:
-        """Of the estimate, the LiDAR, the wheels and the messages. ``silent``: seconds since topics were last heard."""
-        return [self._of_estimate(), self._of_lidar(core), self._of_wheels(core), _of_messages(dropped, silent or {})]
+    def statuses(
+        self,
+        core: Core,
+        dropped: Sequence[str] = (),
+        silent: Mapping[str, float] | None = None,
+        troubles: Mapping[str, str] | None = None,
+    ) -> list[Status]:
+        """Of the estimate, the LiDAR, the wheels, the files and the messages. ``silent``: seconds since topics were last heard;
+        ``troubles``: what cannot be written, and why."""
+        of_sensors = [self._of_estimate(), self._of_lidar(core), self._of_wheels(core)]
+        return [*of_sensors, _of_files(troubles or {}), _of_messages(dropped, silent or {})]
 
     def _of_estimate(self) -> Status:
         e = self.estimate
@@ -122,6 +130,12 @@ class Health:
         if math.hypot(vx, vy) > _SLIP_M_S or abs(wz) > _SLIP_RAD_S:
             return Status("wheels", WARN, "they turn otherwise than the robot moves: slip", values)
         return Status("wheels", values=values)
+
+
+def _of_files(troubles: Mapping[str, str]) -> Status:
+    if troubles:
+        return Status("files", WARN, " ".join(troubles.values()), troubles)
+    return Status("files")
 
 
 def _of_messages(dropped: Sequence[str], silent: Mapping[str, float]) -> Status:

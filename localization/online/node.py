@@ -89,7 +89,7 @@ class Node:
         stream = Stream(heard, robot, tally, epoch_ns, is_ros1=transport.is_ros1)
         made = made_by(pair, robot, heard.mounts, has_lidar, config, "live topics")
         core = Core(pair, robot, heard.mounts, has_lidar, config)
-        session = Session.start(files, core, f"{pair.model.name}_{pair.estimator}", made, stream.memory, {"tally": tally}, is_whole=False)
+        session = Session.start(files, core, f"{pair.model.name}_{pair.estimator}", made, stream.memory, {"tally": tally}, tell)
         if view is not None:
             view.begin(robot, heard.mounts)
             session.view = view
@@ -171,7 +171,7 @@ class Node:
     def _tell(self) -> None:
         health = self.session.health
         silent = self._stream.silent(time.monotonic_ns())
-        self.statuses = health.statuses(self.session.core, self._stream.dropped(), silent)
+        self.statuses = health.statuses(self.session.core, self._stream.dropped(), silent, self.session.troubles)
         stamp_ns = self._stream.sender_stamp_ns(self._newest_ns, by_lidar=True)
         self._teller.diagnostics(self.statuses, self._hardware, stamp_ns)
         parameters = self.session.core.estimator.parameters()

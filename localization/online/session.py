@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -19,6 +20,7 @@ from localization.trajectory import write_tum
 from motion_models.robot import Mount, Robot
 
 _SUFFIXES = (".mcap", ".tum")
+_MEANWHILE = {"state": "The state of before stays", "output": "The output lacks what is estimated meanwhile"}
 
 
 @dataclass(frozen=True)
@@ -68,14 +70,25 @@ class Session:
     """Made by `start`."""
 
     def __init__(
-        self, core: Core, kept: Any, name: str, files: Files, spool: Spool | None, dumper: Dumper | None, head: Mapping[str, Any]
+        self,
+        core: Core,
+        kept: Any,
+        name: str,
+        files: Files,
+        spool: Spool | None,
+        dumper: Dumper | None,
+        head: Mapping[str, Any],
+        tell: Callable[[str], None] | None,
     ) -> None:
         self.core, self.name, self.health = core, name, Health()
         self.kept = kept
         """What is dumped with the core; of a resumed session, what had been."""
         self.head = head
         """Of the state that was resumed; empty for a new one."""
-        self._files, self._spool, self._dumper = files, spool, dumper
+        self._files, self._spool, self._dumper, self._tell = files, spool, dumper, tell
+        self.troubles: dict[str, str] = {}
+        """What cannot be written at present, and why."""
+        self._told: set[str] = set()
         self.count = int(head.get("events", 0))
         """Events so far, those before the state included."""
         self.view: View | None = None
@@ -90,23 +103,23 @@ class Session:
         made: Mapping[str, str],
         kept: Any = None,
         shared: Mapping[str, Any] | None = None,
-        *,
-        is_whole: bool = True,
+        tell: Callable[[str], None] | None = None,
     ) -> Session:
         """A new session with ``core``, or one that goes on from the state on disk, if there is one that was ``made`` by the same.
 
-        ``kept`` is dumped with the core; ``shared`` is what it holds that is not to be dumped. ``is_whole``: an output must hold the
-        estimates from the very first on, not from the state on. Raises `DumpError` and `OutputError`.
+        ``kept`` is dumped with the core; ``shared`` is what it holds that is not to be dumped. ``tell`` is of a live session: it hears
+        what cannot be written, once, where others raise it, for the robot must still know where it is; and its output may hold the
+        estimates from the state on, others' hold them from the very first. Raises `DumpError` and `OutputError`.
         """
         shared = shared or {}
         dumper = None if files.state is None else Dumper(files.state, made, shared)
         if files.out is not None and files.out.exists():
             raise OutputError(f"'{files.out}' exists already; nothing is overwritten. Choose another name or remove it.")
         if files.state is None or not files.state.exists():
-            return cls(core, kept, name, files, None if files.spool is None else Spool.create(files.spool), dumper, {})
+            return cls(core, kept, name, files, None if files.spool is None else Spool.create(files.spool), dumper, {}, tell)
         found = read_dump(files.state, made, shared)
         records = found.head.get("records")
-        if (records is not None and files.spool is None) or (records is None and files.spool is not None and is_whole):
+        if (records is not None and files.spool is None) or (records is None and files.spool is not None and tell is None):
             with_or_without = "without an --out" if records is None else "with an --out"
             raise DumpError(f"the state in '{files.state}' is of a run {with_or_without}: resume it so, or remove it to start anew.")
         if not (isinstance(found.value, list) and len(found.value) == 2 and isinstance(found.value[0], Core)):
@@ -115,7 +128,7 @@ class Session:
         if files.spool is not None:
             spool = Spool.create(files.spool) if records is None else Spool.resume(files.spool, int(records))
         core, kept = found.value
-        return cls(core, kept, name, files, spool, dumper, found.head)
+        return cls(core, kept, name, files, spool, dumper, found.head, tell)
 
     def push(self, event: Event, out: Callable[[Estimate], None] = lambda estimate: None) -> list[Estimate]:
         """``out`` is given each estimate before anything else is done with it. Raises `EstimatorError`."""
@@ -147,16 +160,32 @@ class Session:
             if self.view is not None:
                 self._unseen.append(estimate)
             if self._spool is not None:
-                self._spool.add(estimate)
+                with self._on_disk("output"):
+                    self._spool.add(estimate)
         return estimates
 
+    @contextmanager
+    def _on_disk(self, what: str) -> Iterator[None]:
+        """What is told, not raised, of a live session."""
+        try:
+            yield
+            self.troubles.pop(what, None)
+        except (DumpError, OutputError) as error:
+            if self._tell is None:
+                raise
+            self.troubles[what] = str(error)
+            if what not in self._told:
+                self._told.add(what)
+                self._tell(f"{error} {_MEANWHILE[what]}; it is tried again.")
+
     def dump(self, extra: Callable[[], Mapping[str, Any]] = dict, now: bool = False) -> None:
-        """The state to disk, if it is due or wanted ``now``. What ``extra`` tells enters its head. Raises `DumpError`."""
+        """The state to disk, if it is due or wanted ``now``. What ``extra`` tells enters its head. Raises `DumpError` unless live."""
         if self._dumper is None or not (now or self._dumper.is_due()):
             return
         on_disk = () if self._spool is None else (self._spool.descriptor,)
         records = None if self._spool is None else self._spool.count
-        self._dumper.write([self.core, self.kept], {**extra(), "events": self.count, "records": records}, on_disk)
+        with self._on_disk("state"):
+            self._dumper.write([self.core, self.kept], {**extra(), "events": self.count, "records": records}, on_disk)
 
     def write_out(self) -> int | None:
         """The output, if one is wanted; returns how many estimates it holds. Raises `OutputError` where there are none."""
@@ -167,8 +196,11 @@ class Session:
             write_tum(self._files.out, trajectory(stamps, table))
         elif len(stamps):
             write_fused(self._files.out, {self.name: fused_estimates(stamps, table)}, self.name)
+        if self._tell is not None and self._spool.missing:
+            self._tell(f"'{self._files.out}' lacks {self._spool.missing} estimates, for which there was no room on the disk.")
         if self._dumper is not None:
-            self._dumper.wait()  # it may count on the rows being there
+            with self._on_disk("state"):
+                self._dumper.wait()  # it may count on the rows being there
         self._spool.remove()
         self._spool = None
         if not len(stamps):
@@ -176,9 +208,10 @@ class Session:
         return len(stamps)
 
     def close(self, forget: bool = False) -> None:
-        """End; ``forget`` removes the state, for there is nothing to go on with. Raises `DumpError`."""
+        """End; ``forget`` removes the state, for there is nothing to go on with. Raises `DumpError` unless live."""
         if self._dumper is not None:
-            self._dumper.close()
+            with self._on_disk("state"):
+                self._dumper.close()
             if forget:
                 remove_dump(self._dumper.path)
         if self._spool is not None:
