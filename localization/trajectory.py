@@ -6,6 +6,7 @@ A TUM file has one pose a line, ``timestamp tx ty tz qx qy qz qw``, in seconds a
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -136,21 +137,27 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     """Write a TUM file: same trajectory, same bytes.
 
     Stamps keep every nanosecond and positions every bit; the heading passes through a quaternion and comes back wrapped and equal to
-    the last digit or two. Raises `OutputError` if there is such a file already or it cannot be written.
+    the last digit or two. The file is whole or not there: it is written beside its place and moved. Raises `OutputError` if there is
+    such a file already or it cannot be written.
     """
+    path = Path(path)
     lines = [f"# {' '.join(_TUM_COLUMNS)}\n"]
     for stamp, (x, y, theta) in zip(trajectory.stamps_ns.tolist(), trajectory.poses.tolist(), strict=True):
         seconds, nanoseconds = divmod(abs(stamp), 10**9)
         sign = "-" if stamp < 0 else ""
         qz, qw = math.sin(0.5 * theta), math.cos(0.5 * theta)
         lines.append(f"{sign}{seconds}.{nanoseconds:09d} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}\n")
+    if path.exists() or path.is_symlink():
+        raise OutputError(f"'{path}' exists already. Remove it or choose another name.")
+    beside = path.with_name(f".{path.name}.new")  # one that a killed process has left is written over
     try:
-        with open(path, "x", encoding="ascii", newline="\n") as file:
-            file.writelines(lines)
-    except FileExistsError as error:
-        raise OutputError(f"'{path}' exists already. Remove it or choose another name.") from error
+        beside.write_text("".join(lines), encoding="ascii", newline="\n")
+        beside.replace(path)
     except OSError as error:
         raise OutputError(f"'{path}' cannot be written: {error.strerror}.") from error
+    finally:
+        with contextlib.suppress(OSError):
+            beside.unlink()
 
 
 def read_tum(path: str | Path) -> Trajectory:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import os
 import tempfile
 import time
 from collections import deque
@@ -138,18 +137,6 @@ def run_node(transport: LogTransport, estimator: str = "ekf", files: Files | Non
     )
     node.spin(transport.is_empty)
     return node, told
-
-
-def fill_disk(monkeypatch, after: int = 0, name: str = "pwrite") -> None:
-    """From the call ``after`` on, ``os.NAME`` finds no room."""
-    real, calls = getattr(os, name), iter(range(10**9))
-
-    def full_disk(*arguments):
-        if next(calls) >= after:
-            raise OSError(28, "No space left on device")
-        return real(*arguments)
-
-    monkeypatch.setattr(os, name, full_disk)
 
 
 def published(transport: LogTransport, topic: str) -> list:

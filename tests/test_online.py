@@ -26,7 +26,8 @@ from localization.run import Pair, replay
 from localization.trajectory import read_tum
 from motion_models.registry import make_model
 from tests import bags
-from tests.online_help import ROBOT, LogTransport, drive_events, drive_log, fill_disk, published, run_node, stamp_of, track
+from tests.disks import fill_disk
+from tests.online_help import ROBOT, LogTransport, drive_events, drive_log, published, run_node, stamp_of, track
 
 S = 1_000_000_000
 pytestmark = pytest.mark.xdist_group("online")

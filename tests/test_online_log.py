@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -19,7 +17,8 @@ from localization.errors import OutputError
 from localization.estimators import Estimate
 from localization.online.dump import read_head
 from localization.online.records import Spool
-from tests.online_help import drive_log, fill_disk
+from tests.disks import files_of_at_most, fill_disk
+from tests.online_help import drive_log
 
 COMMAND = (sys.executable, "-m", "localization.cli", "online")
 
@@ -162,17 +161,6 @@ def test_states_that_do_not_fit_are_refused(killed, tmp_path, capsys):
     out.write_text("precious")
     assert online("--rate", "max", "--out", out) == 2
     assert out.read_text() == "precious"
-
-
-@contextlib.contextmanager
-def files_of_at_most(size):
-    """What a full disk is to a file: a part of what is written goes in, then nothing."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_estimates_on_a_full_disk_are_whole_and_go_on_when_there_is_room(tmp_path):

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from localization.errors import EvaluationError, OutputError
 from localization.trajectory import Trajectory, path_nodes, read_tum, write_tum
 from motion_models import se2
+from tests.disks import files_of_at_most
 
 SECOND = 10**9
 
@@ -207,3 +208,14 @@ def test_nothing_is_overwritten(tmp_path):
     assert (tmp_path / "a.tum").read_text() == "precious"
     with pytest.raises(OutputError, match="cannot be written"):
         write_tum(tmp_path / "no" / "a.tum", random_trajectory())
+
+
+def test_a_file_is_whole_or_not_there(tmp_path):
+    whole = random_trajectory()
+    with files_of_at_most(1000), pytest.raises(OutputError, match=r"a\.tum' cannot be written: File too large"):
+        write_tum(tmp_path / "a.tum", whole)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / ".a.tum.new").write_text("left by a process that was killed")
+    write_tum(tmp_path / "a.tum", whole)
+    assert len(read_tum(tmp_path / "a.tum")) == len(whole)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.tum"]
