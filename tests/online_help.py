@@ -17,8 +17,8 @@ from localization.estimators import Estimate
 from localization.logs import open_log
 from localization.logs.source import open_source
 from localization.online.core import Core, Pair
+from localization.online.files import Files
 from localization.online.node import Node, NodeConfig
-from localization.online.session import Files
 from localization.online.tell import DIAGNOSTICS, ODOMETRY, TF
 from localization.online.transport import Received
 from localization.simulate.drives import MoveArms, OpenLoop, Rest, constant

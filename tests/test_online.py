@@ -17,10 +17,10 @@ from localization.events import Scan, WheelSample
 from localization.logs import TopicOverrides, open_log
 from localization.logs.wire import encode
 from localization.online.dump import Dumper, read_head
+from localization.online.files import Files
 from localization.online.health import ERROR, OK, WARN, degeneracy
 from localization.online.node import Node, NodeConfig
 from localization.online.pace import Pace
-from localization.online.session import Files
 from localization.online.tell import CORRECTIONS, DIAGNOSTICS, ODOMETRY, TF
 from localization.run import Pair, replay
 from localization.trajectory import read_tum
@@ -360,7 +360,8 @@ def test_a_state_of_another_time_is_refused(tmp_path):
             drive_log(), lambda messages, by=shift_s: [messages[0]] + [restamped(m, int((by + 30.0) * S)) for m in messages[1000:]]
         )
         with pytest.raises(DumpError, match=said):
-            run_node(later, files=files)
+            run_node(later, files=Files(tmp_path / "run.tum", files.state))
+        assert [path.name for path in tmp_path.iterdir()] == ["state"]  # once it is removed, nothing is in the way
         (tmp_path / "state").unlink()
 
 

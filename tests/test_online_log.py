@@ -16,6 +16,7 @@ from localization.cli import main
 from localization.errors import OutputError
 from localization.estimators import Estimate
 from localization.online.dump import read_head
+from localization.online.files import Files
 from localization.online.records import Spool
 from tests.disks import files_of_at_most, fill_disk
 from tests.online_help import drive_log
@@ -93,16 +94,60 @@ def test_killed_twice_and_resumed_it_writes_the_same_bytes(replayed, killed, tmp
     assert [path.name for path in tmp_path.iterdir()] == ["fused.mcap"]
 
 
-def test_a_service_that_is_stopped_leaves_its_last_state(replayed, tmp_path):
+def test_a_service_that_is_stopped_leaves_its_last_state(replayed, tmp_path, capsys):
     process = start(tmp_path, "4")
     wait_for_state(tmp_path, process, 100)
+    for other in (["--out", tmp_path / "a.tum", "--state", tmp_path / "state"], ["--out", tmp_path / "fused.mcap"]):
+        assert online("--rate", "max", *other) == 2
+        assert "is in use by another process that runs" in capsys.readouterr().err
     process.send_signal(signal.SIGTERM)
     said, _ = process.communicate()
     assert process.returncode == 130
     assert "interrupted" in said
+    assert "the same command goes on from there" in said
     assert "Traceback" not in said
     assert online("--rate", "max", "--out", tmp_path / "fused.mcap", "--state", tmp_path / "state") == 0
     assert (tmp_path / "fused.mcap").read_bytes() == (replayed / "fused.mcap").read_bytes()
+
+
+def test_a_run_that_is_stopped_without_a_state_writes_what_it_has(replayed, tmp_path):
+    out, spool = tmp_path / "a.tum", tmp_path / ".a.tum.part"
+    options = ("--robot", "vaultbot", "--rate", "4", "--out", out)
+    process = subprocess.Popen([*COMMAND, drive_log(), *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    end = time.monotonic() + 60.0
+    while time.monotonic() < end and not (spool.exists() and spool.stat().st_size > 20_000):
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate()
+    assert process.returncode == 130, said
+    lines = out.read_text().splitlines()
+    assert f"{len(lines) - 1} estimates, up to where the run was stopped" in said.replace("\n", " ")
+    assert len(lines) > 50
+    assert lines == (replayed / "skid_steer_ekf.tum").read_text().splitlines()[: len(lines)]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.tum"]
+
+
+def test_files_that_cannot_be_kept_are_refused_at_the_start(tmp_path, capsys):
+    out = tmp_path / "a.tum"
+    for state, said in [
+        (tmp_path / "no" / "state", "Name a file in a folder that is there"),
+        (tmp_path, "is a folder"),
+        (out, "is the output as well"),
+        (tmp_path / "b" / ".." / ".a.tum.part", "is where the output grows as well"),
+    ]:
+        assert online("--out", out, "--state", state) == 2
+        assert said in capsys.readouterr().err.replace("\n", " ")
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_files_are_one_process_s_at_a_time(tmp_path):
+    files = Files(tmp_path / "a.tum", tmp_path / "state")
+    (tmp_path / ".state.lock").touch()  # of a process that was killed
+    with files.claimed(), pytest.raises(OutputError, match=r"state' is in use by another process"), Files(state=files.state).claimed():
+        pass
+    assert list(tmp_path.iterdir()) == []
+    with files.claimed():
+        pass
 
 
 def test_real_time_takes_its_time(tmp_path):
@@ -187,7 +232,7 @@ def test_a_full_disk_ends_the_run_of_a_log_with_its_reason(tmp_path, monkeypatch
     fill_disk(monkeypatch, 50)
     assert online("--rate", "max", "--out", tmp_path / "a.tum") == 2
     assert ".a.tum.part': No space left on device." in capsys.readouterr().err
-    assert not (tmp_path / "a.tum").exists()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_doors_whose_libraries_are_missing_name_them(tmp_path):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from types import FrameType
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import tyro
 from rich.console import Console
@@ -23,9 +23,10 @@ from localization.errors import DumpError, OutputError
 from localization.estimators import check_estimator
 from localization.logs import TopicOverrides, open_log
 from localization.online.core import Core, Pair, ReplayConfig
+from localization.online.files import Files
 from localization.online.node import Node, NodeConfig
 from localization.online.pace import Pace
-from localization.online.session import Files, Session, View, made_by
+from localization.online.session import Session, View, made_by
 from localization.online.transport import Transport
 from localization.provenance import fingerprint
 from localization.settings import check_settings
@@ -80,7 +81,7 @@ class Online:
         rate, files, robot = parse_rate(self.rate), Files(self.out, self.state), load_robot(self.robot)
         view = self._view()
         try:
-            with Stop() as stop:
+            with Stop() as stop, files.claimed():
                 if self.log is not None:
                     self._play(console, self.log, rate, files, robot, stop, view)
                 else:
@@ -96,19 +97,18 @@ class Online:
         made = made_by(pair, robot, log.mounts, has_lidar, self.config, f"log {fingerprint(path)[:12]}")
         core = Core(pair, robot, log.mounts, has_lidar, self.config)
         session = Session.start(files, core, f"{pair.model.name}_{pair.estimator}", made)
-        if view is not None:
-            view.begin(robot, log.mounts)
-            session.view = view
-        if session.head:
-            console.print(f"resumed from {files.state} after {session.count} events", markup=False, soft_wrap=True)
         pace, began, first_ns, shown, seconds, is_done = Pace(rate, sleep=stop.sleep), time.monotonic(), None, -math.inf, 0.0, False
         try:
+            if view is not None:
+                view.begin(robot, log.mounts)
+                session.view = view
+            if session.head:
+                console.print(f"resumed from {files.state} after {session.count} events", markup=False, soft_wrap=True)
             with Live(console=console, auto_refresh=False, transient=True) as live:
                 for event in islice(log.events(), session.count, None):
                     pace.wait(event.stamp_ns)
                     if stop.is_set():
-                        session.dump(now=True)
-                        raise KeyboardInterrupt
+                        self._interrupt(console, session)
                     session.push(event)
                     session.dump()
                     first_ns = event.stamp_ns if first_ns is None else first_ns
@@ -126,6 +126,15 @@ class Online:
         for note in dict.fromkeys([*log.notes(), *session.core.stepper.notes()]):
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         self._summarize(console, session, seconds, count)
+
+    def _interrupt(self, console: Console, session: Session) -> NoReturn:
+        """With a state, the same command goes on from there. Without one nothing can: the output is what there is so far."""
+        session.dump(now=True)
+        if self.state is not None:
+            console.print(f"the state is in {self.state}: the same command goes on from there", markup=False, soft_wrap=True)
+        elif (count := session.write_out()) is not None:
+            console.print(f"{self.out}: {count} estimates, up to where the run was stopped", markup=False, soft_wrap=True)
+        raise KeyboardInterrupt
 
     def _spin(self, console: Console, files: Files, robot: Robot, stop: Stop, view: View | None) -> None:
         def tell(said: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -16,10 +17,11 @@ from localization.logs.tally import Tally
 from localization.logs.topics import TopicOverrides
 from localization.online.core import Core, Pair, ReplayConfig
 from localization.online.dump import read_head
+from localization.online.files import Files
 from localization.online.health import Status
 from localization.online.listen import Listener
 from localization.online.live import Memory, Stream, check_age
-from localization.online.session import Files, Session, View, made_by
+from localization.online.session import Session, View, made_by
 from localization.online.tell import Teller
 from localization.online.transport import Received, Transport
 from localization.online.warm import warm_up
@@ -90,19 +92,21 @@ class Node:
         made = made_by(pair, robot, heard.mounts, has_lidar, config, "live topics")
         core = Core(pair, robot, heard.mounts, has_lidar, config)
         session = Session.start(files, core, f"{pair.model.name}_{pair.estimator}", made, stream.memory, {"tally": tally}, tell)
-        if view is not None:
-            view.begin(robot, heard.mounts)
-            session.view = view
-        teller = Teller(transport, with_tf=node.tf)
-        made_node = cls(transport, stream, session, teller, robot)
-        if session.head:
-            if not isinstance(session.kept, Memory):
-                raise DumpError(f"the state in '{files.state}' is of a log. Remove it to start anew.")
-            age = check_age(session.head, heard.start_ns, str(files.state))
-            stream.remember(session.kept)
-            tell(f"resumed from {files.state}, {age:.1f} s later.")
-        for received in heard.backlog:
-            made_node._push(received, time_it=False)
+        with ExitStack() as failing:
+            failing.callback(session.close)
+            if view is not None:
+                view.begin(robot, heard.mounts)
+                session.view = view
+            made_node = cls(transport, stream, session, Teller(transport, with_tf=node.tf), robot)
+            if session.head:
+                if not isinstance(session.kept, Memory):
+                    raise DumpError(f"the state in '{files.state}' is of a log. Remove it to start anew.")
+                age = check_age(session.head, heard.start_ns, str(files.state))
+                stream.remember(session.kept)
+                tell(f"resumed from {files.state}, {age:.1f} s later.")
+            for received in heard.backlog:
+                made_node._push(received, time_it=False)
+            failing.pop_all()
         return made_node
 
     def spin(self, is_over: Callable[[], bool] = lambda: False, on_line: Callable[[Node], None] = lambda node: None) -> None:

@@ -68,7 +68,8 @@ class Spool:
         """A new file. Raises `OutputError`, also where a run that was killed has left one."""
         if path.exists():
             raise OutputError(
-                f"'{path}' is left from a run that was killed: pass that run's --state to go on from there, or remove the file."
+                f"'{path}' is left from a run that was killed: pass that run's --state to go on from there. "
+                "If there is no such state, nothing can go on from it: remove the file to start anew."
             )
         try:
             return cls(path, path.open("xb", buffering=0), 0, -(1 << 63))

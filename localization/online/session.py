@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
 from localization.errors import DumpError, OutputError
@@ -14,32 +12,13 @@ from localization.events import Event
 from localization.logs.fused import write_fused
 from localization.online.core import Core, Pair, ReplayConfig
 from localization.online.dump import Dumper, fingerprints, read_dump, remove_dump
+from localization.online.files import Files
 from localization.online.health import Health
 from localization.online.records import Spool, fused_estimates, trajectory
 from localization.trajectory import write_tum
 from motion_models.robot import Mount, Robot
 
-_SUFFIXES = (".mcap", ".tum")
 _MEANWHILE = {"state": "The state of before stays", "output": "The output lacks what is estimated meanwhile"}
-
-
-@dataclass(frozen=True)
-class Files:
-    """What a session writes."""
-
-    out: Path | None = None
-    """Trajectory, .mcap or .tum, written at the end."""
-    state: Path | None = None
-    """Resumed at the start if it is there."""
-
-    def __post_init__(self) -> None:
-        if self.out is not None and self.out.suffix not in _SUFFIXES:
-            raise OutputError(f"output '{self.out}': its name must end in {' or '.join(_SUFFIXES)}.")
-
-    @property
-    def spool(self) -> Path | None:
-        """Where the estimates are until the end."""
-        return None if self.out is None else self.out.with_name(f".{self.out.name}.part")
 
 
 class View(Protocol):
@@ -89,6 +68,8 @@ class Session:
         self.troubles: dict[str, str] = {}
         """What cannot be written at present, and why."""
         self._told: set[str] = set()
+        self._is_counted_on = head.get("records") is not None
+        """The spool, by a state."""
         self.count = int(head.get("events", 0))
         """Events so far, those before the state included."""
         self.view: View | None = None
@@ -113,8 +94,6 @@ class Session:
         """
         shared = shared or {}
         dumper = None if files.state is None else Dumper(files.state, made, shared)
-        if files.out is not None and files.out.exists():
-            raise OutputError(f"'{files.out}' exists already; nothing is overwritten. Choose another name or remove it.")
         if files.state is None or not files.state.exists():
             return cls(core, kept, name, files, None if files.spool is None else Spool.create(files.spool), dumper, {}, tell)
         found = read_dump(files.state, made, shared)
@@ -179,13 +158,19 @@ class Session:
                 self._tell(f"{error} {_MEANWHILE[what]}; it is tried again.")
 
     def dump(self, extra: Callable[[], Mapping[str, Any]] = dict, now: bool = False) -> None:
-        """The state to disk, if it is due or wanted ``now``. What ``extra`` tells enters its head. Raises `DumpError` unless live."""
+        """The state to disk, if it is due or wanted ``now``; then it is there on return. What ``extra`` tells enters its head.
+
+        Raises `DumpError` unless live.
+        """
         if self._dumper is None or not (now or self._dumper.is_due()):
             return
         on_disk = () if self._spool is None else (self._spool.descriptor,)
         records = None if self._spool is None else self._spool.count
         with self._on_disk("state"):
             self._dumper.write([self.core, self.kept], {**extra(), "events": self.count, "records": records}, on_disk)
+            self._is_counted_on = True
+            if now:
+                self._dumper.wait()
 
     def write_out(self) -> int | None:
         """The output, if one is wanted; returns how many estimates it holds. Raises `OutputError` where there are none."""
@@ -208,11 +193,17 @@ class Session:
         return len(stamps)
 
     def close(self, forget: bool = False) -> None:
-        """End; ``forget`` removes the state, for there is nothing to go on with. Raises `DumpError` unless live."""
-        if self._dumper is not None:
-            with self._on_disk("state"):
-                self._dumper.close()
-            if forget:
-                remove_dump(self._dumper.path)
-        if self._spool is not None:
-            self._spool.close()
+        """End; ``forget`` removes the state, for there is nothing to go on with. Estimates that no state counts on are removed where they
+        can be had again, or are none: they would be in the way of the next run. Raises `DumpError` unless live.
+        """
+        try:
+            if self._dumper is not None:
+                with self._on_disk("state"):
+                    self._dumper.close()
+                if forget:
+                    remove_dump(self._dumper.path)
+        finally:
+            if self._spool is not None:
+                is_counted_on = self._is_counted_on and self._dumper is not None and self._dumper.path.exists()
+                is_needed = is_counted_on or (self._tell is not None and self._spool.count)
+                (self._spool.close if is_needed else self._spool.remove)()

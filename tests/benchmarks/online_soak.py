@@ -15,8 +15,8 @@ import numpy as np
 
 from localization.logs.forms import Form, Message, Template
 from localization.online.core import Pair
+from localization.online.files import Files
 from localization.online.node import Node, NodeConfig
-from localization.online.session import Files
 from localization.online.transport import Received
 from localization.simulate.experiments import ExperimentConfig
 from localization.simulate.scanners import ScannerConfig

@@ -1,0 +1,75 @@
+"""The files of a session: which they are, that they do not get into each other's way, and that no other process has them meanwhile."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
+
+from localization.errors import OutputError
+
+_SUFFIXES = (".mcap", ".tum")
+
+
+@dataclass(frozen=True)
+class Files:
+    """What a session writes. Raises `OutputError` for an output of unknown kind, a state that is a folder, and two that are one file."""
+
+    out: Path | None = None
+    """Trajectory, .mcap or .tum, written at the end."""
+    state: Path | None = None
+    """Resumed at the start if it is there."""
+
+    def __post_init__(self) -> None:
+        if self.out is not None and self.out.suffix not in _SUFFIXES:
+            raise OutputError(f"output '{self.out}': its name must end in {' or '.join(_SUFFIXES)}.")
+        if self.state is not None and self.state.is_dir():
+            raise OutputError(f"the state '{self.state}' is a folder. Name a file in it.")
+        if self.out is not None and self.spool is not None and self.state is not None:
+            for taken, what in ((self.out, "the output"), (self.spool, "where the output grows")):
+                if self.state.resolve() == taken.resolve():
+                    raise OutputError(f"the state '{self.state}' is {what} as well. Give the state a name of its own.")
+
+    @property
+    def spool(self) -> Path | None:
+        """Where the estimates are until the end."""
+        return None if self.out is None else self.out.with_name(f".{self.out.name}.part")
+
+    @contextlib.contextmanager
+    def claimed(self) -> Iterator[None]:
+        """Inside, they are this process's alone. Raises `OutputError` where they cannot be written, for an output that exists, and where
+        another process has them."""
+        if self.out is not None and (self.out.exists() or self.out.is_symlink()):
+            raise OutputError(f"'{self.out}' exists already; nothing is overwritten. Choose another name or remove it.")
+        with contextlib.ExitStack() as stack:
+            for path in (self.out, self.state):
+                if path is not None:
+                    lock = path.with_name(f".{path.name}.lock")
+                    stack.enter_context(_locked(path, lock))
+                    stack.callback(lock.unlink, missing_ok=True)  # while it is locked
+            yield
+
+
+def _locked(path: Path, lock: Path) -> TextIO:
+    """The file ``lock``, which is another than ``path``, for a state is replaced again and again. The lock ends with the process, however
+    that ends."""
+    while True:
+        try:
+            file = lock.open("a")
+        except OSError as error:
+            raise OutputError(f"'{path}' cannot be written: {error.strerror}. Name a file in a folder that is there and yours.") from error
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            file.close()
+            raise OutputError(f"'{path}' is in use by another process that runs. Stop that, or name another file.") from error
+        except OSError:
+            return file  # a file system without locks is no reason not to work
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file.fileno()), lock.stat()):
+                return file
+        file.close()  # whoever had it removed it meanwhile
