@@ -25,7 +25,7 @@ from localization.online.thaw import thaw
 from localization.steps import StepConfig
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
-from tests.online_help import ROBOT, drive_events, new_core, numbers
+from tests.online_help import ROBOT, drive_events, new_core, numbers, reseal
 
 ESTIMATORS = [("odometry", "diff_drive", "none"), ("lidar", "skid_steer", "none"), ("ekf", "skid_steer", "constant")]
 ESTIMATORS += [("graph", "skid_steer", "cg_field")]
@@ -147,6 +147,32 @@ def test_damage_anywhere_is_noticed(state):
         state.write_bytes(content[:length])
         with pytest.raises(DumpError, match=r"damaged|no state of an estimator"):
             read_dump(state, made_by(), {})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("events", -1),
+        ("events", "x"),
+        ("events", 10**30),
+        ("records", -5),
+        ("records", 1.5),
+        ("made_by", None),
+        ("made_by", []),
+        ("state_bytes", -1),
+        ("state_bytes", 10**9),
+        ("state_bytes", None),
+        ("stamp_ns", "now"),
+        ("stamp_ns", 10**400),
+        ("topics", "/scan"),
+        ("topics", [1]),
+    ],
+)
+def test_an_odd_head_is_refused_though_its_check_sum_is_right(state, name, value):
+    reseal(state, name, value)
+    for read in (read_head, lambda path: read_dump(path, made_by(), {})):
+        with pytest.raises(DumpError, match="no readable head"):
+            read(state)
 
 
 def test_foreign_files_are_refused_and_run_no_code(tmp_path):

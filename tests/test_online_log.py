@@ -19,7 +19,7 @@ from localization.online.dump import read_head
 from localization.online.files import Files
 from localization.online.records import Spool
 from tests.disks import files_of_at_most, fill_disk
-from tests.online_help import drive_log
+from tests.online_help import drive_log, reseal
 
 COMMAND = (sys.executable, "-m", "localization.cli", "online")
 
@@ -200,6 +200,11 @@ def test_states_that_do_not_fit_are_refused(killed, tmp_path, capsys):
     other_log = drive_log(seed=1)
     assert main(["online", str(other_log), "--robot", "vaultbot", "--state", str(state), "--out", str(tmp_path / "fused.mcap")]) == 2
     assert "made with another source" in capsys.readouterr().err
+    whole = state.read_bytes()
+    reseal(state, "events", 10**9)
+    assert online("--rate", "max", "--state", state, "--out", tmp_path / "fused.mcap") == 2
+    assert "is of 1000000000 events where the log has" in capsys.readouterr().err
+    state.write_bytes(whole)
     os.truncate(tmp_path / ".fused.mcap.part", 208)
     assert online("--rate", "max", "--state", state, "--out", tmp_path / "fused.mcap") == 2
     assert "estimates where the state counts on" in capsys.readouterr().err

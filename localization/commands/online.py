@@ -7,6 +7,7 @@ import math
 import signal
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -21,6 +22,7 @@ from rich.markup import escape
 from localization.commands.online_line import live_line
 from localization.errors import DumpError, OutputError
 from localization.estimators import check_estimator
+from localization.events import Event
 from localization.logs import TopicOverrides, open_log
 from localization.online.core import Core, Pair, ReplayConfig
 from localization.online.files import Files
@@ -105,7 +107,7 @@ class Online:
             if session.head:
                 console.print(f"resumed from {files.state} after {session.count} events", markup=False, soft_wrap=True)
             with Live(console=console, auto_refresh=False, transient=True) as live:
-                for event in islice(log.events(), session.count, None):
+                for event in self._rest(log.events(), session.count):
                     pace.wait(event.stamp_ns)
                     if stop.is_set():
                         self._interrupt(console, session)
@@ -126,6 +128,13 @@ class Online:
         for note in dict.fromkeys([*log.notes(), *session.core.stepper.notes()]):
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         self._summarize(console, session, seconds, count)
+
+    def _rest(self, events: Iterator[Event], done: int) -> Iterator[Event]:
+        """Those after the first ``done``. Raises `DumpError` where there are not so many."""
+        found = sum(1 for _ in islice(events, done))
+        if found < done:
+            raise DumpError(f"the state in '{self.state}' is of {done} events where the log has {found}. Remove it to start anew.")
+        yield from events
 
     def _interrupt(self, console: Console, session: Session) -> NoReturn:
         """With a state, the same command goes on from there. Without one nothing can: the output is what there is so far."""

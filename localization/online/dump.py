@@ -26,6 +26,7 @@ from localization.provenance import versions
 from motion_models.robot import Robot
 
 _MAGIC = b"skidloc state 1\n"
+_INT_END = 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def read_dump(path: Path, made_by: Mapping[str, str], shared: Mapping[str, Any])
     Raises `DumpError` for a file that is not there, damaged or foreign, or if it was made by something else than ``made_by``.
     """
     head, text, blob = _read(path)
-    then = head.get("made_by", {})
+    then = head["made_by"]
     different = [name for name in made_by if then.get(name) != made_by[name]]
     if different:
         told = ", ".join(f"{name} ({then.get(name, 'unknown')} then, {made_by[name]} now)" for name in different)
@@ -137,10 +138,31 @@ def _read(path: Path) -> tuple[dict[str, Any], bytes, bytes]:
     about, _, rest = body.partition(b"\n")
     try:
         head = json.loads(about)
-        size = int(head["state_bytes"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise DumpError(f"the state in '{path}' has no readable head. Remove it to start anew.") from error
+    except (RecursionError, ValueError):
+        head = None
+    if not _is_head(head, len(rest)):
+        raise DumpError(f"the state in '{path}' has no readable head. Remove it to start anew.")
+    size = head["state_bytes"]
     return head, rest[:size], rest[size:]
+
+
+def _is_head(head: Any, most_bytes: int) -> bool:
+    """Whether it is of the kind that writers of states tell. A check sum that is right does not make it so."""
+
+    def is_count(name: str, most: int = _INT_END) -> bool:
+        return type(head.get(name, 0)) is int and 0 <= head.get(name, 0) <= most
+
+    return (
+        isinstance(head, dict)
+        and {"made_by", "state_bytes"} <= set(head)
+        and isinstance(head["made_by"], dict)
+        and is_count("state_bytes", most_bytes)
+        and is_count("events")
+        and (head.get("records") is None or is_count("records"))
+        and is_count("stamp_ns")
+        and isinstance(head.get("topics", []), list)
+        and all(isinstance(topic, str) for topic in head.get("topics", []))
+    )
 
 
 class Dumper:
