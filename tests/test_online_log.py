@@ -160,6 +160,8 @@ def test_real_time_takes_its_time(tmp_path):
     ("arguments", "said"),
     [
         (["--rate", "0"], "--rate is '0'"),
+        (["--rate", "nan"], "--rate is 'nan'"),
+        (["--rate", "1e-300"], "--rate is '1e-300'; it must be a number from 0.001 (1 is real time), or max."),
         (["--rate", "fast"], "--rate is 'fast'"),
         (["--estimator", "magic"], "no estimator 'magic'"),
         (["--model", "magic"], "magic"),

@@ -37,6 +37,7 @@ from motion_models.registry import make_model
 from motion_models.robot import Robot, load_robot
 
 _LINE_S = 0.25
+_SLOWEST = 0.001  # a second of the log in a quarter of an hour
 
 
 @dataclass(frozen=True)
@@ -208,8 +209,8 @@ def parse_rate(text: str) -> float:
         rate = math.inf if text == "max" else float(text)
     except ValueError:
         rate = math.nan
-    if not rate > 0.0:
-        raise OutputError(f"--rate is '{text}'; it must be a number above 0 (1 is real time), or max.")
+    if not rate >= _SLOWEST:
+        raise OutputError(f"--rate is '{text}'; it must be a number from {_SLOWEST} (1 is real time), or max.")
     return rate
 
 
