@@ -15,6 +15,7 @@ import pytest
 from localization.cli import main
 from localization.errors import OutputError
 from localization.estimators import Estimate
+from localization.logs.fused import write_fused
 from localization.online.dump import read_head
 from localization.online.files import Files
 from localization.online.records import Spool
@@ -91,6 +92,22 @@ def test_killed_twice_and_resumed_it_writes_the_same_bytes(replayed, killed, tmp
     assert online("--rate", "max", "--out", tmp_path / "fused.mcap", "--state", tmp_path / "state") == 0
     assert "resumed from" in capsys.readouterr().out
     assert (tmp_path / "fused.mcap").read_bytes() == (replayed / "fused.mcap").read_bytes()
+    assert [path.name for path in tmp_path.iterdir()] == ["fused.mcap"]
+
+
+def test_what_a_kill_left_of_an_output_is_replaced_by_the_next_run(tmp_path, monkeypatch):
+    written = []
+
+    def write(path, *arguments):
+        assert list(path.parent.iterdir()) == []
+        written.append(path)
+        write_fused(path, *arguments)
+
+    monkeypatch.setattr("localization.online.session.write_fused", write)
+    beside = tmp_path / ".fused.mcap.new"
+    (beside / ".fused-abc").mkdir(parents=True)
+    assert online("--rate", "max", "--estimator", "odometry", "--out", tmp_path / "fused.mcap") == 0
+    assert written == [beside / "fused.mcap"]
     assert [path.name for path in tmp_path.iterdir()] == ["fused.mcap"]
 
 

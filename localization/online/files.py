@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
 from localization.errors import OutputError
+from localization.logs.output import output_errors, refuse_existing
 
 _SUFFIXES = (".mcap", ".tum")
 
@@ -40,11 +42,28 @@ class Files:
         return None if self.out is None else self.out.with_name(f".{self.out.name}.part")
 
     @contextlib.contextmanager
+    def beside(self) -> Iterator[Path]:
+        """Where to write what becomes the output at the end, under its name, for a bag holds that. What a process that was killed has left
+        there is removed. Raises `OutputError`."""
+        assert self.out is not None
+        folder = self.out.with_name(f".{self.out.name}.new")
+        with output_errors(self.out):
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+        try:
+            yield folder / self.out.name
+            refuse_existing(self.out)
+            with output_errors(self.out):
+                (folder / self.out.name).replace(self.out)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    @contextlib.contextmanager
     def claimed(self) -> Iterator[None]:
         """Inside, they are this process's alone. Raises `OutputError` where they cannot be written, for an output that exists, and where
         another process has them."""
-        if self.out is not None and (self.out.exists() or self.out.is_symlink()):
-            raise OutputError(f"'{self.out}' exists already; nothing is overwritten. Choose another name or remove it.")
+        if self.out is not None:
+            refuse_existing(self.out)
         with contextlib.ExitStack() as stack:
             for path in (self.out, self.state):
                 if path is not None:

@@ -180,7 +180,8 @@ class Session:
         if len(stamps) and self._files.out.suffix == ".tum":
             write_tum(self._files.out, trajectory(stamps, table))
         elif len(stamps):
-            write_fused(self._files.out, {self.name: fused_estimates(stamps, table)}, self.name)
+            with self._files.beside() as bag:
+                write_fused(bag, {self.name: fused_estimates(stamps, table)}, self.name)
         if self._tell is not None and self._spool.missing:
             self._tell(f"'{self._files.out}' lacks {self._spool.missing} estimates, for which there was no room on the disk.")
         if self._dumper is not None:
