@@ -31,7 +31,6 @@ from localization.online.pace import Pace
 from localization.online.session import Session, View, made_by
 from localization.online.transport import Transport
 from localization.provenance import fingerprint
-from localization.settings import check_settings
 from motion_models.corrections import check_forms
 from motion_models.registry import make_model
 from motion_models.robot import Robot, load_robot
@@ -75,7 +74,6 @@ class Online:
     config: ReplayConfig = field(default_factory=ReplayConfig)
 
     def run(self, console: Console) -> None:
-        check_settings(self.node)
         if self.state is not None and self.estimator == "graph" and self.config.estimator.graph.backend == "isam2":
             raise DumpError(
                 f"no state can be kept in --state {self.state}: iSAM2's is GTSAM's own and cannot be written down. "

@@ -25,13 +25,14 @@ from localization.online.session import Session, View, made_by
 from localization.online.tell import Teller
 from localization.online.transport import Received, Transport
 from localization.online.warm import warm_up
+from localization.settings import Settings
 from motion_models.robot import Robot
 
 _TELL_S, _POLL_S = 1.0, 0.2
 
 
 @dataclass(frozen=True)
-class NodeConfig:
+class NodeConfig(Settings):
     """How a node behaves."""
 
     wait_s: float = 5.0
