@@ -518,6 +518,24 @@ def test_a_frozen_scanner_is_found_out(driven: rooms.Drive) -> None:
     assert worst(driven, estimates, SPOILT.stop + 5, len(driven.poses)) < 0.02  # the old map is found again
 
 
+def test_a_scanner_that_froze_on_the_way_is_no_better_when_the_robot_stands() -> None:
+    drive = rooms.drive_through(LAB, rooms.path((1.5, 0.4, 0.2), (2.5, 0.0, 0.0), (1.5, 0.4, 0.2), (1.0, 0.0, 0.0)), 1)
+    frozen = scans_of(drive)[8]
+    estimates, counts = run(drive, lambda k, s: replace(s, points=frozen.points, offsets=frozen.offsets) if k > 8 else s)
+    assert counts["stale"] == len(drive.stamps) - 9
+    assert counts["standing"] > 30
+    assert worst(drive, estimates, 0, len(drive.poses)) < 0.1  # by wheels
+
+
+def test_a_robot_that_stands_may_see_the_same_again_and_again() -> None:
+    """As in a simulator without noise."""
+    drive = rooms.drive_through(LAB, rooms.path((1.0, 0.0, 0.0)), 1, scanner=rooms.Beams(noise=0.0))
+    assert all(np.array_equal(scan.points, scans_of(drive)[0].points) for scan in scans_of(drive))
+    _, counts = run(drive, lambda k, s: s)
+    assert counts["stale"] == 0
+    assert counts["matched"] == len(drive.stamps)
+
+
 def test_a_scan_from_elsewhere_is_left_out(driven: rooms.Drive) -> None:
     off = np.array([0.9, 0.4, 0.3])
 

@@ -17,15 +17,18 @@ class ScanCheck:
     def __init__(self, config: LidarConfig) -> None:
         self._config = config
         self._points: FloatArray | None = None
+        self._is_frozen = False
         self._jumps = 0
         self.counts = dict.fromkeys(("stale", "jumps", "degenerate"), 0)
 
     def is_stale(self, scan: Scan, is_standing: bool) -> bool:
-        """The very same ranges as last time although the wheels turn: noise alone would have changed them."""
+        """The very same ranges as last time although the wheels turn: noise alone would have changed them. Once they were, they stay stale
+        until they change: a scanner that froze while the robot drove is no better when it stands."""
         last, self._points = self._points, scan.points
-        is_same = last is not None and len(last) > 0 and np.array_equal(last, scan.points) and not is_standing
-        self.counts["stale"] += is_same
-        return is_same
+        is_same = last is not None and len(last) > 0 and np.array_equal(last, scan.points)
+        self._is_frozen = is_same and (self._is_frozen or not is_standing)
+        self.counts["stale"] += self._is_frozen
+        return self._is_frozen
 
     def is_jump(self, off: FloatArray, found: Registration, since_s: float) -> bool:
         """The scan lies ``off`` (3,) where the wheels say, farther than the robot can slip in ``since_s`` [s] since the last one.
