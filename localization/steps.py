@@ -12,6 +12,7 @@ import numpy as np
 
 from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
 from localization.gyro import GyroHistory, Turn
+from localization.lidar_frames import LidarFrames
 from localization.settings import Positive, Settings, at_least
 from localization.wheel_history import WheelHistory
 from motion_models import se2
@@ -79,6 +80,8 @@ class Stepper:
         """(k,) the model's parameters: estimated by the filter, and used from the next step on."""
         self._wheels = WheelHistory(robot.center_of_gravity)
         self._gyro = GyroHistory(robot.gyro_noise, mounts)
+        self.frames = LidarFrames(mounts)
+        """Of the scans."""
         self._has_lidar = has_lidar
         self._scans: deque[Scan] = deque()
         self._empty_scans, self._late_scans, self._deaf_s = 0, 0, 0.0
@@ -100,7 +103,7 @@ class Stepper:
             self._gyro.push(event)
         elif isinstance(event, CgSample):
             self._wheels.set_cg(event)
-        elif isinstance(event, Scan):
+        elif isinstance(event, Scan) and self.frames.admit(event):
             self._empty_scans += not len(event.points)
             # one that was overtaken goes where it belongs, if that still waits
             self._scans.insert(bisect.bisect_right(self._scans, event.stamp_ns, key=lambda scan: scan.stamp_ns), event)
@@ -124,7 +127,7 @@ class Stepper:
             said.append(f"{self._late_scans} scan{'s' * (self._late_scans > 1)} came after later ones and could not be used.")
         if self._deaf_s > 0.0:
             said.append(f"no wheels were heard for {self._deaf_s:.1f} s in all: there the motion is a guess with a wide covariance.")
-        return said
+        return [*said, *self.frames.notes()]
 
     def _ready(self, is_last: bool) -> Iterator[Step]:
         while (end := self._next_end(is_last)) is not None:

@@ -24,7 +24,7 @@ from localization.online.freeze import freeze
 from localization.online.thaw import thaw
 from localization.steps import StepConfig
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot import Mount, load_robot
 from tests.online_help import ROBOT, drive_events, new_core, numbers, reseal
 
 ESTIMATORS = [("odometry", "diff_drive", "none"), ("lidar", "skid_steer", "none"), ("ekf", "skid_steer", "constant")]
@@ -57,6 +57,27 @@ def test_cut_anywhere_and_resumed_the_results_are_the_same_to_the_last_bit(kind)
         expected = whole[made[cut] : made[end] if end < len(events) else len(whole)]
         assert found == expected, cut
     assert len(whole) > 200
+
+
+@pytest.mark.parametrize("estimator", ["lidar", "ekf", "graph"])
+def test_places_that_are_told_late_reach_whoever_was_resumed(estimator):
+    """Frames are unknown to all parts of a core until one moment: cut shortly before, or not."""
+    events, mounts = drive_events()
+    cut, met = 1000, 1100
+    core = Core(Pair(make_model("skid_steer", ROBOT), estimator), ROBOT, {}, has_lidar=True)
+    before = [numbers(e) for event in events[:cut] for e in core.push(event)]
+    resumed = thaw(*freeze(core))
+    found = []
+    for goes_on in (core, resumed):
+        rest = [numbers(e) for event in events[cut:met] for e in goes_on.push(event)]
+        assert goes_on.meet(mounts)
+        assert not goes_on.meet({"laser": Mount(x=9.0)})  # a frame that has its place keeps it
+        rest += [numbers(e) for event in events[met : met + AHEAD] for e in goes_on.push(event)]
+        found.append(rest)
+        assert goes_on.stepper.frames.lack is None
+        assert "/tf_static was late" in goes_on.stepper.notes()[-1]
+    assert found[0] == found[1]
+    assert len(before) > 50
 
 
 _RESUME = """

@@ -24,6 +24,7 @@ from localization.online.pace import Pace
 from localization.online.tell import CORRECTIONS, DIAGNOSTICS, ODOMETRY, TF
 from localization.run import Pair, replay
 from localization.trajectory import read_tum
+from motion_models import se2
 from motion_models.registry import make_model
 from tests import bags
 from tests.disks import fill_disk
@@ -99,7 +100,7 @@ def test_subscriptions_are_of_sensor_data_but_for_static_transforms(calm):
     subscribed = calm[0].subscribed
     assert [topic for topic, is_latched in subscribed.items() if is_latched] == ["/tf_static"]
     assert {"/joint_states", "/scan", "/points", "/imu/data", "/center_of_gravity"} <= set(subscribed)
-    assert calm[0].kept == {"/joint_states", "/scan", "/imu/data"}  # what is not used costs nothing from the start on
+    assert calm[0].kept == {"/joint_states", "/scan", "/imu/data", "/tf_static"}  # what is not used costs nothing from the start on
 
 
 @pytest.mark.parametrize(("estimator", "seed"), [("ekf", 0), ("ekf", 1), ("graph", 2)])
@@ -241,6 +242,53 @@ def test_degeneracy_tells_corridors_from_rooms(calm):
     health.saw(dataclasses.replace(last, points=np.column_stack([corridor, np.zeros(len(corridor))])))
     assert health.statuses(node.session.core)[1].level == WARN
     health.saw(last)
+
+
+def late_transforms(messages):
+    """/tf_static comes four seconds after the rest."""
+    late = [m._replace(received_ns=m.received_ns + 4 * S) if m.topic == "/tf_static" else m for m in messages]
+    return sorted(late, key=lambda m: m.received_ns)
+
+
+def lidar_statuses(transport):
+    return [s for m in published(transport, DIAGNOSTICS) for s in m.status if s.name == "skidloc: lidar"]
+
+
+def test_a_lidar_whose_place_nobody_tells_is_an_error_and_a_note():
+    lost = LogTransport(drive_log(), silenced("/tf_static", 0.0, 99.0))
+    node, told = run_node(lost)
+    (said,) = told
+    assert "frame 'laser'" in said
+    assert "Publish it on /tf_static, or add [mounts.laser] to the robot file." in said
+    assert {(s.level, s.message) for s in lidar_statuses(lost)} == {(ERROR, said)}
+    (note,) = node.notes()
+    assert "frame 'laser'" in note
+    assert f"{node.session.core.estimator.counts()['scans']} scans of it were taken as if from the body's origin" in note
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "graph"])
+def test_transforms_that_come_late_are_used_from_then_on(estimator, tmp_path):
+    calm, late = undisturbed(estimator)[0], LogTransport(drive_log(), late_transforms)
+    node, told = run_node(late, estimator, Files(state=tmp_path / "state"))
+    assert len(told) == 2
+    assert "frame 'laser'" in told[0]
+    assert "tells now where the LiDAR sits" in told[1]
+    assert node.session.core.mounts["laser"].x != 0.0
+    (note,) = node.notes()
+    assert "/tf_static was late" in note
+    # what was wrong until then stays; from then on it is as right as it says
+    a, b = track(calm), track(late)
+    begin, *_, last = sorted(s for s in set(a) & set(b) if s > min(a) + 5 * S)
+    off = se2.between(se2.between(a[begin][0], a[last][0]), se2.between(b[begin][0], b[last][0]))
+    sigmas = np.maximum(a[last][1], b[last][1])
+    assert np.all(np.abs(off) < 3.0 * sigmas), (off, sigmas)
+    # nor did the body jump to where it had been taken to be all along
+    poses = np.array([pose for pose, _ in b.values()])
+    assert np.hypot(*se2.between(poses[:-1], poses[1:])[:, :2].T).max() < 0.1
+    # the state is one of that place: who hears it at once may go on with it
+    node.finish()
+    again = LogTransport(drive_log(), lambda messages: [messages[0], *messages[-100:]])
+    assert "resumed from" in run_node(again, estimator, Files(state=tmp_path / "state"))[1][-1]
 
 
 def test_silence_is_told_and_then_the_run_begins():

@@ -157,6 +157,8 @@ def spoiled(kind):
             stamp.sec += 7200
         elif kind == "repeated" and number % 10 == 3:
             stamp.nanosec, stamp.sec = (log_ns - bags.S // 10) % bags.S, (log_ns - bags.S // 10) // bags.S
+        elif kind == "frame" and number > 30:
+            scan.header.frame_id = "nobody_knows"
         elif kind == "vanishes" and 30 < number < 70:
             return None
         return scan, log_ns
@@ -164,7 +166,7 @@ def spoiled(kind):
     return spoil
 
 
-@pytest.mark.parametrize("kind", ["nan", "all nan", "empty", "backwards", "jump", "repeated", "vanishes"])
+@pytest.mark.parametrize("kind", ["nan", "all nan", "empty", "backwards", "jump", "repeated", "vanishes", "frame"])
 def test_bad_scans_are_survived(kind, tmp_path, capsys):
     log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(10.0, multiplier=1.875, spoil=spoiled(kind)))
     assert replay(log, tmp_path / "out", "--robot", "vaultbot", "--model", "diff_drive", "--estimator", "lidar,ekf") == 0
@@ -177,6 +179,7 @@ def test_bad_scans_are_survived(kind, tmp_path, capsys):
         "repeated": "/scan",
         "empty": "without a usable point",
         "all nan": "without a usable point",
+        "frame": "frame 'nobody_knows' sits on the robot: 69 scans of it were not used",
     }
     assert told.get(kind, "") in capsys.readouterr().out
 

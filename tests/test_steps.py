@@ -18,7 +18,7 @@ from localization.wheel_history import WheelHistory
 from motion_models import se2
 from motion_models.integrate import preintegrate
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot import Mount, load_robot
 from tests import bags
 
 MS, S = 1_000_000, bags.S
@@ -33,8 +33,8 @@ def wheel(t_s, position=None, velocity=None, t0=T0):
     )
 
 
-def scan(t_s, n=1):
-    return Scan(T0 + round(t_s * S), np.ones((n, 3)))
+def scan(t_s, n=1, frame="laser"):
+    return Scan(T0 + round(t_s * S), np.ones((n, 3)), frame_id=frame)
 
 
 def angles(t):
@@ -51,7 +51,7 @@ def in_order(*groups):
 
 
 def stepper(has_lidar=True, model="skid_steer", config=None):
-    return Stepper(make_model(model, ROBOT), ROBOT, {}, has_lidar, config)
+    return Stepper(make_model(model, ROBOT), ROBOT, {"laser": Mount()}, has_lidar, config)
 
 
 def cut(events, **kind):
@@ -456,6 +456,27 @@ def test_empty_scans_are_steps_and_are_told():
     found, cutter = cut(in_order(wheels(2.0), [scan(0.1 * i, n=i % 2) for i in range(1, 15)]))
     assert sum(s.scan is not None for s in found) == 14
     assert "7 scans without a usable point" in cutter.notes()[0]
+
+
+def test_scans_of_an_unknown_frame_are_told_and_not_mixed_with_others():
+    known, strange = [scan(0.1 * i) for i in range(1, 8)], [scan(0.1 * i, frame="top") for i in range(8, 15)]
+    found, cutter = cut(in_order(wheels(2.0), known, strange))
+    assert [s.scan for s in found if s.scan is not None] == known
+    assert found[-1].end_ns > strange[-1].stamp_ns
+    (note,) = cutter.notes()
+    assert "frame 'top'" in note
+    assert "7 scans of it were not used" in note
+    assert "[mounts.top]" in note
+    assert cutter.frames.lack is not None
+    # where none is known, they are all there is
+    found, cutter = cut(in_order(wheels(2.0), strange))
+    assert sum(s.scan is not None for s in found) == 7
+    (note,) = cutter.notes()
+    assert "7 scans of it were taken as if from the body's origin" in note
+    # the first of them may come before any other
+    found, cutter = cut(in_order(wheels(2.0), [scan(0.05, frame="top")], known, strange))
+    assert sum(s.scan is not None for s in found) == 8
+    assert ["1 scan of it was taken" in note or "7 scans of it were not used" in note for note in cutter.notes()] == [True, True]
 
 
 def test_a_long_stream_keeps_little():

@@ -24,12 +24,14 @@ class LidarAlone:
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig | None = None) -> None:
         self._mounts, self._odometry = mounts, LidarOdometry(config)
+        self._used: dict[str, Mount] = {}  # a frame stays where it was taken to be: KISS-ICP has but one map, drawn from there
         self._pose, self._twist, self._stamp_ns = np.zeros(3), np.zeros(3), 0
         self._n_scans = 0
 
     def step(self, step: Step) -> Estimate:
         if step.scan is not None:
-            points = body_points(step.scan, self._mounts.get(step.scan.frame_id, Mount()), self._twist)
+            frame = step.scan.frame_id
+            points = body_points(step.scan, self._used.setdefault(frame, self._mounts.get(frame, Mount())), self._twist)
             pose = self._odometry.register(points)
             if not np.isfinite(pose).all():
                 raise EstimatorError(f"KISS-ICP lost itself at stamp {step.end_ns} ns: its pose is not finite.")

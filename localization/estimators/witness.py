@@ -66,7 +66,8 @@ class ScanWitness:
     """Scan-to-map matching (`LidarMatcher`), and what of it enters the map."""
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig | None = None, is_thorough: bool = False) -> None:
-        self._mounts, self._matcher = mounts, LidarMatcher(config, is_thorough)
+        self._mounts, self._matcher, self._is_thorough = mounts, LidarMatcher(config, is_thorough), is_thorough
+        self._is_placed = True  # it is known where the LiDAR sits that drew the map
         self._is_begun, self._slip = False, Slip()
         self._seen_ns, self._last_ns = -1, -1  # stamp of the last scan, and of the last that was good
         self._twist = np.zeros(3)  # of the last step with a scan
@@ -86,7 +87,7 @@ class ScanWitness:
         self._is_good = not self._check.is_stale(step.scan, step.is_standing)
         if not self._is_good:
             return None
-        sweep = Sweep.of(step.scan, self._mounts.get(step.scan.frame_id, Mount()))
+        sweep = Sweep.of(step.scan, self._mount(step.scan.frame_id))
         slip = self._slip
         slip.advance(step.duration, step.predicted.cov)
         rate = slip.rate
@@ -107,6 +108,14 @@ class ScanWitness:
         swept = self._swept(step, found.lateness, sweep.lateness, gain, change)
         tie = replace(found.tie, sweep=swept)
         return Sight(Motion(se2.between(anchor, found.pose), found.cov), found.trust, tie)
+
+    def _mount(self, frame: str) -> Mount:
+        """Where ``frame`` sits. Once that is known, a map that was drawn as if from the body's origin is worth nothing."""
+        mount = self._mounts.get(frame)
+        if mount is not None and not self._is_placed:
+            self._matcher, self._is_begun = LidarMatcher(self._matcher.config, self._is_thorough), False
+        self._is_placed = mount is not None
+        return mount or Mount()
 
     def _amended(self, found: Registration, sweep: Sweep, step: Step, missed: FloatArray) -> Registration:
         """The same, had it been known that within the sweep the twist is other by ``missed`` (3,)."""

@@ -47,12 +47,14 @@ class Core:
     ) -> None:
         """``hindsight``: the estimator will be asked at the end what the whole log tells; it changes no estimate of a moment."""
         config = config or ReplayConfig()
+        self.mounts = dict(mounts)
+        """Where frames are known to sit; shared by all who ask."""
         model = correctable(pair.model, pair.corrections) if pair.estimator in CORRECTING else pair.model
-        self.stepper = Stepper(model, robot, mounts, has_lidar, config.step)
+        self.stepper = Stepper(model, robot, self.mounts, has_lidar, config.step)
         self.wheel_twist: FloatArray | None = None
         """(3,) mean twist of the last step by the wheels alone; None where they were not heard during all of it."""
         self.estimator: Estimator = make_estimator(
-            pair.estimator, model, pair.corrections, robot, mounts, has_lidar, config.estimator, hindsight
+            pair.estimator, model, pair.corrections, robot, self.mounts, has_lidar, config.estimator, hindsight
         )
 
     def push(self, event: Event) -> list[Estimate]:
@@ -72,6 +74,12 @@ class Core:
         estimates = self._take(self.stepper.finish())
         self.settle()
         return estimates
+
+    def meet(self, mounts: Mapping[str, Mount]) -> bool:
+        """Take in places of frames that are known only now; one that is known already stays. Returns whether there were any."""
+        new = {frame: mount for frame, mount in mounts.items() if frame not in self.mounts}
+        self.mounts.update(new)
+        return bool(new)
 
     def _take(self, steps: Iterable[Step]) -> list[Estimate]:
         found = []

@@ -107,6 +107,8 @@ class Health:
 
     def _of_lidar(self, core: Core) -> Status:
         values = {name: str(count) for name, count in core.estimator.counts().items()}
+        if (lack := core.stepper.frames.lack) is not None:
+            return Status("lidar", ERROR, lack, values)
         scene = self.degeneracy
         if scene is not None:
             values["degeneracy"] = f"{scene:.4f}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -23,12 +24,30 @@ _MOST_KEPT = 20_000
 """What is heard before the start is used, but nobody's memory shall be filled by it."""
 
 
+class LiveTransforms:
+    """What comes on /tf_static."""
+
+    def __init__(self, *, is_ros1: bool) -> None:
+        self._decode, self._fixed = decoder(TF_TYPE, is_ros1=is_ros1), FixedTransforms()
+
+    def hear(self, data: bytes) -> None:
+        """Take in a message; bytes that are none say nothing."""
+        with contextlib.suppress(UnusableError):
+            self._fixed.add(self._decode(data), is_static=True)
+
+    def mounts(self) -> Mapping[str, Mount]:
+        """Of all frames so far that are tied to the body's."""
+        return self._fixed.mounts()
+
+
 @dataclass(frozen=True)
 class Heard:
     """What there is to run on."""
 
     parts: Parts
     mounts: Mapping[str, Mount]
+    transforms: LiveTransforms
+    """What mounts are known by: more may come."""
     plan: ClockPlan
     start_ns: int
     """First stamp of the topics in use."""
@@ -52,10 +71,8 @@ class Listener:
             transport.subscribe(topic, message_type, is_latched=False)
         transport.subscribe(TF_STATIC, TF_TYPE, is_latched=True)
         self._asked = {topic for kind in TYPES if (topic := getattr(topics, kind))}
-        self._decoders = {
-            topic: decoder(kind, is_ros1=transport.is_ros1) for topic, kind in {**self.candidates, TF_STATIC: TF_TYPE}.items()
-        }
-        self._transforms = FixedTransforms()
+        self._decoders = {topic: decoder(kind, is_ros1=transport.is_ros1) for topic, kind in self.candidates.items()}
+        self._transforms = LiveTransforms(is_ros1=transport.is_ros1)
         self._backlog: list[Received] = []
         self._counts: Counter[str] = Counter()
         self._first: dict[str, tuple[int, int]] = {}
@@ -95,10 +112,7 @@ class Listener:
 
     def _hear(self, received: Received, epoch_ns: int) -> None:
         if received.topic == TF_STATIC:
-            try:
-                self._transforms.add(self._decoders[TF_STATIC](received.data), is_static=True)
-            except UnusableError:
-                return
+            self._transforms.hear(received.data)
             return
         try:
             message = self._decoders[received.topic](received.data)
@@ -153,7 +167,7 @@ class Listener:
             (stamp + plan.shifts_ns.get(topic, 0) for topic, (_, stamp) in first.items()), default=epoch_ns + time.monotonic_ns()
         )
         mounts = {"base_link": Mount(), **self._robot.mounts, **self._transforms.mounts()}
-        return Heard(parts, mounts, plan, start_ns, self._backlog)
+        return Heard(parts, mounts, self._transforms, plan, start_ns, self._backlog)
 
     def _joint_names(self, topic: str) -> list[list[str]]:
         decode = self._decoders[topic]

@@ -16,17 +16,17 @@ from localization.events import Event, Scan
 from localization.logs.tally import Tally
 from localization.logs.topics import TopicOverrides
 from localization.online.core import Core, Pair, ReplayConfig
-from localization.online.dump import read_head
+from localization.online.dump import fingerprints, read_head
 from localization.online.files import Files
 from localization.online.health import Status
-from localization.online.listen import Listener
+from localization.online.listen import TF_STATIC, Heard, Listener
 from localization.online.live import Memory, Stream, check_age
 from localization.online.session import Session, View, made_by
 from localization.online.tell import Teller
 from localization.online.transport import Received, Transport
 from localization.online.warm import warm_up
 from localization.settings import Settings
-from motion_models.robot import Robot
+from motion_models.robot import Mount, Robot
 
 _TELL_S, _POLL_S = 1.0, 0.2
 
@@ -44,9 +44,21 @@ class NodeConfig(Settings):
 class Node:
     """Made by `start`; `spin` until the end, then `finish`."""
 
-    def __init__(self, transport: Transport, stream: Stream, session: Session, teller: Teller, robot: Robot) -> None:
+    def __init__(
+        self,
+        transport: Transport,
+        stream: Stream,
+        session: Session,
+        teller: Teller,
+        robot: Robot,
+        heard: Heard,
+        made: dict[str, str],
+        tell: Callable[[str], None],
+    ) -> None:
+        """``made``: what a state says that it was made with; it changes with the mounts that come."""
         self._transport, self._stream, self.session, self._teller = transport, stream, session, teller
-        self._hardware = robot.name
+        self._robot, self._transforms, self._made, self._say = robot, heard.transforms, made, tell
+        self._lacks: set[str] = set()  # that were told
         self._told = -float("inf")
         self._newest_ns = 0
         self._began_ns: int | None = None
@@ -87,7 +99,7 @@ class Node:
             warm_up(pair, robot, heard.mounts, has_lidar, is_planar=False, config=config)
         gc.collect()
         gc.freeze()  # what is here now stays: later collections need not look at it
-        transport.keep([source.topic for source in heard.parts.sources.used()], [] if lidar is None else [lidar.topic])
+        transport.keep([TF_STATIC, *(source.topic for source in heard.parts.sources.used())], [] if lidar is None else [lidar.topic])
         tally = Tally()
         stream = Stream(heard, robot, tally, epoch_ns, is_ros1=transport.is_ros1)
         made = made_by(pair, robot, heard.mounts, has_lidar, config, "live topics")
@@ -98,7 +110,7 @@ class Node:
             if view is not None:
                 view.begin(robot, heard.mounts)
                 session.view = view
-            made_node = cls(transport, stream, session, Teller(transport, with_tf=node.tf), robot)
+            made_node = cls(transport, stream, session, Teller(transport, with_tf=node.tf), robot, heard, made, tell)
             if session.head:
                 if not isinstance(session.kept, Memory):
                     raise DumpError(f"the state in '{files.state}' is of a log. Remove it to start anew.")
@@ -149,6 +161,10 @@ class Node:
 
     def _push(self, received: Received, *, time_it: bool) -> bool:
         """True if it made an estimate."""
+        if received.topic == TF_STATIC:
+            self._transforms.hear(received.data)
+            self._meet(self._transforms.mounts())
+            return False
         has_estimate = False
         for event in self._stream.push(received):
             self._newest_ns = max(self._newest_ns, event.stamp_ns)
@@ -156,10 +172,29 @@ class Node:
             arrived_ns = received.received_ns if time_it and isinstance(event, Scan) else None
             has_estimate |= bool(self.session.push(event, partial(self._publish, event, arrived_ns)))
             self.session.saw(event)
+            self._watch_frames()
         if has_estimate:  # the next scan is far now, and does not wait
             self.session.core.settle()
             self.session.dump(self._head)
         return has_estimate
+
+    def _meet(self, mounts: Mapping[str, Mount]) -> None:
+        """Frames whose place is told only now have it from now on, and so has the state."""
+        core = self.session.core
+        was_lacking = core.stepper.frames.lack is not None
+        if not core.meet(mounts):
+            return
+        self._made.update(fingerprints(mounts=core.mounts))
+        if was_lacking and core.stepper.frames.lack is None:
+            self._say("/tf_static tells now where the LiDAR sits: its scans are placed by that from here on.")
+        if self.session.view is not None:
+            self.session.view.begin(self._robot, core.mounts)
+
+    def _watch_frames(self) -> None:
+        lack = self.session.core.stepper.frames.lack
+        if lack is not None and lack not in self._lacks:
+            self._lacks.add(lack)
+            self._say(lack)
 
     def _patience_s(self) -> float:
         return 0.0 if self.session.core.stepper.is_waiting else self._stream.patience_s(time.monotonic_ns())
@@ -178,7 +213,7 @@ class Node:
         silent = self._stream.silent(time.monotonic_ns())
         self.statuses = health.statuses(self.session.core, self._stream.dropped(), silent, self.session.troubles)
         stamp_ns = self._stream.sender_stamp_ns(self._newest_ns, by_lidar=True)
-        self._teller.diagnostics(self.statuses, self._hardware, stamp_ns)
+        self._teller.diagnostics(self.statuses, self._robot.name, stamp_ns)
         parameters = self.session.core.estimator.parameters()
         if parameters:
             self._teller.corrections(parameters, stamp_ns)
