@@ -105,7 +105,7 @@ class _Lane:
             self._core.estimator.parameters(),
             self._core.estimator.counts(),
             self._core.estimator.map_points(),
-            self._core.stepper.notes(),
+            self._core.notes(),
             self._seconds,
             self._pair.corrections if self._pair.estimator in CORRECTING else None,
             None if whole is None else moments,

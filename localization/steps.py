@@ -13,6 +13,7 @@ import numpy as np
 from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
 from localization.gyro import GyroHistory, Turn
 from localization.lidar_frames import LidarFrames
+from localization.lidar_tilt import LidarTilt
 from localization.settings import Positive, Settings, at_least
 from localization.wheel_history import WheelHistory
 from motion_models import se2
@@ -82,6 +83,7 @@ class Stepper:
         self._gyro = GyroHistory(robot.gyro_noise, mounts)
         self.frames = LidarFrames(mounts)
         """Of the scans."""
+        self._tilt = LidarTilt(mounts)
         self._has_lidar = has_lidar
         self._scans: deque[Scan] = deque()
         self._empty_scans, self._late_scans, self._deaf_s = 0, 0, 0.0
@@ -105,6 +107,7 @@ class Stepper:
             self._wheels.set_cg(event)
         elif isinstance(event, Scan) and self.frames.admit(event):
             self._empty_scans += not len(event.points)
+            self._tilt.see(event)
             # one that was overtaken goes where it belongs, if that still waits
             self._scans.insert(bisect.bisect_right(self._scans, event.stamp_ns, key=lambda scan: scan.stamp_ns), event)
         yield from self._ready(is_last=False)
@@ -127,7 +130,7 @@ class Stepper:
             said.append(f"{self._late_scans} scan{'s' * (self._late_scans > 1)} came after later ones and could not be used.")
         if self._deaf_s > 0.0:
             said.append(f"no wheels were heard for {self._deaf_s:.1f} s in all: there the motion is a guess with a wide covariance.")
-        return [*said, *self.frames.notes()]
+        return [*said, *self._tilt.notes(), *self.frames.notes()]
 
     def _ready(self, is_last: bool) -> Iterator[Step]:
         while (end := self._next_end(is_last)) is not None:

@@ -13,6 +13,7 @@ from localization.events import Scan
 from localization.lidar import LidarMatcher, Slip, Sweep, body_points
 from localization.lidar.lines import FitOptions, LineFit, LineMap, Spread
 from localization.lidar.noise import Noise
+from localization.lidar_tilt import LidarTilt, ground
 from localization.online.core import Core, Pair, ReplayConfig
 from localization.simulate import world
 from motion_models import se2
@@ -457,6 +458,48 @@ def test_clouds_come_by_the_same_door(tilt: float) -> None:
     assert found.cov[0, 0] < 0.03**2
 
 
+def tilted(pitch, scans: int = 24) -> LidarTilt:
+    """What clouds on a bend tell, whose scan k is pitched by ``pitch`` (k) [rad]."""
+    found = LidarTilt({"laser": Mount(z=0.8)})
+    for k in range(scans):
+        points = cloud(LAB, np.array([0.05 * k, 0.02 * k, 0.03 * k]), k, pitch(k)) - np.array([0.0, 0.0, 0.8])
+        found.see(Scan(k * 500_000_000, points, frame_id="laser", is_planar=False))
+    return found
+
+
+def test_clouds_that_are_tilted_are_told() -> None:
+    assert tilted(lambda k: math.radians(0.4)).notes() == []
+    (note,) = tilted(lambda k: math.radians(3.0)).notes()
+    assert "by 3.0 deg (roll +0.0, pitch +3.0)" in note
+    assert "mount of 'laser'" in note
+    (note,) = tilted(lambda k: math.radians(4.0) * math.sin(0.7 * k)).notes()
+    assert float(note.split("sway by ")[1].split()[0]) == pytest.approx(4.0 / math.sqrt(2.0), abs=0.2)
+    assert "mount" not in note
+    assert tilted(lambda k: math.radians(3.0), scans=9).notes() == []  # a glimpse is not enough
+
+
+def test_a_mount_that_tells_the_tilt_is_believed() -> None:
+    points = cloud(LAB, np.zeros(3), 0, math.radians(5.0)) - np.array([0.0, 0.0, 0.8])
+    found = LidarTilt({"laser": Mount(z=0.8, pitch=math.radians(5.0))})
+    for k in range(12):
+        found.see(Scan(k * 500_000_000, points, frame_id="laser", is_planar=False))
+    assert found.notes() == []
+
+
+def test_only_a_ground_is_taken_for_one() -> None:
+    rng = np.random.default_rng(0)
+    across = rng.uniform(-8.0, 8.0, (2000, 2))
+    level = np.array([-0.8, 0.05, -0.1])
+    flat = np.column_stack([across, level[0] + across @ level[1:] + 0.01 * rng.normal(size=2000)])
+    np.testing.assert_allclose(ground(flat), level, atol=0.01)
+    steep = np.column_stack([across, 0.5 * across[:, 0]])
+    heap = np.column_stack([across, rng.uniform(-2.0, 2.0, 2000)])
+    strip = flat[np.abs(across[:, 1]) < 0.5]
+    shelf = np.concatenate([flat, flat[np.abs(across).max(axis=1) < 3.5] - [20.0, 0.0, 3.0]])  # there is more below
+    for none in (np.empty((0, 3)), flat[:5], steep, heap, strip, shelf):
+        assert ground(none) is None
+
+
 # --- spoilt scans ------------------------------------------------------------------------------------------------------------------------
 
 
@@ -573,6 +616,24 @@ def test_without_scans_the_wheels_carry_on(driven: rooms.Drive) -> None:
         estimates, counts = run(driven, spoil)
         assert worst(driven, estimates, SPOILT.stop + 5, len(driven.poses)) < 0.02
         assert counts["matched"] >= len(driven.stamps) - len(SPOILT) - 2
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "graph"])
+def test_scans_that_hold_nothing_to_match_are_told(estimator: str, driven: rooms.Drive) -> None:
+    """Clouds of the floor alone, and a few points: neither is a scan without a point."""
+    clouds = [cloud(LAB, np.zeros(3), k) for k in range(10)]
+    floors = [
+        replace(scan, points=c[c[:, 2] < 0.1], offsets=np.empty(0), is_planar=False)
+        for scan, c in zip(scans_of(driven)[:10], clouds, strict=True)
+    ]
+    for spoilt in (floors, [replace(scan, points=scan.points[:9], offsets=scan.offsets[:9]) for scan in scans_of(driven)[:10]]):
+        core = Core(Pair(make_model("diff_drive", rooms.ROBOT), estimator), rooms.ROBOT, driven.mounts, True, ReplayConfig())
+        for event in sorted([*spoilt, *(e for e in driven.events[:50] if not isinstance(e, Scan))], key=lambda e: e.stamp_ns):
+            core.push(event)
+        core.finish()
+        assert core.estimator.counts()["scans"] == 10
+        assert core.estimator.counts()["matched"] == 0
+        assert core.notes() == ["10 scans had too few points on walls to be matched: the wheels carried on alone."]
 
 
 def test_a_degenerate_scene_is_counted() -> None:

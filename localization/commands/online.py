@@ -124,7 +124,7 @@ class Online:
             is_done = True
         finally:
             session.close(forget=is_done)
-        for note in dict.fromkeys([*log.notes(), *session.core.stepper.notes()]):
+        for note in dict.fromkeys([*log.notes(), *session.core.notes()]):
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         self._summarize(console, session, seconds, count)
 

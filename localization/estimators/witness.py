@@ -94,6 +94,7 @@ class ScanWitness:
         change, self._twist = step.twist - self._twist, step.twist
         found = self._matcher.register(sweep.at_stamp(step.twist + rate), sweep.is_planar, guess, self._drift, sweep.offsets)
         if found is None:
+            self._check.miss(step.scan)
             self._is_good = not self._matcher.has_map
             return None
         self._is_good = not self._check.is_jump(se2.between(guess, found.pose), found, since_s)

@@ -30,6 +30,11 @@ class ScanCheck:
         self.counts["stale"] += self._is_frozen
         return self._is_frozen
 
+    def miss(self, scan: Scan) -> None:
+        """There was too little in the scan to be matched; one without any point is no scan at all."""
+        if len(scan.points):
+            self.counts["sparse"] = self.counts.get("sparse", 0) + 1
+
     def is_jump(self, off: FloatArray, found: Registration, since_s: float) -> bool:
         """The scan lies ``off`` (3,) where the wheels say, farther than the robot can slip in ``since_s`` [s] since the last one.
 

@@ -75,6 +75,12 @@ class Core:
         self.settle()
         return estimates
 
+    def notes(self) -> list[str]:
+        """What was found amiss with the sensors on the way."""
+        sparse = self.estimator.counts().get("sparse", 0)
+        said = f"{sparse} scan{'s' * (sparse > 1)} had too few points on walls to be matched: the wheels carried on alone."
+        return [*self.stepper.notes(), *([said] if sparse else [])]
+
     def meet(self, mounts: Mapping[str, Mount]) -> bool:
         """Take in places of frames that are known only now; one that is known already stays. Returns whether there were any."""
         new = {frame: mount for frame, mount in mounts.items() if frame not in self.mounts}

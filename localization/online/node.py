@@ -152,7 +152,7 @@ class Node:
 
     def notes(self) -> list[str]:
         """Sentences about everything that was lost or mended."""
-        return list(dict.fromkeys([*self._stream.dropped(), *self.session.core.stepper.notes()]))
+        return list(dict.fromkeys([*self._stream.dropped(), *self.session.core.notes()]))
 
     @property
     def seconds(self) -> float:
