@@ -173,3 +173,16 @@ def test_a_robot_file_whose_urdf_is_not_there_is_refused(tmp_path: Path) -> None
     records: list[Record] = [("/joint_states", both(START + i * STEP, i), START + i * STEP) for i in range(10)]
     with pytest.raises(RobotError, match=r"lost\.urdf"):
         open_log(bags.write_mcap(tmp_path / "run.mcap", records), robot)
+
+
+def test_a_centre_of_gravity_that_is_not_in_metres_is_left_out_and_told(tmp_path: Path) -> None:
+    """Half the wheelbase is 0.26 m: neither millimetres nor 0.4 m can be true."""
+    places = [(0.05, -0.01), (20.0, 10.0), (0.4, 0.0), (0.0, -0.3), (1e200, 0.0), (0.06, 0.01)]
+    records: list[Record] = []
+    for i, place in enumerate(places):
+        stamp = START + i * STEP
+        records += [("/joint_states", wheels(stamp, i), stamp), ("/center_of_gravity", bags.point_stamped(stamp, *place), stamp)]
+    log = open_log(bags.write_mcap(tmp_path / "run.mcap", records), ROBOT)
+    assert [tuple(s.position) for s in cgs(log)] == [places[0], places[-1]]
+    (note,) = log.notes()
+    assert note.startswith("/center_of_gravity: 4 messages with a centre of gravity at which the robot would tip over")

@@ -261,6 +261,34 @@ def test_encoders_that_are_reset_cost_one_increment(tmp_path: Path) -> None:
     assert any("/joint_states: 1 message with a wheel angle" in note for note in log.notes())
 
 
+WILD = "/joint_states: 4 messages with rates that wheels cannot reach; these were left out."
+
+
+def test_rates_that_wheels_cannot_reach_are_left_out_and_told(tmp_path: Path) -> None:
+    """Where angles are there, they tell; without angles nothing does, and the message is dropped."""
+    position, velocity = 0.1 * np.arange(30)[:, None] * [1, 1, 1, 1], np.ones((30, 4))
+    for i, wild in ((5, 1e300), (10, -1e5), (15, 80.0), (20, np.inf)):
+        velocity[i, 2] = wild
+    both = [bags.joint_state(START + i * S // 10, position=position[i], velocity=velocity[i]) for i in range(30)]
+    log = log_of(tmp_path, "/joint_states", both)
+    wheels = wheels_of(log)
+    assert len(wheels) == 30
+    np.testing.assert_allclose([w.position for w in wheels], position[:, :2])
+    rates = np.ones((30, 2))
+    rates[[5, 10, 15, 20], 0] = np.nan
+    np.testing.assert_array_equal([w.velocity for w in wheels], rates)
+    assert log.notes() == [WILD]
+
+    (tmp_path / "rates").mkdir()
+    velocity[20, 2] = 90.0  # of inf alone nothing is decoded
+    alone = [bags.joint_state(START + i * S // 10, position=[np.nan] * 4 if i % 2 else (), velocity=velocity[i]) for i in range(30)]
+    log = log_of(tmp_path / "rates", "/joint_states", alone)
+    wheels = wheels_of(log)
+    assert [(w.stamp_ns - START) * 10 // S for w in wheels] == [i for i in range(30) if i not in (5, 10, 15, 20)]
+    np.testing.assert_array_equal([w.velocity for w in wheels], np.ones((26, 2)))
+    assert log.notes() == [WILD]
+
+
 # Odometry
 
 
@@ -328,6 +356,25 @@ def test_an_odometry_that_is_reset_costs_one_increment(tmp_path: Path) -> None:
     log = odometry_log(tmp_path, poses, twists)
     np.testing.assert_allclose(np.diff([w.position for w in wheels_of(log)], axis=0), rates * 0.1, atol=1e-9)
     assert any("/odom: 1 message with a pose that wheels cannot reach" in note for note in log.notes())
+
+
+@pytest.mark.parametrize("wild", [(1e5, 0.0), (0.0, -1e300), (6.0, 11.0)])
+def test_twists_that_wheels_cannot_reach_are_left_out_and_told(tmp_path: Path, wild: Any) -> None:
+    """The pose tells the motion; where it is NaN or never moves, the message is dropped, and its time is the next one's."""
+    rates = np.tile([4.0, 5.0], (60, 1))
+    poses, twists = drive(rates, 0.1, ROBOT.driver)
+    twists[[9, 29]] = wild  # of the messages 10 and 30
+    log = odometry_log(tmp_path, poses, twists)
+    wheels = wheels_of(log)
+    np.testing.assert_allclose(np.diff([w.position for w in wheels], axis=0), rates * 0.1, atol=1e-9)
+    np.testing.assert_array_equal(np.isnan([w.velocity for w in wheels]).any(axis=1), [i in (10, 30) for i in range(61)])
+    assert log.notes() == ["/odom: 2 messages with rates that wheels cannot reach; these were left out."]
+
+    for name, spoiled in (("still", 0.0 * poses), ("nan", np.where(np.arange(61)[:, None] % 20 == 10, np.nan, poses))):
+        (tmp_path / name).mkdir()
+        wheels = wheels_of(odometry_log(tmp_path / name, spoiled, twists))
+        assert len(wheels) == 59
+        np.testing.assert_allclose(wheels[-1].position - wheels[0].position, [24.0, 30.0], rtol=1e-9)
 
 
 def test_a_reset_without_twist_is_no_motion(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ def records(steps: int = 40) -> Iterator[Record]:
             stamp + 5_000_000,
         )
         yield "/gizmo", bags.Unknown(), stamp + 6_000_000
-        yield "/center_of_gravity", bags.point_stamped(stamp, 0.01 * i, -0.02), stamp + 7_000_000
+        yield "/center_of_gravity", bags.point_stamped(stamp, 0.01 * (i % 20), -0.02), stamp + 7_000_000
         yield "/nonsense", bags.Unknown("acme_msgs/msg/Broken", "this is ( not a definition\n"), stamp + 8_000_000
         yield "/scan", bags.laser_scan(stamp, [1.0, 2.0, 3.0 + i], angle_min=0.0, angle_increment=np.pi / 2), stamp + 50_000_000
 
@@ -100,14 +100,14 @@ def test_definitions_of_the_log_are_used(tmp_path: Path) -> None:
     for i in range(5):
         stamp = START + i * S
         header = types["std_msgs/msg/Header"](stamp=types["builtin_interfaces/msg/Time"](sec=stamp // S, nanosec=0), frame_id="base_link")
-        point = types["geometry_msgs/msg/Point"](confidence=9.0, x=0.25, y=0.5, z=0.75)
+        point = types["geometry_msgs/msg/Point"](confidence=9.0, x=0.25, y=0.125, z=0.75)
         message = types["geometry_msgs/msg/PointStamped"](header=header, point=point)
         data = bytes(custom.serialize_cdr(message, "geometry_msgs/msg/PointStamped"))
         log_records.append(("/center_of_gravity", bags.Unknown("geometry_msgs/msg/PointStamped", text, data), stamp))
     events = list(open_log(bags.write_ros2_bag(tmp_path / "run", log_records), ROBOT).events())
     assert len(events) == 5
     assert isinstance(events[0], CgSample)
-    np.testing.assert_allclose(events[0].position, [0.25, 0.5])
+    np.testing.assert_allclose(events[0].position, [0.25, 0.125])
 
 
 def _peak(path: Path) -> tuple[int, int]:

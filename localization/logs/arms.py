@@ -1,4 +1,4 @@
-"""Joint states of the arms to centres of gravity, where no topic tells it."""
+"""Centres of gravity: from joint states of the arms where no topic tells them, and none at which the robot would tip over."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from localization.events import CgSample
 from localization.logs.decode import ArmReading
 from localization.logs.tally import Oddity, Tally
 from motion_models.center_of_gravity import CgModel
+from motion_models.cg_parts import support_margin
 from motion_models.cg_tracker import CgTracker
 from motion_models.robot import Geometry
 
@@ -20,12 +21,18 @@ def arms_to_cg(model: CgModel, geometry: Geometry, topic: str, tally: Tally) -> 
         estimate = tracker.update(reading.names, reading.position)
         if estimate is None:
             return
-        if estimate.margin(geometry.wheelbase_m, geometry.track_width_m) <= 0.0:
-            tally.count(topic, Oddity.TIPPING)
-            return
-        yield CgSample(reading.stamp_ns, estimate.position, estimate.covariance)
+        sample = CgSample(reading.stamp_ns, estimate.position, estimate.covariance)
+        yield from standing(sample, geometry, topic, Oddity.TIPPING, tally)
 
     return convert
+
+
+def standing(sample: CgSample, geometry: Geometry, topic: str, oddity: Oddity, tally: Tally) -> Iterator[CgSample]:
+    """``sample``, unless the robot would tip over with it, which is counted as ``oddity``."""
+    if support_margin(sample.position, geometry.wheelbase_m, geometry.track_width_m) > 0.0:
+        yield sample
+    else:
+        tally.count(topic, oddity)
 
 
 def covering(wanted: Iterable[str], told: Mapping[str, set[str]]) -> tuple[list[str], list[str]]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
-from localization.events import Event
-from localization.logs.arms import arms_to_cg
+from localization.events import CgSample, Event
+from localization.logs.arms import arms_to_cg, standing
 from localization.logs.clouds import decode_cloud
 from localization.logs.decode import (
     ArmReading,
@@ -55,20 +56,24 @@ class Intake:
         self.from_odometry = OdometryToWheels(robot.driver, wheels, tally)
         named = " and ".join(source.topic for source in sources.arms)
         self._from_arms = None if arms is None else arms_to_cg(arms, robot.geometry, named, tally)
+        told_by = "" if sources.center_of_gravity is None else sources.center_of_gravity.topic
+        self._standing = partial(standing, geometry=robot.geometry, topic=told_by, oddity=Oddity.TIPPING_CG, tally=tally)
         self.parts: Mapping[str, Part] = {source.topic: (_RANKS[source.kind], self._decoder(source)) for source in sources.used()}
         """By topic."""
 
     def events(self, payload: Any) -> Iterator[Event]:
         """The events of one decoded message; readings must come in order."""
         if isinstance(payload, JointReading):
-            yield self.from_joints(payload)
+            yield from self.from_joints(payload)
         elif isinstance(payload, ArmReading):
             if (wheels := payload.wheels) is not None:
-                yield self.from_joints(JointReading(payload.stamp_ns, wheels.position, wheels.velocity))
+                yield from self.from_joints(JointReading(payload.stamp_ns, wheels.position, wheels.velocity))
             if self._from_arms is not None:
                 yield from self._from_arms(payload)
         elif isinstance(payload, OdometryReading):
-            yield self.from_odometry(payload)
+            yield from self.from_odometry(payload)
+        elif isinstance(payload, CgSample):
+            yield from self._standing(payload)
         else:
             yield payload
 

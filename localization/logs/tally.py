@@ -24,6 +24,8 @@ class Oddity(Enum):
     NO_POSE = "with rates but a pose that never moves; the increment was taken from the rates"
     NO_TWIST = "with a moving pose but no rates; these were taken from the pose"
     TIPPING = "with arms at which the robot would tip over (joints in degrees?); their centre of gravity was left out"
+    TIPPING_CG = "with a centre of gravity at which the robot would tip over (not in metres, or not from base_link?); it was left out"
+    WHEEL_RATE = "with rates that wheels cannot reach; these were left out"
     WHEEL_JUMP = "with a wheel angle that wheels cannot reach (a reset); the increment was taken from the rates"
 
 

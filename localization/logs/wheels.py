@@ -1,12 +1,14 @@
 """Readings of joints or of a driver's odometry, in order of time, to wheel samples: side means, and angles that lose nothing.
 
 Angles are sums of increments, so that a reading that the wheels cannot have made (an encoder or an odometry that was reset) costs its
-own increment only, which is then taken from the rates. An angle that wrapped costs nothing.
+own increment only, which is then taken from the rates. An angle that wrapped costs nothing. Rates that wheels cannot reach are left out,
+and with them a reading that says nothing else.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -31,9 +33,17 @@ class JointsToWheels:
         self._known: JointReading | None = None
         self._angle = np.full(left + right, np.nan)
 
-    def __call__(self, reading: JointReading) -> WheelSample:
-        if not all(map(math.isfinite, reading.position.tolist())):
-            return WheelSample(reading.stamp_ns, self._side_means(reading.velocity), np.full(2, np.nan))
+    def __call__(self, reading: JointReading) -> Iterator[WheelSample]:
+        has_angles = all(map(math.isfinite, reading.position.tolist()))
+        velocity = reading.velocity
+        if any(abs(rate) * self._radius > _FASTEST_M_PER_S for rate in velocity.tolist()):
+            self._tally.count(self._topic, Oddity.WHEEL_RATE)
+            if not has_angles:
+                return
+            velocity = np.where(np.abs(velocity) * self._radius > _FASTEST_M_PER_S, np.nan, velocity)
+        if not has_angles:
+            yield WheelSample(reading.stamp_ns, self._side_means(velocity), np.full(2, np.nan))
+            return
         known = self._known
         if known is None:
             self._angle = reading.position
@@ -43,15 +53,15 @@ class JointsToWheels:
             farthest = _FASTEST_M_PER_S * max(dt, _SHORTEST_S)
             if max(map(abs, step.tolist())) * self._radius > farthest:  # quicker than numpy's, on a handful
                 jumped = np.abs(step) * self._radius > farthest
-                expected = np.nan_to_num(reading.velocity) * dt
+                expected = np.nan_to_num(velocity) * dt
                 wrapped = np.remainder(step + math.pi, math.tau) - math.pi
-                is_wrap = np.abs(wrapped - expected) < np.where(np.isfinite(reading.velocity), _WRAP_RAD, _WRAP_WITHOUT_RATE_RAD)
+                is_wrap = np.abs(wrapped - expected) < np.where(np.isfinite(velocity), _WRAP_RAD, _WRAP_WITHOUT_RATE_RAD)
                 if (jumped & ~is_wrap).any():
                     self._tally.count(self._topic, Oddity.WHEEL_JUMP)
                 step = np.where(jumped, np.where(is_wrap, wrapped, expected), step)
             self._angle = self._angle + step
         self._known = reading
-        return WheelSample(reading.stamp_ns, self._side_means(reading.velocity), self._side_means(self._angle))
+        yield WheelSample(reading.stamp_ns, self._side_means(velocity), self._side_means(self._angle))
 
     def _side_means(self, values: FloatArray) -> FloatArray:
         numbers = values.tolist()
@@ -73,9 +83,14 @@ class OdometryToWheels:
         self._angle = np.zeros(2)
         self._pose_has_moved = self._twist_has_moved = False
 
-    def __call__(self, reading: OdometryReading) -> WheelSample:
+    def __call__(self, reading: OdometryReading) -> Iterator[WheelSample]:
         vx, _, wz = reading.twist
-        twist_is_known = math.isfinite(vx) and math.isfinite(wz)
+        is_wild = abs(vx) > _FASTEST_M_PER_S or abs(wz) > _FASTEST_RAD_PER_S
+        if is_wild:
+            self._tally.count(self._topic, Oddity.WHEEL_RATE)
+            if not math.isfinite(sum(reading.pose)) or (self._twist_has_moved and not self._pose_has_moved):
+                return  # only the twist would have told, and the next message tells of this time too
+        twist_is_known = math.isfinite(vx) and math.isfinite(wz) and not is_wild
         self._twist_has_moved |= twist_is_known and bool(vx != 0.0 or wz != 0.0)
         rate = self._wheels(vx, wz) if twist_is_known else np.full(2, np.nan)
         previous = self._previous
@@ -100,7 +115,7 @@ class OdometryToWheels:
                 rate = increment / dt
             self._angle = self._angle + increment
         self._previous = reading
-        return WheelSample(reading.stamp_ns, rate, self._angle)
+        yield WheelSample(reading.stamp_ns, rate, self._angle)
 
     def _wheels(self, forward: float, turn: float) -> FloatArray:
         return np.array([forward - turn * self._half_track, forward + turn * self._half_track]) / self._radius
