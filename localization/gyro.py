@@ -17,6 +17,9 @@ _LONGEST_GAP_NS, _LONGEST_HOLD_NS = 500_000_000, 100_000_000
 _FIRST_SAMPLES = 20
 _LEAST_GRAVITY, _MOST_GRAVITY = 8.0, 12.0  # m/s^2; drivers that publish none, or in other units, tell nothing of the mount
 _MOST_TILT = math.radians(30.0)
+_JUMP_RAD_PER_S, _JUMP_RAD_PER_S2 = 2.0, 200.0  # noise and shaking, and how fast such a robot may begin to turn
+_MOST_JUMP_RAD_PER_S = 10.0  # at which none turns
+_SPIKES = 2  # that agree, in a row; a third is believed
 _TELLING_TURN = 0.5  # rad of turning by the wheels, after which they have told which way the gyro's axis points
 
 
@@ -38,6 +41,9 @@ class GyroHistory:
     Gravity shows which axis of the IMU is upright. Where the mount says another one, the rate is that about gravity, and whether this
     axis points up or down (some drivers publish gravity, not specific force) is seen by the turns of the wheels; until those have told,
     the gyro is not used.
+
+    A rate that no robot can have come to since the sample before is left out, unless it lasts: the third in a row is believed, and with
+    it those before.
     """
 
     def __init__(self, noise: GyroNoise, mounts: Mapping[str, Mount], keep_s: float = 10.0) -> None:
@@ -46,6 +52,8 @@ class GyroHistory:
         self._stamps: list[int] = []
         self._angles: list[float] = []
         self._rate = 0.0
+        self._doubted: list[tuple[int, float]] = []
+        self._spikes = 0
         self._frame: str | None = None
         self._force = np.zeros(3)
         self._axis = np.array([0.0, 0.0, 1.0])
@@ -57,21 +65,45 @@ class GyroHistory:
         if sample.frame_id != self._frame:
             self._begin(sample)
         self._watch_gravity(sample)
-        rate = float(self._axis @ sample.angular_velocity)
-        if self._stamps and sample.stamp_ns <= self._stamps[-1]:
+        self._weigh(sample.stamp_ns, float(self._axis @ sample.angular_velocity))
+
+    def _weigh(self, stamp_ns: int, rate: float) -> None:
+        """Take a rate, or doubt it."""
+        last_ns = self._doubted[-1][0] if self._doubted else self._stamps[-1] if self._stamps else None
+        if last_ns is not None and stamp_ns <= last_ns:
             return
-        if self._stamps and sample.stamp_ns - self._stamps[-1] > _LONGEST_GAP_NS:
+        if self._stamps and stamp_ns - self._stamps[-1] > _LONGEST_GAP_NS:
             self._forget()
+        if not self._stamps or _may_follow((self._stamps[-1], self._rate), (stamp_ns, rate)):
+            self._reject()
+            self._take(stamp_ns, rate)
+            return
+        if self._doubted and not _may_follow(self._doubted[-1], (stamp_ns, rate)):
+            self._reject()
+        self._doubted.append((stamp_ns, rate))
+        if len(self._doubted) > _SPIKES:
+            believed, self._doubted = self._doubted, []
+            if len(self._stamps) == 1:  # nothing but the first sample speaks against them
+                self._forget()
+                self._spikes += 1
+            for entry in believed:
+                self._take(*entry)
+
+    def _take(self, stamp_ns: int, rate: float) -> None:
         if self._stamps:
-            dt = (sample.stamp_ns - self._stamps[-1]) * _NS
+            dt = (stamp_ns - self._stamps[-1]) * _NS
             self._angles.append(self._angles[-1] + 0.5 * (self._rate + rate) * dt)
         else:
             self._angles.append(0.0)
         self._rate = rate
-        self._stamps.append(sample.stamp_ns)
-        if self._stamps[0] < sample.stamp_ns - 2 * self._keep_ns:
-            n = bisect.bisect_left(self._stamps, sample.stamp_ns - self._keep_ns)
+        self._stamps.append(stamp_ns)
+        if self._stamps[0] < stamp_ns - 2 * self._keep_ns:
+            n = bisect.bisect_left(self._stamps, stamp_ns - self._keep_ns)
             del self._stamps[:n], self._angles[:n]
+
+    def _reject(self) -> None:
+        self._spikes += len(self._doubted)
+        self._doubted = []
 
     @property
     def newest_ns(self) -> int | None:
@@ -96,17 +128,23 @@ class GyroHistory:
         return Turn(self._sign * angle, variance, dt)
 
     def notes(self) -> list[str]:
-        """What a user should know about the mount."""
+        """What a user should know about the IMU."""
+        said = []
+        if self._spikes:
+            plural = "s" * (self._spikes > 1)
+            said.append(f"IMU '{self._frame}': {self._spikes} reading{plural} dropped (the yaw rate jumped as no such robot's does).")
         if not self._contradicts:
-            return []
+            return said
         if self._turned < _TELLING_TURN:
             return [
-                f"the mount of IMU '{self._frame}' contradicts gravity, and the robot turned too little to tell its axis: it was not used."
+                *said,
+                f"the mount of IMU '{self._frame}' contradicts gravity, and the robot turned too little to tell its axis: it was not used.",
             ]
         axis = ", ".join(f"{value:+.2f}" for value in self._sign * self._axis)
         return [
+            *said,
             f"the mount of IMU '{self._frame}' contradicts gravity: the yaw rate was taken about [{axis}] in the IMU's frame. "
-            "Correct its roll, pitch and yaw in /tf_static or in the robot file's [mounts]."
+            "Correct its roll, pitch and yaw in /tf_static or in the robot file's [mounts].",
         ]
 
     def _begin(self, sample: ImuSample) -> None:
@@ -130,6 +168,7 @@ class GyroHistory:
                 self._forget()
 
     def _forget(self) -> None:
+        self._reject()
         self._stamps.clear()
         self._angles.clear()
 
@@ -142,3 +181,8 @@ class GyroHistory:
             return self._angles[-1]
         part = (stamp_ns - self._stamps[i - 1]) / (self._stamps[i] - self._stamps[i - 1])
         return self._angles[i - 1] + part * (self._angles[i] - self._angles[i - 1])
+
+
+def _may_follow(before: tuple[int, float], after: tuple[int, float]) -> bool:
+    """Whether a robot's rate can be ``after`` [ns, rad/s] where it was ``before``."""
+    return abs(after[1] - before[1]) <= min(_JUMP_RAD_PER_S + _JUMP_RAD_PER_S2 * (after[0] - before[0]) * _NS, _MOST_JUMP_RAD_PER_S)

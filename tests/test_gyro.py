@@ -76,7 +76,7 @@ def test_turn_is_the_integral_of_the_rate(one_ms, other_ms):
     assert turn.duration == pytest.approx((end - start) / 1e3)
 
 
-@given(st.lists(st.tuples(st.integers(1, 400), st.floats(-3, 3)), min_size=2, max_size=40), st.floats(0, 1), st.floats(0, 1))
+@given(st.lists(st.tuples(st.integers(1, 400), st.floats(-1, 1)), min_size=2, max_size=40), st.floats(0, 1), st.floats(0, 1))
 @settings(max_examples=60, deadline=None)
 def test_any_rates_at_any_stamps_are_summed_by_trapezes(profile, one, other):
     """And turns of two windows that touch add up to that of both."""
@@ -119,6 +119,41 @@ def test_a_gap_is_bridged_if_short_and_forgotten_if_long():
     assert past.turn(T0 + S, T0 + 3 * S, 0.0) is None
     assert past.turn(T0 + 2500 * MS, T0 + 3 * S, 0.0) is None
     assert past.turn(T0 + 2600 * MS, T0 + 3 * S, 0.0).angle == pytest.approx(0.12, abs=1e-9)
+
+
+def spoiled(wild, hz=100.0):
+    """Four seconds of turning by 0.5 rad/s, with other samples in the place of those that ``wild`` [rad/s] says by index."""
+    return [
+        ImuSample(s.stamp_ns, wild[i] * UP, s.linear_acceleration, s.frame_id) if i in wild else s
+        for i, s in enumerate(samples(4.0, hz=hz, wz=lambda t: 0.5))
+    ]
+
+
+@pytest.mark.parametrize("hz", [10.0, 100.0, 400.0])
+@pytest.mark.parametrize("wild", [{20: 30.0}, {20: -30.0, 21: 30.0, 22: -30.0}, {20: 12.0, 22: 12.0, 24: 12.0, 27: -12.0, 28: -12.0}])
+def test_spikes_are_left_out_and_told(wild, hz):
+    past = history(spoiled(wild, hz))
+    assert past.turn(T0, T0 + 4 * S, 0.0).angle == pytest.approx(2.0, abs=1e-9)
+    (note,) = past.notes()
+    assert note.startswith(f"IMU 'imu_link': {len(wild)} reading{'s' * (len(wild) > 1)} dropped")
+    # meanwhile the last rate that was believed holds
+    begun = spoiled(wild, hz)[: min(wild) + 1]
+    assert history(begun).turn(T0, begun[-1].stamp_ns, 0.0).angle == pytest.approx(0.5 * 20 / hz, abs=1e-9)
+
+
+def test_a_jump_that_lasts_is_believed_from_its_begin():
+    past = history(samples(4.0, wz=lambda t: 12.0 if 2.0 <= t < 3.0 else 0.0))
+    assert past.turn(T0, T0 + 4 * S, 0.0).angle == pytest.approx(12.0)
+    assert past.notes() == []
+
+
+@pytest.mark.parametrize("hz", [10.0, 100.0])
+def test_a_spike_at_the_begin_does_not_stand_against_all_others(hz):
+    past = history(spoiled({0: 30.0}, hz))
+    assert past.turn(T0, T0 + S, 0.0) is None
+    assert past.turn(T0 + round(S / hz), T0 + 4 * S, 0.0).angle == pytest.approx(0.5 * (4.0 - 1.0 / hz), abs=1e-9)
+    (note,) = past.notes()
+    assert "1 reading dropped" in note
 
 
 @pytest.mark.parametrize("late", [[100], [100, 100], [0, 100], [37, 12], [4000]])

@@ -79,6 +79,15 @@ def test_nan_limits_are_no_limits_and_a_nan_angle_is_malformed(tmp_path: Path) -
     assert any("/scan: 1 message dropped" in note for note in log.notes())
 
 
+@pytest.mark.parametrize(("beam_s", "count"), [(1e30, 0), (-1e30, 0), (np.inf, 0), (1.1, 0), (0.9, 1), (np.nan, 1)])
+def test_a_sweep_that_lasts_for_seconds_is_malformed(tmp_path: Path, beam_s: float, count: int) -> None:
+    """NaN is no time, and the scan one without times."""
+    scans, log = scans_of(tmp_path, [bags.laser_scan(START, [2.0, 3.0], time_increment=beam_s)])
+    assert len(scans) == count
+    assert log.notes() == ["/scan: 1 message dropped (fields that contradict each other)."] * (1 - count)
+    assert [len(scan.offsets) for scan in scans] == [0 if np.isnan(beam_s) else 2] * count
+
+
 def test_directions_follow_a_scanner_that_is_reconfigured(tmp_path: Path) -> None:
     messages = [bags.laser_scan(START + i * S // 10, [1.0] * n, angle_min=0.0, angle_increment=0.5) for i, n in enumerate((2, 3, 2))]
     scans, _ = scans_of(tmp_path, messages)
@@ -163,6 +172,14 @@ def test_times_that_are_all_nan_are_no_times(tmp_path: Path) -> None:
     assert scan.offsets.shape == (0,)
 
 
+@pytest.mark.parametrize(("kind", "last"), [("<f4", 1e30), ("<f8", -1e300), ("<u4", 4e9), ("<i4", -2e9)])
+def test_times_of_points_that_are_of_no_one_sweep_are_malformed(tmp_path: Path, kind: str, last: float) -> None:
+    rows = [(*row, value) for row, value in zip(ROWS, (0.0, 3.0, last), strict=True)]
+    scans, log = scans_of(tmp_path, [bags.cloud(START, table(rows, [("t", kind)]))], "/points")
+    assert scans == []
+    assert log.notes() == ["/points: 1 message dropped (fields that contradict each other)."]
+
+
 def _broken_clouds() -> dict[str, Any]:
     def changed(**fields: Any) -> Any:
         return dataclasses.replace(bags.cloud(START, table(ROWS)), **fields)
@@ -206,6 +223,19 @@ def test_samples_that_are_not_finite_are_dropped_and_counted(tmp_path: Path) -> 
     (tmp_path / "cg").mkdir()
     log = log_of(tmp_path / "cg", "/center_of_gravity", [bags.point_stamped(START, np.nan, 0.0), bags.point_stamped(START + S, 0.1, 0.2)])
     assert len(list(log.events())) == 1
+
+
+def test_samples_beyond_what_sensors_measure_are_dropped_and_counted(tmp_path: Path) -> None:
+    messages = [
+        bags.imu(START, (0.0, 0.0, 34.0), (0.0, 0.0, 9810.0)),
+        bags.imu(START + 1000, (0.0, 0.0, -36.0)),
+        bags.imu(START + 2000, (1e160, 0.0, 0.0)),
+        bags.imu(START + 3000, force=(0.0, 2e5, 0.0)),
+        bags.imu(START + 4000),
+    ]
+    log = log_of(tmp_path, "/imu/data", messages)
+    assert [e.stamp_ns - START for e in log.events() if isinstance(e, ImuSample)] == [0, 4000]
+    assert log.notes() == ["/imu/data: 3 messages dropped (beyond what such a sensor can measure)."]
 
 
 def test_bytes_that_are_not_the_message_are_dropped_and_counted(tmp_path: Path) -> None:

@@ -7,19 +7,18 @@ from typing import Any
 import numpy as np
 
 from localization.events import Scan
-from localization.logs.decode import UnusableError, frame_name
+from localization.logs.decode import LONGEST_SWEEP_S, UnusableError, frame_name
 from localization.logs.tally import Oddity
 from motion_models.se2 import FloatArray
 
 # sensor_msgs/PointField: datatype 1..8
 _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "offset_time", "time_offset", "stamp", "stamps")
-_LONGEST_SWEEP_S = 2.0
 _LATEST_BEGIN_S = 0.5  # a sweep begins at its header's stamp, or ends there
 
 
 def decode_cloud(message: Any, stamp: int) -> Scan:
-    """Raises `UnusableError` if it has no x, y, z or if its sizes contradict each other."""
+    """Raises `UnusableError` if it has no x, y, z, if its sizes contradict each other, or if its points' times are of no one sweep."""
     table = _table(message)
     with np.errstate(invalid="ignore"):  # signalling NaNs
         points = np.stack([table[name].astype(float).ravel() for name in ("x", "y", "z")], axis=1)
@@ -31,6 +30,8 @@ def decode_cloud(message: Any, stamp: int) -> Scan:
         if np.isfinite(times[good]).any():
             good &= np.isfinite(times)
             offsets = times[good]
+            if np.ptp(offsets) > LONGEST_SWEEP_S:
+                raise UnusableError(Oddity.MALFORMED)
     return Scan(stamp, np.ascontiguousarray(points[good]), offsets, frame_name(message.header.frame_id), is_planar=False)
 
 
@@ -84,7 +85,7 @@ def _offsets(times: Any, good: Any, stamp: int) -> FloatArray:
     largest, spread = float(np.abs(known).max()), float(np.ptp(known))
     unit = next((u for limit, u in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)) if largest > limit), 0.0)
     if unit == 0.0:
-        unit = next((u for u in (1.0, 1e-3, 1e-6, 1e-9) if spread * u <= _LONGEST_SWEEP_S), 1e-9)
+        unit = next((u for u in (1.0, 1e-3, 1e-6, 1e-9) if spread * u <= LONGEST_SWEEP_S), 1e-9)
     seconds, first = values * unit, float(known.min()) * unit
     if abs(first) <= _LATEST_BEGIN_S:
         return np.asarray(seconds, dtype=float)

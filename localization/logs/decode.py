@@ -18,6 +18,9 @@ from localization.logs.chunks import Channel, RawMessage
 from localization.logs.tally import Oddity
 from motion_models.se2 import FloatArray
 
+LONGEST_SWEEP_S = 2.0
+_FASTEST_TURN = math.radians(2000.0)  # rad/s, the full scale of gyros on robots
+_STRONGEST_FORCE = 1e5  # m/s^2; drivers use other units, in which this may be 100 g (cm/s^2)
 _KNOWN_NAMES = 100  # nobody's joints change that often, but the memory must not grow
 
 
@@ -121,6 +124,8 @@ def decode_imu(message: Any, stamp: int) -> ImuSample:
     w, a = message.angular_velocity, message.linear_acceleration
     if not math.isfinite(w.x + w.y + w.z + a.x + a.y + a.z):  # quicker than numpy's, on six numbers
         raise UnusableError(Oddity.NOT_FINITE)
+    if max(abs(w.x), abs(w.y), abs(w.z)) > _FASTEST_TURN or max(abs(a.x), abs(a.y), abs(a.z)) > _STRONGEST_FORCE:
+        raise UnusableError(Oddity.BEYOND)
     return ImuSample(stamp, np.array([w.x, w.y, w.z]), np.array([a.x, a.y, a.z]), frame_name(message.header.frame_id))
 
 
@@ -233,6 +238,8 @@ def scan_decoder() -> Callable[[Any, int], Scan]:
         points = direction.take(kept, axis=0)
         points *= ranges.take(kept)[:, None]
         beam_s = float(message.time_increment)
+        if abs(beam_s) * len(ranges) > LONGEST_SWEEP_S:
+            raise UnusableError(Oddity.MALFORMED)
         offsets: FloatArray = np.empty(0)
         if math.isfinite(beam_s) and beam_s != 0.0:
             offsets = np.asarray(kept * beam_s, dtype=float)

@@ -12,6 +12,7 @@ class Oddity(Enum):
     UNDECODABLE = "dropped (bytes that are not of the type)"
     MALFORMED = "dropped (fields that contradict each other)"
     NOT_FINITE = "dropped (NaN or inf)"
+    BEYOND = "dropped (beyond what such a sensor can measure)"
     NO_FIX = "left out (no GPS fix)"
     NO_STAMP = "without a header stamp, placed by the time of recording"
     FOREIGN_CLOCK = "stamped by another clock than the other topics', moved to the time of recording"
