@@ -101,6 +101,51 @@ def test_a_recorder_that_stalls_loses_nothing() -> None:
     assert tally.sentences() == []
 
 
+@pytest.mark.parametrize("rate", [50, 10, 4])
+def test_what_comes_late_in_a_burst_is_no_clock_that_was_set(rate: int) -> None:
+    """The network holds everything for eight seconds, and of what it held the older half is lost."""
+    kept = [i for i in ticks("/wheels", 30, rate) if not START + 8 * S < i.stamp_ns < START + 12 * S]
+    held = [
+        i if not 8 * S < i.log_ns - START < 16 * S else mark(i.topic, i.stamp_ns, START + 16 * S + (i.log_ns - START) // 10_000)
+        for i in [*kept, *ticks("/scan", 30, 10, latency=60 * MS)]
+    ]
+    marks, tally = run(held)
+    check_order(marks)
+    assert [m.true_ns for m in marks if m.topic == "/wheels"] == [i.stamp_ns for i in kept]
+    assert all(m.stamp_ns == m.true_ns for m in marks)
+    assert tally.sentences() == []
+
+
+@pytest.mark.parametrize("ends", [0, 100])
+def test_a_clock_that_was_set_is_seen_behind_a_burst(ends: int) -> None:
+    """What comes after it agrees with the last ``ends`` messages in it."""
+    items = []
+    for i in range(1500):
+        t = START + i * S // 50
+        log = t + 5 * MS if not 400 <= i < 800 else START + 16 * S + i * MS // 1000
+        items.append(mark("/wheels", t, log, t + (HOUR if i >= 800 - ends else 0)))
+    marks, tally = run(items)
+    check_order(marks)
+    assert len(marks) + tally.of("/wheels", Oddity.REPEATED) == 1500
+    assert tally.of("/wheels", Oddity.REBASED) == 700 + ends
+    assert tally.of("/wheels", Oddity.OUTLIER) == 0
+    assert max(abs(m.stamp_ns - m.true_ns) for m in marks) <= 2 * S // 50  # what came at once may have been measured two periods apart
+
+
+@pytest.mark.parametrize("batch", [S // 5, S, 4 * S, 60 * S])
+def test_a_clock_that_is_set_is_seen_in_a_log_written_in_batches(batch: int) -> None:
+    """All of a batch bears one time of recording, when it was written."""
+    items = []
+    for i in range(3000):
+        t = START + i * S // 50
+        items.append(mark("/wheels", t, t - (t - START) % batch + batch, t + (HOUR if i >= 1525 else 0)))
+    marks, tally = run(items)
+    check_order(marks)
+    assert len(marks) + tally.of("/wheels", Oddity.REPEATED) == 3000
+    assert tally.of("/wheels", Oddity.REBASED) == 1475
+    assert max(abs(m.stamp_ns - m.true_ns) for m in marks) <= 2 * S // 50  # what came at once may have been measured two periods apart
+
+
 def test_a_driver_that_pauses_is_no_jump() -> None:
     items = [i for i in ticks("/scan", 60, 10) if not START + 20 * S < i.stamp_ns < START + 45 * S]
     marks, tally = run([*items, *ticks("/wheels", 60, 50)])

@@ -156,6 +156,28 @@ def test_the_clock_of_all_sensors_jumps(jump_s, calm):
     assert np.all(np.abs(_wrapped(found[0] - truth[0])) < most)
 
 
+@pytest.mark.parametrize("estimator", ["ekf", "graph"])
+def test_what_the_network_held_comes_at_once_and_the_clocks_stay(estimator):
+    """For six seconds nothing comes, then all that its queues could keep: of wheels and IMU the newer half."""
+
+    def held(messages):
+        begin, end = (messages[0].received_ns + seconds * S for seconds in (6, 12))
+        kept = [m for m in messages if m.topic == "/scan" or not begin <= m.received_ns < begin + 3 * S]
+        return [
+            m._replace(received_ns=end - 10**6 + (m.received_ns - begin) // 10_000) if begin <= m.received_ns < end else m for m in kept
+        ]
+
+    transport = LogTransport(drive_log(), lambda messages: sorted(held(messages), key=lambda m: m.received_ns))
+    node, _ = run_node(transport, estimator)
+    assert not any("jump of the clock" in note or "could not be used" in note for note in node.notes()), node.notes()
+    truth, found = track(undisturbed(estimator)[0]), track(transport)
+    begin = min(truth)
+    after = [stamp for stamp in truth if stamp > begin + 13 * S]
+    assert set(after) <= set(found)
+    assert np.all(np.abs(_wrapped(found[after[-1]][0] - truth[after[-1]][0])) < 3.0 * found[after[-1]][1])
+    assert np.all(found[after[-1]][1] < 2.0 * truth[after[-1]][1])
+
+
 def silenced(topic, begin_s, end_s):
     def spoil(messages):
         first = messages[0].received_ns

@@ -162,6 +162,31 @@ def test_topics_that_are_not_kept_are_heard_no_more():
         assert all(received.data[8:9].decode() == received.topic[1] for received in found)
 
 
+def test_messages_that_waited_came_when_they_were_sent():
+    """Two seconds without a look, of which the last one is kept."""
+    with chatter("a") as here:
+        here.keep(["/a"])
+        here.take(1.0)
+        looked = time.monotonic_ns()
+        time.sleep(2.0)
+        came = [received.received_ns for received in here.take(1.0)]
+        assert len(came) == 200
+        assert (np.diff(came) > 0).all()
+        assert came[0] > looked + 0.3 * S
+        assert came[-1] - came[0] > 0.99 * S
+        assert came[-1] <= time.monotonic_ns()
+
+
+def test_times_of_receiving_lie_between_two_looks():
+    times_of_receiving = importlib.import_module("localization.online.dds").times_of_receiving
+    assert times_of_receiving([], 0, 100) == []
+    assert times_of_receiving([7], 0, 100) == [100]
+    assert times_of_receiving([10, 30, 50], 0, 100) == [60, 80, 100]
+    assert times_of_receiving([50, 10, 30], 60, 120) == [120, 80, 100]  # whatever their order
+    assert times_of_receiving([1000, 3000, 5000], 60, 120) == [80, 100, 120]  # the sender's clock is another one
+    assert times_of_receiving([5, 5, 5], 60, 120) == [120, 120, 120]  # sent in a burst
+
+
 def test_patience_ends_where_something_urgent_comes():
     """Twenty messages of /a to one of /b; without patience each is heard when it comes."""
     with chatter("a" * 20 + "b") as here:

@@ -6,7 +6,8 @@ latency, and now and then nonsense. Three things happen here:
 - Each topic's clock is watched (`TopicClock`). A stamp is trusted if it lies within a second of the stamp before it, or if it is as
   far from the time of recording as the stamps before it were, to a second. (The first holds when the recorder stalls, the second
   when the driver pauses.) One or two that are neither are outliers, and dropped; three in a row that agree are a clock that was
-  set, and from there on the topic is moved back by the jump.
+  set, and from there on the topic is moved back by the jump. What comes in a burst tells nothing of clocks, and waits for what comes
+  after it: if that is trusted and continues it, the burst was late and nothing else.
 - A topic without stamps gets the time of recording, and so does, by a constant shift, one whose clock is far from all others'.
 - Trusted messages wait in a heap until nothing older can come: one second after the slowest topic's usual latency. On a robot, where
   an estimate is wanted now, they do not wait.
@@ -30,6 +31,8 @@ _FOREIGN = 10 * _SECOND
 _SAME_JUMP = _SECOND // 4
 _JUMP_AFTER = 3
 _LONGEST_PENDING = 10 * _SECOND
+_LONGEST_BURST = 5 * _SECOND
+_MOST_PENDING = 200
 _MOST_HELD = 20_000
 
 
@@ -88,6 +91,7 @@ class TopicClock:
         self._newest: int | None = None
         self.offset_ns = plan.latency_ns.get(topic, plan.offset_ns)
         """Stamp minus time of recording, of the last trusted message."""
+        self._soonest_ns = self.offset_ns
         self._pending: list[Item] = []
 
     @property
@@ -103,8 +107,11 @@ class TopicClock:
         while self._pending and log_ns - self._pending[0].log_ns > _LONGEST_PENDING:
             del self._pending[0]
             self._tally.count(self._topic, Oddity.OUTLIER)
-        since = min(log_ns, self._pending[0].log_ns) if self._pending else log_ns
-        return since + self.offset_ns
+        if not self._pending:
+            return log_ns + self.offset_ns
+        first = self._pending[0]
+        since = min(log_ns, first.log_ns) + self.offset_ns
+        return min(since, first.stamp_ns + self._shift) if self._may_be_late() else since
 
     def put(self, item: Item) -> list[Item]:
         """Messages that have become trusted by this one, with their final stamps."""
@@ -112,16 +119,25 @@ class TopicClock:
             self._tally.count(self._topic, Oddity.NO_STAMP)
             return [_restamped(item, item.log_ns + self._common)]
         if self._is_trusted(item):
-            self.close()
-            return [self._trust(item)]
+            if not self._is_continued_by(item):
+                self.close()
+            self._pending.append(item)
+            return self._release()
         if self._pending and not _agree(self._pending[-1], item):
             self.close()
         self._pending.append(item)
-        if len(self._pending) < _JUMP_AFTER:
+        if len(self._pending) < _JUMP_AFTER or self._is_burst():
             return []
         self._set_clock()
-        released, self._pending = self._pending, []
-        return [self._trust(i) for i in released]
+        return self._release()
+
+    def finish(self) -> list[Item]:
+        """What is pending at the end, where it is enough for a clock that was set; else it is given up."""
+        if len(self._pending) >= _JUMP_AFTER:
+            self._set_clock()
+        else:
+            self.close()
+        return self._release()
 
     def close(self) -> None:
         """Give up what is pending."""
@@ -131,11 +147,35 @@ class TopicClock:
 
     def _is_trusted(self, item: Item) -> bool:
         stamp = item.stamp_ns + self._shift
-        return self._last is None or abs(stamp - self._last) <= _TRUSTED_STEP or abs(stamp - item.log_ns - self.offset_ns) <= _TRUSTED_STEP
+        known = (self.offset_ns, self._soonest_ns)  # after a burst, messages are no longer late
+        return (
+            self._last is None
+            or abs(stamp - self._last) <= _TRUSTED_STEP
+            or any(abs(stamp - item.log_ns - offset) <= _TRUSTED_STEP for offset in known)
+        )
+
+    def _release(self) -> list[Item]:
+        released, self._pending = self._pending, []
+        return [self._trust(i) for i in released]
+
+    def _may_be_late(self) -> bool:
+        """Whether what is pending comes after what was trusted."""
+        return bool(self._pending) and self._last is not None and self._last <= self._pending[0].stamp_ns + self._shift
+
+    def _is_continued_by(self, item: Item) -> bool:
+        """Whether ``item``, which is trusted, comes soon after what is pending, and that after what was trusted."""
+        return self._may_be_late() and 0 <= item.stamp_ns - self._pending[-1].stamp_ns <= _TRUSTED_STEP
+
+    def _is_burst(self) -> bool:
+        """Whether what is pending came in less than half the time over which it was measured. None is long: it may be a bag's at a rate."""
+        first, last = self._pending[0], self._pending[-1]
+        is_fast = last.log_ns - first.log_ns < min((last.stamp_ns - first.stamp_ns) / 2, _LONGEST_BURST)
+        return is_fast and len(self._pending) < _MOST_PENDING
 
     def _trust(self, item: Item) -> Item:
         stamp = item.stamp_ns + self._shift
         self._last, self.offset_ns = stamp, stamp - item.log_ns
+        self._soonest_ns = max(self._soonest_ns, self.offset_ns)
         if self._rebased:
             self._tally.count(self._topic, Oddity.REBASED)
         elif self._foreign:
@@ -147,7 +187,8 @@ class TopicClock:
 
     def _set_clock(self) -> None:
         """The clock was set: shift the topic so that it is as far from the time of recording as it was before."""
-        deviation = statistics.median_low([i.stamp_ns + self._shift - i.log_ns - self.offset_ns for i in self._pending])
+        first = self._pending[:_JUMP_AFTER]  # in a burst, they are as late as what was trusted before them
+        deviation = statistics.median_low([i.stamp_ns + self._shift - i.log_ns - self.offset_ns for i in first])
         shift = self._shift - deviation
         # The latency jitters. Where another topic made the same jump, or this one a jump back, the same shift keeps them aligned.
         same = [known for known in (0, *self._jumps) if abs(known - shift) <= _SAME_JUMP]
@@ -180,14 +221,7 @@ class Merger:
         if clock is None:  # a topic without stamps
             clock = self._clocks[item.topic] = TopicClock(item.topic, self._plan, self._jumps, self._tally)
         self._now = max(self._now, item.log_ns)
-        for trusted in clock.put(item):
-            newest = self._newest if self._wait_ns is not None else self._emitted.get((trusted.topic, trusted.rank), trusted.stamp_ns)
-            if trusted.stamp_ns < newest:
-                self._tally.count(item.topic, Oddity.LATE)
-                continue
-            heapq.heappush(self._held, (trusted.stamp_ns, trusted.rank, self._serial, trusted))
-            self._serial += 1
-            self._held_weight += trusted.weight
+        self._hold(clock.put(item))
         if self._wait_ns is None:
             clock.horizon(self._now)  # gives up what has been pending for long
             yield from self._release(2**63 - 1, 0)
@@ -201,8 +235,18 @@ class Merger:
     def finish(self) -> Iterator[Any]:
         """All that is held, for nothing more will come."""
         for clock in self._clocks.values():
-            clock.close()
+            self._hold(clock.finish())
         yield from self._release(2**63 - 1, 0)
+
+    def _hold(self, items: Iterable[Item]) -> None:
+        for item in items:
+            newest = self._newest if self._wait_ns is not None else self._emitted.get((item.topic, item.rank), item.stamp_ns)
+            if item.stamp_ns < newest:
+                self._tally.count(item.topic, Oddity.LATE)
+                continue
+            heapq.heappush(self._held, (item.stamp_ns, item.rank, self._serial, item))
+            self._serial += 1
+            self._held_weight += item.weight
 
     def _release(self, horizon: int, most: int) -> Iterator[Any]:
         held = self._held

@@ -11,7 +11,7 @@ import functools
 import re
 import socket
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -58,6 +58,7 @@ class DdsTransport:
         self._readers: list[tuple[str, DataReader[Any], dds.ReadCondition]] = []
         self._writers: dict[str, tuple[DataWriter[Any], type[Any]]] = {}
         self._found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+        self._looked_ns = time.monotonic_ns()
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         quality = _latched() if is_latched else _sensor_data()
@@ -88,17 +89,19 @@ class DdsTransport:
     def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
         """In the order in which it was sent: after a pause, one topic's must not all come before another's."""
         is_urgent = patience_s > 0.0 and self._urgent.wait(round(patience_s * 1e9))
-        if not is_urgent and not self._waiting.wait(round(timeout_s * 1e9)):
+        is_there = is_urgent or self._waiting.wait(round(timeout_s * 1e9))
+        since, self._looked_ns = self._looked_ns, time.monotonic_ns()
+        if not is_there:
             return []
-        now = time.monotonic_ns()
-        found = [
-            (sample.sample_info.source_timestamp, topic, sample)
-            for topic, reader, is_new in self._readers
-            if is_new.triggered  # to take costs ten times as much, and mostly it is one of them
-            for sample in reader.take(1000)
-        ]
+        found: list[tuple[int, Received]] = []
+        for topic, reader, is_new in self._readers:
+            if is_new.triggered:  # to take costs ten times as much, and mostly it is one of them
+                samples = [sample for sample in reader.take(1000) if isinstance(sample, _Bytes)]
+                sent = [int(sample.sample_info.source_timestamp) for sample in samples]
+                came = times_of_receiving(sent, since, self._looked_ns)
+                found += [(at, Received(topic, ns, bytes(sample))) for at, ns, sample in zip(sent, came, samples, strict=True)]
         found.sort(key=lambda entry: entry[0])
-        return [Received(topic, now, bytes(sample)) for _, topic, sample in found if isinstance(sample, bytes)]
+        return [received for _, received in found]
 
     def publishers(self) -> Mapping[str, set[str]]:
         found: dict[str, set[str]] = {}
@@ -113,6 +116,17 @@ class DdsTransport:
         self._readers.clear()
         self._writers.clear()
         del self._waiting, self._urgent, self._found, self._participant, self._domain
+
+
+def times_of_receiving(sent_ns: Sequence[int], since_ns: int, now_ns: int) -> list[int]:
+    """When messages came that are found at ``now_ns`` and were not there at ``since_ns``: the newest now, the others as long before as
+    they were sent before it. ``sent_ns`` is by the sender's clock; where it tells of a longer time than there was, that is shared out.
+    """
+    newest = max(sent_ns, default=0)
+    # The first came after its predecessor, which was seen the last time: by as much as one mostly comes after the other.
+    told_ns = (newest - min(sent_ns, default=0)) * len(sent_ns) / max(len(sent_ns) - 1, 1)
+    share = min((now_ns - since_ns) / told_ns, 1.0) if told_ns > 0.0 else 0.0
+    return [now_ns - round((newest - sent) * share) for sent in sent_ns]
 
 
 def _sensor_data() -> Qos:
@@ -137,7 +151,9 @@ def _dds_name(topic: str) -> str:
 
 
 class _Bytes(bytes):
-    """What a reader gives out; cyclonedds sets an attribute on it."""
+    """What a reader gives out; cyclonedds sets the attribute on it."""
+
+    sample_info: Any
 
 
 @functools.cache
