@@ -78,6 +78,7 @@ class LogTransport:
     """A robot made of a log: its messages as bytes, as fast as they are taken; ``spoil`` may lose, double, delay or change them."""
 
     is_ros1 = False
+    place, elsewhere = "a log", "Look elsewhere."
 
     def __init__(self, path: Path, spoil: Callable[[list[Received]], list[Received]] = list, types: dict[str, str] | None = None) -> None:
         source = open_source(path)

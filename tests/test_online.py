@@ -329,6 +329,7 @@ def test_silence_is_told_and_then_the_run_begins():
     assert "nothing comes on /joint_states (sensor_msgs/JointState)" in told[0]
     assert "/scan (sensor_msgs/LaserScan)" in told[0]
     assert len(told) == 1  # it is not said again and again
+    assert told[0].endswith(". Nobody publishes anything in a log. Look elsewhere.")
     named = LogTransport(drive_log(), silenced("/scan", 0.0, 5.0))
     named.types.pop("/scan")
     _, told = run_node(named, topics=TopicOverrides(scan="/scan"))

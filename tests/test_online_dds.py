@@ -29,8 +29,8 @@ DOMAIN = 100 + os.getpid() % 100  # not that of another run of these tests
 
 
 def start_node(*arguments):
-    command = [sys.executable, "-m", "localization.cli", "online", "--robot", "vaultbot", "--door", "dds", "--domain", str(DOMAIN)]
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    command = [sys.executable, "-m", "localization.cli", "online", "--robot", "vaultbot", "--door", "dds"]
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1", "ROS_DOMAIN_ID": str(DOMAIN)}
     return subprocess.Popen([*command, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
 
 
@@ -127,6 +127,25 @@ def test_nobody_there_is_told_and_interrupted_without_a_word_too_many(tmp_path):
     assert "nothing comes on /joint_states (sensor_msgs/JointState)" in " ".join(said.split())
     assert node.returncode == 130
     assert "Traceback" not in said
+
+
+def test_who_hears_nobody_is_told_where_it_listens(monkeypatch, capsys):
+    """And how to hear the others, in the domain of ROS's environment."""
+    node = start_node("--node.wait-s", "0.5")
+    said = " ".join((node.stdout.readline() + ended(node)).split())
+    assert f"Nobody publishes anything in domain {DOMAIN} on interface lo." in said
+    assert "--interface default" in said
+    for bad in ("231", "-1", "robot", "1.5"):
+        monkeypatch.setenv("ROS_DOMAIN_ID", bad)
+        assert main(["online", "--robot", "vaultbot", "--door", "dds"]) == 2
+        assert f"ROS_DOMAIN_ID is '{bad}'; ROS 2's domains are the numbers 0 to 230." in capsys.readouterr().err
+    default_domain = importlib.import_module("localization.online.dds").default_domain
+    for domain in (0, 230):
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+        assert default_domain() == domain
+    for nothing in (lambda: monkeypatch.setenv("ROS_DOMAIN_ID", ""), lambda: monkeypatch.delenv("ROS_DOMAIN_ID")):
+        nothing()
+        assert default_domain() == 0
 
 
 def test_another_type_is_refused_by_what_the_robot_says_of_itself(capsys):

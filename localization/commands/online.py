@@ -65,8 +65,8 @@ class Online:
     """New .rrd file to record rerun's picture to, instead of opening its viewer."""
     door: Literal["auto", "dds", "rclpy", "rospy"] = "auto"
     """Of live topics: ROS 2 by DDS itself (extra `ros2`), ROS 2 by rclpy, ROS 1 by rospy. `auto`: rclpy where it is sourced, else DDS."""
-    domain: int = 0
-    """ROS 2 domain (door dds)."""
+    domain: int | None = None
+    """ROS 2 domain (door dds); by default that of ROS_DOMAIN_ID, or 0."""
     interface: str = "lo"
     """Network interface or address (door dds). `lo`: this machine only, nobody else is listened to; `default`: as Cyclone DDS is set."""
     node: NodeConfig = field(default_factory=NodeConfig)
@@ -151,14 +151,15 @@ class Online:
         transport = self._transport()
         try:
             node = Node.start(transport, robot, self._pair, files, tell, self.topic, self.config, self.node, stop.is_set, view)
-            console.print(f"running {self.model} in {self.estimator} on {', '.join(node.topics)}", markup=False, soft_wrap=True)
+            said = f"running {self.model} in {self.estimator} on {', '.join(node.topics)} of {transport.place}"
+            console.print(said, markup=False, soft_wrap=True)
             with Live(console=console, auto_refresh=False, transient=True) as live:
                 node.spin(stop.is_set, lambda n: self._show(console, live, n))
             count = node.finish()
         finally:
             transport.close()
-        for said in node.notes():
-            tell(said)
+        for note in node.notes():
+            tell(note)
         self._summarize(console, node.session, node.seconds, count)
 
     def _transport(self) -> Transport:
@@ -174,9 +175,9 @@ class Online:
             from localization.online.ros2 import RclpyTransport
 
             return RclpyTransport()
-        from localization.online.dds import DdsTransport
+        from localization.online.dds import DdsTransport, default_domain
 
-        return DdsTransport(self.domain, self.interface)
+        return DdsTransport(default_domain() if self.domain is None else self.domain, self.interface)
 
     def _view(self) -> View | None:
         """Raises `DoorError` and `OutputError`. Imported only where it is wanted."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import os
 import re
 import socket
 import time
@@ -35,8 +36,17 @@ except ImportError as error:
 
 LOOPBACK = "lo"
 DEFAULT = "default"
+_LAST_DOMAIN = 230
 _LATEST, _DEPTH, _LATCHED_DEPTH = 200, 10, 100
 _TYPE = re.compile(r"(\w+)::(?:msg::)dds_::(\w+)_")
+
+
+def default_domain() -> int:
+    """ROS 2's domain by its environment, 0 where that names none. Raises `DoorError`."""
+    said = os.environ.get("ROS_DOMAIN_ID") or "0"
+    if not (said.isdecimal() and int(said) <= _LAST_DOMAIN):
+        raise DoorError(f"ROS_DOMAIN_ID is '{said}'; ROS 2's domains are the numbers 0 to {_LAST_DOMAIN}. Set it right, or pass --domain.")
+    return int(said)
 
 
 class DdsTransport:
@@ -46,8 +56,12 @@ class DdsTransport:
 
     def __init__(self, domain: int = 0, interface: str = LOOPBACK) -> None:
         """Raises `DoorError`."""
-        if not 0 <= domain <= 230:
-            raise DoorError(f"the domain is {domain}; ROS 2's domains are 0 to 230.")
+        if not 0 <= domain <= _LAST_DOMAIN:
+            raise DoorError(f"the domain is {domain}; ROS 2's domains are 0 to {_LAST_DOMAIN}.")
+        self.place = f"domain {domain} on interface {interface}"
+        self.elsewhere = "What is set up as usual for ROS 2, on this machine too, is heard with --interface default." * (
+            interface == LOOPBACK
+        )
         try:
             with _only_heard_on(interface):
                 self._domain = None if interface == DEFAULT else Domain(domain, _configuration(interface))

@@ -140,10 +140,10 @@ class Listener:
             said = [f"{topic} ({'published, but nothing comes' if topic in published else 'nobody publishes it'})" for topic in silent]
             return f"waiting for {', '.join(said)}." + self._others(published, {self.candidates[topic] for topic in silent})
         wanted = ", ".join(f"{topic} ({short_type(kind)})" for topic, kind in self.candidates.items() if kind in _MOVING)
-        known = f" Published are {', '.join(there)}." if there else ""
-        return f"waiting for wheels or a LiDAR: nothing comes on {wanted}.{known}" + (
-            self._others(published, _MOVING) or ("" if published else " Nobody publishes anything here.")
-        )
+        waiting = f"waiting for wheels or a LiDAR: nothing comes on {wanted}."
+        if not published:
+            return f"{waiting} Nobody publishes anything in {self._transport.place}. {self._transport.elsewhere}".rstrip()
+        return waiting + (f" Published are {', '.join(there)}." if there else "") + self._others(published, _MOVING)
 
     def _others(self, published: Mapping[str, set[str]], kinds: set[str]) -> str:
         """What is published under other names than the robot file's, and how to have it used."""

@@ -40,6 +40,7 @@ class RospyTransport:
     """See `Transport`."""
 
     is_ros1 = True
+    elsewhere = "Is ROS_MASTER_URI the robot's?"
 
     def __init__(self, node: str = "skidloc") -> None:
         """Raises `DoorError` where rospy or the master is not there."""
@@ -49,6 +50,7 @@ class RospyTransport:
             raise DoorError(f"no ROS 1 master answers at {uri}. Start roscore, or set ROS_MASTER_URI.")
         if urlparse(uri).hostname in ("localhost", "127.0.0.1"):
             os.environ.setdefault("ROS_IP", "127.0.0.1")  # listen there only
+        self.place = f"the graph of {uri}"
         self._master = graph.Master(f"/{node}")
         self._rospy.init_node(node, disable_signals=True, anonymous=True)
         self._heard: queue.SimpleQueue[Received] = queue.SimpleQueue()

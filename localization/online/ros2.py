@@ -17,6 +17,7 @@ class RclpyTransport:
     """See `Transport`. Domain, interfaces and middleware are those of the ROS environment."""
 
     is_ros1 = False
+    place, elsewhere = "the ROS environment's domain", "Is ROS_DOMAIN_ID the robot's?"
 
     def __init__(self, node: str = "skidloc") -> None:
         """Raises `DoorError` where no ROS 2 is sourced."""

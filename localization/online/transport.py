@@ -20,6 +20,10 @@ class Transport(Protocol):
 
     is_ros1: bool
     """Bytes are ROS 1's, not CDR."""
+    place: str
+    """Where it is, for a person: `domain 0 on interface lo`."""
+    elsewhere: str
+    """How to hear what is not heard there: a sentence, or empty."""
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         """Hear ``topic``. ``is_latched``: messages sent before matter too (tf_static); else as sensor data, the newest only."""

@@ -45,6 +45,7 @@ class SimulatedRobot:
     """A `Transport` whose messages are made when they are asked for, one at a time; it stops the time until it is asked for the next."""
 
     is_ros1 = False
+    place, elsewhere = "this process", ""
 
     def __init__(self, hours: float, beams: int) -> None:
         sensors = SensorConfig(scanner=ScannerConfig(beams=beams))
