@@ -206,6 +206,23 @@ def test_times_of_receiving_lie_between_two_looks():
     assert times_of_receiving([5, 5, 5], 60, 120) == [120, 120, 120]  # sent in a burst
 
 
+def test_what_had_to_wait_for_us_came_when_it_was_sent():
+    """A sender's clock, 5 s behind ours, whose messages take 1 ms or more; then we do not look for 12 s, and find the oldest first."""
+    clock, ms = importlib.import_module("localization.online.dds").SenderClock(), S // 1000
+    ours = [100 * S + i * 20 * ms for i in range(50)]
+    for i, now in enumerate(ours):
+        came = clock.came_ns(now - 5 * S - (1 + i % 3) * ms, now - 15 * ms, now)
+        assert now - 3 * ms <= came <= now
+    begin = ours[-1]
+    assert clock.came_ns(begin - S, begin, begin + 12 * S) == pytest.approx(begin + 4 * S, abs=3 * ms)
+    # 40 ms on the way, and looked for all the time
+    assert clock.came_ns(begin + 7 * S, begin + 12.03 * S, begin + 12.04 * S) == begin + 12.04 * S
+    # it is set: forward, and back
+    for shift in (3600 * S, -3600 * S):
+        now = begin + 20 * S
+        assert [clock.came_ns(now - 5 * S + shift + i * S, now + i * S - 20 * ms, now + i * S) - now for i in range(3)] == [0, S, 2 * S]
+
+
 def test_patience_ends_where_something_urgent_comes():
     """Twenty messages of /a to one of /b; without patience each is heard when it comes."""
     with chatter("a" * 20 + "b") as here:

@@ -38,6 +38,7 @@ LOOPBACK = "lo"
 DEFAULT = "default"
 _LAST_DOMAIN = 230
 _LATEST, _DEPTH, _LATCHED_DEPTH = 200, 10, 100
+_FASTEST_DRIFT = 1e-4  # of one clock against another
 _TYPE = re.compile(r"(\w+)::(?:msg::)dds_::(\w+)_")
 
 
@@ -73,6 +74,7 @@ class DdsTransport:
         self._writers: dict[str, tuple[DataWriter[Any], type[Any]]] = {}
         self._found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         self._looked_ns = time.monotonic_ns()
+        self._clocks: dict[str, SenderClock] = {}
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         quality = _latched() if is_latched else _sensor_data()
@@ -112,7 +114,8 @@ class DdsTransport:
             if is_new.triggered:  # to take costs ten times as much, and mostly it is one of them
                 samples = [sample for sample in reader.take(1000) if isinstance(sample, _Bytes)]
                 sent = [int(sample.sample_info.source_timestamp) for sample in samples]
-                came = times_of_receiving(sent, since, self._looked_ns)
+                newest = self._clocks.setdefault(topic, SenderClock()).came_ns(max(sent, default=0), since, self._looked_ns)
+                came = times_of_receiving(sent, since, newest)
                 found += [(at, Received(topic, ns, bytes(sample))) for at, ns, sample in zip(sent, came, samples, strict=True)]
         found.sort(key=lambda entry: entry[0])
         return [received for _, received in found]
@@ -132,15 +135,31 @@ class DdsTransport:
         del self._waiting, self._urgent, self._found, self._participant, self._domain
 
 
-def times_of_receiving(sent_ns: Sequence[int], since_ns: int, now_ns: int) -> list[int]:
-    """When messages came that are found at ``now_ns`` and were not there at ``since_ns``: the newest now, the others as long before as
-    they were sent before it. ``sent_ns`` is by the sender's clock; where it tells of a longer time than there was, that is shared out.
+class SenderClock:
+    """How far the clock of a topic's sender is from ours, by those of its messages that were on their way for the shortest time."""
+
+    def __init__(self) -> None:
+        self._offset_ns, self._known_ns = 1 << 80, 0
+
+    def came_ns(self, sent_ns: int, since_ns: int, now_ns: int) -> int:
+        """When a message came that is found at ``now_ns`` and was not there at ``since_ns``: what had to wait for us came when it was
+        sent. One that was sent before ``since_ns`` was late, or the sender's clock was set: it came now.
+        """
+        drift_ns = round((now_ns - self._known_ns) * _FASTEST_DRIFT)
+        self._offset_ns, self._known_ns = min(now_ns - sent_ns, self._offset_ns + drift_ns), now_ns
+        came_ns = sent_ns + self._offset_ns
+        return came_ns if came_ns > since_ns else now_ns
+
+
+def times_of_receiving(sent_ns: Sequence[int], since_ns: int, newest_ns: int) -> list[int]:
+    """When messages came that were not there at ``since_ns``: the newest at ``newest_ns``, the others as long before as they were sent
+    before it. ``sent_ns`` is by the sender's clock; where it tells of a longer time than there was, that is shared out.
     """
-    newest = max(sent_ns, default=0)
+    last_sent_ns = max(sent_ns, default=0)
     # The first came after its predecessor, which was seen the last time: by as much as one mostly comes after the other.
-    told_ns = (newest - min(sent_ns, default=0)) * len(sent_ns) / max(len(sent_ns) - 1, 1)
-    share = min((now_ns - since_ns) / told_ns, 1.0) if told_ns > 0.0 else 0.0
-    return [now_ns - round((newest - sent) * share) for sent in sent_ns]
+    told_ns = (last_sent_ns - min(sent_ns, default=0)) * len(sent_ns) / max(len(sent_ns) - 1, 1)
+    share = min((newest_ns - since_ns) / told_ns, 1.0) if told_ns > 0.0 else 0.0
+    return [newest_ns - round((last_sent_ns - sent) * share) for sent in sent_ns]
 
 
 def _sensor_data() -> Qos:
