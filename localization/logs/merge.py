@@ -32,7 +32,7 @@ _SAME_JUMP = _SECOND // 4
 _JUMP_AFTER = 3
 _LONGEST_PENDING = 10 * _SECOND
 _LONGEST_BURST = 5 * _SECOND
-_MOST_PENDING = 200
+_MOST_PENDING = 1000
 _MOST_HELD = 20_000
 
 
@@ -170,7 +170,8 @@ class TopicClock:
         """Whether what is pending came in less than half the time over which it was measured. None is long: it may be a bag's at a rate."""
         first, last = self._pending[0], self._pending[-1]
         is_fast = last.log_ns - first.log_ns < min((last.stamp_ns - first.stamp_ns) / 2, _LONGEST_BURST)
-        return is_fast and len(self._pending) < _MOST_PENDING
+        n = len(self._pending)
+        return is_fast and n < _MOST_PENDING and n * last.weight < _MOST_HELD
 
     def _trust(self, item: Item) -> Item:
         stamp = item.stamp_ns + self._shift
