@@ -54,7 +54,7 @@ class Step:
     d_clock: FloatArray
     """(3,) change of the predicted motion (right perturbation) per second by which the wheels' clock is shifted [m/s, m/s, rad/s]."""
     twist: FloatArray
-    """(3,) body twist at the end, by the wheels."""
+    """(3,) body twist at the end, by the wheels; of a step of no duration, by what they say next or said last."""
     is_standing: bool
     """No wheel moved during the step."""
     has_wheels: bool
@@ -163,8 +163,8 @@ class Stepper:
         return None if end_ns - self._start_ns < least / _NS else (end_ns, None)
 
     def _is_heard(self, stamp_ns: int) -> bool:
-        wheels = self._wheels.newest_ns
-        return wheels is not None and wheels >= stamp_ns + self.clock_offset_s / _NS
+        told = self._wheels.told_ns
+        return told is not None and told >= stamp_ns + self.clock_offset_s / _NS
 
     def _step(self, start_ns: int, end_ns: int, scan: Scan | None) -> Step:
         shift = round(self.clock_offset_s / _NS)
@@ -176,6 +176,9 @@ class Stepper:
         if len(dt):
             first, last = twist.value[0], twist.value[-1]
             d_clock = last - se2.adjoint(se2.inverse(motion.delta)) @ first
+        elif start_ns == end_ns:  # a scan sweeps on from here, the first one of a drive too
+            rates, cg = self._wheels.at(end_ns + shift, self.config.max_hold_s)
+            last = self._model.twist(rates, cg, self.params).value.sum(axis=0)
         if missing:
             self._deaf_s += missing
             lost = np.array([self.config.lost_speed_m_s, self.config.lost_speed_m_s, self.config.lost_rate_rad_s]) * missing

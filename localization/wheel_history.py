@@ -27,6 +27,11 @@ class WheelHistory:
     def newest_ns(self) -> int | None:
         return None if self._last is None else self._last.stamp_ns
 
+    @property
+    def told_ns(self) -> int | None:
+        """Up to when rates are known; None before two samples tell the first of them."""
+        return self._ends[-1] if self._ends else None
+
     def set_cg(self, sample: CgSample) -> None:
         self._cg, self._cg_cov = sample.position, sample.covariance
 
@@ -59,6 +64,14 @@ class WheelHistory:
         if self._ends[0] < sample.stamp_ns - 2 * self._keep_ns:
             n = bisect.bisect_left(self._ends, sample.stamp_ns - self._keep_ns)
             del self._ends[:n], self._intervals[:n]
+
+    def at(self, stamp_ns: int, max_hold_s: float) -> tuple[FloatArray, FloatArray]:
+        """Rates (n, 2) and CG (n, 2) from a moment on, n = 1; by the nearest samples after it or before it, n = 0 if these are farther than
+        ``max_hold_s``."""
+        i = min(bisect.bisect_right(self._ends, stamp_ns), len(self._ends) - 1)
+        known = self._intervals[i : i + 1] if i >= 0 and abs(self._intervals[i][0] - stamp_ns) <= max_hold_s / _NS else []
+        table = np.array([row[1:5] for row in known]).reshape(-1, 4)
+        return table[:, :2], table[:, 2:]
 
     def window(self, start_ns: int, end_ns: int, max_hold_s: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
         """Intervals (n,) [s], rates (n, 2), CG (n, 2) from ``start_ns`` to ``end_ns``, and the seconds that nothing is known of.

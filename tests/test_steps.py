@@ -425,6 +425,19 @@ def test_twist_is_that_of_the_end():
         np.testing.assert_allclose(step.twist, model.twist(rates, np.zeros(2), model.nominal).value, atol=0.02)
 
 
+@pytest.mark.parametrize("scan_s", [0.0, -0.1, 0.1])
+def test_the_first_scan_has_the_twist_of_its_moment(scan_s):
+    """Scans are swept from their stamp on, and the wheels of a robot that moves already tell how only by two samples."""
+    cutter, model = stepper(model="diff_drive"), make_model("diff_drive", ROBOT)
+    turned = lambda t: (3.0 * t, 3.5 * t)  # noqa: E731
+    assert not list(cutter.push(scan(scan_s)))
+    samples = wheels(0.2, turned=turned)
+    first = next(step for sample in samples for step in cutter.push(sample))
+    assert first.duration == 0.0
+    assert first.has_wheels
+    np.testing.assert_allclose(first.twist, model.twist(np.array([3.0, 3.5]), np.zeros(2), model.nominal).value, atol=1e-9)
+
+
 def test_parameters_given_between_steps_hold_from_the_next_one_on():
     cutter = stepper(model="diff_drive", has_lidar=False)
     other = make_model("diff_drive", ROBOT).nominal * [1.1, 1.3]
