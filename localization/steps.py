@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -38,9 +38,9 @@ class StepConfig(Settings):
     max_hold_s: float = 0.5
     """For how long the last wheel rates are believed when no more come [s]."""
     lost_speed_m_s: Positive = 0.5
-    """How fast the robot may move while no wheels are heard: sigma [m/s]."""
+    """How fast the robot may move while no wheels are heard, all the while: sigma [m/s]."""
     lost_rate_rad_s: Positive = 0.5
-    """How fast it may turn meanwhile: sigma [rad/s]."""
+    """How fast it may turn meanwhile, unless a gyro tells: sigma [rad/s]."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,16 @@ class Step:
     d_clock: FloatArray
     """(3,) change of the predicted motion (right perturbation) per second by which the wheels' clock is shifted [m/s, m/s, rad/s]."""
     twist: FloatArray
-    """(3,) body twist at the end, by the wheels; of a step of no duration, by what they say next or said last."""
+    """(3,) body twist at the end, by the wheels; of a step of no duration, by what they say next or said last. Where they were not heard,
+    zero, but for the mean turn rate by the gyro."""
     is_standing: bool
     """No wheel moved during the step."""
     has_wheels: bool
-    """Wheels were heard during all of the step."""
+    """Wheels were heard during all of the step; of no duration, about then."""
     turn: Turn | None = None
     scan: Scan | None = None
+    twist_var: FloatArray = field(default_factory=lambda: np.zeros(3))
+    """(3,) of a ``twist`` that no wheels tell; zero where they do."""
 
     @property
     def duration(self) -> float:
@@ -87,6 +90,7 @@ class Stepper:
         self._has_lidar = has_lidar
         self._scans: deque[Scan] = deque()
         self._empty_scans, self._late_scans, self._deaf_s = 0, 0, 0.0
+        self._lost_s = 0.0  # how long no wheels have been heard
         self._start_ns: int | None = None
         self._now_ns = -(1 << 62)
         self.clock_offset_s = 0.0
@@ -179,13 +183,21 @@ class Stepper:
         elif start_ns == end_ns:  # a scan sweeps on from here, the first one of a drive too
             rates, cg = self._wheels.at(end_ns + shift, self.config.max_hold_s)
             last = self._model.twist(rates, cg, self.params).value.sum(axis=0)
+        lost = np.array([self.config.lost_speed_m_s, self.config.lost_speed_m_s, self.config.lost_rate_rad_s]) ** 2
+        before, self._lost_s = self._lost_s, missing + (0.0 if len(dt) else self._lost_s)
         if missing:
             self._deaf_s += missing
-            lost = np.array([self.config.lost_speed_m_s, self.config.lost_speed_m_s, self.config.lost_rate_rad_s]) * missing
-            motion = Motion(motion.delta, motion.cov + np.diag(lost**2), motion.d_params)
+            # a velocity that lasts takes the robot as far as the time, however that is cut into steps
+            motion = Motion(motion.delta, motion.cov + np.diag(lost * ((before + missing) ** 2 - before**2)), motion.d_params)
         standing = bool(len(dt)) and missing == 0.0 and not rates.any()
         turn = self._gyro.turn(start_ns, end_ns, float(motion.delta[2])) if end_ns > start_ns else None
-        return Step(start_ns, end_ns, motion, d_clock, last, standing, missing == 0.0, turn, scan)
+        if missing == 0.0 and len(rates):
+            return Step(start_ns, end_ns, motion, d_clock, last, standing, True, turn, scan)
+        last = np.zeros(3)
+        if turn is not None:
+            last[2] = turn.angle / turn.duration
+            lost[2] = turn.variance / turn.duration**2 + self._robot.gyro_noise.bias_sigma_rad_per_s**2
+        return Step(start_ns, end_ns, motion, d_clock, last, standing, False, turn, scan, lost)
 
 
 def steps(events: Iterable[Event], stepper: Stepper) -> Iterator[Step]:

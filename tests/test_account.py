@@ -168,6 +168,18 @@ def test_what_the_scene_leaves_open_grows_no_faster_than_the_wheels_errors(kind:
 
 
 @pytest.mark.parametrize("kind", ["ekf", "graph"])
+def test_a_map_begun_by_a_sweep_that_nobody_could_set_right_is_known_as_badly(kind: str) -> None:
+    """The wheels are heard too late for the first scan."""
+    nees, late = [], rooms.WALL_START_NS + 5 * 10**8
+    for seed in range(RUNS):
+        drive = rooms.drive_through(ROOM, rooms.path((5, 0.4, 0.4), (4, 0.4, -0.5)), seed, scanner=SCANNER)
+        events = [e for e in drive.events if isinstance(e, Scan) or e.stamp_ns > late]
+        nees.append(_last_error(replace(drive, events=events), kind)[0])
+    low, high = mean_band(RUNS, 3.0)
+    assert low <= np.mean(nees) <= high
+
+
+@pytest.mark.parametrize("kind", ["ekf", "graph"])
 def test_a_drive_that_begins_in_motion_is_no_surer_than_it_is_right(kind: str) -> None:
     """The first scan is swept while the robot moves, and all others are matched with it."""
     ways = rooms.path((5, 0.4, 0.4), (4, 0.4, -0.5)), rooms.path((9, 0.0, 0.5))

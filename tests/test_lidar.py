@@ -217,15 +217,35 @@ def test_slip_is_followed_and_forgotten() -> None:
     slip = Slip()
     usual = np.diag([1e-5, 1e-5, 1e-4])
     for _ in range(10):  # wheels that spin on the spot at 0.5 m/s
-        slip.advance(0.08, usual)
+        slip.advance(0.08, usual, np.zeros(3))
         slip.measure(np.array([-0.5, 0.0, 0.0]), np.full(3, 0.02**2))
     assert slip.rate[0] == pytest.approx(-0.5, abs=0.05)
     assert abs(slip.rate[1:]).max() < 1e-12
-    slip.advance(2.0, 25.0 * usual)
+    slip.advance(2.0, 25.0 * usual, np.zeros(3))
     assert abs(slip.rate[0]) < 0.01
-    slip.advance(0.08, np.zeros((3, 3)))
+    slip.advance(0.08, np.zeros((3, 3)), np.zeros(3))
     slip.measure(np.array([0.3, 0.0, 0.0]), np.full(3, 10.0**2))  # along a corridor nothing was measured
     assert abs(slip.rate[0]) < 0.02
+
+
+def test_a_sweep_is_taken_back_as_the_robot_moves_whoever_tells(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wheels that fall silent and come back are one witness more or less: the robot does not stop or start for it."""
+    drive = rooms.drive_through(LAB, rooms.path((1, 0, 0), (10, 0.4, 0.3)), 2)
+    gone = (rooms.WALL_START_NS + 3 * 10**9, rooms.WALL_START_NS + 8 * 10**9)
+    heard = [e for e in drive.events if isinstance(e, Scan) or not gone[0] < e.stamp_ns < gone[1]]
+    swept: dict[int, tuple[Sweep, np.ndarray]] = {}  # the first twist that was thought of each sweep
+    at_stamp = Sweep.at_stamp
+
+    def watched(self: Sweep, twist: np.ndarray) -> np.ndarray:
+        swept.setdefault(id(self), (self, twist))
+        return at_stamp(self, twist)
+
+    monkeypatch.setattr(Sweep, "at_stamp", watched)
+    rooms.results(replace(drive, events=heard), "ekf")
+    thought = np.array([twist for _, twist in swept.values()])
+    assert len(thought) == len(drive.stamps)
+    off = np.abs(thought - [0.4, 0.0, 0.3])[drive.stamps > rooms.WALL_START_NS + 2 * 10**9]
+    assert off.max() < 0.2
 
 
 # --- noise -------------------------------------------------------------------------------------------------------------------------------

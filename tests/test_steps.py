@@ -300,8 +300,36 @@ def test_wheels_that_vanish_leave_a_wide_covariance_and_a_note():
         assert np.sqrt(step.predicted.cov[0, 0]) >= config.lost_speed_m_s * step.duration * 0.999
         assert np.sqrt(step.predicted.cov[2, 2]) >= config.lost_rate_rad_s * step.duration * 0.999
         assert not step.predicted.delta.any()
+        assert not step.twist.any()
+        np.testing.assert_array_equal(np.sqrt(step.twist_var), [config.lost_speed_m_s, config.lost_speed_m_s, config.lost_rate_rad_s])
+    assert not any(s.twist_var.any() for s in heard)
     (note,) = cutter.notes()
     assert f"{5.9 - 2.5:.1f} s" in note
+
+
+@pytest.mark.parametrize("scan_s", [0.05, 0.1, 0.4])
+def test_a_lost_robot_may_go_on_as_long_as_the_wheels_are_gone(scan_s):
+    """A velocity that nobody knows lasts: how far it leads does not depend on how often a scanner looks meanwhile."""
+    config = StepConfig()
+    gone = [w for w in wheels(20.0, turned=lambda t: (0.1 * (t > 12.5),) * 2) if not 2.0 < (w.stamp_ns - T0) * 1e-9 < 12.99]
+    found, _ = cut(in_order(gone, [scan(scan_s * i) for i in range(round(15.0 / scan_s))]))
+    lost = [s for s in found if not s.has_wheels and s.end_ns <= T0 + 12_500 * MS]
+    seconds = (lost[-1].end_ns - T0) * 1e-9 - 2.0 - config.max_hold_s
+    assert seconds > 9.0
+    variance = np.sum([np.diag(s.predicted.cov) for s in lost], axis=0)
+    np.testing.assert_allclose(np.sqrt(variance), np.array([config.lost_speed_m_s] * 2 + [config.lost_rate_rad_s]) * seconds, rtol=1e-6)
+    again = next(s for s in found if s.has_wheels and s.start_ns >= T0 + 13 * S)
+    assert np.diag(again.predicted.cov).max() < 1e-3
+
+
+def test_a_gyro_tells_how_a_lost_robot_turns():
+    imu = [ImuSample(T0 + 10 * MS * i, np.array([0.0, 0.0, 0.3]), np.array([0.0, 0.0, 9.81])) for i in range(600)]
+    found, _ = cut(in_order(wheels(2.0), imu, [scan(0.1 * i) for i in range(1, 55)]))
+    deaf = [s for s in found if s.start_ns >= T0 + 2500 * MS]
+    assert deaf
+    for step in deaf:
+        np.testing.assert_allclose(step.twist, [0.0, 0.0, 0.3], atol=1e-9)
+        assert 0.0 < step.twist_var[2] < 0.1**2
 
 
 def test_wheels_that_come_back_are_heard_again():

@@ -81,8 +81,9 @@ class Account:
         """
         # old lines that did not hold the last scan were drawn not long ago: the error of the map as it was is none of theirs
         old = tie.old if self._held is None else _common(tie.old, self._held)
-        self._held, kept, fresh = _shared(tie.information, old, tie.of_map)
-        noise = cov - cov @ tie.of_map @ cov + tie.sweep + doubt
+        self._held, kept, fresh = _shared(tie.information, old, tie.of_map, tie.bent)
+        found = cov - tie.bent
+        noise = found - found @ tie.of_map @ found + tie.sweep + doubt
         met, H, R, self._swept = _met(self._P, K, d_pose, noise, kept, fresh, tie.sweep)
         self._P = corrected(met, K, H, R)
 
@@ -144,7 +145,7 @@ def _shared(information: FloatArray, old: FloatArray, of_map: FloatArray) -> tup
     for i in range(3):
         held[i, i] += _LOOSE[i]
     C = quick_inverse(held)
-    kept, by_map = _shrunk(product(C, old)), product(product(C, of_map), C)
+    kept, by_map = _shrunk(product(C, old)), product(product(C, of_map), C) + bent
     values, vectors = eigen(by_map - product(kept, by_map))
     for k in range(3):
         for i in range(3):

@@ -70,7 +70,8 @@ class ScanWitness:
         self._is_placed = True  # it is known where the LiDAR sits that drew the map
         self._is_begun, self._slip = False, Slip()
         self._seen_ns, self._last_ns = -1, -1  # stamp of the last scan, and of the last that was good
-        self._twist = np.zeros(3)  # of the last step with a scan
+        self._twist, self._has_wheels = np.zeros(3), True  # of the last step with a scan
+        self._late, self._late_first = 0.0, 0.0  # of the last sweep; of that which began the map, until another has met it
         self._check, self._is_good = ScanCheck(self._matcher.config), True
         self._drift = np.zeros((3, 3))  # of the wheels, since the last scan that was good
 
@@ -88,10 +89,13 @@ class ScanWitness:
         if not self._is_good:
             return None
         sweep = Sweep.of(step.scan, self._mount(step.scan.frame_id))
+        self._late = sweep.lateness
         slip = self._slip
-        slip.advance(step.duration, step.predicted.cov)
+        if step.has_wheels != self._has_wheels:  # the robot moves on as it did, whoever tells
+            slip.rate = slip.rate + self._twist - step.twist
+        slip.advance(step.duration, step.predicted.cov, step.twist_var)
         rate = slip.rate
-        change, self._twist = step.twist - self._twist, step.twist
+        change, self._twist, self._has_wheels = step.twist - self._twist, step.twist, step.has_wheels
         found = self._matcher.register(sweep.at_stamp(step.twist + rate), sweep.is_planar, guess, self._drift, sweep.offsets)
         if found is None:
             self._check.miss(step.scan)
@@ -102,13 +106,20 @@ class ScanWitness:
             return None
         gain = np.zeros(3)
         if step.start_ns == self._last_ns and step.duration > 0.0:
-            off = se2.log(se2.between(se2.compose(anchor, step.predicted.delta), found.pose))
+            told = step.predicted.delta if step.has_wheels else se2.exp(step.twist * step.duration)
+            off = se2.log(se2.between(se2.compose(anchor, told), found.pose))
             variance = np.diag(found.cov) / found.trust + (1.0 - found.trust) * off**2
             gain = slip.measure(off / step.duration, variance / step.duration**2)
             found = self._amended(found, sweep, step, slip.rate - rate)
         swept = self._swept(step, found.lateness, sweep.lateness, gain, change)
-        tie = replace(found.tie, sweep=swept)
-        return Sight(Motion(se2.between(anchor, found.pose), found.cov), found.trust, tie)
+        bent = self._bent()
+        tie = replace(found.tie, bent=bent, sweep=swept)
+        return Sight(Motion(se2.between(anchor, found.pose), found.cov + bent), found.trust, tie)
+
+    def _bent(self) -> FloatArray:
+        """(3, 3) by how much a map is off that a sweep began whose slip nobody had measured yet; once, as the map keeps that error."""
+        late, self._late_first = self._late_first, 0.0
+        return np.diag(late**2 * (self._slip.rate**2 + self._slip.variance_in(0.0)))
 
     def _mount(self, frame: str) -> Mount:
         """Where ``frame`` sits. Once that is known, a map that was drawn as if from the body's origin is worth nothing."""
@@ -156,7 +167,8 @@ class ScanWitness:
         if step.is_standing and self._is_begun:
             return False
         self._matcher.insert(pose)
-        self._is_begun = self._matcher.has_map
+        if not self._is_begun:
+            self._is_begun, self._late_first = self._matcher.has_map, self._late
         return True
 
     def map_points(self, way: Way | None = None) -> FloatArray:

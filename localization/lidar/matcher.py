@@ -70,6 +70,8 @@ class MapTie:
     sweep: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
     """(3, 3) of the registration's covariance, what comes from a motion within the sweep other than was thought. What the scan adds to
     the map has no part in it: the points are off one way, and the pose that was found for them the other."""
+    bent: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    """(3, 3) the same, by which the map itself is off, as nobody could set right the sweep that began it."""
 
 
 @dataclass(frozen=True)

@@ -22,12 +22,13 @@ class Slip:
     def __init__(self) -> None:
         self.rate, self._variance, self._usual = np.zeros(3), np.zeros(3), np.zeros(3)
 
-    def advance(self, duration: float, cov: FloatArray) -> None:
-        """``duration`` [s] have passed, in which the wheels' motion had ``cov`` (3, 3)."""
+    def advance(self, duration: float, cov: FloatArray, unheard: FloatArray) -> None:
+        """``duration`` [s] have passed, in which the wheels' motion had ``cov`` (3, 3), or the twist the variance ``unheard`` (3,) if they
+        were not heard, else zero."""
         if duration <= 0.0:
             return
         stays = math.exp(-duration / LASTS_S)
-        self._usual = usual = np.diag(cov) / (2.0 * LASTS_S * duration)
+        self._usual = usual = unheard if unheard.any() else np.diag(cov) / (2.0 * LASTS_S * duration)
         self.rate = stays * self.rate
         self._variance = stays**2 * self._variance + (1.0 - stays**2) * usual
 
