@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -91,6 +92,10 @@ class Stepper:
         self._scans: deque[Scan] = deque()
         self._empty_scans, self._late_scans, self._deaf_s = 0, 0, 0.0
         self._lost_s = 0.0  # how long no wheels have been heard
+        self._timeless, self._turned = (
+            0,
+            0.0,
+        )  # scans without times of points, and the most that the wheels turned up to one
         self._start_ns: int | None = None
         self._now_ns = -(1 << 62)
         self.clock_offset_s = 0.0
@@ -132,6 +137,11 @@ class Stepper:
             said.append(f"{self._empty_scans} scan{'s' * (self._empty_scans > 1)} without a usable point: the wheels carried on alone.")
         if self._late_scans:
             said.append(f"{self._late_scans} scan{'s' * (self._late_scans > 1)} came after later ones and could not be used.")
+        if self._timeless:
+            said.append(
+                f"{self._timeless} scan{'s' * (self._timeless > 1)} without the times of their points, taken as seen at once while the "
+                f"robot turned: if the scanner sweeps, that bends them by up to {math.degrees(self._turned):.1f} degrees."
+            )
         if self._deaf_s > 0.0:
             said.append(f"no wheels were heard for {self._deaf_s:.1f} s in all: there the motion is a guess with a wide covariance.")
         return [*said, *self._tilt.notes(), *self.frames.notes()]
@@ -191,6 +201,8 @@ class Stepper:
             motion = Motion(motion.delta, motion.cov + np.diag(lost * ((before + missing) ** 2 - before**2)), motion.d_params)
         standing = bool(len(dt)) and missing == 0.0 and not rates.any()
         turn = self._gyro.turn(start_ns, end_ns, float(motion.delta[2])) if end_ns > start_ns else None
+        if scan is not None and len(scan.points) and not len(scan.offsets) and motion.delta[2]:
+            self._timeless, self._turned = self._timeless + 1, max(self._turned, abs(float(motion.delta[2])))
         if missing == 0.0 and len(rates):
             return Step(start_ns, end_ns, motion, d_clock, last, standing, True, turn, scan)
         last = np.zeros(3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -303,8 +304,7 @@ def test_wheels_that_vanish_leave_a_wide_covariance_and_a_note():
         assert not step.twist.any()
         np.testing.assert_array_equal(np.sqrt(step.twist_var), [config.lost_speed_m_s, config.lost_speed_m_s, config.lost_rate_rad_s])
     assert not any(s.twist_var.any() for s in heard)
-    (note,) = cutter.notes()
-    assert f"{5.9 - 2.5:.1f} s" in note
+    assert f"no wheels were heard for {5.9 - 2.5:.1f} s" in cutter.notes()[-1]
 
 
 @pytest.mark.parametrize("scan_s", [0.05, 0.1, 0.4])
@@ -518,6 +518,17 @@ def test_scans_of_an_unknown_frame_are_told_and_not_mixed_with_others():
     found, cutter = cut(in_order(wheels(2.0), [scan(0.05, frame="top")], known, strange))
     assert sum(s.scan is not None for s in found) == 8
     assert ["1 scan of it was taken" in note or "7 scans of it were not used" in note for note in cutter.notes()] == [True, True]
+
+
+def test_scans_without_times_are_told_where_the_robot_turns():
+    timed = [replace(scan(0.1 * i), offsets=np.zeros(1)) for i in range(1, 15)]
+    spin = wheels(2.0, turned=lambda t: (-3.0 * t, 3.0 * t))
+    found, cutter = cut(in_order(spin, [scan(0.1 * i) for i in range(1, 15)]))
+    (note,) = cutter.notes()
+    assert "13 scans without the times" in note  # but for the first, before which there is no motion
+    assert f"up to {math.degrees(max(s.predicted.delta[2] for s in found if s.scan)):.1f} degrees" in note
+    assert cut(in_order(spin, timed))[1].notes() == []
+    assert cut(in_order(wheels(2.0, turned=lambda t: (3.0, 3.0)), [scan(0.1 * i) for i in range(1, 15)]))[1].notes() == []
 
 
 def test_a_long_stream_keeps_little():

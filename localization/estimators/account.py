@@ -132,7 +132,9 @@ class Account:
 
 
 @numba.njit(cache=True)
-def _shared(information: FloatArray, old: FloatArray, of_map: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:  # pragma: no cover
+def _shared(
+    information: FloatArray, old: FloatArray, of_map: FloatArray, bent: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # pragma: no cover
     """By what a scan is held (see `MapTie`), with that which holds it where the scene does not: (3, 3) all ``information`` L, how much of
     the map's error was in it before, L^-1 ``old``, and the covariance of the noise with which the rest was drawn.
 
