@@ -92,10 +92,8 @@ class Stepper:
         self._scans: deque[Scan] = deque()
         self._empty_scans, self._late_scans, self._deaf_s = 0, 0, 0.0
         self._lost_s = 0.0  # how long no wheels have been heard
-        self._timeless, self._turned = (
-            0,
-            0.0,
-        )  # scans without times of points, and the most that the wheels turned up to one
+        self._timeless = 0  # scans without the times of their points, while turning; below, how fast, and how often they come
+        self._fastest, self._period_s = 0.0, math.inf
         self._start_ns: int | None = None
         self._now_ns = -(1 << 62)
         self.clock_offset_s = 0.0
@@ -140,7 +138,8 @@ class Stepper:
         if self._timeless:
             said.append(
                 f"{self._timeless} scan{'s' * (self._timeless > 1)} without the times of their points, taken as seen at once while the "
-                f"robot turned: if the scanner sweeps, that bends them by up to {math.degrees(self._turned):.1f} degrees."
+                f"robot turned: if the scanner sweeps, that bends them by up to "
+                f"{math.degrees(self._fastest * self._period_s):.1f} degrees at {self._fastest:.1f} rad/s."
             )
         if self._deaf_s > 0.0:
             said.append(f"no wheels were heard for {self._deaf_s:.1f} s in all: there the motion is a guess with a wide covariance.")
@@ -201,8 +200,10 @@ class Stepper:
             motion = Motion(motion.delta, motion.cov + np.diag(lost * ((before + missing) ** 2 - before**2)), motion.d_params)
         standing = bool(len(dt)) and missing == 0.0 and not rates.any()
         turn = self._gyro.turn(start_ns, end_ns, float(motion.delta[2])) if end_ns > start_ns else None
-        if scan is not None and len(scan.points) and not len(scan.offsets) and motion.delta[2]:
-            self._timeless, self._turned = self._timeless + 1, max(self._turned, abs(float(motion.delta[2])))
+        if scan is not None and len(scan.points) and not len(scan.offsets) and motion.delta[2] and missing == 0.0:
+            seconds = (end_ns - start_ns) * _NS
+            self._timeless, self._period_s = self._timeless + 1, min(self._period_s, seconds)
+            self._fastest = max(self._fastest, abs(float(motion.delta[2])) / seconds)
         if missing == 0.0 and len(rates):
             return Step(start_ns, end_ns, motion, d_clock, last, standing, True, turn, scan)
         last = np.zeros(3)

@@ -526,7 +526,8 @@ def test_scans_without_times_are_told_where_the_robot_turns():
     found, cutter = cut(in_order(spin, [scan(0.1 * i) for i in range(1, 15)]))
     (note,) = cutter.notes()
     assert "13 scans without the times" in note  # but for the first, before which there is no motion
-    assert f"up to {math.degrees(max(s.predicted.delta[2] for s in found if s.scan)):.1f} degrees" in note
+    rate = max(s.predicted.delta[2] / 0.1 for s in found if s.scan)
+    assert f"up to {math.degrees(0.1 * rate):.1f} degrees at {rate:.1f} rad/s" in note
     assert cut(in_order(spin, timed))[1].notes() == []
     assert cut(in_order(wheels(2.0, turned=lambda t: (3.0, 3.0)), [scan(0.1 * i) for i in range(1, 15)]))[1].notes() == []
 
