@@ -261,7 +261,7 @@ def test_degeneracy_tells_corridors_from_rooms(calm):
     last = health._scan
     assert health.statuses(node.session.core)[1].level == OK
     corridor = scan(1.5 / np.abs(np.sin(angle)))
-    health.saw(dataclasses.replace(last, points=np.column_stack([corridor, np.zeros(len(corridor))])))
+    health.saw(dataclasses.replace(last, points=np.column_stack([corridor, np.zeros(len(corridor))]), offsets=np.empty(0)))
     assert health.statuses(node.session.core)[1].level == WARN
     health.saw(last)
 
@@ -412,6 +412,7 @@ def test_a_full_disk_does_not_stop_the_robot_from_knowing_where_it_is(tmp_path, 
         f"an estimate cannot be written to '{files.spool}': No space left on device. "
         "The output lacks what is estimated meanwhile; it is tried again.",
     ]
+    node._tell()
     files_status = next(s for s in published(full, DIAGNOSTICS)[-1].status if s.name == "skidloc: files")
     assert files_status.level == WARN
     assert files_status.message.count("No space left on device") == 2
