@@ -500,8 +500,9 @@ def test_empty_scans_are_steps_and_are_told():
 
 
 def test_scans_of_an_unknown_frame_are_told_and_not_mixed_with_others():
+    ahead = wheels(2.0, turned=lambda t: (3.0 * t, 3.0 * t))
     known, strange = [scan(0.1 * i) for i in range(1, 8)], [scan(0.1 * i, frame="top") for i in range(8, 15)]
-    found, cutter = cut(in_order(wheels(2.0), known, strange))
+    found, cutter = cut(in_order(ahead, known, strange))
     assert [s.scan for s in found if s.scan is not None] == known
     assert found[-1].end_ns > strange[-1].stamp_ns
     (note,) = cutter.notes()
@@ -510,12 +511,12 @@ def test_scans_of_an_unknown_frame_are_told_and_not_mixed_with_others():
     assert "[mounts.top]" in note
     assert cutter.frames.lack is not None
     # where none is known, they are all there is
-    found, cutter = cut(in_order(wheels(2.0), strange))
+    found, cutter = cut(in_order(ahead, strange))
     assert sum(s.scan is not None for s in found) == 7
     (note,) = cutter.notes()
     assert "7 scans of it were taken as if from the body's origin" in note
     # the first of them may come before any other
-    found, cutter = cut(in_order(wheels(2.0), [scan(0.05, frame="top")], known, strange))
+    found, cutter = cut(in_order(ahead, [scan(0.05, frame="top")], known, strange))
     assert sum(s.scan is not None for s in found) == 8
     assert ["1 scan of it was taken" in note or "7 scans of it were not used" in note for note in cutter.notes()] == [True, True]
 
