@@ -92,7 +92,7 @@ class Stepper:
         self._scans: deque[Scan] = deque()
         self._empty_scans, self._late_scans, self._deaf_s = 0, 0, 0.0
         self._lost_s = 0.0  # how long no wheels have been heard
-        self._timeless = 0  # scans without the times of their points, while turning; below, how fast, and how often they come
+        self._timeless = 0  # scans without the times of their points; below, how fast the robot turned, and how often they come
         self._fastest, self._period_s = 0.0, math.inf
         self._start_ns: int | None = None
         self._now_ns = -(1 << 62)
@@ -135,11 +135,11 @@ class Stepper:
             said.append(f"{self._empty_scans} scan{'s' * (self._empty_scans > 1)} without a usable point: the wheels carried on alone.")
         if self._late_scans:
             said.append(f"{self._late_scans} scan{'s' * (self._late_scans > 1)} came after later ones and could not be used.")
-        if self._timeless:
+        if self._fastest:
             said.append(
-                f"{self._timeless} scan{'s' * (self._timeless > 1)} without the times of their points, taken as seen at once while the "
-                f"robot turned: if the scanner sweeps, that bends them by up to "
-                f"{math.degrees(self._fastest * self._period_s):.1f} degrees at {self._fastest:.1f} rad/s."
+                f"{self._timeless} scan{'s' * (self._timeless > 1)} without the times of their points, taken as seen at once: "
+                f"if the scanner sweeps, turning at up to {self._fastest:.1f} rad/s bends them by up to "
+                f"{math.degrees(self._fastest * self._period_s):.0f} degrees."
             )
         if self._deaf_s > 0.0:
             said.append(f"no wheels were heard for {self._deaf_s:.1f} s in all: there the motion is a guess with a wide covariance.")
@@ -200,10 +200,12 @@ class Stepper:
             motion = Motion(motion.delta, motion.cov + np.diag(lost * ((before + missing) ** 2 - before**2)), motion.d_params)
         standing = bool(len(dt)) and missing == 0.0 and not rates.any()
         turn = self._gyro.turn(start_ns, end_ns, float(motion.delta[2])) if end_ns > start_ns else None
-        if scan is not None and len(scan.points) and not len(scan.offsets) and motion.delta[2] and missing == 0.0:
-            seconds = (end_ns - start_ns) * _NS
-            self._timeless, self._period_s = self._timeless + 1, min(self._period_s, seconds)
-            self._fastest = max(self._fastest, abs(float(motion.delta[2])) / seconds)
+        if scan is not None and len(scan.points) and not len(scan.offsets):
+            self._timeless += 1
+            if motion.delta[2] and missing == 0.0:
+                seconds = (end_ns - start_ns) * _NS
+                self._period_s = min(self._period_s, seconds)
+                self._fastest = max(self._fastest, abs(float(motion.delta[2])) / seconds)
         if missing == 0.0 and len(rates):
             return Step(start_ns, end_ns, motion, d_clock, last, standing, True, turn, scan)
         last = np.zeros(3)

@@ -526,9 +526,9 @@ def test_scans_without_times_are_told_where_the_robot_turns():
     spin = wheels(2.0, turned=lambda t: (-3.0 * t, 3.0 * t))
     found, cutter = cut(in_order(spin, [scan(0.1 * i) for i in range(1, 15)]))
     (note,) = cutter.notes()
-    assert "13 scans without the times" in note  # but for the first, before which there is no motion
+    assert "14 scans without the times" in note
     rate = max(s.predicted.delta[2] / 0.1 for s in found if s.scan)
-    assert f"up to {math.degrees(0.1 * rate):.1f} degrees at {rate:.1f} rad/s" in note
+    assert f"turning at up to {rate:.1f} rad/s bends them by up to {math.degrees(0.1 * rate):.0f} degrees" in note
     assert cut(in_order(spin, timed))[1].notes() == []
     assert cut(in_order(wheels(2.0, turned=lambda t: (3.0, 3.0)), [scan(0.1 * i) for i in range(1, 15)]))[1].notes() == []
 
