@@ -656,6 +656,20 @@ def test_scans_that_hold_nothing_to_match_are_told(estimator: str, driven: rooms
         assert core.notes() == ["10 scans had too few points on walls to be matched: the wheels carried on alone."]
 
 
+def test_scans_that_cannot_be_true_are_told(driven: rooms.Drive) -> None:
+    frozen = scans_of(driven)[40]
+    scans = [replace(frozen, stamp_ns=s.stamp_ns) if 40 < k <= 50 else s for k, s in enumerate(scans_of(driven)[:75])]
+    strange = replace(scans[60], points=scans[60].points + np.array([0.9, 0.4, 0.0]))
+    core = Core(Pair(make_model("diff_drive", rooms.ROBOT), "ekf"), rooms.ROBOT, driven.mounts, True, ReplayConfig())
+    wheels = (e for e in driven.events if not isinstance(e, Scan))
+    for event in sorted([*scans[:60], strange, *scans[61:], *wheels], key=lambda e: e.stamp_ns):
+        core.push(event)
+    assert core.notes() == [
+        "10 scans told the very same ranges as the one before although the robot drove: the wheels carried on alone.",
+        "1 scan would have moved the robot as no slip can: the wheels carried on alone.",
+    ]
+
+
 def test_a_degenerate_scene_is_counted() -> None:
     drive = rooms.drive_through(CORRIDOR, rooms.path((3.0, 0.5, 0.0)), 0, noise=NO_SLIP, scanner=rooms.Beams(longest=20.0))
     _, counts = run(drive, lambda k, s: s)

@@ -14,6 +14,12 @@ from motion_models.corrections import Form, correctable
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
+_MISSED = {
+    "sparse": "had too few points on walls to be matched",
+    "stale": "told the very same ranges as the one before although the robot drove",
+    "jumps": "would have moved the robot as no slip can",
+}
+
 
 @dataclass(frozen=True)
 class ReplayConfig:
@@ -77,9 +83,11 @@ class Core:
 
     def notes(self) -> list[str]:
         """What was found amiss with the sensors on the way."""
-        sparse = self.estimator.counts().get("sparse", 0)
-        said = f"{sparse} scan{'s' * (sparse > 1)} had too few points on walls to be matched: the wheels carried on alone."
-        return [*self.stepper.notes(), *([said] if sparse else [])]
+        counts = self.estimator.counts()
+        missed = [
+            f"{n} scan{'s' * (n > 1)} {what}: the wheels carried on alone." for name, what in _MISSED.items() if (n := counts.get(name, 0))
+        ]
+        return [*self.stepper.notes(), *missed]
 
     def meet(self, mounts: Mapping[str, Mount]) -> bool:
         """Take in places of frames that are known only now; one that is known already stays. Returns whether there were any."""
