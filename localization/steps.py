@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -92,8 +91,7 @@ class Stepper:
         self._scans: deque[Scan] = deque()
         self._empty_scans, self._late_scans, self._deaf_s = 0, 0, 0.0
         self._lost_s = 0.0  # how long no wheels have been heard
-        self._timeless = 0  # scans without the times of their points; below, how fast the robot turned, and how often they come
-        self._fastest, self._period_s = 0.0, math.inf
+        self._timeless, self._has_turned = 0, False  # scans without the times of their points, and whether the robot turned at one
         self._start_ns: int | None = None
         self._now_ns = -(1 << 62)
         self.clock_offset_s = 0.0
@@ -135,11 +133,10 @@ class Stepper:
             said.append(f"{self._empty_scans} scan{'s' * (self._empty_scans > 1)} without a usable point: the wheels carried on alone.")
         if self._late_scans:
             said.append(f"{self._late_scans} scan{'s' * (self._late_scans > 1)} came after later ones and could not be used.")
-        if self._fastest:
+        if self._has_turned:
             said.append(
-                f"{self._timeless} scan{'s' * (self._timeless > 1)} without the times of their points, taken as seen at once: "
-                f"if the scanner sweeps, turning at up to {self._fastest:.1f} rad/s bends them by up to "
-                f"{math.degrees(self._fastest * self._period_s):.0f} degrees."
+                f"{self._timeless} scan{'s' * (self._timeless > 1)} without the times of their points, taken as seen at once: if the "
+                "scanner sweeps, turns bend them. Have its driver tell the times (time_increment of a scan, a field of a cloud)."
             )
         if self._deaf_s > 0.0:
             said.append(f"no wheels were heard for {self._deaf_s:.1f} s in all: there the motion is a guess with a wide covariance.")
@@ -202,10 +199,7 @@ class Stepper:
         turn = self._gyro.turn(start_ns, end_ns, float(motion.delta[2])) if end_ns > start_ns else None
         if scan is not None and len(scan.points) and not len(scan.offsets):
             self._timeless += 1
-            if motion.delta[2] and missing == 0.0:
-                seconds = (end_ns - start_ns) * _NS
-                self._period_s = min(self._period_s, seconds)
-                self._fastest = max(self._fastest, abs(float(motion.delta[2])) / seconds)
+            self._has_turned |= bool(motion.delta[2])
         if missing == 0.0 and len(rates):
             return Step(start_ns, end_ns, motion, d_clock, last, standing, True, turn, scan)
         last = np.zeros(3)
