@@ -6,7 +6,6 @@ A TUM file has one pose a line, ``timestamp tx ty tz qx qy qz qw``, in seconds a
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from localization.errors import EvaluationError, OutputError
+from localization.errors import EvaluationError
+from localization.output import output_errors, refuse_existing
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
@@ -147,17 +147,14 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
         sign = "-" if stamp < 0 else ""
         qz, qw = math.sin(0.5 * theta), math.cos(0.5 * theta)
         lines.append(f"{sign}{seconds}.{nanoseconds:09d} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}\n")
-    if path.exists() or path.is_symlink():
-        raise OutputError(f"'{path}' exists already. Remove it or choose another name.")
+    refuse_existing(path)
     beside = path.with_name(f".{path.name}.new")  # one that a killed process has left is written over
-    try:
-        beside.write_text("".join(lines), encoding="ascii", newline="\n")
-        beside.replace(path)
-    except OSError as error:
-        raise OutputError(f"'{path}' cannot be written: {error.strerror}.") from error
-    finally:
-        with contextlib.suppress(OSError):
-            beside.unlink()
+    with output_errors(path):
+        try:
+            beside.write_text("".join(lines), encoding="ascii", newline="\n")
+            beside.replace(path)
+        finally:
+            beside.unlink(missing_ok=True)
 
 
 def read_tum(path: str | Path) -> Trajectory:

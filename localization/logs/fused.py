@@ -39,7 +39,7 @@ from rosbags.typesys.stores.ros2_humble import std_msgs__msg__Header as Header
 from rosbags.typesys.stores.ros2_humble import tf2_msgs__msg__TFMessage as TFMessage
 
 from localization.errors import OutputError
-from localization.logs.output import output_errors, refuse_existing
+from localization.output import output_errors, refuse_existing
 from motion_models.se2 import FloatArray
 
 UNKNOWN_VARIANCE = 1e6

@@ -10,7 +10,7 @@ from typing import Any
 from rosbags import rosbag1, rosbag2
 
 from localization.logs.forms import STORE, STORE_ROS1, Form, Message, Template
-from localization.logs.output import output_errors, refuse_existing, unwritable
+from localization.output import output_errors, refuse_existing, unwritable
 
 _LATCHED_TOPIC = "/tf_static"
 

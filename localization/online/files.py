@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TextIO
 
 from localization.errors import OutputError
-from localization.logs.output import output_errors, refuse_existing
+from localization.output import output_errors, refuse_existing
 
 _SUFFIXES = (".mcap", ".tum")
 

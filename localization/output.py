@@ -1,4 +1,4 @@
-"""Logs are written to places that nothing stands in, and what goes wrong there is told with the place."""
+"""Logs and trajectories are written to places that nothing stands in, and what goes wrong there is told with the place."""
 
 from __future__ import annotations
 
