@@ -91,6 +91,7 @@ class Stepper:
         self._scans: deque[Scan] = deque()
         self._empty_scans, self._late_scans, self._deaf_s = 0, 0, 0.0
         self._lost_s = 0.0  # how long no wheels have been heard
+        self._lost_var = np.array([self.config.lost_speed_m_s, self.config.lost_speed_m_s, self.config.lost_rate_rad_s]) ** 2
         self._timeless, self._has_turned = 0, False  # scans without the times of their points, and whether the robot turned at one
         self._start_ns: int | None = None
         self._now_ns = -(1 << 62)
@@ -189,12 +190,11 @@ class Stepper:
         elif start_ns == end_ns:  # a scan sweeps on from here, the first one of a drive too
             rates, cg = self._wheels.at(end_ns + shift, self.config.max_hold_s)
             last = self._model.twist(rates, cg, self.params).value.sum(axis=0)
-        lost = np.array([self.config.lost_speed_m_s, self.config.lost_speed_m_s, self.config.lost_rate_rad_s]) ** 2
         before, self._lost_s = self._lost_s, missing + (0.0 if len(dt) else self._lost_s)
         if missing:
             self._deaf_s += missing
             # a velocity that lasts takes the robot as far as the time, however that is cut into steps
-            motion = Motion(motion.delta, motion.cov + np.diag(lost * ((before + missing) ** 2 - before**2)), motion.d_params)
+            motion = Motion(motion.delta, motion.cov + np.diag(self._lost_var * ((before + missing) ** 2 - before**2)), motion.d_params)
         standing = bool(len(dt)) and missing == 0.0 and not rates.any()
         turn = self._gyro.turn(start_ns, end_ns, float(motion.delta[2])) if end_ns > start_ns else None
         if scan is not None and len(scan.points) and not len(scan.offsets):
@@ -202,7 +202,7 @@ class Stepper:
             self._has_turned |= bool(motion.delta[2])
         if missing == 0.0 and len(rates):
             return Step(start_ns, end_ns, motion, d_clock, last, standing, True, turn, scan)
-        last = np.zeros(3)
+        last, lost = np.zeros(3), self._lost_var.copy()
         if turn is not None:
             last[2] = turn.angle / turn.duration
             lost[2] = turn.variance / turn.duration**2 + self._robot.gyro_noise.bias_sigma_rad_per_s**2

@@ -9,13 +9,13 @@ import pytest
 from scipy.linalg import eigh
 
 from localization.consistency import mean_band
-from localization.estimators.account import _LOOSE, Account
+from localization.estimators.account import _LOOSE, Account, _shared
 from localization.estimators.ekf import Ekf
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.witness import ScanWitness
 from localization.events import Scan
 from localization.lidar import LidarConfig, LidarMatcher, MapTie, body_points
-from localization.lidar.lines import FitOptions, LineMap, Spread
+from localization.lidar.lines import LEVER_M, FitOptions, LineMap, Spread
 from localization.lidar.noise import Noise
 from localization.lidar.track import positive_part
 from localization.simulate import world
@@ -56,7 +56,7 @@ def test_it_is_the_covariance_of_errors_that_are_made() -> None:
         account.move(delta, F[:3, 3:], Q)
         told = np.linalg.inv(spd(rng, 3, 0.02))
         old = 0.8 * np.linalg.inv(np.linalg.inv(told) + spd(rng, 3, 0.02))
-        all_of = told + np.diag(_LOOSE)  # with what holds it where the scene does not
+        all_of = told + _LOOSE * np.eye(3)  # with what holds it where the scene does not
         kept, total = np.linalg.solve(all_of, old), np.linalg.inv(told + 0.1 * np.eye(3))
         if held is not None:  # where it is more than three times that by which the last scan was held, the rest was drawn of late
             back = np.linalg.inv(F[:3, :3])
@@ -135,6 +135,21 @@ def test_in_a_room_errors_are_as_large_as_is_said(kind: str) -> None:
     low, high = mean_band(RUNS, 3.0)
     assert low <= np.mean(nees) <= high
     assert np.mean(yaw) < mean_band(RUNS, 1.0)[1]  # what the sweep adds: without it, some five times too sure of the heading
+
+
+def test_no_error_of_the_map_grows_from_scan_to_scan() -> None:
+    """Also where walls are so nearly parallel that one scan by itself would make a hundred times as much of it."""
+    rng, scale, grown = np.random.default_rng(3), np.array([1.0, 1.0, LEVER_M]), 0
+    for _ in range(300):
+        angle, apart = rng.uniform(-np.pi, np.pi), 10.0 ** rng.uniform(-4.0, 0.0)
+        n = np.array([[np.cos(a), np.sin(a), rng.normal()] for a in (angle, angle + apart, angle - 0.5 * apart)])
+        parts = [10.0 ** rng.uniform(3.0, 8.0) * np.outer(row, row) for row in n]
+        information, old = sum(parts), parts[0] + rng.uniform() * parts[1]
+        _, kept, fresh = _shared(information, old, 0.4 * information, np.zeros((3, 3)))
+        grown += np.linalg.norm(np.linalg.solve(information + _LOOSE * np.eye(3), old) * scale[:, None] / scale, 2) > 2.0
+        assert np.linalg.norm(kept * scale[:, None] / scale, 2) < 1.0 + 1e-6
+        assert np.linalg.eigvalsh(fresh).min() > -1e-12
+    assert grown > 30  # or nothing was held back
 
 
 LONG_WALLS = {

@@ -14,10 +14,11 @@ import math
 import numba
 import numpy as np
 
-from localization.estimators.error_states import cloned, corrected, eigen, moved, quick_inverse, replace
+from localization.estimators.error_states import cloned, corrected, eigen, moved, of_eigen, quick_inverse, replace
 from localization.estimators.graph_qr import add_outer, add_spread, product
 from localization.estimators.revisit_update import revisited_covariance
 from localization.lidar import MapTie, Revisit
+from localization.lidar.lines import LEVER_M
 from localization.lidar.revisit import slip_of
 from localization.lidar.track import Place, Track
 from localization.lidar.track import moved as moved_place
@@ -27,8 +28,7 @@ from motion_models.se2 import FloatArray, triple
 _POSE = slice(0, 3)
 _PLACE_M, _PLACE_RAD = 1.0, 0.5  # what is remembered of the way
 # Where the scene holds nothing, the map is where it was last drawn. Of what it does hold, the scans' error of millimetres is to last.
-_LOOSE = (0.3**-2, 0.3**-2, 0.3**-2)  # [1 / m^2, 1 / m^2, 1 / rad^2]
-_LEVER_M = 5.0  # by which a turn is compared with a shift
+_LOOSE = 0.3**-2  # [1 / m^2, 1 / rad^2]
 _ALIKE = 3.0  # informations of one scene differ by less, from scan to scan
 
 
@@ -143,17 +143,11 @@ def _shared(
     robot stays, it learns no more of its place and forgets nothing of it. With C = L^-1, what is new of the map adds C (L - old) C, which
     is (1 - ``kept``) C, and the map's part of that is noise.
     """
-    held, fresh = information.copy(), np.zeros((3, 3))
-    for i in range(3):
-        held[i, i] += _LOOSE[i]
+    held = information + _LOOSE * np.eye(3)
     C = quick_inverse(held)
     kept, by_map = _shrunk(product(C, old)), product(product(C, of_map), C) + bent
     values, vectors = eigen(by_map - product(kept, by_map))
-    for k in range(3):
-        for i in range(3):
-            for j in range(3):
-                fresh[i, j] += max(values[k], 0.0) * vectors[i, k] * vectors[j, k]
-    return held, kept, fresh
+    return held, kept, of_eigen(np.maximum(values, 0.0), vectors)
 
 
 @numba.njit(cache=True)
@@ -163,20 +157,16 @@ def _shrunk(kept: FloatArray) -> FloatArray:  # pragma: no cover
     Walls that are nearly parallel turn an error across them into a larger one along them. One scan is right to do so, but scan by scan
     the direction along them changes a little, and a product of many such would grow without bound.
     """
-    scaled, squares, less = kept.copy(), np.zeros((3, 3)), np.zeros((3, 3))
+    scaled, squares = kept.copy(), np.zeros((3, 3))
     for i in range(2):
-        scaled[2, i] *= _LEVER_M
-        scaled[i, 2] /= _LEVER_M
+        scaled[2, i] *= LEVER_M
+        scaled[i, 2] /= LEVER_M
     add_outer(squares, scaled.T.copy(), scaled.T.copy())
     values, vectors = eigen(squares)
-    for k in range(3):
-        for i in range(3):
-            for j in range(3):
-                less[i, j] += vectors[i, k] * vectors[j, k] / math.sqrt(max(values[k], 1.0))
-    scaled = product(scaled, less)
+    scaled = product(scaled, of_eigen(1.0 / np.sqrt(np.maximum(values, 1.0)), vectors))
     for i in range(2):
-        scaled[2, i] /= _LEVER_M
-        scaled[i, 2] *= _LEVER_M
+        scaled[2, i] /= LEVER_M
+        scaled[i, 2] *= LEVER_M
     return scaled
 
 

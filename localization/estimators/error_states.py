@@ -201,3 +201,15 @@ def eigen(A: FloatArray) -> tuple[FloatArray, FloatArray]:  # pragma: no cover
     for i in range(n):
         values[i] = D[i, i]
     return values, V
+
+
+@numba.njit(cache=True)
+def of_eigen(values: FloatArray, vectors: FloatArray) -> FloatArray:  # pragma: no cover
+    """(n, n) the symmetric matrix with eigenvalues ``values`` (n,) and eigenvectors ``vectors`` (n, n), in columns."""
+    n = len(values)
+    out = np.zeros((n, n))
+    for k in range(n):
+        for i in range(n):
+            for j in range(n):
+                out[i, j] += values[k] * vectors[i, k] * vectors[j, k]
+    return out

@@ -22,7 +22,8 @@ AT_ONCE = np.empty(0)
 """Offsets in time of points that were all seen at once."""
 # Where the scene holds nothing, the measurement's sigma: metres, metres, radians. It decides nothing, it only keeps numbers finite.
 _NOTHING = np.diag([10.0**-2, 10.0**-2, 3.0**-2])
-_LEVER_M = 5.0  # by which a turn is compared with a shift
+LEVER_M = 5.0
+"""By which a turn is compared with a shift."""
 
 
 @dataclass(frozen=True)
@@ -247,7 +248,7 @@ def _known(information: FloatArray) -> FloatArray:
     (a, b, c), (_, d, e), (_, _, f) = information.tolist()
     if a > 0.0 and a * d > b * b and a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d) > 0.0:
         return information
-    scale = np.array([1.0, 1.0, _LEVER_M])
+    scale = np.array([1.0, 1.0, LEVER_M])
     return positive_part(information / np.outer(scale, scale)) * np.outer(scale, scale)
 
 
