@@ -68,6 +68,21 @@ class Scan:
     frame_id: str = ""
     is_planar: bool = True
 
+    @property
+    def middle_s(self) -> float:
+        """Middle of the sweep, after `stamp_ns` [s]."""
+        return 0.5 * (float(self.offsets.min()) + float(self.offsets.max())) if len(self.offsets) else 0.0
+
+    @property
+    def middle_ns(self) -> int:
+        """Middle of the sweep: the moment of which a scan measures the pose."""
+        return self.stamp_ns + round(self.middle_s * 1e9)
+
+    @property
+    def times_from_middle(self) -> FloatArray:
+        """(N,) time of each point after the middle of the sweep [s], or (0,) where the log does not tell."""
+        return self.offsets - self.middle_s if len(self.offsets) else self.offsets
+
     def __post_init__(self) -> None:
         rows = np.shape(self.points)[:1]
         _check_shape(self, "points", (*rows, 3))

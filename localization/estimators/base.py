@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from localization.steps import Step
+from localization.synchronizer import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.se2 import FloatArray

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from localization.estimators.base import NO_POINTS, Estimate, mean_twist
-from localization.steps import Step
+from localization.synchronizer import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.se2 import FloatArray

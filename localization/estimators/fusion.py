@@ -1,130 +1,165 @@
-"""Wheels, gyro and LiDAR in one filter, with the map that the filter itself draws.
-
-The wheels say where to look for the scan in the map; what the scan then says of the pose, its covariance included, comes from scan and
-map alone, so nothing is counted twice. The scan enters the map where the fused estimate puts it: a place seen again pulls the robot back.
-"""
+"""Odometry: wheels, gyro and LiDAR in the filter, and the submap that the filter's poses draw. Poses are ``odom_T_body``."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from localization.estimators.base import NO_POINTS, Estimate, mean_twist
-from localization.estimators.ekf import BIAS, CLOCK, PARAMS, POSE, Ekf, EkfConfig
-from localization.estimators.teaching import teaching
-from localization.estimators.witness import ScanWitness, Witness
-from localization.lidar import LidarConfig
-from localization.steps import Step
+from localization.estimators.filter import BIAS, CLOCK, PARAMS, POSE, SCALE, START, Filter, FilterConfig
+from localization.lidar import LidarConfig, LostScans, ScanMatch, ScanMatchingSensor
+from localization.settings import Positive, Settings
+from localization.synchronizer import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
-from motion_models.base import MotionModel
+from motion_models.base import Motion, MotionModel
 from motion_models.corrections import Corrections
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
+_MAX_STANDSTILL_M, _MAX_STANDSTILL_RAD = 0.01, 0.01
+"""A scan or a turn of the gyro that is off by more, and by 5 sigma, contradicts wheels that stand [m, rad]."""
+_SIGMAS = 5.0
+_BLOCKED_SPEED = np.array([0.5, 0.5, 0.5])
+"""Sigma of the twist where wheels read zero but the robot moves [m/s, m/s, rad/s]."""
+
+
+@dataclass(frozen=True)
+class FusionConfig:
+    """Settings of filter and scan matching."""
+
+    filter: FilterConfig = field(default_factory=FilterConfig)
+    lidar: LidarConfig = field(default_factory=LidarConfig)
+
 
 class EkfFusion:
-    """The filter's steps in their order, and the counts of what happened."""
+    """`step` after `step`: predict by the wheels, update by the gyro, match the scan, update by it; the submap grows afterwards."""
 
-    def __init__(
-        self,
-        model: MotionModel,
-        corrected: Corrections,
-        robot: Robot,
-        mounts: Mapping[str, Mount],
-        has_lidar: bool,
-        config: EkfConfig | None = None,
-        lidar: LidarConfig | None = None,
-        witness: Witness | None = None,
-    ) -> None:
-        """``witness`` measures the motion between scans; if not given, scans are matched as ``lidar`` says."""
-        config = config or EkfConfig()
-        # without a LiDAR there is no second clock until a gyro is heard
-        self._ekf = Ekf(robot.gyro_noise, corrected, config if has_lidar else replace(config, clock_sigma_s=0.0))
-        self._clock_sigma_s = 0.0 if has_lidar else config.clock_sigma_s
-        self._witness = (witness or ScanWitness(mounts, lidar)) if has_lidar else None
-        self._model, self._corrected, self._track_m = model, corrected, robot.geometry.track_width_m
-        self._has_gyro = False
-        self._to_settle: tuple[Step, bool] | None = None  # a step with a scan, and whether that was matched
-        self._counts = dict.fromkeys(("scans", "matched", "contradictions", "standing", "revisits"), 0)
+    def __init__(self, model: MotionModel, corrections: Corrections, robot: Robot, sensor: ScanMatchingSensor | None, config: FilterConfig):
+        """``sensor``: None without a LiDAR; then there is no second clock until the gyro's first reading."""
+        self._clock_sigma_s = config.clock_sigma_s if sensor is None else 0.0
+        self.filter = Filter(robot.gyro_noise, corrections, replace(config, clock_sigma_s=0.0) if sensor is None else config)
+        self._sensor, self._model, self._corrections = sensor, model, corrections
+        self._track_m = robot.geometry.track_width_m
+        self._slip = np.zeros(3)  # twist that the wheels missed in the last step
+        self._has_gyro = self._is_blocked = self._is_scan_pending = False
+        self.counts_by_name = dict.fromkeys(("scans", "matched", "standing", "searched"), 0)
 
     @property
     def clock_offset_s(self) -> float:
-        return self._ekf.clock_offset
+        return self.filter.clock_offset
 
     @property
     def params(self) -> FloatArray:
-        return np.asarray(self._model.nominal + self._corrected.directions @ self._ekf.correction)
+        return np.asarray(self._model.nominal + self._corrections.directions @ self.filter.corrections)
+
+    @property
+    def lost(self) -> LostScans | None:
+        """Scans that could not be matched; None without a LiDAR."""
+        return None if self._sensor is None else self._sensor.lost
 
     def step(self, step: Step) -> Estimate:
+        """Predict, update by the gyro, update by the scan."""
         self.settle()
-        ekf, nis = self._ekf, None
-        ekf.predict(teaching(step, self._track_m, self._corrected, ekf.covariance[PARAMS:, PARAMS:]))
+        ekf, nis = self.filter, None
+        step = self._check_standstill(step)
+        ekf.predict(step, self._is_turning(step.predicted))
         if step.turn is not None:
-            ekf.measure_turn(step.turn)
-            if not self._has_gyro:
-                self._has_gyro = True
-                ekf.meet_clock(self._clock_sigma_s)
-        if step.is_standing:
-            self._counts["standing"] += 1
-            ekf.measure_standing()
-        if step.scan is not None and self._witness is not None:
-            nis = self._look(step, self._witness)
-        twist, twist_cov = self._twist(step)
-        return Estimate(step.end_ns, ekf.pose, ekf.errors[POSE, POSE], twist, twist_cov, nis)
-
-    def _look(self, step: Step, witness: Witness) -> float | None:
-        ekf, nis = self._ekf, None
-        self._counts["scans"] += 1
-        seen = witness.look(step, ekf.anchor, ekf.pose)
-        if seen is not None:
-            self._counts["matched"] += 1
-            nis = ekf.measure_motion(seen.motion, seen.trust, seen.tie)
-            self._counts["contradictions"] += nis > ekf.gate
-        if witness.can_begin:
-            self._to_settle = step, seen is not None
-        return nis
+            self._start_gyro()
+            ekf.update_turn(step.turn)
+        if step.scan is not None and self._sensor is not None:
+            nis = self._update_scan(step, self._sensor)
+        delta, cov = ekf.motion_since(START)
+        twist, twist_cov = mean_twist(delta, cov, step.duration) if step.duration > 0.0 else (step.twist, None)
+        self._slip = twist - _mean_twist(step)
+        return Estimate(step.end_ns, ekf.pose, ekf.P[POSE, POSE].copy(), twist, twist_cov, nis)
 
     def settle(self) -> None:
-        """Whether the place was seen long before; the last scan enters the map."""
-        if self._to_settle is None or self._witness is None:
+        """The last scan enters the submap, if it is a key scan. Deferred until its estimate is out."""
+        if not self._is_scan_pending or self._sensor is None:
             return
-        ekf, witness, (step, is_matched) = self._ekf, self._witness, self._to_settle
-        self._to_settle = None
-        if is_matched and (known := witness.recall(step, ekf.pose, ekf.covariance[POSE, POSE])) is not None:
-            self._counts["revisits"] += 1
-            before = ekf.pose
-            ekf.measure_revisit(known)
-            witness.correct(before, ekf.pose)
-        ekf.set_anchor(witness.remember(step, ekf.pose))
+        self._is_scan_pending = False
+        if self._sensor.is_key(self.filter.pose):
+            self.filter.insert_key_scan(*self._sensor.insert_key_scan(self.filter.pose))
 
-    def _twist(self, step: Step) -> tuple[FloatArray, FloatArray | None]:
-        """Mean twist of the step as all witnesses see it."""
-        if step.duration <= 0:
-            return step.twist, None
-        delta = se2.between(self._ekf.start, self._ekf.pose)
-        return mean_twist(delta, self._ekf.motion_cov(delta), step.duration)
+    def _update_scan(self, step: Step, sensor: ScanMatchingSensor) -> float | None:
+        ekf, duration = self.filter, step.duration
+        self.counts_by_name["scans"] += 1
+        prior, cov = ekf.pose, ekf.map_relative_cov()
+        match = sensor.measure(step, prior, cov, step.twist + self._slip)
+        self._is_scan_pending = True
+        if match is None:
+            return None
+        if duration > 0.0:
+            seen = se2.log(se2.between(ekf.start, match.pose)) / duration
+            match = sensor.refine(match, step.twist + seen - _mean_twist(step))
+        self.counts_by_name["matched"] += 1
+        self.counts_by_name["searched"] += bool(match.outlier_cov.any())
+        self._is_blocked = step.is_standing and _is_contradicted(prior, cov, match)
+        return ekf.update_scan(match.measured, match.cov, match.outlier_cov)
+
+    def _is_turning(self, motion: Motion) -> bool:
+        """Whether ``motion`` turns enough to say something of the corrections."""
+        d = motion.delta
+        return bool(abs(d[2]) * self._track_m >= self._corrections.least_turn * math.hypot(d[0], d[1]))
+
+    def _check_standstill(self, step: Step) -> Step:
+        """Wheels that read zero while gyro or scans show motion count as unknown."""
+        if not step.is_standing:
+            return step
+        if step.turn is not None and self._has_gyro:
+            turned = abs(step.turn.angle - self.filter.bias * step.turn.duration)
+            sigma = math.sqrt(step.turn.variance + self.filter.P[BIAS, BIAS] * step.turn.duration**2)
+            self._is_blocked |= turned > max(_SIGMAS * sigma, _MAX_STANDSTILL_RAD)
+        if not self._is_blocked:
+            self.counts_by_name["standing"] += 1
+            return step
+        unknown = np.diag((_BLOCKED_SPEED * step.duration) ** 2)
+        return replace(step, predicted=Motion(step.predicted.delta, step.predicted.cov + unknown, step.predicted.d_params))
+
+    def _start_gyro(self) -> None:
+        """With the gyro's first reading there is a second clock, from which the wheels' may be off."""
+        if not self._has_gyro:
+            self._has_gyro = True
+            self.filter.P[CLOCK, CLOCK] += self._clock_sigma_s**2
 
     def finish(self, moments: Trajectory | None = None) -> None:
         self.settle()
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
-        found = {}
+        ekf, found = self.filter, {}
+        sigmas = np.sqrt(np.diagonal(ekf.P))
         if self._has_gyro:
-            found["gyro_bias_rad_per_s"] = self._ekf.bias, math.sqrt(self._ekf.covariance[BIAS, BIAS])
-        if self._witness is not None or self._has_gyro:
-            found["wheel_clock_offset_s"] = self._ekf.clock_offset, math.sqrt(self._ekf.covariance[CLOCK, CLOCK])
+            found["gyro_bias_rad_per_s"] = ekf.bias, float(sigmas[BIAS])
+            found["gyro_scale"] = ekf.scale, float(sigmas[SCALE])
+        if self._sensor is not None or self._has_gyro:
+            found["wheel_clock_offset_s"] = ekf.clock_offset, float(sigmas[CLOCK])
         nominal = dict(zip(self._model.param_names, self._model.nominal, strict=True))
-        for i, name in enumerate(self._corrected.names):
-            mean = nominal.get(name, 0.0) + self._ekf.correction[i]
-            found[name] = float(mean), math.sqrt(self._ekf.covariance[PARAMS + i, PARAMS + i])
+        for i, name in enumerate(self._corrections.names):
+            found[name] = float(nominal.get(name, 0.0) + ekf.corrections[i]), float(sigmas[PARAMS + i])
         return found
 
     def counts(self) -> Mapping[str, int]:
-        return self._counts if self._witness is None else {**self._counts, **self._witness.counts()}
+        return self.counts_by_name if self._sensor is None else {**self.counts_by_name, **self._sensor.lost.causes}
 
     def map_points(self) -> FloatArray:
-        return NO_POINTS if self._witness is None else self._witness.map_points()
+        return NO_POINTS if self._sensor is None else self._sensor.map_points()
+
+
+def _mean_twist(step: Step) -> FloatArray:
+    """(3,) of the wheels over the step."""
+    return se2.log(step.predicted.delta) / step.duration if step.duration > 0.0 else step.twist
+
+
+def _is_contradicted(prior: FloatArray, cov: FloatArray, match: ScanMatch) -> bool:
+    """Whether a scan shows that the robot moved although its wheels stand."""
+    off, sigma = np.abs(se2.log(se2.between(prior, match.measured))), np.sqrt(np.diagonal(cov + match.cov))
+    return bool((off > np.maximum(_SIGMAS * sigma, [_MAX_STANDSTILL_M, _MAX_STANDSTILL_M, _MAX_STANDSTILL_RAD])).any())
+
+
+def make_sensor(mounts: Mapping[str, Mount], config: LidarConfig, has_lidar: bool) -> ScanMatchingSensor | None:
+    """The LiDAR as a sensor, if there is one."""
+    return ScanMatchingSensor(mounts, config) if has_lidar else None

@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 from localization.errors import EstimatorError
 from localization.estimators.base import Estimator
 from localization.estimators.dead_reckoning import DeadReckoning
-from localization.estimators.ekf import EkfConfig
-from localization.estimators.fusion import EkfFusion
-from localization.estimators.graph_fusion import GraphConfig, GraphFusion
-from localization.estimators.lidar_alone import LidarAlone
+from localization.estimators.filter import FilterConfig
+from localization.estimators.fusion import EkfFusion, make_sensor
+from localization.estimators.lidar_odometry import LidarOdometry
 from localization.lidar import LidarConfig
 from motion_models.base import MotionModel
 from motion_models.corrections import Corrections, Form, corrections
@@ -22,8 +21,7 @@ from motion_models.robot import Mount, Robot
 class EstimatorConfig:
     """Settings of all estimators."""
 
-    ekf: EkfConfig = field(default_factory=EkfConfig)
-    graph: GraphConfig = field(default_factory=GraphConfig)
+    ekf: FilterConfig = field(default_factory=FilterConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig)
 
 
@@ -31,12 +29,9 @@ _Maker = Callable[[MotionModel, Corrections, Robot, Mapping[str, Mount], bool, E
 
 ESTIMATORS: Mapping[str, _Maker] = {
     "odometry": lambda model, corrected, robot, mounts, has_lidar, config, hindsight: DeadReckoning(),
-    "lidar": lambda model, corrected, robot, mounts, has_lidar, config, hindsight: LidarAlone(mounts, config.lidar),
+    "lidar": lambda model, corrected, robot, mounts, has_lidar, config, hindsight: LidarOdometry(mounts, config.lidar),
     "ekf": lambda model, corrected, robot, mounts, has_lidar, config, hindsight: EkfFusion(
-        model, corrected, robot, mounts, has_lidar, config.ekf, config.lidar
-    ),
-    "graph": lambda model, corrected, robot, mounts, has_lidar, config, hindsight: GraphFusion(
-        model, corrected, robot, mounts, has_lidar, config.graph, config.ekf, config.lidar, hindsight=hindsight
+        model, corrected, robot, make_sensor(mounts, config.lidar, has_lidar), config.ekf
     ),
 }
 

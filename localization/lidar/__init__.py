@@ -1,23 +1,9 @@
-"""LiDAR scan matching: KISS-ICP finds the pose, point-to-line steps refine it and say how sure it is."""
+"""LiDAR scan matching: scans to the submap of the last key scans, with a covariance from the scene."""
 
-from localization.lidar.check import ScanCheck
-from localization.lidar.matcher import LidarConfig, LidarMatcher, MapTie, Registration
-from localization.lidar.odometry import LidarOdometry
-from localization.lidar.revisit import Revisit, RevisitConfig, Way
-from localization.lidar.slip import Slip
-from localization.lidar.sweep import Sweep, body_points
+from localization.lidar.deskew import Sweep
+from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
+from localization.lidar.scan_checks import LostScans
+from localization.lidar.scan_matcher import LidarConfig, ScanMatch, ScanMatcher
+from localization.lidar.scan_matching import ScanMatchingSensor
 
-__all__ = [
-    "LidarConfig",
-    "LidarMatcher",
-    "LidarOdometry",
-    "MapTie",
-    "Registration",
-    "Revisit",
-    "RevisitConfig",
-    "ScanCheck",
-    "Slip",
-    "Sweep",
-    "Way",
-    "body_points",
-]
+__all__ = ["KissIcp", "LidarConfig", "LostScans", "ScanMatch", "ScanMatcher", "ScanMatchingSensor", "Sweep", "choose_voxel_size"]

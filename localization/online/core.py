@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from localization.estimators import CORRECTING, Estimate, Estimator, EstimatorConfig, make_estimator
 from localization.events import Event
-from localization.steps import Step, StepConfig, Stepper
+from localization.synchronizer import Step, StepConfig, Synchronizer
 from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.corrections import Form, correctable
@@ -56,7 +56,7 @@ class Core:
         self.mounts = dict(mounts)
         """Where frames are known to sit; shared by all who ask."""
         model = correctable(pair.model, pair.corrections) if pair.estimator in CORRECTING else pair.model
-        self.stepper = Stepper(model, robot, self.mounts, has_lidar, config.step)
+        self.stepper = Synchronizer(model, robot, self.mounts, has_lidar, config.step)
         self.wheel_twist: FloatArray | None = None
         """(3,) mean twist of the last step by the wheels alone; None where they were not heard during all of it."""
         self.estimator: Estimator = make_estimator(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -17,7 +17,7 @@ from localization.lidar_tilt import LidarTilt
 from localization.settings import Positive, Settings, at_least
 from localization.wheel_history import WheelHistory
 from motion_models import se2
-from motion_models.base import Motion, MotionModel
+from motion_models.base import Motion, MotionModel, Twist
 from motion_models.integrate import integrate_twists
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
@@ -62,8 +62,6 @@ class Step:
     """Wheels were heard during all of the step; of no duration, about then."""
     turn: Turn | None = None
     scan: Scan | None = None
-    twist_var: FloatArray = field(default_factory=lambda: np.zeros(3))
-    """(3,) of a ``twist`` that no wheels tell; zero where they do."""
 
     @property
     def duration(self) -> float:
@@ -71,7 +69,7 @@ class Step:
         return (self.end_ns - self.start_ns) * _NS
 
 
-class Stepper:
+class Synchronizer:
     """Cuts a stream of events into steps. Give it events with `push`; then take all steps that are ready.
 
     Streaming and bounded: a scan waits until the wheels were heard up to it, or for at most `StepConfig.wait_s`.
@@ -88,10 +86,10 @@ class Stepper:
         """Of the scans."""
         self._tilt = LidarTilt(mounts)
         self._has_lidar = has_lidar
-        self._scans: deque[Scan] = deque()
+        self._scans: deque[tuple[int, Scan]] = deque()  # and the middle of its sweep
         self._empty_scans, self._late_scans, self._deaf_s = 0, 0, 0.0
         self._lost_s = 0.0  # how long no wheels have been heard
-        self._lost_var = np.array([self.config.lost_speed_m_s, self.config.lost_speed_m_s, self.config.lost_rate_rad_s]) ** 2
+        self._speed = np.zeros(2)  # the last that wheels gave [m/s, rad/s]
         self._timeless, self._has_turned = 0, False  # scans without the times of their points, and whether the robot turned at one
         self._start_ns: int | None = None
         self._now_ns = -(1 << 62)
@@ -115,7 +113,7 @@ class Stepper:
             self._empty_scans += not len(event.points)
             self._tilt.see(event)
             # one that was overtaken goes where it belongs, if that still waits
-            self._scans.insert(bisect.bisect_right(self._scans, event.stamp_ns, key=lambda scan: scan.stamp_ns), event)
+            self._scans.insert(bisect.bisect_right(self._scans, event.middle_ns, key=lambda scan: scan[0]), (event.middle_ns, event))
         yield from self._ready(is_last=False)
 
     @property
@@ -156,10 +154,9 @@ class Stepper:
     def _next_end(self, is_last: bool) -> tuple[int, Scan | None] | None:
         """Where the next step ends, and the scan there; None while there is more to wait for, which ``is_last`` says will not come."""
         if self._scans:
-            scan = self._scans[0]
-            if is_last or self._is_heard(scan.stamp_ns) or self._now_ns > scan.stamp_ns + self.config.wait_s / _NS:
-                return scan.stamp_ns, self._scans.popleft()
-            return None
+            middle_ns, _ = self._scans[0]
+            is_late = self._now_ns > middle_ns + self.config.wait_s / _NS
+            return self._scans.popleft() if is_last or is_late or self._has_rates_until(middle_ns) else None
         if self._start_ns is None or self._wheels.newest_ns is None:
             return None
         end_ns = self._wheels.newest_ns - round(self.clock_offset_s / _NS)
@@ -173,44 +170,64 @@ class Stepper:
         least = _NS if is_last else self.config.no_lidar_step_s
         return None if end_ns - self._start_ns < least / _NS else (end_ns, None)
 
-    def _is_heard(self, stamp_ns: int) -> bool:
-        told = self._wheels.told_ns
-        return told is not None and told >= stamp_ns + self.clock_offset_s / _NS
+    def _has_rates_until(self, stamp_ns: int) -> bool:
+        known_ns = self._wheels.told_ns
+        return known_ns is not None and known_ns >= stamp_ns + self.clock_offset_s / _NS
 
     def _step(self, start_ns: int, end_ns: int, scan: Scan | None) -> Step:
         shift = round(self.clock_offset_s / _NS)
         dt, rates, cg, missing = self._wheels.window(start_ns + shift, end_ns + shift, self.config.max_hold_s)
-        twist = self._model.twist(rates, cg, self.params)
-        cg_cov = self._wheels.cg_cov
-        motion = integrate_twists(dt, twist, self._robot.wheel_noise, cg_cov if cg_cov.any() else None)
-        d_clock, last = np.zeros(3), np.zeros(3)
-        if len(dt):
-            first, last = twist.value[0], twist.value[-1]
-            d_clock = last - se2.adjoint(se2.inverse(motion.delta)) @ first
-        elif start_ns == end_ns:  # a scan sweeps on from here, the first one of a drive too
+        motion, d_clock, last = self._integrate(start_ns + shift, dt, rates, cg)
+        if start_ns == end_ns:  # the first scan of a drive: its sweep needs a twist
             rates, cg = self._wheels.at(end_ns + shift, self.config.max_hold_s)
             last = self._model.twist(rates, cg, self.params).value.sum(axis=0)
-        before, self._lost_s = self._lost_s, missing + (0.0 if len(dt) else self._lost_s)
-        if missing:
-            self._deaf_s += missing
-            # a velocity that lasts takes the robot as far as the time, however that is cut into steps
-            motion = Motion(motion.delta, motion.cov + np.diag(self._lost_var * ((before + missing) ** 2 - before**2)), motion.d_params)
-        standing = bool(len(dt)) and missing == 0.0 and not rates.any()
+        is_standing = bool(len(dt)) and missing == 0.0 and not rates.any()
+        has_wheels = missing == 0.0 and bool(len(rates))
+        motion = self._widen(motion, missing, has_rates=bool(len(dt)))
         turn = self._gyro.turn(start_ns, end_ns, float(motion.delta[2])) if end_ns > start_ns else None
         if scan is not None and len(scan.points) and not len(scan.offsets):
             self._timeless += 1
             self._has_turned |= bool(motion.delta[2])
-        if missing == 0.0 and len(rates):
-            return Step(start_ns, end_ns, motion, d_clock, last, standing, True, turn, scan)
-        last, lost = np.zeros(3), self._lost_var.copy()
-        if turn is not None:
-            last[2] = turn.angle / turn.duration
-            lost[2] = turn.variance / turn.duration**2 + self._robot.gyro_noise.bias_sigma_rad_per_s**2
-        return Step(start_ns, end_ns, motion, d_clock, last, standing, False, turn, scan, lost)
+        if has_wheels:
+            self._speed = np.array([float(np.hypot(last[0], last[1])), abs(float(last[2]))])
+        else:
+            last = np.array([0.0, 0.0, 0.0 if turn is None else turn.angle / turn.duration])
+        return Step(start_ns, end_ns, motion, d_clock, last, is_standing, has_wheels, turn, scan)
+
+    def _integrate(self, start_ns: int, dt: FloatArray, rates: FloatArray, cg: FloatArray) -> tuple[Motion, FloatArray, FloatArray]:
+        """Motion of the wheels over the intervals, its derivative by the wheels' clock (3,), and the twist (3,) at the end.
+
+        A window that is late by c has motion exp(-c twist_before) delta exp(c twist_end): the derivative is the twist just before the end
+        less that just before the start, seen from the end. It is not zero where each window has one wheel sample.
+        """
+        if not len(dt):
+            return Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, len(self.params)))), np.zeros(3), np.zeros(3)
+        before, before_cg = self._wheels.at(start_ns - 1, self.config.max_hold_s)
+        n = len(before)
+        twist = self._model.twist(np.vstack([before, rates]), np.vstack([before_cg, cg]), self.params)
+        cg_cov = self._wheels.cg_cov
+        inside = Twist(twist.value[n:], twist.d_wheels[n:], twist.d_cg[n:], twist.d_params[n:])
+        motion = integrate_twists(dt, inside, self._robot.wheel_noise, cg_cov if cg_cov.any() else None)
+        first, last = twist.value[0], twist.value[-1]
+        return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last
+
+    def _widen(self, motion: Motion, missing_s: float, has_rates: bool) -> Motion:
+        """``motion`` with the covariance of a velocity that is unknown for ``missing_s`` [s] of it, and lasts.
+
+        Such a velocity takes the robot as far as the time, however that is cut into steps. It may be as large as the last that was known.
+        """
+        before, self._lost_s = self._lost_s, missing_s + (0.0 if has_rates else self._lost_s)
+        if not missing_s:
+            return motion
+        self._deaf_s += missing_s
+        v = max(self.config.lost_speed_m_s, float(self._speed[0]))
+        w = max(self.config.lost_rate_rad_s, float(self._speed[1]))
+        grown = np.diag([v, v, w]) ** 2 * ((before + missing_s) ** 2 - before**2)
+        return Motion(motion.delta, motion.cov + grown, motion.d_params)
 
 
-def steps(events: Iterable[Event], stepper: Stepper) -> Iterator[Step]:
-    """All steps of a stream of events. `Stepper.clock_offset_s` may be changed between two of them."""
+def steps(events: Iterable[Event], synchronizer: Synchronizer) -> Iterator[Step]:
+    """All steps of a stream of events. `Synchronizer.clock_offset_s` may be changed between two of them."""
     for event in events:
-        yield from stepper.push(event)
-    yield from stepper.finish()
+        yield from synchronizer.push(event)
+    yield from synchronizer.finish()

@@ -1,4 +1,4 @@
-"""LiDAR alone: KISS-ICP as it comes, guessing by its own constant velocity. The other yardstick; wheels are never asked."""
+"""LiDAR alone: KISS-ICP as it comes, from its own constant-velocity guess. A baseline; wheels are not used."""
 
 from __future__ import annotations
 
@@ -8,33 +8,42 @@ import numpy as np
 
 from localization.errors import EstimatorError
 from localization.estimators.base import NO_POINTS, Estimate
-from localization.lidar import LidarConfig, LidarOdometry, body_points
-from localization.steps import Step
+from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
+from localization.lidar.scan_matcher import MIN_POINTS
+from localization.synchronizer import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
+_FALLBACK_VOXEL_M = 0.5
+"""Voxel where the first scan has too few points to choose one."""
 
-class LidarAlone:
+
+class LidarOdometry:
     """A pose for each scan; between scans it stays where it was. No covariance: KISS-ICP has none."""
 
     clock_offset_s = 0.0
     params = None
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig | None = None) -> None:
-        self._mounts, self._odometry = mounts, LidarOdometry(config)
-        self._used: dict[str, Mount] = {}  # a frame stays where it was taken to be: KISS-ICP has but one map, drawn from there
+        self._mounts, self._config = mounts, config or LidarConfig()
+        self._kiss: KissIcp | None = None
+        self._used: dict[str, Mount] = {}  # a frame keeps its first mount: KISS-ICP has but one map, drawn from there
         self._pose, self._twist, self._stamp_ns = np.zeros(3), np.zeros(3), 0
         self._n_scans = 0
 
     def step(self, step: Step) -> Estimate:
         if step.scan is not None:
-            frame = step.scan.frame_id
-            points = body_points(step.scan, self._used.setdefault(frame, self._mounts.get(frame, Mount())), self._twist)
-            pose = self._odometry.register(points)
+            frame, c = step.scan.frame_id, self._config
+            mount = self._used.setdefault(frame, self._mounts.get(frame, Mount()))
+            points = Sweep.from_scan(step.scan, mount).within(c.min_range_m, c.max_range_m).deskew(self._twist)
+            if self._kiss is None:
+                voxel = c.voxel_size_m or (choose_voxel_size(points) if len(points) >= MIN_POINTS else _FALLBACK_VOXEL_M)
+                self._kiss = KissIcp(voxel, c.max_range_m)
+            pose = self._kiss.register_frame(points)
             if not np.isfinite(pose).all():
-                raise EstimatorError(f"KISS-ICP lost itself at stamp {step.end_ns} ns: its pose is not finite.")
+                raise EstimatorError(f"KISS-ICP failed at stamp {step.end_ns} ns: its pose is not finite.")
             if self._n_scans and step.end_ns > self._stamp_ns:
                 self._twist = se2.log(se2.between(self._pose, pose)) / ((step.end_ns - self._stamp_ns) * 1e-9)
             self._pose, self._stamp_ns = pose, step.end_ns
@@ -54,4 +63,4 @@ class LidarAlone:
         return {"scans": self._n_scans}
 
     def map_points(self) -> FloatArray:
-        return self._odometry.point_cloud() if self._n_scans else NO_POINTS
+        return NO_POINTS if self._kiss is None else self._kiss.point_cloud()[:, :2]

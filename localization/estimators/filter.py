@@ -1,0 +1,182 @@
+"""Error-state extended Kalman filter on SE(2): wheels predict, gyro and scan matching update. One covariance.
+
+The mean pose lives on the manifold; the error state's mean is zero (Sola 2017, "Quaternion kinematics for the error-state Kalman filter"),
+with right perturbations: true pose = pose * exp(error).
+
+    e = [ pose, start, map, key, gyro bias, gyro scale, clock offset, corrections ]
+
+`start` and `key` are clones of the pose (Roumeliotis & Burdick 2002, stochastic cloning) at the start of the step and at the last keyframe.
+`map` is the error of the submap around the robot, seen from the body. Scans that are matched to one submap share that error, so it is a
+consider state (Schmidt 1966): its covariance and correlations count, its gain is zero, as the submap stays where it is drawn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from filterpy.kalman import predict as predict_linear
+
+from localization.errors import EstimatorError
+from localization.estimators.measurement_models import predict_turn, subtract_map_error
+from localization.gyro import Turn
+from localization.settings import Settings
+from localization.synchronizer import Step
+from motion_models import se2
+from motion_models.corrections import Corrections
+from motion_models.robot import GyroNoise
+from motion_models.se2 import FloatArray
+
+POSE, START, MAP, KEY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+BIAS, SCALE, CLOCK, PARAMS = 12, 13, 14, 15
+_MAX_NUMBER = 1e12
+"""No state or covariance of a robot on Earth is larger, in SI units."""
+
+
+@dataclass(frozen=True)
+class FilterConfig(Settings):
+    """Prior and process noise of the filter."""
+
+    clock_sigma_s: float = 0.1
+    """Sigma of the offset between the clocks of wheels and LiDAR at first [s]; 0 takes them as one."""
+    clock_walk_s_per_sqrt_s: float = 1e-4
+    """Random walk of the clock offset."""
+    standstill_m2_per_s: float = 1e-6
+    """Variance of the position while no wheel moves, per second: a push, a slope [m^2/s]."""
+    standstill_rad2_per_s: float = 1e-6
+    """The same for the yaw [rad^2/s]."""
+
+
+class Filter:
+    """State inside; `predict` and `update_...` advance it. All covariances are of right perturbations [m, m, rad]."""
+
+    def __init__(self, gyro: GyroNoise, corrections: Corrections, config: FilterConfig) -> None:
+        self._gyro, self._corrections, self._config = gyro, corrections, config
+        n = PARAMS + len(corrections.names)
+        self.pose, self.start, self.key = np.zeros(3), np.zeros(3), np.zeros(3)
+        """(3,) estimates of the pose, and of its clones."""
+        self.bias, self.scale, self.clock_offset = 0.0, 0.0, 0.0
+        self.corrections = np.zeros(len(corrections.names))
+        """(k,) added to the motion model's parameters along the corrections' directions."""
+        self.P = np.zeros((n, n))
+        self.P[BIAS, BIAS], self.P[SCALE, SCALE] = gyro.bias_sigma_rad_per_s**2, gyro.scale_sigma**2
+        self.P[CLOCK, CLOCK] = config.clock_sigma_s**2
+        self.P[PARAMS:, PARAMS:] = corrections.cov
+        self._consider = np.zeros(n, dtype=bool)
+        self._consider[MAP] = True
+        self._scan_noise: tuple[FloatArray, FloatArray] | None = None  # of the last scan: covariance with the errors (n, 3), own (3, 3)
+
+    def predict(self, step: Step, is_turning: bool = True) -> None:
+        """Move by the wheels' motion (delta, covariance, derivatives) of ``step``:
+
+        e_pose' = Ad(delta^-1) e_pose + (d delta / d clock) e_clock + (d delta / d params) e_params + slip.
+
+        Motion that is not ``is_turning`` says nothing of how the robot turns: until the next step, corrections are consider states.
+        """
+        motion, dt = step.predicted, step.duration
+        A = se2.adjoint(se2.inverse(motion.delta))
+        F = np.eye(len(self.P))
+        F[POSE, POSE] = A
+        F[POSE, CLOCK] = step.d_clock
+        F[POSE, PARAMS:] = motion.d_params @ self._corrections.directions
+        F[START, START], F[START, POSE] = 0.0, np.eye(3)  # the clone of the pose as it was
+        F[MAP, MAP] = A  # the same error of the submap, seen from where the body is now
+        Q = np.zeros_like(self.P)
+        Q[POSE, POSE] = motion.cov
+        Q[BIAS, BIAS] = self._gyro.bias_walk_rad_per_s_sqrt_s**2 * dt
+        if self._config.clock_sigma_s:
+            Q[CLOCK, CLOCK] = self._config.clock_walk_s_per_sqrt_s**2 * dt
+        if step.is_standing:
+            c = self._config
+            Q[POSE, POSE] += np.diag([c.standstill_m2_per_s, c.standstill_m2_per_s, c.standstill_rad2_per_s]) * dt
+        else:
+            Q[PARAMS:, PARAMS:] = self._corrections.walk_cov * dt
+        _, P = predict_linear(np.zeros(len(F)), self.P, F=F, Q=Q)  # P = F P F^T + Q
+        pose = se2.compose(self.pose, motion.delta)
+        _check(f"the motion of the wheels until stamp {step.end_ns} ns", pose, P)
+        self.start, self.pose, self.P = self.pose, pose, P
+        self._consider[PARAMS:], self._scan_noise = not is_turning, None
+
+    def update_turn(self, turn: Turn) -> float:
+        """The gyro's turn since the start of the step. Returns the normalised innovation squared (NIS, 1 degree of freedom)."""
+        predicted, by_pose, by_start, by_bias, by_scale = predict_turn(self.start, self.pose, turn, self.bias, self.scale)
+        H = np.zeros((1, len(self.P)))
+        H[:, POSE], H[:, START], H[0, BIAS], H[0, SCALE] = by_pose, by_start, by_bias, by_scale
+        return self._update(se2.wrap_angle(np.array([turn.angle - predicted])), H, np.array([[turn.variance]]))[0]
+
+    def update_scan(self, measured: FloatArray, R: FloatArray, outlier_cov: FloatArray) -> float:
+        """The pose (3,) that a scan has in the submap, with the scan's covariance ``R`` (3, 3). Returns its NIS (3 degrees of freedom).
+
+        ``outlier_cov`` (3, 3): what the wheels' motion is worse by than predicted.
+        """
+        self.P[POSE, POSE] += outlier_cov
+        innovation, by_pose, by_map = subtract_map_error(self.pose, measured)
+        H = np.zeros((3, len(self.P)))
+        H[:, POSE], H[:, MAP] = by_pose, by_map
+        nis, K = self._update(innovation, H, R)
+        self._scan_noise = K @ R, R
+        return nis
+
+    def insert_key_scan(self, weight: FloatArray, R: FloatArray) -> None:
+        """The last scan is drawn into the submap from the pose as it is: e_map' = (I - W) e_map + W (e_pose - n), W = ``weight`` (3, 3).
+
+        n is the scan's own noise. Where the scan was matched, the pose's error contains it already, by the gain K: cov(e, n) = K R. Else it
+        has the covariance ``R`` (3, 3).
+        """
+        C, R = self._scan_noise or (np.zeros((len(self.P), 3)), R)
+        G, B = np.eye(len(self.P)), np.zeros((len(self.P), 3))
+        G[MAP, MAP], G[MAP, POSE] = np.eye(3) - weight, weight
+        B[MAP] = -weight
+        self.P = _symmetric(G @ self.P @ G.T + G @ C @ B.T + B @ C.T @ G.T + B @ R @ B.T)
+
+    def start_key(self) -> None:
+        """Clone the pose: `key_motion` counts from here on."""
+        F = np.eye(len(self.P))
+        F[KEY, KEY], F[KEY, POSE] = 0.0, np.eye(3)
+        self.key, self.P = self.pose, F @ self.P @ F.T
+
+    def map_relative_cov(self) -> FloatArray:
+        """(3, 3) covariance of the pose against the submap around the robot: that of the prior of a match."""
+        P = self.P
+        return np.asarray(P[POSE, POSE] + P[MAP, MAP] - P[POSE, MAP] - P[MAP, POSE])
+
+    def motion_since(self, clone: slice) -> tuple[FloatArray, FloatArray]:
+        """Motion (3,) since the clone `START` or `KEY`, and its covariance (3, 3)."""
+        delta = se2.between(self.start if clone == START else self.key, self.pose)
+        J = np.hstack([np.eye(3), -se2.adjoint(se2.inverse(delta))])
+        states = np.r_[POSE, clone]
+        return delta, J @ self.P[np.ix_(states, states)] @ J.T
+
+    def _update(self, innovation: FloatArray, H: FloatArray, R: FloatArray) -> tuple[float, FloatArray]:
+        """Schmidt-Kalman update in Joseph's form; consider states have no gain. Returns NIS and gain. Raises `EstimatorError`."""
+        P = self.P
+        S = H @ P @ H.T + R
+        _check("a measurement", innovation, S)
+        K = np.linalg.solve(S, H @ P).T
+        K[self._consider] = 0.0
+        A = np.eye(len(P)) - K @ H
+        self.P = _symmetric(A @ P @ A.T + K @ R @ K.T)
+        _check("a measurement", self.P)
+        self._move(K @ innovation)
+        return float(innovation @ np.linalg.solve(S, innovation)), K
+
+    def _move(self, error: FloatArray) -> None:
+        """Move the means by the estimated ``error`` (n,)."""
+        self.pose = se2.compose(self.pose, se2.exp(error[POSE]))
+        self.start = se2.compose(self.start, se2.exp(error[START]))
+        self.key = se2.compose(self.key, se2.exp(error[KEY]))
+        self.bias += float(error[BIAS])
+        self.scale += float(error[SCALE])
+        self.clock_offset += float(error[CLOCK])
+        self.corrections = self.corrections + error[PARAMS:]
+
+
+def _symmetric(P: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (P + P.T))
+
+
+def _check(what: str, *arrays: FloatArray) -> None:
+    """Raises `EstimatorError` for numbers that would spoil the state for good."""
+    for array in arrays:
+        if not (np.abs(array) < _MAX_NUMBER).all():
+            raise EstimatorError(f"{what} has numbers that are not finite, or too large to compute with. Look at its source in the log.")

@@ -1,0 +1,147 @@
+"""Correlative search: the pose of a scan within a wide window, by exhaustive search over a pyramid of likelihood images (Olson 2009).
+
+Coarse images hold the maxima of what a coarse step can reach, so that a coarse score is never below that of the fine poses within.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from motion_models import se2
+from motion_models.se2 import FloatArray
+
+COARSE = 4
+"""Cells of a coarse step, and again from level to level."""
+_KEPT = 150
+"""Coarse candidates that are refined."""
+_MAX_CANDIDATES = 200_000
+"""Poses that the coarsest level may score; a wider window gets a coarser level."""
+_TOGETHER = 6.0
+"""Neighbouring beams that err together, where scores are compared: they hit one surface."""
+_APART_CELLS = 6
+"""A pose is another one, and not the flank of the best, from so many cells away on."""
+_MIN_YAW_STEP_RAD = 2e-3
+
+
+@dataclass(frozen=True, eq=False)
+class LikelihoodImage:
+    """How probable a point is in each cell: 1 at the points of a submap, falling off over a cell."""
+
+    levels: tuple[FloatArray, ...]
+    """Finest first; each holds the maxima of 4 x 4 cells of the one before, and of their neighbours."""
+    origin: FloatArray
+    """(2,) of all levels [m]."""
+    cell: float
+    """Edge of a cell of the finest level [m]."""
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    pose: FloatArray
+    """(3,) of the best score, prior included."""
+    score: float
+    """Mean likelihood of the points, 0 to 1."""
+    rival_score: float
+    """The best score of a pose elsewhere."""
+
+
+def draw_image(points: FloatArray, cell: float) -> LikelihoodImage:
+    """The image of ``points`` (N, 2) [m]."""
+    margin, step = 8 * cell, COARSE**2
+    origin = points.min(axis=0) - margin
+    shape = np.ceil((points.max(axis=0) + margin - origin) / cell).astype(int) + 8
+    fine = np.zeros(tuple((shape + step - 1) // step * step), np.float32)
+    _draw(points, fine, origin, cell)
+    levels = [fine]
+    for _ in range(2):
+        image = levels[-1]
+        blocks = image.reshape(image.shape[0] // COARSE, COARSE, image.shape[1] // COARSE, COARSE).max((1, 3))
+        padded = np.pad(blocks, 1)
+        shifted = [padded[i : i + blocks.shape[0], j : j + blocks.shape[1]] for i in range(3) for j in range(3)]
+        levels.append(np.ascontiguousarray(np.max(shifted, axis=0)))
+    return LikelihoodImage(tuple(levels), origin, cell)
+
+
+def search(image: LikelihoodImage, points: FloatArray, prior: FloatArray, cov: FloatArray, limit: FloatArray) -> SearchResult:
+    """The best pose of ``points`` (N, 2) of the body frame within 3 sigma of ``prior`` (3,), at most ``limit`` (3,) [m, m, rad] from it.
+
+    ``cov`` (3, 3) is that of the prior's right perturbation. Every score counts as the log-likelihood of N / 6 independent points.
+    """
+    world = _to_world(prior[2], cov)
+    half = np.minimum(3.0 * np.sqrt(np.diag(world)), limit)
+    reach = float(np.quantile(np.hypot(points[:, 0], points[:, 1]), 0.8))
+    yaw_step = max(image.cell / max(reach, 1e-3), _MIN_YAW_STEP_RAD)
+    yaws = np.arange(-math.ceil(half[2] / yaw_step), math.ceil(half[2] / yaw_step) + 1) * yaw_step
+    level = 1 if _count(half, len(yaws), image.cell * COARSE) <= _MAX_CANDIDATES else 2
+    step = image.cell * COARSE**level
+    axes = [np.arange(-math.ceil(h / step), math.ceil(h / step) + 1) * step for h in half[:2]]
+    a, x, y = np.meshgrid(np.arange(len(yaws)), *axes, indexing="ij")
+    offsets = np.stack([x.ravel(), y.ravel()], axis=-1)
+    turned = _turned_points(points, prior, yaws) - image.origin
+    rows = a.ravel()
+    while True:
+        scores = _score(image.levels[level], turned, rows, offsets, image.cell * COARSE**level)
+        if level == 0:
+            break
+        best = np.argsort(-scores, kind="stable")[: _KEPT if level == 1 else 20 * _KEPT]
+        level -= 1
+        fine = np.arange(-COARSE // 2, COARSE // 2) * image.cell * COARSE**level
+        dx, dy = (d.ravel() for d in np.meshgrid(fine, fine, indexing="ij"))
+        offsets = (offsets[best][:, None, :] + np.stack([dx, dy], axis=-1)).reshape(-1, 2)
+        rows = np.repeat(rows[best], COARSE**2)
+    shifts = np.column_stack([offsets, yaws[rows]])
+    return _pick(prior, shifts, scores, len(points), np.linalg.inv(world), np.array([image.cell, image.cell, yaw_step]))
+
+
+def _count(half: FloatArray, yaws: int, step: float) -> float:
+    return float((2.0 * half[0] / step + 3.0) * (2.0 * half[1] / step + 3.0) * yaws)
+
+
+def _pick(prior: FloatArray, shifts: FloatArray, scores: FloatArray, n: int, information: FloatArray, step: FloatArray) -> SearchResult:
+    log_likelihood = n / _TOGETHER * np.log(np.maximum(scores, 1e-6))
+    best = int(np.argmax(log_likelihood - 0.5 * np.einsum("ki,ij,kj->k", shifts, information, shifts)))
+    away = shifts - shifts[best]
+    is_elsewhere = (np.hypot(away[:, 0], away[:, 1]) > _APART_CELLS * step[0]) | (np.abs(away[:, 2]) > _APART_CELLS * step[2])
+    rival = float(scores[is_elsewhere].max()) if is_elsewhere.any() else 0.0
+    return SearchResult(prior + shifts[best], float(scores[best]), rival)
+
+
+def _to_world(yaw: float, cov: FloatArray) -> FloatArray:
+    """``cov`` (3, 3) of a right perturbation, along the world's axes."""
+    R = np.eye(3)
+    R[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+    return np.asarray(R @ cov @ R.T)
+
+
+def _turned_points(points: FloatArray, prior: FloatArray, yaws: FloatArray) -> FloatArray:
+    """(Y, N, 2) the points where the prior has them, turned by each of the ``yaws`` (Y,)."""
+    poses = np.column_stack([np.tile(prior[:2], (len(yaws), 1)), prior[2] + yaws])
+    return np.asarray(se2.transform(poses[:, None, :], points))
+
+
+@numba.njit(cache=True)
+def _draw(points: FloatArray, image: FloatArray, origin: FloatArray, cell: float) -> None:
+    for i in range(points.shape[0]):
+        x, y = (points[i, 0] - origin[0]) / cell, (points[i, 1] - origin[1]) / cell
+        for jx in range(int(x) - 2, int(x) + 3):
+            for jy in range(int(y) - 2, int(y) + 3):
+                value = math.exp(-0.5 * ((jx + 0.5 - x) ** 2 + (jy + 0.5 - y) ** 2))
+                image[jx, jy] = max(image[jx, jy], value)
+
+
+@numba.njit(cache=True)
+def _score(image: FloatArray, points: FloatArray, rows: FloatArray, offsets: FloatArray, step: float) -> FloatArray:
+    """(K,) mean of the image where ``points`` (Y, N, 2) of rows (K,) lie, moved by ``offsets`` (K, 2) [m]; cells have edge ``step``."""
+    out = np.empty(len(rows))
+    for k in range(len(rows)):
+        total = 0.0
+        for i in range(points.shape[1]):
+            x, y = (points[rows[k], i, 0] + offsets[k, 0]) / step, (points[rows[k], i, 1] + offsets[k, 1]) / step
+            if x >= 0.0 and y >= 0.0 and x < image.shape[0] and y < image.shape[1]:
+                total += image[int(x), int(y)]
+        out[k] = total / points.shape[1]
+    return out

@@ -1,0 +1,87 @@
+"""From a scan to points of the body at one moment, and from a 3D cloud to the walls in it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from localization.events import Scan
+from motion_models import se2
+from motion_models.robot import Mount
+from motion_models.se2 import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """Points (N, 3) of one sweep, each in the body frame of its own moment [m]."""
+
+    points: FloatArray
+    times: FloatArray
+    """(N,) when each point was measured, after the middle of the sweep [s]; (0,) if all at once."""
+    is_planar: bool = True
+
+    @classmethod
+    def from_scan(cls, scan: Scan, mount: Mount) -> Sweep:
+        """``scan`` in the body frame. Points that are not finite are left out."""
+        points, times = scan.points @ mount.rotation().T + (mount.x, mount.y, mount.z), scan.times_from_middle
+        is_finite = np.isfinite(points).all(axis=1)
+        if not is_finite.all():
+            points, times = points[is_finite], times[is_finite] if len(times) else times
+        return cls(points, times, scan.is_planar)
+
+    def within(self, min_range_m: float, max_range_m: float) -> Sweep:
+        """The points whose distance from the body's origin is in this range [m]."""
+        r2 = np.einsum("ni,ni->n", self.points, self.points)
+        kept = (r2 >= min_range_m**2) & (r2 <= max_range_m**2)
+        return self if kept.all() else Sweep(self.points[kept], self.times[kept] if len(self.times) else self.times, self.is_planar)
+
+    def deskew(self, twist: FloatArray) -> FloatArray:
+        """(N, 3) the points in the body frame at the middle of the sweep, during which the body moves with constant ``twist`` (3,).
+
+        Each point's own time is used, so that a sweep that fills part of the scan period is not over-corrected. About the middle, an error
+        of the twist cancels to first order; about the start it would read as yaw.
+        """
+        if not len(self.times) or not np.any(twist):
+            return self.points
+        points = np.empty_like(self.points)
+        _move(self.points, self.times, twist, points)
+        return points
+
+    def displacement(self, twist: FloatArray) -> float:
+        """How far an error of ``twist`` (3,) moves points of the sweep against each other [m]."""
+        if not len(self.times):
+            return 0.0
+        reach = float(np.median(np.hypot(self.points[:, 0], self.points[:, 1])))
+        return float(np.ptp(self.times)) * (math.hypot(twist[0], twist[1]) + abs(float(twist[2])) * reach)
+
+
+def extract_walls(points: FloatArray, cell: float, min_height: float = 0.3) -> FloatArray:
+    """(M, 2) the upright structure in a 3D cloud ``points`` (N, 3): one mean point for each ``cell`` [m] that spans ``min_height`` [m].
+
+    Floors and ceilings span no height in a cell; walls, trees and poles do. What is left is a planar scan.
+    """
+    if len(points) == 0:
+        return np.empty((0, 2))
+    index = np.floor(points[:, :2] / cell).astype(np.int64)
+    order = np.lexsort((index[:, 1], index[:, 0]))
+    is_first = np.any(np.diff(index[order], axis=0, prepend=index[order[:1]] - 1) != 0, axis=1)
+    starts = np.flatnonzero(is_first)
+    ordered = points[order]
+    heights = np.maximum.reduceat(ordered[:, 2], starts) - np.minimum.reduceat(ordered[:, 2], starts)
+    means = np.add.reduceat(ordered[:, :2], starts) / np.diff(starts, append=len(points))[:, None]
+    return np.asarray(means[heights >= min_height])
+
+
+@numba.njit(cache=True)
+def _move(points: FloatArray, times: FloatArray, twist: FloatArray, out: FloatArray) -> None:
+    """Fill ``out`` (N, 3) with ``points`` after the motion at ``twist`` (3,) for ``times`` (N,)."""
+    for i in range(points.shape[0]):
+        t = times[i]
+        x, y, yaw = se2.scalar_exp((t * twist[0], t * twist[1], t * twist[2]))
+        c, s = math.cos(yaw), math.sin(yaw)
+        out[i, 0] = x + c * points[i, 0] - s * points[i, 1]
+        out[i, 1] = y + s * points[i, 0] + c * points[i, 1]
+        out[i, 2] = points[i, 2]

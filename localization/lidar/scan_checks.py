@@ -1,0 +1,80 @@
+"""Scans that cannot be used: a scanner that repeats itself while the robot drives, and how long the LiDAR was lost."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from localization.events import Scan
+from motion_models.se2 import FloatArray
+
+
+class StaleScans:
+    """Recognises a scanner that has frozen."""
+
+    def __init__(self) -> None:
+        self._points: FloatArray | None = None
+        self._is_frozen = False
+
+    def is_stale(self, scan: Scan, is_standing: bool) -> bool:
+        """The very same ranges as last time although the wheels turn: noise alone would have changed them.
+
+        A scanner that froze while the robot drove stays stale until its ranges change, also where the robot stands.
+        """
+        last, self._points = self._points, scan.points
+        is_same = last is not None and len(last) > 0 and np.array_equal(last, scan.points)
+        self._is_frozen = is_same and (self._is_frozen or not is_standing)
+        return self._is_frozen
+
+
+class LostScans:
+    """Counts scans that could not be used, by cause, and the time without a matched scan."""
+
+    def __init__(self) -> None:
+        self._first_ns: int | None = None
+        self._matched_ns = self._last_ns = 0
+        self.scans = 0
+        """All scans so far."""
+        self.causes: Counter[str] = Counter()
+        """Scans that were not matched: `lost` (they fit nowhere, or in several places), `sparse`, `stale`."""
+        self._lost_ns = 0
+        self._longest: tuple[int, int] = (0, 0)  # length and start [ns]
+
+    def add_matched(self, stamp_ns: int) -> None:
+        """A scan that was matched."""
+        self._count(stamp_ns)
+        if self._last_ns > self._matched_ns:
+            self._close(stamp_ns)
+        self._matched_ns = self._last_ns = stamp_ns
+
+    def add(self, stamp_ns: int, cause: str) -> None:
+        """A scan that was not."""
+        self._count(stamp_ns)
+        self.causes[cause] += 1
+        self._last_ns = stamp_ns
+
+    @property
+    def share(self) -> float:
+        """Share of the time, from the first scan to the last, 0 to 1."""
+        if self._first_ns is None or self._last_ns == self._first_ns:
+            return 0.0
+        return (self._lost_ns + self._last_ns - self._matched_ns) / (self._last_ns - self._first_ns)
+
+    @property
+    def longest(self) -> tuple[float, float]:
+        """Length [s] of the longest time without a match, and when it began, after the first scan [s]."""
+        if self._first_ns is None:
+            return 0.0, 0.0
+        length, start = max(self._longest, (self._last_ns - self._matched_ns, self._matched_ns))
+        return length * 1e-9, (start - self._first_ns) * 1e-9 if length else 0.0
+
+    def _count(self, stamp_ns: int) -> None:
+        self.scans += 1
+        if self._first_ns is None:
+            self._first_ns = self._matched_ns = self._last_ns = stamp_ns
+
+    def _close(self, stamp_ns: int) -> None:
+        length = stamp_ns - self._matched_ns
+        self._lost_ns += length
+        self._longest = max(self._longest, (length, self._matched_ns))

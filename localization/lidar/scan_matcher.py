@@ -1,0 +1,268 @@
+"""Scan-to-submap matching: Gauss-Newton from a prior, and a correlative search where its result does not fit.
+
+    minimise   sum_i rho(e_i)  +  |log(prior^-1 x)|^2_P,      e_i = n_i^T (T(x) p_i - mu_i) / s_i
+
+over the pose x, with mean mu_i, normal n_i and variance s_i^2 of the surface nearest to each point p_i. rho is Geman-McClure's. The prior stays
+quadratic: a robust loss on it lets the pose jump along directions that the scene leaves open.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numba
+import numpy as np
+
+from localization.lidar.correlative_search import LikelihoodImage, draw_image, search
+from localization.lidar.submap import VoxelGrid, fill_surface, find_nearest, make_grid, measure_new_share, voxel_means
+from localization.settings import Allowed, Below, Count, Positive, Settings, Share
+from motion_models import se2
+from motion_models.se2 import FloatArray, Triple, triple
+
+MIN_POINTS = 10
+"""Points without which a scan is not matched."""
+_KERNEL = 3.0
+"""Scale of Geman-McClure's loss, and residuals that count as fitting, in sigmas."""
+_REACH_CELLS = 2.5
+"""How far a point may be from the voxel that it is associated with [cells]."""
+_ITERATIONS = 20
+_TOGETHER = 6.0
+"""Neighbouring beams that err together, where two poses are compared: they hit one surface."""
+_OUTLIER_COST = 12.5
+"""-log of the odds that the prior is an outlier (wheels that slip or count wrongly): a deviation of 5 sigma."""
+_SEARCH_FACTOR = 9.0
+_SEARCH_FLOOR = np.diag([0.1, 0.1, 0.03]) ** 2
+"""The search covers 3 sigma of 9 P + this [m^2, m^2, rad^2]."""
+_SEARCH_LIMIT, _WIDEST_SEARCH = np.array([3.0, 3.0, 1.0]), np.array([15.0, 15.0, math.pi])
+"""Half the window of a search at most, for a prior that may be an outlier, and for one that is wide itself [m, m, rad]."""
+_MAX_RIVAL = 0.9
+"""A search is ambiguous where a pose elsewhere scores more than this share of the best."""
+_BASIN_M, _BASIN_RAD = 0.15, 0.15
+"""Sigma of a prior from which Gauss-Newton alone may end elsewhere: from .3 m, .15 rad it does in 14 to 31 % of trials."""
+_OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
+"""Added to the information of a match, so that an open direction has a sigma of 10 m or 1 rad [1/m^2, 1/m^2, 1/rad^2]."""
+_MAPPED_INFORMATION = np.diag([1e2, 1e2, 1e2])
+"""Information of a key scan along a direction, from which on it says where the map is along it [1/m^2, 1/m^2, 1/rad^2]."""
+
+
+@dataclass(frozen=True)
+class LidarConfig(Settings):
+    """How scans are matched."""
+
+    matcher: Literal["submap", "kiss"] = "submap"
+    """What aligns scans: `submap`, or `kiss` for KISS-ICP started from the prediction."""
+    voxel_size_m: Annotated[float, Allowed("0, or from 0.01 to 10", lambda value: value == 0.0 or 0.01 <= value <= 10.0)] = 0.0
+    """Edge of the voxels [m]; 0 takes 2 % of the first scan's median range (KISS-ICP: 5 %), at least 0.04 m."""
+    min_range_m: Annotated[float, Below("max_range_m")] = 0.1
+    """Nearer points are the robot itself [m]."""
+    max_range_m: Positive = 50.0
+    """Farther points are left out [m]."""
+    range_noise_m: Positive = 0.02
+    """Sigma of a range, added to the thickness of surfaces [m]."""
+    key_distance_m: Positive = 0.5
+    """A scan enters the submap when the robot has moved this far since the last that did [m]."""
+    key_angle_rad: Positive = 0.35
+    """The same for turns [rad]."""
+    key_scans: Count = 40
+    """Key scans of a submap."""
+    search_below: Share = 0.7
+    """Share of points on the submap, below which a better pose is searched."""
+    lost_below: Share = 0.4
+    """Share of points on the submap, below which a scan is lost and wheels carry on alone."""
+
+
+@dataclass(frozen=True)
+class ScanMatch:
+    """Where a scan fits into the submap."""
+
+    pose: FloatArray
+    """(3,) ``odom_T_body`` that scan and prior give together."""
+    measured: FloatArray
+    """(3,) the pose that the scan alone gives: the prior's share is taken off."""
+    cov: FloatArray
+    """(3, 3) of the right perturbation of ``measured``; wide open along directions that the scene leaves open."""
+    overlap: float
+    """Share of points within 3 sigma of a surface of the submap."""
+    outlier_cov: FloatArray
+    """(3, 3) to be added to the prior's covariance where the search showed that it was an outlier; else zero."""
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A minimum of the cost above."""
+
+    pose: FloatArray
+    information: FloatArray
+    overlap: float
+    cost: float
+    """-log likelihood of the points, those that err together counted once."""
+    variance_ratio: float
+    """Mean of e^2 over the points that fit: the real variance over that which was assumed."""
+
+
+class ScanMatcher:
+    """The submap of the last key scans, and where scans fit into it. Poses are ``odom_T_body``, points (N, 2) of the body frame."""
+
+    def __init__(self, config: LidarConfig, cell: float) -> None:
+        """``cell``: edge of the submap's voxels [m]."""
+        self._config, self.cell = config, cell
+        self._keys: list[FloatArray] = []
+        self._grid: VoxelGrid | None = None
+        self._image: LikelihoodImage | None = None
+
+    def match(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray | None = None) -> ScanMatch | None:
+        """The pose of ``points`` near ``prior`` (3,), whose error against the submap has covariance ``cov`` (3, 3); None where it is lost.
+
+        Gauss-Newton starts from ``guess`` (3,), or from the prior. A pose is searched where the prior is wider than the basin of
+        convergence, or where the result does not fit.
+        """
+        nothing = np.zeros((3, 3))
+        is_wide = math.sqrt(float(np.linalg.eigvalsh(cov[:2, :2])[-1])) > _BASIN_M or cov[2, 2] > _BASIN_RAD**2
+        fit = None if is_wide else self._align(points, prior, cov, prior if guess is None else guess)
+        if fit is not None and fit.overlap >= self._config.search_below:
+            return self._result(fit, prior, cov, nothing)
+        outlier_cov = (_SEARCH_FACTOR - 1.0) * cov + _SEARCH_FLOOR
+        best = self._search(points, prior, cov + outlier_cov, cov)
+        if best is not None:
+            if fit is None and _mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:
+                outlier_cov = nothing
+            found = self._align(points, prior, cov + outlier_cov, best)
+            if found.overlap >= self._config.lost_below and (fit is None or _is_better(found, fit, prior, cov)):
+                return self._result(found, prior, cov + outlier_cov, outlier_cov)
+        return None if fit is None or fit.overlap < self._config.lost_below else self._result(fit, prior, cov, nothing)
+
+    def refine(self, points: FloatArray, prior: FloatArray, cov: FloatArray, match: ScanMatch) -> ScanMatch | None:
+        """``match`` again, for the same scan deskewed anew."""
+        fit = self._align(points, prior, cov + match.outlier_cov, match.pose)
+        return None if fit.overlap < self._config.lost_below else self._result(fit, prior, cov + match.outlier_cov, match.outlier_cov)
+
+    def evaluate(self, points: FloatArray, pose: FloatArray) -> ScanMatch | None:
+        """The match of ``points`` at ``pose`` (3,), which another method has found; None where too few of them fit there."""
+        assert self._grid is not None
+        H, _, found = linearize(self._grid, points, triple(pose), 0.0)
+        if found[0] < self._config.lost_below:
+            return None
+        cov = np.linalg.inv(H + _OPEN_INFORMATION) * found[2]
+        return ScanMatch(pose, pose, cov, float(found[0]), np.zeros((3, 3)))
+
+    def insert_key_scan(self, pose: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Draw a scan from ``pose`` (3,).
+
+        Returns the weight (3, 3) with which its error enters that of the submap around the robot, and the covariance (3, 3) of the error
+        by which its own noise moves its surfaces.
+        """
+        drawn = np.asarray(se2.transform(pose, points))
+        scan = make_grid(drawn, self.cell, self._config.range_noise_m)
+        share = 1.0 if self._grid is None else measure_new_share(self._grid, scan)
+        self._keys = [*self._keys, drawn][-self._config.key_scans :]
+        self._grid, self._image = make_grid(np.vstack(self._keys), self.cell, self._config.range_noise_m), None
+        H = linearize(self._grid, points, triple(pose), 0.0)[0]
+        return share * np.linalg.solve(H + _MAPPED_INFORMATION, H), np.linalg.inv(H + _OPEN_INFORMATION)
+
+    def points(self) -> FloatArray:
+        """(M, 2) of the submap, in the odometry frame [m]."""
+        return np.vstack(self._keys) if self._keys else np.empty((0, 2))
+
+    def _align(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray) -> _Fit:
+        assert self._grid is not None
+        pose, H, found = _align(self._grid, points, prior, cov, np.linalg.inv(cov), guess)
+        return _Fit(pose, H, float(found[0]), float(found[1]), float(found[2]))
+
+    def _search(self, points: FloatArray, prior: FloatArray, wide: FloatArray, cov: FloatArray) -> FloatArray | None:
+        """The best pose (3,) within 3 sigma of ``wide`` (3, 3), limited unless ``cov`` (3, 3) is wider; None where it is ambiguous."""
+        if self._image is None:
+            self._image = draw_image(self.points(), self.cell)
+        limit = np.minimum(np.maximum(_SEARCH_LIMIT, 3.0 * np.sqrt(np.diagonal(cov))), _WIDEST_SEARCH)
+        best = search(self._image, voxel_means(points, self.cell), prior, wide, limit)
+        return None if best.rival_score >= _MAX_RIVAL * best.score else best.pose
+
+    def _result(self, fit: _Fit, prior: FloatArray, cov: FloatArray, outlier_cov: FloatArray) -> ScanMatch:
+        """The scan's own pose z: where its gradient H (z - x) outweighs the prior's, J^T P^-1 log(prior^-1 x)."""
+        R = np.linalg.inv(fit.information + _OPEN_INFORMATION)
+        off = se2.log(se2.between(prior, fit.pose))
+        gradient = se2.right_jacobian_inverse(off).T @ np.linalg.solve(cov, off)
+        measured = se2.compose(fit.pose, se2.exp(R @ gradient))
+        return ScanMatch(fit.pose, measured, R * fit.variance_ratio, fit.overlap, outlier_cov)
+
+
+def _is_better(found: _Fit, fit: _Fit, prior: FloatArray, cov: FloatArray) -> bool:
+    """Whether the pose that was ``found`` is more probable than ``fit``, where the prior may be an outlier."""
+    return _total_cost(found, prior, cov) < _total_cost(fit, prior, cov)
+
+
+def _total_cost(fit: _Fit, prior: FloatArray, cov: FloatArray) -> float:
+    return fit.cost + min(_mahalanobis(prior, fit.pose, cov) / 2.0, _OUTLIER_COST)
+
+
+def _mahalanobis(prior: FloatArray, pose: FloatArray, cov: FloatArray) -> float:
+    """Squared distance of ``pose`` from ``prior`` in sigmas of ``cov``."""
+    off = se2.log(se2.between(prior, pose))
+    return float(off @ np.linalg.solve(cov, off))
+
+
+@numba.njit(cache=True)
+def _align(
+    grid: VoxelGrid, points: FloatArray, prior: FloatArray, cov: FloatArray, information: FloatArray, guess: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Gauss-Newton from ``guess`` (3,): pose (3,), information of the points (3, 3); overlap, cost and variance ratio."""
+    least = _REACH_CELLS * grid.cell
+    r2 = points[:, 0] ** 2 + points[:, 1] ** 2
+    spread = 3.0 * math.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2] * np.median(r2))  # how far the prior may move a point
+    x, jacobian = triple(guess), np.empty((3, 3))
+    for _ in range(_ITERATIONS):
+        H, g, _found = linearize(grid, points, x, spread)
+        off = se2.scalar_log(se2.scalar_between(triple(prior), x))
+        se2.fill_right_jacobian_inverse(off, jacobian)
+        pull = jacobian.T @ information
+        step = np.linalg.solve(H + pull @ jacobian, g + pull @ np.array(off))
+        x = se2.scalar_compose(x, se2.scalar_exp((-step[0], -step[1], -step[2])))
+        if abs(step[0]) + abs(step[1]) < 1e-4 and abs(step[2]) < 1e-5 and spread < least / 3.0:
+            break
+        spread = spread / 2.0 if spread > least / 4.0 else 0.0
+    H, g, found = linearize(grid, points, x, 0.0)
+    return np.array(x), H, found
+
+
+@numba.njit(cache=True)
+def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Information (3, 3) and gradient (3,) of the points at ``x``; overlap, cost and variance ratio.
+
+    While the pose may still be off by ``spread`` [m] at a point, points are associated from so far, and residuals are weighed by it.
+    """
+    H, g = np.zeros((3, 3)), np.zeros(3)
+    c, s = math.cos(x[2]), math.sin(x[2])
+    reach, loose = max(_REACH_CELLS * grid.cell, spread), (spread / _KERNEL) ** 2
+    n, fitting, cost, squares = points.shape[0], 0, 0.0, 0.0
+    J = np.empty(3)
+    for i in range(n):
+        px, py = points[i, 0], points[i, 1]
+        wx, wy = x[0] + c * px - s * py - grid.origin[0], x[1] + s * px + c * py - grid.origin[1]
+        v = find_nearest(grid, wx, wy, reach)
+        if v < 0:
+            cost += _KERNEL**2
+            continue
+        surface = grid.surfaces[v]
+        if math.isnan(surface[4]):
+            fill_surface(grid, v)
+        var = surface[4]
+        if math.isinf(var):
+            cost += _KERNEL**2
+            continue
+        e = surface[2] * (wx - surface[0]) + surface[3] * (wy - surface[1])
+        square = e * e / var
+        cost += min(square, _KERNEL**2)
+        if square < _KERNEL**2:
+            fitting += 1
+            squares += square
+        scale = _KERNEL**2 * var + loose
+        weight = (scale / (scale + e * e)) ** 2 / (var + loose)
+        J[0], J[1] = c * surface[2] + s * surface[3], -s * surface[2] + c * surface[3]  # the normal, seen from the body
+        J[2] = px * J[1] - py * J[0]
+        for a in range(3):
+            g[a] += weight * J[a] * e
+            for b in range(3):
+                H[a, b] += weight * J[a] * J[b]
+    found = np.array([fitting / max(n, 1), 0.5 * cost / _TOGETHER, squares / max(fitting, 1)])
+    return H, g, found

@@ -1,0 +1,147 @@
+"""The LiDAR as a sensor of the filter: scans in, poses in the submap out, and the submap grows where the filter puts its key scans."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from localization.lidar.deskew import Sweep, extract_walls
+from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
+from localization.lidar.scan_checks import LostScans, StaleScans
+from localization.lidar.scan_matcher import MIN_POINTS, LidarConfig, ScanMatch, ScanMatcher
+from localization.synchronizer import Step
+from motion_models import se2
+from motion_models.robot import Mount
+from motion_models.se2 import FloatArray
+
+_CELL_OF_RANGE, _MIN_CELL_M = 0.02, 0.04
+"""Voxel of a submap, as a share of the first scan's median range, and at least [m]."""
+_WALL_CELL_M = 0.2
+"""Cell in which a cloud has to span a height to be a wall [m]."""
+_MIN_DISPLACEMENT_M = 1e-3
+"""Points that another twist moves by less are not deskewed again [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Scan:
+    """The scan at hand, deskewed."""
+
+    sweep: Sweep
+    twist: FloatArray
+    """(3,) with which it was deskewed."""
+    points: FloatArray
+    """(N, 3) at the middle of the sweep."""
+    planar: FloatArray
+    """(M, 2) what is matched in the plane."""
+
+
+class ScanMatchingSensor:
+    """Give it each step with a scan: `measure`, perhaps `refine`, then `insert_key_scan` where `is_key`."""
+
+    def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig) -> None:
+        self._mounts, self._config = mounts, config
+        self._is_placed = True  # the submap was drawn with known mounts
+        self._matcher: ScanMatcher | None = None
+        self._kiss: KissIcp | None = None
+        self._scan: _Scan | None = None
+        self._prior, self._cov = np.zeros(3), np.eye(3)
+        self._last_key: FloatArray | None = None
+        self._stale, self.lost = StaleScans(), LostScans()
+
+    def measure(self, step: Step, prior: FloatArray, cov: FloatArray, twist: FloatArray) -> ScanMatch | None:
+        """Match the scan of ``step`` near ``prior`` (3,) with its covariance (3, 3) against the submap; None where it is lost.
+
+        The sweep is deskewed with ``twist`` (3,), the body's at the middle of the sweep.
+        """
+        assert step.scan is not None
+        self._scan, self._prior, self._cov = None, prior, cov
+        if self._stale.is_stale(step.scan, step.is_standing):
+            self.lost.add(step.end_ns, "stale")
+            return None
+        sweep = Sweep.from_scan(step.scan, self._mount(step.scan.frame_id)).within(self._config.min_range_m, self._config.max_range_m)
+        self._scan = self._deskew(sweep, twist)
+        if len(self._scan.planar) < MIN_POINTS:
+            self._scan = None
+            self.lost.add(step.end_ns, "sparse")
+            return None
+        if self._matcher is None:
+            self._begin(self._scan)
+            self.lost.add_matched(step.end_ns)
+            return None
+        found = self._match(self._matcher, self._scan)
+        if found is None:
+            self.lost.add(step.end_ns, "lost")
+        else:
+            self.lost.add_matched(step.end_ns)
+        return found
+
+    def refine(self, match: ScanMatch, twist: FloatArray) -> ScanMatch:
+        """``match`` again, its sweep deskewed with ``twist`` (3,); the same where that moves no point."""
+        assert self._scan is not None and self._matcher is not None
+        if self._scan.sweep.displacement(twist - self._scan.twist) < _MIN_DISPLACEMENT_M:
+            return match
+        self._scan = self._deskew(self._scan.sweep, twist)
+        return self._matcher.refine(self._scan.planar, self._prior, self._cov, match) or match
+
+    def is_key(self, pose: FloatArray) -> bool:
+        """Whether the scan at hand, taken from ``pose`` (3,), is to enter the submap."""
+        if self._scan is None:
+            return False
+        if self._last_key is None:
+            return True
+        moved = se2.between(self._last_key, pose)
+        c = self._config
+        return bool(math.hypot(moved[0], moved[1]) > c.key_distance_m or abs(moved[2]) > c.key_angle_rad)
+
+    def insert_key_scan(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Draw the scan at hand from ``pose`` (3,). Returns the weight (3, 3) of its error in that of the submap, and its own covariance."""
+        assert self._scan is not None and self._matcher is not None
+        self._last_key = pose
+        if self._kiss is not None:
+            self._kiss.insert(self._scan.points, pose)
+        return self._matcher.insert_key_scan(pose, self._scan.planar)
+
+    def scan_points(self) -> FloatArray:
+        """(M, 2) the scan at hand in the body frame, or (0, 2)."""
+        return np.empty((0, 2)) if self._scan is None else self._scan.planar
+
+    def map_points(self) -> FloatArray:
+        """(M, 2) the submap in the odometry frame [m]."""
+        return np.empty((0, 2)) if self._matcher is None else self._matcher.points()
+
+    @property
+    def cell(self) -> float:
+        """Edge of the submap's voxels [m]."""
+        return 0.0 if self._matcher is None else self._matcher.cell
+
+    def _deskew(self, sweep: Sweep, twist: FloatArray) -> _Scan:
+        points = sweep.deskew(twist)
+        planar = points[:, :2] if sweep.is_planar else extract_walls(points, _WALL_CELL_M)
+        return _Scan(sweep, twist, points, np.ascontiguousarray(planar))
+
+    def _begin(self, scan: _Scan) -> None:
+        """The first scan sets the size of the voxels."""
+        median = float(np.median(np.hypot(scan.planar[:, 0], scan.planar[:, 1])))
+        c = self._config
+        self._matcher = ScanMatcher(c, c.voxel_size_m or max(_CELL_OF_RANGE * median, _MIN_CELL_M))
+        if c.matcher == "kiss" or not scan.sweep.is_planar:
+            self._kiss = KissIcp(c.voxel_size_m or choose_voxel_size(scan.points), c.max_range_m)
+
+    def _match(self, matcher: ScanMatcher, scan: _Scan) -> ScanMatch | None:
+        if self._kiss is None:
+            return matcher.match(scan.planar, self._prior, self._cov)
+        guess = self._kiss.align(scan.points, self._prior)
+        if self._config.matcher == "kiss":
+            return matcher.evaluate(scan.planar, guess)
+        return matcher.match(scan.planar, self._prior, self._cov, guess)
+
+    def _mount(self, frame: str) -> Mount:
+        """Where ``frame`` is mounted. A submap that was drawn before that was known is dropped."""
+        mount = self._mounts.get(frame)
+        if mount is not None and not self._is_placed:
+            self._matcher, self._kiss, self._last_key = None, None, None
+        self._is_placed = mount is not None
+        return mount or Mount()

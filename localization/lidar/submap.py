@@ -1,0 +1,164 @@
+"""Submap: the points of the last key scans in voxels, each with mean, normal and thickness of the surface around it.
+
+A surface is a distribution, not a line: a thick, cluttered one simply counts less (Biber & Strasser 2003, normal distributions transform).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from localization.trajectory import IntArray
+from motion_models.se2 import FloatArray
+
+POOLED_VOXELS = 5
+"""Voxels whose points are pooled for one surface: fewer give no direction along sparse walls, more round off corners."""
+MAX_RINGS = 4
+"""How many voxels away the pooled ones may be; what is sparser than that has no surface."""
+_EMPTY = -(1 << 62)
+
+
+class VoxelGrid(NamedTuple):
+    """The arrays of a submap, as compiled loops take them."""
+
+    cell: float
+    """Edge of a voxel [m]."""
+    noise: float
+    """Variance of a range [m^2], which every surface has at least."""
+    origin: FloatArray
+    """(2,) from which the voxels' sums are taken [m]."""
+    slots: IntArray
+    """(H, 2) hash table with open addressing: key of a cell, row of its voxel. H is a power of two."""
+    cells: IntArray
+    """(V, 2) column and row of each voxel in the grid."""
+    sums: FloatArray
+    """(V, 6) number of points, and their sums of x, y, x^2, x y, y^2."""
+    surfaces: FloatArray
+    """(V, 5) mean (2), normal (2) and variance along it [m^2] around each voxel. Filled when first used: NaN until then."""
+
+
+def make_grid(points: FloatArray, cell: float, noise_m: float) -> VoxelGrid:
+    """Voxels with edge ``cell`` [m] of ``points`` (N, 2) [m], whose ranges have sigma ``noise_m`` [m]."""
+    origin = np.floor(points.mean(axis=0) / cell) * cell if len(points) else np.zeros(2)
+    slots = np.full((1 << max(4, math.ceil(math.log2(2 * len(points) + 1))), 2), _EMPTY, dtype=np.int64)
+    cells, sums = np.empty((len(points), 2), dtype=np.int64), np.zeros((len(points), 6))
+    n = _fill(points, cell, origin, slots, cells, sums)
+    return VoxelGrid(cell, noise_m**2, origin, slots, cells[:n], sums[:n], np.full((n, 5), np.nan))
+
+
+def voxel_means(points: FloatArray, cell: float) -> FloatArray:
+    """(M, 2) the mean of ``points`` (N, 2) in each voxel with edge ``cell`` [m]."""
+    grid = make_grid(points, cell, 0.0)
+    return np.asarray(grid.sums[:, 1:3] / grid.sums[:, :1] + grid.origin)
+
+
+@numba.njit(cache=True)
+def find_slot(slots: IntArray, i: int, j: int) -> int:
+    """Index of the slot that holds cell (i, j), or of the empty one where it belongs."""
+    key = (i << 32) ^ (j & 0xFFFFFFFF)
+    mask = slots.shape[0] - 1
+    scattered = key * -7046029254386353131  # 2^64 / golden ratio (Knuth, multiplicative hashing)
+    at = ((scattered >> 32) ^ scattered) & mask
+    while slots[at, 0] != _EMPTY and slots[at, 0] != key:
+        at = (at + 1) & mask
+    return at
+
+
+@numba.njit(cache=True)
+def find_voxel(slots: IntArray, i: int, j: int) -> int:
+    """Row of the voxel in cell (i, j); -1 where there is none."""
+    at = find_slot(slots, i, j)
+    return slots[at, 1] if slots[at, 0] != _EMPTY else -1
+
+
+@numba.njit(cache=True)
+def _fill(points: FloatArray, cell: float, origin: FloatArray, slots: IntArray, cells: IntArray, sums: FloatArray) -> int:
+    """Sort ``points`` into voxels; returns how many there are."""
+    n = 0
+    for p in range(points.shape[0]):
+        x, y = points[p, 0] - origin[0], points[p, 1] - origin[1]
+        i, j = math.floor(x / cell), math.floor(y / cell)
+        at = find_slot(slots, i, j)
+        if slots[at, 0] == _EMPTY:
+            slots[at, 0], slots[at, 1] = (i << 32) ^ (j & 0xFFFFFFFF), n
+            cells[n, 0], cells[n, 1] = i, j
+            n += 1
+        v = slots[at, 1]
+        sums[v, 0] += 1.0
+        sums[v, 1] += x
+        sums[v, 2] += y
+        sums[v, 3] += x * x
+        sums[v, 4] += x * y
+        sums[v, 5] += y * y
+    return n
+
+
+@numba.njit(cache=True)
+def find_nearest(grid: VoxelGrid, x: float, y: float, reach: float) -> int:
+    """The voxel whose mean is nearest to (x, y) [m, from the grid's origin], or -1 where none is within ``reach`` [m]."""
+    cell = grid.cell
+    i, j = math.floor(x / cell), math.floor(y / cell)
+    border = min(x - i * cell, (i + 1) * cell - x, y - j * cell, (j + 1) * cell - y)
+    best, nearest = reach * reach, -1
+    ring = 0
+    while ring == 0 or ((ring - 1) * cell + border) ** 2 < best:
+        for di in range(-ring, ring + 1):
+            stride = 1 if abs(di) == ring else 2 * ring
+            for dj in range(-ring, ring + 1, max(stride, 1)):
+                v = find_voxel(grid.slots, i + di, j + dj)
+                if v >= 0:
+                    n = grid.sums[v, 0]
+                    d2 = (grid.sums[v, 1] / n - x) ** 2 + (grid.sums[v, 2] / n - y) ** 2
+                    if d2 < best:
+                        best, nearest = d2, v
+        ring += 1
+    return nearest
+
+
+@numba.njit(cache=True)
+def fill_surface(grid: VoxelGrid, v: int) -> None:
+    """Pool the points of the `POOLED_VOXELS` voxels nearest to voxel ``v``: mean, direction of least spread, and the spread along it."""
+    n = grid.sums[v, 0]
+    x, y = grid.sums[v, 1] / n, grid.sums[v, 2] / n
+    found, d2s, rows = 0, np.empty((2 * MAX_RINGS + 1) ** 2), np.empty((2 * MAX_RINGS + 1) ** 2, dtype=np.int64)
+    ring = 0
+    while found < POOLED_VOXELS and ring < MAX_RINGS:
+        ring += 1
+        found = 0
+        for di in range(-ring, ring + 1):
+            for dj in range(-ring, ring + 1):
+                w = find_voxel(grid.slots, grid.cells[v, 0] + di, grid.cells[v, 1] + dj)
+                if w >= 0:
+                    m = grid.sums[w, 0]
+                    d2s[found], rows[found] = (grid.sums[w, 1] / m - x) ** 2 + (grid.sums[w, 2] / m - y) ** 2, w
+                    found += 1
+    total = np.zeros(6)
+    for w in rows[np.argsort(d2s[:found])[:POOLED_VOXELS]]:
+        total += grid.sums[w]
+    mx, my = total[1] / total[0], total[2] / total[0]
+    xx, xy, yy = total[3] / total[0] - mx * mx, total[4] / total[0] - mx * my, total[5] / total[0] - my * my
+    angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
+    least = 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy)
+    out = grid.surfaces[v]
+    out[0], out[1], out[2], out[3] = mx, my, -math.sin(angle), math.cos(angle)
+    out[4] = max(least, 0.0) + grid.noise if found >= 3 else math.inf  # two voxels have a direction, but no thickness
+
+
+@numba.njit(cache=True)
+def measure_new_share(grid: VoxelGrid, scan: VoxelGrid) -> float:
+    """Share, 0 to 1, that the points of ``scan`` would have of all points in their voxels, in the mean over its points.
+
+    ``scan`` has the cells of ``grid``. 1: the place is new; 1 / (n + 1): it was mapped by n scans like this one.
+    """
+    share, points = 0.0, 0.0
+    di = math.floor((scan.origin[0] - grid.origin[0]) / grid.cell + 0.5)
+    dj = math.floor((scan.origin[1] - grid.origin[1]) / grid.cell + 0.5)
+    for w in range(scan.cells.shape[0]):
+        v = find_voxel(grid.slots, scan.cells[w, 0] + di, scan.cells[w, 1] + dj)
+        n = scan.sums[w, 0]
+        share += n * (1.0 if v < 0 else n / (n + grid.sums[v, 0]))
+        points += n
+    return share / max(points, 1.0)
