@@ -12,7 +12,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from localization.events import Event, Scan, WheelSample
-from localization.lidar import body_points
+from localization.lidar import Sweep
 from localization.run import Pair, ReplayConfig, Run, replay
 from localization.simulate.raycast import Grid, cast, make_grid
 from motion_models import se2
@@ -110,7 +110,7 @@ class Beams:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """What a robot's sensors said, and where it really was at the stamp of each scan."""
+    """Events of a robot's sensors, and where it really was in the middle of each sweep."""
 
     events: list[Event]
     stamps: np.ndarray
@@ -175,8 +175,8 @@ def drive_through(
         seen = np.isfinite(ranges) & (ranges > 0.0)
         ranges[~seen] = 1.0
         points = np.column_stack([ranges * np.cos(aims), ranges * np.sin(aims), np.zeros(len(ranges))])[seen]
-        stamps.append(_ns(k / scanner.rate_hz))
-        events.append(Scan(stamps[-1], points, offsets[seen], "laser"))
+        events.append(Scan(_ns(k / scanner.rate_hz), points, offsets[seen], "laser"))
+        stamps.append(events[-1].middle_ns)
     events.sort(key=lambda e: e.stamp_ns)
     at = np.round((np.array(stamps) - WALL_START_NS) * 1e-9 / _STEP_S).astype(int)
     track = se2.between(poses[0], poses)
@@ -184,12 +184,12 @@ def drive_through(
 
 
 def true_points(drive: Drive, scan: Scan) -> np.ndarray:
-    """(N, 3) points of ``scan`` in the body frame at its stamp, moved there as the robot really moved."""
-    at = ((scan.stamp_ns - WALL_START_NS) * 1e-9 + np.append(0.0, scan.offsets)) / _STEP_S
+    """(N, 3) points of ``scan`` in the body frame at the middle of its sweep, moved there as the robot really moved."""
+    at = ((scan.middle_ns - WALL_START_NS) * 1e-9 + np.append(0.0, scan.times_from_middle)) / _STEP_S
     i = np.minimum(at.astype(int), len(drive.track) - 2)
     f = (at - i)[:, None]
     poses = (1.0 - f) * drive.track[i] + f * drive.track[i + 1]
-    points = body_points(scan, drive.mount, np.zeros(3))
+    points = Sweep.from_scan(scan, drive.mount).points.copy()
     points[:, :2] = se2.transform(se2.between(poses[0], poses[1:]), points[:, :2])
     return points
 

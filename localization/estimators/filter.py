@@ -20,6 +20,7 @@ from filterpy.kalman import predict as predict_linear
 from localization.errors import EstimatorError
 from localization.estimators.measurement_models import predict_turn, subtract_map_error
 from localization.gyro import Turn
+from localization.lidar import KeyScanError
 from localization.settings import Settings
 from localization.synchronizer import Step
 from motion_models import se2
@@ -117,17 +118,17 @@ class Filter:
         self._scan_noise = K @ R, R
         return nis
 
-    def insert_key_scan(self, weight: FloatArray, R: FloatArray) -> None:
-        """The last scan is drawn into the submap from the pose as it is: e_map' = (I - W) e_map + W (e_pose - n), W = ``weight`` (3, 3).
+    def insert_key_scan(self, error: KeyScanError) -> None:
+        """The last scan is drawn into the submap from the pose as it is: e_map' = (I - W) e_map + W (e_pose - n) + m.
 
-        n is the scan's own noise. Where the scan was matched, the pose's error contains it already, by the gain K: cov(e, n) = K R. Else it
-        has the covariance ``R`` (3, 3).
+        n is the scan's own noise. Where the scan was matched, the pose's error contains it already, by the gain K: cov(e, n) = K R.
         """
-        C, R = self._scan_noise or (np.zeros((len(self.P), 3)), R)
+        C, R = self._scan_noise or (np.zeros((len(self.P), 3)), error.noise_cov)
         G, B = np.eye(len(self.P)), np.zeros((len(self.P), 3))
-        G[MAP, MAP], G[MAP, POSE] = np.eye(3) - weight, weight
-        B[MAP] = -weight
+        G[MAP, MAP], G[MAP, POSE] = np.eye(3) - error.weight, error.weight
+        B[MAP] = -error.weight
         self.P = _symmetric(G @ self.P @ G.T + G @ C @ B.T + B @ C.T @ G.T + B @ R @ B.T)
+        self.P[MAP, MAP] += error.new_cov
 
     def start_key(self) -> None:
         """Clone the pose: `key_motion` counts from here on."""

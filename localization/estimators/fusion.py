@@ -83,7 +83,7 @@ class EkfFusion:
             return
         self._is_scan_pending = False
         if self._sensor.is_key(self.filter.pose):
-            self.filter.insert_key_scan(*self._sensor.insert_key_scan(self.filter.pose))
+            self.filter.insert_key_scan(self._sensor.insert_key_scan(self.filter.pose))
 
     def _update_scan(self, step: Step, sensor: ScanMatchingSensor) -> float | None:
         ekf, duration = self.filter, step.duration

@@ -3,7 +3,17 @@
 from localization.lidar.deskew import Sweep
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
 from localization.lidar.scan_checks import LostScans
-from localization.lidar.scan_matcher import LidarConfig, ScanMatch, ScanMatcher
+from localization.lidar.scan_matcher import KeyScanError, LidarConfig, ScanMatch, ScanMatcher
 from localization.lidar.scan_matching import ScanMatchingSensor
 
-__all__ = ["KissIcp", "LidarConfig", "LostScans", "ScanMatch", "ScanMatcher", "ScanMatchingSensor", "Sweep", "choose_voxel_size"]
+__all__ = [
+    "KeyScanError",
+    "KissIcp",
+    "LidarConfig",
+    "LostScans",
+    "ScanMatch",
+    "ScanMatcher",
+    "ScanMatchingSensor",
+    "Sweep",
+    "choose_voxel_size",
+]

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 
 from localization.lidar.correlative_search import LikelihoodImage, draw_image, search
-from localization.lidar.submap import VoxelGrid, fill_surface, find_nearest, make_grid, measure_new_share, voxel_means
+from localization.lidar.submap import VoxelGrid, fill_surface, find_nearest, make_grid, measure_shares, voxel_means
 from localization.settings import Allowed, Below, Count, Positive, Settings, Share
 from motion_models import se2
 from motion_models.se2 import FloatArray, Triple, triple
@@ -28,6 +28,11 @@ _KERNEL = 3.0
 _REACH_CELLS = 2.5
 """How far a point may be from the voxel that it is associated with [cells]."""
 _ITERATIONS = 20
+_BLOCK = 30
+"""Neighbouring beams whose residuals are summed, to measure how they err together [beams]: the residuals of real scans are correlated over
+10 to 20 beams, those of simulated rooms over 1 to 10."""
+_FORGETTING = 0.98
+"""Of the residuals' statistics, per scan: they are a mean over the last 50 scans."""
 _TOGETHER = 6.0
 """Neighbouring beams that err together, where two poses are compared: they hit one surface."""
 _OUTLIER_COST = 12.5
@@ -90,6 +95,18 @@ class ScanMatch:
 
 
 @dataclass(frozen=True)
+class KeyScanError:
+    """How the error of a key scan enters that of the submap around the robot: e_map' = (I - W) e_map + W (e_pose - n) + m."""
+
+    weight: FloatArray
+    """(3, 3) W: the share that the scan has of its surroundings in the submap, along the directions that it measures."""
+    noise_cov: FloatArray
+    """(3, 3) of n, the error by which the scan's noise moves its surfaces, if it was not matched."""
+    new_cov: FloatArray
+    """(3, 3) of m: places that were not mapped before hang on this scan alone."""
+
+
+@dataclass(frozen=True)
 class _Fit:
     """A minimum of the cost above."""
 
@@ -98,8 +115,10 @@ class _Fit:
     overlap: float
     cost: float
     """-log likelihood of the points, those that err together counted once."""
-    variance_ratio: float
-    """Mean of e^2 over the points that fit: the real variance over that which was assumed."""
+    squares: float
+    """Sum of the squared sums of residuals over blocks of neighbouring beams."""
+    beams: float
+    """Beams in these blocks."""
 
 
 class ScanMatcher:
@@ -111,6 +130,7 @@ class ScanMatcher:
         self._keys: list[FloatArray] = []
         self._grid: VoxelGrid | None = None
         self._image: LikelihoodImage | None = None
+        self._squares, self._beams = 1e-3, 1e-3
 
     def match(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray | None = None) -> ScanMatch | None:
         """The pose of ``points`` near ``prior`` (3,), whose error against the submap has covariance ``cov`` (3, 3); None where it is lost.
@@ -144,22 +164,27 @@ class ScanMatcher:
         H, _, found = linearize(self._grid, points, triple(pose), 0.0)
         if found[0] < self._config.lost_below:
             return None
-        cov = np.linalg.inv(H + _OPEN_INFORMATION) * found[2]
-        return ScanMatch(pose, pose, cov, float(found[0]), np.zeros((3, 3)))
+        fit = _Fit(pose, H, *(float(value) for value in found))
+        return self._result(fit, pose, np.eye(3), np.zeros((3, 3)))
 
-    def insert_key_scan(self, pose: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Draw a scan from ``pose`` (3,).
-
-        Returns the weight (3, 3) with which its error enters that of the submap around the robot, and the covariance (3, 3) of the error
-        by which its own noise moves its surfaces.
-        """
+    def insert_key_scan(self, pose: FloatArray, points: FloatArray) -> KeyScanError:
+        """Draw a scan from ``pose`` (3,)."""
         drawn = np.asarray(se2.transform(pose, points))
         scan = make_grid(drawn, self.cell, self._config.range_noise_m)
-        share = 1.0 if self._grid is None else measure_new_share(self._grid, scan)
+        share, new = (1.0, 0.0) if self._grid is None else measure_shares(self._grid, scan)
         self._keys = [*self._keys, drawn][-self._config.key_scans :]
         self._grid, self._image = make_grid(np.vstack(self._keys), self.cell, self._config.range_noise_m), None
         H = linearize(self._grid, points, triple(pose), 0.0)[0]
-        return share * np.linalg.solve(H + _MAPPED_INFORMATION, H), np.linalg.inv(H + _OPEN_INFORMATION)
+        seen, noise = np.linalg.solve(H + _MAPPED_INFORMATION, H), np.linalg.inv(H + _OPEN_INFORMATION) * self._variance_ratio
+        return KeyScanError(share * seen, noise, new * seen @ noise @ seen.T)
+
+    @property
+    def _variance_ratio(self) -> float:
+        """Variance of a match over that of independent points with the assumed noise, by the residuals of the last scans.
+
+        The variance of sums over blocks of neighbouring beams, which contains how these err together (batch means).
+        """
+        return self._squares / self._beams
 
     def points(self) -> FloatArray:
         """(M, 2) of the submap, in the odometry frame [m]."""
@@ -168,7 +193,7 @@ class ScanMatcher:
     def _align(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray) -> _Fit:
         assert self._grid is not None
         pose, H, found = _align(self._grid, points, prior, cov, np.linalg.inv(cov), guess)
-        return _Fit(pose, H, float(found[0]), float(found[1]), float(found[2]))
+        return _Fit(pose, H, *(float(value) for value in found))
 
     def _search(self, points: FloatArray, prior: FloatArray, wide: FloatArray, cov: FloatArray) -> FloatArray | None:
         """The best pose (3,) within 3 sigma of ``wide`` (3, 3), limited unless ``cov`` (3, 3) is wider; None where it is ambiguous."""
@@ -184,7 +209,8 @@ class ScanMatcher:
         off = se2.log(se2.between(prior, fit.pose))
         gradient = se2.right_jacobian_inverse(off).T @ np.linalg.solve(cov, off)
         measured = se2.compose(fit.pose, se2.exp(R @ gradient))
-        return ScanMatch(fit.pose, measured, R * fit.variance_ratio, fit.overlap, outlier_cov)
+        self._squares, self._beams = _FORGETTING * self._squares + fit.squares, _FORGETTING * self._beams + fit.beams
+        return ScanMatch(fit.pose, measured, R * self._variance_ratio, fit.overlap, outlier_cov)
 
 
 def _is_better(found: _Fit, fit: _Fit, prior: FloatArray, cov: FloatArray) -> bool:
@@ -234,8 +260,8 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
     H, g = np.zeros((3, 3)), np.zeros(3)
     c, s = math.cos(x[2]), math.sin(x[2])
     reach, loose = max(_REACH_CELLS * grid.cell, spread), (spread / _KERNEL) ** 2
-    n, fitting, cost, squares = points.shape[0], 0, 0.0, 0.0
-    J = np.empty(3)
+    n, fitting, cost = points.shape[0], 0, 0.0
+    J, block, squares = np.empty(3), 0.0, 0.0
     for i in range(n):
         px, py = points[i, 0], points[i, 1]
         wx, wy = x[0] + c * px - s * py - grid.origin[0], x[1] + s * px + c * py - grid.origin[1]
@@ -254,8 +280,10 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
         square = e * e / var
         cost += min(square, _KERNEL**2)
         if square < _KERNEL**2:
+            block += e / math.sqrt(var)
             fitting += 1
-            squares += square
+            if fitting % _BLOCK == 0:
+                squares, block = squares + block * block, 0.0
         scale = _KERNEL**2 * var + loose
         weight = (scale / (scale + e * e)) ** 2 / (var + loose)
         J[0], J[1] = c * surface[2] + s * surface[3], -s * surface[2] + c * surface[3]  # the normal, seen from the body
@@ -264,5 +292,5 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
             g[a] += weight * J[a] * e
             for b in range(3):
                 H[a, b] += weight * J[a] * J[b]
-    found = np.array([fitting / max(n, 1), 0.5 * cost / _TOGETHER, squares / max(fitting, 1)])
+    found = np.array([fitting / max(n, 1), 0.5 * cost / _TOGETHER, squares, _BLOCK * (fitting // _BLOCK)])
     return H, g, found

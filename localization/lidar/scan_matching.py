@@ -11,7 +11,7 @@ import numpy as np
 from localization.lidar.deskew import Sweep, extract_walls
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
 from localization.lidar.scan_checks import LostScans, StaleScans
-from localization.lidar.scan_matcher import MIN_POINTS, LidarConfig, ScanMatch, ScanMatcher
+from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher
 from localization.synchronizer import Step
 from motion_models import se2
 from motion_models.robot import Mount
@@ -96,8 +96,8 @@ class ScanMatchingSensor:
         c = self._config
         return bool(math.hypot(moved[0], moved[1]) > c.key_distance_m or abs(moved[2]) > c.key_angle_rad)
 
-    def insert_key_scan(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Draw the scan at hand from ``pose`` (3,). Returns the weight (3, 3) of its error in that of the submap, and its own covariance."""
+    def insert_key_scan(self, pose: FloatArray) -> KeyScanError:
+        """Draw the scan at hand from ``pose`` (3,)."""
         assert self._scan is not None and self._matcher is not None
         self._last_key = pose
         if self._kiss is not None:

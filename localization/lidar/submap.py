@@ -148,12 +148,13 @@ def fill_surface(grid: VoxelGrid, v: int) -> None:
 
 
 @numba.njit(cache=True)
-def measure_new_share(grid: VoxelGrid, scan: VoxelGrid) -> float:
-    """Share, 0 to 1, that the points of ``scan`` would have of all points in their voxels, in the mean over its points.
+def measure_shares(grid: VoxelGrid, scan: VoxelGrid) -> tuple[float, float]:
+    """Shares, 0 to 1, of the points of ``scan``, which has the cells of ``grid``.
 
-    ``scan`` has the cells of ``grid``. 1: the place is new; 1 / (n + 1): it was mapped by n scans like this one.
+    First the share that they would have of all points in their voxels, in the mean: 1 / (n + 1) in a place that was mapped by n scans like
+    this one. Second, the share of the points whose voxels were empty.
     """
-    share, points = 0.0, 0.0
+    share, points, new = 0.0, 0.0, 0.0
     di = math.floor((scan.origin[0] - grid.origin[0]) / grid.cell + 0.5)
     dj = math.floor((scan.origin[1] - grid.origin[1]) / grid.cell + 0.5)
     for w in range(scan.cells.shape[0]):
@@ -161,4 +162,5 @@ def measure_new_share(grid: VoxelGrid, scan: VoxelGrid) -> float:
         n = scan.sums[w, 0]
         share += n * (1.0 if v < 0 else n / (n + grid.sums[v, 0]))
         points += n
-    return share / max(points, 1.0)
+        new += n if v < 0 else 0.0
+    return share / max(points, 1.0), new / max(points, 1.0)
