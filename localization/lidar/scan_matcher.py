@@ -141,7 +141,7 @@ class ScanMatcher:
         nothing = np.zeros((3, 3))
         is_wide = math.sqrt(float(np.linalg.eigvalsh(cov[:2, :2])[-1])) > _BASIN_M or cov[2, 2] > _BASIN_RAD**2
         fit = None if is_wide else self._align(points, prior, cov, prior if guess is None else guess)
-        if fit is not None and fit.overlap >= self._config.search_below:
+        if fit is not None and fit.overlap >= self._config.search_below and _mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST:
             return self._result(fit, prior, cov, nothing)
         outlier_cov = (_SEARCH_FACTOR - 1.0) * cov + _SEARCH_FLOOR
         best = self._search(points, prior, cov + outlier_cov, cov)
