@@ -116,9 +116,11 @@ class Fit:
     cost: float
     """-log likelihood of the points, those that err together counted once."""
     squares: float
-    """Sum of the squared sums of residuals over blocks of neighbouring beams."""
-    beams: float
-    """Beams in these blocks."""
+    """Sum of e^2 over the points that fit."""
+    block_squares: float
+    """Sum of squares of the sums of e over blocks of neighbouring points that fit."""
+    fitting: float
+    """How many points fit."""
 
 
 class ScanMatcher:
@@ -130,7 +132,7 @@ class ScanMatcher:
         self._keys: list[FloatArray] = []
         self._grid: VoxelGrid | None = None
         self._image: LikelihoodImage | None = None
-        self._squares, self._beams = 1e-3, 1e-3
+        self._residuals = np.full(3, 1e-3)  # sums over the last scans: squares, squares of blocks, points
 
     def match(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray | None = None) -> ScanMatch | None:
         """The pose of ``points`` near ``prior`` (3,), whose error against the submap has covariance ``cov`` (3, 3); None where it is lost.
@@ -175,16 +177,15 @@ class ScanMatcher:
         self._keys = [*self._keys, drawn][-self._config.key_scans :]
         self._grid, self._image = make_grid(np.vstack(self._keys), self.cell, self._config.range_noise_m), None
         H = linearize(self._grid, points, triple(pose), 0.0)[0]
-        seen, noise = np.linalg.solve(H + _MAPPED_INFORMATION, H), np.linalg.inv(H + _OPEN_INFORMATION) * self._variance_ratio
+        seen, noise = np.linalg.solve(H + _MAPPED_INFORMATION, H), np.linalg.inv(H + _OPEN_INFORMATION) * self._variance_ratio(1)
         return KeyScanError(share * seen, noise, new * seen @ noise @ seen.T)
 
-    @property
-    def _variance_ratio(self) -> float:
+    def _variance_ratio(self, which: int) -> float:
         """Variance of a match over that of independent points with the assumed noise, by the residuals of the last scans.
 
         The variance of sums over blocks of neighbouring beams, which contains how these err together (batch means).
         """
-        return self._squares / self._beams
+        return float(self._residuals[which] / self._residuals[2])
 
     def points(self) -> FloatArray:
         """(M, 2) of the submap, in the odometry frame [m]."""
@@ -208,8 +209,8 @@ class ScanMatcher:
         off = se2.log(se2.between(prior, fit.pose))
         gradient = se2.right_jacobian_inverse(off).T @ np.linalg.solve(cov, off)
         measured = se2.compose(fit.pose, se2.exp(R @ gradient))
-        self._squares, self._beams = _FORGETTING * self._squares + fit.squares, _FORGETTING * self._beams + fit.beams
-        return ScanMatch(fit.pose, measured, R * self._variance_ratio, fit.overlap, outlier_cov)
+        self._residuals = _FORGETTING * self._residuals + [fit.squares, fit.block_squares, fit.fitting]
+        return ScanMatch(fit.pose, measured, R * self._variance_ratio(0), fit.overlap, outlier_cov)
 
 
 def align_points(grid: VoxelGrid, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray) -> Fit:
@@ -266,7 +267,7 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
     c, s = math.cos(x[2]), math.sin(x[2])
     reach, loose = max(_REACH_CELLS * grid.cell, spread), (spread / _KERNEL) ** 2
     n, fitting, cost = points.shape[0], 0, 0.0
-    J, block, squares = np.empty(3), 0.0, 0.0
+    J, block, squares, block_squares = np.empty(3), 0.0, 0.0, 0.0
     for i in range(n):
         px, py = points[i, 0], points[i, 1]
         wx, wy = x[0] + c * px - s * py - grid.origin[0], x[1] + s * px + c * py - grid.origin[1]
@@ -287,8 +288,9 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
         if square < _KERNEL**2:
             block += e / math.sqrt(var)
             fitting += 1
+            squares += square
             if fitting % _BLOCK == 0:
-                squares, block = squares + block * block, 0.0
+                block_squares, block = block_squares + block * block, 0.0
         scale = _KERNEL**2 * var + loose
         weight = (scale / (scale + e * e)) ** 2 / (var + loose)
         J[0], J[1] = c * surface[2] + s * surface[3], -s * surface[2] + c * surface[3]  # the normal, seen from the body
@@ -297,5 +299,5 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
             g[a] += weight * J[a] * e
             for b in range(3):
                 H[a, b] += weight * J[a] * J[b]
-    found = np.array([fitting / max(n, 1), 0.5 * cost / _TOGETHER, squares, _BLOCK * (fitting // _BLOCK)])
+    found = np.array([fitting / max(n, 1), 0.5 * cost / _TOGETHER, squares, block_squares, fitting])
     return H, g, found
