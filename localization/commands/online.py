@@ -67,8 +67,9 @@ class Online:
     """Of live topics: ROS 2 by DDS itself (extra `ros2`), ROS 2 by rclpy, ROS 1 by rospy. `auto`: rclpy where it is sourced, else DDS."""
     domain: int | None = None
     """ROS 2 domain (door dds); by default that of ROS_DOMAIN_ID, or 0."""
-    interface: str = "lo"
-    """Network interface or address (door dds). `lo`: this machine only, nobody else is listened to; `default`: as Cyclone DDS is set."""
+    interface: str | None = None
+    """Network interface or address (door dds). `localhost`: this machine only, packets of others are dropped; `default`: as
+    ROS_LOCALHOST_ONLY and ROS_AUTOMATIC_DISCOVERY_RANGE demand, else all of the subnet. Without the option as these variables demand, else `localhost`."""
     node: NodeConfig = field(default_factory=NodeConfig)
     topic: TopicOverrides = field(default_factory=TopicOverrides)
     config: ReplayConfig = field(default_factory=ReplayConfig)
@@ -175,9 +176,10 @@ class Online:
             from localization.online.ros2 import RclpyTransport
 
             return RclpyTransport()
-        from localization.online.dds import DdsTransport, default_domain
+        from localization.online.dds import DdsTransport
+        from localization.online.dds_settings import choose_interface, default_domain
 
-        return DdsTransport(default_domain() if self.domain is None else self.domain, self.interface)
+        return DdsTransport(default_domain() if self.domain is None else self.domain, choose_interface(self.interface))
 
     def _view(self) -> View | None:
         """Raises `DoorError` and `OutputError`. Imported only where it is wanted."""
