@@ -114,7 +114,9 @@ def test_a_robot_in_another_process_is_followed_killed_and_followed_on(tmp_path)
     assert "k_0" in names
     assert len(names) == len(means) == len(sigmas)
     last = heard["diagnostics"][-2]
-    assert {"skidloc: estimate", "skidloc: lidar", "skidloc: wheels", "skidloc: files", "skidloc: messages"} == set(last)
+    assert {"skidloc: estimate", "skidloc: lidar", "skidloc: wheels", "skidloc: files", "skidloc: messages", "skidloc: transforms"} == set(
+        last
+    )
     assert float(last["skidloc: lidar"]["degeneracy"]) > 0.1
     assert float(last["skidloc: lidar"]["nis_mean"]) < 8.0
     # and the whole way is in one file

@@ -192,7 +192,8 @@ def _hashed(quality: Qos, kind: str) -> Qos:
 
 
 def _sensor_data() -> Qos:
-    return Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(_LATEST), *_COMMON)
+    latest = Policy.History.KeepLast(_LATEST)
+    return Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, latest, Policy.IgnoreLocal.Participant, *_COMMON)
 
 
 def _latched() -> Qos:
