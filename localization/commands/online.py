@@ -68,8 +68,9 @@ class Online:
     domain: int | None = None
     """ROS 2 domain (door dds); by default that of ROS_DOMAIN_ID, or 0."""
     interface: str | None = None
-    """Network interface or address (door dds). `localhost`: this machine only, packets of others are dropped; `default`: as
-    ROS_LOCALHOST_ONLY and ROS_AUTOMATIC_DISCOVERY_RANGE demand, else all of the subnet. Without the option as these variables demand, else `localhost`."""
+    """Network interface or address (door dds). `localhost`: this machine only, packets of others are dropped; `default`: what
+    ROS_LOCALHOST_ONLY and ROS_AUTOMATIC_DISCOVERY_RANGE demand, else all of the subnet. Without the option, what these variables demand,
+    else `localhost`."""
     node: NodeConfig = field(default_factory=NodeConfig)
     topic: TopicOverrides = field(default_factory=TopicOverrides)
     config: ReplayConfig = field(default_factory=ReplayConfig)

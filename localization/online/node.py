@@ -107,12 +107,10 @@ class Node:
             warm_up(pair, robot, heard.mounts, has_lidar, is_planar=False, config=config)
         gc.collect()
         gc.freeze()  # what is here now stays: later collections need not look at it
-        transport.keep(
-            [node.names.resolve(TF_STATIC), *(source.topic for source in heard.parts.sources.used())],
-            [] if lidar is None else [lidar.topic],
-        )
+        transforms = [node.names.resolve(topic) for topic in ((TF_STATIC, TF) if node.tf else (TF_STATIC,))]
         if node.tf:
-            transport.subscribe(node.names.resolve(TF), TF_TYPE, is_latched=False)
+            transport.subscribe(transforms[1], TF_TYPE, is_latched=False)
+        transport.keep([*transforms, *(source.topic for source in heard.parts.sources.used())], [] if lidar is None else [lidar.topic])
         tally = Tally()
         stream = Stream(heard, robot, tally, epoch_ns, is_ros1=transport.is_ros1)
         made = made_by(pair, robot, heard.mounts, has_lidar, config, "live topics")

@@ -40,9 +40,7 @@ class Frames(Settings):
         super().__post_init__()
         for name, frame in (("odom_frame", self.odom_frame), ("base_link_frame", self.base_link_frame)):
             if not frame or frame.startswith("/") or frame != frame.strip():
-                raise SettingError(
-                    f"setting {name} is '{frame}'; a frame's name must not be empty, begin with '/', or have blanks around it."
-                )
+                raise SettingError(f"setting {name} is '{frame}'; it must not be empty, begin with '/', or have blanks around it.")
         if self.odom_frame == self.base_link_frame:
             raise SettingError(f"odom_frame and base_link_frame are both '{self.odom_frame}'; they must be two frames.")
 
