@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 
 from localization.logs.decode import UnusableError, frame_name
 from localization.logs.wire import decoder
 
 _TF_TYPE = "tf2_msgs/msg/TFMessage"
 _CURRENT_S = 5.0
-_KEPT = 20
 
 
 class TransformConflicts:
@@ -18,16 +18,13 @@ class TransformConflicts:
     def __init__(self, odom_frame: str, base_link_frame: str, *, is_ros1: bool) -> None:
         self._odom, self._body = odom_frame, base_link_frame
         self._decode = decoder(_TF_TYPE, is_ros1=is_ros1)
-        self._own: list[bytes] = []
         self._sentence: str | None = None
         self._until = 0.0
 
-    def check(self, data: bytes, own: bytes) -> str | None:
-        """A sentence where ``data`` of /tf holds such a transform for the first time. ``own``: the last that this node published, which
+    def check(self, data: bytes, own: Iterable[bytes]) -> str | None:
+        """A sentence where ``data`` of /tf holds such a transform for the first time. ``own``: what this node published of late, which
         comes back from some transports."""
-        if own and (not self._own or self._own[-1] != own):
-            self._own = [*self._own[-_KEPT:], own]
-        if self._body.encode() not in data or any(data.startswith(mine) for mine in self._own):
+        if self._body.encode() not in data or any(data.startswith(mine) for mine in own):
             return None
         try:
             transforms = self._decode(data).transforms

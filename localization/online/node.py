@@ -96,6 +96,7 @@ class Node:
         warm_up(make_pair(True), robot, robot.mounts, has_lidar=True, is_planar=True, config=config)
         robot, topics = node.names.apply_to_robot(robot), node.names.apply_to_overrides(topics or TopicOverrides())
         listener = Listener(transport, robot, topics, node.names, node.frames.base_link_frame)
+        teller = Teller(transport, node.names, node.frames, with_tf=node.tf)  # now: whoever subscribes has found it by the first estimate
         needed = read_head(files.state).get("topics", []) if files.state is not None and files.state.exists() else []
         heard = listener.listen(node.wait_s, needed, tell, epoch_ns, is_over)
         for note in heard.parts.notes:
@@ -121,7 +122,6 @@ class Node:
             if view is not None:
                 view.begin(robot, heard.mounts)
                 session.view = view
-            teller = Teller(transport, node.names, node.frames, with_tf=node.tf)
             made_node = cls(transport, stream, session, teller, robot, heard, made, tell, node)
             if session.head:
                 if not isinstance(session.kept, Memory):
@@ -157,6 +157,10 @@ class Node:
             self.session.dump(self._head, now=True)
             self.session.close()
 
+    def publish_tf(self, is_on: bool) -> None:
+        """Publish the transform from now on, or no more."""
+        self._teller.publish_tf(is_on)
+
     @property
     def topics(self) -> list[str]:
         """Those in use."""
@@ -174,7 +178,7 @@ class Node:
     def _push(self, received: Received, *, time_it: bool) -> bool:
         """True if it made an estimate."""
         if received.topic == self._tf:
-            if (found := self._conflicts.check(received.data, self._teller.last_transform)) is not None:
+            if (found := self._conflicts.check(received.data, self._teller.recent_transforms)) is not None:
                 self._say(found)
             return False
         if received.topic == self._tf_static:

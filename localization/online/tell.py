@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ from localization.settings import Settings
 
 ODOMETRY, CORRECTIONS, TF, DIAGNOSTICS = "~/odometry", "~/corrections", "/tf", "/diagnostics"
 
+_RECENT = 500  # 10 s at 50 Hz: those of a start's backlog come back only after all of them
 _TYPES = {
     ODOMETRY: "nav_msgs/msg/Odometry",
     CORRECTIONS: "sensor_msgs/msg/JointState",
@@ -51,12 +53,18 @@ class Teller:
     def __init__(self, transport: Transport, names: Names, frames: Frames, *, with_tf: bool) -> None:
         self._transport, self._with_tf, self._frames = transport, with_tf, frames
         self._fused = FusedWriter(is_ros1=transport.is_ros1, parent=frames.odom_frame, body=frames.base_link_frame)
-        self.last_transform = b""
-        """As it was published."""
+        self.recent_transforms: deque[bytes] = deque(maxlen=_RECENT)
+        """As they were published."""
         self._topics = {topic: names.resolve(topic) for topic in _TYPES}
-        for topic, kind in _TYPES.items():
+        for topic in _TYPES:
             if topic != TF or with_tf:
-                transport.advertise(self._topics[topic], kind)
+                self._advertise(topic)
+
+    def publish_tf(self, is_on: bool) -> None:
+        """Publish the transform from now on, or no more."""
+        if is_on and not self._with_tf and not self.recent_transforms:
+            self._advertise(TF)
+        self._with_tf = is_on
 
     def estimate(self, estimate: Estimate, stamp_ns: int) -> None:
         """nav_msgs/Odometry with the true vy, and the transform `odom` -> `base_link`, at ``stamp_ns``."""
@@ -64,8 +72,8 @@ class Teller:
         fused = FusedEstimate(stamp_ns, estimate.pose, estimate.twist, covariance, estimate.twist_covariance)
         self._transport.publish(self._topics[ODOMETRY], self._fused.odometry(fused))
         if self._with_tf:
-            self.last_transform = self._fused.transform(fused)
-            self._transport.publish(self._topics[TF], self.last_transform)
+            self.recent_transforms.append(self._fused.transform(fused))
+            self._transport.publish(self._topics[TF], self.recent_transforms[-1])
 
     def corrections(self, parameters: Mapping[str, tuple[float, float]], stamp_ns: int) -> None:
         """Named numbers as sensor_msgs/JointState: ``position`` is the mean, ``effort`` its sigma."""
@@ -89,6 +97,9 @@ class Teller:
             for status in statuses
         ]
         self._publish(DIAGNOSTICS, make(_TYPES[DIAGNOSTICS], header=self._header(stamp_ns), status=entries))
+
+    def _advertise(self, topic: str) -> None:
+        self._transport.advertise(self._topics[topic], _TYPES[topic])
 
     def _publish(self, topic: str, message: object) -> None:
         self._transport.publish(self._topics[topic], encode(message, is_ros1=self._transport.is_ros1))
