@@ -1,6 +1,6 @@
 """ROS 2 parameters of the node: one for each number, name and switch of `NodeSettings`, with the same description and bounds.
 
-`python -m localization.online.parameters` writes `params.yaml`.
+`python -m localization.online.parameters` writes `share/params.yaml`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from localization.online.names import Names
 from localization.online.settings import OnlineSettings
 from localization.settings import Allowed, rules_of
 
-PARAMS_FILE = Path(__file__).with_name("params.yaml")
+PARAMS_FILE = Path(__file__).parent / "share" / "params.yaml"
 _LEFT_OUT = "none"
 _RENAMED = {"node.tf": "publish_tf", "node.wait_s": "wait_s"}  # publish_tf as robot_localization has it
 _DYNAMIC = ("node.tf",)
