@@ -62,6 +62,7 @@ class DdsTransport:
         self._waiting, self._urgent = dds.WaitSet(self._participant), dds.WaitSet(self._participant)
         self._readers: list[tuple[str, DataReader[Any], dds.ReadCondition]] = []
         self._writers: dict[str, _Writer] = {}
+        self._topics: dict[str, Topic[Any]] = {}
         self._found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         self._looked_ns = time.monotonic_ns()
         self._clocks: dict[str, SenderClock] = {}
@@ -70,9 +71,7 @@ class DdsTransport:
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         quality = _latched() if is_latched else _sensor_data()
-        reader = DataReader(
-            self._participant, Topic(self._participant, _dds_name(topic), _bytes_type(kind), quality), _hashed(quality, kind)
-        )
+        reader = DataReader(self._participant, self._topic(_dds_name(topic), kind), _hashed(quality, kind))
         is_new = dds.ReadCondition(reader, dds.ViewState.Any | dds.InstanceState.Any | dds.SampleState.NotRead)
         self._waiting.attach(is_new)
         self._readers.append((topic, reader, is_new))
@@ -125,11 +124,17 @@ class DdsTransport:
     def close(self) -> None:
         self._readers.clear()
         self._writers.clear()
+        self._topics.clear()
         del self._graph, self._waiting, self._urgent, self._found, self._participant, self._domain
 
+    def _topic(self, dds_name: str, kind: str) -> Topic[Any]:
+        """One for a reader and a writer, whose qualities differ: a second one with another quality is refused."""
+        if dds_name not in self._topics:
+            self._topics[dds_name] = Topic(self._participant, dds_name, _bytes_type(kind), Qos(*_COMMON))
+        return self._topics[dds_name]
+
     def _writer(self, dds_name: str, kind: str, quality: Qos) -> _Writer:
-        made = _bytes_type(kind)
-        return DataWriter(self._participant, Topic(self._participant, dds_name, made, quality), _hashed(quality, kind)), made
+        return DataWriter(self._participant, self._topic(dds_name, kind), _hashed(quality, kind)), _bytes_type(kind)
 
     def _publish_graph(self) -> None:
         """The participant's node and its endpoints: from these messages, not from DDS's own discovery, ROS 2 knows nodes."""

@@ -21,7 +21,7 @@ _FOLDER = ROOT / ".ros2"
 _COMMON = "ament-cmake ament-cmake-gmock ament-cmake-gtest ament-cmake-include-directories ament-cmake-pytest ament-package \
 fastrtps-cmake-module python-cmake-module rosidl-core-generators rosidl-default-generators"
 _MESSAGES = ("nav-msgs", "sensor-msgs", "geometry-msgs", "diagnostic-msgs", "std-srvs")
-_EXTRA = ["catkin-pkg==1.1.1", "colcon-core==0.21.3", "colcon-ros==0.5.0", "setuptools==68.1.2"]
+_EXTRA = ["catkin-pkg==1.1.1", "colcon-core==0.21.3", "colcon-ros==0.5.0", "setuptools==79.0.1"]
 
 
 def _pins(prefix: str, rclpy: str, rmw: str, messages: str, tools: str) -> list[str]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -82,11 +83,12 @@ def test_dds_door_beside_robots_that_leave_come_late_and_restart(distro, running
     assert node.process.poll() is None, node.text
 
     robot = running(Robot(distro, domain))
+    robot.do("spin 2")
     robot.do("play 9")
     found = robot.report()
     print({name: found[name] for name in ("sent", "answered", "first_s", "tf_count")}, np.quantile(found["latencies_s"][-60:], [0.5, 0.99]))
     assert found["answered"] >= 0.95 * found["sent"] > 90
-    assert found["first_s"] < 6.0  # 5 s of them are the node's own wait for all topics
+    assert found["first_s"] < 2.0 + 5.0  # 2 s without scans, then as long as the node waits for all topics
     assert found["frames"] == found["tf"] == [["odom", "base_link"]]
     assert found["tf_count"] == found["answered"]
     assert "/skidloc" in found["nodes"]
@@ -95,6 +97,7 @@ def test_dds_door_beside_robots_that_leave_come_late_and_restart(distro, running
     robot.kill()
 
     again = running(Robot(distro, domain))
+    again.do("spin 2")
     again.do("play 4")
     found = again.report()
     assert found["answered"] >= 0.9 * found["sent"] > 40
@@ -209,3 +212,32 @@ def test_lifecycle_node_refuses_wrong_parameters(distro, running, arguments, err
     node.end()
     assert error in node.text
     assert "Traceback" not in node.text
+
+
+def test_colcon_build_installs_a_package_that_ros2_finds_and_starts(distro, running, tmp_path):
+    """From a copy of the sources; the node is started as launch files do, with the installed parameter file."""
+    source, python = tmp_path / "src" / "skidloc", ros2_python(distro)
+    source.mkdir(parents=True)
+    for name in ("pyproject.toml", "setup.py", "package.xml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    for name in ("localization", "motion_models"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    environment = {**ros2_environment(own_domain(7)), "PATH": f"{python.parent}:{os.environ['PATH']}"}
+    build = [python.parent / "colcon", "build", "--event-handlers", "console_direct+"]
+    done = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True, env=environment, timeout=120)
+    assert done.returncode == 0, done.stderr
+    prefix = tmp_path / "install" / "skidloc"
+    index = "from ament_index_python.packages import get_package_share_directory as share; print(share('skidloc'))"
+    found = subprocess.run(
+        [python, "-c", index], capture_output=True, text=True, env={**environment, "AMENT_PREFIX_PATH": str(prefix)}, timeout=60
+    )
+    share = prefix / "share" / "skidloc"
+    assert found.stdout.strip() == str(share)
+    assert len(list((share / "launch").glob("*.launch.py"))) == 3
+    (site,) = prefix.glob("lib/python*/site-packages")
+    command = ["sh", "-c", 'exec "$@"', "sh", prefix / "lib" / "skidloc" / "skidloc_node"]
+    options = ["--ros-args", "-r", "__node:=skidloc", "--params-file", share / "params.yaml", "-p", "robot:=nobot"]
+    node = running(Process([*command, *options], {**environment, "PYTHONPATH": str(site)}))
+    assert node.process.wait(timeout=60) == 2  # read from both: a robot that drives would have to wait for compilers
+    node.end()
+    assert "nobot" in node.text
