@@ -17,6 +17,7 @@ from rich.live import Live
 from rich.markup import escape
 
 from localization.commands.online_line import live_line
+from localization.commands.online_terminal import terminal_view
 from localization.errors import DumpError, OutputError
 from localization.events import Event
 from localization.logs import open_log
@@ -96,7 +97,8 @@ class Online(OnlineSettings):
                         session.saw(event)
                     if console.is_terminal and now - shown >= _LINE_S:
                         shown, speed = now, f"  {seconds / max(now - began, 1e-9):.1f}x"
-                        live.update(live_line(session, seconds, session.health.statuses(session.core), speed), refresh=True)
+                        statuses = session.health.statuses(session.core)
+                        live.update(terminal_view(session, seconds, statuses, extra=speed), refresh=True)
             session.finish()
             count = session.write_out()
             is_done = True
@@ -170,7 +172,7 @@ class Online(OnlineSettings):
 
     def _show(self, console: Console, live: Live, node: Node) -> None:
         if console.is_terminal:
-            live.update(live_line(node.session, node.seconds, node.statuses), refresh=True)
+            live.update(terminal_view(node.session, node.seconds, node.statuses, node.rates()), refresh=True)
 
     def _summarize(self, console: Console, session: Session, seconds: float, count: int | None) -> None:
         console.print(live_line(session, seconds, []), soft_wrap=True)

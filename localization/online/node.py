@@ -166,6 +166,10 @@ class Node:
         """Those in use."""
         return [source.topic for source in self._stream.sources.used()]
 
+    def rates(self) -> dict[str, float]:
+        """Messages per second of the topics in use [Hz]."""
+        return self._stream.rates()
+
     def notes(self) -> list[str]:
         """Sentences about everything that was lost or mended."""
         return list(dict.fromkeys([*self._stream.dropped(), *self.session.core.notes()]))
