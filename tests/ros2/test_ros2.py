@@ -23,13 +23,12 @@ from tests.ros2.peers import Process, Robot, own_domain, start_skidloc
 pytest.importorskip("cyclonedds", reason="the extra 'ros2' (cyclonedds) is not installed")
 pytestmark = [
     pytest.mark.skipif(not os.environ.get("SKIDLOC_TEST_ROS2"), reason="real ROS 2 peers: run `make test-ros2`"),
-    pytest.mark.xdist_group("ros2"),
 ]
 ODOMETRY_HASH = "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0"  # as nav_msgs ships it
 _CLOUD_BYTES = 4_000_000
 
 
-@pytest.fixture(params=["kilted", "jazzy"])
+@pytest.fixture(params=[pytest.param(name, marks=pytest.mark.xdist_group(name)) for name in ("kilted", "jazzy")])
 def distro(request):
     try:
         ros2_python(request.param)
