@@ -18,13 +18,13 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from localization.commands.accuracy_table import accuracy_table
 from localization.commands.calibration_tables import WIDE, show
 from localization.commands.common import check_new, names, new_folder, write_json
-from localization.errors import EvaluationError
+from localization.errors import EstimatorError, EvaluationError
 from localization.estimators import CORRECTING, check_estimator
-from localization.events import Event
+from localization.events import Event, PositionSample
 from localization.logs import Log, TopicOverrides, open_log
 from localization.logs.fused import FusedEstimate, write_fused
-from localization.provenance import fingerprint, versions
 from localization.positions import merge_positions, position_samples
+from localization.provenance import fingerprint, versions
 from localization.references import ReferenceTrack, Relations, read_reference_file, reference_track
 from localization.report import ReportHead, overview_png, verdict, write_report
 from localization.run import Pair, ReplayConfig, Run, replay
