@@ -11,6 +11,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 from zlib import crc32
@@ -286,8 +287,8 @@ def _indexed_chunk(record: bytes, end: int) -> Chunk:
     pairs = sorted((at, key) for key, at in struct.iter_unpack("<HQ", record[36 : 36 + length // 10 * 10]))
     (index_size,) = struct.unpack_from("<Q", record, 36 + length)
     after = position + size + index_size
-    places = [at for at, _ in pairs] + [after]
-    if after > end or size < 9 or start_ns > end_ns or any(b - a < 15 for a, b in zip(places, places[1:], strict=False)):
+    places = [*(at for at, _ in pairs), after]
+    if after > end or size < 9 or start_ns > end_ns or any(b - a < 15 for a, b in pairwise(places)):
         raise DamagedError("its index of chunks contradicts itself")
     counts = {key: (following - at - 15) // 16 for (at, key), following in zip(pairs, places[1:], strict=True)}
     return Chunk(position, start_ns, end_ns, {key: count for key, count in counts.items() if count}, size)

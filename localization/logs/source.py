@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import stat
 import tempfile
+import warnings
 from collections.abc import Collection, Iterator
 from itertools import chain
 from pathlib import Path, PurePath
@@ -52,7 +53,9 @@ def _read_metadata(path: Path) -> tuple[list[str], int]:
     if path.stat().st_size > _LONGEST_METADATA:
         raise DamagedError("metadata.yaml is longer than any recorder's")
     try:
-        content = YAML(typ="safe").load(path.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the parser, about names that come twice
+            content = YAML(typ="safe").load(path.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
         names, listed = content["relative_file_paths"], content["message_count"]
     except FileNotFoundError:
         raise

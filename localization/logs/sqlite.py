@@ -82,7 +82,7 @@ class SqliteFile:
             raise DamagedError(str(error)) from error
         self._counts = Counter({key: n for key, n in count if key in self._topics})
         self.channels = _channels(self._topics, definitions, self._counts)
-        self.start_ns, self.end_ns = span if all(isinstance(stamp, int) for stamp in span) else (0, 0)
+        self.start_ns, self.end_ns = (int(stamp) if isinstance(stamp, int) else 0 for stamp in span)
         self.notes: list[str] = []
         wal = path.with_name(path.name + "-wal")
         if wal.is_file() and wal.stat().st_size > 0:
