@@ -278,3 +278,31 @@ def test_metadata_of_millions_of_brackets_is_not_parsed(tmp_path: Path) -> None:
         events, notes = read_all(path)
         assert sum(isinstance(e, Scan) for e in events) == 20
         assert "is not whole" in notes
+
+
+@pytest.mark.parametrize("compression", ["NONE", "LZ4", "ZSTD"])
+def test_whole_mcap_of_another_writer_is_read_by_its_index(tmp_path: Path, compression: str) -> None:
+    """With checksums of chunks and of the index, as rosbag2 writes them; a flipped bit of the index costs the index only."""
+    from mcap.writer import CompressionType, Writer
+
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=50_000, compression=CompressionType[compression])
+        writer.start("ros2", "test")
+        ids: dict[str, int] = {}
+        for topic, message, log_ns in records(100):
+            kind = message.__msgtype__
+            if topic not in ids:
+                schema = writer.register_schema(kind, "ros2msg", bags.STORE.generate_msgdef(kind, ros_version=2)[0].encode())
+                ids[topic] = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(ids[topic], log_ns, bytes(bags.STORE.serialize_cdr(message, kind)), log_ns)
+        writer.finish()
+    events, notes = read_all(path)
+    assert len(events) == 200
+    assert notes == ""
+    data = bytearray(path.read_bytes())
+    data[-100] ^= 1
+    path.write_bytes(data)
+    events, notes = read_all(path)
+    assert len(events) == 200
+    assert "read record by record (the checksum of its index is wrong)" in notes

@@ -122,7 +122,7 @@ class McapFile:
             raise DamagedError("it has no index of chunks")
         if not len(MAGIC) <= first <= end:
             raise DamagedError("its footer points outside of it")
-        if crc and _checksum(file, first, end + 25) != crc:
+        if crc and _checksum(file, first, end + 25) != crc:  # the footer up to the checksum itself is part of it
             raise DamagedError("the checksum of its index is wrong")
         listed = None
         for op, record in _described(file, first, end):
@@ -257,7 +257,7 @@ class McapFile:
 
 def _checksum(file: BinaryIO, first: int, end: int) -> int:
     file.seek(first)
-    crc, left = 0, end - first - 8  # of the footer, up to the checksum itself
+    crc, left = 0, end - first
     while left > 0 and (piece := file.read(min(left, _PIECE))):
         crc, left = crc32(piece, crc), left - len(piece)
     return crc
