@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import stat
 import tempfile
 import warnings
 from collections.abc import Collection, Iterator
@@ -15,6 +14,7 @@ from ruamel.yaml import YAML
 from localization.errors import LogError
 from localization.logs import mcap, ros1, sqlite
 from localization.logs.chunks import DamagedError, RawMessage, Source, inflate_file, merge_channels
+from motion_models.text_files import check_file
 
 _LONGEST_METADATA = 4 << 20
 """Of metadata.yaml [B]. It has some kB for a hundred topics and 200 B for each file that a recording was split into."""
@@ -96,10 +96,12 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 def require_file(path: Path) -> None:
     """Raises `LogError` for what is there but is no file: to read it may never end."""
-    mode = path.stat().st_mode
-    if not stat.S_ISREG(mode):
-        kind = {stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket", stat.S_IFDIR: "a folder"}.get(stat.S_IFMT(mode), "a device")
-        raise LogError(f"'{path}' is {kind}, not a file; copy what it gives into a file first.")
+    try:
+        check_file(path)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise LogError(f"log '{path}' cannot be read: {error.strerror}.") from error
 
 
 def _open_file(path: Path) -> Source:
