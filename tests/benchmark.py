@@ -13,6 +13,7 @@ PARTS = (
     "tests.benchmarks.lidar",
     "tests.benchmarks.graph",
     "tests.benchmarks.diagnosis",
+    "tests.benchmarks.faults",
     "tests.studies.thesis_regressions",
     "tests.studies.friction_grid",
     "tests.studies.gentle_arcs",

@@ -7,7 +7,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from localization.errors import LogError
+from localization.errors import LogError, TopicError
 from localization.events import Event, Reference
 from localization.logs.chunks import Source, merge_channels
 from localization.logs.decode import Decoder, UnusableError, frame_name, stamp_ns
@@ -98,7 +98,7 @@ class Log:
         Raises `TopicError` if the joint states, the only source of wheels, lack the robot's wheel joints.
         """
         if self.wheels_error is not None:
-            raise self.wheels_error
+            raise TopicError(" ".join([str(self.wheels_error), *self.damage()]))  # what was lost may be why
         tally = self._tallies["events"] = Tally()
         return self._events(tally)
 
