@@ -14,6 +14,7 @@ PARTS = (
     "tests.benchmarks.graph",
     "tests.benchmarks.diagnosis",
     "tests.benchmarks.faults",
+    "tests.benchmarks.fuzz",
     "tests.studies.thesis_regressions",
     "tests.studies.friction_grid",
     "tests.studies.gentle_arcs",
