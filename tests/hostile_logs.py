@@ -40,6 +40,9 @@ FAR_M, MOST_SIGMA = 1.0, 5.0
 _MOST_SECONDS = 120.0
 _MOST_BYTES = 4 << 30  # of address space: numba, gtsam and the log itself take 2 GB of it, and a fault may take 2 GB more
 
+_SCORED = ("/ground_truth/odom", "/fix")
+"""Topics that no fault changes."""
+
 Mutation = Callable[[list[Record], np.random.Generator], list[Record]]
 
 
@@ -127,7 +130,7 @@ def _each(kinds: tuple[str, ...], change: Callable[[Any, float], Any]) -> Mutati
         begin, end = records[0][2], records[-1][2]
         found = []
         for topic, message, stamp in records:
-            if message.__msgtype__.rsplit("/", 1)[1] in kinds:
+            if message.__msgtype__.rsplit("/", 1)[1] in kinds and topic not in _SCORED:
                 message = change(message, (stamp - begin) / max(end - begin, 1))
             if message is not None:
                 found.append((topic, message, stamp))
@@ -193,8 +196,7 @@ def _second_publisher(records: list[Record], rng: np.random.Generator) -> list[R
 def _silent(seconds: float) -> Mutation:
     def mutate(records: list[Record], rng: np.random.Generator) -> list[Record]:
         begin = records[0][2] + int(rng.uniform(2.0, 3.5) * S)
-        scored = ("/ground_truth/odom", "/fix")
-        return [r for r in records if r[0] in scored or not begin < r[2] < begin + seconds * S]
+        return [r for r in records if r[0] in _SCORED or not begin < r[2] < begin + seconds * S]
 
     return mutate
 
@@ -204,13 +206,14 @@ def _quaternion(norm: float) -> Any:
 
 
 _WHEELS, _SCANS, _IMU = ("JointState",), ("LaserScan",), ("Imu",)
+_ALL_WHEELS = (*_WHEELS, "Odometry")
 _LEVEL = bags.quaternion()
 SENSOR_FAULTS: dict[str, Mutation] = {
     "none": lambda records, rng: records,
     "all silent 5 s": _silent(5.0),
     "all silent 8 s": _silent(8.0),
-    "wheels read zero": _each(_WHEELS, lambda m, at: _stopped(m)),
-    "wheels stop half way": _each(_WHEELS, lambda m, at: None if at > 0.5 else m),
+    "wheels read zero": _each(_ALL_WHEELS, lambda m, at: _stopped(m)),
+    "wheels stop half way": _each(_ALL_WHEELS, lambda m, at: None if at > 0.5 else m),
     "wheels NaN half way": _each(
         _WHEELS, lambda m, at: _set(m, position=m.position * np.nan, velocity=m.velocity * np.nan) if at > 0.5 else m
     ),
