@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 from localization.compare_job import OK, Job, Row, Trial
 from localization.errors import OutputError
 from localization.estimators import CORRECTING
-from localization.output import whole_file
+from localization.output import output_errors, whole_file
 
 _HEAD = ("log", "robot", "model", "estimator", "corrections", "key", "status", "error")
 _TEXTS = (*_HEAD, "notes", "damage")
@@ -68,6 +68,8 @@ class Table:
         first = self.rows(jobs)
         known = {_name(row) for row in first}
         rows = first + [row for name, row in self._rows.items() if name not in known]
+        with output_errors(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(self.path, replace=True) as file:
             self._write(file, rows)
             file.flush()

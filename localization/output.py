@@ -64,7 +64,6 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[BinaryIO]:
     if not replace:
         refuse_existing(path)
     with output_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
         descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=".skidloc-")
     try:
         with output_errors(path):
@@ -80,7 +79,9 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[BinaryIO]:
 
 
 def write_text_file(path: Path, text: str, *, replace: bool = False) -> None:
-    """Write ``text`` as UTF-8; bytes of file names that are none appear as escapes. Raises `OutputError`."""
+    """Write ``text`` as UTF-8, and make the folders above; bytes of file names that are none appear as escapes. Raises `OutputError`."""
+    with output_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path, replace=replace) as file:
         file.write(as_text(text).encode())
 

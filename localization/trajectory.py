@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from localization.errors import EvaluationError
-from localization.output import write_text_file
+from localization.output import whole_file
 from motion_models import se2
 from motion_models.se2 import FloatArray
 from motion_models.text_files import check_file
@@ -148,7 +148,8 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
         sign = "-" if stamp < 0 else ""
         qz, qw = math.sin(0.5 * theta), math.cos(0.5 * theta)
         lines.append(f"{sign}{seconds}.{nanoseconds:09d} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}\n")
-    write_text_file(path, "".join(lines))
+    with whole_file(path) as file:
+        file.write("".join(lines).encode("ascii"))
 
 
 def read_tum(path: str | Path) -> Trajectory:

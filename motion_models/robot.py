@@ -311,7 +311,7 @@ def _build(kind: type[Section], table: Any, name: str, source: str) -> Section:
 def _refuse_unknown(table: Mapping[str, Any], known: set[str], where: str) -> None:
     unknown = sorted(set(table) - known)
     if unknown:
-        nearest = difflib.get_close_matches(unknown[0], sorted(known), n=1)
+        nearest = difflib.get_close_matches(unknown[0][:_LONGEST_SHOWN], sorted(known), n=1)
         meant = f" (did you mean {nearest[0]}?)" if nearest else ""
         named = ", ".join(name if len(name) <= _LONGEST_SHOWN else f"{name[:_LONGEST_SHOWN]}..." for name in unknown[:10])
         raise RobotError(f"{where}: unknown entry {named}{meant}; known are {', '.join(sorted(known))}.")
