@@ -11,6 +11,7 @@ from pathlib import Path
 from localization.compare_stats import Difference, Mean, by_combination, combination
 from localization.compare_verdict import Findings, against_best, closing, headline, p_words, percent
 from localization.errors import OutputError
+from localization.output import write_text_file
 from localization.report_compare_plots import gains_svg, means_svg
 from localization.report_lines import capitalised, estimator_colours
 from localization.report_page import bullets, figure, glossary, html_page, opening, section
@@ -52,13 +53,7 @@ class CompareHead:
 def write_comparison_report(path: Path, head: CompareHead, found: Findings) -> None:
     """Write the page, over the report of an earlier state of the same table, but over nothing else. Raises `OutputError`."""
     check_report(path)
-    beside = path.with_name(f".{path.name}.new")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside.write_text(comparison_page(head, found), encoding="utf-8")
-        beside.replace(path)
-    except OSError as error:
-        raise OutputError(f"'{path}' cannot be written: {error.strerror}.") from error
+    write_text_file(path, comparison_page(head, found), replace=True)
 
 
 def check_report(path: Path) -> None:

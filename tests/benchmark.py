@@ -13,6 +13,8 @@ PARTS = (
     "tests.benchmarks.lidar",
     "tests.benchmarks.graph",
     "tests.benchmarks.diagnosis",
+    "tests.benchmarks.faults",
+    "tests.benchmarks.fuzz",
     "tests.studies.thesis_regressions",
     "tests.studies.friction_grid",
     "tests.studies.gentle_arcs",
