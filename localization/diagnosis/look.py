@@ -57,16 +57,16 @@ def candidates(pipeline: Pipeline, moments: int) -> tuple[Effect, ...]:
     """Causes that this drive could show; a change of the floor at so many ``moments``."""
     drive = pipeline.drive
     out = set()
-    if drive.gyro is None and not drive.gyro_is_witness:
+    if drive.gyro is None and not drive.is_gyro_reference:
         out.add("gyro_bias")
     if not pipeline.dropout_seen:
         out.add("encoder_dropout")
-    if drive.gyro_is_witness:
+    if drive.is_gyro_reference:
         out |= {"lidar_offset_x", "lidar_offset_y", "lidar_yaw", "lidar_time_offset", "lateral_slip_speed", "longitudinal_slip_turning"}
     if drive.kind == "rotations":
         out |= {"lidar_time_offset", "wheel_time_offset", "slope", "lateral_slip_speed", "rotation_slip_speed", "longitudinal_slip_turning"}
     found = [e for e in EFFECTS.values() if e.id not in out]
-    if drive.kind == "log" and not drive.gyro_is_witness:
+    if drive.kind == "log" and not drive.is_gyro_reference:
         found.append(slope_across())
         length = float(drive.starts_s[-1])
         if len(drive.maneuvers) >= 24:

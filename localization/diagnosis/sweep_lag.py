@@ -17,7 +17,7 @@ def sweep_lag(pipeline: Pipeline) -> FloatArray:
     """
     batch = pipeline.batch
     out = np.zeros((len(batch.ends), len(CHANNELS), 2))
-    if pipeline.drive.kind != "log" or pipeline.drive.gyro_is_witness:
+    if pipeline.drive.kind != "log" or pipeline.drive.is_gyro_reference:
         return out
     twist = pipeline.nominal_twist
     for i, (end, owner) in enumerate(zip(batch.ends, batch.owner, strict=True)):
