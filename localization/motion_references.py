@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -121,7 +120,7 @@ class GyroMotionReference:
             duration = (span.end_ns - span.start_ns) * _NS
             cov = span.cov + np.diag([0.0, 0.0, (sigma * duration) ** 2])
             yaw = se2.wrap_angle(np.asarray(span.measured[2] - bias * duration))
-            corrected.append(dataclasses.replace(span, measured=np.array([0.0, 0.0, float(yaw)]), cov=cov))
+            corrected.append(replace(span, measured=np.array([0.0, 0.0, float(yaw)]), cov=cov))
         return corrected
 
     def notes(self) -> list[str]:
@@ -141,9 +140,8 @@ class LidarMotionReference:
 
     def __init__(self, mounts: Mapping[str, Mount], window_s: float, config: LidarConfig | None = None) -> None:
         self._mounts, self._window_ns = mounts, round(window_s / _NS)
-        self._config = config or LidarConfig()
+        self._config = replace(config or LidarConfig(), key_scans=1)
         self._matcher: ScanMatcher | None = None
-        self._first = np.empty((0, 2))  # points of the window's first scan, until there is a matcher
         self._start_ns: int | None = None
         self._last_ns = 0
         self._pose, self._slip = np.zeros(3), np.zeros(3)
@@ -154,7 +152,7 @@ class LidarMotionReference:
             return
         self._scans += 1
         stamp_ns = event.middle_ns
-        if self._start_ns is None or (stamp_ns - self._last_ns) * _NS > _MAX_SCAN_GAP_S:
+        if self._matcher is None or self._start_ns is None or (stamp_ns - self._last_ns) * _NS > _MAX_SCAN_GAP_S:
             self._slip = np.zeros(3)
             self._begin(stamp_ns, self._deskew(self._sweep(event), event, wheels))
             return
@@ -166,7 +164,7 @@ class LidarMotionReference:
                 yield Span(self._start_ns, stamp_ns, np.zeros(3), _STANDSTILL_COV)
                 self._begin(stamp_ns, self._deskew(self._sweep(event), event, wheels))
             return
-        match, points = self._match(event, wheels)
+        match, points = self._match(self._matcher, event, wheels)
         if is_complete:
             yield self._span(stamp_ns, match)
             self._begin(stamp_ns, points)
@@ -184,11 +182,16 @@ class LidarMotionReference:
         return notes
 
     def _begin(self, stamp_ns: int, points: FloatArray) -> None:
-        self._first, self._matcher = points, None
-        self._start_ns = self._last_ns = stamp_ns
-        self._pose = np.zeros(3)
+        """A window begins with a scan of these ``points`` (N, 2), or with the next one if they are too few."""
+        self._last_ns, self._pose = stamp_ns, np.zeros(3)
+        self._start_ns = stamp_ns if len(points) >= MIN_POINTS else None
+        if self._start_ns is None:
+            return
+        if self._matcher is None:
+            self._matcher = ScanMatcher(self._config, choose_cell(self._config, points))
+        self._matcher.insert_key_scan(self._pose, points)
 
-    def _match(self, scan: Scan, wheels: Wheels) -> tuple[ScanMatch | None, FloatArray]:
+    def _match(self, matcher: ScanMatcher, scan: Scan, wheels: Wheels) -> tuple[ScanMatch | None, FloatArray]:
         """The match of ``scan`` with the first of its window, and its points (M, 2) as they were deskewed. Without a match, the pose is
         the wheels'."""
         motion = wheels.motion(self._last_ns, scan.middle_ns)
@@ -197,15 +200,12 @@ class LidarMotionReference:
         sweep = self._sweep(scan)
         points = self._deskew(sweep, scan, wheels)
         match, gap = None, (scan.middle_ns - self._last_ns) * _NS
-        if self._matcher is None and len(self._first) >= MIN_POINTS:
-            self._matcher = ScanMatcher(self._config, choose_cell(self._config, self._first))
-            self._matcher.insert_key_scan(np.zeros(3), self._first)
-        if self._matcher is not None and len(points) >= MIN_POINTS:
-            match = self._matcher.match(points, prior, cov)
+        if len(points) >= MIN_POINTS:
+            match = matcher.match(points, prior, cov)
             if match is not None and gap > 0.0:
                 self._slip = (se2.log(se2.between(self._pose, match.measured)) - se2.log(motion.delta)) / gap
                 points = self._deskew(sweep, scan, wheels)
-                match = self._matcher.refine(points, prior, cov, match)
+                match = matcher.refine(points, prior, cov, match)
         self._unmatched += match is None
         self._pose, self._last_ns = prior if match is None else match.measured, scan.middle_ns
         return match, points
