@@ -134,8 +134,8 @@ class GyroMotionReference:
 class LidarMotionReference:
     """Scan matching alone: the last scan of each window against the submap of its first. Spans run between the middles of sweeps.
 
-    The scans between lead from one to the other. Wheels start each match, and supply what the twist within a sweep differs by from the
-    motion that was matched last; neither the measured pose nor its covariance contains them.
+    The scans between lead from one to the other. Wheels are the prior of each match, also along directions that the scene leaves open, and
+    the twist within a sweep is theirs plus the slip of the last match. The measured pose and its covariance are without that prior.
     """
 
     def __init__(self, mounts: Mapping[str, Mount], window_s: float, config: LidarConfig | None = None) -> None:
@@ -203,11 +203,11 @@ class LidarMotionReference:
         if len(points) >= MIN_POINTS:
             match = matcher.match(points, prior, cov)
             if match is not None and gap > 0.0:
-                self._slip = (se2.log(se2.between(self._pose, match.measured)) - se2.log(motion.delta)) / gap
+                self._slip = (se2.log(se2.between(self._pose, match.pose)) - se2.log(motion.delta)) / gap
                 points = self._deskew(sweep, scan, wheels)
                 match = matcher.refine(points, prior, cov, match)
         self._unmatched += match is None
-        self._pose, self._last_ns = prior if match is None else match.measured, scan.middle_ns
+        self._pose, self._last_ns = prior if match is None else match.pose, scan.middle_ns
         return match, points
 
     def _span(self, end_ns: int, match: ScanMatch | None) -> Span:
