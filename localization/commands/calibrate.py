@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from localization.calibration import Calibrated, Cut, Turning, MotionReferenceName, calibrated, cut_log, turning
+from localization.calibration import Calibrated, Cut, MotionReferenceName, Turning, calibrated, cut_log, turning
 from localization.commands.calibration_tables import numbers, print_by_source, print_cuts, print_fit, print_rotation_errors
 from localization.commands.common import check_new, write_json, write_text
 from localization.commands.regression_tables import print_regressions, regression_numbers
