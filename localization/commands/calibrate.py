@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from localization.calibration import Calibrated, Cut, Turning, WitnessName, calibrated, cut_log, turning
+from localization.calibration import Calibrated, Cut, MotionReferenceName, Turning, calibrated, cut_log, turning
 from localization.commands.calibration_tables import numbers, print_by_source, print_cuts, print_fit, print_rotation_errors
 from localization.commands.common import write_json
 from localization.commands.regression_tables import print_regressions, regression_numbers
@@ -49,7 +49,7 @@ class Calibrate:
     """Motion model to fit."""
     fit: str = ""
     """Parameters to fit, separated by commas; all of them must show. Default: the model's usual ones, as far as the drive reveals them."""
-    witness: WitnessName = "auto"
+    witness: MotionReferenceName = "auto"
     """What measured the real motion in logs: the reference if one is named, else the LiDAR, else the gyro (headings alone)."""
     reference: str | None = None
     """Topic or TUM file with positions and headings, as the witness. Never used unless named."""

@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from localization.calibration import WitnessName
+from localization.calibration import MotionReferenceName
 from localization.commands.common import new_folder, write_json
 from localization.diagnosis.diagnose import DiagnosisConfig, Examined, examine
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_table
@@ -42,7 +42,7 @@ class Diagnose:
     """Motion model whose predictions are held against what really happened."""
     out: Path | None = None
     """New folder for diagnosis.json, diagnosis.html and robot.toml, the robot with the findings in it, which every command takes."""
-    witness: WitnessName = "auto"
+    witness: MotionReferenceName = "auto"
     """What measured the real motion in logs: the reference if one is named, else the LiDAR, else the gyro (headings alone)."""
     reference: str | None = None
     """Topic or TUM file with positions and headings, as the witness. Never used unless named."""
