@@ -51,7 +51,10 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
 
 
 def equally_good(lines: Sequence[Line], best: Line, reference: ReferenceTrack | Relations) -> list[Line]:
-    """The scored runs that can be recommended, without ``best``, whose errors this log cannot tell from those of ``best``, or that differ by less than 2 %."""
+    """The scored runs but ``best`` whose errors this log cannot tell from its errors, or that differ by less than 2 %.
+
+    Runs that lost the LiDAR for long are not among them.
+    """
     others = [line for line in lines if line is not best and line.error is not None and not line.is_lost]
     return [line for line in others if is_close(line, best) or not _is_worse(line, best, reference)]
 

@@ -2,9 +2,10 @@
 
 python -m tests.studies.ablation [--only NAME,...] [--seconds 300] [--write]
 
-Five drives, the first 300 s of each (`--seconds`): ACES (mean error of the relations), fr079 and MIT-CSAIL (ATE at the reference's instants), laps simulated by the physics of
-the tyres with nominal sensors, and laps over a slippery patch whose ranges are twice as noisy as assumed, with slip that the filter's noise
-model does not have (ATE, and mean NEES of the pose with 3 expected). `--write` puts the table into `localization/estimators/README.md`.
+Five drives, the first 300 s of each (`--seconds`): ACES (mean error of the relations), fr079 and MIT-CSAIL (ATE at the reference's
+instants), laps simulated by the physics of the tyres with nominal sensors, and laps over a slippery patch whose ranges are twice as noisy
+as assumed, with slip that the filter's noise model does not have (ATE, and mean NEES of the pose with 3 expected). `--write` puts the table
+into `localization/estimators/README.md`.
 """
 
 from __future__ import annotations
