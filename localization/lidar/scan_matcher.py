@@ -107,7 +107,7 @@ class KeyScanError:
 
 
 @dataclass(frozen=True)
-class _Fit:
+class Fit:
     """A minimum of the cost above."""
 
     pose: FloatArray
@@ -164,7 +164,7 @@ class ScanMatcher:
         H, _, found = linearize(self._grid, points, triple(pose), 0.0)
         if found[0] < self._config.lost_below:
             return None
-        fit = _Fit(pose, H, *(float(value) for value in found))
+        fit = Fit(pose, H, *(float(value) for value in found))
         return self._result(fit, pose, np.eye(3), np.zeros((3, 3)))
 
     def insert_key_scan(self, pose: FloatArray, points: FloatArray) -> KeyScanError:
@@ -190,10 +190,9 @@ class ScanMatcher:
         """(M, 2) of the submap, in the odometry frame [m]."""
         return np.vstack(self._keys) if self._keys else np.empty((0, 2))
 
-    def _align(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray) -> _Fit:
+    def _align(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray) -> Fit:
         assert self._grid is not None
-        pose, H, found = _align(self._grid, points, prior, cov, np.linalg.inv(cov), guess)
-        return _Fit(pose, H, *(float(value) for value in found))
+        return align_points(self._grid, points, prior, cov, guess)
 
     def _search(self, points: FloatArray, prior: FloatArray, wide: FloatArray, cov: FloatArray) -> FloatArray | None:
         """The best pose (3,) within 3 sigma of ``wide`` (3, 3), limited unless ``cov`` (3, 3) is wider; None where it is ambiguous."""
@@ -203,7 +202,7 @@ class ScanMatcher:
         best = search(self._image, voxel_means(points, self.cell), prior, wide, limit)
         return None if best.rival_score >= _MAX_RIVAL * best.score else best.pose
 
-    def _result(self, fit: _Fit, prior: FloatArray, cov: FloatArray, outlier_cov: FloatArray) -> ScanMatch:
+    def _result(self, fit: Fit, prior: FloatArray, cov: FloatArray, outlier_cov: FloatArray) -> ScanMatch:
         """The scan's own pose z: where its gradient H (z - x) outweighs the prior's, J^T P^-1 log(prior^-1 x)."""
         R = np.linalg.inv(fit.information + _OPEN_INFORMATION)
         off = se2.log(se2.between(prior, fit.pose))
@@ -213,12 +212,18 @@ class ScanMatcher:
         return ScanMatch(fit.pose, measured, R * self._variance_ratio, fit.overlap, outlier_cov)
 
 
-def _is_better(found: _Fit, fit: _Fit, prior: FloatArray, cov: FloatArray) -> bool:
+def align_points(grid: VoxelGrid, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray) -> Fit:
+    """Gauss-Newton from ``guess`` (3,) for ``points`` (N, 2), with the ``prior`` (3,) of covariance ``cov`` (3, 3)."""
+    pose, H, found = _align(grid, points, prior, cov, np.linalg.inv(cov), guess)
+    return Fit(pose, H, *(float(value) for value in found))
+
+
+def _is_better(found: Fit, fit: Fit, prior: FloatArray, cov: FloatArray) -> bool:
     """Whether the pose that was ``found`` is more probable than ``fit``, where the prior may be an outlier."""
     return _total_cost(found, prior, cov) < _total_cost(fit, prior, cov)
 
 
-def _total_cost(fit: _Fit, prior: FloatArray, cov: FloatArray) -> float:
+def _total_cost(fit: Fit, prior: FloatArray, cov: FloatArray) -> float:
     return fit.cost + min(_mahalanobis(prior, fit.pose, cov) / 2.0, _OUTLIER_COST)
 
 
