@@ -35,8 +35,8 @@ from motion_models.robot import Mount, Robot, load_robot
 DATA = Path(__file__).parents[1] / "data"
 RPE_M = 10.0
 SHORT_S = 20.0
-_SAME_INSTANT_NS = 150_000_000
-"""A pose farther in time from a reference's instant is not scored: less than a scan's period on ACES, the slowest of these logs."""
+_SAME_INSTANT_NS = 1_000_000
+"""A pose farther in time from a reference's instant is not scored: the references' stamps are those of scans, rounded to a microsecond."""
 
 
 @dataclass(frozen=True)
