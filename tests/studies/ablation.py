@@ -44,7 +44,7 @@ README = Path(__file__).parents[2] / "localization/estimators/README.md"
 BEGIN, END = "<!-- ablation: begin -->", "<!-- ablation: end -->"
 _NO_PRIOR = 1e6 * np.eye(3)
 """Covariance of a prior that says nothing [m^2, m^2, rad^2]."""
-_LAPS = 2
+_LAPS = 1
 
 Patch = Callable[[], contextlib.AbstractContextManager[Any]]
 
