@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import pytest
 
+from localization.compare_job import _scores
+from localization.compare_table import Table
 from localization.compare_verdict import closing, find
 from localization.lidar import LostScans
 from localization.lidar_losses import LidarLosses, per_cent
@@ -129,6 +131,20 @@ def test_comparison_with_lost_best_combination_advises_another() -> None:
 @pytest.mark.parametrize("share", [None, 0.04])
 def test_comparison_without_long_losses_is_silent(share: float | None) -> None:
     assert not any("recommended" in sentence for sentence in closing(find(compared(share), "ate_rmse_m")))
+
+
+def test_rows_of_a_comparison_are_numbers_that_the_table_reads_again(tmp_path) -> None:
+    """Also of a run with live poses besides the smoothed ones."""
+    smoothed = replace(lost_and_found()[0], moments=run().trajectory)
+    (result,) = score([smoothed], track())
+    scores = _scores(result.metrics(200.0, with_timing=False))
+    assert (scores["lidar_lost_share"], scores["lidar_longest_lost_s"], scores["lidar_longest_lost_since_s"]) == (0.6, 60.0, 7.0)
+    assert not any(isinstance(value, dict) for value in scores.values())
+    table = Table(tmp_path / "table.csv")
+    head = {"log": "a", "robot": "r", "model": "m", "estimator": "graph", "corrections": "", "key": "k", "status": "ok", "error": ""}
+    table.put([{**head, **scores}])
+    table.save([])
+    assert Table(tmp_path / "table.csv").path.exists()
 
 
 @pytest.mark.parametrize(
