@@ -96,7 +96,7 @@ def _thin_grid(*arguments: Any) -> VoxelGrid:
 def _align_freely(original: Callable[..., Any], self: ScanMatcher, points: Any, prior: Any, cov: Any, guess: Any) -> Any:
     """The prior sets the reach of associations but does not pull."""
     pose, H, found = scan_matcher._align(self._grid, points, prior, cov, np.linalg.inv(_NO_PRIOR), guess)
-    return scan_matcher._Fit(pose, H, *(float(value) for value in found))
+    return scan_matcher.Fit(pose, H, *(float(value) for value in found))
 
 
 def _result_freely(original: Callable[..., Any], self: ScanMatcher, fit: Any, prior: Any, cov: Any, outlier_cov: Any) -> Any:
