@@ -20,6 +20,7 @@ from localization.report_tables import MISSING, definition_table, header, number
 
 _TITLE = "Comparison over"
 _BEST, _EQUAL = ' <span class="badge">best</span>', ' <span class="badge soft">not told apart</span>'
+_LOST = ' <span class="badge soft">LiDAR lost</span>'
 _TERMS = (
     (
         "Mean",
@@ -110,7 +111,7 @@ def _tests(found: Findings, styles: Mapping[str, tuple[str, int]]) -> str:
     for mean in found.means:
         d = None if mean is found.best else found.against_best(mean.name)
         interval = f"<br><small>{number(mean.low, digits)} to {number(mean.high, digits)}</small>" if mean.n > 1 else ""
-        badge = _BEST if mean is found.best else _EQUAL if d is None or not found.is_shown(d) else ""
+        badge = _LOST if found.lost(mean.name) else _BEST if mean is found.best else _EQUAL if d is None or not found.is_shown(d) else ""
         cells = (MISSING,) * 3 if d is None else _cells(d, found)
         rows.append(row(_name(mean.name, found, styles, badge), number(mean.mean, digits) + interval, str(mean.n), *cells))
     unit = f"<br><small>{found.unit or found.metric}, 95 %</small>"
