@@ -19,6 +19,9 @@ from motion_models.se2 import FloatArray
 
 Section = TypeVar("Section")
 
+MODEL_OPTIONS: Mapping[str, tuple[str, ...]] = {"friction": ("contact", "centripetal")}
+"""Entries of [models.NAME] that choose something, where all others are numbers."""
+
 
 @dataclass(frozen=True)
 class Geometry:
@@ -144,6 +147,8 @@ class Robot:
     gyro_noise: GyroNoise = GyroNoise()
     models: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Coefficients by model name, then by parameter name; what is not named keeps the model's own default."""
+    options: Mapping[str, Mapping[str, str | bool]] = field(default_factory=dict)
+    """Choices by model name, then by `MODEL_OPTIONS`; in the file they stand among the model's coefficients."""
     arms: Arms | None = None
     """Arms that move the centre of gravity; None where it stays where `Geometry` says."""
     folder: Path | None = field(default=None, compare=False)
@@ -164,6 +169,20 @@ class Robot:
         if unknown:
             raise RobotError(f"robot '{self.name}': models.{model} has no parameter {', '.join(unknown)}; it has {', '.join(names)}.")
         return np.array([table.get(name, default) for name, default in zip(names, defaults, strict=True)])
+
+    def choice(self, model: str, name: str, allowed: tuple[str, ...], default: str) -> str:
+        """What [models.MODEL] chooses by ``name``. Raises `RobotError` for what is not ``allowed``."""
+        chosen = self.options.get(model, {}).get(name, default)
+        if chosen not in allowed:
+            raise RobotError(f"robot '{self.name}': models.{model}.{name} is {chosen!r}; there are {', '.join(allowed)}.")
+        return str(chosen)
+
+    def switch(self, model: str, name: str, default: bool) -> bool:
+        """Whether [models.MODEL] switches ``name`` on. Raises `RobotError` for what is neither true nor false."""
+        chosen = self.options.get(model, {}).get(name, default)
+        if not isinstance(chosen, bool):
+            raise RobotError(f"robot '{self.name}': models.{model}.{name} is {chosen!r}; it must be true or false.")
+        return chosen
 
 
 def robot_names() -> list[str]:
@@ -199,7 +218,7 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise RobotError(f"{source}: not valid TOML: {error}.") from error
-    known = {f.name for f in dataclasses.fields(Robot)} - {"folder"}
+    known = {f.name for f in dataclasses.fields(Robot)} - {"folder", "options"}
     _refuse_unknown(data, known, source)
     if not isinstance(data.get("name"), str):
         raise RobotError(f'{source}: needs a line name = "...".')
@@ -211,11 +230,7 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
     if min(driver.wheel_radius_m, driver.track_width_m, driver.wheel_separation_multiplier) <= 0:
         raise RobotError(f"{source}: every number of [driver] must be positive.")
     mounts = {frame: _build(Mount, table, f"mounts.{frame}", source) for frame, table in _table(data, "mounts", source).items()}
-    models = {
-        model: {name: _number(value, f"models.{model}.{name}", source) for name, value in _table(tables, model, source).items()}
-        for tables in [_table(data, "models", source)]
-        for model in tables
-    }
+    models, options = _models(_table(data, "models", source), source)
     return Robot(
         name=data["name"],
         geometry=geometry,
@@ -226,9 +241,26 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
         wheel_noise=_section(WheelNoise, data, "wheel_noise", source),
         gyro_noise=_section(GyroNoise, data, "gyro_noise", source),
         models=models,
+        options=options,
         arms=_arms(data, source) if "arms" in data else None,
         folder=folder,
     )
+
+
+def _models(tables: Mapping[str, Any], source: str) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, str | bool]]]:
+    """Coefficients and choices of each model."""
+    models: dict[str, dict[str, float]] = {}
+    options: dict[str, dict[str, str | bool]] = {}
+    for model in tables:
+        models[model] = {}
+        for name, value in _table(tables, model, source).items():
+            if name not in MODEL_OPTIONS.get(model, ()):
+                models[model][name] = _number(value, f"models.{model}.{name}", source)
+            elif isinstance(value, str | bool):
+                options.setdefault(model, {})[name] = value
+            else:
+                raise RobotError(f"{source}: models.{model}.{name} must be text or true or false, found {value!r}.")
+    return models, options
 
 
 def _arms(data: Mapping[str, Any], source: str) -> Arms:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 
@@ -23,6 +24,7 @@ CHANNELS = ("x", "y", "yaw", "gyro", "force_x", "force_y")
 CHANNEL_UNITS = ("m", "m", "rad", "rad", "m/s^2", "m/s^2")
 _GRAVITY = 9.81
 _REMEMBERED = 100
+_MOST_OTHER_LAW = 1.3  # share of the other contact law; beyond 1 for the search only
 _NO_COLUMNS: IntArray = np.empty(0, dtype=np.int64)
 
 
@@ -54,7 +56,7 @@ class Pipeline:
             inside = slice(first[w], first[w + 1])
             dt = self.batch.dt[inside]
             self._times[inside] = start + np.cumsum(dt) - dt - dt[: lead[w]].sum()
-        self._base = steady_twists(self._friction.nominal, self.batch.wheels, self.batch.cg)
+        self._base = steady_twists(self._friction, self._friction.nominal, self.batch.wheels, self.batch.cg)
         self._kinematic_forces = self._accelerations()
         self._known: dict[tuple[object, ...], FloatArray] = {}
 
@@ -187,7 +189,7 @@ class _Changed:
     def _floor(self, rates: FloatArray, cg: FloatArray) -> FloatArray:
         """(N, 3) what the friction model says is otherwise: causes of the floor, and inertia."""
         p, b = self._p, self._b
-        is_otherwise = b.friction or any(b.cg) or b.payload_kg or b.change
+        is_otherwise = b.friction or any(b.cg) or b.payload_kg or b.change or b.other_law
         if not (is_otherwise or any(b.slope) or p.settling):
             return np.zeros((len(rates), 3))
         friction = p._friction
@@ -198,7 +200,11 @@ class _Changed:
         params[6], params[7] = max(params[6], 0.0), max(params[7], 0.0)
         params[9] = min(max(params[9], -0.9), 0.9)
         params[1] = max(params[1], 0.2 * friction.nominal[1])
-        nominal = self._settled(rates, cg, friction.nominal)
+        law = friction
+        if b.other_law:
+            share = min(b.other_law, _MOST_OTHER_LAW)
+            law = dataclasses.replace(friction, saturation=friction.saturation + (1.0 - 2.0 * friction.saturation) * share)
+        nominal = self._settled(friction, rates, cg, friction.nominal)
         moved = cg
         if any(b.cg) or b.payload_kg:
             mass = p.drive.robot.geometry.mass_kg
@@ -206,38 +212,45 @@ class _Changed:
             half = 0.49 * np.array([params[2], params[1]])
             moved = np.clip(moved, -half, half)
         if not b.change:
-            return self._moved(rates, moved, params) - nominal
+            return self._moved(law, rates, moved, params) - nominal
         later = params.copy()
         later[4] = max(later[4] * (1.0 + b.change), 0.05)
         is_later = (p._times >= b.change_s)[:, None]
-        return np.asarray(np.where(is_later, self._moved(rates, moved, later), self._moved(rates, moved, params)) - nominal)
+        return np.asarray(np.where(is_later, self._moved(law, rates, moved, later), self._moved(law, rates, moved, params)) - nominal)
 
-    def _settled(self, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+    def _settled(self, law: FrictionModel, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
         """(N, 3) twists of the tracked point without inertia; remembered, as many beliefs share them."""
         p, b = self._p, self._b
-        key = (*self._rates_key(), params.tobytes(), *((b.cg, b.payload_kg) if cg is not p.batch.cg else ()))
+        key = (*self._rates_key(), law.saturation, params.tobytes(), *((b.cg, b.payload_kg) if cg is not p.batch.cg else ()))
         if key not in p._known:
             if len(p._known) > _REMEMBERED:
                 p._known.clear()
-            p._known[key] = steady_twists(params, rates, cg)
+            p._known[key] = steady_twists(law, params, rates, cg)
         return p._known[key]
 
     def _rates_key(self) -> tuple[object, ...]:
         b = self._b
         return b.radius_left, b.radius_right, b.encoder_lost, b.wheels_late_s - b.lidar_late_s, b.wheel_lag_s
 
-    def _moved(self, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+    def _moved(self, law: FrictionModel, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
         """(N, 3) twists of the tracked point, with inertia where that counts."""
         p, b = self._p, self._b
-        settled = self._settled(rates, cg, params)
+        settled = self._settled(law, rates, cg, params)
         if not (p.settling or any(b.slope)):
             return settled
-        key = (*self._rates_key(), params.tobytes(), b.slope, *((b.cg, b.payload_kg) if cg is not p.batch.cg else ()), "inertia")
+        key = (
+            *self._rates_key(),
+            law.saturation,
+            params.tobytes(),
+            b.slope,
+            *((b.cg, b.payload_kg) if cg is not p.batch.cg else ()),
+            "inertia",
+        )
         if key not in p._known:
             x, y = params[TRACKED[0]], params[TRACKED[1]]
             middle = settled + settled[:, 2:] * np.array([y, -x, 0.0])
             batch = p.batch
-            twists = settling_twists(p.drive.robot, params, batch.dt, rates, cg, batch.first, p.headings, b.slope, middle)
+            twists = settling_twists(p.drive.robot, law, params, batch.dt, rates, cg, batch.first, p.headings, b.slope, middle)
             p._known[key] = np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
         return p._known[key]
 

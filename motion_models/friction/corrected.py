@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from motion_models.base import Twist
-from motion_models.friction import FrictionModel, check_parameters
+from motion_models.friction.model import FrictionModel, check_parameters
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
