@@ -249,9 +249,7 @@ def print_table() -> None:
     laws = [shipped("thesis", 13.333), shipped("isotropic", 13.333), shipped("isotropic", 10.0), shipped("isotropic", 10.0, True)]
     laws += [rival("brush", 8.0), rival("brush", 8.0, centripetal=True), rival("tanh", 6.0), rival("tanh", 6.0, centripetal=True)]
     laws += [rival("exponential", 10.0, ratio) for ratio in (0.5, 2.0)]
-    print(
-        "RMS errors. Rotations: ratio unfitted; then ratio, x_CR [mm], y_CR [mm] with four numbers fitted, in sample and in rows left out of"
-    )
+    print("RMS errors. Rotations: ratio unfitted; then ratio, x_CR [mm], y_CR [mm] with four numbers fitted, in sample and without rows of")
     print(
         "constant x_G and y_G. Runs: vision error [mm], all 84 and the 42 on gentle arcs. Husky: 603 windows of 2 s, unfitted [m, rad].\n"
     )
