@@ -119,7 +119,7 @@ _ALL = (
     Effect(
         "lateral_force_law",
         "1",
-        "the tyres' lateral force follows the other contact law by this share (isotropic: grows with the total slip; thesis: saturated)",
+        "the lateral force follows the other contact law by this share (isotropic: it grows with the slip; thesis: saturated at any slip)",
         1.0,
         0.15,
         _plain("other_law"),

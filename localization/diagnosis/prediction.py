@@ -16,7 +16,7 @@ from localization.diagnosis.steady import steady_twists
 from motion_models import se2
 from motion_models.base import MotionModel, Twist
 from motion_models.friction import FrictionModel
-from motion_models.maneuvers import Batch, IntArray, make_batch
+from motion_models.maneuvers import Batch, IntArray, Maneuver, make_batch
 from motion_models.prediction import predict
 from motion_models.se2 import FloatArray
 
@@ -46,6 +46,8 @@ class Pipeline:
     def __post_init__(self) -> None:
         self.batch = make_batch(self.drive.maneuvers)
         self._friction = FrictionModel.from_robot(self.drive.robot)
+        runs = [_whole(m, path) for m, path in zip(self.drive.maneuvers, self.drive.paths, strict=False)]
+        self._path_batch = make_batch(runs) if runs else None
         self._lost = lost_share(self.batch)
         rolls = np.abs(self.batch.wheels).max(axis=1) > RESTS
         self._lost_time = float((self._lost.max(axis=1) * rolls) @ self.batch.dt / max(float(rolls @ self.batch.dt), 1e-9))
@@ -110,6 +112,11 @@ class Pipeline:
         if drive.gyro_is_witness:
             witness[2:] = 0.0
         changed = _Changed(self, belief)
+        if self._path_batch is not None:
+            poses, _, _ = predict(changed, self._path_batch, changed.nominal, witness, _NO_COLUMNS, drive.robot.wheel_noise)
+            apart = np.hypot(*(poses - self._path_batch.measured)[:, :2].T)
+            out[:, 0] = drive.path_errors - np.bincount(self._path_batch.owner, apart) / np.bincount(self._path_batch.owner)
+            return out
         poses, _, _ = predict(changed, batch, changed.nominal, witness, _NO_COLUMNS, drive.robot.wheel_noise)
         off = se2.between(poses, batch.measured)
         known = np.isfinite(np.diagonal(batch.cov, axis1=1, axis2=2))
@@ -150,6 +157,11 @@ class Pipeline:
         step = 0.1 * effect.usual
         ahead = self.discrepancies(effect.inject(belief, step))
         return np.asarray(((self.discrepancies(belief) if base is None else base) - ahead) / step)
+
+
+def _whole(maneuver: Maneuver, path: FloatArray) -> Maneuver:
+    """``maneuver`` with the poses (n, 3) of ``path`` at the end of each of its intervals."""
+    return dataclasses.replace(maneuver, measured=path, ends=np.arange(1, len(path) + 1), cov=np.zeros((3, 3)))
 
 
 class _Changed:
