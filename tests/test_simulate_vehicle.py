@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from localization.errors import SimulationError
 from localization.simulate.dynamics import Chassis, Now, change
+from localization.simulate.effects import Reality, changed
 from localization.simulate.masses import Masses
 from localization.simulate.stepping import follow
 from localization.simulate.vehicle import CG, MARGIN, POSE, TWIST, Body, VehicleConfig, VehicleState, accelerations, advance
@@ -19,10 +20,11 @@ from motion_models.errors import CgError
 from motion_models.friction.contact import SATURATION
 from motion_models.friction.dynamics import FrictionDynamics, Influence
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot import Mount, load_robot
 
 ROBOT = load_robot("vaultbot")
 BODY = Body.from_robot(ROBOT)
+ROBOTS = {law: dataclasses.replace(ROBOT, options={"friction": {"contact": law}}) for law in SATURATION}
 PLAIN = FrictionDynamics.from_robot(ROBOT)
 CONFIG = VehicleConfig()
 FLOOR = np.zeros((0, 5))
@@ -159,6 +161,16 @@ def test_wheels_speed_up_no_faster_than_the_controller_lets_them():
     rates = np.diff(rows[:, 6], prepend=0.0) / CONFIG.step_s
     assert rates.max() * 0.164 <= CONFIG.acceleration_m_s2 * (1 + 1e-9)
     assert rates.max() * 0.164 > 0.95 * CONFIG.acceleration_m_s2
+
+
+def test_the_tyres_follow_the_law_of_the_robot_file_and_an_effect_turns_it_into_the_other():
+    reality = {law: Reality(Body.from_robot(robot), Mount()) for law, robot in ROBOTS.items()}
+    for law, other in (("isotropic", "thesis"), ("thesis", "isotropic")):
+        assert reality[law].body.chassis(CONFIG).tyre.saturation == SATURATION[law]
+        assert changed(reality[law], {"lateral_force_law": 1.0}).body.chassis(CONFIG).tyre == reality[other].body.chassis(CONFIG).tyre
+    # on a gentle arc the thesis's robot turns less
+    turns = [drive((3.0, 3.3), 2.0, body=of.body)[-1, TWIST][2] for of in reality.values()]
+    assert turns[1] < 0.9 * turns[0]
 
 
 def energy(rows, body, cg):

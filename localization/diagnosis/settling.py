@@ -13,7 +13,7 @@ import numpy as np
 
 from motion_models.friction.dynamics import FrictionDynamics, _accelerations, _Body
 from motion_models.friction.equilibrium import Floor
-from motion_models.friction.model import FrictionModel, check_parameters, floor_of
+from motion_models.friction.model import FrictionModel, check_parameters
 from motion_models.maneuvers import IntArray
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -57,7 +57,7 @@ def settling_twists(
         dynamics.rest_speed,
     )
     out = np.empty((len(dt), 3))
-    _settle(dt, wheels, cg, first, headings, np.array(slope), settled, floor_of(params, model.saturation), body, out)
+    _settle(dt, wheels, cg, first, headings, np.array(slope), settled, model.floor(params), body, out)
     return out
 
 

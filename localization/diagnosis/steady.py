@@ -14,7 +14,7 @@ import numpy as np
 from motion_models.errors import ModelError
 from motion_models.friction.contact import CREEP
 from motion_models.friction.equilibrium import Floor, motion, newton
-from motion_models.friction.model import FrictionModel, check_parameters, floor_of, loads_at, pull_of, unit_rolls
+from motion_models.friction.model import FrictionModel, check_parameters, loads_at, pull_of, unit_rolls
 from motion_models.se2 import FloatArray
 
 _NEAR = 0.02
@@ -27,7 +27,7 @@ def steady_twists(model: FrictionModel, params: FloatArray, wheels: FloatArray, 
     """
     check_parameters(cg, params)
     out = np.empty((len(wheels), 3))
-    _steady(wheels, cg, params, floor_of(params, model.saturation), float(model.centripetal), out)
+    _steady(wheels, cg, params, model.floor(params), float(model.centripetal), out)
     lost = np.isnan(out[:, 2]) & np.isfinite(wheels).all(axis=1)
     if np.any(lost):
         raise ModelError(f"no balance of forces found for {np.count_nonzero(lost)} of {lost.size} samples.")

@@ -41,9 +41,6 @@ _K = FrictionModel.param_names.index("slip_stiffness")
 _DRAWS = 2000
 _HEIGHTS = {"VaultBot": 0.35, "Husky": 0.2}  # m; VaultBot's is the thesis's, the Husky's is a guess
 
-Make = Callable[[FloatArray], MotionModel]
-"""A law: from the nominal parameters (12,) of a robot, whose stiffness it may replace, to its model."""
-
 
 @dataclass(frozen=True)
 class Law:
@@ -207,7 +204,7 @@ def husky_curvature(laws: Sequence[Law]) -> list[CurvatureBin]:
     robot = drive_husky.robot()
     radius, track = robot.geometry.wheel_radius_m, robot.geometry.track_width_m
     ways = np.array([radius * (m.dt[:, None] * m.wheels).sum(axis=0) for m in maneuvers])
-    # the measured yaw is wrapped; windows of 2 s turn by less than half a turn more than any law says
+    # the measured yaw is wrapped; it differs by less than half a turn from that of any law
     laws_yaw = [np.array([float(model_yaw(law.model("Husky"), m.dt, m.wheels)) for m in maneuvers]) for law in laws]
     yaw = np.array([m.measured[-1, 2] for m in maneuvers])
     yaw = laws_yaw[-1] + se2.wrap_angle(yaw - laws_yaw[-1])
