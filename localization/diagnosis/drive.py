@@ -191,7 +191,7 @@ def drive_of_table(name: str, robot: Robot, maneuvers: Sequence[Maneuver], kind:
     >>> found = diagnose(drive_of_table("rotation_grid.csv", robot, rotations, "rotations"), make_model("friction", robot))
     >>> strongest = found.findings[0]
     >>> strongest.cause, round(strongest.size, 2), strongest.effect.unit
-    ('lidar_offset_x', 0.07, 'm')
+    ('lidar_offset_x', 0.06, 'm')
     """
     if kind == "windows":
         maneuvers = [piece for m in maneuvers for piece in _pieces(m)]
