@@ -8,10 +8,10 @@ and scrub are fitted to the rotations for each law; arcs never enter a fit. Stif
 
 Literature: J. Y. Wong, C. F. Chiang, "A general theory for skid steering of tracked vehicles on firm ground", Proc. IMechE D 215(3), 2001
 (shear stress opposes the resultant shear displacement); M. Gaefvert, J. Svendenius, "Construction of novel semi-empirical tire models for
-combined braking and cornering", ISRN LUTFD2/TFRT-7606, 2003, and H. B. Pacejka, "Tyre and Vehicle Dynamics", ch. 3 (brush tyres: one
-factor of the combined slip); W. Yu et al., "Analysis and experimental verification for dynamic modeling of a skid-steered wheeled
-vehicle", IEEE T-RO 26(2), 2010 (exponential of the shear displacement, for turns of constant curvature). Titles and theses are cited from
-the laws' usual references; the papers themselves were not at hand.
+combined braking and cornering", ISRN LUTFD2/TFRT-7606, 2003, secs. 2 and 3.2 (brush model; combined-slip forces as a scaling of pure-slip
+forces); H. B. Pacejka, "Tyre and Vehicle Dynamics", ch. 3; W. Yu, O. Chuy, E. G. Collins, P. Hollis, "Dynamic modeling of a skid-steered
+wheeled vehicle with experimental verification" (rolling resistance, friction and shear deformation modulus of each terrain, for general
+planar motion). Of Gaefvert & Svendenius the contents and of Yu et al. the abstract were checked; the other two are cited from memory.
 """
 
 from __future__ import annotations
