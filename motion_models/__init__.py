@@ -11,7 +11,7 @@ from motion_models.cross_validation import HeldOut, Interval, cross_validate, ro
 from motion_models.diff_drive import DiffDrive
 from motion_models.errors import CalibrationError, CgError, ModelError, RobotError, SkidlocError
 from motion_models.friction import FrictionModel
-from motion_models.friction_dynamics import FrictionDynamics
+from motion_models.friction.dynamics import FrictionDynamics
 from motion_models.full_linear import FullLinear
 from motion_models.icr import Icr
 from motion_models.integrate import preintegrate

@@ -13,8 +13,7 @@ import numpy as np
 
 from motion_models.base import MotionModel
 from motion_models.errors import ModelError
-from motion_models.friction import FrictionModel
-from motion_models.friction_corrected import CorrectedFriction
+from motion_models.friction import CorrectedFriction, FrictionModel
 from motion_models.se2 import FloatArray
 
 Form = str

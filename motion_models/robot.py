@@ -26,6 +26,8 @@ _LARGEST = 1e9
 _LONGEST_M = 100.0
 """Of a length of a robot [m]; the largest mining vehicles have 20."""
 _LONGEST_SHOWN = 60  # characters of what a user wrote, in a message
+MODEL_OPTIONS: Mapping[str, tuple[str, ...]] = {"friction": ("contact", "centripetal")}
+"""Entries of [models.NAME] that choose something, where all others are numbers."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +154,8 @@ class Robot:
     gyro_noise: GyroNoise = GyroNoise()
     models: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Coefficients by model name, then by parameter name; what is not named keeps the model's own default."""
+    options: Mapping[str, Mapping[str, str | bool]] = field(default_factory=dict)
+    """Choices by model name, then by `MODEL_OPTIONS`; in the file they stand among the model's coefficients."""
     arms: Arms | None = None
     """Arms that move the centre of gravity; None where it stays where `Geometry` says."""
     folder: Path | None = field(default=None, compare=False)
@@ -172,6 +176,20 @@ class Robot:
         if unknown:
             raise RobotError(f"robot '{self.name}': models.{model} has no parameter {', '.join(unknown)}; it has {', '.join(names)}.")
         return np.array([table.get(name, default) for name, default in zip(names, defaults, strict=True)])
+
+    def choice(self, model: str, name: str, allowed: tuple[str, ...], default: str) -> str:
+        """What [models.MODEL] chooses by ``name``. Raises `RobotError` for what is not ``allowed``."""
+        chosen = self.options.get(model, {}).get(name, default)
+        if chosen not in allowed:
+            raise RobotError(f"robot '{self.name}': models.{model}.{name} is {chosen!r}; there are {', '.join(allowed)}.")
+        return str(chosen)
+
+    def switch(self, model: str, name: str, default: bool) -> bool:
+        """Whether [models.MODEL] switches ``name`` on. Raises `RobotError` for what is neither true nor false."""
+        chosen = self.options.get(model, {}).get(name, default)
+        if not isinstance(chosen, bool):
+            raise RobotError(f"robot '{self.name}': models.{model}.{name} is {chosen!r}; it must be true or false.")
+        return chosen
 
 
 def robot_names() -> list[str]:
@@ -209,7 +227,7 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
         raise RobotError(f"{source}: not valid TOML: {error}.") from error
     except RecursionError as error:
         raise RobotError(f"{source}: not valid TOML: its brackets are nested too deeply.") from error
-    known = {f.name for f in dataclasses.fields(Robot)} - {"folder"}
+    known = {f.name for f in dataclasses.fields(Robot)} - {"folder", "options"}
     _refuse_unknown(data, known, source)
     if not isinstance(data.get("name"), str):
         raise RobotError(f'{source}: needs a line name = "...".')
@@ -224,6 +242,7 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
     if min(driver.wheel_radius_m, driver.track_width_m, driver.wheel_separation_multiplier) <= 0:
         raise RobotError(f"{source}: every number of [driver] must be positive.")
     mounts = {frame: _build(Mount, table, f"mounts.{frame}", source) for frame, table in _table(data, "mounts", source).items()}
+    models, options = _models(_table(data, "models", source), source)
     return Robot(
         name=data["name"],
         geometry=geometry,
@@ -233,7 +252,8 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
         mounts=mounts,
         wheel_noise=_noise(WheelNoise, data, "wheel_noise", source),
         gyro_noise=_noise(GyroNoise, data, "gyro_noise", source),
-        models=_models(_table(data, "models", source), source),
+        models=models,
+        options=options,
         arms=_arms(data, source) if "arms" in data else None,
         folder=folder,
     )
@@ -247,16 +267,22 @@ def _noise(kind: type[Section], data: Mapping[str, Any], name: str, source: str)
     return noise
 
 
-def _models(tables: Mapping[str, Any], source: str) -> dict[str, dict[str, float]]:
+def _models(tables: Mapping[str, Any], source: str) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, str | bool]]]:
+    """Coefficients and choices of each model."""
     from motion_models.registry import MODELS  # the models themselves are made of robots
 
     _refuse_unknown(tables, set(MODELS), f"{source}, [models]")
-    models = {}
+    models: dict[str, dict[str, float]] = {}
+    options: dict[str, dict[str, str | bool]] = {}
     for model in tables:
-        table = _table(tables, model, source)
-        _refuse_unknown(table, set(cast(tuple[str, ...], MODELS[model].param_names)), f"{source}, [models.{model}]")
-        models[model] = {name: _number(value, f"models.{model}.{name}", source) for name, value in table.items()}
-    return models
+        table, choices = _table(tables, model, source), MODEL_OPTIONS.get(model, ())
+        _refuse_unknown(table, {*cast(tuple[str, ...], MODELS[model].param_names), *choices}, f"{source}, [models.{model}]")
+        models[model] = {name: _number(value, f"models.{model}.{name}", source) for name, value in table.items() if name not in choices}
+        for name in table.keys() & choices:
+            if not isinstance(table[name], str | bool):
+                raise RobotError(f"{source}: models.{model}.{name} must be text or true or false, found {table[name]!r}.")
+            options.setdefault(model, {})[name] = table[name]
+    return models, options
 
 
 def _arms(data: Mapping[str, Any], source: str) -> Arms:

@@ -30,8 +30,9 @@ def robot_toml(robot: Robot, sigmas: Mapping[str, Mapping[str, float]] | None = 
         lines += _table("arms", {name: value for name, value in dataclasses.asdict(robot.arms).items() if value != ()})
     for frame, mount in robot.mounts.items():
         lines += _table(f"mounts.{_key(frame)}", dataclasses.asdict(mount))
-    for model, coefficients in robot.models.items():
-        lines += _table(f"models.{_key(model)}", coefficients, sigmas.get(model, {}))
+    for model in [*robot.models, *(name for name in robot.options if name not in robot.models)]:
+        entries = {**robot.options.get(model, {}), **robot.models.get(model, {})}
+        lines += _table(f"models.{_key(model)}", entries, sigmas.get(model, {}))
     return "\n".join(lines) + "\n"
 
 
@@ -60,6 +61,8 @@ def _key(name: str) -> str:
 def _value(value: Any) -> str:
     if isinstance(value, str):
         return _text(value)
+    if isinstance(value, bool):
+        return "true" if value else "false"
     if isinstance(value, tuple | list):
         return "[" + ", ".join(_text(v) for v in value) + "]"
     return repr(float(value))

@@ -41,12 +41,12 @@ Row = tuple[int, dict[str, str]]
 
 def table_columns(path: str | Path) -> tuple[str, ...]:
     """The header of a CSV file. Raises `CalibrationError` for one that cannot be read or is empty."""
-    return tuple(_read(path)[0])
+    return tuple(read_rows(path)[0])
 
 
 def read_windows(path: str | Path) -> list[Maneuver]:
     """The maneuvers of a CSV file as described above. Raises `CalibrationError`, naming line and column."""
-    columns, rows = _read(path)
+    columns, rows = read_rows(path)
     missing = [name for name in NEEDED if name not in columns]
     if "x_m" in columns or "y_m" in columns:
         missing += [name for name in ("x_m", "y_m") if name not in columns]
@@ -83,7 +83,8 @@ def windows_text(maneuvers: Sequence[Maneuver]) -> str:
     return text.getvalue()
 
 
-def _read(path: str | Path) -> tuple[list[str], list[Row]]:
+def read_rows(path: str | Path) -> tuple[list[str], list[Row]]:
+    """Header and lines of a CSV file. Raises `CalibrationError` for one that cannot be read or is empty, naming the line."""
     try:
         check_file(path)
         with open(path, newline="", encoding="utf-8-sig") as file:

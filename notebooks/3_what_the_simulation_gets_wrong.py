@@ -9,7 +9,7 @@
 # # 3. What the simulation gets wrong about 68 rotations, and why
 #
 # **Claim: physics with nothing fitted gets the centre of rotation wrong by 6 cm. Its errors have a shape, and shapes have causes: the
-# LiDAR sits 6.6 cm farther ahead than was thought, the chassis is warped, the track is 2 cm wider. Neither rotational inertia nor the
+# LiDAR sits 6.4 cm farther ahead than was thought, the chassis is warped, the track is 3 cm wider. Neither rotational inertia nor the
 # tyres' treads, which the thesis blamed, explain it.**
 #
 # `skidloc diagnose rotation_grid.csv --robot vaultbot` does this in a second; here it is step by step.

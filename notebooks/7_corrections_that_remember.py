@@ -144,6 +144,6 @@ picture(*panels)
 # %% [markdown]
 # ## Where it helps less
 #
-# These robots turn on the spot, as those did on which the regressions were measured. On gentle arcs a skid-steer robot turns much less
-# for the same difference of its wheels, and no function of the CG alone can say that: such arcs are not allowed to teach, and little is
+# These robots turn on the spot, as those did on which the regressions were measured. On gentle arcs the centre of rotation follows the CG
+# half as far (notebook 8), and no function of the CG alone describes both: such arcs are not used for corrections, and little is
 # gained on a drive that consists of them (`python -m tests.studies.graph_corrections`). The friction model knows about them.

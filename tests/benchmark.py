@@ -18,6 +18,7 @@ PARTS = (
     "tests.studies.thesis_regressions",
     "tests.studies.friction_grid",
     "tests.studies.gentle_arcs",
+    "tests.studies.contact_law",
     "tests.studies.graph_corrections",
     "tests.studies.terrain_track",
     "tests.studies.real_husky",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Literal
@@ -17,6 +18,7 @@ from localization.simulate.scanners import ScannerConfig
 from localization.simulate.sensors import ImuConfig
 from localization.simulate.simulator import Simulation, SimulationConfig, write_simulation
 from localization.simulate.suite import SensorConfig
+from motion_models.friction import FrictionModel
 from motion_models.registry import make_model
 from motion_models.robot import Driver, Geometry, Robot, load_robot
 
@@ -34,6 +36,7 @@ TYPICAL: Mapping[str, float] = {
     "wheel_time_offset": 0.05,
     "friction_anisotropy": 0.2,
     "friction_change": 0.3,
+    "lateral_force_law": 1.0,
     "diagonal_load": 0.15,
     "tread_asymmetry": 0.15,
     "rolling_resistance": 0.03,
@@ -46,7 +49,7 @@ TYPICAL: Mapping[str, float] = {
     "longitudinal_slip_turning": 0.1,
 }
 """Sizes that robots really have."""
-ONE_SIDED = ("payload", "encoder_dropout", "scrub", "rolling_resistance")
+ONE_SIDED = ("payload", "encoder_dropout", "scrub", "rolling_resistance", "lateral_force_law")
 
 _CGS = ((0.06, -0.01), (-0.02, 0.02))
 
@@ -131,7 +134,15 @@ def drive(name: str) -> Experiment:
 
 
 def robot_named(name: str) -> Robot:
-    """A shipped robot, or a small one (the published sizes of Clearpath's Jackal)."""
+    """A shipped robot, or a small one (the published sizes of Clearpath's Jackal).
+
+    ``_thesis`` at the end: by the thesis's contact law, at the stiffness that the robot has without it.
+    """
+    if name.endswith("_thesis"):
+        plain = robot_named(name.removesuffix("_thesis"))
+        stiffness = float(FrictionModel.from_robot(plain).nominal[FrictionModel.param_names.index("slip_stiffness")])
+        models = {**plain.models, "friction": {**plain.models.get("friction", {}), "slip_stiffness": stiffness}}
+        return dataclasses.replace(plain, models=models, options={"friction": {"contact": "thesis"}})
     if name != "jackal":
         return load_robot(name)
     geometry = Geometry(wheel_radius_m=0.098, track_width_m=0.37559, wheelbase_m=0.262, mass_kg=17.0, cg_x_m=0.012, cg_y_m=0.002)

@@ -249,7 +249,7 @@ def test_a_reference_tells_how_k_and_the_centre_of_rotation_follow_the_cg(tmp_pa
     want_k, want_x = np.transpose([in_place(at) for at in cgs])
     np.testing.assert_allclose(x_cr, want_x, atol=0.01)  # the slope is that of the physics, 2.17, by its line
     xs = [x for x, _ in cgs]
-    np.testing.assert_allclose(k, np.polyval(np.polyfit(xs, want_k, 2), xs), rtol=0.01)  # the physics is no parabola, but 4.21 is
+    np.testing.assert_allclose(k, np.polyval(np.polyfit(xs, want_k, 2), xs), rtol=0.015)  # the physics is no parabola, but 4.21 is
     assert told["parameters"]["x_cr_1"]["value"] == pytest.approx(np.polyfit(xs, want_x, 1)[0], rel=0.05)
 
 

@@ -17,8 +17,10 @@ Diagnosed = Callable[..., Diagnosis]
 
 @pytest.fixture
 def diagnosed(tmp_path: Path) -> Diagnosed:
-    def run(effects: Mapping[str, float], seed: int, robot: str = "vaultbot", route: str = "tour", imu_hz: float = 50.0) -> Diagnosis:
-        return look(bag(tmp_path / "drive.mcap", effects, seed, robot, drive(route), imu_hz=imu_hz), robot).diagnosis
+    def run(
+        effects: Mapping[str, float], seed: int, robot: str = "vaultbot", route: str = "tour", imu_hz: float = 50.0, as_robot: str = ""
+    ) -> Diagnosis:
+        return look(bag(tmp_path / "drive.mcap", effects, seed, robot, drive(route), imu_hz=imu_hz), as_robot or robot).diagnosis
 
     return run
 
@@ -40,6 +42,27 @@ def test_a_hidden_cause_is_named_with_its_size(diagnosed: Diagnosed, cause: str,
 @pytest.mark.parametrize(("robot", "route", "seed"), [("vaultbot", "tour", 400), ("jackal", "random_4", 401), ("vaultbot", "20s", 20_009)])
 def test_where_nothing_is_hidden_nothing_is_found(diagnosed: Diagnosed, robot: str, route: str, seed: int) -> None:
     found = diagnosed({}, seed, robot, route)
+    assert found.verdict == "consistent"
+    assert not found.findings
+
+
+@pytest.mark.parametrize(
+    ("true", "file", "route"),
+    [
+        ("vaultbot", "vaultbot_thesis", "tour"),
+        ("vaultbot_thesis", "vaultbot", "tour"),
+        ("husky_a200", "husky_a200_thesis", "random_4"),
+        ("husky_a200_thesis", "husky_a200", "random_4"),
+    ],
+)
+def test_the_law_of_the_tyres_is_named_where_the_file_has_the_other(diagnosed: Diagnosed, true: str, file: str, route: str) -> None:
+    found = diagnosed({}, 440, true, route, as_robot=file)
+    assert found.findings[0].cause == "lateral_force_law"
+    assert found.findings[0].size == pytest.approx(1.0, abs=max(0.15, 3.0 * found.findings[0].sigma))
+
+
+def test_where_file_and_tyres_both_have_the_thesis_law_nothing_is_found(diagnosed: Diagnosed) -> None:
+    found = diagnosed({}, 441, "vaultbot_thesis")
     assert found.verdict == "consistent"
     assert not found.findings
 

@@ -11,7 +11,9 @@ import pytest
 from localization.diagnosis.diagnose import diagnose
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_table
 from localization.diagnosis.findings import Diagnosis
+from localization.diagnosis.runs import drive_of_runs, read_runs
 from localization.logs import open_log
+from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
 from motion_models.regressions import read_rotation_table
 from motion_models.robot import load_robot
@@ -44,6 +46,43 @@ def test_the_thesis_tracked_a_point_ahead_of_the_wheelbase_and_stood_on_a_warped
     assert sizes["track_width"] == pytest.approx(0.022, abs=0.008)
     assert of_rotations.gain is not None
     assert of_rotations.gain.low > 0.7
+
+
+def runs(contact: str) -> Diagnosis:
+    """Of Table 5-2, by the friction model with nothing fitted."""
+    robot = dataclasses.replace(load_robot("vaultbot"), options={"friction": {"contact": contact}})
+    drive = drive_of_runs("runs", robot, read_runs(DATA / "vaultbot" / "controller_evaluation.csv"))
+    return diagnose(drive, make_model("friction", robot))
+
+
+def test_the_84_runs_name_the_lateral_force_law_where_the_robot_file_has_the_thesis_law() -> None:
+    found = runs("thesis")
+    assert found.windows == 84
+    assert found.sentence.startswith("Correct lateral_force_law by")
+    assert found.findings[0].size == pytest.approx(1.0, abs=0.2)
+    assert found.findings[0].gain.low > 0.5
+
+
+def test_the_84_runs_do_not_ask_for_another_law_where_the_robot_file_has_the_isotropic_one() -> None:
+    found = runs("isotropic")
+    assert "lateral_force_law" not in {f.cause for f in found.findings} | {name for f in found.findings for name, _ in f.aliases}
+    assert found.discrepancy["x"].rms < 0.75 * runs("thesis").discrepancy["x"].rms
+
+
+@pytest.mark.parametrize(
+    ("cell", "message"),
+    [
+        ("arc_9,ready,skid_steer,0.1", "line 2: no trajectory 'arc_9'; there are arc_1"),
+        ("arc_1,ready,pid,0.1", "line 2: no controller 'pid'; there are skid_steer, diff_drive"),
+        ("arc_1,ready,skid_steer,-1", "line 2: vision_error_m must be a distance in metres, found '-1'"),
+        ("arc_1,ready,skid_steer,", "line 2: vision_error_m must be a distance in metres, found ''"),
+    ],
+)
+def test_a_run_that_cannot_be_read_is_named(tmp_path: Path, cell: str, message: str) -> None:
+    path = tmp_path / "runs.csv"
+    path.write_text(f"trajectory,arm_configuration,controller,vision_error_m\n{cell}\n", encoding="utf-8")
+    with pytest.raises(CalibrationError, match=message):
+        read_runs(path)
 
 
 def test_neither_treads_nor_the_centre_of_gravity_explain_the_rotations(of_rotations: Diagnosis) -> None:

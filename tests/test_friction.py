@@ -1,5 +1,6 @@
 """Claims about the friction model that are its own: equations, loads, limits where the answer is known, and that every case converges."""
 
+import dataclasses
 import math
 import time
 
@@ -11,11 +12,14 @@ from scipy.optimize import linprog, root
 
 from motion_models.errors import CgError, ModelError
 from motion_models.friction import FrictionModel
-from motion_models.friction_kernel import CREEP, loads, rolling
+from motion_models.friction.contact import CREEP, SATURATION, loads, rolling
+from motion_models.friction.equilibrium import Loads, newton
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
 
-MODEL = make_model("friction", load_robot("vaultbot"))
+VAULTBOT = load_robot("vaultbot")
+MODEL = make_model("friction", VAULTBOT)
+LAWS = {law: FrictionModel.from_robot(dataclasses.replace(VAULTBOT, options={"friction": {"contact": law}})) for law in SATURATION}
 NOMINAL = MODEL.nominal
 HALF = np.array([0.26, 0.28])
 inside = st.floats(-0.999, 0.999)
@@ -28,8 +32,8 @@ def with_params(**changes):
     return params
 
 
-def move(wheels, cg=(0.0, 0.0), **changes):
-    return MODEL.twist(np.array(wheels, dtype=float), np.array(cg, dtype=float), with_params(**changes)).value
+def move(wheels, cg=(0.0, 0.0), model=MODEL, **changes):
+    return model.twist(np.array(wheels, dtype=float), np.array(cg, dtype=float), with_params(**changes)).value
 
 
 def thesis_residual(unknowns, wheels, cg, p=NOMINAL):
@@ -64,7 +68,7 @@ def thesis_residual(unknowns, wheels, cg, p=NOMINAL):
 @pytest.mark.parametrize("cg", [(0.0, 0.0), (0.1, 0.02), (-0.06, -0.03)])
 def test_the_motion_solves_the_equations_as_the_thesis_prints_them(wheels, cg):
     """Second way to the number: all seven unknowns at once by scipy, on unrounded friction."""
-    value = move(wheels, cg)
+    value = move(wheels, cg, LAWS["thesis"])
     start = np.concatenate([value * 1.05 + 0.01, [0.25] * 4])
     answer = root(thesis_residual, start, args=(wheels, cg), tol=1e-12)
     assert np.abs(answer.fun).max() < 1e-10
@@ -185,6 +189,7 @@ def every_kind_of_case(rng, n):
     return wheels, cg * HALF
 
 
+@pytest.mark.parametrize("law", list(LAWS))
 @pytest.mark.parametrize(
     "changes",
     [
@@ -197,22 +202,22 @@ def every_kind_of_case(rng, n):
     ],
     ids=str,
 )
-def test_every_case_converges_to_a_balance(changes):
+def test_every_case_converges_to_a_balance(changes, law):
     rng = np.random.default_rng(11)
     wheels, cg = every_kind_of_case(rng, 20_000)
     params = with_params(**changes)
-    twist = MODEL.twist(wheels, cg, params)  # raises where it fails
+    twist = LAWS[law].twist(wheels, cg, params)  # raises where it fails
     for field in (twist.value, twist.d_wheels, twist.d_cg, twist.d_params):
         assert np.isfinite(field).all()
     # The balance, written down anew with the rounding, must hold: sums of forces and of moments over m g.
     speed = 0.164 * np.hypot(wheels[:, 0], wheels[:, 1]) / math.sqrt(2)
     going = speed > 0
-    left = rounded_balance(twist.value[going] / speed[going, None], 0.164 * wheels[going] / speed[going, None], cg[going], params)
+    left = rounded_balance(twist.value[going] / speed[going, None], 0.164 * wheels[going] / speed[going, None], cg[going], params, law)
     assert np.abs(left).max() < 1e-8
     assert not twist.value[~going].any()
 
 
-def rounded_balance(twist, roll, cg, p):
+def rounded_balance(twist, roll, cg, p, law):
     _, d, w, mu, ratio, K, f_r, scrub, warp, tread = p[:10]
     n = np.array([loads(x / (w / 2), y / (d / 2), warp)[:4] for x, y in cg])
     x, y = np.array([1, 1, -1, -1]) * w / 2, np.array([1, -1, 1, -1]) * d / 2
@@ -220,26 +225,26 @@ def rounded_balance(twist, roll, cg, p):
     vx, vy, wz = (twist[:, [i]] for i in range(3))
     s_x, s_y = vx - wz * y - roll, vy + wz * x
     speed = np.sqrt(s_x**2 + s_y**2 + CREEP**2)
-    slip = np.hypot(s_x, CREEP) / np.maximum(np.maximum(np.abs(s_x + roll), np.abs(roll)), CREEP)
-    f_x = n * (-mu * (1 - np.exp(-K * slip)) * s_x / speed - f_r * np.vectorize(lambda u: rolling(u)[0])(roll))
-    f_y = -n * mu * ratio * (1 - np.exp(-K)) * s_y / speed * (1 + tread * s_y / speed)
+    fastest = np.maximum(np.maximum(np.abs(s_x + roll), np.abs(roll)), CREEP)
+    along = 1 - np.exp(-K * (np.hypot(s_x, CREEP) if law == "thesis" else speed) / fastest)
+    across = 1 - math.exp(-K) if law == "thesis" else along
+    f_x = n * (-mu * along * s_x / speed - f_r * np.vectorize(lambda u: rolling(u)[0])(roll))
+    f_y = -n * mu * ratio * across * s_y / speed * (1 + tread * s_y / speed)
     spin = wz[:, 0] * d / 2
     moment = (x * f_y - y * f_x).sum(axis=1) - mu * scrub * spin / np.hypot(spin, CREEP)
     return np.stack([f_x.sum(axis=1), f_y.sum(axis=1), moment], axis=-1)
 
 
-def test_the_answer_does_not_depend_on_where_the_search_starts():
+@pytest.mark.parametrize("law", list(LAWS))
+def test_the_answer_does_not_depend_on_where_the_search_starts(law):
     """With Appendix A's constants the balance has one solution: searches from eight other twists end at the same."""
-    from motion_models.friction import floor_of
-    from motion_models.friction_solve import Loads, newton
-
     rng = np.random.default_rng(5)
     wheels, cg = every_kind_of_case(rng, 3000)
     wheels = wheels[np.any(wheels != 0, axis=1)]
     cg = cg[: len(wheels)]
     speed = np.hypot(wheels[:, 0], wheels[:, 1])[:, None] * 0.164 / math.sqrt(2)
-    value = MODEL.twist(wheels, cg, NOMINAL).value / speed
-    floor = floor_of(NOMINAL)
+    value = LAWS[law].twist(wheels, cg, NOMINAL).value / speed
+    floor = LAWS[law].floor(NOMINAL)
     reached = 0
     for u, c, v in zip(0.164 * wheels / speed, cg, value, strict=True):
         load = Loads(*loads(c[0] / HALF[0], c[1] / HALF[1], 0.0)[:4])
@@ -286,7 +291,9 @@ def test_a_centre_of_gravity_outside_the_wheels_is_tipping(cg):
         MODEL.wheels(np.array([0.1, 0.1]), np.array(cg), NOMINAL)
 
 
-@pytest.mark.parametrize("changes", [{"mu": 0.0}, {"slip_stiffness": -1.0}, {"tread": 1.0}, {"scrub": math.nan}, {"wheel_radius": -0.1}])
+@pytest.mark.parametrize(
+    "changes", [{"mu": 0.0}, {"slip_stiffness": 0.0}, {"slip_stiffness": -1.0}, {"tread": 1.0}, {"scrub": math.nan}, {"wheel_radius": -0.1}]
+)
 def test_impossible_parameters_are_named(changes):
     (name, value), *_ = changes.items()
     with pytest.raises(ModelError, match=f"{name} = {value:.6g}"):

@@ -3,22 +3,43 @@
 import numpy as np
 import pytest
 
+from motion_models.friction import FrictionModel
+from motion_models.friction.model import STIFFNESS
 from tests.studies import friction_grid
 from tests.studies.friction_grid import ALIASES, FITTED, fit, fitted, friction, grid, jackknife_sigma, left_out, measured, predict, unfitted
+
+THESIS = friction("thesis")
 
 
 def test_with_the_thesis_constants_and_nothing_fitted():
     errors, slope = unfitted()
+    assert errors.ratio <= 0.0315
+    assert slope == pytest.approx(2.17, rel=0.01)
+    errors, slope = unfitted(THESIS)
     assert errors.ratio <= 0.028
     assert slope == pytest.approx(2.17, rel=0.01)
+
+
+def test_with_the_default_stiffness_and_nothing_fitted():
+    assert unfitted(with_stiffness(STIFFNESS["isotropic"]))[0].ratio <= 0.0153
+
+
+def with_stiffness(value):
+    nominal = friction().nominal.copy()
+    nominal[friction().param_names.index("slip_stiffness")] = value
+    return FrictionModel(nominal)
 
 
 @pytest.mark.parametrize("axis", [0, 1], ids=["rows of constant x_G", "rows of constant y_G"])
 def test_four_fitted_numbers_predict_rows_that_they_have_not_seen(axis):
     errors, heuristic = left_out(FITTED, axis), left_out(None, axis)
-    assert errors.ratio <= 0.012
-    assert errors.x_cr <= 0.008
-    assert errors.y_cr <= 0.007
+    assert errors.ratio <= 0.0108
+    assert errors.x_cr <= 0.0072
+    assert errors.y_cr <= 0.0062
+    by_thesis = left_out(FITTED, axis, THESIS)
+    assert errors.ratio < by_thesis.ratio <= 0.012
+    assert errors.x_cr < by_thesis.x_cr <= 0.008
+    assert errors.y_cr < by_thesis.y_cr <= 0.007
     # and better than the heuristic's eleven, refitted in the same way, in all three
     assert errors.ratio < 0.5 * heuristic.ratio
     assert errors.x_cr < 0.7 * heuristic.x_cr
@@ -26,12 +47,20 @@ def test_four_fitted_numbers_predict_rows_that_they_have_not_seen(axis):
 
 
 def test_the_fitted_numbers():
-    found, _ = fitted()
-    sigma = jackknife_sigma()
-    assert np.all(np.abs(found.values - [0.065, 0.135, 0.583, 0.0031]) < 0.5 * sigma)
-    assert np.all(sigma > found.sigma * 0.7)
-    # Each stands clear of what the thesis assumes.
-    assert np.all(np.abs(found.values - [0, 0, 0.56, 0]) > 4 * sigma)
+    for model, values in ((friction(), [0.064, 0.130, 0.5856, 0.0043]), (THESIS, [0.065, 0.135, 0.583, 0.0031])):
+        found, _ = fitted(model=model)
+        sigma = jackknife_sigma(model=model)
+        assert np.all(np.abs(found.values - values) < 0.5 * sigma)
+        assert np.all(sigma > found.sigma * 0.7)
+        # Each stands clear of what the thesis assumes.
+        assert np.all(np.abs(found.values - [0, 0, 0.56, 0]) > 4 * sigma)
+
+
+def test_the_rotations_ask_for_nearly_the_stiffness_of_appendix_a():
+    names = (*FITTED, "slip_stiffness")
+    found, _ = fitted(names)
+    assert found.values[-1] == pytest.approx(12.6, abs=0.1)
+    assert abs(found.values[-1] - 13.333) < 2 * jackknife_sigma(names)[-1]
 
 
 def test_each_fitted_number_is_needed_for_its_own_component():
@@ -48,7 +77,7 @@ def test_each_fitted_number_is_needed_for_its_own_component():
 def test_scrub_has_aliases_that_fit_as_well():
     _, full = fitted()
     for name in ALIASES:
-        assert fitted((*FITTED[:3], name))[1].ratio == pytest.approx(full.ratio, rel=0.02)
+        assert fitted((*FITTED[:3], name))[1].ratio == pytest.approx(full.ratio, rel=0.1)
 
 
 def test_the_fit_recovers_numbers_that_it_was_given():

@@ -6,7 +6,7 @@ import pytest
 from motion_models import se2
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
-from tests.studies.friction_grid import fitted, friction
+from tests.studies.friction_grid import fitted, friction, grid
 from tests.studies.gentle_arcs import (
     GENTLE,
     TRAJECTORIES,
@@ -19,8 +19,9 @@ from tests.studies.gentle_arcs import (
     vision_error,
 )
 
-FITTED = fitted()[0].params
-ROBOTS = pytest.mark.parametrize("robot", [FITTED, friction().nominal], ids=["four fitted", "nothing fitted"])
+MODEL, THESIS = friction(), friction("thesis")
+FITTED, FITTED_THESIS = (fitted(model=model)[0].params for model in (MODEL, THESIS))
+KINDS = pytest.mark.parametrize("kind", ["four fitted", "nothing fitted"])
 
 
 @pytest.fixture(scope="module")
@@ -28,38 +29,72 @@ def rows():
     return compare(FITTED, configurations(FITTED))
 
 
-@ROBOTS
-def test_k_falls_by_about_a_quarter_on_a_gentle_arc_and_the_slope_of_x_cr_by_about_a_third(robot):
-    by_arc = {(loss.vx, loss.wz): loss for loss in losses(robot)}
+@pytest.fixture(scope="module")
+def thesis_rows():
+    return compare(FITTED_THESIS, configurations(FITTED_THESIS, THESIS), THESIS)
+
+
+@KINDS
+def test_k_on_gentle_arcs_with_a_centred_cg_is_that_in_place(kind):
+    by_arc = {(loss.vx, loss.wz): loss for loss in losses(FITTED if kind == "four fitted" else MODEL.nominal)}
+    for wz in (0.5, 0.2, 0.1, 0.05):
+        assert by_arc[0.5, wz].k_centred == pytest.approx(1.0, abs=0.02)
+    # x_CR's slope on x_G falls from 2.2 towards 1, that of proportional tyres
+    slopes = [by_arc[0.5, wz].x_cr for wz in (0.5, 0.2, 0.1, 0.05)]
+    assert slopes == sorted(slopes, reverse=True)
+    assert slopes[-1] == pytest.approx(0.5, abs=0.03)
+    # a rotation in place does not depend on its speed
+    assert by_arc[0.0, 0.1].k == pytest.approx(1.0, abs=1e-6)
+
+
+@KINDS
+def test_the_thesis_law_takes_a_quarter_off_k_on_a_gentle_arc(kind):
+    by_arc = {(loss.vx, loss.wz): loss for loss in losses(FITTED_THESIS if kind == "four fitted" else THESIS.nominal, THESIS)}
     gentle = by_arc[0.5, 0.1]
     assert gentle.k_centred == pytest.approx(0.75, abs=0.03)
     assert gentle.x_cr == pytest.approx(0.65, abs=0.05)
-    # The gentler, the more; a rotation in place does not care how fast it is.
-    assert by_arc[0.0, 0.1].k == pytest.approx(1.0, abs=1e-6)
     k = [by_arc[0.5, wz].k for wz in (0.5, 0.2, 0.1, 0.05)]
     assert k == sorted(k, reverse=True)
 
 
-@ROBOTS
-def test_the_heuristic_must_lose_on_the_gentle_arcs_and_only_there(robot):
-    predicted = {row.trajectory: row.predicted_loss for row in compare(robot, configurations(FITTED))}
-    assert {name for name, loss in predicted.items() if loss > 0} == set(GENTLE)
+def test_table_5_2_decides_where_the_prediction_is_decided(rows):
+    """The heuristic must win on sharp turns, and does; on gentle arcs neither prediction nor measurement is beyond the scatter."""
+    verdicts = {row.trajectory: row.verdict for row in rows}
+    assert {name for name, verdict in verdicts.items() if verdict == "undecided"} == set(GENTLE)
+    assert not [name for name, verdict in verdicts.items() if verdict == "must lose"]
+    for row in rows:
+        if row.verdict == "must win":
+            assert row.measured_loss[0] < 0
 
 
-def test_it_must_lose_there_wherever_the_centres_of_gravity_were():
+def test_gentle_arcs_of_the_84_runs_are_predicted_four_times_as_well_as_by_the_thesis_law(rows, thesis_rows):
+    def rms(found, names):
+        return float(np.sqrt(np.mean([(row.predicted - row.measured) ** 2 for row in found if row.trajectory in names])))
+
+    assert rms(thesis_rows, GENTLE) > 0.058
+    assert rms(rows, GENTLE) <= 0.015
+    assert rms(thesis_rows, TRAJECTORIES) > 0.049
+    assert rms(rows, TRAJECTORIES) <= 0.038
+
+
+def test_the_thesis_law_wants_the_heuristic_to_lose_on_the_gentle_arcs_and_only_there(thesis_rows):
+    assert {row.trajectory for row in thesis_rows if row.predicted_loss > 0} == set(GENTLE)
+
+
+def test_by_the_thesis_law_it_must_lose_there_wherever_the_centres_of_gravity_were():
     """Not only at the configurations' inferred CGs: as a mean over the thesis's whole grid too."""
-    from tests.studies.thesis_regressions import grid
-
     skid, diff = (make_model(name, load_robot("vaultbot")) for name in ("skid_steer", "diff_drive"))
     cg = grid().cg
-    losing = {name for name in TRAJECTORIES if np.mean(vision_error(name, cg, skid, FITTED) - vision_error(name, cg, diff, FITTED)) > 0}
-    assert losing == set(GENTLE)
+    errors = {
+        name: [vision_error(name, cg, controller, FITTED_THESIS, THESIS).mean() for controller in (skid, diff)] for name in TRAJECTORIES
+    }
+    assert {name for name, (by_skid, by_diff) in errors.items() if by_skid > by_diff} == set(GENTLE)
 
 
 def test_what_it_lost_and_won_of_the_six(rows):
     measured = {row.trajectory: row.measured_loss for row in rows}
     assert {name for name, (loss, _) in measured.items() if loss > 0} == {"arc_1", "arc_4"}
-    # arc_2 is the prediction's one miss; on the two that it lost, it lost by less than the scatter over configurations.
+    # On the two that it lost, it lost by less than the scatter over configurations.
     assert measured["arc_2"][0] == pytest.approx(-0.012, abs=5e-4)
     for name in ("arc_1", "arc_4"):
         assert measured[name][0] < 2 * measured[name][1]
@@ -93,7 +128,7 @@ def test_which_configurations_win_in_reverse_is_predicted(rows):
     """arc_4 is driven backwards: a CG ahead, which wins forwards, loses there, and the other way round."""
     row = next(r for r in rows if r.trajectory == "arc_4")
     loss = [r[:, 0] - r[:, 1] for r in (row.predicted, row.measured)]
-    assert np.corrcoef(loss[0], loss[1])[0, 1] > 0.7
+    assert np.corrcoef(loss[0], loss[1])[0, 1] > 0.65
     rotate = next(r for r in rows if r.trajectory == "rotate")
     assert np.corrcoef(*(r[:, 0] - r[:, 1] for r in (rotate.predicted, rotate.measured)))[0, 1] > 0.95
 

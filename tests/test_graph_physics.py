@@ -19,8 +19,7 @@ from localization.steps import Step
 from motion_models.base import Motion
 from motion_models.corrections import check_forms, correctable, corrections
 from motion_models.errors import CgError, ModelError
-from motion_models.friction import FrictionModel
-from motion_models.friction_corrected import CorrectedFriction
+from motion_models.friction import CorrectedFriction, FrictionModel
 from motion_models.integrate import preintegrate
 from motion_models.registry import make_model
 from motion_models.robot import WheelNoise, load_robot

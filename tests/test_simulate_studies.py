@@ -65,4 +65,4 @@ def test_the_scores_are_of_the_size_of_table_5_2_where_the_study_says_so(drives)
     assert rotate.simulated[:, 1, 1].mean() == pytest.approx(rotate.measured[:, 1, 1].mean(), rel=0.3)  # by nothing
     gentle = [drives[name] for name in ("arc_1", "arc_2", "arc_4")]
     times = np.mean([row.simulated[:, :, 2].mean() / row.measured[:, :, 2].mean() for row in gentle])
-    assert 2.0 < times < 3.5  # it differs there, by this
+    assert times == pytest.approx(1.0, abs=0.2)  # by the thesis's contact law it errs 2 to 3.5 times as much

@@ -12,16 +12,19 @@ from hypothesis import strategies as st
 
 from localization.errors import SimulationError
 from localization.simulate.dynamics import Chassis, Now, change
+from localization.simulate.effects import Reality, changed
 from localization.simulate.masses import Masses
 from localization.simulate.stepping import follow
 from localization.simulate.vehicle import CG, MARGIN, POSE, TWIST, Body, VehicleConfig, VehicleState, accelerations, advance
 from motion_models.errors import CgError
-from motion_models.friction_dynamics import FrictionDynamics, Influence
+from motion_models.friction.contact import SATURATION
+from motion_models.friction.dynamics import FrictionDynamics, Influence
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot import Mount, load_robot
 
 ROBOT = load_robot("vaultbot")
 BODY = Body.from_robot(ROBOT)
+ROBOTS = {law: dataclasses.replace(ROBOT, options={"friction": {"contact": law}}) for law in SATURATION}
 PLAIN = FrictionDynamics.from_robot(ROBOT)
 CONFIG = VehicleConfig()
 FLOOR = np.zeros((0, 5))
@@ -73,7 +76,9 @@ def test_once_its_tyres_have_given_way_its_accelerations_are_those_of_the_rigid_
 @settings(max_examples=100, deadline=None)
 def test_derivatives_are_those_of_differences(seed):
     rng = np.random.default_rng(seed)
-    body = BODY.chassis(CONFIG)._replace(warp=0.1, tread=0.2, creep=0.02, scrub=0.03)
+    chassis = BODY.chassis(CONFIG)
+    soft = chassis.tyre._replace(tread=0.2, saturation=float(rng.choice([0.0, 0.3, 1.0])))
+    body = chassis._replace(warp=0.1, tyre=soft, creep=0.02, scrub=0.03)
     now = Now(*rng.uniform(-0.5, 0.5, 2), *rng.uniform(0.5, 1, 4), 118.0, 2.5, *rng.uniform(-0.05, 0.05, 7), 10.0, 5.0)
     twist, tilt, step = rng.uniform(-0.5, 0.5, 3), rng.uniform(-1.1, 1.1, 2), 1e-7
     found = change(*twist, *tilt, now, body)
@@ -158,6 +163,16 @@ def test_wheels_speed_up_no_faster_than_the_controller_lets_them():
     assert rates.max() * 0.164 > 0.95 * CONFIG.acceleration_m_s2
 
 
+def test_the_tyres_follow_the_law_of_the_robot_file_and_an_effect_turns_it_into_the_other():
+    reality = {law: Reality(Body.from_robot(robot), Mount()) for law, robot in ROBOTS.items()}
+    for law, other in (("isotropic", "thesis"), ("thesis", "isotropic")):
+        assert reality[law].body.chassis(CONFIG).tyre.saturation == SATURATION[law]
+        assert changed(reality[law], {"lateral_force_law": 1.0}).body.chassis(CONFIG).tyre == reality[other].body.chassis(CONFIG).tyre
+    # on a gentle arc the thesis's robot turns less
+    turns = [drive((3.0, 3.3), 2.0, body=of.body)[-1, TWIST][2] for of in reality.values()]
+    assert turns[1] < 0.9 * turns[0]
+
+
 def energy(rows, body, cg):
     vx, vy, wz = rows[:, TWIST].T
     return 0.5 * body.mass * ((vx - wz * cg[1]) ** 2 + (vy + wz * cg[0]) ** 2) + 0.5 * body.inertia * wz**2
@@ -176,23 +191,26 @@ def test_locked_wheels_only_ever_take_energy(seed):
     assert found[-1] < 1e-6 * found[0]
 
 
-def wheel_forces(body: Chassis, row, cg, share):
-    """(4, 2) forces by 3.15-3.17 as they are printed, wheel by wheel, unrounded."""
+def wheel_forces(body: Chassis, row, cg, share, law):
+    """(4, 2) forces by 3.15-3.17 as they are printed, or by the isotropic law, wheel by wheel, unrounded."""
     vx, vy, wz = row[TWIST]
     out = []
     for (sx, sy), n in zip([(1, 1), (1, -1), (-1, 1), (-1, -1)], share, strict=True):
         x, y = sx * body.half_wheelbase, sy * body.half_track
         q = row[6] * body.radius_left if sy > 0 else row[7] * body.radius_right
         s_x, s_y = vx - y * wz - q, vy + x * wz
-        whole, over = math.hypot(s_x, s_y), abs(s_x) / max(abs(s_x + q), abs(q))
-        fx = -body.mu * n * (1 - math.exp(-body.slip_stiffness * over)) * s_x / whole - body.rolling_resistance * n * np.sign(q)
-        out.append((fx, -body.mu * n * body.side * s_y / whole))
+        whole, fastest, stiffness = math.hypot(s_x, s_y), max(abs(s_x + q), abs(q)), body.tyre.stiffness
+        along = 1 - math.exp(-stiffness * (abs(s_x) if law == "thesis" else whole) / fastest)
+        across = 1 - math.exp(-stiffness) if law == "thesis" else along
+        fx = -body.mu * n * along * s_x / whole - body.rolling_resistance * n * np.sign(q)
+        out.append((fx, -body.mu * n * across * s_y / whole))
     return np.array(out)
 
 
-def test_the_change_of_momentum_is_the_impulse_of_the_forces_that_the_thesis_prints():
+@pytest.mark.parametrize("law", list(SATURATION))
+def test_the_change_of_momentum_is_the_impulse_of_the_forces_that_the_law_prints(law):
     """A sliding robot with a CG on the floor, whose loads are then those of standing: m dv of the CG in the world = sum of F dt."""
-    body = dataclasses.replace(BODY, cg_height=0.0)
+    body = dataclasses.replace(BODY, cg_height=0.0, saturation=SATURATION[law])
     cg, config = np.array([0.06, 0.02]), VehicleConfig(step_s=0.001)
     rows = drive((1.0, 3.0), 0.4, cg, body, config, twist=(0.6, 0.2, -0.8))
     chassis = body.chassis(config)
@@ -204,7 +222,7 @@ def test_the_change_of_momentum_is_the_impulse_of_the_forces_that_the_thesis_pri
         turn = np.array([[c, -s], [s, c]])
         vx, vy, wz = row[TWIST]
         momentum[i] = body.mass * turn @ [vx - wz * cg[1], vy + wz * cg[0]]
-        impulse[i] = turn @ wheel_forces(chassis, row, cg, share).sum(axis=0)
+        impulse[i] = turn @ wheel_forces(chassis, row, cg, share, law).sum(axis=0)
     summed = np.cumsum(0.5 * (impulse[1:] + impulse[:-1]) * config.step_s, axis=0)
     changed = momentum[1:] - momentum[0]
     assert np.abs(changed).max() > 20.0  # kg m/s: something happened

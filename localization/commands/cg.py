@@ -19,7 +19,7 @@ from motion_models.cg_files import arms_model, arms_postures, weighed_cg
 from motion_models.cg_parts import Arms, CgEstimate, Payload, StaticPart, require_support
 from motion_models.errors import CgError
 from motion_models.friction import FrictionModel
-from motion_models.friction_kernel import loads
+from motion_models.friction.contact import loads
 from motion_models.postures import Posture, parse_postures
 from motion_models.robot import Robot, load_robot
 from motion_models.se2 import FloatArray

@@ -16,6 +16,7 @@ from localization.diagnosis.diagnose import DiagnosisConfig, Examined, examine
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_table
 from localization.diagnosis.findings import Diagnosis
 from localization.diagnosis.patch import patched
+from localization.diagnosis.runs import drive_of_runs, read_runs
 from localization.logs import TopicOverrides, open_log
 from localization.maneuver_windows import WindowConfig
 from localization.output import check_outputs, write_text_file
@@ -35,7 +36,8 @@ class Diagnose:
 
     source: tyro.conf.Positional[Path]
     """Log (.bag, folder, .mcap), or table (.csv): rotations in place at many centres of gravity (cg_x_m, cg_y_m, rotation_ratio, cor_x_m,
-    cor_y_m), or windows of wheel motion (window, dt_s, left_rad_per_s, right_rad_per_s, x_m, y_m, yaw_rad, ...)."""
+    cor_y_m), runs of a trajectory under a controller (trajectory, arm_configuration, controller, vision_error_m), or windows of wheel
+    motion (window, dt_s, left_rad_per_s, right_rad_per_s, x_m, y_m, yaw_rad, ...)."""
     robot: str
     """Name of a shipped robot, or path of a robot TOML file."""
     model: str = "friction"
@@ -80,7 +82,10 @@ class Diagnose:
             return drive_of_log(
                 open_log(self.source, robot, self.topic), self.witness, self.reference, WindowConfig(window_s=self.window_s)
             )
-        if "rotation_ratio" in table_columns(self.source):
+        columns = table_columns(self.source)
+        if "vision_error_m" in columns:
+            return drive_of_runs(name, robot, read_runs(self.source))
+        if "rotation_ratio" in columns:
             maneuvers = rotations_as_maneuvers(read_rotation_table(self.source), robot)
             return drive_of_table(name, robot, maneuvers, "rotations")
         return drive_of_table(name, robot, read_windows(self.source), "windows")

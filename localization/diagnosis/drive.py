@@ -40,7 +40,7 @@ class Drive:
     witness: str
     """What measured the motion, in words."""
     kind: str = "log"
-    """log, windows or rotations."""
+    """log, windows, rotations or runs."""
     starts_s: FloatArray = field(default_factory=lambda: np.zeros(0))
     """(W,) when each maneuver began; for tables, how much was driven before."""
     spans_ns: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
@@ -52,6 +52,10 @@ class Drive:
     """(W, 2) mean specific force along the body's x and y over each maneuver [m/s^2]; None without accelerometers."""
     payload_arms: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     """(N, 2) from the CG to where a payload would be held, in each interval of the maneuvers end to end [m]."""
+    paths: tuple[FloatArray, ...] = ()
+    """For runs: (n, 3) path of the controller's odometry in each, a pose at the end of each interval."""
+    path_errors: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """For runs: (W,) measured mean distance of the driven path from it [m]."""
     lidar_frame: str = ""
     """Frame of the scans that were matched."""
     lidar_at: tuple[float, float] = (0.0, 0.0)
@@ -189,7 +193,7 @@ def drive_of_table(name: str, robot: Robot, maneuvers: Sequence[Maneuver], kind:
     >>> found = diagnose(drive_of_table("rotation_grid.csv", robot, rotations, "rotations"), make_model("friction", robot))
     >>> strongest = found.findings[0]
     >>> strongest.cause, round(strongest.size, 2), strongest.effect.unit
-    ('lidar_offset_x', 0.07, 'm')
+    ('lidar_offset_x', 0.06, 'm')
     """
     if kind == "windows":
         maneuvers = [piece for m in maneuvers for piece in _pieces(m)]

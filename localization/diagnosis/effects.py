@@ -32,6 +32,8 @@ class Belief:
     """vy += a vx wz; wz *= 1 - b |vx|; vx -= c vx |wz|."""
     slope: tuple[float, float] = (0.0, 0.0)
     """Rise of the floor along the axes of the drive's first heading [rad]."""
+    other_law: float = 0.0
+    """Share of the contact law that the robot file does not choose (`motion_models.friction.contact`)."""
     change: float = 0.0
     """Sideways grip is more by this share from `change_s` on."""
     change_s: float = 0.0
@@ -113,6 +115,15 @@ _ALL = (
         0.2,
         0.03,
         _friction("mu_ratio"),
+    ),
+    Effect(
+        "lateral_force_law",
+        "1",
+        "the lateral force follows the other contact law by this share (isotropic: it grows with the slip; thesis: saturated at any slip)",
+        1.0,
+        0.15,
+        _plain("other_law"),
+        one_sided=True,
     ),
     Effect(
         "diagonal_load",

@@ -62,7 +62,7 @@ def candidates(pipeline: Pipeline, moments: int) -> tuple[Effect, ...]:
         out.add("encoder_dropout")
     if drive.is_gyro_reference:
         out |= {"lidar_offset_x", "lidar_offset_y", "lidar_yaw", "lidar_time_offset", "lateral_slip_speed", "longitudinal_slip_turning"}
-    if drive.kind == "rotations":
+    if drive.kind in ("rotations", "runs"):
         out |= {"lidar_time_offset", "wheel_time_offset", "slope", "lateral_slip_speed", "rotation_slip_speed", "longitudinal_slip_turning"}
     found = [e for e in EFFECTS.values() if e.id not in out]
     if drive.kind == "log" and not drive.is_gyro_reference:
@@ -70,6 +70,9 @@ def candidates(pipeline: Pipeline, moments: int) -> tuple[Effect, ...]:
         length = float(drive.starts_s[-1])
         if len(drive.maneuvers) >= 24:
             found += [friction_change(length * q) for q in np.linspace(0.1, 0.9, moments)]
+    if drive.kind == "runs":
+        out = {"wheel_radius_difference", "tread_asymmetry", "lidar_yaw", "gyro_bias", "encoder_dropout"}
+        return tuple(e for e in found if e.id not in out)
     if drive.kind == "windows":
         found += list(EXTRA.values())
     elif pipeline.model.name != "friction":  # its own number for how far it turns is not the floor's

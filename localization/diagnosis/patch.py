@@ -11,6 +11,7 @@ from localization.diagnosis.effects import Belief
 from localization.diagnosis.prediction import Pipeline
 from motion_models.base import MotionModel
 from motion_models.friction import FrictionModel
+from motion_models.friction.contact import SATURATION
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
@@ -80,7 +81,14 @@ def patched(pipeline: Pipeline, belief: Belief, lidar_frame: str | None = None, 
         by_hand.append(f"an encoder loses counts in {100 * belief.encoder_lost:.1f} % of the time: check its cable.")
     if belief.change:
         by_hand.append(f"the floor grips otherwise from {belief.change_s:.0f} s on; one robot file cannot say both.")
-    new = dataclasses.replace(robot, geometry=geometry, arms=arms, mounts=mounts)
+    options = robot.options
+    if belief.other_law:
+        law = _law(robot, belief)
+        options = {**options, FrictionModel.name: {**options.get(FrictionModel.name, {}), "contact": law}}
+        by_hand.append(
+            f"the tyres follow the other contact law by {100 * belief.other_law:.0f} %; [models.friction] has contact = {law!r}."
+        )
+    new = dataclasses.replace(robot, geometry=geometry, arms=arms, mounts=mounts, options=options)
     if not changed:
         return Patch(new, tuple(by_hand))
     lasting = dataclasses.replace(
@@ -113,6 +121,13 @@ def _friction(robot: Robot, belief: Belief, scale: float) -> dict[str, float]:
     for name in ("rolling_resistance", "scrub"):
         values[name] = max(values[name], 0.0)
     return values
+
+
+def _law(robot: Robot, belief: Belief) -> str:
+    """The contact law nearest to the belief."""
+    saturation = FrictionModel.from_robot(robot).saturation
+    share = saturation + (1.0 - 2.0 * saturation) * belief.other_law
+    return min(SATURATION, key=lambda name: abs(SATURATION[name] - share))
 
 
 def _matched(pipeline: Pipeline, belief: Belief, new: Robot, name: str, shift: FloatArray) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 
@@ -15,7 +16,7 @@ from localization.diagnosis.steady import steady_twists
 from motion_models import se2
 from motion_models.base import MotionModel, Twist
 from motion_models.friction import FrictionModel
-from motion_models.maneuvers import Batch, IntArray, make_batch
+from motion_models.maneuvers import Batch, IntArray, Maneuver, make_batch
 from motion_models.prediction import predict
 from motion_models.se2 import FloatArray
 
@@ -23,6 +24,7 @@ CHANNELS = ("x", "y", "yaw", "gyro", "force_x", "force_y")
 CHANNEL_UNITS = ("m", "m", "rad", "rad", "m/s^2", "m/s^2")
 _GRAVITY = 9.81
 _REMEMBERED = 100
+_MOST_OTHER_LAW = 1.3  # share of the other contact law; beyond 1 for the search only
 _NO_COLUMNS: IntArray = np.empty(0, dtype=np.int64)
 
 
@@ -44,6 +46,8 @@ class Pipeline:
     def __post_init__(self) -> None:
         self.batch = make_batch(self.drive.maneuvers)
         self._friction = FrictionModel.from_robot(self.drive.robot)
+        runs = [_whole(m, path) for m, path in zip(self.drive.maneuvers, self.drive.paths, strict=False)]
+        self._path_batch = make_batch(runs) if runs else None
         self._lost = lost_share(self.batch)
         rolls = np.abs(self.batch.wheels).max(axis=1) > RESTS
         self._lost_time = float((self._lost.max(axis=1) * rolls) @ self.batch.dt / max(float(rolls @ self.batch.dt), 1e-9))
@@ -54,7 +58,7 @@ class Pipeline:
             inside = slice(first[w], first[w + 1])
             dt = self.batch.dt[inside]
             self._times[inside] = start + np.cumsum(dt) - dt - dt[: lead[w]].sum()
-        self._base = steady_twists(self._friction.nominal, self.batch.wheels, self.batch.cg)
+        self._base = steady_twists(self._friction, self._friction.nominal, self.batch.wheels, self.batch.cg)
         self._kinematic_forces = self._accelerations()
         self._known: dict[tuple[object, ...], FloatArray] = {}
 
@@ -108,6 +112,11 @@ class Pipeline:
         if drive.is_gyro_reference:
             witness[2:] = 0.0
         changed = _Changed(self, belief)
+        if self._path_batch is not None:
+            poses, _, _ = predict(changed, self._path_batch, changed.nominal, witness, _NO_COLUMNS, drive.robot.wheel_noise)
+            apart = np.hypot(*(poses - self._path_batch.measured)[:, :2].T)
+            out[:, 0] = drive.path_errors - np.bincount(self._path_batch.owner, apart) / np.bincount(self._path_batch.owner)
+            return out
         poses, _, _ = predict(changed, batch, changed.nominal, witness, _NO_COLUMNS, drive.robot.wheel_noise)
         off = se2.between(poses, batch.measured)
         known = np.isfinite(np.diagonal(batch.cov, axis1=1, axis2=2))
@@ -150,6 +159,11 @@ class Pipeline:
         return np.asarray(((self.discrepancies(belief) if base is None else base) - ahead) / step)
 
 
+def _whole(maneuver: Maneuver, path: FloatArray) -> Maneuver:
+    """``maneuver`` with the poses (n, 3) of ``path`` at the end of each of its intervals."""
+    return dataclasses.replace(maneuver, measured=path, ends=np.arange(1, len(path) + 1), cov=np.zeros((3, 3)))
+
+
 class _Changed:
     """The model with a belief's changes: a `MotionModel` for the length of one batch."""
 
@@ -187,7 +201,7 @@ class _Changed:
     def _floor(self, rates: FloatArray, cg: FloatArray) -> FloatArray:
         """(N, 3) what the friction model says is otherwise: causes of the floor, and inertia."""
         p, b = self._p, self._b
-        is_otherwise = b.friction or any(b.cg) or b.payload_kg or b.change
+        is_otherwise = b.friction or any(b.cg) or b.payload_kg or b.change or b.other_law
         if not (is_otherwise or any(b.slope) or p.settling):
             return np.zeros((len(rates), 3))
         friction = p._friction
@@ -198,7 +212,11 @@ class _Changed:
         params[6], params[7] = max(params[6], 0.0), max(params[7], 0.0)
         params[9] = min(max(params[9], -0.9), 0.9)
         params[1] = max(params[1], 0.2 * friction.nominal[1])
-        nominal = self._settled(rates, cg, friction.nominal)
+        law = friction
+        if b.other_law:
+            share = min(b.other_law, _MOST_OTHER_LAW)
+            law = dataclasses.replace(friction, saturation=friction.saturation + (1.0 - 2.0 * friction.saturation) * share)
+        nominal = self._settled(friction, rates, cg, friction.nominal)
         moved = cg
         if any(b.cg) or b.payload_kg:
             mass = p.drive.robot.geometry.mass_kg
@@ -206,38 +224,45 @@ class _Changed:
             half = 0.49 * np.array([params[2], params[1]])
             moved = np.clip(moved, -half, half)
         if not b.change:
-            return self._moved(rates, moved, params) - nominal
+            return self._moved(law, rates, moved, params) - nominal
         later = params.copy()
         later[4] = max(later[4] * (1.0 + b.change), 0.05)
         is_later = (p._times >= b.change_s)[:, None]
-        return np.asarray(np.where(is_later, self._moved(rates, moved, later), self._moved(rates, moved, params)) - nominal)
+        return np.asarray(np.where(is_later, self._moved(law, rates, moved, later), self._moved(law, rates, moved, params)) - nominal)
 
-    def _settled(self, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+    def _settled(self, law: FrictionModel, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
         """(N, 3) twists of the tracked point without inertia; remembered, as many beliefs share them."""
         p, b = self._p, self._b
-        key = (*self._rates_key(), params.tobytes(), *((b.cg, b.payload_kg) if cg is not p.batch.cg else ()))
+        key = (*self._rates_key(), law.saturation, params.tobytes(), *((b.cg, b.payload_kg) if cg is not p.batch.cg else ()))
         if key not in p._known:
             if len(p._known) > _REMEMBERED:
                 p._known.clear()
-            p._known[key] = steady_twists(params, rates, cg)
+            p._known[key] = steady_twists(law, params, rates, cg)
         return p._known[key]
 
     def _rates_key(self) -> tuple[object, ...]:
         b = self._b
         return b.radius_left, b.radius_right, b.encoder_lost, b.wheels_late_s - b.lidar_late_s, b.wheel_lag_s
 
-    def _moved(self, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+    def _moved(self, law: FrictionModel, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
         """(N, 3) twists of the tracked point, with inertia where that counts."""
         p, b = self._p, self._b
-        settled = self._settled(rates, cg, params)
+        settled = self._settled(law, rates, cg, params)
         if not (p.settling or any(b.slope)):
             return settled
-        key = (*self._rates_key(), params.tobytes(), b.slope, *((b.cg, b.payload_kg) if cg is not p.batch.cg else ()), "inertia")
+        key = (
+            *self._rates_key(),
+            law.saturation,
+            params.tobytes(),
+            b.slope,
+            *((b.cg, b.payload_kg) if cg is not p.batch.cg else ()),
+            "inertia",
+        )
         if key not in p._known:
             x, y = params[TRACKED[0]], params[TRACKED[1]]
             middle = settled + settled[:, 2:] * np.array([y, -x, 0.0])
             batch = p.batch
-            twists = settling_twists(p.drive.robot, params, batch.dt, rates, cg, batch.first, p.headings, b.slope, middle)
+            twists = settling_twists(p.drive.robot, law, params, batch.dt, rates, cg, batch.first, p.headings, b.slope, middle)
             p._known[key] = np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
         return p._known[key]
 

@@ -1,7 +1,7 @@
 """Friction with inertia: how the robot follows its wheels when it accelerates, shifts its load, or stands on a slope.
 
-`motion_models.friction` gives the motion that constant wheel rates settle to. Here each wheel sample is one implicit (backward Euler)
-step of `motion_models.friction_dynamics`: stiff contact forces cannot make it unstable, and a long step lands on the settled motion.
+`motion_models.friction.model` gives the motion that constant wheel rates settle to. Here each wheel sample is one implicit (backward Euler)
+step of `motion_models.friction.dynamics`: stiff contact forces cannot make it unstable, and a long step lands on the settled motion.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import math
 import numba
 import numpy as np
 
-from motion_models.friction import FrictionModel, check_parameters, floor_of
-from motion_models.friction_dynamics import FrictionDynamics, _accelerations, _Body
-from motion_models.friction_solve import Floor
+from motion_models.friction.dynamics import FrictionDynamics, _accelerations, _Body
+from motion_models.friction.equilibrium import Floor
+from motion_models.friction.model import FrictionModel, check_parameters
 from motion_models.maneuvers import IntArray
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -27,6 +27,7 @@ _DIFFERENCE = 1e-5
 
 def settling_twists(
     robot: Robot,
+    model: FrictionModel,
     params: FloatArray,
     dt: FloatArray,
     wheels: FloatArray,
@@ -36,11 +37,11 @@ def settling_twists(
     slope: tuple[float, float],
     settled: FloatArray,
 ) -> FloatArray:
-    """Body twists (N, 3) of the wheelbase's centre for wheel rates (N, 2) in intervals ``dt`` (N,), CG (N, 2), friction ``params`` (12,).
+    """Body twists (N, 3) of the wheelbase's centre for wheel rates (N, 2) in intervals ``dt`` (N,), CG (N, 2), ``params`` (12,).
 
-    Maneuvers begin at ``first`` (W + 1,), with the ``headings`` (W,) [rad]; ``slope`` is by how much the floor rises along the x and y
-    axes in which headings count [rad]. ``settled`` (N, 3) are the twists without inertia: where each maneuver starts, and what stands in
-    where no step is found. Raises `CgError` and `ModelError` as `FrictionModel` does.
+    The contact law is that of ``model``. Maneuvers begin at ``first`` (W + 1,), with the ``headings`` (W,) [rad]; ``slope`` is by how much
+    the floor rises along the x and y axes in which headings count [rad]. ``settled`` (N, 3) are the twists without inertia: where each
+    maneuver starts, and the result where no step is found. Raises `CgError` and `ModelError` as `FrictionModel` does.
     """
     check_parameters(cg, params)
     dynamics = FrictionDynamics.from_robot(robot)
@@ -56,7 +57,7 @@ def settling_twists(
         dynamics.rest_speed,
     )
     out = np.empty((len(dt), 3))
-    _settle(dt, wheels, cg, first, headings, np.array(slope), settled, floor_of(params), body, out)
+    _settle(dt, wheels, cg, first, headings, np.array(slope), settled, model.floor(params), body, out)
     return out
 
 

@@ -1,6 +1,6 @@
 """Twists of the friction model without their derivatives, from sample to sample: a diagnosis predicts a drive some hundred times.
 
-The same balance as `motion_models.friction`, by the same Newton's method. It starts from the sample before where the wheels roll at
+The same balance as `motion_models.friction.model`, by the same Newton's method. It starts from the sample before where the wheels roll at
 nearly the same proportion, which is where it ends, too.
 """
 
@@ -12,22 +12,22 @@ import numba
 import numpy as np
 
 from motion_models.errors import ModelError
-from motion_models.friction import check_parameters, floor_of
-from motion_models.friction_kernel import CREEP, loads
-from motion_models.friction_solve import Floor, Loads, motion, newton
+from motion_models.friction.contact import CREEP
+from motion_models.friction.equilibrium import Floor, motion, newton
+from motion_models.friction.model import FrictionModel, check_parameters, loads_at, pull_of, unit_rolls
 from motion_models.se2 import FloatArray
 
 _NEAR = 0.02
 
 
-def steady_twists(params: FloatArray, wheels: FloatArray, cg: FloatArray) -> FloatArray:
-    """Body twists (N, 3) of the tracked point for wheel rates (N, 2), CG (N, 2) and friction ``params`` (12,).
+def steady_twists(model: FrictionModel, params: FloatArray, wheels: FloatArray, cg: FloatArray) -> FloatArray:
+    """Body twists (N, 3) of the tracked point for wheel rates (N, 2), CG (N, 2) and ``params`` (12,), by the contact law of ``model``.
 
     Raises `CgError` and `ModelError` as `FrictionModel.twist` does.
     """
     check_parameters(cg, params)
     out = np.empty((len(wheels), 3))
-    _steady(wheels, cg, params, floor_of(params), out)
+    _steady(wheels, cg, params, model.floor(params), float(model.centripetal), out)
     lost = np.isnan(out[:, 2]) & np.isfinite(wheels).all(axis=1)
     if np.any(lost):
         raise ModelError(f"no balance of forces found for {np.count_nonzero(lost)} of {lost.size} samples.")
@@ -35,17 +35,17 @@ def steady_twists(params: FloatArray, wheels: FloatArray, cg: FloatArray) -> Flo
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _steady(wheels: FloatArray, cg: FloatArray, params: FloatArray, floor: Floor, out: FloatArray) -> None:  # pragma: no cover
-    radius, warp, tracked_x, tracked_y = params[0], params[8], params[10], params[11]
+def _steady(
+    wheels: FloatArray, cg: FloatArray, params: FloatArray, floor: Floor, centripetal: float, out: FloatArray
+) -> None:  # pragma: no cover
+    radius, mu, warp, tracked_x, tracked_y = params[0], params[3], params[8], params[10], params[11]
     vx = vy = wz = last_l = last_r = 0.0
     for i in range(wheels.shape[0]):
-        fl, fr, rl, rr, _, _, _ = loads(cg[i, 0] / floor.half_wheelbase, cg[i, 1] / floor.half_track, warp)
-        load = Loads(fl, fr, rl, rr)
-        speed = radius * math.hypot(wheels[i, 0], wheels[i, 1]) * math.sqrt(0.5)
+        speed, roll_l, roll_r = unit_rolls(radius, wheels[i, 0], wheels[i, 1])
         if speed == 0.0:
             out[i] = 0.0
             continue
-        roll_l, roll_r = radius * wheels[i, 0] / speed, radius * wheels[i, 1] / speed
+        load, _ = loads_at(cg[i, 0], cg[i, 1], warp, floor, pull_of(speed, mu, centripetal))
         found = False
         if abs(roll_l - last_l) < _NEAR and abs(roll_r - last_r) < _NEAR:
             vx, vy, wz, found = newton(vx, vy, wz, roll_l, roll_r, load, floor, CREEP)

@@ -1,6 +1,6 @@
 """The dynamic friction model with a floor under each wheel and a radius for each side, and with its exact derivatives.
 
-The physics are those of `motion_models.friction_dynamics` (Ebersole 2016, 3.15-3.26), with one thing added: tyres are springs. On a
+The physics are those of `motion_models.friction.dynamics` (Ebersole 2016, 3.15-3.26), with one thing added: tyres are springs. On a
 rigid robot the loads hang on the forces and the forces on the loads at the same instant, and for a high CG on a grippy floor there may
 be no loads that agree (Painleve's paradox, 1895). Here the loads follow what the forces ask for within a tyre's time; at rest and in
 steady motion they are the same.
@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numba
 
-from motion_models.friction_kernel import contact, loads, rolling, traction
+from motion_models.friction.contact import Tyre, contact, loads, rolling
 
 
 class Chassis(NamedTuple):
@@ -24,13 +24,10 @@ class Chassis(NamedTuple):
     radius_left: float
     radius_right: float
     mu: float
-    side: float
-    """mu_y / mu_x (1 - exp(-K))."""
-    slip_stiffness: float
+    tyre: Tyre
     rolling_resistance: float
     scrub: float
     warp: float
-    tread: float
     height: float
     """Of the CG above the floor [m]."""
     gravity: float
@@ -89,7 +86,7 @@ class Change(NamedTuple):
 def change(vx: float, vy: float, wz: float, xi: float, eta: float, now: Now, body: Chassis) -> Change:  # pragma: no cover
     """Accelerations of the wheelbase's centre in the body frame at the twist ``vx, vy, wz`` and the tilt ``xi, eta``.
 
-    The tilt is where the loads' centre lies, as a fraction of the half wheelbase and the half track (see `friction_kernel.loads`);
+    The tilt is where the loads' centre lies, as a fraction of the half wheelbase and the half track (see `contact.loads`);
     beyond +-1 the wheels of an axle or a side are in the air, and the others carry all.
     """
     speed = math.sqrt(0.5 * (now.roll_left * now.roll_left + now.roll_right * now.roll_right) + body.rest_speed * body.rest_speed)
@@ -101,7 +98,6 @@ def change(vx: float, vy: float, wz: float, xi: float, eta: float, now: Now, bod
     for left in (True, False):
         at_y, roll = (body.half_track, now.roll_left * per) if left else (-body.half_track, now.roll_right * per)
         slip = (vx - at_y * wz) * per - roll
-        taken, by_slip, _, _ = traction(slip, roll, body.slip_stiffness, body.creep)
         drag = body.rolling_resistance * rolling(roll)[0]  # 3.17
         for ahead in (True, False):
             at_x = body.half_wheelbase if ahead else -body.half_wheelbase
@@ -110,9 +106,9 @@ def change(vx: float, vy: float, wz: float, xi: float, eta: float, now: Now, bod
             else:
                 share, grip = (fr, now.grip_fr) if ahead else (rr, now.grip_rr)
             n = share * body.mu * grip
-            fx, fy, xs, xd, ys, yd = contact(slip, (vy + at_x * wz) * per, taken, by_slip, body.side, body.tread, body.creep)
-            fx, fy = n * fx - share * drag, n * fy  # 3.15, 3.16
-            xs, xd, ys, yd = n * per * xs, n * per * xd, n * per * ys, n * per * yd
+            f = contact(slip, (vy + at_x * wz) * per, roll, body.tyre, body.creep)
+            fx, fy = n * f.x - share * drag, n * f.y
+            xs, xd, ys, yd = n * per * f.x_slip, n * per * f.x_drift, n * per * f.y_slip, n * per * f.y_drift
             xw, yw = at_x * xd - at_y * xs, at_x * yd - at_y * ys
             arm_x, arm_y = at_x - now.cg_x, at_y - now.cg_y
             x, y, m, mean_mu = x + fx, y + fy, m + arm_x * fy - arm_y * fx, mean_mu + n

@@ -99,6 +99,12 @@ def _yield(index: int) -> Callable[[Reality, float], Reality]:
     return apply
 
 
+def _other_law(reality: Reality, size: float) -> Reality:
+    """From the robot file's contact law towards the other: isotropic for the thesis's and the other way round."""
+    old = reality.body.saturation
+    return _body(reality, dataclasses.replace(reality.body, saturation=old + (1.0 - 2.0 * round(old)) * size))
+
+
 def _slope(reality: Reality, size: float) -> Reality:
     return _body(reality, dataclasses.replace(reality.body, slope=reality.body.slope + size))
 
@@ -123,6 +129,7 @@ _ALL = (
         0.9,
         _plain("side_friction_later", factor=True),
     ),
+    Effect("lateral_force_law", "1", "the tyres follow the other contact law by this share (1: wholly)", 1.0, _other_law),
     Effect("diagonal_load", "1", "a warped chassis loads front left and rear right by this share of m g / 4", 0.9, _param("warp")),
     Effect("tread_asymmetry", "1", "wheels that slide to the left grip more by this share, to the right less", 0.9, _param("tread")),
     Effect("rolling_resistance", "1", "rolling resistance over load is more by this", 0.3, _param("rolling_resistance")),
@@ -160,7 +167,7 @@ def changed(reality: Reality, effects: Mapping[str, float]) -> Reality:
             known = "\n".join(f"  {e.id} [{e.unit}]: {e.meaning}" for e in _ALL)
             raise SimulationError(f"no effect '{name}'; there are\n{known}")
         effect = EFFECTS[name]
-        least = 0.0 if name in ("payload", "encoder_dropout") else -effect.largest
+        least = 0.0 if name in ("payload", "encoder_dropout", "lateral_force_law") else -effect.largest
         if not least <= size <= effect.largest:
             raise SimulationError(f"effect {name} of {size:g} {effect.unit} is out of reason; it may be {least:g} to {effect.largest:g}.")
         reality = effect.apply(reality, size)

@@ -13,8 +13,9 @@ from localization.errors import SimulationError
 from localization.settings import Positive, Settings, up_to
 from localization.simulate.dynamics import Chassis, Now, change
 from localization.simulate.stepping import drive
-from motion_models.friction import FrictionModel, check_parameters
-from motion_models.friction_dynamics import FrictionDynamics
+from motion_models.friction.contact import tyre
+from motion_models.friction.dynamics import FrictionDynamics
+from motion_models.friction.model import FrictionModel, check_parameters
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -57,6 +58,8 @@ class Body:
     """[m]"""
     radius_right: float
     """[m]"""
+    saturation: float = 0.0
+    """Contact law of the tyres, as `FrictionModel.saturation`."""
     slope: float = 0.0
     """Tilt of the floor: it rises towards the world's +x by this angle [rad]."""
     cg_offset: tuple[float, float] = (0.0, 0.0)
@@ -69,7 +72,7 @@ class Body:
         """The nominal robot on its nominal floor."""
         plain = FrictionDynamics.from_robot(robot)
         radius = float(plain.params[0])
-        return cls(plain.params, plain.mass, plain.inertia, plain.cg_height, radius, radius)
+        return cls(plain.params, plain.mass, plain.inertia, plain.cg_height, radius, radius, plain.saturation)
 
     def with_param(self, name: str, value: float) -> Body:
         """This body with another friction parameter."""
@@ -89,12 +92,10 @@ class Body:
             radius_left=self.radius_left,
             radius_right=self.radius_right,
             mu=p[3],
-            side=p[4] * (1.0 - math.exp(-p[5])),
-            slip_stiffness=p[5],
+            tyre=tyre(p[5], p[4], p[9], self.saturation),
             rolling_resistance=p[6],
             scrub=p[7],
             warp=p[8],
-            tread=p[9],
             height=self.cg_height,
             gravity=config.gravity * math.cos(self.slope),
             creep=config.creep,

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import root
 
-from motion_models.friction import floor_of
-from motion_models.friction_kernel import CREEP, loads
-from motion_models.friction_solve import Floor, Loads, balance
-from motion_models.registry import make_model
+from motion_models.friction.contact import CREEP, loads
+from motion_models.friction.equilibrium import Floor, Loads, balance
+from motion_models.friction.model import FrictionModel
 from motion_models.robot import load_robot
 from motion_models.se2 import FloatArray
 
@@ -48,9 +47,9 @@ def median_time(call: Callable[[], object], n: int, rounds: int) -> float:
     return float(np.median(taken))
 
 
-def by_scipy(wheels: FloatArray, cg: FloatArray, params: FloatArray, compiled: bool) -> FloatArray:
+def by_scipy(model: FrictionModel, wheels: FloatArray, cg: FloatArray, params: FloatArray, compiled: bool) -> FloatArray:
     """(3,) the twist of one case; the balance in numpy, or the model's own compiled one behind scipy's search."""
-    floor = floor_of(params)
+    floor = model.floor(params)
     share = loads(cg[0] / floor.half_wheelbase, cg[1] / floor.half_track, params[8])[:4]
     speed = params[0] * math.hypot(*wheels) / math.sqrt(2.0)
     roll = params[0] * wheels / speed
@@ -68,15 +67,15 @@ def _numpy_balance(v: FloatArray, roll: FloatArray, n: FloatArray, floor: Floor)
     y = np.array([1.0, -1.0, 1.0, -1.0]) * floor.half_track
     slip, drift = v[0] - y * v[2] - roll, v[1] + x * v[2]
     sliding = np.sqrt(slip**2 + drift**2 + CREEP**2)
-    ratio = np.hypot(slip, CREEP) / np.maximum(np.maximum(np.abs(slip + roll), np.abs(roll)), CREEP)
-    fx = -n * ((1.0 - np.exp(-floor.slip_stiffness * ratio)) * slip / sliding + floor.drag * roll / np.hypot(roll, 0.02))
-    fy = -n * floor.side * drift / sliding * (1.0 + floor.tread * drift / sliding)
+    fastest = np.maximum(np.maximum(np.abs(slip + roll), np.abs(roll)), CREEP)
+    factor = n * (1.0 - np.exp(-floor.tyre.stiffness * sliding / fastest)) / sliding
+    fx, fy = -factor * slip - n * floor.drag * roll / np.hypot(roll, 0.02), -factor * drift
     return [fx.sum(), fy.sum(), (x * fy - y * fx).sum()]
 
 
 def timings(rounds: int = 15) -> list[Timing]:
     robot = load_robot("vaultbot")
-    model = make_model("friction", robot)
+    model = FrictionModel.from_robot(robot)
     params = model.nominal
     rng = np.random.default_rng(0)
     found = []
@@ -92,7 +91,7 @@ def timings(rounds: int = 15) -> list[Timing]:
         found.append(Timing(f"friction, inverse, {where}", inverse, math.nan))
     wheels, cg = cases(rng, 50, arms)
     for what, compiled in (("in numpy", False), ("compiled", True)):
-        once = median_time(lambda k=compiled: [by_scipy(w, c, params, k) for w, c in zip(wheels, cg, strict=True)], 50, 5)  # type: ignore[misc]
+        once = median_time(lambda k=compiled: [by_scipy(model, w, c, params, k) for w, c in zip(wheels, cg, strict=True)], 50, 5)  # type: ignore[misc]
         found.append(Timing(f"scipy.optimize.root, balance {what}, CG within the arms' reach", once, math.nan))
     return found
 

@@ -2,6 +2,8 @@
 
 python -m tests.studies.friction_grid
 
+`tests.studies.contact_law` compares contact laws on the same rotations.
+
 A rotation was commanded at 0.3 rad/s through diff_drive_controller, so the wheel rates are known; the friction model says how fast
 and about which point the robot then turns. A row of the table is left out and predicted from the others: of constant y_G (the
 tables' rows, 7 of them) or of constant x_G (their columns, 10).
@@ -9,11 +11,13 @@ tables' rows, 7 of them) or of constant x_G (their columns, 10).
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
 from motion_models.base import MotionModel
+from motion_models.friction import FrictionModel
 from motion_models.registry import make_model
 from motion_models.regressions import RotationTable, polynomial, skid_steer_fit
 from motion_models.robot import load_robot
@@ -63,9 +67,12 @@ class GridFit:
     """(c,) from the scatter about the fit, as if all rows were independent."""
 
 
-def friction() -> MotionModel:
-    """With Appendix A's constants."""
-    return make_model("friction", load_robot("vaultbot"))
+def friction(contact: str = "isotropic") -> FrictionModel:
+    """VaultBot, with Appendix A's constants."""
+    return FrictionModel.from_robot(dataclasses.replace(load_robot("vaultbot"), options={"friction": {"contact": contact}}))
+
+
+VAULTBOT = friction()
 
 
 def wheel_rates() -> FloatArray:
@@ -79,9 +86,9 @@ def measured(table: RotationTable) -> FloatArray:
     return np.column_stack([table.ratio, table.cor])
 
 
-def predict(cg: FloatArray, params: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What the friction model says of `measured` (n, 3) for ``cg`` (n, 2), and its derivative (n, 3, 12) by ``params`` (12,)."""
-    twist = friction().twist(wheel_rates(), cg, params)
+def predict(cg: FloatArray, params: FloatArray, model: MotionModel = VAULTBOT) -> tuple[FloatArray, FloatArray]:
+    """`measured` (n, 3) as the friction model predicts it for ``cg`` (n, 2), and its derivative (n, 3, 12) by ``params`` (12,)."""
+    twist = model.twist(wheel_rates(), cg, params)
     (vx, vy, wz), (d_vx, d_vy, d_wz) = np.moveaxis(twist.value, -1, 0), np.moveaxis(twist.d_params, 1, 0)
     value = np.stack([wz / COMMAND[1], -vy / wz, vx / wz], axis=-1)
     by_x = -(d_vy - (vy / wz)[:, None] * d_wz) / wz[:, None]
@@ -89,41 +96,40 @@ def predict(cg: FloatArray, params: FloatArray) -> tuple[FloatArray, FloatArray]
     return value, np.stack([d_wz / COMMAND[1], by_x, by_y], axis=1)
 
 
-def fit(names: tuple[str, ...], cg: FloatArray, seen: FloatArray) -> GridFit:
+def fit(names: tuple[str, ...], cg: FloatArray, seen: FloatArray, model: MotionModel = VAULTBOT) -> GridFit:
     """``names`` fitted to ``seen`` (n, 3) at ``cg`` (n, 2) from Appendix A's constants; components weigh by their own scatter."""
-    model = friction()
     free = [model.param_names.index(name) for name in names]
     params = model.nominal.copy()
-    value, derivative = predict(cg, params)
+    value, derivative = predict(cg, params, model)
     for _ in range(40):
         scatter = (seen - value).std(axis=0)
         residual = ((seen - value) / scatter).ravel()
         design = (derivative[:, :, free] / scatter[:, None]).reshape(residual.size, -1)
         step = np.linalg.lstsq(design, residual, rcond=None)[0]
-        params[free] += step * min(1.0, 0.05 / np.max(np.abs(step)))
-        value, derivative = predict(cg, params)
+        params[free] += step * min(1.0, 0.05 / np.max(np.abs(step) / np.maximum(np.abs(params[free]), 1.0)))
+        value, derivative = predict(cg, params, model)
         if np.max(np.abs(step)) < 1e-11:
             break
     variance = residual @ residual / (residual.size - len(free))
     return GridFit(names, params, params[free], np.sqrt(np.diagonal(np.linalg.inv(design.T @ design)) * variance))
 
 
-def unfitted() -> tuple[Errors, float]:
+def unfitted(model: MotionModel = VAULTBOT) -> tuple[Errors, float]:
     """Errors with Appendix A's constants and nothing fitted, and the slope of x_CR on x_G, by the thesis's way of means over y_G."""
     table = grid()
-    value, _ = predict(table.cg, friction().nominal)
+    value, _ = predict(table.cg, model.nominal, model)
     x, mean = table.means_over_y(value[:, 1])
     return Errors.of(value - measured(table)), float(polynomial(mean, x, 1).coefficients[1])
 
 
-def fitted(names: tuple[str, ...] = FITTED) -> tuple[GridFit, Errors]:
+def fitted(names: tuple[str, ...] = FITTED, model: MotionModel = VAULTBOT) -> tuple[GridFit, Errors]:
     """The fit to all rows, and what error it leaves in them."""
     table = grid()
-    found = fit(names, table.cg, measured(table))
-    return found, Errors.of(predict(table.cg, found.params)[0] - measured(table))
+    found = fit(names, table.cg, measured(table), model)
+    return found, Errors.of(predict(table.cg, found.params, model)[0] - measured(table))
 
 
-def jackknife_sigma(names: tuple[str, ...] = FITTED) -> FloatArray:
+def jackknife_sigma(names: tuple[str, ...] = FITTED, model: MotionModel = VAULTBOT) -> FloatArray:
     """(c,) standard deviations from what the fit becomes without one row: the larger of rows of constant x_G and of constant y_G.
 
     Errors within a row are alike, so this is up to twice `GridFit.sigma`, and the honest one.
@@ -132,12 +138,12 @@ def jackknife_sigma(names: tuple[str, ...] = FITTED) -> FloatArray:
     spread = []
     for axis in (0, 1):
         rows = np.unique(table.cg[:, axis])
-        values = np.array([fit(names, table.cg[keep], seen[keep]).values for keep in (table.cg[:, axis] != at for at in rows)])
+        values = np.array([fit(names, table.cg[keep], seen[keep], model).values for keep in (table.cg[:, axis] != at for at in rows)])
         spread.append(np.sqrt((len(rows) - 1) * values.var(axis=0)))
     return np.max(spread, axis=0)
 
 
-def left_out(names: tuple[str, ...] | None, axis: int) -> Errors:
+def left_out(names: tuple[str, ...] | None, axis: int, model: MotionModel = VAULTBOT) -> Errors:
     """Errors in rows of constant x_G (``axis`` 0) or y_G (1), each predicted from the other rows.
 
     By the friction model with ``names`` fitted, or by the heuristic with its eleven coefficients where ``names`` is None.
@@ -152,7 +158,7 @@ def left_out(names: tuple[str, ...] | None, axis: int) -> Errors:
             k, x_cr, y_cr = SkidSteer(1.0, 1.0, coefficients).rotation(table.cg[out], coefficients)
             value = np.stack([1.875 * k, x_cr, y_cr], axis=-1)
         else:
-            value, _ = predict(table.cg[out], fit(names, table.cg[~out], seen[~out]).params)
+            value, _ = predict(table.cg[out], fit(names, table.cg[~out], seen[~out], model).params, model)
         errors[out] = value - seen[out]
     return Errors.of(errors)
 

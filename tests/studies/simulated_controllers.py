@@ -91,9 +91,9 @@ def main() -> None:
         cells = [f"{which} {100 * row.gain(which):+4.0f} % ({row.wins(which)}/7)" for which in ("simulated", "measured")]
         print(f"{row.trajectory:8} {', '.join(cells)}")
     print(
-        "\nWhere it differs: on gentle arcs (arc_1, 2, 4) both controllers of the simulated robot err two to three times as much as the "
-        "real ones:\nthe friction law takes a quarter off k there, and the real floor took less. On the s-curve the simulated robot "
-        "follows its command\nbetter (drive error), while its odometry errs about as much as the real one's (vision error)."
+        "\nOn gentle arcs (arc_1, 2, 4) the simulated robot errs about as much as the real one; with the thesis's contact law "
+        '(contact = "thesis")\nit errs two to three times as much, as that takes a quarter off k. Where it differs: on the s-curve the '
+        "simulated robot follows its\ncommand better (drive error), and the heuristic's odometry errs half as much as the real one's."
     )
 
 

@@ -17,7 +17,7 @@ from localization.simulate.scanners import ScannerConfig
 from localization.simulate.simulator import SimulationConfig, simulate, write_simulation
 from localization.simulate.suite import SensorConfig
 from localization.simulate.vehicle import Body, VehicleConfig, VehicleState, advance
-from motion_models.friction_dynamics import FrictionDynamics
+from motion_models.friction.dynamics import FrictionDynamics
 from motion_models.robot import load_robot
 from motion_models.se2 import FloatArray
 

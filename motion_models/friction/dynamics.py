@@ -1,7 +1,8 @@
 """The dynamic form of Ebersole 2016, Ch. 3 (eqs. 3.15-3.26, signs mended): accelerations of a skidding robot, for simulation.
 
-Where `friction` asks which motion the wheels settle to, this asks how the robot gets there: with mass, inertia, a CG that arms move, load
-that shifts under acceleration, and a force from outside. Its resting point at constant wheel rates is `friction`'s twist.
+Where `model` asks which motion the wheels settle to, this asks how the robot gets there: with mass, inertia, a CG that arms move, load
+that shifts under acceleration, and a force from outside. Its resting point at constant wheel rates is the model's twist, with the
+centripetal force; for a CG on the floor it is so exactly.
 
 Mended against the thesis: (3.17, 3.24) rolling resistance opposes the wheel's rolling; (3.25) m a_y has the sign of (3.24)'s;
 Appendix A's y_ddot_G_B has the signs of (3.19), and its inertia squares 0.43.
@@ -16,9 +17,9 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from motion_models.friction import FrictionModel, check_parameters, floor_of
-from motion_models.friction_kernel import CREEP, contact, loads, rolling, traction
-from motion_models.friction_solve import Floor
+from motion_models.friction.contact import CREEP, contact, loads, rolling
+from motion_models.friction.equilibrium import Floor
+from motion_models.friction.model import GRAVITY, FrictionModel, check_parameters, floor_of
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -71,7 +72,9 @@ class FrictionDynamics:
     """Yaw inertia about the CG [kg m^2]."""
     cg_height: float
     """z_G above the floor [m]."""
-    gravity: float = 9.81
+    saturation: float = 0.0
+    """Contact law, as `FrictionModel.saturation`."""
+    gravity: float = GRAVITY
     """[m/s^2]"""
     creep: float = CREEP
     """Slip at which friction is fully there, as a fraction of the wheels' speed. Ten times the creep allows ten times as long steps."""
@@ -83,12 +86,14 @@ class FrictionDynamics:
         """The robot's friction parameters and mass; its inertia is the thesis's per mass unless given [kg m^2]."""
         g = robot.geometry
         inertia = g.mass_kg * _THESIS_GYRATION_SQUARED if inertia is None else inertia
-        return cls(FrictionModel.from_robot(robot).nominal, g.mass_kg, inertia, g.cg_height_m)
+        model = FrictionModel.from_robot(robot)
+        return cls(model.nominal, g.mass_kg, inertia, g.cg_height_m, model.saturation)
 
     def longest_step(self, speed: float) -> float:
         """Step [s] beyond which Runge-Kutta may become unstable while the wheels roll at ``speed`` [m/s] or more.
 
-        A wheel without slip resists as stiffly as mu m g / (creep speed) against motion, and with its lever arm against the turn.
+        A wheel without slip resists as stiffly as mu m g / (creep speed) against motion, and with its lever arm against the turn. Under the
+        isotropic law that holds only for wheels that stand still: where all roll, a step 1 / (creep slip_stiffness) as long is stable.
         """
         mu, track, wheelbase = self.params[3] * max(1.0, self.params[4]), self.params[1], self.params[2]
         lever = max(1.0, self.mass * (track**2 + wheelbase**2) / 4.0 / self.inertia)
@@ -102,7 +107,7 @@ class FrictionDynamics:
         """
         check_parameters(influence.cg, self.params)
         state = np.array([0.0, 0.0, 0.0, *twist])
-        ax, ay, aw, margin = _accelerations(state, wheels[0], wheels[1], self._influence(influence), floor_of(self.params), self._body())
+        ax, ay, aw, margin = _accelerations(state, wheels[0], wheels[1], self._influence(influence), self._floor(), self._body())
         return np.array([ax, ay, aw]), margin
 
     def advance(self, state: FloatArray, dt: float, steps: int, wheels: FloatArray, influence: Influence) -> tuple[FloatArray, float]:
@@ -112,8 +117,11 @@ class FrictionDynamics:
         """
         check_parameters(influence.cg, self.params)
         after = np.array(state, dtype=np.float64)
-        margin = _advance(after, dt, steps, wheels[0], wheels[1], self._influence(influence), floor_of(self.params), self._body())
+        margin = _advance(after, dt, steps, wheels[0], wheels[1], self._influence(influence), self._floor(), self._body())
         return after, margin
+
+    def _floor(self) -> Floor:
+        return floor_of(self.params, self.saturation)
 
     def _body(self) -> _Body:
         mu, warp, radius = float(self.params[3]), float(self.params[8]), float(self.params[0])
@@ -142,12 +150,11 @@ def _accelerations(
         sign_y, roll = (1.0, radius * q_l / speed) if left else (-1.0, radius * q_r / speed)
         y = sign_y * floor.half_track
         slip = vx - y * wz - roll
-        taken, by_slip, _, _ = traction(slip, roll, floor.slip_stiffness, creep)
         for ahead in (True, False):
             sign_x = 1.0 if ahead else -1.0
             x = sign_x * floor.half_wheelbase
-            fx, fy, _, _, _, _ = contact(slip, vy + x * wz, taken, by_slip, floor.side, floor.tread, creep)
-            fx -= floor.drag * rolling(roll)[0]  # 3.17
+            f = contact(slip, vy + x * wz, roll, floor.tyre, creep)
+            fx, fy = f.x - floor.drag * rolling(roll)[0], f.y  # 3.17
             m = (x - x_g) * fy - (y - y_g) * fx
             x_0, x_xi, x_eta, x_t = x_0 + fx, x_xi + sign_x * fx, x_eta + sign_y * fx, x_t + sign_x * sign_y * fx
             y_0, y_xi, y_eta, y_t = y_0 + fy, y_xi + sign_x * fy, y_eta + sign_y * fy, y_t + sign_x * sign_y * fy

@@ -1,4 +1,4 @@
-"""The friction model as an estimator corrects it: its CG may be off, and what is believed of it stays what a robot can be."""
+"""The friction model as an estimator corrects it: with an offset of its CG, and estimates held to what a robot can have."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from motion_models.base import Twist
-from motion_models.friction import FrictionModel, check_parameters
+from motion_models.friction.model import FrictionModel, check_parameters
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -20,9 +20,9 @@ _EDGE = 0.98  # of the way to where the robot tips over
 
 @dataclass(frozen=True)
 class CorrectedFriction:
-    """`FrictionModel` with two more parameters, cg_offset_x and cg_offset_y [m]: how far the CG is from where it is said to be.
+    """`FrictionModel` with two more parameters, cg_offset_x and cg_offset_y [m]: how far the CG is from where it is given.
 
-    A belief may wander to where no robot is, before better is known: it is held at the edge, where its derivative is zero.
+    An estimate may move to where no robot is: it is held at the edge, where its derivative is zero.
     """
 
     inner: FrictionModel
@@ -31,7 +31,7 @@ class CorrectedFriction:
 
     @classmethod
     def from_robot(cls, robot: Robot) -> CorrectedFriction:
-        """`FrictionModel.from_robot`, the CG where it is said to be."""
+        """`FrictionModel.from_robot`, the CG where it is given."""
         return cls(FrictionModel.from_robot(robot))
 
     @property
