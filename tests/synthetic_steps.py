@@ -1,7 +1,7 @@
 """Steps from an independent generator: a true robot whose parameters, noise and sensors are drawn from what the estimators believe.
 
 Nothing here uses the estimators' own prediction: the truth is composed from small intervals with slip drawn in each, and what a Step says
-comes from `Stepper`'s own parts (`integrate_twists`) at the parameters that the estimator hands back.
+comes from `Synchronizer`'s own parts (`integrate_twists`) at the parameters that the estimator hands back.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from localization.estimators.base import Estimator
 from localization.estimators.witness import Sight
 from localization.events import Scan
 from localization.gyro import Turn
-from localization.steps import Step
+from localization.synchronizer import Step
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.corrections import Corrections
@@ -129,7 +129,7 @@ class World:
     def step(self, params: np.ndarray, clock_offset: float) -> tuple[Step, Motion]:
         """The next step as an estimator with these beliefs would be given it, and the LiDAR's motion."""
         rng, noise = self.rng, self.noise
-        # the wheels' stamps are early by the offset: what really happens at t stands in the log at t + clock (as Stepper reads it)
+        # the wheels' stamps are early by the offset: what really happens at t stands in the log at t + clock (as Synchronizer reads it)
         dt, rates, cg = self._rates(self.t)
         true_params = self.model.nominal + self.corrected.directions @ self.correction
         twists = self.model.twist(rates, cg, true_params).value

@@ -21,7 +21,7 @@ from localization.events import Scan, WheelSample
 from localization.gyro import Turn
 from localization.lidar import MapTie, Registration
 from localization.residuals import motion_residual, turn_residual
-from localization.steps import Step, Stepper, steps
+from localization.synchronizer import Step, Synchronizer, steps
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.corrections import corrections
@@ -44,7 +44,7 @@ def scan_at(t):
 
 def drive(seconds, turned, clock=0.0, params=None, hz=20.0):
     """Steps of 0.1 s from the stepper itself, for wheel angles ``turned(t)``."""
-    cutter = Stepper(MODEL, ROBOT, {}, True)
+    cutter = Synchronizer(MODEL, ROBOT, {}, True)
     cutter.clock_offset_s = clock
     cutter.params = MODEL.nominal if params is None else params
     wheels = [

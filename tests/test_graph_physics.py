@@ -15,7 +15,7 @@ from localization.estimators.ekf import EkfConfig
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.online.core import Core, Pair
-from localization.steps import Step
+from localization.synchronizer import Step
 from motion_models.base import Motion
 from motion_models.corrections import check_forms, correctable, corrections
 from motion_models.errors import CgError, ModelError
