@@ -347,7 +347,7 @@ def test_velocity_without_wheels_may_be_as_large_as_the_last_one():
 def test_step_of_a_sweep_ends_at_its_middle():
     sweeps = [Scan(T0 + 100 * i * MS, np.ones((3, 3)), np.array([0.0, 0.02, 0.06])) for i in range(1, 15)]
     found, _ = cut(in_order(wheels(2.0), sweeps))
-    assert [s.end_ns for s in found] == [scan.stamp_ns + 30 * MS for scan in sweeps]
+    assert [s.end_ns for s in found if s.scan is not None] == [scan.stamp_ns + 30 * MS for scan in sweeps]
 
 
 def test_sweep_waits_for_wheels_until_its_middle():
