@@ -106,6 +106,21 @@ class ImuSample:
 
 
 @dataclass(frozen=True)
+class PositionSample:
+    """A position by a source that is to be fused, as GPS, in a plane of its own."""
+
+    stamp_ns: int
+    position: FloatArray
+    """(2,) east, north [m]."""
+    covariance: FloatArray
+    """(2, 2) [m^2]."""
+
+    def __post_init__(self) -> None:
+        _check_finite(self, "position", (2,))
+        _check_finite(self, "covariance", (2, 2))
+
+
+@dataclass(frozen=True)
 class Reference:
     """Where a trusted source says the robot is. Used to score, never to estimate."""
 
@@ -118,7 +133,7 @@ class Reference:
     """(3, 3) of x, y, yaw [m, m, rad]; NaN where unknown."""
 
 
-Event = WheelSample | CgSample | Scan | ImuSample | Reference
+Event = WheelSample | CgSample | Scan | ImuSample | PositionSample | Reference
 
 
 def _check_shape(event: Event, name: str, shape: tuple[int, ...]) -> None:

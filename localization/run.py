@@ -76,7 +76,7 @@ class _Lane:
 
     def __init__(self, pair: Pair, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig) -> None:
         self._pair, self._records = pair, Records()
-        self._core = Core(pair, robot, mounts, has_lidar, config, hindsight=True)
+        self._core = Core(pair, robot, mounts, has_lidar, config, is_smoothing=True)
         self._seconds = 0.0
 
     def push(self, event: Event) -> None:

@@ -55,7 +55,7 @@ class Settings:
 
 def check_settings(settings: object) -> None:
     """Raises `SettingError` naming the first number of the dataclass ``settings`` that is not what it may be."""
-    rules = _rules(type(settings))
+    rules = rules_of(type(settings))
     numbers = {name: value for name in rules if isinstance(value := getattr(settings, name), Real)}
     for name, value in numbers.items():
         allowed = next((rule for rule in rules[name] if isinstance(rule, Allowed)), _NOT_NEGATIVE)
@@ -74,7 +74,7 @@ def _refusal(settings: object, name: str, wanted: str) -> SettingError:
     return SettingError(f"setting {name} of {type(settings).__name__} is {getattr(settings, name):g}; it must be {wanted}.")
 
 
-def _rules(kind: type) -> Mapping[str, tuple[Any, ...]]:
+def rules_of(kind: type) -> Mapping[str, tuple[Any, ...]]:
     """Of each field, what it is annotated with."""
     hints = get_type_hints(kind, include_extras=True)
     return {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}

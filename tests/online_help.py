@@ -20,6 +20,7 @@ from localization.logs import open_log
 from localization.logs.source import open_source
 from localization.online.core import Core, Pair
 from localization.online.files import Files
+from localization.online.names import Names
 from localization.online.node import Node, NodeConfig
 from localization.online.tell import DIAGNOSTICS, ODOMETRY, TF
 from localization.online.transport import Received
@@ -126,7 +127,9 @@ class LogTransport:
         self.is_closed = True
 
 
-def run_node(transport: LogTransport, estimator: str = "ekf", files: Files | None = None, **options) -> tuple[Node, list[str]]:
+def run_node(
+    transport: LogTransport, estimator: str = "ekf", files: Files | None = None, config: NodeConfig | None = None, **options
+) -> tuple[Node, list[str]]:
     """A node over all that ``transport`` holds, and what it told."""
     told: list[str] = []
     node = Node.start(
@@ -135,7 +138,7 @@ def run_node(transport: LogTransport, estimator: str = "ekf", files: Files | Non
         lambda has_lidar: Pair(make_model("skid_steer", ROBOT), estimator),
         files or Files(),
         told.append,
-        node=NodeConfig(wait_s=0.0),
+        node=config or NodeConfig(wait_s=0.0),
         **options,
     )
     node.spin(transport.is_empty)
@@ -152,7 +155,9 @@ def reseal(state: Path, name: str, value: object) -> None:
 def published(transport: LogTransport, topic: str) -> list:
     store = get_typestore(Stores.ROS2_HUMBLE)
     kinds = {ODOMETRY: "nav_msgs/msg/Odometry", TF: "tf2_msgs/msg/TFMessage", DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray"}
-    return [store.deserialize_cdr(data, kinds.get(topic, "sensor_msgs/msg/JointState")) for data in transport.published[topic]]
+    return [
+        store.deserialize_cdr(data, kinds.get(topic, "sensor_msgs/msg/JointState")) for data in transport.published[Names().resolve(topic)]
+    ]
 
 
 def stamp_of(message) -> int:

@@ -11,17 +11,21 @@ import types
 
 import numpy as np
 import pytest
+from rosbags.typesys import Stores, get_typestore
 
-from localization.errors import DoorError, DumpError, TopicError
+from localization.errors import DoorError, DumpError, SettingError, TopicError
 from localization.events import Scan, WheelSample
 from localization.logs import TopicOverrides, open_log
+from localization.logs.fused import FusedEstimate, transform_message
 from localization.logs.wire import encode
 from localization.online.dump import Dumper, read_head
 from localization.online.files import Files
 from localization.online.health import ERROR, OK, WARN, degeneracy
+from localization.online.names import Names
 from localization.online.node import Node, NodeConfig
 from localization.online.pace import Pace
-from localization.online.tell import CORRECTIONS, DIAGNOSTICS, ODOMETRY, TF
+from localization.online.tell import CORRECTIONS, DIAGNOSTICS, ODOMETRY, TF, Frames
+from localization.online.transport import Received
 from localization.run import Pair, replay
 from localization.trajectory import read_tum
 from motion_models import se2
@@ -88,7 +92,14 @@ def test_what_is_published(calm):
     assert len(corrections.position) == len(corrections.effort) == len(corrections.name)
     assert (corrections.effort > 0.0).all()
     statuses = {s.name: s for s in published(transport, DIAGNOSTICS)[-1].status}
-    assert set(statuses) == {"skidloc: estimate", "skidloc: lidar", "skidloc: wheels", "skidloc: files", "skidloc: messages"}
+    assert set(statuses) == {
+        "skidloc: estimate",
+        "skidloc: lidar",
+        "skidloc: wheels",
+        "skidloc: files",
+        "skidloc: messages",
+        "skidloc: transforms",
+    }
     values = {v.key: v.value for v in statuses["skidloc: lidar"].values}
     assert {"degeneracy", "nis_mean", "contradictions"} <= set(values)
     assert float(values["degeneracy"]) > 0.2
@@ -100,7 +111,7 @@ def test_subscriptions_are_of_sensor_data_but_for_static_transforms(calm):
     subscribed = calm[0].subscribed
     assert [topic for topic, is_latched in subscribed.items() if is_latched] == ["/tf_static"]
     assert {"/joint_states", "/scan", "/points", "/imu/data", "/center_of_gravity"} <= set(subscribed)
-    assert calm[0].kept == {"/joint_states", "/scan", "/imu/data", "/tf_static"}  # what is not used costs nothing from the start on
+    assert calm[0].kept == {"/joint_states", "/scan", "/imu/data", "/tf_static", "/tf"}  # what is not used costs nothing from the start on
 
 
 @pytest.mark.parametrize(("estimator", "seed"), [("ekf", 0), ("ekf", 1), ("graph", 2)])
@@ -437,6 +448,78 @@ def test_a_state_of_another_time_is_refused(tmp_path):
         (tmp_path / "state").unlink()
 
 
+def with_transform(parent, child):
+    """Another node publishes this transform on /tf, from the middle of the drive on."""
+    tf = transform_message(FusedEstimate(1, np.zeros(3), np.zeros(3)))
+    tf.transforms[0].header.frame_id, tf.transforms[0].child_frame_id = parent, child
+
+    def spoil(messages):
+        late = messages[len(messages) // 2 :]
+        return sorted([*messages, *(Received("/tf", m.received_ns, encode(tf)) for m in late[::50])], key=lambda m: m.received_ns)
+
+    return spoil
+
+
+def test_node_reports_another_publisher_of_its_transform():
+    transport = LogTransport(drive_log(), with_transform("odom", "base_link"), {"/tf": "tf2_msgs/msg/TFMessage"})
+    node, told = run_node(transport)
+    sentences = [said for said in told if "another node publishes 'odom' -> 'base_link' on /tf" in said]
+    assert len(sentences) == 1
+    assert "--node.no-tf" in sentences[0]
+    node._tell()
+    status = next(s for s in published(transport, DIAGNOSTICS)[-1].status if s.name == "skidloc: transforms")
+    assert status.level == ERROR
+    assert "enable_odom_tf" in status.message
+
+
+def test_node_accepts_other_transforms_and_without_tf_any():
+    for parent, child, config in (("map", "odom", None), ("odom", "base_link", NodeConfig(wait_s=0.0, tf=False))):
+        transport = LogTransport(drive_log(), with_transform(parent, child), {"/tf": "tf2_msgs/msg/TFMessage"})
+        _, told = run_node(transport, config=config)
+        assert not [said for said in told if "another node" in said]
+
+
+def test_names_and_frames_are_used_for_all_that_is_published():
+    """In a namespace, with a remapped scan: other topics and frames, the same estimates."""
+    names = Names("rover", "/team", ("scan:=/front/scan", "~/odometry:=odom"))
+    config = NodeConfig(wait_s=0.0, names=names, frames=Frames("team_odom", "team_base"))
+    transport = LogTransport(drive_log(), lambda messages: [m._replace(topic=renamed(m.topic)) for m in messages])
+    transport.types = {renamed(topic): kind for topic, kind in transport.types.items()}
+    node, told = run_node(transport, config=config)
+    assert set(transport.published) == {"/team/odom", "/team/rover/corrections", "/tf", "/diagnostics"}
+    assert set(node.topics) == {"/team/joint_states", "/front/scan", "/team/imu/data"}
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    odometry = store.deserialize_cdr(transport.published["/team/odom"][-1], "nav_msgs/msg/Odometry")
+    (tf,) = store.deserialize_cdr(transport.published["/tf"][-1], "tf2_msgs/msg/TFMessage").transforms
+    assert (odometry.header.frame_id, odometry.child_frame_id) == (tf.header.frame_id, tf.child_frame_id) == ("team_odom", "team_base")
+    assert [said for said in told if "base_link_frame 'team_base' is not on /tf_static" in said]
+    calm = undisturbed("ekf")[0]
+    assert odometry.pose.pose.position == published(calm, ODOMETRY)[-1].pose.pose.position
+
+
+def renamed(topic):
+    return "/front/scan" if topic == "/scan" else topic if topic.startswith("/tf") else f"/team{topic}"
+
+
+@pytest.mark.parametrize(
+    ("settings", "error"),
+    [
+        ({"name": "sk id"}, "the node's name is 'sk id'"),
+        ({"namespace": "team"}, "it must begin with '/'"),
+        ({"remap": ("scan=front",)}, "FROM:=TO"),
+    ],
+)
+def test_names_that_ros_refuses_are_refused(settings, error):
+    with pytest.raises(SettingError, match=error):
+        Names(**settings)
+
+
+@pytest.mark.parametrize("frames", [("", "base_link"), ("/odom", "base_link"), ("odom", "odom")])
+def test_frames_that_tf2_refuses_are_refused(frames):
+    with pytest.raises(SettingError, match="odom_frame"):
+        Frames(*frames)
+
+
 def test_pace_keeps_the_logs_time_and_skips_its_pauses():
     now, slept = [100.0], []
 
@@ -471,12 +554,24 @@ class _FakeRclpy(types.ModuleType):
         super().__init__("rclpy")
         self.subscriptions, self.sent, self.waiting = {}, [], []
 
-    def init(self, args=None): ...
+    def init(self, args=None, signal_handler_options=None):
+        self.handlers = signal_handler_options
 
     def try_shutdown(self): ...
 
-    def create_node(self, name):
+    def create_node(self, name, namespace):
         return self
+
+    def get_name(self):
+        return "skidloc"
+
+    def get_namespace(self):
+        return "/"
+
+    def get_topic_names_and_types(self):
+        return [("/scan", ["sensor_msgs/msg/LaserScan"]), ("/points", ["sensor_msgs/msg/PointCloud2"])]
+
+    def destroy_publisher(self, publisher): ...
 
     def destroy_node(self): ...
 
@@ -492,22 +587,38 @@ class _FakeRclpy(types.ModuleType):
         return types.SimpleNamespace(publish=lambda data: self.sent.append((topic, data)))
 
     def get_publishers_info_by_topic(self, topic):
-        return [types.SimpleNamespace(topic_type="sensor_msgs/msg/LaserScan")]
+        found = types.SimpleNamespace(topic_type="sensor_msgs/msg/LaserScan", node_name="robot", node_namespace="/")
+        return [found] if topic == "/scan" else []
 
-    def spin_once(self, node, timeout_sec):
+    def add_node(self, node): ...
+
+    def remove_node(self, node): ...
+
+    def shutdown(self): ...
+
+    def spin_once(self, timeout_sec):
         if self.waiting:
             topic, data = self.waiting.pop(0)
             self.subscriptions[topic][1](data)
 
 
 def test_rclpy_door_by_its_documented_interface(monkeypatch):
-    fake, quality = _FakeRclpy(), types.ModuleType("rclpy.qos")
+    fake, quality, signals, executors = _FakeRclpy(), *(types.ModuleType(f"rclpy.{name}") for name in ("qos", "signals", "executors"))
+    signals.SignalHandlerOptions = types.SimpleNamespace(NO="none")
+    executors.SingleThreadedExecutor = lambda: fake
     quality.QoSProfile = lambda **fields: types.SimpleNamespace(**fields)
     quality.ReliabilityPolicy = types.SimpleNamespace(RELIABLE="reliable", BEST_EFFORT="best effort")
     quality.DurabilityPolicy = types.SimpleNamespace(TRANSIENT_LOCAL="transient local", VOLATILE="volatile")
-    for name, module in {"rclpy": fake, "rclpy.qos": quality}.items():
+    for name, module in {"rclpy": fake, "rclpy.qos": quality, "rclpy.signals": signals, "rclpy.executors": executors}.items():
         monkeypatch.setitem(sys.modules, name, module)
-    for package, kinds in {"sensor_msgs": ["LaserScan"], "tf2_msgs": ["TFMessage"], "nav_msgs": ["Odometry"]}.items():
+    packages = {
+        "sensor_msgs": ["LaserScan"],
+        "tf2_msgs": ["TFMessage"],
+        "nav_msgs": ["Odometry"],
+        "geometry_msgs": [],
+        "diagnostic_msgs": [],
+    }
+    for package, kinds in packages.items():
         messages = types.ModuleType(f"{package}.msg")
         for kind in kinds:
             setattr(messages, kind, type(kind, (), {}))
@@ -525,7 +636,8 @@ def test_rclpy_door_by_its_documented_interface(monkeypatch):
     assert [(r.topic, r.data) for r in transport.take(0.1)] == [("/scan", b"one"), ("/tf_static", b"two")]
     transport.publish("/skidloc/odometry", b"three")
     assert fake.sent == [("/skidloc/odometry", b"three")]
-    assert transport.publishers()["/scan"] == {"sensor_msgs/msg/LaserScan"}
+    assert transport.publishers() == {"/scan": {"sensor_msgs/msg/LaserScan"}}  # /points has no publisher
     transport.keep(["/scan"])
-    assert set(fake.subscriptions) == set(transport.publishers()) == {"/scan"}
+    assert set(fake.subscriptions) == {"/scan"}
+    assert fake.handlers == "none"  # Ctrl-C is the command's
     transport.close()

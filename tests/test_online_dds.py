@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,7 +17,9 @@ import numpy as np
 import pytest
 
 from localization.cli import main
+from localization.errors import DoorError
 from localization.logs import open_log
+from localization.online.dds_settings import choose_interface, configuration, default_domain
 from localization.run import Pair, replay
 from localization.trajectory import read_tum
 from motion_models.registry import make_model
@@ -111,7 +114,9 @@ def test_a_robot_in_another_process_is_followed_killed_and_followed_on(tmp_path)
     assert "k_0" in names
     assert len(names) == len(means) == len(sigmas)
     last = heard["diagnostics"][-2]
-    assert {"skidloc: estimate", "skidloc: lidar", "skidloc: wheels", "skidloc: files", "skidloc: messages"} == set(last)
+    assert {"skidloc: estimate", "skidloc: lidar", "skidloc: wheels", "skidloc: files", "skidloc: messages", "skidloc: transforms"} == set(
+        last
+    )
     assert float(last["skidloc: lidar"]["degeneracy"]) > 0.1
     assert float(last["skidloc: lidar"]["nis_mean"]) < 8.0
     # and the whole way is in one file
@@ -139,7 +144,6 @@ def test_who_hears_nobody_is_told_where_it_listens(monkeypatch, capsys):
         monkeypatch.setenv("ROS_DOMAIN_ID", bad)
         assert main(["online", "--robot", "vaultbot", "--door", "dds"]) == 2
         assert f"ROS_DOMAIN_ID is '{bad}'; ROS 2's domains are the numbers 0 to 230." in capsys.readouterr().err
-    default_domain = importlib.import_module("localization.online.dds").default_domain
     for domain in (0, 230):
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
         assert default_domain() == domain
@@ -235,10 +239,101 @@ def test_patience_ends_where_something_urgent_comes():
         assert any({received.topic for received in found} == {"/a"} for found in alone)
 
 
+@pytest.mark.parametrize(
+    ("interface", "environment", "chosen"),
+    [
+        (None, {}, "lo"),
+        ("lo", {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, "lo"),
+        ("localhost", {}, "lo"),
+        ("127.0.0.1", {}, "lo"),
+        ("default", {}, "default"),
+        ("192.0.2.7", {"ROS_LOCALHOST_ONLY": "1"}, "192.0.2.7"),
+        *((i, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, "lo") for i in (None, "default")),
+        *((i, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "subnet"}, "default") for i in (None, "default")),
+        (None, {"ROS_LOCALHOST_ONLY": "0"}, "lo"),
+        ("default", {"ROS_LOCALHOST_ONLY": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, "lo"),
+    ],
+)
+def test_choose_interface_follows_the_option_then_ros_variables(interface, environment, chosen):
+    assert choose_interface(interface, environment) == chosen
+
+
+@pytest.mark.parametrize(
+    ("interface", "environment", "error"),
+    [
+        ("etho", {}, "there are lo"),
+        ("localhots", {}, "Did you mean 'localhost'?"),
+        (None, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOSTS"}, "Did you mean LOCALHOST?"),
+        ("default", {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, "no topic can be discovered"),
+    ],
+)
+def test_choose_interface_refuses_what_does_not_exist(interface, environment, error):
+    with pytest.raises(DoorError, match=re.escape(error)):
+        choose_interface(interface, environment)
+
+
+def test_configuration_of_default_ends_with_the_users():
+    environment = {"CYCLONEDDS_URI": "file:///etc/cyclone.xml", "ROS_STATIC_PEERS": "192.0.2.9; robot.local"}
+    fragments = configuration("default", environment).split(",")
+    assert fragments[1:] == ["file:///etc/cyclone.xml"]
+    for peer in ("localhost", "192.0.2.9", "robot.local"):
+        assert f'<Peer address="{peer}"/>' in fragments[0]
+    for interface in ("default", "lo", "192.0.2.7"):
+        assert "<IgnoreTypeInformation>1.15</IgnoreTypeInformation>" in configuration(interface, environment)
+    assert "cyclone.xml" not in configuration("lo", environment)
+
+
+def test_publishers_of_a_participant_that_left_are_gone():
+    """A sample of an instance without a publisher holds its key alone, no names."""
+    with chatter("a") as here:
+        assert "/a" in here.publishers()
+        with chatter("b", here):
+            assert {"/a", "/b"} <= set(here.publishers())
+        end = time.monotonic() + 15.0  # it was killed: its lease of 10 s has to end
+        while "/b" in here.publishers():
+            assert time.monotonic() < end
+            time.sleep(0.1)
+        assert "/a" in here.publishers()
+
+
+def test_node_and_type_hashes_are_published_as_by_ros2():
+    """Received by a peer whose types are written out by hand."""
+    here = importlib.import_module("localization.online.dds").DdsTransport(DOMAIN, name="rover", namespace="/team")
+    here.subscribe("/scan", "sensor_msgs/msg/LaserScan", is_latched=False)
+    here.advertise("/odometry", "nav_msgs/msg/Odometry")
+    code = (
+        "import json, sys, time\n"
+        "from cyclonedds.builtin import *\n"
+        "from tests.dds_peer import *\n"
+        "d = Domain(int(sys.argv[1]), XML); p = DomainParticipant(int(sys.argv[1]))\n"
+        "r = DataReader(p, Topic(p, 'ros_discovery_info', ParticipantEntitiesInfo), LATCHED)\n"
+        "b = [BuiltinDataReader(p, t) for t in (BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription, BuiltinTopicDcpsParticipant)]\n"
+        "time.sleep(3)\n"
+        "info = [s for s in r.take(9)][-1]; node = info.node_entities_info_seq[0]\n"
+        "def data(s): return (s.qos[Policy.Userdata] or Policy.Userdata(b'')).data.decode()\n"
+        "ends = [(s.topic_name, data(s), list(s.key.bytes)) for q in b[:2] for s in q.read(99)]\n"
+        "said = [data(s) for s in b[2].read(9)]\n"
+        "gids = [[list(g.data) for g in seq] for seq in (node.writer_gid_seq, node.reader_gid_seq)]\n"
+        "print(json.dumps([node.node_namespace, node.node_name, gids, ends, said]))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(DOMAIN)], capture_output=True, text=True, cwd=Path(__file__).parents[1], timeout=60
+    )
+    here.close()
+    assert done.returncode == 0, done.stderr
+    namespace, name, (writers, readers), ends, participants = json.loads(done.stdout)
+    assert (namespace, name) == ("/team", "rover")
+    found = {topic: (data, gid) for topic, data, gid in ends if topic.startswith("rt/")}
+    # ROS 2's own hashes, as its message packages ship them
+    assert found["rt/scan"] == ("typehash=RIHS01_64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828;", readers[0])
+    assert found["rt/odometry"] == ("typehash=RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0;", writers[0])
+    assert "enclave=/;" in participants
+
+
 @contextlib.contextmanager
-def chatter(names):
-    """A transport that hears the topics of these names from another process, one message every 5 ms, each saying its name."""
-    here = importlib.import_module("localization.online.dds").DdsTransport(DOMAIN)
+def chatter(names, transport=None):
+    """A transport that receives the topics of these names from another process, one message every 5 ms, each with its name."""
+    here = transport or importlib.import_module("localization.online.dds").DdsTransport(DOMAIN)
     code = (
         "import sys, time\n"
         "from localization.online.dds import DdsTransport\n"
@@ -261,12 +356,13 @@ def chatter(names):
     finally:
         peer.kill()
         peer.wait()
-        here.close()
+        if transport is None:
+            here.close()
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
-    [(["--domain", "999"], "the domain is 999"), (["--interface", "no_such_device", "--domain", "98"], "interface 'no_such_device'")],
+    [(["--domain", "999"], "the domain is 999"), (["--interface", "no_such_device"], "interface 'no_such_device'")],
 )
 def test_bad_domains_and_interfaces_are_explained(arguments, said, capsys):
     assert main(["online", "--robot", "vaultbot", "--door", "dds", *arguments]) == 2

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import math
-import signal
-import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from types import FrameType
-from typing import Any, Literal, NoReturn
+from typing import Literal, NoReturn
 
 import tyro
 from rich.console import Console
@@ -20,19 +17,19 @@ from rich.live import Live
 from rich.markup import escape
 
 from localization.commands.online_line import live_line
+from localization.commands.online_terminal import terminal_view
 from localization.errors import DumpError, OutputError
-from localization.estimators import check_estimator
 from localization.events import Event
-from localization.logs import TopicOverrides, open_log
-from localization.online.core import Core, Pair, ReplayConfig
+from localization.logs import open_log
+from localization.online.core import Core
 from localization.online.files import Files
-from localization.online.node import Node, NodeConfig
+from localization.online.node import Node
 from localization.online.pace import Pace
 from localization.online.session import Session, View, made_by
+from localization.online.settings import OnlineSettings
+from localization.online.stop import Stop
 from localization.online.transport import Transport
 from localization.provenance import fingerprint
-from motion_models.corrections import check_forms
-from motion_models.registry import make_model
 from motion_models.robot import Robot, load_robot
 
 _LINE_S = 0.25
@@ -40,46 +37,28 @@ _SLOWEST = 0.001  # a second of the log in a quarter of an hour
 
 
 @dataclass(frozen=True)
-class Online:
+class Online(OnlineSettings):
     """Run one motion model and estimator live, on ROS topics or on a log as it was recorded; Ctrl-C ends it."""
 
-    robot: str
-    """Name of a shipped robot, or path of a robot TOML file."""
     log: tyro.conf.Positional[Path | None] = None
     """A log to run from, instead of live topics."""
     rate: str = "1"
     """Of the log: times as fast as it was recorded, or `max`."""
-    model: str = "skid_steer"
-    """Motion model."""
-    estimator: str = "ekf"
-    """Estimator."""
-    corrections: str = "constant"
-    """What ekf and graph learn of the motion model: none, constant or cg_field."""
-    out: Path | None = None
-    """New trajectory file, .tum, or .mcap with Odometry, TF and covariances. It gets its name at the end."""
-    state: Path | None = None
-    """File of the estimator's state, at most a second old; resumed at the start if it is there. Removed at the end of a log."""
     view: Literal["terminal", "rerun"] = "terminal"
-    """Live picture: a line in the terminal, or rerun's viewer as well (extra `viz`)."""
+    """Live picture: in the terminal, or in rerun's viewer as well (extra `viz`)."""
     view_file: Path | None = None
     """New .rrd file to record rerun's picture to, instead of opening its viewer."""
     door: Literal["auto", "dds", "rclpy", "rospy"] = "auto"
     """Of live topics: ROS 2 by DDS itself (extra `ros2`), ROS 2 by rclpy, ROS 1 by rospy. `auto`: rclpy where it is sourced, else DDS."""
     domain: int | None = None
     """ROS 2 domain (door dds); by default that of ROS_DOMAIN_ID, or 0."""
-    interface: str = "lo"
-    """Network interface or address (door dds). `lo`: this machine only, nobody else is listened to; `default`: as Cyclone DDS is set."""
-    node: NodeConfig = field(default_factory=NodeConfig)
-    topic: TopicOverrides = field(default_factory=TopicOverrides)
-    config: ReplayConfig = field(default_factory=ReplayConfig)
+    interface: str | None = None
+    """Network interface or address (door dds). `localhost`: this machine only, packets of others are dropped; `default`: what
+    ROS_LOCALHOST_ONLY and ROS_AUTOMATIC_DISCOVERY_RANGE demand, else all of the subnet. Without the option, what these variables demand,
+    else `localhost`."""
 
     def run(self, console: Console) -> None:
-        if self.state is not None and self.estimator == "graph" and self.config.estimator.graph.backend == "isam2":
-            raise DumpError(
-                f"no state can be kept in --state {self.state}: iSAM2's is GTSAM's own and cannot be written down. "
-                "Set --config.estimator.graph.backend to fixed_lag or batch, or leave --state out."
-            )
-        rate, files, robot = parse_rate(self.rate), Files(self.out, self.state), load_robot(self.robot)
+        rate, files, robot = parse_rate(self.rate), self.files(), load_robot(self.robot)
         view = self._view()
         try:
             with Stop() as stop, files.claimed():
@@ -94,7 +73,7 @@ class Online:
     def _play(self, console: Console, path: Path, rate: float, files: Files, robot: Robot, stop: Stop, view: View | None) -> None:
         log = open_log(path, robot, self.topic)
         has_lidar = log.sources.lidar is not None
-        pair = self._pair(has_lidar)
+        pair = self.make_pair(has_lidar)
         made = made_by(pair, robot, log.mounts, has_lidar, self.config, f"log {fingerprint(path)[:12]}")
         core = Core(pair, robot, log.mounts, has_lidar, self.config)
         session = Session.start(files, core, f"{pair.model.name}_{pair.estimator}", made)
@@ -118,7 +97,8 @@ class Online:
                         session.saw(event)
                     if console.is_terminal and now - shown >= _LINE_S:
                         shown, speed = now, f"  {seconds / max(now - began, 1e-9):.1f}x"
-                        live.update(live_line(session, seconds, session.health.statuses(session.core), speed), refresh=True)
+                        statuses = session.health.statuses(session.core)
+                        live.update(terminal_view(session, seconds, statuses, extra=speed), refresh=True)
             session.finish()
             count = session.write_out()
             is_done = True
@@ -150,7 +130,7 @@ class Online:
 
         transport = self._transport()
         try:
-            node = Node.start(transport, robot, self._pair, files, tell, self.topic, self.config, self.node, stop.is_set, view)
+            node = Node.start(transport, robot, self.make_pair, files, tell, self.topic, self.config, self.node, stop.is_set, view)
             said = f"running {self.model} in {self.estimator} on {', '.join(node.topics)} of {transport.place}"
             console.print(said, markup=False, soft_wrap=True)
             with Live(console=console, auto_refresh=False, transient=True) as live:
@@ -164,7 +144,7 @@ class Online:
 
     def _transport(self) -> Transport:
         """Raises `DoorError`. Each is imported only where it is wanted."""
-        door = self.door
+        door, names = self.door, self.node.names
         if door == "auto":
             door = "dds" if importlib.util.find_spec("rclpy") is None else "rclpy"
         if door == "rospy":
@@ -174,10 +154,13 @@ class Online:
         if door == "rclpy":
             from localization.online.ros2 import RclpyTransport
 
-            return RclpyTransport()
-        from localization.online.dds import DdsTransport, default_domain
+            return RclpyTransport(names.name, names.namespace)
+        from localization.online.dds import DdsTransport
+        from localization.online.dds_settings import choose_interface, default_domain
 
-        return DdsTransport(default_domain() if self.domain is None else self.domain, self.interface)
+        return DdsTransport(
+            default_domain() if self.domain is None else self.domain, choose_interface(self.interface), names.name, names.namespace
+        )
 
     def _view(self) -> View | None:
         """Raises `DoorError` and `OutputError`. Imported only where it is wanted."""
@@ -187,14 +170,9 @@ class Online:
 
         return RerunView(self.view_file)
 
-    def _pair(self, has_lidar: bool) -> Pair:
-        check_estimator(self.estimator, has_lidar)
-        (form,) = check_forms([self.corrections])
-        return Pair(make_model(self.model, load_robot(self.robot)), self.estimator, form)
-
     def _show(self, console: Console, live: Live, node: Node) -> None:
         if console.is_terminal:
-            live.update(live_line(node.session, node.seconds, node.statuses), refresh=True)
+            live.update(terminal_view(node.session, node.seconds, node.statuses, node.rates()), refresh=True)
 
     def _summarize(self, console: Console, session: Session, seconds: float, count: int | None) -> None:
         console.print(live_line(session, seconds, []), soft_wrap=True)
@@ -211,32 +189,3 @@ def parse_rate(text: str) -> float:
     if not rate >= _SLOWEST:
         raise OutputError(f"--rate is '{text}'; it must be a number from {_SLOWEST} (1 is real time), or max.")
     return rate
-
-
-class Stop:
-    """Ctrl-C, and what stops services (SIGTERM): noted, and obeyed between two events, for half an event is no state. The second
-    Ctrl-C does not wait."""
-
-    def __init__(self) -> None:
-        self._asked = threading.Event()
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> Stop:
-        self._before = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _ask(self, number: int, frame: FrameType | None) -> None:
-        if self._asked.is_set():
-            raise KeyboardInterrupt
-        self._asked.set()
-
-    def is_set(self) -> bool:
-        return self._asked.is_set()
-
-    def sleep(self, seconds: float) -> None:
-        """Until then, or until asked to stop."""
-        self._asked.wait(seconds)

@@ -24,6 +24,7 @@ from localization.events import Event
 from localization.logs import Log, TopicOverrides, open_log
 from localization.logs.fused import FusedEstimate, write_fused
 from localization.provenance import fingerprint, versions
+from localization.positions import merge_positions, position_samples
 from localization.references import ReferenceTrack, Relations, read_reference_file, reference_track
 from localization.report import ReportHead, overview_png, verdict, write_report
 from localization.run import Pair, ReplayConfig, Run, replay
@@ -58,6 +59,9 @@ class Replay:
     joined by + (the friction model's: mu_ratio, tracked_x, tracked_y, warp, cg_offset_x, cg_offset_y; as constant+cg_offset_x)."""
     reference: str | None = None
     """Topic of the log, or file (.tum, .relations), to score against; `none` for no score. Default: the robot file's topic, if any."""
+    positions: str | None = None
+    """Topic of positions (NavSatFix, poses) that `graph` is to fuse, as GPS: `/fix`. The lever arm of the antenna is
+    --config.estimator.graph.antenna-x-m and -y-m. Do not score against the same topic."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
     config: ReplayConfig = field(default_factory=ReplayConfig)
     timing: bool = False
@@ -80,11 +84,11 @@ class Replay:
             for model in models
             for form in check_forms(forms)[: None if estimator in CORRECTING else 1]
         ]
-        reference = self._reference(log)
+        reference, positions = self._reference(log), self._positions(log)
         # the LiDAR alone asks no motion model: it runs once, and counts for each
         once = [p for p in pairs if p.estimator != _WHEELLESS or p.model is models[0]]
         with _progress(console, log) as (events, on_event):
-            found = replay(events, once, robot, log.mounts, has_lidar, self.config, on_event)
+            found = replay(merge_positions(events, positions), once, robot, log.mounts, has_lidar, self.config, on_event)
         by_pair = {(p.model.name, p.estimator, p.corrections): run for p, run in zip(once, found, strict=True)}
         runs = []
         for p in pairs:
@@ -137,6 +141,13 @@ class Replay:
             raise EvaluationError(f"no reference '{name}': neither a topic of {log.path.name} nor a file. `skidloc info` lists the topics.")
         check_overlap(found, log)
         return found
+
+    def _positions(self, log: Log) -> list[PositionSample]:
+        if self.positions is None:
+            return []
+        if "graph" not in self.estimator.split(","):
+            raise EstimatorError("--positions are fused by the graph alone. Add it: --estimator odometry,ekf,graph.")
+        return position_samples(log.references(self.positions), self.positions)
 
     def _metrics(self, head: ReportHead, results: Sequence[Result]) -> dict[str, Any]:
         return {

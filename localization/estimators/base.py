@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from localization.events import PositionSample
 from localization.synchronizer import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
@@ -29,6 +30,10 @@ class Estimate:
     """(3, 3)"""
     nis: float | None = None
     """Normalised innovation squared of this step's LiDAR measurement, 3 degrees of freedom; None where there was none."""
+    odometry: tuple[FloatArray, FloatArray | None] | None = None
+    """``odom_T_body`` (3,) and its covariance (3, 3), where ``pose`` is ``map_T_body``: it never jumps."""
+    map_T_odom: FloatArray | None = None
+    """(3,) what loop closures and positions have corrected; None where ``pose`` is in the odometry frame."""
 
 
 class Estimator(Protocol):
@@ -39,6 +44,9 @@ class Estimator(Protocol):
 
     def settle(self) -> None:
         """Do what waits, if anything does; else `step` and `finish` do it first. What it finds out, the next estimate tells."""
+
+    def add_position(self, sample: PositionSample) -> None:
+        """Take a measured position; estimators without a map frame leave it out."""
 
     def finish(self, moments: Trajectory | None = None) -> Trajectory | None:
         """A trajectory that later measurements have smoothed, or None where the estimates of each moment are all there is.

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from localization.estimators.base import NO_POINTS, Estimate, mean_twist
+from localization.events import PositionSample
 from localization.synchronizer import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
@@ -31,6 +32,9 @@ class DeadReckoning:
         return Estimate(step.end_ns, self._pose, self._cov, twist, twist_cov)
 
     def settle(self) -> None:
+        return None
+
+    def add_position(self, sample: PositionSample) -> None:
         return None
 
     def finish(self, moments: Trajectory | None = None) -> None:

@@ -136,6 +136,12 @@ class Filter:
         F[KEY, KEY], F[KEY, POSE] = 0.0, np.eye(3)
         self.key, self.P = self.pose, F @ self.P @ F.T
 
+    def set_corrections(self, mean: FloatArray, cov: FloatArray) -> None:
+        """Take the corrections from an estimator that has used this filter's measurements and others: mean (k,), covariance (k, k)."""
+        self.corrections = mean
+        self.P[PARAMS:, :] = self.P[:, PARAMS:] = 0.0
+        self.P[PARAMS:, PARAMS:] = cov
+
     def map_relative_cov(self) -> FloatArray:
         """(3, 3) covariance of the pose against the submap around the robot: that of the prior of a match."""
         P = self.P

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
 from localization.estimators.base import NO_POINTS, Estimate, mean_twist
 from localization.estimators.filter import BIAS, CLOCK, PARAMS, POSE, SCALE, START, Filter, FilterConfig
-from localization.lidar import LidarConfig, LostScans, ScanMatch, ScanMatchingSensor
-from localization.settings import Positive, Settings
+from localization.events import PositionSample
+from localization.lidar import LostScans, ScanMatch, ScanMatchingSensor
 from localization.synchronizer import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion, MotionModel
 from motion_models.corrections import Corrections
-from motion_models.robot import Mount, Robot
+from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
 _MAX_STANDSTILL_M, _MAX_STANDSTILL_RAD = 0.01, 0.01
@@ -25,14 +25,6 @@ _MAX_STANDSTILL_M, _MAX_STANDSTILL_RAD = 0.01, 0.01
 _SIGMAS = 5.0
 _BLOCKED_SPEED = np.array([0.5, 0.5, 0.5])
 """Sigma of the twist where wheels read zero but the robot moves [m/s, m/s, rad/s]."""
-
-
-@dataclass(frozen=True)
-class FusionConfig:
-    """Settings of filter and scan matching."""
-
-    filter: FilterConfig = field(default_factory=FilterConfig)
-    lidar: LidarConfig = field(default_factory=LidarConfig)
 
 
 class EkfFusion:
@@ -46,6 +38,8 @@ class EkfFusion:
         self._track_m = robot.geometry.track_width_m
         self._slip = np.zeros(3)  # twist that the wheels missed in the last step
         self._has_gyro = self._is_blocked = self._is_scan_pending = False
+        self.wheel_motion, self.is_turning = Motion(np.zeros(3), np.zeros((3, 3))), True
+        """Motion of the last step by the wheels, with the covariance that the filter gave it in the end; whether it corrects the model."""
         self.counts_by_name = dict.fromkeys(("scans", "matched", "standing", "searched"), 0)
 
     @property
@@ -57,6 +51,16 @@ class EkfFusion:
         return np.asarray(self._model.nominal + self._corrections.directions @ self.filter.corrections)
 
     @property
+    def scan_points(self) -> FloatArray:
+        """(M, 2) the last scan in the body frame [m], or (0, 2)."""
+        return NO_POINTS if self._sensor is None else self._sensor.scan_points()
+
+    @property
+    def cell(self) -> float:
+        """Edge of the submap's voxels [m]; 0 before the first scan."""
+        return 0.0 if self._sensor is None else self._sensor.cell
+
+    @property
     def lost(self) -> LostScans | None:
         """Scans that could not be matched; None without a LiDAR."""
         return None if self._sensor is None else self._sensor.lost
@@ -66,7 +70,8 @@ class EkfFusion:
         self.settle()
         ekf, nis = self.filter, None
         step = self._check_standstill(step)
-        ekf.predict(step, self._is_turning(step.predicted))
+        self.wheel_motion, self.is_turning = step.predicted, self._is_turning(step.predicted)
+        ekf.predict(step, self.is_turning)
         if step.turn is not None:
             self._start_gyro()
             ekf.update_turn(step.turn)
@@ -99,6 +104,7 @@ class EkfFusion:
         self.counts_by_name["matched"] += 1
         self.counts_by_name["searched"] += bool(match.outlier_cov.any())
         self._is_blocked = step.is_standing and _is_contradicted(prior, cov, match)
+        self.wheel_motion = replace(self.wheel_motion, cov=self.wheel_motion.cov + match.outlier_cov)
         return ekf.update_scan(match.measured, match.cov, match.outlier_cov)
 
     def _is_turning(self, motion: Motion) -> bool:
@@ -125,6 +131,9 @@ class EkfFusion:
         if not self._has_gyro:
             self._has_gyro = True
             self.filter.P[CLOCK, CLOCK] += self._clock_sigma_s**2
+
+    def add_position(self, sample: PositionSample) -> None:
+        return None
 
     def finish(self, moments: Trajectory | None = None) -> None:
         self.settle()
@@ -158,8 +167,3 @@ def _is_contradicted(prior: FloatArray, cov: FloatArray, match: ScanMatch) -> bo
     """Whether a scan shows that the robot moved although its wheels stand."""
     off, sigma = np.abs(se2.log(se2.between(prior, match.measured))), np.sqrt(np.diagonal(cov + match.cov))
     return bool((off > np.maximum(_SIGMAS * sigma, [_MAX_STANDSTILL_M, _MAX_STANDSTILL_M, _MAX_STANDSTILL_RAD])).any())
-
-
-def make_sensor(mounts: Mapping[str, Mount], config: LidarConfig, has_lidar: bool) -> ScanMatchingSensor | None:
-    """The LiDAR as a sensor, if there is one."""
-    return ScanMatchingSensor(mounts, config) if has_lidar else None

@@ -8,6 +8,7 @@ import numpy as np
 
 from localization.errors import EstimatorError
 from localization.estimators.base import NO_POINTS, Estimate
+from localization.events import PositionSample
 from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
 from localization.lidar.scan_matcher import MIN_POINTS
 from localization.synchronizer import Step
@@ -51,6 +52,9 @@ class LidarOdometry:
         return Estimate(step.end_ns, self._pose, None, self._twist, None)
 
     def settle(self) -> None:
+        return None
+
+    def add_position(self, sample: PositionSample) -> None:
         return None
 
     def finish(self, moments: Trajectory | None = None) -> None:

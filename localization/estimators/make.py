@@ -9,9 +9,10 @@ from localization.errors import EstimatorError
 from localization.estimators.base import Estimator
 from localization.estimators.dead_reckoning import DeadReckoning
 from localization.estimators.filter import FilterConfig
-from localization.estimators.fusion import EkfFusion, make_sensor
+from localization.estimators.fusion import EkfFusion
+from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.estimators.lidar_odometry import LidarOdometry
-from localization.lidar import LidarConfig
+from localization.lidar import LidarConfig, ScanMatchingSensor
 from motion_models.base import MotionModel
 from motion_models.corrections import Corrections, Form, corrections
 from motion_models.robot import Mount, Robot
@@ -22,16 +23,32 @@ class EstimatorConfig:
     """Settings of all estimators."""
 
     ekf: FilterConfig = field(default_factory=FilterConfig)
+    graph: GraphConfig = field(default_factory=GraphConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig)
 
 
 _Maker = Callable[[MotionModel, Corrections, Robot, Mapping[str, Mount], bool, EstimatorConfig, bool], Estimator]
 
+
+def _make_ekf(
+    model: MotionModel,
+    corrected: Corrections,
+    robot: Robot,
+    mounts: Mapping[str, Mount],
+    has_lidar: bool,
+    config: EstimatorConfig,
+    is_smoothing: bool,
+) -> EkfFusion:
+    sensor = ScanMatchingSensor(mounts, config.lidar) if has_lidar else None
+    return EkfFusion(model, corrected, robot, sensor, config.ekf)
+
+
 ESTIMATORS: Mapping[str, _Maker] = {
-    "odometry": lambda model, corrected, robot, mounts, has_lidar, config, hindsight: DeadReckoning(),
-    "lidar": lambda model, corrected, robot, mounts, has_lidar, config, hindsight: LidarOdometry(mounts, config.lidar),
-    "ekf": lambda model, corrected, robot, mounts, has_lidar, config, hindsight: EkfFusion(
-        model, corrected, robot, make_sensor(mounts, config.lidar, has_lidar), config.ekf
+    "odometry": lambda model, corrected, robot, mounts, has_lidar, config, is_smoothing: DeadReckoning(),
+    "lidar": lambda model, corrected, robot, mounts, has_lidar, config, is_smoothing: LidarOdometry(mounts, config.lidar),
+    "ekf": _make_ekf,
+    "graph": lambda model, corrected, robot, mounts, has_lidar, config, is_smoothing: GraphFusion(
+        _make_ekf(model, corrected, robot, mounts, has_lidar, config, is_smoothing), corrected, config.lidar, config.graph, is_smoothing
     ),
 }
 
@@ -57,9 +74,9 @@ def make_estimator(
     mounts: Mapping[str, Mount],
     has_lidar: bool,
     config: EstimatorConfig | None = None,
-    hindsight: bool = False,
+    is_smoothing: bool = False,
 ) -> Estimator:
-    """The estimator ``name`` at the origin, with corrections of ``form``; with ``hindsight``, it will be asked for what the whole log
-    tells of each moment (`Estimator.finish`). Raises what `check_estimator` and `corrections` do."""
+    """The estimator ``name`` at the origin, with corrections of ``form``; with ``is_smoothing``, `Estimator.finish` is to give
+    the smoothed trajectory. Raises what `check_estimator` and `corrections` do."""
     check_estimator(name, has_lidar)
-    return ESTIMATORS[name](model, corrections(model, form), robot, mounts, has_lidar, config or EstimatorConfig(), hindsight)
+    return ESTIMATORS[name](model, corrections(model, form), robot, mounts, has_lidar, config or EstimatorConfig(), is_smoothing)

@@ -107,7 +107,7 @@ class KeyScanError:
 
 
 @dataclass(frozen=True)
-class _Fit:
+class Fit:
     """A minimum of the cost above."""
 
     pose: FloatArray
@@ -116,9 +116,11 @@ class _Fit:
     cost: float
     """-log likelihood of the points, those that err together counted once."""
     squares: float
-    """Sum of the squared sums of residuals over blocks of neighbouring beams."""
-    beams: float
-    """Beams in these blocks."""
+    """Sum of e^2 over the points that fit."""
+    block_squares: float
+    """Sum of squares of the sums of e over blocks of neighbouring points that fit."""
+    fitting: float
+    """How many points fit."""
 
 
 class ScanMatcher:
@@ -130,7 +132,7 @@ class ScanMatcher:
         self._keys: list[FloatArray] = []
         self._grid: VoxelGrid | None = None
         self._image: LikelihoodImage | None = None
-        self._squares, self._beams = 1e-3, 1e-3
+        self._residuals = np.full(3, 1e-3)  # sums over the last scans: squares, squares of blocks, points
 
     def match(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray | None = None) -> ScanMatch | None:
         """The pose of ``points`` near ``prior`` (3,), whose error against the submap has covariance ``cov`` (3, 3); None where it is lost.
@@ -164,7 +166,7 @@ class ScanMatcher:
         H, _, found = linearize(self._grid, points, triple(pose), 0.0)
         if found[0] < self._config.lost_below:
             return None
-        fit = _Fit(pose, H, *(float(value) for value in found))
+        fit = Fit(pose, H, *(float(value) for value in found))
         return self._result(fit, pose, np.eye(3), np.zeros((3, 3)))
 
     def insert_key_scan(self, pose: FloatArray, points: FloatArray) -> KeyScanError:
@@ -175,7 +177,7 @@ class ScanMatcher:
         self._keys = [*self._keys, drawn][-self._config.key_scans :]
         self._draw()
         H = linearize(self._grid, points, triple(pose), 0.0)[0]
-        seen, noise = np.linalg.solve(H + _MAPPED_INFORMATION, H), np.linalg.inv(H + _OPEN_INFORMATION) * self._variance_ratio
+        seen, noise = np.linalg.solve(H + _MAPPED_INFORMATION, H), np.linalg.inv(H + _OPEN_INFORMATION) * self._variance_ratio(1)
         return KeyScanError(share * seen, noise, new * seen @ noise @ seen.T)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -187,13 +189,12 @@ class ScanMatcher:
         if self._keys:
             self._draw()
 
-    @property
-    def _variance_ratio(self) -> float:
+    def _variance_ratio(self, which: int) -> float:
         """Variance of a match over that of independent points with the assumed noise, by the residuals of the last scans.
 
         The variance of sums over blocks of neighbouring beams, which contains how these err together (batch means).
         """
-        return self._squares / self._beams
+        return float(self._residuals[which] / self._residuals[2])
 
     def points(self) -> FloatArray:
         """(M, 2) of the submap, in the odometry frame [m]."""
@@ -202,10 +203,9 @@ class ScanMatcher:
     def _draw(self) -> None:
         self._grid, self._image = make_grid(self.points(), self.cell, self._config.range_noise_m), None
 
-    def _align(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray) -> _Fit:
+    def _align(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray) -> Fit:
         assert self._grid is not None
-        pose, H, found = _align(self._grid, points, prior, cov, np.linalg.inv(cov), guess)
-        return _Fit(pose, H, *(float(value) for value in found))
+        return align_points(self._grid, points, prior, cov, guess)
 
     def _search(self, points: FloatArray, prior: FloatArray, wide: FloatArray, cov: FloatArray) -> FloatArray | None:
         """The best pose (3,) within 3 sigma of ``wide`` (3, 3), limited unless ``cov`` (3, 3) is wider; None where it is ambiguous."""
@@ -215,22 +215,28 @@ class ScanMatcher:
         best = search(self._image, voxel_means(points, self.cell), prior, wide, limit)
         return None if best.rival_score >= _MAX_RIVAL * best.score else best.pose
 
-    def _result(self, fit: _Fit, prior: FloatArray, cov: FloatArray, outlier_cov: FloatArray) -> ScanMatch:
+    def _result(self, fit: Fit, prior: FloatArray, cov: FloatArray, outlier_cov: FloatArray) -> ScanMatch:
         """The scan's own pose z: where its gradient H (z - x) outweighs the prior's, J^T P^-1 log(prior^-1 x)."""
         R = np.linalg.inv(fit.information + _OPEN_INFORMATION)
         off = se2.log(se2.between(prior, fit.pose))
         gradient = se2.right_jacobian_inverse(off).T @ np.linalg.solve(cov, off)
         measured = se2.compose(fit.pose, se2.exp(R @ gradient))
-        self._squares, self._beams = _FORGETTING * self._squares + fit.squares, _FORGETTING * self._beams + fit.beams
-        return ScanMatch(fit.pose, measured, R * self._variance_ratio, fit.overlap, outlier_cov)
+        self._residuals = _FORGETTING * self._residuals + [fit.squares, fit.block_squares, fit.fitting]
+        return ScanMatch(fit.pose, measured, R * self._variance_ratio(0), fit.overlap, outlier_cov)
 
 
-def _is_better(found: _Fit, fit: _Fit, prior: FloatArray, cov: FloatArray) -> bool:
+def align_points(grid: VoxelGrid, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray) -> Fit:
+    """Gauss-Newton from ``guess`` (3,) for ``points`` (N, 2), with the ``prior`` (3,) of covariance ``cov`` (3, 3)."""
+    pose, H, found = _align(grid, points, prior, cov, np.linalg.inv(cov), guess)
+    return Fit(pose, H, *(float(value) for value in found))
+
+
+def _is_better(found: Fit, fit: Fit, prior: FloatArray, cov: FloatArray) -> bool:
     """Whether the pose that was ``found`` is more probable than ``fit``, where the prior may be an outlier."""
     return _total_cost(found, prior, cov) < _total_cost(fit, prior, cov)
 
 
-def _total_cost(fit: _Fit, prior: FloatArray, cov: FloatArray) -> float:
+def _total_cost(fit: Fit, prior: FloatArray, cov: FloatArray) -> float:
     return fit.cost + min(_mahalanobis(prior, fit.pose, cov) / 2.0, _OUTLIER_COST)
 
 
@@ -273,7 +279,7 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
     c, s = math.cos(x[2]), math.sin(x[2])
     reach, loose = max(_REACH_CELLS * grid.cell, spread), (spread / _KERNEL) ** 2
     n, fitting, cost = points.shape[0], 0, 0.0
-    J, block, squares = np.empty(3), 0.0, 0.0
+    J, block, squares, block_squares = np.empty(3), 0.0, 0.0, 0.0
     for i in range(n):
         px, py = points[i, 0], points[i, 1]
         wx, wy = x[0] + c * px - s * py - grid.origin[0], x[1] + s * px + c * py - grid.origin[1]
@@ -294,8 +300,9 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
         if square < _KERNEL**2:
             block += e / math.sqrt(var)
             fitting += 1
+            squares += square
             if fitting % _BLOCK == 0:
-                squares, block = squares + block * block, 0.0
+                block_squares, block = block_squares + block * block, 0.0
         scale = _KERNEL**2 * var + loose
         weight = (scale / (scale + e * e)) ** 2 / (var + loose)
         J[0], J[1] = c * surface[2] + s * surface[3], -s * surface[2] + c * surface[3]  # the normal, seen from the body
@@ -304,5 +311,5 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
             g[a] += weight * J[a] * e
             for b in range(3):
                 H[a, b] += weight * J[a] * J[b]
-    found = np.array([fitting / max(n, 1), 0.5 * cost / _TOGETHER, squares, _BLOCK * (fitting // _BLOCK)])
+    found = np.array([fitting / max(n, 1), 0.5 * cost / _TOGETHER, squares, block_squares, fitting])
     return H, g, found

@@ -43,8 +43,12 @@ class FixedTransforms:
                 self._moving.add(edge)
             self._edges[edge] = matrix
 
-    def mounts(self) -> dict[str, Mount]:
-        """Pose in the body frame of every frame that is fixed to it, by name."""
+    def frames(self) -> set[str]:
+        """Names of all frames so far."""
+        return {frame for edge in self._edges for frame in edge}
+
+    def mounts(self, body: str | None = None) -> dict[str, Mount]:
+        """Pose in the body frame of every frame that is fixed to it, by name. ``body``: its name where it is not one of the usual."""
         neighbours: dict[str, list[tuple[str, FloatArray]]] = {}
         for (parent, child), parent_T_child in sorted(self._edges.items(), key=lambda e: e[0]):
             if (parent, child) not in self._moving:
@@ -52,7 +56,7 @@ class FixedTransforms:
                 upwards = neighbours.setdefault(child, [])
                 if (parent, child) in self._fixed:  # what only seems fixed may be a robot that stands still in the world
                     upwards.append((parent, np.asarray(np.linalg.inv(parent_T_child), dtype=float)))
-        root = _root(neighbours)
+        root = body if body in neighbours else _root(neighbours)
         if root is None:
             return {}
         poses = {root: np.eye(4)}

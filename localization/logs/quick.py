@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from localization.logs.forms import Form, Message, Template
-from localization.logs.fused import FusedEstimate, odom_axes, odometry_message, six_by_six, transform_message
+from localization.logs.fused import BODY_FRAME, PARENT_FRAME, FusedEstimate, odom_axes, odometry_message, six_by_six, transform_message
 from motion_models.se2 import FloatArray
 
 _CDR, _FIRST = b"\0\1\0\0", 4  # little endian; places are counted from behind these bytes
@@ -157,16 +158,30 @@ def _doubles(data: bytes, at: int) -> tuple[FloatArray, int]:
 class FusedWriter:
     """Estimates as the bytes of `odometry_message` and `transform_message`."""
 
-    def __init__(self, *, is_ros1: bool) -> None:
-        self._odometry, self._transform = Template(_ODOMETRY, is_ros1=is_ros1), Template(_TRANSFORM, is_ros1=is_ros1)
+    def __init__(self, *, is_ros1: bool, parent: str = PARENT_FRAME, body: str = BODY_FRAME) -> None:
+        """``parent`` and ``body``: the frames between which the estimates are."""
+        self._odometry_form, self._transform_form = _named(_ODOMETRY, parent, body), _named(_TRANSFORM, parent, body)
+        self._odometry, self._transform = (Template(form, is_ros1=is_ros1) for form in (self._odometry_form, self._transform_form))
 
     def odometry(self, estimate: FusedEstimate) -> bytes:
         covariance = None if estimate.covariance is None else odom_axes(estimate.covariance, float(estimate.pose[2]))
         parts = (*_place(estimate), six_by_six(covariance), estimate.twist[:2], estimate.twist[2:], six_by_six(estimate.twist_covariance))
-        return self._odometry.fill(Message(_ODOMETRY, estimate.stamp_ns, estimate.stamp_ns, parts))
+        return self._odometry.fill(Message(self._odometry_form, estimate.stamp_ns, estimate.stamp_ns, parts))
 
     def transform(self, estimate: FusedEstimate) -> bytes:
-        return self._transform.fill(Message(_TRANSFORM, estimate.stamp_ns, estimate.stamp_ns, _place(estimate)))
+        return self._transform.fill(Message(self._transform_form, estimate.stamp_ns, estimate.stamp_ns, _place(estimate)))
+
+
+def _named(form: Form, parent: str, body: str) -> Form:
+    """``form`` with these frames in its messages."""
+
+    def build(*parts: Any) -> Any:
+        made = form.build(*parts)
+        stamped = made.transforms[0] if hasattr(made, "transforms") else made
+        stamped.header.frame_id, stamped.child_frame_id = parent, body
+        return made
+
+    return replace(form, build=build)
 
 
 def _place(estimate: FusedEstimate) -> tuple[FloatArray, FloatArray]:

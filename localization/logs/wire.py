@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from localization.logs.chunks import Channel
@@ -14,6 +15,9 @@ from localization.logs.forms import STORE, STORE_ROS1
 from localization.logs.quick import quick_reader
 from localization.logs.tally import Oddity
 
+_GRAPH_PACKAGE = "rmw_dds_common"
+_STORE_GRAPH = get_typestore(Stores.ROS2_JAZZY)  # its entities have 16 bytes since Iron, 24 in Humble
+
 Shape = tuple[Any, ...]
 """Of a field: ("base", name), ("message", type), ("array", shape, length) or ("sequence", shape)."""
 
@@ -21,7 +25,7 @@ Shape = tuple[Any, ...]
 def encode(message: Any, *, is_ros1: bool = False) -> bytes:
     """The bytes of a message object of `make` or of this package."""
     kind = message.__msgtype__
-    data = STORE.serialize_cdr(message, kind)
+    data = _store(kind).serialize_cdr(message, kind)
     return bytes(STORE.cdr_to_ros1(data, kind) if is_ros1 else data)
 
 
@@ -43,7 +47,12 @@ def decoder(kind: str, *, is_ros1: bool = False) -> Callable[[bytes], Any]:
 
 def make(kind: str, **fields: Any) -> Any:
     """A message object of ROS 2's type ``kind`` (package/msg/Type)."""
-    return STORE.types[kind](**fields)
+    return _store(kind).types[kind](**fields)
+
+
+def type_hash(kind: str) -> str:
+    """Hash of ROS 2's type ``kind`` (`RIHS01_...`, REP-2016), which peers since Iron compare."""
+    return str(_store(kind).hash_rihs01(kind))
 
 
 def definition(kind: str, *, is_ros1: bool = False) -> tuple[str, str]:
@@ -60,7 +69,11 @@ def live_channel(topic: str, kind: str, count: int) -> Channel:
 
 def fields(kind: str) -> list[tuple[str, Shape]]:
     """Fields of ROS 2's type ``kind`` with their shapes, in order."""
-    return [(name, _shape(described)) for name, described in STORE.fielddefs[kind][1]]
+    return [(name, _shape(described)) for name, described in _store(kind).fielddefs[kind][1]]
+
+
+def _store(kind: str) -> Typestore:
+    return _STORE_GRAPH if kind.startswith(_GRAPH_PACKAGE) else STORE
 
 
 def _shape(described: Any) -> Shape:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from localization.estimators import CORRECTING, Estimate, Estimator, EstimatorConfig, make_estimator
-from localization.events import Event
+from localization.events import Event, PositionSample
 from localization.synchronizer import Step, StepConfig, Synchronizer
 from motion_models import se2
 from motion_models.base import MotionModel
@@ -40,7 +40,7 @@ class Pair:
 
 
 class Core:
-    """Stepper and estimator of one pair. Bounded, but for hindsight: it keeps no trajectory."""
+    """Stepper and estimator of one pair. Bounded, unless it smooths: it keeps no trajectory."""
 
     def __init__(
         self,
@@ -49,9 +49,9 @@ class Core:
         mounts: Mapping[str, Mount],
         has_lidar: bool,
         config: ReplayConfig | None = None,
-        hindsight: bool = False,
+        is_smoothing: bool = False,
     ) -> None:
-        """``hindsight``: the estimator will be asked at the end what the whole log tells; it changes no estimate of a moment."""
+        """``is_smoothing``: the estimator is to give a smoothed trajectory at the end; it changes no estimate on the way."""
         config = config or ReplayConfig()
         self.mounts = dict(mounts)
         """Where frames are known to sit; shared by all who ask."""
@@ -60,7 +60,7 @@ class Core:
         self.wheel_twist: FloatArray | None = None
         """(3,) mean twist of the last step by the wheels alone; None where they were not heard during all of it."""
         self.estimator: Estimator = make_estimator(
-            pair.estimator, model, pair.corrections, robot, self.mounts, has_lidar, config.estimator, hindsight
+            pair.estimator, model, pair.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing
         )
 
     def push(self, event: Event) -> list[Estimate]:
@@ -69,6 +69,9 @@ class Core:
         Stamps are believed: where wheels of an hour ahead have made a step, scans of before are late. Logs and topics are cleared of
         such leaps as they are read (`logs.merge`); whoever makes events has to do it.
         """
+        if isinstance(event, PositionSample):
+            self.estimator.add_position(event)
+            return []
         return self._take(self.stepper.push(event))
 
     def settle(self) -> None:

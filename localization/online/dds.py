@@ -1,7 +1,7 @@
 """ROS 2 topics without a ROS installation: DDS through cyclonedds (extra `ros2`).
 
 A ROS 2 topic `/scan` is DDS's `rt/scan`, a type `pkg/msg/Type` is `pkg::msg::dds_::Type_`. Messages pass as bytes, which `logs.wire`
-reads and writes as it does those of logs; cyclonedds is only told the types' fields, for peers that ask.
+reads and writes as it does those of logs; cyclonedds gets the types' fields only for peers that ask.
 """
 
 from __future__ import annotations
@@ -15,10 +15,12 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import quoteattr
+
+import numpy as np
 
 from localization.errors import DoorError
-from localization.logs.wire import Shape, fields
+from localization.logs.wire import Shape, encode, fields, make, type_hash
+from localization.online.dds_settings import LAST_DOMAIN, LOOPBACK, configuration
 from localization.online.transport import Received
 
 try:
@@ -34,54 +36,46 @@ try:
 except ImportError as error:
     raise DoorError(f"ROS 2 topics without a ROS installation need the extra 'ros2': pip install 'skidloc[ros2]' ({error}).") from error
 
-LOOPBACK = "lo"
-DEFAULT = "default"
-_LAST_DOMAIN = 230
 _LATEST, _DEPTH, _LATCHED_DEPTH = 200, 10, 100
 _FASTEST_DRIFT = 1e-4  # of one clock against another
 _TYPE = re.compile(r"(\w+)::(?:msg::)dds_::(\w+)_")
-
-
-def default_domain() -> int:
-    """ROS 2's domain by its environment, 0 where that names none. Raises `DoorError`."""
-    said = os.environ.get("ROS_DOMAIN_ID") or "0"
-    if not (said.isdecimal() and int(said) <= _LAST_DOMAIN):
-        raise DoorError(f"ROS_DOMAIN_ID is '{said}'; ROS 2's domains are the numbers 0 to {_LAST_DOMAIN}. Set it right, or pass --domain.")
-    return int(said)
+_GRAPH_TOPIC, _GRAPH_TYPE = "ros_discovery_info", "rmw_dds_common/msg/ParticipantEntitiesInfo"
 
 
 class DdsTransport:
-    """See `Transport`. ``interface``: a network interface's name or address; `lo` leaves nothing open to other machines."""
+    """See `Transport`. One participant with one node, ``name`` in ``namespace``, which ROS 2's node list shows."""
 
     is_ros1 = False
 
-    def __init__(self, domain: int = 0, interface: str = LOOPBACK) -> None:
-        """Raises `DoorError`."""
-        if not 0 <= domain <= _LAST_DOMAIN:
-            raise DoorError(f"the domain is {domain}; ROS 2's domains are 0 to {_LAST_DOMAIN}.")
+    def __init__(self, domain: int = 0, interface: str = LOOPBACK, name: str = "skidloc", namespace: str = "/") -> None:
+        """``interface`` is one of `dds_settings.choose_interface`; `lo` leaves nothing open to other machines. Raises `DoorError`."""
+        if not 0 <= domain <= LAST_DOMAIN:
+            raise DoorError(f"the domain is {domain}; ROS 2's domains are 0 to {LAST_DOMAIN}.")
         self.place = f"domain {domain} on interface {interface}"
-        self.elsewhere = "What is set up as usual for ROS 2, on this machine too, is heard with --interface default." * (
-            interface == LOOPBACK
-        )
+        self.elsewhere = "Robots on other machines are discovered with --interface default." * (interface == LOOPBACK)
         try:
-            with _only_heard_on(interface):
-                self._domain = None if interface == DEFAULT else Domain(domain, _configuration(interface))
-                self._participant = DomainParticipant(domain)
+            with _bound_to(interface):
+                self._domain = Domain(domain, configuration(interface))
+                self._participant = DomainParticipant(domain, Qos(Policy.Userdata(b"enclave=/;")))
         except dds.DDSException as error:
             raise DoorError(f"DDS cannot be used on interface '{interface}', domain {domain}: {error}.") from error
         self._waiting, self._urgent = dds.WaitSet(self._participant), dds.WaitSet(self._participant)
         self._readers: list[tuple[str, DataReader[Any], dds.ReadCondition]] = []
-        self._writers: dict[str, tuple[DataWriter[Any], type[Any]]] = {}
+        self._writers: dict[str, _Writer] = {}
+        self._topics: dict[str, Topic[Any]] = {}
         self._found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         self._looked_ns = time.monotonic_ns()
         self._clocks: dict[str, SenderClock] = {}
+        self._name, self._namespace = name, namespace
+        self._graph = None if os.environ.get("ROS_DISTRO") == "humble" else self._writer(_GRAPH_TOPIC, _GRAPH_TYPE, _graph_quality())
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         quality = _latched() if is_latched else _sensor_data()
-        reader = DataReader(self._participant, Topic(self._participant, _dds_name(topic), _bytes_type(kind), quality), quality)
+        reader = DataReader(self._participant, self._topic(_dds_name(topic), kind), _hashed(quality, kind))
         is_new = dds.ReadCondition(reader, dds.ViewState.Any | dds.InstanceState.Any | dds.SampleState.NotRead)
         self._waiting.attach(is_new)
         self._readers.append((topic, reader, is_new))
+        self._publish_graph()
 
     def keep(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
         for topic, _, is_new in self._readers:
@@ -90,17 +84,14 @@ class DdsTransport:
             elif topic in urgent:
                 self._urgent.attach(is_new)
         self._readers = [entry for entry in self._readers if entry[0] in topics]
+        self._publish_graph()
 
     def advertise(self, topic: str, kind: str) -> None:
-        made, quality = _bytes_type(kind), _reliable()
-        self._writers[topic] = DataWriter(self._participant, Topic(self._participant, _dds_name(topic), made, quality), quality), made
+        self._writers[topic] = self._writer(_dds_name(topic), kind, _reliable())
+        self._publish_graph()
 
     def publish(self, topic: str, data: bytes) -> None:
-        writer, made = self._writers[topic]
-        sample = object.__new__(made)
-        vars(sample)["data_"] = data
-        with contextlib.suppress(dds.DDSException):  # a reader that is too slow must not stop the robot
-            writer.write(sample)
+        _write(self._writers[topic], data)
 
     def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
         """In the order in which it was sent: after a pause, one topic's must not all come before another's."""
@@ -123,16 +114,40 @@ class DdsTransport:
     def publishers(self) -> Mapping[str, set[str]]:
         found: dict[str, set[str]] = {}
         for publication in self._found.read(1000):
-            info = publication.sample_info
+            if publication.sample_info.instance_state != dds.InstanceState.Alive:
+                continue  # of one that left nothing but its key is known
             name, kind = publication.topic_name, _TYPE.fullmatch(publication.type_name)
-            if info.instance_state == dds.InstanceState.Alive and name.startswith("rt/") and name[2:] not in self._writers:
+            if name.startswith("rt/") and name[2:] not in self._writers:
                 found.setdefault(name[2:], set()).add(f"{kind[1]}/msg/{kind[2]}" if kind else publication.type_name)
         return found
 
     def close(self) -> None:
         self._readers.clear()
         self._writers.clear()
-        del self._waiting, self._urgent, self._found, self._participant, self._domain
+        self._topics.clear()
+        del self._graph, self._waiting, self._urgent, self._found, self._participant, self._domain
+
+    def _topic(self, dds_name: str, kind: str) -> Topic[Any]:
+        """One for a reader and a writer, whose qualities differ: a second one with another quality is refused."""
+        if dds_name not in self._topics:
+            self._topics[dds_name] = Topic(self._participant, dds_name, _bytes_type(kind), Qos(*_COMMON))
+        return self._topics[dds_name]
+
+    def _writer(self, dds_name: str, kind: str, quality: Qos) -> _Writer:
+        return DataWriter(self._participant, self._topic(dds_name, kind), _hashed(quality, kind)), _bytes_type(kind)
+
+    def _publish_graph(self) -> None:
+        """The participant's node and its endpoints: from these messages, not from DDS's own discovery, ROS 2 knows nodes."""
+        if self._graph is None:
+            return
+        node = make(
+            "rmw_dds_common/msg/NodeEntitiesInfo",
+            node_namespace=self._namespace,
+            node_name=self._name,
+            reader_gid_seq=[_gid(reader) for _, reader, _ in self._readers],
+            writer_gid_seq=[_gid(writer) for writer, _ in self._writers.values()],
+        )
+        _write(self._graph, encode(make(_GRAPH_TYPE, gid=_gid(self._participant), node_entities_info_seq=[node])))
 
 
 class SenderClock:
@@ -162,8 +177,28 @@ def times_of_receiving(sent_ns: Sequence[int], since_ns: int, newest_ns: int) ->
     return [newest_ns - round((last_sent_ns - sent) * share) for sent in sent_ns]
 
 
+_Writer = tuple["DataWriter[Any]", type[Any]]
+
+
+def _write(writer: _Writer, data: bytes) -> None:
+    sample = object.__new__(writer[1])
+    vars(sample)["data_"] = data
+    with contextlib.suppress(dds.DDSException):  # a reader that is too slow must not stop the robot
+        writer[0].write(sample)
+
+
+def _gid(entity: Any) -> Any:
+    return make("rmw_dds_common/msg/Gid", data=np.frombuffer(entity.guid.bytes, np.uint8))
+
+
+def _hashed(quality: Qos, kind: str) -> Qos:
+    """``quality`` of an endpoint, with the hash of its type as ROS 2 puts it beside."""
+    return Qos(Policy.Userdata(f"typehash={type_hash(kind)};".encode()), base=quality)
+
+
 def _sensor_data() -> Qos:
-    return Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(_LATEST), *_COMMON)
+    latest = Policy.History.KeepLast(_LATEST)
+    return Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, latest, Policy.IgnoreLocal.Participant, *_COMMON)
 
 
 def _latched() -> Qos:
@@ -174,6 +209,12 @@ def _latched() -> Qos:
 def _reliable() -> Qos:
     reliable = Policy.Reliability.Reliable(duration(milliseconds=1))  # never wait for a slow reader
     return Qos(reliable, Policy.Durability.Volatile, Policy.History.KeepLast(_DEPTH), *_COMMON)
+
+
+def _graph_quality() -> Qos:
+    """As rmw_dds_common has it."""
+    reliable = Policy.Reliability.Reliable(duration(milliseconds=1))
+    return Qos(reliable, Policy.Durability.TransientLocal, Policy.History.KeepLast(1), *_COMMON)
 
 
 _COMMON = (Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),)
@@ -217,24 +258,9 @@ def _bytes_type(kind: str) -> type[Any]:
     return made
 
 
-def _configuration(interface: str) -> str:
-    """XML. Loopback has no multicast: peers are looked for on the ports of the domain's first participants."""
-    try:
-        socket.inet_aton(interface)
-        chosen = f"address={quoteattr(interface)}"
-    except OSError:
-        chosen = f"name={quoteattr(interface)}"
-    general = f"<Interfaces><NetworkInterface {chosen}/></Interfaces>"
-    discovery = "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>"
-    if interface == LOOPBACK:
-        general += "<AllowMulticast>false</AllowMulticast>"
-        discovery += '<Peers><Peer address="127.0.0.1"/></Peers>'
-    return f"<CycloneDDS><Domain><General>{general}</General><Discovery>{discovery}</Discovery></Domain></CycloneDDS>"
-
-
 @contextlib.contextmanager
-def _only_heard_on(interface: str) -> Any:
-    """Cyclone sends from the chosen interface, but hears on all of them: bind the sockets that it opens to the loopback device.
+def _bound_to(interface: str) -> Any:
+    """Cyclone sends from the chosen interface, but receives on all of them: bind the sockets that it opens to the loopback device.
 
     Raises `DoorError` where that cannot be done.
     """
@@ -249,7 +275,7 @@ def _only_heard_on(interface: str) -> Any:
                     opened.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, LOOPBACK.encode() + b"\0")
             except (AttributeError, OSError) as error:
                 raise DoorError(
-                    f"DDS cannot be kept from hearing other machines ({error}). If that does no harm: --interface default."
+                    f"DDS cannot be restricted to this machine ({error}). If packets of others do no harm: --interface default."
                 ) from error
             finally:
                 opened.detach()  # it stays Cyclone's

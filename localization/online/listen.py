@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -15,6 +16,7 @@ from localization.logs.mounts import FixedTransforms
 from localization.logs.parts import Parts, choose_parts
 from localization.logs.topics import TYPES, TopicChooser, TopicOverrides, short_type
 from localization.logs.wire import decoder, live_channel
+from localization.online.names import Names
 from localization.online.transport import Received, Transport
 from motion_models.robot import Mount, Robot
 
@@ -27,8 +29,9 @@ _MOST_KEPT = 20_000
 class LiveTransforms:
     """What comes on /tf_static."""
 
-    def __init__(self, *, is_ros1: bool) -> None:
-        self._decode, self._fixed = decoder(TF_TYPE, is_ros1=is_ros1), FixedTransforms()
+    def __init__(self, body: str, *, is_ros1: bool) -> None:
+        """``body``: the robot's frame."""
+        self._decode, self._fixed, self._body = decoder(TF_TYPE, is_ros1=is_ros1), FixedTransforms(), body
 
     def hear(self, data: bytes) -> None:
         """Take in a message; bytes that are none say nothing."""
@@ -37,7 +40,17 @@ class LiveTransforms:
 
     def mounts(self) -> Mapping[str, Mount]:
         """Of all frames so far that are tied to the body's."""
-        return self._fixed.mounts()
+        return self._fixed.mounts(self._body)
+
+    @property
+    def problem(self) -> str | None:
+        """A sentence where there are transforms, but none of the robot's frame."""
+        frames = sorted(self._fixed.frames())
+        if not frames or self._body in frames:
+            return None
+        near = difflib.get_close_matches(self._body, frames, n=1)
+        nearest = f" Did you mean '{near[0]}'?" if near else ""
+        return f"base_link_frame '{self._body}' is not on /tf_static, which has {', '.join(frames)}.{nearest}"
 
 
 @dataclass(frozen=True)
@@ -58,7 +71,9 @@ class Heard:
 class Listener:
     """Subscribes to all that a robot may have. `listen` ends when all of it that is published was heard."""
 
-    def __init__(self, transport: Transport, robot: Robot, topics: TopicOverrides) -> None:
+    def __init__(self, transport: Transport, robot: Robot, topics: TopicOverrides, names: Names, body: str) -> None:
+        """Topics of ``robot`` and ``topics`` are resolved names; ``body`` is the robot's frame."""
+        self._tf_static = names.resolve(TF_STATIC)
         self._transport, self._robot, self._topics = transport, robot, topics
         self.candidates: dict[str, str] = {}
         """Type by topic."""
@@ -69,10 +84,10 @@ class Listener:
                 self.candidates.setdefault(topic, message_type)
         for topic, message_type in self.candidates.items():
             transport.subscribe(topic, message_type, is_latched=False)
-        transport.subscribe(TF_STATIC, TF_TYPE, is_latched=True)
+        transport.subscribe(self._tf_static, TF_TYPE, is_latched=True)
         self._asked = {topic for kind in TYPES if (topic := getattr(topics, kind))}
         self._decoders = {topic: decoder(kind, is_ros1=transport.is_ros1) for topic, kind in self.candidates.items()}
-        self._transforms = LiveTransforms(is_ros1=transport.is_ros1)
+        self._transforms = LiveTransforms(body, is_ros1=transport.is_ros1)
         self._backlog: list[Received] = []
         self._counts: Counter[str] = Counter()
         self._first: dict[str, tuple[int, int]] = {}
@@ -100,7 +115,7 @@ class Listener:
             waited_for = {*needed, *(() if late else published)} & set(self.candidates)
             silent = sorted(waited_for - set(self._counts))
             settled = first is not None and now - first >= min(wait_s, _SETTLE_S)
-            has_mounts = bool(self._transforms.mounts()) or TF_STATIC not in published or late
+            has_mounts = bool(self._transforms.mounts()) or self._tf_static not in published or late
             if settled and not silent and has_mounts:
                 for topic in sorted(set(published) & set(self.candidates) - set(self._counts)):
                     tell(f"begun without {topic}: it is published, but nothing comes.")
@@ -111,7 +126,7 @@ class Listener:
         raise KeyboardInterrupt
 
     def _hear(self, received: Received, epoch_ns: int) -> None:
-        if received.topic == TF_STATIC:
+        if received.topic == self._tf_static:
             self._transforms.hear(received.data)
             return
         try:

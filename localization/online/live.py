@@ -80,6 +80,10 @@ class Stream:
         found = {topic: watch.silence(now_ns) for topic, watch in self._watches.items()}
         return {topic: seconds for topic, seconds in found.items() if seconds is not None}
 
+    def rates(self) -> dict[str, float]:
+        """Messages per second of the topics in use, by their last dozen [Hz]; 0 of one that never came twice."""
+        return {topic: watch.rate_hz for topic, watch in self._watches.items()}
+
     def patience_s(self, now_ns: int) -> float:
         """How long messages may wait for others [s]: nobody waits for what they say until the next scan. 0 without a LiDAR.
 
@@ -111,6 +115,10 @@ class _Watch:
             gap = (now_ns - self._last_ns) * _NS
             self._period_s += (min(gap, 10.0 * self._period_s + 0.01) - self._period_s) * 0.1
         self._last_ns = now_ns
+
+    @property
+    def rate_hz(self) -> float:
+        return 1.0 / self._period_s if self._period_s > 0.0 else 0.0
 
     def rest(self, now_ns: int, parts: Sequence[float]) -> float:
         """Until the next of ``parts`` of the time to the next message is over [s]; 0 when all are."""

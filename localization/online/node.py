@@ -6,7 +6,7 @@ import gc
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -15,14 +15,16 @@ from localization.estimators import Estimate
 from localization.events import Event, Scan
 from localization.logs.tally import Tally
 from localization.logs.topics import TopicOverrides
+from localization.online.conflicts import TransformConflicts
 from localization.online.core import Core, Pair, ReplayConfig
 from localization.online.dump import fingerprints, read_head
 from localization.online.files import Files
-from localization.online.health import Status
-from localization.online.listen import TF_STATIC, Heard, Listener
+from localization.online.health import ERROR, Status
+from localization.online.listen import TF_STATIC, TF_TYPE, Heard, Listener
 from localization.online.live import Memory, Stream, check_age
+from localization.online.names import Names
 from localization.online.session import Session, View, made_by
-from localization.online.tell import Teller
+from localization.online.tell import TF, Frames, Teller
 from localization.online.transport import Received, Transport
 from localization.online.warm import warm_up
 from localization.settings import Settings
@@ -36,9 +38,11 @@ class NodeConfig(Settings):
     """How a node behaves."""
 
     wait_s: float = 5.0
-    """How long topics that somebody publishes are waited for before a start without them, and how often silence is told [s]."""
+    """How long topics that are published are waited for before a start without them, and how often silence is reported [s]."""
     tf: bool = True
-    """Publish `odom` -> `base_link`; leave it to another node if one does."""
+    """Publish the transform `odom_frame` -> `base_link_frame`; false where another node publishes it."""
+    frames: Frames = field(default_factory=Frames)
+    names: Names = field(default_factory=Names)
 
 
 class Node:
@@ -54,8 +58,11 @@ class Node:
         heard: Heard,
         made: dict[str, str],
         tell: Callable[[str], None],
+        config: NodeConfig,
     ) -> None:
-        """``made``: what a state says that it was made with; it changes with the mounts that come."""
+        """``made``: what a state was made with; it changes with the mounts that come."""
+        self._tf_static, self._tf = config.names.resolve(TF_STATIC), config.names.resolve(TF)
+        self._conflicts = TransformConflicts(config.frames.odom_frame, config.frames.base_link_frame, is_ros1=transport.is_ros1)
         self._transport, self._stream, self.session, self._teller = transport, stream, session, teller
         self._robot, self._transforms, self._made, self._say = robot, heard.transforms, made, tell
         self._lacks: set[str] = set()  # that were told
@@ -87,7 +94,9 @@ class Node:
         config, node = config or ReplayConfig(), node or NodeConfig()
         epoch_ns = time.time_ns() - time.monotonic_ns()
         warm_up(make_pair(True), robot, robot.mounts, has_lidar=True, is_planar=True, config=config)
-        listener = Listener(transport, robot, topics or TopicOverrides())
+        robot, topics = node.names.apply_to_robot(robot), node.names.apply_to_overrides(topics or TopicOverrides())
+        listener = Listener(transport, robot, topics, node.names, node.frames.base_link_frame)
+        teller = Teller(transport, node.names, node.frames, with_tf=node.tf)  # now: whoever subscribes has found it by the first estimate
         needed = read_head(files.state).get("topics", []) if files.state is not None and files.state.exists() else []
         heard = listener.listen(node.wait_s, needed, tell, epoch_ns, is_over)
         for note in heard.parts.notes:
@@ -99,7 +108,10 @@ class Node:
             warm_up(pair, robot, heard.mounts, has_lidar, is_planar=False, config=config)
         gc.collect()
         gc.freeze()  # what is here now stays: later collections need not look at it
-        transport.keep([TF_STATIC, *(source.topic for source in heard.parts.sources.used())], [] if lidar is None else [lidar.topic])
+        transforms = [node.names.resolve(topic) for topic in ((TF_STATIC, TF) if node.tf else (TF_STATIC,))]
+        if node.tf:
+            transport.subscribe(transforms[1], TF_TYPE, is_latched=False)
+        transport.keep([*transforms, *(source.topic for source in heard.parts.sources.used())], [] if lidar is None else [lidar.topic])
         tally = Tally()
         stream = Stream(heard, robot, tally, epoch_ns, is_ros1=transport.is_ros1)
         made = made_by(pair, robot, heard.mounts, has_lidar, config, "live topics")
@@ -110,7 +122,7 @@ class Node:
             if view is not None:
                 view.begin(robot, heard.mounts)
                 session.view = view
-            made_node = cls(transport, stream, session, Teller(transport, with_tf=node.tf), robot, heard, made, tell)
+            made_node = cls(transport, stream, session, teller, robot, heard, made, tell, node)
             if session.head:
                 if not isinstance(session.kept, Memory):
                     raise DumpError(f"the state in '{files.state}' is of a log. Remove it to start anew.")
@@ -145,10 +157,18 @@ class Node:
             self.session.dump(self._head, now=True)
             self.session.close()
 
+    def publish_tf(self, is_on: bool) -> None:
+        """Publish the transform from now on, or no more."""
+        self._teller.publish_tf(is_on)
+
     @property
     def topics(self) -> list[str]:
         """Those in use."""
         return [source.topic for source in self._stream.sources.used()]
+
+    def rates(self) -> dict[str, float]:
+        """Messages per second of the topics in use [Hz]."""
+        return self._stream.rates()
 
     def notes(self) -> list[str]:
         """Sentences about everything that was lost or mended."""
@@ -161,7 +181,11 @@ class Node:
 
     def _push(self, received: Received, *, time_it: bool) -> bool:
         """True if it made an estimate."""
-        if received.topic == TF_STATIC:
+        if received.topic == self._tf:
+            if (found := self._conflicts.check(received.data, self._teller.recent_transforms)) is not None:
+                self._say(found)
+            return False
+        if received.topic == self._tf_static:
             self._transforms.hear(received.data)
             self._meet(self._transforms.mounts())
             return False
@@ -191,10 +215,10 @@ class Node:
             self.session.view.begin(self._robot, core.mounts)
 
     def _watch_frames(self) -> None:
-        lack = self.session.core.stepper.frames.lack
-        if lack is not None and lack not in self._lacks:
-            self._lacks.add(lack)
-            self._say(lack)
+        for problem in (self.session.core.stepper.frames.lack, self._transforms.problem):
+            if problem is not None and problem not in self._lacks:
+                self._lacks.add(problem)
+                self._say(problem)
 
     def _patience_s(self) -> float:
         return 0.0 if self.session.core.stepper.is_waiting else self._stream.patience_s(time.monotonic_ns())
@@ -212,6 +236,8 @@ class Node:
         health = self.session.health
         silent = self._stream.silent(time.monotonic_ns())
         self.statuses = health.statuses(self.session.core, self._stream.dropped(), silent, self.session.troubles)
+        problems = [problem for problem in (self._conflicts.current(), self._transforms.problem) if problem is not None]
+        self.statuses.append(Status("transforms", ERROR, " ".join(problems)) if problems else Status("transforms"))
         stamp_ns = self._stream.sender_stamp_ns(self._newest_ns, by_lidar=True)
         self._teller.diagnostics(self.statuses, self._robot.name, stamp_ns)
         parameters = self.session.core.estimator.parameters()

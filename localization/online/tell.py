@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from localization.errors import SettingError
 from localization.estimators import Estimate
 from localization.logs.fused import FusedEstimate
 from localization.logs.quick import FusedWriter
 from localization.logs.wire import encode, make
 from localization.online.health import Status
+from localization.online.names import Names
 from localization.online.transport import Transport
+from localization.settings import Settings
 
-ODOMETRY, CORRECTIONS, TF, DIAGNOSTICS = "/skidloc/odometry", "/skidloc/corrections", "/tf", "/diagnostics"
+ODOMETRY, CORRECTIONS, TF, DIAGNOSTICS = "~/odometry", "~/corrections", "/tf", "/diagnostics"
 
+_RECENT = 500  # 10 s at 50 Hz: those of a start's backlog come back only after all of them
 _TYPES = {
     ODOMETRY: "nav_msgs/msg/Odometry",
     CORRECTIONS: "sensor_msgs/msg/JointState",
@@ -23,29 +29,57 @@ _TYPES = {
 }
 
 
+@dataclass(frozen=True)
+class Frames(Settings):
+    """Frames of what is published (REP-105)."""
+
+    odom_frame: str = "odom"
+    """Parent frame of the published odometry and transform."""
+    base_link_frame: str = "base_link"
+    """Frame of the robot's body, child of `odom_frame`; the point about which the robot file's geometry is given."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, frame in (("odom_frame", self.odom_frame), ("base_link_frame", self.base_link_frame)):
+            if not frame or frame.startswith("/") or frame != frame.strip():
+                raise SettingError(f"setting {name} is '{frame}'; it must not be empty, begin with '/', or have blanks around it.")
+        if self.odom_frame == self.base_link_frame:
+            raise SettingError(f"odom_frame and base_link_frame are both '{self.odom_frame}'; they must be two frames.")
+
+
 class Teller:
     """Publishes on a transport. Odometry and TF with every estimate; corrections and diagnostics when asked."""
 
-    def __init__(self, transport: Transport, *, with_tf: bool) -> None:
-        self._transport, self._with_tf = transport, with_tf
-        self._fused = FusedWriter(is_ros1=transport.is_ros1)
-        for topic, kind in _TYPES.items():
+    def __init__(self, transport: Transport, names: Names, frames: Frames, *, with_tf: bool) -> None:
+        self._transport, self._with_tf, self._frames = transport, with_tf, frames
+        self._fused = FusedWriter(is_ros1=transport.is_ros1, parent=frames.odom_frame, body=frames.base_link_frame)
+        self.recent_transforms: deque[bytes] = deque(maxlen=_RECENT)
+        """As they were published."""
+        self._topics = {topic: names.resolve(topic) for topic in _TYPES}
+        for topic in _TYPES:
             if topic != TF or with_tf:
-                transport.advertise(topic, kind)
+                self._advertise(topic)
+
+    def publish_tf(self, is_on: bool) -> None:
+        """Publish the transform from now on, or no more."""
+        if is_on and not self._with_tf and not self.recent_transforms:
+            self._advertise(TF)
+        self._with_tf = is_on
 
     def estimate(self, estimate: Estimate, stamp_ns: int) -> None:
-        """nav_msgs/Odometry with the true vy, and `odom` -> `base_link`, at ``stamp_ns``."""
+        """nav_msgs/Odometry with the true vy, and the transform `odom` -> `base_link`, at ``stamp_ns``."""
         covariance = estimate.covariance
         fused = FusedEstimate(stamp_ns, estimate.pose, estimate.twist, covariance, estimate.twist_covariance)
-        self._transport.publish(ODOMETRY, self._fused.odometry(fused))
+        self._transport.publish(self._topics[ODOMETRY], self._fused.odometry(fused))
         if self._with_tf:
-            self._transport.publish(TF, self._fused.transform(fused))
+            self.recent_transforms.append(self._fused.transform(fused))
+            self._transport.publish(self._topics[TF], self.recent_transforms[-1])
 
     def corrections(self, parameters: Mapping[str, tuple[float, float]], stamp_ns: int) -> None:
         """Named numbers as sensor_msgs/JointState: ``position`` is the mean, ``effort`` its sigma."""
         means, sigmas = (np.array([value[i] for value in parameters.values()], dtype=float) for i in (0, 1))
         message = make(
-            _TYPES[CORRECTIONS], header=_header(stamp_ns), name=list(parameters), position=means, velocity=np.zeros(0), effort=sigmas
+            _TYPES[CORRECTIONS], header=self._header(stamp_ns), name=list(parameters), position=means, velocity=np.zeros(0), effort=sigmas
         )
         self._publish(CORRECTIONS, message)
 
@@ -62,12 +96,14 @@ class Teller:
             )
             for status in statuses
         ]
-        self._publish(DIAGNOSTICS, make(_TYPES[DIAGNOSTICS], header=_header(stamp_ns), status=entries))
+        self._publish(DIAGNOSTICS, make(_TYPES[DIAGNOSTICS], header=self._header(stamp_ns), status=entries))
+
+    def _advertise(self, topic: str) -> None:
+        self._transport.advertise(self._topics[topic], _TYPES[topic])
 
     def _publish(self, topic: str, message: object) -> None:
-        self._transport.publish(topic, encode(message, is_ros1=self._transport.is_ros1))
+        self._transport.publish(self._topics[topic], encode(message, is_ros1=self._transport.is_ros1))
 
-
-def _header(stamp_ns: int) -> object:
-    time = make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-    return make("std_msgs/msg/Header", stamp=time, frame_id="odom")
+    def _header(self, stamp_ns: int) -> object:
+        time = make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        return make("std_msgs/msg/Header", stamp=time, frame_id=self._frames.odom_frame)

@@ -1,0 +1,272 @@
+"""Localization: the filter's odometry, and a graph of its keyframes with loop closures and positions. Poses are ``map_T_body``.
+
+The filter never depends on the graph, but for the corrections of the motion model: ``odom_T_body`` is continuous, and loops move ``map_T_odom``
+(REP-105).
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from localization.errors import EstimatorError
+from localization.estimators.base import Estimate
+from localization.estimators.filter import KEY, PARAMS
+from localization.estimators.fusion import EkfFusion
+from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
+from localization.events import PositionSample
+from localization.lidar import LidarConfig, LostScans
+from localization.lidar.loop_detection import Keyframe, LoopDetector
+from localization.settings import Positive, Settings, Signed
+from localization.synchronizer import Step
+from localization.trajectory import Trajectory
+from motion_models import se2
+from motion_models.base import Motion
+from motion_models.corrections import Corrections
+from motion_models.se2 import FloatArray
+
+_BETWEEN_FLOOR = np.diag([5e-3, 5e-3, 1e-3]) ** 2
+"""Covariance of a motion between keyframes, at least: submaps bend [m^2, m^2, rad^2]."""
+_MIN_POSITIONS, _MIN_BASELINE_M = 3, 5.0
+"""Positions, and the distance between them [m], from which they give the heading of the map."""
+_WALK_S = 60.0
+"""Corrections are constant for this long [s]; as a random walk of an hour they change by an eighth of their prior sigma meanwhile."""
+
+
+@dataclass(frozen=True)
+class GraphConfig(Settings):
+    """Keyframes of the graph, and positions."""
+
+    keyframe_distance_m: Positive = 1.0
+    """A keyframe follows when the robot has moved this far [m]."""
+    keyframe_angle_rad: Positive = 0.5
+    """The same for turns [rad]."""
+    antenna_x_m: Signed = 0.0
+    """Where the antenna of `--positions` sits, ahead of the body's origin [m]; estimated within half a metre."""
+    antenna_y_m: Signed = 0.0
+    """The same, to its left [m]."""
+
+
+class GraphFusion:
+    """`EkfFusion` with a `PoseGraph` behind it."""
+
+    def __init__(self, odometry: EkfFusion, corrections: Corrections, lidar: LidarConfig, config: GraphConfig, is_smoothing: bool):
+        """``is_smoothing``: `finish` is to give the smoothed trajectory; memory then grows with the drive, 24 bytes a step."""
+        self.odometry, self._corrections, self._lidar, self._config = odometry, corrections, lidar, config
+        self._graph = PoseGraph(corrections.cov, np.array([config.antenna_x_m, config.antenna_y_m]))
+        self._loops: LoopDetector | None = None
+        self._wheels = _KeyframeMotion(len(corrections.names))
+        self._steps, self._stamps_ns = array("d"), array("q")  # the filter's poses, if they are to be smoothed
+        self._nodes = array("q")  # which of them are keyframes
+        self._is_smoothing = is_smoothing
+        self._is_keyframe_due = False
+        self._map_T_odom, self._key_cov = np.zeros(3), np.zeros((3, 3))
+        self._walked_s = 0.0
+        self._positions: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []  # keyframe, offset, position, cov: not aligned yet
+        self._waiting: list[PositionSample] = []
+        self._is_aligned = False
+        self.n_loops = self.n_positions = 0
+
+    @property
+    def clock_offset_s(self) -> float:
+        return self.odometry.clock_offset_s
+
+    @property
+    def params(self) -> FloatArray:
+        return self.odometry.params
+
+    @property
+    def lost(self) -> LostScans | None:
+        """See `EkfFusion.lost`."""
+        return self.odometry.lost
+
+    def step(self, step: Step) -> Estimate:
+        """The filter's estimate, seen from the map."""
+        self.settle()
+        ekf = self.odometry.filter
+        estimate = self.odometry.step(step)
+        self._wheels.add(self.odometry.wheel_motion, self._corrections, self.odometry.is_turning)
+        self._walked_s += step.duration
+        if self._is_smoothing and (not self._stamps_ns or step.end_ns > self._stamps_ns[-1]):
+            self._steps.extend(ekf.pose)
+            self._stamps_ns.append(step.end_ns)
+        delta, cov = ekf.motion_since(KEY)
+        moved = math.hypot(delta[0], delta[1]) >= self._config.keyframe_distance_m or abs(delta[2]) >= self._config.keyframe_angle_rad
+        self._is_keyframe_due = not self._graph.count or (moved and (step.scan is not None or self.lost is None))
+        self._place_positions(step)
+        A = se2.adjoint(se2.inverse(delta))
+        pose = se2.compose(self._map_T_odom, ekf.pose)
+        odometry = estimate.pose, estimate.covariance
+        return replace(estimate, pose=pose, covariance=A @ self._key_cov @ A.T + cov, odometry=odometry, map_T_odom=self._map_T_odom)
+
+    def settle(self) -> None:
+        """What the last estimate need not wait for: the submap, a keyframe, loops, positions."""
+        self.odometry.settle()
+        if self._is_keyframe_due:
+            self._is_keyframe_due = False
+            self._add_keyframe()
+
+    def add_position(self, sample: PositionSample) -> None:
+        """A position by GPS. It is placed once the odometry has come to its stamp."""
+        self._waiting.append(sample)
+
+    def _add_keyframe(self) -> None:
+        ekf, k = self.odometry.filter, self._graph.count
+        if k:
+            delta, cov = ekf.motion_since(KEY)
+            wheels = self._wheels.preintegrated(ekf.corrections)
+            total = wheels.cov + wheels.by_corrections @ ekf.P[PARAMS:, PARAMS:] @ wheels.by_corrections.T
+            measured = _subtract_information(delta, cov + _BETWEEN_FLOOR, wheels.delta, total + _BETWEEN_FLOOR)
+            walk = self._corrections.walk_cov * self._walked_s if self._walked_s > _WALK_S else None
+            walk = None if walk is None or not len(walk) or not np.any(walk) else walk + 1e-12 * np.diag(self._corrections.sigmas**2)
+            self._walked_s = 0.0 if walk is not None else self._walked_s
+            pose = se2.compose(self._graph.pose(k - 1), delta)
+            update = Update(pose, wheels, walk, (Between(k - 1, k, *measured),))
+        else:
+            update = Update(ekf.pose)
+        self._graph.apply(update)
+        self._nodes.append(len(self._stamps_ns) - 1)
+        ekf.start_key()
+        self._wheels = _KeyframeMotion(len(self._corrections.names))
+        self._close_loops(Keyframe(ekf.pose, self.odometry.scan_points))
+        self._align_positions()
+        if len(self._corrections.names) and k:
+            ekf.set_corrections(*self._graph.corrections())
+        self._map_T_odom = se2.compose(self._graph.pose(k), se2.inverse(ekf.pose))
+        self._key_cov = self._graph.marginal(k)
+
+    def _close_loops(self, keyframe: Keyframe) -> None:
+        if self._loops is None:
+            if self.odometry.cell == 0.0:
+                return
+            self._loops = LoopDetector(self._lidar, self.odometry.cell)
+            self._loops.keyframes += [Keyframe(self._graph.pose(k), keyframe.points[:0]) for k in range(self._graph.count - 1)]
+        self._loops.add(keyframe)
+        loops = self._loops.detect(self._graph.poses, self._graph.marginal)
+        if loops:
+            self.n_loops += len(loops)
+            between = tuple(Between(loop.a, loop.b, loop.delta, np.linalg.inv(loop.cov), is_loop=True) for loop in loops)
+            self._graph.apply(Update(betweens=between))
+
+    def _place_positions(self, step: Step) -> None:
+        """Positions up to the end of ``step`` are taken from the newest keyframe."""
+        ekf = self.odometry.filter
+        while self._waiting and self._waiting[0].stamp_ns <= step.end_ns:
+            sample = self._waiting.pop(0)
+            if sample.stamp_ns < step.start_ns or not self._graph.count:
+                continue
+            part = (sample.stamp_ns - step.start_ns) / max(step.end_ns - step.start_ns, 1)
+            pose = se2.interpolate(ekf.start, ekf.pose, np.array(part))
+            offset = se2.between(ekf.key, pose)
+            self._positions.append((self._graph.count - 1, offset, sample.position, sample.covariance))
+
+    def _align_positions(self) -> None:
+        """Positions enter the graph, the first time together with the heading that they give to the map."""
+        if not self._positions:
+            return
+        alignment = None
+        if not self._is_aligned:
+            ours = np.array([se2.compose(self._graph.pose(k), offset)[:2] for k, offset, _, _ in self._positions])
+            theirs = np.array([position for _, _, position, _ in self._positions])
+            if len(ours) < _MIN_POSITIONS or np.hypot(*np.ptp(ours, axis=0)) < _MIN_BASELINE_M:
+                return
+            alignment, self._is_aligned = _align(ours, theirs), True
+        found = tuple(Position(*row) for row in self._positions)
+        self.n_positions += len(found)
+        self._graph.apply(Update(positions=found, alignment=alignment))
+        self._positions = []
+
+    def finish(self, moments: Trajectory | None = None) -> Trajectory | None:
+        """The smoothed trajectory at the stamps of ``moments``; None where nothing was asked for or nothing ties the drive but odometry."""
+        if self._is_keyframe_due:
+            self.settle()
+        self.odometry.settle()
+        if not self._is_smoothing or moments is None or self._graph.count < 2:
+            return None
+        poses, covs = self._graph.smooth()
+        if not (np.isfinite(poses).all() and np.isfinite(covs).all()):
+            raise EstimatorError("the pose graph has no finite solution. Look at the log.")
+        smoothed, smoothed_covs = _interpolate(np.array(self._nodes), poses, covs, np.array(self._steps).reshape(-1, 3))
+        return Trajectory(moments.stamps_ns, smoothed, smoothed_covs)
+
+    def parameters(self) -> Mapping[str, tuple[float, float]]:
+        return self.odometry.parameters()
+
+    def counts(self) -> Mapping[str, int]:
+        found = {**self.odometry.counts(), "keyframes": self._graph.count}
+        if self._loops is not None:
+            found["loops"] = self.n_loops
+        return {**found, "positions": self.n_positions} if self.n_positions else found
+
+    def map_points(self) -> FloatArray:
+        """(M, 2) the scans of all keyframes, where the graph has them [m]."""
+        if self._loops is None:
+            return self.odometry.map_points()
+        poses = self._graph.poses()
+        drawn = [se2.transform(pose, key.points) for pose, key in zip(poses, self._loops.keyframes, strict=False) if len(key.points)]
+        return np.vstack(drawn) if drawn else np.empty((0, 2))
+
+
+class _KeyframeMotion:
+    """Preintegrates steps from keyframe to keyframe."""
+
+    def __init__(self, n: int) -> None:
+        self._delta, self._cov = np.zeros(3), np.zeros((3, 3))
+        self._by_corrections, self._straight = np.zeros((3, n)), np.zeros((3, n))
+        self._prior = np.zeros((n, n))
+
+    def add(self, motion: Motion, corrections: Corrections, is_turning: bool) -> None:
+        """The next step. What is nearly straight says nothing of the corrections: there they are one error of the whole motion."""
+        A = se2.adjoint(se2.inverse(motion.delta))
+        self._delta = se2.compose(self._delta, motion.delta)
+        self._cov = A @ self._cov @ A.T + motion.cov
+        D = motion.d_params @ corrections.directions if motion.d_params.shape[1] else np.zeros_like(self._straight)
+        self._by_corrections = A @ self._by_corrections + (D if is_turning else 0.0)
+        self._straight = A @ self._straight + (0.0 if is_turning else D)
+        self._prior = corrections.cov
+
+    def preintegrated(self, at: FloatArray) -> PreintegratedMotion:
+        """All of it, with the corrections ``at`` which the steps were predicted."""
+        cov = self._cov + self._straight @ self._prior @ self._straight.T + 1e-10 * np.eye(3)
+        return PreintegratedMotion(self._delta, cov, self._by_corrections, at)
+
+
+def _subtract_information(delta: FloatArray, cov: FloatArray, prior: FloatArray, prior_cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What gyro and scans say of a motion, where they and the wheels' ``prior`` (3,) together give ``delta`` (3,): motion, information.
+
+    The wheels have a factor of their own, and must not be counted twice: information C^-1 - C_w^-1, where it is positive.
+    """
+    joint, own = np.linalg.inv(cov), np.linalg.inv(prior_cov)
+    values, vectors = np.linalg.eigh(joint - own)
+    information = (vectors * np.maximum(values, 1e-6)) @ vectors.T
+    shift = np.linalg.solve(information, own @ se2.log(se2.between(prior, delta)))
+    reliable = vectors @ np.diag((values > 1.0).astype(float)) @ vectors.T
+    return se2.compose(delta, se2.exp(reliable @ shift)), information
+
+
+def _align(ours: FloatArray, theirs: FloatArray) -> FloatArray:
+    """Pose (3,) that moves points ``ours`` (N, 2) onto ``theirs`` (N, 2) by least squares (Umeyama 1991, without scale)."""
+    a, b = ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)
+    yaw = math.atan2(float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), float(np.sum(a * b)))
+    turned = se2.transform(np.array([0.0, 0.0, yaw]), ours.mean(axis=0))
+    return np.array([*(theirs.mean(axis=0) - turned), yaw])
+
+
+def _interpolate(nodes: FloatArray, poses: FloatArray, covs: FloatArray, odom: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Poses (N, 3) and covariances of all steps, whose odometry is ``odom`` (N, 3), where the ``nodes`` (K,) of them are at ``poses`` (K, 3).
+
+    What the motion between two keyframes has changed by grows evenly along it, and not where the robot stands.
+    """
+    steps = se2.between(odom[:-1], odom[1:])
+    travelled = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]) + np.abs(steps[:, 2]) + 1e-9)])
+    k = np.clip(np.searchsorted(nodes, np.arange(len(odom)), side="right") - 1, 0, len(nodes) - 2)
+    since, until = se2.between(odom[nodes[k]], odom), se2.between(odom, odom[nodes[k + 1]])
+    part = np.clip((travelled - travelled[nodes[k]]) / (travelled[nodes[k + 1]] - travelled[nodes[k]]), 0.0, 1.0)
+    forward, backward = se2.compose(poses[k], since), se2.compose(poses[k + 1], se2.inverse(until))
+    A, B = se2.adjoint(se2.inverse(since)), se2.adjoint(until)
+    mixed = (1.0 - part)[:, None, None] * (A @ covs[k] @ A.swapaxes(-1, -2)) + part[:, None, None] * (B @ covs[k + 1] @ B.swapaxes(-1, -2))
+    return se2.compose(forward, se2.exp(part[:, None] * se2.log(se2.between(forward, backward)))), mixed

@@ -1,0 +1,268 @@
+"""Pose graph in GTSAM: keyframes, tied by wheels, scan matching, loop closures and positions, with the motion model's corrections.
+
+    x_k          keyframe poses ``map_T_body``
+    c_j          corrections of the motion model (k, centre of rotation, ... by name): one vector for each minute or so, a random walk
+    t, l         ``enu_T_map`` and the lever arm of the positions' antenna, if there are positions
+
+Incremental by ISAM2 (Kaess et al. 2012) on the way; Levenberg-Marquardt and marginals at the end. All perturbations act on the right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from localization.estimators.measurement_models import motion_residual, position_residual
+from motion_models import se2
+from motion_models.se2 import FloatArray
+
+_ALIGNMENT, _LEVER = gtsam.symbol("t", 0), gtsam.symbol("l", 0)
+_FIRST_SIGMA = np.array([1e-3, 1e-3, 1e-4])
+"""The first keyframe is the origin of the map [m, m, rad]."""
+_CAUCHY = 1.0
+"""Scale of the robust loss of loop closures [sigma]."""
+_HUBER = 1.345
+"""Scale of the robust loss of wheels and positions [sigma]: 95 % efficiency on Gaussian noise (Huber 1981)."""
+_LEVER_SIGMA_M = 0.5
+"""Where the antenna may be, away from the given lever arm [m]."""
+_ALIGNMENT_SIGMA = np.array([1e3, 1e3, 1e3])
+_MAX_ITERATIONS, _CONVERGED = 50, 1e-8
+
+
+@dataclass(frozen=True)
+class PreintegratedMotion:
+    """The wheels' motion from keyframe to keyframe, by any motion model."""
+
+    delta: FloatArray
+    """(3,) at the corrections ``at``."""
+    cov: FloatArray
+    """(3, 3)"""
+    by_corrections: FloatArray
+    """(3, c) its derivative (right perturbation)."""
+    at: FloatArray
+    """(c,)"""
+
+
+@dataclass(frozen=True)
+class Between:
+    """A measured motion from keyframe ``a`` to keyframe ``b``, with the information (3, 3) of its right perturbation."""
+
+    a: int
+    b: int
+    delta: FloatArray
+    information: FloatArray
+    is_loop: bool = False
+
+
+@dataclass(frozen=True)
+class Position:
+    """A position by GPS, at ``offset`` (3,) from keyframe ``k``."""
+
+    k: int
+    offset: FloatArray
+    position: FloatArray
+    """(2,) east, north [m]."""
+    cov: FloatArray
+    """(2, 2)"""
+
+
+@dataclass(frozen=True)
+class Update:
+    """What enters the graph at once. Replayed in order, updates give the same graph to the last bit."""
+
+    pose: FloatArray | None = None
+    """(3,) initial value of the next keyframe, if there is one."""
+    wheels: PreintegratedMotion | None = None
+    walk_cov: FloatArray | None = None
+    """(c, c) if the corrections go on as a new variable: how far they may have changed."""
+    betweens: tuple[Between, ...] = ()
+    positions: tuple[Position, ...] = ()
+    alignment: FloatArray | None = None
+    """(3,) initial value of ``enu_T_map``, with the first positions."""
+
+
+@dataclass
+class PoseGraph:
+    """Add keyframes by `apply`; `poses`, `corrections` and `marginal` are the estimates by all that was added."""
+
+    prior_cov: FloatArray
+    """(c, c) of the corrections, around zero."""
+    lever: FloatArray = field(default_factory=lambda: np.zeros(2))
+    """(2,) of the positions' antenna in the body frame [m]."""
+    updates: list[Update] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        params = gtsam.ISAM2Params()
+        params.relinearizeSkip = 1
+        params.setFactorization("QR")  # CHOLESKY ended in IndeterminateLinearSystem after thousands of ordinary steps
+        self._isam, self.count, self._walks = gtsam.ISAM2(params), 0, 0
+        updates, self.updates = self.updates, []
+        for update in updates:
+            self.apply(update)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"prior_cov": self.prior_cov, "lever": self.lever, "updates": self.updates}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state)  # type: ignore[misc]
+
+    def apply(self, update: Update) -> None:
+        """Add ``update`` and solve."""
+        self.updates.append(update)
+        factors, values = self._factors(update)
+        self._isam.update(factors, values)
+        if any(between.is_loop for between in update.betweens) or update.alignment is not None:
+            for _ in range(2):
+                self._isam.update()
+        self._values = self._isam.calculateEstimate()
+
+    def pose(self, k: int) -> FloatArray:
+        """(3,) ``map_T_body`` of keyframe ``k``."""
+        return _array(self._values.atPose2(gtsam.symbol("x", k)))
+
+    def poses(self) -> FloatArray:
+        """(count, 3)"""
+        return np.array([self.pose(k) for k in range(self.count)]).reshape(-1, 3)
+
+    def marginal(self, k: int) -> FloatArray:
+        """(3, 3) covariance of keyframe ``k``."""
+        return np.asarray(self._isam.marginalCovariance(gtsam.symbol("x", k)))
+
+    def corrections(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (c,) and covariance (c, c) of the corrections."""
+        if not len(self.prior_cov) or not self.count:
+            return np.zeros(len(self.prior_cov)), self.prior_cov
+        key = gtsam.symbol("c", self._walks)
+        return np.asarray(self._values.atVector(key)), np.asarray(self._isam.marginalCovariance(key))
+
+    def smooth(self) -> tuple[FloatArray, FloatArray]:
+        """Poses (count, 3) by all measurements, by Levenberg-Marquardt, and their covariances (count, 3, 3)."""
+        graph, values = gtsam.NonlinearFactorGraph(), self._values
+        count, self.count, self._walks = self.count, 0, 0
+        for update in self.updates:
+            graph.push_back(self._factors(update)[0])
+        assert self.count == count
+        values = _levenberg_marquardt(graph, values)
+        linear = graph.linearize(values)
+        marginals = gtsam.Marginals(linear, linear.optimize())
+        keys = [gtsam.symbol("x", k) for k in range(count)]
+        self._values = values
+        return self.poses(), np.array([marginals.marginalCovariance(key) for key in keys])
+
+    def _factors(self, update: Update) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        if update.pose is not None:
+            self._add_keyframe(update.pose, factors, values)
+        k = self.count - 1
+        if update.walk_cov is not None:
+            self._add_walk(update.walk_cov, factors, values)
+        if update.wheels is not None:
+            factors.add(_wheel_factor(k - 1, k, gtsam.symbol("c", self._walks), update.wheels))
+        for between in update.betweens:
+            noise = gtsam.noiseModel.Gaussian.Information(between.information)
+            if between.is_loop:
+                noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY), noise)
+            a, b = (gtsam.symbol("x", i) for i in (between.a, between.b))
+            factors.add(gtsam.BetweenFactorPose2(a, b, gtsam.Pose2(*between.delta), noise))
+        if update.alignment is not None:
+            sigma = gtsam.noiseModel.Diagonal.Sigmas
+            factors.add(gtsam.PriorFactorPose2(_ALIGNMENT, gtsam.Pose2(*update.alignment), sigma(_ALIGNMENT_SIGMA)))
+            factors.add(gtsam.PriorFactorPoint2(_LEVER, self.lever, sigma(np.full(2, _LEVER_SIGMA_M))))
+            values.insert(_ALIGNMENT, gtsam.Pose2(*update.alignment))
+            values.insert(_LEVER, self.lever)
+        for position in update.positions:
+            factors.add(_position_factor(position))
+        return factors, values
+
+    def _add_keyframe(self, pose: FloatArray, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        key = gtsam.symbol("x", self.count)
+        values.insert(key, gtsam.Pose2(*pose))
+        if not self.count:
+            factors.add(gtsam.PriorFactorPose2(key, gtsam.Pose2(*pose), gtsam.noiseModel.Diagonal.Sigmas(_FIRST_SIGMA)))
+            if len(self.prior_cov):
+                prior = np.zeros(len(self.prior_cov))
+                factors.add(gtsam.PriorFactorVector(gtsam.symbol("c", 0), prior, gtsam.noiseModel.Gaussian.Covariance(self.prior_cov)))
+                values.insert(gtsam.symbol("c", 0), prior)
+        self.count += 1
+
+    def _add_walk(self, cov: FloatArray, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        before, after = gtsam.symbol("c", self._walks), gtsam.symbol("c", self._walks + 1)
+        factors.add(gtsam.BetweenFactorVector(before, after, np.zeros(len(cov)), gtsam.noiseModel.Gaussian.Covariance(cov)))
+        values.insert(after, self.corrections()[0])
+        self._walks += 1
+
+
+def _wheel_factor(a: int, b: int, corrections: int, wheels: PreintegratedMotion) -> gtsam.CustomFactor:
+    """log((delta exp(D (c - c0)))^-1 (x_a^-1 x_b)): the motion model's prediction as a factor of both poses and the corrections."""
+    keys = [gtsam.symbol("x", a), gtsam.symbol("x", b)]
+    has_corrections = wheels.by_corrections.any()
+    if has_corrections:
+        keys.append(corrections)
+
+    def error(this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None) -> FloatArray:
+        D = wheels.by_corrections
+        shift = D @ (values.atVector(corrections) - wheels.at) if has_corrections else np.zeros(3)
+        predicted = se2.compose(wheels.delta, se2.exp(shift))
+        residual, by_a, by_b = motion_residual(_array(values.atPose2(keys[0])), _array(values.atPose2(keys[1])), predicted)
+        if H is not None:
+            H[0], H[1] = np.asfortranarray(by_a), np.asfortranarray(by_b)
+            if has_corrections:
+                by_predicted = -by_b @ se2.adjoint(se2.exp(-residual))
+                H[2] = np.asfortranarray(by_predicted @ se2.right_jacobian(shift) @ D)
+        return residual
+
+    return _robust_factor(keys, wheels.cov, error)
+
+
+def _position_factor(position: Position) -> gtsam.CustomFactor:
+    """t x_k (offset l) - p: where the antenna at lever arm l is, against the measured position."""
+    key = gtsam.symbol("x", position.k)
+
+    def error(this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None) -> FloatArray:
+        enu_T_map, map_T_key, lever = values.atPose2(_ALIGNMENT), values.atPose2(key), np.asarray(values.atPoint2(_LEVER))
+        enu_T_map, map_T_key = _array(enu_T_map), _array(map_T_key)
+        in_key = se2.transform(position.offset, lever)
+        _, by_offset, by_lever = position_residual(position.offset, lever, in_key)
+        on_map, by_key, by_point = position_residual(map_T_key, in_key, np.zeros(2))
+        residual, by_alignment, by_map = position_residual(enu_T_map, on_map, position.position)
+        if H is not None:
+            H[0] = np.asfortranarray(by_alignment)
+            H[1] = np.asfortranarray(by_map @ by_key)
+            H[2] = np.asfortranarray(by_map @ by_point @ by_lever)
+        return np.asarray(residual)
+
+    return _robust_factor([_ALIGNMENT, key, _LEVER], position.cov, error)
+
+
+def _robust_factor(keys: Sequence[int], cov: FloatArray, error: Callable[..., FloatArray]) -> gtsam.CustomFactor:
+    """Pass a covariance, never a lower-triangular root: GTSAM takes that as diagonal, silently."""
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER)
+    return gtsam.CustomFactor(gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(cov)), list(keys), error)
+
+
+def _levenberg_marquardt(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+    """GTSAM's own loop copies all values at every Python callback; this one does the same without: damped steps until the cost stays."""
+    cost, damping = graph.error(values), 0.0
+    for _ in range(_MAX_ITERATIONS):
+        linear = graph.linearize(values)
+        for key, block in linear.hessianBlockDiagonal().items() if damping else ():
+            n = len(block)
+            linear.add(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(n), np.zeros(n), gtsam.noiseModel.Unit.Create(n)))
+        moved = values.retract(linear.optimize())
+        new_cost = graph.error(moved)
+        if new_cost > cost * (1.0 + 1e-12) + 1e-12:
+            damping = max(10.0 * damping, 1e-3)
+            continue
+        values, is_done = moved, cost - new_cost <= _CONVERGED * cost + 1e-9
+        cost, damping = new_cost, 0.1 * damping if damping > 1e-6 else 0.0
+        if is_done:
+            break
+    return values
+
+
+def _array(pose: gtsam.Pose2) -> FloatArray:
+    return np.array([pose.x(), pose.y(), pose.theta()])

@@ -1,0 +1,128 @@
+"""Loop detection: whether a keyframe is at a place that was mapped long before, by correlative search and alignment of local submaps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from localization.lidar.correlative_search import draw_image, search
+from localization.lidar.scan_matcher import LidarConfig, align_points
+from localization.lidar.submap import make_grid, voxel_means
+from motion_models import se2
+from motion_models.se2 import FloatArray
+
+_EVERY = 2
+"""Keyframes between trials."""
+_MIN_KEYFRAMES = 25
+"""Keyframes that must lie between both visits: what is nearer in time is in the filter's own submap."""
+_AROUND = 8
+"""Keyframes before and after the old one whose scans make its submap."""
+_RECENT = 5
+"""Keyframes whose scans are matched together: one scan fits many places, five of them few."""
+_CHAIN_SCALE = 4.0
+"""Variance of the drift since the old visit, over the graph's marginal: only the size of the search depends on it."""
+_PLACE_COV = np.diag([0.05, 0.05, 0.01]) ** 2
+_LIMIT_CELLS, _LIMIT_RAD = 40.0, 0.5
+"""Half the widest window of a search."""
+_MAX_RIVAL = 0.85
+"""A loop is ambiguous where a pose elsewhere scores more than this share of the best."""
+_MIN_OVERLAP = 0.65
+_MAX_SIGMA_M = 0.25
+"""Scenes that leave a direction open to more than this close no loop [m]."""
+_FLOOR_COV = np.diag([0.02, 0.02, 0.005]) ** 2
+"""Submaps bend: covariance of a loop, at least [m^2, m^2, rad^2]."""
+_HEADING_WEIGHT = 0.3
+"""How much a turned scanner, which sees other walls, counts as distance: of the median range, per radian."""
+_AGREE_M, _AGREE_RAD = 0.15, 0.06
+"""Two loops agree where one predicts the other within this and 3 sigma."""
+_AGREE_WITHIN = 6 * _EVERY
+"""Keyframes within which a second loop has to agree."""
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    odom_T_body: FloatArray
+    """(3,) the filter's pose."""
+    points: FloatArray
+    """(N, 2) of its scan, in the body frame [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoopClosure:
+    """Keyframe ``b`` was measured from keyframe ``a``, visited long before."""
+
+    a: int
+    b: int
+    delta: FloatArray
+    """(3,) ``a_T_b``."""
+    cov: FloatArray
+    """(3, 3) of its right perturbation."""
+
+
+class LoopDetector:
+    """Give it each keyframe; it answers with the loops that two trials agree on."""
+
+    def __init__(self, config: LidarConfig, cell: float) -> None:
+        """``cell``: edge of voxels [m]."""
+        self._config, self._cell = config, cell
+        self.keyframes: list[Keyframe] = []
+        self._pending: list[LoopClosure] = []
+        self._closed: set[tuple[int, int]] = set()
+
+    def add(self, keyframe: Keyframe) -> None:
+        self.keyframes.append(keyframe)
+
+    def detect(self, poses: Callable[[], FloatArray], marginal: Callable[[int], FloatArray]) -> list[LoopClosure]:
+        """Loops that end at the newest keyframe, or shortly before. ``poses()`` (K, 3) are the graph's, ``marginal(k)`` (3, 3) their covariance."""
+        k = len(self.keyframes) - 1
+        if k % _EVERY or k <= _MIN_KEYFRAMES or not len(self.keyframes[k].points):
+            return []
+        found = self._match(k, poses(), marginal(k))
+        self._pending = [loop for loop in self._pending if k - loop.b <= _AGREE_WITHIN]
+        if found is None:
+            return []
+        self._pending.append(found)
+        agreeing = [loop for loop in self._pending if loop is not found and self._agree(loop, found)]
+        new = [loop for loop in [*agreeing, found] if agreeing and (loop.a, loop.b) not in self._closed]
+        self._closed |= {(loop.a, loop.b) for loop in new}
+        return new
+
+    def _match(self, k: int, poses: FloatArray, marginal: FloatArray) -> LoopClosure | None:
+        points = self.keyframes[k].points
+        median = float(np.median(np.hypot(points[:, 0], points[:, 1])))
+        old = poses[: k - _MIN_KEYFRAMES + 1]
+        distance = np.hypot(*(old[:, :2] - poses[k, :2]).T)
+        turned = np.abs(se2.wrap_angle(old[:, 2] - poses[k, 2]))
+        j = int(np.argmin(distance + _HEADING_WEIGHT * median * turned))
+        prior = se2.between(poses[j], poses[k])
+        cov = _CHAIN_SCALE * marginal + _PLACE_COV
+        if distance[j] > 3.0 * math.sqrt(float(np.linalg.eigvalsh(marginal[:2, :2])[-1])) + 1.5 * median:
+            return None
+        place = self._merge(range(max(0, j - _AROUND), min(k - _MIN_KEYFRAMES, j + _AROUND) + 1), poses, j)
+        recent = voxel_means(self._merge(range(max(0, k - _RECENT + 1), k + 1), poses, k), 1.5 * self._cell)
+        limit = np.array([_LIMIT_CELLS * self._cell, _LIMIT_CELLS * self._cell, _LIMIT_RAD])
+        best = search(draw_image(place, self._cell), recent, prior, cov, limit)
+        if best.rival_score > _MAX_RIVAL * best.score:
+            return None
+        near = np.diag([2.0 * self._cell, 2.0 * self._cell, 0.03]) ** 2
+        fit = align_points(make_grid(place, self._cell, self._config.range_noise_m), recent, best.pose, near, best.pose)
+        own_cov = np.linalg.inv(fit.information + 1e-6 * np.eye(3))
+        if fit.overlap < _MIN_OVERLAP or math.sqrt(float(np.linalg.eigvalsh(own_cov[:2, :2])[-1])) > _MAX_SIGMA_M:
+            return None
+        return LoopClosure(j, k, fit.pose, own_cov + _FLOOR_COV)
+
+    def _merge(self, ids: range, poses: FloatArray, base: int) -> FloatArray:
+        """(N, 2) the scans of keyframes ``ids`` in the frame of keyframe ``base``."""
+        moved = [se2.transform(se2.between(poses[base], poses[i]), self.keyframes[i].points) for i in ids if len(self.keyframes[i].points)]
+        return np.vstack(moved)
+
+    def _agree(self, one: LoopClosure, other: LoopClosure) -> bool:
+        """Whether both loops and the odometry between their ends close: a1^-1 a2 and b1^-1 b2 are known by odometry."""
+        a = se2.between(self.keyframes[one.a].odom_T_body, self.keyframes[other.a].odom_T_body)
+        b = se2.between(self.keyframes[one.b].odom_T_body, self.keyframes[other.b].odom_T_body)
+        error = se2.between(se2.compose(one.delta, b), se2.compose(a, other.delta))
+        sigma = math.sqrt(float(np.trace(one.cov[:2, :2]) + np.trace(other.cov[:2, :2])))
+        return bool(math.hypot(error[0], error[1]) < _AGREE_M + 3.0 * sigma and abs(error[2]) < _AGREE_RAD)

@@ -1,0 +1,136 @@
+"""A robot on rclpy, in a process of its own: plays recorded messages in real time and records what is published of it.
+
+python robot.py MESSAGES, where MESSAGES is a pickle of (log time [ns], topic, type, bytes). Commands come on the standard input, one
+a line, and each is answered by one line: `play SECONDS`, `spin SECONDS`, `report` (JSON), `cloud BYTES COUNT` (PointCloud2 at 10 Hz).
+It imports nothing of this project.
+"""
+
+import importlib
+import json
+import pickle
+import sys
+import time
+from array import array
+from collections import deque
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import PointCloud2, PointField
+from tf2_msgs.msg import TFMessage
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+QUALITY = {"/scan": qos_profile_sensor_data, "/imu/data": qos_profile_sensor_data, "/tf_static": LATCHED}
+
+
+def stamp(message):
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+
+
+class Robot:
+    def __init__(self, messages):
+        rclpy.init(args=[])
+        self.node = rclpy.create_node("robot")
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.odometry, self.counts, self.statuses, self.tf = [], {}, {}, []
+        self.sent, self.latencies, self.first_s = {}, [], None
+        self.begin = time.monotonic()
+        for topic, kind in (("/skidloc/odometry", Odometry), ("/tf", TFMessage), ("/diagnostics", DiagnosticArray)):
+            self.node.create_subscription(kind, topic, getattr(self, f"on_{kind.__name__}"), 50)
+        kinds = {topic: kind for _, topic, kind, _ in messages}
+        self.publishers = {topic: self.publisher(topic, kind) for topic, kind in kinds.items()}
+        for _, topic, _, data in messages:
+            if topic == "/tf_static":
+                self.publishers[topic].publish(data)
+        self.left = deque(message for message in messages if message[1] != "/tf_static")
+
+    def publisher(self, topic, kind):
+        package, _, name = kind.split("/")
+        message = getattr(importlib.import_module(f"{package}.msg"), name)
+        return self.node.create_publisher(message, topic, QUALITY.get(topic, 50))
+
+    def on_Odometry(self, message):
+        now = time.monotonic()
+        self.first_s = now - self.begin if self.first_s is None else self.first_s
+        if stamp(message) in self.sent:
+            self.latencies.append(now - self.sent[stamp(message)])
+        self.odometry.append(message)
+
+    def on_TFMessage(self, message):
+        self.tf += [(t.header.frame_id, t.child_frame_id) for t in message.transforms]
+
+    def on_DiagnosticArray(self, message):
+        self.statuses |= {s.name: {"level": s.level[0], "message": s.message} for s in message.status}
+
+    def spin(self, seconds):
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0.0:
+            self.executor.spin_once(timeout_sec=left)
+
+    def play(self, seconds):
+        begin, first = time.monotonic(), self.left[0][0] if self.left else 0
+        while self.left and self.left[0][0] < first + seconds * 1e9:
+            at, topic, _, data = self.left.popleft()
+            self.spin(begin + (at - first) * 1e-9 - time.monotonic())
+            if topic == "/scan":
+                sec, nanosec = memoryview(data)[4:12].cast("I")  # the header's stamp comes first
+                self.sent[sec * 10**9 + nanosec] = time.monotonic()
+            self.publishers[topic].publish(data)
+        self.spin(1.0)
+
+    def cloud(self, size, count):
+        """``count`` clouds of ``size`` bytes at 10 Hz on /points, reliable as most drivers send them."""
+        publisher = self.node.create_publisher(PointCloud2, "/points", 5)
+        points = size // 16
+        fields = [PointField(name=n, offset=4 * i, datatype=7, count=1) for i, n in enumerate("xyz")]
+        message = PointCloud2(
+            height=1, width=points, point_step=16, row_step=16 * points, fields=fields, data=array("B", bytes(16 * points))
+        )
+        message.header.frame_id = "base_link"
+        self.spin(2.0)
+        for _ in range(count):
+            now = time.time_ns()
+            message.header.stamp.sec, message.header.stamp.nanosec = now // 10**9, now % 10**9
+            publisher.publish(message)
+            self.spin(0.1)
+        self.spin(1.0)
+
+    def report(self):
+        infos = self.node.get_publishers_info_by_topic("/skidloc/odometry")
+        return {
+            "nodes": sorted(self.node.get_fully_qualified_node_names())
+            if hasattr(self.node, "get_fully_qualified_node_names")
+            else sorted(f"{namespace.rstrip('/')}/{name}" for name, namespace in self.node.get_node_names_and_namespaces()),
+            "hashes": [[str(info.topic_type_hash), info.node_name] for info in infos],
+            "sent": len(self.sent),
+            "answered": len(self.latencies),
+            "latencies_s": self.latencies,
+            "first_s": self.first_s,
+            "tf": sorted(set(self.tf)),
+            "tf_count": len(self.tf),
+            "frames": sorted({(o.header.frame_id, o.child_frame_id) for o in self.odometry}),
+            "poses": [[o.pose.pose.position.x, o.pose.pose.position.y] for o in self.odometry],
+            "statuses": self.statuses,
+        }
+
+
+def main():
+    robot = Robot(pickle.load(open(sys.argv[1], "rb")))  # noqa: SIM115
+    print("up", flush=True)
+    for line in sys.stdin:
+        command, *numbers = line.split()
+        if command == "report":
+            print(json.dumps(robot.report()), flush=True)
+            continue
+        getattr(robot, command)(*(float(n) if command != "cloud" else int(n) for n in numbers))
+        print("done", flush=True)
+    robot.executor.shutdown()
+    robot.node.destroy_node()
+    rclpy.shutdown()
+
+
+if __name__ == "__main__":
+    main()
