@@ -11,12 +11,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from localization.lidar.kiss import Kiss
+from localization.lidar.matcher import in_range
 
 from localization.consistency import mean_band, nees
 from localization.events import Scan
 from localization.lidar import LidarMatcher
-from localization.lidar.kiss import Kiss
-from localization.lidar.matcher import in_range
 from localization.simulate import world
 from motion_models import se2
 from motion_models.robot import WheelNoise

@@ -14,14 +14,14 @@ import time
 from pathlib import Path
 
 import numpy as np
+from localization.lidar.kiss import Kiss
+from localization.lidar.matcher import in_range, voxel_size
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from localization.events import Scan
 from localization.lidar import LidarConfig
-from localization.lidar.kiss import Kiss
-from localization.lidar.matcher import in_range, voxel_size
 from localization.logs import open_log
 from localization.run import Pair, replay
 from motion_models.integrate import preintegrate

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
-from localization.events import CgSample, Scan, WheelSample
 from localization.lidar.matcher import LidarMatcher
 from localization.lidar.sweep import Sweep
+
+from localization.events import CgSample, Scan, WheelSample
 from localization.logs import open_log
 from localization.simulate.experiments import grid_points
 from localization.simulate.runs import RunRecord
