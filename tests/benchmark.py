@@ -11,7 +11,6 @@ PARTS = (
     "tests.benchmarks.online",
     "tests.benchmarks.compare",
     "tests.benchmarks.lidar",
-    "tests.benchmarks.graph",
     "tests.benchmarks.diagnosis",
     "tests.studies.thesis_regressions",
     "tests.studies.friction_grid",

@@ -36,9 +36,8 @@ def ekf(drive: rooms.Drive, **lidar) -> Run:
 
 
 def make_core(drive: rooms.Drive, mounts: dict[str, Mount] | None = None) -> Core:
-    return Core(
-        Pair(make_model("diff_drive", rooms.ROBOT), "ekf"), rooms.ROBOT, drive.mounts if mounts is None else mounts, True, ReplayConfig()
-    )
+    pair = Pair(make_model("diff_drive", rooms.ROBOT), "ekf")
+    return Core(pair, rooms.ROBOT, drive.mounts if mounts is None else mounts, True, ReplayConfig())
 
 
 def scans_of(drive: rooms.Drive) -> list[Scan]:
@@ -117,10 +116,9 @@ def test_clock_offset_is_learned(offset_s: float, wheel_every: int) -> None:
 
 def test_deskewing_by_the_filters_twist_follows_slip() -> None:
     drive = rooms.drive_through(LAB, TOUR, 0)
-    at_once = replace(
-        drive, events=[replace(e, stamp_ns=e.middle_ns, offsets=np.empty(0)) if isinstance(e, Scan) else e for e in drive.events]
-    )
-    at_once.events.sort(key=lambda e: e.stamp_ns)
+    scans = [replace(scan, stamp_ns=scan.middle_ns, offsets=np.empty(0)) for scan in scans_of(drive)]
+    wheels = [e for e in drive.events if not isinstance(e, Scan)]
+    at_once = replace(drive, events=sorted([*scans, *wheels], key=lambda e: e.stamp_ns))
     with_times, without = (second_error(drive, rooms.at_scans(drive, ekf(d))[0]) for d in (drive, at_once))
     assert with_times[1] < 0.3 * without[1]
     assert with_times[0] < 0.5 * without[0]
@@ -164,7 +162,7 @@ def test_encoders_that_read_zero_while_the_robot_moves_are_overruled() -> None:
 
     drive = rooms.drive_through(LAB, rooms.path((1, 0, 0), (12, 0.4, 0.4), (1, 0, 0)), 0, wheels=stuck)
     result = rooms.results(drive, "odometry", "ekf")
-    poses, covs = rooms.at_scans(drive, result["ekf"])
+    poses, _ = rooms.at_scans(drive, result["ekf"])
     assert rooms.ate(drive, rooms.at_scans(drive, result["odometry"])[0]) > 0.5
     assert rooms.ate(drive, poses) < 0.02
     assert np.hypot(*(poses - drive.poses)[:, :2].T).max() < 0.1
@@ -194,9 +192,8 @@ def test_frozen_scanner_is_found_out(driven: rooms.Drive) -> None:
     assert core.estimator.counts()["stale"] == len(SPOILT) - 1
     assert worst(driven, estimates, SPOILT.start, SPOILT.stop) < 0.1  # by wheels
     assert worst(driven, estimates, SPOILT.stop + 5, len(driven.poses)) < 0.02  # the old submap is found again
-    assert core.notes() == [
-        f"{len(SPOILT) - 1} scans told the very same ranges as the one before although the robot drove: the wheels carried on alone."
-    ]
+    (note,) = core.notes()
+    assert note.startswith(f"{len(SPOILT) - 1} scans told the very same ranges as the one before although the robot drove")
 
 
 def test_scanner_that_froze_on_the_way_stays_stale_at_rest() -> None:
@@ -372,6 +369,6 @@ def test_input_that_is_not_finite_is_refused(driven: rooms.Drive) -> None:
     core = make_core(driven)
     for event in driven.events[:100]:
         core.push(event)
+    leaps = [replace(e, position=e.position + 1e200 * k) for k, e in enumerate(driven.events[100:160]) if isinstance(e, WheelSample)]
     with pytest.raises(EstimatorError, match="not finite, or too large"):
-        for k, event in enumerate(driven.events[100:160]):
-            core.push(replace(event, position=event.position + 1e200 * k) if isinstance(event, WheelSample) else event)
+        list(map(core.push, [*leaps, *scans_of(driven)[20:40]]))

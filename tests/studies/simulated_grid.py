@@ -15,16 +15,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from localization.lidar.matcher import LidarMatcher
-from localization.lidar.sweep import Sweep
 
 from localization.events import CgSample, Scan, WheelSample
+from localization.lidar import LidarConfig, ScanMatcher, Sweep, choose_cell
 from localization.logs import open_log
 from localization.simulate.experiments import grid_points
 from localization.simulate.runs import RunRecord
 from localization.simulate.simulator import simulate, write_simulation
 from localization.simulate.suite import START_NS
 from localization.simulate.vehicle import TWIST, Body, VehicleConfig, VehicleState, advance
+from localization.trajectory import IntArray
 from motion_models import se2
 from motion_models.center_of_rotation import center_from_end_poses
 from motion_models.registry import make_model
@@ -32,8 +32,10 @@ from motion_models.regressions import Regression, regress
 from motion_models.robot import Mount, load_robot
 from motion_models.se2 import FloatArray
 
-_REST_S, _RATE_HZ = 1.2, 12.5
-_MAPPED_RAD = 0.3
+_REST_S = 1.2
+_DRAWN_AT_REST = 6  # scans that begin the map, before the robot turns
+_MAPPED_RAD = 0.3  # turn after which the next scan enters the map
+_PRIOR_COV = 1e-3 * np.eye(3)  # of the motion from scan to scan, by that of the last [m^2, m^2, rad^2]
 _SETTLING = 5  # scans after the start, and before the end, that are left out: the vehicle's rates follow the wheels' by and by
 
 
@@ -91,31 +93,7 @@ def rotations(folder: Path, seed: int = 0) -> list[Rotation]:
 def _measure(run: RunRecord, window: _Window, mount: Mount) -> Rotation:
     robot = load_robot("vaultbot")
     begin = START_NS + round(run.start_s * 1e9)
-    matcher, pose, mapped = LidarMatcher(), np.zeros(3), 0.0
-    step = np.zeros(3)
-    own = [np.zeros((3, 3)), np.zeros((3, 3))]  # covariances of the last two scans, between which the motion within a sweep is measured
-    poses, covs, stamps = [], [], []
-    drawn = np.zeros((3, 3))  # of the map: what is drawn farther on has the errors of all scans from which it was drawn
-    for number, scan in enumerate(window.scans):
-        sweep = Sweep.of(scan, mount)
-        guess = se2.compose(pose, se2.exp(step))
-        found = matcher.register(sweep.at_stamp(step * _RATE_HZ), True, guess, np.diag([1e-3, 1e-3, 1e-3]), sweep.offsets)
-        before = pose
-        if found is not None:
-            pose = found.pose
-            if scan.stamp_ns >= begin:
-                poses.append(pose)
-                late = _RATE_HZ * found.lateness
-                covs.append(found.cov + late @ (own[0] + own[1]) @ late.T + drawn)
-                stamps.append(scan.stamp_ns)
-            step = se2.log(se2.between(before, pose)) if number > 1 else np.zeros(3)
-            own = [own[1], found.cov]
-        if number < 6 or abs(pose[2] - mapped) > _MAPPED_RAD:
-            matcher.insert(pose)
-            mapped = pose[2]
-            if found is not None and number >= 6:
-                drawn = drawn + found.cov
-    track, cov = np.array(poses), np.array(covs)
+    stamps, track, cov = _track(window.scans, mount, begin)
 
     yaw = np.unwrap(track[:, 2])
     turns = np.abs(np.diff(yaw, prepend=yaw[0]))
@@ -139,6 +117,39 @@ def _measure(run: RunRecord, window: _Window, mount: Mount) -> Rotation:
     said = _centre(model.twist(rates, cg, model.nominal).value, per_wheels)
     settled = _centre(_settled(rates, cg), per_wheels)
     return Rotation(cg, k, sigma, centre.value, centre.cov, said, settled)
+
+
+def _track(scans: Sequence[Scan], mount: Mount, begin_ns: int) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Stamps (n,) from ``begin_ns`` on, poses (n, 3) and their covariances (n, 3, 3), by scan matching alone: each match starts from the
+    motion of the last."""
+    config = LidarConfig()
+    matcher, pose, mapped, twist = None, np.zeros(3), 0.0, np.zeros(3)
+    last_ns = scans[0].middle_ns
+    drawn = np.zeros((3, 3))  # covariance of the map: what is drawn farther on has the errors of all scans from which it was drawn
+    found = []
+    for number, scan in enumerate(scans):
+        sweep, gap = Sweep.from_scan(scan, mount), (scan.middle_ns - last_ns) * 1e-9
+        points = sweep.project(sweep.deskew(twist))
+        matcher = matcher or ScanMatcher(config, choose_cell(config, points))
+        prior, match = se2.compose(pose, se2.exp(gap * twist)), None
+        if number > 0:
+            match = matcher.match(points, prior, _PRIOR_COV)
+            assert match is not None, f"scan {number} fits nowhere"
+            twist = se2.log(se2.between(pose, match.measured)) / gap if number >= _DRAWN_AT_REST else np.zeros(3)
+            points = sweep.project(sweep.deskew(twist))
+            match = matcher.refine(points, prior, _PRIOR_COV, match)
+            assert match is not None, f"scan {number} fits nowhere"
+            pose = match.measured
+            if scan.stamp_ns >= begin_ns:
+                found.append((scan.middle_ns, pose, match.cov + drawn))
+        if number < _DRAWN_AT_REST or abs(pose[2] - mapped) > _MAPPED_RAD:
+            matcher.insert_key_scan(pose, points)
+            mapped = pose[2]
+            if match is not None and number >= _DRAWN_AT_REST:
+                drawn = drawn + match.cov
+        last_ns = scan.middle_ns
+    stamps, poses, covs = zip(*found, strict=True)
+    return np.array(stamps), np.array(poses), np.array(covs)
 
 
 def _centre(twist: FloatArray, per_wheels: float) -> FloatArray:
