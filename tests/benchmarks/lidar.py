@@ -14,6 +14,7 @@ import numpy as np
 
 from localization.consistency import mean_band, nees
 from localization.events import Scan
+from localization.lidar import KissIcp, LidarConfig, ScanMatcher, choose_voxel_size
 from localization.simulate import world
 from motion_models import se2
 from motion_models.robot import WheelNoise

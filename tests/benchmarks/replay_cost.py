@@ -19,7 +19,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from localization.events import Scan
-from localization.lidar import LidarConfig
+from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
 from localization.logs import open_log
 from localization.run import Pair, replay
 from motion_models.integrate import preintegrate
