@@ -16,7 +16,9 @@ demo: .venv/ready
 	$(BIN)/skidloc replay $(DATA)/husky-outdoor-gps/test1.bag --robot husky_a200 --model diff_drive,skid_steer --out $(DEMO)/husky
 	$(BIN)/skidloc replay $(DATA)/aces/aces.mcap --robot aces --model diff_drive,skid_steer --estimator odometry,lidar,ekf,graph \
 		--reference $(DATA)/aces/aces.relations --out $(DEMO)/aces
-	@echo "Open $(DEMO)/aces/report.html and $(DEMO)/husky/report.html in a browser."
+	$(BIN)/skidloc replay $(DATA)/fr079/fr079.mcap --robot $(DATA)/fr079/fr079.toml --model diff_drive --estimator odometry,lidar,ekf,graph \
+		--reference $(DATA)/fr079/fr079_reference.tum --out $(DEMO)/fr079
+	@echo "Open $(DEMO)/aces/report.html, $(DEMO)/fr079/report.html and $(DEMO)/husky/report.html in a browser."
 
 test: .venv/ready
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow"

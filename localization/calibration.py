@@ -13,9 +13,9 @@ import numpy as np
 from localization.errors import EvaluationError
 from localization.logs import Log, TopicOverrides, open_log
 from localization.maneuver_windows import WindowConfig, cut
+from localization.motion_references import GyroMotionReference, LidarMotionReference, MotionReference, TrackMotionReference
 from localization.references import ReferenceTrack, read_reference_file, reference_track
 from localization.trajectory import BoolArray
-from localization.witnesses import GyroWitness, LidarWitness, ReferenceWitness, Witness
 from motion_models.base import MotionModel
 from motion_models.calibrate import Fit, fit
 from motion_models.calibration_plan import Calibration, calibrate, free_of
@@ -27,7 +27,7 @@ from motion_models.registry import make_model
 from motion_models.robot import Robot, WheelNoise
 from motion_models.se2 import FloatArray
 
-WitnessName = Literal["auto", "lidar", "gyro", "reference"]
+MotionReferenceName = Literal["auto", "lidar", "gyro", "reference"]
 
 ADVICE = "Drive some 10 s straight, 10 s of turning in place to each side, and a few arcs, with a second of standing in between."
 _FOLDS, _FEWEST_GROUPS = 10, 3
@@ -78,12 +78,17 @@ class Calibrated:
 
 
 def cut_log(
-    path: Path, robot: Robot, topics: TopicOverrides, witness: WitnessName, reference: str | None, config: WindowConfig | None = None
+    path: Path,
+    robot: Robot,
+    topics: TopicOverrides,
+    witness: MotionReferenceName,
+    reference: str | None,
+    config: WindowConfig | None = None,
 ) -> Cut:
     """The maneuvers of a log, as measured by ``witness``; "auto" is the reference if one is named, else the LiDAR, else the gyro.
 
     A reference, even one that the robot file names, is never used unless the user says so: what is calibrated on it cannot be scored
-    against it. Raises `CalibrationError` where there is no witness, and what opening the log does.
+    against it. Raises `CalibrationError` where nothing measures the motion, and what opening the log does.
     """
     config = config or WindowConfig()
     log = open_log(path, robot, topics)
@@ -92,24 +97,27 @@ def cut_log(
             f"{log.path.name} has no wheels: neither joint states ({robot.topics.joint_states}) nor the driver's odometry"
             f" ({robot.topics.odometry}); name them with --topic.joint-states or --topic.odometry. `skidloc info` lists the topics."
         )
-    seen_by, words = _witness(log, robot, witness, reference, config)
+    motion_reference, words = make_motion_reference(log, robot, witness, reference, config)
     events = log.events()
-    windows = cut(events, seen_by, make_model("diff_drive", robot), robot, config, log.path.name)
+    windows = cut(events, motion_reference, make_model("diff_drive", robot), robot, config, log.path.name)
     kept = f"{len(windows.maneuvers)} windows of {config.window_s:g} s"
     left = f"{kept}; left out: {windows.standing} standing still, {windows.lost} not measured."
     return Cut(log.path.name, windows.maneuvers, words, (left, *windows.notes, *log.notes()))
 
 
-def _witness(log: Log, robot: Robot, name: WitnessName, reference: str | None, config: WindowConfig) -> tuple[Witness, str]:
+def make_motion_reference(
+    log: Log, robot: Robot, name: MotionReferenceName, reference: str | None, config: WindowConfig
+) -> tuple[MotionReference, str]:
+    """What measures the motion of ``log``, and its name in words. Raises `CalibrationError` where the log lacks it."""
     if name == "reference" or (name == "auto" and reference is not None):
         track = _track(log, reference)
-        return ReferenceWitness(track, config.window_s), f"reference {track.source}"
+        return TrackMotionReference(track, config.window_s), f"reference {track.source}"
     sources = log.sources
     if sources.lidar is not None and name in ("auto", "lidar"):
-        return LidarWitness(log.mounts, config.window_s), f"scan matching of {sources.lidar.topic}"
+        return LidarMotionReference(log.mounts, config.window_s), f"scan matching of {sources.lidar.topic}"
     if sources.imu is not None and name in ("auto", "gyro"):
-        return GyroWitness(robot.gyro_noise, log.mounts, config.window_s), f"gyro {sources.imu.topic}"
-    wanted = {"auto": "neither a LiDAR nor an IMU", "lidar": "no LiDAR", "gyro": "no IMU"}.get(name, "no witness")
+        return GyroMotionReference(robot.gyro_noise, log.mounts, config.window_s), f"gyro {sources.imu.topic}"
+    wanted = {"auto": "neither a LiDAR nor an IMU", "lidar": "no LiDAR", "gyro": "no IMU"}.get(name, "no motion reference")
     raise CalibrationError(
         f"{log.path.name} has {wanted}, so nothing measures what the wheels do; name a reference with headings with --reference, or topics"
         " with --topic.scan, --topic.points or --topic.imu. `skidloc info` lists them."

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from localization.commands.calibrate import Calibrate
 from localization.commands.cg import Cg
@@ -18,6 +17,7 @@ from localization.commands.info import Info
 from localization.commands.online import Online
 from localization.commands.replay import Replay
 from localization.commands.simulate import Simulate
+from localization.commands.terminal import PlainConsole
 from motion_models.errors import SkidlocError
 
 _BAD_INPUT = 2
@@ -37,7 +37,7 @@ Command = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code: 0, 2 for bad input."""
-    complaints = Console(stderr=True, soft_wrap=True, highlight=False)
+    complaints = PlainConsole(stderr=True, soft_wrap=True, highlight=False)
     try:
         command = tyro.cli(
             Command,
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             args=arguments,
             config=(tyro.conf.FlagCreatePairsOff,),
         )
-        command.run(Console(highlight=False))
+        command.run(PlainConsole(highlight=False))
     except SkidlocError as error:
         complaints.print(f"skidloc: {error}", markup=False)
         return _BAD_INPUT
@@ -55,6 +55,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _INTERRUPTED
     except BrokenPipeError:  # `skidloc info LOG | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:  # what no part of the program expected of the system: names that are too long, folders without permission
+        name = f"'{error.filename}': " if error.filename is not None else ""
+        complaints.print(f"skidloc: {name}{error.strerror or error}.", markup=False)
+        return _BAD_INPUT
+    except MemoryError:
+        complaints.print("skidloc: there is not enough memory for this. Use a shorter log, or smaller settings.")
+        return _BAD_INPUT
     return 0
 
 

@@ -7,11 +7,12 @@ import io
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from localization.compare_job import OK, Job, Row, Trial
 from localization.errors import OutputError
 from localization.estimators import CORRECTING
+from localization.output import output_errors, whole_file
 
 _HEAD = ("log", "robot", "model", "estimator", "corrections", "key", "status", "error")
 _TEXTS = (*_HEAD, "notes", "damage")
@@ -67,13 +68,12 @@ class Table:
         first = self.rows(jobs)
         known = {_name(row) for row in first}
         rows = first + [row for name, row in self._rows.items() if name not in known]
-        beside = self.path.with_name(f".{self.path.name}.new")
-        try:
+        with output_errors(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._write(beside, rows)
-            beside.replace(self.path)
-        except OSError as error:
-            raise OutputError(f"table '{self.path}' cannot be written: {error.strerror or error}.") from error
+        with whole_file(self.path, replace=True) as file:
+            self._write(file, rows)
+            file.flush()
+            os.fsync(file.fileno())
 
 
 def _name(row: Mapping[str, Any]) -> Name:
@@ -88,15 +88,12 @@ def _columns(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys([*_HEAD, *(name for row in rows for name in row)]))
 
 
-def _write_csv(path: Path, rows: Sequence[Row]) -> None:
+def _write_csv(file: BinaryIO, rows: Sequence[Row]) -> None:
     text = io.StringIO()
     writer = csv.DictWriter(text, _columns(rows), restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows({name: "" if value is None else value for name, value in row.items()} for row in rows)
-    with path.open("w", encoding="utf-8") as file:
-        file.write(text.getvalue())
-        file.flush()
-        os.fsync(file.fileno())
+    file.write(text.getvalue().encode("utf-8", errors="backslashreplace"))
 
 
 def _read_csv(path: Path) -> list[Row]:
@@ -110,7 +107,7 @@ def _number(text: str) -> float | int | None:
     return int(text) if text.lstrip("-").isdigit() else float(text)
 
 
-def _parquet(path: Path) -> tuple[Callable[[Path], list[Row]], Callable[[Path, Sequence[Row]], None]]:
+def _parquet(path: Path) -> tuple[Callable[[Path], list[Row]], Callable[[BinaryIO, Sequence[Row]], None]]:
     try:
         import pyarrow
         import pyarrow.parquet as parquet
@@ -125,7 +122,7 @@ def _parquet(path: Path) -> tuple[Callable[[Path], list[Row]], Callable[[Path, S
         except pyarrow.ArrowException as error:
             raise ValueError(" ".join(str(error).split())) from error
 
-    def write(path: Path, rows: Sequence[Row]) -> None:
+    def write(file: BinaryIO, rows: Sequence[Row]) -> None:
         """What no row has a number of is a column of numbers, too: the file's types do not depend on what has been run so far."""
         columns = {}
         for name in _columns(rows):
@@ -133,9 +130,6 @@ def _parquet(path: Path) -> tuple[Callable[[Path], list[Row]], Callable[[Path, S
             is_whole = any(type(value) is int for value in values) and all(value is None or type(value) is int for value in values)
             kind = pyarrow.string() if name in _TEXTS else pyarrow.int64() if is_whole else pyarrow.float64()
             columns[name] = pyarrow.array(values, kind)
-        with path.open("wb") as file:
-            parquet.write_table(pyarrow.table(columns), file)
-            file.flush()
-            os.fsync(file.fileno())
+        parquet.write_table(pyarrow.table(columns), file)
 
     return read, write

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from localization.compare_job import OK, Row
 from localization.compare_stats import Difference, Mean, combination, differences, means
+from localization.lidar_losses import is_long, per_cent
 from localization.report_lines import capitalised, joined, words_of
 from localization.report_tables import unit_of
 
@@ -56,6 +57,12 @@ class Findings:
         """What of a log could not be read, by log; of those that count nevertheless."""
         return {row["log"]: row["damage"] for row in self.rows if row.get("damage")}
 
+    def lost(self, name: str) -> list[Row]:
+        """Runs of a combination whose LiDAR was lost for so long that they cannot be recommended."""
+        return [
+            row for row in self.rows if combination(row) == name and is_long(row.get("lidar_lost_share"), row.get("lidar_longest_lost_s"))
+        ]
+
     def against_best(self, name: str) -> Difference | None:
         """None where the two have fewer than two logs in common."""
         pair = {name, self.best.name}
@@ -99,7 +106,7 @@ def against_best(other: Mean, found: Findings) -> str:
 
 def closing(found: Findings) -> list[str]:
     """What is missing, and what to do."""
-    return [*_incomplete(found), _advice(found)]
+    return [*_incomplete(found), *_losses(found), _advice(found)]
 
 
 def _of(d: Difference, found: Findings) -> str:
@@ -144,9 +151,30 @@ def _incomplete(found: Findings) -> list[str]:
     return said
 
 
+def _losses(found: Findings) -> list[str]:
+    """Combinations that lost the LiDAR for long, and where it was the longest."""
+    sentences = []
+    for mean in found.means:
+        if rows := found.lost(mean.name):
+            worst = max(rows, key=lambda row: row["lidar_longest_lost_s"])
+            where = f"{per_cent(worst['lidar_lost_share'])} of {worst['log']}, longest {worst['lidar_longest_lost_s']:.2g} s"
+            since = f"at t = {worst['lidar_longest_lost_since_s']:.0f} s"
+            sentences.append(f"Not recommended is {found.words[mean.name]}: LiDAR lost for long on {_logs(len(rows))} ({where} {since}).")
+    if sentences:
+        sentences.append("`skidloc replay` on those logs reports the causes.")
+    return sentences
+
+
 def _advice(found: Findings) -> str:
-    best, pairs = found.best, [(mean, found.against_best(mean.name)) for mean in found.means[1:]]
+    usable = [mean for mean in found.means if not found.lost(mean.name)]
+    if not usable:
+        return "No combination can be recommended."
+    if usable[0] is not found.best:
+        return f"Of the others, {found.words[usable[0].name]} has the smallest mean: {_amount(usable[0], found)}."
+    best, pairs = found.best, [(mean, found.against_best(mean.name)) for mean in usable[1:]]
     equal = [found.words[mean.name] for mean, d in pairs if d is None or not found.is_shown(d)]
+    if not pairs and len(found.means) > 1:
+        return f"Use {found.words[best.name]}."
     if not pairs:
         return "Name another model or estimator to have it compared."
     if not equal:

@@ -1,4 +1,4 @@
-"""Logs cut into maneuvers for calibration: seconds of wheel motion, each with what another witness measured of the same seconds."""
+"""Logs cut into maneuvers for calibration: seconds of wheel motion, each with the motion that a reference measured in the same seconds."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from localization.events import CgSample, Event, WheelSample
+from localization.motion_references import HOLD_S, MotionReference, Span, Wheels
 from localization.settings import Count, Positive, Settings
 from localization.wheel_history import WheelHistory
-from localization.witnesses import HOLD_S, Span, Wheels, Witness
 from motion_models.base import MotionModel
 from motion_models.maneuvers import Maneuver
 from motion_models.robot import Robot
@@ -26,7 +26,7 @@ class WindowConfig(Settings):
     """How a log is cut into maneuvers."""
 
     window_s: Positive = 2.0
-    """Length of a maneuver [s]: long enough for the wheels to stand out of the witness's noise, short enough not to drift."""
+    """Length of a maneuver [s]: long enough for the wheels to stand out of the reference's noise, short enough not to drift."""
     around_s: float = 0.3
     """Wheel motion kept before and after each, in which a shift between the clocks is looked for [s]."""
     least_m: float = 0.02
@@ -43,17 +43,22 @@ class Windows:
     standing: int
     """Windows that were left out because the robot stood still in them."""
     lost: int
-    """Windows that were left out because the wheels or the witness were not heard, or not trusted."""
+    """Windows that were left out because wheels or reference had no data, or no valid measurement."""
     notes: tuple[str, ...]
-    """What a user should know of the witness."""
+    """Limits of the motion reference, in sentences for the user."""
 
 
 def cut(
-    events: Iterable[Event], witness: Witness, model: MotionModel, robot: Robot, config: WindowConfig | None = None, name: str = "log"
+    events: Iterable[Event],
+    reference: MotionReference,
+    model: MotionModel,
+    robot: Robot,
+    config: WindowConfig | None = None,
+    name: str = "log",
 ) -> Windows:
-    """Cut a log's ``events`` into maneuvers as long as ``witness`` measures them; ``name`` begins the names of their groups.
+    """Cut a log's ``events`` into maneuvers as long as ``reference`` measures them; ``name`` begins the names of their groups.
 
-    The ``model``'s nominal parameters lead the search of the witness and tell left from right; what it measures does not depend on them.
+    The ``model``'s nominal parameters start the matching of scans and give turns their sign; what is measured does not depend on them.
     """
     config = config or WindowConfig()
     history = WheelHistory(robot.center_of_gravity, keep_s=2.0 * config.window_s + 10.0)
@@ -77,7 +82,7 @@ def cut(
         rolled = robot.geometry.wheel_radius_m * np.abs(rates[lead : lead + n]).T @ dt[lead : lead + n]
         if np.max(rolled) < config.least_m:
             still.append(span)
-        elif span.is_trusted:
+        elif span.is_valid:
             end = np.array([n], dtype=np.int64)
             found.append((span, Maneuver(dt, rates, span.measured[None], end, cg, span.cov, lead=lead)))
         else:
@@ -89,20 +94,20 @@ def cut(
             history.push(event)
         elif isinstance(event, CgSample):
             history.set_cg(event)
-        waiting.extend(witness.spans(event, wheels))
+        waiting.extend(reference.spans(event, wheels))
         if history.newest_ns is not None:
             for span in take(history.newest_ns):
                 lost += use(span)
     for span in take(None):
         lost += use(span)
-    corrected = witness.correct([span for span, _ in found], still)
+    corrected = reference.correct([span for span, _ in found], still)
     first = found[0][0].start_ns if found else 0
     maneuvers = []
     for (_, maneuver), span in zip(found, corrected, strict=True):
         number = int((span.start_ns - first) * _NS / (config.window_s * config.per_group))
         group = f"{name}, {number * config.window_s * config.per_group:g} s"
         maneuvers.append(dataclasses.replace(maneuver, measured=span.measured[None], cov=span.cov, group=group))
-    return Windows(tuple(maneuvers), len(still), lost, tuple(witness.notes()))
+    return Windows(tuple(maneuvers), len(still), lost, tuple(reference.notes()))
 
 
 def _window(history: WheelHistory, span: Span, around: int) -> tuple[FloatArray, FloatArray, FloatArray, int, int] | None:

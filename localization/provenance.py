@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from importlib.metadata import version
 from pathlib import Path
 
@@ -23,7 +24,7 @@ def fingerprint(path: Path) -> str:
     digest = hashlib.sha256()
     for file in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
         size = file.stat().st_size
-        digest.update(f"{file.relative_to(path)}\0{size}\0".encode())
+        digest.update(os.fsencode(file.relative_to(path)) + f"\0{size}\0".encode())
         with file.open("rb") as data:
             digest.update(data.read(_END))
             data.seek(max(size - _END, 0))

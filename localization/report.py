@@ -92,7 +92,11 @@ def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack 
     """The whole page."""
     lines = make_lines(results)
     best = best_line(lines) if reference is not None else None
-    near = [line for line in lines if best is not None and line is not best and line.error is not None and is_close(line, best)]
+    near = [
+        line
+        for line in lines
+        if best is not None and line is not best and line.error is not None and not line.is_lost and is_close(line, best)
+    ]
     sentences = verdict_sentences(results, reference)
     facts = f"{head.robot} · {head.duration_s:,.1f} s from {head.start}"
     parts = opening(f"Replay of {head.log}", facts, sentences)

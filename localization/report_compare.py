@@ -11,6 +11,7 @@ from pathlib import Path
 from localization.compare_stats import Difference, Mean, by_combination, combination
 from localization.compare_verdict import Findings, against_best, closing, headline, p_words, percent
 from localization.errors import OutputError
+from localization.output import write_text_file
 from localization.report_compare_plots import gains_svg, means_svg
 from localization.report_lines import capitalised, estimator_colours
 from localization.report_page import bullets, figure, glossary, html_page, opening, section
@@ -19,6 +20,7 @@ from localization.report_tables import MISSING, definition_table, header, number
 
 _TITLE = "Comparison over"
 _BEST, _EQUAL = ' <span class="badge">best</span>', ' <span class="badge soft">not told apart</span>'
+_LOST = ' <span class="badge soft">LiDAR lost</span>'
 _TERMS = (
     (
         "Mean",
@@ -52,13 +54,7 @@ class CompareHead:
 def write_comparison_report(path: Path, head: CompareHead, found: Findings) -> None:
     """Write the page, over the report of an earlier state of the same table, but over nothing else. Raises `OutputError`."""
     check_report(path)
-    beside = path.with_name(f".{path.name}.new")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside.write_text(comparison_page(head, found), encoding="utf-8")
-        beside.replace(path)
-    except OSError as error:
-        raise OutputError(f"'{path}' cannot be written: {error.strerror}.") from error
+    write_text_file(path, comparison_page(head, found), replace=True)
 
 
 def check_report(path: Path) -> None:
@@ -115,7 +111,7 @@ def _tests(found: Findings, styles: Mapping[str, tuple[str, int]]) -> str:
     for mean in found.means:
         d = None if mean is found.best else found.against_best(mean.name)
         interval = f"<br><small>{number(mean.low, digits)} to {number(mean.high, digits)}</small>" if mean.n > 1 else ""
-        badge = _BEST if mean is found.best else _EQUAL if d is None or not found.is_shown(d) else ""
+        badge = _LOST if found.lost(mean.name) else _BEST if mean is found.best else _EQUAL if d is None or not found.is_shown(d) else ""
         cells = (MISSING,) * 3 if d is None else _cells(d, found)
         rows.append(row(_name(mean.name, found, styles, badge), number(mean.mean, digits) + interval, str(mean.n), *cells))
     unit = f"<br><small>{found.unit or found.metric}, 95 %</small>"

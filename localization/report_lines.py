@@ -57,6 +57,12 @@ class Line:
         """The headline number [m]: mean error of the relations, else ATE; None where there is no (finite) score."""
         return headline(self.result.accuracy)
 
+    @property
+    def is_lost(self) -> bool:
+        """Whether the LiDAR was lost for so long that the run is not to be recommended."""
+        losses = self.result.run.lidar
+        return losses is not None and losses.is_long
+
     def placed(self, poses: FloatArray) -> FloatArray:
         """Poses (N, 3) of the run's world in the reference's plane where the alignment is known, else as they are."""
         alignment = self.result.accuracy.reference_T_world if self.result.accuracy else None
@@ -119,8 +125,8 @@ def make_lines(results: Sequence[Result]) -> list[Line]:
 
 
 def best_line(lines: Sequence[Line]) -> Line | None:
-    """The one of the smallest headline error; None without scores."""
-    scored = [line for line in lines if line.error is not None]
+    """The one of the smallest headline error that can be recommended; None without scores."""
+    scored = [line for line in lines if line.error is not None and not line.is_lost]
     return min(scored, key=lambda line: (line.error, line.number)) if scored else None
 
 

@@ -13,6 +13,7 @@ from localization.score import Result
 MISSING = "–"  # noqa: RUF001
 _MINUS = "\N{MINUS SIGN}"
 _BEST = ' <span class="badge">best</span>'
+_LOST = ' <span class="badge soft">LiDAR lost</span>'
 _NEAR = ' <span class="badge soft">as good</span>'
 REFERENCE_SWATCH = '<svg class="swatch" viewBox="0 0 30 8" aria-hidden="true"><path d="M1 4H29" stroke="var(--ink)"/></svg>'
 _UNITS = (
@@ -77,6 +78,10 @@ _CONSISTENCY = (
     Column("NEES", "3 expected", 2, lambda result: result.nees_mean, is_error=False),
     Column("NIS", "3 expected", 2, lambda result: result.nis_mean, is_error=False),
 )
+_LOSSES = (
+    Column("LiDAR lost", "% of the time", 2, lambda result: 100.0 * result.run.lidar.share if result.run.lidar else None, is_error=False),
+    Column("longest", "s", 1, lambda result: result.run.lidar.longest_s if result.run.lidar else None, is_error=False),
+)
 _DRIVEN = Column("Driven", "m, by its own estimate", 1, lambda result: result.run.trajectory.distance(0.05), is_error=False)
 
 
@@ -96,10 +101,13 @@ def accuracy_table(lines: Sequence[Line], best: Line | None, near: Sequence[Line
 
     ``near``: the runs practically as good as the best.
     """
-    columns = _known([*_TRACK, *_RELATIONS, *_CONSISTENCY], lines)
+    columns = _known([*_TRACK, *_RELATIONS, *_CONSISTENCY, *_LOSSES], lines)
     if not any(c.is_error for c in columns):
         columns = [_DRIVEN, *columns]
-    errors = _rows(lines, columns, {**{line.number: _NEAR for line in near}, **({best.number: _BEST} if best else {})})
+    badges = {line.number: _LOST for line in lines if line.is_lost} | {line.number: _NEAR for line in near}
+    if best is not None:
+        badges[best.number] = _BEST
+    errors = _rows(lines, columns, badges)
     squares = _known(_SQUARES, lines)
     more = (
         f"<details><summary>Mean squares, as published for the benchmark</summary>{_rows(lines, squares, {})}</details>" if squares else ""

@@ -39,17 +39,23 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
     lines = make_lines(results)
     if not lines:
         return ["Nothing was run, so there is nothing to tell."]
-    best = best_line(lines)
-    if best is None or reference is None:
+    best, losses = best_line(lines), _losses(lines)
+    if reference is None or all(line.error is None for line in lines):
         line = _most_informed(lines)
-        return [*_unscored(lines), *_honesty(line, f"The covariances of {line.words}")]
+        return [*_unscored(lines), *losses, *_honesty(line, f"The covariances of {line.words}")]
+    if best is None:
+        return [*losses, "No run can be recommended."]
     equals = equally_good(lines, best, reference)
-    return [*_ranking(lines, best, equals, reference), *_hindsight(best), *_coverage(best), *_honesty(best), *_advice(lines, best, equals)]
+    ranking = _ranking(lines, best, equals, reference)
+    return [*ranking, *losses, *_hindsight(best), *_coverage(best), *_honesty(best), *_advice(lines, best, equals)]
 
 
 def equally_good(lines: Sequence[Line], best: Line, reference: ReferenceTrack | Relations) -> list[Line]:
-    """The scored runs, without ``best``, whose errors this log cannot tell from those of ``best``, or that differ by less than 2 %."""
-    others = [line for line in lines if line is not best and line.error is not None]
+    """The scored runs but ``best`` whose errors this log cannot tell from its errors, or that differ by less than 2 %.
+
+    Runs that lost the LiDAR for long are not among them.
+    """
+    others = [line for line in lines if line is not best and line.error is not None and not line.is_lost]
     return [line for line in others if is_close(line, best) or not _is_worse(line, best, reference)]
 
 
@@ -105,6 +111,8 @@ def _ranking(lines: Sequence[Line], best: Line, equals: Sequence[Line], referenc
         return [f"{capitalised(best.words)}: {metres(best.error)} {measure}.", alone]
     near, unproven = [x for x in equals if is_close(x, best)], [x for x in equals if not is_close(x, best)]
     found = "has the smallest error" if equals else "is best"
+    if any(line.is_lost and line.error is not None and line.error < best.error for line in lines):
+        found += " of the runs that can be recommended"
     sentences = [f"{capitalised(best.words)} {found}: {metres(best.error)} {measure}{_gains(lines, best)}."]
     if near:
         sentences.append(f"Within 2 % of it: {_listed(near)}.")
@@ -137,6 +145,20 @@ def _gains(lines: Sequence[Line], best: Line) -> str:
         rounded = f"{math.floor(less)}" if less < 99.0 else f"{math.floor(10.0 * min(less, 99.9)) / 10.0:.1f}"  # never up to all of it
         gains.append(f"{rounded} % less than {part.words} ({metres(part.error)})")
     return ", " + joined(gains) if gains else ""
+
+
+def _losses(lines: Sequence[Line]) -> list[str]:
+    """Runs without LiDAR for so long that they are not recommended, and what to do."""
+    lost = [(line, line.result.run.lidar) for line in lines if line.is_lost]
+    if not lost:
+        return []
+    parts = [
+        f"{line.words}{'' if line.error is None else f' ({metres(line.error)})'}: {losses.summary}"
+        for line, losses in lost
+        if losses is not None
+    ]
+    advice = dict.fromkeys(losses.advice for _, losses in lost if losses is not None)
+    return [f"Not recommended are {'; '.join(parts)}." if len(parts) > 1 else f"Not recommended is {parts[0]}.", *advice]
 
 
 def _hindsight(best: Line) -> list[str]:

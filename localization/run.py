@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from localization.errors import LogError
 from localization.estimators import CORRECTING
 from localization.events import Event
+from localization.lidar_losses import LidarLosses
 from localization.online.core import Core, Pair, ReplayConfig
 from localization.online.records import NIS, TWIST, TWIST_COV, Records, trajectory
 from localization.trajectory import Trajectory
@@ -46,6 +47,8 @@ class Run:
     """Form of the corrections to the motion model, or None where the estimator makes none."""
     moments: Trajectory | None = None
     """Poses as they were estimated at each moment, and would have been published live, where the whole log tells otherwise."""
+    lidar: LidarLosses | None = None
+    """How long the LiDAR was lost; None where no scans were matched to a map."""
 
 
 def replay(
@@ -109,4 +112,5 @@ class _Lane:
             self._seconds,
             self._pair.corrections if self._pair.estimator in CORRECTING else None,
             None if whole is None else moments,
+            self._core.lidar,
         )

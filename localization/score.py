@@ -53,6 +53,7 @@ class Result:
             "real_time_factor": duration_s / self.run.seconds if with_timing and self.run.seconds > 0 else None,
             "parameters": {name: list(value) for name, value in self.run.parameters.items()},
             "counts": dict(self.run.counts),
+            "lidar": None if self.run.lidar is None else self.run.lidar.numbers(),
             **{name: number for name, number in numbers.items() if self.accuracy or not name.startswith("n_")},
         }
 

@@ -10,6 +10,11 @@ from typing import Annotated, Any, get_type_hints
 
 from localization.errors import SettingError
 
+_LARGEST = 1e9
+"""Of a number, in SI units or ratios: no length, time, rate, weight or variance of a robot, its sensors or its drive is larger."""
+_MOST = 1_000_000
+"""Of a whole number: iterations, nodes, windows; a day's drive has as many scans."""
+
 
 @dataclass(frozen=True)
 class Allowed:
@@ -17,6 +22,8 @@ class Allowed:
 
     what: str
     test: Callable[[float], bool]
+    most: float | None = None
+    """Its upper bound; None for the common one (`_LARGEST`, of whole numbers `_MOST`)."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +46,7 @@ Positive = Annotated[float, Allowed("above 0", lambda value: value > 0.0)]
 Signed = Annotated[float, Allowed("a number", lambda value: True)]
 Probability = Annotated[float, Allowed("between 0 and 1, and neither of them", lambda value: 0.0 < value < 1.0)]
 Share = Annotated[float, Allowed("from 0 to below 1", lambda value: 0.0 <= value < 1.0)]
+Seed = Annotated[int, Allowed("from 0 to 2^32 - 1", lambda value: 0 <= value < 2**32, most=2**32)]
 Count = Annotated[int, at_least(1)]
 _NOT_NEGATIVE = at_least(0)  # where a field does not say otherwise
 
@@ -56,11 +64,14 @@ class Settings:
 def check_settings(settings: object) -> None:
     """Raises `SettingError` naming the first number of the dataclass ``settings`` that is not what it may be."""
     rules = rules_of(type(settings))
-    numbers = {name: value for name in rules if isinstance(value := getattr(settings, name), Real)}
+    numbers: dict[str, float] = {name: value for name in rules if isinstance(value := getattr(settings, name), Real)}  # type: ignore[misc]
     for name, value in numbers.items():
         allowed = next((rule for rule in rules[name] if isinstance(rule, Allowed)), _NOT_NEGATIVE)
-        if not math.isfinite(value):
+        most = allowed.most or (_MOST if isinstance(value, int) else _LARGEST)
+        if isinstance(value, float) and not math.isfinite(value):
             raise _refusal(settings, name, "a finite number")
+        if not -most <= value <= most:  # whole numbers may be too large for a float
+            raise _refusal(settings, name, f"at most {most:g}")
         if not allowed.test(float(value)):
             raise _refusal(settings, name, allowed.what)
     for name, value in numbers.items():
@@ -71,7 +82,9 @@ def check_settings(settings: object) -> None:
 
 
 def _refusal(settings: object, name: str, wanted: str) -> SettingError:
-    return SettingError(f"setting {name} of {type(settings).__name__} is {getattr(settings, name):g}; it must be {wanted}.")
+    value = getattr(settings, name)
+    shown = f"{value:g}" if abs(value) < 10**18 or isinstance(value, float) else "a number of more than 18 digits"
+    return SettingError(f"setting {name} of {type(settings).__name__} is {shown}; it must be {wanted}.")
 
 
 def rules_of(kind: type) -> Mapping[str, tuple[Any, ...]]:

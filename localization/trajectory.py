@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from localization.errors import EvaluationError
-from localization.output import output_errors, refuse_existing
+from localization.output import whole_file
 from motion_models import se2
 from motion_models.se2 import FloatArray
+from motion_models.text_files import check_file
 
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -147,14 +148,8 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
         sign = "-" if stamp < 0 else ""
         qz, qw = math.sin(0.5 * theta), math.cos(0.5 * theta)
         lines.append(f"{sign}{seconds}.{nanoseconds:09d} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}\n")
-    refuse_existing(path)
-    beside = path.with_name(f".{path.name}.new")  # one that a killed process has left is written over
-    with output_errors(path):
-        try:
-            beside.write_text("".join(lines), encoding="ascii", newline="\n")
-            beside.replace(path)
-        finally:
-            beside.unlink(missing_ok=True)
+    with whole_file(path) as file:
+        file.write("".join(lines).encode("ascii"))
 
 
 def read_tum(path: str | Path) -> Trajectory:
@@ -188,6 +183,7 @@ def tum_rows(path: str | Path) -> Iterator[tuple[int, int, list[float]]]:
 def number_rows(path: str | Path, columns: tuple[str, ...]) -> Iterator[tuple[int, list[str]]]:
     """(line number, words) of every line that is not empty or a comment. Raises `EvaluationError` unless it has all ``columns``."""
     try:
+        check_file(path)
         text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
         raise EvaluationError(f"'{path}' cannot be read: {error.strerror}.") from error

@@ -12,6 +12,7 @@ from motion_models.center_of_gravity import CgModel, cg_model
 from motion_models.cg_parts import TYPICAL, Arms, CgEstimate, Payload, StaticPart, Tolerances, require_support
 from motion_models.errors import CgError, RobotError
 from motion_models.postures import Posture, parse_postures
+from motion_models.text_files import read_text
 from motion_models.urdf import Urdf, load_urdf, parse_urdf
 from motion_models.weighing import Scales, WeighedCg, cg_from_scales, read_weighings, wheel_contacts
 
@@ -91,7 +92,7 @@ def _text(name: str, folder: Path | None) -> str:
     try:
         found = _beside(name, folder)
         if found is not None:
-            return found.read_text(encoding="utf-8")
+            return read_text(found)
         return (resources.files(__package__) / "robots" / name).read_text(encoding="utf-8")
     except OSError as error:
         raise RobotError(f"'{name}', which the robot file names, cannot be read: {error.strerror}.") from error

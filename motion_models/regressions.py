@@ -16,6 +16,7 @@ from scipy import stats
 
 from motion_models.errors import CalibrationError
 from motion_models.se2 import FloatArray
+from motion_models.text_files import check_file
 
 COLUMNS = ("cg_x_m", "cg_y_m", "rotation_ratio", "cor_x_m", "cor_y_m")
 CONTROLLER_MULTIPLIER = 1.875
@@ -42,6 +43,7 @@ class RotationTable:
 def read_rotation_table(path: str | Path) -> RotationTable:
     """The table of a CSV file with the columns `COLUMNS`, in any order. Raises `CalibrationError`, naming row and column."""
     try:
+        check_file(path)
         with open(path, newline="", encoding="utf-8-sig") as file:
             rows = list(csv.DictReader(file))
             names = set(rows[0]) if rows else set()

@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from motion_models.cg_parts import Arms
 from motion_models.errors import RobotError
 from motion_models.se2 import FloatArray
+from motion_models.text_files import read_text
 
 Section = TypeVar("Section")
+
+_LARGEST = 1e9
+"""Of any number of a robot, in SI units; the largest that robots have are stiffnesses and inertias of 1e6."""
+_LONGEST_M = 100.0
+"""Of a length of a robot [m]; the largest mining vehicles have 20."""
+_LONGEST_SHOWN = 60  # characters of what a user wrote, in a message
 
 
 @dataclass(frozen=True)
@@ -181,7 +189,7 @@ def load_robot(robot: str | Path) -> Robot:
     path = Path(robot)
     if path.suffix == ".toml":
         try:
-            text = path.read_text(encoding="utf-8")
+            text = read_text(path)
         except OSError as error:
             raise RobotError(f"robot file '{path}' cannot be read: {error.strerror}.") from error
         except UnicodeDecodeError as error:
@@ -197,8 +205,10 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
     """The robot of a TOML text; ``source`` names it in errors, ``folder`` is where paths in it start. Raises `RobotError`."""
     try:
         data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # what the parser raises, and for a number of thousands of digits
         raise RobotError(f"{source}: not valid TOML: {error}.") from error
+    except RecursionError as error:
+        raise RobotError(f"{source}: not valid TOML: its brackets are nested too deeply.") from error
     known = {f.name for f in dataclasses.fields(Robot)} - {"folder"}
     _refuse_unknown(data, known, source)
     if not isinstance(data.get("name"), str):
@@ -207,15 +217,13 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
     for name in ("wheel_radius_m", "track_width_m", "wheelbase_m", "mass_kg"):
         if not getattr(geometry, name) > 0:
             raise RobotError(f"{source}: geometry.{name} is {getattr(geometry, name)}; it must be positive.")
+    for name, value in dataclasses.asdict(geometry).items():
+        if name.endswith("_m") and abs(value) > _LONGEST_M:
+            raise RobotError(f"{source}: geometry.{name} is {value:g}; it must be in metres, and at most {_LONGEST_M:g}.")
     driver = _section(Driver, data, "driver", source) if "driver" in data else Driver(geometry.wheel_radius_m, geometry.track_width_m)
     if min(driver.wheel_radius_m, driver.track_width_m, driver.wheel_separation_multiplier) <= 0:
         raise RobotError(f"{source}: every number of [driver] must be positive.")
     mounts = {frame: _build(Mount, table, f"mounts.{frame}", source) for frame, table in _table(data, "mounts", source).items()}
-    models = {
-        model: {name: _number(value, f"models.{model}.{name}", source) for name, value in _table(tables, model, source).items()}
-        for tables in [_table(data, "models", source)]
-        for model in tables
-    }
     return Robot(
         name=data["name"],
         geometry=geometry,
@@ -223,12 +231,32 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
         topics=_section(Topics, data, "topics", source),
         joints=_section(Joints, data, "joints", source),
         mounts=mounts,
-        wheel_noise=_section(WheelNoise, data, "wheel_noise", source),
-        gyro_noise=_section(GyroNoise, data, "gyro_noise", source),
-        models=models,
+        wheel_noise=_noise(WheelNoise, data, "wheel_noise", source),
+        gyro_noise=_noise(GyroNoise, data, "gyro_noise", source),
+        models=_models(_table(data, "models", source), source),
         arms=_arms(data, source) if "arms" in data else None,
         folder=folder,
     )
+
+
+def _noise(kind: type[Section], data: Mapping[str, Any], name: str, source: str) -> Section:
+    noise = _section(kind, data, name, source)
+    for entry, value in dataclasses.asdict(noise).items():  # type: ignore[call-overload]
+        if value < 0.0:
+            raise RobotError(f"{source}: {name}.{entry} is {value:g}; it must not be below 0.")
+    return noise
+
+
+def _models(tables: Mapping[str, Any], source: str) -> dict[str, dict[str, float]]:
+    from motion_models.registry import MODELS  # the models themselves are made of robots
+
+    _refuse_unknown(tables, set(MODELS), f"{source}, [models]")
+    models = {}
+    for model in tables:
+        table = _table(tables, model, source)
+        _refuse_unknown(table, set(cast(tuple[str, ...], MODELS[model].param_names)), f"{source}, [models.{model}]")
+        models[model] = {name: _number(value, f"models.{model}.{name}", source) for name, value in table.items()}
+    return models
 
 
 def _arms(data: Mapping[str, Any], source: str) -> Arms:
@@ -283,10 +311,15 @@ def _build(kind: type[Section], table: Any, name: str, source: str) -> Section:
 def _refuse_unknown(table: Mapping[str, Any], known: set[str], where: str) -> None:
     unknown = sorted(set(table) - known)
     if unknown:
-        raise RobotError(f"{where}: unknown entry {', '.join(unknown)}; known are {', '.join(sorted(known))}.")
+        nearest = difflib.get_close_matches(unknown[0][:_LONGEST_SHOWN], sorted(known), n=1)
+        meant = f" (did you mean {nearest[0]}?)" if nearest else ""
+        named = ", ".join(name if len(name) <= _LONGEST_SHOWN else f"{name[:_LONGEST_SHOWN]}..." for name in unknown[:10])
+        raise RobotError(f"{where}: unknown entry {named}{meant}; known are {', '.join(sorted(known))}.")
 
 
 def _number(value: Any, name: str, source: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise RobotError(f"{source}: {name} must be a finite number, found {value!r}.")
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not -_LARGEST <= value <= _LARGEST:  # false for NaN
+        found = repr(value) if not isinstance(value, int) or abs(value) < 10**20 else "an integer of more than 20 digits"
+        raise RobotError(f"{source}: {name} must be a finite number of at most {_LARGEST:g}, found {found[:_LONGEST_SHOWN]}.")
     return float(value)

@@ -18,6 +18,7 @@ import numpy as np
 from motion_models.errors import RobotError
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
+from motion_models.text_files import read_text
 
 _MOVING = ("revolute", "continuous", "prismatic")
 _XACRO = "it is a xacro file, not a URDF; expand it first: xacro FILE.xacro > FILE.urdf"
@@ -90,7 +91,7 @@ def load_urdf(path: str | Path) -> Urdf:
     if path.suffix == ".xacro":
         raise RobotError(f"'{path}' cannot be used: {_XACRO}.")
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except OSError as error:
         raise RobotError(f"URDF '{path}' cannot be read: {error.strerror}.") from error
     except UnicodeDecodeError as error:

@@ -11,6 +11,7 @@ import numpy as np
 
 from motion_models.errors import CgError
 from motion_models.se2 import FloatArray
+from motion_models.text_files import check_file
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 """Order of the wheels in every array of four."""
@@ -92,6 +93,7 @@ def read_weighings(path: str | Path) -> FloatArray:
     """
     columns = [f"{wheel}_kg" for wheel in WHEELS]
     try:
+        check_file(path)
         with Path(path).open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
             header = [name.strip() for name in reader.fieldnames or ()]

@@ -28,6 +28,7 @@ import numpy as np
 
 from motion_models.errors import CalibrationError
 from motion_models.maneuvers import Maneuver
+from motion_models.text_files import check_file
 
 NEEDED = ("window", "dt_s", "left_rad_per_s", "right_rad_per_s", "yaw_rad")
 POSE = ("x_m", "y_m", "yaw_rad")
@@ -84,6 +85,7 @@ def windows_text(maneuvers: Sequence[Maneuver]) -> str:
 
 def _read(path: str | Path) -> tuple[list[str], list[Row]]:
     try:
+        check_file(path)
         with open(path, newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file)
             columns = [name.strip() for name in next(reader, [])]

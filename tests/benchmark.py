@@ -12,6 +12,8 @@ PARTS = (
     "tests.benchmarks.compare",
     "tests.benchmarks.lidar",
     "tests.benchmarks.diagnosis",
+    "tests.benchmarks.faults",
+    "tests.benchmarks.fuzz",
     "tests.studies.thesis_regressions",
     "tests.studies.friction_grid",
     "tests.studies.gentle_arcs",

@@ -224,8 +224,8 @@ def test_mcap_with_a_bad_chunk_loses_that_chunk_only(tmp_path: Path) -> None:
     assert "A chunk at byte" in said(log)
 
 
-def test_mcap_chunks_are_believed_only_if_their_checksum_is_right(tmp_path: Path) -> None:
-    """A flipped bit in a range looks like any other range."""
+def test_mcap_chunk_of_a_wrong_checksum_is_used_and_reported(tmp_path: Path) -> None:
+    """A flipped bit in a range looks like any other range: which message it is in cannot be known, and the others are right."""
     from mcap.writer import CompressionType, Writer
 
     path = tmp_path / "run.mcap"
@@ -247,11 +247,10 @@ def test_mcap_chunks_are_believed_only_if_their_checksum_is_right(tmp_path: Path
     path.write_bytes(data)
     log = open_log(path, ROBOT)
     scans = {e.stamp_ns: e for e in log.events() if isinstance(e, Scan)}
-    assert 60 < len(scans) < 100
-    assert "checksum" in said(log)
-    for scan in whole:
-        if scan.stamp_ns in scans:
-            np.testing.assert_array_equal(scan.points, scans[scan.stamp_ns].points)
+    assert len(scans) >= 99
+    assert "is damaged (its checksum is wrong)" in said(log)
+    differing = [s for s in whole if s.stamp_ns not in scans or not np.array_equal(s.points, scans[s.stamp_ns].points)]
+    assert len(differing) <= 1
 
 
 def test_mcap_without_chunks_or_summary(tmp_path: Path) -> None:

@@ -491,7 +491,7 @@ def test_a_type_that_the_log_defines_otherwise_is_dropped_and_counted(tmp_path: 
     data = bytes(store.serialize_cdr(types["sensor_msgs/msg/Imu"](header=header, temperature=20.0), "sensor_msgs/msg/Imu"))
     log = log_of(tmp_path, "/imu/data", [bags.Unknown("sensor_msgs/msg/Imu", definition, data)] * 3)
     assert list(log.events()) == []
-    assert log.notes() == ["/imu/data: 3 messages dropped (fields that contradict each other)."]
+    assert log.notes() == ["/imu/data: 3 messages dropped (bytes that are not of the type)."]
 
 
 def test_two_types_and_two_publishers_on_one_topic(tmp_path: Path) -> None:

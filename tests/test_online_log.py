@@ -211,7 +211,6 @@ def test_states_that_do_not_fit_are_refused(killed, tmp_path, capsys):
         (["--model", "diff_drive", "--state", state, "--out", tmp_path / "fused.mcap"], "made with another model"),
         (["--state", state], "with an --out"),
         (["--state", state, "--out", out], "the estimates up to the state, cannot be read"),
-        (["--out", tmp_path / "fused.mcap"], "left from a run that was killed"),
         (["--state", drive_log(), "--out", out], "no state of an estimator"),
     ]:
         assert online("--rate", "max", *arguments) == 2
@@ -273,3 +272,23 @@ def test_doors_whose_libraries_are_missing_name_them(tmp_path):
     assert "source a ROS 2 installation" in found.stderr
     assert "apt install python3-rospy" in found.stderr
     assert "Traceback" not in found.stderr
+
+
+def test_what_a_killed_run_has_left_keeps_no_other_from_starting(tmp_path):
+    """Hidden files beside the output, also links, of which nobody knows; the estimates are kept."""
+    path, victim = tmp_path / ".a.tum.part", tmp_path / "victim"
+    victim.write_text("precious")
+    path.write_bytes(b"estimates")
+    spool = Spool.create(path)
+    spool.add(Estimate(1, np.zeros(3), None, np.zeros(3), None))
+    spool.close()
+    assert (tmp_path / ".a.tum.part.old").read_bytes() == b"estimates"
+    path.unlink()
+    path.symlink_to(victim)
+    Spool.create(path).remove()
+    files = Files(out=tmp_path / "a.tum")
+    (tmp_path / ".a.tum.new").symlink_to(victim)
+    with files.beside() as beside:
+        beside.write_text("whole")
+    assert (tmp_path / "a.tum").read_text() == "whole"
+    assert victim.read_text() == "precious"

@@ -40,10 +40,11 @@ _COLUMNS: tuple[tuple[str, str, _Number], ...] = (
     ("deg", ".3f", _relation("short", "rotation_deg")),
     ("NEES", ".2f", lambda result: result.nees_mean),
     ("NIS", ".2f", lambda result: result.nis_mean),
+    ("LiDAR lost %", ".2f", lambda result: 100.0 * result.run.lidar.share if result.run.lidar else None),
 )
 
 
-_FIRST_TO_GO = ("RPE deg/m", "speed x", "drift %", "ATE deg", "end m", "NEES")
+_FIRST_TO_GO = ("RPE deg/m", "speed x", "drift %", "ATE deg", "end m", "NEES", "LiDAR lost %")
 
 
 def accuracy_table(results: Sequence[Result], duration_s: float, width: int) -> Table:

@@ -12,12 +12,13 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from localization.calibration import Calibrated, Cut, Turning, WitnessName, calibrated, cut_log, turning
+from localization.calibration import Calibrated, Cut, MotionReferenceName, Turning, calibrated, cut_log, turning
 from localization.commands.calibration_tables import numbers, print_by_source, print_cuts, print_fit, print_rotation_errors
-from localization.commands.common import check_new, write_json, write_text
+from localization.commands.common import write_json
 from localization.commands.regression_tables import print_regressions, regression_numbers
 from localization.logs import TopicOverrides
 from localization.maneuver_windows import WindowConfig
+from localization.output import check_outputs, write_text_file
 from motion_models.base import MotionModel
 from motion_models.cg_files import arms_model, arms_postures
 from motion_models.errors import CalibrationError
@@ -48,7 +49,7 @@ class Calibrate:
     """Motion model to fit."""
     fit: str = ""
     """Parameters to fit, separated by commas; all of them must show. Default: the model's usual ones, as far as the drive reveals them."""
-    witness: WitnessName = "auto"
+    witness: MotionReferenceName = "auto"
     """What measured the real motion in logs: the reference if one is named, else the LiDAR, else the gyro (headings alone)."""
     reference: str | None = None
     """Topic or TUM file with positions and headings, as the witness. Never used unless named."""
@@ -87,9 +88,7 @@ class Calibrate:
             raise CalibrationError(f"--window-s is {self.window_s:g}; maneuvers of 0.5 to 20 s make sense.")
         if self.export_out is not None and self.export is None:
             raise CalibrationError("--export-out names a file, but --export does not say for which package.")
-        for path in (self.out, self.export_out, self.windows, self.json):
-            if path is not None:
-                check_new(path)
+        check_outputs(self.out, self.export_out, self.windows, self.json)
         if self.out is not None and self.out.suffix != ".toml":
             raise CalibrationError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")
 
@@ -107,7 +106,7 @@ class Calibrate:
         by_source = _each(found, cuts, robot) if len(cuts) > 1 else []
         print_by_source(console, by_source)
         if self.windows is not None:
-            write_text(self.windows, windows_text([m for each in cuts for m in each.maneuvers]))
+            write_text_file(self.windows, windows_text([m for each in cuts for m in each.maneuvers]))
         told = {"robot": robot.name, "model": model.name, **numbers(found, about, cuts, by_source)}
         return found.fit.robot(robot), found.sigmas, told
 
@@ -135,7 +134,7 @@ class Calibrate:
         model = make_model(self.model, new)
         if self.out is not None:
             remarks = f"Calibrated by skidloc: {self.model} on {', '.join(path.name for path in self.source)}, from {robot.name}."
-            write_text(self.out, robot_toml(relocated(new, self.out.parent), {self.model: sigmas}, remarks))
+            write_text_file(self.out, robot_toml(relocated(new, self.out.parent), {self.model: sigmas}, remarks))
             console.print(f"robot file: {self.out}", markup=False, soft_wrap=True)
         if self.export is not None:
             text = (
@@ -144,7 +143,7 @@ class Calibrate:
                 else robot_localization_yaml(model, new, model.nominal)
             )
             if self.export_out is not None:
-                write_text(self.export_out, text)
+                write_text_file(self.export_out, text)
                 console.print(f"{self.export}: {self.export_out}", markup=False, soft_wrap=True)
             else:
                 console.print(text, markup=False, soft_wrap=True)

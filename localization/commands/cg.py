@@ -12,7 +12,8 @@ import tyro
 from rich.console import Console
 
 from localization.commands.calibration_tables import plain_table, row, say, show
-from localization.commands.common import check_new, write_json
+from localization.commands.common import write_json
+from localization.output import check_outputs
 from motion_models.center_of_gravity import static_part_from_weighing
 from motion_models.cg_files import arms_model, arms_postures, weighed_cg
 from motion_models.cg_parts import Arms, CgEstimate, Payload, StaticPart, require_support
@@ -59,8 +60,7 @@ class Cg:
 
     def run(self, console: Console) -> None:
         robot = load_robot(self.robot)
-        if self.json is not None:
-            check_new(self.json)
+        check_outputs(self.json)
         g = robot.geometry
         weighed = None if self.weighings is None else weighed_cg(self.weighings, g.wheelbase_m, g.track_width_m)
         wants_arms = bool(self.posture or self.joint or self.payload or self.urdf or self.weighed_posture)

@@ -11,7 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from localization.errors import OutputError, SettingError
+from localization.errors import SettingError
+from localization.output import output_errors, refuse_existing, write_text_file
 
 
 def names(text: str, option: str) -> list[str]:
@@ -22,53 +23,26 @@ def names(text: str, option: str) -> list[str]:
     return found
 
 
-def check_new(path: Path) -> None:
-    """Refuse an output that would overwrite something. Raises `OutputError`."""
-    if path.exists():
-        kind = "folder" if path.is_dir() else "file"
-        raise OutputError(f"{kind} '{path}' exists already; nothing is overwritten. Choose another name or remove it.")
-
-
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
     """A folder to write into that gets its name ``path`` once all is written: it is complete, or it is not there. Raises `OutputError`."""
-    check_new(path)
-    try:
+    refuse_existing(path)
+    with output_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}-"))
-    except OSError as error:
-        raise OutputError(f"cannot write into '{path.parent}': {error.strerror}.") from None
+        folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=".skidloc-"))
     try:
-        yield folder
-        check_new(path)
-        folder.chmod(0o755)  # mkdtemp's folders are for their owner only
-        folder.rename(path)
-    except OSError as error:
-        raise OutputError(f"cannot write '{path}': {error.strerror}.") from None
+        with output_errors(path):
+            yield folder
+            refuse_existing(path)
+            folder.chmod(0o755)  # mkdtemp's folders are for their owner only
+            folder.rename(path)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write ``text``. Raises `OutputError` rather than overwrite."""
-    check_new(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except OSError as error:
-        raise OutputError(f"cannot write '{path}': {error.strerror}.") from None
-
-
 def write_json(path: Path, content: Any) -> None:
     """Write ``content`` as JSON, sorted as given, not finite numbers as null. Raises `OutputError` rather than overwrite."""
-    check_new(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("x", encoding="utf-8") as file:
-            file.write(json.dumps(_finite(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
-    except OSError as error:
-        raise OutputError(f"cannot write '{path}': {error.strerror}.") from None
+    write_text_file(path, json.dumps(_finite(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def _finite(content: Any) -> Any:

@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table as Grid
 
-from localization.commands.common import check_new, names, write_json
+from localization.commands.common import names, write_json
 from localization.compare_job import OK, Job, Row, job_key, run_job, trials
 from localization.compare_pool import run_local
 from localization.compare_table import Table
@@ -24,6 +24,7 @@ from localization.compare_verdict import Findings, against_best, closing, find, 
 from localization.errors import EvaluationError, LogError, OutputError
 from localization.estimators import check_estimator
 from localization.logs import TopicOverrides
+from localization.output import check_outputs
 from localization.provenance import versions
 from localization.report_compare import CompareHead, check_report, write_comparison_report
 from localization.run import ReplayConfig
@@ -63,8 +64,7 @@ class Compare:
     """Write means and differences to this file as well."""
 
     def run(self, console: Console) -> None:
-        if self.json is not None:
-            check_new(self.json)
+        check_outputs(self.json)
         if self.processes < 0:
             raise OutputError(f"--processes is {self.processes}; it must be 1 or more, or 0 for as many as there are cores.")
         table_path, report_path = places(self.out)

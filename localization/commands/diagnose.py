@@ -10,14 +10,15 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from localization.calibration import WitnessName
-from localization.commands.common import check_new, new_folder, write_json, write_text
+from localization.calibration import MotionReferenceName
+from localization.commands.common import new_folder, write_json
 from localization.diagnosis.diagnose import DiagnosisConfig, Examined, examine
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_table
 from localization.diagnosis.findings import Diagnosis
 from localization.diagnosis.patch import patched
 from localization.logs import TopicOverrides, open_log
 from localization.maneuver_windows import WindowConfig
+from localization.output import check_outputs, write_text_file
 from localization.report_diagnosis import write_diagnosis_report
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
@@ -41,7 +42,7 @@ class Diagnose:
     """Motion model whose predictions are held against what really happened."""
     out: Path | None = None
     """New folder for diagnosis.json, diagnosis.html and robot.toml, the robot with the findings in it, which every command takes."""
-    witness: WitnessName = "auto"
+    witness: MotionReferenceName = "auto"
     """What measured the real motion in logs: the reference if one is named, else the LiDAR, else the gyro (headings alone)."""
     reference: str | None = None
     """Topic or TUM file with positions and headings, as the witness. Never used unless named."""
@@ -55,9 +56,7 @@ class Diagnose:
     def run(self, console: Console) -> None:
         if not 0.5 <= self.window_s <= 20.0:
             raise CalibrationError(f"--window-s is {self.window_s:g}; windows of 0.5 to 20 s make sense.")
-        for path in (self.out, self.json):
-            if path is not None:
-                check_new(path)
+        check_outputs(self.out, self.json)
         robot = load_robot(self.robot)
         model = make_model(self.model, robot)
         with console.status("reading"):
@@ -96,7 +95,7 @@ class Diagnose:
         remarks = [f"Diagnosed by skidloc: {d.model} on {d.log}, from {robot.name}.", f"Corrected here: {named}.", *by_hand]
         # in the folder's parent, paths start where they will start once it has its name
         text = robot_toml(relocated(new, folder), remarks="\n".join(remarks))
-        write_text(folder / "robot.toml", text)
+        write_text_file(folder / "robot.toml", text)
 
 
 def print_diagnosis(console: Console, d: Diagnosis) -> None:

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from localization.commands.common import write_json
 from localization.logs import LogInfo, TopicOverrides, open_log
+from localization.output import check_outputs
 from motion_models.robot import load_robot
 
 
@@ -30,6 +31,7 @@ class Info:
     """Write what is printed to this file as well."""
 
     def run(self, console: Console) -> None:
+        check_outputs(self.json)
         with console.status("reading the log"):
             info = open_log(self.log, load_robot(self.robot), self.topic).info()
         if self.json is not None:

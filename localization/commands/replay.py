@@ -17,14 +17,15 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from localization.commands.accuracy_table import accuracy_table
 from localization.commands.calibration_tables import WIDE, show
-from localization.commands.common import check_new, names, new_folder, write_json
-from localization.errors import EvaluationError
+from localization.commands.common import names, new_folder, write_json
+from localization.errors import EstimatorError, EvaluationError
 from localization.estimators import CORRECTING, check_estimator
-from localization.events import Event
+from localization.events import Event, PositionSample
 from localization.logs import Log, TopicOverrides, open_log
 from localization.logs.fused import FusedEstimate, write_fused
-from localization.provenance import fingerprint, versions
+from localization.output import as_text, check_outputs
 from localization.positions import merge_positions, position_samples
+from localization.provenance import fingerprint, versions
 from localization.references import ReferenceTrack, Relations, read_reference_file, reference_track
 from localization.report import ReportHead, overview_png, verdict, write_report
 from localization.run import Pair, ReplayConfig, Run, replay
@@ -71,9 +72,7 @@ class Replay:
 
     def run(self, console: Console) -> None:
         robot = load_robot(self.robot)
-        check_new(self.out)
-        if self.json is not None:
-            check_new(self.json)
+        check_outputs(self.out, self.json)
         log = open_log(self.log, robot, self.topic)
         has_lidar = log.sources.lidar is not None
         models = [make_model(name, robot) for name in names(self.model, "--model")]
@@ -98,11 +97,11 @@ class Replay:
             runs.append(dataclasses.replace(run, model=p.model.name, estimator=label))
         results = score(runs, reference)
         head = ReportHead(
-            log=log.path.name,
+            log=as_text(log.path.name),
             robot=robot.name,
             start=describe_instant(log.start_ns),
             duration_s=log.duration_s,
-            notes=list(dict.fromkeys([*log.notes(), *(note for run in runs for note in run.notes)])),
+            notes=[as_text(note) for note in dict.fromkeys([*log.notes(), *(note for run in runs for note in run.notes)])],
             versions=versions(),
             log_fingerprint=fingerprint(log.path),
         )

@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from localization.commands.common import check_new, write_json
+from localization.commands.common import write_json
+from localization.output import check_outputs
 from localization.simulate.effects import EFFECTS, parse_effects
 from localization.simulate.evaluation import Score, mean_by_trajectory, score_runs
 from localization.simulate.experiments import EXPERIMENTS
@@ -42,9 +43,7 @@ class Simulate:
     """Write what is printed, and when each run began and ended, to this file as well."""
 
     def run(self, console: Console) -> None:
-        check_new(self.out)
-        if self.json is not None:
-            check_new(self.json)
+        check_outputs(self.out, self.json)
         robot, effects = load_robot(self.robot), parse_effects(self.effect)
         simulation = simulate(self.experiment, robot, self.seed, effects, self.config)
         with console.status("driving") as status:

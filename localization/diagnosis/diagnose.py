@@ -20,7 +20,7 @@ from localization.diagnosis.next_drive import general_advice, separating_drive
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, Pipeline, with_sizes
 from localization.diagnosis.search import aliases_of, search, true_cost
 from localization.diagnosis.words import evidence, sentence
-from localization.settings import Count, Probability, Settings
+from localization.settings import Count, Probability, Seed, Settings
 from motion_models.base import MotionModel
 from motion_models.se2 import FloatArray
 
@@ -43,7 +43,7 @@ class DiagnosisConfig(Settings):
     """Fewer measured windows than this decide nothing."""
     moments: Count = 9
     """At how many moments a change of the floor is looked for."""
-    seed: int = 0
+    seed: Seed = 0
     """Of the random numbers in tests and intervals."""
 
 

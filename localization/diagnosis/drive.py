@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from localization.calibration import WitnessName, _witness
+from localization.calibration import MotionReferenceName, make_motion_reference
 from localization.events import Event, ImuSample, Scan
 from localization.gyro import GyroHistory
 from localization.logs.log import Log
 from localization.maneuver_windows import WindowConfig, cut
-from localization.witnesses import GyroWitness, Span, Wheels, Witness
+from localization.motion_references import GyroMotionReference, MotionReference, Span, Wheels
 from motion_models import se2
 from motion_models.cg_files import arms_model
 from motion_models.cg_parts import Payload
@@ -32,7 +32,7 @@ _LEAST_GRAVITY, _MOST_GRAVITY = 8.0, 12.0
 
 @dataclass(frozen=True)
 class Drive:
-    """Maneuvers in order of time, and the further witnesses of each; all arrays follow the maneuvers."""
+    """Maneuvers in order of time, and what else was measured in each; all arrays follow the maneuvers."""
 
     name: str
     robot: Robot
@@ -46,8 +46,8 @@ class Drive:
     spans_ns: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     """(W, 2) start and end stamps; (0, 2) for tables."""
     gyro: GyroHistory | None = None
-    """All of the gyro; None without one, or where it is itself the witness."""
-    gyro_is_witness: bool = False
+    """All of the gyro; None without one, or where it is itself the motion reference."""
+    is_gyro_reference: bool = False
     forces: FloatArray | None = None
     """(W, 2) mean specific force along the body's x and y over each maneuver [m/s^2]; None without accelerometers."""
     payload_arms: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
@@ -65,17 +65,17 @@ class Drive:
 
 @dataclass
 class _Recorder:
-    """A witness that remembers which stretches of time became maneuvers."""
+    """A motion reference that records which spans became maneuvers."""
 
-    inner: Witness
+    inner: MotionReference
     used: list[Span] = field(default_factory=list)
 
     def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
         yield from self.inner.spans(event, wheels)
 
-    def correct(self, spans: Sequence[Span], still: Sequence[Span]) -> list[Span]:
+    def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
         self.used = list(spans)
-        return self.inner.correct(spans, still)
+        return self.inner.correct(spans, standing)
 
     def notes(self) -> list[str]:
         return self.inner.notes()
@@ -125,8 +125,10 @@ class _Postures:
         return getattr(self._model, name)
 
 
-def drive_of_log(log: Log, witness: WitnessName = "auto", reference: str | None = None, config: WindowConfig | None = None) -> Drive:
-    """Read ``log`` once. Raises `CalibrationError` where it has no wheels or no witness of what they do."""
+def drive_of_log(
+    log: Log, witness: MotionReferenceName = "auto", reference: str | None = None, config: WindowConfig | None = None
+) -> Drive:
+    """Read ``log`` once. Raises `CalibrationError` where it has no wheels, and for a ``witness`` that it does not have."""
     config = config or WindowConfig()
     robot = log.robot
     if log.sources.wheels is None and log.wheels_error is None:
@@ -134,7 +136,7 @@ def drive_of_log(log: Log, witness: WitnessName = "auto", reference: str | None 
     if witness == "auto" and reference is None and log.sources.lidar is None and log.sources.imu is None:
         alone = f"{log.path.name} has neither a LiDAR nor an IMU, and no reference was named: nothing measures what the wheels do."
         return Drive(log.path.name, robot, (), "none", notes=(alone, *log.notes()))
-    inner, words = _witness(log, robot, witness, reference, config)
+    inner, words = make_motion_reference(log, robot, witness, reference, config)
     recorder = _Recorder(inner)
     imu = _Imu(robot, log.mounts)
     postures = None
@@ -157,7 +159,7 @@ def drive_of_log(log: Log, witness: WitnessName = "auto", reference: str | None 
     spans = np.array([(s.start_ns, s.end_ns) for s in recorder.used], dtype=np.int64).reshape(-1, 2)
     left = f"{len(windows.maneuvers)} windows of {config.window_s:g} s; left out: {windows.standing} standing, {windows.lost} not measured."
     mount = log.mounts.get(frame, Mount())
-    by_gyro = isinstance(inner, GyroWitness)
+    by_gyro = isinstance(inner, GyroMotionReference)
     heard = bool(imu.stamps) and not by_gyro
     return Drive(
         name=log.path.name,
@@ -167,7 +169,7 @@ def drive_of_log(log: Log, witness: WitnessName = "auto", reference: str | None 
         starts_s=(spans[:, 0] - spans[0, 0]) * _NS if len(spans) else np.zeros(0),
         spans_ns=spans,
         gyro=imu.gyro if heard else None,
-        gyro_is_witness=by_gyro,
+        is_gyro_reference=by_gyro,
         forces=imu.means(spans) if heard and len(spans) else None,
         payload_arms=_payload_arms(robot, windows.maneuvers, postures),
         lidar_frame=frame,

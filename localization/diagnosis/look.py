@@ -12,7 +12,6 @@ from localization.diagnosis.drive import Drive
 from localization.diagnosis.effects import EFFECTS, EXTRA, Belief, Effect, friction_change, slope_across
 from localization.diagnosis.noise import Noise, estimated_noise, plain_noise, regressors
 from localization.diagnosis.prediction import Pipeline, with_sizes
-from localization.diagnosis.sweep_lag import sweep_lag
 from motion_models.base import MotionModel
 from motion_models.se2 import FloatArray
 
@@ -57,16 +56,16 @@ def candidates(pipeline: Pipeline, moments: int) -> tuple[Effect, ...]:
     """Causes that this drive could show; a change of the floor at so many ``moments``."""
     drive = pipeline.drive
     out = set()
-    if drive.gyro is None and not drive.gyro_is_witness:
+    if drive.gyro is None and not drive.is_gyro_reference:
         out.add("gyro_bias")
     if not pipeline.dropout_seen:
         out.add("encoder_dropout")
-    if drive.gyro_is_witness:
+    if drive.is_gyro_reference:
         out |= {"lidar_offset_x", "lidar_offset_y", "lidar_yaw", "lidar_time_offset", "lateral_slip_speed", "longitudinal_slip_turning"}
     if drive.kind == "rotations":
         out |= {"lidar_time_offset", "wheel_time_offset", "slope", "lateral_slip_speed", "rotation_slip_speed", "longitudinal_slip_turning"}
     found = [e for e in EFFECTS.values() if e.id not in out]
-    if drive.kind == "log" and not drive.gyro_is_witness:
+    if drive.kind == "log" and not drive.is_gyro_reference:
         found.append(slope_across())
         length = float(drive.starts_s[-1])
         if len(drive.maneuvers) >= 24:
@@ -86,7 +85,7 @@ def look(pipeline: Pipeline, effects: tuple[Effect, ...], sizes: dict[Effect, fl
     linear = rows.copy()
     for effect, size in sizes.items():
         linear += signatures[..., [e.key for e in effects].index(effect.key)] * size
-    nuisances = _nuisances(pipeline, rows)
+    nuisances = _nuisances(rows)
     noise = _noise(pipeline, linear, signatures, nuisances, effects)
     problem = normal_form(linear, signatures, nuisances, noise, effects, tolerance)
     return Look(effects, rows, linear, signatures, nuisances, noise, tolerance, problem)
@@ -108,12 +107,11 @@ def normal_form(
     return regression(y, s, z, _PRIOR * np.array([e.usual for e in effects]), tolerance * np.array([e.negligible for e in effects]))
 
 
-def _nuisances(pipeline: Pipeline, rows: FloatArray) -> FloatArray:
-    """(M, 6, 4) accelerometers and the floor under the IMU are never quite level, and sweeps lag."""
+def _nuisances(rows: FloatArray) -> FloatArray:
+    """(M, 6, 2) accelerometers and the floor under the IMU are never quite level."""
     level = np.zeros((*rows.shape, 2))
     level[:, 4, 0] = level[:, 5, 1] = 1.0
-    found = np.concatenate([level, sweep_lag(pipeline)], axis=-1)
-    return np.where(np.isfinite(rows)[..., None], found, np.nan)
+    return np.where(np.isfinite(rows)[..., None], level, np.nan)
 
 
 def _noise(pipeline: Pipeline, linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, effects: tuple[Effect, ...]) -> Noise:

@@ -105,14 +105,14 @@ class Pipeline:
         batch, drive = self.batch, self.drive
         out = np.full((len(batch.ends), len(CHANNELS)), np.nan)
         witness = np.array([belief.wheels_late_s - belief.lidar_late_s, belief.wheel_lag_s, *self._tracked(belief)])
-        if drive.gyro_is_witness:
+        if drive.is_gyro_reference:
             witness[2:] = 0.0
         changed = _Changed(self, belief)
         poses, _, _ = predict(changed, batch, changed.nominal, witness, _NO_COLUMNS, drive.robot.wheel_noise)
         off = se2.between(poses, batch.measured)
         known = np.isfinite(np.diagonal(batch.cov, axis1=1, axis2=2))
         out[:, :3] = np.where(known, off, np.nan)
-        if drive.gyro_is_witness:
+        if drive.is_gyro_reference:
             out[:, 2] -= belief.gyro_bias * np.array([float(m.dt[m.lead : m.lead + int(m.ends[-1])].sum()) for m in drive.maneuvers])
         if drive.gyro is not None:
             late = round(belief.lidar_late_s * 1e9)

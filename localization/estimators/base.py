@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from localization.events import PositionSample
+from localization.lidar import LostScans
 from localization.synchronizer import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
@@ -60,6 +61,10 @@ class Estimator(Protocol):
     @property
     def params(self) -> FloatArray | None:
         """(k,) the motion model's parameters as they are now believed to be, or None where nothing corrects them."""
+
+    @property
+    def lost(self) -> LostScans | None:
+        """Scans that could not be matched to a map; None where the estimator matches none."""
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         """Mean and sigma of what was estimated besides the pose, by name."""

@@ -19,6 +19,7 @@ class DeadReckoning:
 
     clock_offset_s = 0.0
     params = None
+    lost = None
 
     def __init__(self) -> None:
         self._pose, self._cov = np.zeros(3), np.zeros((3, 3))

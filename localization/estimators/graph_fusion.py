@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from scipy.linalg import block_diag
+
 from localization.errors import EstimatorError
 from localization.estimators.base import Estimate
 from localization.estimators.filter import KEY, PARAMS
@@ -33,6 +35,8 @@ _BETWEEN_FLOOR = np.diag([5e-3, 5e-3, 1e-3]) ** 2
 """Covariance of a motion between keyframes, at least: submaps bend [m^2, m^2, rad^2]."""
 _MIN_POSITIONS, _MIN_BASELINE_M = 3, 5.0
 """Positions, and the distance between them [m], from which they give the heading of the map."""
+_WHEEL_SCALE_SIGMA = 0.02
+"""Relative error of the wheels' radius, both sides alike: wear and pressure of tyres. Positions and loops show it."""
 _WALK_S = 60.0
 """Corrections are constant for this long [s]; as a random walk of an hour they change by an eighth of their prior sigma meanwhile."""
 
@@ -57,7 +61,8 @@ class GraphFusion:
     def __init__(self, odometry: EkfFusion, corrections: Corrections, lidar: LidarConfig, config: GraphConfig, is_smoothing: bool):
         """``is_smoothing``: `finish` is to give the smoothed trajectory; memory then grows with the drive, 24 bytes a step."""
         self.odometry, self._corrections, self._lidar, self._config = odometry, corrections, lidar, config
-        self._graph = PoseGraph(corrections.cov, np.array([config.antenna_x_m, config.antenna_y_m]))
+        prior = block_diag(corrections.cov, _WHEEL_SCALE_SIGMA**2)
+        self._graph = PoseGraph(prior, np.array([config.antenna_x_m, config.antenna_y_m]))
         self._loops: LoopDetector | None = None
         self._wheels = _KeyframeMotion(len(corrections.names))
         self._steps, self._stamps_ns = array("d"), array("q")  # the filter's poses, if they are to be smoothed
@@ -119,13 +124,11 @@ class GraphFusion:
         if k:
             delta, cov = ekf.motion_since(KEY)
             wheels = self._wheels.preintegrated(ekf.corrections)
-            total = wheels.cov + wheels.by_corrections @ ekf.P[PARAMS:, PARAMS:] @ wheels.by_corrections.T
+            D = wheels.by_corrections[:, :-1]
+            total = wheels.cov + D @ ekf.P[PARAMS:, PARAMS:] @ D.T
             measured = _subtract_information(delta, cov + _BETWEEN_FLOOR, wheels.delta, total + _BETWEEN_FLOOR)
-            walk = self._corrections.walk_cov * self._walked_s if self._walked_s > _WALK_S else None
-            walk = None if walk is None or not len(walk) or not np.any(walk) else walk + 1e-12 * np.diag(self._corrections.sigmas**2)
-            self._walked_s = 0.0 if walk is not None else self._walked_s
             pose = se2.compose(self._graph.pose(k - 1), delta)
-            update = Update(pose, wheels, walk, (Between(k - 1, k, *measured),))
+            update = Update(pose, wheels, self._walk(), (Between(k - 1, k, *measured),))
         else:
             update = Update(ekf.pose)
         self._graph.apply(update)
@@ -135,9 +138,18 @@ class GraphFusion:
         self._close_loops(Keyframe(ekf.pose, self.odometry.scan_points))
         self._align_positions()
         if len(self._corrections.names) and k:
-            ekf.set_corrections(*self._graph.corrections())
+            mean, cov = self._graph.corrections()
+            ekf.set_corrections(mean[:-1], cov[:-1, :-1])
         self._map_T_odom = se2.compose(self._graph.pose(k), se2.inverse(ekf.pose))
         self._key_cov = self._graph.marginal(k)
+
+    def _walk(self) -> FloatArray | None:
+        """(c, c) by which the corrections may have changed, once a minute; None meanwhile."""
+        if self._walked_s < _WALK_S:
+            return None
+        cov = block_diag(self._corrections.walk_cov * self._walked_s, 0.0)
+        self._walked_s = 0.0
+        return np.asarray(cov + 1e-12 * np.eye(len(cov)))
 
     def _close_loops(self, keyframe: Keyframe) -> None:
         if self._loops is None:
@@ -194,7 +206,8 @@ class GraphFusion:
         return Trajectory(moments.stamps_ns, smoothed, smoothed_covs)
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
-        return self.odometry.parameters()
+        mean, cov = self._graph.corrections()
+        return {**self.odometry.parameters(), "wheel_radius_scale": (1.0 + float(mean[-1]), math.sqrt(float(cov[-1, -1])))}
 
     def counts(self) -> Mapping[str, int]:
         found = {**self.odometry.counts(), "keyframes": self._graph.count}
@@ -232,7 +245,8 @@ class _KeyframeMotion:
     def preintegrated(self, at: FloatArray) -> PreintegratedMotion:
         """All of it, with the corrections ``at`` which the steps were predicted."""
         cov = self._cov + self._straight @ self._prior @ self._straight.T + 1e-10 * np.eye(3)
-        return PreintegratedMotion(self._delta, cov, self._by_corrections, at)
+        by_scale = se2.log(self._delta) * [1.0, 1.0, 0.0]  # turns have a scale of their own: k
+        return PreintegratedMotion(self._delta, cov, np.column_stack([self._by_corrections, by_scale]), np.append(at, 0.0))
 
 
 def _subtract_information(delta: FloatArray, cov: FloatArray, prior: FloatArray, prior_cov: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -26,6 +26,7 @@ class LidarOdometry:
 
     clock_offset_s = 0.0
     params = None
+    lost = None
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig | None = None) -> None:
         self._mounts, self._config = mounts, config or LidarConfig()

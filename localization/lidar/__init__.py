@@ -3,10 +3,11 @@
 from localization.lidar.deskew import Sweep
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
 from localization.lidar.scan_checks import LostScans
-from localization.lidar.scan_matcher import KeyScanError, LidarConfig, ScanMatch, ScanMatcher
+from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher, choose_cell
 from localization.lidar.scan_matching import ScanMatchingSensor
 
 __all__ = [
+    "MIN_POINTS",
     "KeyScanError",
     "KissIcp",
     "LidarConfig",
@@ -15,5 +16,6 @@ __all__ = [
     "ScanMatcher",
     "ScanMatchingSensor",
     "Sweep",
+    "choose_cell",
     "choose_voxel_size",
 ]

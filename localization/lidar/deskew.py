@@ -13,6 +13,9 @@ from motion_models import se2
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
+_WALL_CELL_M = 0.2
+"""Cell in which a cloud has to span a height to be a wall [m]."""
+
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
@@ -49,6 +52,10 @@ class Sweep:
         points = np.empty_like(self.points)
         _move(self.points, self.times, twist, points)
         return points
+
+    def project(self, points: FloatArray) -> FloatArray:
+        """(M, 2) what of the deskewed ``points`` (N, 3) is matched in the plane: a planar scan as it is, of a cloud the walls."""
+        return np.ascontiguousarray(points[:, :2] if self.is_planar else extract_walls(points, _WALL_CELL_M))
 
     def displacement(self, twist: FloatArray) -> float:
         """How far an error of ``twist`` (3,) moves points of the sweep against each other [m]."""

@@ -14,8 +14,6 @@ from localization.lidar.submap import make_grid, voxel_means
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
-_EVERY = 2
-"""Keyframes between trials."""
 _MIN_KEYFRAMES = 25
 """Keyframes that must lie between both visits: what is nearer in time is in the filter's own submap."""
 _AROUND = 8
@@ -38,7 +36,7 @@ _HEADING_WEIGHT = 0.3
 """How much a turned scanner, which sees other walls, counts as distance: of the median range, per radian."""
 _AGREE_M, _AGREE_RAD = 0.15, 0.06
 """Two loops agree where one predicts the other within this and 3 sigma."""
-_AGREE_WITHIN = 6 * _EVERY
+_AGREE_WITHIN = 12
 """Keyframes within which a second loop has to agree."""
 
 
@@ -76,9 +74,10 @@ class LoopDetector:
         self.keyframes.append(keyframe)
 
     def detect(self, poses: Callable[[], FloatArray], marginal: Callable[[int], FloatArray]) -> list[LoopClosure]:
-        """Loops that end at the newest keyframe, or shortly before. ``poses()`` (K, 3) are the graph's, ``marginal(k)`` (3, 3) their covariance."""
+        """Loops that end at the newest keyframe, or shortly before. ``poses()`` (K, 3) are the graph's,
+        ``marginal(k)`` (3, 3) is the covariance of one."""
         k = len(self.keyframes) - 1
-        if k % _EVERY or k <= _MIN_KEYFRAMES or not len(self.keyframes[k].points):
+        if k <= _MIN_KEYFRAMES or not len(self.keyframes[k].points):
             return []
         found = self._match(k, poses(), marginal(k))
         self._pending = [loop for loop in self._pending if k - loop.b <= _AGREE_WITHIN]

@@ -67,6 +67,11 @@ class LostScans:
         length, start = max(self._longest, (self._last_ns - self._matched_ns, self._matched_ns))
         return length * 1e-9, (start - self._first_ns) * 1e-9 if length else 0.0
 
+    @property
+    def ongoing_s(self) -> float:
+        """Time from the last match to the last scan [s]."""
+        return (self._last_ns - self._matched_ns) * 1e-9
+
     def _count(self, stamp_ns: int) -> None:
         self.scans += 1
         if self._first_ns is None:

@@ -28,6 +28,8 @@ _KERNEL = 3.0
 _REACH_CELLS = 2.5
 """How far a point may be from the voxel that it is associated with [cells]."""
 _ITERATIONS = 20
+_CELL_OF_RANGE, _MIN_CELL_M = 0.02, 0.04
+"""Voxel of a submap, as a share of the first scan's median range, and at least [m]."""
 _BLOCK = 30
 """Neighbouring beams whose residuals are summed, to measure how they err together [beams]: the residuals of real scans are correlated over
 10 to 20 beams, those of simulated rooms over 1 to 10."""
@@ -229,6 +231,11 @@ def align_points(grid: VoxelGrid, points: FloatArray, prior: FloatArray, cov: Fl
     """Gauss-Newton from ``guess`` (3,) for ``points`` (N, 2), with the ``prior`` (3,) of covariance ``cov`` (3, 3)."""
     pose, H, found = _align(grid, points, prior, cov, np.linalg.inv(cov), guess)
     return Fit(pose, H, *(float(value) for value in found))
+
+
+def choose_cell(config: LidarConfig, points: FloatArray) -> float:
+    """Edge of the voxels [m] for a submap that begins with ``points`` (N, 2) of the body frame."""
+    return config.voxel_size_m or max(_CELL_OF_RANGE * float(np.median(np.hypot(points[:, 0], points[:, 1]))), _MIN_CELL_M)
 
 
 def _is_better(found: Fit, fit: Fit, prior: FloatArray, cov: FloatArray) -> bool:

@@ -8,19 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localization.lidar.deskew import Sweep, extract_walls
+from localization.lidar.deskew import Sweep
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
 from localization.lidar.scan_checks import LostScans, StaleScans
-from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher
+from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher, choose_cell
 from localization.synchronizer import Step
 from motion_models import se2
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
-_CELL_OF_RANGE, _MIN_CELL_M = 0.02, 0.04
-"""Voxel of a submap, as a share of the first scan's median range, and at least [m]."""
-_WALL_CELL_M = 0.2
-"""Cell in which a cloud has to span a height to be a wall [m]."""
 _MIN_DISPLACEMENT_M = 1e-3
 """Points that another twist moves by less are not deskewed again [m]."""
 
@@ -119,14 +115,12 @@ class ScanMatchingSensor:
 
     def _deskew(self, sweep: Sweep, twist: FloatArray) -> _Scan:
         points = sweep.deskew(twist)
-        planar = points[:, :2] if sweep.is_planar else extract_walls(points, _WALL_CELL_M)
-        return _Scan(sweep, twist, points, np.ascontiguousarray(planar))
+        return _Scan(sweep, twist, points, sweep.project(points))
 
     def _begin(self, scan: _Scan) -> None:
         """The first scan sets the size of the voxels."""
-        median = float(np.median(np.hypot(scan.planar[:, 0], scan.planar[:, 1])))
         c = self._config
-        self._matcher = ScanMatcher(c, c.voxel_size_m or max(_CELL_OF_RANGE * median, _MIN_CELL_M))
+        self._matcher = ScanMatcher(c, choose_cell(c, scan.planar))
         if c.matcher == "kiss" or not scan.sweep.is_planar:
             self._kiss = KissIcp(c.voxel_size_m or choose_voxel_size(scan.points), c.max_range_m)
 

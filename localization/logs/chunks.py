@@ -96,18 +96,41 @@ class DamagedError(Exception):
     """Bytes that cannot be what they should be. Never leaves this package."""
 
 
+_MOST_HELD_BYTES = 512 << 20
+"""Of messages that wait for their turn [B]. Recorders' chunks overlap by seconds (a few MB); where they overlap by more than this, the
+oldest message is given out early, and `merge` reports what then comes too late."""
+
+
 def in_log_order(chunks: Iterable[Chunk], load: Callable[[Chunk], Iterable[RawMessage]]) -> Iterator[RawMessage]:
     """All messages in order of log time (those of equal time in order of the file), holding only chunks that overlap in time."""
     held: list[tuple[int, int, RawMessage]] = []
-    serial = 0
+    serial = held_bytes = 0
     for chunk in sorted(chunks, key=lambda c: (c.start_ns, c.position)):
-        while held and held[0][0] < chunk.start_ns:
-            yield heapq.heappop(held)[2]
+        while held and (held[0][0] < chunk.start_ns or held_bytes > _MOST_HELD_BYTES):
+            message = heapq.heappop(held)[2]
+            held_bytes -= len(message.data)
+            yield message
         for message in load(chunk):
             heapq.heappush(held, (message.log_ns, serial, message))
+            held_bytes += len(message.data)
             serial += 1
     while held:
         yield heapq.heappop(held)[2]
+
+
+MOST_PLAIN_BYTES = 256 << 20
+"""Of a chunk or of a message, decompressed [B]. Recorders make chunks of 0.8 to 16 MB, and the largest messages of robots (maps, stitched
+clouds) have 100 MB; what is larger is read uncompressed only, where it needs the memory that it takes on the disk."""
+_MOST_RATIO = 1000
+"""Decompressed to compressed size, of more than `_ANY_RATIO_BYTES`. Sensor data compress by 2 to 10, joint states of a robot that rests by
+100; an empty map compresses by 10,000, but has 16 MB."""
+_ANY_RATIO_BYTES = 64 << 20
+_PIECE_BYTES = 1 << 20
+
+
+def most_plain_bytes(packed: int) -> int:
+    """What ``packed`` bytes may decompress to [B], if they are no bomb."""
+    return max(_ANY_RATIO_BYTES, _MOST_RATIO * packed)
 
 
 def decompress(data: bytes, compression: str) -> bytes:
@@ -119,7 +142,7 @@ def decompress(data: bytes, compression: str) -> bytes:
 
 
 def decompress_head(data: bytes, compression: str) -> tuple[bytes, bool]:
-    """As much as can be had of a chunk whose end may be missing, and whether that is all of it."""
+    """As much as can be had of a chunk whose end may be missing, and whether that is all of it. Raises `DamagedError`."""
     if compression in ("", "none"):
         return data, True
     makers: dict[str, Callable[[], Any]] = {
@@ -130,10 +153,13 @@ def decompress_head(data: bytes, compression: str) -> tuple[bytes, bool]:
     if compression not in makers:
         raise DamagedError(f"compression '{compression}' is not known")
     decoder = makers[compression]()
+    most = min(MOST_PLAIN_BYTES, most_plain_bytes(len(data)))
     try:
-        plain: bytes = decoder.decompress(data)
-    except (OSError, EOFError, RuntimeError, ValueError, zstd.ZstdError) as error:
+        plain: bytes = decoder.decompress(data, max_length=most + 1)
+    except (OSError, EOFError, RuntimeError, ValueError, MemoryError, zstd.ZstdError) as error:
         raise DamagedError(f"a chunk does not decompress: {error}") from error
+    if len(plain) > most:
+        raise DamagedError(f"its {len(data)} bytes decompress to more than {most >> 20} MB, which no recorder writes (a bomb)")
     return plain, bool(decoder.eof)
 
 
@@ -142,22 +168,29 @@ def inflate_message(data: bytes) -> bytes:
     if data[:4] != b"\x28\xb5\x2f\xfd":
         return data
     try:
-        return zstd.decompress(data)
-    except zstd.ZstdError:
+        return decompress(data, "zstd")
+    except DamagedError:
         return data  # which the decoder will refuse, and count
 
 
 def inflate_file(path: Path, target: Path) -> str:
     """Decompress a zstd file into ``target`` as far as it goes; the reason why it went no further, or nothing."""
+    most = most_plain_bytes(path.stat().st_size)
     with path.open("rb") as packed, target.open("wb") as plain:
         decoder = zstd.ZstdDecompressor()
         try:
-            pending = packed.read(1 << 20)
-            while pending:
+            pending = packed.read(_PIECE_BYTES)
+            while pending or not decoder.needs_input:
                 if decoder.eof:  # a file may hold several frames
                     decoder = zstd.ZstdDecompressor()
-                plain.write(decoder.decompress(pending))
-                pending = (decoder.unused_data if decoder.eof else b"") or packed.read(1 << 20)
+                plain.write(decoder.decompress(pending, _PIECE_BYTES))
+                if plain.tell() > most:
+                    return f"it decompresses to more than {_MOST_RATIO} times its size"
+                pending = decoder.unused_data if decoder.eof else b""
+                if not pending and (decoder.eof or decoder.needs_input):
+                    pending = packed.read(_PIECE_BYTES)
+                    if not pending:
+                        break
         except zstd.ZstdError as error:
             return str(error)
     return "" if decoder.eof else "it was cut off"

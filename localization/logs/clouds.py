@@ -14,6 +14,7 @@ from motion_models.se2 import FloatArray
 # sensor_msgs/PointField: datatype 1..8
 _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "offset_time", "time_offset", "stamp", "stamps")
+_MOST_POINTS = 10_000_000  # of a sweep; LiDARs have up to 300,000, and as numbers these take 1 GB
 _LATEST_BEGIN_S = 0.5  # a sweep begins at its header's stamp, or ends there
 
 
@@ -43,6 +44,8 @@ def _table(message: Any) -> Any:
     step, row_step = int(message.point_step), int(message.row_step)
     order = ">" if message.is_bigendian else "<"
     data = np.ascontiguousarray(message.data, dtype=np.uint8)
+    if height * width > _MOST_POINTS:
+        raise UnusableError(Oddity.MALFORMED)
     if height * width == 0:
         return np.empty((0, 0), dtype=[(name, "f8") for name in "xyz"])
     if height == 1:

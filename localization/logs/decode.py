@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.interfaces import MessageDefinitionFormat, Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 from localization.events import CgSample, ImuSample, Scan
@@ -21,6 +21,11 @@ from motion_models.se2 import FloatArray
 LONGEST_SWEEP_S = 2.0
 _FASTEST_TURN = math.radians(2000.0)  # rad/s, the full scale of gyros on robots
 _STRONGEST_FORCE = 1e5  # m/s^2; drivers use other units, in which this may be 100 g (cm/s^2)
+_LEAST_SQUARED_NORM = 0.01  # of a rotation, whose quaternion need not be normalised; what is smaller is the noise of one not filled in
+_MOST_BEAMS = 1_000_000  # of a planar scan; the finest scanners have 20,000
+_WIDEST_RAD = math.tau * 1.1  # from first to last beam; scanners that turn on a little overlap their first beam
+_LONGEST_DEFINITION = 1 << 18  # characters; those of ROS's own types have up to 20,000
+_LONGEST_FIXED_ARRAY = 10_000  # elements; ROS's longest is a covariance of 36. The reader's code has a line or more for each
 _KNOWN_NAMES = 100  # nobody's joints change that often, but the memory must not grow
 
 
@@ -92,21 +97,77 @@ class Decoder:
 
 @lru_cache(maxsize=64)
 def _deserializer(kind: str, form: MessageDefinitionFormat, text: str, is_ros1: bool) -> Callable[[bytes], Any]:
+    standard = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     store = get_typestore(Stores.EMPTY)
     try:
-        if form == MessageDefinitionFormat.MSG:
-            types = get_types_from_msg(text, kind)
-        else:
-            types = {}
-            for part in text.split("=" * 80 + "\n"):
-                idl = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
-                types.update(get_types_from_idl(idl) if idl.strip() else {})
+        types = _parse_definition(kind, form, text)
+        if not _is_bounded(types):
+            raise ValueError("a definition with arrays that no robot sends")
         store.register(types)
+        if not _has_fields(store.fielddefs, standard.fielddefs, kind):
+            raise ValueError("a definition without the fields that the type has")
         store.get_msgdef(kind)
     except Exception:  # no definition, or one that the parser does not understand (it lets out anything): the standard one will do
-        store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+        store = standard
     deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
     return lambda data: deserialize(data, kind)
+
+
+def _parse_definition(kind: str, form: MessageDefinitionFormat, text: str) -> dict[str, Any]:
+    """Fields by type. Raises anything."""
+    if len(text) > _LONGEST_DEFINITION:
+        raise ValueError("a definition that is too long")
+    if form == MessageDefinitionFormat.MSG:
+        return dict(get_types_from_msg(text, kind))
+    if "<<" in text:  # a constant may be 1 << 10**9, and the parser computes it; no message of ROS shifts
+        raise ValueError("a definition that computes")
+    types: dict[str, Any] = {}
+    for part in text.split("=" * 80 + "\n"):
+        idl = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
+        types.update(get_types_from_idl(idl) if idl.strip() else {})
+    return types
+
+
+def _is_bounded(types: Mapping[str, Any]) -> bool:
+    """Whether no array is too long to generate a reader for, and none has elements without bytes, whose number has no bound."""
+    for _, fields in types.values():
+        for _, (node, inside) in fields:
+            if node not in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+                continue
+            (element, name), length = inside
+            if node == Nodetype.ARRAY and length > _LONGEST_FIXED_ARRAY:
+                return False
+            if element == Nodetype.NAME and not _has_bytes(types, name, len(types)):
+                return False
+    return True
+
+
+def _has_bytes(types: Mapping[str, Any], name: str, depth: int) -> bool:
+    """Whether a message of the type takes any. One that is not among ``types`` does, as it is of ROS's own basic ones."""
+    if name not in types:
+        return True
+    return depth > 0 and any(
+        (node != Nodetype.NAME or _has_bytes(types, inside, depth - 1))
+        and (node != Nodetype.ARRAY or (inside[1] > 0 and (inside[0][0] != Nodetype.NAME or _has_bytes(types, inside[0][1], depth - 1))))
+        for _, (node, inside) in types[name][1]
+    )
+
+
+def _has_fields(found: Mapping[str, Any], standard: Mapping[str, Any], kind: str) -> bool:
+    """Whether the definition ``found`` of a type has all fields of the standard one, of the same types; it may have more."""
+    if kind not in standard:
+        return True
+    if kind not in found:
+        return False
+    have = dict(found[kind][1])
+    for name, described in standard[kind][1]:
+        if have.get(name) != described:
+            return False
+        node, inside = described
+        inner = inside if node == Nodetype.NAME else inside[0][1] if node != Nodetype.BASE and inside[0][0] == Nodetype.NAME else None
+        if inner is not None and not _has_fields(found, standard, inner):
+            return False
+    return True
 
 
 def stamp_ns(message: Any) -> int:
@@ -137,8 +198,8 @@ def decode_cg(message: Any, stamp: int) -> CgSample:
 
 
 def yaw_of(q: Any) -> float:
-    """Heading of a quaternion [rad]; NaN if it is none (all zeros)."""
-    if q.x == 0 and q.y == 0 and q.z == 0 and q.w == 0:
+    """Heading of a quaternion [rad]; NaN if it is no rotation, as one that was never filled in."""
+    if not q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w >= _LEAST_SQUARED_NORM:
         return math.nan
     return math.atan2(2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
 
@@ -222,8 +283,11 @@ def scan_decoder() -> Callable[[Any, int], Scan]:
         first, step = float(message.angle_min), float(message.angle_increment)
         if step == 0.0 and len(ranges) > 1:
             step = (float(message.angle_max) - first) / (len(ranges) - 1)
-        if not (math.isfinite(first) and math.isfinite(step)):
+        n = len(ranges)
+        if not (math.isfinite(first) and math.isfinite(step)) or n > _MOST_BEAMS:
             raise UnusableError(Oddity.MALFORMED)
+        if n > 1 and not 0.0 < abs(step) * (n - 1) <= _WIDEST_RAD:
+            raise UnusableError(Oddity.NO_ANGLES)
         key = (len(ranges), first, step)
         direction = directions.get(key)
         if direction is None:

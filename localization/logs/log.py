@@ -7,7 +7,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from localization.errors import LogError
+from localization.errors import LogError, TopicError
 from localization.events import Event, Reference
 from localization.logs.chunks import Source, merge_channels
 from localization.logs.decode import Decoder, UnusableError, frame_name, stamp_ns
@@ -71,6 +71,7 @@ class Log:
         self.wheels_error = parts.wheels_error
         """Why `events` will refuse, if it will."""
         self._joints, self._arms, self._choice_notes = parts.joints, parts.arms, parts.notes
+        self._mount_notes: list[str] = []
         self.frames: dict[str, str] = {}
         """Frame of the first message of each topic that is used."""
         self._clocks = self._watch_clocks()
@@ -97,7 +98,7 @@ class Log:
         Raises `TopicError` if the joint states, the only source of wheels, lack the robot's wheel joints.
         """
         if self.wheels_error is not None:
-            raise self.wheels_error
+            raise TopicError(" ".join([str(self.wheels_error), *self.damage()]))  # what was lost may be why
         tally = self._tallies["events"] = Tally()
         return self._events(tally)
 
@@ -131,7 +132,11 @@ class Log:
                 if raw.log_ns > self.start_ns + _TF_WATCHED_NS:
                     break
                 _try(lambda raw=raw: transforms.add(decode(raw), is_static=False))  # type: ignore[misc]
-        return {"base_link": Mount(), **self.robot.mounts, **transforms.mounts()}
+        found = transforms.mounts()
+        self._mount_notes = transforms.notes()
+        for frame in transforms.contradictions().keys() & self.robot.mounts.keys():
+            del found[frame]  # the robot file decides
+        return {"base_link": Mount(), **self.robot.mounts, **found}
 
     def damage(self) -> list[str]:
         """Sentences about what of its files could not be read, and how much could, so far."""
@@ -139,7 +144,7 @@ class Log:
 
     def notes(self) -> list[str]:
         """Sentences about everything that was lost, mended or chosen without being told, so far: `damage` first."""
-        said = [*self.damage(), *self._choice_notes]
+        said = [*self.damage(), *self._mount_notes, *self._choice_notes]
         for tally in self._tallies.values():
             said += tally.sentences()
         return list(dict.fromkeys(said))

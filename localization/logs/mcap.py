@@ -1,14 +1,17 @@
-"""MCAP files that rosbags refuses: cut off, out of order without an index, or of ROS 1. Read record by record.
+"""MCAP files, chunk by chunk, of ROS 2 and ROS 1, whole or cut off.
 
-Format: https://mcap.dev/spec. The index is made anew by going through the file once; messages outside of chunks are taken together
-in runs of a megabyte, which then are chunks like the others.
+Chunks are taken from the file's own index where that is whole; where it is not, the index is made anew by going through the file once,
+and messages outside of chunks are taken together in runs of a megabyte, which then are chunks like the others. What a damaged chunk
+still holds is searched for. Format: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
 
+import re
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 from zlib import crc32
@@ -21,14 +24,21 @@ from localization.logs.chunks import Channel, Chunk, DamagedError, RawMessage, d
 
 MAGIC = b"\x89MCAP0\r\n"
 
-_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _CHUNK_INDEX = 2, 3, 4, 5, 6, 8
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _CHUNK_INDEX, _STATISTICS = 2, 3, 4, 5, 6, 8, 11
 _RUN = 1 << 20
+_PIECE = 1 << 20
+_FOOTER_BYTES = 37  # with the magic that ends the file
+_LONGEST_DESCRIPTION = 16 << 20  # bytes of a schema, channel or index record; a message's definition has some kB, a chunk's index too
 _FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
     "ros1msg": MessageDefinitionFormat.MSG,
     "ros2idl": MessageDefinitionFormat.IDL,
     "omgidl": MessageDefinitionFormat.IDL,
 }
+_MAY_BE_MESSAGE = re.compile(rb"(?=\x05.{5}\0{3})", re.DOTALL)  # of less than 2^40 bytes
+
+Entry = tuple[int, int, bytes]
+"""Channel, time of recording [ns] and data of a message."""
 
 
 class _Topic(NamedTuple):
@@ -38,37 +48,37 @@ class _Topic(NamedTuple):
     encoding: str
 
 
-class RecoveredMcap:
+class McapFile:
     """As much of an MCAP file as can be read. Raises `LogError` if that is nothing."""
 
-    def __init__(self, path: Path, reason: str) -> None:
+    def __init__(self, path: Path) -> None:
         self._path = path
         self._schemas: dict[int, tuple[str, MessageDefinition]] = {}
-        self._topics: dict[int, _Topic] = {}
+        self._described: dict[int, _Topic] = {}
         self._chunks: list[Chunk] = []
         self._run: Chunk | None = None
+        self._reported: set[int] = set()
         self.notes: list[str] = []
+        reason, unread = "", 0
         with path.open("rb") as file:
-            unread = self._index(file)
+            try:
+                self._read_summary(file)
+            except (DamagedError, struct.error) as error:
+                reason = str(error)
+                self._schemas, self._described, self._chunks, self.notes = {}, {}, [], []
+                unread = self._index(file)
         totals: Counter[int] = Counter()
         for chunk in self._chunks:
             totals.update(chunk.counts)
-        encodings = Counter({t.encoding: 0 for t in self._topics.values()})
-        for key, topic in self._topics.items():
-            encodings[topic.encoding] += totals[key]
-        if not encodings["cdr"] and not encodings["ros1"]:
-            found = (
-                f"its messages are encoded as {', '.join(sorted(encodings))}, not as those of ROS" if encodings else "it holds no messages"
-            )
-            raise LogError(f"'{path}' cannot be read: {reason}; {found}.")
-        self.is_ros1 = encodings["ros1"] > encodings["cdr"]
+        self.is_ros1 = self._is_ros1(totals, reason)
         used = "ros1" if self.is_ros1 else "cdr"
-        self._topics = {key: t for key, t in self._topics.items() if t.encoding == used}
+        self._topics = {key: t for key, t in self._described.items() if t.encoding == used}
         self.channels = [Channel(t.name, t.type, t.definition, totals[key]) for key, t in sorted(self._topics.items())]
         self.start_ns = min((c.start_ns for c in self._chunks), default=0)
         self.end_ns = max((c.end_ns for c in self._chunks), default=0)
-        lost = f"; of its last {unread} bytes only what is whole could be read" if unread else ""
-        self.notes.insert(0, f"{path.name} was read record by record ({reason}): {totals.total()} messages of it are used{lost}.")
+        if reason:
+            lost = f"; of its last {unread} bytes only what is whole could be read" if unread else ""
+            self.notes.insert(0, f"{path.name} was read record by record ({reason}): {totals.total()} messages of it are used{lost}.")
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         wanted = {key: t for key, t in self._topics.items() if t.name in topics}
@@ -76,27 +86,71 @@ class RecoveredMcap:
 
             def load(chunk: Chunk) -> list[RawMessage]:
                 file.seek(chunk.position)
-                plain, _ = _plain(file.read(chunk.size))
+                entries, damage = self._entries(file.read(chunk.size))
+                if len(entries) < sum(chunk.counts.values()) or damage:
+                    self._report(chunk, len(entries), damage or "its index lists more")
                 return [
                     RawMessage(log_ns, wanted[key].name, wanted[key].type, inflate_message(data))
-                    for key, log_ns, data in _messages(plain)
+                    for key, log_ns, data in entries
                     if key in wanted
                 ]
 
             yield from in_log_order((c for c in self._chunks if not wanted.keys().isdisjoint(c.counts)), load)
 
+    def _is_ros1(self, totals: Counter[int], reason: str) -> bool:
+        """Whether most messages are encoded as ROS 1's. Raises `LogError` where there are neither these nor those of ROS 2."""
+        encodings = Counter({t.encoding: 0 for t in self._described.values()})
+        for key, topic in self._described.items():
+            encodings[topic.encoding] += totals[key]
+        if not encodings["cdr"] and not encodings["ros1"] and (reason or encodings.total()):
+            names = ", ".join(sorted(name or "nothing" for name, count in encodings.items() if count))
+            found = f"its messages are encoded as {names}, not as those of ROS" if names else "it holds no messages"
+            raise LogError(" ".join([f"'{self._path}' cannot be read: {reason + '; ' if reason else ''}{found}.", *self.notes]))
+        return encodings["ros1"] > encodings["cdr"]
+
+    def _read_summary(self, file: BinaryIO) -> None:
+        """Topics and chunks as the end of the file lists them. Raises `DamagedError` and `struct.error`."""
+        end = file.seek(0, 2) - _FOOTER_BYTES
+        if end < len(MAGIC):
+            raise DamagedError("it breaks off")
+        file.seek(end)
+        footer = file.read(_FOOTER_BYTES)
+        if not footer.endswith(MAGIC) or footer[0] != _FOOTER:
+            raise DamagedError("its end is missing")
+        first, _, crc = struct.unpack_from("<QQI", footer, 9)
+        if first == 0:
+            raise DamagedError("it has no index of chunks")
+        if not len(MAGIC) <= first <= end:
+            raise DamagedError("its footer points outside of it")
+        if crc and _checksum(file, first, end + 25) != crc:  # the footer up to the checksum itself is part of it
+            raise DamagedError("the checksum of its index is wrong")
+        listed = None
+        for op, record in _described(file, first, end):
+            if op in (_SCHEMA, _CHANNEL):
+                self._describe(op, record)
+            elif op == _CHUNK_INDEX:
+                self._chunks.append(_indexed_chunk(record, first))
+            elif op == _STATISTICS:
+                (listed,) = struct.unpack_from("<Q", record)
+        found = sum(sum(chunk.counts.values()) for chunk in self._chunks)
+        if listed is None and not self._chunks:
+            raise DamagedError("it has no index of chunks")
+        if listed is not None and listed != found:
+            raise DamagedError(f"its index lists {found} of {listed} messages")
+        if not {key for chunk in self._chunks for key in chunk.counts} <= self._described.keys():
+            raise DamagedError("its index does not describe all topics")
+
     def _index(self, file: BinaryIO) -> int:
         """Go through the file; the bytes at its end that could not be read."""
-        file.seek(0, 2)
-        end = file.tell()
-        position = len(MAGIC)
+        end = file.seek(0, 2)
+        position, op = len(MAGIC), 0
         while position + 9 <= end:
             file.seek(position)
             op, size = struct.unpack("<BQ", file.read(9))
             whole = position + 9 + size <= end
             if op == _FOOTER or op == 0:
                 break
-            if op in (_SCHEMA, _CHANNEL) and whole:
+            if op in (_SCHEMA, _CHANNEL) and whole and size <= _LONGEST_DESCRIPTION:
                 self._describe(op, file.read(size))
             elif op == _MESSAGE and whole and size >= 22:
                 self._add_to_run(position, 9 + size, file.read(22))
@@ -111,25 +165,14 @@ class RecoveredMcap:
     def _add_chunk(self, position: int, size: int, file: BinaryIO) -> None:
         self._end_run()
         file.seek(position)
-        try:
-            plain, is_whole = _plain(file.read(size))
-        except DamagedError as reason:
-            self.notes.append(f"A chunk at byte {position} of {self._path.name} was left out: {reason}.")
-            return
-        left = len(plain)
-        for op, record in _records(plain):
-            left -= 9 + len(record)
-            if op in (_SCHEMA, _CHANNEL):
-                self._describe(op, record)
-        if is_whole and left:
-            self.notes.append(f"A chunk at byte {position} of {self._path.name} is damaged: its last {left} bytes were left out.")
-        counts: Counter[int] = Counter()
-        start, end = 2**63 - 1, 0
-        for key, log_ns, _ in _messages(plain):
-            counts[key] += 1
-            start, end = min(start, log_ns), max(end, log_ns)
+        entries, damage = self._entries(file.read(size))
+        counts = Counter(key for key, _, _ in entries)
+        stamps = [log_ns for _, log_ns, _ in entries]
+        chunk = Chunk(position, min(stamps, default=0), max(stamps, default=0), dict(counts), size)
+        if damage:
+            self._report(chunk, len(entries), damage)
         if counts:
-            self._chunks.append(Chunk(position, start, end, dict(counts), size))
+            self._chunks.append(chunk)
 
     def _add_to_run(self, position: int, size: int, head: bytes) -> None:
         key, _, log_ns, _ = struct.unpack("<HIQQ", head)
@@ -148,6 +191,52 @@ class RecoveredMcap:
             self._chunks.append(self._run)
             self._run = None
 
+    def _entries(self, record: bytes) -> tuple[list[Entry], str]:
+        """Messages of a chunk record or of a run of messages, as far as they are whole, and what is damaged, or nothing.
+
+        Topics that it describes are taken in. A chunk that is cut off gives what it has. Of a compressed chunk that is damaged nothing is
+        believed, of an uncompressed one what looks like messages.
+        """
+        if record[:1] != bytes([_CHUNK]):
+            return _whole_messages(record), ""
+        try:
+            plain, span, damage = _plain(record)
+        except DamagedError as error:
+            return [], str(error)
+        position, entries = 0, []
+        while position + 9 <= len(plain):
+            op, size = struct.unpack_from("<BQ", plain, position)
+            after = position + 9 + size
+            entry = _entry(plain, position, after) if op == _MESSAGE else None
+            if after > len(plain) or op == 0 or (op == _MESSAGE and (entry is None or entry[0] not in self._described)):
+                damage = damage or f"byte {position} of it is not the start of a record"
+                position = self._next_message(plain, position + 1, span)
+                continue
+            if op in (_SCHEMA, _CHANNEL):
+                self._describe(op, plain[position + 9 : after])
+            elif entry is not None:
+                entries.append(entry)
+            position = after
+        return entries, damage
+
+    def _next_message(self, plain: bytes, position: int, span: tuple[int, int]) -> int:
+        """Where the next message of a known topic and of the chunk's time begins; the end if there is none."""
+        for found in _MAY_BE_MESSAGE.finditer(plain, position):
+            after = found.start() + 9 + int.from_bytes(plain[found.start() + 1 : found.start() + 9], "little")
+            entry = _entry(plain, found.start(), after)
+            if entry is not None and entry[0] in self._described and span[0] <= entry[1] <= span[1]:
+                return found.start()
+        return len(plain)
+
+    def _report(self, chunk: Chunk, count: int, damage: str) -> None:
+        """Once for each chunk."""
+        if chunk.position in self._reported:
+            return
+        self._reported.add(chunk.position)
+        listed = sum(chunk.counts.values())
+        used = f"{count} of its {listed} messages are" if listed > count else f"{count} messages of it are"
+        self.notes.append(f"A chunk at byte {chunk.position} of {self._path.name} is damaged ({damage}): {used} used.")
+
     def _describe(self, op: int, record: bytes) -> None:
         try:
             if op == _SCHEMA:
@@ -161,67 +250,90 @@ class RecoveredMcap:
                 topic, at = _string(record, 4)
                 encoding, _ = _string(record, at)
                 kind, definition = self._schemas.get(schema, ("", MessageDefinition(MessageDefinitionFormat.NONE, "")))
-                self._topics[key] = _Topic(topic, normalize_msgtype(kind) if "/" in kind else kind, definition, encoding)
+                self._described.setdefault(key, _Topic(topic, normalize_msgtype(kind) if "/" in kind else kind, definition, encoding))
         except struct.error:
             self.notes.append(f"A description of a topic in {self._path.name} is damaged.")
 
 
-def has_chunk_index(path: Path) -> bool:
-    """Whether rosbags can read the file in order of time: its summary lists the chunks. True where there is no telling."""
-    with path.open("rb") as file:
-        try:
-            file.seek(-37, 2)
-            tail = file.read(37)
-            if not tail.endswith(MAGIC) or tail[0] != _FOOTER:
-                return True
-            (position,) = struct.unpack_from("<Q", tail, 9)
-            while position:
-                file.seek(position)
-                op, size = struct.unpack("<BQ", file.read(9))
-                if op == _CHUNK_INDEX:
-                    return True
-                if op == _FOOTER:
-                    return False
-                position += 9 + size
-        except (OSError, struct.error, OverflowError):
-            return True
-    return False
+def _checksum(file: BinaryIO, first: int, end: int) -> int:
+    file.seek(first)
+    crc, left = 0, end - first
+    while left > 0 and (piece := file.read(min(left, _PIECE))):
+        crc, left = crc32(piece, crc), left - len(piece)
+    return crc
 
 
-def _plain(record: bytes) -> tuple[bytes, bool]:
-    """Records of a chunk record or of a run of messages; a chunk that is cut off gives what it has."""
-    if record[:1] != bytes([_CHUNK]):
-        return record, True
+def _described(file: BinaryIO, first: int, end: int) -> Iterator[tuple[int, bytes]]:
+    """The records between two places of a file, but for those that describe nothing. Raises `DamagedError` and `struct.error`."""
+    position = first
+    while position < end:
+        file.seek(position)
+        op, size = struct.unpack("<BQ", file.read(9))
+        position += 9 + size
+        if position > end:
+            raise DamagedError("its index breaks off")
+        if op in (_SCHEMA, _CHANNEL, _CHUNK_INDEX, _STATISTICS):
+            if size > _LONGEST_DESCRIPTION:
+                raise DamagedError("its index holds a record that is too long")
+            yield op, file.read(size)
+
+
+def _indexed_chunk(record: bytes, end: int) -> Chunk:
+    """What a chunk's index record says of it, if it lies before ``end``. Raises `DamagedError` and `struct.error`.
+
+    Messages are counted by the lengths of their channels' index records, which follow the chunk: 15 bytes and 16 for each message.
+    """
+    start_ns, end_ns, position, size, length = struct.unpack_from("<QQQQI", record)
+    pairs = sorted((at, key) for key, at in struct.iter_unpack("<HQ", record[36 : 36 + length // 10 * 10]))
+    (index_size,) = struct.unpack_from("<Q", record, 36 + length)
+    after = position + size + index_size
+    places = [*(at for at, _ in pairs), after]
+    if after > end or size < 9 or start_ns > end_ns or any(b - a < 15 for a, b in pairwise(places)):
+        raise DamagedError("its index of chunks contradicts itself")
+    counts = {key: (following - at - 15) // 16 for (at, key), following in zip(pairs, places[1:], strict=True)}
+    return Chunk(position, start_ns, end_ns, {key: count for key, count in counts.items() if count}, size)
+
+
+def _plain(record: bytes) -> tuple[bytes, tuple[int, int], str]:
+    """Records of a chunk record, the span of time that it covers, and what is damaged. Raises `DamagedError` where nothing is to be had."""
     try:
-        size, _, _, _, crc = struct.unpack_from("<QQQQI", record, 1)
+        size, start_ns, end_ns, _, crc = struct.unpack_from("<QQQQI", record, 1)
         compression, at = _string(record, 9 + 28)
         (length,) = struct.unpack_from("<Q", record, at)
     except struct.error as error:
         raise DamagedError("it breaks off in its head") from error
     data = record[at + 8 : at + 8 + length]
+    span = start_ns, end_ns
     if len(record) < 9 + size:
-        return decompress_head(data, compression)
+        return decompress_head(data, compression)[0], span, "it breaks off"
+    if at + 8 + length != 9 + size:
+        raise DamagedError("its sizes contradict each other")
     plain = decompress(data, compression)
-    if crc and crc32(plain) != crc:
+    if not crc or crc32(plain) == crc:
+        return plain, span, ""
+    if compression:
         raise DamagedError("its checksum is wrong")
-    return plain, True
+    return plain, span, "its checksum is wrong"
 
 
-def _records(plain: bytes) -> Iterator[tuple[int, bytes]]:
-    position = 0
-    while position + 9 <= len(plain):
-        op, size = struct.unpack_from("<BQ", plain, position)
-        if position + 9 + size > len(plain):
-            return
-        yield op, plain[position + 9 : position + 9 + size]
-        position += 9 + size
+def _entry(plain: bytes, position: int, after: int) -> Entry | None:
+    """The message record between two places; None if they are not those of one."""
+    if after - position < 9 + 22 or after > len(plain):
+        return None
+    key, _, log_ns, _ = struct.unpack_from("<HIQQ", plain, position + 9)
+    return key, log_ns, plain[position + 31 : after]
 
 
-def _messages(plain: bytes) -> Iterator[tuple[int, int, bytes]]:
-    for op, record in _records(plain):
-        if op == _MESSAGE and len(record) >= 22:
-            key, _, log_ns, _ = struct.unpack_from("<HIQQ", record)
-            yield key, log_ns, record[22:]
+def _whole_messages(run: bytes) -> list[Entry]:
+    """Of a run of message records, which were whole when the file was gone through."""
+    position, entries = 0, []
+    while position + 9 <= len(run):
+        after = position + 9 + int(struct.unpack_from("<Q", run, position + 1)[0])
+        entry = _entry(run, position, after)
+        if entry is not None:
+            entries.append(entry)
+        position = after
+    return entries
 
 
 def _string(data: bytes, position: int) -> tuple[str, int]:

@@ -5,9 +5,10 @@ latency, and now and then nonsense. Three things happen here:
 
 - Each topic's clock is watched (`TopicClock`). A stamp is trusted if it lies within a second of the stamp before it, or if it is as
   far from the time of recording as the stamps before it were, to a second. (The first holds when the recorder stalls, the second
-  when the driver pauses.) One or two that are neither are outliers, and dropped; three in a row that agree are a clock that was
-  set, and from there on the topic is moved back by the jump. What comes in a burst tells nothing of clocks, and waits for what comes
-  after it: if that is trusted and continues it, the burst was late and nothing else.
+  when the driver pauses.) It is not if it leaves the topic's even pace by more than 0.3 s while messages are recorded evenly. One or
+  two that are not are outliers, and dropped; three in a row that agree are a clock that was set, and from there on the topic is moved
+  back by the jump. What comes in a burst tells nothing of clocks, and waits for what comes after it: if that is trusted and continues
+  it, the burst was late and nothing else.
 - A topic without stamps gets the time of recording, and so does, by a constant shift, one whose clock is far from all others'.
 - Trusted messages wait in a heap until nothing older can come: one second after the slowest topic's usual latency. On a robot, where
   an estimate is wanted now, they do not wait.
@@ -18,6 +19,7 @@ from __future__ import annotations
 import dataclasses
 import heapq
 import statistics
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -30,6 +32,10 @@ _WAIT = _SECOND
 _FOREIGN = 10 * _SECOND
 _SAME_JUMP = _SECOND // 4
 _JUMP_AFTER = 3
+_SUDDEN = 3 * _SECOND // 10
+"""A stamp that leaves the even pace of its topic by more than this, while recording goes on evenly, is no latency but a clock that was set
+[ns]. Smaller jumps move a robot by less than 0.3 m at 1 m/s; estimators weigh these."""
+_PACE_OF = 20  # messages
 _LONGEST_PENDING = 10 * _SECOND
 _LONGEST_BURST = 5 * _SECOND
 _MOST_PENDING = 1000
@@ -93,6 +99,9 @@ class TopicClock:
         """Stamp minus time of recording, of the last trusted message."""
         self._soonest_ns = self.offset_ns
         self._pending: list[Item] = []
+        self._last_log = 0
+        self._pace: deque[tuple[int, int]] = deque(maxlen=_PACE_OF)
+        """Steps of the last trusted stamps, and by how much those of recording differed from them."""
 
     @property
     def shift_ns(self) -> int:
@@ -148,11 +157,23 @@ class TopicClock:
     def _is_trusted(self, item: Item) -> bool:
         stamp = item.stamp_ns + self._shift
         known = (self.offset_ns, self._soonest_ns)  # after a burst, messages are no longer late
-        return (
+        return not self._is_sudden(item) and (
             self._last is None
             or abs(stamp - self._last) <= _TRUSTED_STEP
             or any(abs(stamp - item.log_ns - offset) <= _TRUSTED_STEP for offset in known)
         )
+
+    def _is_sudden(self, item: Item) -> bool:
+        """Whether the stamp leaves its topic's even pace, though the message was recorded when it was due."""
+        if self._last is None or len(self._pace) < _PACE_OF:
+            return False
+        stamp, step = item.stamp_ns + self._shift, item.log_ns - self._last_log
+        deviation = abs(stamp - self._last - step)
+        if deviation <= _SUDDEN or abs(stamp - item.log_ns - self._soonest_ns) <= _SUDDEN:
+            return False
+        due = (len(self._pending) + 1) * statistics.median(period for period, _ in self._pace)
+        usual = max(abs(jitter) for _, jitter in self._pace)
+        return deviation > 3 * usual and 0.3 * due <= step <= 3.0 * due
 
     def _release(self) -> list[Item]:
         released, self._pending = self._pending, []
@@ -175,7 +196,10 @@ class TopicClock:
 
     def _trust(self, item: Item) -> Item:
         stamp = item.stamp_ns + self._shift
-        self._last, self.offset_ns = stamp, stamp - item.log_ns
+        if self._last is not None:
+            step = stamp - self._last
+            self._pace.append((step, item.log_ns - self._last_log - step))
+        self._last, self._last_log, self.offset_ns = stamp, item.log_ns, stamp - item.log_ns
         self._soonest_ns = max(self._soonest_ns, self.offset_ns)
         if self._rebased:
             self._tally.count(self._topic, Oddity.REBASED)

@@ -15,6 +15,10 @@ from motion_models.se2 import FloatArray
 _ROOTS = ("base_link", "base_footprint")
 _WORLDS = {"map", "odom", "world", "earth"}
 _SAME = 1e-6
+_AGREE_M, _AGREE_RAD = 0.01, math.radians(0.5)
+"""Two ways to a frame that differ by less are one: drivers round, and publish a robot's model beside their own mounts."""
+_LEAST_NORM, _LARGEST_NORM = 0.5, 2.0
+"""Of a quaternion that is a rotation. Those of drivers differ from 1 by rounding; some are typed in by hand with two digits."""
 
 Edges = dict[tuple[str, str], FloatArray]
 
@@ -26,16 +30,23 @@ class FixedTransforms:
         self._edges: Edges = {}
         self._fixed: set[tuple[str, str]] = set()
         self._moving: set[tuple[str, str]] = set()
+        self._contradictions: dict[str, str] = {}
+        self._no_rotations: dict[str, str] = {}
 
     def add(self, message: Any, *, is_static: bool) -> None:
-        """Take in a TFMessage. On a static topic the last word counts, on /tf what changes is no mount."""
+        """Take in a TFMessage. On a static topic the last transform counts, on /tf what changes is no mount."""
         for transform in message.transforms:
             edge = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
             matrix = _matrix(transform.transform)
-            if matrix is None:
+            if matrix is None or edge[0] == edge[1]:
+                if is_static:
+                    reason = "its rotation is no unit quaternion" if matrix is None else "a frame cannot be its own parent"
+                    self._no_rotations[edge[1]] = f"/tf_static: the transform from '{edge[0]}' to '{edge[1]}' was left out: {reason}."
                 continue
             before = self._edges.get(edge)
             if is_static:
+                if edge in self._fixed and before is not None and not _agree(before, matrix):
+                    self._contradict(edge[1], f"'{edge[0]}' to '{edge[1]}' is published with two different poses")
                 self._fixed.add(edge)
             elif edge in self._fixed:
                 continue
@@ -67,7 +78,39 @@ class FixedTransforms:
                 if other not in poses and other not in _WORLDS:
                     poses[other] = poses[frame] @ frame_T_other
                     queue.append(other)
+        self._compare(poses)
         return {frame: mount_of(pose) for frame, pose in poses.items()}
+
+    def contradictions(self) -> dict[str, str]:
+        """Frames whose poses in the log contradict each other, as found by `mounts`, with a sentence about each."""
+        return dict(self._contradictions)
+
+    def notes(self) -> list[str]:
+        """Sentences about transforms that could not be used, or that contradict each other."""
+        return [*self._contradictions.values(), *self._no_rotations.values()]
+
+    def _compare(self, poses: dict[str, FloatArray]) -> None:
+        """Frames with two parents, and chains that lead back to themselves, must lead to one place."""
+        for (parent, child), parent_T_child in sorted(self._edges.items(), key=lambda e: e[0]):
+            if (
+                (parent, child) in self._fixed
+                and parent in poses
+                and child in poses
+                and not _agree(poses[parent] @ parent_T_child, poses[child])
+            ):
+                self._contradict(child, f"the chain by way of '{parent}' leads to another pose of '{child}' than the shortest chain does")
+
+    def _contradict(self, frame: str, what: str) -> None:
+        self._contradictions.setdefault(
+            frame,
+            f"/tf_static contradicts itself: {what}. What is measured in '{frame}' may be placed wrongly; leave one publisher of that"
+            f" frame, or add [mounts.{frame}] to the robot file, which then is used.",
+        )
+
+
+def _agree(one: FloatArray, other: FloatArray) -> bool:
+    turned = np.linalg.norm(one[:3, :3] - other[:3, :3]) / math.sqrt(2.0)  # 2 sin of half the angle between them
+    return bool(np.linalg.norm(one[:3, 3] - other[:3, 3]) <= _AGREE_M and turned <= _AGREE_RAD)
 
 
 def _root(frames: Iterable[str]) -> str | None:
@@ -88,7 +131,7 @@ def _matrix(transform: Any) -> FloatArray | None:
     t, q = transform.translation, transform.rotation
     values = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w], dtype=float)
     norm = np.linalg.norm(values[3:])
-    if not np.isfinite(values).all() or norm < 0.5:
+    if not np.isfinite(values).all() or not _LEAST_NORM <= norm <= _LARGEST_NORM:
         return None
     x, y, z, w = values[3:] / norm
     matrix = np.eye(4)

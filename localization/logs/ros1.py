@@ -7,6 +7,7 @@ from the records where it is not. Format: http://wiki.ros.org/Bags/Format/2.0.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -23,6 +24,8 @@ MAGIC = b"#ROSBAG V"
 
 _MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
 _LONGEST_HEADER = 1 << 24
+_LONGEST_MESSAGE_HEADER = 64  # bytes; conn, op and time take 38
+_MESSAGE_OP = re.compile(rb"\x04\0{3}op=\x02")
 
 Fields = dict[bytes, bytes]
 
@@ -49,6 +52,8 @@ class Ros1Bag:
             if version != b"2.0":
                 raise LogError(f"'{path}' is a ROS bag of version {version.decode(errors='replace')}; only 2.0 can be read.")
             first = file.tell()
+            self._size = file.seek(0, 2)
+            file.seek(first)
             try:
                 self._read_index(file)
             except DamagedError as reason:
@@ -69,23 +74,33 @@ class Ros1Bag:
         with self._path.open("rb") as file:
 
             def load(chunk: Chunk) -> list[RawMessage]:
+                listed = sum(chunk.counts.values())
                 try:
-                    return list(_messages(self._chunk_bytes(file, chunk), wanted))
+                    entries = [entry for entry in _entries(self._chunk_bytes(file, chunk)) if isinstance(entry, _Message)]
                 except DamagedError as reason:
-                    if chunk.position not in self._reported:
-                        self._reported.add(chunk.position)
-                        lost = sum(chunk.counts.values())
-                        self.notes.append(f"A chunk of {lost} messages at byte {chunk.position} was left out: {reason}.")
+                    self._report(chunk, f"A chunk of {listed} messages at byte {chunk.position} was left out: {reason}.")
                     return []
+                if len(entries) < listed:
+                    where = f"A chunk at byte {chunk.position} of {self._path.name} is damaged"
+                    self._report(chunk, f"{where}: {len(entries)} of its {listed} messages are used.")
+                return [RawMessage(e.log_ns, wanted[e.key].topic, wanted[e.key].type, e.data) for e in entries if e.key in wanted]
 
             yield from in_log_order((c for c in self._chunks if not wanted.keys().isdisjoint(c.counts)), load)
 
+    def _report(self, chunk: Chunk, note: str) -> None:
+        """Once for each chunk."""
+        if chunk.position not in self._reported:
+            self._reported.add(chunk.position)
+            self.notes.append(note)
+
     def _chunk_bytes(self, file: BinaryIO, chunk: Chunk) -> bytes:
+        if chunk.position >= self._size:
+            raise DamagedError("the index says that it lies beyond the end of the file")
         file.seek(chunk.position)
         header, size = _record_start(file)
         if header.get(b"op") != bytes([_CHUNK]):
             raise DamagedError("there is no chunk where the index says")
-        data = file.read(size)
+        data = file.read(min(size, self._size - file.tell()))
         compression = header.get(b"compression", b"none").decode(errors="replace")
         # The last chunk of a bag that was cut off is the only one that may be short, and its messages are known to be readable.
         return decompress_head(data, compression)[0] if len(data) < size else decompress(data, compression)
@@ -100,8 +115,7 @@ class Ros1Bag:
         position = _u64(header, b"index_pos")
         if position == 0:
             raise DamagedError("it was never closed, and so has no index")
-        file.seek(0, 2)
-        if position > file.tell():
+        if position > self._size:
             raise DamagedError("it ends before its index")
         file.seek(position)
         connections: dict[int, _Connection] = {}
@@ -121,8 +135,7 @@ class Ros1Bag:
 
     def _rebuild_index(self, file: BinaryIO, first: int, reason: str) -> None:
         """Walk through the records as far as they go, and note what that gave."""
-        file.seek(0, 2)
-        end = file.tell()
+        end = self._size
         file.seek(first)
         whole = first
         loose = 0
@@ -131,7 +144,7 @@ class Ros1Bag:
                 position = file.tell()
                 header, size = _record_start(file)
                 body = file.tell()
-                data = file.read(size) if header.get(b"op") in (bytes([_CHUNK]), bytes([_CONNECTION])) else b""
+                data = file.read(min(size, end - body)) if header.get(b"op") in (bytes([_CHUNK]), bytes([_CONNECTION])) else b""
                 if header.get(b"op") == bytes([_CHUNK]):
                     self._add_chunk(position, header, data)
                 elif header.get(b"op") == bytes([_CONNECTION]) and len(data) == size:
@@ -163,43 +176,65 @@ class Ros1Bag:
             return
         counts: Counter[int] = Counter()
         start, end = 2**63 - 1, 0
-        for op, record, body in _records(plain):
-            if op == _CONNECTION:
-                key, connection = _connection(record, body)
-                self._connections.setdefault(key, connection)
-            elif op == _MESSAGE:
-                stamp = _time(record, b"time")
-                start, end = min(start, stamp), max(end, stamp)
-                counts[_u32(record, b"conn")] += 1
+        for entry in _entries(plain):
+            if isinstance(entry, _Message):
+                start, end = min(start, entry.log_ns), max(end, entry.log_ns)
+                counts[entry.key] += 1
+            else:
+                self._connections.setdefault(*entry)
         if counts:
             self._chunks.append(Chunk(position, start, end, dict(counts)))
 
 
-def _messages(plain: bytes, wanted: dict[int, _Connection]) -> Iterator[RawMessage]:
-    for op, record, body in _records(plain):
-        if op == _MESSAGE:
-            connection = wanted.get(_u32(record, b"conn"))
-            if connection is not None:
-                yield RawMessage(_time(record, b"time"), connection.topic, connection.type, body)
+class _Message(NamedTuple):
+    key: int
+    """Of its connection."""
+    log_ns: int
+    data: bytes
 
 
-def _records(plain: bytes) -> Iterator[tuple[int, Fields, bytes]]:
-    """The whole records of a chunk's bytes; a last one that breaks off is left out."""
-    position, end = 0, len(plain)
-    while position + 8 <= end:
-        header_size = int.from_bytes(plain[position : position + 4], "little")
-        body = position + 8 + header_size
-        if body > end:
-            return
-        size = int.from_bytes(plain[body - 4 : body], "little")
-        if body + size > end:
-            return
-        fields = _fields(plain[position + 4 : body - 4])
-        op = fields.get(b"op", b"")
-        if len(op) != 1:
-            raise DamagedError("a record has no kind")
-        yield op[0], fields, plain[body : body + size]
-        position = body + size
+def _entries(plain: bytes) -> Iterator[_Message | tuple[int, _Connection]]:
+    """The whole messages and connections of a chunk's bytes. What is none is skipped, up to where a message begins again."""
+    position = 0
+    while position + 8 <= len(plain):
+        try:
+            op, fields, body, position = _record(plain, position)
+            if op == _MESSAGE:
+                yield _Message(_u32(fields, b"conn"), _time(fields, b"time"), body)
+            elif op == _CONNECTION:
+                yield _connection(fields, body)
+        except DamagedError:
+            position = _next_message(plain, position + 1)
+
+
+def _record(plain: bytes, position: int) -> tuple[int, Fields, bytes, int]:
+    """Kind, header and body of a chunk's record, and where the next one begins. Raises `DamagedError`."""
+    body = position + 8 + int.from_bytes(plain[position : position + 4], "little")
+    if body > len(plain):
+        raise DamagedError("a record's header breaks off")
+    after = body + int.from_bytes(plain[body - 4 : body], "little")
+    if after > len(plain):
+        raise DamagedError("a record breaks off")
+    fields = _fields(plain[position + 4 : body - 4])
+    op = fields.get(b"op", b"")
+    if len(op) != 1:
+        raise DamagedError("a record has no kind")
+    return op[0], fields, plain[body:after], after
+
+
+def _next_message(plain: bytes, position: int) -> int:
+    """Where a message record begins that has all its fields and lies in ``plain`` wholly; the end if there is none."""
+    for found in _MESSAGE_OP.finditer(plain, position):
+        for start in range(max(found.start() - _LONGEST_MESSAGE_HEADER, position), found.start() - 3):
+            if int.from_bytes(plain[start : start + 4], "little") > _LONGEST_MESSAGE_HEADER:
+                continue
+            try:
+                op, fields, _, _ = _record(plain, start)
+                if op == _MESSAGE and fields.keys() >= {b"conn", b"time"}:
+                    return start
+            except DamagedError:
+                continue
+    return len(plain)
 
 
 def _record_start(file: BinaryIO) -> tuple[Fields, int]:

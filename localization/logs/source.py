@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import re
 import tempfile
+import warnings
 from collections.abc import Collection, Iterator
-from contextlib import closing, nullcontext
 from itertools import chain
-from pathlib import Path
+from pathlib import Path, PurePath
 
-from rosbags.rosbag2 import Reader
+from ruamel.yaml import YAML
 
 from localization.errors import LogError
 from localization.logs import mcap, ros1, sqlite
-from localization.logs.chunks import Channel, DamagedError, RawMessage, Source, inflate_file, merge_channels
+from localization.logs.chunks import DamagedError, RawMessage, Source, inflate_file, merge_channels
+from motion_models.text_files import check_file
+
+_LONGEST_METADATA = 4 << 20
+"""Of metadata.yaml [B]. It has some kB for a hundred topics and 200 B for each file that a recording was split into."""
 
 
 def open_source(path: Path) -> Source:
@@ -27,13 +31,44 @@ def open_source(path: Path) -> Source:
 
 
 def _open_folder(path: Path) -> Source:
+    """A ROS 2 folder: the files that metadata.yaml names, in its order, or, where that is damaged, all that there are, by name."""
     try:
-        return Ros2Bag(path)
+        names, listed = _read_metadata(path / "metadata.yaml")
+        missing = [name for name in names if not (path / name).exists()]
+        if missing:
+            raise DamagedError(f"its files {', '.join(missing)} are missing")
+        parts: list[Source] = [_open_part(path / name) for name in names]
     except FileNotFoundError:
-        reason = "metadata.yaml is missing"
-    except DamagedError as error:
-        reason = str(error)
-    return _recover_folder(path, reason)
+        return _recover_folder(path, "metadata.yaml is missing")
+    except (DamagedError, LogError) as error:
+        return _recover_folder(path, str(error).rstrip("."))
+    count = sum(channel.count for part in parts for channel in part.channels)
+    lost = [f"metadata.yaml of {path.name} lists {listed} messages; its files hold {count}."] if count < listed else []
+    return Parts(parts, lost)
+
+
+def _read_metadata(path: Path) -> tuple[list[str], int]:
+    """Names of the storage files, and how many messages they hold. Raises `DamagedError` and `FileNotFoundError`."""
+    require_file(path)
+    if path.stat().st_size > _LONGEST_METADATA:
+        raise DamagedError("metadata.yaml is longer than any recorder's")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the parser, about names that come twice
+            content = YAML(typ="safe").load(path.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+        names, listed = content["relative_file_paths"], content["message_count"]
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # the parser lets out errors of its own, of types and of recursion
+        raise DamagedError("metadata.yaml is damaged") from error
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) and name for name in names) or type(listed) is not int:
+        raise DamagedError("metadata.yaml is damaged")
+    # as rosbag2 wrote them before its version 4, with the folder's name before them
+    return [PurePath(name).name for name in names], listed
+
+
+def _open_part(path: Path) -> Source:
+    return Inflated(path) if path.suffix == ".zstd" else _open_file(path)
 
 
 def _recover_folder(path: Path, reason: str) -> Source:
@@ -46,7 +81,7 @@ def _recover_folder(path: Path, reason: str) -> Source:
     notes = [f"{path.name} is not whole ({reason}): its files {', '.join(f.name for f in files)} are read by themselves."]
     for file in files:
         try:
-            parts.append(Inflated(file) if file.suffix == ".zstd" else _open_file(file))
+            parts.append(_open_part(file))
         except LogError as error:
             notes.append(str(error))
     if not parts:
@@ -59,90 +94,32 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", path.name)]
 
 
+def require_file(path: Path) -> None:
+    """Raises `LogError` for what is there but is no file: to read it may never end."""
+    try:
+        check_file(path)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise LogError(f"log '{path}' cannot be read: {error.strerror}.") from error
+
+
 def _open_file(path: Path) -> Source:
+    require_file(path)
     with path.open("rb") as file:
         head = file.read(16)
     if not head:
         raise LogError(f"log '{path}' is empty.")
     if head.startswith(ros1.MAGIC):
         return ros1.Ros1Bag(path)
-    is_mcap, is_sqlite = head.startswith(mcap.MAGIC), head.startswith(sqlite.MAGIC)
-    if not is_mcap and not is_sqlite:
+    if head.startswith(mcap.MAGIC):
+        return mcap.McapFile(path)
+    if not head.startswith(sqlite.MAGIC):
         raise LogError(f"'{path}' is not a log: it is neither a ROS 1 bag (.bag), nor an MCAP file (.mcap), nor a ROS 2 bag folder.")
     try:
-        return Ros2Bag(path)
+        return sqlite.SqliteFile(path)
     except DamagedError as reason:
-        return _recover_file(path, str(reason))
-
-
-def _recover_file(path: Path, reason: str) -> Source:
-    with path.open("rb") as file:
-        is_mcap = file.read(16).startswith(mcap.MAGIC)
-    return mcap.RecoveredMcap(path, reason) if is_mcap else sqlite.RecoveredSqlite(path, reason)
-
-
-class Ros2Bag:
-    """A whole ROS 2 log, read by rosbags. Raises `DamagedError` for any other.
-
-    Damage in the middle of a file shows only when it is read; the rest is then read as that of a file that was cut off.
-    """
-
-    is_ros1 = False
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._notes = [
-            f"{wal.name} holds rows that the recorder had not yet moved into {wal.name.removesuffix('-wal')}; they are not read."
-            " Opening that file once with SQLite's own shell moves them."
-            for wal in sorted(path.glob("*.db3-wal") if path.is_dir() else path.parent.glob(path.name + "-wal"))
-            if wal.stat().st_size > 0
-        ]
-        self._rest: Source | None = None
-        self._held: Reader | None = None
-        files = path.glob("*.mcap") if path.is_dir() else [path] if path.suffix == ".mcap" else []
-        if any(not mcap.has_chunk_index(file) for file in files):
-            raise DamagedError("it has no index of chunks")
-        try:
-            reader = Reader(path)
-            reader.open()
-            if reader.compression_mode == "file":
-                self._held = reader  # it has inflated the files to a temporary folder, which is not to be done again and again
-            with nullcontext(reader) if self._held else closing(reader):
-                self.channels = [Channel(c.topic, c.msgtype, c.msgdef, c.msgcount) for c in reader.connections]
-                self.start_ns, self.end_ns = (reader.start_time, reader.end_time - 1) if reader.message_count else (0, 0)
-        except FileNotFoundError:
-            raise
-        except Exception as error:  # for damaged files rosbags lets out struct.error, AssertionError, zstd's and SQLite's errors
-            raise DamagedError(_reason(error)) from error
-
-    @property
-    def notes(self) -> list[str]:
-        return self._notes if self._rest is None else [*self._notes, *self._rest.notes]
-
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        last = self.start_ns - 1
-        with nullcontext(self._held) if self._held is not None else Reader(self._path) as reader:
-            connections = [c for c in reader.connections if c.topic in topics]
-            messages = reader.messages(connections) if connections else iter(())
-            while True:
-                try:
-                    connection, last, data = next(messages)
-                except StopIteration:
-                    return
-                except Exception as error:  # as above
-                    rest = self._recover(_reason(error))
-                    break
-                yield RawMessage(last, connection.topic, connection.msgtype, data)
-        yield from (message for message in rest.messages(topics) if message.log_ns > last)
-
-    def _recover(self, reason: str) -> Source:
-        if self._rest is None:
-            self._rest = _recover_folder(self._path, reason) if self._path.is_dir() else _recover_file(self._path, reason)
-        return self._rest
-
-
-def _reason(error: Exception) -> str:
-    return str(error).rstrip(".") or "its end is missing"
+        return sqlite.RecoveredSqlite(path, str(reason))
 
 
 class Inflated:
@@ -151,7 +128,12 @@ class Inflated:
     def __init__(self, path: Path) -> None:
         self._folder = tempfile.TemporaryDirectory()  # removed when this object is
         target = Path(self._folder.name) / path.stem
-        stopped = inflate_file(path, target)
+        require_file(path)
+        try:
+            stopped = inflate_file(path, target)
+        except OSError as error:
+            where = f"'{path}' cannot be decompressed into '{self._folder.name}': {error.strerror}"
+            raise LogError(f"{where}. Set TMPDIR to a folder with more room.") from error
         self._inner = _open_file(target)
         self.is_ros1, self.channels = self._inner.is_ros1, self._inner.channels
         self.start_ns, self.end_ns = self._inner.start_ns, self._inner.end_ns

@@ -1,7 +1,8 @@
-"""SQLite storage files that rosbags refuses, because they were cut off or hold bad pages: page by page, as far as they go.
+"""SQLite storage files of ROS 2: read by SQLite, or, where they were cut off or hold bad pages, page by page, as far as they go.
 
 A table's rows hang on a tree whose inner pages lie anywhere in the file, so that SQLite finds nothing in many a file that was cut off.
 Its leaves, which hold the rows, lie in the order in which they were recorded. Format: https://www.sqlite.org/fileformat2.html.
+A database can hold code (views, computed columns); only plain tables are read, and with bounds.
 """
 
 from __future__ import annotations
@@ -17,14 +18,108 @@ from urllib.parse import quote
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 from localization.errors import LogError
-from localization.logs.chunks import Channel, RawMessage, inflate_message
+from localization.logs.chunks import MOST_PLAIN_BYTES, Channel, DamagedError, RawMessage, inflate_message
 
 MAGIC = b"SQLite format 3\x00"
 
 _TABLE_LEAF = 13
+_MOST_TOPICS = 100_000  # robots have tens to hundreds
 _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
+_NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
 Row = tuple[int, int, bytes]
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    """For reading alone. What is in a row has a bound, and functions that could do harm cannot be called by what the file holds."""
+    database = sqlite3.connect(f"file:{quote(bytes(path.resolve()))}?immutable=1", uri=True)
+    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_PLAIN_BYTES)
+    database.execute("PRAGMA trusted_schema=OFF")
+    database.text_factory = lambda data: data.decode(errors="replace")
+    return database
+
+
+def _describe(database: sqlite3.Connection) -> tuple[dict[int, tuple[str, str]], dict[str, MessageDefinition]]:
+    """Name and type of each topic by its number, and definitions by type. Raises `DamagedError` and `sqlite3.DatabaseError`."""
+    columns = {}
+    for table in ("topics", "messages", "message_definitions"):
+        found = database.execute("SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name = ?", (table,)).fetchone()[0]
+        columns[table] = {row[1] for row in database.execute(f"PRAGMA table_info({table})")} if found else set()
+    if not {"id", "name", "type"} <= columns["topics"]:
+        raise DamagedError("it has no table of topics")
+    if not {"topic_id", "timestamp", "data"} <= columns["messages"]:
+        raise DamagedError("it has no table of messages")
+    rows = database.execute("SELECT id, name, type FROM topics ORDER BY id LIMIT ?", (_MOST_TOPICS,)).fetchall()
+    topics = {key: (name, kind) for key, name, kind in rows if isinstance(key, int) and isinstance(name, str) and isinstance(kind, str)}
+    if not {"topic_type", "encoding", "encoded_message_definition"} <= columns["message_definitions"]:
+        return topics, {}  # recordings before ROS 2 Iron have no such table
+    wanted = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions LIMIT ?"
+    definitions = {
+        kind: MessageDefinition(_FORMATS.get(encoding, MessageDefinitionFormat.NONE), text)
+        for kind, encoding, text in database.execute(wanted, (_MOST_TOPICS,))
+        if isinstance(text, str)
+    }
+    return topics, definitions
+
+
+def _channels(topics: dict[int, tuple[str, str]], definitions: dict[str, MessageDefinition], counts: Counter[int]) -> list[Channel]:
+    return [Channel(name, kind, definitions.get(kind, _NO_DEFINITION), counts[key]) for key, (name, kind) in topics.items()]
+
+
+class SqliteFile:
+    """A whole .db3 file. Raises `DamagedError` for any other; damage that shows later costs what SQLite does not find behind it."""
+
+    is_ros1 = False
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            with closing(_connect(path)) as database:
+                self._topics, definitions = _describe(database)
+                count = database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id").fetchall()
+                span = database.execute("SELECT min(timestamp), max(timestamp) FROM messages").fetchone()
+        except sqlite3.Error as error:
+            raise DamagedError(str(error)) from error
+        self._counts = Counter({key: n for key, n in count if key in self._topics})
+        self.channels = _channels(self._topics, definitions, self._counts)
+        self.start_ns, self.end_ns = (int(stamp) if isinstance(stamp, int) else 0 for stamp in span)
+        self.notes: list[str] = []
+        wal = path.with_name(path.name + "-wal")
+        if wal.is_file() and wal.stat().st_size > 0:
+            self.notes.append(
+                f"{wal.name} holds rows that the recorder had not yet moved into {path.name}; they are not read."
+                " Opening that file once with SQLite's own shell moves them."
+            )
+        self._rest: RecoveredSqlite | None = None
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        wanted = {key: topic for key, topic in self._topics.items() if topic[0] in topics}
+        last, found = self.start_ns - 1, 0
+        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({','.join(map(str, wanted))}) ORDER BY timestamp"
+        with closing(_connect(self._path)) as database:
+            rows = iter(database.execute(query))
+            while True:
+                try:
+                    key, stamp, data = next(rows)
+                except StopIteration:
+                    self._compare(found, sum(self._counts[key] for key in wanted))
+                    return
+                except sqlite3.Error as error:
+                    reason = str(error)
+                    break
+                found += 1
+                if isinstance(stamp, int) and isinstance(data, bytes):
+                    last = stamp
+                    yield RawMessage(stamp, *wanted[key], inflate_message(data))
+        if self._rest is None:
+            self._rest = RecoveredSqlite(self._path, reason)
+            self.notes += self._rest.notes
+        yield from (message for message in self._rest.messages(topics) if message.log_ns > last)
+
+    def _compare(self, found: int, listed: int) -> None:
+        note = f"{self._path.name} is damaged: {found} of {listed} messages of the topics in use could be read."
+        if found < listed and note not in self.notes:
+            self.notes.append(note)
 
 
 class RecoveredSqlite:
@@ -35,23 +130,18 @@ class RecoveredSqlite:
     def __init__(self, path: Path, reason: str) -> None:
         self._path = path
         try:
-            with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?immutable=1", uri=True)) as database:
+            with closing(_connect(path)) as database:
                 # SQLite refuses a file that is shorter than its header says, unless it is told that the header may be wrong.
                 database.execute("PRAGMA writable_schema=ON")
-                topics = database.execute("SELECT id, name, type FROM topics").fetchall()
-                definitions = _definitions(database)
-        except sqlite3.DatabaseError as error:
+                self._topics, definitions = _describe(database)
+        except (sqlite3.Error, DamagedError) as error:
             raise LogError(f"'{path}' cannot be read: {reason}; not even its list of topics can ({error}).") from error
-        self._topics: dict[int, tuple[str, str]] = {
-            key: (name, kind) for key, name, kind in topics if isinstance(name, str) and isinstance(kind, str)
-        }
         counts: Counter[int] = Counter()
         start, end = 2**63 - 1, 0
         for topic, log_ns, _ in self._rows():
             counts[topic] += 1
             start, end = min(start, log_ns), max(end, log_ns)
-        nothing = MessageDefinition(MessageDefinitionFormat.NONE, "")
-        self.channels = [Channel(name, kind, definitions.get(kind, nothing), counts[key]) for key, (name, kind) in self._topics.items()]
+        self.channels = _channels(self._topics, definitions, counts)
         self.start_ns, self.end_ns = (start, end) if counts else (0, 0)
         self.notes = [
             f"{path.name} was read page by page ({reason}): {counts.total()} messages of it are used; how many are lost, it does not tell."
@@ -66,41 +156,60 @@ class RecoveredSqlite:
     def _rows(self) -> Iterator[Row]:
         """Messages on the file's leaf pages: those rows that are an id, a known topic's number, a time and bytes."""
         with self._path.open("rb") as file:
-            head = file.read(100)
-            page_size = int.from_bytes(head[16:18], "big")
-            page_size = 65536 if page_size == 1 else page_size
-            if page_size < 512:
-                return
-            number = 1
-            while True:
-                file.seek(number * page_size)
-                page = file.read(page_size)
-                number += 1
-                if len(page) < page_size:
-                    return
-                if page[0] == _TABLE_LEAF:
-                    for row in _leaf_rows(file, page, page_size - head[20]):
+            pages = _Pages(file)
+            for number in range(1, pages.count):
+                page = pages.read(number)
+                if page[:1] == bytes([_TABLE_LEAF]):
+                    for row in _leaf_rows(pages, page):
                         if row[0] in self._topics:
                             yield row
 
 
-def _leaf_rows(file: BinaryIO, page: bytes, usable: int) -> Iterator[Row]:
+class _Pages:
+    """Of a file; each can be a part of one row only, so that pages that lead back to themselves end."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        head = file.read(100)
+        size = int.from_bytes(head[16:18], "big")
+        self.size = 65536 if size == 1 else size
+        self.usable = self.size - (head[20] if len(head) == 100 else 0)
+        is_valid = self.size >= 512 and self.size & (self.size - 1) == 0 and self.usable >= 480
+        self.count = file.seek(0, 2) // self.size if is_valid else 0
+        self._is_taken = bytearray(self.count)
+
+    def read(self, number: int) -> bytes:
+        self._file.seek(number * self.size)
+        return self._file.read(self.size)
+
+    def take(self, number: int) -> bytes | None:
+        """A page that a row overflows onto, by its number from 1; None if it is not there or a part of another row."""
+        if not 0 < number <= self.count or self._is_taken[number - 1]:
+            return None
+        self._is_taken[number - 1] = 1
+        return self.read(number - 1)
+
+
+def _leaf_rows(pages: _Pages, page: bytes) -> Iterator[Row]:
     count = int.from_bytes(page[3:5], "big")
     for i in range(min(count, len(page) // 4)):
         at = int.from_bytes(page[8 + 2 * i : 10 + 2 * i], "big")
         length, at = _varint(page, at)
         _, at = _varint(page, at)
-        payload = _payload(file, page, at, length, usable)
+        payload = _payload(pages, page, at, length)
         row = _message_row(payload) if payload is not None else None
         if row is not None:
             yield row
 
 
-def _payload(file: BinaryIO, page: bytes, at: int, length: int, usable: int) -> bytes | None:
+def _payload(pages: _Pages, page: bytes, at: int, length: int) -> bytes | None:
     """A row's bytes, gathered from the pages onto which it overflows; None if one of them is missing."""
+    usable = pages.usable
     most = usable - 35
     if length <= most:
         return page[at : at + length] if at + length <= len(page) else None
+    if length > min(pages.count * pages.size, MOST_PLAIN_BYTES):
+        return None
     least = (usable - 12) * 32 // 255 - 23
     local = least + (length - least) % (usable - 4)
     if local > most:
@@ -108,11 +217,8 @@ def _payload(file: BinaryIO, page: bytes, at: int, length: int, usable: int) -> 
     parts, left = [page[at : at + local]], length - local
     following = int.from_bytes(page[at + local : at + local + 4], "big")
     while left > 0:
-        if following == 0:
-            return None
-        file.seek((following - 1) * len(page))
-        overflow = file.read(len(page))
-        if len(overflow) < len(page):
+        overflow = pages.take(following)
+        if overflow is None:
             return None
         parts.append(overflow[4 : 4 + min(left, usable - 4)])
         left -= len(parts[-1])
@@ -123,6 +229,8 @@ def _payload(file: BinaryIO, page: bytes, at: int, length: int, usable: int) -> 
 def _message_row(payload: bytes) -> Row | None:
     """(topic, time, data) of a row (id, topic_id, timestamp, data) of the table `messages`; None of any other row."""
     head, at = _varint(payload, 0)
+    if head > len(payload):
+        return None
     types = []
     while at < head:
         kind, at = _varint(payload, at)
@@ -155,15 +263,3 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
         if byte < 0x80:
             return value, at + i + 1
     return value, at + 9
-
-
-def _definitions(database: sqlite3.Connection) -> dict[str, MessageDefinition]:
-    try:
-        rows = database.execute("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions").fetchall()
-    except sqlite3.DatabaseError:  # recordings before ROS 2 Iron have no such table
-        return {}
-    return {
-        kind: MessageDefinition(_FORMATS.get(encoding, MessageDefinitionFormat.NONE), text)
-        for kind, encoding, text in rows
-        if isinstance(text, str)
-    }

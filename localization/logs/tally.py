@@ -11,6 +11,7 @@ class Oddity(Enum):
 
     UNDECODABLE = "dropped (bytes that are not of the type)"
     MALFORMED = "dropped (fields that contradict each other)"
+    NO_ANGLES = "dropped (angle_increment is zero, or makes more than a full turn: in degrees?); correct the driver's angles"
     NOT_FINITE = "dropped (NaN or inf)"
     BEYOND = "dropped (beyond what such a sensor can measure)"
     NO_FIX = "left out (no GPS fix)"
@@ -27,6 +28,7 @@ class Oddity(Enum):
     TIPPING = "with arms at which the robot would tip over (joints in degrees?); their centre of gravity was left out"
     TIPPING_CG = "with a centre of gravity at which the robot would tip over (not in metres, or not from base_link?); it was left out"
     WHEEL_RATE = "with rates that wheels cannot reach; these were left out"
+    SECOND_PUBLISHER = "of a second publisher whose wheels turn less, left out; stop one of the two (`ros2 topic info --verbose`)"
     WHEEL_JUMP = "with a wheel angle that wheels cannot reach (a reset); the increment was taken from the rates"
 
 

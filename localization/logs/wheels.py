@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,13 +26,31 @@ _STILL_M, _STILL_RAD = 1e-9, 1e-9
 _WRAP_RAD, _WRAP_WITHOUT_RATE_RAD = 0.3, 1.0
 
 
+_LATEST_NS = 1_000_000_000  # of a second publisher, after its reading before; drivers publish at 10 Hz and more
+
+
+class _Chain(NamedTuple):
+    """Readings that follow from each other: those of one publisher."""
+
+    reading: JointReading
+    """The last one."""
+    angle: FloatArray
+    """(n,) accumulated [rad]."""
+    turned: float = 0.0
+    """Sum of the wheels' steps since there are two publishers [rad]."""
+
+
 class JointsToWheels:
-    """Converter of readings whose first ``left`` joints are the left side's and the next ``right`` the right side's."""
+    """Converter of readings whose first ``left`` joints are the left side's and the next ``right`` the right side's.
+
+    Where two publishers share the topic, angles leap to and fro between what either of them publishes. The one whose wheels turn more is
+    used: a second one is mostly a `joint_state_publisher` that fills in zeros.
+    """
 
     def __init__(self, left: int, right: int, wheel_radius_m: float, topic: str, tally: Tally) -> None:
         self._left, self._right, self._radius, self._topic, self._tally = left, right, wheel_radius_m, topic, tally
-        self._known: JointReading | None = None
-        self._angle = np.full(left + right, np.nan)
+        self._chain: _Chain | None = None
+        self._other: _Chain | None = None
 
     def __call__(self, reading: JointReading) -> Iterator[WheelSample]:
         has_angles = all(map(math.isfinite, reading.position.tolist()))
@@ -44,24 +63,47 @@ class JointsToWheels:
         if not has_angles:
             yield WheelSample(reading.stamp_ns, self._side_means(velocity), np.full(2, np.nan))
             return
-        known = self._known
-        if known is None:
-            self._angle = reading.position
+        chain = self._chain
+        if chain is None:
+            chain = self._chain = _Chain(reading, reading.position)
+        elif self._reaches(chain, reading):
+            chain = self._chain = self._follow(chain, reading, reading.position - chain.reading.position)
+        elif self._other is not None and self._reaches(self._other, reading):
+            chain, self._other = self._follow(self._other, reading, reading.position - self._other.reading.position), chain
+            self._chain = chain
+            if chain.turned < self._other.turned:
+                self._tally.count(self._topic, Oddity.SECOND_PUBLISHER)
+                return
         else:
-            dt = (reading.stamp_ns - known.stamp_ns) * 1e-9
-            step = reading.position - known.position
-            farthest = _FASTEST_M_PER_S * max(dt, _SHORTEST_S)
-            if max(map(abs, step.tolist())) * self._radius > farthest:  # quicker than numpy's, on a handful
-                jumped = np.abs(step) * self._radius > farthest
-                expected = np.nan_to_num(velocity) * dt
-                wrapped = np.remainder(step + math.pi, math.tau) - math.pi
-                is_wrap = np.abs(wrapped - expected) < np.where(np.isfinite(velocity), _WRAP_RAD, _WRAP_WITHOUT_RATE_RAD)
-                if (jumped & ~is_wrap).any():
-                    self._tally.count(self._topic, Oddity.WHEEL_JUMP)
-                step = np.where(jumped, np.where(is_wrap, wrapped, expected), step)
-            self._angle = self._angle + step
-        self._known = reading
-        yield WheelSample(reading.stamp_ns, self._side_means(velocity), self._side_means(self._angle))
+            step, is_reset = self._mended_step(chain.reading, reading, velocity)
+            if is_reset:
+                self._tally.count(self._topic, Oddity.WHEEL_JUMP)
+                self._other = chain._replace(turned=0.0)
+                chain = chain._replace(turned=0.0)
+            chain = self._chain = self._follow(chain, reading, step)
+        yield WheelSample(reading.stamp_ns, self._side_means(velocity), self._side_means(chain.angle))
+
+    def _reaches(self, chain: _Chain, reading: JointReading) -> bool:
+        """Whether wheels can have turned from the last reading of ``chain`` to ``reading``."""
+        passed_ns = reading.stamp_ns - chain.reading.stamp_ns
+        if chain is self._other and passed_ns > _LATEST_NS:
+            return False
+        step = max(map(abs, (reading.position - chain.reading.position).tolist()))  # quicker than numpy's, on a handful
+        return bool(step * self._radius <= _FASTEST_M_PER_S * max(passed_ns * 1e-9, _SHORTEST_S))
+
+    def _follow(self, chain: _Chain, reading: JointReading, step: FloatArray) -> _Chain:
+        turned = chain.turned if self._other is None else chain.turned + sum(map(abs, step.tolist()))
+        return _Chain(reading, chain.angle + step, turned)
+
+    def _mended_step(self, known: JointReading, reading: JointReading, velocity: FloatArray) -> tuple[FloatArray, bool]:
+        """(n,) increments where some are too large: of an angle that wrapped, or from the rates for one that was reset; whether one was."""
+        dt = (reading.stamp_ns - known.stamp_ns) * 1e-9
+        step = reading.position - known.position
+        jumped = np.abs(step) * self._radius > _FASTEST_M_PER_S * max(dt, _SHORTEST_S)
+        expected = np.nan_to_num(velocity) * dt
+        wrapped = np.remainder(step + math.pi, math.tau) - math.pi
+        is_wrap = np.abs(wrapped - expected) < np.where(np.isfinite(velocity), _WRAP_RAD, _WRAP_WITHOUT_RATE_RAD)
+        return np.where(jumped, np.where(is_wrap, wrapped, expected), step), bool((jumped & ~is_wrap).any())
 
     def _side_means(self, values: FloatArray) -> FloatArray:
         numbers = values.tolist()

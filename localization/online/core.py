@@ -7,18 +7,13 @@ from dataclasses import dataclass, field
 
 from localization.estimators import CORRECTING, Estimate, Estimator, EstimatorConfig, make_estimator
 from localization.events import Event, PositionSample
+from localization.lidar_losses import LidarLosses
 from localization.synchronizer import Step, StepConfig, Synchronizer
 from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.corrections import Form, correctable
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
-
-_MISSED = {
-    "sparse": "had too few points on walls to be matched",
-    "stale": "told the very same ranges as the one before although the robot drove",
-    "jumps": "would have moved the robot as no slip can",
-}
 
 
 @dataclass(frozen=True)
@@ -53,6 +48,7 @@ class Core:
     ) -> None:
         """``is_smoothing``: the estimator is to give a smoothed trajectory at the end; it changes no estimate on the way."""
         config = config or ReplayConfig()
+        self._name = f"{pair.estimator} ({pair.model.name})"
         self.mounts = dict(mounts)
         """Where frames are known to sit; shared by all who ask."""
         model = correctable(pair.model, pair.corrections) if pair.estimator in CORRECTING else pair.model
@@ -84,13 +80,17 @@ class Core:
         self.settle()
         return estimates
 
+    @property
+    def lidar(self) -> LidarLosses | None:
+        """How long the LiDAR was lost so far; None where no scans are matched."""
+        lost = self.estimator.lost
+        return None if lost is None else LidarLosses.of(lost)
+
     def notes(self) -> list[str]:
         """What was found amiss with the sensors on the way."""
-        counts = self.estimator.counts()
-        missed = [
-            f"{n} scan{'s' * (n > 1)} {what}: the wheels carried on alone." for name, what in _MISSED.items() if (n := counts.get(name, 0))
-        ]
-        return [*self.stepper.notes(), *missed]
+        losses = self.lidar
+        said = "" if losses is None else losses.describe()
+        return [*self.stepper.notes(), *([f"{self._name}: {said}"] if said else [])]
 
     def meet(self, mounts: Mapping[str, Mount]) -> bool:
         """Take in places of frames that are known only now; one that is known already stays. Returns whether there were any."""

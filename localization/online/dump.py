@@ -76,7 +76,8 @@ def _store(path: Path, body: Sequence[bytes], after: Sequence[int]) -> None:
     try:
         for file_number in after:
             os.fsync(file_number)
-        with beside.open("wb") as file:
+        beside.unlink(missing_ok=True)
+        with beside.open("xb") as file:  # newly made: a link that stands there would lead elsewhere
             file.write(_MAGIC + digest.hexdigest().encode() + b"\n")
             file.writelines(body)
             file.flush()
@@ -89,7 +90,7 @@ def _store(path: Path, body: Sequence[bytes], after: Sequence[int]) -> None:
 
 
 def _beside(path: Path) -> Path:
-    """Where a state is until it is whole; what a process that was killed has left there is written over."""
+    """Where a state is until it is whole; what a process that was killed has left there is removed."""
     return path.with_name(f".{path.name}.new")
 
 

@@ -48,6 +48,8 @@ class Files:
         assert self.out is not None
         folder = self.out.with_name(f".{self.out.name}.new")
         with output_errors(self.out):
+            if folder.is_symlink() or folder.is_file():
+                folder.unlink()
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
         try:
@@ -78,7 +80,7 @@ def _locked(path: Path, lock: Path) -> TextIO:
     that ends."""
     while True:
         try:
-            file = lock.open("a")
+            file = os.fdopen(os.open(lock, os.O_CREAT | os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644), "a")
         except OSError as error:
             raise OutputError(f"'{path}' cannot be written: {error.strerror}. Name a file in a folder that is there and yours.") from error
         try:

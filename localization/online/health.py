@@ -11,6 +11,7 @@ import numpy as np
 
 from localization.estimators import Estimate
 from localization.events import Event, Scan
+from localization.lidar_losses import MAX_LOST_S, LidarLosses
 from localization.online.core import Core
 from motion_models.se2 import FloatArray
 
@@ -106,7 +107,13 @@ class Health:
         return Status("estimate", values=values)
 
     def _of_lidar(self, core: Core) -> Status:
-        values = {name: str(count) for name, count in core.estimator.counts().items()}
+        values, losses = {name: str(count) for name, count in core.estimator.counts().items()}, core.lidar
+        if losses is not None:
+            values |= {
+                "lost_share": f"{losses.share:.4f}",
+                "longest_lost_s": f"{losses.longest_s:.1f}",
+                "lost_now_s": f"{losses.ongoing_s:.1f}",
+            }
         if (lack := core.stepper.frames.lack) is not None:
             return Status("lidar", ERROR, lack, values)
         scene = self.degeneracy
@@ -116,6 +123,8 @@ class Health:
         if self._nis:
             above = sum(n > _NIS_95 for n in self._nis) / len(self._nis)
             values |= {"nis_mean": f"{self.nis:.2f}", "nis_last": f"{self._nis[-1]:.2f}", "nis_above_95": f"{above:.2f}"}
+        if losses is not None and (lost := _of_losses(losses, values)) is not None:
+            return lost
         if scene is not None and scene < _DEGENERATE:
             return Status("lidar", WARN, "the scene holds no position along one direction (a corridor, one wall)", values)
         if above > _MOST_ABOVE:
@@ -132,6 +141,17 @@ class Health:
         if math.hypot(vx, vy) > _SLIP_M_S or abs(wz) > _SLIP_RAD_S:
             return Status("wheels", WARN, "they turn otherwise than the robot moves: slip", values)
         return Status("wheels", values=values)
+
+
+def _of_losses(losses: LidarLosses, values: Mapping[str, str]) -> Status | None:
+    """ERROR while the LiDAR is lost for long, WARN while it is lost or was for long, else None."""
+    if losses.ongoing_s > MAX_LOST_S:
+        return Status("lidar", ERROR, f"lost for {losses.ongoing_s:.0f} s: the wheels carry on alone. {losses.advice}", values)
+    if losses.ongoing_s > 0.0:
+        return Status("lidar", WARN, f"lost for {losses.ongoing_s:.1f} s: the wheels carry on alone. {losses.advice}", values)
+    if losses.is_long:
+        return Status("lidar", WARN, f"{losses.summary}. {losses.advice}", values)
+    return None
 
 
 def _of_files(troubles: Mapping[str, str]) -> Status:

@@ -55,6 +55,11 @@ class Records:
         return np.array(self._numbers).reshape(-1, _COLUMNS)
 
 
+def old_spool(path: Path) -> Path:
+    """Where the spool ``path`` of a run that was killed is kept."""
+    return path.with_name(f"{path.name}.old")
+
+
 class Spool:
     """The same in a file that grows, at once and by whole rows. They survive the process; a state says how many it counts on (`resume`)."""
 
@@ -65,13 +70,11 @@ class Spool:
 
     @classmethod
     def create(cls, path: Path) -> Spool:
-        """A new file. Raises `OutputError`, also where a run that was killed has left one."""
-        if path.exists():
-            raise OutputError(
-                f"'{path}' is left from a run that was killed: pass that run's --state to go on from there. "
-                "If there is no such state, nothing can go on from it: remove the file to start anew."
-            )
+        """A new file. One that a run that was killed has left, and from which no state goes on, is kept as `old_spool`, instead of the one
+        that was kept before it. Raises `OutputError`."""
         try:
+            if path.is_symlink() or path.exists():
+                path.replace(old_spool(path))
             return cls(path, path.open("xb", buffering=0), 0, -(1 << 63))
         except OSError as error:
             raise OutputError(f"'{path}' cannot be written: {error.strerror}.") from error

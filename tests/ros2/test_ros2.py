@@ -26,6 +26,7 @@ pytestmark = [
 ]
 ODOMETRY_HASH = "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0"  # as nav_msgs ships it
 _CLOUD_BYTES = 4_000_000
+_COMPILED_S = 180.0  # a first start compiles for half a minute, on a busy machine for several
 
 
 @pytest.fixture(params=[pytest.param(name, marks=pytest.mark.xdist_group(name)) for name in ("kilted", "jazzy")])
@@ -75,7 +76,7 @@ def test_dds_door_beside_robots_that_leave_come_late_and_restart(distro, running
     """35 s without a robot but for one that leaves; then one that drives, is killed, and is there again."""
     domain = own_domain(1)
     node = running(start_skidloc(domain))
-    node.line("Nobody publishes anything")
+    node.line("Nobody publishes anything", timeout_s=_COMPILED_S)
     begin = time.monotonic()
     Robot(distro, domain).leave()
     time.sleep(max(begin + 35.0 - time.monotonic(), 0.0))
@@ -129,7 +130,7 @@ def test_dds_door_receives_all_clouds_of_4_mb_at_10_hz(distro, running):
 def test_rclpy_door_waits_runs_and_ends_by_sigint(distro, running, tmp_path):
     domain, out = own_domain(3), tmp_path / "run.tum"
     node = running(start_skidloc(domain, "--out", out, python=ros2_python(distro), door="rclpy", ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST"))
-    node.line("Nobody publishes anything")
+    node.line("Nobody publishes anything", timeout_s=_COMPILED_S)
     robot = running(Robot(distro, domain))
     robot.do("spin 2")
     robot.do("play 8")

@@ -1,0 +1,64 @@
+"""A campaign of mutated logs: three drives, faults of sensors and of files, all formats, by seed. Prints what was survived.
+
+python -m tests.benchmarks.faults [--count 300] [--seed 0] [--only TEXT] [--verbose]
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from tests.hostile_logs import BAD, SOURCES, Case, cases, run_guarded, truth_of, write_case
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="", help="cases whose description has this in it")
+    parser.add_argument("--verbose", action="store_true", help="print each case")
+    options = parser.parse_args([] if arguments is None else arguments)
+    with tempfile.TemporaryDirectory(prefix="skidloc-faults-") as name:
+        _campaign(Path(name), [c for c in cases(options.count, options.seed) if options.only in str(c)], options.seed, options.verbose)
+
+
+def _campaign(folder: Path, chosen: list[Case], seed: int, verbose: bool) -> None:
+    counts: Counter[str] = Counter()
+    bad: list[str] = []
+    seconds = []
+    robots = {source.name: source.robot for source in SOURCES}
+    truths = {name: truth_of(name, folder) for name in sorted({case.source for case in chosen})}
+
+    def jobs() -> Iterator[tuple[Any, ...]]:
+        for case in chosen:
+            place = folder / str(case.number)
+            place.mkdir()
+            yield case, write_case(case, place, seed), robots[case.source], truths[case.source], place / "out"
+
+    for case, outcome, took in run_guarded(jobs()):
+        counts[outcome.kind] += 1
+        seconds.append(took)
+        line = f"{outcome.kind}: {case} ({outcome.error_m:.3f} m, {outcome.sigmas:.1f} sigma, {took:.1f} s) {outcome.said[:300]}"
+        if outcome.kind in BAD:
+            bad.append(line)
+        if verbose:
+            print(line, flush=True)
+        shutil.rmtree(folder / str(case.number), ignore_errors=True)
+    print(
+        f"tried {len(chosen)} (seed {seed}), survived {counts['survived']}, reported {counts['reported'] + counts['refused']}"
+        f" (of these refused {counts['refused']}), wrong {counts['wrong']}, tracebacks {counts['traceback']}, hangs {counts['hang']},"
+        f" out of memory {counts['memory']}; longest {max(seconds, default=0.0):.1f} s"
+    )
+    for line in bad:
+        print(line)
+
+
+if __name__ == "__main__":
+    import sys
+
+    main(sys.argv[1:])

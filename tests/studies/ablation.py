@@ -1,0 +1,208 @@
+"""What each mechanism of filter and scan matching is worth: one is switched off at a time, all else stays at its defaults.
+
+python -m tests.studies.ablation [--only NAME,...] [--seconds 300] [--write]
+
+Five drives, the first 300 s of each (`--seconds`): ACES (mean error of the relations), fr079 and MIT-CSAIL (ATE at the reference's
+instants), laps simulated by the physics of the tyres with nominal sensors, and laps over a slippery patch whose ranges are twice as noisy
+as assumed, with slip that the filter's noise model does not have (ATE, and mean NEES of the pose with 3 expected). `--write` puts the table
+into `localization/estimators/README.md`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numba
+import numpy as np
+
+from localization.consistency import pose_consistency
+from localization.estimators import fusion
+from localization.estimators.filter import MAP, Filter
+from localization.evaluate import evaluate
+from localization.lidar import scan_matcher
+from localization.lidar.scan_matcher import ScanMatcher
+from localization.lidar.scan_matching import ScanMatchingSensor
+from localization.lidar.submap import VoxelGrid, fill_surface, make_grid
+from localization.logs import open_log
+from localization.references import ReferenceTrack, reference_track
+from localization.simulate.experiments import ExperimentConfig
+from localization.simulate.scanners import ScannerConfig
+from localization.simulate.simulator import SimulationConfig, simulate, write_simulation
+from localization.simulate.suite import ImuConfig, SensorConfig
+from motion_models.robot import load_robot
+from tests.studies.buildings import BUILDINGS, Drive, errors_of
+
+README = Path(__file__).parents[2] / "localization/estimators/README.md"
+BEGIN, END = "<!-- ablation: begin -->", "<!-- ablation: end -->"
+_NO_PRIOR = 1e6 * np.eye(3)
+"""Covariance of a prior that says nothing [m^2, m^2, rad^2]."""
+_LAPS = 1
+
+Patch = Callable[[], contextlib.AbstractContextManager[Any]]
+
+
+def _attribute(owner: Any, name: str, value: Any) -> Patch:
+    return lambda: mock.patch.object(owner, name, value)
+
+
+@contextlib.contextmanager
+def _together(*patches: Patch) -> Iterator[None]:
+    with contextlib.ExitStack() as stack:
+        for patch in patches:
+            stack.enter_context(patch())
+        yield
+
+
+def _wrap(owner: Any, name: str, change: Callable[..., Any]) -> Patch:
+    """``change`` (original, self, *arguments) in place of a method."""
+    original = getattr(owner, name)
+    return lambda: mock.patch.object(owner, name, lambda *a, **k: change(original, *a, **k))
+
+
+def _independent(original: Callable[..., None], ekf: Filter, *rest: Any) -> None:
+    """The submap's error is drawn anew for each scan."""
+    own = ekf.P[MAP, MAP].copy()
+    ekf.P[MAP, :] = ekf.P[:, MAP] = 0.0
+    ekf.P[MAP, MAP] = own
+    original(ekf, *rest)
+
+
+def _without_new(original: Callable[..., None], ekf: Filter, error: scan_matcher.KeyScanError) -> None:
+    original(ekf, replace(error, new_cov=np.zeros((3, 3))))
+
+
+@numba.njit(cache=True)
+def _fill_thin(grid: VoxelGrid) -> None:
+    for v in range(grid.sums.shape[0]):
+        fill_surface(grid, v)
+        if not math.isinf(grid.surfaces[v, 4]):
+            grid.surfaces[v, 4] = grid.noise
+
+
+def _thin_grid(*arguments: Any) -> VoxelGrid:
+    grid = make_grid(*arguments)
+    _fill_thin(grid)
+    return grid
+
+
+def _align_freely(original: Callable[..., Any], self: ScanMatcher, points: Any, prior: Any, cov: Any, guess: Any) -> Any:
+    """The prior sets the reach of associations but does not pull."""
+    pose, H, found = scan_matcher._align(self._grid, points, prior, cov, np.linalg.inv(_NO_PRIOR), guess)
+    return scan_matcher.Fit(pose, H, *(float(value) for value in found))
+
+
+def _result_freely(original: Callable[..., Any], self: ScanMatcher, fit: Any, prior: Any, cov: Any, outlier_cov: Any) -> Any:
+    return original(self, fit, prior, _NO_PRIOR, outlier_cov)
+
+
+_NO_SEARCH = (
+    _attribute(ScanMatcher, "_search", lambda *a: None),
+    _attribute(scan_matcher, "_BASIN_M", math.inf),
+    _attribute(scan_matcher, "_BASIN_RAD", math.inf),
+)
+PATCHES: Mapping[str, Patch] = {
+    "second deskewing pass": _attribute(ScanMatchingSensor, "refine", lambda self, match, twist: match),
+    "slip in the deskewing twist": _wrap(
+        ScanMatchingSensor, "measure", lambda original, self, step, prior, cov, twist: original(self, step, prior, cov, step.twist)
+    ),
+    "correlative search": lambda: _together(*_NO_SEARCH),
+    "rival test of the search": _attribute(scan_matcher, "_MAX_RIVAL", math.inf),
+    "total cost (more points fit, instead)": _attribute(
+        scan_matcher, "_is_better", lambda found, fit, prior, cov: found.overlap > fit.overlap
+    ),
+    "prior as possible outlier": _attribute(scan_matcher, "_OUTLIER_COST", math.inf),
+    "prior in the least squares": lambda: _together(
+        _wrap(ScanMatcher, "_align", _align_freely), _wrap(ScanMatcher, "_result", _result_freely)
+    ),
+    "thickness of surfaces": _attribute(scan_matcher, "make_grid", _thin_grid),
+    "block variance ratio": _attribute(ScanMatcher, "_variance_ratio", property(lambda self: 1.0)),
+    "submap's error": _attribute(Filter, "insert_key_scan", lambda self, error: None),
+    "submap's error as consider state (independent noise, instead)": _wrap(Filter, "predict", _independent),
+    "new surfaces' error of key scans": _wrap(Filter, "insert_key_scan", _without_new),
+    "check of wheels that stand": _attribute(fusion.EkfFusion, "_check_standstill", lambda self, step: step),
+    "excitation gate of corrections": _attribute(fusion.EkfFusion, "_is_turning", lambda self, motion: True),
+}
+SETTINGS: Mapping[str, Mapping[str, Any]] = {
+    "clock offset": {"clock_sigma_s": 0.0, "clock_walk_s_per_sqrt_s": 0.0},
+    "corrections to the motion model": {"corrections": "none"},
+}
+
+
+def simulated(experiment: str, sensors: SensorConfig, seed: int) -> Drive:
+    """A drive of VaultBot, by the physics of its tyres."""
+    robot = load_robot("vaultbot")
+    config = SimulationConfig(experiment=ExperimentConfig(laps=_LAPS), sensors=sensors)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "drive.mcap"
+        write_simulation(path, simulate(experiment, robot, seed, {}, config))
+        log = open_log(path, robot)
+        truth = reference_track(log.references("/ground_truth/odom"), "/ground_truth/odom")
+        return Drive(list(log.events()), robot, log.mounts, truth)
+
+
+def drives(seconds: float) -> Mapping[str, Drive]:
+    """The first ``seconds`` of all five, by the heads of their columns."""
+    imu = ImuConfig(rate_hz=0.0)
+    noisy = ScannerConfig(noise_m=0.04)  # twice `LidarConfig.range_noise_m`
+    found = {
+        "ACES: relations [m]": BUILDINGS["aces"].open(),
+        "fr079: ATE [m]": BUILDINGS["fr079"].open(),
+        "CSAIL: ATE [m]": BUILDINGS["csail"].open(),
+        "laps: ATE [mm], NEES": simulated("laps", SensorConfig(imu=imu), 0),
+        "slippery, noisy: ATE [mm], NEES": simulated("slippery_patch", SensorConfig(imu=imu, scanner=noisy), 1),
+    }
+    return {name: drive.until(seconds) for name, drive in found.items()}
+
+
+def cell(name: str, drive: Drive, settings: Mapping[str, Any]) -> str:
+    """One number of the table, or two."""
+    run = drive.run("ekf", "skid_steer", **settings)
+    if "NEES" not in name or not isinstance(drive.reference, ReferenceTrack):
+        error = errors_of(run.trajectory, drive.reference)[0]
+        return f"{error:.4f}" if "relations" in name else f"{error:.3f}"
+    ate = evaluate(run.trajectory, drive.reference).ate_rmse_m or 0.0  # truth is exact at any time: interpolated
+    found = pose_consistency(run.trajectory, drive.reference)
+    return f"{1e3 * ate:.1f}, " + ("–" if found is None else f"{found.mean:.2f}")  # noqa: RUF001
+
+
+def table(names: Sequence[str], seconds: float) -> Iterator[str]:
+    """Lines of the table, as they are computed."""
+    logs = drives(seconds)
+    yield f"| without | {' | '.join(logs)} |"
+    yield "|---" * (len(logs) + 1) + "|"
+    for name in ("nothing", *names):
+        settings = SETTINGS.get(name, {})
+        with PATCHES.get(name, contextlib.nullcontext)():
+            yield f"| {name} | {' | '.join(cell(log, drive, settings) for log, drive in logs.items())} |"
+
+
+def write_into(text: str, lines: Sequence[str]) -> str:
+    """``text`` with ``lines`` between the markers."""
+    head, rest = text.split(BEGIN)
+    return f"{head}{BEGIN}\n" + "\n".join(lines) + f"\n{END}{rest.split(END)[1]}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--only", default=",".join([*PATCHES, *SETTINGS]), help="mechanisms, separated by commas")
+    parser.add_argument("--seconds", type=float, default=300.0, help="of each drive")
+    parser.add_argument("--write", action="store_true", help="write the table into the README of the estimators")
+    options = parser.parse_args()
+    lines = []
+    for line in table([name for name in [*PATCHES, *SETTINGS] if name in options.only], options.seconds):
+        lines.append(line)
+        print(line, flush=True)
+    if options.write:
+        README.write_text(write_into(README.read_text(encoding="utf-8"), lines), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

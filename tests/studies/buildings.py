@@ -1,0 +1,161 @@
+"""Estimators in buildings that nobody tuned them on: fr079, MIT-CSAIL and ACES, with default settings.
+
+python -m tests.studies.buildings [--log fr079,csail,aces] [--estimator ...] [--model diff_drive,skid_steer,icr]
+    [--corrections none,constant,cg_field] [--matcher submap,kiss]
+
+Absolute trajectory error (ATE) after one SE(2) alignment, and the median relative pose error over 10 m of the reference's path. Both use
+the reference at its own instants alone: MIT-CSAIL's holds at key scans only, so nothing is interpolated between its poses. ACES has
+hand-verified relative poses instead: their mean translation error, over all of them and over those under 20 s.
+CPU is that of the whole replay in memory, after a first run of a few seconds that compiles.
+Where an estimator smooths at the end, its live poses have a row of their own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from localization.estimators import CORRECTING, ESTIMATORS, EstimatorConfig
+from localization.estimators.filter import FilterConfig
+from localization.evaluate import align, relation_errors
+from localization.events import Event
+from localization.lidar import LidarConfig
+from localization.logs import open_log
+from localization.online.core import Pair, ReplayConfig
+from localization.references import ReferenceTrack, Relations, read_reference_file
+from localization.run import Run, replay
+from localization.trajectory import Trajectory
+from motion_models import se2
+from motion_models.registry import make_model
+from motion_models.robot import Mount, Robot, load_robot
+
+DATA = Path(__file__).parents[1] / "data"
+_WARM_UP_S = 20.0
+RPE_M = 10.0
+SHORT_S = 20.0
+_SAME_INSTANT_NS = 1_000_000
+"""A pose farther in time from a reference's instant is not scored: the references' stamps are those of scans, rounded to a microsecond."""
+
+
+@dataclass(frozen=True)
+class Building:
+    """Where a log, its robot and its reference are."""
+
+    log: Path
+    robot: str
+    reference: Path
+
+    def open(self) -> Drive:
+        """The log, read once."""
+        robot = load_robot(self.robot)
+        log = open_log(self.log, robot)
+        return Drive(list(log.events()), robot, log.mounts, read_reference_file(self.reference))
+
+
+BUILDINGS: Mapping[str, Building] = {
+    "fr079": Building(DATA / "fr079/fr079.mcap", str(DATA / "fr079/fr079.toml"), DATA / "fr079/fr079_reference.tum"),
+    "csail": Building(DATA / "mit-csail/csail.mcap", str(DATA / "mit-csail/csail.toml"), DATA / "mit-csail/csail_reference.tum"),
+    "aces": Building(DATA / "aces/aces.mcap", "aces", DATA / "aces/aces.relations"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A log in memory."""
+
+    events: Sequence[Event]
+    robot: Robot
+    mounts: Mapping[str, Mount]
+    reference: ReferenceTrack | Relations
+
+    def run(self, estimator: str, model: str = "diff_drive", corrections: str = "constant", matcher: str = "submap", **ekf: float) -> Run:
+        """One estimator over the log; ``ekf``: settings of the filter that are not the default ones."""
+        config = ReplayConfig(estimator=EstimatorConfig(ekf=FilterConfig(**ekf), lidar=LidarConfig(matcher=matcher)))
+        pair = Pair(make_model(model, self.robot), estimator, corrections)
+        return replay(self.events, [pair], self.robot, self.mounts, True, config)[0]
+
+    def until(self, seconds: float) -> Drive:
+        """The first ``seconds`` of it."""
+        end = self.events[0].stamp_ns + round(seconds * 1e9)
+        return Drive([event for event in self.events if event.stamp_ns <= end], self.robot, self.mounts, self.reference)
+
+
+def track_errors(trajectory: Trajectory, reference: ReferenceTrack) -> tuple[float, float]:
+    """ATE and median RPE over 10 m [m] at the instants of ``reference``, by the nearest pose in time."""
+    stamps = trajectory.stamps_ns
+    at = np.clip(np.searchsorted(stamps, reference.stamps_ns), 1, len(stamps) - 1)
+    at -= reference.stamps_ns - stamps[at - 1] < stamps[at] - reference.stamps_ns
+    use = np.abs(stamps[at] - reference.stamps_ns) < _SAME_INSTANT_NS
+    estimate, truth = trajectory.poses[at[use]], reference.poses[use]
+    aligned = se2.compose(align(estimate, truth[:, :2], truth[:, 2]), estimate)
+    ate = float(np.sqrt(np.mean(np.sum((aligned - truth)[:, :2] ** 2, axis=1))))
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
+    end = np.searchsorted(way, way + RPE_M)
+    start = np.flatnonzero(end < len(way))
+    error = se2.between(se2.between(truth[start], truth[end[start]]), se2.between(estimate[start], estimate[end[start]]))
+    return ate, float(np.median(np.hypot(error[:, 0], error[:, 1])))
+
+
+def errors_of(trajectory: Trajectory, reference: ReferenceTrack | Relations) -> tuple[float, float]:
+    """`track_errors`, or mean errors of relations: of all, and of those under 20 s [m]."""
+    if isinstance(reference, ReferenceTrack):
+        return track_errors(trajectory, reference)
+    found = relation_errors(trajectory, reference)
+    return float(found.translation_m.mean()), float(found.translation_m[found.spans_s < SHORT_S].mean())
+
+
+def measure(drive: Drive, estimator: str, model: str, form: str, matcher: str) -> Iterator[tuple[str, str]]:
+    """A name and a cell for each kind of poses that the estimator has."""
+    begin = time.process_time()
+    run = drive.run(estimator, model, form, matcher)
+    seconds = time.process_time() - begin
+    lidar = "–" if run.lidar is None else f"{100.0 * (1.0 - run.lidar.matched / max(run.lidar.scans, 1)):.2f}"  # noqa: RUF001
+    scans = sum(hasattr(event, "points") for event in drive.events)
+    rest = f"{lidar} | {1e3 * seconds / scans:.2f}"
+    names = {"": run.trajectory} if run.moments is None else {" live": run.moments, " smoothed": run.trajectory}
+    for kind, trajectory in names.items():
+        yield kind, "{:.3f} / {:.4f} | {}".format(*errors_of(trajectory, drive.reference), rest)
+
+
+def rows(drive: Drive, options: argparse.Namespace) -> Iterator[str]:
+    """Lines of the table for one log."""
+    for estimator in options.estimator:
+        models = options.model if estimator != "lidar" else options.model[:1]
+        forms = options.corrections if estimator in CORRECTING else ["none"]
+        matchers = options.matcher if estimator in CORRECTING else ["submap"]
+        for model, form, matcher in ((m, f, k) for m in models for f in forms for k in matchers):
+            parts = [model] * (estimator != "lidar") + ([form, matcher] if estimator in CORRECTING else [])
+            for kind, cells in measure(drive, estimator, model, form, matcher):
+                yield f"{estimator}{kind}{' (' + ', '.join(parts) + ')' if parts else ''} | {cells}"
+
+
+def _arguments(words: Sequence[str] | None) -> argparse.Namespace:
+    def split(text: str) -> list[str]:
+        return text.split(",")
+
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--log", type=split, default=list(BUILDINGS), help="fr079, csail, aces")
+    parser.add_argument("--estimator", type=split, default=list(ESTIMATORS))
+    parser.add_argument("--model", type=split, default=["diff_drive"])
+    parser.add_argument("--corrections", type=split, default=["constant"])
+    parser.add_argument("--matcher", type=split, default=["submap"])
+    return parser.parse_args(words)
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    options = _arguments(words)
+    print("| log | estimator | ATE / RPE 10 m, or relations all / < 20 s [m] | scans lost [%] | CPU ms a scan |\n|---|---|---|---|---|")
+    for name in options.log:
+        drive = BUILDINGS[name].open()
+        drive.until(_WARM_UP_S).run("ekf")
+        for line in rows(drive, options):
+            print(f"| {name} | {line} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
