@@ -11,7 +11,6 @@ PARTS = (
     "tests.benchmarks.online",
     "tests.benchmarks.compare",
     "tests.benchmarks.lidar",
-    "tests.benchmarks.graph",
     "tests.benchmarks.diagnosis",
     "tests.benchmarks.faults",
     "tests.benchmarks.fuzz",

@@ -261,3 +261,31 @@ def look_around(walls: np.ndarray, pose: np.ndarray, angles: np.ndarray, longest
     ranges = np.empty(len(angles))
     _cast(np.tile(np.asarray(pose, dtype=float), (len(angles), 1)), angles, longest, make_grid(walls), ranges)
     return ranges
+
+
+def scan_from(walls: np.ndarray, pose: np.ndarray, rng: np.random.Generator, noise: float = 0.012, beams: int = 720) -> np.ndarray:
+    """(N, 2) points all around, measured at once from ``pose`` (3,), in its frame; ranges up to 30 m with sigma ``noise`` [m]."""
+    angles = np.linspace(-math.pi, math.pi, beams, endpoint=False)
+    ranges = look_around(walls, pose, angles, 30.0)
+    is_hit = np.isfinite(ranges)
+    ranges = ranges[is_hit] + noise * rng.normal(size=int(is_hit.sum()))
+    return np.column_stack([ranges * np.cos(angles[is_hit]), ranges * np.sin(angles[is_hit])])
+
+
+def cloud(walls: np.ndarray, pose: np.ndarray, seed: int, tilt: float = 0.0) -> np.ndarray:
+    """(N, 3) 16 rings 0.8 m above a floor, in the body frame, which is pitched by ``tilt`` [rad]."""
+    rng = np.random.default_rng(seed)
+    azimuth = np.linspace(-math.pi, math.pi, 400, endpoint=False)
+    found = []
+    for elevation in np.radians(np.linspace(-15.0, 15.0, 16)):
+        c, s = math.cos(tilt), math.sin(tilt)
+        ray = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.full(400, math.sin(elevation))])
+        level = np.stack([c * ray[0] + s * ray[2], ray[1], -s * ray[0] + c * ray[2]])
+        across = np.hypot(level[0], level[1])
+        to_wall = look_around(walls, pose, np.arctan2(level[1], level[0])) / across
+        with np.errstate(divide="ignore"):
+            to_floor = np.where(level[2] < 0.0, -0.8 / level[2], np.inf)
+        r = np.minimum(to_wall, to_floor) + 0.02 * rng.normal(size=400)
+        found.append((r * ray).T)
+    points = np.concatenate(found) + np.array([0.0, 0.0, 0.8])
+    return points[np.isfinite(points).all(axis=1)]

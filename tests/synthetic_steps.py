@@ -1,7 +1,7 @@
 """Steps from an independent generator: a true robot whose parameters, noise and sensors are drawn from what the estimators believe.
 
 Nothing here uses the estimators' own prediction: the truth is composed from small intervals with slip drawn in each, and what a Step says
-comes from `Stepper`'s own parts (`integrate_twists`) at the parameters that the estimator hands back.
+comes from `Synchronizer`'s own parts (`integrate_twists`) at the parameters that the estimator hands back.
 """
 
 from __future__ import annotations
@@ -12,15 +12,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from localization.estimators.base import Estimator
-from localization.estimators.witness import Sight
+from localization.estimators.filter import BIAS, POSE, FilterConfig
+from localization.estimators.fusion import EkfFusion
 from localization.events import Scan
 from localization.gyro import Turn
-from localization.steps import Step
+from localization.lidar import LostScans, ScanMatch
+from localization.synchronizer import Step
 from motion_models import se2
 from motion_models.base import Motion
-from motion_models.corrections import Corrections
+from motion_models.corrections import Corrections, corrections
 from motion_models.integrate import integrate_twists
-from motion_models.robot import GyroNoise, WheelNoise
+from motion_models.registry import make_model
+from motion_models.robot import GyroNoise, Robot, WheelNoise, load_robot
 
 DT = 0.1
 _SUB = 4
@@ -42,37 +45,29 @@ class Noise:
         return replace(self, wheels=w, lidar_m=self.lidar_m * factor, lidar_rad=self.lidar_rad * factor)
 
 
-class Seer:
-    """A witness that says what it is told: the true motion with noise of a covariance that it knows."""
-
-    can_begin = True
+class PoseSensor:
+    """In place of `ScanMatchingSensor`: poses with noise of a covariance that it knows, in a submap that is exact."""
 
     def __init__(self) -> None:
-        self.next: Motion | None = None
+        self.next: ScanMatch | None = None
+        self.lost = LostScans()
 
-    def look(self, step, anchor, guess):
-        return None if self.next is None else Sight(self.next, 1.0)
+    def measure(self, step, prior, cov, twist):
+        return self.next
 
-    def recall(self, step, pose, cov):
-        return None
+    def refine(self, match, twist):
+        return match
 
-    def remember(self, step, pose):
-        return True
+    def is_key(self, pose):
+        return False
 
-    def map_points(self, way=None):
+    def map_points(self):
         return NO_POINTS
 
-    def counts(self):
-        return {}
 
-
-@dataclass
-class Result:
-    truth: np.ndarray
-    """(3,) last true pose"""
-    slow: np.ndarray
-    """true gyro bias, clock offset, corrections"""
-    nees_pose: list[float]
+def match_at(pose: np.ndarray, cov: np.ndarray) -> ScanMatch:
+    """What `PoseSensor` measures next: ``pose`` (3,), with noise of ``cov`` (3, 3)."""
+    return ScanMatch(pose, pose, cov, 1.0, np.zeros((3, 3)))
 
 
 def weave(t: float) -> tuple[float, float]:
@@ -98,22 +93,21 @@ class World:
         belief=None,
         wheels=weave,
         cg=lambda t: (0.0, 0.0),
-        mount=(0.0, 0.0, 0.0),
     ):
-        """``mount`` (3,): how far the LiDAR truly sits off where its transform says, a left perturbation in the body frame."""
         self.model, self.corrected, self.noise, self.rng = model, corrected, noise, rng
         self.has_lidar, self.wheels, self.cg = has_lidar, wheels, cg
         self.pose, self.t, self.k = np.zeros(3), 0.0, 0
         self.bias = rng.normal(0.0, noise.gyro.bias_sigma_rad_per_s)
         self.clock = rng.normal(0.0, belief.clock_sigma_s) if belief is not None else 0.0
-        self.belief, self.mount = belief, se2.exp(np.array(mount, dtype=float))
+        self.belief, self.scale = belief, rng.normal(0.0, noise.gyro.scale_sigma)
         k = len(corrected.names)
         self.correction = rng.multivariate_normal(np.zeros(k), corrected.cov) if k else np.zeros(0)
         self._walk = np.linalg.cholesky(corrected.walk_cov + 1e-18 * np.eye(k))
 
     @property
     def slow(self) -> np.ndarray:
-        return np.concatenate([[self.bias, self.clock], self.correction])
+        """(3 + k,) true gyro bias and scale, clock offset, corrections."""
+        return np.concatenate([[self.bias, self.scale, self.clock], self.correction])
 
     def first(self) -> Step:
         none = Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, len(self.model.param_names))))
@@ -126,10 +120,10 @@ class World:
         times = begin + (np.arange(_SUB) + 0.5) * DT / _SUB
         return np.full(_SUB, DT / _SUB), np.array([self.wheels(t) for t in times]), np.array([self.cg(t) for t in times])
 
-    def step(self, params: np.ndarray, clock_offset: float) -> tuple[Step, Motion]:
-        """The next step as an estimator with these beliefs would be given it, and the LiDAR's motion."""
+    def step(self, params: np.ndarray, clock_offset: float) -> tuple[Step, ScanMatch]:
+        """The next step as an estimator with these parameters would be given it, and the LiDAR's pose."""
         rng, noise = self.rng, self.noise
-        # the wheels' stamps are early by the offset: what really happens at t stands in the log at t + clock (as Stepper reads it)
+        # the wheels' stamps are early by the offset: what really happens at t stands in the log at t + clock (as Synchronizer reads it)
         dt, rates, cg = self._rates(self.t)
         true_params = self.model.nominal + self.corrected.directions @ self.correction
         twists = self.model.twist(rates, cg, true_params).value
@@ -158,11 +152,10 @@ class World:
 
         g = noise.gyro
         turned = float(delta[2])
-        variance = g.white_rad_per_sqrt_s**2 * DT + (g.scale_sigma * turned) ** 2
-        turn = Turn(turned + self.bias * DT + rng.normal(0.0, math.sqrt(variance)), variance, DT)
+        variance = g.white_rad_per_sqrt_s**2 * DT
+        turn = Turn((1.0 + self.scale) * turned + self.bias * DT + rng.normal(0.0, math.sqrt(variance)), variance, DT)
         sigmas = np.array([noise.lidar_m, noise.lidar_m, noise.lidar_rad])
-        by_lidar = se2.compose(se2.inverse(self.mount), se2.compose(delta, self.mount))
-        seen = Motion(se2.compose(by_lidar, se2.exp(sigmas * rng.normal(size=3))), np.diag(sigmas**2))
+        match = match_at(se2.compose(self.pose, se2.exp(sigmas * rng.normal(size=3))), np.diag(sigmas**2))
 
         start, self.k = self.k, self.k + 1
         self.t = self.k * DT
@@ -171,15 +164,59 @@ class World:
         self.correction = self.correction + self._walk @ rng.normal(size=len(self.correction)) * math.sqrt(DT)
         if self.belief is not None:
             self.clock += rng.normal(0.0, self.belief.clock_walk_s_per_sqrt_s * math.sqrt(DT))
-        return Step(*stamps, predicted, d_clock, twist.value[-1], False, True, turn, self._scan(stamps[1])), seen
+        return Step(*stamps, predicted, d_clock, twist.value[-1], False, True, turn, self._scan(stamps[1])), match
 
 
-def drive(world: World, estimator: Estimator, seer: Seer, steps: int, every: int = 1):
+def drive(world: World, estimator: Estimator, sensor: PoseSensor, steps: int):
     """Yield (estimate, true pose) after each step."""
     if world.has_lidar:
         estimator.step(world.first())
     for _ in range(steps):
         params = world.model.nominal if estimator.params is None else estimator.params
-        step, seen = world.step(params, estimator.clock_offset_s)
-        seer.next = seen
+        step, sensor.next = world.step(params, estimator.clock_offset_s)
         yield estimator.step(step), world.pose
+
+
+def make_filter(
+    sensor: PoseSensor, model="skid_steer", form="constant", noise=None, has_lidar=True, robot: Robot | None = None
+) -> EkfFusion:
+    """The filter with the noise of the synthetic robot. ``model``: a name, or a model."""
+    noise = noise or Noise()
+    robot = replace(robot or load_robot("husky_a200"), wheel_noise=noise.wheels, gyro_noise=noise.gyro)
+    made = make_model(model, robot) if isinstance(model, str) else model
+    return EkfFusion(made, corrections(made, form), robot, sensor if has_lidar else None, FilterConfig())
+
+
+def make_world(estimator, seed, noise=None, has_lidar=True, wheels=weave, **more) -> World:
+    """A robot whose parameters and noise are drawn from the priors of ``estimator``."""
+    rng = np.random.default_rng(seed)
+    return World(estimator._model, estimator._corrections, noise or Noise(), rng, has_lidar, FilterConfig(), wheels, **more)
+
+
+def run(estimator, sensor, seed=0, steps=60, **world):
+    """All estimates of a drive, and the true poses (steps, 3)."""
+    found, truth = [], []
+    for estimate, pose in drive(make_world(estimator, seed, **world), estimator, sensor, steps):
+        found.append(estimate)
+        truth.append(pose)
+    return found, np.array(truth)
+
+
+def slow_states(estimator: EkfFusion) -> tuple[np.ndarray, np.ndarray]:
+    """Means (m,) of gyro bias and scale, clock offset and corrections, and the joint covariance (3 + m, 3 + m) of pose and these."""
+    ekf = estimator.filter
+    index = np.r_[POSE, BIAS : len(ekf.P)]
+    return np.concatenate([[ekf.bias, ekf.scale, ekf.clock_offset], ekf.corrections]), ekf.P[np.ix_(index, index)]
+
+
+def squared_errors(seed, steps, noise, model="skid_steer", form="constant"):
+    """Normalised squared errors of the pose, of the slow states and of all, and which slow states are inside their 90 % intervals."""
+    sensor = PoseSensor()
+    estimator = make_filter(sensor, model, form, noise)
+    world = make_world(estimator, seed, noise)
+    *_, (estimate, truth) = drive(world, estimator, sensor, steps)
+    slow, P = slow_states(estimator)
+    error = np.concatenate([se2.log(se2.between(estimate.pose, truth)), world.slow - slow])
+    inside = np.abs(error[3:]) < 1.6449 * np.sqrt(np.diag(P)[3:])
+    parts = (slice(0, 3), slice(3, None), slice(0, None))
+    return [float(error[p] @ np.linalg.solve(P[p, p], error[p])) for p in parts], inside, [len(error[p]) for p in parts]

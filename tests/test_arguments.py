@@ -12,7 +12,7 @@ import pytest
 
 from localization.cli import main
 from localization.errors import OutputError, SettingError
-from localization.estimators.ekf import EkfConfig
+from localization.estimators.filter import FilterConfig
 from localization.estimators.graph_fusion import GraphConfig
 from localization.output import check_outputs, whole_file, write_text_file
 from localization.trajectory import Trajectory, write_tum
@@ -92,7 +92,7 @@ def test_setting_beyond_all_reason_is_refused(value: float) -> None:
         GraphConfig(lag_nodes=value)  # type: ignore[arg-type]
     if value != 10**9:
         with pytest.raises(SettingError, match=r"clock_sigma_s.*must be"):
-            EkfConfig(clock_sigma_s=value)
+            FilterConfig(clock_sigma_s=value)
 
 
 def test_setting_of_400_digits_on_the_command_line_is_refused(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

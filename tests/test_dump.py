@@ -16,23 +16,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from localization.errors import DumpError
-from localization.lidar.lines import LineMap
-from localization.lidar.track import Place
+from localization.estimators import CORRECTING, ESTIMATORS
+from localization.events import WheelSample
+from localization.lidar import LidarConfig
+from localization.lidar.scan_matcher import ScanMatcher
 from localization.online.core import Core, Pair, ReplayConfig
 from localization.online.dump import Dumper, fingerprints, read_dump, read_head, write_dump
 from localization.online.freeze import freeze
 from localization.online.thaw import thaw
-from localization.steps import StepConfig
+from localization.synchronizer import StepConfig
 from motion_models.registry import make_model
 from motion_models.robot import Mount, load_robot
 from tests.online_help import ROBOT, drive_events, new_core, numbers, reseal
 
-ESTIMATORS = [("odometry", "diff_drive", "none"), ("lidar", "skid_steer", "none"), ("ekf", "skid_steer", "constant")]
-ESTIMATORS += [("graph", "skid_steer", "cg_field")]
+KINDS = [(name, "skid_steer", "cg_field" if name in CORRECTING else "none") for name in ESTIMATORS]
 AHEAD = 300  # events after a cut that are compared: some 30 scans
 
 
-@pytest.mark.parametrize("kind", ESTIMATORS, ids="-".join)
+@pytest.mark.parametrize("kind", KINDS, ids="-".join)
 def test_cut_anywhere_and_resumed_the_results_are_the_same_to_the_last_bit(kind):
     events, _ = drive_events()
     cuts = {0, 1, 2, 60, *np.random.default_rng(3).integers(3, len(events), 9).tolist(), len(events)}
@@ -59,7 +60,7 @@ def test_cut_anywhere_and_resumed_the_results_are_the_same_to_the_last_bit(kind)
     assert len(whole) > 200
 
 
-@pytest.mark.parametrize("estimator", ["lidar", "ekf", "graph"])
+@pytest.mark.parametrize("estimator", [name for name in ESTIMATORS if name != "odometry"])
 def test_places_that_are_told_late_reach_whoever_was_resumed(estimator):
     """Frames are unknown to all parts of a core until one moment: cut shortly before, or not."""
     events, mounts = drive_events()
@@ -106,13 +107,14 @@ def test_another_process_resumes_it(tmp_path):
 def test_a_list_of_many_alike_is_written_down_as_columns():
     """One by one, each with names and shapes of its own, they would take seconds and megabytes of text."""
     rng = np.random.default_rng(0)
-    places = [Place(i, float(i), rng.normal(size=3), rng.normal(size=(3, 3))) for i in range(20_000)]
-    text, blob = freeze(places)
+    samples = [WheelSample(i, rng.normal(size=2), rng.normal(size=2)) for i in range(20_000)]
+    text, blob = freeze(samples)
     again = thaw(text, blob)
     assert len(text) < 1000
-    assert all(a.stamp_ns == b.stamp_ns and a.travel == b.travel for a, b in zip(again, places, strict=True))
-    assert all(np.array_equal(a.pose, b.pose) and np.array_equal(a.cov, b.cov) for a, b in zip(again, places, strict=True))
-    assert again[0].pose.base is None
+    assert all(a.stamp_ns == b.stamp_ns for a, b in zip(again, samples, strict=True))
+    assert all(np.array_equal(a.velocity, b.velocity) for a, b in zip(again, samples, strict=True))
+    assert all(np.array_equal(a.position, b.position) for a, b in zip(again, samples, strict=True))
+    assert again[0].position.base is None
 
 
 scalars = st.none() | st.booleans() | st.integers(-(2**70), 2**70) | st.floats() | st.text(max_size=5)
@@ -281,15 +283,24 @@ def test_dumper_writes_no_more_often_than_it_is_told_and_reports_a_full_disk(tmp
     assert read_dump(tmp_path / "state", {}, {}).value == [1.5]
 
 
-def test_a_map_of_lines_is_written_by_its_points_not_by_its_table():
-    lines = LineMap(0.4, 0.01, 50.0)
-    for travel in range(3):
-        lines.insert(np.random.default_rng(travel).uniform(-4.0, 4.0, (400, 2)), np.array([travel, 0.5, 0.3]), float(travel))
-    text, blob = freeze(lines)
-    assert len(text) + len(blob) < 30 * len(lines.point_cloud()) + 20 * np.count_nonzero(lines._cells[:, 2]) + 1000
+def test_submap_is_written_as_key_scans_and_matches_bit_by_bit():
+    """Voxels, their surfaces and the image of the search follow from the points."""
+    rng, matcher = np.random.default_rng(0), ScanMatcher(LidarConfig(), 0.1)
+    angles = np.linspace(-3.1, 3.1, 400)
+    room = np.column_stack([np.clip(9.0 * np.cos(angles), -4.0, 5.0), np.clip(9.0 * np.sin(angles), -3.0, 2.0)])
+    for key in range(3):
+        matcher.insert_key_scan(np.array([0.01 * key, 0.0, 0.0]), room + 0.01 * rng.normal(size=room.shape))
+    prior, narrow, wide = np.array([0.02, -0.01, 0.005]), np.diag([1e-3, 1e-3, 1e-4]), np.diag([0.2, 0.2, 0.1])
+    matcher.match(room, prior, narrow)  # fills surfaces
+    matcher.match(room, prior, wide)  # draws the image
+    text, blob = freeze(matcher)
+    assert len(text) + len(blob) < 16 * 3 * len(room) + 2000
     again = thaw(text, blob)
-    assert vars(again).keys() == vars(lines).keys()
-    assert all(np.array_equal(vars(again)[name], value) for name, value in vars(lines).items())
+    for cov in (narrow, wide):
+        one, other = (m.match(room, prior, cov) for m in (matcher, again))
+        assert one is not None
+        assert all(np.array_equal(vars(one)[name], vars(other)[name]) for name in vars(one))
+    assert thaw(*freeze(ScanMatcher(LidarConfig(), 0.1))).points().shape == (0, 2)
 
 
 def test_pair_is_shared_not_written():

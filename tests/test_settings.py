@@ -9,11 +9,9 @@ import pytest
 
 from localization.diagnosis.diagnose import DiagnosisConfig
 from localization.errors import SettingError
-from localization.estimators.ekf import EkfConfig
-from localization.estimators.graph_fusion import GraphConfig
+from localization.estimators.filter import FilterConfig
 from localization.evaluate import EvaluateConfig
 from localization.lidar import LidarConfig
-from localization.lidar.revisit import RevisitConfig
 from localization.maneuver_windows import WindowConfig
 from localization.run import ReplayConfig
 from localization.simulate.experiments import ExperimentConfig
@@ -22,7 +20,7 @@ from localization.simulate.sensors import EncoderConfig, GpsConfig
 from localization.simulate.simulator import SimulationConfig
 from localization.simulate.suite import SensorConfig
 from localization.simulate.vehicle import VehicleConfig
-from localization.steps import StepConfig
+from localization.synchronizer import StepConfig
 
 ROOTS = (ReplayConfig, SimulationConfig, DiagnosisConfig, WindowConfig, EvaluateConfig)
 
@@ -33,19 +31,13 @@ ROOTS = (ReplayConfig, SimulationConfig, DiagnosisConfig, WindowConfig, Evaluate
         (StepConfig, {"max_step_s": [0, -1, 1e-12]}, "0.001 or more"),
         (StepConfig, {"no_lidar_step_s": [0], "lost_speed_m_s": [-1], "lost_rate_rad_s": [0]}, "above 0"),
         (StepConfig, {"wait_s": [-1], "max_hold_s": [-1]}, "0 or more"),
-        (EkfConfig, {"gate_probability": [0, 1, 2]}, "between 0 and 1, and neither of them"),
-        (EkfConfig, {"clock_sigma_s": [-1], "clock_walk_s_per_sqrt_s": [-1], "nudge_m2_per_s": [-1]}, "0 or more"),
-        (EkfConfig, {"standing_sigma_m": [0], "standing_sigma_rad": [0]}, "above 0"),
-        (GraphConfig, {"kernel_scale": [0], "mount_sigma_m": [0, -1], "mount_sigma_rad": [0]}, "above 0"),
-        (GraphConfig, {"relinearize_at": [-1]}, "0 or more"),
-        (GraphConfig, {"lag_nodes": [1, -5]}, "2 or more"),
+        (FilterConfig, {"clock_sigma_s": [-1], "clock_walk_s_per_sqrt_s": [-1]}, "0 or more"),
+        (FilterConfig, {"standstill_m2_per_s": [-1], "standstill_rad2_per_s": [-1]}, "0 or more"),
         (LidarConfig, {"voxel_size_m": [-1, 1e-9, 1e3]}, "0, or from 0.01 to 10"),
         (LidarConfig, {"min_range_m": [60, 50]}, "below max_range_m, which is 50"),
-        (LidarConfig, {"max_range_m": [0], "sigma_point_m": [0, -1], "sigma_line_m": [-1], "max_jump_m_s": [0]}, "above 0"),
-        (LidarConfig, {"iterations": [0, -3]}, "1 or more"),
-        (LidarConfig, {"max_jumps": [-1], "max_shift_m": [-1]}, "0 or more"),
-        (RevisitConfig, {"gate_probability": [1]}, "between 0 and 1"),
-        (RevisitConfig, {"min_matched": [0, 1.01]}, "above 0 and at most 1"),
+        (LidarConfig, {"max_range_m": [0], "range_noise_m": [0, -1], "key_distance_m": [0], "key_angle_rad": [0]}, "above 0"),
+        (LidarConfig, {"key_scans": [0, -3]}, "1 or more"),
+        (LidarConfig, {"search_below": [1, -0.1], "lost_below": [1]}, "from 0 to below 1"),
         (DiagnosisConfig, {"significance": [0], "fewest_windows": [0], "moments": [0], "seed": [-1]}, ""),
         (WindowConfig, {"window_s": [0], "around_s": [-1], "per_group": [0]}, ""),
         (VehicleConfig, {"step_s": [0, 0.05]}, "above 0 and at most 0.02"),

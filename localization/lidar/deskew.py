@@ -29,11 +29,11 @@ class Sweep:
     @classmethod
     def from_scan(cls, scan: Scan, mount: Mount) -> Sweep:
         """``scan`` in the body frame. Points that are not finite are left out."""
-        points, times = scan.points @ mount.rotation().T + (mount.x, mount.y, mount.z), scan.times_from_middle
+        points, times = scan.points, scan.times_from_middle
         is_finite = np.isfinite(points).all(axis=1)
         if not is_finite.all():
             points, times = points[is_finite], times[is_finite] if len(times) else times
-        return cls(points, times, scan.is_planar)
+        return cls(points @ mount.rotation().T + (mount.x, mount.y, mount.z), times, scan.is_planar)
 
     def within(self, min_range_m: float, max_range_m: float) -> Sweep:
         """The points whose distance from the body's origin is in this range [m]."""

@@ -68,7 +68,7 @@ class LoopDetector:
         self._config, self._cell = config, cell
         self.keyframes: list[Keyframe] = []
         self._pending: list[LoopClosure] = []
-        self._closed: set[tuple[int, int]] = set()
+        self._closed: dict[tuple[int, int], None] = {}  # as checkpoints take it
 
     def add(self, keyframe: Keyframe) -> None:
         self.keyframes.append(keyframe)
@@ -86,7 +86,7 @@ class LoopDetector:
         self._pending.append(found)
         agreeing = [loop for loop in self._pending if loop is not found and self._agree(loop, found)]
         new = [loop for loop in [*agreeing, found] if agreeing and (loop.a, loop.b) not in self._closed]
-        self._closed |= {(loop.a, loop.b) for loop in new}
+        self._closed |= dict.fromkeys((loop.a, loop.b) for loop in new)
         return new
 
     def _match(self, k: int, poses: FloatArray, marginal: FloatArray) -> LoopClosure | None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 
 from localization.events import Scan
@@ -36,7 +34,7 @@ class LostScans:
         self._matched_ns = self._last_ns = 0
         self.scans = 0
         """All scans so far."""
-        self.causes: Counter[str] = Counter()
+        self.causes: dict[str, int] = {}
         """Scans that were not matched: `lost` (they fit nowhere, or in several places), `sparse`, `stale`."""
         self._lost_ns = 0
         self._longest: tuple[int, int] = (0, 0)  # length and start [ns]
@@ -51,7 +49,7 @@ class LostScans:
     def add(self, stamp_ns: int, cause: str) -> None:
         """A scan that was not."""
         self._count(stamp_ns)
-        self.causes[cause] += 1
+        self.causes[cause] = self.causes.get(cause, 0) + 1
         self._last_ns = stamp_ns
 
     @property

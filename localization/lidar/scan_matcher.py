@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numba
 import numpy as np
@@ -177,10 +177,19 @@ class ScanMatcher:
         scan = make_grid(drawn, self.cell, self._config.range_noise_m)
         share, new = (1.0, 0.0) if self._grid is None else measure_shares(self._grid, scan)
         self._keys = [*self._keys, drawn][-self._config.key_scans :]
-        self._grid, self._image = make_grid(np.vstack(self._keys), self.cell, self._config.range_noise_m), None
+        self._draw()
         H = linearize(self._grid, points, triple(pose), 0.0)[0]
         seen, noise = np.linalg.solve(H + _MAPPED_INFORMATION, H), np.linalg.inv(H + _OPEN_INFORMATION) * self._variance_ratio(1)
         return KeyScanError(share * seen, noise, new * seen @ noise @ seen.T)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The key scans; grid and image are computed from them."""
+        return {name: value for name, value in vars(self).items() if name not in ("_grid", "_image")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _grid=None, _image=None)
+        if self._keys:
+            self._draw()
 
     def _variance_ratio(self, which: int) -> float:
         """Variance of a match over that of independent points with the assumed noise, by the residuals of the last scans.
@@ -192,6 +201,9 @@ class ScanMatcher:
     def points(self) -> FloatArray:
         """(M, 2) of the submap, in the odometry frame [m]."""
         return np.vstack(self._keys) if self._keys else np.empty((0, 2))
+
+    def _draw(self) -> None:
+        self._grid, self._image = make_grid(self.points(), self.cell, self._config.range_noise_m), None
 
     def _align(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray) -> Fit:
         assert self._grid is not None

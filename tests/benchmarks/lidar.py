@@ -14,9 +14,7 @@ import numpy as np
 
 from localization.consistency import mean_band, nees
 from localization.events import Scan
-from localization.lidar import LidarMatcher
-from localization.lidar.kiss import Kiss
-from localization.lidar.matcher import in_range
+from localization.lidar import KissIcp, LidarConfig, ScanMatcher, choose_voxel_size
 from localization.simulate import world
 from motion_models import se2
 from motion_models.robot import WheelNoise
@@ -65,21 +63,26 @@ def accuracy(walls: np.ndarray, noise: WheelNoise, seeds: int = 3) -> dict[str, 
 
 
 def matching(walls: np.ndarray, twists: np.ndarray, seed: int, start=(0.0, 0.0, 0.0), guess_m: float = 0.01, scanner=None):
-    """Yield milliseconds of register and insert, of KISS-ICP alone, registration, true pose of each scan; points and map are moved by the
+    """Yield milliseconds of match and insertion, of KISS-ICP alone, match, true pose of each scan; points and map are moved by the
     true motion, so that nothing is judged but the match."""
     drive = rooms.drive_through(walls, twists, seed, start, scanner, noise=NO_SLIP)
-    rng, matcher, kiss = np.random.default_rng(seed), LidarMatcher(), None
+    rng, cov, config = np.random.default_rng(seed), np.diag([1e-4, 1e-4, 1e-4]), LidarConfig()
     scans = [event for event in drive.events if isinstance(event, Scan)]
+    first = rooms.true_points(drive, scans[0])
+    cell = max(0.02 * float(np.median(np.linalg.norm(first, axis=1))), 0.04)
+    matcher, kiss, last_key = ScanMatcher(config, cell), KissIcp(choose_voxel_size(first), config.max_range_m), None
     for scan, pose in zip(scans, drive.poses, strict=True):
         points = rooms.true_points(drive, scan)
+        planar = np.ascontiguousarray(points[:, :2])
         guess = se2.compose(pose, se2.exp(guess_m * rng.normal(size=3)))
         begin = time.perf_counter()
-        found = matcher.register(points, True, guess, np.diag([1e-4, 1e-4, 1e-4]))
-        matcher.insert(pose)
+        found = None if last_key is None else matcher.match(planar, guess, cov)
+        moved = None if last_key is None else se2.between(last_key, pose)
+        if moved is None or np.hypot(moved[0], moved[1]) > config.key_distance_m or abs(moved[2]) > config.key_angle_rad:
+            matcher.insert_key_scan(pose, planar)
+            last_key = pose
         middle = time.perf_counter()
-        if kiss is None:
-            kiss = Kiss(matcher._voxel, 0.0, matcher.config.max_range_m)
-        kiss.register_frame(in_range(points, matcher.config))
+        kiss.register_frame(points)
         yield 1e3 * (middle - begin), 1e3 * (time.perf_counter() - middle), found, pose
 
 
@@ -96,7 +99,7 @@ def registration_nees(walls: np.ndarray, scanner: rooms.Beams | None = None, run
     for seed in range(runs):
         rng = np.random.default_rng(seed)
         start = (rng.uniform(-2, 0), rng.uniform(-1, 1), rng.uniform(-3, 3))
-        rows = [(pose, one.pose, one.cov) for *_, one, pose in matching(walls, way, seed, start, scanner=scanner) if one is not None]
+        rows = [(pose, one.measured, one.cov) for *_, one, pose in matching(walls, way, seed, start, scanner=scanner) if one is not None]
         true, poses, covs = (np.array(column[9:]) for column in zip(*rows, strict=True))
         found.append(nees(se2.log(se2.between(true, poses)), covs).mean())
     return np.array(found)

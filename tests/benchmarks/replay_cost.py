@@ -19,14 +19,12 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from localization.events import Scan
-from localization.lidar import LidarConfig
-from localization.lidar.kiss import Kiss
-from localization.lidar.matcher import in_range, voxel_size
+from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
 from localization.logs import open_log
 from localization.run import Pair, replay
 from motion_models.integrate import preintegrate
 from motion_models.registry import MODELS, make_model
-from motion_models.robot import load_robot
+from motion_models.robot import Mount, load_robot
 
 ACES = Path(__file__).parents[1] / "data" / "aces" / "aces.mcap"
 
@@ -35,8 +33,9 @@ def kiss_seconds() -> float:
     """KISS-ICP's register_frame on all scans of ACES, and nothing else."""
     config = LidarConfig()
     log = open_log(ACES, load_robot("aces"))
-    clouds = [in_range(event.points, config) for event in log.events() if isinstance(event, Scan)]
-    kiss = Kiss(voxel_size(clouds[0]), 0.0, config.max_range_m)
+    sweeps = (Sweep.from_scan(event, Mount()) for event in log.events() if isinstance(event, Scan))
+    clouds = [sweep.within(config.min_range_m, config.max_range_m).points for sweep in sweeps]
+    kiss = KissIcp(choose_voxel_size(clouds[0]), config.max_range_m)
     begin = time.perf_counter()
     for cloud in clouds:
         kiss.register_frame(cloud)

@@ -24,8 +24,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
 from localization.estimators.ekf import EkfConfig
+from localization.steps import Stepper
+
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.evaluate import evaluate
@@ -36,7 +37,6 @@ from localization.references import ReferenceTrack, reference_track
 from localization.simulate.experiments import ExperimentConfig
 from localization.simulate.simulator import SimulationConfig, simulate, write_simulation
 from localization.simulate.suite import START_NS
-from localization.steps import Stepper
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion

@@ -1,0 +1,508 @@
+"""The filter: prediction and updates against filterpy, textbook formulas and Monte Carlo; honest over many seeds."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import math
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chi2
+
+from localization.consistency import lag1_whiteness, mean_band
+from localization.errors import EstimatorError
+from localization.estimators.filter import BIAS, CLOCK, KEY, MAP, PARAMS, POSE, SCALE, START, Filter, FilterConfig
+from localization.events import Scan, WheelSample
+from localization.gyro import Turn
+from localization.lidar import KeyScanError
+from localization.synchronizer import Step, Synchronizer, steps
+from motion_models import se2
+from motion_models.base import Motion
+from motion_models.corrections import corrections
+from motion_models.registry import make_model
+from motion_models.robot import load_robot
+from tests import bags
+
+S, T0 = bags.S, bags.START
+ROBOT = load_robot("vaultbot")
+GYRO = ROBOT.gyro_noise
+MODEL = make_model("skid_steer", ROBOT)
+CORRECTED = corrections(MODEL, "constant")
+LIDAR = np.diag([0.004, 0.006, 0.002]) ** 2
+
+
+def scan_at(t):
+    return Scan(T0 + round(t * S), np.ones((1, 3)))
+
+
+def drive(seconds, turned, clock=0.0, params=None, hz=20.0):
+    """Steps of 0.1 s from the stepper itself, for wheel angles ``turned(t)``."""
+    cutter = Synchronizer(MODEL, ROBOT, {}, True)
+    cutter.clock_offset_s = clock
+    cutter.params = MODEL.nominal if params is None else params
+    wheels = [
+        WheelSample(T0 + round(i / hz * S), np.full(2, np.nan), np.array(turned(i / hz), float)) for i in range(round(seconds * hz) + 20)
+    ]
+    scans = [scan_at(0.525 + 0.1 * i) for i in range(round(10 * seconds))]
+    return list(steps(sorted([*wheels, *scans], key=lambda e: e.stamp_ns), cutter))[1 : round(10 * seconds)]
+
+
+def winding(t):
+    """Both ways round, fast and slow: it shows the scaling of rotation and the clocks."""
+    return 3.0 * t - 3.0 * math.sin(0.9 * t) + 0.5 * math.sin(2.3 * t), 3.0 * t + 3.0 * math.sin(0.9 * t) + 0.5 * math.sin(2.3 * t)
+
+
+@functools.cache
+def winding_steps(seconds):
+    return tuple(drive(seconds, winding))
+
+
+def standing(seconds):
+    return drive(seconds, lambda t: (1.0, 1.0))
+
+
+def step_of(delta, cov=None, duration=0.1, d_clock=None, is_standing=False):
+    n = len(MODEL.param_names)
+    motion = Motion(np.asarray(delta, float), np.diag([1e-4, 1e-4, 1e-4]) if cov is None else cov, np.zeros((3, n)))
+    return Step(T0, T0 + round(duration * S), motion, np.zeros(3) if d_clock is None else d_clock, np.zeros(3), is_standing, True)
+
+
+def filter_at(pose=None, config=None):
+    """A filter whose pose is known exactly, at ``pose`` (3,)."""
+    found = Filter(GYRO, CORRECTED, config or FilterConfig())
+    if pose is not None:
+        found.pose = np.asarray(pose, float)
+    return found
+
+
+NOTHING = np.zeros((3, 3))
+SIZE = PARAMS + len(CORRECTED.names)
+
+
+def random_covariance(rng, scale=1e-3):
+    A = rng.normal(size=(SIZE, SIZE))
+    return scale**2 * A @ A.T
+
+
+# --- prediction
+
+
+def test_predict_moves_the_covariance_along_the_derivatives_of_the_motion():
+    """F by differences: the error that a wrong pose, clock or parameter leaves after a step that the synchronizer cuts with it."""
+    h, config = 1e-5, FilterConfig(clock_walk_s_per_sqrt_s=0.0)
+    rng = np.random.default_rng(0)
+    P0 = random_covariance(rng, 1.0)
+    for number in (3, 8, 14):
+        pose = rng.normal(size=3)
+        nominal = drive(2.0, winding)[number]
+        back = se2.inverse(nominal.predicted.delta)
+
+        def after(e, pose=pose, number=number, nominal=nominal):
+            params = MODEL.nominal + CORRECTED.directions @ e[PARAMS:]
+            delta = drive(2.0, winding, e[CLOCK], params)[number].predicted.delta if e[BIAS:].any() else nominal.predicted.delta
+            return se2.compose(se2.compose(pose, se2.exp(e[POSE])), delta)
+
+        F = np.eye(SIZE)
+        for i in [*range(3), CLOCK, *range(PARAMS, SIZE)]:
+            e = np.zeros(SIZE)
+            e[i] = h
+            F[POSE, i] = se2.log(se2.between(after(-e), after(e))) / (2 * h)
+        for i in range(3):  # the submap's error, carried along with the body
+            moved = [se2.log(se2.compose(se2.compose(back, se2.exp(s * h * np.eye(3)[i])), se2.inverse(back))) for s in (1.0, -1.0)]
+            F[MAP, MAP.start + i] = (moved[0] - moved[1]) / (2 * h)
+        F[START, START], F[START, POSE] = np.zeros((3, 3)), np.eye(3)
+        ekf = filter_at(pose, config)
+        ekf.P = P0.copy()
+        ekf.predict(nominal)
+        expected = F @ P0 @ F.T
+        expected[POSE, POSE] += nominal.predicted.cov
+        expected[BIAS, BIAS] += GYRO.bias_walk_rad_per_s_sqrt_s**2 * nominal.duration
+        expected[PARAMS:, PARAMS:] += CORRECTED.walk_cov * nominal.duration
+        np.testing.assert_allclose(ekf.P, expected, rtol=2e-4, atol=2e-4)
+        np.testing.assert_allclose(ekf.pose, se2.compose(pose, nominal.predicted.delta))
+        np.testing.assert_array_equal(ekf.start, pose)
+
+
+def test_drift_without_measurements_grows_as_dead_reckoning_has_it():
+    ekf, cov = filter_at(config=FilterConfig(clock_sigma_s=0.0)), np.zeros((3, 3))
+    ekf.P[PARAMS:, PARAMS:] = 0.0
+    for step in winding_steps(10.0):
+        quiet = dataclasses.replace(step, predicted=Motion(step.predicted.delta, step.predicted.cov, np.zeros((3, 11))))
+        A = se2.adjoint(se2.inverse(step.predicted.delta))
+        cov = A @ cov @ A.T + step.predicted.cov
+        ekf.predict(quiet)
+    np.testing.assert_allclose(ekf.P[POSE, POSE], cov, rtol=1e-9)
+
+
+@pytest.mark.parametrize("clone", [START, KEY])
+def test_motion_since_a_clone_has_the_covariance_of_its_derivatives(clone):
+    rng = np.random.default_rng(1)
+    ekf = filter_at(rng.normal(size=3))
+    ekf.start, ekf.key, ekf.P = rng.normal(size=3), rng.normal(size=3), random_covariance(rng)
+    delta, cov = ekf.motion_since(clone)
+    origin = ekf.start if clone == START else ekf.key
+    np.testing.assert_allclose(delta, se2.between(origin, ekf.pose))
+    J, h = np.zeros((3, SIZE)), 1e-6
+    for i in range(3):
+        e = h * np.eye(3)[i]
+        for states, pair in (
+            (POSE, lambda s, e=e: (origin, se2.compose(ekf.pose, se2.exp(s * e)))),
+            (clone, lambda s, e=e: (se2.compose(origin, se2.exp(s * e)), ekf.pose)),
+        ):
+            ends = [se2.log(se2.between(delta, se2.between(*pair(s)))) for s in (1.0, -1.0)]
+            J[:, states.start + i] = (ends[0] - ends[1]) / (2 * h)
+    np.testing.assert_allclose(cov, J @ ekf.P @ J.T, rtol=1e-5, atol=1e-12)
+
+
+def test_start_key_clones_the_pose():
+    rng = np.random.default_rng(2)
+    ekf = filter_at(rng.normal(size=3))
+    ekf.P = random_covariance(rng)
+    before = ekf.P.copy()
+    ekf.start_key()
+    delta, cov = ekf.motion_since(KEY)
+    np.testing.assert_allclose(delta, 0.0, atol=1e-12)
+    np.testing.assert_allclose(cov, 0.0, atol=1e-15)
+    others = np.r_[0:9, 12:SIZE]
+    np.testing.assert_array_equal(ekf.P[np.ix_(others, others)], before[np.ix_(others, others)])
+
+
+# --- updates
+
+
+def prepared(seed):
+    """A filter with a full covariance, and a measured pose near its own."""
+    rng = np.random.default_rng(seed)
+    ekf = filter_at(rng.normal(size=3))
+    ekf.start, ekf.key, ekf.P = rng.normal(size=3), rng.normal(size=3), random_covariance(rng)
+    return ekf, se2.compose(ekf.pose, se2.exp(1e-3 * rng.normal(size=3)))
+
+
+def states(ekf):
+    return np.concatenate([ekf.pose, ekf.start, ekf.key, [ekf.bias, ekf.scale, ekf.clock_offset], ekf.corrections])
+
+
+def test_update_is_filterpys_where_no_state_is_a_consider_state():
+    ekf, measured = prepared(0)
+    ekf._consider[:] = False
+    H = np.zeros((3, SIZE))
+    H[:, POSE], H[:, MAP] = np.eye(3), -np.eye(3)
+    other = KalmanFilter(SIZE, 3)
+    other.P, other.H, other.R = ekf.P.copy(), H, LIDAR
+    other.update(se2.log(se2.between(ekf.pose, measured)))
+    pose, key = ekf.pose, ekf.key
+    nis = ekf.update_scan(measured, LIDAR, NOTHING)
+    np.testing.assert_allclose(ekf.P, other.P, rtol=1e-9, atol=1e-15)
+    assert nis == pytest.approx(other.mahalanobis**2)
+    error = other.x.ravel()
+    np.testing.assert_allclose(ekf.pose, se2.compose(pose, se2.exp(error[POSE])), atol=1e-12)
+    np.testing.assert_allclose(ekf.key, se2.compose(key, se2.exp(error[KEY])), atol=1e-12)
+    np.testing.assert_allclose([ekf.bias, ekf.scale, ekf.clock_offset], error[BIAS:PARAMS], atol=1e-15)
+    np.testing.assert_allclose(ekf.corrections, error[PARAMS:], atol=1e-15)
+
+
+def test_update_of_consider_states_is_schmidts():
+    """By his partitioned formulas (Schmidt 1966): no gain, the same covariance, correlations that shrink."""
+    ekf, measured = prepared(1)
+    P, innovation = ekf.P.copy(), se2.log(se2.between(ekf.pose, measured))
+    c = np.arange(MAP.start, MAP.stop)
+    x = np.setdiff1d(np.arange(SIZE), c)
+    Hx, Hc = np.zeros((3, len(x))), -np.eye(3)
+    Hx[:, :3] = np.eye(3)
+    Pxx, Pxc, Pcc = P[np.ix_(x, x)], P[np.ix_(x, c)], P[np.ix_(c, c)]
+    S = Hx @ Pxx @ Hx.T + Hx @ Pxc @ Hc.T + Hc @ Pxc.T @ Hx.T + Hc @ Pcc @ Hc.T + LIDAR
+    K = (Pxx @ Hx.T + Pxc @ Hc.T) @ np.linalg.inv(S)
+    before = ekf.bias
+    nis = ekf.update_scan(measured, LIDAR, NOTHING)
+    np.testing.assert_allclose(ekf.P[np.ix_(x, x)], Pxx - K @ (Hx @ Pxx + Hc @ Pxc.T), rtol=1e-7, atol=1e-14)
+    np.testing.assert_allclose(ekf.P[np.ix_(x, c)], Pxc - K @ (Hx @ Pxc + Hc @ Pcc), rtol=1e-7, atol=1e-14)
+    np.testing.assert_array_equal(ekf.P[np.ix_(c, c)], 0.5 * (Pcc + Pcc.T))
+    assert ekf.bias - before == pytest.approx((K @ innovation)[BIAS - 3])
+    assert nis == pytest.approx(innovation @ np.linalg.inv(S) @ innovation)
+
+
+@pytest.mark.parametrize("is_turning", [True, False])
+def test_corrections_have_no_gain_where_the_motion_does_not_turn(is_turning):
+    ekf, _ = prepared(2)
+    ekf.predict(step_of([0.1, 0.0, 0.01]), is_turning)
+    before, P = ekf.corrections.copy(), ekf.P[PARAMS:, PARAMS:].copy()
+    ekf.update_turn(Turn(0.05, 1e-6, 0.1))
+    ekf.update_scan(se2.compose(ekf.pose, np.array([1e-3, 1e-3, 1e-3])), LIDAR, NOTHING)
+    assert np.array_equal(ekf.corrections, before) == (not is_turning)
+    assert np.allclose(ekf.P[PARAMS:, PARAMS:], P, rtol=1e-9) == (not is_turning)
+
+
+def test_turn_updates_like_a_scalar_kalman_filter():
+    ekf, _ = prepared(3)
+    ekf.start = se2.compose(ekf.pose, np.array([-0.1, 0.0, -0.3]))
+    P, turn = ekf.P.copy(), Turn(0.301, 1e-6, 0.1)
+    H = np.zeros((1, SIZE))
+    H[0, 2], H[0, 5], H[0, BIAS], H[0, SCALE] = 1.0, -1.0, 0.1, 0.3
+    c = np.zeros(SIZE, bool)
+    c[MAP] = True
+    S = float((H @ P @ H.T)[0, 0]) + 1e-6
+    K = np.where(c, 0.0, (P @ H.T)[:, 0] / S)
+    A = np.eye(SIZE) - np.outer(K, H)
+    nis = ekf.update_turn(turn)
+    np.testing.assert_allclose(ekf.P, A @ P @ A.T + 1e-6 * np.outer(K, K), rtol=1e-7, atol=1e-14)
+    assert ekf.bias == pytest.approx(K[BIAS] * 0.001)
+    assert ekf.scale == pytest.approx(K[SCALE] * 0.001)
+    assert nis == pytest.approx(0.001**2 / S)
+
+
+def test_outlier_covariance_widens_the_pose_before_the_update():
+    wide, (plain, measured) = prepared(4)[0], prepared(4)
+    outlier = np.diag([0.1, 0.1, 0.05]) ** 2
+    wide.P[POSE, POSE] += outlier
+    wide.update_scan(measured, LIDAR, NOTHING)
+    plain.update_scan(measured, LIDAR, outlier)
+    np.testing.assert_allclose(plain.P, wide.P)
+    np.testing.assert_allclose(plain.pose, wide.pose)
+
+
+KEY_SCAN = KeyScanError(np.array([[0.4, 0.02, 0.0], [0.02, 0.3, 0.01], [0.0, 0.01, 0.35]]), 2.0 * LIDAR, np.diag([1e-6, 2e-6, 1e-7]))
+SAMPLES = 40_000
+
+
+def assert_scatter(errors, P):
+    """The covariance of (SAMPLES, n) errors is ``P``, within 5 sigma of what so many samples give."""
+    scatter = errors.T @ errors / len(errors)
+    sigma = np.sqrt((np.outer(np.diag(P), np.diag(P)) + P**2) / len(errors))
+    assert (np.abs(scatter - P) <= 5.0 * sigma + 1e-18).all()
+
+
+@pytest.mark.parametrize("is_matched", [True, False])
+def test_covariance_is_the_scatter_of_errors_by_monte_carlo(is_matched):
+    """Errors drawn, updated with the gain and put into the submap, e_map' = (I - W) e_map + W (e_pose - n) + m, one by one."""
+    ekf, measured = prepared(5)
+    rng = np.random.default_rng(0)
+    e = rng.multivariate_normal(np.zeros(SIZE), ekf.P, SAMPLES, method="cholesky")
+    n = rng.multivariate_normal(np.zeros(3), LIDAR if is_matched else KEY_SCAN.noise_cov, SAMPLES)
+    if is_matched:
+        H = np.zeros((3, SIZE))
+        H[:, POSE], H[:, MAP] = np.eye(3), -np.eye(3)
+        K = np.linalg.solve(H @ ekf.P @ H.T + LIDAR, H @ ekf.P).T
+        K[MAP] = 0.0
+        e = e - (e @ H.T - n) @ K.T
+        ekf.update_scan(measured, LIDAR, NOTHING)
+        assert_scatter(e, ekf.P)
+    ekf.insert_key_scan(KEY_SCAN)
+    W, m = KEY_SCAN.weight, rng.multivariate_normal(np.zeros(3), KEY_SCAN.new_cov, SAMPLES)
+    e[:, MAP] = e[:, MAP] @ (np.eye(3) - W).T + (e[:, POSE] - n) @ W.T + m
+    assert_scatter(e, ekf.P)
+
+
+def test_map_relative_covariance_is_that_of_the_difference():
+    ekf, _ = prepared(6)
+    J = np.zeros((3, SIZE))
+    J[:, POSE], J[:, MAP] = np.eye(3), -np.eye(3)
+    np.testing.assert_allclose(ekf.map_relative_cov(), J @ ekf.P @ J.T, rtol=1e-9)
+
+
+def test_first_key_scan_makes_the_map_err_as_the_pose():
+    """Drawn where the robot is, an error of the pose is one of the submap: against it, the pose is known but for the scan's noise."""
+    ekf, _ = prepared(7)
+    ekf.P[MAP], ekf.P[:, MAP] = 0.0, 0.0
+    ekf.insert_key_scan(KeyScanError(np.eye(3), LIDAR, NOTHING))
+    np.testing.assert_allclose(ekf.map_relative_cov(), LIDAR, atol=1e-12)
+
+
+# --- a covariance stays a covariance
+
+
+def check_covariance(P):
+    np.testing.assert_allclose(P, P.T, atol=1e-12 * np.abs(P).max())
+    scale = np.sqrt(np.maximum(np.diag(P), 1e-300))
+    assert np.linalg.eigvalsh(P / np.outer(scale, scale)).min() > -1e-9
+
+
+def test_covariance_stays_one_over_thousands_of_random_steps():
+    rng = np.random.default_rng(3)
+    ekf, drives = filter_at(), winding_steps(20.0)
+    for i in range(4000):
+        kind = rng.integers(6)
+        step = drives[i % len(drives)] if kind else step_of(np.zeros(3), np.zeros((3, 3)), is_standing=True)
+        ekf.predict(step, bool(kind))
+        if kind != 1:
+            ekf.update_turn(Turn(step.predicted.delta[2] + 0.01 * rng.normal(), 10.0 ** rng.uniform(-10, -2), step.duration))
+        if kind > 2:
+            noise = 10.0 ** rng.uniform(-4, 1, 3)
+            off = noise * rng.normal(size=3) * (1 if rng.random() < 0.95 else 30)
+            ekf.update_scan(se2.compose(ekf.pose, se2.exp(off)), np.diag(noise**2), NOTHING)
+        if kind == 4:
+            ekf.insert_key_scan(KEY_SCAN)
+            ekf.start_key()
+        if i % 20 == 0:
+            check_covariance(ekf.P)
+    assert np.isfinite(ekf.pose).all()
+    check_covariance(ekf.P)
+
+
+# --- standing still
+
+
+def test_standing_freezes_the_pose_and_shows_the_gyros_bias():
+    rng, bias = np.random.default_rng(5), 8e-4
+    ekf = filter_at()
+    for step in winding_steps(5.0):
+        ekf.predict(step)
+    before, wide = ekf.pose, ekf.P[POSE, POSE].copy()
+    for step in standing(60.0):
+        assert step.is_standing
+        ekf.predict(step)
+        noise = GYRO.white_rad_per_sqrt_s * math.sqrt(step.duration) * rng.normal()
+        ekf.update_turn(Turn(bias * step.duration + noise, GYRO.white_rad_per_sqrt_s**2 * step.duration, step.duration))
+    sigma = math.sqrt(ekf.P[BIAS, BIAS])
+    assert abs(ekf.bias - bias) < 3.0 * sigma
+    # 60 s of white noise leave 2e-3 / sqrt(60) = 2.6e-4 rad/s, the prior and the walks a little either way
+    assert 1.5e-4 < sigma < 4e-4
+    np.testing.assert_allclose(ekf.pose, before, atol=1e-3)
+    # a robot that stands measures nothing of where it is, and loses little
+    assert np.linalg.eigvalsh(ekf.P[POSE, POSE] - 0.999 * wide).min() > -1e-6
+    assert np.trace(ekf.P[POSE, POSE]) < 1.05 * np.trace(wide)
+
+
+def test_standing_estimates_nothing_of_the_model():
+    ekf = filter_at()
+    before = ekf.P[PARAMS:, PARAMS:].copy()
+    for step in standing(20.0):
+        ekf.predict(step, False)
+        ekf.update_scan(se2.compose(ekf.pose, np.array([1e-3, -1e-3, 1e-3])), LIDAR, NOTHING)
+    np.testing.assert_allclose(ekf.P[PARAMS:, PARAMS:], before, rtol=1e-12)
+    assert not ekf.corrections.any()
+
+
+# --- over many seeds
+
+
+@dataclasses.dataclass
+class World:
+    """What the filter assumes, drawn: slip, clock, bias, scale and corrections, all with their walks; a submap that is exact."""
+
+    rng: np.random.Generator
+    seconds: float = 15.0
+
+    def run(self):
+        rng, config = self.rng, FilterConfig()
+        ekf, pose = filter_at(config=config), np.zeros(3)
+        bias, scale = GYRO.bias_sigma_rad_per_s * rng.normal(), GYRO.scale_sigma * rng.normal()
+        clock = config.clock_sigma_s * rng.normal()
+        params = CORRECTED.sigmas * rng.normal(size=len(CORRECTED.names))
+        nis, turns, innovations = [], [], []
+        for step in winding_steps(self.seconds):
+            dt = step.duration
+            off = step.d_clock * (clock - ekf.clock_offset) + step.predicted.d_params @ CORRECTED.directions @ (params - ekf.corrections)
+            slip = rng.multivariate_normal(np.zeros(3), step.predicted.cov, method="cholesky")
+            before, pose = pose, se2.compose(pose, se2.compose(step.predicted.delta, se2.exp(off + slip)))
+            bias += GYRO.bias_walk_rad_per_s_sqrt_s * math.sqrt(dt) * rng.normal()
+            clock += config.clock_walk_s_per_sqrt_s * math.sqrt(dt) * rng.normal()
+            params = params + np.sqrt(np.diag(CORRECTED.walk_cov) * dt) * rng.normal(size=len(params))
+            ekf.predict(step)
+            angle = float(se2.between(before, pose)[2])
+            variance = GYRO.white_rad_per_sqrt_s**2 * dt
+            turns.append(ekf.update_turn(Turn((1.0 + scale) * angle + bias * dt + math.sqrt(variance) * rng.normal(), variance, dt)))
+            measured = se2.compose(pose, se2.exp(np.sqrt(np.diag(LIDAR)) * rng.normal(size=3)))
+            innovations.append(se2.log(se2.between(ekf.pose, measured)))
+            nis.append(ekf.update_scan(measured, LIDAR, NOTHING))
+        off = [bias - ekf.bias, scale - ekf.scale, clock - ekf.clock_offset]
+        return np.concatenate([se2.log(se2.between(ekf.pose, pose)), off, params - ekf.corrections]), ekf.P, nis, turns, innovations
+
+
+SEEDS = 80
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    return [tuple(map(np.array, World(np.random.default_rng(100 + seed)).run())) for seed in range(SEEDS)]
+
+
+PARTS = {
+    "pose": [0, 1, 2],
+    "gyro bias": [BIAS],
+    "gyro scale": [SCALE],
+    "clock": [CLOCK],
+    "k": [PARAMS],
+    "centre of rotation": [PARAMS + 1, PARAMS + 2],
+    "all": [0, 1, 2, *range(BIAS, PARAMS + 3)],
+}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_nees_is_inside_its_band(worlds, part):
+    """Every part of the state, at the end of 15 s, over independent seeds; 99.8 % band, so that seven of them hold together."""
+    of = np.array(PARTS[part])
+    at = [i if i < 3 else 3 + i - BIAS for i in of]  # where the part stands in the vector of errors
+    values = [error[at] @ np.linalg.solve(P[np.ix_(of, of)], error[at]) for error, P, *_ in worlds]
+    low, high = mean_band(SEEDS, len(of), 0.998)
+    assert low < np.mean(values) < high
+    assert np.mean(np.array(values) < chi2.ppf(0.95, len(of))) > 0.85
+
+
+def test_nis_is_inside_its_band(worlds):
+    lidar, gyro = (np.concatenate([w[i] for w in worlds]) for i in (2, 3))
+    for values, dof in ((lidar, 3), (gyro, 1)):
+        low, high = mean_band(len(values), dof, 0.998)
+        assert low < values.mean() < high
+    assert np.mean(lidar > chi2.ppf(0.95, 3)) == pytest.approx(0.05, abs=0.012)
+
+
+def test_calibration_states_are_learned(worlds):
+    """What began at sigma is known several times better; the clock's sign is part of its error above."""
+    for index, sigma, share in (
+        (CLOCK, FilterConfig().clock_sigma_s, 0.3),
+        (PARAMS, CORRECTED.sigmas[0], 0.5),
+        (PARAMS + 1, CORRECTED.sigmas[1], 0.5),
+        (BIAS, GYRO.bias_sigma_rad_per_s, 0.5),
+        (SCALE, GYRO.scale_sigma, 0.8),
+    ):
+        assert np.mean([math.sqrt(P[index, index]) for _, P, *_ in worlds]) < share * sigma
+
+
+def test_innovations_are_white(worlds):
+    rhos = [lag1_whiteness(w[4], np.broadcast_to(np.cov(w[4].T), (len(w[4]), 3, 3))).lag1 for w in worlds]
+    n = len(worlds[0][4])
+    assert abs(np.mean(rhos)) < 4.0 / math.sqrt(3 * n * SEEDS) + 2.0 / n
+
+
+# --- any input
+
+
+HOSTILE = st.sampled_from([math.nan, math.inf, -math.inf, 1e300, -1e300, 1e150, 0.0, 1e-300, -1.0, 0.1])
+
+
+@given(st.data())
+@settings(max_examples=150, deadline=None)
+def test_no_input_makes_the_state_non_finite(data):
+    def draw(*shape):
+        return np.array(data.draw(st.lists(HOSTILE, min_size=int(np.prod(shape)), max_size=int(np.prod(shape))))).reshape(shape)
+
+    ekf = filter_at()
+    for step in winding_steps(5.0)[:4]:
+        ekf.predict(step)
+    calls = {
+        "motion": lambda: ekf.predict(step_of(draw(3))),
+        "covariance": lambda: ekf.predict(step_of([0.1, 0, 0], np.diag(np.abs(draw(3))))),
+        "clock": lambda: ekf.predict(step_of([0.1, 0, 0], d_clock=draw(3))),
+        "turn": lambda: ekf.update_turn(Turn(*np.abs(draw(3)).tolist())),
+        "scan": lambda: ekf.update_scan(draw(3), np.diag(np.abs(draw(3))), NOTHING),
+    }
+    for name in data.draw(st.lists(st.sampled_from(sorted(calls)), min_size=1, max_size=4)):
+        with contextlib.suppress(EstimatorError), np.errstate(all="ignore"):
+            calls[name]()
+        for part in (ekf.pose, ekf.start, ekf.key, ekf.P, ekf.corrections, ekf.bias, ekf.scale, ekf.clock_offset):
+            assert np.isfinite(part).all()
+
+
+def test_motion_that_is_not_finite_is_refused_with_its_stamp():
+    ekf = filter_at()
+    with pytest.raises(EstimatorError, match=f"the motion of the wheels until stamp {T0 + S // 10} ns"):
+        ekf.predict(step_of([np.nan, 0.0, 0.0]))
+    with pytest.raises(EstimatorError, match="a measurement"):
+        ekf.update_scan(np.array([0.0, np.nan, 0.0]), LIDAR, NOTHING)
+    with pytest.raises(EstimatorError, match="a measurement"):
+        ekf.update_turn(Turn(np.nan, 1e-6, 0.1))

@@ -1,0 +1,382 @@
+"""Wheels, gyro and LiDAR fused on drives through simulated rooms, with data that are late, spoilt, missing and contradictory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from localization.consistency import nees
+from localization.errors import EstimatorError
+from localization.estimators import EstimatorConfig
+from localization.estimators.base import Estimate
+from localization.events import Event, ImuSample, Scan, WheelSample
+from localization.lidar import LidarConfig
+from localization.online.core import Core, Pair, ReplayConfig
+from localization.run import Run
+from localization.simulate import world
+from motion_models import se2
+from motion_models.registry import make_model
+from motion_models.robot import Mount, WheelNoise
+from tests import rooms
+
+S = 1_000_000_000
+NO_SLIP = WheelNoise(*[0.0] * 8)
+LAB, HALL = world.lab().walls, world.hall().walls
+CORRIDOR = np.concatenate([world.line(-60, -1.2, 60, -1.2), world.line(-60, 1.2, 60, 1.2)])
+TOUR = rooms.path((1, 0, 0), (5, 0.4, 0.5), (5, 0.4, -0.5), (2, 0, 0.5), (1, 0, 0))
+NEW_SCENE = pytest.mark.xfail(
+    strict=True, reason="turning towards places that are not mapped, up to five scans in a row are lost: overlap .3, although the rest fits"
+)
+SPOILT = range(60, 85)  # two seconds
+
+
+def ekf(drive: rooms.Drive, **lidar) -> Run:
+    return rooms.results(drive, "ekf", config=ReplayConfig(estimator=EstimatorConfig(lidar=LidarConfig(**lidar))))["ekf"]
+
+
+def make_core(drive: rooms.Drive, mounts: dict[str, Mount] | None = None) -> Core:
+    pair = Pair(make_model("diff_drive", rooms.ROBOT), "ekf")
+    return Core(pair, rooms.ROBOT, drive.mounts if mounts is None else mounts, True, ReplayConfig())
+
+
+def scans_of(drive: rooms.Drive) -> list[Scan]:
+    return [event for event in drive.events if isinstance(event, Scan)]
+
+
+def run(drive: rooms.Drive, spoil: Callable[[int, Scan], Scan | None]) -> tuple[list[Estimate], Core]:
+    """The estimates of ``drive`` whose scan k is ``spoil`` (k, scan), None for one that never comes."""
+    core, found, k = make_core(drive), [], 0
+    for event in drive.events:
+        if isinstance(event, Scan):
+            event, k = spoil(k, event), k + 1
+        if event is not None:
+            found += core.push(event)
+    return found + core.finish(), core
+
+
+def worst(drive: rooms.Drive, estimates: list[Estimate], first: int, last: int) -> float:
+    """Largest error of the position at scans ``first`` to ``last`` [m]."""
+    at = {e.stamp_ns: e.pose for e in estimates}
+    pairs = zip(drive.stamps[first:last], drive.poses[first:last], strict=True)
+    return max(float(np.hypot(*(at[int(s)] - p)[:2])) for s, p in pairs if int(s) in at)
+
+
+def second_error(drive: rooms.Drive, poses: np.ndarray) -> tuple[float, float]:
+    """RMS errors of the motion in a second [m, rad]."""
+    error = rooms.second_errors(drive, poses)
+    return float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean())), float(np.sqrt((error[:, 2] ** 2).mean()))
+
+
+@pytest.fixture(scope="module")
+def driven() -> rooms.Drive:
+    return rooms.drive_through(LAB, TOUR[:6000], 3)
+
+
+# --- accuracy and consistency
+
+
+@pytest.mark.parametrize("walls", [pytest.param(LAB, marks=NEW_SCENE), HALL])
+def test_errors_in_rooms_are_millimetres(walls: np.ndarray) -> None:
+    """Also where wheels slip by a fifth of their turning, changing twice a second. Root mean square of three drives."""
+    for noise, most_rad in ((NO_SLIP, math.radians(0.03)), (WheelNoise(), math.radians(0.05))):
+        drives = [rooms.drive_through(walls, TOUR, seed, noise=noise) for seed in (1, 2, 3)]
+        errors = [second_error(drive, rooms.at_scans(drive, ekf(drive))[0]) for drive in drives]
+        metres, radians = np.sqrt((np.array(errors) ** 2).mean(axis=0))
+        assert metres < 0.0025
+        assert radians < most_rad
+
+
+@pytest.mark.parametrize("walls", [LAB, HALL])
+def test_nees_of_poses_in_rooms_is_that_of_their_covariances(walls: np.ndarray) -> None:
+    """Eight drives of 10 s but for the first two seconds; errors of one drive are correlated, so the band is that of eight drives."""
+    few, means = rooms.Beams(beams=240, rate_hz=6.25), []
+    for seed in range(8):
+        drive = rooms.drive_through(walls, rooms.path((1, 0, 0), (5, 0.4, 0.4), (4, 0.4, -0.5)), seed, scanner=few)
+        poses, covs = rooms.at_scans(drive, ekf(drive))
+        assert covs is not None
+        settled = drive.stamps >= drive.stamps[0] + 2 * S
+        means.append(nees(se2.log(se2.between(drive.poses, poses))[settled], covs[settled]).mean())
+    assert 1.0 < np.mean(means) < 6.0
+
+
+@pytest.mark.parametrize("offset_s", [0.06, -0.06])
+@pytest.mark.parametrize("wheel_every", [1, 4])
+def test_clock_offset_is_learned(offset_s: float, wheel_every: int) -> None:
+    """What happened at t bears t + offset in the wheels' stamps; with 50 samples a second, and with one per scan."""
+    scanner = rooms.Beams(beams=240)
+    drive = rooms.drive_through(LAB, rooms.path(*[(1.5, 0.4, 0.5), (1.5, 0.1, -0.6)] * 7), 0, scanner=scanner)
+    kept = [e for i, e in enumerate([e for e in drive.events if isinstance(e, WheelSample)]) if i % wheel_every == 0]
+    shifted = [replace(e, stamp_ns=e.stamp_ns + round(offset_s * S)) for e in kept]
+    events = sorted([*scans_of(drive), *shifted], key=lambda e: e.stamp_ns)
+    mean, sigma = ekf(replace(drive, events=events)).parameters["wheel_clock_offset_s"]
+    assert sigma < 0.015
+    assert abs(mean - offset_s) < max(4.0 * sigma, 0.01)
+
+
+def test_deskewing_by_the_filters_twist_follows_slip() -> None:
+    drive = rooms.drive_through(LAB, TOUR, 0)
+    scans = [replace(scan, stamp_ns=scan.middle_ns, offsets=np.empty(0)) for scan in scans_of(drive)]
+    wheels = [e for e in drive.events if not isinstance(e, Scan)]
+    at_once = replace(drive, events=sorted([*scans, *wheels], key=lambda e: e.stamp_ns))
+    with_times, without = (second_error(drive, rooms.at_scans(drive, ekf(d))[0]) for d in (drive, at_once))
+    assert with_times[1] < 0.3 * without[1]
+    assert with_times[0] < 0.5 * without[0]
+
+
+# --- scenes that leave directions open
+
+
+@pytest.mark.xfail(strict=True, reason="noise of the surfaces' normals counts as information along the walls: 3.5 % short, 21 sigma")
+def test_bare_corridor_is_as_long_as_the_wheels_measure() -> None:
+    noise = WheelNoise(lateral_m2_per_m=1e-6, yaw_rad2_per_m=1e-5)
+    drive = rooms.drive_through(CORRIDOR, rooms.path((1, 0, 0), (30, 0.5, 0.0), (1, 0, 0)), 0, (0.0, 0.1, 0.02), noise=noise)
+    runs = rooms.results(drive, "lidar", "ekf")
+    found = {name: np.hypot(*rooms.at_scans(drive, r)[0][-1, :2]) for name, r in runs.items()}
+    length = np.hypot(*drive.poses[-1, :2])
+    assert found["ekf"] == pytest.approx(length, rel=0.02)
+    assert found["lidar"] < 0.9 * length  # or the corridor were no test
+    poses, covs = rooms.at_scans(drive, runs["ekf"])
+    assert covs is not None
+    error = se2.log(se2.between(drive.poses[-1], poses[-1]))
+    assert np.abs(error / np.sqrt(np.diag(covs[-1]))).max() < 4.0
+
+
+# --- wheels that contradict
+
+
+def test_wheels_that_spin_on_the_spot_do_no_harm() -> None:
+    def spinning(t: np.ndarray, twists: np.ndarray) -> np.ndarray:
+        return twists + np.where((t > 6) & (t < 10), 0.5, 0.0)[:, None] * [1.0, 0.0, 0.0]
+
+    way = rooms.path((1, 0, 0), (4, 0.4, 0.3), (6, 0, 0), (6, 0.3, 0.4), (1, 0, 0))
+    drive = rooms.drive_through(HALL, way, 0, wheels=spinning)
+    off = {name: rooms.ate(drive, rooms.at_scans(drive, r)[0]) for name, r in rooms.results(drive, "odometry", "lidar", "ekf").items()}
+    assert off["odometry"] > 0.5
+    assert off["ekf"] < 1.1 * off["lidar"]
+    assert off["ekf"] < 0.02
+
+
+def test_encoders_that_read_zero_while_the_robot_moves_are_overruled() -> None:
+    def stuck(t: np.ndarray, twists: np.ndarray) -> np.ndarray:
+        return twists * np.where((t > 5) & (t < 9), 0.0, 1.0)[:, None]
+
+    drive = rooms.drive_through(LAB, rooms.path((1, 0, 0), (12, 0.4, 0.4), (1, 0, 0)), 0, wheels=stuck)
+    result = rooms.results(drive, "odometry", "ekf")
+    poses, _ = rooms.at_scans(drive, result["ekf"])
+    assert rooms.ate(drive, rooms.at_scans(drive, result["odometry"])[0]) > 0.5
+    assert rooms.ate(drive, poses) < 0.02
+    assert np.hypot(*(poses - drive.poses)[:, :2].T).max() < 0.1
+
+
+def test_gap_of_8_s_stays_inside_five_sigma() -> None:
+    """Neither wheels nor scans while the robot drives on: the covariance says so, and the submap is found again."""
+    drive = rooms.drive_through(HALL, rooms.path((1, 0, 0), (6, 0.4, 0.2), (8, 0.4, -0.2), (6, 0.3, 0.3), (1, 0, 0)), 0)
+    begin, end = rooms.WALL_START_NS + 6 * S, rooms.WALL_START_NS + 14 * S
+    gap = replace(drive, events=[e for e in drive.events if not begin < e.stamp_ns < end])
+    kept = ~((drive.stamps > begin) & (drive.stamps < end + S // 10))
+    result = rooms.results(gap, "ekf")["ekf"]
+    index = np.searchsorted(result.trajectory.stamps_ns, drive.stamps[kept])
+    assert result.trajectory.covariances is not None
+    poses, covs = result.trajectory.poses[index], result.trajectory.covariances[index]
+    errors = se2.log(se2.between(drive.poses[kept], poses))
+    assert (np.abs(errors) < 5.0 * np.sqrt(covs.diagonal(axis1=1, axis2=2)) + 1e-3).all()
+    assert np.hypot(*(poses[-1] - drive.poses[-1])[:2]) < 0.05
+
+
+# --- spoilt scans
+
+
+def test_frozen_scanner_is_found_out(driven: rooms.Drive) -> None:
+    frozen = scans_of(driven)[SPOILT.start]
+    estimates, core = run(driven, lambda k, s: replace(s, points=frozen.points, offsets=frozen.offsets) if k in SPOILT else s)
+    assert core.estimator.counts()["stale"] == len(SPOILT) - 1
+    assert worst(driven, estimates, SPOILT.start, SPOILT.stop) < 0.1  # by wheels
+    assert worst(driven, estimates, SPOILT.stop + 5, len(driven.poses)) < 0.02  # the old submap is found again
+    (note,) = core.notes()
+    assert note.startswith(f"{len(SPOILT) - 1} scans told the very same ranges as the one before although the robot drove")
+
+
+def test_scanner_that_froze_on_the_way_stays_stale_at_rest() -> None:
+    drive = rooms.drive_through(LAB, rooms.path((1.5, 0.4, 0.2), (2.5, 0.0, 0.0), (1.5, 0.4, 0.2), (1.0, 0.0, 0.0)), 1)
+    frozen = scans_of(drive)[8]
+    estimates, core = run(drive, lambda k, s: replace(s, points=frozen.points, offsets=frozen.offsets) if k > 8 else s)
+    counts = core.estimator.counts()
+    assert counts["stale"] == len(drive.stamps) - 9
+    assert counts["standing"] > 30
+    assert worst(drive, estimates, 0, len(drive.poses)) < 0.1  # by wheels
+
+
+def test_equal_scans_of_a_robot_at_rest_are_matched() -> None:
+    """As in a simulator without noise."""
+    drive = rooms.drive_through(LAB, rooms.path((1.0, 0.0, 0.0)), 1, scanner=rooms.Beams(noise=0.0))
+    assert all(np.array_equal(scan.points, scans_of(drive)[0].points) for scan in scans_of(drive))
+    _, core = run(drive, lambda k, s: s)
+    counts = core.estimator.counts()
+    assert counts.get("stale", 0) == 0
+    assert counts["matched"] == counts["scans"] - 1 == len(drive.stamps) - 1  # the first begins the submap
+
+
+def test_scans_that_jump_are_not_followed(driven: rooms.Drive) -> None:
+    off = np.array([0.9, 0.4, 0.3])
+
+    def jump(k: int, scan: Scan) -> Scan:
+        if k not in (60, 61, 90):
+            return scan
+        return replace(scan, points=np.column_stack([se2.transform(off, scan.points[:, :2]), scan.points[:, 2]]))
+
+    estimates, _ = run(driven, jump)
+    after = [k for k in range(len(driven.poses)) if k not in (60, 61, 90)]
+    at = {e.stamp_ns: e.pose for e in estimates}
+    assert max(np.hypot(*(at[int(driven.stamps[k])] - driven.poses[k])[:2]) for k in after if k > 64) < 0.03
+
+
+def test_robot_that_was_carried_is_found_again(driven: rooms.Drive) -> None:
+    """Half a second is cut out of a log: .2 m from one scan to the next, that no wheel measured."""
+    at, gap = int(driven.stamps[60]) + 1, 480_000_000
+    before: list[Event] = [e for e in driven.events if e.stamp_ns < at]
+    after: list[Event] = [e for e in driven.events if e.stamp_ns > at + gap]
+    lost = [next(e for e in events if isinstance(e, WheelSample)).position for events in (after, before[::-1])]
+    after = [replace(e, stamp_ns=e.stamp_ns - gap) for e in after]
+    after = [replace(e, position=e.position - lost[0] + lost[1]) if isinstance(e, WheelSample) else e for e in after]
+    core = make_core(driven)
+    found = [estimate for event in before + after for estimate in core.push(event)] + core.finish()
+    stamps = set(driven.stamps[70:].tolist())
+    poses = np.array([e.pose for e in found if e.stamp_ns + gap in stamps])
+    np.testing.assert_allclose(poses[-20:, :2], driven.poses[-20:, :2], atol=0.02)
+
+
+@NEW_SCENE
+def test_without_scans_the_wheels_carry_on(driven: rooms.Drive) -> None:
+    nothing = np.empty((0, 3))
+    for spoil in (
+        lambda k, s: None if k in SPOILT else s,
+        lambda k, s: replace(s, points=nothing, offsets=nothing[:, 0]) if k in SPOILT else s,
+    ):
+        estimates, core = run(driven, spoil)
+        assert worst(driven, estimates, SPOILT.stop + 5, len(driven.poses)) < 0.02
+        assert core.estimator.counts()["matched"] >= len(driven.stamps) - len(SPOILT) - 2
+
+
+def test_scans_with_nothing_to_match_are_counted_as_sparse(driven: rooms.Drive) -> None:
+    """Clouds of the floor alone, and a few points: neither is a scan without a point."""
+    clouds = [rooms.cloud(LAB, np.zeros(3), k) for k in range(10)]
+    floors = [
+        replace(scan, points=c[c[:, 2] < 0.1], offsets=np.empty(0), is_planar=False)
+        for scan, c in zip(scans_of(driven)[:10], clouds, strict=True)
+    ]
+    for spoilt in (floors, [replace(scan, points=scan.points[:9], offsets=scan.offsets[:9]) for scan in scans_of(driven)[:10]]):
+        core = make_core(driven)
+        for event in sorted([*spoilt, *(e for e in driven.events[:50] if not isinstance(e, Scan))], key=lambda e: e.stamp_ns):
+            core.push(event)
+        core.finish()
+        assert core.estimator.counts()["scans"] == 10
+        assert core.estimator.counts()["matched"] == 0
+        assert core.notes() == ["10 scans had too few points on walls to be matched: the wheels carried on alone."]
+
+
+@NEW_SCENE
+def test_scans_of_changing_size_are_all_matched(driven: rooms.Drive) -> None:
+    rng = np.random.default_rng(0)
+
+    def thin(k: int, scan: Scan) -> Scan:
+        kept = np.sort(rng.choice(len(scan.points), rng.integers(100, len(scan.points)), replace=False))
+        return replace(scan, points=scan.points[kept], offsets=scan.offsets[kept])
+
+    estimates, core = run(driven, thin)
+    assert core.estimator.counts()["matched"] == len(driven.stamps) - 1
+    assert worst(driven, estimates, 0, len(driven.poses)) < 0.02
+
+
+# --- other sensors
+
+
+@NEW_SCENE
+def test_two_lidars_are_fused() -> None:
+    """Back to back, half a period apart: each in its own frame, one submap."""
+    front = rooms.drive_through(LAB, TOUR[:4000], 3)
+    back = rooms.drive_through(LAB, TOUR[:4000], 3, scanner=rooms.Beams(mount=Mount(x=-0.4, yaw=math.pi)))
+    behind = [replace(scan, frame_id="back", stamp_ns=scan.stamp_ns) for scan in scans_of(back)]
+    core = make_core(front, {**front.mounts, "back": back.mount})
+    events = sorted([*front.events, *behind], key=lambda e: e.stamp_ns)
+    estimates = [estimate for event in events for estimate in core.push(event)] + core.finish()
+    assert core.estimator.counts()["matched"] > 0.95 * (len(front.stamps) + len(back.stamps))
+    assert worst(front, estimates, 0, len(front.poses)) < 0.02
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.03])
+def test_clouds_give_poses_whose_errors_are_their_sigmas(tilt: float) -> None:
+    """The floor is most of a cloud and holds nothing; a robot that pitches by 2 degrees is still where it is."""
+    core, mounts = None, {"laser": Mount(z=0.8)}
+    drive = rooms.drive_through(LAB, rooms.path((1.0, 0.0, 0.0), (4.0, 0.3, 0.2)), 0, noise=NO_SLIP)
+    core = make_core(drive, mounts)
+    clouds = []
+    for k in range(0, len(drive.stamps), 4):
+        points = rooms.cloud(LAB, drive.poses[k], k, tilt * math.sin(k)) - [0.0, 0.0, 0.8]
+        clouds.append(Scan(int(drive.stamps[k]), points, frame_id="laser", is_planar=False))
+    events = sorted([*clouds, *(e for e in drive.events if isinstance(e, WheelSample))], key=lambda e: e.stamp_ns)
+    estimates = [estimate for event in events for estimate in core.push(event)] + core.finish()
+    assert core.estimator.counts()["matched"] >= len(clouds) - 1
+    at = {int(s): p for s, p in zip(drive.stamps, drive.poses, strict=True)}
+    errors = np.array([se2.log(se2.between(at[e.stamp_ns], e.pose)) for e in estimates if e.stamp_ns in at])
+    assert np.hypot(*errors[:, :2].T).max() < (0.02 if tilt == 0.0 else 0.05)
+    assert np.abs(errors[:, 2]).max() < 0.01
+
+
+def test_matcher_kiss_is_centimetres_off() -> None:
+    drive = rooms.drive_through(HALL, TOUR, 1)
+    result = ekf(drive, matcher="kiss")
+    assert result.counts["matched"] > 0.95 * result.counts["scans"]
+    assert rooms.ate(drive, rooms.at_scans(drive, result)[0]) < 0.05
+
+
+def test_gyro_replaces_wheels_that_do_not_turn_as_they_should() -> None:
+    """Wheels that overstate turns by 60 %, and no LiDAR's help for half of the drive: bias and turns come from the gyro."""
+    drive = rooms.drive_through(LAB, TOUR, 0, wheels=lambda t, twists: twists * [1.0, 1.0, 1.6])
+    yaw = np.unwrap(drive.track[:, 2])
+    stamps = rooms.WALL_START_NS + np.arange(0, len(yaw) - 5, 5) * 2_000_000
+    rates = np.diff(yaw[::5])[: len(stamps)] / 0.01 + 5e-4
+    imu = [ImuSample(int(s), np.array([0.0, 0.0, w]), np.array([0.0, 0.0, 9.81])) for s, w in zip(stamps, rates, strict=False)]
+    half = [e for e in drive.events if not isinstance(e, Scan) or e.stamp_ns < rooms.WALL_START_NS + 7 * S]
+    core = make_core(drive)
+    for event in sorted([*half, *imu], key=lambda e: e.stamp_ns):
+        core.push(event)
+    last = core.finish()[-1]
+    k = round((last.stamp_ns - rooms.WALL_START_NS) / 2_000_000)
+    assert abs(float(se2.wrap_angle(last.pose[2:] - drive.track[min(k, len(drive.track) - 1), 2:])[0])) < 0.02
+    mean, sigma = core.estimator.parameters()["gyro_bias_rad_per_s"]
+    assert abs(mean - 5e-4) < 4.0 * sigma
+
+
+def test_drive_that_begins_in_motion_is_followed() -> None:
+    """The log starts while the robot turns: the first sweep is deskewed by the wheels' twist."""
+    drive = rooms.drive_through(LAB, rooms.path((6.0, 0.5, 0.6)), 0)
+    poses, _ = rooms.at_scans(drive, ekf(drive))
+    assert second_error(drive, poses)[1] < math.radians(0.05)
+    assert rooms.ate(drive, poses) < 0.02
+
+
+def test_mount_that_is_late_begins_a_new_submap(driven: rooms.Drive) -> None:
+    """/tf_static comes after 2 s: scans before it were drawn at the body's origin, and must not be matched to those after."""
+    core, poses = make_core(driven, {}), {}
+    for event in driven.events:
+        if event.stamp_ns > rooms.WALL_START_NS + 2 * S:
+            core.meet(driven.mounts)
+        poses.update({e.stamp_ns: e.pose for e in core.push(event)})
+    stamps = [int(s) for s in driven.stamps if s > rooms.WALL_START_NS + 3 * S and int(s) in poses]
+    at = {int(s): p for s, p in zip(driven.stamps, driven.poses, strict=True)}
+    found, true = np.array([poses[s] for s in stamps]), np.array([at[s] for s in stamps])
+    moved = se2.log(se2.between(se2.between(true[0], true), se2.between(found[0], found)))
+    assert np.hypot(*moved[:, :2].T).max() < 0.02
+
+
+def test_input_that_is_not_finite_is_refused(driven: rooms.Drive) -> None:
+    core = make_core(driven)
+    for event in driven.events[:100]:
+        core.push(event)
+    leaps = [replace(e, position=e.position + 1e200 * k) for k, e in enumerate(driven.events[100:160]) if isinstance(e, WheelSample)]
+    with pytest.raises(EstimatorError, match="not finite, or too large"):
+        list(map(core.push, [*leaps, *scans_of(driven)[20:40]]))

@@ -1,0 +1,121 @@
+"""Correlative search, against scoring every pose of its window."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from localization.lidar.correlative_search import COARSE, SearchResult, _score, draw_image, search
+from localization.lidar.submap import voxel_means
+from localization.simulate import world
+from motion_models import se2
+from tests import rooms
+
+CELL = 0.1
+LAB, HALL = world.lab().walls, world.hall().walls
+ANYWHERE = np.array([15.0, 15.0, math.pi])
+
+
+def image_of(walls: np.ndarray, seed: int = 0):
+    """The image of five scans around the origin."""
+    rng = np.random.default_rng(seed)
+    poses = [np.array([x, y, 0.3 * x]) for x, y in ((0.0, 0.0), (0.5, 0.1), (-0.5, 0.2), (0.1, 0.5), (0.2, -0.5))]
+    return draw_image(np.vstack([se2.transform(pose, rooms.scan_from(walls, pose, rng)) for pose in poses]), CELL)
+
+
+def brute_scores(image, points: np.ndarray, pose: np.ndarray) -> float:
+    """Mean of the finest image at ``points`` seen from ``pose``."""
+    at = np.floor((se2.transform(pose, points) - image.origin) / image.cell).astype(int)
+    is_inside = (at >= 0).all(axis=1) & (at < image.levels[0].shape).all(axis=1)
+    return float(image.levels[0][tuple(at[is_inside].T)].sum() / len(points))
+
+
+def test_image_is_one_at_points_and_falls_off_over_a_cell() -> None:
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, (40, 2))
+    image = draw_image(points, CELL)
+    centres = image.origin + CELL * (np.indices(image.levels[0].shape).reshape(2, -1).T + 0.5)
+    d = (centres[:, None] - points) / CELL
+    expected = np.exp(-0.5 * (d**2).sum(axis=-1))
+    expected[(np.abs(d) > 2.5).any(axis=-1)] = 0.0  # five by five cells
+    found = image.levels[0].ravel()
+    is_sure = (np.abs(np.abs(d) - 2.0) > 0.5).all(axis=(1, 2))  # the square is around the point's cell, not around the point
+    np.testing.assert_allclose(found[is_sure], expected.max(axis=1)[is_sure], atol=1e-6)
+    assert is_sure.sum() > 100
+    assert found.max() <= 1.0
+
+
+def test_coarse_scores_are_never_below_the_fine_ones_within() -> None:
+    image, rng = image_of(LAB), np.random.default_rng(1)
+    points = se2.transform(np.array([0.3, -0.2, 0.4]), voxel_means(rooms.scan_from(LAB, np.zeros(3), rng), CELL)) - image.origin
+    turned, rows = points[None], np.zeros(300, int)
+    offsets = rng.uniform(-1.5, 1.5, (300, 2))
+    for level in (1, 2):
+        step = CELL * COARSE**level
+        within = offsets + rng.integers(-(COARSE**level) // 2, COARSE**level // 2 + 1, (300, 2)) * CELL
+        coarse = _score(image.levels[level], turned, rows, offsets, step)
+        fine = _score(image.levels[0], turned, rows, within, CELL)
+        assert (coarse >= fine - 1e-6).all()
+        assert (coarse < 1.0).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_search_finds_the_best_of_all_poses(seed: int) -> None:
+    """Every cell and yaw of the window, scored one by one, with the prior."""
+    rng, image = np.random.default_rng(seed), image_of(HALL)
+    points = voxel_means(rooms.scan_from(HALL, np.array([0.1, -0.1, 0.2]), rng), CELL)
+    prior = np.array([0.1, -0.1, 0.2]) + rng.uniform(-0.25, 0.25, 3) * [1.0, 1.0, 0.4]
+    sigmas = np.array([0.2, 0.2, 0.06])
+    found = search(image, points, prior, np.diag(sigmas**2), ANYWHERE)
+    reach = float(np.quantile(np.hypot(*points.T), 0.8))
+    yaw_step = CELL / reach
+    n, m = math.ceil(3.0 * sigmas[0] / CELL), math.ceil(3.0 * sigmas[2] / yaw_step)
+    shifts = np.array([(i * CELL, j * CELL, k * yaw_step) for i in range(-n, n + 1) for j in range(-n, n + 1) for k in range(-m, m + 1)])
+    scores = np.array([brute_scores(image, points, prior + shift) for shift in shifts])
+    total = len(points) / 6.0 * np.log(np.maximum(scores, 1e-6)) - 0.5 * ((shifts / sigmas) ** 2).sum(axis=1)
+    np.testing.assert_allclose(found.pose, prior + shifts[total.argmax()], atol=1e-9)
+    assert found.score == pytest.approx(scores[total.argmax()], abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_search_of_a_wide_window_finds_the_robot(seed: int) -> None:
+    """Sigmas of 1.5 m and .5 rad: 4.5 m and 1.5 rad to either side."""
+    rng = np.random.default_rng(seed)
+    true = np.array([0.2, 0.1, -0.1])
+    off = np.array([rng.uniform(-3.0, 3.0), rng.uniform(-3.0, 3.0), rng.uniform(-1.0, 1.0)])
+    points = voxel_means(rooms.scan_from(HALL, true, rng), CELL)
+    found = search(image_of(HALL), points, true + off, np.diag([1.5, 1.5, 0.5]) ** 2, ANYWHERE)
+    error = se2.between(true, found.pose)
+    assert np.hypot(*error[:2]) < 1.5 * CELL
+    assert abs(error[2]) < 0.05
+    assert found.rival_score < 0.9 * found.score
+
+
+def test_search_stays_inside_its_limit() -> None:
+    true = np.array([0.2, 0.1, -0.1])
+    points = voxel_means(rooms.scan_from(HALL, true, np.random.default_rng(0)), CELL)
+    limit, prior, step = np.array([0.4, 0.4, 0.1]), np.array([2.2, 0.1, -0.1]), np.array([4 * CELL, 4 * CELL, 0.05])
+    found = search(image_of(HALL), points, prior, np.eye(3), limit)
+    assert (np.abs(found.pose - prior) <= limit + step).all()
+
+
+def square(seed: int, spread: float) -> SearchResult:
+    """The search in a square room, whose four corners are alike."""
+    rng, walls = np.random.default_rng(seed), world.box(-3.0, -3.0, 3.0, 3.0)
+    image = draw_image(rooms.scan_from(walls, np.zeros(3), rng), CELL)
+    return search(
+        image, voxel_means(rooms.scan_from(walls, np.zeros(3), rng), CELL), np.zeros(3), np.diag([0.1, 0.1, spread]) ** 2, ANYWHERE
+    )
+
+
+def test_rival_of_a_square_room_is_as_good_as_the_best() -> None:
+    result = square(0, 0.8)
+    assert result.rival_score > 0.9 * result.score
+    result = square(0, 0.05)
+    assert result.rival_score < 0.9 * result.score
+
+
+def test_scan_of_another_place_scores_low() -> None:
+    points = voxel_means(rooms.scan_from(LAB, np.array([0.5, 0.3, 0.7]), np.random.default_rng(0)), CELL)
+    assert search(image_of(HALL), points, np.zeros(3), np.diag([0.5, 0.5, 0.3]) ** 2, ANYWHERE).score < 0.5

@@ -1,0 +1,71 @@
+"""Scans that cannot be used, and for how long."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from localization.events import Scan
+from localization.lidar import LostScans
+from localization.lidar.scan_checks import StaleScans
+
+S = 1_000_000_000
+
+
+def scan(seed: int, n: int = 5) -> Scan:
+    return Scan(0, np.random.default_rng(seed).normal(size=(n, 3)))
+
+
+def test_same_ranges_of_a_driving_robot_are_stale() -> None:
+    checks = StaleScans()
+    found = [checks.is_stale(scan(seed), False) for seed in (0, 1, 1, 1, 2, 1)]
+    assert found == [False, False, True, True, False, False]
+
+
+def test_same_ranges_of_a_standing_robot_are_not() -> None:
+    """As in a simulator without noise."""
+    checks = StaleScans()
+    assert not any(checks.is_stale(scan(0), True) for _ in range(5))
+
+
+def test_scanner_that_froze_on_the_way_stays_stale_when_the_robot_stands() -> None:
+    checks = StaleScans()
+    found = [
+        checks.is_stale(scan(seed), standing) for seed, standing in ((0, False), (0, False), (0, True), (0, True), (1, True), (1, True))
+    ]
+    assert found == [False, True, True, True, False, False]
+
+
+def test_empty_scans_are_not_stale() -> None:
+    checks = StaleScans()
+    assert not any(checks.is_stale(scan(0, 0), False) for _ in range(3))
+
+
+def test_time_without_a_match_runs_from_match_to_match() -> None:
+    lost = LostScans()
+    matched = [True, True, False, False, True, True, False, True, True, False, False, False]
+    for t, is_matched in enumerate(matched):
+        if is_matched:
+            lost.add_matched(10 * S + t * S)
+        else:
+            lost.add(10 * S + t * S, "lost" if t < 6 else "sparse")
+    assert lost.scans == len(matched)
+    assert lost.causes == {"lost": 2, "sparse": 4}
+    assert lost.share == pytest.approx((3 + 2 + 3) / 11)
+    assert lost.longest == (3.0, 8.0)  # of two that are as long, the later
+
+
+def test_lidar_that_never_matches_is_lost_all_the_time() -> None:
+    lost = LostScans()
+    for t in range(5):
+        lost.add(t * S, "lost")
+    assert lost.share == 1.0
+    assert lost.longest == (4.0, 0.0)
+
+
+def test_no_scan_or_one_is_no_time() -> None:
+    lost = LostScans()
+    assert (lost.share, lost.longest) == (0.0, (0.0, 0.0))
+    lost.add(7 * S, "sparse")
+    assert (lost.share, lost.longest) == (0.0, (0.0, 0.0))
+    assert lost.causes == {"sparse": 1}
