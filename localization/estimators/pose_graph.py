@@ -30,7 +30,9 @@ _HUBER = 1.345
 _LEVER_SIGMA_M = 0.5
 """Where the antenna may be, away from the given lever arm [m]."""
 _ALIGNMENT_SIGMA = np.array([1e3, 1e3, 1e3])
-_MAX_ITERATIONS, _CONVERGED = 50, 1e-8
+_MAX_ITERATIONS = 50
+_CONVERGED = 1e-6
+"""Relative change of the cost at which the optimization ends: a tenth of GTSAM's own default."""
 
 
 @dataclass(frozen=True)
@@ -249,9 +251,8 @@ def _levenberg_marquardt(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
     cost, damping = graph.error(values), 0.0
     for _ in range(_MAX_ITERATIONS):
         linear = graph.linearize(values)
-        for key, block in linear.hessianBlockDiagonal().items() if damping else ():
-            n = len(block)
-            linear.add(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(n), np.zeros(n), gtsam.noiseModel.Unit.Create(n)))
+        for key, n in values.dims().items() if damping else ():
+            linear.push_back(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(n), np.zeros(n), gtsam.noiseModel.Unit.Create(n)))
         moved = values.retract(linear.optimize())
         new_cost = graph.error(moved)
         if new_cost > cost * (1.0 + 1e-12) + 1e-12:
