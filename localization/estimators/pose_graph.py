@@ -128,7 +128,8 @@ class PoseGraph:
 
     def poses(self) -> FloatArray:
         """(count, 3)"""
-        return np.array([self.pose(k) for k in range(self.count)]).reshape(-1, 3)
+        values = gtsam.utilities.extractPose2(self._values)  # in order of keys: before x, there may be t
+        return np.asarray(values[len(values) - self.count :])
 
     def marginal(self, k: int) -> FloatArray:
         """(3, 3) covariance of keyframe ``k``."""
@@ -165,7 +166,7 @@ class PoseGraph:
         if update.wheels is not None:
             factors.add(_wheel_factor(k - 1, k, gtsam.symbol("c", self._walks), update.wheels))
         for between in update.betweens:
-            noise = gtsam.noiseModel.Gaussian.Information(between.information)
+            noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Information(between.information)
             if between.is_loop:
                 noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY), noise)
             a, b = (gtsam.symbol("x", i) for i in (between.a, between.b))
@@ -225,8 +226,7 @@ def _position_factor(position: Position) -> gtsam.CustomFactor:
     key = gtsam.symbol("x", position.k)
 
     def error(this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None) -> FloatArray:
-        enu_T_map, map_T_key, lever = values.atPose2(_ALIGNMENT), values.atPose2(key), np.asarray(values.atPoint2(_LEVER))
-        enu_T_map, map_T_key = _array(enu_T_map), _array(map_T_key)
+        enu_T_map, map_T_key, lever = _array(values.atPose2(_ALIGNMENT)), _array(values.atPose2(key)), np.asarray(values.atPoint2(_LEVER))
         in_key = se2.transform(position.offset, lever)
         _, by_offset, by_lever = position_residual(position.offset, lever, in_key)
         on_map, by_key, by_point = position_residual(map_T_key, in_key, np.zeros(2))

@@ -74,7 +74,7 @@ class Teller:
         self._with_tf = is_on
 
     def estimate(self, estimate: Estimate, stamp_ns: int) -> None:
-        """nav_msgs/Odometry with the true vy, and the transforms `odom` -> `base_link` and, of a graph, `map` -> `odom`, at ``stamp_ns``."""
+        """nav_msgs/Odometry with true vy, and the transforms `odom` -> `base_link` and, of a graph, `map` -> `odom`, at ``stamp_ns``."""
         pose, covariance = estimate.odometry or (estimate.pose, estimate.covariance)
         fused = FusedEstimate(stamp_ns, pose, estimate.twist, covariance, estimate.twist_covariance)
         self._transport.publish(self._topics[ODOMETRY], self._fused.odometry(fused))
