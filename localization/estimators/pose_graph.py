@@ -144,7 +144,7 @@ class PoseGraph:
 
     def smooth(self) -> tuple[FloatArray, FloatArray]:
         """Poses (count, 3) by all measurements, by Levenberg-Marquardt, and their covariances (count, 3, 3)."""
-        graph, values = gtsam.NonlinearFactorGraph(), self._values
+        graph, values = gtsam.NonlinearFactorGraph(), self._isam.calculateEstimate()
         count, self.count, self._walks = self.count, 0, 0
         for update in self.updates:
             graph.push_back(self._factors(update)[0])
