@@ -30,6 +30,11 @@ _HUBER = 1.345
 _LEVER_SIGMA_M = 0.5
 """Where the antenna may be, away from the given lever arm [m]."""
 _ALIGNMENT_SIGMA = np.array([1e3, 1e3, 1e3])
+_RELINEARIZE = 0.002
+"""Change of a variable from which its factors are linearized anew [m, rad]. With GTSAM's 0.1 a loop that closes 0.15 m keeps the weight
+that its robust loss had before: sigma of the last pose of 41 was 0.14 m, where 0.072 m is right."""
+_MAX_UPDATES = 10
+"""Updates of ISAM2 after a loop, at most."""
 _MAX_ITERATIONS = 50
 _CONVERGED = 1e-6
 """Relative change of the cost at which the optimization ends: a tenth of GTSAM's own default."""
@@ -100,6 +105,7 @@ class PoseGraph:
     def __post_init__(self) -> None:
         params = gtsam.ISAM2Params()
         params.relinearizeSkip = 1
+        params.setRelinearizeThreshold(_RELINEARIZE)
         params.setFactorization("QR")  # CHOLESKY ended in IndeterminateLinearSystem after thousands of ordinary steps
         self._isam, self.count, self._walks = gtsam.ISAM2(params), 0, 0
         updates, self.updates = self.updates, []
@@ -118,9 +124,14 @@ class PoseGraph:
         factors, values = self._factors(update)
         self._isam.update(factors, values)
         if any(between.is_loop for between in update.betweens) or update.alignment is not None:
-            for _ in range(2):
-                self._isam.update()
+            self._iterate()
         self._values = self._isam.calculateEstimate()
+
+    def _iterate(self) -> None:
+        """Until nothing changes: a robust loss gives what was just closed its weight only step by step."""
+        for _ in range(_MAX_UPDATES):
+            if not self._isam.update().getVariablesRelinearized():
+                break
 
     def pose(self, k: int) -> FloatArray:
         """(3,) ``map_T_body`` of keyframe ``k``."""
@@ -228,7 +239,7 @@ def _position_factor(position: Position) -> gtsam.CustomFactor:
     def error(this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None) -> FloatArray:
         enu_T_map, map_T_key, lever = _array(values.atPose2(_ALIGNMENT)), _array(values.atPose2(key)), np.asarray(values.atPoint2(_LEVER))
         in_key = se2.transform(position.offset, lever)
-        _, by_offset, by_lever = position_residual(position.offset, lever, in_key)
+        _, _, by_lever = position_residual(position.offset, lever, in_key)
         on_map, by_key, by_point = position_residual(map_T_key, in_key, np.zeros(2))
         residual, by_alignment, by_map = position_residual(enu_T_map, on_map, position.position)
         if H is not None:

@@ -135,8 +135,8 @@ class Spool:
 
 
 def fused_estimates(stamps_ns: IntArray, table: FloatArray, parent: str) -> Iterator[FusedEstimate]:
-    """What `write_fused` takes, of stamps (N,) and rows (N, 25) whose poses are in the frame ``parent``. Without covariances unless all poses
-    have one."""
+    """What `write_fused` takes, of stamps (N,) and rows (N, 25) whose poses are in the frame ``parent``. Without covariances unless all
+    poses have one."""
     has_cov = bool(np.isfinite(table[:, COV]).all())
     for stamp, row in zip(stamps_ns, table, strict=True):
         twist_cov = row[TWIST_COV].reshape(3, 3)

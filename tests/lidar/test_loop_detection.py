@@ -1,0 +1,116 @@
+"""Loop detection in simulated rooms: places that are visited again are found, places that look alike are not taken for one another."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from localization.lidar import LidarConfig
+from localization.lidar.correlative_search import draw_image, search
+from localization.lidar.loop_detection import Keyframe, LoopClosure, LoopDetector, _within_reach
+from localization.simulate import world
+from motion_models import se2
+from tests import rooms
+
+CELL = 0.08
+LAB = world.lab().walls
+NEAR, WIDE = np.diag([0.1, 0.1, 0.03]) ** 2, np.diag([2.0, 2.0, 0.1]) ** 2
+AWAY = np.array([100.0, 100.0, 0.0])
+
+
+def visit(walls: np.ndarray, n: int, seed: int, start: tuple[float, float] = (-1.0, 0.0)) -> list[tuple[np.ndarray, np.ndarray]]:
+    """``n`` poses (3,) 0.3 m apart along x, and their scans."""
+    rng = np.random.default_rng(seed)
+    poses = [np.array([start[0] + 0.3 * k, start[1] + 0.02 * k, 0.02 * k]) for k in range(n)]
+    return [(pose, rooms.scan_from(walls, pose, rng, beams=360)) for pose in poses]
+
+
+def detect(frames: list[tuple[np.ndarray, np.ndarray]], poses: np.ndarray, marginal: np.ndarray) -> list[LoopClosure]:
+    """What is found on the way along keyframes that a drifting graph has at ``poses`` (n, 3)."""
+    detector, found = LoopDetector(LidarConfig(), CELL), []
+    for k, (pose, points) in enumerate(frames):
+        detector.add(Keyframe(poses[k], points))
+        found += detector.detect(lambda k=k: poses[: k + 1], lambda k: marginal)
+        del pose
+    return found
+
+
+def there_and_back(
+    first: np.ndarray, second: np.ndarray, second_start: tuple[float, float] = (-0.9, 0.1)
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """A visit of one room, 30 keyframes far away without points, a visit of another."""
+    absent = [(AWAY, np.empty((0, 2)))] * 30
+    return [*visit(first, 8, 1), *absent, *visit(second, 8, 2, second_start)]
+
+
+@pytest.mark.parametrize("drift", [np.zeros(3), np.array([0.5, -0.3, 0.08])])
+def test_place_that_is_visited_again_is_found_with_its_pose(drift: np.ndarray) -> None:
+    frames = there_and_back(LAB, LAB)
+    truth = np.array([pose for pose, _ in frames])
+    poses = truth.copy()
+    poses[38:] = se2.compose(drift, truth[38:])
+    found = detect(frames, poses, np.diag([0.3, 0.3, 0.05]) ** 2)
+    assert len(found) >= 3
+    for loop in found:
+        error = se2.log(se2.between(se2.between(truth[loop.a], truth[loop.b]), loop.delta))
+        assert loop.a < 8 <= 38 <= loop.b
+        assert np.abs(error / np.sqrt(np.diag(loop.cov))).max() < 4.0
+    assert len({(loop.a, loop.b) for loop in found}) == len(found)
+
+
+def test_first_trial_alone_closes_nothing() -> None:
+    """A second one has to agree."""
+    frames = there_and_back(LAB, LAB)[:39]
+    assert detect(frames, np.array([pose for pose, _ in frames]), NEAR) == []
+
+
+@pytest.mark.parametrize("is_unsure", [True, False])
+def test_rooms_that_are_alike_close_a_loop_only_where_the_graph_tells_them_apart(is_unsure: bool) -> None:
+    """Two equal rooms, 2.8 m apart, both visited before; a third visit is in one of them."""
+    room = world.box(-1.3, -1.3, 1.3, 1.3)
+    pair = np.concatenate([room, room + np.array([2.8, 0.0, 2.8, 0.0, 0.0])])
+    absent = [(AWAY, np.empty((0, 2)))] * 30
+    frames = [*visit(pair, 4, 1, (-0.5, 0.0)), *visit(pair, 4, 2, (2.3, 0.0)), *absent, *visit(pair, 4, 3, (-0.4, 0.1))]
+    found = detect(frames, np.array([pose for pose, _ in frames]), WIDE if is_unsure else NEAR)
+    assert bool(found) is not is_unsure
+
+
+def test_room_that_is_another_closes_no_loop() -> None:
+    """Where the graph takes the one for the other: another furniture, another size."""
+    other = np.concatenate([world.box(-3, -2.5, 3.5, 3.0), world.pillar(1.5, 2.0), world.box(-3, 1, -2, 3.0)])
+    frames = there_and_back(LAB, other)
+    assert detect(frames, np.array([pose for pose, _ in frames]), NEAR) == []
+
+
+def test_corridor_closes_no_loop_along_which_it_is_open() -> None:
+    walls = np.concatenate([world.line(-60, -1.2, 60, -1.2), world.line(-60, 1.2, 60, 1.2)])
+    frames = there_and_back(walls, walls)
+    assert detect(frames, np.array([pose for pose, _ in frames]), WIDE) == []
+
+
+def test_keyframes_that_follow_one_another_are_no_loop() -> None:
+    frames = visit(LAB, 8, 1) * 3
+    assert detect(frames, np.array([pose for pose, _ in frames]), NEAR) == []
+
+
+def test_scans_without_points_close_no_loops_and_spoil_none() -> None:
+    frames = there_and_back(LAB, LAB)
+    truth = np.array([pose for pose, _ in frames])
+    for k in (2, 40, 43):
+        frames[k] = (frames[k][0], np.empty((0, 2)))
+    found = detect(frames, truth, NEAR)
+    assert found
+    assert not {2, 40, 43} & {loop.b for loop in found}
+
+
+@pytest.mark.parametrize("cov", [NEAR, WIDE])
+def test_search_finds_the_same_where_only_what_it_reaches_is_drawn(cov: np.ndarray) -> None:
+    rng = np.random.default_rng(3)
+    place = np.vstack([rooms.scan_from(LAB, np.zeros(3), rng), rng.uniform(-60.0, 60.0, (500, 2))])
+    points, prior = rooms.scan_from(LAB, np.array([0.4, 0.2, 0.1]), rng, beams=180), np.array([0.3, 0.3, 0.12])
+    limit = np.array([3.2, 3.2, 0.5])
+    drawn = _within_reach(place, points, prior, cov, limit)
+    assert len(drawn) < len(place)
+    whole, part = (search(draw_image(p, CELL), points, prior, cov, limit) for p in (place, drawn))
+    assert part.pose == pytest.approx(whole.pose, abs=CELL)
+    assert part.score == pytest.approx(whole.score, abs=0.1)  # the cells lie elsewhere
