@@ -1,7 +1,7 @@
 """Localization: the filter's odometry, and a graph of its keyframes with loop closures and positions. Poses are ``map_T_body``.
 
-The filter never depends on the graph, but for the corrections of the motion model: ``odom_T_body`` is continuous, and loops move ``map_T_odom``
-(REP-105).
+The filter never depends on the graph, but for the corrections of the motion model: ``odom_T_body`` is continuous, and loops move
+``map_T_odom`` (REP-105).
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-
 from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
@@ -274,7 +273,7 @@ def _align(ours: FloatArray, theirs: FloatArray) -> FloatArray:
 
 
 def _interpolate(nodes: FloatArray, poses: FloatArray, covs: FloatArray, odom: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Poses (N, 3) and covariances of all steps, whose odometry is ``odom`` (N, 3), where the ``nodes`` (K,) of them are at ``poses`` (K, 3).
+    """Poses (N, 3) and covariances of all steps, with odometry ``odom`` (N, 3), where the ``nodes`` (K,) of them are at ``poses`` (K, 3).
 
     What the motion between two keyframes has changed by grows evenly along it, and not where the robot stands.
     """

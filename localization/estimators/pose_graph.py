@@ -30,10 +30,10 @@ _HUBER = 1.345
 _LEVER_SIGMA_M = 0.5
 """Where the antenna may be, away from the given lever arm [m]."""
 _ALIGNMENT_SIGMA = np.array([1e3, 1e3, 1e3])
-_RELINEARIZE = 0.002
+_RELINEARIZE = 0.01
 """Change of a variable from which its factors are linearized anew [m, rad]. With GTSAM's 0.1 a loop that closes 0.15 m keeps the weight
 that its robust loss had before: sigma of the last pose of 41 was 0.14 m, where 0.072 m is right."""
-_MAX_UPDATES = 10
+_MAX_UPDATES = 5
 """Updates of ISAM2 after a loop, at most."""
 _MAX_ITERATIONS = 50
 _CONVERGED = 1e-6

@@ -42,8 +42,8 @@ _AGREE_WITHIN = 12
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    odom_T_body: FloatArray
-    """(3,) the filter's pose."""
+    odometry: FloatArray
+    """(3,) ``odom_T_body`` of the filter."""
     points: FloatArray
     """(N, 2) of its scan, in the body frame [m]."""
 
@@ -120,8 +120,8 @@ class LoopDetector:
 
     def _agree(self, one: LoopClosure, other: LoopClosure) -> bool:
         """Whether both loops and the odometry between their ends close: a1^-1 a2 and b1^-1 b2 are known by odometry."""
-        a = se2.between(self.keyframes[one.a].odom_T_body, self.keyframes[other.a].odom_T_body)
-        b = se2.between(self.keyframes[one.b].odom_T_body, self.keyframes[other.b].odom_T_body)
+        a = se2.between(self.keyframes[one.a].odometry, self.keyframes[other.a].odometry)
+        b = se2.between(self.keyframes[one.b].odometry, self.keyframes[other.b].odometry)
         error = se2.between(se2.compose(one.delta, b), se2.compose(a, other.delta))
         sigma = math.sqrt(float(np.trace(one.cov[:2, :2]) + np.trace(other.cov[:2, :2])))
         return bool(math.hypot(error[0], error[1]) < _AGREE_M + 3.0 * sigma and abs(error[2]) < _AGREE_RAD)
