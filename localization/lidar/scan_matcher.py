@@ -2,8 +2,8 @@
 
     minimise   sum_i rho(e_i)  +  |log(prior^-1 x)|^2_P,      e_i = n_i^T (T(x) p_i - mu_i) / s_i
 
-over the pose x, with mean mu_i, normal n_i and variance s_i^2 of the surface nearest to each point p_i. rho is Geman-McClure's. The prior stays
-quadratic: a robust loss on it lets the pose jump along directions that the scene leaves open.
+over the pose x, with mean mu_i, normal n_i and variance s_i^2 of the surface nearest to each point p_i. rho is Geman-McClure's. The prior
+stays quadratic: a robust loss on it lets the pose jump along directions that the scene leaves open.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from motion_models.se2 import FloatArray, Triple, triple
 
 MIN_POINTS = 10
 """Points without which a scan is not matched."""
+_MIN_MAPPED_POINTS = 30
+"""Points that have to fit where the rest of a scan is in unmapped space: what two short walls give."""
 _KERNEL = 3.0
 """Scale of Geman-McClure's loss, and residuals that count as fitting, in sigmas."""
 _REACH_CELLS = 2.5
@@ -98,12 +100,14 @@ class ScanMatch:
 
 @dataclass(frozen=True)
 class KeyScanError:
-    """How the error of a key scan enters that of the submap around the robot: e_map' = (I - W) e_map + W (e_pose - n) + m."""
+    """How the error of a key scan enters that of the submap around the robot: e_map' = (1 - s) e_map + s (e_pose - W n) + m."""
 
-    weight: FloatArray
-    """(3, 3) W: the share that the scan has of its surroundings in the submap, along the directions that it measures."""
+    share: float
+    """s, 0 to 1: the scan's share of its surroundings in the submap."""
+    measured: FloatArray
+    """(3, 3) W: the directions along which the scan's noise n moves its surfaces; zero along those that the scene leaves open."""
     noise_cov: FloatArray
-    """(3, 3) of n, the error by which the scan's noise moves its surfaces, if it was not matched."""
+    """(3, 3) of n, if the scan was not matched."""
     new_cov: FloatArray
     """(3, 3) of m: places that were not mapped before hang on this scan alone."""
 
@@ -123,6 +127,8 @@ class Fit:
     """Sum of squares of the sums of e over blocks of neighbouring points that fit."""
     fitting: float
     """How many points fit."""
+    mapped: float
+    """How many points have a surface of the submap near them."""
 
 
 class ScanMatcher:
@@ -143,24 +149,27 @@ class ScanMatcher:
         convergence, or where the result does not fit.
         """
         nothing = np.zeros((3, 3))
-        is_wide = math.sqrt(float(np.linalg.eigvalsh(cov[:2, :2])[-1])) > _BASIN_M or cov[2, 2] > _BASIN_RAD**2
-        fit = None if is_wide else self._align(points, prior, cov, prior if guess is None else guess)
-        if fit is not None and fit.overlap >= self._config.search_below and _mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST:
+        fit = self._align(points, prior, cov, prior if guess is None else guess)
+        is_near, agrees = _is_within_basin(fit, cov), _mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST
+        if is_near and agrees and fit.overlap >= self._config.search_below:
             return self._result(fit, prior, cov, nothing)
         outlier_cov = (_SEARCH_FACTOR - 1.0) * cov + _SEARCH_FLOOR
         best = self._search(points, prior, cov + outlier_cov, cov)
         if best is not None:
-            if fit is None and _mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:
+            if not is_near and _mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:
                 outlier_cov = nothing
             found = self._align(points, prior, cov + outlier_cov, best)
-            if found.overlap >= self._config.lost_below and (fit is None or _is_better(found, fit, prior, cov)):
+            if found.overlap >= self._config.lost_below and (not is_near or _is_better(found, fit, prior, cov)):
                 return self._result(found, prior, cov + outlier_cov, outlier_cov)
-        return None if fit is None or fit.overlap < self._config.lost_below else self._result(fit, prior, cov, nothing)
+        is_usable = fit.overlap >= self._config.lost_below or (agrees and self._is_new_scene(fit))
+        return self._result(fit, prior, cov, nothing) if is_near and is_usable else None
 
     def refine(self, points: FloatArray, prior: FloatArray, cov: FloatArray, match: ScanMatch) -> ScanMatch | None:
         """``match`` again, for the same scan deskewed anew."""
         fit = self._align(points, prior, cov + match.outlier_cov, match.pose)
-        return None if fit.overlap < self._config.lost_below else self._result(fit, prior, cov + match.outlier_cov, match.outlier_cov)
+        if fit.overlap < min(self._config.lost_below, match.overlap):
+            return None
+        return self._result(fit, prior, cov + match.outlier_cov, match.outlier_cov)
 
     def evaluate(self, points: FloatArray, pose: FloatArray) -> ScanMatch | None:
         """The match of ``points`` at ``pose`` (3,), which another method has found; None where too few of them fit there."""
@@ -178,9 +187,11 @@ class ScanMatcher:
         share, new = (1.0, 0.0) if self._grid is None else measure_shares(self._grid, scan)
         self._keys = [*self._keys, drawn][-self._config.key_scans :]
         self._draw()
+        assert self._grid is not None
         H = linearize(self._grid, points, triple(pose), 0.0)[0]
-        seen, noise = np.linalg.solve(H + _MAPPED_INFORMATION, H), np.linalg.inv(H + _OPEN_INFORMATION) * self._variance_ratio(1)
-        return KeyScanError(share * seen, noise, new * seen @ noise @ seen.T)
+        seen = np.asarray(np.linalg.solve(H + _MAPPED_INFORMATION, H), dtype=float)
+        noise = np.asarray(np.linalg.inv(H + _OPEN_INFORMATION) * self._variance_ratio(1), dtype=float)
+        return KeyScanError(share, seen, noise, new * seen @ noise @ seen.T)
 
     def __getstate__(self) -> dict[str, Any]:
         """The key scans; grid and image are computed from them."""
@@ -202,6 +213,10 @@ class ScanMatcher:
         """(M, 2) of the submap, in the odometry frame [m]."""
         return np.vstack(self._keys) if self._keys else np.empty((0, 2))
 
+    def _is_new_scene(self, fit: Fit) -> bool:
+        """Most points lie where nothing was mapped yet, but those that do not fit."""
+        return fit.fitting >= max(_MIN_MAPPED_POINTS, self._config.search_below * fit.mapped)
+
     def _draw(self) -> None:
         self._grid, self._image = make_grid(self.points(), self.cell, self._config.range_noise_m), None
 
@@ -219,7 +234,7 @@ class ScanMatcher:
 
     def _result(self, fit: Fit, prior: FloatArray, cov: FloatArray, outlier_cov: FloatArray) -> ScanMatch:
         """The scan's own pose z: where its gradient H (z - x) outweighs the prior's, J^T P^-1 log(prior^-1 x)."""
-        R = np.linalg.inv(fit.information + _OPEN_INFORMATION)
+        R = np.asarray(np.linalg.inv(fit.information + _OPEN_INFORMATION), dtype=float)
         off = se2.log(se2.between(prior, fit.pose))
         gradient = se2.right_jacobian_inverse(off).T @ np.linalg.solve(cov, off)
         measured = se2.compose(fit.pose, se2.exp(R @ gradient))
@@ -229,13 +244,22 @@ class ScanMatcher:
 
 def align_points(grid: VoxelGrid, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray) -> Fit:
     """Gauss-Newton from ``guess`` (3,) for ``points`` (N, 2), with the ``prior`` (3,) of covariance ``cov`` (3, 3)."""
-    pose, H, found = _align(grid, points, prior, cov, np.linalg.inv(cov), guess)
+    pose, H, found = _align(grid, points, prior, cov, np.asarray(np.linalg.inv(cov), dtype=float), guess)
     return Fit(pose, H, *(float(value) for value in found))
 
 
 def choose_cell(config: LidarConfig, points: FloatArray) -> float:
     """Edge of the voxels [m] for a submap that begins with ``points`` (N, 2) of the body frame."""
     return config.voxel_size_m or max(_CELL_OF_RANGE * float(np.median(np.hypot(points[:, 0], points[:, 1]))), _MIN_CELL_M)
+
+
+def _is_within_basin(fit: Fit, cov: FloatArray) -> bool:
+    """Whether Gauss-Newton from a prior with ``cov`` (3, 3) may be trusted: what the scan takes off the prior is within its basin.
+
+    Along directions that the scene leaves open, a prior may be as wide as it likes.
+    """
+    taken = cov - np.linalg.inv(np.linalg.inv(cov) + fit.information)
+    return bool(np.linalg.eigvalsh(taken[:2, :2])[-1] < _BASIN_M**2 and taken[2, 2] < _BASIN_RAD**2)
 
 
 def _is_better(found: Fit, fit: Fit, prior: FloatArray, cov: FloatArray) -> bool:
@@ -286,7 +310,8 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
     c, s = math.cos(x[2]), math.sin(x[2])
     reach, loose = max(_REACH_CELLS * grid.cell, spread), (spread / _KERNEL) ** 2
     n, fitting, cost = points.shape[0], 0, 0.0
-    J, block, squares, block_squares = np.empty(3), 0.0, 0.0, 0.0
+    J, T, spurious = np.empty(3), np.empty(3), np.zeros((3, 3))
+    mapped, block, squares, block_squares = 0, 0.0, 0.0, 0.0
     for i in range(n):
         px, py = points[i, 0], points[i, 1]
         wx, wy = x[0] + c * px - s * py - grid.origin[0], x[1] + s * px + c * py - grid.origin[1]
@@ -301,6 +326,7 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
         if math.isinf(var):
             cost += _KERNEL**2
             continue
+        mapped += 1
         e = surface[2] * (wx - surface[0]) + surface[3] * (wy - surface[1])
         square = e * e / var
         cost += min(square, _KERNEL**2)
@@ -314,9 +340,30 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
         weight = (scale / (scale + e * e)) ** 2 / (var + loose)
         J[0], J[1] = c * surface[2] + s * surface[3], -s * surface[2] + c * surface[3]  # the normal, seen from the body
         J[2] = px * J[1] - py * J[0]
+        T[0], T[1] = -J[1], J[0]  # along the surface
+        T[2] = px * T[1] - py * T[0]
         for a in range(3):
             g[a] += weight * J[a] * e
             for b in range(3):
                 H[a, b] += weight * J[a] * J[b]
-    found = np.array([fitting / max(n, 1), 0.5 * cost / _TOGETHER, squares, block_squares, fitting])
+                spurious[a, b] += weight * min(surface[5], 1.0) * T[a] * T[b]
+    found = np.array([fitting / max(n, 1), 0.5 * cost / _TOGETHER, squares, block_squares, fitting, mapped])
+    _discount(H, g, spurious)
     return H, g, found
+
+
+@numba.njit(cache=True)
+def _discount(H: FloatArray, g: FloatArray, spurious: FloatArray) -> None:
+    """Take off, in place, the information that comes from the noise of normals: along a bare wall it would hold the robot where it is.
+
+    In the directions where the share m of ``spurious`` in ``H`` is largest, information is scaled by 1 - 2 m, at least 0: it is as likely
+    to be false as not from m = 1/2 on. Directions are those of both matrices' generalised eigenvectors.
+    """
+    L = np.linalg.cholesky(H + 1e-6 * np.eye(3))
+    whitened = np.linalg.solve(L, np.linalg.solve(L, spurious).T)
+    m, V = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    kept = np.maximum(1.0 - 2.0 * m, 0.0)
+    root = L @ V
+    scaled = root * kept  # columns
+    H[:, :] = scaled @ root.T
+    g[:] = scaled @ np.linalg.solve(root, g)
