@@ -118,6 +118,9 @@ class Fit:
 
     pose: FloatArray
     information: FloatArray
+    """(3, 3) of the points alone."""
+    gradient: FloatArray
+    """(3,) of the points' cost, which the prior balances."""
     overlap: float
     cost: float
     """-log likelihood of the points, those that err together counted once."""
@@ -152,7 +155,7 @@ class ScanMatcher:
         fit = self._align(points, prior, cov, prior if guess is None else guess)
         is_near, agrees = _is_within_basin(fit, cov), _mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST
         if is_near and agrees and fit.overlap >= self._config.search_below:
-            return self._result(fit, prior, cov, nothing)
+            return self._result(fit, nothing)
         outlier_cov = (_SEARCH_FACTOR - 1.0) * cov + _SEARCH_FLOOR
         best = self._search(points, prior, cov + outlier_cov, cov)
         if best is not None:
@@ -160,16 +163,16 @@ class ScanMatcher:
                 outlier_cov = nothing
             found = self._align(points, prior, cov + outlier_cov, best)
             if found.overlap >= self._config.lost_below and (not is_near or _is_better(found, fit, prior, cov)):
-                return self._result(found, prior, cov + outlier_cov, outlier_cov)
+                return self._result(found, outlier_cov)
         is_usable = fit.overlap >= self._config.lost_below or (agrees and self._is_new_scene(fit))
-        return self._result(fit, prior, cov, nothing) if is_near and is_usable else None
+        return self._result(fit, nothing) if is_near and is_usable else None
 
     def refine(self, points: FloatArray, prior: FloatArray, cov: FloatArray, match: ScanMatch) -> ScanMatch | None:
         """``match`` again, for the same scan deskewed anew."""
         fit = self._align(points, prior, cov + match.outlier_cov, match.pose)
         if fit.overlap < min(self._config.lost_below, match.overlap):
             return None
-        return self._result(fit, prior, cov + match.outlier_cov, match.outlier_cov)
+        return self._result(fit, match.outlier_cov)
 
     def evaluate(self, points: FloatArray, pose: FloatArray) -> ScanMatch | None:
         """The match of ``points`` at ``pose`` (3,), which another method has found; None where too few of them fit there."""
@@ -177,8 +180,7 @@ class ScanMatcher:
         H, _, found = linearize(self._grid, points, triple(pose), 0.0)
         if found[0] < self._config.lost_below:
             return None
-        fit = Fit(pose, H, *(float(value) for value in found))
-        return self._result(fit, pose, np.eye(3), np.zeros((3, 3)))
+        return self._result(Fit(pose, H, np.zeros(3), *(float(value) for value in found)), np.zeros((3, 3)))
 
     def insert_key_scan(self, pose: FloatArray, points: FloatArray) -> KeyScanError:
         """Draw a scan from ``pose`` (3,)."""
@@ -232,20 +234,18 @@ class ScanMatcher:
         best = search(self._image, voxel_means(points, self.cell), prior, wide, limit)
         return None if best.rival_score >= _MAX_RIVAL * best.score else best.pose
 
-    def _result(self, fit: Fit, prior: FloatArray, cov: FloatArray, outlier_cov: FloatArray) -> ScanMatch:
-        """The scan's own pose z: where its gradient H (z - x) outweighs the prior's, J^T P^-1 log(prior^-1 x)."""
+    def _result(self, fit: Fit, outlier_cov: FloatArray) -> ScanMatch:
+        """What the scan alone says: one more Gauss-Newton step from the minimum, without the prior's pull."""
         R = np.asarray(np.linalg.inv(fit.information + _OPEN_INFORMATION), dtype=float)
-        off = se2.log(se2.between(prior, fit.pose))
-        gradient = se2.right_jacobian_inverse(off).T @ np.linalg.solve(cov, off)
-        measured = se2.compose(fit.pose, se2.exp(R @ gradient))
+        measured = se2.compose(fit.pose, se2.exp(-R @ fit.gradient))
         self._residuals = _FORGETTING * self._residuals + [fit.squares, fit.block_squares, fit.fitting]
         return ScanMatch(fit.pose, measured, R * self._variance_ratio(0), fit.overlap, outlier_cov)
 
 
 def align_points(grid: VoxelGrid, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray) -> Fit:
     """Gauss-Newton from ``guess`` (3,) for ``points`` (N, 2), with the ``prior`` (3,) of covariance ``cov`` (3, 3)."""
-    pose, H, found = _align(grid, points, prior, cov, np.asarray(np.linalg.inv(cov), dtype=float), guess)
-    return Fit(pose, H, *(float(value) for value in found))
+    pose, H, g, found = _align(grid, points, prior, cov, np.asarray(np.linalg.inv(cov), dtype=float), guess)
+    return Fit(pose, H, g, *(float(value) for value in found))
 
 
 def choose_cell(config: LidarConfig, points: FloatArray) -> float:
@@ -280,8 +280,8 @@ def _mahalanobis(prior: FloatArray, pose: FloatArray, cov: FloatArray) -> float:
 @numba.njit(cache=True)
 def _align(
     grid: VoxelGrid, points: FloatArray, prior: FloatArray, cov: FloatArray, information: FloatArray, guess: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Gauss-Newton from ``guess`` (3,): pose (3,), information of the points (3, 3); overlap, cost and variance ratio."""
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Gauss-Newton from ``guess`` (3,): pose (3,), information (3, 3) and gradient (3,) of the points there, numbers of the fit."""
     least = _REACH_CELLS * grid.cell
     r2 = points[:, 0] ** 2 + points[:, 1] ** 2
     spread = 3.0 * math.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2] * np.median(r2))  # how far the prior may move a point
@@ -297,7 +297,7 @@ def _align(
             break
         spread = spread / 2.0 if spread > least / 4.0 else 0.0
     H, g, found = linearize(grid, points, x, 0.0)
-    return np.array(x), H, found
+    return np.array(x), H, g, found
 
 
 @numba.njit(cache=True)
