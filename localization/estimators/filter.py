@@ -20,7 +20,7 @@ from filterpy.kalman import predict as predict_linear
 from localization.errors import EstimatorError
 from localization.estimators.measurement_models import predict_turn, subtract_map_error
 from localization.gyro import Turn
-from localization.lidar import KeyScanError
+from localization.lidar import KeyScanError, select_measured
 from localization.settings import Settings
 from localization.synchronizer import Step
 from motion_models import se2
@@ -126,7 +126,7 @@ class Filter:
         C, R = self._scan_noise or (np.zeros((len(self.P), 3)), error.noise_cov)
         G, B = np.eye(len(self.P)), np.zeros((len(self.P), 3))
         G[MAP, MAP], G[MAP, POSE] = (1.0 - error.share) * np.eye(3), error.share * np.eye(3)
-        B[MAP] = -error.share * error.measured
+        B[MAP] = -error.share * select_measured(R)
         self.P = _symmetric(G @ self.P @ G.T + G @ C @ B.T + B @ C.T @ G.T + B @ R @ B.T)
         self.P[MAP, MAP] += error.new_cov
 

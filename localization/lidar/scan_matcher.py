@@ -53,7 +53,7 @@ _BASIN_M, _BASIN_RAD = 0.15, 0.15
 _OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
 """Added to the information of a match, so that an open direction has a sigma of 10 m or 1 rad [1/m^2, 1/m^2, 1/rad^2]."""
 _MAPPED_INFORMATION = np.diag([1e2, 1e2, 1e2])
-"""Information of a key scan along a direction, from which on it says where the map is along it [1/m^2, 1/m^2, 1/rad^2]."""
+"""Information of a key scan along a direction, from which on its noise moves its surfaces along it [1/m^2, 1/m^2, 1/rad^2]."""
 
 
 @dataclass(frozen=True)
@@ -104,10 +104,8 @@ class KeyScanError:
 
     share: float
     """s, 0 to 1: the scan's share of its surroundings in the submap."""
-    measured: FloatArray
-    """(3, 3) W: the directions along which the scan's noise n moves its surfaces; zero along those that the scene leaves open."""
     noise_cov: FloatArray
-    """(3, 3) of n, if the scan was not matched."""
+    """(3, 3) of n, the scan's own noise, if it was not matched. W is `select_measured`."""
     new_cov: FloatArray
     """(3, 3) of m: places that were not mapped before hang on this scan alone."""
 
@@ -191,9 +189,9 @@ class ScanMatcher:
         self._draw()
         assert self._grid is not None
         H = linearize(self._grid, points, triple(pose), 0.0)[0]
-        seen = np.asarray(np.linalg.solve(H + _MAPPED_INFORMATION, H), dtype=float)
         noise = np.asarray(np.linalg.inv(H + _OPEN_INFORMATION) * self._variance_ratio(1), dtype=float)
-        return KeyScanError(share, seen, noise, new * seen @ noise @ seen.T)
+        W = select_measured(noise)
+        return KeyScanError(share, noise, new * W @ noise @ W.T)
 
     def __getstate__(self) -> dict[str, Any]:
         """The key scans; grid and image are computed from them."""
@@ -240,6 +238,11 @@ class ScanMatcher:
         measured = se2.compose(fit.pose, se2.exp(-R @ fit.gradient))
         self._residuals = _FORGETTING * self._residuals + [fit.squares, fit.block_squares, fit.fitting]
         return ScanMatch(fit.pose, measured, R * self._variance_ratio(0), fit.overlap, outlier_cov)
+
+
+def select_measured(noise_cov: FloatArray) -> FloatArray:
+    """W (3, 3): the directions along which noise of ``noise_cov`` (3, 3) moves a scan's surfaces: not those that the scene leaves open."""
+    return np.asarray(np.linalg.inv(np.eye(3) + noise_cov @ _MAPPED_INFORMATION), dtype=float)
 
 
 def align_points(grid: VoxelGrid, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray) -> Fit:
