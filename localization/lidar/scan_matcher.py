@@ -141,6 +141,8 @@ class ScanMatcher:
         self._keys: list[FloatArray] = []
         self._grid: VoxelGrid | None = None
         self._image: LikelihoodImage | None = None
+        self.is_new_place = False
+        """The scan that was matched last lies mostly in unmapped space, and its prior is narrow: it should be drawn."""
         self._residuals = np.full(3, 1e-3)  # sums over the last scans: squares, squares of blocks, points
 
     def match(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray | None = None) -> ScanMatch | None:
@@ -151,6 +153,7 @@ class ScanMatcher:
         """
         nothing = np.zeros((3, 3))
         fit = self._align(points, prior, cov, prior if guess is None else guess)
+        self.is_new_place = fit.mapped < 0.5 * len(points) and _is_narrow(cov)
         is_near, agrees = _is_within_basin(fit, cov), _mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST
         if is_near and agrees and fit.overlap >= self._config.search_below:
             return self._result(fit, nothing)
@@ -214,8 +217,8 @@ class ScanMatcher:
         return np.vstack(self._keys) if self._keys else np.empty((0, 2))
 
     def _is_new_scene(self, fit: Fit) -> bool:
-        """Most points lie where nothing was mapped yet, but those that do not fit."""
-        return fit.fitting >= max(_MIN_MAPPED_POINTS, self._config.search_below * fit.mapped)
+        """Most points lie where nothing was mapped yet, but most of those that do not, fit."""
+        return fit.fitting >= max(_MIN_MAPPED_POINTS, 0.5 * fit.mapped)
 
     def _draw(self) -> None:
         self._grid, self._image = make_grid(self.points(), self.cell, self._config.range_noise_m), None
@@ -261,8 +264,12 @@ def _is_within_basin(fit: Fit, cov: FloatArray) -> bool:
 
     Along directions that the scene leaves open, a prior may be as wide as it likes.
     """
-    taken = cov - np.linalg.inv(np.linalg.inv(cov) + fit.information)
-    return bool(np.linalg.eigvalsh(taken[:2, :2])[-1] < _BASIN_M**2 and taken[2, 2] < _BASIN_RAD**2)
+    return _is_narrow(cov - np.linalg.inv(np.linalg.inv(cov) + fit.information))
+
+
+def _is_narrow(cov: FloatArray) -> bool:
+    """Whether a pose with ``cov`` (3, 3) is within the basin of Gauss-Newton."""
+    return bool(np.linalg.eigvalsh(cov[:2, :2])[-1] < _BASIN_M**2 and cov[2, 2] < _BASIN_RAD**2)
 
 
 def _is_better(found: Fit, fit: Fit, prior: FloatArray, cov: FloatArray) -> bool:
