@@ -23,8 +23,6 @@ from motion_models.se2 import FloatArray, Triple, triple
 
 MIN_POINTS = 10
 """Points without which a scan is not matched."""
-_MIN_MAPPED_POINTS = 30
-"""Points that have to fit where the rest of a scan is in unmapped space: what two short walls give."""
 _KERNEL = 3.0
 """Scale of Geman-McClure's loss, and residuals that count as fitting, in sigmas."""
 _REACH_CELLS = 2.5
@@ -142,7 +140,7 @@ class ScanMatcher:
         self._grid: VoxelGrid | None = None
         self._image: LikelihoodImage | None = None
         self.is_new_place = False
-        """The scan that was matched last lies mostly in unmapped space, and its prior is narrow: it should be drawn."""
+        """Most of the last scan lies in unmapped space, the rest fits and the prior is narrow: it should be drawn at once."""
         self._residuals = np.full(3, 1e-3)  # sums over the last scans: squares, squares of blocks, points
 
     def match(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray | None = None) -> ScanMatch | None:
@@ -153,7 +151,7 @@ class ScanMatcher:
         """
         nothing = np.zeros((3, 3))
         fit = self._align(points, prior, cov, prior if guess is None else guess)
-        self.is_new_place = fit.mapped < 0.5 * len(points) and _is_narrow(cov)
+        self.is_new_place = fit.mapped < 0.5 * len(points) and fit.fitting >= 0.5 * fit.mapped and _is_narrow(cov)
         is_near, agrees = _is_within_basin(fit, cov), _mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST
         if is_near and agrees and fit.overlap >= self._config.search_below:
             return self._result(fit, nothing)
@@ -165,15 +163,12 @@ class ScanMatcher:
             found = self._align(points, prior, cov + outlier_cov, best)
             if found.overlap >= self._config.lost_below and (not is_near or _is_better(found, fit, prior, cov)):
                 return self._result(found, outlier_cov)
-        is_usable = fit.overlap >= self._config.lost_below or (agrees and self._is_new_scene(fit))
-        return self._result(fit, nothing) if is_near and is_usable else None
+        return self._result(fit, nothing) if is_near and fit.overlap >= self._config.lost_below else None
 
     def refine(self, points: FloatArray, prior: FloatArray, cov: FloatArray, match: ScanMatch) -> ScanMatch | None:
         """``match`` again, for the same scan deskewed anew."""
         fit = self._align(points, prior, cov + match.outlier_cov, match.pose)
-        if fit.overlap < min(self._config.lost_below, match.overlap):
-            return None
-        return self._result(fit, match.outlier_cov)
+        return None if fit.overlap < self._config.lost_below else self._result(fit, match.outlier_cov)
 
     def evaluate(self, points: FloatArray, pose: FloatArray) -> ScanMatch | None:
         """The match of ``points`` at ``pose`` (3,), which another method has found; None where too few of them fit there."""
@@ -215,10 +210,6 @@ class ScanMatcher:
     def points(self) -> FloatArray:
         """(M, 2) of the submap, in the odometry frame [m]."""
         return np.vstack(self._keys) if self._keys else np.empty((0, 2))
-
-    def _is_new_scene(self, fit: Fit) -> bool:
-        """Most points lie where nothing was mapped yet, but most of those that do not, fit."""
-        return fit.fitting >= max(_MIN_MAPPED_POINTS, 0.5 * fit.mapped)
 
     def _draw(self) -> None:
         self._grid, self._image = make_grid(self.points(), self.cell, self._config.range_noise_m), None
