@@ -162,9 +162,12 @@ found = {
 }
 apart, learned = [], []
 for (title, (ekf, graph)), colour in zip(found.items(), ("green", "blue", "red"), strict=True):
-    sigmas = np.sqrt(np.maximum(ekf.trajectory.covariances.diagonal(axis1=1, axis2=2), 1e-8))
-    distance = np.abs(se2.log(se2.between(ekf.trajectory.poses, graph.trajectory.poses)) / sigmas).max(axis=1)
-    apart.append(Series(title, (ekf.trajectory.stamps_ns - ekf.trajectory.stamps_ns[0]) * 1e-9, distance, colour))
+    track = ekf.trajectory
+    other = graph.trajectory.at(track.stamps_ns)
+    common = np.isfinite(other).all(axis=1)
+    sigmas = np.sqrt(np.maximum(track.covariances[common].diagonal(axis1=1, axis2=2), 1e-8))
+    distance = np.abs(se2.log(se2.between(track.poses[common], other[common])) / sigmas).max(axis=1)
+    apart.append(Series(title, (track.stamps_ns[common] - track.stamps_ns[0]) * 1e-9, distance, colour))
     for name, (mean, sigma) in ekf.parameters.items():
         learned.append([title, name, *(f"{m:.4g} ± {s:.2g}" for m, s in ((mean, sigma), graph.parameters[name]))])
 picture(Panel("time [s]", "apart [sigmas]", apart, "Filter against graph, largest of x, y, heading", level=1.0), columns=1, row_in=2.6)
