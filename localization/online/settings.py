@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from localization.errors import DumpError
 from localization.estimators import check_estimator
 from localization.logs.topics import TopicOverrides
 from localization.online.core import Pair, ReplayConfig
@@ -37,12 +36,7 @@ class OnlineSettings:
     config: ReplayConfig = field(default_factory=ReplayConfig)
 
     def files(self) -> Files:
-        """Raises `DumpError` for a state that cannot be kept, `OutputError` for names that cannot be."""
-        if self.state is not None and self.estimator == "graph" and self.config.estimator.graph.backend == "isam2":
-            raise DumpError(
-                f"no state can be kept in --state {self.state}: iSAM2's is GTSAM's own and cannot be written down. "
-                "Set --config.estimator.graph.backend to fixed_lag or batch, or leave --state out."
-            )
+        """Raises `OutputError` for names that cannot be."""
         return Files(self.out, self.state)
 
     def make_pair(self, has_lidar: bool) -> Pair:
