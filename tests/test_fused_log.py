@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import tracemalloc
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from localization.errors import OutputError
-from localization.logs.fused import UNKNOWN_VARIANCE, FusedEstimate, write_fused
+from localization.logs.fused import MAP_FRAME, UNKNOWN_VARIANCE, FusedEstimate, write_fused
 from motion_models import se2
 
 COVARIANCE = np.array([[4e-2, 1e-3, 2e-3], [1e-3, 1e-2, -3e-3], [2e-3, -3e-3, 5e-3]])
@@ -74,6 +75,18 @@ def test_odometry_holds_pose_twist_and_stamp(tmp_path: Path, read: Any) -> None:
         linear, angular = message.twist.twist.linear, message.twist.twist.angular
         assert (linear.x, linear.y, linear.z) == (*estimate.twist[:2], 0)
         assert (angular.x, angular.y, angular.z) == (0, 0, estimate.twist[2])
+
+
+def test_poses_of_a_localization_are_in_the_map(tmp_path: Path) -> None:
+    """Side by side with an odometry, whose frame is another one."""
+    path = tmp_path / "fused.mcap"
+    in_map = [replace(estimate, parent=MAP_FRAME) for estimate in estimates()]
+    write_fused(path, {"ekf": estimates(), "graph": in_map}, tf_of="graph")
+    messages = with_rosbags(path)
+    assert {m.header.frame_id for topic, _, m in messages if topic == "/ekf/odometry"} == {"odom"}
+    assert {m.header.frame_id for topic, _, m in messages if topic == "/graph/odometry"} == {"map"}
+    tf = [m.transforms[0] for topic, _, m in messages if topic == "/tf"]
+    assert {(t.header.frame_id, t.child_frame_id) for t in tf} == {("map", "base_link")}
 
 
 @READERS

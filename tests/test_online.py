@@ -14,6 +14,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from localization.errors import DoorError, DumpError, SettingError, TopicError
+from localization.estimators import Estimate
 from localization.events import Scan, WheelSample
 from localization.logs import TopicOverrides, open_log
 from localization.logs.fused import FusedEstimate, transform_message
@@ -24,7 +25,7 @@ from localization.online.health import ERROR, OK, WARN, degeneracy
 from localization.online.names import Names
 from localization.online.node import Node, NodeConfig
 from localization.online.pace import Pace
-from localization.online.tell import CORRECTIONS, DIAGNOSTICS, ODOMETRY, TF, Frames
+from localization.online.tell import CORRECTIONS, DIAGNOSTICS, ODOMETRY, TF, Frames, Teller
 from localization.online.transport import Received
 from localization.run import Pair, replay
 from localization.trajectory import read_tum
@@ -479,10 +480,47 @@ def test_node_accepts_other_transforms_and_without_tf_any():
         assert not [said for said in told if "another node" in said]
 
 
+@pytest.mark.parametrize("frames", [Frames(), Frames("team_map", "team_odom", "team_base")])
+def test_estimate_of_a_graph_is_published_as_odometry_and_correction(frames):
+    """Odometry and its transform are those that never jump; what the graph corrects is a transform of its own (REP-105)."""
+    transport = LogTransport(drive_log())
+    teller = Teller(transport, Names(), frames, with_tf=True)
+    in_odom, map_T_odom = np.array([1.0, 2.0, 0.3]), np.array([0.5, -0.25, -0.1])
+    cov, cov_in_map = 0.01 * np.eye(3), 0.04 * np.eye(3)
+    pose = se2.compose(map_T_odom, in_odom)
+    teller.estimate(Estimate(5 * S, in_odom, None, np.zeros(3), None), 5 * S)
+    teller.estimate(Estimate(6 * S, pose, cov_in_map, np.zeros(3), None, None, (in_odom, cov), map_T_odom), 6 * S)
+    odometry, tf = published(transport, ODOMETRY)[-1], [m.transforms[0] for m in published(transport, TF)]
+    assert odometry.header.frame_id == frames.odom_frame
+    assert (odometry.pose.pose.position.x, odometry.pose.pose.position.y) == (1.0, 2.0)
+    assert odometry.pose.covariance[0] == pytest.approx(0.01)
+    links = [(t.header.frame_id, t.child_frame_id) for t in tf]
+    body, correction = (frames.odom_frame, frames.base_link_frame), (frames.map_frame, frames.odom_frame)
+    assert links == [body, body, correction]
+    np.testing.assert_allclose(se2.compose(planar(tf[2]), planar(tf[1])), pose, atol=1e-12)
+
+
+def test_odometry_of_a_graph_is_published_without_its_corrections():
+    """Live: the published chain map -> odom -> base_link ends where the graph's estimates are."""
+    transport, log = undisturbed("graph")[0], open_log(drive_log(), ROBOT)
+    run = replay(log.events(), [Pair(make_model("skid_steer", ROBOT), "graph")], ROBOT, log.mounts, True)[0]
+    assert run.moments is not None
+    tf = [m.transforms[0] for m in published(transport, TF)]
+    map_T_odom, odom_T_body = (np.array([planar(t) for t in tf if t.header.frame_id == frame]) for frame in ("map", "odom"))
+    assert len(map_T_odom) == len(odom_T_body) == len(run.moments)
+    off = se2.between(run.moments.poses, se2.compose(map_T_odom, odom_T_body))
+    assert np.abs(off).max() < 1e-9
+
+
+def planar(stamped):
+    place, turn = stamped.transform.translation, stamped.transform.rotation
+    return np.array([place.x, place.y, 2.0 * math.atan2(turn.z, turn.w)])
+
+
 def test_names_and_frames_are_used_for_all_that_is_published():
     """In a namespace, with a remapped scan: other topics and frames, the same estimates."""
     names = Names("rover", "/team", ("scan:=/front/scan", "~/odometry:=odom"))
-    config = NodeConfig(wait_s=0.0, names=names, frames=Frames("team_odom", "team_base"))
+    config = NodeConfig(wait_s=0.0, names=names, frames=Frames("team_map", "team_odom", "team_base"))
     transport = LogTransport(drive_log(), lambda messages: [m._replace(topic=renamed(m.topic)) for m in messages])
     transport.types = {renamed(topic): kind for topic, kind in transport.types.items()}
     node, told = run_node(transport, config=config)
@@ -514,7 +552,9 @@ def test_names_that_ros_refuses_are_refused(settings, error):
         Names(**settings)
 
 
-@pytest.mark.parametrize("frames", [("", "base_link"), ("/odom", "base_link"), ("odom", "odom")])
+@pytest.mark.parametrize(
+    "frames", [("map", "", "base_link"), ("map", "/odom", "base_link"), ("map", "odom", "odom"), ("odom", "odom", "base_link")]
+)
 def test_frames_that_tf2_refuses_are_refused(frames):
     with pytest.raises(SettingError, match="odom_frame"):
         Frames(*frames)

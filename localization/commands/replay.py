@@ -19,10 +19,10 @@ from localization.commands.accuracy_table import accuracy_table
 from localization.commands.calibration_tables import WIDE, show
 from localization.commands.common import names, new_folder, write_json
 from localization.errors import EstimatorError, EvaluationError
-from localization.estimators import CORRECTING, check_estimator
+from localization.estimators import CORRECTING, LOCALIZING, check_estimator
 from localization.events import Event, PositionSample
 from localization.logs import Log, TopicOverrides, open_log
-from localization.logs.fused import FusedEstimate, write_fused
+from localization.logs.fused import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
 from localization.output import as_text, check_outputs
 from localization.positions import merge_positions, position_samples
 from localization.provenance import fingerprint, versions
@@ -191,6 +191,7 @@ def _distance(results: Sequence[Result]) -> float | None:
 
 def _estimates(run: Run) -> Iterator[FusedEstimate]:
     t = run.trajectory if run.moments is None else run.moments  # what would have been published
+    parent = MAP_FRAME if run.estimator in LOCALIZING else PARENT_FRAME
     for i in range(len(t)):
         twist_cov = run.twist_covariances[i]
         yield FusedEstimate(
@@ -199,6 +200,7 @@ def _estimates(run: Run) -> Iterator[FusedEstimate]:
             run.twists[i],
             None if t.covariances is None else t.covariances[i],
             twist_cov if np.isfinite(twist_cov).all() else None,
+            parent,
         )
 
 

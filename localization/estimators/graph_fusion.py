@@ -161,7 +161,7 @@ class GraphFusion:
         loops = self._loops.detect(self._graph.poses, self._graph.marginal)
         if loops:
             self.n_loops += len(loops)
-            between = tuple(Between(loop.a, loop.b, loop.delta, np.linalg.inv(loop.cov), is_loop=True) for loop in loops)
+            between = tuple(Between(loop.a, loop.b, loop.delta, np.asarray(np.linalg.inv(loop.cov)), is_loop=True) for loop in loops)
             self._graph.apply(Update(betweens=between))
 
     def _place_positions(self, step: Step) -> None:
@@ -252,14 +252,17 @@ class _KeyframeMotion:
 def _subtract_information(delta: FloatArray, cov: FloatArray, prior: FloatArray, prior_cov: FloatArray) -> tuple[FloatArray, FloatArray]:
     """What gyro and scans say of a motion, where they and the wheels' ``prior`` (3,) together give ``delta`` (3,): motion, information.
 
-    The wheels have a factor of their own, and must not be counted twice: information C^-1 - C_w^-1, where it is positive.
+    The wheels have a factor of their own, and must not be counted twice: information C^-1 - C_w^-1, where it is positive. Along directions
+    in which gyro and scans say less than the wheels, their share of the motion cannot be told: there it is at most as far from ``delta``
+    as the wheels are.
     """
-    joint, own = np.linalg.inv(cov), np.linalg.inv(prior_cov)
-    values, vectors = np.linalg.eigh(joint - own)
-    information = (vectors * np.maximum(values, 1e-6)) @ vectors.T
-    shift = np.linalg.solve(information, own @ se2.log(se2.between(prior, delta)))
-    reliable = vectors @ np.diag((values > 1.0).astype(float)) @ vectors.T
-    return se2.compose(delta, se2.exp(reliable @ shift)), information
+    root = np.linalg.cholesky(np.linalg.inv(prior_cov))
+    whiten = np.linalg.inv(root)
+    ratios, axes = np.linalg.eigh(whiten @ np.linalg.inv(cov) @ whiten.T)  # information with gyro and scans, over that of the wheels
+    gained = np.maximum(ratios - 1.0, 1e-6)
+    to_axes = axes.T @ root.T
+    shift = np.linalg.solve(to_axes, to_axes @ se2.log(se2.between(prior, delta)) / np.maximum(gained, 1.0))
+    return se2.compose(delta, se2.exp(shift)), (to_axes.T * gained) @ to_axes
 
 
 def _align(ours: FloatArray, theirs: FloatArray) -> FloatArray:

@@ -54,6 +54,8 @@ ESTIMATORS: Mapping[str, _Maker] = {
 
 CORRECTING = ("ekf", "graph")
 """Those that correct the motion model on the way."""
+LOCALIZING = ("graph",)
+"""Those whose poses are ``map_T_body``; the others' are ``odom_T_body``."""
 
 
 def check_estimator(name: str, has_lidar: bool) -> None:

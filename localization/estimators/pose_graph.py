@@ -30,7 +30,9 @@ _HUBER = 1.345
 _LEVER_SIGMA_M = 0.5
 """Where the antenna may be, away from the given lever arm [m]."""
 _ALIGNMENT_SIGMA = np.array([1e3, 1e3, 1e3])
-_MAX_ITERATIONS, _CONVERGED = 50, 1e-8
+_MAX_ITERATIONS = 50
+_CONVERGED = 1e-6
+"""Relative change of the cost at which the optimization ends: a tenth of GTSAM's own default."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,8 @@ class PoseGraph:
 
     def poses(self) -> FloatArray:
         """(count, 3)"""
-        return np.array([self.pose(k) for k in range(self.count)]).reshape(-1, 3)
+        values = gtsam.utilities.extractPose2(self._values)  # in order of keys: before x, there may be t
+        return np.asarray(values[len(values) - self.count :])
 
     def marginal(self, k: int) -> FloatArray:
         """(3, 3) covariance of keyframe ``k``."""
@@ -141,7 +144,7 @@ class PoseGraph:
 
     def smooth(self) -> tuple[FloatArray, FloatArray]:
         """Poses (count, 3) by all measurements, by Levenberg-Marquardt, and their covariances (count, 3, 3)."""
-        graph, values = gtsam.NonlinearFactorGraph(), self._values
+        graph, values = gtsam.NonlinearFactorGraph(), self._isam.calculateEstimate()
         count, self.count, self._walks = self.count, 0, 0
         for update in self.updates:
             graph.push_back(self._factors(update)[0])
@@ -163,7 +166,7 @@ class PoseGraph:
         if update.wheels is not None:
             factors.add(_wheel_factor(k - 1, k, gtsam.symbol("c", self._walks), update.wheels))
         for between in update.betweens:
-            noise = gtsam.noiseModel.Gaussian.Information(between.information)
+            noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Information(between.information)
             if between.is_loop:
                 noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY), noise)
             a, b = (gtsam.symbol("x", i) for i in (between.a, between.b))
@@ -223,8 +226,7 @@ def _position_factor(position: Position) -> gtsam.CustomFactor:
     key = gtsam.symbol("x", position.k)
 
     def error(this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None) -> FloatArray:
-        enu_T_map, map_T_key, lever = values.atPose2(_ALIGNMENT), values.atPose2(key), np.asarray(values.atPoint2(_LEVER))
-        enu_T_map, map_T_key = _array(enu_T_map), _array(map_T_key)
+        enu_T_map, map_T_key, lever = _array(values.atPose2(_ALIGNMENT)), _array(values.atPose2(key)), np.asarray(values.atPoint2(_LEVER))
         in_key = se2.transform(position.offset, lever)
         _, by_offset, by_lever = position_residual(position.offset, lever, in_key)
         on_map, by_key, by_point = position_residual(map_T_key, in_key, np.zeros(2))
@@ -249,9 +251,8 @@ def _levenberg_marquardt(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
     cost, damping = graph.error(values), 0.0
     for _ in range(_MAX_ITERATIONS):
         linear = graph.linearize(values)
-        for key, block in linear.hessianBlockDiagonal().items() if damping else ():
-            n = len(block)
-            linear.add(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(n), np.zeros(n), gtsam.noiseModel.Unit.Create(n)))
+        for key, n in values.dims().items() if damping else ():
+            linear.push_back(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(n), np.zeros(n), gtsam.noiseModel.Unit.Create(n)))
         moved = values.retract(linear.optimize())
         new_cost = graph.error(moved)
         if new_cost > cost * (1.0 + 1e-12) + 1e-12:

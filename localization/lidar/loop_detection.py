@@ -103,7 +103,7 @@ class LoopDetector:
         place = self._merge(range(max(0, j - _AROUND), min(k - _MIN_KEYFRAMES, j + _AROUND) + 1), poses, j)
         recent = voxel_means(self._merge(range(max(0, k - _RECENT + 1), k + 1), poses, k), 1.5 * self._cell)
         limit = np.array([_LIMIT_CELLS * self._cell, _LIMIT_CELLS * self._cell, _LIMIT_RAD])
-        best = search(draw_image(place, self._cell), recent, prior, cov, limit)
+        best = search(draw_image(_within_reach(place, recent, prior, cov, limit), self._cell), recent, prior, cov, limit)
         if best.rival_score > _MAX_RIVAL * best.score:
             return None
         near = np.diag([2.0 * self._cell, 2.0 * self._cell, 0.03]) ** 2
@@ -125,3 +125,12 @@ class LoopDetector:
         error = se2.between(se2.compose(one.delta, b), se2.compose(a, other.delta))
         sigma = math.sqrt(float(np.trace(one.cov[:2, :2]) + np.trace(other.cov[:2, :2])))
         return bool(math.hypot(error[0], error[1]) < _AGREE_M + 3.0 * sigma and abs(error[2]) < _AGREE_RAD)
+
+
+def _within_reach(place: FloatArray, points: FloatArray, prior: FloatArray, cov: FloatArray, limit: FloatArray) -> FloatArray:
+    """Those of ``place`` (N, 2) where `search` with the same arguments can put ``points`` (M, 2): no larger image is needed."""
+    moved = se2.transform(prior, points)
+    half = np.minimum(3.0 * np.sqrt([np.trace(cov[:2, :2]), np.trace(cov[:2, :2]), cov[2, 2]]), limit)
+    swept = half[:2] + half[2] * np.hypot(points[:, 0], points[:, 1]).max()
+    is_near = ((place >= moved.min(axis=0) - swept) & (place <= moved.max(axis=0) + swept)).all(axis=1)
+    return place[is_near]

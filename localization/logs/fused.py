@@ -2,13 +2,14 @@
 
 What a message holds, and where ROS means something else than this library:
 
-- `/NAME/odometry`, nav_msgs/Odometry, `odom` -> `base_link`; the twist is the body's, with the true vy.
+- `/NAME/odometry`, nav_msgs/Odometry, `odom` -> `base_link`, or `map` -> `base_link` of estimators that localize; the twist is the body's,
+  with the true vy.
 - The covariance of a pose is, here, that of a perturbation in the body's axes; ROS wants that of x, y in the axes of `odom`
   (REP-103, nav_msgs/Odometry). The block of x, y, yaw is therefore turned by the heading. The covariance of a twist stays in
   the body's axes, in both.
 - What planar motion does not estimate (z, roll, pitch and their rates) is zero with a variance of `UNKNOWN_VARIANCE`, and so is
   every variance of an estimate without covariance: robot_localization and its like then take nothing from it.
-- `/tf` carries `odom` -> `base_link` of one result only, for a frame can have only one parent.
+- `/tf` carries the transform to `base_link` of one result only, for a frame can have only one parent.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ UNKNOWN_VARIANCE = 1e6
 """Variance of what is not estimated [m^2, rad^2, and per s^2]: the number that ROS's own drivers use for "do not use this"."""
 
 PARENT_FRAME = "odom"
+MAP_FRAME = "map"
 BODY_FRAME = "base_link"
 
 _ODOMETRY = "nav_msgs/msg/Odometry"
@@ -71,6 +73,8 @@ class FusedEstimate:
     """(3, 3) of the pose's right (body-frame) perturbation, or None where nothing is known of it."""
     twist_covariance: FloatArray | None = None
     """(3, 3) of the twist, or None where nothing is known of it."""
+    parent: str = PARENT_FRAME
+    """Frame that the pose is in."""
 
 
 def write_fused(path: str | Path, results: Mapping[str, Iterable[FusedEstimate]], tf_of: str | None = None) -> None:
@@ -133,7 +137,7 @@ def odometry_message(estimate: FusedEstimate) -> Odometry:
     x, y, theta = (float(v) for v in estimate.pose)
     vx, vy, wz = (float(v) for v in estimate.twist)
     return Odometry(
-        header=_header(estimate.stamp_ns),
+        header=_header(estimate),
         child_frame_id=BODY_FRAME,
         pose=PoseWithCovariance(
             pose=Pose(position=Point(x=x, y=y, z=0.0), orientation=_heading(theta)),
@@ -147,10 +151,10 @@ def odometry_message(estimate: FusedEstimate) -> Odometry:
 
 
 def transform_message(estimate: FusedEstimate) -> TFMessage:
-    """tf2_msgs/TFMessage, `odom` -> `base_link`."""
+    """tf2_msgs/TFMessage, from the frame of the pose to `base_link`."""
     x, y, theta = (float(v) for v in estimate.pose)
     transform = Transform(translation=Vector3(x=x, y=y, z=0.0), rotation=_heading(theta))
-    return TFMessage(transforms=[TransformStamped(header=_header(estimate.stamp_ns), child_frame_id=BODY_FRAME, transform=transform)])
+    return TFMessage(transforms=[TransformStamped(header=_header(estimate), child_frame_id=BODY_FRAME, transform=transform)])
 
 
 def odom_axes(covariance: FloatArray, theta: float) -> FloatArray:
@@ -172,8 +176,9 @@ def six_by_six(planar: FloatArray | None) -> FloatArray:
     return full.ravel()
 
 
-def _header(stamp_ns: int) -> Header:
-    return Header(stamp=Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9), frame_id=PARENT_FRAME)
+def _header(estimate: FusedEstimate) -> Header:
+    stamp_ns = estimate.stamp_ns
+    return Header(stamp=Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9), frame_id=estimate.parent)
 
 
 def _heading(theta: float) -> Quaternion:

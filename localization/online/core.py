@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from localization.estimators import CORRECTING, Estimate, Estimator, EstimatorConfig, make_estimator
+from localization.estimators import CORRECTING, LOCALIZING, Estimate, Estimator, EstimatorConfig, make_estimator
 from localization.events import Event, PositionSample
 from localization.lidar_losses import LidarLosses
 from localization.synchronizer import Step, StepConfig, Synchronizer
@@ -49,6 +49,7 @@ class Core:
         """``is_smoothing``: the estimator is to give a smoothed trajectory at the end; it changes no estimate on the way."""
         config = config or ReplayConfig()
         self._name = f"{pair.estimator} ({pair.model.name})"
+        self.is_localizing = pair.estimator in LOCALIZING
         self.mounts = dict(mounts)
         """Where frames are known to sit; shared by all who ask."""
         model = correctable(pair.model, pair.corrections) if pair.estimator in CORRECTING else pair.model

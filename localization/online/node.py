@@ -40,7 +40,7 @@ class NodeConfig(Settings):
     wait_s: float = 5.0
     """How long topics that are published are waited for before a start without them, and how often silence is reported [s]."""
     tf: bool = True
-    """Publish the transform `odom_frame` -> `base_link_frame`; false where another node publishes it."""
+    """Publish the transforms `odom_frame` -> `base_link_frame` and, of a graph, `map_frame` -> `odom_frame`; false where others do."""
     frames: Frames = field(default_factory=Frames)
     names: Names = field(default_factory=Names)
 

@@ -134,13 +134,15 @@ class Spool:
         self.path.unlink(missing_ok=True)
 
 
-def fused_estimates(stamps_ns: IntArray, table: FloatArray) -> Iterator[FusedEstimate]:
-    """What `write_fused` takes, of stamps (N,) and rows (N, 25). Without covariances unless all poses have one."""
+def fused_estimates(stamps_ns: IntArray, table: FloatArray, parent: str) -> Iterator[FusedEstimate]:
+    """What `write_fused` takes, of stamps (N,) and rows (N, 25) whose poses are in the frame ``parent``. Without covariances unless all poses
+    have one."""
     has_cov = bool(np.isfinite(table[:, COV]).all())
     for stamp, row in zip(stamps_ns, table, strict=True):
         twist_cov = row[TWIST_COV].reshape(3, 3)
         known = np.isfinite(twist_cov).all()
-        yield FusedEstimate(int(stamp), row[POSE], row[TWIST], row[COV].reshape(3, 3) if has_cov else None, twist_cov if known else None)
+        cov = row[COV].reshape(3, 3) if has_cov else None
+        yield FusedEstimate(int(stamp), row[POSE], row[TWIST], cov, twist_cov if known else None, parent)
 
 
 def trajectory(stamps_ns: IntArray, table: FloatArray) -> Trajectory:

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from localization.errors import DumpError, OutputError
 from localization.estimators import Estimate
 from localization.events import Event
-from localization.logs.fused import write_fused
+from localization.logs.fused import MAP_FRAME, PARENT_FRAME, write_fused
 from localization.online.core import Core, Pair, ReplayConfig
 from localization.online.dump import Dumper, fingerprints, read_dump, remove_dump
 from localization.online.files import Files
@@ -180,8 +180,9 @@ class Session:
         if len(stamps) and self._files.out.suffix == ".tum":
             write_tum(self._files.out, trajectory(stamps, table))
         elif len(stamps):
+            parent = MAP_FRAME if self.core.is_localizing else PARENT_FRAME
             with self._files.beside() as bag:
-                write_fused(bag, {self.name: fused_estimates(stamps, table)}, self.name)
+                write_fused(bag, {self.name: fused_estimates(stamps, table, parent)}, self.name)
         if self._tell is not None and self._spool.missing:
             self._tell(f"'{self._files.out}' lacks {self._spool.missing} estimates, for which there was no room on the disk.")
         if self._dumper is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -33,18 +35,22 @@ _TYPES = {
 class Frames(Settings):
     """Frames of what is published (REP-105)."""
 
+    map_frame: str = "map"
+    """Frame of a graph's localization, parent of `odom_frame`; other estimators have none."""
     odom_frame: str = "odom"
-    """Parent frame of the published odometry and transform."""
+    """Parent frame of the published odometry and transform, without jumps."""
     base_link_frame: str = "base_link"
     """Frame of the robot's body, child of `odom_frame`; the point about which the robot file's geometry is given."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, frame in (("odom_frame", self.odom_frame), ("base_link_frame", self.base_link_frame)):
+        frames = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        for name, frame in frames.items():
             if not frame or frame.startswith("/") or frame != frame.strip():
                 raise SettingError(f"setting {name} is '{frame}'; it must not be empty, begin with '/', or have blanks around it.")
-        if self.odom_frame == self.base_link_frame:
-            raise SettingError(f"odom_frame and base_link_frame are both '{self.odom_frame}'; they must be two frames.")
+        for (name, frame), (other, same) in itertools.combinations(frames.items(), 2):
+            if frame == same:
+                raise SettingError(f"{name} and {other} are both '{frame}'; they must be two frames.")
 
 
 class Teller:
@@ -53,8 +59,9 @@ class Teller:
     def __init__(self, transport: Transport, names: Names, frames: Frames, *, with_tf: bool) -> None:
         self._transport, self._with_tf, self._frames = transport, with_tf, frames
         self._fused = FusedWriter(is_ros1=transport.is_ros1, parent=frames.odom_frame, body=frames.base_link_frame)
+        self._correction = FusedWriter(is_ros1=transport.is_ros1, parent=frames.map_frame, body=frames.odom_frame)
         self.recent_transforms: deque[bytes] = deque(maxlen=_RECENT)
-        """As they were published."""
+        """Those of the body, as they were published."""
         self._topics = {topic: names.resolve(topic) for topic in _TYPES}
         for topic in _TYPES:
             if topic != TF or with_tf:
@@ -67,13 +74,16 @@ class Teller:
         self._with_tf = is_on
 
     def estimate(self, estimate: Estimate, stamp_ns: int) -> None:
-        """nav_msgs/Odometry with the true vy, and the transform `odom` -> `base_link`, at ``stamp_ns``."""
-        covariance = estimate.covariance
-        fused = FusedEstimate(stamp_ns, estimate.pose, estimate.twist, covariance, estimate.twist_covariance)
+        """nav_msgs/Odometry with true vy, and the transforms `odom` -> `base_link` and, of a graph, `map` -> `odom`, at ``stamp_ns``."""
+        pose, covariance = estimate.odometry or (estimate.pose, estimate.covariance)
+        fused = FusedEstimate(stamp_ns, pose, estimate.twist, covariance, estimate.twist_covariance)
         self._transport.publish(self._topics[ODOMETRY], self._fused.odometry(fused))
         if self._with_tf:
             self.recent_transforms.append(self._fused.transform(fused))
             self._transport.publish(self._topics[TF], self.recent_transforms[-1])
+            if estimate.map_T_odom is not None:
+                correction = FusedEstimate(stamp_ns, estimate.map_T_odom, np.zeros(3))
+                self._transport.publish(self._topics[TF], self._correction.transform(correction))
 
     def corrections(self, parameters: Mapping[str, tuple[float, float]], stamp_ns: int) -> None:
         """Named numbers as sensor_msgs/JointState: ``position`` is the mean, ``effort`` its sigma."""

@@ -1,0 +1,312 @@
+"""The graph behind the filter on simulated drives: loops about a building, positions, corrections, frames, checkpoints."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from localization.consistency import nees
+from localization.estimators import Estimate
+from localization.estimators.graph_fusion import _interpolate, _subtract_information
+from localization.events import PositionSample, Scan, WheelSample
+from localization.online.core import Core, Pair
+from localization.online.freeze import freeze
+from localization.online.records import Records, trajectory
+from localization.online.thaw import thaw
+from localization.positions import merge_positions
+from localization.run import replay
+from localization.simulate import world
+from localization.trajectory import Trajectory
+from motion_models import se2
+from motion_models.registry import make_model
+from motion_models.robot import WheelNoise
+from tests import rooms
+
+QUIET = WheelNoise(*[1e-8] * 8)
+SCANNER = rooms.Beams(beams=240, rate_hz=6.25, longest=8.0)
+RADIUS_ERROR, TURN_ERROR = 1.03, 1.1
+"""Wheels count more than they drive and turn."""
+
+
+def building() -> np.ndarray:
+    """A corridor of 2 m about a core of 12 x 8 m, with things of irregular size along its outer walls."""
+    rng, things = np.random.default_rng(8), []
+    for x in np.cumsum(rng.uniform(0.8, 2.2, 12)) - 8.0:
+        if x < 7.0:
+            things += [
+                world.box(x, -6, x + rng.uniform(0.2, 0.6), rng.uniform(-5.9, -5.6)),
+                world.box(x + 0.3, rng.uniform(5.6, 5.9), x + 0.7, 6),
+            ]
+    for y in np.cumsum(rng.uniform(0.8, 2.2, 9)) - 6.0:
+        if y < 5.0:
+            things += [world.box(-8, y, rng.uniform(-7.9, -7.6), y + 0.4), world.box(rng.uniform(7.6, 7.9), y + 0.2, 8, y + 0.6)]
+    return np.concatenate([world.box(-8, -6, 8, 6), world.box(-6, -4, 6, 4), *things])
+
+
+def lap() -> np.ndarray:
+    turn = (0.5 * math.pi / 0.8, 0.0, 0.8)
+    legs = [leg for length in (14.0, 10.0, 14.0, 10.0) for leg in ((length / 0.8, 0.8, 0.0), turn)]
+    return rooms.path((1, 0, 0), *legs, (10, 0.8, 0), (1, 0, 0))
+
+
+@functools.cache
+def around(seed: int = 0) -> rooms.Drive:
+    """Once around the building and 8 m farther, with wheels that are wrong."""
+    return rooms.drive_through(
+        building(), lap(), seed, (-7.0, -5.0, 0.0), SCANNER, QUIET, lambda t, twists: twists * [RADIUS_ERROR, 1.0, TURN_ERROR]
+    )
+
+
+def make_core(drive: rooms.Drive, has_lidar: bool = True, is_smoothing: bool = True, model: str = "diff_drive") -> Core:
+    return Core(Pair(make_model(model, rooms.ROBOT), "graph"), rooms.ROBOT, drive.mounts, has_lidar, is_smoothing=is_smoothing)
+
+
+def run(core: Core, events: list) -> list[Estimate]:
+    return [estimate for event in events for estimate in core.push(event)] + core.finish()
+
+
+@functools.cache
+def estimated(seed: int = 0) -> tuple[list[Estimate], Core]:
+    core = make_core(around(seed))
+    return run(core, around(seed).events), core
+
+
+def smoothed(estimates: list[Estimate], core: Core) -> Trajectory:
+    records = Records()
+    for estimate in estimates:
+        records.add(estimate)
+    found = core.estimator.finish(trajectory(records.stamps(), records.table()))
+    assert found is not None
+    return found
+
+
+def errors(drive: rooms.Drive, stamps: list[int], poses: np.ndarray) -> np.ndarray:
+    """Distance from the truth at each scan [m]."""
+    rows = {stamp: i for i, stamp in enumerate(stamps)}
+    found = [(poses[rows[int(s)]] - truth)[:2] for s, truth in zip(drive.stamps, drive.poses, strict=True) if int(s) in rows]
+    assert len(found) > 0.95 * len(drive.stamps)
+    return np.hypot(*np.array(found).T)
+
+
+# --- loops about a building
+
+
+def test_loop_about_a_building_closes() -> None:
+    """After it, the live pose is nearer the truth than the odometry's drift, and so is the smoothed one."""
+    drive, (estimates, core) = around(), estimated()
+    stamps = [e.stamp_ns for e in estimates]
+    odometry = errors(drive, stamps, np.array([e.odometry[0] for e in estimates]))
+    live = errors(drive, stamps, np.array([e.pose for e in estimates]))
+    whole = smoothed(estimates, core)
+    assert core.estimator.counts()["loops"] >= 2
+    assert odometry[-20:].mean() > 0.03
+    assert live[-20:].mean() < 0.5 * odometry[-20:].mean()
+    after = errors(drive, whole.stamps_ns.tolist(), whole.poses)
+    assert np.sqrt(np.mean(after**2)) < 0.9 * np.sqrt(np.mean(odometry**2))
+
+
+def test_loop_moves_the_map_and_never_the_odometry() -> None:
+    """The pose in the map jumps where the loop closes; odom -> base_link moves as the robot does (REP-105)."""
+    estimates, _ = estimated()
+    odometry = np.array([e.odometry[0] for e in estimates])
+    jumps = np.hypot(*np.diff([e.map_T_odom for e in estimates], axis=0)[:, :2].T)
+    assert jumps.max() > 0.01
+    moved = se2.between(odometry[:-1], odometry[1:])
+    assert np.hypot(moved[:, 0], moved[:, 1]).max() < 0.8 / SCANNER.rate_hz + 0.03  # 0.8 m/s
+    chained = se2.compose(np.array([e.map_T_odom for e in estimates]), odometry)
+    assert np.abs(se2.between(chained, np.array([e.pose for e in estimates]))).max() < 1e-12
+
+
+def test_odometry_is_that_of_a_filter_that_gets_the_corrections_alone() -> None:
+    """Until the first keyframes the graph's odometry is the filter's, to the last bit."""
+    drive = around().until(rooms.WALL_START_NS + 2 * 10**9)
+    ours = run(make_core(drive), drive.events)
+    theirs = run(Core(Pair(make_model("diff_drive", rooms.ROBOT), "ekf"), rooms.ROBOT, drive.mounts, True), drive.events)
+    assert len(ours) == len(theirs) > 10
+    assert all(np.array_equal(a.odometry[0], b.pose) for a, b in zip(ours[:8], theirs[:8], strict=True))
+
+
+def test_wheels_that_are_wrong_are_learned() -> None:
+    """Radius by the scans along the way, k by the turns; both within 3 sigma, and with more certainty than at first."""
+    estimates, core = estimated()
+    del estimates
+    parameters = core.estimator.parameters()
+    mean, sigma = parameters["wheel_radius_scale"]
+    assert sigma < 0.005
+    assert abs(mean - 1.0 / RADIUS_ERROR) < 3.0 * sigma
+    nominal = rooms.ROBOT.driver.wheel_separation_multiplier
+    mean, sigma = parameters["wheel_separation_multiplier"]
+    assert abs(mean - nominal * TURN_ERROR) < 3.0 * sigma
+    assert abs(mean - nominal * TURN_ERROR) < abs(mean - nominal)
+
+
+def test_corrections_of_the_graph_are_those_of_the_next_prediction() -> None:
+    _, core = estimated()
+    names = core.estimator.odometry._corrections.names
+    learned = core.estimator._graph.corrections()[0][: len(names)]
+    assert np.abs(learned).min() > 0.0
+    assert core.stepper.params == pytest.approx(core.estimator.params)
+    nominal = make_model("diff_drive", rooms.ROBOT).nominal
+    assert not np.allclose(core.stepper.params, nominal)
+
+
+def test_nees_of_smoothed_poses_is_that_of_their_covariances() -> None:
+    """The middle and the end of five drives, of 3 degrees of freedom each."""
+    found = []
+    for seed in range(5):
+        drive, (estimates, core) = around(seed), estimated(seed)
+        whole = smoothed(estimates, core)
+        assert whole.covariances is not None
+        for share in (0.5, 0.95):
+            k = int(share * len(drive.stamps))
+            i = int(np.searchsorted(whole.stamps_ns, drive.stamps[k]))
+            assert whole.stamps_ns[i] == drive.stamps[k]
+            error = se2.log(se2.between(drive.poses[k], whole.poses[i]))
+            found.append(nees(error[None], whole.covariances[i : i + 1])[0])
+    assert 0.3 < np.mean(found) < 6.0
+
+
+# --- what may be missing
+
+
+def test_scans_without_points_are_keyframes_and_close_no_loops() -> None:
+    drive = around()
+    blind = [
+        replace(e, points=e.points[:0], offsets=e.offsets[:0]) if isinstance(e, Scan) and i % 3 else e for i, e in enumerate(drive.events)
+    ]
+    core = make_core(drive)
+    estimates = run(core, blind)
+    assert np.isfinite([e.pose for e in estimates]).all()
+    assert core.estimator.counts()["keyframes"] > 40
+    assert np.isfinite(smoothed(estimates, core).poses).all()
+
+
+def test_wheels_alone_make_a_graph() -> None:
+    """Without LiDAR and positions it is dead reckoning, with a covariance that grows."""
+    drive = around()
+    core = make_core(drive, has_lidar=False)
+    estimates = run(core, [e for e in drive.events if isinstance(e, WheelSample)])
+    sigmas = [float(np.sqrt(np.trace(e.covariance[:2, :2]))) for e in estimates]
+    assert sigmas[-1] > 5.0 * sigmas[len(sigmas) // 10]
+    assert core.estimator.counts()["keyframes"] > 40
+    assert "loops" not in core.estimator.counts()
+    assert len(core.estimator.map_points()) == 0
+    whole = smoothed(estimates, core)
+    assert np.abs(se2.between(whole.poses, np.array([e.pose for e in estimates]))).max() < 0.05
+
+
+# --- positions
+
+
+def positions(drive: rooms.Drive, sigma_m: float = 0.1, spoil: dict[int, np.ndarray] | None = None) -> list[PositionSample]:
+    """One each second, of a plane that is turned and moved."""
+    rng, enu_T_map = np.random.default_rng(1), np.array([300.0, -200.0, 0.9])
+    found = []
+    for n, k in enumerate(range(0, len(drive.stamps), 6)):
+        at = se2.compose(enu_T_map, drive.poses[k])[:2] + sigma_m * rng.normal(size=2) + (spoil or {}).get(n, np.zeros(2))
+        found.append(PositionSample(int(drive.stamps[k]), at, sigma_m**2 * np.eye(2)))
+    return found
+
+
+def driven_with(fixes: list[PositionSample]) -> tuple[np.ndarray, Core]:
+    """Errors [m] of the smoothed poses by wheels and ``fixes`` alone."""
+    drive, core = around(), make_core(around(), has_lidar=False)
+    wheels = [e for e in drive.events if isinstance(e, WheelSample)]
+    estimates = run(core, list(merge_positions(wheels, fixes)))
+    whole = smoothed(estimates, core)
+    at = np.column_stack([np.interp(drive.stamps, whole.stamps_ns, column) for column in whole.poses[:, :2].T])
+    return np.hypot(*(at - drive.poses[:, :2]).T), core
+
+
+def test_positions_pull_wheels_that_are_wrong() -> None:
+    without, with_fixes = driven_with([])[0], driven_with(positions(around()))[0]
+    assert without.max() > 2.0
+    assert np.sqrt(np.mean(with_fixes**2)) < 0.2 * np.sqrt(np.mean(without**2))
+
+
+def test_an_outlier_among_positions_does_not_pull() -> None:
+    clean, core = driven_with(positions(around()))
+    spoilt, _ = driven_with(positions(around(), spoil={40: np.array([50.0, 0.0])}))
+    assert core.estimator.counts()["positions"] > 70
+    assert np.abs(spoilt - clean).max() < 0.3
+
+
+def test_positions_before_the_map_has_a_heading_wait() -> None:
+    """From a robot that has not moved by 5 m they do not tell where the map is turned to."""
+    drive = around()
+    core = make_core(drive, is_smoothing=False)
+    until = rooms.WALL_START_NS + 5 * 10**9
+    run(core, list(merge_positions([e for e in drive.events if e.stamp_ns < until], positions(drive))))
+    assert "positions" not in core.estimator.counts()
+
+
+# --- checkpoints
+
+
+def numbers(estimate: Estimate) -> tuple:
+    arrays = (estimate.pose, estimate.covariance, estimate.twist, estimate.odometry[0], estimate.odometry[1], estimate.map_T_odom)
+    return estimate.stamp_ns, *(array.tobytes() for array in arrays)
+
+
+def test_cut_after_its_loops_and_resumed_the_graph_goes_on_to_the_last_bit() -> None:
+    drive = around()
+    fixed = list(merge_positions(drive.events, positions(drive)))
+    core, cut = make_core(drive), int(0.97 * len(fixed))
+    for event in fixed[:cut]:
+        core.push(event)
+    assert core.estimator.counts()["loops"] >= 2
+    assert core.estimator.counts()["positions"] > 50
+    resumed = thaw(*freeze(core))
+    assert list(map(numbers, run(core, fixed[cut:]))) == list(map(numbers, run(resumed, fixed[cut:])))
+    assert dict(core.estimator.parameters()) == dict(resumed.estimator.parameters())
+
+
+def test_replay_is_what_was_estimated_live_to_the_last_bit() -> None:
+    drive, (estimates, core) = around(), estimated()
+    live = make_core(drive, is_smoothing=False)
+    found = []
+    for event in drive.events:
+        found += live.push(event)
+        live.settle()
+    found += live.finish()
+    (replayed,) = replay(drive.events, [Pair(make_model("diff_drive", rooms.ROBOT), "graph")], rooms.ROBOT, drive.mounts, True)
+    assert list(map(numbers, found)) == list(map(numbers, estimates))
+    assert replayed.moments is not None
+    assert np.array_equal(replayed.moments.poses[-1], found[-1].pose)
+    assert np.array_equal(replayed.trajectory.poses, smoothed(estimates, core).poses)
+
+
+# --- parts
+
+
+def test_motion_less_the_wheels_share_gives_the_filters_motion_with_it() -> None:
+    wheels, wheel_cov = np.array([1.0, 0.0, 0.1]), np.diag([0.05, 0.05, 0.03]) ** 2
+    delta, cov = np.array([1.01, 0.005, 0.11]), np.diag([0.01, 0.01, 0.002]) ** 2
+    measured, information = _subtract_information(delta, cov, wheels, wheel_cov)
+    np.testing.assert_allclose(information + np.linalg.inv(wheel_cov), np.linalg.inv(cov), rtol=1e-9)
+    by_scans, by_wheels = se2.log(se2.between(delta, measured)), se2.log(se2.between(delta, wheels))
+    np.testing.assert_allclose(
+        information @ by_scans + np.linalg.inv(wheel_cov) @ by_wheels, 0.0, atol=0.02 * np.abs(information @ by_scans).max()
+    )
+
+
+@pytest.mark.parametrize("gain", [0.5, 0.999, 1.0, 1.001, 1.5])
+def test_motion_less_the_wheels_share_is_no_farther_off_than_the_wheels(gain: float) -> None:
+    """Also where scans say next to nothing along x: a difference is not divided by nothing."""
+    wheels, wheel_cov = np.array([1.1, 0.0, 0.0]), np.diag([0.02, 0.02, 0.05]) ** 2
+    delta, cov = np.array([1.0, 0.0, 0.0]), wheel_cov * [[1.0 / gain], [0.1], [0.1]]
+    measured, information = _subtract_information(delta, cov, wheels, wheel_cov)
+    assert np.abs(measured - delta).max() <= 0.1 + 1e-9
+    assert (np.linalg.eigvalsh(information) > 0.0).all()
+
+
+def test_poses_between_keyframes_are_moved_as_far_as_was_travelled() -> None:
+    odom = np.column_stack([[0.0, 1.0, 1.0, 2.0], np.zeros(4), np.zeros(4)])  # it rests in between
+    poses, covs = np.array([[0.0, 0.0, 0.0], [2.2, 0.0, 0.0]]), np.array([0.01 * np.eye(3), 0.03 * np.eye(3)])
+    found, mixed = _interpolate(np.array([0, 3]), poses, covs, odom)
+    np.testing.assert_allclose(found[:, 0], [0.0, 1.1, 1.1, 2.2], atol=1e-6)
+    np.testing.assert_allclose(mixed[[0, 3]], covs, atol=1e-8)
