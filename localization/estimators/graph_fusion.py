@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-
 from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError

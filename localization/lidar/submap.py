@@ -65,7 +65,7 @@ def find_slot(slots: IntArray, i: int, j: int) -> int:
     at = ((scattered >> 32) ^ scattered) & mask
     while slots[at, 0] != _EMPTY and slots[at, 0] != key:
         at = (at + 1) & mask
-    return at
+    return int(at)
 
 
 @numba.njit(cache=True)
