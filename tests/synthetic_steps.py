@@ -48,6 +48,8 @@ class Noise:
 class PoseSensor:
     """In place of `ScanMatchingSensor`: poses with noise of a covariance that it knows, in a submap that is exact."""
 
+    cell = 0.0  # no voxels, and so no loops
+
     def __init__(self) -> None:
         self.next: ScanMatch | None = None
         self.lost = LostScans()
@@ -60,6 +62,9 @@ class PoseSensor:
 
     def is_key(self, pose):
         return False
+
+    def scan_points(self):
+        return NO_POINTS
 
     def map_points(self):
         return NO_POINTS

@@ -88,15 +88,15 @@ def test_urdf_that_expands_without_end_is_refused(tmp_path: Path, capsys: pytest
 
 @pytest.mark.parametrize("value", [1e300, -1e300, 10**400, 10**9])
 def test_setting_beyond_all_reason_is_refused(value: float) -> None:
-    with pytest.raises(SettingError, match=r"lag_nodes.*must be"):
-        GraphConfig(lag_nodes=value)  # type: ignore[arg-type]
+    with pytest.raises(SettingError, match=r"keyframe_distance_m.*must be"):
+        GraphConfig(keyframe_distance_m=value)
     if value != 10**9:
         with pytest.raises(SettingError, match=r"clock_sigma_s.*must be"):
             FilterConfig(clock_sigma_s=value)
 
 
 def test_setting_of_400_digits_on_the_command_line_is_refused(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for option in ("--config.estimator.ekf.clock-sigma-s", "--config.estimator.graph.lag-nodes"):
+    for option in ("--config.estimator.ekf.clock-sigma-s", "--config.estimator.graph.keyframe-distance-m"):
         assert run("replay", log, "--robot", "vaultbot", "--out", tmp_path / "o", option, "9" * 400) == 2
         assert "must be" in capsys.readouterr().err
 

@@ -14,7 +14,12 @@ from tests.notebook_tools import FOLDER, read, sources
 SHORTER = {
     "1": {"LOG_S = 1400.0": "LOG_S = 100.0"},
     "4": {'TRIED = ("wheel_radius_difference", "cg_offset_x", "lidar_time_offset", "friction_anisotropy")': 'TRIED = ("cg_offset_x",)'},
-    "5": {"RUNS, STEPS = 40, 150": "RUNS, STEPS = 3, 30", '"aces", 120.0': '"aces", 10.0', '"husky_a200", 300.0': '"husky_a200", 30.0'},
+    "5": {
+        "RUNS, STEPS = 40, 150": "RUNS, STEPS = 3, 30",
+        "LAPS = 7": "LAPS = 1",
+        'load_robot("aces"), 120.0': 'load_robot("aces"), 10.0',
+        'load_robot("husky_a200"), 300.0': 'load_robot("husky_a200"), 30.0',
+    },
     "6": {"DRAWS = 20": "DRAWS = 1"},
     "7": {"LAPS = 12": "LAPS = 3"},
 }

@@ -196,13 +196,6 @@ def test_bad_arguments_are_explained(arguments, said, capsys):
     assert "Traceback" not in shown.err
 
 
-def test_a_state_that_cannot_be_written_is_refused_before_anything_is(tmp_path, capsys):
-    isam2 = ("--estimator", "graph", "--config.estimator.graph.backend", "isam2")
-    assert online("--rate", "max", *isam2, "--state", tmp_path / "state", "--out", tmp_path / "run.tum") == 2
-    assert "cannot be written down. Set --config.estimator.graph.backend" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
 def test_states_that_do_not_fit_are_refused(killed, tmp_path, capsys):
     shutil.copytree(killed, tmp_path, dirs_exist_ok=True)
     state, out = tmp_path / "state", tmp_path / "a.tum"

@@ -52,12 +52,12 @@ def test_make_settings_puts_each_value_in_its_place():
         "topic.scan": "none",
         "topic.imu": "imu",
         "state": "/tmp/state",
-        "config.estimator.graph.learn": ["clock", "lidar_yaw"],
+        "config.estimator.lidar.matcher": "kiss",
     }
     made = make_settings(values, Names("rover", "/team"))
     assert (made.robot, made.node.tf, made.node.frames.odom_frame, made.node.wait_s) == ("husky_a200", False, "world", 3.0)
     assert (made.topic.scan, made.topic.imu, made.topic.points, made.state) == ("", "imu", None, Path("/tmp/state"))
-    assert made.config.estimator.graph.learn == ("clock", "lidar_yaw")
+    assert made.config.estimator.lidar.matcher == "kiss"
     assert made.node.names == Names("rover", "/team")
 
 
@@ -65,12 +65,11 @@ def test_make_settings_puts_each_value_in_its_place():
     ("values", "error"),
     [
         ({"publish_tff": True}, "there is no parameter 'publish_tff'. Did you mean 'publish_tf'?"),
-        ({"lag_nodes": 3}, "Did you mean 'config.estimator.graph.lag_nodes'?"),
+        ({"keyframe_distance_m": 3.0}, "Did you mean 'config.estimator.graph.keyframe_distance_m'"),
         ({"wait_s": "long"}, "parameter 'wait_s' is 'long'; it must be a number."),
         ({"wait_s": True}, "it must be a number"),
         ({"wait_s": -1.0}, "setting wait_s of NodeConfig is -1; it must be 0 or more."),
-        ({"config.estimator.graph.backend": "fixed"}, "Did you mean 'fixed_lag'?"),
-        ({"config.estimator.graph.learn": ["clocks"]}, "Did you mean 'clock'?"),
+        ({"config.estimator.lidar.matcher": "submaps"}, "Did you mean 'submap'?"),
         ({"odom_frame": "base_link"}, "they must be two frames"),
     ],
 )

@@ -258,7 +258,13 @@ def nothing_asked(option):
 
 
 def a_setting_of_no_use(tmp_path):
-    return [str(tmp_path), "--robot", "vaultbot", "--config.estimator.ekf.gate-probability", "0"], "gate_probability of EkfConfig is 0; it"
+    return [
+        str(tmp_path),
+        "--robot",
+        "vaultbot",
+        "--config.estimator.graph.keyframe-distance-m",
+        "0",
+    ], "keyframe_distance_m of GraphConfig is 0; it"
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from filterpy.kalman import predict as predict_linear
 from localization.errors import EstimatorError
 from localization.estimators.measurement_models import predict_turn, subtract_map_error
 from localization.gyro import Turn
-from localization.lidar import KeyScanError
+from localization.lidar import KeyScanError, select_measured
 from localization.settings import Settings
 from localization.synchronizer import Step
 from motion_models import se2
@@ -119,14 +119,14 @@ class Filter:
         return nis
 
     def insert_key_scan(self, error: KeyScanError) -> None:
-        """The last scan is drawn into the submap from the pose as it is: e_map' = (I - W) e_map + W (e_pose - n) + m.
+        """The last scan is drawn into the submap from the pose as it is: e_map' = (1 - s) e_map + s (e_pose - W n) + m.
 
         n is the scan's own noise. Where the scan was matched, the pose's error contains it already, by the gain K: cov(e, n) = K R.
         """
         C, R = self._scan_noise or (np.zeros((len(self.P), 3)), error.noise_cov)
         G, B = np.eye(len(self.P)), np.zeros((len(self.P), 3))
-        G[MAP, MAP], G[MAP, POSE] = np.eye(3) - error.weight, error.weight
-        B[MAP] = -error.weight
+        G[MAP, MAP], G[MAP, POSE] = (1.0 - error.share) * np.eye(3), error.share * np.eye(3)
+        B[MAP] = -error.share * select_measured(R)
         self.P = _symmetric(G @ self.P @ G.T + G @ C @ B.T + B @ C.T @ G.T + B @ R @ B.T)
         self.P[MAP, MAP] += error.new_cov
 
@@ -159,7 +159,7 @@ class Filter:
         P = self.P
         S = H @ P @ H.T + R
         _check("a measurement", innovation, S)
-        K = np.linalg.solve(S, H @ P).T
+        K = np.asarray(np.linalg.solve(S, H @ P).T, dtype=float)
         K[self._consider] = 0.0
         A = np.eye(len(P)) - K @ H
         self.P = _symmetric(A @ P @ A.T + K @ R @ K.T)

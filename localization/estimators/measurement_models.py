@@ -1,4 +1,4 @@
-"""What measurements say of the state: predicted values and exact Jacobians, the same for filter and graph. Perturbations act on the right."""
+"""Measurement models: predicted values and exact Jacobians, the same for filter and graph. Perturbations act on the right."""
 
 from __future__ import annotations
 
@@ -39,7 +39,10 @@ def motion_residual(world_T_a: FloatArray, world_T_b: FloatArray, measured: Floa
 
 
 def position_residual(world_T_a: FloatArray, lever: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """How far the point ``lever`` (2,) of the body at a is off a measured ``position`` (2,) [m]; Jacobians (2, 3) by a, (2, 2) by the lever."""
+    """How far the point ``lever`` (2,) of the body at a is off a measured ``position`` (2,) [m].
+
+    Returns it with its Jacobians by a (2, 3) and by the lever (2, 2).
+    """
     c, s = np.cos(world_T_a[2]), np.sin(world_T_a[2])
     R = np.array([[c, -s], [s, c]])
     sideways = np.array([-lever[1], lever[0]])

@@ -94,7 +94,9 @@ def search(image: LikelihoodImage, points: FloatArray, prior: FloatArray, cov: F
         offsets = (offsets[best][:, None, :] + np.stack([dx, dy], axis=-1)).reshape(-1, 2)
         rows = np.repeat(rows[best], COARSE**2)
     shifts = np.column_stack([offsets, yaws[rows]])
-    return _pick(prior, shifts, scores, len(points), np.linalg.inv(world), np.array([image.cell, image.cell, yaw_step]))
+    return _pick(
+        prior, shifts, scores, len(points), np.asarray(np.linalg.inv(world), dtype=float), np.array([image.cell, image.cell, yaw_step])
+    )
 
 
 def _count(half: FloatArray, yaws: int, step: float) -> float:

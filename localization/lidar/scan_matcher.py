@@ -2,8 +2,8 @@
 
     minimise   sum_i rho(e_i)  +  |log(prior^-1 x)|^2_P,      e_i = n_i^T (T(x) p_i - mu_i) / s_i
 
-over the pose x, with mean mu_i, normal n_i and variance s_i^2 of the surface nearest to each point p_i. rho is Geman-McClure's. The prior stays
-quadratic: a robust loss on it lets the pose jump along directions that the scene leaves open.
+over the pose x, with mean mu_i, normal n_i and variance s_i^2 of the surface nearest to each point p_i. rho is Geman-McClure's. The prior
+stays quadratic: a robust loss on it lets the pose jump along directions that the scene leaves open.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _BASIN_M, _BASIN_RAD = 0.15, 0.15
 _OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
 """Added to the information of a match, so that an open direction has a sigma of 10 m or 1 rad [1/m^2, 1/m^2, 1/rad^2]."""
 _MAPPED_INFORMATION = np.diag([1e2, 1e2, 1e2])
-"""Information of a key scan along a direction, from which on it says where the map is along it [1/m^2, 1/m^2, 1/rad^2]."""
+"""Information of a key scan along a direction, from which on its noise moves its surfaces along it [1/m^2, 1/m^2, 1/rad^2]."""
 
 
 @dataclass(frozen=True)
@@ -98,12 +98,12 @@ class ScanMatch:
 
 @dataclass(frozen=True)
 class KeyScanError:
-    """How the error of a key scan enters that of the submap around the robot: e_map' = (I - W) e_map + W (e_pose - n) + m."""
+    """How the error of a key scan enters that of the submap around the robot: e_map' = (1 - s) e_map + s (e_pose - W n) + m."""
 
-    weight: FloatArray
-    """(3, 3) W: the share that the scan has of its surroundings in the submap, along the directions that it measures."""
+    share: float
+    """s, 0 to 1: the scan's share of its surroundings in the submap."""
     noise_cov: FloatArray
-    """(3, 3) of n, the error by which the scan's noise moves its surfaces, if it was not matched."""
+    """(3, 3) of n, the scan's own noise, if it was not matched. W is `select_measured`."""
     new_cov: FloatArray
     """(3, 3) of m: places that were not mapped before hang on this scan alone."""
 
@@ -114,6 +114,9 @@ class Fit:
 
     pose: FloatArray
     information: FloatArray
+    """(3, 3) of the points alone."""
+    gradient: FloatArray
+    """(3,) of the points' cost, which the prior balances."""
     overlap: float
     cost: float
     """-log likelihood of the points, those that err together counted once."""
@@ -123,6 +126,8 @@ class Fit:
     """Sum of squares of the sums of e over blocks of neighbouring points that fit."""
     fitting: float
     """How many points fit."""
+    mapped: float
+    """How many points have a surface of the submap near them."""
 
 
 class ScanMatcher:
@@ -134,6 +139,8 @@ class ScanMatcher:
         self._keys: list[FloatArray] = []
         self._grid: VoxelGrid | None = None
         self._image: LikelihoodImage | None = None
+        self.is_new_place = False
+        """Most of the last scan lies in unmapped space, the rest fits and the prior is narrow: it should be drawn at once."""
         self._residuals = np.full(3, 1e-3)  # sums over the last scans: squares, squares of blocks, points
 
     def match(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray | None = None) -> ScanMatch | None:
@@ -143,24 +150,25 @@ class ScanMatcher:
         convergence, or where the result does not fit.
         """
         nothing = np.zeros((3, 3))
-        is_wide = math.sqrt(float(np.linalg.eigvalsh(cov[:2, :2])[-1])) > _BASIN_M or cov[2, 2] > _BASIN_RAD**2
-        fit = None if is_wide else self._align(points, prior, cov, prior if guess is None else guess)
-        if fit is not None and fit.overlap >= self._config.search_below and _mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST:
-            return self._result(fit, prior, cov, nothing)
+        fit = self._align(points, prior, cov, prior if guess is None else guess)
+        self.is_new_place = fit.mapped < 0.5 * len(points) and fit.fitting >= 0.5 * fit.mapped and _is_narrow(cov)
+        is_near, agrees = _is_within_basin(fit, cov), _mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST
+        if is_near and agrees and fit.overlap >= self._config.search_below:
+            return self._result(fit, nothing)
         outlier_cov = (_SEARCH_FACTOR - 1.0) * cov + _SEARCH_FLOOR
         best = self._search(points, prior, cov + outlier_cov, cov)
         if best is not None:
-            if fit is None and _mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:
+            if not is_near and _mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:
                 outlier_cov = nothing
             found = self._align(points, prior, cov + outlier_cov, best)
-            if found.overlap >= self._config.lost_below and (fit is None or _is_better(found, fit, prior, cov)):
-                return self._result(found, prior, cov + outlier_cov, outlier_cov)
-        return None if fit is None or fit.overlap < self._config.lost_below else self._result(fit, prior, cov, nothing)
+            if found.overlap >= self._config.lost_below and (not is_near or _is_better(found, fit, prior, cov)):
+                return self._result(found, outlier_cov)
+        return self._result(fit, nothing) if is_near and fit.overlap >= self._config.lost_below else None
 
     def refine(self, points: FloatArray, prior: FloatArray, cov: FloatArray, match: ScanMatch) -> ScanMatch | None:
         """``match`` again, for the same scan deskewed anew."""
         fit = self._align(points, prior, cov + match.outlier_cov, match.pose)
-        return None if fit.overlap < self._config.lost_below else self._result(fit, prior, cov + match.outlier_cov, match.outlier_cov)
+        return None if fit.overlap < self._config.lost_below else self._result(fit, match.outlier_cov)
 
     def evaluate(self, points: FloatArray, pose: FloatArray) -> ScanMatch | None:
         """The match of ``points`` at ``pose`` (3,), which another method has found; None where too few of them fit there."""
@@ -168,8 +176,7 @@ class ScanMatcher:
         H, _, found = linearize(self._grid, points, triple(pose), 0.0)
         if found[0] < self._config.lost_below:
             return None
-        fit = Fit(pose, H, *(float(value) for value in found))
-        return self._result(fit, pose, np.eye(3), np.zeros((3, 3)))
+        return self._result(Fit(pose, H, np.zeros(3), *(float(value) for value in found)), np.zeros((3, 3)))
 
     def insert_key_scan(self, pose: FloatArray, points: FloatArray) -> KeyScanError:
         """Draw a scan from ``pose`` (3,)."""
@@ -178,9 +185,11 @@ class ScanMatcher:
         share, new = (1.0, 0.0) if self._grid is None else measure_shares(self._grid, scan)
         self._keys = [*self._keys, drawn][-self._config.key_scans :]
         self._draw()
+        assert self._grid is not None
         H = linearize(self._grid, points, triple(pose), 0.0)[0]
-        seen, noise = np.linalg.solve(H + _MAPPED_INFORMATION, H), np.linalg.inv(H + _OPEN_INFORMATION) * self._variance_ratio(1)
-        return KeyScanError(share * seen, noise, new * seen @ noise @ seen.T)
+        noise = np.asarray(np.linalg.inv(H + _OPEN_INFORMATION) * self._variance_ratio(1), dtype=float)
+        W = select_measured(noise)
+        return KeyScanError(share, noise, new * W @ noise @ W.T)
 
     def __getstate__(self) -> dict[str, Any]:
         """The key scans; grid and image are computed from them."""
@@ -217,25 +226,41 @@ class ScanMatcher:
         best = search(self._image, voxel_means(points, self.cell), prior, wide, limit)
         return None if best.rival_score >= _MAX_RIVAL * best.score else best.pose
 
-    def _result(self, fit: Fit, prior: FloatArray, cov: FloatArray, outlier_cov: FloatArray) -> ScanMatch:
-        """The scan's own pose z: where its gradient H (z - x) outweighs the prior's, J^T P^-1 log(prior^-1 x)."""
-        R = np.linalg.inv(fit.information + _OPEN_INFORMATION)
-        off = se2.log(se2.between(prior, fit.pose))
-        gradient = se2.right_jacobian_inverse(off).T @ np.linalg.solve(cov, off)
-        measured = se2.compose(fit.pose, se2.exp(R @ gradient))
+    def _result(self, fit: Fit, outlier_cov: FloatArray) -> ScanMatch:
+        """What the scan alone says: one more Gauss-Newton step from the minimum, without the prior's pull."""
+        R = np.asarray(np.linalg.inv(fit.information + _OPEN_INFORMATION), dtype=float)
+        measured = se2.compose(fit.pose, se2.exp(-R @ fit.gradient))
         self._residuals = _FORGETTING * self._residuals + [fit.squares, fit.block_squares, fit.fitting]
         return ScanMatch(fit.pose, measured, R * self._variance_ratio(0), fit.overlap, outlier_cov)
 
 
+def select_measured(noise_cov: FloatArray) -> FloatArray:
+    """W (3, 3): the directions along which noise of ``noise_cov`` (3, 3) moves a scan's surfaces: not those that the scene leaves open."""
+    return np.asarray(np.linalg.inv(np.eye(3) + noise_cov @ _MAPPED_INFORMATION), dtype=float)
+
+
 def align_points(grid: VoxelGrid, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray) -> Fit:
     """Gauss-Newton from ``guess`` (3,) for ``points`` (N, 2), with the ``prior`` (3,) of covariance ``cov`` (3, 3)."""
-    pose, H, found = _align(grid, points, prior, cov, np.linalg.inv(cov), guess)
-    return Fit(pose, H, *(float(value) for value in found))
+    pose, H, g, found = _align(grid, points, prior, cov, np.asarray(np.linalg.inv(cov), dtype=float), guess)
+    return Fit(pose, H, g, *(float(value) for value in found))
 
 
 def choose_cell(config: LidarConfig, points: FloatArray) -> float:
     """Edge of the voxels [m] for a submap that begins with ``points`` (N, 2) of the body frame."""
     return config.voxel_size_m or max(_CELL_OF_RANGE * float(np.median(np.hypot(points[:, 0], points[:, 1]))), _MIN_CELL_M)
+
+
+def _is_within_basin(fit: Fit, cov: FloatArray) -> bool:
+    """Whether Gauss-Newton from a prior with ``cov`` (3, 3) may be trusted: what the scan takes off the prior is within its basin.
+
+    Along directions that the scene leaves open, a prior may be as wide as it likes.
+    """
+    return _is_narrow(cov - np.linalg.inv(np.linalg.inv(cov) + fit.information))
+
+
+def _is_narrow(cov: FloatArray) -> bool:
+    """Whether a pose with ``cov`` (3, 3) is within the basin of Gauss-Newton."""
+    return bool(np.linalg.eigvalsh(cov[:2, :2])[-1] < _BASIN_M**2 and cov[2, 2] < _BASIN_RAD**2)
 
 
 def _is_better(found: Fit, fit: Fit, prior: FloatArray, cov: FloatArray) -> bool:
@@ -256,8 +281,8 @@ def _mahalanobis(prior: FloatArray, pose: FloatArray, cov: FloatArray) -> float:
 @numba.njit(cache=True)
 def _align(
     grid: VoxelGrid, points: FloatArray, prior: FloatArray, cov: FloatArray, information: FloatArray, guess: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Gauss-Newton from ``guess`` (3,): pose (3,), information of the points (3, 3); overlap, cost and variance ratio."""
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Gauss-Newton from ``guess`` (3,): pose (3,), information (3, 3) and gradient (3,) of the points there, numbers of the fit."""
     least = _REACH_CELLS * grid.cell
     r2 = points[:, 0] ** 2 + points[:, 1] ** 2
     spread = 3.0 * math.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2] * np.median(r2))  # how far the prior may move a point
@@ -273,7 +298,7 @@ def _align(
             break
         spread = spread / 2.0 if spread > least / 4.0 else 0.0
     H, g, found = linearize(grid, points, x, 0.0)
-    return np.array(x), H, found
+    return np.array(x), H, g, found
 
 
 @numba.njit(cache=True)
@@ -286,7 +311,8 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
     c, s = math.cos(x[2]), math.sin(x[2])
     reach, loose = max(_REACH_CELLS * grid.cell, spread), (spread / _KERNEL) ** 2
     n, fitting, cost = points.shape[0], 0, 0.0
-    J, block, squares, block_squares = np.empty(3), 0.0, 0.0, 0.0
+    J, T, spurious = np.empty(3), np.empty(3), np.zeros((3, 3))
+    mapped, block, squares, block_squares = 0, 0.0, 0.0, 0.0
     for i in range(n):
         px, py = points[i, 0], points[i, 1]
         wx, wy = x[0] + c * px - s * py - grid.origin[0], x[1] + s * px + c * py - grid.origin[1]
@@ -301,6 +327,7 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
         if math.isinf(var):
             cost += _KERNEL**2
             continue
+        mapped += 1
         e = surface[2] * (wx - surface[0]) + surface[3] * (wy - surface[1])
         square = e * e / var
         cost += min(square, _KERNEL**2)
@@ -314,9 +341,30 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
         weight = (scale / (scale + e * e)) ** 2 / (var + loose)
         J[0], J[1] = c * surface[2] + s * surface[3], -s * surface[2] + c * surface[3]  # the normal, seen from the body
         J[2] = px * J[1] - py * J[0]
+        T[0], T[1] = -J[1], J[0]  # along the surface
+        T[2] = px * T[1] - py * T[0]
         for a in range(3):
             g[a] += weight * J[a] * e
             for b in range(3):
                 H[a, b] += weight * J[a] * J[b]
-    found = np.array([fitting / max(n, 1), 0.5 * cost / _TOGETHER, squares, block_squares, fitting])
+                spurious[a, b] += weight * min(surface[5], 1.0) * T[a] * T[b]
+    found = np.array([fitting / max(n, 1), 0.5 * cost / _TOGETHER, squares, block_squares, fitting, mapped])
+    _discount(H, g, spurious)
     return H, g, found
+
+
+@numba.njit(cache=True)
+def _discount(H: FloatArray, g: FloatArray, spurious: FloatArray) -> None:
+    """Take off, in place, the information that comes from the noise of normals: along a bare wall it would hold the robot where it is.
+
+    In the directions where the share m of ``spurious`` in ``H`` is largest, information is scaled by 1 - 2 m, at least 0: it is as likely
+    to be false as not from m = 1/2 on. Directions are those of both matrices' generalised eigenvectors.
+    """
+    L = np.linalg.cholesky(H + 1e-6 * np.eye(3))
+    whitened = np.linalg.solve(L, np.linalg.solve(L, spurious).T)
+    m, V = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    kept = np.maximum(1.0 - 2.0 * m, 0.0)
+    root = L @ V
+    scaled = root * kept  # columns
+    H[:, :] = scaled @ root.T
+    g[:] = scaled @ np.linalg.solve(root, g)

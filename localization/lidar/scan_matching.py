@@ -76,7 +76,8 @@ class ScanMatchingSensor:
 
     def refine(self, match: ScanMatch, twist: FloatArray) -> ScanMatch:
         """``match`` again, its sweep deskewed with ``twist`` (3,); the same where that moves no point."""
-        assert self._scan is not None and self._matcher is not None
+        assert self._scan is not None
+        assert self._matcher is not None
         if self._scan.sweep.displacement(twist - self._scan.twist) < _MIN_DISPLACEMENT_M:
             return match
         self._scan = self._deskew(self._scan.sweep, twist)
@@ -86,7 +87,7 @@ class ScanMatchingSensor:
         """Whether the scan at hand, taken from ``pose`` (3,), is to enter the submap."""
         if self._scan is None:
             return False
-        if self._last_key is None:
+        if self._last_key is None or (self._matcher is not None and self._matcher.is_new_place):
             return True
         moved = se2.between(self._last_key, pose)
         c = self._config
@@ -94,7 +95,8 @@ class ScanMatchingSensor:
 
     def insert_key_scan(self, pose: FloatArray) -> KeyScanError:
         """Draw the scan at hand from ``pose`` (3,)."""
-        assert self._scan is not None and self._matcher is not None
+        assert self._scan is not None
+        assert self._matcher is not None
         self._last_key = pose
         if self._kiss is not None:
             self._kiss.insert(self._scan.points, pose)

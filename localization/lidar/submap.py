@@ -37,7 +37,8 @@ class VoxelGrid(NamedTuple):
     sums: FloatArray
     """(V, 6) number of points, and their sums of x, y, x^2, x y, y^2."""
     surfaces: FloatArray
-    """(V, 5) mean (2), normal (2) and variance along it [m^2] around each voxel. Filled when first used: NaN until then."""
+    """(V, 6) mean (2), normal (2), variance along it [m^2] and variance of its angle [rad^2] around each voxel. Filled when first used: NaN
+    until then."""
 
 
 def make_grid(points: FloatArray, cell: float, noise_m: float) -> VoxelGrid:
@@ -46,7 +47,7 @@ def make_grid(points: FloatArray, cell: float, noise_m: float) -> VoxelGrid:
     slots = np.full((1 << max(4, math.ceil(math.log2(2 * len(points) + 1))), 2), _EMPTY, dtype=np.int64)
     cells, sums = np.empty((len(points), 2), dtype=np.int64), np.zeros((len(points), 6))
     n = _fill(points, cell, origin, slots, cells, sums)
-    return VoxelGrid(cell, noise_m**2, origin, slots, cells[:n], sums[:n], np.full((n, 5), np.nan))
+    return VoxelGrid(cell, noise_m**2, origin, slots, cells[:n], sums[:n], np.full((n, 6), np.nan))
 
 
 def voxel_means(points: FloatArray, cell: float) -> FloatArray:
@@ -64,14 +65,14 @@ def find_slot(slots: IntArray, i: int, j: int) -> int:
     at = ((scattered >> 32) ^ scattered) & mask
     while slots[at, 0] != _EMPTY and slots[at, 0] != key:
         at = (at + 1) & mask
-    return at
+    return int(at)
 
 
 @numba.njit(cache=True)
 def find_voxel(slots: IntArray, i: int, j: int) -> int:
     """Row of the voxel in cell (i, j); -1 where there is none."""
     at = find_slot(slots, i, j)
-    return slots[at, 1] if slots[at, 0] != _EMPTY else -1
+    return int(slots[at, 1]) if slots[at, 0] != _EMPTY else -1
 
 
 @numba.njit(cache=True)
@@ -141,10 +142,11 @@ def fill_surface(grid: VoxelGrid, v: int) -> None:
     mx, my = total[1] / total[0], total[2] / total[0]
     xx, xy, yy = total[3] / total[0] - mx * mx, total[4] / total[0] - mx * my, total[5] / total[0] - my * my
     angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
-    least = 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy)
+    least, most = 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy), 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)
     out = grid.surfaces[v]
     out[0], out[1], out[2], out[3] = mx, my, -math.sin(angle), math.cos(angle)
     out[4] = max(least, 0.0) + grid.noise if found >= 3 else math.inf  # two voxels have a direction, but no thickness
+    out[5] = out[4] / (total[0] * most) if most > 0.0 else math.inf  # of a line fit: variance across over the spread along
 
 
 @numba.njit(cache=True)

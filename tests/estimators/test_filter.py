@@ -19,7 +19,7 @@ from localization.errors import EstimatorError
 from localization.estimators.filter import BIAS, CLOCK, KEY, MAP, PARAMS, POSE, SCALE, START, Filter, FilterConfig
 from localization.events import Scan, WheelSample
 from localization.gyro import Turn
-from localization.lidar import KeyScanError
+from localization.lidar import KeyScanError, select_measured
 from localization.synchronizer import Step, Synchronizer, steps
 from motion_models import se2
 from motion_models.base import Motion
@@ -265,7 +265,7 @@ def test_outlier_covariance_widens_the_pose_before_the_update():
     np.testing.assert_allclose(plain.pose, wide.pose)
 
 
-KEY_SCAN = KeyScanError(np.array([[0.4, 0.02, 0.0], [0.02, 0.3, 0.01], [0.0, 0.01, 0.35]]), 2.0 * LIDAR, np.diag([1e-6, 2e-6, 1e-7]))
+KEY_SCAN = KeyScanError(0.35, 2.0 * LIDAR, np.diag([1e-6, 2e-6, 1e-7]))
 SAMPLES = 40_000
 
 
@@ -278,7 +278,7 @@ def assert_scatter(errors, P):
 
 @pytest.mark.parametrize("is_matched", [True, False])
 def test_covariance_is_the_scatter_of_errors_by_monte_carlo(is_matched):
-    """Errors drawn, updated with the gain and put into the submap, e_map' = (I - W) e_map + W (e_pose - n) + m, one by one."""
+    """Errors drawn, updated with the gain and put into the submap, e_map' = (1 - s) e_map + s (e_pose - W n) + m, one by one."""
     ekf, measured = prepared(5)
     rng = np.random.default_rng(0)
     e = rng.multivariate_normal(np.zeros(SIZE), ekf.P, SAMPLES, method="cholesky")
@@ -292,8 +292,9 @@ def test_covariance_is_the_scatter_of_errors_by_monte_carlo(is_matched):
         ekf.update_scan(measured, LIDAR, NOTHING)
         assert_scatter(e, ekf.P)
     ekf.insert_key_scan(KEY_SCAN)
-    W, m = KEY_SCAN.weight, rng.multivariate_normal(np.zeros(3), KEY_SCAN.new_cov, SAMPLES)
-    e[:, MAP] = e[:, MAP] @ (np.eye(3) - W).T + (e[:, POSE] - n) @ W.T + m
+    s, m = KEY_SCAN.share, rng.multivariate_normal(np.zeros(3), KEY_SCAN.new_cov, SAMPLES)
+    W = select_measured(LIDAR if is_matched else KEY_SCAN.noise_cov)
+    e[:, MAP] = (1.0 - s) * e[:, MAP] + s * (e[:, POSE] - n @ W.T) + m
     assert_scatter(e, ekf.P)
 
 
@@ -308,8 +309,9 @@ def test_first_key_scan_makes_the_map_err_as_the_pose():
     """Drawn where the robot is, an error of the pose is one of the submap: against it, the pose is known but for the scan's noise."""
     ekf, _ = prepared(7)
     ekf.P[MAP], ekf.P[:, MAP] = 0.0, 0.0
-    ekf.insert_key_scan(KeyScanError(np.eye(3), LIDAR, NOTHING))
-    np.testing.assert_allclose(ekf.map_relative_cov(), LIDAR, atol=1e-12)
+    ekf.insert_key_scan(KeyScanError(1.0, LIDAR, NOTHING))
+    W = select_measured(LIDAR)
+    np.testing.assert_allclose(ekf.map_relative_cov(), W @ LIDAR @ W.T, atol=1e-12)
 
 
 # --- a covariance stays a covariance

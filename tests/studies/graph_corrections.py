@@ -24,27 +24,27 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from localization.estimators.ekf import EkfConfig
-from localization.steps import Stepper
 
+from localization.estimators.filter import FilterConfig
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.evaluate import evaluate
 from localization.events import Event
+from localization.lidar import LidarConfig
 from localization.logs import open_log
 from localization.online.core import Core, Pair
 from localization.references import ReferenceTrack, reference_track
 from localization.simulate.experiments import ExperimentConfig
 from localization.simulate.simulator import SimulationConfig, simulate, write_simulation
 from localization.simulate.suite import START_NS
+from localization.synchronizer import Synchronizer
 from localization.trajectory import Trajectory
 from motion_models import se2
-from motion_models.base import Motion
 from motion_models.corrections import Form, correctable, corrections
 from motion_models.registry import make_model
 from motion_models.robot import Mount, load_robot
 from motion_models.se2 import FloatArray
-from tests.synthetic_steps import Seer
+from tests.synthetic_steps import PoseSensor, match_at
 
 POSTURES = 7
 SIGMAS = np.array([0.005, 0.005, 0.001])
@@ -97,28 +97,25 @@ def laps(seed: int = 0, count: int = 2 * POSTURES, effects: Mapping[str, float] 
 
 def drift(drive: Laps, model_name: str, form: Form, kind: str = "ekf", seed: int = 0) -> Drift:
     """Odometry with the parameters that the estimator ``kind`` learns with corrections of ``form``."""
-    robot, seer, rng = load_robot("vaultbot"), Seer(), np.random.default_rng(seed)
+    robot, sensor, rng = load_robot("vaultbot"), PoseSensor(), np.random.default_rng(seed)
     model = correctable(make_model(model_name, robot), form)
     corrected = corrections(model, form)
-    estimator: EkfFusion | GraphFusion
-    if kind == "ekf":
-        estimator = EkfFusion(model, corrected, robot, drive.mounts, True, EkfConfig(), witness=seer)
-    else:
-        estimator = GraphFusion(model, corrected, robot, drive.mounts, True, GraphConfig(), EkfConfig(), witness=seer)
-    stepper, truth = Stepper(model, robot, drive.mounts, True), Trajectory(drive.truth.stamps_ns, drive.truth.poses)
-    pose, anchor = np.zeros(3), None
+    ekf = EkfFusion(model, corrected, robot, sensor, FilterConfig())
+    estimator = ekf if kind == "ekf" else GraphFusion(ekf, corrected, LidarConfig(), GraphConfig(), is_smoothing=False)
+    stepper, truth = Synchronizer(model, robot, drive.mounts, True), Trajectory(drive.truth.stamps_ns, drive.truth.poses)
+    pose, start = np.zeros(3), None
     stamps, poses, params = [], [], []
 
     def take(steps) -> None:
-        nonlocal pose, anchor
+        nonlocal pose, start
         for step in steps:
             pose = se2.compose(pose, step.predicted.delta)
             now = truth.at(np.array([step.end_ns]))[0]
-            seer.next = None
+            sensor.next = None
             if step.scan is not None and np.isfinite(now).all():
-                if anchor is not None:
-                    seer.next = Motion(se2.compose(se2.between(anchor, now), se2.exp(SIGMAS * rng.normal(size=3))), np.diag(SIGMAS**2))
-                anchor = now
+                start = now if start is None else start
+                measured = se2.compose(se2.between(start, now), se2.exp(SIGMAS * rng.normal(size=3)))
+                sensor.next = match_at(measured, np.diag(SIGMAS**2))
             estimator.step(step)
             stepper.clock_offset_s, stepper.params = estimator.clock_offset_s, estimator.params
             stamps.append(step.end_ns)
