@@ -133,4 +133,4 @@ def _within_reach(place: FloatArray, points: FloatArray, prior: FloatArray, cov:
     half = np.minimum(3.0 * np.sqrt([np.trace(cov[:2, :2]), np.trace(cov[:2, :2]), cov[2, 2]]), limit)
     swept = half[:2] + half[2] * np.hypot(points[:, 0], points[:, 1]).max()
     is_near = ((place >= moved.min(axis=0) - swept) & (place <= moved.max(axis=0) + swept)).all(axis=1)
-    return place[is_near]
+    return np.asarray(place[is_near])
