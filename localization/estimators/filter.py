@@ -30,6 +30,8 @@ from motion_models.se2 import FloatArray
 
 POSE, START, MAP, KEY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 BIAS, SCALE, CLOCK, PARAMS = 12, 13, 14, 15
+_MIN_VARIANCE = 1e-14
+"""No relative motion is known better than a tenth of a micrometre or microradian [m^2, rad^2]."""
 _MAX_NUMBER = 1e12
 """No state or covariance of a robot on Earth is larger, in SI units."""
 
@@ -152,7 +154,7 @@ class Filter:
         delta = se2.between(self.start if clone == START else self.key, self.pose)
         J = np.hstack([np.eye(3), -se2.adjoint(se2.inverse(delta))])
         states = np.r_[POSE, clone]
-        return delta, J @ self.P[np.ix_(states, states)] @ J.T
+        return delta, _positive(J @ self.P[np.ix_(states, states)] @ J.T)
 
     def _update(self, innovation: FloatArray, H: FloatArray, R: FloatArray) -> tuple[float, FloatArray]:
         """Schmidt-Kalman update in Joseph's form; consider states have no gain. Returns NIS and gain. Raises `EstimatorError`."""
@@ -176,6 +178,12 @@ class Filter:
         self.scale += float(error[SCALE])
         self.clock_offset += float(error[CLOCK])
         self.corrections = self.corrections + error[PARAMS:]
+
+
+def _positive(cov: FloatArray) -> FloatArray:
+    """``cov`` (n, n), a difference of large covariances, without the negative eigenvalues that rounding leaves in it."""
+    values, vectors = np.linalg.eigh(_symmetric(cov))
+    return np.asarray((vectors * np.maximum(values, _MIN_VARIANCE)) @ vectors.T, dtype=float)
 
 
 def _symmetric(P: FloatArray) -> FloatArray:
