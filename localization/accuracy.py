@@ -85,7 +85,7 @@ class Accuracy:
     """Samples that were not usable: not finite or of a repeated stamp."""
     overlap: float = 0.0
     """Part of the trajectory's duration between first and last match, 0 to 1."""
-    reference_T_world: FloatArray | None = field(default=None, compare=False)  # noqa: N815
+    reference_T_world: FloatArray | None = field(default=None, compare=False)
     """(3,) the alignment by the whole path: puts the trajectory's poses into the reference's plane."""
     errors: ErrorSeries | None = field(default=None, compare=False)
     notes: tuple[str, ...] = ()
