@@ -27,7 +27,7 @@ from motion_models.robot import WheelNoise
 from tests import rooms
 
 QUIET = WheelNoise(*[1e-8] * 8)
-SCANNER = rooms.Beams(beams=240, rate_hz=6.25, longest=8.0)
+SCANNER = rooms.Beams(beams=240, rate_hz=6.25, noise=0.03, longest=8.0)
 RADIUS_ERROR, TURN_ERROR = 1.03, 1.1
 """Wheels count more than they drive and turn."""
 
