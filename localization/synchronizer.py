@@ -171,8 +171,10 @@ class Synchronizer:
         return None if end_ns - self._start_ns < least / _NS else (end_ns, None)
 
     def _has_rates_until(self, stamp_ns: int) -> bool:
-        known_ns = self._wheels.told_ns
-        return known_ns is not None and known_ns >= stamp_ns + self.clock_offset_s / _NS
+        """Of the wheels, and of a gyro that is not silent: which of them comes first must not matter."""
+        known_ns, gyro_ns = self._wheels.told_ns, self._gyro.newest_ns
+        is_gyro_known = gyro_ns is None or gyro_ns >= stamp_ns or self._now_ns > gyro_ns + self.config.wait_s / _NS
+        return is_gyro_known and known_ns is not None and known_ns >= stamp_ns + self.clock_offset_s / _NS
 
     def _step(self, start_ns: int, end_ns: int, scan: Scan | None) -> Step:
         shift = round(self.clock_offset_s / _NS)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,7 +29,8 @@ _WRAP_RAD, _WRAP_WITHOUT_RATE_RAD = 0.3, 1.0
 _LATEST_NS = 1_000_000_000  # of a second publisher, after its reading before; drivers publish at 10 Hz and more
 
 
-class _Chain(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Chain:
     """Readings that follow from each other: those of one publisher."""
 
     reading: JointReading
