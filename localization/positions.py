@@ -10,7 +10,7 @@ from localization.errors import LogError
 from localization.events import Event, PositionSample, Reference
 
 _UNKNOWN_SIGMA_M = 2.5
-"""Of a source that gives no covariance [m]: a GPS receiver without corrections (GPS Standard Positioning Service, 2020: 95 % within 8 m)."""
+"""Where a source has no covariance [m]: GPS receiver without corrections (GPS Standard Positioning Service, 2020: 95 % within 8 m)."""
 _MIN_SIGMA_M = 0.01
 """No receiver is better, whatever its covariance [m]."""
 
