@@ -9,7 +9,7 @@
 # # 5. Filter and graph agree, and their covariances are as large as their errors
 #
 # **Claim: where the noise is as assumed, the filter's errors are as large as its covariance; where it is not, NEES and coverage show it.
-# On simulated and real logs the factor graph, live, stays near the filter.**
+# On the simulated and real logs below the live factor graph stays within 2.1 of the filter's sigmas.**
 #
 # A consistent estimator has normalised errors `e^T P^-1 e` (NEES) that average to the number of the error's components, 3 for a
 # pose, and its 95 % regions contain the truth in 95 of 100 runs. One run is one sample: errors along a run are not independent.

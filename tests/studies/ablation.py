@@ -123,7 +123,7 @@ PATCHES: Mapping[str, Patch] = {
         _wrap(ScanMatcher, "_align", _align_freely), _wrap(ScanMatcher, "_result", _result_freely)
     ),
     "thickness of surfaces": _attribute(scan_matcher, "make_grid", _thin_grid),
-    "block variance ratio": _attribute(ScanMatcher, "_variance_ratio", property(lambda self: 1.0)),
+    "block variance ratio": _attribute(ScanMatcher, "_variance_ratio", lambda self, which: 1.0),
     "submap's error": _attribute(Filter, "insert_key_scan", lambda self, error: None),
     "submap's error as consider state (independent noise, instead)": _wrap(Filter, "predict", _independent),
     "new surfaces' error of key scans": _wrap(Filter, "insert_key_scan", _without_new),
