@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -79,8 +79,8 @@ class JointsToWheels:
             step, is_reset = self._mended_step(chain.reading, reading, velocity)
             if is_reset:
                 self._tally.count(self._topic, Oddity.WHEEL_JUMP)
-                self._other = chain._replace(turned=0.0)
-                chain = chain._replace(turned=0.0)
+                self._other = replace(chain, turned=0.0)
+                chain = replace(chain, turned=0.0)
             chain = self._chain = self._follow(chain, reading, step)
         yield WheelSample(reading.stamp_ns, self._side_means(velocity), self._side_means(chain.angle))
 
