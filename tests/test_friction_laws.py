@@ -204,7 +204,7 @@ def test_a_robot_file_chooses_the_law():
         ("contact = true", "models.friction.contact is True; there are isotropic, thesis"),
         ("contact = 1", "models.friction.contact must be text or true or false, found 1"),
         ('centripetal = "yes"', "models.friction.centripetal is 'yes'; it must be true or false"),
-        ('slip_stiffness = "soft"', "models.friction.slip_stiffness must be a finite number, found 'soft'"),
+        ('slip_stiffness = "soft"', "models.friction.slip_stiffness must be a finite number of at most 1e.09, found 'soft'"),
     ],
 )
 def test_a_choice_that_does_not_exist_is_named(entry, message):

@@ -138,7 +138,7 @@ def test_a_log_ten_times_as_long_takes_no_more_memory(tmp_path: Path, write: Cal
         for i in range(steps):
             stamp = START + i * S // 20
             yield "/joint_states", bags.joint_state(stamp, velocity=[1, 2, 3, 4]), stamp + 5_000_000
-            yield "/scan", bags.laser_scan(stamp, ranges, angle_increment=0.01), stamp + 50_000_000
+            yield "/scan", bags.laser_scan(stamp, ranges, angle_increment=0.003), stamp + 50_000_000
 
     short, few = _peak(write(tmp_path / "short", long_records(250)))
     long, many = _peak(write(tmp_path / "long", long_records(2500)))

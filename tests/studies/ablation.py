@@ -95,12 +95,8 @@ def _thin_grid(*arguments: Any) -> VoxelGrid:
 
 def _align_freely(original: Callable[..., Any], self: ScanMatcher, points: Any, prior: Any, cov: Any, guess: Any) -> Any:
     """The prior sets the reach of associations but does not pull."""
-    pose, H, found = scan_matcher._align(self._grid, points, prior, cov, np.linalg.inv(_NO_PRIOR), guess)
-    return scan_matcher.Fit(pose, H, *(float(value) for value in found))
-
-
-def _result_freely(original: Callable[..., Any], self: ScanMatcher, fit: Any, prior: Any, cov: Any, outlier_cov: Any) -> Any:
-    return original(self, fit, prior, _NO_PRIOR, outlier_cov)
+    pose, H, g, found = scan_matcher._align(self._grid, points, prior, cov, np.linalg.inv(_NO_PRIOR), guess)
+    return scan_matcher.Fit(pose, H, g, *(float(value) for value in found))
 
 
 _NO_SEARCH = (
@@ -119,9 +115,7 @@ PATCHES: Mapping[str, Patch] = {
         scan_matcher, "_is_better", lambda found, fit, prior, cov: found.overlap > fit.overlap
     ),
     "prior as possible outlier": _attribute(scan_matcher, "_OUTLIER_COST", math.inf),
-    "prior in the least squares": lambda: _together(
-        _wrap(ScanMatcher, "_align", _align_freely), _wrap(ScanMatcher, "_result", _result_freely)
-    ),
+    "prior in the least squares": _wrap(ScanMatcher, "_align", _align_freely),
     "thickness of surfaces": _attribute(scan_matcher, "make_grid", _thin_grid),
     "block variance ratio": _attribute(ScanMatcher, "_variance_ratio", lambda self, which: 1.0),
     "submap's error": _attribute(Filter, "insert_key_scan", lambda self, error: None),
