@@ -20,7 +20,7 @@ _KEPT = 150
 """Coarse candidates that are refined."""
 _MAX_CANDIDATES = 200_000
 """Poses that the coarsest level may score; a wider window gets a coarser level."""
-_TOGETHER = 6.0
+CORRELATED_BEAMS = 6.0
 """Neighbouring beams that err together, where scores are compared: they hit one surface."""
 _APART_CELLS = 6
 """A pose is another one, and not the flank of the best, from so many cells away on."""
@@ -104,7 +104,7 @@ def _count(half: FloatArray, yaws: int, step: float) -> float:
 
 
 def _pick(prior: FloatArray, shifts: FloatArray, scores: FloatArray, n: int, information: FloatArray, step: FloatArray) -> SearchResult:
-    log_likelihood = n / _TOGETHER * np.log(np.maximum(scores, 1e-6))
+    log_likelihood = n / CORRELATED_BEAMS * np.log(np.maximum(scores, 1e-6))
     best = int(np.argmax(log_likelihood - 0.5 * np.einsum("ki,ij,kj->k", shifts, information, shifts)))
     away = shifts - shifts[best]
     is_elsewhere = (np.hypot(away[:, 0], away[:, 1]) > _APART_CELLS * step[0]) | (np.abs(away[:, 2]) > _APART_CELLS * step[2])

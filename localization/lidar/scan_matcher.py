@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 import numba
 import numpy as np
 
-from localization.lidar.correlative_search import LikelihoodImage, draw_image, search
+from localization.lidar.correlative_search import CORRELATED_BEAMS, LikelihoodImage, draw_image, search
 from localization.lidar.submap import VoxelGrid, fill_surface, find_nearest, make_grid, measure_shares, voxel_means
 from localization.settings import Allowed, Below, Count, Positive, Settings, Share
 from motion_models import se2
@@ -35,8 +35,6 @@ _BLOCK = 30
 10 to 20 beams, those of simulated rooms over 1 to 10."""
 _FORGETTING = 0.98
 """Of the residuals' statistics, per scan: they are a mean over the last 50 scans."""
-_TOGETHER = 6.0
-"""Neighbouring beams that err together, where two poses are compared: they hit one surface."""
 _OUTLIER_COST = 12.5
 """-log of the odds that the prior is an outlier (wheels that slip or count wrongly): a deviation of 5 sigma."""
 _SEARCH_FACTOR = 9.0
@@ -348,7 +346,7 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
             for b in range(3):
                 H[a, b] += weight * J[a] * J[b]
                 spurious[a, b] += weight * min(surface[5], 1.0) * T[a] * T[b]
-    found = np.array([fitting / max(n, 1), 0.5 * cost / _TOGETHER, squares, block_squares, fitting, mapped])
+    found = np.array([fitting / max(n, 1), 0.5 * cost / CORRELATED_BEAMS, squares, block_squares, fitting, mapped])
     _discount(H, g, spurious)
     return H, g, found
 
