@@ -34,7 +34,7 @@ check: .venv/ready
 	$(BIN)/lint-imports
 
 benchmark: .venv/ready
-	$(BIN)/python -m tests.benchmark
+	$(BIN)/python -m tests.benchmarks.all
 
 clean:
 	rm -rf .venv .ros2 $(DEMO)

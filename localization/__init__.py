@@ -1,11 +1,11 @@
 """Localization of skid-steer robots: logs, LiDAR, estimators, scores and reports. The names here are what a notebook needs."""
 
 from localization.estimators import ESTIMATORS, EstimatorConfig
-from localization.evaluate import Accuracy, evaluate
+from localization.evaluation.metrics import Accuracy, evaluate
+from localization.evaluation.references import read_reference_file, reference_track
+from localization.evaluation.scores import Result, score
 from localization.logs import Log, TopicOverrides, open_log
-from localization.references import read_reference_file, reference_track
-from localization.run import Pair, ReplayConfig, Run, replay
-from localization.score import Result, score
+from localization.pipeline import ReplayConfig, Run, Trial, replay
 from localization.trajectory import Trajectory, read_tum, write_tum
 
 __all__ = [
@@ -13,12 +13,12 @@ __all__ = [
     "Accuracy",
     "EstimatorConfig",
     "Log",
-    "Pair",
     "ReplayConfig",
     "Result",
     "Run",
     "TopicOverrides",
     "Trajectory",
+    "Trial",
     "evaluate",
     "open_log",
     "read_reference_file",

@@ -35,7 +35,7 @@ class Turn:
     """Time that the bias acted [s]."""
 
 
-class GyroHistory:
+class GyroBuffer:
     """The last seconds of the yaw rate.
 
     Gravity shows which axis of the IMU is upright. Where the mount says another one, the rate is that about gravity, and whether this
@@ -60,7 +60,7 @@ class GyroHistory:
         self._contradicts, self._sign = False, 1.0
         self._agreement = self._turned = 0.0
 
-    def push(self, sample: ImuSample) -> None:
+    def insert(self, sample: ImuSample) -> None:
         """Take the next sample; one that does not come after the newest changes nothing."""
         if sample.frame_id != self._frame:
             self._begin(sample)
@@ -127,7 +127,7 @@ class GyroHistory:
         variance = self._noise.white_rad_per_sqrt_s**2 * dt + (self._noise.scale_sigma * angle) ** 2
         return Turn(self._sign * angle, variance, dt)
 
-    def notes(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """What a user should know about the IMU."""
         said = []
         if self._spikes:

@@ -1,33 +1,33 @@
 """Motion models of skid-steer robots whose centre of gravity moves: pure functions of wheels, CG and parameters."""
 
 from motion_models.base import Motion, MotionModel, Twist
-from motion_models.calibrate import Fit, fit
-from motion_models.center_of_gravity import CgModel, cg_model, static_part_from_weighing
-from motion_models.center_of_rotation import CenterOfRotation, center_from_end_poses, center_of_arc
-from motion_models.cg_files import arms_model, arms_postures, urdf_cg, weighed_cg
-from motion_models.cg_parts import Arms, CgEstimate, Payload, StaticPart, Tolerances, support_margin
-from motion_models.cg_tracker import CgTracker
-from motion_models.cross_validation import HeldOut, Interval, cross_validate, root_mean, root_mean_gain
+from motion_models.calibration.center_of_rotation import CenterOfRotation, center_from_end_poses, center_of_arc
+from motion_models.calibration.cross_validation import HeldOut, Interval, cross_validate, root_mean, root_mean_gain
+from motion_models.calibration.fit import Fit, fit
+from motion_models.calibration.least_squares import FitConfig
+from motion_models.calibration.maneuvers import Maneuver
+from motion_models.calibration.prediction import WITNESS_NAMES
+from motion_models.calibration.regressions import RotationTable, read_rotation_table, skid_steer_fit
+from motion_models.calibration.ros_export import diff_drive_controller_yaml, multiplier_table, multipliers, robot_localization_yaml
+from motion_models.calibration.rotations import rotations_as_maneuvers
+from motion_models.calibration.windows_table import read_windows, windows_text
+from motion_models.center_of_gravity.files import arms_model, arms_postures, urdf_cg, weighed_cg
+from motion_models.center_of_gravity.model import CgModel, cg_model, static_part_from_weighing
+from motion_models.center_of_gravity.parts import Arms, CgEstimate, Payload, StaticPart, Tolerances, support_margin
+from motion_models.center_of_gravity.postures import posture_for
+from motion_models.center_of_gravity.tracker import CgTracker
+from motion_models.center_of_gravity.weighing import Scales, WeighedCg, cg_from_scales, read_weighings, wheel_contacts
 from motion_models.diff_drive import DiffDrive
 from motion_models.errors import CalibrationError, CgError, ModelError, RobotError, SkidlocError
 from motion_models.friction import FrictionModel
 from motion_models.friction.dynamics import FrictionDynamics
 from motion_models.full_linear import FullLinear
 from motion_models.icr import Icr
-from motion_models.integrate import preintegrate
-from motion_models.least_squares import FitConfig
-from motion_models.maneuvers import Maneuver
-from motion_models.postures import posture_for
-from motion_models.prediction import WITNESS_NAMES
+from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
-from motion_models.regressions import RotationTable, read_rotation_table, skid_steer_fit
 from motion_models.robot import Robot, load_robot, parse_robot, robot_names
 from motion_models.robot_file import robot_toml
-from motion_models.ros_export import diff_drive_controller_yaml, multiplier_table, multipliers, robot_localization_yaml
-from motion_models.rotations import rotations_as_maneuvers
 from motion_models.skid_steer import SkidSteer, thesis_coefficients
-from motion_models.weighing import Scales, WeighedCg, cg_from_scales, read_weighings, wheel_contacts
-from motion_models.windows_table import read_windows, windows_text
 
 __all__ = [
     "MODELS",

@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from motion_models.cg_parts import Arms
+from motion_models.center_of_gravity.parts import Arms
 from motion_models.errors import RobotError
 from motion_models.se2 import FloatArray
 from motion_models.text_files import read_text

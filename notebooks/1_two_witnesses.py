@@ -19,11 +19,11 @@ import itertools
 
 from scipy.stats import chi2
 
-from localization import Pair, open_log, read_reference_file, replay, score
-from localization.plots_notebook import Panel, Series, picture, table, trajectories
-from localization.report import verdict
-from localization.report_data import nis_means, spans
-from localization.report_lines import make_lines
+from localization import Trial, open_log, read_reference_file, replay, score
+from localization.report.figure_data import nis_means, spans
+from localization.report.notebook import Panel, Series, picture, table, trajectories
+from localization.report.replay_page import verdict
+from localization.report.runs import make_lines
 from motion_models import load_robot, make_model
 
 LOG_S = 1400.0  # all of it
@@ -39,7 +39,7 @@ f"{log.duration_s:.0f} s; wheels on {log.sources.wheels.topic}, LiDAR on {log.so
 
 # %%
 model = make_model("diff_drive", robot)
-pairs = [Pair(model, estimator) for estimator in ("odometry", "lidar", "ekf")]
+pairs = [Trial(model, estimator) for estimator in ("odometry", "lidar", "ekf")]
 part = itertools.takewhile(lambda event: event.stamp_ns < log.start_ns + LOG_S * 1e9, log.events())
 runs = replay(part, pairs, robot, log.mounts, has_lidar=True)
 results = score(runs, truth)

@@ -19,11 +19,11 @@
 # %%
 import numpy as np
 
-from localization.calibration import Cut, calibrated
-from localization.plots_notebook import CYCLE, MARKERS, Panel, Series, picture, table
-from localization.simulate import SensorConfig, SimulationConfig, simulate
+from localization.calibration.calibrate import Cut, calibrated
+from localization.report.notebook import CYCLE, MARKERS, Panel, Series, picture, table
+from localization.simulation import SensorConfig, SimulationConfig, simulate
 from motion_models import SkidSteer, load_robot, make_model, read_rotation_table, rotations_as_maneuvers, se2, thesis_coefficients
-from motion_models.regressions import cor_x, cor_y_full, cor_y_lines, cor_y_multivariate, rotation_ratio
+from motion_models.calibration.regressions import cor_x, cor_y_full, cor_y_lines, cor_y_multivariate, rotation_ratio
 
 robot = load_robot("vaultbot")
 grid = read_rotation_table("../tests/data/vaultbot/rotation_grid.csv")

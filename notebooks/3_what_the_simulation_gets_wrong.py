@@ -19,11 +19,11 @@ import numpy as np
 
 from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import drive_of_table
-from localization.plots_notebook import CYCLE, MARKERS, Bars, Panel, Series, picture, table
-from localization.simulate import SensorConfig, SimulationConfig, simulate
+from localization.report.notebook import CYCLE, MARKERS, Bars, Panel, Series, picture, table
+from localization.simulation import SensorConfig, SimulationConfig, simulate
 from motion_models import center_from_end_poses, fit, load_robot, make_model, read_rotation_table, rotations_as_maneuvers
-from motion_models.least_squares import FitConfig
-from motion_models.regressions import rotation_ratio
+from motion_models.calibration.least_squares import FitConfig
+from motion_models.calibration.regressions import rotation_ratio
 from motion_models.robot import WheelNoise
 
 robot = load_robot("vaultbot")
@@ -186,7 +186,7 @@ f"turns least at x_G = {-500.0 * b / a:+.1f} mm; its centre of rotation is off b
 # %% [markdown]
 # All rotations were counter-clockwise. Had half of them been clockwise, the treads' size would be known 20 times better (sigma 0.0007
 # instead of 0.013), any other cause's at most 1.4 times: the simulator turned a robot with these errors 136 times, one way or both
-# (`python -m tests.diagnosis_rotations`).
+# (`python -m tests.helpers.diagnosis_rotations`).
 
 # %% [markdown]
 # ## What is left

@@ -24,11 +24,11 @@ from pathlib import Path
 
 import numpy as np
 
-from localization.plots_notebook import Bars, Panel, Series, picture, table
-from localization.simulate import EFFECTS
+from localization.report.notebook import Bars, Panel, Series, picture, table
+from localization.simulation import EFFECTS
 
 sys.path.insert(0, "..")
-from tests.diagnosis_drives import TYPICAL, bag, look
+from tests.helpers.diagnosis_drives import TYPICAL, bag, look
 
 table(
     ["you may hide", "unit", "a size that robots have", "meaning"],

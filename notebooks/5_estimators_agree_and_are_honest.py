@@ -22,15 +22,15 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
-from localization import Pair, open_log, replay
-from localization.consistency import consistency, mean_over_runs, nees
-from localization.plots_notebook import Bars, Panel, Series, picture, table
+from localization import Trial, open_log, replay
+from localization.evaluation.consistency import consistency, mean_over_runs, nees
+from localization.report.notebook import Bars, Panel, Series, picture, table
 from localization.trajectory import Trajectory
 from motion_models import load_robot, make_model, se2
 
 sys.path.insert(0, "..")
+from tests.helpers.synthetic_steps import PoseSensor, make_filter, run
 from tests.studies.graph_corrections import laps
-from tests.synthetic_steps import PoseSensor, make_filter, run
 
 RUNS, STEPS = 40, 150
 LAPS = 7
@@ -151,12 +151,12 @@ def replay_log(path, robot, seconds):
     """Filter and graph over the first ``seconds`` of a log."""
     log = open_log(f"../tests/data/{path}", robot)
     part = itertools.takewhile(lambda e: e.stamp_ns < log.start_ns + seconds * 1e9, log.events())
-    return replay(part, [Pair(make_model("diff_drive", robot), kind) for kind in KINDS], robot, log.mounts, log.sources.lidar is not None)
+    return replay(part, [Trial(make_model("diff_drive", robot), kind) for kind in KINDS], robot, log.mounts, log.sources.lidar is not None)
 
 
 vaultbot, drive = load_robot("vaultbot"), laps(count=LAPS)
 found = {
-    "laps": replay(drive.events, [Pair(make_model("skid_steer", vaultbot), kind) for kind in KINDS], vaultbot, drive.mounts, True),
+    "laps": replay(drive.events, [Trial(make_model("skid_steer", vaultbot), kind) for kind in KINDS], vaultbot, drive.mounts, True),
     "ACES": replay_log("aces/aces.mcap", load_robot("aces"), 120.0),
     "Husky": replay_log("husky-outdoor-gps/test1.bag", load_robot("husky_a200"), 300.0),
 }

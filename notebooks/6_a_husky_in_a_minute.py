@@ -19,9 +19,9 @@ import sys
 
 import numpy as np
 
-from localization.calibration import Cut, calibrated, turning
-from localization.maneuver_windows import driven
-from localization.plots_notebook import Bars, Panel, Series, picture, table
+from localization.calibration.calibrate import Cut, calibrated, turning
+from localization.calibration.windows import driven
+from localization.report.notebook import Bars, Panel, Series, picture, table
 from motion_models import make_model, root_mean
 
 sys.path.insert(0, "..")

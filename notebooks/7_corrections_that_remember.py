@@ -25,11 +25,11 @@ from pathlib import Path
 import numpy as np
 
 from localization import open_log, reference_track
-from localization.plots_notebook import CYCLE, MARKERS, Panel, Series, picture, table
-from localization.simulate import Experiment, ExperimentConfig, SensorConfig, Simulation, SimulationConfig, write_simulation
-from localization.simulate.drives import MoveArms, Rest, Route, TurnTo
-from localization.simulate.scanners import ScannerConfig
-from localization.simulate.suite import START_NS
+from localization.report.notebook import CYCLE, MARKERS, Panel, Series, picture, table
+from localization.simulation import Experiment, ExperimentConfig, SensorConfig, Simulation, SimulationConfig, write_simulation
+from localization.simulation.drives import MoveArms, Rest, Route, TurnTo
+from localization.simulation.scanners import ScannerConfig
+from localization.simulation.sensor_suite import START_NS
 from motion_models import load_robot
 
 sys.path.insert(0, "..")

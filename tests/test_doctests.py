@@ -21,7 +21,9 @@ MODULES = sorted(
 
 
 def test_there_are_examples_of_what_a_user_calls_first():
-    assert {"motion_models.se2", "motion_models.registry", "localization.score", "localization.calibration"} <= set(MODULES)
+    assert {"motion_models.se2", "motion_models.registry", "localization.evaluation.scores", "localization.calibration.calibrate"} <= set(
+        MODULES
+    )
 
 
 @pytest.mark.parametrize("name", MODULES)

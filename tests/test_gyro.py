@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from localization.events import ImuSample
-from localization.gyro import GyroHistory
+from localization.gyro import GyroBuffer
 from motion_models.robot import GyroNoise, Mount
-from tests import bags
+from tests.helpers import bags
 
 MS, S, T0 = 1_000_000, bags.S, bags.START
 NOISE = GyroNoise()
@@ -40,17 +40,17 @@ def samples(seconds, body_R_imu=None, gravity=9.81, hz=100.0, start_s=0.0, frame
 
 
 def history(events, mounts=None, noise=NOISE):
-    made = GyroHistory(noise, mounts or {})
+    made = GyroBuffer(noise, mounts or {})
     for event in events:
-        made.push(event)
+        made.insert(event)
     return made
 
 
 def turns(events, mounts=None, window_s=0.1, wheels=lambda a, b: turned(b) - turned(a)):
     """(start, end, turn) of windows asked for as the samples come, and the history."""
-    made, found, start = GyroHistory(NOISE, mounts or {}), [], 0.0
+    made, found, start = GyroBuffer(NOISE, mounts or {}), [], 0.0
     for event in events:
-        made.push(event)
+        made.insert(event)
         end = start + window_s
         if event.stamp_ns >= T0 + round(end * S):
             found.append((start, end, made.turn(T0 + round(start * S), T0 + round(end * S), wheels(start, end))))
@@ -105,7 +105,7 @@ def test_nothing_is_said_of_times_that_were_not_heard():
     past = history(samples(1.0, start_s=1.0))
     assert past.turn(T0 + 900 * MS, T0 + 1500 * MS, 0.0) is None
     assert past.turn(T0 + 1500 * MS, T0 + 2200 * MS, 0.0) is None
-    assert GyroHistory(NOISE, {}).turn(T0, T0 + S, 0.0) is None
+    assert GyroBuffer(NOISE, {}).turn(T0, T0 + S, 0.0) is None
     held = past.turn(T0 + 1900 * MS, T0 + 2050 * MS, 0.0)  # a sample or two that are still on their way
     assert held.angle == pytest.approx(turned(2.0) - turned(1.9) + 0.05 * rate(2.0), abs=1e-5)
 
@@ -134,7 +134,7 @@ def spoiled(wild, hz=100.0):
 def test_spikes_are_left_out_and_told(wild, hz):
     past = history(spoiled(wild, hz))
     assert past.turn(T0, T0 + 4 * S, 0.0).angle == pytest.approx(2.0, abs=1e-9)
-    (note,) = past.notes()
+    (note,) = past.warnings()
     assert note.startswith(f"IMU 'imu_link': {len(wild)} reading{'s' * (len(wild) > 1)} dropped")
     # meanwhile the last rate that was believed holds
     begun = spoiled(wild, hz)[: min(wild) + 1]
@@ -144,7 +144,7 @@ def test_spikes_are_left_out_and_told(wild, hz):
 def test_a_jump_that_lasts_is_believed_from_its_begin():
     past = history(samples(4.0, wz=lambda t: 12.0 if 2.0 <= t < 3.0 else 0.0))
     assert past.turn(T0, T0 + 4 * S, 0.0).angle == pytest.approx(12.0)
-    assert past.notes() == []
+    assert past.warnings() == []
 
 
 @pytest.mark.parametrize("hz", [10.0, 100.0])
@@ -152,7 +152,7 @@ def test_a_spike_at_the_begin_does_not_stand_against_all_others(hz):
     past = history(spoiled({0: 30.0}, hz))
     assert past.turn(T0, T0 + S, 0.0) is None
     assert past.turn(T0 + round(S / hz), T0 + 4 * S, 0.0).angle == pytest.approx(0.5 * (4.0 - 1.0 / hz), abs=1e-9)
-    (note,) = past.notes()
+    (note,) = past.warnings()
     assert "1 reading dropped" in note
 
 
@@ -173,7 +173,7 @@ def test_a_mount_that_is_true_gives_the_yaw_rate_however_it_stands(roll, pitch, 
     R = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
     found, past = turns(samples(2.0, R), {"imu_link": Mount(roll=roll, pitch=pitch, yaw=yaw)}, wheels=lambda a, b: 0.0)
     check_all_right(found, 0.0)
-    assert past.notes() == []
+    assert past.warnings() == []
 
 
 def test_mounts_are_taken_by_frame():
@@ -203,7 +203,7 @@ def test_a_mount_that_contradicts_gravity_is_set_right(case):
     assert len(sworn) > 80
     by_then = sum(abs(turned(b) - turned(a)) for a, b, _ in found[2 : told + 1])
     assert 0.4 < by_then < 0.7  # it waits for half a radian of turning by the wheels, and not longer
-    (note,) = past.notes()
+    (note,) = past.warnings()
     assert "imu_link" in note
     assert "contradicts gravity" in note
     axis = [float(number) for number in note[note.index("[") + 1 : note.index("]")].split(",")]
@@ -223,7 +223,7 @@ def test_before_the_wheels_have_told_the_axis_is_not_used():
     body_R_imu, _, _ = WRONG["upside down"]
     found, past = turns(samples(5.0, body_R_imu), wheels=lambda a, b: 0.001)
     assert all(t is None for a, _, t in found if a > 0.3)
-    (note,) = past.notes()
+    (note,) = past.warnings()
     assert "turned too little" in note
 
 
@@ -232,7 +232,7 @@ def test_without_gravity_the_mount_is_believed(gravity):
     """Drivers that publish no acceleration, or one in other units, say nothing of the mount."""
     found, past = turns(samples(3.0, gravity=gravity), {"imu_link": Mount()}, wheels=lambda a, b: 0.0)
     check_all_right(found, 0.0)
-    assert past.notes() == []
+    assert past.warnings() == []
     tipped = Rotation.from_euler("x", 180, degrees=True).as_matrix()
     found, past = turns(samples(3.0, tipped, gravity=gravity), {"imu_link": Mount(roll=math.pi)}, wheels=lambda a, b: 0.0)
     check_all_right(found, 0.0)
@@ -243,7 +243,7 @@ def test_a_slope_of_ten_degrees_is_no_contradiction(degrees):
     """Gravity alone cannot tell a slope from a mount: the mount holds, and the scale is off by the cosine."""
     R = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
     found, past = turns(samples(3.0, R), {"imu_link": Mount()}, wheels=lambda a, b: 0.0)
-    assert past.notes() == []
+    assert past.warnings() == []
     for start, end, turn in found:
         assert turn.angle == pytest.approx(math.cos(math.radians(10.0)) * (turned(end) - turned(start)), abs=2e-5)
 
@@ -254,13 +254,13 @@ def test_vibration_and_driving_do_not_look_like_another_mount():
         ImuSample(s.stamp_ns, s.angular_velocity, s.linear_acceleration + rng.normal([1.5, 0.0, 0.0], 2.0), s.frame_id)
         for s in samples(3.0)
     ]
-    assert history(shaken).notes() == []
+    assert history(shaken).warnings() == []
 
 
 def test_history_is_bounded():
-    past = GyroHistory(NOISE, {}, keep_s=2.0)
+    past = GyroBuffer(NOISE, {}, keep_s=2.0)
     for sample in samples(120.0):
-        past.push(sample)
+        past.insert(sample)
     assert len(past._stamps) == len(past._angles) <= 401
     turn = past.turn(T0 + 118_100 * MS, T0 + 119 * S, 0.0)
     assert turn.angle == pytest.approx(turned(119.0) - turned(118.1), abs=1e-4)

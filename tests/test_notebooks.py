@@ -8,7 +8,7 @@ import sys
 import nbformat
 import pytest
 
-from tests.notebook_tools import FOLDER, read, sources
+from tests.helpers.notebooks import FOLDER, read, sources
 
 # What makes a notebook long, and what it is here: the same cells, fewer seconds.
 SHORTER = {
@@ -45,7 +45,7 @@ def test_it_runs(source, monkeypatch):
 
 @pytest.mark.parametrize("source", sources(), ids=lambda source: source.stem)
 def test_what_is_shown_is_what_was_run(source):
-    """Mended by `python -m tests.notebook_tools NAME`."""
+    """Mended by `python -m tests.helpers.notebooks NAME`."""
     shown = nbformat.read(source.with_suffix(".ipynb"), as_version=4)
     nbformat.validate(shown)
     assert [(c.cell_type, c.source) for c in shown.cells] == [(c.cell_type, c.source) for c in read(source).cells]

@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 from localization.cli import main
 from localization.trajectory import read_tum
-from tests import bags, rooms
+from tests.helpers import bags, rooms
 
 DATA = Path(__file__).parent / "data"
 ACES, RELATIONS = DATA / "aces" / "aces.mcap", DATA / "aces" / "aces.relations"

@@ -7,19 +7,19 @@ import math
 
 import pytest
 
+from localization.calibration.windows import WindowConfig
 from localization.diagnosis.diagnose import DiagnosisConfig
 from localization.errors import SettingError
 from localization.estimators.filter import FilterConfig
-from localization.evaluate import EvaluateConfig
+from localization.evaluation.metrics import EvaluateConfig
 from localization.lidar import LidarConfig
-from localization.maneuver_windows import WindowConfig
-from localization.run import ReplayConfig
-from localization.simulate.experiments import ExperimentConfig
-from localization.simulate.scanners import ScannerConfig, SpinningConfig
-from localization.simulate.sensors import EncoderConfig, GpsConfig
-from localization.simulate.simulator import SimulationConfig
-from localization.simulate.suite import SensorConfig
-from localization.simulate.vehicle import VehicleConfig
+from localization.pipeline import ReplayConfig
+from localization.simulation.experiments import ExperimentConfig
+from localization.simulation.scanners import ScannerConfig, SpinningConfig
+from localization.simulation.sensor_suite import SensorConfig
+from localization.simulation.sensors import EncoderConfig, GpsConfig
+from localization.simulation.simulator import SimulationConfig
+from localization.simulation.vehicle import VehicleConfig
 from localization.synchronizer import StepConfig
 
 ROOTS = (ReplayConfig, SimulationConfig, DiagnosisConfig, WindowConfig, EvaluateConfig)

@@ -14,13 +14,14 @@ from hypothesis import strategies as st
 
 from localization.errors import EventError
 from localization.events import CgSample, ImuSample, Scan, WheelSample
-from localization.synchronizer import StepConfig, Synchronizer, steps
-from localization.wheel_history import WheelHistory
+from localization.synchronizer import StepConfig, Synchronizer
+from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
-from motion_models.integrate import preintegrate
+from motion_models.preintegration import preintegrate
 from motion_models.registry import make_model
 from motion_models.robot import Mount, load_robot
-from tests import bags
+from tests.helpers import bags
+from tests.helpers.steps import last_steps, steps, steps_after
 
 MS, S = 1_000_000, bags.S
 T0 = bags.START
@@ -82,9 +83,9 @@ def whole(samples, cg=(0.0, 0.0), model="skid_steer"):
 
 
 def history(samples, cg=(0.0, 0.0)):
-    made = WheelHistory(np.array(cg))
+    made = WheelBuffer(np.array(cg))
     for sample in samples:
-        made.push(sample)
+        made.insert(sample)
     return made
 
 
@@ -179,18 +180,18 @@ def test_repeated_and_late_samples_change_nothing(late):
 
 
 def test_each_interval_keeps_the_centre_of_gravity_that_held_then():
-    past = WheelHistory(np.array([0.0, 0.0]))
+    past = WheelBuffer(np.array([0.0, 0.0]))
     for i, x in enumerate([0.0, 0.0, 0.1, 0.2]):
         past.set_cg(CgSample(T0, np.array([x, -x])))
-        past.push(wheel(0.1 * i, (i, i)))
+        past.insert(wheel(0.1 * i, (i, i)))
     _, _, cg, _ = past.window(T0, T0 + 300 * MS, 0.5)
     np.testing.assert_allclose(cg, [[0.0, 0.0], [0.1, -0.1], [0.2, -0.2]])
 
 
 def test_history_is_bounded():
-    past = WheelHistory(np.zeros(2), keep_s=2.0)
+    past = WheelBuffer(np.zeros(2), keep_s=2.0)
     for i in range(20_000):
-        past.push(wheel(i / 100.0, (i, i)))
+        past.insert(wheel(i / 100.0, (i, i)))
     assert len(past._ends) == len(past._intervals) <= 401
     dt, rates, _, missing = past.window(T0 + 198 * S, T0 + 199 * S, 0.5)  # and the last seconds are all there
     assert missing == 0.0
@@ -276,10 +277,10 @@ def test_a_scan_waits_for_late_wheels():
     samples = wheels(1.0)
     cutter, found = stepper(), []
     for event in [*samples[:11], scan(0.0), scan(0.3)]:
-        found += cutter.push(event)
+        found += steps_after(event, cutter)
     assert [s.end_ns for s in found] == [T0]  # wheels were heard up to 0.2 s
     for event in samples[11:]:
-        found += cutter.push(event)
+        found += steps_after(event, cutter)
         if event.stamp_ns >= T0 + 300 * MS:
             break
     assert found[-1].end_ns == T0 + 300 * MS
@@ -302,7 +303,7 @@ def test_wheels_that_vanish_leave_a_wide_covariance_and_a_note():
         assert np.sqrt(step.predicted.cov[2, 2]) >= config.lost_rate_rad_s * step.duration * 0.999
         assert not step.predicted.delta.any()
         assert not step.twist.any()
-    assert f"no wheels were heard for {5.9 - 2.5:.1f} s" in cutter.notes()[-1]
+    assert f"no wheel data for {5.9 - 2.5:.1f} s" in cutter.warnings()[-1]
 
 
 @pytest.mark.parametrize("scan_s", [0.05, 0.1, 0.4])
@@ -353,10 +354,10 @@ def test_step_of_a_sweep_ends_at_its_middle():
 def test_sweep_waits_for_wheels_until_its_middle():
     cutter, found = stepper(), []
     for event in [*wheels(0.1), Scan(T0 + 100 * MS, np.ones((2, 3)), np.array([0.0, 0.08]))]:
-        found += cutter.push(event)
+        found += steps_after(event, cutter)
     assert not found
     for event in wheels(0.2, start_s=0.12):
-        found += cutter.push(event)
+        found += steps_after(event, cutter)
     assert [s.end_ns for s in found] == [T0 + 140 * MS]
 
 
@@ -374,7 +375,7 @@ def test_d_clock_is_the_derivative_of_the_motion_by_the_shift(wheel_hz):
 
     def shifted(offset):
         cutter = stepper()
-        cutter.clock_offset_s = offset
+        cutter.set_calibration(None, offset)
         return list(steps(events, cutter))
 
     found, less, more = shifted(0.0), shifted(-h), shifted(h)
@@ -389,7 +390,7 @@ def test_wheels_that_come_back_are_heard_again():
     check_contiguous(found)
     assert all(s.has_wheels for s in found if s.start_ns >= T0 + 5 * S or s.end_ns <= T0 + 2 * S)
     assert not any(s.has_wheels for s in found if s.start_ns >= T0 + 2600 * MS and s.end_ns < T0 + 4900 * MS)
-    assert cutter.notes()
+    assert cutter.warnings()
 
 
 def test_a_lidar_that_vanishes_leaves_steps_by_the_wheels():
@@ -413,7 +414,7 @@ def test_a_log_without_wheels_still_steps_from_scan_to_scan():
     found, cutter = cut(scans)
     assert [s.scan for s in found] == scans
     assert not any(s.is_standing for s in found)
-    assert "1.9 s" in cutter.notes()[0]
+    assert "1.9 s" in cutter.warnings()[0]
 
 
 def test_scans_that_come_late_or_twice_cannot_turn_time_back():
@@ -429,12 +430,12 @@ def test_scans_that_come_late_or_twice_cannot_turn_time_back():
         + ([] if (end - T0) % (20 * MS) == 0 else [WheelSample(end, NAN, interpolated(samples, end))])
     )
     np.testing.assert_allclose(composed(found), expected.delta, atol=1e-9)
-    assert "3 scans came after later ones" in cutter.notes()[0]
+    assert "3 scans came after later ones" in cutter.warnings()[0]
 
 
 def test_finish_turns_no_time_back_either():
     cutter = stepper()
-    found = [s for e in [*wheels(0.1), scan(0.05), scan(0.5), scan(0.4)] for s in cutter.push(e)] + list(cutter.finish())
+    found = [s for e in [*wheels(0.1), scan(0.05), scan(0.5), scan(0.4)] for s in steps_after(e, cutter)] + list(last_steps(cutter))
     check_contiguous(found, T0 + 50 * MS)
     assert found[-1].end_ns == T0 + 500 * MS
 
@@ -456,7 +457,7 @@ def test_clock_offset_shifts_what_is_used(late_s):
     scans = [scan(0.5 + 0.1 * i) for i in range(20)]
     expected, _ = cut(in_order(true, scans))
     cutter = stepper()
-    cutter.clock_offset_s = late_s
+    cutter.set_calibration(None, late_s)
     found = list(steps(in_order(late, scans), cutter))
     uncorrected, _ = cut(in_order(late, scans))
     scanned = [[s.predicted.delta for s in steps_ if s.scan is not None] for steps_ in (expected, found, uncorrected)]
@@ -471,7 +472,7 @@ def test_derivative_by_the_clock_is_that_of_numerical_differences(model):
     by_offset = {}
     for offset in (-h, 0.0, h):
         cutter = stepper(model=model)
-        cutter.clock_offset_s = offset
+        cutter.set_calibration(None, offset)
         by_offset[offset] = list(steps(in_order(samples, [scan(0.525), scan(0.875), scan(1.325)]), cutter))[1:3]
     for minus, at, plus in zip(*(by_offset[o] for o in (-h, 0.0, h)), strict=True):
         numerical = se2.log(se2.between(minus.predicted.delta, plus.predicted.delta)) / (2.0 * h)
@@ -509,9 +510,9 @@ def test_the_first_scan_has_the_twist_of_its_moment(scan_s):
     """Scans are swept from their stamp on, and the wheels of a robot that moves already tell how only by two samples."""
     cutter, model = stepper(model="diff_drive"), make_model("diff_drive", ROBOT)
     turned = lambda t: (3.0 * t, 3.5 * t)  # noqa: E731
-    assert not list(cutter.push(scan(scan_s)))
+    assert not list(steps_after(scan(scan_s), cutter))
     samples = wheels(0.2, turned=turned)
-    first = next(step for sample in samples for step in cutter.push(sample))
+    first = next(step for sample in samples for step in steps_after(sample, cutter))
     assert first.duration == 0.0
     assert first.has_wheels
     np.testing.assert_allclose(first.twist, model.twist(np.array([3.0, 3.5]), np.zeros(2), model.nominal).value, atol=1e-9)
@@ -522,11 +523,11 @@ def test_parameters_given_between_steps_hold_from_the_next_one_on():
     other = make_model("diff_drive", ROBOT).nominal * [1.1, 1.3]
     found = []
     for event in wheels(2.0):
-        for step in cutter.push(event):
-            cutter.params = other
+        for step in steps_after(event, cutter):
+            cutter.set_calibration(other, 0.0)
             found.append(step)
     before, after = stepper(model="diff_drive", has_lidar=False), stepper(model="diff_drive", has_lidar=False)
-    after.params = other
+    after.set_calibration(other, 0.0)
     expected = list(steps(wheels(2.0), before))[:1] + list(steps(wheels(2.0), after))[1:]
     for one, two in zip(found, expected, strict=False):
         np.testing.assert_array_equal(one.predicted.delta, two.predicted.delta)
@@ -547,7 +548,7 @@ def test_uncertain_centre_of_gravity_widens_the_prediction():
 def test_empty_scans_are_steps_and_are_told():
     found, cutter = cut(in_order(wheels(2.0), [scan(0.1 * i, n=i % 2) for i in range(1, 15)]))
     assert sum(s.scan is not None for s in found) == 14
-    assert "7 scans without a usable point" in cutter.notes()[0]
+    assert "7 scans without a usable point" in cutter.warnings()[0]
 
 
 def test_scans_of_an_unknown_frame_are_told_and_not_mixed_with_others():
@@ -556,7 +557,7 @@ def test_scans_of_an_unknown_frame_are_told_and_not_mixed_with_others():
     found, cutter = cut(in_order(ahead, known, strange))
     assert [s.scan for s in found if s.scan is not None] == known
     assert found[-1].end_ns > strange[-1].stamp_ns
-    (note,) = cutter.notes()
+    (note,) = cutter.warnings()
     assert "frame 'top'" in note
     assert "7 scans of it were not used" in note
     assert "[mounts.top]" in note
@@ -564,21 +565,21 @@ def test_scans_of_an_unknown_frame_are_told_and_not_mixed_with_others():
     # where none is known, they are all there is
     found, cutter = cut(in_order(ahead, strange))
     assert sum(s.scan is not None for s in found) == 7
-    (note,) = cutter.notes()
+    (note,) = cutter.warnings()
     assert "7 scans of it were taken as if from the body's origin" in note
     # the first of them may come before any other
     found, cutter = cut(in_order(ahead, [scan(0.05, frame="top")], known, strange))
     assert sum(s.scan is not None for s in found) == 8
-    assert ["1 scan of it was taken" in note or "7 scans of it were not used" in note for note in cutter.notes()] == [True, True]
+    assert ["1 scan of it was taken" in note or "7 scans of it were not used" in note for note in cutter.warnings()] == [True, True]
 
 
 def test_scans_without_times_are_told_where_the_robot_turns():
     timed = [replace(scan(0.1 * i), offsets=np.zeros(1)) for i in range(1, 15)]
     spin = wheels(2.0, turned=lambda t: (-3.0 * t, 3.0 * t))
-    (note,) = cut(in_order(spin, [scan(0.1 * i) for i in range(1, 15)]))[1].notes()
+    (note,) = cut(in_order(spin, [scan(0.1 * i) for i in range(1, 15)]))[1].warnings()
     assert "14 scans without the times" in note
-    assert cut(in_order(spin, timed))[1].notes() == []
-    assert cut(in_order(wheels(2.0, turned=lambda t: (3.0, 3.0)), [scan(0.1 * i) for i in range(1, 15)]))[1].notes() == []
+    assert cut(in_order(spin, timed))[1].warnings() == []
+    assert cut(in_order(wheels(2.0, turned=lambda t: (3.0, 3.0)), [scan(0.1 * i) for i in range(1, 15)]))[1].warnings() == []
 
 
 def test_a_long_stream_keeps_little():
@@ -590,7 +591,7 @@ def test_a_long_stream_keeps_little():
         if i % 2 == 0:
             events.append(scan(t))
         for event in events:
-            for _ in cutter.push(event):
+            for _ in steps_after(event, cutter):
                 pass
         most = max(most, len(cutter._scans))
     assert most <= 8

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from localization.errors import EvaluationError, OutputError
 from localization.trajectory import Trajectory, path_nodes, read_tum, write_tum
 from motion_models import se2
-from tests.disks import files_of_at_most
+from tests.helpers.disks import files_of_at_most
 
 SECOND = 10**9
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from rich.console import Console
 from rich.table import Table
 
-from localization.accuracy import Accuracy, RelationErrors
-from localization.score import Result
+from localization.evaluation.accuracy import Accuracy, RelationErrors
+from localization.evaluation.scores import Result
 
 _MISSING = "\u2013"  # an en dash
 _Number = Callable[[Result], float | None]

@@ -12,25 +12,25 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from localization.calibration import Calibrated, Cut, MotionReferenceName, Turning, calibrated, cut_log, turning
+from localization.calibration.calibrate import Calibrated, Cut, MotionReferenceName, Turning, calibrated, cut_log, turning
+from localization.calibration.windows import WindowConfig
 from localization.commands.calibration_tables import numbers, print_by_source, print_cuts, print_fit, print_rotation_errors
 from localization.commands.common import write_json
 from localization.commands.regression_tables import print_regressions, regression_numbers
 from localization.logs import TopicOverrides
-from localization.maneuver_windows import WindowConfig
 from localization.output import check_outputs, write_text_file
 from motion_models.base import MotionModel
-from motion_models.cg_files import arms_model, arms_postures
+from motion_models.calibration.regressions import RotationTable, read_rotation_table, skid_steer_fit
+from motion_models.calibration.ros_export import diff_drive_controller_yaml, robot_localization_yaml
+from motion_models.calibration.rotations import rotations_as_maneuvers
+from motion_models.calibration.windows_table import read_windows, table_columns, windows_text
+from motion_models.center_of_gravity.files import arms_model, arms_postures
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
-from motion_models.regressions import RotationTable, read_rotation_table, skid_steer_fit
 from motion_models.robot import Robot, load_robot
 from motion_models.robot_file import relocated, robot_toml
-from motion_models.ros_export import diff_drive_controller_yaml, robot_localization_yaml
-from motion_models.rotations import rotations_as_maneuvers
 from motion_models.se2 import FloatArray
 from motion_models.skid_steer import SkidSteer
-from motion_models.windows_table import read_windows, table_columns, windows_text
 
 _TABLE = ".csv"
 _USUAL_ROBOT = "husky_a200"

@@ -11,17 +11,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from localization.calibration import Calibrated, Cut, Turning
-from localization.maneuver_windows import driven
+from localization.calibration.calibrate import Calibrated, Cut, Turning
+from localization.calibration.windows import driven
 from motion_models.base import MotionModel
-from motion_models.calibration_plan import MEANING
-from motion_models.cross_validation import Interval, root_mean, root_mean_gain
-from motion_models.regressions import RotationTable
+from motion_models.calibration.cross_validation import Interval, root_mean, root_mean_gain
+from motion_models.calibration.plan import MEANING
+from motion_models.calibration.regressions import RotationTable
+from motion_models.calibration.rotations import COMMANDED_RAD_PER_S
 from motion_models.robot import Robot
-from motion_models.rotations import COMMANDED_RAD_PER_S
 from motion_models.se2 import FloatArray
 
-Pair = tuple[float, float]
+Trial = tuple[float, float]
 _MANY_TIMES = 1.5  # a noise model that is wrong by less is right
 
 
@@ -64,7 +64,7 @@ def print_cuts(console: Console, robot: Robot, cuts: Sequence[Cut]) -> None:
             console,
             f"{each.source}: {seconds:.0f} s of motion, {metres:.1f} m and {radians:.1f} rad by the wheels, measured by {each.witness}",
         )
-        for note in each.notes:
+        for note in each.warnings:
             say(console, f"  {note}")
 
 
@@ -171,7 +171,7 @@ def numbers(found: Calibrated, about: Turning, cuts: Sequence[Cut], by_source: S
         "heldout": found.heldout is not None,
         "errors": {name: {k: [v.value, v.low, v.high] for k, v in values.items()} for name, values in errors(found).items()},
         "by_source": {source: None if each is None else _turning(each) for source, each in by_source},
-        "notes": {each.source: list(each.notes) for each in cuts},
+        "notes": {each.source: list(each.warnings) for each in cuts},
     }
 
 
@@ -201,5 +201,5 @@ def print_rotation_errors(console: Console, found: Calibrated, rotations: Rotati
     show(console, table)
 
 
-def _pm(value: Pair, digits: int = 3) -> str:
+def _pm(value: Trial, digits: int = 3) -> str:
     return f"{value[0]:.{digits}f} +- {value[1]:.{digits}f}" if value[1] > 0.0 else f"{value[0]:.{digits}f}"

@@ -14,17 +14,17 @@ from rich.console import Console
 from localization.commands.calibration_tables import plain_table, row, say, show
 from localization.commands.common import write_json
 from localization.output import check_outputs
-from motion_models.center_of_gravity import static_part_from_weighing
-from motion_models.cg_files import arms_model, arms_postures, weighed_cg
-from motion_models.cg_parts import Arms, CgEstimate, Payload, StaticPart, require_support
+from motion_models.center_of_gravity.files import arms_model, arms_postures, weighed_cg
+from motion_models.center_of_gravity.model import static_part_from_weighing
+from motion_models.center_of_gravity.parts import Arms, CgEstimate, Payload, StaticPart, require_support
+from motion_models.center_of_gravity.postures import Posture, parse_postures
+from motion_models.center_of_gravity.weighing import WHEELS, WeighedCg, read_weighings
 from motion_models.errors import CgError
 from motion_models.friction import FrictionModel
 from motion_models.friction.contact import loads
-from motion_models.postures import Posture, parse_postures
 from motion_models.robot import Robot, load_robot
 from motion_models.se2 import FloatArray
 from motion_models.skid_steer import SkidSteer
-from motion_models.weighing import WHEELS, WeighedCg, read_weighings
 
 
 @dataclass(frozen=True)

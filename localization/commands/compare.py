@@ -17,18 +17,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table as Grid
 
 from localization.commands.common import names, write_json
-from localization.compare_job import OK, Job, Row, job_key, run_job, trials
-from localization.compare_pool import run_local
-from localization.compare_table import Table
-from localization.compare_verdict import Findings, against_best, closing, find, headline
+from localization.comparison.jobs import OK, Job, Row, job_key, run_job, trials
+from localization.comparison.page import CompareHead, check_report, write_comparison_report
+from localization.comparison.process_executor import run_local
+from localization.comparison.summary import Findings, against_best, closing, find, headline
+from localization.comparison.table import Table
 from localization.errors import EvaluationError, LogError, OutputError
 from localization.estimators import check_estimator
 from localization.logs import TopicOverrides
 from localization.output import check_outputs
+from localization.pipeline import ReplayConfig
 from localization.provenance import versions
-from localization.report_compare import CompareHead, check_report, write_comparison_report
-from localization.run import ReplayConfig
-from motion_models.corrections import check_forms
+from motion_models.online_calibration import check_forms
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
 
@@ -108,7 +108,7 @@ class Compare:
 
     def _run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, list[Row]]]:
         if self.dask is not None:
-            from localization.compare_dask import run_on_cluster
+            from localization.comparison.dask_executor import run_on_cluster
 
             return run_on_cluster(jobs, self.dask)
         absent = [job for job in jobs if not Path(job.log).exists()]  # no process need be started to say so

@@ -10,24 +10,24 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from localization.calibration import MotionReferenceName
+from localization.calibration.calibrate import MotionReferenceName
+from localization.calibration.windows import WindowConfig
 from localization.commands.common import new_folder, write_json
+from localization.diagnosis.controller_runs import drive_of_runs, read_runs
+from localization.diagnosis.corrected_robot import patched
 from localization.diagnosis.diagnose import DiagnosisConfig, Examined, examine
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_table
 from localization.diagnosis.findings import Diagnosis
-from localization.diagnosis.patch import patched
-from localization.diagnosis.runs import drive_of_runs, read_runs
 from localization.logs import TopicOverrides, open_log
-from localization.maneuver_windows import WindowConfig
 from localization.output import check_outputs, write_text_file
-from localization.report_diagnosis import write_diagnosis_report
+from localization.report.diagnosis_page import write_diagnosis_report
+from motion_models.calibration.regressions import read_rotation_table
+from motion_models.calibration.rotations import rotations_as_maneuvers
+from motion_models.calibration.windows_table import read_windows, table_columns
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
-from motion_models.regressions import read_rotation_table
 from motion_models.robot import Robot, load_robot
 from motion_models.robot_file import relocated, robot_toml
-from motion_models.rotations import rotations_as_maneuvers
-from motion_models.windows_table import read_windows, table_columns
 
 
 @dataclass(frozen=True)
@@ -122,5 +122,5 @@ def print_diagnosis(console: Console, d: Diagnosis) -> None:
         console.print(f"unexplained: {shape.text}", markup=False, soft_wrap=True)
     if d.next_drive:
         console.print(f"next drive: {d.next_drive}", markup=False, soft_wrap=True)
-    for note in d.notes:
+    for note in d.warnings:
         console.print(f"! {note}", markup=False, soft_wrap=True)

@@ -62,5 +62,5 @@ def _print(console: Console, info: LogInfo) -> None:
         console.print(f"mount of {frame}: [{at}] m, roll, pitch and yaw [{turned}] deg", markup=False)
     for problem in info.problems:
         console.print(f"[yellow]![/] {escape(problem)}", soft_wrap=True)
-    for note in info.notes:
+    for note in info.warnings:
         console.print(f"  {note}", markup=False, soft_wrap=True)

@@ -21,15 +21,15 @@ from localization.commands.online_terminal import terminal_view
 from localization.errors import DumpError, OutputError
 from localization.events import Event
 from localization.logs import open_log
-from localization.online.core import Core
-from localization.online.files import Files
-from localization.online.node import Node
-from localization.online.pace import Pace
-from localization.online.session import Session, View, made_by
-from localization.online.settings import OnlineSettings
-from localization.online.stop import Stop
-from localization.online.transport import Transport
+from localization.pipeline import Pipeline
 from localization.provenance import fingerprint
+from localization.ros.node import Node
+from localization.ros.playback_clock import Pace
+from localization.ros.session import Session, View, made_by
+from localization.ros.session_files import Files
+from localization.ros.settings import OnlineSettings
+from localization.ros.signals import Stop
+from localization.ros.transports.base import Transport
 from motion_models.robot import Robot, load_robot
 
 _LINE_S = 0.25
@@ -75,8 +75,8 @@ class Online(OnlineSettings):
         has_lidar = log.sources.lidar is not None
         pair = self.make_pair(has_lidar)
         made = made_by(pair, robot, log.mounts, has_lidar, self.config, f"log {fingerprint(path)[:12]}")
-        core = Core(pair, robot, log.mounts, has_lidar, self.config)
-        session = Session.start(files, core, f"{pair.model.name}_{pair.estimator}", made)
+        pipeline = Pipeline(pair, robot, log.mounts, has_lidar, self.config)
+        session = Session.start(files, pipeline, f"{pair.model.name}_{pair.estimator}", made)
         pace, began, first_ns, shown, seconds, is_done = Pace(rate, sleep=stop.sleep), time.monotonic(), None, -math.inf, 0.0, False
         try:
             if view is not None:
@@ -97,14 +97,14 @@ class Online(OnlineSettings):
                         session.saw(event)
                     if console.is_terminal and now - shown >= _LINE_S:
                         shown, speed = now, f"  {seconds / max(now - began, 1e-9):.1f}x"
-                        statuses = session.health.statuses(session.core)
+                        statuses = session.health.statuses(session.pipeline)
                         live.update(terminal_view(session, seconds, statuses, extra=speed), refresh=True)
             session.finish()
             count = session.write_out()
             is_done = True
         finally:
             session.close(forget=is_done)
-        for note in dict.fromkeys([*log.notes(), *session.core.notes()]):
+        for note in dict.fromkeys([*log.warnings(), *session.pipeline.warnings()]):
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         self._summarize(console, session, seconds, count)
 
@@ -138,7 +138,7 @@ class Online(OnlineSettings):
             count = node.finish()
         finally:
             transport.close()
-        for note in node.notes():
+        for note in node.warnings():
             tell(note)
         self._summarize(console, node.session, node.seconds, count)
 
@@ -148,15 +148,15 @@ class Online(OnlineSettings):
         if door == "auto":
             door = "dds" if importlib.util.find_spec("rclpy") is None else "rclpy"
         if door == "rospy":
-            from localization.online.ros1 import RospyTransport
+            from localization.ros.transports.rospy import RospyTransport
 
             return RospyTransport()
         if door == "rclpy":
-            from localization.online.ros2 import RclpyTransport
+            from localization.ros.transports.rclpy import RclpyTransport
 
             return RclpyTransport(names.name, names.namespace)
-        from localization.online.dds import DdsTransport
-        from localization.online.dds_settings import choose_interface, default_domain
+        from localization.ros.transports.dds import DdsTransport
+        from localization.ros.transports.dds_settings import choose_interface, default_domain
 
         return DdsTransport(
             default_domain() if self.domain is None else self.domain, choose_interface(self.interface), names.name, names.namespace
@@ -166,7 +166,7 @@ class Online(OnlineSettings):
         """Raises `DoorError` and `OutputError`. Imported only where it is wanted."""
         if self.view == "terminal" and self.view_file is None:
             return None
-        from localization.online.view import RerunView
+        from localization.ros.rerun_view import RerunView
 
         return RerunView(self.view_file)
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from rich.text import Text
 
-from localization.online.health import OK, Status
-from localization.online.session import Session
+from localization.ros.diagnostics import OK, Status
+from localization.ros.session import Session
 
 
 def live_line(session: Session, seconds: float, statuses: list[Status], extra: str = "") -> Text:

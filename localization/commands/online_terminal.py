@@ -9,8 +9,8 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from localization.online.health import ERROR, OK, Status
-from localization.online.session import Session
+from localization.ros.diagnostics import ERROR, OK, Status
+from localization.ros.session import Session
 
 _LEARNED = 8  # corrections that are shown; grids of them have dozens
 
@@ -35,7 +35,7 @@ def terminal_view(
             _row(view, "sigma", [f"{1e3 * sigma_x:.0f} mm", f"{1e3 * sigma_y:.0f} mm", f"{math.degrees(sigma_yaw):.2f} deg", nis])
         _row(view, "motion", [f"vx {e.twist[0]:+.2f} m/s", f"vy {e.twist[1]:+.2f} m/s", f"wz {e.twist[2]:+.2f} rad/s"])
     _row(view, "rates", [f"{topic} {rate:.1f} Hz" for topic, rate in (rates or {}).items()])
-    learned = list(session.core.estimator.parameters().items())
+    learned = list(session.pipeline.estimator.parameters().items())
     more = f"and {len(learned) - _LEARNED} more" if len(learned) > _LEARNED else ""
     _row(view, "learned", [*(f"{name} {mean:.4g} +- {sigma:.2g}" for name, (mean, sigma) in learned[:_LEARNED]), more])
     for status in statuses:

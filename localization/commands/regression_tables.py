@@ -9,8 +9,8 @@ import numpy as np
 from rich.console import Console
 
 from localization.commands.calibration_tables import plain_table, row, say, show
-from motion_models.calibration_plan import MEANING
-from motion_models.regressions import (
+from motion_models.calibration.plan import MEANING
+from motion_models.calibration.regressions import (
     Regression,
     RotationTable,
     SkidSteerFit,

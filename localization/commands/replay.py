@@ -20,19 +20,19 @@ from localization.commands.calibration_tables import WIDE, show
 from localization.commands.common import names, new_folder, write_json
 from localization.errors import EstimatorError, EvaluationError
 from localization.estimators import CORRECTING, LOCALIZING, check_estimator
+from localization.evaluation.references import ReferenceTrack, Relations, read_reference_file, reference_track
+from localization.evaluation.scores import Result, score
+from localization.evaluation.time_overlap import describe_instant, no_overlap_message
 from localization.events import Event, PositionSample
 from localization.logs import Log, TopicOverrides, open_log
-from localization.logs.fused import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
+from localization.logs.fused_log import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
+from localization.logs.positions import merge_positions, position_samples
 from localization.output import as_text, check_outputs
-from localization.positions import merge_positions, position_samples
+from localization.pipeline import ReplayConfig, Run, Trial, replay
 from localization.provenance import fingerprint, versions
-from localization.references import ReferenceTrack, Relations, read_reference_file, reference_track
-from localization.report import ReportHead, overview_png, verdict, write_report
-from localization.run import Pair, ReplayConfig, Run, replay
-from localization.score import Result, score
-from localization.timespans import describe_instant, no_overlap_message
+from localization.report.replay_page import ReportHead, overview_png, verdict, write_report
 from localization.trajectory import write_tum
-from motion_models.corrections import check_forms
+from motion_models.online_calibration import check_forms
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
 
@@ -78,7 +78,7 @@ class Replay:
         models = [make_model(name, robot) for name in names(self.model, "--model")]
         forms = names(self.corrections, "--corrections")
         pairs = [
-            Pair(model, estimator, form)
+            Trial(model, estimator, form)
             for estimator in self._estimators(has_lidar)
             for model in models
             for form in check_forms(forms)[: None if estimator in CORRECTING else 1]
@@ -101,7 +101,7 @@ class Replay:
             robot=robot.name,
             start=describe_instant(log.start_ns),
             duration_s=log.duration_s,
-            notes=[as_text(note) for note in dict.fromkeys([*log.notes(), *(note for run in runs for note in run.notes)])],
+            warnings=[as_text(note) for note in dict.fromkeys([*log.warnings(), *(note for run in runs for note in run.warnings)])],
             versions=versions(),
             log_fingerprint=fingerprint(log.path),
         )
@@ -155,7 +155,7 @@ class Replay:
             "duration_s": head.duration_s,
             "distance_m": _distance(results),
             "results": [result.metrics(head.duration_s, self.timing) for result in results],
-            "notes": list(head.notes),
+            "notes": list(head.warnings),
             "provenance": {
                 "log_fingerprint": head.log_fingerprint,
                 "versions": dict(head.versions),
@@ -164,7 +164,7 @@ class Replay:
         }
 
     def _print(self, console: Console, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
-        for note in head.notes:
+        for note in head.warnings:
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         show(console, accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
         console.print(verdict(results, reference), markup=False, soft_wrap=True)

@@ -13,11 +13,11 @@ from rich.table import Table
 
 from localization.commands.common import write_json
 from localization.output import check_outputs
-from localization.simulate.effects import EFFECTS, parse_effects
-from localization.simulate.evaluation import Score, mean_by_trajectory, score_runs
-from localization.simulate.experiments import EXPERIMENTS
-from localization.simulate.simulator import Simulation, SimulationConfig, simulate, write_simulation
-from localization.simulate.suite import START_NS
+from localization.simulation.experiments import EXPERIMENTS
+from localization.simulation.faults import EFFECTS, parse_effects
+from localization.simulation.open_loop_scores import Score, mean_by_trajectory, score_runs
+from localization.simulation.sensor_suite import START_NS
+from localization.simulation.simulator import Simulation, SimulationConfig, simulate, write_simulation
 from motion_models.robot import load_robot
 
 _EXPERIMENTS = "; ".join(f"{e.name}: {e.meaning}" for e in EXPERIMENTS.values())

@@ -9,17 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from localization.diagnosis import residue
-from localization.diagnosis.attribution import max_statistic, p_value, statistic
+from localization.diagnosis import trends
+from localization.diagnosis.causes import Effect
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.effects import Effect
 from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain, Verdict
 from localization.diagnosis.heldout import heldout_gain
-from localization.diagnosis.look import Look, candidates, held_to, look, make_pipeline
-from localization.diagnosis.next_drive import general_advice, separating_drive
-from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, Pipeline, with_sizes
-from localization.diagnosis.search import aliases_of, search, true_cost
-from localization.diagnosis.words import evidence, sentence
+from localization.diagnosis.linearization import Look, candidates, held_to, look, make_predictor
+from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, DrivePredictor, with_sizes
+from localization.diagnosis.recommendations import general_advice, separating_drive
+from localization.diagnosis.selection import aliases_of, search, true_cost
+from localization.diagnosis.subset_selection import max_statistic, p_value, statistic
+from localization.diagnosis.summary import evidence, sentence
 from localization.settings import Count, Probability, Seed, Settings
 from motion_models.base import MotionModel
 from motion_models.se2 import FloatArray
@@ -68,7 +68,7 @@ class Examined:
     """A diagnosis and what it was made of."""
 
     diagnosis: Diagnosis
-    pipeline: Pipeline | None
+    pipeline: DrivePredictor | None
     """None where there was too little to look at."""
     residuals: Residuals | None
     state: Look | None = None
@@ -85,8 +85,8 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
     config = config or DiagnosisConfig()
     if len(drive.maneuvers) < config.fewest_windows:
         why = f"only {len(drive.maneuvers)} windows of motion were measured; it takes {config.fewest_windows}."
-        return Examined(_undecidable(drive, model, drive.notes[0] if drive.witness == "none" else why), None, None)
-    pipeline = make_pipeline(drive, model)
+        return Examined(_undecidable(drive, model, drive.warnings[0] if drive.witness == "none" else why), None, None)
+    pipeline = make_predictor(drive, model)
     effects = candidates(pipeline, config.moments)
     first = look(pipeline, effects, {}, _TOLERANCES[0])
     found = _examined(pipeline, first, config)
@@ -97,7 +97,7 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
     return found
 
 
-def _examined(pipeline: Pipeline, first: Look, config: DiagnosisConfig) -> Examined:
+def _examined(pipeline: DrivePredictor, first: Look, config: DiagnosisConfig) -> Examined:
     """With everything that is not named within the tolerance of the ``first`` look."""
     rng = np.random.default_rng(config.seed)
     effects, tolerance = first.effects, first.tolerance
@@ -146,7 +146,7 @@ def _p_value(state: Look, others: tuple[int, ...], i: int, rng: np.random.Genera
 
 
 def _conclude(
-    pipeline: Pipeline, first: Look, state: Look, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig
+    pipeline: DrivePredictor, first: Look, state: Look, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig
 ) -> Examined:
     drive, problem, effects = pipeline.drive, state.problem, state.effects
 
@@ -182,7 +182,7 @@ def _conclude(
     findings = _merged(findings)
     left = state.linear - state.signatures[..., list(chosen)] @ sizes
     spreads = problem.scale * np.where(np.isin(np.arange(len(effects)), chosen), 1.0, problem.tolerance)
-    found_shapes, left_gain = residue.shapes(pipeline, state.noise, left, state.signatures, state.nuisances, spreads, rng)
+    found_shapes, left_gain = trends.shapes(pipeline, state.noise, left, state.signatures, state.nuisances, spreads, rng)
     share = left_gain / max(left_gain + gained, 1e-9) if found_shapes else 0.0
     visible: dict[str, float] = {}
     for i, effect in enumerate(effects):
@@ -212,7 +212,7 @@ def _conclude(
         visible=visible,
         gain=total,
         windows=len(drive.maneuvers),
-        notes=drive.notes,
+        warnings=drive.warnings,
         belief=belief,
     )
     scale = np.sqrt(np.diagonal(problem.gram) + 1e-12)
@@ -261,5 +261,5 @@ def _undecidable(drive: Drive, model: MotionModel, why: str) -> Diagnosis:
         next_drive=advice,
         sentence=f"Nothing can be said of {model.name} on this drive: {why} {advice}",
         windows=len(drive.maneuvers),
-        notes=drive.notes,
+        warnings=drive.warnings,
     )

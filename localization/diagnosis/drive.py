@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from localization.calibration import MotionReferenceName, make_motion_reference
+from localization.calibration.calibrate import MotionReferenceName, make_motion_reference
+from localization.calibration.motion_references import GyroMotionReference, MotionReference, Span, Wheels
+from localization.calibration.windows import WindowConfig, cut
 from localization.events import Event, ImuSample, Scan
-from localization.gyro import GyroHistory
-from localization.logs.log import Log
-from localization.maneuver_windows import WindowConfig, cut
-from localization.motion_references import GyroMotionReference, MotionReference, Span, Wheels
+from localization.gyro import GyroBuffer
+from localization.logs.reader import Log
 from motion_models import se2
-from motion_models.cg_files import arms_model
-from motion_models.cg_parts import Payload
+from motion_models.calibration.maneuvers import IntArray, Maneuver
+from motion_models.center_of_gravity.files import arms_model
+from motion_models.center_of_gravity.parts import Payload
 from motion_models.errors import CalibrationError, SkidlocError
-from motion_models.maneuvers import IntArray, Maneuver
 from motion_models.registry import make_model
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
@@ -45,7 +45,7 @@ class Drive:
     """(W,) when each maneuver began; for tables, how much was driven before."""
     spans_ns: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     """(W, 2) start and end stamps; (0, 2) for tables."""
-    gyro: GyroHistory | None = None
+    gyro: GyroBuffer | None = None
     """All of the gyro; None without one, or where it is itself the motion reference."""
     is_gyro_reference: bool = False
     forces: FloatArray | None = None
@@ -60,7 +60,7 @@ class Drive:
     """Frame of the scans that were matched."""
     lidar_at: tuple[float, float] = (0.0, 0.0)
     """Where it sits, by its transform [m]."""
-    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def poses(self) -> int:
@@ -81,8 +81,8 @@ class _Recorder:
         self.used = list(spans)
         return self.inner.correct(spans, standing)
 
-    def notes(self) -> list[str]:
-        return self.inner.notes()
+    def warnings(self) -> list[str]:
+        return self.inner.warnings()
 
 
 class _Imu:
@@ -90,12 +90,12 @@ class _Imu:
 
     def __init__(self, robot: Robot, mounts: Any) -> None:
         self._mounts = mounts
-        self.gyro = GyroHistory(robot.gyro_noise, mounts, keep_s=_FOREVER_S)
+        self.gyro = GyroBuffer(robot.gyro_noise, mounts, keep_s=_FOREVER_S)
         self.stamps: list[int] = []
         self.forces: list[FloatArray] = []
 
     def push(self, sample: ImuSample) -> None:
-        self.gyro.push(sample)
+        self.gyro.insert(sample)
         self.stamps.append(sample.stamp_ns)
         self.forces.append(self._mounts.get(sample.frame_id, Mount()).rotation() @ sample.linear_acceleration)
 
@@ -139,7 +139,7 @@ def drive_of_log(
         raise CalibrationError(f"{log.path.name} has no wheels: name their topic with --topic.joint-states or --topic.odometry.")
     if witness == "auto" and reference is None and log.sources.lidar is None and log.sources.imu is None:
         alone = f"{log.path.name} has neither a LiDAR nor an IMU, and no reference was named: nothing measures what the wheels do."
-        return Drive(log.path.name, robot, (), "none", notes=(alone, *log.notes()))
+        return Drive(log.path.name, robot, (), "none", warnings=(alone, *log.warnings()))
     inner, words = make_motion_reference(log, robot, witness, reference, config)
     recorder = _Recorder(inner)
     imu = _Imu(robot, log.mounts)
@@ -178,7 +178,7 @@ def drive_of_log(
         payload_arms=_payload_arms(robot, windows.maneuvers, postures),
         lidar_frame=frame,
         lidar_at=(mount.x, mount.y),
-        notes=(left, *windows.notes, *log.notes()),
+        warnings=(left, *windows.warnings, *log.warnings()),
     )
 
 

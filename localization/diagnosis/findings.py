@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from localization.diagnosis.effects import Belief, Effect
+from localization.diagnosis.causes import Belief, Effect
 
 Verdict = Literal["consistent", "explained", "ambiguous", "unexplained", "undecidable"]
 
@@ -124,7 +124,7 @@ class Diagnosis:
     gain: Gain | None = None
     """By all findings together."""
     windows: int = 0
-    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     belief: Belief = field(default_factory=Belief)
 
     def to_dict(self) -> dict[str, Any]:
@@ -144,5 +144,5 @@ class Diagnosis:
             "windows": self.windows,
             "within_tolerance": {name: list(value) for name, value in self.within.items()},
             "smallest_visible": dict(self.visible),
-            "notes": list(self.notes),
+            "notes": list(self.warnings),
         }

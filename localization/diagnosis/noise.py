@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from motion_models.maneuvers import Batch
+from motion_models.calibration.maneuvers import Batch
 from motion_models.se2 import FloatArray
 
 _ROUNDS = 8

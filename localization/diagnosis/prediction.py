@@ -8,16 +8,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from localization.diagnosis.causes import Belief, Effect
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.dropout import RESTS, lost_share
-from localization.diagnosis.effects import Belief, Effect
-from localization.diagnosis.settling import TRACKED, settling_twists
-from localization.diagnosis.steady import steady_twists
+from localization.diagnosis.dynamic_response import TRACKED, settling_twists
+from localization.diagnosis.encoder_dropout import RESTS, lost_share
+from localization.diagnosis.quasi_static import steady_twists
 from motion_models import se2
 from motion_models.base import MotionModel, Twist
+from motion_models.calibration.maneuvers import Batch, IntArray, Maneuver, make_batch
+from motion_models.calibration.prediction import predict
 from motion_models.friction import FrictionModel
-from motion_models.maneuvers import Batch, IntArray, Maneuver, make_batch
-from motion_models.prediction import predict
 from motion_models.se2 import FloatArray
 
 CHANNELS = ("x", "y", "yaw", "gyro", "force_x", "force_y")
@@ -29,7 +29,7 @@ _NO_COLUMNS: IntArray = np.empty(0, dtype=np.int64)
 
 
 @dataclass
-class Pipeline:
+class DrivePredictor:
     """Predicts a drive's motions with one model; discrepancies are measured minus predicted.
 
     Causes of the floor act through the friction model whatever the model is: what they change there is added to what the model says.
@@ -167,7 +167,7 @@ def _whole(maneuver: Maneuver, path: FloatArray) -> Maneuver:
 class _Changed:
     """The model with a belief's changes: a `MotionModel` for the length of one batch."""
 
-    def __init__(self, pipeline: Pipeline, belief: Belief) -> None:
+    def __init__(self, pipeline: DrivePredictor, belief: Belief) -> None:
         self._p, self._b = pipeline, belief
         self.name, self.param_names = pipeline.model.name, pipeline.model.param_names
         self.nominal = pipeline.model.nominal

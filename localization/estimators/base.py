@@ -10,7 +10,7 @@ import numpy as np
 
 from localization.events import PositionSample
 from localization.lidar import LostScans
-from localization.synchronizer import Step
+from localization.step import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.se2 import FloatArray
@@ -41,9 +41,9 @@ class Estimator(Protocol):
     """State inside; one `step` after the other, then `finish`."""
 
     def step(self, step: Step) -> Estimate:
-        """The estimate at the end of ``step``. What of the work can wait until that is out, waits for `settle`."""
+        """The estimate at the end of ``step``. What of the work can wait until that is out, waits for `run_deferred`."""
 
-    def settle(self) -> None:
+    def run_deferred(self) -> None:
         """Do what waits, if anything does; else `step` and `finish` do it first. What it finds out, the next estimate tells."""
 
     def add_position(self, sample: PositionSample) -> None:

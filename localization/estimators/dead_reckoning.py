@@ -8,7 +8,7 @@ import numpy as np
 
 from localization.estimators.base import NO_POINTS, Estimate, mean_twist
 from localization.events import PositionSample
-from localization.synchronizer import Step
+from localization.step import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.se2 import FloatArray
@@ -32,7 +32,7 @@ class DeadReckoning:
         twist, twist_cov = mean_twist(motion.delta, motion.cov, step.duration) if step.duration > 0 else (step.twist, None)
         return Estimate(step.end_ns, self._pose, self._cov, twist, twist_cov)
 
-    def settle(self) -> None:
+    def run_deferred(self) -> None:
         return None
 
     def add_position(self, sample: PositionSample) -> None:

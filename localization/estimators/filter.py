@@ -22,9 +22,9 @@ from localization.estimators.measurement_models import predict_turn, subtract_ma
 from localization.gyro import Turn
 from localization.lidar import KeyScanError, select_measured
 from localization.settings import Settings
-from localization.synchronizer import Step
+from localization.step import Step
 from motion_models import se2
-from motion_models.corrections import Corrections
+from motion_models.online_calibration import Corrections
 from motion_models.robot import GyroNoise
 from motion_models.se2 import FloatArray
 

@@ -12,11 +12,11 @@ from localization.estimators.base import NO_POINTS, Estimate, mean_twist
 from localization.estimators.filter import BIAS, CLOCK, PARAMS, POSE, SCALE, START, Filter, FilterConfig
 from localization.events import PositionSample
 from localization.lidar import LostScans, ScanMatch, ScanMatchingSensor
-from localization.synchronizer import Step
+from localization.step import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion, MotionModel
-from motion_models.corrections import Corrections
+from motion_models.online_calibration import Corrections
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -67,7 +67,7 @@ class EkfFusion:
 
     def step(self, step: Step) -> Estimate:
         """Predict, update by the gyro, update by the scan."""
-        self.settle()
+        self.run_deferred()
         ekf, nis = self.filter, None
         step = self._check_standstill(step)
         self.wheel_motion, self.is_turning = step.predicted, self._is_turning(step.predicted)
@@ -82,7 +82,7 @@ class EkfFusion:
         self._slip = twist - _mean_twist(step)
         return Estimate(step.end_ns, ekf.pose, ekf.P[POSE, POSE].copy(), twist, twist_cov, nis)
 
-    def settle(self) -> None:
+    def run_deferred(self) -> None:
         """The last scan enters the submap, if it is a key scan. Deferred until its estimate is out."""
         if not self._is_scan_pending or self._sensor is None:
             return
@@ -136,7 +136,7 @@ class EkfFusion:
         return None
 
     def finish(self, moments: Trajectory | None = None) -> None:
-        self.settle()
+        self.run_deferred()
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         ekf, found = self.filter, {}

@@ -23,11 +23,11 @@ from localization.events import PositionSample
 from localization.lidar import LidarConfig, LostScans
 from localization.lidar.loop_detection import Keyframe, LoopDetector
 from localization.settings import Positive, Settings, Signed
-from localization.synchronizer import Step
+from localization.step import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion
-from motion_models.corrections import Corrections
+from motion_models.online_calibration import Corrections
 from motion_models.se2 import FloatArray
 
 _BETWEEN_FLOOR = np.diag([5e-3, 5e-3, 1e-3]) ** 2
@@ -90,7 +90,7 @@ class GraphFusion:
 
     def step(self, step: Step) -> Estimate:
         """The filter's estimate, seen from the map."""
-        self.settle()
+        self.run_deferred()
         ekf = self.odometry.filter
         estimate = self.odometry.step(step)
         self._wheels.add(self.odometry.wheel_motion, self._corrections, self.odometry.is_turning)
@@ -107,9 +107,9 @@ class GraphFusion:
         odometry = estimate.pose, estimate.covariance
         return replace(estimate, pose=pose, covariance=A @ self._key_cov @ A.T + cov, odometry=odometry, map_T_odom=self._map_T_odom)
 
-    def settle(self) -> None:
+    def run_deferred(self) -> None:
         """What the last estimate need not wait for: the submap, a keyframe, loops, positions."""
-        self.odometry.settle()
+        self.odometry.run_deferred()
         if self._is_keyframe_due:
             self._is_keyframe_due = False
             self._add_keyframe()
@@ -194,8 +194,8 @@ class GraphFusion:
     def finish(self, moments: Trajectory | None = None) -> Trajectory | None:
         """The smoothed trajectory at the stamps of ``moments``; None where nothing was asked for or nothing ties the drive but odometry."""
         if self._is_keyframe_due:
-            self.settle()
-        self.odometry.settle()
+            self.run_deferred()
+        self.odometry.run_deferred()
         if not self._is_smoothing or moments is None or self._graph.count < 2:
             return None
         poses, covs = self._graph.smooth()

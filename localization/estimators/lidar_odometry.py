@@ -11,7 +11,7 @@ from localization.estimators.base import NO_POINTS, Estimate
 from localization.events import PositionSample
 from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
 from localization.lidar.scan_matcher import MIN_POINTS
-from localization.synchronizer import Step
+from localization.step import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.robot import Mount
@@ -52,7 +52,7 @@ class LidarOdometry:
             self._n_scans += 1
         return Estimate(step.end_ns, self._pose, None, self._twist, None)
 
-    def settle(self) -> None:
+    def run_deferred(self) -> None:
         return None
 
     def add_position(self, sample: PositionSample) -> None:

@@ -14,7 +14,7 @@ from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.estimators.lidar_odometry import LidarOdometry
 from localization.lidar import LidarConfig, ScanMatchingSensor
 from motion_models.base import MotionModel
-from motion_models.corrections import Corrections, Form, corrections
+from motion_models.online_calibration import Corrections, Form, corrections
 from motion_models.robot import Mount, Robot
 
 

@@ -12,7 +12,7 @@ from localization.lidar.deskew import Sweep
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
 from localization.lidar.scan_checks import LostScans, StaleScans
 from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher, choose_cell
-from localization.synchronizer import Step
+from localization.step import Step
 from motion_models import se2
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray

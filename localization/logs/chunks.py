@@ -70,7 +70,7 @@ class Source(Protocol):
     def end_ns(self) -> int: ...
 
     @property
-    def notes(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """What was lost or odd so far, as sentences."""
         ...
 

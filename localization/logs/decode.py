@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 
 from localization.events import CgSample, ImuSample, Scan
 from localization.logs.chunks import Channel, RawMessage
-from localization.logs.tally import Oddity
+from localization.logs.message_stats import Oddity
 from motion_models.se2 import FloatArray
 
 LONGEST_SWEEP_S = 2.0

@@ -58,14 +58,14 @@ class McapFile:
         self._chunks: list[Chunk] = []
         self._run: Chunk | None = None
         self._reported: set[int] = set()
-        self.notes: list[str] = []
+        self.warnings: list[str] = []
         reason, unread = "", 0
         with path.open("rb") as file:
             try:
                 self._read_summary(file)
             except (DamagedError, struct.error) as error:
                 reason = str(error)
-                self._schemas, self._described, self._chunks, self.notes = {}, {}, [], []
+                self._schemas, self._described, self._chunks, self.warnings = {}, {}, [], []
                 unread = self._index(file)
         totals: Counter[int] = Counter()
         for chunk in self._chunks:
@@ -78,7 +78,7 @@ class McapFile:
         self.end_ns = max((c.end_ns for c in self._chunks), default=0)
         if reason:
             lost = f"; of its last {unread} bytes only what is whole could be read" if unread else ""
-            self.notes.insert(0, f"{path.name} was read record by record ({reason}): {totals.total()} messages of it are used{lost}.")
+            self.warnings.insert(0, f"{path.name} was read record by record ({reason}): {totals.total()} messages of it are used{lost}.")
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         wanted = {key: t for key, t in self._topics.items() if t.name in topics}
@@ -105,7 +105,7 @@ class McapFile:
         if not encodings["cdr"] and not encodings["ros1"] and (reason or encodings.total()):
             names = ", ".join(sorted(name or "nothing" for name, count in encodings.items() if count))
             found = f"its messages are encoded as {names}, not as those of ROS" if names else "it holds no messages"
-            raise LogError(" ".join([f"'{self._path}' cannot be read: {reason + '; ' if reason else ''}{found}.", *self.notes]))
+            raise LogError(" ".join([f"'{self._path}' cannot be read: {reason + '; ' if reason else ''}{found}.", *self.warnings]))
         return encodings["ros1"] > encodings["cdr"]
 
     def _read_summary(self, file: BinaryIO) -> None:
@@ -235,7 +235,7 @@ class McapFile:
         self._reported.add(chunk.position)
         listed = sum(chunk.counts.values())
         used = f"{count} of its {listed} messages are" if listed > count else f"{count} messages of it are"
-        self.notes.append(f"A chunk at byte {chunk.position} of {self._path.name} is damaged ({damage}): {used} used.")
+        self.warnings.append(f"A chunk at byte {chunk.position} of {self._path.name} is damaged ({damage}): {used} used.")
 
     def _describe(self, op: int, record: bytes) -> None:
         try:
@@ -252,7 +252,7 @@ class McapFile:
                 kind, definition = self._schemas.get(schema, ("", MessageDefinition(MessageDefinitionFormat.NONE, "")))
                 self._described.setdefault(key, _Topic(topic, normalize_msgtype(kind) if "/" in kind else kind, definition, encoding))
         except struct.error:
-            self.notes.append(f"A description of a topic in {self._path.name} is damaged.")
+            self.warnings.append(f"A description of a topic in {self._path.name} is damaged.")
 
 
 def _checksum(file: BinaryIO, first: int, end: int) -> int:

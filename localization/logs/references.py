@@ -10,7 +10,7 @@ import numpy as np
 
 from localization.events import Reference
 from localization.logs.decode import UnusableError, yaw_of
-from localization.logs.tally import Oddity
+from localization.logs.message_stats import Oddity
 from motion_models.se2 import FloatArray
 
 _SEMI_MAJOR_M = 6_378_137.0

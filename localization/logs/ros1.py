@@ -45,7 +45,7 @@ class Ros1Bag:
         self._path = path
         self._connections: dict[int, _Connection] = {}
         self._chunks: list[Chunk] = []
-        self.notes: list[str] = []
+        self.warnings: list[str] = []
         self._reported: set[int] = set()
         with path.open("rb") as file:
             version = file.readline(32).removeprefix(MAGIC).strip()
@@ -91,7 +91,7 @@ class Ros1Bag:
         """Once for each chunk."""
         if chunk.position not in self._reported:
             self._reported.add(chunk.position)
-            self.notes.append(note)
+            self.warnings.append(note)
 
     def _chunk_bytes(self, file: BinaryIO, chunk: Chunk) -> bytes:
         if chunk.position >= self._size:
@@ -159,20 +159,20 @@ class Ros1Bag:
             reason = f"{reason}; {error}"
         count = sum(sum(c.counts.values()) for c in self._chunks)
         lost = end - whole
-        self.notes.append(
+        self.warnings.append(
             f"{self._path.name} is damaged: {reason}. Its {count} readable messages are used; of its last {lost} bytes only what is"
             " whole could be read."
             if lost
             else f"{self._path.name} is damaged: {reason}. All of its {count} messages could be read."
         )
         if loose:
-            self.notes.append(f"{loose} messages of {self._path.name} lie outside of chunks and were left out.")
+            self.warnings.append(f"{loose} messages of {self._path.name} lie outside of chunks and were left out.")
 
     def _add_chunk(self, position: int, header: Fields, data: bytes) -> None:
         try:
             plain, _ = decompress_head(data, header.get(b"compression", b"none").decode(errors="replace"))
         except DamagedError as reason:
-            self.notes.append(f"A chunk at byte {position} of {self._path.name} was left out: {reason}.")
+            self.warnings.append(f"A chunk at byte {position} of {self._path.name} was left out: {reason}.")
             return
         counts: Counter[int] = Counter()
         start, end = 2**63 - 1, 0

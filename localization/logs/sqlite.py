@@ -83,10 +83,10 @@ class SqliteFile:
         self._counts = Counter({key: n for key, n in count if key in self._topics})
         self.channels = _channels(self._topics, definitions, self._counts)
         self.start_ns, self.end_ns = (int(stamp) if isinstance(stamp, int) else 0 for stamp in span)
-        self.notes: list[str] = []
+        self.warnings: list[str] = []
         wal = path.with_name(path.name + "-wal")
         if wal.is_file() and wal.stat().st_size > 0:
-            self.notes.append(
+            self.warnings.append(
                 f"{wal.name} holds rows that the recorder had not yet moved into {path.name}; they are not read."
                 " Opening that file once with SQLite's own shell moves them."
             )
@@ -113,13 +113,13 @@ class SqliteFile:
                     yield RawMessage(stamp, *wanted[key], inflate_message(data))
         if self._rest is None:
             self._rest = RecoveredSqlite(self._path, reason)
-            self.notes += self._rest.notes
+            self.warnings += self._rest.warnings
         yield from (message for message in self._rest.messages(topics) if message.log_ns > last)
 
     def _compare(self, found: int, listed: int) -> None:
         note = f"{self._path.name} is damaged: {found} of {listed} messages of the topics in use could be read."
-        if found < listed and note not in self.notes:
-            self.notes.append(note)
+        if found < listed and note not in self.warnings:
+            self.warnings.append(note)
 
 
 class RecoveredSqlite:
@@ -143,7 +143,7 @@ class RecoveredSqlite:
             start, end = min(start, log_ns), max(end, log_ns)
         self.channels = _channels(self._topics, definitions, counts)
         self.start_ns, self.end_ns = (start, end) if counts else (0, 0)
-        self.notes = [
+        self.warnings = [
             f"{path.name} was read page by page ({reason}): {counts.total()} messages of it are used; how many are lost, it does not tell."
         ]
 

@@ -86,7 +86,7 @@ class TopicChooser:
                 self._types.setdefault(channel.topic, channel.type)
             elif channel.topic not in self._types:
                 self._empty.add(channel.topic)
-        self.notes: list[str] = []
+        self.warnings: list[str] = []
 
     def of_type(self, *types: str) -> list[str]:
         return sorted(topic for topic, kind in self._types.items() if kind in types)
@@ -111,7 +111,7 @@ class TopicChooser:
         topics = [topic for topic in self.of_type(TYPES[kind]) if topic not in kept_out]
         if len(topics) > 1:
             option = f"--topic.{kind.replace('_', '-')}"
-            self.notes.append(f"{', '.join(topics)} could each be the {kind.replace('_', ' ')}; name one with {option}.")
+            self.warnings.append(f"{', '.join(topics)} could each be the {kind.replace('_', ' ')}; name one with {option}.")
         return TopicSource(topics[0], kind, "only") if len(topics) == 1 else None
 
     def require(self, topic: str, types: tuple[str, ...], option: str) -> None:

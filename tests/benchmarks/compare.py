@@ -10,12 +10,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from localization.compare_job import Job, job_key, trials
-from localization.compare_pool import run_local
+from localization.comparison.jobs import Job, job_key, trials
+from localization.comparison.process_executor import run_local
 from localization.logs import TopicOverrides
-from localization.run import ReplayConfig
-from localization.simulate.experiments import ExperimentConfig
-from localization.simulate.simulator import SimulationConfig, simulate, write_simulation
+from localization.pipeline import ReplayConfig
+from localization.simulation.experiments import ExperimentConfig
+from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
 from motion_models.robot import load_robot
 
 _LOGS, _ROUNDS = 8, 2

@@ -22,15 +22,15 @@ from typing import Any, Literal
 
 import numpy as np
 
+from localization.diagnosis.causes import Effect
 from localization.diagnosis.diagnose import _TOLERANCES, examine
 from localization.diagnosis.drive import Drive, drive_of_log
-from localization.diagnosis.effects import Effect
-from localization.diagnosis.look import Look, look, normal_form
+from localization.diagnosis.linearization import Look, look, normal_form
 from localization.logs import open_log
 from motion_models.registry import make_model
-from tests.diagnosis_drives import ONE_SIDED, TYPICAL, bag, drive, robot_named
-from tests.diagnosis_rivals import NONE, oracle, rivals
-from tests.diagnosis_scores import COLUMNS, report
+from tests.helpers.diagnosis_drives import ONE_SIDED, TYPICAL, bag, drive, robot_named
+from tests.helpers.diagnosis_rivals import NONE, oracle, rivals
+from tests.helpers.diagnosis_scores import COLUMNS, report
 
 Kind = Literal["single", "null", "pair", "alike"]
 SIZES = (0.5, 1.0, 2.0)

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from tests.hostile_logs import BAD, SOURCES, Case, cases, run_guarded, truth_of, write_case
+from tests.helpers.hostile_logs import BAD, SOURCES, Case, cases, run_guarded, truth_of, write_case
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -11,8 +11,8 @@ import time
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 
-from tests import bags
-from tests.fuzz import CHANGES, check
+from tests.helpers import bags
+from tests.helpers.fuzz import CHANGES, check
 
 _EXAMPLES = 200
 

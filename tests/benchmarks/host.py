@@ -14,7 +14,7 @@ _TRIES = 50
 
 def paced(work_s: float, period_s: float, count: int) -> tuple[np.ndarray, float]:
     """Arithmetic that takes ``work_s`` when it is done over and over, done by a process that sleeps until a datagram comes, ``count`` of
-    them and one every ``period_s``. Seconds from each datagram to the end of the work, and the part of a core that it takes."""
+    them and one every ``period_s``. Seconds from each datagram to the end of the work, and the part of a pipeline that it takes."""
     rounds = _rounds(work_s)
     ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     child = os.fork()

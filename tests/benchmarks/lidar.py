@@ -12,13 +12,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from localization.consistency import mean_band, nees
+from localization.evaluation.consistency import mean_band, nees
 from localization.events import Scan
 from localization.lidar import KissIcp, LidarConfig, ScanMatcher, choose_voxel_size
-from localization.simulate import world
+from localization.simulation import world
 from motion_models import se2
 from motion_models.robot import WheelNoise
-from tests import rooms
+from tests.helpers import rooms
 
 ESTIMATORS = ("odometry", "lidar", "ekf")
 NO_SLIP = WheelNoise(*[0.0] * 8)

@@ -1,4 +1,4 @@
-"""The estimator live: how long after a scan its estimate is out, what part of a core it takes, and whether its memory stays flat.
+"""The estimator live: how long after a scan its estimate is out, what part of a pipeline it takes, and whether its memory stays flat.
 
 python -m tests.benchmarks.online [latency | soak [HOURS [BEAMS]]]
 """
@@ -16,13 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from localization.logs import open_log
-from localization.online.core import Core, Pair
-from localization.online.warm import warm_up
-from localization.run import ReplayConfig
-from localization.simulate.experiments import ExperimentConfig
-from localization.simulate.scanners import ScannerConfig
-from localization.simulate.simulator import SimulationConfig, simulate, write_simulation
-from localization.simulate.suite import SensorConfig
+from localization.pipeline import Pipeline, ReplayConfig, Trial
+from localization.ros.jit_warm_up import warm_up
+from localization.simulation.experiments import ExperimentConfig
+from localization.simulation.scanners import ScannerConfig
+from localization.simulation.sensor_suite import SensorConfig
+from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
 from tests.benchmarks.host import paced
@@ -45,28 +44,28 @@ def in_process(path: Path, estimator: str) -> tuple[np.ndarray, float]:
     """Seconds from each event that completes an estimate, and CPU per second of the log."""
     robot = load_robot("vaultbot")
     log = open_log(path, robot)
-    pair, config = Pair(make_model("skid_steer", robot), estimator), ReplayConfig()
+    pair, config = Trial(make_model("skid_steer", robot), estimator), ReplayConfig()
     warm_up(pair, robot, log.mounts, True, True, config)
     events, took = list(log.events()), []
-    core = Core(pair, robot, log.mounts, True, config)
+    pipeline = Pipeline(pair, robot, log.mounts, True, config)
     begin = time.process_time()
     for event in events:
         start = time.perf_counter()
-        if core.push(event):
+        if pipeline.process(event):
             took.append(time.perf_counter() - start)
-            core.settle()
+            pipeline.run_deferred()
     cpu = time.process_time() - begin
     return np.array(took), cpu / ((events[-1].stamp_ns - events[0].stamp_ns) * 1e-9)
 
 
 def over_dds(path: Path, estimator: str, folder: Path) -> tuple[np.ndarray, np.ndarray, float]:
     """Seconds from each scan on the wire to its odometry on the wire; the same as another process sees it, which writes the one and reads
-    the other in Python; and the estimator's part of a core."""
+    the other in Python; and the estimator's part of a pipeline."""
     domain = "97"
     node_command = (sys.executable, "-m", "localization.cli", "online", "--robot", "vaultbot", "--door", "dds", "--domain", domain)
     options = ("--estimator", estimator, "--node.wait-s", "1", "--state", folder / f"{estimator}.state")
     peer = subprocess.Popen(
-        [sys.executable, "-m", "tests.dds_peer", path, domain], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-m", "tests.helpers.dds_peer", path, domain], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     assert peer.stdout is not None
     assert peer.stdin is not None

@@ -13,15 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from localization.logs.forms import Form, Message, Template
-from localization.online.core import Pair
-from localization.online.files import Files
-from localization.online.node import Node, NodeConfig
-from localization.online.transport import Received
-from localization.simulate.experiments import ExperimentConfig
-from localization.simulate.scanners import ScannerConfig
-from localization.simulate.simulator import SimulationConfig, simulate
-from localization.simulate.suite import SensorConfig
+from localization.logs.message_templates import Form, Message, Template
+from localization.pipeline import Trial
+from localization.ros.node import Node, NodeConfig
+from localization.ros.session_files import Files
+from localization.ros.transports.base import Received
+from localization.simulation.experiments import ExperimentConfig
+from localization.simulation.scanners import ScannerConfig
+from localization.simulation.sensor_suite import SensorConfig
+from localization.simulation.simulator import SimulationConfig, simulate
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
 
@@ -127,7 +127,7 @@ def drive(hours: float, beams: int, estimator: str = "ekf") -> list[Row]:
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         files = Files(Path(folder) / "soak.tum", Path(folder) / "state")
-        pair = Pair(make_model("skid_steer", robot), estimator)
+        pair = Trial(make_model("skid_steer", robot), estimator)
         node = Node.start(transport, robot, lambda has_lidar: pair, files, print, node=NodeConfig(wait_s=0.0))
         start = np.append(transport.truth, 0.0)
 

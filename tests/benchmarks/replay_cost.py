@@ -21,8 +21,8 @@ from rosbags.typesys import Stores, get_typestore
 from localization.events import Scan
 from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
 from localization.logs import open_log
-from localization.run import Pair, replay
-from motion_models.integrate import preintegrate
+from localization.pipeline import Trial, replay
+from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import Mount, load_robot
 
@@ -47,7 +47,7 @@ def ekf_seconds(model: str = "diff_drive") -> float:
     robot = load_robot("aces")
     begin = time.perf_counter()
     log = open_log(ACES, robot)
-    replay(log.events(), [Pair(make_model(model, robot), "ekf")], robot, log.mounts, has_lidar=True)
+    replay(log.events(), [Trial(make_model(model, robot), "ekf")], robot, log.mounts, has_lidar=True)
     return time.perf_counter() - begin
 
 

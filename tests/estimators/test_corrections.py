@@ -9,20 +9,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from localization.consistency import mean_band
 from localization.estimators.filter import FilterConfig
-from localization.online.core import Core, Pair
-from localization.synchronizer import Step
+from localization.evaluation.consistency import mean_band
+from localization.pipeline import Pipeline, Trial
+from localization.step import Step
 from motion_models import se2
 from motion_models.base import Motion
-from motion_models.corrections import check_forms, correctable, corrections
 from motion_models.errors import CgError, ModelError
 from motion_models.friction import CorrectedFriction, FrictionModel
-from motion_models.integrate import preintegrate
+from motion_models.online_calibration import check_forms, correctable, corrections
+from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import WheelNoise, load_robot
 from motion_models.se2 import between, log
-from tests.synthetic_steps import (
+from tests.helpers.synthetic_steps import (
     DT,
     Noise,
     PoseSensor,
@@ -37,7 +37,7 @@ from tests.synthetic_steps import (
     straight,
     weave,
 )
-from tests.test_model_laws import assert_one_agrees, differences, some_drive, some_params
+from tests.motion_models.test_model_laws import assert_one_agrees, differences, some_drive, some_params
 
 ROBOT = load_robot("vaultbot")
 OFFSET = "mu_ratio+cg_offset_x+cg_offset_y"
@@ -149,16 +149,16 @@ def test_what_a_model_does_not_have_is_refused():
     with pytest.raises(ModelError, match="correctable"):
         corrections(make_model("friction", ROBOT), "cg_offset_x")
     with pytest.raises(ModelError, match="warp"):
-        Core(Pair(make_model("icr", ROBOT), "ekf", "warp"), ROBOT, {}, True)
+        Pipeline(Trial(make_model("icr", ROBOT), "ekf", "warp"), ROBOT, {}, True)
 
 
 def test_pair_gives_synchronizer_and_filter_the_same_parameters():
-    core = Core(Pair(make_model("friction", ROBOT), "ekf", OFFSET), ROBOT, {}, True)
-    assert isinstance(core.stepper._model, CorrectedFriction)
-    np.testing.assert_array_equal(core.stepper.params, core.estimator.params)
-    assert set(OFFSET.split("+")) <= set(core.estimator.parameters())
-    plain = Core(Pair(make_model("friction", ROBOT), "ekf", "none"), ROBOT, {}, True)
-    assert isinstance(plain.stepper._model, FrictionModel)
+    pipeline = Pipeline(Trial(make_model("friction", ROBOT), "ekf", OFFSET), ROBOT, {}, True)
+    assert isinstance(pipeline.synchronizer._model, CorrectedFriction)
+    np.testing.assert_array_equal(pipeline.synchronizer._params, pipeline.estimator.params)
+    assert set(OFFSET.split("+")) <= set(pipeline.estimator.parameters())
+    plain = Pipeline(Trial(make_model("friction", ROBOT), "ekf", "none"), ROBOT, {}, True)
+    assert isinstance(plain.synchronizer._model, FrictionModel)
 
 
 # --- learned where the motion shows it

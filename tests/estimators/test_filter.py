@@ -14,19 +14,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from localization.consistency import lag1_whiteness, mean_band
 from localization.errors import EstimatorError
 from localization.estimators.filter import BIAS, CLOCK, KEY, MAP, PARAMS, POSE, SCALE, START, Filter, FilterConfig
+from localization.evaluation.consistency import lag1_whiteness, mean_band
 from localization.events import Scan, WheelSample
 from localization.gyro import Turn
 from localization.lidar import KeyScanError, select_measured
-from localization.synchronizer import Step, Synchronizer, steps
+from localization.step import Step
+from localization.synchronizer import Synchronizer
 from motion_models import se2
 from motion_models.base import Motion
-from motion_models.corrections import corrections
+from motion_models.online_calibration import corrections
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
-from tests import bags
+from tests.helpers import bags
+from tests.helpers.steps import steps
 
 S, T0 = bags.S, bags.START
 ROBOT = load_robot("vaultbot")
@@ -43,8 +45,7 @@ def scan_at(t):
 def drive(seconds, turned, clock=0.0, params=None, hz=20.0):
     """Steps of 0.1 s from the stepper itself, for wheel angles ``turned(t)``."""
     cutter = Synchronizer(MODEL, ROBOT, {}, True)
-    cutter.clock_offset_s = clock
-    cutter.params = MODEL.nominal if params is None else params
+    cutter.set_calibration(MODEL.nominal if params is None else params, clock)
     wheels = [
         WheelSample(T0 + round(i / hz * S), np.full(2, np.nan), np.array(turned(i / hz), float)) for i in range(round(seconds * hz) + 20)
     ]

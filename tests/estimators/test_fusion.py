@@ -9,19 +9,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from localization.consistency import nees
 from localization.errors import EstimatorError
 from localization.estimators import EstimatorConfig
 from localization.estimators.base import Estimate
+from localization.evaluation.consistency import nees
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.lidar import LidarConfig
-from localization.online.core import Core, Pair, ReplayConfig
-from localization.run import Run
-from localization.simulate import world
+from localization.pipeline import Pipeline, ReplayConfig, Run, Trial
+from localization.simulation import world
 from motion_models import se2
 from motion_models.registry import make_model
 from motion_models.robot import Mount, WheelNoise
-from tests import rooms
+from tests.helpers import rooms
 
 S = 1_000_000_000
 NO_SLIP = WheelNoise(*[0.0] * 8)
@@ -35,24 +34,24 @@ def ekf(drive: rooms.Drive, **lidar) -> Run:
     return rooms.results(drive, "ekf", config=ReplayConfig(estimator=EstimatorConfig(lidar=LidarConfig(**lidar))))["ekf"]
 
 
-def make_core(drive: rooms.Drive, mounts: dict[str, Mount] | None = None) -> Core:
-    pair = Pair(make_model("diff_drive", rooms.ROBOT), "ekf")
-    return Core(pair, rooms.ROBOT, drive.mounts if mounts is None else mounts, True, ReplayConfig())
+def make_pipeline(drive: rooms.Drive, mounts: dict[str, Mount] | None = None) -> Pipeline:
+    pair = Trial(make_model("diff_drive", rooms.ROBOT), "ekf")
+    return Pipeline(pair, rooms.ROBOT, drive.mounts if mounts is None else mounts, True, ReplayConfig())
 
 
 def scans_of(drive: rooms.Drive) -> list[Scan]:
     return [event for event in drive.events if isinstance(event, Scan)]
 
 
-def run(drive: rooms.Drive, spoil: Callable[[int, Scan], Scan | None]) -> tuple[list[Estimate], Core]:
+def run(drive: rooms.Drive, spoil: Callable[[int, Scan], Scan | None]) -> tuple[list[Estimate], Pipeline]:
     """The estimates of ``drive`` whose scan k is ``spoil`` (k, scan), None for one that never comes."""
-    core, found, k = make_core(drive), [], 0
+    pipeline, found, k = make_pipeline(drive), [], 0
     for event in drive.events:
         if isinstance(event, Scan):
             event, k = spoil(k, event), k + 1
         if event is not None:
-            found += core.push(event)
-    return found + core.finish(), core
+            found += pipeline.process(event)
+    return found + pipeline.finish(), pipeline
 
 
 def worst(drive: rooms.Drive, estimates: list[Estimate], first: int, last: int) -> float:
@@ -188,11 +187,11 @@ def test_gap_of_8_s_stays_inside_five_sigma() -> None:
 
 def test_frozen_scanner_is_found_out(driven: rooms.Drive) -> None:
     frozen = scans_of(driven)[SPOILT.start]
-    estimates, core = run(driven, lambda k, s: replace(s, points=frozen.points, offsets=frozen.offsets) if k in SPOILT else s)
-    assert core.estimator.counts()["stale"] == len(SPOILT) - 1
+    estimates, pipeline = run(driven, lambda k, s: replace(s, points=frozen.points, offsets=frozen.offsets) if k in SPOILT else s)
+    assert pipeline.estimator.counts()["stale"] == len(SPOILT) - 1
     assert worst(driven, estimates, SPOILT.start, SPOILT.stop) < 0.1  # by wheels
     assert worst(driven, estimates, SPOILT.stop + 5, len(driven.poses)) < 0.02  # the old submap is found again
-    (note,) = core.notes()
+    (note,) = pipeline.warnings()
     assert "LiDAR lost for 18 % of the drive" in note
     assert f"{len(SPOILT) - 1} repeated the ranges of the scan before" in note
 
@@ -200,8 +199,8 @@ def test_frozen_scanner_is_found_out(driven: rooms.Drive) -> None:
 def test_scanner_that_froze_on_the_way_stays_stale_at_rest() -> None:
     drive = rooms.drive_through(LAB, rooms.path((1.5, 0.4, 0.2), (2.5, 0.0, 0.0), (1.5, 0.4, 0.2), (1.0, 0.0, 0.0)), 1)
     frozen = scans_of(drive)[8]
-    estimates, core = run(drive, lambda k, s: replace(s, points=frozen.points, offsets=frozen.offsets) if k > 8 else s)
-    counts = core.estimator.counts()
+    estimates, pipeline = run(drive, lambda k, s: replace(s, points=frozen.points, offsets=frozen.offsets) if k > 8 else s)
+    counts = pipeline.estimator.counts()
     assert counts["stale"] == len(drive.stamps) - 9
     assert counts["standing"] > 30
     assert worst(drive, estimates, 0, len(drive.poses)) < 0.1  # by wheels
@@ -211,8 +210,8 @@ def test_equal_scans_of_a_robot_at_rest_are_matched() -> None:
     """As in a simulator without noise."""
     drive = rooms.drive_through(LAB, rooms.path((1.0, 0.0, 0.0)), 1, scanner=rooms.Beams(noise=0.0))
     assert all(np.array_equal(scan.points, scans_of(drive)[0].points) for scan in scans_of(drive))
-    _, core = run(drive, lambda k, s: s)
-    counts = core.estimator.counts()
+    _, pipeline = run(drive, lambda k, s: s)
+    counts = pipeline.estimator.counts()
     assert counts.get("stale", 0) == 0
     assert counts["matched"] == counts["scans"] - 1 == len(drive.stamps) - 1  # the first begins the submap
 
@@ -239,8 +238,8 @@ def test_robot_that_was_carried_is_found_again(driven: rooms.Drive) -> None:
     lost = [next(e for e in events if isinstance(e, WheelSample)).position for events in (after, before[::-1])]
     after = [replace(e, stamp_ns=e.stamp_ns - gap) for e in after]
     after = [replace(e, position=e.position - lost[0] + lost[1]) if isinstance(e, WheelSample) else e for e in after]
-    core = make_core(driven)
-    found = [estimate for event in before + after for estimate in core.push(event)] + core.finish()
+    pipeline = make_pipeline(driven)
+    found = [estimate for event in before + after for estimate in pipeline.process(event)] + pipeline.finish()
     stamps = set(driven.stamps[70:].tolist())
     poses = np.array([e.pose for e in found if e.stamp_ns + gap in stamps])
     np.testing.assert_allclose(poses[-20:, :2], driven.poses[-20:, :2], atol=0.02)
@@ -252,9 +251,9 @@ def test_without_scans_the_wheels_carry_on(driven: rooms.Drive) -> None:
         lambda k, s: None if k in SPOILT else s,
         lambda k, s: replace(s, points=nothing, offsets=nothing[:, 0]) if k in SPOILT else s,
     ):
-        estimates, core = run(driven, spoil)
+        estimates, pipeline = run(driven, spoil)
         assert worst(driven, estimates, SPOILT.stop + 5, len(driven.poses)) < 0.02
-        assert core.estimator.counts()["matched"] >= len(driven.stamps) - len(SPOILT) - 2
+        assert pipeline.estimator.counts()["matched"] >= len(driven.stamps) - len(SPOILT) - 2
 
 
 def test_scans_with_nothing_to_match_are_counted_as_sparse(driven: rooms.Drive) -> None:
@@ -265,13 +264,13 @@ def test_scans_with_nothing_to_match_are_counted_as_sparse(driven: rooms.Drive) 
         for scan, c in zip(scans_of(driven)[:10], clouds, strict=True)
     ]
     for spoilt in (floors, [replace(scan, points=scan.points[:9], offsets=scan.offsets[:9]) for scan in scans_of(driven)[:10]]):
-        core = make_core(driven)
+        pipeline = make_pipeline(driven)
         for event in sorted([*spoilt, *(e for e in driven.events[:50] if not isinstance(e, Scan))], key=lambda e: e.stamp_ns):
-            core.push(event)
-        core.finish()
-        assert core.estimator.counts()["scans"] == 10
-        assert core.estimator.counts()["matched"] == 0
-        (note,) = core.notes()
+            pipeline.process(event)
+        pipeline.finish()
+        assert pipeline.estimator.counts()["scans"] == 10
+        assert pipeline.estimator.counts()["matched"] == 0
+        (note,) = pipeline.warnings()
         assert "10 of 10 scans: 10 had too few points on walls" in note
 
 
@@ -283,8 +282,8 @@ def test_scans_of_changing_size_are_matched(driven: rooms.Drive) -> None:
         kept = np.sort(rng.choice(len(scan.points), rng.integers(100, len(scan.points)), replace=False))
         return replace(scan, points=scan.points[kept], offsets=scan.offsets[kept])
 
-    estimates, core = run(driven, thin)
-    assert core.estimator.counts()["matched"] >= len(driven.stamps) - 2
+    estimates, pipeline = run(driven, thin)
+    assert pipeline.estimator.counts()["matched"] >= len(driven.stamps) - 2
     assert worst(driven, estimates, 0, len(driven.poses)) < 0.02
 
 
@@ -296,26 +295,26 @@ def test_two_lidars_are_fused() -> None:
     front = rooms.drive_through(LAB, TOUR[:4000], 3)
     back = rooms.drive_through(LAB, TOUR[:4000], 3, scanner=rooms.Beams(mount=Mount(x=-0.4, yaw=math.pi)))
     behind = [replace(scan, frame_id="back", stamp_ns=scan.stamp_ns) for scan in scans_of(back)]
-    core = make_core(front, {**front.mounts, "back": back.mount})
+    pipeline = make_pipeline(front, {**front.mounts, "back": back.mount})
     events = sorted([*front.events, *behind], key=lambda e: e.stamp_ns)
-    estimates = [estimate for event in events for estimate in core.push(event)] + core.finish()
-    assert core.estimator.counts()["matched"] > 0.95 * (len(front.stamps) + len(back.stamps))
+    estimates = [estimate for event in events for estimate in pipeline.process(event)] + pipeline.finish()
+    assert pipeline.estimator.counts()["matched"] > 0.95 * (len(front.stamps) + len(back.stamps))
     assert worst(front, estimates, 0, len(front.poses)) < 0.02
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.03])
 def test_clouds_give_poses_whose_errors_are_their_sigmas(tilt: float) -> None:
     """The floor is most of a cloud and holds nothing; a robot that pitches by 2 degrees is still where it is."""
-    core, mounts = None, {"laser": Mount(z=0.8)}
+    pipeline, mounts = None, {"laser": Mount(z=0.8)}
     drive = rooms.drive_through(LAB, rooms.path((1.0, 0.0, 0.0), (4.0, 0.3, 0.2)), 0, noise=NO_SLIP)
-    core = make_core(drive, mounts)
+    pipeline = make_pipeline(drive, mounts)
     clouds = []
     for k in range(0, len(drive.stamps), 4):
         points = rooms.cloud(LAB, drive.poses[k], k, tilt * math.sin(k)) - [0.0, 0.0, 0.8]
         clouds.append(Scan(int(drive.stamps[k]), points, frame_id="laser", is_planar=False))
     events = sorted([*clouds, *(e for e in drive.events if isinstance(e, WheelSample))], key=lambda e: e.stamp_ns)
-    estimates = [estimate for event in events for estimate in core.push(event)] + core.finish()
-    assert core.estimator.counts()["matched"] >= len(clouds) - 1
+    estimates = [estimate for event in events for estimate in pipeline.process(event)] + pipeline.finish()
+    assert pipeline.estimator.counts()["matched"] >= len(clouds) - 1
     at = {int(s): p for s, p in zip(drive.stamps, drive.poses, strict=True)}
     errors = np.array([se2.log(se2.between(at[e.stamp_ns], e.pose)) for e in estimates if e.stamp_ns in at])
     assert np.hypot(*errors[:, :2].T).max() < (0.02 if tilt == 0.0 else 0.05)
@@ -337,13 +336,13 @@ def test_gyro_replaces_wheels_that_do_not_turn_as_they_should() -> None:
     rates = np.diff(yaw[::5])[: len(stamps)] / 0.01 + 5e-4
     imu = [ImuSample(int(s), np.array([0.0, 0.0, w]), np.array([0.0, 0.0, 9.81])) for s, w in zip(stamps, rates, strict=False)]
     half = [e for e in drive.events if not isinstance(e, Scan) or e.stamp_ns < rooms.WALL_START_NS + 7 * S]
-    core = make_core(drive)
+    pipeline = make_pipeline(drive)
     for event in sorted([*half, *imu], key=lambda e: e.stamp_ns):
-        core.push(event)
-    last = core.finish()[-1]
+        pipeline.process(event)
+    last = pipeline.finish()[-1]
     k = round((last.stamp_ns - rooms.WALL_START_NS) / 2_000_000)
     assert abs(float(se2.wrap_angle(last.pose[2:] - drive.track[min(k, len(drive.track) - 1), 2:])[0])) < 0.02
-    mean, sigma = core.estimator.parameters()["gyro_bias_rad_per_s"]
+    mean, sigma = pipeline.estimator.parameters()["gyro_bias_rad_per_s"]
     assert abs(mean - 5e-4) < 4.0 * sigma
 
 
@@ -357,11 +356,11 @@ def test_drive_that_begins_in_motion_is_followed() -> None:
 
 def test_mount_that_is_late_begins_a_new_submap(driven: rooms.Drive) -> None:
     """/tf_static comes after 2 s: scans before it were drawn at the body's origin, and must not be matched to those after."""
-    core, poses = make_core(driven, {}), {}
+    pipeline, poses = make_pipeline(driven, {}), {}
     for event in driven.events:
         if event.stamp_ns > rooms.WALL_START_NS + 2 * S:
-            core.meet(driven.mounts)
-        poses.update({e.stamp_ns: e.pose for e in core.push(event)})
+            pipeline.add_mounts(driven.mounts)
+        poses.update({e.stamp_ns: e.pose for e in pipeline.process(event)})
     stamps = [int(s) for s in driven.stamps if s > rooms.WALL_START_NS + 3 * S and int(s) in poses]
     at = {int(s): p for s, p in zip(driven.stamps, driven.poses, strict=True)}
     found, true = np.array([poses[s] for s in stamps]), np.array([at[s] for s in stamps])
@@ -370,9 +369,9 @@ def test_mount_that_is_late_begins_a_new_submap(driven: rooms.Drive) -> None:
 
 
 def test_input_that_is_not_finite_is_refused(driven: rooms.Drive) -> None:
-    core = make_core(driven)
+    pipeline = make_pipeline(driven)
     for event in driven.events[:100]:
-        core.push(event)
+        pipeline.process(event)
     leaps = [replace(e, position=e.position + 1e200 * k) for k, e in enumerate(driven.events[100:160]) if isinstance(e, WheelSample)]
     with pytest.raises(EstimatorError, match="not finite, or too large"):
-        list(map(core.push, [*leaps, *scans_of(driven)[20:40]]))
+        list(map(pipeline.process, [*leaps, *scans_of(driven)[20:40]]))

@@ -9,22 +9,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from localization.consistency import nees
+from localization.estimate_table import EstimateTable, trajectory
 from localization.estimators import Estimate
 from localization.estimators.graph_fusion import _interpolate, _subtract_information
+from localization.evaluation.consistency import nees
 from localization.events import PositionSample, Scan, WheelSample
-from localization.online.core import Core, Pair
-from localization.online.freeze import freeze
-from localization.online.records import Records, trajectory
-from localization.online.thaw import thaw
-from localization.positions import merge_positions
-from localization.run import replay
-from localization.simulate import world
+from localization.logs.positions import merge_positions
+from localization.pipeline import Pipeline, Trial, replay
+from localization.ros.deserialize import thaw
+from localization.ros.serialize import freeze
+from localization.simulation import world
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.registry import make_model
 from motion_models.robot import WheelNoise
-from tests import rooms
+from tests.helpers import rooms
 
 QUIET = WheelNoise(*[1e-8] * 8)
 SCANNER = rooms.Beams(beams=240, rate_hz=6.25, noise=0.03, longest=8.0)
@@ -33,7 +32,7 @@ RADIUS_ERROR, TURN_ERROR = 1.03, 1.1
 
 
 def building() -> np.ndarray:
-    """A corridor of 2 m about a core of 12 x 8 m, with things of irregular size along its outer walls."""
+    """A corridor of 2 m about a pipeline of 12 x 8 m, with things of irregular size along its outer walls."""
     rng, things = np.random.default_rng(8), []
     for x in np.cumsum(rng.uniform(0.8, 2.2, 12)) - 8.0:
         if x < 7.0:
@@ -61,25 +60,25 @@ def around(seed: int = 0) -> rooms.Drive:
     )
 
 
-def make_core(drive: rooms.Drive, has_lidar: bool = True, is_smoothing: bool = True, model: str = "diff_drive") -> Core:
-    return Core(Pair(make_model(model, rooms.ROBOT), "graph"), rooms.ROBOT, drive.mounts, has_lidar, is_smoothing=is_smoothing)
+def make_pipeline(drive: rooms.Drive, has_lidar: bool = True, is_smoothing: bool = True, model: str = "diff_drive") -> Pipeline:
+    return Pipeline(Trial(make_model(model, rooms.ROBOT), "graph"), rooms.ROBOT, drive.mounts, has_lidar, is_smoothing=is_smoothing)
 
 
-def run(core: Core, events: list) -> list[Estimate]:
-    return [estimate for event in events for estimate in core.push(event)] + core.finish()
+def run(pipeline: Pipeline, events: list) -> list[Estimate]:
+    return [estimate for event in events for estimate in pipeline.process(event)] + pipeline.finish()
 
 
 @functools.cache
-def estimated(seed: int = 0) -> tuple[list[Estimate], Core]:
-    core = make_core(around(seed))
-    return run(core, around(seed).events), core
+def estimated(seed: int = 0) -> tuple[list[Estimate], Pipeline]:
+    pipeline = make_pipeline(around(seed))
+    return run(pipeline, around(seed).events), pipeline
 
 
-def smoothed(estimates: list[Estimate], core: Core) -> Trajectory:
-    records = Records()
+def smoothed(estimates: list[Estimate], pipeline: Pipeline) -> Trajectory:
+    records = EstimateTable()
     for estimate in estimates:
         records.add(estimate)
-    found = core.estimator.finish(trajectory(records.stamps(), records.table()))
+    found = pipeline.estimator.finish(trajectory(records.stamps(), records.rows()))
     assert found is not None
     return found
 
@@ -97,12 +96,12 @@ def errors(drive: rooms.Drive, stamps: list[int], poses: np.ndarray) -> np.ndarr
 
 def test_loop_about_a_building_closes() -> None:
     """After it, the live pose is nearer the truth than the odometry's drift, and so is the smoothed one."""
-    drive, (estimates, core) = around(), estimated()
+    drive, (estimates, pipeline) = around(), estimated()
     stamps = [e.stamp_ns for e in estimates]
     odometry = errors(drive, stamps, np.array([e.odometry[0] for e in estimates]))
     live = errors(drive, stamps, np.array([e.pose for e in estimates]))
-    whole = smoothed(estimates, core)
-    assert core.estimator.counts()["loops"] >= 2
+    whole = smoothed(estimates, pipeline)
+    assert pipeline.estimator.counts()["loops"] >= 2
     assert odometry[-20:].mean() > 0.03
     assert live[-20:].mean() < 0.5 * odometry[-20:].mean()
     after = errors(drive, whole.stamps_ns.tolist(), whole.poses)
@@ -124,17 +123,17 @@ def test_loop_moves_the_map_and_never_the_odometry() -> None:
 def test_odometry_is_that_of_a_filter_that_gets_the_corrections_alone() -> None:
     """Until the first keyframes the graph's odometry is the filter's, to the last bit."""
     drive = around().until(rooms.WALL_START_NS + 2 * 10**9)
-    ours = run(make_core(drive), drive.events)
-    theirs = run(Core(Pair(make_model("diff_drive", rooms.ROBOT), "ekf"), rooms.ROBOT, drive.mounts, True), drive.events)
+    ours = run(make_pipeline(drive), drive.events)
+    theirs = run(Pipeline(Trial(make_model("diff_drive", rooms.ROBOT), "ekf"), rooms.ROBOT, drive.mounts, True), drive.events)
     assert len(ours) == len(theirs) > 10
     assert all(np.array_equal(a.odometry[0], b.pose) for a, b in zip(ours[:8], theirs[:8], strict=True))
 
 
 def test_wheels_that_are_wrong_are_learned() -> None:
     """Radius by the scans along the way, k by the turns; both within 3 sigma, and with more certainty than at first."""
-    estimates, core = estimated()
+    estimates, pipeline = estimated()
     del estimates
-    parameters = core.estimator.parameters()
+    parameters = pipeline.estimator.parameters()
     mean, sigma = parameters["wheel_radius_scale"]
     assert sigma < 0.005
     assert abs(mean - 1.0 / RADIUS_ERROR) < 3.0 * sigma
@@ -145,21 +144,21 @@ def test_wheels_that_are_wrong_are_learned() -> None:
 
 
 def test_corrections_of_the_graph_are_those_of_the_next_prediction() -> None:
-    _, core = estimated()
-    names = core.estimator.odometry._corrections.names
-    learned = core.estimator._graph.corrections()[0][: len(names)]
+    _, pipeline = estimated()
+    names = pipeline.estimator.odometry._corrections.names
+    learned = pipeline.estimator._graph.corrections()[0][: len(names)]
     assert np.abs(learned).min() > 0.0
-    assert core.stepper.params == pytest.approx(core.estimator.params)
+    assert pipeline.synchronizer._params == pytest.approx(pipeline.estimator.params)
     nominal = make_model("diff_drive", rooms.ROBOT).nominal
-    assert not np.allclose(core.stepper.params, nominal)
+    assert not np.allclose(pipeline.synchronizer._params, nominal)
 
 
 def test_nees_of_smoothed_poses_is_that_of_their_covariances() -> None:
     """The middle and the end of five drives, of 3 degrees of freedom each."""
     found = []
     for seed in range(5):
-        drive, (estimates, core) = around(seed), estimated(seed)
-        whole = smoothed(estimates, core)
+        drive, (estimates, pipeline) = around(seed), estimated(seed)
+        whole = smoothed(estimates, pipeline)
         assert whole.covariances is not None
         for share in (0.5, 0.95):
             k = int(share * len(drive.stamps))
@@ -178,24 +177,24 @@ def test_scans_without_points_are_keyframes_and_close_no_loops() -> None:
     blind = [
         replace(e, points=e.points[:0], offsets=e.offsets[:0]) if isinstance(e, Scan) and i % 3 else e for i, e in enumerate(drive.events)
     ]
-    core = make_core(drive)
-    estimates = run(core, blind)
+    pipeline = make_pipeline(drive)
+    estimates = run(pipeline, blind)
     assert np.isfinite([e.pose for e in estimates]).all()
-    assert core.estimator.counts()["keyframes"] > 40
-    assert np.isfinite(smoothed(estimates, core).poses).all()
+    assert pipeline.estimator.counts()["keyframes"] > 40
+    assert np.isfinite(smoothed(estimates, pipeline).poses).all()
 
 
 def test_wheels_alone_make_a_graph() -> None:
     """Without LiDAR and positions it is dead reckoning, with a covariance that grows."""
     drive = around()
-    core = make_core(drive, has_lidar=False)
-    estimates = run(core, [e for e in drive.events if isinstance(e, WheelSample)])
+    pipeline = make_pipeline(drive, has_lidar=False)
+    estimates = run(pipeline, [e for e in drive.events if isinstance(e, WheelSample)])
     sigmas = [float(np.sqrt(np.trace(e.covariance[:2, :2]))) for e in estimates]
     assert sigmas[-1] > 5.0 * sigmas[len(sigmas) // 10]
-    assert core.estimator.counts()["keyframes"] > 40
-    assert "loops" not in core.estimator.counts()
-    assert len(core.estimator.map_points()) == 0
-    whole = smoothed(estimates, core)
+    assert pipeline.estimator.counts()["keyframes"] > 40
+    assert "loops" not in pipeline.estimator.counts()
+    assert len(pipeline.estimator.map_points()) == 0
+    whole = smoothed(estimates, pipeline)
     assert np.abs(se2.between(whole.poses, np.array([e.pose for e in estimates]))).max() < 0.05
 
 
@@ -212,14 +211,14 @@ def positions(drive: rooms.Drive, sigma_m: float = 0.1, spoil: dict[int, np.ndar
     return found
 
 
-def driven_with(fixes: list[PositionSample]) -> tuple[np.ndarray, Core]:
+def driven_with(fixes: list[PositionSample]) -> tuple[np.ndarray, Pipeline]:
     """Errors [m] of the smoothed poses by wheels and ``fixes`` alone."""
-    drive, core = around(), make_core(around(), has_lidar=False)
+    drive, pipeline = around(), make_pipeline(around(), has_lidar=False)
     wheels = [e for e in drive.events if isinstance(e, WheelSample)]
-    estimates = run(core, list(merge_positions(wheels, fixes)))
-    whole = smoothed(estimates, core)
+    estimates = run(pipeline, list(merge_positions(wheels, fixes)))
+    whole = smoothed(estimates, pipeline)
     at = np.column_stack([np.interp(drive.stamps, whole.stamps_ns, column) for column in whole.poses[:, :2].T])
-    return np.hypot(*(at - drive.poses[:, :2]).T), core
+    return np.hypot(*(at - drive.poses[:, :2]).T), pipeline
 
 
 def test_positions_pull_wheels_that_are_wrong() -> None:
@@ -229,19 +228,19 @@ def test_positions_pull_wheels_that_are_wrong() -> None:
 
 
 def test_an_outlier_among_positions_does_not_pull() -> None:
-    clean, core = driven_with(positions(around()))
+    clean, pipeline = driven_with(positions(around()))
     spoilt, _ = driven_with(positions(around(), spoil={40: np.array([50.0, 0.0])}))
-    assert core.estimator.counts()["positions"] > 70
+    assert pipeline.estimator.counts()["positions"] > 70
     assert np.abs(spoilt - clean).max() < 0.3
 
 
 def test_positions_before_the_map_has_a_heading_wait() -> None:
     """From a robot that has not moved by 5 m they do not tell where the map is turned to."""
     drive = around()
-    core = make_core(drive, is_smoothing=False)
+    pipeline = make_pipeline(drive, is_smoothing=False)
     until = rooms.WALL_START_NS + 5 * 10**9
-    run(core, list(merge_positions([e for e in drive.events if e.stamp_ns < until], positions(drive))))
-    assert "positions" not in core.estimator.counts()
+    run(pipeline, list(merge_positions([e for e in drive.events if e.stamp_ns < until], positions(drive))))
+    assert "positions" not in pipeline.estimator.counts()
 
 
 # --- checkpoints
@@ -255,29 +254,29 @@ def numbers(estimate: Estimate) -> tuple:
 def test_cut_after_its_loops_and_resumed_the_graph_goes_on_to_the_last_bit() -> None:
     drive = around()
     fixed = list(merge_positions(drive.events, positions(drive)))
-    core, cut = make_core(drive), int(0.97 * len(fixed))
+    pipeline, cut = make_pipeline(drive), int(0.97 * len(fixed))
     for event in fixed[:cut]:
-        core.push(event)
-    assert core.estimator.counts()["loops"] >= 2
-    assert core.estimator.counts()["positions"] > 50
-    resumed = thaw(*freeze(core))
-    assert list(map(numbers, run(core, fixed[cut:]))) == list(map(numbers, run(resumed, fixed[cut:])))
-    assert dict(core.estimator.parameters()) == dict(resumed.estimator.parameters())
+        pipeline.process(event)
+    assert pipeline.estimator.counts()["loops"] >= 2
+    assert pipeline.estimator.counts()["positions"] > 50
+    resumed = thaw(*freeze(pipeline))
+    assert list(map(numbers, run(pipeline, fixed[cut:]))) == list(map(numbers, run(resumed, fixed[cut:])))
+    assert dict(pipeline.estimator.parameters()) == dict(resumed.estimator.parameters())
 
 
 def test_replay_is_what_was_estimated_live_to_the_last_bit() -> None:
-    drive, (estimates, core) = around(), estimated()
-    live = make_core(drive, is_smoothing=False)
+    drive, (estimates, pipeline) = around(), estimated()
+    live = make_pipeline(drive, is_smoothing=False)
     found = []
     for event in drive.events:
-        found += live.push(event)
-        live.settle()
+        found += live.process(event)
+        live.run_deferred()
     found += live.finish()
-    (replayed,) = replay(drive.events, [Pair(make_model("diff_drive", rooms.ROBOT), "graph")], rooms.ROBOT, drive.mounts, True)
+    (replayed,) = replay(drive.events, [Trial(make_model("diff_drive", rooms.ROBOT), "graph")], rooms.ROBOT, drive.mounts, True)
     assert list(map(numbers, found)) == list(map(numbers, estimates))
     assert replayed.moments is not None
     assert np.array_equal(replayed.moments.poses[-1], found[-1].pose)
-    assert np.array_equal(replayed.trajectory.poses, smoothed(estimates, core).poses)
+    assert np.array_equal(replayed.trajectory.poses, smoothed(estimates, pipeline).poses)
 
 
 # --- parts

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from localization.consistency import nees
 from localization.estimators import pose_graph
 from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
-from localization.online.freeze import freeze
-from localization.online.thaw import thaw
+from localization.evaluation.consistency import nees
+from localization.ros.deserialize import thaw
+from localization.ros.serialize import freeze
 from motion_models import se2
 
 COV = np.diag([0.02, 0.02, 0.01]) ** 2

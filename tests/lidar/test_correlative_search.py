@@ -9,9 +9,9 @@ import pytest
 
 from localization.lidar.correlative_search import COARSE, SearchResult, _score, draw_image, search
 from localization.lidar.submap import voxel_means
-from localization.simulate import world
+from localization.simulation import world
 from motion_models import se2
-from tests import rooms
+from tests.helpers import rooms
 
 CELL = 0.1
 LAB, HALL = world.lab().walls, world.hall().walls

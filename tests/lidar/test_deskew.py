@@ -12,10 +12,10 @@ import pytest
 from localization.events import Scan
 from localization.lidar import Sweep
 from localization.lidar.deskew import extract_walls
-from localization.simulate import world
+from localization.simulation import world
 from motion_models import se2
 from motion_models.robot import Mount, WheelNoise
-from tests import rooms
+from tests.helpers import rooms
 
 NO_SLIP = WheelNoise(*[0.0] * 8)
 LAB = world.lab().walls

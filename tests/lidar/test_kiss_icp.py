@@ -10,11 +10,11 @@ from kiss_icp.threshold import get_threshold_estimator
 
 from localization.lidar import KissIcp, choose_voxel_size
 from localization.lidar.kiss_icp import AdaptiveThreshold
-from localization.online.freeze import freeze
-from localization.online.thaw import thaw
-from localization.simulate import world
+from localization.ros.deserialize import thaw
+from localization.ros.serialize import freeze
+from localization.simulation import world
 from motion_models import se2
-from tests import rooms
+from tests.helpers import rooms
 
 HALL = world.hall().walls
 POSES = np.array([[0.05 * k, 0.02 * k, 0.03 * k] for k in range(20)])

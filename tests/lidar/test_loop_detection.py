@@ -8,9 +8,9 @@ import pytest
 from localization.lidar import LidarConfig
 from localization.lidar.correlative_search import draw_image, search
 from localization.lidar.loop_detection import Keyframe, LoopClosure, LoopDetector, _within_reach
-from localization.simulate import world
+from localization.simulation import world
 from motion_models import se2
-from tests import rooms
+from tests.helpers import rooms
 
 CELL = 0.08
 LAB = world.lab().walls

@@ -11,10 +11,10 @@ import pytest
 from localization.lidar import LidarConfig, ScanMatch, ScanMatcher
 from localization.lidar.scan_matcher import _KERNEL, linearize
 from localization.lidar.submap import fill_surface, find_nearest, make_grid
-from localization.simulate import world
+from localization.simulation import world
 from motion_models import se2
 from motion_models.se2 import triple
-from tests import rooms
+from tests.helpers import rooms
 
 LAB, HALL = world.lab().walls, world.hall().walls
 CORRIDOR = np.concatenate([world.line(-60, -1.2, 60, -1.2), world.line(-60, 1.2, 60, 1.2)])

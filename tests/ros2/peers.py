@@ -16,8 +16,8 @@ import threading
 import time
 from pathlib import Path
 
-from localization.logs.source import open_source
-from tests.online_help import drive_log
+from localization.logs.sources import open_source
+from tests.helpers.online import drive_log
 from tests.ros2.environment import HERE, ROOT, clean_environment, ros2_python
 
 _TOPICS = ("/joint_states", "/scan", "/imu/data", "/tf_static")

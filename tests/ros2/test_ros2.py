@@ -54,7 +54,7 @@ def ros2_environment(domain):
 
 def start_managed(distro, domain, *arguments):
     """`skidloc_node`, in the environment of ROS 2 ``distro``."""
-    command = [ros2_python(distro), "-m", "localization.online.lifecycle", "--ros-args", *arguments]
+    command = [ros2_python(distro), "-m", "localization.ros.lifecycle", "--ros-args", *arguments]
     return Process(command, {**ros2_environment(domain), "PYTHONPATH": str(ROOT)})
 
 
@@ -110,7 +110,7 @@ def test_dds_door_receives_all_clouds_of_4_mb_at_10_hz(distro, running):
     domain = own_domain(2)
     code = (
         "import sys, time\n"
-        "from localization.online.dds import DdsTransport\n"
+        "from localization.ros.transports.dds import DdsTransport\n"
         "here, count, last = DdsTransport(int(sys.argv[1])), 0, time.monotonic() + 20\n"
         "here.subscribe('/points', 'sensor_msgs/msg/PointCloud2', is_latched=False)\n"
         "print('up', flush=True)\n"

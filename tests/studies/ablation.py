@@ -23,20 +23,20 @@ from unittest import mock
 import numba
 import numpy as np
 
-from localization.consistency import pose_consistency
 from localization.estimators import fusion
 from localization.estimators.filter import MAP, Filter
-from localization.evaluate import evaluate
+from localization.evaluation.consistency import pose_consistency
+from localization.evaluation.metrics import evaluate
+from localization.evaluation.references import ReferenceTrack, reference_track
 from localization.lidar import scan_matcher
 from localization.lidar.scan_matcher import ScanMatcher
 from localization.lidar.scan_matching import ScanMatchingSensor
 from localization.lidar.submap import VoxelGrid, fill_surface, make_grid
 from localization.logs import open_log
-from localization.references import ReferenceTrack, reference_track
-from localization.simulate.experiments import ExperimentConfig
-from localization.simulate.scanners import ScannerConfig
-from localization.simulate.simulator import SimulationConfig, simulate, write_simulation
-from localization.simulate.suite import ImuConfig, SensorConfig
+from localization.simulation.experiments import ExperimentConfig
+from localization.simulation.scanners import ScannerConfig
+from localization.simulation.sensor_suite import ImuConfig, SensorConfig
+from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
 from motion_models.robot import load_robot
 from tests.studies.buildings import BUILDINGS, Drive, errors_of
 

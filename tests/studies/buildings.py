@@ -22,13 +22,12 @@ import numpy as np
 
 from localization.estimators import CORRECTING, ESTIMATORS, EstimatorConfig
 from localization.estimators.filter import FilterConfig
-from localization.evaluate import align, relation_errors
+from localization.evaluation.metrics import align, relation_errors
+from localization.evaluation.references import ReferenceTrack, Relations, read_reference_file
 from localization.events import Event
 from localization.lidar import LidarConfig
 from localization.logs import open_log
-from localization.online.core import Pair, ReplayConfig
-from localization.references import ReferenceTrack, Relations, read_reference_file
-from localization.run import Run, replay
+from localization.pipeline import ReplayConfig, Run, Trial, replay
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.registry import make_model
@@ -76,7 +75,7 @@ class Drive:
     def run(self, estimator: str, model: str = "diff_drive", corrections: str = "constant", matcher: str = "submap", **ekf: float) -> Run:
         """One estimator over the log; ``ekf``: settings of the filter that are not the default ones."""
         config = ReplayConfig(estimator=EstimatorConfig(ekf=FilterConfig(**ekf), lidar=LidarConfig(matcher=matcher)))
-        pair = Pair(make_model(model, self.robot), estimator, corrections)
+        pair = Trial(make_model(model, self.robot), estimator, corrections)
         return replay(self.events, [pair], self.robot, self.mounts, True, config)[0]
 
     def until(self, seconds: float) -> Drive:

@@ -26,10 +26,10 @@ import numpy as np
 
 from motion_models import se2
 from motion_models.base import MotionModel
+from motion_models.calibration.maneuvers import make_batch
+from motion_models.calibration.prediction import predict
 from motion_models.friction import FrictionModel
 from motion_models.friction.contact import SATURATION
-from motion_models.maneuvers import make_batch
-from motion_models.prediction import predict
 from motion_models.robot import load_robot
 from motion_models.se2 import FloatArray
 from tests.studies import drive_husky, gentle_arcs, real_husky, terrain_track

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from motion_models import se2
-from motion_models.maneuvers import Maneuver
+from motion_models.calibration.maneuvers import Maneuver
 from motion_models.robot import Driver, Geometry, Robot
 from motion_models.se2 import FloatArray
 

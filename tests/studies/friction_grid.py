@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from motion_models.base import MotionModel
+from motion_models.calibration.regressions import RotationTable, polynomial, skid_steer_fit
 from motion_models.friction import FrictionModel
 from motion_models.registry import make_model
-from motion_models.regressions import RotationTable, polynomial, skid_steer_fit
 from motion_models.robot import load_robot
 from motion_models.se2 import FloatArray
 from motion_models.skid_steer import SkidSteer

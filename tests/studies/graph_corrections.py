@@ -28,23 +28,24 @@ import numpy as np
 from localization.estimators.filter import FilterConfig
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
-from localization.evaluate import evaluate
+from localization.evaluation.metrics import evaluate
+from localization.evaluation.references import ReferenceTrack, reference_track
 from localization.events import Event
 from localization.lidar import LidarConfig
 from localization.logs import open_log
-from localization.online.core import Core, Pair
-from localization.references import ReferenceTrack, reference_track
-from localization.simulate.experiments import ExperimentConfig
-from localization.simulate.simulator import SimulationConfig, simulate, write_simulation
-from localization.simulate.suite import START_NS
+from localization.pipeline import Pipeline, Trial
+from localization.simulation.experiments import ExperimentConfig
+from localization.simulation.sensor_suite import START_NS
+from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
 from localization.synchronizer import Synchronizer
 from localization.trajectory import Trajectory
 from motion_models import se2
-from motion_models.corrections import Form, correctable, corrections
+from motion_models.online_calibration import Form, correctable, corrections
 from motion_models.registry import make_model
 from motion_models.robot import Mount, load_robot
 from motion_models.se2 import FloatArray
-from tests.synthetic_steps import PoseSensor, match_at
+from tests.helpers.steps import last_steps, steps_after
+from tests.helpers.synthetic_steps import PoseSensor, match_at
 
 POSTURES = 7
 SIGMAS = np.array([0.005, 0.005, 0.001])
@@ -117,14 +118,14 @@ def drift(drive: Laps, model_name: str, form: Form, kind: str = "ekf", seed: int
                 measured = se2.compose(se2.between(start, now), se2.exp(SIGMAS * rng.normal(size=3)))
                 sensor.next = match_at(measured, np.diag(SIGMAS**2))
             estimator.step(step)
-            stepper.clock_offset_s, stepper.params = estimator.clock_offset_s, estimator.params
+            stepper.set_calibration(estimator.params, estimator.clock_offset_s)
             stamps.append(step.end_ns)
             poses.append(pose)
             params.append(estimator.params)
 
     for event in drive.events:
-        take(stepper.push(event))
-    take(stepper.finish())
+        take(steps_after(event, stepper))
+    take(last_steps(stepper))
     keep = np.concatenate([[True], np.diff(stamps) > 0])
     odometry = Trajectory(np.array(stamps)[keep], np.array(poses)[keep])
     first, last = max(odometry.stamps_ns[0], truth.stamps_ns[0]), min(odometry.stamps_ns[-1], truth.stamps_ns[-1])
@@ -143,16 +144,14 @@ def husky() -> None:
     print(f"{'odometry by':12} {'learning':10} {'ATE [m]':>8}")
     for name in ("diff_drive", "skid_steer", "icr", "friction"):
         for form in ("none", "constant"):
-            core = Core(Pair(make_model(name, robot), "ekf", form), robot, log.mounts, has_lidar=False)
+            pipeline = Pipeline(Trial(make_model(name, robot), "ekf", form), robot, log.mounts, has_lidar=False)
             pose, found = np.zeros(3), {}
             for event in events:
-                for step in core.stepper.push(event):
+                for step in steps_after(event, pipeline.synchronizer):
                     pose = se2.compose(pose, step.predicted.delta)
                     found[step.end_ns] = pose
-                    core.estimator.step(step)
-                    core.stepper.clock_offset_s = core.estimator.clock_offset_s
-                    if core.estimator.params is not None:
-                        core.stepper.params = core.estimator.params
+                    pipeline.estimator.step(step)
+                    pipeline.synchronizer.set_calibration(pipeline.estimator.params, pipeline.estimator.clock_offset_s)
             odometry = Trajectory(np.array(list(found)), np.array(list(found.values())))
             print(f"{name:12} {form:10} {evaluate(odometry, reference).ate_rmse_m:8.2f}", flush=True)
 

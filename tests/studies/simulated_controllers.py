@@ -4,7 +4,7 @@ python -m tests.studies.simulated_controllers
 
 The robot is VaultBot as its calibration grid shows it (`tests.studies.friction_grid`: a LiDAR 6.5 cm ahead of where it was thought to be, a
 warped chassis, a track of 58 cm); the arms stand at the seven CGs that are inferred from one column of the table (see
-`localization.simulate.experiments.CONFIGURATION_CGS`). Nothing is fitted to an arc.
+`localization.simulation.experiments.CONFIGURATION_CGS`). Nothing is fitted to an arc.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localization.simulate.evaluation import Score, score_runs
-from localization.simulate.experiments import CONTROLLERS, TRAJECTORIES
-from localization.simulate.simulator import SimulationConfig, simulate
-from localization.simulate.suite import SensorConfig
+from localization.simulation.experiments import CONTROLLERS, TRAJECTORIES
+from localization.simulation.open_loop_scores import Score, score_runs
+from localization.simulation.sensor_suite import SensorConfig
+from localization.simulation.simulator import SimulationConfig, simulate
 from motion_models.robot import load_robot
 from motion_models.se2 import FloatArray
 from tests.studies.friction_grid import fitted

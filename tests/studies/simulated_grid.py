@@ -19,16 +19,16 @@ import numpy as np
 from localization.events import CgSample, Scan, WheelSample
 from localization.lidar import LidarConfig, ScanMatcher, Sweep, choose_cell
 from localization.logs import open_log
-from localization.simulate.experiments import grid_points
-from localization.simulate.runs import RunRecord
-from localization.simulate.simulator import simulate, write_simulation
-from localization.simulate.suite import START_NS
-from localization.simulate.vehicle import TWIST, Body, VehicleConfig, VehicleState, advance
+from localization.simulation.experiments import grid_points
+from localization.simulation.run_records import RunRecord
+from localization.simulation.sensor_suite import START_NS
+from localization.simulation.simulator import simulate, write_simulation
+from localization.simulation.vehicle import TWIST, Body, VehicleConfig, VehicleState, advance
 from localization.trajectory import IntArray
 from motion_models import se2
-from motion_models.center_of_rotation import center_from_end_poses
+from motion_models.calibration.center_of_rotation import center_from_end_poses
+from motion_models.calibration.regressions import Regression, regress
 from motion_models.registry import make_model
-from motion_models.regressions import Regression, regress
 from motion_models.robot import Mount, load_robot
 from motion_models.se2 import FloatArray
 

@@ -1,4 +1,4 @@
-"""How fast the simulator is, bag written, on one core, and what its integration step costs in accuracy.
+"""How fast the simulator is, bag written, on one pipeline, and what its integration step costs in accuracy.
 
 python -m tests.studies.simulated_speed
 """
@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from localization.simulate.scanners import ScannerConfig
-from localization.simulate.simulator import SimulationConfig, simulate, write_simulation
-from localization.simulate.suite import SensorConfig
-from localization.simulate.vehicle import Body, VehicleConfig, VehicleState, advance
+from localization.simulation.scanners import ScannerConfig
+from localization.simulation.sensor_suite import SensorConfig
+from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
+from localization.simulation.vehicle import Body, VehicleConfig, VehicleState, advance
 from motion_models.friction.dynamics import FrictionDynamics
 from motion_models.robot import load_robot
 from motion_models.se2 import FloatArray

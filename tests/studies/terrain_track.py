@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from motion_models.calibrate import Fit, fit
-from motion_models.cross_validation import Interval
+from motion_models.calibration.cross_validation import Interval
+from motion_models.calibration.fit import Fit, fit
+from motion_models.calibration.least_squares import FitConfig
+from motion_models.calibration.maneuvers import Maneuver
 from motion_models.errors import CalibrationError
-from motion_models.least_squares import FitConfig
-from motion_models.maneuvers import Maneuver
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
 from motion_models.se2 import FloatArray

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from motion_models.regressions import (
+from motion_models.calibration.regressions import (
     RotationTable,
     cor_x,
     cor_y_full,

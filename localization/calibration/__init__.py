@@ -1,0 +1,1 @@
+"""Calibration of motion models by logs."""

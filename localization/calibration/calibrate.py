@@ -1,0 +1,244 @@
+"""Calibration of a motion model by logs: maneuvers, the fit of what they reveal, and how well it predicts maneuvers it has not seen."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, MotionReference, TrackMotionReference
+from localization.calibration.windows import WindowConfig, cut
+from localization.errors import EvaluationError
+from localization.evaluation.references import ReferenceTrack, read_reference_file, reference_track
+from localization.logs import Log, TopicOverrides, open_log
+from localization.trajectory import BoolArray
+from motion_models.base import MotionModel
+from motion_models.calibration.cross_validation import HeldOut, cross_validate
+from motion_models.calibration.fit import Fit, fit
+from motion_models.calibration.least_squares import FitConfig
+from motion_models.calibration.maneuvers import IntArray, Maneuver
+from motion_models.calibration.plan import Calibration, calibrate, free_of
+from motion_models.errors import CalibrationError
+from motion_models.registry import make_model
+from motion_models.robot import Robot, WheelNoise
+from motion_models.se2 import FloatArray
+
+MotionReferenceName = Literal["auto", "lidar", "gyro", "reference"]
+
+ADVICE = "Drive some 10 s straight, 10 s of turning in place to each side, and a few arcs, with a second of standing in between."
+_FOLDS, _FEWEST_GROUPS = 10, 3
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Maneuvers of one log or table."""
+
+    source: str
+    maneuvers: tuple[Maneuver, ...]
+    witness: str
+    """What measured the motion, in words."""
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A calibration and its proof."""
+
+    model: MotionModel
+    calibration: Calibration
+    before: FloatArray
+    """(M, 3) predicted poses seen from the measured ones, by the robot file's own numbers [m, m, rad]."""
+    inside: FloatArray
+    """(M, 3) the same by the fit, of the maneuvers that it was fitted to."""
+    group: IntArray
+    """(M,) group of each."""
+    position_known: BoolArray
+    """(M,) whether the position was measured, not only the heading."""
+    heldout: HeldOut | None
+    """The same by fits that have not seen the maneuver's group; None for too few groups to leave any out."""
+    systematic: dict[str, float]
+    """Sigma by parameter that no number of maneuvers averages out: the gyro's scale; empty without a gyro."""
+
+    @property
+    def measures_positions(self) -> bool:
+        return bool(self.position_known.any())
+
+    @property
+    def fit(self) -> Fit:
+        return self.calibration.fit
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Standard deviation by parameter, systematic errors included."""
+        return {name: float(np.hypot(sigma, self.systematic.get(name, 0.0))) for name, sigma in self.fit.sigmas.items()}
+
+
+def cut_log(
+    path: Path,
+    robot: Robot,
+    topics: TopicOverrides,
+    witness: MotionReferenceName,
+    reference: str | None,
+    config: WindowConfig | None = None,
+) -> Cut:
+    """The maneuvers of a log, as measured by ``witness``; "auto" is the reference if one is named, else the LiDAR, else the gyro.
+
+    A reference, even one that the robot file names, is never used unless the user says so: what is calibrated on it cannot be scored
+    against it. Raises `CalibrationError` where nothing measures the motion, and what opening the log does.
+    """
+    config = config or WindowConfig()
+    log = open_log(path, robot, topics)
+    if log.sources.wheels is None and log.wheels_error is None:
+        raise CalibrationError(
+            f"{log.path.name} has no wheels: neither joint states ({robot.topics.joint_states}) nor the driver's odometry"
+            f" ({robot.topics.odometry}); name them with --topic.joint-states or --topic.odometry. `skidloc info` lists the topics."
+        )
+    motion_reference, words = make_motion_reference(log, robot, witness, reference, config)
+    events = log.events()
+    windows = cut(events, motion_reference, make_model("diff_drive", robot), robot, config, log.path.name)
+    kept = f"{len(windows.maneuvers)} windows of {config.window_s:g} s"
+    left = f"{kept}; left out: {windows.standing} standing still, {windows.lost} not measured."
+    return Cut(log.path.name, windows.maneuvers, words, (left, *windows.warnings, *log.warnings()))
+
+
+def make_motion_reference(
+    log: Log, robot: Robot, name: MotionReferenceName, reference: str | None, config: WindowConfig
+) -> tuple[MotionReference, str]:
+    """What measures the motion of ``log``, and its name in words. Raises `CalibrationError` where the log lacks it."""
+    if name == "reference" or (name == "auto" and reference is not None):
+        track = _track(log, reference)
+        return TrackMotionReference(track, config.window_s), f"reference {track.source}"
+    sources = log.sources
+    if sources.lidar is not None and name in ("auto", "lidar"):
+        return LidarMotionReference(log.mounts, config.window_s), f"scan matching of {sources.lidar.topic}"
+    if sources.imu is not None and name in ("auto", "gyro"):
+        return GyroMotionReference(robot.gyro_noise, log.mounts, config.window_s), f"gyro {sources.imu.topic}"
+    wanted = {"auto": "neither a LiDAR nor an IMU", "lidar": "no LiDAR", "gyro": "no IMU"}.get(name, "no motion reference")
+    raise CalibrationError(
+        f"{log.path.name} has {wanted}, so nothing measures what the wheels do; name a reference with headings with --reference, or topics"
+        " with --topic.scan, --topic.points or --topic.imu. `skidloc info` lists them."
+    )
+
+
+def _track(log: Log, reference: str | None) -> ReferenceTrack:
+    name = reference if reference is not None else log.reference_topic
+    if name is None:
+        raise CalibrationError(f"{log.path.name} has no reference topic {log.robot.topics.reference}; name one with --reference.")
+    if name not in log.types and Path(name).is_file():
+        found = read_reference_file(name)
+        if not isinstance(found, ReferenceTrack):
+            raise EvaluationError(f"'{name}' holds relations; calibration needs a trajectory with headings (TUM) or a topic.")
+        return found
+    return reference_track(log.references(name), name)
+
+
+def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequence[str] = (), of_rotations: bool = False) -> Calibrated:
+    """Fit ``free`` (or else what these maneuvers reveal) of ``model`` and hold out each group once.
+
+    Raises `CalibrationError` where there is too little motion, and for names in ``free`` that are unknown or that the drive does not
+    reveal, saying what to drive.
+
+    >>> from motion_models import load_robot, read_rotation_table, rotations_as_maneuvers
+    >>> robot = load_robot("vaultbot")
+    >>> rotations = rotations_as_maneuvers(read_rotation_table("tests/data/vaultbot/rotation_grid.csv"), robot)
+    >>> cut = Cut("rotation_grid.csv", tuple(rotations), "the table")
+    >>> found = calibrated(make_model("friction", robot), [cut], robot, of_rotations=True)
+    >>> found.fit.names
+    ('tracked_x', 'warp', 'track_width', 'scrub')
+    """
+    maneuvers = [m for each in cuts for m in each.maneuvers]
+    if not maneuvers:
+        told = " ".join(f"{each.source}: {each.warnings[0]}" if each.warnings else each.source for each in cuts)
+        raise CalibrationError(f"no motion to calibrate on. {told} {ADVICE}")
+    wanted = tuple(free) or free_of(model, maneuvers, of_rotations)
+    # In a table of rotations nothing slips at random: every row has the same wheels, and its own errors.
+    config = FitConfig(noise=_NO_SLIP if of_rotations else robot.wheel_noise)
+    found = calibrate(model, maneuvers, wanted, config, insist=bool(free))
+    if not free:
+        unseen = tuple((name, _UNSEEN) for name in free_of(model, maneuvers[:0]) if name not in wanted and _only_turns(maneuvers))
+        found = dataclasses.replace(found, held=(*unseen, *found.held))
+    chosen = dataclasses.replace(found.fit.config, strict=False)
+
+    def train(some: Sequence[Maneuver]) -> Fit:
+        return fit(model, some, found.fit.names, chosen)
+
+    names = list(dict.fromkeys(m.group for m in maneuvers))
+    counts = [len(m.ends) for m in maneuvers]
+    group = np.repeat([names.index(m.group) for m in maneuvers], counts)
+    heldout = cross_validate(train, maneuvers, min(_FOLDS, len(names))) if len(names) >= _FEWEST_GROUPS else None
+    before = dataclasses.replace(found.fit, params=model.nominal, witness=np.zeros(5)).residuals(maneuvers)
+    inside = found.fit.residuals(maneuvers)
+    systematic = _gyro_scale(train, found.fit, maneuvers, cuts, robot)
+    return Calibrated(model, found, before, inside, group, _position_known(maneuvers), heldout, systematic)
+
+
+_NO_SLIP = WheelNoise(*(0.0,) * 8)
+_UNSEEN = "headings alone were measured, and no distance: record a LiDAR or a reference with positions to reveal it."
+
+
+def _only_turns(maneuvers: Sequence[Maneuver]) -> bool:
+    return not _position_known(maneuvers).any()
+
+
+def _position_known(maneuvers: Sequence[Maneuver]) -> BoolArray:
+    return np.concatenate([np.isfinite(np.broadcast_to(m.cov, (len(m.ends), 3, 3))[:, 0, 0]) for m in maneuvers])
+
+
+def _gyro_scale(
+    train: Callable[[Sequence[Maneuver]], Fit], found: Fit, maneuvers: Sequence[Maneuver], cuts: Sequence[Cut], robot: Robot
+) -> dict[str, float]:
+    """By how much the parameters move if the gyro's scale is off by its sigma."""
+    if not any(each.witness.startswith("gyro") for each in cuts):
+        return {}
+    scale = np.array([1.0, 1.0, 1.0 + robot.gyro_noise.scale_sigma])
+    other = train([dataclasses.replace(m, measured=m.measured * scale) for m in maneuvers])
+    moved = {name: abs(float(b - a)) for name, a, b in zip(found.names, found.values, other.values, strict=True)}
+    ties = {name: abs(factor) * moved[master] for name, (master, factor) in found.config.ties.items()}
+    return moved | ties
+
+
+@dataclass(frozen=True)
+class Turning:
+    """What a calibration says of turning in place at the robot's nominal CG, and of driving straight on; each with its sigma."""
+
+    effective_track_m: tuple[float, float]
+    """Distance of two wheels without slip that would turn the robot as fast."""
+    x_cr_m: tuple[float, float]
+    y_cr_m: tuple[float, float]
+    forward_scale: tuple[float, float]
+    """Metres driven straight on for each metre that the wheels roll by the robot file's radius."""
+
+
+def turning(found: Calibrated, robot: Robot) -> Turning:
+    """See `Turning`. Sigmas to first order."""
+    model, result = found.model, found.fit
+
+    def numbers(params: FloatArray) -> FloatArray:
+        r, cg = robot.geometry.wheel_radius_m, robot.center_of_gravity
+        rates = np.array([[-2.0, 2.0], [2.0, 2.0]])
+        turn, straight = model.twist(rates, cg, params).value
+        vx, vy, wz = turn
+        return np.array([4.0 * r / wz, -vy / wz, vx / wz, straight[0] / (2.0 * r)])
+
+    value = numbers(result.params)
+    everything = list(model.param_names)
+    free = [name for name in result.names if name in everything]
+    rows = []
+    for name in free:
+        step = np.zeros(len(everything))
+        size = 1e-5 * max(abs(result.params[everything.index(name)]), 0.1)
+        step[everything.index(name)] = size
+        for tied, (master, factor) in result.config.ties.items():
+            if master == name:
+                step[everything.index(tied)] = factor * size
+        rows.append((numbers(result.params + step) - numbers(result.params - step)) / (2.0 * size))
+    J = np.array(rows).reshape(len(free), 4).T
+    index = [result.names.index(name) for name in free]
+    systematic = np.array([found.systematic.get(name, 0.0) for name in free])
+    cov = result.cov[np.ix_(index, index)] + np.outer(systematic, systematic)
+    sigma = np.sqrt(np.maximum(np.diagonal(J @ cov @ J.T), 0.0))
+    return Turning(*((float(v), float(s)) for v, s in zip(value, sigma, strict=True)))

@@ -1,0 +1,267 @@
+"""What measures the motion that the wheels' is compared with: a LiDAR, a gyro, or a reference that the user names."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from localization.evaluation.references import ReferenceTrack
+from localization.events import Event, ImuSample, Scan
+from localization.gyro import GyroBuffer
+from localization.lidar import MIN_POINTS, LidarConfig, ScanMatch, ScanMatcher, Sweep, choose_cell
+from localization.trajectory import Trajectory
+from localization.wheel_buffer import WheelBuffer
+from motion_models import se2
+from motion_models.base import Motion, MotionModel
+from motion_models.preintegration import integrate_twists
+from motion_models.robot import GyroNoise, Mount, WheelNoise
+from motion_models.se2 import FloatArray
+
+_NS = 1e-9
+_MAX_SCAN_GAP_S, _MAX_REFERENCE_GAP_S = 1.0, 0.5
+HOLD_S = 0.5
+"""Without a new sample, the wheels' last rates hold for this time [s]."""
+_PRIOR_SIGMA = np.array([0.1, 0.1, 0.1])
+"""Sigma of a match's prior, beyond the wheels' slip [m, m, rad]."""
+_TURN_ERROR = 0.5
+"""Sigma of a turn by the nominal model, as a share of the turn."""
+_OPEN_SIGMA_M = 0.05
+"""Sigma of a position beyond which a scene counts as a corridor: matching then slides towards no motion at all [m]."""
+_STANDSTILL_COV = np.diag([1e-12, 1e-12, 1e-12])
+
+
+@dataclass(frozen=True)
+class Span:
+    """Motion measured from one moment to another."""
+
+    start_ns: int
+    end_ns: int
+    measured: FloatArray
+    """(3,) pose at the end seen from that at the start [m, m, rad]."""
+    cov: FloatArray
+    """(3, 3) of its right perturbation, inf on the diagonal for what is not measured."""
+    is_valid: bool = True
+
+
+@dataclass(frozen=True)
+class Wheels:
+    """The wheels' latest motion, by the nominal model."""
+
+    buffer: WheelBuffer
+    model: MotionModel
+    noise: WheelNoise
+
+    def motion(self, start_ns: int, end_ns: int) -> Motion:
+        """Motion from start to end; the last rates hold for `HOLD_S`."""
+        dt, rates, cg, _ = self.buffer.window(start_ns, end_ns, HOLD_S)
+        return integrate_twists(dt, self.model.twist(rates, cg, self.model.nominal), self.noise)
+
+    def is_standing(self, start_ns: int, end_ns: int) -> bool:
+        """Whether no wheel moved."""
+        dt, rates, _, _ = self.buffer.window(start_ns, end_ns, HOLD_S)
+        return len(dt) > 0 and not np.any(rates)
+
+
+class MotionReference(Protocol):
+    """Takes all events of one log, in order."""
+
+    def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
+        """Spans that ``event`` completes, of the length that the reference was made for."""
+
+    def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
+        """``spans`` without errors that the whole log shows; ``standing``: those during which no wheel moved."""
+
+    def warnings(self) -> list[str]:
+        """Limits of what was measured, in sentences for the user."""
+
+
+class GyroMotionReference:
+    """Yaw by the gyro; its bias from the times at which the robot stood still. Positions are not measured."""
+
+    def __init__(self, noise: GyroNoise, mounts: Mapping[str, Mount], window_s: float) -> None:
+        self._noise, self._window_ns = noise, round(window_s / _NS)
+        self._gyro = GyroBuffer(noise, mounts, keep_s=2.0 * window_s + 10.0)
+        self._start_ns = self._newest_ns = None  # type: int | None
+        self._bias: tuple[float, float] | None = None
+
+    def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
+        if isinstance(event, ImuSample):
+            self._gyro.insert(event)
+            self._newest_ns = event.stamp_ns
+        newest = wheels.buffer.newest_ns
+        if newest is None or self._newest_ns is None:
+            return
+        if self._start_ns is None:
+            self._start_ns = max(newest, self._newest_ns)
+        end_ns = self._start_ns + self._window_ns
+        if min(newest, self._newest_ns) < end_ns:
+            return
+        turn = self._gyro.turn(self._start_ns, end_ns, float(wheels.motion(self._start_ns, end_ns).delta[2]))
+        angle, variance = (0.0, math.inf) if turn is None else (turn.angle, turn.variance)
+        yield Span(self._start_ns, end_ns, np.array([0.0, 0.0, angle]), np.diag([math.inf, math.inf, variance]), is_valid=turn is not None)
+        self._start_ns = end_ns
+
+    def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
+        valid = [span for span in standing if span.is_valid]
+        bias, sigma = 0.0, self._noise.bias_sigma_rad_per_s
+        if valid:
+            rates = np.array([span.measured[2] / ((span.end_ns - span.start_ns) * _NS) for span in valid])
+            seconds = sum((span.end_ns - span.start_ns) * _NS for span in valid)
+            # The scatter covers the noise, and the bias's walk between the stops.
+            scatter = float(rates.std(ddof=1)) / math.sqrt(len(rates)) if len(rates) > 1 else 0.0
+            bias, sigma = float(rates.mean()), max(scatter, self._noise.white_rad_per_sqrt_s / math.sqrt(seconds))
+            self._bias = bias, seconds
+        corrected = []
+        for span in spans:
+            duration = (span.end_ns - span.start_ns) * _NS
+            cov = span.cov + np.diag([0.0, 0.0, (sigma * duration) ** 2])
+            yaw = se2.wrap_angle(np.asarray(span.measured[2] - bias * duration))
+            corrected.append(replace(span, measured=np.array([0.0, 0.0, float(yaw)]), cov=cov))
+        return corrected
+
+    def warnings(self) -> list[str]:
+        if self._bias is None:
+            note = "the robot never stood still, so the gyro's bias is not known and counts as error; let it stand for a few seconds."
+        else:
+            note = f"the gyro's bias is {self._bias[0]:+.5f} rad/s, by {self._bias[1]:.0f} s of standing still; it was taken off."
+        return [note, *self._gyro.warnings()]
+
+
+class LidarMotionReference:
+    """Scan matching alone: the last scan of each window against the submap of its first. Spans run between the middles of sweeps.
+
+    The scans between lead from one to the other. Wheels are the prior of each match, also along directions that the scene leaves open, and
+    the twist within a sweep is theirs plus the slip of the last match. The measured pose and its covariance are without that prior.
+    """
+
+    def __init__(self, mounts: Mapping[str, Mount], window_s: float, config: LidarConfig | None = None) -> None:
+        self._mounts, self._window_ns = mounts, round(window_s / _NS)
+        self._config = replace(config or LidarConfig(), key_scans=1)
+        self._matcher: ScanMatcher | None = None
+        self._start_ns: int | None = None
+        self._last_ns = 0
+        self._pose, self._slip = np.zeros(3), np.zeros(3)
+        self._unmatched = self._scans = self._open = 0
+
+    def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
+        if not isinstance(event, Scan) or wheels.buffer.newest_ns is None:
+            return
+        self._scans += 1
+        stamp_ns = event.middle_ns
+        if self._matcher is None or self._start_ns is None or (stamp_ns - self._last_ns) * _NS > _MAX_SCAN_GAP_S:
+            self._slip = np.zeros(3)
+            self._begin(stamp_ns, self._deskew(self._sweep(event), event, wheels))
+            return
+        is_complete = stamp_ns - self._start_ns >= self._window_ns
+        if wheels.is_standing(self._start_ns, stamp_ns):
+            self._slip = np.zeros(3)
+            self._last_ns = stamp_ns
+            if is_complete:
+                yield Span(self._start_ns, stamp_ns, np.zeros(3), _STANDSTILL_COV)
+                self._begin(stamp_ns, self._deskew(self._sweep(event), event, wheels))
+            return
+        match, points = self._match(self._matcher, event, wheels)
+        if is_complete:
+            yield self._span(stamp_ns, match)
+            self._begin(stamp_ns, points)
+
+    def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
+        return list(spans)
+
+    def warnings(self) -> list[str]:
+        notes = []
+        if self._open:
+            notes.append(f"{self._open} windows count by their heading alone: along walls and corridors scans do not fix the position.")
+        if self._unmatched:
+            lost = f"{self._unmatched} of {self._scans} scans could not be matched with the first of their window"
+            notes.append(f"{lost}; windows that end in one were left out.")
+        return notes
+
+    def _begin(self, stamp_ns: int, points: FloatArray) -> None:
+        """A window begins with a scan of these ``points`` (N, 2), or with the next one if they are too few."""
+        self._last_ns, self._pose = stamp_ns, np.zeros(3)
+        self._start_ns = stamp_ns if len(points) >= MIN_POINTS else None
+        if self._start_ns is None:
+            return
+        if self._matcher is None:
+            self._matcher = ScanMatcher(self._config, choose_cell(self._config, points))
+        self._matcher.insert_key_scan(self._pose, points)
+
+    def _match(self, matcher: ScanMatcher, scan: Scan, wheels: Wheels) -> tuple[ScanMatch | None, FloatArray]:
+        """The match of ``scan`` with the first of its window, and its points (M, 2) as they were deskewed. Without a match, the pose is
+        the wheels'."""
+        motion = wheels.motion(self._last_ns, scan.middle_ns)
+        prior = se2.compose(self._pose, motion.delta)
+        cov = motion.cov + np.diag(_PRIOR_SIGMA**2 + np.array([0.0, 0.0, (_TURN_ERROR * motion.delta[2]) ** 2]))
+        sweep = self._sweep(scan)
+        points = self._deskew(sweep, scan, wheels)
+        match, gap = None, (scan.middle_ns - self._last_ns) * _NS
+        if len(points) >= MIN_POINTS:
+            match = matcher.match(points, prior, cov)
+            if match is not None and gap > 0.0:
+                self._slip = (se2.log(se2.between(self._pose, match.pose)) - se2.log(motion.delta)) / gap
+                points = self._deskew(sweep, scan, wheels)
+                match = matcher.refine(points, prior, cov, match)
+        self._unmatched += match is None
+        self._pose, self._last_ns = prior if match is None else match.pose, scan.middle_ns
+        return match, points
+
+    def _span(self, end_ns: int, match: ScanMatch | None) -> Span:
+        assert self._start_ns is not None
+        if match is None:
+            return Span(self._start_ns, end_ns, self._pose, np.eye(3), is_valid=False)
+        cov = match.cov
+        if np.linalg.eigvalsh(cov[:2, :2])[1] > _OPEN_SIGMA_M**2:
+            self._open += 1
+            cov = np.diag([math.inf, math.inf, cov[2, 2]])
+        return Span(self._start_ns, end_ns, match.measured, cov)
+
+    def _sweep(self, scan: Scan) -> Sweep:
+        mount = self._mounts.get(scan.frame_id, Mount())
+        return Sweep.from_scan(scan, mount).within(self._config.min_range_m, self._config.max_range_m)
+
+    def _deskew(self, sweep: Sweep, scan: Scan, wheels: Wheels) -> FloatArray:
+        """(M, 2) what is matched in the plane, at the middle of the sweep: the wheels' mean twist within it, and their last slip."""
+        if not len(sweep.times):
+            return sweep.project(sweep.points)
+        half = max(round(0.5 * float(np.ptp(sweep.times)) / _NS), 1)
+        driven = wheels.motion(scan.middle_ns - half, scan.middle_ns + half).delta
+        return sweep.project(sweep.deskew(se2.log(driven) / (2 * half * _NS) + self._slip))
+
+
+class TrackMotionReference:
+    """A reference with headings that the user names: motion capture, a total station with a compass, another estimator."""
+
+    def __init__(self, track: ReferenceTrack, window_s: float, sigma_m: float = 0.02, sigma_rad: float = 0.01) -> None:
+        """Raises `EvaluationError` for a reference of positions only."""
+        self._track = Trajectory(track.stamps_ns, track.poses)
+        self._warnings = track.warnings
+        self._window_ns = round(window_s / _NS)
+        # Of the motion between two poses that err independently.
+        self._cov = 2.0 * np.diag([sigma_m**2, sigma_m**2, sigma_rad**2])
+        self._start_ns: int | None = None
+
+    def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
+        newest = wheels.buffer.newest_ns
+        if newest is None:
+            return
+        if self._start_ns is None:
+            self._start_ns = newest
+        end_ns = self._start_ns + self._window_ns
+        if newest < end_ns:
+            return
+        known = bool(self._track.covers([self._start_ns, end_ns], _MAX_REFERENCE_GAP_S).all())
+        start, end = self._track.at([self._start_ns, end_ns])
+        measured = se2.between(start, end) if known else np.zeros(3)
+        yield Span(self._start_ns, end_ns, measured, self._cov, is_valid=known)
+        self._start_ns = end_ns
+
+    def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
+        return list(spans)
+
+    def warnings(self) -> list[str]:
+        return list(self._warnings)

@@ -1,0 +1,136 @@
+"""Logs cut into maneuvers for calibration: seconds of wheel motion, each with the motion that a reference measured in the same seconds."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from localization.calibration.motion_references import HOLD_S, MotionReference, Span, Wheels
+from localization.events import CgSample, Event, WheelSample
+from localization.settings import Count, Positive, Settings
+from localization.wheel_buffer import WheelBuffer
+from motion_models.base import MotionModel
+from motion_models.calibration.maneuvers import Maneuver
+from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
+
+_NS = 1e-9
+_NOTHING = np.zeros((0,))
+
+
+@dataclass(frozen=True)
+class WindowConfig(Settings):
+    """How a log is cut into maneuvers."""
+
+    window_s: Positive = 2.0
+    """Length of a maneuver [s]: long enough for the wheels to stand out of the reference's noise, short enough not to drift."""
+    around_s: float = 0.3
+    """Wheel motion kept before and after each, in which a shift between the clocks is looked for [s]."""
+    least_m: float = 0.02
+    """A window in which no wheel rolls as far as this counts as standing still and is left out [m]."""
+    per_group: Count = 3
+    """Neighbouring windows that share their errors, and are held out together."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """What a log gave for calibration."""
+
+    maneuvers: tuple[Maneuver, ...]
+    standing: int
+    """Windows that were left out because the robot stood still in them."""
+    lost: int
+    """Windows that were left out because wheels or reference had no data, or no valid measurement."""
+    warnings: tuple[str, ...]
+    """Limits of the motion reference, in sentences for the user."""
+
+
+def cut(
+    events: Iterable[Event],
+    reference: MotionReference,
+    model: MotionModel,
+    robot: Robot,
+    config: WindowConfig | None = None,
+    name: str = "log",
+) -> Windows:
+    """Cut a log's ``events`` into maneuvers as long as ``reference`` measures them; ``name`` begins the names of their groups.
+
+    The ``model``'s nominal parameters start the matching of scans and give turns their sign; what is measured does not depend on them.
+    """
+    config = config or WindowConfig()
+    history = WheelBuffer(robot.center_of_gravity, keep_s=2.0 * config.window_s + 10.0)
+    wheels = Wheels(history, model, robot.wheel_noise)
+    around = round(config.around_s / _NS)
+    waiting: list[Span] = []
+    found: list[tuple[Span, Maneuver]] = []
+    still: list[Span] = []
+    lost = 0
+
+    def take(until_ns: int | None) -> Iterator[Span]:
+        while waiting and (until_ns is None or waiting[0].end_ns + around <= until_ns):
+            yield waiting.pop(0)
+
+    def use(span: Span) -> int:
+        """1 if the span is lost."""
+        window = _window(history, span, around)
+        if window is None:
+            return 1
+        dt, rates, cg, lead, n = window
+        rolled = robot.geometry.wheel_radius_m * np.abs(rates[lead : lead + n]).T @ dt[lead : lead + n]
+        if np.max(rolled) < config.least_m:
+            still.append(span)
+        elif span.is_valid:
+            end = np.array([n], dtype=np.int64)
+            found.append((span, Maneuver(dt, rates, span.measured[None], end, cg, span.cov, lead=lead)))
+        else:
+            return 1
+        return 0
+
+    for event in events:
+        if isinstance(event, WheelSample):
+            history.insert(event)
+        elif isinstance(event, CgSample):
+            history.set_cg(event)
+        waiting.extend(reference.spans(event, wheels))
+        if history.newest_ns is not None:
+            for span in take(history.newest_ns):
+                lost += use(span)
+    for span in take(None):
+        lost += use(span)
+    corrected = reference.correct([span for span, _ in found], still)
+    first = found[0][0].start_ns if found else 0
+    maneuvers = []
+    for (_, maneuver), span in zip(found, corrected, strict=True):
+        number = int((span.start_ns - first) * _NS / (config.window_s * config.per_group))
+        group = f"{name}, {number * config.window_s * config.per_group:g} s"
+        maneuvers.append(dataclasses.replace(maneuver, measured=span.measured[None], cov=span.cov, group=group))
+    return Windows(tuple(maneuvers), len(still), lost, tuple(reference.warnings()))
+
+
+def _window(history: WheelBuffer, span: Span, around: int) -> tuple[FloatArray, FloatArray, FloatArray, int, int] | None:
+    """Intervals (n,), rates (n, 2) and CG (n, 2) around a span, how many lie before it, and how many in it; None where some are missing."""
+    parts = []
+    for begin, end in ((span.start_ns - around, span.start_ns), (span.start_ns, span.end_ns), (span.end_ns, span.end_ns + around)):
+        dt, rates, cg, missing = history.window(begin, end, HOLD_S)
+        if missing:
+            if begin == span.start_ns:
+                return None
+            dt, rates, cg = _NOTHING, np.zeros((0, 2)), np.zeros((0, 2))  # at the log's ends, no clock is looked for
+        parts.append((dt, rates, cg))
+    dt, rates, cg = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return dt, rates, cg, len(parts[0][0]), len(parts[1][0])
+
+
+def driven(maneuvers: Sequence[Maneuver], wheel_radius_m: float, track_width_m: float) -> tuple[float, float, float]:
+    """Seconds, metres that the wheels' mean rolled, and radians by the difference of both sides' ways over the track."""
+    seconds = metres = radians = 0.0
+    for m in maneuvers:
+        inside = slice(m.lead, m.lead + int(m.ends[-1]))
+        dt, ways = m.dt[inside], m.wheels[inside] * m.dt[inside, None] * wheel_radius_m
+        seconds += float(dt.sum())
+        metres += float(np.abs(ways.mean(axis=1)).sum())
+        radians += float(np.abs(ways[:, 1] - ways[:, 0]).sum()) / track_width_m
+    return seconds, metres, radians

@@ -1,0 +1,1 @@
+"""Comparison of motion models and estimators over many logs."""

@@ -1,0 +1,135 @@
+"""The table of a comparison on disk: CSV or Parquet, rewritten as a whole after each log, so that what is done is never lost."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from localization.comparison.jobs import OK, Job, Row, TrialSpec
+from localization.errors import OutputError
+from localization.estimators import CORRECTING
+from localization.output import output_errors, whole_file
+
+_HEAD = ("log", "robot", "model", "estimator", "corrections", "key", "status", "error")
+_TEXTS = (*_HEAD, "notes", "damage")
+_SUFFIXES = (".csv", ".parquet")
+
+Name = tuple[str, str, str, str]
+"""Log, model, estimator and corrections."""
+
+
+class Table:
+    """Rows by what was run. Reads what is there; `put` and `save`."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises `OutputError` for a file that is no table of a comparison, or a format that cannot be written here."""
+        if path.suffix not in _SUFFIXES:
+            raise OutputError(f"table '{path}': its name must end in {' or '.join(_SUFFIXES)}.")
+        self.path = path
+        self._read, self._write = (_read_csv, _write_csv) if path.suffix == ".csv" else _parquet(path)
+        self._rows: dict[Name, Row] = {}
+        if path.exists():
+            for row in self._load():
+                self._rows[_name(row)] = row
+
+    def _load(self) -> list[Row]:
+        try:
+            rows = self._read(self.path)
+        except OSError as error:
+            raise OutputError(f"table '{self.path}' cannot be read: {error.strerror or error}.") from error
+        except (ValueError, csv.Error) as error:
+            raise OutputError(f"'{self.path}' is no table of a comparison ({error}). Name another file.") from error
+        if any(set(_HEAD) - set(row) for row in rows) or not rows:
+            raise OutputError(f"'{self.path}' is no table of a comparison: it lacks its columns. Name another file.")
+        return rows
+
+    def missing(self, job: Job) -> tuple[TrialSpec, ...]:
+        """The job's trials that have no row yet, or one of another configuration, log or version, or one that failed."""
+        return tuple(trial for trial in job.trials if not self._is_done(self._rows.get(_name_of(job, trial)), job))
+
+    def _is_done(self, row: Row | None, job: Job) -> bool:
+        return row is not None and row["key"] == job.key and row["status"] == OK
+
+    def put(self, rows: Iterable[Row]) -> None:
+        for row in rows:
+            self._rows[_name(row)] = row
+
+    def rows(self, jobs: Sequence[Job]) -> list[Row]:
+        """Those of ``jobs``, in their order, whatever the order in which they ended."""
+        names = [_name_of(job, trial) for job in jobs for trial in job.trials]
+        return [self._rows[name] for name in names if name in self._rows]
+
+    def save(self, jobs: Sequence[Job]) -> None:
+        """The rows of ``jobs``, then those that were there before of others. Raises `OutputError`."""
+        first = self.rows(jobs)
+        known = {_name(row) for row in first}
+        rows = first + [row for name, row in self._rows.items() if name not in known]
+        with output_errors(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(self.path, replace=True) as file:
+            self._write(file, rows)
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def _name(row: Mapping[str, Any]) -> Name:
+    return row["log"], row["model"], row["estimator"], row["corrections"]
+
+
+def _name_of(job: Job, trial: TrialSpec) -> Name:
+    return job.log, trial.model, trial.estimator, trial.corrections if trial.estimator in CORRECTING else ""
+
+
+def _columns(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys([*_HEAD, *(name for row in rows for name in row)]))
+
+
+def _write_csv(file: BinaryIO, rows: Sequence[Row]) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, _columns(rows), restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: "" if value is None else value for name, value in row.items()} for row in rows)
+    file.write(text.getvalue().encode("utf-8", errors="backslashreplace"))
+
+
+def _read_csv(path: Path) -> list[Row]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return [{name: value if name in _TEXTS else _number(value) for name, value in row.items()} for row in csv.DictReader(file)]
+
+
+def _number(text: str) -> float | int | None:
+    if text == "":
+        return None
+    return int(text) if text.lstrip("-").isdigit() else float(text)
+
+
+def _parquet(path: Path) -> tuple[Callable[[Path], list[Row]], Callable[[BinaryIO, Sequence[Row]], None]]:
+    try:
+        import pyarrow
+        import pyarrow.parquet as parquet
+    except ImportError as error:
+        raise OutputError(
+            f"table '{path}': Parquet needs the extra 'parquet': pip install 'skidloc[parquet]' ({error}). Or name a .csv."
+        ) from error
+
+    def read(path: Path) -> list[Row]:
+        try:
+            return [dict(row) for row in parquet.read_table(path).to_pylist()]
+        except pyarrow.ArrowException as error:
+            raise ValueError(" ".join(str(error).split())) from error
+
+    def write(file: BinaryIO, rows: Sequence[Row]) -> None:
+        """What no row has a number of is a column of numbers, too: the file's types do not depend on what has been run so far."""
+        columns = {}
+        for name in _columns(rows):
+            values = [row.get(name) for row in rows]
+            is_whole = any(type(value) is int for value in values) and all(value is None or type(value) is int for value in values)
+            kind = pyarrow.string() if name in _TEXTS else pyarrow.int64() if is_whole else pyarrow.float64()
+            columns[name] = pyarrow.array(values, kind)
+        parquet.write_table(pyarrow.table(columns), file)
+
+    return read, write

@@ -1,0 +1,1 @@
+"""Evaluation: metrics against a reference, and consistency of covariances."""

@@ -1,0 +1,227 @@
+"""Does an estimator know how wrong it is? NEES and NIS against chi-square bands, and the whiteness of innovations.
+
+An honest estimator's normalised squared errors ``e^T P^-1 e`` follow chi-square with as many degrees of freedom as ``e`` has dimensions
+(Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001, sec. 5.4). NEES takes errors against the
+truth, NIS innovations against their predicted covariance. Both are needed: an innovation can be honest while the state is not.
+
+The trap: the bands count independent samples. Innovations of an honest filter are independent; pose errors along one run are not (this
+second's error is the last one's plus a little), so one run counts as one sample however long it is.
+
+What a singular covariance means is told in `localization.evaluation.normalized_errors`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2, norm
+
+from localization.errors import EvaluationError
+from localization.evaluation.metrics import match
+from localization.evaluation.normalized_errors import is_covariance, normalize
+from localization.evaluation.references import ReferenceTrack
+from localization.trajectory import IntArray, Trajectory
+from motion_models import se2
+from motion_models.se2 import FloatArray
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """Correlation of normalised innovations with their successors; beyond the bound the filter's model misses something."""
+
+    lag1: float
+    """-1 to 1."""
+    bound: float
+    """Absolute correlation that white innovations exceed with probability 1 - ``probability`` only."""
+    probability: float
+
+    @property
+    def is_white(self) -> bool:
+        return abs(self.lag1) <= self.bound
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Mean of normalised squared errors, and the band that it keeps to with ``probability`` if the covariances are honest."""
+
+    n: int
+    """Samples that count (those with at least one degree of freedom)."""
+    n_independent: int
+    """How many of them the band takes as independent."""
+    dof: float
+    """Mean degrees of freedom per sample: what the mean should be."""
+    mean: float
+    band: tuple[float, float]
+    fraction_inside: float
+    """Part of the samples below the 95 % quantile of their own chi-square distribution; honest is 0.95."""
+    probability: float
+    whiteness: Whiteness | None = None
+
+    @property
+    def verdict(self) -> Literal["consistent", "overconfident", "conservative"]:
+        if self.mean > self.band[1]:
+            return "overconfident"
+        return "conservative" if self.mean < self.band[0] else "consistent"
+
+
+def nees(errors: ArrayLike, covariances: ArrayLike) -> FloatArray:
+    """(N,) normalised estimation errors squared of errors (N, d) with covariances (N, d, d).
+
+    Infinite where a covariance of zero variance is contradicted. Raises `EvaluationError` for what is no covariance.
+    """
+    return normalize(errors, covariances)[0]
+
+
+def nis(innovations: ArrayLike, covariances: ArrayLike) -> FloatArray:
+    """(N,) normalised innovations squared of innovations (N, d) with their predicted covariances (N, d, d): the same sum as `nees`."""
+    return nees(innovations, covariances)
+
+
+def degrees_of_freedom(covariances: ArrayLike) -> NDArray[np.int64]:
+    """(N,) directions in which the covariances (N, d, d) admit any error: d, less those of zero variance."""
+    p = np.asarray(covariances, dtype=float)
+    return normalize(np.zeros(p.shape[:-1]), p)[1]
+
+
+def mean_band(n: int, dof: float, probability: float = 0.95) -> tuple[float, float]:
+    """Two-sided band of the mean of ``n`` independent chi-square variables of ``dof`` degrees of freedom each."""
+    if n < 1 or dof <= 0.0 or not 0.0 < probability < 1.0:
+        raise EvaluationError(f"no band for {n} samples of {dof:g} degrees of freedom at probability {probability:g}.")
+    tail = 0.5 * (1.0 - probability)
+    low, high = chi2.ppf([tail, 1.0 - tail], n * dof) / n
+    return float(low), float(high)
+
+
+def consistency(
+    errors: ArrayLike,
+    covariances: ArrayLike,
+    probability: float = 0.95,
+    n_independent: int | None = None,
+    whiteness: bool = False,
+) -> Consistency:
+    """Test errors (N, d), or (R, N, d) of R runs, against their covariances of shape (..., d, d).
+
+    ``n_independent``: all samples unless told; give the number of runs for errors that are correlated within a run.
+    ``whiteness``: also test that successive samples are uncorrelated, for innovations of one run (N, d) in order of time.
+    Raises `EvaluationError` if nothing is left to test.
+    """
+    e, p = np.asarray(errors, dtype=float), np.asarray(covariances, dtype=float)
+    d = e.shape[-1] if e.ndim else 0
+    values, dof, _ = normalize(e.reshape(-1, d), p.reshape(-1, d, d))
+    counted = (dof > 0) | np.isinf(values)  # a broken claim of certainty counts even if nothing else was admitted
+    values, dof = values[counted], np.maximum(dof[counted], 1)
+    if not values.size:
+        raise EvaluationError("no sample with an uncertain error: consistency cannot be tested on covariances that are zero.")
+    independent = values.size if n_independent is None else n_independent
+    mean_dof = float(dof.mean())
+    return Consistency(
+        n=values.size,
+        n_independent=independent,
+        dof=mean_dof,
+        mean=float(values.mean()),
+        band=mean_band(independent, mean_dof, probability),
+        fraction_inside=float(np.mean(values <= chi2.ppf(0.95, dof))),
+        probability=probability,
+        whiteness=lag1_whiteness(e, p, probability) if whiteness else None,
+    )
+
+
+def mean_over_runs(values: ArrayLike, dof: float, probability: float = 0.95) -> tuple[FloatArray, tuple[float, float]]:
+    """Mean (N,) of NEES or NIS (R, N) over R independent runs at each instant, and the band that each of the N means keeps to."""
+    v = np.asarray(values, dtype=float)
+    if v.ndim != 2 or not v.size:
+        raise EvaluationError(f"values over runs must have shape (R, N), found {v.shape}.")
+    return v.mean(axis=0), mean_band(v.shape[0], dof, probability)
+
+
+def lag1_whiteness(innovations: ArrayLike, covariances: ArrayLike, probability: float = 0.95) -> Whiteness:
+    """Correlation of innovations (N, d) in order of time with their successors, N > 1.
+
+    Each is brought to unit covariance by the symmetric root of its own; the time-average autocorrelation
+    ``sum z_k . z_k+1 / sqrt(sum z_k . z_k  sum z_k+1 . z_k+1)`` of white ones is about normal with variance 1 / (d (N - 1))
+    (Bar-Shalom et al. 2001, sec. 5.4.2). Scaling all covariances alike does not change it: it
+    tests the model, not the size of the noise.
+    """
+    _, dof, z = normalize(innovations, covariances)
+    if len(z) < 2 or not np.any(z):
+        raise EvaluationError(f"whiteness needs at least two innovations that are not all zero, found {len(z)}.")
+    now, then = z[:-1], z[1:]
+    scale = math.sqrt(float(np.sum(now * now)) * float(np.sum(then * then)))
+    terms = float(np.minimum(dof[:-1], dof[1:]).sum())
+    bound = float(norm.ppf(0.5 * (1.0 + probability))) / math.sqrt(max(terms, 1.0))
+    return Whiteness(float(np.sum(now * then)) / scale if scale > 0.0 else 0.0, bound, probability)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """Errors of a trajectory in the tangent space of its own poses, since the first match with the reference."""
+
+    stamps_ns: IntArray
+    """(N,)"""
+    errors: FloatArray
+    """(N, 3) ``log(between(estimate, truth))``, body frame [m, m, rad]."""
+    covariances: FloatArray | None
+    """(N, 3, 3) what the estimator says of them, or None if it says nothing."""
+    n_left_out: int = 0
+    """Matches left out: before the first motion, and where the growth of the covariance since the first match is no covariance."""
+
+
+def pose_errors(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: float = 1.0) -> PoseErrors:
+    """Errors of an odometry-like trajectory against a reference with headings, for `consistency`.
+
+    Odometry knows where it is since its start, not where the start lies in the reference's plane: both motions count from the first
+    match. It is left out itself, as is what comes before the estimate first moves (only the reference's jitter would be tested there).
+    With ``d`` the estimated and ``r`` the true motion since then, the error is ``log(between(d, r))``.
+
+    If the estimator was already uncertain at the first match, by ``P_0``, its increments since have ``P_k - A P_0 A^T`` with
+    ``A = adjoint(inverse(d))``: exact to first order if increments are independent, as in odometry. Where that is no covariance they are
+    not, and the match is left out. Where the reference tells its own covariance, it is added, of this sample and of the first.
+
+    Raises `EvaluationError` if the reference has no headings or too few samples match.
+    """
+    estimate, part = match(trajectory, reference, max_gap_s)
+    truth = part.poses
+    d, r = se2.between(estimate[0], estimate[1:]), se2.between(truth[0], truth[1:])
+    errors, stamps = se2.log(se2.between(d, r)), part.stamps_ns[1:]
+    known = trajectory.covariances_at(part.stamps_ns)
+    if known is None:
+        return PoseErrors(stamps, errors, None)
+    grown = known[1:] - _moved(known[0], d)
+    stands = (np.abs(d).max(axis=1) < 1e-9) & (np.abs(grown).max(axis=(1, 2)) < 1e-15)
+    use = is_covariance(grown) & ~stands
+    if part.covariances is not None:
+        noise = _in_body(part.covariances, truth[:, 2])
+        grown = grown + noise[1:] + _moved(noise[0], r)
+    return PoseErrors(stamps[use], errors[use], grown[use], int(np.count_nonzero(~use)))
+
+
+def pose_consistency(
+    trajectory: Trajectory, reference: ReferenceTrack, probability: float = 0.95, max_gap_s: float = 1.0
+) -> Consistency | None:
+    """NEES of a trajectory along one run, which counts as one independent sample; None without covariances, headings or motion to test."""
+    if trajectory.covariances is None or reference.yaws is None:
+        return None
+    found = pose_errors(trajectory, reference, max_gap_s)
+    if found.covariances is None or not found.covariances.any():
+        return None
+    return consistency(found.errors, found.covariances, probability, n_independent=1)
+
+
+def _moved(covariance: FloatArray, motions: FloatArray) -> FloatArray:
+    """(N, 3, 3) what a covariance (3, 3) at the start is at the ends of motions (N, 3)."""
+    a = se2.adjoint(se2.inverse(motions))
+    moved: FloatArray = a @ covariance @ np.swapaxes(a, 1, 2)
+    return moved
+
+
+def _in_body(covariances: FloatArray, yaws: FloatArray) -> FloatArray:
+    """(N, 3, 3) covariances of x, y, yaw in the plane, turned into the body frame; zero where they are not known."""
+    c, s, o = np.cos(yaws), np.sin(yaws), np.zeros_like(yaws)
+    plane_T_body = np.stack([np.stack([c, -s, o], -1), np.stack([s, c, o], -1), np.stack([o, o, o + 1.0], -1)], axis=-2)
+    known = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
+    turned: FloatArray = np.swapaxes(plane_T_body, 1, 2) @ np.where(known[:, None, None], covariances, 0.0) @ plane_T_body
+    return turned

@@ -1,0 +1,166 @@
+"""What a trajectory is scored against: a track of trusted poses or positions, or hand-verified relations between instants."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from localization.errors import EvaluationError
+from localization.events import Reference
+from localization.trajectory import IntArray, number_rows, parse_float, parse_seconds, tum_rows, yaw_of_quaternion
+from motion_models.se2 import FloatArray
+
+_RELATION_COLUMNS = ("t1", "t2", "dx", "dy", "dz", "droll", "dpitch", "dyaw")
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceTrack:
+    """Where a trusted source says the robot was, in order of time, everything finite."""
+
+    stamps_ns: IntArray
+    """(N,) strictly increasing."""
+    positions: FloatArray
+    """(N, 2) in the reference's own plane [m]."""
+    yaws: FloatArray | None = None
+    """(N,) [rad], or None where the source knows positions only (GPS)."""
+    covariances: FloatArray | None = None
+    """(N, 3, 3) of x, y, yaw in the reference's plane, NaN where unknown; None where nothing is known."""
+    source: str = "reference"
+    """What errors call it: a topic or a file."""
+    n_dropped: int = 0
+    """Samples left out because they were not finite or repeated a stamp."""
+    warnings: tuple[str, ...] = ()
+    """What a reader of the scores should know about this reference."""
+
+    @property
+    def poses(self) -> FloatArray:
+        """(N, 3) x, y, yaw. Raises `EvaluationError` where the yaw is not known."""
+        if self.yaws is None:
+            raise EvaluationError(f"{self.source} knows positions only; poses need a reference with heading.")
+        return np.column_stack([self.positions, self.yaws])
+
+
+@dataclass(frozen=True, eq=False)
+class Relations:
+    """Relative poses between pairs of instants: ``start_T_end`` (Kümmerle et al., "On measuring the accuracy of SLAM algorithms", 2009)."""
+
+    starts_ns: IntArray
+    """(N,)"""
+    ends_ns: IntArray
+    """(N,)"""
+    motions: FloatArray
+    """(N, 3) dx, dy, dyaw of the end seen from the start [m, m, rad]."""
+    source: str = "relations"
+
+
+def reference_track(references: Iterable[Reference], source: str = "reference") -> ReferenceTrack:
+    """The track of reference events, sorted by header stamp.
+
+    Samples that are not finite, and all but the first of those with one stamp, are left out and counted. If some samples know their
+    yaw, those without it count as not finite. Headings that cannot be headings (see `frozen_yaw`) are taken as unknown.
+    Raises `EvaluationError` if nothing is left.
+    """
+    samples = list(references)
+    stamps = np.array([r.stamp_ns for r in samples], dtype=np.int64)
+    positions = np.array([r.position for r in samples], dtype=float).reshape(-1, 2)
+    yaws = np.array([math.nan if r.yaw is None else r.yaw for r in samples])
+    covariances = np.array([r.covariance for r in samples], dtype=float).reshape(-1, 3, 3)
+    has_yaw = any(r.yaw is not None for r in samples)
+    return _track(stamps, positions, yaws if has_yaw else None, covariances, source)
+
+
+def read_reference_file(path: str | Path) -> ReferenceTrack | Relations:
+    """A reference from a text file: relations (.relations) or a TUM trajectory (.tum); any other name is judged by its content.
+
+    Both have eight columns. A TUM line ends in a unit quaternion; a relation begins with two times. A TUM file whose quaternions are all
+    zero, or all the same though the path turns, is a reference of positions only. Raises `EvaluationError` with file and line.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix == ".relations":
+        return read_relations(path)
+    if suffix == ".tum" or _looks_like_tum(path):
+        return _read_tum_reference(path)
+    return read_relations(path)
+
+
+def read_relations(path: str | Path) -> Relations:
+    """Relations of a Freiburg benchmark file: lines ``t1 t2 dx dy dz droll dpitch dyaw`` in seconds, metres, radians.
+
+    dz, droll and dpitch are dropped: the plane is what is scored. Raises `EvaluationError` with file and line.
+    """
+    starts: list[int] = []
+    ends: list[int] = []
+    motions: list[tuple[float, float, float]] = []
+    for line, words in number_rows(path, _RELATION_COLUMNS):
+        where = f"{path}, line {line}"
+        dx, dy, *_, dyaw = (parse_float(word, where) for word in words[2:])
+        if not (math.isfinite(dx) and math.isfinite(dy) and math.isfinite(dyaw)):
+            raise EvaluationError(f"{where}: the relation is not finite. Remove the line.")
+        starts.append(parse_seconds(words[0], where))
+        ends.append(parse_seconds(words[1], where))
+        motions.append((dx, dy, dyaw))
+    return Relations(np.array(starts, dtype=np.int64), np.array(ends, dtype=np.int64), np.array(motions), source=str(path))
+
+
+def frozen_yaw(positions: FloatArray, yaws: FloatArray) -> bool:
+    """True if every heading is the same to the last bit though the path is not a straight line.
+
+    Such headings are a default, not a measurement: position sources (RTK, total stations) often fill in the identity quaternion.
+    A skid-steer robot of constant heading stays on its line, here to 5 % of its length and 10 cm.
+    """
+    if len(yaws) < 3 or np.any(yaws != yaws[0]):
+        return False
+    along, across = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / math.sqrt(len(positions))
+    return bool(across > max(0.1, 0.05 * along))
+
+
+def _track(stamps: IntArray, positions: FloatArray, yaws: FloatArray | None, covariances: FloatArray | None, source: str) -> ReferenceTrack:
+    finite = np.isfinite(positions).all(axis=1) & (np.isfinite(yaws) if yaws is not None else True)
+    order = np.flatnonzero(finite)[np.argsort(stamps[finite], kind="stable")]
+    order = order[np.append(True, np.diff(stamps[order]) > 0)] if order.size else order
+    dropped = len(stamps) - order.size
+    if not order.size:
+        raise EvaluationError(f"{source} holds no usable sample ({dropped} in it, none of them finite).")
+    warnings: tuple[str, ...] = ()
+    if dropped:
+        warnings += (f"{dropped} of {len(stamps)} samples of {source} were dropped: not finite, or of a repeated stamp.",)
+    if yaws is not None and frozen_yaw(positions[order], yaws[order]):
+        warnings += (f"the heading in {source} never changes though the path turns: taken as positions only.",)
+        yaws = None
+    if covariances is not None and np.isnan(covariances).all():
+        covariances = None
+    return ReferenceTrack(
+        stamps[order],
+        positions[order],
+        None if yaws is None else yaws[order],
+        None if covariances is None else covariances[order],
+        source,
+        dropped,
+        warnings,
+    )
+
+
+def _read_tum_reference(path: str | Path) -> ReferenceTrack:
+    rows = list(tum_rows(path))
+    stamps = np.array([stamp for _, stamp, _ in rows], dtype=np.int64)
+    positions = np.array([values[:2] for _, _, values in rows])
+    yaws = np.array([yaw_of_quaternion(*values[3:]) for _, _, values in rows])
+    has_yaw = any(any(values[3:]) for _, _, values in rows)
+    return _track(stamps, positions, yaws if has_yaw else None, None, str(path))
+
+
+def _looks_like_tum(path: str | Path) -> bool:
+    """Judged by the first hundred lines: the last four columns are a unit quaternion, or zero, or not known."""
+    for line, words in itertools.islice(number_rows(path, _RELATION_COLUMNS), 100):
+        norm = math.hypot(*(parse_float(word, f"{path}, line {line}") for word in words[4:]))
+        if norm > 0.0 and abs(norm - 1.0) > 0.01:
+            return False
+        first, second = (parse_float(word, f"{path}, line {line}") for word in words[:2])
+        if norm == 0.0 and second >= first:
+            return False  # a relation without rotation: the second column is a time too
+    return True

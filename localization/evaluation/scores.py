@@ -1,0 +1,83 @@
+"""From runs to results: each run scored against the reference, and told in the format of `metrics.json`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from localization.evaluation.accuracy import Accuracy
+from localization.evaluation.consistency import pose_consistency
+from localization.evaluation.metrics import evaluate
+from localization.evaluation.references import ReferenceTrack, Relations
+from localization.pipeline import Run
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A run and its scores."""
+
+    run: Run
+    accuracy: Accuracy | None
+    """None without a reference."""
+    nees_mean: float | None
+    """Mean of the pose's normalised error squared since the first match, 3 expected; None where the reference has no headings.
+    Of the estimates of each moment, where the trajectory is what the whole log tells."""
+    moments: Accuracy | None = None
+    """Of the estimates of each moment, where the run's trajectory is what the whole log tells."""
+
+    @property
+    def name(self) -> str:
+        return f"{self.run.model}_{self.run.estimator}"
+
+    @property
+    def nis_mean(self) -> float | None:
+        """Mean of the LiDAR's normalised innovation squared, 3 expected; None without a LiDAR."""
+        known = self.run.nis[np.isfinite(self.run.nis)]
+        return float(known.mean()) if known.size else None
+
+    def metrics(self, duration_s: float, with_timing: bool) -> dict[str, Any]:
+        """One entry of the results in `metrics.json`. Computing time differs from run to run, so it is null unless asked for."""
+        numbers = self.accuracy.numbers() if self.accuracy else Accuracy().numbers()
+        first = ("ate_rmse_m", "ate_rmse_deg", "rpe_translation_percent", "rpe_rotation_deg_per_m", "end_error_m")
+        return {
+            "model": self.run.model,
+            "estimator": self.run.estimator.removesuffix(f"_{self.run.corrections}"),
+            "corrections": self.run.corrections,
+            **{name: numbers.pop(name) for name in first},
+            "nees_mean": self.nees_mean,
+            "nis_mean": self.nis_mean,
+            "moments": None if self.moments is None else self.moments.numbers(),
+            "real_time_factor": duration_s / self.run.seconds if with_timing and self.run.seconds > 0 else None,
+            "parameters": {name: list(value) for name, value in self.run.parameters.items()},
+            "counts": dict(self.run.counts),
+            "lidar": None if self.run.lidar is None else self.run.lidar.numbers(),
+            **{name: number for name, number in numbers.items() if self.accuracy or not name.startswith("n_")},
+        }
+
+
+def score(runs: Sequence[Run], reference: ReferenceTrack | Relations | None) -> list[Result]:
+    """Score every run. Raises `EvaluationError` if the reference shares no time with them.
+
+    >>> from localization import Trial, open_log, reference_track, replay
+    >>> from motion_models import load_robot, make_model
+    >>> robot = load_robot("husky_a200")
+    >>> log = open_log("tests/data/husky-outdoor-gps/test1.bag", robot)
+    >>> runs = replay(log.events(), [Trial(make_model("diff_drive", robot), "odometry")], robot, log.mounts, has_lidar=False)
+    >>> (result,) = score(runs, reference_track(log.references("/fix"), "/fix"))
+    >>> f"{result.name}: {result.accuracy.ate_rmse_m:.1f} m, {100 * result.accuracy.overlap:.0f} % of the drive"
+    'diff_drive_odometry: 7.0 m, 100 % of the drive'
+    """
+    return [_score(run, reference) for run in runs]
+
+
+def _score(run: Run, reference: ReferenceTrack | Relations | None) -> Result:
+    if reference is None:
+        return Result(run, None, None)
+    accuracy = evaluate(run.trajectory, reference)
+    told = run.trajectory if run.moments is None else run.moments  # whose errors grow by increments, as is assumed there
+    found = None if isinstance(reference, Relations) else pose_consistency(told, reference)
+    moments = None if run.moments is None else evaluate(run.moments, reference)
+    return Result(run, accuracy, None if found is None else found.mean, moments)

@@ -1,0 +1,258 @@
+"""What is in a log, what this robot will use of it, and what is missing or suspect."""
+
+from __future__ import annotations
+
+import dataclasses
+import heapq
+import statistics
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from localization.logs.topics import REFERENCE_TYPES, TYPES, TopicSource, short_type
+
+if TYPE_CHECKING:
+    from localization.logs.reader import Log
+
+_STAMPED = {*TYPES.values(), *REFERENCE_TYPES}
+_GAP_PERIODS, _SHORTEST_GAP_S, _MOST_GAPS = 5.0, 0.25, 10
+_TYPICAL_OF = 200
+_CLOCK_LIMIT_S = 10.0
+_UNEVEN_S = 2.0
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A stretch without messages."""
+
+    at_s: float
+    """Its begin, after the log's first message."""
+    duration_s: float
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """One topic. Stamps are those of the headers where the type is one that this library knows, else null."""
+
+    topic: str
+    type: str
+    count: int
+    rate_hz: float | None
+    used_as: str | None
+    """The part that it plays: wheels, lidar, imu, center_of_gravity, arms, reference; or null."""
+    frame_id: str | None
+    first_stamp_ns: int | None
+    last_stamp_ns: int | None
+    gaps: list[Gap]
+    """The longest ones, in order of time: over five typical periods."""
+    zero_stamps: int
+    repeated_stamps: int
+    backward_stamps: int
+
+
+@dataclass(frozen=True)
+class LogInfo:
+    """What `skidloc info` prints."""
+
+    log: str
+    robot: str
+    start_ns: int
+    end_ns: int
+    """Time of recording of the first and the last message."""
+    duration_s: float
+    messages: int
+    topics: list[TopicInfo]
+    parts: dict[str, dict[str, str] | None]
+    """By part (wheels, lidar, imu, center_of_gravity): topic, kind, and what chose it; null where nothing plays it. A centre of gravity
+    that is computed from the arms has their joint states' topics, and is chosen by "arms"."""
+    references: list[str]
+    """Topics that a result can be scored against."""
+    mounts: dict[str, dict[str, float]]
+    """Frame to pose in the body frame [m, rad]."""
+    problems: list[str]
+    """What is missing or suspect, as sentences."""
+    warnings: list[str]
+    """What was chosen, mended or lost, as sentences."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return dataclasses.asdict(self)
+
+
+class _Statistics:
+    """Stamps of one topic, in constant memory."""
+
+    def __init__(self) -> None:
+        self.count = self.zero = self.repeated = self.backward = 0
+        self.first: int | None = None
+        self.last = 0
+        self._newest = self._first_log = self._last_log = 0
+        self._periods: list[int] = []
+        self._longest: list[tuple[int, int]] = []
+
+    def add(self, log_ns: int, stamp: int) -> None:
+        if self.count == 0:
+            self._first_log = log_ns
+        self.count += 1
+        self._last_log = log_ns
+        if stamp == 0:
+            self.zero += 1
+            return
+        if self.first is None:
+            self.first = self.last = self._newest = stamp
+            return
+        self.repeated += stamp == self.last
+        self.backward += stamp < self.last
+        self.last = stamp
+        step = stamp - self._newest
+        if step > 0:
+            if len(self._periods) < _TYPICAL_OF:
+                self._periods.append(step)
+            (heapq.heappush if len(self._longest) < _MOST_GAPS else heapq.heappushpop)(self._longest, (step, self._newest))
+            self._newest = stamp
+
+    def rate_hz(self) -> float | None:
+        """By the time of recording, which runs even where stamps jump."""
+        return (self.count - 1) / ((self._last_log - self._first_log) * 1e-9) if self._last_log > self._first_log else None
+
+    def gaps(self, start_ns: int) -> list[Gap]:
+        if not self._periods:
+            return []
+        limit = max(_GAP_PERIODS * statistics.median(self._periods), _SHORTEST_GAP_S * 1e9)
+        found = sorted((begin, step) for step, begin in self._longest if step > limit)
+        return [Gap((begin - start_ns) * 1e-9, step * 1e-9) for begin, step in found]
+
+
+def inspect_log(log: Log) -> LogInfo:
+    """Go through the log once, reading no more of a message than its header."""
+    stamped = [channel.topic for channel in log.channels if channel.type in _STAMPED]
+    statistics_of = {topic: _Statistics() for topic in stamped}
+    for raw in log.source.messages(stamped) if stamped else ():
+        if raw.type not in _STAMPED:
+            continue
+        statistics_of[raw.topic].add(raw.log_ns, header_stamp_ns(raw.data, is_ros1=log.source.is_ros1))
+    parts = {
+        "wheels": log.sources.wheels,
+        "lidar": log.sources.lidar,
+        "imu": log.sources.imu,
+        "center_of_gravity": log.sources.center_of_gravity,
+    }
+    played = {source.topic: part for part, source in parts.items() if source is not None}
+    for source in log.sources.arms:
+        played.setdefault(source.topic, "arms")
+    if log.sources.arms:
+        topics_of_arms = ", ".join(source.topic for source in log.sources.arms)
+        parts["center_of_gravity"] = TopicSource(topics_of_arms, "joint_states", "arms")
+    if log.reference_topic is not None:
+        played.setdefault(log.reference_topic, "reference")
+    topics = []
+    for channel in sorted(log.channels, key=lambda c: c.topic):
+        known = statistics_of.get(channel.topic, _Statistics())
+        rate = known.rate_hz() if known.count else (channel.count / log.duration_s if log.duration_s > 0 else None)
+        topics.append(
+            TopicInfo(
+                channel.topic,
+                short_type(channel.type),
+                channel.count,
+                rate,
+                played.get(channel.topic) if log.types[channel.topic] == channel.type else None,
+                log.frames.get(channel.topic),
+                known.first,
+                known.last if known.first is not None else None,
+                known.gaps(known.first if known.first is not None else 0),
+                known.zero,
+                known.repeated,
+                known.backward,
+            )
+        )
+    mounts = log.mounts
+    return LogInfo(
+        log.path.name,
+        log.robot.name,
+        log.start_ns,
+        log.end_ns,
+        log.duration_s,
+        sum(channel.count for channel in log.channels),
+        topics,
+        {part: None if source is None else dataclasses.asdict(source) for part, source in parts.items()},
+        sorted(c.topic for c in log.channels if c.type in REFERENCE_TYPES and c.count and played.get(c.topic) != "wheels"),
+        {frame: dataclasses.asdict(mount) for frame, mount in sorted(mounts.items())},
+        _problems(log, topics),
+        log.warnings(),
+    )
+
+
+def header_stamp_ns(data: bytes, *, is_ros1: bool) -> int:
+    """Stamp of a message that begins with a header, without decoding the rest; 0 if it is too short.
+
+    Four bytes come before it in both: the sequence number in ROS 1, the encapsulation, which tells the byte order, in ROS 2.
+    """
+    if len(data) < 12:
+        return 0
+    order = "<" if is_ros1 or data[1] & 1 else ">"
+    seconds, nanoseconds = struct.unpack_from(order + "iI", data, 4)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+def _problems(log: Log, topics: list[TopicInfo]) -> list[str]:
+    said: list[str] = []
+    wanted = log.robot.topics
+    if log.wheels_error is not None:
+        said.append(str(log.wheels_error))
+    elif log.sources.wheels is None:
+        said.append(
+            f"no wheels: neither joint states ({wanted.joint_states}) nor the driver's odometry ({wanted.odometry}) are in the log."
+        )
+    if log.sources.lidar is None:
+        said.append(f"no LiDAR: neither a planar scan ({wanted.scan}) nor a point cloud ({wanted.points}) is in the log.")
+    if log.sources.imu is None:
+        said.append(f"no IMU ({wanted.imu}) is in the log: the yaw rate comes from the wheels and the LiDAR alone.")
+    for source in (log.sources.lidar, log.sources.imu):
+        frame = log.frames.get(source.topic) if source is not None else None
+        if source is not None and frame is not None and frame not in log.mounts:
+            said.append(
+                f"{source.topic} is measured in frame '{frame}', whose place on the robot neither the log's /tf_static nor the robot"
+                f" file tells; add [mounts.{frame}] to the robot file."
+            )
+    if log.robot.arms is not None and log.sources.center_of_gravity is None and not log.sources.arms:
+        said.append(
+            f"robot '{log.robot.name}' has arms, but no joint states tell how they stand: the centre of gravity stays at"
+            f" ({log.robot.geometry.cg_x_m:g}, {log.robot.geometry.cg_y_m:g}) m."
+        )
+    said += _uneven(log, topics)
+    used = [topic for topic in topics if topic.used_as in ("wheels", "lidar", "imu", "center_of_gravity", "arms")]
+    for topic in used:
+        for count, what in (
+            (topic.zero_stamps, "have no stamp"),
+            (topic.backward_stamps, "are stamped before the one before them"),
+            (topic.repeated_stamps, "repeat the stamp of the one before"),
+        ):
+            if count:
+                said.append(f"{topic.topic}: {count} of {topic.count} messages {what}.")
+        if topic.first_stamp_ns is not None and abs(topic.first_stamp_ns - log.start_ns) * 1e-9 > log.duration_s + _CLOCK_LIMIT_S:
+            apart = (topic.first_stamp_ns - log.start_ns) * 1e-9
+            said.append(f"{topic.topic}: its stamps are {abs(apart):.0f} s {'after' if apart > 0 else 'before'} the time of recording.")
+        if topic.gaps:
+            longest = max(topic.gaps, key=lambda gap: gap.duration_s)
+            said.append(
+                f"{topic.topic}: {len(topic.gaps)} gap{'s' if len(topic.gaps) > 1 else ''}, the longest {longest.duration_s:.2f} s long,"
+                f" {longest.at_s:.1f} s after its first message."
+            )
+    return said
+
+
+def _uneven(log: Log, topics: list[TopicInfo]) -> list[str]:
+    """Sensors that begin after or end before the others."""
+    spans = [(t, t.first_stamp_ns, t.last_stamp_ns) for t in topics if t.used_as in ("wheels", "lidar", "imu")]
+    known = [(t, first, last) for t, first, last in spans if first is not None and last is not None]
+    if len(known) < 2:
+        return []
+    begin, end = min(first for _, first, _ in known), max(last for _, _, last in known)
+    if end - begin > (log.end_ns - log.start_ns) + _CLOCK_LIMIT_S * 1e9:
+        return []  # their clocks differ, which is told elsewhere
+    said = []
+    for topic, first, last in known:
+        for apart_s, what in (((first - begin) * 1e-9, "begins {:.1f} s after"), ((end - last) * 1e-9, "ends {:.1f} s before")):
+            if apart_s > _UNEVEN_S:
+                said.append(f"{topic.topic} {what.format(apart_s)} the other sensors.")
+    return said

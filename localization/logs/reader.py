@@ -1,0 +1,199 @@
+"""A log as the rest of the library sees it: events, references, mounts, and what was odd."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+from localization.errors import LogError, TopicError
+from localization.events import Event, Reference
+from localization.logs.chunks import Source, merge_channels
+from localization.logs.clock_sync import ClockPlan, Item, merge, plan_clocks
+from localization.logs.decode import Decoder, UnusableError, frame_name, stamp_ns
+from localization.logs.event_decoder import Intake, Part, read_item
+from localization.logs.info import LogInfo, inspect_log
+from localization.logs.message_stats import Tally
+from localization.logs.references import reference_decoder
+from localization.logs.sources import open_source
+from localization.logs.topic_roles import choose_parts
+from localization.logs.topics import REFERENCE_TYPES, TopicChooser, TopicOverrides
+from localization.logs.transforms import FixedTransforms
+from motion_models.robot import Mount, Robot
+
+_GPS = "/fix"
+_TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_TF_WATCHED_NS = 10_000_000_000
+_JOINT_STATES_SEEN = 500
+
+
+def open_log(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> Log:  # noqa: B008 (frozen)
+    """Open a ROS 1 bag, a ROS 2 bag folder or a bare .mcap of ``robot``.
+
+    Nothing but the index and a few messages is read. Raises `LogError` if it cannot be used at all, `TopicError` if ``topics``
+    names one that is not there or carries something else.
+
+    >>> from motion_models import load_robot
+    >>> log = open_log("tests/data/aces/aces.mcap", load_robot("aces"))
+    >>> f"{log.duration_s:.0f} s, wheels {log.sources.wheels.topic}, LiDAR {log.sources.lidar.topic}"
+    '1366 s, wheels /odom, LiDAR /scan'
+    """
+    path = Path(path)
+    return Log(path, open_source(path), robot, topics)
+
+
+class Log:
+    """A log of a robot; made by `open_log`. Its iterators read the file anew each time and hold about a second of it."""
+
+    def __init__(self, path: Path, source: Source, robot: Robot, topics: TopicOverrides) -> None:
+        self.path, self.robot = path, robot
+        self.source = source
+        """The file itself, with its raw messages."""
+        self.channels = merge_channels(source.channels)
+        """Topics and types in the log."""
+        count = sum(channel.count for channel in self.channels)
+        if count < 2:
+            found = "no message" if count == 0 else "only one message"
+            raise LogError(" ".join([f"log '{path}' holds {found}; motion needs more.", *source.warnings]))
+        self.start_ns, self.end_ns = source.start_ns, source.end_ns
+        """Time of recording of the first and the last message."""
+        self.types: dict[str, str] = {}
+        """Type of each topic."""
+        for channel in sorted(self.channels, key=lambda c: -c.count):  # of a topic with two types, the more frequent one counts
+            self.types.setdefault(channel.topic, channel.type)
+        self._tallies: dict[str, Tally] = {}
+        self._overrides = topics
+        self._chooser = TopicChooser(path.name, self.channels, robot, topics)
+        parts = choose_parts(path.name, self._chooser, robot, topics, self._joint_names)
+        self.sources = parts.sources
+        """Which topic plays which part."""
+        self.wheels_error = parts.wheels_error
+        """Why `events` will refuse, if it will."""
+        self._joints, self._arms, self._choice_notes = parts.joints, parts.arms, parts.warnings
+        self._mount_notes: list[str] = []
+        self.frames: dict[str, str] = {}
+        """Frame of the first message of each topic that is used."""
+        self._clocks = self._watch_clocks()
+
+    @property
+    def duration_s(self) -> float:
+        return (self.end_ns - self.start_ns) * 1e-9
+
+    @property
+    def reference_topic(self) -> str | None:
+        """The option's reference, else the robot file's, else GPS by its usual name; if the log has it and if it can be one."""
+        asked = self._overrides.reference
+        names = (self.robot.topics.reference, _GPS) if asked is None else (asked,)
+        there = self._chooser.of_type(*REFERENCE_TYPES)
+        return next((name for name in names if name in there), None)
+
+    def info(self) -> LogInfo:
+        """What is in the log, what will be used of it, and what is missing or suspect. Reads it once."""
+        return inspect_log(self)
+
+    def events(self) -> Iterator[Event]:
+        """Wheel, CG, IMU samples and scans by header stamp, never decreasing; within a topic always increasing.
+
+        Raises `TopicError` if the joint states, the only source of wheels, lack the robot's wheel joints.
+        """
+        if self.wheels_error is not None:
+            raise TopicError(" ".join([str(self.wheels_error), *self.damage()]))  # what was lost may be why
+        tally = self._tallies["events"] = Tally()
+        return self._events(tally)
+
+    def references(self, topic: str) -> Iterator[Reference]:
+        """Reference poses of a pose, odometry, transform or GPS topic, by header stamp. GPS: east and north of the first fix.
+
+        Raises `TopicError` if the log has no such topic or if it carries something else.
+        """
+        self._chooser.require(topic, REFERENCE_TYPES, "--reference")
+        tally = self._tallies[topic] = Tally()
+        decode = reference_decoder(self.types[topic])
+        clocks = self._clock_plan([*(s.topic for s in self.sources.used()), topic])
+        return merge(self._items({topic: (0, decode)}, tally), clocks, tally)
+
+    @cached_property
+    def mounts(self) -> Mapping[str, Mount]:
+        """Pose of each sensor's frame in the body frame: the log's, and the robot file's for frames which the log lacks."""
+        transforms = FixedTransforms()
+        tf = [channel for channel in self.channels if channel.type in _TF_TYPES]
+        static = [channel for channel in tf if channel.topic.endswith("tf_static")]
+        decode = Decoder(tf, is_ros1=self.source.is_ros1)
+        left = sum(channel.count for channel in static)
+        for raw in self.source.messages([channel.topic for channel in static]) if left else ():
+            left -= 1
+            _try(lambda raw=raw: transforms.add(decode(raw), is_static=True))  # type: ignore[misc]
+            if left == 0:
+                break
+        if self.source.is_ros1:
+            moving = [channel.topic for channel in tf if not channel.topic.endswith("tf_static")]
+            for raw in self.source.messages(moving) if moving else ():
+                if raw.log_ns > self.start_ns + _TF_WATCHED_NS:
+                    break
+                _try(lambda raw=raw: transforms.add(decode(raw), is_static=False))  # type: ignore[misc]
+        found = transforms.mounts()
+        self._mount_notes = transforms.warnings()
+        for frame in transforms.contradictions().keys() & self.robot.mounts.keys():
+            del found[frame]  # the robot file decides
+        return {"base_link": Mount(), **self.robot.mounts, **found}
+
+    def damage(self) -> list[str]:
+        """Sentences about what of its files could not be read, and how much could, so far."""
+        return list(dict.fromkeys(self.source.warnings))
+
+    def warnings(self) -> list[str]:
+        """Sentences about everything that was lost, mended or chosen without being told, so far: `damage` first."""
+        said = [*self.damage(), *self._mount_notes, *self._choice_notes]
+        for tally in self._tallies.values():
+            said += tally.sentences()
+        return list(dict.fromkeys(said))
+
+    def _events(self, tally: Tally) -> Iterator[Event]:
+        intake = Intake(self.sources, self._joints, self._arms, self.robot, tally)
+        for payload in merge(self._items(intake.parts, tally), self._clocks, tally):
+            yield from intake.events(payload)
+
+    def _items(self, parts: Mapping[str, Part], tally: Tally) -> Iterator[Item]:
+        decode = Decoder([c for c in self.channels if c.topic in parts], is_ros1=self.source.is_ros1)
+        for raw in self.source.messages(parts.keys()):
+            if raw.type == self.types[raw.topic]:
+                item = read_item(raw.topic, raw.log_ns, partial(decode, raw), parts[raw.topic], tally)
+                if item is not None:
+                    yield item
+
+    def _first_messages(self, topic: str, most: int) -> Iterator[tuple[int, Any]]:
+        """The first decodable messages of a topic, with their time of recording."""
+        decode = Decoder([c for c in self.channels if c.topic == topic], is_ros1=self.source.is_ros1)
+        for number, raw in enumerate(self.source.messages([topic])):
+            if number >= most:
+                return
+            try:
+                message = decode(raw)
+            except UnusableError:
+                continue
+            if raw.type == self.types[topic] and hasattr(message, "header"):
+                yield raw.log_ns, message
+
+    def _joint_names(self, topic: str) -> Iterator[list[str]]:
+        return (message.name for _, message in self._first_messages(topic, _JOINT_STATES_SEEN))
+
+    def _watch_clocks(self) -> ClockPlan:
+        return self._clock_plan([source.topic for source in self.sources.used()])
+
+    def _clock_plan(self, topics: list[str]) -> ClockPlan:
+        first: dict[str, tuple[int, int]] = {}
+        for topic in topics:
+            for log_ns, message in self._first_messages(topic, 10):
+                self.frames.setdefault(topic, frame_name(message.header.frame_id))
+                if stamp_ns(message):
+                    first[topic] = log_ns, stamp_ns(message)
+                    break
+        return plan_clocks(first)
+
+
+def _try(action: Callable[[], None]) -> None:
+    try:
+        action()
+    except UnusableError:
+        return

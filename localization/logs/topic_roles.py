@@ -1,0 +1,154 @@
+"""Who plays the parts of a log: wheels, LiDAR, IMU and centre of gravity."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from localization.errors import TopicError
+from localization.logs.arm_cg import covering
+from localization.logs.topics import TYPES, Sources, TopicChooser, TopicOverrides, TopicSource
+from motion_models.center_of_gravity.files import arms_model
+from motion_models.center_of_gravity.model import CgModel
+from motion_models.robot import Robot
+
+JointNames = Callable[[str], Iterable[Iterable[str]]]
+"""Names of the joints in each of the first messages of a topic."""
+
+Sides = tuple[tuple[str, ...], tuple[str, ...]]
+"""Joints of the left and of the right wheels."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The choice, and what it leaves to be said."""
+
+    sources: Sources
+    joints: Sides
+    """Wheel joints that the log has; empty where the wheels are not joint states."""
+    wheels_error: TopicError | None
+    """Why the wheels cannot be used although they seem to be meant."""
+    arms: CgModel | None
+    """What turns the joint states of `Sources.arms` into centres of gravity."""
+    warnings: list[str]
+
+
+def choose_parts(log: str, chooser: TopicChooser, robot: Robot, overrides: TopicOverrides, joint_names: JointNames) -> Parts:
+    """Who plays the parts. Raises `TopicError` if an option names a topic that does not fit, and what `arms_model` does."""
+    return _Choice(log, chooser, robot, overrides, joint_names).parts()
+
+
+class _Choice:
+    def __init__(self, log: str, chooser: TopicChooser, robot: Robot, overrides: TopicOverrides, joint_names: JointNames) -> None:
+        self._log, self._chooser, self._robot = log, chooser, robot
+        self._overrides, self._joint_names = overrides, joint_names
+        self._joints: Sides = ((), ())
+        self._error: TopicError | None = None
+        self._warnings: list[str] = []
+
+    def parts(self) -> Parts:
+        wheels, lidar, imu, center_of_gravity = self._wheels(), self._lidar(), self._choose("imu"), self._choose("center_of_gravity")
+        arms, model = self._arms() if center_of_gravity is None else ((), None)
+        sources = Sources(wheels, lidar, imu, center_of_gravity, arms)
+        return Parts(sources, self._joints, self._error, model, [*self._chooser.warnings, *self._warnings])
+
+    def _arms(self) -> tuple[tuple[TopicSource, ...], CgModel | None]:
+        """Joint states that tell how the arms stand. An empty option for the centre of gravity leaves it where the robot file says."""
+        robot = self._robot
+        if robot.arms is None or self._overrides.center_of_gravity is not None:
+            return (), None
+        model = arms_model(robot.arms, robot.folder)
+        joints = model.chain.joint_names
+        told: dict[str, set[str]] = {}
+        for topic in self._chooser.of_type(TYPES["joint_states"]):
+            names = {name for message_names in self._joint_names(topic) for name in message_names}
+            told[topic] = names
+        topics, missing = covering(joints, told)
+        strange = sorted(set().union(*told.values()) - set(joints) - {*robot.joints.left, *robot.joints.right})
+        if missing and (topics or strange):
+            unknown = f" Joints in it that the robot does not have: {', '.join(strange)}." if strange else ""
+            self._warnings.append(
+                f"{', '.join(topics or told)} lacks {', '.join(missing)} of the arms; until told, the centre of gravity stays where the"
+                f" robot file says.{unknown} Name the joints as the log does, or list those that it has in the robot file's [arms] joints."
+            )
+        if not topics:
+            return (), None
+        return tuple(TopicSource(topic, "joint_states", "robot") for topic in topics), model
+
+    def _choose(self, kind: str) -> TopicSource | None:
+        named = self._chooser.named(kind)
+        return named if named is not None else self._noted(self._chooser.only(kind))
+
+    def _noted(self, source: TopicSource | None) -> TopicSource | None:
+        if source is not None:
+            wanted = getattr(self._robot.topics, source.kind)
+            part = source.kind.replace("_", " ")
+            self._warnings.append(
+                f"{source.topic} is used as {part}: it is the only topic of its type, and the log has no {wanted} of that type."
+            )
+        return source
+
+    def _lidar(self) -> TopicSource | None:
+        if self._overrides.points and not self._overrides.scan:
+            return self._chooser.named("points")
+        return self._chooser.named("scan") or self._chooser.named("points") or self._choose("scan") or self._choose("points")
+
+    def _wheels(self) -> TopicSource | None:
+        """Joint states with wheels in them, else the driver's odometry."""
+        if self._overrides.odometry and not self._overrides.joint_states:
+            return self._chooser.named("odometry")
+        named = self._chooser.named("joint_states")
+        if named is not None:
+            candidates = [named.topic]
+        else:
+            candidates = self._chooser.of_type(TYPES["joint_states"]) if self._overrides.joint_states is None else []
+        known: set[str] = set()
+        fitting = []
+        for topic in candidates:
+            names, joints = self._wheel_joints(topic)
+            known |= names
+            if joints is not None:
+                fitting.append((topic, joints))
+        if len(fitting) == 1:
+            topic, self._joints = fitting[0]
+            wanted = (*self._robot.joints.left, *self._robot.joints.right)
+            absent = [joint for joint in wanted if joint not in (*self._joints[0], *self._joints[1])]
+            if absent:
+                self._warnings.append(f"{topic} lacks the joints {', '.join(absent)}; their sides are the mean of the others.")
+            return named if named is not None else self._noted(TopicSource(topic, "joint_states", "only"))
+        if len(fitting) > 1:
+            topics = ", ".join(topic for topic, _ in fitting)
+            self._warnings.append(f"{topics} all have the wheel joints; name one with --topic.joint-states.")
+        return self._odometry(named, known, bool(candidates) and not fitting)
+
+    def _odometry(self, joint_states: TopicSource | None, known: set[str], joints_are_unknown: bool) -> TopicSource | None:
+        """The odometry, where joint states will not do."""
+        lacking = (
+            f"no joint states of {self._log} have the wheel joints: robot '{self._robot.name}' names"
+            f" {', '.join((*self._robot.joints.left, *self._robot.joints.right))}; joints in it: {', '.join(sorted(known)) or 'none'}"
+        )
+        if joint_states is not None and joint_states.chosen_by == "option":
+            raise TopicError(f"{lacking}. Name them in the robot file's [joints].")
+        odometry = self._choose("odometry")
+        if joints_are_unknown and odometry is not None:
+            self._warnings.append(f"{lacking}; the wheels are taken from {odometry.topic}.")
+        elif joints_are_unknown:
+            self._error = TopicError(
+                f"{lacking}. Name them in the robot file's [joints], or go without wheels by an empty --topic.joint-states."
+            )
+        return odometry
+
+    def _wheel_joints(self, topic: str) -> tuple[set[str], Sides | None]:
+        """All joint names of a topic's first messages, and the left and right wheels' among them if both sides have some."""
+        seen: set[str] = set()
+        best: Sides | None = None
+        wanted = self._robot.joints
+        for message_names in self._joint_names(topic):
+            names = set(message_names)
+            seen |= names
+            left, right = tuple(j for j in wanted.left if j in names), tuple(j for j in wanted.right if j in names)
+            if left and right and (best is None or len(left) + len(right) > len(best[0]) + len(best[1])):
+                best = left, right
+                if len(left) + len(right) == len(wanted.left) + len(wanted.right):
+                    break
+        return seen, best

@@ -1,0 +1,84 @@
+"""Writes messages as a new log: a ROS 1 bag (.bag), a bare ROS 2 file (.mcap), or a ROS 2 folder (any name without those endings)."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from rosbags import rosbag1, rosbag2
+
+from localization.logs.message_templates import STORE, STORE_ROS1, Form, Message, Template
+from localization.output import output_errors, refuse_existing, unwritable
+
+_LATCHED_TOPIC = "/tf_static"
+
+
+def write_bag(path: str | Path, messages: Iterable[Message], on_message: Callable[[int], None] | None = None) -> int:
+    """Write ``messages``, which come in order of their ``log_ns``, one by one to ``path``; same messages, same bytes.
+
+    Messages of one topic share a form, or differ only in the length of texts. ``on_message`` is told the time of each. Returns their
+    number. Raises `OutputError`, and leaves nothing behind, where ``path`` exists or cannot be written; what ``messages`` raises passes.
+    """
+    path = Path(path)
+    refuse_existing(path)
+    with output_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=".writing-")
+    try:
+        # rosbags names the file in a ROS 2 folder after the folder: the name must be right from the start.
+        inner = Path(folder.name) / (path.stem if path.suffix == ".mcap" else path.name)
+        count = _write(inner, path, messages, on_message)
+        refuse_existing(path)
+        with output_errors(path):
+            (inner / path.name if path.suffix == ".mcap" else inner).replace(path)
+    finally:
+        folder.cleanup()
+    return count
+
+
+def _write(inner: Path, path: Path, messages: Iterable[Message], on_message: Callable[[int], None] | None) -> int:
+    is_ros1 = path.suffix == ".bag"
+    writer: Any
+    if is_ros1:
+        writer = rosbag1.Writer(inner)
+    else:
+        plugin = rosbag2.StoragePlugin.MCAP if path.suffix == ".mcap" else rosbag2.StoragePlugin.SQLITE3
+        writer = rosbag2.Writer(inner, version=9, storage_plugin=plugin)
+    # Only the writing is inside `output_errors`: what a simulation raises meanwhile passes as it is.
+    with output_errors(path):
+        writer.open()
+    try:
+        connections: dict[str, Any] = {}
+        templates: dict[int, tuple[Form, Template]] = {}
+        count = 0
+        for message in messages:
+            form = message.form
+            known = templates.get(id(form))
+            if known is None:
+                known = templates[id(form)] = (form, Template(form, is_ros1=is_ros1))
+                if form.topic not in connections:
+                    with output_errors(path):
+                        connections[form.topic] = _connect(writer, form, is_ros1)
+            data = known[1].fill(message)
+            try:
+                writer.write(connections[form.topic], message.log_ns, data)
+            except OSError as error:
+                raise unwritable(path, error) from error
+            count += 1
+            if on_message is not None:
+                on_message(message.log_ns)
+        with output_errors(path):
+            writer.close()
+    except BaseException:
+        writer.abort()
+        raise
+    return count
+
+
+def _connect(writer: Any, form: Form, is_ros1: bool) -> Any:
+    if is_ros1:
+        latched = 1 if form.topic == _LATCHED_TOPIC else None
+        return writer.add_connection(form.topic, form.type, typestore=STORE_ROS1, latching=latched)
+    return writer.add_connection(form.topic, form.type, typestore=STORE)

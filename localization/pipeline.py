@@ -1,0 +1,218 @@
+"""The pipeline: one event in, the estimates that it completes out. Replay, online and compare run the same one.
+
+    events -> synchronize -> preintegrate -> predict -> match -> update -> publish
+
+`Pipeline.process` is that line; the filter's predict, match and update are in `estimators.fusion`, in the same order.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from localization.errors import LogError
+from localization.estimate_table import NIS, TWIST, TWIST_COV, EstimateTable, trajectory
+from localization.estimators import CORRECTING, LOCALIZING, Estimate, Estimator, EstimatorConfig, make_estimator
+from localization.events import Event, PositionSample
+from localization.lidar.losses import LidarLosses
+from localization.step import Step
+from localization.synchronizer import StepConfig, Synchronizer
+from localization.trajectory import Trajectory
+from motion_models import se2
+from motion_models.base import MotionModel
+from motion_models.online_calibration import Form, correctable
+from motion_models.robot import Mount, Robot
+from motion_models.se2 import FloatArray
+
+
+@dataclass(frozen=True)
+class ReplayConfig:
+    """Settings of steps and estimators."""
+
+    step: StepConfig = field(default_factory=StepConfig)
+    estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A motion model and the estimator that uses it."""
+
+    model: MotionModel
+    estimator: str
+    corrections: Form = "constant"
+    """What a fusing estimator learns of the motion model: a form of `motion_models.online_calibration`."""
+
+
+class Pipeline:
+    """Synchronizer and estimator of one trial. Memory is bounded, unless it smooths: it stores no trajectory."""
+
+    def __init__(
+        self,
+        trial: Trial,
+        robot: Robot,
+        mounts: Mapping[str, Mount],
+        has_lidar: bool,
+        config: ReplayConfig | None = None,
+        is_smoothing: bool = False,
+    ) -> None:
+        """``is_smoothing``: the estimator shall give a smoothed trajectory at the end; it changes no estimate on the way."""
+        config = config or ReplayConfig()
+        self._name = f"{trial.estimator} ({trial.model.name})"
+        self.is_localizing = trial.estimator in LOCALIZING
+        self.mounts = dict(mounts)
+        """Known mounts by frame, shared with the synchronizer and the estimator."""
+        model = correctable(trial.model, trial.corrections) if trial.estimator in CORRECTING else trial.model
+        self.synchronizer = Synchronizer(model, robot, self.mounts, has_lidar, config.step)
+        self.estimator: Estimator = make_estimator(
+            trial.estimator, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing
+        )
+        self.wheel_twist: FloatArray | None = None
+        """(3,) mean twist of the last step by the wheels alone; None where wheel data were missing in it."""
+
+    def process(self, event: Event) -> list[Estimate]:
+        """Take ``event``; the estimates that it completes, none or several. Raises `EstimatorError`.
+
+        Stamps are trusted: after a wheel sample stamped an hour ahead, scans of before are late. Logs and topics are freed of such jumps
+        as they are read (`logs.clock_sync`); other sources of events must do it themselves.
+        """
+        if isinstance(event, PositionSample):
+            self.estimator.add_position(event)
+            return []
+        self.synchronizer.insert(event)
+        return list(self._estimates(is_last=False))
+
+    def _estimates(self, is_last: bool) -> Iterator[Estimate]:
+        while (interval := self.synchronizer.next_interval(is_last)) is not None:  # synchronize
+            step = self.synchronizer.preintegrate(interval)  # wheels through the motion model, gyro, scan
+            estimate = self.estimator.step(step)  # predict, match, update
+            self._feed_back(step)
+            yield estimate  # publish
+
+    def _feed_back(self, step: Step) -> None:
+        """What the estimator has learned of wheels and clocks is used from the next step on."""
+        self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
+        if step.duration > 0.0:
+            self.wheel_twist = se2.log(step.predicted.delta) / step.duration if step.has_wheels else None
+
+    def run_deferred(self) -> None:
+        """Do the work that published estimates need not wait for. Left out, the next `process` does it first."""
+        self.estimator.run_deferred()
+
+    def finish(self) -> list[Estimate]:
+        """The estimates that still waited for events when these ended."""
+        estimates = list(self._estimates(is_last=True))
+        self.run_deferred()
+        return estimates
+
+    @property
+    def lidar(self) -> LidarLosses | None:
+        """How long the LiDAR was lost so far; None where no scans are matched."""
+        lost = self.estimator.lost
+        return None if lost is None else LidarLosses.of(lost)
+
+    def warnings(self) -> list[str]:
+        """Problems of the sensors so far."""
+        losses = self.lidar
+        description = "" if losses is None else losses.describe()
+        return [*self.synchronizer.warnings(), *([f"{self._name}: {description}"] if description else [])]
+
+    def add_mounts(self, mounts: Mapping[str, Mount]) -> bool:
+        """Add mounts of frames that become known only now; a known one is not changed. Returns whether there were any."""
+        new = {frame: mount for frame, mount in mounts.items() if frame not in self.mounts}
+        self.mounts.update(new)
+        return bool(new)
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Result of one trial on one log."""
+
+    model: str
+    estimator: str
+    trajectory: Trajectory
+    """Poses given the whole log (smoothed where the estimator smooths), with covariances where the estimator has them."""
+    twists: FloatArray
+    """(N, 3) vx, vy, wz in the body frame at the trajectory's stamps."""
+    twist_covariances: FloatArray
+    """(N, 3, 3); NaN where it has none."""
+    nis: FloatArray
+    """(N,) normalised innovation squared of the LiDAR's measurements, 3 degrees of freedom; NaN where there was none."""
+    parameters: Mapping[str, tuple[float, float]]
+    """Mean and sigma at the end of what was estimated besides the pose."""
+    counts: Mapping[str, int]
+    """Number of occurrences by name: scans, matched, searched, standing..."""
+    map_points: FloatArray
+    """(M, 2) points of the map, in the world [m]; (0, 2) without a LiDAR."""
+    warnings: Sequence[str]
+    """Problems of the sensors."""
+    seconds: float
+    """Computing time of this trial, without reading the log."""
+    corrections: str | None = None
+    """Form of the corrections to the motion model, or None where the estimator makes none."""
+    moments: Trajectory | None = None
+    """Filtered poses, as they were estimated at each moment and published live, where ``trajectory`` is smoothed."""
+    lidar: LidarLosses | None = None
+    """How long the LiDAR was lost; None where no scans were matched to a map."""
+
+
+def replay(
+    events: Iterable[Event],
+    trials: Sequence[Trial],
+    robot: Robot,
+    mounts: Mapping[str, Mount],
+    has_lidar: bool,
+    config: ReplayConfig | None = None,
+    on_event: Callable[[int], None] = lambda stamp_ns: None,
+) -> list[Run]:
+    """Run all ``trials`` over ``events``, which are read once; ``on_event`` is called with the stamp of each.
+
+    Estimators receive the same events in the same order as they would live. Only the trajectories grow with the log.
+    Raises `LogError` if the events give no motion, and what the log's iterator raises.
+    """
+    replays = [_Replay(trial, Pipeline(trial, robot, mounts, has_lidar, config, is_smoothing=True)) for trial in trials]
+    for event in events:
+        for one in replays:
+            one.process(event)
+        on_event(event.stamp_ns)
+    return [one.finish() for one in replays]
+
+
+class _Replay:
+    """One pipeline, and the table of its estimates."""
+
+    def __init__(self, trial: Trial, pipeline: Pipeline) -> None:
+        self._trial, self._pipeline, self._table, self._seconds = trial, pipeline, EstimateTable(), 0.0
+
+    def process(self, event: Event) -> None:
+        begin = time.perf_counter()
+        for estimate in self._pipeline.process(event):
+            self._table.add(estimate)
+        self._seconds += time.perf_counter() - begin
+
+    def finish(self) -> Run:
+        begin = time.perf_counter()
+        for estimate in self._pipeline.finish():
+            self._table.add(estimate)
+        stamps, table = self._table.stamps(), self._table.rows()
+        if not len(stamps):
+            raise LogError("there are wheel samples and scans in the log, but no two that span an interval of time.")
+        filtered, estimator = trajectory(stamps, table), self._pipeline.estimator
+        smoothed = estimator.finish(filtered)
+        self._seconds += time.perf_counter() - begin
+        return Run(
+            self._trial.model.name,
+            self._trial.estimator,
+            filtered if smoothed is None else smoothed,
+            table[:, TWIST],
+            table[:, TWIST_COV].reshape(-1, 3, 3),
+            table[:, NIS],
+            estimator.parameters(),
+            estimator.counts(),
+            estimator.map_points(),
+            self._pipeline.warnings(),
+            self._seconds,
+            self._trial.corrections if self._trial.estimator in CORRECTING else None,
+            None if smoothed is None else filtered,
+            self._pipeline.lidar,
+        )

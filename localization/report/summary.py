@@ -1,0 +1,272 @@
+"""The report in words: which run is best and by how much, whether it knows how wrong it is, and what to do with it.
+
+A difference is called one only if the log can show it. Errors along a drive are correlated and a few large ones (closed loops) make most
+of their mean, so runs are compared by blocks and by ranks: the drive is cut into ten stretches of equally many samples, and the
+differences of two runs' mean errors in them are tested by Wilcoxon's signed ranks, which takes the blocks and not the samples as
+independent and asks nothing of their distribution. Two runs whose errors differ by less than 2 % are called equally good too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import chi2, wilcoxon
+
+from localization.evaluation.consistency import mean_band
+from localization.evaluation.metrics import relation_errors
+from localization.evaluation.references import ReferenceTrack, Relations
+from localization.evaluation.scores import Result
+from localization.report.runs import DEAD_RECKONING, WHEELLESS, Line, baseline_line, best_line, capitalised, headline, joined, make_lines
+from localization.trajectory import IntArray
+from motion_models.se2 import FloatArray
+
+_DOF = 3
+_BLOCKS = 10
+_SAME = 0.02
+# The band of thousands of innovations is so narrow that every filter leaves it: below this factor in sigma nobody need act.
+_NOTABLE = 1.25
+
+
+def verdict(results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> str:
+    """One paragraph that a person can act on, from the numbers alone."""
+    return " ".join(verdict_sentences(results, reference))
+
+
+def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> list[str]:
+    """The paragraph's sentences, what matters most first."""
+    lines = make_lines(results)
+    if not lines:
+        return ["Nothing was run, so there is nothing to tell."]
+    best, losses = best_line(lines), _losses(lines)
+    if reference is None or all(line.error is None for line in lines):
+        line = _most_informed(lines)
+        return [*_unscored(lines), *losses, *_honesty(line, f"The covariances of {line.words}")]
+    if best is None:
+        return [*losses, "No run can be recommended."]
+    equals = equally_good(lines, best, reference)
+    ranking = _ranking(lines, best, equals, reference)
+    return [*ranking, *losses, *_hindsight(best), *_coverage(best), *_honesty(best), *_advice(lines, best, equals)]
+
+
+def equally_good(lines: Sequence[Line], best: Line, reference: ReferenceTrack | Relations) -> list[Line]:
+    """The scored runs but ``best`` whose errors this log cannot tell from its errors, or that differ by less than 2 %.
+
+    Runs that lost the LiDAR for long are not among them.
+    """
+    others = [line for line in lines if line is not best and line.error is not None and not line.is_lost]
+    return [line for line in others if is_close(line, best) or not _is_worse(line, best, reference)]
+
+
+def metres(value: float) -> str:
+    """A length in metres to three digits, never in the notation of machines."""
+    if not math.isfinite(value):
+        return "an infinite distance"
+    if value and value < 0.0095:
+        return f"{1000.0 * value:.2g} mm"
+    digits = 3 if value < 0.995 else 2 if value < 9.995 else 1 if value < 99.95 else 0
+    return f"{value:,.{digits}f} m"
+
+
+def is_close(line: Line, best: Line) -> bool:
+    """True if the errors differ by less than 2 %, whatever can be shown of that."""
+    return _error(line) - _error(best) <= _SAME * _error(best)
+
+
+def _is_worse(line: Line, best: Line, reference: ReferenceTrack | Relations) -> bool:
+    """True if ``line``'s errors exceed those of ``best`` over so much of the drive that it is no accident, at 95 % two-sided."""
+    difference = _differences(line, best, reference)
+    if len(difference) < 2 * _BLOCKS:
+        return False
+    blocks = np.array([block.mean() for block in np.array_split(difference, _BLOCKS)])
+    return bool(blocks.any()) and float(wilcoxon(blocks, alternative="greater", method="exact" if blocks.all() else "auto").pvalue) < 0.025
+
+
+def _differences(line: Line, best: Line, reference: ReferenceTrack | Relations) -> FloatArray:
+    """(N,) in order of time, of what the headline number is the mean of: relations' errors, or squared position errors."""
+    if isinstance(reference, Relations):
+        one, two = (relation_errors(x.result.run.trajectory, reference) for x in (line, best))
+        common = np.intersect1d(one.index, two.index)
+        common = common[np.argsort(reference.starts_ns[common], kind="stable")]
+        return _at(one.translation_m, one.index, common) - _at(two.translation_m, two.index, common)
+    series = [x.result.accuracy.errors if x.result.accuracy else None for x in (line, best)]
+    if series[0] is None or series[1] is None:
+        return np.empty(0)
+    common = np.intersect1d(series[0].stamps_ns, series[1].stamps_ns)
+    squares = [_at(s.position_m, s.stamps_ns, common) ** 2 for s in series if s is not None]
+    return squares[0] - squares[1]
+
+
+def _at(values: FloatArray, keys: IntArray, wanted: IntArray) -> FloatArray:
+    found: FloatArray = values[np.searchsorted(keys, wanted)]
+    return found
+
+
+def _ranking(lines: Sequence[Line], best: Line, equals: Sequence[Line], reference: ReferenceTrack | Relations) -> list[str]:
+    assert best.error is not None
+    measure = _measure(best, reference)
+    if len(lines) == 1:
+        alone = "Nothing else was run, so nothing tells whether another pair does better."
+        return [f"{capitalised(best.words)}: {metres(best.error)} {measure}.", alone]
+    near, unproven = [x for x in equals if is_close(x, best)], [x for x in equals if not is_close(x, best)]
+    found = "has the smallest error" if equals else "is best"
+    if any(line.is_lost and line.error is not None and line.error < best.error for line in lines):
+        found += " of the runs that can be recommended"
+    sentences = [f"{capitalised(best.words)} {found}: {metres(best.error)} {measure}{_gains(lines, best)}."]
+    if near:
+        sentences.append(f"Within 2 % of it: {_listed(near)}.")
+    if unproven:
+        sentences.append(f"Not proven worse by this one drive: {_listed(unproven)}.")
+    return sentences
+
+
+def _listed(lines: Sequence[Line]) -> str:
+    return joined([f"{line.words} ({metres(_error(line))})" for line in lines])
+
+
+def _measure(best: Line, reference: ReferenceTrack | Relations) -> str:
+    accuracy = best.result.accuracy
+    assert accuracy is not None
+    if accuracy.relations:
+        return f"mean translation error over {accuracy.relations.all.n:,} relations"
+    driven = f" over {metres(accuracy.distance_m)} driven" if accuracy.distance_m else ""
+    return f"position error (ATE, root mean square) against {reference.source}{driven}"
+
+
+def _gains(lines: Sequence[Line], best: Line) -> str:
+    """How much less the error is than that of each of the parts."""
+    parts = [baseline_line(lines), next((line for line in lines if line.result.run.estimator == WHEELLESS), None)]
+    gains = []
+    for part in parts:
+        if part is None or part is best or part.error is None or is_close(part, best):
+            continue
+        less = 100.0 * (1.0 - _error(best) / part.error)
+        rounded = f"{math.floor(less)}" if less < 99.0 else f"{math.floor(10.0 * min(less, 99.9)) / 10.0:.1f}"  # never up to all of it
+        gains.append(f"{rounded} % less than {part.words} ({metres(part.error)})")
+    return ", " + joined(gains) if gains else ""
+
+
+def _losses(lines: Sequence[Line]) -> list[str]:
+    """Runs without LiDAR for so long that they are not recommended, and what to do."""
+    lost = [(line, line.result.run.lidar) for line in lines if line.is_lost]
+    if not lost:
+        return []
+    parts = [
+        f"{line.words}{'' if line.error is None else f' ({metres(line.error)})'}: {losses.summary}"
+        for line, losses in lost
+        if losses is not None
+    ]
+    advice = dict.fromkeys(losses.advice for _, losses in lost if losses is not None)
+    return [f"Not recommended are {'; '.join(parts)}." if len(parts) > 1 else f"Not recommended is {parts[0]}.", *advice]
+
+
+def _hindsight(best: Line) -> list[str]:
+    """What of the error was only known to be one when the robot came back."""
+    loops, then = best.result.run.counts.get("loops", 0), headline(best.result.moments)
+    if not loops or then is None:
+        return []
+    places = "a place" if loops == 1 else f"{loops} places"
+    return [f"That is with hindsight, by {places} seen again; as it drove, its error was {metres(then)}."]
+
+
+def _coverage(best: Line) -> list[str]:
+    accuracy = best.result.accuracy
+    if accuracy is None or accuracy.overlap >= 0.9:
+        return []
+    return [f"The reference covers only {100.0 * accuracy.overlap:.0f} % of the drive's time."]
+
+
+def _honesty(line: Line, whose: str = "Its covariances") -> list[str]:
+    """Does the run know how wrong it is? By NIS over many scans; by NEES only where even a single drive is enough to say no."""
+    run, nees = line.result.run, line.result.nees_mean
+    if run.trajectory.covariances is None:
+        return [f"{capitalised(line.words)} gives no covariance."]
+    known = run.nis[np.isfinite(run.nis)]
+    sayings, judged_by_pose = [], ""
+    if len(known) >= 20:
+        verdict_, said = _judge("NIS", float(known.mean()), mean_band(len(known), _DOF), "innovations")
+        middle, expected = float(np.median(known)), float(chi2.median(_DOF))
+        if verdict_ == "over" and middle < expected * _NOTABLE**2:
+            said += f" in the mean, but most fit (median {middle:.1f}, {expected:.1f} expected), so some outliers make it"
+        sayings.append((verdict_, said))
+    if nees is not None and not math.isnan(nees):
+        sayings.append(_judge("NEES", nees, mean_band(1, _DOF), "errors"))
+        judged_by_pose = sayings[-1][0]
+    found = {word: [text for verdict_, text in sayings if verdict_ == word] for word in ("over", "under", "fits")}
+    if found["over"]:
+        also = f" ({joined([*found['under'], *found['fits']])})" if found["under"] or found["fits"] else ""
+        return [f"{whose} are overconfident: {joined(found['over'])}{also}. Enlarge them before anything trusts them."]
+    also = f" ({joined(found['fits'])})" if found["fits"] else ""
+    if found["under"] and judged_by_pose == "under":
+        return [f"{whose} are larger than need be: {joined(found['under'])}{also}; safe to fuse, but given less weight than is due."]
+    if found["under"]:  # innovations are of one step: they test what is believed of wheels and scans, not what became of it in the pose
+        allowed = f"wheels and scans differ less than they allow for ({found['under'][0]}){also}"
+        unknown = "" if judged_by_pose else "; whether the pose's are too large, only a reference track with headings could tell"
+        return [f"Nothing says that {_lower(whose)} are too small: {allowed}{unknown}."]
+    if found["fits"]:
+        return [f"Nothing speaks against {_lower(whose)}: {joined(found['fits'])}."]
+    return [f"{whose} could not be tested: that takes scans, or a reference with headings."]
+
+
+def _judge(name: str, mean: float, band: tuple[float, float], what: str) -> tuple[str, str]:
+    """("over" | "under" | "fits", words). Beyond the band it must be by a factor in sigma that matters, too."""
+    factor = math.sqrt(mean / _DOF)
+    value = "infinite" if math.isinf(mean) else f"{mean:.3g}" if mean < 99.5 else f"{mean:,.0f}"
+    said = f"mean {name} {value}, where {_DOF} is expected"
+    if mean > band[1] and factor > _NOTABLE:
+        return "over", said if math.isinf(mean) else f"{said}, {what} {factor:.1f} times the size it claims"
+    if mean < band[0] and factor < 1.0 / _NOTABLE:
+        return "under", f"{said}, {what} {factor:.2g} times the size it claims"
+    return "fits", said
+
+
+def _advice(lines: Sequence[Line], best: Line, equals: Sequence[Line]) -> list[str]:
+    if len(lines) == 1:
+        return [f"To learn what {best.result.run.estimator} gains, run it beside {DEAD_RECKONING} and another model."]
+    witnesses = [line for line in lines if line.result.run.estimator != DEAD_RECKONING and len(line.result.run.map_points)]
+    if best.result.run.estimator == DEAD_RECKONING and witnesses and not any(line in equals for line in witnesses):
+        return ["The LiDAR made no run better than the wheels alone: check its mount, its stamps and its range in the robot file first."]
+    base = baseline_line(lines)
+    if base is not None and base in equals:
+        return ["Confirm on another drive, before relying on it, that it is better than dead reckoning."]
+    if any(line.result.run.estimator == best.result.run.estimator for line in equals):
+        return [f"Use {best.result.run.estimator}; which motion model is better in it, this drive does not tell."]
+    return [f"Use {best.words}."]
+
+
+def _unscored(lines: Sequence[Line]) -> list[str]:
+    """Without a reference nothing tells which run is right; how far they lie apart can be said."""
+    ask = "Pass --reference with a pose or GPS topic, a TUM file or a relations file to have them scored."
+    if len(lines) == 1:
+        line = lines[0]
+        driven = metres(line.result.run.trajectory.distance(0.05))
+        return [f"No reference was given: {line.words} drove {driven}, and nothing here says how accurately.", ask]
+    ends = {line.number: _end(line) for line in lines}
+    pairs = [(a, b) for i, a in enumerate(lines) for b in lines[i + 1 :] if ends[a.number] is not None and ends[b.number] is not None]
+    apart = []
+    if pairs:
+        gaps = [math.dist(ends[a.number] or (), ends[b.number] or ()) for a, b in pairs]
+        far = max(range(len(gaps)), key=gaps.__getitem__)
+        driven = metres(max(line.result.run.trajectory.distance(0.05) for line in lines))
+        apart = [f"After {driven} at most, {pairs[far][0].words} and {pairs[far][1].words} end farthest apart, by {metres(gaps[far])}."]
+    return ["No reference was given, so nothing here says which run is right.", *apart, ask]
+
+
+def _most_informed(lines: Sequence[Line]) -> Line:
+    """Without scores: the last run that has covariances and, if any has, innovations to test them by."""
+    return max(lines, key=lambda x: (x.result.run.trajectory.covariances is not None, x.result.nis_mean is not None, x.number))
+
+
+def _end(line: Line) -> tuple[float, float] | None:
+    poses = line.result.run.trajectory.poses
+    return (float(poses[-1, 0]), float(poses[-1, 1])) if len(poses) else None
+
+
+def _error(line: Line) -> float:
+    assert line.error is not None
+    return line.error
+
+
+def _lower(text: str) -> str:
+    return text[0].lower() + text[1:]

@@ -1,0 +1,208 @@
+"""A state on disk: written as a whole or not at all, and resumed by another process to the last bit.
+
+The file: a line with the format's name and version, one with the SHA-256 of all that follows, a line of JSON (what made the state, and how
+far it had come), then the state (`freeze`). It is written beside its place, forced to disk, and moved there: whoever kills the process
+at any moment finds the old state or the new one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import os
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from localization.errors import DumpError
+from localization.provenance import versions
+from localization.ros.deserialize import thaw
+from localization.ros.serialize import freeze, freeze_apart
+from motion_models.robot import Robot
+
+_MAGIC = b"skidloc state 1\n"
+_INT_END = 2**63 - 1
+
+
+@dataclass(frozen=True)
+class Dump:
+    """What `read_dump` found."""
+
+    head: Mapping[str, Any]
+    """What the writer told of the state."""
+    value: Any
+
+
+def fingerprints(**objects: Any) -> dict[str, str]:
+    """What must be the same where a state is resumed: the libraries whose rounding enters results, and these objects."""
+    found = {f"version of {name}": version for name, version in versions().items()}
+    for name, value in objects.items():
+        if isinstance(value, Robot):
+            value = dataclasses.replace(value, folder=None)  # the same robot wherever its file is
+        name_of = getattr(value, "name", None)
+        known = f"'{name_of}' " if isinstance(name_of, str) else ""
+        found[name] = value if isinstance(value, str) else known + hashlib.sha256(b"".join(freeze(value))).hexdigest()[:12]
+    return found
+
+
+def write_dump(path: Path, value: Any, head: Mapping[str, Any], made_by: Mapping[str, str], shared: Mapping[str, Any]) -> None:
+    """Replace the file ``path`` by one of ``value``; ``shared`` objects are the resumer's to bring, for ``made_by`` says that they must
+    be the same (`fingerprints`).
+
+    Raises `DumpError` if the state or the file cannot be written.
+    """
+    _store(path, _body(value, head, made_by, shared), ())
+
+
+def _body(value: Any, head: Mapping[str, Any], made_by: Mapping[str, str], shared: Mapping[str, Any]) -> list[bytes]:
+    """What `write_dump` writes after its first two lines, in parts. Raises `DumpError`."""
+    try:
+        text, blobs = freeze_apart(value, shared)
+    except DumpError as error:
+        raise DumpError(f"no state can be dumped: {error}.") from error
+    about = json.dumps({**head, "made_by": made_by, "state_bytes": len(text)}).encode()
+    return [about, b"\n", text, *blobs]
+
+
+def _store(path: Path, body: Sequence[bytes], after: Sequence[int]) -> None:
+    beside, digest = _beside(path), hashlib.sha256()
+    for part in body:
+        digest.update(part)
+    try:
+        for file_number in after:
+            os.fsync(file_number)
+        beside.unlink(missing_ok=True)
+        with beside.open("xb") as file:  # newly made: a link that stands there would lead elsewhere
+            file.write(_MAGIC + digest.hexdigest().encode() + b"\n")
+            file.writelines(body)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            beside.unlink()
+        raise DumpError(f"the state cannot be written to '{path}': {error.strerror}.") from error
+
+
+def _beside(path: Path) -> Path:
+    """Where a state is until it is whole; what a process that was killed has left there is removed."""
+    return path.with_name(f".{path.name}.new")
+
+
+def remove_dump(path: Path) -> None:
+    """The state, and what is left of one."""
+    for left in (path, _beside(path)):
+        left.unlink(missing_ok=True)
+
+
+def read_head(path: Path) -> Mapping[str, Any]:
+    """What the state's writer told of it. Raises `DumpError`."""
+    return _read(path)[0]
+
+
+def read_dump(path: Path, made_by: Mapping[str, str], shared: Mapping[str, Any]) -> Dump:
+    """The state in ``path``, with the ``shared`` objects in their places.
+
+    Raises `DumpError` for a file that is not there, damaged or foreign, or if it was made by something else than ``made_by``.
+    """
+    head, text, blob = _read(path)
+    then = head["made_by"]
+    different = [name for name in made_by if then.get(name) != made_by[name]]
+    if different:
+        told = ", ".join(f"{name} ({then.get(name, 'unknown')} then, {made_by[name]} now)" for name in different)
+        raise DumpError(
+            f"the state in '{path}' was made with another {told}: resume with what it was made with, or remove it to start anew."
+        )
+    try:
+        return Dump(head, thaw(text, blob, shared))
+    except DumpError as error:
+        raise DumpError(f"the state in '{path}' cannot be used: {error}. Remove it to start anew.") from error
+
+
+def _read(path: Path) -> tuple[dict[str, Any], bytes, bytes]:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise DumpError(f"no state can be read from '{path}': {error.strerror}.") from error
+    if not content.startswith(_MAGIC):
+        of_another = content.startswith(_MAGIC[: _MAGIC.rindex(b" ")])
+        what = "of another version of its format" if of_another else "no state of an estimator"
+        raise DumpError(f"'{path}' is {what}. Remove it, or name another file.")
+    digest, _, body = content[len(_MAGIC) :].partition(b"\n")
+    if hashlib.sha256(body).hexdigest().encode() != digest:
+        raise DumpError(f"the state in '{path}' is damaged: its check sum is not that of its content. Remove it to start anew.")
+    about, _, rest = body.partition(b"\n")
+    try:
+        head = json.loads(about)
+    except (RecursionError, ValueError):
+        head = None
+    if not _is_head(head, len(rest)):
+        raise DumpError(f"the state in '{path}' has no readable head. Remove it to start anew.")
+    size = head["state_bytes"]
+    return head, rest[:size], rest[size:]
+
+
+def _is_head(head: Any, most_bytes: int) -> bool:
+    """Whether it is of the kind that writers of states tell. A check sum that is right does not make it so."""
+
+    def is_count(name: str, most: int = _INT_END) -> bool:
+        return type(head.get(name, 0)) is int and 0 <= head.get(name, 0) <= most
+
+    return (
+        isinstance(head, dict)
+        and {"made_by", "state_bytes"} <= set(head)
+        and isinstance(head["made_by"], dict)
+        and is_count("state_bytes", most_bytes)
+        and is_count("events")
+        and (head.get("records") is None or is_count("records"))
+        and is_count("stamp_ns")
+        and isinstance(head.get("topics", []), list)
+        and all(isinstance(topic, str) for topic in head.get("topics", []))
+    )
+
+
+class Dumper:
+    """Writes a state at most once every ``every_s`` [s] of the clock on the wall.
+
+    The state is written down at once, in milliseconds; the disk is waited for in a thread, so that no estimate waits for it.
+    """
+
+    def __init__(self, path: Path, made_by: Mapping[str, str], shared: Mapping[str, Any], every_s: float = 0.75) -> None:
+        self.path, self._made_by, self._shared, self._every_s = path, made_by, shared, every_s
+        self._last = -float("inf")
+        self._disk = ThreadPoolExecutor(1)
+        self._writing: Future[None] | None = None
+
+    def is_due(self) -> bool:
+        is_idle = self._writing is None or self._writing.done()
+        return is_idle and time.monotonic() - self._last >= self._every_s
+
+    def write(self, value: Any, head: Mapping[str, Any], after: Sequence[int] = ()) -> None:
+        """Now. The files ``after`` (descriptors) are on disk before the state is, which may count on what is in them.
+
+        Raises `DumpError`, be it for the state before: this one is on its way nevertheless.
+        """
+        try:
+            self.wait()
+        finally:
+            self._last = time.monotonic()
+            content = _body(value, head, self._made_by, self._shared)
+            self._writing = self._disk.submit(_store, self.path, content, tuple(after))
+
+    def wait(self) -> None:
+        """Until the state is on disk. Raises `DumpError`."""
+        if self._writing is not None:
+            writing, self._writing = self._writing, None
+            writing.result()
+
+    def close(self) -> None:
+        """Raises `DumpError`."""
+        try:
+            self.wait()
+        finally:
+            self._disk.shutdown()

@@ -1,0 +1,190 @@
+"""How well it goes: consistency, degeneracy of the scene, slip and what was dropped, in the words of ROS's diagnostics."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from localization.estimators import Estimate
+from localization.events import Event, Scan
+from localization.lidar.losses import MAX_LOST_S, LidarLosses
+from localization.pipeline import Pipeline
+from motion_models.se2 import FloatArray
+
+OK, WARN, ERROR = 0, 1, 2
+
+_KEPT = 100  # scans: 8 s at 12.5 Hz
+_NIS_95 = 7.81  # 95 % of the NIS with 3 degrees of freedom are below
+_MOST_ABOVE = 0.2
+_DEGENERATE = 0.02  # rooms: 0.3 and more; corridors and single walls: 0.011 and less
+_CHORD_M, _STRAIGHT_M = 0.5, 0.05
+_SLIP_M_S, _SLIP_RAD_S = 0.15, 0.2
+
+
+@dataclass(frozen=True)
+class Status:
+    """One line of diagnostics."""
+
+    name: str
+    level: int = OK
+    message: str = "ok"
+    values: Mapping[str, str] = field(default_factory=dict)
+
+
+class Health:
+    """Watches what goes into a pipeline and what comes out, over the last scans."""
+
+    def __init__(self) -> None:
+        self._nis: deque[float] = deque(maxlen=_KEPT)
+        self._latencies: deque[float] = deque(maxlen=_KEPT)
+        self._scan: Scan | None = None
+        self._slip = np.zeros(3)
+        self.estimate: Estimate | None = None
+        """The last one."""
+
+    def saw(self, event: Event) -> None:
+        """``event`` has gone in."""
+        if isinstance(event, Scan):
+            self._scan = event
+
+    def made(self, estimate: Estimate, pipeline: Pipeline) -> None:
+        """``estimate`` has come out."""
+        self.estimate = estimate
+        if estimate.nis is not None:
+            self._nis.append(estimate.nis)
+        if pipeline.wheel_twist is not None:
+            self._slip = 0.8 * self._slip + 0.2 * (pipeline.wheel_twist - estimate.twist)
+
+    def took(self, seconds: float) -> None:
+        """From a scan's arrival to its estimate."""
+        self._latencies.append(seconds)
+
+    @property
+    def nis(self) -> float | None:
+        """Mean over the last scans; 3 expected."""
+        return float(np.mean(self._nis)) if self._nis else None
+
+    @property
+    def degeneracy(self) -> float | None:
+        """Of the last scan (`degeneracy`); worked out when somebody asks, for it takes longer than all the rest here."""
+        return degeneracy(self._scan.points[:, :2]) if self._scan is not None and self._scan.is_planar else None
+
+    @property
+    def slip(self) -> FloatArray:
+        """(3,) by how much the wheels say more than all witnesses together, smoothed [m/s, m/s, rad/s]."""
+        return self._slip
+
+    @property
+    def latency_p99_s(self) -> float | None:
+        return float(np.quantile(self._latencies, 0.99)) if self._latencies else None
+
+    def statuses(
+        self,
+        pipeline: Pipeline,
+        dropped: Sequence[str] = (),
+        silent: Mapping[str, float] | None = None,
+        troubles: Mapping[str, str] | None = None,
+    ) -> list[Status]:
+        """Of the estimate, the LiDAR, the wheels, the files and the messages. ``silent``: seconds since topics were last heard;
+        ``troubles``: what cannot be written, and why."""
+        of_sensors = [self._of_estimate(), self._of_lidar(pipeline), self._of_wheels(pipeline)]
+        return [*of_sensors, _of_files(troubles or {}), _of_messages(dropped, silent or {})]
+
+    def _of_estimate(self) -> Status:
+        e = self.estimate
+        if e is None:
+            return Status("estimate", WARN, "none yet")
+        values = {"x_m": f"{e.pose[0]:.4f}", "y_m": f"{e.pose[1]:.4f}", "yaw_rad": f"{e.pose[2]:.5f}"}
+        if e.covariance is not None:
+            x, y, yaw = np.sqrt(np.diag(e.covariance))
+            values |= {"sigma_x_m": f"{x:.4f}", "sigma_y_m": f"{y:.4f}", "sigma_yaw_rad": f"{yaw:.5f}"}
+        if self.latency_p99_s is not None:
+            values["latency_p99_ms"] = f"{1e3 * self.latency_p99_s:.2f}"
+        return Status("estimate", values=values)
+
+    def _of_lidar(self, pipeline: Pipeline) -> Status:
+        values, losses = {name: str(count) for name, count in pipeline.estimator.counts().items()}, pipeline.lidar
+        if losses is not None:
+            values |= {
+                "lost_share": f"{losses.share:.4f}",
+                "longest_lost_s": f"{losses.longest_s:.1f}",
+                "lost_now_s": f"{losses.ongoing_s:.1f}",
+            }
+        if (lack := pipeline.synchronizer.frames.lack) is not None:
+            return Status("lidar", ERROR, lack, values)
+        scene = self.degeneracy
+        if scene is not None:
+            values["degeneracy"] = f"{scene:.4f}"
+        above = 0.0
+        if self._nis:
+            above = sum(n > _NIS_95 for n in self._nis) / len(self._nis)
+            values |= {"nis_mean": f"{self.nis:.2f}", "nis_last": f"{self._nis[-1]:.2f}", "nis_above_95": f"{above:.2f}"}
+        if losses is not None and (lost := _of_losses(losses, values)) is not None:
+            return lost
+        if scene is not None and scene < _DEGENERATE:
+            return Status("lidar", WARN, "the scene holds no position along one direction (a corridor, one wall)", values)
+        if above > _MOST_ABOVE:
+            return Status(
+                "lidar", WARN, f"{100.0 * above:.0f} % of the innovations are beyond their 95 %: wheels and LiDAR disagree", values
+            )
+        return Status("lidar", values=values)
+
+    def _of_wheels(self, pipeline: Pipeline) -> Status:
+        vx, vy, wz = (float(v) for v in self._slip)
+        values = {"slip_vx_m_s": f"{vx:.4f}", "slip_vy_m_s": f"{vy:.4f}", "slip_wz_rad_s": f"{wz:.4f}"}
+        if pipeline.wheel_twist is None:
+            return Status("wheels", WARN, "not heard during the last step: the motion is a guess, or the LiDAR's", values)
+        if math.hypot(vx, vy) > _SLIP_M_S or abs(wz) > _SLIP_RAD_S:
+            return Status("wheels", WARN, "they turn otherwise than the robot moves: slip", values)
+        return Status("wheels", values=values)
+
+
+def _of_losses(losses: LidarLosses, values: Mapping[str, str]) -> Status | None:
+    """ERROR while the LiDAR is lost for long, WARN while it is lost or was for long, else None."""
+    if losses.ongoing_s > MAX_LOST_S:
+        return Status("lidar", ERROR, f"lost for {losses.ongoing_s:.0f} s: the wheels carry on alone. {losses.advice}", values)
+    if losses.ongoing_s > 0.0:
+        return Status("lidar", WARN, f"lost for {losses.ongoing_s:.1f} s: the wheels carry on alone. {losses.advice}", values)
+    if losses.is_long:
+        return Status("lidar", WARN, f"{losses.summary}. {losses.advice}", values)
+    return None
+
+
+def _of_files(troubles: Mapping[str, str]) -> Status:
+    if troubles:
+        return Status("files", WARN, " ".join(troubles.values()), troubles)
+    return Status("files")
+
+
+def _of_messages(dropped: Sequence[str], silent: Mapping[str, float]) -> Status:
+    values = {f"dropped_{i + 1}": sentence for i, sentence in enumerate(dropped)}
+    values |= {f"silent {topic}": f"{seconds:.1f} s" for topic, seconds in silent.items()}
+    if silent:
+        return Status("messages", ERROR, f"nothing comes on {', '.join(silent)}", values)
+    return Status("messages", WARN if dropped else OK, "some were mended or dropped" if dropped else "ok", values)
+
+
+def degeneracy(points: FloatArray) -> float | None:
+    """Smallest eigenvalue of the mean n n^T over the normals n of a planar scan ``points`` (N, 2), in the order of the beams.
+
+    0.5 in a round room, 0 where all walls are parallel. Normals are those of chords of about half a metre that are straight. None
+    where there are hardly any.
+    """
+    if len(points) < 10:
+        return None
+    gaps = np.hypot(*np.diff(points, axis=0).T)
+    apart = int(np.clip(_CHORD_M / max(float(np.median(gaps)), 1e-3), 2, len(points) // 4))
+    chord = points[apart:] - points[:-apart]
+    length = np.hypot(chord[:, 0], chord[:, 1])
+    middle = points[apart // 2 : len(points) - apart + apart // 2] - points[:-apart]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        off = np.abs(chord[:, 0] * middle[:, 1] - chord[:, 1] * middle[:, 0]) / length
+    straight = (length > 0.2 * _CHORD_M) & (length < 8.0 * _CHORD_M) & (off < _STRAIGHT_M)
+    if np.count_nonzero(straight) < 5:
+        return None
+    normals = chord[straight] / length[straight, None]  # a turn by 90 degrees changes no eigenvalue
+    return float(np.linalg.eigvalsh(normals.T @ normals / len(normals))[0])

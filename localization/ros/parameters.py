@@ -1,0 +1,201 @@
+"""ROS 2 parameters of the node: one for each number, name and switch of `NodeSettings`, with the same description and bounds.
+
+`python -m localization.ros.parameters` writes `share/params.yaml`.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import difflib
+import inspect
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from localization.errors import SettingError
+from localization.ros.settings import OnlineSettings
+from localization.ros.topic_names import Names
+from localization.settings import Allowed, rules_of
+
+PARAMS_FILE = Path(__file__).parent / "share" / "params.yaml"
+_LEFT_OUT = "none"
+_RENAMED = {"node.tf": "publish_tf", "node.wait_s": "wait_s"}  # publish_tf as robot_localization has it
+_DYNAMIC = ("node.tf",)
+_NOT_LIVE = ("topic.reference",)
+
+Value = bool | int | float | str | list[str]
+
+
+@dataclass(frozen=True)
+class NodeSettings(OnlineSettings):
+    """What the ROS 2 node has besides."""
+
+    autostart: bool = True
+    """Configure and activate at the start; false where a lifecycle manager does so."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of the node."""
+
+    name: str
+    path: tuple[str, ...]
+    """Of the field in `NodeSettings`."""
+    default: Value
+    description: str
+    constraint: str
+    """What its value may be, in words; empty for any of its type."""
+    choices: tuple[str, ...]
+    is_dynamic: bool
+    """May be set while the node is active; others take effect when it is configured."""
+
+
+@cache
+def parameters() -> tuple[Parameter, ...]:
+    """All of them, in the order of the settings. Names of node, namespace and topics' remapping are ROS 2's own (`--ros-args -r`)."""
+    return tuple(_flattened(NodeSettings(""), ()))
+
+
+def defaults() -> dict[str, Value]:
+    """By name."""
+    return {parameter.name: parameter.default for parameter in parameters()}
+
+
+def make_settings(values: Mapping[str, Value], names: Names) -> NodeSettings:
+    """Settings of parameters' ``values``; those that are not there have their defaults.
+
+    Raises `SettingError` for a name that no parameter has (with the nearest one), a value of another type, and one out of its bounds.
+    """
+    known = {parameter.name: parameter for parameter in parameters()}
+    for name in values:
+        if name not in known:
+            raise SettingError(f"there is no parameter '{name}'.{nearest(name, known)}")
+    tree: dict[str, Any] = {}
+    for parameter in known.values():
+        value = _checked(parameter, values.get(parameter.name, parameter.default))
+        branch = tree
+        for part in parameter.path[:-1]:
+            branch = branch.setdefault(part, {})
+        branch[parameter.path[-1]] = value
+    tree.setdefault("node", {})["names"] = names
+    made: NodeSettings = _made(NodeSettings, tree)
+    return made
+
+
+def nearest(name: str, known: Sequence[str] | Mapping[str, object]) -> str:
+    """A sentence with those of ``known`` that are most alike ``name``, by the whole or by the last part; empty where none is."""
+    tails = {full: full.rpartition(".")[2] for full in known}
+    near = difflib.get_close_matches(name, known, n=2, cutoff=0.7)
+    alike = difflib.get_close_matches(name.rpartition(".")[2], tails.values(), n=2, cutoff=0.75)
+    near += [full for full, tail in tails.items() if tail in alike and full not in near]
+    return f" Did you mean {' or '.join(repr(found) for found in near[:3])}?" if near else ""
+
+
+def to_yaml(values: Mapping[str, Value] | None = None) -> str:
+    """A parameter file with all parameters, described; ``values`` instead of some defaults."""
+    lines = ["# Parameters of skidloc's node. Written by `python -m localization.ros.parameters`.", "/**:", "  ros__parameters:"]
+    for parameter in parameters():
+        said = " ".join(filter(None, [parameter.description, f"[{parameter.constraint}]" if parameter.constraint else ""]))
+        lines += [f"    # {line}" for line in textwrap.wrap(said, 130)]
+        lines.append(f"    {parameter.name}: {_yaml((values or {}).get(parameter.name, parameter.default))}")
+    return "\n".join(lines) + "\n"
+
+
+def _flattened(settings: Any, path: tuple[str, ...]) -> Iterator[Parameter]:
+    kind = type(settings)
+    hints, texts, rules = get_type_hints(kind), _field_texts(kind), rules_of(kind)
+    for field in dataclasses.fields(settings):
+        value, here = getattr(settings, field.name), (*path, field.name)
+        if isinstance(value, Names):
+            continue
+        if ".".join(here) in _NOT_LIVE:
+            continue
+        if dataclasses.is_dataclass(value):
+            yield from _flattened(value, here)
+            continue
+        choices = _choices(hints[field.name])
+        allowed = next((rule.what for rule in rules[field.name] if isinstance(rule, Allowed)), "")
+        if not allowed and isinstance(value, float | int) and not isinstance(value, bool):
+            allowed = "0 or more"
+        constraint = f"one or more of {', '.join(choices)}" if isinstance(value, tuple) else ", ".join(choices) or allowed
+        text, full = texts.get(field.name, ""), ".".join(here)
+        if here[0] == "topic":
+            text, constraint = text + f' "" is the robot file\'s, "{_LEFT_OUT}" leaves the part out.', "a topic"
+        name = _RENAMED.get(full, here[-1] if here[:2] == ("node", "frames") else full)
+        default: Value = "" if value is None else list(value) if isinstance(value, tuple) else value
+        yield Parameter(name, here, default, text, constraint, choices, full in _DYNAMIC)
+
+
+def _choices(hint: Any) -> tuple[str, ...]:
+    if get_origin(hint) is Literal:
+        return tuple(map(str, get_args(hint)))
+    return next((found for inner in get_args(hint) if (found := _choices(inner))), ())
+
+
+def _checked(parameter: Parameter, value: Any) -> Any:
+    """``value`` as its field has it. Raises `SettingError`."""
+    default = parameter.default
+    if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if type(value) is not type(default):
+        raise SettingError(f"parameter '{parameter.name}' is {value!r}; it must be a {_TYPE_NAMES[type(default)]}.")
+    entries: list[Any] = value if isinstance(value, list) else [value]
+    for entry in entries:
+        if parameter.choices and entry not in parameter.choices:
+            raise SettingError(
+                f"parameter '{parameter.name}' is {entry!r}; it may be {', '.join(parameter.choices)}.{nearest(entry, parameter.choices)}"
+            )
+    if isinstance(value, list):
+        return tuple(value)
+    if parameter.path[0] == "topic":
+        return None if value == "" else "" if value == _LEFT_OUT else value
+    if parameter.path[0] in ("out", "state"):
+        return Path(str(value)) if value else None
+    return value
+
+
+_TYPE_NAMES = {bool: "bool", int: "whole number", float: "number", str: "string", list: "list of strings"}
+
+
+def _made(kind: Any, tree: Mapping[str, Any]) -> Any:
+    hints = get_type_hints(kind)
+    return kind(**{name: _made(hints[name], value) if isinstance(value, dict) else value for name, value in tree.items()})
+
+
+def _field_texts(kind: type) -> dict[str, str]:
+    """The sentence below each field of a dataclass, those of its bases included."""
+    texts: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        if not dataclasses.is_dataclass(base):
+            continue
+        (made,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        assert isinstance(made, ast.ClassDef)
+        for line, below in zip(made.body, made.body[1:], strict=False):
+            is_text = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+            if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name) and is_text:
+                texts[line.target.id] = inspect.cleandoc(below.value.value).replace("\n", " ")  # type: ignore[attr-defined]
+    return texts
+
+
+def _yaml(value: Value) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return f"[{', '.join(map(_yaml, value))}]"
+    if isinstance(value, float):
+        return _number(value)
+    return f'"{value}"' if isinstance(value, str) else str(value)
+
+
+def _number(value: float) -> str:
+    """With a point: to ROS 2 a number without one is an integer."""
+    text = repr(value)
+    return text if "." in text else text.replace("e", ".0e") if "e" in text else f"{text}.0"
+
+
+if __name__ == "__main__":
+    PARAMS_FILE.write_text(to_yaml())

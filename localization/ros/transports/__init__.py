@@ -1,0 +1,1 @@
+"""Transports: bytes of topics in and out of a robot's network, one module each."""

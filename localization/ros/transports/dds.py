@@ -1,0 +1,290 @@
+"""ROS 2 topics without a ROS installation: DDS through cyclonedds (extra `ros2`).
+
+A ROS 2 topic `/scan` is DDS's `rt/scan`, a type `pkg/msg/Type` is `pkg::msg::dds_::Type_`. Messages pass as bytes, which `logs.wire`
+reads and writes as it does those of logs; cyclonedds gets the types' fields only for peers that ask.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import re
+import socket
+import time
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from localization.errors import DoorError
+from localization.logs.serialization import Shape, encode, fields, make, type_hash
+from localization.ros.transports.base import Received
+from localization.ros.transports.dds_settings import LAST_DOMAIN, LOOPBACK, configuration
+
+try:
+    import cyclonedds.core as dds
+    from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+    from cyclonedds.domain import Domain, DomainParticipant
+    from cyclonedds.idl import make_idl_struct, types
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.qos import Policy, Qos
+    from cyclonedds.sub import DataReader
+    from cyclonedds.topic import Topic
+    from cyclonedds.util import duration
+except ImportError as error:
+    raise DoorError(f"ROS 2 topics without a ROS installation need the extra 'ros2': pip install 'skidloc[ros2]' ({error}).") from error
+
+_LATEST, _DEPTH, _LATCHED_DEPTH = 200, 10, 100
+_FASTEST_DRIFT = 1e-4  # of one clock against another
+_TYPE = re.compile(r"(\w+)::(?:msg::)dds_::(\w+)_")
+_GRAPH_TOPIC, _GRAPH_TYPE = "ros_discovery_info", "rmw_dds_common/msg/ParticipantEntitiesInfo"
+
+
+class DdsTransport:
+    """See `Transport`. One participant with one node, ``name`` in ``namespace``, which ROS 2's node list shows."""
+
+    is_ros1 = False
+
+    def __init__(self, domain: int = 0, interface: str = LOOPBACK, name: str = "skidloc", namespace: str = "/") -> None:
+        """``interface`` is one of `dds_settings.choose_interface`; `lo` leaves nothing open to other machines. Raises `DoorError`."""
+        if not 0 <= domain <= LAST_DOMAIN:
+            raise DoorError(f"the domain is {domain}; ROS 2's domains are 0 to {LAST_DOMAIN}.")
+        self.place = f"domain {domain} on interface {interface}"
+        self.elsewhere = "Robots on other machines are discovered with --interface default." * (interface == LOOPBACK)
+        try:
+            with _bound_to(interface):
+                self._domain = Domain(domain, configuration(interface))
+                self._participant = DomainParticipant(domain, Qos(Policy.Userdata(b"enclave=/;")))
+        except dds.DDSException as error:
+            raise DoorError(f"DDS cannot be used on interface '{interface}', domain {domain}: {error}.") from error
+        self._waiting, self._urgent = dds.WaitSet(self._participant), dds.WaitSet(self._participant)
+        self._readers: list[tuple[str, DataReader[Any], dds.ReadCondition]] = []
+        self._writers: dict[str, _Writer] = {}
+        self._topics: dict[str, Topic[Any]] = {}
+        self._found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+        self._looked_ns = time.monotonic_ns()
+        self._clocks: dict[str, SenderClock] = {}
+        self._name, self._namespace = name, namespace
+        self._graph = None if os.environ.get("ROS_DISTRO") == "humble" else self._writer(_GRAPH_TOPIC, _GRAPH_TYPE, _graph_quality())
+
+    def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
+        quality = _latched() if is_latched else _sensor_data()
+        reader = DataReader(self._participant, self._topic(_dds_name(topic), kind), _hashed(quality, kind))
+        is_new = dds.ReadCondition(reader, dds.ViewState.Any | dds.InstanceState.Any | dds.SampleState.NotRead)
+        self._waiting.attach(is_new)
+        self._readers.append((topic, reader, is_new))
+        self._publish_graph()
+
+    def keep(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
+        for topic, _, is_new in self._readers:
+            if topic not in topics:
+                self._waiting.detach(is_new)
+            elif topic in urgent:
+                self._urgent.attach(is_new)
+        self._readers = [entry for entry in self._readers if entry[0] in topics]
+        self._publish_graph()
+
+    def advertise(self, topic: str, kind: str) -> None:
+        self._writers[topic] = self._writer(_dds_name(topic), kind, _reliable())
+        self._publish_graph()
+
+    def publish(self, topic: str, data: bytes) -> None:
+        _write(self._writers[topic], data)
+
+    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
+        """In the order in which it was sent: after a pause, one topic's must not all come before another's."""
+        is_urgent = patience_s > 0.0 and self._urgent.wait(round(patience_s * 1e9))
+        is_there = is_urgent or self._waiting.wait(round(timeout_s * 1e9))
+        since, self._looked_ns = self._looked_ns, time.monotonic_ns()
+        if not is_there:
+            return []
+        found: list[tuple[int, Received]] = []
+        for topic, reader, is_new in self._readers:
+            if is_new.triggered:  # to take costs ten times as much, and mostly it is one of them
+                samples = [sample for sample in reader.take(1000) if isinstance(sample, _Bytes)]
+                sent = [int(sample.sample_info.source_timestamp) for sample in samples]
+                newest = self._clocks.setdefault(topic, SenderClock()).came_ns(max(sent, default=0), since, self._looked_ns)
+                came = times_of_receiving(sent, since, newest)
+                found += [(at, Received(topic, ns, bytes(sample))) for at, ns, sample in zip(sent, came, samples, strict=True)]
+        found.sort(key=lambda entry: entry[0])
+        return [received for _, received in found]
+
+    def publishers(self) -> Mapping[str, set[str]]:
+        found: dict[str, set[str]] = {}
+        for publication in self._found.read(1000):
+            if publication.sample_info.instance_state != dds.InstanceState.Alive:
+                continue  # of one that left nothing but its key is known
+            name, kind = publication.topic_name, _TYPE.fullmatch(publication.type_name)
+            if name.startswith("rt/") and name[2:] not in self._writers:
+                found.setdefault(name[2:], set()).add(f"{kind[1]}/msg/{kind[2]}" if kind else publication.type_name)
+        return found
+
+    def close(self) -> None:
+        self._readers.clear()
+        self._writers.clear()
+        self._topics.clear()
+        del self._graph, self._waiting, self._urgent, self._found, self._participant, self._domain
+
+    def _topic(self, dds_name: str, kind: str) -> Topic[Any]:
+        """One for a reader and a writer, whose qualities differ: a second one with another quality is refused."""
+        if dds_name not in self._topics:
+            self._topics[dds_name] = Topic(self._participant, dds_name, _bytes_type(kind), Qos(*_COMMON))
+        return self._topics[dds_name]
+
+    def _writer(self, dds_name: str, kind: str, quality: Qos) -> _Writer:
+        return DataWriter(self._participant, self._topic(dds_name, kind), _hashed(quality, kind)), _bytes_type(kind)
+
+    def _publish_graph(self) -> None:
+        """The participant's node and its endpoints: from these messages, not from DDS's own discovery, ROS 2 knows nodes."""
+        if self._graph is None:
+            return
+        node = make(
+            "rmw_dds_common/msg/NodeEntitiesInfo",
+            node_namespace=self._namespace,
+            node_name=self._name,
+            reader_gid_seq=[_gid(reader) for _, reader, _ in self._readers],
+            writer_gid_seq=[_gid(writer) for writer, _ in self._writers.values()],
+        )
+        _write(self._graph, encode(make(_GRAPH_TYPE, gid=_gid(self._participant), node_entities_info_seq=[node])))
+
+
+class SenderClock:
+    """How far the clock of a topic's sender is from ours, by those of its messages that were on their way for the shortest time."""
+
+    def __init__(self) -> None:
+        self._offset_ns, self._known_ns = 1 << 80, 0
+
+    def came_ns(self, sent_ns: int, since_ns: int, now_ns: int) -> int:
+        """When a message came that is found at ``now_ns`` and was not there at ``since_ns``: what had to wait for us came when it was
+        sent. One that was sent before ``since_ns`` was late, or the sender's clock was set: it came now.
+        """
+        drift_ns = round((now_ns - self._known_ns) * _FASTEST_DRIFT)
+        self._offset_ns, self._known_ns = min(now_ns - sent_ns, self._offset_ns + drift_ns), now_ns
+        came_ns = sent_ns + self._offset_ns
+        return came_ns if came_ns > since_ns else now_ns
+
+
+def times_of_receiving(sent_ns: Sequence[int], since_ns: int, newest_ns: int) -> list[int]:
+    """When messages came that were not there at ``since_ns``: the newest at ``newest_ns``, the others as long before as they were sent
+    before it. ``sent_ns`` is by the sender's clock; where it tells of a longer time than there was, that is shared out.
+    """
+    last_sent_ns = max(sent_ns, default=0)
+    # The first came after its predecessor, which was seen the last time: by as much as one mostly comes after the other.
+    told_ns = (last_sent_ns - min(sent_ns, default=0)) * len(sent_ns) / max(len(sent_ns) - 1, 1)
+    share = min((newest_ns - since_ns) / told_ns, 1.0) if told_ns > 0.0 else 0.0
+    return [newest_ns - round((last_sent_ns - sent) * share) for sent in sent_ns]
+
+
+_Writer = tuple["DataWriter[Any]", type[Any]]
+
+
+def _write(writer: _Writer, data: bytes) -> None:
+    sample = object.__new__(writer[1])
+    vars(sample)["data_"] = data
+    with contextlib.suppress(dds.DDSException):  # a reader that is too slow must not stop the robot
+        writer[0].write(sample)
+
+
+def _gid(entity: Any) -> Any:
+    return make("rmw_dds_common/msg/Gid", data=np.frombuffer(entity.guid.bytes, np.uint8))
+
+
+def _hashed(quality: Qos, kind: str) -> Qos:
+    """``quality`` of an endpoint, with the hash of its type as ROS 2 puts it beside."""
+    return Qos(Policy.Userdata(f"typehash={type_hash(kind)};".encode()), base=quality)
+
+
+def _sensor_data() -> Qos:
+    latest = Policy.History.KeepLast(_LATEST)
+    return Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, latest, Policy.IgnoreLocal.Participant, *_COMMON)
+
+
+def _latched() -> Qos:
+    reliable = Policy.Reliability.Reliable(duration(milliseconds=100))
+    return Qos(reliable, Policy.Durability.TransientLocal, Policy.History.KeepLast(_LATCHED_DEPTH), *_COMMON)
+
+
+def _reliable() -> Qos:
+    reliable = Policy.Reliability.Reliable(duration(milliseconds=1))  # never wait for a slow reader
+    return Qos(reliable, Policy.Durability.Volatile, Policy.History.KeepLast(_DEPTH), *_COMMON)
+
+
+def _graph_quality() -> Qos:
+    """As rmw_dds_common has it."""
+    reliable = Policy.Reliability.Reliable(duration(milliseconds=1))
+    return Qos(reliable, Policy.Durability.TransientLocal, Policy.History.KeepLast(1), *_COMMON)
+
+
+_COMMON = (Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),)
+
+
+def _dds_name(topic: str) -> str:
+    return "rt/" + topic.lstrip("/")
+
+
+class _Bytes(bytes):
+    """What a reader gives out; cyclonedds sets the attribute on it."""
+
+    sample_info: Any
+
+
+@functools.cache
+def _struct(kind: str) -> type[Any]:
+    package, _, name = kind.split("/")
+    described = {field: _idl(shape) for field, shape in fields(kind)}
+    made: type[Any] = make_idl_struct(f"{name}_", f"{package}.msg.dds_.{name}_", described)
+    return made
+
+
+def _idl(shape: Shape) -> Any:
+    what, inside, *rest = shape
+    if what == "message":
+        return _struct(inside)
+    if what == "array":
+        return types.array[_idl(inside), rest[0]]
+    if what == "sequence":
+        return types.sequence[_idl(inside)]
+    return {"string": str, "bool": bool, "byte": types.uint8, "char": types.uint8}.get(inside) or getattr(types, inside)
+
+
+@functools.cache
+def _bytes_type(kind: str) -> type[Any]:
+    """The DDS type ``kind``, whose samples are bytes as they are on the wire."""
+    made = _struct(kind)
+    made.deserialize = classmethod(lambda cls, data, has_header=True, use_version_2=None: _Bytes(data))
+    made.serialize = lambda self, buffer=None, endianness=None, use_version_2=None: self.data_
+    return made
+
+
+@contextlib.contextmanager
+def _bound_to(interface: str) -> Any:
+    """Cyclone sends from the chosen interface, but receives on all of them: bind the sockets that it opens to the loopback device.
+
+    Raises `DoorError` where that cannot be done.
+    """
+    before = _sockets()
+    yield
+    if interface != LOOPBACK:
+        return
+    for number in _sockets() - before:
+        with socket.socket(fileno=number) as opened:
+            try:
+                if opened.type == socket.SOCK_DGRAM:
+                    opened.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, LOOPBACK.encode() + b"\0")
+            except (AttributeError, OSError) as error:
+                raise DoorError(
+                    f"DDS cannot be restricted to this machine ({error}). If packets of others do no harm: --interface default."
+                ) from error
+            finally:
+                opened.detach()  # it stays Cyclone's
+
+
+def _sockets() -> set[int]:
+    found = set()
+    for entry in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):
+            if str(entry.readlink()).startswith("socket:"):
+                found.add(int(entry.name))
+    return found

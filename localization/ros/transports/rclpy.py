@@ -1,0 +1,131 @@
+"""ROS 2 topics through rclpy, where a ROS 2 installation is sourced, as bytes."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import time
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+from localization.errors import DoorError
+from localization.ros.transports.base import Received
+
+_LATEST, _LATCHED_DEPTH, _DEPTH = 50, 100, 10
+_MESSAGE_PACKAGES = ("sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "tf2_msgs")
+
+
+def import_rclpy(*parts: str) -> list[Any]:
+    """rclpy's modules ``parts`` (`""` for rclpy itself), where all packages of messages are there too. Raises `DoorError`."""
+    try:
+        found = [importlib.import_module(f"rclpy.{part}".rstrip(".")) for part in parts]
+    except ImportError as error:
+        raise DoorError(f"rclpy cannot be imported ({error}): source a ROS 2 installation, or use --door dds.") from error
+    missing = [package for package in _MESSAGE_PACKAGES if not _is_importable(f"{package}.msg")]
+    if missing:
+        distro = os.environ.get("ROS_DISTRO", "$ROS_DISTRO")
+        names = " ".join(f"ros-{distro}-{package.replace('_', '-')}" for package in missing)
+        raise DoorError(f"rclpy is there, but not its {', '.join(missing)}: apt install {names}, or use --door dds.")
+    return found
+
+
+class RclpyTransport:
+    """See `Transport`. Domain, interfaces and middleware are those of the ROS environment."""
+
+    is_ros1 = False
+    place, elsewhere = "the ROS environment's domain", "Is ROS_DOMAIN_ID the robot's?"
+
+    def __init__(self, name: str = "skidloc", namespace: str = "/") -> None:
+        """A node of its own. Raises `DoorError` where no ROS 2 is sourced."""
+        rclpy, signals = import_rclpy("", "signals")
+        # Signals are the command's: with rclpy's handlers, Ctrl-C raises out of whatever waits.
+        rclpy.init(args=[], signal_handler_options=signals.SignalHandlerOptions.NO)
+        self._attach(rclpy.create_node(name, namespace=namespace))
+        self._rclpy: Any = rclpy
+
+    @classmethod
+    def on_node(cls, node: Any) -> RclpyTransport:
+        """On a node of somebody else, which `close` leaves alone."""
+        made = cls.__new__(cls)
+        made._attach(node)
+        made._rclpy = None
+        return made
+
+    def _attach(self, node: Any) -> None:
+        self._qos, executors = import_rclpy("qos", "executors")
+        self._node, self._executor = node, executors.SingleThreadedExecutor()
+        self._executor.add_node(node)
+        self._received: list[Received] = []
+        self._subscriptions: dict[str, Any] = {}
+        self._writers: dict[str, Any] = {}
+
+    def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
+        q = self._qos
+        quality = q.QoSProfile(
+            depth=_LATCHED_DEPTH if is_latched else _LATEST,
+            reliability=q.ReliabilityPolicy.RELIABLE if is_latched else q.ReliabilityPolicy.BEST_EFFORT,
+            durability=q.DurabilityPolicy.TRANSIENT_LOCAL if is_latched else q.DurabilityPolicy.VOLATILE,
+        )
+
+        def on_message(data: bytes) -> None:
+            self._received.append(Received(topic, time.monotonic_ns(), bytes(data)))
+
+        self._subscriptions[topic] = self._node.create_subscription(_message_class(kind), topic, on_message, quality, raw=True)
+
+    def keep(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
+        for topic in set(self._subscriptions) - set(topics):
+            self._node.destroy_subscription(self._subscriptions.pop(topic))
+
+    def advertise(self, topic: str, kind: str) -> None:
+        self._writers[topic] = self._node.create_publisher(_message_class(kind), topic, _DEPTH)
+
+    def publish(self, topic: str, data: bytes) -> None:
+        self._writers[topic].publish(data)
+
+    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
+        self._executor.spin_once(timeout_sec=timeout_s)
+        while self._received:
+            before = len(self._received)
+            self._executor.spin_once(timeout_sec=0.0)
+            if len(self._received) == before:
+                break
+        found, self._received = self._received, []
+        return found
+
+    def publishers(self) -> Mapping[str, set[str]]:
+        """Types of others' publishers alone: to ROS 2 a topic exists by its subscribers too."""
+        topics = {topic for topic, _ in self._node.get_topic_names_and_types()} | set(self._subscriptions)
+        found = {topic: {info.topic_type for info in self._infos(topic)} for topic in topics - set(self._writers)}
+        return {topic: kinds for topic, kinds in found.items() if kinds}
+
+    def close(self) -> None:
+        self.release()
+        self._executor.remove_node(self._node)
+        self._executor.shutdown()
+        if self._rclpy is not None:
+            self._node.destroy_node()
+            self._rclpy.try_shutdown()
+
+    def release(self) -> None:
+        """End all subscriptions and publishers; others may follow."""
+        for topic in list(self._subscriptions):
+            self._node.destroy_subscription(self._subscriptions.pop(topic))
+        for topic in list(self._writers):
+            self._node.destroy_publisher(self._writers.pop(topic))
+
+    def _infos(self, topic: str) -> Sequence[Any]:
+        own = self._node.get_name(), self._node.get_namespace()
+        return [info for info in self._node.get_publishers_info_by_topic(topic) if (info.node_name, info.node_namespace) != own]
+
+
+def _message_class(kind: str) -> Any:
+    package, _, name = kind.split("/")
+    return getattr(importlib.import_module(f"{package}.msg"), name)
+
+
+def _is_importable(module: str) -> bool:
+    try:
+        importlib.import_module(module)
+    except ImportError:
+        return False
+    return True

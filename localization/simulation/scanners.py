@@ -1,0 +1,207 @@
+"""LiDARs: a planar scanner and a spinning one with rings. Every beam leaves from where the robot is at that beam's own moment."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from localization.logs import message_templates
+from localization.logs.message_templates import Message
+from localization.settings import Below, Count, Positive, Settings, Share, Signed, at_least
+from localization.simulation.clock import Ticks, seconds
+from localization.simulation.raycast import Grid, cast, cast_at_people, make_grid
+from localization.simulation.track import Track, pose_at
+from localization.simulation.world import World
+from motion_models.robot import Mount
+from motion_models.se2 import FloatArray
+
+
+@dataclass(frozen=True)
+class ScannerConfig(Settings):
+    """A planar scanner; by default a SICK LMS511 at half its resolution."""
+
+    rate_hz: Positive = 12.5
+    """Scans per second."""
+    beams: Annotated[int, at_least(2)] = 381
+    """Beams in a scan."""
+    field_of_view_deg: Annotated[Positive, Below("sweep_deg", or_equal=True)] = 190.0
+    """Angle from the first to the last beam, middle ahead [deg]."""
+    sweep_deg: Positive = 360.0
+    """Angle that the mirror turns from scan to scan: the sweep fills field of view / this of the time [deg]."""
+    noise_m: float = 0.012
+    """Standard deviation of a range [m]."""
+    resolution_m: float = 0.001
+    """Ranges are rounded to this [m]."""
+    dropout: Share = 0.002
+    """Share of beams that do not come back."""
+    min_range_m: Annotated[float, Below("max_range_m")] = 0.1
+    """Nearer things are not seen [m]."""
+    max_range_m: Positive = 40.0
+    """Farther things are not seen [m]."""
+
+
+@dataclass(frozen=True)
+class SpinningConfig(Settings):
+    """A spinning scanner; by default like a Velodyne VLP-16 at a third of its points."""
+
+    rate_hz: Positive = 10.0
+    """Turns per second."""
+    rings: Count = 16
+    """Beams above each other."""
+    columns: Annotated[int, at_least(2)] = 600
+    """Firings in a turn."""
+    lowest_deg: Annotated[Signed, Below("highest_deg", or_equal=True)] = -15.0
+    """Elevation of the lowest ring [deg]."""
+    highest_deg: Signed = 15.0
+    """Elevation of the highest ring [deg]."""
+    noise_m: float = 0.02
+    """Standard deviation of a range [m]."""
+    dropout: Share = 0.005
+    """Share of beams that do not come back."""
+    min_range_m: Annotated[float, Below("max_range_m")] = 0.5
+    """Nearer things are not seen [m]."""
+    max_range_m: Positive = 100.0
+    """Farther things are not seen [m]."""
+
+
+class Scanner:
+    """Makes LaserScans. ``mount`` is where the scanner really sits; ``late_s`` is by how much its stamps are late."""
+
+    def __init__(
+        self,
+        config: ScannerConfig,
+        topic: str,
+        frame: str,
+        mount: Mount,
+        world: World,
+        late_s: float,
+        start_ns: int,
+        rng: np.random.Generator,
+    ) -> None:
+        c, self._rng, self._start_ns = config, rng, start_ns
+        self._config, self._world, self._grid = c, world, make_grid(world.walls)
+        view = math.radians(c.field_of_view_deg)
+        self._first, self._step = -0.5 * view, view / max(c.beams - 1, 1)
+        self.beam_s = math.radians(c.field_of_view_deg) / math.radians(c.sweep_deg) / c.rate_hz / max(c.beams - 1, 1)
+        self._mount = np.array([mount.x, mount.y, mount.yaw])
+        self._late_ns = round(late_s * 1e9)
+        angles, times, ranges = (self._first, self._step), (self.beam_s, 1.0 / c.rate_hz), (c.min_range_m, c.max_range_m)
+        self.form = message_templates.laser_scan(topic, frame, c.beams, angles, times, ranges)
+        self._ticks = Ticks(c.rate_hz, self.beam_s * (c.beams - 1))
+
+    def messages(self, track: Track) -> list[Message]:
+        """All scans that are complete and were not yet taken."""
+        starts = self._ticks.due(track.end_s)
+        if not len(starts):
+            return []
+        c = self._config
+        ranges = np.empty((len(starts), c.beams))
+        beams, place = (self.beam_s, self._first, self._step, self._mount), (track.rows, track.start_s, track.step_s)
+        _sweep(seconds(starts), *beams, *place, self._grid, self._world.people, c.max_range_m, ranges)
+        ranges += self._rng.normal(0.0, c.noise_m, ranges.shape) if c.noise_m > 0.0 else 0.0
+        if c.resolution_m > 0.0:
+            ranges = np.round(ranges / c.resolution_m) * c.resolution_m
+        lost = (ranges < c.min_range_m) | (ranges > c.max_range_m)
+        if c.dropout > 0.0:
+            lost |= self._rng.random(ranges.shape, dtype=np.float32) < c.dropout
+        ranges[lost] = math.inf
+        took = round(self.beam_s * (c.beams - 1) * 1e9)
+        values = ranges.astype(np.float32)
+        return [
+            Message(self.form, self._start_ns + int(s) + took, self._start_ns + int(s) + self._late_ns, (values[i],))
+            for i, s in enumerate(starts)
+        ]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _sweep(
+    starts: FloatArray,
+    beam_s: float,
+    first: float,
+    step: float,
+    mount: FloatArray,
+    rows: FloatArray,
+    start_s: float,
+    step_s: float,
+    grid: Grid,
+    people: FloatArray,
+    longest: float,
+    ranges: FloatArray,
+) -> None:  # pragma: no cover
+    """True distances (scans, beams); inf where nothing is met."""
+    for k in range(ranges.shape[0]):
+        for i in range(ranges.shape[1]):
+            t = starts[k] + i * beam_s
+            x, y, theta = pose_at(rows, start_s, step_s, t)
+            c, s = math.cos(theta), math.sin(theta)
+            px, py = x + c * mount[0] - s * mount[1], y + s * mount[0] + c * mount[1]
+            angle = theta + mount[2] + first + i * step
+            found = cast(px, py, angle, longest, grid)
+            if people.shape[0] > 0:
+                found = min(found, cast_at_people(px, py, angle, t, people))
+            ranges[k, i] = found
+
+
+_CLOUD_FIELDS = {"x": "f4", "y": "f4", "z": "f4", "intensity": "f4", "ring": "u2", "time": "f4"}
+
+
+class SpinningScanner:
+    """Makes organised PointCloud2s, one row per ring; ``time`` counts from the stamp, what did not come back is NaN."""
+
+    def __init__(
+        self,
+        config: SpinningConfig,
+        topic: str,
+        frame: str,
+        mount: Mount,
+        above_floor_m: float,
+        world: World,
+        late_s: float,
+        start_ns: int,
+        rng: np.random.Generator,
+    ) -> None:
+        self._config, self._world, self._grid, self._rng, self._start_ns = config, world, make_grid(world.walls), rng, start_ns
+        self._mount, self._height = np.array([mount.x, mount.y, mount.yaw]), above_floor_m
+        self._late_ns = round(late_s * 1e9)
+        self._elevation = np.radians(np.linspace(config.lowest_deg, config.highest_deg, config.rings))
+        self.form = message_templates.point_cloud(topic, frame, config.rings, config.columns, _CLOUD_FIELDS)
+        self._ticks = Ticks(config.rate_hz, 1.0 / config.rate_hz)
+
+    def messages(self, track: Track) -> list[Message]:
+        """All turns that are complete and were not yet taken."""
+        found = []
+        for start in self._ticks.due(track.end_s):
+            data = self._turn(int(start) * 1e-9, track)
+            stamp = self._start_ns + int(start)
+            found.append(Message(self.form, stamp + round(1e9 / self._config.rate_hz), stamp + self._late_ns, (data,)))
+        return found
+
+    def _turn(self, start_s: float, track: Track) -> NDArray[np.uint8]:
+        c = self._config
+        level = np.empty((1, c.columns))
+        column_s, step = 1.0 / c.rate_hz / c.columns, -2.0 * math.pi / c.columns  # clockwise, as they turn
+        beams, place = (column_s, math.pi, step, self._mount), (track.rows, track.start_s, track.step_s)
+        _sweep(np.array([start_s]), *beams, *place, self._grid, self._world.people, 2.0 * c.max_range_m, level)
+        # Walls reach from floor to ceiling: each ring meets the wall, or the floor or the ceiling before it.
+        up = np.tan(self._elevation)[:, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            flat = np.where(up > 0.0, (self._world.ceiling_m - self._height) / up, np.where(up < 0.0, -self._height / up, np.inf))
+            flat = np.minimum(level, flat)
+            ranges = flat / np.cos(self._elevation)[:, None]
+            ranges = ranges + self._rng.normal(0.0, c.noise_m, ranges.shape)
+            lost = ~((ranges > c.min_range_m) & (ranges < c.max_range_m)) | (self._rng.random(ranges.shape) < c.dropout)
+        ranges[lost] = np.nan
+        azimuth = math.pi + step * np.arange(c.columns)
+        cloud = np.zeros((c.rings, c.columns), dtype=list(_CLOUD_FIELDS.items()))
+        across = ranges * np.cos(self._elevation)[:, None]
+        cloud["x"], cloud["y"] = across * np.cos(azimuth), across * np.sin(azimuth)
+        cloud["z"] = ranges * np.sin(self._elevation)[:, None]
+        cloud["intensity"] = 100.0
+        cloud["ring"] = np.arange(c.rings)[:, None]
+        cloud["time"] = column_s * np.arange(c.columns)
+        return np.frombuffer(cloud.tobytes(), dtype=np.uint8)

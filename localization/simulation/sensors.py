@@ -1,0 +1,223 @@
+"""Wheel encoders, arm joints, IMU, GPS, and the truth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from localization.logs import message_templates
+from localization.logs.message_templates import Message
+from localization.settings import Allowed, Positive, Settings, Signed
+from localization.simulation.clock import Ticks, seconds
+from localization.simulation.masses import Masses
+from localization.simulation.track import Track
+from localization.simulation.vehicle import ANGLES, POSE, TWIST
+from motion_models.robot import Mount, Robot
+from motion_models.se2 import FloatArray
+
+_EQUATOR_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563
+_GRAVITY = 9.81
+
+
+@dataclass(frozen=True)
+class EncoderConfig(Settings):
+    rate_hz: Positive = 50.0
+    """Joint states per second."""
+    counts: int = 4096
+    """Counts of an encoder per turn of the wheel; 0 for exact angles."""
+
+
+@dataclass(frozen=True)
+class ImuConfig(Settings):
+    rate_hz: float = 50.0
+    """Samples per second; 0 for no IMU."""
+    gyro_noise: float = 5e-4
+    """White noise of the rates [rad/s/sqrt(Hz)]."""
+    gyro_bias_sigma: float = 2e-3
+    """How large the bias is at switch-on, about each axis [rad/s]."""
+    gyro_bias_walk: float = 3e-5
+    """Random walk of the bias [rad/s/sqrt(s)]."""
+    force_noise: float = 2e-3
+    """White noise of the specific force [m/s^2/sqrt(Hz)]."""
+
+
+@dataclass(frozen=True)
+class GpsConfig(Settings):
+    rate_hz: float = 0.0
+    """Fixes per second; 0 for no GPS."""
+    noise_m: float = 0.3
+    """White noise of east and north [m]."""
+    drift_m: float = 0.8
+    """Slow error of east and north, a Gauss-Markov process [m]."""
+    drift_s: Positive = 60.0
+    """Its correlation time [s]."""
+    latitude_deg: Annotated[float, Allowed("from -89 to 89", lambda value: abs(value) <= 89.0)] = 30.2888
+    """Of the world's origin [deg]."""
+    longitude_deg: Signed = -97.7354
+    """Of the world's origin [deg]."""
+
+
+class Encoders:
+    """Joint states of wheels and arms. ``lost_left`` is the share of time in which the front left encoder loses its counts."""
+
+    def __init__(
+        self, config: EncoderConfig, robot: Robot, masses: Masses, late_s: float, lost_left: float, start_ns: int, rng: np.random.Generator
+    ) -> None:
+        self._config, self._masses, self._start_ns, self._rng = config, masses, start_ns, rng
+        wheels = (*robot.joints.left, *robot.joints.right)
+        self._sides = np.array([0] * len(robot.joints.left) + [1] * len(robot.joints.right))
+        self._phase = rng.random(len(wheels))
+        self.form = message_templates.joint_states(robot.topics.joint_states, (*wheels, *masses.joint_names))
+        self._late_ns, self._lost_left = round(late_s * 1e9), lost_left
+        self._ticks = Ticks(config.rate_hz)
+        self._counts, self._shown = np.zeros(len(wheels)), np.zeros(len(wheels))
+        self._lost_until_ns, self._heard_until_ns = 0, 0
+
+    def messages(self, track: Track) -> list[Message]:
+        """All samples up to the track's end."""
+        ticks = self._ticks.due(track.end_s)
+        if not len(ticks):
+            return []
+        rows = track.at(seconds(ticks))
+        arms, arm_rates = self._masses.joints(seconds(ticks)) if self._masses.joint_names else (np.zeros((len(ticks), 0)),) * 2
+        angles = rows[:, ANGLES][:, self._sides]
+        unit = 2.0 * math.pi / self._config.counts if self._config.counts else 0.0
+        counts = np.floor(angles / unit + self._phase) if unit else angles
+        steps = np.diff(counts, axis=0, prepend=self._counts[None])
+        self._counts = counts[-1]
+        if self._lost_left > 0.0:
+            steps[[self._is_lost(int(tick)) for tick in ticks], 0] = 0.0
+        shown = self._shown + np.cumsum(steps, axis=0)
+        self._shown = shown[-1]
+        scale = unit or 1.0
+        rates = steps * scale * self._config.rate_hz
+        found = []
+        for i, tick in enumerate(ticks):
+            stamp = self._start_ns + int(tick)
+            parts = np.concatenate([shown[i] * scale, arms[i]]), np.concatenate([rates[i], arm_rates[i]])
+            found.append(Message(self.form, stamp, stamp + self._late_ns, parts))
+        return found
+
+    def _is_lost(self, tick_ns: int) -> bool:
+        """Spells of loss of 0.3 s on average, and of being heard between them."""
+        while tick_ns >= self._heard_until_ns:
+            self._lost_until_ns = self._heard_until_ns + int(self._rng.exponential(0.3) * 1e9)
+            heard_s = 0.3 * (1.0 - self._lost_left) / self._lost_left
+            self._heard_until_ns = self._lost_until_ns + int(self._rng.exponential(heard_s) * 1e9)
+        return tick_ns < self._lost_until_ns
+
+
+class Imu:
+    """Specific force and rates at the IMU's place and in its axes; ``tilt`` is the floor's rise towards the world's +x [rad]."""
+
+    def __init__(
+        self,
+        config: ImuConfig,
+        topic: str,
+        frame: str,
+        mount: Mount,
+        gyro_bias: float,
+        tilt: float,
+        start_ns: int,
+        rng: np.random.Generator,
+    ) -> None:
+        self._config, self._mount, self._tilt, self._start_ns, self._rng = config, mount, tilt, start_ns, rng
+        self._bias = rng.normal(0.0, config.gyro_bias_sigma, 3) + mount.rotation().T @ np.array([0.0, 0.0, gyro_bias])
+        rate_sigma, force_sigma = (noise * math.sqrt(config.rate_hz) for noise in (config.gyro_noise, config.force_noise))
+        self._sigmas = rate_sigma, force_sigma
+        self.form = message_templates.imu(topic, frame, rate_sigma**2, force_sigma**2)
+        self._ticks = Ticks(config.rate_hz)
+
+    def messages(self, track: Track) -> list[Message]:
+        """All samples up to the track's end."""
+        ticks = self._ticks.due(track.end_s)
+        if not len(ticks):
+            return []
+        n, period = len(ticks), 1.0 / self._config.rate_hz
+        now, before = track.at(seconds(ticks)), track.at(seconds(ticks) - period)
+        vx, vy, wz = now[:, TWIST].T
+        ax, ay, alpha = ((now - before)[:, TWIST] / period).T  # over its own period, as an IMU does
+        x, y, theta = self._mount.x, self._mount.y, now[:, 2]
+        down = _GRAVITY * math.sin(self._tilt)
+        force = np.column_stack(
+            [
+                ax - vy * wz - alpha * y - wz**2 * x + down * np.cos(theta),
+                ay + vx * wz + alpha * x - wz**2 * y - down * np.sin(theta),
+                np.full(n, _GRAVITY * math.cos(self._tilt)),
+            ]
+        )
+        body_R_imu = self._mount.rotation()
+        bias = self._bias + np.cumsum(self._rng.normal(0.0, self._config.gyro_bias_walk * math.sqrt(period), (n, 3)), axis=0)
+        self._bias = bias[-1]
+        rates = np.column_stack([np.zeros(n), np.zeros(n), wz]) @ body_R_imu + bias + self._rng.normal(0.0, self._sigmas[0], (n, 3))
+        forces = force @ body_R_imu + self._rng.normal(0.0, self._sigmas[1], (n, 3))
+        return [Message(self.form, self._start_ns + int(t), self._start_ns + int(t), (rates[i], forces[i])) for i, t in enumerate(ticks)]
+
+
+class Gps:
+    """Fixes of an antenna above the body's origin; east is the world's +x."""
+
+    def __init__(self, config: GpsConfig, topic: str, frame: str, start_ns: int, rng: np.random.Generator) -> None:
+        self._config, self._start_ns, self._rng = config, start_ns, rng
+        self._drift = rng.normal(0.0, config.drift_m, 2)
+        variance = config.noise_m**2 + config.drift_m**2
+        self.form = message_templates.fix(topic, frame, (variance, variance, 4.0 * variance))
+        self._ticks = Ticks(config.rate_hz)
+
+    def messages(self, track: Track) -> list[Message]:
+        """All fixes up to the track's end."""
+        c, found = self._config, []
+        ticks = self._ticks.due(track.end_s)
+        keep = math.exp(-1.0 / (c.rate_hz * c.drift_s))
+        for tick, row in zip(ticks, track.at(seconds(ticks)), strict=True):
+            self._drift = keep * self._drift + math.sqrt(1.0 - keep * keep) * self._rng.normal(0.0, c.drift_m, 2)
+            east, north = row[:2] + self._drift + self._rng.normal(0.0, c.noise_m, 2)
+            stamp = self._start_ns + int(tick)
+            found.append(Message(self.form, stamp, stamp, (_geodetic(c, east, north),)))
+        return found
+
+
+def _geodetic(config: GpsConfig, east: float, north: float) -> FloatArray:
+    """Latitude, longitude [deg] and altitude [m] on WGS 84, by its radii of curvature at the origin: to a millimetre over a kilometre."""
+    latitude = math.radians(config.latitude_deg)
+    e2 = _FLATTENING * (2.0 - _FLATTENING)
+    w = math.sqrt(1.0 - e2 * math.sin(latitude) ** 2)
+    meridian, normal = _EQUATOR_M * (1.0 - e2) / w**3, _EQUATOR_M / w
+    return np.array(
+        [
+            config.latitude_deg + math.degrees(north / meridian),
+            config.longitude_deg + math.degrees(east / (normal * math.cos(latitude))),
+            150.0,
+        ]
+    )
+
+
+class Truth:
+    """The body's true pose and twist, and, where asked for, the nominal centre of gravity."""
+
+    def __init__(self, rate_hz: float, robot: Robot, masses: Masses, with_cg: bool, start_ns: int) -> None:
+        self._masses, self._start_ns = masses, start_ns
+        self.form = message_templates.odometry(robot.topics.reference, "world", "base_link")
+        self.cg_form = message_templates.point(robot.topics.center_of_gravity, "base_link") if with_cg else None
+        self._ticks = Ticks(rate_hz)
+
+    def messages(self, track: Track) -> list[Message]:
+        """All samples up to the track's end."""
+        ticks = self._ticks.due(track.end_s)
+        if not len(ticks):
+            return []
+        rows = track.at(seconds(ticks))
+        half = 0.5 * rows[:, 2]
+        heading = np.column_stack([np.sin(half), np.cos(half)])
+        found = []
+        for i, tick in enumerate(ticks):
+            stamp = self._start_ns + int(tick)
+            found.append(Message(self.form, stamp, stamp, (rows[i, POSE][:2], heading[i], rows[i, TWIST][:2], rows[i, TWIST][2:])))
+        if self.cg_form is not None:
+            for tick, cg in zip(ticks, self._masses.nominal_cg(seconds(ticks)), strict=True):
+                stamp = self._start_ns + int(tick)
+                found.append(Message(self.cg_form, stamp, stamp, (np.array([cg[0], cg[1], 0.0]),)))
+        return found

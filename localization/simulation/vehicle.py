@@ -1,0 +1,202 @@
+"""The vehicle in time: motors turn wheels, wheels push at the floor, arms move the mass, and the body goes where that leads."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from localization.errors import SimulationError
+from localization.settings import Positive, Settings, up_to
+from localization.simulation.dynamics import Chassis, Now, change
+from localization.simulation.implicit_integration import drive
+from motion_models.friction.contact import tyre
+from motion_models.friction.dynamics import FrictionDynamics
+from motion_models.friction.model import FrictionModel, check_parameters
+from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
+
+POSE, TWIST, RATES, ANGLES, CG, MARGIN, COLUMNS = slice(0, 3), slice(3, 6), slice(6, 8), slice(8, 10), slice(10, 12), 12, 13
+"""Columns of a record: pose in the world (heading not wrapped), body twist, rates and angles of left and right, CG, tipping margin."""
+_FALLS_S = 0.1  # a robot that its own jerk lifts for less than about sqrt(z_G / g) / 2 falls back onto its wheels
+
+
+@dataclass(frozen=True)
+class VehicleConfig(Settings):
+    """How the robot is driven and stepped."""
+
+    step_s: Annotated[float, up_to(0.02)] = 0.005
+    """Length of an integration step [s]."""
+    motor_lag_s: Positive = 0.08
+    """Time constant of the wheel-speed loop [s]."""
+    acceleration_m_s2: Positive = 1.5
+    """How fast the controller lets the wheels' speed change [m/s^2]."""
+    creep: Annotated[float, up_to(0.5)] = 1e-3
+    """Slip at which friction is fully there, as a fraction of the wheels' speed [-]."""
+    tyre_lag_s: Positive = 0.02
+    """Time in which the wheels' loads follow the forces: that of the robot bouncing on its tyres [s]."""
+    gravity: Positive = 9.81
+    """[m/s^2]"""
+
+
+@dataclass(frozen=True)
+class Body:
+    """What the robot and its floor really are; the log's metadata know only the nominal robot."""
+
+    params: FloatArray
+    """(12,) as `FrictionModel.param_names`; the tracked point plays no part."""
+    mass: float
+    """[kg]"""
+    inertia: float
+    """Yaw inertia about the CG [kg m^2]."""
+    cg_height: float
+    """[m]"""
+    radius_left: float
+    """[m]"""
+    radius_right: float
+    """[m]"""
+    saturation: float = 0.0
+    """Contact law of the tyres, as `FrictionModel.saturation`."""
+    slope: float = 0.0
+    """Tilt of the floor: it rises towards the world's +x by this angle [rad]."""
+    cg_offset: tuple[float, float] = (0.0, 0.0)
+    """How far the CG really lies from where arms and robot file have it [m]."""
+    yields: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Shear of a loose floor layer, on which the contacts ride [s, s/m, s/rad]: vy += a vx wz; wz *= 1 - b |vx|; vx -= c vx |wz|."""
+
+    @classmethod
+    def from_robot(cls, robot: Robot) -> Body:
+        """The nominal robot on its nominal floor."""
+        plain = FrictionDynamics.from_robot(robot)
+        radius = float(plain.params[0])
+        return cls(plain.params, plain.mass, plain.inertia, plain.cg_height, radius, radius, plain.saturation)
+
+    def with_param(self, name: str, value: float) -> Body:
+        """This body with another friction parameter."""
+        params = self.params.copy()
+        params[FrictionModel.param_names.index(name)] = value
+        return dataclasses.replace(self, params=params)
+
+    def param(self, name: str) -> float:
+        return float(self.params[FrictionModel.param_names.index(name)])
+
+    def chassis(self, config: VehicleConfig) -> Chassis:
+        """The numbers that the compiled step reads."""
+        p = self.params
+        return Chassis(
+            half_track=p[1] / 2.0,
+            half_wheelbase=p[2] / 2.0,
+            radius_left=self.radius_left,
+            radius_right=self.radius_right,
+            mu=p[3],
+            tyre=tyre(p[5], p[4], p[9], self.saturation),
+            rolling_resistance=p[6],
+            scrub=p[7],
+            warp=p[8],
+            height=self.cg_height,
+            gravity=config.gravity * math.cos(self.slope),
+            creep=config.creep,
+            rest_speed=0.01,
+            tyre_lag=config.tyre_lag_s,
+        )
+
+
+@dataclass
+class VehicleState:
+    """Where the vehicle is; changed by `advance`."""
+
+    steps: int
+    """Steps since the start of the simulation."""
+    numbers: FloatArray
+    """(16,) pose, twist of the contacts, wheel rates, wheel angles, the speed controller's set points of left and right, tilt of the
+    loads and its rate (NaN before the first step)."""
+    on_two_wheels: int = 0
+    """For how many steps now the tipping margin has been negative."""
+
+    @classmethod
+    def at(cls, pose: FloatArray) -> VehicleState:
+        return cls(0, np.concatenate([pose, np.zeros(9), np.full(4, np.nan)]).astype(float))
+
+    @property
+    def pose(self) -> FloatArray:
+        return self.numbers[0:3]
+
+    @property
+    def is_standing(self) -> bool:
+        return bool(np.abs(self.numbers[3:8]).max() < 1e-3)
+
+
+def advance(
+    state: VehicleState,
+    body: Body,
+    config: VehicleConfig,
+    wheels: FloatArray,
+    cg: FloatArray,
+    payload: tuple[float, float],
+    patches: FloatArray,
+) -> FloatArray:
+    """Drive on by n steps; the records (n, 13) at their ends.
+
+    ``wheels`` (n, 2) commanded rates [rad/s]; ``cg`` (n, 7) CG x, y, its velocity and its acceleration (z too) at the start of each step;
+    ``payload`` mass [kg] and distance from the CG of all [m]; ``patches`` (k, 5) floor rectangles x0, y0, x1, y1 with a factor of the
+    friction. Raises `SimulationError` where the robot tips over, `CgError` for a CG outside of the wheels.
+    """
+    cg = cg + np.array([*body.cg_offset, 0.0, 0.0, 0.0, 0.0, 0.0])
+    check_parameters(cg[:, :2], body.params)
+    mass = body.mass + payload[0]
+    inertia = body.inertia + payload[0] * payload[1] ** 2 * (1.0 + payload[0] / body.mass)
+    out = np.empty((len(wheels), COLUMNS))
+    ramp = config.acceleration_m_s2 / (0.5 * (body.radius_left + body.radius_right))
+    chassis = body.chassis(config)
+    start = state.steps * config.step_s
+    along = config.gravity * math.sin(body.slope)
+    failed = drive(
+        state.numbers,
+        np.ascontiguousarray(wheels),
+        np.ascontiguousarray(cg),
+        out,
+        config.step_s,
+        mass,
+        inertia,
+        along,
+        np.array(body.yields),
+        patches,
+        chassis,
+        config.motor_lag_s,
+        ramp,
+    )
+    if failed >= 0:
+        raise SimulationError(
+            f"the forces on the robot could not be balanced {start + failed * config.step_s:.2f} s into the drive (CG at x = "
+            f"{cg[failed, 0]:.3f}, y = {cg[failed, 1]:.3f} m): one wheel may carry nearly all of it. "
+            "Move the CG inwards, or take a larger vehicle.creep."
+        )
+    lifted = out[:, MARGIN] < 0.0
+    for i in range(len(out)) if lifted.any() else ():
+        state.on_two_wheels = state.on_two_wheels + 1 if lifted[i] else 0
+        if state.on_two_wheels * config.step_s <= _FALLS_S:
+            continue
+        raise SimulationError(
+            f"the robot tips over {start + i * config.step_s:.2f} s into the drive: its CG, at x = {cg[i, 0]:.3f}, y = {cg[i, 1]:.3f}, "
+            f"z = {body.cg_height:.2f} m, takes the load off both wheels of a side or an axle at a wheel speed of "
+            f"{out[i, 6] * body.radius_left:.2f} and {out[i, 7] * body.radius_right:.2f} m/s. Drive more gently or lower the CG."
+        )
+    state.on_two_wheels = state.on_two_wheels if lifted[-1] else 0
+    state.steps += len(wheels)
+    return out
+
+
+def accelerations(
+    body: Body, config: VehicleConfig, wheels: FloatArray, twist: FloatArray, cg: FloatArray, tilt: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Rate of change (3,) of ``twist`` (3,) at wheel rates ``wheels`` (2,), a resting CG (2,) and loads tilted by ``tilt`` (2,); and the
+    tilt (2,) that the forces ask for."""
+    now = Now(
+        *(body.radius_left * wheels[0], body.radius_right * wheels[1], 1.0, 1.0, 1.0, 1.0, body.mass, body.inertia),
+        *(cg[0], cg[1], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    )
+    found = change(twist[0], twist[1], twist[2], tilt[0], tilt[1], now, body.chassis(config))
+    return np.array([found.x, found.y, found.w]), np.array([found.xi, found.eta])

@@ -1,0 +1,111 @@
+"""The last seconds of the wheels' motion."""
+
+from __future__ import annotations
+
+import bisect
+from math import isfinite
+
+import numpy as np
+
+from localization.events import CgSample, WheelSample
+from motion_models.se2 import FloatArray
+
+_NS = 1e-9
+
+
+class WheelBuffer:
+    """The last seconds of wheel motion as intervals of constant rates, with the centre of gravity that held in each."""
+
+    def __init__(self, cg: FloatArray, keep_s: float = 10.0) -> None:
+        self._cg, self._cg_cov = cg, np.zeros((2, 2))
+        self._keep_ns = int(keep_s / _NS)
+        self._last: WheelSample | None = None
+        self._ends: list[int] = []
+        self._intervals: list[tuple[int, float, float, float, float, bool]] = []  # start_ns, q_l, q_r, x_G, y_G, by angles
+
+    @property
+    def newest_ns(self) -> int | None:
+        return None if self._last is None else self._last.stamp_ns
+
+    @property
+    def rates_known_until_ns(self) -> int | None:
+        """Up to when rates are known; None before two samples tell the first of them."""
+        return self._ends[-1] if self._ends else None
+
+    def set_cg(self, sample: CgSample) -> None:
+        self._cg, self._cg_cov = sample.position, sample.covariance
+
+    @property
+    def cg_cov(self) -> FloatArray:
+        return self._cg_cov
+
+    def insert(self, sample: WheelSample) -> None:
+        """Take the next sample. One that does not come after the newest, or that tells nothing of a side, changes nothing."""
+        # plain numbers: numpy takes five times as long on two of them, and this is done for every message of the wheels
+        position, velocity = sample.position.tolist(), sample.velocity.tolist()
+        if not all(isfinite(p) or isfinite(v) for p, v in zip(position, velocity, strict=True)):
+            return
+        last = self._last
+        if last is None:
+            self._last = sample
+            return
+        if sample.stamp_ns <= last.stamp_ns:  # what it says of the motion is in the next sample's angles as well
+            return
+        self._last = sample
+        seconds = (sample.stamp_ns - last.stamp_ns) * _NS
+        rates = [(p - before) / seconds for p, before in zip(position, last.position.tolist(), strict=True)]
+        by_angles = all(map(isfinite, rates))
+        if not by_angles:
+            rates = [_mean_of_known(v, before) for v, before in zip(velocity, last.velocity.tolist(), strict=True)]
+        if not all(map(isfinite, rates)):
+            return
+        self._ends.append(sample.stamp_ns)
+        self._intervals.append((last.stamp_ns, rates[0], rates[1], *self._cg.tolist(), by_angles))
+        if self._ends[0] < sample.stamp_ns - 2 * self._keep_ns:
+            n = bisect.bisect_left(self._ends, sample.stamp_ns - self._keep_ns)
+            del self._ends[:n], self._intervals[:n]
+
+    def at(self, stamp_ns: int, max_hold_s: float) -> tuple[FloatArray, FloatArray]:
+        """Rates (n, 2) and CG (n, 2) from a moment on, n = 1; by the nearest samples after it or before it, n = 0 if these are farther than
+        ``max_hold_s``."""
+        i = min(bisect.bisect_right(self._ends, stamp_ns), len(self._ends) - 1)
+        known = self._intervals[i : i + 1] if i >= 0 and abs(self._intervals[i][0] - stamp_ns) <= max_hold_s / _NS else []
+        table = np.array([row[1:5] for row in known]).reshape(-1, 4)
+        return table[:, :2], table[:, 2:]
+
+    def window(self, start_ns: int, end_ns: int, max_hold_s: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        """Intervals (n,) [s], rates (n, 2), CG (n, 2) from ``start_ns`` to ``end_ns``, and the seconds that nothing is known of.
+
+        Without a sample, rates hold for at most ``max_hold_s``, be it past the newest sample or between two of them. Angles on both sides
+        of a longer gap still tell the mean rates in it, but not how they were spread: it counts as unknown, unless no wheel moved.
+        """
+        hold_ns = round(max_hold_s / _NS)
+        rows: list[tuple[float, float, float, float, float]] = []
+        known, covered = start_ns, 0.0
+        for i in range(bisect.bisect_right(self._ends, start_ns), len(self._ends)):
+            began, q_l, q_r, x, y, by_angles = self._intervals[i]
+            if began >= end_ns:
+                break
+            heard = min(self._ends[i], end_ns) if by_angles and q_l == q_r == 0.0 else min(self._ends[i], end_ns, began + hold_ns)
+            begin, end = max(began, known), min(self._ends[i], end_ns) if by_angles else heard
+            if end <= begin:
+                continue
+            rows.append(((end - begin) * _NS, q_l, q_r, x, y))
+            covered += max(heard - begin, 0) * _NS
+            known = end
+        if known < end_ns and self._ends:
+            _, q_l, q_r, x, y, _ = self._intervals[-1]
+            hold = min(end_ns, self._ends[-1] + hold_ns) - max(known, self._ends[-1])
+            if hold > 0:
+                rows.append((hold * _NS, q_l, q_r, x, y))
+                covered += hold * _NS
+        table = np.array(rows).reshape(-1, 5)
+        missing = max((end_ns - start_ns) * _NS - covered, 0.0)
+        return table[:, 0], table[:, 1:3], table[:, 3:5], missing if missing > 1e-6 else 0.0
+
+
+def _mean_of_known(one: float, other: float) -> float:
+    """The mean of those of two that are finite; not finite where neither is."""
+    if not isfinite(one):
+        return other
+    return 0.5 * (one + other) if isfinite(other) else one

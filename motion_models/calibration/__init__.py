@@ -1,0 +1,1 @@
+"""Calibration of any motion model by maneuvers."""

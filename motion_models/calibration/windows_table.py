@@ -1,0 +1,149 @@
+"""Maneuvers as a CSV table, for witnesses that this library does not read itself (total stations, motion capture, other people's logs).
+
+One line an interval of constant wheel rates, in order of time; lines that follow each other with the same `window` are one maneuver:
+
+    window             any text; a new one begins a new maneuver
+    group              optional: maneuvers that share their errors (same place, same run) are held out together; else each is its own
+    dt_s               length of the interval [s]
+    left_rad_per_s     wheel rate of the left side, the mean of its wheels [rad/s]
+    right_rad_per_s    the same of the right side
+    x_m, y_m           optional: measured position of the body at the end of the line, seen from its pose at the start of the window
+    yaw_rad            measured heading in the same way
+    cg_x_m, cg_y_m     optional: centre of gravity in the interval
+    sigma_x_m, sigma_y_m, sigma_yaw_rad   optional: standard deviations of what was measured (default 0.02 m, 0.02 m, 0.01 rad)
+
+Where nothing was measured at the end of a line, its x_m, y_m and yaw_rad are empty, all of them; no other cell may be.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from motion_models.calibration.maneuvers import Maneuver
+from motion_models.errors import CalibrationError
+from motion_models.text_files import check_file
+
+NEEDED = ("window", "dt_s", "left_rad_per_s", "right_rad_per_s", "yaw_rad")
+POSE = ("x_m", "y_m", "yaw_rad")
+CG = ("cg_x_m", "cg_y_m")
+SIGMA = {"sigma_x_m": 0.02, "sigma_y_m": 0.02, "sigma_yaw_rad": 0.01}
+
+Row = tuple[int, dict[str, str]]
+"""Line number and cells by column."""
+
+
+def table_columns(path: str | Path) -> tuple[str, ...]:
+    """The header of a CSV file. Raises `CalibrationError` for one that cannot be read or is empty."""
+    return tuple(read_rows(path)[0])
+
+
+def read_windows(path: str | Path) -> list[Maneuver]:
+    """The maneuvers of a CSV file as described above. Raises `CalibrationError`, naming line and column."""
+    columns, rows = read_rows(path)
+    missing = [name for name in NEEDED if name not in columns]
+    if "x_m" in columns or "y_m" in columns:
+        missing += [name for name in ("x_m", "y_m") if name not in columns]
+    if any(name in columns for name in CG):
+        missing += [name for name in CG if name not in columns]
+    if missing:
+        raise CalibrationError(f"table '{path}' has no column {', '.join(missing)}; it has {', '.join(columns)}.")
+    if not rows:
+        raise CalibrationError(f"table '{path}' has no rows below its header.")
+    return [_maneuver(list(of), columns, path) for _, of in itertools.groupby(rows, key=lambda row: row[1]["window"])]
+
+
+def windows_text(maneuvers: Sequence[Maneuver]) -> str:
+    """``maneuvers`` as such a table; what is read back is the same, but for lead-in intervals, which a table has not."""
+    measured = any(np.isfinite(m.cov[..., 0, 0]).any() for m in maneuvers)
+    pose = POSE if measured else ("yaw_rad",)
+    sigmas = tuple(SIGMA) if measured else ("sigma_yaw_rad",)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["window", "group", "dt_s", "left_rad_per_s", "right_rad_per_s", *pose, *CG, *sigmas])
+    for number, m in enumerate(maneuvers):
+        cg = np.broadcast_to(m.cg, m.wheels.shape)
+        cov = np.broadcast_to(m.cov, (len(m.ends), 3, 3))
+        of_end = {int(end) + m.lead - 1: i for i, end in enumerate(m.ends)}
+        for i in range(m.lead, m.lead + int(m.ends[-1])):
+            found = of_end.get(i)
+            values = ["", "", ""] if found is None else [_cell(v) for v in m.measured[found]]
+            spread = np.sqrt(np.diagonal(cov[0 if found is None else found]))
+            keep = slice(None) if measured else slice(2, None)
+            row = [m.dt[i], *m.wheels[i]]
+            writer.writerow(
+                [number, m.group, *map(_cell, row), *values[keep], *map(_cell, cg[i]), *(_cell(s) for s in spread[keep])]
+            )  # fmt: skip
+    return text.getvalue()
+
+
+def read_rows(path: str | Path) -> tuple[list[str], list[Row]]:
+    """Header and lines of a CSV file. Raises `CalibrationError` for one that cannot be read or is empty, naming the line."""
+    try:
+        check_file(path)
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file)
+            columns = [name.strip() for name in next(reader, [])]
+            rows = []
+            for cells in reader:
+                if not cells:
+                    continue
+                if len(cells) != len(columns):
+                    raise CalibrationError(f"table '{path}', line {reader.line_num}: {len(cells)} cells, but {len(columns)} columns.")
+                rows.append((reader.line_num, {name: cell.strip() for name, cell in zip(columns, cells, strict=True)}))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise CalibrationError(f"table '{path}' cannot be read: {error}.") from error
+    if not columns:
+        raise CalibrationError(f"table '{path}' is empty.")
+    twice = sorted({name for name in columns if columns.count(name) > 1})
+    if twice:
+        raise CalibrationError(f"table '{path}' has the column {', '.join(twice)} more than once.")
+    return columns, rows
+
+
+def _maneuver(rows: list[Row], columns: Sequence[str], path: str | Path) -> Maneuver:
+    def number(row: Row, column: str) -> float:
+        line, cells = row
+        try:
+            value = float(cells[column])
+        except ValueError:
+            value = math.nan
+        endless = column in SIGMA and value == math.inf
+        if not (math.isfinite(value) or endless):
+            raise CalibrationError(f"table '{path}', line {line}: {column} must be a number, found {cells[column]!r}.")
+        if value <= 0.0 and (column in SIGMA or column == "dt_s"):
+            raise CalibrationError(f"table '{path}', line {line}: {column} must be positive, found {cells[column]!r}.")
+        return value
+
+    pose = [name for name in POSE if name in columns]
+    ends, measured, sigmas = [], [], []
+    for i, row in enumerate(rows):
+        if any(row[1][name] for name in pose):
+            at = [number(row, name) for name in pose]
+            ends.append(i + 1)
+            measured.append(at if len(at) == 3 else [0.0, 0.0, *at])
+            spread = [number(row, name) if name in columns else usual for name, usual in SIGMA.items()]
+            sigmas.append(spread if len(at) == 3 else [math.inf, math.inf, spread[2]])
+    first, name = rows[0][0], rows[0][1]["window"]
+    if not ends:
+        raise CalibrationError(f"table '{path}', line {first}: window '{name}' has no measured pose in any of its {len(rows)} lines.")
+    cg = np.array([[number(row, c) for c in CG] for row in rows]) if CG[0] in columns else np.zeros(2)
+    return Maneuver(
+        dt=np.array([number(row, "dt_s") for row in rows]),
+        wheels=np.array([[number(row, side) for side in ("left_rad_per_s", "right_rad_per_s")] for row in rows]),
+        measured=np.array(measured),
+        ends=np.array(ends, dtype=np.int64),
+        cg=cg,
+        cov=np.array([np.diag(np.square(s)) for s in sigmas]),
+        group=(rows[0][1]["group"] if "group" in columns else "") or f"window {name}",
+    )
+
+
+def _cell(value: float) -> str:
+    return repr(float(value))

@@ -1,0 +1,1 @@
+"""Centre of gravity of a robot with arms and payload."""

@@ -1,0 +1,239 @@
+"""Centre of gravity of a robot with arms at any joint positions, with covariance: static part + arms (+ payload).
+
+Ebersole 2016, sec. 4.2.1.2: the static part is a weighed total (`center_of_gravity.weighing`) minus the arms at the weighed posture, and
+the total at another posture is the static part plus the arms there. Without a weighing, the static part is what the URDF says of it.
+"Arms" are all bodies that hang on a joint that can move the centre of mass; all else, wheels included, is the static part.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from motion_models.center_of_gravity.flatten import flatten
+from motion_models.center_of_gravity.kinematics import COM, MASS, Chain, IntArray, body_moment, forward, subtree_jacobian
+from motion_models.center_of_gravity.parts import TYPICAL, CgEstimate, Payload, StaticPart, Tolerances
+from motion_models.center_of_gravity.urdf import Link, Urdf
+from motion_models.center_of_gravity.weighing import WeighedCg
+from motion_models.errors import CgError
+from motion_models.se2 import FloatArray
+
+
+def static_part_from_weighing(weighed: WeighedCg, chain: Chain, posture: Mapping[str, float]) -> StaticPart:
+    """What is left of a weighed robot when its arms, which stood at ``posture``, are taken away.
+
+    The covariance is the weighing's alone; how the arms' errors enter is told by ``weighed_at``. Raises `CgError` where the arms weigh
+    more than all, `RobotError` for joints that are missing or unknown.
+    """
+    q = chain.posture(posture)
+    arms_mass = chain.mass - chain.constants[0, MASS]
+    mass = weighed.mass - arms_mass
+    if mass <= 0.0:
+        raise CgError(f"the scales show {weighed.mass:.2f} kg, but the arms in {chain.source} alone have {arms_mass:.2f} kg.")
+    arms_moment = (chain.center_of_mass(q) * chain.mass - base_com(chain) * chain.constants[0, MASS])[:2]
+    position = (weighed.mass * weighed.position - arms_moment) / mass
+    # d(x_s) = [(x_w - x_s) d(m) + m_w d(x_w)] / m_s
+    jacobian = np.zeros((3, 3))
+    jacobian[0, 0] = 1.0
+    jacobian[1:, 0] = (weighed.position - position) / mass
+    jacobian[1:, 1:] = np.eye(2) * weighed.mass / mass
+    return StaticPart(mass, position, jacobian @ weighed.covariance @ jacobian.T, dict(posture))
+
+
+def base_com(chain: Chain) -> FloatArray:
+    """(3,) centre of mass of the static part in the base's frame, as the URDF has it [m]."""
+    rotations, translations = np.empty((len(chain.layout), 3, 3)), np.empty((len(chain.layout), 3))
+    forward(chain.layout, chain.constants, np.zeros(len(chain.joint_names)), rotations, translations)
+    return np.asarray(translations[0] + rotations[0] @ chain.constants[0, COM:])
+
+
+@dataclass(frozen=True)
+class CgModel:
+    """Centre of gravity as a function of joint positions (..., n), in the order of ``chain.joint_names``. Made by `cg_model`."""
+
+    chain: Chain
+    """The whole robot: its body 0 is the static part, and the payload is in it."""
+    static: StaticPart
+    tolerances: Tolerances
+    payload: Payload | None
+    arms: FloatArray
+    """(b, 18) `Chain.constants` without the payload."""
+    numbers: FloatArray
+    """(19,) payload: body, place (3) in the body's frame [m], mass [kg], sigma of mass [kg] and of place [m], zeros where there is none;
+    then the three `Tolerances`, then the static part's covariance (9)."""
+    weighed_poses: FloatArray
+    """(b, 3, 4) rotations and translations of the bodies at the weighing, or (0, 3, 4)."""
+    mass: float
+    """Of the whole robot with its payload [kg]."""
+
+    def cg(self, positions: FloatArray) -> FloatArray:
+        """(..., 2) centre of gravity in the base's frame [m]."""
+        return self.chain.center_of_mass(positions)[..., :2]
+
+    def jacobian(self, positions: FloatArray) -> FloatArray:
+        """(..., 2, n) derivative of `cg` by the joint positions [m/rad or 1]."""
+        return self.chain.center_of_mass_jacobian(positions)[..., :2, :]
+
+    def estimate(self, positions: FloatArray) -> CgEstimate:
+        """Centre of gravity at ``positions`` (n,) with its covariance. Raises `CgError` for another number of joints."""
+        chain, found = self.chain, np.zeros((3, 2))
+        q = np.ascontiguousarray(positions, dtype=float)
+        if q.shape != chain.lower.shape:
+            raise CgError(f"{chain.source} needs positions of {', '.join(chain.joint_names)}; got an array of shape {q.shape}.")
+        _estimate(chain.layout, chain.constants, self.arms, self.numbers, self.weighed_poses, q, found)
+        return CgEstimate(found[0], found[1:], self.mass)
+
+
+def cg_model(
+    urdf: Urdf,
+    base_link: str = "base_link",
+    joints: tuple[str, ...] | None = None,
+    static: StaticPart | None = None,
+    payload: Payload | None = None,
+    tolerances: Tolerances = TYPICAL,
+) -> CgModel:
+    """The model of ``urdf``; ``joints`` as in `flatten`. ``static`` replaces what the URDF says of everything but the arms.
+
+    Raises `CgError` for a payload or a static part that cannot be, and whatever `flatten` does.
+    """
+    chain = flatten(urdf, base_link, joints)
+    base = base_com(chain)
+    if static is None:
+        mass = float(chain.constants[0, MASS])
+        if mass <= 0.0:
+            raise CgError(f"{urdf.source}: nothing but its arms has a mass; give the static part's mass and centre of gravity.")
+        sigmas = np.array([mass * tolerances.mass_fraction, tolerances.com_m, tolerances.com_m])
+        static = StaticPart(mass, base[:2], np.diag(sigmas**2))
+    elif not (np.isfinite(static.mass) and static.mass > 0.0 and np.all(np.isfinite(static.position))):
+        raise CgError(f"static part: {static.mass} kg at {static.position}; its mass must be positive, its place finite.")
+    else:
+        links = {name: Link(name, 0.0, np.zeros(3)) if body == 0 else urdf.links[name] for name, (body, _) in chain.links.items()}
+        links[base_link] = Link(base_link, static.mass, np.array([*static.position, base[2]]))
+        stiff = tuple(dataclasses.replace(j, kind="fixed", mimic=None) if chain.links[j.child][0] == 0 else j for j in urdf.joints)
+        urdf = dataclasses.replace(urdf, links=links, joints=stiff)
+        joints = None if joints is None else tuple(j.name for j in stiff if j.moves and j.name in joints)
+
+    load = np.zeros(7)
+    if payload is not None:
+        sigmas = np.array([payload.mass_sigma, payload.position_sigma])
+        if not (np.isfinite(payload.mass) and payload.mass > 0.0):
+            raise CgError(f"payload at {payload.link}: mass is {payload.mass} kg; it must be positive.")
+        if not (len(payload.position) == 3 and np.all(np.isfinite([*payload.position, *sigmas])) and np.all(sigmas >= 0.0)):
+            raise CgError(f"payload at {payload.link}: its place must be three finite numbers and its sigmas not below 0, found {payload}.")
+        urdf = urdf.with_mass(payload.link, payload.mass, np.array(payload.position))
+    # Once more: a payload off the axis can make a joint matter that did not.
+    chain = flatten(urdf, base_link, joints)
+    if payload is not None:
+        body, point = chain.point(payload.link, np.array(payload.position))
+        load = np.array([body, *point, payload.mass, *sigmas])
+    numbers = np.array([*load, tolerances.mass_fraction, tolerances.com_m, tolerances.joint, *static.covariance.ravel()])
+    poses = _poses_at(chain, static.weighed_at)
+    return CgModel(chain, static, tolerances, payload, _without(chain, load), numbers, poses, chain.mass)
+
+
+def _without(chain: Chain, load: FloatArray) -> FloatArray:
+    """`Chain.constants` with the payload taken out again."""
+    constants, body, mass = chain.constants.copy(), int(load[0]), load[4]
+    rest = constants[body, MASS] - mass
+    if mass > 0.0:
+        moment = constants[body, MASS] * constants[body, COM:] - mass * load[1:4]
+        constants[body, MASS], constants[body, COM:] = (rest, moment / rest) if rest > 1e-9 else (0.0, 0.0)
+    return constants
+
+
+def _poses_at(chain: Chain, posture: Mapping[str, float] | None) -> FloatArray:
+    if posture is None:
+        return np.empty((0, 3, 4))
+    # A joint that matters only since there is a payload stood wherever it stood.
+    q = np.array([posture.get(name, 0.0) for name in chain.joint_names])
+    rotations, translations = np.empty((len(chain.layout), 3, 3)), np.empty((len(chain.layout), 3))
+    forward(chain.layout, chain.constants, q, rotations, translations)
+    return np.concatenate([rotations, translations[:, :, None]], axis=2)
+
+
+@numba.njit(cache=True)
+def _estimate(
+    layout: IntArray,
+    constants: FloatArray,
+    arms: FloatArray,
+    numbers: FloatArray,
+    weighed_poses: FloatArray,
+    positions: FloatArray,
+    found: FloatArray,
+) -> None:  # pragma: no cover
+    """`CgModel.estimate` at ``positions`` (n,), into ``found`` (3, 2), which starts at zero: the CG, and its covariance below it.
+
+    First order: the CG is a quotient of sums, and each error moves it by (its moment - the CG times its mass) / total mass.
+    """
+    cg, cov = found[0], found[1:]
+    load, tolerances, static_cov = numbers[:7], numbers[7:10], numbers[10:].reshape(3, 3)
+    bodies, joints = layout.shape[0], positions.shape[0]
+    rotations, translations = np.empty((bodies, 3, 3)), np.empty((bodies, 3))
+    forward(layout, constants, positions, rotations, translations)
+    total = 0.0
+    for i in range(bodies):
+        total += constants[i, MASS]
+        for row in range(2):
+            cg[row] += body_moment(constants, rotations, translations, i, row)
+    cg[0] /= total
+    cg[1] /= total
+
+    # Static part: its place moves the CG by its share of the mass, its mass by its lever.
+    share = arms[0, MASS] / total
+    lever = np.empty(2)
+    for row in range(2):
+        lever[row] = (body_moment(arms, rotations, translations, 0, row) / arms[0, MASS] - cg[row]) / total
+    for row in range(2):
+        for column in range(2):
+            cov[row, column] += (
+                share * share * static_cov[1 + row, 1 + column]
+                + share * (static_cov[1 + row, 0] * lever[column] + lever[row] * static_cov[0, 1 + column])
+                + static_cov[0, 0] * lever[row] * lever[column]
+            )
+
+    # Arms. Their errors were in the weighed total too, and so count by what moved since.
+    weighed = weighed_poses.shape[0] > 0
+    spread = np.empty((2, 3))
+    for i in range(1, bodies):
+        mass = arms[i, MASS]
+        for row in range(2):
+            place = body_moment(arms, rotations, translations, i, row) / mass if mass > 0.0 else 0.0
+            before = cg[row]
+            for column in range(3):
+                spread[row, column] = rotations[i, row, column]
+            if weighed:
+                before = weighed_poses[i, row, 3]
+                for column in range(3):
+                    before += weighed_poses[i, row, column] * arms[i, COM + column]
+                    spread[row, column] -= weighed_poses[i, row, column]
+            lever[row] = (place - before) * mass / total
+        for row in range(2):
+            for column in range(2):
+                along = 0.0
+                for k in range(3):
+                    along += spread[row, k] * spread[column, k]
+                cov[row, column] += tolerances[0] ** 2 * lever[row] * lever[column]
+                cov[row, column] += (tolerances[1] * mass / total) ** 2 * along
+
+    by_joint = np.zeros((3, joints))
+    subtree_jacobian(layout, constants, rotations, translations, by_joint)
+    for row in range(2):
+        for column in range(2):
+            for k in range(joints):
+                cov[row, column] += tolerances[2] ** 2 * by_joint[row, k] * by_joint[column, k] / total**2
+
+    if load[4] > 0.0:
+        body = int(load[0])
+        for row in range(2):
+            place = translations[body, row]
+            for k in range(3):
+                place += rotations[body, row, k] * load[1 + k]
+            lever[row] = (place - cg[row]) * load[5] / total
+        for row in range(2):
+            for column in range(2):
+                cov[row, column] += lever[row] * lever[column]
+            cov[row, row] += (load[6] * load[4] / total) ** 2

@@ -1,0 +1,141 @@
+"""Claims about `regressions`: least squares with honest covariance, the thesis's numbers to every printed digit, clear errors."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from motion_models.calibration.regressions import (
+    COLUMNS,
+    RotationTable,
+    polynomial,
+    read_rotation_table,
+    regress,
+    skid_steer_fit,
+)
+from motion_models.errors import CalibrationError
+from motion_models.robot import load_robot
+from motion_models.skid_steer import SkidSteer, thesis_coefficients
+from tests.studies.thesis_regressions import DATA, grid, k_deviation, printed_numbers, variant_errors
+
+
+@pytest.mark.parametrize("number", printed_numbers(), ids=lambda n: n.what)
+def test_a_number_of_the_thesis_is_met_to_every_printed_digit(number):
+    assert number.agrees
+
+
+def test_k_is_met_to_a_thousandth_over_the_grid():
+    assert k_deviation() < 1e-3
+
+
+def test_a_wrong_digit_would_show():
+    import dataclasses
+
+    for number in printed_numbers():
+        step = 10.0**-number.digits if "E" not in number.printed else abs(number.value) * 10.0 ** (1 - number.digits) * 2
+        assert not dataclasses.replace(number, value=number.value + 1.01 * step).agrees
+
+
+def test_the_errors_of_the_heuristics_variants():
+    errors = {e.variant: e for e in variant_errors()}
+    for e in errors.values():
+        assert (e.ratio, e.x_cr) == (pytest.approx(0.02676, abs=5e-6), pytest.approx(0.01144, abs=5e-6))
+    assert [errors[v].y_cr for v in ("multivariate", "full", "symmetric")] == pytest.approx([0.01105, 0.00565, 0.01277], abs=5e-6)
+
+
+def test_a_line_is_that_of_scipy():
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=30)
+    y = 2 * x + rng.normal(size=30)
+    ours, theirs = polynomial(y, x, 1), stats.linregress(x, y)
+    np.testing.assert_allclose(ours.coefficients, [theirs.intercept, theirs.slope])
+    np.testing.assert_allclose(ours.sigma, [theirs.intercept_stderr, theirs.stderr])
+    assert ours.r_squared == pytest.approx(theirs.rvalue**2)
+    assert ours.p_values[1] == pytest.approx(theirs.pvalue)
+    assert ours.significance == pytest.approx(theirs.pvalue)  # F = t^2 for a line
+
+
+def test_intervals_cover():
+    """95 % of them contain the truth; 3000 draws, three coefficients."""
+    rng = np.random.default_rng(1)
+    x = np.linspace(-1, 1, 12)
+    truth = np.array([0.3, -1.0, 2.0])
+    inside = np.zeros(3)
+    for _ in range(3000):
+        fit = polynomial(truth[0] + truth[1] * x + truth[2] * x**2 + rng.normal(size=12), x, 2)
+        low, high = fit.interval().T
+        inside += (low < truth) & (truth < high)
+    assert np.all(np.abs(inside / 3000 - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 3000))
+
+
+def test_the_skid_steer_fit_returns_the_model_that_made_the_table():
+    table = grid()
+    truth = thesis_coefficients("full")
+    model = SkidSteer.from_robot(load_robot("vaultbot"))
+    k, x_cr, y_cr = model.rotation(table.cg, truth)
+    made = RotationTable(table.cg, 1.875 * k, np.stack([x_cr, y_cr], axis=-1))
+    fit = skid_steer_fit(made)
+    np.testing.assert_allclose(fit.coefficients, truth, atol=1e-9)
+    np.testing.assert_allclose(fit.cov, 0.0, atol=1e-12)
+
+
+def test_the_skid_steer_fit_of_the_measurements_is_no_worse_than_the_thesis():
+    """By definition of least squares, on the rows; and its covariance is that of its residuals."""
+    table = grid()
+    fit = skid_steer_fit(table)
+    full = {e.variant: e for e in variant_errors()}["full"]
+    assert fit.k.rms * 1.875 <= full.ratio
+    assert fit.x_cr.rms <= full.x_cr
+    assert fit.y_cr.rms <= full.y_cr
+    assert np.linalg.eigvalsh(fit.cov).min() > 0
+
+
+def write(path, rows, header=COLUMNS):
+    path.write_text("\n".join([",".join(header), *(",".join(str(c) for c in row) for row in rows)]) + "\n")
+    return path
+
+
+def test_columns_may_come_in_any_order(tmp_path):
+    order = COLUMNS[::-1]
+    table = read_rotation_table(write(tmp_path / "t.csv", [[5, 4, 3, 2, 1]], order))
+    np.testing.assert_array_equal(table.cg, [[1, 2]])
+    np.testing.assert_array_equal(table.cor, [[4, 5]])
+    assert len(read_rotation_table(DATA / "rotation_grid.csv").ratio) == 68
+
+
+@pytest.mark.parametrize(
+    ("rows", "header", "message"),
+    [
+        ([[0, 0, 1, 0, 0], [0, 0.01, "", 0, 0]], COLUMNS, r"line 3: rotation_ratio must be a number, found ''"),
+        ([[0, 0, "fast", 0, 0]], COLUMNS, r"line 2: rotation_ratio must be a number, found 'fast'"),
+        ([[0, 0, 1, 0]], COLUMNS, r"line 2: cor_y_m must be a number, found None"),
+        ([[0, 0, 1, 0, "inf"]], COLUMNS, r"line 2: cor_y_m must be a number"),
+        ([[0, 0, 1, 0]], COLUMNS[:4], r"no column cor_y_m; it has cg_x_m, cg_y_m, rotation_ratio, cor_x_m"),
+        ([], COLUMNS, r"no rows below its header"),
+    ],
+)
+def test_a_bad_table_is_refused_with_the_place(tmp_path, rows, header, message):
+    with pytest.raises(CalibrationError, match=message):
+        read_rotation_table(write(tmp_path / "bad.csv", rows, header))
+
+
+@pytest.mark.parametrize(
+    "make", [lambda p: None, lambda p: p.write_bytes(b"\xff\xfe\x00\x01"), lambda p: p.write_text(""), lambda p: p.mkdir()]
+)
+def test_a_file_that_is_no_table_is_refused(tmp_path, make):
+    path = tmp_path / "x.csv"
+    make(path)
+    with pytest.raises(CalibrationError, match=r"x\.csv"):
+        read_rotation_table(path)
+
+
+def test_too_few_rows_and_rows_that_do_not_tell():
+    with pytest.raises(CalibrationError, match="3 rows are too few for the 3 coefficients"):
+        polynomial(np.ones(3), np.arange(3.0), 2)
+    with pytest.raises(CalibrationError, match="cannot tell 1 and x_G apart"):
+        polynomial(np.ones(5), np.full(5, 0.3), 1)
+    line = grid()
+    on_axis = line.cg[:, 1] == 0
+    with pytest.raises(CalibrationError, match="vary the centre of gravity more"):
+        skid_steer_fit(RotationTable(line.cg[on_axis], line.ratio[on_axis], line.cor[on_axis]))
+    with pytest.raises(CalibrationError, match="cannot tell"):
+        regress(np.arange(4.0), {"1": np.ones(4), "twice": 2 * np.ones(4)})

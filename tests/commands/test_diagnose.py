@@ -1,0 +1,104 @@
+"""`skidloc diagnose`: what it prints and writes, what it says where it cannot know, and what it says of input that is none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from localization.cli import main
+from tests.helpers.diagnosis_drives import bag
+
+DATA = Path(__file__).parents[1] / "data"
+GRID = DATA / "vaultbot" / "rotation_grid.csv"
+
+
+def test_a_table_becomes_findings_a_page_and_a_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, again = tmp_path / "out", tmp_path / "again"
+    assert main(["diagnose", str(GRID), "--robot", "vaultbot", "--out", str(out), "--json", str(tmp_path / "d.json")]) == 0
+    printed = capsys.readouterr().out
+    content = json.loads((tmp_path / "d.json").read_text())
+    assert {"log", "robot", "model", "verdict", "discrepancy", "findings", "left_unexplained", "next_drive"} <= set(content)
+    assert content["sentence"] in printed
+    first = content["findings"][0]
+    assert {"cause", "size", "sigma", "unit", "p_value", "aliases", "evidence", "gain"} <= set(first)
+    assert {"heldout_rms_before", "heldout_rms_after", "relative"} <= set(first["gain"])
+    page = (out / "diagnosis.html").read_text()
+    assert page.index('class="verdict"') < page.index("<svg")
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    # the same input, the same bytes
+    assert main(["diagnose", str(GRID), "--robot", "vaultbot", "--out", str(again)]) == 0
+    for name in ("diagnosis.json", "diagnosis.html", "robot.toml"):
+        assert (out / name).read_bytes() == (again / name).read_bytes()
+
+
+def test_the_corrected_robot_has_less_to_correct(tmp_path: Path) -> None:
+    """The patch is in: under it, the floor's causes that were named are gone."""
+    out, second = tmp_path / "out", tmp_path / "second.json"
+    assert main(["diagnose", str(GRID), "--robot", "vaultbot", "--out", str(out)]) == 0
+    assert main(["diagnose", str(GRID), "--robot", str(out / "robot.toml"), "--json", str(second)]) == 0
+    before = {f["cause"] for f in json.loads((out / "diagnosis.json").read_text())["findings"]}
+    after = {f["cause"] for f in json.loads(second.read_text())["findings"]}
+    assert {"diagonal_load", "track_width"} <= before
+    assert not {"diagonal_load", "track_width"} & after
+
+
+def test_a_corrected_robot_replays(tmp_path: Path) -> None:
+    log = bag(tmp_path / "drive.mcap", {"wheel_radius_scale": 0.05}, 1, "husky_a200")
+    out = tmp_path / "out"
+    assert main(["diagnose", str(log), "--robot", "husky_a200", "--out", str(out)]) == 0
+    errors = {}
+    for name, robot in (("before", "husky_a200"), ("after", str(out / "robot.toml"))):
+        replayed = tmp_path / name
+        options = ["--robot", robot, "--model", "friction", "--estimator", "odometry", "--out", str(replayed)]
+        assert main(["replay", str(log), *options]) == 0
+        errors[name] = json.loads((replayed / "metrics.json").read_text())["results"][0]["ate_rmse_m"]
+    assert errors["after"] < 0.6 * errors["before"]
+
+
+def test_a_drive_without_a_witness_is_undecidable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = bag(tmp_path / "drive.mcap", {}, 1, lidar="none", imu_hz=0.0)
+    assert main(["diagnose", str(log), "--robot", "vaultbot", "--json", str(tmp_path / "d.json")]) == 0
+    content = json.loads((tmp_path / "d.json").read_text())
+    assert content["verdict"] == "undecidable"
+    assert "LiDAR" in content["next_drive"]
+    assert "turning in place" in capsys.readouterr().out
+
+
+def test_a_table_that_is_too_short_is_undecidable(tmp_path: Path) -> None:
+    short = tmp_path / "short.csv"
+    short.write_text("\n".join(GRID.read_text().splitlines()[:5]) + "\n")
+    out = tmp_path / "out"
+    assert main(["diagnose", str(short), "--robot", "vaultbot", "--out", str(out)]) == 0
+    assert json.loads((out / "diagnosis.json").read_text())["verdict"] == "undecidable"
+    assert (out / "diagnosis.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "empty"),
+        ("window,dt_s\n1,0.1\n", "left_rad_per_s"),
+        ("window,dt_s,left_rad_per_s,right_rad_per_s,yaw_rad\n1,0.1,fast,1,0.1\n", "line 2"),
+        ("cg_x_m,cg_y_m,rotation_ratio,cor_x_m,cor_y_m\n0,0,nan?,0,0\n", "line 2"),
+        ("cg_x_m,cg_y_m,rotation_ratio\n0,0,1\n", "cor_x_m"),
+    ],
+)
+def test_malformed_tables_are_refused_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str) -> None:
+    table = tmp_path / "table.csv"
+    table.write_text(text)
+    assert main(["diagnose", str(table), "--robot", "vaultbot"]) == 2
+    complaint = capsys.readouterr().err
+    assert said in complaint
+    assert "Traceback" not in complaint
+
+
+def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["diagnose", str(GRID), "--robot", "vaultbot", "--out", str(tmp_path)]) == 2
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_windows_that_are_no_length_of_time_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["diagnose", str(tmp_path / "table.csv"), "--robot", "vaultbot", "--window-s", "nan"]) == 2
+    assert "--window-s is nan; windows of 0.5 to 20 s make sense" in capsys.readouterr().err

@@ -1,0 +1,324 @@
+"""Consistency tests are themselves tested by counting: honest errors pass as often as promised, dishonest ones are found out.
+
+Bounds on counts are binomial at one in a million, so that an honest implementation fails with no seed in practice.
+"""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import binom, chi2, kstest
+
+from localization.errors import EvaluationError
+from localization.evaluation.consistency import (
+    consistency,
+    degrees_of_freedom,
+    lag1_whiteness,
+    mean_band,
+    mean_over_runs,
+    nees,
+    nis,
+    pose_consistency,
+    pose_errors,
+)
+from localization.evaluation.references import ReferenceTrack
+from localization.trajectory import Trajectory
+from motion_models import se2
+
+SECOND = 10**9
+
+
+def random_covariances(rng, n, d=3):
+    a = rng.normal(size=(n, d, d)) * np.array([0.1, 0.02, 0.003])[:d, None]
+    return a @ np.swapaxes(a, 1, 2) + 1e-8 * np.eye(d)
+
+
+def draw(rng, covariances):
+    return np.einsum("nij,nj->ni", np.linalg.cholesky(covariances), rng.normal(size=covariances.shape[:2]))
+
+
+def as_often_as(count, n, probability):
+    low, high = binom.ppf([5e-7, 1 - 5e-7], n, probability)
+    return low <= count <= high
+
+
+def test_values_are_those_of_the_inverse():
+    rng = np.random.default_rng(0)
+    p = random_covariances(rng, 100)
+    e = rng.normal(size=(100, 3))
+    expected = [x @ np.linalg.solve(c, x) for x, c in zip(e, p, strict=True)]
+    np.testing.assert_allclose(nees(e, p), expected, rtol=1e-6)
+    np.testing.assert_array_equal(nis(e, p), nees(e, p))
+
+
+def test_values_do_not_depend_on_units():
+    rng = np.random.default_rng(1)
+    p, scale = random_covariances(rng, 50), np.array([1e3, 1.0, 180 / math.pi])
+    e = draw(rng, p)
+    np.testing.assert_allclose(nees(e * scale, p * np.outer(scale, scale)), nees(e, p), rtol=1e-9)
+
+
+def test_correctly_drawn_errors_are_chi_square():
+    rng = np.random.default_rng(2)
+    p = random_covariances(rng, 20_000)
+    values = nees(draw(rng, p), p)
+    assert kstest(values, chi2(3).cdf).pvalue > 1e-6
+    assert as_often_as(np.count_nonzero(values <= chi2.ppf(0.95, 3)), 20_000, 0.95)
+
+
+@pytest.mark.parametrize("probability", [0.8, 0.95, 0.99])
+def test_honest_runs_are_found_consistent_as_often_as_promised(probability):
+    inside = 0
+    for seed in range(400):
+        rng = np.random.default_rng(seed)
+        p = random_covariances(rng, 50)
+        inside += consistency(draw(rng, p), p, probability).verdict == "consistent"
+    assert as_often_as(inside, 400, probability)
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(0.5, "overconfident"), (2.0, "conservative")])
+def test_a_variance_wrong_by_two_is_found_out(factor, verdict):
+    found = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        p = random_covariances(rng, 50)
+        found.append(consistency(draw(rng, p), factor * p))
+    # 50 samples of 3: the mean moves by 8 of its standard deviations one way, by 5 the other
+    assert [c.verdict for c in found] == [verdict] * 200
+    assert np.mean([c.mean for c in found]) == pytest.approx(3.0 / factor, rel=0.02)
+    assert all((c.fraction_inside < 0.95) == (verdict == "overconfident") for c in found if abs(c.fraction_inside - 0.95) > 0.05)
+
+
+def test_the_band_is_that_of_the_mean():
+    rng = np.random.default_rng(3)
+    means = chi2.rvs(3, size=(20_000, 10), random_state=rng).mean(axis=1)
+    low, high = mean_band(10, 3)
+    assert as_often_as(np.count_nonzero(means < low), 20_000, 0.025)
+    assert as_often_as(np.count_nonzero(means > high), 20_000, 0.025)
+    # Bar-Shalom et al. 2001, example in sec. 5.4.2: 50 runs of dimension 2, two-sided 95 %: [1.5, 2.6]
+    assert np.round(mean_band(50, 2), 1).tolist() == [1.5, 2.6]
+
+
+def test_the_mean_over_runs_keeps_to_its_band_at_each_instant():
+    rng = np.random.default_rng(4)
+    p = np.broadcast_to(np.diag([0.1, 0.2, 0.3]), (25, 2_000, 3, 3)).reshape(-1, 3, 3)
+    values = nees(draw(rng, p), p).reshape(25, 2_000)
+    means, (low, high) = mean_over_runs(values, 3)
+    assert means.shape == (2_000,)
+    assert as_often_as(np.count_nonzero((means > low) & (means < high)), 2_000, 0.95)
+    assert mean_band(25, 3) == (low, high)
+
+
+def test_runs_may_be_stacked():
+    rng = np.random.default_rng(5)
+    p = random_covariances(rng, 60)
+    e = draw(rng, p)
+    flat, stacked = consistency(e, p), consistency(e.reshape(6, 10, 3), p.reshape(6, 10, 3, 3), n_independent=6)
+    assert stacked.mean == flat.mean
+    assert (stacked.n, stacked.n_independent) == (60, 6)
+    assert stacked.band == mean_band(6, 3)
+
+
+# --- singular covariances
+
+
+def test_a_direction_of_no_variance_is_not_counted_while_the_error_keeps_to_it():
+    rng = np.random.default_rng(6)
+    basis = np.linalg.qr(rng.normal(size=(5_000, 3, 3)))[0][:, :, :2]  # errors lie in a plane, another one each time
+    p = basis @ np.array([[0.4, 0.1], [0.1, 0.2]]) @ np.swapaxes(basis, 1, 2)
+    e = np.einsum("nij,nj->ni", basis, rng.multivariate_normal([0, 0], [[0.4, 0.1], [0.1, 0.2]], 5_000))
+    assert set(degrees_of_freedom(p)) == {2}
+    assert kstest(nees(e, p), chi2(2).cdf).pvalue > 1e-6
+    found = consistency(e, p)
+    assert (found.dof, found.verdict) == (2.0, "consistent")
+
+
+def test_a_broken_claim_of_certainty_is_infinitely_wrong():
+    p = np.diag([0.01, 0.0, 0.01])
+    assert nees([[0.1, 0.0, 0.0]], [p])[0] == pytest.approx(1.0)
+    assert nees([[0.1, 1e-3, 0.0]], [p])[0] == np.inf
+    assert nees([[0.1, 1e-9, 0.0]], [p])[0] == pytest.approx(1.0)  # a nanometre is rounding
+    found = consistency([[0.1, 1e-3, 0.0], [0.1, 0.0, 0.0]], [p, p])
+    assert (found.mean, found.verdict, found.fraction_inside) == (np.inf, "overconfident", 0.5)
+    assert consistency([[1.0, 0.0, 0.0]], np.zeros((1, 3, 3))).verdict == "overconfident"
+
+
+def test_certain_samples_without_error_say_nothing():
+    rng = np.random.default_rng(7)
+    p = random_covariances(rng, 10)
+    e = draw(rng, p)
+    padded = consistency(np.vstack([np.zeros((5, 3)), e]), np.concatenate([np.zeros((5, 3, 3)), p]))
+    assert padded == consistency(e, p)
+    with pytest.raises(EvaluationError, match="no sample with an uncertain error"):
+        consistency(np.zeros((5, 3)), np.zeros((5, 3, 3)))
+
+
+@pytest.mark.parametrize(
+    ("errors", "covariances", "complaint"),
+    [
+        (np.zeros((2, 3)), np.zeros((2, 2, 2)), r"found \(2, 3\) and \(2, 2, 2\)"),
+        (np.zeros(3), np.eye(3), "shape"),
+        ([[0.0, np.nan]], [np.eye(2)], "error number 0 .* not finite"),
+        ([[0.0, 0.0]], [np.full((2, 2), np.inf)], "covariance number 0 .* not finite"),
+        ([[0.0, 0.0]] * 2, [np.eye(2), [[1.0, 0.5], [0.0, 1.0]]], "covariance number 1 is not symmetric"),
+        ([[0.0, 0.0]], [[[1.0, 2.0], [2.0, 1.0]]], "negative eigenvalue"),
+        ([[0.0, 0.0]], [[[1.0, 0.0], [0.0, -1.0]]], "negative eigenvalue"),
+        ([[0.0, 0.0]], [[[0.0, 0.1], [0.1, 1.0]]], "no covariance"),
+    ],
+)
+def test_what_is_no_covariance_is_refused(errors, covariances, complaint):
+    with pytest.raises(EvaluationError, match=complaint):
+        nees(errors, covariances)
+
+
+@pytest.mark.parametrize(("n", "dof", "probability"), [(0, 3, 0.95), (5, 0, 0.95), (5, 3, 1.0)])
+def test_no_band_for_nothing(n, dof, probability):
+    with pytest.raises(EvaluationError, match="no band"):
+        mean_band(n, dof, probability)
+
+
+# --- whiteness
+
+
+def test_white_innovations_are_found_white_as_often_as_promised():
+    white = 0
+    for seed in range(400):
+        rng = np.random.default_rng(1000 + seed)
+        p = random_covariances(rng, 200)
+        white += lag1_whiteness(draw(rng, p), p).is_white
+    assert as_often_as(white, 400, 0.95)
+
+
+def test_correlated_innovations_are_found_out_and_measured():
+    rng = np.random.default_rng(8)
+    z = np.zeros((5_000, 3))
+    for k in range(1, 5_000):
+        z[k] = 0.3 * z[k - 1] + math.sqrt(1 - 0.09) * rng.normal(size=3)
+    p = random_covariances(rng, 1).repeat(5_000, axis=0)
+    e = z @ np.linalg.cholesky(p[0]).T
+    found = consistency(e, p, whiteness=True)
+    assert found.whiteness.lag1 == pytest.approx(0.3, abs=4 / math.sqrt(15_000))
+    assert not found.whiteness.is_white
+    assert found.verdict == "consistent"  # of the right size all the same: whiteness is another question
+    assert lag1_whiteness(e, 9.0 * p).lag1 == pytest.approx(found.whiteness.lag1)  # nor does it ask for the size
+    with pytest.raises(EvaluationError, match="at least two"):
+        lag1_whiteness(e[:1], p[:1])
+
+
+# --- pose errors
+
+STEP_COVARIANCE = np.array([[4e-4, 1e-5, 0.0], [1e-5, 1e-4, 2e-5], [0.0, 2e-5, 4e-5]])
+
+
+def odometry_runs(seed, runs=1, n=60, first_covariance=None):
+    """Truths (runs, n + 1, 3), and the one odometry (n + 1, 3) of them all, in another plane, with the covariance that first-order
+    propagation gives it."""
+    motion = np.array([0.2, 0.0, 0.05])
+    noise = np.random.default_rng(seed).multivariate_normal(np.zeros(3), STEP_COVARIANCE, (runs, n))
+    truths, estimate = [np.zeros((runs, 3))], [np.array([4.0, -2.0, 1.0])]
+    covariances = [np.zeros((3, 3)) if first_covariance is None else first_covariance]
+    a = se2.adjoint(se2.inverse(se2.exp(motion)))
+    for k in range(n):
+        estimate.append(se2.compose(estimate[-1], se2.exp(motion)))
+        truths.append(se2.compose(truths[-1], se2.compose(se2.exp(motion), se2.exp(noise[:, k]))))
+        covariances.append(a @ covariances[-1] @ a.T + STEP_COVARIANCE)
+    return np.stack(truths, axis=1), np.array(estimate), np.array(covariances)
+
+
+def odometry_run(seed, **more):
+    truths, estimate, covariances = odometry_runs(seed, **more)
+    return truths[0], estimate, covariances
+
+
+def as_track(truth, **more):
+    return ReferenceTrack(np.arange(len(truth)) * SECOND, truth[:, :2], truth[:, 2], **more)
+
+
+def as_trajectory(estimate, covariances):
+    return Trajectory(np.arange(len(estimate)) * SECOND, estimate, covariances)
+
+
+def test_errors_count_from_the_first_match_in_the_frame_of_the_estimate():
+    truth, estimate, covariances = odometry_run(9)
+    found = pose_errors(as_trajectory(estimate, covariances), as_track(truth))
+    assert len(found.errors) == 60  # the first match is the alignment itself
+    start = se2.compose(truth[0], se2.inverse(estimate[0]))
+    # right perturbation: the aligned estimate, moved by the error, is the truth
+    np.testing.assert_allclose(se2.compose(se2.compose(start, estimate[1:]), se2.exp(found.errors)), truth[1:], atol=1e-12)
+    np.testing.assert_array_equal(found.covariances, covariances[1:])
+    assert found.n_left_out == 0
+
+
+@pytest.mark.parametrize("first", [None, np.diag([0.04, 0.01, 0.01])])
+def test_honest_odometry_passes_over_many_runs_whatever_its_first_uncertainty(first):
+    truths, estimate, p = odometry_runs(14, runs=200, first_covariance=first)
+    found = [pose_errors(as_trajectory(estimate, p), as_track(truth)) for truth in truths]
+    values = np.array([nees(f.errors, f.covariances) for f in found])
+    # at each of the instants the mean of 200 independent runs; instants are correlated, hence three of them only, at 99.9 %
+    means, (low, high) = mean_over_runs(values, 3, probability=0.999)
+    assert np.all((means[[0, 30, 59]] > low) & (means[[0, 30, 59]] < high))
+
+
+def test_odometry_that_claims_half_the_variance_is_found_out_over_runs():
+    truths, estimate, p = odometry_runs(15, runs=100)
+    found = [pose_errors(as_trajectory(estimate, 0.5 * p), as_track(truth)) for truth in truths]
+    values = [nees(f.errors, f.covariances) for f in found]
+    means, (_, high) = mean_over_runs(values, 3)
+    assert np.all(means > high)
+
+
+def test_one_run_counts_as_one_sample():
+    verdicts = []
+    truths, estimate, p = odometry_runs(16, runs=200)
+    for truth in truths:
+        found = pose_consistency(as_trajectory(estimate, p), as_track(truth))
+        assert (found.n, found.n_independent, found.band) == (60, 1, mean_band(1, 3))
+        verdicts.append(found.verdict)
+    # the mean of sixty correlated samples spreads less than one sample, so honest runs pass at least as often
+    assert verdicts.count("consistent") >= binom.ppf(1e-6, 200, 0.95)
+
+
+def test_noise_of_the_reference_is_part_of_the_error_where_it_is_told():
+    noise = np.diag([0.09, 0.0009, 0.0025])  # along and across the plane's x, not the robot's
+    truths, estimate, p = odometry_runs(17, runs=400, n=10)
+    rng = np.random.default_rng(18)
+    whitened = []
+    for truth in truths:
+        seen = se2.compose([0, 0, 0.7], truth) + rng.multivariate_normal(np.zeros(3), noise, len(truth))
+        found = pose_errors(as_trajectory(estimate, p), as_track(seen, covariances=np.broadcast_to(noise, (len(seen), 3, 3))))
+        whitened.append(np.linalg.solve(np.linalg.cholesky(found.covariances[-1]), found.errors[-1]))
+    # 400 draws: a variance is known to 7 %, a correlation to 5 %; five of these
+    np.testing.assert_allclose(np.cov(whitened, rowvar=False), np.eye(3), atol=0.35)
+    unknown = np.full((11, 3, 3), np.nan)
+    np.testing.assert_array_equal(pose_errors(as_trajectory(estimate, p), as_track(truths[0], covariances=unknown)).covariances, p[1:])
+
+
+def test_standing_before_the_first_motion_is_left_out():
+    truth, estimate, p = odometry_run(10)
+    stands = 20
+    truth, estimate = (np.vstack([np.repeat(a[:1], stands, axis=0), a]) for a in (truth, estimate))
+    p = np.concatenate([np.zeros((stands, 3, 3)), p])
+    jitter = np.random.default_rng(11).normal(0, 1e-3, (len(truth), 3))
+    found = pose_consistency(as_trajectory(estimate, p), as_track(truth + jitter))
+    assert found.n == 60
+    assert math.isfinite(found.mean)
+
+
+def test_certainty_that_grows_is_left_out_and_counted():
+    truth, estimate, p = odometry_run(12, first_covariance=np.diag([0.04, 0.01, 0.01]))
+    p[40] = 1e-3 * np.eye(3)  # an absolute fix: less than the start's uncertainty carried along
+    found = pose_errors(as_trajectory(estimate, p), as_track(truth))
+    assert found.n_left_out == 1
+    assert 40 * SECOND not in found.stamps_ns
+
+
+def test_what_cannot_be_tested_is_none_or_refused():
+    truth, estimate, p = odometry_run(13)
+    positions = ReferenceTrack(np.arange(61) * SECOND, truth[:, :2])
+    assert pose_consistency(as_trajectory(estimate, p), positions) is None
+    assert pose_consistency(Trajectory(np.arange(61) * SECOND, estimate), as_track(truth)) is None
+    assert pose_errors(Trajectory(np.arange(61) * SECOND, estimate), as_track(truth)).covariances is None
+    parked = as_trajectory(np.zeros((61, 3)), np.zeros((61, 3, 3)))
+    assert pose_consistency(parked, as_track(np.zeros((61, 3)))) is None
+    with pytest.raises(EvaluationError, match="knows positions only"):
+        pose_errors(as_trajectory(estimate, p), positions)

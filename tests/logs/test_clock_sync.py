@@ -1,0 +1,400 @@
+"""Events come in order of their stamps, in bounded memory, whatever clocks and recorders do."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from localization.events import Event, ImuSample, Scan, WheelSample
+from localization.logs import Log, open_log
+from localization.logs.clock_sync import Item, merge, plan_clocks
+from localization.logs.message_stats import Oddity, Tally
+from motion_models.robot import load_robot
+from tests.helpers import bags
+from tests.helpers.bags import START, Record, S
+
+ROBOT = load_robot("vaultbot")
+MS = S // 1000
+HOUR = 3600 * S
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A payload that knows where it came from and when it was really measured."""
+
+    stamp_ns: int
+    topic: str
+    true_ns: int
+
+
+def mark(topic: str, true_ns: int, log_ns: int, stamp_ns: int | None = None) -> Item:
+    stamp = true_ns if stamp_ns is None else stamp_ns
+    return Item(log_ns, stamp, topic, 0, 1, Mark(stamp, topic, true_ns))
+
+
+def run(items: Iterable[Item]) -> tuple[list[Mark], Tally]:
+    """Merge items after bringing them into the order of recording, with clocks planned by each topic's first."""
+    ordered = sorted(items, key=lambda item: item.log_ns)
+    first: dict[str, tuple[int, int]] = {}
+    for item in ordered:
+        if item.stamp_ns:
+            first.setdefault(item.topic, (item.log_ns, item.stamp_ns))
+    tally = Tally()
+    return list(merge(ordered, plan_clocks(first), tally)), tally
+
+
+def check_order(marks: list[Mark]) -> None:
+    stamps = [m.stamp_ns for m in marks]
+    assert stamps == sorted(stamps)
+    for topic in {m.topic for m in marks}:
+        own = [m.stamp_ns for m in marks if m.topic == topic]
+        assert own == sorted(set(own))
+
+
+def ticks(topic: str, seconds: float, rate: float, latency: int = 5 * MS, start: int = START) -> list[Item]:
+    return [mark(topic, start + int(i * S / rate), start + int(i * S / rate) + latency) for i in range(int(seconds * rate))]
+
+
+def test_latencies_up_to_a_second_are_sorted_out() -> None:
+    rng = np.random.default_rng(1)
+    items = [
+        mark(topic, START + i * S // rate, START + i * S // rate + int(rng.uniform(0, worst) * S))
+        for topic, rate, worst in (("/wheels", 50, 0.02), ("/scan", 10, 0.9), ("/imu", 100, 0.3))
+        for i in range(10 * rate)
+    ]
+    marks, tally = run(items)
+    check_order(marks)
+    assert len(marks) == 1600
+    assert {oddity for oddity in Oddity if any(tally.of(t, oddity) for t in ("/wheels", "/scan", "/imu"))} <= {Oddity.OUT_OF_ORDER}
+
+
+def test_a_topic_that_is_always_three_seconds_late_is_waited_for() -> None:
+    """As a slow driver on another computer may be: its usual latency is learnt."""
+    marks, tally = run([*ticks("/wheels", 20, 50), *ticks("/points", 20, 10, latency=3 * S)])
+    check_order(marks)
+    assert len(marks) == 1200
+    assert tally.sentences() == []
+
+
+def test_a_recorder_that_stalls_loses_nothing() -> None:
+    """For four seconds nothing is written; then all that waited, at once. The headers were right all the time."""
+    items = [*ticks("/wheels", 20, 50), *ticks("/scan", 20, 10, latency=60 * MS)]
+    stalled = [
+        mark(
+            i.topic,
+            i.stamp_ns,
+            i.log_ns if not START + 8 * S < i.log_ns < START + 12 * S else START + 12 * S + (i.log_ns - START) // 10_000,
+        )
+        for i in items
+    ]
+    marks, tally = run(stalled)
+    check_order(marks)
+    assert sorted(m.true_ns for m in marks) == sorted(i.stamp_ns for i in items)
+    assert all(m.stamp_ns == m.true_ns for m in marks)
+    assert tally.sentences() == []
+
+
+@pytest.mark.parametrize("rate", [50, 10, 4])
+@pytest.mark.parametrize("lost_s", [(8.0, 12.0), (8.0, 10.5), (10.0, 12.5), (9.0, 15.5), (12.0, 16.0)])
+def test_what_comes_late_in_a_burst_is_no_clock_that_was_set(rate: int, lost_s: tuple[float, float]) -> None:
+    """The network holds everything for eight seconds, and of what it held a part is lost."""
+    kept = [i for i in ticks("/wheels", 30, rate) if not lost_s[0] * S < i.stamp_ns - START < lost_s[1] * S]
+    held = [
+        i if not 8 * S < i.log_ns - START < 16 * S else mark(i.topic, i.stamp_ns, START + 16 * S + (i.log_ns - START) // 10_000)
+        for i in [*kept, *ticks("/scan", 30, 10, latency=60 * MS)]
+    ]
+    marks, tally = run(held)
+    check_order(marks)
+    assert [m.true_ns for m in marks if m.topic == "/wheels"] == [i.stamp_ns for i in kept]
+    assert all(m.stamp_ns == m.true_ns for m in marks)
+    assert tally.sentences() == []
+
+
+@pytest.mark.parametrize("ends", [0, 100])
+def test_a_clock_that_was_set_is_seen_behind_a_burst(ends: int) -> None:
+    """What comes after it agrees with the last ``ends`` messages in it."""
+    items = []
+    for i in range(1500):
+        t = START + i * S // 50
+        log = t + 5 * MS if not 400 <= i < 800 else START + 16 * S + i * MS // 1000
+        items.append(mark("/wheels", t, log, t + (HOUR if i >= 800 - ends else 0)))
+    marks, tally = run(items)
+    check_order(marks)
+    assert len(marks) + tally.of("/wheels", Oddity.REPEATED) == 1500
+    assert tally.of("/wheels", Oddity.REBASED) == 700 + ends
+    assert tally.of("/wheels", Oddity.OUTLIER) == 0
+    assert max(abs(m.stamp_ns - m.true_ns) for m in marks) <= 2 * S // 50  # what came at once may have been measured two periods apart
+
+
+@pytest.mark.parametrize("batch", [S // 5, S, 4 * S, 60 * S])
+def test_a_clock_that_is_set_is_seen_in_a_log_written_in_batches(batch: int) -> None:
+    """All of a batch bears one time of recording, when it was written."""
+    items = []
+    for i in range(3000):
+        t = START + i * S // 50
+        items.append(mark("/wheels", t, t - (t - START) % batch + batch, t + (HOUR if i >= 1525 else 0)))
+    marks, tally = run(items)
+    check_order(marks)
+    assert len(marks) + tally.of("/wheels", Oddity.REPEATED) == 3000
+    assert tally.of("/wheels", Oddity.REBASED) == 1475
+    assert max(abs(m.stamp_ns - m.true_ns) for m in marks) <= 2 * S // 50  # what came at once may have been measured two periods apart
+
+
+def test_a_driver_that_pauses_is_no_jump() -> None:
+    items = [i for i in ticks("/scan", 60, 10) if not START + 20 * S < i.stamp_ns < START + 45 * S]
+    marks, tally = run([*items, *ticks("/wheels", 60, 50)])
+    assert len(marks) == len(items) + 3000
+    assert tally.sentences() == []
+
+
+@pytest.mark.parametrize("jump", [HOUR, -HOUR, 5 * S, -5 * S, 10 * 365 * 24 * HOUR])
+def test_a_clock_that_is_set_is_set_back(jump: int) -> None:
+    """From 10 s on the scanner's clock is off; its scans stay where they were measured, to the jitter of the latency."""
+    rng = np.random.default_rng(2)
+    scans = [
+        mark("/scan", t, t + 30 * MS + int(rng.uniform(0, 20) * MS), t + (jump if i >= 100 else 0))
+        for i, t in ((i, START + i * S // 10) for i in range(300))
+    ]
+    marks, tally = run([*ticks("/wheels", 30, 50), *scans])
+    check_order(marks)
+    found = [m for m in marks if m.topic == "/scan"]
+    assert len(found) == 300
+    assert max(abs(m.stamp_ns - m.true_ns) for m in found) <= 25 * MS
+    steps = np.diff([m.stamp_ns for m in found[100:]])
+    assert (steps == S // 10).all()  # after the jump it is one shift for all
+    assert tally.of("/scan", Oddity.REBASED) == 200
+    assert tally.of("/scan", Oddity.OUTLIER) == 0
+
+
+def test_topics_that_jump_together_stay_together() -> None:
+    """A computer's clock is set: all its topics jump by the same amount, and are set back by exactly the same."""
+    rng = np.random.default_rng(3)
+    items = [
+        mark(topic, t, t + int(rng.uniform(1, 60) * MS), t + (HOUR if t > START + 5 * S else 0))
+        for topic, rate in (("/wheels", 50), ("/scan", 10))
+        for t in (START + i * S // rate for i in range(20 * rate))
+    ]
+    marks, _ = run(items)
+    check_order(marks)
+    assert len(marks) == 1200
+    for topic in ("/wheels", "/scan"):
+        shifts = {m.stamp_ns - m.true_ns for m in marks if m.topic == topic and m.true_ns > START + 6 * S}
+        assert len(shifts) == 1
+    assert len({m.stamp_ns - m.true_ns for m in marks if m.true_ns > START + 6 * S}) == 1
+
+
+def test_a_jump_there_and_back_ends_at_the_true_stamps() -> None:
+    items = [mark("/scan", t, t + 20 * MS, t + (HOUR if 100 <= i < 200 else 0)) for i, t in ((i, START + i * S // 10) for i in range(300))]
+    marks, tally = run([*ticks("/wheels", 30, 50), *items])
+    check_order(marks)
+    assert all(m.stamp_ns == m.true_ns for m in marks)
+    assert len(marks) == 1800
+    assert tally.of("/scan", Oddity.REBASED) == 100
+
+
+def test_lone_wild_stamps_are_dropped_and_counted() -> None:
+    wild = {50: HOUR, 51: -HOUR, 120: 10 * S, 121: 10 * S, 200: -7 * S}
+    items = [mark("/scan", t, t + 20 * MS, t + wild.get(i, 0)) for i, t in ((i, START + i * S // 10) for i in range(300))]
+    marks, tally = run([*ticks("/wheels", 30, 50), *items])
+    check_order(marks)
+    assert len(marks) == 1500 + 295
+    assert all(m.stamp_ns == m.true_ns for m in marks)
+    assert tally.of("/scan", Oddity.OUTLIER) == 5
+    assert tally.sentences() == ["/scan: 5 messages dropped (stamp that fits neither its neighbours nor the time of recording)."]
+
+
+def test_a_wild_first_stamp_does_not_move_the_others() -> None:
+    items = [mark("/scan", t, t + 20 * MS, t + (HOUR if i == 0 else 0)) for i, t in ((i, START + i * S // 10) for i in range(100))]
+    marks, _ = run([*ticks("/wheels", 10, 50), *items])
+    check_order(marks)
+    assert len(marks) == 600
+    assert all(m.stamp_ns == m.true_ns for m in marks if m.true_ns > START)
+
+
+def test_stamps_that_repeat_are_dropped_and_counted() -> None:
+    items = ticks("/scan", 10, 10)
+    again = [mark("/scan", i.stamp_ns, i.log_ns + 3 * MS) for i in items[::4]]
+    marks, tally = run([*items, *again, *ticks("/wheels", 10, 50)])
+    check_order(marks)
+    assert len(marks) == 600
+    assert tally.of("/scan", Oddity.REPEATED) == 25
+
+
+def test_a_clock_that_stands_still_gives_one_event() -> None:
+    marks, tally = run([mark("/scan", START, START + i * S // 10) for i in range(100)])
+    assert len(marks) == 1
+    assert tally.of("/scan", Oddity.REPEATED) == 99
+
+
+def test_stamps_that_go_backwards_a_little_are_sorted() -> None:
+    items = ticks("/scan", 10, 10)
+    swapped = [mark("/scan", items[i ^ 1].stamp_ns, items[i].log_ns) for i in range(100)]
+    marks, tally = run(swapped)
+    check_order(marks)
+    assert len(marks) == 100
+    assert tally.of("/scan", Oddity.OUT_OF_ORDER) == 50
+
+
+def test_a_message_that_is_far_too_late_is_dropped_and_counted() -> None:
+    items = ticks("/wheels", 20, 50)
+    late = mark("/wheels", START + 5 * S + 1, START + 5 * S + 950 * MS)
+    # In time: within a second. Too late: trusted, for its neighbour is near, but all others are gone by.
+    marks, tally = run([*items, late])
+    assert len(marks) == 1001
+    too_late = [mark("/slow", START + i * S // 2, START + i * S // 2 + (10 * MS if i != 20 else 3 * S)) for i in range(40)]
+    marks, tally = run([*items, *too_late])
+    check_order(marks)
+    assert tally.of("/slow", Oddity.LATE) + tally.of("/slow", Oddity.OUTLIER) == 1
+    assert len(marks) == 1039
+
+
+def test_zero_stamps_are_replaced_by_the_time_of_recording() -> None:
+    marks, tally = run([*ticks("/wheels", 5, 50), *(mark("/cg", START + i * S, START + i * S + MS, 0) for i in range(5))])
+    check_order(marks)
+    assert [m.stamp_ns for m in marks if m.topic == "/cg"] == [START + i * S + MS for i in range(5)]
+    assert tally.of("/cg", Oddity.NO_STAMP) == 5
+
+
+def test_zero_stamps_in_a_log_of_a_replay_join_the_others_clock() -> None:
+    """A log recorded while an old one was played: headers of years ago, and one topic without any."""
+    old = START - 3 * 365 * 24 * HOUR
+    wheels = [mark("/wheels", old + i * S // 50, START + i * S // 50) for i in range(250)]
+    marks, _ = run([*wheels, *(mark("/cg", old + i * S, START + i * S, 0) for i in range(5))])
+    check_order(marks)
+    assert len(marks) == 255
+    assert all(m.stamp_ns == m.true_ns for m in marks)
+
+
+def test_a_topic_with_a_clock_of_its_own_is_moved_onto_the_common_one() -> None:
+    """A LiDAR without time synchronisation stamps by its uptime."""
+    lidar = [mark("/points", t, t + 50 * MS, t - START + 100 * S) for t in (START + i * S // 10 for i in range(100))]
+    marks, tally = run([*ticks("/wheels", 10, 50), *lidar])
+    check_order(marks)
+    assert len(marks) == 600
+    assert max(abs(m.stamp_ns - m.true_ns) for m in marks) <= 60 * MS
+    assert tally.of("/points", Oddity.FOREIGN_CLOCK) == 100
+
+
+def test_headers_that_are_all_of_another_time_are_kept() -> None:
+    old = START - 5 * HOUR
+    items = [
+        mark(topic, old + i * S // rate, START + i * S // rate + latency)
+        for topic, rate, latency in (("/wheels", 50, MS), ("/scan", 10, 40 * MS))
+        for i in range(5 * rate)
+    ]
+    marks, tally = run(items)
+    check_order(marks)
+    assert all(m.stamp_ns == m.true_ns for m in marks)
+    assert len(marks) == 300
+    assert tally.sentences() == []
+
+
+def test_equal_stamps_come_in_order_of_rank() -> None:
+    items = [Item(START + 9 - rank, START, f"/{rank}", rank, 1, Mark(START, f"/{rank}", START)) for rank in (3, 0, 2, 1)]
+    marks, _ = run(items)
+    assert [m.topic for m in marks] == ["/0", "/1", "/2", "/3"]
+
+
+@pytest.mark.parametrize("case", ["same log time", "same stamp step of 1 ns", "random stamps", "log time runs away"])
+def test_memory_is_bounded_whatever_happens(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("localization.logs.clock_sync._MOST_HELD", 2000)
+    rng = np.random.default_rng(4)
+
+    def items(n: int) -> Iterator[Item]:
+        for i in range(n):
+            t = START + i * MS
+            yield {
+                "same log time": lambda t=t: mark("/a", t, START),
+                "same stamp step of 1 ns": lambda i=i: mark("/a", START + i, START),
+                "random stamps": lambda t=t: mark("/a", t, t, int(rng.integers(1, 2 * START))),
+                "log time runs away": lambda t=t, i=i: mark("/a", t, START + i * 10 * S),
+            }[case]()
+
+    def peak(n: int) -> int:
+        tracemalloc.start()
+        last = 0
+        for event in merge(items(n), plan_clocks({"/a": (START, START)}), Tally()):
+            assert event.stamp_ns >= last
+            last = event.stamp_ns
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return most
+
+    assert peak(12_000) < 1.5 * peak(3_000)
+
+
+stamped = st.tuples(
+    st.sampled_from(["/a", "/b", "/c"]),
+    st.integers(0, 5 * S),
+    st.one_of(st.integers(-S, S), st.integers(-2 * HOUR, 2 * HOUR), st.just(None)),
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(stamped, max_size=60))
+def test_any_stamps_at_all_come_out_in_order_and_are_accounted_for(entries: list[tuple[str, int, int | None]]) -> None:
+    """Nothing is lost silently: what goes in comes out, or is counted."""
+    items = [mark(topic, START + at, START + at, 0 if late is None else START + at - late) for topic, at, late in entries]
+    marks, tally = run(items)
+    check_order(marks)
+    dropped = sum(tally.of(t, o) for t in ("/a", "/b", "/c") for o in (Oddity.REPEATED, Oddity.LATE, Oddity.OUTLIER))
+    assert len(marks) + dropped == len(items)
+
+
+# The same, through a file.
+
+
+def log_of(tmp_path: Path, records: list[Record]) -> Log:
+    ordered = sorted(records, key=lambda record: record[2])
+    return open_log(bags.write_ros1_bag(tmp_path / "run.bag", ordered), ROBOT)
+
+
+def test_scans_of_a_bad_log_are_in_order_and_the_notes_tell_all(tmp_path: Path) -> None:
+    """Backward, repeated, wild and missing stamps in one log, of which the rest is unharmed."""
+    records: list[Record] = []
+    for i in range(300):
+        t = START + i * S // 10
+        records.append(("/joint_states", bags.joint_state(t, position=[0.1 * i] * 4, velocity=[1.0] * 4), t + MS))
+        records.append(("/imu/data", bags.imu(0 if i % 100 == 5 else t), t + 2 * MS))
+        stamp = t + (2 * HOUR if i >= 200 else 0)
+        if i == 50:
+            stamp = t - HOUR
+        if i == 60:
+            stamp = t - S // 10  # repeats the one before
+        records.append(("/scan", bags.laser_scan(stamp), t + 40 * MS))
+    log = log_of(tmp_path, records)
+    events: list[Event] = list(log.events())
+    stamps = [event.stamp_ns for event in events]
+    assert stamps == sorted(stamps)
+    assert sum(isinstance(e, WheelSample) for e in events) == 300
+    assert sum(isinstance(e, ImuSample) for e in events) == 300
+    scans = [e.stamp_ns for e in events if isinstance(e, Scan)]
+    assert scans == [START + i * S // 10 for i in range(300) if i not in (50, 60)]
+    assert log.warnings() == [
+        "/imu/data: 3 messages without a header stamp, placed by the time of recording.",
+        "/scan: 1 message dropped (stamp repeated).",
+        "/scan: 1 message dropped (stamp that fits neither its neighbours nor the time of recording).",
+        "/scan: 100 messages stamped after a jump of the clock, moved back by it.",
+    ]
+    said = " ".join(log.info().problems)
+    assert "/imu/data: 3 of 300 messages have no stamp" in said
+    assert "/scan: 2 of 300 messages are stamped before the one before them" not in said  # the wild one, and that alone
+    assert "/scan: 1 of 300 messages are stamped before the one before them" in said
+
+
+def test_references_are_ordered_by_the_same_rules(tmp_path: Path) -> None:
+    records: list[Record] = [("/scan", bags.laser_scan(START + i * S), START + i * S) for i in range(10)]
+    for i in range(100):
+        t = START + i * S // 10
+        records.append(("/vicon", bags.pose_stamped(t if i < 50 else t + HOUR, 0.1 * i), t + 10 * MS))
+    log = log_of(tmp_path, records)
+    references = list(log.references("/vicon"))
+    assert [r.stamp_ns for r in references] == [START + i * S // 10 for i in range(100)]
+    assert any("/vicon: 50 messages stamped after a jump" in note for note in log.warnings())

@@ -1,0 +1,68 @@
+"""A small, deterministic part of `tests.benchmarks.faults` and of `tests.benchmarks.fuzz`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from localization.errors import LogError
+from localization.logs import open_log
+from motion_models.robot import load_robot
+from tests.helpers import bags, fuzz
+from tests.helpers.hostile_logs import BAD, FILE_FAULTS, SENSOR_FAULTS, SOURCES, Case, cases, run_case, truth_of, write_case
+
+
+@pytest.fixture(scope="module")
+def truths(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("truths")
+
+
+DECIDED_IN_LOGS = (
+    "second publisher of joint states",
+    "LiDAR stamps jump 0.9 s",
+    "LiDAR angle_increment 0",
+    "transform twice",
+    "quaternion of norm 1e-6",
+)
+
+
+@pytest.mark.parametrize("fault", DECIDED_IN_LOGS)
+def test_sensor_fault_decided_in_logs_is_never_silently_wrong(tmp_path: Path, truths: Path, fault: str) -> None:
+    source = SOURCES[0]
+    log = write_case(Case(0, source.name, "mcap", fault, ""), tmp_path, seed=0)
+    outcome = run_case(log, source.robot, truth_of(source.name, truths), tmp_path / "out")
+    assert outcome.kind not in BAD, outcome
+    assert outcome.said != ""
+
+
+@pytest.mark.parametrize("form", bags.FORMATS)
+@pytest.mark.parametrize("fault", FILE_FAULTS)
+def test_damaged_file_of_any_format_is_read_or_refused(tmp_path: Path, form: str, fault: str) -> None:
+    for number in range(2):
+        (tmp_path / str(number)).mkdir()
+        path = write_case(Case(number, "husky", form, "none", fault), tmp_path / str(number), seed=1)
+        try:
+            log = open_log(path, load_robot("husky_a200"))
+            stamps = [event.stamp_ns for event in log.events()]
+            log.info()
+        except LogError:
+            continue
+        assert stamps == sorted(stamps)
+
+
+def test_cases_of_a_seed_are_the_same_and_hold_all_faults() -> None:
+    chosen = cases(300, 0)
+    assert chosen == cases(300, 0) != cases(300, 1)
+    assert {case.sensor_fault for case in chosen} == set(SENSOR_FAULTS)
+    assert {case.file_fault for case in chosen} == {"", *FILE_FAULTS}
+    assert {case.form for case in chosen} == set(bags.FORMATS)
+    assert {case.source for case in chosen} == {source.name for source in SOURCES}
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(form=st.sampled_from(sorted(bags.FORMATS)), changes=fuzz.CHANGES, of_metadata=st.booleans())
+def test_changed_bytes_of_any_log_are_read_or_refused(form: str, changes: list, of_metadata: bool) -> None:
+    fuzz.check(form, changes, of_metadata)

@@ -1,0 +1,204 @@
+"""Faults of sensors that are decided while a log is read: each is survived, or reported with its topic and what to do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from localization.evaluation.references import reference_track
+from localization.events import Scan, WheelSample
+from localization.logs import Log, open_log
+from motion_models.robot import Mount, load_robot
+from tests.helpers import bags
+from tests.helpers.bags import START, Record, S
+from tests.helpers.rooms import drive
+
+ROBOT = load_robot("vaultbot")
+
+
+def said(log: Log) -> str:
+    return " ".join(log.warnings())
+
+
+def opened(folder: Path, records: list[Record]) -> Log:
+    return open_log(bags.write_mcap(folder / "run.mcap", records), ROBOT)
+
+
+# LaserScan's angles
+
+
+@pytest.mark.parametrize("angles", [(0.0, 0.0), (0.0, 1.0), (0.5, -1.0)], ids=["no step", "step from the ends", "degrees"])
+def test_scan_whose_angles_cannot_be_is_dropped_and_reported(tmp_path: Path, angles: tuple[float, float]) -> None:
+    step, last = angles
+
+    def spoil(number, scan, log_ns):
+        scan.angle_increment, scan.angle_max = step, scan.angle_min + last if last >= 0 else scan.angle_max
+        return scan, log_ns
+
+    log = opened(tmp_path, drive(3.0, spoil=spoil))
+    scans = [e for e in log.events() if isinstance(e, Scan)]
+    if last == 1.0:  # the ends tell the step
+        assert len(scans) == 30
+    else:
+        assert scans == []
+        assert "/scan: 30 messages dropped (angle_increment is zero, or makes more than a full turn" in said(log)
+
+
+# /tf_static
+
+
+def turned(x: float, y: float, z: float, w: float):
+    return bags.T["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
+
+
+def with_tf(*edges: tuple) -> list[Record]:
+    records = drive(1.0)
+    return [*(("/tf_static", bags.tf(START, [edge]), START) for edge in edges), *records]
+
+
+HERE, THERE = (0.3, 0.0, 0.2), (-0.3, 0.0, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("edges", "expected"),
+    [
+        ([("base_link", "laser", HERE, bags.quaternion()), ("base_link", "laser", THERE, bags.quaternion())], "two different poses"),
+        ([("base_link", "laser", HERE, bags.quaternion()), ("base_link", "laser", HERE, bags.quaternion(math.pi))], "two different poses"),
+        (
+            [
+                ("base_link", "laser", HERE, bags.quaternion()),
+                ("base_link", "mast", (0.0, 0.0, 1.0), bags.quaternion()),
+                ("mast", "laser", HERE, bags.quaternion()),
+            ],
+            "by way of 'mast' leads to another pose of 'laser'",
+        ),
+        (
+            [("base_link", "laser", HERE, bags.quaternion()), ("laser", "base_link", HERE, bags.quaternion())],
+            "by way of 'laser' leads to another pose of 'base_link'",
+        ),
+        ([("base_link", "laser", HERE, turned(0.0, 0.0, 0.0, 0.0))], "'base_link' to 'laser' was left out: its rotation is no unit"),
+        ([("base_link", "laser", HERE, turned(0.0, 0.0, 1e-6, 0.0))], "'base_link' to 'laser' was left out: its rotation is no unit"),
+        ([("base_link", "laser", HERE, bags.quaternion()), ("laser", "laser", HERE, bags.quaternion())], "cannot be its own parent"),
+    ],
+    ids=["two poses", "two headings", "two parents", "cycle", "zero quaternion", "tiny quaternion", "own parent"],
+)
+def test_static_transforms_that_contradict_are_reported(tmp_path: Path, edges: list, expected: str) -> None:
+    log = opened(tmp_path, with_tf(*edges))
+    assert isinstance(log.mounts, dict)
+    assert expected in said(log)
+
+
+def test_static_transforms_that_agree_are_not_reported(tmp_path: Path) -> None:
+    """The same mount twice, rounded differently; and by two ways, as a robot's model and its own launch file publish it."""
+    edges = [
+        ("base_link", "laser", HERE, bags.quaternion(0.5)),
+        ("base_link", "laser", (0.3001, 0.0, 0.2), bags.quaternion(0.5004)),
+        ("base_link", "mast", (0.0, 0.0, 0.1), bags.quaternion()),
+        ("mast", "laser", (0.3, 0.0, 0.1), bags.quaternion(0.5)),
+    ]
+    log = opened(tmp_path, with_tf(*edges))
+    assert log.mounts["laser"].yaw == pytest.approx(0.5004)
+    assert log.warnings() == []
+
+
+def test_mount_that_the_log_contradicts_is_taken_from_the_robot_file(tmp_path: Path) -> None:
+    frame = "laser"
+    robot = load_robot("vaultbot")
+    robot = type(robot)(**{**{f: getattr(robot, f) for f in robot.__dataclass_fields__}, "mounts": {frame: Mount(x=0.7)}})
+    edges = [("base_link", frame, HERE, bags.quaternion()), ("base_link", frame, THERE, bags.quaternion())]
+    log = open_log(bags.write_mcap(tmp_path / "run.mcap", with_tf(*edges)), robot)
+    assert log.mounts[frame] == Mount(x=0.7)
+    assert "contradicts itself" in said(log)
+
+
+@pytest.mark.parametrize("norm", [0.0, 1e-6])
+def test_reference_with_quaternions_of_no_length_is_reported(tmp_path: Path, norm: float) -> None:
+    records = []
+    for i in range(20):
+        message = bags.pose_stamped(START + i * S // 10, x=0.1 * i, yaw=0.5)
+        if i % 2:
+            message.pose.orientation = turned(0.0, 0.0, norm * math.sin(1.0), norm * math.cos(1.0))
+        records.append(("/pose", message, START + i * S // 10))
+    log = opened(tmp_path, records)
+    track = reference_track(log.references("/pose"), "/pose")
+    assert track.yaws == pytest.approx(np.full(10, 0.5))
+    assert "/pose: 10 messages dropped" in said(log)
+
+
+# two publishers of one topic
+
+
+def wheels_of(log: Log) -> list[WheelSample]:
+    return [e for e in log.events() if isinstance(e, WheelSample)]
+
+
+@pytest.mark.parametrize("offset_ms", [3, 10, 17])
+@pytest.mark.parametrize("rate", [10, 50])
+def test_second_publisher_of_zeros_costs_no_distance(tmp_path: Path, offset_ms: int, rate: int) -> None:
+    """As `joint_state_publisher` does. The drive is 8 m long."""
+
+    def records() -> Iterator[Record]:
+        for topic, message, stamp in drive(20.0):
+            yield topic, message, stamp
+            if topic == "/joint_states" and (stamp - START) * rate // S != (stamp - START - S // 50) * rate // S:
+                later = stamp + offset_ms * 1_000_000
+                yield topic, bags.joint_state(later, position=(0.0,) * 4, velocity=(0.0,) * 4), later
+
+    honest = wheels_of(opened(tmp_path, drive(20.0)))
+    (tmp_path / "run.mcap").unlink()
+    log = opened(tmp_path, sorted(records(), key=lambda record: record[2]))
+    found = wheels_of(log)
+    np.testing.assert_allclose(found[-1].position, honest[-1].position, atol=2.0)  # of 40 to 60 rad; 0.25 m are not told apart at first
+    assert "of a second publisher whose wheels turn less, left out" in said(log)
+
+
+def test_encoder_that_is_reset_is_no_second_publisher(tmp_path: Path) -> None:
+    records = drive(20.0)
+    for i, (topic, message, _) in enumerate(records):
+        if topic == "/joint_states" and i > len(records) // 2:
+            message.position = message.position - 30.0
+    log = opened(tmp_path, records)
+    assert len(wheels_of(log)) == 1000
+    assert "second publisher" not in said(log)
+    assert "/joint_states: 1 message with a wheel angle that wheels cannot reach" in said(log)
+
+
+# LiDAR stamps that jump by less than the second that latencies may have
+
+
+@pytest.mark.parametrize("jump_s", [0.9, -0.9, 0.5, -0.5])
+def test_lidar_clock_that_jumps_by_less_than_a_second_is_set_back(tmp_path: Path, jump_s: float) -> None:
+    shift = round(jump_s * S)
+
+    def spoil(number, scan, log_ns):
+        if number >= 100:
+            stamp = log_ns + shift
+            scan.header.stamp.sec, scan.header.stamp.nanosec = stamp // S, stamp % S
+        return scan, log_ns + 20_000_000 + (number % 3) * 4_000_000
+
+    log = opened(tmp_path, sorted(drive(20.0, spoil=spoil), key=lambda record: record[2]))
+    stamps = [e.stamp_ns for e in log.events() if isinstance(e, Scan)]
+    assert len(stamps) >= 198
+    wrong = [abs(stamp - START - round((stamp - START) / (S / 10)) * S // 10) for stamp in stamps]
+    assert max(wrong) <= 0.02 * S
+    assert stamps[-1] == pytest.approx(START + 19.9 * S, abs=0.02 * S)
+    assert "stamped after a jump of the clock, moved back by it" in said(log)
+
+
+@pytest.mark.parametrize("jump_s", [0.9, -0.9])
+def test_lone_scans_stamped_wrongly_by_less_than_a_second_are_dropped(tmp_path: Path, jump_s: float) -> None:
+    def spoil(number, scan, log_ns):
+        if number > 30 and number % 10 == 0:
+            stamp = log_ns + round(jump_s * S)
+            scan.header.stamp.sec, scan.header.stamp.nanosec = stamp // S, stamp % S + 1
+        return scan, log_ns + 20_000_000
+
+    log = opened(tmp_path, sorted(drive(20.0, spoil=spoil), key=lambda record: record[2]))
+    stamps = [e.stamp_ns for e in log.events() if isinstance(e, Scan)]
+    assert all((stamp - START) % (S // 10) == 0 for stamp in stamps)
+    assert len(stamps) == 200 - 16
+    assert "/scan: 16 messages dropped (stamp that fits neither" in said(log)

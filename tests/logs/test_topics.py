@@ -1,0 +1,209 @@
+"""Which topic plays which part, and what is said when one is missing."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from localization.errors import TopicError
+from localization.events import Scan, WheelSample
+from localization.logs import Log, TopicOverrides, open_log
+from motion_models.robot import Joints, Topics, load_robot
+from tests.helpers import bags
+from tests.helpers.bags import START, Record, S
+
+ROBOT = load_robot("vaultbot")
+POINTS = np.array([(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)], dtype=[("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+ARM = ("shoulder_pan_joint", "elbow_joint")
+
+
+def make(stamp: int, kind: str) -> object:
+    i = (stamp - START) // (S // 10)
+    return {
+        "joints": lambda: bags.joint_state(stamp, position=[0.1 * i] * 4, velocity=[1.0] * 4),
+        "arm": lambda: bags.joint_state(stamp, ARM, [0.0, 0.0], [0.0, 0.0]),
+        "odom": lambda: bags.odometry(stamp, x=0.05 * i, vx=0.5),
+        "scan": lambda: bags.laser_scan(stamp),
+        "points": lambda: bags.cloud(stamp, POINTS),
+        "imu": lambda: bags.imu(stamp),
+        "pose": lambda: bags.pose_stamped(stamp),
+    }[kind]()
+
+
+def log_of(tmp_path: Path, topics: dict[str, str], overrides: TopicOverrides = TopicOverrides(), robot: object = ROBOT) -> Log:  # noqa: B008
+    """A log of two seconds with these topics, each of this kind."""
+    records: list[Record] = []
+    for i in range(20):
+        stamp = START + i * S // 10
+        records += [(topic, make(stamp, kind), stamp) for topic, kind in topics.items()]
+    return open_log(bags.write_mcap(tmp_path / "run.mcap", records), robot, overrides)  # type: ignore[arg-type]
+
+
+def parts(log: Log) -> dict[str, tuple[str, str] | None]:
+    s = log.sources
+    return {
+        name: None if source is None else (source.topic, source.chosen_by)
+        for name, source in (("wheels", s.wheels), ("lidar", s.lidar), ("imu", s.imu), ("cg", s.center_of_gravity))
+    }
+
+
+def test_the_robot_files_topics_are_used(tmp_path: Path) -> None:
+    log = log_of(
+        tmp_path, {"/joint_states": "joints", "/odom": "odom", "/scan": "scan", "/points": "points", "/imu/data": "imu", "/b": "imu"}
+    )
+    assert parts(log) == {
+        "wheels": ("/joint_states", "robot"),
+        "lidar": ("/scan", "robot"),
+        "imu": ("/imu/data", "robot"),
+        "cg": None,
+    }
+    assert log.warnings() == []
+
+
+def test_an_option_goes_before_the_robot_file(tmp_path: Path) -> None:
+    topics = {"/joint_states": "joints", "/odom": "odom", "/scan": "scan", "/points": "points", "/imu/data": "imu", "/b": "imu"}
+    log = log_of(tmp_path, topics, TopicOverrides(odometry="/odom", points="/points", imu="/b"))
+    assert parts(log) == {"wheels": ("/odom", "option"), "lidar": ("/points", "option"), "imu": ("/b", "option"), "cg": None}
+
+
+def test_the_only_topic_of_a_type_is_used_and_noted(tmp_path: Path) -> None:
+    log = log_of(tmp_path, {"/husky/joints": "joints", "/velodyne": "points", "/microstrain": "imu"})
+    assert parts(log) == {"wheels": ("/husky/joints", "only"), "lidar": ("/velodyne", "only"), "imu": ("/microstrain", "only"), "cg": None}
+    for topic in ("/husky/joints", "/velodyne", "/microstrain"):
+        assert any(topic in note and "only topic of its type" in note for note in log.warnings())
+
+
+def test_two_candidates_are_not_guessed_between(tmp_path: Path) -> None:
+    log = log_of(tmp_path, {"/joint_states": "joints", "/front": "scan", "/rear": "scan"})
+    assert log.sources.lidar is None
+    assert any("/front, /rear" in note and "--topic.scan" in note for note in log.warnings())
+
+
+def test_the_reference_is_not_taken_for_the_wheels(tmp_path: Path) -> None:
+    log = log_of(tmp_path, {"/ground_truth/odom": "odom", "/scan": "scan"})
+    assert log.sources.wheels is None
+    assert [type(e) for e in log.events()] == [Scan] * 20
+
+
+def test_a_topic_of_the_robot_file_with_another_type_is_passed_over(tmp_path: Path) -> None:
+    log = log_of(tmp_path, {"/joint_states": "joints", "/scan": "points"})
+    assert parts(log)["lidar"] == ("/scan", "only")
+    assert log.sources.lidar is not None
+    assert log.sources.lidar.kind == "points"
+
+
+def test_a_missing_topic_is_named_with_those_that_fit(tmp_path: Path) -> None:
+    with pytest.raises(TopicError, match=r"no topic '/points' in run\.mcap.*PointCloud2 in it: /ouster/points.*--topic\.points"):
+        log_of(tmp_path, {"/joint_states": "joints", "/ouster/points": "points"}, TopicOverrides(points="/points"))
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_topic_without_messages_plays_no_part(tmp_path: Path, storage: str) -> None:
+    """Recorders list the topics that they subscribed to, whether anything came or not."""
+    from rosbags import rosbag2
+
+    with rosbag2.Writer(tmp_path / "run", version=9, storage_plugin=rosbag2.StoragePlugin[storage.upper()]) as writer:
+        writer.add_connection("/scan", "sensor_msgs/msg/LaserScan", typestore=bags.STORE)
+        points = writer.add_connection("/points", "sensor_msgs/msg/PointCloud2", typestore=bags.STORE)
+        for i in range(5):
+            writer.write(points, START + i * S, bags.STORE.serialize_cdr(bags.cloud(START + i * S, POINTS), "sensor_msgs/msg/PointCloud2"))
+    log = open_log(tmp_path / "run", ROBOT)
+    assert parts(log)["lidar"] == ("/points", "robot")
+    assert len(list(log.events())) == 5
+    with pytest.raises(TopicError, match=r"topic '/scan' of run has no messages.*no topic of type sensor_msgs/LaserScan"):
+        open_log(tmp_path / "run", ROBOT, TopicOverrides(scan="/scan"))
+
+
+def test_two_topics_with_the_wheel_joints_are_not_guessed_between(tmp_path: Path) -> None:
+    log = log_of(tmp_path, {"/a/joints": "joints", "/b/joints": "joints", "/odom": "odom"})
+    assert parts(log)["wheels"] == ("/odom", "robot")
+    assert any("/a/joints, /b/joints" in note for note in log.warnings())
+
+
+def test_a_topic_of_the_wrong_type_says_so(tmp_path: Path) -> None:
+    with pytest.raises(
+        TopicError, match=r"'/pose' in run\.mcap carries geometry_msgs/PoseStamped, not sensor_msgs/Imu.*no topic of type.*--topic\.imu"
+    ):
+        log_of(tmp_path, {"/joint_states": "joints", "/pose": "pose"}, TopicOverrides(imu="/pose"))
+
+
+@pytest.mark.parametrize("field", [f.name for f in dataclasses.fields(TopicOverrides) if f.name != "reference"])
+def test_every_override_is_checked(tmp_path: Path, field: str) -> None:
+    with pytest.raises(TopicError, match="--topic." + field.replace("_", "-")):
+        log_of(tmp_path, {"/a": "pose"}, TopicOverrides(**{field: "/a"}))
+
+
+def test_overrides_have_the_fields_of_the_robot_file() -> None:
+    assert [f.name for f in dataclasses.fields(TopicOverrides)] == [f.name for f in dataclasses.fields(Topics)]
+
+
+def test_an_empty_option_leaves_a_part_out(tmp_path: Path) -> None:
+    topics = {"/joint_states": "joints", "/odom": "odom", "/scan": "scan", "/imu/data": "imu"}
+    log = log_of(tmp_path, topics, TopicOverrides(joint_states="", imu=""))
+    assert parts(log) == {"wheels": ("/odom", "robot"), "lidar": ("/scan", "robot"), "imu": None, "cg": None}
+
+
+def test_joint_states_of_an_arm_give_way_to_odometry(tmp_path: Path) -> None:
+    log = log_of(tmp_path, {"/joint_states": "arm", "/odom": "odom"})
+    assert parts(log)["wheels"] == ("/odom", "robot")
+    assert any("shoulder_pan_joint" in note and "/odom" in note for note in log.warnings())
+
+
+def test_unknown_joints_without_odometry_are_listed_when_wheels_are_asked_for(tmp_path: Path) -> None:
+    log = log_of(tmp_path, {"/joint_states": "arm", "/scan": "scan"})
+    with pytest.raises(TopicError, match=r"front_left_wheel.*elbow_joint, shoulder_pan_joint.*\[joints\]"):
+        log.events()
+    assert any("elbow_joint" in problem for problem in log.info().problems)
+    (tmp_path / "again").mkdir()
+    without = log_of(tmp_path / "again", {"/joint_states": "arm", "/scan": "scan"}, TopicOverrides(joint_states=""))
+    assert len(list(without.events())) == 20
+
+
+def test_unknown_joints_in_an_option_are_refused_at_once(tmp_path: Path) -> None:
+    with pytest.raises(TopicError, match="elbow_joint"):
+        log_of(tmp_path, {"/arm": "arm", "/odom": "odom"}, TopicOverrides(joint_states="/arm"))
+
+
+def test_arms_and_wheels_that_share_a_topic_are_told_apart(tmp_path: Path) -> None:
+    records: list[Record] = []
+    for i in range(20):
+        stamp = START + i * S // 10
+        records += [("/joint_states", make(stamp, "arm"), stamp), ("/joint_states", make(stamp, "joints"), stamp + 1000)]
+    log = open_log(bags.write_mcap(tmp_path / "run.mcap", records), dataclasses.replace(ROBOT, arms=None))
+    wheels = list(log.events())
+    assert len(wheels) == 20
+    assert all(isinstance(w, WheelSample) and (w.velocity == 1.0).all() for w in wheels)
+    assert log.warnings() == []
+
+
+def test_a_side_is_the_mean_of_those_of_its_joints_that_the_log_has(tmp_path: Path) -> None:
+    robot = dataclasses.replace(ROBOT, joints=Joints(("front_left_wheel", "lost_left"), ("front_right_wheel", "rear_right_wheel")))
+    records = [
+        ("/joint_states", bags.joint_state(START + i * S, position=[0.1 * i, 0.2 * i, 9.0, 0.4 * i], velocity=[1, 2, 9, 4]), START + i * S)
+        for i in range(3)
+    ]
+    log = open_log(bags.write_mcap(tmp_path / "run.mcap", records), robot)
+    last = list(log.events())[-1]
+    assert isinstance(last, WheelSample)
+    np.testing.assert_allclose(last.velocity, [1.0, 3.0])
+    np.testing.assert_allclose(last.position, [0.2, 0.6])
+    assert any("lost_left" in note for note in log.warnings())
+
+
+def test_a_log_without_lidar_or_without_wheels_opens(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    assert len(list(log_of(tmp_path / "a", {"/scan": "scan"}).events())) == 20
+    assert len(list(log_of(tmp_path / "b", {"/odom": "odom"}).events())) == 20
+
+
+def test_reference_topics_are_checked(tmp_path: Path) -> None:
+    log = log_of(tmp_path, {"/joint_states": "joints", "/vicon": "pose"})
+    with pytest.raises(TopicError, match=r"no topic '/fix'.*/vicon.*--reference"):
+        log.references("/fix")
+    with pytest.raises(TopicError, match=r"'/joint_states'.*carries sensor_msgs/JointState"):
+        log.references("/joint_states")
+    assert len(list(log.references("/vicon"))) == 20

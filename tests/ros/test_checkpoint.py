@@ -1,0 +1,311 @@
+"""A state on disk: cut anywhere and resumed, elsewhere too, the results are the same to the last bit; no other file is taken for one."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from localization.errors import DumpError
+from localization.estimators import CORRECTING, ESTIMATORS
+from localization.events import WheelSample
+from localization.lidar import LidarConfig
+from localization.lidar.scan_matcher import ScanMatcher
+from localization.pipeline import Pipeline, ReplayConfig, Trial
+from localization.ros.checkpoint import Dumper, fingerprints, read_dump, read_head, write_dump
+from localization.ros.deserialize import thaw
+from localization.ros.serialize import freeze
+from localization.synchronizer import StepConfig
+from motion_models.registry import make_model
+from motion_models.robot import Mount, load_robot
+from tests.helpers.online import ROBOT, drive_events, new_core, numbers, reseal
+
+KINDS = [(name, "skid_steer", "cg_field" if name in CORRECTING else "none") for name in ESTIMATORS]
+AHEAD = 300  # events after a cut that are compared: some 30 scans
+
+
+@pytest.mark.parametrize("kind", KINDS, ids="-".join)
+def test_cut_anywhere_and_resumed_the_results_are_the_same_to_the_last_bit(kind):
+    events, _ = drive_events()
+    cuts = {0, 1, 2, 60, *np.random.default_rng(3).integers(3, len(events), 9).tolist(), len(events)}
+    pipeline, whole, states, made = new_core(*kind), [], {}, []
+    for i in range(len(events) + 1):
+        if i in cuts:
+            states[i] = freeze(pipeline)
+        made.append(len(whole))
+        whole += map(numbers, pipeline.process(events[i]) if i < len(events) else pipeline.finish())
+    for cut, state in states.items():
+        resumed, found = thaw(*state), []
+        end = min(cut + AHEAD, len(events))
+        for event in events[cut:end]:
+            found += map(numbers, resumed.process(event))
+        if end == len(events):
+            found += map(numbers, resumed.finish())
+            assert dict(resumed.estimator.parameters()) == dict(pipeline.estimator.parameters())
+            assert dict(resumed.estimator.counts()) == dict(pipeline.estimator.counts())
+            assert resumed.synchronizer.warnings() == pipeline.synchronizer.warnings()
+            a, b = resumed.estimator.map_points(), pipeline.estimator.map_points()
+            assert np.array_equal(a[np.lexsort(a.T)], b[np.lexsort(b.T)])
+        expected = whole[made[cut] : made[end] if end < len(events) else len(whole)]
+        assert found == expected, cut
+    assert len(whole) > 200
+
+
+@pytest.mark.parametrize("estimator", [name for name in ESTIMATORS if name != "odometry"])
+def test_places_that_are_told_late_reach_whoever_was_resumed(estimator):
+    """Frames are unknown to all parts of a pipeline until one moment: cut shortly before, or not."""
+    events, mounts = drive_events()
+    cut, met = 1000, 1100
+    pipeline = Pipeline(Trial(make_model("skid_steer", ROBOT), estimator), ROBOT, {}, has_lidar=True)
+    before = [numbers(e) for event in events[:cut] for e in pipeline.process(event)]
+    resumed = thaw(*freeze(pipeline))
+    found = []
+    for goes_on in (pipeline, resumed):
+        rest = [numbers(e) for event in events[cut:met] for e in goes_on.process(event)]
+        assert goes_on.add_mounts(mounts)
+        assert not goes_on.add_mounts({"laser": Mount(x=9.0)})  # a frame that has its place keeps it
+        rest += [numbers(e) for event in events[met : met + AHEAD] for e in goes_on.process(event)]
+        found.append(rest)
+        assert goes_on.synchronizer.frames.lack is None
+        assert "/tf_static was late" in goes_on.synchronizer.warnings()[-1]
+    assert found[0] == found[1]
+    assert len(before) > 50
+
+
+_RESUME = """
+import hashlib, sys
+from pathlib import Path
+from localization.ros.checkpoint import read_dump
+from tests.helpers.online import drive_events, numbers, new_core
+pipeline = read_dump(Path(sys.argv[1]), {}, {}).value
+events, _ = drive_events()
+found = [numbers(e) for event in events[int(sys.argv[2]):] for e in pipeline.process(event)]
+print(len(found), hashlib.sha256(repr(found).encode()).hexdigest())
+"""
+
+
+def test_another_process_resumes_it(tmp_path):
+    events, _ = drive_events()
+    cut, pipeline = 1500, new_core("ekf")
+    for event in events[:cut]:
+        pipeline.process(event)
+    write_dump(tmp_path / "state", pipeline, {"events": cut}, {}, {})
+    rest = [numbers(e) for event in events[cut:] for e in pipeline.process(event)]
+    said = subprocess.run([sys.executable, "-c", _RESUME, tmp_path / "state", str(cut)], check=True, capture_output=True, text=True).stdout
+    assert said.split() == [str(len(rest)), hashlib.sha256(repr(rest).encode()).hexdigest()]
+
+
+def test_a_list_of_many_alike_is_written_down_as_columns():
+    """One by one, each with names and shapes of its own, they would take seconds and megabytes of text."""
+    rng = np.random.default_rng(0)
+    samples = [WheelSample(i, rng.normal(size=2), rng.normal(size=2)) for i in range(20_000)]
+    text, blob = freeze(samples)
+    again = thaw(text, blob)
+    assert len(text) < 1000
+    assert all(a.stamp_ns == b.stamp_ns for a, b in zip(again, samples, strict=True))
+    assert all(np.array_equal(a.velocity, b.velocity) for a, b in zip(again, samples, strict=True))
+    assert all(np.array_equal(a.position, b.position) for a, b in zip(again, samples, strict=True))
+    assert again[0].position.base is None
+
+
+scalars = st.none() | st.booleans() | st.integers(-(2**70), 2**70) | st.floats() | st.text(max_size=5)
+values = st.recursive(
+    scalars, lambda inner: st.lists(inner, max_size=12) | st.tuples(inner, inner) | st.dictionaries(st.text(max_size=3), inner, max_size=3)
+)
+
+
+@given(values)
+@settings(max_examples=60, deadline=None)
+def test_plain_values_come_back_as_they_were(value):
+    assert repr(thaw(*freeze(value))) == repr(value)
+
+
+def test_what_is_held_twice_stays_one_and_views_stay_views():
+    base = np.arange(24.0).reshape(4, 6).copy()
+    a, b, view, turned = thaw(*freeze([base, base, base[1:, ::2], np.asfortranarray(base)]))
+    assert a is b
+    assert view.base is not None
+    view[0, 0] = 99.0
+    assert a[1, 0] == 99.0
+    assert turned.flags.f_contiguous
+    assert not turned.flags.c_contiguous
+
+
+@pytest.mark.parametrize("strange", [print, object(), {1, 2}, np.array([object()]), sys])
+def test_what_cannot_be_written_down_is_named(strange):
+    with pytest.raises(DumpError, match="holds a"):
+        freeze([strange])
+
+
+@pytest.fixture
+def state(tmp_path):
+    path = tmp_path / "state"
+    write_dump(path, new_core("ekf"), {"events": 0}, made_by(), {})
+    return path
+
+
+def made_by(robot=ROBOT, model="skid_steer", config=None):
+    return fingerprints(robot=robot, model=make_model(model, robot), estimator="ekf", configuration=config or ReplayConfig())
+
+
+def test_damage_anywhere_is_noticed(state):
+    content = bytearray(state.read_bytes())
+    rng = np.random.default_rng(1)
+    for at in [0, 8, 20, 90, 200, len(content) - 1, *rng.integers(0, len(content), 30)]:
+        damaged = bytearray(content)
+        damaged[at] ^= 0x20
+        state.write_bytes(damaged)
+        with pytest.raises(DumpError, match=r"damaged|no state of an estimator|another version"):
+            read_dump(state, made_by(), {})
+    for length in (0, 5, 16, 50, len(content) // 2, len(content) - 1):
+        state.write_bytes(content[:length])
+        with pytest.raises(DumpError, match=r"damaged|no state of an estimator"):
+            read_dump(state, made_by(), {})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("events", -1),
+        ("events", "x"),
+        ("events", 10**30),
+        ("records", -5),
+        ("records", 1.5),
+        ("made_by", None),
+        ("made_by", []),
+        ("state_bytes", -1),
+        ("state_bytes", 10**9),
+        ("state_bytes", None),
+        ("stamp_ns", "now"),
+        ("stamp_ns", 10**400),
+        ("topics", "/scan"),
+        ("topics", [1]),
+    ],
+)
+def test_an_odd_head_is_refused_though_its_check_sum_is_right(state, name, value):
+    reseal(state, name, value)
+    for read in (read_head, lambda path: read_dump(path, made_by(), {})):
+        with pytest.raises(DumpError, match="no readable head"):
+            read(state)
+
+
+def test_foreign_files_are_refused_and_run_no_code(tmp_path):
+    path, trap = tmp_path / "x", tmp_path / "trap"
+
+    class Trap:
+        def __reduce__(self):
+            return os.mkdir, (str(trap),)
+
+    for content in (pickle.dumps(Trap()), b"PK\3\4", b"", b"{}", os.urandom(1000)):
+        path.write_bytes(content)
+        with pytest.raises(DumpError, match="no state of an estimator"):
+            read_dump(path, {}, {})
+    assert not trap.exists()
+    with pytest.raises(DumpError, match="No such file"):
+        read_dump(tmp_path / "absent", {}, {})
+    path.write_bytes(b"skidloc state 9\nabc\n")
+    with pytest.raises(DumpError, match="another version of its format"):
+        read_head(path)
+
+
+@pytest.mark.parametrize(
+    "kind", [["c", "os", "system", {}], ["c", "subprocess", "Popen", {}], ["c", "localization.pipeline", "Nobody", {}]]
+)
+def test_only_classes_of_this_project_are_made(kind):
+    text = json.dumps({"root": ["o", 0], "objects": [kind], "arrays": []}).encode()
+    with pytest.raises(DumpError, match="does not have"):
+        thaw(text, b"")
+    packed = ["p", "objects", kind[1], kind[2], ["a"], ["int", 0]]
+    text = json.dumps({"root": ["o", 0], "objects": [packed], "arrays": [["<i8", [1], "C", 0]]}).encode()
+    with pytest.raises(DumpError, match="does not have"):
+        thaw(text, bytes(8))
+
+
+@given(st.binary(max_size=60), st.binary(max_size=20))
+def test_bytes_that_mean_nothing_are_refused_whatever_they_are(text, blob):
+    with pytest.raises(DumpError):
+        thaw(text, blob)
+
+
+def test_the_state_of_another_robot_model_or_configuration_is_refused(state):
+    assert isinstance(read_dump(state, made_by(), {}).value, Pipeline)
+    heavier = dataclasses.replace(ROBOT, geometry=dataclasses.replace(ROBOT.geometry, mass_kg=120.0))
+    for other, told in [
+        (made_by(load_robot("husky_a200")), r"another .*robot \('vaultbot' \w+ then, 'husky_a200' \w+ now\)"),
+        (made_by(heavier), "another robot"),
+        (made_by(model="diff_drive"), "another model"),
+        (made_by(config=ReplayConfig(step=StepConfig(wait_s=0.2))), "another configuration"),
+        ({**made_by(), "version of numpy": "1.0"}, "another version of numpy"),
+    ]:
+        with pytest.raises(DumpError, match=told):
+            read_dump(state, other, {})
+    moved = dataclasses.replace(ROBOT, folder=state.parent)
+    assert isinstance(read_dump(state, made_by(moved), {}).value, Pipeline)
+
+
+def test_the_old_state_stays_until_the_new_one_is_whole(state, monkeypatch):
+    before = state.read_bytes()
+
+    def full_disk(number):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(DumpError, match="No space left"):
+        write_dump(state, [1], {}, {}, {})
+    assert state.read_bytes() == before
+    assert [path.name for path in state.parent.iterdir()] == ["state"]
+
+
+def test_dumper_writes_no_more_often_than_it_is_told_and_reports_a_full_disk(tmp_path, monkeypatch):
+    dumper = Dumper(tmp_path / "state", {}, {}, every_s=30.0)
+    assert dumper.is_due()
+    dumper.write([1.5], {"events": 7})
+    assert not dumper.is_due()
+    dumper.wait()
+    assert not dumper.is_due()
+    assert read_dump(tmp_path / "state", {}, {}).value == [1.5]
+    assert read_head(tmp_path / "state")["events"] == 7
+
+    def full_disk(number):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    dumper.write([2.5], {})
+    with pytest.raises(DumpError, match="No space left"):
+        dumper.close()
+    assert read_dump(tmp_path / "state", {}, {}).value == [1.5]
+
+
+def test_submap_is_written_as_key_scans_and_matches_bit_by_bit():
+    """Voxels, their surfaces and the image of the search follow from the points."""
+    rng, matcher = np.random.default_rng(0), ScanMatcher(LidarConfig(), 0.1)
+    angles = np.linspace(-3.1, 3.1, 400)
+    room = np.column_stack([np.clip(9.0 * np.cos(angles), -4.0, 5.0), np.clip(9.0 * np.sin(angles), -3.0, 2.0)])
+    for key in range(3):
+        matcher.insert_key_scan(np.array([0.01 * key, 0.0, 0.0]), room + 0.01 * rng.normal(size=room.shape))
+    prior, narrow, wide = np.array([0.02, -0.01, 0.005]), np.diag([1e-3, 1e-3, 1e-4]), np.diag([0.2, 0.2, 0.1])
+    matcher.match(room, prior, narrow)  # fills surfaces
+    matcher.match(room, prior, wide)  # draws the image
+    text, blob = freeze(matcher)
+    assert len(text) + len(blob) < 16 * 3 * len(room) + 2000
+    again = thaw(text, blob)
+    for cov in (narrow, wide):
+        one, other = (m.match(room, prior, cov) for m in (matcher, again))
+        assert one is not None
+        assert all(np.array_equal(vars(one)[name], vars(other)[name]) for name in vars(one))
+    assert thaw(*freeze(ScanMatcher(LidarConfig(), 0.1))).points().shape == (0, 2)
+
+
+def test_pair_is_shared_not_written():
+    model = make_model("skid_steer", ROBOT)
+    pair = Trial(model, "ekf")
+    assert thaw(*freeze([pair, model], {"model": model}), {"model": model})[1] is model

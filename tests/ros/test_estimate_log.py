@@ -1,0 +1,287 @@
+"""`skidloc online` on a log: the bytes of a replay, also after kill -9; files that cannot be gone on from are refused."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from localization.cli import main
+from localization.errors import OutputError
+from localization.estimators import Estimate
+from localization.logs.fused_log import write_fused
+from localization.ros.checkpoint import read_head
+from localization.ros.estimate_log import Spool
+from localization.ros.session_files import Files
+from tests.helpers.disks import files_of_at_most, fill_disk
+from tests.helpers.online import drive_log, reseal
+
+COMMAND = (sys.executable, "-m", "localization.cli", "online")
+
+
+pytestmark = pytest.mark.xdist_group("online")
+
+
+@pytest.fixture(scope="module")
+def replayed(tmp_path_factory):
+    out = tmp_path_factory.mktemp("online") / "replayed"
+    options = ("--robot", "vaultbot", "--model", "skid_steer", "--estimator", "ekf", "--reference", "none")
+    assert main(["replay", str(drive_log()), *options, "--out", str(out)]) == 0
+    return out
+
+
+def online(*arguments):
+    return main(["online", str(drive_log()), "--robot", "vaultbot", *map(str, arguments)])
+
+
+def test_its_output_is_the_replays_to_the_last_byte(replayed, tmp_path, capsys):
+    assert online("--rate", "max", "--out", tmp_path / "fused.mcap") == 0  # a bag's name is written in it
+    assert (tmp_path / "fused.mcap").read_bytes() == (replayed / "fused.mcap").read_bytes()
+    assert online("--rate", "max", "--out", tmp_path / "run.tum") == 0
+    assert (tmp_path / "run.tum").read_bytes() == (replayed / "skid_steer_ekf.tum").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fused.mcap", "run.tum"]
+    assert "estimates" in capsys.readouterr().out
+
+
+def start(tmp_path, rate):
+    files = ("--out", tmp_path / "fused.mcap", "--state", tmp_path / "state")
+    return subprocess.Popen(
+        [*COMMAND, drive_log(), "--robot", "vaultbot", "--rate", rate, *files], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def wait_for_state(tmp_path, process, events):
+    end = time.monotonic() + 60.0
+    while time.monotonic() < end and process.poll() is None:
+        if (tmp_path / "state").exists() and read_head(tmp_path / "state")["events"] > events:
+            return
+        time.sleep(0.02)
+    pytest.fail(f"no state: {process.stdout.read() if process.poll() is not None else 'still running'}")
+
+
+def kill_after(tmp_path, events):
+    process = start(tmp_path, "4")
+    wait_for_state(tmp_path, process, events)
+    ages = []
+    for _ in range(20):  # a state on disk is whole, and never older than a second
+        ages.append(time.time() - (tmp_path / "state").stat().st_mtime)
+        assert read_head(tmp_path / "state")["records"] >= 0
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert max(ages) < 1.0
+    assert not (tmp_path / "fused.mcap").exists()
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("killed")
+    kill_after(folder, 200)
+    return folder
+
+
+def test_killed_twice_and_resumed_it_writes_the_same_bytes(replayed, killed, tmp_path, capsys):
+    shutil.copytree(killed, tmp_path, dirs_exist_ok=True)
+    kill_after(tmp_path, read_head(tmp_path / "state")["events"] + 50)  # written by this process, not left by the one before
+    assert online("--rate", "max", "--out", tmp_path / "fused.mcap", "--state", tmp_path / "state") == 0
+    assert "resumed from" in capsys.readouterr().out
+    assert (tmp_path / "fused.mcap").read_bytes() == (replayed / "fused.mcap").read_bytes()
+    assert [path.name for path in tmp_path.iterdir()] == ["fused.mcap"]
+
+
+def test_what_a_kill_left_of_an_output_is_replaced_by_the_next_run(tmp_path, monkeypatch):
+    written = []
+
+    def write(path, *arguments):
+        assert list(path.parent.iterdir()) == []
+        written.append(path)
+        write_fused(path, *arguments)
+
+    monkeypatch.setattr("localization.ros.session.write_fused", write)
+    beside = tmp_path / ".fused.mcap.new"
+    (beside / ".fused-abc").mkdir(parents=True)
+    assert online("--rate", "max", "--estimator", "odometry", "--out", tmp_path / "fused.mcap") == 0
+    assert written == [beside / "fused.mcap"]
+    assert [path.name for path in tmp_path.iterdir()] == ["fused.mcap"]
+
+
+def test_a_service_that_is_stopped_leaves_its_last_state(replayed, tmp_path, capsys):
+    process = start(tmp_path, "4")
+    wait_for_state(tmp_path, process, 100)
+    for other in (["--out", tmp_path / "a.tum", "--state", tmp_path / "state"], ["--out", tmp_path / "fused.mcap"]):
+        assert online("--rate", "max", *other) == 2
+        assert "is in use by another process that runs" in capsys.readouterr().err
+    process.send_signal(signal.SIGTERM)
+    said, _ = process.communicate()
+    assert process.returncode == 130
+    assert "interrupted" in said
+    assert "the same command goes on from there" in said
+    assert "Traceback" not in said
+    assert online("--rate", "max", "--out", tmp_path / "fused.mcap", "--state", tmp_path / "state") == 0
+    assert (tmp_path / "fused.mcap").read_bytes() == (replayed / "fused.mcap").read_bytes()
+
+
+def test_a_run_that_is_stopped_without_a_state_writes_what_it_has(replayed, tmp_path):
+    out, spool = tmp_path / "a.tum", tmp_path / ".a.tum.part"
+    options = ("--robot", "vaultbot", "--rate", "4", "--out", out)
+    process = subprocess.Popen([*COMMAND, drive_log(), *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    end = time.monotonic() + 60.0
+    while time.monotonic() < end and not (spool.exists() and spool.stat().st_size > 20_000):
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate()
+    assert process.returncode == 130, said
+    lines = out.read_text().splitlines()
+    assert f"{len(lines) - 1} estimates, up to where the run was stopped" in said.replace("\n", " ")
+    assert len(lines) > 50
+    assert lines == (replayed / "skid_steer_ekf.tum").read_text().splitlines()[: len(lines)]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.tum"]
+
+
+def test_files_that_cannot_be_kept_are_refused_at_the_start(tmp_path, capsys):
+    out = tmp_path / "a.tum"
+    for state, said in [
+        (tmp_path / "no" / "state", "Name a file in a folder that is there"),
+        (tmp_path, "is a folder"),
+        (out, "is the output as well"),
+        (tmp_path / "b" / ".." / ".a.tum.part", "is where the output grows as well"),
+    ]:
+        assert online("--out", out, "--state", state) == 2
+        assert said in capsys.readouterr().err.replace("\n", " ")
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_files_are_one_process_s_at_a_time(tmp_path):
+    files = Files(tmp_path / "a.tum", tmp_path / "state")
+    (tmp_path / ".state.lock").touch()  # of a process that was killed
+    with files.claimed(), pytest.raises(OutputError, match=r"state' is in use by another process"), Files(state=files.state).claimed():
+        pass
+    assert list(tmp_path.iterdir()) == []
+    with files.claimed():
+        pass
+
+
+def test_real_time_takes_its_time(tmp_path):
+    begin = time.monotonic()
+    assert online("--rate", "40", "--estimator", "odometry", "--out", tmp_path / "a.tum") == 0
+    assert time.monotonic() - begin > 20.0 / 40.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--rate", "0"], "--rate is '0'"),
+        (["--rate", "nan"], "--rate is 'nan'"),
+        (["--rate", "1e-300"], "--rate is '1e-300'; it must be a number from 0.001 (1 is real time), or max."),
+        (["--rate", "fast"], "--rate is 'fast'"),
+        (["--estimator", "magic"], "no estimator 'magic'"),
+        (["--model", "magic"], "magic"),
+        (["--corrections", "magic"], "no form of corrections 'magic'"),
+        (["--out", "a.csv"], "must end in .mcap or .tum"),
+        (["--robot", "nobody"], "nobody"),
+        (["--topic.scan", "/nowhere"], "no topic '/nowhere'"),
+        (["--node.wait-s", "nan"], "setting wait_s of NodeConfig is nan"),
+    ],
+)
+def test_bad_arguments_are_explained(arguments, said, capsys):
+    assert online(*arguments) == 2
+    shown = capsys.readouterr()
+    assert said in shown.err
+    assert "Traceback" not in shown.err
+
+
+def test_states_that_do_not_fit_are_refused(killed, tmp_path, capsys):
+    shutil.copytree(killed, tmp_path, dirs_exist_ok=True)
+    state, out = tmp_path / "state", tmp_path / "a.tum"
+    for arguments, said in [
+        (["--estimator", "graph", "--state", state, "--out", tmp_path / "fused.mcap"], "made with another estimator (ekf then, graph now)"),
+        (["--model", "diff_drive", "--state", state, "--out", tmp_path / "fused.mcap"], "made with another model"),
+        (["--state", state], "with an --out"),
+        (["--state", state, "--out", out], "the estimates up to the state, cannot be read"),
+        (["--state", drive_log(), "--out", out], "no state of an estimator"),
+    ]:
+        assert online("--rate", "max", *arguments) == 2
+        assert said in capsys.readouterr().err.replace("\n", " ")
+    other_log = drive_log(seed=1)
+    assert main(["online", str(other_log), "--robot", "vaultbot", "--state", str(state), "--out", str(tmp_path / "fused.mcap")]) == 2
+    assert "made with another source" in capsys.readouterr().err
+    whole = state.read_bytes()
+    reseal(state, "events", 10**9)
+    assert online("--rate", "max", "--state", state, "--out", tmp_path / "fused.mcap") == 2
+    assert "is of 1000000000 events where the log has" in capsys.readouterr().err
+    state.write_bytes(whole)
+    os.truncate(tmp_path / ".fused.mcap.part", 208)
+    assert online("--rate", "max", "--state", state, "--out", tmp_path / "fused.mcap") == 2
+    assert "estimates where the state counts on" in capsys.readouterr().err
+    out.write_text("precious")
+    assert online("--rate", "max", "--out", out) == 2
+    assert out.read_text() == "precious"
+
+
+def test_estimates_on_a_full_disk_are_whole_and_go_on_when_there_is_room(tmp_path):
+    spool = Spool.create(tmp_path / "part")
+    estimates = [Estimate(stamp, np.array([stamp, 0.0, 0.0]), None, np.zeros(3), None) for stamp in range(1, 6)]
+    with files_of_at_most(500):  # two rows and a part
+        for estimate in estimates[:2]:
+            spool.add(estimate)
+        for estimate in estimates[2:4]:
+            with pytest.raises(OutputError, match=r"cannot be written to '.*part': File too large"):
+                spool.add(estimate)
+        assert spool.rows()[0].tolist() == [1, 2]
+    spool.add(estimates[4])
+    assert spool.rows()[0].tolist() == [1, 2, 5]
+    assert spool.rows()[1][:, 0].tolist() == [1.0, 2.0, 5.0]
+    assert spool.missing == 2
+    spool.close()
+    again = Spool.resume(tmp_path / "part", 2)
+    assert again.rows()[0].tolist() == [1, 2]
+    again.remove()
+
+
+def test_a_full_disk_ends_the_run_of_a_log_with_its_reason(tmp_path, monkeypatch, capsys):
+    fill_disk(monkeypatch, 50)
+    assert online("--rate", "max", "--out", tmp_path / "a.tum") == 2
+    assert ".a.tum.part': No space left on device." in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_doors_whose_libraries_are_missing_name_them(tmp_path):
+    """In a process in which nothing of the extras can be imported."""
+    code = (
+        "import sys, importlib.util\n"
+        "for name in ('cyclonedds', 'cyclonedds.core', 'rclpy', 'rospy', 'rosgraph', 'distributed'): sys.modules[name] = None\n"
+        "from localization.cli import main\n"
+        "print([main(['online', '--robot', 'vaultbot', '--door', door]) for door in ('dds', 'rclpy', 'rospy')])\n"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[2, 2, 2]"
+    assert "pip install 'skidloc[ros2]'" in found.stderr
+    assert "source a ROS 2 installation" in found.stderr
+    assert "apt install python3-rospy" in found.stderr
+    assert "Traceback" not in found.stderr
+
+
+def test_what_a_killed_run_has_left_keeps_no_other_from_starting(tmp_path):
+    """Hidden files beside the output, also links, of which nobody knows; the estimates are kept."""
+    path, victim = tmp_path / ".a.tum.part", tmp_path / "victim"
+    victim.write_text("precious")
+    path.write_bytes(b"estimates")
+    spool = Spool.create(path)
+    spool.add(Estimate(1, np.zeros(3), None, np.zeros(3), None))
+    spool.close()
+    assert (tmp_path / ".a.tum.part.old").read_bytes() == b"estimates"
+    path.unlink()
+    path.symlink_to(victim)
+    Spool.create(path).remove()
+    files = Files(out=tmp_path / "a.tum")
+    (tmp_path / ".a.tum.new").symlink_to(victim)
+    with files.beside() as beside:
+        beside.write_text("whole")
+    assert (tmp_path / "a.tum").read_text() == "whole"
+    assert victim.read_text() == "precious"

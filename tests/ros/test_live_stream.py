@@ -1,0 +1,683 @@
+"""The estimator live: the same numbers as a replay's, whatever happens to messages, clocks and sensors on the way."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import sys
+import time
+import types
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from localization.errors import DoorError, DumpError, SettingError, TopicError
+from localization.estimators import Estimate
+from localization.events import Scan, WheelSample
+from localization.logs import TopicOverrides, open_log
+from localization.logs.fused_log import FusedEstimate, transform_message
+from localization.logs.serialization import encode
+from localization.pipeline import Trial, replay
+from localization.ros.checkpoint import Dumper, read_head
+from localization.ros.diagnostics import ERROR, OK, WARN, degeneracy
+from localization.ros.node import Node, NodeConfig
+from localization.ros.playback_clock import Pace
+from localization.ros.publisher import CORRECTIONS, DIAGNOSTICS, ODOMETRY, TF, Frames, Teller
+from localization.ros.session_files import Files
+from localization.ros.topic_names import Names
+from localization.ros.transports.base import Received
+from localization.trajectory import read_tum
+from motion_models import se2
+from motion_models.registry import make_model
+from tests.helpers import bags
+from tests.helpers.disks import fill_disk
+from tests.helpers.online import ROBOT, LogTransport, drive_events, drive_log, published, run_node, stamp_of, track
+
+S = 1_000_000_000
+pytestmark = pytest.mark.xdist_group("online")
+
+
+@functools.cache
+def undisturbed(estimator):
+    transport = LogTransport(drive_log())
+    node, told = run_node(transport, estimator)
+    return transport, node, told
+
+
+@pytest.fixture
+def calm():
+    return undisturbed("ekf")
+
+
+def worst(faulty, calm):
+    """Largest change of the pose at any common stamp, in sigmas, and the pair of final poses."""
+    a, b = track(calm), track(faulty)
+    common = sorted(set(a) & set(b))
+    ratios = [np.abs(_wrapped(b[s][0] - a[s][0])) / np.maximum(a[s][1], 1e-9) for s in common if a[s][1].min() > 0.0]
+    return float(np.max(ratios)), len(common) / len(a)
+
+
+def _wrapped(difference):
+    return np.array([difference[0], difference[1], math.remainder(difference[2], math.tau)])
+
+
+def test_live_and_replay_give_the_same_numbers(calm):
+    transport, node, told = calm
+    log = open_log(drive_log(), ROBOT)
+    run = replay(log.events(), [Trial(make_model("skid_steer", ROBOT), "ekf")], ROBOT, log.mounts, True)[0]
+    live = track(transport)
+    assert list(live) == run.trajectory.stamps_ns.tolist()
+    for stamp, pose, covariance in zip(live, run.trajectory.poses, run.trajectory.covariances, strict=True):
+        assert np.abs(_wrapped(live[stamp][0] - pose)).max() < 1e-12  # the heading passed through a quaternion
+        turn = np.array([[math.cos(pose[2]), -math.sin(pose[2])], [math.sin(pose[2]), math.cos(pose[2])]])
+        in_odom = np.diag(turn @ covariance[:2, :2] @ turn.T)  # ROS's covariance is in the axes of odom
+        np.testing.assert_allclose(live[stamp][1] ** 2, [*in_odom, covariance[2, 2]], rtol=1e-9, atol=1e-18)
+    assert told == []
+    assert node.warnings() == []
+
+
+def test_what_is_published(calm):
+    transport, node, _ = calm
+    odometry, tf = published(transport, ODOMETRY), published(transport, TF)
+    assert len(odometry) == len(tf) > 250
+    turning = [m for m in odometry if abs(m.twist.twist.angular.z) > 0.3]
+    lateral = np.array([m.twist.twist.linear.y / m.twist.twist.angular.z for m in turning])
+    assert np.median(np.abs(lateral)) > 0.005  # a skid-steer turns about a point that is not its centre: vy is not 0
+    last = tf[-1].transforms[0]
+    assert (last.header.frame_id, last.child_frame_id) == ("odom", "base_link")
+    assert last.transform.translation.x == odometry[-1].pose.pose.position.x
+    corrections = published(transport, CORRECTIONS)[-1]
+    assert {"gyro_bias_rad_per_s", "wheel_clock_offset_s", "k_0"} <= set(corrections.name)
+    assert len(corrections.position) == len(corrections.effort) == len(corrections.name)
+    assert (corrections.effort > 0.0).all()
+    statuses = {s.name: s for s in published(transport, DIAGNOSTICS)[-1].status}
+    assert set(statuses) == {
+        "skidloc: estimate",
+        "skidloc: lidar",
+        "skidloc: wheels",
+        "skidloc: files",
+        "skidloc: messages",
+        "skidloc: transforms",
+    }
+    values = {v.key: v.value for v in statuses["skidloc: lidar"].values}
+    assert {"degeneracy", "nis_mean", "lost_share"} <= set(values)
+    assert float(values["degeneracy"]) > 0.2
+    assert "slip_wz_rad_s" in {v.key for v in statuses["skidloc: wheels"].values}
+    assert node.session.health.latency_p99_s > 0.0
+
+
+def test_subscriptions_are_of_sensor_data_but_for_static_transforms(calm):
+    subscribed = calm[0].subscribed
+    assert [topic for topic, is_latched in subscribed.items() if is_latched] == ["/tf_static"]
+    assert {"/joint_states", "/scan", "/points", "/imu/data", "/center_of_gravity"} <= set(subscribed)
+    assert calm[0].kept == {"/joint_states", "/scan", "/imu/data", "/tf_static", "/tf"}  # what is not used costs nothing from the start on
+
+
+@pytest.mark.parametrize(("estimator", "seed"), [("ekf", 0), ("ekf", 1), ("graph", 2)])
+def test_loss_duplicates_and_reordering_change_the_pose_by_less_than_its_sigma(estimator, seed):
+    faulty = LogTransport(drive_log(), lambda messages: shaken(messages, seed))
+    node, _ = run_node(faulty, estimator)
+    ratio, share = worst(faulty, undisturbed(estimator)[0])
+    assert share > 0.97
+    assert ratio < 1.0
+    assert any("stamp repeated" in note for note in node.warnings())
+    assert any("came after newer ones" in note for note in node.warnings())
+
+
+def shaken(messages, seed, loss=0.01, doubled=0.05, late_s=0.05):
+    rng = np.random.default_rng(seed)
+    found = []
+    for m in messages:
+        if m.topic == "/tf_static" or rng.random() >= loss:
+            copies = 2 if rng.random() < doubled else 1
+            found += [m._replace(received_ns=m.received_ns + int(rng.uniform(0.0, late_s * S))) for _ in range(copies)]
+    return sorted(found, key=lambda m: m.received_ns)
+
+
+def restamped(message, shift_ns, kinds={"/scan": "LaserScan", "/joint_states": "JointState", "/imu/data": "Imu"}):  # noqa: B006
+    if message.topic not in kinds:
+        return message
+    kind = f"sensor_msgs/msg/{kinds[message.topic]}"
+    content = bags.STORE.deserialize_cdr(message.data, kind)
+    stamp = stamp_of(content) + shift_ns
+    content.header.stamp.sec, content.header.stamp.nanosec = stamp // S, stamp % S
+    return message._replace(data=encode(content))
+
+
+@pytest.mark.parametrize("jump_s", [500.0, -0.9, 3.0])
+def test_the_clock_of_all_sensors_jumps(jump_s, calm):
+    """Set forward and back: the pose hardly notices, and what is published bears the sender's new stamps.
+
+    Set back by less than a second, which nothing tells from jitter, it costs no more than was driven in that time.
+    """
+
+    def jumping(messages):
+        half = messages[len(messages) // 2].received_ns
+        return [restamped(m, int(jump_s * S)) if m.received_ns >= half else m for m in messages]
+
+    transport = LogTransport(drive_log(), jumping)
+    node, _ = run_node(transport)
+    stamps = [stamp_of(m) for m in published(transport, ODOMETRY)]
+    truth, found = list(track(calm[0]).values())[-1], list(track(transport).values())[-1]
+    if abs(jump_s) > 1.0:
+        assert stamps[-1] - stamps[0] == pytest.approx((20.0 + jump_s) * S, abs=2 * S)
+        assert any("jump of the clock" in note for note in node.warnings())
+    most = 3.0 * truth[1] + 0.02 if abs(jump_s) > 1.0 else 0.5 * abs(jump_s)  # 0.5 m/s, 0.5 rad/s
+    assert np.all(np.abs(_wrapped(found[0] - truth[0])) < most)
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "graph"])
+def test_what_the_network_held_comes_at_once_and_the_clocks_stay(estimator):
+    """For six seconds nothing comes, then all that its queues could keep: of wheels and IMU the newer half."""
+
+    def held(messages):
+        begin, end = (messages[0].received_ns + seconds * S for seconds in (6, 12))
+        kept = [m for m in messages if m.topic == "/scan" or not begin <= m.received_ns < begin + 3 * S]
+        return [
+            m._replace(received_ns=end - 10**6 + (m.received_ns - begin) // 10_000) if begin <= m.received_ns < end else m for m in kept
+        ]
+
+    transport = LogTransport(drive_log(), lambda messages: sorted(held(messages), key=lambda m: m.received_ns))
+    node, _ = run_node(transport, estimator)
+    assert not any("jump of the clock" in note or "could not be used" in note for note in node.warnings()), node.warnings()
+    truth, found = track(undisturbed(estimator)[0]), track(transport)
+    begin = min(truth)
+    after = [stamp for stamp in truth if stamp > begin + 13 * S]
+    assert set(after) <= set(found)
+    assert np.all(np.abs(_wrapped(found[after[-1]][0] - truth[after[-1]][0])) < 3.0 * found[after[-1]][1])
+    assert np.all(found[after[-1]][1] < 2.0 * truth[after[-1]][1])
+
+
+def silenced(topic, begin_s, end_s):
+    def spoil(messages):
+        first = messages[0].received_ns
+        return [m for m in messages if m.topic != topic or not begin_s * S <= m.received_ns - first < end_s * S]
+
+    return spoil
+
+
+@pytest.mark.parametrize("topic", ["/scan", "/imu/data", "/joint_states"])
+def test_a_sensor_vanishes_and_returns(topic, calm):
+    transport = LogTransport(drive_log(), silenced(topic, 6.0, 10.0))
+    node, _ = run_node(transport)
+    a, b = track(calm[0]), track(transport)
+    stamps = np.array(list(b))
+    assert np.diff(stamps).max() < 0.7 * S  # the others carry on
+    common = sorted(set(a) & set(b))
+    gap = [s for s in common if 7.0 * S < s - common[0] < 9.8 * S]
+    if gap and topic == "/scan":
+        assert b[gap[-1]][1][0] > a[gap[-1]][1][0]  # and it is less sure meanwhile
+    truth, found = a[common[-1]], b[common[-1]]
+    assert np.all(np.abs(_wrapped(found[0] - truth[0])) < 3.0 * np.maximum(found[1], truth[1]) + 0.01)
+    assert node.session.pipeline.estimator.counts()["matched"] > 150
+
+
+def test_messages_wait_for_the_next_scan(calm):
+    """They are looked at once before it is due; at once when it is late, or if there is no LiDAR."""
+    stream = calm[1]._stream
+    scans = stream._watches["/scan"]
+    period, last = scans._period_s, scans._last_ns
+    assert period == pytest.approx(0.08, rel=0.1)
+
+    def rests():
+        return [stream.patience_s(last + int(part * period * S)) / period for part in (0.0, 0.3, 0.93, 0.97, 1.05, 1.15, 50.0)]
+
+    assert rests() == pytest.approx([0.95, 0.65, 0.02, 0.13, 0.05, 0.0, 0.0], abs=1e-6)
+    alone = LogTransport(drive_log(), silenced("/scan", 0.0, 99.0))
+    alone.types.pop("/scan")
+    node, _ = run_node(alone)
+    assert node._stream.patience_s(node._stream._watches["/joint_states"]._last_ns) == 0.0
+
+
+def test_nobody_is_patient_while_a_scan_waits_for_the_wheels():
+    """A scan that is ahead of the wheels is used with the very next message that they send."""
+    node, _ = run_node(LogTransport(drive_log()))
+    scan, newest_ns = node.session.health._scan, node._newest_ns
+    node._stream._watches["/scan"]._last_ns = time.monotonic_ns()
+    assert node._patience_s() > 0.0
+    assert node.session.push(dataclasses.replace(scan, stamp_ns=newest_ns + S)) == []
+    assert node._patience_s() == 0.0
+    assert node.session.push(WheelSample(newest_ns + S + S // 10, np.zeros(2), np.full(2, np.nan)))
+    node._stream._watches["/scan"]._last_ns = time.monotonic_ns()
+    assert node._patience_s() > 0.0
+
+
+def test_diagnostics_say_which_topic_is_silent(calm):
+    _, node, _ = calm
+    watches = node._stream._watches
+    assert node._stream.silent(max(w._last_ns for w in watches.values())) == {}
+    later = node._stream.silent(max(w._last_ns for w in watches.values()) + 3 * S)
+    assert set(later) == {"/joint_states", "/scan", "/imu/data"}
+    status = node.session.health.statuses(node.session.pipeline, [], later)[-1]
+    assert status.level == ERROR
+    assert "/scan" in status.message
+
+
+def test_degeneracy_tells_corridors_from_rooms(calm):
+    rng = np.random.default_rng(0)
+    angle = np.radians(np.linspace(-135.0, 135.0, 760))
+
+    def scan(distance):
+        r = np.minimum(distance, 30.0) + rng.normal(0.0, 0.02, 760)
+        return np.column_stack([r * np.cos(angle), r * np.sin(angle)])[r < 29.0]
+
+    with np.errstate(divide="ignore"):
+        for turn in (0.0, 0.4):
+            assert degeneracy(scan(1.5 / np.abs(np.sin(angle + turn)))) < 0.02
+        assert degeneracy(scan(np.minimum(3.0 / np.abs(np.sin(angle)), 4.0 / np.abs(np.cos(angle))))) > 0.2
+    assert degeneracy(np.zeros((5, 2))) is None
+    _, node, _ = calm
+    health = node.session.health
+    last = health._scan
+    assert health.statuses(node.session.pipeline)[1].level == OK
+    corridor = scan(1.5 / np.abs(np.sin(angle)))
+    health.saw(dataclasses.replace(last, points=np.column_stack([corridor, np.zeros(len(corridor))]), offsets=np.empty(0)))
+    assert health.statuses(node.session.pipeline)[1].level == WARN
+    health.saw(last)
+
+
+def late_transforms(messages):
+    """/tf_static comes four seconds after the rest."""
+    late = [m._replace(received_ns=m.received_ns + 4 * S) if m.topic == "/tf_static" else m for m in messages]
+    return sorted(late, key=lambda m: m.received_ns)
+
+
+def lidar_statuses(transport):
+    return [s for m in published(transport, DIAGNOSTICS) for s in m.status if s.name == "skidloc: lidar"]
+
+
+def test_a_lidar_whose_place_nobody_tells_is_an_error_and_a_note():
+    lost = LogTransport(drive_log(), silenced("/tf_static", 0.0, 99.0))
+    node, told = run_node(lost)
+    (said,) = told
+    assert "frame 'laser'" in said
+    assert "Publish it on /tf_static, or add [mounts.laser] to the robot file." in said
+    assert {(s.level, s.message) for s in lidar_statuses(lost)} == {(ERROR, said)}
+    (note,) = node.warnings()
+    assert "frame 'laser'" in note
+    assert f"{node.session.pipeline.estimator.counts()['scans']} scans of it were taken as if from the body's origin" in note
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "graph"])
+def test_transforms_that_come_late_are_used_from_then_on(estimator, tmp_path):
+    calm, late = undisturbed(estimator)[0], LogTransport(drive_log(), late_transforms)
+    node, told = run_node(late, estimator, Files(state=tmp_path / "state"))
+    assert len(told) == 2
+    assert "frame 'laser'" in told[0]
+    assert "tells now where the LiDAR sits" in told[1]
+    assert node.session.pipeline.mounts["laser"].x != 0.0
+    (note,) = node.warnings()
+    assert "/tf_static was late" in note
+    # what was wrong until then stays; from then on it is as right as it says
+    a, b = track(calm), track(late)
+    begin, *_, last = sorted(s for s in set(a) & set(b) if s > min(a) + 5 * S)
+    off = se2.between(se2.between(a[begin][0], a[last][0]), se2.between(b[begin][0], b[last][0]))
+    sigmas = np.maximum(a[last][1], b[last][1])
+    assert np.all(np.abs(off) < 3.0 * sigmas), (off, sigmas)
+    # nor did the body jump to where it had been taken to be all along
+    poses = np.array([pose for pose, _ in b.values()])
+    assert np.hypot(*se2.between(poses[:-1], poses[1:])[:, :2].T).max() < 0.1
+    # the state is one of that place: who hears it at once may go on with it
+    node.finish()
+    again = LogTransport(drive_log(), lambda messages: [messages[0], *messages[-100:]])
+    assert "resumed from" in run_node(again, estimator, Files(state=tmp_path / "state"))[1][-1]
+
+
+def test_silence_is_told_and_then_the_run_begins():
+    quiet = LogTransport(drive_log())
+    polls = 0
+    take = quiet.take
+
+    def late(timeout_s, patience_s=0.0):
+        nonlocal polls
+        polls += 1
+        return take(timeout_s, patience_s) if polls > 3 else []
+
+    quiet.take = late
+    quiet.types = {}
+    _, told = run_node(quiet)
+    assert "nothing comes on /joint_states (sensor_msgs/JointState)" in told[0]
+    assert "/scan (sensor_msgs/LaserScan)" in told[0]
+    assert len(told) == 1  # it is not said again and again
+    assert told[0].endswith(". Nobody publishes anything in a log. Look elsewhere.")
+    named = LogTransport(drive_log(), silenced("/scan", 0.0, 5.0))
+    named.types.pop("/scan")
+    _, told = run_node(named, topics=TopicOverrides(scan="/scan"))
+    assert told[0] == "waiting for /scan (nobody publishes it)."
+
+
+def test_topics_of_other_names_are_offered():
+    other = LogTransport(drive_log(), silenced("/scan", 0.0, 5.0), types={"/front/laser": "sensor_msgs/msg/LaserScan"})
+    other.types.pop("/scan")
+    _, told = run_node(other, topics=TopicOverrides(scan="/scan"))
+    said = "waiting for /scan (nobody publishes it). But /front/laser is sensor_msgs/LaserScan (--topic.scan /front/laser)."
+    assert told[0] == said
+
+
+def test_a_topic_of_another_type_is_refused():
+    transport = LogTransport(drive_log(), silenced("/scan", 0.0, 99.0), types={"/scan": "sensor_msgs/msg/PointCloud2"})
+    with pytest.raises(DoorError, match=r"'/scan' carries sensor_msgs/PointCloud2, not sensor_msgs/LaserScan. Pass --topic.points /scan"):
+        run_node(transport)
+
+
+def test_joint_states_without_the_wheels_are_refused():
+    robot = dataclasses.replace(ROBOT, joints=dataclasses.replace(ROBOT.joints, left=("no_wheel",)))
+    pair = Trial(make_model("skid_steer", ROBOT), "ekf")
+    with pytest.raises(TopicError, match="no joint states of the live topics have the wheel joints"):
+        Node.start(LogTransport(drive_log()), robot, lambda has_lidar: pair, Files(), print, node=NodeConfig(wait_s=0.0))
+
+
+def test_bytes_that_are_no_message_are_dropped_and_counted():
+    def garbled(messages):
+        return [m._replace(data=m.data[: len(m.data) // 2]) if m.topic == "/scan" and i % 50 == 0 else m for i, m in enumerate(messages)]
+
+    node, _ = run_node(LogTransport(drive_log(), garbled))
+    assert any("/scan" in note and "not of the type" in note for note in node.warnings())
+    assert node.session.pipeline.estimator.counts()["matched"] > 200
+
+
+def test_a_node_that_is_killed_goes_on_where_it_was(tmp_path, calm):
+    """Without its pipeline, by the state on disk alone; the second node hears only what comes after."""
+    files = Files(tmp_path / "run.tum", tmp_path / "state")
+
+    def part(begin, end):
+        return lambda messages: [
+            m for i, m in enumerate(messages) if m.topic == "/tf_static" or begin <= (m.received_ns - messages[0].received_ns) / S < end
+        ]
+
+    first = LogTransport(drive_log(), part(0.0, 10.0))
+    node, _ = run_node(first, files=files)
+    node.session.dump(node._head, now=True)
+    node.session._dumper.wait()  # kill -9 from here: no finish, no close
+    second = LogTransport(drive_log(), part(10.5, 17.0))
+    node, told = run_node(second, files=files)
+    assert node.finish() == len(read_tum(tmp_path / "run.tum"))
+    assert "resumed from" in told[-1]
+    a, b = track(calm[0]), track(second)
+    common = sorted(set(a) & set(b))
+    for s in (common[10], common[-1]):
+        assert np.all(np.abs(_wrapped(b[s][0] - a[s][0])) < 3.0 * np.maximum(a[s][1], b[s][1]))
+    assert np.hypot(*b[common[0]][0][:2]) > 0.3  # and not from the origin
+    assert (tmp_path / "state").exists()
+    assert len(read_tum(tmp_path / "run.tum")) > 0.65 * len(a)
+    # it ended in order: what goes on from here has an output of its own
+    third = LogTransport(drive_log(), part(17.5, 99.0))
+    node, told = run_node(third, files=Files(tmp_path / "more.tum", tmp_path / "state"))
+    assert "resumed from" in told[-1]
+    assert 20 < node.finish() < 0.4 * len(a)
+
+
+def test_a_full_disk_does_not_stop_the_robot_from_knowing_where_it_is(tmp_path, monkeypatch, calm):
+    files = Files(tmp_path / "run.tum", tmp_path / "state")
+    monkeypatch.setattr(Dumper, "is_due", lambda self: True)
+    full = LogTransport(drive_log())
+    with monkeypatch.context() as disk:
+        fill_disk(disk, after=10, name="fsync")  # two for each state
+        fill_disk(disk, after=100, name="pwrite")
+        node, told = run_node(full, files=files)
+        assert read_head(tmp_path / "state")["records"] <= 5
+    assert len(track(full)) == len(track(calm[0]))
+    assert [said for said in told if "No space left" in said] == [
+        f"the state cannot be written to '{files.state}': No space left on device. The state of before stays; it is tried again.",
+        f"an estimate cannot be written to '{files.spool}': No space left on device. "
+        "The output lacks what is estimated meanwhile; it is tried again.",
+    ]
+    node._tell()
+    files_status = next(s for s in published(full, DIAGNOSTICS)[-1].status if s.name == "skidloc: files")
+    assert files_status.level == WARN
+    assert files_status.message.count("No space left on device") == 2
+    count = node.finish()
+    assert len(read_tum(tmp_path / "run.tum")) == count
+    assert f"lacks {len(track(full)) - 100} estimates" in told[-1]
+    assert read_head(tmp_path / "state")["events"] == node.session.count
+    assert set(node.session.troubles) == {"output"}
+
+
+def test_a_state_of_another_time_is_refused(tmp_path):
+    files = Files(state=tmp_path / "state")
+    for shift_s, said in ((7200.0, "2.0 h old"), (-60.0, "ahead of the robot's clock")):
+        node, _ = run_node(LogTransport(drive_log(), lambda messages: messages[:1000]), files=files)
+        node.finish()
+        later = LogTransport(
+            drive_log(), lambda messages, by=shift_s: [messages[0]] + [restamped(m, int((by + 30.0) * S)) for m in messages[1000:]]
+        )
+        with pytest.raises(DumpError, match=said):
+            run_node(later, files=Files(tmp_path / "run.tum", files.state))
+        assert [path.name for path in tmp_path.iterdir()] == ["state"]  # once it is removed, nothing is in the way
+        (tmp_path / "state").unlink()
+
+
+def with_transform(parent, child):
+    """Another node publishes this transform on /tf, from the middle of the drive on."""
+    tf = transform_message(FusedEstimate(1, np.zeros(3), np.zeros(3)))
+    tf.transforms[0].header.frame_id, tf.transforms[0].child_frame_id = parent, child
+
+    def spoil(messages):
+        late = messages[len(messages) // 2 :]
+        return sorted([*messages, *(Received("/tf", m.received_ns, encode(tf)) for m in late[::50])], key=lambda m: m.received_ns)
+
+    return spoil
+
+
+def test_node_reports_another_publisher_of_its_transform():
+    transport = LogTransport(drive_log(), with_transform("odom", "base_link"), {"/tf": "tf2_msgs/msg/TFMessage"})
+    node, told = run_node(transport)
+    sentences = [said for said in told if "another node publishes 'odom' -> 'base_link' on /tf" in said]
+    assert len(sentences) == 1
+    assert "--node.no-tf" in sentences[0]
+    node._tell()
+    status = next(s for s in published(transport, DIAGNOSTICS)[-1].status if s.name == "skidloc: transforms")
+    assert status.level == ERROR
+    assert "enable_odom_tf" in status.message
+
+
+def test_node_accepts_other_transforms_and_without_tf_any():
+    for parent, child, config in (("map", "odom", None), ("odom", "base_link", NodeConfig(wait_s=0.0, tf=False))):
+        transport = LogTransport(drive_log(), with_transform(parent, child), {"/tf": "tf2_msgs/msg/TFMessage"})
+        _, told = run_node(transport, config=config)
+        assert not [said for said in told if "another node" in said]
+
+
+@pytest.mark.parametrize("frames", [Frames(), Frames("team_map", "team_odom", "team_base")])
+def test_estimate_of_a_graph_is_published_as_odometry_and_correction(frames):
+    """Odometry and its transform are those that never jump; what the graph corrects is a transform of its own (REP-105)."""
+    transport = LogTransport(drive_log())
+    teller = Teller(transport, Names(), frames, with_tf=True)
+    in_odom, map_T_odom = np.array([1.0, 2.0, 0.3]), np.array([0.5, -0.25, -0.1])
+    cov, cov_in_map = 0.01 * np.eye(3), 0.04 * np.eye(3)
+    pose = se2.compose(map_T_odom, in_odom)
+    teller.estimate(Estimate(5 * S, in_odom, None, np.zeros(3), None), 5 * S)
+    teller.estimate(Estimate(6 * S, pose, cov_in_map, np.zeros(3), None, None, (in_odom, cov), map_T_odom), 6 * S)
+    odometry, tf = published(transport, ODOMETRY)[-1], [m.transforms[0] for m in published(transport, TF)]
+    assert odometry.header.frame_id == frames.odom_frame
+    assert (odometry.pose.pose.position.x, odometry.pose.pose.position.y) == (1.0, 2.0)
+    assert odometry.pose.covariance[0] == pytest.approx(0.01)
+    links = [(t.header.frame_id, t.child_frame_id) for t in tf]
+    body, correction = (frames.odom_frame, frames.base_link_frame), (frames.map_frame, frames.odom_frame)
+    assert links == [body, body, correction]
+    np.testing.assert_allclose(se2.compose(planar(tf[2]), planar(tf[1])), pose, atol=1e-12)
+
+
+def test_odometry_of_a_graph_is_published_without_its_corrections():
+    """Live: the published chain map -> odom -> base_link ends where the graph's estimates are."""
+    transport, log = undisturbed("graph")[0], open_log(drive_log(), ROBOT)
+    run = replay(log.events(), [Trial(make_model("skid_steer", ROBOT), "graph")], ROBOT, log.mounts, True)[0]
+    assert run.moments is not None
+    tf = [m.transforms[0] for m in published(transport, TF)]
+    map_T_odom, odom_T_body = (np.array([planar(t) for t in tf if t.header.frame_id == frame]) for frame in ("map", "odom"))
+    assert len(map_T_odom) == len(odom_T_body) == len(run.moments)
+    off = se2.between(run.moments.poses, se2.compose(map_T_odom, odom_T_body))
+    assert np.abs(off).max() < 1e-9
+
+
+def planar(stamped):
+    place, turn = stamped.transform.translation, stamped.transform.rotation
+    return np.array([place.x, place.y, 2.0 * math.atan2(turn.z, turn.w)])
+
+
+def test_names_and_frames_are_used_for_all_that_is_published():
+    """In a namespace, with a remapped scan: other topics and frames, the same estimates."""
+    names = Names("rover", "/team", ("scan:=/front/scan", "~/odometry:=odom"))
+    config = NodeConfig(wait_s=0.0, names=names, frames=Frames("team_map", "team_odom", "team_base"))
+    transport = LogTransport(drive_log(), lambda messages: [m._replace(topic=renamed(m.topic)) for m in messages])
+    transport.types = {renamed(topic): kind for topic, kind in transport.types.items()}
+    node, told = run_node(transport, config=config)
+    assert set(transport.published) == {"/team/odom", "/team/rover/corrections", "/tf", "/diagnostics"}
+    assert set(node.topics) == {"/team/joint_states", "/front/scan", "/team/imu/data"}
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    odometry = store.deserialize_cdr(transport.published["/team/odom"][-1], "nav_msgs/msg/Odometry")
+    (tf,) = store.deserialize_cdr(transport.published["/tf"][-1], "tf2_msgs/msg/TFMessage").transforms
+    assert (odometry.header.frame_id, odometry.child_frame_id) == (tf.header.frame_id, tf.child_frame_id) == ("team_odom", "team_base")
+    assert [said for said in told if "base_link_frame 'team_base' is not on /tf_static" in said]
+    calm = undisturbed("ekf")[0]
+    assert odometry.pose.pose.position == published(calm, ODOMETRY)[-1].pose.pose.position
+
+
+def renamed(topic):
+    return "/front/scan" if topic == "/scan" else topic if topic.startswith("/tf") else f"/team{topic}"
+
+
+@pytest.mark.parametrize(
+    ("settings", "error"),
+    [
+        ({"name": "sk id"}, "the node's name is 'sk id'"),
+        ({"namespace": "team"}, "it must begin with '/'"),
+        ({"remap": ("scan=front",)}, "FROM:=TO"),
+    ],
+)
+def test_names_that_ros_refuses_are_refused(settings, error):
+    with pytest.raises(SettingError, match=error):
+        Names(**settings)
+
+
+@pytest.mark.parametrize(
+    "frames", [("map", "", "base_link"), ("map", "/odom", "base_link"), ("map", "odom", "odom"), ("odom", "odom", "base_link")]
+)
+def test_frames_that_tf2_refuses_are_refused(frames):
+    with pytest.raises(SettingError, match="odom_frame"):
+        Frames(*frames)
+
+
+def test_pace_keeps_the_logs_time_and_skips_its_pauses():
+    now, slept = [100.0], []
+
+    def sleep(seconds):
+        slept.append(seconds)
+        now[0] += seconds
+
+    pace = Pace(2.0, lambda: now[0], sleep)
+    for stamp in (0, S, S, 3 * S, 1003 * S):
+        pace.wait(stamp)
+    assert now[0] == pytest.approx(100.0 + 0.5 + 1.0 + 2.5)
+    now[0] += 1.0  # whoever is late catches up
+    pace.wait(1004 * S)
+    pace.wait(1006 * S)
+    assert now[0] == pytest.approx(104.0 + 0.5 + 1.0)
+    slept.clear()
+    Pace(math.inf, sleep=sleep).wait(0)
+    assert slept == []
+
+
+def test_scans_of_the_drive_are_what_the_tests_believe():
+    events, _ = drive_events()
+    scans = [e for e in events if isinstance(e, Scan)]
+    assert len(scans) > 250
+    assert 8.0 * S < scans[-1].stamp_ns - scans[0].stamp_ns < 30.0 * S
+
+
+class _FakeRclpy(types.ModuleType):
+    """What of rclpy the door uses, as its documentation has it."""
+
+    def __init__(self):
+        super().__init__("rclpy")
+        self.subscriptions, self.sent, self.waiting = {}, [], []
+
+    def init(self, args=None, signal_handler_options=None):
+        self.handlers = signal_handler_options
+
+    def try_shutdown(self): ...
+
+    def create_node(self, name, namespace):
+        return self
+
+    def get_name(self):
+        return "skidloc"
+
+    def get_namespace(self):
+        return "/"
+
+    def get_topic_names_and_types(self):
+        return [("/scan", ["sensor_msgs/msg/LaserScan"]), ("/points", ["sensor_msgs/msg/PointCloud2"])]
+
+    def destroy_publisher(self, publisher): ...
+
+    def destroy_node(self): ...
+
+    def destroy_subscription(self, subscription):
+        del self.subscriptions[subscription]
+
+    def create_subscription(self, kind, topic, callback, quality, raw):
+        assert raw
+        self.subscriptions[topic] = kind, callback, quality
+        return topic
+
+    def create_publisher(self, kind, topic, depth):
+        return types.SimpleNamespace(publish=lambda data: self.sent.append((topic, data)))
+
+    def get_publishers_info_by_topic(self, topic):
+        found = types.SimpleNamespace(topic_type="sensor_msgs/msg/LaserScan", node_name="robot", node_namespace="/")
+        return [found] if topic == "/scan" else []
+
+    def add_node(self, node): ...
+
+    def remove_node(self, node): ...
+
+    def shutdown(self): ...
+
+    def spin_once(self, timeout_sec):
+        if self.waiting:
+            topic, data = self.waiting.pop(0)
+            self.subscriptions[topic][1](data)
+
+
+def test_rclpy_door_by_its_documented_interface(monkeypatch):
+    fake, quality, signals, executors = _FakeRclpy(), *(types.ModuleType(f"rclpy.{name}") for name in ("qos", "signals", "executors"))
+    signals.SignalHandlerOptions = types.SimpleNamespace(NO="none")
+    executors.SingleThreadedExecutor = lambda: fake
+    quality.QoSProfile = lambda **fields: types.SimpleNamespace(**fields)
+    quality.ReliabilityPolicy = types.SimpleNamespace(RELIABLE="reliable", BEST_EFFORT="best effort")
+    quality.DurabilityPolicy = types.SimpleNamespace(TRANSIENT_LOCAL="transient local", VOLATILE="volatile")
+    for name, module in {"rclpy": fake, "rclpy.qos": quality, "rclpy.signals": signals, "rclpy.executors": executors}.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    packages = {
+        "sensor_msgs": ["LaserScan"],
+        "tf2_msgs": ["TFMessage"],
+        "nav_msgs": ["Odometry"],
+        "geometry_msgs": [],
+        "diagnostic_msgs": [],
+    }
+    for package, kinds in packages.items():
+        messages = types.ModuleType(f"{package}.msg")
+        for kind in kinds:
+            setattr(messages, kind, type(kind, (), {}))
+        monkeypatch.setitem(sys.modules, f"{package}.msg", messages)
+    from localization.ros.transports.rclpy import RclpyTransport
+
+    transport = RclpyTransport()
+    transport.subscribe("/scan", "sensor_msgs/msg/LaserScan", is_latched=False)
+    transport.subscribe("/tf_static", "tf2_msgs/msg/TFMessage", is_latched=True)
+    transport.advertise("/skidloc/odometry", "nav_msgs/msg/Odometry")
+    assert (fake.subscriptions["/scan"][2].reliability, fake.subscriptions["/scan"][2].durability) == ("best effort", "volatile")
+    latched = fake.subscriptions["/tf_static"][2]
+    assert (latched.reliability, latched.durability) == ("reliable", "transient local")
+    fake.waiting = [("/scan", b"one"), ("/tf_static", b"two")]
+    assert [(r.topic, r.data) for r in transport.take(0.1)] == [("/scan", b"one"), ("/tf_static", b"two")]
+    transport.publish("/skidloc/odometry", b"three")
+    assert fake.sent == [("/skidloc/odometry", b"three")]
+    assert transport.publishers() == {"/scan": {"sensor_msgs/msg/LaserScan"}}  # /points has no publisher
+    transport.keep(["/scan"])
+    assert set(fake.subscriptions) == {"/scan"}
+    assert fake.handlers == "none"  # Ctrl-C is the command's
+    transport.close()
