@@ -42,7 +42,7 @@ _PROGRESS_NS = 500_000_000
 
 @dataclass(frozen=True)
 class Replay:
-    """Run motion models and estimators over a log and show how well each of them knows where the robot was."""
+    """Run motion models and estimators over a log and score their trajectories."""
 
     log: tyro.conf.Positional[Path]
     """ROS 1 .bag, ROS 2 bag folder, or bare .mcap."""
