@@ -1,4 +1,4 @@
-"""Errors of logs, references and outputs that a user can mend (exit code 2 on the command line)."""
+"""Errors of logs, references and outputs that a user can correct (exit code 2 on the command line)."""
 
 from motion_models.errors import SkidlocError
 
@@ -28,7 +28,7 @@ class OutputError(SkidlocError):
 
 
 class EstimatorError(SkidlocError):
-    """An estimator that does not exist, that lacks what it needs from the log, or whose state is no longer finite."""
+    """An estimator that does not exist, that needs data which the log does not hold, or whose state is no longer finite."""
 
 
 class SimulationError(SkidlocError):

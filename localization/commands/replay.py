@@ -84,7 +84,7 @@ class Replay:
             for form in check_forms(forms)[: None if estimator in CORRECTING else 1]
         ]
         reference, positions = self._reference(log), self._positions(log)
-        # the LiDAR alone asks no motion model: it runs once, and counts for each
+        # the LiDAR alone uses no motion model: it runs once, and counts for each
         once = [p for p in pairs if p.estimator != _WHEELLESS or p.model is models[0]]
         with _progress(console, log) as (events, on_event):
             found = replay(merge_positions(events, positions), once, robot, log.mounts, has_lidar, self.config, on_event)

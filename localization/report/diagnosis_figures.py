@@ -1,4 +1,4 @@
-"""Pictures of a diagnosis: discrepancies over time and turning, before and after correction, and which causes look alike."""
+"""Pictures of a diagnosis: discrepancies over time and turning, before and after correction, and the gain of each finding."""
 
 from __future__ import annotations
 

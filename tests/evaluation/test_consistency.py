@@ -320,5 +320,5 @@ def test_what_cannot_be_tested_is_none_or_refused():
     assert pose_errors(Trajectory(np.arange(61) * SECOND, estimate), as_track(truth)).covariances is None
     parked = as_trajectory(np.zeros((61, 3)), np.zeros((61, 3, 3)))
     assert pose_consistency(parked, as_track(np.zeros((61, 3)))) is None
-    with pytest.raises(EvaluationError, match="knows positions only"):
+    with pytest.raises(EvaluationError, match="has positions only"):
         pose_errors(as_trajectory(estimate, p), positions)
