@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from localization.commands.common import write_json
-from localization.logs import LogInfo, TopicOverrides, open_log
+from localization.logs import LogInfo, TopicOverrides, inspect_log, open_log
 from localization.output import check_outputs
 from motion_models.robot import load_robot
 
@@ -33,7 +33,7 @@ class Info:
     def run(self, console: Console) -> None:
         check_outputs(self.json)
         with console.status("reading the log"):
-            info = open_log(self.log, load_robot(self.robot), self.topic).info()
+            info = inspect_log(open_log(self.log, load_robot(self.robot), self.topic))
         if self.json is not None:
             write_json(self.json, info.to_dict())
         _print(console, info)

@@ -24,7 +24,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from localization.logs.message_stats import Oddity, Tally
+from localization.logs.message_stats import MessageStats, Oddity
 
 _SECOND = 1_000_000_000
 _TRUSTED_STEP = _SECOND
@@ -86,8 +86,8 @@ def plan_clocks(first: Mapping[str, tuple[int, int]]) -> ClockPlan:
 class TopicClock:
     """The stamps of one topic, brought onto the common clock."""
 
-    def __init__(self, topic: str, plan: ClockPlan, jumps: list[int], tally: Tally) -> None:
-        self._topic, self._tally = topic, tally
+    def __init__(self, topic: str, plan: ClockPlan, jumps: list[int], stats: MessageStats) -> None:
+        self._topic, self._stats = topic, stats
         self._common = plan.offset_ns
         self._shift = plan.shifts_ns.get(topic, 0)
         self._foreign = self._shift != 0
@@ -115,43 +115,43 @@ class TopicClock:
         """
         while self._pending and log_ns - self._pending[0].log_ns > _LONGEST_PENDING:
             del self._pending[0]
-            self._tally.count(self._topic, Oddity.OUTLIER)
+            self._stats.count(self._topic, Oddity.OUTLIER)
         if not self._pending:
             return log_ns + self.offset_ns
         first = self._pending[0]
         since = min(log_ns, first.log_ns) + self.offset_ns
         return min(since, first.stamp_ns + self._shift) if self._may_be_late() else since
 
-    def put(self, item: Item) -> list[Item]:
+    def insert(self, item: Item) -> list[Item]:
         """Messages that have become trusted by this one, with their final stamps."""
         if item.stamp_ns == 0:
-            self._tally.count(self._topic, Oddity.NO_STAMP)
+            self._stats.count(self._topic, Oddity.NO_STAMP)
             return [_restamped(item, item.log_ns + self._common)]
         if self._is_trusted(item):
             if not self._is_continued_by(item):
-                self.close()
+                self.drop_pending()
             self._pending.append(item)
             return self._release()
         if self._pending and not _agree(self._pending[-1], item):
-            self.close()
+            self.drop_pending()
         self._pending.append(item)
         if len(self._pending) < _JUMP_AFTER or self._is_burst():
             return []
         self._set_clock()
         return self._release()
 
-    def finish(self) -> list[Item]:
+    def flush(self) -> list[Item]:
         """What is pending at the end, where it is enough for a clock that was set; else it is given up."""
         if len(self._pending) >= _JUMP_AFTER:
             self._set_clock()
         else:
-            self.close()
+            self.drop_pending()
         return self._release()
 
-    def close(self) -> None:
-        """Give up what is pending."""
+    def drop_pending(self) -> None:
+        """Drop what is pending as outliers."""
         if self._pending:
-            self._tally.count(self._topic, Oddity.OUTLIER, len(self._pending))
+            self._stats.count(self._topic, Oddity.OUTLIER, len(self._pending))
             self._pending = []
 
     def _is_trusted(self, item: Item) -> bool:
@@ -202,11 +202,11 @@ class TopicClock:
         self._last, self._last_log, self.offset_ns = stamp, item.log_ns, stamp - item.log_ns
         self._soonest_ns = max(self._soonest_ns, self.offset_ns)
         if self._rebased:
-            self._tally.count(self._topic, Oddity.REBASED)
+            self._stats.count(self._topic, Oddity.REBASED)
         elif self._foreign:
-            self._tally.count(self._topic, Oddity.FOREIGN_CLOCK)
+            self._stats.count(self._topic, Oddity.FOREIGN_CLOCK)
         if self._newest is not None and stamp < self._newest:
-            self._tally.count(self._topic, Oddity.OUT_OF_ORDER)
+            self._stats.count(self._topic, Oddity.OUT_OF_ORDER)
         self._newest = stamp if self._newest is None else max(stamp, self._newest)
         return _restamped(item, stamp)
 
@@ -231,22 +231,22 @@ class Merger:
     topics is the estimator's to use.
     """
 
-    def __init__(self, plan: ClockPlan, tally: Tally, wait_ns: int | None = _WAIT) -> None:
-        self._plan, self._tally, self._wait_ns = plan, tally, wait_ns
+    def __init__(self, plan: ClockPlan, stats: MessageStats, wait_ns: int | None = _WAIT) -> None:
+        self._plan, self._stats, self._wait_ns = plan, stats, wait_ns
         self._jumps: list[int] = []
-        self._clocks = {topic: TopicClock(topic, plan, self._jumps, tally) for topic in plan.latency_ns}
+        self._clocks = {topic: TopicClock(topic, plan, self._jumps, stats) for topic in plan.latency_ns}
         self._held: list[tuple[int, int, int, Item]] = []
         self._held_weight = self._serial = self._now = 0
         self._emitted: dict[tuple[str, int], int] = {}  # two drivers may share a topic, as wheels and arms do, and a stamp
         self._newest = -(2**63)
 
-    def push(self, item: Item) -> Iterator[Any]:
+    def insert(self, item: Item) -> Iterator[Any]:
         """Take the next item by time of recording; what is yielded must be taken before the next."""
         clock = self._clocks.get(item.topic)
         if clock is None:  # a topic without stamps
-            clock = self._clocks[item.topic] = TopicClock(item.topic, self._plan, self._jumps, self._tally)
+            clock = self._clocks[item.topic] = TopicClock(item.topic, self._plan, self._jumps, self._stats)
         self._now = max(self._now, item.log_ns)
-        self._hold(clock.put(item))
+        self._hold(clock.insert(item))
         if self._wait_ns is None:
             clock.horizon(self._now)  # gives up what has been pending for long
             yield from self._release(2**63 - 1, 0)
@@ -257,17 +257,17 @@ class Merger:
         """What is added to the stamps of ``topic`` now, because its clock was set or is not the others'."""
         return self._clocks[topic].shift_ns if topic in self._clocks else 0
 
-    def finish(self) -> Iterator[Any]:
+    def flush(self) -> Iterator[Any]:
         """All that is held, for nothing more will come."""
         for clock in self._clocks.values():
-            self._hold(clock.finish())
+            self._hold(clock.flush())
         yield from self._release(2**63 - 1, 0)
 
     def _hold(self, items: Iterable[Item]) -> None:
         for item in items:
             newest = self._newest if self._wait_ns is not None else self._emitted.get((item.topic, item.rank), item.stamp_ns)
             if item.stamp_ns < newest:
-                self._tally.count(item.topic, Oddity.LATE)
+                self._stats.count(item.topic, Oddity.LATE)
                 continue
             heapq.heappush(self._held, (item.stamp_ns, item.rank, self._serial, item))
             self._serial += 1
@@ -279,18 +279,18 @@ class Merger:
             stamp, _, _, item = heapq.heappop(held)
             self._held_weight -= item.weight
             if self._emitted.get((item.topic, item.rank)) == stamp:
-                self._tally.count(item.topic, Oddity.REPEATED)
+                self._stats.count(item.topic, Oddity.REPEATED)
                 continue
             self._emitted[item.topic, item.rank] = self._newest = stamp
             yield item.payload
 
 
-def merge(items: Iterable[Item], plan: ClockPlan, tally: Tally) -> Iterator[Any]:
+def merge(items: Iterable[Item], plan: ClockPlan, stats: MessageStats) -> Iterator[Any]:
     """The payloads of ``items`` (which come in order of ``log_ns``) by stamp: never decreasing, and within a topic always increasing."""
-    merger = Merger(plan, tally)
+    merger = Merger(plan, stats)
     for item in items:
-        yield from merger.push(item)
-    yield from merger.finish()
+        yield from merger.insert(item)
+    yield from merger.flush()
 
 
 def _restamped(item: Item, stamp_ns: int) -> Item:

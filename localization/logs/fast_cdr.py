@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.logs.fused_log import BODY_FRAME, PARENT_FRAME, FusedEstimate, odom_axes, odometry_message, six_by_six, transform_message
-from localization.logs.message_templates import Form, Message, Template
+from localization.logs.message_templates import Message, MessageLayout, Template
 from motion_models.se2 import FloatArray
 
 _CDR, _FIRST = b"\0\1\0\0", 4  # little endian; places are counted from behind these bytes
@@ -40,7 +40,7 @@ class Vector(NamedTuple):
     z: float
 
 
-class Imu(NamedTuple):
+class ImuMessage(NamedTuple):
     """What is used of sensor_msgs/Imu."""
 
     header: Header
@@ -48,7 +48,7 @@ class Imu(NamedTuple):
     linear_acceleration: Vector
 
 
-class JointState(NamedTuple):
+class JointStateMessage(NamedTuple):
     """What is used of sensor_msgs/JointState."""
 
     header: Header
@@ -57,7 +57,7 @@ class JointState(NamedTuple):
     velocity: FloatArray
 
 
-class LaserScan(NamedTuple):
+class LaserScanMessage(NamedTuple):
     """What is used of sensor_msgs/LaserScan."""
 
     header: Header
@@ -77,23 +77,23 @@ _READERS: dict[str, Callable[[], Callable[[bytes], Any]]] = {
 }
 
 
-def quick_reader(kind: str) -> Callable[[bytes], Any] | None:
+def fast_decoder(kind: str) -> Callable[[bytes], Any] | None:
     """A reader of messages of type ``kind``, or None: it gives what is used of a message, or None for bytes of an unusual kind, which
     rosbags has to look at. It raises (`struct.error`, `ValueError`) where rosbags would."""
     return _READERS[kind]() if kind in _READERS else None
 
 
-def _imu(data: bytes) -> Imu | None:
+def _imu(data: bytes) -> ImuMessage | None:
     sec, nanosec, length = _HEADER.unpack_from(data, _FIRST)
     end = 16 + length
     at = _aligned(end, 8)
     if not data.startswith(_CDR) or not 0 <= len(data) - at - _IMU.size < 4 or not length or data[end - 1]:
         return None
     wx, wy, wz, ax, ay, az = _IMU.unpack_from(data, at)
-    return Imu(Header(Stamp(sec, nanosec), data[16 : end - 1].decode()), Vector(wx, wy, wz), Vector(ax, ay, az))
+    return ImuMessage(Header(Stamp(sec, nanosec), data[16 : end - 1].decode()), Vector(wx, wy, wz), Vector(ax, ay, az))
 
 
-def _laser_scan(data: bytes) -> LaserScan | None:
+def _laser_scan(data: bytes) -> LaserScanMessage | None:
     if not data.startswith(_CDR):
         return None
     sec, nanosec, length = _HEADER.unpack_from(data, _FIRST)
@@ -106,15 +106,15 @@ def _laser_scan(data: bytes) -> LaserScan | None:
     if not 0 <= left < 4 or not length or data[end - 1]:
         return None
     header, ranges = Header(Stamp(sec, nanosec), data[16 : end - 1].decode()), np.frombuffer(data, "<f4", count, at)
-    return LaserScan(header, first, last, step, beam_s, shortest, longest, ranges)
+    return LaserScanMessage(header, first, last, step, beam_s, shortest, longest, ranges)
 
 
-def _joint_states() -> Callable[[bytes], JointState | None]:
+def _joint_states() -> Callable[[bytes], JointStateMessage | None]:
     """It remembers the names of the last message: mostly they are those of the next."""
     told, frame = b"", ""
     names: tuple[str, ...] = ()
 
-    def read(data: bytes) -> JointState | None:
+    def read(data: bytes) -> JointStateMessage | None:
         nonlocal told, frame, names
         if not data.startswith(_CDR):
             return None
@@ -131,7 +131,7 @@ def _joint_states() -> Callable[[bytes], JointState | None]:
         velocity, at = _doubles(data, at)
         _, at = _doubles(data, at)
         sec, nanosec, _ = _HEADER.unpack_from(data, _FIRST)
-        return JointState(Header(Stamp(sec, nanosec), frame), names, position, velocity) if len(data) - at < 4 else None
+        return JointStateMessage(Header(Stamp(sec, nanosec), frame), names, position, velocity) if len(data) - at < 4 else None
 
     return read
 
@@ -172,7 +172,7 @@ class FusedWriter:
         return self._transform.fill(Message(self._transform_form, estimate.stamp_ns, estimate.stamp_ns, _place(estimate)))
 
 
-def _named(form: Form, parent: str, body: str) -> Form:
+def _named(form: MessageLayout, parent: str, body: str) -> MessageLayout:
     """``form`` with these frames in its messages."""
 
     def build(*parts: Any) -> Any:
@@ -210,5 +210,7 @@ def _build_transform(stamp: Any, place: FloatArray, heading: FloatArray) -> Any:
     return made
 
 
-_ODOMETRY = Form("", "nav_msgs/msg/Odometry", (("f8", 2), ("f8", 2), ("f8", 36), ("f8", 2), ("f8", 1), ("f8", 36)), _build_odometry)
-_TRANSFORM = Form("", "tf2_msgs/msg/TFMessage", (("f8", 2), ("f8", 2)), _build_transform)
+_ODOMETRY = MessageLayout(
+    "", "nav_msgs/msg/Odometry", (("f8", 2), ("f8", 2), ("f8", 36), ("f8", 2), ("f8", 1), ("f8", 36)), _build_odometry
+)
+_TRANSFORM = MessageLayout("", "tf2_msgs/msg/TFMessage", (("f8", 2), ("f8", 2)), _build_transform)

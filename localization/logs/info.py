@@ -7,12 +7,10 @@ import heapq
 import statistics
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from localization.logs.topics import REFERENCE_TYPES, TYPES, TopicSource, short_type
-
-if TYPE_CHECKING:
-    from localization.logs.reader import Log
+from localization.logs.reader import Log
+from localization.logs.topic_roles import REFERENCE_TYPES, TYPES, TopicSource, short_type
 
 _STAMPED = {*TYPES.values(), *REFERENCE_TYPES}
 _GAP_PERIODS, _SHORTEST_GAP_S, _MOST_GAPS = 5.0, 0.25, 10

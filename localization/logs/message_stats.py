@@ -32,7 +32,15 @@ class Oddity(Enum):
     WHEEL_JUMP = "with a wheel angle that wheels cannot reach (a reset); the increment was taken from the rates"
 
 
-class Tally:
+class UnusableError(Exception):
+    """A message that says nothing. Never leaves this package."""
+
+    def __init__(self, oddity: Oddity) -> None:
+        super().__init__(oddity.value)
+        self.oddity = oddity
+
+
+class MessageStats:
     """Counts by topic and oddity."""
 
     def __init__(self) -> None:

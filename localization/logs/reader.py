@@ -11,14 +11,13 @@ from localization.errors import LogError, TopicError
 from localization.events import Event, Reference
 from localization.logs.chunks import Source, merge_channels
 from localization.logs.clock_sync import ClockPlan, Item, merge, plan_clocks
-from localization.logs.decode import Decoder, UnusableError, frame_name, stamp_ns
-from localization.logs.event_decoder import Intake, Part, read_item
-from localization.logs.info import LogInfo, inspect_log
-from localization.logs.message_stats import Tally
+from localization.logs.decode import frame_name, stamp_ns
+from localization.logs.event_decoder import EventDecoder, TopicDecoder, decode_item
+from localization.logs.message_stats import MessageStats, UnusableError
 from localization.logs.references import reference_decoder
+from localization.logs.serialization import Decoder
 from localization.logs.sources import open_source
-from localization.logs.topic_roles import choose_parts
-from localization.logs.topics import REFERENCE_TYPES, TopicChooser, TopicOverrides
+from localization.logs.topic_roles import REFERENCE_TYPES, TopicChooser, TopicOverrides, choose_roles
 from localization.logs.transforms import FixedTransforms
 from motion_models.robot import Mount, Robot
 
@@ -62,15 +61,15 @@ class Log:
         """Type of each topic."""
         for channel in sorted(self.channels, key=lambda c: -c.count):  # of a topic with two types, the more frequent one counts
             self.types.setdefault(channel.topic, channel.type)
-        self._tallies: dict[str, Tally] = {}
+        self._stats_by_topic: dict[str, MessageStats] = {}
         self._overrides = topics
         self._chooser = TopicChooser(path.name, self.channels, robot, topics)
-        parts = choose_parts(path.name, self._chooser, robot, topics, self._joint_names)
-        self.sources = parts.sources
+        roles = choose_roles(path.name, self._chooser, robot, topics, self._joint_names)
+        self.sources = roles.sources
         """Which topic plays which part."""
-        self.wheels_error = parts.wheels_error
+        self.wheels_error = roles.wheels_error
         """Why `events` will refuse, if it will."""
-        self._joints, self._arms, self._choice_notes = parts.joints, parts.arms, parts.warnings
+        self._joints, self._arms, self._choice_notes = roles.joints, roles.arms, roles.warnings
         self._mount_notes: list[str] = []
         self.frames: dict[str, str] = {}
         """Frame of the first message of each topic that is used."""
@@ -88,10 +87,6 @@ class Log:
         there = self._chooser.of_type(*REFERENCE_TYPES)
         return next((name for name in names if name in there), None)
 
-    def info(self) -> LogInfo:
-        """What is in the log, what will be used of it, and what is missing or suspect. Reads it once."""
-        return inspect_log(self)
-
     def events(self) -> Iterator[Event]:
         """Wheel, CG, IMU samples and scans by header stamp, never decreasing; within a topic always increasing.
 
@@ -99,8 +94,8 @@ class Log:
         """
         if self.wheels_error is not None:
             raise TopicError(" ".join([str(self.wheels_error), *self.damage()]))  # what was lost may be why
-        tally = self._tallies["events"] = Tally()
-        return self._events(tally)
+        stats = self._stats_by_topic["events"] = MessageStats()
+        return self._events(stats)
 
     def references(self, topic: str) -> Iterator[Reference]:
         """Reference poses of a pose, odometry, transform or GPS topic, by header stamp. GPS: east and north of the first fix.
@@ -108,10 +103,10 @@ class Log:
         Raises `TopicError` if the log has no such topic or if it carries something else.
         """
         self._chooser.require(topic, REFERENCE_TYPES, "--reference")
-        tally = self._tallies[topic] = Tally()
+        stats = self._stats_by_topic[topic] = MessageStats()
         decode = reference_decoder(self.types[topic])
         clocks = self._clock_plan([*(s.topic for s in self.sources.used()), topic])
-        return merge(self._items({topic: (0, decode)}, tally), clocks, tally)
+        return merge(self._items({topic: TopicDecoder(0, decode)}, stats), clocks, stats)
 
     @cached_property
     def mounts(self) -> Mapping[str, Mount]:
@@ -145,20 +140,20 @@ class Log:
     def warnings(self) -> list[str]:
         """Sentences about everything that was lost, mended or chosen without being told, so far: `damage` first."""
         said = [*self.damage(), *self._mount_notes, *self._choice_notes]
-        for tally in self._tallies.values():
-            said += tally.sentences()
+        for stats in self._stats_by_topic.values():
+            said += stats.sentences()
         return list(dict.fromkeys(said))
 
-    def _events(self, tally: Tally) -> Iterator[Event]:
-        intake = Intake(self.sources, self._joints, self._arms, self.robot, tally)
-        for payload in merge(self._items(intake.parts, tally), self._clocks, tally):
-            yield from intake.events(payload)
+    def _events(self, stats: MessageStats) -> Iterator[Event]:
+        decoder = EventDecoder(self.sources, self._joints, self._arms, self.robot, stats)
+        for payload in merge(self._items(decoder.decoders, stats), self._clocks, stats):
+            yield from decoder.events(payload)
 
-    def _items(self, parts: Mapping[str, Part], tally: Tally) -> Iterator[Item]:
-        decode = Decoder([c for c in self.channels if c.topic in parts], is_ros1=self.source.is_ros1)
-        for raw in self.source.messages(parts.keys()):
+    def _items(self, decoders: Mapping[str, TopicDecoder], stats: MessageStats) -> Iterator[Item]:
+        decode = Decoder([c for c in self.channels if c.topic in decoders], is_ros1=self.source.is_ros1)
+        for raw in self.source.messages(decoders.keys()):
             if raw.type == self.types[raw.topic]:
-                item = read_item(raw.topic, raw.log_ns, partial(decode, raw), parts[raw.topic], tally)
+                item = decode_item(raw.topic, raw.log_ns, partial(decode, raw), decoders[raw.topic], stats)
                 if item is not None:
                     yield item
 

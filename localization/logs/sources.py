@@ -44,7 +44,7 @@ def _open_folder(path: Path) -> Source:
         return _recover_folder(path, str(error).rstrip("."))
     count = sum(channel.count for part in parts for channel in part.channels)
     lost = [f"metadata.yaml of {path.name} lists {listed} messages; its files hold {count}."] if count < listed else []
-    return Parts(parts, lost)
+    return SplitSource(parts, lost)
 
 
 def _read_metadata(path: Path) -> tuple[list[str], int]:
@@ -68,7 +68,7 @@ def _read_metadata(path: Path) -> tuple[list[str], int]:
 
 
 def _open_part(path: Path) -> Source:
-    return Inflated(path) if path.suffix == ".zstd" else _open_file(path)
+    return DecompressedSource(path) if path.suffix == ".zstd" else _open_file(path)
 
 
 def _recover_folder(path: Path, reason: str) -> Source:
@@ -86,7 +86,7 @@ def _recover_folder(path: Path, reason: str) -> Source:
             notes.append(str(error))
     if not parts:
         raise LogError(" ".join(notes))
-    return Parts(parts, notes)
+    return SplitSource(parts, notes)
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -122,7 +122,7 @@ def _open_file(path: Path) -> Source:
         return sqlite.RecoveredSqlite(path, str(reason))
 
 
-class Inflated:
+class DecompressedSource:
     """A storage file that the recorder compressed as a whole, as much of it as can be had."""
 
     def __init__(self, path: Path) -> None:
@@ -147,7 +147,7 @@ class Inflated:
         return self._inner.messages(topics)
 
 
-class Parts:
+class SplitSource:
     """Several files one after the other, as a recorder splits a long log."""
 
     def __init__(self, parts: list[Source], notes: list[str]) -> None:

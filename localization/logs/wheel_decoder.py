@@ -15,7 +15,7 @@ import numpy as np
 
 from localization.events import WheelSample
 from localization.logs.decode import JointReading, OdometryReading
-from localization.logs.message_stats import Oddity, Tally
+from localization.logs.message_stats import MessageStats, Oddity
 from motion_models.robot import Driver
 from motion_models.se2 import FloatArray
 
@@ -48,8 +48,8 @@ class JointsToWheels:
     used: a second one is mostly a `joint_state_publisher` that fills in zeros.
     """
 
-    def __init__(self, left: int, right: int, wheel_radius_m: float, topic: str, tally: Tally) -> None:
-        self._left, self._right, self._radius, self._topic, self._tally = left, right, wheel_radius_m, topic, tally
+    def __init__(self, left: int, right: int, wheel_radius_m: float, topic: str, stats: MessageStats) -> None:
+        self._left, self._right, self._radius, self._topic, self._stats = left, right, wheel_radius_m, topic, stats
         self._chain: _Chain | None = None
         self._other: _Chain | None = None
 
@@ -57,7 +57,7 @@ class JointsToWheels:
         has_angles = all(map(math.isfinite, reading.position.tolist()))
         velocity = reading.velocity
         if any(abs(rate) * self._radius > _FASTEST_M_PER_S for rate in velocity.tolist()):
-            self._tally.count(self._topic, Oddity.WHEEL_RATE)
+            self._stats.count(self._topic, Oddity.WHEEL_RATE)
             if not has_angles:
                 return
             velocity = np.where(np.abs(velocity) * self._radius > _FASTEST_M_PER_S, np.nan, velocity)
@@ -73,12 +73,12 @@ class JointsToWheels:
             chain, self._other = self._follow(self._other, reading, reading.position - self._other.reading.position), chain
             self._chain = chain
             if chain.turned < self._other.turned:
-                self._tally.count(self._topic, Oddity.SECOND_PUBLISHER)
+                self._stats.count(self._topic, Oddity.SECOND_PUBLISHER)
                 return
         else:
             step, is_reset = self._mended_step(chain.reading, reading, velocity)
             if is_reset:
-                self._tally.count(self._topic, Oddity.WHEEL_JUMP)
+                self._stats.count(self._topic, Oddity.WHEEL_JUMP)
                 self._other = replace(chain, turned=0.0)
                 chain = replace(chain, turned=0.0)
             chain = self._chain = self._follow(chain, reading, step)
@@ -118,10 +118,10 @@ class OdometryToWheels:
     one of the two is understood.
     """
 
-    def __init__(self, driver: Driver, topic: str, tally: Tally) -> None:
+    def __init__(self, driver: Driver, topic: str, stats: MessageStats) -> None:
         self._radius = driver.wheel_radius_m
         self._half_track = 0.5 * driver.wheel_separation_multiplier * driver.track_width_m
-        self._topic, self._tally = topic, tally
+        self._topic, self._stats = topic, stats
         self._previous: OdometryReading | None = None
         self._angle = np.zeros(2)
         self._pose_has_moved = self._twist_has_moved = False
@@ -130,7 +130,7 @@ class OdometryToWheels:
         vx, _, wz = reading.twist
         is_wild = abs(vx) > _FASTEST_M_PER_S or abs(wz) > _FASTEST_RAD_PER_S
         if is_wild:
-            self._tally.count(self._topic, Oddity.WHEEL_RATE)
+            self._stats.count(self._topic, Oddity.WHEEL_RATE)
             if not math.isfinite(sum(reading.pose)) or (self._twist_has_moved and not self._pose_has_moved):
                 return  # only the twist would have told, and the next message tells of this time too
         twist_is_known = math.isfinite(vx) and math.isfinite(wz) and not is_wild
@@ -144,17 +144,17 @@ class OdometryToWheels:
             moved = abs(forward) > _STILL_M or abs(turn) > _STILL_RAD
             longest = max(dt, _SHORTEST_S)
             if not (abs(forward) <= _FASTEST_M_PER_S * longest and abs(turn) <= _FASTEST_RAD_PER_S * longest):
-                self._tally.count(self._topic, Oddity.POSE_JUMP)
+                self._stats.count(self._topic, Oddity.POSE_JUMP)
                 forward, turn = from_twist
             elif moved:
                 self._pose_has_moved = True
             elif not self._pose_has_moved and self._twist_has_moved:
                 if from_twist != (0.0, 0.0):
-                    self._tally.count(self._topic, Oddity.NO_POSE)
+                    self._stats.count(self._topic, Oddity.NO_POSE)
                 forward, turn = from_twist
             increment = self._wheels(forward, turn)
             if not self._twist_has_moved and moved and dt > 0.0:
-                self._tally.count(self._topic, Oddity.NO_TWIST)
+                self._stats.count(self._topic, Oddity.NO_TWIST)
                 rate = increment / dt
             self._angle = self._angle + increment
         self._previous = reading

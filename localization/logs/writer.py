@@ -9,7 +9,7 @@ from typing import Any
 
 from rosbags import rosbag1, rosbag2
 
-from localization.logs.message_templates import STORE, STORE_ROS1, Form, Message, Template
+from localization.logs.message_templates import STORE, STORE_ROS1, Message, MessageLayout, Template
 from localization.output import output_errors, refuse_existing, unwritable
 
 _LATCHED_TOPIC = "/tf_static"
@@ -51,7 +51,7 @@ def _write(inner: Path, path: Path, messages: Iterable[Message], on_message: Cal
         writer.open()
     try:
         connections: dict[str, Any] = {}
-        templates: dict[int, tuple[Form, Template]] = {}
+        templates: dict[int, tuple[MessageLayout, Template]] = {}
         count = 0
         for message in messages:
             form = message.form
@@ -77,7 +77,7 @@ def _write(inner: Path, path: Path, messages: Iterable[Message], on_message: Cal
     return count
 
 
-def _connect(writer: Any, form: Form, is_ros1: bool) -> Any:
+def _connect(writer: Any, form: MessageLayout, is_ros1: bool) -> Any:
     if is_ros1:
         latched = 1 if form.topic == _LATCHED_TOPIC else None
         return writer.add_connection(form.topic, form.type, typestore=STORE_ROS1, latching=latched)

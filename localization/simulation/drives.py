@@ -108,7 +108,7 @@ class Pursuit:
 @numba.njit(cache=True)
 def _pursue(
     pose: FloatArray, points: FloatArray, along: FloatArray, done: float, speed: float, ahead: float, limit: float
-) -> tuple[float, float, float]:  # pragma: no cover
+) -> tuple[float, float, float]:
     """How much of the way is done, and vx and wz; NaN at its end."""
     length = along[-1]
     reach, best, here = min(1.0, length - done), math.inf, done
@@ -135,7 +135,7 @@ def _pursue(
 
 
 @numba.njit(cache=True)
-def _on_way(at: float, points: FloatArray, along: FloatArray) -> tuple[float, float]:  # pragma: no cover
+def _on_way(at: float, points: FloatArray, along: FloatArray) -> tuple[float, float]:
     """The point ``at`` [m] along the way; beyond its end it goes straight on."""
     k = 0
     while k < len(along) - 2 and along[k + 1] < at:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from localization.simulation.drives import OpenLoop
-from localization.simulation.run_records import RunRecord
 from localization.simulation.simulator import Simulation
+from localization.simulation.track import RunRecord
 from motion_models import se2
 from motion_models.registry import make_model
 from motion_models.se2 import FloatArray
@@ -21,7 +21,7 @@ _FINE_S = 0.005
 
 
 @dataclass(frozen=True)
-class Score:
+class OpenLoopScore:
     """One open-loop run."""
 
     run: str
@@ -36,7 +36,7 @@ class Score:
         return {name: getattr(self, name) for name in ("run", "drive_error_m", "correction_time_s", "vision_error_m")}
 
 
-def score_runs(simulation: Simulation) -> list[Score]:
+def score_open_loop_runs(simulation: Simulation) -> list[OpenLoopScore]:
     """Scores of all open-loop runs that are over.
 
     The actual path is that of the point which the LiDAR tracks: where its transform puts the body, which is elsewhere if it was moved.
@@ -52,14 +52,14 @@ def score_runs(simulation: Simulation) -> list[Score]:
     return found
 
 
-def _score(run: RunRecord, command: OpenLoop, simulation: Simulation, body_T_tracked: FloatArray, rotation_ratio: float) -> Score:
+def _score(run: RunRecord, command: OpenLoop, simulation: Simulation, body_T_tracked: FloatArray, rotation_ratio: float) -> OpenLoopScore:
     actual = se2.compose(run.poses, body_T_tracked)
     actual = se2.between(actual[0], actual)
     wanted = commanded_path(command)
     seen = odometry_path(run, command, simulation)
     vision = float(np.mean(np.hypot(*(actual - seen)[:, :2].T)))
     drive = float(np.mean(np.hypot(*(resampled(actual) - resampled(wanted))[:, :2].T)))
-    return Score(run.name, drive, correction_time(actual[-1], wanted[-1], rotation_ratio), vision)
+    return OpenLoopScore(run.name, drive, correction_time(actual[-1], wanted[-1], rotation_ratio), vision)
 
 
 def commanded_path(command: OpenLoop) -> FloatArray:
@@ -111,14 +111,14 @@ def correction_time(reached: FloatArray, goal: FloatArray, rotation_ratio: float
     return min(turns) / rate + far / _DRIVE_M_S
 
 
-def mean_by_trajectory(scores: Sequence[Score]) -> dict[str, dict[str, Score]]:
+def mean_scores_by_trajectory(scores: Sequence[OpenLoopScore]) -> dict[str, dict[str, OpenLoopScore]]:
     """Means over the arm configurations of runs named trajectory,configuration,controller: by trajectory, then by controller."""
-    groups: dict[tuple[str, str], list[Score]] = {}
+    groups: dict[tuple[str, str], list[OpenLoopScore]] = {}
     for score in scores:
         trajectory, _, controller = score.run.split(",")
         groups.setdefault((trajectory, controller), []).append(score)
-    table: dict[str, dict[str, Score]] = {}
+    table: dict[str, dict[str, OpenLoopScore]] = {}
     for (trajectory, controller), members in groups.items():
         rows = np.array([[s.drive_error_m, s.correction_time_s, s.vision_error_m] for s in members]).mean(axis=0)
-        table.setdefault(trajectory, {})[controller] = Score(f"{trajectory},{controller}", *(float(v) for v in rows))
+        table.setdefault(trajectory, {})[controller] = OpenLoopScore(f"{trajectory},{controller}", *(float(v) for v in rows))
     return table

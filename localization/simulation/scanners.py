@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from localization.logs import message_templates
 from localization.logs.message_templates import Message
 from localization.settings import Below, Count, Positive, Settings, Share, Signed, at_least
-from localization.simulation.clock import Ticks, seconds
-from localization.simulation.raycast import Grid, cast, cast_at_people, make_grid
-from localization.simulation.track import Track, pose_at
-from localization.simulation.world import World
+from localization.simulation.track import SampleClock, TrueMotion, pose_at, seconds
+from localization.simulation.world import Grid, World, cast, cast_at_people, make_grid
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
@@ -69,7 +67,7 @@ class SpinningConfig(Settings):
     """Farther things are not seen [m]."""
 
 
-class Scanner:
+class PlanarScanner:
     """Makes LaserScans. ``mount`` is where the scanner really sits; ``late_s`` is by how much its stamps are late."""
 
     def __init__(
@@ -92,9 +90,9 @@ class Scanner:
         self._late_ns = round(late_s * 1e9)
         angles, times, ranges = (self._first, self._step), (self.beam_s, 1.0 / c.rate_hz), (c.min_range_m, c.max_range_m)
         self.form = message_templates.laser_scan(topic, frame, c.beams, angles, times, ranges)
-        self._ticks = Ticks(c.rate_hz, self.beam_s * (c.beams - 1))
+        self._ticks = SampleClock(c.rate_hz, self.beam_s * (c.beams - 1))
 
-    def messages(self, track: Track) -> list[Message]:
+    def messages(self, track: TrueMotion) -> list[Message]:
         """All scans that are complete and were not yet taken."""
         starts = self._ticks.due(track.end_s)
         if not len(starts):
@@ -132,7 +130,7 @@ def _sweep(
     people: FloatArray,
     longest: float,
     ranges: FloatArray,
-) -> None:  # pragma: no cover
+) -> None:
     """True distances (scans, beams); inf where nothing is met."""
     for k in range(ranges.shape[0]):
         for i in range(ranges.shape[1]):
@@ -170,9 +168,9 @@ class SpinningScanner:
         self._late_ns = round(late_s * 1e9)
         self._elevation = np.radians(np.linspace(config.lowest_deg, config.highest_deg, config.rings))
         self.form = message_templates.point_cloud(topic, frame, config.rings, config.columns, _CLOUD_FIELDS)
-        self._ticks = Ticks(config.rate_hz, 1.0 / config.rate_hz)
+        self._ticks = SampleClock(config.rate_hz, 1.0 / config.rate_hz)
 
-    def messages(self, track: Track) -> list[Message]:
+    def messages(self, track: TrueMotion) -> list[Message]:
         """All turns that are complete and were not yet taken."""
         found = []
         for start in self._ticks.due(track.end_s):
@@ -181,7 +179,7 @@ class SpinningScanner:
             found.append(Message(self.form, stamp + round(1e9 / self._config.rate_hz), stamp + self._late_ns, (data,)))
         return found
 
-    def _turn(self, start_s: float, track: Track) -> NDArray[np.uint8]:
+    def _turn(self, start_s: float, track: TrueMotion) -> NDArray[np.uint8]:
         c = self._config
         level = np.empty((1, c.columns))
         column_s, step = 1.0 / c.rate_hz / c.columns, -2.0 * math.pi / c.columns  # clockwise, as they turn

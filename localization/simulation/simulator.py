@@ -14,13 +14,11 @@ from localization.logs.message_templates import Message, text
 from localization.logs.writer import write_bag
 from localization.simulation.drives import MoveArms, OpenLoop, Phase, PickUp, Pursuit, Rest, Route, turning
 from localization.simulation.experiments import Experiment, ExperimentConfig, find_experiment
-from localization.simulation.faults import Reality, changed
-from localization.simulation.masses import Masses
-from localization.simulation.raycast import clearance
-from localization.simulation.run_records import RUN_HZ, RunRecord
-from localization.simulation.sensor_suite import START_NS, SensorConfig, make_sensors, nominal_mounts, transforms
-from localization.simulation.track import Track
-from localization.simulation.vehicle import CG, COLUMNS, POSE, Body, VehicleConfig, VehicleState, advance
+from localization.simulation.faults import TrueRobot, changed
+from localization.simulation.sensors import START_NS, SensorConfig, make_sensors, nominal_mounts, transforms
+from localization.simulation.track import RUN_HZ, RunRecord, TrueMotion
+from localization.simulation.vehicle import CG, COLUMNS, POSE, Body, MassDistribution, VehicleConfig, VehicleState, advance
+from localization.simulation.world import clearance
 from motion_models.center_of_gravity.parts import require_support
 from motion_models.errors import CgError
 from motion_models.registry import make_model
@@ -64,16 +62,16 @@ class Simulation:
         """Named phases that are over."""
         self.lidar_mount = nominal_mounts(robot)[self.config.sensors.lidar_frame]
         """Where the log says that the LiDAR sits."""
-        self.reality = changed(Reality(Body.from_robot(robot), self.lidar_mount), effects)
+        self.reality = changed(TrueRobot(Body.from_robot(robot), self.lidar_mount), effects)
         self._body = self.reality.body
-        self._masses = Masses(robot)
+        self._masses = MassDistribution(robot)
         self._masses.pick_up(self.reality.payload_kg)
         self._state = VehicleState.at(np.array(experiment.start))
         first = np.zeros(COLUMNS)
         first[POSE], first[-1] = experiment.start, 1.0
         first[CG] = self._masses.cg(np.zeros(1))[0, :2] + np.array(self._body.cg_offset)
         self._check_support(first[CG])
-        self._track = Track(first, self.config.vehicle.step_s)
+        self._track = TrueMotion(first, self.config.vehicle.step_s)
         self._sensors = make_sensors(
             self.config.sensors, robot, self._masses, self.reality, self.world, np.random.SeedSequence(seed), experiment.with_gps
         )

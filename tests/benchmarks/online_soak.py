@@ -20,7 +20,7 @@ from localization.ros.session_files import Files
 from localization.ros.transports.base import Received
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.scanners import ScannerConfig
-from localization.simulation.sensor_suite import SensorConfig
+from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
