@@ -52,8 +52,8 @@ def _print(console: Console, info: LogInfo) -> None:
         table.add_row(*map(escape, cells))
     console.print(table)
     for part, used in info.parts.items():
-        said = "nothing" if used is None else f"{used['topic']} (chosen by {used['chosen_by']})"
-        console.print(f"{part.replace('_', ' ')}: {said}", markup=False)
+        topic_text = "nothing" if used is None else f"{used['topic']} (chosen by {used['chosen_by']})"
+        console.print(f"{part.replace('_', ' ')}: {topic_text}", markup=False)
     console.print(f"can be scored against: {', '.join(info.references) or 'nothing in the log'}", markup=False)
     for frame, mount in info.mounts.items():
         values = list(mount.values())

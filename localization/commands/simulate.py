@@ -37,7 +37,7 @@ class Simulate:
     seed: int = 0
     """Of all noise. The same seed gives the same log, byte for byte."""
     effect: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="ID=SIZE", help=_EFFECTS)] = ()
-    """What is different about the robot than its file says; may be given several times."""
+    """Difference of the robot from its file; may be given several times."""
     config: SimulationConfig = field(default_factory=SimulationConfig)
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write what is printed, and when each run began and ended, to this file as well."""

@@ -1,4 +1,4 @@
-"""From messages to events: what each topic's messages mean, by the part that the topic plays. Logs and live topics alike."""
+"""Messages to events, by the role of their topic. The same for logs and live topics."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class TopicDecoder(NamedTuple):
 
 
 class EventDecoder:
-    """Decoders of the topics in use, and what makes events of readings. It remembers the last readings of wheels and arms."""
+    """Decodes messages of the topics in use to events. Keeps the last readings of wheels and arms."""
 
     def __init__(
         self,
@@ -62,9 +62,9 @@ class EventDecoder:
         self.from_joints = JointsToWheels(len(left), len(right), robot.geometry.wheel_radius_m, wheels, stats)
         self.from_odometry = OdometryToWheels(robot.driver, wheels, stats)
         named = " and ".join(source.topic for source in sources.arms)
-        self._from_arms = None if arms is None else arms_to_cg(arms, robot.geometry, named, stats)
-        told_by = "" if sources.center_of_gravity is None else sources.center_of_gravity.topic
-        self._standing = partial(standing, geometry=robot.geometry, topic=told_by, oddity=Oddity.TIPPING_CG, stats=stats)
+        self._from_arms = None if arms is None else make_arm_cg_converter(arms, robot.geometry, named, stats)
+        cg_topic = "" if sources.center_of_gravity is None else sources.center_of_gravity.topic
+        self._check_cg = partial(check_tipping, geometry=robot.geometry, topic=cg_topic, oddity=Oddity.TIPPING_CG, stats=stats)
         self.decoders: Mapping[str, TopicDecoder] = {
             source.topic: TopicDecoder(_RANKS[source.kind], self._decoder(source)) for source in sources.used()
         }
@@ -82,7 +82,7 @@ class EventDecoder:
         elif isinstance(payload, OdometryReading):
             yield from self.from_odometry(payload)
         elif isinstance(payload, CgSample):
-            yield from self._standing(payload)
+            yield from self._check_cg(payload)
         else:
             yield payload
 
@@ -107,7 +107,7 @@ class EventDecoder:
 
 
 def decode_item(topic: str, log_ns: int, read: Callable[[], Any], decoder: TopicDecoder, stats: MessageStats) -> Item | None:
-    """The message that ``read`` gives, recorded at ``log_ns``, as an item to merge; None, and counted, where it says nothing."""
+    """Decode the message that ``read`` returns, recorded at ``log_ns``, to an item to merge; None, and counted, where it is unusable."""
     rank, decode = decoder
     try:
         message = read()
@@ -116,7 +116,7 @@ def decode_item(topic: str, log_ns: int, read: Callable[[], Any], decoder: Topic
     except UnusableError as reason:
         stats.count(topic, reason.oddity)
         return None
-    except (AttributeError, TypeError, ValueError):  # the log's own definition of the type lacks what the type has
+    except (AttributeError, TypeError, ValueError):  # fields of the type are missing in the log's own definition of it
         stats.count(topic, Oddity.MALFORMED)
         return None
     if payload is None:
@@ -126,8 +126,10 @@ def decode_item(topic: str, log_ns: int, read: Callable[[], Any], decoder: Topic
     return Item(log_ns, stamp, topic, rank, _SCAN_WEIGHT if rank == 3 else 1, payload)
 
 
-def arms_to_cg(model: CgModel, geometry: Geometry, topic: str, stats: MessageStats) -> Callable[[ArmReading], Iterator[CgSample]]:
-    """Converter of readings in order of time. It is silent until each joint of ``model`` was told once, by whatever message."""
+def make_arm_cg_converter(
+    model: CgModel, geometry: Geometry, topic: str, stats: MessageStats
+) -> Callable[[ArmReading], Iterator[CgSample]]:
+    """Converter of readings in order of time. It yields nothing until each joint of ``model`` was received once."""
     tracker = CgTracker(model)
 
     def convert(reading: ArmReading) -> Iterator[CgSample]:
@@ -135,12 +137,12 @@ def arms_to_cg(model: CgModel, geometry: Geometry, topic: str, stats: MessageSta
         if estimate is None:
             return
         sample = CgSample(reading.stamp_ns, estimate.position, estimate.covariance)
-        yield from standing(sample, geometry, topic, Oddity.TIPPING, stats)
+        yield from check_tipping(sample, geometry, topic, Oddity.TIPPING, stats)
 
     return convert
 
 
-def standing(sample: CgSample, geometry: Geometry, topic: str, oddity: Oddity, stats: MessageStats) -> Iterator[CgSample]:
+def check_tipping(sample: CgSample, geometry: Geometry, topic: str, oddity: Oddity, stats: MessageStats) -> Iterator[CgSample]:
     """``sample``, unless the robot would tip over with it, which is counted as ``oddity``."""
     if support_margin(sample.position, geometry.wheelbase_m, geometry.track_width_m) > 0.0:
         yield sample

@@ -1,7 +1,7 @@
-"""Messages that come or go many times a second, without an object for each of their parts, which takes rosbags longer than all the rest.
+"""Fast decoding and encoding of frequent messages (ROS 2 CDR, little endian), without an object for each of their parts.
 
-Read are those of sensors that a robot tells at 50 Hz and more, as bytes of ROS 2 (CDR, little endian) by what rosbags would make of them;
-written are those that go out with each estimate, by templates that rosbags has filled once.
+Decoded are sensor messages at 50 Hz and more, with the values that rosbags gives; encoded are those published with each estimate, by
+templates that rosbags has filled once.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class LaserScanMessage(NamedTuple):
     ranges: NDArray[np.float32]
 
 
-_READERS: dict[str, Callable[[], Callable[[bytes], Any]]] = {
+_DECODERS: dict[str, Callable[[], Callable[[bytes], Any]]] = {
     "sensor_msgs/msg/Imu": lambda: _imu,
     "sensor_msgs/msg/JointState": lambda: _joint_states(),
     "sensor_msgs/msg/LaserScan": lambda: _laser_scan,
@@ -78,9 +78,9 @@ _READERS: dict[str, Callable[[], Callable[[bytes], Any]]] = {
 
 
 def fast_decoder(kind: str) -> Callable[[bytes], Any] | None:
-    """A reader of messages of type ``kind``, or None: it gives what is used of a message, or None for bytes of an unusual kind, which
-    rosbags has to look at. It raises (`struct.error`, `ValueError`) where rosbags would."""
-    return _READERS[kind]() if kind in _READERS else None
+    """Decoder of messages of type ``kind``, or None. It returns the fields in use, or None for an unusual encoding, which is left to
+    rosbags. It raises (`struct.error`, `ValueError`) where rosbags would."""
+    return _DECODERS[kind]() if kind in _DECODERS else None
 
 
 def _imu(data: bytes) -> ImuMessage | None:
@@ -110,15 +110,15 @@ def _laser_scan(data: bytes) -> LaserScanMessage | None:
 
 
 def _joint_states() -> Callable[[bytes], JointStateMessage | None]:
-    """It remembers the names of the last message: mostly they are those of the next."""
-    told, frame = b"", ""
+    """Caches the names of the last message: they rarely change."""
+    cached, frame = b"", ""
     names: tuple[str, ...] = ()
 
     def read(data: bytes) -> JointStateMessage | None:
-        nonlocal told, frame, names
+        nonlocal cached, frame, names
         if not data.startswith(_CDR):
             return None
-        if not told or not data.startswith(told, 12):
+        if not cached or not data.startswith(cached, 12):
             frame, at = _string(data, 12)
             at = _aligned(at, 4)
             (count,) = _UINT.unpack_from(data, at)
@@ -126,8 +126,8 @@ def _joint_states() -> Callable[[bytes], JointStateMessage | None]:
             for _ in range(count):
                 name, at = _string(data, _aligned(at, 4))
                 found.append(name)
-            told, names = data[12 : _aligned(at, 4)], tuple(found)
-        position, at = _doubles(data, 12 + len(told))
+            cached, names = data[12 : _aligned(at, 4)], tuple(found)
+        position, at = _doubles(data, 12 + len(cached))
         velocity, at = _doubles(data, at)
         _, at = _doubles(data, at)
         sec, nanosec, _ = _HEADER.unpack_from(data, _FIRST)
@@ -172,16 +172,16 @@ class FusedWriter:
         return self._transform.fill(Message(self._transform_form, estimate.stamp_ns, estimate.stamp_ns, _place(estimate)))
 
 
-def _named(form: MessageLayout, parent: str, body: str) -> MessageLayout:
-    """``form`` with these frames in its messages."""
+def _named(layout: MessageLayout, parent: str, body: str) -> MessageLayout:
+    """``layout`` with these frames in its messages."""
 
     def build(*parts: Any) -> Any:
-        made = form.build(*parts)
+        made = layout.build(*parts)
         stamped = made.transforms[0] if hasattr(made, "transforms") else made
         stamped.header.frame_id, stamped.child_frame_id = parent, body
         return made
 
-    return replace(form, build=build)
+    return replace(layout, build=build)
 
 
 def _place(estimate: FusedEstimate) -> tuple[FloatArray, FloatArray]:

@@ -1,4 +1,4 @@
-"""Messages of fixed shape as bytes: a message is serialised once by rosbags, and of all others only the numbers are put in place.
+"""Templates of messages with a fixed layout: rosbags serializes one message, and for all others only the numbers are written in place.
 
 rosbags takes some 50 us to serialise a message object; a simulator writes hundreds of them for each second that it may take 10 ms for.
 """
@@ -26,9 +26,9 @@ Array = NDArray[Any]
 
 
 class Message(NamedTuple):
-    """One message: which form, when it was sent, the stamp in its header, and the numbers in the order of the form's parts."""
+    """One message: its layout, time of sending, header stamp, and numbers in the order of the layout's parts."""
 
-    form: MessageLayout
+    layout: MessageLayout
     log_ns: int
     stamp_ns: int
     parts: tuple[Array, ...]
@@ -36,7 +36,7 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MessageLayout:
-    """What all messages of a topic have in common."""
+    """Common layout of all messages of a topic."""
 
     topic: str
     type: str
@@ -49,10 +49,10 @@ class MessageLayout:
 class Template:
     """The bytes of a form's messages, in the encoding of ROS 2 (CDR) or of ROS 1."""
 
-    def __init__(self, form: MessageLayout, *, is_ros1: bool) -> None:
-        marks = [_marks(kind, count, number) for number, (kind, count) in enumerate(form.shapes)]
-        data = STORE.serialize_cdr(form.build(_T["builtin_interfaces/msg/Time"](*_STAMP), *marks), form.type)
-        data = STORE.cdr_to_ros1(data, form.type) if is_ros1 else data
+    def __init__(self, layout: MessageLayout, *, is_ros1: bool) -> None:
+        marks = [_marks(kind, count, number) for number, (kind, count) in enumerate(layout.shapes)]
+        data = STORE.serialize_cdr(layout.build(_T["builtin_interfaces/msg/Time"](*_STAMP), *marks), layout.type)
+        data = STORE.cdr_to_ros1(data, layout.type) if is_ros1 else data
         self._bytes = bytes(data)
         stamp = struct.pack("<II", *_STAMP)
         self._stamps = [i for i in range(len(self._bytes) - 7) if self._bytes[i : i + 8] == stamp]
@@ -132,7 +132,7 @@ def laser_scan(
 
 
 def point_cloud(topic: str, frame: str, height: int, width: int, fields: Mapping[str, str]) -> MessageLayout:
-    """Part: the points' bytes, packed as ``fields`` (numpy's type by name) say."""
+    """Part: the points' bytes, packed as ``fields`` (numpy's type by name)."""
     codes = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
     layout, step = [], 0
     for name, kind in fields.items():
@@ -190,7 +190,7 @@ def fix(topic: str, frame: str, variances: Sequence[float]) -> MessageLayout:
 
 
 def odometry(topic: str, frame: str, child: str) -> MessageLayout:
-    """Parts: x, y; z and w of the heading's quaternion; vx, vy and wz of the body. Covariances are zero: it is the truth."""
+    """Parts: x, y; z and w of the heading's quaternion; vx, vy and wz of the body. Covariances are zero: they are exact."""
 
     def build(stamp: Any, place: Array, heading: Array, speed: Array, turn: Array) -> Any:
         pose = _T["geometry_msgs/msg/Pose"](position=_point((*place, 0)), orientation=_quaternion((0, 0, *heading)))

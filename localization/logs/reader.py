@@ -1,4 +1,4 @@
-"""A log as the rest of the library sees it: events, references, mounts, and what was odd."""
+"""A log: its events, references, sensor mounts, and warnings about its messages."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from motion_models.robot import Mount, Robot
 
 _GPS = "/fix"
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_TF_WATCHED_NS = 10_000_000_000
-_JOINT_STATES_SEEN = 500
+_TF_READ_NS = 10_000_000_000
+_JOINT_STATES_READ = 500
 
 
 def open_log(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> Log:  # noqa: B008 (frozen)
@@ -66,14 +66,14 @@ class Log:
         self._chooser = TopicChooser(path.name, self.channels, robot, topics)
         roles = choose_roles(path.name, self._chooser, robot, topics, self._joint_names)
         self.sources = roles.sources
-        """Which topic plays which part."""
+        """Topic of each role."""
         self.wheels_error = roles.wheels_error
         """Why `events` will refuse, if it will."""
         self._joints, self._arms, self._choice_notes = roles.joints, roles.arms, roles.warnings
         self._mount_notes: list[str] = []
         self.frames: dict[str, str] = {}
         """Frame of the first message of each topic that is used."""
-        self._clocks = self._watch_clocks()
+        self._clocks = self._plan_event_clocks()
 
     @property
     def duration_s(self) -> float:
@@ -90,7 +90,7 @@ class Log:
     def events(self) -> Iterator[Event]:
         """Wheel, CG, IMU samples and scans by header stamp, never decreasing; within a topic always increasing.
 
-        Raises `TopicError` if the joint states, the only source of wheels, lack the robot's wheel joints.
+        Raises `TopicError` if the joint states, the only source of wheels, have no wheel joint of the robot.
         """
         if self.wheels_error is not None:
             raise TopicError(" ".join([str(self.wheels_error), *self.damage()]))  # what was lost may be why
@@ -110,7 +110,7 @@ class Log:
 
     @cached_property
     def mounts(self) -> Mapping[str, Mount]:
-        """Pose of each sensor's frame in the body frame: the log's, and the robot file's for frames which the log lacks."""
+        """Pose of each sensor's frame in the body frame: the log's, and the robot file's for frames that are missing in the log."""
         transforms = FixedTransforms()
         tf = [channel for channel in self.channels if channel.type in _TF_TYPES]
         static = [channel for channel in tf if channel.topic.endswith("tf_static")]
@@ -124,7 +124,7 @@ class Log:
         if self.source.is_ros1:
             moving = [channel.topic for channel in tf if not channel.topic.endswith("tf_static")]
             for raw in self.source.messages(moving) if moving else ():
-                if raw.log_ns > self.start_ns + _TF_WATCHED_NS:
+                if raw.log_ns > self.start_ns + _TF_READ_NS:
                     break
                 _try(lambda raw=raw: transforms.add(decode(raw), is_static=False))  # type: ignore[misc]
         found = transforms.mounts()
@@ -134,15 +134,15 @@ class Log:
         return {"base_link": Mount(), **self.robot.mounts, **found}
 
     def damage(self) -> list[str]:
-        """Sentences about what of its files could not be read, and how much could, so far."""
+        """Warnings about which of its files could not be read, and how much could, so far."""
         return list(dict.fromkeys(self.source.warnings))
 
     def warnings(self) -> list[str]:
-        """Sentences about everything that was lost, mended or chosen without being told, so far: `damage` first."""
-        said = [*self.damage(), *self._mount_notes, *self._choice_notes]
+        """Warnings about everything that was lost, corrected or chosen by default so far: `damage` first."""
+        found = [*self.damage(), *self._mount_notes, *self._choice_notes]
         for stats in self._stats_by_topic.values():
-            said += stats.sentences()
-        return list(dict.fromkeys(said))
+            found += stats.describe()
+        return list(dict.fromkeys(found))
 
     def _events(self, stats: MessageStats) -> Iterator[Event]:
         decoder = EventDecoder(self.sources, self._joints, self._arms, self.robot, stats)
@@ -171,9 +171,9 @@ class Log:
                 yield raw.log_ns, message
 
     def _joint_names(self, topic: str) -> Iterator[list[str]]:
-        return (message.name for _, message in self._first_messages(topic, _JOINT_STATES_SEEN))
+        return (message.name for _, message in self._first_messages(topic, _JOINT_STATES_READ))
 
-    def _watch_clocks(self) -> ClockPlan:
+    def _plan_event_clocks(self) -> ClockPlan:
         return self._clock_plan([source.topic for source in self.sources.used()])
 
     def _clock_plan(self, topics: list[str]) -> ClockPlan:

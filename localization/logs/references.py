@@ -21,7 +21,7 @@ _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 
 
 def reference_decoder(kind: str) -> Callable[[Any, int], Reference]:
-    """Decoder of messages of type ``kind`` (one of `topics.REFERENCE_TYPES`); that of NavSatFix remembers the first fix."""
+    """Decoder of messages of type ``kind`` (one of `topic_roles.REFERENCE_TYPES`); that of NavSatFix keeps the first fix as origin."""
     if kind == "sensor_msgs/msg/NavSatFix":
         return _fix_decoder()
     return {
@@ -42,7 +42,7 @@ def _reference(stamp: int, position: Any, orientation: Any, covariance: Any) -> 
     cov = np.full((3, 3), np.nan)
     if covariance is not None:
         planar = np.asarray(covariance, dtype=float).reshape(6, 6)[_PLANAR]
-        # All zeros is how drivers say that they do not know.
+        # Drivers without a covariance fill in zeros.
         if np.isfinite(planar).all() and (np.diag(planar) >= 0).all() and planar.any():
             cov = planar
     return Reference(stamp, where, yaw, cov)
@@ -58,13 +58,13 @@ def _fix_decoder() -> Callable[[Any, int], Reference]:
             raise UnusableError(Oddity.NO_FIX)
         height = float(message.altitude) if math.isfinite(message.altitude) else 0.0
         latitude, longitude = np.radians(degrees)
-        here = geodetic_to_ecef(latitude, longitude, height)
+        position = geodetic_to_ecef(latitude, longitude, height)
         if origin is None:
-            origin = here, east_north(latitude, longitude)
+            origin = position, east_north(latitude, longitude)
         cov = np.full((3, 3), np.nan)
         if int(message.position_covariance_type) > 0:
             cov[:2, :2] = np.asarray(message.position_covariance, dtype=float).reshape(3, 3)[:2, :2]
-        return Reference(stamp, origin[1] @ (here - origin[0]), None, cov)
+        return Reference(stamp, origin[1] @ (position - origin[0]), None, cov)
 
     return decode
 

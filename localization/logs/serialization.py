@@ -1,4 +1,4 @@
-"""Messages as bytes on the wire, ROS 2's (CDR) and ROS 1's, read and written as those of logs are; and what fields a type has."""
+"""Serialization of messages, ROS 2 (CDR) and ROS 1, in logs and on topics; and the fields of a type."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ from localization.logs.message_templates import STORE, STORE_ROS1
 
 _GRAPH_PACKAGE = "rmw_dds_common"
 _STORE_GRAPH = get_typestore(Stores.ROS2_JAZZY)  # its entities have 16 bytes since Iron, 24 in Humble
-_LONGEST_DEFINITION = 1 << 18  # characters; those of ROS's own types have up to 20,000
-_LONGEST_FIXED_ARRAY = 10_000  # elements; ROS's longest is a covariance of 36. The reader's code has a line or more for each
+_MAX_DEFINITION_CHARACTERS = 1 << 18  # characters; those of ROS's own types have up to 20,000
+_MAX_FIXED_ARRAY_LENGTH = (
+    10_000  # elements; ROS's longest is a covariance of 36, and the generated deserializer has a line or more for each
+)
 
 Shape = tuple[Any, ...]
 """Of a field: ("base", name), ("message", type), ("array", shape, length) or ("sequence", shape)."""
@@ -32,14 +34,14 @@ def encode(message: Any, *, is_ros1: bool = False) -> bytes:
 
 
 def decoder(kind: str, *, is_ros1: bool = False) -> Callable[[bytes], Any]:
-    """What makes message objects of type ``kind`` (package/msg/Type) of bytes, or, of some types, what is used of them (`quick`); it raises
-    `UnusableError`."""
+    """Deserializer of messages of type ``kind`` (package/msg/Type); for frequent types it returns the fields in use only (`fast_cdr`).
+    It raises `UnusableError`."""
     deserialize = STORE_ROS1.deserialize_ros1 if is_ros1 else STORE.deserialize_cdr
-    quick = None if is_ros1 else fast_decoder(kind)
+    fast = None if is_ros1 else fast_decoder(kind)
 
     def decode(data: bytes) -> Any:
         try:
-            message = None if quick is None else quick(data)
+            message = None if fast is None else fast(data)
             return deserialize(data, kind) if message is None else message
         except Exception as error:  # struct.error, SerdeError, UnicodeDecodeError, ... : the bytes are not such a message
             raise UnusableError(Oddity.UNDECODABLE) from error
@@ -65,7 +67,7 @@ def definition(kind: str, *, is_ros1: bool = False) -> tuple[str, str]:
 
 
 def live_channel(topic: str, kind: str, count: int) -> Channel:
-    """A topic of a robot on which ``count`` messages were heard, as if it were a log's."""
+    """A topic of a robot on which ``count`` messages were received, as a channel of a log."""
     return Channel(topic, kind, MessageDefinition(MessageDefinitionFormat.NONE, ""), count)
 
 
@@ -92,7 +94,7 @@ def _shape(described: Any) -> Shape:
 class Decoder:
     """Raw messages to rosbags' message objects, by the definitions that the log carries, else by those of ROS 2 Humble (ROS 1: Noetic).
 
-    A type is looked at when its first message comes: definitions that make no sense hurt only those who use them.
+    A type's definition is parsed at its first message: a damaged definition affects that type only.
     """
 
     def __init__(self, channels: Iterable[Channel], *, is_ros1: bool) -> None:
@@ -133,7 +135,7 @@ def _deserializer(kind: str, form: MessageDefinitionFormat, text: str, is_ros1: 
 
 def _parse_definition(kind: str, form: MessageDefinitionFormat, text: str) -> dict[str, Any]:
     """Fields by type. Raises anything."""
-    if len(text) > _LONGEST_DEFINITION:
+    if len(text) > _MAX_DEFINITION_CHARACTERS:
         raise ValueError("a definition that is too long")
     if form == MessageDefinitionFormat.MSG:
         return dict(get_types_from_msg(text, kind))
@@ -153,7 +155,7 @@ def _is_bounded(types: Mapping[str, Any]) -> bool:
             if node not in (Nodetype.ARRAY, Nodetype.SEQUENCE):
                 continue
             (element, name), length = inside
-            if node == Nodetype.ARRAY and length > _LONGEST_FIXED_ARRAY:
+            if node == Nodetype.ARRAY and length > _MAX_FIXED_ARRAY_LENGTH:
                 return False
             if element == Nodetype.NAME and not _has_bytes(types, name, len(types)):
                 return False

@@ -13,10 +13,10 @@ from ruamel.yaml import YAML
 
 from localization.errors import LogError
 from localization.logs import mcap, ros1, sqlite
-from localization.logs.chunks import DamagedError, RawMessage, Source, inflate_file, merge_channels
+from localization.logs.chunks import DamagedError, RawMessage, Source, decompress_file, merge_channels
 from motion_models.text_files import check_file
 
-_LONGEST_METADATA = 4 << 20
+_MAX_METADATA_BYTES = 4 << 20
 """Of metadata.yaml [B]. It has some kB for a hundred topics and 200 B for each file that a recording was split into."""
 
 
@@ -50,7 +50,7 @@ def _open_folder(path: Path) -> Source:
 def _read_metadata(path: Path) -> tuple[list[str], int]:
     """Names of the storage files, and how many messages they hold. Raises `DamagedError` and `FileNotFoundError`."""
     require_file(path)
-    if path.stat().st_size > _LONGEST_METADATA:
+    if path.stat().st_size > _MAX_METADATA_BYTES:
         raise DamagedError("metadata.yaml is longer than any recorder's")
     try:
         with warnings.catch_warnings():
@@ -130,7 +130,7 @@ class DecompressedSource:
         target = Path(self._folder.name) / path.stem
         require_file(path)
         try:
-            stopped = inflate_file(path, target)
+            stopped = decompress_file(path, target)
         except OSError as error:
             where = f"'{path}' cannot be decompressed into '{self._folder.name}': {error.strerror}"
             raise LogError(f"{where}. Set TMPDIR to a folder with more room.") from error

@@ -1,4 +1,4 @@
-"""A physical skid-steer robot with arms, sensors and a world, that writes real bags. It knows nothing of the models under test."""
+"""A physical skid-steer robot with arms, sensors and a world, that writes real bags. It shares no code with the linear models."""
 
 from localization.simulation.experiments import EXPERIMENTS, Experiment, ExperimentConfig
 from localization.simulation.faults import FAULTS, Fault

@@ -2,7 +2,7 @@
 
 The physics are those of `motion_models.friction.dynamics` (Ebersole 2016, 3.15-3.26), with one thing added: tyres are springs. On a
 rigid robot the loads hang on the forces and the forces on the loads at the same instant, and for a high CG on a grippy floor there may
-be no loads that agree (Painleve's paradox, 1895). Here the loads follow what the forces ask for within a tyre's time; at rest and in
+be no loads that agree (Painleve's paradox, 1895). Here the loads follow their quasi-static values within a tyre's time; at rest and in
 steady motion they are the same.
 """
 
@@ -66,7 +66,7 @@ class DynamicsInput(NamedTuple):
 
 
 class Derivatives(NamedTuple):
-    """Rates of vx, vy, wz, the tilts that the forces ask for, and the rates' derivatives by vx, vy, wz at fixed loads."""
+    """Rates of vx, vy, wz, the quasi-static tilts, and the rates' derivatives by vx, vy, wz at fixed loads."""
 
     x: float
     y: float
@@ -85,7 +85,7 @@ class Derivatives(NamedTuple):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def change(vx: float, vy: float, wz: float, xi: float, eta: float, now: DynamicsInput, body: Chassis) -> Derivatives:
+def derivatives(vx: float, vy: float, wz: float, xi: float, eta: float, now: DynamicsInput, body: Chassis) -> Derivatives:
     """Accelerations of the wheelbase's centre in the body frame at the twist ``vx, vy, wz`` and the tilt ``xi, eta``.
 
     The tilt is where the loads' centre lies, as a fraction of the half wheelbase and the half track (see `contact.loads`);
@@ -122,7 +122,7 @@ def change(vx: float, vy: float, wz: float, xi: float, eta: float, now: Dynamics
     m -= mean_mu * body.scrub * spin * whole
     m_wz -= mean_mu * body.scrub * body.half_track * per * body.creep * body.creep * whole * whole * whole
 
-    # 3.21-3.23: what the forces ask of the loads. 3.24-3.26, then 3.18 and 3.19 solved for the base.
+    # 3.21-3.23: quasi-static loads. 3.24-3.26, then 3.18 and 3.19 solved for the base.
     load = now.mass * (body.gravity + now.cg_az)
     p, i = load / now.mass, load / now.inertia
     alpha = i * m
@@ -150,7 +150,7 @@ def change(vx: float, vy: float, wz: float, xi: float, eta: float, now: Dynamics
 GAMMA = 1.0 - math.sqrt(0.5)
 """The method's coefficient: its stages are at GAMMA h and at h."""
 _NEWTON_STEPS = 25
-_CLOSE = 1e-9  # m/s; the last step of Newton squares it
+_NEWTON_TOLERANCE_M_S = 1e-9  # m/s; the last step of Newton squares it
 _HALVINGS = 10
 
 
@@ -158,14 +158,14 @@ _HALVINGS = 10
 def implicit_stage(
     guess: tuple[float, float, float], base: tuple[float, float, float], h: float, xi: float, eta: float, now: DynamicsInput, body: Chassis
 ) -> tuple[float, float, float, float, float, bool]:
-    """The twist V = ``base`` + ``h`` change(V), searched from ``guess``; the tilts that its forces ask for, and whether it was found."""
+    """The twist V = ``base`` + ``h`` derivatives(V), searched from ``guess``; its quasi-static tilts, and whether it was found."""
     arm2 = body.half_track * body.half_track
     vx, vy, wz = guess
     dx = dy = dw = 0.0
     fraction, left, to_xi, to_eta = 1.0, math.inf, xi, eta
     for _ in range(_NEWTON_STEPS):
         x, y, w = vx + fraction * dx, vy + fraction * dy, wz + fraction * dw
-        k = change(x, y, w, xi, eta, now, body)
+        k = derivatives(x, y, w, xi, eta, now, body)
         rx, ry, rw = base[0] + h * k.x - x, base[1] + h * k.y - y, base[2] + h * k.w - w
         error = rx * rx + ry * ry + rw * rw * arm2
         if error < (1.0 - 1e-4 * fraction) * left or error < 1e-26:
@@ -178,7 +178,7 @@ def implicit_stage(
             dx = over * (c00 * rx + (a02 * a21 - a01 * a22) * ry + (a01 * a12 - a02 * a11) * rw)
             dy = over * (c10 * rx + (a00 * a22 - a02 * a20) * ry + (a02 * a10 - a00 * a12) * rw)
             dw = over * (c20 * rx + (a01 * a20 - a00 * a21) * ry + (a00 * a11 - a01 * a10) * rw)
-            if max(abs(dx), abs(dy), abs(dw) * body.half_track) < _CLOSE:
+            if max(abs(dx), abs(dy), abs(dw) * body.half_track) < _NEWTON_TOLERANCE_M_S:
                 return vx + dx, vy + dy, wz + dw, to_xi, to_eta, True
             fraction = 1.0
         else:
@@ -189,7 +189,7 @@ def implicit_stage(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def follow(q: float, target: float, slope: float, lag: float, t: float) -> tuple[float, float]:
+def wheel_response(q: float, target: float, slope: float, lag: float, t: float) -> tuple[float, float]:
     """A wheel's rate after ``t`` seconds, and the angle it turned, where its speed loop follows ``target`` + ``slope`` t with a ``lag``."""
     behind = q - target + slope * lag
     left = math.exp(-t / lag)
@@ -205,44 +205,40 @@ def _grip(x: float, y: float, patches: FloatArray) -> float:
     return 1.0
 
 
+class Plant(NamedTuple):
+    """Robot, floor and motor control of one call of `integrate`."""
+
+    body: Chassis
+    mass: float
+    """With payload [kg]."""
+    inertia: float
+    """With payload, about the CG [kg m^2]."""
+    slope_gravity: float
+    """Gravity along the floor, down its slope, which rises towards the world's +x [m/s^2]."""
+    yields: FloatArray
+    """(3,) shear of a loose floor layer, as `Body.yields`."""
+    patches: FloatArray
+    """(k, 5) floor rectangles x0, y0, x1, y1 with a factor of the friction."""
+    motor_lag_s: float
+    ramp: float
+    """Largest change of the wheel rates' set points [rad/s^2]."""
+
+
 @numba.njit(cache=True, error_model="numpy")
-def drive(
-    state: FloatArray,
-    wheels: FloatArray,
-    cg: FloatArray,
-    out: FloatArray,
-    h: float,
-    mass: float,
-    inertia: float,
-    along: float,
-    yields: FloatArray,
-    patches: FloatArray,
-    body: Chassis,
-    lag: float,
-    ramp: float,
-) -> int:
-    """Advance ``state`` (16,), fill ``out`` (n, 13); the index of the step that failed, or -1."""
-    targets, slopes = np.empty(2), np.empty(2)
+def integrate(state: FloatArray, wheels: FloatArray, cg: FloatArray, out: FloatArray, h: float, plant: Plant) -> int:
+    """Advance ``state`` (16,) by steps of ``h`` [s], fill ``out`` (n, 13); the index of the step that failed, or -1."""
+    body, targets, slopes = plant.body, np.empty(2), np.empty(2)
     if math.isnan(state[12]):  # at first the loads are those of standing
         state[12], state[13] = cg[0, 0] / body.half_wheelbase, cg[0, 1] / body.half_track
     for k in range(wheels.shape[0]):
         for j in range(2):
             targets[j] = state[10 + j]
-            slopes[j] = min(ramp, max(-ramp, (wheels[k, j] - targets[j]) / h))
-        c, s = math.cos(state[2]), math.sin(state[2])
-        grips = 1.0, 1.0, 1.0, 1.0
-        if patches.shape[0] > 0:
-            fx, fy, lx, ly = c * body.half_wheelbase, s * body.half_wheelbase, -s * body.half_track, c * body.half_track
-            grips = (
-                _grip(state[0] + fx + lx, state[1] + fy + ly, patches),
-                _grip(state[0] + fx - lx, state[1] + fy - ly, patches),
-                _grip(state[0] - fx + lx, state[1] - fy + ly, patches),
-                _grip(state[0] - fx - lx, state[1] - fy - ly, patches),
-            )
-        # Where Newton's method does not settle, the step is cut in pieces.
+            slopes[j] = min(plant.ramp, max(-plant.ramp, (wheels[k, j] - targets[j]) / h))
+        grips = _wheel_grips(state, body, plant.patches)
+        # Where Newton's method does not converge, the step is cut in pieces.
         pieces, found = 1, False
         for _ in range(_HALVINGS):
-            found = _step(state, targets, slopes, cg[k], h, pieces, mass, inertia, along, yields, grips, body, lag)
+            found = _step(state, targets, slopes, cg[k], (h, pieces), grips, plant)
             if found:
                 break
             pieces *= 2
@@ -252,11 +248,26 @@ def drive(
             state[10 + j] = targets[j] + slopes[j] * h
         out[k, :10] = state[:10]
         vx, vy, wz = state[3], state[4], state[5]
-        out[k, 3], out[k, 4], out[k, 5] = _sheared(vx, vy, wz, yields)
+        out[k, 3], out[k, 4], out[k, 5] = _sheared(vx, vy, wz, plant.yields)
         out[k, 10] = cg[k, 0] + h * (cg[k, 2] + 0.5 * h * cg[k, 4])
         out[k, 11] = cg[k, 1] + h * (cg[k, 3] + 0.5 * h * cg[k, 5])
         out[k, 12] = 1.0 - max(abs(state[12]), abs(state[13]))
     return -1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _wheel_grips(state: FloatArray, body: Chassis, patches: FloatArray) -> tuple[float, float, float, float]:
+    """Factors of the friction under front left, front right, rear left and rear right wheel."""
+    if patches.shape[0] == 0:
+        return 1.0, 1.0, 1.0, 1.0
+    c, s = math.cos(state[2]), math.sin(state[2])
+    fx, fy, lx, ly = c * body.half_wheelbase, s * body.half_wheelbase, -s * body.half_track, c * body.half_track
+    return (
+        _grip(state[0] + fx + lx, state[1] + fy + ly, patches),
+        _grip(state[0] + fx - lx, state[1] + fy - ly, patches),
+        _grip(state[0] - fx + lx, state[1] - fy + ly, patches),
+        _grip(state[0] - fx - lx, state[1] - fy - ly, patches),
+    )
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -265,31 +276,51 @@ def _sheared(vx: float, vy: float, wz: float, yields: FloatArray) -> tuple[float
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _inputs_at(
+    t: float, rolls: tuple[float, float], heading: float, cg: FloatArray, grips: tuple[float, float, float, float], plant: Plant
+) -> DynamicsInput:
+    """What acts on the robot ``t`` seconds after the start of the step, at wheel rates ``rolls`` [rad/s]."""
+    return DynamicsInput(
+        plant.body.radius_left * rolls[0],
+        plant.body.radius_right * rolls[1],
+        grips[0],
+        grips[1],
+        grips[2],
+        grips[3],
+        plant.mass,
+        plant.inertia,
+        cg[0] + t * (cg[2] + 0.5 * t * cg[4]),
+        cg[1] + t * (cg[3] + 0.5 * t * cg[5]),
+        cg[2] + t * cg[4],
+        cg[3] + t * cg[5],
+        cg[4],
+        cg[5],
+        cg[6],
+        -plant.slope_gravity * plant.mass * math.cos(heading),
+        plant.slope_gravity * plant.mass * math.sin(heading),
+    )
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _step(
     state: FloatArray,
     targets: FloatArray,
     slopes: FloatArray,
     cg: FloatArray,
-    whole: float,
-    pieces: int,
-    mass: float,
-    inertia: float,
-    along: float,
-    yields: FloatArray,
+    duration: tuple[float, int],
     grips: tuple[float, float, float, float],
-    body: Chassis,
-    lag: float,
+    plant: Plant,
 ) -> bool:
-    """One step in ``pieces``: changes ``state`` but for the set points; or leaves it as it is and says that it failed.
+    """One step of ``duration`` [s] in that many pieces: changes ``state`` but for the set points; or leaves it unchanged, False.
 
     The tilt follows explicitly (a Runge-Kutta method of second order with the same stages), which its time constant allows.
     """
-    h = whole / pieces
+    body, lag = plant.body, plant.motor_lag_s
+    h = duration[0] / duration[1]
     xi, eta, rate_xi, rate_eta = state[12], state[13], state[14], state[15]
-    late = 0.5 / GAMMA
+    late, more = 0.5 / GAMMA, (1.0 - GAMMA) * h
     x, y, theta, vx, vy, wz = state[0], state[1], state[2], state[3], state[4], state[5]
-    q_l, q_r, a_l, a_r = state[6], state[7], state[8], state[9]
-    for i in range(pieces):
+    for i in range(duration[1]):
         v_0 = (vx, vy, wz)
         base, guess = v_0, v_0
         rate_x = rate_y = rate_w = 0.0
@@ -299,49 +330,25 @@ def _step(
         for stage in range(2):
             share = GAMMA if stage == 0 else 1.0
             t = i * h + share * h
-            roll_l = follow(state[6], targets[0], slopes[0], lag, t)[0]
-            roll_r = follow(state[7], targets[1], slopes[1], lag, t)[0]
-            ahead = theta + share * h * guess[2]
-            push_x, push_y = -along * mass * math.cos(ahead), along * mass * math.sin(ahead)
-            now = DynamicsInput(
-                body.radius_left * roll_l,
-                body.radius_right * roll_r,
-                grips[0],
-                grips[1],
-                grips[2],
-                grips[3],
-                mass,
-                inertia,
-                cg[0] + t * (cg[2] + 0.5 * t * cg[4]),
-                cg[1] + t * (cg[3] + 0.5 * t * cg[5]),
-                cg[2] + t * cg[4],
-                cg[3] + t * cg[5],
-                cg[4],
-                cg[5],
-                cg[6],
-                push_x,
-                push_y,
-            )
-            if stage == 1:
-                more = (1.0 - GAMMA) * h
-                base = v_0[0] + more * rate_x, v_0[1] + more * rate_y, v_0[2] + more * rate_w
+            roll_l = wheel_response(state[6], targets[0], slopes[0], lag, t)[0]
+            roll_r = wheel_response(state[7], targets[1], slopes[1], lag, t)[0]
+            now = _inputs_at(t, (roll_l, roll_r), theta + share * h * guess[2], cg, grips, plant)
             if math.isnan(first_xi):  # only at the very start: afterwards the rate is known from the step before
-                asked = change(vx, vy, wz, xi, eta, now, body)
-                first_xi, first_eta = (asked.xi - xi) / body.tyre_lag, (asked.eta - eta) / body.tyre_lag
+                quasi_static = derivatives(vx, vy, wz, xi, eta, now, body)
+                first_xi, first_eta = (quasi_static.xi - xi) / body.tyre_lag, (quasi_static.eta - eta) / body.tyre_lag
             if stage == 0:
                 xi, eta = xi_0 + GAMMA * h * first_xi, eta_0 + GAMMA * h * first_eta
             else:
+                base = v_0[0] + more * rate_x, v_0[1] + more * rate_y, v_0[2] + more * rate_w
                 xi = xi_0 + h * ((1.0 - late) * first_xi + late * rate_xi)
                 eta = eta_0 + h * ((1.0 - late) * first_eta + late * rate_eta)
+                from_x, from_y, from_theta = x + more * by_x, y + more * by_y, theta + more * by_theta
             u, v, w, to_xi, to_eta, found = implicit_stage(guess, base, GAMMA * h, xi, eta, now, body)
             if not found:
                 return False
             rate_xi, rate_eta = (to_xi - xi) / body.tyre_lag, (to_eta - eta) / body.tyre_lag
             rate_x, rate_y, rate_w = (u - base[0]) / (GAMMA * h), (v - base[1]) / (GAMMA * h), (w - base[2]) / (GAMMA * h)
-            if stage == 1:
-                more = (1.0 - GAMMA) * h
-                from_x, from_y, from_theta = x + more * by_x, y + more * by_y, theta + more * by_theta
-            su, sv, by_theta = _sheared(u, v, w, yields)
+            su, sv, by_theta = _sheared(u, v, w, plant.yields)
             heading = from_theta + GAMMA * h * by_theta
             c, s = math.cos(heading), math.sin(heading)
             by_x, by_y = c * su - s * sv, s * su + c * sv
@@ -350,7 +357,7 @@ def _step(
         x, y, theta = from_x + GAMMA * h * by_x, from_y + GAMMA * h * by_y, from_theta + GAMMA * h * by_theta
     state[0], state[1], state[2], state[3], state[4], state[5] = x, y, theta, vx, vy, wz
     state[12], state[13], state[14], state[15] = xi, eta, rate_xi, rate_eta
-    q_l, turned_l = follow(state[6], targets[0], slopes[0], lag, whole)
-    q_r, turned_r = follow(state[7], targets[1], slopes[1], lag, whole)
-    state[6], state[7], state[8], state[9] = q_l, q_r, a_l + turned_l, a_r + turned_r
+    for j in range(2):
+        state[6 + j], turned = wheel_response(state[6 + j], targets[j], slopes[j], lag, duration[0])
+        state[8 + j] += turned
     return True

@@ -1,7 +1,7 @@
-"""Causes as physical changes: what is different about the robot, its floor or its sensors, and told nowhere in the log.
+"""Faults as physical changes of the robot, its floor or its sensors, of which the log has no record.
 
-Each effect changes a `TrueRobot`, which starts as the robot file has it. Mounts in /tf_static, joint names and all else that a log tells
-stay nominal. Nothing here knows how a diagnosis would find it.
+Each fault changes a `TrueRobot`, which starts as the robot file has it. Mounts in /tf_static, joint names and all else in the log stay
+nominal. Independent of the diagnosis.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from motion_models.robot import Mount
 
 @dataclass(frozen=True)
 class TrueRobot:
-    """How things really are."""
+    """True parameters of robot, floor and sensors."""
 
     body: Body
     lidar: Mount
@@ -32,13 +32,13 @@ class TrueRobot:
     """About the body's z axis [rad/s]."""
     encoder_lost: float = 0.0
     """Share of time in which the front left encoder loses its counts."""
-    side_friction_later: float = 1.0
+    friction_change_factor: float = 1.0
     """Factor of the sideways friction in the second half of the drive."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One cause."""
+    """One fault."""
 
     id: str
     unit: str
@@ -127,7 +127,7 @@ _ALL = (
         "1",
         "sideways grip is more by this share in the second half of the drive",
         0.9,
-        _plain("side_friction_later", factor=True),
+        _plain("friction_change_factor", factor=True),
     ),
     Fault("lateral_force_law", "1", "the tyres follow the other contact law by this share (1: wholly)", 1.0, _other_law),
     Fault("diagonal_load", "1", "a warped chassis loads front left and rear right by this share of m g / 4", 0.9, _param("warp")),
@@ -160,7 +160,7 @@ def parse_faults(texts: tuple[str, ...]) -> dict[str, float]:
     return sizes
 
 
-def changed(reality: TrueRobot, effects: Mapping[str, float]) -> TrueRobot:
+def apply_faults(reality: TrueRobot, effects: Mapping[str, float]) -> TrueRobot:
     """``reality`` with all ``effects`` (size by id). Raises `SimulationError` for one that does not exist or is out of reason."""
     for name, size in effects.items():
         if name not in FAULTS:

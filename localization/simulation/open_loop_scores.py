@@ -1,4 +1,4 @@
-"""Scores of open-loop drives (Ebersole 2016, sec. 5.2): how far from the command, how long to mend it, how far from the odometry."""
+"""Scores of open-loop drives (Ebersole 2016, sec. 5.2): how far from the command, how long to correct it, how far from the odometry."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class OpenLoopScore:
     correction_time_s: float
     """To turn to the goal, drive there, and turn to its heading."""
     vision_error_m: float
-    """Mean distance between the actual path, as the LiDAR sees it, and the path of the controller's odometry."""
+    """Mean distance between the actual path, as tracked by the LiDAR, and the path of the controller's odometry."""
 
     def to_dict(self) -> dict[str, float | str]:
         return {name: getattr(self, name) for name in ("run", "drive_error_m", "correction_time_s", "vision_error_m")}
@@ -56,27 +56,27 @@ def _score(run: RunRecord, command: OpenLoop, simulation: Simulation, body_T_tra
     actual = se2.compose(run.poses, body_T_tracked)
     actual = se2.between(actual[0], actual)
     wanted = commanded_path(command)
-    seen = odometry_path(run, command, simulation)
-    vision = float(np.mean(np.hypot(*(actual - seen)[:, :2].T)))
-    drive = float(np.mean(np.hypot(*(resampled(actual) - resampled(wanted))[:, :2].T)))
+    odometry = odometry_path(run, command, simulation)
+    vision = float(np.mean(np.hypot(*(actual - odometry)[:, :2].T)))
+    drive = float(np.mean(np.hypot(*(resample(actual) - resample(wanted))[:, :2].T)))
     return OpenLoopScore(run.name, drive, correction_time(actual[-1], wanted[-1], rotation_ratio), vision)
 
 
 def commanded_path(command: OpenLoop) -> FloatArray:
-    """(n, 3) poses of a robot that does as it is told."""
+    """(n, 3) poses of a robot that follows its commands exactly."""
     times = np.arange(0.5 * _FINE_S, command.duration_s, _FINE_S)
     vx, wz = command.profile(times).T
-    return chained(np.column_stack([vx, np.zeros(len(vx)), wz]) * _FINE_S)
+    return integrate_steps(np.column_stack([vx, np.zeros(len(vx)), wz]) * _FINE_S)
 
 
 def odometry_path(run: RunRecord, command: OpenLoop, simulation: Simulation) -> FloatArray:
     """(n, 3) poses that the controller's own model makes of the wheels' angles."""
     model = make_model(command.controller, simulation.robot)
     turned = np.diff(run.wheel_angles, axis=0)
-    return chained(model.twist(turned, run.nominal_cg, model.nominal).value)
+    return integrate_steps(model.twist(turned, run.nominal_cg, model.nominal).value)
 
 
-def chained(steps: FloatArray) -> FloatArray:
+def integrate_steps(steps: FloatArray) -> FloatArray:
     """(n + 1, 3) poses of a chain of tangent vectors (n, 3), from the origin; headings are not wrapped."""
     heading = np.concatenate([[0.0], np.cumsum(steps[:, 2])])
     moved = se2.exp(steps)
@@ -85,7 +85,7 @@ def chained(steps: FloatArray) -> FloatArray:
     return np.column_stack([np.concatenate([[0.0], x]), np.concatenate([[0.0], y]), heading])
 
 
-def resampled(path: FloatArray) -> FloatArray:
+def resample(path: FloatArray) -> FloatArray:
     """(200, 2) points at even shares of the length of ``path`` (n, 3).
 
     The thesis resamples "to the same number of points"; by length, not by time, for a robot that starts late is not beside its path.
@@ -98,7 +98,7 @@ def resampled(path: FloatArray) -> FloatArray:
 def correction_time(reached: FloatArray, goal: FloatArray, rotation_ratio: float) -> float:
     """Seconds to turn from pose ``reached`` towards ``goal``, drive there and turn to its heading (Ebersole 2016, sec. 5.2).
 
-    Two things that the thesis does not say show in its Table 5-2: the robot may back up (else most arcs would cost more than they do),
+    Two rules are not in the thesis's text but follow from its Table 5-2: the robot may back up (else most arcs would cost more),
     and a goal at the start, that of a rotation, costs the heading only (it lists 0.003 s for a robot that ended 0.1 m away).
     """
     dx, dy = goal[0] - reached[0], goal[1] - reached[1]

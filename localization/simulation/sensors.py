@@ -80,7 +80,7 @@ class EncoderSensor:
         wheels = (*robot.joints.left, *robot.joints.right)
         self._sides = np.array([0] * len(robot.joints.left) + [1] * len(robot.joints.right))
         self._phase = rng.random(len(wheels))
-        self.form = message_templates.joint_states(robot.topics.joint_states, (*wheels, *masses.joint_names))
+        self.layout = message_templates.joint_states(robot.topics.joint_states, (*wheels, *masses.joint_names))
         self._late_ns, self._lost_left = round(late_s * 1e9), lost_left
         self._ticks = SampleClock(config.rate_hz)
         self._counts, self._shown = np.zeros(len(wheels)), np.zeros(len(wheels))
@@ -108,11 +108,11 @@ class EncoderSensor:
         for i, tick in enumerate(ticks):
             stamp = self._start_ns + int(tick)
             parts = np.concatenate([shown[i] * scale, arms[i]]), np.concatenate([rates[i], arm_rates[i]])
-            found.append(Message(self.form, stamp, stamp + self._late_ns, parts))
+            found.append(Message(self.layout, stamp, stamp + self._late_ns, parts))
         return found
 
     def _is_lost(self, tick_ns: int) -> bool:
-        """Spells of loss of 0.3 s on average, and of being heard between them."""
+        """Spells of loss of 0.3 s on average, and of counting between them."""
         while tick_ns >= self._heard_until_ns:
             self._lost_until_ns = self._heard_until_ns + int(self._rng.exponential(0.3) * 1e9)
             heard_s = 0.3 * (1.0 - self._lost_left) / self._lost_left
@@ -138,7 +138,7 @@ class ImuSensor:
         self._bias = rng.normal(0.0, config.gyro_bias_sigma, 3) + mount.rotation().T @ np.array([0.0, 0.0, gyro_bias])
         rate_sigma, force_sigma = (noise * math.sqrt(config.rate_hz) for noise in (config.gyro_noise, config.force_noise))
         self._sigmas = rate_sigma, force_sigma
-        self.form = message_templates.imu(topic, frame, rate_sigma**2, force_sigma**2)
+        self.layout = message_templates.imu(topic, frame, rate_sigma**2, force_sigma**2)
         self._ticks = SampleClock(config.rate_hz)
 
     def messages(self, track: TrueMotion) -> list[Message]:
@@ -164,7 +164,7 @@ class ImuSensor:
         self._bias = bias[-1]
         rates = np.column_stack([np.zeros(n), np.zeros(n), wz]) @ body_R_imu + bias + self._rng.normal(0.0, self._sigmas[0], (n, 3))
         forces = force @ body_R_imu + self._rng.normal(0.0, self._sigmas[1], (n, 3))
-        return [Message(self.form, self._start_ns + int(t), self._start_ns + int(t), (rates[i], forces[i])) for i, t in enumerate(ticks)]
+        return [Message(self.layout, self._start_ns + int(t), self._start_ns + int(t), (rates[i], forces[i])) for i, t in enumerate(ticks)]
 
 
 class GpsSensor:
@@ -174,7 +174,7 @@ class GpsSensor:
         self._config, self._start_ns, self._rng = config, start_ns, rng
         self._drift = rng.normal(0.0, config.drift_m, 2)
         variance = config.noise_m**2 + config.drift_m**2
-        self.form = message_templates.fix(topic, frame, (variance, variance, 4.0 * variance))
+        self.layout = message_templates.fix(topic, frame, (variance, variance, 4.0 * variance))
         self._ticks = SampleClock(config.rate_hz)
 
     def messages(self, track: TrueMotion) -> list[Message]:
@@ -186,7 +186,7 @@ class GpsSensor:
             self._drift = keep * self._drift + math.sqrt(1.0 - keep * keep) * self._rng.normal(0.0, c.drift_m, 2)
             east, north = row[:2] + self._drift + self._rng.normal(0.0, c.noise_m, 2)
             stamp = self._start_ns + int(tick)
-            found.append(Message(self.form, stamp, stamp, (_geodetic(c, east, north),)))
+            found.append(Message(self.layout, stamp, stamp, (_geodetic(c, east, north),)))
         return found
 
 
@@ -210,7 +210,7 @@ class TruthSensor:
 
     def __init__(self, rate_hz: float, robot: Robot, masses: MassDistribution, with_cg: bool, start_ns: int) -> None:
         self._masses, self._start_ns = masses, start_ns
-        self.form = message_templates.odometry(robot.topics.reference, "world", "base_link")
+        self.layout = message_templates.odometry(robot.topics.reference, "world", "base_link")
         self.cg_form = message_templates.point(robot.topics.center_of_gravity, "base_link") if with_cg else None
         self._ticks = SampleClock(rate_hz)
 
@@ -225,7 +225,7 @@ class TruthSensor:
         found = []
         for i, tick in enumerate(ticks):
             stamp = self._start_ns + int(tick)
-            found.append(Message(self.form, stamp, stamp, (rows[i, POSE][:2], heading[i], rows[i, TWIST][:2], rows[i, TWIST][2:])))
+            found.append(Message(self.layout, stamp, stamp, (rows[i, POSE][:2], heading[i], rows[i, TWIST][:2], rows[i, TWIST][2:])))
         if self.cg_form is not None:
             for tick, cg in zip(ticks, self._masses.nominal_cg(seconds(ticks)), strict=True):
                 stamp = self._start_ns + int(tick)
@@ -237,7 +237,6 @@ START_NS = 1_000_000_000
 """Stamp of the simulation's beginning; 0 would mean "not set"."""
 LASER, CLOUD, IMU, GPS = "laser", "velodyne", "imu_link", "gps_link"
 _MOUNTS = {LASER: Mount(x=0.4, z=0.2), CLOUD: Mount(z=0.8), IMU: Mount(z=0.1), GPS: Mount(z=1.0)}
-_BODY_ABOVE_FLOOR_M = 0.13
 
 
 @dataclass(frozen=True)
@@ -247,7 +246,7 @@ class SensorConfig(Settings):
     lidar: Literal["2d", "3d", "none"] = "2d"
     """Planar scanner on /scan, spinning scanner on /points, or none."""
     center_of_gravity: bool = False
-    """Publish the nominal CG, which arms and robot file tell, on its topic."""
+    """Publish the nominal CG, by arms and robot file, on its topic."""
     truth_hz: Positive = 25.0
     """Rate of the truth."""
     encoders: EncoderConfig = field(default_factory=EncoderConfig)
@@ -267,7 +266,7 @@ class Sensor(Protocol):
 
 
 def nominal_mounts(robot: Robot) -> dict[str, Mount]:
-    """Where the log says that the sensors sit: the robot file's mounts, else usual ones."""
+    """Mounts in the log's /tf_static: the robot file's, else usual ones."""
     return {name: robot.mounts.get(name, mount) for name, mount in _MOUNTS.items()}
 
 
@@ -296,13 +295,12 @@ def make_sensors(
     if config.lidar == "2d":
         sensors.append(PlanarScanner(config.scanner, topics.scan, LASER, real, world, late, START_NS, lidar))
     elif config.lidar == "3d":
-        above = real.z + _BODY_ABOVE_FLOOR_M
-        sensors.append(SpinningScanner(config.spinning, topics.points, CLOUD, real, above, world, late, START_NS, lidar))
+        sensors.append(SpinningScanner(config.spinning, topics.points, CLOUD, real, world, late, START_NS, lidar))
     return sensors
 
 
 def transforms(config: SensorConfig, robot: Robot) -> Message:
-    """The nominal mounts, whatever effects have done to the real ones."""
+    """The nominal mounts, which faults do not change."""
     unused = {LASER: config.lidar != "2d", CLOUD: config.lidar != "3d"}
     edges = [
         ("base_link", name, (m.x, m.y, m.z), quaternion(m)) for name, m in nominal_mounts(robot).items() if not unused.get(name, False)

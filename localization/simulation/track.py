@@ -33,7 +33,7 @@ class TrueMotion:
     def append(self, rows: FloatArray) -> None:
         self.rows = np.concatenate([self.rows, rows])
 
-    def forget(self, before_s: float) -> None:
+    def drop_before(self, before_s: float) -> None:
         """Drop what lies before ``before_s``, but never the last record."""
         drop = min(int(before_s / self.step_s) - self.first_step, len(self.rows) - 1)
         if drop > 0:
@@ -89,7 +89,7 @@ RUN_HZ = 20.0
 
 @dataclass(frozen=True, eq=False)
 class RunRecord:
-    """What truly happened in one named phase, 20 times a second from the body's rest before it to its rest after it."""
+    """True motion of one named phase, 20 times a second from the body's rest before it to its rest after it."""
 
     name: str
     start_s: float
@@ -101,7 +101,7 @@ class RunRecord:
     cg: FloatArray
     """(n, 2) true CG [m]."""
     nominal_cg: FloatArray
-    """(2,) as the robot knew it [m]."""
+    """(2,) as the robot has it [m]."""
     command: OpenLoop | Route
 
     @property

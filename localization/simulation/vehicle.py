@@ -1,4 +1,4 @@
-"""The vehicle in time: motors turn wheels, wheels push at the floor, arms move the mass, and the body goes where that leads."""
+"""The vehicle in time: motors turn wheels, wheels push at the floor, arms move the mass, and the body moves by the forces."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from localization.errors import SimulationError
 from localization.settings import Positive, Settings, up_to
-from localization.simulation.dynamics import Chassis, DynamicsInput, change, drive
+from localization.simulation.dynamics import Chassis, DynamicsInput, Plant, derivatives, integrate
 from motion_models.center_of_gravity.files import arms_model, arms_postures
 from motion_models.center_of_gravity.model import CgModel
 from motion_models.center_of_gravity.parts import Payload
@@ -25,7 +25,7 @@ from motion_models.se2 import FloatArray
 
 POSE, TWIST, RATES, ANGLES, CG, MARGIN, COLUMNS = slice(0, 3), slice(3, 6), slice(6, 8), slice(8, 10), slice(10, 12), 12, 13
 """Columns of a record: pose in the world (heading not wrapped), body twist, rates and angles of left and right, CG, tipping margin."""
-_FALLS_S = 0.1  # a robot that its own jerk lifts for less than about sqrt(z_G / g) / 2 falls back onto its wheels
+_MAX_LIFTED_S = 0.1  # a robot that its own jerk lifts for less than about sqrt(z_G / g) / 2 falls back onto its wheels
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class VehicleConfig(Settings):
 
 @dataclass(frozen=True)
 class Body:
-    """What the robot and its floor really are; the log's metadata know only the nominal robot."""
+    """True parameters of the robot and its floor; the log's metadata have the nominal ones."""
 
     params: FloatArray
     """(12,) as `FrictionModel.param_names`; the tracked point plays no part."""
@@ -110,7 +110,7 @@ class Body:
 
 @dataclass
 class VehicleState:
-    """Where the vehicle is; changed by `advance`."""
+    """State of the vehicle; changed by `advance`."""
 
     steps: int
     """Steps since the start of the simulation."""
@@ -154,23 +154,15 @@ def advance(
     inertia = body.inertia + payload[0] * payload[1] ** 2 * (1.0 + payload[0] / body.mass)
     out = np.empty((len(wheels), COLUMNS))
     ramp = config.acceleration_m_s2 / (0.5 * (body.radius_left + body.radius_right))
-    chassis = body.chassis(config)
     start = state.steps * config.step_s
     along = config.gravity * math.sin(body.slope)
-    failed = drive(
+    failed = integrate(
         state.numbers,
         np.ascontiguousarray(wheels),
         np.ascontiguousarray(cg),
         out,
         config.step_s,
-        mass,
-        inertia,
-        along,
-        np.array(body.yields),
-        patches,
-        chassis,
-        config.motor_lag_s,
-        ramp,
+        Plant(body.chassis(config), mass, inertia, along, np.array(body.yields), patches, config.motor_lag_s, ramp),
     )
     if failed >= 0:
         raise SimulationError(
@@ -181,7 +173,7 @@ def advance(
     lifted = out[:, MARGIN] < 0.0
     for i in range(len(out)) if lifted.any() else ():
         state.on_two_wheels = state.on_two_wheels + 1 if lifted[i] else 0
-        if state.on_two_wheels * config.step_s <= _FALLS_S:
+        if state.on_two_wheels * config.step_s <= _MAX_LIFTED_S:
             continue
         raise SimulationError(
             f"the robot tips over {start + i * config.step_s:.2f} s into the drive: its CG, at x = {cg[i, 0]:.3f}, y = {cg[i, 1]:.3f}, "
@@ -197,17 +189,17 @@ def accelerations(
     body: Body, config: VehicleConfig, wheels: FloatArray, twist: FloatArray, cg: FloatArray, tilt: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Rate of change (3,) of ``twist`` (3,) at wheel rates ``wheels`` (2,), a resting CG (2,) and loads tilted by ``tilt`` (2,); and the
-    tilt (2,) that the forces ask for."""
+    tilt (2,) of quasi-static balance with the forces."""
     now = DynamicsInput(
         *(body.radius_left * wheels[0], body.radius_right * wheels[1], 1.0, 1.0, 1.0, 1.0, body.mass, body.inertia),
         *(cg[0], cg[1], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     )
-    found = change(twist[0], twist[1], twist[2], tilt[0], tilt[1], now, body.chassis(config))
+    found = derivatives(twist[0], twist[1], twist[2], tilt[0], tilt[1], now, body.chassis(config))
     return np.array([found.x, found.y, found.w]), np.array([found.xi, found.eta])
 
 
 _DIFFERENCE_S = 1e-3
-_FASTEST_RAD_S = 1.0
+_MAX_JOINT_SPEED_RAD_S = 1.0
 _GRIPPERS = ("left_gripper", "gripper", "tool0", "left_tool0")
 
 
@@ -261,7 +253,7 @@ class MassDistribution:
     def time_to(self, target: FloatArray) -> float:
         """Seconds that a motion to ``target`` takes at the joints' speed, 1 at least; half a second per 5 cm for a ballast."""
         far = float(np.abs(target - self._to).max(initial=0.0))
-        return max(1.0, 1.875 * far / _FASTEST_RAD_S if self._empty is not None else 10.0 * far)
+        return max(1.0, 1.875 * far / _MAX_JOINT_SPEED_RAD_S if self._empty is not None else 10.0 * far)
 
     def move(self, target: FloatArray, start_s: float, duration_s: float) -> None:
         """Begin a motion to ``target``; the one before must have ended."""
@@ -311,7 +303,7 @@ class MassDistribution:
         return out
 
     def nominal_cg(self, times_s: FloatArray) -> FloatArray:
-        """(n, 2) CG as the robot file and the joints tell it, without payload."""
+        """(n, 2) CG by the robot file and the joints, without payload."""
         if times_s[0] >= self._start_s + self._duration_s:
             return np.broadcast_to(self._resting()[1], (len(times_s), 2))
         position, _ = self.joints(times_s)

@@ -1,7 +1,8 @@
-"""Worlds to drive in: walls seen from above, pillars, glass, people who walk, and floors that are not everywhere the same."""
+"""Worlds to drive in: walls in plan view, pillars, glass, people who walk, and floors that are not everywhere the same."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -98,7 +99,7 @@ def rooms() -> World:
 
 
 def corridor() -> World:
-    """60 x 2.4 m, bare but for its ends: along it a scanner sees nothing move."""
+    """60 x 2.4 m, bare but for its ends: along it the ranges do not change."""
     return World(box(-2, -1.2, 58, 1.2), ceiling_m=2.5)
 
 
@@ -159,7 +160,7 @@ def world_svg(world: World, paths: Iterable[FloatArray] = (), width_px: int = 80
 
 
 IntArray = NDArray[np.int64]
-_GLASS_MIRRORS = 0.985  # glass returns a beam that meets it within 10 degrees of its normal, and lets others pass
+_GLASS_MIRRORS = 0.985  # glass returns a beam that hits it within 10 degrees of its normal, and lets others pass
 _FAR = 1e9
 
 
@@ -189,11 +190,10 @@ def make_grid(walls: FloatArray, cell: float = 0.5) -> Grid:
     for k, (xa, ya, xb, yb, _) in enumerate(walls):
         i0, i1 = sorted(int((x - low[0]) / cell) for x in (xa, xb))
         j0, j1 = sorted(int((y - low[1]) / cell) for y in (ya, yb))
-        for j in range(j0, j1 + 1):
-            for i in range(i0, i1 + 1):
-                centre = low + cell * (np.array([i, j]) + 0.5)
-                if _distance(centre[0], centre[1], xa, ya, xb, yb) <= 0.7072 * cell:
-                    lists[j * columns + i].append(k)
+        for j, i in itertools.product(range(j0, j1 + 1), range(i0, i1 + 1)):
+            centre = low + cell * (np.array([i, j]) + 0.5)
+            if _distance(centre[0], centre[1], xa, ya, xb, yb) <= 0.7072 * cell:
+                lists[j * columns + i].append(k)
     first = np.concatenate([[0], np.cumsum([len(one) for one in lists])]).astype(np.int64)
     items = np.array([k for one in lists for k in one], dtype=np.int64)
     return Grid(float(low[0]), float(low[1]), cell, columns, rows, first, items, np.ascontiguousarray(walls))
@@ -257,7 +257,7 @@ def cast(x: float, y: float, angle: float, longest: float, grid: Grid) -> float:
 
 @numba.njit(cache=True, error_model="numpy")
 def cast_at_people(x: float, y: float, angle: float, t: float, people: FloatArray) -> float:
-    """Distance to the nearest person at time ``t`` [s]; inf if the beam meets none."""
+    """Distance to the nearest person at time ``t`` [s]; inf if the beam hits none."""
     ux, uy = math.cos(angle), math.sin(angle)
     nearest = math.inf
     for k in range(people.shape[0]):

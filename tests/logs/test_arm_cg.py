@@ -53,7 +53,7 @@ def expected(i: int) -> np.ndarray:
     return urdf_reference.center_of_mass(URDF, posture(i))[0][:2]
 
 
-URDF = (Path(urdf_reference.__file__).parents[1] / "motion_models" / "robots" / "vaultbot.urdf").read_text()
+URDF = (Path(urdf_reference.__file__).parents[2] / "motion_models" / "robots" / "vaultbot.urdf").read_text()
 
 
 @pytest.mark.parametrize("format_", ["ros1", "mcap"])

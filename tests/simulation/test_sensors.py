@@ -77,7 +77,7 @@ def moving_track(twist=(0.5, 0.1, 1.0), seconds=3.0, start=(0.0, 0.0, 0.3)):
 
 
 def read(message):
-    return STORE.deserialize_cdr(Template(message.form, is_ros1=False).fill(message), message.form.type)
+    return STORE.deserialize_cdr(Template(message.layout, is_ros1=False).fill(message), message.layout.type)
 
 
 @given(st.integers(0, 10**6))
@@ -184,7 +184,7 @@ def test_a_spinning_scanner_sees_walls_floor_and_ceiling_where_they_are():
     walls, mount, track = box(-4, -3, 4, 3), Mount(x=0.1, z=0.8, yaw=0.3), moving_track()
     config = SpinningConfig(noise_m=0.0, dropout=0.0, min_range_m=0.1)
     world = World(walls, ceiling_m=1.5)
-    scanner = SpinningScanner(config, "/points", "velodyne", mount, 0.93, world, 0.0, 0, np.random.default_rng(0))
+    scanner = SpinningScanner(config, "/points", "velodyne", mount, world, 0.0, 0, np.random.default_rng(0))
     message = scanner.messages(track)[4]
     layout = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"), ("ring", "u2"), ("t", "f4")]
     cloud = np.frombuffer(message.parts[0].tobytes(), dtype=layout)
@@ -310,8 +310,8 @@ def test_gps_fixes_lead_back_to_the_path():
 def test_truth_is_the_track_and_the_cg_topic_is_the_nominal_cg():
     track, masses = moving_track(), MassDistribution(ROBOT)
     messages = TruthSensor(25.0, ROBOT, masses, True, 10**9).messages(track)
-    odometry = [m for m in messages if m.form.type.endswith("Odometry")]
-    cgs = [m for m in messages if m.form.type.endswith("PointStamped")]
+    odometry = [m for m in messages if m.layout.type.endswith("Odometry")]
+    cgs = [m for m in messages if m.layout.type.endswith("PointStamped")]
     assert len(odometry) == len(cgs) == 76
     pose, twist = read(odometry[50]).pose.pose, read(odometry[50]).twist.twist
     row = track.at(np.array([2.0]))[0]
