@@ -123,7 +123,7 @@ def test_joints_of_other_names_are_told(tmp_path: Path) -> None:
     log = open_log(bags.write_mcap(tmp_path / "run.mcap", sorted(records, key=lambda r: r[2])), ROBOT)
     assert cgs(log) == []
     (note,) = log.warnings()
-    assert "lacks left_shoulder_pan_joint, " in note
+    assert "has no left_shoulder_pan_joint, " in note
     assert "does not have: ur5_left_elbow_joint, " in note
     assert "[arms] joints" in note
     assert any("has arms, but no joint states tell how they stand" in problem for problem in inspect_log(log).problems)
@@ -138,7 +138,7 @@ def test_one_joint_that_is_never_told_leaves_the_centre_of_gravity_alone_until_i
     path = bags.write_mcap(tmp_path / "run.mcap", records)
     log = open_log(path, ROBOT)
     assert cgs(log) == []
-    assert any("lacks left_elbow_joint of the arms" in note for note in log.warnings())
+    assert any("has no left_elbow_joint of the arms" in note for note in log.warnings())
     assert ROBOT.arms is not None
     told = dataclasses.replace(ROBOT, arms=dataclasses.replace(ROBOT.arms, joints=tuple(names)))
     samples = cgs(open_log(path, told))

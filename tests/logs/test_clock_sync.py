@@ -80,7 +80,7 @@ def test_a_topic_that_is_always_three_seconds_late_is_waited_for() -> None:
     marks, stats = run([*ticks("/wheels", 20, 50), *ticks("/points", 20, 10, latency=3 * S)])
     check_order(marks)
     assert len(marks) == 1200
-    assert stats.sentences() == []
+    assert stats.describe() == []
 
 
 def test_a_recorder_that_stalls_loses_nothing() -> None:
@@ -98,7 +98,7 @@ def test_a_recorder_that_stalls_loses_nothing() -> None:
     check_order(marks)
     assert sorted(m.true_ns for m in marks) == sorted(i.stamp_ns for i in items)
     assert all(m.stamp_ns == m.true_ns for m in marks)
-    assert stats.sentences() == []
+    assert stats.describe() == []
 
 
 @pytest.mark.parametrize("rate", [50, 10, 4])
@@ -114,7 +114,7 @@ def test_what_comes_late_in_a_burst_is_no_clock_that_was_set(rate: int, lost_s: 
     check_order(marks)
     assert [m.true_ns for m in marks if m.topic == "/wheels"] == [i.stamp_ns for i in kept]
     assert all(m.stamp_ns == m.true_ns for m in marks)
-    assert stats.sentences() == []
+    assert stats.describe() == []
 
 
 @pytest.mark.parametrize("ends", [0, 100])
@@ -151,7 +151,7 @@ def test_a_driver_that_pauses_is_no_jump() -> None:
     items = [i for i in ticks("/scan", 60, 10) if not START + 20 * S < i.stamp_ns < START + 45 * S]
     marks, stats = run([*items, *ticks("/wheels", 60, 50)])
     assert len(marks) == len(items) + 3000
-    assert stats.sentences() == []
+    assert stats.describe() == []
 
 
 @pytest.mark.parametrize("jump", [HOUR, -HOUR, 5 * S, -5 * S, 10 * 365 * 24 * HOUR])
@@ -207,7 +207,7 @@ def test_lone_wild_stamps_are_dropped_and_counted() -> None:
     assert len(marks) == 1500 + 295
     assert all(m.stamp_ns == m.true_ns for m in marks)
     assert stats.of("/scan", Oddity.OUTLIER) == 5
-    assert stats.sentences() == ["/scan: 5 messages dropped (stamp that fits neither its neighbours nor the time of recording)."]
+    assert stats.describe() == ["/scan: 5 messages dropped (stamp that fits neither its neighbours nor the time of recording)."]
 
 
 def test_a_wild_first_stamp_does_not_move_the_others() -> None:
@@ -293,7 +293,7 @@ def test_headers_that_are_all_of_another_time_are_kept() -> None:
     check_order(marks)
     assert all(m.stamp_ns == m.true_ns for m in marks)
     assert len(marks) == 300
-    assert stats.sentences() == []
+    assert stats.describe() == []
 
 
 def test_equal_stamps_come_in_order_of_rank() -> None:
@@ -304,7 +304,7 @@ def test_equal_stamps_come_in_order_of_rank() -> None:
 
 @pytest.mark.parametrize("case", ["same log time", "same stamp step of 1 ns", "random stamps", "log time runs away"])
 def test_memory_is_bounded_whatever_happens(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("localization.logs.clock_sync._MOST_HELD", 2000)
+    monkeypatch.setattr("localization.logs.clock_sync._MAX_BUFFERED_WEIGHT", 2000)
     rng = np.random.default_rng(4)
 
     def items(n: int) -> Iterator[Item]:
