@@ -6,10 +6,9 @@ from motion_models.calibration.cross_validation import HeldOut, Interval, cross_
 from motion_models.calibration.fit import Fit, fit
 from motion_models.calibration.least_squares import FitConfig
 from motion_models.calibration.maneuvers import Maneuver
-from motion_models.calibration.prediction import WITNESS_NAMES
-from motion_models.calibration.regressions import RotationTable, read_rotation_table, skid_steer_fit
+from motion_models.calibration.prediction import REFERENCE_PARAM_NAMES
+from motion_models.calibration.regressions import RotationTable, read_rotation_table, rotations_as_maneuvers, skid_steer_fit
 from motion_models.calibration.ros_export import diff_drive_controller_yaml, multiplier_table, multipliers, robot_localization_yaml
-from motion_models.calibration.rotations import rotations_as_maneuvers
 from motion_models.calibration.windows_table import read_windows, windows_text
 from motion_models.center_of_gravity.files import arms_model, arms_postures, urdf_cg, weighed_cg
 from motion_models.center_of_gravity.model import CgModel, cg_model, static_part_from_weighing
@@ -31,7 +30,7 @@ from motion_models.skid_steer import SkidSteer, thesis_coefficients
 
 __all__ = [
     "MODELS",
-    "WITNESS_NAMES",
+    "REFERENCE_PARAM_NAMES",
     "Arms",
     "CalibrationError",
     "CenterOfRotation",

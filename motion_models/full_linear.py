@@ -109,7 +109,7 @@ class FullLinear:
 
 
 @numba.njit(cache=True)
-def _sign(value: float) -> float:  # pragma: no cover
+def _sign(value: float) -> float:
     return 1.0 if value > 0.0 else (-1.0 if value < 0.0 else 0.0)
 
 
@@ -123,7 +123,7 @@ def _twist(
     d_wheels: FloatArray,
     d_cg: FloatArray,
     d_params: FloatArray,
-) -> None:  # pragma: no cover
+) -> None:
     """See `Twist.from_kernel`; ``constants`` is empty."""
     lateral, loss_w, loss_t = params[6], params[7], params[8]
     slip_u, slip_w, slip_t = params[9], params[10], params[11]

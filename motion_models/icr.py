@@ -69,7 +69,7 @@ def _twist(
     d_wheels: FloatArray,
     d_cg: FloatArray,
     d_params: FloatArray,
-) -> None:  # pragma: no cover
+) -> None:
     """See `Twist.from_kernel`; ``constants`` (1,) is the wheel radius."""
     r = constants[0]
     y_l, y_r, x_icr, alpha_l, alpha_r = params[0], params[1], params[2], params[3], params[4]

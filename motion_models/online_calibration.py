@@ -22,12 +22,12 @@ FORMS: tuple[Form, ...] = ("none", "constant", "cg_field")
 # How differently robots of one type turn on different floors and with other loads: relative for what scales a turn (Clearpath's own
 # multipliers for one Husky range from 1.5 to 1.9; terrains differ by a quarter), absolute [m] for where it turns about.
 _TURNING, _CENTRE_X, _CENTRE_Y = 0.15, 0.05, 0.03
-_FORGOTTEN_AFTER_S = 3600.0
+_PRIOR_RETURNS_AFTER_S = 3600.0
 _WARP = 0.15  # VaultBot's chassis, as its rotations show it, moves 13 % of m g / 4 to two opposite wheels
 _MU_RATIO = 0.3
 
-# Least turn that teaches, as track over radius. On gentler arcs tyres creep, of which what was measured in place says nothing; physics
-# does, but where a robot drives straight the two sides differ by their noise alone, and that would pass for knowledge.
+# Least turn with information, as track over radius. On gentler arcs tyres creep, which rotations in place do not cover; the friction
+# model does, but where a robot drives straight the two sides differ by their noise alone, and that would pass for information.
 _IN_PLACE, _NOT_STRAIGHT = 0.25, 0.02
 
 # The rotations of Ebersole 2016, Ch. 4, to which the coefficients of `SkidSteer` were fitted: where the CG was, and the scatter about the
@@ -64,9 +64,9 @@ class Corrections:
     cov: FloatArray
     """(k, k) at first."""
     walk_cov: FloatArray
-    """(k, k) growth per second of motion; it may be singular. What does not walk is remembered."""
+    """(k, k) process noise: growth per second of motion; it may be singular."""
     least_turn: float = 0.0
-    """Track over radius below which a motion says nothing of the corrections."""
+    """Track over radius below which a motion has no information on the corrections."""
 
     @property
     def sigmas(self) -> FloatArray:
@@ -111,7 +111,7 @@ def corrections(model: MotionModel, form: Form) -> Corrections:
         for name, rate in correction.along.items():
             directions[model.param_names.index(name), column] = rate
     sigmas = np.array([c.sigma for c in found])
-    walks = sigmas / np.sqrt(_FORGOTTEN_AFTER_S)  # after an hour the first uncertainty has come back once more
+    walks = sigmas / np.sqrt(_PRIOR_RETURNS_AFTER_S)  # after an hour the first uncertainty has come back once more
     least = {"skid_steer": _IN_PLACE, "friction": _NOT_STRAIGHT}.get(model.name, 0.0)
     return Corrections(tuple(c.name for c in found), directions, np.diag(sigmas**2), np.diag(walks**2), least)
 
@@ -159,7 +159,7 @@ def _regressions(model: MotionModel) -> Corrections:
     floor[0:3, 0] = _TURNING * model.nominal[0:3]  # another floor scales k at every CG
     floor[3, 1], floor[5, 2] = _CENTRE_X, _CENTRE_Y
     spread = floor @ floor.T
-    return Corrections(model.param_names, np.eye(n), regression_cov(with_misfit=True) + spread, spread / _FORGOTTEN_AFTER_S, _IN_PLACE)
+    return Corrections(model.param_names, np.eye(n), regression_cov(with_misfit=True) + spread, spread / _PRIOR_RETURNS_AFTER_S, _IN_PLACE)
 
 
 def _singles(model: MotionModel) -> tuple[Correction, ...]:

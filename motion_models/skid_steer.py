@@ -91,7 +91,7 @@ def _twist(
     d_wheels: FloatArray,
     d_cg: FloatArray,
     d_params: FloatArray,
-) -> None:  # pragma: no cover
+) -> None:
     """See `Twist.from_kernel`; ``constants`` (2,) are the wheel radius and the track width."""
     r, d = constants[0], constants[1]
     k_0, k_1, k_2, x_cr_0, x_cr_1 = params[0], params[1], params[2], params[3], params[4]
