@@ -26,6 +26,9 @@ _LARGEST = 1e9
 _LONGEST_M = 100.0
 """Of a length of a robot [m]; the largest mining vehicles have 20."""
 _LONGEST_SHOWN = 60  # characters of what a user wrote, in a message
+DIFF_DRIVE = "diff_drive"
+"""`Robot.drive` of two driven wheels and casters."""
+DRIVES = ("skid_steer", DIFF_DRIVE)
 MODEL_OPTIONS: Mapping[str, tuple[str, ...]] = {"friction": ("contact", "centripetal")}
 """Entries of [models.NAME] that choose something, where all others are numbers."""
 
@@ -147,6 +150,8 @@ class Robot:
     name: str
     geometry: Geometry
     driver: Driver
+    drive: str = "skid_steer"
+    """How it turns: "skid_steer" (four or more wheels, or tracks, that slide), or "diff_drive" (two driven wheels and casters)."""
     topics: Topics = Topics()
     joints: Joints = Joints()
     mounts: Mapping[str, Mount] = field(default_factory=dict)
@@ -231,6 +236,9 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
     _refuse_unknown(data, known, source)
     if not isinstance(data.get("name"), str):
         raise RobotError(f'{source}: needs a line name = "...".')
+    drive = data.get("drive", DRIVES[0])
+    if drive not in DRIVES:
+        raise RobotError(f"{source}: drive is {drive!r}; there are {', '.join(DRIVES)}.")
     geometry = _section(Geometry, data, "geometry", source)
     for name in ("wheel_radius_m", "track_width_m", "wheelbase_m", "mass_kg"):
         if not getattr(geometry, name) > 0:
@@ -247,6 +255,7 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
         name=data["name"],
         geometry=geometry,
         driver=driver,
+        drive=drive,
         topics=_section(Topics, data, "topics", source),
         joints=_section(Joints, data, "joints", source),
         mounts=mounts,

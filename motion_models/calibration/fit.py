@@ -64,8 +64,13 @@ class Fit:
         return se2.between(batch.measured, poses)
 
     def robot(self, robot: Robot) -> Robot:
-        """``robot`` with all of this model's parameters in its file's table."""
-        table = dict(zip(self.model.param_names, (float(p) for p in self.params), strict=True))
+        """``robot`` with the fitted parameters in its file's table, beside those that it already has.
+
+        What was neither fitted nor in the file stays out, so that it follows the robot's geometry and not this robot's model.
+        """
+        fitted = {*self.names, *self.config.ties, *robot.models.get(self.model.name, {})}
+        everything = zip(self.model.param_names, (float(p) for p in self.params), strict=True)
+        table = {name: value for name, value in everything if name in fitted}
         return dataclasses.replace(robot, models={**robot.models, self.model.name: table})
 
 
