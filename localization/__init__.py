@@ -1,12 +1,17 @@
 """Localization of skid-steer robots: logs, LiDAR, estimators, scores and reports. The names here are what a notebook needs."""
 
-from localization.estimators import ESTIMATORS, EstimatorConfig
-from localization.evaluation.metrics import Accuracy, evaluate
-from localization.evaluation.references import read_reference_file, reference_track
-from localization.evaluation.scores import Result, score
-from localization.logs import Log, TopicOverrides, open_log
-from localization.pipeline import ReplayConfig, Run, Trial, replay
-from localization.trajectory import Trajectory, read_tum, write_tum
+from typing import TYPE_CHECKING
+
+from motion_models.lazy import exports
+
+if TYPE_CHECKING:
+    from localization.estimators import ESTIMATORS, EstimatorConfig
+    from localization.evaluation.metrics import Accuracy, evaluate
+    from localization.evaluation.references import read_reference_file, reference_track
+    from localization.evaluation.scores import Result, score
+    from localization.logs import Log, TopicOverrides, open_log
+    from localization.pipeline import ReplayConfig, Run, Trial, replay
+    from localization.trajectory import Trajectory, read_tum, write_tum
 
 __all__ = [
     "ESTIMATORS",
@@ -28,3 +33,14 @@ __all__ = [
     "score",
     "write_tum",
 ]
+
+_MODULES = {
+    "localization.estimators": "ESTIMATORS EstimatorConfig",
+    "localization.evaluation.metrics": "Accuracy evaluate",
+    "localization.evaluation.references": "read_reference_file reference_track",
+    "localization.evaluation.scores": "Result score",
+    "localization.logs": "Log TopicOverrides open_log",
+    "localization.pipeline": "ReplayConfig Run Trial replay",
+    "localization.trajectory": "Trajectory read_tum write_tum",
+}
+__getattr__ = exports(__name__, {name: module for module, names in _MODULES.items() for name in names.split()})

@@ -1,68 +1,95 @@
-"""The command `skidloc`. Only here are errors turned into messages and exit codes."""
+"""The command `skidloc`. Only here are errors turned into messages and exit codes. A command's module is imported when it is run."""
 
 from __future__ import annotations
 
+import difflib
+import importlib
 import os
 import sys
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Mapping, Sequence
 
-import tyro
-
-from localization.commands.calibrate import Calibrate
-from localization.commands.cg import Cg
-from localization.commands.compare import Compare
-from localization.commands.diagnose import Diagnose
-from localization.commands.info import Info
-from localization.commands.online import Online
-from localization.commands.replay import Replay
-from localization.commands.simulate import Simulate
 from localization.commands.terminal import PlainConsole
 from motion_models.errors import SkidlocError
 
 _BAD_INPUT = 2
 _INTERRUPTED = 130
 
-Command = (
-    Annotated[Info, tyro.conf.subcommand("info", prefix_name=False)]
-    | Annotated[Replay, tyro.conf.subcommand("replay", prefix_name=False)]
-    | Annotated[Compare, tyro.conf.subcommand("compare", prefix_name=False)]
-    | Annotated[Calibrate, tyro.conf.subcommand("calibrate", prefix_name=False)]
-    | Annotated[Diagnose, tyro.conf.subcommand("diagnose", prefix_name=False)]
-    | Annotated[Cg, tyro.conf.subcommand("cg", prefix_name=False)]
-    | Annotated[Online, tyro.conf.subcommand("online", prefix_name=False)]
-    | Annotated[Simulate, tyro.conf.subcommand("simulate", prefix_name=False)]
-)
+COMMANDS: Mapping[str, tuple[str, str]] = {
+    "info": ("Info", "Show what a log holds and what would be used of it."),
+    "replay": ("Replay", "Run motion models and estimators over a log and score their trajectories."),
+    "compare": ("Compare", "Compare motion models and estimators over many logs."),
+    "calibrate": ("Calibrate", "Fit a motion model to logs or tables and write the robot file."),
+    "diagnose": ("Diagnose", "Find what a motion model gets wrong on a log, its cause, and the gain of correcting it."),
+    "cg": ("Cg", "Compute the centre of gravity from scales, arms and payload."),
+    "online": ("Online", "Run the estimator live on ROS topics, or on a log as it was recorded."),
+    "simulate": ("Simulate", "Simulate a skid-steer robot and write a log."),
+}
+"""By name: the class in `localization.commands.NAME`, and one line for the overview."""
+
+USAGE = "usage: skidloc COMMAND [OPTIONS]"
+
+
+def overview() -> str:
+    """The text of ``skidloc --help``."""
+    lines = [f"  {name:10} {summary}" for name, (_, summary) in COMMANDS.items()]
+    return "\n".join(
+        [
+            USAGE,
+            "",
+            "Probabilistic odometry and localization for skid-steer robots whose centre of gravity moves.",
+            "",
+            "commands:",
+            *lines,
+            "",
+            "`skidloc COMMAND --help` describes the options of a command.",
+        ]
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code: 0, 2 for bad input."""
-    complaints = PlainConsole(stderr=True, soft_wrap=True, highlight=False)
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    errors = PlainConsole(stderr=True, soft_wrap=True, highlight=False)
     try:
-        command = tyro.cli(
-            Command,
-            prog="skidloc",
-            description="Probabilistic odometry for skid-steer robots whose centre of gravity moves.",
-            args=arguments,
-            config=(tyro.conf.FlagCreatePairsOff,),
-        )
-        command.run(PlainConsole(highlight=False))
+        if given and given[0] in ("-h", "--help"):
+            print(overview())
+        elif not given or given[0] not in COMMANDS:
+            errors.print(f"skidloc: {_unknown(given)}", markup=False)
+            return _BAD_INPUT
+        else:
+            _run(given[0], given[1:])
     except SkidlocError as error:
-        complaints.print(f"skidloc: {error}", markup=False)
+        errors.print(f"skidloc: {error}", markup=False)
         return _BAD_INPUT
     except KeyboardInterrupt:
-        complaints.print("skidloc: interrupted.")
+        errors.print("skidloc: interrupted.")
         return _INTERRUPTED
     except BrokenPipeError:  # `skidloc info LOG | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except OSError as error:  # what no part of the program expected of the system: names that are too long, folders without permission
+    except OSError as error:  # errors of the system that no command handles: names that are too long, folders without permission
         name = f"'{error.filename}': " if error.filename is not None else ""
-        complaints.print(f"skidloc: {name}{error.strerror or error}.", markup=False)
+        errors.print(f"skidloc: {name}{error.strerror or error}.", markup=False)
         return _BAD_INPUT
     except MemoryError:
-        complaints.print("skidloc: there is not enough memory for this. Use a shorter log, or smaller settings.")
+        errors.print("skidloc: there is not enough memory for this. Use a shorter log, or smaller settings.")
         return _BAD_INPUT
     return 0
+
+
+def _unknown(given: Sequence[str]) -> str:
+    """What is wrong with a first argument that names no command."""
+    if not given:
+        return f"a command is missing: {', '.join(COMMANDS)}. `skidloc --help` describes them."
+    nearest = difflib.get_close_matches(given[0], COMMANDS, n=1)
+    hint = f"did you mean '{nearest[0]}'?" if nearest else f"there are {', '.join(COMMANDS)}."
+    return f"no command '{given[0]}'; {hint}"
+
+
+def _run(name: str, options: Sequence[str]) -> None:
+    import tyro
+
+    command = getattr(importlib.import_module(f"localization.commands.{name}"), COMMANDS[name][0])
+    tyro.cli(command, prog=f"skidloc {name}", args=options, config=(tyro.conf.FlagCreatePairsOff,)).run(PlainConsole(highlight=False))
 
 
 if __name__ == "__main__":

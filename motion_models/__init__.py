@@ -1,32 +1,38 @@
 """Motion models of skid-steer robots whose centre of gravity moves: pure functions of wheels, CG and parameters."""
 
-from motion_models.base import Motion, MotionModel, Twist
-from motion_models.calibration.center_of_rotation import CenterOfRotation, center_from_end_poses, center_of_arc
-from motion_models.calibration.cross_validation import HeldOut, Interval, cross_validate, root_mean, root_mean_gain
-from motion_models.calibration.fit import Fit, fit
-from motion_models.calibration.least_squares import FitConfig
-from motion_models.calibration.maneuvers import Maneuver
-from motion_models.calibration.prediction import REFERENCE_PARAM_NAMES
-from motion_models.calibration.regressions import RotationTable, read_rotation_table, rotations_as_maneuvers, skid_steer_fit
-from motion_models.calibration.ros_export import diff_drive_controller_yaml, multiplier_table, multipliers, robot_localization_yaml
-from motion_models.calibration.windows_table import read_windows, windows_text
-from motion_models.center_of_gravity.files import arms_model, arms_postures, urdf_cg, weighed_cg
-from motion_models.center_of_gravity.model import CgModel, cg_model, static_part_from_weighing
-from motion_models.center_of_gravity.parts import Arms, CgEstimate, Payload, StaticPart, Tolerances, support_margin
-from motion_models.center_of_gravity.postures import posture_for
-from motion_models.center_of_gravity.tracker import CgTracker
-from motion_models.center_of_gravity.weighing import Scales, WeighedCg, cg_from_scales, read_weighings, wheel_contacts
-from motion_models.diff_drive import DiffDrive
-from motion_models.errors import CalibrationError, CgError, ModelError, RobotError, SkidlocError
-from motion_models.friction import FrictionModel
-from motion_models.friction.dynamics import FrictionDynamics
-from motion_models.full_linear import FullLinear
-from motion_models.icr import Icr
-from motion_models.preintegration import preintegrate
-from motion_models.registry import MODELS, make_model
-from motion_models.robot import Robot, load_robot, parse_robot, robot_names
-from motion_models.robot_file import robot_toml
-from motion_models.skid_steer import SkidSteer, thesis_coefficients
+from typing import TYPE_CHECKING
+
+from motion_models.lazy import exports
+
+if TYPE_CHECKING:
+    from motion_models.base import Motion, MotionModel, Twist
+    from motion_models.calibration.center_of_rotation import CenterOfRotation, center_from_end_poses, center_of_arc
+    from motion_models.calibration.cross_validation import HeldOut, Interval, cross_validate, root_mean, root_mean_gain
+    from motion_models.calibration.fit import Fit, fit
+    from motion_models.calibration.least_squares import FitConfig
+    from motion_models.calibration.maneuvers import Maneuver
+    from motion_models.calibration.prediction import REFERENCE_PARAM_NAMES
+    from motion_models.calibration.regressions import RotationTable, read_rotation_table, rotations_as_maneuvers, skid_steer_fit
+    from motion_models.calibration.ros_export import diff_drive_controller_yaml, multiplier_table, multipliers, robot_localization_yaml
+    from motion_models.calibration.windows_table import read_windows, windows_text
+    from motion_models.center_of_gravity.files import arms_model, arms_postures, urdf_cg, weighed_cg
+    from motion_models.center_of_gravity.model import CgModel, cg_model, static_part_from_weighing
+    from motion_models.center_of_gravity.parts import Arms, CgEstimate, Payload, StaticPart, Tolerances, support_margin
+    from motion_models.center_of_gravity.postures import posture_for
+    from motion_models.center_of_gravity.tracker import CgTracker
+    from motion_models.center_of_gravity.weighing import Scales, WeighedCg, cg_from_scales, read_weighings, wheel_contacts
+    from motion_models.diff_drive import DiffDrive
+    from motion_models.errors import CalibrationError, CgError, ModelError, RobotError, SkidlocError
+    from motion_models.friction import FrictionModel
+    from motion_models.friction.dynamics import FrictionDynamics
+    from motion_models.full_linear import FullLinear
+    from motion_models.icr import Icr
+    from motion_models.preintegration import preintegrate
+    from motion_models.prior import SkidPrior, geometric_scaling, prior_note, skid_prior
+    from motion_models.registry import MODELS, make_model
+    from motion_models.robot import Robot, load_robot, parse_robot, robot_names
+    from motion_models.robot_file import robot_toml
+    from motion_models.skid_steer import SkidSteer, thesis_coefficients
 
 __all__ = [
     "MODELS",
@@ -56,6 +62,7 @@ __all__ = [
     "RobotError",
     "RotationTable",
     "Scales",
+    "SkidPrior",
     "SkidSteer",
     "SkidlocError",
     "StaticPart",
@@ -71,6 +78,7 @@ __all__ = [
     "cross_validate",
     "diff_drive_controller_yaml",
     "fit",
+    "geometric_scaling",
     "load_robot",
     "make_model",
     "multiplier_table",
@@ -78,6 +86,7 @@ __all__ = [
     "parse_robot",
     "posture_for",
     "preintegrate",
+    "prior_note",
     "read_rotation_table",
     "read_weighings",
     "read_windows",
@@ -87,6 +96,7 @@ __all__ = [
     "root_mean",
     "root_mean_gain",
     "rotations_as_maneuvers",
+    "skid_prior",
     "skid_steer_fit",
     "static_part_from_weighing",
     "support_margin",
@@ -96,3 +106,35 @@ __all__ = [
     "wheel_contacts",
     "windows_text",
 ]
+
+_MODULES = {
+    "motion_models.base": "Motion MotionModel Twist",
+    "motion_models.calibration.center_of_rotation": "CenterOfRotation center_from_end_poses center_of_arc",
+    "motion_models.calibration.cross_validation": "HeldOut Interval cross_validate root_mean root_mean_gain",
+    "motion_models.calibration.fit": "Fit fit",
+    "motion_models.calibration.least_squares": "FitConfig",
+    "motion_models.calibration.maneuvers": "Maneuver",
+    "motion_models.calibration.prediction": "REFERENCE_PARAM_NAMES",
+    "motion_models.calibration.regressions": "RotationTable read_rotation_table rotations_as_maneuvers skid_steer_fit",
+    "motion_models.calibration.ros_export": "diff_drive_controller_yaml multiplier_table multipliers robot_localization_yaml",
+    "motion_models.calibration.windows_table": "read_windows windows_text",
+    "motion_models.center_of_gravity.files": "arms_model arms_postures urdf_cg weighed_cg",
+    "motion_models.center_of_gravity.model": "CgModel cg_model static_part_from_weighing",
+    "motion_models.center_of_gravity.parts": "Arms CgEstimate Payload StaticPart Tolerances support_margin",
+    "motion_models.center_of_gravity.postures": "posture_for",
+    "motion_models.center_of_gravity.tracker": "CgTracker",
+    "motion_models.center_of_gravity.weighing": "Scales WeighedCg cg_from_scales read_weighings wheel_contacts",
+    "motion_models.diff_drive": "DiffDrive",
+    "motion_models.errors": "CalibrationError CgError ModelError RobotError SkidlocError",
+    "motion_models.friction": "FrictionModel",
+    "motion_models.friction.dynamics": "FrictionDynamics",
+    "motion_models.full_linear": "FullLinear",
+    "motion_models.icr": "Icr",
+    "motion_models.preintegration": "preintegrate",
+    "motion_models.prior": "SkidPrior geometric_scaling prior_note skid_prior",
+    "motion_models.registry": "MODELS make_model",
+    "motion_models.robot": "Robot load_robot parse_robot robot_names",
+    "motion_models.robot_file": "robot_toml",
+    "motion_models.skid_steer": "SkidSteer thesis_coefficients",
+}
+__getattr__ = exports(__name__, {name: module for module, names in _MODULES.items() for name in names.split()})

@@ -1,4 +1,4 @@
-"""Coefficients of `SkidSteer` and `Icr` for a robot without a calibration: from its geometry, by the friction model, with their uncertainty.
+"""Coefficients of `SkidSteer` and `Icr` for a robot without a calibration: from geometry, by the friction model, with uncertainty.
 
 With equally loaded wheels and the isotropic contact law, rotations in place (all wheels slide) and gentle arcs (force proportional to
 slip) have the same limit,

@@ -23,7 +23,7 @@ from localization import Trial, open_log, read_reference_file, replay, score
 from localization.report.figure_data import nis_means, spans
 from localization.report.notebook import Panel, Series, picture, table, trajectories
 from localization.report.replay_page import verdict
-from localization.report.runs import make_lines
+from localization.report.runs import plotted_runs
 from motion_models import load_robot, make_model
 
 LOG_S = 1400.0  # all of it
@@ -69,7 +69,7 @@ table(
 # heading drifts away; only the filter comes back to where it was.
 
 # %%
-lines = make_lines(results)
+lines = plotted_runs(results)
 binned = [spans(line, truth) for line in lines]
 metres = [Series(line.label, s.seconds, s.translation_m, line.colour, "o", line.dashes) for line, s in zip(lines, binned, strict=True)]
 degrees = [Series(line.label, s.seconds, s.rotation_deg, line.colour, "o", line.dashes) for line, s in zip(lines, binned, strict=True)]

@@ -37,7 +37,7 @@ _USUAL_ROBOT = "husky_a200"
 
 @dataclass(frozen=True)
 class Calibrate:
-    """Fit a motion model to what logs or tables say of the robot's real motion, and write the robot file."""
+    """Fit a motion model to logs or tables and write the robot file."""
 
     source: tyro.conf.Positional[tuple[Path, ...]]
     """Logs (.bag, folder, .mcap), or tables (.csv): rotations in place at many centres of gravity (cg_x_m, cg_y_m, rotation_ratio, cor_x_m,

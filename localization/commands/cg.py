@@ -29,7 +29,7 @@ from motion_models.skid_steer import SkidSteer
 
 @dataclass(frozen=True)
 class Cg:
-    """Where the centre of gravity is: by four scales, by the arms' posture, with a payload."""
+    """Compute the centre of gravity from scales, arms and payload."""
 
     weighings: tyro.conf.Positional[Path | None] = None
     """CSV of weighings, one a line: front_left_kg, front_right_kg, rear_left_kg, rear_right_kg."""

@@ -35,7 +35,7 @@ from motion_models.robot import load_robot
 
 @dataclass(frozen=True)
 class Compare:
-    """Run motion models and estimators over many logs, and tell which is better and how sure that is."""
+    """Compare motion models and estimators over many logs."""
 
     logs: tyro.conf.Positional[tuple[Path, ...]]
     """Logs with a reference each: ROS 1 .bag, ROS 2 bag folders, bare .mcap."""

@@ -31,7 +31,7 @@ from motion_models.robot_file import relocated, robot_toml
 
 @dataclass(frozen=True)
 class Diagnose:
-    """Say what a motion model gets wrong on a log or table, why, how to correct it, and what that gains."""
+    """Find what a motion model gets wrong on a log, its cause, and the gain of correcting it."""
 
     source: tyro.conf.Positional[Path]
     """Log (.bag, folder, .mcap), or table (.csv): rotations in place at many centres of gravity (cg_x_m, cg_y_m, rotation_ratio, cor_x_m,

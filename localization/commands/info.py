@@ -20,7 +20,7 @@ from motion_models.robot import load_robot
 
 @dataclass(frozen=True)
 class Info:
-    """Topics, rates and duration of a log, what the robot file will use, what is missing or suspect."""
+    """Show what a log holds and what would be used of it."""
 
     log: tyro.conf.Positional[Path]
     """ROS 1 .bag, ROS 2 bag folder, or bare .mcap."""

@@ -38,7 +38,7 @@ _SLOWEST = 0.001  # a second of the log in a quarter of an hour
 
 @dataclass(frozen=True)
 class Online(OnlineSettings):
-    """Run one motion model and estimator live, on ROS topics or on a log as it was recorded; Ctrl-C ends it."""
+    """Run the estimator live on ROS topics, or on a log as it was recorded."""
 
     log: tyro.conf.Positional[Path | None] = None
     """A log to run from, instead of live topics."""

@@ -42,7 +42,7 @@ _PROGRESS_NS = 500_000_000
 
 @dataclass(frozen=True)
 class Replay:
-    """Run motion models and estimators over a log and show how well each of them knows where the robot was."""
+    """Run motion models and estimators over a log and score their trajectories."""
 
     log: tyro.conf.Positional[Path]
     """ROS 1 .bag, ROS 2 bag folder, or bare .mcap."""
@@ -57,7 +57,7 @@ class Replay:
     corrections: str = "constant"
     """What ekf and graph learn of the motion model, forms separated by commas: none, constant (k and centre of rotation as slowly
     changing constants), cg_field (their regressions on the centre of gravity, remembered from posture to posture), or single ones by name,
-    joined by + (the friction model's: mu_ratio, tracked_x, tracked_y, warp, cg_offset_x, cg_offset_y; as constant+cg_offset_x)."""
+    join_words by + (the friction model's: mu_ratio, tracked_x, tracked_y, warp, cg_offset_x, cg_offset_y; as constant+cg_offset_x)."""
     reference: str | None = None
     """Topic of the log, or file (.tum, .relations), to score against; `none` for no score. Default: the robot file's topic, if any."""
     positions: str | None = None

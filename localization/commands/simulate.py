@@ -26,7 +26,7 @@ _EFFECTS = "; ".join(f"{e.id} [{e.unit}]: {e.meaning}" for e in EFFECTS.values()
 
 @dataclass(frozen=True)
 class Simulate:
-    """Simulate a skid-steer robot by its physics and write a log: wheels, arms, IMU, LiDAR, GPS, and the truth."""
+    """Simulate a skid-steer robot and write a log."""
 
     experiment: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help=_EXPERIMENTS)]
     """What is driven."""

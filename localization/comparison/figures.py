@@ -9,14 +9,14 @@ import numpy as np
 from localization.comparison.statistics import Mean, by_combination
 from localization.comparison.summary import Findings
 from localization.report.figures import Axes, Figure, plain_logs, svg
-from localization.report.svg import COLOURS, Size
+from localization.report.svg import COLOURS, WIDTH_IN
 
 _MARKERS = "osD^v"
 _LOGARITHMIC = 8.0
 _ROW_IN = 0.42
 
 
-def means_svg(found: Findings, styles: Mapping[str, tuple[str, int]], size: Size) -> str:
+def means_svg(found: Findings, styles: Mapping[str, tuple[str, int]]) -> str:
     """A row for each combination, the best on top: a dot for each log, the mean and its 95 % interval. ``styles``: colour's name and
     number of the motion model, by name of the combination."""
     values = {name: np.array(list(table.values())) for name, table in by_combination(found.rows, found.metric).items()}
@@ -34,13 +34,13 @@ def means_svg(found: Findings, styles: Mapping[str, tuple[str, int]], size: Size
             plain_logs(axes)
         else:
             axes.set_xlim(min(0.0, 1.05 * least), 1.05 * most or 1.0)
-        _rows(axes, [found.words[mean.name] for mean in found.means], size)
+        _rows(axes, [found.words[mean.name] for mean in found.means])
         axes.set_xlabel(_with_unit(found))
 
-    return svg(f"means-{size.name}", size.width_in, _ROW_IN * len(found.means) + 0.75, draw)
+    return svg("means", WIDTH_IN, _ROW_IN * len(found.means) + 0.75, draw)
 
 
-def gains_svg(found: Findings, others: Sequence[Mean], styles: Mapping[str, tuple[str, int]], size: Size) -> str:
+def gains_svg(found: Findings, others: Sequence[Mean], styles: Mapping[str, tuple[str, int]]) -> str:
     """By how much the best is smaller than each of ``others``, with 95 % intervals: those that reach 0 show nothing."""
 
     def draw(figure: Figure) -> None:
@@ -53,10 +53,10 @@ def gains_svg(found: Findings, others: Sequence[Mean], styles: Mapping[str, tupl
             colour, model = styles[mean.name]
             _interval(axes, row, 100.0 * sign * d.relative, (low, high), colour, _MARKERS[model % len(_MARKERS)])
         axes.axvline(0.0, color=COLOURS["ink"], linewidth=0.9)
-        _rows(axes, [f"than {found.words[mean.name]}" for mean in others], size)
-        axes.set_xlabel(f"smaller by [%]: {found.measure} of {found.words[found.best.name]}" if size.is_wide else "smaller by [%]")
+        _rows(axes, [f"than {found.words[mean.name]}" for mean in others])
+        axes.set_xlabel(f"smaller by [%]: {found.measure} of {found.words[found.best.name]}")
 
-    return svg(f"gains-{size.name}", size.width_in, _ROW_IN * len(others) + 0.75, draw)
+    return svg("gains", WIDTH_IN, _ROW_IN * len(others) + 0.75, draw)
 
 
 def _interval(axes: Axes, row: int, value: float, interval: tuple[float, float], colour: str, marker: str) -> None:
@@ -64,9 +64,8 @@ def _interval(axes: Axes, row: int, value: float, interval: tuple[float, float],
     axes.plot(value, row, marker, color=COLOURS[colour], markersize=6.5, markeredgecolor=COLOURS["ink"], markeredgewidth=0.6)
 
 
-def _rows(axes: Axes, names: Sequence[str], size: Size) -> None:
-    labels = [name if size.is_wide else name.replace(" with ", "\nwith ") for name in names]
-    axes.set(yticks=range(len(names)), yticklabels=labels, ylim=(len(names) - 0.4, -0.6))
+def _rows(axes: Axes, names: Sequence[str]) -> None:
+    axes.set(yticks=range(len(names)), yticklabels=names, ylim=(len(names) - 0.4, -0.6))
     axes.grid(visible=False, axis="y")
     axes.tick_params(axis="y", length=0)
     axes.spines["left"].set_visible(False)

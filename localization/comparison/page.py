@@ -1,11 +1,10 @@
-"""One self-contained page that tells what a comparison over many logs found: words first, then means, tests, every log, what failed."""
+"""Report of a comparison over many logs: summary, means, tests, every log, failures."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 
 from localization.comparison.figures import gains_svg, means_svg
@@ -13,36 +12,39 @@ from localization.comparison.statistics import Difference, Mean, by_combination,
 from localization.comparison.summary import Findings, against_best, closing, headline, p_words, percent
 from localization.errors import OutputError
 from localization.output import write_text_file
-from localization.report.page import bullets, figure, glossary, html_page, opening, section
-from localization.report.runs import capitalised, estimator_colours
-from localization.report.svg import NARROW, WIDE
-from localization.report.tables import MISSING, definition_table, header, number, row, table
+from localization.report.page import (
+    Block,
+    Bullets,
+    Cell,
+    Definitions,
+    Figure,
+    Item,
+    Page,
+    Paragraph,
+    Section,
+    Table,
+    bullets,
+    glossary,
+    render,
+)
+from localization.report.runs import capitalize, estimator_colours
+from localization.report.tables import MISSING, number
 
 _TITLE = "Comparison over"
-_BEST, _EQUAL = ' <span class="badge">best</span>', ' <span class="badge soft">not told apart</span>'
-_LOST = ' <span class="badge soft">LiDAR lost</span>'
-_TERMS = (
-    (
-        "Mean",
-        "Over logs, each of which counts once: errors within a log hang together, logs do not. In brackets the interval that holds the "
-        "mean of other such logs in 95 of 100 cases, by bootstrap over logs.",
-    ),
-    (
-        "Smaller by",
-        "By what part of the other's mean the best one's is smaller, on the logs that both have, with its 95 % interval. Logs differ far "
-        "more than combinations do on one log: this interval is of the pairs and can be narrow where those of the means overlap.",
-    ),
-    (
-        "p",
-        "How probable so large a difference is if neither were better: signs of the differences are flipped log by log. Corrected for "
-        "all pairs of the table after Holm. Below 0.05 a difference is called shown.",
-    ),
-)
+_BEST, _EQUAL, _LOST = "best", "not told apart", "LiDAR lost"
+_TERMS = {
+    "Mean": "Over logs, each of which counts once: errors within a log are correlated, logs are not. In brackets the interval that holds "
+    "the mean of other such logs in 95 of 100 cases, by bootstrap over logs.",
+    "Smaller by": "By what part of the other's mean the best one's is smaller, on the logs that both have, with its 95 % interval. Logs "
+    "differ far more than combinations do on one log: this interval is of the pairs and can be narrow where those of the means overlap.",
+    "p": "Probability of so large a difference if neither were better: signs of the differences are flipped log by log. Corrected for all "
+    "pairs of the table after Holm. Below 0.05 a difference is called shown.",
+}
 
 
 @dataclass(frozen=True)
 class CompareHead:
-    """What a report says of where it comes from."""
+    """Provenance of a report."""
 
     robot: str
     reference: str
@@ -67,24 +69,21 @@ def check_report(path: Path) -> None:
 
 
 def comparison_page(head: CompareHead, found: Findings) -> str:
-    """The whole page; ``found`` has means."""
-    names = [_short(log, found) for log in _logs(found)]
-    n = len(names)
+    """HTML of the whole page; ``found`` has means."""
+    n = len(_logs(found))
     title = f"{_TITLE} {n} log{'s' * (n != 1)}"
     styles = _styles(found)
     facts = f"{head.robot} · {found.metric} · {len(found.words)} combinations of motion model and estimator"
-    others = [mean for mean in found.means[1:] if (d := found.against_best(mean.name)) is not None and d.relative == d.relative]
-    parts = [
-        *opening(title, facts, [_unbroken(said) for said in (headline(found), *closing(found))]),
-        section("Means over logs", _means_figure(found, styles)),
-        section("The best against the others", _gains_figure(found, others, styles) + _tests(found, styles)),
-        section("Every log", _by_log(found, styles)),
-        section("What failed", _failures(found)),
-        section("What was amiss with logs that did not fail", _notes(found)),
+    sections = [
+        Section("Means over logs", [_means_figure(found, styles)]),
+        Section("The best against the others", [*_gains_figure(found, styles), *_tests(found, styles)]),
+        Section("Every log", _by_log(found, styles)),
+        Section("Failures", _failures(found)),
+        Section("Problems of logs that did not fail", _problems(found)),
         glossary(_TERMS),
-        section("Where this comes from", definition_table(_provenance(head, found))),
+        Section("Sources and versions", [Definitions(_provenance(head, found))]),
     ]
-    return html_page(title, parts)
+    return render(Page(title, facts, [_unbroken(sentence) for sentence in (headline(found), *closing(found))], sections))
 
 
 def _unbroken(sentence: str) -> str:
@@ -92,33 +91,41 @@ def _unbroken(sentence: str) -> str:
     return sentence.replace(" %", "\N{NO-BREAK SPACE}%").replace("p = ", "p\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}")
 
 
-def _means_figure(found: Findings, styles: Mapping[str, tuple[str, int]]) -> str:
+def _means_figure(found: Findings, styles: Mapping[str, tuple[str, int]]) -> Figure:
     caption = "Large: mean over logs, the line its 95 % interval. Small: each log. Colours are estimators, shapes are motion models."
-    return figure("", [means_svg(found, styles, size) for size in (WIDE, NARROW)], f"Mean {found.measure} by combination", caption)
+    return Figure(means_svg(found, styles), f"Mean {found.measure} by combination", caption)
 
 
-def _gains_figure(found: Findings, others: Sequence[Mean], styles: Mapping[str, tuple[str, int]]) -> str:
+def _gains_figure(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[Block]:
+    differences = [(mean, found.against_best(mean.name)) for mean in found.means[1:]]
+    others: list[Mean] = [mean for mean, d in differences if d is not None and not math.isnan(d.relative)]
     if not others:
-        return ""
+        return []
     caption = "Lines are 95 % intervals over logs; where one reaches 0, these logs do not show that the best is better."
-    pictures = [gains_svg(found, others, styles, size) for size in (WIDE, NARROW)]
-    return figure("", pictures, f"By how much the {found.measure} of the best is smaller", caption)
+    return [Figure(gains_svg(found, others, styles), f"By how much the {found.measure} of the best is smaller", caption)]
 
 
-def _tests(found: Findings, styles: Mapping[str, tuple[str, int]]) -> str:
+def _tests(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[Block]:
     digits = _digits(found)
     rows = []
     for mean in found.means:
         d = None if mean is found.best else found.against_best(mean.name)
-        interval = f"<br><small>{number(mean.low, digits)} to {number(mean.high, digits)}</small>" if mean.n > 1 else ""
+        interval = f"{number(mean.low, digits)} to {number(mean.high, digits)}" if mean.n > 1 else ""
         badge = _LOST if found.lost(mean.name) else _BEST if mean is found.best else _EQUAL if d is None or not found.is_shown(d) else ""
         cells = (MISSING,) * 3 if d is None else _cells(d, found)
-        rows.append(row(_name(mean.name, found, styles, badge), number(mean.mean, digits) + interval, str(mean.n), *cells))
-    unit = f"<br><small>{found.unit or found.metric}, 95 %</small>"
-    head = header("Estimator<br><small>motion model</small>", f"Mean{unit}", "Logs", "Best is smaller by<br><small>95 %</small>", "on", "p")
-    sentences = bullets(against_best(mean, found) for mean in found.means[1:])
-    told = f"<details><summary>The same in words</summary>{sentences}</details>" if sentences else ""
-    return table(head, rows) + told + _all_pairs(found)
+        rows.append(
+            [_name(mean.name, found, styles, badge), Cell(number(mean.mean, digits), interval), Cell(str(mean.n)), *map(Cell, cells)]
+        )
+    header = [
+        Cell("Estimator", "motion model"),
+        Cell("Mean", f"{found.unit or found.metric}, 95 %"),
+        Cell("Logs"),
+        Cell("Best is smaller by", "95 %"),
+        Cell("on"),
+        Cell("p"),
+    ]
+    sentences = bullets([against_best(mean, found) for mean in found.means[1:]], "The same in words")
+    return [Table(header, rows), *sentences, *_all_pairs(found)]
 
 
 def _cells(d: Difference, found: Findings) -> tuple[str, str, str]:
@@ -126,22 +133,22 @@ def _cells(d: Difference, found: Findings) -> tuple[str, str, str]:
     return f"{reverse}{percent(d, found.unit)}", f"{d.wins} of {d.n}", p_words(d.p_value)
 
 
-def _all_pairs(found: Findings) -> str:
+def _all_pairs(found: Findings) -> list[Block]:
     if len(found.means) < 3:
-        return ""
+        return []
     rows = [
-        row(
-            escape(f"{capitalised(found.words[d.better])} before {found.words[d.worse]}"),
-            percent(d, found.unit),
-            f"{d.wins} of {d.n}",
-            p_words(d.p_value),
-        )
+        [
+            Cell(f"{capitalize(found.words[d.better])} before {found.words[d.worse]}"),
+            Cell(percent(d, found.unit)),
+            Cell(f"{d.wins} of {d.n}"),
+            Cell(p_words(d.p_value)),
+        ]
         for d in found.tested
     ]
-    return f"<details><summary>All pairs</summary>{table(header('Trial', 'Smaller by', 'on', 'p'), rows)}</details>"
+    return [Table([Cell(title) for title in ("Pair", "Smaller by", "on", "p")], rows, "All pairs")]
 
 
-def _by_log(found: Findings, styles: Mapping[str, tuple[str, int]]) -> str:
+def _by_log(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[Block]:
     numbers = by_combination(found.rows, found.metric)
     shown = [mean.name for mean in found.means]
     failed = {(r["log"], combination(r)) for r in found.failed}
@@ -149,37 +156,35 @@ def _by_log(found: Findings, styles: Mapping[str, tuple[str, int]]) -> str:
     for log in _logs(found):
         values = [numbers[name].get(log) for name in shown]
         least = min((value for value in values if value is not None), default=None)
-        cells = []
+        cells = [Cell(_short(log, found))]
         for name, value in zip(shown, values, strict=True):
             text = ("failed" if (log, name) in failed else MISSING) if value is None else number(value, digits)
-            cells.append(f"<b>{text}</b>" if value is not None and value == least and len(shown) > 1 else text)
-        rows.append(row(escape(_short(log, found)), *cells))
+            cells.append(Cell(text, is_bold=value is not None and value == least and len(shown) > 1))
+        rows.append(cells)
     unit = f" [{found.unit}]" if found.unit else ""
-    note = f"<p><small>{escape(found.measure)}{unit}. Bold: the smallest on its log.</small></p>"
-    return table(header("Log", *(_name(name, found, styles) for name in shown)), rows) + note
+    header = [Cell("Log"), *(_name(name, found, styles) for name in shown)]
+    return [Table(header, rows), Paragraph(f"{found.measure}{unit}. Bold: the smallest on its log.", is_small=True)]
 
 
-def _failures(found: Findings) -> str:
+def _failures(found: Findings) -> list[Block]:
     reasons: dict[tuple[str, str], list[str]] = {}
     for r in found.failed:
         reasons.setdefault((r["log"], r["error"]), []).append(found.words[combination(r)])
-    rows = []
+    items = []
     for (log, reason), names in reasons.items():
         which = "everything" if len(names) == len(found.words) else ", ".join(names)
-        rows.append(f"<li><b>{escape(_short(log, found))}</b> ({escape(which)}): {escape(reason)}</li>")
-    return f"<ul>{''.join(rows)}</ul>" if rows else ""
+        items.append(Item(reason, f"{_short(log, found)} ({which})"))
+    return [Bullets(items)] if items else []
 
 
-def _notes(found: Findings) -> str:
+def _problems(found: Findings) -> list[Block]:
     notes = {r["log"]: r["notes"] for r in found.rows if r.get("notes")}
-    listed = "".join(f"<li><b>{escape(_short(log, found))}</b>: {escape(said)}</li>" for log, said in notes.items())
-    return f"<ul>{listed}</ul>" if listed else ""
+    return [Bullets([Item(note, _short(log, found)) for log, note in notes.items()])] if notes else []
 
 
-def _name(name: str, found: Findings, styles: Mapping[str, tuple[str, int]], badge: str = "") -> str:
+def _name(name: str, found: Findings, styles: Mapping[str, tuple[str, int]], badge: str = "") -> Cell:
     estimator, _, model = found.words[name].partition(" with ")
-    mark = f'<b style="color:var(--{styles[name][0]})">●</b>'
-    return f'<span class="name">{mark} <b>{escape(estimator)}</b></span>{badge}<br><small>{escape(model)}</small>'
+    return Cell(estimator, model, is_bold=True, badge=badge, mark=styles[name][0])
 
 
 def _digits(found: Findings) -> int:

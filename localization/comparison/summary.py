@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from localization.comparison.jobs import OK, Row
 from localization.comparison.statistics import Difference, Mean, combination, differences, means
 from localization.lidar.losses import is_long, per_cent
-from localization.report.runs import capitalised, joined, words_of
+from localization.report.runs import capitalize, describe_run, join_words
 from localization.report.tables import unit_of
 
 _CERTAIN = 0.05
@@ -83,7 +83,7 @@ def find(rows: Sequence[Row], metric: str) -> Findings:
     words = {}
     for row in rows:
         form = f" ({row['corrections']})" if row["corrections"] and len(forms) > 1 else ""
-        words[combination(row)] = words_of(row["estimator"], row["model"]) + form
+        words[combination(row)] = describe_run(row["estimator"], row["model"]) + form
     return Findings(metric, rows, found, differences(rows, metric), words)
 
 
@@ -91,7 +91,7 @@ def headline(found: Findings) -> str:
     """The best against the next one."""
     best, others = found.best, found.means[1:]
     return (
-        against_best(others[0], found) if others else f"{capitalised(found.words[best.name])}: {_amount(best, found)} over {_logs(best.n)}."
+        against_best(others[0], found) if others else f"{capitalize(found.words[best.name])}: {_amount(best, found)} over {_logs(best.n)}."
     )
 
 
@@ -99,7 +99,7 @@ def against_best(other: Mean, found: Findings) -> str:
     """A sentence on the best and one that is not."""
     difference = found.against_best(other.name)
     if difference is None:
-        names = f"{capitalised(found.words[found.best.name])} and {found.words[other.name]}"
+        names = f"{capitalize(found.words[found.best.name])} and {found.words[other.name]}"
         return f"{names} share fewer than two logs: nothing can be told."
     return _of(difference, found)
 
@@ -113,8 +113,8 @@ def _of(d: Difference, found: Findings) -> str:
     better, worse = found.words[d.better], found.words[d.worse]
     gap = f"by {percent(d, found.unit)} of {found.measure}, p = {p_words(d.p_value)}"
     if found.is_shown(d):
-        return f"{capitalised(better)} beats {worse} on {d.wins} of {_logs(d.n)}, {gap}."
-    return f"{capitalised(better)} and {worse} are not told apart: the first is better on {d.wins} of {_logs(d.n)}, {gap}."
+        return f"{capitalize(better)} beats {worse} on {d.wins} of {_logs(d.n)}, {gap}."
+    return f"{capitalize(better)} and {worse} are not told apart: the first is better on {d.wins} of {_logs(d.n)}, {gap}."
 
 
 def percent(d: Difference, unit: str = "") -> str:
@@ -180,7 +180,7 @@ def _advice(found: Findings) -> str:
     if not equal:
         return f"Use {found.words[best.name]}."
     if len(equal) < len(pairs):
-        return f"Use {found.words[best.name]}; these logs do not tell it from {joined(equal, 'or')}."
+        return f"Use {found.words[best.name]}; these logs do not tell it from {join_words(equal, 'or')}."
     if (least := found.least_p(best.n)) >= _CERTAIN:
         enough = next(n for n in range(2, 99) if found.least_p(n) < _CERTAIN)
         return f"{_logs(best.n)} cannot show it: p is at least {p_words(least)} for {_pairs(len(found.tested))}. Take at least {enough}."

@@ -8,14 +8,14 @@ from localization.diagnosis.diagnose import Examined
 from localization.diagnosis.findings import Diagnosis
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS
 from localization.report.figures import Axes, Figure, svg
-from localization.report.svg import COLOURS, Size
+from localization.report.svg import COLOURS, WIDTH_IN
 from motion_models.se2 import FloatArray
 
 _NAMES = {"x": "along", "y": "sideways", "yaw": "heading", "gyro": "gyro - LiDAR"}
 _SHOWN = 4
 
 
-def discrepancy_svg(found: Examined, size: Size) -> str:
+def discrepancy_svg(found: Examined) -> str:
     """Each component window by window: as found, once corrected, and the band of noise."""
     assert found.pipeline is not None
     assert found.residuals is not None
@@ -33,10 +33,10 @@ def discrepancy_svg(found: Examined, size: Size) -> str:
             axes.set_ylabel(f"{_NAMES[CHANNELS[c]]} [{CHANNEL_UNITS[c]}]")
         panels[-1].set_xlabel("time since the first window [s]" if found.diagnosis.windows and seconds.any() else "maneuver")
 
-    return svg(f"discrepancy-{size.name}", size.width_in, 1.35 * len(shown) + 0.5, draw)
+    return svg("discrepancy", WIDTH_IN, 1.35 * len(shown) + 0.5, draw)
 
 
-def dependence_svg(found: Examined, size: Size) -> str:
+def dependence_svg(found: Examined) -> str:
     """Each component against what the wheels did: distance and turn by their rates, before and after."""
     assert found.pipeline is not None
     assert found.residuals is not None
@@ -54,10 +54,10 @@ def dependence_svg(found: Examined, size: Size) -> str:
         panels[-1][0].set_xlabel("driven in the window [m]")
         panels[-1][1].set_xlabel("turned in the window [rad]")
 
-    return svg(f"dependence-{size.name}", size.width_in, 1.6 * len(shown) + 0.5, draw)
+    return svg("dependence", WIDTH_IN, 1.6 * len(shown) + 0.5, draw)
 
 
-def gain_svg(d: Diagnosis, size: Size) -> str:
+def gain_svg(d: Diagnosis) -> str:
     """What each finding takes off the held-out discrepancy, with its interval."""
 
     def draw(figure: Figure) -> None:
@@ -69,7 +69,7 @@ def gain_svg(d: Diagnosis, size: Size) -> str:
         axes.set(yticks=range(len(d.findings)), yticklabels=[f.cause for f in d.findings], xlabel="held-out discrepancy taken off [%]")
         axes.invert_yaxis()
 
-    return svg(f"gain-{size.name}", size.width_in, 0.4 * len(d.findings) + 0.7, draw)
+    return svg("gain", WIDTH_IN, 0.4 * len(d.findings) + 0.7, draw)
 
 
 def _band(axes: Axes, seconds: FloatArray, width: FloatArray) -> None:

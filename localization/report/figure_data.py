@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from localization.evaluation.metrics import relation_errors
 from localization.evaluation.references import ReferenceTrack, Relations
-from localization.report.runs import Ellipse, Line, best_line, ellipse, map_line
+from localization.report.runs import Ellipse, PlottedRun, best_run, ellipse, run_with_map
 from localization.trajectory import Trajectory
 from motion_models.se2 import FloatArray
 
@@ -33,13 +33,13 @@ class MapView:
     """(2,) upper right corner [m]."""
     points: FloatArray
     """(M, 2) the map; (0, 2) without one."""
-    map_of: Line | None
+    map_of: PlottedRun | None
     """Whose map it is."""
     reference: FloatArray | None
     """(N, 2)"""
     paths: tuple[FloatArray, ...]
     """(N, 2) for each line."""
-    best: Line | None
+    best: PlottedRun | None
     """The run whose place is sure to be in the picture, with the map and the ellipses of its covariances if it has any."""
     ellipses: tuple[Ellipse, ...]
     """Two sigmas of the best run's position, at equal distances along its path."""
@@ -51,12 +51,12 @@ class MapView:
     """Lines that leave the picture."""
 
 
-def map_view(lines: Sequence[Line], reference: ReferenceTrack | Relations | None) -> MapView:
+def map_view(lines: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> MapView:
     """Borders hold the reference, the best run, and the map but for its strays. The others widen them by no more than a fifth: a run that
     got lost must not make the rest too small to see.
     """
-    best = best_line(lines) or map_line(lines) or (lines[-1] if lines else None)
-    mapped = map_line(lines)
+    best = best_run(lines) or run_with_map(lines) or (lines[-1] if lines else None)
+    mapped = run_with_map(lines)
     points = np.empty((0, 2))
     if mapped is not None:
         raw = mapped.result.run.map_points
@@ -111,7 +111,7 @@ class Timeline:
     """(N,)"""
 
 
-def timeline(line: Line) -> Timeline | None:
+def timeline(line: PlottedRun) -> Timeline | None:
     """None where the reference is no track."""
     errors = line.result.accuracy.errors if line.result.accuracy else None
     if errors is None:
@@ -134,7 +134,7 @@ class Spans:
     """Relations in each bin."""
 
 
-def spans(line: Line, relations: Relations) -> Spans:
+def spans(line: PlottedRun, relations: Relations) -> Spans:
     """Bins of equal width in the logarithm of the span; those of fewer than five relations are added to their neighbour."""
     found = relation_errors(line.result.run.trajectory, relations)
     span = np.maximum(found.spans_s, 1e-3)
@@ -169,7 +169,7 @@ class NisMeans:
     """Part of the single values below the 95 % quantile."""
 
 
-def nis_means(lines: Sequence[Line], limit: float) -> tuple[list[Line], list[NisMeans]]:
+def nis_means(lines: Sequence[PlottedRun], limit: float) -> tuple[list[PlottedRun], list[NisMeans]]:
     """The lines that have innovations, and about ninety means of each; ``limit``: the 95 % quantile of one value."""
     known = [(line, np.isfinite(line.result.run.nis)) for line in lines]
     known = [(line, use) for line, use in known if use.any()]
@@ -190,7 +190,7 @@ def _seconds(stamps_ns: np.ndarray, trajectory: Trajectory) -> FloatArray:
     return elapsed
 
 
-def _ellipses(line: Line) -> tuple[Ellipse, ...]:
+def _ellipses(line: PlottedRun) -> tuple[Ellipse, ...]:
     trajectory = line.result.run.trajectory
     if trajectory.covariances is None or not len(trajectory):
         return ()

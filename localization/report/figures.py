@@ -1,6 +1,7 @@
-"""Every picture, and the only place that knows matplotlib: figures without pyplot's state, as SVG that takes its colours from the page.
+"""Figures of reports, by matplotlib without pyplot's state, as SVG that takes its colours from the page.
 
-Same data, same bytes: no date, no random names. What the pictures show is gathered in `localization.report.figure_data`.
+The same data give the same bytes: no date, no random names. `localization.report.figure_data` prepares the data. No other module imports
+matplotlib.
 """
 
 from __future__ import annotations
@@ -18,12 +19,10 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from localization.evaluation.consistency import mean_band
 from localization.report.figure_data import MapView, NisMeans, Spans, Timeline, raster
-from localization.report.runs import Line, thin_path, thin_series
-from localization.report.svg import COLOURS, NARROW, WIDE, Size, for_page
+from localization.report.runs import PlottedRun, thin_path, thin_series
+from localization.report.svg import COLOURS, WIDTH_IN, for_page
 
 __all__ = [
-    "NARROW",
-    "WIDE",
     "Axes",
     "Figure",
     "map_svg",
@@ -66,22 +65,28 @@ _STYLE = {
     "path.simplify_threshold": 0.2,
 }
 
+_PIXELS, _OVERVIEW_PIXELS = 900, 1100
+"""Across the raster of a map."""
+_OVERVIEW_IN = 10.0
+"""Width of the overview [in]."""
+_ASPECT = (0.35, 0.9)
+"""Height by width of a map at least and at most: a narrower one is a ribbon, a taller one leaves the screen."""
 
-def map_svg(lines: Sequence[Line], view: MapView, size: Size) -> str:
+
+def map_svg(lines: Sequence[PlottedRun], view: MapView) -> str:
     """Trajectories, reference and ellipses over the map, in metres of one length along both axes."""
     low, high = view.low, view.high
     extent = np.maximum(high - low, 1e-6)
-    # a tall map would fill three phone screens, a long one be a ribbon: axes are never more unequal than this
-    height = float(np.clip(extent[1] / extent[0], 0.35, 0.9 if size.is_wide else 1.25)) * (size.width_in - 0.7) + 0.6
+    height = float(np.clip(extent[1] / extent[0], *_ASPECT)) * (WIDTH_IN - 0.7) + 0.6
 
     def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
-        _draw_map(axes, lines, view, size)
+        _draw_map(axes, lines, view, _PIXELS)
 
-    return svg(f"map-{size.name}", size.width_in, height, draw)
+    return svg("map", WIDTH_IN, height, draw)
 
 
-def timeline_svg(lines: Sequence[Line], timelines: Sequence[Timeline], size: Size) -> str:
+def timeline_svg(lines: Sequence[PlottedRun], timelines: Sequence[Timeline]) -> str:
     """Errors over time, position above heading. ``timelines`` go with ``lines``."""
     has_heading = any(t.heading_deg is not None for t in timelines)
     rows = 2 if has_heading else 1
@@ -91,7 +96,7 @@ def timeline_svg(lines: Sequence[Line], timelines: Sequence[Timeline], size: Siz
         for line, timeline in zip(lines, timelines, strict=True):
             for axes, values in zip(panels, (timeline.position_m, timeline.heading_deg), strict=False):
                 if values is not None and len(values):
-                    kept = thin_series(values, 700 if size.is_wide else 400)
+                    kept = thin_series(values)
                     _plot(axes, line, timeline.seconds[kept], values[kept])
         panels[0].set_ylabel("position error [m]")
         panels[0].set_ylim(bottom=0.0)
@@ -99,28 +104,27 @@ def timeline_svg(lines: Sequence[Line], timelines: Sequence[Timeline], size: Siz
             panels[1].set_ylabel("heading error [deg]")
         panels[-1].set_xlabel("time since the first pose [s]")
 
-    return svg(f"time-{size.name}", size.width_in, (2.2 if size.is_wide else 2.0) * rows + 0.4, draw)
+    return svg("time", WIDTH_IN, 2.2 * rows + 0.4, draw)
 
 
-def spans_svg(lines: Sequence[Line], spans: Sequence[Spans], size: Size) -> str:
+def spans_svg(lines: Sequence[PlottedRun], spans: Sequence[Spans]) -> str:
     """Mean error of relations against the time that they span, both axes logarithmic."""
 
     def draw(figure: Figure) -> None:
-        panels = figure.subplots(1, 2) if size.is_wide else figure.subplots(2, 1, sharex=True)
+        panels = figure.subplots(1, 2)
         for line, span in zip(lines, spans, strict=True):
             for axes, values in zip(panels, (span.translation_m, span.rotation_deg), strict=True):
                 _plot(axes, line, span.seconds, np.maximum(values, 1e-6), marker="o", markersize=3.0)
         for axes, name in zip(panels, ("translation error [m]", "rotation error [deg]"), strict=True):
             axes.set(xscale="log", yscale="log", ylabel=f"mean {name}")
             plain_logs(axes)
-            if size.is_wide or axes is panels[-1]:
-                axes.set_xlabel("time from first to second pose [s]")
+            axes.set_xlabel("time from first to second pose [s]")
 
-    return svg(f"spans-{size.name}", size.width_in, 3.1 if size.is_wide else 4.6, draw)
+    return svg("spans", WIDTH_IN, 3.1, draw)
 
 
-def nis_svg(lines: Sequence[Line], means: Sequence[NisMeans], size: Size) -> str:
-    """Means of successive innovations' NIS over time, on a logarithmic axis, and the band that honest ones keep to."""
+def nis_svg(lines: Sequence[PlottedRun], means: Sequence[NisMeans]) -> str:
+    """Means of successive innovations' NIS over time, on a logarithmic axis, and the 95 % band of consistent ones."""
 
     def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
@@ -134,21 +138,20 @@ def nis_svg(lines: Sequence[Line], means: Sequence[NisMeans], size: Size) -> str
         )
         plain_logs(axes)
 
-    return svg(f"nis-{size.name}", size.width_in, 2.6, draw)
+    return svg("nis", WIDTH_IN, 2.6, draw)
 
 
-def overview(lines: Sequence[Line], view: MapView, measure: str, title: str) -> bytes:
+def overview(lines: Sequence[PlottedRun], view: MapView, measure: str, title: str) -> bytes:
     """A PNG: the trajectories over the map, beside one bar for each run with its headline error."""
-    size = Size("overview", 10.0, 1100)
 
     def draw(figure: Figure) -> None:
         left, right = figure.subplots(1, 2, width_ratios=(1.7, 1.0))
-        _draw_map(left, lines, view, size)
+        _draw_map(left, lines, view, _OVERVIEW_PIXELS)
         left.set_title(title)
         _draw_bars(right, lines, measure)
 
     extent = np.maximum(view.high - view.low, 1e-6)
-    return picture(size.width_in, float(np.clip(extent[1] / extent[0], 0.5, 0.9)) * 6.0 + 0.7, draw)
+    return picture(_OVERVIEW_IN, float(np.clip(extent[1] / extent[0], 0.5, 0.9)) * 6.0 + 0.7, draw)
 
 
 def picture(width_in: float, height_in: float, draw: Callable[[Figure], None]) -> bytes:
@@ -160,9 +163,9 @@ def picture(width_in: float, height_in: float, draw: Callable[[Figure], None]) -
     return out.getvalue()
 
 
-def _draw_map(axes: Axes, lines: Sequence[Line], view: MapView, size: Size) -> None:
+def _draw_map(axes: Axes, lines: Sequence[PlottedRun], view: MapView, pixels: int) -> None:
     low, high = view.low, view.high
-    resolution = float((high - low).max()) / size.pixels
+    resolution = float((high - low).max()) / pixels
     if len(view.points):
         image, extent = raster(view, resolution)
         axes.imshow(image, extent=extent, origin="upper", interpolation="none", aspect="equal", zorder=1)
@@ -193,11 +196,11 @@ def _draw_map(axes: Axes, lines: Sequence[Line], view: MapView, size: Size) -> N
     if view.start is not None:
         axes.plot(*view.start, marker="o", markersize=5.5, color=COLOURS["ink"], markerfacecolor="none", markeredgewidth=1.2, zorder=5)
     axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    axes.xaxis.set_major_locator(MaxNLocator(7 if size.is_wide else 5))
-    axes.yaxis.set_major_locator(MaxNLocator(7 if size.is_wide else 5))
+    axes.xaxis.set_major_locator(MaxNLocator(7))
+    axes.yaxis.set_major_locator(MaxNLocator(7))
 
 
-def _draw_bars(axes: Axes, lines: Sequence[Line], measure: str) -> None:
+def _draw_bars(axes: Axes, lines: Sequence[PlottedRun], measure: str) -> None:
     scored = [line for line in lines if line.error is not None]
     for row, line in enumerate(scored):
         axes.barh(row, line.error or 0.0, height=0.55, color=COLOURS[line.colour], hatch="///" if line.dashes else None, edgecolor="white")
@@ -211,14 +214,14 @@ def _draw_bars(axes: Axes, lines: Sequence[Line], measure: str) -> None:
     axes.spines["left"].set_visible(False)
 
 
-def _plot(axes: Axes, line: Line, x: np.ndarray, y: np.ndarray, **more: object) -> None:
+def _plot(axes: Axes, line: PlottedRun, x: np.ndarray, y: np.ndarray, **more: object) -> None:
     style: dict[str, object] = {"color": COLOURS[line.colour], "gid": f"series-{line.number}", **more}
     (drawn,) = axes.plot(x, y, **style)  # type: ignore[arg-type]  # matplotlib's keywords are typed one by one
     if line.dashes:
         drawn.set_dashes(line.dashes)
 
 
-def _dashes(line: Line) -> tuple[float, ...]:
+def _dashes(line: PlottedRun) -> tuple[float, ...]:
     return line.dashes or (1.0, 0.0)
 
 

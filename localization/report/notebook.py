@@ -21,7 +21,7 @@ from localization.evaluation.scores import Result
 from localization.report import figures
 from localization.report.figure_data import map_view
 from localization.report.figures import Axes, Figure
-from localization.report.runs import make_lines
+from localization.report.runs import plotted_runs
 from localization.report.svg import COLOURS
 
 CYCLE = ("blue", "red", "green", "purple", "orange", "sky", "grey", "ink")
@@ -162,7 +162,7 @@ def picture(*panels: Panel | Bars, columns: int = 2, row_in: float = 3.1, width_
 
 def trajectories(results: Sequence[Result], reference: ReferenceTrack | Relations | None, title: str) -> Picture:
     """Trajectories over the map, beside one bar for each run with its headline error."""
-    lines = make_lines(results)
+    lines = plotted_runs(results)
     measure = "mean error of the relations [m]" if isinstance(reference, Relations) else "position error, ATE [m]"
     return Picture(figures.overview(lines, map_view(lines, reference), measure, title))
 

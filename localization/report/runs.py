@@ -27,7 +27,7 @@ _DASHES: tuple[tuple[float, ...], ...] = ((), (4.0, 1.8), (1.2, 1.4), (5.0, 1.5,
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class PlottedRun:
     """One run as it is drawn and named everywhere in a report."""
 
     number: int
@@ -50,7 +50,7 @@ class Line:
     @property
     def words(self) -> str:
         """As a sentence says it."""
-        return words_of(self.result.run.estimator, self.result.run.model)
+        return describe_run(self.result.run.estimator, self.result.run.model)
 
     @property
     def error(self) -> float | None:
@@ -82,18 +82,18 @@ def headline(accuracy: Accuracy | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
 
 
-def words_of(estimator: str, model: str) -> str:
+def describe_run(estimator: str, model: str) -> str:
     """An estimator and its motion model as a sentence says them."""
     name = _WORDS.get(estimator, estimator)
     return name if estimator == WHEELLESS else f"{name} with {model}"
 
 
-def capitalised(text: str) -> str:
+def capitalize(text: str) -> str:
     """The first letter of a sentence, but for names that are what one types."""
     return "Dead" + text[4:] if text.startswith("dead ") else text
 
 
-def joined(parts: Sequence[str], last: str = "and") -> str:
+def join_words(parts: Sequence[str], last: str = "and") -> str:
     """a, b and c."""
     return f"{', '.join(parts[:-1])} {last} {parts[-1]}" if len(parts) > 1 else "".join(parts)
 
@@ -108,11 +108,11 @@ def estimator_colours(estimators: Iterable[str]) -> dict[str, str]:
     return colours
 
 
-def make_lines(results: Sequence[Result]) -> list[Line]:
+def plotted_runs(results: Sequence[Result]) -> list[PlottedRun]:
     """Lines in the order of the results; of estimators that use no wheels only the first run is kept, the others are its copies."""
     models: list[str] = []
     colours = estimator_colours(result.run.estimator for result in results)
-    lines: list[Line] = []
+    lines: list[PlottedRun] = []
     for result in results:
         run = result.run
         if run.estimator == WHEELLESS and any(line.result.run.estimator == WHEELLESS for line in lines):
@@ -120,17 +120,17 @@ def make_lines(results: Sequence[Result]) -> list[Line]:
         if run.estimator != WHEELLESS and run.model not in models:
             models.append(run.model)
         style = 0 if run.estimator == WHEELLESS else models.index(run.model)
-        lines.append(Line(len(lines), result, colours[run.estimator], _DASHES[style % len(_DASHES)]))
+        lines.append(PlottedRun(len(lines), result, colours[run.estimator], _DASHES[style % len(_DASHES)]))
     return lines
 
 
-def best_line(lines: Sequence[Line]) -> Line | None:
+def best_run(lines: Sequence[PlottedRun]) -> PlottedRun | None:
     """The one of the smallest headline error that can be recommended; None without scores."""
     scored = [line for line in lines if line.error is not None and not line.is_lost]
     return min(scored, key=lambda line: (line.error, line.number)) if scored else None
 
 
-def map_line(lines: Sequence[Line]) -> Line | None:
+def run_with_map(lines: Sequence[PlottedRun]) -> PlottedRun | None:
     """The best run that has a map. Without scores a fusing estimator is taken before one that asks the LiDAR alone."""
     mapped = [line for line in lines if np.isfinite(line.result.run.map_points).all(axis=1).any()]
     trust = {"graph": 0, "ekf": 1, WHEELLESS: 3}
@@ -138,7 +138,7 @@ def map_line(lines: Sequence[Line]) -> Line | None:
     return min(mapped, key=key) if mapped else None
 
 
-def baseline_line(lines: Sequence[Line]) -> Line | None:
+def baseline_run(lines: Sequence[PlottedRun]) -> PlottedRun | None:
     """Dead reckoning with the ideal differential drive, else with whatever model: what every other run has to beat."""
     reckoned = [line for line in lines if line.result.run.estimator == DEAD_RECKONING]
     return min(reckoned, key=lambda line: (line.model != "diff_drive", line.number)) if reckoned else None

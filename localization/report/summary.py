@@ -18,7 +18,17 @@ from localization.evaluation.consistency import mean_band
 from localization.evaluation.metrics import relation_errors
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result
-from localization.report.runs import DEAD_RECKONING, WHEELLESS, Line, baseline_line, best_line, capitalised, headline, joined, make_lines
+from localization.report.runs import (
+    DEAD_RECKONING,
+    WHEELLESS,
+    PlottedRun,
+    baseline_run,
+    best_run,
+    capitalize,
+    headline,
+    join_words,
+    plotted_runs,
+)
 from localization.trajectory import IntArray
 from motion_models.se2 import FloatArray
 
@@ -36,10 +46,10 @@ def verdict(results: Sequence[Result], reference: ReferenceTrack | Relations | N
 
 def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> list[str]:
     """The paragraph's sentences, what matters most first."""
-    lines = make_lines(results)
+    lines = plotted_runs(results)
     if not lines:
         return ["Nothing was run, so there is nothing to tell."]
-    best, losses = best_line(lines), _losses(lines)
+    best, losses = best_run(lines), _losses(lines)
     if reference is None or all(line.error is None for line in lines):
         line = _most_informed(lines)
         return [*_unscored(lines), *losses, *_honesty(line, f"The covariances of {line.words}")]
@@ -50,7 +60,7 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
     return [*ranking, *losses, *_hindsight(best), *_coverage(best), *_honesty(best), *_advice(lines, best, equals)]
 
 
-def equally_good(lines: Sequence[Line], best: Line, reference: ReferenceTrack | Relations) -> list[Line]:
+def equally_good(lines: Sequence[PlottedRun], best: PlottedRun, reference: ReferenceTrack | Relations) -> list[PlottedRun]:
     """The scored runs but ``best`` whose errors this log cannot tell from its errors, or that differ by less than 2 %.
 
     Runs that lost the LiDAR for long are not among them.
@@ -69,12 +79,12 @@ def metres(value: float) -> str:
     return f"{value:,.{digits}f} m"
 
 
-def is_close(line: Line, best: Line) -> bool:
+def is_close(line: PlottedRun, best: PlottedRun) -> bool:
     """True if the errors differ by less than 2 %, whatever can be shown of that."""
     return _error(line) - _error(best) <= _SAME * _error(best)
 
 
-def _is_worse(line: Line, best: Line, reference: ReferenceTrack | Relations) -> bool:
+def _is_worse(line: PlottedRun, best: PlottedRun, reference: ReferenceTrack | Relations) -> bool:
     """True if ``line``'s errors exceed those of ``best`` over so much of the drive that it is no accident, at 95 % two-sided."""
     difference = _differences(line, best, reference)
     if len(difference) < 2 * _BLOCKS:
@@ -83,7 +93,7 @@ def _is_worse(line: Line, best: Line, reference: ReferenceTrack | Relations) -> 
     return bool(blocks.any()) and float(wilcoxon(blocks, alternative="greater", method="exact" if blocks.all() else "auto").pvalue) < 0.025
 
 
-def _differences(line: Line, best: Line, reference: ReferenceTrack | Relations) -> FloatArray:
+def _differences(line: PlottedRun, best: PlottedRun, reference: ReferenceTrack | Relations) -> FloatArray:
     """(N,) in order of time, of what the headline number is the mean of: relations' errors, or squared position errors."""
     if isinstance(reference, Relations):
         one, two = (relation_errors(x.result.run.trajectory, reference) for x in (line, best))
@@ -103,17 +113,19 @@ def _at(values: FloatArray, keys: IntArray, wanted: IntArray) -> FloatArray:
     return found
 
 
-def _ranking(lines: Sequence[Line], best: Line, equals: Sequence[Line], reference: ReferenceTrack | Relations) -> list[str]:
+def _ranking(
+    lines: Sequence[PlottedRun], best: PlottedRun, equals: Sequence[PlottedRun], reference: ReferenceTrack | Relations
+) -> list[str]:
     assert best.error is not None
     measure = _measure(best, reference)
     if len(lines) == 1:
         alone = "Nothing else was run, so nothing tells whether another pair does better."
-        return [f"{capitalised(best.words)}: {metres(best.error)} {measure}.", alone]
+        return [f"{capitalize(best.words)}: {metres(best.error)} {measure}.", alone]
     near, unproven = [x for x in equals if is_close(x, best)], [x for x in equals if not is_close(x, best)]
     found = "has the smallest error" if equals else "is best"
     if any(line.is_lost and line.error is not None and line.error < best.error for line in lines):
         found += " of the runs that can be recommended"
-    sentences = [f"{capitalised(best.words)} {found}: {metres(best.error)} {measure}{_gains(lines, best)}."]
+    sentences = [f"{capitalize(best.words)} {found}: {metres(best.error)} {measure}{_gains(lines, best)}."]
     if near:
         sentences.append(f"Within 2 % of it: {_listed(near)}.")
     if unproven:
@@ -121,11 +133,11 @@ def _ranking(lines: Sequence[Line], best: Line, equals: Sequence[Line], referenc
     return sentences
 
 
-def _listed(lines: Sequence[Line]) -> str:
-    return joined([f"{line.words} ({metres(_error(line))})" for line in lines])
+def _listed(lines: Sequence[PlottedRun]) -> str:
+    return join_words([f"{line.words} ({metres(_error(line))})" for line in lines])
 
 
-def _measure(best: Line, reference: ReferenceTrack | Relations) -> str:
+def _measure(best: PlottedRun, reference: ReferenceTrack | Relations) -> str:
     accuracy = best.result.accuracy
     assert accuracy is not None
     if accuracy.relations:
@@ -134,9 +146,9 @@ def _measure(best: Line, reference: ReferenceTrack | Relations) -> str:
     return f"position error (ATE, root mean square) against {reference.source}{driven}"
 
 
-def _gains(lines: Sequence[Line], best: Line) -> str:
+def _gains(lines: Sequence[PlottedRun], best: PlottedRun) -> str:
     """How much less the error is than that of each of the parts."""
-    parts = [baseline_line(lines), next((line for line in lines if line.result.run.estimator == WHEELLESS), None)]
+    parts = [baseline_run(lines), next((line for line in lines if line.result.run.estimator == WHEELLESS), None)]
     gains = []
     for part in parts:
         if part is None or part is best or part.error is None or is_close(part, best):
@@ -144,10 +156,10 @@ def _gains(lines: Sequence[Line], best: Line) -> str:
         less = 100.0 * (1.0 - _error(best) / part.error)
         rounded = f"{math.floor(less)}" if less < 99.0 else f"{math.floor(10.0 * min(less, 99.9)) / 10.0:.1f}"  # never up to all of it
         gains.append(f"{rounded} % less than {part.words} ({metres(part.error)})")
-    return ", " + joined(gains) if gains else ""
+    return ", " + join_words(gains) if gains else ""
 
 
-def _losses(lines: Sequence[Line]) -> list[str]:
+def _losses(lines: Sequence[PlottedRun]) -> list[str]:
     """Runs without LiDAR for so long that they are not recommended, and what to do."""
     lost = [(line, line.result.run.lidar) for line in lines if line.is_lost]
     if not lost:
@@ -161,7 +173,7 @@ def _losses(lines: Sequence[Line]) -> list[str]:
     return [f"Not recommended are {'; '.join(parts)}." if len(parts) > 1 else f"Not recommended is {parts[0]}.", *advice]
 
 
-def _hindsight(best: Line) -> list[str]:
+def _hindsight(best: PlottedRun) -> list[str]:
     """What of the error was only known to be one when the robot came back."""
     loops, then = best.result.run.counts.get("loops", 0), headline(best.result.moments)
     if not loops or then is None:
@@ -170,18 +182,18 @@ def _hindsight(best: Line) -> list[str]:
     return [f"That is with hindsight, by {places} seen again; as it drove, its error was {metres(then)}."]
 
 
-def _coverage(best: Line) -> list[str]:
+def _coverage(best: PlottedRun) -> list[str]:
     accuracy = best.result.accuracy
     if accuracy is None or accuracy.overlap >= 0.9:
         return []
     return [f"The reference covers only {100.0 * accuracy.overlap:.0f} % of the drive's time."]
 
 
-def _honesty(line: Line, whose: str = "Its covariances") -> list[str]:
+def _honesty(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
     """Does the run know how wrong it is? By NIS over many scans; by NEES only where even a single drive is enough to say no."""
     run, nees = line.result.run, line.result.nees_mean
     if run.trajectory.covariances is None:
-        return [f"{capitalised(line.words)} gives no covariance."]
+        return [f"{capitalize(line.words)} gives no covariance."]
     known = run.nis[np.isfinite(run.nis)]
     sayings, judged_by_pose = [], ""
     if len(known) >= 20:
@@ -195,17 +207,17 @@ def _honesty(line: Line, whose: str = "Its covariances") -> list[str]:
         judged_by_pose = sayings[-1][0]
     found = {word: [text for verdict_, text in sayings if verdict_ == word] for word in ("over", "under", "fits")}
     if found["over"]:
-        also = f" ({joined([*found['under'], *found['fits']])})" if found["under"] or found["fits"] else ""
-        return [f"{whose} are overconfident: {joined(found['over'])}{also}. Enlarge them before anything trusts them."]
-    also = f" ({joined(found['fits'])})" if found["fits"] else ""
+        also = f" ({join_words([*found['under'], *found['fits']])})" if found["under"] or found["fits"] else ""
+        return [f"{whose} are overconfident: {join_words(found['over'])}{also}. Enlarge them before anything trusts them."]
+    also = f" ({join_words(found['fits'])})" if found["fits"] else ""
     if found["under"] and judged_by_pose == "under":
-        return [f"{whose} are larger than need be: {joined(found['under'])}{also}; safe to fuse, but given less weight than is due."]
+        return [f"{whose} are larger than need be: {join_words(found['under'])}{also}; safe to fuse, but given less weight than is due."]
     if found["under"]:  # innovations are of one step: they test what is believed of wheels and scans, not what became of it in the pose
         allowed = f"wheels and scans differ less than they allow for ({found['under'][0]}){also}"
         unknown = "" if judged_by_pose else "; whether the pose's are too large, only a reference track with headings could tell"
         return [f"Nothing says that {_lower(whose)} are too small: {allowed}{unknown}."]
     if found["fits"]:
-        return [f"Nothing speaks against {_lower(whose)}: {joined(found['fits'])}."]
+        return [f"Nothing speaks against {_lower(whose)}: {join_words(found['fits'])}."]
     return [f"{whose} could not be tested: that takes scans, or a reference with headings."]
 
 
@@ -221,13 +233,13 @@ def _judge(name: str, mean: float, band: tuple[float, float], what: str) -> tupl
     return "fits", said
 
 
-def _advice(lines: Sequence[Line], best: Line, equals: Sequence[Line]) -> list[str]:
+def _advice(lines: Sequence[PlottedRun], best: PlottedRun, equals: Sequence[PlottedRun]) -> list[str]:
     if len(lines) == 1:
         return [f"To learn what {best.result.run.estimator} gains, run it beside {DEAD_RECKONING} and another model."]
     witnesses = [line for line in lines if line.result.run.estimator != DEAD_RECKONING and len(line.result.run.map_points)]
     if best.result.run.estimator == DEAD_RECKONING and witnesses and not any(line in equals for line in witnesses):
         return ["The LiDAR made no run better than the wheels alone: check its mount, its stamps and its range in the robot file first."]
-    base = baseline_line(lines)
+    base = baseline_run(lines)
     if base is not None and base in equals:
         return ["Confirm on another drive, before relying on it, that it is better than dead reckoning."]
     if any(line.result.run.estimator == best.result.run.estimator for line in equals):
@@ -235,7 +247,7 @@ def _advice(lines: Sequence[Line], best: Line, equals: Sequence[Line]) -> list[s
     return [f"Use {best.words}."]
 
 
-def _unscored(lines: Sequence[Line]) -> list[str]:
+def _unscored(lines: Sequence[PlottedRun]) -> list[str]:
     """Without a reference nothing tells which run is right; how far they lie apart can be said."""
     ask = "Pass --reference with a pose or GPS topic, a TUM file or a relations file to have them scored."
     if len(lines) == 1:
@@ -253,17 +265,17 @@ def _unscored(lines: Sequence[Line]) -> list[str]:
     return ["No reference was given, so nothing here says which run is right.", *apart, ask]
 
 
-def _most_informed(lines: Sequence[Line]) -> Line:
+def _most_informed(lines: Sequence[PlottedRun]) -> PlottedRun:
     """Without scores: the last run that has covariances and, if any has, innovations to test them by."""
     return max(lines, key=lambda x: (x.result.run.trajectory.covariances is not None, x.result.nis_mean is not None, x.number))
 
 
-def _end(line: Line) -> tuple[float, float] | None:
+def _end(line: PlottedRun) -> tuple[float, float] | None:
     poses = line.result.run.trajectory.poses
     return (float(poses[-1, 0]), float(poses[-1, 1])) if len(poses) else None
 
 
-def _error(line: Line) -> float:
+def _error(line: PlottedRun) -> float:
     assert line.error is not None
     return line.error
 

@@ -7,7 +7,6 @@ becomes ``var(--name, value)``: the page's style sheet decides for light, dark a
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 
 COLOURS = {
     "ink": "#1c2024",
@@ -41,22 +40,8 @@ DARK_COLOURS = {
 """The same hues, light enough for a dark page."""
 
 
-@dataclass(frozen=True)
-class Size:
-    """A picture is drawn once for wide pages and once for phones, so that letters have one size on both."""
-
-    name: str
-    width_in: float
-    pixels: int
-    """Across the raster of the map."""
-
-    @property
-    def is_wide(self) -> bool:
-        return self.width_in > 5.0
-
-
-WIDE = Size("wide", 8.2, 900)
-NARROW = Size("narrow", 3.9, 520)
+WIDTH_IN = 8.2
+"""Of all figures of a page [in]: 9 pt letters have the size of the page's small text at its full width."""
 
 _KEPT = ("series-", "reference", "band")
 

@@ -112,7 +112,7 @@ def test_page_is_well_formed_loads_nothing_and_begins_with_the_verdict(case):
     assert words.index(headline(found)) < words.index("Means over logs")
     assert "nan" not in words.replace("finance", "")
     assert not re.findall(r"(?:fill|stroke): ?#(?!f{6}|f{3}\b)[0-9a-f]{3,6}", made)  # every colour is the page's to change
-    assert made.count(">position error (ATE) [m]<") == 2  # wide and narrow
+    assert made.count(">position error (ATE) [m]<") == 1
 
 
 def test_every_log_and_every_failure_is_there():

@@ -14,7 +14,7 @@ from localization.lidar import LostScans
 from localization.lidar.losses import LidarLosses, per_cent
 from localization.pipeline import Pipeline, Trial
 from localization.report.replay_page import page
-from localization.report.runs import best_line, make_lines
+from localization.report.runs import best_run, plotted_runs
 from localization.report.summary import verdict
 from localization.ros.diagnostics import ERROR, OK, WARN, Health
 from motion_models.registry import make_model
@@ -71,7 +71,7 @@ def test_verdict_with_lost_best_run_recommends_another(reference) -> None:
     """The run without LiDAR has the smallest error here."""
     results = score(lost_and_found(), reference)
     text = verdict(results, reference)
-    assert best_line(make_lines(results)).result is results[1]
+    assert best_run(plotted_runs(results)).result is results[1]
     assert text.startswith("ekf with diff_drive is best of the runs that can be recommended")
     assert "Not recommended is ekf with skid_steer" in text
     assert "LiDAR lost for 60 % of the drive, longest 60 s at t = 7 s" in text

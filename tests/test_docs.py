@@ -1,0 +1,55 @@
+"""Commands and links of the documents: each command runs, each link and each file that is named exists."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from localization.cli import main
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = sorted(
+    path
+    for path in (
+        ROOT / "README.md",
+        ROOT / "CONTRIBUTING.md",
+        *(ROOT / "localization").rglob("README.md"),
+        *(ROOT / "motion_models").rglob("README.md"),
+        ROOT / "tests/README.md",
+    )
+    if path.exists()
+)
+COMMANDS = [
+    line
+    for path in DOCUMENTS
+    for block in re.findall(r"^```sh\n(.*?)^```", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    for line in block.splitlines()
+    if line.startswith("skidloc ")
+]
+
+
+def test_documents_have_commands() -> None:
+    assert len(COMMANDS) >= 5
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_command_of_a_document_runs(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "tests").symlink_to(ROOT / "tests")
+    monkeypatch.chdir(tmp_path)
+    assert main(shlex.split(command, comments=True)[1:]) == 0
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_of_a_document_lead_to_files(path: Path) -> None:
+    links = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", path.read_text(encoding="utf-8"))
+    assert [link for link in links if not (path.parent / link).exists()] == []
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_modules_named_in_a_document_exist(path: Path) -> None:
+    named = re.findall(r"`([\w/]+\.py)`", path.read_text(encoding="utf-8"))
+    folders = (path.parent, ROOT, ROOT / "localization", ROOT / "localization/ros/transports")
+    assert [name for name in named if not any((folder / name).exists() for folder in folders)] == []
