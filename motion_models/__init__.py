@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from motion_models.full_linear import FullLinear
     from motion_models.icr import Icr
     from motion_models.preintegration import preintegrate
-    from motion_models.prior import SkidPrior, geometric_scaling, prior_note, skid_prior
+    from motion_models.prior import SkidPrior, geometric_scaling, prior_notes, skid_prior
     from motion_models.registry import MODELS, make_model
     from motion_models.robot import Robot, load_robot, parse_robot, robot_names
     from motion_models.robot_file import robot_toml
@@ -86,7 +86,7 @@ __all__ = [
     "parse_robot",
     "posture_for",
     "preintegrate",
-    "prior_note",
+    "prior_notes",
     "read_rotation_table",
     "read_weighings",
     "read_windows",
@@ -131,7 +131,7 @@ _MODULES = {
     "motion_models.full_linear": "FullLinear",
     "motion_models.icr": "Icr",
     "motion_models.preintegration": "preintegrate",
-    "motion_models.prior": "SkidPrior geometric_scaling prior_note skid_prior",
+    "motion_models.prior": "SkidPrior geometric_scaling prior_notes skid_prior",
     "motion_models.registry": "MODELS make_model",
     "motion_models.robot": "Robot load_robot parse_robot robot_names",
     "motion_models.robot_file": "robot_toml",

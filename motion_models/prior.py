@@ -12,6 +12,7 @@ gravity (CG). Nothing here is fitted to a robot; measured robots only set the st
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,8 +53,8 @@ EVIDENCE = (
     Evidence("borealtc_husky", 0.6764, 0.5433, "BorealTC, 75 runs: geometric mean of 0.768 (floor), 0.722, 0.722, 0.599, 0.590 (snow)"),
     Evidence("upenn_4wd", 0.525, 0.576, "a four-wheeled rover whose log is not shipped"),
     Evidence("jackal", 1.0 / 1.5, 0.6614, "Clearpath's wheel_separation_multiplier"),
-    Evidence("husky_a300", 1.0 / 1.75, 0.5356, "Clearpath's wheel_separation_multiplier"),
-    Evidence("leo", 1.0 / 1.76, 0.5697, "firmware's robot_angular_velocity_multiplier"),
+    Evidence("husky_a300", 1.0 / 1.75, 0.5357, "Clearpath's wheel_separation_multiplier"),
+    Evidence("leo", 1.0 / 1.76, 0.5681, "firmware's robot_angular_velocity_multiplier"),
 )
 """All that was found; grounds from floor to snow are averaged for each robot, and differ by 12 % (BorealTC)."""
 
@@ -152,22 +153,26 @@ def slip_at_speed(robot: Robot, speed_m_per_s: float = 1.0, yaw_rate_rad_per_s: 
     return float((vy - vy_still) / (vx * wz)), float((1.0 - wz / wz_still) / abs(vx))
 
 
-def prior_note(robot: Robot) -> str | None:
-    """A sentence for the user where k of ``robot`` is no calibration; None where its file has a k_0.
+def prior_notes(robot: Robot, models: Sequence[str] = ("skid_steer",)) -> list[str]:
+    """A sentence for the user where k of ``robot`` is no calibration and one of ``models`` uses it; else none.
 
     >>> from motion_models import load_robot
-    >>> print(prior_note(load_robot("vaultbot")))
-    None
+    >>> prior_notes(load_robot("vaultbot"))
+    []
     """
-    if "k_0" in robot.models.get("skid_steer", {}):
-        return None
-    prior = skid_prior(robot)
+    if not {"skid_steer", "icr"} & set(models):
+        return []
     if robot.drive == DIFF_DRIVE:
-        return f"{robot.name} has {prior.source}: it does not skid, diff_drive is the right model, and skid_steer is the same with k = 1."
+        return [
+            f"{robot.name} has two driven wheels and a caster: it does not skid, diff_drive is its model, and skid_steer is the same with k = 1."
+        ]
+    if "k_0" in robot.models.get("skid_steer", {}):
+        return []
+    prior = skid_prior(robot)
     k, sigma = prior.coefficients[0], prior.sigmas[0]
     turned = 20.0 * _TURN_RAD_PER_S
     after = k * math.sqrt(robot.wheel_noise.yaw_rad2_per_rad / turned)
-    return (
+    return [
         f"{robot.name}: [models.skid_steer] has no k_0, so k = {k:.2f} +- {sigma:.2f} from {prior.source}; "
         f"20 s of turning make it +- {after:.2f} (`skidloc calibrate LOG --robot ... --out ROBOT.toml`)."
-    )
+    ]
