@@ -162,12 +162,10 @@ def prior_notes(robot: Robot, models: Sequence[str] = ("skid_steer",)) -> list[s
     """
     if not {"skid_steer", "icr"} & set(models):
         return []
-    if robot.drive == DIFF_DRIVE:
-        return [
-            f"{robot.name} has two driven wheels and a caster: it does not skid, diff_drive is its model, and skid_steer is the same with k = 1."
-        ]
     if "k_0" in robot.models.get("skid_steer", {}):
         return []
+    if robot.drive == DIFF_DRIVE:
+        return [f"{robot.name} has two driven wheels and a caster: diff_drive is its model, and skid_steer is the same with k = 1."]
     prior = skid_prior(robot)
     k, sigma = prior.coefficients[0], prior.sigmas[0]
     turned = 20.0 * _TURN_RAD_PER_S
