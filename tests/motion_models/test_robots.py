@@ -9,8 +9,9 @@ import pytest
 
 from localization.cli import main
 from motion_models.robot import DIFF_DRIVE, load_robot, robot_names
+from motion_models.robot_reference import reference
 
-# Wheel radius, track, wheelbase [m], mass [kg], product of the driver's track and multiplier [m], typed off the sources that each file names.
+# Wheel radius, track, wheelbase [m], mass [kg], product of the driver's track and multiplier [m], from the sources in each file.
 SOURCES = {
     "jackal": (0.098, 0.37559, 0.262, 16.523, 0.37559 * 1.5),
     "husky_a300": (0.1651, 0.562, 0.512, 70 + 4 * 2.5, 0.562 * 1.75),
@@ -59,3 +60,14 @@ def test_robots_with_a_name_prints_the_file(capsys: pytest.CaptureFixture[str]) 
     assert main(["robots", "leo"]) == 0
     assert "robot_angular_velocity_multiplier" in capsys.readouterr().out
     assert main(["robots", "nobot"]) == 2
+
+
+def test_reference_of_robot_files_is_up_to_date() -> None:
+    """Else: python -m motion_models.robot_reference > motion_models/robots/README.md"""
+    assert (resources.files("motion_models") / "robots" / "README.md").read_text(encoding="utf-8") == reference()
+
+
+def test_reference_explains_every_key() -> None:
+    rows = [line for line in reference().splitlines() if line.startswith("| `")]
+    assert len(rows) > 80
+    assert all(line.split("|")[-2].strip() for line in rows)
