@@ -20,6 +20,8 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "compare": ("Compare", "Compare motion models and estimators over many logs."),
     "calibrate": ("Calibrate", "Fit a motion model to logs or tables and write the robot file."),
     "diagnose": ("Diagnose", "Find what a motion model gets wrong on a log, its cause, and the gain of correcting it."),
+    "init": ("Init", "Write a robot file for a new robot from a log and a URDF."),
+    "robots": ("Robots", "List the robots that are shipped, with the source of every number."),
     "cg": ("Cg", "Compute the centre of gravity from scales, arms and payload."),
     "online": ("Online", "Run the estimator live on ROS topics, or on a log as it was recorded."),
     "simulate": ("Simulate", "Simulate a skid-steer robot and write a log."),

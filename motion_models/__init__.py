@@ -11,10 +11,9 @@ if TYPE_CHECKING:
     from motion_models.calibration.fit import Fit, fit
     from motion_models.calibration.least_squares import FitConfig
     from motion_models.calibration.maneuvers import Maneuver
-    from motion_models.calibration.prediction import WITNESS_NAMES
-    from motion_models.calibration.regressions import RotationTable, read_rotation_table, skid_steer_fit
+    from motion_models.calibration.prediction import REFERENCE_PARAM_NAMES
+    from motion_models.calibration.regressions import RotationTable, read_rotation_table, rotations_as_maneuvers, skid_steer_fit
     from motion_models.calibration.ros_export import diff_drive_controller_yaml, multiplier_table, multipliers, robot_localization_yaml
-    from motion_models.calibration.rotations import rotations_as_maneuvers
     from motion_models.calibration.windows_table import read_windows, windows_text
     from motion_models.center_of_gravity.files import arms_model, arms_postures, urdf_cg, weighed_cg
     from motion_models.center_of_gravity.model import CgModel, cg_model, static_part_from_weighing
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from motion_models.full_linear import FullLinear
     from motion_models.icr import Icr
     from motion_models.preintegration import preintegrate
+    from motion_models.prior import SkidPrior, geometric_scaling, prior_notes, skid_prior
     from motion_models.registry import MODELS, make_model
     from motion_models.robot import Robot, load_robot, parse_robot, robot_names
     from motion_models.robot_file import robot_toml
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MODELS",
-    "WITNESS_NAMES",
+    "REFERENCE_PARAM_NAMES",
     "Arms",
     "CalibrationError",
     "CenterOfRotation",
@@ -62,6 +62,7 @@ __all__ = [
     "RobotError",
     "RotationTable",
     "Scales",
+    "SkidPrior",
     "SkidSteer",
     "SkidlocError",
     "StaticPart",
@@ -77,6 +78,7 @@ __all__ = [
     "cross_validate",
     "diff_drive_controller_yaml",
     "fit",
+    "geometric_scaling",
     "load_robot",
     "make_model",
     "multiplier_table",
@@ -84,6 +86,7 @@ __all__ = [
     "parse_robot",
     "posture_for",
     "preintegrate",
+    "prior_notes",
     "read_rotation_table",
     "read_weighings",
     "read_windows",
@@ -93,6 +96,7 @@ __all__ = [
     "root_mean",
     "root_mean_gain",
     "rotations_as_maneuvers",
+    "skid_prior",
     "skid_steer_fit",
     "static_part_from_weighing",
     "support_margin",
@@ -110,10 +114,9 @@ _MODULES = {
     "motion_models.calibration.fit": "Fit fit",
     "motion_models.calibration.least_squares": "FitConfig",
     "motion_models.calibration.maneuvers": "Maneuver",
-    "motion_models.calibration.prediction": "WITNESS_NAMES",
-    "motion_models.calibration.regressions": "RotationTable read_rotation_table skid_steer_fit",
+    "motion_models.calibration.prediction": "REFERENCE_PARAM_NAMES",
+    "motion_models.calibration.regressions": "RotationTable read_rotation_table rotations_as_maneuvers skid_steer_fit",
     "motion_models.calibration.ros_export": "diff_drive_controller_yaml multiplier_table multipliers robot_localization_yaml",
-    "motion_models.calibration.rotations": "rotations_as_maneuvers",
     "motion_models.calibration.windows_table": "read_windows windows_text",
     "motion_models.center_of_gravity.files": "arms_model arms_postures urdf_cg weighed_cg",
     "motion_models.center_of_gravity.model": "CgModel cg_model static_part_from_weighing",
@@ -128,6 +131,7 @@ _MODULES = {
     "motion_models.full_linear": "FullLinear",
     "motion_models.icr": "Icr",
     "motion_models.preintegration": "preintegrate",
+    "motion_models.prior": "SkidPrior geometric_scaling prior_notes skid_prior",
     "motion_models.registry": "MODELS make_model",
     "motion_models.robot": "Robot load_robot parse_robot robot_names",
     "motion_models.robot_file": "robot_toml",

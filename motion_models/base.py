@@ -1,4 +1,4 @@
-"""The seam of this project: what a motion model is, and the one type in which wheels and LiDAR both speak of motion."""
+"""The interface of a motion model, and the type of a relative motion with covariance that wheels and LiDAR share."""
 
 from __future__ import annotations
 

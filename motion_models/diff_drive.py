@@ -58,7 +58,7 @@ def _twist(
     d_wheels: FloatArray,
     d_cg: FloatArray,
     d_params: FloatArray,
-) -> None:  # pragma: no cover
+) -> None:
     """See `Twist.from_kernel`; ``constants`` (1,) is the track width."""
     r, multiplier = params[0], params[1]
     turn = r / (multiplier * constants[0])

@@ -8,7 +8,7 @@ exploration", ICRA 2024; the share of turning is this project's way to make a lo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numba
@@ -16,7 +16,8 @@ import numpy as np
 
 from motion_models.base import Twist
 from motion_models.errors import ModelError
-from motion_models.robot import Robot
+from motion_models.prior import slip_at_speed
+from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
 
 _NEWTON_STEPS = 50
@@ -44,6 +45,8 @@ class FullLinear:
 
     nominal: FloatArray
     """(12,) the matrix by rows, then the terms, in the order of `param_names`."""
+    sigmas: FloatArray = field(default_factory=lambda: np.zeros(12))
+    """(12,) standard deviations of terms of which only the size is known, from the robot's geometry (`motion_models.prior`); else 0."""
     name: ClassVar[str] = "full_linear"
     param_names: ClassVar[tuple[str, ...]] = (
         *("vx_left", "vx_right", "vy_left", "vy_right", "wz_left", "wz_right"),
@@ -58,7 +61,11 @@ class FullLinear:
         half = driver.wheel_radius_m / 2.0
         turn = driver.wheel_radius_m / (driver.wheel_separation_multiplier * driver.track_width_m)
         defaults = np.array([half, half, 0.0, 0.0, -turn, turn, *(0.0,) * 6])
-        return cls(robot.coefficients(cls.name, cls.param_names, defaults))
+        sigmas, own = np.zeros(12), robot.models.get(cls.name, {})
+        if robot.drive != DIFF_DRIVE and not {"lateral_slip_speed", "rotation_slip_speed"} <= own.keys():
+            sigmas[[6, 9]] = np.abs(slip_at_speed(robot))
+            sigmas[[name in own for name in cls.param_names]] = 0.0
+        return cls(robot.coefficients(cls.name, cls.param_names, defaults), sigmas)
 
     def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
         """See `MotionModel.twist`."""
@@ -109,7 +116,7 @@ class FullLinear:
 
 
 @numba.njit(cache=True)
-def _sign(value: float) -> float:  # pragma: no cover
+def _sign(value: float) -> float:
     return 1.0 if value > 0.0 else (-1.0 if value < 0.0 else 0.0)
 
 
@@ -123,7 +130,7 @@ def _twist(
     d_wheels: FloatArray,
     d_cg: FloatArray,
     d_params: FloatArray,
-) -> None:  # pragma: no cover
+) -> None:
     """See `Twist.from_kernel`; ``constants`` is empty."""
     lateral, loss_w, loss_t = params[6], params[7], params[8]
     slip_u, slip_w, slip_t = params[9], params[10], params[11]

@@ -8,7 +8,7 @@ parameters. Their axes (x to the right, y ahead) are turned into REP-103 here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numba
@@ -17,6 +17,7 @@ import numpy as np
 from motion_models.base import Twist
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
+from motion_models.skid_steer import SkidSteer
 
 
 @dataclass(frozen=True)
@@ -35,17 +36,23 @@ class Icr:
     """[m]"""
     nominal: FloatArray
     """(5,) the parameters of the class's text, in the order of `param_names`."""
+    sigmas: FloatArray = field(default_factory=lambda: np.zeros(5))
+    """(5,) standard deviations of those that come from the robot's geometry (`motion_models.prior`); 0 for those of a calibration."""
     name: ClassVar[str] = "icr"
     param_names: ClassVar[tuple[str, ...]] = ("y_icr_left", "y_icr_right", "x_icr", "alpha_left", "alpha_right")
 
     @classmethod
     def from_robot(cls, robot: Robot) -> Icr:
-        """For what [models.icr] does not name, the ICRs that reproduce the robot's own diff-drive driver."""
-        geometry, driver = robot.geometry, robot.driver
-        half = driver.wheel_separation_multiplier * driver.track_width_m / 2.0
-        alpha = driver.wheel_radius_m / geometry.wheel_radius_m
-        defaults = np.array([half, -half, 0.0, alpha, alpha])
-        return cls(geometry.wheel_radius_m, robot.coefficients(cls.name, cls.param_names, defaults))
+        """For what [models.icr] does not name, the ICRs of the robot's `SkidSteer` at its nominal CG: y_icr = y_CR +- track / (2 k)."""
+        skid = SkidSteer.from_robot(robot)
+        k, x_cr, y_cr = (float(value) for value in skid.rotation(robot.center_of_gravity, skid.nominal))
+        half = skid.track_width / (2.0 * k)
+        defaults = np.array([y_cr + half, y_cr - half, x_cr, 1.0, 1.0])
+        spread = half * float(skid.sigmas[0]) / k
+        own = robot.models.get(cls.name, {})
+        sigmas = np.array([spread, spread, float(skid.sigmas[3]), 0.0, 0.0])
+        sigmas[[name in own for name in cls.param_names]] = 0.0
+        return cls(skid.wheel_radius, robot.coefficients(cls.name, cls.param_names, defaults), sigmas)
 
     def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
         """See `MotionModel.twist`."""
@@ -69,7 +76,7 @@ def _twist(
     d_wheels: FloatArray,
     d_cg: FloatArray,
     d_params: FloatArray,
-) -> None:  # pragma: no cover
+) -> None:
     """See `Twist.from_kernel`; ``constants`` (1,) is the wheel radius."""
     r = constants[0]
     y_l, y_r, x_icr, alpha_l, alpha_r = params[0], params[1], params[2], params[3], params[4]

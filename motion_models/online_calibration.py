@@ -22,12 +22,14 @@ FORMS: tuple[Form, ...] = ("none", "constant", "cg_field")
 # How differently robots of one type turn on different floors and with other loads: relative for what scales a turn (Clearpath's own
 # multipliers for one Husky range from 1.5 to 1.9; terrains differ by a quarter), absolute [m] for where it turns about.
 _TURNING, _CENTRE_X, _CENTRE_Y = 0.15, 0.05, 0.03
-_FORGOTTEN_AFTER_S = 3600.0
+_PRIOR_RETURNS_AFTER_S = 3600.0
 _WARP = 0.15  # VaultBot's chassis, as its rotations show it, moves 13 % of m g / 4 to two opposite wheels
 _MU_RATIO = 0.3
+_LATERAL_SLIP_S, _ROTATION_SLIP_S_PER_M = 0.05, 0.01
+"""Where the robot gives no other (`motion_models.prior.slip_at_speed`: 0.02 to 0.09 s, and under 0.01 s/m)."""
 
-# Least turn that teaches, as track over radius. On gentler arcs tyres creep, of which what was measured in place says nothing; physics
-# does, but where a robot drives straight the two sides differ by their noise alone, and that would pass for knowledge.
+# Least turn with information, as track over radius. On gentler arcs tyres creep, which rotations in place do not cover; the friction
+# model does, but where a robot drives straight the two sides differ by their noise alone, and that would pass for information.
 _IN_PLACE, _NOT_STRAIGHT = 0.25, 0.02
 
 # The rotations of Ebersole 2016, Ch. 4, to which the coefficients of `SkidSteer` were fitted: where the CG was, and the scatter about the
@@ -37,9 +39,10 @@ _SCATTER_K, _SCATTER_X_CR, _SCATTER_Y_CR = 0.014517, 0.011514, 0.0059057
 
 _SINGLE = (
     *("wheel_separation_multiplier", "k_0", "x_cr_0", "y_cr_0", "y_icr_left", "y_icr_right", "x_icr", "rotation_scale", "x_cr"),
+    *("lateral_slip_speed", "rotation_slip_speed"),
     *("mu_ratio", "tracked_x", "tracked_y", "warp", "cg_offset_x", "cg_offset_y"),
 )
-_ONLY_BY_NAME = ("warp", "cg_offset_x", "cg_offset_y")
+_ONLY_BY_NAME = ("warp", "cg_offset_x", "cg_offset_y", "lateral_slip_speed", "rotation_slip_speed")
 
 
 @dataclass(frozen=True)
@@ -64,9 +67,9 @@ class Corrections:
     cov: FloatArray
     """(k, k) at first."""
     walk_cov: FloatArray
-    """(k, k) growth per second of motion; it may be singular. What does not walk is remembered."""
+    """(k, k) process noise: growth per second of motion; it may be singular."""
     least_turn: float = 0.0
-    """Track over radius below which a motion says nothing of the corrections."""
+    """Track over radius below which a motion has no information on the corrections."""
 
     @property
     def sigmas(self) -> FloatArray:
@@ -111,7 +114,7 @@ def corrections(model: MotionModel, form: Form) -> Corrections:
         for name, rate in correction.along.items():
             directions[model.param_names.index(name), column] = rate
     sigmas = np.array([c.sigma for c in found])
-    walks = sigmas / np.sqrt(_FORGOTTEN_AFTER_S)  # after an hour the first uncertainty has come back once more
+    walks = sigmas / np.sqrt(_PRIOR_RETURNS_AFTER_S)  # after an hour the first uncertainty has come back once more
     least = {"skid_steer": _IN_PLACE, "friction": _NOT_STRAIGHT}.get(model.name, 0.0)
     return Corrections(tuple(c.name for c in found), directions, np.diag(sigmas**2), np.diag(walks**2), least)
 
@@ -156,18 +159,23 @@ def _regressions(model: MotionModel) -> Corrections:
     """Every coefficient on its own: what the rotations left open stays learned, what floors and loads change may change again."""
     n = len(model.param_names)
     floor = np.zeros((n, 3))
-    floor[0:3, 0] = _TURNING * model.nominal[0:3]  # another floor scales k at every CG
+    sigma_k = float(getattr(model, "sigmas", np.zeros(n))[0])
+    turning = sigma_k / model.nominal[0] if sigma_k else _TURNING
+    floor[0:3, 0] = turning * model.nominal[0:3]  # another floor scales k at every CG
     floor[3, 1], floor[5, 2] = _CENTRE_X, _CENTRE_Y
     spread = floor @ floor.T
-    return Corrections(model.param_names, np.eye(n), regression_cov(with_misfit=True) + spread, spread / _FORGOTTEN_AFTER_S, _IN_PLACE)
+    return Corrections(model.param_names, np.eye(n), regression_cov(with_misfit=True) + spread, spread / _PRIOR_RETURNS_AFTER_S, _IN_PLACE)
 
 
 def _singles(model: MotionModel) -> tuple[Correction, ...]:
     """Rotation scaling, the centre of rotation where the model has one; for the friction model its physics."""
     of = dict(zip(model.param_names, model.nominal, strict=True))
 
+    uncalibrated = dict(zip(model.param_names, getattr(model, "sigmas", np.zeros(0)), strict=False))
+
     def own(name: str, sigma: float) -> Correction:
-        return Correction(name, sigma, {name: 1.0})
+        """Where the robot has no calibration, the prior's standard deviation (`motion_models.prior`) instead of ``sigma``."""
+        return Correction(name, float(uncalibrated.get(name, 0.0)) or sigma, {name: 1.0})
 
     if model.name == "diff_drive":
         return (own("wheel_separation_multiplier", _TURNING * of["wheel_separation_multiplier"]),)
@@ -179,7 +187,8 @@ def _singles(model: MotionModel) -> tuple[Correction, ...]:
         # both columns by one factor: corrected apart they would turn a robot that drives straight, and pass for the gyro's bias
         turning = {name: of[name] for name in ("wz_left", "wz_right")}
         sideways = {name: -of["wz_" + name[3:]] for name in ("vy_left", "vy_right")}
-        return Correction("rotation_scale", _TURNING, turning), Correction("x_cr", _CENTRE_X, sideways)
+        at_speed = own("lateral_slip_speed", _LATERAL_SLIP_S), own("rotation_slip_speed", _ROTATION_SLIP_S_PER_M)
+        return Correction("rotation_scale", _TURNING, turning), Correction("x_cr", _CENTRE_X, sideways), *at_speed
     if model.name == "friction":
         centre = own("tracked_x", _CENTRE_X), own("tracked_y", _CENTRE_Y)
         return own("mu_ratio", _MU_RATIO), *centre, own("warp", _WARP), own("cg_offset_x", _CENTRE_X), own("cg_offset_y", _CENTRE_Y)

@@ -61,7 +61,7 @@ def integrate_twists(dt: FloatArray, twist: Twist, noise: WheelNoise, cg_cov: Fl
 @numba.njit(cache=True)
 def _integrate(
     dt: FloatArray, twist: FloatArray, by: FloatArray, noise: FloatArray, delta: FloatArray, cov: FloatArray, d: FloatArray
-) -> None:  # pragma: no cover
+) -> None:
     """Compose the intervals into ``delta`` (3,), ``cov`` (3, 3), ``d`` (3, m), which start at zero and are changed in place."""
     m = by.shape[2]
     moved = np.empty((3, 3))

@@ -26,12 +26,17 @@ _LARGEST = 1e9
 _LONGEST_M = 100.0
 """Of a length of a robot [m]; the largest mining vehicles have 20."""
 _LONGEST_SHOWN = 60  # characters of what a user wrote, in a message
+DIFF_DRIVE = "diff_drive"
+"""`Robot.drive` of two driven wheels and casters."""
+DRIVES = ("skid_steer", DIFF_DRIVE)
 MODEL_OPTIONS: Mapping[str, tuple[str, ...]] = {"friction": ("contact", "centripetal")}
 """Entries of [models.NAME] that choose something, where all others are numbers."""
 
 
 @dataclass(frozen=True)
 class Geometry:
+    """Lengths between the wheels' contacts with the floor, mass and centre of gravity."""
+
     wheel_radius_m: float
     """Radius of the wheels, times the gear ratio where the wheel rates are those of the motor."""
     track_width_m: float
@@ -43,9 +48,9 @@ class Geometry:
     cg_height_m: float = 0.2
     """Height of the centre of gravity above the floor."""
     cg_x_m: float = 0.0
-    """Centre of gravity ahead of the wheelbase's centre, used where the log does not tell it."""
+    """Centre of gravity ahead of the wheelbase's centre, used where the log has none."""
     cg_y_m: float = 0.0
-    """Centre of gravity left of the wheelbase's centre, used where the log does not tell it."""
+    """Centre of gravity left of the wheelbase's centre, used where the log has none."""
 
 
 @dataclass(frozen=True)
@@ -53,20 +58,31 @@ class Driver:
     """How the robot's own driver turns wheel rates into the odometry that it publishes (needed to invert it)."""
 
     wheel_radius_m: float
+    """Radius by which it turns wheel rates into speed (times its own multiplier, if it has one)."""
     track_width_m: float
+    """Its wheel separation."""
     wheel_separation_multiplier: float = 1.0
     """The one hand-tuned number of a diff-drive driver; 1.875 on a stock Husky."""
 
 
 @dataclass(frozen=True)
 class Topics:
+    """Topics of the log. One that is the only one of its type is found without being named here."""
+
     joint_states: str = "/joint_states"
+    """sensor_msgs/JointState of the wheels, and of the arms."""
     odometry: str = "/odom"
+    """nav_msgs/Odometry of the robot's own driver, used where there are no joint states of wheels."""
     scan: str = "/scan"
+    """sensor_msgs/LaserScan."""
     points: str = "/points"
+    """sensor_msgs/PointCloud2, used where there is no planar scan."""
     imu: str = "/imu/data"
+    """sensor_msgs/Imu, of which the yaw rate is used."""
     center_of_gravity: str = "/center_of_gravity"
+    """geometry_msgs/PointStamped in the body frame; goes before the arms."""
     reference: str = "/ground_truth/odom"
+    """What results are scored against, and never estimated from."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +90,9 @@ class Joints:
     """Names in the joint states. The rate of a side is the mean over its wheels."""
 
     left: tuple[str, ...] = ("front_left_wheel", "rear_left_wheel")
+    """Wheels of the left side."""
     right: tuple[str, ...] = ("front_right_wheel", "rear_right_wheel")
+    """Wheels of the right side."""
 
 
 @dataclass(frozen=True)
@@ -82,11 +100,17 @@ class Mount:
     """Where a sensor's frame sits in the body frame: x, y, z [m], then roll, pitch, yaw [rad] (fixed axes, as in URDF)."""
 
     x: float = 0.0
+    """Ahead of the wheelbase's centre [m]."""
     y: float = 0.0
+    """Left of it [m]."""
     z: float = 0.0
+    """Above it [m]."""
     roll: float = 0.0
+    """[rad]"""
     pitch: float = 0.0
+    """[rad]"""
     yaw: float = 0.0
+    """[rad]"""
 
     def rotation(self) -> FloatArray:
         """(3, 3) matrix that takes vectors of the sensor's frame into the body frame."""
@@ -130,6 +154,8 @@ class WheelNoise:
 
 @dataclass(frozen=True)
 class GyroNoise:
+    """Errors of the yaw gyro."""
+
     white_rad_per_sqrt_s: float = 2e-3
     """Angle random walk of the yaw gyro."""
     bias_sigma_rad_per_s: float = 1e-3
@@ -147,6 +173,8 @@ class Robot:
     name: str
     geometry: Geometry
     driver: Driver
+    drive: str = "skid_steer"
+    """How it turns: "skid_steer" (four or more wheels, or tracks, that slide), or "diff_drive" (two driven wheels and casters)."""
     topics: Topics = Topics()
     joints: Joints = Joints()
     mounts: Mapping[str, Mount] = field(default_factory=dict)
@@ -231,6 +259,9 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
     _refuse_unknown(data, known, source)
     if not isinstance(data.get("name"), str):
         raise RobotError(f'{source}: needs a line name = "...".')
+    drive = data.get("drive", DRIVES[0])
+    if drive not in DRIVES:
+        raise RobotError(f"{source}: drive is {drive!r}; there are {', '.join(DRIVES)}.")
     geometry = _section(Geometry, data, "geometry", source)
     for name in ("wheel_radius_m", "track_width_m", "wheelbase_m", "mass_kg"):
         if not getattr(geometry, name) > 0:
@@ -247,6 +278,7 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
         name=data["name"],
         geometry=geometry,
         driver=driver,
+        drive=drive,
         topics=_section(Topics, data, "topics", source),
         joints=_section(Joints, data, "joints", source),
         mounts=mounts,

@@ -24,6 +24,8 @@ def robot_toml(robot: Robot, sigmas: Mapping[str, Mapping[str, float]] | None = 
     sigmas = sigmas or {}
     lines = [f"# {line}".rstrip() for line in remarks.splitlines()]
     lines.append(f"name = {_value(robot.name)}")
+    if robot.drive != Robot.drive:
+        lines.append(f"drive = {_value(robot.drive)}")
     for name in ("geometry", "driver", "topics", "joints", "wheel_noise", "gyro_noise"):
         lines += _table(name, dataclasses.asdict(getattr(robot, name)))
     if robot.arms is not None:

@@ -67,13 +67,13 @@ def _parts(layout: str) -> list[str]:
 
 
 @numba.njit(cache=True)
-def triple(v: FloatArray) -> Triple:  # pragma: no cover
+def triple(v: FloatArray) -> Triple:
     """``v`` (3,)"""
     return v[0], v[1], v[2]
 
 
 @numba.njit(cache=True)
-def scalar_wrap(angle: float) -> float:  # pragma: no cover
+def scalar_wrap(angle: float) -> float:
     """`wrap_angle` of one angle."""
     wrapped = (angle + math.pi) % (2.0 * math.pi) - math.pi
     # rounding can carry an angle just below -pi up to +pi
@@ -81,7 +81,7 @@ def scalar_wrap(angle: float) -> float:  # pragma: no cover
 
 
 @numba.njit(cache=True)
-def _sinc_terms(theta: float) -> tuple[float, float]:  # pragma: no cover
+def _sinc_terms(theta: float) -> tuple[float, float]:
     """``sin(t)/t`` and ``(1 - cos(t))/t``, smooth through t = 0."""
     if abs(theta) < _SMALL_ANGLE:
         return 1.0 - theta * theta / 6.0, theta * (0.5 - theta * theta / 24.0)
@@ -90,7 +90,7 @@ def _sinc_terms(theta: float) -> tuple[float, float]:  # pragma: no cover
 
 
 @numba.njit(cache=True)
-def _curl_terms(theta: float) -> tuple[float, float]:  # pragma: no cover
+def _curl_terms(theta: float) -> tuple[float, float]:
     """``(t - sin(t))/t^2`` and ``(1 - cos(t))/t^2``, smooth through t = 0."""
     if abs(theta) < _SMALL_ANGLE:
         return theta / 6.0, 0.5 - theta * theta / 24.0
@@ -98,14 +98,14 @@ def _curl_terms(theta: float) -> tuple[float, float]:  # pragma: no cover
 
 
 @numba.njit(cache=True)
-def scalar_exp(v: Triple) -> Triple:  # pragma: no cover
+def scalar_exp(v: Triple) -> Triple:
     """`exp` of one tangent vector, for compiled loops."""
     a, b = _sinc_terms(v[2])
     return a * v[0] - b * v[1], b * v[0] + a * v[1], v[2]
 
 
 @numba.njit(cache=True)
-def scalar_log(p: Triple) -> Triple:  # pragma: no cover
+def scalar_log(p: Triple) -> Triple:
     """`log` of one pose."""
     x, y, theta = p[0], p[1], scalar_wrap(p[2])
     a, b = _sinc_terms(theta)
@@ -114,27 +114,27 @@ def scalar_log(p: Triple) -> Triple:  # pragma: no cover
 
 
 @numba.njit(cache=True)
-def scalar_compose(a: Triple, b: Triple) -> Triple:  # pragma: no cover
+def scalar_compose(a: Triple, b: Triple) -> Triple:
     """`compose` of two poses."""
     c, s = math.cos(a[2]), math.sin(a[2])
     return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], scalar_wrap(a[2] + b[2])
 
 
 @numba.njit(cache=True)
-def scalar_inverse(p: Triple) -> Triple:  # pragma: no cover
+def scalar_inverse(p: Triple) -> Triple:
     """`inverse` of one pose."""
     c, s = math.cos(p[2]), math.sin(p[2])
     return -c * p[0] - s * p[1], s * p[0] - c * p[1], scalar_wrap(-p[2])
 
 
 @numba.njit(cache=True)
-def scalar_between(a: Triple, b: Triple) -> Triple:  # pragma: no cover
+def scalar_between(a: Triple, b: Triple) -> Triple:
     """`between` of two poses."""
     return scalar_compose(scalar_inverse(a), b)
 
 
 @numba.njit(cache=True)
-def fill_adjoint(p: Triple, out: FloatArray) -> None:  # pragma: no cover
+def fill_adjoint(p: Triple, out: FloatArray) -> None:
     """`adjoint` of one pose into ``out`` (3, 3)."""
     c, s = math.cos(p[2]), math.sin(p[2])
     out[0, 0], out[0, 1], out[0, 2] = c, -s, p[1]
@@ -143,7 +143,7 @@ def fill_adjoint(p: Triple, out: FloatArray) -> None:  # pragma: no cover
 
 
 @numba.njit(cache=True)
-def fill_right_jacobian(v: Triple, out: FloatArray) -> None:  # pragma: no cover
+def fill_right_jacobian(v: Triple, out: FloatArray) -> None:
     """`right_jacobian` of one tangent vector into ``out`` (3, 3)."""
     f, g = _curl_terms(v[2])
     a, b = _sinc_terms(v[2])
@@ -153,7 +153,7 @@ def fill_right_jacobian(v: Triple, out: FloatArray) -> None:  # pragma: no cover
 
 
 @numba.njit(cache=True)
-def fill_right_jacobian_inverse(v: Triple, out: FloatArray) -> None:  # pragma: no cover
+def fill_right_jacobian_inverse(v: Triple, out: FloatArray) -> None:
     """`right_jacobian_inverse` of one tangent vector into ``out`` (3, 3)."""
     f, g = _curl_terms(v[2])
     a, b = _sinc_terms(v[2])
@@ -173,7 +173,7 @@ def wrap_angle(angle: ArrayLike) -> FloatArray:
 
 
 @gufunc("(n)->(n)")
-def _exp(v: FloatArray, out: FloatArray) -> None:  # pragma: no cover
+def _exp(v: FloatArray, out: FloatArray) -> None:
     out[0], out[1], out[2] = scalar_exp(triple(v))
 
 
@@ -186,7 +186,7 @@ def exp(tangent: ArrayLike) -> FloatArray:
 
 
 @gufunc("(n)->(n)")
-def _log(p: FloatArray, out: FloatArray) -> None:  # pragma: no cover
+def _log(p: FloatArray, out: FloatArray) -> None:
     out[0], out[1], out[2] = scalar_log(triple(p))
 
 
@@ -196,7 +196,7 @@ def log(pose: ArrayLike) -> FloatArray:
 
 
 @gufunc("(n),(n)->(n)")
-def _compose(a: FloatArray, b: FloatArray, out: FloatArray) -> None:  # pragma: no cover
+def _compose(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     out[0], out[1], out[2] = scalar_compose(triple(a), triple(b))
 
 
@@ -206,7 +206,7 @@ def compose(a_T_b: ArrayLike, b_T_c: ArrayLike) -> FloatArray:
 
 
 @gufunc("(n)->(n)")
-def _inverse(p: FloatArray, out: FloatArray) -> None:  # pragma: no cover
+def _inverse(p: FloatArray, out: FloatArray) -> None:
     out[0], out[1], out[2] = scalar_inverse(triple(p))
 
 
@@ -221,7 +221,7 @@ def between(world_T_a: ArrayLike, world_T_b: ArrayLike) -> FloatArray:
 
 
 @gufunc("(n),(m)->(m)")
-def _transform(p: FloatArray, q: FloatArray, out: FloatArray) -> None:  # pragma: no cover
+def _transform(p: FloatArray, q: FloatArray, out: FloatArray) -> None:
     c, s = math.cos(p[2]), math.sin(p[2])
     out[0], out[1] = p[0] + c * q[0] - s * q[1], p[1] + s * q[0] + c * q[1]
 
@@ -232,7 +232,7 @@ def transform(a_T_b: ArrayLike, points_b: ArrayLike) -> FloatArray:
 
 
 @gufunc("(n)->(n,n)")
-def _adjoint(p: FloatArray, out: FloatArray) -> None:  # pragma: no cover
+def _adjoint(p: FloatArray, out: FloatArray) -> None:
     fill_adjoint(triple(p), out)
 
 
@@ -242,7 +242,7 @@ def adjoint(pose: ArrayLike) -> FloatArray:
 
 
 @gufunc("(n)->(n,n)")
-def _right_jacobian(v: FloatArray, out: FloatArray) -> None:  # pragma: no cover
+def _right_jacobian(v: FloatArray, out: FloatArray) -> None:
     fill_right_jacobian(triple(v), out)
 
 
@@ -252,7 +252,7 @@ def right_jacobian(tangent: ArrayLike) -> FloatArray:
 
 
 @gufunc("(n)->(n,n)")
-def _right_jacobian_inverse(v: FloatArray, out: FloatArray) -> None:  # pragma: no cover
+def _right_jacobian_inverse(v: FloatArray, out: FloatArray) -> None:
     fill_right_jacobian_inverse(triple(v), out)
 
 

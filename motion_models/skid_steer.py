@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import numba
 import numpy as np
 
 from motion_models.base import Twist
+from motion_models.prior import skid_prior
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -46,6 +47,8 @@ class SkidSteer:
     """[m]"""
     nominal: FloatArray
     """(11,) the coefficients above."""
+    sigmas: FloatArray = field(default_factory=lambda: np.zeros(11))
+    """(11,) standard deviations of those that come from the robot's geometry (`motion_models.prior`); 0 for those of a calibration."""
     name: ClassVar[str] = "skid_steer"
     param_names: ClassVar[tuple[str, ...]] = (
         *("k_0", "k_1", "k_2", "x_cr_0", "x_cr_1"),
@@ -54,9 +57,13 @@ class SkidSteer:
 
     @classmethod
     def from_robot(cls, robot: Robot) -> SkidSteer:
-        """The coefficients of [models.skid_steer]; for what it does not name, the thesis's with the symmetric y_CR (4.25)."""
-        coefficients = robot.coefficients(cls.name, cls.param_names, thesis_coefficients())
-        return cls(robot.geometry.wheel_radius_m, robot.geometry.track_width_m, coefficients)
+        """The coefficients of [models.skid_steer]; what it does not name comes from the robot's geometry (`motion_models.prior`)."""
+        radius, track, own = robot.geometry.wheel_radius_m, robot.geometry.track_width_m, robot.models.get(cls.name, {})
+        if all(name in own for name in cls.param_names):
+            return cls(radius, track, robot.coefficients(cls.name, cls.param_names, np.zeros(len(cls.param_names))))
+        prior = skid_prior(robot)
+        sigmas = np.array([0.0 if name in own else s for name, s in zip(cls.param_names, prior.sigmas, strict=True)])
+        return cls(radius, track, robot.coefficients(cls.name, cls.param_names, prior.coefficients), sigmas)
 
     def rotation(self, cg: FloatArray, params: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """k [-], x_CR [m] and y_CR [m], each (...,), for ``cg`` (..., 2)."""
@@ -91,7 +98,7 @@ def _twist(
     d_wheels: FloatArray,
     d_cg: FloatArray,
     d_params: FloatArray,
-) -> None:  # pragma: no cover
+) -> None:
     """See `Twist.from_kernel`; ``constants`` (2,) are the wheel radius and the track width."""
     r, d = constants[0], constants[1]
     k_0, k_1, k_2, x_cr_0, x_cr_1 = params[0], params[1], params[2], params[3], params[4]

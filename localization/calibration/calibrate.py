@@ -39,7 +39,7 @@ class Cut:
 
     source: str
     maneuvers: tuple[Maneuver, ...]
-    witness: str
+    measured_by: str
     """What measured the motion, in words."""
     warnings: tuple[str, ...] = ()
 
@@ -81,11 +81,11 @@ def cut_log(
     path: Path,
     robot: Robot,
     topics: TopicOverrides,
-    witness: MotionReferenceName,
+    reference_name: MotionReferenceName,
     reference: str | None,
     config: WindowConfig | None = None,
 ) -> Cut:
-    """The maneuvers of a log, as measured by ``witness``; "auto" is the reference if one is named, else the LiDAR, else the gyro.
+    """The maneuvers of a log, as measured by ``reference_name``; "auto" is the reference if one is named, else the LiDAR, else the gyro.
 
     A reference, even one that the robot file names, is never used unless the user says so: what is calibrated on it cannot be scored
     against it. Raises `CalibrationError` where nothing measures the motion, and what opening the log does.
@@ -97,7 +97,7 @@ def cut_log(
             f"{log.path.name} has no wheels: neither joint states ({robot.topics.joint_states}) nor the driver's odometry"
             f" ({robot.topics.odometry}); name them with --topic.joint-states or --topic.odometry. `skidloc info` lists the topics."
         )
-    motion_reference, words = make_motion_reference(log, robot, witness, reference, config)
+    motion_reference, words = make_motion_reference(log, robot, reference_name, reference, config)
     events = log.events()
     windows = cut(events, motion_reference, make_model("diff_drive", robot), robot, config, log.path.name)
     kept = f"{len(windows.maneuvers)} windows of {config.window_s:g} s"
@@ -170,7 +170,7 @@ def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequ
     counts = [len(m.ends) for m in maneuvers]
     group = np.repeat([names.index(m.group) for m in maneuvers], counts)
     heldout = cross_validate(train, maneuvers, min(_FOLDS, len(names))) if len(names) >= _FEWEST_GROUPS else None
-    before = dataclasses.replace(found.fit, params=model.nominal, witness=np.zeros(5)).residuals(maneuvers)
+    before = dataclasses.replace(found.fit, params=model.nominal, reference_params=np.zeros(5)).residuals(maneuvers)
     inside = found.fit.residuals(maneuvers)
     systematic = _gyro_scale(train, found.fit, maneuvers, cuts, robot)
     return Calibrated(model, found, before, inside, group, _position_known(maneuvers), heldout, systematic)
@@ -192,7 +192,7 @@ def _gyro_scale(
     train: Callable[[Sequence[Maneuver]], Fit], found: Fit, maneuvers: Sequence[Maneuver], cuts: Sequence[Cut], robot: Robot
 ) -> dict[str, float]:
     """By how much the parameters move if the gyro's scale is off by its sigma."""
-    if not any(each.witness.startswith("gyro") for each in cuts):
+    if not any(each.measured_by.startswith("gyro") for each in cuts):
         return {}
     scale = np.array([1.0, 1.0, 1.0 + robot.gyro_noise.scale_sigma])
     other = train([dataclasses.replace(m, measured=m.measured * scale) for m in maneuvers])

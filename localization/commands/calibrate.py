@@ -20,9 +20,8 @@ from localization.commands.regression_tables import print_regressions, regressio
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from motion_models.base import MotionModel
-from motion_models.calibration.regressions import RotationTable, read_rotation_table, skid_steer_fit
+from motion_models.calibration.regressions import RotationTable, read_rotation_table, rotations_as_maneuvers, skid_steer_fit
 from motion_models.calibration.ros_export import diff_drive_controller_yaml, robot_localization_yaml
-from motion_models.calibration.rotations import rotations_as_maneuvers
 from motion_models.calibration.windows_table import read_windows, table_columns, windows_text
 from motion_models.center_of_gravity.files import arms_model, arms_postures
 from motion_models.errors import CalibrationError
@@ -52,7 +51,7 @@ class Calibrate:
     witness: MotionReferenceName = "auto"
     """What measured the real motion in logs: the reference if one is named, else the LiDAR, else the gyro (headings alone)."""
     reference: str | None = None
-    """Topic or TUM file with positions and headings, as the witness. Never used unless named."""
+    """Topic or TUM file with positions and headings, as the motion reference. Never used unless named."""
     window_s: float = 2.0
     """Length of the maneuvers that logs are cut into [s]."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)

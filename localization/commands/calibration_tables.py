@@ -16,8 +16,7 @@ from localization.calibration.windows import driven
 from motion_models.base import MotionModel
 from motion_models.calibration.cross_validation import Interval, root_mean, root_mean_gain
 from motion_models.calibration.plan import MEANING
-from motion_models.calibration.regressions import RotationTable
-from motion_models.calibration.rotations import COMMANDED_RAD_PER_S
+from motion_models.calibration.regressions import COMMANDED_RAD_PER_S, RotationTable
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -62,7 +61,7 @@ def print_cuts(console: Console, robot: Robot, cuts: Sequence[Cut]) -> None:
         seconds, metres, radians = driven(each.maneuvers, g.wheel_radius_m, g.track_width_m)
         say(
             console,
-            f"{each.source}: {seconds:.0f} s of motion, {metres:.1f} m and {radians:.1f} rad by the wheels, measured by {each.witness}",
+            f"{each.source}: {seconds:.0f} s of motion, {metres:.1f} m and {radians:.1f} rad by the wheels, measured by {each.measured_by}",
         )
         for note in each.warnings:
             say(console, f"  {note}")
@@ -86,7 +85,7 @@ def print_fit(console: Console, found: Calibrated, about: Turning, cuts: Sequenc
     if found.measures_positions:
         x, y, forward = _pm(about.x_cr_m), _pm(about.y_cr_m), _pm(about.forward_scale, 4)
         say(console, f"It then turns about ({x}, {y}) m, and drives {forward} m for each metre that its wheels roll.")
-    if any("scan matching" in each.witness for each in cuts):
+    if any("scan matching" in each.measured_by for each in cuts):
         say(
             console,
             "A LiDAR that sits further ahead than its mount says looks like a centre of rotation that far ahead; only measuring the mount,"
@@ -98,7 +97,7 @@ def print_fit(console: Console, found: Calibrated, about: Turning, cuts: Sequenc
     if fit.scale > _MANY_TIMES:
         say(
             console,
-            f"What is left is {fit.scale:.1f} times what the robot file's wheel_noise and the witness's noise explain: raise wheel_noise's"
+            f"What is left is {fit.scale:.1f} times what wheel_noise and the reference's noise explain: raise wheel_noise's"
             f" variances {fit.scale**2:.1f} times, or look what this model lacks with `skidloc diagnose`.",
         )
 
@@ -160,7 +159,7 @@ def numbers(found: Calibrated, about: Turning, cuts: Sequence[Cut], by_source: S
     return {
         "seconds": found.fit.seconds,
         "maneuvers": sum(len(each.maneuvers) for each in cuts),
-        "witness": {each.source: each.witness for each in cuts},
+        "witness": {each.source: each.measured_by for each in cuts},
         "parameters": {
             name: {"value": value, "sigma": sigma, "before": before, "meaning": MEANING.get(name, "")}
             for name, (before, value, sigma) in _parameters(found).items()

@@ -221,8 +221,8 @@ def _print(
     show(console, table)
     if "warp" in told:
         say(console, f"A twisted chassis puts {told['warp']:+.3f} of m g / 4 on the front left and rear right wheels (friction's warp).")
-    own = "skid_steer" in robot.models or robot.name == "vaultbot"
-    title = "\nskid_steer (4.21-4.25)" + ("" if own else ", with VaultBot's coefficients: the robot file has none")
+    own = "k_0" in robot.models.get("skid_steer", {})
+    title = "\nskid_steer (4.21-4.25)" + ("" if own else ", from the robot's geometry by the friction model: the robot file has no k_0")
     what = plain_table("", f"nominal ({robot.geometry.cg_x_m:g}, {robot.geometry.cg_y_m:g}) m", "here", "sigma by the CG", title=title)
     for name, value in told["skid_steer"].items():
         row(what, name.replace("_m", " [m]"), f"{value['nominal']:+.4f}", f"{value['here']:+.4f}", f"{value['sigma']:.4f}")

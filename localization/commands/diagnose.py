@@ -21,8 +21,7 @@ from localization.diagnosis.findings import Diagnosis
 from localization.logs import TopicOverrides, open_log
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
-from motion_models.calibration.regressions import read_rotation_table
-from motion_models.calibration.rotations import rotations_as_maneuvers
+from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.calibration.windows_table import read_windows, table_columns
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
@@ -47,7 +46,7 @@ class Diagnose:
     witness: MotionReferenceName = "auto"
     """What measured the real motion in logs: the reference if one is named, else the LiDAR, else the gyro (headings alone)."""
     reference: str | None = None
-    """Topic or TUM file with positions and headings, as the witness. Never used unless named."""
+    """Topic or TUM file with positions and headings, as the motion reference. Never used unless named."""
     window_s: float = 2.0
     """Length of the windows that logs are cut into [s]."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)

@@ -15,6 +15,7 @@ from rich.table import Table
 from localization.commands.common import write_json
 from localization.logs import LogInfo, TopicOverrides, inspect_log, open_log
 from localization.output import check_outputs
+from motion_models.prior import prior_notes
 from motion_models.robot import load_robot
 
 
@@ -33,7 +34,9 @@ class Info:
     def run(self, console: Console) -> None:
         check_outputs(self.json)
         with console.status("reading the log"):
-            info = inspect_log(open_log(self.log, load_robot(self.robot), self.topic))
+            robot = load_robot(self.robot)
+            info = inspect_log(open_log(self.log, robot, self.topic))
+            info.warnings.extend(prior_notes(robot))
         if self.json is not None:
             write_json(self.json, info.to_dict())
         _print(console, info)

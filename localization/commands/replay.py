@@ -33,6 +33,7 @@ from localization.provenance import fingerprint, versions
 from localization.report.replay_page import ReportHead, overview_png, verdict, write_report
 from localization.trajectory import write_tum
 from motion_models.online_calibration import check_forms
+from motion_models.prior import prior_notes
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
 
@@ -101,7 +102,12 @@ class Replay:
             robot=robot.name,
             start=describe_instant(log.start_ns),
             duration_s=log.duration_s,
-            warnings=[as_text(note) for note in dict.fromkeys([*log.warnings(), *(note for run in runs for note in run.warnings)])],
+            warnings=[
+                as_text(note)
+                for note in dict.fromkeys(
+                    [*prior_notes(robot, [m.name for m in models]), *log.warnings(), *(note for run in runs for note in run.warnings)]
+                )
+            ],
             versions=versions(),
             log_fingerprint=fingerprint(log.path),
         )

@@ -1,4 +1,4 @@
-"""Fit of any model's parameters to maneuvers: robust, weighted by the wheels' own noise, and honest about what the drive reveals."""
+"""Fit of any model's parameters to maneuvers: robust, weighted by the wheels' noise, with a check of observability."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from motion_models.se2 import FloatArray
 
 @dataclass(frozen=True)
 class Fit:
-    """Fitted parameters, and what is known of how good they are."""
+    """Fitted parameters, with their uncertainty."""
 
     model: MotionModel
     names: tuple[str, ...]
-    """The c free parameters, of the model and of the witnesses."""
+    """The c free parameters, of the model and of the motion reference."""
     params: FloatArray
     """(k,) all of the model's parameters, fitted or not."""
-    witness: FloatArray
-    """(5,) as `WITNESS_NAMES`."""
+    reference_params: FloatArray
+    """(5,) as `REFERENCE_PARAM_NAMES`."""
     cov: FloatArray
     """(c, c) of the free parameters. With more than ten groups beyond c, the sandwich over groups (CR1), which stands residuals that
     are correlated within a group and a noise model that is wrong; with fewer, the inverse information times the weighted mean square."""
@@ -47,7 +47,7 @@ class Fit:
     @property
     def values(self) -> FloatArray:
         """(c,) the free parameters."""
-        everything = np.concatenate([self.params, self.witness])
+        everything = np.concatenate([self.params, self.reference_params])
         return np.asarray(everything[indices(self.model, self.names)])
 
     @property
@@ -60,12 +60,17 @@ class Fit:
     def residuals(self, maneuvers: Sequence[Maneuver]) -> FloatArray:
         """(M, 3) predicted poses seen from the measured ones [m, m, rad]; these maneuvers need not be those of the fit."""
         batch = make_batch(maneuvers)
-        poses, _, _ = predict(self.model, batch, self.params, self.witness, np.empty(0, dtype=np.int64), self.config.noise)
+        poses, _, _ = predict(self.model, batch, self.params, self.reference_params, np.empty(0, dtype=np.int64), self.config.noise)
         return se2.between(batch.measured, poses)
 
     def robot(self, robot: Robot) -> Robot:
-        """``robot`` with all of this model's parameters in its file's table."""
-        table = dict(zip(self.model.param_names, (float(p) for p in self.params), strict=True))
+        """``robot`` with the fitted parameters in its file's table, beside those that it already has.
+
+        What was neither fitted nor in the file stays out, so that it follows the robot's geometry and not this robot's model.
+        """
+        fitted = {*self.names, *self.config.ties, *robot.models.get(self.model.name, {})}
+        everything = zip(self.model.param_names, (float(p) for p in self.params), strict=True)
+        table = {name: value for name, value in everything if name in fitted}
         return dataclasses.replace(robot, models={**robot.models, self.model.name: table})
 
 
@@ -76,10 +81,10 @@ def fit(
     config: FitConfig | None = None,
     start: FloatArray | None = None,
 ) -> Fit:
-    """Least squares over the parameters named in ``free`` (of the model or `WITNESS_NAMES`), starting at ``start`` (k,) or the nominal.
+    """Least squares over the parameters ``free`` (of the model or `REFERENCE_PARAM_NAMES`), from ``start`` (k,) or the nominal.
 
     Levenberg-Marquardt on the exact derivatives; robust weights by iterative reweighting, one weight per measured pose, after a
-    plain fit has told the residuals' scale. Raises `CalibrationError` for names that do not exist, for too little motion, and
+    plain fit has given the residuals' scale. Raises `CalibrationError` for names that do not exist, for too little motion, and
     (``config.strict``) for parameters that these maneuvers do not reveal, saying what to drive.
 
     >>> from motion_models import load_robot, make_model, read_rotation_table, rotations_as_maneuvers
@@ -112,7 +117,7 @@ def fit(
         model=model,
         names=problem.names,
         params=problem.params(x),
-        witness=problem.witness(x),
+        reference_params=problem.reference_params(x),
         cov=cov,
         is_sandwich=is_sandwich,
         scale=scale,

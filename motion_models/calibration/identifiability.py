@@ -11,8 +11,8 @@ from motion_models.calibration.maneuvers import Batch, Maneuver, make_batch
 from motion_models.se2 import FloatArray
 
 _SECONDS = 5.0
-_PATIENCE = 600.0  # s; a maneuver that must last longer is no advice
-_SHARE = 0.3  # parameters with less than this part in a direction are not named
+_MAX_MANEUVER_S = 600.0  # s; a maneuver that must last longer is no advice
+_MIN_SHARE = 0.3  # parameters with less than this part in a direction are not named
 
 Derive = Callable[[Batch], tuple[FloatArray, FloatArray]]
 """Derivatives (M, 3, c) of a batch's poses by the c free parameters, and the poses' covariances (M, 3, 3)."""
@@ -29,7 +29,7 @@ class Weakness:
     drive: str
     """The maneuver that would reveal it best; empty where none would."""
     seconds: float
-    """How much of it is needed to bring the spread below 1."""
+    """Duration that brings the spread below 1."""
 
     @property
     def text(self) -> str:
@@ -64,10 +64,10 @@ def weaknesses(
     for spread, vector in weak:
         parts = vector / vector[np.argmax(np.abs(vector))]
         order = np.argsort(-np.abs(parts), kind="stable")
-        combination = {names[i]: float(parts[i]) for i in order if abs(parts[i]) >= _SHARE}
+        combination = {names[i]: float(parts[i]) for i in order if abs(parts[i]) >= _MIN_SHARE}
         drive, gain = _best(derive, vector / np.linalg.norm(vector) * sizes, rate, cg)
         seconds = _SECONDS * float(np.ceil((1.0 - spread**-2) / gain)) if drive else np.inf
-        if seconds > _PATIENCE:
+        if seconds > _MAX_MANEUVER_S:
             drive, seconds = "", np.inf
         found.append(Weakness(combination, spread, drive, seconds))
     return tuple(found)

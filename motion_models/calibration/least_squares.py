@@ -1,4 +1,4 @@
-"""Least squares over a model's and the witnesses' parameters: residuals, robust weights and the solver of `calibrate`."""
+"""Least squares over a model's and the motion reference's parameters: residuals, robust weights and the solver of `calibrate`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import Batch, IntArray
-from motion_models.calibration.prediction import WITNESS_NAMES, predict
+from motion_models.calibration.prediction import REFERENCE_PARAM_NAMES, predict
 from motion_models.errors import CalibrationError, ModelError
 from motion_models.robot import WheelNoise
 from motion_models.se2 import FloatArray
@@ -48,8 +48,8 @@ class FitConfig:
 
 
 def indices(model: MotionModel, names: Sequence[str]) -> IntArray:
-    """Where ``names`` are among the model's parameters followed by `WITNESS_NAMES`. Raises `CalibrationError`."""
-    known = (*model.param_names, *WITNESS_NAMES)
+    """Where ``names`` are among the model's parameters followed by `REFERENCE_PARAM_NAMES`. Raises `CalibrationError`."""
+    known = (*model.param_names, *REFERENCE_PARAM_NAMES)
     unknown = [name for name in names if name not in known]
     if unknown:
         raise CalibrationError(f"{model.name} has no parameter {', '.join(unknown)}; it has {', '.join(known)}.")
@@ -71,7 +71,7 @@ class Problem:
         self.combine = np.eye(len(names), len(names) + len(tied))
         for i, (master, factor) in enumerate(config.ties.values()):
             self.combine[names.index(master), len(names) + i] = factor
-        self.everything = np.concatenate([start, np.zeros(len(WITNESS_NAMES))])
+        self.everything = np.concatenate([start, np.zeros(len(REFERENCE_PARAM_NAMES))])
         self.start = self.everything[self.columns]
         nominal = dict(zip(model.param_names, np.abs(model.nominal), strict=True))
         self.sizes = np.array([config.sizes.get(name) or nominal.get(name) or _SMALL for name in names])
@@ -107,20 +107,20 @@ class Problem:
         return full
 
     def params(self, x: FloatArray) -> FloatArray:
-        return self._full(x)[: -len(WITNESS_NAMES)]
+        return self._full(x)[: -len(REFERENCE_PARAM_NAMES)]
 
-    def witness(self, x: FloatArray) -> FloatArray:
-        return self._full(x)[-len(WITNESS_NAMES) :]
+    def reference_params(self, x: FloatArray) -> FloatArray:
+        return self._full(x)[-len(REFERENCE_PARAM_NAMES) :]
 
     def derive(self, batch: Batch, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See `identifiability.Derive`."""
-        _, d, cov = predict(self.model, batch, self.params(x), self.witness(x), self.all_columns, self.config.noise)
+        _, d, cov = predict(self.model, batch, self.params(x), self.reference_params(x), self.all_columns, self.config.noise)
         usual = self.batch.cov.mean(axis=0)
         return d @ self.combine.T, cov + np.where(np.isfinite(usual), usual, _UNMEASURED)
 
     def residuals(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Whitened residuals (M, 3) and their derivatives (M, 3, c)."""
-        poses, d, _ = predict(self.model, self.batch, self.params(x), self.witness(x), self.all_columns, self.config.noise)
+        poses, d, _ = predict(self.model, self.batch, self.params(x), self.reference_params(x), self.all_columns, self.config.noise)
         off = se2.between(self.batch.measured, poses)
         # `off` moves by its own rotation of what its end moves.
         c, s = np.cos(off[:, 2]), np.sin(off[:, 2])

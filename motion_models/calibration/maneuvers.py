@@ -1,4 +1,4 @@
-"""Maneuvers: short drives of which the wheels tell one story and another witness (LiDAR, reference) the measured other.
+"""Maneuvers: short drives with wheel rates and the motion that a reference (LiDAR, gyro, motion capture) measured.
 
 Calibration compares the two (see `motion_models.calibration.prediction`).
 """

@@ -1,4 +1,4 @@
-"""What to fit of each model when nobody says, what its numbers mean, and what to hold when a drive does not reveal it."""
+"""Parameters that are fitted by default, their meaning, and which of them are held when a drive does not reveal them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FREE: Mapping[str, tuple[str, ...]] = {
     "full_linear": ("wz_left", "vx_left", "vy_left", "longitudinal_slip_curvature", "wz_right", "vx_right", "vy_right"),
     "friction": ("mu_ratio", "tracked_x", "wheel_radius"),
 }
-"""What logs are to tell of a model, dearest first: of those that cannot be told apart, the last is held."""
+"""Parameters fitted to logs, most important first: of those that cannot be separated, the last is held."""
 FREE_WHERE_CG_MOVES: Mapping[str, tuple[str, ...]] = {"skid_steer": ("k_0", "x_cr_0", "y_cr_0", "x_cr_1", "k_2", "k_1", "y_cr_s0")}
 FREE_OF_TURNS: Mapping[str, tuple[str, ...]] = {
     "diff_drive": ("wheel_separation_multiplier",),
@@ -82,6 +82,16 @@ MEANING: Mapping[str, str] = {
     "wz_left": "rad/rad: turning by the left wheels",
     "wz_right": "rad/rad: turning by the right wheels",
     "lateral_slip_speed": "s: sideways speed v wz times this",
+    "longitudinal_slip_turning": "s: share of the forward speed lost per yaw rate",
+    "rotation_slip_speed": "s/m: share of the yaw rate lost per speed",
+    "rotation_slip_rate": "s: share of the yaw rate lost per yaw rate",
+    "rotation_slip_curvature": "share of the yaw rate lost in straight driving, against turning in place",
+    "wheelbase": "m: distance of the front and rear contacts",
+    "mu": "friction along the wheels",
+    "slip_stiffness": "slope of the contact law at zero slip",
+    "rolling_resistance": "rolling resistance over load",
+    "tread": "how much more the wheels grip when they slide to the left than to the right",
+    "tracked_y": "m: tracked point left of the wheelbase's middle",
     "longitudinal_slip_curvature": "forward speed lost to turning, at its most",
     "mu_ratio": "friction across the wheels over that along them",
     "tracked_x": "m: tracked point ahead of the wheelbase's middle",
@@ -102,7 +112,7 @@ class Calibration:
 
 
 def free_of(model: MotionModel, maneuvers: Sequence[Maneuver], of_rotations: bool = False) -> tuple[str, ...]:
-    """What to fit of ``model`` when nobody says: more where the centre of gravity moves, and the clock where there is time around."""
+    """Parameters of ``model`` to fit by default: more where the centre of gravity moves, and the clock where there is time around."""
     if of_rotations and model.name in FREE_OF_ROTATIONS:
         return FREE_OF_ROTATIONS[model.name]
     if maneuvers and not any(np.isfinite(m.cov[..., 0, 0]).any() for m in maneuvers) and model.name in FREE_OF_TURNS:

@@ -1,12 +1,12 @@
-"""What a model makes of the wheels of many maneuvers, with derivatives, as another witness would see it.
+"""Poses that a model predicts from the wheels of many maneuvers, with derivatives, as a motion reference would measure them.
 
-What lies between the witnesses themselves (clocks, lags, where the LiDAR sits) is not the motion model's business, and is described
-here, so that a fit does not push it into the model's parameters.
+Clock offset, lag and mount of the reference are not part of the motion model. They are parameters here, so that a fit does not push
+them into the model's own.
 """
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numba
 import numpy as np
@@ -18,13 +18,57 @@ from motion_models.preintegration import _integrate, noise_vector
 from motion_models.robot import WheelNoise
 from motion_models.se2 import FloatArray
 
-WITNESS_NAMES = ("wheel_time_offset", "wheel_lag", "lidar_offset_x", "lidar_offset_y", "lidar_yaw")
-"""Nuisance terms between the witnesses, in the order of their vector (5,), all 0 by default:
+REFERENCE_PARAM_NAMES = ("wheel_time_offset", "wheel_lag", "lidar_offset_x", "lidar_offset_y", "lidar_yaw")
+"""Nuisance parameters between wheels and motion reference, in the order of their vector (5,), all 0 by default:
 
 wheel_time_offset [s]: how late the wheels' stamps are; the motion at t is in the wheels' samples at t + offset;
 wheel_lag [s]: time constant with which the body follows the wheels (first order);
 lidar_offset_x, lidar_offset_y [m], lidar_yaw [rad]: pose of the tracked point in the body frame, as far as it is not known already.
 """
+
+
+class Spans(NamedTuple):
+    """Which intervals of a batch belong to each measured pose."""
+
+    start: IntArray
+    """(W,) first integrated interval of each maneuver."""
+    ends: IntArray
+    """(M,) index after the last interval before each measured pose."""
+    owner: IntArray
+    """(M,) maneuver of each measured pose."""
+
+
+class Motions(NamedTuple):
+    """Results of `_integrate_all`."""
+
+    poses: FloatArray
+    """(M, 3)"""
+    covs: FloatArray
+    """(M, 3, 3)"""
+    derivatives: FloatArray
+    """(M, 3, c)"""
+
+
+class Smoothed(NamedTuple):
+    """Low-passed wheel rates of one maneuver."""
+
+    middle: FloatArray
+    """(n,) middles of the intervals [s]."""
+    value: FloatArray
+    """(n, 2) [rad/s]"""
+    by_lag: FloatArray
+    """(n, 2) derivative by the lag."""
+
+
+class Delayed(NamedTuple):
+    """Wheel rates read at another time, with derivatives."""
+
+    value: FloatArray
+    """(n, 2) [rad/s]"""
+    by_offset: FloatArray
+    """(n, 2)"""
+    by_lag: FloatArray
+    """(n, 2)"""
 
 
 class HasTwist(Protocol):
@@ -37,22 +81,24 @@ def predict(
     model: HasTwist,
     batch: Batch,
     params: FloatArray,
-    witness: FloatArray,
+    reference_params: FloatArray,
     columns: IntArray,
     noise: WheelNoise,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What the wheels say of every measured pose: poses (M, 3), their derivatives (M, 3, c) and covariances (M, 3, 3).
+    """Predict every measured pose: poses (M, 3), their derivatives (M, 3, c) and covariances (M, 3, 3).
 
-    ``witness`` (5,) as in `WITNESS_NAMES`; ``columns`` (c,) are the wanted derivatives, indices into the model's k parameters
-    followed by the witness's five. Derivatives and covariances are right perturbations; ``noise`` is the wheels' slip.
+    ``reference_params`` (5,) as in `REFERENCE_PARAM_NAMES`; ``columns`` (c,) are the wanted derivatives, indices into the model's k
+    parameters followed by the reference's five. Derivatives and covariances are right perturbations; ``noise`` is the wheels' slip.
     """
     k = len(params)
-    offset, lag = witness[0], witness[1]
+    offset, lag = reference_params[0], reference_params[1]
     delayed = offset != 0.0 or lag != 0.0 or bool(np.isin([k, k + 1], columns).any())
     wheels, by_offset, by_lag = batch.wheels, batch.wheels, batch.wheels
     if delayed:
         wheels, by_offset, by_lag = (np.zeros_like(batch.wheels) for _ in range(3))
-        _delay(batch.dt, batch.wheels, batch.first, offset, lag, wheels, by_offset, by_lag)
+        for a, b in zip(batch.first[:-1], batch.first[1:], strict=True):
+            smooth = _low_pass(batch.dt[a:b], batch.wheels[a:b], lag)
+            _interpolate(smooth, offset, Delayed(wheels[a:b], by_offset[a:b], by_lag[a:b]))
     twist = model.twist(wheels, batch.cg, params)
 
     by = np.zeros((len(batch.dt), 3, len(columns)))
@@ -64,9 +110,10 @@ def predict(
 
     poses, cov = np.zeros((len(batch.ends), 3)), np.zeros((len(batch.ends), 3, 3))
     d = np.zeros((len(batch.ends), 3, len(columns)))
-    _integrate_all(batch.dt, twist.value, by, noise_vector(noise), batch.first[:-1] + batch.lead, batch.ends, batch.owner, poses, cov, d)
-    if np.any(witness[2:] != 0.0) or bool(np.any(columns >= k + 2)):
-        poses, d = _track(poses, d, witness[2:], columns - (k + 2))
+    spans = Spans(batch.first[:-1] + batch.lead, batch.ends, batch.owner)
+    _integrate_all(batch.dt, twist.value, by, noise_vector(noise), spans, Motions(poses, cov, d))
+    if np.any(reference_params[2:] != 0.0) or bool(np.any(columns >= k + 2)):
+        poses, d = _track(poses, d, reference_params[2:], columns - (k + 2))
     return poses, d, cov
 
 
@@ -84,75 +131,61 @@ def _track(poses: FloatArray, d: FloatArray, body_T_lidar: FloatArray, columns: 
 
 
 @numba.njit(cache=True)
-def _integrate_all(
-    dt: FloatArray,
-    twist: FloatArray,
-    by: FloatArray,
-    noise: FloatArray,
-    start: IntArray,
-    ends: IntArray,
-    owner: IntArray,
-    poses: FloatArray,
-    covs: FloatArray,
-    ds: FloatArray,
-) -> None:  # pragma: no cover
-    """Integrate every maneuver from its start, noting pose, covariance and derivatives at each of its ends."""
+def _integrate_all(dt: FloatArray, twist: FloatArray, by: FloatArray, noise: FloatArray, spans: Spans, found: Motions) -> None:
+    """Integrate every maneuver from its start; store pose, covariance and derivatives at each of its ends."""
     delta, cov, d = np.zeros(3), np.zeros((3, 3)), np.zeros((3, by.shape[2]))
-    for i in range(ends.shape[0]):
-        if i == 0 or owner[i] != owner[i - 1]:
+    a = 0
+    for i in range(spans.ends.shape[0]):
+        if i == 0 or spans.owner[i] != spans.owner[i - 1]:
             delta[:], cov[:], d[:] = 0.0, 0.0, 0.0
-            a = start[owner[i]]
+            a = spans.start[spans.owner[i]]
         else:
-            a = ends[i - 1]
-        b = ends[i]
+            a = spans.ends[i - 1]
+        b = spans.ends[i]
         _integrate(dt[a:b], twist[a:b], by[a:b], noise, delta, cov, d)
-        poses[i], covs[i], ds[i] = delta, cov, d
+        found.poses[i], found.covs[i], found.derivatives[i] = delta, cov, d
 
 
 @numba.njit(cache=True)
-def _delay(
-    dt: FloatArray,
-    wheels: FloatArray,
-    first: IntArray,
-    offset: float,
-    lag: float,
-    value: FloatArray,
-    by_offset: FloatArray,
-    by_lag: FloatArray,
-) -> None:  # pragma: no cover
-    """Low-pass the rates of each maneuver with time constant ``lag``, then read them ``offset`` later; with both derivatives.
+def _low_pass(dt: FloatArray, wheels: FloatArray, lag: float) -> Smoothed:
+    """First-order low-pass of the rates (n, 2) of one maneuver. A rate counts for the middle of its interval.
 
-    A rate counts for the middle of its interval, between which it is interpolated; at both ends of a maneuver it is held.
+    Exact for rates that change linearly in between, and so smooth in the lag down to 0 and beyond.
     """
-    for w in range(first.shape[0] - 1):
-        a, b = first[w], first[w + 1]
-        smooth, smooth_by_lag, middle = np.empty((b - a, 2)), np.zeros((b - a, 2)), np.empty(b - a)
-        smooth[0] = wheels[a]
-        middle[0] = dt[a] / 2.0
-        for i in range(1, b - a):
-            h = (dt[a + i - 1] + dt[a + i]) / 2.0
-            middle[i] = middle[i - 1] + h
-            # Exact for rates that change linearly in between, and so smooth in the lag down to 0 and beyond.
-            keep = np.exp(-h / lag) if lag > 0.0 else 0.0
-            keep_by_lag = keep * h / (lag * lag) if lag > 0.0 else 0.0
-            for j in range(2):
-                slope = (wheels[a + i, j] - wheels[a + i - 1, j]) / h
-                behind = smooth[i - 1, j] - wheels[a + i - 1, j] + lag * slope
-                smooth[i, j] = wheels[a + i, j] - lag * slope + keep * behind
-                smooth_by_lag[i, j] = -slope + keep * (smooth_by_lag[i - 1, j] + slope) + keep_by_lag * behind
-        k = 0
-        for i in range(b - a):
-            t = middle[i] + offset
-            if t <= middle[0] or b - a == 1:
-                value[a + i], by_lag[a + i] = smooth[0], smooth_by_lag[0]
-            elif t >= middle[b - a - 1]:
-                value[a + i], by_lag[a + i] = smooth[b - a - 1], smooth_by_lag[b - a - 1]
-            else:
-                while middle[k + 1] <= t:
-                    k += 1
-                h = middle[k + 1] - middle[k]
-                f = (t - middle[k]) / h
-                for j in range(2):
-                    value[a + i, j] = (1.0 - f) * smooth[k, j] + f * smooth[k + 1, j]
-                    by_lag[a + i, j] = (1.0 - f) * smooth_by_lag[k, j] + f * smooth_by_lag[k + 1, j]
-                    by_offset[a + i, j] = (smooth[k + 1, j] - smooth[k, j]) / h
+    n = len(dt)
+    value, by_lag, middle = np.empty((n, 2)), np.zeros((n, 2)), np.empty(n)
+    value[0] = wheels[0]
+    middle[0] = dt[0] / 2.0
+    for i in range(1, n):
+        h = (dt[i - 1] + dt[i]) / 2.0
+        middle[i] = middle[i - 1] + h
+        keep = np.exp(-h / lag) if lag > 0.0 else 0.0
+        keep_by_lag = keep * h / (lag * lag) if lag > 0.0 else 0.0
+        for j in range(2):
+            slope = (wheels[i, j] - wheels[i - 1, j]) / h
+            behind = value[i - 1, j] - wheels[i - 1, j] + lag * slope
+            value[i, j] = wheels[i, j] - lag * slope + keep * behind
+            by_lag[i, j] = -slope + keep * (by_lag[i - 1, j] + slope) + keep_by_lag * behind
+    return Smoothed(middle, value, by_lag)
+
+
+@numba.njit(cache=True)
+def _interpolate(smooth: Smoothed, offset: float, found: Delayed) -> None:
+    """Read the rates ``offset`` later, linearly between the middles of intervals; at both ends of a maneuver they are held."""
+    middle, value, by_lag = smooth.middle, smooth.value, smooth.by_lag
+    last = len(middle) - 1
+    k = 0
+    for i in range(last + 1):
+        t = middle[i] + offset
+        if t <= middle[0] or t >= middle[last]:
+            end = 0 if t <= middle[0] else last
+            found.value[i], found.by_lag[i] = value[end], by_lag[end]
+            continue
+        while middle[k + 1] <= t:
+            k += 1
+        h = middle[k + 1] - middle[k]
+        f = (t - middle[k]) / h
+        for j in range(2):
+            found.value[i, j] = (1.0 - f) * value[k, j] + f * value[k + 1, j]
+            found.by_lag[i, j] = (1.0 - f) * by_lag[k, j] + f * by_lag[k + 1, j]
+            found.by_offset[i, j] = (value[k + 1, j] - value[k, j]) / h

@@ -14,13 +14,21 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
+from motion_models.calibration.maneuvers import Maneuver
 from motion_models.errors import CalibrationError
+from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 from motion_models.text_files import check_file
 
 COLUMNS = ("cg_x_m", "cg_y_m", "rotation_ratio", "cor_x_m", "cor_y_m")
 CONTROLLER_MULTIPLIER = 1.875
 """Wheel separation multiplier of the controller that commanded the rotations: k = rotation ratio / multiplier."""
+COMMANDED_RAD_PER_S = 0.3
+"""Commanded yaw rate of the rotations (Ebersole 2016, sec. 4.2.1) [rad/s]."""
+ROTATION_S = 5.0
+"""Duration of each [s]."""
+_ROTATION_SIGMA = (0.01, 0.01, 0.02)
+"""Scatter of the table's rows about a smooth surface, at the end of a rotation [m, m, rad]."""
 
 
 @dataclass(frozen=True)
@@ -228,3 +236,33 @@ def skid_steer_fit(table: RotationTable, multiplier: float = CONTROLLER_MULTIPLI
     cov = np.zeros((11, 11))
     cov[:3, :3], cov[3:5, 3:5], cov[5:, 5:] = k.cov, x_cr.cov, y_cr.cov
     return SkidSteerFit(np.concatenate([k.coefficients, x_cr.coefficients, y_cr.coefficients]), cov, k, x_cr, y_cr)
+
+
+def rotations_as_maneuvers(
+    table: RotationTable, robot: Robot, rate: float = COMMANDED_RAD_PER_S, seconds: float = ROTATION_S
+) -> list[Maneuver]:
+    """Rotations that were commanded at ``rate`` for ``seconds`` through the robot's own driver, one maneuver a row.
+
+    The wheel rates are those that the driver makes of the command; the pose follows from the measured turn about the measured centre.
+    Rows of one x_G are one group.
+    """
+    driver = robot.driver
+    half = driver.wheel_separation_multiplier * driver.track_width_m * rate / (2.0 * driver.wheel_radius_m)
+    maneuvers = []
+    for cg, ratio, cor in zip(table.cg, table.ratio, table.cor, strict=True):
+        turned = ratio * rate * seconds
+        c, s = math.cos(turned), math.sin(turned)
+        x = cor[0] - (c * cor[0] - s * cor[1])
+        y = cor[1] - (s * cor[0] + c * cor[1])
+        maneuvers.append(
+            Maneuver(
+                dt=np.array([seconds]),
+                wheels=np.array([[-half, half]]),
+                measured=np.array([[x, y, turned]]),
+                ends=np.array([1]),
+                cg=cg,
+                cov=np.diag(np.square(_ROTATION_SIGMA)),
+                group=f"x_G = {cg[0]:g} m",
+            )
+        )
+    return maneuvers

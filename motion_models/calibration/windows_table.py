@@ -1,4 +1,4 @@
-"""Maneuvers as a CSV table, for witnesses that this library does not read itself (total stations, motion capture, other people's logs).
+"""Maneuvers as a CSV table, for motion references that this library does not read itself (total stations, motion capture, other logs).
 
 One line an interval of constant wheel rates, in order of time; lines that follow each other with the same `window` are one maneuver:
 
@@ -90,13 +90,7 @@ def read_rows(path: str | Path) -> tuple[list[str], list[Row]]:
         with open(path, newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file)
             columns = [name.strip() for name in next(reader, [])]
-            rows = []
-            for cells in reader:
-                if not cells:
-                    continue
-                if len(cells) != len(columns):
-                    raise CalibrationError(f"table '{path}', line {reader.line_num}: {len(cells)} cells, but {len(columns)} columns.")
-                rows.append((reader.line_num, {name: cell.strip() for name, cell in zip(columns, cells, strict=True)}))
+            lines = [(reader.line_num, cells) for cells in reader if cells]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise CalibrationError(f"table '{path}' cannot be read: {error}.") from error
     if not columns:
@@ -104,7 +98,10 @@ def read_rows(path: str | Path) -> tuple[list[str], list[Row]]:
     twice = sorted({name for name in columns if columns.count(name) > 1})
     if twice:
         raise CalibrationError(f"table '{path}' has the column {', '.join(twice)} more than once.")
-    return columns, rows
+    for line, cells in lines:
+        if len(cells) != len(columns):
+            raise CalibrationError(f"table '{path}', line {line}: {len(cells)} cells, but {len(columns)} columns.")
+    return columns, [(line, {name: cell.strip() for name, cell in zip(columns, cells, strict=True)}) for line, cells in lines]
 
 
 def _maneuver(rows: list[Row], columns: Sequence[str], path: str | Path) -> Maneuver:

@@ -116,9 +116,7 @@ class Chain:
 
 
 @numba.njit(cache=True)
-def forward(
-    layout: IntArray, constants: FloatArray, positions: FloatArray, rotations: FloatArray, translations: FloatArray
-) -> None:  # pragma: no cover
+def forward(layout: IntArray, constants: FloatArray, positions: FloatArray, rotations: FloatArray, translations: FloatArray) -> None:
     """Poses of all bodies in the base's frame at ``positions`` (n,), into ``rotations`` (b, 3, 3) and ``translations`` (b, 3)."""
     for row in range(3):
         for column in range(3):
@@ -147,7 +145,7 @@ def forward(
 
 
 @numba.njit(cache=True)
-def body_moment(constants: FloatArray, rotations: FloatArray, translations: FloatArray, body: int, row: int) -> float:  # pragma: no cover
+def body_moment(constants: FloatArray, rotations: FloatArray, translations: FloatArray, body: int, row: int) -> float:
     """First moment of one body along axis ``row`` of the base's frame [kg m]."""
     turned = 0.0
     for column in range(3):
@@ -156,7 +154,7 @@ def body_moment(constants: FloatArray, rotations: FloatArray, translations: Floa
 
 
 @numba.njit(cache=True)
-def _center_of_mass(layout: IntArray, constants: FloatArray, positions: FloatArray, out: FloatArray) -> None:  # pragma: no cover
+def _center_of_mass(layout: IntArray, constants: FloatArray, positions: FloatArray, out: FloatArray) -> None:
     """`Chain.center_of_mass` of ``positions`` (N, n) into ``out`` (N, 3)."""
     bodies = layout.shape[0]
     rotations, translations = np.empty((bodies, 3, 3)), np.empty((bodies, 3))
@@ -173,9 +171,7 @@ def _center_of_mass(layout: IntArray, constants: FloatArray, positions: FloatArr
 
 
 @numba.njit(cache=True)
-def subtree_jacobian(
-    layout: IntArray, constants: FloatArray, rotations: FloatArray, translations: FloatArray, out: FloatArray
-) -> None:  # pragma: no cover
+def subtree_jacobian(layout: IntArray, constants: FloatArray, rotations: FloatArray, translations: FloatArray, out: FloatArray) -> None:
     """Derivative of the chain's first moment [kg m] by the joints, added to ``out`` (3, n).
 
     A turning joint moves the moment P of all masses m behind it, whose joint is at o, by z x (P - m o); a sliding one by z m.
@@ -203,7 +199,7 @@ def subtree_jacobian(
 
 
 @numba.njit(cache=True)
-def _jacobian(layout: IntArray, constants: FloatArray, positions: FloatArray, out: FloatArray) -> None:  # pragma: no cover
+def _jacobian(layout: IntArray, constants: FloatArray, positions: FloatArray, out: FloatArray) -> None:
     """`Chain.center_of_mass_jacobian` of ``positions`` (N, n) into ``out`` (N, 3, n), which starts at zero."""
     bodies = layout.shape[0]
     rotations, translations = np.empty((bodies, 3, 3)), np.empty((bodies, 3))

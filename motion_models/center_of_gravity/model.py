@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -155,6 +156,19 @@ def _poses_at(chain: Chain, posture: Mapping[str, float] | None) -> FloatArray:
     return np.concatenate([rotations, translations[:, :, None]], axis=2)
 
 
+class _Posed(NamedTuple):
+    """Poses of all bodies at one posture, with the composite CG."""
+
+    rotations: FloatArray
+    """(b, 3, 3)"""
+    translations: FloatArray
+    """(b, 3) [m]"""
+    cg: FloatArray
+    """(2,) [m]"""
+    mass: float
+    """Of all bodies [kg]."""
+
+
 @numba.njit(cache=True)
 def _estimate(
     layout: IntArray,
@@ -164,14 +178,14 @@ def _estimate(
     weighed_poses: FloatArray,
     positions: FloatArray,
     found: FloatArray,
-) -> None:  # pragma: no cover
+) -> None:
     """`CgModel.estimate` at ``positions`` (n,), into ``found`` (3, 2), which starts at zero: the CG, and its covariance below it.
 
     First order: the CG is a quotient of sums, and each error moves it by (its moment - the CG times its mass) / total mass.
     """
     cg, cov = found[0], found[1:]
     load, tolerances, static_cov = numbers[:7], numbers[7:10], numbers[10:].reshape(3, 3)
-    bodies, joints = layout.shape[0], positions.shape[0]
+    bodies = layout.shape[0]
     rotations, translations = np.empty((bodies, 3, 3)), np.empty((bodies, 3))
     forward(layout, constants, positions, rotations, translations)
     total = 0.0
@@ -181,12 +195,33 @@ def _estimate(
             cg[row] += body_moment(constants, rotations, translations, i, row)
     cg[0] /= total
     cg[1] /= total
+    at = _Posed(rotations, translations, cg, total)
+    _add_static_part(at, arms, static_cov, cov)
+    for i in range(1, bodies):
+        _add_arm_body(at, arms, weighed_poses, i, tolerances, cov)
+    by_joint = np.zeros((3, positions.shape[0]))
+    subtree_jacobian(layout, constants, rotations, translations, by_joint)
+    for k in range(positions.shape[0]):
+        _add_outer(cov, by_joint[:2, k], tolerances[2] ** 2 / total**2)
+    if load[4] > 0.0:
+        _add_payload(at, load, cov)
 
-    # Static part: its place moves the CG by its share of the mass, its mass by its lever.
-    share = arms[0, MASS] / total
+
+@numba.njit(cache=True)
+def _add_outer(cov: FloatArray, vector: FloatArray, variance: float) -> None:
+    """Add ``variance`` times the outer square of ``vector`` (2,) to ``cov`` (2, 2)."""
+    for row in range(2):
+        for column in range(2):
+            cov[row, column] += variance * vector[row] * vector[column]
+
+
+@numba.njit(cache=True)
+def _add_static_part(at: _Posed, arms: FloatArray, static_cov: FloatArray, cov: FloatArray) -> None:
+    """The static part's place moves the CG by its share of the mass, its mass by its lever."""
+    share = arms[0, MASS] / at.mass
     lever = np.empty(2)
     for row in range(2):
-        lever[row] = (body_moment(arms, rotations, translations, 0, row) / arms[0, MASS] - cg[row]) / total
+        lever[row] = (body_moment(arms, at.rotations, at.translations, 0, row) / arms[0, MASS] - at.cg[row]) / at.mass
     for row in range(2):
         for column in range(2):
             cov[row, column] += (
@@ -195,45 +230,37 @@ def _estimate(
                 + static_cov[0, 0] * lever[row] * lever[column]
             )
 
-    # Arms. Their errors were in the weighed total too, and so count by what moved since.
+
+@numba.njit(cache=True)
+def _add_arm_body(at: _Posed, arms: FloatArray, weighed_poses: FloatArray, body: int, tolerances: FloatArray, cov: FloatArray) -> None:
+    """Errors of an arm's body in mass and centre of mass. They were in the weighed total too, and so count by what moved since."""
     weighed = weighed_poses.shape[0] > 0
-    spread = np.empty((2, 3))
-    for i in range(1, bodies):
-        mass = arms[i, MASS]
-        for row in range(2):
-            place = body_moment(arms, rotations, translations, i, row) / mass if mass > 0.0 else 0.0
-            before = cg[row]
-            for column in range(3):
-                spread[row, column] = rotations[i, row, column]
-            if weighed:
-                before = weighed_poses[i, row, 3]
-                for column in range(3):
-                    before += weighed_poses[i, row, column] * arms[i, COM + column]
-                    spread[row, column] -= weighed_poses[i, row, column]
-            lever[row] = (place - before) * mass / total
-        for row in range(2):
-            for column in range(2):
-                along = 0.0
-                for k in range(3):
-                    along += spread[row, k] * spread[column, k]
-                cov[row, column] += tolerances[0] ** 2 * lever[row] * lever[column]
-                cov[row, column] += (tolerances[1] * mass / total) ** 2 * along
-
-    by_joint = np.zeros((3, joints))
-    subtree_jacobian(layout, constants, rotations, translations, by_joint)
+    mass = arms[body, MASS]
+    lever, spread = np.empty(2), np.empty((2, 3))
     for row in range(2):
-        for column in range(2):
-            for k in range(joints):
-                cov[row, column] += tolerances[2] ** 2 * by_joint[row, k] * by_joint[column, k] / total**2
+        place = body_moment(arms, at.rotations, at.translations, body, row) / mass if mass > 0.0 else 0.0
+        before = weighed_poses[body, row, 3] if weighed else at.cg[row]
+        for column in range(3):
+            spread[row, column] = at.rotations[body, row, column]
+            if weighed:
+                before += weighed_poses[body, row, column] * arms[body, COM + column]
+                spread[row, column] -= weighed_poses[body, row, column]
+        lever[row] = (place - before) * mass / at.mass
+    _add_outer(cov, lever, tolerances[0] ** 2)
+    for column in range(3):
+        _add_outer(cov, spread[:, column], (tolerances[1] * mass / at.mass) ** 2)
 
-    if load[4] > 0.0:
-        body = int(load[0])
-        for row in range(2):
-            place = translations[body, row]
-            for k in range(3):
-                place += rotations[body, row, k] * load[1 + k]
-            lever[row] = (place - cg[row]) * load[5] / total
-        for row in range(2):
-            for column in range(2):
-                cov[row, column] += lever[row] * lever[column]
-            cov[row, row] += (load[6] * load[4] / total) ** 2
+
+@numba.njit(cache=True)
+def _add_payload(at: _Posed, load: FloatArray, cov: FloatArray) -> None:
+    """Errors of the payload's mass and place; ``load`` (7,) as in `CgModel.numbers`."""
+    body = int(load[0])
+    lever = np.empty(2)
+    for row in range(2):
+        place = at.translations[body, row]
+        for k in range(3):
+            place += at.rotations[body, row, k] * load[1 + k]
+        lever[row] = (place - at.cg[row]) * load[5] / at.mass
+    _add_outer(cov, lever, 1.0)
+    for row in range(2):
+        cov[row, row] += (load[6] * load[4] / at.mass) ** 2

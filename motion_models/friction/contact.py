@@ -66,7 +66,7 @@ class Force(NamedTuple):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def loads(xi: float, eta: float, warp: float) -> tuple[float, float, float, float, float, float, float]:  # pragma: no cover
+def loads(xi: float, eta: float, warp: float) -> tuple[float, float, float, float, float, float, float]:
     """Shares of the weight on the four wheels, then the diagonal term t that is in them and its derivatives by xi and eta.
 
     ``xi = x_G / (wheelbase / 2)``, ``eta = y_G / (track / 2)``, both inside (-1, 1). On equally stiff wheels
@@ -92,20 +92,20 @@ def loads(xi: float, eta: float, warp: float) -> tuple[float, float, float, floa
 
 
 @numba.njit(cache=True, error_model="numpy")
-def tyre(stiffness: float, mu_ratio: float, tread: float, saturation: float) -> Tyre:  # pragma: no cover
+def tyre(stiffness: float, mu_ratio: float, tread: float, saturation: float) -> Tyre:
     """A `Tyre` with its force at a locked wheel worked out."""
     return Tyre(stiffness, 1.0 - math.exp(-stiffness), mu_ratio, tread, saturation)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def rolling(roll: float) -> tuple[float, float]:  # pragma: no cover
+def rolling(roll: float) -> tuple[float, float]:
     """Direction in which a wheel rolls, rounded through zero, and its derivative: the missing sign of 3.17."""
     whole = 1.0 / math.sqrt(roll * roll + ROLLING * ROLLING)
     return roll * whole, ROLLING * ROLLING * whole * whole * whole
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def _fastest(slip: float, roll: float, creep: float) -> tuple[float, float, float]:  # pragma: no cover
+def _fastest(slip: float, roll: float, creep: float) -> tuple[float, float, float]:
     """V = max(|s_x + r q|, |r q|, creep), with its derivatives by s_x and by r q."""
     over = slip + roll
     if abs(over) >= abs(roll) and abs(over) >= creep:
@@ -117,7 +117,7 @@ def _fastest(slip: float, roll: float, creep: float) -> tuple[float, float, floa
 
 
 @numba.njit(cache=True, error_model="numpy")
-def contact(slip: float, drift: float, roll: float, on: Tyre, creep: float) -> Force:  # pragma: no cover
+def contact(slip: float, drift: float, roll: float, on: Tyre, creep: float) -> Force:
     """Forces at a wheel that slips by ``slip`` = s_x and ``drift`` = s_y while its rim moves at ``roll`` = r q, rounded over ``creep``."""
     whole = 1.0 / math.sqrt(slip * slip + drift * drift + creep * creep)
     c, s = slip * whole, drift * whole

@@ -131,23 +131,25 @@ class FrictionDynamics:
         return np.concatenate([influence.cg, influence.cg_velocity, influence.cg_acceleration, influence.force, influence.at]).astype(float)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _accelerations(
-    state: FloatArray, q_l: float, q_r: float, influence: FloatArray, floor: Floor, body: _Body
-) -> tuple[float, float, float, float]:  # pragma: no cover
-    """Rates of vx, vy, wz and the tipping margin. ``influence`` (13,) holds the fields of `Influence` in their order."""
-    mu, warp, mass, inertia = body.mu, body.warp, body.mass, body.inertia
-    height, gravity, creep, rest, radius = body.height, body.gravity, body.creep, body.rest_speed, body.radius
-    x_g, y_g, dx_g, dy_g = influence[0], influence[1], influence[2], influence[3]
-    ddx_g, ddy_g, ddz_g = influence[4], influence[5], influence[6]
-    f_x, f_y, f_z, p_x, p_y, p_z = influence[7], influence[8], influence[9], influence[10], influence[11], influence[12]
-    speed = math.sqrt(0.5 * radius * radius * (q_l * q_l + q_r * q_r) + rest * rest)
-    vx, vy, wz = state[3] / speed, state[4] / speed, state[5] / speed
+class _WheelSums(NamedTuple):
+    """Forces of the four wheels per mu and load, summed with the signs in which the loads depend on 1, xi, eta and the diagonal term."""
 
-    # Forces of each wheel per mu and load, summed up with the signs in which the loads depend on xi, eta and the diagonal term.
+    x: tuple[float, float, float, float]
+    """Along x."""
+    y: tuple[float, float, float, float]
+    """Along y."""
+    m: tuple[float, float, float, float]
+    """Yaw moment about the CG [m]."""
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _wheel_sums(
+    vx: float, vy: float, wz: float, rolls: tuple[float, float], cg: tuple[float, float], floor: Floor, creep: float
+) -> _WheelSums:
+    """Contact forces at the twist and wheel speeds, both over the wheels' speed."""
     x_0 = x_xi = x_eta = x_t = y_0 = y_xi = y_eta = y_t = m_0 = m_xi = m_eta = m_t = 0.0
     for left in (True, False):
-        sign_y, roll = (1.0, radius * q_l / speed) if left else (-1.0, radius * q_r / speed)
+        sign_y, roll = (1.0, rolls[0]) if left else (-1.0, rolls[1])
         y = sign_y * floor.half_track
         slip = vx - y * wz - roll
         for ahead in (True, False):
@@ -155,24 +157,32 @@ def _accelerations(
             x = sign_x * floor.half_wheelbase
             f = contact(slip, vy + x * wz, roll, floor.tyre, creep)
             fx, fy = f.x - floor.drag * rolling(roll)[0], f.y  # 3.17
-            m = (x - x_g) * fy - (y - y_g) * fx
+            m = (x - cg[0]) * fy - (y - cg[1]) * fx
             x_0, x_xi, x_eta, x_t = x_0 + fx, x_xi + sign_x * fx, x_eta + sign_y * fx, x_t + sign_x * sign_y * fx
             y_0, y_xi, y_eta, y_t = y_0 + fy, y_xi + sign_x * fy, y_eta + sign_y * fy, y_t + sign_x * sign_y * fy
             m_0, m_xi, m_eta, m_t = m_0 + m, m_xi + sign_x * m, m_eta + sign_y * m, m_t + sign_x * sign_y * m
+    return _WheelSums((x_0, x_xi, x_eta, x_t), (y_0, y_xi, y_eta, y_t), (m_0, m_xi, m_eta, m_t))
 
-    # Loads hang on the accelerations, and these on the loads: 3.21-3.23 with 3.24 and 3.25, linear until a wheel lifts.
-    weight = mass * (gravity + ddz_g)
-    load = weight - f_z  # 3.21
-    xi_0 = (weight * x_g + (p_z - height) * f_x - p_x * f_z) / (load * floor.half_wheelbase)  # 3.23, a_x without friction
-    eta_0 = (weight * y_g + (p_z - height) * f_y - p_y * f_z) / (load * floor.half_track)  # 3.22
-    lean_x, lean_y = 0.25 * mu * height / floor.half_wheelbase, 0.25 * mu * height / floor.half_track
+
+@numba.njit(cache=True, error_model="numpy")
+def _weighted(sums: tuple[float, float, float, float], xi: float, eta: float, t: float) -> float:
+    """Sum of the wheels' forces at loads (1, ``xi``, ``eta``, ``t``)."""
+    return sums[0] + sums[1] * xi + sums[2] * eta + sums[3] * t
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _shifted_loads(xi_0: float, eta_0: float, lean_x: float, lean_y: float, warp: float, sums: _WheelSums) -> tuple[float, float]:
+    """xi and eta of loads that shift under the acceleration which they cause: 3.21-3.23 with 3.24 and 3.25, linear until a wheel lifts.
+
+    ``xi_0, eta_0`` are those without friction; ``lean_x, lean_y`` are mu z_G over four half wheelbases and half tracks. Newton's method.
+    """
     xi, eta = _inside(xi_0), _inside(eta_0)
     for _ in range(_CLOSURE_STEPS):
         _, _, _, _, t, t_xi, t_eta = loads(xi, eta, warp)
-        off_x = xi - xi_0 + lean_x * (x_0 + x_xi * xi + x_eta * eta + x_t * t)
-        off_y = eta - eta_0 + lean_y * (y_0 + y_xi * xi + y_eta * eta + y_t * t)
-        a, b = 1.0 + lean_x * (x_xi + x_t * t_xi), lean_x * (x_eta + x_t * t_eta)
-        c, d = lean_y * (y_xi + y_t * t_xi), 1.0 + lean_y * (y_eta + y_t * t_eta)
+        off_x = xi - xi_0 + lean_x * _weighted(sums.x, xi, eta, t)
+        off_y = eta - eta_0 + lean_y * _weighted(sums.y, xi, eta, t)
+        a, b = 1.0 + lean_x * (sums.x[1] + sums.x[3] * t_xi), lean_x * (sums.x[2] + sums.x[3] * t_eta)
+        c, d = lean_y * (sums.y[1] + sums.y[3] * t_xi), 1.0 + lean_y * (sums.y[2] + sums.y[3] * t_eta)
         whole = 1.0 / (a * d - b * c)
         new_xi = _inside(xi - whole * (d * off_x - b * off_y))
         new_eta = _inside(eta - whole * (a * off_y - c * off_x))
@@ -180,35 +190,53 @@ def _accelerations(
         xi, eta = new_xi, new_eta
         if moved < 1e-14:
             break
-    _, _, _, _, t, _, _ = loads(xi, eta, warp)
+    return xi, eta
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _accelerations(
+    state: FloatArray, q_l: float, q_r: float, influence: FloatArray, floor: Floor, body: _Body
+) -> tuple[float, float, float, float]:
+    """Rates of vx, vy, wz and the tipping margin. ``influence`` (13,) holds the fields of `Influence` in their order."""
+    mu, mass, inertia, height, rest, radius = body.mu, body.mass, body.inertia, body.height, body.rest_speed, body.radius
+    x_g, y_g, dx_g, dy_g = influence[0], influence[1], influence[2], influence[3]
+    ddx_g, ddy_g, ddz_g = influence[4], influence[5], influence[6]
+    f_x, f_y, f_z, p_x, p_y, p_z = influence[7], influence[8], influence[9], influence[10], influence[11], influence[12]
+    speed = math.sqrt(0.5 * radius * radius * (q_l * q_l + q_r * q_r) + rest * rest)
+    wz = state[5] / speed
+    rolls = (radius * q_l / speed, radius * q_r / speed)
+    sums = _wheel_sums(state[3] / speed, state[4] / speed, wz, rolls, (x_g, y_g), floor, body.creep)
+
+    weight = mass * (body.gravity + ddz_g)
+    load = weight - f_z  # 3.21
+    xi_0 = (weight * x_g + (p_z - height) * f_x - p_x * f_z) / (load * floor.half_wheelbase)  # 3.23, a_x without friction
+    eta_0 = (weight * y_g + (p_z - height) * f_y - p_y * f_z) / (load * floor.half_track)  # 3.22
+    lean_x, lean_y = 0.25 * mu * height / floor.half_wheelbase, 0.25 * mu * height / floor.half_track
+    xi, eta = _shifted_loads(xi_0, eta_0, lean_x, lean_y, body.warp, sums)
+    _, _, _, _, t, _, _ = loads(xi, eta, body.warp)
     grip = 0.25 * mu * load
-    force_x = grip * (x_0 + x_xi * xi + x_eta * eta + x_t * t)
-    force_y = grip * (y_0 + y_xi * xi + y_eta * eta + y_t * t)
-    moment = grip * (m_0 + m_xi * xi + m_eta * eta + m_t * t)
+    force_x, force_y = grip * _weighted(sums.x, xi, eta, t), grip * _weighted(sums.y, xi, eta, t)
+    moment = grip * _weighted(sums.m, xi, eta, t)
     spin = wz * floor.half_track
-    moment -= mu * load * floor.scrub * spin / math.sqrt(spin * spin + creep * creep)
-    margin = 1.0 - max(
-        abs(xi_0 - height * force_x / (load * floor.half_wheelbase)), abs(eta_0 - height * force_y / (load * floor.half_track))
-    )
+    moment -= mu * load * floor.scrub * spin / math.sqrt(spin * spin + body.creep * body.creep)
+    lean = abs(xi_0 - height * force_x / (load * floor.half_wheelbase)), abs(eta_0 - height * force_y / (load * floor.half_track))
 
     w = state[5]
     a_x, a_y = (force_x + f_x) / mass, (force_y + f_y) / mass  # 3.24, 3.25
     alpha = (moment + (p_x - x_g) * f_y - (p_y - y_g) * f_x) / inertia  # 3.26
     base_x = a_x - ddx_g + y_g * alpha + 2.0 * dy_g * w + x_g * w * w  # 3.18
     base_y = a_y - ddy_g - x_g * alpha - 2.0 * dx_g * w + y_g * w * w  # 3.19
-    return base_x + state[4] * w, base_y - state[3] * w, alpha, margin
+    return base_x + state[4] * w, base_y - state[3] * w, alpha, 1.0 - max(lean)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _inside(share: float) -> float:  # pragma: no cover
+def _inside(share: float) -> float:
     """``share``, or the edge of the wheelbase where it lies beyond."""
     return min(1.0, max(-1.0, share))
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _advance(
-    state: FloatArray, dt: float, steps: int, q_l: float, q_r: float, influence: FloatArray, floor: Floor, body: _Body
-) -> float:  # pragma: no cover
+def _advance(state: FloatArray, dt: float, steps: int, q_l: float, q_r: float, influence: FloatArray, floor: Floor, body: _Body) -> float:
     """Change ``state`` (6,) in place; the smallest tipping margin."""
     h, margin = dt / steps, math.inf
     now, trial, total, rate = influence.copy(), np.empty(6), np.empty(6), np.zeros(6)

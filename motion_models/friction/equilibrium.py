@@ -81,9 +81,7 @@ _FINEST = 1e-4
 
 
 @numba.njit(cache=True, error_model="numpy")
-def balance(
-    vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load: Loads, floor: Floor, creep: float
-) -> Balance:  # pragma: no cover
+def balance(vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load: Loads, floor: Floor, creep: float) -> Balance:
     """The balance at the twist ``vx, vy, wz`` [1, 1, 1/m] of wheels that roll at ``roll_l`` and ``roll_r`` [1]."""
     bx = by = bm = x_vx = x_vy = x_wz = y_vx = y_vy = y_wz = m_vx = m_vy = m_wz = 0.0
     x_left = y_left = m_left = x_right = y_right = m_right = 0.0
@@ -128,7 +126,7 @@ def balance(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def solved(b: Balance, x: float, y: float, m: float) -> tuple[float, float, float]:  # pragma: no cover
+def solved(b: Balance, x: float, y: float, m: float) -> tuple[float, float, float]:
     """The twist by which the balance changes by ``x, y, m``: its derivative matrix, inverted and applied. NaN where it is singular."""
     c00 = b.y_vy * b.m_wz - b.y_wz * b.m_vy
     c10 = b.y_wz * b.m_vx - b.y_vx * b.m_wz
@@ -143,7 +141,7 @@ def solved(b: Balance, x: float, y: float, m: float) -> tuple[float, float, floa
 @numba.njit(cache=True, error_model="numpy")
 def newton(
     vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load: Loads, floor: Floor, creep: float
-) -> tuple[float, float, float, bool]:  # pragma: no cover
+) -> tuple[float, float, float, bool]:
     """The twist that balances, from the twist ``vx, vy, wz``, and whether it was found within `EFFORT` evaluations."""
     arm = floor.half_track
     dx = dy = dw = 0.0
@@ -167,7 +165,7 @@ def newton(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def linear_motion(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[float, float, float]:  # pragma: no cover
+def linear_motion(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[float, float, float]:
     """The twist of wheels whose force is proportional to slip and load: with the CG at the centre k = 1 / (1 + (wheelbase / track)^2)."""
     left, right = roll_l * (load.fl + load.rl), roll_r * (load.fr + load.rr)
     x = floor.half_wheelbase * (load.fl + load.fr - load.rl - load.rr)
@@ -179,7 +177,7 @@ def linear_motion(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tu
 
 
 @numba.njit(cache=True, error_model="numpy")
-def motion(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:  # pragma: no cover
+def motion(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:
     """The twist [1, 1, 1/m] of wheels that roll at ``roll_l, roll_r`` (root mean square 1, or both 0), and whether it was found."""
     if roll_l == 0.0 and roll_r == 0.0:
         return 0.0, 0.0, 0.0, True
@@ -197,7 +195,7 @@ def motion(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[flo
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _narrowed(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:  # pragma: no cover
+def _narrowed(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:
     """`motion` by friction that is rounded less and less."""
     from_x, from_y, from_w = 0.5 * (roll_l + roll_r), 0.0, 0.0
     creep, reached, factor = 1.0, 1.0 / NARROWING, NARROWING
@@ -215,9 +213,7 @@ def _narrowed(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _pulled(
-    vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load: Loads, floor: Floor
-) -> tuple[float, float, float, bool]:  # pragma: no cover
+def _pulled(vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:
     """`motion` from the twist without a centripetal force, by one that grows."""
     share, step = 0.0, 1.0
     while share < 1.0:
@@ -234,18 +230,19 @@ def _pulled(
     return vx, vy, wz, True
 
 
+class Steady(NamedTuple):
+    """A solved motion: twist and wheels' speeds, over the wheels' root mean square."""
+
+    vx: float
+    vy: float
+    wz: float
+    """[1/m]"""
+    roll_l: float
+    roll_r: float
+
+
 @numba.njit(cache=True, error_model="numpy")
-def sensitivities(
-    vx: float,
-    vy: float,
-    wz: float,
-    roll_l: float,
-    roll_r: float,
-    load: Loads,
-    tilt: tuple[float, float, float],
-    floor: Floor,
-    by: FloatArray,
-) -> None:  # pragma: no cover
+def sensitivities(at: Steady, load: Loads, tilt: tuple[float, float, float], floor: Floor, by: FloatArray) -> None:
     """Derivatives of the solved twist, by the implicit function theorem: -(balance by twist)^-1 (balance by what moves it).
 
     ``tilt`` are the derivatives of the loads' diagonal term by xi, eta and warp (see `contact.loads`). Fills ``by`` (3, `COLUMNS`): columns
@@ -253,47 +250,16 @@ def sensitivities(
     far as inertia acts at them.
     """
     by[:] = 0.0
-    for left in (True, False):
-        sign_y, wheel = (1.0, 0) if left else (-1.0, 1)
-        y, roll, front, rear = (floor.half_track, roll_l, load.fl, load.rl) if left else (-floor.half_track, roll_r, load.fr, load.rr)
-        slip = vx - y * wz - roll
-        direction, direction_by_roll = rolling(roll)
-        for ahead in (True, False):
-            sign_x, n = (1.0, front) if ahead else (-1.0, rear)
-            x = sign_x * floor.half_wheelbase
-            f = contact(slip, vy + x * wz, roll, floor.tyre, CREEP)
-            fx = f.x - floor.drag * direction
-            xs, xd, ys, yd = n * f.x_slip, n * f.x_drift, n * f.y_slip, n * f.y_drift
-            _add(by, wheel, n * (f.x_roll - floor.drag * direction_by_roll) - xs, n * f.y_roll - ys, x, y)
-            for j, sign in ((0, sign_x), (1, sign_y), (2, 0.0)):
-                share = 0.25 * (sign + sign_x * sign_y * tilt[j])
-                _add(by, 2 + j, share * fx, share * f.y, x, y)
-            _add(by, 5, -sign_y * wz * xs, -sign_y * wz * ys, x, y)
-            by[2, 5] -= sign_y * n * fx
-            _add(by, 6, sign_x * wz * xd, sign_x * wz * yd, x, y)
-            by[2, 6] += sign_x * n * f.y
-            _add(by, 7, n * f.x_stiffness, n * f.y_stiffness, x, y)
-            _add(by, 8, 0.0, n * f.y / floor.tyre.mu_ratio, x, y)
-            _add(by, 9, -n * direction, 0.0, x, y)
-            _add(by, 11, 0.0, n * f.y_tread, x, y)
-            _add(by, _VX, xs, ys, x, y)
-            _add(by, _VX + 1, xd, yd, x, y)
-            _add(by, _VX + 2, x * xd - y * xs, x * yd - y * ys, x, y)
-    spin = wz * floor.half_track
+    _add_wheels(at, load, tilt, floor, by)
+    spin = at.wz * floor.half_track
     whole = 1.0 / math.sqrt(spin * spin + CREEP * CREEP)
-    by[2, 5] -= floor.scrub * wz * CREEP * CREEP * whole * whole * whole
+    by[2, 5] -= floor.scrub * at.wz * CREEP * CREEP * whole * whole * whole
     by[2, _VX + 2] -= floor.scrub * floor.half_track * CREEP * CREEP * whole * whole * whole
     by[2, 10] -= spin * whole
     columns = 12
     if load.pull != 0.0:
-        columns, p, gx, gy = _VX, load.pull, load.cg_x, load.cg_y
-        by[0, 12], by[1, 12], by[2, 12] = (vy + gx * wz) * wz, -(vx - gy * wz) * wz, -(gx * vx + gy * vy) * wz
-        by[0, 13], by[2, 13] = load.pull * wz * wz, -load.pull * vx * wz
-        by[1, 14], by[2, 14] = load.pull * wz * wz, -load.pull * vy * wz
-        by[0, _VX + 1], by[0, _VX + 2] = by[0, _VX + 1] + p * wz, by[0, _VX + 2] + p * (vy + 2.0 * gx * wz)
-        by[1, _VX], by[1, _VX + 2] = by[1, _VX] - p * wz, by[1, _VX + 2] - p * (vx - 2.0 * gy * wz)
-        by[2, _VX], by[2, _VX + 1] = by[2, _VX] - p * gx * wz, by[2, _VX + 1] - p * gy * wz
-        by[2, _VX + 2] -= p * (gx * vx + gy * vy)
+        columns = _VX
+        _add_pull(at, load, by)
     b = Balance(
         *(0.0, 0.0, 0.0, by[0, 15], by[0, 16], by[0, 17], by[1, 15], by[1, 16], by[1, 17], by[2, 15], by[2, 16], by[2, 17]),
         *(0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
@@ -303,7 +269,51 @@ def sensitivities(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _add(by: FloatArray, column: int, x: float, y: float, at_x: float, at_y: float) -> None:  # pragma: no cover
+def _add_wheels(at: Steady, load: Loads, tilt: tuple[float, float, float], floor: Floor, by: FloatArray) -> None:
+    """Derivatives of the contact forces' balance; arguments as in `sensitivities`."""
+    for left in (True, False):
+        sign_y, wheel = (1.0, 0) if left else (-1.0, 1)
+        y, roll, front, rear = (floor.half_track, at.roll_l, load.fl, load.rl) if left else (-floor.half_track, at.roll_r, load.fr, load.rr)
+        slip = at.vx - y * at.wz - roll
+        direction, direction_by_roll = rolling(roll)
+        for ahead in (True, False):
+            sign_x, n = (1.0, front) if ahead else (-1.0, rear)
+            x = sign_x * floor.half_wheelbase
+            f = contact(slip, at.vy + x * at.wz, roll, floor.tyre, CREEP)
+            fx = f.x - floor.drag * direction
+            xs, xd, ys, yd = n * f.x_slip, n * f.x_drift, n * f.y_slip, n * f.y_drift
+            _add(by, wheel, n * (f.x_roll - floor.drag * direction_by_roll) - xs, n * f.y_roll - ys, x, y)
+            for j, sign in ((0, sign_x), (1, sign_y), (2, 0.0)):
+                share = 0.25 * (sign + sign_x * sign_y * tilt[j])
+                _add(by, 2 + j, share * fx, share * f.y, x, y)
+            _add(by, 5, -sign_y * at.wz * xs, -sign_y * at.wz * ys, x, y)
+            by[2, 5] -= sign_y * n * fx
+            _add(by, 6, sign_x * at.wz * xd, sign_x * at.wz * yd, x, y)
+            by[2, 6] += sign_x * n * f.y
+            _add(by, 7, n * f.x_stiffness, n * f.y_stiffness, x, y)
+            _add(by, 8, 0.0, n * f.y / floor.tyre.mu_ratio, x, y)
+            _add(by, 9, -n * direction, 0.0, x, y)
+            _add(by, 11, 0.0, n * f.y_tread, x, y)
+            _add(by, _VX, xs, ys, x, y)
+            _add(by, _VX + 1, xd, yd, x, y)
+            _add(by, _VX + 2, x * xd - y * xs, x * yd - y * ys, x, y)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _add_pull(at: Steady, load: Loads, by: FloatArray) -> None:
+    """Derivatives of the centripetal force's balance."""
+    vx, vy, wz, p, gx, gy = at.vx, at.vy, at.wz, load.pull, load.cg_x, load.cg_y
+    by[0, 12], by[1, 12], by[2, 12] = (vy + gx * wz) * wz, -(vx - gy * wz) * wz, -(gx * vx + gy * vy) * wz
+    by[0, 13], by[2, 13] = load.pull * wz * wz, -load.pull * vx * wz
+    by[1, 14], by[2, 14] = load.pull * wz * wz, -load.pull * vy * wz
+    by[0, _VX + 1], by[0, _VX + 2] = by[0, _VX + 1] + p * wz, by[0, _VX + 2] + p * (vy + 2.0 * gx * wz)
+    by[1, _VX], by[1, _VX + 2] = by[1, _VX] - p * wz, by[1, _VX + 2] - p * (vx - 2.0 * gy * wz)
+    by[2, _VX], by[2, _VX + 1] = by[2, _VX] - p * gx * wz, by[2, _VX + 1] - p * gy * wz
+    by[2, _VX + 2] -= p * (gx * vx + gy * vy)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _add(by: FloatArray, column: int, x: float, y: float, at_x: float, at_y: float) -> None:
     """Add a force of a wheel at ``at_x, at_y`` to the balance in a column."""
     by[0, column] += x
     by[1, column] += y

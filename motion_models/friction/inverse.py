@@ -26,7 +26,7 @@ _FINEST = 1e-3
 
 
 @numba.njit(cache=True, error_model="numpy")
-def rolls_for(vx: float, wz: float, load: Loads, floor: Floor) -> tuple[float, float]:  # pragma: no cover
+def rolls_for(vx: float, wz: float, load: Loads, floor: Floor) -> tuple[float, float]:
     """Speeds [m/s] at which the left and right wheels have to roll for ``vx`` [m/s] and ``wz`` [rad/s]; NaN if there are none.
 
     ``load.pull`` is that of wheels at 1 m/s.
@@ -49,7 +49,7 @@ def rolls_for(vx: float, wz: float, load: Loads, floor: Floor) -> tuple[float, f
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _linear_start(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[float, float, float]:  # pragma: no cover
+def _linear_start(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[float, float, float]:
     """What `_solve` starts from: the inverse of `equilibrium.linear_motion`."""
     x = floor.half_wheelbase * (load.fl + load.fr - load.rl - load.rr)
     y = floor.half_track * (load.fl + load.rl - load.fr - load.rr)
@@ -65,7 +65,7 @@ def _linear_start(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[
 @numba.njit(cache=True, error_model="numpy")
 def _solve(
     angle: float, drift: float, share: float, to_x: float, to_w: float, unit: float, load: Loads, floor: Floor
-) -> tuple[float, float, float, bool]:  # pragma: no cover
+) -> tuple[float, float, float, bool]:
     """Newton's method for the wheels' angle (0 rolls straight on, pi/2 turns on the spot), vy and the motion's share of the wheels' speed.
 
     The motion is ``share`` times ``to_x, to_w``; ``unit`` is the pull at a share of 1.
@@ -94,9 +94,7 @@ def _solve(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _step(
-    b: Balance, c: float, s: float, v: float, r: float, to_x: float, to_w: float, load: Loads
-) -> tuple[float, float, float]:  # pragma: no cover
+def _step(b: Balance, c: float, s: float, v: float, r: float, to_x: float, to_w: float, load: Loads) -> tuple[float, float, float]:
     """The step in angle, vy and share that balances in first order."""
     by_l, by_r = -s - c, c - s
     x_a, y_a, m_a = b.x_left * by_l + b.x_right * by_r, b.y_left * by_l + b.y_right * by_r, b.m_left * by_l + b.m_right * by_r
@@ -119,7 +117,7 @@ def _step(
 @numba.njit(cache=True, error_model="numpy")
 def _pulled(
     angle: float, drift: float, share: float, to_x: float, to_w: float, unit: float, load: Loads, floor: Floor
-) -> tuple[float, float, float, bool]:  # pragma: no cover
+) -> tuple[float, float, float, bool]:
     """`_solve` from the solution without a centripetal force, by one that grows."""
     reached, step = 0.0, 0.3
     while reached < 1.0:
@@ -136,7 +134,7 @@ def _pulled(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _enclosed(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:  # pragma: no cover
+def _enclosed(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:
     """Angle, vy and share without a centripetal force, by enclosing the angle."""
     still = Loads(load.fl, load.fr, load.rl, load.rr, load.cg_x, load.cg_y, 0.0)
     goal = math.atan2(floor.half_track * to_w, to_x)
@@ -187,9 +185,7 @@ def _enclosed(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[floa
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _miss(
-    angle: float, goal: float, x: float, y: float, w: float, load: Loads, floor: Floor
-) -> tuple[float, float, float, float]:  # pragma: no cover
+def _miss(angle: float, goal: float, x: float, y: float, w: float, load: Loads, floor: Floor) -> tuple[float, float, float, float]:
     """By how much wheels at ``angle`` miss the ``goal``, and their twist.
 
     The search starts at the twist ``x, y, w`` of an angle nearby, if it is one.

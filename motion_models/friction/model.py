@@ -18,7 +18,7 @@ import numpy as np
 from motion_models.base import Twist
 from motion_models.errors import CgError, ModelError
 from motion_models.friction.contact import SATURATION, loads, tyre
-from motion_models.friction.equilibrium import COLUMNS, Floor, Loads, motion, sensitivities
+from motion_models.friction.equilibrium import COLUMNS, Floor, Loads, Steady, motion, sensitivities
 from motion_models.friction.inverse import rolls_for
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -138,7 +138,7 @@ def _twist(
     d_wheels: FloatArray,
     d_cg: FloatArray,
     d_params: FloatArray,
-) -> None:  # pragma: no cover
+) -> None:
     """See `Twist.from_kernel`; ``constants`` (2,) are saturation and centripetal. A sample without a solution becomes NaN."""
     radius, mu, warp, tracked_x, tracked_y = params[0], params[3], params[8], params[10], params[11]
     floor = floor_of(params, constants[0])
@@ -150,7 +150,7 @@ def _twist(
         if not found:
             value[i] = d_wheels[i] = d_cg[i] = d_params[i] = math.nan
             continue
-        sensitivities(vx, vy, wz, roll_l, roll_r, load, tilt, floor, by)
+        sensitivities(Steady(vx, vy, wz, roll_l, roll_r), load, tilt, floor, by)
 
         # The tracked point moves with the body; so do the derivatives.
         for j in range(COLUMNS):
@@ -183,14 +183,14 @@ def _twist(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def floor_of(params: FloatArray, saturation: float) -> Floor:  # pragma: no cover
+def floor_of(params: FloatArray, saturation: float) -> Floor:
     """The parameters (12,) that the balance depends on, with the contact law of ``saturation``."""
     mu, mu_ratio, stiffness, rolling_resistance, scrub = params[3], params[4], params[5], params[6], params[7]
     return Floor(params[1] / 2.0, params[2] / 2.0, tyre(stiffness, mu_ratio, params[9], saturation), rolling_resistance / mu, scrub)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def unit_rolls(radius: float, q_l: float, q_r: float) -> tuple[float, float, float]:  # pragma: no cover
+def unit_rolls(radius: float, q_l: float, q_r: float) -> tuple[float, float, float]:
     """Root mean square of the wheels' speeds [m/s], and the speeds of left and right over it (0 where both stand)."""
     speed = radius * math.hypot(q_l, q_r) * math.sqrt(0.5)
     if speed == 0.0:
@@ -199,20 +199,20 @@ def unit_rolls(radius: float, q_l: float, q_r: float) -> tuple[float, float, flo
 
 
 @numba.njit(cache=True, error_model="numpy")
-def pull_of(speed: float, mu: float, centripetal: float) -> float:  # pragma: no cover
+def pull_of(speed: float, mu: float, centripetal: float) -> float:
     """`Loads.pull` at a speed of the wheels [m/s]; ``centripetal`` is 0 or 1."""
     return centripetal * speed * speed / (mu * GRAVITY)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def loads_at(x: float, y: float, warp: float, floor: Floor, pull: float) -> tuple[Loads, tuple[float, float, float]]:  # pragma: no cover
+def loads_at(x: float, y: float, warp: float, floor: Floor, pull: float) -> tuple[Loads, tuple[float, float, float]]:
     """The loads with the CG at ``x, y`` [m], and the derivatives of their diagonal term by xi, eta and warp (see `contact.loads`)."""
     fl, fr, rl, rr, t, t_xi, t_eta = loads(x / floor.half_wheelbase, y / floor.half_track, warp)
     return Loads(fl, fr, rl, rr, x, y, pull), (t_xi, t_eta, 1.0 if t == warp else 0.0)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _wheels(command: FloatArray, cg: FloatArray, params: FloatArray, constants: FloatArray, rates: FloatArray) -> None:  # pragma: no cover
+def _wheels(command: FloatArray, cg: FloatArray, params: FloatArray, constants: FloatArray, rates: FloatArray) -> None:
     """Fill ``rates`` (n, 2) for ``command`` (n, 2) and ``cg`` (n, 2)."""
     radius, mu, warp, tracked_y = params[0], params[3], params[8], params[11]
     floor = floor_of(params, constants[0])

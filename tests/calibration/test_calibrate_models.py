@@ -14,7 +14,7 @@ from motion_models.calibration.fit import fit
 from motion_models.calibration.identifiability import candidates
 from motion_models.calibration.least_squares import FitConfig
 from motion_models.calibration.maneuvers import Maneuver, make_batch
-from motion_models.calibration.prediction import WITNESS_NAMES, predict
+from motion_models.calibration.prediction import REFERENCE_PARAM_NAMES, predict
 from motion_models.errors import CalibrationError
 from motion_models.preintegration import preintegrate
 from motion_models.registry import make_model
@@ -118,8 +118,8 @@ def test_a_lag_and_an_offset_mean_what_they_say() -> None:
     measured = se2.compose(measured, se2.exp(1e-5 * rng.normal(size=measured.shape)))
     maneuver = Maneuver(np.full(n, h), logged, measured, ends, cov=1e-10 * np.eye(3), lead=50)
     result = fit(model, [maneuver], ("wheel_time_offset", "wheel_lag"), FitConfig("linear", QUIET))
-    assert result.witness[0] == pytest.approx(0.03, abs=0.002)
-    assert result.witness[1] == pytest.approx(0.06, abs=0.004)
+    assert result.reference_params[0] == pytest.approx(0.03, abs=0.002)
+    assert result.reference_params[1] == pytest.approx(0.06, abs=0.004)
 
 
 @pytest.mark.parametrize("name", sorted(WHEEL_FREE))
@@ -353,6 +353,6 @@ def test_witness_terms_are_found_beside_the_model() -> None:
         maneuvers.append(Maneuver(m.dt, m.wheels, seen, m.ends, m.cg, m.cov, m.group))
     free = (*WHEEL_FREE["diff_drive"], "lidar_offset_x", "lidar_offset_y", "lidar_yaw")
     result = fit(model, maneuvers, free, FitConfig("huber", QUIET))
-    found = dict(zip(WITNESS_NAMES, result.witness, strict=True))
+    found = dict(zip(REFERENCE_PARAM_NAMES, result.reference_params, strict=True))
     assert [found["lidar_offset_x"], found["lidar_offset_y"], found["lidar_yaw"]] == pytest.approx(mount.tolist(), abs=3e-3)
     assert result.params == pytest.approx(model.nominal, abs=3e-3)

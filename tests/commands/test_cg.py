@@ -17,7 +17,7 @@ from tests.helpers import urdf_reference
 ROBOT = load_robot("vaultbot")
 assert ROBOT.arms is not None
 POSTURES = arms_postures(ROBOT.arms)
-FILES = Path(urdf_reference.__file__).parents[1] / "motion_models" / "robots"
+FILES = Path(urdf_reference.__file__).parents[2] / "motion_models" / "robots"
 URDF = (FILES / "vaultbot.urdf").read_text()
 HALF = np.array([ROBOT.geometry.wheelbase_m, ROBOT.geometry.track_width_m]) / 2
 CORNERS = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])

@@ -13,8 +13,7 @@ from localization.diagnosis.diagnose import diagnose
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_table
 from localization.diagnosis.findings import Diagnosis
 from localization.logs import open_log
-from motion_models.calibration.regressions import read_rotation_table
-from motion_models.calibration.rotations import rotations_as_maneuvers
+from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
 from motion_models.robot import load_robot

@@ -127,7 +127,7 @@ def main() -> None:
             lost.append((terrain, error))
             print(f"{head} not revealed")
             continue
-        offset, sigma = result.witness[0], result.sigmas["wheel_time_offset"]
+        offset, sigma = result.reference_params[0], result.sigmas["wheel_time_offset"]
         print(f"{head} {fitted_track(result)!s:21s} {offset:+6.2f} +- {sigma:.2f} s")
     for terrain, error in lost:
         print(f"\n{terrain}: {error}")

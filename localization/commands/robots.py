@@ -1,0 +1,63 @@
+"""`skidloc robots`: the robots that are shipped, what k each turns by, and where that k comes from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+
+from localization.commands.calibration_tables import plain_table, row, say, show
+from localization.commands.common import write_json
+from localization.output import check_outputs
+from motion_models.errors import RobotError
+from motion_models.prior import scaling_sigma
+from motion_models.robot import DIFF_DRIVE, Robot, load_robot, robot_names
+from motion_models.skid_steer import SkidSteer
+
+
+@dataclass(frozen=True)
+class Robots:
+    """List the robots that are shipped, or print the file of one, with the source of every number."""
+
+    name: tyro.conf.Positional[str] = ""
+    """Robot whose file is printed; by default all are listed."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write the list to this file as well."""
+
+    def run(self, console: Console) -> None:
+        check_outputs(self.json)
+        if self.name:
+            if self.name not in robot_names():
+                raise RobotError(f"no robot '{self.name}'; shipped are {', '.join(robot_names())}.")
+            say(console, (resources.files("motion_models") / "robots" / f"{self.name}.toml").read_text(encoding="utf-8"))
+            return
+        found = [summary(load_robot(name)) for name in robot_names()]
+        table = plain_table("robot", "drive", "radius [m]", "track [m]", "wheelbase [m]", "mass [kg]", "k", "+-", "k from")
+        for each in found:
+            lengths = [f"{each[key]:.4g}" for key in ("wheel_radius_m", "track_width_m", "wheelbase_m", "mass_kg")]
+            row(table, each["robot"], each["drive"], *lengths, f"{each['k']:.3f}", f"{each['k_sigma']:.3f}", each["k_from"])
+        show(console, table)
+        say(
+            console,
+            f"k from geometry is known to {100.0 * scaling_sigma():.0f} % (one sigma over robots); `skidloc calibrate` measures it.",
+        )
+        say(console, "diff_drive: two driven wheels and a caster do not slide, and --model diff_drive is right for them.")
+        say(
+            console, "`skidloc robots NAME` prints a file with the source of every number; `skidloc init LOG` writes one for another robot."
+        )
+        if self.json is not None:
+            write_json(self.json, {"robots": found})
+
+
+def summary(robot: Robot) -> dict[str, Any]:
+    """Geometry of ``robot``, and k of `SkidSteer` at its nominal CG with standard deviation and source."""
+    g, model = robot.geometry, SkidSteer.from_robot(robot)
+    k = float(model.rotation(robot.center_of_gravity, model.nominal)[0])
+    is_own = "k_0" in robot.models.get("skid_steer", {})
+    source = "its file" if is_own else ("no sliding" if robot.drive == DIFF_DRIVE else "geometry")
+    lengths = {"wheel_radius_m": g.wheel_radius_m, "track_width_m": g.track_width_m, "wheelbase_m": g.wheelbase_m, "mass_kg": g.mass_kg}
+    return {"robot": robot.name, "drive": robot.drive, **lengths, "k": k, "k_sigma": float(model.sigmas[0]), "k_from": source}
