@@ -35,9 +35,9 @@ class SimulationError(SkidlocError):
     """A simulation that does not exist or cannot be driven: an unknown experiment or effect, a robot that tips over or hits a wall."""
 
 
-class DumpError(SkidlocError):
+class CheckpointError(SkidlocError):
     """A state that cannot be written, or a file of one that is damaged, foreign, or of another robot, model or configuration."""
 
 
-class DoorError(SkidlocError):
+class TransportError(SkidlocError):
     """A live source or sink that cannot be used: its library is missing, nobody is there, or another type of message comes."""

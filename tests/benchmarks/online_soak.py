@@ -1,5 +1,5 @@
 """Hours of the estimator live, as fast as it goes: a simulated robot drives round four rooms, and every message of its topics passes
-through the node as bytes, with an output and a state on disk. Memory and time must stay as they are.
+through the node as bytes, with an output and a state on disk. WheelAngles and time must stay as they are.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import numpy as np
 
 from localization.logs.message_templates import Form, Message, Template
 from localization.pipeline import Trial
-from localization.ros.node import Node, NodeConfig
+from localization.ros.node import Node
 from localization.ros.session_files import Files
-from localization.ros.transports.base import Received
+from localization.ros.settings import LiveRun, NodeConfig
+from localization.ros.transports.base import MonotonicTime, Received
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig
@@ -41,7 +42,7 @@ class Row:
     position_error_m: float
 
 
-class SimulatedRobot:
+class SimulatedRobot(MonotonicTime):
     """A `Transport` whose messages are made when they are asked for, one at a time; it stops the time until it is asked for the next."""
 
     is_ros1 = False
@@ -70,10 +71,10 @@ class SimulatedRobot:
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         self._topics.add(topic)
 
-    def keep(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
+    def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
         self._topics = set(topics)
 
-    def advertise(self, topic: str, kind: str) -> None: ...
+    def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None: ...
 
     def publish(self, topic: str, data: bytes) -> None:
         self.published += 1
@@ -128,7 +129,7 @@ def drive(hours: float, beams: int, estimator: str = "ekf") -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         files = Files(Path(folder) / "soak.tum", Path(folder) / "state")
         pair = Trial(make_model("skid_steer", robot), estimator)
-        node = Node.start(transport, robot, lambda has_lidar: pair, files, print, node=NodeConfig(wait_s=0.0))
+        node = Node.start(transport, LiveRun(robot, lambda has_lidar: pair, files, node=NodeConfig(wait_s=0.0)), print)
         start = np.append(transport.truth, 0.0)
 
         def look() -> bool:

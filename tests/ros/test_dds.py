@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from localization.cli import main
-from localization.errors import DoorError
+from localization.errors import TransportError
 from localization.logs import open_log
 from localization.pipeline import Trial, replay
 from localization.ros.transports.dds_settings import choose_interface, configuration, default_domain
@@ -174,7 +174,7 @@ def test_another_type_is_refused_by_what_the_robot_says_of_itself(capsys):
 def test_topics_that_are_not_kept_are_heard_no_more():
     """And what is heard comes in the order in which it was sent."""
     with chatter("abc") as here:
-        here.keep(["/c", "/a"])
+        here.restrict(["/c", "/a"])
         here.take(0.1)
         time.sleep(0.5)
         found = here.take(1.0)
@@ -188,7 +188,7 @@ def test_topics_that_are_not_kept_are_heard_no_more():
 def test_messages_that_waited_came_when_they_were_sent():
     """Two seconds without a look, of which the last one is kept."""
     with chatter("a") as here:
-        here.keep(["/a"])
+        here.restrict(["/a"])
         here.take(1.0)
         looked = time.monotonic_ns()
         time.sleep(2.0)
@@ -201,13 +201,13 @@ def test_messages_that_waited_came_when_they_were_sent():
 
 
 def test_times_of_receiving_lie_between_two_looks():
-    times_of_receiving = importlib.import_module("localization.ros.transports.dds").times_of_receiving
-    assert times_of_receiving([], 0, 100) == []
-    assert times_of_receiving([7], 0, 100) == [100]
-    assert times_of_receiving([10, 30, 50], 0, 100) == [60, 80, 100]
-    assert times_of_receiving([50, 10, 30], 60, 120) == [120, 80, 100]  # whatever their order
-    assert times_of_receiving([1000, 3000, 5000], 60, 120) == [80, 100, 120]  # the sender's clock is another one
-    assert times_of_receiving([5, 5, 5], 60, 120) == [120, 120, 120]  # sent in a burst
+    receive_times = importlib.import_module("localization.ros.transports.dds").receive_times
+    assert receive_times([], 0, 100) == []
+    assert receive_times([7], 0, 100) == [100]
+    assert receive_times([10, 30, 50], 0, 100) == [60, 80, 100]
+    assert receive_times([50, 10, 30], 60, 120) == [120, 80, 100]  # whatever their order
+    assert receive_times([1000, 3000, 5000], 60, 120) == [80, 100, 120]  # the sender's clock is another one
+    assert receive_times([5, 5, 5], 60, 120) == [120, 120, 120]  # sent in a burst
 
 
 def test_what_had_to_wait_for_us_came_when_it_was_sent():
@@ -215,22 +215,26 @@ def test_what_had_to_wait_for_us_came_when_it_was_sent():
     clock, ms = importlib.import_module("localization.ros.transports.dds").SenderClock(), S // 1000
     ours = [100 * S + i * 20 * ms for i in range(50)]
     for i, now in enumerate(ours):
-        came = clock.came_ns(now - 5 * S - (1 + i % 3) * ms, now - 15 * ms, now)
+        came = clock.receive_time_ns(now - 5 * S - (1 + i % 3) * ms, now - 15 * ms, now)
         assert now - 3 * ms <= came <= now
     begin = ours[-1]
-    assert clock.came_ns(begin - S, begin, begin + 12 * S) == pytest.approx(begin + 4 * S, abs=3 * ms)
+    assert clock.receive_time_ns(begin - S, begin, begin + 12 * S) == pytest.approx(begin + 4 * S, abs=3 * ms)
     # 40 ms on the way, and looked for all the time
-    assert clock.came_ns(begin + 7 * S, begin + 12.03 * S, begin + 12.04 * S) == begin + 12.04 * S
+    assert clock.receive_time_ns(begin + 7 * S, begin + 12.03 * S, begin + 12.04 * S) == begin + 12.04 * S
     # it is set: forward, and back
     for shift in (3600 * S, -3600 * S):
         now = begin + 20 * S
-        assert [clock.came_ns(now - 5 * S + shift + i * S, now + i * S - 20 * ms, now + i * S) - now for i in range(3)] == [0, S, 2 * S]
+        assert [clock.receive_time_ns(now - 5 * S + shift + at, now + at - 20 * ms, now + at) - now for at in (0, S, 2 * S)] == [
+            0,
+            S,
+            2 * S,
+        ]
 
 
 def test_patience_ends_where_something_urgent_comes():
     """Twenty messages of /a to one of /b; without patience each is heard when it comes."""
     with chatter("a" * 20 + "b") as here:
-        here.keep(["/a", "/b"], ["/b"])
+        here.restrict(["/a", "/b"], ["/b"])
         here.take(1.0, 20.0)
         found = here.take(1.0, 20.0)
         assert len(found) < 100  # it did not wait for 20 s, after which the last 200 would be there
@@ -268,7 +272,7 @@ def test_choose_interface_follows_the_option_then_ros_variables(interface, envir
     ],
 )
 def test_choose_interface_refuses_what_does_not_exist(interface, environment, error):
-    with pytest.raises(DoorError, match=re.escape(error)):
+    with pytest.raises(TransportError, match=re.escape(error)):
         choose_interface(interface, environment)
 
 

@@ -15,6 +15,7 @@ from collections import deque
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
@@ -35,11 +36,13 @@ class Robot:
         self.node = rclpy.create_node("robot")
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
-        self.odometry, self.counts, self.statuses, self.tf = [], {}, {}, []
+        self.odometry, self.predicted, self.statuses, self.tf = [], [], {}, []
         self.sent, self.latencies, self.first_s = {}, [], None
         self.begin = time.monotonic()
         for topic, kind in (("/skidloc/odometry", Odometry), ("/tf", TFMessage), ("/diagnostics", DiagnosticArray)):
             self.node.create_subscription(kind, topic, getattr(self, f"on_{kind.__name__}"), 50)
+        self.node.create_subscription(Odometry, "/skidloc/odometry_predicted", lambda m: self.predicted.append(stamp(m)), 50)
+        self.initial_pose = self.node.create_publisher(PoseWithCovarianceStamped, "/set_pose", 1)
         kinds = {topic: kind for _, topic, kind, _ in messages}
         self.publishers = {topic: self.publisher(topic, kind) for topic, kind in kinds.items()}
         for _, topic, _, data in messages:
@@ -64,6 +67,13 @@ class Robot:
 
     def on_DiagnosticArray(self, message):
         self.statuses |= {s.name: {"level": s.level[0], "message": s.message} for s in message.status}
+
+    def set_pose(self, x, y):
+        message = PoseWithCovarianceStamped()
+        message.header.frame_id = "odom"
+        message.pose.pose.position.x, message.pose.pose.position.y, message.pose.pose.orientation.w = x, y, 1.0
+        self.initial_pose.publish(message)
+        self.spin(0.5)
 
     def spin(self, seconds):
         end = time.monotonic() + seconds
@@ -111,6 +121,7 @@ class Robot:
             "first_s": self.first_s,
             "tf": sorted(set(self.tf)),
             "tf_count": len(self.tf),
+            "predicted": self.predicted,
             "frames": sorted({(o.header.frame_id, o.child_frame_id) for o in self.odometry}),
             "poses": [[o.pose.pose.position.x, o.pose.pose.position.y] for o in self.odometry],
             "statuses": self.statuses,
