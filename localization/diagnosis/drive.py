@@ -1,4 +1,4 @@
-"""What a diagnosis looks at: windows of wheel motion, and what LiDAR, gyro and accelerometers measured of the same seconds."""
+"""The data of a diagnosis: windows of wheel motion, and what LiDAR, gyro and accelerometers measured of the same seconds."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Drive:
     name: str
     robot: Robot
     maneuvers: tuple[Maneuver, ...]
-    witness: str
+    motion_reference: str
     """What measured the motion, in words."""
     kind: str = "log"
     """log, windows, rotations or runs."""
@@ -86,7 +86,7 @@ class _Recorder:
 
 
 class _Imu:
-    """Keeps the gyro's and the accelerometers' whole story."""
+    """Keeps the gyro's and the accelerometers' whole record."""
 
     def __init__(self, robot: Robot, mounts: Any) -> None:
         self._mounts = mounts
@@ -94,7 +94,7 @@ class _Imu:
         self.stamps: list[int] = []
         self.forces: list[FloatArray] = []
 
-    def push(self, sample: ImuSample) -> None:
+    def insert(self, sample: ImuSample) -> None:
         self.gyro.insert(sample)
         self.stamps.append(sample.stamp_ns)
         self.forces.append(self._mounts.get(sample.frame_id, Mount()).rotation() @ sample.linear_acceleration)
@@ -114,7 +114,7 @@ class _Imu:
 
 
 class _Postures:
-    """Stands in for the log's model of the arms, and remembers the joints of each centre of gravity."""
+    """The log's model of the arms, which also records the joints of each centre of gravity."""
 
     def __init__(self, model: Any) -> None:
         self._model, self.chain = model, model.chain
@@ -130,17 +130,17 @@ class _Postures:
 
 
 def drive_of_log(
-    log: Log, witness: MotionReferenceName = "auto", reference: str | None = None, config: WindowConfig | None = None
+    log: Log, motion_reference: MotionReferenceName = "auto", reference: str | None = None, config: WindowConfig | None = None
 ) -> Drive:
-    """Read ``log`` once. Raises `CalibrationError` where it has no wheels, and for a ``witness`` that it does not have."""
+    """Read ``log`` once. Raises `CalibrationError` where it has no wheels, and for a ``motion_reference`` that it does not have."""
     config = config or WindowConfig()
     robot = log.robot
     if log.sources.wheels is None and log.wheels_error is None:
         raise CalibrationError(f"{log.path.name} has no wheels: name their topic with --topic.joint-states or --topic.odometry.")
-    if witness == "auto" and reference is None and log.sources.lidar is None and log.sources.imu is None:
+    if motion_reference == "auto" and reference is None and log.sources.lidar is None and log.sources.imu is None:
         alone = f"{log.path.name} has neither a LiDAR nor an IMU, and no reference was named: nothing measures what the wheels do."
         return Drive(log.path.name, robot, (), "none", warnings=(alone, *log.warnings()))
-    inner, words = make_motion_reference(log, robot, witness, reference, config)
+    inner, words = make_motion_reference(log, robot, motion_reference, reference, config)
     recorder = _Recorder(inner)
     imu = _Imu(robot, log.mounts)
     postures = None
@@ -150,31 +150,31 @@ def drive_of_log(
 
     frame = ""
 
-    def watched() -> Iterable[Event]:
+    def record_events() -> Iterable[Event]:
         nonlocal frame
         for event in log.events():
             if isinstance(event, ImuSample):
-                imu.push(event)
+                imu.insert(event)
             elif isinstance(event, Scan):
                 frame = event.frame_id
             yield event
 
-    windows = cut(watched(), recorder, make_model("diff_drive", robot), robot, config, log.path.name)
+    windows = cut(record_events(), recorder, make_model("diff_drive", robot), robot, config, log.path.name)
     spans = np.array([(s.start_ns, s.end_ns) for s in recorder.used], dtype=np.int64).reshape(-1, 2)
     left = f"{len(windows.maneuvers)} windows of {config.window_s:g} s; left out: {windows.standing} standing, {windows.lost} not measured."
     mount = log.mounts.get(frame, Mount())
     by_gyro = isinstance(inner, GyroMotionReference)
-    heard = bool(imu.stamps) and not by_gyro
+    has_gyro = bool(imu.stamps) and not by_gyro
     return Drive(
         name=log.path.name,
         robot=robot,
         maneuvers=windows.maneuvers,
-        witness=words,
+        motion_reference=words,
         starts_s=(spans[:, 0] - spans[0, 0]) * _NS if len(spans) else np.zeros(0),
         spans_ns=spans,
-        gyro=imu.gyro if heard else None,
+        gyro=imu.gyro if has_gyro else None,
         is_gyro_reference=by_gyro,
-        forces=imu.means(spans) if heard and len(spans) else None,
+        forces=imu.means(spans) if has_gyro and len(spans) else None,
         payload_arms=_payload_arms(robot, windows.maneuvers, postures),
         lidar_frame=frame,
         lidar_at=(mount.x, mount.y),
@@ -192,7 +192,7 @@ def drive_of_table(name: str, robot: Robot, maneuvers: Sequence[Maneuver], kind:
     >>> rotations = rotations_as_maneuvers(read_rotation_table("tests/data/vaultbot/rotation_grid.csv"), robot)
     >>> found = diagnose(drive_of_table("rotation_grid.csv", robot, rotations, "rotations"), make_model("friction", robot))
     >>> strongest = found.findings[0]
-    >>> strongest.cause, round(strongest.size, 2), strongest.effect.unit
+    >>> strongest.cause, round(strongest.size, 2), strongest.cause.unit
     ('lidar_offset_x', 0.06, 'm')
     """
     if kind == "windows":
@@ -202,7 +202,7 @@ def drive_of_table(name: str, robot: Robot, maneuvers: Sequence[Maneuver], kind:
         name=name,
         robot=robot,
         maneuvers=tuple(maneuvers),
-        witness=f"the table of {len(maneuvers)} {kind}",
+        motion_reference=f"the table of {len(maneuvers)} {kind}",
         kind=kind,
         starts_s=np.asarray(np.cumsum(seconds) - seconds),
         payload_arms=_payload_arms(robot, maneuvers, None),
@@ -215,8 +215,8 @@ def _pieces(m: Maneuver) -> Iterator[Maneuver]:
     covs = np.broadcast_to(m.cov, (len(m.ends), 3, 3))
     for pose, end, cov in zip(m.measured, m.ends, covs, strict=True):
         both = cov if driven == 0 else 2.0 * cov  # two poses that err independently
-        seen = se2.between(before, pose)[None]
-        yield dataclasses.replace(m, measured=seen, ends=np.array([end - driven]), cov=both, lead=m.lead + driven)
+        motion = se2.between(before, pose)[None]
+        yield dataclasses.replace(m, measured=motion, ends=np.array([end - driven]), cov=both, lead=m.lead + driven)
         before, driven = pose, int(end)
 
 

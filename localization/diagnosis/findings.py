@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from localization.diagnosis.causes import Belief, Effect
+from localization.diagnosis.causes import Cause, Hypothesis
 
 Verdict = Literal["consistent", "explained", "ambiguous", "unexplained", "undecidable"]
 
@@ -36,7 +36,7 @@ class Gain:
 class Finding:
     """A named cause."""
 
-    effect: Effect
+    definition: Cause
     size: float
     sigma: float
     p_value: float
@@ -48,15 +48,15 @@ class Finding:
 
     @property
     def cause(self) -> str:
-        return self.effect.id
+        return self.definition.id
 
     def to_dict(self) -> dict[str, Any]:
         return {
             "cause": self.cause,
-            "meaning": self.effect.meaning,
+            "meaning": self.definition.meaning,
             "size": self.size,
             "sigma": self.sigma,
-            "unit": self.effect.unit,
+            "unit": self.definition.unit,
             "p_value": self.p_value,
             "aliases": [name for name, _ in self.aliases],
             "alias_sizes": dict(self.aliases),
@@ -88,7 +88,7 @@ class Component:
 
 
 @dataclass(frozen=True)
-class Shape:
+class Trend:
     """A trend in what is left that no cause has."""
 
     component: str
@@ -108,27 +108,27 @@ class Diagnosis:
     log: str
     robot: str
     model: str
-    witness: str
+    motion_reference: str
     verdict: Verdict
     discrepancy: Mapping[str, Component]
     findings: tuple[Finding, ...]
-    shapes: tuple[Shape, ...]
+    trends: tuple[Trend, ...]
     left_share: float
     """How much of what can be predicted of the discrepancy follows such trends, 0 to 1."""
     next_drive: str
     sentence: str
     within: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Causes that show, but are smaller than anyone would correct: size and sigma."""
-    visible: Mapping[str, float] = field(default_factory=dict)
+    detectable_sizes: Mapping[str, float] = field(default_factory=dict)
     """Smallest size of each cause that this drive would show (three sigma, alone)."""
     gain: Gain | None = None
     """By all findings together."""
     windows: int = 0
     warnings: tuple[str, ...] = ()
-    belief: Belief = field(default_factory=Belief)
+    hypothesis: Hypothesis = field(default_factory=Hypothesis)
 
     def to_dict(self) -> dict[str, Any]:
-        left: dict[str, Any] = {"share": self.left_share, "shapes": [vars(s) for s in self.shapes], "text": [s.text for s in self.shapes]}
+        left: dict[str, Any] = {"share": self.left_share, "shapes": [vars(s) for s in self.trends], "text": [s.text for s in self.trends]}
         return {
             "log": self.log,
             "robot": self.robot,
@@ -137,12 +137,12 @@ class Diagnosis:
             "discrepancy": {name: c.to_dict() for name, c in self.discrepancy.items()},
             "findings": [f.to_dict() for f in self.findings],
             "gain": None if self.gain is None else self.gain.to_dict(),
-            "left_unexplained": left if self.shapes else {},
+            "left_unexplained": left if self.trends else {},
             "next_drive": self.next_drive,
             "sentence": self.sentence,
-            "witness": self.witness,
+            "witness": self.motion_reference,
             "windows": self.windows,
             "within_tolerance": {name: list(value) for name, value in self.within.items()},
-            "smallest_visible": dict(self.visible),
+            "smallest_visible": dict(self.detectable_sizes),
             "notes": list(self.warnings),
         }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from localization.diagnosis.diagnose import Examined
+from localization.diagnosis.diagnose import DiagnosisResult
 from localization.diagnosis.findings import Diagnosis
 from localization.report.diagnosis_figures import dependence_svg, discrepancy_svg, gain_svg
 from localization.report.page import Block, Cell, Figure, Page, Paragraph, Section, Table, bullets, glossary, render, write_new
@@ -25,28 +25,28 @@ _TERMS = {
 }
 
 
-def write_diagnosis_report(path: str | Path, found: Examined) -> None:
+def write_diagnosis_report(path: str | Path, found: DiagnosisResult) -> None:
     """Write the page. Raises `OutputError` if there is such a file already or it cannot be written."""
     write_new(path, diagnosis_page(found).encode())
 
 
-def diagnosis_page(found: Examined) -> str:
+def diagnosis_page(found: DiagnosisResult) -> str:
     """HTML of the whole page."""
     d = found.diagnosis
     sections = [
         Section("Findings", _findings(d)),
         Section("Next drive", [Paragraph(d.next_drive)] if d.next_drive else []),
         *_figures(found),
-        Section("Left unexplained", bullets([s.text for s in d.shapes])),
-        Section("What this drive would show", _visible(d)),
+        Section("Left unexplained", bullets([s.text for s in d.trends])),
+        Section("What this drive would show", _detectable(d)),
         Section("About the log", bullets(d.warnings)),
         glossary(_TERMS),
     ]
-    facts = f"{d.robot} · model {d.model} · reference {d.witness} · {d.windows:,} windows"
+    facts = f"{d.robot} · model {d.model} · reference {d.motion_reference} · {d.windows:,} windows"
     return render(Page(f"Diagnosis of {d.log}", facts, [d.sentence, _VERDICTS[d.verdict]], sections))
 
 
-def _figures(found: Examined) -> list[Section]:
+def _figures(found: DiagnosisResult) -> list[Section]:
     """Discrepancies, components and gains, as far as there are any."""
     d, sections = found.diagnosis, []
     if found.residuals is not None:
@@ -71,10 +71,10 @@ def _findings(d: Diagnosis) -> list[Block]:
         return []
     rows = []
     for f in d.findings:
-        unit = "" if f.effect.unit == "1" else f" {f.effect.unit}"
+        unit = "" if f.definition.unit == "1" else f" {f.definition.unit}"
         others = ", ".join(f"{name} {size:+.3g}" for name, size in f.aliases) or "–"  # noqa: RUF001
         gain = f"{100 * f.gain.relative:.0f} % ({100 * f.gain.low:.0f} to {100 * f.gain.high:.0f})"
-        cause = Cell(f.cause, f"{f.effect.meaning}; {f.evidence}", is_code=True)
+        cause = Cell(f.cause, f"{f.definition.meaning}; {f.evidence}", is_code=True)
         rows.append([cause, Cell(f"{f.size:+.4g} ± {f.sigma:.2g}{unit}"), Cell(gain), Cell(f"{f.p_value:.1g}"), Cell(others)])
     return [Table([Cell(title) for title in ("Cause", "Size", "Held-out gain", "p", "Or")], rows)]
 
@@ -87,6 +87,6 @@ def _components(d: Diagnosis) -> list[Block]:
     return [Table([Cell(title) for title in ("Component", "Unit", "RMS", "Noise", "RMS once corrected", "p")], rows)]
 
 
-def _visible(d: Diagnosis) -> list[Block]:
-    rows = [[Cell(name, is_code=True), Cell(f"{size:.3g}")] for name, size in d.visible.items()]
+def _detectable(d: Diagnosis) -> list[Block]:
+    rows = [[Cell(name, is_code=True), Cell(f"{size:.3g}")] for name, size in d.detectable_sizes.items()]
     return [Table([Cell("Cause"), Cell("Smallest size that this drive would show (3 sigma)")], rows)] if rows else []
