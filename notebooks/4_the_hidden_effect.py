@@ -25,14 +25,14 @@ from pathlib import Path
 import numpy as np
 
 from localization.report.notebook import Bars, Panel, Series, picture, table
-from localization.simulation import EFFECTS
+from localization.simulation import FAULTS
 
 sys.path.insert(0, "..")
 from tests.helpers.diagnosis_drives import TYPICAL, bag, diagnose_bag
 
 table(
     ["you may hide", "unit", "a size that robots have", "meaning"],
-    *([id_, EFFECTS[id_].unit, size, EFFECTS[id_].meaning] for id_, size in TYPICAL.items()),
+    *([id_, FAULTS[id_].unit, size, FAULTS[id_].meaning] for id_, size in TYPICAL.items()),
 )
 
 # %% [markdown]

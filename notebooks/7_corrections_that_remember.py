@@ -29,7 +29,7 @@ from localization.report.notebook import CYCLE, MARKERS, Panel, Series, picture,
 from localization.simulation import Experiment, ExperimentConfig, SensorConfig, Simulation, SimulationConfig, write_simulation
 from localization.simulation.drives import MoveArms, Rest, Route, TurnTo
 from localization.simulation.scanners import ScannerConfig
-from localization.simulation.sensor_suite import START_NS
+from localization.simulation.sensors import START_NS
 from motion_models import load_robot
 
 sys.path.insert(0, "..")

@@ -26,7 +26,7 @@ from localization.evaluation.time_overlap import describe_instant, no_overlap_me
 from localization.events import Event, PositionSample
 from localization.logs import Log, TopicOverrides, open_log
 from localization.logs.fused_log import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
-from localization.logs.positions import merge_positions, position_samples
+from localization.logs.references import merge_positions, read_positions
 from localization.output import as_text, check_outputs
 from localization.pipeline import ReplayConfig, Run, Trial, replay
 from localization.provenance import fingerprint, versions
@@ -146,7 +146,7 @@ class Replay:
             return []
         if "graph" not in self.estimator.split(","):
             raise EstimatorError("--positions are fused by the graph alone. Add it: --estimator odometry,ekf,graph.")
-        return position_samples(log.references(self.positions), self.positions)
+        return read_positions(log.references(self.positions), self.positions)
 
     def _metrics(self, head: ReportHead, results: Sequence[Result]) -> dict[str, Any]:
         return {

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 from localization.errors import DoorError
 from localization.logs.clock_sync import ClockPlan, plan_clocks
-from localization.logs.decode import UnusableError, stamp_ns
+from localization.logs.decode import stamp_ns
+from localization.logs.message_stats import UnusableError
 from localization.logs.serialization import decoder, live_channel
-from localization.logs.topic_roles import Parts, choose_parts
-from localization.logs.topics import TYPES, TopicChooser, TopicOverrides, short_type
+from localization.logs.topic_roles import TYPES, TopicChooser, TopicOverrides, TopicRoles, choose_roles, short_type
 from localization.logs.transforms import FixedTransforms
 from localization.ros.topic_names import Names
 from localization.ros.transports.base import Received, Transport
@@ -57,7 +57,7 @@ class LiveTransforms:
 class Heard:
     """What there is to run on."""
 
-    parts: Parts
+    parts: TopicRoles
     mounts: Mapping[str, Mount]
     transforms: LiveTransforms
     """What mounts are known by: more may come."""
@@ -172,7 +172,7 @@ class Listener:
     def _heard(self, epoch_ns: int) -> Heard:
         channels = [live_channel(topic, self.candidates[topic], count) for topic, count in self._counts.items()]
         chooser = TopicChooser("the live topics", channels, self._robot, self._topics)
-        parts = choose_parts("the live topics", chooser, self._robot, self._topics, self._joint_names)
+        parts = choose_roles("the live topics", chooser, self._robot, self._topics, self._joint_names)
         if parts.wheels_error is not None:
             raise parts.wheels_error
         used = {source.topic for source in parts.sources.used()}

@@ -14,10 +14,10 @@ from typing import Any
 from localization.errors import DumpError
 from localization.events import Event
 from localization.logs.clock_sync import Merger
-from localization.logs.event_decoder import Intake, read_item
-from localization.logs.message_stats import Oddity, Tally
+from localization.logs.event_decoder import EventDecoder, decode_item
+from localization.logs.message_stats import MessageStats, Oddity
 from localization.logs.serialization import decoder
-from localization.logs.topics import TYPES, Sources
+from localization.logs.topic_roles import TYPES, Sources
 from localization.logs.wheel_decoder import JointsToWheels, OdometryToWheels
 from localization.ros.discovery import Heard
 from localization.ros.transports.base import Received
@@ -41,11 +41,11 @@ class Memory:
 class Stream:
     """Messages in, events out."""
 
-    def __init__(self, heard: Heard, robot: Robot, tally: Tally, epoch_ns: int, *, is_ros1: bool) -> None:
+    def __init__(self, heard: Heard, robot: Robot, tally: MessageStats, epoch_ns: int, *, is_ros1: bool) -> None:
         """``epoch_ns``: what makes times of the wall of times of receiving."""
         parts, self._tally, self._epoch_ns = heard.parts, tally, epoch_ns
         self.sources: Sources = parts.sources
-        self._intake = Intake(parts.sources, parts.joints, parts.arms, robot, tally)
+        self._intake = EventDecoder(parts.sources, parts.joints, parts.arms, robot, tally)
         self._merger = Merger(heard.plan, tally, wait_ns=None)
         self._decoders = {source.topic: decoder(TYPES[source.kind], is_ros1=is_ros1) for source in parts.sources.used()}
         self._watches = {source.topic: _Watch() for source in parts.sources.used()}
@@ -65,9 +65,9 @@ class Stream:
             return
         self._watches[received.topic].heard(received.received_ns)
         wall_ns = received.received_ns + self._epoch_ns
-        item = read_item(received.topic, wall_ns, partial(decode, received.data), self._intake.parts[received.topic], self._tally)
+        item = decode_item(received.topic, wall_ns, partial(decode, received.data), self._intake.decoders[received.topic], self._tally)
         if item is not None:
-            for payload in self._merger.push(item):
+            for payload in self._merger.insert(item):
                 yield from self._intake.events(payload)
 
     def sender_stamp_ns(self, stamp_ns: int, *, by_lidar: bool) -> int:

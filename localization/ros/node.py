@@ -13,8 +13,8 @@ from typing import Any
 from localization.errors import DumpError
 from localization.estimators import Estimate
 from localization.events import Event, Scan
-from localization.logs.message_stats import Tally
-from localization.logs.topics import TopicOverrides
+from localization.logs.message_stats import MessageStats
+from localization.logs.topic_roles import TopicOverrides
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.checkpoint import fingerprints, read_head
 from localization.ros.diagnostics import ERROR, Status
@@ -112,7 +112,7 @@ class Node:
         if node.tf:
             transport.subscribe(transforms[1], TF_TYPE, is_latched=False)
         transport.keep([*transforms, *(source.topic for source in heard.parts.sources.used())], [] if lidar is None else [lidar.topic])
-        tally = Tally()
+        tally = MessageStats()
         stream = Stream(heard, robot, tally, epoch_ns, is_ros1=transport.is_ros1)
         made = made_by(pair, robot, heard.mounts, has_lidar, config, "live topics")
         pipeline = Pipeline(pair, robot, heard.mounts, has_lidar, config)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from localization.estimators import check_estimator
-from localization.logs.topics import TopicOverrides
+from localization.logs.topic_roles import TopicOverrides
 from localization.pipeline import ReplayConfig, Trial
 from localization.ros.node import NodeConfig
 from localization.ros.session_files import Files

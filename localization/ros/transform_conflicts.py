@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 
-from localization.logs.decode import UnusableError, frame_name
+from localization.logs.decode import frame_name
+from localization.logs.message_stats import UnusableError
 from localization.logs.serialization import decoder
 
 _TF_TYPE = "tf2_msgs/msg/TFMessage"

@@ -20,7 +20,7 @@ from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.jit_warm_up import warm_up
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.scanners import ScannerConfig
-from localization.simulation.sensor_suite import SensorConfig
+from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
 from motion_models.registry import make_model
 from motion_models.robot import load_robot

@@ -20,7 +20,7 @@ from localization.ros.session_files import Files
 from localization.ros.transports.base import Received
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.scanners import ScannerConfig
-from localization.simulation.sensor_suite import SensorConfig
+from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
@@ -103,8 +103,8 @@ class SimulatedRobot:
     def _received(self) -> Iterator[Received]:
         for message in self._messages:
             self._runs.clear()  # what the simulator keeps of its laps would be taken for the estimator's
-            topic = message.form.topic
-            self._types.setdefault(topic, message.form.type)
+            topic = message.layout.topic
+            self._types.setdefault(topic, message.layout.type)
             self.seconds = (message.log_ns - 1_000_000_000) * 1e-9
             if topic == "/ground_truth/odom":
                 self.truth = np.array(message.parts[0])
@@ -115,9 +115,9 @@ class SimulatedRobot:
                 yield Received(topic, self._base_ns + message.log_ns, self._bytes(message))
 
     def _bytes(self, message: Message) -> bytes:
-        known = self._templates.get(id(message.form))
+        known = self._templates.get(id(message.layout))
         if known is None:
-            known = self._templates[id(message.form)] = message.form, Template(message.form, is_ros1=False)
+            known = self._templates[id(message.layout)] = message.layout, Template(message.layout, is_ros1=False)
         return known[1].fill(message)
 
 

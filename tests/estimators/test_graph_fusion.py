@@ -14,7 +14,7 @@ from localization.estimators import Estimate
 from localization.estimators.graph_fusion import _interpolate, _subtract_information
 from localization.evaluation.consistency import nees
 from localization.events import PositionSample, Scan, WheelSample
-from localization.logs.positions import merge_positions
+from localization.logs.references import merge_positions
 from localization.pipeline import Pipeline, Trial, replay
 from localization.ros.deserialize import thaw
 from localization.ros.serialize import freeze

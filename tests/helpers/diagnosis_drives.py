@@ -15,8 +15,7 @@ from localization.logs import open_log
 from localization.simulation.drives import MoveArms, OpenLoop, Phase, Rest, constant, sine
 from localization.simulation.experiments import EXPERIMENTS, Experiment, ExperimentConfig
 from localization.simulation.scanners import ScannerConfig
-from localization.simulation.sensor_suite import SensorConfig
-from localization.simulation.sensors import ImuConfig
+from localization.simulation.sensors import ImuConfig, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from motion_models.friction import FrictionModel
 from motion_models.registry import make_model

@@ -18,7 +18,7 @@ from localization.diagnosis.findings import Diagnosis
 from localization.diagnosis.subset_selection import signature_correlation
 from localization.simulation.drives import MoveArms, OpenLoop, Phase, Rest, constant
 from localization.simulation.experiments import Experiment, ExperimentConfig, grid_points
-from localization.simulation.sensor_suite import SensorConfig
+from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig
 from motion_models import se2
 from motion_models.calibration.maneuvers import Maneuver

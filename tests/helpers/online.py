@@ -26,8 +26,7 @@ from localization.ros.topic_names import Names
 from localization.ros.transports.base import Received
 from localization.simulation.drives import MoveArms, OpenLoop, Rest, constant
 from localization.simulation.experiments import Experiment
-from localization.simulation.sensor_suite import SensorConfig
-from localization.simulation.sensors import EncoderConfig
+from localization.simulation.sensors import EncoderConfig, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from motion_models.registry import make_model
 from motion_models.robot import load_robot

@@ -18,7 +18,7 @@ import pytest
 
 from localization.errors import LogError
 from localization.events import Scan, WheelSample
-from localization.logs import open_log
+from localization.logs import inspect_log, open_log
 from localization.logs.chunks import MOST_PLAIN_BYTES, DamagedError, decompress, inflate_message, zstd
 from motion_models.robot import load_robot
 from tests.helpers import bags
@@ -53,7 +53,7 @@ def read_all(path: Path) -> tuple[list, str]:
     with limits():
         log = open_log(path, ROBOT)
         events = list(log.events())
-        log.info()
+        inspect_log(log)
         return events, said(log)
 
 

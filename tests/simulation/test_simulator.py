@@ -20,9 +20,9 @@ from localization.logs import open_log
 from localization.logs.writer import write_bag
 from localization.simulation.drives import MoveArms, OpenLoop, PickUp, Rest, Route, TurnTo, constant
 from localization.simulation.experiments import CONFIGURATION_CGS, EXPERIMENTS, Experiment, ExperimentConfig, grid_points
-from localization.simulation.faults import EFFECTS, parse_effects
-from localization.simulation.open_loop_scores import correction_time, score_runs
-from localization.simulation.sensor_suite import START_NS, SensorConfig
+from localization.simulation.faults import FAULTS, parse_faults
+from localization.simulation.open_loop_scores import correction_time, score_open_loop_runs
+from localization.simulation.sensors import START_NS, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, simulate, write_simulation
 from localization.simulation.vehicle import VehicleConfig
 from motion_models import se2
@@ -69,7 +69,7 @@ def test_every_format_is_opened_by_rosbags_and_by_this_library(tmp_path, name, l
     assert types == {
         "/joint_states": "JointState",
         "/ground_truth/odom": "Odometry",
-        "/imu/data": "Imu",
+        "/imu/data": "ImuSensor",
         "/fix": "NavSatFix",
         "/tf_static": "TFMessage",
         "/center_of_gravity": "PointStamped",
@@ -171,7 +171,7 @@ def parts(messages, topic, part):
     return np.array([m.parts[part] for m in messages if m.form.topic == topic])
 
 
-@pytest.mark.parametrize("effect", EFFECTS)
+@pytest.mark.parametrize("effect", FAULTS)
 def test_effects_are_nowhere_in_the_logs_metadata(effect):
     size = {"payload": 5.0, "encoder_dropout": 0.3}.get(effect, 0.02)
     config = SimulationConfig(sensors=SensorConfig(lidar="2d", center_of_gravity=True))
@@ -302,10 +302,10 @@ def test_loose_floor_is_in_truth_and_gyro_alike(effect, value):
 
 
 def test_effects_add_up_and_bad_ones_are_told():
-    assert parse_effects(("slope=0.1", "payload=2", "slope=0.05")) == {"slope": pytest.approx(0.15), "payload": 2.0}
+    assert parse_faults(("slope=0.1", "payload=2", "slope=0.05")) == {"slope": pytest.approx(0.15), "payload": 2.0}
     for text in ("slope", "slope=", "slope=steep", "slope=nan"):
         with pytest.raises(SimulationError, match="not of the form ID=SIZE"):
-            parse_effects((text,))
+            parse_faults((text,))
     for effects, said in (
         ({"gravity": 1.0}, r"no effect 'gravity'; there are\n  wheel_radius_scale \[1\]: all wheels"),
         ({"track_width": 3.0}, r"track_width of 3 m is out of reason; it may be -0.2 to 0.2"),
@@ -372,7 +372,7 @@ def test_every_experiment_is_driven_to_its_end(name):
 def test_scores_of_a_robot_that_does_as_it_is_told_are_zero_but_for_the_motors_lag():
     """Straight on, with the model that skids least; and a hand-made correction."""
     simulation, _ = driven(STRAIGHT)
-    (score,) = score_runs(simulation)
+    (score,) = score_open_loop_runs(simulation)
     assert score.drive_error_m < 0.03
     assert score.vision_error_m < 0.03
     # 0.3 m to the side, same heading: a quarter turn, 0.3 m, a quarter turn back
