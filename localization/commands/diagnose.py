@@ -18,6 +18,7 @@ from localization.diagnosis.corrected_robot import correct_robot
 from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_table
 from localization.diagnosis.findings import Diagnosis
+from localization.diagnosis.summary import describe_outliers, describe_row, describe_tolerated
 from localization.logs import TopicOverrides, open_log
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
@@ -109,20 +110,26 @@ def print_diagnosis(console: Console, d: Diagnosis) -> None:
     """Verdict and sentence first, then discrepancies and findings."""
     console.print(f"{d.verdict}: {d.sentence}", markup=False, soft_wrap=True)
     if d.discrepancy:
-        table = Table("measured - predicted", "unit", "rms", "noise", "left", "p", box=None, header_style="bold", pad_edge=False)
+        titles = "measured - predicted", "unit", "rms", "noise", "left", "p", "attributed to"
+        table = Table(*titles, box=None, header_style="bold", pad_edge=False)
         for name, c in d.discrepancy.items():
-            table.add_row(name, c.unit, f"{c.rms:.4g}", f"{c.expected_rms:.4g}", f"{c.left_rms:.4g}", f"{c.p_value:.2g}")
+            sizes = (f"{v:.4g}" for v in (c.rms, c.expected_rms, c.unattributed_rms))
+            table.add_row(name, c.unit, *sizes, f"{c.p_value:.2g}", describe_row(c))
         console.print(table)
+    for line in describe_tolerated(d):
+        console.print(f"within tolerance: {line}", markup=False, soft_wrap=True)
     if d.findings:
         table = Table("cause", "size", "+-", "unit", "p", "gain", "or", box=None, header_style="bold", pad_edge=False)
         for f in d.findings:
             others = ", ".join(f"{name} {size:+.3g}" for name, size in f.aliases)
-            numbers = f"{f.size:+.4g}", f"{f.sigma:.2g}", f.definition.unit, f"{f.p_value:.1g}", f"{100 * f.gain.relative:.1f} %"
+            numbers = (f"{f.size:+.4g}", f"{f.sigma:.2g}", f.definition.unit, f"{f.p_value:.1g}", f"{100 * f.gain.relative:.1f} %")
             table.add_row(f.cause, *numbers, others)
         console.print(table)
+        for f in d.findings:
+            console.print(f"{f.cause}: {f.description}", markup=False, soft_wrap=True)
     for shape in d.trends:
         console.print(f"unexplained: {shape.text}", markup=False, soft_wrap=True)
     if d.next_drive:
         console.print(f"next drive: {d.next_drive}", markup=False, soft_wrap=True)
-    for note in d.warnings:
+    for note in (*d.contradictions, *describe_outliers(d), *d.warnings):
         console.print(f"! {note}", markup=False, soft_wrap=True)

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
-from localization.diagnosis.causes import Cause
+from localization.diagnosis.causes import MISSING_MESSAGES, Cause
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain, Verdict
+from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, with_tolerance
-from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, DrivePredictor, with_sizes
+from localization.diagnosis.prediction import DrivePredictor, with_sizes
 from localization.diagnosis.recommendations import general_advice, separating_drive
 from localization.diagnosis.selection import aliases_of, refined_cost, search_causes
 from localization.diagnosis.subset_selection import heldout_gain, max_statistic, p_value, statistic
-from localization.diagnosis.summary import evidence, sentence
+from localization.diagnosis.summary import describe_loss, describe_standstill_turn, evidence, sentence
 from localization.diagnosis.trends import find_trends
+from localization.diagnosis.verdict import attribute_rows, decide, find_outliers
 from localization.settings import Count, Probability, Seed, Settings
 from motion_models.base import MotionModel
 from motion_models.se2 import FloatArray
@@ -30,6 +31,7 @@ _SYSTEMATIC_SHARE = 1.0 / 3.0  # systematic part of a size's sigma, over what is
 _MIN_HELDOUT_GAIN = 0.003  # least held-out gain of a finding
 _CLEAR_HELDOUT_GAIN = 0.05
 _FEW_WINDOWS = 64
+_MIN_GAPS = 3  # fewer gaps between messages are pauses
 
 
 @dataclass(frozen=True)
@@ -154,85 +156,126 @@ def _conclude(
     rng: np.random.Generator,
     config: DiagnosisConfig,
 ) -> DiagnosisResult:
+    """Findings, the table with its attributions, and the verdict that follows from it."""
     drive, problem, causes = predictor.drive, linearization.problem, linearization.causes
+    chosen, gains, dropped = _keep_useful(linearization, chosen, config)
+    sizes, _, gained = problem.fit(chosen)
+    findings = _make_findings(predictor, linearization, chosen, gains, rng)
+    rows = attribute_rows(first, linearization, chosen, sizes, config.significance)
+    left = linearization.linear - linearization.signatures[..., list(chosen)] @ sizes
+    spreads = problem.scale * np.where(np.isin(np.arange(len(causes)), chosen), 1.0, problem.tolerance)
+    trends, left_gain = find_trends(predictor, linearization.noise, left, linearization.signatures, linearization.nuisances, spreads, rng)
+    share = left_gain / max(left_gain + gained, 1e-9) if trends else 0.0
+    detectable = _detectable_sizes(linearization)
+    undetectable = [e for e in causes if detectable[e.id] > e.typical]
+    verdict = decide(findings, trends, share, tuple(rows.values()), len(undetectable) / max(len(causes), 1))
+    if findings:
+        next_drive = separating_drive(predictor, findings, linearization, chosen)
+    else:
+        next_drive = general_advice(verdict, [e.id for e in undetectable])
+    within = {**dropped, **_within_tolerance(linearization, chosen, rows)}
+    result = Diagnosis(
+        *(drive.name, drive.robot.name, predictor.model.name, drive.motion_reference, verdict, rows, tuple(findings), trends),
+        left_share=share,
+        next_drive=next_drive,
+        sentence="",
+        within=within,
+        tolerances={e.id: _tolerated_size(linearization, e) for e in causes if e.id in within},
+        detectable_sizes=detectable,
+        gain=_heldout(linearization, chosen, (), config) if chosen else None,
+        contradictions=() if drive.standstill_turn is None else (describe_standstill_turn(drive.standstill_turn),),
+        outliers_s=tuple(float(t) for t in drive.starts_s[predictor.batch.owner][find_outliers(linearization)]),
+        windows=len(drive.maneuvers),
+        warnings=drive.warnings,
+        hypothesis=with_sizes({f.definition: f.size for f in findings}),
+    )
+    result = _with_data_errors(result, drive)
+    scale = np.sqrt(np.diagonal(problem.gram) + 1e-12)
+    residuals = Residuals(first.rows, left, linearization.noise.sigmas, tuple(e.key for e in causes), problem.gram / np.outer(scale, scale))
+    return DiagnosisResult(dataclasses.replace(result, sentence=sentence(result)), predictor, residuals, linearization)
 
-    def held(with_these: tuple[int, ...], without: tuple[int, ...]) -> Gain:
-        data = linearization.linear, linearization.signatures, linearization.nuisances, linearization.noise, problem.scale
-        return heldout_gain(*data, with_these, without, np.random.default_rng(config.seed))
 
+def _heldout(linearization: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], config: DiagnosisConfig) -> Gain:
+    data = linearization.linear, linearization.signatures, linearization.nuisances, linearization.noise, linearization.problem.scale
+    return heldout_gain(*data, chosen, others, np.random.default_rng(config.seed))
+
+
+def _tolerated_size(linearization: Linearization, cause: Cause) -> float:
+    return (1.0 if linearization.tolerance >= TOLERANCES[0] else _STRICT_FACTOR) * cause.negligible
+
+
+def _keep_useful(
+    linearization: Linearization, chosen: tuple[int, ...], config: DiagnosisConfig
+) -> tuple[tuple[int, ...], list[Gain], dict[str, tuple[float, float]]]:
+    """``chosen`` without those within tolerance or without held-out gain; the gain of each; size and sigma of those within tolerance."""
     within: dict[str, tuple[float, float]] = {}
-    least = 1.0 if linearization.tolerance >= TOLERANCES[0] else _STRICT_FACTOR
-    while chosen:  # what nobody would correct, or does not pay where its size was not fitted to, is not named
-        sizes, cov, _ = problem.fit(chosen)
-        gains = [held(chosen, tuple(j for j in chosen if j != i)) for i in chosen]
-        small = [
-            n
-            for n, i in enumerate(chosen)
-            if abs(sizes[n]) < least * causes[i].negligible or not _is_gain_significant(gains[n], len(linearization.rows))
-        ]
+    causes = linearization.causes
+    while True:
+        sizes, cov, _ = linearization.problem.fit(chosen)
+        gains = [_heldout(linearization, chosen, tuple(j for j in chosen if j != i), config) for i in chosen]
+        tolerated = [abs(size) < _tolerated_size(linearization, causes[i]) for size, i in zip(sizes, chosen, strict=True)]
+        small = [n for n in range(len(chosen)) if tolerated[n] or not _is_gain_significant(gains[n], len(linearization.rows))]
         if not small:
-            break
+            return chosen, gains, within
         worst = min(small, key=lambda n: gains[n].relative)
-        within[causes[chosen[worst]].id] = float(sizes[worst]), float(math.sqrt(cov[worst, worst]))
+        if tolerated[worst]:
+            within[causes[chosen[worst]].id] = float(sizes[worst]), float(math.sqrt(cov[worst, worst]))
         chosen = tuple(i for n, i in enumerate(chosen) if n != worst)
-    sizes, cov, gained = problem.fit(chosen)
-    findings = []
+
+
+def _make_findings(
+    predictor: DrivePredictor, linearization: Linearization, chosen: tuple[int, ...], gains: list[Gain], rng: np.random.Generator
+) -> list[Finding]:
+    """Findings, by their held-out gain."""
+    problem, causes = linearization.problem, linearization.causes
+    sizes, cov, _ = problem.fit(chosen)
+    found = []
     for n, i in enumerate(chosen):
         cause, size = causes[i], float(sizes[n])
         sigma = math.hypot(math.sqrt(cov[n, n]), _SYSTEMATIC_SHARE * cause.negligible)
-        if cause.id == "encoder_dropout":  # a share that comes in spells of random length is as sure as there were many
+        if cause.id == "encoder_dropout":  # spells of random length: the share is as certain as they are many
             sigma = math.hypot(sigma, size * math.sqrt(2.0 / max(predictor.dropout_count, 2)))
         others = tuple(j for j in chosen if j != i)
         p = _p_value(linearization, others, i, rng)
         aliases = aliases_of(predictor, linearization, chosen, i)
         text = evidence(cause, linearization.signatures[..., i] * size, linearization.noise, problem.gain(chosen) - problem.gain(others))
-        findings.append(Finding(cause, size, sigma, p, aliases, text, gains[n]))
-    findings.sort(key=lambda f: f.gain.relative, reverse=True)
-    total = held(chosen, ()) if chosen else None
-    findings = _merge_slopes(findings)
-    left = linearization.linear - linearization.signatures[..., list(chosen)] @ sizes
-    spreads = problem.scale * np.where(np.isin(np.arange(len(causes)), chosen), 1.0, problem.tolerance)
-    found_trends, left_gain = find_trends(
-        predictor, linearization.noise, left, linearization.signatures, linearization.nuisances, spreads, rng
-    )
-    share = left_gain / max(left_gain + gained, 1e-9) if found_trends else 0.0
-    detectable_sizes: dict[str, float] = {}
-    for i, cause in enumerate(causes):
+        found.append(Finding(cause, size, sigma, p, aliases, text, gains[n]))
+    return _merge_slopes(sorted(found, key=lambda f: f.gain.relative, reverse=True))
+
+
+def _detectable_sizes(linearization: Linearization) -> dict[str, float]:
+    problem = linearization.problem
+    found: dict[str, float] = {}
+    for i, cause in enumerate(linearization.causes):
         size = 3.0 * problem.scale[i] / math.sqrt(problem.gram[i, i] + 1.0)
-        detectable_sizes[cause.id] = min(detectable_sizes.get(cause.id, math.inf), float(size))
-    undetectable = [e for e in causes if detectable_sizes[e.id] > e.typical]
-    verdict: Verdict
-    if found_trends and (not findings or share > 0.3):
+        found[cause.id] = min(found.get(cause.id, math.inf), float(size))
+    return found
+
+
+def _within_tolerance(
+    linearization: Linearization, chosen: tuple[int, ...], rows: Mapping[str, Component]
+) -> dict[str, tuple[float, float]]:
+    """Size and sigma of the causes that are not named and yet account for a part of a significant row."""
+    listed = {a.cause for row in rows.values() for a in row.attributions if not a.is_named}
+    sizes, sigmas = linearization.problem.posterior(chosen), linearization.problem.posterior_sigmas(chosen)
+    found: dict[str, tuple[float, float]] = {}
+    for i, cause in enumerate(linearization.causes):
+        if cause.id in listed and i not in chosen and abs(sizes[i]) > abs(found.get(cause.id, (0.0, 0.0))[0]):
+            found[cause.id] = float(sizes[i]), float(sigmas[i])
+    return found
+
+
+def _with_data_errors(d: Diagnosis, drive: Drive) -> Diagnosis:
+    """``d`` with missing messages as a finding, and without a consistent verdict where measurements contradict each other."""
+    verdict, findings, loss = d.verdict, d.findings, drive.message_loss
+    if loss is not None and loss.share > MISSING_MESSAGES.negligible and loss.gaps >= _MIN_GAPS:
+        none = Gain(*(float("nan"),) * 2, 0.0, 0.0, 0.0) if d.gain is None else Gain(d.gain.after, d.gain.after, 0.0, 0.0, 0.0)
+        sigma = loss.share * math.sqrt(2.0 / loss.gaps)
+        findings = (*findings, Finding(MISSING_MESSAGES, loss.share, sigma, 0.0, (), describe_loss(loss), none))
+        verdict = "explained" if verdict in ("consistent", "undecidable") else verdict
+    if d.contradictions and verdict == "consistent":
         verdict = "unexplained"
-    elif any(f.aliases for f in findings):
-        verdict = "ambiguous"
-    elif findings:
-        verdict = "explained"
-    elif len(undetectable) > 0.5 * len(causes):
-        verdict = "undecidable"
-    else:
-        verdict = "consistent"
-    discrepancy = _components(first, linearization, left)
-    drive_next = (
-        separating_drive(predictor, findings, linearization, chosen) if findings else general_advice(verdict, [e.id for e in undetectable])
-    )
-    hypothesis = with_sizes({f.definition: f.size for f in findings})
-    result = Diagnosis(
-        *(drive.name, drive.robot.name, predictor.model.name, drive.motion_reference, verdict, discrepancy, tuple(findings), found_trends),
-        left_share=share,
-        next_drive=drive_next,
-        sentence="",
-        within=within,
-        detectable_sizes=detectable_sizes,
-        gain=total,
-        windows=len(drive.maneuvers),
-        warnings=drive.warnings,
-        hypothesis=hypothesis,
-    )
-    scale = np.sqrt(np.diagonal(problem.gram) + 1e-12)
-    alike = problem.gram / np.outer(scale, scale)
-    residuals = Residuals(first.rows, left, linearization.noise.sigmas, tuple(e.key for e in causes), alike)
-    return DiagnosisResult(dataclasses.replace(result, sentence=sentence(result)), predictor, residuals, linearization)
+    return dataclasses.replace(d, verdict=verdict, findings=findings)
 
 
 def _is_gain_significant(gain: Gain, windows: int) -> bool:
@@ -248,23 +291,6 @@ def _merge_slopes(findings: list[Finding]) -> list[Finding]:
     size = math.hypot(slopes[0].size, slopes[1].size)
     whole = dataclasses.replace(slopes[0], size=math.copysign(size, slopes[0].size))
     return [whole if f is slopes[0] else f for f in findings if f is not slopes[1]]
-
-
-def _components(first: Linearization, linearization: Linearization, left: FloatArray) -> dict[str, Component]:
-    """Per channel: what there was, what noise alone makes, and what is left."""
-    found = {}
-    white = linearization.noise.whiten(first.rows)
-    for c, name in enumerate(CHANNELS):
-        known = np.isfinite(first.rows[:, c])
-        if not known.any():
-            continue
-        rms, left_rms = (float(np.sqrt(np.mean(r[known, c] ** 2))) for r in (first.rows, left))
-        expected = float(np.sqrt(np.mean(linearization.noise.sigmas[known, c] ** 2)))
-        if c >= 4:
-            rms, left_rms = (float(np.std(r[known, c])) for r in (first.rows, left))
-        squares = float(np.sum(white[known, c] ** 2)) if c < 4 else float(known.sum())
-        found[name] = Component(CHANNEL_UNITS[c], rms, expected, float(chi2.sf(squares, int(known.sum()))), left_rms)
-    return found
 
 
 def _undecidable(drive: Drive, model: MotionModel, why: str) -> Diagnosis:

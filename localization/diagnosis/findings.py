@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from localization.diagnosis.causes import Cause, Hypothesis
 
@@ -50,10 +51,16 @@ class Finding:
     def cause(self) -> str:
         return self.definition.id
 
+    @property
+    def description(self) -> str:
+        """What it does, with its direction and size in words."""
+        return self.definition.describe(self.size)
+
     def to_dict(self) -> dict[str, Any]:
         return {
             "cause": self.cause,
             "meaning": self.definition.meaning,
+            "description": self.description,
             "size": self.size,
             "sigma": self.sigma,
             "unit": self.definition.unit,
@@ -65,9 +72,23 @@ class Finding:
         }
 
 
+RowStatus = Literal["noise", "attributed", "within tolerance", "unexplained"]
+
+
+class Attribution(NamedTuple):
+    """A cause that accounts for a part of one row of discrepancies."""
+
+    cause: str
+    size: float
+    share: float
+    """Of the row's whitened squares."""
+    is_named: bool
+    """Whether it is a finding; otherwise it is within its tolerance."""
+
+
 @dataclass(frozen=True)
 class Component:
-    """One component of the discrepancy over the whole drive."""
+    """One component of the discrepancy over the whole drive, without outlier windows."""
 
     unit: str
     rms: float
@@ -76,6 +97,13 @@ class Component:
     p_value: float
     left_rms: float
     """Once everything named is corrected."""
+    unattributed_rms: float
+    """Once what is within tolerance is taken off as well."""
+    status: RowStatus = "noise"
+    attributions: tuple[Attribution, ...] = ()
+
+    def with_status(self, status: RowStatus, attributions: tuple[Attribution, ...]) -> Component:
+        return dataclasses.replace(self, status=status, attributions=attributions)
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -84,6 +112,9 @@ class Component:
             "expected_rms": self.expected_rms,
             "p_value": self.p_value,
             "rms_explained": self.left_rms,
+            "rms_unattributed": self.unattributed_rms,
+            "status": self.status,
+            "attributions": [a._asdict() for a in self.attributions],
         }
 
 
@@ -95,10 +126,13 @@ class Trend:
     along: str
     t: float
     p_value: float
+    over_noise: float
+    """Its root mean square over the noise of the component."""
 
     @property
     def text(self) -> str:
-        return f"the {self.component} left over follows {self.along} (t = {self.t:+.1f}, p = {self.p_value:.2g})"
+        size = f"{self.over_noise:.2g} times its noise"
+        return f"the {self.component} left over follows {self.along} (t = {self.t:+.1f}, p = {self.p_value:.2g}, {size})"
 
 
 @dataclass(frozen=True)
@@ -118,11 +152,17 @@ class Diagnosis:
     next_drive: str
     sentence: str
     within: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Causes that show, but are smaller than anyone would correct: size and sigma."""
+    """Causes that are significant but smaller than their tolerance: size and sigma."""
+    tolerances: Mapping[str, float] = field(default_factory=dict)
+    """Tolerated size of each of them."""
     detectable_sizes: Mapping[str, float] = field(default_factory=dict)
     """Smallest size of each cause that this drive would show (three sigma, alone)."""
     gain: Gain | None = None
     """By all findings together."""
+    contradictions: tuple[str, ...] = ()
+    """Measurements that exclude each other, in sentences."""
+    outliers_s: tuple[float, ...] = ()
+    """When windows began that no cause explains to eight sigma: jumps of the reference, or events on the floor."""
     windows: int = 0
     warnings: tuple[str, ...] = ()
     hypothesis: Hypothesis = field(default_factory=Hypothesis)
@@ -140,6 +180,9 @@ class Diagnosis:
             "left_unexplained": left if self.trends else {},
             "next_drive": self.next_drive,
             "sentence": self.sentence,
+            "tolerances": dict(self.tolerances),
+            "contradictions": list(self.contradictions),
+            "outlier_windows_s": list(self.outliers_s),
             "witness": self.motion_reference,
             "windows": self.windows,
             "within_tolerance": {name: list(value) for name, value in self.within.items()},

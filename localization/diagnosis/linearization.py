@@ -15,8 +15,6 @@ from localization.diagnosis.subset_selection import Regression, regression
 from motion_models.base import MotionModel
 from motion_models.se2 import FloatArray
 
-_PRIOR = 4.0  # sigma of a size's prior, over the typical size
-
 
 @dataclass(frozen=True)
 class Linearization:
@@ -57,7 +55,11 @@ def candidate_causes(predictor: DrivePredictor, moments: int) -> tuple[Cause, ..
     drive = predictor.drive
     out = set()
     if drive.gyro is None and not drive.is_gyro_reference:
-        out.add("gyro_bias")
+        out |= {"gyro_bias", "gyro_scale", "gyro_time_offset"}
+    if drive.range_slopes is None:
+        out |= {"range_scale", "range_bias"}
+    if drive.kind != "log":
+        out.add("wheel_radius_drift")
     if not predictor.has_dropouts:
         out.add("encoder_dropout")
     if drive.is_gyro_reference:
@@ -109,7 +111,7 @@ def make_regression(
     y = noise.whiten(linear).ravel()
     s = noise.whiten(signatures).reshape(len(y), -1)
     z = noise.whiten(nuisances).reshape(len(y), -1)
-    return regression(y, s, z, _PRIOR * np.array([e.typical for e in causes]), tolerance * np.array([e.negligible for e in causes]))
+    return regression(y, s, z, np.array([e.plausible for e in causes]), tolerance * np.array([e.negligible for e in causes]))
 
 
 def _nuisances(rows: FloatArray) -> FloatArray:
@@ -136,7 +138,7 @@ def _estimate_drive_noise(
     sigmas[:, 3] = np.hypot(given[:, 2], 1e-3)
     sigmas[:, 4:] = 0.05
     noise = given_noise(linear, sigmas, follows)
-    scale = _PRIOR * np.array([e.typical for e in causes])
+    scale = np.array([e.plausible for e in causes])
     known = np.isfinite(linear)
     for _ in range(3):
         y = noise.whiten(linear).ravel()

@@ -76,7 +76,7 @@ class DrivePredictor:
         return int(np.count_nonzero(np.diff(self._lost, axis=0) > 0.0))
 
     def _headings(self) -> FloatArray:
-        """By the gyro less its mean difference to the witness; else by the witness's own turns, one after the other."""
+        """By the gyro less its mean difference to the reference_params; else by the reference_params's own turns, one after the other."""
         batch, drive = self.batch, self.drive
         last = np.r_[batch.owner[1:] != batch.owner[:-1], True]
         yaw = batch.measured[last, 2]
@@ -107,29 +107,31 @@ class DrivePredictor:
         """(M, 6) measured minus predicted, as `CHANNELS`: motion in the predicted end's frame; NaN where nothing was measured."""
         batch, drive = self.batch, self.drive
         out = np.full((len(batch.ends), len(CHANNELS)), np.nan)
-        witness = np.array(
+        reference_params = np.array(
             [hypothesis.wheel_time_offset_s - hypothesis.lidar_time_offset_s, hypothesis.wheel_lag_s, *self._tracked(hypothesis)]
         )
         if drive.is_gyro_reference:
-            witness[2:] = 0.0
+            reference_params[2:] = 0.0
         changed = _HypothesisModel(self, hypothesis)
         if self._path_batch is not None:
-            poses, _, _ = predict(changed, self._path_batch, changed.nominal, witness, _NO_COLUMNS, drive.robot.wheel_noise)
+            poses, _, _ = predict(changed, self._path_batch, changed.nominal, reference_params, _NO_COLUMNS, drive.robot.wheel_noise)
             apart = np.hypot(*(poses - self._path_batch.measured)[:, :2].T)
             out[:, 0] = drive.path_errors - np.bincount(self._path_batch.owner, apart) / np.bincount(self._path_batch.owner)
             return out
-        poses, _, _ = predict(changed, batch, changed.nominal, witness, _NO_COLUMNS, drive.robot.wheel_noise)
-        off = se2.between(poses, batch.measured)
+        poses, _, _ = predict(changed, batch, changed.nominal, reference_params, _NO_COLUMNS, drive.robot.wheel_noise)
+        off = se2.between(poses, self._measured(hypothesis))
         known = np.isfinite(np.diagonal(batch.cov, axis1=1, axis2=2))
         out[:, :3] = np.where(known, off, np.nan)
         if drive.is_gyro_reference:
-            out[:, 2] -= hypothesis.gyro_bias * np.array([float(m.dt[m.lead : m.lead + int(m.ends[-1])].sum()) for m in drive.maneuvers])
+            seconds = np.array([float(m.dt[m.lead : m.lead + int(m.ends[-1])].sum()) for m in drive.maneuvers])
+            out[:, 2] -= hypothesis.gyro_bias * seconds + batch.measured[:, 2] * hypothesis.gyro_scale / (1.0 + hypothesis.gyro_scale)
         if drive.gyro is not None:
-            late = round(hypothesis.lidar_time_offset_s * 1e9)
+            late = round((hypothesis.lidar_time_offset_s - hypothesis.gyro_time_offset_s) * 1e9)
             for i, (a, b) in enumerate(drive.spans_ns):
                 turn = drive.gyro.turn(int(a) - late, int(b) - late, float(batch.measured[i, 2]))
                 if turn is not None:
-                    out[i, 3] = turn.angle - batch.measured[i, 2] - hypothesis.gyro_bias * turn.duration
+                    angle = turn.angle / (1.0 + hypothesis.gyro_scale)
+                    out[i, 3] = angle - batch.measured[i, 2] - hypothesis.gyro_bias * turn.duration
         if drive.forces is not None:
             middle = self.headings + 0.5 * batch.measured[:, 2]
             c, s = np.cos(middle), np.sin(middle)
@@ -137,6 +139,24 @@ class DrivePredictor:
             out[:, 4] = drive.forces[:, 0] - self._kinematic_forces[:, 0] - (c * sx + s * sy)
             out[:, 5] = drive.forces[:, 1] - self._kinematic_forces[:, 1] - (-s * sx + c * sy)
         return out
+
+    def _wheel_shift(self, hypothesis: Hypothesis) -> float:
+        """By how much the wheels' stamps are later than those of the motion reference [s]."""
+        b = hypothesis
+        return b.wheel_time_offset_s - (b.gyro_time_offset_s if self.drive.is_gyro_reference else b.lidar_time_offset_s)
+
+    def _measured(self, hypothesis: Hypothesis) -> FloatArray:
+        """(M, 3) measured poses without the ranging errors of ``hypothesis``: scan matching scales the LiDAR's own path, and a constant
+        error of all ranges acts by the scene's own derivative (`Drive.range_slopes`)."""
+        b, measured = hypothesis, self.batch.measured
+        if self.drive.range_slopes is None or not (b.range_scale or b.range_bias_m):
+            return measured
+        found = measured - b.range_bias_m * self.drive.range_slopes
+        x, y = self.drive.lidar_at
+        c, s = np.cos(found[:, 2]), np.sin(found[:, 2])
+        lever = np.column_stack([(c - 1.0) * x - s * y, s * x + (c - 1.0) * y])
+        found[:, :2] = (found[:, :2] + lever) / (1.0 + b.range_scale) - lever
+        return found
 
     def _tracked(self, hypothesis: Hypothesis) -> tuple[float, float, float]:
         """Real pose of the frame that the LiDAR's transform takes for the body's: it turns about the sensor, not about the body."""
@@ -176,6 +196,8 @@ class _HypothesisModel:
     def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
         p, b = self._p, self._b
         rates = wheels * np.maximum(1.0 + np.array([b.left_radius_scale, b.right_radius_scale]), 0.1)
+        if b.wheel_radius_drift:
+            rates = rates * (1.0 + b.wheel_radius_drift * p._times / max(float(p.drive.starts_s[-1]), 1e-9))[:, None]
         if b.encoder_loss:
             rates = rates * (1.0 + b.encoder_loss / max(p._lost_time, 1e-9) * p._lost)
         key = (*self._rates_key(), "model")
@@ -204,7 +226,7 @@ class _HypothesisModel:
     def _floor(self, rates: FloatArray, cg: FloatArray) -> FloatArray:
         """(N, 3) what the friction model says is otherwise: causes of the floor, and inertia."""
         p, b = self._p, self._b
-        is_otherwise = b.friction or any(b.cg) or b.payload_kg or b.friction_change or b.other_contact_law
+        is_otherwise = b.friction or any(b.cg) or b.payload_kg or b.friction_change or b.other_contact_law or b.split_friction
         if not (is_otherwise or any(b.slope) or p.has_inertia):
             return np.zeros((len(rates), 3))
         friction = p._friction
@@ -224,6 +246,9 @@ class _HypothesisModel:
         if any(b.cg) or b.payload_kg:
             mass = p.drive.robot.geometry.mass_kg
             moved = cg + np.array(b.cg) + (p.drive.payload_arms * (b.payload_kg / (mass + b.payload_kg)) if b.payload_kg else 0.0)
+        if b.split_friction:
+            moved = _shifted_by_grip(moved, 0.5 * params[1], b.split_friction)
+        if moved is not cg:
             half = 0.49 * np.array([params[2], params[1]])
             moved = np.clip(moved, -half, half)
         if not b.friction_change:
@@ -237,17 +262,26 @@ class _HypothesisModel:
 
     def _quasi_static(self, law: FrictionModel, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
         """(N, 3) twists of the tracked point without inertia; cached, as many hypotheses share them."""
-        p, b = self._p, self._b
-        key = (*self._rates_key(), law.saturation, params.tobytes(), *((b.cg, b.payload_kg) if cg is not p.batch.cg else ()))
+        p = self._p
+        key = (
+            *self._rates_key(),
+            law.saturation,
+            params.tobytes(),
+            *(self._load_key() if cg is not p.batch.cg else ()),
+        )
         if key not in p._twists:
             if len(p._twists) > _MAX_CACHED_TWISTS:
                 p._twists.clear()
             p._twists[key] = quasi_static_twists(law, params, rates, cg)
         return p._twists[key]
 
-    def _rates_key(self) -> tuple[object, ...]:
+    def _load_key(self) -> tuple[object, ...]:
         b = self._b
-        return b.left_radius_scale, b.right_radius_scale, b.encoder_loss, b.wheel_time_offset_s - b.lidar_time_offset_s, b.wheel_lag_s
+        return b.cg, b.payload_kg, b.split_friction
+
+    def _rates_key(self) -> tuple[object, ...]:
+        p, b = self._p, self._b
+        return b.left_radius_scale, b.right_radius_scale, b.encoder_loss, b.wheel_radius_drift, p._wheel_shift(b), b.wheel_lag_s
 
     def _with_inertia(self, law: FrictionModel, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
         """(N, 3) twists of the tracked point, with inertia where that counts."""
@@ -260,7 +294,7 @@ class _HypothesisModel:
             law.saturation,
             params.tobytes(),
             b.slope,
-            *((b.cg, b.payload_kg) if cg is not p.batch.cg else ()),
+            *(self._load_key() if cg is not p.batch.cg else ()),
             "inertia",
         )
         if key not in p._twists:
@@ -270,6 +304,16 @@ class _HypothesisModel:
             twists = dynamic_twists(p.drive.robot, law, params, batch.dt, rates, cg, batch.first, p.headings, b.slope, middle)
             p._twists[key] = np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
         return p._twists[key]
+
+
+def _shifted_by_grip(cg: FloatArray, half_track: float, split: float) -> FloatArray:
+    """(N, 2) centres of the contact forces where the left wheels grip ``split`` more than the right ones, over the mean of both.
+
+    A contact's force goes with its load times its friction: unequal friction acts like a load that is shifted to the side with more grip.
+    """
+    left = (1.0 + cg[:, 1] / half_track) * (1.0 + 0.5 * split)
+    right = (1.0 - cg[:, 1] / half_track) * (1.0 - 0.5 * split)
+    return np.column_stack([cg[:, 0], half_track * (left - right) / (left + right)])
 
 
 def with_sizes(sizes: dict[Cause, float]) -> Hypothesis:

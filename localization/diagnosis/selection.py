@@ -74,7 +74,7 @@ def aliases_of(predictor: DrivePredictor, linearization: Linearization, chosen: 
         subset = (*others, j)
         gain = problem.gain(subset)
         size = float(problem.fit(subset)[0][-1])
-        if own - gain > tolerance or (cause.one_sided and size < 0.0) or abs(size) > 10.0 * cause.typical:
+        if own - gain > tolerance or (cause.one_sided and size < 0.0) or abs(size) > cause.largest:
             continue
         if cause.id not in found or gain > found[cause.id][0]:
             found[cause.id] = gain, j
@@ -138,7 +138,7 @@ def _linear_sizes(linearization: Linearization, subset: tuple[int, ...]) -> dict
 
 
 def _bounds(causes: tuple[Cause, ...]) -> FloatArray:
-    return np.array([(0.0 if e.one_sided else -10.0 * e.typical, 10.0 * e.typical) for e in causes])
+    return np.array([(0.0 if e.one_sided else -e.largest, e.largest) for e in causes])
 
 
 def _bounded(cause: Cause, size: float) -> float:

@@ -67,6 +67,16 @@ class Regression:
         scale = self.scale[i]
         return sizes * scale, (inverse.T @ inverse) * np.outer(scale, scale), twice - self._evidence(())[2]
 
+    def posterior(self, subset: tuple[int, ...]) -> FloatArray:
+        """(p,) posterior means of all sizes, in own units, with those outside of ``subset`` held to their tolerance."""
+        factor, half, _ = self._evidence(subset)
+        return np.asarray(np.linalg.solve(factor.T, half) * self.scale)
+
+    def posterior_sigmas(self, subset: tuple[int, ...]) -> FloatArray:
+        """(p,) standard deviations of `posterior`."""
+        factor, _, _ = self._evidence(subset)
+        return np.asarray(np.linalg.norm(np.linalg.solve(factor, np.eye(len(factor))), axis=0) * self.scale)
+
     def gain(self, subset: tuple[int, ...]) -> float:
         """Twice the log-evidence gained over naming nothing."""
         return self._evidence(subset)[2] - self._evidence(())[2] if subset else 0.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from localization.diagnosis.findings import Trend
@@ -90,6 +92,6 @@ def find_trends(
         if p > _SIGNIFICANT:
             break
         gained += float(t[best]) ** 2
-        result.append(Trend(*names[best], float(t[best]), p))
+        result.append(Trend(*names[best], float(t[best]), p, abs(float(t[best])) / math.sqrt(len(left))))
         given = (*given, best)
     return tuple(result), gained
