@@ -36,7 +36,7 @@ d = found.diagnosis
 print(f"{d.verdict}: {d.sentence}")
 
 # %% [markdown]
-# ## Step 1. Look at the discrepancies
+# ## Step 1. Linearization at the discrepancies
 #
 # Measured minus predicted displacement after 5 s, in the body frame. If this were noise it would be a band around zero; the bars of noise
 # are what the drive itself shows. It is off by centimetres, always to the same side.
@@ -110,13 +110,13 @@ picture(
 table(
     ["cause", "size", "sigma", "unit", "held-out errors fall by", "looks the same"],
     *(
-        [f.effect.meaning, f.size, f.sigma, f.effect.unit, f"{100 * f.gain.relative:.0f} %", ", ".join(a for a, _ in f.aliases)]
+        [f.definition.meaning, f.size, f.sigma, f.definition.unit, f"{100 * f.gain.relative:.0f} %", ", ".join(a for a, _ in f.aliases)]
         for f in d.findings
     ),
 )
 
 # %% [markdown]
-# ## Step 4. Look again
+# ## Step 4. Linearization again
 #
 # What is left once these are corrected.
 
@@ -192,6 +192,6 @@ f"turns least at x_G = {-500.0 * b / a:+.1f} mm; its centre of rotation is off b
 # ## What is left
 
 # %%
-if d.shapes:
-    print("Not explained:", "; ".join(shape.text for shape in d.shapes))
+if d.trends:
+    print("Not explained:", "; ".join(shape.text for shape in d.trends))
 print(d.next_drive or "No further drive is asked for.")

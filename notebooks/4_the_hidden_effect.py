@@ -28,7 +28,7 @@ from localization.report.notebook import Bars, Panel, Series, picture, table
 from localization.simulation import FAULTS
 
 sys.path.insert(0, "..")
-from tests.helpers.diagnosis_drives import TYPICAL, bag, look
+from tests.helpers.diagnosis_drives import TYPICAL, bag, diagnose_bag
 
 table(
     ["you may hide", "unit", "a size that robots have", "meaning"],
@@ -46,7 +46,7 @@ table(
 def diagnosed(hidden, seed=0):
     """Drive with ``hidden`` effects, write the log, and diagnose it."""
     with tempfile.TemporaryDirectory() as folder:
-        return look(bag(Path(folder) / "drive.mcap", hidden, seed))
+        return diagnose_bag(bag(Path(folder) / "drive.mcap", hidden, seed))
 
 
 found = diagnosed(HIDDEN)

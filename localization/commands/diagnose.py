@@ -14,10 +14,11 @@ from localization.calibration.calibrate import MotionReferenceName
 from localization.calibration.windows import WindowConfig
 from localization.commands.common import new_folder, write_json
 from localization.diagnosis.controller_runs import drive_of_runs, read_runs
-from localization.diagnosis.corrected_robot import patched
-from localization.diagnosis.diagnose import DiagnosisConfig, Examined, examine
+from localization.diagnosis.corrected_robot import correct_robot
+from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_table
 from localization.diagnosis.findings import Diagnosis
+from localization.diagnosis.summary import describe_outliers, describe_row, describe_tolerated
 from localization.logs import TopicOverrides, open_log
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
@@ -89,14 +90,16 @@ class Diagnose:
             return drive_of_table(name, robot, maneuvers, "rotations")
         return drive_of_table(name, robot, read_windows(self.source), "windows")
 
-    def _write_robot(self, folder: Path, found: Examined, robot: Robot) -> None:
+    def _write_robot(self, folder: Path, found: DiagnosisResult, robot: Robot) -> None:
         d = found.diagnosis
-        new, by_hand = robot, ()  # type: Robot, tuple[str, ...]
-        if found.pipeline is not None and d.findings:
-            patch = patched(found.pipeline, d.belief)
-            new, by_hand = patch.robot, patch.by_hand
-        named = "; ".join(f"{f.cause} {f.size:+.4g} +- {f.sigma:.2g} {f.effect.unit}".removesuffix(" 1") for f in d.findings) or "nothing"
-        remarks = [f"Diagnosed by skidloc: {d.model} on {d.log}, from {robot.name}.", f"Corrected here: {named}.", *by_hand]
+        new, manual_steps = robot, ()  # type: Robot, tuple[str, ...]
+        if found.predictor is not None and d.findings:
+            patch = correct_robot(found.predictor, d.hypothesis)
+            new, manual_steps = patch.robot, patch.manual_steps
+        named = (
+            "; ".join(f"{f.cause} {f.size:+.4g} +- {f.sigma:.2g} {f.definition.unit}".removesuffix(" 1") for f in d.findings) or "nothing"
+        )
+        remarks = [f"Diagnosed by skidloc: {d.model} on {d.log}, from {robot.name}.", f"Corrected here: {named}.", *manual_steps]
         # in the folder's parent, paths start where they will start once it has its name
         text = robot_toml(relocated(new, folder), remarks="\n".join(remarks))
         write_text_file(folder / "robot.toml", text)
@@ -106,20 +109,26 @@ def print_diagnosis(console: Console, d: Diagnosis) -> None:
     """Verdict and sentence first, then discrepancies and findings."""
     console.print(f"{d.verdict}: {d.sentence}", markup=False, soft_wrap=True)
     if d.discrepancy:
-        table = Table("measured - predicted", "unit", "rms", "noise", "left", "p", box=None, header_style="bold", pad_edge=False)
+        titles = "measured - predicted", "unit", "rms", "noise", "left", "p", "attributed to"
+        table = Table(*titles, box=None, header_style="bold", pad_edge=False)
         for name, c in d.discrepancy.items():
-            table.add_row(name, c.unit, f"{c.rms:.4g}", f"{c.expected_rms:.4g}", f"{c.left_rms:.4g}", f"{c.p_value:.2g}")
+            sizes = (f"{v:.4g}" for v in (c.rms, c.expected_rms, c.unattributed_rms))
+            table.add_row(name, c.unit, *sizes, f"{c.p_value:.2g}", describe_row(c))
         console.print(table)
+    for line in describe_tolerated(d):
+        console.print(f"within tolerance: {line}", markup=False, soft_wrap=True)
     if d.findings:
         table = Table("cause", "size", "+-", "unit", "p", "gain", "or", box=None, header_style="bold", pad_edge=False)
         for f in d.findings:
             others = ", ".join(f"{name} {size:+.3g}" for name, size in f.aliases)
-            numbers = f"{f.size:+.4g}", f"{f.sigma:.2g}", f.effect.unit, f"{f.p_value:.1g}", f"{100 * f.gain.relative:.1f} %"
+            numbers = (f"{f.size:+.4g}", f"{f.sigma:.2g}", f.definition.unit, f"{f.p_value:.1g}", f"{100 * f.gain.relative:.1f} %")
             table.add_row(f.cause, *numbers, others)
         console.print(table)
-    for shape in d.shapes:
+        for f in d.findings:
+            console.print(f"{f.cause}: {f.description}", markup=False, soft_wrap=True)
+    for shape in d.trends:
         console.print(f"unexplained: {shape.text}", markup=False, soft_wrap=True)
     if d.next_drive:
         console.print(f"next drive: {d.next_drive}", markup=False, soft_wrap=True)
-    for note in d.warnings:
+    for note in (*d.contradictions, *describe_outliers(d), *d.warnings):
         console.print(f"! {note}", markup=False, soft_wrap=True)

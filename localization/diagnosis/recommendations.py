@@ -1,4 +1,4 @@
-"""The drive that would tell rivals apart: the maneuver in which they predict most differently, by expected information."""
+"""Experiment design: the short maneuver in which the causes that explain a drive alike predict most differently."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from localization.diagnosis.causes import EFFECTS, EXTRA, Effect
+from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause
 from localization.diagnosis.drive import drive_of_table
 from localization.diagnosis.findings import Finding
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
@@ -22,7 +22,7 @@ _MOST_S = 600.0
 _ENOUGH = 9.0  # twice the log-likelihood that decides
 
 
-def maneuvers_to_try(speed: float, radius: float, cg: FloatArray, has_arms: bool, track: float) -> list[tuple[str, list[Maneuver]]]:
+def candidate_maneuvers(speed: float, radius: float, cg: FloatArray, has_arms: bool, track: float) -> list[tuple[str, list[Maneuver]]]:
     """Drives of 20 s in windows of 2 s, each with what to call it; ``speed`` [m/s] of the drive that was diagnosed."""
     rate = max(speed, 0.3) / radius
     turn = 0.35 * rate
@@ -62,31 +62,33 @@ def maneuvers_to_try(speed: float, radius: float, cg: FloatArray, has_arms: bool
     return found
 
 
-def separating_drive(pipeline: DrivePredictor, findings: Sequence[Finding], state: Any, chosen: tuple[int, ...]) -> str:
+def separating_drive(predictor: DrivePredictor, findings: Sequence[Finding], linearization: Any, chosen: tuple[int, ...]) -> str:
     """In words; empty where nothing is left to tell apart."""
     rivals = [f for f in findings if f.aliases]
     if not rivals:
         return ""
     finding = rivals[0]
-    drive = pipeline.drive
-    wheels = pipeline.batch.wheels
+    drive = predictor.drive
+    wheels = predictor.batch.wheels
     robot = drive.robot
     speed = robot.geometry.wheel_radius_m * float(np.quantile(np.abs(wheels.mean(axis=1)), 0.75))
-    cg = pipeline.batch.cg.mean(axis=0)
-    others = {f.effect: f.size for f in findings if f is not finding}
-    pairs = [(finding.effect, finding.size), *((_named(name), size) for name, size in finding.aliases[:4])]
+    cg = predictor.batch.cg.mean(axis=0)
+    others = {f.definition: f.size for f in findings if f is not finding}
+    pairs = [(finding.definition, finding.size), *((_named(name), size) for name, size in finding.aliases[:4])]
     best = ("", 0.0)
-    for text, maneuvers in maneuvers_to_try(speed, robot.geometry.wheel_radius_m, cg, robot.arms is not None, robot.geometry.track_width_m):
+    for text, maneuvers in candidate_maneuvers(
+        speed, robot.geometry.wheel_radius_m, cg, robot.arms is not None, robot.geometry.track_width_m
+    ):
         table = drive_of_table("next", robot, maneuvers, "windows")
-        tried = DrivePredictor(table, pipeline.model, pipeline.settling)
+        tried = DrivePredictor(table, predictor.model, predictor.has_inertia)
         base = with_sizes(others)
         start = tried.discrepancies(base)[:, :3]
         moved = [(start - tried.discrepancies(e.inject(base, s))[:, :3]) / _SIGMA for e, s in pairs if e is not None]
-        told = []
+        informations = []
         for other in moved[1:]:
             # the rival may take whatever size it likes in the new drive, but then it no longer fits the old one
-            told.append(float(np.sum((moved[0] - other) ** 2)))
-        information = min(told) if told else 0.0
+            informations.append(float(np.sum((moved[0] - other) ** 2)))
+        information = min(informations) if informations else 0.0
         if information > max(1.05 * best[1], 1e-3):
             best = text, information
     names = [e.id for e, _ in pairs if e is not None]
@@ -97,8 +99,8 @@ def separating_drive(pipeline: DrivePredictor, findings: Sequence[Finding], stat
     return f"To separate {listed}, record about {seconds:.0f} s of {best[0]}."
 
 
-def _named(name: str) -> Effect | None:
-    return EFFECTS.get(name) or EXTRA.get(name)
+def _named(name: str) -> Cause | None:
+    return CAUSES.get(name) or WINDOW_CAUSES.get(name)
 
 
 def general_advice(verdict: str, blind: Sequence[str]) -> str:
@@ -110,5 +112,5 @@ def general_advice(verdict: str, blind: Sequence[str]) -> str:
         )
     if verdict == "consistent" and blind:
         hidden = ", ".join(dict.fromkeys(blind))
-        return f"This drive would not show a usual {hidden}; turns in place, arcs to both sides and other postures would."
+        return f"This drive would not show a typical {hidden}; turns in place, arcs to both sides and other postures would."
     return ""

@@ -38,6 +38,8 @@ class Chassis(NamedTuple):
     rest_speed: float
     tyre_lag: float
     """Time in which the loads follow the forces [s]."""
+    grip_split: float = 0.0
+    """The left wheels grip more by half of this share, the right ones less."""
 
 
 class DynamicsInput(NamedTuple):
@@ -258,15 +260,16 @@ def integrate(state: FloatArray, wheels: FloatArray, cg: FloatArray, out: FloatA
 @numba.njit(cache=True, error_model="numpy")
 def _wheel_grips(state: FloatArray, body: Chassis, patches: FloatArray) -> tuple[float, float, float, float]:
     """Factors of the friction under front left, front right, rear left and rear right wheel."""
+    left, right = 1.0 + 0.5 * body.grip_split, 1.0 - 0.5 * body.grip_split
     if patches.shape[0] == 0:
-        return 1.0, 1.0, 1.0, 1.0
+        return left, right, left, right
     c, s = math.cos(state[2]), math.sin(state[2])
     fx, fy, lx, ly = c * body.half_wheelbase, s * body.half_wheelbase, -s * body.half_track, c * body.half_track
     return (
-        _grip(state[0] + fx + lx, state[1] + fy + ly, patches),
-        _grip(state[0] + fx - lx, state[1] + fy - ly, patches),
-        _grip(state[0] - fx + lx, state[1] - fy + ly, patches),
-        _grip(state[0] - fx - lx, state[1] - fy - ly, patches),
+        left * _grip(state[0] + fx + lx, state[1] + fy + ly, patches),
+        right * _grip(state[0] + fx - lx, state[1] + fy - ly, patches),
+        left * _grip(state[0] - fx + lx, state[1] - fy + ly, patches),
+        right * _grip(state[0] - fx - lx, state[1] - fy - ly, patches),
     )
 
 

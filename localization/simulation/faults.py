@@ -32,6 +32,18 @@ class TrueRobot:
     """About the body's z axis [rad/s]."""
     encoder_lost: float = 0.0
     """Share of time in which the front left encoder loses its counts."""
+    gyro_scale: float = 0.0
+    """Share by which the gyro's rates are too large."""
+    gyro_late_s: float = 0.0
+    """By how much the IMU's stamps are late."""
+    range_scale: float = 0.0
+    """Share by which the LiDAR's ranges are too long."""
+    range_bias_m: float = 0.0
+    """By how much they are too long whatever the distance."""
+    wheel_radius_drift: float = 0.0
+    """Share by which all wheels grow from the drive's first phase to its last."""
+    missing_joint_messages: float = 0.0
+    """Share of the joint states that are missing."""
     friction_change_factor: float = 1.0
     """Factor of the sideways friction in the second half of the drive."""
 
@@ -105,6 +117,10 @@ def _other_law(reality: TrueRobot, size: float) -> TrueRobot:
     return _body(reality, dataclasses.replace(reality.body, saturation=old + (1.0 - 2.0 * round(old)) * size))
 
 
+def _split(reality: TrueRobot, size: float) -> TrueRobot:
+    return _body(reality, dataclasses.replace(reality.body, grip_split=reality.body.grip_split + size))
+
+
 def _slope(reality: TrueRobot, size: float) -> TrueRobot:
     return _body(reality, dataclasses.replace(reality.body, slope=reality.body.slope + size))
 
@@ -137,6 +153,13 @@ _ALL = (
     Fault("slope", "rad", "the floor rises towards the world's +x by this angle", 0.4, _slope),
     Fault("encoder_dropout", "1", "share of time in which the front left encoder loses its counts", 0.9, _plain("encoder_lost")),
     Fault("gyro_bias", "rad/s", "the gyro turns about the body's z axis while nothing does", 1.0, _plain("gyro_bias")),
+    Fault("gyro_scale", "1", "the gyro's rates are larger than the truth by this share", 0.5, _plain("gyro_scale")),
+    Fault("gyro_time_offset", "s", "the IMU's stamps are late by this", 0.5, _plain("gyro_late_s")),
+    Fault("range_scale", "1", "the LiDAR's ranges are longer than the truth by this share", 0.5, _plain("range_scale")),
+    Fault("range_bias", "m", "the LiDAR's ranges are longer than the truth by this", 0.5, _plain("range_bias_m")),
+    Fault("wheel_radius_drift", "1", "all wheels grow by this share over the drive", 0.5, _plain("wheel_radius_drift")),
+    Fault("split_friction", "1", "the left wheels grip more by half of this share, the right ones less", 0.9, _split),
+    Fault("missing_joint_messages", "1", "share of the joint states that are missing, in bursts", 0.9, _plain("missing_joint_messages")),
     Fault("lateral_slip_speed", "s", "a loose floor shears sideways in curves: vy += s vx wz", 1.0, _yield(0)),
     Fault("rotation_slip_speed", "s/m", "a loose floor turns along at speed: wz *= 1 - s |vx|", 0.5, _yield(1)),
     Fault("longitudinal_slip_turning", "s/rad", "a loose floor gives way in turns: vx *= 1 - s |wz|", 0.5, _yield(2)),
@@ -167,7 +190,7 @@ def apply_faults(reality: TrueRobot, effects: Mapping[str, float]) -> TrueRobot:
             known = "\n".join(f"  {e.id} [{e.unit}]: {e.meaning}" for e in _ALL)
             raise SimulationError(f"no effect '{name}'; there are\n{known}")
         effect = FAULTS[name]
-        least = 0.0 if name in ("payload", "encoder_dropout", "lateral_force_law") else -effect.largest
+        least = 0.0 if name in ("payload", "encoder_dropout", "lateral_force_law", "missing_joint_messages") else -effect.largest
         if not least <= size <= effect.largest:
             raise SimulationError(f"effect {name} of {size:g} {effect.unit} is out of reason; it may be {least:g} to {effect.largest:g}.")
         reality = effect.apply(reality, size)

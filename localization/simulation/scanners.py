@@ -37,6 +37,10 @@ class ScannerConfig(Settings):
     """Ranges are rounded to this [m]."""
     dropout: Share = 0.002
     """Share of beams that do not come back."""
+    range_scale: Signed = 0.0
+    """Share by which the ranges are too long."""
+    range_bias_m: Signed = 0.0
+    """By how much they are too long whatever the distance [m]."""
     min_range_m: Annotated[float, Below("max_range_m")] = 0.1
     """Least range [m]."""
     max_range_m: Positive = 40.0
@@ -61,6 +65,10 @@ class SpinningConfig(Settings):
     """Standard deviation of a range [m]."""
     dropout: Share = 0.005
     """Share of beams that do not come back."""
+    range_scale: Signed = 0.0
+    """Share by which the ranges are too long."""
+    range_bias_m: Signed = 0.0
+    """By how much they are too long whatever the distance [m]."""
     min_range_m: Annotated[float, Below("max_range_m")] = 0.5
     """Least range [m]."""
     max_range_m: Positive = 100.0
@@ -101,6 +109,8 @@ class PlanarScanner:
         ranges = np.empty((len(starts), c.beams))
         beams = BeamPattern(self.beam_s, self._first, self._step, self._mount, c.max_range_m)
         _cast_sweeps(seconds(starts), beams, Scene(self._grid, self._world.people, track.rows, track.start_s, track.step_s), ranges)
+        ranges *= 1.0 + c.range_scale
+        ranges += c.range_bias_m
         ranges += self._rng.normal(0.0, c.noise_m, ranges.shape) if c.noise_m > 0.0 else 0.0
         if c.resolution_m > 0.0:
             ranges = np.round(ranges / c.resolution_m) * c.resolution_m
@@ -204,6 +214,7 @@ class SpinningScanner:
             flat = np.where(up > 0.0, (self._world.ceiling_m - self._height) / up, np.where(up < 0.0, -self._height / up, np.inf))
             flat = np.minimum(level, flat)
             ranges = flat / np.cos(self._elevation)[:, None]
+            ranges = (1.0 + c.range_scale) * ranges + c.range_bias_m
             ranges = ranges + self._rng.normal(0.0, c.noise_m, ranges.shape)
             lost = ~((ranges > c.min_range_m) & (ranges < c.max_range_m)) | (self._rng.random(ranges.shape) < c.dropout)
         ranges[lost] = np.nan

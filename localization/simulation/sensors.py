@@ -12,7 +12,7 @@ import numpy as np
 
 from localization.logs import message_templates
 from localization.logs.message_templates import Message
-from localization.settings import Allowed, Positive, Settings, Signed
+from localization.settings import Allowed, Positive, Settings, Share, Signed
 from localization.simulation.faults import TrueRobot
 from localization.simulation.scanners import PlanarScanner, ScannerConfig, SpinningConfig, SpinningScanner
 from localization.simulation.track import SampleClock, TrueMotion, seconds
@@ -31,6 +31,8 @@ class EncoderConfig(Settings):
     """Joint states per second."""
     counts: int = 4096
     """Counts of an encoder per turn of the wheel; 0 for exact angles."""
+    missing: Share = 0.0
+    """Share of the messages that are missing, in bursts of 0.2 s on average."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,10 @@ class ImuConfig(Settings):
     """Random walk of the bias [rad/s/sqrt(s)]."""
     force_noise: float = 2e-3
     """White noise of the specific force [m/s^2/sqrt(Hz)]."""
+    gyro_scale: Signed = 0.0
+    """Share by which the rates are too large."""
+    late_s: Signed = 0.0
+    """By how much the stamps are late [s]."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,26 @@ class GpsConfig(Settings):
     """Of the world's origin [deg]."""
     longitude_deg: Signed = -97.7354
     """Of the world's origin [deg]."""
+
+
+_MEAN_SPELL_S = 0.3  # of an encoder's loss of counts
+_MEAN_BURST_S = 0.2  # of missing messages
+
+
+class Spells:
+    """Alternating spells of loss and of data, exponentially long; ``share`` is that of the loss, ``mean_s`` its mean length."""
+
+    def __init__(self, share: float, mean_s: float, rng: np.random.Generator) -> None:
+        self._share, self._mean_s, self._rng = share, mean_s, rng
+        self._lost_until_ns, self._complete_until_ns = 0, 0
+
+    def is_lost(self, tick_ns: int) -> bool:
+        """Whether data of this moment are lost; moments must not decrease."""
+        while tick_ns >= self._complete_until_ns:
+            self._lost_until_ns = self._complete_until_ns + int(self._rng.exponential(self._mean_s) * 1e9)
+            complete_s = self._mean_s * (1.0 - self._share) / self._share
+            self._complete_until_ns = self._lost_until_ns + int(self._rng.exponential(complete_s) * 1e9)
+        return tick_ns < self._lost_until_ns
 
 
 class EncoderSensor:
@@ -84,7 +110,8 @@ class EncoderSensor:
         self._late_ns, self._lost_left = round(late_s * 1e9), lost_left
         self._ticks = SampleClock(config.rate_hz)
         self._counts, self._shown = np.zeros(len(wheels)), np.zeros(len(wheels))
-        self._lost_until_ns, self._heard_until_ns = 0, 0
+        self._count_spells = Spells(lost_left, _MEAN_SPELL_S, rng)
+        self._message_spells = Spells(config.missing, _MEAN_BURST_S, rng)
 
     def messages(self, track: TrueMotion) -> list[Message]:
         """All samples up to the track's end."""
@@ -99,25 +126,19 @@ class EncoderSensor:
         steps = np.diff(counts, axis=0, prepend=self._counts[None])
         self._counts = counts[-1]
         if self._lost_left > 0.0:
-            steps[[self._is_lost(int(tick)) for tick in ticks], 0] = 0.0
+            steps[[self._count_spells.is_lost(int(tick)) for tick in ticks], 0] = 0.0
         shown = self._shown + np.cumsum(steps, axis=0)
         self._shown = shown[-1]
         scale = unit or 1.0
         rates = steps * scale * self._config.rate_hz
         found = []
         for i, tick in enumerate(ticks):
+            if self._config.missing > 0.0 and self._message_spells.is_lost(int(tick)):
+                continue
             stamp = self._start_ns + int(tick)
             parts = np.concatenate([shown[i] * scale, arms[i]]), np.concatenate([rates[i], arm_rates[i]])
             found.append(Message(self.layout, stamp, stamp + self._late_ns, parts))
         return found
-
-    def _is_lost(self, tick_ns: int) -> bool:
-        """Spells of loss of 0.3 s on average, and of counting between them."""
-        while tick_ns >= self._heard_until_ns:
-            self._lost_until_ns = self._heard_until_ns + int(self._rng.exponential(0.3) * 1e9)
-            heard_s = 0.3 * (1.0 - self._lost_left) / self._lost_left
-            self._heard_until_ns = self._lost_until_ns + int(self._rng.exponential(heard_s) * 1e9)
-        return tick_ns < self._lost_until_ns
 
 
 class ImuSensor:
@@ -162,9 +183,12 @@ class ImuSensor:
         body_R_imu = self._mount.rotation()
         bias = self._bias + np.cumsum(self._rng.normal(0.0, self._config.gyro_bias_walk * math.sqrt(period), (n, 3)), axis=0)
         self._bias = bias[-1]
-        rates = np.column_stack([np.zeros(n), np.zeros(n), wz]) @ body_R_imu + bias + self._rng.normal(0.0, self._sigmas[0], (n, 3))
+        turning = np.column_stack([np.zeros(n), np.zeros(n), (1.0 + self._config.gyro_scale) * wz])
+        rates = turning @ body_R_imu + bias + self._rng.normal(0.0, self._sigmas[0], (n, 3))
         forces = force @ body_R_imu + self._rng.normal(0.0, self._sigmas[1], (n, 3))
-        return [Message(self.layout, self._start_ns + int(t), self._start_ns + int(t), (rates[i], forces[i])) for i, t in enumerate(ticks)]
+        late_ns = round(self._config.late_s * 1e9)
+        stamps = [self._start_ns + int(t) for t in ticks]
+        return [Message(self.layout, stamp, stamp + late_ns, (rates[i], forces[i])) for i, stamp in enumerate(stamps)]
 
 
 class GpsSensor:
@@ -282,6 +306,7 @@ def make_sensors(
     """Each with a random generator of its own: one sensor more leaves the noise of the others as it is."""
     encoders, imu, gps, lidar = (np.random.default_rng(seed) for seed in seeds.spawn(4))
     mounts, topics = nominal_mounts(robot), robot.topics
+    config = with_faults(config, reality)
     sensors: list[Sensor] = [
         TruthSensor(config.truth_hz, robot, masses, config.center_of_gravity, START_NS),
         EncoderSensor(config.encoders, robot, masses, reality.wheels_late_s, reality.encoder_lost, START_NS, encoders),
@@ -297,6 +322,20 @@ def make_sensors(
     elif config.lidar == "3d":
         sensors.append(SpinningScanner(config.spinning, topics.points, CLOUD, real, world, late, START_NS, lidar))
     return sensors
+
+
+def with_faults(config: SensorConfig, reality: TrueRobot) -> SensorConfig:
+    """The systematic errors of ``reality``'s sensors, beside those of ``config``."""
+    ranging = {"range_scale": reality.range_scale, "range_bias_m": reality.range_bias_m}
+    return dataclasses.replace(
+        config,
+        encoders=dataclasses.replace(config.encoders, missing=config.encoders.missing + reality.missing_joint_messages),
+        imu=dataclasses.replace(
+            config.imu, gyro_scale=config.imu.gyro_scale + reality.gyro_scale, late_s=config.imu.late_s + reality.gyro_late_s
+        ),
+        scanner=dataclasses.replace(config.scanner, **{k: getattr(config.scanner, k) + v for k, v in ranging.items()}),
+        spinning=dataclasses.replace(config.spinning, **{k: getattr(config.spinning, k) + v for k, v in ranging.items()}),
+    )
 
 
 def transforms(config: SensorConfig, robot: Robot) -> Message:

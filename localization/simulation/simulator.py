@@ -93,6 +93,10 @@ class Simulation:
         for number, phase in enumerate(phases):
             if number == half or (half < 0 and self.time_s > 0.5 * self._limit_s):
                 self._change_friction()
+            if self.reality.wheel_radius_drift and isinstance(phases, list):
+                self._body = self._body.with_radii(
+                    self.reality.body, 1.0 + self.reality.wheel_radius_drift * number / max(len(phases) - 1, 1)
+                )
             for _ in self._drive(phase):
                 if self.time_s > flushed + _FLUSH_S:
                     flushed = self.time_s
@@ -110,7 +114,7 @@ class Simulation:
 
     def _change_friction(self) -> None:
         """The second half of the drive begins."""
-        if self.reality.friction_change_factor != 1.0 and self._body is self.reality.body:
+        if self.reality.friction_change_factor != 1.0 and self._body.params is self.reality.body.params:
             self._body = self._body.with_param("mu_ratio", self._body.param("mu_ratio") * self.reality.friction_change_factor)
 
     def _drive(self, phase: Phase) -> Iterator[None]:

@@ -66,6 +66,8 @@ class Body:
     """Contact law of the tyres, as `FrictionModel.saturation`."""
     slope: float = 0.0
     """Tilt of the floor: it rises towards the world's +x by this angle [rad]."""
+    grip_split: float = 0.0
+    """The left wheels grip more by half of this share, the right ones less."""
     cg_offset: tuple[float, float] = (0.0, 0.0)
     """How far the CG really lies from where arms and robot file have it [m]."""
     yields: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -83,6 +85,10 @@ class Body:
         params = self.params.copy()
         params[FrictionModel.param_names.index(name)] = value
         return dataclasses.replace(self, params=params)
+
+    def with_radii(self, start: Body, factor: float) -> Body:
+        """This body with the wheel radii of ``start`` times ``factor``."""
+        return dataclasses.replace(self, radius_left=start.radius_left * factor, radius_right=start.radius_right * factor)
 
     def param(self, name: str) -> float:
         return float(self.params[FrictionModel.param_names.index(name)])
@@ -105,6 +111,7 @@ class Body:
             creep=config.creep,
             rest_speed=0.01,
             tyre_lag=config.tyre_lag_s,
+            grip_split=self.grip_split,
         )
 
 
