@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from localization.estimators.base import NO_POINTS, Estimate, mean_twist
-from localization.estimators.filter import BIAS, CLOCK, PARAMS, POSE, SCALE, START, Filter, FilterConfig
+from localization.estimators.filter import BIAS, CLOCK, MAP, PARAMS, POSE, SCALE, START, Filter, FilterConfig
 from localization.events import PositionSample
 from localization.lidar import LostScans, ScanMatch, ScanMatchingSensor
 from localization.step import Step
@@ -87,8 +87,9 @@ class EkfFusion:
         if not self._is_scan_pending or self._sensor is None:
             return
         self._is_scan_pending = False
-        if self._sensor.is_key(self.filter.pose):
-            self.filter.insert_key_scan(self._sensor.insert_key_scan(self.filter.pose))
+        ekf = self.filter
+        if self._sensor.is_key(ekf.pose):
+            ekf.insert_key_scan(self._sensor.insert_key_scan(ekf.pose, ekf.P[MAP, MAP].copy()))
 
     def _update_scan(self, step: Step, sensor: ScanMatchingSensor) -> float | None:
         ekf, duration = self.filter, step.duration
