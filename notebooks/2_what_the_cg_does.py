@@ -9,7 +9,7 @@
 # # 2. What the centre of gravity does to a skid-steer robot
 #
 # **Claim: where the centre of gravity (CG) lies decides how much, and about which point, the robot turns for the same wheel rates.
-# Physics with published constants and nothing fitted already says so; with four numbers fitted it describes 68 measurements better than a
+# Physics with published constants and nothing fitted already predicts it; with four numbers fitted it describes 68 measurements better than a
 # polynomial's eleven do in two respects of three, and as well in the third.**
 #
 # VaultBot, a Husky with two arms, turned in place at 68 positions of its CG (J. Ebersole's thesis, 2016, chapter 4). This notebook
@@ -93,7 +93,7 @@ picture(
 # %% [markdown]
 # ## Figures 4-4 to 4-7: rotation ratio and x of the centre of rotation
 #
-# Both depend on x_G and hardly on y_G: 4-4 and 4-6 (the same data over both) are told by the markers here. The least turning is at x_G =
+# Both depend on x_G and hardly on y_G: 4-4 and 4-6 (the same data over both) are distinguished by the markers here. The least turning is at x_G =
 # 0. The measured x_CR, however, is not 0 there but -6.4 cm: notebook 3 asks why.
 
 # %%

@@ -103,12 +103,12 @@ picture(
 # %% [markdown]
 # ## Step 3. Put causes together, as few as explain it
 #
-# The diagnosis tries sets of causes, weighs each by evidence (a cause more must earn its place) and says of each found one how sure it
-# is, what else would look the same on this drive, and what it gains on rows that it has not seen.
+# The diagnosis tries sets of causes, weighs each by evidence (one more cause must pay for itself) and gives for each found one its sigma,
+# the causes that fit this drive as well, and what it gains on held-out rows.
 
 # %%
 table(
-    ["cause", "size", "sigma", "unit", "held-out errors fall by", "looks the same"],
+    ["cause", "size", "sigma", "unit", "held-out errors fall by", "fits as well"],
     *(
         [f.definition.meaning, f.size, f.sigma, f.definition.unit, f"{100 * f.gain.relative:.0f} %", ", ".join(a for a, _ in f.aliases)]
         for f in d.findings
@@ -134,7 +134,7 @@ table(
 #
 # It blamed the constant offset of the centre of rotation on rotational inertia, and the asymmetry on the tyres' treads. The simulated
 # vehicle has inertia, and motors that take half a second to reach their speed: that leaves its centre of rotation where the quasi-static
-# model says.
+# model predicts.
 
 # %%
 vehicle = simulate("rotation_grid", robot, config=SimulationConfig(sensors=SensorConfig(lidar="none")))

@@ -8,11 +8,11 @@
 # %% [markdown]
 # # 4. The hidden effect: you pick one, the tool finds it
 #
-# **Claim: a cause that is told nowhere in a log can be named, with its size, from a minute of driving; and where nothing is hidden,
+# **Claim: a cause that is written nowhere in a log can be named, with its size, from a minute of driving; and where nothing is hidden,
 # nothing is found.**
 #
 # Change the next line, and run the notebook again. The simulator makes it true of the robot or of its sensors; the log, its transforms
-# and the robot file know nothing of it. Then `skidloc diagnose` gets the log.
+# and the robot file hold nothing of it. Then `skidloc diagnose` gets the log.
 
 # %%
 HIDDEN = {"lidar_yaw": 0.03}
@@ -55,7 +55,7 @@ print(f"{d.verdict}: {d.sentence}")
 
 # %%
 table(
-    ["found", "size", "sigma", "hidden", "held-out errors fall by", "this drive cannot tell it from"],
+    ["found", "size", "sigma", "hidden", "held-out errors fall by", "fits this drive as well"],
     *(
         [f.cause, f.size, f.sigma, HIDDEN.get(f.cause, 0.0), f"{100 * f.gain.relative:.0f} %", ", ".join(name for name, _ in f.aliases)]
         for f in d.findings
@@ -76,7 +76,7 @@ picture(
             "window of 2 s",
             label,
             [
-                Series("as the robot file says", count, found.residuals.rows[:, column], "red", "s", (1, 1)),
+                Series("by the robot file", count, found.residuals.rows[:, column], "red", "s", (1, 1)),
                 Series("corrected", count, found.residuals.left[:, column], "blue", "o"),
             ],
             level=0.0,
