@@ -95,7 +95,8 @@ picture(Panel("time [s]", f"NIS, means of {count}", nis, log_y=True, band=band, 
 # %% [markdown]
 # ## What the filter has learned on the way
 #
-# The wheels' clock is off against the LiDAR's, and the robot turns less than its wheels predict. Both were estimated from the innovations alone.
+# The wheels' clock is off against the LiDAR's, and the robot turns less than its wheels predict. Both were estimated from the innovations
+# alone.
 
 # %%
 fused = results[-1].run

@@ -11,10 +11,10 @@
 # **Claim: a robot file that is wrong can be corrected while driving; corrections that are a field over the centre of gravity (`cg_field`)
 # are still there when the arms come back to a posture, where two numbers (`constant`) have to be learned anew each time.**
 #
-# The robot is simulated by the physics of its tyres. Its file does not hold that this floor grips 30 % more sideways, nor that its centre of
-# gravity lies 3 cm farther ahead than it was weighed. It drives squares and turns on the spot at their corners; before each lap the arms
-# move on to the next of three postures. The LiDAR is stood in for by the truth with 5 mm and 1 mrad of noise, so that only the models
-# differ.
+# The robot is simulated by the physics of its tyres. Its file does not hold that this floor grips 30 % more sideways, nor that its centre
+# of gravity lies 3 cm farther ahead than it was weighed. It drives squares and turns on the spot at their corners; before each lap the
+# arms move on to the next of three postures. The LiDAR is stood in for by the truth with 5 mm and 1 mrad of noise, so that only the
+# models differ.
 
 # %%
 import math

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +21,7 @@ from localization.commands.calibration_tables import WIDE, show
 from localization.commands.common import names, new_folder, write_json
 from localization.errors import EstimatorError, EvaluationError
 from localization.estimators import CORRECTING, LOCALIZING, check_estimator
-from localization.evaluation.references import ReferenceTrack, Relations, read_reference_file, reference_track
+from localization.evaluation.references import ReferenceTrack, Relations, read_reference_file, reference_track, with_noise
 from localization.evaluation.scores import Result, score
 from localization.evaluation.time_overlap import describe_instant, no_overlap_message
 from localization.events import Event, PositionSample
@@ -58,9 +59,11 @@ class Replay:
     corrections: str = "constant"
     """What ekf and graph learn of the motion model, forms separated by commas: none, constant (k and centre of rotation as slowly
     changing constants), cg_field (their regressions on the centre of gravity, remembered from posture to posture), or single ones by name,
-    join_words by + (the friction model's: mu_ratio, tracked_x, tracked_y, warp, cg_offset_x, cg_offset_y; as constant+cg_offset_x)."""
+    joined by + (the friction model's: mu_ratio, tracked_x, tracked_y, warp, cg_offset_x, cg_offset_y; as constant+cg_offset_x)."""
     reference: str | None = None
     """Topic of the log, or file (.tum, .relations), to score against; `none` for no score. Default: the robot file's topic, if any."""
+    reference_sigma: tuple[float, float] | None = None
+    """Noise of the poses of a reference without covariances [m, deg], as 0.02 0.5: NEES takes such a reference as exact otherwise."""
     positions: str | None = None
     """Topic of positions (NavSatFix, poses) that `graph` is to fuse, as GPS: `/fix`. The lever arm of the antenna is
     --config.estimator.graph.antenna-x-m and -y-m. Do not score against the same topic."""
@@ -145,7 +148,11 @@ class Replay:
         else:
             raise EvaluationError(f"no reference '{name}': neither a topic of {log.path.name} nor a file. `skidloc info` lists the topics.")
         check_overlap(found, log)
-        return found
+        if self.reference_sigma is None:
+            return found
+        if isinstance(found, Relations):
+            raise EvaluationError("--reference-sigma is the noise of poses, and the reference has relations. Leave it out.")
+        return with_noise(found, self.reference_sigma[0], math.radians(self.reference_sigma[1]))
 
     def _positions(self, log: Log) -> list[PositionSample]:
         if self.positions is None:

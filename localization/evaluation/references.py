@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +43,16 @@ class ReferenceTrack:
         if self.yaws is None:
             raise EvaluationError(f"{self.source} has positions only; poses need a reference with heading.")
         return np.column_stack([self.positions, self.yaws])
+
+
+def with_noise(track: ReferenceTrack, sigma_m: float, sigma_rad: float) -> ReferenceTrack:
+    """``track`` with this noise of x, y and of the yaw, where it has no covariances. Raises `EvaluationError` for a negative sigma."""
+    if not (math.isfinite(sigma_m) and math.isfinite(sigma_rad) and min(sigma_m, sigma_rad) >= 0.0):
+        raise EvaluationError(f"noise of the reference is {sigma_m} m, {math.degrees(sigma_rad):.4g} deg; both must be 0 or more.")
+    if track.covariances is not None:
+        return track
+    noise = np.diag([sigma_m, sigma_m, sigma_rad]) ** 2
+    return replace(track, covariances=np.broadcast_to(noise, (len(track.stamps_ns), 3, 3)).copy())
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,7 +57,15 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
         return [*losses, "No run can be recommended."]
     equals = equally_good(lines, best, reference)
     ranking = _ranking(lines, best, equals, reference)
-    return [*ranking, *losses, *_smoothing(best), *_coverage(best), *_consistency(best), *_advice(lines, best, equals)]
+    return [
+        *ranking,
+        *losses,
+        *_smoothing(best),
+        *_coverage(best),
+        *_consistency(best),
+        *_exactness(best, reference),
+        *_advice(lines, best, equals),
+    ]
 
 
 def equally_good(lines: Sequence[PlottedRun], best: PlottedRun, reference: ReferenceTrack | Relations) -> list[PlottedRun]:
@@ -219,6 +227,14 @@ def _consistency(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
     if found["fits"]:
         return [f"{whose} are consistent: {join_words(found['fits'])}."]
     return [f"{whose} could not be tested: that takes scans, or a reference with headings."]
+
+
+def _exactness(best: PlottedRun, reference: ReferenceTrack | Relations) -> list[str]:
+    """That large NEES may be the reference's noise, where that is unknown."""
+    nees = best.result.nees_mean
+    if not isinstance(reference, ReferenceTrack) or reference.covariances is not None or nees is None or nees <= mean_band(1, _DOF)[1]:
+        return []
+    return ["NEES takes this reference as exact, because it has no covariances: pass its noise with --reference-sigma."]
 
 
 def _test(name: str, mean: float, band: tuple[float, float], what: str) -> tuple[str, str]:

@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 
 from localization.errors import OutputError
-from localization.evaluation.references import ReferenceTrack, Relations
+from localization.evaluation.references import ReferenceTrack, Relations, with_noise
 from localization.evaluation.scores import Result, score
 from localization.pipeline import Run
 from localization.report.figure_data import map_view, nis_means, spans
@@ -602,3 +602,10 @@ def test_same_bytes_from_another_process_and_another_user_s_style(tmp_path):
     ).stdout.strip()
     here = hashlib.sha256(page_of("track").encode()).hexdigest()
     assert there == here
+
+
+def test_summary_of_a_large_nees_asks_for_the_noise_of_an_exact_reference() -> None:
+    results = [dataclasses.replace(result, nees_mean=40.0) for result in score([run(noise=0.1)], track())]
+    exact, noisy = track(), with_noise(track(), 0.02, 0.01)
+    assert "pass its noise with --reference-sigma" in verdict(results, exact)
+    assert "--reference-sigma" not in verdict(results, noisy)
