@@ -25,7 +25,7 @@ from motion_models.se2 import FloatArray
 
 _NS = 1e-9
 _SCAN_WAIT_NS = 1_000_000_000
-"""From the first wheel sample on: a LiDAR that is silent for longer joins a drive that the wheels have begun. Scanners have 2 Hz or more."""
+"""From the first wheel sample on: a LiDAR that is silent for longer joins a drive that wheels have begun. Scanners have 2 Hz or more."""
 
 
 @dataclass(frozen=True)

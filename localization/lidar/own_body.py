@@ -25,14 +25,17 @@ class OwnBodyFilter:
 
     def __init__(self) -> None:
         self._range = np.full(_BEARINGS, np.nan)
-        self._travel, self._turn = np.zeros(_BEARINGS), np.zeros(_BEARINGS)
+        self._travel = np.zeros(_BEARINGS)
+        self._headings = np.zeros((2, _BEARINGS))  # least and greatest since the range is the same [rad]
         self._is_own = np.zeros(_BEARINGS, dtype=bool)
-        self._moved = np.zeros(2)
-        self._largest_share, self._frame = 0.0, ""
+        self._travelled = self._heading = 0.0
+        self.share = 0.0
+        """Largest share of a scan's points that were the robot itself, 0 to 1."""
 
     def add_motion(self, delta: FloatArray) -> None:
         """Motion (3,) of the body since the last call."""
-        self._moved += (math.hypot(delta[0], delta[1]), abs(float(delta[2])))
+        self._travelled += math.hypot(delta[0], delta[1])
+        self._heading += float(delta[2])
 
     def filter(self, scan: Scan) -> Scan:
         """``scan`` without the points that are known to be the robot itself. Only planar scans are examined."""
@@ -45,24 +48,16 @@ class OwnBodyFilter:
         np.minimum.at(nearest, bins, r)
         nearest[nearest > _MAX_RANGE_M] = np.nan
         is_same = np.abs(nearest - self._range) <= _SAME_RANGE_M
-        self._travel = np.where(is_same, self._travel + self._moved[0], 0.0)
-        self._turn = np.where(is_same, self._turn + self._moved[1], 0.0)
+        self._travel = np.where(is_same, self._travel + self._travelled, 0.0)
+        least, greatest = self._headings
+        self._headings = np.where(is_same, [np.minimum(least, self._heading), np.maximum(greatest, self._heading)], self._heading)
         self._range = np.where(is_same, self._range, nearest)
-        self._moved[:] = 0.0
-        self._is_own = is_same & (self._is_own | ((self._travel >= _MIN_TRAVEL_M) & (self._turn >= _MIN_TURN_RAD)))
+        self._travelled = 0.0
+        has_turned = self._headings[1] - self._headings[0] >= _MIN_TURN_RAD
+        self._is_own = is_same & (self._is_own | ((self._travel >= _MIN_TRAVEL_M) & has_turned))
         is_own = self._is_own[bins] & (np.abs(r - self._range[bins]) <= _SAME_RANGE_M)
         share = float(is_own.mean())
         if share < _MIN_SHARE:
             return scan
-        self._largest_share, self._frame = max(self._largest_share, share), scan.frame_id
+        self.share = max(self.share, share)
         return replace(scan, points=points[~is_own], offsets=scan.offsets[~is_own] if len(scan.offsets) else scan.offsets)
-
-    def warnings(self) -> list[str]:
-        """The largest share of points that were the robot itself."""
-        if not self._largest_share:
-            return []
-        return [
-            f"LiDAR '{self._frame}': {100.0 * self._largest_share:.0f} % of its points are the robot itself (the same ranges below"
-            f" {_MAX_RANGE_M:g} m while it drove and turned) and were left out. Remove what covers the LiDAR, or filter these beams in its"
-            " driver (laser_filters)."
-        ]
