@@ -35,7 +35,8 @@ _MIN_JUMPED_MESSAGES = 3
 _MIN_JUMP_NS = 3 * _SECOND // 10
 """A stamp that leaves the even pace of its topic by more than this, while recording goes on evenly, is no latency but a clock that was set
 [ns]. Smaller jumps move a robot by less than 0.3 m at 1 m/s; estimators weigh these."""
-_PACE_MESSAGES = 20  # messages
+_PACE_MESSAGES, _MIN_PACE_MESSAGES = 20, 8
+"""Messages of which the pace is known, and the fewest: scanners of 2 Hz have 8 in 4 s."""
 _MAX_PENDING_NS = 10 * _SECOND
 _MAX_BURST_NS = 5 * _SECOND
 _MAX_PENDING_MESSAGES = 1000
@@ -165,7 +166,7 @@ class TopicClock:
 
     def _is_sudden(self, item: Item) -> bool:
         """Whether the stamp leaves its topic's even pace, though the message was recorded when it was due."""
-        if self._last is None or len(self._pace) < _PACE_MESSAGES:
+        if self._last is None or len(self._pace) < _MIN_PACE_MESSAGES:
             return False
         stamp, step = item.stamp_ns + self._shift, item.log_ns - self._last_log
         deviation = abs(stamp - self._last - step)

@@ -59,7 +59,7 @@ class EventDecoder:
         self._sources, self._joints, self._arms = sources, joints, arms
         wheels = "" if sources.wheels is None else sources.wheels.topic
         left, right = joints
-        self.from_joints = JointsToWheels(len(left), len(right), robot.geometry.wheel_radius_m, wheels, stats)
+        self.from_joints = JointsToWheels(left, right, robot.geometry.wheel_radius_m, wheels, stats)
         self.from_odometry = OdometryToWheels(robot.driver, wheels, stats)
         named = " and ".join(source.topic for source in sources.arms)
         self._from_arms = None if arms is None else make_arm_cg_converter(arms, robot.geometry, named, stats)

@@ -8,8 +8,9 @@ and with them a reading that has nothing else.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +30,14 @@ _WRAP_RAD, _WRAP_WITHOUT_RATE_RAD = 0.3, 1.0
 _MAX_PUBLISHER_GAP_NS = 1_000_000_000  # of a second publisher, after its reading before; drivers publish at 10 Hz and more
 
 
+_MIN_SWAPS = 6
+"""From one publisher to the other and back, before one is left out."""
+_VELOCITY_NOISE, _MAX_ACCELERATION = 0.05, 5.0
+"""Of readings without angles, and of a driver's twist [m/s, m/s^2; rad/s, rad/s^2]. Robots of this size brake at up to 3 m/s^2."""
+_FROZEN_AFTER_RAD = 0.5
+"""Turned by another wheel of the same side; these are coupled by a chain or by the ground."""
+
+
 @dataclass(frozen=True, eq=False)
 class _PublisherState:
     """Readings that follow from each other: those of one publisher."""
@@ -41,6 +50,64 @@ class _PublisherState:
     """Sum of the wheels' steps since there are two publishers [rad]."""
 
 
+class _Motion(NamedTuple):
+    """What one publisher has sent last."""
+
+    velocity: FloatArray
+    """(n,) [m/s, or rad/s in the last entry of a twist]; NaN where absent."""
+    pose: FloatArray
+    """(3,) [m, m, rad], or (0,)."""
+
+
+@dataclass
+class _Publisher:
+    stamp_ns: int
+    motion: _Motion
+    travelled: float = 0.0
+    """Since there are two publishers [m]."""
+
+
+class PublisherSeparator:
+    """Separates the readings of two publishers that share a topic: velocities and poses leap to and fro between them.
+
+    The one whose wheels travel more is used. A single leap is a reset, a stop, or noise.
+    """
+
+    def __init__(self) -> None:
+        self._current: _Publisher | None = None
+        self._other: _Publisher | None = None
+        self._swaps = 0
+
+    def admit(self, stamp_ns: int, motion: _Motion, speed: float) -> bool:
+        """Whether a reading of ``motion`` at ``speed`` [m/s] is to be used."""
+        if self._other is not None and stamp_ns - self._other.stamp_ns > _MAX_PUBLISHER_GAP_NS:
+            self._other, self._swaps = None, 0
+        current = self._current
+        if current is None:
+            self._current = _Publisher(stamp_ns, motion)
+            return True
+        if not _may_follow(current, stamp_ns, motion):
+            if self._other is not None and _may_follow(self._other, stamp_ns, motion):
+                current, self._other = self._other, current
+                self._swaps += 1
+            else:
+                current, self._other, self._swaps = _Publisher(stamp_ns, motion), replace(current, travelled=0.0), 0
+        if math.isfinite(speed):
+            current.travelled += speed * (stamp_ns - current.stamp_ns) * 1e-9
+        current.stamp_ns, current.motion = stamp_ns, motion
+        self._current = current
+        return self._other is None or self._swaps < _MIN_SWAPS or current.travelled >= self._other.travelled
+
+
+def _may_follow(publisher: _Publisher, stamp_ns: int, motion: _Motion) -> bool:
+    """Whether a robot can have come from the publisher's last reading to ``motion``."""
+    passed_s = max((stamp_ns - publisher.stamp_ns) * 1e-9, _MIN_INTERVAL_S)
+    change = np.abs(motion.velocity - publisher.motion.velocity)
+    moved = np.abs(motion.pose - publisher.motion.pose)[:2]
+    is_too_fast = bool((change > _VELOCITY_NOISE + _MAX_ACCELERATION * passed_s).any() or (moved > _MAX_SPEED_M_S * passed_s).any())
+    return not is_too_fast  # a comparison with NaN is false
+
+
 class JointsToWheels:
     """Converter of readings whose first ``left`` joints are the left side's and the next ``right`` the right side's.
 
@@ -48,10 +115,15 @@ class JointsToWheels:
     used: a second one is mostly a `joint_state_publisher` that fills in zeros.
     """
 
-    def __init__(self, left: int, right: int, wheel_radius_m: float, topic: str, stats: MessageStats) -> None:
-        self._left, self._right, self._radius, self._topic, self._stats = left, right, wheel_radius_m, topic, stats
+    def __init__(self, left: Sequence[str], right: Sequence[str], wheel_radius_m: float, topic: str, stats: MessageStats) -> None:
+        """``left`` and ``right``: names of the joints."""
+        self._left, self._names = len(left), (*left, *right)
+        self._radius, self._topic, self._stats = wheel_radius_m, topic, stats
         self._publisher: _PublisherState | None = None
         self._second_publisher: _PublisherState | None = None
+        self._rates = PublisherSeparator()
+        self._turned = np.zeros(len(self._names))  # by each joint so far [rad]
+        self._is_working = np.ones(len(self._names), dtype=bool)
 
     def __call__(self, reading: JointReading) -> Iterator[WheelSample]:
         has_angles = all(map(math.isfinite, reading.position.tolist()))
@@ -62,7 +134,7 @@ class JointsToWheels:
                 return
             velocity = np.where(np.abs(velocity) * self._radius > _MAX_SPEED_M_S, np.nan, velocity)
         if not has_angles:
-            yield WheelSample(reading.stamp_ns, self._side_means(velocity), np.full(2, np.nan))
+            yield from self._convert_rates(reading.stamp_ns, velocity)
             return
         publisher = self._publisher
         if publisher is None:
@@ -85,7 +157,30 @@ class JointsToWheels:
                 self._second_publisher = replace(publisher, turned=0.0)
                 publisher = replace(publisher, turned=0.0)
             publisher = self._publisher = self._accumulate(publisher, reading, step)
+        self._find_frozen(publisher)
         yield WheelSample(reading.stamp_ns, self._side_means(velocity), self._side_means(publisher.angle))
+
+    def _convert_rates(self, stamp_ns: int, velocity: FloatArray) -> Iterator[WheelSample]:
+        """A reading without angles, unless it is of a second publisher."""
+        angles = self._publisher
+        if angles is not None and stamp_ns - angles.reading.stamp_ns <= _MAX_PUBLISHER_GAP_NS and self._turned.any():
+            self._stats.count(self._topic, Oddity.SECOND_PUBLISHER)  # wheels that have turned by their angles have these
+            return
+        speed = velocity * self._radius
+        travel_m_s = float(np.nanmax(np.abs(speed))) if np.isfinite(speed).any() else 0.0
+        if not self._rates.admit(stamp_ns, _Motion(speed, np.zeros(0)), travel_m_s):
+            self._stats.count(self._topic, Oddity.SECOND_PUBLISHER)
+            return
+        yield WheelSample(stamp_ns, self._side_means(velocity), np.full(2, np.nan))
+
+    def _find_frozen(self, publisher: _PublisherState) -> None:
+        """Leave out a wheel that never turns while others of its side do; its encoder has failed."""
+        for side in (slice(None, self._left), slice(self._left, None)):
+            turned = self._turned[side]
+            if len(turned) > 1 and turned.max() > _FROZEN_AFTER_RAD:
+                self._is_working[side] = turned > _STATIONARY_RAD
+        for i in np.flatnonzero(~self._is_working) if not self._is_working.all() else ():
+            self._stats.count(f"{self._topic}, joint '{self._names[i]}'", Oddity.FROZEN_WHEEL)
 
     def _is_reachable(self, publisher: _PublisherState, reading: JointReading) -> bool:
         """Whether wheels can have turned from the last reading of ``publisher`` to ``reading``."""
@@ -97,6 +192,7 @@ class JointsToWheels:
 
     def _accumulate(self, publisher: _PublisherState, reading: JointReading, step: FloatArray) -> _PublisherState:
         turned = publisher.turned if self._second_publisher is None else publisher.turned + sum(map(abs, step.tolist()))
+        self._turned += np.abs(step)
         return _PublisherState(reading, publisher.angle + step, turned)
 
     def _corrected_step(self, known: JointReading, reading: JointReading, velocity: FloatArray) -> tuple[FloatArray, bool]:
@@ -110,8 +206,11 @@ class JointsToWheels:
         return np.where(jumped, np.where(is_wrap, wrapped, expected), step), bool((jumped & ~is_wrap).any())
 
     def _side_means(self, values: FloatArray) -> FloatArray:
+        if not self._is_working.all():
+            left, right = self._is_working[: self._left], self._is_working[self._left :]
+            return np.array([values[: self._left][left].mean(), values[self._left :][right].mean()])
         numbers = values.tolist()
-        return np.array([sum(numbers[: self._left]) / self._left, sum(numbers[self._left :]) / self._right])
+        return np.array([sum(numbers[: self._left]) / self._left, sum(numbers[self._left :]) / (len(numbers) - self._left)])
 
 
 class OdometryToWheels:
@@ -128,8 +227,12 @@ class OdometryToWheels:
         self._previous: OdometryReading | None = None
         self._angle = np.zeros(2)
         self._pose_has_moved = self._twist_has_moved = False
+        self._publishers = PublisherSeparator()
 
     def __call__(self, reading: OdometryReading) -> Iterator[WheelSample]:
+        if not self._publishers.admit(reading.stamp_ns, _Motion(reading.twist, reading.pose), float(np.hypot(*reading.twist[:2]))):
+            self._stats.count(self._topic, Oddity.SECOND_PUBLISHER)
+            return
         vx, _, wz = reading.twist
         is_out_of_range = abs(vx) > _MAX_SPEED_M_S or abs(wz) > _MAX_TURN_RATE_RAD_S
         if is_out_of_range:

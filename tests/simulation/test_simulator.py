@@ -115,7 +115,7 @@ def test_the_log_says_when_each_run_begins_and_ends():
     simulation, messages = driven(
         short(Rest(0.5), OpenLoop("a", constant(0.3, 0.0), 2.7), Rest(1.0), OpenLoop("b", constant(0.0, 0.3), 2.0))
     )
-    marks = [(m.log_ns, json.loads(m.parts[0].tobytes())) for m in messages if m.form.topic == "/experiment"]
+    marks = [(m.log_ns, json.loads(m.parts[0].tobytes())) for m in messages if m.layout.topic == "/experiment"]
     assert [(mark["run"], mark["what"]) for _, mark in marks] == [("a", "begins"), ("a", "ends"), ("b", "begins"), ("b", "ends")]
     assert [stamp - START_NS for stamp, _ in marks] == [500_000_000, 4_200_000_000, 5_200_000_000, 8_200_000_000]
     assert [m.log_ns for m in messages] == sorted(m.log_ns for m in messages)
@@ -126,7 +126,7 @@ def test_one_sensor_more_leaves_the_noise_of_the_others_as_it_is():
     _, blind = driven()
     _, seeing = driven(config=SimulationConfig(sensors=SensorConfig(lidar="3d", center_of_gravity=True)))
     for topic in ("/imu/data", "/joint_states", "/ground_truth/odom"):
-        a, b = ([m for m in messages if m.form.topic == topic] for messages in (blind, seeing))
+        a, b = ([m for m in messages if m.layout.topic == topic] for messages in (blind, seeing))
         assert len(a) == len(b) > 20
         assert all(np.array_equal(p, q) for m, n in zip(a, b, strict=True) for p, q in zip(m.parts, n.parts, strict=True))
 
@@ -168,7 +168,7 @@ def distance(simulation):
 
 
 def parts(messages, topic, part):
-    return np.array([m.parts[part] for m in messages if m.form.topic == topic])
+    return np.array([m.parts[part] for m in messages if m.layout.topic == topic])
 
 
 @pytest.mark.parametrize("effect", FAULTS)
@@ -176,15 +176,15 @@ def test_effects_are_nowhere_in_the_logs_metadata(effect):
     size = {"payload": 5.0, "encoder_dropout": 0.3}.get(effect, 0.02)
     config = SimulationConfig(sensors=SensorConfig(lidar="2d", center_of_gravity=True))
     (_, plain), (_, changed) = driven(config=config), driven(effects={effect: size}, config=config)
-    transforms = [next(m for m in messages if m.form.topic == "/tf_static") for messages in (plain, changed)]
+    transforms = [next(m for m in messages if m.layout.topic == "/tf_static") for messages in (plain, changed)]
     from localization.logs.message_templates import Template
 
-    assert len({Template(m.form, is_ros1=False).fill(m) for m in transforms}) == 1
-    assert {m.form.topic for m in plain} == {m.form.topic for m in changed}
+    assert len({Template(m.layout, is_ros1=False).fill(m) for m in transforms}) == 1
+    assert {m.layout.topic for m in plain} == {m.layout.topic for m in changed}
     np.testing.assert_array_equal(parts(plain, "/center_of_gravity", 0), parts(changed, "/center_of_gravity", 0))
     # but something that is measured did change
     topics = ("/joint_states", "/scan", "/imu/data", "/ground_truth/odom")
-    now = [[(m.stamp_ns, *(p.tobytes() for p in m.parts)) for m in messages if m.form.topic in topics] for messages in (plain, changed)]
+    now = [[(m.stamp_ns, *(p.tobytes() for p in m.parts)) for m in messages if m.layout.topic in topics] for messages in (plain, changed)]
     assert now[0] != now[1]
 
 
@@ -232,8 +232,8 @@ def test_late_stamps_are_late_and_the_messages_are_not(effect, topic):
     config = SimulationConfig()
     (_, plain), (_, late) = driven(config=config), driven(effects={effect: 0.03}, config=config)
     for a, b in zip(plain, late, strict=True):
-        assert (a.form.topic, a.log_ns) == (b.form.topic, b.log_ns)
-        assert b.stamp_ns - a.stamp_ns == (30_000_000 if a.form.topic == topic else 0)
+        assert (a.layout.topic, a.log_ns) == (b.layout.topic, b.log_ns)
+        assert b.stamp_ns - a.stamp_ns == (30_000_000 if a.layout.topic == topic else 0)
 
 
 def test_more_grip_to_the_side_turns_less_and_from_the_middle_on_only_then():
@@ -327,7 +327,7 @@ def test_a_cg_that_tips_the_robot_is_told_before_and_during_the_drive():
 
 
 def test_a_robot_that_cannot_get_there_says_so():
-    with pytest.raises(SimulationError, match="does not get where it is sent"):
+    with pytest.raises(SimulationError, match="does not reach its way point"):
         driven(short(Route(np.array([[3.0, 0.0]])), world="slippery"), {"slope": 0.4}, HUSKY)  # a wet patch is steeper than it grips
 
 
@@ -346,7 +346,7 @@ def test_routes_and_turns_lead_where_they_should():
     simulation, messages = driven(way)
     end = simulation.runs[-1].poses[-1]
     assert np.hypot(end[0] - 2.0, end[1] - 2.0) < 0.2
-    last = [m for m in messages if m.form.topic == "/ground_truth/odom"][-1]
+    last = [m for m in messages if m.layout.topic == "/ground_truth/odom"][-1]
     assert abs(abs(2 * math.atan2(*last.parts[1])) - math.pi) < 0.05
 
 

@@ -11,8 +11,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from localization.errors import SimulationError
-from localization.simulation.dynamics import Chassis, DynamicsInput, change, follow
-from localization.simulation.faults import TrueRobot, changed
+from localization.simulation.dynamics import Chassis, DynamicsInput, derivatives, wheel_response
+from localization.simulation.faults import TrueRobot, apply_faults
 from localization.simulation.vehicle import (
     CG,
     MARGIN,
@@ -90,10 +90,10 @@ def test_derivatives_are_those_of_differences(seed):
     body = chassis._replace(warp=0.1, tyre=soft, creep=0.02, scrub=0.03)
     now = DynamicsInput(*rng.uniform(-0.5, 0.5, 2), *rng.uniform(0.5, 1, 4), 118.0, 2.5, *rng.uniform(-0.05, 0.05, 7), 10.0, 5.0)
     twist, tilt, step = rng.uniform(-0.5, 0.5, 3), rng.uniform(-1.1, 1.1, 2), 1e-7
-    found = change(*twist, *tilt, now, body)
+    found = derivatives(*twist, *tilt, now, body)
     numeric = np.zeros((3, 3))
     for j in range(3):
-        up, down = (np.array(change(*(twist + sign * step * np.eye(3)[j]), *tilt, now, body)[:3]) for sign in (1, -1))
+        up, down = (np.array(derivatives(*(twist + sign * step * np.eye(3)[j]), *tilt, now, body)[:3]) for sign in (1, -1))
         numeric[:, j] = (up - down) / (2 * step)
     np.testing.assert_allclose(np.array(found[5:]).reshape(3, 3), numeric, atol=2e-5 * max(1.0, np.abs(numeric).max()))
 
@@ -160,7 +160,7 @@ def test_wheels_follow_ramps_through_their_lag_exactly():
     for i in range(10_000):
         target = 1.0 + 3.0 * (i + 0.5) * h
         q, angle = q + h * (target - q) / lag, angle + h * q
-    rate, turned = follow(0.7, 1.0, 3.0, lag, 0.1)
+    rate, turned = wheel_response(0.7, 1.0, 3.0, lag, 0.1)
     assert rate == pytest.approx(q, abs=1e-4)
     assert turned == pytest.approx(angle, abs=1e-4)
 
@@ -176,7 +176,7 @@ def test_the_tyres_follow_the_law_of_the_robot_file_and_an_effect_turns_it_into_
     reality = {law: TrueRobot(Body.from_robot(robot), Mount()) for law, robot in ROBOTS.items()}
     for law, other in (("isotropic", "thesis"), ("thesis", "isotropic")):
         assert reality[law].body.chassis(CONFIG).tyre.saturation == SATURATION[law]
-        assert changed(reality[law], {"lateral_force_law": 1.0}).body.chassis(CONFIG).tyre == reality[other].body.chassis(CONFIG).tyre
+        assert apply_faults(reality[law], {"lateral_force_law": 1.0}).body.chassis(CONFIG).tyre == reality[other].body.chassis(CONFIG).tyre
     # on a gentle arc the thesis's robot turns less
     turns = [drive((3.0, 3.3), 2.0, body=of.body)[-1, TWIST][2] for of in reality.values()]
     assert turns[1] < 0.9 * turns[0]
