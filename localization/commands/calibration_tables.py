@@ -94,6 +94,12 @@ def print_fit(console: Console, found: Calibrated, about: Turning, cuts: Sequenc
     show(console, _errors_table(found))
     if found.heldout is None:
         say(console, "Too few groups of maneuvers to hold any out: these errors are of the maneuvers that were fitted. Drive longer.")
+    if found.gain is not None and not found.is_recommended:
+        say(
+            console,
+            f"NOT RECOMMENDED: on maneuvers that it was not fitted to, this fit errs {1.0 / found.gain:.2f} times as much as the robot"
+            " file's own numbers. The old values are kept. Drive longer, on the same floor, or fit fewer parameters with --fit.",
+        )
     if fit.scale > _MANY_TIMES:
         say(
             console,
@@ -168,6 +174,8 @@ def numbers(found: Calibrated, about: Turning, cuts: Sequence[Cut], by_source: S
         "turning": _turning(about),
         "noise_scale": found.fit.scale,
         "heldout": found.heldout is not None,
+        "gain": found.gain,
+        "recommended": found.is_recommended,
         "errors": {name: {k: [v.value, v.low, v.high] for k, v in values.items()} for name, values in errors(found).items()},
         "by_source": {source: None if each is None else _turning(each) for source, each in by_source},
         "notes": {each.source: list(each.warnings) for each in cuts},
