@@ -21,6 +21,7 @@ from motion_models.calibration.cross_validation import HeldOut, cross_validate
 from motion_models.calibration.fit import Fit, fit
 from motion_models.calibration.least_squares import FitConfig
 from motion_models.calibration.maneuvers import IntArray, Maneuver
+from motion_models.calibration.noise import LearnedNoise, learn_noise
 from motion_models.calibration.plan import Calibration, calibrate, free_of
 from motion_models.corrected_wheels import CorrectedWheels
 from motion_models.errors import CalibrationError
@@ -63,6 +64,8 @@ class Calibrated:
     """The same by fits that have not seen the maneuver's group; None for too few groups to leave any out."""
     systematic: dict[str, float]
     """Sigma by parameter that no number of maneuvers averages out: the gyro's scale; empty without a gyro."""
+    noise: LearnedNoise
+    """Factors on the robot file's wheel noise, by the errors on held-out maneuvers; 1 where none were held out."""
 
     @property
     def measures_positions(self) -> bool:
@@ -193,7 +196,9 @@ def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequ
     before = dataclasses.replace(found.fit, params=model.nominal, reference_params=np.zeros(5)).residuals(maneuvers)
     inside = found.fit.residuals(maneuvers)
     systematic = _gyro_scale(train, found.fit, maneuvers, cuts, robot)
-    return Calibrated(model, found, before, inside, group, _position_known(maneuvers), heldout, systematic)
+    is_learned = heldout is not None and not of_rotations
+    noise = learn_noise(found.fit, maneuvers, heldout.residuals) if heldout is not None and is_learned else LearnedNoise(1.0, 1.0)
+    return Calibrated(model, found, before, inside, group, _position_known(maneuvers), heldout, systematic, noise)
 
 
 def _least_error(residuals: FloatArray) -> float:

@@ -109,7 +109,8 @@ class Calibrate:
         told = {"robot": robot.name, "model": model.name, **numbers(found, about, cuts, by_source)}
         if not found.is_recommended:
             return robot, {}, told
-        return found.fit.robot(robot), found.sigmas, told
+        calibrated_robot = found.fit.robot(robot)
+        return dataclasses.replace(calibrated_robot, wheel_noise=found.noise.scaled(robot.wheel_noise)), found.sigmas, told
 
     def _cut(self, path: Path, robot: Robot, kind: str) -> Cut:
         if kind == "log":
