@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from motion_models.base import MotionModel
+from motion_models.corrected_wheels import RADIUS_NAMES, CorrectedWheels
 from motion_models.errors import ModelError
 from motion_models.friction import CorrectedFriction, FrictionModel
 from motion_models.se2 import FloatArray
@@ -25,6 +26,9 @@ _TURNING, _CENTRE_X, _CENTRE_Y = 0.15, 0.05, 0.03
 _PRIOR_RETURNS_AFTER_S = 3600.0
 _WARP = 0.15  # VaultBot's chassis, as its rotations show it, moves 13 % of m g / 4 to two opposite wheels
 _MU_RATIO = 0.3
+_RADIUS_SCALE, _RADIUS_DIFFERENCE = 0.03, 0.01
+"""Relative, of all radii and of left against right: pneumatic tyres lose 3 % under load; unequal wheels of up to 1 % are Borenstein's and
+Feng's main systematic odometry error ("Measurement and correction of systematic odometry errors", IEEE T-RA 12(6), 1996; from memory)."""
 _LATERAL_SLIP_S, _ROTATION_SLIP_S_PER_M = 0.05, 0.01
 """Where the robot gives no other (`motion_models.prior.slip_at_speed`: 0.02 to 0.09 s, and under 0.01 s/m)."""
 
@@ -39,10 +43,10 @@ _SCATTER_K, _SCATTER_X_CR, _SCATTER_Y_CR = 0.014517, 0.011514, 0.0059057
 
 _SINGLE = (
     *("wheel_separation_multiplier", "k_0", "x_cr_0", "y_cr_0", "y_icr_left", "y_icr_right", "x_icr", "rotation_scale", "x_cr"),
-    *("lateral_slip_speed", "rotation_slip_speed"),
+    *("lateral_slip_speed", "rotation_slip_speed", *RADIUS_NAMES),
     *("mu_ratio", "tracked_x", "tracked_y", "warp", "cg_offset_x", "cg_offset_y"),
 )
-_ONLY_BY_NAME = ("warp", "cg_offset_x", "cg_offset_y", "lateral_slip_speed", "rotation_slip_speed")
+_ONLY_BY_NAME = ("warp", "cg_offset_x", "cg_offset_y", "lateral_slip_speed", "rotation_slip_speed", *RADIUS_NAMES)
 
 
 @dataclass(frozen=True)
@@ -89,8 +93,9 @@ def check_forms(names: Sequence[str]) -> list[Form]:
 
 
 def correctable(model: MotionModel, form: Form) -> MotionModel:
-    """``model`` with all parameters that corrections of ``form`` may change: the friction model's CG may be off, too."""
-    return CorrectedFriction(model) if isinstance(model, FrictionModel) and form != "none" else model
+    """``model`` with all parameters that corrections of ``form`` may change: the friction model's CG, any model's wheel radii."""
+    corrected: MotionModel = CorrectedFriction(model) if isinstance(model, FrictionModel) and form != "none" else model
+    return CorrectedWheels(corrected) if set(form.split("+")) & set(RADIUS_NAMES) else corrected
 
 
 def corrections(model: MotionModel, form: Form) -> Corrections:
@@ -115,7 +120,8 @@ def corrections(model: MotionModel, form: Form) -> Corrections:
             directions[model.param_names.index(name), column] = rate
     sigmas = np.array([c.sigma for c in found])
     walks = sigmas / np.sqrt(_PRIOR_RETURNS_AFTER_S)  # after an hour the first uncertainty has come back once more
-    least = {"skid_steer": _IN_PLACE, "friction": _NOT_STRAIGHT}.get(model.name, 0.0)
+    has_radii = any(c.name in RADIUS_NAMES for c in found)  # observed where the robot drives straight
+    least = 0.0 if has_radii else {"skid_steer": _IN_PLACE, "friction": _NOT_STRAIGHT}.get(model.name, 0.0)
     return Corrections(tuple(c.name for c in found), directions, np.diag(sigmas**2), np.diag(walks**2), least)
 
 
@@ -168,6 +174,12 @@ def _regressions(model: MotionModel) -> Corrections:
 
 
 def _singles(model: MotionModel) -> tuple[Correction, ...]:
+    """`_own_singles`, and the wheels' radii, which every model has (`CorrectedWheels`)."""
+    radii = zip(RADIUS_NAMES, (_RADIUS_SCALE, _RADIUS_DIFFERENCE), strict=True)
+    return *_own_singles(model), *(Correction(name, sigma, {name: 1.0}) for name, sigma in radii)
+
+
+def _own_singles(model: MotionModel) -> tuple[Correction, ...]:
     """Rotation scaling, the centre of rotation where the model has one; for the friction model its physics."""
     of = dict(zip(model.param_names, model.nominal, strict=True))
 

@@ -21,7 +21,9 @@ from motion_models.calibration.cross_validation import HeldOut, cross_validate
 from motion_models.calibration.fit import Fit, fit
 from motion_models.calibration.least_squares import FitConfig
 from motion_models.calibration.maneuvers import IntArray, Maneuver
+from motion_models.calibration.noise import LearnedNoise, learn_noise
 from motion_models.calibration.plan import Calibration, calibrate, free_of
+from motion_models.corrected_wheels import CorrectedWheels
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
 from motion_models.robot import Robot, WheelNoise
@@ -62,6 +64,8 @@ class Calibrated:
     """The same by fits that have not seen the maneuver's group; None for too few groups to leave any out."""
     systematic: dict[str, float]
     """Sigma by parameter that no number of maneuvers averages out: the gyro's scale; empty without a gyro."""
+    noise: LearnedNoise
+    """Factors on the robot file's wheel noise, by the errors on held-out maneuvers; 1 where none were held out."""
 
     @property
     def measures_positions(self) -> bool:
@@ -70,6 +74,23 @@ class Calibrated:
     @property
     def fit(self) -> Fit:
         return self.calibration.fit
+
+    @property
+    def gain(self) -> float | None:
+        """Error by the robot file's own numbers over that of fits on maneuvers which these have not been fitted to; below 1 the fit is
+        worse. Geometric mean of the ratios of RMS position and RMS heading; None where no maneuvers could be held out."""
+        if self.heldout is None:
+            return None
+        known = self.position_known
+        parts = [np.s_[:, 2]] + ([np.s_[known, :2]] if known.any() else [])
+        after = self.heldout.residuals
+        squares = [(_least_error(self.before[part]), _least_error(after[part])) for part in parts]
+        return float(np.prod([before / held for before, held in squares]) ** (0.5 / len(squares)))
+
+    @property
+    def is_recommended(self) -> bool:
+        """Whether the fit is no worse than the robot file's numbers on held-out maneuvers, or could not be checked."""
+        return self.gain is None or self.gain >= 1.0
 
     @property
     def sigmas(self) -> dict[str, float]:
@@ -154,6 +175,8 @@ def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequ
     if not maneuvers:
         told = " ".join(f"{each.source}: {each.warnings[0]}" if each.warnings else each.source for each in cuts)
         raise CalibrationError(f"no motion to calibrate on. {told} {ADVICE}")
+    if model.name == "skid_steer" and not of_rotations:
+        model = CorrectedWheels(model)
     wanted = tuple(free) or free_of(model, maneuvers, of_rotations)
     # In a table of rotations nothing slips at random: every row has the same wheels, and its own errors.
     config = FitConfig(noise=_NO_SLIP if of_rotations else robot.wheel_noise)
@@ -173,9 +196,18 @@ def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequ
     before = dataclasses.replace(found.fit, params=model.nominal, reference_params=np.zeros(5)).residuals(maneuvers)
     inside = found.fit.residuals(maneuvers)
     systematic = _gyro_scale(train, found.fit, maneuvers, cuts, robot)
-    return Calibrated(model, found, before, inside, group, _position_known(maneuvers), heldout, systematic)
+    is_learned = heldout is not None and not of_rotations
+    noise = learn_noise(found.fit, maneuvers, heldout.residuals) if heldout is not None and is_learned else LearnedNoise(1.0, 1.0)
+    return Calibrated(model, found, before, inside, group, _position_known(maneuvers), heldout, systematic, noise)
 
 
+def _least_error(residuals: FloatArray) -> float:
+    """Mean square of ``residuals``, as if none could be measured better than `_FINEST_ERROR`."""
+    return float(np.mean(residuals**2)) + _FINEST_ERROR**2
+
+
+_FINEST_ERROR = 1e-4
+"""Of a position [m] or heading [rad]; what the best references resolve."""
 _NO_SLIP = WheelNoise(*(0.0,) * 8)
 _UNSEEN = "headings alone were measured, and no distance: record a LiDAR or a reference with positions to reveal it."
 

@@ -107,7 +107,10 @@ class Calibrate:
         if self.windows is not None:
             write_text_file(self.windows, windows_text([m for each in cuts for m in each.maneuvers]))
         told = {"robot": robot.name, "model": model.name, **numbers(found, about, cuts, by_source)}
-        return found.fit.robot(robot), found.sigmas, told
+        if not found.is_recommended:
+            return robot, {}, told
+        calibrated_robot = found.fit.robot(robot)
+        return dataclasses.replace(calibrated_robot, wheel_noise=found.noise.scaled(robot.wheel_noise)), found.sigmas, told
 
     def _cut(self, path: Path, robot: Robot, kind: str) -> Cut:
         if kind == "log":
@@ -132,7 +135,10 @@ class Calibrate:
     def _write(self, console: Console, robot: Robot, new: Robot, sigmas: dict[str, float], told: dict[str, Any]) -> None:
         model = make_model(self.model, new)
         if self.out is not None:
-            remarks = f"Calibrated by skidloc: {self.model} on {', '.join(path.name for path in self.source)}, from {robot.name}."
+            sources = ", ".join(path.name for path in self.source)
+            remarks = f"Calibrated by skidloc: {self.model} on {sources}, from {robot.name}."
+            if new is robot:
+                remarks = f"Not changed by skidloc: {self.model} fitted on {sources} was worse than {robot.name} on held-out maneuvers."
             write_text_file(self.out, robot_toml(relocated(new, self.out.parent), {self.model: sigmas}, remarks))
             console.print(f"robot file: {self.out}", markup=False, soft_wrap=True)
         if self.export is not None:

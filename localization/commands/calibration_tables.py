@@ -15,6 +15,7 @@ from localization.calibration.calibrate import Calibrated, Cut, Turning
 from localization.calibration.windows import driven
 from motion_models.base import MotionModel
 from motion_models.calibration.cross_validation import Interval, root_mean, root_mean_gain
+from motion_models.calibration.noise import LearnedNoise
 from motion_models.calibration.plan import MEANING
 from motion_models.calibration.regressions import COMMANDED_RAD_PER_S, RotationTable
 from motion_models.robot import Robot
@@ -94,11 +95,23 @@ def print_fit(console: Console, found: Calibrated, about: Turning, cuts: Sequenc
     show(console, _errors_table(found))
     if found.heldout is None:
         say(console, "Too few groups of maneuvers to hold any out: these errors are of the maneuvers that were fitted. Drive longer.")
+    if found.gain is not None and not found.is_recommended:
+        say(
+            console,
+            f"NOT RECOMMENDED: on maneuvers that it was not fitted to, this fit errs {1.0 / found.gain:.2f} times as much as the robot"
+            " file's own numbers. The old values are kept. Drive longer, on the same floor, or fit fewer parameters with --fit.",
+        )
+    if found.noise != LearnedNoise(1.0, 1.0):
+        say(
+            console,
+            f"Wheel noise learned from held-out maneuvers: yaw variances {found.noise.yaw:.2g} times the robot file's, position variances"
+            f" {found.noise.position:.2g} times.",
+        )
     if fit.scale > _MANY_TIMES:
         say(
             console,
-            f"What is left is {fit.scale:.1f} times what wheel_noise and the reference's noise explain: raise wheel_noise's"
-            f" variances {fit.scale**2:.1f} times, or look what this model lacks with `skidloc diagnose`.",
+            f"What is left is {fit.scale:.1f} times what the robot file's wheel_noise and the reference's noise explain; `skidloc diagnose`"
+            " finds what this model gets wrong.",
         )
 
 
@@ -167,7 +180,10 @@ def numbers(found: Calibrated, about: Turning, cuts: Sequence[Cut], by_source: S
         "held": [{"parameter": name, "why": why} for name, why in found.calibration.held],
         "turning": _turning(about),
         "noise_scale": found.fit.scale,
+        "wheel_noise_factors": {"yaw": found.noise.yaw, "position": found.noise.position},
         "heldout": found.heldout is not None,
+        "gain": found.gain,
+        "recommended": found.is_recommended,
         "errors": {name: {k: [v.value, v.low, v.high] for k, v in values.items()} for name, values in errors(found).items()},
         "by_source": {source: None if each is None else _turning(each) for source, each in by_source},
         "notes": {each.source: list(each.warnings) for each in cuts},

@@ -14,6 +14,7 @@ from motion_models.calibration.identifiability import Weakness, weaknesses
 from motion_models.calibration.least_squares import KNEE, FitConfig, Loss, Problem, indices
 from motion_models.calibration.maneuvers import IntArray, Maneuver, make_batch
 from motion_models.calibration.prediction import predict
+from motion_models.corrected_wheels import RADIUS_NAMES
 from motion_models.errors import CalibrationError
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -69,9 +70,19 @@ class Fit:
         What was neither fitted nor in the file stays out, so that it follows the robot's geometry and not this robot's model.
         """
         fitted = {*self.names, *self.config.ties, *robot.models.get(self.model.name, {})}
-        everything = zip(self.model.param_names, (float(p) for p in self.params), strict=True)
-        table = {name: value for name, value in everything if name in fitted}
-        return dataclasses.replace(robot, models={**robot.models, self.model.name: table})
+        everything = dict(zip(self.model.param_names, (float(p) for p in self.params), strict=True))
+        table = {name: value for name, value in everything.items() if name in fitted and name not in RADIUS_NAMES}
+        found = dataclasses.replace(robot, models={**robot.models, self.model.name: table})
+        return _with_radius(found, 1.0 + everything.get("wheel_radius_scale", 0.0))
+
+
+def _with_radius(robot: Robot, scale: float) -> Robot:
+    """``robot`` with wheels ``scale`` times as large; ratios to the old radius in the ICR model's table keep their meaning."""
+    if scale == 1.0:
+        return robot
+    icr = {name: value / scale if name.startswith("alpha") else value for name, value in robot.models.get("icr", {}).items()}
+    geometry = dataclasses.replace(robot.geometry, wheel_radius_m=robot.geometry.wheel_radius_m * scale)
+    return dataclasses.replace(robot, geometry=geometry, models={**robot.models, **({"icr": icr} if icr else {})})
 
 
 def fit(

@@ -22,13 +22,15 @@ _CG_MOVES_M = 0.01
 
 FREE: Mapping[str, tuple[str, ...]] = {
     "diff_drive": ("wheel_separation_multiplier", "wheel_radius"),
-    "skid_steer": ("k_0", "x_cr_0", "y_cr_0"),
+    "skid_steer": ("k_0", "x_cr_0", "y_cr_0", "wheel_radius_scale"),
     "icr": ("y_icr_left", "x_icr", "alpha_left", "alpha_right", "y_icr_right"),
     "full_linear": ("wz_left", "vx_left", "vy_left", "longitudinal_slip_curvature", "wz_right", "vx_right", "vy_right"),
     "friction": ("mu_ratio", "tracked_x", "wheel_radius"),
 }
 """Parameters fitted to logs, most important first: of those that cannot be separated, the last is held."""
-FREE_WHERE_CG_MOVES: Mapping[str, tuple[str, ...]] = {"skid_steer": ("k_0", "x_cr_0", "y_cr_0", "x_cr_1", "k_2", "k_1", "y_cr_s0")}
+FREE_WHERE_CG_MOVES: Mapping[str, tuple[str, ...]] = {
+    "skid_steer": ("k_0", "x_cr_0", "y_cr_0", "x_cr_1", "k_2", "k_1", "y_cr_s0", "wheel_radius_scale")
+}
 FREE_OF_TURNS: Mapping[str, tuple[str, ...]] = {
     "diff_drive": ("wheel_separation_multiplier",),
     "skid_steer": ("k_0",),
@@ -45,7 +47,7 @@ FREE_OF_ROTATIONS: Mapping[str, tuple[str, ...]] = {
 }
 """The same for a table of rotations in place."""
 
-_SIZES = {"k_1": 1.0}
+_SIZES = {"k_1": 1.0, "wheel_radius_scale": 0.05}
 """What counts as large where the nominal value is small only because the robot is symmetric; see `FitConfig.sizes`."""
 _MIRROR: Mapping[str, tuple[str, float]] = {
     "y_icr_right": ("y_icr_left", -1.0),
@@ -98,6 +100,8 @@ MEANING: Mapping[str, str] = {
     "track_width": "m: distance of the left and right contacts",
     "warp": "of m g / 4: load on the front left and rear right wheels by a twisted chassis",
     "scrub": "m: yaw moment of the contact patches over mu m g",
+    "wheel_radius_scale": "radius of all wheels over the robot file's, less 1",
+    "wheel_radius_difference": "radius of the left wheels less the right ones', over the mean",
     CLOCK: "s: how late the wheels' stamps are (not part of the robot)",
 }
 
@@ -119,7 +123,7 @@ def free_of(model: MotionModel, maneuvers: Sequence[Maneuver], of_rotations: boo
         return (*FREE_OF_TURNS[model.name], CLOCK) if any(m.lead for m in maneuvers) else FREE_OF_TURNS[model.name]
     cg = np.concatenate([np.atleast_2d(m.cg) for m in maneuvers]) if maneuvers else np.zeros((1, 2))
     plan = FREE_WHERE_CG_MOVES if float(np.max(np.std(cg, axis=0))) > _CG_MOVES_M and model.name in FREE_WHERE_CG_MOVES else FREE
-    names = plan.get(model.name, model.param_names)
+    names = tuple(name for name in plan.get(model.name, model.param_names) if name in model.param_names)
     return (*names, CLOCK) if any(m.lead for m in maneuvers) else names
 
 

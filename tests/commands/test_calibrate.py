@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -130,7 +131,7 @@ def test_a_gyro_tells_k_of_a_real_husky_and_no_distance(tmp_path: Path, capsys: 
     assert k["value"] == pytest.approx(slope, rel=0.02)
     assert 0.0026 < k["sigma"] < 0.012  # not below the half percent to which the gyro's scale is known
     assert told["parameters"]["wheel_time_offset"]["value"] == pytest.approx(shift, abs=0.03)
-    assert {held["parameter"] for held in told["held"]} == {"x_cr_0", "y_cr_0"}
+    assert {held["parameter"] for held in told["held"]} == {"x_cr_0", "y_cr_0", "wheel_radius_scale"}
     assert set(told["errors"]) == {"heading_deg"}
     assert told["errors"]["heading_deg"]["gain"][1] > 0  # held out
     assert "record a LiDAR or a reference" in capsys.readouterr().out
@@ -335,10 +336,12 @@ def test_every_model_s_calibration_can_be_replayed(tmp_path: Path, name: str) ->
     table = tmp_path / "w.csv"
     table.write_text(windows_text(made_windows("icr")))
     told = run(tmp_path, table, "--robot", "vaultbot", "--model", name, "--out", tmp_path / "new" / "robot.toml")
-    model = make_model(name, load_robot(tmp_path / "new" / "robot.toml"))
+    robot = load_robot(tmp_path / "new" / "robot.toml")
+    model = make_model(name, robot)
     read = dict(zip(model.param_names, model.nominal, strict=True))
+    read["wheel_radius_scale"] = robot.geometry.wheel_radius_m / VAULTBOT.geometry.wheel_radius_m - 1.0
     for parameter, entry in told["parameters"].items():
-        assert read[parameter] == entry["value"], parameter
+        assert read[parameter] == pytest.approx(entry["value"], rel=1e-12), parameter
     assert told["parameters"]
     assert "# +- " in (tmp_path / "new" / "robot.toml").read_text()
 
@@ -416,9 +419,52 @@ def test_driving_straight_only_does_not_tell_how_it_turns(tmp_path: Path, capsys
     pose, cov = np.array([[0.66, 0.0, 0.0]]), np.diag([1e-4] * 3)
     straight = [Maneuver(np.full(20, 0.1), np.full((20, 2), 2.0), pose, np.array([20]), cov=cov, group=str(i)) for i in range(6)]
     table.write_text(windows_text(straight))
-    said = refused(capsys, table, "--robot", "vaultbot")
-    assert "this drive reveals nothing of k_0, x_cr_0, y_cr_0" in said
-    assert "turning in place" in said
+    told = run(tmp_path, table, "--robot", "vaultbot")
+    held = {each["parameter"]: each["why"] for each in told["held"]}
+    assert set(held) == {"k_0", "x_cr_0", "y_cr_0"}
+    assert "turning in place" in held["k_0"]
+    assert told["parameters"]["wheel_radius_scale"]["value"] == pytest.approx(0.66 / (4.0 * 0.164) - 1.0, abs=1e-6)
+    assert "k_0: k_0 does not show" in capsys.readouterr().out
+
+
+def test_skid_steer_fits_the_wheel_radius_where_distance_is_measured(tmp_path: Path) -> None:
+    """Tyres that are 4 % smaller than the robot file has them: the radius is found, k is not changed by it, and both are written."""
+    small = dataclasses.replace(VAULTBOT, geometry=dataclasses.replace(VAULTBOT.geometry, wheel_radius_m=0.164 * 0.96))
+    true, rng = make_model("skid_steer", small), np.random.default_rng(3)
+    windows = []
+    for i in range(24):
+        q = np.repeat(rng.uniform(-3, 3, (1, 2)), 20, axis=0)
+        delta = integrate_twists(np.full(20, 0.1), true.twist(q, np.zeros(2), true.nominal), WheelNoise()).delta
+        measured = (delta + rng.normal(0, 1e-3, 3))[None]
+        windows.append(Maneuver(np.full(20, 0.1), q, measured, np.array([20]), cov=np.diag([1e-6] * 3), group=str(i)))
+    table, out = tmp_path / "w.csv", tmp_path / "robot.toml"
+    table.write_text(windows_text(windows))
+    told = run(tmp_path, table, "--robot", "vaultbot", "--out", out)
+    assert told["recommended"]
+    assert told["parameters"]["wheel_radius_scale"]["value"] == pytest.approx(-0.04, abs=0.003)
+    assert load_robot(out).geometry.wheel_radius_m == pytest.approx(0.164 * 0.96, rel=0.003)
+    assert load_robot(out).models["skid_steer"]["k_0"] == pytest.approx(true.nominal[0], rel=0.01)
+
+
+def test_a_fit_that_is_worse_on_held_out_data_is_not_recommended(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Windows of pure noise about the robot file's own motion: the fit follows the noise, and the old numbers stay."""
+    model, rng = make_model("diff_drive", VAULTBOT), np.random.default_rng(5)
+    windows = []
+    for i in range(6):
+        q = np.repeat(rng.uniform(-3, 3, (1, 2)), 20, axis=0)
+        delta = integrate_twists(np.full(20, 0.1), model.twist(q, np.zeros(2), model.nominal), WheelNoise()).delta
+        measured = (delta + rng.normal(0, [0.05, 0.05, 0.05]))[None]
+        windows.append(Maneuver(np.full(20, 0.1), q, measured, np.array([20]), cov=np.diag([2.5e-3] * 3), group=str(i)))
+    table, out = tmp_path / "w.csv", tmp_path / "robot.toml"
+    table.write_text(windows_text(windows))
+    told = run(tmp_path, table, "--robot", "vaultbot", "--model", "diff_drive", "--out", out)
+    assert not told["recommended"]
+    assert told["gain"] < 1.0
+    printed = capsys.readouterr().out
+    assert "NOT RECOMMENDED" in printed
+    assert "The old values are kept" in printed
+    assert load_robot(out).models == VAULTBOT.models
+    assert "Not changed by skidloc" in out.read_text()
 
 
 GRID_HEADER = "cg_x_m,cg_y_m,rotation_ratio,cor_x_m,cor_y_m"
