@@ -22,6 +22,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import PointCloud2, PointField
 from tf2_msgs.msg import TFMessage
 
+PERIOD_NS = 80_000_000  # of the scans
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 QUALITY = {"/scan": qos_profile_sensor_data, "/imu/data": qos_profile_sensor_data, "/tf_static": LATCHED}
 
@@ -37,7 +38,7 @@ class Robot:
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
         self.odometry, self.predicted, self.statuses, self.tf = [], [], {}, []
-        self.sent, self.latencies, self.first_s = {}, [], None
+        self.sent, self.latencies, self.first_s = {}, {}, None
         self.begin = time.monotonic()
         for topic, kind in (("/skidloc/odometry", Odometry), ("/tf", TFMessage), ("/diagnostics", DiagnosticArray)):
             self.node.create_subscription(kind, topic, getattr(self, f"on_{kind.__name__}"), 50)
@@ -58,9 +59,14 @@ class Robot:
     def on_Odometry(self, message):
         now = time.monotonic()
         self.first_s = now - self.begin if self.first_s is None else self.first_s
-        if stamp(message) in self.sent:
-            self.latencies.append(now - self.sent[stamp(message)])
+        if (sent := self.scan_of(stamp(message))) is not None:
+            self.latencies[sent] = now - self.sent[sent]
         self.odometry.append(message)
+
+    def scan_of(self, estimate_ns):
+        """Stamp of the scan whose sweep was halfway at ``estimate_ns``: of the last that began before."""
+        before = [sent for sent in list(self.sent)[-200:] if 0 <= estimate_ns - sent < PERIOD_NS]
+        return before[-1] if before else None
 
     def on_TFMessage(self, message):
         self.tf += [(t.header.frame_id, t.child_frame_id) for t in message.transforms]
@@ -117,7 +123,7 @@ class Robot:
             "hashes": [[str(info.topic_type_hash), info.node_name] for info in infos],
             "sent": len(self.sent),
             "answered": len(self.latencies),
-            "latencies_s": self.latencies,
+            "latencies_s": list(self.latencies.values()),
             "first_s": self.first_s,
             "tf": sorted(set(self.tf)),
             "tf_count": len(self.tf),
