@@ -236,7 +236,13 @@ def main(path: str, domain: int) -> None:
     writers = {
         topic: DataWriter(participant, Topic(participant, f"rt{topic}", kind), QUALITY.get(topic, VOLATILE)) for topic, kind in SENT.items()
     }
-    hear = {"/skidloc/odometry": Odometry, "/skidloc/odometry_predicted": Odometry, "/tf": TFMessage, "/diagnostics": DiagnosticArray, "/skidloc/corrections": JointState}
+    hear = {
+        "/skidloc/odometry": Odometry,
+        "/skidloc/odometry_predicted": Odometry,
+        "/tf": TFMessage,
+        "/diagnostics": DiagnosticArray,
+        "/skidloc/corrections": JointState,
+    }
     readers = {topic: DataReader(participant, Topic(participant, f"rt{topic}", kind), VOLATILE) for topic, kind in hear.items()}
     heard = {topic: [] for topic in hear}
     scans_sent, answered, latencies, out, arrivals = {}, set(), [], [], []
@@ -286,7 +292,8 @@ def main(path: str, domain: int) -> None:
                 "arrivals_s": arrivals,
                 "predicted_stamps": [stamp(o.header) for o in heard["/skidloc/odometry_predicted"]],
                 "predicted_poses": [
-                    [o.pose.pose.position.x, o.pose.pose.position.y, o.pose.pose.orientation.z] for o in heard["/skidloc/odometry_predicted"]
+                    [o.pose.pose.position.x, o.pose.pose.position.y, o.pose.pose.orientation.z]
+                    for o in heard["/skidloc/odometry_predicted"]
                 ],
                 "latencies_s": latencies,
                 "out_s": out,
