@@ -13,6 +13,7 @@ from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
 from localization.pipeline import Pipeline
 from localization.ros.predictor import Predictor
 from localization.ros.settings import LiveRun
+from motion_models.center_of_gravity.files import arms_model
 from motion_models.se2 import FloatArray
 
 _ROOM_M, _SPEED_M_S = 8.0, 0.5
@@ -24,16 +25,19 @@ def warm_up(run: LiveRun) -> None:
     """Process short synthetic drives with every kind of sensor that the robot may have, and discard the results.
 
     Once with planar scans, once with clouds and once without a LiDAR (where the estimator works without one), each with a gap in the
-    scans, after which the matcher searches a wide prior.
+    scans, after which the matcher searches a wide prior. The centre of gravity of the robot's arms first.
     """
+    if run.robot.arms is not None:
+        model = arms_model(run.robot.arms, run.robot.folder)
+        model.estimate(np.zeros_like(model.chain.lower))
     for has_lidar, is_planar in ((True, True), (True, False), (False, True)):
         try:
             trial = run.make_trial(has_lidar)
+            pipeline = Pipeline(trial, run.robot, run.robot.mounts, has_lidar, run.config)
         except EstimatorError:
             if has_lidar:
                 raise
             continue
-        pipeline = Pipeline(trial, run.robot, run.robot.mounts, has_lidar, run.config)
         predictor = Predictor(trial.model, run.robot, run.config.step.max_hold_s)
         for event in synthetic_drive(has_lidar, is_planar):
             predictor.insert(event)

@@ -32,6 +32,8 @@ from motion_models.robot import Mount
 _STATUS_PERIOD_S, _POLL_S = 1.0, 0.2
 _AFTER_ESTIMATE = 1.5
 """A status waits for an estimate for up to this many periods: then the next scan is farthest."""
+_MAX_PREDICTED_AGE_NS = 200_000_000
+"""Older messages of the wheels are not predicted to: after a pause of the process there are hundreds, and the newest is what counts."""
 
 
 class Node:
@@ -229,7 +231,7 @@ class Node:
         arrived_ns = received.received_ns if not is_backlog and isinstance(event, Scan) else None
         is_predictable = self._predictor is not None and self._predictor.insert(event)
         estimates = self.session.process(event, partial(self._publish, event, arrived_ns))
-        if is_predictable or estimates:
+        if (is_predictable or estimates) and self._transport.now_ns() - received.received_ns < _MAX_PREDICTED_AGE_NS:
             self._publish_prediction()
         self.session.observe(event)
         self._check_frames()

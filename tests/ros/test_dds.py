@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import json
 import os
@@ -22,6 +23,7 @@ from localization.logs import open_log
 from localization.pipeline import Trial, replay
 from localization.ros.transports.dds_settings import choose_interface, configuration, default_domain
 from localization.trajectory import read_tum
+from motion_models import se2
 from motion_models.registry import make_model
 from tests.helpers.online import ROBOT, drive_log
 
@@ -46,12 +48,24 @@ class Peer:
         assert self.process.stdout.readline() == "up\n"
 
     def play(self, seconds):
+        self.begin(seconds)
+        self.wait()
+
+    def begin(self, seconds):
         self.process.stdin.write(f"{seconds}\n")
         self.process.stdin.flush()
+
+    def wait(self):
         assert self.process.stdout.readline() == "played\n"
 
     def heard(self):
         return json.loads(self.process.communicate(timeout=30)[0])
+
+
+@functools.cache
+def replayed():
+    log = open_log(drive_log(), ROBOT)
+    return replay(log.events(), [Trial(make_model("skid_steer", ROBOT), "ekf")], ROBOT, log.mounts, True)[0]
 
 
 def ended(process, number=signal.SIGINT):
@@ -91,8 +105,7 @@ def test_a_robot_in_another_process_is_followed_killed_and_followed_on(tmp_path)
     assert listening
     assert all("%lo:" in address or address.startswith("127.0.0.1") for address in listening)
 
-    log = open_log(drive_log(), ROBOT)
-    run = replay(log.events(), [Trial(make_model("skid_steer", ROBOT), "ekf")], ROBOT, log.mounts, True)[0].trajectory
+    run = replayed().trajectory
     by_stamp = dict(zip(run.stamps_ns.tolist(), run.poses, strict=True))
     stamps = heard["stamps"]
     assert len(stamps) > 0.8 * heard["sent_scans"]
@@ -123,6 +136,45 @@ def test_a_robot_in_another_process_is_followed_killed_and_followed_on(tmp_path)
     live = read_tum(tmp_path / "live.tum")
     assert (np.diff(live.stamps_ns) > 0).all()
     assert len(live) >= 0.9 * len(stamps)
+
+
+def test_node_that_was_stopped_for_5_s_is_back_within_1_s(tmp_path):
+    """SIGSTOP: 250 messages of wheels and IMU each come for queues of 200, and scans overflow the socket's buffer."""
+    state = tmp_path / "state"
+    peer, node = Peer(), start_node("--state", state, "--node.wait-s", "1")
+    node.stdout.readline()
+    peer.begin(15.0)
+    time.sleep(7.0)
+    node.send_signal(signal.SIGSTOP)
+    time.sleep(5.0)
+    node.send_signal(signal.SIGCONT)
+    resumed_s = time.monotonic()
+    peer.wait()
+    text = ended(node)
+    assert node.returncode == 0, text
+    assert "jump of the clock" not in text
+    again = start_node("--state", state, "--node.wait-s", "1")
+    again.stdout.readline()
+    peer.play(99.0)
+    text = ended(again)
+    assert "resumed from" in text
+    assert again.returncode == 0, text
+    heard = peer.heard()
+    stamps, arrivals = np.array(heard["stamps"]), np.array(heard["arrivals_s"])
+    sent = dict(heard["scans"])
+    after = [i for i in range(len(stamps)) if arrivals[i] > resumed_s]
+    current = next(i for i in after if arrivals[i] - sent[max(stamp for stamp in sent if stamp <= stamps[i])] < 0.2)
+    assert arrivals[after[0]] - resumed_s < 1.0
+    assert arrivals[current] - resumed_s < 2.5  # half the pause: 0.7 s on an idle machine
+    run = replayed().trajectory
+    by_stamp = dict(zip(run.stamps_ns.tolist(), run.poses, strict=True))
+    before = next(i for i in reversed(range(len(stamps))) if arrivals[i] < resumed_s - 5.0 and stamps[i] in by_stamp)
+    poses = np.array([[x, y, 2.0 * np.arcsin(z)] for x, y, z in heard["poses"]])
+    sigmas = np.sqrt(heard["pose_variances"])
+    for i in (next(i for i in after if i >= current and stamps[i] in by_stamp), max(i for i in after if stamps[i] in by_stamp)):
+        moved, expected = (se2.between(a, b) for a, b in ((poses[before], poses[i]), (by_stamp[stamps[before]], by_stamp[stamps[i]])))
+        print(np.abs(se2.between(expected, moved)), sigmas[i], arrivals[current] - resumed_s)
+        assert (np.abs(se2.between(expected, moved)) < 5.0 * sigmas[i]).all()
 
 
 def test_nobody_there_is_told_and_interrupted_without_a_word_too_many(tmp_path):

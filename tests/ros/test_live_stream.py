@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import os
 import sys
 import time
 import types
@@ -22,6 +23,7 @@ from localization.logs.serialization import encode
 from localization.pipeline import Trial, replay
 from localization.ros.checkpoint import CheckpointWriter, read_head
 from localization.ros.diagnostics import ERROR, OK, WARN, degeneracy
+from localization.ros.estimate_log import old_estimate_log
 from localization.ros.node import Node
 from localization.ros.publisher import CORRECTIONS, DIAGNOSTICS, ODOMETRY, EstimatePublisher
 from localization.ros.run_control import PlaybackClock
@@ -412,6 +414,31 @@ def test_a_node_that_is_killed_goes_on_where_it_was(tmp_path, calm):
     node, told = run_node(third, files=Files(tmp_path / "more.tum", tmp_path / "state"))
     assert "resumed from" in told[-1]
     assert 20 < node.finish() < 0.4 * len(a)
+
+
+@pytest.mark.parametrize("left", ["nothing", "half", "hidden files"])
+def test_files_that_a_killed_run_left_do_not_stop_a_new_one(tmp_path, left):
+    """State and estimates that do not fit each other, as after a power cut, and hidden files of any kind."""
+    files = Files(tmp_path / "run.tum", tmp_path / "state")
+    node, _ = run_node(LogTransport(drive_log(), lambda messages: messages[:1200]), files=files)
+    node.session.save_state(node._head, now=True)
+    log = files.estimate_log
+    if left == "nothing":
+        log.unlink()
+    elif left == "half":
+        os.truncate(log, log.stat().st_size // 2)
+    else:
+        for name in (".state.new", ".state.lock", ".run.tum.lock", old_estimate_log(log).name):
+            (tmp_path / name).write_bytes(b"half a file")
+        (tmp_path / ".run.tum.new").mkdir()
+        (tmp_path / ".run.tum.new" / "run.tum").touch()
+    with files.claimed():
+        rest = LogTransport(drive_log(), lambda messages: [messages[0], *messages[1250:]])
+        node, reports = run_node(rest, files=files)
+        assert any("resumed from" in text for text in reports)
+        assert any("its output begins here" in text for text in reports) == (left != "hidden files")
+        assert node.finish() == len(read_tum(tmp_path / "run.tum")) > 100
+    assert (tmp_path / "state").is_file()
 
 
 def test_a_full_disk_does_not_stop_the_robot_from_knowing_where_it_is(tmp_path, monkeypatch, calm):

@@ -167,13 +167,13 @@ def test_lifecycle_node_is_managed_from_another_process(distro, running):
     manage = running(Manager(distro, domain, "/team/rover"))
     assert manage("state") == "unconfigured"
     assert manage("get", "wait_s") == 5.0
-    description, constraint = manage("describe", "config.estimator.graph.kernel")
+    description, constraint = manage("describe", "config.estimator.lidar.matcher")
     assert description
-    assert constraint == "none, huber, cauchy"
+    assert constraint == "submap, kiss"
     for name, value, reason in (
         ("wait_s", -1.0, "must be 0 or more"),
         ("wait_s", "long", "must be a number"),
-        ("config.estimator.graph.kernel", "hubert", "Did you mean 'huber'?"),
+        ("config.estimator.lidar.matcher", "submaps", "Did you mean 'submap'?"),
     ):
         is_set, why = manage("set", [name, value])
         assert not is_set
