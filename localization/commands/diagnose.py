@@ -18,6 +18,7 @@ from localization.diagnosis.corrected_robot import correct_robot
 from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_table
 from localization.diagnosis.findings import Diagnosis
+from localization.diagnosis.linearization import default_model
 from localization.diagnosis.summary import describe_outliers, describe_row, describe_tolerated
 from localization.logs import TopicOverrides, open_log
 from localization.output import check_outputs, write_text_file
@@ -40,8 +41,8 @@ class Diagnose:
     motion (window, dt_s, left_rad_per_s, right_rad_per_s, x_m, y_m, yaw_rad, ...)."""
     robot: str
     """Name of a shipped robot, or path of a robot TOML file."""
-    model: str = "friction"
-    """Motion model whose predictions are held against what really happened."""
+    model: str = ""
+    """Motion model to diagnose; by default friction, or diff_drive for a robot with casters (separation multiplier 1 in its file)."""
     out: Path | None = None
     """New folder for diagnosis.json, diagnosis.html and robot.toml, the robot with the findings in it, which every command takes."""
     witness: MotionReferenceName = "auto"
@@ -60,7 +61,7 @@ class Diagnose:
             raise CalibrationError(f"--window-s is {self.window_s:g}; windows of 0.5 to 20 s make sense.")
         check_outputs(self.out, self.json)
         robot = load_robot(self.robot)
-        model = make_model(self.model, robot)
+        model = make_model(self.model or default_model(robot), robot)
         with console.status("reading"):
             drive = self._drive(robot)
         with console.status("looking for causes"):
@@ -126,8 +127,9 @@ def print_diagnosis(console: Console, d: Diagnosis) -> None:
         console.print(table)
         for f in d.findings:
             console.print(f"{f.cause}: {f.description}", markup=False, soft_wrap=True)
-    for shape in d.trends:
-        console.print(f"unexplained: {shape.text}", markup=False, soft_wrap=True)
+    label = "unexplained" if d.verdict == "unexplained" else "left, and less than the noise"
+    for trend in d.trends:
+        console.print(f"{label}: {trend.text}", markup=False, soft_wrap=True)
     if d.next_drive:
         console.print(f"next drive: {d.next_drive}", markup=False, soft_wrap=True)
     for note in (*d.contradictions, *describe_outliers(d), *d.warnings):

@@ -102,7 +102,9 @@ class Cause:
         'the left and right contacts are 12 mm closer together than the robot file has it'
         """
         factor, unit = (1.0, self.unit) if self.is_coefficient else _SHOWN_UNITS.get(self.unit, (1.0, self.unit))
-        return self.words[size < 0.0].format(f"{abs(size) * factor:.2g} {unit}")
+        amount = abs(size) * factor
+        decimals = max(0, 1 - math.floor(math.log10(max(amount, 1e-12))))  # two digits at least
+        return self.words[size < 0.0].format(f"{amount:.{decimals}f}" + ("" if unit == "1" else f" {unit}"))
 
     @property
     def is_coefficient(self) -> bool:

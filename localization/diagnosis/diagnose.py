@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localization.diagnosis.causes import MISSING_MESSAGES, Cause
+from localization.diagnosis.causes import CAUSES, MISSING_MESSAGES, WINDOW_CAUSES, Cause
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, with_tolerance
@@ -19,7 +19,7 @@ from localization.diagnosis.selection import aliases_of, refined_cost, search_ca
 from localization.diagnosis.subset_selection import heldout_gain, max_statistic, p_value, statistic
 from localization.diagnosis.summary import describe_loss, describe_standstill_turn, evidence, sentence
 from localization.diagnosis.trends import find_trends
-from localization.diagnosis.verdict import attribute_rows, decide, find_outliers
+from localization.diagnosis.verdict import attribute_rows, decide, find_outliers, tolerated_sizes
 from localization.settings import Count, Probability, Seed, Settings
 from motion_models.base import MotionModel
 from motion_models.se2 import FloatArray
@@ -31,6 +31,7 @@ _SYSTEMATIC_SHARE = 1.0 / 3.0  # systematic part of a size's sigma, over what is
 _MIN_HELDOUT_GAIN = 0.003  # least held-out gain of a finding
 _CLEAR_HELDOUT_GAIN = 0.05
 _FEW_WINDOWS = 64
+_YAW_CAUSES = ("rotation_scale", "wheel_radius_difference", "wheel_time_offset", "gyro_bias", "rotation_slip_speed")
 _MIN_GAPS = 3  # fewer gaps between messages are pauses
 
 
@@ -239,8 +240,22 @@ def _make_findings(
         p = _p_value(linearization, others, i, rng)
         aliases = aliases_of(predictor, linearization, chosen, i)
         text = evidence(cause, linearization.signatures[..., i] * size, linearization.noise, problem.gain(chosen) - problem.gain(others))
-        found.append(Finding(cause, size, sigma, p, aliases, text, gains[n]))
+        finding = Finding(cause, size, sigma, p, aliases, text, gains[n])
+        found.append(_shown_by_yaw(finding) if predictor.drive.is_gyro_reference else finding)
     return _merge_slopes(sorted(found, key=lambda f: f.gain.relative, reverse=True))
+
+
+def _shown_by_yaw(finding: Finding) -> Finding:
+    """``finding`` under the name of what headings alone show, where its first name is one of several physical reasons for that."""
+    sizes = dict(finding.aliases)
+    name = next((name for name in _YAW_CAUSES if name in sizes), None)
+    if name is None or finding.cause in _YAW_CAUSES:
+        return finding
+    definition = CAUSES.get(name) or WINDOW_CAUSES[name]
+    others = tuple((alias, size) for alias, size in finding.aliases if alias != name)
+    sigma = finding.sigma * abs(sizes[name] / finding.size) if finding.size else finding.sigma
+    aliases = ((finding.cause, finding.size), *others)
+    return dataclasses.replace(finding, definition=definition, size=sizes[name], sigma=sigma, aliases=aliases)
 
 
 def _detectable_sizes(linearization: Linearization) -> dict[str, float]:
@@ -257,7 +272,7 @@ def _within_tolerance(
 ) -> dict[str, tuple[float, float]]:
     """Size and sigma of the causes that are not named and yet account for a part of a significant row."""
     listed = {a.cause for row in rows.values() for a in row.attributions if not a.is_named}
-    sizes, sigmas = linearization.problem.posterior(chosen), linearization.problem.posterior_sigmas(chosen)
+    sizes, sigmas = tolerated_sizes(linearization, chosen), linearization.problem.posterior_sigmas(chosen)
     found: dict[str, tuple[float, float]] = {}
     for i, cause in enumerate(linearization.causes):
         if cause.id in listed and i not in chosen and abs(sizes[i]) > abs(found.get(cause.id, (0.0, 0.0))[0]):

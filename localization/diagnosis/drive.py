@@ -29,6 +29,7 @@ _FOREVER_S = 1e6
 _GRIPPERS = ("left_gripper", "gripper", "tool0", "left_tool0")
 _MIN_GRAVITY, _MAX_GRAVITY = 8.0, 12.0
 _RANGE_STEP_M = 0.05  # added to all ranges for the scene's derivative: about the ranging error of common scanners
+_MAX_SHIFTED_WINDOWS = 60  # windows whose scans are matched twice, once with longer ranges
 _MAX_STANDSTILL_RATE = 0.05  # rad/s; five sigma of plausible gyro biases (`causes`): a robot that turns while its wheels stand
 _MIN_REGULAR_SHARE = 0.6  # of the intervals between messages that must be near their median for messages to have a period
 _MAX_PAUSE_S = 5.0  # longer gaps are pauses of the driver, not lost messages
@@ -105,7 +106,7 @@ class _Recorder:
 
     def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
         yield from self._inner.spans(event, wheels)
-        if self._shifted is not None:
+        if self._shifted is not None and len(self._shifted_spans) < _MAX_SHIFTED_WINDOWS:
             longer = _with_longer_ranges(event) if isinstance(event, Scan) else event
             self._shifted_spans.update({(s.start_ns, s.end_ns): s for s in self._shifted.spans(longer, wheels) if s.is_valid})
 
@@ -117,11 +118,15 @@ class _Recorder:
         return self._inner.warnings()
 
     def range_slopes(self) -> FloatArray | None:
-        """See `Drive.range_slopes`; 0 for windows that only one of the two references measured."""
-        if self._shifted is None or not self.used:
+        """See `Drive.range_slopes`; beyond the first windows by their mean share of the path, as matching twice takes twice as long."""
+        pairs = [(s, self._shifted_spans[key]) for s in self.used if (key := (s.start_ns, s.end_ns)) in self._shifted_spans]
+        if not pairs:
             return None
-        pairs = [(s, self._shifted_spans.get((s.start_ns, s.end_ns), s)) for s in self.used]
-        return np.array([(b.measured - a.measured) / _RANGE_STEP_M for a, b in pairs])
+        slopes = {(a.start_ns, a.end_ns): (b.measured - a.measured) / _RANGE_STEP_M for a, b in pairs}
+        paths = np.array([a.measured[:2] for a, _ in pairs])
+        changes = np.array([slope[:2] for slope in slopes.values()])
+        share = float(np.sum(changes * paths) / max(float(np.sum(paths**2)), 1e-9))
+        return np.array([slopes.get((s.start_ns, s.end_ns), np.array([*(share * s.measured[:2]), 0.0])) for s in self.used])
 
 
 def _with_longer_ranges(scan: Scan) -> Scan:

@@ -13,7 +13,17 @@ from localization.diagnosis.noise import Noise, estimate_noise, given_noise, var
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
 from localization.diagnosis.subset_selection import Regression, regression
 from motion_models.base import MotionModel
+from motion_models.diff_drive import DiffDrive
+from motion_models.friction import FrictionModel
+from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
+
+SKIDDING = frozenset(
+    {"track_width", "payload", "cg_offset_x", "cg_offset_y", "friction_anisotropy", "friction_change", "split_friction", "scrub"}
+    | {"lateral_force_law", "diagonal_load", "tread_asymmetry", "rolling_resistance", "slope", "rotation_slip_speed"}
+)
+"""Causes that act by the friction of wheels that skid: none of a robot with casters, whose track is a scale of its rotation."""
+_CASTER_TOLERANCE = 0.02  # of the separation multiplier: what is calibrated on a robot with casters
 
 
 @dataclass(frozen=True)
@@ -35,10 +45,22 @@ class Linearization:
     problem: Regression
 
 
+def is_skid_steer(robot: Robot) -> bool:
+    """Whether the robot's wheels skid in turns; a robot with casters turns by its geometry (separation multiplier 1 in its file)."""
+    model = DiffDrive.from_robot(robot)
+    multiplier = float(model.nominal[model.param_names.index("wheel_separation_multiplier")])
+    return robot.arms is not None or abs(multiplier - 1.0) > _CASTER_TOLERANCE
+
+
+def default_model(robot: Robot) -> str:
+    """Name of the motion model that suits ``robot``."""
+    return FrictionModel.name if is_skid_steer(robot) else DiffDrive.name
+
+
 def make_predictor(drive: Drive, model: MotionModel) -> DrivePredictor:
     """With inertia where that describes the drive better (or is what the friction model leaves out by its nature)."""
     plain = DrivePredictor(drive, model, has_inertia=False)
-    if drive.kind != "log":
+    if drive.kind != "log" or not is_skid_steer(drive.robot):
         return plain
     with_inertia = DrivePredictor(drive, model, has_inertia=True)
     squares = []
@@ -75,9 +97,11 @@ def candidate_causes(predictor: DrivePredictor, moments: int) -> tuple[Cause, ..
     if drive.kind == "runs":
         out = {"wheel_radius_difference", "tread_asymmetry", "lidar_yaw", "gyro_bias", "encoder_dropout"}
         return tuple(e for e in found if e.id not in out)
+    if not is_skid_steer(drive.robot):
+        found = [e for e in found if e.id not in SKIDDING]
     if drive.kind == "windows":
         found += list(WINDOW_CAUSES.values())
-    elif predictor.model.name != "friction":  # its own number for how far it turns is not the floor's
+    elif predictor.model.name != "friction" or drive.is_gyro_reference:  # its own number for how far it turns is not the floor's
         found.append(WINDOW_CAUSES["rotation_scale"])
     return tuple(found)
 

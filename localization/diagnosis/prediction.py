@@ -107,9 +107,7 @@ class DrivePredictor:
         """(M, 6) measured minus predicted, as `CHANNELS`: motion in the predicted end's frame; NaN where nothing was measured."""
         batch, drive = self.batch, self.drive
         out = np.full((len(batch.ends), len(CHANNELS)), np.nan)
-        reference_params = np.array(
-            [hypothesis.wheel_time_offset_s - hypothesis.lidar_time_offset_s, hypothesis.wheel_lag_s, *self._tracked(hypothesis)]
-        )
+        reference_params = np.array([self._wheel_shift(hypothesis), hypothesis.wheel_lag_s, *self._tracked(hypothesis)])
         if drive.is_gyro_reference:
             reference_params[2:] = 0.0
         changed = _HypothesisModel(self, hypothesis)

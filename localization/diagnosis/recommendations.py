@@ -18,7 +18,7 @@ from motion_models.se2 import FloatArray
 _SECONDS, _DT = 20.0, 0.1
 _WINDOW = 20  # intervals
 _SIGMA = np.array([0.004, 0.004, 0.003])
-_MOST_S = 600.0
+_MAX_S = 120.0
 _ENOUGH = 9.0  # twice the log-likelihood that decides
 
 
@@ -28,7 +28,7 @@ def candidate_maneuvers(speed: float, radius: float, cg: FloatArray, has_arms: b
     turn = 0.35 * rate
     n = round(_SECONDS / _DT)
     t = np.arange(n) * _DT
-    steady = np.ones(n)
+    pace = np.where((t % 10.0) < 5.0, 0.6, 1.4)
     wave = np.sign(np.sin(2.0 * math.pi * t / 10.0 + 1e-9))
     halting = np.where((t % 4.0) < 2.0, 1.0, 0.05)
     half = np.where(np.arange(n) % (2 * _WINDOW) < _WINDOW, 1.0, -1.0)
@@ -40,9 +40,8 @@ def candidate_maneuvers(speed: float, radius: float, cg: FloatArray, has_arms: b
         return [Maneuver(np.full(_WINDOW, _DT), p, np.zeros((1, 3)), ends, at, np.diag(_SIGMA**2)) for p in parts]
 
     found = [
-        ("straight driving", table(rate * steady, rate * steady, cg)),
         ("straight driving, forwards and backwards", table(rate * wave, rate * wave, cg)),
-        ("straight driving, slow and fast", table(rate * (1.0 + 0.5 * half), rate * (1.0 + 0.5 * half), cg)),
+        ("straight driving to and fro, slow and fast", table(rate * wave * pace, rate * wave * pace, cg)),
         ("turning in place, both ways", table(-turn * half, turn * half, cg)),
         ("turning in place, fast and slow", table(-turn * (1.2 + half), turn * (1.2 + half), cg)),
         ("gentle arcs to both sides", table(rate * (1.0 - 0.15 * half), rate * (1.0 + 0.15 * half), cg)),
@@ -95,7 +94,9 @@ def separating_drive(predictor: DrivePredictor, findings: Sequence[Finding], lin
     listed = ", ".join(names[:-1]) + " and " + names[-1]
     if not best[0]:
         return f"No short drive separates {listed}: measure one of them directly."
-    seconds = min(max(_SECONDS, 5.0 * math.ceil(_SECONDS * _ENOUGH / best[1] / 5.0)), _MOST_S)
+    seconds = max(_SECONDS, 5.0 * math.ceil(_SECONDS * _ENOUGH / best[1] / 5.0))
+    if seconds > _MAX_S:
+        return f"No drive of two minutes separates {listed}: measure one of them directly."
     return f"To separate {listed}, record about {seconds:.0f} s of {best[0]}."
 
 

@@ -17,6 +17,8 @@ _MANY = 1500  # as many numbers must be measured for sets of more than _FEW caus
 _FEW = 4
 _DRAWS = 4000
 _KEPT = 12
+MAX_TOLERANCE_SIGMAS = 3.0
+"""Largest size of a cause that is not named, over the sigma of its tolerance: about what is negligible (see `diagnose.TOLERANCES`)."""
 _BLOCK_WINDOWS, _FOLDS, _BOOTSTRAP_DRAWS = 4, 5, 1000
 
 
@@ -82,9 +84,17 @@ class Regression:
         return self._evidence(subset)[2] - self._evidence(())[2] if subset else 0.0
 
     def misfit(self) -> float:
-        """Sum of squares that is left where every cause keeps within its tolerance."""
-        half = self._evidence(())[1]
-        return self.rest - float(half @ half)
+        """Sum of squares that is left where every cause keeps within its tolerance, and what that takes.
+
+        A prior does not hold a size against much data: beyond `MAX_TOLERANCE_SIGMAS` a size would not be tolerated, and is cut there.
+        """
+        factor, half, _ = self._evidence(())
+        x = np.linalg.solve(factor.T, half)
+        limit = MAX_TOLERANCE_SIGMAS * self.tolerance
+        if np.all(np.abs(x) <= limit):
+            return self.rest - float(half @ half)
+        x = np.clip(x, -limit, limit)
+        return self.rest + float(x @ self.gram @ x - 2.0 * x @ self.moment + np.sum(np.square(x / self.tolerance)))
 
     def scores(self, given: tuple[int, ...], wanted: list[int]) -> tuple[FloatArray, FloatArray]:
         """(n,) scores of the ``wanted`` causes with those ``given`` free and all others within tolerance, and their (n, n) covariance if

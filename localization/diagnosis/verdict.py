@@ -12,6 +12,7 @@ from localization.diagnosis.causes import Cause
 from localization.diagnosis.findings import Attribution, Component, Finding, Trend, Verdict
 from localization.diagnosis.linearization import Linearization
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS
+from localization.diagnosis.subset_selection import MAX_TOLERANCE_SIGMAS
 from motion_models.se2 import FloatArray
 
 MAX_LEFT_OVER_NOISE = 1.5
@@ -33,7 +34,9 @@ def find_outliers(linearization: Linearization) -> NDArray[np.bool_]:
 
 def tolerated_sizes(linearization: Linearization, chosen: tuple[int, ...]) -> FloatArray:
     """(p,) estimated sizes of the causes that are not named, which are held to their tolerances; 0 for those ``chosen``."""
-    sizes = linearization.problem.posterior(chosen)
+    problem = linearization.problem
+    limit = MAX_TOLERANCE_SIGMAS * problem.tolerance * problem.scale
+    sizes = np.clip(problem.posterior(chosen), -limit, limit)
     sizes[list(chosen)] = 0.0
     return sizes
 
