@@ -75,7 +75,7 @@ class EkfFusion:
         if step.turn is not None:
             self._start_gyro()
             ekf.update_turn(step.turn)
-        if step.scan is not None and self._sensor is not None:
+        if self._sensor is not None:
             nis = self._update_scan(step, self._sensor)
         delta, cov = ekf.motion_since(START)
         twist, twist_cov = mean_twist(delta, cov, step.duration) if step.duration > 0.0 else (step.twist, None)
@@ -92,6 +92,10 @@ class EkfFusion:
             ekf.insert_key_scan(self._sensor.insert_key_scan(ekf.pose, ekf.P[MAP, MAP].copy()))
 
     def _update_scan(self, step: Step, sensor: ScanMatchingSensor) -> float | None:
+        """Match the scan of ``step`` and update by it; its NIS, or None where there is no scan or no match."""
+        if step.scan is None:
+            sensor.lost.add_no_scan(step.end_ns)
+            return None
         ekf, duration = self.filter, step.duration
         self.counts_by_name["scans"] += 1
         prior, cov = ekf.pose, ekf.map_relative_cov()
