@@ -57,7 +57,7 @@ _MAX_CURVATURE_RAD_M = 0.6
 """Sharper turns slide sideways."""
 _MAX_DIRECTION_RAD, _MIN_COHERENCE = math.radians(12.0), 0.9
 """Honest drives (ACES) have 0.5 deg over 340 pairs of scans; a robot on a side slope or in curves slides by a few degrees."""
-_MIN_OWN_SHARE = 0.02
+_MIN_OWN_SHARE = 0.05
 _STANDING_SPEED_M_S = 0.1
 _SHAKE_M_S2, _SHAKE_SAMPLES = 0.4, 20
 """Standard deviation of the specific force over a second: Husky outdoors at rest 0.005 to 0.11, driving 0.51 to 1.6 (5 to 95 %)."""
@@ -126,19 +126,14 @@ class _Relation(NamedTuple):
     ratio: float
     is_excited: bool
     """Both turn enough for a scale."""
-    t: float
-    """Student's t of the correlation."""
+    is_opposite: bool
 
     @property
     def is_equal(self) -> bool:
         return self.is_excited and self.correlation >= _EQUAL_CORRELATION and 1.0 / _MAX_EQUAL_RATIO <= self.ratio <= _MAX_EQUAL_RATIO
 
-    @property
-    def is_opposite(self) -> bool:
-        return self.correlation <= _OPPOSITE_CORRELATION and self.t <= -_MIN_T
 
-
-_NO_RELATION = _Relation(0.0, 1.0, False, 0.0)
+_NO_RELATION = _Relation(0.0, 1.0, False, False)
 
 
 class SensorChecks:
@@ -149,7 +144,7 @@ class SensorChecks:
         self._scans, self._own_body = ScanOdometry(), OwnBodyFilter()
         self._bins: deque[_Bin] = deque(maxlen=_WINDOW_BINS)
         self._open = _Accumulator()
-        self._is_gyro_stuck = False
+        self._is_gyro_stuck = self._has_scans = False
         self._shaking = ShakeDetector()
         self._suspected: dict[Fault, tuple[float, float]] = {}  # when first found, and start of the bins then [s]
         self.found: dict[Fault, Found] = {}
@@ -264,7 +259,9 @@ class SensorChecks:
             turned[2] = step.turn.angle
         self._by_gyro = se2.compose(self._by_gyro, turned)
         self._open.add(step)
-        if self._open.duration_s < _BIN_S or (step.scan is None and self._open.duration_s < 2.0 * _BIN_S):
+        self._has_scans |= step.scan is not None
+        waits_for_scan = self._has_scans and step.scan is None
+        if self._open.duration_s < (2.0 * _BIN_S if waits_for_scan else _BIN_S):
             return
         lidar = np.full(3, np.nan)
         if step.scan is not None:
@@ -287,7 +284,8 @@ class SensorChecks:
         self._is_gyro_stuck = _is_constant(rates[:, 1], rates[:, 0])
         if self._is_gyro_stuck:
             suspects[Fault.GYRO_STUCK] = {"others": "the wheels"}
-        if (direction := _travel_direction(list(self._bins))) is not None and abs(direction) > _MAX_DIRECTION_RAD:
+        direction = _travel_direction(list(self._bins))
+        if direction is not None and abs(direction) > _MAX_DIRECTION_RAD:
             degrees = math.degrees(direction)
             side = "left" if degrees > 0.0 else "right"
             suspects[Fault.LIDAR_DIRECTION] = {"degrees": abs(degrees), "side": side, "correction": -degrees}
@@ -296,7 +294,8 @@ class SensorChecks:
         for fault, (first_s, since_s) in self._suspected.items():
             if now_s - first_s >= _MIN_LASTING_S:
                 self._declare(fault, since_s, suspects[fault])
-        if not suspects and (wheels_gyro.is_equal or wheels_lidar.is_equal or lidar_gyro.is_equal):
+        is_turn_confirmed = wheels_gyro.is_equal or wheels_lidar.is_equal or lidar_gyro.is_equal
+        if not suspects and is_turn_confirmed and (direction is not None or not self._has_scans):
             self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)
 
     def _declare(self, fault: Fault, at_s: float, numbers: Mapping[str, float | str]) -> None:
@@ -369,13 +368,21 @@ def _relate(a: FloatArray, b: FloatArray) -> _Relation:
     if both.sum() < _MIN_BINS:
         return _NO_RELATION
     a, b = a[both], b[both]
-    b = b - min(max(float((b - a).mean()), -_MAX_BIAS_RAD_S), _MAX_BIAS_RAD_S)
+    bias = float((b - a).mean())
+    b = b - min(max(bias, -_MAX_BIAS_RAD_S), _MAX_BIAS_RAD_S)
     size_a, size_b = math.sqrt(float(a @ a) / len(a)), math.sqrt(float(b @ b) / len(b))
     if min(size_a, size_b) < _MIN_RATE_RAD_S:
         return _NO_RELATION
-    r = min(max(float(a @ b) / len(a) / (size_a * size_b), -1.0), 1.0)
+    r = float(a @ b) / len(a) / (size_a * size_b)
+    is_opposite = _is_opposite(a, b) if abs(bias) > _MAX_BIAS_RAD_S else _is_opposite(a - a.mean(), b - b.mean())
+    return _Relation(r, size_b / size_a, min(size_a, size_b) >= _MIN_EXCITED_RAD_S, is_opposite)
+
+
+def _is_opposite(a: FloatArray, b: FloatArray) -> bool:
+    """Whether two turn rates (n,) have opposite signs, and not by chance. Means that a bias explains must be taken out before."""
+    r = min(max(float(a @ b) / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-12), -1.0), 1.0)
     t = r * math.sqrt((len(a) - 2) / max(1.0 - r * r, 1e-9))
-    return _Relation(r, size_b / size_a, min(size_a, size_b) >= _MIN_EXCITED_RAD_S, t)
+    return r <= _OPPOSITE_CORRELATION and t <= -_MIN_T
 
 
 def _find_turn_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation) -> list[tuple[Fault, dict[str, float | str]]]:
