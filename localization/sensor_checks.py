@@ -149,7 +149,8 @@ class SensorChecks:
         self._suspected: dict[Fault, tuple[float, float]] = {}  # when first found, and start of the bins then [s]
         self.found: dict[Fault, Found] = {}
         self._start_ns: int | None = None
-        self._standing_s = 0.0  # time for which the wheels' standstill is contradicted
+        self._stood_s = 0.0  # time for which the wheels read zero
+        self._standing_s = 0.0  # the same, while that is contradicted
         self._pose: FloatArray | None = None
         self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)  # motion since the sensors last agreed
         self._pending = np.zeros((3, 3))
@@ -224,17 +225,18 @@ class SensorChecks:
     def _check_standstill(self, step: Step) -> Step:
         """Wheels that read zero while LiDAR or IMU show motion count as unknown, for as long as that lasts."""
         if not step.is_standing:
-            self._standing_s = 0.0
+            self._standing_s = self._stood_s = 0.0
             return step
+        self._stood_s += step.duration
         travelled = sum(math.hypot(b.lidar[0], b.lidar[1]) for b in self._recent() if b.is_standing and np.isfinite(b.lidar[0]))
         lasted = sum(b.duration_s for b in self._recent() if b.is_standing and np.isfinite(b.lidar[0]))
         is_lidar_moving = lasted >= 1.0 and travelled >= _STANDING_SPEED_M_S * lasted
         has_lidar = lasted > 0.0
-        if not is_lidar_moving and (has_lidar or self._shaking.lasted_s < _SHAKE_S):
+        if not is_lidar_moving and (has_lidar or min(self._shaking.lasted_s, self._stood_s) < _SHAKE_S):
             self._standing_s = 0.0
             return step
         before = self._standing_s
-        self._standing_s = before + step.duration if before else max(_SHAKE_S, step.duration)
+        self._standing_s = self._stood_s
         others = "the LiDAR" if is_lidar_moving else "the IMU shakes as if it"
         self._declare(Fault.WHEELS_STANDING, self._now_s(step) - self._standing_s, {"others": others})
         return self._with_unknown_motion(step, self._standing_s**2 - before**2)
