@@ -127,13 +127,15 @@ class _Relation(NamedTuple):
     is_excited: bool
     """Both turn enough for a scale."""
     is_opposite: bool
+    unit_ratio: float
+    """Ratio of the second to the first that only a wrong unit explains; 0 where there is none."""
 
     @property
     def is_equal(self) -> bool:
         return self.is_excited and self.correlation >= _EQUAL_CORRELATION and 1.0 / _MAX_EQUAL_RATIO <= self.ratio <= _MAX_EQUAL_RATIO
 
 
-_NO_RELATION = _Relation(0.0, 1.0, False, False)
+_NO_RELATION = _Relation(0.0, 1.0, False, False, 0.0)
 
 
 class SensorChecks:
@@ -377,7 +379,17 @@ def _relate(a: FloatArray, b: FloatArray) -> _Relation:
         return _NO_RELATION
     r = float(a @ b) / len(a) / (size_a * size_b)
     is_opposite = _is_opposite(a, b) if abs(bias) > _MAX_BIAS_RAD_S else _is_opposite(a - a.mean(), b - b.mean())
-    return _Relation(r, size_b / size_a, min(size_a, size_b) >= _MIN_EXCITED_RAD_S, is_opposite)
+    unit_ratio = _unit_ratio(a, b) or _unit_ratio(a - a.mean(), b - b.mean())
+    return _Relation(r, size_b / size_a, min(size_a, size_b) >= _MIN_EXCITED_RAD_S, is_opposite, unit_ratio)
+
+
+def _unit_ratio(a: FloatArray, b: FloatArray) -> float:
+    """Ratio of turn rate ``b`` to ``a`` (n,) where they agree but for a factor as between degrees and radians; else 0."""
+    size_a, size_b = math.sqrt(float(a @ a)), math.sqrt(float(b @ b))
+    if min(size_a, size_b) < _MIN_RATE_RAD_S * math.sqrt(len(a)) or float(a @ b) < _EQUAL_CORRELATION * size_a * size_b:
+        return 0.0
+    low, high = _DEG_PER_RAD_RANGE
+    return size_b / size_a if low <= max(size_b / size_a, size_a / size_b) <= high else 0.0
 
 
 def _is_opposite(a: FloatArray, b: FloatArray) -> bool:
@@ -397,10 +409,8 @@ def _find_turn_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyr
     elif wheels_lidar.is_opposite:
         found.append((Fault.LIDAR_OPPOSITE, {"others": "wheels and gyro" if wheels_gyro.is_equal else "the wheels"}))
     for relation, others in ((wheels_gyro, "the wheels"), (lidar_gyro, "the LiDAR")):
-        low, high = _DEG_PER_RAD_RANGE
-        is_unit = low <= relation.ratio <= high or low <= 1.0 / max(relation.ratio, 1e-9) <= high
-        if is_unit and relation.correlation >= _EQUAL_CORRELATION:
-            found.append((Fault.GYRO_UNIT, {"others": others, "ratio": relation.ratio}))
+        if relation.unit_ratio:
+            found.append((Fault.GYRO_UNIT, {"others": others, "ratio": relation.unit_ratio}))
             break
     return found
 

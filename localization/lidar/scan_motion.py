@@ -16,11 +16,12 @@ import numpy as np
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
-_BEARINGS = 360
+_BEARINGS = 180
+"""Of 2 deg: each has a beam of any scanner in use, however its beams lie to the bins."""
 _BIN_RAD = 2.0 * np.pi / _BEARINGS
-_MIN_BEARINGS = 60
+_MIN_BEARINGS = 30
 """Filled bearings of a profile, of `_BEARINGS`; fewer leave the turn ambiguous."""
-_MAX_TURN_BINS = 60
+_MAX_TURN_BINS = 30
 _ITERATIONS = 8
 _FIRST_SCALE_M, _LAST_SCALE_M = 0.5, 0.05
 """Scale of the robust loss (Cauchy), annealed [m]."""
@@ -47,11 +48,11 @@ class _Profile(NamedTuple):
     center: FloatArray
     """(2,) sensor in the body frame [m]."""
     points: FloatArray
-    """(M, 2) nearest point of each filled bearing, about the sensor in the body's axes [m]."""
+    """(180, 2) nearest point by bearing, about the sensor in the body's axes [m]; NaN where none."""
     ranges: FloatArray
-    """(360,) nearest range by bearing; NaN where none [m]."""
+    """(180,) nearest range by bearing; NaN where none [m]."""
     normals: FloatArray
-    """(360, 2) of the surface at each bearing; NaN where unknown."""
+    """(180, 2) of the surface at each bearing; NaN where unknown."""
 
 
 class ScanOdometry:
@@ -83,19 +84,20 @@ def _make_profile(points: FloatArray, center: FloatArray) -> _Profile | None:
     ranges[~np.isfinite(ranges)] = np.nan
     if np.isfinite(ranges).sum() < _MIN_BEARINGS:
         return None
-    bearing = (np.arange(_BEARINGS) + 0.5) * _BIN_RAD
-    surface = ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
-    along = np.roll(surface, -2, axis=0) - np.roll(surface, 2, axis=0)
+    is_nearest = r == ranges[bins]
+    surface = np.full((_BEARINGS, 2), np.nan)
+    surface[bins[is_nearest]] = points[is_nearest]
+    along = np.roll(surface, -1, axis=0) - np.roll(surface, 1, axis=0)
     length = np.hypot(along[:, 0], along[:, 1])
     is_edge = ~(length < 0.1 + 0.5 * ranges)  # from one surface to another, or unknown
     normals = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(length, 1e-6)[:, None]
     normals[is_edge] = np.nan
-    return _Profile(center, points[r == ranges[bins]], ranges, normals)
+    return _Profile(center, surface, ranges, normals)
 
 
 @numba.njit(cache=True)
 def _correlate(a: FloatArray, b: FloatArray) -> float:
-    """Turn [rad] from profile ``a`` to ``b``, log-ranges (360,), at their least mean difference; NaN where they share too few bearings."""
+    """Turn [rad] from profile ``a`` to ``b``, log-ranges (180,), at their least mean difference; NaN where they share too few bearings."""
     best, turn = np.inf, np.nan
     for shift in range(-_MAX_TURN_BINS, _MAX_TURN_BINS + 1):
         n, cost = 0, 0.0
@@ -115,11 +117,11 @@ def _refine(a: _Profile, b: _Profile, turn: float) -> ScanMotion | None:
     A = np.zeros((3, 3))
     inliers = 0
     for scale in np.geomspace(_FIRST_SCALE_M, _LAST_SCALE_M, _ITERATIONS):
-        A, gradient, structure, inliers = _normal_equations(a.ranges, a.normals, b.points, a_T_b, float(scale))
+        A, gradient, structure, inliers = _normal_equations(a.points, a.normals, b.points, a_T_b, float(scale))
         if inliers < _MIN_BEARINGS // 2:
             return None
         a_T_b = a_T_b - np.linalg.solve(A + _DAMPING * inliers * np.eye(3), gradient)
-    if inliers < _MIN_INLIERS * len(b.points) or not np.isfinite(a_T_b).all():
+    if inliers < _MIN_INLIERS * np.isfinite(b.ranges).sum() or not np.isfinite(a_T_b).all():
         return None
     body_T_sensor = np.array([a.center[0], a.center[1], 0.0])
     moved = se2.compose(se2.compose(body_T_sensor, a_T_b), se2.inverse(body_T_sensor))
@@ -128,7 +130,7 @@ def _refine(a: _Profile, b: _Profile, turn: float) -> ScanMotion | None:
 
 @numba.njit(cache=True)
 def _normal_equations(
-    ranges: FloatArray, normals: FloatArray, points: FloatArray, a_T_b: FloatArray, scale: float
+    surface: FloatArray, normals: FloatArray, points: FloatArray, a_T_b: FloatArray, scale: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, int]:
     """J^T W J (3, 3) and J^T W r (3,) of the distances r of ``points`` (M, 2), moved by ``a_T_b`` (3,), from the lines of a profile.
 
@@ -139,10 +141,11 @@ def _normal_equations(
     for i in range(points.shape[0]):
         tx, ty = c * points[i, 0] - s * points[i, 1], s * points[i, 0] + c * points[i, 1]
         x, y = tx + a_T_b[0], ty + a_T_b[1]
+        if math.isnan(x):
+            continue
         k = math.floor(math.atan2(y, x) / _BIN_RAD) % _BEARINGS
         nx, ny = normals[k, 0], normals[k, 1]
-        bearing = (k + 0.5) * _BIN_RAD
-        dx, dy = x - ranges[k] * math.cos(bearing), y - ranges[k] * math.sin(bearing)
+        dx, dy = x - surface[k, 0], y - surface[k, 1]
         if math.isnan(nx) or not (abs(dx) < _MAX_DISTANCE_M and abs(dy) < _MAX_DISTANCE_M):
             continue
         r = nx * dx + ny * dy
