@@ -57,7 +57,7 @@ _MAX_CURVATURE_RAD_M = 0.6
 """Sharper turns slide sideways."""
 _MAX_DIRECTION_RAD, _MIN_COHERENCE = math.radians(12.0), 0.9
 """Honest drives (ACES) have 0.5 deg over 340 pairs of scans; a robot on a side slope or in curves slides by a few degrees."""
-_MIN_OWN_SHARE = 0.02
+_MIN_OWN_SHARE = 0.05
 _STANDING_SPEED_M_S = 0.1
 _SHAKE_M_S2, _SHAKE_SAMPLES = 0.4, 20
 """Standard deviation of the specific force over a second: Husky outdoors at rest 0.005 to 0.11, driving 0.51 to 1.6 (5 to 95 %)."""
@@ -126,19 +126,16 @@ class _Relation(NamedTuple):
     ratio: float
     is_excited: bool
     """Both turn enough for a scale."""
-    t: float
-    """Student's t of the correlation."""
+    is_opposite: bool
+    unit_ratio: float
+    """Ratio of the second to the first that only a wrong unit explains; 0 where there is none."""
 
     @property
     def is_equal(self) -> bool:
         return self.is_excited and self.correlation >= _EQUAL_CORRELATION and 1.0 / _MAX_EQUAL_RATIO <= self.ratio <= _MAX_EQUAL_RATIO
 
-    @property
-    def is_opposite(self) -> bool:
-        return self.correlation <= _OPPOSITE_CORRELATION and self.t <= -_MIN_T
 
-
-_NO_RELATION = _Relation(0.0, 1.0, False, 0.0)
+_NO_RELATION = _Relation(0.0, 1.0, False, False, 0.0)
 
 
 class SensorChecks:
@@ -149,12 +146,13 @@ class SensorChecks:
         self._scans, self._own_body = ScanOdometry(), OwnBodyFilter()
         self._bins: deque[_Bin] = deque(maxlen=_WINDOW_BINS)
         self._open = _Accumulator()
-        self._is_gyro_stuck = False
+        self._is_gyro_stuck = self._has_scans = False
         self._shaking = ShakeDetector()
         self._suspected: dict[Fault, tuple[float, float]] = {}  # when first found, and start of the bins then [s]
         self.found: dict[Fault, Found] = {}
         self._start_ns: int | None = None
-        self._standing_s = 0.0  # time for which the wheels' standstill is contradicted
+        self._stood_s = 0.0  # time for which the wheels read zero
+        self._standing_s = 0.0  # the same, while that is contradicted
         self._pose: FloatArray | None = None
         self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)  # motion since the sensors last agreed
         self._pending = np.zeros((3, 3))
@@ -229,17 +227,18 @@ class SensorChecks:
     def _check_standstill(self, step: Step) -> Step:
         """Wheels that read zero while LiDAR or IMU show motion count as unknown, for as long as that lasts."""
         if not step.is_standing:
-            self._standing_s = 0.0
+            self._standing_s = self._stood_s = 0.0
             return step
+        self._stood_s += step.duration
         travelled = sum(math.hypot(b.lidar[0], b.lidar[1]) for b in self._recent() if b.is_standing and np.isfinite(b.lidar[0]))
         lasted = sum(b.duration_s for b in self._recent() if b.is_standing and np.isfinite(b.lidar[0]))
         is_lidar_moving = lasted >= 1.0 and travelled >= _STANDING_SPEED_M_S * lasted
         has_lidar = lasted > 0.0
-        if not is_lidar_moving and (has_lidar or self._shaking.lasted_s < _SHAKE_S):
+        if not is_lidar_moving and (has_lidar or min(self._shaking.lasted_s, self._stood_s) < _SHAKE_S):
             self._standing_s = 0.0
             return step
         before = self._standing_s
-        self._standing_s = before + step.duration if before else max(_SHAKE_S, step.duration)
+        self._standing_s = self._stood_s
         others = "the LiDAR" if is_lidar_moving else "the IMU shakes as if it"
         self._declare(Fault.WHEELS_STANDING, self._now_s(step) - self._standing_s, {"others": others})
         return self._with_unknown_motion(step, self._standing_s**2 - before**2)
@@ -264,7 +263,9 @@ class SensorChecks:
             turned[2] = step.turn.angle
         self._by_gyro = se2.compose(self._by_gyro, turned)
         self._open.add(step)
-        if self._open.duration_s < _BIN_S or (step.scan is None and self._open.duration_s < 2.0 * _BIN_S):
+        self._has_scans |= step.scan is not None
+        waits_for_scan = self._has_scans and step.scan is None
+        if self._open.duration_s < (2.0 * _BIN_S if waits_for_scan else _BIN_S):
             return
         lidar = np.full(3, np.nan)
         if step.scan is not None:
@@ -287,7 +288,8 @@ class SensorChecks:
         self._is_gyro_stuck = _is_constant(rates[:, 1], rates[:, 0])
         if self._is_gyro_stuck:
             suspects[Fault.GYRO_STUCK] = {"others": "the wheels"}
-        if (direction := _travel_direction(list(self._bins))) is not None and abs(direction) > _MAX_DIRECTION_RAD:
+        direction = _travel_direction(list(self._bins))
+        if direction is not None and abs(direction) > _MAX_DIRECTION_RAD:
             degrees = math.degrees(direction)
             side = "left" if degrees > 0.0 else "right"
             suspects[Fault.LIDAR_DIRECTION] = {"degrees": abs(degrees), "side": side, "correction": -degrees}
@@ -296,7 +298,8 @@ class SensorChecks:
         for fault, (first_s, since_s) in self._suspected.items():
             if now_s - first_s >= _MIN_LASTING_S:
                 self._declare(fault, since_s, suspects[fault])
-        if not suspects and (wheels_gyro.is_equal or wheels_lidar.is_equal or lidar_gyro.is_equal):
+        is_turn_confirmed = wheels_gyro.is_equal or wheels_lidar.is_equal or lidar_gyro.is_equal
+        if not suspects and is_turn_confirmed and (direction is not None or not self._has_scans):
             self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)
 
     def _declare(self, fault: Fault, at_s: float, numbers: Mapping[str, float | str]) -> None:
@@ -369,13 +372,31 @@ def _relate(a: FloatArray, b: FloatArray) -> _Relation:
     if both.sum() < _MIN_BINS:
         return _NO_RELATION
     a, b = a[both], b[both]
-    b = b - min(max(float((b - a).mean()), -_MAX_BIAS_RAD_S), _MAX_BIAS_RAD_S)
+    bias = float((b - a).mean())
+    b = b - min(max(bias, -_MAX_BIAS_RAD_S), _MAX_BIAS_RAD_S)
     size_a, size_b = math.sqrt(float(a @ a) / len(a)), math.sqrt(float(b @ b) / len(b))
     if min(size_a, size_b) < _MIN_RATE_RAD_S:
         return _NO_RELATION
-    r = min(max(float(a @ b) / len(a) / (size_a * size_b), -1.0), 1.0)
+    r = float(a @ b) / len(a) / (size_a * size_b)
+    is_opposite = _is_opposite(a, b) if abs(bias) > _MAX_BIAS_RAD_S else _is_opposite(a - a.mean(), b - b.mean())
+    unit_ratio = _unit_ratio(a, b) or _unit_ratio(a - a.mean(), b - b.mean())
+    return _Relation(r, size_b / size_a, min(size_a, size_b) >= _MIN_EXCITED_RAD_S, is_opposite, unit_ratio)
+
+
+def _unit_ratio(a: FloatArray, b: FloatArray) -> float:
+    """Ratio of turn rate ``b`` to ``a`` (n,) where they agree but for a factor as between degrees and radians; else 0."""
+    size_a, size_b = math.sqrt(float(a @ a)), math.sqrt(float(b @ b))
+    if min(size_a, size_b) < _MIN_RATE_RAD_S * math.sqrt(len(a)) or float(a @ b) < _EQUAL_CORRELATION * size_a * size_b:
+        return 0.0
+    low, high = _DEG_PER_RAD_RANGE
+    return size_b / size_a if low <= max(size_b / size_a, size_a / size_b) <= high else 0.0
+
+
+def _is_opposite(a: FloatArray, b: FloatArray) -> bool:
+    """Whether two turn rates (n,) have opposite signs, and not by chance. Means that a bias explains must be taken out before."""
+    r = min(max(float(a @ b) / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-12), -1.0), 1.0)
     t = r * math.sqrt((len(a) - 2) / max(1.0 - r * r, 1e-9))
-    return _Relation(r, size_b / size_a, min(size_a, size_b) >= _MIN_EXCITED_RAD_S, t)
+    return r <= _OPPOSITE_CORRELATION and t <= -_MIN_T
 
 
 def _find_turn_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation) -> list[tuple[Fault, dict[str, float | str]]]:
@@ -388,10 +409,8 @@ def _find_turn_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyr
     elif wheels_lidar.is_opposite:
         found.append((Fault.LIDAR_OPPOSITE, {"others": "wheels and gyro" if wheels_gyro.is_equal else "the wheels"}))
     for relation, others in ((wheels_gyro, "the wheels"), (lidar_gyro, "the LiDAR")):
-        low, high = _DEG_PER_RAD_RANGE
-        is_unit = low <= relation.ratio <= high or low <= 1.0 / max(relation.ratio, 1e-9) <= high
-        if is_unit and relation.correlation >= _EQUAL_CORRELATION:
-            found.append((Fault.GYRO_UNIT, {"others": others, "ratio": relation.ratio}))
+        if relation.unit_ratio:
+            found.append((Fault.GYRO_UNIT, {"others": others, "ratio": relation.unit_ratio}))
             break
     return found
 

@@ -1,0 +1,57 @@
+"""Motion from scan to scan against a room of formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from localization.lidar.scan_motion import ScanOdometry
+from motion_models import se2
+from tests.helpers.rooms import ANGLES, ranges
+
+
+def scan(pose: np.ndarray, sensor: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """(360, 2) in the body frame at ``pose``, by a sensor at ``sensor`` (3,) on it."""
+    r = ranges(tuple(se2.compose(pose, sensor))) + 0.01 * rng.normal(size=len(ANGLES))
+    return se2.transform(sensor, np.column_stack([r * np.cos(ANGLES), r * np.sin(ANGLES)]))
+
+
+@pytest.mark.parametrize("motion", [(0.1, 0.0, 0.0), (0.2, 0.0, 0.2), (0.0, 0.0, -0.6), (-0.3, 0.1, 0.05), (0.0, 0.0, 0.0)])
+@pytest.mark.parametrize("sensor", [(0.0, 0.0, 0.0), (0.4, -0.1, 0.7)])
+def test_motion_between_two_scans_is_that_of_the_body(motion: tuple, sensor: tuple) -> None:
+    rng, odometry, mount = np.random.default_rng(0), ScanOdometry(), np.array(sensor)
+    assert odometry.register(scan(np.zeros(3), mount, rng), mount[:2]) is None
+    found = odometry.register(scan(np.array(motion), mount, rng), mount[:2])
+    assert found is not None
+    assert found.has_translation
+    np.testing.assert_allclose(found.delta, motion, atol=0.02)
+
+
+def test_motion_along_a_corridor_is_unknown() -> None:
+    rng, odometry = np.random.default_rng(0), ScanOdometry()
+    with np.errstate(divide="ignore"):
+        r = np.minimum(1.2 / np.abs(np.sin(ANGLES)), 200.0)
+    is_wall = r < 30.0
+    found = None
+    for _ in range(2):
+        noisy = (r + 0.01 * rng.normal(size=len(r)))[is_wall]
+        found = odometry.register(np.column_stack([noisy * np.cos(ANGLES[is_wall]), noisy * np.sin(ANGLES[is_wall])]), np.zeros(2))
+    assert found is not None
+    assert not found.has_translation
+    assert abs(found.delta[2]) < 0.01
+
+
+@pytest.mark.parametrize("n", [0, 1, 50])
+def test_scan_with_too_few_points_gives_no_motion(n: int) -> None:
+    rng, odometry = np.random.default_rng(0), ScanOdometry()
+    points = scan(np.zeros(3), np.zeros(3), rng)
+    odometry.register(points, np.zeros(2))
+    assert odometry.register(points[:n], np.zeros(2)) is None
+    assert odometry.register(points, np.zeros(2)) is None
+
+
+def test_scan_of_another_place_gives_no_motion() -> None:
+    rng, odometry = np.random.default_rng(0), ScanOdometry()
+    odometry.register(scan(np.zeros(3), np.zeros(3), rng), np.zeros(2))
+    elsewhere = rng.uniform(-8.0, 8.0, (360, 2))
+    assert odometry.register(elsewhere, np.zeros(2)) is None
