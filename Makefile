@@ -17,7 +17,7 @@ demo: .venv/ready
 	$(BIN)/skidloc replay $(DATA)/aces/aces.mcap --robot aces --model diff_drive,skid_steer --estimator odometry,lidar,ekf,graph \
 		--reference $(DATA)/aces/aces.relations --out $(DEMO)/aces
 	$(BIN)/skidloc replay $(DATA)/fr079/fr079.mcap --robot $(DATA)/fr079/fr079.toml --model diff_drive --estimator odometry,lidar,ekf,graph \
-		--reference $(DATA)/fr079/fr079_reference.tum --out $(DEMO)/fr079
+		--reference $(DATA)/fr079/fr079_reference.tum --reference-sigma 0.016 0.5 --out $(DEMO)/fr079
 	@echo "Open $(DEMO)/aces/report.html, $(DEMO)/fr079/report.html and $(DEMO)/husky/report.html in a browser."
 
 test: .venv/ready

@@ -1,4 +1,4 @@
-"""Errors of logs, references and outputs that a user can mend (exit code 2 on the command line)."""
+"""Errors of logs, references and outputs that a user can correct (exit code 2 on the command line)."""
 
 from motion_models.errors import SkidlocError
 
@@ -28,16 +28,16 @@ class OutputError(SkidlocError):
 
 
 class EstimatorError(SkidlocError):
-    """An estimator that does not exist, that lacks what it needs from the log, or whose state is no longer finite."""
+    """An estimator that does not exist, that needs data which the log does not hold, or whose state is no longer finite."""
 
 
 class SimulationError(SkidlocError):
     """A simulation that does not exist or cannot be driven: an unknown experiment or effect, a robot that tips over or hits a wall."""
 
 
-class DumpError(SkidlocError):
+class CheckpointError(SkidlocError):
     """A state that cannot be written, or a file of one that is damaged, foreign, or of another robot, model or configuration."""
 
 
-class DoorError(SkidlocError):
+class TransportError(SkidlocError):
     """A live source or sink that cannot be used: its library is missing, nobody is there, or another type of message comes."""

@@ -1,4 +1,4 @@
-"""What a log says, one event at a time, in SI units and header time.
+"""Events of a log, one at a time, in SI units and header time.
 
 Stamps are integer nanoseconds of the message's header. Arrays are float64 and finite unless a field says otherwise; events are
 never changed after they are made. Making one that estimators would compute with and that is not so raises `EventError`.
@@ -27,9 +27,9 @@ class WheelSample:
 
     stamp_ns: int
     velocity: FloatArray
-    """(2,) left and right wheel rate [rad/s]; NaN where the log does not tell."""
+    """(2,) left and right wheel rate [rad/s]; NaN where the log has none."""
     position: FloatArray
-    """(2,) left and right accumulated wheel angle [rad]; NaN where the log does not tell. Preferred over rates: it loses nothing."""
+    """(2,) left and right accumulated wheel angle [rad]; NaN where the log has none. Preferred over rates: no motion is lost."""
 
     def __post_init__(self) -> None:
         _check_shape(self, "velocity", (2,))
@@ -60,11 +60,11 @@ class Scan:
     """One sweep of a LiDAR, planar or not. Points that were not finite or out of range are already gone."""
 
     stamp_ns: int
-    """Header stamp. For a LaserScan the time of the first beam; a PointCloud2 tells by `offsets`."""
+    """Header stamp. For a LaserScan the time of the first beam; a PointCloud2 has `offsets`."""
     points: FloatArray
     """(N, 3) in the sensor's frame [m]; z = 0 for a planar scanner."""
     offsets: FloatArray = field(default_factory=_no_floats)
-    """(N,) time of each point after `stamp_ns` [s], or (0,) where the log does not tell."""
+    """(N,) time of each point after `stamp_ns` [s], or (0,) where the log has none."""
     frame_id: str = ""
     is_planar: bool = True
 
@@ -80,7 +80,7 @@ class Scan:
 
     @property
     def times_from_middle(self) -> FloatArray:
-        """(N,) time of each point after the middle of the sweep [s], or (0,) where the log does not tell."""
+        """(N,) time of each point after the middle of the sweep [s], or (0,) where the log has none."""
         return self.offsets - self.middle_s if len(self.offsets) else self.offsets
 
     def __post_init__(self) -> None:
@@ -122,13 +122,13 @@ class PositionSample:
 
 @dataclass(frozen=True)
 class Reference:
-    """Where a trusted source says the robot is. Used to score, never to estimate."""
+    """Pose of the robot by a trusted source. Used to score, never to estimate."""
 
     stamp_ns: int
     position: FloatArray
     """(2,) in the reference's own plane [m]."""
     yaw: float | None
-    """[rad]; None where the source knows positions only (GPS)."""
+    """[rad]; None where the source has positions only (GPS)."""
     covariance: FloatArray = field(default_factory=lambda: np.full((3, 3), np.nan))
     """(3, 3) of x, y, yaw [m, m, rad]; NaN where unknown."""
 

@@ -14,8 +14,9 @@ from dataclasses import dataclass, field
 from localization.errors import LogError
 from localization.estimate_table import NIS, TWIST, TWIST_COV, EstimateTable, trajectory
 from localization.estimators import CORRECTING, LOCALIZING, Estimate, Estimator, EstimatorConfig, make_estimator
-from localization.events import Event, PositionSample
+from localization.events import Event, ImuSample, PositionSample
 from localization.lidar.losses import LidarLosses
+from localization.sensor_checks import SensorChecks
 from localization.step import Step
 from localization.synchronizer import StepConfig, Synchronizer
 from localization.trajectory import Trajectory
@@ -67,6 +68,7 @@ class Pipeline:
         self.estimator: Estimator = make_estimator(
             trial.estimator, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing
         )
+        self.checks = SensorChecks(self.mounts, config.estimator.lidar)
         self.wheel_twist: FloatArray | None = None
         """(3,) mean twist of the last step by the wheels alone; None where wheel data were missing in it."""
 
@@ -79,13 +81,16 @@ class Pipeline:
         if isinstance(event, PositionSample):
             self.estimator.add_position(event)
             return []
+        if isinstance(event, ImuSample):
+            self.checks.insert_imu(event)
         self.synchronizer.insert(event)
         return list(self._estimates(is_last=False))
 
     def _estimates(self, is_last: bool) -> Iterator[Estimate]:
         while (interval := self.synchronizer.next_interval(is_last)) is not None:  # synchronize
             step = self.synchronizer.preintegrate(interval)  # wheels through the motion model, gyro, scan
-            estimate = self.estimator.step(step)  # predict, match, update
+            step = self.checks.apply(step)  # without faulty sensors
+            estimate = self.checks.widen(self.estimator.step(step))  # predict, match, update
             self._feed_back(step)
             yield estimate  # publish
 
@@ -115,7 +120,7 @@ class Pipeline:
         """Problems of the sensors so far."""
         losses = self.lidar
         description = "" if losses is None else losses.describe()
-        return [*self.synchronizer.warnings(), *([f"{self._name}: {description}"] if description else [])]
+        return [*self.synchronizer.warnings(), *self.checks.warnings(), *([f"{self._name}: {description}"] if description else [])]
 
     def add_mounts(self, mounts: Mapping[str, Mount]) -> bool:
         """Add mounts of frames that become known only now; a known one is not changed. Returns whether there were any."""
@@ -199,6 +204,7 @@ class _Replay:
             raise LogError("there are wheel samples and scans in the log, but no two that span an interval of time.")
         filtered, estimator = trajectory(stamps, table), self._pipeline.estimator
         smoothed = estimator.finish(filtered)
+        smoothed = None if smoothed is None else self._pipeline.checks.widen_trajectory(smoothed)
         self._seconds += time.perf_counter() - begin
         return Run(
             self._trial.model.name,

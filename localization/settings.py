@@ -48,11 +48,11 @@ Probability = Annotated[float, Allowed("between 0 and 1, and neither of them", l
 Share = Annotated[float, Allowed("from 0 to below 1", lambda value: 0.0 <= value < 1.0)]
 Seed = Annotated[int, Allowed("from 0 to 2^32 - 1", lambda value: 0 <= value < 2**32, most=2**32)]
 Count = Annotated[int, at_least(1)]
-_NOT_NEGATIVE = at_least(0)  # where a field does not say otherwise
+_NOT_NEGATIVE = at_least(0)  # the default of a field
 
 
 class Settings:
-    """Base of the dataclasses of settings. Their fields say by `Annotated` what they may be; without it, a number is 0 or more.
+    """Base of the dataclasses of settings. Their fields have bounds by `Annotated`; without one, a number is 0 or more.
 
     Making one raises `SettingError` for the first number that nothing can be computed with.
     """

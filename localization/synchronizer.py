@@ -24,6 +24,8 @@ from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
 _NS = 1e-9
+_SCAN_WAIT_NS = 1_000_000_000
+"""From the first wheel sample on: a LiDAR that is silent for longer joins a drive that wheels have begun. Scanners have 2 Hz or more."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,7 @@ class Synchronizer:
         self._speed = np.zeros(2)  # the last that wheels gave [m/s, rad/s]
         self._timeless, self._has_turned = 0, False  # scans without the times of their points, and whether the robot turned at one
         self._start_ns: int | None = None
+        self._first_wheel_ns: int | None = None
         self._now_ns = -(1 << 62)
         self._clock_offset_s = 0.0
 
@@ -83,6 +86,8 @@ class Synchronizer:
         self._now_ns = max(self._now_ns, event.stamp_ns)
         if isinstance(event, WheelSample):
             self._wheels.insert(event)
+            if self._first_wheel_ns is None:
+                self._first_wheel_ns = event.stamp_ns
             if self._start_ns is None and not self._has_lidar:
                 self._start_ns = event.stamp_ns
         elif isinstance(event, ImuSample):
@@ -134,6 +139,8 @@ class Synchronizer:
             middle_ns, _ = self._scans[0]
             is_late = self._now_ns > middle_ns + self.config.wait_s / _NS
             return self._scans.popleft() if is_last or is_late or self._has_rates_until(middle_ns) else None
+        if self._start_ns is None and self._first_wheel_ns is not None and (is_last or self._now_ns > self._first_wheel_ns + _SCAN_WAIT_NS):
+            self._start_ns = self._first_wheel_ns
         if self._start_ns is None or self._wheels.newest_ns is None:
             return None
         end_ns = self._wheels.newest_ns - round(self._clock_offset_s / _NS)

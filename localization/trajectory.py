@@ -64,7 +64,7 @@ class Trajectory:
         return float(self.stamps_ns[-1] - self.stamps_ns[0]) * 1e-9 if len(self) else 0.0
 
     def distance(self, resolution_m: float = 0.0) -> float:
-        """Length of the path [m], seen at a resolution (see `path_nodes`)."""
+        """Length of the path [m] at a resolution (see `path_nodes`)."""
         return float(path_nodes(self.poses[:, :2], resolution_m)[1][-1]) if len(self) else 0.0
 
     def covers(self, stamps_ns: ArrayLike, max_gap_s: float = math.inf) -> BoolArray:
@@ -116,7 +116,7 @@ class Trajectory:
 
 
 def path_nodes(positions: FloatArray, resolution_m: float) -> tuple[NDArray[np.intp], FloatArray]:
-    """The samples that make up a path when it is seen at a resolution, and the distance driven at each.
+    """Samples of a path at a resolution, and the distance driven at each.
 
     A sample (of ``positions`` (N, 2), N > 0) is a node when it lies ``resolution_m`` or more from the node before; the rest is jitter.
     Without this a robot that stands still under a noisy sensor would drive for miles.
@@ -153,7 +153,7 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
 
 
 def read_tum(path: str | Path) -> Trajectory:
-    """The trajectory of a TUM file, seen from above: z, roll and pitch are dropped. Raises `EvaluationError` with file and line."""
+    """The trajectory of a TUM file in the plane: z, roll and pitch are dropped. Raises `EvaluationError` with file and line."""
     stamps: list[int] = []
     poses: list[tuple[float, float, float]] = []
     for line, stamp, values in tum_rows(path):

@@ -9,8 +9,8 @@
 # # 2. What the centre of gravity does to a skid-steer robot
 #
 # **Claim: where the centre of gravity (CG) lies decides how much, and about which point, the robot turns for the same wheel rates.
-# Physics with published constants and nothing fitted already says so; with four numbers fitted it describes 68 measurements better than a
-# polynomial's eleven do in two respects of three, and as well in the third.**
+# Physics with published constants and nothing fitted already predicts it; with four numbers fitted it describes 68 measurements better
+# than a polynomial's eleven do in two respects of three, and as well in the third.**
 #
 # VaultBot, a Husky with two arms, turned in place at 68 positions of its CG (J. Ebersole's thesis, 2016, chapter 4). This notebook
 # redraws that chapter's figures 4-2 to 4-15 from its tables, and puts two models beside them: `skid_steer`, the thesis's regressions, and
@@ -93,8 +93,8 @@ picture(
 # %% [markdown]
 # ## Figures 4-4 to 4-7: rotation ratio and x of the centre of rotation
 #
-# Both depend on x_G and hardly on y_G: 4-4 and 4-6 (the same data over both) are told by the markers here. The least turning is at x_G =
-# 0. The measured x_CR, however, is not 0 there but -6.4 cm: notebook 3 asks why.
+# Both depend on x_G and hardly on y_G: 4-4 and 4-6 (the same data over both) are distinguished by the markers here. The least turning is
+# at x_G = 0. The measured x_CR, however, is not 0 there but -6.4 cm: notebook 3 asks why.
 
 # %%
 line = np.stack([np.linspace(-0.062, 0.122, 93), np.zeros(93)], axis=-1)

@@ -36,7 +36,7 @@ d = found.diagnosis
 print(f"{d.verdict}: {d.sentence}")
 
 # %% [markdown]
-# ## Step 1. Look at the discrepancies
+# ## Step 1. Linearization at the discrepancies
 #
 # Measured minus predicted displacement after 5 s, in the body frame. If this were noise it would be a band around zero; the bars of noise
 # are what the drive itself shows. It is off by centimetres, always to the same side.
@@ -103,20 +103,20 @@ picture(
 # %% [markdown]
 # ## Step 3. Put causes together, as few as explain it
 #
-# The diagnosis tries sets of causes, weighs each by evidence (a cause more must earn its place) and says of each found one how sure it
-# is, what else would look the same on this drive, and what it gains on rows that it has not seen.
+# The diagnosis tries sets of causes, weighs each by evidence (one more cause must pay for itself) and gives for each found one its sigma,
+# the causes that fit this drive as well, and what it gains on held-out rows.
 
 # %%
 table(
-    ["cause", "size", "sigma", "unit", "held-out errors fall by", "looks the same"],
+    ["cause", "size", "sigma", "unit", "held-out errors fall by", "fits as well"],
     *(
-        [f.effect.meaning, f.size, f.sigma, f.effect.unit, f"{100 * f.gain.relative:.0f} %", ", ".join(a for a, _ in f.aliases)]
+        [f.definition.meaning, f.size, f.sigma, f.definition.unit, f"{100 * f.gain.relative:.0f} %", ", ".join(a for a, _ in f.aliases)]
         for f in d.findings
     ),
 )
 
 # %% [markdown]
-# ## Step 4. Look again
+# ## Step 4. Linearization again
 #
 # What is left once these are corrected.
 
@@ -134,7 +134,7 @@ table(
 #
 # It blamed the constant offset of the centre of rotation on rotational inertia, and the asymmetry on the tyres' treads. The simulated
 # vehicle has inertia, and motors that take half a second to reach their speed: that leaves its centre of rotation where the quasi-static
-# model says.
+# model predicts.
 
 # %%
 vehicle = simulate("rotation_grid", robot, config=SimulationConfig(sensors=SensorConfig(lidar="none")))
@@ -192,6 +192,6 @@ f"turns least at x_G = {-500.0 * b / a:+.1f} mm; its centre of rotation is off b
 # ## What is left
 
 # %%
-if d.shapes:
-    print("Not explained:", "; ".join(shape.text for shape in d.shapes))
+if d.trends:
+    print("Not explained:", "; ".join(shape.text for shape in d.trends))
 print(d.next_drive or "No further drive is asked for.")

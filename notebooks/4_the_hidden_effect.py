@@ -8,11 +8,11 @@
 # %% [markdown]
 # # 4. The hidden effect: you pick one, the tool finds it
 #
-# **Claim: a cause that is told nowhere in a log can be named, with its size, from a minute of driving; and where nothing is hidden,
+# **Claim: a cause that is written nowhere in a log can be named, with its size, from a minute of driving; and where nothing is hidden,
 # nothing is found.**
 #
 # Change the next line, and run the notebook again. The simulator makes it true of the robot or of its sensors; the log, its transforms
-# and the robot file know nothing of it. Then `skidloc diagnose` gets the log.
+# and the robot file hold nothing of it. Then `skidloc diagnose` gets the log.
 
 # %%
 HIDDEN = {"lidar_yaw": 0.03}
@@ -25,14 +25,14 @@ from pathlib import Path
 import numpy as np
 
 from localization.report.notebook import Bars, Panel, Series, picture, table
-from localization.simulation import EFFECTS
+from localization.simulation import FAULTS
 
 sys.path.insert(0, "..")
-from tests.helpers.diagnosis_drives import TYPICAL, bag, look
+from tests.helpers.diagnosis_drives import TYPICAL, bag, diagnose_bag
 
 table(
     ["you may hide", "unit", "a size that robots have", "meaning"],
-    *([id_, EFFECTS[id_].unit, size, EFFECTS[id_].meaning] for id_, size in TYPICAL.items()),
+    *([id_, FAULTS[id_].unit, size, FAULTS[id_].meaning] for id_, size in TYPICAL.items()),
 )
 
 # %% [markdown]
@@ -46,7 +46,7 @@ table(
 def diagnosed(hidden, seed=0):
     """Drive with ``hidden`` effects, write the log, and diagnose it."""
     with tempfile.TemporaryDirectory() as folder:
-        return look(bag(Path(folder) / "drive.mcap", hidden, seed))
+        return diagnose_bag(bag(Path(folder) / "drive.mcap", hidden, seed))
 
 
 found = diagnosed(HIDDEN)
@@ -55,7 +55,7 @@ print(f"{d.verdict}: {d.sentence}")
 
 # %%
 table(
-    ["found", "size", "sigma", "hidden", "held-out errors fall by", "this drive cannot tell it from"],
+    ["found", "size", "sigma", "hidden", "held-out errors fall by", "fits this drive as well"],
     *(
         [f.cause, f.size, f.sigma, HIDDEN.get(f.cause, 0.0), f"{100 * f.gain.relative:.0f} %", ", ".join(name for name, _ in f.aliases)]
         for f in d.findings
@@ -76,7 +76,7 @@ picture(
             "window of 2 s",
             label,
             [
-                Series("as the robot file says", count, found.residuals.rows[:, column], "red", "s", (1, 1)),
+                Series("by the robot file", count, found.residuals.rows[:, column], "red", "s", (1, 1)),
                 Series("corrected", count, found.residuals.left[:, column], "blue", "o"),
             ],
             level=0.0,

@@ -11,7 +11,7 @@
 # **Claim: 48 s of driving, and all other minutes of this Husky are predicted to within 7 % of the error that ten minutes of driving
 # leave; by its geometry alone, the error is more than twice as large.**
 #
-# The DRIVE data set (Université Laval) has 201 steps of 6 s of a Husky with random wheel speeds, and what LiDAR scan matching says of
+# The DRIVE data set (Université Laval) has 201 steps of 6 s of a Husky with random wheel speeds, and what LiDAR scan matching measured of
 # every two seconds of them. `skidloc calibrate` does with any log what this notebook does step by step.
 
 # %%
@@ -35,10 +35,10 @@ seconds, metres, radians = driven(maneuvers, robot.geometry.wheel_radius_m, robo
 f"{len(maneuvers)} windows of {len(steps)} steps: {seconds:.0f} s, {metres:.0f} m by the wheels"
 
 # %% [markdown]
-# ## What the first eight steps say: 48 s
+# ## The first eight steps: 48 s
 #
 # Four numbers of a robot that is the same left and right: how much it turns and drives for what its wheels do, about which point, and how
-# much less far it goes on tight arcs. `calibrated` says how sure each is. (On the command line: `--model full_linear --fit` and these
+# much less far it goes on tight arcs. `calibrated` gives the sigma of each. (On the command line: `--model full_linear --fit` and these
 # names.)
 
 # %%
@@ -66,7 +66,7 @@ table(
 # %% [markdown]
 # ## Does it hold for the other nineteen minutes?
 #
-# Errors of position after two seconds, in windows that the fit has not seen.
+# Errors of position after two seconds, in windows that were not fitted.
 
 # %%
 rest = [m for m in maneuvers if m.group not in steps[:8]]
@@ -112,7 +112,7 @@ picture(
 # ## How many seconds does it take?
 #
 # Steps are drawn at random, fitted, and all others predicted; twenty times for each number of steps. With a prior around what the robot's
-# driver says, even a few seconds do not lead astray.
+# driver publishes, even a few seconds do not lead astray.
 
 # %%
 DRAWS = 20
@@ -148,7 +148,7 @@ table(
 # ## Which terms earn their place
 #
 # All models, trained on nine tenths of the steps and scored on the rest, ten times. Slip is what matters: how much less the robot turns
-# than its wheels say, about which point, and how much less far it goes on tight arcs: four numbers are as good as twelve.
+# than its wheels predict, about which point, and how much less far it goes on tight arcs: four numbers are as good as twelve.
 
 # %%
 held = {

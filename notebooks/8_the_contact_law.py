@@ -39,7 +39,7 @@ ROBOTS = {law: dataclasses.replace(vaultbot, options={"friction": {"contact": la
 MODELS = {law: FrictionModel.from_robot(robot) for law, robot in ROBOTS.items()}
 
 # %% [markdown]
-# ## Step 1. What the two laws say of the same wheels
+# ## Step 1. Two laws for the same wheels
 #
 # The rotation scaling k (turn over what a rolling robot would turn) from straight driving to a turn in place, CG at the wheelbase's centre
 # and 8 cm ahead of it. In place both laws agree. A robot whose tyres are proportional to slip and one whose tyres slide have the same
@@ -81,7 +81,7 @@ picture(
 # ## Step 2. What a real Husky does
 #
 # 603 windows of 2 s (DRIVE), turns by ICP. Its k is smaller than geometry says, at all curvatures, and no contact law explains that (in
-# place all have one k). Its *shape* over curvature is what tells the laws apart: k over that of the sharpest turns, with standard errors
+# place all have one k). Its *shape* over curvature is what distinguishes the laws: k over that of the sharpest turns, with standard errors
 # by jackknife over steps of three windows.
 
 # %%

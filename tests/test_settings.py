@@ -16,8 +16,7 @@ from localization.lidar import LidarConfig
 from localization.pipeline import ReplayConfig
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.scanners import ScannerConfig, SpinningConfig
-from localization.simulation.sensor_suite import SensorConfig
-from localization.simulation.sensors import EncoderConfig, GpsConfig
+from localization.simulation.sensors import EncoderConfig, GpsConfig, SensorConfig
 from localization.simulation.simulator import SimulationConfig
 from localization.simulation.vehicle import VehicleConfig
 from localization.synchronizer import StepConfig

@@ -23,6 +23,8 @@ from motion_models.se2 import FloatArray
 
 _NS = 1e-9
 _MAX_SCAN_GAP_S, _MAX_REFERENCE_GAP_S = 1.0, 0.5
+_MAX_GAP_OVER_PERIOD = 2.5  # for references that are sparser than that: one missing measurement does not end a window
+_MAX_GYRO_BIAS = 0.05  # rad/s; a robot that turns faster by the gyro than any bias does not stand, whatever its wheels report
 HOLD_S = 0.5
 """Without a new sample, the wheels' last rates hold for this time [s]."""
 _PRIOR_SIGMA = np.array([0.1, 0.1, 0.1])
@@ -31,6 +33,7 @@ _TURN_ERROR = 0.5
 """Sigma of a turn by the nominal model, as a share of the turn."""
 _OPEN_SIGMA_M = 0.05
 """Sigma of a position beyond which a scene counts as a corridor: matching then slides towards no motion at all [m]."""
+_RATE_GAPS = 20  # gaps between scans, by which their rate is known
 _STANDSTILL_COV = np.diag([1e-12, 1e-12, 1e-12])
 
 
@@ -106,7 +109,8 @@ class GyroMotionReference:
         self._start_ns = end_ns
 
     def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
-        valid = [span for span in standing if span.is_valid]
+        seconds_of = [(span.end_ns - span.start_ns) * _NS for span in standing]
+        valid = [s for s, t in zip(standing, seconds_of, strict=True) if s.is_valid and abs(float(s.measured[2])) < _MAX_GYRO_BIAS * t]
         bias, sigma = 0.0, self._noise.bias_sigma_rad_per_s
         if valid:
             rates = np.array([span.measured[2] / ((span.end_ns - span.start_ns) * _NS) for span in valid])
@@ -143,7 +147,8 @@ class LidarMotionReference:
         self._config = replace(config or LidarConfig(), key_scans=1)
         self._matcher: ScanMatcher | None = None
         self._start_ns: int | None = None
-        self._last_ns = 0
+        self._last_ns = self._last_scan_ns = 0
+        self._max_gap_s, self._first_gaps_s = _MAX_SCAN_GAP_S, list[float]()
         self._pose, self._slip = np.zeros(3), np.zeros(3)
         self._unmatched = self._scans = self._open = 0
 
@@ -152,7 +157,8 @@ class LidarMotionReference:
             return
         self._scans += 1
         stamp_ns = event.middle_ns
-        if self._matcher is None or self._start_ns is None or (stamp_ns - self._last_ns) * _NS > _MAX_SCAN_GAP_S:
+        self._adapt_to_rate(stamp_ns)
+        if self._matcher is None or self._start_ns is None or (stamp_ns - self._last_ns) * _NS > self._max_gap_s:
             self._slip = np.zeros(3)
             self._begin(stamp_ns, self._deskew(self._sweep(event), event, wheels))
             return
@@ -180,6 +186,13 @@ class LidarMotionReference:
             lost = f"{self._unmatched} of {self._scans} scans could not be matched with the first of their window"
             notes.append(f"{lost}; windows that end in one were left out.")
         return notes
+
+    def _adapt_to_rate(self, stamp_ns: int) -> None:
+        """Let the longest gap within a window follow the median of the first gaps between scans: keyframes may be seconds apart."""
+        if len(self._first_gaps_s) < _RATE_GAPS and self._scans > 1:
+            self._first_gaps_s.append((stamp_ns - self._last_scan_ns) * _NS)
+            self._max_gap_s = max(_MAX_SCAN_GAP_S, _MAX_GAP_OVER_PERIOD * float(np.median(self._first_gaps_s)))
+        self._last_scan_ns = stamp_ns
 
     def _begin(self, stamp_ns: int, points: FloatArray) -> None:
         """A window begins with a scan of these ``points`` (N, 2), or with the next one if they are too few."""
@@ -244,21 +257,30 @@ class TrackMotionReference:
         # Of the motion between two poses that err independently.
         self._cov = 2.0 * np.diag([sigma_m**2, sigma_m**2, sigma_rad**2])
         self._start_ns: int | None = None
+        self._stamps = track.stamps_ns
+        period_s = float(np.median(np.diff(track.stamps_ns))) * _NS if len(track.stamps_ns) > 1 else 0.0
+        self._is_sparse = period_s > _MAX_REFERENCE_GAP_S
+        self._max_gap_s = max(_MAX_REFERENCE_GAP_S, _MAX_GAP_OVER_PERIOD * period_s)
 
     def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
         newest = wheels.buffer.newest_ns
         if newest is None:
             return
         if self._start_ns is None:
-            self._start_ns = newest
-        end_ns = self._start_ns + self._window_ns
+            self._start_ns = self._at_stamp(newest)
+        end_ns = self._at_stamp(self._start_ns + self._window_ns)
         if newest < end_ns:
             return
-        known = bool(self._track.covers([self._start_ns, end_ns], _MAX_REFERENCE_GAP_S).all())
+        known = bool(self._track.covers([self._start_ns, end_ns], self._max_gap_s).all())
         start, end = self._track.at([self._start_ns, end_ns])
         measured = se2.between(start, end) if known else np.zeros(3)
         yield Span(self._start_ns, end_ns, measured, self._cov, is_valid=known)
         self._start_ns = end_ns
+
+    def _at_stamp(self, moment_ns: int) -> int:
+        """``moment_ns``, or for a sparse reference the first of its stamps from then on: between them nothing was measured."""
+        i = int(np.searchsorted(self._stamps, moment_ns))
+        return int(self._stamps[i]) if self._is_sparse and i < len(self._stamps) else moment_ns
 
     def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
         return list(spans)

@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 
 from localization.logs.chunks import merge_channels
-from localization.logs.decode import Decoder, UnusableError, frame_name, stamp_ns
+from localization.logs.decode import frame_name, stamp_ns
+from localization.logs.message_stats import UnusableError
 from localization.logs.reader import open_log
+from localization.logs.serialization import Decoder
 from localization.logs.sources import open_source
-from localization.logs.topics import TYPES
+from localization.logs.topic_roles import TYPES
 from motion_models.center_of_gravity.urdf import parse_urdf
 from motion_models.robot import DIFF_DRIVE, Driver, Geometry, Joints, Mount, Robot, Topics
 from motion_models.se2 import FloatArray

@@ -111,7 +111,7 @@ class Compare:
             from localization.comparison.dask_executor import run_on_cluster
 
             return run_on_cluster(jobs, self.dask)
-        absent = [job for job in jobs if not Path(job.log).exists()]  # no process need be started to say so
+        absent = [job for job in jobs if not Path(job.log).exists()]  # no process needs to be started for that
         there = [job for job in jobs if job not in absent]
         return itertools.chain(((job, run_job(job)) for job in absent), run_local(there, self.processes or os.cpu_count() or 1))
 

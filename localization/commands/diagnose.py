@@ -14,10 +14,12 @@ from localization.calibration.calibrate import MotionReferenceName
 from localization.calibration.windows import WindowConfig
 from localization.commands.common import new_folder, write_json
 from localization.diagnosis.controller_runs import drive_of_runs, read_runs
-from localization.diagnosis.corrected_robot import patched
-from localization.diagnosis.diagnose import DiagnosisConfig, Examined, examine
+from localization.diagnosis.corrected_robot import correct_robot
+from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_table
 from localization.diagnosis.findings import Diagnosis
+from localization.diagnosis.linearization import default_model
+from localization.diagnosis.summary import describe_outliers, describe_row, describe_tolerated
 from localization.logs import TopicOverrides, open_log
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
@@ -39,8 +41,8 @@ class Diagnose:
     motion (window, dt_s, left_rad_per_s, right_rad_per_s, x_m, y_m, yaw_rad, ...)."""
     robot: str
     """Name of a shipped robot, or path of a robot TOML file."""
-    model: str = "friction"
-    """Motion model whose predictions are held against what really happened."""
+    model: str = ""
+    """Motion model to diagnose; by default friction, or diff_drive for a robot with casters (separation multiplier 1 in its file)."""
     out: Path | None = None
     """New folder for diagnosis.json, diagnosis.html and robot.toml, the robot with the findings in it, which every command takes."""
     witness: MotionReferenceName = "auto"
@@ -59,7 +61,7 @@ class Diagnose:
             raise CalibrationError(f"--window-s is {self.window_s:g}; windows of 0.5 to 20 s make sense.")
         check_outputs(self.out, self.json)
         robot = load_robot(self.robot)
-        model = make_model(self.model, robot)
+        model = make_model(self.model or default_model(robot), robot)
         with console.status("reading"):
             drive = self._drive(robot)
         with console.status("looking for causes"):
@@ -89,14 +91,16 @@ class Diagnose:
             return drive_of_table(name, robot, maneuvers, "rotations")
         return drive_of_table(name, robot, read_windows(self.source), "windows")
 
-    def _write_robot(self, folder: Path, found: Examined, robot: Robot) -> None:
+    def _write_robot(self, folder: Path, found: DiagnosisResult, robot: Robot) -> None:
         d = found.diagnosis
-        new, by_hand = robot, ()  # type: Robot, tuple[str, ...]
-        if found.pipeline is not None and d.findings:
-            patch = patched(found.pipeline, d.belief)
-            new, by_hand = patch.robot, patch.by_hand
-        named = "; ".join(f"{f.cause} {f.size:+.4g} +- {f.sigma:.2g} {f.effect.unit}".removesuffix(" 1") for f in d.findings) or "nothing"
-        remarks = [f"Diagnosed by skidloc: {d.model} on {d.log}, from {robot.name}.", f"Corrected here: {named}.", *by_hand]
+        new, manual_steps = robot, ()  # type: Robot, tuple[str, ...]
+        if found.predictor is not None and d.findings:
+            patch = correct_robot(found.predictor, d.hypothesis)
+            new, manual_steps = patch.robot, patch.manual_steps
+        named = (
+            "; ".join(f"{f.cause} {f.size:+.4g} +- {f.sigma:.2g} {f.definition.unit}".removesuffix(" 1") for f in d.findings) or "nothing"
+        )
+        remarks = [f"Diagnosed by skidloc: {d.model} on {d.log}, from {robot.name}.", f"Corrected here: {named}.", *manual_steps]
         # in the folder's parent, paths start where they will start once it has its name
         text = robot_toml(relocated(new, folder), remarks="\n".join(remarks))
         write_text_file(folder / "robot.toml", text)
@@ -106,20 +110,27 @@ def print_diagnosis(console: Console, d: Diagnosis) -> None:
     """Verdict and sentence first, then discrepancies and findings."""
     console.print(f"{d.verdict}: {d.sentence}", markup=False, soft_wrap=True)
     if d.discrepancy:
-        table = Table("measured - predicted", "unit", "rms", "noise", "left", "p", box=None, header_style="bold", pad_edge=False)
+        titles = "measured - predicted", "unit", "rms", "noise", "left", "p", "attributed to"
+        table = Table(*titles, box=None, header_style="bold", pad_edge=False)
         for name, c in d.discrepancy.items():
-            table.add_row(name, c.unit, f"{c.rms:.4g}", f"{c.expected_rms:.4g}", f"{c.left_rms:.4g}", f"{c.p_value:.2g}")
+            sizes = (f"{v:.4g}" for v in (c.rms, c.expected_rms, c.unattributed_rms))
+            table.add_row(name, c.unit, *sizes, f"{c.p_value:.2g}", describe_row(c))
         console.print(table)
+    for line in describe_tolerated(d):
+        console.print(f"within tolerance: {line}", markup=False, soft_wrap=True)
     if d.findings:
         table = Table("cause", "size", "+-", "unit", "p", "gain", "or", box=None, header_style="bold", pad_edge=False)
         for f in d.findings:
             others = ", ".join(f"{name} {size:+.3g}" for name, size in f.aliases)
-            numbers = f"{f.size:+.4g}", f"{f.sigma:.2g}", f.effect.unit, f"{f.p_value:.1g}", f"{100 * f.gain.relative:.1f} %"
+            numbers = (f"{f.size:+.4g}", f"{f.sigma:.2g}", f.definition.unit, f"{f.p_value:.1g}", f"{100 * f.gain.relative:.1f} %")
             table.add_row(f.cause, *numbers, others)
         console.print(table)
-    for shape in d.shapes:
-        console.print(f"unexplained: {shape.text}", markup=False, soft_wrap=True)
+        for f in d.findings:
+            console.print(f"{f.cause}: {f.description}", markup=False, soft_wrap=True)
+    label = "unexplained" if d.verdict == "unexplained" else "left, and less than the noise"
+    for trend in d.trends:
+        console.print(f"{label}: {trend.text}", markup=False, soft_wrap=True)
     if d.next_drive:
         console.print(f"next drive: {d.next_drive}", markup=False, soft_wrap=True)
-    for note in d.warnings:
+    for note in (*d.contradictions, *describe_outliers(d), *d.warnings):
         console.print(f"! {note}", markup=False, soft_wrap=True)

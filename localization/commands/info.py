@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from localization.commands.common import write_json
-from localization.logs import LogInfo, TopicOverrides, open_log
+from localization.logs import LogInfo, TopicOverrides, inspect_log, open_log
 from localization.output import check_outputs
 from motion_models.prior import prior_notes
 from motion_models.robot import load_robot
@@ -35,7 +35,7 @@ class Info:
         check_outputs(self.json)
         with console.status("reading the log"):
             robot = load_robot(self.robot)
-            info = open_log(self.log, robot, self.topic).info()
+            info = inspect_log(open_log(self.log, robot, self.topic))
             info.warnings.extend(prior_notes(robot))
         if self.json is not None:
             write_json(self.json, info.to_dict())
@@ -55,8 +55,8 @@ def _print(console: Console, info: LogInfo) -> None:
         table.add_row(*map(escape, cells))
     console.print(table)
     for part, used in info.parts.items():
-        said = "nothing" if used is None else f"{used['topic']} (chosen by {used['chosen_by']})"
-        console.print(f"{part.replace('_', ' ')}: {said}", markup=False)
+        topic_text = "nothing" if used is None else f"{used['topic']} (chosen by {used['chosen_by']})"
+        console.print(f"{part.replace('_', ' ')}: {topic_text}", markup=False)
     console.print(f"can be scored against: {', '.join(info.references) or 'nothing in the log'}", markup=False)
     for frame, mount in info.mounts.items():
         values = list(mount.values())

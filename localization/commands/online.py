@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import Annotated, Literal, NoReturn
 
 import tyro
 from rich.console import Console
@@ -18,19 +17,17 @@ from rich.markup import escape
 
 from localization.commands.online_line import live_line
 from localization.commands.online_terminal import terminal_view
-from localization.errors import DumpError, OutputError
+from localization.errors import CheckpointError, OutputError
 from localization.events import Event
 from localization.logs import open_log
 from localization.pipeline import Pipeline
 from localization.provenance import fingerprint
 from localization.ros.node import Node
-from localization.ros.playback_clock import Pace
-from localization.ros.session import Session, View, made_by
-from localization.ros.session_files import Files
-from localization.ros.settings import OnlineSettings
-from localization.ros.signals import Stop
-from localization.ros.transports.base import Transport
-from motion_models.robot import Robot, load_robot
+from localization.ros.run_control import PlaybackClock, StopSignal
+from localization.ros.session import Session, SessionState, View, made_by
+from localization.ros.settings import LiveRun, OnlineSettings
+from localization.ros.transports import TransportName, open_transport
+from localization.ros.transports.sim_time import SimTimeTransport
 
 _LINE_S = 0.25
 _SLOWEST = 0.001  # a second of the log in a quarter of an hour
@@ -48,36 +45,39 @@ class Online(OnlineSettings):
     """Live picture: in the terminal, or in rerun's viewer as well (extra `viz`)."""
     view_file: Path | None = None
     """New .rrd file to record rerun's picture to, instead of opening its viewer."""
-    door: Literal["auto", "dds", "rclpy", "rospy"] = "auto"
-    """Of live topics: ROS 2 by DDS itself (extra `ros2`), ROS 2 by rclpy, ROS 1 by rospy. `auto`: rclpy where it is sourced, else DDS."""
+    transport: Annotated[TransportName, tyro.conf.arg(aliases=["--door"])] = "auto"
+    """Of live topics: ROS 2 by DDS itself (extra `ros2`), by rclpy, or by zenoh (extra `zenoh`, experimental); ROS 1 by rospy. `auto`:
+    rclpy where it is sourced, else DDS."""
     domain: int | None = None
-    """ROS 2 domain (door dds); by default that of ROS_DOMAIN_ID, or 0."""
+    """ROS 2 domain (transports dds and zenoh); by default that of ROS_DOMAIN_ID, or 0."""
     interface: str | None = None
-    """Network interface or address (door dds). `localhost`: this machine only, packets of others are dropped; `default`: what
-    ROS_LOCALHOST_ONLY and ROS_AUTOMATIC_DISCOVERY_RANGE demand, else all of the subnet. Without the option, what these variables demand,
-    else `localhost`."""
+    """Network interface or address (transport dds); endpoint of the router (zenoh). `localhost`: this machine only, packets of others are
+    dropped; `default`: what ROS_LOCALHOST_ONLY and ROS_AUTOMATIC_DISCOVERY_RANGE demand, else all of the subnet. Without the option, what
+    these variables demand, else `localhost`."""
 
     def run(self, console: Console) -> None:
-        rate, files, robot = parse_rate(self.rate), self.files(), load_robot(self.robot)
+        rate, run = parse_rate(self.rate), self.live_run()
         view = self._view()
         try:
-            with Stop() as stop, files.claimed():
+            with StopSignal() as stop, run.files.claimed():
                 if self.log is not None:
-                    self._play(console, self.log, rate, files, robot, stop, view)
+                    self._play(console, self.log, rate, run, stop, view)
                 else:
-                    self._spin(console, files, robot, stop, view)
+                    self._spin(console, run, stop, view)
         finally:
             if view is not None:
                 view.close()
 
-    def _play(self, console: Console, path: Path, rate: float, files: Files, robot: Robot, stop: Stop, view: View | None) -> None:
+    def _play(self, console: Console, path: Path, rate: float, run: LiveRun, stop: StopSignal, view: View | None) -> None:
+        robot, files = run.robot, run.files
         log = open_log(path, robot, self.topic)
         has_lidar = log.sources.lidar is not None
-        pair = self.make_pair(has_lidar)
-        made = made_by(pair, robot, log.mounts, has_lidar, self.config, f"log {fingerprint(path)[:12]}")
-        pipeline = Pipeline(pair, robot, log.mounts, has_lidar, self.config)
-        session = Session.start(files, pipeline, f"{pair.model.name}_{pair.estimator}", made)
-        pace, began, first_ns, shown, seconds, is_done = Pace(rate, sleep=stop.sleep), time.monotonic(), None, -math.inf, 0.0, False
+        trial = self.make_trial(has_lidar)
+        made = made_by(trial, robot, log.mounts, has_lidar, self.config, f"log {fingerprint(path)[:12]}")
+        pipeline = Pipeline(trial, robot, log.mounts, has_lidar, self.config)
+        session = Session.start(files, SessionState(pipeline), f"{trial.model.name}_{trial.estimator}", made)
+        clock, began, shown, seconds, is_done = PlaybackClock(rate, sleep=stop.sleep), time.monotonic(), -math.inf, 0.0, False
+        first_ns = None
         try:
             if view is not None:
                 view.begin(robot, log.mounts)
@@ -86,21 +86,21 @@ class Online(OnlineSettings):
                 console.print(f"resumed from {files.state} after {session.count} events", markup=False, soft_wrap=True)
             with Live(console=console, auto_refresh=False, transient=True) as live:
                 for event in self._rest(log.events(), session.count):
-                    pace.wait(event.stamp_ns)
+                    clock.wait(event.stamp_ns)
                     if stop.is_set():
                         self._interrupt(console, session)
-                    session.push(event)
-                    session.dump()
+                    session.process(event)
+                    session.save_state()
                     first_ns = event.stamp_ns if first_ns is None else first_ns
                     seconds, now = (event.stamp_ns - first_ns) * 1e-9, time.monotonic()
                     if console.is_terminal or view is not None:
-                        session.saw(event)
+                        session.observe(event)
                     if console.is_terminal and now - shown >= _LINE_S:
                         shown, speed = now, f"  {seconds / max(now - began, 1e-9):.1f}x"
                         statuses = session.health.statuses(session.pipeline)
                         live.update(terminal_view(session, seconds, statuses, extra=speed), refresh=True)
             session.finish()
-            count = session.write_out()
+            count = session.write_output()
             is_done = True
         finally:
             session.close(forget=is_done)
@@ -109,61 +109,43 @@ class Online(OnlineSettings):
         self._summarize(console, session, seconds, count)
 
     def _rest(self, events: Iterator[Event], done: int) -> Iterator[Event]:
-        """Those after the first ``done``. Raises `DumpError` where there are not so many."""
+        """Those after the first ``done``. Raises `CheckpointError` where there are not so many."""
         found = sum(1 for _ in islice(events, done))
         if found < done:
-            raise DumpError(f"the state in '{self.state}' is of {done} events where the log has {found}. Remove it to start anew.")
+            raise CheckpointError(f"the state in '{self.state}' is of {done} events where the log has {found}. Remove it to start anew.")
         yield from events
 
     def _interrupt(self, console: Console, session: Session) -> NoReturn:
         """With a state, the same command goes on from there. Without one nothing can: the output is what there is so far."""
-        session.dump(now=True)
+        session.save_state(now=True)
         if self.state is not None:
             console.print(f"the state is in {self.state}: the same command goes on from there", markup=False, soft_wrap=True)
-        elif (count := session.write_out()) is not None:
+        elif (count := session.write_output()) is not None:
             console.print(f"{self.out}: {count} estimates, up to where the run was stopped", markup=False, soft_wrap=True)
         raise KeyboardInterrupt
 
-    def _spin(self, console: Console, files: Files, robot: Robot, stop: Stop, view: View | None) -> None:
-        def tell(said: str) -> None:
-            console.print(f"[yellow]![/] {escape(said)}", soft_wrap=True)
+    def _spin(self, console: Console, run: LiveRun, stop: StopSignal, view: View | None) -> None:
+        def report(text: str) -> None:
+            console.print(f"[yellow]![/] {escape(text)}", soft_wrap=True)
 
-        transport = self._transport()
+        transport = open_transport(self.transport, run.node.names, self.domain, self.interface)
+        if run.node.use_sim_time:
+            transport = SimTimeTransport(transport)
         try:
-            node = Node.start(transport, robot, self.make_pair, files, tell, self.topic, self.config, self.node, stop.is_set, view)
-            said = f"running {self.model} in {self.estimator} on {', '.join(node.topics)} of {transport.place}"
-            console.print(said, markup=False, soft_wrap=True)
+            node = Node.start(transport, run, report, stop.is_set, view)
+            text = f"running {self.model} in {self.estimator} on {', '.join(node.topics)} of {transport.place}"
+            console.print(text, markup=False, soft_wrap=True)
             with Live(console=console, auto_refresh=False, transient=True) as live:
                 node.spin(stop.is_set, lambda n: self._show(console, live, n))
             count = node.finish()
         finally:
             transport.close()
         for note in node.warnings():
-            tell(note)
+            report(note)
         self._summarize(console, node.session, node.seconds, count)
 
-    def _transport(self) -> Transport:
-        """Raises `DoorError`. Each is imported only where it is wanted."""
-        door, names = self.door, self.node.names
-        if door == "auto":
-            door = "dds" if importlib.util.find_spec("rclpy") is None else "rclpy"
-        if door == "rospy":
-            from localization.ros.transports.rospy import RospyTransport
-
-            return RospyTransport()
-        if door == "rclpy":
-            from localization.ros.transports.rclpy import RclpyTransport
-
-            return RclpyTransport(names.name, names.namespace)
-        from localization.ros.transports.dds import DdsTransport
-        from localization.ros.transports.dds_settings import choose_interface, default_domain
-
-        return DdsTransport(
-            default_domain() if self.domain is None else self.domain, choose_interface(self.interface), names.name, names.namespace
-        )
-
     def _view(self) -> View | None:
-        """Raises `DoorError` and `OutputError`. Imported only where it is wanted."""
+        """Raises `TransportError` and `OutputError`. Imported only where it is wanted."""
         if self.view == "terminal" and self.view_file is None:
             return None
         from localization.ros.rerun_view import RerunView

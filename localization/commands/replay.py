@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,13 +21,13 @@ from localization.commands.calibration_tables import WIDE, show
 from localization.commands.common import names, new_folder, write_json
 from localization.errors import EstimatorError, EvaluationError
 from localization.estimators import CORRECTING, LOCALIZING, check_estimator
-from localization.evaluation.references import ReferenceTrack, Relations, read_reference_file, reference_track
+from localization.evaluation.references import ReferenceTrack, Relations, read_reference_file, reference_track, with_noise
 from localization.evaluation.scores import Result, score
 from localization.evaluation.time_overlap import describe_instant, no_overlap_message
 from localization.events import Event, PositionSample
 from localization.logs import Log, TopicOverrides, open_log
 from localization.logs.fused_log import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
-from localization.logs.positions import merge_positions, position_samples
+from localization.logs.references import merge_positions, read_positions
 from localization.output import as_text, check_outputs
 from localization.pipeline import ReplayConfig, Run, Trial, replay
 from localization.provenance import fingerprint, versions
@@ -58,9 +59,11 @@ class Replay:
     corrections: str = "constant"
     """What ekf and graph learn of the motion model, forms separated by commas: none, constant (k and centre of rotation as slowly
     changing constants), cg_field (their regressions on the centre of gravity, remembered from posture to posture), or single ones by name,
-    join_words by + (the friction model's: mu_ratio, tracked_x, tracked_y, warp, cg_offset_x, cg_offset_y; as constant+cg_offset_x)."""
+    joined by + (the friction model's: mu_ratio, tracked_x, tracked_y, warp, cg_offset_x, cg_offset_y; as constant+cg_offset_x)."""
     reference: str | None = None
     """Topic of the log, or file (.tum, .relations), to score against; `none` for no score. Default: the robot file's topic, if any."""
+    reference_sigma: tuple[float, float] | None = None
+    """Noise of the poses of a reference without covariances [m, deg], as 0.02 0.5: NEES takes such a reference as exact otherwise."""
     positions: str | None = None
     """Topic of positions (NavSatFix, poses) that `graph` is to fuse, as GPS: `/fix`. The lever arm of the antenna is
     --config.estimator.graph.antenna-x-m and -y-m. Do not score against the same topic."""
@@ -85,7 +88,7 @@ class Replay:
             for form in check_forms(forms)[: None if estimator in CORRECTING else 1]
         ]
         reference, positions = self._reference(log), self._positions(log)
-        # the LiDAR alone asks no motion model: it runs once, and counts for each
+        # the LiDAR alone uses no motion model: it runs once, and counts for each
         once = [p for p in pairs if p.estimator != _WHEELLESS or p.model is models[0]]
         with _progress(console, log) as (events, on_event):
             found = replay(merge_positions(events, positions), once, robot, log.mounts, has_lidar, self.config, on_event)
@@ -145,14 +148,18 @@ class Replay:
         else:
             raise EvaluationError(f"no reference '{name}': neither a topic of {log.path.name} nor a file. `skidloc info` lists the topics.")
         check_overlap(found, log)
-        return found
+        if self.reference_sigma is None:
+            return found
+        if isinstance(found, Relations):
+            raise EvaluationError("--reference-sigma is the noise of poses, and the reference has relations. Leave it out.")
+        return with_noise(found, self.reference_sigma[0], math.radians(self.reference_sigma[1]))
 
     def _positions(self, log: Log) -> list[PositionSample]:
         if self.positions is None:
             return []
         if "graph" not in self.estimator.split(","):
             raise EstimatorError("--positions are fused by the graph alone. Add it: --estimator odometry,ekf,graph.")
-        return position_samples(log.references(self.positions), self.positions)
+        return read_positions(log.references(self.positions), self.positions)
 
     def _metrics(self, head: ReportHead, results: Sequence[Result]) -> dict[str, Any]:
         return {

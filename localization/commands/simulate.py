@@ -14,14 +14,14 @@ from rich.table import Table
 from localization.commands.common import write_json
 from localization.output import check_outputs
 from localization.simulation.experiments import EXPERIMENTS
-from localization.simulation.faults import EFFECTS, parse_effects
-from localization.simulation.open_loop_scores import Score, mean_by_trajectory, score_runs
-from localization.simulation.sensor_suite import START_NS
+from localization.simulation.faults import FAULTS, parse_faults
+from localization.simulation.open_loop_scores import OpenLoopScore, mean_scores_by_trajectory, score_open_loop_runs
+from localization.simulation.sensors import START_NS
 from localization.simulation.simulator import Simulation, SimulationConfig, simulate, write_simulation
 from motion_models.robot import load_robot
 
 _EXPERIMENTS = "; ".join(f"{e.name}: {e.meaning}" for e in EXPERIMENTS.values())
-_EFFECTS = "; ".join(f"{e.id} [{e.unit}]: {e.meaning}" for e in EFFECTS.values())
+_EFFECTS = "; ".join(f"{e.id} [{e.unit}]: {e.meaning}" for e in FAULTS.values())
 
 
 @dataclass(frozen=True)
@@ -37,14 +37,14 @@ class Simulate:
     seed: int = 0
     """Of all noise. The same seed gives the same log, byte for byte."""
     effect: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="ID=SIZE", help=_EFFECTS)] = ()
-    """What is different about the robot than its file says; may be given several times."""
+    """Difference of the robot from its file; may be given several times."""
     config: SimulationConfig = field(default_factory=SimulationConfig)
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write what is printed, and when each run began and ended, to this file as well."""
 
     def run(self, console: Console) -> None:
         check_outputs(self.out, self.json)
-        robot, effects = load_robot(self.robot), parse_effects(self.effect)
+        robot, effects = load_robot(self.robot), parse_faults(self.effect)
         simulation = simulate(self.experiment, robot, self.seed, effects, self.config)
         with console.status("driving") as status:
             shown = 0
@@ -57,13 +57,13 @@ class Simulate:
                     status.update(f"driving: {second} s")
 
             count = write_simulation(self.out, simulation, on_message)
-        scores = score_runs(simulation)
+        scores = score_open_loop_runs(simulation)
         if self.json is not None:
             write_json(self.json, _content(simulation, self.seed, effects, count, scores))
         _print(console, simulation, self.out, count, scores)
 
 
-def _content(simulation: Simulation, seed: int, effects: dict[str, float], count: int, scores: list[Score]) -> dict[str, Any]:
+def _content(simulation: Simulation, seed: int, effects: dict[str, float], count: int, scores: list[OpenLoopScore]) -> dict[str, Any]:
     runs = [
         {
             "name": run.name,
@@ -85,14 +85,14 @@ def _content(simulation: Simulation, seed: int, effects: dict[str, float], count
     }
 
 
-def _print(console: Console, simulation: Simulation, out: Path, count: int, scores: list[Score]) -> None:
+def _print(console: Console, simulation: Simulation, out: Path, count: int, scores: list[OpenLoopScore]) -> None:
     what, who = simulation.experiment.name, simulation.robot.name
     driven = f"{simulation.time_s:.1f} s, {count} messages, {len(simulation.runs)} named runs"
     console.print(f"{escape(str(out))}: {what} with {who}, {driven}", soft_wrap=True)
     if simulation.experiment.name != "controller_evaluation":
         return
     table = Table("trajectory", "controller", "drive m", "correction s", "vision m", box=None, header_style="bold", pad_edge=False)
-    for trajectory, by_controller in mean_by_trajectory(scores).items():
+    for trajectory, by_controller in mean_scores_by_trajectory(scores).items():
         for controller, mean in by_controller.items():
             numbers = f"{mean.drive_error_m:.3f}", f"{mean.correction_time_s:.2f}", f"{mean.vision_error_m:.3f}"
             table.add_row(trajectory, controller, *numbers)

@@ -7,27 +7,27 @@ import re
 from collections.abc import Iterator, Sequence
 
 from localization.comparison.jobs import Job, Row, failed_rows, run_job
-from localization.errors import DoorError
+from localization.errors import TransportError
 
 try:
     import distributed
 except ImportError as error:
-    raise DoorError(f"a Dask cluster needs the extra 'dask': pip install 'skidloc[dask]' ({error}).") from error
+    raise TransportError(f"a Dask cluster needs the extra 'dask': pip install 'skidloc[dask]' ({error}).") from error
 
-logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # it tells of a lost scheduler with tracebacks; here it is one sentence
+logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # it logs tracebacks for a lost scheduler; here it is one sentence
 
 _TIMEOUT_S = 10
 _ADDRESS = re.compile(r"((tcp|tls|wss?|ucxx?)://)?(\[[^\]]+\]|[^/:\[\]\s]+):\d+")
 
 
 def run_on_cluster(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, list[Row]]]:
-    """Each job with its rows, as it ends. What a lost worker had is done by another. Raises `DoorError`."""
-    if not _ADDRESS.fullmatch(address):  # which distributed would look for until it gives up, with a traceback
-        raise DoorError(f"no Dask scheduler answers at {address}: that is no address. One looks like tcp://host:8786.")
+    """Each job with its rows, as it ends. What a lost worker had is done by another. Raises `TransportError`."""
+    if not _ADDRESS.fullmatch(address):  # distributed would retry until its timeout, then raise a traceback
+        raise TransportError(f"'{address}' is not an address of a Dask scheduler; an example is tcp://host:8786.")
     try:
         client = distributed.Client(address, timeout=_TIMEOUT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
-        raise DoorError(
+        raise TransportError(
             f"no Dask scheduler answers at {address} ({_short(error)}). Start `dask scheduler` there, or leave --dask out."
         ) from error
     try:
@@ -35,14 +35,14 @@ def run_on_cluster(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, lis
             try:
                 client.wait_for_workers(1, timeout=_TIMEOUT_S)
             except TimeoutError as error:
-                raise DoorError(f"the Dask scheduler at {address} has no workers. Start some: dask worker {address}.") from error
+                raise TransportError(f"the Dask scheduler at {address} has no workers. Start some: dask worker {address}.") from error
         futures = {client.submit(run_job, job, pure=False, retries=1): job for job in jobs}
         for future in distributed.as_completed(list(futures), loop=client.loop):
             job = futures.pop(future)
             yield job, _rows(future, job)
             future.release()
     except (OSError, distributed.client.ClosedClientError, distributed.client.FutureCancelledError) as error:
-        raise DoorError(
+        raise TransportError(
             f"the Dask scheduler at {address} went away ({_short(error)}). What was done is kept: run the same again."
         ) from error
     finally:
@@ -50,7 +50,7 @@ def run_on_cluster(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, lis
 
 
 def _rows(future: distributed.Future, job: Job) -> list[Row]:
-    """Of a future that has ended. Raises what is amiss with the cluster; what is amiss with the job alone becomes rows."""
+    """Rows of a future that has ended. Raises errors of the cluster; errors of the job alone become rows."""
     try:
         rows: list[Row] = future.result()
     except Exception as error:

@@ -24,7 +24,7 @@ from motion_models.robot import Robot
 OK, FAILED = "ok", "failed"
 
 Row = dict[str, Any]
-"""Of the table: what was run, `status`, `error`, `notes` on what was amiss with the log, of them `damage` to its files, and the scores."""
+"""One row of the table: what was run, `status`, `error`, `notes` on problems of the log, `damage` of its files, and the scores."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Job:
 
 def job_key(log: Path, robot: Robot, reference: str | None, topics: TopicOverrides, config: ReplayConfig) -> str:
     """Twelve digits that change with anything that the results depend on."""
-    told = {
+    settings = {
         "robot": repr(replace(robot, folder=None)),
         "reference": reference,
         "topics": asdict(topics),
@@ -69,15 +69,15 @@ def job_key(log: Path, robot: Robot, reference: str | None, topics: TopicOverrid
     }
     file = _reference_file(log, reference)
     try:
-        told["log"] = fingerprint(log)
-        told["reference file"] = fingerprint(file) if file is not None else ""
+        settings["log"] = fingerprint(log)
+        settings["reference file"] = fingerprint(file) if file is not None else ""
     except OSError as error:
-        told["log"] = str(error)
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:12]
+        settings["log"] = str(error)
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def run_job(job: Job) -> list[Row]:
-    """Rows of all trials. What is wrong with the log, whatever it is, becomes rows that say so."""
+    """Rows of all trials. Any error of the log becomes rows with that error."""
     try:
         return _run(job)
     except SkidlocError as error:
@@ -87,7 +87,7 @@ def run_job(job: Job) -> list[Row]:
 
 
 def failed_rows(job: Job, reason: str) -> list[Row]:
-    """Rows that say why there are no scores."""
+    """Rows with an error instead of scores."""
     return [{**_head(job, trial), "status": FAILED, "error": " ".join(reason.split())} for trial in job.trials]
 
 
@@ -106,10 +106,10 @@ def _run(job: Job) -> list[Row]:
     reference = _reference(log, job)
     named = [Trial(make_model(trial.model, job.robot), trial.estimator, trial.corrections) for trial in able]
     runs = replay(log.events(), named, job.robot, log.mounts, has_lidar, job.config)
-    amiss = {"notes": " ".join(log.warnings()), "damage": " ".join(log.damage())}
+    problems = {"notes": " ".join(log.warnings()), "damage": " ".join(log.damage())}
     for trial, result in zip(able, score(runs, reference), strict=True):
         scores = _scores(result.metrics(log.duration_s, with_timing=False))
-        rows.append({**_head(job, trial), "status": OK, "error": "", **amiss, **scores})
+        rows.append({**_head(job, trial), "status": OK, "error": "", **problems, **scores})
     return rows
 
 
@@ -151,7 +151,7 @@ def _reference_file(log: Path, name: str | None, folder: Path = Path()) -> Path 
 
 
 def trials(models: Sequence[str], estimators: Sequence[str], forms: Sequence[Form]) -> list[TrialSpec]:
-    """All combinations; forms of corrections only where an estimator makes some, and the LiDAR alone once, for it asks no model."""
+    """All combinations; forms of corrections only where an estimator makes some, and the LiDAR alone once, as it uses no model."""
     return [
         TrialSpec(model, estimator, form)
         for estimator in estimators

@@ -31,7 +31,7 @@ from localization.report.runs import capitalize, estimator_colours
 from localization.report.tables import MISSING, number
 
 _TITLE = "Comparison over"
-_BEST, _EQUAL, _LOST = "best", "not told apart", "LiDAR lost"
+_BEST, _EQUAL, _LOST = "best", "not significant", "LiDAR lost"
 _TERMS = {
     "Mean": "Over logs, each of which counts once: errors within a log are correlated, logs are not. In brackets the interval that holds "
     "the mean of other such logs in 95 of 100 cases, by bootstrap over logs.",

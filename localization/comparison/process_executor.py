@@ -30,35 +30,65 @@ class _Worker:
 
 def run_local(jobs: Sequence[Job], processes: int, work: Work = run_job) -> Iterator[tuple[Job, list[Row]]]:
     """Each job with its rows, as it ends. ``work`` is run in the processes and must be importable there."""
-    waiting = deque((job, 1) for job in jobs)
-    context = multiprocessing.get_context("spawn")  # libraries with threads do not survive a fork
-    busy: list[_Worker] = []
+    pool = _Pool(jobs, processes, work)
     try:
-        while waiting or busy:
-            while waiting and len(busy) < processes:
-                busy.append(_start(context, work, *waiting.popleft()))
-            ready = wait([worker.pipe for worker in busy])
-            for worker in [worker for worker in busy if worker.pipe in ready]:
-                job = worker.job
-                try:
-                    rows = worker.pipe.recv()
-                except (EOFError, OSError):
-                    busy.remove(worker)
-                    worker.process.join()
-                    if worker.tries < _TRIES:
-                        waiting.append((job, worker.tries + 1))
-                        continue
-                    rows = failed_rows(job, f"its process died, {_cause(worker.process.exitcode)}, {_TRIES} times over.")
-                else:
-                    if waiting:
-                        worker.job, worker.tries = waiting.popleft()
-                        worker.pipe.send(worker.job)
-                    else:
-                        busy.remove(worker)
-                        worker.pipe.close()  # by which the process ends
-                yield job, rows
+        yield from pool.results()
     finally:
-        for worker in busy:
+        pool.terminate()
+
+
+class _Pool:
+    """Busy processes, and the jobs that wait for one, each with the number of its try."""
+
+    def __init__(self, jobs: Sequence[Job], processes: int, work: Work) -> None:
+        self._waiting = deque((job, 1) for job in jobs)
+        self._context = multiprocessing.get_context("spawn")  # libraries with threads do not survive a fork
+        self._busy: list[_Worker] = []
+        self._processes, self._work = processes, work
+
+    def results(self) -> Iterator[tuple[Job, list[Row]]]:
+        """Each job with its rows, as it ends."""
+        while self.fill():
+            for worker in self.ready():
+                job, rows = worker.job, self.receive(worker)
+                if rows is not None:
+                    yield job, rows
+
+    def fill(self) -> bool:
+        """Start processes for waiting jobs; whether any process is busy."""
+        while self._waiting and len(self._busy) < self._processes:
+            self._busy.append(_start(self._context, self._work, *self._waiting.popleft()))
+        return bool(self._busy)
+
+    def ready(self) -> list[_Worker]:
+        """Processes that have ended their job or died; waits for one."""
+        pipes = wait([worker.pipe for worker in self._busy])
+        return [worker for worker in self._busy if worker.pipe in pipes]
+
+    def receive(self, worker: _Worker) -> list[Row] | None:
+        """Rows of the worker's job, and its next job; None where the process died and the job is tried again."""
+        try:
+            rows: list[Row] = worker.pipe.recv()
+        except (EOFError, OSError):
+            return self._replace(worker)
+        if self._waiting:
+            worker.job, worker.tries = self._waiting.popleft()
+            worker.pipe.send(worker.job)
+        else:
+            self._busy.remove(worker)
+            worker.pipe.close()  # by which the process ends
+        return rows
+
+    def _replace(self, worker: _Worker) -> list[Row] | None:
+        self._busy.remove(worker)
+        worker.process.join()
+        if worker.tries < _TRIES:
+            self._waiting.append((worker.job, worker.tries + 1))
+            return None
+        return failed_rows(worker.job, f"its process died, {_cause(worker.process.exitcode)}, {_TRIES} times over.")
+
+    def terminate(self) -> None:
+        for worker in self._busy:
             worker.process.terminate()
             worker.process.join()
 

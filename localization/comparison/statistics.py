@@ -1,4 +1,4 @@
-"""What a table of many logs says: means with intervals over logs, and whether one is better than another on the same logs.
+"""Statistics of a table of many logs: means with intervals over logs, and whether one is better than another on the same logs.
 
 A log is the unit: errors within one are correlated, logs are not. Intervals are percentiles of the bootstrap over logs; differences
 are tested by flipping their signs log by log (exact for few logs), for which it does not matter how errors are distributed. With n logs no
@@ -61,7 +61,7 @@ def combination(row: Row) -> str:
 
 
 def by_combination(rows: Sequence[Row], metric: str) -> dict[str, dict[str, float]]:
-    """The numbers of ``metric`` by combination and log; rows that failed, lack it or have words there are left out."""
+    """The numbers of ``metric`` by combination and log; failed rows, and those without a number there, are left out."""
     found: dict[str, dict[str, float]] = {}
     for row in rows:
         value = row.get(metric) if row["status"] == OK else None

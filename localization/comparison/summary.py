@@ -1,4 +1,4 @@
-"""What a comparison says, in words: which combination is best, over which others that is shown, and what to do."""
+"""Summary of a comparison in words: which combination is best, over which others that is significant, and what to do."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MEASURES = {
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What is said and shown of a comparison; made by `find`."""
+    """Results of a comparison; made by `find`."""
 
     metric: str
     rows: Sequence[Row]
@@ -33,7 +33,7 @@ class Findings:
     """The smallest first."""
     tested: Sequence[Difference]
     words: Mapping[str, str]
-    """By name of a combination: as a sentence says it."""
+    """By name of a combination: its name in a sentence."""
 
     @property
     def best(self) -> Mean:
@@ -41,7 +41,7 @@ class Findings:
 
     @property
     def measure(self) -> str:
-        """The metric as a reader says it."""
+        """Name of the metric in a sentence."""
         return _MEASURES.get(self.metric, self.metric)
 
     @property
@@ -100,7 +100,7 @@ def against_best(other: Mean, found: Findings) -> str:
     difference = found.against_best(other.name)
     if difference is None:
         names = f"{capitalize(found.words[found.best.name])} and {found.words[other.name]}"
-        return f"{names} share fewer than two logs: nothing can be told."
+        return f"{names} share fewer than two logs: no test is possible."
     return _of(difference, found)
 
 
@@ -114,11 +114,11 @@ def _of(d: Difference, found: Findings) -> str:
     gap = f"by {percent(d, found.unit)} of {found.measure}, p = {p_words(d.p_value)}"
     if found.is_shown(d):
         return f"{capitalize(better)} beats {worse} on {d.wins} of {_logs(d.n)}, {gap}."
-    return f"{capitalize(better)} and {worse} are not told apart: the first is better on {d.wins} of {_logs(d.n)}, {gap}."
+    return f"The difference of {better} and {worse} is not significant: the first is better on {d.wins} of {_logs(d.n)}, {gap}."
 
 
 def percent(d: Difference, unit: str = "") -> str:
-    """By how much the better one is smaller, with its interval: of the worse one's mean where that can be said, else in the ``unit``."""
+    """By how much the better one is smaller, with its interval: in percent of the worse one's mean if positive, else in the ``unit``."""
     if math.isnan(d.relative):
         return f"{d.mean:.3g} {unit}".rstrip() + f" [{d.low:.3g}, {d.high:.3g}]"
     return f"{_part(d.relative)} % [{_part(d.relative_low)}, {_part(d.relative_high)}]"
@@ -140,15 +140,17 @@ def _amount(mean: Mean, found: Findings) -> str:
 
 
 def _incomplete(found: Findings) -> list[str]:
-    said = []
+    sentences = []
     if len({mean.n for mean in found.means}) > 1:
-        said.append("Not all have a number on all logs, so their means are of different drives; the tests use the logs that both have.")
+        sentences.append(
+            "Not all have a number on all logs, so their means are of different drives; the tests use the logs that both have."
+        )
     if failed := found.failed:
         logs = len({row["log"] for row in failed})
-        said.append(f"{len(failed)} of {len(found.rows)} runs failed, on {_logs(logs)}.")
+        sentences.append(f"{len(failed)} of {len(found.rows)} runs failed, on {_logs(logs)}.")
     if n := len(found.damaged):
-        said.append(f"{_logs(n)} {'is' if n == 1 else 'are'} not whole: what could be read counts as much as a whole drive.")
-    return said
+        sentences.append(f"{_logs(n)} {'is' if n == 1 else 'are'} not whole: what could be read counts as much as a whole drive.")
+    return sentences
 
 
 def _losses(found: Findings) -> list[str]:
@@ -180,11 +182,11 @@ def _advice(found: Findings) -> str:
     if not equal:
         return f"Use {found.words[best.name]}."
     if len(equal) < len(pairs):
-        return f"Use {found.words[best.name]}; these logs do not tell it from {join_words(equal, 'or')}."
+        return f"Use {found.words[best.name]}; it is not significantly better than {join_words(equal, 'or')} on these logs."
     if (least := found.least_p(best.n)) >= _CERTAIN:
         enough = next(n for n in range(2, 99) if found.least_p(n) < _CERTAIN)
         return f"{_logs(best.n)} cannot show it: p is at least {p_words(least)} for {_pairs(len(found.tested))}. Take at least {enough}."
-    return "These logs do not tell which is better: take the simplest, or drive more."
+    return "No difference is significant on these logs: take the simplest, or record more drives."
 
 
 def _pairs(n: int) -> str:

@@ -44,7 +44,7 @@ class Table:
         except (ValueError, csv.Error) as error:
             raise OutputError(f"'{self.path}' is no table of a comparison ({error}). Name another file.") from error
         if any(set(_HEAD) - set(row) for row in rows) or not rows:
-            raise OutputError(f"'{self.path}' is no table of a comparison: it lacks its columns. Name another file.")
+            raise OutputError(f"'{self.path}' is no table of a comparison: columns are missing. Name another file.")
         return rows
 
     def missing(self, job: Job) -> tuple[TrialSpec, ...]:

@@ -1,79 +1,123 @@
-"""Causes: each says what would be different about robot, floor or sensors. Its signature follows by predicting again.
+"""Causes: what may differ on robot, floor or sensors. Each has a signature, the change that it makes in the predicted motions.
 
-A `Belief` holds everything that may be otherwise than the robot file says; a cause adds its size to one place of it. The pipeline that
-predicts motions from a belief is in `localization.diagnosis.prediction`.
+A `Hypothesis` holds everything that may be otherwise than the robot file says; a cause adds its size to one place of it. The predictor that
+predicts motions from a hypothesis is in `localization.diagnosis.prediction`.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 
 @dataclass(frozen=True)
-class Belief:
-    """How things may be; all 0 as the robot file says."""
+class Hypothesis:
+    """Deviations from the robot file, of every kind that a cause can have; all 0 for the robot file as it is."""
 
-    radius_left: float = 0.0
+    left_radius_scale: float = 0.0
     """Relative."""
-    radius_right: float = 0.0
+    right_radius_scale: float = 0.0
     friction: Mapping[str, float] = field(default_factory=dict)
     """Additions to parameters of `FrictionModel`."""
     cg: tuple[float, float] = (0.0, 0.0)
     payload_kg: float = 0.0
-    lidar: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    lidar_late_s: float = 0.0
-    wheels_late_s: float = 0.0
+    lidar_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lidar_time_offset_s: float = 0.0
+    wheel_time_offset_s: float = 0.0
     gyro_bias: float = 0.0
-    encoder_lost: float = 0.0
-    yields: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gyro_scale: float = 0.0
+    gyro_time_offset_s: float = 0.0
+    range_scale: float = 0.0
+    range_bias_m: float = 0.0
+    wheel_radius_drift: float = 0.0
+    """Relative growth of all wheels from the drive's start to its end."""
+    split_friction: float = 0.0
+    """Grip of the left wheels less that of the right ones, over their mean."""
+    encoder_loss: float = 0.0
+    slip_coefficients: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """vy += a vx wz; wz *= 1 - b |vx|; vx -= c vx |wz|."""
     slope: tuple[float, float] = (0.0, 0.0)
     """Rise of the floor along the axes of the drive's first heading [rad]."""
-    other_law: float = 0.0
+    other_contact_law: float = 0.0
     """Share of the contact law that the robot file does not choose (`motion_models.friction.contact`)."""
-    change: float = 0.0
-    """Sideways grip is more by this share from `change_s` on."""
-    change_s: float = 0.0
-    turns: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    friction_change: float = 0.0
+    """Sideways grip is more by this share from `friction_change_at_s` on."""
+    friction_change_at_s: float = 0.0
+    rotation_coefficients: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """wz *= 1 + a - b |wz| - c (1 - T), T the share of turning, see `FullLinear`."""
-    mixed: float = 0.0
+    longitudinal_curvature_slip: float = 0.0
     """Longitudinal slip by the share of turning, see `FullLinear.longitudinal_slip_curvature`."""
     wheel_lag_s: float = 0.0
 
 
+_PRIOR_FACTOR = 4.0  # sigma of a size's prior, over the typical size, where no physical limit is given
+_SHOWN_UNITS: Mapping[str, tuple[float, str]] = {"1": (100.0, "%"), "m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg"), "s": (1e3, "ms")}
+"""Factor and unit in sentences, by the SI unit of a size."""
+
+
 @dataclass(frozen=True)
-class Effect:
-    """One cause, as a direction in which things may differ."""
+class Cause:
+    """One cause, as a direction in which hypotheses may differ."""
 
     id: str
     unit: str
     meaning: str
-    usual: float
-    """A size that a robot may well have: what the drive must be able to show, and the step by which signatures are differenced."""
+    typical: float
+    """A size that is common on robots: what a drive should be able to show, and the unit of steps in numeric differences."""
     negligible: float
-    """Smaller sizes are within what robot files, mounts and clocks are ever known to."""
-    inject: Callable[[Belief, float], Belief] = field(repr=False)
+    """Smaller sizes are within the accuracy of robot files, mounts and clocks: they are tolerated."""
+    inject: Callable[[Hypothesis, float], Hypothesis] = field(repr=False)
+    words: tuple[str, str]
+    """What the robot does at a positive and at a negative size; {} stands for the magnitude with its unit."""
     one_sided: bool = False
     is_clock: bool = False
     """It shifts samples in time, between which rates have kinks: signatures are differenced to both sides, over a larger step."""
     at_s: float | None = None
     """For a change: when."""
+    prior_sigma: float = 0.0
+    """How large the size may plausibly be, as a standard deviation; 0 for four times the typical size."""
 
     @property
     def key(self) -> str:
         """Unique also among several moments of one change."""
         return self.id if self.at_s is None else f"{self.id}@{self.at_s:g}"
 
+    @property
+    def plausible(self) -> float:
+        """Sigma of the prior of the size."""
+        return self.prior_sigma or _PRIOR_FACTOR * self.typical
 
-def _plain(name: str) -> Callable[[Belief, float], Belief]:
+    @property
+    def largest(self) -> float:
+        """Magnitude beyond which a size is not considered: ten times the typical size, or five sigma of a physical prior."""
+        return min(10.0 * self.typical, 5.0 * self.prior_sigma or math.inf)
+
+    def describe(self, size: float) -> str:
+        """The effect of ``size`` in words, with its direction.
+
+        >>> CAUSES["track_width"].describe(-0.012)
+        'the left and right contacts are 12 mm closer together than the robot file has it'
+        """
+        factor, unit = (1.0, self.unit) if self.is_coefficient else _SHOWN_UNITS.get(self.unit, (1.0, self.unit))
+        amount = abs(size) * factor
+        decimals = max(0, 1 - math.floor(math.log10(max(amount, 1e-12))))  # two digits at least
+        return self.words[size < 0.0].format(f"{amount:.{decimals}f}" + ("" if unit == "1" else f" {unit}"))
+
+    @property
+    def is_coefficient(self) -> bool:
+        """Whether the size is a coefficient of a slip law, which has no unit that is read by itself."""
+        return "= " in self.meaning
+
+
+def _add(name: str) -> Callable[[Hypothesis, float], Hypothesis]:
     return lambda b, s: dataclasses.replace(b, **{name: getattr(b, name) + s})
 
 
-def _item(name: str, index: int) -> Callable[[Belief, float], Belief]:
-    def inject(b: Belief, s: float) -> Belief:
+def _add_item(name: str, index: int) -> Callable[[Hypothesis, float], Hypothesis]:
+    def inject(b: Hypothesis, s: float) -> Hypothesis:
         old = getattr(b, name)
         changed: dict[str, Any] = {name: tuple(v + s if i == index else v for i, v in enumerate(old))}
         return dataclasses.replace(b, **changed)
@@ -81,121 +125,255 @@ def _item(name: str, index: int) -> Callable[[Belief, float], Belief]:
     return inject
 
 
-def _radii(left: float, right: float) -> Callable[[Belief, float], Belief]:
-    return lambda b, s: dataclasses.replace(b, radius_left=b.radius_left + left * s, radius_right=b.radius_right + right * s)
+def _add_radii(left: float, right: float) -> Callable[[Hypothesis, float], Hypothesis]:
+    return lambda b, s: dataclasses.replace(
+        b, left_radius_scale=b.left_radius_scale + left * s, right_radius_scale=b.right_radius_scale + right * s
+    )
 
 
-def _friction(name: str) -> Callable[[Belief, float], Belief]:
+def _add_friction(name: str) -> Callable[[Hypothesis, float], Hypothesis]:
     return lambda b, s: dataclasses.replace(b, friction={**b.friction, name: b.friction.get(name, 0.0) + s})
 
 
-_ALL = (
-    Effect("wheel_radius_scale", "1", "all wheels roll farther by this share than the robot file says", 0.02, 0.002, _radii(1.0, 1.0)),
-    Effect(
+_FILE = "than the robot file has it"
+_TRANSFORM = "than its transform has it"
+_GYRO_BIAS_SIGMA = 0.01
+"""Zero-rate offset of MEMS gyros that robots carry, after the zeroing at switch-on that drivers do: 0.5 to 1 deg/s at most by the data
+sheets (BMI088: 1 deg/s; MPU-9250: 5 deg/s before zeroing; ADIS16470: 0.2 deg/s) [rad/s]."""
+_GYRO_SCALE_SIGMA = 0.03
+"""Sensitivity tolerance of the same gyros: 1 to 3 % [-]."""
+_CLOCK_SIGMA_S = 0.2
+"""Latency of drivers and of clocks that are not synchronized, as in the logs that come with the tests (0.04 to 0.2 s) [s]."""
+_RANGE_SCALE_SIGMA, _RANGE_BIAS_SIGMA_M = 0.02, 0.05
+"""Ranging errors of time-of-flight scanners: 0.03 to 0.05 m by data sheets (SICK LMS1xx, Velodyne VLP-16), 1 to 2 % for triangulation."""
+
+_CAUSES = (
+    Cause(
+        "wheel_radius_scale",
+        *("1", "all wheels roll farther by this share than the robot file says", 0.02, 0.002, _add_radii(1.0, 1.0)),
+        (f"all wheels roll {{}} farther {_FILE}", f"all wheels roll {{}} less far {_FILE}"),
+    ),
+    Cause(
         "wheel_radius_difference",
-        "1",
-        "the left wheels are larger by half of this share, the right ones smaller",
-        0.02,
-        0.001,
-        _radii(0.5, -0.5),
+        *("1", "the left wheels are larger by half of this share, the right ones smaller", 0.02, 0.001, _add_radii(0.5, -0.5)),
+        ("the left wheels are {} larger than the right ones", "the left wheels are {} smaller than the right ones"),
     ),
-    Effect("track_width", "m", "the left and right contacts are farther apart by this", 0.03, 0.003, _friction("track_width")),
-    Effect("payload", "kg", "the robot carries a mass that it does not know of", 8.0, 1.0, _plain("payload_kg"), one_sided=True),
-    Effect("cg_offset_x", "m", "the centre of gravity lies farther ahead than told", 0.03, 0.003, _item("cg", 0)),
-    Effect("cg_offset_y", "m", "the centre of gravity lies farther left than told", 0.02, 0.003, _item("cg", 1)),
-    Effect("lidar_offset_x", "m", "the tracked sensor sits farther ahead than its transform says", 0.05, 0.005, _item("lidar", 0)),
-    Effect("lidar_offset_y", "m", "the tracked sensor sits farther left than its transform says", 0.05, 0.005, _item("lidar", 1)),
-    Effect("lidar_yaw", "rad", "the tracked sensor is turned to the left against its transform", 0.03, 0.003, _item("lidar", 2)),
-    Effect("lidar_time_offset", "s", "the LiDAR's stamps are late by this", 0.05, 0.008, _plain("lidar_late_s"), is_clock=True),
-    Effect("wheel_time_offset", "s", "the wheels' stamps are late by this", 0.05, 0.008, _plain("wheels_late_s"), is_clock=True),
-    Effect(
+    Cause(
+        "track_width",
+        *("m", "the left and right contacts are farther apart by this", 0.03, 0.003, _add_friction("track_width")),
+        (f"the left and right contacts are {{}} farther apart {_FILE}", f"the left and right contacts are {{}} closer together {_FILE}"),
+    ),
+    Cause(
+        "payload",
+        *("kg", "the robot carries a mass that its file does not have", 8.0, 1.0, _add("payload_kg")),
+        ("the robot carries {} that its file does not have", "the robot carries {} less than its file has"),
+        one_sided=True,
+    ),
+    Cause(
+        "cg_offset_x",
+        *("m", "the centre of gravity lies farther ahead than given", 0.03, 0.003, _add_item("cg", 0)),
+        ("the centre of gravity lies {} farther ahead than given", "the centre of gravity lies {} farther back than given"),
+    ),
+    Cause(
+        "cg_offset_y",
+        *("m", "the centre of gravity lies farther left than given", 0.02, 0.003, _add_item("cg", 1)),
+        ("the centre of gravity lies {} farther left than given", "the centre of gravity lies {} farther right than given"),
+    ),
+    Cause(
+        "lidar_offset_x",
+        *("m", "the tracked sensor sits farther ahead than its transform says", 0.05, 0.005, _add_item("lidar_offset", 0)),
+        (f"the tracked sensor sits {{}} farther ahead {_TRANSFORM}", f"the tracked sensor sits {{}} farther back {_TRANSFORM}"),
+    ),
+    Cause(
+        "lidar_offset_y",
+        *("m", "the tracked sensor sits farther left than its transform says", 0.05, 0.005, _add_item("lidar_offset", 1)),
+        (f"the tracked sensor sits {{}} farther left {_TRANSFORM}", f"the tracked sensor sits {{}} farther right {_TRANSFORM}"),
+    ),
+    Cause(
+        "lidar_yaw",
+        *("rad", "the tracked sensor is turned to the left against its transform", 0.03, 0.003, _add_item("lidar_offset", 2)),
+        (f"the tracked sensor is turned {{}} farther left {_TRANSFORM}", f"the tracked sensor is turned {{}} farther right {_TRANSFORM}"),
+    ),
+    Cause(
+        "lidar_time_offset",
+        *("s", "the LiDAR's stamps are late by this", 0.05, 0.008, _add("lidar_time_offset_s")),
+        ("the LiDAR's stamps are {} late", "the LiDAR's stamps are {} early"),
+        is_clock=True,
+        prior_sigma=_CLOCK_SIGMA_S,
+    ),
+    Cause(
+        "wheel_time_offset",
+        *("s", "the wheels' stamps are late by this", 0.05, 0.008, _add("wheel_time_offset_s")),
+        ("the wheels' stamps are {} late", "the wheels' stamps are {} early"),
+        is_clock=True,
+        prior_sigma=_CLOCK_SIGMA_S,
+    ),
+    Cause(
+        "gyro_time_offset",
+        *("s", "the gyro's stamps are late by this", 0.05, 0.008, _add("gyro_time_offset_s")),
+        ("the gyro's stamps are {} late", "the gyro's stamps are {} early"),
+        is_clock=True,
+        prior_sigma=_CLOCK_SIGMA_S,
+    ),
+    Cause(
         "friction_anisotropy",
-        "1",
-        "the floor grips more sideways by this share (mu_y / mu_x)",
-        0.2,
-        0.03,
-        _friction("mu_ratio"),
+        *("1", "the floor grips more sideways by this share (mu_y / mu_x)", 0.2, 0.03, _add_friction("mu_ratio")),
+        (f"the floor grips {{}} more sideways {_FILE}", f"the floor grips {{}} less sideways {_FILE}"),
     ),
-    Effect(
+    Cause(
+        "split_friction",
+        *("1", "the left wheels grip more by half of this share, the right ones less", 0.2, 0.03, _add("split_friction")),
+        ("the left wheels grip {} more than the right ones", "the left wheels grip {} less than the right ones"),
+    ),
+    Cause(
         "lateral_force_law",
         "1",
         "the lateral force follows the other contact law by this share (isotropic: it grows with the slip; thesis: saturated at any slip)",
-        1.0,
-        0.15,
-        _plain("other_law"),
+        *(1.0, 0.15, _add("other_contact_law")),
+        ("the lateral force follows the contact law that the robot file does not choose, by {}", "{} less of the other contact law"),
         one_sided=True,
     ),
-    Effect(
+    Cause(
         "diagonal_load",
-        "1",
-        "a warped chassis loads front left and rear right by this share of m g / 4",
-        0.15,
-        0.02,
-        _friction("warp"),
+        *("1", "a warped chassis loads front left and rear right by this share of m g / 4", 0.15, 0.02, _add_friction("warp")),
+        (
+            "a warped chassis loads front left and rear right by {} of m g / 4",
+            "a warped chassis loads front right and rear left by {} of m g / 4",
+        ),
     ),
-    Effect("tread_asymmetry", "1", "wheels that slide to the left grip more by this share", 0.15, 0.02, _friction("tread")),
-    Effect(
+    Cause(
+        "tread_asymmetry",
+        *("1", "wheels that slide to the left grip more by this share", 0.15, 0.02, _add_friction("tread")),
+        ("wheels that slide to the left grip {} more", "wheels that slide to the left grip {} less"),
+    ),
+    Cause(
         "rolling_resistance",
-        "1",
-        "rolling resistance over load is more by this",
-        0.03,
-        0.004,
-        _friction("rolling_resistance"),
+        *("1", "rolling resistance over load is more by this", 0.03, 0.004, _add_friction("rolling_resistance")),
+        ("rolling resistance is more, by {} of the load", "rolling resistance is less, by {} of the load"),
     ),
-    Effect("scrub", "m", "the contact patches oppose any turn by this moment, over mu m g", 0.02, 0.002, _friction("scrub")),
-    Effect("slope", "rad", "the floor rises along the drive's first heading", 0.05, 0.005, _item("slope", 0)),
-    Effect(
+    Cause(
+        "scrub",
+        *("m", "the contact patches oppose any turn by this moment, over mu m g", 0.02, 0.002, _add_friction("scrub")),
+        ("the contact patches oppose any turn more, by {} times mu m g", "the contact patches oppose any turn less, by {} times mu m g"),
+    ),
+    Cause(
+        "slope",
+        *("rad", "the floor rises along the drive's first heading", 0.05, 0.005, _add_item("slope", 0)),
+        ("the floor rises by {} along the drive's first heading", "the floor falls by {} along the drive's first heading"),
+    ),
+    Cause(
         "encoder_dropout",
-        "1",
-        "share of its rolling time in which an encoder loses its counts",
-        0.1,
-        0.01,
-        _plain("encoder_lost"),
+        *("1", "share of its rolling time in which an encoder loses its counts", 0.1, 0.01, _add("encoder_loss")),
+        ("an encoder loses its counts in {} of its rolling time", "{} fewer counts are lost"),
         one_sided=True,
     ),
-    Effect("gyro_bias", "rad/s", "the gyro turns while nothing does", 0.02, 0.0075, _plain("gyro_bias")),
-    Effect("lateral_slip_speed", "s", "the robot slides sideways in curves: vy += s vx wz", 0.05, 0.005, _item("yields", 0)),
-    Effect("rotation_slip_speed", "s/m", "the robot turns less at speed: wz *= 1 - s |vx|", 0.1, 0.01, _item("yields", 1)),
-    Effect("longitudinal_slip_turning", "s/rad", "the robot goes less far in turns: vx *= 1 - s |wz|", 0.1, 0.01, _item("yields", 2)),
+    Cause(
+        "gyro_bias",
+        *("rad/s", "the gyro's rate at standstill", 0.02, 0.0075, _add("gyro_bias")),
+        ("the gyro reads {} to the left at standstill", "the gyro reads {} to the right at standstill"),
+        prior_sigma=_GYRO_BIAS_SIGMA,
+    ),
+    Cause(
+        "gyro_scale",
+        *("1", "the gyro's rates are larger than the truth by this share", 0.03, 0.005, _add("gyro_scale")),
+        ("the gyro's rates are {} too large", "the gyro's rates are {} too small"),
+        prior_sigma=_GYRO_SCALE_SIGMA,
+    ),
+    Cause(
+        "range_scale",
+        *("1", "the LiDAR's ranges are longer than the truth by this share", 0.02, 0.003, _add("range_scale")),
+        ("the LiDAR's ranges are {} too long", "the LiDAR's ranges are {} too short"),
+        prior_sigma=_RANGE_SCALE_SIGMA,
+    ),
+    Cause(
+        "range_bias",
+        *("m", "the LiDAR's ranges are longer than the truth by this, whatever the distance", 0.05, 0.01, _add("range_bias_m")),
+        ("the LiDAR's ranges are {} too long, whatever the distance", "the LiDAR's ranges are {} too short, whatever the distance"),
+        prior_sigma=_RANGE_BIAS_SIGMA_M,
+    ),
+    Cause(
+        "wheel_radius_drift",
+        *("1", "all wheels grow by this share from the drive's start to its end", 0.02, 0.003, _add("wheel_radius_drift")),
+        ("all wheels grow by {} from the drive's start to its end", "all wheels shrink by {} from the drive's start to its end"),
+    ),
+    Cause(
+        "lateral_slip_speed",
+        *("s", "the robot slides sideways in curves: vy += s vx wz", 0.05, 0.005, _add_item("slip_coefficients", 0)),
+        ("the robot slides to the inside of curves: vy += {} vx wz", "the robot slides to the outside of curves: vy -= {} vx wz"),
+    ),
+    Cause(
+        "rotation_slip_speed",
+        *("s/m", "the robot turns less at speed: wz *= 1 - s |vx|", 0.1, 0.01, _add_item("slip_coefficients", 1)),
+        ("the robot turns less at speed: wz *= 1 - {} |vx|", "the robot turns more at speed: wz *= 1 + {} |vx|"),
+    ),
+    Cause(
+        "longitudinal_slip_turning",
+        *("s/rad", "the robot goes less far in turns: vx *= 1 - s |wz|", 0.1, 0.01, _add_item("slip_coefficients", 2)),
+        ("the robot goes less far in turns: vx *= 1 - {} |wz|", "the robot goes farther in turns: vx *= 1 + {} |wz|"),
+    ),
 )
-EFFECTS: Mapping[str, Effect] = {effect.id: effect for effect in _ALL}
+CAUSES: Mapping[str, Cause] = {cause.id: cause for cause in _CAUSES}
 """All causes that hold for the whole of a drive, by id."""
 
 
-def friction_change(at_s: float) -> Effect:
+def friction_change(at_s: float) -> Cause:
     """The sideways grip changes ``at_s`` after the drive's beginning."""
 
-    def inject(b: Belief, s: float) -> Belief:
-        return dataclasses.replace(b, change=b.change + s, change_s=at_s)
+    def inject(b: Hypothesis, s: float) -> Hypothesis:
+        return dataclasses.replace(b, friction_change=b.friction_change + s, friction_change_at_s=at_s)
 
-    return Effect("friction_change", "1", f"sideways grip is more by this share from {at_s:.0f} s on", 0.3, 0.04, inject, at_s=at_s)
+    from_then = f"from {at_s:.0f} s on"
+    words = f"the floor grips {{}} more sideways {from_then}", f"the floor grips {{}} less sideways {from_then}"
+    return Cause("friction_change", "1", f"sideways grip is more by this share {from_then}", 0.3, 0.04, inject, words, at_s=at_s)
 
 
-EXTRA: Mapping[str, Effect] = {
-    "longitudinal_slip_curvature": Effect(
-        "longitudinal_slip_curvature", "1", "the robot goes less far on tight arcs, at any speed: vx *= 1 - s T", 0.2, 0.02, _plain("mixed")
+MISSING_MESSAGES = Cause(
+    "missing_joint_messages",
+    *("1", "share of the wheels' messages that are missing", 0.1, 0.02, lambda b, s: b),
+    ("{} of the wheels' messages are missing", "{} of the wheels' messages are missing"),
+    one_sided=True,
+)
+"""Counted by the gaps between stamps, not estimated from the motion."""
+
+_WINDOW_CAUSES = (
+    Cause(
+        "longitudinal_slip_curvature",
+        *("1", "the robot goes less far on tight arcs, at any speed: vx *= 1 - s T", 0.2, 0.02, _add("longitudinal_curvature_slip")),
+        ("the robot goes less far on tight arcs: vx *= 1 - {} T", "the robot goes farther on tight arcs: vx *= 1 + {} T"),
     ),
-    "wheel_lag": Effect(
-        "wheel_lag", "s", "the body follows the wheels with this time constant", 0.05, 0.008, _plain("wheel_lag_s"), one_sided=True
+    Cause(
+        "wheel_lag",
+        *("s", "the body follows the wheels with this time constant", 0.05, 0.008, _add("wheel_lag_s")),
+        ("the body follows the wheels with a time constant of {}", "the body leads the wheels by {}"),
+        one_sided=True,
     ),
-    "rotation_scale": Effect(
-        "rotation_scale", "1", "the robot turns farther than the model says by this share, at any speed", 0.1, 0.01, _item("turns", 0)
+    Cause(
+        "rotation_scale",
+        *("1", "the robot turns farther than the model says by this share, at any speed", 0.1, 0.01, _add_item("rotation_coefficients", 0)),
+        ("the robot turns {} more than the model predicts, at any speed", "the robot turns {} less than the model predicts, at any speed"),
     ),
-    "rotation_slip_rate": Effect(
-        "rotation_slip_rate", "s/rad", "the robot turns less the faster it turns: wz *= 1 - s |wz|", 0.1, 0.01, _item("turns", 1)
+    Cause(
+        "rotation_slip_rate",
+        *("s/rad", "the robot turns less the faster it turns: wz *= 1 - s |wz|", 0.1, 0.01, _add_item("rotation_coefficients", 1)),
+        ("the robot turns less the faster it turns: wz *= 1 - {} |wz|", "the robot turns more the faster it turns: wz *= 1 + {} |wz|"),
     ),
-    "rotation_slip_curvature": Effect(
+    Cause(
         "rotation_slip_curvature",
         "1",
         "the robot turns less on gentle arcs, at any speed: wz *= 1 - s (1 - T)",
-        0.2,
-        0.02,
-        _item("turns", 2),
+        *(0.2, 0.02, _add_item("rotation_coefficients", 2)),
+        ("the robot turns less on gentle arcs: wz *= 1 - {} (1 - T)", "the robot turns more on gentle arcs: wz *= 1 + {} (1 - T)"),
     ),
-}
-"""What other people's data taught: causes beyond the simulator's."""
+)
+WINDOW_CAUSES: Mapping[str, Cause] = {cause.id: cause for cause in _WINDOW_CAUSES}
+"""Causes that recorded data of other robots needed, beyond those of the simulator; for tables of windows. T is the share of turning."""
 
 
-def slope_across() -> Effect:
+def slope_across() -> Cause:
     """The floor rises to the left of the drive's first heading."""
-    return Effect("slope", "rad", "the floor rises to the left of the drive's first heading", 0.05, 0.005, _item("slope", 1), at_s=-1.0)
+    words = (
+        "the floor rises by {} to the left of the drive's first heading",
+        "the floor rises by {} to the right of the drive's first heading",
+    )
+    meaning = "the floor rises to the left of the drive's first heading"
+    return Cause("slope", "rad", meaning, 0.05, 0.005, _add_item("slope", 1), words, at_s=-1.0)

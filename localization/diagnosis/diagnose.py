@@ -4,33 +4,35 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
-from localization.diagnosis import trends
-from localization.diagnosis.causes import Effect
+from localization.diagnosis.causes import CAUSES, MISSING_MESSAGES, WINDOW_CAUSES, Cause
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain, Verdict
-from localization.diagnosis.heldout import heldout_gain
-from localization.diagnosis.linearization import Look, candidates, held_to, look, make_predictor
-from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, DrivePredictor, with_sizes
+from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain
+from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, with_tolerance
+from localization.diagnosis.prediction import DrivePredictor, with_sizes
 from localization.diagnosis.recommendations import general_advice, separating_drive
-from localization.diagnosis.selection import aliases_of, search, true_cost
-from localization.diagnosis.subset_selection import max_statistic, p_value, statistic
-from localization.diagnosis.summary import evidence, sentence
+from localization.diagnosis.selection import aliases_of, refined_cost, search_causes
+from localization.diagnosis.subset_selection import heldout_gain, max_statistic, p_value, statistic
+from localization.diagnosis.summary import describe_loss, describe_standstill_turn, evidence, sentence
+from localization.diagnosis.trends import find_trends
+from localization.diagnosis.verdict import attribute_rows, decide, find_outliers, tolerated_sizes
 from localization.settings import Count, Probability, Seed, Settings
 from motion_models.base import MotionModel
 from motion_models.se2 import FloatArray
 
 _ROUNDS = 5
-_TOLERANCES = (0.35, 0.1)  # sigma of causes that nobody names, over what is negligible: first as robots are, then as files say
-_STRICT = 2.0  # with the stricter of them, sizes must be so many times what is negligible
-_UNSURE = 1.0 / 3.0  # systematic part of a size's sigma, over what is negligible: clocks, mounts and physics are no better
-_PAYS = 0.003  # least held-out gain of a finding
-_CLEAR = 0.05
+TOLERANCES = (0.35, 0.1)  # sigma of causes that nobody names, over what is negligible: first as robots are, then as files say
+_STRICT_FACTOR = 2.0  # with the stricter of them, sizes must be so many times what is negligible
+_SYSTEMATIC_SHARE = 1.0 / 3.0  # systematic part of a size's sigma, over what is negligible: clocks, mounts and physics are no better
+_MIN_HELDOUT_GAIN = 0.003  # least held-out gain of a finding
+_CLEAR_HELDOUT_GAIN = 0.05
 _FEW_WINDOWS = 64
+_YAW_CAUSES = ("rotation_scale", "wheel_radius_difference", "wheel_time_offset", "gyro_bias", "rotation_slip_speed")
+_MIN_GAPS = 3  # fewer gaps between messages are pauses
 
 
 @dataclass(frozen=True)
@@ -64,14 +66,14 @@ class Residuals:
 
 
 @dataclass(frozen=True)
-class Examined:
+class DiagnosisResult:
     """A diagnosis and what it was made of."""
 
     diagnosis: Diagnosis
-    pipeline: DrivePredictor | None
+    predictor: DrivePredictor | None
     """None where there was too little to look at."""
     residuals: Residuals | None
-    state: Look | None = None
+    linearization: Linearization | None = None
     """The last look at the drive: its signatures, and its noise."""
 
 
@@ -80,59 +82,61 @@ def diagnose(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = 
     return examine(drive, model, config).diagnosis
 
 
-def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None) -> Examined:
+def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None) -> DiagnosisResult:
     """The same, with what pictures, patches and other methods start from."""
     config = config or DiagnosisConfig()
     if len(drive.maneuvers) < config.fewest_windows:
         why = f"only {len(drive.maneuvers)} windows of motion were measured; it takes {config.fewest_windows}."
-        return Examined(_undecidable(drive, model, drive.warnings[0] if drive.witness == "none" else why), None, None)
-    pipeline = make_predictor(drive, model)
-    effects = candidates(pipeline, config.moments)
-    first = look(pipeline, effects, {}, _TOLERANCES[0])
-    found = _examined(pipeline, first, config)
+        return DiagnosisResult(_undecidable(drive, model, drive.warnings[0] if drive.motion_reference == "none" else why), None, None)
+    predictor = make_predictor(drive, model)
+    causes = candidate_causes(predictor, config.moments)
+    first = linearize(predictor, causes, {}, TOLERANCES[0])
+    found = _diagnose_within(predictor, first, config)
     if found.diagnosis.verdict == "consistent":  # within what robots are: is it what their files say?
-        strict = _examined(pipeline, held_to(first, _TOLERANCES[1]), config)
+        strict = _diagnose_within(predictor, with_tolerance(first, TOLERANCES[1]), config)
         if strict.diagnosis.verdict != "consistent":
             return strict
     return found
 
 
-def _examined(pipeline: DrivePredictor, first: Look, config: DiagnosisConfig) -> Examined:
+def _diagnose_within(predictor: DrivePredictor, first: Linearization, config: DiagnosisConfig) -> DiagnosisResult:
     """With everything that is not named within the tolerance of the ``first`` look."""
     rng = np.random.default_rng(config.seed)
-    effects, tolerance = first.effects, first.tolerance
-    state = first
-    current: dict[Effect, float] = {}
-    visited: list[dict[Effect, float]] = []
-    seen: list[frozenset[str]] = []
+    causes, tolerance = first.causes, first.tolerance
+    linearization = first
+    current: dict[Cause, float] = {}
+    visited: list[dict[Cause, float]] = []
+    visited_keys: list[frozenset[str]] = []
     for _ in range(_ROUNDS):
-        sizes = search(pipeline, state)
+        sizes = search_causes(predictor, linearization)
         keys = frozenset(e.key for e in sizes)
         if keys == frozenset(e.key for e in current):
             break
         current = sizes
         visited.append(sizes)
-        state = look(pipeline, effects, current, tolerance)
-        if keys in seen:
+        linearization = linearize(predictor, causes, current, tolerance)
+        if keys in visited_keys:
             break
-        seen.append(keys)
+        visited_keys.append(keys)
     if len(visited) > 1:  # later looks need not be better: all that were preferred once are compared by one noise
-        best = min(visited, key=lambda sizes: true_cost(pipeline, state, sizes))
+        best = min(visited, key=lambda sizes: refined_cost(predictor, linearization, sizes))
         if set(best) != set(current):
             current = best
-            state = look(pipeline, effects, current, tolerance)
-    index = {e.key: i for i, e in enumerate(effects)}
-    chosen = _tested(state, tuple(sorted(index[e.key] for e in current)), rng, config)
-    return _conclude(pipeline, first, state, chosen, rng, config)
+            linearization = linearize(predictor, causes, current, tolerance)
+    index = {e.key: i for i, e in enumerate(causes)}
+    chosen = _drop_insignificant(linearization, tuple(sorted(index[e.key] for e in current)), rng, config)
+    return _conclude(predictor, first, linearization, chosen, rng, config)
 
 
-def _tested(state: Look, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig) -> tuple[int, ...]:
+def _drop_insignificant(
+    linearization: Linearization, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig
+) -> tuple[int, ...]:
     """``chosen``, less what does not stand up to the test."""
     while chosen:
         p = []
         for i in chosen:
             others = tuple(j for j in chosen if j != i)
-            p.append(_p_value(state, others, i, rng))
+            p.append(_p_value(linearization, others, i, rng))
         worst = int(np.argmax(p))
         if p[worst] <= config.significance:
             break
@@ -140,93 +144,161 @@ def _tested(state: Look, chosen: tuple[int, ...], rng: np.random.Generator, conf
     return chosen
 
 
-def _p_value(state: Look, others: tuple[int, ...], i: int, rng: np.random.Generator) -> float:
-    df = state.noise.freedom
-    return p_value(statistic(state.problem, others, i), max_statistic(state.problem, others, rng, df), df)
+def _p_value(linearization: Linearization, others: tuple[int, ...], i: int, rng: np.random.Generator) -> float:
+    df = linearization.noise.freedom
+    return p_value(statistic(linearization.problem, others, i), max_statistic(linearization.problem, others, rng, df), df)
 
 
 def _conclude(
-    pipeline: DrivePredictor, first: Look, state: Look, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig
-) -> Examined:
-    drive, problem, effects = pipeline.drive, state.problem, state.effects
-
-    def held(with_these: tuple[int, ...], without: tuple[int, ...]) -> Gain:
-        data = state.linear, state.signatures, state.nuisances, state.noise, problem.scale
-        return heldout_gain(*data, with_these, without, np.random.default_rng(config.seed))
-
-    within: dict[str, tuple[float, float]] = {}
-    least = 1.0 if state.tolerance >= _TOLERANCES[0] else _STRICT
-    while chosen:  # what nobody would correct, or does not pay where its size was not fitted to, is not named
-        sizes, cov, _ = problem.fit(chosen)
-        gains = [held(chosen, tuple(j for j in chosen if j != i)) for i in chosen]
-        small = [n for n, i in enumerate(chosen) if abs(sizes[n]) < least * effects[i].negligible or not _pays(gains[n], len(state.rows))]
-        if not small:
-            break
-        worst = min(small, key=lambda n: gains[n].relative)
-        within[effects[chosen[worst]].id] = float(sizes[worst]), float(math.sqrt(cov[worst, worst]))
-        chosen = tuple(i for n, i in enumerate(chosen) if n != worst)
-    sizes, cov, gained = problem.fit(chosen)
-    findings = []
-    for n, i in enumerate(chosen):
-        effect, size = effects[i], float(sizes[n])
-        sigma = math.hypot(math.sqrt(cov[n, n]), _UNSURE * effect.negligible)
-        if effect.id == "encoder_dropout":  # a share that comes in spells of random length is as sure as there were many
-            sigma = math.hypot(sigma, size * math.sqrt(2.0 / max(pipeline.dropout_spells, 2)))
-        others = tuple(j for j in chosen if j != i)
-        p = _p_value(state, others, i, rng)
-        aliases = aliases_of(pipeline, state, chosen, i)
-        told = evidence(effect, state.signatures[..., i] * size, state.noise, problem.gain(chosen) - problem.gain(others))
-        findings.append(Finding(effect, size, sigma, p, aliases, told, gains[n]))
-    findings.sort(key=lambda f: f.gain.relative, reverse=True)
-    total = held(chosen, ()) if chosen else None
-    findings = _merged(findings)
-    left = state.linear - state.signatures[..., list(chosen)] @ sizes
-    spreads = problem.scale * np.where(np.isin(np.arange(len(effects)), chosen), 1.0, problem.tolerance)
-    found_shapes, left_gain = trends.shapes(pipeline, state.noise, left, state.signatures, state.nuisances, spreads, rng)
-    share = left_gain / max(left_gain + gained, 1e-9) if found_shapes else 0.0
-    visible: dict[str, float] = {}
-    for i, effect in enumerate(effects):
-        size = 3.0 * problem.scale[i] / math.sqrt(problem.gram[i, i] + 1.0)
-        visible[effect.id] = min(visible.get(effect.id, math.inf), float(size))
-    blind = [e for e in effects if visible[e.id] > e.usual]
-    verdict: Verdict
-    if found_shapes and (not findings or share > 0.3):
-        verdict = "unexplained"
-    elif any(f.aliases for f in findings):
-        verdict = "ambiguous"
-    elif findings:
-        verdict = "explained"
-    elif len(blind) > 0.5 * len(effects):
-        verdict = "undecidable"
+    predictor: DrivePredictor,
+    first: Linearization,
+    linearization: Linearization,
+    chosen: tuple[int, ...],
+    rng: np.random.Generator,
+    config: DiagnosisConfig,
+) -> DiagnosisResult:
+    """Findings, the table with its attributions, and the verdict that follows from it."""
+    drive, problem, causes = predictor.drive, linearization.problem, linearization.causes
+    chosen, gains, dropped = _keep_useful(linearization, chosen, config)
+    sizes, _, gained = problem.fit(chosen)
+    findings = _make_findings(predictor, linearization, chosen, gains, rng)
+    rows = attribute_rows(first, linearization, chosen, sizes, config.significance)
+    left = linearization.linear - linearization.signatures[..., list(chosen)] @ sizes
+    spreads = problem.scale * np.where(np.isin(np.arange(len(causes)), chosen), 1.0, problem.tolerance)
+    trends, left_gain = find_trends(predictor, linearization.noise, left, linearization.signatures, linearization.nuisances, spreads, rng)
+    share = left_gain / max(left_gain + gained, 1e-9) if trends else 0.0
+    detectable = _detectable_sizes(linearization)
+    undetectable = [e for e in causes if detectable[e.id] > e.typical]
+    verdict = decide(findings, trends, share, tuple(rows.values()), len(undetectable) / max(len(causes), 1))
+    if findings:
+        next_drive = separating_drive(predictor, findings, linearization, chosen)
     else:
-        verdict = "consistent"
-    discrepancy = _components(first, state, left)
-    drive_next = separating_drive(pipeline, findings, state, chosen) if findings else general_advice(verdict, [e.id for e in blind])
-    belief = with_sizes({f.effect: f.size for f in findings})
+        next_drive = general_advice(verdict, [e.id for e in undetectable])
+    within = {**dropped, **_within_tolerance(linearization, chosen, rows)}
     result = Diagnosis(
-        *(drive.name, drive.robot.name, pipeline.model.name, drive.witness, verdict, discrepancy, tuple(findings), found_shapes),
+        *(drive.name, drive.robot.name, predictor.model.name, drive.motion_reference, verdict, rows, tuple(findings), trends),
         left_share=share,
-        next_drive=drive_next,
+        next_drive=next_drive,
         sentence="",
         within=within,
-        visible=visible,
-        gain=total,
+        tolerances={e.id: _tolerated_size(linearization, e) for e in causes if e.id in within},
+        detectable_sizes=detectable,
+        gain=_heldout(linearization, chosen, (), config) if chosen else None,
+        contradictions=() if drive.standstill_turn is None else (describe_standstill_turn(drive.standstill_turn),),
+        outliers_s=tuple(float(t) for t in drive.starts_s[predictor.batch.owner][find_outliers(linearization)]),
         windows=len(drive.maneuvers),
         warnings=drive.warnings,
-        belief=belief,
+        hypothesis=with_sizes({f.definition: f.size for f in findings}),
     )
+    result = _with_data_errors(result, drive)
     scale = np.sqrt(np.diagonal(problem.gram) + 1e-12)
-    alike = problem.gram / np.outer(scale, scale)
-    residuals = Residuals(first.rows, left, state.noise.sigmas, tuple(e.key for e in effects), alike)
-    return Examined(dataclasses.replace(result, sentence=sentence(result)), pipeline, residuals, state)
+    residuals = Residuals(first.rows, left, linearization.noise.sigmas, tuple(e.key for e in causes), problem.gram / np.outer(scale, scale))
+    return DiagnosisResult(dataclasses.replace(result, sentence=sentence(result)), predictor, residuals, linearization)
 
 
-def _pays(gain: Gain, windows: int) -> bool:
+def _heldout(linearization: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], config: DiagnosisConfig) -> Gain:
+    data = linearization.linear, linearization.signatures, linearization.nuisances, linearization.noise, linearization.problem.scale
+    return heldout_gain(*data, chosen, others, np.random.default_rng(config.seed))
+
+
+def _tolerated_size(linearization: Linearization, cause: Cause) -> float:
+    return (1.0 if linearization.tolerance >= TOLERANCES[0] else _STRICT_FACTOR) * cause.negligible
+
+
+def _keep_useful(
+    linearization: Linearization, chosen: tuple[int, ...], config: DiagnosisConfig
+) -> tuple[tuple[int, ...], list[Gain], dict[str, tuple[float, float]]]:
+    """``chosen`` without those within tolerance or without held-out gain; the gain of each; size and sigma of those within tolerance."""
+    within: dict[str, tuple[float, float]] = {}
+    causes = linearization.causes
+    while True:
+        sizes, cov, _ = linearization.problem.fit(chosen)
+        gains = [_heldout(linearization, chosen, tuple(j for j in chosen if j != i), config) for i in chosen]
+        tolerated = [abs(size) < _tolerated_size(linearization, causes[i]) for size, i in zip(sizes, chosen, strict=True)]
+        small = [n for n in range(len(chosen)) if tolerated[n] or not _is_gain_significant(gains[n], len(linearization.rows))]
+        if not small:
+            return chosen, gains, within
+        worst = min(small, key=lambda n: gains[n].relative)
+        if tolerated[worst]:
+            within[causes[chosen[worst]].id] = float(sizes[worst]), float(math.sqrt(cov[worst, worst]))
+        chosen = tuple(i for n, i in enumerate(chosen) if n != worst)
+
+
+def _make_findings(
+    predictor: DrivePredictor, linearization: Linearization, chosen: tuple[int, ...], gains: list[Gain], rng: np.random.Generator
+) -> list[Finding]:
+    """Findings, by their held-out gain."""
+    problem, causes = linearization.problem, linearization.causes
+    sizes, cov, _ = problem.fit(chosen)
+    found = []
+    for n, i in enumerate(chosen):
+        cause, size = causes[i], float(sizes[n])
+        sigma = math.hypot(math.sqrt(cov[n, n]), _SYSTEMATIC_SHARE * cause.negligible)
+        if cause.id == "encoder_dropout":  # spells of random length: the share is as certain as they are many
+            sigma = math.hypot(sigma, size * math.sqrt(2.0 / max(predictor.dropout_count, 2)))
+        others = tuple(j for j in chosen if j != i)
+        p = _p_value(linearization, others, i, rng)
+        aliases = aliases_of(predictor, linearization, chosen, i)
+        text = evidence(cause, linearization.signatures[..., i] * size, linearization.noise, problem.gain(chosen) - problem.gain(others))
+        finding = Finding(cause, size, sigma, p, aliases, text, gains[n])
+        found.append(_shown_by_yaw(finding) if predictor.drive.is_gyro_reference else finding)
+    return _merge_slopes(sorted(found, key=lambda f: f.gain.relative, reverse=True))
+
+
+def _shown_by_yaw(finding: Finding) -> Finding:
+    """``finding`` under the name of what headings alone show, where its first name is one of several physical reasons for that."""
+    sizes = dict(finding.aliases)
+    name = next((name for name in _YAW_CAUSES if name in sizes), None)
+    if name is None or finding.cause in _YAW_CAUSES:
+        return finding
+    definition = CAUSES.get(name) or WINDOW_CAUSES[name]
+    others = tuple((alias, size) for alias, size in finding.aliases if alias != name)
+    sigma = finding.sigma * abs(sizes[name] / finding.size) if finding.size else finding.sigma
+    aliases = ((finding.cause, finding.size), *others)
+    return dataclasses.replace(finding, definition=definition, size=sizes[name], sigma=sigma, aliases=aliases)
+
+
+def _detectable_sizes(linearization: Linearization) -> dict[str, float]:
+    problem = linearization.problem
+    found: dict[str, float] = {}
+    for i, cause in enumerate(linearization.causes):
+        size = 3.0 * problem.scale[i] / math.sqrt(problem.gram[i, i] + 1.0)
+        found[cause.id] = min(found.get(cause.id, math.inf), float(size))
+    return found
+
+
+def _within_tolerance(
+    linearization: Linearization, chosen: tuple[int, ...], rows: Mapping[str, Component]
+) -> dict[str, tuple[float, float]]:
+    """Size and sigma of the causes that are not named and yet account for a part of a significant row."""
+    listed = {a.cause for row in rows.values() for a in row.attributions if not a.is_named}
+    sizes, sigmas = tolerated_sizes(linearization, chosen), linearization.problem.posterior_sigmas(chosen)
+    found: dict[str, tuple[float, float]] = {}
+    for i, cause in enumerate(linearization.causes):
+        if cause.id in listed and i not in chosen and abs(sizes[i]) > abs(found.get(cause.id, (0.0, 0.0))[0]):
+            found[cause.id] = float(sizes[i]), float(sigmas[i])
+    return found
+
+
+def _with_data_errors(d: Diagnosis, drive: Drive) -> Diagnosis:
+    """``d`` with missing messages as a finding, and without a consistent verdict where measurements contradict each other."""
+    verdict, findings, loss = d.verdict, d.findings, drive.message_loss
+    if loss is not None and loss.share > MISSING_MESSAGES.negligible and loss.gaps >= _MIN_GAPS:
+        none = Gain(*(float("nan"),) * 2, 0.0, 0.0, 0.0) if d.gain is None else Gain(d.gain.after, d.gain.after, 0.0, 0.0, 0.0)
+        sigma = loss.share * math.sqrt(2.0 / loss.gaps)
+        findings = (*findings, Finding(MISSING_MESSAGES, loss.share, sigma, 0.0, (), describe_loss(loss), none))
+        verdict = "explained" if verdict in ("consistent", "undecidable") else verdict
+    if d.contradictions and verdict == "consistent":
+        verdict = "unexplained"
+    return dataclasses.replace(d, verdict=verdict, findings=findings)
+
+
+def _is_gain_significant(gain: Gain, windows: int) -> bool:
     """On windows that sizes were not fitted to. An interval from a few blocks of windows is wider than it says: there a clear gain does."""
-    return gain.relative >= _PAYS and (gain.low > 0.0 or (windows < _FEW_WINDOWS and gain.relative > _CLEAR))
+    return gain.relative >= _MIN_HELDOUT_GAIN and (gain.low > 0.0 or (windows < _FEW_WINDOWS and gain.relative > _CLEAR_HELDOUT_GAIN))
 
 
-def _merged(findings: list[Finding]) -> list[Finding]:
+def _merge_slopes(findings: list[Finding]) -> list[Finding]:
     """Both directions of a slope are one finding."""
     slopes = [f for f in findings if f.cause == "slope"]
     if len(slopes) < 2:
@@ -236,27 +308,10 @@ def _merged(findings: list[Finding]) -> list[Finding]:
     return [whole if f is slopes[0] else f for f in findings if f is not slopes[1]]
 
 
-def _components(first: Look, state: Look, left: FloatArray) -> dict[str, Component]:
-    """Per channel: what there was, what noise alone makes, and what is left."""
-    found = {}
-    white = state.noise.whiten(first.rows)
-    for c, name in enumerate(CHANNELS):
-        known = np.isfinite(first.rows[:, c])
-        if not known.any():
-            continue
-        rms, left_rms = (float(np.sqrt(np.mean(r[known, c] ** 2))) for r in (first.rows, left))
-        expected = float(np.sqrt(np.mean(state.noise.sigmas[known, c] ** 2)))
-        if c >= 4:
-            rms, left_rms = (float(np.std(r[known, c])) for r in (first.rows, left))
-        squares = float(np.sum(white[known, c] ** 2)) if c < 4 else float(known.sum())
-        found[name] = Component(CHANNEL_UNITS[c], rms, expected, float(chi2.sf(squares, int(known.sum()))), left_rms)
-    return found
-
-
 def _undecidable(drive: Drive, model: MotionModel, why: str) -> Diagnosis:
     advice = general_advice("undecidable", [])
     return Diagnosis(
-        *(drive.name, drive.robot.name, model.name, drive.witness, "undecidable", {}, (), ()),
+        *(drive.name, drive.robot.name, model.name, drive.motion_reference, "undecidable", {}, (), ()),
         left_share=0.0,
         next_drive=advice,
         sentence=f"Nothing can be said of {model.name} on this drive: {why} {advice}",

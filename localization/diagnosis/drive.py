@@ -1,18 +1,18 @@
-"""What a diagnosis looks at: windows of wheel motion, and what LiDAR, gyro and accelerometers measured of the same seconds."""
+"""The data of a diagnosis: windows of wheel motion, and what LiDAR, gyro and accelerometers measured of the same seconds."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from localization.calibration.calibrate import MotionReferenceName, make_motion_reference
-from localization.calibration.motion_references import GyroMotionReference, MotionReference, Span, Wheels
-from localization.calibration.windows import WindowConfig, cut
-from localization.events import Event, ImuSample, Scan
+from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, MotionReference, Span, Wheels
+from localization.calibration.windows import WindowConfig, Windows, cut
+from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.gyro import GyroBuffer
 from localization.logs.reader import Log
 from motion_models import se2
@@ -27,7 +27,30 @@ from motion_models.se2 import FloatArray
 _NS = 1e-9
 _FOREVER_S = 1e6
 _GRIPPERS = ("left_gripper", "gripper", "tool0", "left_tool0")
-_LEAST_GRAVITY, _MOST_GRAVITY = 8.0, 12.0
+_MIN_GRAVITY, _MAX_GRAVITY = 8.0, 12.0
+_RANGE_STEP_M = 0.05  # added to all ranges for the scene's derivative: about the ranging error of common scanners
+_MAX_SHIFTED_WINDOWS = 60  # windows whose scans are matched twice, once with longer ranges
+_MAX_STANDSTILL_RATE = 0.05  # rad/s; five sigma of plausible gyro biases (`causes`): a robot that turns while its wheels stand
+_MIN_REGULAR_SHARE = 0.6  # of the intervals between messages that must be near their median for messages to have a period
+_MAX_PAUSE_S = 5.0  # longer gaps are pauses of the driver, not lost messages
+
+
+class MessageLoss(NamedTuple):
+    """Messages of the wheels that are missing, by the gaps between their stamps."""
+
+    share: float
+    gaps: int
+    longest_s: float
+    period_s: float
+
+
+class StandstillTurn(NamedTuple):
+    """Turning by the gyro while no wheel moved."""
+
+    seconds: float
+    angle_rad: float
+    first_s: float
+    """Start of the first such window, since the first window."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +60,7 @@ class Drive:
     name: str
     robot: Robot
     maneuvers: tuple[Maneuver, ...]
-    witness: str
+    motion_reference: str
     """What measured the motion, in words."""
     kind: str = "log"
     """log, windows, rotations or runs."""
@@ -56,6 +79,10 @@ class Drive:
     """For runs: (n, 3) path of the controller's odometry in each, a pose at the end of each interval."""
     path_errors: FloatArray = field(default_factory=lambda: np.zeros(0))
     """For runs: (W,) measured mean distance of the driven path from it [m]."""
+    range_slopes: FloatArray | None = None
+    """(W, 3) change of the measured motion per metre that is added to all ranges; None where no LiDAR measured it."""
+    message_loss: MessageLoss | None = None
+    standstill_turn: StandstillTurn | None = None
     lidar_frame: str = ""
     """Frame of the scans that were matched."""
     lidar_at: tuple[float, float] = (0.0, 0.0)
@@ -67,26 +94,48 @@ class Drive:
         return sum(len(m.ends) for m in self.maneuvers)
 
 
-@dataclass
 class _Recorder:
-    """A motion reference that records which spans became maneuvers."""
+    """A motion reference that records which spans became maneuvers, and how a change of all ranges would change what it measures."""
 
-    inner: MotionReference
-    used: list[Span] = field(default_factory=list)
+    def __init__(self, inner: MotionReference, shifted: MotionReference | None) -> None:
+        """``shifted``: the same kind of LiDAR reference, which is given longer ranges; None for other references."""
+        self._inner, self._shifted = inner, shifted
+        self.used: list[Span] = []
+        self.standing: list[Span] = []
+        self._shifted_spans: dict[tuple[int, int], Span] = {}
 
     def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
-        yield from self.inner.spans(event, wheels)
+        yield from self._inner.spans(event, wheels)
+        if self._shifted is not None and len(self._shifted_spans) < _MAX_SHIFTED_WINDOWS:
+            longer = _with_longer_ranges(event) if isinstance(event, Scan) else event
+            self._shifted_spans.update({(s.start_ns, s.end_ns): s for s in self._shifted.spans(longer, wheels) if s.is_valid})
 
     def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
-        self.used = list(spans)
-        return self.inner.correct(spans, standing)
+        self.used, self.standing = list(spans), list(standing)
+        return self._inner.correct(spans, standing)
 
     def warnings(self) -> list[str]:
-        return self.inner.warnings()
+        return self._inner.warnings()
+
+    def range_slopes(self) -> FloatArray | None:
+        """See `Drive.range_slopes`; beyond the first windows by their mean share of the path, as matching twice takes twice as long."""
+        pairs = [(s, self._shifted_spans[key]) for s in self.used if (key := (s.start_ns, s.end_ns)) in self._shifted_spans]
+        if not pairs:
+            return None
+        slopes = {(a.start_ns, a.end_ns): (b.measured - a.measured) / _RANGE_STEP_M for a, b in pairs}
+        paths = np.array([a.measured[:2] for a, _ in pairs])
+        changes = np.array([slope[:2] for slope in slopes.values()])
+        share = float(np.sum(changes * paths) / max(float(np.sum(paths**2)), 1e-9))
+        return np.array([slopes.get((s.start_ns, s.end_ns), np.array([*(share * s.measured[:2]), 0.0])) for s in self.used])
+
+
+def _with_longer_ranges(scan: Scan) -> Scan:
+    ranges = np.maximum(np.linalg.norm(scan.points, axis=1, keepdims=True), 1e-9)
+    return dataclasses.replace(scan, points=scan.points * (1.0 + _RANGE_STEP_M / ranges))
 
 
 class _Imu:
-    """Keeps the gyro's and the accelerometers' whole story."""
+    """Keeps the gyro's and the accelerometers' whole record."""
 
     def __init__(self, robot: Robot, mounts: Any) -> None:
         self._mounts = mounts
@@ -94,7 +143,7 @@ class _Imu:
         self.stamps: list[int] = []
         self.forces: list[FloatArray] = []
 
-    def push(self, sample: ImuSample) -> None:
+    def insert(self, sample: ImuSample) -> None:
         self.gyro.insert(sample)
         self.stamps.append(sample.stamp_ns)
         self.forces.append(self._mounts.get(sample.frame_id, Mount()).rotation() @ sample.linear_acceleration)
@@ -104,7 +153,7 @@ class _Imu:
         if not self.stamps:
             return None
         stamps, forces = np.array(self.stamps), np.array(self.forces)
-        if not _LEAST_GRAVITY < float(np.median(forces[:, 2])) < _MOST_GRAVITY:
+        if not _MIN_GRAVITY < float(np.median(forces[:, 2])) < _MAX_GRAVITY:
             return None
         total = np.vstack([np.zeros(3), np.cumsum(forces, axis=0)])
         a, b = np.searchsorted(stamps, spans[:, 0]), np.searchsorted(stamps, spans[:, 1])
@@ -114,7 +163,7 @@ class _Imu:
 
 
 class _Postures:
-    """Stands in for the log's model of the arms, and remembers the joints of each centre of gravity."""
+    """The log's model of the arms, which also records the joints of each centre of gravity."""
 
     def __init__(self, model: Any) -> None:
         self._model, self.chain = model, model.chain
@@ -130,18 +179,19 @@ class _Postures:
 
 
 def drive_of_log(
-    log: Log, witness: MotionReferenceName = "auto", reference: str | None = None, config: WindowConfig | None = None
+    log: Log, motion_reference: MotionReferenceName = "auto", reference: str | None = None, config: WindowConfig | None = None
 ) -> Drive:
-    """Read ``log`` once. Raises `CalibrationError` where it has no wheels, and for a ``witness`` that it does not have."""
+    """Read ``log`` once. Raises `CalibrationError` where it has no wheels, and for a ``motion_reference`` that it does not have."""
     config = config or WindowConfig()
     robot = log.robot
     if log.sources.wheels is None and log.wheels_error is None:
         raise CalibrationError(f"{log.path.name} has no wheels: name their topic with --topic.joint-states or --topic.odometry.")
-    if witness == "auto" and reference is None and log.sources.lidar is None and log.sources.imu is None:
+    if motion_reference == "auto" and reference is None and log.sources.lidar is None and log.sources.imu is None:
         alone = f"{log.path.name} has neither a LiDAR nor an IMU, and no reference was named: nothing measures what the wheels do."
         return Drive(log.path.name, robot, (), "none", warnings=(alone, *log.warnings()))
-    inner, words = make_motion_reference(log, robot, witness, reference, config)
-    recorder = _Recorder(inner)
+    inner, words = make_motion_reference(log, robot, motion_reference, reference, config)
+    by_lidar = isinstance(inner, LidarMotionReference)
+    recorder = _Recorder(inner, LidarMotionReference(log.mounts, config.window_s) if by_lidar else None)
     imu = _Imu(robot, log.mounts)
     postures = None
     if log._arms is not None:
@@ -149,37 +199,74 @@ def drive_of_log(
         log._arms = postures  # type: ignore[assignment]
 
     frame = ""
+    wheel_stamps: list[int] = []
 
-    def watched() -> Iterable[Event]:
+    def record_events() -> Iterable[Event]:
         nonlocal frame
         for event in log.events():
             if isinstance(event, ImuSample):
-                imu.push(event)
+                imu.insert(event)
+            elif isinstance(event, WheelSample):
+                wheel_stamps.append(event.stamp_ns)
             elif isinstance(event, Scan):
                 frame = event.frame_id
             yield event
 
-    windows = cut(watched(), recorder, make_model("diff_drive", robot), robot, config, log.path.name)
+    windows = cut(record_events(), recorder, make_model("diff_drive", robot), robot, config, log.path.name)
     spans = np.array([(s.start_ns, s.end_ns) for s in recorder.used], dtype=np.int64).reshape(-1, 2)
-    left = f"{len(windows.maneuvers)} windows of {config.window_s:g} s; left out: {windows.standing} standing, {windows.lost} not measured."
+    left = _describe_windows(windows, spans, config)
     mount = log.mounts.get(frame, Mount())
     by_gyro = isinstance(inner, GyroMotionReference)
-    heard = bool(imu.stamps) and not by_gyro
+    has_gyro = bool(imu.stamps) and not by_gyro
     return Drive(
         name=log.path.name,
         robot=robot,
         maneuvers=windows.maneuvers,
-        witness=words,
+        motion_reference=words,
         starts_s=(spans[:, 0] - spans[0, 0]) * _NS if len(spans) else np.zeros(0),
         spans_ns=spans,
-        gyro=imu.gyro if heard else None,
+        gyro=imu.gyro if has_gyro else None,
         is_gyro_reference=by_gyro,
-        forces=imu.means(spans) if heard and len(spans) else None,
+        forces=imu.means(spans) if has_gyro and len(spans) else None,
         payload_arms=_payload_arms(robot, windows.maneuvers, postures),
+        range_slopes=recorder.range_slopes(),
+        message_loss=find_message_loss(np.array(wheel_stamps, dtype=np.int64)),
+        standstill_turn=find_standstill_turn(imu.gyro, recorder.standing) if imu.stamps else None,
         lidar_frame=frame,
         lidar_at=(mount.x, mount.y),
         warnings=(left, *windows.warnings, *log.warnings()),
     )
+
+
+def _describe_windows(windows: Windows, spans: IntArray, config: WindowConfig) -> str:
+    length_s = float(np.median(spans[:, 1] - spans[:, 0])) * _NS if len(spans) else config.window_s
+    text = f"{len(windows.maneuvers)} windows of {length_s:.2g} s; left out: {windows.standing} standing, {windows.lost} not measured."
+    if length_s > 1.3 * config.window_s:
+        text += f" The motion reference is sparse, so that windows of {config.window_s:g} s were extended to its stamps."
+    return text
+
+
+def find_message_loss(stamps: IntArray) -> MessageLoss | None:
+    """Missing messages by gaps in ``stamps`` (n,) [ns]; None where messages come at no regular rate."""
+    gaps = np.diff(stamps) * _NS
+    if len(gaps) < 50:
+        return None
+    period = float(np.median(gaps))
+    if period <= 0.0 or float(np.mean(np.abs(gaps - period) < 0.3 * period)) < _MIN_REGULAR_SHARE:
+        return None
+    holes = gaps[(gaps > 1.6 * period) & (gaps < _MAX_PAUSE_S)]
+    missing = float(np.sum(np.round(holes / period) - 1.0))
+    return MessageLoss(missing / (missing + len(stamps)), len(holes), float(holes.max(initial=0.0)), period)
+
+
+def find_standstill_turn(gyro: GyroBuffer, standing: Sequence[Span]) -> StandstillTurn | None:
+    """Turning by ``gyro`` in the windows in which no wheel moved; None where it stood as well."""
+    turns = [(s, gyro.turn(s.start_ns, s.end_ns, 0.0)) for s in standing]
+    moved = [(s, t) for s, t in turns if t is not None and t.duration > 0.0 and abs(t.angle) > _MAX_STANDSTILL_RATE * t.duration]
+    if not moved:
+        return None
+    first = (moved[0][0].start_ns - standing[0].start_ns) * _NS
+    return StandstillTurn(sum(t.duration for _, t in moved), sum(abs(t.angle) for _, t in moved), first)
 
 
 def drive_of_table(name: str, robot: Robot, maneuvers: Sequence[Maneuver], kind: str) -> Drive:
@@ -192,7 +279,7 @@ def drive_of_table(name: str, robot: Robot, maneuvers: Sequence[Maneuver], kind:
     >>> rotations = rotations_as_maneuvers(read_rotation_table("tests/data/vaultbot/rotation_grid.csv"), robot)
     >>> found = diagnose(drive_of_table("rotation_grid.csv", robot, rotations, "rotations"), make_model("friction", robot))
     >>> strongest = found.findings[0]
-    >>> strongest.cause, round(strongest.size, 2), strongest.effect.unit
+    >>> strongest.cause, round(strongest.size, 2), strongest.cause.unit
     ('lidar_offset_x', 0.06, 'm')
     """
     if kind == "windows":
@@ -202,7 +289,7 @@ def drive_of_table(name: str, robot: Robot, maneuvers: Sequence[Maneuver], kind:
         name=name,
         robot=robot,
         maneuvers=tuple(maneuvers),
-        witness=f"the table of {len(maneuvers)} {kind}",
+        motion_reference=f"the table of {len(maneuvers)} {kind}",
         kind=kind,
         starts_s=np.asarray(np.cumsum(seconds) - seconds),
         payload_arms=_payload_arms(robot, maneuvers, None),
@@ -215,8 +302,8 @@ def _pieces(m: Maneuver) -> Iterator[Maneuver]:
     covs = np.broadcast_to(m.cov, (len(m.ends), 3, 3))
     for pose, end, cov in zip(m.measured, m.ends, covs, strict=True):
         both = cov if driven == 0 else 2.0 * cov  # two poses that err independently
-        seen = se2.between(before, pose)[None]
-        yield dataclasses.replace(m, measured=seen, ends=np.array([end - driven]), cov=both, lead=m.lead + driven)
+        motion = se2.between(before, pose)[None]
+        yield dataclasses.replace(m, measured=motion, ends=np.array([end - driven]), cov=both, lead=m.lead + driven)
         before, driven = pose, int(end)
 
 

@@ -1,4 +1,4 @@
-"""Wheels that jump as no wheel can: one side's rate drops at once and comes back at once, while the other rolls on."""
+"""Encoder dropouts: one side's rate falls to half between two samples and doubles later, while the other's is steady."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from motion_models.se2 import FloatArray
 
 _DROP = (0.4, 0.62)  # one of two encoders silent; the rate of a side is their mean
 _LEAST_RATE = 0.5  # rad/s
-RESTS = 0.25  # rad/s
+REST_RATE_RAD_PER_S = 0.25  # rad/s
 _LONGEST_S = 3.0
 
 
-def lost_share(batch: Batch) -> FloatArray:
+def find_dropouts(batch: Batch) -> FloatArray:
     """(N, 2) what would have to be added to each rate, as a share of it: 1 where half of a side's counts are missing, else 0.
 
     A spell begins where a side's rate falls to about half between two samples while the other's stays, and ends where it doubles.
@@ -44,8 +44,8 @@ def _spells(rate: FloatArray, other: FloatArray, dt: FloatArray) -> FloatArray:
             jumps.append((i, -1))
         elif level and abs(after) > _LEAST_RATE and _DROP[0] < rises < _DROP[1]:
             jumps.append((i, 1))
-    # steps cannot be read while wheels hardly turn, so that no spell is believed to outlast a rest
-    rests = np.flatnonzero(np.abs(rate) < RESTS)
+    # steps do not show while wheels hardly turn, so that every spell ends at a rest
+    rests = np.flatnonzero(np.abs(rate) < REST_RATE_RAD_PER_S)
     spells = []
     start = None
     if jumps and jumps[0][1] == 1:

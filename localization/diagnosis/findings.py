@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-from localization.diagnosis.causes import Belief, Effect
+from localization.diagnosis.causes import Cause, Hypothesis
 
 Verdict = Literal["consistent", "explained", "ambiguous", "unexplained", "undecidable"]
 
@@ -36,7 +37,7 @@ class Gain:
 class Finding:
     """A named cause."""
 
-    effect: Effect
+    definition: Cause
     size: float
     sigma: float
     p_value: float
@@ -48,15 +49,21 @@ class Finding:
 
     @property
     def cause(self) -> str:
-        return self.effect.id
+        return self.definition.id
+
+    @property
+    def description(self) -> str:
+        """What it does, with its direction and size in words."""
+        return self.definition.describe(self.size)
 
     def to_dict(self) -> dict[str, Any]:
         return {
             "cause": self.cause,
-            "meaning": self.effect.meaning,
+            "meaning": self.definition.meaning,
+            "description": self.description,
             "size": self.size,
             "sigma": self.sigma,
-            "unit": self.effect.unit,
+            "unit": self.definition.unit,
             "p_value": self.p_value,
             "aliases": [name for name, _ in self.aliases],
             "alias_sizes": dict(self.aliases),
@@ -65,9 +72,23 @@ class Finding:
         }
 
 
+RowStatus = Literal["noise", "attributed", "within tolerance", "unexplained"]
+
+
+class Attribution(NamedTuple):
+    """A cause that accounts for a part of one row of discrepancies."""
+
+    cause: str
+    size: float
+    share: float
+    """Of the row's whitened squares."""
+    is_named: bool
+    """Whether it is a finding; otherwise it is within its tolerance."""
+
+
 @dataclass(frozen=True)
 class Component:
-    """One component of the discrepancy over the whole drive."""
+    """One component of the discrepancy over the whole drive, without outlier windows."""
 
     unit: str
     rms: float
@@ -76,6 +97,13 @@ class Component:
     p_value: float
     left_rms: float
     """Once everything named is corrected."""
+    unattributed_rms: float
+    """Once what is within tolerance is taken off as well."""
+    status: RowStatus = "noise"
+    attributions: tuple[Attribution, ...] = ()
+
+    def with_status(self, status: RowStatus, attributions: tuple[Attribution, ...]) -> Component:
+        return dataclasses.replace(self, status=status, attributions=attributions)
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -84,21 +112,27 @@ class Component:
             "expected_rms": self.expected_rms,
             "p_value": self.p_value,
             "rms_explained": self.left_rms,
+            "rms_unattributed": self.unattributed_rms,
+            "status": self.status,
+            "attributions": [a._asdict() for a in self.attributions],
         }
 
 
 @dataclass(frozen=True)
-class Shape:
+class Trend:
     """A trend in what is left that no cause has."""
 
     component: str
     along: str
     t: float
     p_value: float
+    over_noise: float
+    """Its root mean square over the noise of the component."""
 
     @property
     def text(self) -> str:
-        return f"the {self.component} left over follows {self.along} (t = {self.t:+.1f}, p = {self.p_value:.2g})"
+        size = f"{self.over_noise:.2g} times its noise"
+        return f"the {self.component} left over follows {self.along} (t = {self.t:+.1f}, p = {self.p_value:.2g}, {size})"
 
 
 @dataclass(frozen=True)
@@ -108,27 +142,33 @@ class Diagnosis:
     log: str
     robot: str
     model: str
-    witness: str
+    motion_reference: str
     verdict: Verdict
     discrepancy: Mapping[str, Component]
     findings: tuple[Finding, ...]
-    shapes: tuple[Shape, ...]
+    trends: tuple[Trend, ...]
     left_share: float
     """How much of what can be predicted of the discrepancy follows such trends, 0 to 1."""
     next_drive: str
     sentence: str
     within: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Causes that show, but are smaller than anyone would correct: size and sigma."""
-    visible: Mapping[str, float] = field(default_factory=dict)
+    """Causes that are significant but smaller than their tolerance: size and sigma."""
+    tolerances: Mapping[str, float] = field(default_factory=dict)
+    """Tolerated size of each of them."""
+    detectable_sizes: Mapping[str, float] = field(default_factory=dict)
     """Smallest size of each cause that this drive would show (three sigma, alone)."""
     gain: Gain | None = None
     """By all findings together."""
+    contradictions: tuple[str, ...] = ()
+    """Measurements that exclude each other, in sentences."""
+    outliers_s: tuple[float, ...] = ()
+    """When windows began that no cause explains to eight sigma: jumps of the reference, or events on the floor."""
     windows: int = 0
     warnings: tuple[str, ...] = ()
-    belief: Belief = field(default_factory=Belief)
+    hypothesis: Hypothesis = field(default_factory=Hypothesis)
 
     def to_dict(self) -> dict[str, Any]:
-        left: dict[str, Any] = {"share": self.left_share, "shapes": [vars(s) for s in self.shapes], "text": [s.text for s in self.shapes]}
+        left: dict[str, Any] = {"share": self.left_share, "shapes": [vars(s) for s in self.trends], "text": [s.text for s in self.trends]}
         return {
             "log": self.log,
             "robot": self.robot,
@@ -137,12 +177,15 @@ class Diagnosis:
             "discrepancy": {name: c.to_dict() for name, c in self.discrepancy.items()},
             "findings": [f.to_dict() for f in self.findings],
             "gain": None if self.gain is None else self.gain.to_dict(),
-            "left_unexplained": left if self.shapes else {},
+            "left_unexplained": left if self.trends else {},
             "next_drive": self.next_drive,
             "sentence": self.sentence,
-            "witness": self.witness,
+            "tolerances": dict(self.tolerances),
+            "contradictions": list(self.contradictions),
+            "outlier_windows_s": list(self.outliers_s),
+            "witness": self.motion_reference,
             "windows": self.windows,
             "within_tolerance": {name: list(value) for name, value in self.within.items()},
-            "smallest_visible": dict(self.visible),
+            "smallest_visible": dict(self.detectable_sizes),
             "notes": list(self.warnings),
         }

@@ -1,4 +1,4 @@
-"""One look at a drive: what differs from a belief, what every cause would do about it, and how noisy that is."""
+"""A drive linearized about a hypothesis: discrepancies, the signature of every cause, and the noise of both."""
 
 from __future__ import annotations
 
@@ -7,26 +7,34 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localization.diagnosis.causes import EFFECTS, EXTRA, Belief, Effect, friction_change, slope_across
+from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause, Hypothesis, friction_change, slope_across
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.noise import Noise, estimated_noise, plain_noise, regressors
+from localization.diagnosis.noise import Noise, estimate_noise, given_noise, variance_regressors
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
 from localization.diagnosis.subset_selection import Regression, regression
 from motion_models.base import MotionModel
+from motion_models.diff_drive import DiffDrive
+from motion_models.friction import FrictionModel
+from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
-_PRIOR = 4.0  # sigma of a size before looking, over the usual one
+SKIDDING = frozenset(
+    {"track_width", "payload", "cg_offset_x", "cg_offset_y", "friction_anisotropy", "friction_change", "split_friction", "scrub"}
+    | {"lateral_force_law", "diagonal_load", "tread_asymmetry", "rolling_resistance", "slope", "rotation_slip_speed"}
+)
+"""Causes that act by the friction of wheels that skid: none of a robot with casters, whose track is a scale of its rotation."""
+_CASTER_TOLERANCE = 0.02  # of the separation multiplier: what is calibrated on a robot with casters
 
 
 @dataclass(frozen=True)
-class Look:
-    """One linearisation: everything about the drive around a belief."""
+class Linearization:
+    """Discrepancies of a drive about a hypothesis, to first order in the sizes of all causes."""
 
-    effects: tuple[Effect, ...]
+    causes: tuple[Cause, ...]
     rows: FloatArray
-    """(M, 6) at the belief."""
+    """(M, 6) at the hypothesis."""
     linear: FloatArray
-    """(M, 6) the same, as if nothing were believed yet."""
+    """(M, 6) the same, moved back to the robot file by the signatures."""
     signatures: FloatArray
     """(M, 6, p)"""
     nuisances: FloatArray
@@ -37,34 +45,50 @@ class Look:
     problem: Regression
 
 
+def is_skid_steer(robot: Robot) -> bool:
+    """Whether the robot's wheels skid in turns; a robot with casters turns by its geometry (separation multiplier 1 in its file)."""
+    model = DiffDrive.from_robot(robot)
+    multiplier = float(model.nominal[model.param_names.index("wheel_separation_multiplier")])
+    return robot.arms is not None or abs(multiplier - 1.0) > _CASTER_TOLERANCE
+
+
+def default_model(robot: Robot) -> str:
+    """Name of the motion model that suits ``robot``."""
+    return FrictionModel.name if is_skid_steer(robot) else DiffDrive.name
+
+
 def make_predictor(drive: Drive, model: MotionModel) -> DrivePredictor:
     """With inertia where that describes the drive better (or is what the friction model leaves out by its nature)."""
-    plain = DrivePredictor(drive, model, settling=False)
-    if drive.kind != "log":
+    plain = DrivePredictor(drive, model, has_inertia=False)
+    if drive.kind != "log" or not is_skid_steer(drive.robot):
         return plain
-    with_inertia = DrivePredictor(drive, model, settling=True)
+    with_inertia = DrivePredictor(drive, model, has_inertia=True)
     squares = []
-    for pipeline in (plain, with_inertia):
-        rows = pipeline.discrepancies(Belief())[:, :3]
+    for predictor in (plain, with_inertia):
+        rows = predictor.discrepancies(Hypothesis())[:, :3]
         known = np.isfinite(rows).any(axis=0)
         squares.append(np.nanmedian(np.abs(rows[:, known]), axis=0))
     better = np.sum(np.log(np.maximum(squares[0], 1e-9)) - np.log(np.maximum(squares[1], 1e-9))) > 0.0
     return with_inertia if better or model.name == "friction" else plain
 
 
-def candidates(pipeline: DrivePredictor, moments: int) -> tuple[Effect, ...]:
+def candidate_causes(predictor: DrivePredictor, moments: int) -> tuple[Cause, ...]:
     """Causes that this drive could show; a change of the floor at so many ``moments``."""
-    drive = pipeline.drive
+    drive = predictor.drive
     out = set()
     if drive.gyro is None and not drive.is_gyro_reference:
-        out.add("gyro_bias")
-    if not pipeline.dropout_seen:
+        out |= {"gyro_bias", "gyro_scale", "gyro_time_offset"}
+    if drive.range_slopes is None:
+        out |= {"range_scale", "range_bias"}
+    if drive.kind != "log":
+        out.add("wheel_radius_drift")
+    if not predictor.has_dropouts:
         out.add("encoder_dropout")
     if drive.is_gyro_reference:
         out |= {"lidar_offset_x", "lidar_offset_y", "lidar_yaw", "lidar_time_offset", "lateral_slip_speed", "longitudinal_slip_turning"}
     if drive.kind in ("rotations", "runs"):
         out |= {"lidar_time_offset", "wheel_time_offset", "slope", "lateral_slip_speed", "rotation_slip_speed", "longitudinal_slip_turning"}
-    found = [e for e in EFFECTS.values() if e.id not in out]
+    found = [e for e in CAUSES.values() if e.id not in out]
     if drive.kind == "log" and not drive.is_gyro_reference:
         found.append(slope_across())
         length = float(drive.starts_s[-1])
@@ -73,41 +97,45 @@ def candidates(pipeline: DrivePredictor, moments: int) -> tuple[Effect, ...]:
     if drive.kind == "runs":
         out = {"wheel_radius_difference", "tread_asymmetry", "lidar_yaw", "gyro_bias", "encoder_dropout"}
         return tuple(e for e in found if e.id not in out)
+    if not is_skid_steer(drive.robot):
+        found = [e for e in found if e.id not in SKIDDING]
     if drive.kind == "windows":
-        found += list(EXTRA.values())
-    elif pipeline.model.name != "friction":  # its own number for how far it turns is not the floor's
-        found.append(EXTRA["rotation_scale"])
+        found += list(WINDOW_CAUSES.values())
+    elif predictor.model.name != "friction" or drive.is_gyro_reference:  # its own number for how far it turns is not the floor's
+        found.append(WINDOW_CAUSES["rotation_scale"])
     return tuple(found)
 
 
-def look(pipeline: DrivePredictor, effects: tuple[Effect, ...], sizes: dict[Effect, float], tolerance: float) -> Look:
-    """Everything around the belief that causes have these ``sizes``."""
-    belief = with_sizes(sizes)
-    rows = pipeline.discrepancies(belief)
-    signatures = np.stack([pipeline.signature(belief, e, rows) for e in effects], axis=-1)
+def linearize(predictor: DrivePredictor, causes: tuple[Cause, ...], sizes: dict[Cause, float], tolerance: float) -> Linearization:
+    """Everything around the hypothesis that causes have these ``sizes``."""
+    hypothesis = with_sizes(sizes)
+    rows = predictor.discrepancies(hypothesis)
+    signatures = np.stack([predictor.signature(hypothesis, e, rows) for e in causes], axis=-1)
     linear = rows.copy()
-    for effect, size in sizes.items():
-        linear += signatures[..., [e.key for e in effects].index(effect.key)] * size
+    for cause, size in sizes.items():
+        linear += signatures[..., [e.key for e in causes].index(cause.key)] * size
     nuisances = _nuisances(rows)
-    noise = _noise(pipeline, linear, signatures, nuisances, effects)
-    problem = normal_form(linear, signatures, nuisances, noise, effects, tolerance)
-    return Look(effects, rows, linear, signatures, nuisances, noise, tolerance, problem)
+    noise = _estimate_drive_noise(predictor, linear, signatures, nuisances, causes)
+    problem = make_regression(linear, signatures, nuisances, noise, causes, tolerance)
+    return Linearization(causes, rows, linear, signatures, nuisances, noise, tolerance, problem)
 
 
-def held_to(state: Look, tolerance: float) -> Look:
-    """The same look, with what is not named within another ``tolerance``."""
-    problem = normal_form(state.linear, state.signatures, state.nuisances, state.noise, state.effects, tolerance)
-    return dataclasses.replace(state, tolerance=tolerance, problem=problem)
+def with_tolerance(linearization: Linearization, tolerance: float) -> Linearization:
+    """The same, with unnamed causes held to another ``tolerance``."""
+    problem = make_regression(
+        linearization.linear, linearization.signatures, linearization.nuisances, linearization.noise, linearization.causes, tolerance
+    )
+    return dataclasses.replace(linearization, tolerance=tolerance, problem=problem)
 
 
-def normal_form(
-    linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, noise: Noise, effects: tuple[Effect, ...], tolerance: float
+def make_regression(
+    linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, noise: Noise, causes: tuple[Cause, ...], tolerance: float
 ) -> Regression:
     """Whitened, without nuisances, and with what is not named within ``tolerance``."""
     y = noise.whiten(linear).ravel()
     s = noise.whiten(signatures).reshape(len(y), -1)
     z = noise.whiten(nuisances).reshape(len(y), -1)
-    return regression(y, s, z, _PRIOR * np.array([e.usual for e in effects]), tolerance * np.array([e.negligible for e in effects]))
+    return regression(y, s, z, np.array([e.plausible for e in causes]), tolerance * np.array([e.negligible for e in causes]))
 
 
 def _nuisances(rows: FloatArray) -> FloatArray:
@@ -117,13 +145,13 @@ def _nuisances(rows: FloatArray) -> FloatArray:
     return np.where(np.isfinite(rows)[..., None], level, np.nan)
 
 
-def _noise(
-    pipeline: DrivePredictor, linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, effects: tuple[Effect, ...]
+def _estimate_drive_noise(
+    predictor: DrivePredictor, linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, causes: tuple[Cause, ...]
 ) -> Noise:
     """Estimated from what all causes together leave, in a few rounds as sizes and noise hang on each other."""
-    batch, drive = pipeline.batch, pipeline.drive
+    batch, drive = predictor.batch, predictor.drive
     g = drive.robot.geometry
-    features = regressors(batch, g.wheel_radius_m, g.track_width_m)
+    features = variance_regressors(batch, g.wheel_radius_m, g.track_width_m)
     starts = np.r_[True, batch.owner[1:] != batch.owner[:-1]]
     follows = ~starts
     if len(drive.spans_ns):
@@ -133,8 +161,8 @@ def _noise(
     sigmas[:, :3] = given
     sigmas[:, 3] = np.hypot(given[:, 2], 1e-3)
     sigmas[:, 4:] = 0.05
-    noise = plain_noise(linear, sigmas, follows)
-    scale = _PRIOR * np.array([e.usual for e in effects])
+    noise = given_noise(linear, sigmas, follows)
+    scale = np.array([e.plausible for e in causes])
     known = np.isfinite(linear)
     for _ in range(3):
         y = noise.whiten(linear).ravel()
@@ -142,11 +170,11 @@ def _noise(
         inverse = np.linalg.inv(design.T @ design + np.eye(design.shape[1]))
         x = inverse @ (design.T @ y)
         spent = np.sum((design @ inverse) * design, axis=1).reshape(linear.shape).sum(axis=0)
-        p = len(effects)
+        p = len(causes)
         left = linear - signatures @ (x[:p] * scale) - nuisances @ (x[p:] * 1e3)
-        noise = estimated_noise(np.where(known, left, np.nan), features, follows, spent, sigmas)
+        noise = estimate_noise(np.where(known, left, np.nan), features, follows, spent, sigmas)
     return noise
 
 
-def group_of(effect: Effect) -> str:
-    return effect.id if effect.id != "slope" else effect.key
+def group_of(cause: Cause) -> str:
+    return cause.id if cause.id != "slope" else cause.key

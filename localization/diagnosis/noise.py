@@ -13,9 +13,9 @@ from motion_models.se2 import FloatArray
 
 _ROUNDS = 8
 _MOTION = 3  # channels of the motion itself
-_LEAST_FREE = 0.1  # of all numbers, however many causes there are
-_CLAIM = 4.0  # windows that a witness's own covariance is worth
-_HONEST = 0.5  # a witness may be better than it says, but not by more than this
+_MIN_FREE_SHARE = 0.1  # of all numbers, however many causes there are
+_CLAIMED_WINDOWS = 4.0  # number of windows that a motion reference's own covariance counts for
+_MIN_SIGMA_OVER_CLAIMED = 0.5  # least sigma, as a share of the one that the motion reference gives
 _CLIP = 9.0  # squares beyond this many variances are outliers, and count as this much
 
 
@@ -27,7 +27,7 @@ class Noise:
     """(M, 6) standard deviation of each number; 1 where nothing was measured."""
     mixing: FloatArray
     """(6, 6) lower triangular: makes the channels of one window independent."""
-    memory: FloatArray
+    autocorrelation: FloatArray
     """(6,) share of the error of the window before that is still in the next."""
     follows: NDArray[np.bool_]
     """(M,) whether a window begins where the one before ended."""
@@ -43,12 +43,12 @@ class Noise:
         mixed = np.einsum("ij,nj...->ni...", self.mixing, scaled)
         before = np.zeros_like(mixed)
         before[1:] = mixed[:-1] * self.follows[1:].reshape(-1, *(1,) * (rows.ndim - 1))
-        memory = self.memory.reshape(1, -1, *(1,) * (rows.ndim - 2))
-        unmixed = (mixed - memory * before) / np.sqrt(1.0 - memory**2)
+        autocorrelation = self.autocorrelation.reshape(1, -1, *(1,) * (rows.ndim - 2))
+        unmixed = (mixed - autocorrelation * before) / np.sqrt(1.0 - autocorrelation**2)
         return np.asarray(unmixed * self.weights.reshape(-1, *(1,) * (rows.ndim - 1)))
 
 
-def regressors(batch: Batch, wheel_radius: float, track: float) -> FloatArray:
+def variance_regressors(batch: Batch, wheel_radius: float, track: float) -> FloatArray:
     """(M, 3) what variances may grow with: constant, metres driven, radians by the wheels' difference."""
     driven, turned = np.zeros(len(batch.ends)), np.zeros(len(batch.ends))
     for i, (end, owner) in enumerate(zip(batch.ends, batch.owner, strict=True)):
@@ -59,20 +59,20 @@ def regressors(batch: Batch, wheel_radius: float, track: float) -> FloatArray:
     return np.column_stack([np.ones(len(driven)), driven, turned])
 
 
-def plain_noise(rows: FloatArray, sigmas: FloatArray, follows: NDArray[np.bool_]) -> Noise:
+def given_noise(rows: FloatArray, sigmas: FloatArray, follows: NDArray[np.bool_]) -> Noise:
     """Independent numbers with the given ``sigmas`` (M, 6)."""
     return Noise(np.where(np.isfinite(rows), sigmas, 1.0), np.eye(rows.shape[1]), np.zeros(rows.shape[1]), follows, np.ones(len(rows)))
 
 
-def estimated_noise(left: FloatArray, features: FloatArray, follows: NDArray[np.bool_], spent: FloatArray, claimed: FloatArray) -> Noise:
+def estimate_noise(left: FloatArray, features: FloatArray, follows: NDArray[np.bool_], spent: FloatArray, claimed: FloatArray) -> Noise:
     """By ``left`` (M, 6), what the richest explanation leaves, which has used up ``spent`` (6,) degrees of freedom in each channel.
 
-    What the witnesses say of themselves, ``claimed`` (M, 6), counts as much as a few windows: short drives show little of their noise. They
-    may be better than they say, but not by much.
+    The sigmas that the motion references give, ``claimed`` (M, 6), count as much as a few windows: short drives show little of their noise.
+    The estimate may be smaller than they are, but not by much.
     """
     known = np.isfinite(left)
     counts = known.sum(axis=0)
-    free = np.maximum(counts - spent, np.maximum(_LEAST_FREE * counts, 1.0))
+    free = np.maximum(counts - spent, np.maximum(_MIN_FREE_SHARE * counts, 1.0))
     inflate = np.where(counts > 0, counts / free, 1.0)
     sigmas = np.ones_like(left)
     for channel in range(left.shape[1]):
@@ -86,24 +86,24 @@ def estimated_noise(left: FloatArray, features: FloatArray, follows: NDArray[np.
             clipped = np.minimum(squares, _CLIP * variance)
             found = nnls(f / variance[:, None], clipped / variance)[0]
             variance = np.maximum(f @ found, 0.2 * float(np.median(variance)))
-        said = claimed[use, channel]
-        pooled = (free[channel] * variance + _CLAIM * said**2) / (free[channel] + _CLAIM)
-        sigmas[use, channel] = np.maximum(np.sqrt(pooled), _HONEST * said)
+        given = claimed[use, channel]
+        pooled = (free[channel] * variance + _CLAIMED_WINDOWS * given**2) / (free[channel] + _CLAIMED_WINDOWS)
+        sigmas[use, channel] = np.maximum(np.sqrt(pooled), _MIN_SIGMA_OVER_CLAIMED * given)
     z = np.nan_to_num(left * np.sqrt(inflate) / sigmas, nan=0.0)
     lengths = np.abs(z).max(axis=1)
     weights = np.minimum(1.0, 4.0 / np.maximum(lengths, 1e-9))
     z = z * weights[:, None]
     mixing = _mixing(z, known)
     z = z @ mixing.T
-    memory = np.zeros(left.shape[1])
+    autocorrelation = np.zeros(left.shape[1])
     for channel in range(left.shape[1]):
         pairs = follows[1:] & known[1:, channel] & known[:-1, channel]
         if pairs.sum() > 20:
             a, b = z[1:, channel][pairs], z[:-1, channel][pairs]
             rho = float(a @ b / max(np.sqrt((a @ a) * (b @ b)), 1e-12))
-            memory[channel] = min(max(rho - 1.0 / np.sqrt(pairs.sum()), 0.0), 0.8)
+            autocorrelation[channel] = min(max(rho - 1.0 / np.sqrt(pairs.sum()), 0.0), 0.8)
     motion = [float(free[c]) for c in range(_MOTION) if counts[c]]
-    return Noise(sigmas, mixing, memory, follows, weights, min(motion, default=1.0) + _CLAIM)
+    return Noise(sigmas, mixing, autocorrelation, follows, weights, min(motion, default=1.0) + _CLAIMED_WINDOWS)
 
 
 def _mixing(z: FloatArray, known: NDArray[np.bool_]) -> FloatArray:

@@ -1,4 +1,4 @@
-"""From a belief to discrepancies: the real pipeline, run again with something otherwise."""
+"""Discrepancies of a drive under a hypothesis: measured minus predicted motion, with the model's own integration."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from localization.diagnosis.causes import Belief, Effect
+from localization.diagnosis.causes import Cause, Hypothesis
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.dynamic_response import TRACKED, settling_twists
-from localization.diagnosis.encoder_dropout import RESTS, lost_share
-from localization.diagnosis.quasi_static import steady_twists
+from localization.diagnosis.encoder_dropout import REST_RATE_RAD_PER_S, find_dropouts
+from localization.diagnosis.friction_response import TRACKED, dynamic_twists, quasi_static_twists
 from motion_models import se2
 from motion_models.base import MotionModel, Twist
 from motion_models.calibration.maneuvers import Batch, IntArray, Maneuver, make_batch
@@ -23,8 +22,8 @@ from motion_models.se2 import FloatArray
 CHANNELS = ("x", "y", "yaw", "gyro", "force_x", "force_y")
 CHANNEL_UNITS = ("m", "m", "rad", "rad", "m/s^2", "m/s^2")
 _GRAVITY = 9.81
-_REMEMBERED = 100
-_MOST_OTHER_LAW = 1.3  # share of the other contact law; beyond 1 for the search only
+_MAX_CACHED_TWISTS = 100
+_MAX_CONTACT_LAW = 1.3  # share of the other contact law; beyond 1 for the search only
 _NO_COLUMNS: IntArray = np.empty(0, dtype=np.int64)
 
 
@@ -33,12 +32,12 @@ class DrivePredictor:
     """Predicts a drive's motions with one model; discrepancies are measured minus predicted.
 
     Causes of the floor act through the friction model whatever the model is: what they change there is added to what the model says.
-    ``settling`` adds what constant-rate models leave out by their nature: inertia, and the load that accelerations shift.
+    ``has_inertia`` adds what constant-rate models leave out by their nature: inertia, and the load that accelerations shift.
     """
 
     drive: Drive
     model: MotionModel
-    settling: bool
+    has_inertia: bool
     batch: Batch = field(init=False)
     headings: FloatArray = field(init=False)
     """(W,) at the start of each maneuver, counted from the first [rad]."""
@@ -48,8 +47,8 @@ class DrivePredictor:
         self._friction = FrictionModel.from_robot(self.drive.robot)
         runs = [_whole(m, path) for m, path in zip(self.drive.maneuvers, self.drive.paths, strict=False)]
         self._path_batch = make_batch(runs) if runs else None
-        self._lost = lost_share(self.batch)
-        rolls = np.abs(self.batch.wheels).max(axis=1) > RESTS
+        self._lost = find_dropouts(self.batch)
+        rolls = np.abs(self.batch.wheels).max(axis=1) > REST_RATE_RAD_PER_S
         self._lost_time = float((self._lost.max(axis=1) * rolls) @ self.batch.dt / max(float(rolls @ self.batch.dt), 1e-9))
         self.headings = self._headings()
         first, lead = self.batch.first, self.batch.lead
@@ -58,9 +57,9 @@ class DrivePredictor:
             inside = slice(first[w], first[w + 1])
             dt = self.batch.dt[inside]
             self._times[inside] = start + np.cumsum(dt) - dt - dt[: lead[w]].sum()
-        self._base = steady_twists(self._friction, self._friction.nominal, self.batch.wheels, self.batch.cg)
+        self._base = quasi_static_twists(self._friction, self._friction.nominal, self.batch.wheels, self.batch.cg)
         self._kinematic_forces = self._accelerations()
-        self._known: dict[tuple[object, ...], FloatArray] = {}
+        self._twists: dict[tuple[object, ...], FloatArray] = {}
 
     @property
     def nominal_twist(self) -> FloatArray:
@@ -68,16 +67,16 @@ class DrivePredictor:
         return self._base
 
     @property
-    def dropout_seen(self) -> bool:
+    def has_dropouts(self) -> bool:
         return bool(self._lost.any())
 
     @property
-    def dropout_spells(self) -> int:
-        """How often a side fell silent, as far as it was seen."""
+    def dropout_count(self) -> int:
+        """Number of spells in which a side's counts drop to half."""
         return int(np.count_nonzero(np.diff(self._lost, axis=0) > 0.0))
 
     def _headings(self) -> FloatArray:
-        """By the gyro less its mean difference to the witness; else by the witness's own turns, one after the other."""
+        """By the gyro less its mean difference to the reference_params; else by the reference_params's own turns, one after the other."""
         batch, drive = self.batch, self.drive
         last = np.r_[batch.owner[1:] != batch.owner[:-1], True]
         yaw = batch.measured[last, 2]
@@ -104,59 +103,79 @@ class DrivePredictor:
             found[w, 1] = (t[-1, 1] - t[0, 1]) / whole + (t[:, 0] * t[:, 2]) @ dt / whole
         return found
 
-    def discrepancies(self, belief: Belief) -> FloatArray:
+    def discrepancies(self, hypothesis: Hypothesis) -> FloatArray:
         """(M, 6) measured minus predicted, as `CHANNELS`: motion in the predicted end's frame; NaN where nothing was measured."""
         batch, drive = self.batch, self.drive
         out = np.full((len(batch.ends), len(CHANNELS)), np.nan)
-        witness = np.array([belief.wheels_late_s - belief.lidar_late_s, belief.wheel_lag_s, *self._tracked(belief)])
+        reference_params = np.array([self._wheel_shift(hypothesis), hypothesis.wheel_lag_s, *self._tracked(hypothesis)])
         if drive.is_gyro_reference:
-            witness[2:] = 0.0
-        changed = _Changed(self, belief)
+            reference_params[2:] = 0.0
+        changed = _HypothesisModel(self, hypothesis)
         if self._path_batch is not None:
-            poses, _, _ = predict(changed, self._path_batch, changed.nominal, witness, _NO_COLUMNS, drive.robot.wheel_noise)
+            poses, _, _ = predict(changed, self._path_batch, changed.nominal, reference_params, _NO_COLUMNS, drive.robot.wheel_noise)
             apart = np.hypot(*(poses - self._path_batch.measured)[:, :2].T)
             out[:, 0] = drive.path_errors - np.bincount(self._path_batch.owner, apart) / np.bincount(self._path_batch.owner)
             return out
-        poses, _, _ = predict(changed, batch, changed.nominal, witness, _NO_COLUMNS, drive.robot.wheel_noise)
-        off = se2.between(poses, batch.measured)
+        poses, _, _ = predict(changed, batch, changed.nominal, reference_params, _NO_COLUMNS, drive.robot.wheel_noise)
+        off = se2.between(poses, self._measured(hypothesis))
         known = np.isfinite(np.diagonal(batch.cov, axis1=1, axis2=2))
         out[:, :3] = np.where(known, off, np.nan)
         if drive.is_gyro_reference:
-            out[:, 2] -= belief.gyro_bias * np.array([float(m.dt[m.lead : m.lead + int(m.ends[-1])].sum()) for m in drive.maneuvers])
+            seconds = np.array([float(m.dt[m.lead : m.lead + int(m.ends[-1])].sum()) for m in drive.maneuvers])
+            out[:, 2] -= hypothesis.gyro_bias * seconds + batch.measured[:, 2] * hypothesis.gyro_scale / (1.0 + hypothesis.gyro_scale)
         if drive.gyro is not None:
-            late = round(belief.lidar_late_s * 1e9)
+            late = round((hypothesis.lidar_time_offset_s - hypothesis.gyro_time_offset_s) * 1e9)
             for i, (a, b) in enumerate(drive.spans_ns):
                 turn = drive.gyro.turn(int(a) - late, int(b) - late, float(batch.measured[i, 2]))
                 if turn is not None:
-                    out[i, 3] = turn.angle - batch.measured[i, 2] - belief.gyro_bias * turn.duration
+                    angle = turn.angle / (1.0 + hypothesis.gyro_scale)
+                    out[i, 3] = angle - batch.measured[i, 2] - hypothesis.gyro_bias * turn.duration
         if drive.forces is not None:
             middle = self.headings + 0.5 * batch.measured[:, 2]
             c, s = np.cos(middle), np.sin(middle)
-            sx, sy = _GRAVITY * math.sin(belief.slope[0]), _GRAVITY * math.sin(belief.slope[1])
+            sx, sy = _GRAVITY * math.sin(hypothesis.slope[0]), _GRAVITY * math.sin(hypothesis.slope[1])
             out[:, 4] = drive.forces[:, 0] - self._kinematic_forces[:, 0] - (c * sx + s * sy)
             out[:, 5] = drive.forces[:, 1] - self._kinematic_forces[:, 1] - (-s * sx + c * sy)
         return out
 
-    def _tracked(self, belief: Belief) -> tuple[float, float, float]:
-        """Real pose of the frame that the LiDAR believes to be the body's: it turns about the sensor, not about the body."""
-        (x, y), (dx, dy, yaw) = self.drive.lidar_at, belief.lidar
+    def _wheel_shift(self, hypothesis: Hypothesis) -> float:
+        """By how much the wheels' stamps are later than those of the motion reference [s]."""
+        b = hypothesis
+        return b.wheel_time_offset_s - (b.gyro_time_offset_s if self.drive.is_gyro_reference else b.lidar_time_offset_s)
+
+    def _measured(self, hypothesis: Hypothesis) -> FloatArray:
+        """(M, 3) measured poses without the ranging errors of ``hypothesis``: scan matching scales the LiDAR's own path, and a constant
+        error of all ranges acts by the scene's own derivative (`Drive.range_slopes`)."""
+        b, measured = hypothesis, self.batch.measured
+        if self.drive.range_slopes is None or not (b.range_scale or b.range_bias_m):
+            return measured
+        found = measured - b.range_bias_m * self.drive.range_slopes
+        x, y = self.drive.lidar_at
+        c, s = np.cos(found[:, 2]), np.sin(found[:, 2])
+        lever = np.column_stack([(c - 1.0) * x - s * y, s * x + (c - 1.0) * y])
+        found[:, :2] = (found[:, :2] + lever) / (1.0 + b.range_scale) - lever
+        return found
+
+    def _tracked(self, hypothesis: Hypothesis) -> tuple[float, float, float]:
+        """Real pose of the frame that the LiDAR's transform takes for the body's: it turns about the sensor, not about the body."""
+        (x, y), (dx, dy, yaw) = self.drive.lidar_at, hypothesis.lidar_offset
         c, s = math.cos(yaw), math.sin(yaw)
         return dx + x - (c * x - s * y), dy + y - (s * x + c * y), yaw
 
-    def corrected_twist(self, belief: Belief) -> FloatArray:
-        """(N, 3) what the model says of every interval once ``belief`` is put in [m/s, m/s, rad/s]."""
-        changed = _Changed(self, belief)
+    def corrected_twist(self, hypothesis: Hypothesis) -> FloatArray:
+        """(N, 3) what the model says of every interval once ``hypothesis`` is put in [m/s, m/s, rad/s]."""
+        changed = _HypothesisModel(self, hypothesis)
         return changed.twist(self.batch.wheels, self.batch.cg, changed.nominal).value
 
-    def signature(self, belief: Belief, effect: Effect, base: FloatArray | None = None) -> FloatArray:
-        """(M, 6) change of the discrepancy per unit of ``effect`` around ``belief``, where its sign says what correcting it removes."""
-        if effect.is_clock:
-            step = 0.5 * effect.usual
-            behind, ahead = (self.discrepancies(effect.inject(belief, s)) for s in (-step, step))
+    def signature(self, hypothesis: Hypothesis, cause: Cause, base: FloatArray | None = None) -> FloatArray:
+        """(M, 6) change of the discrepancy per unit of ``cause`` around ``hypothesis``, where its sign says what correcting it removes."""
+        if cause.is_clock:
+            step = 0.5 * cause.typical
+            behind, ahead = (self.discrepancies(cause.inject(hypothesis, s)) for s in (-step, step))
             return np.asarray((behind - ahead) / (2.0 * step))
-        step = 0.1 * effect.usual
-        ahead = self.discrepancies(effect.inject(belief, step))
-        return np.asarray(((self.discrepancies(belief) if base is None else base) - ahead) / step)
+        step = 0.1 * cause.typical
+        ahead = self.discrepancies(cause.inject(hypothesis, step))
+        return np.asarray(((self.discrepancies(hypothesis) if base is None else base) - ahead) / step)
 
 
 def _whole(maneuver: Maneuver, path: FloatArray) -> Maneuver:
@@ -164,36 +183,40 @@ def _whole(maneuver: Maneuver, path: FloatArray) -> Maneuver:
     return dataclasses.replace(maneuver, measured=path, ends=np.arange(1, len(path) + 1), cov=np.zeros((3, 3)))
 
 
-class _Changed:
-    """The model with a belief's changes: a `MotionModel` for the length of one batch."""
+class _HypothesisModel:
+    """The model with a hypothesis's changes: a `MotionModel` for the length of one batch."""
 
-    def __init__(self, pipeline: DrivePredictor, belief: Belief) -> None:
-        self._p, self._b = pipeline, belief
-        self.name, self.param_names = pipeline.model.name, pipeline.model.param_names
-        self.nominal = pipeline.model.nominal
+    def __init__(self, predictor: DrivePredictor, hypothesis: Hypothesis) -> None:
+        self._p, self._b = predictor, hypothesis
+        self.name, self.param_names = predictor.model.name, predictor.model.param_names
+        self.nominal = predictor.model.nominal
 
     def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
         p, b = self._p, self._b
-        rates = wheels * np.maximum(1.0 + np.array([b.radius_left, b.radius_right]), 0.1)
-        if b.encoder_lost:
-            rates = rates * (1.0 + b.encoder_lost / max(p._lost_time, 1e-9) * p._lost)
+        rates = wheels * np.maximum(1.0 + np.array([b.left_radius_scale, b.right_radius_scale]), 0.1)
+        if b.wheel_radius_drift:
+            rates = rates * (1.0 + b.wheel_radius_drift * p._times / max(float(p.drive.starts_s[-1]), 1e-9))[:, None]
+        if b.encoder_loss:
+            rates = rates * (1.0 + b.encoder_loss / max(p._lost_time, 1e-9) * p._lost)
         key = (*self._rates_key(), "model")
-        if key not in p._known:
-            p._known[key] = p.model.twist(rates, cg, params).value
-        value = p._known[key] + self._floor(rates, cg)
-        if any(b.turns):
+        if key not in p._twists:
+            p._twists[key] = p.model.twist(rates, cg, params).value
+        value = p._twists[key] + self._floor(rates, cg)
+        if any(b.rotation_coefficients):
             energy = 2.0 * np.maximum(np.sum(rates**2, axis=-1), 1e-12)
             straight = 1.0 - (rates[:, 1] - rates[:, 0]) ** 2 / energy
-            more, rate, gentle = b.turns
+            more, rate, gentle = b.rotation_coefficients
             value = value * np.stack(
                 [np.ones(len(rates)), np.ones(len(rates)), 1.0 + more - rate * np.abs(value[:, 2]) - gentle * straight], axis=-1
             )
-        if b.mixed:
+        if b.longitudinal_curvature_slip:
             energy = 2.0 * np.maximum(np.sum(rates**2, axis=-1), 1e-12)
-            value = value * np.stack([1.0 - b.mixed * (rates[:, 1] - rates[:, 0]) ** 2 / energy, *(np.ones(len(rates)),) * 2], axis=-1)
-        if any(b.yields):
+            value = value * np.stack(
+                [1.0 - b.longitudinal_curvature_slip * (rates[:, 1] - rates[:, 0]) ** 2 / energy, *(np.ones(len(rates)),) * 2], axis=-1
+            )
+        if any(b.slip_coefficients):
             vx, vy, wz = value.T
-            lateral, rotation, forward = b.yields
+            lateral, rotation, forward = b.slip_coefficients
             value = np.stack([vx * (1.0 - forward * np.abs(wz)), vy + lateral * vx * wz, wz * (1.0 - rotation * np.abs(vx))], axis=-1)
         n, k = len(value), len(params)
         return Twist(np.ascontiguousarray(value), np.zeros((n, 3, 2)), np.zeros((n, 3, 2)), np.zeros((n, 3, k)))
@@ -201,8 +224,8 @@ class _Changed:
     def _floor(self, rates: FloatArray, cg: FloatArray) -> FloatArray:
         """(N, 3) what the friction model says is otherwise: causes of the floor, and inertia."""
         p, b = self._p, self._b
-        is_otherwise = b.friction or any(b.cg) or b.payload_kg or b.change or b.other_law
-        if not (is_otherwise or any(b.slope) or p.settling):
+        is_otherwise = b.friction or any(b.cg) or b.payload_kg or b.friction_change or b.other_contact_law or b.split_friction
+        if not (is_otherwise or any(b.slope) or p.has_inertia):
             return np.zeros((len(rates), 3))
         friction = p._friction
         params = friction.nominal.copy()
@@ -213,63 +236,87 @@ class _Changed:
         params[9] = min(max(params[9], -0.9), 0.9)
         params[1] = max(params[1], 0.2 * friction.nominal[1])
         law = friction
-        if b.other_law:
-            share = min(b.other_law, _MOST_OTHER_LAW)
+        if b.other_contact_law:
+            share = min(b.other_contact_law, _MAX_CONTACT_LAW)
             law = dataclasses.replace(friction, saturation=friction.saturation + (1.0 - 2.0 * friction.saturation) * share)
-        nominal = self._settled(friction, rates, cg, friction.nominal)
+        nominal = self._quasi_static(friction, rates, cg, friction.nominal)
         moved = cg
         if any(b.cg) or b.payload_kg:
             mass = p.drive.robot.geometry.mass_kg
             moved = cg + np.array(b.cg) + (p.drive.payload_arms * (b.payload_kg / (mass + b.payload_kg)) if b.payload_kg else 0.0)
+        if b.split_friction:
+            moved = _shifted_by_grip(moved, 0.5 * params[1], b.split_friction)
+        if moved is not cg:
             half = 0.49 * np.array([params[2], params[1]])
             moved = np.clip(moved, -half, half)
-        if not b.change:
-            return self._moved(law, rates, moved, params) - nominal
+        if not b.friction_change:
+            return self._with_inertia(law, rates, moved, params) - nominal
         later = params.copy()
-        later[4] = max(later[4] * (1.0 + b.change), 0.05)
-        is_later = (p._times >= b.change_s)[:, None]
-        return np.asarray(np.where(is_later, self._moved(law, rates, moved, later), self._moved(law, rates, moved, params)) - nominal)
+        later[4] = max(later[4] * (1.0 + b.friction_change), 0.05)
+        is_after_change = (p._times >= b.friction_change_at_s)[:, None]
+        return np.asarray(
+            np.where(is_after_change, self._with_inertia(law, rates, moved, later), self._with_inertia(law, rates, moved, params)) - nominal
+        )
 
-    def _settled(self, law: FrictionModel, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
-        """(N, 3) twists of the tracked point without inertia; remembered, as many beliefs share them."""
-        p, b = self._p, self._b
-        key = (*self._rates_key(), law.saturation, params.tobytes(), *((b.cg, b.payload_kg) if cg is not p.batch.cg else ()))
-        if key not in p._known:
-            if len(p._known) > _REMEMBERED:
-                p._known.clear()
-            p._known[key] = steady_twists(law, params, rates, cg)
-        return p._known[key]
+    def _quasi_static(self, law: FrictionModel, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+        """(N, 3) twists of the tracked point without inertia; cached, as many hypotheses share them."""
+        p = self._p
+        key = (
+            *self._rates_key(),
+            law.saturation,
+            params.tobytes(),
+            *(self._load_key() if cg is not p.batch.cg else ()),
+        )
+        if key not in p._twists:
+            if len(p._twists) > _MAX_CACHED_TWISTS:
+                p._twists.clear()
+            p._twists[key] = quasi_static_twists(law, params, rates, cg)
+        return p._twists[key]
+
+    def _load_key(self) -> tuple[object, ...]:
+        b = self._b
+        return b.cg, b.payload_kg, b.split_friction
 
     def _rates_key(self) -> tuple[object, ...]:
-        b = self._b
-        return b.radius_left, b.radius_right, b.encoder_lost, b.wheels_late_s - b.lidar_late_s, b.wheel_lag_s
+        p, b = self._p, self._b
+        return b.left_radius_scale, b.right_radius_scale, b.encoder_loss, b.wheel_radius_drift, p._wheel_shift(b), b.wheel_lag_s
 
-    def _moved(self, law: FrictionModel, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+    def _with_inertia(self, law: FrictionModel, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
         """(N, 3) twists of the tracked point, with inertia where that counts."""
         p, b = self._p, self._b
-        settled = self._settled(law, rates, cg, params)
-        if not (p.settling or any(b.slope)):
+        settled = self._quasi_static(law, rates, cg, params)
+        if not (p.has_inertia or any(b.slope)):
             return settled
         key = (
             *self._rates_key(),
             law.saturation,
             params.tobytes(),
             b.slope,
-            *((b.cg, b.payload_kg) if cg is not p.batch.cg else ()),
+            *(self._load_key() if cg is not p.batch.cg else ()),
             "inertia",
         )
-        if key not in p._known:
+        if key not in p._twists:
             x, y = params[TRACKED[0]], params[TRACKED[1]]
             middle = settled + settled[:, 2:] * np.array([y, -x, 0.0])
             batch = p.batch
-            twists = settling_twists(p.drive.robot, law, params, batch.dt, rates, cg, batch.first, p.headings, b.slope, middle)
-            p._known[key] = np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
-        return p._known[key]
+            twists = dynamic_twists(p.drive.robot, law, params, batch.dt, rates, cg, batch.first, p.headings, b.slope, middle)
+            p._twists[key] = np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
+        return p._twists[key]
 
 
-def with_sizes(sizes: dict[Effect, float]) -> Belief:
-    """What is believed once the named causes have these sizes."""
-    belief = Belief()
-    for effect, size in sizes.items():
-        belief = effect.inject(belief, size)
-    return belief
+def _shifted_by_grip(cg: FloatArray, half_track: float, split: float) -> FloatArray:
+    """(N, 2) centres of the contact forces where the left wheels grip ``split`` more than the right ones, over the mean of both.
+
+    A contact's force goes with its load times its friction: unequal friction acts like a load that is shifted to the side with more grip.
+    """
+    left = (1.0 + cg[:, 1] / half_track) * (1.0 + 0.5 * split)
+    right = (1.0 - cg[:, 1] / half_track) * (1.0 - 0.5 * split)
+    return np.column_stack([cg[:, 0], half_track * (left - right) / (left + right)])
+
+
+def with_sizes(sizes: dict[Cause, float]) -> Hypothesis:
+    """The hypothesis that causes have these ``sizes``."""
+    hypothesis = Hypothesis()
+    for cause, size in sizes.items():
+        hypothesis = cause.inject(hypothesis, size)
+    return hypothesis

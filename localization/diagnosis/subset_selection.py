@@ -1,4 +1,4 @@
-"""Which causes: joint generalised least squares on their signatures, best subsets, and a test that pays for having looked at them all."""
+"""Which causes: joint generalised least squares on their signatures, best subsets, and tests corrected for the number of causes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from localization.diagnosis.findings import Gain
+from localization.diagnosis.noise import Noise
 from motion_models.se2 import FloatArray
 
 MOST_CAUSES = 7
@@ -15,12 +17,15 @@ _MANY = 1500  # as many numbers must be measured for sets of more than _FEW caus
 _FEW = 4
 _DRAWS = 4000
 _KEPT = 12
+MAX_TOLERANCE_SIGMAS = 3.0
+"""Largest size of a cause that is not named, over the sigma of its tolerance: about what is negligible (see `diagnose.TOLERANCES`)."""
+_BLOCK_WINDOWS, _FOLDS, _BOOTSTRAP_DRAWS = 4, 5, 1000
 
 
 @dataclass(frozen=True)
 class Regression:
     """Whitened discrepancies and signatures in normal form; nuisances are already projected out, sizes are in units of their sigma
-    before looking (the prior).
+    a priori.
 
     Every cause is there all the time, if only within its tolerance: robot files, mounts and clocks are never known better. To name a cause
     is to let it have any size. So subsets are weighed by their evidence (marginal likelihood), in which causes outside of the subset
@@ -64,14 +69,32 @@ class Regression:
         scale = self.scale[i]
         return sizes * scale, (inverse.T @ inverse) * np.outer(scale, scale), twice - self._evidence(())[2]
 
+    def posterior(self, subset: tuple[int, ...]) -> FloatArray:
+        """(p,) posterior means of all sizes, in own units, with those outside of ``subset`` held to their tolerance."""
+        factor, half, _ = self._evidence(subset)
+        return np.asarray(np.linalg.solve(factor.T, half) * self.scale)
+
+    def posterior_sigmas(self, subset: tuple[int, ...]) -> FloatArray:
+        """(p,) standard deviations of `posterior`."""
+        factor, _, _ = self._evidence(subset)
+        return np.asarray(np.linalg.norm(np.linalg.solve(factor, np.eye(len(factor))), axis=0) * self.scale)
+
     def gain(self, subset: tuple[int, ...]) -> float:
         """Twice the log-evidence gained over naming nothing."""
         return self._evidence(subset)[2] - self._evidence(())[2] if subset else 0.0
 
     def misfit(self) -> float:
-        """Sum of squares that is left where every cause keeps within its tolerance."""
-        half = self._evidence(())[1]
-        return self.rest - float(half @ half)
+        """Sum of squares that is left where every cause keeps within its tolerance, and what that takes.
+
+        A prior does not hold a size against much data: beyond `MAX_TOLERANCE_SIGMAS` a size would not be tolerated, and is cut there.
+        """
+        factor, half, _ = self._evidence(())
+        x = np.linalg.solve(factor.T, half)
+        limit = MAX_TOLERANCE_SIGMAS * self.tolerance
+        if np.all(np.abs(x) <= limit):
+            return self.rest - float(half @ half)
+        x = np.clip(x, -limit, limit)
+        return self.rest + float(x @ self.gram @ x - 2.0 * x @ self.moment + np.sum(np.square(x / self.tolerance)))
 
     def scores(self, given: tuple[int, ...], wanted: list[int]) -> tuple[FloatArray, FloatArray]:
         """(n,) scores of the ``wanted`` causes with those ``given`` free and all others within tolerance, and their (n, n) covariance if
@@ -107,7 +130,7 @@ def cost(problem: Regression, groups: list[str], subset: tuple[int, ...]) -> flo
     return 2.0 * math.log(math.comb(len(set(groups)), k)) + k * math.log(max(problem.count, 2)) - problem.gain(subset)
 
 
-def ranked_subsets(problem: Regression, groups: list[str], allowed: FloatArray, kept: int = _KEPT) -> list[tuple[float, tuple[int, ...]]]:
+def rank_subsets(problem: Regression, groups: list[str], allowed: FloatArray, kept: int = _KEPT) -> list[tuple[float, tuple[int, ...]]]:
     """The best sets of causes by `cost`, best first, the empty one among them. Causes of one group exclude each other; ``allowed`` (p, 2)
     bounds sizes in own units."""
     p = len(groups)
@@ -144,12 +167,12 @@ def max_statistic(problem: Regression, given: tuple[int, ...], rng: np.random.Ge
     left = [i for i in range(len(problem.moment) if among is None else among) if i not in given]
     cov = problem.scores(given, left)[1]
     sigma = np.sqrt(np.maximum(np.diag(cov), 1e-12))
-    seen = np.diag(cov) > 1e-6
-    correlation = cov[np.ix_(seen, seen)] / np.outer(sigma[seen], sigma[seen])
-    if not seen.any():
+    is_observable = np.diag(cov) > 1e-6
+    correlation = cov[np.ix_(is_observable, is_observable)] / np.outer(sigma[is_observable], sigma[is_observable])
+    if not is_observable.any():
         return np.zeros(_DRAWS)
     values, vectors = np.linalg.eigh(correlation)
-    draws = rng.standard_normal((_DRAWS, int(seen.sum()))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    draws = rng.standard_normal((_DRAWS, int(is_observable.sum()))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
     draws /= np.sqrt(rng.chisquare(df, size=(_DRAWS, 1)) / df)
     return np.asarray(np.abs(draws).max(axis=1))
 
@@ -176,7 +199,49 @@ def p_value(t: float, draws: FloatArray, df: float) -> float:
     return float(min(0.01 * math.exp(-slope * (df * math.log1p(t**2 / df) - q[1])), 1.0))
 
 
-def likeness(problem: Regression, given: tuple[int, ...], a: int, b: int) -> float:
+def signature_correlation(problem: Regression, given: tuple[int, ...], a: int, b: int) -> float:
     """Correlation of two signatures once those ``given`` are taken out of both."""
     cov = problem.scores(given, [a, b])[1]
     return float(cov[0, 1] / math.sqrt(max(float(cov[0, 0] * cov[1, 1]), 1e-18)))
+
+
+def heldout_gain(
+    linear: FloatArray,
+    signatures: FloatArray,
+    nuisances: FloatArray,
+    noise: Noise,
+    scale: FloatArray,
+    chosen: tuple[int, ...],
+    others: tuple[int, ...],
+    rng: np.random.Generator,
+) -> Gain:
+    """Root mean square of held-out whitened discrepancies by ``others`` and by ``chosen``; folds are of blocks of 4 windows."""
+    squares = [heldout_squares(linear, signatures, nuisances, noise, scale, subset) for subset in (others, chosen)]
+    n = len(linear)
+    block = np.arange(n) // _BLOCK_WINDOWS
+    counts = np.bincount(block, weights=np.isfinite(linear).sum(axis=1))
+    sums = [np.bincount(block, weights=s) for s in squares]
+    rms = [float(np.sqrt(s.sum() / counts.sum())) for s in sums]
+    draws = rng.multinomial(len(counts), np.full(len(counts), 1.0 / len(counts)), size=_BOOTSTRAP_DRAWS)
+    before, after = (np.sqrt((draws @ s) / np.maximum(draws @ counts, 1.0)) for s in sums)
+    low, high = np.quantile(1.0 - after / np.maximum(before, 1e-12), [0.025, 0.975])
+    return Gain(rms[0], rms[1], 1.0 - rms[1] / max(rms[0], 1e-12), float(low), float(high))
+
+
+def heldout_squares(
+    linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, noise: Noise, scale: FloatArray, subset: tuple[int, ...]
+) -> FloatArray:
+    """(M,) sum of squares of each window."""
+    y = noise.whiten(linear)
+    columns = [noise.whiten(signatures[..., list(subset)]) * scale[list(subset)], noise.whiten(nuisances) * 1e3]
+    design = np.concatenate(columns, axis=-1)
+    fold = (np.arange(len(y)) // _BLOCK_WINDOWS) % _FOLDS
+    out = np.zeros(len(y))
+    for f in range(_FOLDS):
+        held = fold == f
+        if not held.any() or held.all():
+            continue
+        a = design[~held].reshape(-1, design.shape[-1])
+        x = np.linalg.solve(a.T @ a + np.eye(a.shape[1]), a.T @ y[~held].ravel())
+        out[held] = np.sum((y[held] - design[held] @ x) ** 2, axis=1)
+    return out

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from localization.diagnosis.findings import Shape
+from localization.diagnosis.findings import Trend
 from localization.diagnosis.noise import Noise
 from localization.diagnosis.prediction import CHANNELS, DrivePredictor
 from localization.diagnosis.subset_selection import max_statistic, p_value, regression, statistics
@@ -14,18 +16,18 @@ _SIGNIFICANT = 0.01
 _COMPONENTS = 3
 
 
-def features(pipeline: DrivePredictor) -> dict[str, FloatArray]:
+def features(predictor: DrivePredictor) -> dict[str, FloatArray]:
     """Trends by name, each (M,) a number per measured pose."""
-    batch = pipeline.batch
-    twist, cg = pipeline._base, batch.cg
+    batch = predictor.batch
+    twist, cg = predictor._base, batch.cg
     rows: list[list[float]] = []
     for end, owner in zip(batch.ends, batch.owner, strict=True):
         a = batch.first[owner] + batch.lead[owner]
         t, dt = twist[a:end], batch.dt[a:end]
         v, w = t[:, 0], t[:, 2]
         whole = dt.sum()
-        heading = pipeline.headings[owner]
-        clock = pipeline.drive.starts_s[owner]
+        heading = predictor.headings[owner]
+        clock = predictor.drive.starts_s[owner]
         driven, turned = float(v @ dt), float(w @ dt)
         x, y = float(cg[a:end, 0] @ dt / whole), float(cg[a:end, 1] @ dt / whole)
         rows.append(
@@ -51,18 +53,18 @@ def features(pipeline: DrivePredictor) -> dict[str, FloatArray]:
     return {name: table[:, i] for i, name in enumerate(names) if np.ptp(table[:, i]) > 1e-9 or i == 0}
 
 
-def shapes(
-    pipeline: DrivePredictor,
+def find_trends(
+    predictor: DrivePredictor,
     noise: Noise,
     left: FloatArray,
     signatures: FloatArray,
     nuisances: FloatArray,
     spreads: FloatArray,
     rng: np.random.Generator,
-) -> tuple[tuple[Shape, ...], float]:
+) -> tuple[tuple[Trend, ...], float]:
     """Significant trends of ``left`` (M, 6), strongest first, beyond what causes of ``signatures`` (M, 6, p) make within their ``spreads``
     (p,) and ``nuisances`` (M, 6, q) at any size; and twice the log-likelihood that they would gain."""
-    found = features(pipeline)
+    found = features(predictor)
     measured = [c for c in range(_COMPONENTS) if np.isfinite(left[:, c]).any()]
     columns, names = [], []
     for channel in measured:
@@ -90,6 +92,6 @@ def shapes(
         if p > _SIGNIFICANT:
             break
         gained += float(t[best]) ** 2
-        result.append(Shape(*names[best], float(t[best]), p))
+        result.append(Trend(*names[best], float(t[best]), p, abs(float(t[best])) / math.sqrt(len(left))))
         given = (*given, best)
     return tuple(result), gained

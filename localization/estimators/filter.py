@@ -32,6 +32,8 @@ POSE, START, MAP, KEY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 BIAS, SCALE, CLOCK, PARAMS = 12, 13, 14, 15
 _MIN_VARIANCE = 1e-14
 """No relative motion is known better than a tenth of a micrometre or microradian [m^2, rad^2]."""
+_MIN_DRIFT_SHARE = 0.01
+"""Of the variance of a motion, at least: a tenth of its sigma, so that its information is finite."""
 _MAX_NUMBER = 1e12
 """No state or covariance of a robot on Earth is larger, in SI units."""
 
@@ -155,6 +157,21 @@ class Filter:
         J = np.hstack([np.eye(3), -se2.adjoint(se2.inverse(delta))])
         states = np.r_[POSE, clone]
         return delta, _positive(J @ self.P[np.ix_(states, states)] @ J.T)
+
+    def drift_since_key(self) -> FloatArray:
+        """(3, 3) covariance that the motion since the clone `KEY` adds to the pose's, where such motions are chained as independent.
+
+        |P - A P_key A^T|, A = Ad(delta^-1), with the matrix' absolute value and at most 1 in units of `motion_since`'s covariance C. Scans
+        that are matched to one submap share its error: C holds the noise of the scans at both ends, which a chain would count anew with
+        every motion. What the pose's covariance has shrunk by, later scans have found out about the clone alone.
+        """
+        delta, cov = self.motion_since(KEY)
+        A = se2.adjoint(se2.inverse(delta))
+        root = np.linalg.cholesky(cov)
+        whiten = np.linalg.inv(root)
+        shares, axes = np.linalg.eigh(_symmetric(whiten @ (self.P[POSE, POSE] - A @ self.P[KEY, KEY] @ A.T) @ whiten.T))
+        kept = root @ axes
+        return np.asarray((kept * np.clip(np.abs(shares), _MIN_DRIFT_SHARE, 1.0)) @ kept.T)
 
     def _update(self, innovation: FloatArray, H: FloatArray, R: FloatArray) -> tuple[float, FloatArray]:
         """Schmidt-Kalman update in Joseph's form; consider states have no gain. Returns NIS and gain. Raises `EstimatorError`."""

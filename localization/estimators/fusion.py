@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from localization.estimators.base import NO_POINTS, Estimate, mean_twist
-from localization.estimators.filter import BIAS, CLOCK, PARAMS, POSE, SCALE, START, Filter, FilterConfig
+from localization.estimators.filter import BIAS, CLOCK, MAP, PARAMS, POSE, SCALE, START, Filter, FilterConfig
 from localization.events import PositionSample
 from localization.lidar import LostScans, ScanMatch, ScanMatchingSensor
 from localization.step import Step
@@ -75,7 +75,7 @@ class EkfFusion:
         if step.turn is not None:
             self._start_gyro()
             ekf.update_turn(step.turn)
-        if step.scan is not None and self._sensor is not None:
+        if self._sensor is not None:
             nis = self._update_scan(step, self._sensor)
         delta, cov = ekf.motion_since(START)
         twist, twist_cov = mean_twist(delta, cov, step.duration) if step.duration > 0.0 else (step.twist, None)
@@ -87,10 +87,15 @@ class EkfFusion:
         if not self._is_scan_pending or self._sensor is None:
             return
         self._is_scan_pending = False
-        if self._sensor.is_key(self.filter.pose):
-            self.filter.insert_key_scan(self._sensor.insert_key_scan(self.filter.pose))
+        ekf = self.filter
+        if self._sensor.is_key(ekf.pose):
+            ekf.insert_key_scan(self._sensor.insert_key_scan(ekf.pose, ekf.P[MAP, MAP].copy()))
 
     def _update_scan(self, step: Step, sensor: ScanMatchingSensor) -> float | None:
+        """Match the scan of ``step`` and update by it; its NIS, or None where there is no scan or no match."""
+        if step.scan is None:
+            sensor.lost.add_no_scan(step.end_ns)
+            return None
         ekf, duration = self.filter, step.duration
         self.counts_by_name["scans"] += 1
         prior, cov = ekf.pose, ekf.map_relative_cov()

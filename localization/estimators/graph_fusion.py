@@ -30,8 +30,6 @@ from motion_models.base import Motion
 from motion_models.online_calibration import Corrections
 from motion_models.se2 import FloatArray
 
-_BETWEEN_FLOOR = np.diag([5e-3, 5e-3, 1e-3]) ** 2
-"""Covariance of a motion between keyframes, at least: submaps bend [m^2, m^2, rad^2]."""
 _MIN_POSITIONS, _MIN_BASELINE_M = 3, 5.0
 """Positions, and the distance between them [m], from which they give the heading of the map."""
 _WHEEL_SCALE_SIGMA = 0.02
@@ -98,14 +96,16 @@ class GraphFusion:
         if self._is_smoothing and (not self._stamps_ns or step.end_ns > self._stamps_ns[-1]):
             self._steps.extend(ekf.pose)
             self._stamps_ns.append(step.end_ns)
-        delta, cov = ekf.motion_since(KEY)
+        delta, _ = ekf.motion_since(KEY)
         moved = math.hypot(delta[0], delta[1]) >= self._config.keyframe_distance_m or abs(delta[2]) >= self._config.keyframe_angle_rad
         self._is_keyframe_due = not self._graph.count or (moved and (step.scan is not None or self.lost is None))
         self._place_positions(step)
         A = se2.adjoint(se2.inverse(delta))
         pose = se2.compose(self._map_T_odom, ekf.pose)
         odometry = estimate.pose, estimate.covariance
-        return replace(estimate, pose=pose, covariance=A @ self._key_cov @ A.T + cov, odometry=odometry, map_T_odom=self._map_T_odom)
+        return replace(
+            estimate, pose=pose, covariance=A @ self._key_cov @ A.T + ekf.drift_since_key(), odometry=odometry, map_T_odom=self._map_T_odom
+        )
 
     def run_deferred(self) -> None:
         """What the last estimate need not wait for: the submap, a keyframe, loops, positions."""
@@ -121,11 +121,11 @@ class GraphFusion:
     def _add_keyframe(self) -> None:
         ekf, k = self.odometry.filter, self._graph.count
         if k:
-            delta, cov = ekf.motion_since(KEY)
+            delta, _ = ekf.motion_since(KEY)
             wheels = self._wheels.preintegrated(ekf.corrections)
             D = wheels.by_corrections[:, :-1]
             total = wheels.cov + D @ ekf.P[PARAMS:, PARAMS:] @ D.T
-            measured = _subtract_information(delta, cov + _BETWEEN_FLOOR, wheels.delta, total + _BETWEEN_FLOOR)
+            measured = _subtract_information(delta, ekf.drift_since_key(), wheels.delta, total)
             pose = se2.compose(self._graph.pose(k - 1), delta)
             update = Update(pose, wheels, self._walk(), (Between(k - 1, k, *measured),))
         else:

@@ -1,4 +1,4 @@
-"""The scores of a trajectory against a reference. How each is computed is told in `localization.evaluation.metrics`."""
+"""Scores of a trajectory against a reference. Their definitions are in `localization.evaluation.metrics`."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class Accuracy:
     """(3,) the alignment by the whole path: puts the trajectory's poses into the reference's plane."""
     errors: ErrorSeries | None = field(default=None, compare=False)
     warnings: tuple[str, ...] = ()
-    """What a reader of the numbers should know."""
+    """Remarks on the numbers."""
 
     def numbers(self) -> dict[str, float | int | None]:
         """Every number of the scores by name, as they go into a metrics file; those of the relations begin with ``relations_``."""

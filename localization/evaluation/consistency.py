@@ -1,13 +1,13 @@
-"""Does an estimator know how wrong it is? NEES and NIS against chi-square bands, and the whiteness of innovations.
+"""Consistency of covariances: NEES and NIS against chi-square bands, and the whiteness of innovations (Bar-Shalom et al. 2001, 5.4).
 
-An honest estimator's normalised squared errors ``e^T P^-1 e`` follow chi-square with as many degrees of freedom as ``e`` has dimensions
+A consistent estimator's normalised squared errors ``e^T P^-1 e`` follow chi-square with as many degrees of freedom as ``e`` has dimensions
 (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001, sec. 5.4). NEES takes errors against the
-truth, NIS innovations against their predicted covariance. Both are needed: an innovation can be honest while the state is not.
+truth, NIS innovations against their predicted covariance. Both are needed: innovations can be consistent while the state is not.
 
-The trap: the bands count independent samples. Innovations of an honest filter are independent; pose errors along one run are not (this
+The trap: the bands count independent samples. Innovations of a consistent filter are independent; pose errors along one run are not (this
 second's error is the last one's plus a little), so one run counts as one sample however long it is.
 
-What a singular covariance means is told in `localization.evaluation.normalized_errors`.
+Singular covariances are treated in `localization.evaluation.normalized_errors`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Whiteness:
 
 @dataclass(frozen=True)
 class Consistency:
-    """Mean of normalised squared errors, and the band that it keeps to with ``probability`` if the covariances are honest."""
+    """Mean of normalised squared errors, and its band of ``probability`` for consistent covariances."""
 
     n: int
     """Samples that count (those with at least one degree of freedom)."""
@@ -57,7 +57,7 @@ class Consistency:
     mean: float
     band: tuple[float, float]
     fraction_inside: float
-    """Part of the samples below the 95 % quantile of their own chi-square distribution; honest is 0.95."""
+    """Part of the samples below the 95 % quantile of their own chi-square distribution; 0.95 if consistent."""
     probability: float
     whiteness: Whiteness | None = None
 
@@ -105,7 +105,7 @@ def consistency(
 ) -> Consistency:
     """Test errors (N, d), or (R, N, d) of R runs, against their covariances of shape (..., d, d).
 
-    ``n_independent``: all samples unless told; give the number of runs for errors that are correlated within a run.
+    ``n_independent``: by default all samples; give the number of runs for errors that are correlated within a run.
     ``whiteness``: also test that successive samples are uncorrelated, for innovations of one run (N, d) in order of time.
     Raises `EvaluationError` if nothing is left to test.
     """
@@ -165,7 +165,7 @@ class PoseErrors:
     errors: FloatArray
     """(N, 3) ``log(between(estimate, truth))``, body frame [m, m, rad]."""
     covariances: FloatArray | None
-    """(N, 3, 3) what the estimator says of them, or None if it says nothing."""
+    """(N, 3, 3) covariances of the estimator, or None if it has none."""
     n_left_out: int = 0
     """Matches left out: before the first motion, and where the growth of the covariance since the first match is no covariance."""
 
@@ -173,13 +173,13 @@ class PoseErrors:
 def pose_errors(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: float = 1.0) -> PoseErrors:
     """Errors of an odometry-like trajectory against a reference with headings, for `consistency`.
 
-    Odometry knows where it is since its start, not where the start lies in the reference's plane: both motions count from the first
+    Odometry estimates the motion since its start, not where the start lies in the reference's plane: both motions count from the first
     match. It is left out itself, as is what comes before the estimate first moves (only the reference's jitter would be tested there).
     With ``d`` the estimated and ``r`` the true motion since then, the error is ``log(between(d, r))``.
 
     If the estimator was already uncertain at the first match, by ``P_0``, its increments since have ``P_k - A P_0 A^T`` with
     ``A = adjoint(inverse(d))``: exact to first order if increments are independent, as in odometry. Where that is no covariance they are
-    not, and the match is left out. Where the reference tells its own covariance, it is added, of this sample and of the first.
+    not, and the match is left out. Where the reference has a covariance, it is added, of this sample and of the first.
 
     Raises `EvaluationError` if the reference has no headings or too few samples match.
     """

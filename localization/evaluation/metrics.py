@@ -1,6 +1,6 @@
 """How well a trajectory agrees with a reference: ATE, RPE per distance, end error and drift, and the relations metric.
 
-Each metric is defined where it is computed. What a reference cannot tell is None, never 0. The lever arm between the tracked point of
+Each metric is defined where it is computed. Numbers without a reference are None, never 0. The lever arm between the tracked point of
 the reference (a GPS antenna) and the robot's base is not known and not removed; it is part of the error.
 """
 

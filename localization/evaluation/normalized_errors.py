@@ -1,6 +1,6 @@
 """Errors measured in their own standard deviations, with a rule for covariances that are singular.
 
-A direction of zero variance is a claim of certainty. Where the error keeps to that claim the direction says nothing and is not counted
+A direction of zero variance is a claim of certainty. Where the error is zero too, the direction has no information and is not counted
 (one degree of freedom less); where it does not, the square is infinite, which is what such a claim is worth. A plain pseudo-inverse
 would forgive it. Zero is what rounding leaves of it: each component is first scaled to its own variance, so that metres and radians do
 not mix, then eigenvalues below 1e-12 of the largest are zero, and an error of three standard deviations of that (3e-6) keeps to the claim.

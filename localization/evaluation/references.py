@@ -1,11 +1,11 @@
-"""What a trajectory is scored against: a track of trusted poses or positions, or hand-verified relations between instants."""
+"""References of scores: a track of trusted poses or positions, or hand-verified relations between instants."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +20,14 @@ _RELATION_COLUMNS = ("t1", "t2", "dx", "dy", "dz", "droll", "dpitch", "dyaw")
 
 @dataclass(frozen=True, eq=False)
 class ReferenceTrack:
-    """Where a trusted source says the robot was, in order of time, everything finite."""
+    """Poses or positions of the robot by a trusted source, in order of time, everything finite."""
 
     stamps_ns: IntArray
     """(N,) strictly increasing."""
     positions: FloatArray
     """(N, 2) in the reference's own plane [m]."""
     yaws: FloatArray | None = None
-    """(N,) [rad], or None where the source knows positions only (GPS)."""
+    """(N,) [rad], or None where the source has positions only (GPS)."""
     covariances: FloatArray | None = None
     """(N, 3, 3) of x, y, yaw in the reference's plane, NaN where unknown; None where nothing is known."""
     source: str = "reference"
@@ -35,14 +35,24 @@ class ReferenceTrack:
     n_dropped: int = 0
     """Samples left out because they were not finite or repeated a stamp."""
     warnings: tuple[str, ...] = ()
-    """What a reader of the scores should know about this reference."""
+    """Remarks on this reference."""
 
     @property
     def poses(self) -> FloatArray:
         """(N, 3) x, y, yaw. Raises `EvaluationError` where the yaw is not known."""
         if self.yaws is None:
-            raise EvaluationError(f"{self.source} knows positions only; poses need a reference with heading.")
+            raise EvaluationError(f"{self.source} has positions only; poses need a reference with heading.")
         return np.column_stack([self.positions, self.yaws])
+
+
+def with_noise(track: ReferenceTrack, sigma_m: float, sigma_rad: float) -> ReferenceTrack:
+    """``track`` with this noise of x, y and of the yaw, where it has no covariances. Raises `EvaluationError` for a negative sigma."""
+    if not (math.isfinite(sigma_m) and math.isfinite(sigma_rad) and min(sigma_m, sigma_rad) >= 0.0):
+        raise EvaluationError(f"noise of the reference is {sigma_m} m, {math.degrees(sigma_rad):.4g} deg; both must be 0 or more.")
+    if track.covariances is not None:
+        return track
+    noise = np.diag([sigma_m, sigma_m, sigma_rad]) ** 2
+    return replace(track, covariances=np.broadcast_to(noise, (len(track.stamps_ns), 3, 3)).copy())
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +64,14 @@ class Relations:
     ends_ns: IntArray
     """(N,)"""
     motions: FloatArray
-    """(N, 3) dx, dy, dyaw of the end seen from the start [m, m, rad]."""
+    """(N, 3) dx, dy, dyaw of the end relative to the start [m, m, rad]."""
     source: str = "relations"
 
 
 def reference_track(references: Iterable[Reference], source: str = "reference") -> ReferenceTrack:
     """The track of reference events, sorted by header stamp.
 
-    Samples that are not finite, and all but the first of those with one stamp, are left out and counted. If some samples know their
+    Samples that are not finite, and all but the first of those with one stamp, are left out and counted. If some samples have a
     yaw, those without it count as not finite. Headings that cannot be headings (see `frozen_yaw`) are taken as unknown.
     Raises `EvaluationError` if nothing is left.
     """
@@ -75,7 +85,7 @@ def reference_track(references: Iterable[Reference], source: str = "reference") 
 
 
 def read_reference_file(path: str | Path) -> ReferenceTrack | Relations:
-    """A reference from a text file: relations (.relations) or a TUM trajectory (.tum); any other name is judged by its content.
+    """A reference from a text file: relations (.relations) or a TUM trajectory (.tum); any other name by its content.
 
     Both have eight columns. A TUM line ends in a unit quaternion; a relation begins with two times. A TUM file whose quaternions are all
     zero, or all the same though the path turns, is a reference of positions only. Raises `EvaluationError` with file and line.
@@ -155,7 +165,7 @@ def _read_tum_reference(path: str | Path) -> ReferenceTrack:
 
 
 def _looks_like_tum(path: str | Path) -> bool:
-    """Judged by the first hundred lines: the last four columns are a unit quaternion, or zero, or not known."""
+    """By the first hundred lines: the last four columns are a unit quaternion, or zero, or not finite."""
     for line, words in itertools.islice(number_rows(path, _RELATION_COLUMNS), 100):
         norm = math.hypot(*(parse_float(word, f"{path}, line {line}") for word in words[4:]))
         if norm > 0.0 and abs(norm - 1.0) > 0.01:

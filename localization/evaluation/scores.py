@@ -1,4 +1,4 @@
-"""From runs to results: each run scored against the reference, and told in the format of `metrics.json`."""
+"""Scores of runs against a reference, in the format of `metrics.json`."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Result:
     """None without a reference."""
     nees_mean: float | None
     """Mean of the pose's normalised error squared since the first match, 3 expected; None where the reference has no headings.
-    Of the estimates of each moment, where the trajectory is what the whole log tells."""
+    Of the filtered poses, where the trajectory is smoothed."""
     moments: Accuracy | None = None
-    """Of the estimates of each moment, where the run's trajectory is what the whole log tells."""
+    """Of the filtered poses, where the run's trajectory is smoothed."""
 
     @property
     def name(self) -> str:
@@ -77,7 +77,7 @@ def _score(run: Run, reference: ReferenceTrack | Relations | None) -> Result:
     if reference is None:
         return Result(run, None, None)
     accuracy = evaluate(run.trajectory, reference)
-    told = run.trajectory if run.moments is None else run.moments  # whose errors grow by increments, as is assumed there
-    found = None if isinstance(reference, Relations) else pose_consistency(told, reference)
+    filtered = run.trajectory if run.moments is None else run.moments  # their errors grow by increments, as the NEES here assumes
+    found = None if isinstance(reference, Relations) else pose_consistency(filtered, reference)
     moments = None if run.moments is None else evaluate(run.moments, reference)
     return Result(run, accuracy, None if found is None else found.mean, moments)

@@ -1,4 +1,4 @@
-"""Words for two stretches of time that should have met."""
+"""Messages for two spans of time that do not overlap."""
 
 from __future__ import annotations
 

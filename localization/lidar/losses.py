@@ -1,4 +1,4 @@
-"""How long the LiDAR was lost, for metrics, reports and diagnostics: counted by `lidar.LostScans`, said here."""
+"""How long the LiDAR was lost, for metrics, reports and diagnostics: counted by `lidar.LostScans`, described here."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ _CAUSES: Mapping[str, tuple[str, str]] = {
     ),
 }
 """What happened and what to do, by cause."""
+_SILENCE_ADVICE = "Check the LiDAR's driver, cable and topic."
 
 
 @dataclass(frozen=True)
@@ -48,12 +49,14 @@ class LidarLosses:
     """Time since the last match, up to the last scan [s]."""
     causes: Mapping[str, int]
     """Scans that were not matched, by cause: lost, sparse, stale."""
+    silences: int = 0
+    """Times in which no scan came for a second or more."""
 
     @classmethod
     def of(cls, lost: LostScans) -> LidarLosses:
         """Up to now."""
         causes = {name: n for name, n in lost.causes.items() if n}
-        return cls(lost.scans, lost.scans - sum(causes.values()), lost.share, *lost.longest, lost.ongoing_s, causes)
+        return cls(lost.scans, lost.scans - sum(causes.values()), lost.share, *lost.longest, lost.ongoing_s, causes, lost.silences)
 
     @property
     def is_long(self) -> bool:
@@ -67,15 +70,20 @@ class LidarLosses:
 
     @property
     def advice(self) -> str:
-        """What to do against the most frequent cause; "" where none was lost."""
+        """What to do against missing scans, else against the most frequent cause; "" where nothing was lost."""
+        if self.silences:
+            return _SILENCE_ADVICE
         return _CAUSES[max(self.causes, key=lambda name: self.causes[name])][1] if self.causes else ""
 
     def describe(self) -> str:
-        """What happened, where, why, and what to do; "" where every scan was matched."""
-        if not self.causes:
-            return ""
-        parts = ", ".join(f"{n} {_CAUSES[name][0]}" for name, n in self.causes.items())
-        return f"{self.summary} ({sum(self.causes.values())} of {self.scans} scans: {parts}). Wheels carried on alone. {self.advice}"
+        """What happened, where, why, and what to do; "" where every scan came and was matched."""
+        found = []
+        if self.causes:
+            parts = ", ".join(f"{n} {_CAUSES[name][0]}" for name, n in self.causes.items())
+            found.append(f"{sum(self.causes.values())} of {self.scans} scans: {parts}")
+        if self.silences:
+            found.append("no scans came for a second or more" + (f", {self.silences} times" if self.silences > 1 else ""))
+        return f"{self.summary} ({'; '.join(found)}). Wheels carried on alone. {self.advice}" if found else ""
 
     def numbers(self) -> dict[str, Any]:
         """As in `metrics.json`."""
@@ -86,6 +94,7 @@ class LidarLosses:
             "longest_lost_s": self.longest_s,
             "longest_lost_since_s": self.since_s,
             "causes": dict(self.causes),
+            "silences": self.silences,
         }
 
 

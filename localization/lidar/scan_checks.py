@@ -7,6 +7,12 @@ import numpy as np
 from localization.events import Scan
 from motion_models.se2 import FloatArray
 
+_MAX_SCAN_GAP_S = 1.0
+"""Time without a scan that counts as lost [s]: scanners give 5 to 40 scans a second, and in this time wheels alone err by the few
+centimetres of a voxel."""
+_MAX_SCAN_GAP_PERIODS = 4.0
+"""The same for logs with few scans, in mean times from scan to scan."""
+
 
 class StaleScans:
     """Recognises a scanner that has frozen."""
@@ -27,15 +33,18 @@ class StaleScans:
 
 
 class LostScans:
-    """Counts scans that could not be used, by cause, and the time without a matched scan."""
+    """Counts scans that could not be used, by cause, and the time without a matched scan: also where none come at all."""
 
     def __init__(self) -> None:
         self._first_ns: int | None = None
-        self._matched_ns = self._last_ns = 0
+        self._matched_ns = self._scan_ns = self._last_ns = 0  # last match, last scan, end of the counted time
         self.scans = 0
         """All scans so far."""
         self.causes: dict[str, int] = {}
         """Scans that were not matched: `lost` (they fit nowhere, or in several places), `sparse`, `stale`."""
+        self.silences = 0
+        """Gaps between scans that count as lost."""
+        self._is_silent = False
         self._lost_ns = 0
         self._longest: tuple[int, int] = (0, 0)  # length and start [ns]
 
@@ -52,9 +61,20 @@ class LostScans:
         self.causes[cause] = self.causes.get(cause, 0) + 1
         self._last_ns = stamp_ns
 
+    def add_no_scan(self, stamp_ns: int) -> None:
+        """The time has come to ``stamp_ns`` without a scan. It is lost once no scan has come for `_MAX_SCAN_GAP_S`, or for much longer
+        than they are apart."""
+        if self._first_ns is None:
+            return
+        apart_ns = (self._scan_ns - self._first_ns) / max(self.scans - 1, 1)
+        if stamp_ns - self._scan_ns <= max(_MAX_SCAN_GAP_S * 1e9, _MAX_SCAN_GAP_PERIODS * apart_ns):
+            return
+        self.silences += not self._is_silent
+        self._is_silent, self._last_ns = True, max(stamp_ns, self._last_ns)
+
     @property
     def share(self) -> float:
-        """Share of the time, from the first scan to the last, 0 to 1."""
+        """Share of the time, from the first scan to the last or to the end of a silence, 0 to 1."""
         if self._first_ns is None or self._last_ns == self._first_ns:
             return 0.0
         return (self._lost_ns + self._last_ns - self._matched_ns) / (self._last_ns - self._first_ns)
@@ -69,13 +89,16 @@ class LostScans:
 
     @property
     def ongoing_s(self) -> float:
-        """Time from the last match to the last scan [s]."""
+        """Time from the last match to the last scan, or until now where scans have ceased [s]."""
         return (self._last_ns - self._matched_ns) * 1e-9
 
     def _count(self, stamp_ns: int) -> None:
-        self.scans += 1
         if self._first_ns is None:
             self._first_ns = self._matched_ns = self._last_ns = stamp_ns
+        else:
+            self.add_no_scan(stamp_ns)
+        self.scans += 1
+        self._scan_ns, self._is_silent = stamp_ns, False
 
     def _close(self, stamp_ns: int) -> None:
         length = stamp_ns - self._matched_ns

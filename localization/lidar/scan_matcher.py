@@ -46,6 +46,8 @@ _MAX_RIVAL = 0.9
 """A search is ambiguous where a pose elsewhere scores more than this share of the best."""
 _BASIN_M, _BASIN_RAD = 0.15, 0.15
 """Sigma of a prior from which Gauss-Newton alone may end elsewhere: from .3 m, .15 rad it does in 14 to 31 % of trials."""
+_MAX_OLD_SUBMAPS = 3
+"""Key scans older than the last ones, at most, in units of their number."""
 _OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
 """Added to the information of a match, so that an open direction has a sigma of 10 m or 1 rad [1/m^2, 1/m^2, 1/rad^2]."""
 _MAPPED_INFORMATION = np.diag([1e2, 1e2, 1e2])
@@ -106,6 +108,24 @@ class KeyScanError:
     """(3, 3) of m: places that were not mapped before hang on this scan alone."""
 
 
+@dataclass(frozen=True, eq=False)
+class KeyScan:
+    """A scan of the submap."""
+
+    points: FloatArray
+    """(N, 2) in the odometry frame [m]."""
+    pose: FloatArray
+    """(3,) from which it was drawn."""
+    map_cov: FloatArray
+    """(3, 3) covariance of the submap's error around it, before it was drawn; a right perturbation."""
+
+    def drift_variance(self, pose: FloatArray, map_cov: FloatArray, range_m: float) -> float:
+        """Variance [m^2] by which points at ``range_m`` have drifted from this scan to the submap around ``pose`` (3,)."""
+        A = se2.adjoint(se2.inverse(se2.between(self.pose, pose)))
+        grown = map_cov - A @ self.map_cov @ A.T
+        return float(grown[0, 0] + grown[1, 1] + range_m**2 * grown[2, 2])
+
+
 @dataclass(frozen=True)
 class Fit:
     """A minimum of the cost above."""
@@ -134,7 +154,7 @@ class ScanMatcher:
     def __init__(self, config: LidarConfig, cell: float) -> None:
         """``cell``: edge of the submap's voxels [m]."""
         self._config, self.cell = config, cell
-        self._keys: list[FloatArray] = []
+        self._keys: list[KeyScan] = []
         self._grid: VoxelGrid | None = None
         self._image: LikelihoodImage | None = None
         self.is_new_place = False
@@ -176,18 +196,31 @@ class ScanMatcher:
             return None
         return self._result(Fit(pose, H, np.zeros(3), *(float(value) for value in found)), np.zeros((3, 3)))
 
-    def insert_key_scan(self, pose: FloatArray, points: FloatArray) -> KeyScanError:
-        """Draw a scan from ``pose`` (3,)."""
+    def insert_key_scan(self, pose: FloatArray, points: FloatArray, map_cov: FloatArray | None = None) -> KeyScanError:
+        """Draw a scan from ``pose`` (3,). ``map_cov`` (3, 3) of the submap's error there: with it, scans of long ago stay while they fit."""
         drawn = np.asarray(se2.transform(pose, points))
         scan = make_grid(drawn, self.cell, self._config.range_noise_m)
         share, new = (1.0, 0.0) if self._grid is None else measure_shares(self._grid, scan)
-        self._keys = [*self._keys, drawn][-self._config.key_scans :]
+        self._keys = [*self._fitting_keys(pose, points, map_cov), KeyScan(drawn, pose, np.zeros((3, 3)) if map_cov is None else map_cov)]
         self._draw()
         assert self._grid is not None
         H = linearize(self._grid, points, triple(pose), 0.0)[0]
         noise = np.asarray(np.linalg.inv(H + _OPEN_INFORMATION) * self._variance_ratio(1), dtype=float)
         W = select_measured(noise)
         return KeyScanError(share, noise, new * W @ noise @ W.T)
+
+    def _fitting_keys(self, pose: FloatArray, points: FloatArray, map_cov: FloatArray | None) -> list[KeyScan]:
+        """The key scans that stay beside a new one: the last ones, and older ones from which the drift is below the noise of a range.
+
+        These thicken no surface; the drift does not grow where the robot comes back to them.
+        """
+        n = self._config.key_scans - 1
+        recent = self._keys[max(len(self._keys) - n, 0) :]
+        if map_cov is None:
+            return recent
+        range_m, limit = float(np.median(np.hypot(points[:, 0], points[:, 1]))), self._config.range_noise_m**2
+        older = [key for key in self._keys[: len(self._keys) - len(recent)] if key.drift_variance(pose, map_cov, range_m) < limit]
+        return [*older[-_MAX_OLD_SUBMAPS * self._config.key_scans :], *recent]
 
     def __getstate__(self) -> dict[str, Any]:
         """The key scans; grid and image are computed from them."""
@@ -207,7 +240,7 @@ class ScanMatcher:
 
     def points(self) -> FloatArray:
         """(M, 2) of the submap, in the odometry frame [m]."""
-        return np.vstack(self._keys) if self._keys else np.empty((0, 2))
+        return np.vstack([key.points for key in self._keys]) if self._keys else np.empty((0, 2))
 
     def _draw(self) -> None:
         self._grid, self._image = make_grid(self.points(), self.cell, self._config.range_noise_m), None

@@ -93,14 +93,14 @@ class ScanMatchingSensor:
         c = self._config
         return bool(math.hypot(moved[0], moved[1]) > c.key_distance_m or abs(moved[2]) > c.key_angle_rad)
 
-    def insert_key_scan(self, pose: FloatArray) -> KeyScanError:
-        """Draw the scan at hand from ``pose`` (3,)."""
+    def insert_key_scan(self, pose: FloatArray, map_cov: FloatArray) -> KeyScanError:
+        """Draw the scan at hand from ``pose`` (3,), where the submap's error has covariance ``map_cov`` (3, 3)."""
         assert self._scan is not None
         assert self._matcher is not None
         self._last_key = pose
         if self._kiss is not None:
             self._kiss.insert(self._scan.points, pose)
-        return self._matcher.insert_key_scan(pose, self._scan.planar)
+        return self._matcher.insert_key_scan(pose, self._scan.planar, map_cov)
 
     def scan_points(self) -> FloatArray:
         """(M, 2) the scan at hand in the body frame, or (0, 2)."""

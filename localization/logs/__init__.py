@@ -1,7 +1,7 @@
 """Robot logs behind one door: `open_log` reads ROS 1 bags, ROS 2 folders and bare .mcap files as streams of events."""
 
-from localization.logs.info import LogInfo, TopicInfo
+from localization.logs.info import LogInfo, TopicInfo, inspect_log
 from localization.logs.reader import Log, open_log
-from localization.logs.topics import Sources, TopicOverrides, TopicSource
+from localization.logs.topic_roles import Sources, TopicOverrides, TopicSource
 
-__all__ = ["Log", "LogInfo", "Sources", "TopicInfo", "TopicOverrides", "TopicSource", "open_log"]
+__all__ = ["Log", "LogInfo", "Sources", "TopicInfo", "TopicOverrides", "TopicSource", "inspect_log", "open_log"]

@@ -1,4 +1,4 @@
-"""What every file format is brought down to: channels, raw messages, and chunks of them that are read one at a time.
+"""Common ground of all file formats: channels, raw messages, and chunks of messages that are read one at a time.
 
 ROS 1 bags and MCAP files keep their messages in chunks of about a megabyte, each with the span of log time that it covers. That is
 all one needs to go through a log of any length in order of log time while holding only the chunks that overlap.
@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, BinaryIO, NamedTuple, Protocol
 
 import lz4.frame  # type: ignore[import-untyped]
 from rosbags.interfaces import MessageDefinition
@@ -71,7 +71,7 @@ class Source(Protocol):
 
     @property
     def warnings(self) -> list[str]:
-        """What was lost or odd so far, as sentences."""
+        """What was lost or odd so far, as warnings."""
         ...
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
@@ -89,14 +89,14 @@ class Chunk:
     counts: dict[int, int]
     """Messages of each channel id in it."""
     size: int = 0
-    """Bytes of it in the file, where the file itself does not say."""
+    """Bytes of it in the file, where the file itself does not contain it."""
 
 
 class DamagedError(Exception):
-    """Bytes that cannot be what they should be. Never leaves this package."""
+    """Bytes that contradict the format. Raised and caught within this package."""
 
 
-_MOST_HELD_BYTES = 512 << 20
+_MAX_BUFFERED_BYTES = 512 << 20
 """Of messages that wait for their turn [B]. Recorders' chunks overlap by seconds (a few MB); where they overlap by more than this, the
 oldest message is given out early, and `merge` reports what then comes too late."""
 
@@ -106,7 +106,7 @@ def in_log_order(chunks: Iterable[Chunk], load: Callable[[Chunk], Iterable[RawMe
     held: list[tuple[int, int, RawMessage]] = []
     serial = held_bytes = 0
     for chunk in sorted(chunks, key=lambda c: (c.start_ns, c.position)):
-        while held and (held[0][0] < chunk.start_ns or held_bytes > _MOST_HELD_BYTES):
+        while held and (held[0][0] < chunk.start_ns or held_bytes > _MAX_BUFFERED_BYTES):
             message = heapq.heappop(held)[2]
             held_bytes -= len(message.data)
             yield message
@@ -118,19 +118,19 @@ def in_log_order(chunks: Iterable[Chunk], load: Callable[[Chunk], Iterable[RawMe
         yield heapq.heappop(held)[2]
 
 
-MOST_PLAIN_BYTES = 256 << 20
+MAX_DECOMPRESSED_BYTES = 256 << 20
 """Of a chunk or of a message, decompressed [B]. Recorders make chunks of 0.8 to 16 MB, and the largest messages of robots (maps, stitched
 clouds) have 100 MB; what is larger is read uncompressed only, where it needs the memory that it takes on the disk."""
-_MOST_RATIO = 1000
-"""Decompressed to compressed size, of more than `_ANY_RATIO_BYTES`. Sensor data compress by 2 to 10, joint states of a robot that rests by
-100; an empty map compresses by 10,000, but has 16 MB."""
-_ANY_RATIO_BYTES = 64 << 20
+_MAX_COMPRESSION_RATIO = 1000
+"""Decompressed to compressed size, of more than `_UNLIMITED_RATIO_BYTES`. Sensor data compress by 2 to 10, joint states of a robot at rest
+by 100; an empty map compresses by 10,000, but has 16 MB."""
+_UNLIMITED_RATIO_BYTES = 64 << 20
 _PIECE_BYTES = 1 << 20
 
 
-def most_plain_bytes(packed: int) -> int:
+def max_decompressed_bytes(packed: int) -> int:
     """What ``packed`` bytes may decompress to [B], if they are no bomb."""
-    return max(_ANY_RATIO_BYTES, _MOST_RATIO * packed)
+    return max(_UNLIMITED_RATIO_BYTES, _MAX_COMPRESSION_RATIO * packed)
 
 
 def decompress(data: bytes, compression: str) -> bytes:
@@ -153,7 +153,7 @@ def decompress_head(data: bytes, compression: str) -> tuple[bytes, bool]:
     if compression not in makers:
         raise DamagedError(f"compression '{compression}' is not known")
     decoder = makers[compression]()
-    most = min(MOST_PLAIN_BYTES, most_plain_bytes(len(data)))
+    most = min(MAX_DECOMPRESSED_BYTES, max_decompressed_bytes(len(data)))
     try:
         plain: bytes = decoder.decompress(data, max_length=most + 1)
     except (OSError, EOFError, RuntimeError, ValueError, MemoryError, zstd.ZstdError) as error:
@@ -163,34 +163,48 @@ def decompress_head(data: bytes, compression: str) -> tuple[bytes, bool]:
     return plain, bool(decoder.eof)
 
 
-def inflate_message(data: bytes) -> bytes:
-    """A ROS 2 message, decompressed where the recorder compressed it by itself (that is told in metadata.yaml, which may be lost)."""
+def decompress_message(data: bytes) -> bytes:
+    """A ROS 2 message, decompressed where the recorder compressed it by itself (metadata.yaml, which has this mode, may be lost)."""
     if data[:4] != b"\x28\xb5\x2f\xfd":
         return data
     try:
         return decompress(data, "zstd")
     except DamagedError:
-        return data  # which the decoder will refuse, and count
+        return data  # the decoder rejects and counts it
 
 
-def inflate_file(path: Path, target: Path) -> str:
+def decompress_file(path: Path, target: Path) -> str:
     """Decompress a zstd file into ``target`` as far as it goes; the reason why it went no further, or nothing."""
-    most = most_plain_bytes(path.stat().st_size)
-    with path.open("rb") as packed, target.open("wb") as plain:
-        decoder = zstd.ZstdDecompressor()
-        try:
+    most = max_decompressed_bytes(path.stat().st_size)
+    try:
+        with path.open("rb") as packed, target.open("wb") as plain:
+            return _copy(_decompressed_pieces(packed), plain, most)
+    except zstd.ZstdError as error:
+        return str(error)
+    except EOFError:
+        return "it was cut off"
+
+
+def _copy(pieces: Iterable[bytes], target: BinaryIO, most: int) -> str:
+    for piece in pieces:
+        target.write(piece)
+        if target.tell() > most:
+            return f"it decompresses to more than {_MAX_COMPRESSION_RATIO} times its size"
+    return ""
+
+
+def _decompressed_pieces(packed: BinaryIO) -> Iterator[bytes]:
+    """Content of a zstd file, which may have several frames. Raises `ZstdError`, and `EOFError` where the last frame is cut off."""
+    decoder = zstd.ZstdDecompressor()
+    pending = packed.read(_PIECE_BYTES)
+    while pending or not decoder.needs_input:
+        if decoder.eof:
+            decoder = zstd.ZstdDecompressor()
+        yield decoder.decompress(pending, _PIECE_BYTES)
+        pending = decoder.unused_data if decoder.eof else b""
+        if not pending and (decoder.eof or decoder.needs_input):
             pending = packed.read(_PIECE_BYTES)
-            while pending or not decoder.needs_input:
-                if decoder.eof:  # a file may hold several frames
-                    decoder = zstd.ZstdDecompressor()
-                plain.write(decoder.decompress(pending, _PIECE_BYTES))
-                if plain.tell() > most:
-                    return f"it decompresses to more than {_MOST_RATIO} times its size"
-                pending = decoder.unused_data if decoder.eof else b""
-                if not pending and (decoder.eof or decoder.needs_input):
-                    pending = packed.read(_PIECE_BYTES)
-                    if not pending:
-                        break
-        except zstd.ZstdError as error:
-            return str(error)
-    return "" if decoder.eof else "it was cut off"
+            if not pending:
+                break
+    if not decoder.eof:
+        raise EOFError

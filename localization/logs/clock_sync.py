@@ -1,16 +1,16 @@
-"""Several topics in order of their header stamps, within bounded memory, whatever their clocks do.
+"""Several topics in order of their header stamps, within bounded memory, for clocks with offsets and jumps.
 
 Messages come in the order in which they were recorded; their headers say when they were measured, which is earlier by an unknown
-latency, and now and then nonsense. Three things happen here:
+latency, and some are wrong. Three steps:
 
-- Each topic's clock is watched (`TopicClock`). A stamp is trusted if it lies within a second of the stamp before it, or if it is as
+- Each topic's clock is monitored (`TopicClock`). A stamp is plausible if it lies within a second of the stamp before it, or if it is as
   far from the time of recording as the stamps before it were, to a second. (The first holds when the recorder stalls, the second
   when the driver pauses.) It is not if it leaves the topic's even pace by more than 0.3 s while messages are recorded evenly. One or
   two that are not are outliers, and dropped; three in a row that agree are a clock that was set, and from there on the topic is moved
-  back by the jump. What comes in a burst tells nothing of clocks, and waits for what comes after it: if that is trusted and continues
-  it, the burst was late and nothing else.
+  back by the jump. A burst gives no information about clocks and waits for what comes after it: if that is plausible and continues
+  it, the burst was merely late.
 - A topic without stamps gets the time of recording, and so does, by a constant shift, one whose clock is far from all others'.
-- Trusted messages wait in a heap until nothing older can come: one second after the slowest topic's usual latency. On a robot, where
+- Plausible messages wait in a heap until nothing older can come: one second after the slowest topic's usual latency. On a robot, where
   an estimate is wanted now, they do not wait.
 """
 
@@ -24,22 +24,23 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from localization.logs.message_stats import Oddity, Tally
+from localization.logs.message_stats import MessageStats, Oddity
 
 _SECOND = 1_000_000_000
-_TRUSTED_STEP = _SECOND
-_WAIT = _SECOND
-_FOREIGN = 10 * _SECOND
-_SAME_JUMP = _SECOND // 4
-_JUMP_AFTER = 3
-_SUDDEN = 3 * _SECOND // 10
+_MAX_STEP_NS = _SECOND
+_REORDER_WAIT_NS = _SECOND
+_MAX_CLOCK_OFFSET_NS = 10 * _SECOND
+_EQUAL_JUMP_NS = _SECOND // 4
+_MIN_JUMPED_MESSAGES = 3
+_MIN_JUMP_NS = 3 * _SECOND // 10
 """A stamp that leaves the even pace of its topic by more than this, while recording goes on evenly, is no latency but a clock that was set
 [ns]. Smaller jumps move a robot by less than 0.3 m at 1 m/s; estimators weigh these."""
-_PACE_OF = 20  # messages
-_LONGEST_PENDING = 10 * _SECOND
-_LONGEST_BURST = 5 * _SECOND
-_MOST_PENDING = 1000
-_MOST_HELD = 20_000
+_PACE_MESSAGES, _MIN_PACE_MESSAGES = 20, 8
+"""Messages of which the pace is known, and the fewest: scanners of 2 Hz have 8 in 4 s."""
+_MAX_PENDING_NS = 10 * _SECOND
+_MAX_BURST_NS = 5 * _SECOND
+_MAX_PENDING_MESSAGES = 1000
+_MAX_BUFFERED_WEIGHT = 20_000
 
 
 @dataclass(frozen=True)
@@ -70,24 +71,24 @@ class ClockPlan:
 
 
 def plan_clocks(first: Mapping[str, tuple[int, int]]) -> ClockPlan:
-    """Clocks by the first (log stamp, header stamp) of each topic; topics with a zero stamp say nothing.
+    """Clocks by the first (log stamp, header stamp) of each topic; topics with a zero stamp are left out.
 
     If any topic agrees with the recorder to 10 s, that is the common clock; else the median of all.
     """
     offsets = {topic: stamp - log for topic, (log, stamp) in first.items() if stamp != 0}
-    if not offsets or any(abs(offset) <= _FOREIGN for offset in offsets.values()):
+    if not offsets or any(abs(offset) <= _MAX_CLOCK_OFFSET_NS for offset in offsets.values()):
         common = 0
     else:
         common = statistics.median_low(sorted(offsets.values()))
-    shifts = {topic: common - offset for topic, offset in offsets.items() if abs(offset - common) > _FOREIGN}
+    shifts = {topic: common - offset for topic, offset in offsets.items() if abs(offset - common) > _MAX_CLOCK_OFFSET_NS}
     return ClockPlan(common, shifts, {topic: offset + shifts.get(topic, 0) for topic, offset in offsets.items()})
 
 
 class TopicClock:
     """The stamps of one topic, brought onto the common clock."""
 
-    def __init__(self, topic: str, plan: ClockPlan, jumps: list[int], tally: Tally) -> None:
-        self._topic, self._tally = topic, tally
+    def __init__(self, topic: str, plan: ClockPlan, jumps: list[int], stats: MessageStats) -> None:
+        self._topic, self._stats = topic, stats
         self._common = plan.offset_ns
         self._shift = plan.shifts_ns.get(topic, 0)
         self._foreign = self._shift != 0
@@ -96,12 +97,12 @@ class TopicClock:
         self._last: int | None = None
         self._newest: int | None = None
         self.offset_ns = plan.latency_ns.get(topic, plan.offset_ns)
-        """Stamp minus time of recording, of the last trusted message."""
-        self._soonest_ns = self.offset_ns
+        """Stamp minus time of recording, of the last plausible message."""
+        self._min_latency_offset_ns = self.offset_ns
         self._pending: list[Item] = []
         self._last_log = 0
-        self._pace: deque[tuple[int, int]] = deque(maxlen=_PACE_OF)
-        """Steps of the last trusted stamps, and by how much those of recording differed from them."""
+        self._pace: deque[tuple[int, int]] = deque(maxlen=_PACE_MESSAGES)
+        """Steps of the last plausible stamps, and by how much those of recording differed from them."""
 
     @property
     def shift_ns(self) -> int:
@@ -111,65 +112,65 @@ class TopicClock:
     def horizon(self, log_ns: int) -> int:
         """No message recorded after ``log_ns`` is expected to have an older stamp than this, less some waiting.
 
-        What has been pending for ten seconds is given up, so that it does not hold all others.
+        Messages that have been pending for ten seconds are dropped, so that they do not hold all others.
         """
-        while self._pending and log_ns - self._pending[0].log_ns > _LONGEST_PENDING:
+        while self._pending and log_ns - self._pending[0].log_ns > _MAX_PENDING_NS:
             del self._pending[0]
-            self._tally.count(self._topic, Oddity.OUTLIER)
+            self._stats.count(self._topic, Oddity.OUTLIER)
         if not self._pending:
             return log_ns + self.offset_ns
         first = self._pending[0]
         since = min(log_ns, first.log_ns) + self.offset_ns
         return min(since, first.stamp_ns + self._shift) if self._may_be_late() else since
 
-    def put(self, item: Item) -> list[Item]:
-        """Messages that have become trusted by this one, with their final stamps."""
+    def insert(self, item: Item) -> list[Item]:
+        """Take the next message; returns those that are plausible now, with their final stamps."""
         if item.stamp_ns == 0:
-            self._tally.count(self._topic, Oddity.NO_STAMP)
+            self._stats.count(self._topic, Oddity.NO_STAMP)
             return [_restamped(item, item.log_ns + self._common)]
-        if self._is_trusted(item):
+        if self._is_plausible(item):
             if not self._is_continued_by(item):
-                self.close()
+                self.drop_pending()
             self._pending.append(item)
             return self._release()
         if self._pending and not _agree(self._pending[-1], item):
-            self.close()
+            self.drop_pending()
         self._pending.append(item)
-        if len(self._pending) < _JUMP_AFTER or self._is_burst():
+        if len(self._pending) < _MIN_JUMPED_MESSAGES or self._is_burst():
             return []
         self._set_clock()
         return self._release()
 
-    def finish(self) -> list[Item]:
-        """What is pending at the end, where it is enough for a clock that was set; else it is given up."""
-        if len(self._pending) >= _JUMP_AFTER:
+    def flush(self) -> list[Item]:
+        """What is pending at the end, where it is enough for a clock that was set; else it is dropped."""
+        if len(self._pending) >= _MIN_JUMPED_MESSAGES:
             self._set_clock()
         else:
-            self.close()
+            self.drop_pending()
         return self._release()
 
-    def close(self) -> None:
-        """Give up what is pending."""
+    def drop_pending(self) -> None:
+        """Drop what is pending as outliers."""
         if self._pending:
-            self._tally.count(self._topic, Oddity.OUTLIER, len(self._pending))
+            self._stats.count(self._topic, Oddity.OUTLIER, len(self._pending))
             self._pending = []
 
-    def _is_trusted(self, item: Item) -> bool:
+    def _is_plausible(self, item: Item) -> bool:
         stamp = item.stamp_ns + self._shift
-        known = (self.offset_ns, self._soonest_ns)  # after a burst, messages are no longer late
+        known = (self.offset_ns, self._min_latency_offset_ns)  # after a burst, messages are no longer late
         return not self._is_sudden(item) and (
             self._last is None
-            or abs(stamp - self._last) <= _TRUSTED_STEP
-            or any(abs(stamp - item.log_ns - offset) <= _TRUSTED_STEP for offset in known)
+            or abs(stamp - self._last) <= _MAX_STEP_NS
+            or any(abs(stamp - item.log_ns - offset) <= _MAX_STEP_NS for offset in known)
         )
 
     def _is_sudden(self, item: Item) -> bool:
         """Whether the stamp leaves its topic's even pace, though the message was recorded when it was due."""
-        if self._last is None or len(self._pace) < _PACE_OF:
+        if self._last is None or len(self._pace) < _MIN_PACE_MESSAGES:
             return False
         stamp, step = item.stamp_ns + self._shift, item.log_ns - self._last_log
         deviation = abs(stamp - self._last - step)
-        if deviation <= _SUDDEN or abs(stamp - item.log_ns - self._soonest_ns) <= _SUDDEN:
+        if deviation <= _MIN_JUMP_NS or abs(stamp - item.log_ns - self._min_latency_offset_ns) <= _MIN_JUMP_NS:
             return False
         due = (len(self._pending) + 1) * statistics.median(period for period, _ in self._pace)
         usual = max(abs(jitter) for _, jitter in self._pace)
@@ -177,46 +178,46 @@ class TopicClock:
 
     def _release(self) -> list[Item]:
         released, self._pending = self._pending, []
-        return [self._trust(i) for i in released]
+        return [self._accept(i) for i in released]
 
     def _may_be_late(self) -> bool:
-        """Whether what is pending comes after what was trusted."""
+        """Whether what is pending comes after the last plausible message."""
         return bool(self._pending) and self._last is not None and self._last <= self._pending[0].stamp_ns + self._shift
 
     def _is_continued_by(self, item: Item) -> bool:
-        """Whether ``item``, which is trusted, comes soon after what is pending, and that after what was trusted."""
-        return self._may_be_late() and 0 <= item.stamp_ns - self._pending[-1].stamp_ns <= _TRUSTED_STEP
+        """Whether ``item``, which is plausible, comes soon after what is pending, and that after the last plausible message."""
+        return self._may_be_late() and 0 <= item.stamp_ns - self._pending[-1].stamp_ns <= _MAX_STEP_NS
 
     def _is_burst(self) -> bool:
         """Whether what is pending came in less than half the time over which it was measured. None is long: it may be a bag's at a rate."""
         first, last = self._pending[0], self._pending[-1]
-        is_fast = last.log_ns - first.log_ns < min((last.stamp_ns - first.stamp_ns) / 2, _LONGEST_BURST)
+        is_fast = last.log_ns - first.log_ns < min((last.stamp_ns - first.stamp_ns) / 2, _MAX_BURST_NS)
         n = len(self._pending)
-        return is_fast and n < _MOST_PENDING and n * last.weight < _MOST_HELD
+        return is_fast and n < _MAX_PENDING_MESSAGES and n * last.weight < _MAX_BUFFERED_WEIGHT
 
-    def _trust(self, item: Item) -> Item:
+    def _accept(self, item: Item) -> Item:
         stamp = item.stamp_ns + self._shift
         if self._last is not None:
             step = stamp - self._last
             self._pace.append((step, item.log_ns - self._last_log - step))
         self._last, self._last_log, self.offset_ns = stamp, item.log_ns, stamp - item.log_ns
-        self._soonest_ns = max(self._soonest_ns, self.offset_ns)
+        self._min_latency_offset_ns = max(self._min_latency_offset_ns, self.offset_ns)
         if self._rebased:
-            self._tally.count(self._topic, Oddity.REBASED)
+            self._stats.count(self._topic, Oddity.REBASED)
         elif self._foreign:
-            self._tally.count(self._topic, Oddity.FOREIGN_CLOCK)
+            self._stats.count(self._topic, Oddity.FOREIGN_CLOCK)
         if self._newest is not None and stamp < self._newest:
-            self._tally.count(self._topic, Oddity.OUT_OF_ORDER)
+            self._stats.count(self._topic, Oddity.OUT_OF_ORDER)
         self._newest = stamp if self._newest is None else max(stamp, self._newest)
         return _restamped(item, stamp)
 
     def _set_clock(self) -> None:
         """The clock was set: shift the topic so that it is as far from the time of recording as it was before."""
-        first = self._pending[:_JUMP_AFTER]  # in a burst, they are as late as what was trusted before them
+        first = self._pending[:_MIN_JUMPED_MESSAGES]  # in a burst, they are as late as the message before them
         deviation = statistics.median_low([i.stamp_ns + self._shift - i.log_ns - self.offset_ns for i in first])
         shift = self._shift - deviation
         # The latency jitters. Where another topic made the same jump, or this one a jump back, the same shift keeps them aligned.
-        same = [known for known in (0, *self._jumps) if abs(known - shift) <= _SAME_JUMP]
+        same = [known for known in (0, *self._jumps) if abs(known - shift) <= _EQUAL_JUMP_NS]
         self._shift = same[0] if same else shift
         self._rebased = self._shift != 0
         if not same:
@@ -224,50 +225,50 @@ class TopicClock:
 
 
 class Merger:
-    """The payloads of items by stamp, one item in, what has become sure out. A topic's payloads always have increasing stamps.
+    """Merges items by stamp: `insert` an item, take the payloads that are due. A topic's payloads always have increasing stamps.
 
     With ``wait_ns`` [ns] (a log) the payloads of all topics come in order of stamps, never decreasing. Without (a robot) each is given
     out at once, in order of arrival: one that comes after a newer one of its own topic is dropped, and what is late against the other
     topics is the estimator's to use.
     """
 
-    def __init__(self, plan: ClockPlan, tally: Tally, wait_ns: int | None = _WAIT) -> None:
-        self._plan, self._tally, self._wait_ns = plan, tally, wait_ns
+    def __init__(self, plan: ClockPlan, stats: MessageStats, wait_ns: int | None = _REORDER_WAIT_NS) -> None:
+        self._plan, self._stats, self._wait_ns = plan, stats, wait_ns
         self._jumps: list[int] = []
-        self._clocks = {topic: TopicClock(topic, plan, self._jumps, tally) for topic in plan.latency_ns}
+        self._clocks = {topic: TopicClock(topic, plan, self._jumps, stats) for topic in plan.latency_ns}
         self._held: list[tuple[int, int, int, Item]] = []
         self._held_weight = self._serial = self._now = 0
         self._emitted: dict[tuple[str, int], int] = {}  # two drivers may share a topic, as wheels and arms do, and a stamp
         self._newest = -(2**63)
 
-    def push(self, item: Item) -> Iterator[Any]:
+    def insert(self, item: Item) -> Iterator[Any]:
         """Take the next item by time of recording; what is yielded must be taken before the next."""
         clock = self._clocks.get(item.topic)
         if clock is None:  # a topic without stamps
-            clock = self._clocks[item.topic] = TopicClock(item.topic, self._plan, self._jumps, self._tally)
+            clock = self._clocks[item.topic] = TopicClock(item.topic, self._plan, self._jumps, self._stats)
         self._now = max(self._now, item.log_ns)
-        self._hold(clock.put(item))
+        self._hold(clock.insert(item))
         if self._wait_ns is None:
-            clock.horizon(self._now)  # gives up what has been pending for long
+            clock.horizon(self._now)  # drops what has been pending for long
             yield from self._release(2**63 - 1, 0)
         else:
-            yield from self._release(min(c.horizon(self._now) for c in self._clocks.values()) - self._wait_ns, _MOST_HELD)
+            yield from self._release(min(c.horizon(self._now) for c in self._clocks.values()) - self._wait_ns, _MAX_BUFFERED_WEIGHT)
 
     def shift_ns(self, topic: str) -> int:
         """What is added to the stamps of ``topic`` now, because its clock was set or is not the others'."""
         return self._clocks[topic].shift_ns if topic in self._clocks else 0
 
-    def finish(self) -> Iterator[Any]:
+    def flush(self) -> Iterator[Any]:
         """All that is held, for nothing more will come."""
         for clock in self._clocks.values():
-            self._hold(clock.finish())
+            self._hold(clock.flush())
         yield from self._release(2**63 - 1, 0)
 
     def _hold(self, items: Iterable[Item]) -> None:
         for item in items:
             newest = self._newest if self._wait_ns is not None else self._emitted.get((item.topic, item.rank), item.stamp_ns)
             if item.stamp_ns < newest:
-                self._tally.count(item.topic, Oddity.LATE)
+                self._stats.count(item.topic, Oddity.LATE)
                 continue
             heapq.heappush(self._held, (item.stamp_ns, item.rank, self._serial, item))
             self._serial += 1
@@ -279,18 +280,18 @@ class Merger:
             stamp, _, _, item = heapq.heappop(held)
             self._held_weight -= item.weight
             if self._emitted.get((item.topic, item.rank)) == stamp:
-                self._tally.count(item.topic, Oddity.REPEATED)
+                self._stats.count(item.topic, Oddity.REPEATED)
                 continue
             self._emitted[item.topic, item.rank] = self._newest = stamp
             yield item.payload
 
 
-def merge(items: Iterable[Item], plan: ClockPlan, tally: Tally) -> Iterator[Any]:
+def merge(items: Iterable[Item], plan: ClockPlan, stats: MessageStats) -> Iterator[Any]:
     """The payloads of ``items`` (which come in order of ``log_ns``) by stamp: never decreasing, and within a topic always increasing."""
-    merger = Merger(plan, tally)
+    merger = Merger(plan, stats)
     for item in items:
-        yield from merger.push(item)
-    yield from merger.finish()
+        yield from merger.insert(item)
+    yield from merger.flush()
 
 
 def _restamped(item: Item, stamp_ns: int) -> Item:
@@ -301,4 +302,4 @@ def _restamped(item: Item, stamp_ns: int) -> Item:
 
 def _agree(one: Item, other: Item) -> bool:
     step = other.stamp_ns - one.stamp_ns
-    return abs(step) <= _TRUSTED_STEP or abs(step - (other.log_ns - one.log_ns)) <= _TRUSTED_STEP
+    return abs(step) <= _MAX_STEP_NS or abs(step - (other.log_ns - one.log_ns)) <= _MAX_STEP_NS

@@ -1,44 +1,51 @@
-"""From messages to events: what each topic's messages mean, by the part that the topic plays. Logs and live topics alike."""
+"""Messages to events, by the role of their topic. The same for logs and live topics."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from localization.events import CgSample, Event
-from localization.logs.arm_cg import arms_to_cg, standing
 from localization.logs.clock_sync import Item
 from localization.logs.decode import (
     ArmReading,
     JointReading,
     OdometryReading,
-    UnusableError,
     arm_decoder,
     decode_cg,
+    decode_cloud,
     decode_imu,
     decode_odometry,
     joint_decoder,
     scan_decoder,
     stamp_ns,
 )
-from localization.logs.message_stats import Oddity, Tally
-from localization.logs.point_clouds import decode_cloud
-from localization.logs.topics import Sources, TopicSource
+from localization.logs.message_stats import MessageStats, Oddity, UnusableError
+from localization.logs.topic_roles import Sources, TopicSource
 from localization.logs.wheel_decoder import JointsToWheels, OdometryToWheels
 from motion_models.center_of_gravity.model import CgModel
-from motion_models.robot import Robot
+from motion_models.center_of_gravity.parts import support_margin
+from motion_models.center_of_gravity.tracker import CgTracker
+from motion_models.robot import Geometry, Robot
 
 _RANKS = {"joint_states": 0, "odometry": 0, "center_of_gravity": 1, "imu": 2, "scan": 3, "points": 3}
 _SCAN_WEIGHT = 100
 
-Payload = Callable[[Any, int], Any]
-Part = tuple[int, Payload]
-"""Rank among equal stamps, and the decoder of a message with its stamp."""
+MessageDecoder = Callable[[Any, int], Any]
+"""An event, or a reading that becomes one, from a message and its header stamp [ns]; None for a message without content."""
 
 
-class Intake:
-    """Decoders of the topics in use, and what makes events of readings. It remembers the last readings of wheels and arms."""
+class TopicDecoder(NamedTuple):
+    """How the messages of one topic become events or readings."""
+
+    rank: int
+    """Order among events of equal stamps."""
+    decode: MessageDecoder
+
+
+class EventDecoder:
+    """Decodes messages of the topics in use to events. Keeps the last readings of wheels and arms."""
 
     def __init__(
         self,
@@ -46,19 +53,21 @@ class Intake:
         joints: tuple[tuple[str, ...], tuple[str, ...]],
         arms: CgModel | None,
         robot: Robot,
-        tally: Tally,
+        stats: MessageStats,
     ) -> None:
         """``joints``: names of the left and of the right wheels' joints."""
         self._sources, self._joints, self._arms = sources, joints, arms
         wheels = "" if sources.wheels is None else sources.wheels.topic
         left, right = joints
-        self.from_joints = JointsToWheels(len(left), len(right), robot.geometry.wheel_radius_m, wheels, tally)
-        self.from_odometry = OdometryToWheels(robot.driver, wheels, tally)
+        self.from_joints = JointsToWheels(left, right, robot.geometry.wheel_radius_m, wheels, stats)
+        self.from_odometry = OdometryToWheels(robot.driver, wheels, stats)
         named = " and ".join(source.topic for source in sources.arms)
-        self._from_arms = None if arms is None else arms_to_cg(arms, robot.geometry, named, tally)
-        told_by = "" if sources.center_of_gravity is None else sources.center_of_gravity.topic
-        self._standing = partial(standing, geometry=robot.geometry, topic=told_by, oddity=Oddity.TIPPING_CG, tally=tally)
-        self.parts: Mapping[str, Part] = {source.topic: (_RANKS[source.kind], self._decoder(source)) for source in sources.used()}
+        self._from_arms = None if arms is None else make_arm_cg_converter(arms, robot.geometry, named, stats)
+        cg_topic = "" if sources.center_of_gravity is None else sources.center_of_gravity.topic
+        self._check_cg = partial(check_tipping, geometry=robot.geometry, topic=cg_topic, oddity=Oddity.TIPPING_CG, stats=stats)
+        self.decoders: Mapping[str, TopicDecoder] = {
+            source.topic: TopicDecoder(_RANKS[source.kind], self._decoder(source)) for source in sources.used()
+        }
         """By topic."""
 
     def events(self, payload: Any) -> Iterator[Event]:
@@ -73,11 +82,11 @@ class Intake:
         elif isinstance(payload, OdometryReading):
             yield from self.from_odometry(payload)
         elif isinstance(payload, CgSample):
-            yield from self._standing(payload)
+            yield from self._check_cg(payload)
         else:
             yield payload
 
-    def _decoder(self, source: TopicSource) -> Payload:
+    def _decoder(self, source: TopicSource) -> MessageDecoder:
         if source.kind == "joint_states":
             wheels = self._sources.wheels
             is_wheels = wheels is not None and wheels.topic == source.topic
@@ -88,7 +97,7 @@ class Intake:
             return of_wheels
         if source.kind == "scan":
             return scan_decoder()
-        decoders: dict[str, Payload] = {
+        decoders: dict[str, MessageDecoder] = {
             "odometry": decode_odometry,
             "imu": decode_imu,
             "center_of_gravity": decode_cg,
@@ -97,21 +106,45 @@ class Intake:
         return decoders[source.kind]
 
 
-def read_item(topic: str, log_ns: int, read: Callable[[], Any], part: Part, tally: Tally) -> Item | None:
-    """The message that ``read`` gives, recorded at ``log_ns``, as an item to merge; None, and counted, where it says nothing."""
-    rank, payload_of = part
+def decode_item(topic: str, log_ns: int, read: Callable[[], Any], decoder: TopicDecoder, stats: MessageStats) -> Item | None:
+    """Decode the message that ``read`` returns, recorded at ``log_ns``, to an item to merge; None, and counted, where it is unusable."""
+    rank, decode = decoder
     try:
         message = read()
         stamp = stamp_ns(message)
-        payload = payload_of(message, stamp)
+        payload = decode(message, stamp)
     except UnusableError as reason:
-        tally.count(topic, reason.oddity)
+        stats.count(topic, reason.oddity)
         return None
-    except (AttributeError, TypeError, ValueError):  # the log's own definition of the type lacks what the type has
-        tally.count(topic, Oddity.MALFORMED)
+    except (AttributeError, TypeError, ValueError):  # fields of the type are missing in the log's own definition of it
+        stats.count(topic, Oddity.MALFORMED)
         return None
     if payload is None:
         return None
     if isinstance(payload, ArmReading) and payload.wheels is None:
         rank = _RANKS["center_of_gravity"]
     return Item(log_ns, stamp, topic, rank, _SCAN_WEIGHT if rank == 3 else 1, payload)
+
+
+def make_arm_cg_converter(
+    model: CgModel, geometry: Geometry, topic: str, stats: MessageStats
+) -> Callable[[ArmReading], Iterator[CgSample]]:
+    """Converter of readings in order of time. It yields nothing until each joint of ``model`` was received once."""
+    tracker = CgTracker(model)
+
+    def convert(reading: ArmReading) -> Iterator[CgSample]:
+        estimate = tracker.update(reading.names, reading.position)
+        if estimate is None:
+            return
+        sample = CgSample(reading.stamp_ns, estimate.position, estimate.covariance)
+        yield from check_tipping(sample, geometry, topic, Oddity.TIPPING, stats)
+
+    return convert
+
+
+def check_tipping(sample: CgSample, geometry: Geometry, topic: str, oddity: Oddity, stats: MessageStats) -> Iterator[CgSample]:
+    """``sample``, unless the robot would tip over with it, which is counted as ``oddity``."""
+    if support_margin(sample.position, geometry.wheelbase_m, geometry.track_width_m) > 0.0:
+        yield sample
+    else:
+        stats.count(topic, oddity)

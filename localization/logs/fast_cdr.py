@@ -1,7 +1,7 @@
-"""Messages that come or go many times a second, without an object for each of their parts, which takes rosbags longer than all the rest.
+"""Fast decoding and encoding of frequent messages (ROS 2 CDR, little endian), without an object for each of their parts.
 
-Read are those of sensors that a robot tells at 50 Hz and more, as bytes of ROS 2 (CDR, little endian) by what rosbags would make of them;
-written are those that go out with each estimate, by templates that rosbags has filled once.
+Decoded are sensor messages at 50 Hz and more, with the values that rosbags gives; encoded are those published with each estimate, by
+templates that rosbags has filled once.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.logs.fused_log import BODY_FRAME, PARENT_FRAME, FusedEstimate, odom_axes, odometry_message, six_by_six, transform_message
-from localization.logs.message_templates import Form, Message, Template
+from localization.logs.message_templates import Message, MessageLayout, Template
 from motion_models.se2 import FloatArray
 
 _CDR, _FIRST = b"\0\1\0\0", 4  # little endian; places are counted from behind these bytes
@@ -40,7 +40,7 @@ class Vector(NamedTuple):
     z: float
 
 
-class Imu(NamedTuple):
+class ImuMessage(NamedTuple):
     """What is used of sensor_msgs/Imu."""
 
     header: Header
@@ -48,7 +48,7 @@ class Imu(NamedTuple):
     linear_acceleration: Vector
 
 
-class JointState(NamedTuple):
+class JointStateMessage(NamedTuple):
     """What is used of sensor_msgs/JointState."""
 
     header: Header
@@ -57,7 +57,7 @@ class JointState(NamedTuple):
     velocity: FloatArray
 
 
-class LaserScan(NamedTuple):
+class LaserScanMessage(NamedTuple):
     """What is used of sensor_msgs/LaserScan."""
 
     header: Header
@@ -70,30 +70,30 @@ class LaserScan(NamedTuple):
     ranges: NDArray[np.float32]
 
 
-_READERS: dict[str, Callable[[], Callable[[bytes], Any]]] = {
+_DECODERS: dict[str, Callable[[], Callable[[bytes], Any]]] = {
     "sensor_msgs/msg/Imu": lambda: _imu,
     "sensor_msgs/msg/JointState": lambda: _joint_states(),
     "sensor_msgs/msg/LaserScan": lambda: _laser_scan,
 }
 
 
-def quick_reader(kind: str) -> Callable[[bytes], Any] | None:
-    """A reader of messages of type ``kind``, or None: it gives what is used of a message, or None for bytes of an unusual kind, which
-    rosbags has to look at. It raises (`struct.error`, `ValueError`) where rosbags would."""
-    return _READERS[kind]() if kind in _READERS else None
+def fast_decoder(kind: str) -> Callable[[bytes], Any] | None:
+    """Decoder of messages of type ``kind``, or None. It returns the fields in use, or None for an unusual encoding, which is left to
+    rosbags. It raises (`struct.error`, `ValueError`) where rosbags would."""
+    return _DECODERS[kind]() if kind in _DECODERS else None
 
 
-def _imu(data: bytes) -> Imu | None:
+def _imu(data: bytes) -> ImuMessage | None:
     sec, nanosec, length = _HEADER.unpack_from(data, _FIRST)
     end = 16 + length
     at = _aligned(end, 8)
     if not data.startswith(_CDR) or not 0 <= len(data) - at - _IMU.size < 4 or not length or data[end - 1]:
         return None
     wx, wy, wz, ax, ay, az = _IMU.unpack_from(data, at)
-    return Imu(Header(Stamp(sec, nanosec), data[16 : end - 1].decode()), Vector(wx, wy, wz), Vector(ax, ay, az))
+    return ImuMessage(Header(Stamp(sec, nanosec), data[16 : end - 1].decode()), Vector(wx, wy, wz), Vector(ax, ay, az))
 
 
-def _laser_scan(data: bytes) -> LaserScan | None:
+def _laser_scan(data: bytes) -> LaserScanMessage | None:
     if not data.startswith(_CDR):
         return None
     sec, nanosec, length = _HEADER.unpack_from(data, _FIRST)
@@ -106,19 +106,19 @@ def _laser_scan(data: bytes) -> LaserScan | None:
     if not 0 <= left < 4 or not length or data[end - 1]:
         return None
     header, ranges = Header(Stamp(sec, nanosec), data[16 : end - 1].decode()), np.frombuffer(data, "<f4", count, at)
-    return LaserScan(header, first, last, step, beam_s, shortest, longest, ranges)
+    return LaserScanMessage(header, first, last, step, beam_s, shortest, longest, ranges)
 
 
-def _joint_states() -> Callable[[bytes], JointState | None]:
-    """It remembers the names of the last message: mostly they are those of the next."""
-    told, frame = b"", ""
+def _joint_states() -> Callable[[bytes], JointStateMessage | None]:
+    """Caches the names of the last message: they rarely change."""
+    cached, frame = b"", ""
     names: tuple[str, ...] = ()
 
-    def read(data: bytes) -> JointState | None:
-        nonlocal told, frame, names
+    def read(data: bytes) -> JointStateMessage | None:
+        nonlocal cached, frame, names
         if not data.startswith(_CDR):
             return None
-        if not told or not data.startswith(told, 12):
+        if not cached or not data.startswith(cached, 12):
             frame, at = _string(data, 12)
             at = _aligned(at, 4)
             (count,) = _UINT.unpack_from(data, at)
@@ -126,12 +126,12 @@ def _joint_states() -> Callable[[bytes], JointState | None]:
             for _ in range(count):
                 name, at = _string(data, _aligned(at, 4))
                 found.append(name)
-            told, names = data[12 : _aligned(at, 4)], tuple(found)
-        position, at = _doubles(data, 12 + len(told))
+            cached, names = data[12 : _aligned(at, 4)], tuple(found)
+        position, at = _doubles(data, 12 + len(cached))
         velocity, at = _doubles(data, at)
         _, at = _doubles(data, at)
         sec, nanosec, _ = _HEADER.unpack_from(data, _FIRST)
-        return JointState(Header(Stamp(sec, nanosec), frame), names, position, velocity) if len(data) - at < 4 else None
+        return JointStateMessage(Header(Stamp(sec, nanosec), frame), names, position, velocity) if len(data) - at < 4 else None
 
     return read
 
@@ -172,16 +172,16 @@ class FusedWriter:
         return self._transform.fill(Message(self._transform_form, estimate.stamp_ns, estimate.stamp_ns, _place(estimate)))
 
 
-def _named(form: Form, parent: str, body: str) -> Form:
-    """``form`` with these frames in its messages."""
+def _named(layout: MessageLayout, parent: str, body: str) -> MessageLayout:
+    """``layout`` with these frames in its messages."""
 
     def build(*parts: Any) -> Any:
-        made = form.build(*parts)
+        made = layout.build(*parts)
         stamped = made.transforms[0] if hasattr(made, "transforms") else made
         stamped.header.frame_id, stamped.child_frame_id = parent, body
         return made
 
-    return replace(form, build=build)
+    return replace(layout, build=build)
 
 
 def _place(estimate: FusedEstimate) -> tuple[FloatArray, FloatArray]:
@@ -210,5 +210,7 @@ def _build_transform(stamp: Any, place: FloatArray, heading: FloatArray) -> Any:
     return made
 
 
-_ODOMETRY = Form("", "nav_msgs/msg/Odometry", (("f8", 2), ("f8", 2), ("f8", 36), ("f8", 2), ("f8", 1), ("f8", 36)), _build_odometry)
-_TRANSFORM = Form("", "tf2_msgs/msg/TFMessage", (("f8", 2), ("f8", 2)), _build_transform)
+_ODOMETRY = MessageLayout(
+    "", "nav_msgs/msg/Odometry", (("f8", 2), ("f8", 2), ("f8", 36), ("f8", 2), ("f8", 1), ("f8", 36)), _build_odometry
+)
+_TRANSFORM = MessageLayout("", "tf2_msgs/msg/TFMessage", (("f8", 2), ("f8", 2)), _build_transform)

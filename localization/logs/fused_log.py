@@ -1,14 +1,14 @@
-"""Writes what estimators found as a ROS 2 bag: one bare .mcap with Odometry for each of them, and /tf for one.
+"""Write estimates as a ROS 2 bag: one bare .mcap with Odometry for each of them, and /tf for one.
 
-What a message holds, and where ROS means something else than this library:
+Content of the messages, and where ROS's conventions differ from this library's:
 
 - `/NAME/odometry`, nav_msgs/Odometry, `odom` -> `base_link`, or `map` -> `base_link` of estimators that localize; the twist is the body's,
   with the true vy.
-- The covariance of a pose is, here, that of a perturbation in the body's axes; ROS wants that of x, y in the axes of `odom`
+- The covariance of a pose is, here, that of a perturbation in the body's axes; ROS defines it as that of x, y in the axes of `odom`
   (REP-103, nav_msgs/Odometry). The block of x, y, yaw is therefore turned by the heading. The covariance of a twist stays in
   the body's axes, in both.
 - What planar motion does not estimate (z, roll, pitch and their rates) is zero with a variance of `UNKNOWN_VARIANCE`, and so is
-  every variance of an estimate without covariance: robot_localization and its like then take nothing from it.
+  every variance of an estimate without covariance: robot_localization and similar filters then give it no weight.
 - `/tf` carries the transform to `base_link` of one result only, for a frame can have only one parent.
 """
 
@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from rosbags.interfaces import Connection
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.stores.ros2_humble import builtin_interfaces__msg__Time as Time
@@ -44,7 +45,7 @@ from localization.output import output_errors, refuse_existing
 from motion_models.se2 import FloatArray
 
 UNKNOWN_VARIANCE = 1e6
-"""Variance of what is not estimated [m^2, rad^2, and per s^2]: the number that ROS's own drivers use for "do not use this"."""
+"""Variance of what is not estimated [m^2, rad^2, and per s^2]: ROS drivers' convention for values without information."""
 
 PARENT_FRAME = "odom"
 MAP_FRAME = "map"
@@ -62,7 +63,7 @@ _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))  # x, y, yaw among x, y, z, roll, pitch, 
 
 @dataclass(frozen=True)
 class FusedEstimate:
-    """Where one estimator says the body is, and how it moves."""
+    """Pose and twist of one estimator at one moment."""
 
     stamp_ns: int
     pose: FloatArray
@@ -89,7 +90,7 @@ def write_fused(path: str | Path, results: Mapping[str, Iterable[FusedEstimate]]
     do not rise.
     """
     path = Path(path)
-    tf_of = _checked_names(results, tf_of)
+    tf_of = _check_names(results, tf_of)
     if path.suffix != ".mcap":
         raise OutputError(f"output '{path}': the fused log is an MCAP file; give it a name that ends in .mcap.")
     refuse_existing(path)
@@ -115,14 +116,13 @@ def _write_bag(bag: Path, path: Path, results: Mapping[str, Iterable[FusedEstima
         connections = {name: writer.add_connection(f"/{name}/odometry", _ODOMETRY, typestore=_STORE) for name in results}
         tf = writer.add_connection("/tf", _TF, typestore=_STORE)
         count = 0
-        for name, estimate in heapq.merge(*(_checked(*item) for item in results.items()), key=lambda item: item[1].stamp_ns):
+        for name, estimate in heapq.merge(*(_check_estimates(*item) for item in results.items()), key=lambda item: item[1].stamp_ns):
             count += 1
             messages = [(connections[name], _STORE.serialize_cdr(odometry_message(estimate), _ODOMETRY))]
             if name == tf_of:
                 messages.append((tf, _STORE.serialize_cdr(transform_message(estimate), _TF)))
-            with output_errors(path):
-                for connection, data in messages:
-                    writer.write(connection, estimate.stamp_ns, data)
+            for connection, data in messages:
+                _write(writer, path, connection, estimate.stamp_ns, data)
         if not count:
             raise OutputError(f"output '{path}': there is nothing to write: no estimates in {', '.join(results)}.")
         with output_errors(path):
@@ -130,6 +130,11 @@ def _write_bag(bag: Path, path: Path, results: Mapping[str, Iterable[FusedEstima
     except BaseException:
         writer.abort()
         raise
+
+
+def _write(writer: Writer, path: Path, connection: Connection, stamp_ns: int, data: bytes | memoryview) -> None:
+    with output_errors(path):
+        writer.write(connection, stamp_ns, data)
 
 
 def odometry_message(estimate: FusedEstimate) -> Odometry:
@@ -185,7 +190,7 @@ def _heading(theta: float) -> Quaternion:
     return Quaternion(x=0.0, y=0.0, z=math.sin(theta / 2), w=math.cos(theta / 2))
 
 
-def _checked(name: str, estimates: Iterable[FusedEstimate]) -> Iterator[tuple[str, FusedEstimate]]:
+def _check_estimates(name: str, estimates: Iterable[FusedEstimate]) -> Iterator[tuple[str, FusedEstimate]]:
     """The estimates with their result's name. Raises `OutputError` at the first that no message should carry."""
     last_ns = -1
     for estimate in estimates:
@@ -200,12 +205,11 @@ def _checked(name: str, estimates: Iterable[FusedEstimate]) -> Iterator[tuple[st
         _check_values("pose", estimate.pose, (3,), where)
         _check_values("twist", estimate.twist, (3,), where)
         for what, covariance in (("covariance", estimate.covariance), ("twist covariance", estimate.twist_covariance)):
-            if covariance is not None:
-                _check_values(what, covariance, (3, 3), where)
-                if min(covariance[0, 0], covariance[1, 1], covariance[2, 2]) < -_ROUNDING:
-                    raise OutputError(
-                        f"{where}: the {what} has a negative variance, {np.diag(covariance).tolist()}: the estimator has failed."
-                    )
+            if covariance is None:
+                continue
+            _check_values(what, covariance, (3, 3), where)
+            if min(covariance[0, 0], covariance[1, 1], covariance[2, 2]) < -_ROUNDING:
+                raise OutputError(f"{where}: the {what} has a negative variance, {np.diag(covariance).tolist()}: the estimator has failed.")
         yield name, estimate
 
 
@@ -218,7 +222,7 @@ def _check_values(what: str, values: FloatArray, shape: tuple[int, ...], where: 
         )
 
 
-def _checked_names(results: Mapping[str, Iterable[FusedEstimate]], tf_of: str | None) -> str:
+def _check_names(results: Mapping[str, Iterable[FusedEstimate]], tf_of: str | None) -> str:
     """The name of the result that goes to /tf."""
     if not results:
         raise OutputError("there is no result to write; give at least one.")

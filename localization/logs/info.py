@@ -7,18 +7,16 @@ import heapq
 import statistics
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from localization.logs.topics import REFERENCE_TYPES, TYPES, TopicSource, short_type
-
-if TYPE_CHECKING:
-    from localization.logs.reader import Log
+from localization.logs.reader import Log
+from localization.logs.topic_roles import REFERENCE_TYPES, TYPES, TopicSource, short_type
 
 _STAMPED = {*TYPES.values(), *REFERENCE_TYPES}
-_GAP_PERIODS, _SHORTEST_GAP_S, _MOST_GAPS = 5.0, 0.25, 10
-_TYPICAL_OF = 200
-_CLOCK_LIMIT_S = 10.0
-_UNEVEN_S = 2.0
+_GAP_PERIODS, _MIN_GAP_S, _MAX_GAPS = 5.0, 0.25, 10
+_PERIOD_MESSAGES = 200
+_MAX_CLOCK_OFFSET_S = 10.0
+_MAX_UNEVEN_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -32,14 +30,14 @@ class Gap:
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """One topic. Stamps are those of the headers where the type is one that this library knows, else null."""
+    """One topic. Stamps are those of the headers where the type is supported, else null."""
 
     topic: str
     type: str
     count: int
     rate_hz: float | None
     used_as: str | None
-    """The part that it plays: wheels, lidar, imu, center_of_gravity, arms, reference; or null."""
+    """Its role: wheels, lidar, imu, center_of_gravity, arms, reference; or null."""
     frame_id: str | None
     first_stamp_ns: int | None
     last_stamp_ns: int | None
@@ -52,7 +50,7 @@ class TopicInfo:
 
 @dataclass(frozen=True)
 class LogInfo:
-    """What `skidloc info` prints."""
+    """Content of `skidloc info`."""
 
     log: str
     robot: str
@@ -63,7 +61,7 @@ class LogInfo:
     messages: int
     topics: list[TopicInfo]
     parts: dict[str, dict[str, str] | None]
-    """By part (wheels, lidar, imu, center_of_gravity): topic, kind, and what chose it; null where nothing plays it. A centre of gravity
+    """By role (wheels, lidar, imu, center_of_gravity): topic, kind, and what chose it; null where no topic has it. A centre of gravity
     that is computed from the arms has their joint states' topics, and is chosen by "arms"."""
     references: list[str]
     """Topics that a result can be scored against."""
@@ -79,7 +77,7 @@ class LogInfo:
         return dataclasses.asdict(self)
 
 
-class _Statistics:
+class _StampStats:
     """Stamps of one topic, in constant memory."""
 
     def __init__(self) -> None:
@@ -106,9 +104,9 @@ class _Statistics:
         self.last = stamp
         step = stamp - self._newest
         if step > 0:
-            if len(self._periods) < _TYPICAL_OF:
+            if len(self._periods) < _PERIOD_MESSAGES:
                 self._periods.append(step)
-            (heapq.heappush if len(self._longest) < _MOST_GAPS else heapq.heappushpop)(self._longest, (step, self._newest))
+            (heapq.heappush if len(self._longest) < _MAX_GAPS else heapq.heappushpop)(self._longest, (step, self._newest))
             self._newest = stamp
 
     def rate_hz(self) -> float | None:
@@ -118,7 +116,7 @@ class _Statistics:
     def gaps(self, start_ns: int) -> list[Gap]:
         if not self._periods:
             return []
-        limit = max(_GAP_PERIODS * statistics.median(self._periods), _SHORTEST_GAP_S * 1e9)
+        limit = max(_GAP_PERIODS * statistics.median(self._periods), _MIN_GAP_S * 1e9)
         found = sorted((begin, step) for step, begin in self._longest if step > limit)
         return [Gap((begin - start_ns) * 1e-9, step * 1e-9) for begin, step in found]
 
@@ -126,28 +124,28 @@ class _Statistics:
 def inspect_log(log: Log) -> LogInfo:
     """Go through the log once, reading no more of a message than its header."""
     stamped = [channel.topic for channel in log.channels if channel.type in _STAMPED]
-    statistics_of = {topic: _Statistics() for topic in stamped}
+    stats_of = {topic: _StampStats() for topic in stamped}
     for raw in log.source.messages(stamped) if stamped else ():
         if raw.type not in _STAMPED:
             continue
-        statistics_of[raw.topic].add(raw.log_ns, header_stamp_ns(raw.data, is_ros1=log.source.is_ros1))
+        stats_of[raw.topic].add(raw.log_ns, header_stamp_ns(raw.data, is_ros1=log.source.is_ros1))
     parts = {
         "wheels": log.sources.wheels,
         "lidar": log.sources.lidar,
         "imu": log.sources.imu,
         "center_of_gravity": log.sources.center_of_gravity,
     }
-    played = {source.topic: part for part, source in parts.items() if source is not None}
+    role_of = {source.topic: part for part, source in parts.items() if source is not None}
     for source in log.sources.arms:
-        played.setdefault(source.topic, "arms")
+        role_of.setdefault(source.topic, "arms")
     if log.sources.arms:
         topics_of_arms = ", ".join(source.topic for source in log.sources.arms)
         parts["center_of_gravity"] = TopicSource(topics_of_arms, "joint_states", "arms")
     if log.reference_topic is not None:
-        played.setdefault(log.reference_topic, "reference")
+        role_of.setdefault(log.reference_topic, "reference")
     topics = []
     for channel in sorted(log.channels, key=lambda c: c.topic):
-        known = statistics_of.get(channel.topic, _Statistics())
+        known = stats_of.get(channel.topic, _StampStats())
         rate = known.rate_hz() if known.count else (channel.count / log.duration_s if log.duration_s > 0 else None)
         topics.append(
             TopicInfo(
@@ -155,7 +153,7 @@ def inspect_log(log: Log) -> LogInfo:
                 short_type(channel.type),
                 channel.count,
                 rate,
-                played.get(channel.topic) if log.types[channel.topic] == channel.type else None,
+                role_of.get(channel.topic) if log.types[channel.topic] == channel.type else None,
                 log.frames.get(channel.topic),
                 known.first,
                 known.last if known.first is not None else None,
@@ -175,9 +173,9 @@ def inspect_log(log: Log) -> LogInfo:
         sum(channel.count for channel in log.channels),
         topics,
         {part: None if source is None else dataclasses.asdict(source) for part, source in parts.items()},
-        sorted(c.topic for c in log.channels if c.type in REFERENCE_TYPES and c.count and played.get(c.topic) != "wheels"),
+        sorted(c.topic for c in log.channels if c.type in REFERENCE_TYPES and c.count and role_of.get(c.topic) != "wheels"),
         {frame: dataclasses.asdict(mount) for frame, mount in sorted(mounts.items())},
-        _problems(log, topics),
+        _find_problems(log, topics),
         log.warnings(),
     )
 
@@ -185,7 +183,7 @@ def inspect_log(log: Log) -> LogInfo:
 def header_stamp_ns(data: bytes, *, is_ros1: bool) -> int:
     """Stamp of a message that begins with a header, without decoding the rest; 0 if it is too short.
 
-    Four bytes come before it in both: the sequence number in ROS 1, the encapsulation, which tells the byte order, in ROS 2.
+    Four bytes come before it in both: the sequence number in ROS 1, the encapsulation, which has the byte order, in ROS 2.
     """
     if len(data) < 12:
         return 0
@@ -194,32 +192,32 @@ def header_stamp_ns(data: bytes, *, is_ros1: bool) -> int:
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
-def _problems(log: Log, topics: list[TopicInfo]) -> list[str]:
-    said: list[str] = []
+def _find_problems(log: Log, topics: list[TopicInfo]) -> list[str]:
+    found: list[str] = []
     wanted = log.robot.topics
     if log.wheels_error is not None:
-        said.append(str(log.wheels_error))
+        found.append(str(log.wheels_error))
     elif log.sources.wheels is None:
-        said.append(
+        found.append(
             f"no wheels: neither joint states ({wanted.joint_states}) nor the driver's odometry ({wanted.odometry}) are in the log."
         )
     if log.sources.lidar is None:
-        said.append(f"no LiDAR: neither a planar scan ({wanted.scan}) nor a point cloud ({wanted.points}) is in the log.")
+        found.append(f"no LiDAR: neither a planar scan ({wanted.scan}) nor a point cloud ({wanted.points}) is in the log.")
     if log.sources.imu is None:
-        said.append(f"no IMU ({wanted.imu}) is in the log: the yaw rate comes from the wheels and the LiDAR alone.")
+        found.append(f"no IMU ({wanted.imu}) is in the log: the yaw rate comes from the wheels and the LiDAR alone.")
     for source in (log.sources.lidar, log.sources.imu):
         frame = log.frames.get(source.topic) if source is not None else None
         if source is not None and frame is not None and frame not in log.mounts:
-            said.append(
-                f"{source.topic} is measured in frame '{frame}', whose place on the robot neither the log's /tf_static nor the robot"
-                f" file tells; add [mounts.{frame}] to the robot file."
+            found.append(
+                f"{source.topic} is measured in frame '{frame}', whose pose on the robot is neither in the log's /tf_static nor in the"
+                f" robot file; add [mounts.{frame}] to the robot file."
             )
     if log.robot.arms is not None and log.sources.center_of_gravity is None and not log.sources.arms:
-        said.append(
-            f"robot '{log.robot.name}' has arms, but no joint states tell how they stand: the centre of gravity stays at"
+        found.append(
+            f"robot '{log.robot.name}' has arms, but no joint states have their angles: the centre of gravity stays at"
             f" ({log.robot.geometry.cg_x_m:g}, {log.robot.geometry.cg_y_m:g}) m."
         )
-    said += _uneven(log, topics)
+    found += _find_uneven_spans(log, topics)
     used = [topic for topic in topics if topic.used_as in ("wheels", "lidar", "imu", "center_of_gravity", "arms")]
     for topic in used:
         for count, what in (
@@ -228,31 +226,31 @@ def _problems(log: Log, topics: list[TopicInfo]) -> list[str]:
             (topic.repeated_stamps, "repeat the stamp of the one before"),
         ):
             if count:
-                said.append(f"{topic.topic}: {count} of {topic.count} messages {what}.")
-        if topic.first_stamp_ns is not None and abs(topic.first_stamp_ns - log.start_ns) * 1e-9 > log.duration_s + _CLOCK_LIMIT_S:
+                found.append(f"{topic.topic}: {count} of {topic.count} messages {what}.")
+        if topic.first_stamp_ns is not None and abs(topic.first_stamp_ns - log.start_ns) * 1e-9 > log.duration_s + _MAX_CLOCK_OFFSET_S:
             apart = (topic.first_stamp_ns - log.start_ns) * 1e-9
-            said.append(f"{topic.topic}: its stamps are {abs(apart):.0f} s {'after' if apart > 0 else 'before'} the time of recording.")
+            found.append(f"{topic.topic}: its stamps are {abs(apart):.0f} s {'after' if apart > 0 else 'before'} the time of recording.")
         if topic.gaps:
             longest = max(topic.gaps, key=lambda gap: gap.duration_s)
-            said.append(
+            found.append(
                 f"{topic.topic}: {len(topic.gaps)} gap{'s' if len(topic.gaps) > 1 else ''}, the longest {longest.duration_s:.2f} s long,"
                 f" {longest.at_s:.1f} s after its first message."
             )
-    return said
+    return found
 
 
-def _uneven(log: Log, topics: list[TopicInfo]) -> list[str]:
+def _find_uneven_spans(log: Log, topics: list[TopicInfo]) -> list[str]:
     """Sensors that begin after or end before the others."""
     spans = [(t, t.first_stamp_ns, t.last_stamp_ns) for t in topics if t.used_as in ("wheels", "lidar", "imu")]
     known = [(t, first, last) for t, first, last in spans if first is not None and last is not None]
     if len(known) < 2:
         return []
     begin, end = min(first for _, first, _ in known), max(last for _, _, last in known)
-    if end - begin > (log.end_ns - log.start_ns) + _CLOCK_LIMIT_S * 1e9:
-        return []  # their clocks differ, which is told elsewhere
-    said = []
+    if end - begin > (log.end_ns - log.start_ns) + _MAX_CLOCK_OFFSET_S * 1e9:
+        return []  # their clocks differ, reported elsewhere
+    found = []
     for topic, first, last in known:
         for apart_s, what in (((first - begin) * 1e-9, "begins {:.1f} s after"), ((end - last) * 1e-9, "ends {:.1f} s before")):
-            if apart_s > _UNEVEN_S:
-                said.append(f"{topic.topic} {what.format(apart_s)} the other sensors.")
-    return said
+            if apart_s > _MAX_UNEVEN_S:
+                found.append(f"{topic.topic} {what.format(apart_s)} the other sensors.")
+    return found

@@ -20,15 +20,15 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.typesys.msg import normalize_msgtype
 
 from localization.errors import LogError
-from localization.logs.chunks import Channel, Chunk, DamagedError, RawMessage, decompress, decompress_head, in_log_order, inflate_message
+from localization.logs.chunks import Channel, Chunk, DamagedError, RawMessage, decompress, decompress_head, decompress_message, in_log_order
 
 MAGIC = b"\x89MCAP0\r\n"
 
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _CHUNK_INDEX, _STATISTICS = 2, 3, 4, 5, 6, 8, 11
-_RUN = 1 << 20
-_PIECE = 1 << 20
+_RUN_BYTES = 1 << 20
+_READ_BYTES = 1 << 20
 _FOOTER_BYTES = 37  # with the magic that ends the file
-_LONGEST_DESCRIPTION = 16 << 20  # bytes of a schema, channel or index record; a message's definition has some kB, a chunk's index too
+_MAX_DESCRIPTION_BYTES = 16 << 20  # bytes of a schema, channel or index record; a message's definition has some kB, a chunk's index too
 _FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
     "ros1msg": MessageDefinitionFormat.MSG,
@@ -90,7 +90,7 @@ class McapFile:
                 if len(entries) < sum(chunk.counts.values()) or damage:
                     self._report(chunk, len(entries), damage or "its index lists more")
                 return [
-                    RawMessage(log_ns, wanted[key].name, wanted[key].type, inflate_message(data))
+                    RawMessage(log_ns, wanted[key].name, wanted[key].type, decompress_message(data))
                     for key, log_ns, data in entries
                     if key in wanted
                 ]
@@ -125,7 +125,7 @@ class McapFile:
         if crc and _checksum(file, first, end + 25) != crc:  # the footer up to the checksum itself is part of it
             raise DamagedError("the checksum of its index is wrong")
         listed = None
-        for op, record in _described(file, first, end):
+        for op, record in _index_records(file, first, end):
             if op in (_SCHEMA, _CHANNEL):
                 self._describe(op, record)
             elif op == _CHUNK_INDEX:
@@ -150,7 +150,7 @@ class McapFile:
             whole = position + 9 + size <= end
             if op == _FOOTER or op == 0:
                 break
-            if op in (_SCHEMA, _CHANNEL) and whole and size <= _LONGEST_DESCRIPTION:
+            if op in (_SCHEMA, _CHANNEL) and whole and size <= _MAX_DESCRIPTION_BYTES:
                 self._describe(op, file.read(size))
             elif op == _MESSAGE and whole and size >= 22:
                 self._add_to_run(position, 9 + size, file.read(22))
@@ -177,7 +177,7 @@ class McapFile:
     def _add_to_run(self, position: int, size: int, head: bytes) -> None:
         key, _, log_ns, _ = struct.unpack("<HIQQ", head)
         run = self._run
-        if run is not None and (run.position + run.size != position or run.size > _RUN):
+        if run is not None and (run.position + run.size != position or run.size > _RUN_BYTES):
             self._end_run()
             run = None
         if run is None:
@@ -194,8 +194,8 @@ class McapFile:
     def _entries(self, record: bytes) -> tuple[list[Entry], str]:
         """Messages of a chunk record or of a run of messages, as far as they are whole, and what is damaged, or nothing.
 
-        Topics that it describes are taken in. A chunk that is cut off gives what it has. Of a compressed chunk that is damaged nothing is
-        believed, of an uncompressed one what looks like messages.
+        Topics that it describes are taken in. A chunk that is cut off gives what it has. A damaged compressed chunk is
+        dropped; in a damaged uncompressed one messages are searched for.
         """
         if record[:1] != bytes([_CHUNK]):
             return _whole_messages(record), ""
@@ -258,12 +258,12 @@ class McapFile:
 def _checksum(file: BinaryIO, first: int, end: int) -> int:
     file.seek(first)
     crc, left = 0, end - first
-    while left > 0 and (piece := file.read(min(left, _PIECE))):
+    while left > 0 and (piece := file.read(min(left, _READ_BYTES))):
         crc, left = crc32(piece, crc), left - len(piece)
     return crc
 
 
-def _described(file: BinaryIO, first: int, end: int) -> Iterator[tuple[int, bytes]]:
+def _index_records(file: BinaryIO, first: int, end: int) -> Iterator[tuple[int, bytes]]:
     """The records between two places of a file, but for those that describe nothing. Raises `DamagedError` and `struct.error`."""
     position = first
     while position < end:
@@ -273,13 +273,13 @@ def _described(file: BinaryIO, first: int, end: int) -> Iterator[tuple[int, byte
         if position > end:
             raise DamagedError("its index breaks off")
         if op in (_SCHEMA, _CHANNEL, _CHUNK_INDEX, _STATISTICS):
-            if size > _LONGEST_DESCRIPTION:
+            if size > _MAX_DESCRIPTION_BYTES:
                 raise DamagedError("its index holds a record that is too long")
             yield op, file.read(size)
 
 
 def _indexed_chunk(record: bytes, end: int) -> Chunk:
-    """What a chunk's index record says of it, if it lies before ``end``. Raises `DamagedError` and `struct.error`.
+    """Content of a chunk's index record, if the chunk lies before ``end``. Raises `DamagedError` and `struct.error`.
 
     Messages are counted by the lengths of their channels' index records, which follow the chunk: 15 bytes and 16 for each message.
     """

@@ -1,4 +1,4 @@
-"""Counts of what was lost or mended while a log was read, as sentences."""
+"""Counts of messages that were dropped or corrected while a log was read, and their descriptions."""
 
 from __future__ import annotations
 
@@ -29,10 +29,19 @@ class Oddity(Enum):
     TIPPING_CG = "with a centre of gravity at which the robot would tip over (not in metres, or not from base_link?); it was left out"
     WHEEL_RATE = "with rates that wheels cannot reach; these were left out"
     SECOND_PUBLISHER = "of a second publisher whose wheels turn less, left out; stop one of the two (`ros2 topic info --verbose`)"
+    FROZEN_WHEEL = "with an angle that never changes while another wheel of its side turns; it was left out (check its encoder)"
     WHEEL_JUMP = "with a wheel angle that wheels cannot reach (a reset); the increment was taken from the rates"
 
 
-class Tally:
+class UnusableError(Exception):
+    """A message without usable content. Raised and caught within this package."""
+
+    def __init__(self, oddity: Oddity) -> None:
+        super().__init__(oddity.value)
+        self.oddity = oddity
+
+
+class MessageStats:
     """Counts by topic and oddity."""
 
     def __init__(self) -> None:
@@ -44,6 +53,6 @@ class Tally:
     def of(self, topic: str, oddity: Oddity) -> int:
         return self._counts[topic, oddity]
 
-    def sentences(self) -> list[str]:
+    def describe(self) -> list[str]:
         ordered = sorted(self._counts.items(), key=lambda entry: (entry[0][0], list(Oddity).index(entry[0][1])))
         return [f"{topic}: {n} message{'s' if n > 1 else ''} {oddity.value}." for (topic, oddity), n in ordered if n]

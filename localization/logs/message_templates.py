@@ -1,4 +1,4 @@
-"""Messages of fixed shape as bytes: a message is serialised once by rosbags, and of all others only the numbers are put in place.
+"""Templates of messages with a fixed layout: rosbags serializes one message, and for all others only the numbers are written in place.
 
 rosbags takes some 50 us to serialise a message object; a simulator writes hundreds of them for each second that it may take 10 ms for.
 """
@@ -26,17 +26,17 @@ Array = NDArray[Any]
 
 
 class Message(NamedTuple):
-    """One message: which form, when it was sent, the stamp in its header, and the numbers in the order of the form's parts."""
+    """One message: its layout, time of sending, header stamp, and numbers in the order of the layout's parts."""
 
-    form: Form
+    layout: MessageLayout
     log_ns: int
     stamp_ns: int
     parts: tuple[Array, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Form:
-    """What all messages of a topic have in common."""
+class MessageLayout:
+    """Common layout of all messages of a topic."""
 
     topic: str
     type: str
@@ -49,10 +49,10 @@ class Form:
 class Template:
     """The bytes of a form's messages, in the encoding of ROS 2 (CDR) or of ROS 1."""
 
-    def __init__(self, form: Form, *, is_ros1: bool) -> None:
-        marks = [_marks(kind, count, number) for number, (kind, count) in enumerate(form.shapes)]
-        data = STORE.serialize_cdr(form.build(_T["builtin_interfaces/msg/Time"](*_STAMP), *marks), form.type)
-        data = STORE.cdr_to_ros1(data, form.type) if is_ros1 else data
+    def __init__(self, layout: MessageLayout, *, is_ros1: bool) -> None:
+        marks = [_marks(kind, count, number) for number, (kind, count) in enumerate(layout.shapes)]
+        data = STORE.serialize_cdr(layout.build(_T["builtin_interfaces/msg/Time"](*_STAMP), *marks), layout.type)
+        data = STORE.cdr_to_ros1(data, layout.type) if is_ros1 else data
         self._bytes = bytes(data)
         stamp = struct.pack("<II", *_STAMP)
         self._stamps = [i for i in range(len(self._bytes) - 7) if self._bytes[i : i + 8] == stamp]
@@ -97,7 +97,7 @@ def _quaternion(values: Sequence[float] | Array) -> Any:
     return _T["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
 
 
-def joint_states(topic: str, names: Sequence[str]) -> Form:
+def joint_states(topic: str, names: Sequence[str]) -> MessageLayout:
     """Parts: positions [rad] and velocities [rad/s] of ``names``."""
 
     def build(stamp: Any, position: Array, velocity: Array) -> Any:
@@ -105,12 +105,12 @@ def joint_states(topic: str, names: Sequence[str]) -> Form:
         return kind(header=_header(stamp, ""), name=list(names), position=position, velocity=velocity, effort=np.zeros(0))
 
     n = len(names)
-    return Form(topic, "sensor_msgs/msg/JointState", (("f8", n), ("f8", n)), build)
+    return MessageLayout(topic, "sensor_msgs/msg/JointState", (("f8", n), ("f8", n)), build)
 
 
 def laser_scan(
     topic: str, frame: str, beams: int, angles: tuple[float, float], times: tuple[float, float], ranges: tuple[float, float]
-) -> Form:
+) -> MessageLayout:
     """Part: ranges [m]. ``angles``: of the first beam and from beam to beam [rad]; ``times``: from beam to beam and from scan to scan [s];
     ``ranges``: least and greatest [m]."""
 
@@ -128,11 +128,11 @@ def laser_scan(
             intensities=np.zeros(0, dtype=np.float32),
         )
 
-    return Form(topic, "sensor_msgs/msg/LaserScan", (("f4", beams),), build)
+    return MessageLayout(topic, "sensor_msgs/msg/LaserScan", (("f4", beams),), build)
 
 
-def point_cloud(topic: str, frame: str, height: int, width: int, fields: Mapping[str, str]) -> Form:
-    """Part: the points' bytes, packed as ``fields`` (numpy's type by name) say."""
+def point_cloud(topic: str, frame: str, height: int, width: int, fields: Mapping[str, str]) -> MessageLayout:
+    """Part: the points' bytes, packed as ``fields`` (numpy's type by name)."""
     codes = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
     layout, step = [], 0
     for name, kind in fields.items():
@@ -152,10 +152,10 @@ def point_cloud(topic: str, frame: str, height: int, width: int, fields: Mapping
             is_dense=False,
         )
 
-    return Form(topic, "sensor_msgs/msg/PointCloud2", (("u1", step * height * width),), build)
+    return MessageLayout(topic, "sensor_msgs/msg/PointCloud2", (("u1", step * height * width),), build)
 
 
-def imu(topic: str, frame: str, rate_variance: float, force_variance: float) -> Form:
+def imu(topic: str, frame: str, rate_variance: float, force_variance: float) -> MessageLayout:
     """Parts: angular velocity (3) [rad/s], specific force (3) [m/s^2]. It has no orientation (REP-145: -1)."""
 
     def build(stamp: Any, rate: Array, force: Array) -> Any:
@@ -169,10 +169,10 @@ def imu(topic: str, frame: str, rate_variance: float, force_variance: float) -> 
             linear_acceleration_covariance=np.diag(np.full(3, force_variance)).ravel(),
         )
 
-    return Form(topic, "sensor_msgs/msg/Imu", (("f8", 3), ("f8", 3)), build)
+    return MessageLayout(topic, "sensor_msgs/msg/Imu", (("f8", 3), ("f8", 3)), build)
 
 
-def fix(topic: str, frame: str, variances: Sequence[float]) -> Form:
+def fix(topic: str, frame: str, variances: Sequence[float]) -> MessageLayout:
     """Part: latitude, longitude [degrees], altitude [m]. ``variances`` east, north, up [m^2]."""
 
     def build(stamp: Any, place: Array) -> Any:
@@ -186,11 +186,11 @@ def fix(topic: str, frame: str, variances: Sequence[float]) -> Form:
             position_covariance_type=2,
         )
 
-    return Form(topic, "sensor_msgs/msg/NavSatFix", (("f8", 3),), build)
+    return MessageLayout(topic, "sensor_msgs/msg/NavSatFix", (("f8", 3),), build)
 
 
-def odometry(topic: str, frame: str, child: str) -> Form:
-    """Parts: x, y; z and w of the heading's quaternion; vx, vy and wz of the body. Covariances are zero: it is the truth."""
+def odometry(topic: str, frame: str, child: str) -> MessageLayout:
+    """Parts: x, y; z and w of the heading's quaternion; vx, vy and wz of the body. Covariances are zero: they are exact."""
 
     def build(stamp: Any, place: Array, heading: Array, speed: Array, turn: Array) -> Any:
         pose = _T["geometry_msgs/msg/Pose"](position=_point((*place, 0)), orientation=_quaternion((0, 0, *heading)))
@@ -202,19 +202,19 @@ def odometry(topic: str, frame: str, child: str) -> Form:
             twist=_T["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
         )
 
-    return Form(topic, "nav_msgs/msg/Odometry", (("f8", 2), ("f8", 2), ("f8", 2), ("f8", 1)), build)
+    return MessageLayout(topic, "nav_msgs/msg/Odometry", (("f8", 2), ("f8", 2), ("f8", 2), ("f8", 1)), build)
 
 
-def point(topic: str, frame: str) -> Form:
+def point(topic: str, frame: str) -> MessageLayout:
     """Part: x, y, z [m]."""
 
     def build(stamp: Any, place: Array) -> Any:
         return _T["geometry_msgs/msg/PointStamped"](header=_header(stamp, frame), point=_point(place))
 
-    return Form(topic, "geometry_msgs/msg/PointStamped", (("f8", 3),), build)
+    return MessageLayout(topic, "geometry_msgs/msg/PointStamped", (("f8", 3),), build)
 
 
-def transforms(topic: str, edges: Sequence[tuple[str, str, Sequence[float], Sequence[float]]]) -> Form:
+def transforms(topic: str, edges: Sequence[tuple[str, str, Sequence[float], Sequence[float]]]) -> MessageLayout:
     """No parts. ``edges``: parent, child, translation [m], quaternion x, y, z, w."""
 
     def build(stamp: Any) -> Any:
@@ -222,11 +222,11 @@ def transforms(topic: str, edges: Sequence[tuple[str, str, Sequence[float], Sequ
         found = [kind(_header(stamp, a), b, inner(translation=_vector(t), rotation=_quaternion(q))) for a, b, t, q in edges]
         return _T["tf2_msgs/msg/TFMessage"](transforms=found)
 
-    return Form(topic, "tf2_msgs/msg/TFMessage", (), build)
+    return MessageLayout(topic, "tf2_msgs/msg/TFMessage", (), build)
 
 
-def text(topic: str, length: int) -> Form:
+def text(topic: str, length: int) -> MessageLayout:
     """Part: the bytes (UTF-8) of a text of ``length``."""
-    return Form(
+    return MessageLayout(
         topic, "std_msgs/msg/String", (("u1", length),), lambda stamp, data: _T["std_msgs/msg/String"](data=data.tobytes().decode())
     )

@@ -1,4 +1,4 @@
-"""A log as the rest of the library sees it: events, references, mounts, and what was odd."""
+"""A log: its events, references, sensor mounts, and warnings about its messages."""
 
 from __future__ import annotations
 
@@ -11,21 +11,20 @@ from localization.errors import LogError, TopicError
 from localization.events import Event, Reference
 from localization.logs.chunks import Source, merge_channels
 from localization.logs.clock_sync import ClockPlan, Item, merge, plan_clocks
-from localization.logs.decode import Decoder, UnusableError, frame_name, stamp_ns
-from localization.logs.event_decoder import Intake, Part, read_item
-from localization.logs.info import LogInfo, inspect_log
-from localization.logs.message_stats import Tally
+from localization.logs.decode import frame_name, stamp_ns
+from localization.logs.event_decoder import EventDecoder, TopicDecoder, decode_item
+from localization.logs.message_stats import MessageStats, UnusableError
 from localization.logs.references import reference_decoder
+from localization.logs.serialization import Decoder
 from localization.logs.sources import open_source
-from localization.logs.topic_roles import choose_parts
-from localization.logs.topics import REFERENCE_TYPES, TopicChooser, TopicOverrides
+from localization.logs.topic_roles import REFERENCE_TYPES, TopicChooser, TopicOverrides, choose_roles
 from localization.logs.transforms import FixedTransforms
 from motion_models.robot import Mount, Robot
 
 _GPS = "/fix"
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_TF_WATCHED_NS = 10_000_000_000
-_JOINT_STATES_SEEN = 500
+_TF_READ_NS = 10_000_000_000
+_JOINT_STATES_READ = 500
 
 
 def open_log(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> Log:  # noqa: B008 (frozen)
@@ -62,19 +61,19 @@ class Log:
         """Type of each topic."""
         for channel in sorted(self.channels, key=lambda c: -c.count):  # of a topic with two types, the more frequent one counts
             self.types.setdefault(channel.topic, channel.type)
-        self._tallies: dict[str, Tally] = {}
+        self._stats_by_topic: dict[str, MessageStats] = {}
         self._overrides = topics
         self._chooser = TopicChooser(path.name, self.channels, robot, topics)
-        parts = choose_parts(path.name, self._chooser, robot, topics, self._joint_names)
-        self.sources = parts.sources
-        """Which topic plays which part."""
-        self.wheels_error = parts.wheels_error
+        roles = choose_roles(path.name, self._chooser, robot, topics, self._joint_names)
+        self.sources = roles.sources
+        """Topic of each role."""
+        self.wheels_error = roles.wheels_error
         """Why `events` will refuse, if it will."""
-        self._joints, self._arms, self._choice_notes = parts.joints, parts.arms, parts.warnings
+        self._joints, self._arms, self._choice_notes = roles.joints, roles.arms, roles.warnings
         self._mount_notes: list[str] = []
         self.frames: dict[str, str] = {}
         """Frame of the first message of each topic that is used."""
-        self._clocks = self._watch_clocks()
+        self._clocks = self._plan_event_clocks()
 
     @property
     def duration_s(self) -> float:
@@ -88,19 +87,15 @@ class Log:
         there = self._chooser.of_type(*REFERENCE_TYPES)
         return next((name for name in names if name in there), None)
 
-    def info(self) -> LogInfo:
-        """What is in the log, what will be used of it, and what is missing or suspect. Reads it once."""
-        return inspect_log(self)
-
     def events(self) -> Iterator[Event]:
         """Wheel, CG, IMU samples and scans by header stamp, never decreasing; within a topic always increasing.
 
-        Raises `TopicError` if the joint states, the only source of wheels, lack the robot's wheel joints.
+        Raises `TopicError` if the joint states, the only source of wheels, have no wheel joint of the robot.
         """
         if self.wheels_error is not None:
             raise TopicError(" ".join([str(self.wheels_error), *self.damage()]))  # what was lost may be why
-        tally = self._tallies["events"] = Tally()
-        return self._events(tally)
+        stats = self._stats_by_topic["events"] = MessageStats()
+        return self._events(stats)
 
     def references(self, topic: str) -> Iterator[Reference]:
         """Reference poses of a pose, odometry, transform or GPS topic, by header stamp. GPS: east and north of the first fix.
@@ -108,14 +103,14 @@ class Log:
         Raises `TopicError` if the log has no such topic or if it carries something else.
         """
         self._chooser.require(topic, REFERENCE_TYPES, "--reference")
-        tally = self._tallies[topic] = Tally()
+        stats = self._stats_by_topic[topic] = MessageStats()
         decode = reference_decoder(self.types[topic])
         clocks = self._clock_plan([*(s.topic for s in self.sources.used()), topic])
-        return merge(self._items({topic: (0, decode)}, tally), clocks, tally)
+        return merge(self._items({topic: TopicDecoder(0, decode)}, stats), clocks, stats)
 
     @cached_property
     def mounts(self) -> Mapping[str, Mount]:
-        """Pose of each sensor's frame in the body frame: the log's, and the robot file's for frames which the log lacks."""
+        """Pose of each sensor's frame in the body frame: the log's, and the robot file's for frames that are missing in the log."""
         transforms = FixedTransforms()
         tf = [channel for channel in self.channels if channel.type in _TF_TYPES]
         static = [channel for channel in tf if channel.topic.endswith("tf_static")]
@@ -129,7 +124,7 @@ class Log:
         if self.source.is_ros1:
             moving = [channel.topic for channel in tf if not channel.topic.endswith("tf_static")]
             for raw in self.source.messages(moving) if moving else ():
-                if raw.log_ns > self.start_ns + _TF_WATCHED_NS:
+                if raw.log_ns > self.start_ns + _TF_READ_NS:
                     break
                 _try(lambda raw=raw: transforms.add(decode(raw), is_static=False))  # type: ignore[misc]
         found = transforms.mounts()
@@ -139,26 +134,26 @@ class Log:
         return {"base_link": Mount(), **self.robot.mounts, **found}
 
     def damage(self) -> list[str]:
-        """Sentences about what of its files could not be read, and how much could, so far."""
+        """Warnings about which of its files could not be read, and how much could, so far."""
         return list(dict.fromkeys(self.source.warnings))
 
     def warnings(self) -> list[str]:
-        """Sentences about everything that was lost, mended or chosen without being told, so far: `damage` first."""
-        said = [*self.damage(), *self._mount_notes, *self._choice_notes]
-        for tally in self._tallies.values():
-            said += tally.sentences()
-        return list(dict.fromkeys(said))
+        """Warnings about everything that was lost, corrected or chosen by default so far: `damage` first."""
+        found = [*self.damage(), *self._mount_notes, *self._choice_notes]
+        for stats in self._stats_by_topic.values():
+            found += stats.describe()
+        return list(dict.fromkeys(found))
 
-    def _events(self, tally: Tally) -> Iterator[Event]:
-        intake = Intake(self.sources, self._joints, self._arms, self.robot, tally)
-        for payload in merge(self._items(intake.parts, tally), self._clocks, tally):
-            yield from intake.events(payload)
+    def _events(self, stats: MessageStats) -> Iterator[Event]:
+        decoder = EventDecoder(self.sources, self._joints, self._arms, self.robot, stats)
+        for payload in merge(self._items(decoder.decoders, stats), self._clocks, stats):
+            yield from decoder.events(payload)
 
-    def _items(self, parts: Mapping[str, Part], tally: Tally) -> Iterator[Item]:
-        decode = Decoder([c for c in self.channels if c.topic in parts], is_ros1=self.source.is_ros1)
-        for raw in self.source.messages(parts.keys()):
+    def _items(self, decoders: Mapping[str, TopicDecoder], stats: MessageStats) -> Iterator[Item]:
+        decode = Decoder([c for c in self.channels if c.topic in decoders], is_ros1=self.source.is_ros1)
+        for raw in self.source.messages(decoders.keys()):
             if raw.type == self.types[raw.topic]:
-                item = read_item(raw.topic, raw.log_ns, partial(decode, raw), parts[raw.topic], tally)
+                item = decode_item(raw.topic, raw.log_ns, partial(decode, raw), decoders[raw.topic], stats)
                 if item is not None:
                     yield item
 
@@ -176,9 +171,9 @@ class Log:
                 yield raw.log_ns, message
 
     def _joint_names(self, topic: str) -> Iterator[list[str]]:
-        return (message.name for _, message in self._first_messages(topic, _JOINT_STATES_SEEN))
+        return (message.name for _, message in self._first_messages(topic, _JOINT_STATES_READ))
 
-    def _watch_clocks(self) -> ClockPlan:
+    def _plan_event_clocks(self) -> ClockPlan:
         return self._clock_plan([source.topic for source in self.sources.used()])
 
     def _clock_plan(self, topics: list[str]) -> ClockPlan:

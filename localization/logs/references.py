@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
 
-from localization.events import Reference
-from localization.logs.decode import UnusableError, yaw_of
-from localization.logs.message_stats import Oddity
+from localization.errors import LogError
+from localization.events import Event, PositionSample, Reference
+from localization.logs.decode import yaw_of
+from localization.logs.message_stats import Oddity, UnusableError
 from motion_models.se2 import FloatArray
 
 _SEMI_MAJOR_M = 6_378_137.0
@@ -20,7 +21,7 @@ _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 
 
 def reference_decoder(kind: str) -> Callable[[Any, int], Reference]:
-    """Decoder of messages of type ``kind`` (one of `topics.REFERENCE_TYPES`); that of NavSatFix remembers the first fix."""
+    """Decoder of messages of type ``kind`` (one of `topic_roles.REFERENCE_TYPES`); that of NavSatFix keeps the first fix as origin."""
     if kind == "sensor_msgs/msg/NavSatFix":
         return _fix_decoder()
     return {
@@ -41,7 +42,7 @@ def _reference(stamp: int, position: Any, orientation: Any, covariance: Any) -> 
     cov = np.full((3, 3), np.nan)
     if covariance is not None:
         planar = np.asarray(covariance, dtype=float).reshape(6, 6)[_PLANAR]
-        # All zeros is how drivers say that they do not know.
+        # Drivers without a covariance fill in zeros.
         if np.isfinite(planar).all() and (np.diag(planar) >= 0).all() and planar.any():
             cov = planar
     return Reference(stamp, where, yaw, cov)
@@ -57,13 +58,13 @@ def _fix_decoder() -> Callable[[Any, int], Reference]:
             raise UnusableError(Oddity.NO_FIX)
         height = float(message.altitude) if math.isfinite(message.altitude) else 0.0
         latitude, longitude = np.radians(degrees)
-        here = geodetic_to_ecef(latitude, longitude, height)
+        position = geodetic_to_ecef(latitude, longitude, height)
         if origin is None:
-            origin = here, east_north(latitude, longitude)
+            origin = position, east_north(latitude, longitude)
         cov = np.full((3, 3), np.nan)
         if int(message.position_covariance_type) > 0:
             cov[:2, :2] = np.asarray(message.position_covariance, dtype=float).reshape(3, 3)[:2, :2]
-        return Reference(stamp, origin[1] @ (here - origin[0]), None, cov)
+        return Reference(stamp, origin[1] @ (position - origin[0]), None, cov)
 
     return decode
 
@@ -85,3 +86,35 @@ def east_north(latitude: float, longitude: float) -> FloatArray:
     """(2, 3) unit vectors to the east and to the north, in the earth-centred frame."""
     sin_lat, cos_lat, sin_lon, cos_lon = math.sin(latitude), math.cos(latitude), math.sin(longitude), math.cos(longitude)
     return np.array([[-sin_lon, cos_lon, 0.0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]])
+
+
+_UNKNOWN_SIGMA_M = 2.5
+"""Of a source without covariance [m]: a GPS receiver without corrections (GPS Standard Positioning Service, 2020: 95 % within 8 m)."""
+_MIN_SIGMA_M = 0.01
+"""No receiver is better, whatever its covariance [m]."""
+
+
+def read_positions(references: Iterable[Reference], source: str) -> list[PositionSample]:
+    """Positions of a topic, by stamp; those that are not finite or repeat a stamp are left out. Raises `LogError` if none is left."""
+    found: dict[int, PositionSample] = {}
+    for reference in references:
+        if not np.isfinite(reference.position).all():
+            continue
+        cov = reference.covariance[:2, :2]
+        if not np.isfinite(cov).all() or (np.linalg.eigvalsh(cov) <= 0.0).any():
+            cov = _UNKNOWN_SIGMA_M**2 * np.eye(2)
+        found.setdefault(reference.stamp_ns, PositionSample(reference.stamp_ns, reference.position, cov + _MIN_SIGMA_M**2 * np.eye(2)))
+    if not found:
+        raise LogError(f"{source} has no usable position. `skidloc info` lists the topics and what is wrong with them.")
+    return [found[stamp] for stamp in sorted(found)]
+
+
+def merge_positions(events: Iterable[Event], positions: list[PositionSample]) -> Iterator[Event]:
+    """``events``, with each position before the first event that is later."""
+    waiting = iter(positions)
+    sample = next(waiting, None)
+    for event in events:
+        while sample is not None and sample.stamp_ns <= event.stamp_ns:
+            yield sample
+            sample = next(waiting, None)
+        yield event

@@ -23,8 +23,8 @@ from localization.logs.chunks import Channel, Chunk, DamagedError, RawMessage, d
 MAGIC = b"#ROSBAG V"
 
 _MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
-_LONGEST_HEADER = 1 << 24
-_LONGEST_MESSAGE_HEADER = 64  # bytes; conn, op and time take 38
+_MAX_HEADER_BYTES = 1 << 24
+_MAX_MESSAGE_HEADER_BYTES = 64  # bytes; conn, op and time take 38
 _MESSAGE_OP = re.compile(rb"\x04\0{3}op=\x02")
 
 Fields = dict[bytes, bytes]
@@ -95,11 +95,11 @@ class Ros1Bag:
 
     def _chunk_bytes(self, file: BinaryIO, chunk: Chunk) -> bytes:
         if chunk.position >= self._size:
-            raise DamagedError("the index says that it lies beyond the end of the file")
+            raise DamagedError("by the index it lies beyond the end of the file")
         file.seek(chunk.position)
         header, size = _record_start(file)
         if header.get(b"op") != bytes([_CHUNK]):
-            raise DamagedError("there is no chunk where the index says")
+            raise DamagedError("there is no chunk at its place in the index")
         data = file.read(min(size, self._size - file.tell()))
         compression = header.get(b"compression", b"none").decode(errors="replace")
         # The last chunk of a bag that was cut off is the only one that may be short, and its messages are known to be readable.
@@ -122,19 +122,19 @@ class Ros1Bag:
         chunks: list[Chunk] = []
         for _ in range(_u32(header, b"conn_count")):
             record, size = _record_start(file)
-            key, connection = _connection(record, _exactly(file, size))
+            key, connection = _connection(record, _read_exactly(file, size))
             connections[key] = connection
         for _ in range(_u32(header, b"chunk_count")):
             record, size = _record_start(file)
             if record.get(b"op") != bytes([_CHUNK_INFO]):
                 raise DamagedError("its index breaks off")
-            pairs = struct.iter_unpack("<II", _exactly(file, size // 8 * 8))
+            pairs = struct.iter_unpack("<II", _read_exactly(file, size // 8 * 8))
             start, end = _time(record, b"start_time"), _time(record, b"end_time")
             chunks.append(Chunk(_u64(record, b"chunk_pos"), start, end, {k: n for k, n in pairs if n}))
         self._connections, self._chunks = connections, chunks
 
     def _rebuild_index(self, file: BinaryIO, first: int, reason: str) -> None:
-        """Walk through the records as far as they go, and note what that gave."""
+        """Read all records as far as possible, and report how many were found."""
         end = self._size
         file.seek(first)
         whole = first
@@ -225,25 +225,29 @@ def _record(plain: bytes, position: int) -> tuple[int, Fields, bytes, int]:
 def _next_message(plain: bytes, position: int) -> int:
     """Where a message record begins that has all its fields and lies in ``plain`` wholly; the end if there is none."""
     for found in _MESSAGE_OP.finditer(plain, position):
-        for start in range(max(found.start() - _LONGEST_MESSAGE_HEADER, position), found.start() - 3):
-            if int.from_bytes(plain[start : start + 4], "little") > _LONGEST_MESSAGE_HEADER:
-                continue
-            try:
-                op, fields, _, _ = _record(plain, start)
-                if op == _MESSAGE and fields.keys() >= {b"conn", b"time"}:
-                    return start
-            except DamagedError:
-                continue
+        for start in range(max(found.start() - _MAX_MESSAGE_HEADER_BYTES, position), found.start() - 3):
+            if _is_message(plain, start):
+                return start
     return len(plain)
+
+
+def _is_message(plain: bytes, start: int) -> bool:
+    if int.from_bytes(plain[start : start + 4], "little") > _MAX_MESSAGE_HEADER_BYTES:
+        return False
+    try:
+        op, fields, _, _ = _record(plain, start)
+    except DamagedError:
+        return False
+    return op == _MESSAGE and fields.keys() >= {b"conn", b"time"}
 
 
 def _record_start(file: BinaryIO) -> tuple[Fields, int]:
     """A record's header and the size of its body, with the file standing at the body."""
-    size = int.from_bytes(_exactly(file, 4), "little")
-    if size > _LONGEST_HEADER:
+    size = int.from_bytes(_read_exactly(file, 4), "little")
+    if size > _MAX_HEADER_BYTES:
         raise DamagedError(f"byte {file.tell() - 4} is not the start of a record")
-    header = _fields(_exactly(file, size))
-    return header, int.from_bytes(_exactly(file, 4), "little")
+    header = _fields(_read_exactly(file, size))
+    return header, int.from_bytes(_read_exactly(file, 4), "little")
 
 
 def _fields(header: bytes) -> Fields:
@@ -264,13 +268,13 @@ def _connection(header: Fields, body: bytes) -> tuple[int, _Connection]:
         raise DamagedError("a connection record is not one")
     fields = _fields(body)
     if not {b"type", b"message_definition"} <= fields.keys():
-        raise DamagedError("a connection record lacks its type")
+        raise DamagedError("a connection record has no type")
     topic = "/".join(part for part in header[b"topic"].decode(errors="replace").split("/") if part)
     kind = fields[b"type"].decode(errors="replace")
     return _u32(header, b"conn"), _Connection(f"/{topic}", normalize_msgtype(kind), fields[b"message_definition"].decode(errors="replace"))
 
 
-def _exactly(file: BinaryIO, size: int) -> bytes:
+def _read_exactly(file: BinaryIO, size: int) -> bytes:
     data = file.read(size)
     if len(data) != size:
         raise DamagedError("it breaks off in the middle of a record")

@@ -13,10 +13,10 @@ from ruamel.yaml import YAML
 
 from localization.errors import LogError
 from localization.logs import mcap, ros1, sqlite
-from localization.logs.chunks import DamagedError, RawMessage, Source, inflate_file, merge_channels
+from localization.logs.chunks import DamagedError, RawMessage, Source, decompress_file, merge_channels
 from motion_models.text_files import check_file
 
-_LONGEST_METADATA = 4 << 20
+_MAX_METADATA_BYTES = 4 << 20
 """Of metadata.yaml [B]. It has some kB for a hundred topics and 200 B for each file that a recording was split into."""
 
 
@@ -44,13 +44,13 @@ def _open_folder(path: Path) -> Source:
         return _recover_folder(path, str(error).rstrip("."))
     count = sum(channel.count for part in parts for channel in part.channels)
     lost = [f"metadata.yaml of {path.name} lists {listed} messages; its files hold {count}."] if count < listed else []
-    return Parts(parts, lost)
+    return SplitSource(parts, lost)
 
 
 def _read_metadata(path: Path) -> tuple[list[str], int]:
     """Names of the storage files, and how many messages they hold. Raises `DamagedError` and `FileNotFoundError`."""
     require_file(path)
-    if path.stat().st_size > _LONGEST_METADATA:
+    if path.stat().st_size > _MAX_METADATA_BYTES:
         raise DamagedError("metadata.yaml is longer than any recorder's")
     try:
         with warnings.catch_warnings():
@@ -68,7 +68,7 @@ def _read_metadata(path: Path) -> tuple[list[str], int]:
 
 
 def _open_part(path: Path) -> Source:
-    return Inflated(path) if path.suffix == ".zstd" else _open_file(path)
+    return DecompressedSource(path) if path.suffix == ".zstd" else _open_file(path)
 
 
 def _recover_folder(path: Path, reason: str) -> Source:
@@ -86,7 +86,7 @@ def _recover_folder(path: Path, reason: str) -> Source:
             notes.append(str(error))
     if not parts:
         raise LogError(" ".join(notes))
-    return Parts(parts, notes)
+    return SplitSource(parts, notes)
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -122,7 +122,7 @@ def _open_file(path: Path) -> Source:
         return sqlite.RecoveredSqlite(path, str(reason))
 
 
-class Inflated:
+class DecompressedSource:
     """A storage file that the recorder compressed as a whole, as much of it as can be had."""
 
     def __init__(self, path: Path) -> None:
@@ -130,7 +130,7 @@ class Inflated:
         target = Path(self._folder.name) / path.stem
         require_file(path)
         try:
-            stopped = inflate_file(path, target)
+            stopped = decompress_file(path, target)
         except OSError as error:
             where = f"'{path}' cannot be decompressed into '{self._folder.name}': {error.strerror}"
             raise LogError(f"{where}. Set TMPDIR to a folder with more room.") from error
@@ -147,7 +147,7 @@ class Inflated:
         return self._inner.messages(topics)
 
 
-class Parts:
+class SplitSource:
     """Several files one after the other, as a recorder splits a long log."""
 
     def __init__(self, parts: list[Source], notes: list[str]) -> None:

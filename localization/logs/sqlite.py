@@ -18,12 +18,12 @@ from urllib.parse import quote
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 from localization.errors import LogError
-from localization.logs.chunks import MOST_PLAIN_BYTES, Channel, DamagedError, RawMessage, inflate_message
+from localization.logs.chunks import MAX_DECOMPRESSED_BYTES, Channel, DamagedError, RawMessage, decompress_message
 
 MAGIC = b"SQLite format 3\x00"
 
 _TABLE_LEAF = 13
-_MOST_TOPICS = 100_000  # robots have tens to hundreds
+_MAX_TOPICS = 100_000  # robots have tens to hundreds
 _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
@@ -33,7 +33,7 @@ Row = tuple[int, int, bytes]
 def _connect(path: Path) -> sqlite3.Connection:
     """For reading alone. What is in a row has a bound, and functions that could do harm cannot be called by what the file holds."""
     database = sqlite3.connect(f"file:{quote(bytes(path.resolve()))}?immutable=1", uri=True)
-    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_PLAIN_BYTES)
+    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_DECOMPRESSED_BYTES)
     database.execute("PRAGMA trusted_schema=OFF")
     database.text_factory = lambda data: data.decode(errors="replace")
     return database
@@ -49,14 +49,14 @@ def _describe(database: sqlite3.Connection) -> tuple[dict[int, tuple[str, str]],
         raise DamagedError("it has no table of topics")
     if not {"topic_id", "timestamp", "data"} <= columns["messages"]:
         raise DamagedError("it has no table of messages")
-    rows = database.execute("SELECT id, name, type FROM topics ORDER BY id LIMIT ?", (_MOST_TOPICS,)).fetchall()
+    rows = database.execute("SELECT id, name, type FROM topics ORDER BY id LIMIT ?", (_MAX_TOPICS,)).fetchall()
     topics = {key: (name, kind) for key, name, kind in rows if isinstance(key, int) and isinstance(name, str) and isinstance(kind, str)}
     if not {"topic_type", "encoding", "encoded_message_definition"} <= columns["message_definitions"]:
         return topics, {}  # recordings before ROS 2 Iron have no such table
     wanted = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions LIMIT ?"
     definitions = {
         kind: MessageDefinition(_FORMATS.get(encoding, MessageDefinitionFormat.NONE), text)
-        for kind, encoding, text in database.execute(wanted, (_MOST_TOPICS,))
+        for kind, encoding, text in database.execute(wanted, (_MAX_TOPICS,))
         if isinstance(text, str)
     }
     return topics, definitions
@@ -110,7 +110,7 @@ class SqliteFile:
                 found += 1
                 if isinstance(stamp, int) and isinstance(data, bytes):
                     last = stamp
-                    yield RawMessage(stamp, *wanted[key], inflate_message(data))
+                    yield RawMessage(stamp, *wanted[key], decompress_message(data))
         if self._rest is None:
             self._rest = RecoveredSqlite(self._path, reason)
             self.warnings += self._rest.warnings
@@ -131,7 +131,7 @@ class RecoveredSqlite:
         self._path = path
         try:
             with closing(_connect(path)) as database:
-                # SQLite refuses a file that is shorter than its header says, unless it is told that the header may be wrong.
+                # SQLite refuses a file that is shorter than its header says, unless the schema is declared writable.
                 database.execute("PRAGMA writable_schema=ON")
                 self._topics, definitions = _describe(database)
         except (sqlite3.Error, DamagedError) as error:
@@ -144,14 +144,14 @@ class RecoveredSqlite:
         self.channels = _channels(self._topics, definitions, counts)
         self.start_ns, self.end_ns = (start, end) if counts else (0, 0)
         self.warnings = [
-            f"{path.name} was read page by page ({reason}): {counts.total()} messages of it are used; how many are lost, it does not tell."
+            f"{path.name} was read page by page ({reason}): {counts.total()} messages of it are used; the number of lost ones is not known."
         ]
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         wanted = {key: topic for key, topic in self._topics.items() if topic[0] in topics}
         for key, log_ns, data in self._rows():
             if key in wanted:
-                yield RawMessage(log_ns, *wanted[key], inflate_message(data))
+                yield RawMessage(log_ns, *wanted[key], decompress_message(data))
 
     def _rows(self) -> Iterator[Row]:
         """Messages on the file's leaf pages: those rows that are an id, a known topic's number, a time and bytes."""
@@ -159,10 +159,8 @@ class RecoveredSqlite:
             pages = _Pages(file)
             for number in range(1, pages.count):
                 page = pages.read(number)
-                if page[:1] == bytes([_TABLE_LEAF]):
-                    for row in _leaf_rows(pages, page):
-                        if row[0] in self._topics:
-                            yield row
+                rows = _leaf_rows(pages, page) if page[:1] == bytes([_TABLE_LEAF]) else ()
+                yield from (row for row in rows if row[0] in self._topics)
 
 
 class _Pages:
@@ -208,7 +206,7 @@ def _payload(pages: _Pages, page: bytes, at: int, length: int) -> bytes | None:
     most = usable - 35
     if length <= most:
         return page[at : at + length] if at + length <= len(page) else None
-    if length > min(pages.count * pages.size, MOST_PLAIN_BYTES):
+    if length > min(pages.count * pages.size, MAX_DECOMPRESSED_BYTES):
         return None
     least = (usable - 12) * 32 // 255 - 23
     local = least + (length - least) % (usable - 4)

@@ -1,16 +1,139 @@
-"""Who plays the parts of a log: wheels, LiDAR, IMU and centre of gravity."""
+"""Topic roles of a log: wheels, LiDAR, IMU and centre of gravity."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from localization.errors import TopicError
-from localization.logs.arm_cg import covering
-from localization.logs.topics import TYPES, Sources, TopicChooser, TopicOverrides, TopicSource
+from localization.logs.chunks import Channel
 from motion_models.center_of_gravity.files import arms_model
 from motion_models.center_of_gravity.model import CgModel
 from motion_models.robot import Robot
+
+TYPES: Mapping[str, str] = {
+    "joint_states": "sensor_msgs/msg/JointState",
+    "odometry": "nav_msgs/msg/Odometry",
+    "scan": "sensor_msgs/msg/LaserScan",
+    "points": "sensor_msgs/msg/PointCloud2",
+    "imu": "sensor_msgs/msg/Imu",
+    "center_of_gravity": "geometry_msgs/msg/PointStamped",
+}
+REFERENCE_TYPES = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+    "sensor_msgs/msg/NavSatFix",
+)
+
+
+@dataclass(frozen=True)
+class TopicOverrides:
+    """Topics to use instead of the robot file's. An empty name disables the role."""
+
+    joint_states: str | None = None
+    """sensor_msgs/JointState with the wheels' joints."""
+    odometry: str | None = None
+    """nav_msgs/Odometry of the robot's own driver, used where no joint states are."""
+    scan: str | None = None
+    """sensor_msgs/LaserScan."""
+    points: str | None = None
+    """sensor_msgs/PointCloud2, used where no planar scan is."""
+    imu: str | None = None
+    """sensor_msgs/Imu."""
+    center_of_gravity: str | None = None
+    """geometry_msgs/PointStamped in the body frame."""
+    reference: str | None = None
+    """What the result is scored against: a pose, odometry or GPS topic."""
+
+
+@dataclass(frozen=True)
+class TopicSource:
+    """A topic in a role."""
+
+    topic: str
+    kind: str
+    """The entry of the robot file's [topics] that it stands for; this sets its message type (`TYPES`)."""
+    chosen_by: str
+    """"option", "robot" or "only" (the only one of its type in the log)."""
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Topic of each role; None where there is none."""
+
+    wheels: TopicSource | None
+    lidar: TopicSource | None
+    imu: TopicSource | None
+    center_of_gravity: TopicSource | None
+    arms: tuple[TopicSource, ...] = ()
+    """Joint states of the arms, from which the centre of gravity is computed where no topic has it; one may be the wheels' too."""
+
+    def used(self) -> list[TopicSource]:
+        """Each topic once."""
+        others = [s for s in (self.wheels, self.center_of_gravity, self.imu, self.lidar) if s is not None]
+        return others + [arm for arm in self.arms if all(arm.topic != other.topic for other in others)]
+
+
+class TopicChooser:
+    """The topics of one log, and the choice among them."""
+
+    def __init__(self, log: str, channels: Iterable[Channel], robot: Robot, overrides: TopicOverrides) -> None:
+        self._log, self._robot, self._overrides = log, robot, overrides
+        self._types: dict[str, str] = {}
+        self._empty: set[str] = set()
+        for channel in sorted(channels, key=lambda c: -c.count):
+            if channel.count:
+                self._types.setdefault(channel.topic, channel.type)
+            elif channel.topic not in self._types:
+                self._empty.add(channel.topic)
+        self.warnings: list[str] = []
+
+    def of_type(self, *types: str) -> list[str]:
+        return sorted(topic for topic, kind in self._types.items() if kind in types)
+
+    def find_named(self, kind: str) -> TopicSource | None:
+        """The topic that an option or the robot file names. Raises `TopicError` if an option names one that does not fit."""
+        wanted = getattr(self._overrides, kind)
+        if wanted:
+            self.require(wanted, (TYPES[kind],), f"--topic.{kind.replace('_', '-')}")
+            return TopicSource(wanted, kind, "option")
+        topic = getattr(self._robot.topics, kind)
+        if wanted is None and self._types.get(topic) == TYPES[kind]:
+            return TopicSource(topic, kind, "robot")
+        return None
+
+    def find_only(self, kind: str) -> TopicSource | None:
+        """The only topic of the matching type, if no option sets the role."""
+        if getattr(self._overrides, kind) is not None:
+            return None
+        # What the run is scored against must not be what it is estimated from.
+        kept_out = {self._robot.topics.reference, self._overrides.reference}
+        topics = [topic for topic in self.of_type(TYPES[kind]) if topic not in kept_out]
+        if len(topics) > 1:
+            option = f"--topic.{kind.replace('_', '-')}"
+            self.warnings.append(f"{', '.join(topics)} could each be the {kind.replace('_', ' ')}; name one with {option}.")
+        return TopicSource(topics[0], kind, "only") if len(topics) == 1 else None
+
+    def require(self, topic: str, types: tuple[str, ...], option: str) -> None:
+        """Raises `TopicError` unless the log has ``topic`` with one of these types."""
+        have = self._types.get(topic)
+        if have in types:
+            return
+        short = " or ".join(short_type(t) for t in types)
+        found = f"topic '{topic}' of {self._log} has no messages" if topic in self._empty else f"no topic '{topic}' in {self._log}"
+        if have is not None:
+            found = f"'{topic}' in {self._log} carries {short_type(have)}, not {short}"
+        others = self.of_type(*types)
+        fitting = f"topics of type {short} in it: {', '.join(others)}" if others else f"it has no topic of type {short}"
+        raise TopicError(f"{found}; {fitting}. Pass {option}.")
+
+
+def short_type(name: str) -> str:
+    """Type name without the "/msg/" in the middle."""
+    return name.replace("/msg/", "/")
+
 
 JointNames = Callable[[str], Iterable[Iterable[str]]]
 """Names of the joints in each of the first messages of a topic."""
@@ -20,8 +143,8 @@ Sides = tuple[tuple[str, ...], tuple[str, ...]]
 
 
 @dataclass(frozen=True)
-class Parts:
-    """The choice, and what it leaves to be said."""
+class TopicRoles:
+    """Topic of each role, and warnings about the choice."""
 
     sources: Sources
     joints: Sides
@@ -33,12 +156,12 @@ class Parts:
     warnings: list[str]
 
 
-def choose_parts(log: str, chooser: TopicChooser, robot: Robot, overrides: TopicOverrides, joint_names: JointNames) -> Parts:
-    """Who plays the parts. Raises `TopicError` if an option names a topic that does not fit, and what `arms_model` does."""
-    return _Choice(log, chooser, robot, overrides, joint_names).parts()
+def choose_roles(log: str, chooser: TopicChooser, robot: Robot, overrides: TopicOverrides, joint_names: JointNames) -> TopicRoles:
+    """Choose a topic for each role. Raises `TopicError` if an option names a topic that does not fit, and what `arms_model` does."""
+    return _RoleChooser(log, chooser, robot, overrides, joint_names).choose()
 
 
-class _Choice:
+class _RoleChooser:
     def __init__(self, log: str, chooser: TopicChooser, robot: Robot, overrides: TopicOverrides, joint_names: JointNames) -> None:
         self._log, self._chooser, self._robot = log, chooser, robot
         self._overrides, self._joint_names = overrides, joint_names
@@ -46,40 +169,41 @@ class _Choice:
         self._error: TopicError | None = None
         self._warnings: list[str] = []
 
-    def parts(self) -> Parts:
+    def choose(self) -> TopicRoles:
         wheels, lidar, imu, center_of_gravity = self._wheels(), self._lidar(), self._choose("imu"), self._choose("center_of_gravity")
         arms, model = self._arms() if center_of_gravity is None else ((), None)
         sources = Sources(wheels, lidar, imu, center_of_gravity, arms)
-        return Parts(sources, self._joints, self._error, model, [*self._chooser.warnings, *self._warnings])
+        return TopicRoles(sources, self._joints, self._error, model, [*self._chooser.warnings, *self._warnings])
 
     def _arms(self) -> tuple[tuple[TopicSource, ...], CgModel | None]:
-        """Joint states that tell how the arms stand. An empty option for the centre of gravity leaves it where the robot file says."""
+        """Joint states of the arms. An empty option for the centre of gravity leaves it at the robot file's value."""
         robot = self._robot
         if robot.arms is None or self._overrides.center_of_gravity is not None:
             return (), None
         model = arms_model(robot.arms, robot.folder)
         joints = model.chain.joint_names
-        told: dict[str, set[str]] = {}
+        received: dict[str, set[str]] = {}
         for topic in self._chooser.of_type(TYPES["joint_states"]):
             names = {name for message_names in self._joint_names(topic) for name in message_names}
-            told[topic] = names
-        topics, missing = covering(joints, told)
-        strange = sorted(set().union(*told.values()) - set(joints) - {*robot.joints.left, *robot.joints.right})
+            received[topic] = names
+        topics, missing = cover_joints(joints, received)
+        strange = sorted(set().union(*received.values()) - set(joints) - {*robot.joints.left, *robot.joints.right})
         if missing and (topics or strange):
             unknown = f" Joints in it that the robot does not have: {', '.join(strange)}." if strange else ""
             self._warnings.append(
-                f"{', '.join(topics or told)} lacks {', '.join(missing)} of the arms; until told, the centre of gravity stays where the"
-                f" robot file says.{unknown} Name the joints as the log does, or list those that it has in the robot file's [arms] joints."
+                f"{', '.join(topics or received)} has no {', '.join(missing)} of the arms; until these are received, the centre of"
+                f" gravity stays at the robot file's value.{unknown} Name the joints as the log does, or list those that it has in the"
+                " robot file's [arms] joints."
             )
         if not topics:
             return (), None
         return tuple(TopicSource(topic, "joint_states", "robot") for topic in topics), model
 
     def _choose(self, kind: str) -> TopicSource | None:
-        named = self._chooser.named(kind)
-        return named if named is not None else self._noted(self._chooser.only(kind))
+        named = self._chooser.find_named(kind)
+        return named if named is not None else self._warn_default(self._chooser.find_only(kind))
 
-    def _noted(self, source: TopicSource | None) -> TopicSource | None:
+    def _warn_default(self, source: TopicSource | None) -> TopicSource | None:
         if source is not None:
             wanted = getattr(self._robot.topics, source.kind)
             part = source.kind.replace("_", " ")
@@ -90,14 +214,14 @@ class _Choice:
 
     def _lidar(self) -> TopicSource | None:
         if self._overrides.points and not self._overrides.scan:
-            return self._chooser.named("points")
-        return self._chooser.named("scan") or self._chooser.named("points") or self._choose("scan") or self._choose("points")
+            return self._chooser.find_named("points")
+        return self._chooser.find_named("scan") or self._chooser.find_named("points") or self._choose("scan") or self._choose("points")
 
     def _wheels(self) -> TopicSource | None:
         """Joint states with wheels in them, else the driver's odometry."""
         if self._overrides.odometry and not self._overrides.joint_states:
-            return self._chooser.named("odometry")
-        named = self._chooser.named("joint_states")
+            return self._chooser.find_named("odometry")
+        named = self._chooser.find_named("joint_states")
         if named is not None:
             candidates = [named.topic]
         else:
@@ -114,41 +238,57 @@ class _Choice:
             wanted = (*self._robot.joints.left, *self._robot.joints.right)
             absent = [joint for joint in wanted if joint not in (*self._joints[0], *self._joints[1])]
             if absent:
-                self._warnings.append(f"{topic} lacks the joints {', '.join(absent)}; their sides are the mean of the others.")
-            return named if named is not None else self._noted(TopicSource(topic, "joint_states", "only"))
+                self._warnings.append(f"{topic} has no joints {', '.join(absent)}; their sides are the mean of the others.")
+            return named if named is not None else self._warn_default(TopicSource(topic, "joint_states", "only"))
         if len(fitting) > 1:
             topics = ", ".join(topic for topic, _ in fitting)
             self._warnings.append(f"{topics} all have the wheel joints; name one with --topic.joint-states.")
         return self._odometry(named, known, bool(candidates) and not fitting)
 
-    def _odometry(self, joint_states: TopicSource | None, known: set[str], joints_are_unknown: bool) -> TopicSource | None:
+    def _odometry(self, joint_states: TopicSource | None, known: set[str], is_missing_joints: bool) -> TopicSource | None:
         """The odometry, where joint states will not do."""
-        lacking = (
+        missing_joints = (
             f"no joint states of {self._log} have the wheel joints: robot '{self._robot.name}' names"
             f" {', '.join((*self._robot.joints.left, *self._robot.joints.right))}; joints in it: {', '.join(sorted(known)) or 'none'}"
         )
         if joint_states is not None and joint_states.chosen_by == "option":
-            raise TopicError(f"{lacking}. Name them in the robot file's [joints].")
+            raise TopicError(f"{missing_joints}. Name them in the robot file's [joints].")
         odometry = self._choose("odometry")
-        if joints_are_unknown and odometry is not None:
-            self._warnings.append(f"{lacking}; the wheels are taken from {odometry.topic}.")
-        elif joints_are_unknown:
+        if is_missing_joints and odometry is not None:
+            self._warnings.append(f"{missing_joints}; the wheels are taken from {odometry.topic}.")
+        elif is_missing_joints:
             self._error = TopicError(
-                f"{lacking}. Name them in the robot file's [joints], or go without wheels by an empty --topic.joint-states."
+                f"{missing_joints}. Name them in the robot file's [joints], or go without wheels by an empty --topic.joint-states."
             )
         return odometry
 
     def _wheel_joints(self, topic: str) -> tuple[set[str], Sides | None]:
         """All joint names of a topic's first messages, and the left and right wheels' among them if both sides have some."""
-        seen: set[str] = set()
+        names_found: set[str] = set()
         best: Sides | None = None
         wanted = self._robot.joints
         for message_names in self._joint_names(topic):
             names = set(message_names)
-            seen |= names
+            names_found |= names
             left, right = tuple(j for j in wanted.left if j in names), tuple(j for j in wanted.right if j in names)
             if left and right and (best is None or len(left) + len(right) > len(best[0]) + len(best[1])):
                 best = left, right
                 if len(left) + len(right) == len(wanted.left) + len(wanted.right):
                     break
-        return seen, best
+        return names_found, best
+
+
+def cover_joints(wanted: Iterable[str], available: Mapping[str, set[str]]) -> tuple[list[str], list[str]]:
+    """The fewest topics that have all joints ``wanted``, and the joints that none has. ``available``: topic -> its joints.
+
+    Greedy set cover: the topic with most joints comes first; one that adds none is left out.
+    """
+    left = list(wanted)
+    topics: list[str] = []
+    while left:
+        best = max(available, key=lambda topic: (len(available[topic].intersection(left)), topic), default="")
+        if not best or not available[best].intersection(left):
+            break
+        topics.append(best)
+        left = [joint for joint in left if joint not in available[best]]
+    return topics, left

@@ -1,4 +1,4 @@
-"""Where the sensors sit: the log's fixed transforms, chained down from the body frame."""
+"""Sensor mounts: the log's fixed transforms, chained down from the body frame."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _WORLDS = {"map", "odom", "world", "earth"}
 _SAME = 1e-6
 _AGREE_M, _AGREE_RAD = 0.01, math.radians(0.5)
 """Two ways to a frame that differ by less are one: drivers round, and publish a robot's model beside their own mounts."""
-_LEAST_NORM, _LARGEST_NORM = 0.5, 2.0
+_MIN_NORM, _MAX_NORM = 0.5, 2.0
 """Of a quaternion that is a rotation. Those of drivers differ from 1 by rounding; some are typed in by hand with two digits."""
 
 Edges = dict[tuple[str, str], FloatArray]
@@ -131,7 +131,7 @@ def _matrix(transform: Any) -> FloatArray | None:
     t, q = transform.translation, transform.rotation
     values = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w], dtype=float)
     norm = np.linalg.norm(values[3:])
-    if not np.isfinite(values).all() or not _LEAST_NORM <= norm <= _LARGEST_NORM:
+    if not np.isfinite(values).all() or not _MIN_NORM <= norm <= _MAX_NORM:
         return None
     x, y, z, w = values[3:] / norm
     matrix = np.eye(4)

@@ -9,8 +9,8 @@ from typing import Any
 
 from rosbags import rosbag1, rosbag2
 
-from localization.logs.message_templates import STORE, STORE_ROS1, Form, Message, Template
-from localization.output import output_errors, refuse_existing, unwritable
+from localization.logs.message_templates import STORE, STORE_ROS1, Message, MessageLayout, Template
+from localization.output import output_errors, refuse_existing
 
 _LATCHED_TOPIC = "/tf_static"
 
@@ -18,8 +18,9 @@ _LATCHED_TOPIC = "/tf_static"
 def write_bag(path: str | Path, messages: Iterable[Message], on_message: Callable[[int], None] | None = None) -> int:
     """Write ``messages``, which come in order of their ``log_ns``, one by one to ``path``; same messages, same bytes.
 
-    Messages of one topic share a form, or differ only in the length of texts. ``on_message`` is told the time of each. Returns their
-    number. Raises `OutputError`, and leaves nothing behind, where ``path`` exists or cannot be written; what ``messages`` raises passes.
+    Messages of one topic share a layout, or differ only in the length of texts. ``on_message`` is called with the time of each.
+    Returns their number. Raises `OutputError`, and leaves nothing behind, where ``path`` exists or cannot be written; what ``messages``
+    raises passes.
     """
     path = Path(path)
     refuse_existing(path)
@@ -50,22 +51,17 @@ def _write(inner: Path, path: Path, messages: Iterable[Message], on_message: Cal
     with output_errors(path):
         writer.open()
     try:
-        connections: dict[str, Any] = {}
-        templates: dict[int, tuple[Form, Template]] = {}
+        topics: dict[str, Any] = {}
+        templates: dict[MessageLayout, Template] = {}
         count = 0
         for message in messages:
-            form = message.form
-            known = templates.get(id(form))
-            if known is None:
-                known = templates[id(form)] = (form, Template(form, is_ros1=is_ros1))
-                if form.topic not in connections:
-                    with output_errors(path):
-                        connections[form.topic] = _connect(writer, form, is_ros1)
-            data = known[1].fill(message)
-            try:
-                writer.write(connections[form.topic], message.log_ns, data)
-            except OSError as error:
-                raise unwritable(path, error) from error
+            layout = message.layout
+            if layout not in templates:
+                templates[layout] = Template(layout, is_ros1=is_ros1)
+                topics[layout.topic] = topics.get(layout.topic) or _connect(writer, path, layout, is_ros1)
+            data = templates[layout].fill(message)
+            with output_errors(path):
+                writer.write(topics[layout.topic], message.log_ns, data)
             count += 1
             if on_message is not None:
                 on_message(message.log_ns)
@@ -77,8 +73,9 @@ def _write(inner: Path, path: Path, messages: Iterable[Message], on_message: Cal
     return count
 
 
-def _connect(writer: Any, form: Form, is_ros1: bool) -> Any:
-    if is_ros1:
-        latched = 1 if form.topic == _LATCHED_TOPIC else None
-        return writer.add_connection(form.topic, form.type, typestore=STORE_ROS1, latching=latched)
-    return writer.add_connection(form.topic, form.type, typestore=STORE)
+def _connect(writer: Any, path: Path, layout: MessageLayout, is_ros1: bool) -> Any:
+    with output_errors(path):
+        if is_ros1:
+            latched = 1 if layout.topic == _LATCHED_TOPIC else None
+            return writer.add_connection(layout.topic, layout.type, typestore=STORE_ROS1, latching=latched)
+        return writer.add_connection(layout.topic, layout.type, typestore=STORE)

@@ -1,10 +1,10 @@
-"""Pictures of a diagnosis: discrepancies over time and turning, before and after correction, and which causes look alike."""
+"""Pictures of a diagnosis: discrepancies over time and turning, before and after correction, and the gain of each finding."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from localization.diagnosis.diagnose import Examined
+from localization.diagnosis.diagnose import DiagnosisResult
 from localization.diagnosis.findings import Diagnosis
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS
 from localization.report.figures import Axes, Figure, svg
@@ -15,13 +15,13 @@ _NAMES = {"x": "along", "y": "sideways", "yaw": "heading", "gyro": "gyro - LiDAR
 _SHOWN = 4
 
 
-def discrepancy_svg(found: Examined) -> str:
+def discrepancy_svg(found: DiagnosisResult) -> str:
     """Each component window by window: as found, once corrected, and the band of noise."""
-    assert found.pipeline is not None
+    assert found.predictor is not None
     assert found.residuals is not None
     r = found.residuals
-    owner = found.pipeline.batch.owner
-    seconds = found.pipeline.drive.starts_s[owner]
+    owner = found.predictor.batch.owner
+    seconds = found.predictor.drive.starts_s[owner]
     shown = [c for c in range(_SHOWN) if np.isfinite(r.rows[:, c]).any()]
 
     def draw(figure: Figure) -> None:
@@ -36,9 +36,9 @@ def discrepancy_svg(found: Examined) -> str:
     return svg("discrepancy", WIDTH_IN, 1.35 * len(shown) + 0.5, draw)
 
 
-def dependence_svg(found: Examined) -> str:
+def dependence_svg(found: DiagnosisResult) -> str:
     """Each component against what the wheels did: distance and turn by their rates, before and after."""
-    assert found.pipeline is not None
+    assert found.predictor is not None
     assert found.residuals is not None
     r = found.residuals
     driven, turned = _motion(found)
@@ -77,10 +77,10 @@ def _band(axes: Axes, seconds: FloatArray, width: FloatArray) -> None:
     axes.axhline(0.0, color=COLOURS["soft"], linewidth=0.6, zorder=0.6)
 
 
-def _motion(found: Examined) -> tuple[FloatArray, FloatArray]:
-    assert found.pipeline is not None
-    batch = found.pipeline.batch
-    twist = found.pipeline.nominal_twist
+def _motion(found: DiagnosisResult) -> tuple[FloatArray, FloatArray]:
+    assert found.predictor is not None
+    batch = found.predictor.batch
+    twist = found.predictor.nominal_twist
     parts = []
     for end, owner in zip(batch.ends, batch.owner, strict=True):
         inside = slice(batch.first[owner] + batch.lead[owner], end)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from localization.diagnosis.diagnose import Examined
+from localization.diagnosis.diagnose import DiagnosisResult
 from localization.diagnosis.findings import Diagnosis
+from localization.diagnosis.summary import describe_outliers, describe_row, describe_tolerated
 from localization.report.diagnosis_figures import dependence_svg, discrepancy_svg, gain_svg
 from localization.report.page import Block, Cell, Figure, Page, Paragraph, Section, Table, bullets, glossary, render, write_new
 
@@ -20,33 +21,36 @@ _TERMS = {
     "Discrepancy": "What the reference measured in a window of the drive minus the model's prediction from the wheels in that window.",
     "Noise": "How large discrepancies without a cause are, estimated from this drive after everything that any cause could explain.",
     "p": "Probability that noise alone would make any of all causes look as strong as this one.",
+    "Left": "What neither the findings nor causes within their tolerance account for.",
     "Gain": "How much smaller discrepancies become in windows that the cause's size was not fitted to.",
     "Or": "Causes that would explain the same drive about as well, each with the size that it would need.",
 }
 
 
-def write_diagnosis_report(path: str | Path, found: Examined) -> None:
+def write_diagnosis_report(path: str | Path, found: DiagnosisResult) -> None:
     """Write the page. Raises `OutputError` if there is such a file already or it cannot be written."""
     write_new(path, diagnosis_page(found).encode())
 
 
-def diagnosis_page(found: Examined) -> str:
+def diagnosis_page(found: DiagnosisResult) -> str:
     """HTML of the whole page."""
     d = found.diagnosis
     sections = [
         Section("Findings", _findings(d)),
         Section("Next drive", [Paragraph(d.next_drive)] if d.next_drive else []),
         *_figures(found),
-        Section("Left unexplained", bullets([s.text for s in d.shapes])),
-        Section("What this drive would show", _visible(d)),
-        Section("About the log", bullets(d.warnings)),
+        Section("Within tolerance", bullets(describe_tolerated(d))),
+        Section("Contradictions", bullets(d.contradictions)),
+        Section("Left unexplained", bullets([s.text for s in d.trends])),
+        Section("What this drive would show", _detectable(d)),
+        Section("About the log", bullets([*describe_outliers(d), *d.warnings])),
         glossary(_TERMS),
     ]
-    facts = f"{d.robot} · model {d.model} · reference {d.witness} · {d.windows:,} windows"
+    facts = f"{d.robot} · model {d.model} · reference {d.motion_reference} · {d.windows:,} windows"
     return render(Page(f"Diagnosis of {d.log}", facts, [d.sentence, _VERDICTS[d.verdict]], sections))
 
 
-def _figures(found: Examined) -> list[Section]:
+def _figures(found: DiagnosisResult) -> list[Section]:
     """Discrepancies, components and gains, as far as there are any."""
     d, sections = found.diagnosis, []
     if found.residuals is not None:
@@ -71,22 +75,22 @@ def _findings(d: Diagnosis) -> list[Block]:
         return []
     rows = []
     for f in d.findings:
-        unit = "" if f.effect.unit == "1" else f" {f.effect.unit}"
+        unit = "" if f.definition.unit == "1" else f" {f.definition.unit}"
         others = ", ".join(f"{name} {size:+.3g}" for name, size in f.aliases) or "–"  # noqa: RUF001
         gain = f"{100 * f.gain.relative:.0f} % ({100 * f.gain.low:.0f} to {100 * f.gain.high:.0f})"
-        cause = Cell(f.cause, f"{f.effect.meaning}; {f.evidence}", is_code=True)
+        cause = Cell(f.cause, f"{f.description}; {f.evidence}", is_code=True)
         rows.append([cause, Cell(f"{f.size:+.4g} ± {f.sigma:.2g}{unit}"), Cell(gain), Cell(f"{f.p_value:.1g}"), Cell(others)])
     return [Table([Cell(title) for title in ("Cause", "Size", "Held-out gain", "p", "Or")], rows)]
 
 
 def _components(d: Diagnosis) -> list[Block]:
-    rows = [
-        [Cell(text) for text in (name, c.unit, f"{c.rms:.4g}", f"{c.expected_rms:.4g}", f"{c.left_rms:.4g}", f"{c.p_value:.2g}")]
-        for name, c in d.discrepancy.items()
-    ]
-    return [Table([Cell(title) for title in ("Component", "Unit", "RMS", "Noise", "RMS once corrected", "p")], rows)]
+    rows = []
+    for name, c in d.discrepancy.items():
+        numbers = (f"{c.rms:.4g}", f"{c.expected_rms:.4g}", f"{c.unattributed_rms:.4g}", f"{c.p_value:.2g}")
+        rows.append([Cell(text) for text in (name, c.unit, *numbers, describe_row(c))])
+    return [Table([Cell(title) for title in ("Component", "Unit", "RMS", "Noise", "Left", "p", "Attributed to")], rows)]
 
 
-def _visible(d: Diagnosis) -> list[Block]:
-    rows = [[Cell(name, is_code=True), Cell(f"{size:.3g}")] for name, size in d.visible.items()]
+def _detectable(d: Diagnosis) -> list[Block]:
+    rows = [[Cell(name, is_code=True), Cell(f"{size:.3g}")] for name, size in d.detectable_sizes.items()]
     return [Table([Cell("Cause"), Cell("Smallest size that this drive would show (3 sigma)")], rows)] if rows else []

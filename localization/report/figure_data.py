@@ -16,7 +16,7 @@ from motion_models.se2 import FloatArray
 
 _N_ELLIPSES = 12
 _REACH = 0.2
-# half-way between white and black paper: the map is a raster and cannot ask the page for its colour
+# half-way between white and black paper: the map is a raster, whose colour the page cannot set
 _MAP_GREY = (118, 125, 132)
 _N_MEANS = 90
 _N_BINS = 9
@@ -53,7 +53,7 @@ class MapView:
 
 def map_view(lines: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> MapView:
     """Borders hold the reference, the best run, and the map but for its strays. The others widen them by no more than a fifth: a run that
-    got lost must not make the rest too small to see.
+    diverged must not make the rest too small.
     """
     best = best_run(lines) or run_with_map(lines) or (lines[-1] if lines else None)
     mapped = run_with_map(lines)

@@ -1,6 +1,6 @@
-"""Pictures and tables of the notebooks: what to draw is said as data, how it looks is one style, and nothing here computes.
+"""Figures and tables of the notebooks: data in, one style, no computation.
 
-Colours are names of `localization.report.svg.COLOURS` (Okabe and Ito's); markers and dashes tell the same apart in grey.
+Colours are names of `localization.report.svg.COLOURS` (Okabe and Ito's); markers and dashes distinguish them in grey.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Panel:
     log_x: bool = False
     log_y: bool = False
     band: tuple[float, float] | None = None
-    """Of y, shaded: where honest values lie."""
+    """Of y, shaded: band of consistent values."""
     level: float | None = None
     """A thin horizontal line."""
     moments: Mapping[str, float] = field(default_factory=dict)

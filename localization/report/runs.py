@@ -16,7 +16,7 @@ from motion_models import se2
 from motion_models.se2 import FloatArray
 
 WHEELLESS = "lidar"
-"""The estimator that never asks the wheels: its runs are the same for every motion model."""
+"""The estimator that does not use wheels: its runs are the same for every motion model."""
 DEAD_RECKONING = "odometry"
 
 _WORDS = {DEAD_RECKONING: "dead reckoning", WHEELLESS: "LiDAR alone"}
@@ -39,7 +39,7 @@ class PlottedRun:
 
     @property
     def model(self) -> str | None:
-        """None where the estimator asks no wheels."""
+        """None where the estimator does not use wheels."""
         return None if self.result.run.estimator == WHEELLESS else self.result.run.model
 
     @property
@@ -49,7 +49,7 @@ class PlottedRun:
 
     @property
     def words(self) -> str:
-        """As a sentence says it."""
+        """Name in a sentence."""
         return describe_run(self.result.run.estimator, self.result.run.model)
 
     @property
@@ -83,7 +83,7 @@ def headline(accuracy: Accuracy | None) -> float | None:
 
 
 def describe_run(estimator: str, model: str) -> str:
-    """An estimator and its motion model as a sentence says them."""
+    """Name of an estimator and its motion model in a sentence."""
     name = _WORDS.get(estimator, estimator)
     return name if estimator == WHEELLESS else f"{name} with {model}"
 
@@ -131,10 +131,10 @@ def best_run(lines: Sequence[PlottedRun]) -> PlottedRun | None:
 
 
 def run_with_map(lines: Sequence[PlottedRun]) -> PlottedRun | None:
-    """The best run that has a map. Without scores a fusing estimator is taken before one that asks the LiDAR alone."""
+    """The best run that has a map. Without scores a fusing estimator is preferred to the LiDAR alone."""
     mapped = [line for line in lines if np.isfinite(line.result.run.map_points).all(axis=1).any()]
-    trust = {"graph": 0, "ekf": 1, WHEELLESS: 3}
-    key = lambda line: (math.inf if line.error is None else line.error, trust.get(line.result.run.estimator, 2), line.number)  # noqa: E731
+    order = {"graph": 0, "ekf": 1, WHEELLESS: 3}
+    key = lambda line: (math.inf if line.error is None else line.error, order.get(line.result.run.estimator, 2), line.number)  # noqa: E731
     return min(mapped, key=key) if mapped else None
 
 

@@ -1,9 +1,9 @@
-"""The report in words: which run is best and by how much, whether it knows how wrong it is, and what to do with it.
+"""Summary of a replay in words: which run is best and by how much, whether its covariances are consistent, and what to do.
 
 A difference is called one only if the log can show it. Errors along a drive are correlated and a few large ones (closed loops) make most
 of their mean, so runs are compared by blocks and by ranks: the drive is cut into ten stretches of equally many samples, and the
 differences of two runs' mean errors in them are tested by Wilcoxon's signed ranks, which takes the blocks and not the samples as
-independent and asks nothing of their distribution. Two runs whose errors differ by less than 2 % are called equally good too.
+independent and assumes nothing of their distribution. Two runs whose errors differ by less than 2 % are called equally good too.
 """
 
 from __future__ import annotations
@@ -48,20 +48,28 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
     """The paragraph's sentences, what matters most first."""
     lines = plotted_runs(results)
     if not lines:
-        return ["Nothing was run, so there is nothing to tell."]
+        return ["Nothing was run."]
     best, losses = best_run(lines), _losses(lines)
     if reference is None or all(line.error is None for line in lines):
         line = _most_informed(lines)
-        return [*_unscored(lines), *losses, *_honesty(line, f"The covariances of {line.words}")]
+        return [*_unscored(lines), *losses, *_consistency(line, f"The covariances of {line.words}")]
     if best is None:
         return [*losses, "No run can be recommended."]
     equals = equally_good(lines, best, reference)
     ranking = _ranking(lines, best, equals, reference)
-    return [*ranking, *losses, *_hindsight(best), *_coverage(best), *_honesty(best), *_advice(lines, best, equals)]
+    return [
+        *ranking,
+        *losses,
+        *_smoothing(best),
+        *_coverage(best),
+        *_consistency(best),
+        *_exactness(best, reference),
+        *_advice(lines, best, equals),
+    ]
 
 
 def equally_good(lines: Sequence[PlottedRun], best: PlottedRun, reference: ReferenceTrack | Relations) -> list[PlottedRun]:
-    """The scored runs but ``best`` whose errors this log cannot tell from its errors, or that differ by less than 2 %.
+    """The scored runs but ``best`` that are not significantly worse on this log, or differ by less than 2 %.
 
     Runs that lost the LiDAR for long are not among them.
     """
@@ -119,7 +127,7 @@ def _ranking(
     assert best.error is not None
     measure = _measure(best, reference)
     if len(lines) == 1:
-        alone = "Nothing else was run, so nothing tells whether another pair does better."
+        alone = "Nothing else was run for comparison."
         return [f"{capitalize(best.words)}: {metres(best.error)} {measure}.", alone]
     near, unproven = [x for x in equals if is_close(x, best)], [x for x in equals if not is_close(x, best)]
     found = "has the smallest error" if equals else "is best"
@@ -173,13 +181,13 @@ def _losses(lines: Sequence[PlottedRun]) -> list[str]:
     return [f"Not recommended are {'; '.join(parts)}." if len(parts) > 1 else f"Not recommended is {parts[0]}.", *advice]
 
 
-def _hindsight(best: PlottedRun) -> list[str]:
-    """What of the error was only known to be one when the robot came back."""
+def _smoothing(best: PlottedRun) -> list[str]:
+    """Error of the filtered poses, where loop closures have smoothed them."""
     loops, then = best.result.run.counts.get("loops", 0), headline(best.result.moments)
     if not loops or then is None:
         return []
     places = "a place" if loops == 1 else f"{loops} places"
-    return [f"That is with hindsight, by {places} seen again; as it drove, its error was {metres(then)}."]
+    return [f"That is the smoothed trajectory, with loop closures at {places}; as it drove, its error was {metres(then)}."]
 
 
 def _coverage(best: PlottedRun) -> list[str]:
@@ -189,71 +197,79 @@ def _coverage(best: PlottedRun) -> list[str]:
     return [f"The reference covers only {100.0 * accuracy.overlap:.0f} % of the drive's time."]
 
 
-def _honesty(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
-    """Does the run know how wrong it is? By NIS over many scans; by NEES only where even a single drive is enough to say no."""
+def _consistency(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
+    """Whether the covariances are consistent: by NIS over many scans; by NEES only where a single drive is enough to reject it."""
     run, nees = line.result.run, line.result.nees_mean
     if run.trajectory.covariances is None:
         return [f"{capitalize(line.words)} gives no covariance."]
     known = run.nis[np.isfinite(run.nis)]
-    sayings, judged_by_pose = [], ""
+    results_, by_pose = [], ""
     if len(known) >= 20:
-        verdict_, said = _judge("NIS", float(known.mean()), mean_band(len(known), _DOF), "innovations")
+        verdict_, text = _test("NIS", float(known.mean()), mean_band(len(known), _DOF), "innovations")
         middle, expected = float(np.median(known)), float(chi2.median(_DOF))
         if verdict_ == "over" and middle < expected * _NOTABLE**2:
-            said += f" in the mean, but most fit (median {middle:.1f}, {expected:.1f} expected), so some outliers make it"
-        sayings.append((verdict_, said))
+            text += f" in the mean, but most fit (median {middle:.1f}, {expected:.1f} expected), so some outliers make it"
+        results_.append((verdict_, text))
     if nees is not None and not math.isnan(nees):
-        sayings.append(_judge("NEES", nees, mean_band(1, _DOF), "errors"))
-        judged_by_pose = sayings[-1][0]
-    found = {word: [text for verdict_, text in sayings if verdict_ == word] for word in ("over", "under", "fits")}
+        results_.append(_test("NEES", nees, mean_band(1, _DOF), "errors"))
+        by_pose = results_[-1][0]
+    found = {word: [text for verdict_, text in results_ if verdict_ == word] for word in ("over", "under", "fits")}
     if found["over"]:
         also = f" ({join_words([*found['under'], *found['fits']])})" if found["under"] or found["fits"] else ""
-        return [f"{whose} are overconfident: {join_words(found['over'])}{also}. Enlarge them before anything trusts them."]
+        return [f"{whose} are overconfident: {join_words(found['over'])}{also}. Enlarge them before fusing them elsewhere."]
     also = f" ({join_words(found['fits'])})" if found["fits"] else ""
-    if found["under"] and judged_by_pose == "under":
+    if found["under"] and by_pose == "under":
         return [f"{whose} are larger than need be: {join_words(found['under'])}{also}; safe to fuse, but given less weight than is due."]
-    if found["under"]:  # innovations are of one step: they test what is believed of wheels and scans, not what became of it in the pose
-        allowed = f"wheels and scans differ less than they allow for ({found['under'][0]}){also}"
-        unknown = "" if judged_by_pose else "; whether the pose's are too large, only a reference track with headings could tell"
-        return [f"Nothing says that {_lower(whose)} are too small: {allowed}{unknown}."]
+    if found["under"]:  # innovations are of one step: they test the noise of wheels and scans, not the pose's covariance
+        allowed = f"wheels and scans differ less than their noise allows ({found['under'][0]}){also}"
+        unknown = "" if by_pose else "; whether those of the pose are too large, only a reference with headings can show"
+        return [f"{whose} are not too small: {allowed}{unknown}."]
     if found["fits"]:
-        return [f"Nothing speaks against {_lower(whose)}: {join_words(found['fits'])}."]
+        return [f"{whose} are consistent: {join_words(found['fits'])}."]
     return [f"{whose} could not be tested: that takes scans, or a reference with headings."]
 
 
-def _judge(name: str, mean: float, band: tuple[float, float], what: str) -> tuple[str, str]:
+def _exactness(best: PlottedRun, reference: ReferenceTrack | Relations) -> list[str]:
+    """That large NEES may be the reference's noise, where that is unknown."""
+    nees = best.result.nees_mean
+    if not isinstance(reference, ReferenceTrack) or reference.covariances is not None or nees is None or nees <= mean_band(1, _DOF)[1]:
+        return []
+    return ["NEES takes this reference as exact, because it has no covariances: pass its noise with --reference-sigma."]
+
+
+def _test(name: str, mean: float, band: tuple[float, float], what: str) -> tuple[str, str]:
     """("over" | "under" | "fits", words). Beyond the band it must be by a factor in sigma that matters, too."""
     factor = math.sqrt(mean / _DOF)
     value = "infinite" if math.isinf(mean) else f"{mean:.3g}" if mean < 99.5 else f"{mean:,.0f}"
-    said = f"mean {name} {value}, where {_DOF} is expected"
+    text = f"mean {name} {value}, where {_DOF} is expected"
     if mean > band[1] and factor > _NOTABLE:
-        return "over", said if math.isinf(mean) else f"{said}, {what} {factor:.1f} times the size it claims"
+        return "over", text if math.isinf(mean) else f"{text}, {what} {factor:.1f} times their sigma"
     if mean < band[0] and factor < 1.0 / _NOTABLE:
-        return "under", f"{said}, {what} {factor:.2g} times the size it claims"
-    return "fits", said
+        return "under", f"{text}, {what} {factor:.2g} times their sigma"
+    return "fits", text
 
 
 def _advice(lines: Sequence[PlottedRun], best: PlottedRun, equals: Sequence[PlottedRun]) -> list[str]:
     if len(lines) == 1:
         return [f"To learn what {best.result.run.estimator} gains, run it beside {DEAD_RECKONING} and another model."]
-    witnesses = [line for line in lines if line.result.run.estimator != DEAD_RECKONING and len(line.result.run.map_points)]
-    if best.result.run.estimator == DEAD_RECKONING and witnesses and not any(line in equals for line in witnesses):
+    with_lidar = [line for line in lines if line.result.run.estimator != DEAD_RECKONING and len(line.result.run.map_points)]
+    if best.result.run.estimator == DEAD_RECKONING and with_lidar and not any(line in equals for line in with_lidar):
         return ["The LiDAR made no run better than the wheels alone: check its mount, its stamps and its range in the robot file first."]
     base = baseline_run(lines)
     if base is not None and base in equals:
         return ["Confirm on another drive, before relying on it, that it is better than dead reckoning."]
     if any(line.result.run.estimator == best.result.run.estimator for line in equals):
-        return [f"Use {best.result.run.estimator}; which motion model is better in it, this drive does not tell."]
+        return [f"Use {best.result.run.estimator}; which motion model is better in it is not significant on this drive."]
     return [f"Use {best.words}."]
 
 
 def _unscored(lines: Sequence[PlottedRun]) -> list[str]:
-    """Without a reference nothing tells which run is right; how far they lie apart can be said."""
-    ask = "Pass --reference with a pose or GPS topic, a TUM file or a relations file to have them scored."
+    """Without a reference: how far the runs lie apart."""
+    advice = "Pass --reference with a pose or GPS topic, a TUM file or a relations file to have them scored."
     if len(lines) == 1:
         line = lines[0]
         driven = metres(line.result.run.trajectory.distance(0.05))
-        return [f"No reference was given: {line.words} drove {driven}, and nothing here says how accurately.", ask]
+        return [f"No reference was given: {line.words} drove {driven}, its accuracy is unknown.", advice]
     ends = {line.number: _end(line) for line in lines}
     pairs = [(a, b) for i, a in enumerate(lines) for b in lines[i + 1 :] if ends[a.number] is not None and ends[b.number] is not None]
     apart = []
@@ -262,7 +278,7 @@ def _unscored(lines: Sequence[PlottedRun]) -> list[str]:
         far = max(range(len(gaps)), key=gaps.__getitem__)
         driven = metres(max(line.result.run.trajectory.distance(0.05) for line in lines))
         apart = [f"After {driven} at most, {pairs[far][0].words} and {pairs[far][1].words} end farthest apart, by {metres(gaps[far])}."]
-    return ["No reference was given, so nothing here says which run is right.", *apart, ask]
+    return ["No reference was given, so which run is right is unknown.", *apart, advice]
 
 
 def _most_informed(lines: Sequence[PlottedRun]) -> PlottedRun:

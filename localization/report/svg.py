@@ -1,6 +1,6 @@
 """Colours of the report, and how an SVG of matplotlib's becomes a part of the page.
 
-The colours are Okabe and Ito's ("Color universal design", 2008), which colour-blind readers tell apart. In an SVG each colour
+The colours are Okabe and Ito's ("Color universal design", 2008), which colour-blind readers can distinguish. In an SVG each colour
 becomes ``var(--name, value)``: the page's style sheet decides for light, dark and paper, and the picture stands without one as well.
 """
 

@@ -1,7 +1,7 @@
 """A state on disk: written as a whole or not at all, and resumed by another process to the last bit.
 
 The file: a line with the format's name and version, one with the SHA-256 of all that follows, a line of JSON (what made the state, and how
-far it had come), then the state (`freeze`). It is written beside its place, forced to disk, and moved there: whoever kills the process
+far it had come), then the state (`serialize`). It is written beside its place, forced to disk, and moved there: whoever kills the process
 at any moment finds the old state or the new one.
 """
 
@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from localization.errors import DumpError
+from localization.errors import CheckpointError
 from localization.provenance import versions
-from localization.ros.deserialize import thaw
-from localization.ros.serialize import freeze, freeze_apart
+from localization.ros.deserialize import deserialize
+from localization.ros.serialize import serialize, serialize_parts
 from motion_models.robot import Robot
 
 _MAGIC = b"skidloc state 1\n"
@@ -30,8 +30,8 @@ _INT_END = 2**63 - 1
 
 
 @dataclass(frozen=True)
-class Dump:
-    """What `read_dump` found."""
+class Checkpoint:
+    """What `read_checkpoint` found."""
 
     head: Mapping[str, Any]
     """What the writer told of the state."""
@@ -46,25 +46,25 @@ def fingerprints(**objects: Any) -> dict[str, str]:
             value = dataclasses.replace(value, folder=None)  # the same robot wherever its file is
         name_of = getattr(value, "name", None)
         known = f"'{name_of}' " if isinstance(name_of, str) else ""
-        found[name] = value if isinstance(value, str) else known + hashlib.sha256(b"".join(freeze(value))).hexdigest()[:12]
+        found[name] = value if isinstance(value, str) else known + hashlib.sha256(b"".join(serialize(value))).hexdigest()[:12]
     return found
 
 
-def write_dump(path: Path, value: Any, head: Mapping[str, Any], made_by: Mapping[str, str], shared: Mapping[str, Any]) -> None:
+def write_checkpoint(path: Path, value: Any, head: Mapping[str, Any], made_by: Mapping[str, str], shared: Mapping[str, Any]) -> None:
     """Replace the file ``path`` by one of ``value``; ``shared`` objects are the resumer's to bring, for ``made_by`` says that they must
     be the same (`fingerprints`).
 
-    Raises `DumpError` if the state or the file cannot be written.
+    Raises `CheckpointError` if the state or the file cannot be written.
     """
     _store(path, _body(value, head, made_by, shared), ())
 
 
 def _body(value: Any, head: Mapping[str, Any], made_by: Mapping[str, str], shared: Mapping[str, Any]) -> list[bytes]:
-    """What `write_dump` writes after its first two lines, in parts. Raises `DumpError`."""
+    """What `write_checkpoint` writes after its first two lines, in parts. Raises `CheckpointError`."""
     try:
-        text, blobs = freeze_apart(value, shared)
-    except DumpError as error:
-        raise DumpError(f"no state can be dumped: {error}.") from error
+        text, blobs = serialize_parts(value, shared)
+    except CheckpointError as error:
+        raise CheckpointError(f"no state can be dumped: {error}.") from error
     about = json.dumps({**head, "made_by": made_by, "state_bytes": len(text)}).encode()
     return [about, b"\n", text, *blobs]
 
@@ -86,7 +86,7 @@ def _store(path: Path, body: Sequence[bytes], after: Sequence[int]) -> None:
     except OSError as error:
         with contextlib.suppress(OSError):
             beside.unlink()
-        raise DumpError(f"the state cannot be written to '{path}': {error.strerror}.") from error
+        raise CheckpointError(f"the state cannot be written to '{path}': {error.strerror}.") from error
 
 
 def _beside(path: Path) -> Path:
@@ -94,55 +94,55 @@ def _beside(path: Path) -> Path:
     return path.with_name(f".{path.name}.new")
 
 
-def remove_dump(path: Path) -> None:
+def remove_checkpoint(path: Path) -> None:
     """The state, and what is left of one."""
     for left in (path, _beside(path)):
         left.unlink(missing_ok=True)
 
 
 def read_head(path: Path) -> Mapping[str, Any]:
-    """What the state's writer told of it. Raises `DumpError`."""
+    """What the state's writer told of it. Raises `CheckpointError`."""
     return _read(path)[0]
 
 
-def read_dump(path: Path, made_by: Mapping[str, str], shared: Mapping[str, Any]) -> Dump:
+def read_checkpoint(path: Path, made_by: Mapping[str, str], shared: Mapping[str, Any]) -> Checkpoint:
     """The state in ``path``, with the ``shared`` objects in their places.
 
-    Raises `DumpError` for a file that is not there, damaged or foreign, or if it was made by something else than ``made_by``.
+    Raises `CheckpointError` for a file that is not there, damaged or foreign, or if it was made by something else than ``made_by``.
     """
     head, text, blob = _read(path)
     then = head["made_by"]
     different = [name for name in made_by if then.get(name) != made_by[name]]
     if different:
         told = ", ".join(f"{name} ({then.get(name, 'unknown')} then, {made_by[name]} now)" for name in different)
-        raise DumpError(
+        raise CheckpointError(
             f"the state in '{path}' was made with another {told}: resume with what it was made with, or remove it to start anew."
         )
     try:
-        return Dump(head, thaw(text, blob, shared))
-    except DumpError as error:
-        raise DumpError(f"the state in '{path}' cannot be used: {error}. Remove it to start anew.") from error
+        return Checkpoint(head, deserialize(text, blob, shared))
+    except CheckpointError as error:
+        raise CheckpointError(f"the state in '{path}' cannot be used: {error}. Remove it to start anew.") from error
 
 
 def _read(path: Path) -> tuple[dict[str, Any], bytes, bytes]:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise DumpError(f"no state can be read from '{path}': {error.strerror}.") from error
+        raise CheckpointError(f"no state can be read from '{path}': {error.strerror}.") from error
     if not content.startswith(_MAGIC):
         of_another = content.startswith(_MAGIC[: _MAGIC.rindex(b" ")])
         what = "of another version of its format" if of_another else "no state of an estimator"
-        raise DumpError(f"'{path}' is {what}. Remove it, or name another file.")
+        raise CheckpointError(f"'{path}' is {what}. Remove it, or name another file.")
     digest, _, body = content[len(_MAGIC) :].partition(b"\n")
     if hashlib.sha256(body).hexdigest().encode() != digest:
-        raise DumpError(f"the state in '{path}' is damaged: its check sum is not that of its content. Remove it to start anew.")
+        raise CheckpointError(f"the state in '{path}' is damaged: its check sum is not that of its content. Remove it to start anew.")
     about, _, rest = body.partition(b"\n")
     try:
         head = json.loads(about)
     except (RecursionError, ValueError):
         head = None
     if not _is_head(head, len(rest)):
-        raise DumpError(f"the state in '{path}' has no readable head. Remove it to start anew.")
+        raise CheckpointError(f"the state in '{path}' has no readable head. Remove it to start anew.")
     size = head["state_bytes"]
     return head, rest[:size], rest[size:]
 
@@ -166,7 +166,7 @@ def _is_head(head: Any, most_bytes: int) -> bool:
     )
 
 
-class Dumper:
+class CheckpointWriter:
     """Writes a state at most once every ``every_s`` [s] of the clock on the wall.
 
     The state is written down at once, in milliseconds; the disk is waited for in a thread, so that no estimate waits for it.
@@ -185,7 +185,7 @@ class Dumper:
     def write(self, value: Any, head: Mapping[str, Any], after: Sequence[int] = ()) -> None:
         """Now. The files ``after`` (descriptors) are on disk before the state is, which may count on what is in them.
 
-        Raises `DumpError`, be it for the state before: this one is on its way nevertheless.
+        Raises `CheckpointError`, be it for the state before: this one is on its way nevertheless.
         """
         try:
             self.wait()
@@ -195,13 +195,13 @@ class Dumper:
             self._writing = self._disk.submit(_store, self.path, content, tuple(after))
 
     def wait(self) -> None:
-        """Until the state is on disk. Raises `DumpError`."""
+        """Until the state is on disk. Raises `CheckpointError`."""
         if self._writing is not None:
             writing, self._writing = self._writing, None
             writing.result()
 
     def close(self) -> None:
-        """Raises `DumpError`."""
+        """Raises `CheckpointError`."""
         try:
             self.wait()
         finally:

@@ -1,4 +1,4 @@
-"""The way back from `freeze`: values from JSON and the bytes of arrays. Nothing of them is run, whatever they say."""
+"""The way back from `serialize`: values from JSON and the bytes of arrays. Nothing of them is run, whatever they say."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from localization.errors import DumpError
+from localization.errors import CheckpointError
 from localization.ros.serialize import KINDS, PACKAGES
 
 Json = Any
 
 
-def thaw(text: bytes, blob: bytes, shared: Mapping[str, Any] | None = None) -> Any:
-    """The value of `freeze`. Raises `DumpError` for bytes that are none of its."""
+def deserialize(text: bytes, blob: bytes, shared: Mapping[str, Any] | None = None) -> Any:
+    """The value of `serialize`. Raises `CheckpointError` for bytes that are none of its."""
     try:
         content = json.loads(text)
         return _Reader(content, blob, shared or {}).get(content["root"])
-    except DumpError:
+    except CheckpointError:
         raise
     except (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, UnicodeDecodeError, ValueError) as error:
-        raise DumpError(f"it does not hold what this version writes ({type(error).__name__}: {error})") from error
+        raise CheckpointError(f"it does not hold what this version writes ({type(error).__name__}: {error})") from error
 
 
 class _Reader:
@@ -132,7 +132,7 @@ def _class(module: str, name: str) -> type[Any]:
     for part in name.split("."):
         found = getattr(found, part, None)
     if not isinstance(found, type) or found.__module__ != module:
-        raise DumpError(f"it holds a {module}.{name}, which this version does not have")
+        raise CheckpointError(f"it holds a {module}.{name}, which this version does not have")
     return found
 
 

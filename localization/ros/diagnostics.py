@@ -1,4 +1,4 @@
-"""How well it goes: consistency, degeneracy of the scene, slip and what was dropped, in the words of ROS's diagnostics."""
+"""Diagnostics (REP-107): latency, consistency, degeneracy of the scene, slip, silent topics and dropped messages."""
 
 from __future__ import annotations
 
@@ -23,6 +23,14 @@ _MOST_ABOVE = 0.2
 _DEGENERATE = 0.02  # rooms: 0.3 and more; corridors and single walls: 0.011 and less
 _CHORD_M, _STRAIGHT_M = 0.5, 0.05
 _SLIP_M_S, _SLIP_RAD_S = 0.15, 0.2
+_LATENCIES = 25
+"""Scans whose latency makes the level: 2 s at 12.5 Hz."""
+_LATE_SHARE = 0.2
+"""Share of them that must be late: one scan that waited for the disk or the scheduler is none of the robot's concern."""
+_ERROR_RATIO = 10.0
+"""Error above this many times the latency of a warning."""
+_MAX_SIGMA_M, _MAX_SIGMA_RAD = 1.0, 0.5
+"""Larger sigmas are reported: a pose that is known worse does not lead a robot through a door [m, rad]."""
 
 
 @dataclass(frozen=True)
@@ -35,32 +43,42 @@ class Status:
     values: Mapping[str, str] = field(default_factory=dict)
 
 
-class Health:
-    """Watches what goes into a pipeline and what comes out, over the last scans."""
+_NO_WHEELS = "no wheel data during the last step: the motion is by the LiDAR, or extrapolated. Check the driver of the wheels."
+_SLIP = "their motion differs from the robot's: slip. Drive more slowly, or calibrate the motion model."
 
-    def __init__(self) -> None:
+
+class Health:
+    """Monitors what goes into a pipeline and what comes out, over the last scans."""
+
+    def __init__(self, max_latency_s: float = 0.1) -> None:
+        """``max_latency_s``: later estimates are reported [s]."""
+        self.max_latency_s = max_latency_s
+        self._scan: Scan | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all estimates."""
         self._nis: deque[float] = deque(maxlen=_KEPT)
         self._latencies: deque[float] = deque(maxlen=_KEPT)
-        self._scan: Scan | None = None
         self._slip = np.zeros(3)
         self.estimate: Estimate | None = None
         """The last one."""
 
-    def saw(self, event: Event) -> None:
-        """``event`` has gone in."""
+    def observe_event(self, event: Event) -> None:
+        """Store the scan that went in last."""
         if isinstance(event, Scan):
             self._scan = event
 
-    def made(self, estimate: Estimate, pipeline: Pipeline) -> None:
-        """``estimate`` has come out."""
+    def add_estimate(self, estimate: Estimate, pipeline: Pipeline) -> None:
+        """``estimate`` came out of ``pipeline``."""
         self.estimate = estimate
         if estimate.nis is not None:
             self._nis.append(estimate.nis)
         if pipeline.wheel_twist is not None:
             self._slip = 0.8 * self._slip + 0.2 * (pipeline.wheel_twist - estimate.twist)
 
-    def took(self, seconds: float) -> None:
-        """From a scan's arrival to its estimate."""
+    def add_latency(self, seconds: float) -> None:
+        """Time from a scan's arrival to its estimate [s]."""
         self._latencies.append(seconds)
 
     @property
@@ -70,12 +88,12 @@ class Health:
 
     @property
     def degeneracy(self) -> float | None:
-        """Of the last scan (`degeneracy`); worked out when somebody asks, for it takes longer than all the rest here."""
+        """Of the last scan (`degeneracy`), computed on demand, for it takes longer than all the rest here."""
         return degeneracy(self._scan.points[:, :2]) if self._scan is not None and self._scan.is_planar else None
 
     @property
     def slip(self) -> FloatArray:
-        """(3,) by how much the wheels say more than all witnesses together, smoothed [m/s, m/s, rad/s]."""
+        """(3,) twist by the wheels minus the estimated one, smoothed [m/s, m/s, rad/s]."""
         return self._slip
 
     @property
@@ -89,22 +107,33 @@ class Health:
         silent: Mapping[str, float] | None = None,
         troubles: Mapping[str, str] | None = None,
     ) -> list[Status]:
-        """Of the estimate, the LiDAR, the wheels, the files and the messages. ``silent``: seconds since topics were last heard;
-        ``troubles``: what cannot be written, and why."""
+        """Of the estimate, the LiDAR, the wheels, the files and the messages. ``silent``: seconds since the last message of
+        topics; ``troubles``: what cannot be written, and why."""
         of_sensors = [self._of_estimate(), self._of_lidar(pipeline), self._of_wheels(pipeline)]
         return [*of_sensors, _of_files(troubles or {}), _of_messages(dropped, silent or {})]
 
     def _of_estimate(self) -> Status:
         e = self.estimate
         if e is None:
-            return Status("estimate", WARN, "none yet")
+            return Status("estimate", WARN, "none yet: it begins with wheels that turn or a second scan")
         values = {"x_m": f"{e.pose[0]:.4f}", "y_m": f"{e.pose[1]:.4f}", "yaw_rad": f"{e.pose[2]:.5f}"}
         if e.covariance is not None:
             x, y, yaw = np.sqrt(np.diag(e.covariance))
             values |= {"sigma_x_m": f"{x:.4f}", "sigma_y_m": f"{y:.4f}", "sigma_yaw_rad": f"{yaw:.5f}"}
         if self.latency_p99_s is not None:
             values["latency_p99_ms"] = f"{1e3 * self.latency_p99_s:.2f}"
-        return Status("estimate", values=values)
+        problems = [*self._late_estimates(), *_wide_covariance(e)]
+        return Status("estimate", max((level for level, _ in problems), default=OK), " ".join(text for _, text in problems) or "ok", values)
+
+    def _late_estimates(self) -> list[tuple[int, str]]:
+        """Level and message where more than `_LATE_SHARE` of the last scans had to wait too long."""
+        last = list(self._latencies)[-_LATENCIES:]
+        late = float(np.quantile(last, 1.0 - _LATE_SHARE, method="lower")) if last else 0.0
+        if late <= self.max_latency_s:
+            return []
+        advice = "free the processor, or lower the rate or the points of the LiDAR"
+        level = ERROR if late > _ERROR_RATIO * self.max_latency_s else WARN
+        return [(level, f"estimates come {late:.2f} s after their scans: {advice}.")]
 
     def _of_lidar(self, pipeline: Pipeline) -> Status:
         values, losses = {name: str(count) for name, count in pipeline.estimator.counts().items()}, pipeline.lidar
@@ -137,10 +166,24 @@ class Health:
         vx, vy, wz = (float(v) for v in self._slip)
         values = {"slip_vx_m_s": f"{vx:.4f}", "slip_vy_m_s": f"{vy:.4f}", "slip_wz_rad_s": f"{wz:.4f}"}
         if pipeline.wheel_twist is None:
-            return Status("wheels", WARN, "not heard during the last step: the motion is a guess, or the LiDAR's", values)
+            return Status(
+                "wheels",
+                WARN,
+                _NO_WHEELS,
+                values,
+            )
         if math.hypot(vx, vy) > _SLIP_M_S or abs(wz) > _SLIP_RAD_S:
-            return Status("wheels", WARN, "they turn otherwise than the robot moves: slip", values)
+            return Status("wheels", WARN, _SLIP, values)
         return Status("wheels", values=values)
+
+
+def _wide_covariance(estimate: Estimate) -> list[tuple[int, str]]:
+    if estimate.covariance is None:
+        return []
+    x, y, yaw = np.sqrt(np.diag(estimate.covariance))
+    if math.hypot(x, y) <= _MAX_SIGMA_M and yaw <= _MAX_SIGMA_RAD:
+        return []
+    return [(WARN, f"the pose is uncertain by {math.hypot(x, y):.1f} m and {yaw:.2f} rad: set it on /initialpose or /set_pose.")]
 
 
 def _of_losses(losses: LidarLosses, values: Mapping[str, str]) -> Status | None:
@@ -164,8 +207,8 @@ def _of_messages(dropped: Sequence[str], silent: Mapping[str, float]) -> Status:
     values = {f"dropped_{i + 1}": sentence for i, sentence in enumerate(dropped)}
     values |= {f"silent {topic}": f"{seconds:.1f} s" for topic, seconds in silent.items()}
     if silent:
-        return Status("messages", ERROR, f"nothing comes on {', '.join(silent)}", values)
-    return Status("messages", WARN if dropped else OK, "some were mended or dropped" if dropped else "ok", values)
+        return Status("messages", ERROR, f"no messages on {', '.join(silent)}: check their drivers and the network", values)
+    return Status("messages", WARN if dropped else OK, "some were corrected or dropped: " + dropped[0] if dropped else "ok", values)
 
 
 def degeneracy(points: FloatArray) -> float | None:

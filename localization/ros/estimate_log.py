@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from localization.errors import DumpError, OutputError
+from localization.errors import CheckpointError, OutputError
 from localization.estimate_table import COLUMNS, COV, POSE, TWIST, TWIST_COV, row_of
 from localization.estimators import Estimate
 from localization.logs.fused_log import FusedEstimate
@@ -19,13 +19,13 @@ from motion_models.se2 import FloatArray
 _ROW = np.dtype([("stamp_ns", "<i8"), ("numbers", "<f8", (COLUMNS,))])
 
 
-def old_spool(path: Path) -> Path:
-    """Where the spool ``path`` of a run that was killed is kept."""
+def old_estimate_log(path: Path) -> Path:
+    """Name under which the estimate log ``path`` of a killed run is kept."""
     return path.with_name(f"{path.name}.old")
 
 
-class Spool:
-    """The same in a file that grows, at once and by whole rows. They survive the process; a state says how many it counts on (`resume`)."""
+class EstimateLog:
+    """Rows of estimates in a file that grows by whole rows at once. They survive the process; a checkpoint refers to the first so many."""
 
     def __init__(self, path: Path, file: FileIO, count: int, last_ns: int) -> None:
         self.path, self._file, self.count, self._last_ns = path, file, count, last_ns
@@ -33,25 +33,27 @@ class Spool:
         """Estimates for which there was no room."""
 
     @classmethod
-    def create(cls, path: Path) -> Spool:
-        """A new file. One that a run that was killed has left, and from which no state goes on, is kept as `old_spool`, instead of the one
-        that was kept before it. Raises `OutputError`."""
+    def create(cls, path: Path) -> EstimateLog:
+        """A new file. What a killed run has left, where no state refers to it, is kept as `old_estimate_log`, instead of what was there.
+
+        Raises `OutputError`.
+        """
         try:
             if path.is_symlink() or path.exists():
-                path.replace(old_spool(path))
+                path.replace(old_estimate_log(path))
             return cls(path, path.open("xb", buffering=0), 0, -(1 << 63))
         except OSError as error:
             raise OutputError(f"'{path}' cannot be written: {error.strerror}.") from error
 
     @classmethod
-    def resume(cls, path: Path, count: int) -> Spool:
-        """The first ``count`` rows of a file; what came after them is dropped, to be written anew. Raises `DumpError`."""
+    def resume(cls, path: Path, count: int) -> EstimateLog:
+        """The first ``count`` rows of a file; what came after them is dropped, to be written anew. Raises `CheckpointError`."""
         try:
             file = path.open("r+b", buffering=0)
             size = file.seek(0, 2)
             if size < count * _ROW.itemsize:
                 file.close()
-                raise DumpError(
+                raise CheckpointError(
                     f"'{path}' holds {size // _ROW.itemsize} estimates where the state counts on {count}. Remove both to start anew."
                 )
             file.truncate(count * _ROW.itemsize)
@@ -60,7 +62,9 @@ class Spool:
                 file.seek((count - 1) * _ROW.itemsize)
                 last_ns = int(np.frombuffer(file.read(_ROW.itemsize), _ROW)["stamp_ns"][0])
         except OSError as error:
-            raise DumpError(f"'{path}', the estimates up to the state, cannot be read: {error.strerror}. Remove the state.") from error
+            raise CheckpointError(
+                f"'{path}', the estimates up to the state, cannot be read: {error.strerror}. Remove the state."
+            ) from error
         return cls(path, file, count, last_ns)
 
     def add(self, estimate: Estimate) -> None:

@@ -1,38 +1,82 @@
-"""The first scans would wait for the compiler: compile before the robot does."""
+"""Compile before the robot moves: numba compiles each kernel at its first call, for seconds, and scans would wait for it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
-from localization.events import Event, ImuSample, Scan, WheelSample
-from localization.pipeline import Pipeline, ReplayConfig, Trial
-from motion_models.robot import Mount, Robot
+from localization.errors import EstimatorError
+from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
+from localization.pipeline import Pipeline
+from localization.ros.predictor import Predictor
+from localization.ros.settings import LiveRun
+from motion_models.center_of_gravity.files import arms_model
+from motion_models.se2 import FloatArray
 
-_SCANS = 6
-
-
-def warm_up(pair: Trial, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, is_planar: bool, config: ReplayConfig) -> None:
-    """Run a short imagined drive through a pipeline like the one that is wanted, and forget it."""
-    pipeline = Pipeline(pair, robot, mounts, has_lidar, config)
-    for event in _imagined(is_planar):
-        pipeline.process(event)
-    pipeline.finish()
+_ROOM_M, _SPEED_M_S = 8.0, 0.5
+_PERIOD_NS = 10_000_000
+_EVENTS_PER_SCAN = 10
 
 
-def _imagined(is_planar: bool) -> Iterator[Event]:
-    """Half a second of a straight drive in a square room of 8 m."""
+def warm_up(run: LiveRun) -> None:
+    """Process short synthetic drives with every kind of sensor that the robot may have, and discard the results.
+
+    Once with planar scans, once with clouds and once without a LiDAR (where the estimator works without one), each with a gap in the
+    scans, after which the matcher searches a wide prior. The centre of gravity of the robot's arms first.
+    """
+    if run.robot.arms is not None:
+        model = arms_model(run.robot.arms, run.robot.folder)
+        model.estimate(np.zeros_like(model.chain.lower))
+    for has_lidar, is_planar in ((True, True), (True, False), (False, True)):
+        try:
+            trial = run.make_trial(has_lidar)
+            pipeline = Pipeline(trial, run.robot, run.robot.mounts, has_lidar, run.config)
+        except EstimatorError:
+            if has_lidar:
+                raise
+            continue
+        predictor = Predictor(trial.model, run.robot, run.config.step.max_hold_s)
+        for event in synthetic_drive(has_lidar, is_planar):
+            predictor.insert(event)
+            for estimate in pipeline.process(event):
+                pipeline.run_deferred()
+                predictor.reset(estimate, pipeline.estimator.params, pipeline.estimator.clock_offset_s)
+            predictor.predict()
+        pipeline.estimator.map_points()
+        pipeline.finish()
+
+
+def synthetic_drive(has_lidar: bool, is_planar: bool) -> Iterator[Event]:
+    """Some seconds of a drive along an arc in a square room: a standstill, motion over several keyframes, and a second without scans."""
+    room = _room(is_planar)
+    stamp, pose, turned = 1_000_000_000, np.zeros(3), np.zeros(2)
+    yield CgSample(stamp, np.zeros(2))
+    for i in range(600):
+        speed = 0.0 if i < 50 else _SPEED_M_S
+        rates = speed * np.array([9.0, 10.0])
+        pose = pose + _PERIOD_NS * 1e-9 * np.array([speed * math.cos(pose[2]), speed * math.sin(pose[2]), 0.3 * speed])
+        stamp, turned = stamp + _PERIOD_NS, turned + rates * _PERIOD_NS * 1e-9
+        yield WheelSample(stamp, rates, turned)
+        yield ImuSample(stamp, np.array([0.0, 0.0, 0.3 * speed]), np.array([0.0, 0.0, 9.81]), "imu_link")
+        if has_lidar and i % _EVENTS_PER_SCAN == 9 and not 300 < i < 400:
+            yield replace(room, stamp_ns=stamp, points=_from_pose(room.points, pose))
+
+
+def _room(is_planar: bool) -> Scan:
+    """A square room with a pillar, which makes its corners distinct."""
     angle = np.linspace(-math.pi, math.pi, 400)
-    reach = 4.0 / np.maximum(np.abs(np.cos(angle)), np.abs(np.sin(angle)))
-    ring = np.column_stack([reach * np.cos(angle), reach * np.sin(angle), np.zeros(len(angle))])
+    distance = 0.5 * _ROOM_M / np.maximum(np.abs(np.cos(angle)), np.abs(np.sin(angle)))
+    distance = np.where(np.abs(angle - 0.6) < 0.1, 2.5, distance)
+    ring = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), np.zeros(len(angle))])
     points = ring if is_planar else np.concatenate([ring + np.array([0.0, 0.0, z]) for z in np.arange(0.0, 1.5, 0.1)])
-    offsets = np.linspace(0.0, 0.05, len(points))
-    for i in range(10 * _SCANS):
-        stamp = 1_000_000_000 + i * 10_000_000
-        turned = 0.03 * i * np.array([1.0, 1.01])
-        yield WheelSample(stamp, np.array([3.0, 3.03]), turned)
-        yield ImuSample(stamp, np.array([0.0, 0.0, 0.01]), np.array([0.0, 0.0, 9.81]), "imu_link")
-        if i % 10 == 9:
-            yield Scan(stamp, points, offsets, "base_link", is_planar)
+    return Scan(0, points, np.linspace(0.0, 0.05, len(points)), "base_link", is_planar)
+
+
+def _from_pose(points: FloatArray, pose: FloatArray) -> FloatArray:
+    """``points`` (N, 3) of the room in the body frame at ``pose``."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    x, y = points[:, 0] - pose[0], points[:, 1] - pose[1]
+    return np.column_stack([c * x + s * y, c * y - s * x, points[:, 2]])

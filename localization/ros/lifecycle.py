@@ -1,6 +1,6 @@
 """`skidloc_node`: the estimator as a managed ROS 2 node (lifecycle, parameters), through rclpy.
 
-One thread does all: while the estimator runs, its transport spins the node, and with it the services of lifecycle and parameters.
+There is one thread: while the estimator runs, its transport spins the node, and with it the services of lifecycle and parameters.
 """
 
 from __future__ import annotations
@@ -13,12 +13,14 @@ from typing import Any
 from localization.errors import SettingError
 from localization.ros.jit_warm_up import warm_up
 from localization.ros.node import Node
-from localization.ros.parameters import NodeSettings, make_settings, nearest, parameters
-from localization.ros.signals import Stop
+from localization.ros.parameters import make_settings, nearest, parameters
+from localization.ros.run_control import StopSignal
+from localization.ros.settings import LiveRun, ManagedNodeSettings
 from localization.ros.topic_names import Names
+from localization.ros.transports.base import Transport
 from localization.ros.transports.rclpy import RclpyTransport, import_rclpy
+from localization.ros.transports.sim_time import SimTimeTransport
 from motion_models.errors import SkidlocError
-from motion_models.robot import Robot, load_robot
 
 _IDLE_S = 0.2
 _BAD_INPUT = 2
@@ -30,14 +32,14 @@ class ManagedNode:
     """Unconfigured at first; `run` until a signal or a shutdown."""
 
     def __init__(self, arguments: Sequence[str]) -> None:
-        """``arguments`` as of ROS 2 (`--ros-args ...`). Raises `DoorError` without rclpy, `SettingError` for unknown parameters."""
+        """``arguments`` as of ROS 2 (`--ros-args ...`). Raises `TransportError` without rclpy, `SettingError` for unknown parameters."""
         self._rclpy, lifecycle, signals = import_rclpy("", "lifecycle", "signals")
         self._messages: Any = importlib.import_module("rcl_interfaces.msg")  # rclpy itself needs it
         self._rclpy.init(args=["skidloc_node", *arguments], signal_handler_options=signals.SignalHandlerOptions.NO)
         self._node: Any = lifecycle.LifecycleNode("skidloc")
         self._log: Any = self._node.get_logger()
-        self._settings: NodeSettings | None = None
-        self._robot: Robot | None = None
+        self._settings: ManagedNodeSettings | None = None
+        self._live_run: LiveRun | None = None
         self._estimator: Node | None = None
         self._is_active = self._is_shut_down = self._has_failed = False
         self._declare_parameters()
@@ -47,7 +49,7 @@ class ManagedNode:
 
     def run(self) -> int:
         """The exit code."""
-        with Stop() as stop:
+        with StopSignal() as stop:
             try:
                 if self._node.get_parameter("autostart").value and not self._start():
                     return _BAD_INPUT
@@ -67,9 +69,8 @@ class ManagedNode:
         settings = self._read_settings()
         if not settings.robot:
             raise SettingError("parameter 'robot' is empty; it must be the name of a shipped robot or the path of a robot TOML file.")
-        settings.files()
-        self._robot = load_robot(settings.robot)
-        warm_up(settings.make_pair(True), self._robot, self._robot.mounts, has_lidar=True, is_planar=True, config=settings.config)
+        self._live_run = settings.live_run()
+        warm_up(self._live_run)
         self._settings = settings
 
     def activate(self) -> None:
@@ -92,28 +93,19 @@ class ManagedNode:
             self._node.trigger_activate()
         return self._is_active
 
-    def _estimate(self, stop: Stop) -> None:
+    def _estimate(self, stop: StopSignal) -> None:
         """Until deactivated, or stopped. What fails is logged, and the node is inactive then."""
         assert self._settings is not None
-        assert self._robot is not None
-        settings, files = self._settings, self._settings.files()
+        assert self._live_run is not None
+        settings, files = self._settings, self._live_run.files
+        transport: Transport = SimTimeTransport(self._transport) if settings.node.use_sim_time else self._transport
 
         def is_over() -> bool:
             return stop.is_set() or not self._is_active
 
         try:
             with files.claimed():
-                self._estimator = Node.start(
-                    self._transport,
-                    self._robot,
-                    settings.make_pair,
-                    files,
-                    self._log.warning,
-                    settings.topic,
-                    settings.config,
-                    settings.node,
-                    is_over,
-                )
+                self._estimator = Node.start(transport, self._live_run, self._log.warning, is_over)
                 self._log.info(f"running {settings.model} in {settings.estimator} on {', '.join(self._estimator.topics)}")
                 self._estimator.spin(is_over)
                 count = self._estimator.finish()
@@ -132,7 +124,7 @@ class ManagedNode:
         self._has_failed = True
         if self._is_active:
             self._node.trigger_deactivate()
-            self._is_shut_down = bool(self._node.get_parameter("autostart").value)  # nobody is there to activate it again
+            self._is_shut_down = bool(self._node.get_parameter("autostart").value)  # no manager would activate it again
 
     def _declare_parameters(self) -> None:
         """Raises `SettingError` for a parameter that does not exist: rclpy would ignore it."""
@@ -148,11 +140,12 @@ class ManagedNode:
             )
             self._node.declare_parameter(parameter.name, parameter.default, descriptor)
 
-    def _read_settings(self, changed: Sequence[Any] = ()) -> NodeSettings:
-        """Of the parameters, with those ``changed``. Raises `SettingError`."""
+    def _read_settings(self, changed: Sequence[Any] = ()) -> ManagedNodeSettings:
+        """Settings of the parameters, with those ``changed``. Raises `SettingError`."""
         values = {parameter.name: self._node.get_parameter(parameter.name).value for parameter in parameters()}
         values |= {parameter.name: parameter.value for parameter in changed if parameter.name in values}
-        return make_settings(values, Names(self._node.get_name(), self._node.get_namespace()))
+        use_sim_time = bool(self._node.get_parameter("use_sim_time").value)
+        return make_settings(values, Names(self._node.get_name(), self._node.get_namespace()), use_sim_time=use_sim_time)
 
     def _on_set_parameters(self, changed: Sequence[Any]) -> Any:
         result = self._messages.SetParametersResult
@@ -172,7 +165,7 @@ class ManagedNode:
 
 
 def _make_entity(lifecycle: Any, managed: ManagedNode) -> Any:
-    """What rclpy calls at transitions."""
+    """The managed entity that rclpy calls at transitions."""
     done = lifecycle.TransitionCallbackReturn
 
     class Entity(lifecycle.ManagedEntity):  # type: ignore[misc]

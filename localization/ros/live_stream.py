@@ -1,7 +1,7 @@
-"""From messages as they come to estimates: late, lost, doubled and reordered ones, clocks that jump, sensors that leave and return.
+"""Live messages to events: late, lost, doubled and reordered ones, clocks that jump, sensors that leave and return.
 
-What a message means, which stamps are believed and what is dropped are decided as for logs (`logs.intake`, `logs.merge`), but nothing
-waits for what might still come: an event goes to the pipeline when it is here.
+Decoding, trusted stamps and dropped messages are those of logs (`logs.event_decoder`, `logs.clock_sync`), but nothing waits for messages
+that may still come: an event goes to the pipeline when it is here.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from localization.errors import DumpError
+from localization.errors import CheckpointError
 from localization.events import Event
 from localization.logs.clock_sync import Merger
-from localization.logs.event_decoder import Intake, read_item
-from localization.logs.message_stats import Oddity, Tally
+from localization.logs.event_decoder import EventDecoder, decode_item
+from localization.logs.message_stats import MessageStats, Oddity
 from localization.logs.serialization import decoder
-from localization.logs.topics import TYPES, Sources
+from localization.logs.topic_roles import TYPES, Sources
 from localization.logs.wheel_decoder import JointsToWheels, OdometryToWheels
-from localization.ros.discovery import Heard
+from localization.ros.discovery import DiscoveredTopics
 from localization.ros.transports.base import Received
 from motion_models.robot import Robot
 
@@ -31,71 +31,71 @@ _NEAR, _PAST, _LONGEST_S = 0.95, 1.1, 0.12
 
 
 @dataclass(frozen=True)
-class Memory:
-    """What a state remembers besides the pipeline: angles that wheels have turned, by whichever source."""
+class WheelAngles:
+    """Accumulated angles of the wheels by each source: what a checkpoint holds besides the pipeline."""
 
     joints: JointsToWheels
     odometry: OdometryToWheels
 
 
-class Stream:
+class LiveStream:
     """Messages in, events out."""
 
-    def __init__(self, heard: Heard, robot: Robot, tally: Tally, epoch_ns: int, *, is_ros1: bool) -> None:
-        """``epoch_ns``: what makes times of the wall of times of receiving."""
-        parts, self._tally, self._epoch_ns = heard.parts, tally, epoch_ns
+    def __init__(self, discovered: DiscoveredTopics, robot: Robot, tally: MessageStats, epoch_ns: int, *, is_ros1: bool) -> None:
+        """``epoch_ns``: what turns times of receiving into the time of ROS."""
+        parts, self._tally, self._epoch_ns = discovered.parts, tally, epoch_ns
         self.sources: Sources = parts.sources
-        self._intake = Intake(parts.sources, parts.joints, parts.arms, robot, tally)
-        self._merger = Merger(heard.plan, tally, wait_ns=None)
+        self._intake = EventDecoder(parts.sources, parts.joints, parts.arms, robot, tally)
+        self._merger = Merger(discovered.plan, tally, wait_ns=None)
         self._decoders = {source.topic: decoder(TYPES[source.kind], is_ros1=is_ros1) for source in parts.sources.used()}
-        self._watches = {source.topic: _Watch() for source in parts.sources.used()}
+        self._rates = {source.topic: _TopicRate() for source in parts.sources.used()}
 
     @property
-    def memory(self) -> Memory:
-        return Memory(self._intake.from_joints, self._intake.from_odometry)
+    def wheel_angles(self) -> WheelAngles:
+        return WheelAngles(self._intake.from_joints, self._intake.from_odometry)
 
-    def remember(self, memory: Memory) -> None:
-        """Go on from where another stream was."""
-        self._intake.from_joints, self._intake.from_odometry = memory.joints, memory.odometry
+    def restore(self, angles: WheelAngles) -> None:
+        """Continue from the angles of another stream."""
+        self._intake.from_joints, self._intake.from_odometry = angles.joints, angles.odometry
 
-    def push(self, received: Received) -> Iterator[Event]:
+    def events(self, received: Received) -> Iterator[Event]:
         """The events that ``received`` makes, none or several."""
         decode = self._decoders.get(received.topic)
         if decode is None:
             return
-        self._watches[received.topic].heard(received.received_ns)
+        self._rates[received.topic].count(received.received_ns)
         wall_ns = received.received_ns + self._epoch_ns
-        item = read_item(received.topic, wall_ns, partial(decode, received.data), self._intake.parts[received.topic], self._tally)
+        item = decode_item(received.topic, wall_ns, partial(decode, received.data), self._intake.decoders[received.topic], self._tally)
         if item is not None:
-            for payload in self._merger.push(item):
+            for payload in self._merger.insert(item):
                 yield from self._intake.events(payload)
 
     def sender_stamp_ns(self, stamp_ns: int, *, by_lidar: bool) -> int:
-        """A stamp of an event in the clock of who sends it now, which may have been set since the start."""
+        """A stamp of an event in the present clock of its sender, which may have been set since the start."""
         source = self.sources.lidar if by_lidar and self.sources.lidar is not None else self.sources.wheels or self.sources.lidar
         return stamp_ns if source is None else stamp_ns - self._merger.shift_ns(source.topic)
 
     def silent(self, now_ns: int) -> dict[str, float]:
-        """Seconds since topics in use were heard, of those that should have been since."""
-        found = {topic: watch.silence(now_ns) for topic, watch in self._watches.items()}
+        """Seconds since the last message, of topics in use whose next one is overdue."""
+        found = {topic: watch.silence(now_ns) for topic, watch in self._rates.items()}
         return {topic: seconds for topic, seconds in found.items() if seconds is not None}
 
     def rates(self) -> dict[str, float]:
         """Messages per second of the topics in use, by their last dozen [Hz]; 0 of one that never came twice."""
-        return {topic: watch.rate_hz for topic, watch in self._watches.items()}
+        return {topic: watch.rate_hz for topic, watch in self._rates.items()}
 
     def patience_s(self, now_ns: int) -> float:
-        """How long messages may wait for others [s]: nobody waits for what they say until the next scan. 0 without a LiDAR.
+        """How long messages that are not urgent may wait for others [s]: until shortly before the next scan. 0 without a LiDAR.
 
-        To be woken takes longer than to read a few. They are looked at once before the scan is due, so that it need not wait for them.
+        To wake up for each takes longer than to read a few.
         """
         lidar = self.sources.lidar
-        return 0.0 if lidar is None else self._watches[lidar.topic].rest(now_ns, (_NEAR, _PAST))
+        return 0.0 if lidar is None else self._rates[lidar.topic].rest(now_ns, (_NEAR, _PAST))
 
     def dropped(self) -> list[str]:
-        """Sentences of what was mended or dropped."""
+        """Messages that were corrected or dropped, as sentences."""
         found = []
-        for topic in self._watches:
+        for topic in self._rates:
             for oddity in Oddity:
                 if (count := self._tally.of(topic, oddity)) and oddity is not Oddity.OUT_OF_ORDER:
                     what = _LATE if oddity is Oddity.LATE else oddity.value
@@ -103,14 +103,14 @@ class Stream:
         return found
 
 
-class _Watch:
-    """When one topic was heard, and how often it is."""
+class _TopicRate:
+    """Time of the last message of a topic, and its mean period."""
 
     def __init__(self) -> None:
         self._last_ns: int | None = None
         self._period_s = 0.0
 
-    def heard(self, now_ns: int) -> None:
+    def count(self, now_ns: int) -> None:
         if self._last_ns is not None:
             gap = (now_ns - self._last_ns) * _NS
             self._period_s += (min(gap, 10.0 * self._period_s + 0.01) - self._period_s) * 0.1
@@ -133,9 +133,9 @@ class _Watch:
 
 
 def check_age(head: Mapping[str, Any], stamp_ns: int, where: str) -> float:
-    """Seconds from a state's last event to one of ``stamp_ns``. Raises `DumpError` where nothing can be told of the time between."""
+    """Seconds from a state's last event to one of ``stamp_ns``. Raises `CheckpointError` where that is too long to continue."""
     age = (stamp_ns - int(head.get("stamp_ns", stamp_ns))) * _NS
     if not -_NEWEST_S <= age <= _OLDEST_S:
         what = f"{age / 3600.0:.1f} h old" if age > 0 else f"{-age:.1f} s ahead of the robot's clock"
-        raise DumpError(f"the state in '{where}' is {what}: the robot may be anywhere. Remove it to start anew.")
+        raise CheckpointError(f"the state in '{where}' is {what}: the robot may be anywhere. Remove it to start anew.")
     return age

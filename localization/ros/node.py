@@ -6,43 +6,34 @@ import gc
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from localization.errors import DumpError
+from localization.errors import CheckpointError
 from localization.estimators import Estimate
 from localization.events import Event, Scan
-from localization.logs.message_stats import Tally
-from localization.logs.topics import TopicOverrides
-from localization.pipeline import Pipeline, ReplayConfig, Trial
+from localization.logs.message_stats import MessageStats
+from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import fingerprints, read_head
-from localization.ros.diagnostics import ERROR, Status
-from localization.ros.discovery import TF_STATIC, TF_TYPE, Heard, Listener
+from localization.ros.diagnostics import ERROR, WARN, Health, Status
+from localization.ros.discovery import DiscoveredTopics, TopicDiscovery
 from localization.ros.jit_warm_up import warm_up
-from localization.ros.live_stream import Memory, Stream, check_age
-from localization.ros.publisher import TF, Frames, Teller
-from localization.ros.session import Session, View, made_by
-from localization.ros.session_files import Files
-from localization.ros.topic_names import Names
-from localization.ros.transform_conflicts import TransformConflicts
+from localization.ros.live_stream import LiveStream, WheelAngles, check_age
+from localization.ros.operator_commands import OperatorCommands
+from localization.ros.predictor import Predictor
+from localization.ros.publisher import EstimatePublisher
+from localization.ros.session import Session, SessionState, View, made_by
+from localization.ros.settings import LiveRun
+from localization.ros.start_pose import StartPose
+from localization.ros.transforms import TF, TF_STATIC, TF_TYPE, TransformConflicts
 from localization.ros.transports.base import Received, Transport
-from localization.settings import Settings
-from motion_models.robot import Mount, Robot
+from motion_models.robot import Mount
 
-_TELL_S, _POLL_S = 1.0, 0.2
-
-
-@dataclass(frozen=True)
-class NodeConfig(Settings):
-    """How a node behaves."""
-
-    wait_s: float = 5.0
-    """How long topics that are published are waited for before a start without them, and how often silence is reported [s]."""
-    tf: bool = True
-    """Publish the transforms `odom_frame` -> `base_link_frame` and, of a graph, `map_frame` -> `odom_frame`; false where others do."""
-    frames: Frames = field(default_factory=Frames)
-    names: Names = field(default_factory=Names)
+_STATUS_PERIOD_S, _POLL_S = 1.0, 0.2
+_AFTER_ESTIMATE = 1.5
+"""A status waits for an estimate for up to this many periods: then the next scan is farthest."""
+_MAX_PREDICTED_AGE_NS = 200_000_000
+"""Older messages of the wheels are not predicted to: after a pause of the process there are hundreds, and the newest is what counts."""
 
 
 class Node:
@@ -51,195 +42,262 @@ class Node:
     def __init__(
         self,
         transport: Transport,
-        stream: Stream,
-        session: Session,
-        teller: Teller,
-        robot: Robot,
-        heard: Heard,
-        made: dict[str, str],
-        tell: Callable[[str], None],
-        config: NodeConfig,
+        run: LiveRun,
+        discovered: DiscoveredTopics,
+        trial: Trial,
+        publisher: EstimatePublisher,
+        report: Callable[[str], None],
     ) -> None:
-        """``made``: what a state was made with; it changes with the mounts that come."""
-        self._tf_static, self._tf = config.names.resolve(TF_STATIC), config.names.resolve(TF)
-        self._conflicts = TransformConflicts(config.frames.odom_frame, config.frames.base_link_frame, is_ros1=transport.is_ros1)
-        self._transport, self._stream, self.session, self._teller = transport, stream, session, teller
-        self._robot, self._transforms, self._made, self._say = robot, heard.transforms, made, tell
-        self._lacks: set[str] = set()  # that were told
-        self._told = -float("inf")
+        """``run`` with resolved topics. The session begins in `_open_session`."""
+        self._transport, self._run, self._trial, self._publisher, self._report = transport, run, trial, publisher, report
+        names, self._sources = run.node.names, discovered.parts.sources
+        self._tf_static, self._tf = names.resolve(TF_STATIC), names.resolve(TF)
+        self._conflicts = TransformConflicts(run.node.frames.base_link_frame, is_ros1=transport.is_ros1)
+        self._transforms = discovered.transforms
+        self._tally = MessageStats()
+        self._stream = LiveStream(discovered, run.robot, self._tally, transport.epoch_ns, is_ros1=transport.is_ros1)
+        self._made = made_by(trial, run.robot, discovered.mounts, self.has_lidar, run.config, "live topics")
+        self._predictor = Predictor(trial.model, run.robot, run.config.step.max_hold_s) if run.node.predict else None
+        self._commands = OperatorCommands(self, transport, names, report)
+        self._problems: set[str] = set()  # that were reported
+        self._next_status = self._next_path = self._next_map = -float("inf")
         self._newest_ns = 0
-        self._began_ns: int | None = None
+        self._begin_ns: int | None = None
         self.statuses: list[Status] = []
         """Of the last second."""
+        self.is_paused = False
 
     @classmethod
     def start(
         cls,
         transport: Transport,
-        robot: Robot,
-        make_pair: Callable[[bool], Trial],
-        files: Files,
-        tell: Callable[[str], None],
-        topics: TopicOverrides | None = None,
-        config: ReplayConfig | None = None,
-        node: NodeConfig | None = None,
+        run: LiveRun,
+        report: Callable[[str], None],
         is_over: Callable[[], bool] = lambda: False,
         view: View | None = None,
     ) -> Node:
-        """Listen, then begin, or go on from the state on disk. ``make_pair`` is told whether there is a LiDAR; ``tell`` hears what a
-        person should know meanwhile; ``is_over`` ends it (`KeyboardInterrupt`).
+        """Compile, discover the topics, then begin, or continue from the state on disk.
 
-        Raises `DoorError`, `TopicError`, `EstimatorError`, `DumpError` and `OutputError`.
+        ``report`` is given messages for the user; ``is_over`` ends it (`KeyboardInterrupt`). Raises `TransportError`, `TopicError`,
+        `EstimatorError`, `CheckpointError` and `OutputError`.
         """
-        config, node = config or ReplayConfig(), node or NodeConfig()
-        epoch_ns = time.time_ns() - time.monotonic_ns()
-        warm_up(make_pair(True), robot, robot.mounts, has_lidar=True, is_planar=True, config=config)
-        robot, topics = node.names.apply_to_robot(robot), node.names.apply_to_overrides(topics or TopicOverrides())
-        listener = Listener(transport, robot, topics, node.names, node.frames.base_link_frame)
-        teller = Teller(transport, node.names, node.frames, with_tf=node.tf)  # now: whoever subscribes has found it by the first estimate
-        needed = read_head(files.state).get("topics", []) if files.state is not None and files.state.exists() else []
-        heard = listener.listen(node.wait_s, needed, tell, epoch_ns, is_over)
-        for note in heard.parts.warnings:
-            tell(note)
-        has_lidar = heard.parts.sources.lidar is not None
-        pair = make_pair(has_lidar)
-        lidar = heard.parts.sources.lidar
-        if lidar is None or lidar.kind != "scan":
-            warm_up(pair, robot, heard.mounts, has_lidar, is_planar=False, config=config)
-        gc.collect()
-        gc.freeze()  # what is here now stays: later collections need not look at it
-        transforms = [node.names.resolve(topic) for topic in ((TF_STATIC, TF) if node.tf else (TF_STATIC,))]
-        if node.tf:
-            transport.subscribe(transforms[1], TF_TYPE, is_latched=False)
-        transport.keep([*transforms, *(source.topic for source in heard.parts.sources.used())], [] if lidar is None else [lidar.topic])
-        tally = Tally()
-        stream = Stream(heard, robot, tally, epoch_ns, is_ros1=transport.is_ros1)
-        made = made_by(pair, robot, heard.mounts, has_lidar, config, "live topics")
-        pipeline = Pipeline(pair, robot, heard.mounts, has_lidar, config)
-        session = Session.start(files, pipeline, f"{pair.model.name}_{pair.estimator}", made, stream.memory, {"tally": tally}, tell)
-        with ExitStack() as failing:
-            failing.callback(session.close)
-            if view is not None:
-                view.begin(robot, heard.mounts)
-                session.view = view
-            made_node = cls(transport, stream, session, teller, robot, heard, made, tell, node)
-            if session.head:
-                if not isinstance(session.kept, Memory):
-                    raise DumpError(f"the state in '{files.state}' is of a log. Remove it to start anew.")
-                age = check_age(session.head, heard.start_ns, str(files.state))
-                stream.remember(session.kept)
-                tell(f"resumed from {files.state}, {age:.1f} s later.")
-            for received in heard.backlog:
-                made_node._push(received, time_it=False)
-            failing.pop_all()
-        return made_node
+        warm_up(run)
+        run = run.resolve_topics()
+        config, state_file = run.node, run.files.state
+        discovery = TopicDiscovery(transport, run.robot, run.topics, config.names, config.frames.base_link_frame)
+        # now: subscribers have found it by the first estimate
+        publisher = EstimatePublisher(transport, config.names, config.frames, with_tf=config.tf)
+        needed = read_head(state_file).get("topics", []) if state_file is not None and state_file.exists() else []
+        discovered = discovery.discover(config.wait_s, needed, report, is_over)
+        for warning in discovered.parts.warnings:
+            report(warning)
+        node = cls(transport, run, discovered, run.make_trial(discovered.parts.sources.lidar is not None), publisher, report)
+        node._open_session(discovered, view)
+        return node
 
-    def spin(self, is_over: Callable[[], bool] = lambda: False, on_line: Callable[[Node], None] = lambda node: None) -> None:
-        """Until ``is_over``; ``on_line`` is called about every fifth of a second."""
-        shown = 0.0
+    def _open_session(self, discovered: DiscoveredTopics, view: View | None) -> None:
+        gc.collect()
+        gc.freeze()  # these objects stay: later collections skip them
+        mounts = discovered.mounts
+        pipeline = Pipeline(self._trial, self._run.robot, mounts, self.has_lidar, self._run.config)
+        config, is_localizing = self._run.node, pipeline.is_localizing
+        self._publisher.advertise_optional(
+            has_predictions=config.predict,
+            has_map_frame=is_localizing,
+            has_path=bool(config.path_period_s),
+            has_map=bool(config.map_period_s) and self.has_lidar,
+        )
+        self._subscribe()
+        state = SessionState(pipeline, StartPose(), self._stream.wheel_angles)
+        name = f"{self._trial.model.name}_{self._trial.estimator}"
+        self.session = Session.start(self._run.files, state, name, self._made, {"tally": self._tally}, self._report)
+        self.session.health = Health(config.max_latency_s)
+        with ExitStack() as failing:
+            failing.callback(self.session.close)
+            if view is not None:
+                view.begin(self._run.robot, mounts)
+                self.session.view = view
+            if self.session.head:
+                self._continue_from(self.session.head, discovered.start_ns)
+            for received in discovered.backlog:
+                self._receive(received, is_backlog=True)
+            failing.pop_all()
+
+    def _subscribe(self) -> None:
+        """To what is used from here on; wheels are urgent where every message of them makes a prediction."""
+        transforms = [self._tf_static]
+        if self._run.node.tf:
+            self._transport.subscribe(self._tf, TF_TYPE, is_latched=False)
+            transforms.append(self._tf)
+        urgent = [source.topic for source in (self._sources.lidar, self._sources.wheels if self._predictor else None) if source is not None]
+        topics = [source.topic for source in self._sources.used()]
+        self._transport.restrict([*transforms, *topics, *self._commands.topics], [*urgent, *self._commands.topics])
+
+    def _continue_from(self, head: Mapping[str, Any], start_ns: int) -> None:
+        """Raises `CheckpointError` for a checkpoint of a log or of another time."""
+        state, path = self.session.state, self._run.files.state
+        if not isinstance(state.angles, WheelAngles):
+            raise CheckpointError(f"the state in '{path}' is of a log. Remove it to start anew.")
+        age = check_age(head, start_ns, str(path))
+        self._stream.restore(state.angles)
+        self._report(f"resumed from {path}, {age:.1f} s later.")
+
+    def spin(self, is_over: Callable[[], bool] = lambda: False, on_poll: Callable[[Node], None] = lambda node: None) -> None:
+        """Until ``is_over``; ``on_poll`` is called about five times a second."""
+        next_poll = 0.0
         while not is_over():
             has_estimate = False
             for received in self._transport.take(_POLL_S, self._patience_s()):
-                has_estimate |= self._push(received, time_it=True)
+                has_estimate |= self._receive(received)
             now = time.monotonic()
-            if now - self._told >= (_TELL_S if has_estimate else 1.5 * _TELL_S):  # after an estimate the next scan is far
-                self._told = now
-                self._tell()
-            if now - shown >= _POLL_S:
-                shown = now
-                on_line(self)
+            if now >= self._next_status + (0.0 if has_estimate else (_AFTER_ESTIMATE - 1.0) * _STATUS_PERIOD_S):
+                self._next_status = now + _STATUS_PERIOD_S
+                self._publish_status()
+                self._publish_overview(now)
+            if now >= next_poll:
+                next_poll = now + _POLL_S
+                on_poll(self)
 
     def finish(self) -> int | None:
         """Write the output and the last state; returns how many estimates there were, if an output was wanted."""
         try:
-            return self.session.write_out()
+            return self.session.write_output()
         finally:
-            self.session.dump(self._head, now=True)
+            self.session.save_state(self._head, now=True)
             self.session.close()
 
     def publish_tf(self, is_on: bool) -> None:
-        """Publish the transform from now on, or no more."""
-        self._teller.publish_tf(is_on)
+        """Publish the transforms from now on, or no more."""
+        self._publisher.publish_tf(is_on)
+
+    def restart(self, start: StartPose) -> None:
+        """Begin anew at ``start``: with a new map, and nothing learned of the motion model."""
+        pipeline = Pipeline(self._trial, self._run.robot, self.session.pipeline.mounts, self.has_lidar, self._run.config)
+        self.session.restart(pipeline, start)
+        self._publisher.restart()
+        if self._predictor is not None:
+            self._predictor.stop()
+
+    @property
+    def frames(self) -> Any:
+        """Names of the frames that are published."""
+        return self._run.node.frames
+
+    @property
+    def has_lidar(self) -> bool:
+        return self._sources.lidar is not None
 
     @property
     def topics(self) -> list[str]:
         """Those in use."""
-        return [source.topic for source in self._stream.sources.used()]
+        return [source.topic for source in self._sources.used()]
 
     def rates(self) -> dict[str, float]:
         """Messages per second of the topics in use [Hz]."""
         return self._stream.rates()
 
     def warnings(self) -> list[str]:
-        """Sentences about everything that was lost or mended."""
+        """Everything that was lost or corrected, as sentences."""
         return list(dict.fromkeys([*self._stream.dropped(), *self.session.pipeline.warnings()]))
 
     @property
     def seconds(self) -> float:
         """Since the first event [s]."""
-        return 0.0 if self._began_ns is None else (self._newest_ns - self._began_ns) * 1e-9
+        return 0.0 if self._begin_ns is None else (self._newest_ns - self._begin_ns) * 1e-9
 
-    def _push(self, received: Received, *, time_it: bool) -> bool:
-        """True if it made an estimate."""
+    def _receive(self, received: Received, *, is_backlog: bool = False) -> bool:
+        """Process a message; True if it made an estimate."""
         if received.topic == self._tf:
-            if (found := self._conflicts.check(received.data, self._teller.recent_transforms)) is not None:
-                self._say(found)
+            if (conflict := self._conflicts.check(received.data, self._publisher.recent_transforms)) is not None:
+                self._report(conflict)
             return False
         if received.topic == self._tf_static:
-            self._transforms.hear(received.data)
-            self._meet(self._transforms.mounts())
+            self._transforms.insert(received.data)
+            self._add_mounts(self._transforms.mounts())
+            return False
+        if self._commands.execute(received) or self.is_paused:
             return False
         has_estimate = False
-        for event in self._stream.push(received):
-            self._newest_ns = max(self._newest_ns, event.stamp_ns)
-            self._began_ns = event.stamp_ns if self._began_ns is None else self._began_ns
-            arrived_ns = received.received_ns if time_it and isinstance(event, Scan) else None
-            has_estimate |= bool(self.session.push(event, partial(self._publish, event, arrived_ns)))
-            self.session.saw(event)
-            self._watch_frames()
-        if has_estimate:  # the next scan is far now, and does not wait
+        for event in self._stream.events(received):
+            has_estimate |= self._process(event, received, is_backlog=is_backlog)
+        if has_estimate:  # the next scan is farthest now, and does not wait
             self.session.pipeline.run_deferred()
-            self.session.dump(self._head)
+            self.session.save_state(self._head)
         return has_estimate
 
-    def _meet(self, mounts: Mapping[str, Mount]) -> None:
-        """Frames whose place is told only now have it from now on, and so has the state."""
+    def _process(self, event: Event, received: Received, *, is_backlog: bool) -> bool:
+        self._newest_ns = max(self._newest_ns, event.stamp_ns)
+        self._begin_ns = event.stamp_ns if self._begin_ns is None else self._begin_ns
+        arrived_ns = received.received_ns if not is_backlog and isinstance(event, Scan) else None
+        is_predictable = self._predictor is not None and self._predictor.insert(event)
+        estimates = self.session.process(event, partial(self._publish, event, arrived_ns))
+        if (is_predictable or estimates) and self._transport.now_ns() - received.received_ns < _MAX_PREDICTED_AGE_NS:
+            self._publish_prediction()
+        self.session.observe(event)
+        self._check_frames()
+        return bool(estimates)
+
+    def _add_mounts(self, mounts: Mapping[str, Mount]) -> None:
+        """Frames that become known only now have their mounts from here on, and so has the state."""
         pipeline = self.session.pipeline
-        was_lacking = pipeline.synchronizer.frames.lack is not None
+        was_missing = pipeline.synchronizer.frames.lack is not None
         if not pipeline.add_mounts(mounts):
             return
         self._made.update(fingerprints(mounts=pipeline.mounts))
-        if was_lacking and pipeline.synchronizer.frames.lack is None:
-            self._say("/tf_static tells now where the LiDAR sits: its scans are placed by that from here on.")
+        if was_missing and pipeline.synchronizer.frames.lack is None:
+            self._report("/tf_static now has the mount of the LiDAR: its scans are placed by that from here on.")
         if self.session.view is not None:
-            self.session.view.begin(self._robot, pipeline.mounts)
+            self.session.view.begin(self._run.robot, pipeline.mounts)
 
-    def _watch_frames(self) -> None:
+    def _check_frames(self) -> None:
         for problem in (self.session.pipeline.synchronizer.frames.lack, self._transforms.problem):
-            if problem is not None and problem not in self._lacks:
-                self._lacks.add(problem)
-                self._say(problem)
+            if problem is not None and problem not in self._problems:
+                self._problems.add(problem)
+                self._report(problem)
 
     def _patience_s(self) -> float:
-        return 0.0 if self.session.pipeline.synchronizer.is_waiting else self._stream.patience_s(time.monotonic_ns())
+        return 0.0 if self.session.pipeline.synchronizer.is_waiting else self._stream.patience_s(self._transport.now_ns())
 
     def _head(self) -> Mapping[str, Any]:
         return {"stamp_ns": self._newest_ns, "topics": self.topics}
 
     def _publish(self, event: Event, arrived_ns: int | None, estimate: Estimate) -> None:
         by_lidar = estimate.nis is not None or isinstance(event, Scan)
-        self._teller.estimate(estimate, self._stream.sender_stamp_ns(estimate.stamp_ns, by_lidar=by_lidar))
+        stamp_ns = self._stream.sender_stamp_ns(estimate.stamp_ns, by_lidar=by_lidar)
+        self._publisher.publish_estimate(estimate, stamp_ns)
         if arrived_ns is not None:
-            self.session.health.took((time.monotonic_ns() - arrived_ns) * 1e-9)
+            self.session.health.add_latency((self._transport.now_ns() - arrived_ns) * 1e-9)
+        if self._predictor is not None:
+            estimator = self.session.pipeline.estimator
+            self._predictor.reset(estimate, estimator.params, estimator.clock_offset_s)
 
-    def _tell(self) -> None:
+    def _publish_prediction(self) -> None:
+        prediction = None if self._predictor is None else self._predictor.predict()
+        if prediction is not None:
+            self._publisher.publish_prediction(prediction, self._stream.sender_stamp_ns(prediction.stamp_ns, by_lidar=self.has_lidar))
+
+    def _publish_status(self) -> None:
         health = self.session.health
-        silent = self._stream.silent(time.monotonic_ns())
+        silent = self._stream.silent(self._transport.now_ns())
         self.statuses = health.statuses(self.session.pipeline, self._stream.dropped(), silent, self.session.troubles)
         problems = [problem for problem in (self._conflicts.current(), self._transforms.problem) if problem is not None]
         self.statuses.append(Status("transforms", ERROR, " ".join(problems)) if problems else Status("transforms"))
+        if self.is_paused:
+            self.statuses.append(Status("pause", WARN, "paused: no messages are used. Call ~/pause with data: false to continue."))
         stamp_ns = self._stream.sender_stamp_ns(self._newest_ns, by_lidar=True)
-        self._teller.diagnostics(self.statuses, self._robot.name, stamp_ns)
+        self._publisher.publish_diagnostics(self.statuses, self._run.robot.name, stamp_ns)
         parameters = self.session.pipeline.estimator.parameters()
         if parameters:
-            self._teller.corrections(parameters, stamp_ns)
+            self._publisher.publish_corrections(parameters, stamp_ns)
+
+    def _publish_overview(self, now: float) -> None:
+        """Path and map, where they are due."""
+        config, stamp_ns = self._run.node, self._stream.sender_stamp_ns(self._newest_ns, by_lidar=True)
+        if self.session.health.estimate is None:
+            return
+        if config.path_period_s and now >= self._next_path:
+            self._next_path = now + config.path_period_s
+            self._publisher.publish_path(stamp_ns)
+        if config.map_period_s and self.has_lidar and now >= self._next_map:
+            self._next_map = now + config.map_period_s
+            self._publisher.publish_map(self.session.pipeline.estimator.map_points(), stamp_ns)

@@ -1,4 +1,4 @@
-"""ROS 2 parameters of the node: one for each number, name and switch of `NodeSettings`, with the same description and bounds.
+"""ROS 2 parameters of the node: one for each number, name and switch of `ManagedNodeSettings`, with the same description and bounds.
 
 `python -m localization.ros.parameters` writes `share/params.yaml`.
 """
@@ -17,25 +17,18 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from localization.errors import SettingError
-from localization.ros.settings import OnlineSettings
+from localization.ros.settings import ManagedNodeSettings
 from localization.ros.topic_names import Names
 from localization.settings import Allowed, rules_of
 
 PARAMS_FILE = Path(__file__).parent / "share" / "params.yaml"
 _LEFT_OUT = "none"
-_RENAMED = {"node.tf": "publish_tf", "node.wait_s": "wait_s"}  # publish_tf as robot_localization has it
+_RENAMED = {"node.tf": "publish_tf"}  # as robot_localization has it
 _DYNAMIC = ("node.tf",)
-_NOT_LIVE = ("topic.reference",)
+_LEFT_TO_ROS = ("topic.reference", "node.use_sim_time", "node.names")
+"""Not of a live run, or parameters and arguments that every ROS 2 node has."""
 
 Value = bool | int | float | str | list[str]
-
-
-@dataclass(frozen=True)
-class NodeSettings(OnlineSettings):
-    """What the ROS 2 node has besides."""
-
-    autostart: bool = True
-    """Configure and activate at the start; false where a lifecycle manager does so."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +37,11 @@ class Parameter:
 
     name: str
     path: tuple[str, ...]
-    """Of the field in `NodeSettings`."""
+    """Of the field in `ManagedNodeSettings`."""
     default: Value
     description: str
     constraint: str
-    """What its value may be, in words; empty for any of its type."""
+    """Values that are allowed, in words; empty for any of its type."""
     choices: tuple[str, ...]
     is_dynamic: bool
     """May be set while the node is active; others take effect when it is configured."""
@@ -57,7 +50,7 @@ class Parameter:
 @cache
 def parameters() -> tuple[Parameter, ...]:
     """All of them, in the order of the settings. Names of node, namespace and topics' remapping are ROS 2's own (`--ros-args -r`)."""
-    return tuple(_flattened(NodeSettings(""), ()))
+    return tuple(_flatten(ManagedNodeSettings(""), ()))
 
 
 def defaults() -> dict[str, Value]:
@@ -65,8 +58,8 @@ def defaults() -> dict[str, Value]:
     return {parameter.name: parameter.default for parameter in parameters()}
 
 
-def make_settings(values: Mapping[str, Value], names: Names) -> NodeSettings:
-    """Settings of parameters' ``values``; those that are not there have their defaults.
+def make_settings(values: Mapping[str, Value], names: Names, *, use_sim_time: bool = False) -> ManagedNodeSettings:
+    """Settings of the parameters' ``values``; missing ones have their defaults.
 
     Raises `SettingError` for a name that no parameter has (with the nearest one), a value of another type, and one out of its bounds.
     """
@@ -76,18 +69,18 @@ def make_settings(values: Mapping[str, Value], names: Names) -> NodeSettings:
             raise SettingError(f"there is no parameter '{name}'.{nearest(name, known)}")
     tree: dict[str, Any] = {}
     for parameter in known.values():
-        value = _checked(parameter, values.get(parameter.name, parameter.default))
+        value = _convert(parameter, values.get(parameter.name, parameter.default))
         branch = tree
         for part in parameter.path[:-1]:
             branch = branch.setdefault(part, {})
         branch[parameter.path[-1]] = value
-    tree.setdefault("node", {})["names"] = names
-    made: NodeSettings = _made(NodeSettings, tree)
-    return made
+    tree["node"] |= {"names": names, "use_sim_time": use_sim_time}
+    settings: ManagedNodeSettings = _construct(ManagedNodeSettings, tree)
+    return settings
 
 
 def nearest(name: str, known: Sequence[str] | Mapping[str, object]) -> str:
-    """A sentence with those of ``known`` that are most alike ``name``, by the whole or by the last part; empty where none is."""
+    """A sentence with the entries of ``known`` nearest to ``name``, by the whole or by the last part; empty where none is near."""
     tails = {full: full.rpartition(".")[2] for full in known}
     near = difflib.get_close_matches(name, known, n=2, cutoff=0.7)
     alike = difflib.get_close_matches(name.rpartition(".")[2], tails.values(), n=2, cutoff=0.75)
@@ -99,23 +92,21 @@ def to_yaml(values: Mapping[str, Value] | None = None) -> str:
     """A parameter file with all parameters, described; ``values`` instead of some defaults."""
     lines = ["# Parameters of skidloc's node. Written by `python -m localization.ros.parameters`.", "/**:", "  ros__parameters:"]
     for parameter in parameters():
-        said = " ".join(filter(None, [parameter.description, f"[{parameter.constraint}]" if parameter.constraint else ""]))
-        lines += [f"    # {line}" for line in textwrap.wrap(said, 130)]
+        text = " ".join(filter(None, [parameter.description, f"[{parameter.constraint}]" if parameter.constraint else ""]))
+        lines += [f"    # {line}" for line in textwrap.wrap(text, 130)]
         lines.append(f"    {parameter.name}: {_yaml((values or {}).get(parameter.name, parameter.default))}")
     return "\n".join(lines) + "\n"
 
 
-def _flattened(settings: Any, path: tuple[str, ...]) -> Iterator[Parameter]:
+def _flatten(settings: Any, path: tuple[str, ...]) -> Iterator[Parameter]:
     kind = type(settings)
     hints, texts, rules = get_type_hints(kind), _field_texts(kind), rules_of(kind)
     for field in dataclasses.fields(settings):
         value, here = getattr(settings, field.name), (*path, field.name)
-        if isinstance(value, Names):
-            continue
-        if ".".join(here) in _NOT_LIVE:
+        if ".".join(here) in _LEFT_TO_ROS:
             continue
         if dataclasses.is_dataclass(value):
-            yield from _flattened(value, here)
+            yield from _flatten(value, here)
             continue
         choices = _choices(hints[field.name])
         allowed = next((rule.what for rule in rules[field.name] if isinstance(rule, Allowed)), "")
@@ -125,7 +116,7 @@ def _flattened(settings: Any, path: tuple[str, ...]) -> Iterator[Parameter]:
         text, full = texts.get(field.name, ""), ".".join(here)
         if here[0] == "topic":
             text, constraint = text + f' "" is the robot file\'s, "{_LEFT_OUT}" leaves the part out.', "a topic"
-        name = _RENAMED.get(full, here[-1] if here[:2] == ("node", "frames") else full)
+        name = _RENAMED.get(full, here[-1] if here[0] == "node" else full)
         default: Value = "" if value is None else list(value) if isinstance(value, tuple) else value
         yield Parameter(name, here, default, text, constraint, choices, full in _DYNAMIC)
 
@@ -136,7 +127,7 @@ def _choices(hint: Any) -> tuple[str, ...]:
     return next((found for inner in get_args(hint) if (found := _choices(inner))), ())
 
 
-def _checked(parameter: Parameter, value: Any) -> Any:
+def _convert(parameter: Parameter, value: Any) -> Any:
     """``value`` as its field has it. Raises `SettingError`."""
     default = parameter.default
     if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
@@ -161,9 +152,9 @@ def _checked(parameter: Parameter, value: Any) -> Any:
 _TYPE_NAMES = {bool: "bool", int: "whole number", float: "number", str: "string", list: "list of strings"}
 
 
-def _made(kind: Any, tree: Mapping[str, Any]) -> Any:
+def _construct(kind: Any, tree: Mapping[str, Any]) -> Any:
     hints = get_type_hints(kind)
-    return kind(**{name: _made(hints[name], value) if isinstance(value, dict) else value for name, value in tree.items()})
+    return kind(**{name: _construct(hints[name], value) if isinstance(value, dict) else value for name, value in tree.items()})
 
 
 def _field_texts(kind: type) -> dict[str, str]:

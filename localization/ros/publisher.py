@@ -1,99 +1,153 @@
-"""What is published: where the robot is, what was learned of it, and how well it goes."""
+"""What is published: odometry, transforms, pose, path and map of the robot, what was learned of it, and diagnostics."""
 
 from __future__ import annotations
 
-import dataclasses
-import itertools
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from localization.errors import SettingError
 from localization.estimators import Estimate
 from localization.logs.fast_cdr import FusedWriter
-from localization.logs.fused_log import FusedEstimate
+from localization.logs.fused_log import FusedEstimate, odom_axes, six_by_six
 from localization.logs.serialization import encode, make
 from localization.ros.diagnostics import Status
+from localization.ros.settings import Frames
 from localization.ros.topic_names import Names
+from localization.ros.transforms import TF, TF_TYPE
 from localization.ros.transports.base import Transport
-from localization.settings import Settings
+from motion_models.se2 import FloatArray
 
-ODOMETRY, CORRECTIONS, TF, DIAGNOSTICS = "~/odometry", "~/corrections", "/tf", "/diagnostics"
+ODOMETRY, PREDICTED_ODOMETRY, POSE = "~/odometry", "~/odometry_predicted", "~/pose"
+CORRECTIONS, DIAGNOSTICS, PATH, MAP = "~/corrections", "/diagnostics", "~/path", "~/map"
 
 _RECENT = 500  # 10 s at 50 Hz: those of a start's backlog come back only after all of them
 _TYPES = {
     ODOMETRY: "nav_msgs/msg/Odometry",
+    PREDICTED_ODOMETRY: "nav_msgs/msg/Odometry",
+    POSE: "geometry_msgs/msg/PoseWithCovarianceStamped",
     CORRECTIONS: "sensor_msgs/msg/JointState",
-    TF: "tf2_msgs/msg/TFMessage",
+    TF: TF_TYPE,
     DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
+    PATH: "nav_msgs/msg/Path",
+    MAP: "nav_msgs/msg/OccupancyGrid",
 }
+_LATCHED = (POSE, PATH, MAP)
+_MAX_PATH_POSES, _PATH_SPACING_M = 500, 0.05
+"""A path is thinned to so many poses: rosbags takes 15 us for each, and no scan shall wait for it for more than 10 ms."""
+_CELL_M, _MAX_CELLS = 0.1, 4_000_000
+"""Edge of the map's cells [m]; it doubles until the map has at most so many."""
 
 
-@dataclass(frozen=True)
-class Frames(Settings):
-    """Frames of what is published (REP-105)."""
+class EstimatePublisher:
+    """Publishes on a transport.
 
-    map_frame: str = "map"
-    """Frame of a graph's localization, parent of `odom_frame`; other estimators have none."""
-    odom_frame: str = "odom"
-    """Parent frame of the published odometry and transform, without jumps."""
-    base_link_frame: str = "base_link"
-    """Frame of the robot's body, child of `odom_frame`; the point about which the robot file's geometry is given."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        frames = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        for name, frame in frames.items():
-            if not frame or frame.startswith("/") or frame != frame.strip():
-                raise SettingError(f"setting {name} is '{frame}'; it must not be empty, begin with '/', or have blanks around it.")
-        for (name, frame), (other, same) in itertools.combinations(frames.items(), 2):
-            if frame == same:
-                raise SettingError(f"{name} and {other} are both '{frame}'; they must be two frames.")
-
-
-class Teller:
-    """Publishes on a transport. Odometry and TF with every estimate; corrections and diagnostics when asked."""
+    Each estimate has the stamp of its scan, which came some 10 ms ago; predictions have those of the wheels' newest messages. Transforms
+    and predicted odometry are one stream of both in order of stamps: an estimate that a prediction has overtaken is left out there, and
+    the next prediction starts from it.
+    """
 
     def __init__(self, transport: Transport, names: Names, frames: Frames, *, with_tf: bool) -> None:
         self._transport, self._with_tf, self._frames = transport, with_tf, frames
-        self._fused = FusedWriter(is_ros1=transport.is_ros1, parent=frames.odom_frame, body=frames.base_link_frame)
-        self._correction = FusedWriter(is_ros1=transport.is_ros1, parent=frames.map_frame, body=frames.odom_frame)
+        self._odometry = FusedWriter(is_ros1=transport.is_ros1, parent=frames.odom_frame, body=frames.base_link_frame)
+        self._map_correction = FusedWriter(is_ros1=transport.is_ros1, parent=frames.map_frame, body=frames.odom_frame)
         self.recent_transforms: deque[bytes] = deque(maxlen=_RECENT)
-        """Those of the body, as they were published."""
+        """Transforms of the body, as they were published."""
         self._topics = {topic: names.resolve(topic) for topic in _TYPES}
-        for topic in _TYPES:
-            if topic != TF or with_tf:
+        self._last_ns = -(1 << 63)
+        self._has_predictions = False
+        self._path = Path()
+        for topic in (ODOMETRY, CORRECTIONS, DIAGNOSTICS, *((TF,) if with_tf else ())):
+            self._advertise(topic)
+
+    def advertise_optional(self, *, has_predictions: bool, has_map_frame: bool, has_path: bool, has_map: bool) -> None:
+        """Open the topics that not every node fills."""
+        self._has_predictions = has_predictions
+        for topic, is_used in ((PREDICTED_ODOMETRY, has_predictions), (POSE, has_map_frame), (PATH, has_path), (MAP, has_map)):
+            if is_used:
                 self._advertise(topic)
 
     def publish_tf(self, is_on: bool) -> None:
-        """Publish the transform from now on, or no more."""
+        """Publish the transforms from now on, or no more."""
         if is_on and not self._with_tf and not self.recent_transforms:
             self._advertise(TF)
         self._with_tf = is_on
 
-    def estimate(self, estimate: Estimate, stamp_ns: int) -> None:
-        """nav_msgs/Odometry with true vy, and the transforms `odom` -> `base_link` and, of a graph, `map` -> `odom`, at ``stamp_ns``."""
-        pose, covariance = estimate.odometry or (estimate.pose, estimate.covariance)
-        fused = FusedEstimate(stamp_ns, pose, estimate.twist, covariance, estimate.twist_covariance)
-        self._transport.publish(self._topics[ODOMETRY], self._fused.odometry(fused))
+    def restart(self) -> None:
+        """Forget the path, for the robot was set to another place."""
+        self._path = Path()
+
+    def publish_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
+        """nav_msgs/Odometry with true vy at ``stamp_ns``, and the transforms; of a graph the pose in `map` too.
+
+        ``stamp_ns`` is the stamp of the estimate in the clock of its sender, which may have been set since the start.
+        """
+        data = self._odometry.odometry(_fused(estimate, stamp_ns))
+        self._transport.publish(self._topics[ODOMETRY], data)
+        self._publish_in_order(estimate, stamp_ns, data)
+        self._path.insert(estimate)
+        if estimate.map_T_odom is not None:
+            self._publish_pose(estimate, stamp_ns)
+
+    def publish_prediction(self, prediction: Estimate, stamp_ns: int) -> None:
+        """The same between estimates: odometry on a topic of its own, and the transforms."""
+        self._publish_in_order(prediction, stamp_ns)
+
+    def _publish_in_order(self, estimate: Estimate, stamp_ns: int, odometry: bytes | None = None) -> None:
+        if estimate.stamp_ns <= self._last_ns:
+            return
+        self._last_ns, fused = estimate.stamp_ns, _fused(estimate, stamp_ns)
         if self._with_tf:
-            self.recent_transforms.append(self._fused.transform(fused))
+            self.recent_transforms.append(self._odometry.transform(fused))
             self._transport.publish(self._topics[TF], self.recent_transforms[-1])
             if estimate.map_T_odom is not None:
                 correction = FusedEstimate(stamp_ns, estimate.map_T_odom, np.zeros(3))
-                self._transport.publish(self._topics[TF], self._correction.transform(correction))
+                self._transport.publish(self._topics[TF], self._map_correction.transform(correction))
+        if self._has_predictions:
+            self._transport.publish(self._topics[PREDICTED_ODOMETRY], odometry or self._odometry.odometry(fused))
 
-    def corrections(self, parameters: Mapping[str, tuple[float, float]], stamp_ns: int) -> None:
+    def _publish_pose(self, estimate: Estimate, stamp_ns: int) -> None:
+        """geometry_msgs/PoseWithCovarianceStamped in `map`."""
+        cov = None if estimate.covariance is None else odom_axes(estimate.covariance, float(estimate.pose[2]))
+        pose = make("geometry_msgs/msg/PoseWithCovariance", pose=_pose(estimate.pose), covariance=six_by_six(cov))
+        self._publish(POSE, make(_TYPES[POSE], header=self._header(stamp_ns, self._frames.map_frame), pose=pose))
+
+    def publish_path(self, stamp_ns: int) -> None:
+        """nav_msgs/Path of the estimates so far, thinned, in `map` where there is one, else in `odom`."""
+        frame = self._frames.map_frame if self._path.is_in_map else self._frames.odom_frame
+        poses = [
+            make("geometry_msgs/msg/PoseStamped", header=self._header(estimate_ns, frame), pose=_pose(pose))
+            for estimate_ns, pose in self._path.poses
+        ]
+        self._publish(PATH, make(_TYPES[PATH], header=self._header(stamp_ns, frame), poses=poses))
+
+    def publish_map(self, points: FloatArray, stamp_ns: int) -> None:
+        """nav_msgs/OccupancyGrid of the LiDAR's map ``points`` (N, 2) [m]: 100 where there are points, else -1 (unknown)."""
+        if not len(points):
+            return
+        origin, cell, grid = occupancy_grid(points)
+        frame = self._frames.map_frame if self._path.is_in_map else self._frames.odom_frame
+        height, width = grid.shape
+        info = make(
+            "nav_msgs/msg/MapMetaData",
+            map_load_time=_time(stamp_ns),
+            resolution=cell,
+            width=width,
+            height=height,
+            origin=_pose(np.array([*origin, 0.0])),
+        )
+        self._publish(MAP, make(_TYPES[MAP], header=self._header(stamp_ns, frame), info=info, data=grid.ravel()))
+
+    def publish_corrections(self, parameters: Mapping[str, tuple[float, float]], stamp_ns: int) -> None:
         """Named numbers as sensor_msgs/JointState: ``position`` is the mean, ``effort`` its sigma."""
         means, sigmas = (np.array([value[i] for value in parameters.values()], dtype=float) for i in (0, 1))
-        message = make(
-            _TYPES[CORRECTIONS], header=self._header(stamp_ns), name=list(parameters), position=means, velocity=np.zeros(0), effort=sigmas
-        )
+        header = self._header(stamp_ns, self._frames.odom_frame)
+        message = make(_TYPES[CORRECTIONS], header=header, name=list(parameters), position=means, velocity=np.zeros(0), effort=sigmas)
         self._publish(CORRECTIONS, message)
 
-    def diagnostics(self, statuses: Sequence[Status], hardware: str, stamp_ns: int) -> None:
+    def publish_diagnostics(self, statuses: Sequence[Status], hardware: str, stamp_ns: int) -> None:
         """diagnostic_msgs/DiagnosticArray, one status for each of ``statuses``."""
         entries = [
             make(
@@ -106,14 +160,66 @@ class Teller:
             )
             for status in statuses
         ]
-        self._publish(DIAGNOSTICS, make(_TYPES[DIAGNOSTICS], header=self._header(stamp_ns), status=entries))
+        self._publish(DIAGNOSTICS, make(_TYPES[DIAGNOSTICS], header=self._header(stamp_ns, self._frames.odom_frame), status=entries))
 
     def _advertise(self, topic: str) -> None:
-        self._transport.advertise(self._topics[topic], _TYPES[topic])
+        self._transport.advertise(self._topics[topic], _TYPES[topic], is_latched=topic in _LATCHED)
 
     def _publish(self, topic: str, message: object) -> None:
         self._transport.publish(self._topics[topic], encode(message, is_ros1=self._transport.is_ros1))
 
-    def _header(self, stamp_ns: int) -> object:
-        time = make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-        return make("std_msgs/msg/Header", stamp=time, frame_id=self._frames.odom_frame)
+    def _header(self, stamp_ns: int, frame: str) -> object:
+        return make("std_msgs/msg/Header", stamp=_time(stamp_ns), frame_id=frame)
+
+
+def _fused(estimate: Estimate, stamp_ns: int) -> FusedEstimate:
+    """``estimate`` in `odom`."""
+    pose, covariance = estimate.odometry or (estimate.pose, estimate.covariance)
+    return FusedEstimate(stamp_ns, pose, estimate.twist, covariance, estimate.twist_covariance)
+
+
+class Path:
+    """Poses along the way: the spacing doubles whenever there are too many."""
+
+    def __init__(self) -> None:
+        self.poses: list[tuple[int, FloatArray]] = []
+        self.is_in_map = False
+        self._spacing_m = _PATH_SPACING_M
+
+    def insert(self, estimate: Estimate) -> None:
+        """Add the pose of ``estimate`` where it is far enough from the last one."""
+        self.is_in_map = estimate.map_T_odom is not None
+        if self.poses and math.dist(self.poses[-1][1][:2], estimate.pose[:2]) < self._spacing_m:
+            return
+        self.poses.append((estimate.stamp_ns, estimate.pose))
+        if len(self.poses) > _MAX_PATH_POSES:
+            del self.poses[1::2]
+            self._spacing_m *= 2.0
+
+
+def occupancy_grid(points: FloatArray) -> tuple[FloatArray, float, Any]:
+    """Corner (2,) [m], edge of a cell [m] and cells (rows by y, columns by x) as int8, 100 or -1, of ``points`` (N, 2)."""
+    low, high, cell = points.min(axis=0), points.max(axis=0), _CELL_M
+    while np.prod(np.floor((high - low) / cell) + 1) > _MAX_CELLS:
+        cell *= 2.0
+    at = np.floor((points - low) / cell).astype(int)
+    columns, rows = at.max(axis=0) + 1
+    grid = np.full((rows, columns), -1, np.int8)
+    grid[at[:, 1], at[:, 0]] = 100
+    return low, cell, grid
+
+
+def _pose(pose: FloatArray) -> object:
+    x, y, yaw = map(float, pose)
+    position = make("geometry_msgs/msg/Point", x=x, y=y, z=0.0)
+    half = 0.5 * math.remainder(yaw, math.tau)
+    return make(
+        "geometry_msgs/msg/Pose", position=position, orientation=make(_QUATERNION, x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
+    )
+
+
+_QUATERNION = "geometry_msgs/msg/Quaternion"
+
+
+def _time(stamp_ns: int) -> object:
+    return make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)

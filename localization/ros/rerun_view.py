@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from localization.errors import DoorError, OutputError
+from localization.errors import OutputError, TransportError
 from localization.estimators import Estimate
 from localization.events import Event, Scan
 from localization.pipeline import Pipeline
@@ -31,7 +31,7 @@ try:
     import rerun as rr
     import rerun.blueprint as rrb
 except ImportError as error:
-    raise DoorError(f"rerun's view needs the extra 'viz': pip install 'skidloc[viz]' ({error}).") from error
+    raise TransportError(f"rerun's view needs the extra 'viz': pip install 'skidloc[viz]' ({error}).") from error
 
 _LOOPBACK, _PATIENCE_S = "127.0.0.1", 10.0
 _TIMELINE = "stamp"
@@ -46,7 +46,7 @@ class RerunView:
     """A `session.View`. With ``file``, a recording (.rrd) of all of it; without, rerun's viewer is opened beside this process."""
 
     def __init__(self, file: Path | None = None) -> None:
-        """Raises `OutputError` where the file cannot be written, `DoorError` where no viewer can be opened."""
+        """Raises `OutputError` where the file cannot be written, `TransportError` where no viewer can be opened."""
         self._stream = rr.RecordingStream("skidloc")
         self._file, self._pipeline = file, None  # type: Path | None, Pipeline | None
         if file is None:
@@ -156,10 +156,10 @@ class RerunView:
 
 
 def _viewer(command: Sequence[str] = ()) -> int:
-    """The port on which a new viewer listens; unlike those that rerun opens itself, for this machine only. Raises `DoorError`."""
+    """The port on which a new viewer listens; unlike those that rerun opens itself, for this machine only. Raises `TransportError`."""
     advice = "--view-file NAME.rrd records for a later look."
     if sys.platform == "linux" and not (command or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise DoorError(f"rerun's viewer needs a display, and there is none here. {advice}")
+        raise TransportError(f"rerun's viewer needs a display, and there is none here. {advice}")
     with socket.create_server((_LOOPBACK, 0)) as probe:
         port: int = probe.getsockname()[1]
     program = Path(sys.executable).with_name("rerun")  # installed beside Python, whether that is on the PATH or not
@@ -170,7 +170,7 @@ def _viewer(command: Sequence[str] = ()) -> int:
                 [*command, "--bind", _LOOPBACK, "--port", str(port)], stdout=said, stderr=said, start_new_session=True
             )
         except OSError as error:
-            raise DoorError(f"rerun's viewer cannot be started: {error.strerror}. {advice}") from error
+            raise TransportError(f"rerun's viewer cannot be started: {error.strerror}. {advice}") from error
         end, is_heard = time.monotonic() + _PATIENCE_S, False
         while time.monotonic() < end and viewer.poll() is None:
             if is_heard:
@@ -182,7 +182,7 @@ def _viewer(command: Sequence[str] = ()) -> int:
             os.killpg(viewer.pid, signal.SIGKILL)  # what is installed as `rerun` starts another process
         said.seek(0)
         lines = said.read().decode(errors="replace").strip().splitlines() or ["it says nothing"]
-        raise DoorError(f"rerun's viewer cannot be opened ({lines[-1]}). {advice}")
+        raise TransportError(f"rerun's viewer cannot be opened ({lines[-1]}). {advice}")
 
 
 def two_sigma(covariance: FloatArray) -> FloatArray:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from localization.errors import DumpError
+from localization.errors import CheckpointError
 
 PACKAGES = ("localization.", "motion_models.")
 KINDS = "biufc"
@@ -33,16 +33,16 @@ _PACKED_AT_LEAST = 8
 Json = Any
 
 
-def freeze(value: Any, shared: Mapping[str, Any] | None = None) -> tuple[bytes, bytes]:
-    """``value`` as JSON and the bytes of its arrays. ``shared`` objects, by name, are not written: `thaw.thaw` is given them again.
+def serialize(value: Any, shared: Mapping[str, Any] | None = None) -> tuple[bytes, bytes]:
+    """``value`` as JSON and the bytes of its arrays. ``shared`` objects, by name, are not written: `deserialize` is given them again.
 
-    Raises `DumpError` for an object that cannot be written.
+    Raises `CheckpointError` for an object that cannot be written.
     """
-    text, blobs = freeze_apart(value, shared)
+    text, blobs = serialize_parts(value, shared)
     return text, b"".join(blobs)
 
 
-def freeze_apart(value: Any, shared: Mapping[str, Any] | None = None) -> tuple[bytes, list[bytes]]:
+def serialize_parts(value: Any, shared: Mapping[str, Any] | None = None) -> tuple[bytes, list[bytes]]:
     """The same with the bytes array by array: who writes megabytes of them need not copy them once more."""
     writer = _Writer(shared or {})
     root = writer.put(value)
@@ -95,7 +95,7 @@ class _Writer:
             return ["s", value.start, value.stop, value.step]
         if kind.__module__.startswith(PACKAGES) and not isinstance(value, Enum):
             return ["c", kind.__module__, kind.__qualname__, self.put(_state(value))]
-        raise DumpError(f"the state holds a {kind.__module__}.{kind.__qualname__}, which cannot be written down")
+        raise CheckpointError(f"the state holds a {kind.__module__}.{kind.__qualname__}, which cannot be written down")
 
     def _packed(self, values: list[Any]) -> list[Json] | None:
         """A long list of numbers, of equal rows of numbers, or of frozen dataclasses: the last seconds of wheels are thousands."""
@@ -134,7 +134,7 @@ class _Writer:
 
     def _ndarray(self, value: NDArray[Any]) -> Json:
         if value.dtype.kind not in KINDS:
-            raise DumpError(f"the state holds an array of {value.dtype}, which cannot be written down")
+            raise CheckpointError(f"the state holds an array of {value.dtype}, which cannot be written down")
         base = value
         while isinstance(base.base, np.ndarray):
             base = base.base

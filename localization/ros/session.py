@@ -1,29 +1,31 @@
-"""A pipeline at work: events in, estimates recorded, its health watched, its state on disk at most a second old."""
+"""A pipeline at work: events in, estimates recorded, its health monitored, its state on disk at most a second old."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from localization.errors import DumpError, OutputError
+from localization.errors import CheckpointError, OutputError
 from localization.estimate_table import trajectory
 from localization.estimators import Estimate
 from localization.events import Event
 from localization.logs.fused_log import MAP_FRAME, PARENT_FRAME, write_fused
 from localization.pipeline import Pipeline, ReplayConfig, Trial
-from localization.ros.checkpoint import Dumper, fingerprints, read_dump, remove_dump
+from localization.ros.checkpoint import Checkpoint, CheckpointWriter, fingerprints, read_checkpoint, remove_checkpoint
 from localization.ros.diagnostics import Health
-from localization.ros.estimate_log import Spool, fused_estimates
+from localization.ros.estimate_log import EstimateLog, fused_estimates
 from localization.ros.session_files import Files
+from localization.ros.start_pose import StartPose
 from localization.trajectory import write_tum
 from motion_models.robot import Mount, Robot
 
-_MEANWHILE = {"state": "The state of before stays", "output": "The output lacks what is estimated meanwhile"}
+_CONSEQUENCES = {"state": "The state of before stays", "output": "The output lacks what is estimated meanwhile"}
 
 
 class View(Protocol):
-    """Shows a session while it runs. It is asked after estimates are out, so that none waits for it."""
+    """Shows a session while it runs. It is called after estimates are published, so that none waits for it."""
 
     def begin(self, robot: Robot, mounts: Mapping[str, Mount]) -> None: ...
 
@@ -32,13 +34,13 @@ class View(Protocol):
     def close(self) -> None: ...
 
 
-def made_by(pair: Trial, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig, source: str) -> dict[str, str]:
-    """What must be the same where a state is resumed."""
+def made_by(trial: Trial, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig, source: str) -> dict[str, str]:
+    """Fingerprints of what must be the same where a state is resumed."""
     return fingerprints(
         robot=robot,
-        model=pair.model,
-        estimator=pair.estimator,
-        corrections=pair.corrections,
+        model=trial.model,
+        estimator=trial.estimator,
+        corrections=trial.corrections,
         configuration=config,
         mounts=dict(mounts),
         LiDAR="used" if has_lidar else "not used",
@@ -46,167 +48,200 @@ def made_by(pair: Trial, robot: Robot, mounts: Mapping[str, Mount], has_lidar: b
     )
 
 
+@dataclass
+class SessionState:
+    """What a checkpoint holds."""
+
+    pipeline: Pipeline
+    start: StartPose = field(default_factory=StartPose)
+    angles: Any = None
+    """`WheelAngles` of a live session."""
+
+
 class Session:
     """Made by `start`."""
 
     def __init__(
         self,
-        pipeline: Pipeline,
-        kept: Any,
+        state: SessionState,
         name: str,
         files: Files,
-        spool: Spool | None,
-        dumper: Dumper | None,
+        estimate_log: EstimateLog | None,
+        checkpoints: CheckpointWriter | None,
         head: Mapping[str, Any],
-        tell: Callable[[str], None] | None,
+        report: Callable[[str], None] | None,
     ) -> None:
-        self.pipeline, self.name, self.health = pipeline, name, Health()
-        self.kept = kept
-        """What is dumped with the core; of a resumed session, what had been."""
+        self.state, self.name, self.health = state, name, Health()
         self.head = head
-        """Of the state that was resumed; empty for a new one."""
-        self._files, self._spool, self._dumper, self._tell = files, spool, dumper, tell
+        """Of the checkpoint that was resumed; empty for a new session."""
+        self._files, self._estimate_log, self._checkpoints, self._report = files, estimate_log, checkpoints, report
         self.troubles: dict[str, str] = {}
         """What cannot be written at present, and why."""
-        self._told: set[str] = set()
-        self._is_counted_on = head.get("records") is not None
-        """The spool, by a state."""
+        self._reported: set[str] = set()
+        self._is_log_referenced = head.get("records") is not None  # by a checkpoint
         self.count = int(head.get("events", 0))
-        """Events so far, those before the state included."""
+        """Events so far, those before the checkpoint included."""
         self.view: View | None = None
-        self._unseen: list[Estimate] = []
+        self._not_shown: list[Estimate] = []
 
     @classmethod
     def start(
         cls,
         files: Files,
-        pipeline: Pipeline,
+        state: SessionState,
         name: str,
         made: Mapping[str, str],
-        kept: Any = None,
         shared: Mapping[str, Any] | None = None,
-        tell: Callable[[str], None] | None = None,
+        report: Callable[[str], None] | None = None,
     ) -> Session:
-        """A new session with ``core``, or one that goes on from the state on disk, if there is one that was ``made`` by the same.
+        """A new session from ``state``, or the one of the checkpoint on disk, if there is one that was ``made`` by the same.
 
-        ``kept`` is dumped with the core; ``shared`` is what it holds that is not to be dumped. ``tell`` is of a live session: it hears
-        what cannot be written, once, where others raise it, for the robot must still know where it is; and its output may hold the
-        estimates from the state on, others' hold them from the very first. Raises `DumpError` and `OutputError`.
+        ``shared``: objects in the state that are not to be written. ``report`` is of a live session: what cannot be written or read is
+        reported once, where other sessions raise it, for the robot must still be localized; and its output may begin at the checkpoint.
+        Raises `CheckpointError` and `OutputError`.
         """
         shared = shared or {}
-        dumper = None if files.state is None else Dumper(files.state, made, shared)
+        checkpoints = None if files.state is None else CheckpointWriter(files.state, made, shared)
         if files.state is None or not files.state.exists():
-            return cls(pipeline, kept, name, files, None if files.spool is None else Spool.create(files.spool), dumper, {}, tell)
-        found = read_dump(files.state, made, shared)
-        records = found.head.get("records")
-        if (records is not None and files.spool is None) or (records is None and files.spool is not None and tell is None):
-            with_or_without = "without an --out" if records is None else "with an --out"
-            raise DumpError(f"the state in '{files.state}' is of a run {with_or_without}: resume it so, or remove it to start anew.")
-        if not (isinstance(found.value, list) and len(found.value) == 2 and isinstance(found.value[0], Pipeline)):
-            raise DumpError(f"the state in '{files.state}' holds no estimator. Remove it to start anew.")
-        spool = None
-        if files.spool is not None:
-            spool = Spool.create(files.spool) if records is None else Spool.resume(files.spool, int(records))
-        pipeline, kept = found.value
-        return cls(pipeline, kept, name, files, spool, dumper, found.head, tell)
+            log = None if files.estimate_log is None else EstimateLog.create(files.estimate_log)
+            return cls(state, name, files, log, checkpoints, {}, report)
+        found = read_checkpoint(files.state, made, shared)
+        if not isinstance(found.value, SessionState) or not isinstance(found.value.pipeline, Pipeline):
+            raise CheckpointError(f"the state in '{files.state}' holds no estimator. Remove it to start anew.")
+        log, head = _resume_log(files, found, report)
+        return cls(found.value, name, files, log, checkpoints, head, report)
 
-    def push(self, event: Event, out: Callable[[Estimate], None] = lambda estimate: None) -> list[Estimate]:
-        """``out`` is given each estimate before anything else is done with it. Raises `EstimatorError`."""
+    @property
+    def pipeline(self) -> Pipeline:
+        return self.state.pipeline
+
+    def restart(self, pipeline: Pipeline, start: StartPose) -> None:
+        """Continue with a new ``pipeline`` that begins at ``start``."""
+        self.state.pipeline, self.state.start = pipeline, start
+        self.health.reset()
+
+    def process(self, event: Event, publish: Callable[[Estimate], None] = lambda estimate: None) -> list[Estimate]:
+        """``publish`` is called with each estimate before anything else is done with it. Raises `EstimatorError`."""
         self.count += 1
-        estimates = self.pipeline.process(event)
+        estimates = [self.state.start.apply(estimate) for estimate in self.pipeline.process(event)]
         for estimate in estimates:
-            out(estimate)
-        return self._take(estimates)
+            publish(estimate)
+        self._record(estimates)
+        return estimates
 
-    def saw(self, event: Event) -> None:
-        """After `push`, for whoever watches: its health, and a view."""
-        self.health.saw(event)
+    def observe(self, event: Event) -> None:
+        """After `process`, for diagnostics and a view."""
+        self.health.observe_event(event)
         self._show(event)
 
     def _show(self, event: Event | None) -> None:
         if self.view is not None:
-            self.view.show(event, self._unseen, self.pipeline)
-            self._unseen.clear()
+            self.view.show(event, self._not_shown, self.pipeline)
+            self._not_shown.clear()
 
     def finish(self) -> list[Estimate]:
         """No more events will come. Raises `EstimatorError`."""
-        estimates = self._take(self.pipeline.finish())
+        estimates = [self.state.start.apply(estimate) for estimate in self.pipeline.finish()]
+        self._record(estimates)
         self._show(None)
         return estimates
 
-    def _take(self, estimates: list[Estimate]) -> list[Estimate]:
+    def _record(self, estimates: list[Estimate]) -> None:
         for estimate in estimates:
-            self.health.made(estimate, self.pipeline)
+            self.health.add_estimate(estimate, self.pipeline)
             if self.view is not None:
-                self._unseen.append(estimate)
-            if self._spool is not None:
-                with self._on_disk("output"):
-                    self._spool.add(estimate)
-        return estimates
+                self._not_shown.append(estimate)
+            if self._estimate_log is not None:
+                with self._writing("output"):
+                    self._estimate_log.add(estimate)
 
     @contextmanager
-    def _on_disk(self, what: str) -> Iterator[None]:
-        """What is told, not raised, of a live session."""
+    def _writing(self, what: str) -> Iterator[None]:
+        """Report what fails of a live session, instead of raising it."""
         try:
             yield
             self.troubles.pop(what, None)
-        except (DumpError, OutputError) as error:
-            if self._tell is None:
+        except (CheckpointError, OutputError) as error:
+            if self._report is None:
                 raise
             self.troubles[what] = str(error)
-            if what not in self._told:
-                self._told.add(what)
-                self._tell(f"{error} {_MEANWHILE[what]}; it is tried again.")
+            if what not in self._reported:
+                self._reported.add(what)
+                self._report(f"{error} {_CONSEQUENCES[what]}; it is tried again.")
 
-    def dump(self, extra: Callable[[], Mapping[str, Any]] = dict, now: bool = False) -> None:
-        """The state to disk, if it is due or wanted ``now``; then it is there on return. What ``extra`` tells enters its head.
+    def save_state(self, extra: Callable[[], Mapping[str, Any]] = dict, now: bool = False) -> None:
+        """Write a checkpoint, if one is due or wanted ``now``; then it is on disk on return. ``extra`` gives entries of its head.
 
-        Raises `DumpError` unless live.
+        Raises `CheckpointError` unless live.
         """
-        if self._dumper is None or not (now or self._dumper.is_due()):
+        if self._checkpoints is None or not (now or self._checkpoints.is_due()):
             return
-        on_disk = () if self._spool is None else (self._spool.descriptor,)
-        records = None if self._spool is None else self._spool.count
-        with self._on_disk("state"):
-            self._dumper.write([self.pipeline, self.kept], {**extra(), "events": self.count, "records": records}, on_disk)
-            self._is_counted_on = True
+        on_disk = () if self._estimate_log is None else (self._estimate_log.descriptor,)
+        records = None if self._estimate_log is None else self._estimate_log.count
+        with self._writing("state"):
+            self._checkpoints.write(self.state, {**extra(), "events": self.count, "records": records}, on_disk)
+            self._is_log_referenced = True
             if now:
-                self._dumper.wait()
+                self._checkpoints.wait()
 
-    def write_out(self) -> int | None:
+    def write_output(self) -> int | None:
         """The output, if one is wanted; returns how many estimates it holds. Raises `OutputError` where there are none."""
-        if self._spool is None or self._files.out is None:
+        if self._estimate_log is None or self._files.out is None:
             return None
-        stamps, table = self._spool.rows()
+        stamps, table = self._estimate_log.rows()
         if len(stamps) and self._files.out.suffix == ".tum":
             write_tum(self._files.out, trajectory(stamps, table))
         elif len(stamps):
             parent = MAP_FRAME if self.pipeline.is_localizing else PARENT_FRAME
             with self._files.beside() as bag:
                 write_fused(bag, {self.name: fused_estimates(stamps, table, parent)}, self.name)
-        if self._tell is not None and self._spool.missing:
-            self._tell(f"'{self._files.out}' lacks {self._spool.missing} estimates, for which there was no room on the disk.")
-        if self._dumper is not None:
-            with self._on_disk("state"):
-                self._dumper.wait()  # it may count on the rows being there
-        self._spool.remove()
-        self._spool = None
+        if self._report is not None and self._estimate_log.missing:
+            self._report(f"'{self._files.out}' lacks {self._estimate_log.missing} estimates, for which there was no room on the disk.")
+        if self._checkpoints is not None:
+            with self._writing("state"):
+                self._checkpoints.wait()  # it may refer to the rows
+        self._estimate_log.remove()
+        self._estimate_log = None
         if not len(stamps):
-            raise OutputError(f"output '{self._files.out}': there is nothing to write, no motion could be told from what was heard.")
+            raise OutputError(f"output '{self._files.out}': there is nothing to write, the messages gave no motion.")
         return len(stamps)
 
     def close(self, forget: bool = False) -> None:
-        """End; ``forget`` removes the state, for there is nothing to go on with. Estimates that no state counts on are removed where they
-        can be had again, or are none: they would be in the way of the next run. Raises `DumpError` unless live.
+        """End; ``forget`` removes the state, where there is nothing to continue.
+
+        Estimates that no checkpoint refers to are removed where a run can make them again, or where there are none. Raises
+        `CheckpointError` unless live.
         """
         try:
-            if self._dumper is not None:
-                with self._on_disk("state"):
-                    self._dumper.close()
+            if self._checkpoints is not None:
+                with self._writing("state"):
+                    self._checkpoints.close()
                 if forget:
-                    remove_dump(self._dumper.path)
+                    remove_checkpoint(self._checkpoints.path)
         finally:
-            if self._spool is not None:
-                is_counted_on = self._is_counted_on and self._dumper is not None and self._dumper.path.exists()
-                is_needed = is_counted_on or (self._tell is not None and self._spool.count)
-                (self._spool.close if is_needed else self._spool.remove)()
+            if self._estimate_log is not None:
+                is_referenced = self._is_log_referenced and self._checkpoints is not None and self._checkpoints.path.exists()
+                is_needed = is_referenced or (self._report is not None and self._estimate_log.count)
+                (self._estimate_log.close if is_needed else self._estimate_log.remove)()
+
+
+def _resume_log(files: Files, found: Checkpoint, report: Callable[[str], None] | None) -> tuple[EstimateLog | None, Mapping[str, Any]]:
+    """The estimates up to the checkpoint ``found``, and its head. Raises `CheckpointError` and `OutputError`.
+
+    A live session whose estimates were lost, as by a power cut, continues without them.
+    """
+    records = found.head.get("records")
+    if (records is not None and files.estimate_log is None) or (records is None and files.estimate_log is not None and report is None):
+        with_or_without = "without an --out" if records is None else "with an --out"
+        raise CheckpointError(f"the state in '{files.state}' is of a run {with_or_without}: resume it so, or remove it to start anew.")
+    if files.estimate_log is None:
+        return None, found.head
+    if records is None:
+        return EstimateLog.create(files.estimate_log), found.head
+    try:
+        return EstimateLog.resume(files.estimate_log, int(records)), found.head
+    except CheckpointError as error:
+        if report is None:
+            raise
+        report(f"{error} This run continues from the state; its output begins here.")
+        return EstimateLog.create(files.estimate_log), {**found.head, "records": None}

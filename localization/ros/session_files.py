@@ -31,13 +31,13 @@ class Files:
             raise OutputError(f"output '{self.out}': its name must end in {' or '.join(_SUFFIXES)}.")
         if self.state is not None and self.state.is_dir():
             raise OutputError(f"the state '{self.state}' is a folder. Name a file in it.")
-        if self.out is not None and self.spool is not None and self.state is not None:
-            for taken, what in ((self.out, "the output"), (self.spool, "where the output grows")):
+        if self.out is not None and self.estimate_log is not None and self.state is not None:
+            for taken, what in ((self.out, "the output"), (self.estimate_log, "where the output grows")):
                 if self.state.resolve() == taken.resolve():
                     raise OutputError(f"the state '{self.state}' is {what} as well. Give the state a name of its own.")
 
     @property
-    def spool(self) -> Path | None:
+    def estimate_log(self) -> Path | None:
         """Where the estimates are until the end."""
         return None if self.out is None else self.out.with_name(f".{self.out.name}.part")
 
@@ -87,7 +87,7 @@ def _locked(path: Path, lock: Path) -> TextIO:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             file.close()
-            raise OutputError(f"'{path}' is in use by another process that runs. Stop that, or name another file.") from error
+            raise OutputError(f"'{path}' is in use by another process that runs. StopSignal that, or name another file.") from error
         except OSError:
             return file  # a file system without locks is no reason not to work
         with contextlib.suppress(FileNotFoundError):

@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 
 from localization.errors import SettingError
-from localization.logs.topics import TopicOverrides
+from localization.logs.topic_roles import TopicOverrides
 from localization.settings import Settings
 from motion_models.robot import Robot
 

@@ -1,4 +1,4 @@
-"""What the robot is told to do: phases, one after the other, and the two that look where they are going."""
+"""Commands of a drive: phases, one after the other, of which two are steered by the true pose."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class PickUp:
 
 @dataclass(frozen=True, eq=False)
 class OpenLoop:
-    """Follow a profile blindly, as the thesis's drives did, and stop. This is a run: it is recorded under its name."""
+    """Follow a profile open loop, as the thesis's drives did, and stop. This is a run: it is recorded under its name."""
 
     name: str
     profile: Profile
@@ -52,7 +52,7 @@ class OpenLoop:
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """Drive along way points, looking where the robot really is: what a navigation stack, or a person with a joystick, does."""
+    """Drive along way points, steered by the true pose, as by a navigation stack or a person with a joystick."""
 
     points: FloatArray
     """(n, 2) [m]; from where the robot is to the first of them, and so on."""
@@ -94,7 +94,7 @@ class Pursuit:
 
     @property
     def length(self) -> float:
-        """Of the way [m]."""
+        """Of the route [m]."""
         return float(self._along[-1])
 
     def command(self, pose: FloatArray) -> FloatArray | None:
@@ -108,12 +108,12 @@ class Pursuit:
 @numba.njit(cache=True)
 def _pursue(
     pose: FloatArray, points: FloatArray, along: FloatArray, done: float, speed: float, ahead: float, limit: float
-) -> tuple[float, float, float]:  # pragma: no cover
-    """How much of the way is done, and vx and wz; NaN at its end."""
+) -> tuple[float, float, float]:
+    """Distance driven along the route, and vx and wz; NaN at its end."""
     length = along[-1]
     reach, best, here = min(1.0, length - done), math.inf, done
-    for i in range(21):  # the nearest point of the way, of the next metre
-        x, y = _on_way(done + reach * i / 20.0, points, along)
+    for i in range(21):  # the nearest point of the route's next metre
+        x, y = _point_on_route(done + reach * i / 20.0, points, along)
         off = math.hypot(x - pose[0], y - pose[1])
         if off < best:
             best, here = off, done + reach * i / 20.0
@@ -122,7 +122,7 @@ def _pursue(
     past = c * (points[-1, 0] - pose[0]) + s * (points[-1, 1] - pose[1]) < 0.02
     if left < 0.05 or (left < 0.4 and past):
         return here, math.nan, math.nan
-    x, y = _on_way(here + ahead, points, along)
+    x, y = _point_on_route(here + ahead, points, along)
     gx, gy = c * (x - pose[0]) + s * (y - pose[1]), -s * (x - pose[0]) + c * (y - pose[1])
     bearing = math.atan2(gy, gx)
     if abs(bearing) > 1.0:  # turn first
@@ -135,8 +135,8 @@ def _pursue(
 
 
 @numba.njit(cache=True)
-def _on_way(at: float, points: FloatArray, along: FloatArray) -> tuple[float, float]:  # pragma: no cover
-    """The point ``at`` [m] along the way; beyond its end it goes straight on."""
+def _point_on_route(at: float, points: FloatArray, along: FloatArray) -> tuple[float, float]:
+    """The point ``at`` [m] along the route; beyond its end it goes straight on."""
     k = 0
     while k < len(along) - 2 and along[k + 1] < at:
         k += 1
@@ -144,7 +144,7 @@ def _on_way(at: float, points: FloatArray, along: FloatArray) -> tuple[float, fl
     return points[k, 0] + f * (points[k + 1, 0] - points[k, 0]), points[k, 1] + f * (points[k + 1, 1] - points[k, 1])
 
 
-def turning(pose: FloatArray, heading: float, limit: float = 0.4) -> FloatArray | None:
+def turn_command(pose: FloatArray, heading: float, limit: float = 0.4) -> FloatArray | None:
     """vx, wz that turn the robot towards ``heading``; None where it is there."""
     error = float(se2.wrap_angle(heading - pose[2]))
     if abs(error) < 0.01:

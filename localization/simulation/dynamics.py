@@ -2,7 +2,7 @@
 
 The physics are those of `motion_models.friction.dynamics` (Ebersole 2016, 3.15-3.26), with one thing added: tyres are springs. On a
 rigid robot the loads hang on the forces and the forces on the loads at the same instant, and for a high CG on a grippy floor there may
-be no loads that agree (Painleve's paradox, 1895). Here the loads follow what the forces ask for within a tyre's time; at rest and in
+be no loads that agree (Painleve's paradox, 1895). Here the loads follow their quasi-static values within a tyre's time; at rest and in
 steady motion they are the same.
 """
 
@@ -12,8 +12,10 @@ import math
 from typing import NamedTuple
 
 import numba
+import numpy as np
 
 from motion_models.friction.contact import Tyre, contact, loads, rolling
+from motion_models.se2 import FloatArray
 
 
 class Chassis(NamedTuple):
@@ -36,9 +38,11 @@ class Chassis(NamedTuple):
     rest_speed: float
     tyre_lag: float
     """Time in which the loads follow the forces [s]."""
+    grip_split: float = 0.0
+    """The left wheels grip more by half of this share, the right ones less."""
 
 
-class Now(NamedTuple):
+class DynamicsInput(NamedTuple):
     """What acts on the robot at one moment."""
 
     roll_left: float
@@ -63,8 +67,8 @@ class Now(NamedTuple):
     force_y: float
 
 
-class Change(NamedTuple):
-    """Rates of vx, vy, wz, the tilts that the forces ask for, and the rates' derivatives by vx, vy, wz at fixed loads."""
+class Derivatives(NamedTuple):
+    """Rates of vx, vy, wz, the quasi-static tilts, and the rates' derivatives by vx, vy, wz at fixed loads."""
 
     x: float
     y: float
@@ -83,7 +87,7 @@ class Change(NamedTuple):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def change(vx: float, vy: float, wz: float, xi: float, eta: float, now: Now, body: Chassis) -> Change:  # pragma: no cover
+def derivatives(vx: float, vy: float, wz: float, xi: float, eta: float, now: DynamicsInput, body: Chassis) -> Derivatives:
     """Accelerations of the wheelbase's centre in the body frame at the twist ``vx, vy, wz`` and the tilt ``xi, eta``.
 
     The tilt is where the loads' centre lies, as a fraction of the half wheelbase and the half track (see `contact.loads`);
@@ -120,14 +124,14 @@ def change(vx: float, vy: float, wz: float, xi: float, eta: float, now: Now, bod
     m -= mean_mu * body.scrub * spin * whole
     m_wz -= mean_mu * body.scrub * body.half_track * per * body.creep * body.creep * whole * whole * whole
 
-    # 3.21-3.23: what the forces ask of the loads. 3.24-3.26, then 3.18 and 3.19 solved for the base.
+    # 3.21-3.23: quasi-static loads. 3.24-3.26, then 3.18 and 3.19 solved for the base.
     load = now.mass * (body.gravity + now.cg_az)
     p, i = load / now.mass, load / now.inertia
     alpha = i * m
     x_g, y_g = now.cg_x, now.cg_y
     base_x = p * x + now.force_x / now.mass - now.cg_ax + y_g * alpha + 2.0 * now.cg_vy * wz + x_g * wz * wz + vy * wz
     base_y = p * y + now.force_y / now.mass - now.cg_ay - x_g * alpha - 2.0 * now.cg_vx * wz + y_g * wz * wz - vx * wz
-    return Change(
+    return Derivatives(
         base_x,
         base_y,
         alpha,
@@ -143,3 +147,220 @@ def change(vx: float, vy: float, wz: float, xi: float, eta: float, now: Now, bod
         i * m_vy,
         i * m_wz,
     )
+
+
+GAMMA = 1.0 - math.sqrt(0.5)
+"""The method's coefficient: its stages are at GAMMA h and at h."""
+_NEWTON_STEPS = 25
+_NEWTON_TOLERANCE_M_S = 1e-9  # m/s; the last step of Newton squares it
+_HALVINGS = 10
+
+
+@numba.njit(cache=True, error_model="numpy")
+def implicit_stage(
+    guess: tuple[float, float, float], base: tuple[float, float, float], h: float, xi: float, eta: float, now: DynamicsInput, body: Chassis
+) -> tuple[float, float, float, float, float, bool]:
+    """The twist V = ``base`` + ``h`` derivatives(V), searched from ``guess``; its quasi-static tilts, and whether it was found."""
+    arm2 = body.half_track * body.half_track
+    vx, vy, wz = guess
+    dx = dy = dw = 0.0
+    fraction, left, to_xi, to_eta = 1.0, math.inf, xi, eta
+    for _ in range(_NEWTON_STEPS):
+        x, y, w = vx + fraction * dx, vy + fraction * dy, wz + fraction * dw
+        k = derivatives(x, y, w, xi, eta, now, body)
+        rx, ry, rw = base[0] + h * k.x - x, base[1] + h * k.y - y, base[2] + h * k.w - w
+        error = rx * rx + ry * ry + rw * rw * arm2
+        if error < (1.0 - 1e-4 * fraction) * left or error < 1e-26:
+            vx, vy, wz, left, to_xi, to_eta = x, y, w, error, k.xi, k.eta
+            a00, a01, a02 = 1.0 - h * k.x_vx, -h * k.x_vy, -h * k.x_wz
+            a10, a11, a12 = -h * k.y_vx, 1.0 - h * k.y_vy, -h * k.y_wz
+            a20, a21, a22 = -h * k.w_vx, -h * k.w_vy, 1.0 - h * k.w_wz
+            c00, c10, c20 = a11 * a22 - a12 * a21, a12 * a20 - a10 * a22, a10 * a21 - a11 * a20
+            over = 1.0 / (a00 * c00 + a01 * c10 + a02 * c20)
+            dx = over * (c00 * rx + (a02 * a21 - a01 * a22) * ry + (a01 * a12 - a02 * a11) * rw)
+            dy = over * (c10 * rx + (a00 * a22 - a02 * a20) * ry + (a02 * a10 - a00 * a12) * rw)
+            dw = over * (c20 * rx + (a01 * a20 - a00 * a21) * ry + (a00 * a11 - a01 * a10) * rw)
+            if max(abs(dx), abs(dy), abs(dw) * body.half_track) < _NEWTON_TOLERANCE_M_S:
+                return vx + dx, vy + dy, wz + dw, to_xi, to_eta, True
+            fraction = 1.0
+        else:
+            fraction *= 0.4
+            if fraction < 1e-4:
+                break
+    return vx, vy, wz, to_xi, to_eta, False
+
+
+@numba.njit(cache=True, error_model="numpy")
+def wheel_response(q: float, target: float, slope: float, lag: float, t: float) -> tuple[float, float]:
+    """A wheel's rate after ``t`` seconds, and the angle it turned, where its speed loop follows ``target`` + ``slope`` t with a ``lag``."""
+    behind = q - target + slope * lag
+    left = math.exp(-t / lag)
+    rate = target + slope * t - slope * lag + behind * left
+    return rate, target * t + 0.5 * slope * t * t - slope * lag * t + behind * lag * (1.0 - left)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _grip(x: float, y: float, patches: FloatArray) -> float:
+    for i in range(patches.shape[0] - 1, -1, -1):
+        if patches[i, 0] <= x <= patches[i, 2] and patches[i, 1] <= y <= patches[i, 3]:
+            return float(patches[i, 4])
+    return 1.0
+
+
+class Plant(NamedTuple):
+    """Robot, floor and motor control of one call of `integrate`."""
+
+    body: Chassis
+    mass: float
+    """With payload [kg]."""
+    inertia: float
+    """With payload, about the CG [kg m^2]."""
+    slope_gravity: float
+    """Gravity along the floor, down its slope, which rises towards the world's +x [m/s^2]."""
+    yields: FloatArray
+    """(3,) shear of a loose floor layer, as `Body.yields`."""
+    patches: FloatArray
+    """(k, 5) floor rectangles x0, y0, x1, y1 with a factor of the friction."""
+    motor_lag_s: float
+    ramp: float
+    """Largest change of the wheel rates' set points [rad/s^2]."""
+
+
+@numba.njit(cache=True, error_model="numpy")
+def integrate(state: FloatArray, wheels: FloatArray, cg: FloatArray, out: FloatArray, h: float, plant: Plant) -> int:
+    """Advance ``state`` (16,) by steps of ``h`` [s], fill ``out`` (n, 13); the index of the step that failed, or -1."""
+    body, targets, slopes = plant.body, np.empty(2), np.empty(2)
+    if math.isnan(state[12]):  # at first the loads are those of standing
+        state[12], state[13] = cg[0, 0] / body.half_wheelbase, cg[0, 1] / body.half_track
+    for k in range(wheels.shape[0]):
+        for j in range(2):
+            targets[j] = state[10 + j]
+            slopes[j] = min(plant.ramp, max(-plant.ramp, (wheels[k, j] - targets[j]) / h))
+        grips = _wheel_grips(state, body, plant.patches)
+        # Where Newton's method does not converge, the step is cut in pieces.
+        pieces, found = 1, False
+        for _ in range(_HALVINGS):
+            found = _step(state, targets, slopes, cg[k], (h, pieces), grips, plant)
+            if found:
+                break
+            pieces *= 2
+        if not found:
+            return k
+        for j in range(2):
+            state[10 + j] = targets[j] + slopes[j] * h
+        out[k, :10] = state[:10]
+        vx, vy, wz = state[3], state[4], state[5]
+        out[k, 3], out[k, 4], out[k, 5] = _sheared(vx, vy, wz, plant.yields)
+        out[k, 10] = cg[k, 0] + h * (cg[k, 2] + 0.5 * h * cg[k, 4])
+        out[k, 11] = cg[k, 1] + h * (cg[k, 3] + 0.5 * h * cg[k, 5])
+        out[k, 12] = 1.0 - max(abs(state[12]), abs(state[13]))
+    return -1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _wheel_grips(state: FloatArray, body: Chassis, patches: FloatArray) -> tuple[float, float, float, float]:
+    """Factors of the friction under front left, front right, rear left and rear right wheel."""
+    left, right = 1.0 + 0.5 * body.grip_split, 1.0 - 0.5 * body.grip_split
+    if patches.shape[0] == 0:
+        return left, right, left, right
+    c, s = math.cos(state[2]), math.sin(state[2])
+    fx, fy, lx, ly = c * body.half_wheelbase, s * body.half_wheelbase, -s * body.half_track, c * body.half_track
+    return (
+        left * _grip(state[0] + fx + lx, state[1] + fy + ly, patches),
+        right * _grip(state[0] + fx - lx, state[1] + fy - ly, patches),
+        left * _grip(state[0] - fx + lx, state[1] - fy + ly, patches),
+        right * _grip(state[0] - fx - lx, state[1] - fy - ly, patches),
+    )
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _sheared(vx: float, vy: float, wz: float, yields: FloatArray) -> tuple[float, float, float]:
+    return vx - yields[2] * vx * abs(wz), vy + yields[0] * vx * wz, wz * (1.0 - yields[1] * abs(vx))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _inputs_at(
+    t: float, rolls: tuple[float, float], heading: float, cg: FloatArray, grips: tuple[float, float, float, float], plant: Plant
+) -> DynamicsInput:
+    """What acts on the robot ``t`` seconds after the start of the step, at wheel rates ``rolls`` [rad/s]."""
+    return DynamicsInput(
+        plant.body.radius_left * rolls[0],
+        plant.body.radius_right * rolls[1],
+        grips[0],
+        grips[1],
+        grips[2],
+        grips[3],
+        plant.mass,
+        plant.inertia,
+        cg[0] + t * (cg[2] + 0.5 * t * cg[4]),
+        cg[1] + t * (cg[3] + 0.5 * t * cg[5]),
+        cg[2] + t * cg[4],
+        cg[3] + t * cg[5],
+        cg[4],
+        cg[5],
+        cg[6],
+        -plant.slope_gravity * plant.mass * math.cos(heading),
+        plant.slope_gravity * plant.mass * math.sin(heading),
+    )
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _step(
+    state: FloatArray,
+    targets: FloatArray,
+    slopes: FloatArray,
+    cg: FloatArray,
+    duration: tuple[float, int],
+    grips: tuple[float, float, float, float],
+    plant: Plant,
+) -> bool:
+    """One step of ``duration`` [s] in that many pieces: changes ``state`` but for the set points; or leaves it unchanged, False.
+
+    The tilt follows explicitly (a Runge-Kutta method of second order with the same stages), which its time constant allows.
+    """
+    body, lag = plant.body, plant.motor_lag_s
+    h = duration[0] / duration[1]
+    xi, eta, rate_xi, rate_eta = state[12], state[13], state[14], state[15]
+    late, more = 0.5 / GAMMA, (1.0 - GAMMA) * h
+    x, y, theta, vx, vy, wz = state[0], state[1], state[2], state[3], state[4], state[5]
+    for i in range(duration[1]):
+        v_0 = (vx, vy, wz)
+        base, guess = v_0, v_0
+        rate_x = rate_y = rate_w = 0.0
+        xi_0, eta_0, first_xi, first_eta = xi, eta, rate_xi, rate_eta
+        from_x, from_y, from_theta = x, y, theta
+        by_x = by_y = by_theta = 0.0
+        for stage in range(2):
+            share = GAMMA if stage == 0 else 1.0
+            t = i * h + share * h
+            roll_l = wheel_response(state[6], targets[0], slopes[0], lag, t)[0]
+            roll_r = wheel_response(state[7], targets[1], slopes[1], lag, t)[0]
+            now = _inputs_at(t, (roll_l, roll_r), theta + share * h * guess[2], cg, grips, plant)
+            if math.isnan(first_xi):  # only at the very start: afterwards the rate is known from the step before
+                quasi_static = derivatives(vx, vy, wz, xi, eta, now, body)
+                first_xi, first_eta = (quasi_static.xi - xi) / body.tyre_lag, (quasi_static.eta - eta) / body.tyre_lag
+            if stage == 0:
+                xi, eta = xi_0 + GAMMA * h * first_xi, eta_0 + GAMMA * h * first_eta
+            else:
+                base = v_0[0] + more * rate_x, v_0[1] + more * rate_y, v_0[2] + more * rate_w
+                xi = xi_0 + h * ((1.0 - late) * first_xi + late * rate_xi)
+                eta = eta_0 + h * ((1.0 - late) * first_eta + late * rate_eta)
+                from_x, from_y, from_theta = x + more * by_x, y + more * by_y, theta + more * by_theta
+            u, v, w, to_xi, to_eta, found = implicit_stage(guess, base, GAMMA * h, xi, eta, now, body)
+            if not found:
+                return False
+            rate_xi, rate_eta = (to_xi - xi) / body.tyre_lag, (to_eta - eta) / body.tyre_lag
+            rate_x, rate_y, rate_w = (u - base[0]) / (GAMMA * h), (v - base[1]) / (GAMMA * h), (w - base[2]) / (GAMMA * h)
+            su, sv, by_theta = _sheared(u, v, w, plant.yields)
+            heading = from_theta + GAMMA * h * by_theta
+            c, s = math.cos(heading), math.sin(heading)
+            by_x, by_y = c * su - s * sv, s * su + c * sv
+            guess = (u, v, w)
+        vx, vy, wz = guess
+        x, y, theta = from_x + GAMMA * h * by_x, from_y + GAMMA * h * by_y, from_theta + GAMMA * h * by_theta
+    state[0], state[1], state[2], state[3], state[4], state[5] = x, y, theta, vx, vy, wz
+    state[12], state[13], state[14], state[15] = xi, eta, rate_xi, rate_eta
+    for j in range(2):
+        state[6 + j], turned = wheel_response(state[6 + j], targets[j], slopes[j], lag, duration[0])
+        state[8 + j] += turned
+    return True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numba
 import numpy as np
@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from localization.logs import message_templates
 from localization.logs.message_templates import Message
 from localization.settings import Below, Count, Positive, Settings, Share, Signed, at_least
-from localization.simulation.clock import Ticks, seconds
-from localization.simulation.raycast import Grid, cast, cast_at_people, make_grid
-from localization.simulation.track import Track, pose_at
-from localization.simulation.world import World
+from localization.simulation.track import SampleClock, TrueMotion, pose_at, seconds
+from localization.simulation.world import Grid, World, cast, cast_at_people, make_grid
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
@@ -39,10 +37,14 @@ class ScannerConfig(Settings):
     """Ranges are rounded to this [m]."""
     dropout: Share = 0.002
     """Share of beams that do not come back."""
+    range_scale: Signed = 0.0
+    """Share by which the ranges are too long."""
+    range_bias_m: Signed = 0.0
+    """By how much they are too long whatever the distance [m]."""
     min_range_m: Annotated[float, Below("max_range_m")] = 0.1
-    """Nearer things are not seen [m]."""
+    """Least range [m]."""
     max_range_m: Positive = 40.0
-    """Farther things are not seen [m]."""
+    """Greatest range [m]."""
 
 
 @dataclass(frozen=True)
@@ -63,13 +65,17 @@ class SpinningConfig(Settings):
     """Standard deviation of a range [m]."""
     dropout: Share = 0.005
     """Share of beams that do not come back."""
+    range_scale: Signed = 0.0
+    """Share by which the ranges are too long."""
+    range_bias_m: Signed = 0.0
+    """By how much they are too long whatever the distance [m]."""
     min_range_m: Annotated[float, Below("max_range_m")] = 0.5
-    """Nearer things are not seen [m]."""
+    """Least range [m]."""
     max_range_m: Positive = 100.0
-    """Farther things are not seen [m]."""
+    """Greatest range [m]."""
 
 
-class Scanner:
+class PlanarScanner:
     """Makes LaserScans. ``mount`` is where the scanner really sits; ``late_s`` is by how much its stamps are late."""
 
     def __init__(
@@ -91,18 +97,20 @@ class Scanner:
         self._mount = np.array([mount.x, mount.y, mount.yaw])
         self._late_ns = round(late_s * 1e9)
         angles, times, ranges = (self._first, self._step), (self.beam_s, 1.0 / c.rate_hz), (c.min_range_m, c.max_range_m)
-        self.form = message_templates.laser_scan(topic, frame, c.beams, angles, times, ranges)
-        self._ticks = Ticks(c.rate_hz, self.beam_s * (c.beams - 1))
+        self.layout = message_templates.laser_scan(topic, frame, c.beams, angles, times, ranges)
+        self._ticks = SampleClock(c.rate_hz, self.beam_s * (c.beams - 1))
 
-    def messages(self, track: Track) -> list[Message]:
+    def messages(self, track: TrueMotion) -> list[Message]:
         """All scans that are complete and were not yet taken."""
         starts = self._ticks.due(track.end_s)
         if not len(starts):
             return []
         c = self._config
         ranges = np.empty((len(starts), c.beams))
-        beams, place = (self.beam_s, self._first, self._step, self._mount), (track.rows, track.start_s, track.step_s)
-        _sweep(seconds(starts), *beams, *place, self._grid, self._world.people, c.max_range_m, ranges)
+        beams = BeamPattern(self.beam_s, self._first, self._step, self._mount, c.max_range_m)
+        _cast_sweeps(seconds(starts), beams, Scene(self._grid, self._world.people, track.rows, track.start_s, track.step_s), ranges)
+        ranges *= 1.0 + c.range_scale
+        ranges += c.range_bias_m
         ranges += self._rng.normal(0.0, c.noise_m, ranges.shape) if c.noise_m > 0.0 else 0.0
         if c.resolution_m > 0.0:
             ranges = np.round(ranges / c.resolution_m) * c.resolution_m
@@ -113,40 +121,53 @@ class Scanner:
         took = round(self.beam_s * (c.beams - 1) * 1e9)
         values = ranges.astype(np.float32)
         return [
-            Message(self.form, self._start_ns + int(s) + took, self._start_ns + int(s) + self._late_ns, (values[i],))
+            Message(self.layout, self._start_ns + int(s) + took, self._start_ns + int(s) + self._late_ns, (values[i],))
             for i, s in enumerate(starts)
         ]
 
 
+class BeamPattern(NamedTuple):
+    """Beams of one sweep in time and angle."""
+
+    beam_s: float
+    """From beam to beam [s]."""
+    first_rad: float
+    step_rad: float
+    mount: FloatArray
+    """(3,) body_T_lidar."""
+    max_range_m: float
+
+
+class Scene(NamedTuple):
+    """What beams can hit, and the motion of the scanner through it."""
+
+    grid: Grid
+    people: FloatArray
+    rows: FloatArray
+    """(n, 13) records of the true motion, ``step_s`` apart from ``start_s`` on."""
+    start_s: float
+    step_s: float
+
+
 @numba.njit(cache=True, error_model="numpy")
-def _sweep(
-    starts: FloatArray,
-    beam_s: float,
-    first: float,
-    step: float,
-    mount: FloatArray,
-    rows: FloatArray,
-    start_s: float,
-    step_s: float,
-    grid: Grid,
-    people: FloatArray,
-    longest: float,
-    ranges: FloatArray,
-) -> None:  # pragma: no cover
-    """True distances (scans, beams); inf where nothing is met."""
+def _cast_sweeps(starts: FloatArray, sweep: BeamPattern, scene: Scene, ranges: FloatArray) -> None:
+    """True distances (scans, beams) into ``ranges``; inf where nothing is hit."""
+    mount = sweep.mount
     for k in range(ranges.shape[0]):
         for i in range(ranges.shape[1]):
-            t = starts[k] + i * beam_s
-            x, y, theta = pose_at(rows, start_s, step_s, t)
+            t = starts[k] + i * sweep.beam_s
+            x, y, theta = pose_at(scene.rows, scene.start_s, scene.step_s, t)
             c, s = math.cos(theta), math.sin(theta)
             px, py = x + c * mount[0] - s * mount[1], y + s * mount[0] + c * mount[1]
-            angle = theta + mount[2] + first + i * step
-            found = cast(px, py, angle, longest, grid)
-            if people.shape[0] > 0:
-                found = min(found, cast_at_people(px, py, angle, t, people))
+            angle = theta + mount[2] + sweep.first_rad + i * sweep.step_rad
+            found = cast(px, py, angle, sweep.max_range_m, scene.grid)
+            if scene.people.shape[0] > 0:
+                found = min(found, cast_at_people(px, py, angle, t, scene.people))
             ranges[k, i] = found
 
 
+_BODY_ABOVE_FLOOR_M = 0.13
+"""Height of the body frame, that of the Husky's wheel axles [m]."""
 _CLOUD_FIELDS = {"x": "f4", "y": "f4", "z": "f4", "intensity": "f4", "ring": "u2", "time": "f4"}
 
 
@@ -159,40 +180,41 @@ class SpinningScanner:
         topic: str,
         frame: str,
         mount: Mount,
-        above_floor_m: float,
         world: World,
         late_s: float,
         start_ns: int,
         rng: np.random.Generator,
     ) -> None:
         self._config, self._world, self._grid, self._rng, self._start_ns = config, world, make_grid(world.walls), rng, start_ns
-        self._mount, self._height = np.array([mount.x, mount.y, mount.yaw]), above_floor_m
+        self._mount, self._height = np.array([mount.x, mount.y, mount.yaw]), mount.z + _BODY_ABOVE_FLOOR_M
         self._late_ns = round(late_s * 1e9)
         self._elevation = np.radians(np.linspace(config.lowest_deg, config.highest_deg, config.rings))
-        self.form = message_templates.point_cloud(topic, frame, config.rings, config.columns, _CLOUD_FIELDS)
-        self._ticks = Ticks(config.rate_hz, 1.0 / config.rate_hz)
+        self.layout = message_templates.point_cloud(topic, frame, config.rings, config.columns, _CLOUD_FIELDS)
+        self._ticks = SampleClock(config.rate_hz, 1.0 / config.rate_hz)
 
-    def messages(self, track: Track) -> list[Message]:
+    def messages(self, track: TrueMotion) -> list[Message]:
         """All turns that are complete and were not yet taken."""
         found = []
         for start in self._ticks.due(track.end_s):
             data = self._turn(int(start) * 1e-9, track)
             stamp = self._start_ns + int(start)
-            found.append(Message(self.form, stamp + round(1e9 / self._config.rate_hz), stamp + self._late_ns, (data,)))
+            found.append(Message(self.layout, stamp + round(1e9 / self._config.rate_hz), stamp + self._late_ns, (data,)))
         return found
 
-    def _turn(self, start_s: float, track: Track) -> NDArray[np.uint8]:
+    def _turn(self, start_s: float, track: TrueMotion) -> NDArray[np.uint8]:
         c = self._config
         level = np.empty((1, c.columns))
         column_s, step = 1.0 / c.rate_hz / c.columns, -2.0 * math.pi / c.columns  # clockwise, as they turn
-        beams, place = (column_s, math.pi, step, self._mount), (track.rows, track.start_s, track.step_s)
-        _sweep(np.array([start_s]), *beams, *place, self._grid, self._world.people, 2.0 * c.max_range_m, level)
-        # Walls reach from floor to ceiling: each ring meets the wall, or the floor or the ceiling before it.
+        beams = BeamPattern(column_s, math.pi, step, self._mount, 2.0 * c.max_range_m)
+        scene = Scene(self._grid, self._world.people, track.rows, track.start_s, track.step_s)
+        _cast_sweeps(np.array([start_s]), beams, scene, level)
+        # Walls reach from floor to ceiling: each ring hits the wall, or the floor or the ceiling before it.
         up = np.tan(self._elevation)[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
             flat = np.where(up > 0.0, (self._world.ceiling_m - self._height) / up, np.where(up < 0.0, -self._height / up, np.inf))
             flat = np.minimum(level, flat)
             ranges = flat / np.cos(self._elevation)[:, None]
+            ranges = (1.0 + c.range_scale) * ranges + c.range_bias_m
             ranges = ranges + self._rng.normal(0.0, c.noise_m, ranges.shape)
             lost = ~((ranges > c.min_range_m) & (ranges < c.max_range_m)) | (self._rng.random(ranges.shape) < c.dropout)
         ranges[lost] = np.nan

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from dataclasses import dataclass
-from typing import Annotated
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
 
 from localization.logs import message_templates
 from localization.logs.message_templates import Message
-from localization.settings import Allowed, Positive, Settings, Signed
-from localization.simulation.clock import Ticks, seconds
-from localization.simulation.masses import Masses
-from localization.simulation.track import Track
-from localization.simulation.vehicle import ANGLES, POSE, TWIST
+from localization.settings import Allowed, Positive, Settings, Share, Signed
+from localization.simulation.faults import TrueRobot
+from localization.simulation.scanners import PlanarScanner, ScannerConfig, SpinningConfig, SpinningScanner
+from localization.simulation.track import SampleClock, TrueMotion, seconds
+from localization.simulation.vehicle import ANGLES, POSE, TWIST, MassDistribution
+from localization.simulation.world import World
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
@@ -28,6 +31,8 @@ class EncoderConfig(Settings):
     """Joint states per second."""
     counts: int = 4096
     """Counts of an encoder per turn of the wheel; 0 for exact angles."""
+    missing: Share = 0.0
+    """Share of the messages that are missing, in bursts of 0.2 s on average."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,10 @@ class ImuConfig(Settings):
     """Random walk of the bias [rad/s/sqrt(s)]."""
     force_noise: float = 2e-3
     """White noise of the specific force [m/s^2/sqrt(Hz)]."""
+    gyro_scale: Signed = 0.0
+    """Share by which the rates are too large."""
+    late_s: Signed = 0.0
+    """By how much the stamps are late [s]."""
 
 
 @dataclass(frozen=True)
@@ -60,23 +69,51 @@ class GpsConfig(Settings):
     """Of the world's origin [deg]."""
 
 
-class Encoders:
+_MEAN_SPELL_S = 0.3  # of an encoder's loss of counts
+_MEAN_BURST_S = 0.2  # of missing messages
+
+
+class Spells:
+    """Alternating spells of loss and of data, exponentially long; ``share`` is that of the loss, ``mean_s`` its mean length."""
+
+    def __init__(self, share: float, mean_s: float, rng: np.random.Generator) -> None:
+        self._share, self._mean_s, self._rng = share, mean_s, rng
+        self._lost_until_ns, self._complete_until_ns = 0, 0
+
+    def is_lost(self, tick_ns: int) -> bool:
+        """Whether data of this moment are lost; moments must not decrease."""
+        while tick_ns >= self._complete_until_ns:
+            self._lost_until_ns = self._complete_until_ns + int(self._rng.exponential(self._mean_s) * 1e9)
+            complete_s = self._mean_s * (1.0 - self._share) / self._share
+            self._complete_until_ns = self._lost_until_ns + int(self._rng.exponential(complete_s) * 1e9)
+        return tick_ns < self._lost_until_ns
+
+
+class EncoderSensor:
     """Joint states of wheels and arms. ``lost_left`` is the share of time in which the front left encoder loses its counts."""
 
     def __init__(
-        self, config: EncoderConfig, robot: Robot, masses: Masses, late_s: float, lost_left: float, start_ns: int, rng: np.random.Generator
+        self,
+        config: EncoderConfig,
+        robot: Robot,
+        masses: MassDistribution,
+        late_s: float,
+        lost_left: float,
+        start_ns: int,
+        rng: np.random.Generator,
     ) -> None:
         self._config, self._masses, self._start_ns, self._rng = config, masses, start_ns, rng
         wheels = (*robot.joints.left, *robot.joints.right)
         self._sides = np.array([0] * len(robot.joints.left) + [1] * len(robot.joints.right))
         self._phase = rng.random(len(wheels))
-        self.form = message_templates.joint_states(robot.topics.joint_states, (*wheels, *masses.joint_names))
+        self.layout = message_templates.joint_states(robot.topics.joint_states, (*wheels, *masses.joint_names))
         self._late_ns, self._lost_left = round(late_s * 1e9), lost_left
-        self._ticks = Ticks(config.rate_hz)
+        self._ticks = SampleClock(config.rate_hz)
         self._counts, self._shown = np.zeros(len(wheels)), np.zeros(len(wheels))
-        self._lost_until_ns, self._heard_until_ns = 0, 0
+        self._count_spells = Spells(lost_left, _MEAN_SPELL_S, rng)
+        self._message_spells = Spells(config.missing, _MEAN_BURST_S, rng)
 
-    def messages(self, track: Track) -> list[Message]:
+    def messages(self, track: TrueMotion) -> list[Message]:
         """All samples up to the track's end."""
         ticks = self._ticks.due(track.end_s)
         if not len(ticks):
@@ -89,28 +126,22 @@ class Encoders:
         steps = np.diff(counts, axis=0, prepend=self._counts[None])
         self._counts = counts[-1]
         if self._lost_left > 0.0:
-            steps[[self._is_lost(int(tick)) for tick in ticks], 0] = 0.0
+            steps[[self._count_spells.is_lost(int(tick)) for tick in ticks], 0] = 0.0
         shown = self._shown + np.cumsum(steps, axis=0)
         self._shown = shown[-1]
         scale = unit or 1.0
         rates = steps * scale * self._config.rate_hz
         found = []
         for i, tick in enumerate(ticks):
+            if self._config.missing > 0.0 and self._message_spells.is_lost(int(tick)):
+                continue
             stamp = self._start_ns + int(tick)
             parts = np.concatenate([shown[i] * scale, arms[i]]), np.concatenate([rates[i], arm_rates[i]])
-            found.append(Message(self.form, stamp, stamp + self._late_ns, parts))
+            found.append(Message(self.layout, stamp, stamp + self._late_ns, parts))
         return found
 
-    def _is_lost(self, tick_ns: int) -> bool:
-        """Spells of loss of 0.3 s on average, and of being heard between them."""
-        while tick_ns >= self._heard_until_ns:
-            self._lost_until_ns = self._heard_until_ns + int(self._rng.exponential(0.3) * 1e9)
-            heard_s = 0.3 * (1.0 - self._lost_left) / self._lost_left
-            self._heard_until_ns = self._lost_until_ns + int(self._rng.exponential(heard_s) * 1e9)
-        return tick_ns < self._lost_until_ns
 
-
-class Imu:
+class ImuSensor:
     """Specific force and rates at the IMU's place and in its axes; ``tilt`` is the floor's rise towards the world's +x [rad]."""
 
     def __init__(
@@ -128,10 +159,10 @@ class Imu:
         self._bias = rng.normal(0.0, config.gyro_bias_sigma, 3) + mount.rotation().T @ np.array([0.0, 0.0, gyro_bias])
         rate_sigma, force_sigma = (noise * math.sqrt(config.rate_hz) for noise in (config.gyro_noise, config.force_noise))
         self._sigmas = rate_sigma, force_sigma
-        self.form = message_templates.imu(topic, frame, rate_sigma**2, force_sigma**2)
-        self._ticks = Ticks(config.rate_hz)
+        self.layout = message_templates.imu(topic, frame, rate_sigma**2, force_sigma**2)
+        self._ticks = SampleClock(config.rate_hz)
 
-    def messages(self, track: Track) -> list[Message]:
+    def messages(self, track: TrueMotion) -> list[Message]:
         """All samples up to the track's end."""
         ticks = self._ticks.due(track.end_s)
         if not len(ticks):
@@ -152,22 +183,25 @@ class Imu:
         body_R_imu = self._mount.rotation()
         bias = self._bias + np.cumsum(self._rng.normal(0.0, self._config.gyro_bias_walk * math.sqrt(period), (n, 3)), axis=0)
         self._bias = bias[-1]
-        rates = np.column_stack([np.zeros(n), np.zeros(n), wz]) @ body_R_imu + bias + self._rng.normal(0.0, self._sigmas[0], (n, 3))
+        turning = np.column_stack([np.zeros(n), np.zeros(n), (1.0 + self._config.gyro_scale) * wz])
+        rates = turning @ body_R_imu + bias + self._rng.normal(0.0, self._sigmas[0], (n, 3))
         forces = force @ body_R_imu + self._rng.normal(0.0, self._sigmas[1], (n, 3))
-        return [Message(self.form, self._start_ns + int(t), self._start_ns + int(t), (rates[i], forces[i])) for i, t in enumerate(ticks)]
+        late_ns = round(self._config.late_s * 1e9)
+        stamps = [self._start_ns + int(t) for t in ticks]
+        return [Message(self.layout, stamp, stamp + late_ns, (rates[i], forces[i])) for i, stamp in enumerate(stamps)]
 
 
-class Gps:
+class GpsSensor:
     """Fixes of an antenna above the body's origin; east is the world's +x."""
 
     def __init__(self, config: GpsConfig, topic: str, frame: str, start_ns: int, rng: np.random.Generator) -> None:
         self._config, self._start_ns, self._rng = config, start_ns, rng
         self._drift = rng.normal(0.0, config.drift_m, 2)
         variance = config.noise_m**2 + config.drift_m**2
-        self.form = message_templates.fix(topic, frame, (variance, variance, 4.0 * variance))
-        self._ticks = Ticks(config.rate_hz)
+        self.layout = message_templates.fix(topic, frame, (variance, variance, 4.0 * variance))
+        self._ticks = SampleClock(config.rate_hz)
 
-    def messages(self, track: Track) -> list[Message]:
+    def messages(self, track: TrueMotion) -> list[Message]:
         """All fixes up to the track's end."""
         c, found = self._config, []
         ticks = self._ticks.due(track.end_s)
@@ -176,7 +210,7 @@ class Gps:
             self._drift = keep * self._drift + math.sqrt(1.0 - keep * keep) * self._rng.normal(0.0, c.drift_m, 2)
             east, north = row[:2] + self._drift + self._rng.normal(0.0, c.noise_m, 2)
             stamp = self._start_ns + int(tick)
-            found.append(Message(self.form, stamp, stamp, (_geodetic(c, east, north),)))
+            found.append(Message(self.layout, stamp, stamp, (_geodetic(c, east, north),)))
         return found
 
 
@@ -195,16 +229,16 @@ def _geodetic(config: GpsConfig, east: float, north: float) -> FloatArray:
     )
 
 
-class Truth:
+class TruthSensor:
     """The body's true pose and twist, and, where asked for, the nominal centre of gravity."""
 
-    def __init__(self, rate_hz: float, robot: Robot, masses: Masses, with_cg: bool, start_ns: int) -> None:
+    def __init__(self, rate_hz: float, robot: Robot, masses: MassDistribution, with_cg: bool, start_ns: int) -> None:
         self._masses, self._start_ns = masses, start_ns
-        self.form = message_templates.odometry(robot.topics.reference, "world", "base_link")
+        self.layout = message_templates.odometry(robot.topics.reference, "world", "base_link")
         self.cg_form = message_templates.point(robot.topics.center_of_gravity, "base_link") if with_cg else None
-        self._ticks = Ticks(rate_hz)
+        self._ticks = SampleClock(rate_hz)
 
-    def messages(self, track: Track) -> list[Message]:
+    def messages(self, track: TrueMotion) -> list[Message]:
         """All samples up to the track's end."""
         ticks = self._ticks.due(track.end_s)
         if not len(ticks):
@@ -215,9 +249,110 @@ class Truth:
         found = []
         for i, tick in enumerate(ticks):
             stamp = self._start_ns + int(tick)
-            found.append(Message(self.form, stamp, stamp, (rows[i, POSE][:2], heading[i], rows[i, TWIST][:2], rows[i, TWIST][2:])))
+            found.append(Message(self.layout, stamp, stamp, (rows[i, POSE][:2], heading[i], rows[i, TWIST][:2], rows[i, TWIST][2:])))
         if self.cg_form is not None:
             for tick, cg in zip(ticks, self._masses.nominal_cg(seconds(ticks)), strict=True):
                 stamp = self._start_ns + int(tick)
                 found.append(Message(self.cg_form, stamp, stamp, (np.array([cg[0], cg[1], 0.0]),)))
         return found
+
+
+START_NS = 1_000_000_000
+"""Stamp of the simulation's beginning; 0 would mean "not set"."""
+LASER, CLOUD, IMU, GPS = "laser", "velodyne", "imu_link", "gps_link"
+_MOUNTS = {LASER: Mount(x=0.4, z=0.2), CLOUD: Mount(z=0.8), IMU: Mount(z=0.1), GPS: Mount(z=1.0)}
+
+
+@dataclass(frozen=True)
+class SensorConfig(Settings):
+    """Which sensors there are, and how good they are."""
+
+    lidar: Literal["2d", "3d", "none"] = "2d"
+    """Planar scanner on /scan, spinning scanner on /points, or none."""
+    center_of_gravity: bool = False
+    """Publish the nominal CG, by arms and robot file, on its topic."""
+    truth_hz: Positive = 25.0
+    """Rate of the truth."""
+    encoders: EncoderConfig = field(default_factory=EncoderConfig)
+    scanner: ScannerConfig = field(default_factory=ScannerConfig)
+    spinning: SpinningConfig = field(default_factory=SpinningConfig)
+    imu: ImuConfig = field(default_factory=ImuConfig)
+    gps: GpsConfig = field(default_factory=GpsConfig)
+
+    @property
+    def lidar_frame(self) -> str:
+        return CLOUD if self.lidar == "3d" else LASER
+
+
+class Sensor(Protocol):
+    def messages(self, track: TrueMotion) -> Sequence[Message]:
+        """What it has measured by the track's end and was not yet taken."""
+
+
+def nominal_mounts(robot: Robot) -> dict[str, Mount]:
+    """Mounts in the log's /tf_static: the robot file's, else usual ones."""
+    return {name: robot.mounts.get(name, mount) for name, mount in _MOUNTS.items()}
+
+
+def make_sensors(
+    config: SensorConfig,
+    robot: Robot,
+    masses: MassDistribution,
+    reality: TrueRobot,
+    world: World,
+    seeds: np.random.SeedSequence,
+    with_gps: bool,
+) -> list[Sensor]:
+    """Each with a random generator of its own: one sensor more leaves the noise of the others as it is."""
+    encoders, imu, gps, lidar = (np.random.default_rng(seed) for seed in seeds.spawn(4))
+    mounts, topics = nominal_mounts(robot), robot.topics
+    config = with_faults(config, reality)
+    sensors: list[Sensor] = [
+        TruthSensor(config.truth_hz, robot, masses, config.center_of_gravity, START_NS),
+        EncoderSensor(config.encoders, robot, masses, reality.wheels_late_s, reality.encoder_lost, START_NS, encoders),
+    ]
+    if config.imu.rate_hz > 0.0:
+        sensors.append(ImuSensor(config.imu, topics.imu, IMU, mounts[IMU], reality.gyro_bias, reality.body.slope, START_NS, imu))
+    fixes = dataclasses.replace(config.gps, rate_hz=1.0) if with_gps and config.gps.rate_hz == 0.0 else config.gps
+    if fixes.rate_hz > 0.0:
+        sensors.append(GpsSensor(fixes, "/fix", GPS, START_NS, gps))
+    real, late = reality.lidar, reality.lidar_late_s
+    if config.lidar == "2d":
+        sensors.append(PlanarScanner(config.scanner, topics.scan, LASER, real, world, late, START_NS, lidar))
+    elif config.lidar == "3d":
+        sensors.append(SpinningScanner(config.spinning, topics.points, CLOUD, real, world, late, START_NS, lidar))
+    return sensors
+
+
+def with_faults(config: SensorConfig, reality: TrueRobot) -> SensorConfig:
+    """The systematic errors of ``reality``'s sensors, beside those of ``config``."""
+    ranging = {"range_scale": reality.range_scale, "range_bias_m": reality.range_bias_m}
+    return dataclasses.replace(
+        config,
+        encoders=dataclasses.replace(config.encoders, missing=config.encoders.missing + reality.missing_joint_messages),
+        imu=dataclasses.replace(
+            config.imu, gyro_scale=config.imu.gyro_scale + reality.gyro_scale, late_s=config.imu.late_s + reality.gyro_late_s
+        ),
+        scanner=dataclasses.replace(config.scanner, **{k: getattr(config.scanner, k) + v for k, v in ranging.items()}),
+        spinning=dataclasses.replace(config.spinning, **{k: getattr(config.spinning, k) + v for k, v in ranging.items()}),
+    )
+
+
+def transforms(config: SensorConfig, robot: Robot) -> Message:
+    """The nominal mounts, which faults do not change."""
+    unused = {LASER: config.lidar != "2d", CLOUD: config.lidar != "3d"}
+    edges = [
+        ("base_link", name, (m.x, m.y, m.z), quaternion(m)) for name, m in nominal_mounts(robot).items() if not unused.get(name, False)
+    ]
+    return Message(message_templates.transforms("/tf_static", edges), START_NS, START_NS, ())
+
+
+def quaternion(mount: Mount) -> tuple[float, float, float, float]:
+    """x, y, z, w of a mount's rotation (fixed axes)."""
+    (cr, sr), (cp, sp), (cy, sy) = ((np.cos(0.5 * a), np.sin(0.5 * a)) for a in (mount.roll, mount.pitch, mount.yaw))
+    return (
+        float(sr * cp * cy - cr * sp * sy),
+        float(cr * sp * cy + sr * cp * sy),
+        float(cr * cp * sy - sr * sp * cy),
+        float(cr * cp * cy + sr * sp * sy),
+    )

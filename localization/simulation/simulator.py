@@ -12,15 +12,13 @@ import numpy as np
 from localization.errors import SimulationError
 from localization.logs.message_templates import Message, text
 from localization.logs.writer import write_bag
-from localization.simulation.drives import MoveArms, OpenLoop, Phase, PickUp, Pursuit, Rest, Route, turning
+from localization.simulation.drives import MoveArms, OpenLoop, Phase, PickUp, Pursuit, Rest, Route, turn_command
 from localization.simulation.experiments import Experiment, ExperimentConfig, find_experiment
-from localization.simulation.faults import Reality, changed
-from localization.simulation.masses import Masses
-from localization.simulation.raycast import clearance
-from localization.simulation.run_records import RUN_HZ, RunRecord
-from localization.simulation.sensor_suite import START_NS, SensorConfig, make_sensors, nominal_mounts, transforms
-from localization.simulation.track import Track
-from localization.simulation.vehicle import CG, COLUMNS, POSE, Body, VehicleConfig, VehicleState, advance
+from localization.simulation.faults import TrueRobot, apply_faults
+from localization.simulation.sensors import START_NS, SensorConfig, make_sensors, nominal_mounts, transforms
+from localization.simulation.track import RUN_HZ, RunRecord, TrueMotion
+from localization.simulation.vehicle import CG, COLUMNS, POSE, Body, MassDistribution, VehicleConfig, VehicleState, advance
+from localization.simulation.world import clearance
 from motion_models.center_of_gravity.parts import require_support
 from motion_models.errors import CgError
 from motion_models.registry import make_model
@@ -28,9 +26,9 @@ from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
 MARKS_TOPIC = "/experiment"
-"""std_msgs/String: JSON that says which named part of the drive begins or ends."""
+"""std_msgs/String: JSON with the named part of the drive that begins or ends."""
 _CONTROL_S = 0.02
-_LOOK_S = 0.1
+_STEERING_PERIOD_S = 0.1
 _FLUSH_S = 2.0
 _KEEP_S = 1.0
 _SETTLE_S = 1.0
@@ -63,17 +61,17 @@ class Simulation:
         self.runs: list[RunRecord] = []
         """Named phases that are over."""
         self.lidar_mount = nominal_mounts(robot)[self.config.sensors.lidar_frame]
-        """Where the log says that the LiDAR sits."""
-        self.reality = changed(Reality(Body.from_robot(robot), self.lidar_mount), effects)
+        """The LiDAR's mount in the log's /tf_static."""
+        self.reality = apply_faults(TrueRobot(Body.from_robot(robot), self.lidar_mount), effects)
         self._body = self.reality.body
-        self._masses = Masses(robot)
+        self._masses = MassDistribution(robot)
         self._masses.pick_up(self.reality.payload_kg)
         self._state = VehicleState.at(np.array(experiment.start))
         first = np.zeros(COLUMNS)
         first[POSE], first[-1] = experiment.start, 1.0
         first[CG] = self._masses.cg(np.zeros(1))[0, :2] + np.array(self._body.cg_offset)
         self._check_support(first[CG])
-        self._track = Track(first, self.config.vehicle.step_s)
+        self._track = TrueMotion(first, self.config.vehicle.step_s)
         self._sensors = make_sensors(
             self.config.sensors, robot, self._masses, self.reality, self.world, np.random.SeedSequence(seed), experiment.with_gps
         )
@@ -94,7 +92,11 @@ class Simulation:
         flushed = 0.0
         for number, phase in enumerate(phases):
             if number == half or (half < 0 and self.time_s > 0.5 * self._limit_s):
-                self._later()
+                self._change_friction()
+            if self.reality.wheel_radius_drift and isinstance(phases, list):
+                self._body = self._body.with_radii(
+                    self.reality.body, 1.0 + self.reality.wheel_radius_drift * number / max(len(phases) - 1, 1)
+                )
             for _ in self._drive(phase):
                 if self.time_s > flushed + _FLUSH_S:
                     flushed = self.time_s
@@ -110,20 +112,20 @@ class Simulation:
     def _phases(self) -> Iterator[Phase]:
         return self.experiment.phases(self.robot, self.config.experiment)
 
-    def _later(self) -> None:
+    def _change_friction(self) -> None:
         """The second half of the drive begins."""
-        if self.reality.side_friction_later != 1.0 and self._body is self.reality.body:
-            self._body = self._body.with_param("mu_ratio", self._body.param("mu_ratio") * self.reality.side_friction_later)
+        if self.reality.friction_change_factor != 1.0 and self._body.params is self.reality.body.params:
+            self._body = self._body.with_param("mu_ratio", self._body.param("mu_ratio") * self.reality.friction_change_factor)
 
     def _drive(self, phase: Phase) -> Iterator[None]:
-        """Drive one phase, coming back every now and then so that messages can be written."""
+        """Drive one phase, yielding from time to time so that messages can be written."""
         if isinstance(phase, Rest):
-            yield from self._blind(np.zeros((self._control_steps(phase.duration_s), 2)), "diff_drive")
+            yield from self._drive_open_loop(np.zeros((self._control_steps(phase.duration_s), 2)), "diff_drive")
         elif isinstance(phase, MoveArms):
             target = self._masses.posture(phase.target) if isinstance(phase.target, str) else self._reach(phase.target)
             duration = phase.duration_s or self._masses.time_to(target)
             self._masses.move(target, self.time_s, duration)
-            yield from self._blind(np.zeros((self._control_steps(duration), 2)), "diff_drive")
+            yield from self._drive_open_loop(np.zeros((self._control_steps(duration), 2)), "diff_drive")
             self._check_support(self._track.rows[-1, CG])
         elif isinstance(phase, PickUp):
             self._masses.pick_up(phase.mass_kg + self.reality.payload_kg)
@@ -133,12 +135,12 @@ class Simulation:
             commands = np.vstack(
                 [phase.profile(np.asarray(_CONTROL_S * np.arange(n), dtype=np.float64)), np.zeros((self._control_steps(_SETTLE_S), 2))]
             )
-            yield from self._recorded(phase, self._blind(commands, phase.controller))
+            yield from self._recorded(phase, self._drive_open_loop(commands, phase.controller))
         elif isinstance(phase, Route):
-            yield from self._recorded(phase, self._seeing(Pursuit(self._state.pose, phase).command, self._route_limit(phase)))
+            yield from self._recorded(phase, self._drive_closed_loop(Pursuit(self._state.pose, phase).command, self._route_limit(phase)))
         else:
             heading = phase.heading
-            yield from self._seeing(lambda pose: turning(pose, heading), 60.0)
+            yield from self._drive_closed_loop(lambda pose: turn_command(pose, heading), 60.0)
 
     def _recorded(self, phase: OpenLoop | Route, drive: Iterator[None]) -> Iterator[None]:
         """Keep what happens in a phase that has a name."""
@@ -163,27 +165,27 @@ class Simulation:
             rows = np.concatenate(kept)
             self.runs.append(RunRecord(phase.name, start_s, rows[:, POSE], rows[:, 8:10], rows[:, CG], cg, phase))
 
-    def _blind(self, commands: FloatArray, controller: str) -> Iterator[None]:
+    def _drive_open_loop(self, commands: FloatArray, controller: str) -> Iterator[None]:
         """Commands (n, 2), one for each control period."""
         chunk = max(1, round(1.0 / _CONTROL_S))
         for first in range(0, len(commands), chunk):
             self._advance(commands[first : first + chunk], controller)
             yield
 
-    def _seeing(self, steer: Callable[[FloatArray], FloatArray | None], limit_s: float) -> Iterator[None]:
+    def _drive_closed_loop(self, steer: Callable[[FloatArray], FloatArray | None], limit_s: float) -> Iterator[None]:
         """Commands that depend on the true pose, ten times a second; then stop."""
         until = self.time_s + limit_s
-        periods = round(_LOOK_S / _CONTROL_S)
+        periods = round(_STEERING_PERIOD_S / _CONTROL_S)
         while (command := steer(self._state.pose)) is not None:
             if self.time_s > until:
                 x, y, _ = self._state.pose
                 raise SimulationError(
-                    f"the robot does not get where it is sent: after {limit_s:.0f} s it is at x = {x:.2f}, y = {y:.2f} m, "
+                    f"the robot does not reach its way point: after {limit_s:.0f} s it is at x = {x:.2f}, y = {y:.2f} m, "
                     f"{self.time_s:.1f} s into the drive. Its wheels may slip too much; make the effects smaller."
                 )
             self._advance(command[None], "diff_drive", periods)
             yield
-        yield from self._blind(np.zeros((self._control_steps(0.6), 2)), "diff_drive")
+        yield from self._drive_open_loop(np.zeros((self._control_steps(0.6), 2)), "diff_drive")
 
     def _route_limit(self, route: Route) -> float:
         return 30.0 + 4.0 * Pursuit(self._state.pose, route).length / route.speed_m_s
@@ -241,7 +243,7 @@ class Simulation:
         marks, self._marks = self._marks, []
         ready = marks + [message for sensor in self._sensors for message in sensor.messages(self._track)]
         ready.sort(key=lambda message: message.log_ns)
-        self._track.forget(self._track.end_s - _KEEP_S)
+        self._track.drop_before(self._track.end_s - _KEEP_S)
         return ready
 
 

@@ -22,10 +22,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from localization.diagnosis.causes import Effect
-from localization.diagnosis.diagnose import _TOLERANCES, examine
+from localization.diagnosis.causes import Cause
+from localization.diagnosis.diagnose import TOLERANCES, examine
 from localization.diagnosis.drive import Drive, drive_of_log
-from localization.diagnosis.linearization import Look, look, normal_form
+from localization.diagnosis.linearization import Linearization, linearize, make_regression
 from localization.logs import open_log
 from motion_models.registry import make_model
 from tests.helpers.diagnosis_drives import ONE_SIDED, TYPICAL, bag, drive, robot_named
@@ -142,11 +142,11 @@ def run(case: Case) -> dict[str, Any]:
         ),
         "seconds": round(seconds, 2),
     }
-    if found.pipeline is None or found.state is None:
+    if found.predictor is None or found.linearization is None:
         return row
-    pipeline, state = found.pipeline, found.state
-    looked = look(pipeline, state.effects, {}, _TOLERANCES[0])
-    problem = normal_form(looked.linear, looked.signatures, looked.nuisances, state.noise, looked.effects, _TOLERANCES[0])
+    pipeline, state = found.predictor, found.linearization
+    looked = linearize(pipeline, state.causes, {}, TOLERANCES[0])
+    problem = make_regression(looked.linear, looked.signatures, looked.nuisances, state.noise, looked.causes, TOLERANCES[0])
     nominal = dataclasses.replace(looked, noise=state.noise, problem=problem)
     said = {name: [name_, round(gain, 5)] for name, (name_, gain) in rivals(seen, pipeline, nominal).items()}
     row["rivals"] = json.dumps(said)
@@ -158,7 +158,7 @@ def run(case: Case) -> dict[str, Any]:
     return row
 
 
-def significance(state: Look, effects: Mapping[str, float], name: str) -> float | None:
+def significance(state: Linearization, effects: Mapping[str, float], name: str) -> float | None:
     """Of effect ``name``: its size over the sigma with which this drive can measure it, while the other hidden causes are free and all
     others keep within their tolerance. None if the drive does not show the cause at all."""
     problem = state.problem
@@ -170,7 +170,7 @@ def significance(state: Look, effects: Mapping[str, float], name: str) -> float 
     return round(float(np.sqrt(cov[0, 0]) * abs(effects[name]) / problem.scale[own[0]]), 2)
 
 
-def loudness(state: Look, name: str, size: float) -> float | None:
+def loudness(state: Linearization, name: str, size: float) -> float | None:
     """Root mean square over the windows of what the effect does, over their noise, in the channel where that is most."""
     own = _columns(state, name)
     if not own:
@@ -179,15 +179,15 @@ def loudness(state: Look, name: str, size: float) -> float | None:
     return round(float(np.sqrt(np.mean(part**2, axis=0)).max()), 2)
 
 
-def _columns(state: Look, name: str) -> list[int]:
+def _columns(state: Linearization, name: str) -> list[int]:
     """Where the cause is among the state's, at most one."""
-    return [i for i, e in enumerate(state.effects) if e.id == name and _is_true(e, state)]
+    return [i for i, e in enumerate(state.causes) if e.id == name and _is_true(e, state)]
 
 
-def _is_true(effect: Effect, state: Look) -> bool:
+def _is_true(effect: Cause, state: Linearization) -> bool:
     """Of many moments the middle one; of two slopes the one along the first heading, which is the world's x."""
     if effect.id == "friction_change":
-        moments = [e.at_s for e in state.effects if e.id == "friction_change" and e.at_s is not None]
+        moments = [e.at_s for e in state.causes if e.id == "friction_change" and e.at_s is not None]
         return effect.at_s == moments[len(moments) // 2]
     return effect.id != "slope" or effect.at_s is None
 

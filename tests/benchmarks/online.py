@@ -18,9 +18,10 @@ import numpy as np
 from localization.logs import open_log
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.jit_warm_up import warm_up
+from localization.ros.settings import LiveRun
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.scanners import ScannerConfig
-from localization.simulation.sensor_suite import SensorConfig
+from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
@@ -45,7 +46,7 @@ def in_process(path: Path, estimator: str) -> tuple[np.ndarray, float]:
     robot = load_robot("vaultbot")
     log = open_log(path, robot)
     pair, config = Trial(make_model("skid_steer", robot), estimator), ReplayConfig()
-    warm_up(pair, robot, log.mounts, True, True, config)
+    warm_up(LiveRun(robot, lambda has_lidar: pair, config=config))
     events, took = list(log.events()), []
     pipeline = Pipeline(pair, robot, log.mounts, True, config)
     begin = time.process_time()

@@ -1,5 +1,5 @@
 """Hours of the estimator live, as fast as it goes: a simulated robot drives round four rooms, and every message of its topics passes
-through the node as bytes, with an output and a state on disk. Memory and time must stay as they are.
+through the node as bytes, with an output and a state on disk. WheelAngles and time must stay as they are.
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ import numpy as np
 
 from localization.logs.message_templates import Form, Message, Template
 from localization.pipeline import Trial
-from localization.ros.node import Node, NodeConfig
+from localization.ros.node import Node
 from localization.ros.session_files import Files
-from localization.ros.transports.base import Received
+from localization.ros.settings import LiveRun, NodeConfig
+from localization.ros.transports.base import MonotonicTime, Received
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.scanners import ScannerConfig
-from localization.simulation.sensor_suite import SensorConfig
+from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
@@ -41,7 +42,7 @@ class Row:
     position_error_m: float
 
 
-class SimulatedRobot:
+class SimulatedRobot(MonotonicTime):
     """A `Transport` whose messages are made when they are asked for, one at a time; it stops the time until it is asked for the next."""
 
     is_ros1 = False
@@ -70,10 +71,10 @@ class SimulatedRobot:
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         self._topics.add(topic)
 
-    def keep(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
+    def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
         self._topics = set(topics)
 
-    def advertise(self, topic: str, kind: str) -> None: ...
+    def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None: ...
 
     def publish(self, topic: str, data: bytes) -> None:
         self.published += 1
@@ -103,8 +104,8 @@ class SimulatedRobot:
     def _received(self) -> Iterator[Received]:
         for message in self._messages:
             self._runs.clear()  # what the simulator keeps of its laps would be taken for the estimator's
-            topic = message.form.topic
-            self._types.setdefault(topic, message.form.type)
+            topic = message.layout.topic
+            self._types.setdefault(topic, message.layout.type)
             self.seconds = (message.log_ns - 1_000_000_000) * 1e-9
             if topic == "/ground_truth/odom":
                 self.truth = np.array(message.parts[0])
@@ -115,9 +116,9 @@ class SimulatedRobot:
                 yield Received(topic, self._base_ns + message.log_ns, self._bytes(message))
 
     def _bytes(self, message: Message) -> bytes:
-        known = self._templates.get(id(message.form))
+        known = self._templates.get(id(message.layout))
         if known is None:
-            known = self._templates[id(message.form)] = message.form, Template(message.form, is_ros1=False)
+            known = self._templates[id(message.layout)] = message.layout, Template(message.layout, is_ros1=False)
         return known[1].fill(message)
 
 
@@ -128,7 +129,7 @@ def drive(hours: float, beams: int, estimator: str = "ekf") -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         files = Files(Path(folder) / "soak.tum", Path(folder) / "state")
         pair = Trial(make_model("skid_steer", robot), estimator)
-        node = Node.start(transport, robot, lambda has_lidar: pair, files, print, node=NodeConfig(wait_s=0.0))
+        node = Node.start(transport, LiveRun(robot, lambda has_lidar: pair, files, node=NodeConfig(wait_s=0.0)), print)
         start = np.append(transport.truth, 0.0)
 
         def look() -> bool:

@@ -66,10 +66,10 @@ def test_intervals_of_the_gain_cover_the_truth():
 def test_what_is_not_shown_is_not_claimed():
     noise = np.array([1.1, 0.9, 1.05, 0.93, 1.02, 0.97, 1.0, 1.01])
     first, rest = told({WORSE: HARD, BETTER: HARD * noise})
-    assert "are not told apart" in first
-    assert rest == ["These logs do not tell which is better: take the simplest, or drive more."]
+    assert "is not significant" in first
+    assert rest == ["No difference is significant on these logs: take the simplest, or record more drives."]
     first, rest = told({WORSE: HARD[:4], BETTER: 0.5 * HARD[:4]})  # clear, but on four logs only
-    assert "are not told apart: the first is better on 4 of 4 logs" in first
+    assert "is not significant: the first is better on 4 of 4 logs" in first
     assert rest == ["4 logs cannot show it: p is at least 0.12 for one pair. Take at least 6."]
     first, rest = told({WORSE: HARD})
     assert first.startswith("ekf with diff_drive: mean position error (ATE) 1.7 [")
@@ -81,7 +81,7 @@ def test_what_is_not_shown_is_not_claimed():
 def test_the_simpler_of_two_equals_is_named_beside_the_best():
     equal = HARD * np.array([0.52, 0.49, 0.5, 0.48, 0.5, 0.49, 0.51, 0.52])
     _, rest = told({("diff_drive", "odometry"): 5.0 * HARD, WORSE: 0.5 * HARD, BETTER: equal})
-    assert rest == ["Use ekf with skid_steer; these logs do not tell it from ekf with diff_drive."]
+    assert rest == ["Use ekf with skid_steer; it is not significantly better than ekf with diff_drive on these logs."]
 
 
 def cases():

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from localization.diagnosis.findings import Diagnosis
-from tests.helpers.diagnosis_drives import ONE_SIDED, TYPICAL, bag, drive, look
+from tests.helpers.diagnosis_drives import ONE_SIDED, TYPICAL, bag, diagnose_bag, drive
 
 CASES = [(cause, size if cause in ONE_SIDED or i % 2 == 0 else -size, 300 + i) for i, (cause, size) in enumerate(TYPICAL.items())]
 
@@ -22,7 +22,7 @@ def diagnosed(tmp_path: Path) -> Diagnosed:
     def run(
         effects: Mapping[str, float], seed: int, robot: str = "vaultbot", route: str = "tour", imu_hz: float = 50.0, as_robot: str = ""
     ) -> Diagnosis:
-        return look(bag(tmp_path / "drive.mcap", effects, seed, robot, drive(route), imu_hz=imu_hz), as_robot or robot).diagnosis
+        return diagnose_bag(bag(tmp_path / "drive.mcap", effects, seed, robot, drive(route), imu_hz=imu_hz), as_robot or robot).diagnosis
 
     return run
 
@@ -125,8 +125,8 @@ def test_a_wet_patch_of_floor_has_no_name(diagnosed: Diagnosed) -> None:
     found = diagnosed({}, 433, route="slippery_patch")
     assert found.verdict == "unexplained"
     assert not found.findings
-    assert found.shapes
-    assert all(shape.component == "yaw" for shape in found.shapes)
+    assert found.trends
+    assert all(trend.component == "yaw" for trend in found.trends)
 
 
 def test_a_minor_second_cause_does_not_hide_the_first(diagnosed: Diagnosed) -> None:

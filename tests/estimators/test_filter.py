@@ -173,6 +173,27 @@ def test_start_key_clones_the_pose():
     np.testing.assert_array_equal(ekf.P[np.ix_(others, others)], before[np.ix_(others, others)])
 
 
+def test_drift_since_key_of_wheels_alone_is_the_motions_covariance():
+    ekf, rng = filter_at(np.array([1.0, 2.0, 0.3])), np.random.default_rng(0)
+    ekf.P = np.zeros_like(ekf.P)
+    ekf.P[POSE, POSE] = np.diag([0.1, 0.2, 0.05]) ** 2
+    ekf.start_key()
+    for _ in range(5):
+        ekf.predict(step_of(np.array([0.2, 0.0, 0.1]), np.diag(rng.uniform(1e-5, 1e-4, 3))))
+    np.testing.assert_allclose(ekf.drift_since_key(), ekf.motion_since(KEY)[1], rtol=1e-6)
+
+
+def test_drift_since_key_without_drift_leaves_out_noise_of_scans():
+    """Pose and clone err by one submap's error, and each by a scan's noise: their motion errs by both noises, the chain by none."""
+    ekf, noise = filter_at(), 1e-3**2 * np.eye(3)
+    ekf.P = np.zeros_like(ekf.P)
+    for a in (POSE, KEY):
+        for b in (POSE, KEY):
+            ekf.P[a, b] = np.diag([0.1, 0.2, 0.05]) ** 2 + (noise if a == b else 0.0)
+    np.testing.assert_allclose(ekf.motion_since(KEY)[1], 2.0 * noise, rtol=1e-6)
+    np.testing.assert_allclose(ekf.drift_since_key(), 0.02 * noise, rtol=1e-6)
+
+
 # --- updates
 
 

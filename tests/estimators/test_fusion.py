@@ -375,3 +375,14 @@ def test_input_that_is_not_finite_is_refused(driven: rooms.Drive) -> None:
     leaps = [replace(e, position=e.position + 1e200 * k) for k, e in enumerate(driven.events[100:160]) if isinstance(e, WheelSample)]
     with pytest.raises(EstimatorError, match="not finite, or too large"):
         list(map(pipeline.process, [*leaps, *scans_of(driven)[20:40]]))
+
+
+def test_lidar_that_dies_on_the_way_is_lost_until_the_end(driven: rooms.Drive) -> None:
+    """Scans for 4.8 s of 12 s; the wheels go on."""
+    _, pipeline = run(driven, lambda k, scan: scan if k < 60 else None)
+    losses = pipeline.lidar
+    assert losses is not None
+    assert (losses.silences, losses.matched) == (1, 60)
+    assert losses.ongoing_s == losses.longest_s == pytest.approx(12.0 - 59 / 12.5, abs=0.3)
+    assert losses.share == pytest.approx(losses.longest_s / (losses.longest_s + 59 / 12.5), abs=0.01)
+    assert "no scans came for a second or more" in pipeline.warnings()[-1]

@@ -14,10 +14,10 @@ from localization.estimators import Estimate
 from localization.estimators.graph_fusion import _interpolate, _subtract_information
 from localization.evaluation.consistency import nees
 from localization.events import PositionSample, Scan, WheelSample
-from localization.logs.positions import merge_positions
+from localization.logs.references import merge_positions
 from localization.pipeline import Pipeline, Trial, replay
-from localization.ros.deserialize import thaw
-from localization.ros.serialize import freeze
+from localization.ros.deserialize import deserialize
+from localization.ros.serialize import serialize
 from localization.simulation import world
 from localization.trajectory import Trajectory
 from motion_models import se2
@@ -259,7 +259,7 @@ def test_cut_after_its_loops_and_resumed_the_graph_goes_on_to_the_last_bit() -> 
         pipeline.process(event)
     assert pipeline.estimator.counts()["loops"] >= 2
     assert pipeline.estimator.counts()["positions"] > 50
-    resumed = thaw(*freeze(pipeline))
+    resumed = deserialize(*serialize(pipeline))
     assert list(map(numbers, run(pipeline, fixed[cut:]))) == list(map(numbers, run(resumed, fixed[cut:])))
     assert dict(pipeline.estimator.parameters()) == dict(resumed.estimator.parameters())
 

@@ -13,8 +13,8 @@ from scipy.stats import chi2
 from localization.estimators import pose_graph
 from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
 from localization.evaluation.consistency import nees
-from localization.ros.deserialize import thaw
-from localization.ros.serialize import freeze
+from localization.ros.deserialize import deserialize
+from localization.ros.serialize import serialize
 from motion_models import se2
 
 COV = np.diag([0.02, 0.02, 0.01]) ** 2
@@ -236,7 +236,7 @@ def test_lever_arm_of_the_antenna_is_estimated(given: np.ndarray) -> None:
 def test_graph_that_was_frozen_goes_on_to_the_last_bit() -> None:
     graph, truth = circles(30, np.random.default_rng(5))
     graph.apply(Update(betweens=(loop(truth, 2, 22, np.zeros(3)),)))
-    resumed = thaw(*freeze(graph))
+    resumed = deserialize(*serialize(graph))
     for one in (graph, resumed):
         one.apply(Update(se2.compose(one.pose(29), ARC), betweens=(Between(29, 30, ARC, inverse(COV)),)))
         one.apply(Update(betweens=(loop(truth, 5, 25, np.zeros(3)),)))

@@ -21,7 +21,7 @@ from localization.evaluation.consistency import (
     pose_consistency,
     pose_errors,
 )
-from localization.evaluation.references import ReferenceTrack
+from localization.evaluation.references import ReferenceTrack, with_noise
 from localization.trajectory import Trajectory
 from motion_models import se2
 
@@ -320,5 +320,23 @@ def test_what_cannot_be_tested_is_none_or_refused():
     assert pose_errors(Trajectory(np.arange(61) * SECOND, estimate), as_track(truth)).covariances is None
     parked = as_trajectory(np.zeros((61, 3)), np.zeros((61, 3, 3)))
     assert pose_consistency(parked, as_track(np.zeros((61, 3)))) is None
-    with pytest.raises(EvaluationError, match="knows positions only"):
+    with pytest.raises(EvaluationError, match="has positions only"):
         pose_errors(as_trajectory(estimate, p), positions)
+
+
+def test_pose_consistency_with_noise_of_the_reference_counts_it() -> None:
+    """Poses that are exact but for the reference's noise: overconfident without it, consistent with it."""
+    rng, n, sigma = np.random.default_rng(3), 4000, np.array([0.02, 0.02, 0.01])
+    stamps = np.arange(n, dtype=np.int64) * 100_000_000
+    truth = np.column_stack([0.01 * np.arange(n), np.zeros(n), np.zeros(n)])
+    estimate = Trajectory(stamps, truth, np.tile(1e-8 * np.eye(3), (n, 1, 1)) * np.arange(1, n + 1)[:, None, None])
+    noisy = truth + rng.normal(size=(n, 3)) * sigma
+    noisy[0] = truth[0]
+    reference = ReferenceTrack(stamps, noisy[:, :2], noisy[:, 2])
+    exact, known = pose_consistency(estimate, reference), pose_consistency(estimate, with_noise(reference, 0.02, 0.01))
+    assert exact is not None
+    assert known is not None
+    assert exact.mean > 100.0
+    assert 0.2 < known.mean < 3.5
+    with pytest.raises(EvaluationError, match="both must be 0 or more"):
+        with_noise(reference, -1.0, 0.0)

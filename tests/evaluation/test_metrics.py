@@ -383,7 +383,7 @@ def test_gps_samples_make_a_track_of_positions_with_covariance():
     found = reference_track([Reference(i, np.array([i, 0.0]), None, covariance) for i in range(5)])
     assert found.yaws is None
     np.testing.assert_array_equal(found.covariances[0], covariance)
-    with pytest.raises(EvaluationError, match="knows positions only"):
+    with pytest.raises(EvaluationError, match="has positions only"):
         _ = found.poses
 
 
@@ -451,6 +451,6 @@ def test_every_score_defaults_to_unknown():
     scores = {
         k: v
         for k, v in dataclasses.asdict(Accuracy()).items()
-        if k not in ("n_reference", "n_matched", "n_dropped", "overlap", "rpe", "notes")
+        if k not in ("n_reference", "n_matched", "n_dropped", "overlap", "rpe", "warnings")
     }
     assert set(scores.values()) == {None}

@@ -9,7 +9,7 @@ import tempfile
 from pathlib import Path
 
 from localization.comparison.jobs import Job, Row, failed_rows, run_job
-from localization.simulation.sensor_suite import SensorConfig
+from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from tests.helpers.online import DRIVE, ROBOT
 

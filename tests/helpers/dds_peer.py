@@ -193,6 +193,7 @@ class ParticipantEntitiesInfo(IdlStruct, typename="rmw_dds_common.msg.dds_.Parti
     node_entities_info_seq: sequence[NodeEntitiesInfo]
 
 
+PERIOD_NS = 80_000_000  # of the scans
 SENT = {"/joint_states": JointState, "/scan": LaserScan, "/imu/data": Imu, "/tf_static": TFMessage}
 _RELIABLE = Policy.Reliability.Reliable(duration(seconds=1))
 VOLATILE = Qos(_RELIABLE, Policy.Durability.Volatile, Policy.History.KeepLast(50))
@@ -220,6 +221,12 @@ def stamp(header) -> int:
     return header.stamp.sec * 10**9 + header.stamp.nanosec
 
 
+def scan_of(estimate_ns, sent):
+    """Stamp of the scan whose sweep was halfway at ``estimate_ns``: of the last that began before."""
+    before = [stamp_ns for stamp_ns in list(sent)[-200:] if 0 <= estimate_ns - stamp_ns < PERIOD_NS]
+    return before[-1] if before else None
+
+
 def main(path: str, domain: int) -> None:
     with AnyReader([Path(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         connections = [c for c in reader.connections if c.topic in SENT]
@@ -229,21 +236,30 @@ def main(path: str, domain: int) -> None:
     writers = {
         topic: DataWriter(participant, Topic(participant, f"rt{topic}", kind), QUALITY.get(topic, VOLATILE)) for topic, kind in SENT.items()
     }
-    hear = {"/skidloc/odometry": Odometry, "/tf": TFMessage, "/diagnostics": DiagnosticArray, "/skidloc/corrections": JointState}
+    hear = {
+        "/skidloc/odometry": Odometry,
+        "/skidloc/odometry_predicted": Odometry,
+        "/tf": TFMessage,
+        "/diagnostics": DiagnosticArray,
+        "/skidloc/corrections": JointState,
+    }
     readers = {topic: DataReader(participant, Topic(participant, f"rt{topic}", kind), VOLATILE) for topic, kind in hear.items()}
     heard = {topic: [] for topic in hear}
-    scans_sent, latencies, out = {}, [], []
+    scans_sent, answered, latencies, out, arrivals = {}, set(), [], [], []
 
     def listen() -> None:
         for topic, reader in readers.items():
             for sample in reader.take(100):
                 if not isinstance(sample, hear[topic]):
                     continue
-                if topic == "/skidloc/odometry" and stamp(sample.header) in scans_sent:
-                    before, after_ns = scans_sent[stamp(sample.header)]
+                if topic == "/skidloc/odometry" and (sent := scan_of(stamp(sample.header), scans_sent)) is not None:
+                    before, after_ns = scans_sent[sent]
+                    answered.add(sent)
                     latencies.append(time.monotonic() - before)
                     out.append((sample.sample_info.source_timestamp - after_ns) * 1e-9)
                 heard[topic].append(sample)
+                if topic == "/skidloc/odometry":
+                    arrivals.append(time.monotonic())
 
     for _, topic, message in records:
         if topic == "/tf_static":
@@ -271,6 +287,14 @@ def main(path: str, domain: int) -> None:
         json.dumps(
             {
                 "sent_scans": len(scans_sent),
+                "answered_scans": len(answered),
+                "scans": [[stamp_ns, sent_s] for stamp_ns, (sent_s, _) in scans_sent.items()],
+                "arrivals_s": arrivals,
+                "predicted_stamps": [stamp(o.header) for o in heard["/skidloc/odometry_predicted"]],
+                "predicted_poses": [
+                    [o.pose.pose.position.x, o.pose.pose.position.y, o.pose.pose.orientation.z]
+                    for o in heard["/skidloc/odometry_predicted"]
+                ],
                 "latencies_s": latencies,
                 "out_s": out,
                 "stamps": [stamp(o.header) for o in odometry],

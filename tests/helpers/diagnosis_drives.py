@@ -9,14 +9,13 @@ from typing import Literal
 
 import numpy as np
 
-from localization.diagnosis.diagnose import Examined, examine
+from localization.diagnosis.diagnose import DiagnosisResult, examine
 from localization.diagnosis.drive import drive_of_log
 from localization.logs import open_log
 from localization.simulation.drives import MoveArms, OpenLoop, Phase, Rest, constant, sine
 from localization.simulation.experiments import EXPERIMENTS, Experiment, ExperimentConfig
 from localization.simulation.scanners import ScannerConfig
-from localization.simulation.sensor_suite import SensorConfig
-from localization.simulation.sensors import ImuConfig
+from localization.simulation.sensors import ImuConfig, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from motion_models.friction import FrictionModel
 from motion_models.registry import make_model
@@ -158,7 +157,7 @@ def bag(
     lidar: Literal["2d", "none"] = "2d",
     imu_hz: float = 50.0,
 ) -> Path:
-    """A bag in which ``effects`` (size by id) are hidden; half of the usual beams save half of the time."""
+    """A bag in which ``effects`` (size by id) are hidden; half of the typical beams save half of the time."""
     sensors = SensorConfig(lidar=lidar, scanner=ScannerConfig(beams=191), imu=ImuConfig(rate_hz=imu_hz))
     config = SimulationConfig(experiment=ExperimentConfig(laps=1, payload_kg=0.0), sensors=sensors)
     simulation = Simulation(experiment, robot_named(robot), seed, effects, config)
@@ -166,7 +165,7 @@ def bag(
     return path
 
 
-def look(path: Path, robot: str = "vaultbot", model: str = "friction") -> Examined:
+def diagnose_bag(path: Path, robot: str = "vaultbot", model: str = "friction") -> DiagnosisResult:
     """What the diagnosis says of a bag, by the nominal robot's file."""
     nominal = robot_named(robot)
     return examine(drive_of_log(open_log(path, nominal)), make_model(model, nominal))

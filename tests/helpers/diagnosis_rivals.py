@@ -3,7 +3,7 @@
 All see the same discrepancies, signatures and noise, and are held out by the same folds:
 
 - stepwise: forward selection by BIC on the linear signatures, no tolerances, no test, no second look through the pipeline;
-- stlsq: sequentially thresholded least squares (Brunton et al., "SINDy", 2016) on them, threshold half of a usual size;
+- stlsq: sequentially thresholded least squares (Brunton et al., "SINDy", 2016) on them, threshold half of a typical size;
 - gp: a Gaussian process on the windows' motion, which predicts but names nothing;
 - noise: the nominal model with its noise scaled to fit, which gains nothing by construction;
 - oracle: is told the cause and its size.
@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from localization.diagnosis.causes import EFFECTS, Effect, friction_change
+from localization.diagnosis.causes import CAUSES, Cause, friction_change
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.heldout import _heldout, heldout_gain
-from localization.diagnosis.linearization import Look
+from localization.diagnosis.linearization import Linearization
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
+from localization.diagnosis.subset_selection import heldout_gain, heldout_squares
 from motion_models.se2 import FloatArray
 
 NONE = "nothing"
@@ -25,7 +25,7 @@ _MOST = 7
 _BLOCK, _FOLDS = 4, 5
 
 
-def rivals(drive: Drive, pipeline: DrivePredictor, state: Look) -> dict[str, tuple[str, float]]:
+def rivals(drive: Drive, pipeline: DrivePredictor, state: Linearization) -> dict[str, tuple[str, float]]:
     """Name and relative held-out gain by each; ``state`` is the nominal one, in the noise by which all are measured."""
     y = state.noise.whiten(state.linear).ravel()
     scale = state.problem.scale
@@ -40,22 +40,22 @@ def rivals(drive: Drive, pipeline: DrivePredictor, state: Look) -> dict[str, tup
         x = np.linalg.lstsq(s[:, subset], y, rcond=None)[0] if subset else np.zeros(0)
         parts = {i: float(np.linalg.norm(s[:, i] * v)) for i, v in zip(subset, x, strict=True)}  # what each explains by its own size
         strongest = max(parts, key=lambda i: parts[i]) if parts else None
-        found[name] = (NONE if strongest is None else state.effects[strongest].id, gain(tuple(subset)))
+        found[name] = (NONE if strongest is None else state.causes[strongest].id, gain(tuple(subset)))
     found["gp"] = NONE, _gp_gain(drive, state)
     found["noise"] = NONE, 0.0
     return found
 
 
-def oracle(pipeline: DrivePredictor, state: Look, truth: dict[str, float]) -> float:
+def oracle(pipeline: DrivePredictor, state: Linearization, truth: dict[str, float]) -> float:
     """Relative held-out gain of the very causes at their very sizes."""
     moment = [friction_change(float(at)) for at in np.linspace(0.2, 0.8, 31) * float(pipeline.drive.starts_s[-1])]
-    options: list[dict[Effect, float]] = [{}]
+    options: list[dict[Cause, float]] = [{}]
     for name, size in truth.items():
-        effects = moment if name == "friction_change" else [EFFECTS[name]]
+        effects = moment if name == "friction_change" else [CAUSES[name]]
         options = [{**option, effect: size} for option in options for effect in effects]
     data = state.signatures, state.nuisances, state.noise, state.problem.scale, ()
-    left = min(float(_heldout(pipeline.discrepancies(with_sizes(option)), *data).sum()) for option in options)
-    before = float(_heldout(state.rows, *data).sum())
+    left = min(float(heldout_squares(pipeline.discrepancies(with_sizes(option)), *data).sum()) for option in options)
+    before = float(heldout_squares(state.rows, *data).sum())
     return 1.0 - float(np.sqrt(left / before))
 
 
@@ -89,7 +89,7 @@ def _stlsq(y: FloatArray, s: FloatArray, threshold: float) -> list[int]:
     return [int(i) for i in np.flatnonzero(keep)]
 
 
-def _gp_gain(drive: Drive, state: Look) -> float:
+def _gp_gain(drive: Drive, state: Linearization) -> float:
     """A squared-exponential Gaussian process on (distance, turn, CG) of each window and a constant, one for each channel."""
     inputs = []
     for m in drive.maneuvers:
@@ -102,7 +102,7 @@ def _gp_gain(drive: Drive, state: Look) -> float:
     distance = np.sum((x[:, None] - x[None]) ** 2, axis=-1)
     y = state.noise.whiten(state.linear)
     fold = (np.arange(len(y)) // _BLOCK) % _FOLDS
-    before = float(_heldout(state.linear, state.signatures, state.nuisances, state.noise, state.problem.scale, ()).sum())
+    before = float(heldout_squares(state.linear, state.signatures, state.nuisances, state.noise, state.problem.scale, ()).sum())
     after = 0.0
     for c in range(y.shape[1]):
         kernel = max(float(np.var(y[:, c])) - 1.0, 0.01) * np.exp(-0.5 * distance) + float(np.mean(y[:, c] ** 2))

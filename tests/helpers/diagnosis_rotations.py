@@ -15,10 +15,10 @@ import numpy as np
 from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import Drive, drive_of_table
 from localization.diagnosis.findings import Diagnosis
-from localization.diagnosis.subset_selection import likeness
+from localization.diagnosis.subset_selection import signature_correlation
 from localization.simulation.drives import MoveArms, OpenLoop, Phase, Rest, constant
 from localization.simulation.experiments import Experiment, ExperimentConfig, grid_points
-from localization.simulation.sensor_suite import SensorConfig
+from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig
 from motion_models import se2
 from motion_models.calibration.maneuvers import Maneuver
@@ -75,11 +75,11 @@ def rotations(rates: tuple[float, ...], seed: int) -> Drive:
 
 def known(drive: Drive) -> Known:
     found = examine(drive, make_model("friction", drive.robot))
-    assert found.state is not None
-    problem, names = found.state.problem, [e.id for e in found.state.effects]
+    assert found.linearization is not None
+    problem, names = found.linearization.problem, [e.id for e in found.linearization.causes]
     free = np.sqrt(np.diagonal(np.linalg.inv(problem.gram + np.eye(len(names))))) * problem.scale
     given = tuple(names.index(name) for name in ("lidar_offset_x", "track_width"))
-    alike = likeness(problem, given, names.index("diagonal_load"), names.index("tread_asymmetry"))
+    alike = signature_correlation(problem, given, names.index("diagonal_load"), names.index("tread_asymmetry"))
     return Known(found.diagnosis, dict(zip(names, (float(v) for v in free), strict=True)), alike)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from hypothesis import strategies as st
 
 from localization.errors import LogError
-from localization.logs import open_log
+from localization.logs import inspect_log, open_log
 from motion_models.robot import load_robot
 from tests.helpers import bags
 from tests.logs.test_formats import records
@@ -75,7 +75,7 @@ def check(form: str, changes: list[tuple[str, float, float, int]], of_metadata: 
         try:
             log = open_log(folder if len(files) > 1 else folder / next(iter(files)), ROBOT)
             stamps = [event.stamp_ns for event in log.events()]
-            log.info()
+            inspect_log(log)
         except LogError:
             stamps = []
         assert stamps == sorted(stamps)

@@ -23,7 +23,7 @@ import numpy as np
 from localization.cli import main
 from localization.evaluation.references import read_reference_file, reference_track
 from localization.logs import open_log
-from localization.logs.decode import Decoder
+from localization.logs.serialization import Decoder
 from localization.logs.sources import open_source
 from localization.trajectory import read_tum
 from motion_models.robot import load_robot

@@ -13,21 +13,23 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from localization.logs.topics import TopicOverrides
 from rosbags.typesys import Stores, get_typestore
 
 from localization.estimators import Estimate
 from localization.logs import open_log
 from localization.logs.sources import open_source
 from localization.pipeline import Pipeline, Trial
-from localization.ros.node import Node, NodeConfig
-from localization.ros.publisher import DIAGNOSTICS, ODOMETRY, TF
+from localization.ros.node import Node
+from localization.ros.publisher import DIAGNOSTICS, MAP, ODOMETRY, PATH, POSE, PREDICTED_ODOMETRY
 from localization.ros.session_files import Files
+from localization.ros.settings import LiveRun, NodeConfig
 from localization.ros.topic_names import Names
-from localization.ros.transports.base import Received
+from localization.ros.transforms import TF
+from localization.ros.transports.base import MonotonicTime, Received, ServiceHandler
 from localization.simulation.drives import MoveArms, OpenLoop, Rest, constant
 from localization.simulation.experiments import Experiment
-from localization.simulation.sensor_suite import SensorConfig
-from localization.simulation.sensors import EncoderConfig
+from localization.simulation.sensors import EncoderConfig, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
@@ -75,7 +77,7 @@ def numbers(estimate: Estimate) -> tuple:
     return estimate.stamp_ns, *(None if a is None else np.asarray(a).tobytes() for a in arrays), estimate.nis
 
 
-class LogTransport:
+class LogTransport(MonotonicTime):
     """A robot made of a log: its messages as bytes, as fast as they are taken; ``spoil`` may lose, double, delay or change them."""
 
     is_ros1 = False
@@ -90,16 +92,21 @@ class LogTransport:
         self._begin: int | None = None
         self.subscribed: dict[str, bool] = {}
         self.kept: set[str] | None = None
+        self.services: dict[str, ServiceHandler] = {}
         self.published: dict[str, list[bytes]] = {}
         self.is_closed = False
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         self.subscribed[topic] = is_latched
 
-    def keep(self, topics, urgent=()) -> None:
-        self.kept = set(topics)
+    def restrict(self, topics, urgent=()) -> None:
+        self.kept, self.urgent = set(topics), set(urgent)
 
-    def advertise(self, topic: str, kind: str) -> None:
+    def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
+        self.services[name] = handler
+        return True
+
+    def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
         self.published[topic] = []
 
     def publish(self, topic: str, data: bytes) -> None:
@@ -120,6 +127,10 @@ class LogTransport:
         wanted = self.subscribed if self.kept is None else self.kept
         return [message for message in found if message.topic in wanted]
 
+    def now_ns(self) -> int:
+        """When the last message was taken: a microsecond after it came."""
+        return (self._begin or time.monotonic_ns()) + 1000
+
     def is_empty(self) -> bool:
         return not self._left
 
@@ -128,21 +139,24 @@ class LogTransport:
 
 
 def run_node(
-    transport: LogTransport, estimator: str = "ekf", files: Files | None = None, config: NodeConfig | None = None, **options
+    transport: LogTransport,
+    estimator: str = "ekf",
+    files: Files | None = None,
+    config: NodeConfig | None = None,
+    topics: TopicOverrides | None = None,
 ) -> tuple[Node, list[str]]:
-    """A node over all that ``transport`` holds, and what it told."""
-    told: list[str] = []
-    node = Node.start(
-        transport,
+    """A node over all that ``transport`` holds, and what it reported. It publishes no predictions unless ``config`` has it so."""
+    reports: list[str] = []
+    run = LiveRun(
         ROBOT,
         lambda has_lidar: Trial(make_model("skid_steer", ROBOT), estimator),
         files or Files(),
-        told.append,
-        node=config or NodeConfig(wait_s=0.0),
-        **options,
+        topics or TopicOverrides(),
+        node=config or NodeConfig(wait_s=0.0, predict=False),
     )
+    node = Node.start(transport, run, reports.append)
     node.spin(transport.is_empty)
-    return node, told
+    return node, reports
 
 
 def reseal(state: Path, name: str, value: object) -> None:
@@ -154,7 +168,15 @@ def reseal(state: Path, name: str, value: object) -> None:
 
 def published(transport: LogTransport, topic: str) -> list:
     store = get_typestore(Stores.ROS2_HUMBLE)
-    kinds = {ODOMETRY: "nav_msgs/msg/Odometry", TF: "tf2_msgs/msg/TFMessage", DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray"}
+    kinds = {
+        ODOMETRY: "nav_msgs/msg/Odometry",
+        PREDICTED_ODOMETRY: "nav_msgs/msg/Odometry",
+        TF: "tf2_msgs/msg/TFMessage",
+        DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
+        POSE: "geometry_msgs/msg/PoseWithCovarianceStamped",
+        PATH: "nav_msgs/msg/Path",
+        MAP: "nav_msgs/msg/OccupancyGrid",
+    }
     return [
         store.deserialize_cdr(data, kinds.get(topic, "sensor_msgs/msg/JointState")) for data in transport.published[Names().resolve(topic)]
     ]
@@ -164,10 +186,10 @@ def stamp_of(message) -> int:
     return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
 
-def track(transport: LogTransport) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Pose and sigmas (x, y, yaw) that were published, by stamp."""
+def track(transport: LogTransport, topic: str = ODOMETRY) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Pose and sigmas (x, y, yaw) that were published on ``topic``, by stamp."""
     found = {}
-    for m in published(transport, ODOMETRY):
+    for m in published(transport, topic):
         q, p = m.pose.pose.orientation, m.pose.pose.position
         pose = np.array([p.x, p.y, 2.0 * math.atan2(q.z, q.w)])
         found[stamp_of(m)] = pose, np.sqrt(m.pose.covariance[[0, 7, 35]])

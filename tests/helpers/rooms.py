@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 from localization.events import Event, Scan, WheelSample
 from localization.lidar import Sweep
 from localization.pipeline import ReplayConfig, Run, Trial, replay
-from localization.simulation.raycast import Grid, cast, make_grid
+from localization.simulation.world import Grid, cast, make_grid
 from motion_models import se2
 from motion_models.registry import make_model
 from motion_models.robot import Mount, WheelNoise, load_robot

@@ -10,8 +10,8 @@ from kiss_icp.threshold import get_threshold_estimator
 
 from localization.lidar import KissIcp, choose_voxel_size
 from localization.lidar.kiss_icp import AdaptiveThreshold
-from localization.ros.deserialize import thaw
-from localization.ros.serialize import freeze
+from localization.ros.deserialize import deserialize
+from localization.ros.serialize import serialize
 from localization.simulation import world
 from motion_models import se2
 from tests.helpers import rooms
@@ -46,7 +46,7 @@ def test_state_is_resumed_bit_by_bit() -> None:
     kiss, scans = KissIcp(0.3, 50.0), frames()
     for scan in scans[:12]:
         kiss.register_frame(scan)
-    again = thaw(*freeze(kiss))
+    again = deserialize(*serialize(kiss))
     for scan in scans[12:]:
         np.testing.assert_array_equal(kiss.register_frame(scan), again.register_frame(scan))
 

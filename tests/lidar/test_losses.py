@@ -45,6 +45,21 @@ def test_losses_of_scans_have_share_and_longest_gap() -> None:
     assert losses.describe().endswith(losses.advice)
 
 
+def test_losses_of_a_lidar_that_dies_are_described_and_long() -> None:
+    """Ten scans, then nothing while the wheels turn for 6 s more."""
+    lost = counted("mmmmmmmmmm")
+    for half in range(1, 13):
+        lost.add_no_scan(9 * S + half * S // 2)
+    losses = LidarLosses.of(lost)
+    assert (losses.scans, losses.matched, losses.ongoing_s) == (10, 10, 6.0)
+    assert losses.is_long
+    assert losses.describe() == (
+        "LiDAR lost for 40 % of the drive, longest 6 s at t = 9 s (no scans came for a second or more). Wheels carried on alone. "
+        "Check the LiDAR's driver, cable and topic."
+    )
+    assert losses.numbers()["silences"] == 1
+
+
 def test_losses_without_lost_scans_are_silent() -> None:
     losses = LidarLosses.of(counted("mmmm"))
     assert losses.describe() == losses.advice == ""
@@ -106,6 +121,7 @@ def test_metrics_of_lost_run_have_its_losses() -> None:
         "longest_lost_s": 60.0,
         "longest_lost_since_s": 7.0,
         "causes": {"lost": 600},
+        "silences": 0,
     }
     assert reckoned.metrics(200.0, with_timing=False)["lidar"] is None
 

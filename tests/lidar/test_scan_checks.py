@@ -69,3 +69,28 @@ def test_no_scan_or_one_is_no_time() -> None:
     lost.add(7 * S, "sparse")
     assert (lost.share, lost.longest) == (0.0, (0.0, 0.0))
     assert lost.causes == {"sparse": 1}
+
+
+def test_no_scans_for_seconds_is_lost_until_they_come_back() -> None:
+    """Scans at 10 Hz until 2 s and from 7 s to 8 s; the last 4 s of 12 s without any."""
+    lost, tenth = LostScans(), S // 10
+    for k in range(120):
+        is_scan = k <= 20 or 70 <= k <= 80
+        lost.add_matched(k * tenth) if is_scan else lost.add_no_scan(k * tenth)
+        if k == 25:
+            assert lost.ongoing_s == 0.0
+        if k == 60:
+            assert lost.ongoing_s == pytest.approx(4.0)
+    assert lost.silences == 2
+    assert lost.causes == {}
+    assert lost.share == pytest.approx((5.0 + 3.9) / 11.9)
+    assert lost.longest == pytest.approx((5.0, 2.0))
+    assert lost.ongoing_s == pytest.approx(3.9)
+
+
+def test_gap_is_counted_when_the_next_scan_comes_without_steps_between() -> None:
+    """Also where that scan is not matched; gaps as they are between few scans are none."""
+    lost = LostScans()
+    for t in (0, 1, 2, 3, 9, 10):
+        lost.add(t * S, "lost") if t == 9 else lost.add_matched(t * S)
+    assert (lost.silences, lost.longest) == (1, (7.0, 3.0))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from localization.lidar import LidarConfig, ScanMatch, ScanMatcher
-from localization.lidar.scan_matcher import _KERNEL, linearize
+from localization.lidar.scan_matcher import _KERNEL, KeyScan, linearize
 from localization.lidar.submap import fill_surface, find_nearest, make_grid
 from localization.simulation import world
 from motion_models import se2
@@ -248,6 +248,29 @@ def test_submap_holds_the_last_key_scans_only() -> None:
         matcher.insert_key_scan(np.array([10.0 * k, 0.0, 0.0]), rng.uniform(-1.0, 1.0, (100, 2)))
     assert matcher.points().shape == (300, 2)
     assert matcher.points()[:, 0].min() > 18.0
+
+
+@pytest.mark.parametrize(("drift_m", "stays"), [(0.01, True), (0.03, False)])
+def test_old_key_scan_stays_while_drift_is_below_range_noise(drift_m: float, stays: bool) -> None:
+    """The noise of a range is 0.02 m. Three submaps' worth of old key scans stay at most."""
+    rng, matcher = np.random.default_rng(0), ScanMatcher(LidarConfig(key_scans=2), CELL)
+    for k in range(20):
+        cov = np.diag([drift_m**2 * (k >= 10), 0.0, 0.0])
+        matcher.insert_key_scan(np.array([10.0 * k, 0.0, 0.0]), rng.uniform(-1.0, 1.0, (100, 2)), cov)
+        if k == 10:
+            assert matcher.points().shape == (100 * (8 if stays else 2), 2)
+    assert matcher.points().shape == (800, 2)
+
+
+def test_drift_of_the_yaw_counts_by_the_range_of_the_points() -> None:
+    """An error of 1 mrad moves walls at 5 m by 5 mm, at 50 m by 50 mm; the same error carried along to another place is no drift."""
+    cov = np.diag([0.0, 0.0, 1e-6])
+    key = KeyScan(np.zeros((1, 2)), np.zeros(3), np.zeros((3, 3)))
+    assert key.drift_variance(np.zeros(3), cov, 5.0) == pytest.approx(25e-6)
+    assert key.drift_variance(np.zeros(3), cov, 50.0) == pytest.approx(2500e-6)
+    there = np.array([7.0, -2.0, 1.0])
+    A = se2.adjoint(se2.inverse(there))
+    assert KeyScan(np.zeros((1, 2)), np.zeros(3), cov).drift_variance(there, A @ cov @ A.T, 5.0) == pytest.approx(0.0, abs=1e-12)
 
 
 # --- spoilt scans

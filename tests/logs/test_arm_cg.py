@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from localization.events import CgSample, WheelSample
-from localization.logs import TopicOverrides, open_log
+from localization.logs import TopicOverrides, inspect_log, open_log
 from motion_models.center_of_gravity.files import arms_postures
 from motion_models.errors import RobotError
 from motion_models.robot import load_robot
@@ -53,7 +53,7 @@ def expected(i: int) -> np.ndarray:
     return urdf_reference.center_of_mass(URDF, posture(i))[0][:2]
 
 
-URDF = (Path(urdf_reference.__file__).parents[1] / "motion_models" / "robots" / "vaultbot.urdf").read_text()
+URDF = (Path(urdf_reference.__file__).parents[2] / "motion_models" / "robots" / "vaultbot.urdf").read_text()
 
 
 @pytest.mark.parametrize("format_", ["ros1", "mcap"])
@@ -72,7 +72,7 @@ def test_the_centre_of_gravity_follows_the_arms(tmp_path: Path, format_: str) ->
     assert [rate.stamp_ns for rate in rates] == [sample.stamp_ns for sample in samples]
     np.testing.assert_allclose([rate.position[0] for rate in rates], 0.1 * np.arange(40))
     assert log.warnings() == []
-    info = log.info()
+    info = inspect_log(log)
     assert info.parts["center_of_gravity"] == {"topic": "/joint_states", "kind": "joint_states", "chosen_by": "arms"}
 
 
@@ -94,7 +94,7 @@ def test_arms_that_are_told_apart_from_the_wheels_and_from_each_other(tmp_path: 
     for i in (0, 17, 39):
         np.testing.assert_allclose(samples[2 * i].position, expected(i), atol=1e-12)
     assert log.warnings() == []
-    assert {t.topic: t.used_as for t in log.info().topics} == {"/joint_states": "wheels", "/left_arm/joint_states": "arms"}
+    assert {t.topic: t.used_as for t in inspect_log(log).topics} == {"/joint_states": "wheels", "/left_arm/joint_states": "arms"}
 
 
 def test_a_topic_that_repeats_what_another_tells_is_left_out(tmp_path: Path) -> None:
@@ -123,10 +123,10 @@ def test_joints_of_other_names_are_told(tmp_path: Path) -> None:
     log = open_log(bags.write_mcap(tmp_path / "run.mcap", sorted(records, key=lambda r: r[2])), ROBOT)
     assert cgs(log) == []
     (note,) = log.warnings()
-    assert "lacks left_shoulder_pan_joint, " in note
+    assert "has no left_shoulder_pan_joint, " in note
     assert "does not have: ur5_left_elbow_joint, " in note
     assert "[arms] joints" in note
-    assert any("has arms, but no joint states tell how they stand" in problem for problem in log.info().problems)
+    assert any("has arms, but no joint states tell how they stand" in problem for problem in inspect_log(log).problems)
 
 
 def test_one_joint_that_is_never_told_leaves_the_centre_of_gravity_alone_until_it_need_not_be(tmp_path: Path) -> None:
@@ -138,7 +138,7 @@ def test_one_joint_that_is_never_told_leaves_the_centre_of_gravity_alone_until_i
     path = bags.write_mcap(tmp_path / "run.mcap", records)
     log = open_log(path, ROBOT)
     assert cgs(log) == []
-    assert any("lacks left_elbow_joint of the arms" in note for note in log.warnings())
+    assert any("has no left_elbow_joint of the arms" in note for note in log.warnings())
     assert ROBOT.arms is not None
     told = dataclasses.replace(ROBOT, arms=dataclasses.replace(ROBOT.arms, joints=tuple(names)))
     samples = cgs(open_log(path, told))

@@ -13,7 +13,7 @@ import pytest
 
 from localization.errors import LogError
 from localization.events import Event, Scan, WheelSample
-from localization.logs import Log, open_log
+from localization.logs import Log, inspect_log, open_log
 from localization.logs.sqlite import RecoveredSqlite
 from motion_models.robot import load_robot
 from tests.helpers import bags
@@ -392,7 +392,7 @@ def test_any_cut_and_any_flipped_byte_gives_events_or_our_error(tmp_path: Path, 
         try:
             log = open_log(original, ROBOT)
             events: list[Event] = list(log.events())
-            log.info()
+            inspect_log(log)
         except LogError:
             continue
         readable += 1

@@ -14,7 +14,7 @@ from rosbags import rosbag1
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from localization.events import Event, ImuSample, Scan, WheelSample
-from localization.logs import Log, open_log
+from localization.logs import Log, inspect_log, open_log
 from motion_models import se2
 from motion_models.robot import Driver, load_robot
 from tests.helpers import bags
@@ -500,7 +500,7 @@ def test_two_types_and_two_publishers_on_one_topic(tmp_path: Path) -> None:
     records.insert(5, ("/scan", bags.imu(START + S // 2), START + S // 2))
     log = open_log(bags.write_ros1_bag(tmp_path / "run.bag", records), ROBOT)
     assert len(list(log.events())) == 10
-    assert [(t.topic, t.type, t.count) for t in log.info().topics] == [
+    assert [(t.topic, t.type, t.count) for t in inspect_log(log).topics] == [
         ("/scan", "sensor_msgs/LaserScan", 10),
         ("/scan", "sensor_msgs/Imu", 1),
     ]
@@ -512,4 +512,4 @@ def test_two_types_and_two_publishers_on_one_topic(tmp_path: Path) -> None:
         for i in range(10):
             data = bags.STORE.cdr_to_ros1(bags.STORE.serialize_cdr(records[0][1], "sensor_msgs/msg/LaserScan"), "sensor_msgs/msg/LaserScan")
             writer.write(connections[i % 2], START + i * S // 10, data)
-    assert [(t.topic, t.count) for t in open_log(tmp_path / "two.bag", ROBOT).info().topics] == [("/scan", 10)]
+    assert [(t.topic, t.count) for t in inspect_log(open_log(tmp_path / "two.bag", ROBOT)).topics] == [("/scan", 10)]

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from localization.logs.decode import UnusableError
-from localization.logs.fast_cdr import FusedWriter, quick_reader
+from localization.logs.fast_cdr import FusedWriter, fast_decoder
 from localization.logs.fused_log import FusedEstimate, odometry_message, transform_message
+from localization.logs.message_stats import UnusableError
 from localization.logs.serialization import decoder, encode, make
 from tests.helpers.bags import STORE
 
@@ -122,7 +122,7 @@ def test_joint_states_are_read_as_by_rosbags_whole_cut_and_garbled(messages, lon
 def test_imus_and_scans_are_read_as_by_rosbags_whole_cut_and_garbled(kind, data, longer, where):
     message = data.draw(MESSAGES[kind])
     decode, whole = decoder(kind), encode(message)
-    assert quick_reader(kind)(whole) is not None
+    assert fast_decoder(kind)(whole) is not None
     assert read(decode, whole) == content(message)
     changed = whole[:longer] if longer < 0 else whole + b"\0" * longer
     assert read(decode, changed) == by_rosbags(changed, kind)
@@ -135,7 +135,7 @@ def test_imus_and_scans_are_read_as_by_rosbags_whole_cut_and_garbled(kind, data,
 def test_the_other_order_of_bytes_is_left_to_rosbags(kind, data):
     message = data.draw(MESSAGES[kind])
     turned = bytes(STORE.serialize_cdr(message, kind, little_endian=False))
-    quick = quick_reader(kind)
+    quick = fast_decoder(kind)
     assert quick(turned) is None
     assert read(decoder(kind), turned) == content(message)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
-from localization.logs import open_log
+from localization.logs import inspect_log, open_log
 from motion_models.robot import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
@@ -117,7 +117,7 @@ def _peak(path: Path) -> tuple[int, int]:
     try:
         log = open_log(path, ROBOT)
         count = sum(1 for _ in log.events())
-        log.info()
+        inspect_log(log)
         return tracemalloc.get_traced_memory()[1], count
     finally:
         tracemalloc.stop()

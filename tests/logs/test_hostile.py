@@ -18,8 +18,8 @@ import pytest
 
 from localization.errors import LogError
 from localization.events import Scan, WheelSample
-from localization.logs import open_log
-from localization.logs.chunks import MOST_PLAIN_BYTES, DamagedError, decompress, inflate_message, zstd
+from localization.logs import inspect_log, open_log
+from localization.logs.chunks import MAX_DECOMPRESSED_BYTES, DamagedError, decompress, decompress_message, zstd
 from motion_models.robot import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, S
@@ -53,7 +53,7 @@ def read_all(path: Path) -> tuple[list, str]:
     with limits():
         log = open_log(path, ROBOT)
         events = list(log.events())
-        log.info()
+        inspect_log(log)
         return events, said(log)
 
 
@@ -160,7 +160,7 @@ BOMB = bytes(64 << 20) * 8  # half a gigabyte
 @pytest.mark.parametrize(("name", "pack"), [("lz4", lz4.frame.compress), ("zstd", zstd.compress), ("bz2", bz2.compress)])
 def test_decompression_bomb_is_refused_within_bounds(name: str, pack) -> None:
     packed = pack(BOMB) if name != "bz2" else pack(BOMB[: 80 << 20]) + b""
-    with limits(extra_bytes=3 * MOST_PLAIN_BYTES), pytest.raises(DamagedError, match="decompress to more than"):
+    with limits(extra_bytes=3 * MAX_DECOMPRESSED_BYTES), pytest.raises(DamagedError, match="decompress to more than"):
         decompress(packed, name)
 
 
@@ -184,7 +184,7 @@ def test_message_that_is_a_bomb_is_dropped_and_counted(tmp_path: Path) -> None:
     events, notes = read_all(path)
     assert sum(isinstance(e, Scan) for e in events) == 30
     assert "/scan: 1 message dropped (bytes that are not of the type)" in notes
-    assert len(inflate_message(zstd.compress(BOMB))) < 1 << 20
+    assert len(decompress_message(zstd.compress(BOMB))) < 1 << 20
 
 
 def test_storage_file_that_is_a_bomb_is_refused(tmp_path: Path) -> None:

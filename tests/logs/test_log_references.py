@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from localization.events import Reference
-from localization.logs import Log, TopicOverrides, open_log
+from localization.logs import Log, TopicOverrides, inspect_log, open_log
 from localization.logs.transforms import mount_of
 from motion_models.robot import Mount, load_robot, parse_robot
 from tests.helpers import bags
@@ -231,7 +231,7 @@ def test_a_loop_of_transforms_ends(tmp_path: Path) -> None:
 
 
 def test_info_of_the_husky() -> None:
-    info = open_log(HUSKY_BAG, load_robot("husky_a200")).info()
+    info = inspect_log(open_log(HUSKY_BAG, load_robot("husky_a200")))
     by_topic = {topic.topic: topic for topic in info.topics}
     odometry, gps, inertial = by_topic["/husky_velocity_controller/odom"], by_topic["/fix"], by_topic["/imu/data"]
     assert (odometry.count, gps.count, inertial.count) == (3952, 989, 11865)
@@ -252,7 +252,7 @@ def test_info_finds_gaps_frames_and_what_is_missing(tmp_path: Path) -> None:
         if not 50 <= i < 80:
             records.append(("/scan", bags.laser_scan(t, frame_id="strange_frame"), t))
         records.append(("/camera", bags.Unknown("sensor_msgs/msg/Compressed"), t))
-    info = log_of(tmp_path, records).info()
+    info = inspect_log(log_of(tmp_path, records))
     scan = next(topic for topic in info.topics if topic.topic == "/scan")
     assert [(round(gap.at_s, 3), round(gap.duration_s, 3)) for gap in scan.gaps] == [(4.9, 3.1)]
     assert scan.frame_id == "strange_frame"
@@ -267,7 +267,7 @@ def test_info_of_a_log_that_was_cut_off_says_so(tmp_path: Path) -> None:
     data = HUSKY_BAG.read_bytes()
     path = tmp_path / "test1.bag"
     path.write_bytes(data[: len(data) // 2])
-    info = open_log(path, load_robot("husky_a200")).info()
+    info = inspect_log(open_log(path, load_robot("husky_a200")))
     # Its chunks of 41 s are single blocks of bz2, of which there is all or nothing.
     assert info.duration_s == pytest.approx(165.2, abs=0.1)
     assert any("test1.bag is damaged" in note for note in info.warnings)
@@ -281,13 +281,13 @@ def test_info_tells_which_sensor_ends_early(tmp_path: Path) -> None:
         records.append(("/odom", bags.odometry(t), t))
         if 50 <= i < 200:
             records.append(("/scan", bags.laser_scan(t), t))
-    said = "\n".join(log_of(tmp_path, records).info().problems)
+    said = "\n".join(inspect_log(log_of(tmp_path, records)).problems)
     assert "/scan begins 5.0 s after the other sensors" in said
     assert "/scan ends 10.0 s before the other sensors" in said
 
 
 def test_info_names_the_reference_that_will_be_used(tmp_path: Path) -> None:
     records = pad([("/ground_truth/odom", bags.odometry(START + i * S), START + i * S) for i in range(5)])
-    info = log_of(tmp_path, records).info()
+    info = inspect_log(log_of(tmp_path, records))
     assert next(topic for topic in info.topics if topic.topic == "/ground_truth/odom").used_as == "reference"
     assert info.references == ["/ground_truth/odom"]

@@ -7,7 +7,7 @@ import pytest
 
 from localization.errors import LogError
 from localization.events import PositionSample, Reference, WheelSample
-from localization.logs.positions import merge_positions, position_samples
+from localization.logs.references import merge_positions, read_positions
 
 KNOWN = np.diag([0.5, 0.2, 0.1]) ** 2
 
@@ -17,7 +17,7 @@ def reference(stamp_ns: int, position: tuple[float, float] = (1.0, 2.0), cov: np
 
 
 def test_positions_are_sorted_and_repeated_stamps_left_out() -> None:
-    found = position_samples([reference(3), reference(1, (5.0, 6.0)), reference(3, (9.0, 9.0))], "/fix")
+    found = read_positions([reference(3), reference(1, (5.0, 6.0)), reference(3, (9.0, 9.0))], "/fix")
     assert [sample.stamp_ns for sample in found] == [1, 3]
     assert found[0].position == pytest.approx([5.0, 6.0])
     assert found[1].position == pytest.approx([1.0, 2.0])
@@ -26,19 +26,19 @@ def test_positions_are_sorted_and_repeated_stamps_left_out() -> None:
 
 @pytest.mark.parametrize("position", [(np.nan, 0.0), (0.0, np.inf)])
 def test_positions_that_are_not_finite_are_left_out(position: tuple[float, float]) -> None:
-    assert len(position_samples([reference(1), reference(2, position)], "/fix")) == 1
+    assert len(read_positions([reference(1), reference(2, position)], "/fix")) == 1
     with pytest.raises(LogError, match="/fix has no usable position"):
-        position_samples([reference(2, position)], "/fix")
+        read_positions([reference(2, position)], "/fix")
 
 
 @pytest.mark.parametrize("cov", [np.full((3, 3), np.nan), np.zeros((3, 3)), -KNOWN])
 def test_position_without_a_covariance_gets_that_of_a_plain_receiver(cov: np.ndarray) -> None:
-    (sample,) = position_samples([reference(1, cov=cov)], "/fix")
+    (sample,) = read_positions([reference(1, cov=cov)], "/fix")
     assert np.sqrt(np.diag(sample.covariance)) == pytest.approx([2.5, 2.5], rel=1e-3)
 
 
 def test_position_far_off_is_kept_for_the_graph_to_judge() -> None:
-    (sample,) = position_samples([reference(1, (4.5e5, 5.4e6))], "/fix")
+    (sample,) = read_positions([reference(1, (4.5e5, 5.4e6))], "/fix")
     assert sample.position == pytest.approx([4.5e5, 5.4e6])
 
 

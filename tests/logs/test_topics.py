@@ -10,7 +10,7 @@ import pytest
 
 from localization.errors import TopicError
 from localization.events import Scan, WheelSample
-from localization.logs import Log, TopicOverrides, open_log
+from localization.logs import Log, TopicOverrides, inspect_log, open_log
 from motion_models.robot import Joints, Topics, load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
@@ -156,7 +156,7 @@ def test_unknown_joints_without_odometry_are_listed_when_wheels_are_asked_for(tm
     log = log_of(tmp_path, {"/joint_states": "arm", "/scan": "scan"})
     with pytest.raises(TopicError, match=r"front_left_wheel.*elbow_joint, shoulder_pan_joint.*\[joints\]"):
         log.events()
-    assert any("elbow_joint" in problem for problem in log.info().problems)
+    assert any("elbow_joint" in problem for problem in inspect_log(log).problems)
     (tmp_path / "again").mkdir()
     without = log_of(tmp_path / "again", {"/joint_states": "arm", "/scan": "scan"}, TopicOverrides(joint_states=""))
     assert len(list(without.events())) == 20

@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 
 from localization.errors import OutputError
-from localization.evaluation.references import ReferenceTrack, Relations
+from localization.evaluation.references import ReferenceTrack, Relations, with_noise
 from localization.evaluation.scores import Result, score
 from localization.pipeline import Run
 from localization.report.figure_data import map_view, nis_means, spans
@@ -165,7 +165,7 @@ def test_track_reference_is_named_with_ate_and_distance():
 def test_without_reference_nothing_is_called_best():
     runs = three_runs()
     text = verdict(score(runs, None), None)
-    assert text.startswith("No reference was given, so nothing here says which run is right.")
+    assert text.startswith("No reference was given, so which run is right is unknown.")
     assert "--reference" in text
     assert "best" not in text
     ends = [r.trajectory.poses[-1, :2] for r in runs]
@@ -178,7 +178,7 @@ def test_one_run_is_not_the_best_of_anything():
     assert "Nothing else was run" in text
     assert "best" not in text
     alone = verdict(score([run(noise=0.1)], None), None)
-    assert "nothing here says how accurately" in alone
+    assert "its accuracy is unknown" in alone
 
 
 def test_equal_runs_are_a_tie_and_no_gain_is_claimed():
@@ -188,7 +188,7 @@ def test_equal_runs_are_a_tie_and_no_gain_is_claimed():
     assert "Within 2 % of it: ekf with skid_steer" in text
     assert "is best" not in text
     assert "less than" not in text
-    assert "which motion model is better in it, this drive does not tell" in text
+    assert "which motion model is better in it is not significant on this drive" in text
 
 
 def test_a_difference_made_by_one_stretch_of_the_drive_is_not_proven():
@@ -225,8 +225,8 @@ def test_how_often_equal_filters_are_told_apart():
     ("scale", "said"),
     [
         (4.0, "are overconfident"),
-        (0.25, "Nothing says that its covariances are too small"),
-        (1.0, "Nothing speaks against its covariances"),
+        (0.25, "Its covariances are not too small"),
+        (1.0, "Its covariances are consistent"),
     ],
 )
 def test_nis_decides_what_is_said_of_covariances(scale, said):
@@ -239,7 +239,7 @@ def test_nis_decides_what_is_said_of_covariances(scale, said):
 def test_factor_of_overconfidence_is_the_one_in_sigma():
     """All innovations three times what the filter believes: NIS nine times too large."""
     text = verdict(score([run(nis=honest(scale=9.0), noise=0.01)], track(yaws=False)), track(yaws=False))
-    assert re.search(r"innovations (2\.9|3\.0|3\.1) times the size it claims", text)
+    assert re.search(r"innovations (2\.9|3\.0|3\.1) times their sigma", text)
 
 
 def test_a_few_outliers_are_not_mistaken_for_a_filter_that_is_wrong_throughout():
@@ -602,3 +602,10 @@ def test_same_bytes_from_another_process_and_another_user_s_style(tmp_path):
     ).stdout.strip()
     here = hashlib.sha256(page_of("track").encode()).hexdigest()
     assert there == here
+
+
+def test_summary_of_a_large_nees_asks_for_the_noise_of_an_exact_reference() -> None:
+    results = [dataclasses.replace(result, nees_mean=40.0) for result in score([run(noise=0.1)], track())]
+    exact, noisy = track(), with_noise(track(), 0.02, 0.01)
+    assert "pass its noise with --reference-sigma" in verdict(results, exact)
+    assert "--reference-sigma" not in verdict(results, noisy)

@@ -15,15 +15,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from localization.errors import DumpError
+from localization.errors import CheckpointError
 from localization.estimators import CORRECTING, ESTIMATORS
 from localization.events import WheelSample
 from localization.lidar import LidarConfig
 from localization.lidar.scan_matcher import ScanMatcher
 from localization.pipeline import Pipeline, ReplayConfig, Trial
-from localization.ros.checkpoint import Dumper, fingerprints, read_dump, read_head, write_dump
-from localization.ros.deserialize import thaw
-from localization.ros.serialize import freeze
+from localization.ros.checkpoint import CheckpointWriter, fingerprints, read_checkpoint, read_head, write_checkpoint
+from localization.ros.deserialize import deserialize
+from localization.ros.serialize import serialize
 from localization.synchronizer import StepConfig
 from motion_models.registry import make_model
 from motion_models.robot import Mount, load_robot
@@ -40,11 +40,11 @@ def test_cut_anywhere_and_resumed_the_results_are_the_same_to_the_last_bit(kind)
     pipeline, whole, states, made = new_core(*kind), [], {}, []
     for i in range(len(events) + 1):
         if i in cuts:
-            states[i] = freeze(pipeline)
+            states[i] = serialize(pipeline)
         made.append(len(whole))
         whole += map(numbers, pipeline.process(events[i]) if i < len(events) else pipeline.finish())
     for cut, state in states.items():
-        resumed, found = thaw(*state), []
+        resumed, found = deserialize(*state), []
         end = min(cut + AHEAD, len(events))
         for event in events[cut:end]:
             found += map(numbers, resumed.process(event))
@@ -67,7 +67,7 @@ def test_places_that_are_told_late_reach_whoever_was_resumed(estimator):
     cut, met = 1000, 1100
     pipeline = Pipeline(Trial(make_model("skid_steer", ROBOT), estimator), ROBOT, {}, has_lidar=True)
     before = [numbers(e) for event in events[:cut] for e in pipeline.process(event)]
-    resumed = thaw(*freeze(pipeline))
+    resumed = deserialize(*serialize(pipeline))
     found = []
     for goes_on in (pipeline, resumed):
         rest = [numbers(e) for event in events[cut:met] for e in goes_on.process(event)]
@@ -84,9 +84,9 @@ def test_places_that_are_told_late_reach_whoever_was_resumed(estimator):
 _RESUME = """
 import hashlib, sys
 from pathlib import Path
-from localization.ros.checkpoint import read_dump
+from localization.ros.checkpoint import read_checkpoint
 from tests.helpers.online import drive_events, numbers, new_core
-pipeline = read_dump(Path(sys.argv[1]), {}, {}).value
+pipeline = read_checkpoint(Path(sys.argv[1]), {}, {}).value
 events, _ = drive_events()
 found = [numbers(e) for event in events[int(sys.argv[2]):] for e in pipeline.process(event)]
 print(len(found), hashlib.sha256(repr(found).encode()).hexdigest())
@@ -98,7 +98,7 @@ def test_another_process_resumes_it(tmp_path):
     cut, pipeline = 1500, new_core("ekf")
     for event in events[:cut]:
         pipeline.process(event)
-    write_dump(tmp_path / "state", pipeline, {"events": cut}, {}, {})
+    write_checkpoint(tmp_path / "state", pipeline, {"events": cut}, {}, {})
     rest = [numbers(e) for event in events[cut:] for e in pipeline.process(event)]
     said = subprocess.run([sys.executable, "-c", _RESUME, tmp_path / "state", str(cut)], check=True, capture_output=True, text=True).stdout
     assert said.split() == [str(len(rest)), hashlib.sha256(repr(rest).encode()).hexdigest()]
@@ -108,8 +108,8 @@ def test_a_list_of_many_alike_is_written_down_as_columns():
     """One by one, each with names and shapes of its own, they would take seconds and megabytes of text."""
     rng = np.random.default_rng(0)
     samples = [WheelSample(i, rng.normal(size=2), rng.normal(size=2)) for i in range(20_000)]
-    text, blob = freeze(samples)
-    again = thaw(text, blob)
+    text, blob = serialize(samples)
+    again = deserialize(text, blob)
     assert len(text) < 1000
     assert all(a.stamp_ns == b.stamp_ns for a, b in zip(again, samples, strict=True))
     assert all(np.array_equal(a.velocity, b.velocity) for a, b in zip(again, samples, strict=True))
@@ -126,12 +126,12 @@ values = st.recursive(
 @given(values)
 @settings(max_examples=60, deadline=None)
 def test_plain_values_come_back_as_they_were(value):
-    assert repr(thaw(*freeze(value))) == repr(value)
+    assert repr(deserialize(*serialize(value))) == repr(value)
 
 
 def test_what_is_held_twice_stays_one_and_views_stay_views():
     base = np.arange(24.0).reshape(4, 6).copy()
-    a, b, view, turned = thaw(*freeze([base, base, base[1:, ::2], np.asfortranarray(base)]))
+    a, b, view, turned = deserialize(*serialize([base, base, base[1:, ::2], np.asfortranarray(base)]))
     assert a is b
     assert view.base is not None
     view[0, 0] = 99.0
@@ -142,14 +142,14 @@ def test_what_is_held_twice_stays_one_and_views_stay_views():
 
 @pytest.mark.parametrize("strange", [print, object(), {1, 2}, np.array([object()]), sys])
 def test_what_cannot_be_written_down_is_named(strange):
-    with pytest.raises(DumpError, match="holds a"):
-        freeze([strange])
+    with pytest.raises(CheckpointError, match="holds a"):
+        serialize([strange])
 
 
 @pytest.fixture
 def state(tmp_path):
     path = tmp_path / "state"
-    write_dump(path, new_core("ekf"), {"events": 0}, made_by(), {})
+    write_checkpoint(path, new_core("ekf"), {"events": 0}, made_by(), {})
     return path
 
 
@@ -164,12 +164,12 @@ def test_damage_anywhere_is_noticed(state):
         damaged = bytearray(content)
         damaged[at] ^= 0x20
         state.write_bytes(damaged)
-        with pytest.raises(DumpError, match=r"damaged|no state of an estimator|another version"):
-            read_dump(state, made_by(), {})
+        with pytest.raises(CheckpointError, match=r"damaged|no state of an estimator|another version"):
+            read_checkpoint(state, made_by(), {})
     for length in (0, 5, 16, 50, len(content) // 2, len(content) - 1):
         state.write_bytes(content[:length])
-        with pytest.raises(DumpError, match=r"damaged|no state of an estimator"):
-            read_dump(state, made_by(), {})
+        with pytest.raises(CheckpointError, match=r"damaged|no state of an estimator"):
+            read_checkpoint(state, made_by(), {})
 
 
 @pytest.mark.parametrize(
@@ -193,8 +193,8 @@ def test_damage_anywhere_is_noticed(state):
 )
 def test_an_odd_head_is_refused_though_its_check_sum_is_right(state, name, value):
     reseal(state, name, value)
-    for read in (read_head, lambda path: read_dump(path, made_by(), {})):
-        with pytest.raises(DumpError, match="no readable head"):
+    for read in (read_head, lambda path: read_checkpoint(path, made_by(), {})):
+        with pytest.raises(CheckpointError, match="no readable head"):
             read(state)
 
 
@@ -207,13 +207,13 @@ def test_foreign_files_are_refused_and_run_no_code(tmp_path):
 
     for content in (pickle.dumps(Trap()), b"PK\3\4", b"", b"{}", os.urandom(1000)):
         path.write_bytes(content)
-        with pytest.raises(DumpError, match="no state of an estimator"):
-            read_dump(path, {}, {})
+        with pytest.raises(CheckpointError, match="no state of an estimator"):
+            read_checkpoint(path, {}, {})
     assert not trap.exists()
-    with pytest.raises(DumpError, match="No such file"):
-        read_dump(tmp_path / "absent", {}, {})
+    with pytest.raises(CheckpointError, match="No such file"):
+        read_checkpoint(tmp_path / "absent", {}, {})
     path.write_bytes(b"skidloc state 9\nabc\n")
-    with pytest.raises(DumpError, match="another version of its format"):
+    with pytest.raises(CheckpointError, match="another version of its format"):
         read_head(path)
 
 
@@ -222,22 +222,22 @@ def test_foreign_files_are_refused_and_run_no_code(tmp_path):
 )
 def test_only_classes_of_this_project_are_made(kind):
     text = json.dumps({"root": ["o", 0], "objects": [kind], "arrays": []}).encode()
-    with pytest.raises(DumpError, match="does not have"):
-        thaw(text, b"")
+    with pytest.raises(CheckpointError, match="does not have"):
+        deserialize(text, b"")
     packed = ["p", "objects", kind[1], kind[2], ["a"], ["int", 0]]
     text = json.dumps({"root": ["o", 0], "objects": [packed], "arrays": [["<i8", [1], "C", 0]]}).encode()
-    with pytest.raises(DumpError, match="does not have"):
-        thaw(text, bytes(8))
+    with pytest.raises(CheckpointError, match="does not have"):
+        deserialize(text, bytes(8))
 
 
 @given(st.binary(max_size=60), st.binary(max_size=20))
 def test_bytes_that_mean_nothing_are_refused_whatever_they_are(text, blob):
-    with pytest.raises(DumpError):
-        thaw(text, blob)
+    with pytest.raises(CheckpointError):
+        deserialize(text, blob)
 
 
 def test_the_state_of_another_robot_model_or_configuration_is_refused(state):
-    assert isinstance(read_dump(state, made_by(), {}).value, Pipeline)
+    assert isinstance(read_checkpoint(state, made_by(), {}).value, Pipeline)
     heavier = dataclasses.replace(ROBOT, geometry=dataclasses.replace(ROBOT.geometry, mass_kg=120.0))
     for other, told in [
         (made_by(load_robot("husky_a200")), r"another .*robot \('vaultbot' \w+ then, 'husky_a200' \w+ now\)"),
@@ -246,10 +246,10 @@ def test_the_state_of_another_robot_model_or_configuration_is_refused(state):
         (made_by(config=ReplayConfig(step=StepConfig(wait_s=0.2))), "another configuration"),
         ({**made_by(), "version of numpy": "1.0"}, "another version of numpy"),
     ]:
-        with pytest.raises(DumpError, match=told):
-            read_dump(state, other, {})
+        with pytest.raises(CheckpointError, match=told):
+            read_checkpoint(state, other, {})
     moved = dataclasses.replace(ROBOT, folder=state.parent)
-    assert isinstance(read_dump(state, made_by(moved), {}).value, Pipeline)
+    assert isinstance(read_checkpoint(state, made_by(moved), {}).value, Pipeline)
 
 
 def test_the_old_state_stays_until_the_new_one_is_whole(state, monkeypatch):
@@ -259,30 +259,30 @@ def test_the_old_state_stays_until_the_new_one_is_whole(state, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(DumpError, match="No space left"):
-        write_dump(state, [1], {}, {}, {})
+    with pytest.raises(CheckpointError, match="No space left"):
+        write_checkpoint(state, [1], {}, {}, {})
     assert state.read_bytes() == before
     assert [path.name for path in state.parent.iterdir()] == ["state"]
 
 
 def test_dumper_writes_no_more_often_than_it_is_told_and_reports_a_full_disk(tmp_path, monkeypatch):
-    dumper = Dumper(tmp_path / "state", {}, {}, every_s=30.0)
-    assert dumper.is_due()
-    dumper.write([1.5], {"events": 7})
-    assert not dumper.is_due()
-    dumper.wait()
-    assert not dumper.is_due()
-    assert read_dump(tmp_path / "state", {}, {}).value == [1.5]
+    checkpoints = CheckpointWriter(tmp_path / "state", {}, {}, every_s=30.0)
+    assert checkpoints.is_due()
+    checkpoints.write([1.5], {"events": 7})
+    assert not checkpoints.is_due()
+    checkpoints.wait()
+    assert not checkpoints.is_due()
+    assert read_checkpoint(tmp_path / "state", {}, {}).value == [1.5]
     assert read_head(tmp_path / "state")["events"] == 7
 
     def full_disk(number):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full_disk)
-    dumper.write([2.5], {})
-    with pytest.raises(DumpError, match="No space left"):
-        dumper.close()
-    assert read_dump(tmp_path / "state", {}, {}).value == [1.5]
+    checkpoints.write([2.5], {})
+    with pytest.raises(CheckpointError, match="No space left"):
+        checkpoints.close()
+    assert read_checkpoint(tmp_path / "state", {}, {}).value == [1.5]
 
 
 def test_submap_is_written_as_key_scans_and_matches_bit_by_bit():
@@ -295,17 +295,17 @@ def test_submap_is_written_as_key_scans_and_matches_bit_by_bit():
     prior, narrow, wide = np.array([0.02, -0.01, 0.005]), np.diag([1e-3, 1e-3, 1e-4]), np.diag([0.2, 0.2, 0.1])
     matcher.match(room, prior, narrow)  # fills surfaces
     matcher.match(room, prior, wide)  # draws the image
-    text, blob = freeze(matcher)
+    text, blob = serialize(matcher)
     assert len(text) + len(blob) < 16 * 3 * len(room) + 2000
-    again = thaw(text, blob)
+    again = deserialize(text, blob)
     for cov in (narrow, wide):
         one, other = (m.match(room, prior, cov) for m in (matcher, again))
         assert one is not None
         assert all(np.array_equal(vars(one)[name], vars(other)[name]) for name in vars(one))
-    assert thaw(*freeze(ScanMatcher(LidarConfig(), 0.1))).points().shape == (0, 2)
+    assert deserialize(*serialize(ScanMatcher(LidarConfig(), 0.1))).points().shape == (0, 2)
 
 
 def test_pair_is_shared_not_written():
     model = make_model("skid_steer", ROBOT)
     pair = Trial(model, "ekf")
-    assert thaw(*freeze([pair, model], {"model": model}), {"model": model})[1] is model
+    assert deserialize(*serialize([pair, model], {"model": model}), {"model": model})[1] is model

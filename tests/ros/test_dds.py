@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import json
 import os
@@ -17,11 +18,12 @@ import numpy as np
 import pytest
 
 from localization.cli import main
-from localization.errors import DoorError
+from localization.errors import TransportError
 from localization.logs import open_log
 from localization.pipeline import Trial, replay
 from localization.ros.transports.dds_settings import choose_interface, configuration, default_domain
 from localization.trajectory import read_tum
+from motion_models import se2
 from motion_models.registry import make_model
 from tests.helpers.online import ROBOT, drive_log
 
@@ -46,12 +48,24 @@ class Peer:
         assert self.process.stdout.readline() == "up\n"
 
     def play(self, seconds):
+        self.begin(seconds)
+        self.wait()
+
+    def begin(self, seconds):
         self.process.stdin.write(f"{seconds}\n")
         self.process.stdin.flush()
+
+    def wait(self):
         assert self.process.stdout.readline() == "played\n"
 
     def heard(self):
         return json.loads(self.process.communicate(timeout=30)[0])
+
+
+@functools.cache
+def replayed():
+    log = open_log(drive_log(), ROBOT)
+    return replay(log.events(), [Trial(make_model("skid_steer", ROBOT), "ekf")], ROBOT, log.mounts, True)[0]
 
 
 def ended(process, number=signal.SIGINT):
@@ -91,8 +105,7 @@ def test_a_robot_in_another_process_is_followed_killed_and_followed_on(tmp_path)
     assert listening
     assert all("%lo:" in address or address.startswith("127.0.0.1") for address in listening)
 
-    log = open_log(drive_log(), ROBOT)
-    run = replay(log.events(), [Trial(make_model("skid_steer", ROBOT), "ekf")], ROBOT, log.mounts, True)[0].trajectory
+    run = replayed().trajectory
     by_stamp = dict(zip(run.stamps_ns.tolist(), run.poses, strict=True))
     stamps = heard["stamps"]
     assert len(stamps) > 0.8 * heard["sent_scans"]
@@ -123,6 +136,45 @@ def test_a_robot_in_another_process_is_followed_killed_and_followed_on(tmp_path)
     live = read_tum(tmp_path / "live.tum")
     assert (np.diff(live.stamps_ns) > 0).all()
     assert len(live) >= 0.9 * len(stamps)
+
+
+def test_node_that_was_stopped_for_5_s_is_back_within_1_s(tmp_path):
+    """SIGSTOP: 250 messages of wheels and IMU each come for queues of 200, and scans overflow the socket's buffer."""
+    state = tmp_path / "state"
+    peer, node = Peer(), start_node("--state", state, "--node.wait-s", "1")
+    node.stdout.readline()
+    peer.begin(15.0)
+    time.sleep(7.0)
+    node.send_signal(signal.SIGSTOP)
+    time.sleep(5.0)
+    node.send_signal(signal.SIGCONT)
+    resumed_s = time.monotonic()
+    peer.wait()
+    text = ended(node)
+    assert node.returncode == 0, text
+    assert "jump of the clock" not in text
+    again = start_node("--state", state, "--node.wait-s", "1")
+    again.stdout.readline()
+    peer.play(99.0)
+    text = ended(again)
+    assert "resumed from" in text
+    assert again.returncode == 0, text
+    heard = peer.heard()
+    stamps, arrivals = np.array(heard["stamps"]), np.array(heard["arrivals_s"])
+    sent = dict(heard["scans"])
+    after = [i for i in range(len(stamps)) if arrivals[i] > resumed_s]
+    current = next(i for i in after if arrivals[i] - sent[max(stamp for stamp in sent if stamp <= stamps[i])] < 0.2)
+    assert arrivals[after[0]] - resumed_s < 1.0
+    assert arrivals[current] - resumed_s < 2.5  # half the pause: 0.7 s on an idle machine
+    run = replayed().trajectory
+    by_stamp = dict(zip(run.stamps_ns.tolist(), run.poses, strict=True))
+    before = next(i for i in reversed(range(len(stamps))) if arrivals[i] < resumed_s - 5.0 and stamps[i] in by_stamp)
+    poses = np.array([[x, y, 2.0 * np.arcsin(z)] for x, y, z in heard["poses"]])
+    sigmas = np.sqrt(heard["pose_variances"])
+    for i in (next(i for i in after if i >= current and stamps[i] in by_stamp), max(i for i in after if stamps[i] in by_stamp)):
+        moved, expected = (se2.between(a, b) for a, b in ((poses[before], poses[i]), (by_stamp[stamps[before]], by_stamp[stamps[i]])))
+        print(np.abs(se2.between(expected, moved)), sigmas[i], arrivals[current] - resumed_s)
+        assert (np.abs(se2.between(expected, moved)) < 5.0 * sigmas[i]).all()
 
 
 def test_nobody_there_is_told_and_interrupted_without_a_word_too_many(tmp_path):
@@ -174,7 +226,7 @@ def test_another_type_is_refused_by_what_the_robot_says_of_itself(capsys):
 def test_topics_that_are_not_kept_are_heard_no_more():
     """And what is heard comes in the order in which it was sent."""
     with chatter("abc") as here:
-        here.keep(["/c", "/a"])
+        here.restrict(["/c", "/a"])
         here.take(0.1)
         time.sleep(0.5)
         found = here.take(1.0)
@@ -188,7 +240,7 @@ def test_topics_that_are_not_kept_are_heard_no_more():
 def test_messages_that_waited_came_when_they_were_sent():
     """Two seconds without a look, of which the last one is kept."""
     with chatter("a") as here:
-        here.keep(["/a"])
+        here.restrict(["/a"])
         here.take(1.0)
         looked = time.monotonic_ns()
         time.sleep(2.0)
@@ -201,13 +253,13 @@ def test_messages_that_waited_came_when_they_were_sent():
 
 
 def test_times_of_receiving_lie_between_two_looks():
-    times_of_receiving = importlib.import_module("localization.ros.transports.dds").times_of_receiving
-    assert times_of_receiving([], 0, 100) == []
-    assert times_of_receiving([7], 0, 100) == [100]
-    assert times_of_receiving([10, 30, 50], 0, 100) == [60, 80, 100]
-    assert times_of_receiving([50, 10, 30], 60, 120) == [120, 80, 100]  # whatever their order
-    assert times_of_receiving([1000, 3000, 5000], 60, 120) == [80, 100, 120]  # the sender's clock is another one
-    assert times_of_receiving([5, 5, 5], 60, 120) == [120, 120, 120]  # sent in a burst
+    receive_times = importlib.import_module("localization.ros.transports.dds").receive_times
+    assert receive_times([], 0, 100) == []
+    assert receive_times([7], 0, 100) == [100]
+    assert receive_times([10, 30, 50], 0, 100) == [60, 80, 100]
+    assert receive_times([50, 10, 30], 60, 120) == [120, 80, 100]  # whatever their order
+    assert receive_times([1000, 3000, 5000], 60, 120) == [80, 100, 120]  # the sender's clock is another one
+    assert receive_times([5, 5, 5], 60, 120) == [120, 120, 120]  # sent in a burst
 
 
 def test_what_had_to_wait_for_us_came_when_it_was_sent():
@@ -215,22 +267,26 @@ def test_what_had_to_wait_for_us_came_when_it_was_sent():
     clock, ms = importlib.import_module("localization.ros.transports.dds").SenderClock(), S // 1000
     ours = [100 * S + i * 20 * ms for i in range(50)]
     for i, now in enumerate(ours):
-        came = clock.came_ns(now - 5 * S - (1 + i % 3) * ms, now - 15 * ms, now)
+        came = clock.receive_time_ns(now - 5 * S - (1 + i % 3) * ms, now - 15 * ms, now)
         assert now - 3 * ms <= came <= now
     begin = ours[-1]
-    assert clock.came_ns(begin - S, begin, begin + 12 * S) == pytest.approx(begin + 4 * S, abs=3 * ms)
+    assert clock.receive_time_ns(begin - S, begin, begin + 12 * S) == pytest.approx(begin + 4 * S, abs=3 * ms)
     # 40 ms on the way, and looked for all the time
-    assert clock.came_ns(begin + 7 * S, begin + 12.03 * S, begin + 12.04 * S) == begin + 12.04 * S
+    assert clock.receive_time_ns(begin + 7 * S, begin + 12.03 * S, begin + 12.04 * S) == begin + 12.04 * S
     # it is set: forward, and back
     for shift in (3600 * S, -3600 * S):
         now = begin + 20 * S
-        assert [clock.came_ns(now - 5 * S + shift + i * S, now + i * S - 20 * ms, now + i * S) - now for i in range(3)] == [0, S, 2 * S]
+        assert [clock.receive_time_ns(now - 5 * S + shift + at, now + at - 20 * ms, now + at) - now for at in (0, S, 2 * S)] == [
+            0,
+            S,
+            2 * S,
+        ]
 
 
 def test_patience_ends_where_something_urgent_comes():
     """Twenty messages of /a to one of /b; without patience each is heard when it comes."""
     with chatter("a" * 20 + "b") as here:
-        here.keep(["/a", "/b"], ["/b"])
+        here.restrict(["/a", "/b"], ["/b"])
         here.take(1.0, 20.0)
         found = here.take(1.0, 20.0)
         assert len(found) < 100  # it did not wait for 20 s, after which the last 200 would be there
@@ -268,7 +324,7 @@ def test_choose_interface_follows_the_option_then_ros_variables(interface, envir
     ],
 )
 def test_choose_interface_refuses_what_does_not_exist(interface, environment, error):
-    with pytest.raises(DoorError, match=re.escape(error)):
+    with pytest.raises(TransportError, match=re.escape(error)):
         choose_interface(interface, environment)
 
 

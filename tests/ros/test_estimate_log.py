@@ -17,7 +17,7 @@ from localization.errors import OutputError
 from localization.estimators import Estimate
 from localization.logs.fused_log import write_fused
 from localization.ros.checkpoint import read_head
-from localization.ros.estimate_log import Spool
+from localization.ros.estimate_log import EstimateLog
 from localization.ros.session_files import Files
 from tests.helpers.disks import files_of_at_most, fill_disk
 from tests.helpers.online import drive_log, reseal
@@ -128,11 +128,11 @@ def test_a_service_that_is_stopped_leaves_its_last_state(replayed, tmp_path, cap
 
 
 def test_a_run_that_is_stopped_without_a_state_writes_what_it_has(replayed, tmp_path):
-    out, spool = tmp_path / "a.tum", tmp_path / ".a.tum.part"
+    out, estimate_log = tmp_path / "a.tum", tmp_path / ".a.tum.part"
     options = ("--robot", "vaultbot", "--rate", "4", "--out", out)
     process = subprocess.Popen([*COMMAND, drive_log(), *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     end = time.monotonic() + 60.0
-    while time.monotonic() < end and not (spool.exists() and spool.stat().st_size > 20_000):
+    while time.monotonic() < end and not (estimate_log.exists() and estimate_log.stat().st_size > 20_000):
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
     said, _ = process.communicate()
@@ -225,21 +225,21 @@ def test_states_that_do_not_fit_are_refused(killed, tmp_path, capsys):
 
 
 def test_estimates_on_a_full_disk_are_whole_and_go_on_when_there_is_room(tmp_path):
-    spool = Spool.create(tmp_path / "part")
+    estimate_log = EstimateLog.create(tmp_path / "part")
     estimates = [Estimate(stamp, np.array([stamp, 0.0, 0.0]), None, np.zeros(3), None) for stamp in range(1, 6)]
     with files_of_at_most(500):  # two rows and a part
         for estimate in estimates[:2]:
-            spool.add(estimate)
+            estimate_log.add(estimate)
         for estimate in estimates[2:4]:
             with pytest.raises(OutputError, match=r"cannot be written to '.*part': File too large"):
-                spool.add(estimate)
-        assert spool.rows()[0].tolist() == [1, 2]
-    spool.add(estimates[4])
-    assert spool.rows()[0].tolist() == [1, 2, 5]
-    assert spool.rows()[1][:, 0].tolist() == [1.0, 2.0, 5.0]
-    assert spool.missing == 2
-    spool.close()
-    again = Spool.resume(tmp_path / "part", 2)
+                estimate_log.add(estimate)
+        assert estimate_log.rows()[0].tolist() == [1, 2]
+    estimate_log.add(estimates[4])
+    assert estimate_log.rows()[0].tolist() == [1, 2, 5]
+    assert estimate_log.rows()[1][:, 0].tolist() == [1.0, 2.0, 5.0]
+    assert estimate_log.missing == 2
+    estimate_log.close()
+    again = EstimateLog.resume(tmp_path / "part", 2)
     assert again.rows()[0].tolist() == [1, 2]
     again.remove()
 
@@ -272,13 +272,13 @@ def test_what_a_killed_run_has_left_keeps_no_other_from_starting(tmp_path):
     path, victim = tmp_path / ".a.tum.part", tmp_path / "victim"
     victim.write_text("precious")
     path.write_bytes(b"estimates")
-    spool = Spool.create(path)
-    spool.add(Estimate(1, np.zeros(3), None, np.zeros(3), None))
-    spool.close()
+    estimate_log = EstimateLog.create(path)
+    estimate_log.add(Estimate(1, np.zeros(3), None, np.zeros(3), None))
+    estimate_log.close()
     assert (tmp_path / ".a.tum.part.old").read_bytes() == b"estimates"
     path.unlink()
     path.symlink_to(victim)
-    Spool.create(path).remove()
+    EstimateLog.create(path).remove()
     files = Files(out=tmp_path / "a.tum")
     (tmp_path / ".a.tum.new").symlink_to(victim)
     with files.beside() as beside:

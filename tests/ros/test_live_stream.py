@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import os
 import sys
 import time
 import types
@@ -13,21 +14,24 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from localization.errors import DoorError, DumpError, SettingError, TopicError
+from localization.errors import CheckpointError, SettingError, TopicError, TransportError
 from localization.estimators import Estimate
 from localization.events import Scan, WheelSample
 from localization.logs import TopicOverrides, open_log
 from localization.logs.fused_log import FusedEstimate, transform_message
 from localization.logs.serialization import encode
 from localization.pipeline import Trial, replay
-from localization.ros.checkpoint import Dumper, read_head
+from localization.ros.checkpoint import CheckpointWriter, read_head
 from localization.ros.diagnostics import ERROR, OK, WARN, degeneracy
-from localization.ros.node import Node, NodeConfig
-from localization.ros.playback_clock import Pace
-from localization.ros.publisher import CORRECTIONS, DIAGNOSTICS, ODOMETRY, TF, Frames, Teller
+from localization.ros.estimate_log import old_estimate_log
+from localization.ros.node import Node
+from localization.ros.publisher import CORRECTIONS, DIAGNOSTICS, ODOMETRY, EstimatePublisher
+from localization.ros.run_control import PlaybackClock
 from localization.ros.session_files import Files
+from localization.ros.settings import Frames, LiveRun, NodeConfig
 from localization.ros.topic_names import Names
-from localization.ros.transports.base import Received
+from localization.ros.transforms import TF
+from localization.ros.transports.base import Received, ServiceReply
 from localization.trajectory import read_tum
 from motion_models import se2
 from motion_models.registry import make_model
@@ -112,7 +116,8 @@ def test_subscriptions_are_of_sensor_data_but_for_static_transforms(calm):
     subscribed = calm[0].subscribed
     assert [topic for topic, is_latched in subscribed.items() if is_latched] == ["/tf_static"]
     assert {"/joint_states", "/scan", "/points", "/imu/data", "/center_of_gravity"} <= set(subscribed)
-    assert calm[0].kept == {"/joint_states", "/scan", "/imu/data", "/tf_static", "/tf"}  # what is not used costs nothing from the start on
+    commands = {"/set_pose", "/initialpose"}
+    assert calm[0].kept == {"/joint_states", "/scan", "/imu/data", "/tf_static", "/tf", *commands}  # unused topics cost nothing
 
 
 @pytest.mark.parametrize(("estimator", "seed"), [("ekf", 0), ("ekf", 1), ("graph", 2)])
@@ -217,7 +222,7 @@ def test_a_sensor_vanishes_and_returns(topic, calm):
 def test_messages_wait_for_the_next_scan(calm):
     """They are looked at once before it is due; at once when it is late, or if there is no LiDAR."""
     stream = calm[1]._stream
-    scans = stream._watches["/scan"]
+    scans = stream._rates["/scan"]
     period, last = scans._period_s, scans._last_ns
     assert period == pytest.approx(0.08, rel=0.1)
 
@@ -228,25 +233,25 @@ def test_messages_wait_for_the_next_scan(calm):
     alone = LogTransport(drive_log(), silenced("/scan", 0.0, 99.0))
     alone.types.pop("/scan")
     node, _ = run_node(alone)
-    assert node._stream.patience_s(node._stream._watches["/joint_states"]._last_ns) == 0.0
+    assert node._stream.patience_s(node._stream._rates["/joint_states"]._last_ns) == 0.0
 
 
 def test_nobody_is_patient_while_a_scan_waits_for_the_wheels():
     """A scan that is ahead of the wheels is used with the very next message that they send."""
     node, _ = run_node(LogTransport(drive_log()))
     scan, newest_ns = node.session.health._scan, node._newest_ns
-    node._stream._watches["/scan"]._last_ns = time.monotonic_ns()
+    node._stream._rates["/scan"]._last_ns = time.monotonic_ns()
     assert node._patience_s() > 0.0
-    assert node.session.push(dataclasses.replace(scan, stamp_ns=newest_ns + S)) == []
+    assert node.session.process(dataclasses.replace(scan, stamp_ns=newest_ns + S)) == []
     assert node._patience_s() == 0.0
-    assert node.session.push(WheelSample(newest_ns + S + S // 10, np.zeros(2), np.full(2, np.nan)))
-    node._stream._watches["/scan"]._last_ns = time.monotonic_ns()
+    assert node.session.process(WheelSample(newest_ns + S + S // 10, np.zeros(2), np.full(2, np.nan)))
+    node._stream._rates["/scan"]._last_ns = time.monotonic_ns()
     assert node._patience_s() > 0.0
 
 
 def test_diagnostics_say_which_topic_is_silent(calm):
     _, node, _ = calm
-    watches = node._stream._watches
+    watches = node._stream._rates
     assert node._stream.silent(max(w._last_ns for w in watches.values())) == {}
     later = node._stream.silent(max(w._last_ns for w in watches.values()) + 3 * S)
     assert set(later) == {"/joint_states", "/scan", "/imu/data"}
@@ -273,9 +278,9 @@ def test_degeneracy_tells_corridors_from_rooms(calm):
     last = health._scan
     assert health.statuses(node.session.pipeline)[1].level == OK
     corridor = scan(1.5 / np.abs(np.sin(angle)))
-    health.saw(dataclasses.replace(last, points=np.column_stack([corridor, np.zeros(len(corridor))]), offsets=np.empty(0)))
+    health.observe_event(dataclasses.replace(last, points=np.column_stack([corridor, np.zeros(len(corridor))]), offsets=np.empty(0)))
     assert health.statuses(node.session.pipeline)[1].level == WARN
-    health.saw(last)
+    health.observe_event(last)
 
 
 def late_transforms(messages):
@@ -306,7 +311,7 @@ def test_transforms_that_come_late_are_used_from_then_on(estimator, tmp_path):
     node, told = run_node(late, estimator, Files(state=tmp_path / "state"))
     assert len(told) == 2
     assert "frame 'laser'" in told[0]
-    assert "tells now where the LiDAR sits" in told[1]
+    assert "now has the mount of the LiDAR" in told[1]
     assert node.session.pipeline.mounts["laser"].x != 0.0
     (note,) = node.warnings()
     assert "/tf_static was late" in note
@@ -358,7 +363,9 @@ def test_topics_of_other_names_are_offered():
 
 def test_a_topic_of_another_type_is_refused():
     transport = LogTransport(drive_log(), silenced("/scan", 0.0, 99.0), types={"/scan": "sensor_msgs/msg/PointCloud2"})
-    with pytest.raises(DoorError, match=r"'/scan' carries sensor_msgs/PointCloud2, not sensor_msgs/LaserScan. Pass --topic.points /scan"):
+    with pytest.raises(
+        TransportError, match=r"'/scan' carries sensor_msgs/PointCloud2, not sensor_msgs/LaserScan. Pass --topic.points /scan"
+    ):
         run_node(transport)
 
 
@@ -366,7 +373,7 @@ def test_joint_states_without_the_wheels_are_refused():
     robot = dataclasses.replace(ROBOT, joints=dataclasses.replace(ROBOT.joints, left=("no_wheel",)))
     pair = Trial(make_model("skid_steer", ROBOT), "ekf")
     with pytest.raises(TopicError, match="no joint states of the live topics have the wheel joints"):
-        Node.start(LogTransport(drive_log()), robot, lambda has_lidar: pair, Files(), print, node=NodeConfig(wait_s=0.0))
+        Node.start(LogTransport(drive_log()), LiveRun(robot, lambda has_lidar: pair, node=NodeConfig(wait_s=0.0)), print)
 
 
 def test_bytes_that_are_no_message_are_dropped_and_counted():
@@ -389,8 +396,8 @@ def test_a_node_that_is_killed_goes_on_where_it_was(tmp_path, calm):
 
     first = LogTransport(drive_log(), part(0.0, 10.0))
     node, _ = run_node(first, files=files)
-    node.session.dump(node._head, now=True)
-    node.session._dumper.wait()  # kill -9 from here: no finish, no close
+    node.session.save_state(node._head, now=True)
+    node.session._checkpoints.wait()  # kill -9 from here: no finish, no close
     second = LogTransport(drive_log(), part(10.5, 17.0))
     node, told = run_node(second, files=files)
     assert node.finish() == len(read_tum(tmp_path / "run.tum"))
@@ -409,9 +416,34 @@ def test_a_node_that_is_killed_goes_on_where_it_was(tmp_path, calm):
     assert 20 < node.finish() < 0.4 * len(a)
 
 
+@pytest.mark.parametrize("left", ["nothing", "half", "hidden files"])
+def test_files_that_a_killed_run_left_do_not_stop_a_new_one(tmp_path, left):
+    """State and estimates that do not fit each other, as after a power cut, and hidden files of any kind."""
+    files = Files(tmp_path / "run.tum", tmp_path / "state")
+    node, _ = run_node(LogTransport(drive_log(), lambda messages: messages[:1200]), files=files)
+    node.session.save_state(node._head, now=True)
+    log = files.estimate_log
+    if left == "nothing":
+        log.unlink()
+    elif left == "half":
+        os.truncate(log, log.stat().st_size // 2)
+    else:
+        for name in (".state.new", ".state.lock", ".run.tum.lock", old_estimate_log(log).name):
+            (tmp_path / name).write_bytes(b"half a file")
+        (tmp_path / ".run.tum.new").mkdir()
+        (tmp_path / ".run.tum.new" / "run.tum").touch()
+    with files.claimed():
+        rest = LogTransport(drive_log(), lambda messages: [messages[0], *messages[1250:]])
+        node, reports = run_node(rest, files=files)
+        assert any("resumed from" in text for text in reports)
+        assert any("its output begins here" in text for text in reports) == (left != "hidden files")
+        assert node.finish() == len(read_tum(tmp_path / "run.tum")) > 100
+    assert (tmp_path / "state").is_file()
+
+
 def test_a_full_disk_does_not_stop_the_robot_from_knowing_where_it_is(tmp_path, monkeypatch, calm):
     files = Files(tmp_path / "run.tum", tmp_path / "state")
-    monkeypatch.setattr(Dumper, "is_due", lambda self: True)
+    monkeypatch.setattr(CheckpointWriter, "is_due", lambda self: True)
     full = LogTransport(drive_log())
     with monkeypatch.context() as disk:
         fill_disk(disk, after=10, name="fsync")  # two for each state
@@ -421,10 +453,10 @@ def test_a_full_disk_does_not_stop_the_robot_from_knowing_where_it_is(tmp_path, 
     assert len(track(full)) == len(track(calm[0]))
     assert [said for said in told if "No space left" in said] == [
         f"the state cannot be written to '{files.state}': No space left on device. The state of before stays; it is tried again.",
-        f"an estimate cannot be written to '{files.spool}': No space left on device. "
+        f"an estimate cannot be written to '{files.estimate_log}': No space left on device. "
         "The output lacks what is estimated meanwhile; it is tried again.",
     ]
-    node._tell()
+    node._publish_status()
     files_status = next(s for s in published(full, DIAGNOSTICS)[-1].status if s.name == "skidloc: files")
     assert files_status.level == WARN
     assert files_status.message.count("No space left on device") == 2
@@ -443,7 +475,7 @@ def test_a_state_of_another_time_is_refused(tmp_path):
         later = LogTransport(
             drive_log(), lambda messages, by=shift_s: [messages[0]] + [restamped(m, int((by + 30.0) * S)) for m in messages[1000:]]
         )
-        with pytest.raises(DumpError, match=said):
+        with pytest.raises(CheckpointError, match=said):
             run_node(later, files=Files(tmp_path / "run.tum", files.state))
         assert [path.name for path in tmp_path.iterdir()] == ["state"]  # once it is removed, nothing is in the way
         (tmp_path / "state").unlink()
@@ -467,14 +499,14 @@ def test_node_reports_another_publisher_of_its_transform():
     sentences = [said for said in told if "another node publishes 'odom' -> 'base_link' on /tf" in said]
     assert len(sentences) == 1
     assert "--node.no-tf" in sentences[0]
-    node._tell()
+    node._publish_status()
     status = next(s for s in published(transport, DIAGNOSTICS)[-1].status if s.name == "skidloc: transforms")
     assert status.level == ERROR
     assert "enable_odom_tf" in status.message
 
 
 def test_node_accepts_other_transforms_and_without_tf_any():
-    for parent, child, config in (("map", "odom", None), ("odom", "base_link", NodeConfig(wait_s=0.0, tf=False))):
+    for parent, child, config in (("map", "odom", None), ("odom", "base_link", NodeConfig(wait_s=0.0, predict=False, tf=False))):
         transport = LogTransport(drive_log(), with_transform(parent, child), {"/tf": "tf2_msgs/msg/TFMessage"})
         _, told = run_node(transport, config=config)
         assert not [said for said in told if "another node" in said]
@@ -484,12 +516,12 @@ def test_node_accepts_other_transforms_and_without_tf_any():
 def test_estimate_of_a_graph_is_published_as_odometry_and_correction(frames):
     """Odometry and its transform are those that never jump; what the graph corrects is a transform of its own (REP-105)."""
     transport = LogTransport(drive_log())
-    teller = Teller(transport, Names(), frames, with_tf=True)
+    publisher = EstimatePublisher(transport, Names(), frames, with_tf=True)
     in_odom, map_T_odom = np.array([1.0, 2.0, 0.3]), np.array([0.5, -0.25, -0.1])
     cov, cov_in_map = 0.01 * np.eye(3), 0.04 * np.eye(3)
     pose = se2.compose(map_T_odom, in_odom)
-    teller.estimate(Estimate(5 * S, in_odom, None, np.zeros(3), None), 5 * S)
-    teller.estimate(Estimate(6 * S, pose, cov_in_map, np.zeros(3), None, None, (in_odom, cov), map_T_odom), 6 * S)
+    publisher.publish_estimate(Estimate(5 * S, in_odom, None, np.zeros(3), None), 5 * S)
+    publisher.publish_estimate(Estimate(6 * S, pose, cov_in_map, np.zeros(3), None, None, (in_odom, cov), map_T_odom), 6 * S)
     odometry, tf = published(transport, ODOMETRY)[-1], [m.transforms[0] for m in published(transport, TF)]
     assert odometry.header.frame_id == frames.odom_frame
     assert (odometry.pose.pose.position.x, odometry.pose.pose.position.y) == (1.0, 2.0)
@@ -520,11 +552,12 @@ def planar(stamped):
 def test_names_and_frames_are_used_for_all_that_is_published():
     """In a namespace, with a remapped scan: other topics and frames, the same estimates."""
     names = Names("rover", "/team", ("scan:=/front/scan", "~/odometry:=odom"))
-    config = NodeConfig(wait_s=0.0, names=names, frames=Frames("team_map", "team_odom", "team_base"))
+    config = NodeConfig(wait_s=0.0, predict=False, names=names, frames=Frames("team_map", "team_odom", "team_base"))
     transport = LogTransport(drive_log(), lambda messages: [m._replace(topic=renamed(m.topic)) for m in messages])
     transport.types = {renamed(topic): kind for topic, kind in transport.types.items()}
     node, told = run_node(transport, config=config)
-    assert set(transport.published) == {"/team/odom", "/team/rover/corrections", "/tf", "/diagnostics"}
+    own = {f"/team/rover/{name}" for name in ("corrections", "path", "map")}
+    assert set(transport.published) == {"/team/odom", "/tf", "/diagnostics", *own}
     assert set(node.topics) == {"/team/joint_states", "/front/scan", "/team/imu/data"}
     store = get_typestore(Stores.ROS2_HUMBLE)
     odometry = store.deserialize_cdr(transport.published["/team/odom"][-1], "nav_msgs/msg/Odometry")
@@ -567,16 +600,16 @@ def test_pace_keeps_the_logs_time_and_skips_its_pauses():
         slept.append(seconds)
         now[0] += seconds
 
-    pace = Pace(2.0, lambda: now[0], sleep)
+    clock = PlaybackClock(2.0, lambda: now[0], sleep)
     for stamp in (0, S, S, 3 * S, 1003 * S):
-        pace.wait(stamp)
+        clock.wait(stamp)
     assert now[0] == pytest.approx(100.0 + 0.5 + 1.0 + 2.5)
     now[0] += 1.0  # whoever is late catches up
-    pace.wait(1004 * S)
-    pace.wait(1006 * S)
+    clock.wait(1004 * S)
+    clock.wait(1006 * S)
     assert now[0] == pytest.approx(104.0 + 0.5 + 1.0)
     slept.clear()
-    Pace(math.inf, sleep=sleep).wait(0)
+    PlaybackClock(math.inf, sleep=sleep).wait(0)
     assert slept == []
 
 
@@ -592,7 +625,7 @@ class _FakeRclpy(types.ModuleType):
 
     def __init__(self):
         super().__init__("rclpy")
-        self.subscriptions, self.sent, self.waiting = {}, [], []
+        self.subscriptions, self.services, self.sent, self.waiting = {}, {}, [], []
 
     def init(self, args=None, signal_handler_options=None):
         self.handlers = signal_handler_options
@@ -612,6 +645,11 @@ class _FakeRclpy(types.ModuleType):
         return [("/scan", ["sensor_msgs/msg/LaserScan"]), ("/points", ["sensor_msgs/msg/PointCloud2"])]
 
     def destroy_publisher(self, publisher): ...
+
+    def create_service(self, kind, name, callback):
+        self.services[name] = callback
+
+    def destroy_service(self, service): ...
 
     def destroy_node(self): ...
 
@@ -663,6 +701,9 @@ def test_rclpy_door_by_its_documented_interface(monkeypatch):
         for kind in kinds:
             setattr(messages, kind, type(kind, (), {}))
         monkeypatch.setitem(sys.modules, f"{package}.msg", messages)
+    services = types.ModuleType("std_srvs.srv")
+    services.SetBool = type("SetBool", (), {})
+    monkeypatch.setitem(sys.modules, "std_srvs.srv", services)
     from localization.ros.transports.rclpy import RclpyTransport
 
     transport = RclpyTransport()
@@ -677,7 +718,10 @@ def test_rclpy_door_by_its_documented_interface(monkeypatch):
     transport.publish("/skidloc/odometry", b"three")
     assert fake.sent == [("/skidloc/odometry", b"three")]
     assert transport.publishers() == {"/scan": {"sensor_msgs/msg/LaserScan"}}  # /points has no publisher
-    transport.keep(["/scan"])
+    assert transport.offer_service("/skidloc/pause", "std_srvs/srv/SetBool", lambda data: ServiceReply(data, "paused"))
+    response = fake.services["/skidloc/pause"](types.SimpleNamespace(data=True), types.SimpleNamespace(success=False, message=""))
+    assert (response.success, response.message) == (True, "paused")
+    transport.restrict(["/scan"])
     assert set(fake.subscriptions) == {"/scan"}
     assert fake.handlers == "none"  # Ctrl-C is the command's
     transport.close()

@@ -18,7 +18,7 @@ from localization.ros.parameters import PARAMS_FILE, defaults, make_settings, pa
 from localization.ros.topic_names import Names
 
 ROOT = Path(__file__).parents[2]
-LAUNCH = sorted((ROOT / "localization" / "online" / "launch").glob("*.launch.py"))
+LAUNCH = sorted((ROOT / "localization" / "ros" / "launch").glob("*.launch.py"))
 
 
 def test_params_file_is_what_the_settings_make():
@@ -121,7 +121,7 @@ def test_launch_file_declares_what_it_uses_and_names_what_exists(path, launch_ap
     known = {parameter.name for parameter in parameters()}
     for node in of["Node"]:
         if node.named["package"] == "skidloc":
-            assert (ROOT / "localization" / "online" / "share" / node.named["executable"]).exists()
+            assert (ROOT / "localization" / "ros" / "share" / node.named["executable"]).exists()
             assert set(node.named["parameters"][1]) <= known
     installed = {Path(name).name for names in data_files().values() for pattern in names for name in map(str, ROOT.glob(pattern))}
     for joined in of["PathJoinSubstitution"]:

@@ -21,7 +21,7 @@ _FOLDER = ROOT / ".ros2"
 _COMMON = "ament-cmake ament-cmake-gmock ament-cmake-gtest ament-cmake-include-directories ament-cmake-pytest ament-package \
 fastrtps-cmake-module python-cmake-module rosidl-core-generators rosidl-default-generators"
 _MESSAGES = ("nav-msgs", "sensor-msgs", "geometry-msgs", "diagnostic-msgs", "std-srvs")
-_EXTRA = ["catkin-pkg==1.1.1", "colcon-pipeline==0.21.3", "colcon-ros==0.5.0", "setuptools==79.0.1"]
+_EXTRA = ["catkin-pkg==1.1.1", "colcon-core==0.21.3", "colcon-ros==0.5.0", "setuptools==79.0.1"]
 
 
 def _pins(prefix: str, rclpy: str, rmw: str, messages: str, tools: str) -> list[str]:
@@ -30,7 +30,7 @@ def _pins(prefix: str, rclpy: str, rmw: str, messages: str, tools: str) -> list[
 
 
 PINS = {
-    "kilted": _pins("ros-", "9.1.2", "9.3.3", "5.5.1", _COMMON + " ament-cmake-ros-pipeline rmw-test-fixture"),
+    "kilted": _pins("ros-", "9.1.2", "9.3.3", "5.5.1", _COMMON + " ament-cmake-ros-core rmw-test-fixture"),
     "jazzy": _pins("ros-jazzy-", "7.1.6", "8.4.3", "5.3.6", _COMMON + " ament-cmake-ros"),
 }
 

@@ -11,6 +11,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
 from rclpy.parameter import Parameter
+from std_srvs.srv import Empty, SetBool, Trigger
 
 WAIT_S = 60.0
 
@@ -45,6 +46,15 @@ class Manager:
     def describe(self, name):
         (descriptor,) = self.call(DescribeParameters, "describe_parameters", names=[name]).descriptors
         return [descriptor.description, descriptor.additional_constraints]
+
+    def reset(self, _):
+        return self.call(Empty, "reset") is not None
+
+    def pause(self, is_paused):
+        return self.call(SetBool, "pause", data=is_paused).success
+
+    def tare_payload(self, _):
+        return self.call(Trigger, "tare_payload").success
 
     def set(self, argument):
         name, value = argument

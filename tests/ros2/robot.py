@@ -1,13 +1,15 @@
 """A robot on rclpy, in a process of its own: plays recorded messages in real time and records what is published of it.
 
 python robot.py MESSAGES, where MESSAGES is a pickle of (log time [ns], topic, type, bytes). Commands come on the standard input, one
-a line, and each is answered by one line: `play SECONDS`, `spin SECONDS`, `report` (JSON), `cloud BYTES COUNT` (PointCloud2 at 10 Hz).
+a line, and each is answered by one line: `play SECONDS`, `spin SECONDS`, `report` (JSON), `cloud BYTES COUNT` (PointCloud2 at 10 Hz),
+`drive SECONDS` (the same messages over and over, stamped by the clock on the wall), `clear` (what was received so far).
 It imports nothing of this project.
 """
 
 import importlib
 import json
 import pickle
+import struct
 import sys
 import time
 from array import array
@@ -15,12 +17,14 @@ from collections import deque
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import PointCloud2, PointField
 from tf2_msgs.msg import TFMessage
 
+PERIOD_NS = 80_000_000  # of the scans
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 QUALITY = {"/scan": qos_profile_sensor_data, "/imu/data": qos_profile_sensor_data, "/tf_static": LATCHED}
 
@@ -35,17 +39,21 @@ class Robot:
         self.node = rclpy.create_node("robot")
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
-        self.odometry, self.counts, self.statuses, self.tf = [], {}, {}, []
-        self.sent, self.latencies, self.first_s = {}, [], None
+        self.odometry, self.predicted, self.statuses, self.tf = [], [], {}, []
+        self.sent, self.latencies, self.first_s = {}, {}, None
         self.begin = time.monotonic()
         for topic, kind in (("/skidloc/odometry", Odometry), ("/tf", TFMessage), ("/diagnostics", DiagnosticArray)):
             self.node.create_subscription(kind, topic, getattr(self, f"on_{kind.__name__}"), 50)
+        self.node.create_subscription(Odometry, "/skidloc/odometry_predicted", lambda m: self.predicted.append(stamp(m)), 50)
+        self.initial_pose = self.node.create_publisher(PoseWithCovarianceStamped, "/set_pose", 1)
         kinds = {topic: kind for _, topic, kind, _ in messages}
         self.publishers = {topic: self.publisher(topic, kind) for topic, kind in kinds.items()}
         for _, topic, _, data in messages:
             if topic == "/tf_static":
                 self.publishers[topic].publish(data)
-        self.left = deque(message for message in messages if message[1] != "/tf_static")
+        self.drive_messages = [message for message in messages if message[1] != "/tf_static"]
+        self.left = deque(self.drive_messages)
+        self.create_echo_subscription()
 
     def publisher(self, topic, kind):
         package, _, name = kind.split("/")
@@ -55,9 +63,14 @@ class Robot:
     def on_Odometry(self, message):
         now = time.monotonic()
         self.first_s = now - self.begin if self.first_s is None else self.first_s
-        if stamp(message) in self.sent:
-            self.latencies.append(now - self.sent[stamp(message)])
+        if (sent := self.scan_of(stamp(message))) is not None:
+            self.latencies[sent] = now - self.sent[sent]
         self.odometry.append(message)
+
+    def scan_of(self, estimate_ns):
+        """Stamp of the scan whose sweep was halfway at ``estimate_ns``: of the last that began before."""
+        before = [sent for sent in list(self.sent)[-200:] if 0 <= estimate_ns - sent < PERIOD_NS]
+        return before[-1] if before else None
 
     def on_TFMessage(self, message):
         self.tf += [(t.header.frame_id, t.child_frame_id) for t in message.transforms]
@@ -65,10 +78,50 @@ class Robot:
     def on_DiagnosticArray(self, message):
         self.statuses |= {s.name: {"level": s.level[0], "message": s.message} for s in message.status}
 
+    def set_pose(self, x, y):
+        message = PoseWithCovarianceStamped()
+        message.header.frame_id = "odom"
+        message.pose.pose.position.x, message.pose.pose.position.y, message.pose.pose.orientation.w = x, y, 1.0
+        self.initial_pose.publish(message)
+        self.spin(0.5)
+
     def spin(self, seconds):
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0.0:
             self.executor.spin_once(timeout_sec=left)
+
+    def create_echo_subscription(self):
+        def on_echo(message):
+            self.echo_latencies.append(time.monotonic() - self.sent.get(stamp(message), time.monotonic()))
+
+        self.echo_latencies = []
+        self.node.create_subscription(Odometry, "/echo/odometry", on_echo, 50)
+
+    def clear(self):
+        self.odometry.clear()
+        self.predicted.clear()
+        self.sent.clear()
+        self.latencies.clear()
+        self.echo_latencies.clear()
+
+    def drive(self, seconds):
+        """A message is sent as long after the first of the round as it was recorded."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            if not self.left or not hasattr(self, "round_s"):
+                self.left = deque(self.drive_messages)
+                self.round_s, self.round_ns, self.first_ns = time.monotonic(), time.time_ns(), self.left[0][0]
+            if self.round_s + (self.left[0][0] - self.first_ns) * 1e-9 < time.monotonic() - 0.5:  # was not driven for a while
+                pause = time.monotonic() - self.round_s - (self.left[0][0] - self.first_ns) * 1e-9
+                self.round_s, self.round_ns = self.round_s + pause, self.round_ns + int(pause * 1e9)
+            at, topic, _, data = self.left.popleft()
+            self.spin(self.round_s + (at - self.first_ns) * 1e-9 - time.monotonic())
+            sec, nanosec = struct.unpack_from("<II", data, 4)
+            stamp_ns = sec * 10**9 + nanosec - self.first_ns + self.round_ns
+            if topic == "/scan":
+                self.sent[stamp_ns] = time.monotonic()
+            data = data[:4] + struct.pack("<II", stamp_ns // 10**9, stamp_ns % 10**9) + data[12:]
+            self.publishers[topic].publish(data)
 
     def play(self, seconds):
         begin, first = time.monotonic(), self.left[0][0] if self.left else 0
@@ -107,10 +160,12 @@ class Robot:
             "hashes": [[str(info.topic_type_hash), info.node_name] for info in infos],
             "sent": len(self.sent),
             "answered": len(self.latencies),
-            "latencies_s": self.latencies,
+            "latencies_s": list(self.latencies.values()),
+            "echo_latencies_s": self.echo_latencies,
             "first_s": self.first_s,
             "tf": sorted(set(self.tf)),
             "tf_count": len(self.tf),
+            "predicted": self.predicted,
             "frames": sorted({(o.header.frame_id, o.child_frame_id) for o in self.odometry}),
             "poses": [[o.pose.pose.position.x, o.pose.pose.position.y] for o in self.odometry],
             "statuses": self.statuses,

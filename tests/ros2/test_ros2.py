@@ -90,7 +90,10 @@ def test_dds_door_beside_robots_that_leave_come_late_and_restart(distro, running
     assert found["answered"] >= 0.95 * found["sent"] > 90
     assert found["first_s"] < 2.0 + 5.0  # 2 s without scans, then as long as the node waits for all topics
     assert found["frames"] == found["tf"] == [["odom", "base_link"]]
-    assert found["tf_count"] == found["answered"]
+    steps = np.diff(found["predicted"])
+    assert (steps > 0).all()
+    assert np.median(steps) < 0.0201e9  # the wheels' 50 Hz
+    assert found["tf_count"] == len(found["predicted"]) > 3 * found["answered"]
     assert "/skidloc" in found["nodes"]
     assert [info[0] for info in found["hashes"]] == [ODOMETRY_HASH]
     assert {s["level"] for s in found["statuses"].values()} == {0}, found["statuses"]
@@ -157,19 +160,20 @@ def test_rclpy_door_without_tf2_msgs_names_the_package_to_install(distro):
 
 def test_lifecycle_node_is_managed_from_another_process(distro, running):
     domain = own_domain(5)
-    remap = ["-r", "__node:=rover", "-r", "__ns:=/team", "-r", "~/odometry:=/skidloc/odometry"]
+    renamed = {"~/odometry": "/skidloc/odometry", "~/odometry_predicted": "/skidloc/odometry_predicted", "set_pose": "/set_pose"}
+    remap = ["-r", "__node:=rover", "-r", "__ns:=/team", *(part for name in renamed for part in ("-r", f"{name}:={renamed[name]}"))]
     topics = ["-p", "topic.joint_states:=/joint_states", "-p", "topic.scan:=/scan", "-p", "topic.imu:=/imu/data"]
     node = running(start_managed(distro, domain, *remap, "-p", "autostart:=false", "-p", "robot:=vaultbot", *topics))
     manage = running(Manager(distro, domain, "/team/rover"))
     assert manage("state") == "unconfigured"
     assert manage("get", "wait_s") == 5.0
-    description, constraint = manage("describe", "config.estimator.graph.kernel")
+    description, constraint = manage("describe", "config.estimator.lidar.matcher")
     assert description
-    assert constraint == "none, huber, cauchy"
+    assert constraint == "submap, kiss"
     for name, value, reason in (
         ("wait_s", -1.0, "must be 0 or more"),
         ("wait_s", "long", "must be a number"),
-        ("config.estimator.graph.kernel", "hubert", "Did you mean 'huber'?"),
+        ("config.estimator.lidar.matcher", "submaps", "Did you mean 'submap'?"),
     ):
         is_set, why = manage("set", [name, value])
         assert not is_set
@@ -188,7 +192,19 @@ def test_lifecycle_node_is_managed_from_another_process(distro, running):
     robot.line("done")
     found = robot.report()
     assert found["answered"] >= 0.9 * found["sent"] > 60
-    assert 0 < found["tf_count"] < found["answered"]
+    assert 0 < found["tf_count"] < 0.9 * len(found["predicted"])
+    assert manage("tare_payload")
+    robot.do("set_pose 30 -20")
+    robot.do("play 2")
+    assert np.hypot(*np.subtract(robot.report()["poses"][-1], [30.0, -20.0])) < 2.0
+    assert manage("pause", True)
+    before = len(robot.report()["poses"])
+    robot.do("play 1")
+    assert len(robot.report()["poses"]) == before
+    assert manage("pause", False)
+    assert manage("reset")
+    robot.do("play 3")
+    assert np.hypot(*robot.report()["poses"][-1]) < 3.0
     assert "/team/rover" in found["nodes"]
     assert manage("change", "deactivate")
     assert manage("state") == "inactive"

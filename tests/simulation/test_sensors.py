@@ -12,16 +12,33 @@ from hypothesis import strategies as st
 
 from localization.logs.message_templates import STORE, Template
 from localization.logs.references import reference_decoder
-from localization.simulation.clock import Ticks
-from localization.simulation.masses import Masses
-from localization.simulation.raycast import cast, cast_at_people, clearance, make_grid, person_at
-from localization.simulation.scanners import Scanner, ScannerConfig, SpinningConfig, SpinningScanner
-from localization.simulation.sensor_suite import quaternion
-from localization.simulation.sensors import EncoderConfig, Encoders, Gps, GpsConfig, Imu, ImuConfig, Truth
-from localization.simulation.track import Track
-from localization.simulation.vehicle import COLUMNS
-from localization.simulation.world import GLASS, WORLDS, World, box, line, pillar
-from localization.simulation.world_svg import world_svg
+from localization.simulation.scanners import PlanarScanner, ScannerConfig, SpinningConfig, SpinningScanner
+from localization.simulation.sensors import (
+    EncoderConfig,
+    EncoderSensor,
+    GpsConfig,
+    GpsSensor,
+    ImuConfig,
+    ImuSensor,
+    TruthSensor,
+    quaternion,
+)
+from localization.simulation.track import SampleClock, TrueMotion
+from localization.simulation.vehicle import COLUMNS, MassDistribution
+from localization.simulation.world import (
+    GLASS,
+    WORLDS,
+    World,
+    box,
+    cast,
+    cast_at_people,
+    clearance,
+    line,
+    make_grid,
+    person_at,
+    pillar,
+    world_svg,
+)
 from motion_models import se2
 from motion_models.robot import Mount, load_robot
 
@@ -54,13 +71,13 @@ def moving_track(twist=(0.5, 0.1, 1.0), seconds=3.0, start=(0.0, 0.0, 0.3)):
     rows[:, 0:2], rows[:, 2], rows[:, 3:6] = moved[:, :2], heading, twist
     rows[:, 8], rows[:, 9] = 2.0 * t, 3.0 * t
     rows[:, 6], rows[:, 7] = 2.0, 3.0
-    track = Track(rows[0], STEP)
+    track = TrueMotion(rows[0], STEP)
     track.append(rows[1:])
     return track
 
 
 def read(message):
-    return STORE.deserialize_cdr(Template(message.form, is_ros1=False).fill(message), message.form.type)
+    return STORE.deserialize_cdr(Template(message.layout, is_ros1=False).fill(message), message.layout.type)
 
 
 @given(st.integers(0, 10**6))
@@ -115,7 +132,7 @@ def test_every_beam_leaves_from_where_the_robot_is_at_its_own_moment():
     """While turning at 1 rad/s, points laid out with the pose of each beam's time lie on the walls; with that of the scan's start, not."""
     walls = np.concatenate([box(-4, -3, 4, 3), pillar(2, 1)])
     mount, track = Mount(x=0.4, y=-0.1, yaw=0.2), moving_track()
-    scanner = Scanner(EXACT, "/scan", "laser", mount, World(walls), 0.0, 10**9, np.random.default_rng(0))
+    scanner = PlanarScanner(EXACT, "/scan", "laser", mount, World(walls), 0.0, 10**9, np.random.default_rng(0))
     messages = scanner.messages(track)
     assert len(messages) == 37  # 3 s at 12.5 Hz, the first at once, the last sweep over by then
     off = {"own": 0.0, "start": 0.0}
@@ -134,7 +151,7 @@ def test_every_beam_leaves_from_where_the_robot_is_at_its_own_moment():
 
 
 def test_a_sweep_fills_only_its_part_of_the_period_and_is_sent_when_it_is_over():
-    scanner = Scanner(EXACT, "/scan", "laser", Mount(), World(box(-4, -3, 4, 3)), 0.0, 10**9, np.random.default_rng(0))
+    scanner = PlanarScanner(EXACT, "/scan", "laser", Mount(), World(box(-4, -3, 4, 3)), 0.0, 10**9, np.random.default_rng(0))
     message = scanner.messages(moving_track())[3]
     scan = read(message)
     sweep = scan.time_increment * 380
@@ -149,8 +166,10 @@ def test_a_sweep_fills_only_its_part_of_the_period_and_is_sent_when_it_is_over()
 def test_ranges_have_the_noise_the_rounding_and_the_dropouts_that_are_set():
     config = ScannerConfig(noise_m=0.02, resolution_m=0.005, dropout=0.05)
     still = moving_track(twist=(0.0, 0.0, 0.0), seconds=8.0)
-    truth = read(Scanner(EXACT, "/s", "l", Mount(), World(box(-4, -3, 4, 3)), 0.0, 0, np.random.default_rng(1)).messages(still)[0]).ranges
-    noisy = Scanner(config, "/s", "l", Mount(), World(box(-4, -3, 4, 3)), 0.0, 0, np.random.default_rng(1)).messages(still)
+    truth = read(
+        PlanarScanner(EXACT, "/s", "l", Mount(), World(box(-4, -3, 4, 3)), 0.0, 0, np.random.default_rng(1)).messages(still)[0]
+    ).ranges
+    noisy = PlanarScanner(config, "/s", "l", Mount(), World(box(-4, -3, 4, 3)), 0.0, 0, np.random.default_rng(1)).messages(still)
     ranges = np.array([m.parts[0] for m in noisy], dtype=float)
     lost = np.isinf(ranges)
     n = ranges.size
@@ -165,7 +184,7 @@ def test_a_spinning_scanner_sees_walls_floor_and_ceiling_where_they_are():
     walls, mount, track = box(-4, -3, 4, 3), Mount(x=0.1, z=0.8, yaw=0.3), moving_track()
     config = SpinningConfig(noise_m=0.0, dropout=0.0, min_range_m=0.1)
     world = World(walls, ceiling_m=1.5)
-    scanner = SpinningScanner(config, "/points", "velodyne", mount, 0.93, world, 0.0, 0, np.random.default_rng(0))
+    scanner = SpinningScanner(config, "/points", "velodyne", mount, world, 0.0, 0, np.random.default_rng(0))
     message = scanner.messages(track)[4]
     layout = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"), ("ring", "u2"), ("t", "f4")]
     cloud = np.frombuffer(message.parts[0].tobytes(), dtype=layout)
@@ -189,7 +208,7 @@ def test_a_spinning_scanner_sees_walls_floor_and_ceiling_where_they_are():
 
 
 def encoders(counts=4096, late=0.0, lost=0.0, rate=50.0):
-    return Encoders(EncoderConfig(rate, counts), ROBOT, Masses(ROBOT), late, lost, 10**9, np.random.default_rng(3))
+    return EncoderSensor(EncoderConfig(rate, counts), ROBOT, MassDistribution(ROBOT), late, lost, 10**9, np.random.default_rng(3))
 
 
 @pytest.mark.parametrize("rate", [50.0, 100.0, 200.0])
@@ -231,17 +250,17 @@ def test_a_loose_encoder_plug_loses_its_share_of_one_wheels_counts():
 
 
 def test_ticks_are_handed_out_once_and_only_when_they_are_over():
-    ticks = Ticks(12.5, takes_s=0.05)
+    ticks = SampleClock(12.5, takes_s=0.05)
     assert ticks.due(0.049).tolist() == []
     assert ticks.due(0.05).tolist() == [0]
     assert ticks.due(0.21).tolist() == [80_000_000, 160_000_000]
     assert ticks.due(0.21).tolist() == []
-    assert Ticks(30.0).due(1e5)[-1] == 100_000 * 10**9
+    assert SampleClock(30.0).due(1e5)[-1] == 100_000 * 10**9
 
 
 def quiet_imu(mount=None, bias=0.0, tilt=0.0):
     config = ImuConfig(100.0, gyro_noise=0.0, gyro_bias_sigma=0.0, gyro_bias_walk=0.0, force_noise=0.0)
-    return Imu(config, "/imu", "imu_link", mount or Mount(), bias, tilt, 0, np.random.default_rng(0))
+    return ImuSensor(config, "/imu", "imu_link", mount or Mount(), bias, tilt, 0, np.random.default_rng(0))
 
 
 def test_an_imu_feels_gravity_turning_and_its_own_lever_arm():
@@ -271,7 +290,7 @@ def test_gyro_bias_and_slope_are_in_the_imu():
 def test_imu_noise_is_as_large_as_its_density_says():
     config = ImuConfig(100.0, gyro_noise=1e-3, gyro_bias_sigma=0.0, gyro_bias_walk=0.0, force_noise=5e-3)
     still = moving_track(twist=(0, 0, 0), seconds=60.0)
-    parts = [m.parts for m in Imu(config, "/imu", "imu_link", Mount(), 0.0, 0.0, 0, np.random.default_rng(2)).messages(still)]
+    parts = [m.parts for m in ImuSensor(config, "/imu", "imu_link", Mount(), 0.0, 0.0, 0, np.random.default_rng(2)).messages(still)]
     assert np.std([p[0] for p in parts]) == pytest.approx(1e-2, rel=0.03)
     assert np.std([p[1] for p in parts], axis=0) == pytest.approx(np.full(3, 5e-2), rel=0.05)
 
@@ -280,7 +299,7 @@ def test_gps_fixes_lead_back_to_the_path():
     """By the library's own reading of NavSatFix, which has its own geodesy."""
     track = moving_track(twist=(3.0, 0.0, 0.1), seconds=40.0)
     config = GpsConfig(5.0, noise_m=0.0, drift_m=0.0)
-    messages = Gps(config, "/fix", "gps_link", 0, np.random.default_rng(0)).messages(track)
+    messages = GpsSensor(config, "/fix", "gps_link", 0, np.random.default_rng(0)).messages(track)
     decode = reference_decoder("sensor_msgs/msg/NavSatFix")
     found = np.array([decode(read(m), m.stamp_ns).position for m in messages])
     truth = track.at(np.array([m.stamp_ns * 1e-9 for m in messages]))[:, :2]
@@ -289,10 +308,10 @@ def test_gps_fixes_lead_back_to_the_path():
 
 
 def test_truth_is_the_track_and_the_cg_topic_is_the_nominal_cg():
-    track, masses = moving_track(), Masses(ROBOT)
-    messages = Truth(25.0, ROBOT, masses, True, 10**9).messages(track)
-    odometry = [m for m in messages if m.form.type.endswith("Odometry")]
-    cgs = [m for m in messages if m.form.type.endswith("PointStamped")]
+    track, masses = moving_track(), MassDistribution(ROBOT)
+    messages = TruthSensor(25.0, ROBOT, masses, True, 10**9).messages(track)
+    odometry = [m for m in messages if m.layout.type.endswith("Odometry")]
+    cgs = [m for m in messages if m.layout.type.endswith("PointStamped")]
     assert len(odometry) == len(cgs) == 76
     pose, twist = read(odometry[50]).pose.pose, read(odometry[50]).twist.twist
     row = track.at(np.array([2.0]))[0]

@@ -20,9 +20,9 @@ from localization.logs import open_log
 from localization.logs.writer import write_bag
 from localization.simulation.drives import MoveArms, OpenLoop, PickUp, Rest, Route, TurnTo, constant
 from localization.simulation.experiments import CONFIGURATION_CGS, EXPERIMENTS, Experiment, ExperimentConfig, grid_points
-from localization.simulation.faults import EFFECTS, parse_effects
-from localization.simulation.open_loop_scores import correction_time, score_runs
-from localization.simulation.sensor_suite import START_NS, SensorConfig
+from localization.simulation.faults import FAULTS, parse_faults
+from localization.simulation.open_loop_scores import correction_time, score_open_loop_runs
+from localization.simulation.sensors import START_NS, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, simulate, write_simulation
 from localization.simulation.vehicle import VehicleConfig
 from motion_models import se2
@@ -69,7 +69,7 @@ def test_every_format_is_opened_by_rosbags_and_by_this_library(tmp_path, name, l
     assert types == {
         "/joint_states": "JointState",
         "/ground_truth/odom": "Odometry",
-        "/imu/data": "Imu",
+        "/imu/data": "ImuSensor",
         "/fix": "NavSatFix",
         "/tf_static": "TFMessage",
         "/center_of_gravity": "PointStamped",
@@ -115,7 +115,7 @@ def test_the_log_says_when_each_run_begins_and_ends():
     simulation, messages = driven(
         short(Rest(0.5), OpenLoop("a", constant(0.3, 0.0), 2.7), Rest(1.0), OpenLoop("b", constant(0.0, 0.3), 2.0))
     )
-    marks = [(m.log_ns, json.loads(m.parts[0].tobytes())) for m in messages if m.form.topic == "/experiment"]
+    marks = [(m.log_ns, json.loads(m.parts[0].tobytes())) for m in messages if m.layout.topic == "/experiment"]
     assert [(mark["run"], mark["what"]) for _, mark in marks] == [("a", "begins"), ("a", "ends"), ("b", "begins"), ("b", "ends")]
     assert [stamp - START_NS for stamp, _ in marks] == [500_000_000, 4_200_000_000, 5_200_000_000, 8_200_000_000]
     assert [m.log_ns for m in messages] == sorted(m.log_ns for m in messages)
@@ -126,7 +126,7 @@ def test_one_sensor_more_leaves_the_noise_of_the_others_as_it_is():
     _, blind = driven()
     _, seeing = driven(config=SimulationConfig(sensors=SensorConfig(lidar="3d", center_of_gravity=True)))
     for topic in ("/imu/data", "/joint_states", "/ground_truth/odom"):
-        a, b = ([m for m in messages if m.form.topic == topic] for messages in (blind, seeing))
+        a, b = ([m for m in messages if m.layout.topic == topic] for messages in (blind, seeing))
         assert len(a) == len(b) > 20
         assert all(np.array_equal(p, q) for m, n in zip(a, b, strict=True) for p, q in zip(m.parts, n.parts, strict=True))
 
@@ -168,23 +168,23 @@ def distance(simulation):
 
 
 def parts(messages, topic, part):
-    return np.array([m.parts[part] for m in messages if m.form.topic == topic])
+    return np.array([m.parts[part] for m in messages if m.layout.topic == topic])
 
 
-@pytest.mark.parametrize("effect", EFFECTS)
+@pytest.mark.parametrize("effect", FAULTS)
 def test_effects_are_nowhere_in_the_logs_metadata(effect):
     size = {"payload": 5.0, "encoder_dropout": 0.3}.get(effect, 0.02)
     config = SimulationConfig(sensors=SensorConfig(lidar="2d", center_of_gravity=True))
     (_, plain), (_, changed) = driven(config=config), driven(effects={effect: size}, config=config)
-    transforms = [next(m for m in messages if m.form.topic == "/tf_static") for messages in (plain, changed)]
+    transforms = [next(m for m in messages if m.layout.topic == "/tf_static") for messages in (plain, changed)]
     from localization.logs.message_templates import Template
 
-    assert len({Template(m.form, is_ros1=False).fill(m) for m in transforms}) == 1
-    assert {m.form.topic for m in plain} == {m.form.topic for m in changed}
+    assert len({Template(m.layout, is_ros1=False).fill(m) for m in transforms}) == 1
+    assert {m.layout.topic for m in plain} == {m.layout.topic for m in changed}
     np.testing.assert_array_equal(parts(plain, "/center_of_gravity", 0), parts(changed, "/center_of_gravity", 0))
     # but something that is measured did change
     topics = ("/joint_states", "/scan", "/imu/data", "/ground_truth/odom")
-    now = [[(m.stamp_ns, *(p.tobytes() for p in m.parts)) for m in messages if m.form.topic in topics] for messages in (plain, changed)]
+    now = [[(m.stamp_ns, *(p.tobytes() for p in m.parts)) for m in messages if m.layout.topic in topics] for messages in (plain, changed)]
     assert now[0] != now[1]
 
 
@@ -232,8 +232,8 @@ def test_late_stamps_are_late_and_the_messages_are_not(effect, topic):
     config = SimulationConfig()
     (_, plain), (_, late) = driven(config=config), driven(effects={effect: 0.03}, config=config)
     for a, b in zip(plain, late, strict=True):
-        assert (a.form.topic, a.log_ns) == (b.form.topic, b.log_ns)
-        assert b.stamp_ns - a.stamp_ns == (30_000_000 if a.form.topic == topic else 0)
+        assert (a.layout.topic, a.log_ns) == (b.layout.topic, b.log_ns)
+        assert b.stamp_ns - a.stamp_ns == (30_000_000 if a.layout.topic == topic else 0)
 
 
 def test_more_grip_to_the_side_turns_less_and_from_the_middle_on_only_then():
@@ -302,10 +302,10 @@ def test_loose_floor_is_in_truth_and_gyro_alike(effect, value):
 
 
 def test_effects_add_up_and_bad_ones_are_told():
-    assert parse_effects(("slope=0.1", "payload=2", "slope=0.05")) == {"slope": pytest.approx(0.15), "payload": 2.0}
+    assert parse_faults(("slope=0.1", "payload=2", "slope=0.05")) == {"slope": pytest.approx(0.15), "payload": 2.0}
     for text in ("slope", "slope=", "slope=steep", "slope=nan"):
         with pytest.raises(SimulationError, match="not of the form ID=SIZE"):
-            parse_effects((text,))
+            parse_faults((text,))
     for effects, said in (
         ({"gravity": 1.0}, r"no effect 'gravity'; there are\n  wheel_radius_scale \[1\]: all wheels"),
         ({"track_width": 3.0}, r"track_width of 3 m is out of reason; it may be -0.2 to 0.2"),
@@ -327,7 +327,7 @@ def test_a_cg_that_tips_the_robot_is_told_before_and_during_the_drive():
 
 
 def test_a_robot_that_cannot_get_there_says_so():
-    with pytest.raises(SimulationError, match="does not get where it is sent"):
+    with pytest.raises(SimulationError, match="does not reach its way point"):
         driven(short(Route(np.array([[3.0, 0.0]])), world="slippery"), {"slope": 0.4}, HUSKY)  # a wet patch is steeper than it grips
 
 
@@ -346,7 +346,7 @@ def test_routes_and_turns_lead_where_they_should():
     simulation, messages = driven(way)
     end = simulation.runs[-1].poses[-1]
     assert np.hypot(end[0] - 2.0, end[1] - 2.0) < 0.2
-    last = [m for m in messages if m.form.topic == "/ground_truth/odom"][-1]
+    last = [m for m in messages if m.layout.topic == "/ground_truth/odom"][-1]
     assert abs(abs(2 * math.atan2(*last.parts[1])) - math.pi) < 0.05
 
 
@@ -372,7 +372,7 @@ def test_every_experiment_is_driven_to_its_end(name):
 def test_scores_of_a_robot_that_does_as_it_is_told_are_zero_but_for_the_motors_lag():
     """Straight on, with the model that skids least; and a hand-made correction."""
     simulation, _ = driven(STRAIGHT)
-    (score,) = score_runs(simulation)
+    (score,) = score_open_loop_runs(simulation)
     assert score.drive_error_m < 0.03
     assert score.vision_error_m < 0.03
     # 0.3 m to the side, same heading: a quarter turn, 0.3 m, a quarter turn back

@@ -11,11 +11,20 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from localization.errors import SimulationError
-from localization.simulation.dynamics import Chassis, Now, change
-from localization.simulation.faults import Reality, changed
-from localization.simulation.implicit_integration import follow
-from localization.simulation.masses import Masses
-from localization.simulation.vehicle import CG, MARGIN, POSE, TWIST, Body, VehicleConfig, VehicleState, accelerations, advance
+from localization.simulation.dynamics import Chassis, DynamicsInput, derivatives, wheel_response
+from localization.simulation.faults import TrueRobot, apply_faults
+from localization.simulation.vehicle import (
+    CG,
+    MARGIN,
+    POSE,
+    TWIST,
+    Body,
+    MassDistribution,
+    VehicleConfig,
+    VehicleState,
+    accelerations,
+    advance,
+)
 from motion_models.errors import CgError
 from motion_models.friction.contact import SATURATION
 from motion_models.friction.dynamics import FrictionDynamics, Influence
@@ -79,12 +88,12 @@ def test_derivatives_are_those_of_differences(seed):
     chassis = BODY.chassis(CONFIG)
     soft = chassis.tyre._replace(tread=0.2, saturation=float(rng.choice([0.0, 0.3, 1.0])))
     body = chassis._replace(warp=0.1, tyre=soft, creep=0.02, scrub=0.03)
-    now = Now(*rng.uniform(-0.5, 0.5, 2), *rng.uniform(0.5, 1, 4), 118.0, 2.5, *rng.uniform(-0.05, 0.05, 7), 10.0, 5.0)
+    now = DynamicsInput(*rng.uniform(-0.5, 0.5, 2), *rng.uniform(0.5, 1, 4), 118.0, 2.5, *rng.uniform(-0.05, 0.05, 7), 10.0, 5.0)
     twist, tilt, step = rng.uniform(-0.5, 0.5, 3), rng.uniform(-1.1, 1.1, 2), 1e-7
-    found = change(*twist, *tilt, now, body)
+    found = derivatives(*twist, *tilt, now, body)
     numeric = np.zeros((3, 3))
     for j in range(3):
-        up, down = (np.array(change(*(twist + sign * step * np.eye(3)[j]), *tilt, now, body)[:3]) for sign in (1, -1))
+        up, down = (np.array(derivatives(*(twist + sign * step * np.eye(3)[j]), *tilt, now, body)[:3]) for sign in (1, -1))
         numeric[:, j] = (up - down) / (2 * step)
     np.testing.assert_allclose(np.array(found[5:]).reshape(3, 3), numeric, atol=2e-5 * max(1.0, np.abs(numeric).max()))
 
@@ -151,7 +160,7 @@ def test_wheels_follow_ramps_through_their_lag_exactly():
     for i in range(10_000):
         target = 1.0 + 3.0 * (i + 0.5) * h
         q, angle = q + h * (target - q) / lag, angle + h * q
-    rate, turned = follow(0.7, 1.0, 3.0, lag, 0.1)
+    rate, turned = wheel_response(0.7, 1.0, 3.0, lag, 0.1)
     assert rate == pytest.approx(q, abs=1e-4)
     assert turned == pytest.approx(angle, abs=1e-4)
 
@@ -164,10 +173,10 @@ def test_wheels_speed_up_no_faster_than_the_controller_lets_them():
 
 
 def test_the_tyres_follow_the_law_of_the_robot_file_and_an_effect_turns_it_into_the_other():
-    reality = {law: Reality(Body.from_robot(robot), Mount()) for law, robot in ROBOTS.items()}
+    reality = {law: TrueRobot(Body.from_robot(robot), Mount()) for law, robot in ROBOTS.items()}
     for law, other in (("isotropic", "thesis"), ("thesis", "isotropic")):
         assert reality[law].body.chassis(CONFIG).tyre.saturation == SATURATION[law]
-        assert changed(reality[law], {"lateral_force_law": 1.0}).body.chassis(CONFIG).tyre == reality[other].body.chassis(CONFIG).tyre
+        assert apply_faults(reality[law], {"lateral_force_law": 1.0}).body.chassis(CONFIG).tyre == reality[other].body.chassis(CONFIG).tyre
     # on a gentle arc the thesis's robot turns less
     turns = [drive((3.0, 3.3), 2.0, body=of.body)[-1, TWIST][2] for of in reality.values()]
     assert turns[1] < 0.9 * turns[0]
@@ -290,7 +299,7 @@ def test_loose_floor_shears_as_it_says():
 
 
 def test_the_cg_moves_with_the_arms_as_its_own_velocity_and_acceleration_say():
-    masses = Masses(ROBOT)
+    masses = MassDistribution(ROBOT)
     masses.move(masses.posture("ready"), 1.0, 2.0)
     t = np.linspace(0.5, 3.5, 3001)
     rows = masses.cg(t)
@@ -305,7 +314,7 @@ def test_the_cg_moves_with_the_arms_as_its_own_velocity_and_acceleration_say():
 
 def test_moving_arms_push_a_robot_without_grip_the_other_way_and_leave_its_cg_where_it_is():
     slick = BODY.with_param("mu", 1e-9).with_param("rolling_resistance", 0.0)
-    masses = Masses(ROBOT)
+    masses = MassDistribution(ROBOT)
     masses.move(masses.posture("ready"), 0.2, 2.0)
     t = CONFIG.step_s * np.arange(500)
     state = VehicleState.at(np.zeros(3))
@@ -316,7 +325,7 @@ def test_moving_arms_push_a_robot_without_grip_the_other_way_and_leave_its_cg_wh
 
 
 def test_a_payload_shifts_the_cg_by_its_share_and_adds_its_inertia():
-    masses = Masses(ROBOT)
+    masses = MassDistribution(ROBOT)
     masses.move(masses.posture("ready"), 0.0, 1.0)
     at = np.array([5.0])
     empty = masses.cg(at)[0, :2]
@@ -333,10 +342,10 @@ def test_a_payload_shifts_the_cg_by_its_share_and_adds_its_inertia():
 
 
 def test_a_robot_without_arms_moves_a_ballast_and_knows_no_postures():
-    masses = Masses(load_robot("husky_a200"))
+    masses = MassDistribution(load_robot("husky_a200"))
     masses.move(masses.reach(np.array([0.05, 0.0])), 0.0, 1.0)
     np.testing.assert_allclose(masses.cg(np.array([2.0]))[0, :2], [0.05, 0.0])
     with pytest.raises(SimulationError, match="'husky_a200' has no arm posture 'ready'; its postures: none"):
         masses.posture("ready")
     with pytest.raises(SimulationError, match="its postures: ready, stow_back"):
-        Masses(ROBOT).posture("folded")
+        MassDistribution(ROBOT).posture("folded")

@@ -35,7 +35,7 @@ from localization.lidar.submap import VoxelGrid, fill_surface, make_grid
 from localization.logs import open_log
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.scanners import ScannerConfig
-from localization.simulation.sensor_suite import ImuConfig, SensorConfig
+from localization.simulation.sensors import ImuConfig, SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
 from motion_models.robot import load_robot
 from tests.studies.buildings import BUILDINGS, Drive, errors_of

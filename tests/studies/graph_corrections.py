@@ -35,7 +35,7 @@ from localization.lidar import LidarConfig
 from localization.logs import open_log
 from localization.pipeline import Pipeline, Trial
 from localization.simulation.experiments import ExperimentConfig
-from localization.simulation.sensor_suite import START_NS
+from localization.simulation.sensors import START_NS
 from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
 from localization.synchronizer import Synchronizer
 from localization.trajectory import Trajectory

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from localization.simulation.experiments import CONTROLLERS, TRAJECTORIES
-from localization.simulation.open_loop_scores import Score, score_runs
-from localization.simulation.sensor_suite import SensorConfig
+from localization.simulation.open_loop_scores import OpenLoopScore, score_open_loop_runs
+from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate
 from motion_models.robot import load_robot
 from motion_models.se2 import FloatArray
@@ -58,16 +58,16 @@ def effects() -> dict[str, float]:
     }
 
 
-def scores(seed: int = 0) -> list[Score]:
+def scores(seed: int = 0) -> list[OpenLoopScore]:
     """All 84 runs."""
     config = SimulationConfig(sensors=SensorConfig(lidar="none"))
     simulation = simulate("controller_evaluation", load_robot("vaultbot"), seed, effects(), config)
     for _ in simulation.messages():
         pass
-    return score_runs(simulation)
+    return score_open_loop_runs(simulation)
 
 
-def rows(found: list[Score]) -> list[Row]:
+def rows(found: list[OpenLoopScore]) -> list[Row]:
     with open(DATA / "controller_evaluation.csv", newline="", encoding="utf-8") as file:
         table = {(r["trajectory"], r["arm_configuration"], r["controller"]): [float(r[m]) for m in METRICS] for r in csv.DictReader(file)}
     mine = {tuple(score.run.split(",")): [getattr(score, m) for m in METRICS] for score in found}

@@ -20,9 +20,9 @@ from localization.events import CgSample, Scan, WheelSample
 from localization.lidar import LidarConfig, ScanMatcher, Sweep, choose_cell
 from localization.logs import open_log
 from localization.simulation.experiments import grid_points
-from localization.simulation.run_records import RunRecord
-from localization.simulation.sensor_suite import START_NS
+from localization.simulation.sensors import START_NS
 from localization.simulation.simulator import simulate, write_simulation
+from localization.simulation.track import RunRecord
 from localization.simulation.vehicle import TWIST, Body, VehicleConfig, VehicleState, advance
 from localization.trajectory import IntArray
 from motion_models import se2

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from localization.simulation.scanners import ScannerConfig
-from localization.simulation.sensor_suite import SensorConfig
+from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
 from localization.simulation.vehicle import Body, VehicleConfig, VehicleState, advance
 from motion_models.friction.dynamics import FrictionDynamics

@@ -1,1 +1,39 @@
-"""Transports: bytes of topics in and out of a robot's network, one module each."""
+"""Transports: bytes of topics in and out of a robot's network, one module each, imported only where it is wanted."""
+
+from __future__ import annotations
+
+import importlib.util
+from typing import Literal
+
+from localization.ros.topic_names import Names
+from localization.ros.transports.base import Transport
+
+TransportName = Literal["auto", "dds", "rclpy", "zenoh", "rospy"]
+
+
+def open_transport(kind: TransportName, names: Names, domain: int | None, interface: str | None) -> Transport:
+    """The transport ``kind``; `auto` is rclpy where a ROS 2 is sourced, else dds.
+
+    ``domain`` (dds, zenoh): by default that of ROS_DOMAIN_ID, or 0. ``interface``: see `dds_settings.choose_interface`; of zenoh the
+    endpoint of its router. Raises `TransportError`.
+    """
+    if kind == "auto":
+        kind = "dds" if importlib.util.find_spec("rclpy") is None else "rclpy"
+    if kind == "rospy":
+        from localization.ros.transports.rospy import RospyTransport
+
+        return RospyTransport()
+    if kind == "rclpy":
+        from localization.ros.transports.rclpy import RclpyTransport
+
+        return RclpyTransport(names.name, names.namespace)
+    from localization.ros.transports.dds_settings import choose_interface, default_domain
+
+    domain = default_domain() if domain is None else domain
+    if kind == "zenoh":
+        from localization.ros.transports.zenoh import ZenohTransport
+
+        return ZenohTransport(domain, interface, names.name, names.namespace)
+    from localization.ros.transports.dds import DdsTransport
+
+    return DdsTransport(domain, choose_interface(interface), names.name, names.namespace)

@@ -1,7 +1,10 @@
 """ROS 2 topics without a ROS installation: DDS through cyclonedds (extra `ros2`).
 
-A ROS 2 topic `/scan` is DDS's `rt/scan`, a type `pkg/msg/Type` is `pkg::msg::dds_::Type_`. Messages pass as bytes, which `logs.wire`
-reads and writes as it does those of logs; cyclonedds gets the types' fields only for peers that ask.
+A ROS 2 topic `/scan` is DDS's `rt/scan`, a type `pkg/msg/Type` is `pkg::msg::dds_::Type_`. Messages pass as bytes, which
+`logs.serialization` reads and writes as it does those of logs; cyclonedds gets the types' fields only for peers that ask for them.
+
+There are no services: Fast DDS relates a reply to its request by an inline QoS of the sample (related_sample_identity), which cyclonedds's
+Python API cannot write. A service that is discovered but never answers would be worse than none.
 """
 
 from __future__ import annotations
@@ -18,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from localization.errors import DoorError
+from localization.errors import TransportError
 from localization.logs.serialization import Shape, encode, fields, make, type_hash
-from localization.ros.transports.base import Received
+from localization.ros.transports.base import MonotonicTime, Received
 from localization.ros.transports.dds_settings import LAST_DOMAIN, LOOPBACK, configuration
 
 try:
@@ -34,7 +37,9 @@ try:
     from cyclonedds.topic import Topic
     from cyclonedds.util import duration
 except ImportError as error:
-    raise DoorError(f"ROS 2 topics without a ROS installation need the extra 'ros2': pip install 'skidloc[ros2]' ({error}).") from error
+    raise TransportError(
+        f"ROS 2 topics without a ROS installation need the extra 'ros2': pip install 'skidloc[ros2]' ({error})."
+    ) from error
 
 _LATEST, _DEPTH, _LATCHED_DEPTH = 200, 10, 100
 _FASTEST_DRIFT = 1e-4  # of one clock against another
@@ -42,32 +47,32 @@ _TYPE = re.compile(r"(\w+)::(?:msg::)dds_::(\w+)_")
 _GRAPH_TOPIC, _GRAPH_TYPE = "ros_discovery_info", "rmw_dds_common/msg/ParticipantEntitiesInfo"
 
 
-class DdsTransport:
+class DdsTransport(MonotonicTime):
     """See `Transport`. One participant with one node, ``name`` in ``namespace``, which ROS 2's node list shows."""
 
     is_ros1 = False
 
     def __init__(self, domain: int = 0, interface: str = LOOPBACK, name: str = "skidloc", namespace: str = "/") -> None:
-        """``interface`` is one of `dds_settings.choose_interface`; `lo` leaves nothing open to other machines. Raises `DoorError`."""
+        """``interface`` is one of `dds_settings.choose_interface`; `lo` leaves nothing open to other machines. Raises `TransportError`."""
         if not 0 <= domain <= LAST_DOMAIN:
-            raise DoorError(f"the domain is {domain}; ROS 2's domains are 0 to {LAST_DOMAIN}.")
+            raise TransportError(f"the domain is {domain}; ROS 2's domains are 0 to {LAST_DOMAIN}.")
         self.place = f"domain {domain} on interface {interface}"
         self.elsewhere = "Robots on other machines are discovered with --interface default." * (interface == LOOPBACK)
         try:
-            with _bound_to(interface):
+            with _bind_to(interface):
                 self._domain = Domain(domain, configuration(interface))
                 self._participant = DomainParticipant(domain, Qos(Policy.Userdata(b"enclave=/;")))
         except dds.DDSException as error:
-            raise DoorError(f"DDS cannot be used on interface '{interface}', domain {domain}: {error}.") from error
+            raise TransportError(f"DDS cannot be used on interface '{interface}', domain {domain}: {error}.") from error
         self._waiting, self._urgent = dds.WaitSet(self._participant), dds.WaitSet(self._participant)
         self._readers: list[tuple[str, DataReader[Any], dds.ReadCondition]] = []
         self._writers: dict[str, _Writer] = {}
         self._topics: dict[str, Topic[Any]] = {}
         self._found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
-        self._looked_ns = time.monotonic_ns()
+        self._last_take_ns = time.monotonic_ns()
         self._clocks: dict[str, SenderClock] = {}
         self._name, self._namespace = name, namespace
-        self._graph = None if os.environ.get("ROS_DISTRO") == "humble" else self._writer(_GRAPH_TOPIC, _GRAPH_TYPE, _graph_quality())
+        self._graph = None if os.environ.get("ROS_DISTRO") == "humble" else self._writer(_GRAPH_TOPIC, _GRAPH_TYPE, _latched_output())
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         quality = _latched() if is_latched else _sensor_data()
@@ -77,7 +82,7 @@ class DdsTransport:
         self._readers.append((topic, reader, is_new))
         self._publish_graph()
 
-    def keep(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
+    def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
         for topic, _, is_new in self._readers:
             if topic not in topics:
                 self._waiting.detach(is_new)
@@ -86,27 +91,27 @@ class DdsTransport:
         self._readers = [entry for entry in self._readers if entry[0] in topics]
         self._publish_graph()
 
-    def advertise(self, topic: str, kind: str) -> None:
-        self._writers[topic] = self._writer(_dds_name(topic), kind, _reliable())
+    def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
+        self._writers[topic] = self._writer(_dds_name(topic), kind, _latched_output() if is_latched else _reliable())
         self._publish_graph()
 
     def publish(self, topic: str, data: bytes) -> None:
         _write(self._writers[topic], data)
 
     def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
-        """In the order in which it was sent: after a pause, one topic's must not all come before another's."""
+        """In the order of sending: after a pause, the messages of one topic must not all come before another's."""
         is_urgent = patience_s > 0.0 and self._urgent.wait(round(patience_s * 1e9))
         is_there = is_urgent or self._waiting.wait(round(timeout_s * 1e9))
-        since, self._looked_ns = self._looked_ns, time.monotonic_ns()
+        since, self._last_take_ns = self._last_take_ns, time.monotonic_ns()
         if not is_there:
             return []
         found: list[tuple[int, Received]] = []
         for topic, reader, is_new in self._readers:
-            if is_new.triggered:  # to take costs ten times as much, and mostly it is one of them
+            if is_new.triggered:  # `take` costs ten times as much, and mostly one of them has messages
                 samples = [sample for sample in reader.take(1000) if isinstance(sample, _Bytes)]
                 sent = [int(sample.sample_info.source_timestamp) for sample in samples]
-                newest = self._clocks.setdefault(topic, SenderClock()).came_ns(max(sent, default=0), since, self._looked_ns)
-                came = times_of_receiving(sent, since, newest)
+                newest = self._clocks.setdefault(topic, SenderClock()).receive_time_ns(max(sent, default=0), since, self._last_take_ns)
+                came = receive_times(sent, since, newest)
                 found += [(at, Received(topic, ns, bytes(sample))) for at, ns, sample in zip(sent, came, samples, strict=True)]
         found.sort(key=lambda entry: entry[0])
         return [received for _, received in found]
@@ -115,7 +120,7 @@ class DdsTransport:
         found: dict[str, set[str]] = {}
         for publication in self._found.read(1000):
             if publication.sample_info.instance_state != dds.InstanceState.Alive:
-                continue  # of one that left nothing but its key is known
+                continue  # of a disposed instance only the key is valid
             name, kind = publication.topic_name, _TYPE.fullmatch(publication.type_name)
             if name.startswith("rt/") and name[2:] not in self._writers:
                 found.setdefault(name[2:], set()).add(f"{kind[1]}/msg/{kind[2]}" if kind else publication.type_name)
@@ -151,22 +156,22 @@ class DdsTransport:
 
 
 class SenderClock:
-    """How far the clock of a topic's sender is from ours, by those of its messages that were on their way for the shortest time."""
+    """Offset between the clock of a topic's sender and ours, by its messages with the shortest latency."""
 
     def __init__(self) -> None:
         self._offset_ns, self._known_ns = 1 << 80, 0
 
-    def came_ns(self, sent_ns: int, since_ns: int, now_ns: int) -> int:
+    def receive_time_ns(self, sent_ns: int, since_ns: int, now_ns: int) -> int:
         """When a message came that is found at ``now_ns`` and was not there at ``since_ns``: what had to wait for us came when it was
         sent. One that was sent before ``since_ns`` was late, or the sender's clock was set: it came now.
         """
         drift_ns = round((now_ns - self._known_ns) * _FASTEST_DRIFT)
         self._offset_ns, self._known_ns = min(now_ns - sent_ns, self._offset_ns + drift_ns), now_ns
-        came_ns = sent_ns + self._offset_ns
-        return came_ns if came_ns > since_ns else now_ns
+        receive_time_ns = sent_ns + self._offset_ns
+        return receive_time_ns if receive_time_ns > since_ns else now_ns
 
 
-def times_of_receiving(sent_ns: Sequence[int], since_ns: int, newest_ns: int) -> list[int]:
+def receive_times(sent_ns: Sequence[int], since_ns: int, newest_ns: int) -> list[int]:
     """When messages came that were not there at ``since_ns``: the newest at ``newest_ns``, the others as long before as they were sent
     before it. ``sent_ns`` is by the sender's clock; where it tells of a longer time than there was, that is shared out.
     """
@@ -211,8 +216,8 @@ def _reliable() -> Qos:
     return Qos(reliable, Policy.Durability.Volatile, Policy.History.KeepLast(_DEPTH), *_COMMON)
 
 
-def _graph_quality() -> Qos:
-    """As rmw_dds_common has it."""
+def _latched_output() -> Qos:
+    """The last message, kept for late subscribers: the graph's quality in rmw_dds_common too."""
     reliable = Policy.Reliability.Reliable(duration(milliseconds=1))
     return Qos(reliable, Policy.Durability.TransientLocal, Policy.History.KeepLast(1), *_COMMON)
 
@@ -259,10 +264,10 @@ def _bytes_type(kind: str) -> type[Any]:
 
 
 @contextlib.contextmanager
-def _bound_to(interface: str) -> Any:
+def _bind_to(interface: str) -> Any:
     """Cyclone sends from the chosen interface, but receives on all of them: bind the sockets that it opens to the loopback device.
 
-    Raises `DoorError` where that cannot be done.
+    Raises `TransportError` where that cannot be done.
     """
     before = _sockets()
     yield
@@ -274,7 +279,7 @@ def _bound_to(interface: str) -> Any:
                 if opened.type == socket.SOCK_DGRAM:
                     opened.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, LOOPBACK.encode() + b"\0")
             except (AttributeError, OSError) as error:
-                raise DoorError(
+                raise TransportError(
                     f"DDS cannot be restricted to this machine ({error}). If packets of others do no harm: --interface default."
                 ) from error
             finally:

@@ -11,7 +11,7 @@ import socket
 from collections.abc import Mapping, Sequence
 from xml.sax.saxutils import quoteattr
 
-from localization.errors import DoorError
+from localization.errors import TransportError
 
 LOOPBACK, DEFAULT = "lo", "default"
 LAST_DOMAIN = 230
@@ -32,10 +32,12 @@ _ASKING = (
 
 
 def default_domain(environment: Mapping[str, str] = os.environ) -> int:
-    """ROS 2's domain by ROS_DOMAIN_ID, 0 without it. Raises `DoorError`."""
+    """ROS 2's domain by ROS_DOMAIN_ID, 0 without it. Raises `TransportError`."""
     value = environment.get("ROS_DOMAIN_ID") or "0"
     if not (value.isdecimal() and int(value) <= LAST_DOMAIN):
-        raise DoorError(f"ROS_DOMAIN_ID is '{value}'; ROS 2's domains are the numbers 0 to {LAST_DOMAIN}. Set it right, or pass --domain.")
+        raise TransportError(
+            f"ROS_DOMAIN_ID is '{value}'; ROS 2's domains are the numbers 0 to {LAST_DOMAIN}. Correct it, or pass --domain."
+        )
     return int(value)
 
 
@@ -43,7 +45,7 @@ def choose_interface(interface: str | None, environment: Mapping[str, str] = os.
     """`lo`, `default`, or the name or address of one network interface.
 
     ``interface``: `lo` or `localhost`, `default` (what ROS_LOCALHOST_ONLY and ROS_AUTOMATIC_DISCOVERY_RANGE demand, the subnet without
-    them), a device or an address; None as `default`, but `lo` where neither variable is set. Raises `DoorError`.
+    them), a device or an address; None as `default`, but `lo` where neither variable is set. Raises `TransportError`.
     """
     if interface in _LOOPBACK_NAMES:
         return LOOPBACK
@@ -53,7 +55,7 @@ def choose_interface(interface: str | None, environment: Mapping[str, str] = os.
     if interface not in devices and not _is_address(interface):
         near = difflib.get_close_matches(interface, [*devices, *_LOOPBACK_NAMES, DEFAULT], n=1)
         nearest = f" Did you mean '{near[0]}'?" if near else ""
-        raise DoorError(
+        raise TransportError(
             f"DDS cannot be used on interface '{interface}': there are {', '.join(devices)}.{nearest} "
             "--interface also takes localhost, default, or an address of this machine."
         )
@@ -70,9 +72,9 @@ def _interface_of_environment(environment: Mapping[str, str], unset: str) -> str
     if reach not in _RANGES:
         near = difflib.get_close_matches(reach, _RANGES, n=1)
         nearest = f" Did you mean {near[0]}?" if near else ""
-        raise DoorError(f"ROS_AUTOMATIC_DISCOVERY_RANGE is '{reach}'; it may be {', '.join(_RANGES)}.{nearest}")
+        raise TransportError(f"ROS_AUTOMATIC_DISCOVERY_RANGE is '{reach}'; it may be {', '.join(_RANGES)}.{nearest}")
     if reach == "OFF":
-        raise DoorError(
+        raise TransportError(
             "ROS_AUTOMATIC_DISCOVERY_RANGE is OFF: no topic can be discovered. Set it to LOCALHOST or SUBNET, or pass --interface."
         )
     return LOOPBACK if reach == "LOCALHOST" else DEFAULT

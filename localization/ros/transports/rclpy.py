@@ -8,35 +8,37 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from localization.errors import DoorError
-from localization.ros.transports.base import Received
+from localization.errors import TransportError
+from localization.ros.transports.base import MonotonicTime, Received, ServiceHandler
 
 _LATEST, _LATCHED_DEPTH, _DEPTH = 50, 100, 10
 _MESSAGE_PACKAGES = ("sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "tf2_msgs")
+_SERVICE_PACKAGES = ("std_srvs",)
 
 
 def import_rclpy(*parts: str) -> list[Any]:
-    """rclpy's modules ``parts`` (`""` for rclpy itself), where all packages of messages are there too. Raises `DoorError`."""
+    """rclpy's modules ``parts`` (`""` for rclpy itself), where all packages of messages are there too. Raises `TransportError`."""
     try:
         found = [importlib.import_module(f"rclpy.{part}".rstrip(".")) for part in parts]
     except ImportError as error:
-        raise DoorError(f"rclpy cannot be imported ({error}): source a ROS 2 installation, or use --door dds.") from error
+        raise TransportError(f"rclpy cannot be imported ({error}): source a ROS 2 installation, or use --door dds.") from error
     missing = [package for package in _MESSAGE_PACKAGES if not _is_importable(f"{package}.msg")]
+    missing += [package for package in _SERVICE_PACKAGES if not _is_importable(f"{package}.srv")]
     if missing:
         distro = os.environ.get("ROS_DISTRO", "$ROS_DISTRO")
         names = " ".join(f"ros-{distro}-{package.replace('_', '-')}" for package in missing)
-        raise DoorError(f"rclpy is there, but not its {', '.join(missing)}: apt install {names}, or use --door dds.")
+        raise TransportError(f"rclpy is there, but not its {', '.join(missing)}: apt install {names}, or use --door dds.")
     return found
 
 
-class RclpyTransport:
+class RclpyTransport(MonotonicTime):
     """See `Transport`. Domain, interfaces and middleware are those of the ROS environment."""
 
     is_ros1 = False
     place, elsewhere = "the ROS environment's domain", "Is ROS_DOMAIN_ID the robot's?"
 
     def __init__(self, name: str = "skidloc", namespace: str = "/") -> None:
-        """A node of its own. Raises `DoorError` where no ROS 2 is sourced."""
+        """A node of its own. Raises `TransportError` where no ROS 2 is sourced."""
         rclpy, signals = import_rclpy("", "signals")
         # Signals are the command's: with rclpy's handlers, Ctrl-C raises out of whatever waits.
         rclpy.init(args=[], signal_handler_options=signals.SignalHandlerOptions.NO)
@@ -58,6 +60,7 @@ class RclpyTransport:
         self._received: list[Received] = []
         self._subscriptions: dict[str, Any] = {}
         self._writers: dict[str, Any] = {}
+        self._services: list[Any] = []
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         q = self._qos
@@ -70,14 +73,26 @@ class RclpyTransport:
         def on_message(data: bytes) -> None:
             self._received.append(Received(topic, time.monotonic_ns(), bytes(data)))
 
-        self._subscriptions[topic] = self._node.create_subscription(_message_class(kind), topic, on_message, quality, raw=True)
+        self._subscriptions[topic] = self._node.create_subscription(_interface_class(kind), topic, on_message, quality, raw=True)
 
-    def keep(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
+    def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
         for topic in set(self._subscriptions) - set(topics):
             self._node.destroy_subscription(self._subscriptions.pop(topic))
 
-    def advertise(self, topic: str, kind: str) -> None:
-        self._writers[topic] = self._node.create_publisher(_message_class(kind), topic, _DEPTH)
+    def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
+        q = self._qos
+        latched = q.QoSProfile(depth=1, reliability=q.ReliabilityPolicy.RELIABLE, durability=q.DurabilityPolicy.TRANSIENT_LOCAL)
+        self._writers[topic] = self._node.create_publisher(_interface_class(kind), topic, latched if is_latched else _DEPTH)
+
+    def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
+        def answer(request: Any, response: Any) -> Any:
+            reply = handler(getattr(request, "data", True))
+            if hasattr(response, "success"):
+                response.success, response.message = reply
+            return response
+
+        self._services.append(self._node.create_service(_interface_class(kind), name, answer))
+        return True
 
     def publish(self, topic: str, data: bytes) -> None:
         self._writers[topic].publish(data)
@@ -107,20 +122,23 @@ class RclpyTransport:
             self._rclpy.try_shutdown()
 
     def release(self) -> None:
-        """End all subscriptions and publishers; others may follow."""
+        """End all subscriptions, publishers and services; others may follow."""
         for topic in list(self._subscriptions):
             self._node.destroy_subscription(self._subscriptions.pop(topic))
         for topic in list(self._writers):
             self._node.destroy_publisher(self._writers.pop(topic))
+        while self._services:
+            self._node.destroy_service(self._services.pop())
 
     def _infos(self, topic: str) -> Sequence[Any]:
         own = self._node.get_name(), self._node.get_namespace()
         return [info for info in self._node.get_publishers_info_by_topic(topic) if (info.node_name, info.node_namespace) != own]
 
 
-def _message_class(kind: str) -> Any:
-    package, _, name = kind.split("/")
-    return getattr(importlib.import_module(f"{package}.msg"), name)
+def _interface_class(kind: str) -> Any:
+    """The class of a message or service, `pkg/msg/Type` or `pkg/srv/Type`."""
+    package, group, name = kind.split("/")
+    return getattr(importlib.import_module(f"{package}.{group}"), name)
 
 
 def _is_importable(module: str) -> bool:

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
 
-from localization.errors import DoorError
+from localization.errors import TransportError
 from localization.logs.serialization import definition
-from localization.ros.transports.base import Received
+from localization.ros.transports.base import MonotonicTime, Received
 
 _DEBIAN = Path("/usr/lib/python3/dist-packages")
 _LATEST = 100
@@ -31,45 +31,45 @@ def _import(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise DoorError(
+        raise TransportError(
             f"ROS 1 needs rospy, which cannot be imported ({error}): apt install python3-rospy, or source /opt/ros/.../setup.bash."
         ) from error
 
 
-class RospyTransport:
+class RospyTransport(MonotonicTime):
     """See `Transport`."""
 
     is_ros1 = True
     elsewhere = "Is ROS_MASTER_URI the robot's?"
 
     def __init__(self, node: str = "skidloc") -> None:
-        """Raises `DoorError` where rospy or the master is not there."""
+        """Raises `TransportError` where rospy or the master is not there."""
         self._rospy, graph = _import("rospy"), _import("rosgraph")
         uri = os.environ.setdefault("ROS_MASTER_URI", "http://127.0.0.1:11311")
         if not graph.is_master_online():
-            raise DoorError(f"no ROS 1 master answers at {uri}. Start roscore, or set ROS_MASTER_URI.")
+            raise TransportError(f"no ROS 1 master answers at {uri}. Start roscore, or set ROS_MASTER_URI.")
         if urlparse(uri).hostname in ("localhost", "127.0.0.1"):
             os.environ.setdefault("ROS_IP", "127.0.0.1")  # listen there only
         self.place = f"the graph of {uri}"
         self._master = graph.Master(f"/{node}")
         self._rospy.init_node(node, disable_signals=True, anonymous=True)
-        self._heard: queue.SimpleQueue[Received] = queue.SimpleQueue()
+        self._received: queue.SimpleQueue[Received] = queue.SimpleQueue()
         self._subscribers: dict[str, Any] = {}
         self._writers: dict[str, tuple[Any, type[Any]]] = {}
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         def on_message(message: Any) -> None:
-            self._heard.put(Received(topic, time.monotonic_ns(), message._buff))
+            self._received.put(Received(topic, time.monotonic_ns(), message._buff))
 
         self._subscribers[topic] = self._rospy.Subscriber(topic, self._bytes_type(kind), on_message, queue_size=_LATEST, tcp_nodelay=True)
 
-    def keep(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
+    def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
         for topic in set(self._subscribers) - set(topics):
             self._subscribers.pop(topic).unregister()
 
-    def advertise(self, topic: str, kind: str) -> None:
+    def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
         made = self._bytes_type(kind)
-        self._writers[topic] = self._rospy.Publisher(topic, made, queue_size=10, tcp_nodelay=True), made
+        self._writers[topic] = self._rospy.Publisher(topic, made, queue_size=10, tcp_nodelay=True, latch=is_latched), made
 
     def publish(self, topic: str, data: bytes) -> None:
         writer, made = self._writers[topic]
@@ -80,9 +80,9 @@ class RospyTransport:
     def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
         found = []
         try:
-            found.append(self._heard.get(timeout=timeout_s))
+            found.append(self._received.get(timeout=timeout_s))
             while True:
-                found.append(self._heard.get_nowait())
+                found.append(self._received.get_nowait())
         except queue.Empty:
             return found
 

@@ -6,15 +6,15 @@
 # ---
 
 # %% [markdown]
-# # 7. Corrections that remember the arms' posture
+# # 7. Corrections by the arms' posture
 #
 # **Claim: a robot file that is wrong can be corrected while driving; corrections that are a field over the centre of gravity (`cg_field`)
 # are still there when the arms come back to a posture, where two numbers (`constant`) have to be learned anew each time.**
 #
-# The robot is simulated by the physics of its tyres. Nobody told it that this floor grips 30 % more sideways, nor that its centre of
-# gravity lies 3 cm farther ahead than it was weighed. It drives squares and turns on the spot at their corners; before each lap the arms
-# move on to the next of three postures. The LiDAR is stood in for by the truth with 5 mm and 1 mrad of noise, so that only the models
-# differ.
+# The robot is simulated by the physics of its tyres. Its file does not hold that this floor grips 30 % more sideways, nor that its centre
+# of gravity lies 3 cm farther ahead than it was weighed. It drives squares and turns on the spot at their corners; before each lap the
+# arms move on to the next of three postures. The LiDAR is stood in for by the truth with 5 mm and 1 mrad of noise, so that only the
+# models differ.
 
 # %%
 import math
@@ -29,7 +29,7 @@ from localization.report.notebook import CYCLE, MARKERS, Panel, Series, picture,
 from localization.simulation import Experiment, ExperimentConfig, SensorConfig, Simulation, SimulationConfig, write_simulation
 from localization.simulation.drives import MoveArms, Rest, Route, TurnTo
 from localization.simulation.scanners import ScannerConfig
-from localization.simulation.sensor_suite import START_NS
+from localization.simulation.sensors import START_NS
 from motion_models import load_robot
 
 sys.path.insert(0, "..")
@@ -117,7 +117,7 @@ table(
 # %% [markdown]
 # ## What was learned
 #
-# The rotation scaling k at each posture as believed at the end of each lap. `constant` adds one number to k at all postures, and goes to
+# The rotation scaling k at each posture as estimated at the end of each lap. `constant` adds one number to k at all postures, and goes to
 # and fro with them. `cg_field` bends the curve.
 
 # %%
@@ -146,4 +146,4 @@ picture(*panels)
 #
 # These robots turn on the spot, as those did on which the regressions were measured. On gentle arcs the centre of rotation follows the CG
 # half as far (notebook 8), and no function of the CG alone describes both: such arcs are not used for corrections, and little is
-# gained on a drive that consists of them (`python -m tests.studies.graph_corrections`). The friction model knows about them.
+# gained on a drive that consists of them (`python -m tests.studies.graph_corrections`). The friction model has them.

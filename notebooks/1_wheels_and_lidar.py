@@ -6,9 +6,9 @@
 # ---
 
 # %% [markdown]
-# # 1. Two witnesses of one motion
+# # 1. Wheels and LiDAR measure one motion
 #
-# **Claim: wheels drift, a LiDAR gets lost in a corridor, and each knows what the other does not. Weighed against each other, they are far
+# **Claim: wheels drift, LiDAR odometry diverges in a corridor, and their errors are independent. Weighed by their covariances, they are far
 # better than either.**
 #
 # The log is real: 23 minutes through the ACES building (University of Texas at Austin, recorded by P. Beeson), with a planar laser of 5
@@ -34,8 +34,8 @@ truth = read_reference_file("../tests/data/aces/aces.relations")
 f"{log.duration_s:.0f} s; wheels on {log.sources.wheels.topic}, LiDAR on {log.sources.lidar.topic}"
 
 # %% [markdown]
-# Three estimators hear the same events in the same order, as they would on the robot: the wheels alone, KISS-ICP alone (constant velocity
-# is its only guess), and the filter, which predicts by the wheels, lets scan matching correct it, and learns how much the wheels slip.
+# Three estimators get the same events in the same order, as they would on the robot: the wheels alone, KISS-ICP alone (constant velocity
+# is its only prior), and the filter, which predicts by the wheels, is corrected by scan matching, and estimates how much the wheels slip.
 
 # %%
 model = make_model("diff_drive", robot)
@@ -50,7 +50,7 @@ print(verdict(results, truth))
 
 # %%
 table(
-    ["witness", "mean error [m]", "mean error [deg]", "relations"],
+    ["estimator", "mean error [m]", "mean error [deg]", "relations"],
     *(
         [
             result.run.estimator,
@@ -79,10 +79,10 @@ picture(
 )
 
 # %% [markdown]
-# ## Do the witnesses contradict each other?
+# ## Are the innovations consistent?
 #
-# A filter that knows how wrong both are sees innovations whose normalised square (NIS) is 3 on average, and within the band as a mean of
-# so many. Above it, the LiDAR disagrees with the prediction more than the filter believes possible; below, it was more careful than it
+# A consistent filter has innovations whose normalised square (NIS) is 3 on average, and within the band as a mean of
+# so many. Above it, LiDAR and prediction differ by more than their covariances allow; below, the covariances are larger than they
 # had to be.
 
 # %%
@@ -95,7 +95,8 @@ picture(Panel("time [s]", f"NIS, means of {count}", nis, log_y=True, band=band, 
 # %% [markdown]
 # ## What the filter has learned on the way
 #
-# The wheels' clock is off against the LiDAR's, and the robot turns less than its wheels say. Both came out of the contradiction alone.
+# The wheels' clock is off against the LiDAR's, and the robot turns less than its wheels predict. Both were estimated from the innovations
+# alone.
 
 # %%
 fused = results[-1].run

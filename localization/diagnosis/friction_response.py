@@ -1,7 +1,8 @@
-"""Friction with inertia: how the robot follows its wheels when it accelerates, shifts its load, or stands on a slope.
+"""Twists of the friction model from sample to sample, without derivatives: quasi-static, or with inertia and on a slope.
 
-`motion_models.friction.model` gives the motion that constant wheel rates settle to. Here each wheel sample is one implicit (backward Euler)
-step of `motion_models.friction.dynamics`: stiff contact forces cannot make it unstable, and a long step lands on the settled motion.
+`quasi_static_twists` solves the balance of `motion_models.friction.model` by the same Newton's method; it starts from the sample before
+where the wheels roll at nearly the same proportion. In `dynamic_twists` each wheel sample is one implicit (backward Euler) step of
+`motion_models.friction.dynamics`: stiff contact forces cannot make it unstable, and a long step ends at the quasi-static motion.
 """
 
 from __future__ import annotations
@@ -12,20 +13,60 @@ import numba
 import numpy as np
 
 from motion_models.calibration.maneuvers import IntArray
+from motion_models.errors import ModelError
+from motion_models.friction.contact import CREEP
 from motion_models.friction.dynamics import FrictionDynamics, _accelerations, _Body
-from motion_models.friction.equilibrium import Floor
-from motion_models.friction.model import FrictionModel, check_parameters
+from motion_models.friction.equilibrium import Floor, motion, newton
+from motion_models.friction.model import FrictionModel, check_parameters, loads_at, pull_of, unit_rolls
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
 _CREEP = 3e-3
 _NEWTON = 12
-_BALANCED = 1e-7  # m/s and rad/s
-_GOOD = 0.2  # slopes are good for as long as a step leaves no more than this
+_MAX_RESIDUAL = 1e-7  # m/s and rad/s
+_MIN_REDUCTION = 0.2  # slopes are good for as long as a step leaves no more than this
 _DIFFERENCE = 1e-5
+_MAX_ROLL_CHANGE = 0.02  # of unit rolls between samples, for which the last solution starts the next
 
 
-def settling_twists(
+def quasi_static_twists(model: FrictionModel, params: FloatArray, wheels: FloatArray, cg: FloatArray) -> FloatArray:
+    """Body twists (N, 3) of the tracked point for wheel rates (N, 2), CG (N, 2) and ``params`` (12,), by the contact law of ``model``.
+
+    Raises `CgError` and `ModelError` as `FrictionModel.twist` does.
+    """
+    check_parameters(cg, params)
+    out = np.empty((len(wheels), 3))
+    _solve_quasi_static(wheels, cg, params, model.floor(params), float(model.centripetal), out)
+    lost = np.isnan(out[:, 2]) & np.isfinite(wheels).all(axis=1)
+    if np.any(lost):
+        raise ModelError(f"no balance of forces found for {np.count_nonzero(lost)} of {lost.size} samples.")
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _solve_quasi_static(wheels: FloatArray, cg: FloatArray, params: FloatArray, floor: Floor, centripetal: float, out: FloatArray) -> None:
+    radius, mu, warp, tracked_x, tracked_y = params[0], params[3], params[8], params[10], params[11]
+    vx = vy = wz = previous_l = previous_r = 0.0
+    for i in range(wheels.shape[0]):
+        speed, roll_l, roll_r = unit_rolls(radius, wheels[i, 0], wheels[i, 1])
+        if speed == 0.0:
+            out[i] = 0.0
+            continue
+        load, _ = loads_at(cg[i, 0], cg[i, 1], warp, floor, pull_of(speed, mu, centripetal))
+        found = False
+        if abs(roll_l - previous_l) < _MAX_ROLL_CHANGE and abs(roll_r - previous_r) < _MAX_ROLL_CHANGE:
+            vx, vy, wz, found = newton(vx, vy, wz, roll_l, roll_r, load, floor, CREEP)
+        if not found:
+            vx, vy, wz, found = motion(roll_l, roll_r, load, floor)
+        if not found:
+            out[i] = math.nan
+            previous_l = previous_r = 0.0
+            continue
+        previous_l, previous_r = roll_l, roll_r
+        out[i, 0], out[i, 1], out[i, 2] = (vx - wz * tracked_y) * speed, (vy + wz * tracked_x) * speed, wz * speed
+
+
+def dynamic_twists(
     robot: Robot,
     model: FrictionModel,
     params: FloatArray,
@@ -35,12 +76,12 @@ def settling_twists(
     first: IntArray,
     headings: FloatArray,
     slope: tuple[float, float],
-    settled: FloatArray,
+    quasi_static: FloatArray,
 ) -> FloatArray:
     """Body twists (N, 3) of the wheelbase's centre for wheel rates (N, 2) in intervals ``dt`` (N,), CG (N, 2), ``params`` (12,).
 
     The contact law is that of ``model``. Maneuvers begin at ``first`` (W + 1,), with the ``headings`` (W,) [rad]; ``slope`` is by how much
-    the floor rises along the x and y axes in which headings count [rad]. ``settled`` (N, 3) are the twists without inertia: where each
+    the floor rises along the x and y axes in which headings count [rad]. ``quasi_static`` (N, 3) are the twists without inertia: where each
     maneuver starts, and the result where no step is found. Raises `CgError` and `ModelError` as `FrictionModel` does.
     """
     check_parameters(cg, params)
@@ -57,7 +98,7 @@ def settling_twists(
         dynamics.rest_speed,
     )
     out = np.empty((len(dt), 3))
-    _settle(dt, wheels, cg, first, headings, np.array(slope), settled, model.floor(params), body, out)
+    _integrate(dt, wheels, cg, first, headings, np.array(slope), quasi_static, model.floor(params), body, out)
     return out
 
 
@@ -65,25 +106,25 @@ TRACKED = tuple(FrictionModel.param_names.index(name) for name in ("tracked_x", 
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _settle(
+def _integrate(
     dt: FloatArray,
     wheels: FloatArray,
     cg: FloatArray,
     first: IntArray,
     headings: FloatArray,
     slope: FloatArray,
-    settled: FloatArray,
+    quasi_static: FloatArray,
     floor: Floor,
     body: _Body,
     out: FloatArray,
-) -> None:  # pragma: no cover
+) -> None:
     state, influence = np.zeros(6), np.zeros(13)
     influence[12] = body.height
     jacobian, off, off_tried, tried = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     weight = body.mass * body.gravity
     for w in range(first.shape[0] - 1):
         heading = headings[w]
-        before = settled[first[w]].copy()
+        before = quasi_static[first[w]].copy()
         fresh = True  # the slopes are of another drive, or of none
         for i in range(first[w], first[w + 1]):
             q_l, q_r, h = wheels[i, 0], wheels[i, 1], dt[i]
@@ -96,21 +137,21 @@ def _settle(
             influence[7] = -weight * (c * slope[0] + s * slope[1])
             influence[8] = -weight * (-s * slope[0] + c * slope[1])
             influence[10], influence[11] = cg[i, 0], cg[i, 1]
-            # start as far from the settled motion as the sample before was, or from it; by the slopes of the sample before, if they do
+            # start as far from the quasi_static motion as the sample before was, or from it; by the slopes of the sample before, if they do
             found = False
             for start in range(2):
-                now = settled[i].copy()
+                now = quasi_static[i].copy()
                 if start == 0 and i > first[w]:
-                    now += before - settled[i - 1]
+                    now += before - quasi_static[i - 1]
                 size = _misfit(now, before, h, q_l, q_r, state, influence, floor, body, off)
                 for _ in range(_NEWTON):
-                    if size < _BALANCED:
+                    if size < _MAX_RESIDUAL:
                         break
                     if not fresh:
                         d0, d1, d2, regular = _solve(jacobian, off)
                         tried[0], tried[1], tried[2] = now[0] - d0, now[1] - d1, now[2] - d2
                         new = _misfit(tried, before, h, q_l, q_r, state, influence, floor, body, off_tried) if regular else math.inf
-                        if new < _GOOD * size:
+                        if new < _MIN_REDUCTION * size:
                             now[:] = tried
                             off[:] = off_tried
                             size = new
@@ -142,7 +183,7 @@ def _settle(
                     found = True
                     break
                 fresh = True
-            out[i] = now if found else settled[i]
+            out[i] = now if found else quasi_static[i]
             before[:] = out[i]
             heading += out[i, 2] * h
 
@@ -159,7 +200,7 @@ def _misfit(
     floor: Floor,
     body: _Body,
     off: FloatArray,
-) -> float:  # pragma: no cover
+) -> float:
     """Fill ``off`` (3,) with how far ``twist`` is off a backward Euler step [m/s, m/s, rad/s]; its length."""
     state[3], state[4], state[5] = twist[0], twist[1], twist[2]
     a_x, a_y, a_w, _ = _accelerations(state, q_l, q_r, influence, floor, body)
@@ -168,7 +209,7 @@ def _misfit(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _solve(a: FloatArray, b: FloatArray) -> tuple[float, float, float, bool]:  # pragma: no cover
+def _solve(a: FloatArray, b: FloatArray) -> tuple[float, float, float, bool]:
     """x of a x = b, by Cramer's rule."""
     c0 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
     c1 = a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2]

@@ -1,0 +1,427 @@
+"""Consistency of the sensors with each other: wheels, gyro and LiDAR each measure the same motion.
+
+The turn rates of the three, and the direction of travel by wheels and LiDAR, are compared over the last seconds. A sensor that contradicts
+the two others is left out from then on; where only two can be compared, the covariance takes both into account. Each fault gives a warning
+with sensor, time and remedy, and widens the published covariance by the difference that it has made so far.
+
+The LiDAR's motion is that of `lidar.scan_motion`, which uses neither the filter nor the other sensors.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from localization.estimators import Estimate
+from localization.events import ImuSample
+from localization.lidar import LidarConfig, Sweep
+from localization.lidar.own_body import OwnBodyFilter
+from localization.lidar.scan_motion import ScanOdometry
+from localization.step import Step
+from localization.trajectory import Trajectory
+from motion_models import se2
+from motion_models.base import Motion
+from motion_models.robot import Mount
+from motion_models.se2 import FloatArray
+
+_BIN_S = 0.25
+_WINDOW_BINS, _MIN_BINS = 24, 10
+"""Bins that are compared (6 s), and the fewest (2.5 s)."""
+_MIN_LASTING_S = 1.0
+"""Time for which a comparison must give the same result before a sensor is declared faulty."""
+_MAX_BIAS_RAD_S = 0.05
+"""Gyro bias that is no contradiction; ten times the prior sigma of the shipped robots."""
+_MIN_RATE_RAD_S = 0.001
+"""Root mean square of the slower turn rate, from where on signs are compared: none of 65 windows of the Husky outdoors, straight or not,
+has a correlation below -0.3."""
+_MIN_T = 4.0
+"""Student's t of a correlation that is no chance."""
+_MIN_EXCITED_RAD_S = 0.03
+"""The same for the scale: above it all windows have correlations of 0.8 and more (Husky outdoors, 32 windows; simulated laps)."""
+_OPPOSITE_CORRELATION, _EQUAL_CORRELATION = -0.6, 0.6
+_REPEATED_RAD_S, _MIN_STUCK_WHEELS_RAD_S = 1e-7, 0.002
+"""A gyro's mean rates never repeat to the last digit, but for its noise; over a whole window it is stuck if the wheels turn at all."""
+_DEG_PER_RAD_RANGE = (25.0, 130.0)
+"""Ratio of turn rates that only a wrong unit explains: 57.3, with the factor of 0.45 to 2.3 by which wheels may be off on loose floor."""
+_MAX_EQUAL_RATIO = 2.5
+_MIN_TRAVEL_M = 0.05
+"""Of wheels and LiDAR in a bin, for its direction to count."""
+_MIN_TRAVEL_BINS = 6
+_MAX_CURVATURE_RAD_M = 0.6
+"""Sharper turns slide sideways."""
+_MAX_DIRECTION_RAD, _MIN_COHERENCE = math.radians(12.0), 0.9
+"""Honest drives (ACES) have 0.5 deg over 340 pairs of scans; a robot on a side slope or in curves slides by a few degrees."""
+_MIN_OWN_SHARE = 0.02
+_STANDING_SPEED_M_S = 0.1
+_SHAKE_M_S2, _SHAKE_SAMPLES = 0.4, 20
+"""Standard deviation of the specific force over a second: Husky outdoors at rest 0.005 to 0.11, driving 0.51 to 1.6 (5 to 95 %)."""
+_SHAKE_S = 2.0
+_UNKNOWN_SPEED = np.array([0.5, 0.5, 0.5])
+"""Sigma of a twist that no sensor measures [m/s, m/s, rad/s], as `StepConfig.lost_speed_m_s`."""
+_NS = 1e-9
+
+
+class Fault(Enum):
+    """What is wrong, and what to do."""
+
+    GYRO_OPPOSITE = "the gyro turns opposite to {others}. It is not used from then on. Correct the IMU's mount, or the sign in its driver."
+    GYRO_UNIT = (
+        "the gyro's rates are {ratio:.2g} times those of {others} (deg/s?). It is not used from then on. Let its driver publish rad/s."
+    )
+    GYRO_STUCK = "the gyro repeats one value while {others} turn. It is not used as long as that lasts. Check the IMU and its driver."
+    WHEELS_OPPOSITE = (
+        "the wheels turn opposite to {others}. They are not used from then on. Swap left and right in the robot file's [joints]."
+    )
+    LIDAR_OPPOSITE = (
+        "the LiDAR turns opposite to {others}. Its scans are not used from then on. It is mounted upside down, or left and right wheels are"
+        " swapped: correct the roll of its frame in /tf_static or in the robot file's [mounts], or the robot file's [joints]."
+    )
+    LIDAR_DIRECTION = (
+        "by the LiDAR the robot travels {degrees:.0f} deg to the {side} of where the wheels drive. Its scans are not used from then on."
+        " Correct the yaw of its frame by {correction:+.0f} deg in /tf_static or in the robot file's [mounts]."
+    )
+    LIDAR_OWN_BODY = (
+        "{percent:.0f} % of the LiDAR's points are the robot itself (same ranges while it drives and turns). They are left out"
+        " from then on. Remove what covers the LiDAR, or filter these beams in its driver (laser_filters)."
+    )
+    WHEELS_STANDING = (
+        "the wheels read zero while {others} moved. They count as unknown there. Check the encoders, the driver of the wheels and the"
+        " joints' names in the robot file's [joints]."
+    )
+
+
+@dataclass(frozen=True)
+class Found:
+    """A fault with its time and numbers."""
+
+    fault: Fault
+    at_s: float
+    """After the first step [s]."""
+    message: str
+
+
+class _Bin(NamedTuple):
+    """Motion over a quarter of a second or more."""
+
+    duration_s: float
+    wheels: FloatArray
+    """(3,) by the wheels; NaN where they were missing."""
+    gyro: float
+    """Turn [rad]; NaN where it was missing."""
+    lidar: FloatArray
+    """(3,) by the scans; NaN where unknown, translation where the scene does not show it."""
+    is_standing: bool
+
+
+class _Relation(NamedTuple):
+    """How the turn rates of two sensors relate: correlation, and ratio of the second to the first."""
+
+    correlation: float
+    ratio: float
+    is_excited: bool
+    """Both turn enough for a scale."""
+    t: float
+    """Student's t of the correlation."""
+
+    @property
+    def is_equal(self) -> bool:
+        return self.is_excited and self.correlation >= _EQUAL_CORRELATION and 1.0 / _MAX_EQUAL_RATIO <= self.ratio <= _MAX_EQUAL_RATIO
+
+    @property
+    def is_opposite(self) -> bool:
+        return self.correlation <= _OPPOSITE_CORRELATION and self.t <= -_MIN_T
+
+
+_NO_RELATION = _Relation(0.0, 1.0, False, 0.0)
+
+
+class SensorChecks:
+    """`apply` to each step before the estimator, `widen` its estimate afterwards."""
+
+    def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig) -> None:
+        self._mounts, self._config = mounts, config
+        self._scans, self._own_body = ScanOdometry(), OwnBodyFilter()
+        self._bins: deque[_Bin] = deque(maxlen=_WINDOW_BINS)
+        self._open = _Accumulator()
+        self._is_gyro_stuck = False
+        self._shaking = ShakeDetector()
+        self._suspected: dict[Fault, tuple[float, float]] = {}  # when first found, and start of the bins then [s]
+        self.found: dict[Fault, Found] = {}
+        self._start_ns: int | None = None
+        self._standing_s = 0.0  # time for which the wheels' standstill is contradicted
+        self._pose: FloatArray | None = None
+        self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)  # motion since the sensors last agreed
+        self._pending = np.zeros((3, 3))
+        self._spread = np.zeros((3, 3))
+        self._spread_since_ns: int | None = None
+
+    def insert_imu(self, sample: ImuSample) -> None:
+        """Specific force shows whether the robot moves."""
+        self._shaking.insert(sample)
+
+    def apply(self, step: Step) -> Step:
+        """``step`` without the sensors that are faulty, and with the motion of wheels in doubt widened."""
+        if self._start_ns is None:
+            self._start_ns = step.start_ns
+        step = self._without_own_body(step)
+        self._record(step)
+        if self.found:
+            step = self._without_faulty(step)
+        return self._check_standstill(step)
+
+    def widen(self, estimate: Estimate) -> Estimate:
+        """``estimate`` with the covariance of what faulty sensors have done to it."""
+        own = estimate.pose if estimate.odometry is None else estimate.odometry[0]
+        delta = np.zeros(3) if self._pose is None else se2.between(self._pose, own)
+        self._pose, self._estimated = own, se2.compose(self._estimated, delta)
+        A = se2.adjoint(se2.inverse(delta))
+        self._spread = A @ self._spread @ A.T + self._pending
+        self._pending = np.zeros((3, 3))
+        if not self._spread.any():
+            return estimate
+        if self._spread_since_ns is None:
+            self._spread_since_ns = estimate.stamp_ns
+        cov = None if estimate.covariance is None else estimate.covariance + self._spread
+        odometry = estimate.odometry
+        if odometry is not None and odometry[1] is not None:
+            odometry = odometry[0], odometry[1] + self._spread
+        return replace(estimate, covariance=cov, odometry=odometry)
+
+    def widen_trajectory(self, smoothed: Trajectory) -> Trajectory:
+        """``smoothed`` with the same covariance at its end, from the first fault on, in the world's axes."""
+        if self._spread_since_ns is None or smoothed.covariances is None:
+            return smoothed
+        covariances = smoothed.covariances.copy()
+        world = _turned(self._spread, float(smoothed.poses[-1, 2]))
+        for i in np.flatnonzero(smoothed.stamps_ns >= self._spread_since_ns):
+            covariances[i] += _turned(world, -float(smoothed.poses[i, 2]))
+        return Trajectory(smoothed.stamps_ns, smoothed.poses, covariances)
+
+    def warnings(self) -> list[str]:
+        """Faults so far."""
+        return [f"at t = {found.at_s:.1f} s: {found.message}" for found in self.found.values()]
+
+    def _without_own_body(self, step: Step) -> Step:
+        self._own_body.add_motion(step.predicted.delta)
+        if step.scan is None:
+            return step
+        scan = self._own_body.filter(step.scan)
+        if self._own_body.share > _MIN_OWN_SHARE:
+            self._declare(Fault.LIDAR_OWN_BODY, self._now_s(step), {"percent": 100.0 * self._own_body.share})
+        return replace(step, scan=scan)
+
+    def _without_faulty(self, step: Step) -> Step:
+        faults = self.found.keys()
+        if faults & {Fault.GYRO_OPPOSITE, Fault.GYRO_UNIT} or (self._is_gyro_stuck and Fault.GYRO_STUCK in faults):
+            step = replace(step, turn=None)
+        if faults & {Fault.LIDAR_OPPOSITE, Fault.LIDAR_DIRECTION}:
+            step = replace(step, scan=None)
+        if Fault.WHEELS_OPPOSITE in faults:
+            step = self._with_unknown_motion(step, step.duration**2)
+        return step
+
+    def _check_standstill(self, step: Step) -> Step:
+        """Wheels that read zero while LiDAR or IMU show motion count as unknown, for as long as that lasts."""
+        if not step.is_standing:
+            self._standing_s = 0.0
+            return step
+        travelled = sum(math.hypot(b.lidar[0], b.lidar[1]) for b in self._recent() if b.is_standing and np.isfinite(b.lidar[0]))
+        lasted = sum(b.duration_s for b in self._recent() if b.is_standing and np.isfinite(b.lidar[0]))
+        is_lidar_moving = lasted >= 1.0 and travelled >= _STANDING_SPEED_M_S * lasted
+        has_lidar = lasted > 0.0
+        if not is_lidar_moving and (has_lidar or self._shaking.lasted_s < _SHAKE_S):
+            self._standing_s = 0.0
+            return step
+        before = self._standing_s
+        self._standing_s = before + step.duration if before else max(_SHAKE_S, step.duration)
+        others = "the LiDAR" if is_lidar_moving else "the IMU shakes as if it"
+        self._declare(Fault.WHEELS_STANDING, self._now_s(step) - self._standing_s, {"others": others})
+        return self._with_unknown_motion(step, self._standing_s**2 - before**2)
+
+    def _with_unknown_motion(self, step: Step, seconds2: float) -> Step:
+        """``step`` with the covariance of a lasting unknown twist, which grows by ``seconds2`` [s^2]."""
+        motion = step.predicted
+        cov = motion.cov + np.diag(_UNKNOWN_SPEED**2) * seconds2
+        return replace(step, predicted=Motion(motion.delta, cov, motion.d_params), is_standing=False, has_wheels=False)
+
+    def _recent(self) -> list[_Bin]:
+        return list(self._bins)[-8:]
+
+    def _now_s(self, step: Step) -> float:
+        return (step.end_ns - (self._start_ns or 0)) * _NS
+
+    def _record(self, step: Step) -> None:
+        """Add ``step`` to the open bin; close it where it is long enough, at a scan if there are any."""
+        self._by_wheels = se2.compose(self._by_wheels, step.predicted.delta)
+        turned = step.predicted.delta.copy()
+        if step.turn is not None:
+            turned[2] = step.turn.angle
+        self._by_gyro = se2.compose(self._by_gyro, turned)
+        self._open.add(step)
+        if self._open.duration_s < _BIN_S or (step.scan is None and self._open.duration_s < 2.0 * _BIN_S):
+            return
+        lidar = np.full(3, np.nan)
+        if step.scan is not None:
+            mount = self._mounts.get(step.scan.frame_id, Mount())
+            sweep = Sweep.from_scan(step.scan, mount).within(self._config.min_range_m, self._config.max_range_m)
+            motion = self._scans.register(sweep.project(sweep.points), np.array([mount.x, mount.y]))
+            if motion is not None and self._open.has_scan_at_start:
+                lidar = motion.delta if motion.has_translation else np.array([np.nan, np.nan, motion.delta[2]])
+        self._bins.append(self._open.close(lidar))
+        self._open = _Accumulator(has_scan_at_start=step.scan is not None)
+        if len(self._bins) >= _MIN_BINS:
+            self._evaluate(self._now_s(step))
+
+    def _evaluate(self, now_s: float) -> None:
+        """Compare the sensors over the last bins."""
+        seconds = np.array([b.duration_s for b in self._bins])
+        rates = np.array([[b.wheels[2], b.gyro, b.lidar[2]] for b in self._bins]) / seconds[:, None]
+        wheels_gyro, wheels_lidar, lidar_gyro = (_relate(rates[:, i], rates[:, j]) for i, j in ((0, 1), (0, 2), (2, 1)))
+        suspects = dict(_find_turn_faults(wheels_gyro, wheels_lidar, lidar_gyro))
+        self._is_gyro_stuck = _is_constant(rates[:, 1], rates[:, 0])
+        if self._is_gyro_stuck:
+            suspects[Fault.GYRO_STUCK] = {"others": "the wheels"}
+        if (direction := _travel_direction(list(self._bins))) is not None and abs(direction) > _MAX_DIRECTION_RAD:
+            degrees = math.degrees(direction)
+            side = "left" if degrees > 0.0 else "right"
+            suspects[Fault.LIDAR_DIRECTION] = {"degrees": abs(degrees), "side": side, "correction": -degrees}
+        first = now_s, max(now_s - float(seconds.sum()), 0.0)
+        self._suspected = {fault: self._suspected.get(fault, first) for fault in suspects}
+        for fault, (first_s, since_s) in self._suspected.items():
+            if now_s - first_s >= _MIN_LASTING_S:
+                self._declare(fault, since_s, suspects[fault])
+        if not suspects and (wheels_gyro.is_equal or wheels_lidar.is_equal or lidar_gyro.is_equal):
+            self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)
+
+    def _declare(self, fault: Fault, at_s: float, numbers: Mapping[str, float | str]) -> None:
+        """Report ``fault`` once, and widen the covariance by how far the estimate is from the other sensors' dead reckoning."""
+        if fault in self.found:
+            return
+        self.found[fault] = Found(fault, max(at_s, 0.0), fault.value.format(**numbers))
+        if fault == Fault.WHEELS_STANDING:
+            return
+        is_gyro = fault in (Fault.GYRO_OPPOSITE, Fault.GYRO_STUCK, Fault.GYRO_UNIT)
+        difference = se2.log(se2.between(self._estimated, self._by_wheels if is_gyro else self._by_gyro))
+        self._pending = self._pending + np.outer(difference, difference)
+
+
+@dataclass
+class _Accumulator:
+    """The open bin."""
+
+    has_scan_at_start: bool = False
+    duration_s: float = 0.0
+    _wheels: FloatArray | None = None
+    _gyro: float = 0.0
+    _is_standing: bool = True
+
+    def add(self, step: Step) -> None:
+        if step.duration == 0.0:
+            return
+        self.duration_s += step.duration
+        delta = step.predicted.delta if step.has_wheels else np.full(3, np.nan)
+        self._wheels = delta if self._wheels is None else se2.compose(self._wheels, delta)
+        self._gyro += math.nan if step.turn is None else step.turn.angle
+        self._is_standing &= step.is_standing
+
+    def close(self, lidar: FloatArray) -> _Bin:
+        wheels = np.full(3, np.nan) if self._wheels is None else self._wheels
+        return _Bin(self.duration_s, wheels, self._gyro, lidar, self._is_standing)
+
+
+class ShakeDetector:
+    """How long the IMU's specific force has varied as it does on a robot that drives."""
+
+    def __init__(self) -> None:
+        self._forces: deque[tuple[int, FloatArray]] = deque(maxlen=400)
+        self._since_ns: int | None = None
+        self._now_ns = 0
+
+    @property
+    def lasted_s(self) -> float:
+        return 0.0 if self._since_ns is None else (self._now_ns - self._since_ns) * _NS
+
+    def insert(self, sample: ImuSample) -> None:
+        """Evaluated once for each second of samples."""
+        self._now_ns = sample.stamp_ns
+        self._forces.append((sample.stamp_ns, sample.linear_acceleration))
+        start_ns = self._forces[0][0]
+        if sample.stamp_ns - start_ns < 1 / _NS:
+            return
+        forces = np.array([force for _, force in self._forces])
+        self._forces.clear()
+        is_shaking = len(forces) >= _SHAKE_SAMPLES and float(np.linalg.norm(forces.std(axis=0))) > _SHAKE_M_S2
+        if not is_shaking:
+            self._since_ns = None
+        elif self._since_ns is None:
+            self._since_ns = start_ns
+
+
+def _relate(a: FloatArray, b: FloatArray) -> _Relation:
+    """Relation of two turn rates (n,), up to a bias of the second [rad/s]."""
+    both = np.isfinite(a) & np.isfinite(b)
+    if both.sum() < _MIN_BINS:
+        return _NO_RELATION
+    a, b = a[both], b[both]
+    b = b - min(max(float((b - a).mean()), -_MAX_BIAS_RAD_S), _MAX_BIAS_RAD_S)
+    size_a, size_b = math.sqrt(float(a @ a) / len(a)), math.sqrt(float(b @ b) / len(b))
+    if min(size_a, size_b) < _MIN_RATE_RAD_S:
+        return _NO_RELATION
+    r = min(max(float(a @ b) / len(a) / (size_a * size_b), -1.0), 1.0)
+    t = r * math.sqrt((len(a) - 2) / max(1.0 - r * r, 1e-9))
+    return _Relation(r, size_b / size_a, min(size_a, size_b) >= _MIN_EXCITED_RAD_S, t)
+
+
+def _find_turn_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation) -> list[tuple[Fault, dict[str, float | str]]]:
+    """Faults by the relations of the turn rates: the sensor that contradicts the two others, or one of two."""
+    found: list[tuple[Fault, dict[str, float | str]]] = []
+    if wheels_gyro.is_opposite and lidar_gyro.is_equal:
+        found.append((Fault.WHEELS_OPPOSITE, {"others": "gyro and LiDAR"}))
+    elif wheels_gyro.is_opposite:
+        found.append((Fault.GYRO_OPPOSITE, {"others": "wheels and LiDAR" if wheels_lidar.is_equal else "the wheels"}))
+    elif wheels_lidar.is_opposite:
+        found.append((Fault.LIDAR_OPPOSITE, {"others": "wheels and gyro" if wheels_gyro.is_equal else "the wheels"}))
+    for relation, others in ((wheels_gyro, "the wheels"), (lidar_gyro, "the LiDAR")):
+        low, high = _DEG_PER_RAD_RANGE
+        is_unit = low <= relation.ratio <= high or low <= 1.0 / max(relation.ratio, 1e-9) <= high
+        if is_unit and relation.correlation >= _EQUAL_CORRELATION:
+            found.append((Fault.GYRO_UNIT, {"others": others, "ratio": relation.ratio}))
+            break
+    return found
+
+
+def _is_constant(gyro: FloatArray, wheels: FloatArray) -> bool:
+    """Whether the gyro's rates (n,) are one and the same value while the wheels' (n,) turn by something else."""
+    both = np.isfinite(gyro) & np.isfinite(wheels)
+    n = int(both.sum())
+    if n < _MIN_BINS or float(np.ptp(gyro[both])) > _REPEATED_RAD_S:
+        return False
+    off = wheels[both] - gyro[both]
+    is_turning = math.sqrt(float(off @ off) / n) > _MAX_BIAS_RAD_S or float(wheels[both].std()) > _MIN_EXCITED_RAD_S
+    return is_turning or (n == _WINDOW_BINS and float(wheels[both].std()) > _MIN_STUCK_WHEELS_RAD_S)
+
+
+def _travel_direction(bins: list[_Bin]) -> float | None:
+    """Direction [rad] of the LiDAR's travel against the wheels', where both agree among themselves; None where it is not known."""
+    rows = [b for b in bins if np.isfinite(b.wheels).all() and np.isfinite(b.lidar).all()]
+    wheels = np.array([complex(b.wheels[0], b.wheels[1]) for b in rows])
+    lidar = np.array([complex(b.lidar[0], b.lidar[1]) for b in rows])
+    turned = np.array([abs(b.wheels[2]) for b in rows])
+    is_long = (np.abs(wheels) >= _MIN_TRAVEL_M) & (np.abs(lidar) >= _MIN_TRAVEL_M) & (turned <= _MAX_CURVATURE_RAD_M * np.abs(wheels))
+    if is_long.sum() < _MIN_TRAVEL_BINS:
+        return None
+    offset = lidar[is_long] * np.conj(wheels[is_long])
+    unit = offset / np.abs(offset)
+    return float(np.angle(offset.sum())) if abs(unit.mean()) >= _MIN_COHERENCE else None
+
+
+def _turned(cov: FloatArray, angle: float) -> FloatArray:
+    c, s = math.cos(angle), math.sin(angle)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(R @ cov @ R.T)

@@ -1,0 +1,44 @@
+"""No kernel is compiled, or loaded, after the warm-up: checked in a process of its own, in which none is yet."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+CODE = """
+import sys
+from numba.core.registry import CPUDispatcher
+from localization.ros.jit_warm_up import warm_up
+from localization.ros.node import Node
+from localization.ros.settings import LiveRun, NodeConfig
+from localization.ros.session_files import Files
+from localization.pipeline import Trial
+from motion_models.registry import make_model
+from tests.helpers.online import ROBOT, LogTransport, drive_log
+
+def compiled():
+    modules = [m for name, m in sys.modules.items() if name.startswith(("localization", "motion_models"))]
+    kernels = {id(v): v for m in modules for v in vars(m).values() if isinstance(v, CPUDispatcher)}
+    return {f"{k.py_func.__module__}.{k.py_func.__name__}": len(k.overloads) for k in kernels.values()}
+
+transport = LogTransport(drive_log())
+trial = Trial(make_model(sys.argv[2], ROBOT), sys.argv[1])
+run = LiveRun(ROBOT, lambda has_lidar: trial, node=NodeConfig(wait_s=0.0))
+warm_up(run)
+before = compiled()
+node = Node.start(transport, run, print)
+node.spin(transport.is_empty)
+node.finish()
+after = compiled()
+assert before["localization.lidar.scan_matcher._align"] == 1, before
+print("compiled late:", {name: n for name, n in after.items() if n > before.get(name, 0)})
+"""
+
+
+@pytest.mark.parametrize(("estimator", "model"), [("ekf", "skid_steer"), ("graph", "friction")])
+def test_node_compiles_nothing_after_the_warm_up(estimator, model):
+    done = subprocess.run([sys.executable, "-c", CODE, estimator, model], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "compiled late: {}"

@@ -1,0 +1,129 @@
+"""Prediction between scans: in order, continuous but for corrections, and without any effect on the estimates."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+
+from localization.estimators import Estimate
+from localization.events import WheelSample
+from localization.ros.predictor import Predictor
+from localization.ros.publisher import ODOMETRY, POSE, PREDICTED_ODOMETRY
+from localization.ros.session_files import Files
+from localization.ros.settings import NodeConfig
+from localization.ros.transforms import TF
+from localization.trajectory import read_tum
+from motion_models import se2
+from motion_models.registry import make_model
+from tests.helpers.online import ROBOT, LogTransport, drive_log, published, run_node, stamp_of, track
+
+S = 1_000_000_000
+pytestmark = pytest.mark.xdist_group("online")
+
+
+@functools.cache
+def driven(estimator, predict):
+    transport = LogTransport(drive_log())
+    return transport, run_node(transport, estimator, config=NodeConfig(wait_s=0.0, predict=predict))[0]
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "graph"])
+def test_odometry_is_published_at_the_rate_of_the_wheels_in_order(estimator):
+    stamps = np.array([stamp_of(m) for m in published(driven(estimator, True)[0], PREDICTED_ODOMETRY)])
+    assert (np.diff(stamps) > 0).all()
+    assert np.median(np.diff(stamps)) <= 0.0201 * S  # 50 Hz
+    assert np.diff(stamps).max() <= 0.045 * S
+    assert len(stamps) > 3 * len(published(driven(estimator, False)[0], ODOMETRY))
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "graph"])
+def test_estimates_are_the_same_to_the_last_bit_with_prediction(estimator):
+    with_prediction, without = (track(driven(estimator, predict)[0]) for predict in (True, False))
+    assert list(with_prediction) == list(without)
+    for stamp in without:
+        assert np.array_equal(with_prediction[stamp][0], without[stamp][0])
+        assert np.array_equal(with_prediction[stamp][1], without[stamp][1])
+
+
+def test_output_is_the_same_to_the_last_byte_with_prediction(tmp_path):
+    for predict in (True, False):
+        transport = LogTransport(drive_log())
+        node, _ = run_node(transport, files=Files(tmp_path / f"{predict}.tum"), config=NodeConfig(wait_s=0.0, predict=predict))
+        node.finish()
+    assert (tmp_path / "True.tum").read_bytes() == (tmp_path / "False.tum").read_bytes()
+    assert len(read_tum(tmp_path / "True.tum")) > 200
+
+
+def test_odometry_moves_by_no_more_than_motion_and_correction():
+    """0.5 m/s and 1 rad/s are this robot's bounds; corrections of the filter are below 5 mm and 5 mrad here."""
+    messages = list(track(driven("ekf", True)[0], PREDICTED_ODOMETRY).items())
+    stamps, poses = np.array([stamp for stamp, _ in messages]), np.array([pose for _, (pose, _) in messages])
+    step, seconds = se2.between(poses[:-1], poses[1:]), np.diff(stamps) * 1e-9
+    assert (np.hypot(step[:, 0], step[:, 1]) <= 0.6 * seconds + 0.005).all()
+    assert (np.abs(step[:, 2]) <= 1.2 * seconds + 0.005).all()
+
+
+def test_predicted_odometry_has_a_covariance_at_each_stamp():
+    sigmas = np.array([sigma for _, sigma in track(driven("ekf", True)[0], PREDICTED_ODOMETRY).values()])
+    assert (sigmas[-1000:] > 0.0).all()  # the drive begins with a standstill
+    assert sigmas.max() < 0.1
+
+
+def test_transforms_of_a_graph_reach_the_map_at_every_stamp():
+    """`map` -> `odom` is repeated with each transform of the body: else tf2 must extrapolate. Its pose has a covariance of its own."""
+    transport, node = driven("graph", True)
+    links = [(m.transforms[0].header.frame_id, stamp_of(m.transforms[0])) for m in published(transport, TF)]
+    in_odom, in_map = ([stamp for frame, stamp in links if frame == name] for name in ("odom", "map"))
+    assert in_map == in_odom[-len(in_map) :]
+    assert len(in_map) > 0.99 * len(in_odom)
+    last, estimate = published(transport, POSE)[-1], node.session.health.estimate
+    assert last.header.frame_id == "map"
+    assert last.pose.pose.position.x == estimate.pose[0]
+    assert last.pose.covariance[35] == pytest.approx(estimate.covariance[2, 2])
+
+
+def predictor_at(stamp_ns, clock_offset_s=0.0):
+    model = make_model("skid_steer", ROBOT)
+    predictor = Predictor(model, ROBOT, 0.5)
+    cov = np.diag([1e-4, 2e-4, 3e-4])
+    predictor.reset(Estimate(stamp_ns, np.array([1.0, 2.0, 0.5]), cov, np.zeros(3), None), None, clock_offset_s)
+    return predictor
+
+
+def insert_wheels(predictor, begin_ns, count, rate=5.0, period_ns=S // 50):
+    for i in range(count):
+        predictor.insert(WheelSample(begin_ns + i * period_ns, np.full(2, rate), np.full(2, rate * i * period_ns * 1e-9)))
+
+
+def test_predict_straight_motion_moves_ahead_and_widens_the_covariance():
+    predictor = predictor_at(S)
+    insert_wheels(predictor, S, 6)
+    found = predictor.predict()
+    assert found.stamp_ns == S + S // 10
+    ahead = se2.between(np.array([1.0, 2.0, 0.5]), found.pose)
+    speed = 5.0 * ROBOT.geometry.wheel_radius_m
+    assert ahead == pytest.approx([0.1 * speed, 0.0, 0.0], abs=0.01 * speed)
+    assert found.twist[0] == pytest.approx(ahead[0] / 0.1)
+    assert (np.linalg.eigvalsh(found.covariance - np.diag([1e-4, 2e-4, 3e-4]))[-1]) > 0.0
+
+
+def test_predict_uses_the_offset_of_the_wheels_clock():
+    predictor = predictor_at(S, clock_offset_s=0.03)
+    insert_wheels(predictor, S, 6)
+    assert predictor.predict().stamp_ns == S + S // 10 - 3 * S // 100
+
+
+@pytest.mark.parametrize(("begin_ns", "count", "period_ns"), [(0, 2, S // 50), (S, 4, S), (S, 200, S // 50)])
+def test_predict_without_recent_wheels_or_estimate_gives_none(begin_ns, count, period_ns):
+    predictor = predictor_at(S)
+    insert_wheels(predictor, begin_ns, count, period_ns=period_ns)
+    assert predictor.predict() is None
+
+
+def test_predict_after_stop_gives_none():
+    predictor = predictor_at(S)
+    insert_wheels(predictor, S, 6)
+    predictor.stop()
+    assert predictor.predict() is None
