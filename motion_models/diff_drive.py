@@ -31,7 +31,7 @@ class DiffDrive:
     def from_robot(cls, robot: Robot) -> DiffDrive:
         """The robot's driver's own geometry, where its file has no [models.diff_drive]."""
         geometry, driver = robot.geometry, robot.driver
-        # The driver may believe in another track; the product of track and multiplier is what it turns by.
+        # The driver may have another track; the product of track and multiplier is what it turns by.
         multiplier = driver.wheel_separation_multiplier * driver.track_width_m / geometry.track_width_m
         defaults = np.array([geometry.wheel_radius_m, multiplier])
         return cls(geometry.track_width_m, robot.coefficients(cls.name, cls.param_names, defaults))

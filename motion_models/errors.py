@@ -1,4 +1,4 @@
-"""Errors that a user can mend. Each says what was found, where, and what to do; the command line turns them into exit code 2."""
+"""Errors that a user can mend. Each message has what was found, where, and what to do; the command line turns them into exit code 2."""
 
 
 class SkidlocError(Exception):
@@ -14,7 +14,7 @@ class ModelError(SkidlocError):
 
 
 class CalibrationError(SkidlocError):
-    """Data that cannot tell what is asked of them: malformed tables, too few rows, too little motion."""
+    """Data that do not determine what is to be estimated: malformed tables, too few rows, too little motion."""
 
 
 class CgError(SkidlocError):

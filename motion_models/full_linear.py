@@ -26,7 +26,7 @@ _CONVERGED = 1e-12
 
 @dataclass(frozen=True)
 class FullLinear:
-    """A 3x2 matrix from wheel rates to twist, then six optional terms, all 0 unless the robot's file or a fit says otherwise.
+    """A 3x2 matrix from wheel rates to twist, then six optional terms, all 0 unless the robot's file or a fit sets them.
 
     u = vx_left q_l + vx_right q_r     b = vy_left q_l + vy_right q_r     w = wz_left q_l + wz_right q_r
     vx = u (1 - longitudinal_slip_turning |w| - longitudinal_slip_curvature T)
@@ -40,7 +40,7 @@ class FullLinear:
 
     |u| and |w| have no derivative at 0; the mean of both sides (0) is returned there. At standstill T = 0 and the derivative is
     the matrix's, although with `_curvature` terms it depends on the direction in which the wheels set off. The terms are the first of
-    a series: believe them where the brackets stay well above 0.
+    a series: they hold where the brackets stay well above 0.
     """
 
     nominal: FloatArray

@@ -22,7 +22,7 @@ from motion_models.skid_steer import SkidSteer
 
 @dataclass(frozen=True)
 class Icr:
-    """Five parameters: where the three ICRs lie in the body frame [m], and how far each side's tread runs of what its wheels say [-].
+    """Five parameters: where the three ICRs lie in the body frame [m], and the share of its wheels' way that each side's tread runs [-].
 
     At its own ICR a side's tread does not slip lengthwise, so the body moves there as the tread does:
 

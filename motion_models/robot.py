@@ -185,7 +185,7 @@ class Robot:
     options: Mapping[str, Mapping[str, str | bool]] = field(default_factory=dict)
     """Choices by model name, then by `MODEL_OPTIONS`; in the file they stand among the model's coefficients."""
     arms: Arms | None = None
-    """Arms that move the centre of gravity; None where it stays where `Geometry` says."""
+    """Arms that move the centre of gravity; None where it stays at that of `Geometry`."""
     folder: Path | None = field(default=None, compare=False)
     """Where the robot's file is, from which the paths in it start; None for a robot that is shipped. Not in the file."""
 

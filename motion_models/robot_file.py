@@ -39,7 +39,7 @@ def robot_toml(robot: Robot, sigmas: Mapping[str, Mapping[str, float]] | None = 
 
 
 def relocated(robot: Robot, folder: Path) -> Robot:
-    """``robot`` as a file in ``folder`` says it: the paths in it start there. Those of shipped robots hold everywhere."""
+    """``robot`` as a file in ``folder`` has it: the paths in it start there. Those of shipped robots hold everywhere."""
     if robot.arms is None or robot.folder is None:
         return dataclasses.replace(robot, folder=folder)
     start, names = robot.folder, (robot.arms.urdf, robot.arms.postures)

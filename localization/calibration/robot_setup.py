@@ -6,6 +6,7 @@ Every value that is chosen comes with the reason, and what nothing gives is list
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import re
 from collections.abc import Iterable, Mapping
@@ -15,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from localization.logs.chunks import merge_channels
+from localization.logs.chunks import RawMessage, merge_channels
 from localization.logs.decode import frame_name, stamp_ns
 from localization.logs.message_stats import UnusableError
 from localization.logs.reader import open_log
@@ -31,8 +32,10 @@ DRIVE_60_S = (
     "Drive about 60 s for the calibration: stand 3 s; 10 s straight ahead; stand 2 s; 10 s of turning in place to the left; stand 2 s; "
     "10 s of turning in place to the right; stand 2 s; 10 s of arcs to each side; stand 3 s. Use everyday speeds and floor."
 )
-_FIRST_MESSAGES = 200
+_FIRST_JOINT_STATES = 200
+"""Messages in which all joints have been named: wheels and arms often publish separately."""
 _PAIRS = 4000
+"""Joint states and odometry messages to which the driver's constants are fitted."""
 _NOT_THE_DRIVERS = re.compile(
     r"truth|reference|filter|fused|ekf|ukf|gps|gnss|slam|icp|lidar|laser|visual|vio|amcl|map|mocap|vicon", re.IGNORECASE
 )
@@ -107,18 +110,24 @@ def survey_log(path: Path) -> Survey:
     decode = Decoder(channels, is_ros1=source.is_ros1)
     names: dict[str, dict[str, None]] = {}
     frames: dict[str, str] = {}
-    for topic in [topic for topic, (kind, _) in topics.items() if kind in TYPES.values()]:
-        for i, raw in enumerate(source.messages([topic])):
-            message = _decoded(decode, raw)
-            if message is not None:
-                frames.setdefault(topic, frame_name(message.header.frame_id))
-                if topics[topic][0] == TYPES["joint_states"]:
-                    names.setdefault(topic, {}).update(dict.fromkeys(message.name))
-            if i >= (_FIRST_MESSAGES if topics[topic][0] == TYPES["joint_states"] else 5):
-                break
+    for topic, (kind, _) in topics.items():
+        if kind not in TYPES.values():
+            continue
+        is_joints = kind == TYPES["joint_states"]
+        messages = _first_messages(source.messages([topic]), decode, _FIRST_JOINT_STATES if is_joints else 1)
+        if messages:
+            frames[topic] = frame_name(messages[0].header.frame_id)
+        if is_joints:
+            names[topic] = dict.fromkeys(name for message in messages for name in message.name)
     placeholder = Robot("new", Geometry(0.1, 0.5, 0.5, 50.0), Driver(0.1, 0.5))
     mounts = open_log(path, placeholder).mounts
     return Survey(path.name, topics, {topic: tuple(found) for topic, found in names.items()}, frames, mounts)
+
+
+def _first_messages(raws: Iterable[RawMessage], decode: Decoder, count: int) -> list[Any]:
+    """The first ``count`` messages that can be decoded."""
+    decoded = (_decoded(decode, raw) for raw in raws)
+    return list(itertools.islice((message for message in decoded if message is not None), count))
 
 
 def _decoded(decode: Decoder, raw: Any) -> Any:

@@ -28,8 +28,11 @@ _NEEDED = {
 
 @dataclass(frozen=True)
 class Init:
-    """Write a robot file for a new robot: topics, joints, frames, mounts and geometry are guessed and explained. In a terminal, numbers
-    that neither the log nor a URDF has are asked for; elsewhere each has an option."""
+    """Write a robot file for a new robot from a log and a URDF.
+
+    Topics, joints, frames, mounts and geometry are guessed and explained. In a terminal, lengths that neither the log nor a URDF has are
+    asked for; elsewhere each has an option.
+    """
 
     log: tyro.conf.Positional[Path]
     """A log of the robot: ROS 1 .bag, ROS 2 bag folder, or bare .mcap."""

@@ -21,10 +21,10 @@ from motion_models.skid_steer import SkidSteer
 
 @dataclass(frozen=True)
 class Robots:
-    """List the robots that are shipped, or print the file of one, with the source of every number."""
+    """List the robots that are shipped, with the source of every number."""
 
     name: tyro.conf.Positional[str] = ""
-    """Robot whose file is printed; by default all are listed."""
+    """Robot whose file is printed, with the source of every number; by default all are listed."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write the list to this file as well."""
 

@@ -32,7 +32,7 @@ class CenterOfRotation:
     """(2, 2) [m^2]."""
     chi_square: float = 0.0
     """Squared normalized residuals of the poses about this centre; far above ``degrees_of_freedom`` means that the robot did not turn
-    about one point, or that the poses are worse than their covariance says."""
+    about one point, or that the poses are worse than by their covariance."""
     degrees_of_freedom: int = 0
 
 

@@ -36,7 +36,7 @@ class Fit:
     are correlated within a group and a noise model that is wrong; with fewer, the inverse information times the weighted mean square."""
     is_sandwich: bool
     scale: float
-    """Robust size of the whitened residuals: how many times larger than the noise model said the errors are."""
+    """Robust size of the whitened residuals: how many times larger than by the noise model the errors are."""
     cost: float
     """Half the robust sum of squares over the squared scale, prior included."""
     weaknesses: tuple[Weakness, ...]
@@ -116,7 +116,7 @@ def fit(
 
     r, J = problem.residuals(x)
     weights = problem.weights(r, KNEE[config.loss] * scale)
-    # Residuals smaller than the noise model says are luck or simulation: the model's word then counts.
+    # Residuals smaller than by the noise model are luck or simulation: the noise model then counts.
     information = np.einsum("nri,nrj->ij", J, J) / max(scale, 1.0) ** 2
     rate = float(np.sqrt(np.mean(batch.wheels**2)))
     lost = weaknesses(problem.names, problem.sizes, information, lambda b: problem.derive(b, x), rate, batch.cg.mean(axis=0))

@@ -25,7 +25,7 @@ class Weakness:
     combination: dict[str, float]
     """Parameter -> its part in the combination, in units of its size; the largest is 1."""
     spread: float
-    """Sigma of the combination, in the same units; infinite where the drive says nothing of it."""
+    """Sigma of the combination, in the same units; infinite where the drive has no information on it."""
     drive: str
     """The maneuver that would reveal it best; empty where none would."""
     seconds: float
@@ -52,10 +52,10 @@ def weaknesses(
     """Eigenvectors of the scaled ``information`` (c, c) of the parameters ``names`` with a sigma above 1, weakest first.
 
     Scaled means: in units of ``sizes`` (c,), what counts as large for each. Every weak one is held against `candidates` at wheel
-    rates around ``rate`` [rad/s] and ``cg`` (2,) [m], to find the maneuver that would tell most of it.
+    rates around ``rate`` [rad/s] and ``cg`` (2,) [m], to find the maneuver with most information on it.
     """
     values, vectors = np.linalg.eigh(information * np.outer(sizes, sizes))
-    # What double precision cannot tell from nothing at all.
+    # What double precision does not separate from zero.
     unseen = values <= 1e-13 * max(float(values[-1]), 1.0)
     poor = ~unseen & (values < 1.0)
     weak = [(np.inf, vector) for vector in _sparse(vectors[:, unseen].T)]
@@ -123,7 +123,7 @@ def _candidate(wheels: FloatArray, cg: FloatArray, dt: float) -> Maneuver:
 
 
 def _best(derive: Derive, direction: FloatArray, rate: float, cg: FloatArray) -> tuple[str, float]:
-    """The candidate that tells most of the parameters' ``direction`` (c,), and its information; "" where none tells anything."""
+    """The candidate with most information on the parameters' ``direction`` (c,), and its information; "" where none has any."""
     best, gain = "", 0.0
     for text, maneuver in candidates(rate, cg):
         d, cov = derive(make_batch([maneuver]))

@@ -82,7 +82,7 @@ class Problem:
         """How many numbers were measured."""
         self.stretch = _MEDIAN_LENGTH[2] / _MEDIAN_LENGTH[np.maximum(measured.sum(axis=1), 1) - 1]
         if self.components < len(names):
-            raise CalibrationError(f"{len(batch.ends)} measured poses cannot tell {len(names)} parameters; drive more, or fit fewer.")
+            raise CalibrationError(f"{len(batch.ends)} measured poses do not determine {len(names)} parameters; drive more, or fit fewer.")
 
         full = self._full(self.start)
         k = len(start)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,11 +20,10 @@ _MIN_POSES = 20
 """Measured poses below which a variance is not learned: its relative error is sqrt(2 / n)."""
 _FACTOR_BOUNDS = (0.05, 20.0)
 """Of a variance against the robot file's. Calibrated Huskies on floor and snow differ by 10 (`WheelNoise`)."""
-_CLIP_SIGMA = 2.5
-"""Errors count as if they were at most this many standard deviations, so that lost matches, up to a tenth, do not set the noise."""
-_CLIPPED_MEAN = 0.978
-"""Mean of the square of a unit normal number that is clipped there."""
-_STEPS = 50
+_QUANTILE, _CHI_SQUARE = 0.75, 1.3233
+"""Quantile of the normalized squared errors that is matched, and its value for one degree of freedom: a quarter of the errors may be lost
+matches. Of fr079's positions by scan matching a tenth is beyond four sigma, and the median is that of the usual noise."""
+_BISECTIONS = 40
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class LearnedNoise:
 
 
 def learn_noise(fit: Fit, maneuvers: Sequence[Maneuver], residuals: FloatArray) -> LearnedNoise:
-    """Maximum likelihood of both factors for ``residuals`` (M, 3) of ``maneuvers``, predicted by fits that have not seen them.
+    """Both factors by the `_QUANTILE` of normalized ``residuals`` (M, 3) of ``maneuvers``, predicted by fits that have not seen them.
 
     The covariance of a predicted pose is linear in the variances: C = a_yaw C_yaw + a_position C_position + R, with the measurement's R.
     Headings give a_yaw, positions then a_position. What is correlated within a maneuver (slip over 0.1 to 2 s) is in the errors at its
@@ -49,6 +49,8 @@ def learn_noise(fit: Fit, maneuvers: Sequence[Maneuver], residuals: FloatArray) 
     both factors counts.
     """
     batch = make_batch(maneuvers)
+    if len(residuals) < _MIN_POSES:
+        return LearnedNoise(1.0, 1.0)
     values = _values(fit.config.noise)
     yaw, position = (
         _covariances(fit, batch, WheelNoise(**{name: value if (name in _YAW) == is_yaw else 0.0 for name, value in values.items()}))
@@ -57,35 +59,38 @@ def learn_noise(fit: Fit, maneuvers: Sequence[Maneuver], residuals: FloatArray) 
     measured = np.diagonal(batch.cov, axis1=1, axis2=2)
     heading = np.isfinite(measured[:, 2])
     group = batch.group
-    a_yaw = _larger_factor(residuals[heading, 2:], yaw[heading, 2, 2], measured[heading, 2], group[heading])
+    a_yaw = _larger_factor(residuals[heading, 2], yaw[heading, 2, 2], measured[heading, 2], group[heading])
     known = np.isfinite(measured[:, :2]).all(axis=1)
-    rest = a_yaw * np.trace(yaw[known, :2, :2], axis1=1, axis2=2) + measured[known, :2].sum(axis=1)
-    a_position = _larger_factor(residuals[known, :2], np.trace(position[known, :2, :2], axis1=1, axis2=2), rest, group[known])
+    slip, rest = (
+        np.concatenate([values[known, 0, 0], values[known, 1, 1]])
+        for values in (position, a_yaw * yaw + np.where(batch.cov < np.inf, batch.cov, 0.0))
+    )
+    a_position = _larger_factor(
+        residuals[known, :2].T.ravel(), slip, rest, np.concatenate([group[known], group[known] + len(batch.groups)])
+    )
     return LearnedNoise(a_yaw, a_position)
 
 
 def _larger_factor(errors: FloatArray, slip: FloatArray, rest: FloatArray, group: IntArray) -> float:
-    """`_factor` of ``errors`` (n, c) one by one, or of their sums over each ``group`` (n,), whichever is larger."""
-    single = _factor(np.sum(errors**2, axis=1), slip, rest)
-    sums = np.stack([np.bincount(group, column) for column in errors.T], axis=-1)
-    slip_sum, rest_sum = (np.asarray(np.bincount(group, values), dtype=np.float64) for values in (slip, rest))
-    together = _factor(np.sum(sums**2, axis=1), slip_sum, rest_sum)
+    """`_factor` of ``errors`` (n,) one by one, or of their sums over each ``group`` (n,), whichever is larger."""
+    single = _factor(errors**2, slip, rest)
+    errors_sum, slip_sum, rest_sum = (np.asarray(np.bincount(group, values), dtype=np.float64) for values in (errors, slip, rest))
+    together = _factor(errors_sum**2, slip_sum, rest_sum)
     return max(single, together) if np.count_nonzero(slip_sum) >= _MIN_POSES else single
 
 
 def _factor(squares: FloatArray, slip: FloatArray, rest: FloatArray) -> float:
-    """a by which variances a ``slip`` + ``rest`` explain ``squares``, each (n,): scoring steps of the Gaussian likelihood."""
+    """a for which the quantile of ``squares`` / (a ``slip`` + ``rest``), each (n,), is that of a unit normal's square: bisection."""
     usable = slip > 0.0
     squares, slip, rest = squares[usable], slip[usable], rest[usable]
     if len(squares) < _MIN_POSES:
         return 1.0
-    a = 1.0
-    for _ in range(_STEPS):
-        variance = a * slip + rest
-        clipped = np.minimum(squares, _CLIP_SIGMA**2 * variance)
-        weight = (slip / variance) ** 2
-        a = float(np.clip(np.sum(weight * (clipped / _CLIPPED_MEAN - rest) / slip) / np.sum(weight), *_FACTOR_BOUNDS))
-    return a
+    low, high = (math.log(bound) for bound in _FACTOR_BOUNDS)
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        is_low = np.quantile(squares / (math.exp(middle) * slip + rest), _QUANTILE) > _CHI_SQUARE
+        low, high = (middle, high) if is_low else (low, middle)
+    return math.exp(0.5 * (low + high))
 
 
 def _covariances(fit: Fit, batch: Batch, noise: WheelNoise) -> FloatArray:

@@ -61,7 +61,7 @@ _MIRROR: Mapping[str, tuple[str, float]] = {
 MEANING: Mapping[str, str] = {
     "wheel_radius": "m: how far the robot drives per radian of its wheels",
     "wheel_separation_multiplier": "track that the robot turns by, over the real one",
-    "k_0": "k, turning over what the wheels' difference says, at CG x = 0",
+    "k_0": "k, yaw rate over that of wheels without slip, at CG x = 0",
     "k_1": "1/m: change of k with the CG ahead",
     "k_2": "1/m^2: how k grows when the CG leaves the middle",
     "x_cr_0": "m: centre of rotation ahead of the middle, at CG x = 0",
@@ -159,5 +159,5 @@ def calibrate(
             free.remove(last)
         else:
             break
-    said = dict.fromkeys(weakness.text for weakness in reasons)
-    raise CalibrationError("\n".join([f"this drive reveals nothing of {', '.join(wanted)}:", *said]))
+    texts = dict.fromkeys(weakness.text for weakness in reasons)
+    raise CalibrationError("\n".join([f"this drive reveals nothing of {', '.join(wanted)}:", *texts]))

@@ -149,7 +149,7 @@ class Regression:
 def regress(y: FloatArray, terms: dict[str, FloatArray]) -> Regression:
     """``y`` (n,) by least squares as a sum of ``terms`` (n,) by name.
 
-    Raises `CalibrationError` for fewer than p + 1 rows, and for terms that the rows cannot tell apart.
+    Raises `CalibrationError` for fewer than p + 1 rows, and for terms that the rows do not separate.
     """
     names, design = tuple(terms), np.column_stack(list(terms.values()))
     n, p = design.shape
@@ -160,7 +160,7 @@ def regress(y: FloatArray, terms: dict[str, FloatArray]) -> Regression:
     if values[-1] < 1e-10 * values[0]:
         worst = [name for name, part in zip(names, directions[-1], strict=True) if abs(part) > 0.1]
         raise CalibrationError(
-            f"the rows cannot tell {' and '.join(worst)} apart (of {', '.join(names)}): vary the centre of gravity more, in x and in y."
+            f"the rows do not separate {' and '.join(worst)} (of {', '.join(names)}): vary the centre of gravity more, in x and in y."
         )
     coefficients: FloatArray = np.asarray(np.linalg.lstsq(design, y, rcond=None)[0], dtype=np.float64)
     residual_ss = float(np.sum((y - design @ coefficients) ** 2))

@@ -19,7 +19,7 @@ _SPEED = (0.3, 0.3)  # m/s and rad/s at which the multipliers are read off a mod
 _TURN_IN = 0.3  # s within which a turn, and its sideways speed, sets in
 # The defaults of robot_localization's process_noise_covariance.
 _PROCESS_NOISE = (0.05, 0.05, 0.06, 0.03, 0.03, 0.06, 0.025, 0.025, 0.04, 0.01, 0.01, 0.02, 0.01, 0.01, 0.015)
-_UNUSED = 1e3  # variance of what no wheel tells (z, roll, pitch)
+_UNUSED = 1e3  # variance of what wheels do not measure (z, roll, pitch)
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def diff_drive_controller_yaml(
     """Parameters for ros2_controllers' diff_drive_controller: geometry, multipliers at the robot's nominal CG and twist covariance.
 
     With ``cgs`` (n, 2) [m] the table of `multiplier_table` follows as comments. The controller knows neither vy = -wz x_CR nor a loss
-    in arcs: what it cannot say is in its covariance, from the robot's wheel noise.
+    in arcs: what it does not model is in its covariance, from the robot's wheel noise.
     """
     m = multipliers(model, robot, robot.center_of_gravity, params)
     twist = _diagonal(twist_variances(model, robot, params, publish_rate_hz))
@@ -108,7 +108,7 @@ def robot_localization_yaml(
     """A patch for robot_localization: fuse vx and yaw rate of the wheels, never their vy = 0, and not their integrated pose.
 
     A diff-drive controller reports vy = 0 with the variance that it was given, often 0 or 1e-3. A skid-steer robot's vy is
-    -wz x_CR, many sigmas away, and the filter believes the wheels.
+    -wz x_CR, many sigmas away, and the filter follows the wheels.
     """
     variances = twist_variances(model, robot, params, publish_rate_hz)
     noise = list(_PROCESS_NOISE)
@@ -153,7 +153,7 @@ def twist_variances(model: MotionModel, robot: Robot, params: FloatArray, publis
 
 
 def _sideways(model: MotionModel, robot: Robot, params: FloatArray) -> float:
-    """|vy| of turning in place [m/s]. Where the model knows none, that of a centre of rotation on an axle."""
+    """|vy| of turning in place [m/s]. Where the model has none, that of a centre of rotation on an axle."""
     cg = robot.center_of_gravity
     vy = float(model.twist(model.wheels(np.array([0.0, _SPEED[1]]), cg, params), cg, params).value[1])
     return abs(vy) if abs(vy) > 1e-9 else _SPEED[1] * robot.geometry.wheelbase_m / 2.0

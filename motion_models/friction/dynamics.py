@@ -50,7 +50,7 @@ class Influence:
     cg_acceleration: FloatArray
     """(3,) its acceleration in the body frame, by the arms; z up [m/s^2]."""
     force: FloatArray
-    """(3,) force from outside, on a gripper say, in the body frame [N]."""
+    """(3,) force from outside, as on a gripper, in the body frame [N]."""
     at: FloatArray
     """(3,) where it acts, in the body frame, z above the floor [m]."""
 
