@@ -26,9 +26,11 @@ def generate_launch_description():
             DeclareLaunchArgument("rviz", default_value="true", description="false: without RViz"),
             IncludeLaunchDescription(
                 PathJoinSubstitution([share, "launch", "lidar.launch.py"]),
-                launch_arguments={"robot": LaunchConfiguration("robot")}.items(),
+                launch_arguments={"robot": LaunchConfiguration("robot"), "use_sim_time": "true"}.items(),
             ),
             rviz,
-            ExecuteProcess(cmd=["ros2", "bag", "play", bag, "--rate", rate, "--remap", "/tf:=/tf_recorded"], output="screen"),
+            ExecuteProcess(
+                cmd=["ros2", "bag", "play", bag, "--rate", rate, "--clock", "100", "--remap", "/tf:=/tf_recorded"], output="screen"
+            ),
         ]
     )
