@@ -135,7 +135,7 @@ def _convert(parameter: Parameter, value: Any) -> Any:
     if type(value) is not type(default):
         raise SettingError(f"parameter '{parameter.name}' is {value!r}; it must be a {_TYPE_NAMES[type(default)]}.")
     if parameter.choices and value not in parameter.choices:
-        known = f"it may be {', '.join(parameter.choices)}.{nearest(value, parameter.choices)}"
+        known = f"it may be {', '.join(parameter.choices)}.{nearest(str(value), parameter.choices)}"
         raise SettingError(f"parameter '{parameter.name}' is {value!r}; {known}")
     if parameter.path[0] == "topic":
         return None if value == "" else "" if value == _LEFT_OUT else value

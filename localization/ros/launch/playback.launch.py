@@ -11,6 +11,7 @@ from launch_ros.substitutions import FindPackageShare
 def generate_launch_description():
     share = FindPackageShare("skidloc")
     bag, rate = LaunchConfiguration("bag"), LaunchConfiguration("rate")
+    play = ["ros2", "bag", "play", bag, "--rate", rate, "--clock", "100", "--remap", "/tf:=/tf_recorded"]
     rviz = Node(
         package="rviz2",
         executable="rviz2",
