@@ -30,8 +30,6 @@ def generate_launch_description():
                 launch_arguments={"robot": LaunchConfiguration("robot"), "use_sim_time": "true"}.items(),
             ),
             rviz,
-            ExecuteProcess(
-                cmd=["ros2", "bag", "play", bag, "--rate", rate, "--clock", "100", "--remap", "/tf:=/tf_recorded"], output="screen"
-            ),
+            ExecuteProcess(cmd=play, output="screen"),
         ]
     )
