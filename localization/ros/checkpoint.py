@@ -34,7 +34,7 @@ class Checkpoint:
     """What `read_checkpoint` found."""
 
     head: Mapping[str, Any]
-    """What the writer told of the state."""
+    """Its head: what made the state, and how far it had come."""
     value: Any
 
 
@@ -51,8 +51,8 @@ def fingerprints(**objects: Any) -> dict[str, str]:
 
 
 def write_checkpoint(path: Path, value: Any, head: Mapping[str, Any], made_by: Mapping[str, str], shared: Mapping[str, Any]) -> None:
-    """Replace the file ``path`` by one of ``value``; ``shared`` objects are the resumer's to bring, for ``made_by`` says that they must
-    be the same (`fingerprints`).
+    """Replace the file ``path`` by one of ``value``; ``shared`` objects are not written: whoever resumes it has them, the same by
+    ``made_by`` (`fingerprints`).
 
     Raises `CheckpointError` if the state or the file cannot be written.
     """
@@ -101,7 +101,7 @@ def remove_checkpoint(path: Path) -> None:
 
 
 def read_head(path: Path) -> Mapping[str, Any]:
-    """What the state's writer told of it. Raises `CheckpointError`."""
+    """Head of the checkpoint in ``path``. Raises `CheckpointError`."""
     return _read(path)[0]
 
 
@@ -114,9 +114,9 @@ def read_checkpoint(path: Path, made_by: Mapping[str, str], shared: Mapping[str,
     then = head["made_by"]
     different = [name for name in made_by if then.get(name) != made_by[name]]
     if different:
-        told = ", ".join(f"{name} ({then.get(name, 'unknown')} then, {made_by[name]} now)" for name in different)
+        changes = ", ".join(f"{name} ({then.get(name, 'unknown')} then, {made_by[name]} now)" for name in different)
         raise CheckpointError(
-            f"the state in '{path}' was made with another {told}: resume with what it was made with, or remove it to start anew."
+            f"the state in '{path}' was made with another {changes}: resume with what it was made with, or remove it to start anew."
         )
     try:
         return Checkpoint(head, deserialize(text, blob, shared))
@@ -148,7 +148,7 @@ def _read(path: Path) -> tuple[dict[str, Any], bytes, bytes]:
 
 
 def _is_head(head: Any, most_bytes: int) -> bool:
-    """Whether it is of the kind that writers of states tell. A check sum that is right does not make it so."""
+    """Whether it has the entries of a head, with their types: a correct check sum does not prove it."""
 
     def is_count(name: str, most: int = _INT_END) -> bool:
         return type(head.get(name, 0)) is int and 0 <= head.get(name, 0) <= most

@@ -1,4 +1,4 @@
-"""The way back from `serialize`: values from JSON and the bytes of arrays. Nothing of them is run, whatever they say."""
+"""Values from what `serialize` wrote: JSON and the bytes of arrays. No code in them is run, whatever they hold."""
 
 from __future__ import annotations
 

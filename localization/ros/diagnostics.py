@@ -57,7 +57,7 @@ class Health:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all estimates."""
+        """Discard all estimates so far."""
         self._nis: deque[float] = deque(maxlen=_KEPT)
         self._latencies: deque[float] = deque(maxlen=_KEPT)
         self._slip = np.zeros(3)
@@ -143,8 +143,8 @@ class Health:
                 "longest_lost_s": f"{losses.longest_s:.1f}",
                 "lost_now_s": f"{losses.ongoing_s:.1f}",
             }
-        if (lack := pipeline.synchronizer.frames.lack) is not None:
-            return Status("lidar", ERROR, lack, values)
+        if (problem := pipeline.synchronizer.frames.lack) is not None:
+            return Status("lidar", ERROR, problem, values)
         scene = self.degeneracy
         if scene is not None:
             values["degeneracy"] = f"{scene:.4f}"

@@ -124,8 +124,9 @@ class TopicDiscovery:
     def _silence(self, published: Mapping[str, set[str]], silent: Sequence[str]) -> str:
         there = sorted(topic for topic in published if topic in self.candidates)
         if silent:
-            said = [f"{topic} ({'published, but no message comes' if topic in published else 'nobody publishes it'})" for topic in silent]
-            return f"waiting for {', '.join(said)}." + self._others(published, {self.candidates[topic] for topic in silent})
+            idle, missing = "published, but no message comes", "nobody publishes it"
+            entries = ", ".join(f"{topic} ({idle if topic in published else missing})" for topic in silent)
+            return f"waiting for {entries}." + self._others(published, {self.candidates[topic] for topic in silent})
         wanted = ", ".join(f"{topic} ({short_type(kind)})" for topic, kind in self.candidates.items() if kind in _MOTION_TYPES)
         waiting = f"waiting for wheels or a LiDAR: nothing comes on {wanted}."
         if not published:

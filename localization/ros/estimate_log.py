@@ -54,7 +54,7 @@ class EstimateLog:
             if size < count * _ROW.itemsize:
                 file.close()
                 raise CheckpointError(
-                    f"'{path}' holds {size // _ROW.itemsize} estimates where the state counts on {count}. Remove both to start anew."
+                    f"'{path}' holds {size // _ROW.itemsize} estimates where the state refers to {count}. Remove both to start anew."
                 )
             file.truncate(count * _ROW.itemsize)
             last_ns = -(1 << 63)
@@ -68,7 +68,7 @@ class EstimateLog:
         return cls(path, file, count, last_ns)
 
     def add(self, estimate: Estimate) -> None:
-        """Raises `OutputError` where the file cannot grow: it then lacks this estimate, and the next one may find room again."""
+        """Raises `OutputError` where the file cannot grow: this estimate is then missing in it, and the next one may find room again."""
         if estimate.stamp_ns <= self._last_ns:
             return
         row, at = np.array([(estimate.stamp_ns, row_of(estimate))], _ROW).tobytes(), self.count * _ROW.itemsize

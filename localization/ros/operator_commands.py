@@ -1,4 +1,4 @@
-"""What an operator asks of a running node: a pose on /initialpose or /set_pose; the services reset, pause and tare_payload."""
+"""Commands of an operator to a running node: a pose on /initialpose or /set_pose; the services reset, pause and tare_payload."""
 
 from __future__ import annotations
 

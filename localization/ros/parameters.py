@@ -28,7 +28,7 @@ _DYNAMIC = ("node.tf",)
 _LEFT_TO_ROS = ("topic.reference", "node.use_sim_time", "node.names")
 """Not of a live run, or parameters and arguments that every ROS 2 node has."""
 
-Value = bool | int | float | str | list[str]
+Value = bool | int | float | str
 
 
 @dataclass(frozen=True)
@@ -112,12 +112,12 @@ def _flatten(settings: Any, path: tuple[str, ...]) -> Iterator[Parameter]:
         allowed = next((rule.what for rule in rules[field.name] if isinstance(rule, Allowed)), "")
         if not allowed and isinstance(value, float | int) and not isinstance(value, bool):
             allowed = "0 or more"
-        constraint = f"one or more of {', '.join(choices)}" if isinstance(value, tuple) else ", ".join(choices) or allowed
+        constraint = ", ".join(choices) or allowed
         text, full = texts.get(field.name, ""), ".".join(here)
         if here[0] == "topic":
             text, constraint = text + f' "" is the robot file\'s, "{_LEFT_OUT}" leaves the part out.', "a topic"
         name = _RENAMED.get(full, here[-1] if here[0] == "node" else full)
-        default: Value = "" if value is None else list(value) if isinstance(value, tuple) else value
+        default: Value = "" if value is None else value
         yield Parameter(name, here, default, text, constraint, choices, full in _DYNAMIC)
 
 
@@ -134,14 +134,9 @@ def _convert(parameter: Parameter, value: Any) -> Any:
         value = float(value)
     if type(value) is not type(default):
         raise SettingError(f"parameter '{parameter.name}' is {value!r}; it must be a {_TYPE_NAMES[type(default)]}.")
-    entries: list[Any] = value if isinstance(value, list) else [value]
-    for entry in entries:
-        if parameter.choices and entry not in parameter.choices:
-            raise SettingError(
-                f"parameter '{parameter.name}' is {entry!r}; it may be {', '.join(parameter.choices)}.{nearest(entry, parameter.choices)}"
-            )
-    if isinstance(value, list):
-        return tuple(value)
+    if parameter.choices and value not in parameter.choices:
+        known = f"it may be {', '.join(parameter.choices)}.{nearest(str(value), parameter.choices)}"
+        raise SettingError(f"parameter '{parameter.name}' is {value!r}; {known}")
     if parameter.path[0] == "topic":
         return None if value == "" else "" if value == _LEFT_OUT else value
     if parameter.path[0] in ("out", "state"):
@@ -149,7 +144,7 @@ def _convert(parameter: Parameter, value: Any) -> Any:
     return value
 
 
-_TYPE_NAMES = {bool: "bool", int: "whole number", float: "number", str: "string", list: "list of strings"}
+_TYPE_NAMES = {bool: "bool", int: "whole number", float: "number", str: "string"}
 
 
 def _construct(kind: Any, tree: Mapping[str, Any]) -> Any:
@@ -175,8 +170,6 @@ def _field_texts(kind: type) -> dict[str, str]:
 def _yaml(value: Value) -> str:
     if isinstance(value, bool):
         return str(value).lower()
-    if isinstance(value, list):
-        return f"[{', '.join(map(_yaml, value))}]"
     if isinstance(value, float):
         return _number(value)
     return f'"{value}"' if isinstance(value, str) else str(value)

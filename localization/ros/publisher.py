@@ -76,7 +76,7 @@ class EstimatePublisher:
         self._with_tf = is_on
 
     def restart(self) -> None:
-        """Forget the path, for the robot was set to another place."""
+        """Begin a new path, for the robot was set to another place."""
         self._path = Path()
 
     def publish_estimate(self, estimate: Estimate, stamp_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""What the estimator does, in rerun's viewer or in a file for it (extra `viz`): robot, path, scans, map, how sure it is, what it learns.
+"""What the estimator does, in rerun's viewer or in a file for it (extra `viz`): robot, path, scans, map, covariance and corrections.
 
 Entities: `world/robot` (with `two_sigma` and each scan under its frame), `world/path/N`, `world/map`, `estimate/*`, `corrections/*`.
 """
@@ -157,17 +157,17 @@ class RerunView:
 
 def _viewer(command: Sequence[str] = ()) -> int:
     """The port on which a new viewer listens; unlike those that rerun opens itself, for this machine only. Raises `TransportError`."""
-    advice = "--view-file NAME.rrd records for a later look."
+    advice = "--view-file NAME.rrd records to a file."
     if sys.platform == "linux" and not (command or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise TransportError(f"rerun's viewer needs a display, and there is none here. {advice}")
     with socket.create_server((_LOOPBACK, 0)) as probe:
         port: int = probe.getsockname()[1]
     program = Path(sys.executable).with_name("rerun")  # installed beside Python, whether that is on the PATH or not
     command = command or (str(program) if program.exists() else "rerun", "--hide-welcome-screen")
-    with tempfile.TemporaryFile() as said:
+    with tempfile.TemporaryFile() as output:
         try:
             viewer = subprocess.Popen(
-                [*command, "--bind", _LOOPBACK, "--port", str(port)], stdout=said, stderr=said, start_new_session=True
+                [*command, "--bind", _LOOPBACK, "--port", str(port)], stdout=output, stderr=output, start_new_session=True
             )
         except OSError as error:
             raise TransportError(f"rerun's viewer cannot be started: {error.strerror}. {advice}") from error
@@ -177,11 +177,11 @@ def _viewer(command: Sequence[str] = ()) -> int:
                 return port
             with contextlib.suppress(OSError), socket.create_connection((_LOOPBACK, port), timeout=1.0):
                 is_heard = True
-            time.sleep(0.5)  # it listens before it looks for its display
+            time.sleep(0.5)  # its port opens before it opens its display
         with contextlib.suppress(ProcessLookupError):
             os.killpg(viewer.pid, signal.SIGKILL)  # what is installed as `rerun` starts another process
-        said.seek(0)
-        lines = said.read().decode(errors="replace").strip().splitlines() or ["it says nothing"]
+        output.seek(0)
+        lines = output.read().decode(errors="replace").strip().splitlines() or ["no message"]
         raise TransportError(f"rerun's viewer cannot be opened ({lines[-1]}). {advice}")
 
 

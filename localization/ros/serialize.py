@@ -5,8 +5,7 @@ without calling them (``__setstate__`` where a class has one). What is held twic
 layout in memory, and a view of another array stays one: linear algebra rounds by layout, and results are to be the same to the last bit.
 
 Long lists of numbers, and of frozen dataclasses of numbers and arrays, are written as columns: hours of them must not take longer than
-a scan. What the entries of such a list share with each other or with the rest, each then holds by itself; of what is never changed nobody
-can tell.
+a scan. Objects that the entries of such a list share become one copy for each entry; as none is ever changed, that makes no difference.
 """
 
 from __future__ import annotations
@@ -152,7 +151,7 @@ class _Writer:
 
 
 def _frozen_fields(value: Any) -> list[str]:
-    """Names of the fields of an instance of one of our frozen dataclasses that has nothing to say about its state; else none."""
+    """Names of the fields of an instance of one of our frozen dataclasses without a state of its own; else none."""
     kind = type(value)
     if not kind.__module__.startswith(PACKAGES) or not dataclasses.is_dataclass(kind) or hasattr(kind, "__setstate__"):
         return []

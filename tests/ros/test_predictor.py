@@ -33,6 +33,7 @@ def driven(estimator, predict):
 def test_odometry_is_published_at_the_rate_of_the_wheels_in_order(estimator):
     stamps = np.array([stamp_of(m) for m in published(driven(estimator, True)[0], PREDICTED_ODOMETRY)])
     assert (np.diff(stamps) > 0).all()
+    stamps = stamps[stamps > stamps[0] + 3 * S]  # what came before the start is estimated, not predicted
     assert np.median(np.diff(stamps)) <= 0.0201 * S  # 50 Hz
     assert np.diff(stamps).max() <= 0.045 * S
     assert len(stamps) > 3 * len(published(driven(estimator, False)[0], ODOMETRY))

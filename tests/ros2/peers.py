@@ -119,4 +119,4 @@ def start_skidloc(domain, *arguments, python=sys.executable, door="dds", **envir
 
 def own_domain(offset=0):
     """Not that of another run of these tests."""
-    return 10 + (os.getpid() * 7 + offset) % 90
+    return 10 + (os.getpid() * 8 + offset) % 90

@@ -11,6 +11,7 @@ from launch_ros.substitutions import FindPackageShare
 def generate_launch_description():
     share = FindPackageShare("skidloc")
     bag, rate = LaunchConfiguration("bag"), LaunchConfiguration("rate")
+    play = ["ros2", "bag", "play", bag, "--rate", rate, "--clock", "100", "--remap", "/tf:=/tf_recorded"]
     rviz = Node(
         package="rviz2",
         executable="rviz2",
@@ -26,9 +27,9 @@ def generate_launch_description():
             DeclareLaunchArgument("rviz", default_value="true", description="false: without RViz"),
             IncludeLaunchDescription(
                 PathJoinSubstitution([share, "launch", "lidar.launch.py"]),
-                launch_arguments={"robot": LaunchConfiguration("robot")}.items(),
+                launch_arguments={"robot": LaunchConfiguration("robot"), "use_sim_time": "true"}.items(),
             ),
             rviz,
-            ExecuteProcess(cmd=["ros2", "bag", "play", bag, "--rate", rate, "--remap", "/tf:=/tf_recorded"], output="screen"),
+            ExecuteProcess(cmd=play, output="screen"),
         ]
     )

@@ -142,7 +142,7 @@ class DdsTransport(MonotonicTime):
         return DataWriter(self._participant, self._topic(dds_name, kind), _hashed(quality, kind)), _bytes_type(kind)
 
     def _publish_graph(self) -> None:
-        """The participant's node and its endpoints: from these messages, not from DDS's own discovery, ROS 2 knows nodes."""
+        """The participant's node and its endpoints: ROS 2 lists nodes by these messages, not by DDS's own discovery."""
         if self._graph is None:
             return
         node = make(
@@ -173,12 +173,12 @@ class SenderClock:
 
 def receive_times(sent_ns: Sequence[int], since_ns: int, newest_ns: int) -> list[int]:
     """When messages came that were not there at ``since_ns``: the newest at ``newest_ns``, the others as long before as they were sent
-    before it. ``sent_ns`` is by the sender's clock; where it tells of a longer time than there was, that is shared out.
+    before it. ``sent_ns`` is by the sender's clock; a longer time than there was is scaled down to it.
     """
     last_sent_ns = max(sent_ns, default=0)
-    # The first came after its predecessor, which was seen the last time: by as much as one mostly comes after the other.
-    told_ns = (last_sent_ns - min(sent_ns, default=0)) * len(sent_ns) / max(len(sent_ns) - 1, 1)
-    share = min((newest_ns - since_ns) / told_ns, 1.0) if told_ns > 0.0 else 0.0
+    # The first came after its predecessor, which was received in the last call: by the mean period.
+    span_ns = (last_sent_ns - min(sent_ns, default=0)) * len(sent_ns) / max(len(sent_ns) - 1, 1)
+    share = min((newest_ns - since_ns) / span_ns, 1.0) if span_ns > 0.0 else 0.0
     return [newest_ns - round((last_sent_ns - sent) * share) for sent in sent_ns]
 
 

@@ -22,7 +22,7 @@ _LATEST = 100
 
 
 def _import(name: str) -> Any:
-    """A module of ROS 1, which Debian and Ubuntu install for the system's Python; a virtual environment does not look there."""
+    """A module of ROS 1, which Debian and Ubuntu install for the system's Python; it is not on the path of a virtual environment."""
     try:
         return importlib.import_module(name)
     except ImportError:
