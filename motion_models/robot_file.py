@@ -24,7 +24,7 @@ def robot_toml(robot: Robot, sigmas: Mapping[str, Mapping[str, float]] | None = 
     sigmas = sigmas or {}
     lines = [f"# {line}".rstrip() for line in remarks.splitlines()]
     lines.append(f"name = {_value(robot.name)}")
-    for name in ("geometry", "driver", "topics", "joints", "wheel_noise", "gyro_noise"):
+    for name in ("geometry", "driver", "topics", "joints", "wheel_noise", "gyro_noise", "clock"):
         lines += _table(name, dataclasses.asdict(getattr(robot, name)))
     if robot.arms is not None:
         lines += _table("arms", {name: value for name, value in dataclasses.asdict(robot.arms).items() if value != ()})

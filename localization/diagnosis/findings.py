@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
@@ -136,6 +137,28 @@ class Trend:
 
 
 @dataclass(frozen=True)
+class HandoverCheck:
+    """Discrepancies of the second half of a drive by the old robot, and by one that was corrected by the first half alone."""
+
+    before: dict[str, float]
+    """Root mean square by component, as `prediction.CHANNELS`."""
+    after: dict[str, float]
+    windows: int
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the product of all components' errors falls."""
+        return math.prod(self.after[c] / max(self.before[c], 1e-12) for c in self.before) < 1.0
+
+    def describe(self) -> str:
+        rows = ", ".join(f"{c} {self.before[c]:.3g} -> {self.after[c]:.3g} {'rad' if c == 'yaw' else 'm'}" for c in self.before)
+        return f"second half of the drive ({self.windows} windows), corrected by the first half alone: {rows} (root mean square)"
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"windows": self.windows, "rms_before": self.before, "rms_after": self.after, "is_better": self.is_better}
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """The answer to one drive and one model."""
 
@@ -166,6 +189,8 @@ class Diagnosis:
     windows: int = 0
     warnings: tuple[str, ...] = ()
     hypothesis: Hypothesis = field(default_factory=Hypothesis)
+    handover: HandoverCheck | None = None
+    """What the corrected robot gains on the second half of the drive."""
 
     def to_dict(self) -> dict[str, Any]:
         left: dict[str, Any] = {"share": self.left_share, "shapes": [vars(s) for s in self.trends], "text": [s.text for s in self.trends]}
@@ -181,6 +206,7 @@ class Diagnosis:
             "next_drive": self.next_drive,
             "sentence": self.sentence,
             "tolerances": dict(self.tolerances),
+            "handover": None if self.handover is None else self.handover.to_dict(),
             "contradictions": list(self.contradictions),
             "outlier_windows_s": list(self.outliers_s),
             "witness": self.motion_reference,
