@@ -163,7 +163,8 @@ def _conclude(
     chosen, gains, dropped = _keep_useful(linearization, chosen, config)
     sizes, _, gained = problem.fit(chosen)
     findings = _make_findings(predictor, linearization, chosen, gains, rng)
-    rows = attribute_rows(first, linearization, chosen, sizes, config.significance)
+    reference_sigmas = np.sqrt(np.diagonal(predictor.batch.cov, axis1=1, axis2=2)) if drive.kind == "log" else None
+    rows = attribute_rows(first, linearization, chosen, sizes, config.significance, reference_sigmas)
     left = linearization.linear - linearization.signatures[..., list(chosen)] @ sizes
     spreads = problem.scale * np.where(np.isin(np.arange(len(causes)), chosen), 1.0, problem.tolerance)
     trends, left_gain = find_trends(predictor, linearization.noise, left, linearization.signatures, linearization.nuisances, spreads, rng)

@@ -53,6 +53,11 @@ class Finding:
         return self.definition.id
 
     @property
+    def is_plausible(self) -> bool:
+        """Whether robots have the cause at such a size."""
+        return abs(self.size) <= self.definition.largest_plausible
+
+    @property
     def description(self) -> str:
         """What it does, with its direction and size in words."""
         return self.definition.describe(self.size)
@@ -62,6 +67,7 @@ class Finding:
             "cause": self.cause,
             "meaning": self.definition.meaning,
             "description": self.description,
+            "is_plausible": self.is_plausible,
             "size": self.size,
             "sigma": self.sigma,
             "unit": self.definition.unit,
@@ -100,6 +106,8 @@ class Component:
     """Once everything named is corrected."""
     unattributed_rms: float
     """Once what is within tolerance is taken off as well."""
+    noise_over_reference: float = 1.0
+    """Noise of the drive over that of the motion reference by its own covariance."""
     status: RowStatus = "noise"
     attributions: tuple[Attribution, ...] = ()
 
@@ -114,6 +122,7 @@ class Component:
             "p_value": self.p_value,
             "rms_explained": self.left_rms,
             "rms_unattributed": self.unattributed_rms,
+            "noise_over_reference": self.noise_over_reference,
             "status": self.status,
             "attributions": [a._asdict() for a in self.attributions],
         }
