@@ -75,3 +75,5 @@ UNKNOWN: Mapping[str, Callable[[Drive], Drive]] = {
     "reference turns with its range": _by_reference(lambda p, t: p + np.array([0.0, 0.0, 0.05 * abs(p[0])])),
 }
 """By what happens."""
+INSEPARABLE = frozenset({"slip with the square of speed"})
+"""Those that a drive at two speeds shows as a wheel radius, 8 % off."""
