@@ -25,6 +25,7 @@ _LARGEST = 1e9
 """Of any number of a robot, in SI units; the largest that robots have are stiffnesses and inertias of 1e6."""
 _LONGEST_M = 100.0
 """Of a length of a robot [m]; the largest mining vehicles have 20."""
+_LARGEST_CLOCK_OFFSET_S = 10.0
 _LONGEST_SHOWN = 60  # characters of what a user wrote, in a message
 DIFF_DRIVE = "diff_drive"
 """`Robot.drive` of two driven wheels and casters."""
@@ -51,6 +52,27 @@ class Geometry:
     """Centre of gravity ahead of the wheelbase's centre, used where the log has none."""
     cg_y_m: float = 0.0
     """Centre of gravity left of the wheelbase's centre, used where the log has none."""
+    left_wheel_radius_multiplier: float = 1.0
+    """Rolled distance of the left wheels over `wheel_radius_m` times their angle, as in ROS's diff_drive_controller."""
+    right_wheel_radius_multiplier: float = 1.0
+    """The same of the right wheels."""
+
+    @property
+    def radius_multipliers(self) -> FloatArray:
+        """(2,) left and right; wheel rates of logs and topics are multiplied by them."""
+        return np.array([self.left_wheel_radius_multiplier, self.right_wheel_radius_multiplier])
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Offsets of the sensors' clocks: what happened at t is stamped t + offset. Stamps are corrected by them when messages are decoded."""
+
+    wheel_time_offset_s: float = 0.0
+    """By how much the wheels' stamps are late."""
+    lidar_time_offset_s: float = 0.0
+    """By how much the LiDAR's stamps are late."""
+    gyro_time_offset_s: float = 0.0
+    """By how much the IMU's stamps are late."""
 
 
 @dataclass(frozen=True)
@@ -180,6 +202,7 @@ class Robot:
     mounts: Mapping[str, Mount] = field(default_factory=dict)
     wheel_noise: WheelNoise = WheelNoise()
     gyro_noise: GyroNoise = GyroNoise()
+    clock: Clock = Clock()
     models: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Coefficients by model name, then by parameter name; what is not named keeps the model's own default."""
     options: Mapping[str, Mapping[str, str | bool]] = field(default_factory=dict)
@@ -266,6 +289,9 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
     for name in ("wheel_radius_m", "track_width_m", "wheelbase_m", "mass_kg"):
         if not getattr(geometry, name) > 0:
             raise RobotError(f"{source}: geometry.{name} is {getattr(geometry, name)}; it must be positive.")
+    for name in ("left_wheel_radius_multiplier", "right_wheel_radius_multiplier"):
+        if not 0.1 < getattr(geometry, name) < 10.0:
+            raise RobotError(f"{source}: geometry.{name} is {getattr(geometry, name)}; it must be near 1.")
     for name, value in dataclasses.asdict(geometry).items():
         if name.endswith("_m") and abs(value) > _LONGEST_M:
             raise RobotError(f"{source}: geometry.{name} is {value:g}; it must be in metres, and at most {_LONGEST_M:g}.")
@@ -284,11 +310,22 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
         mounts=mounts,
         wheel_noise=_noise(WheelNoise, data, "wheel_noise", source),
         gyro_noise=_noise(GyroNoise, data, "gyro_noise", source),
+        clock=_clock(data, source),
         models=models,
         options=options,
         arms=_arms(data, source) if "arms" in data else None,
         folder=folder,
     )
+
+
+def _clock(data: Mapping[str, Any], source: str) -> Clock:
+    clock = _section(Clock, data, "clock", source)
+    for entry, value in dataclasses.asdict(clock).items():
+        if abs(value) > _LARGEST_CLOCK_OFFSET_S:
+            raise RobotError(
+                f"{source}: clock.{entry} is {value:g} s; it must be at most {_LARGEST_CLOCK_OFFSET_S:g}. Synchronize the clocks."
+            )
+    return clock
 
 
 def _noise(kind: type[Section], data: Mapping[str, Any], name: str, source: str) -> Section:

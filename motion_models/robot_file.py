@@ -26,7 +26,7 @@ def robot_toml(robot: Robot, sigmas: Mapping[str, Mapping[str, float]] | None = 
     lines.append(f"name = {_value(robot.name)}")
     if robot.drive != Robot.drive:
         lines.append(f"drive = {_value(robot.drive)}")
-    for name in ("geometry", "driver", "topics", "joints", "wheel_noise", "gyro_noise"):
+    for name in ("geometry", "driver", "topics", "joints", "wheel_noise", "gyro_noise", "clock"):
         lines += _table(name, dataclasses.asdict(getattr(robot, name)))
     if robot.arms is not None:
         lines += _table("arms", {name: value for name, value in dataclasses.asdict(robot.arms).items() if value != ()})

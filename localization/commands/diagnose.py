@@ -30,6 +30,8 @@ from motion_models.registry import make_model
 from motion_models.robot import Robot, load_robot
 from motion_models.robot_file import relocated, robot_toml
 
+NOT_BETTER = "the corrected robot is not better on the second half of the drive: robot.toml keeps the old values."
+
 
 @dataclass(frozen=True)
 class Diagnose:
@@ -94,13 +96,19 @@ class Diagnose:
     def _write_robot(self, folder: Path, found: DiagnosisResult, robot: Robot) -> None:
         d = found.diagnosis
         new, manual_steps = robot, ()  # type: Robot, tuple[str, ...]
-        if found.predictor is not None and d.findings:
+        is_worse = d.handover is not None and not d.handover.is_better
+        if is_worse:
+            manual_steps = (NOT_BETTER,)
+        elif found.predictor is not None and d.findings:
             patch = correct_robot(found.predictor, d.hypothesis)
             new, manual_steps = patch.robot, patch.manual_steps
         named = (
             "; ".join(f"{f.cause} {f.size:+.4g} +- {f.sigma:.2g} {f.definition.unit}".removesuffix(" 1") for f in d.findings) or "nothing"
         )
-        remarks = [f"Diagnosed by skidloc: {d.model} on {d.log}, from {robot.name}.", f"Corrected here: {named}.", *manual_steps]
+        title = "Found, not corrected" if is_worse else "Corrected here"
+        remarks = [f"Diagnosed by skidloc: {d.model} on {d.log}, from {robot.name}.", f"{title}: {named}.", *manual_steps]
+        if d.handover is not None:
+            remarks.append(d.handover.describe())
         # in the folder's parent, paths start where they will start once it has its name
         text = robot_toml(relocated(new, folder), remarks="\n".join(remarks))
         write_text_file(folder / "robot.toml", text)
@@ -130,6 +138,10 @@ def print_diagnosis(console: Console, d: Diagnosis) -> None:
     label = "unexplained" if d.verdict == "unexplained" else "left, and less than the noise"
     for trend in d.trends:
         console.print(f"{label}: {trend.text}", markup=False, soft_wrap=True)
+    if d.handover is not None:
+        console.print(f"corrected robot, {d.handover.describe()}", markup=False, soft_wrap=True)
+        if not d.handover.is_better:
+            console.print(NOT_BETTER, markup=False, soft_wrap=True)
     if d.next_drive:
         console.print(f"next drive: {d.next_drive}", markup=False, soft_wrap=True)
     for note in (*d.contradictions, *describe_outliers(d), *d.warnings):

@@ -95,6 +95,12 @@ class Cause:
         """Magnitude beyond which a size is not considered: ten times the typical size, or five sigma of a physical prior."""
         return min(10.0 * self.typical, 5.0 * self.prior_sigma or math.inf)
 
+    @property
+    def largest_plausible(self) -> float:
+        """Magnitude beyond which another cause is more likely that is not in the catalogue: five times the typical size, or four sigma of
+        a physical prior; rotations differ from the geometry's by up to all of it on skid-steer robots."""
+        return 1.0 if self.id == "rotation_scale" else min(5.0 * self.typical, 4.0 * self.prior_sigma or math.inf)
+
     def describe(self, size: float) -> str:
         """The effect of ``size`` in words, with its direction.
 
@@ -144,7 +150,7 @@ _GYRO_SCALE_SIGMA = 0.03
 """Sensitivity tolerance of the same gyros: 1 to 3 % [-]."""
 _CLOCK_SIGMA_S = 0.2
 """Latency of drivers and of clocks that are not synchronized, as in the logs that come with the tests (0.04 to 0.2 s) [s]."""
-_RANGE_SCALE_SIGMA, _RANGE_BIAS_SIGMA_M = 0.02, 0.05
+_RANGE_SCALE_SIGMA, _RANGE_BIAS_SIGMA_M = 0.015, 0.05
 """Ranging errors of time-of-flight scanners: 0.03 to 0.05 m by data sheets (SICK LMS1xx, Velodyne VLP-16), 1 to 2 % for triangulation."""
 
 _CAUSES = (

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from localization.diagnosis.causes import Hypothesis
-from localization.diagnosis.prediction import DrivePredictor
+from localization.diagnosis.findings import HandoverCheck
+from localization.diagnosis.linearization import Linearization, make_regression
+from localization.diagnosis.prediction import CHANNELS, DrivePredictor, with_sizes
 from motion_models.base import MotionModel
+from motion_models.center_of_gravity.parts import Arms
 from motion_models.friction import FrictionModel
 from motion_models.friction.contact import SATURATION
 from motion_models.registry import MODELS, make_model
-from motion_models.robot import Mount, Robot
+from motion_models.robot import Clock, Geometry, Mount, Robot
 from motion_models.se2 import FloatArray
 
 _MAX_SAMPLES = 800
@@ -21,6 +25,9 @@ _ROUNDS = 12
 _ANCHOR_WEIGHT = 1e-3  # weight of the old coefficients beside one sample's twist, so that what the drive does not show stays
 _TURN_M = 0.3  # one radian counts as so many metres in the match of twists
 _TWIST = 1e-4
+_MIN_HALF_WINDOWS = 8
+_CLOCKS = ("wheel_time_offset_s", "lidar_time_offset_s", "gyro_time_offset_s")
+_PASSING = ("slope", "encoder_loss", "friction_change", "wheel_radius_drift", "wheel_lag_s", *_CLOCKS)
 
 
 @dataclass(frozen=True)
@@ -29,91 +36,167 @@ class CorrectedRobot:
 
     robot: Robot
     manual_steps: tuple[str, ...]
-    """What a robot file cannot say, and where to mend it instead."""
+    """What a robot file cannot hold, and where to correct it instead."""
+    cg_shift: FloatArray
+    """(2,) by which the new file moves the centre of gravity [m]."""
 
 
-def correct_robot(
-    predictor: DrivePredictor, hypothesis: Hypothesis, lidar_frame: str | None = None, changed: bool = True
-) -> CorrectedRobot:
-    """The drive's robot under ``hypothesis``; every model's coefficients are matched to the corrected motion on the drive's own wheels.
-
-    ``lidar_frame`` is the mount that a LiDAR's findings move.
-    """
+def correct_robot(predictor: DrivePredictor, hypothesis: Hypothesis) -> CorrectedRobot:
+    """The drive's robot under ``hypothesis``; every model's coefficients are matched to the corrected motion on the drive's own wheels."""
     robot = predictor.drive.robot
-    manual_steps: list[str] = []
-    geometry = robot.geometry
-    scale = 1.0 + 0.5 * (hypothesis.left_radius_scale + hypothesis.right_radius_scale)
-    track = geometry.track_width_m + hypothesis.friction.get("track_width", 0.0)
-    geometry = dataclasses.replace(geometry, wheel_radius_m=geometry.wheel_radius_m * scale, track_width_m=track)
     shift = _shift(predictor, hypothesis)
-    arms = robot.arms
-    if np.any(shift):
-        if arms is None:
-            geometry = dataclasses.replace(geometry, cg_x_m=geometry.cg_x_m + float(shift[0]), cg_y_m=geometry.cg_y_m + float(shift[1]))
-        elif arms.static_mass_kg > 0.0:
-            share = geometry.mass_kg / arms.static_mass_kg
-            x, y = (float(v) for v in shift * share)
-            arms = dataclasses.replace(arms, static_x_m=arms.static_x_m + x, static_y_m=arms.static_y_m + y)
-        else:
-            manual_steps.append(
-                f"the centre of gravity is off by ({shift[0]:+.4f}, {shift[1]:+.4f}) m, which the arms' URDF would have to say; "
-                "the models' coefficients hold it instead."
-            )
-            shift = np.zeros(2)
-    geometry = dataclasses.replace(geometry, mass_kg=geometry.mass_kg + hypothesis.payload_kg)
+    geometry, arms, note, shift = _with_cg(robot, _corrected_geometry(robot, hypothesis), shift)
     mounts = dict(robot.mounts)
     if any(hypothesis.lidar_offset):
-        frame = lidar_frame or "laser"
+        frame = predictor.drive.lidar_frame or "laser"
         old = mounts.get(frame, Mount())
         x, y, yaw = hypothesis.lidar_offset
         mounts[frame] = dataclasses.replace(old, x=old.x + x, y=old.y + y, yaw=old.yaw + yaw)
-        manual_steps.append(
-            f"move {frame} by ({x:+.4f} m, {y:+.4f} m, {yaw:+.4f} rad) where /tf_static comes from: it goes before [mounts]."
-        )
-    if hypothesis.wheel_time_offset_s or hypothesis.lidar_time_offset_s:
-        late = [(n, s) for n, s in (("wheels'", hypothesis.wheel_time_offset_s), ("LiDAR's", hypothesis.lidar_time_offset_s)) if s]
-        manual_steps += [
-            f"the {name} stamps are {1e3 * s:+.0f} ms late: mend the clock or the driver, robot files have none." for name, s in late
-        ]
-    if hypothesis.wheel_lag_s:
-        manual_steps.append(f"the body follows the wheels {1e3 * hypothesis.wheel_lag_s:.0f} ms late.")
-    if hypothesis.gyro_bias:
-        manual_steps.append(f"the gyro's bias is {hypothesis.gyro_bias:+.5f} rad/s; let the driver zero it while the robot stands.")
-    if any(hypothesis.slope):
-        manual_steps.append(
-            f"this drive's floor is not level ({hypothesis.slope[0]:+.3f}, {hypothesis.slope[1]:+.3f} rad); that is not the robot's."
-        )
-    if hypothesis.encoder_loss:
-        manual_steps.append(f"an encoder loses counts in {100 * hypothesis.encoder_loss:.1f} % of the time: check its cable.")
-    if hypothesis.friction_change:
-        manual_steps.append(f"the floor grips otherwise from {hypothesis.friction_change_at_s:.0f} s on; one robot file cannot say both.")
     options = robot.options
     if hypothesis.other_contact_law:
         law = _law(robot, hypothesis)
         options = {**options, FrictionModel.name: {**options.get(FrictionModel.name, {}), "contact": law}}
-        manual_steps.append(
-            f"the tyres follow the other contact law by {100 * hypothesis.other_contact_law:.0f} %; "
-            f"[models.friction] has contact = {law!r}."
-        )
-    new = dataclasses.replace(robot, geometry=geometry, arms=arms, mounts=mounts, options=options)
-    if not changed:
-        return CorrectedRobot(new, tuple(manual_steps))
-    lasting = dataclasses.replace(
-        hypothesis,
-        slope=(0.0, 0.0),
-        encoder_loss=0.0,
-        friction_change=0.0,
-        wheel_time_offset_s=0.0,
-        lidar_time_offset_s=0.0,
-        wheel_lag_s=0.0,
+    new = dataclasses.replace(
+        robot, geometry=geometry, arms=arms, mounts=mounts, options=options, clock=_corrected_clock(robot.clock, hypothesis)
     )
     models = dict(robot.models)
     for name in MODELS:
         if name == FrictionModel.name:
-            models[name] = _friction(robot, hypothesis, scale)
+            models[name] = _friction(robot, hypothesis)
+            if any(hypothesis.rotation_coefficients) or any(hypothesis.slip_coefficients):
+                start = dataclasses.replace(new, models={**new.models, name: models[name]})
+                models[name] = _matched(predictor, _lasting(hypothesis), start, name, shift, ("track_width",))
         else:
-            models[name] = _matched(predictor, lasting, new, name, shift)
-    return CorrectedRobot(dataclasses.replace(new, models=models), tuple(manual_steps))
+            models[name] = _matched(predictor, _lasting(hypothesis), new, name, shift)
+    steps = (*note, *_manual_steps(robot, hypothesis, predictor.drive.lidar_frame or "laser"))
+    return CorrectedRobot(dataclasses.replace(new, models=models), steps, shift)
+
+
+def check_handover(predictor: DrivePredictor, linearization: Linearization, named: Sequence[str]) -> HandoverCheck | None:
+    """Correct the robot by the first half of the drive, and predict the second half with it; ``named`` are the keys of the findings.
+
+    What was measured is corrected by the same findings, as a corrected mount or clock would. None for drives of a table, or without
+    motion in either half.
+    """
+    drive = predictor.drive
+    half = len(drive.maneuvers) // 2
+    if drive.kind != "log" or half < _MIN_HALF_WINDOWS or not named:
+        return None
+    is_first = np.arange(len(linearization.rows)) < half
+    first = [np.where(is_first.reshape(-1, *(1,) * (a.ndim - 1)), a, np.nan) for a in _arrays(linearization)]
+    chosen = [i for i, cause in enumerate(linearization.causes) if cause.key in named]
+    causes = tuple(linearization.causes[i] for i in chosen)
+    problem = make_regression(first[0], first[1][..., chosen], first[2], linearization.noise, causes, linearization.tolerance)
+    sizes = problem.fit(tuple(range(len(causes))))[0]
+    hypothesis = with_sizes(dict(zip(causes, (float(v) for v in sizes), strict=True)))
+    corrected = correct_robot(predictor, hypothesis)
+    factors = corrected.robot.geometry.radius_multipliers / drive.robot.geometry.radius_multipliers
+    maneuvers = tuple(dataclasses.replace(m, wheels=m.wheels * factors, cg=m.cg + corrected.cg_shift) for m in drive.maneuvers)
+    model = make_model(predictor.model.name, corrected.robot)
+    after = DrivePredictor(dataclasses.replace(drive, robot=corrected.robot, maneuvers=maneuvers), model, has_inertia=predictor.has_inertia)
+    rows = predictor.discrepancies(Hypothesis()), after.discrepancies(_of_sensors(hypothesis))
+    rms = [np.sqrt(np.nanmean(r[half:, :3] ** 2, axis=0)) for r in rows if np.isfinite(r[half:, 2]).any()]
+    if len(rms) < 2:
+        return None
+    shown = [c for c in range(3) if np.isfinite(rms[0][c])]
+    before_rms, after_rms = ({CHANNELS[c]: float(r[c]) for c in shown} for r in rms)
+    return HandoverCheck(before_rms, after_rms, len(drive.maneuvers) - half)
+
+
+def _arrays(linearization: Linearization) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return linearization.linear, linearization.signatures, linearization.nuisances
+
+
+def _of_sensors(hypothesis: Hypothesis) -> Hypothesis:
+    """The part of ``hypothesis`` that changes measurements and clocks, not the motion of the robot."""
+    names = ("lidar_offset", "lidar_time_offset_s", "wheel_time_offset_s", "gyro_bias", "gyro_scale", "gyro_time_offset_s")
+    return Hypothesis(**{name: getattr(hypothesis, name) for name in (*names, "range_scale", "range_bias_m", "slope")})
+
+
+def _lasting(hypothesis: Hypothesis) -> Hypothesis:
+    """``hypothesis`` without what belongs to this drive, its clocks, or the wheels' radii difference, which the geometry holds."""
+    nothing = Hypothesis()
+    kept = {f.name: getattr(hypothesis, f.name) for f in dataclasses.fields(hypothesis)}
+    return Hypothesis(**{name: getattr(nothing, name) if name in _PASSING else value for name, value in kept.items()})
+
+
+def _corrected_geometry(robot: Robot, hypothesis: Hypothesis) -> Geometry:
+    """Radius, its difference by multipliers whose mean is kept, track and mass."""
+    g = robot.geometry
+    left, right = 1.0 + hypothesis.left_radius_scale, 1.0 + hypothesis.right_radius_scale
+    mean = 0.5 * (left + right)
+    return dataclasses.replace(
+        g,
+        wheel_radius_m=g.wheel_radius_m * mean,
+        left_wheel_radius_multiplier=g.left_wheel_radius_multiplier * left / mean,
+        right_wheel_radius_multiplier=g.right_wheel_radius_multiplier * right / mean,
+        track_width_m=g.track_width_m + hypothesis.friction.get("track_width", 0.0),
+        mass_kg=g.mass_kg + hypothesis.payload_kg,
+    )
+
+
+def _with_cg(robot: Robot, geometry: Geometry, shift: FloatArray) -> tuple[Geometry, Arms | None, tuple[str, ...], FloatArray]:
+    """Geometry and arms with the CG moved by ``shift`` (2,), a note where neither holds it, and the shift that is held."""
+    arms = robot.arms
+    if not np.any(shift):
+        return geometry, arms, (), shift
+    if arms is None:
+        return (
+            dataclasses.replace(geometry, cg_x_m=geometry.cg_x_m + float(shift[0]), cg_y_m=geometry.cg_y_m + float(shift[1])),
+            None,
+            (),
+            shift,
+        )
+    if arms.static_mass_kg > 0.0:
+        x, y = (float(v) for v in shift * (robot.geometry.mass_kg / arms.static_mass_kg))
+        return geometry, dataclasses.replace(arms, static_x_m=arms.static_x_m + x, static_y_m=arms.static_y_m + y), (), shift
+    note = (
+        f"the centre of gravity is off by ({shift[0]:+.4f}, {shift[1]:+.4f}) m, which belongs into the arms' URDF; "
+        "the models' coefficients hold it instead."
+    )
+    return geometry, arms, (note,), np.zeros(2)
+
+
+def _corrected_clock(clock: Clock, hypothesis: Hypothesis) -> Clock:
+    return Clock(
+        clock.wheel_time_offset_s + hypothesis.wheel_time_offset_s,
+        clock.lidar_time_offset_s + hypothesis.lidar_time_offset_s,
+        clock.gyro_time_offset_s + hypothesis.gyro_time_offset_s,
+    )
+
+
+def _manual_steps(robot: Robot, h: Hypothesis, lidar_frame: str) -> list[str]:
+    """What to correct elsewhere, one sentence each."""
+    x, y, yaw = h.lidar_offset
+    clocks = "wheel", h.wheel_time_offset_s, "LiDAR", h.lidar_time_offset_s, "IMU", h.gyro_time_offset_s
+    late = ", ".join(f"{name} {1e3 * s:+.0f} ms" for name, s in zip(clocks[::2], clocks[1::2], strict=True) if s)
+    law = _law(robot, h)
+    steps = (
+        (
+            any(h.lidar_offset),
+            f"move {lidar_frame} by ({x:+.4f} m, {y:+.4f} m, {yaw:+.4f} rad) where /tf_static comes from: a log's "
+            "transforms go before [mounts].",
+        ),
+        (late, f"stamps are late ({late}): [clock] corrects them; synchronize the clocks or mend the driver, and remove it."),
+        (h.wheel_lag_s, f"the body follows the wheels {1e3 * h.wheel_lag_s:.0f} ms late."),
+        (h.gyro_bias, f"the gyro's bias is {h.gyro_bias:+.5f} rad/s; let the driver zero it while the robot stands."),
+        (h.gyro_scale, f"divide the gyro's rates by {1.0 + h.gyro_scale:.4f} in its driver."),
+        (h.range_scale, f"divide the LiDAR's ranges by {1.0 + h.range_scale:.4f} in its driver."),
+        (h.range_bias_m, f"subtract {h.range_bias_m:+.3f} m from the LiDAR's ranges in its driver."),
+        (
+            h.wheel_radius_drift,
+            f"the wheels' radius changed by {100.0 * h.wheel_radius_drift:+.1f} % over the drive: check the tyres.",
+        ),
+        (h.split_friction, f"the left wheels grip {100.0 * h.split_friction:+.0f} % more than the right ones: compare the tyres' treads."),
+        (any(h.slope), f"this drive's floor is not level ({h.slope[0]:+.3f}, {h.slope[1]:+.3f} rad); that is not the robot's."),
+        (h.encoder_loss, f"an encoder loses counts in {100.0 * h.encoder_loss:.1f} % of the time: check its cable."),
+        (h.friction_change, f"the floor's grip changed at {h.friction_change_at_s:.0f} s; one robot file cannot hold both."),
+        (
+            h.other_contact_law,
+            f"the tyres follow the other law by {100.0 * h.other_contact_law:.0f} %; [models.friction] has contact = {law!r}.",
+        ),
+    )
+    return [text for is_found, text in steps if is_found]
 
 
 def _shift(predictor: DrivePredictor, hypothesis: Hypothesis) -> FloatArray:
@@ -124,11 +207,11 @@ def _shift(predictor: DrivePredictor, hypothesis: Hypothesis) -> FloatArray:
     return shift
 
 
-def _friction(robot: Robot, hypothesis: Hypothesis, scale: float) -> dict[str, float]:
+def _friction(robot: Robot, hypothesis: Hypothesis) -> dict[str, float]:
     """The friction model takes the causes of the floor as they are."""
     model = FrictionModel.from_robot(robot)
     values = dict(zip(model.param_names, (float(v) for v in model.nominal), strict=True))
-    values["wheel_radius"] *= scale
+    values["wheel_radius"] *= 1.0 + 0.5 * (hypothesis.left_radius_scale + hypothesis.right_radius_scale)
     for name, more in hypothesis.friction.items():
         values[name] = values[name] * (1.0 + more) if name == "mu_ratio" else values[name] + more
     for name in ("rolling_resistance", "scrub"):
@@ -143,16 +226,21 @@ def _law(robot: Robot, hypothesis: Hypothesis) -> str:
     return min(SATURATION, key=lambda name: abs(SATURATION[name] - share))
 
 
-def _matched(predictor: DrivePredictor, hypothesis: Hypothesis, new: Robot, name: str, shift: FloatArray) -> dict[str, float]:
-    """Coefficients of model ``name`` under the new robot that give the old one's twists plus what the hypothesis changes."""
+def _matched(
+    predictor: DrivePredictor, hypothesis: Hypothesis, new: Robot, name: str, shift: FloatArray, free: tuple[str, ...] = ()
+) -> dict[str, float]:
+    """Coefficients of model ``name`` under the ``new`` robot that give the old one's twists plus what the hypothesis changes; those of
+    ``free`` alone, or all."""
     batch = predictor.batch
     step = max(1, len(batch.dt) // _MAX_SAMPLES)
     rows = np.arange(0, len(batch.dt), step)
-    rates, cg = batch.wheels[rows], batch.cg[rows]
+    factors = new.geometry.radius_multipliers / predictor.drive.robot.geometry.radius_multipliers
+    rates, cg = batch.wheels[rows] * factors, batch.cg[rows]
     old: MotionModel = make_model(name, predictor.drive.robot)
     wanted = dataclasses.replace(predictor, model=old, has_inertia=False).corrected_twist(hypothesis)[rows]
     model: MotionModel = make_model(name, new)
     params = model.nominal.copy()
+    is_free = np.array([not free or param in free for param in model.param_names])
     weight = np.array([1.0, 1.0, _TURN_M])
     size = np.maximum(np.abs(params), 0.05)
     scale = float(np.sqrt(np.mean(wanted**2))) or 1.0
@@ -160,7 +248,7 @@ def _matched(predictor: DrivePredictor, hypothesis: Hypothesis, new: Robot, name
     for _ in range(_ROUNDS):
         twist = model.twist(rates, cg + shift, params)
         off = ((wanted - twist.value) * weight).ravel()
-        slopes = (twist.d_params * weight[:, None]).reshape(-1, len(params)) * size
+        slopes = (twist.d_params * weight[:, None]).reshape(-1, len(params)) * size * is_free
         design = np.vstack([slopes, anchor])
         target = np.r_[off, anchor @ ((model.nominal - params) / size)]
         change = np.linalg.lstsq(design, target, rcond=None)[0]

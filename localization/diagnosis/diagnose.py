@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from localization.diagnosis.causes import CAUSES, MISSING_MESSAGES, WINDOW_CAUSES, Cause
+from localization.diagnosis.corrected_robot import check_handover
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, with_tolerance
@@ -162,7 +163,8 @@ def _conclude(
     chosen, gains, dropped = _keep_useful(linearization, chosen, config)
     sizes, _, gained = problem.fit(chosen)
     findings = _make_findings(predictor, linearization, chosen, gains, rng)
-    rows = attribute_rows(first, linearization, chosen, sizes, config.significance)
+    reference_sigmas = np.sqrt(np.diagonal(predictor.batch.cov, axis1=1, axis2=2)) if drive.kind == "log" else None
+    rows = attribute_rows(first, linearization, chosen, sizes, config.significance, reference_sigmas)
     left = linearization.linear - linearization.signatures[..., list(chosen)] @ sizes
     spreads = problem.scale * np.where(np.isin(np.arange(len(causes)), chosen), 1.0, problem.tolerance)
     trends, left_gain = find_trends(predictor, linearization.noise, left, linearization.signatures, linearization.nuisances, spreads, rng)
@@ -188,9 +190,11 @@ def _conclude(
         outliers_s=tuple(float(t) for t in drive.starts_s[predictor.batch.owner][find_outliers(linearization)]),
         windows=len(drive.maneuvers),
         warnings=drive.warnings,
-        hypothesis=with_sizes({f.definition: f.size for f in findings}),
+        hypothesis=with_sizes({causes[i]: float(size) for i, size in zip(chosen, sizes, strict=True)}),
     )
     result = _with_data_errors(result, drive)
+    handover = check_handover(predictor, linearization, [causes[i].key for i in chosen])
+    result = dataclasses.replace(result, handover=handover)
     scale = np.sqrt(np.diagonal(problem.gram) + 1e-12)
     residuals = Residuals(first.rows, left, linearization.noise.sigmas, tuple(e.key for e in causes), problem.gram / np.outer(scale, scale))
     return DiagnosisResult(dataclasses.replace(result, sentence=sentence(result)), predictor, residuals, linearization)

@@ -282,6 +282,9 @@ def drive_of_table(name: str, robot: Robot, maneuvers: Sequence[Maneuver], kind:
     >>> strongest.cause, round(strongest.size, 2), strongest.cause.unit
     ('lidar_offset_x', 0.06, 'm')
     """
+    factors = robot.geometry.radius_multipliers
+    if (factors != 1.0).any():
+        maneuvers = [dataclasses.replace(m, wheels=m.wheels * factors) for m in maneuvers]
     if kind == "windows":
         maneuvers = [piece for m in maneuvers for piece in _pieces(m)]
     seconds = np.array([float(m.dt[m.lead : m.lead + int(m.ends[-1])].sum()) for m in maneuvers])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
@@ -52,6 +53,11 @@ class Finding:
         return self.definition.id
 
     @property
+    def is_plausible(self) -> bool:
+        """Whether robots have the cause at such a size."""
+        return abs(self.size) <= self.definition.largest_plausible
+
+    @property
     def description(self) -> str:
         """What it does, with its direction and size in words."""
         return self.definition.describe(self.size)
@@ -61,6 +67,7 @@ class Finding:
             "cause": self.cause,
             "meaning": self.definition.meaning,
             "description": self.description,
+            "is_plausible": self.is_plausible,
             "size": self.size,
             "sigma": self.sigma,
             "unit": self.definition.unit,
@@ -99,6 +106,8 @@ class Component:
     """Once everything named is corrected."""
     unattributed_rms: float
     """Once what is within tolerance is taken off as well."""
+    noise_over_reference: float = 1.0
+    """Noise of the drive over that of the motion reference by its own covariance."""
     status: RowStatus = "noise"
     attributions: tuple[Attribution, ...] = ()
 
@@ -113,6 +122,7 @@ class Component:
             "p_value": self.p_value,
             "rms_explained": self.left_rms,
             "rms_unattributed": self.unattributed_rms,
+            "noise_over_reference": self.noise_over_reference,
             "status": self.status,
             "attributions": [a._asdict() for a in self.attributions],
         }
@@ -133,6 +143,28 @@ class Trend:
     def text(self) -> str:
         size = f"{self.over_noise:.2g} times its noise"
         return f"the {self.component} left over follows {self.along} (t = {self.t:+.1f}, p = {self.p_value:.2g}, {size})"
+
+
+@dataclass(frozen=True)
+class HandoverCheck:
+    """Discrepancies of the second half of a drive by the old robot, and by one that was corrected by the first half alone."""
+
+    before: dict[str, float]
+    """Root mean square by component, as `prediction.CHANNELS`."""
+    after: dict[str, float]
+    windows: int
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the product of all components' errors falls."""
+        return math.prod(self.after[c] / max(self.before[c], 1e-12) for c in self.before) < 1.0
+
+    def describe(self) -> str:
+        rows = ", ".join(f"{c} {self.before[c]:.3g} -> {self.after[c]:.3g} {'rad' if c == 'yaw' else 'm'}" for c in self.before)
+        return f"second half of the drive ({self.windows} windows), corrected by the first half alone: {rows} (root mean square)"
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"windows": self.windows, "rms_before": self.before, "rms_after": self.after, "is_better": self.is_better}
 
 
 @dataclass(frozen=True)
@@ -166,6 +198,8 @@ class Diagnosis:
     windows: int = 0
     warnings: tuple[str, ...] = ()
     hypothesis: Hypothesis = field(default_factory=Hypothesis)
+    handover: HandoverCheck | None = None
+    """What the corrected robot gains on the second half of the drive."""
 
     def to_dict(self) -> dict[str, Any]:
         left: dict[str, Any] = {"share": self.left_share, "shapes": [vars(s) for s in self.trends], "text": [s.text for s in self.trends]}
@@ -181,6 +215,7 @@ class Diagnosis:
             "next_drive": self.next_drive,
             "sentence": self.sentence,
             "tolerances": dict(self.tolerances),
+            "handover": None if self.handover is None else self.handover.to_dict(),
             "contradictions": list(self.contradictions),
             "outlier_windows_s": list(self.outliers_s),
             "witness": self.motion_reference,

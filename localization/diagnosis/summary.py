@@ -12,6 +12,7 @@ from localization.diagnosis.drive import MessageLoss, StandstillTurn
 from localization.diagnosis.findings import Component, Diagnosis, Finding
 from localization.diagnosis.noise import Noise
 from localization.diagnosis.prediction import CHANNELS
+from localization.diagnosis.verdict import MAX_NOISE_OVER_REFERENCE
 from motion_models.se2 import FloatArray
 
 _CHANNEL_WORDS = {
@@ -62,6 +63,8 @@ def describe_tolerated(d: Diagnosis) -> list[str]:
 def describe_row(row: Component) -> str:
     """The causes behind one row of the table of discrepancies, or that there are none."""
     by = ", ".join(f"{a.cause} {100 * a.share:.0f} %" for a in row.attributions)
+    if row.status == "unexplained" and row.noise_over_reference > MAX_NOISE_OVER_REFERENCE:
+        return f"unexplained: the noise is {row.noise_over_reference:.1f} times the reference's own"
     if row.status == "unexplained":
         return f"unexplained ({by} and no more)" if by else "unexplained"
     return f"{by} (within tolerance)" if row.status == "within tolerance" else by
@@ -121,8 +124,11 @@ def _left(d: Diagnosis) -> str:
     """What no cause accounts for: trends, else rows of the table."""
     if d.trends:
         return d.trends[0].text
+    implausible = [f"{f.cause} {f.size:+.2g} is more than robots have" for f in d.findings if not f.is_plausible]
+    if implausible:
+        return f"what is named here stands for something else ({'; '.join(implausible)})"
     rows = [
-        f"{name} {row.unattributed_rms:.2g} {row.unit}, noise {row.expected_rms:.2g}"
+        f"{name} {row.unattributed_rms:.2g} {row.unit}, noise {row.expected_rms:.2g}, {describe_row(row).removeprefix('unexplained: ')}"
         for name, row in d.discrepancy.items()
         if row.status == "unexplained"
     ]

@@ -10,10 +10,12 @@ from localization.diagnosis.findings import Trend
 from localization.diagnosis.noise import Noise
 from localization.diagnosis.prediction import CHANNELS, DrivePredictor
 from localization.diagnosis.subset_selection import max_statistic, p_value, regression, statistics
+from motion_models.calibration.maneuvers import IntArray
 from motion_models.se2 import FloatArray
 
 _SIGNIFICANT = 0.01
 _COMPONENTS = 3
+_MIN_VARIANCE = 0.01  # of what is left of a channel, over the noise's
 
 
 def features(predictor: DrivePredictor) -> dict[str, FloatArray]:
@@ -80,18 +82,33 @@ def find_trends(
     n = len(names)
     scale = np.r_[np.ones(n), spreads]
     problem = regression(y, s, z, scale, np.r_[np.zeros(n), spreads])
+    whitened = noise.whiten(left)
+    rest = np.column_stack([np.sum(whitened**2, axis=0), np.isfinite(left).sum(axis=0)]).astype(float)  # squares and degrees of freedom
+    t_channels = np.array([CHANNELS.index(channel) for channel, _ in names])
     given: tuple[int, ...] = ()
     result = []
     gained = 0.0
     for _ in range(3):
         t = np.zeros(n)
         free = [i for i in range(n) if i not in given]
-        t[free] = statistics(problem, given, free)
+        t[free] = statistics(problem, given, free) / _residual_sigmas(rest, t_channels[free], statistics(problem, given, free))
         best = int(np.argmax(np.abs(t)))
-        p = p_value(float(t[best]), max_statistic(problem, given, rng, noise.freedom, n), noise.freedom)
+        freedom = max(min(noise.freedom, rest[t_channels[best], 1] - 1.0), 1.0)
+        p = p_value(float(t[best]), max_statistic(problem, given, rng, freedom, n), freedom)
         if p > _SIGNIFICANT:
             break
+        rest[t_channels[best], 0] -= float(statistics(problem, given, [best])[0]) ** 2
+        rest[t_channels[best], 1] -= 1.0
         gained += float(t[best]) ** 2
         result.append(Trend(*names[best], float(t[best]), p, abs(float(t[best])) / math.sqrt(len(left))))
         given = (*given, best)
     return tuple(result), gained
+
+
+def _residual_sigmas(rest: FloatArray, channels: IntArray, t: FloatArray) -> FloatArray:
+    """(n,) standard deviation that is left of each trend's channel with the trend taken out, in units of the noise; at most 1.
+
+    Noise that was estimated while the trend was in it is too large. ``rest`` (6, 2) are each channel's squares and degrees of freedom.
+    """
+    squares, freedom = rest[channels].T
+    return np.asarray(np.sqrt(np.clip((squares - t**2) / np.maximum(freedom - 1.0, 1.0), _MIN_VARIANCE, 1.0)))

@@ -17,6 +17,9 @@ from motion_models.se2 import FloatArray
 
 MAX_LEFT_OVER_NOISE = 1.5
 """Root mean square that may be left of a row, over its noise: at 1.5 what has no cause is as large as the noise (1.5^2 = 1 + 1.1^2)."""
+MAX_NOISE_OVER_REFERENCE = 3.0
+"""Noise of the drive, over that of the motion reference by its own covariance: up to 1.5 where nothing is hidden, 3.1 to 200 for effects
+that no cause has (`tests.helpers.diagnosis_unknown`)."""
 _MAX_TREND_OVER_NOISE = 0.5  # a trend of half the noise adds 12 % to the root mean square of a row
 _MIN_ATTRIBUTED_SHARE = 0.1  # of a row's squares, for a cause to be listed beside it
 _MAX_ATTRIBUTIONS = 3
@@ -42,9 +45,17 @@ def tolerated_sizes(linearization: Linearization, chosen: tuple[int, ...]) -> Fl
 
 
 def attribute_rows(
-    first: Linearization, linearization: Linearization, chosen: tuple[int, ...], sizes: FloatArray, significance: float
+    first: Linearization,
+    linearization: Linearization,
+    chosen: tuple[int, ...],
+    sizes: FloatArray,
+    significance: float,
+    reference_sigmas: FloatArray | None,
 ) -> dict[str, Component]:
-    """Each channel over the whole drive but its outliers, with the causes that account for it; ``sizes`` (k,) of those ``chosen``."""
+    """Each channel over the whole drive but its outliers, with the causes that account for it; ``sizes`` (k,) of those ``chosen``.
+
+    ``reference_sigmas`` (M, 3) are those of the motion reference, inf where it measured nothing; None where they are not known.
+    """
     regular = ~find_outliers(linearization)
     every = tolerated_sizes(linearization, chosen)
     named = linearization.linear - linearization.signatures[..., list(chosen)] @ sizes
@@ -63,13 +74,23 @@ def attribute_rows(
         squares = float(np.sum(white[known, c] ** 2))
         count = int(known.sum())
         p = float(chi2.sf(squares if c < _TESTED_CHANNELS else count, count))
-        component = Component(CHANNEL_UNITS[c], rms, expected, p, left_rms, rest_rms)
-        if c < _TESTED_CHANNELS and p < significance:
+        excess = _noise_excess(linearization, reference_sigmas, known, c)
+        component = Component(CHANNEL_UNITS[c], rms, expected, p, left_rms, rest_rms, excess)
+        if c < _TESTED_CHANNELS and (p < significance or excess > MAX_NOISE_OVER_REFERENCE):
             shares = parts[known, c].T @ scaled[known, c] / max(float(scaled[known, c] @ scaled[known, c]), 1e-12)
             whitened = float(np.sqrt(np.mean(white_rest[known, c] ** 2)))
             component = _attributed(component, shares, every, linearization.causes, chosen, whitened)
         found[name] = component
     return found
+
+
+def _noise_excess(linearization: Linearization, reference_sigmas: FloatArray | None, known: NDArray[np.bool_], channel: int) -> float:
+    """Median of the estimated noise over that of the reference; 1 where the latter is not known."""
+    if reference_sigmas is None or channel >= reference_sigmas.shape[1]:
+        return 1.0
+    given = reference_sigmas[known, channel]
+    usable = np.isfinite(given) & (given > 0.0)
+    return float(np.median(linearization.noise.sigmas[known, channel][usable] / given[usable])) if usable.any() else 1.0
 
 
 def _rms(values: FloatArray, channel: int) -> float:
@@ -86,7 +107,7 @@ def _attributed(
         if is_listed and len(by) < _MAX_ATTRIBUTIONS:
             by.setdefault(causes[i].id, Attribution(causes[i].id, float(sizes[i]), float(shares[i]), int(i) in chosen))
     left = max(component.unattributed_rms / max(component.expected_rms, 1e-12), whitened)
-    if left > MAX_LEFT_OVER_NOISE:
+    if left > MAX_LEFT_OVER_NOISE or component.noise_over_reference > MAX_NOISE_OVER_REFERENCE:
         return component.with_status("unexplained", tuple(by.values()))
     return component.with_status("attributed" if any(a.is_named for a in by.values()) else "within tolerance", tuple(by.values()))
 
@@ -94,7 +115,10 @@ def _attributed(
 def decide(
     findings: Sequence[Finding], trends: Sequence[Trend], trend_share: float, rows: Sequence[Component], undetectable_share: float
 ) -> Verdict:
-    """The verdict that the table shows: unexplained where a significant row or trend is left, else by what was named."""
+    """The verdict that the table shows: unexplained where a significant row or trend is left, or a size is not plausible, else by what was
+    named."""
+    if any(not f.is_plausible for f in findings):
+        return "unexplained"
     is_left = any(row.status == "unexplained" for row in rows) or any(t.over_noise > _MAX_TREND_OVER_NOISE for t in trends)
     if is_left or (trends and (not findings or trend_share > _MAX_TREND_SHARE)):
         return "unexplained"

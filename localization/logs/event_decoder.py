@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
-from localization.events import CgSample, Event
+from localization.events import CgSample, Event, WheelSample
 from localization.logs.clock_sync import Item
 from localization.logs.decode import (
     ArmReading,
@@ -27,7 +28,7 @@ from localization.logs.wheel_decoder import JointsToWheels, OdometryToWheels
 from motion_models.center_of_gravity.model import CgModel
 from motion_models.center_of_gravity.parts import support_margin
 from motion_models.center_of_gravity.tracker import CgTracker
-from motion_models.robot import Geometry, Robot
+from motion_models.robot import Clock, Geometry, Robot
 
 _RANKS = {"joint_states": 0, "odometry": 0, "center_of_gravity": 1, "imu": 2, "scan": 3, "points": 3}
 _SCAN_WEIGHT = 100
@@ -42,6 +43,8 @@ class TopicDecoder(NamedTuple):
     rank: int
     """Order among events of equal stamps."""
     decode: MessageDecoder
+    late_ns: int = 0
+    """By how much stamps are late, as `motion_models.robot.Clock` has it."""
 
 
 class EventDecoder:
@@ -59,6 +62,8 @@ class EventDecoder:
         self._sources, self._joints, self._arms = sources, joints, arms
         wheels = "" if sources.wheels is None else sources.wheels.topic
         left, right = joints
+        self._multipliers = robot.geometry.radius_multipliers
+        self._has_multipliers = bool((self._multipliers != 1.0).any())
         self.from_joints = JointsToWheels(left, right, robot.geometry.wheel_radius_m, wheels, stats)
         self.from_odometry = OdometryToWheels(robot.driver, wheels, stats)
         named = " and ".join(source.topic for source in sources.arms)
@@ -66,25 +71,32 @@ class EventDecoder:
         cg_topic = "" if sources.center_of_gravity is None else sources.center_of_gravity.topic
         self._check_cg = partial(check_tipping, geometry=robot.geometry, topic=cg_topic, oddity=Oddity.TIPPING_CG, stats=stats)
         self.decoders: Mapping[str, TopicDecoder] = {
-            source.topic: TopicDecoder(_RANKS[source.kind], self._decoder(source)) for source in sources.used()
+            source.topic: TopicDecoder(_RANKS[source.kind], self._decoder(source), _late_ns(source.kind, robot.clock))
+            for source in sources.used()
         }
         """By topic."""
 
     def events(self, payload: Any) -> Iterator[Event]:
         """The events of one decoded message; readings must come in order."""
         if isinstance(payload, JointReading):
-            yield from self.from_joints(payload)
+            yield from map(self._roll, self.from_joints(payload))
         elif isinstance(payload, ArmReading):
             if (wheels := payload.wheels) is not None:
-                yield from self.from_joints(JointReading(payload.stamp_ns, wheels.position, wheels.velocity))
+                yield from map(self._roll, self.from_joints(JointReading(payload.stamp_ns, wheels.position, wheels.velocity)))
             if self._from_arms is not None:
                 yield from self._from_arms(payload)
         elif isinstance(payload, OdometryReading):
-            yield from self.from_odometry(payload)
+            yield from map(self._roll, self.from_odometry(payload))
         elif isinstance(payload, CgSample):
             yield from self._check_cg(payload)
         else:
             yield payload
+
+    def _roll(self, sample: WheelSample) -> WheelSample:
+        """``sample`` with each side's rate and angle times its wheels' radius multiplier."""
+        if not self._has_multipliers:
+            return sample
+        return dataclasses.replace(sample, velocity=sample.velocity * self._multipliers, position=sample.position * self._multipliers)
 
     def _decoder(self, source: TopicSource) -> MessageDecoder:
         if source.kind == "joint_states":
@@ -106,12 +118,23 @@ class EventDecoder:
         return decoders[source.kind]
 
 
+def _late_ns(kind: str, clock: Clock) -> int:
+    seconds = {
+        "joint_states": clock.wheel_time_offset_s,
+        "odometry": clock.wheel_time_offset_s,
+        "imu": clock.gyro_time_offset_s,
+        "scan": clock.lidar_time_offset_s,
+        "points": clock.lidar_time_offset_s,
+    }
+    return round(seconds.get(kind, 0.0) * 1e9)
+
+
 def decode_item(topic: str, log_ns: int, read: Callable[[], Any], decoder: TopicDecoder, stats: MessageStats) -> Item | None:
     """Decode the message that ``read`` returns, recorded at ``log_ns``, to an item to merge; None, and counted, where it is unusable."""
-    rank, decode = decoder
+    rank, decode, late_ns = decoder
     try:
         message = read()
-        stamp = stamp_ns(message)
+        stamp = stamp_ns(message) - late_ns
         payload = decode(message, stamp)
     except UnusableError as reason:
         stats.count(topic, reason.oddity)

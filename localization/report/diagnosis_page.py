@@ -39,6 +39,7 @@ def diagnosis_page(found: DiagnosisResult) -> str:
         Section("Findings", _findings(d)),
         Section("Next drive", [Paragraph(d.next_drive)] if d.next_drive else []),
         *_figures(found),
+        Section("Corrected robot: before and after", _handover(d)),
         Section("Within tolerance", bullets(describe_tolerated(d))),
         Section("Contradictions", bullets(d.contradictions)),
         Section("Left unexplained", bullets([s.text for s in d.trends])),
@@ -89,6 +90,14 @@ def _components(d: Diagnosis) -> list[Block]:
         numbers = (f"{c.rms:.4g}", f"{c.expected_rms:.4g}", f"{c.unattributed_rms:.4g}", f"{c.p_value:.2g}")
         rows.append([Cell(text) for text in (name, c.unit, *numbers, describe_row(c))])
     return [Table([Cell(title) for title in ("Component", "Unit", "RMS", "Noise", "Left", "p", "Attributed to")], rows)]
+
+
+def _handover(d: Diagnosis) -> list[Block]:
+    if d.handover is None:
+        return []
+    h = d.handover
+    rows = [[Cell(c), Cell(f"{h.before[c]:.4g}"), Cell(f"{h.after[c]:.4g}")] for c in h.before]
+    return [Paragraph(h.describe()), Table([Cell(title) for title in ("Component", "RMS before", "RMS after")], rows)]
 
 
 def _detectable(d: Diagnosis) -> list[Block]:

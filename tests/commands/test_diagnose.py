@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from localization.cli import main
+from motion_models.robot import load_robot
 from tests.helpers.diagnosis_drives import bag
 
 DATA = Path(__file__).parents[1] / "data"
@@ -55,6 +56,21 @@ def test_a_corrected_robot_replays(tmp_path: Path) -> None:
         assert main(["replay", str(log), *options]) == 0
         errors[name] = json.loads((replayed / "metrics.json").read_text())["results"][0]["ate_rmse_m"]
     assert errors["after"] < 0.6 * errors["before"]
+
+
+def test_diagnose_out_hands_radii_and_clock_to_diff_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """diff_drive has no parameter for either: the file's [geometry] and [clock] hold them for every model."""
+    log = bag(tmp_path / "drive.mcap", {"wheel_radius_difference": 0.04, "wheel_time_offset": 0.06}, 1, "husky_a200")
+    out = tmp_path / "out"
+    assert main(["diagnose", str(log), "--robot", "husky_a200", "--model", "diff_drive", "--out", str(out)]) == 0
+    assert "second half of the drive" in capsys.readouterr().out
+    content = json.loads((out / "diagnosis.json").read_text())["handover"]
+    assert content["is_better"]
+    assert all(content["rms_after"][name] < 0.6 * content["rms_before"][name] for name in ("x", "y", "yaw"))
+    robot = load_robot(out / "robot.toml")
+    assert robot.clock.wheel_time_offset_s == pytest.approx(0.06, abs=0.01)
+    assert robot.geometry.left_wheel_radius_multiplier == pytest.approx(1.02, abs=0.003)
+    assert "before and after" in (out / "diagnosis.html").read_text()
 
 
 def test_a_drive_without_a_witness_is_undecidable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -46,8 +46,13 @@ TYPICAL: Mapping[str, float] = {
     "lateral_slip_speed": 0.1,
     "rotation_slip_speed": 0.1,
     "longitudinal_slip_turning": 0.1,
+    "gyro_scale": 0.05,
+    "gyro_time_offset": 0.05,
+    "range_scale": 0.02,
+    "wheel_radius_drift": 0.03,
+    "split_friction": 0.3,
 }
-"""Sizes that robots really have."""
+"""Sizes that robots really have. A bias of all ranges hardly shows in a hall."""
 ONE_SIDED = ("payload", "encoder_dropout", "scrub", "rolling_resistance", "lateral_force_law")
 
 _CGS = ((0.06, -0.01), (-0.02, 0.02))
