@@ -103,7 +103,9 @@ class GraphFusion:
         A = se2.adjoint(se2.inverse(delta))
         pose = se2.compose(self._map_T_odom, ekf.pose)
         odometry = estimate.pose, estimate.covariance
-        return replace(estimate, pose=pose, covariance=A @ self._key_cov @ A.T + ekf.drift_since_key(), odometry=odometry, map_T_odom=self._map_T_odom)
+        return replace(
+            estimate, pose=pose, covariance=A @ self._key_cov @ A.T + ekf.drift_since_key(), odometry=odometry, map_T_odom=self._map_T_odom
+        )
 
     def run_deferred(self) -> None:
         """What the last estimate need not wait for: the submap, a keyframe, loops, positions."""
