@@ -154,12 +154,12 @@ class Filter:
     def motion_since(self, clone: slice) -> tuple[FloatArray, FloatArray]:
         """Motion (3,) since the clone `START` or `KEY`, and its covariance (3, 3)."""
         delta = se2.between(self.start if clone == START else self.key, self.pose)
-        J = np.hstack([np.eye(3), -se2.adjoint(se2.inverse(delta))])
-        states = np.r_[POSE, clone]
-        return delta, _positive(J @ self.P[np.ix_(states, states)] @ J.T)
+        A, P = se2.adjoint(se2.inverse(delta)), self.P
+        cross = P[POSE, clone] @ A.T
+        return delta, _positive(P[POSE, POSE] - cross - cross.T + A @ P[clone, clone] @ A.T)
 
-    def drift_since_key(self) -> FloatArray:
-        """(3, 3) covariance that the motion since the clone `KEY` adds to the pose's, where such motions are chained as independent.
+    def drift_since_key(self) -> tuple[FloatArray, FloatArray]:
+        """Motion (3,) since the clone `KEY`, and the covariance (3, 3) that it adds to the pose's where motions are chained as independent.
 
         |P - A P_key A^T|, A = Ad(delta^-1), with the matrix' absolute value and at most 1 in units of `motion_since`'s covariance C. Scans
         that are matched to one submap share its error: C holds the noise of the scans at both ends, which a chain would count anew with
@@ -171,7 +171,7 @@ class Filter:
         whiten = np.linalg.inv(root)
         shares, axes = np.linalg.eigh(_symmetric(whiten @ (self.P[POSE, POSE] - A @ self.P[KEY, KEY] @ A.T) @ whiten.T))
         kept = root @ axes
-        return np.asarray((kept * np.clip(np.abs(shares), _MIN_DRIFT_SHARE, 1.0)) @ kept.T)
+        return delta, np.asarray((kept * np.clip(np.abs(shares), _MIN_DRIFT_SHARE, 1.0)) @ kept.T)
 
     def _update(self, innovation: FloatArray, H: FloatArray, R: FloatArray) -> tuple[float, FloatArray]:
         """Schmidt-Kalman update in Joseph's form; consider states have no gain. Returns NIS and gain. Raises `EstimatorError`."""

@@ -23,6 +23,8 @@ from motion_models.se2 import FloatArray
 _MAX_STANDSTILL_M, _MAX_STANDSTILL_RAD = 0.01, 0.01
 """A scan or a turn of the gyro that is off by more, and by 5 sigma, contradicts wheels that stand [m, rad]."""
 _SIGMAS = 5.0
+_FORGETTING = 0.98
+"""Of the statistics of slip, per scan: they are a mean over the last 50 scans, as those of the matcher."""
 _BLOCKED_SPEED = np.array([0.5, 0.5, 0.5])
 """Sigma of the twist where wheels read zero but the robot moves [m/s, m/s, rad/s]."""
 
@@ -37,6 +39,7 @@ class EkfFusion:
         self._sensor, self._model, self._corrections = sensor, model, corrections
         self._track_m = robot.geometry.track_width_m
         self._slip = np.zeros(3)  # twist that the wheels missed in the last step
+        self._slip_changes = _SlipChanges()
         self._has_gyro = self._is_blocked = self._is_scan_pending = False
         self.wheel_motion, self.is_turning = Motion(np.zeros(3), np.zeros((3, 3))), True
         """Motion of the last step by the wheels, with the covariance that the filter gave it in the end; whether it corrects the model."""
@@ -103,14 +106,17 @@ class EkfFusion:
         self._is_scan_pending = True
         if match is None:
             return None
+        R = match.cov
         if duration > 0.0:
-            seen = se2.log(se2.between(ekf.start, match.pose)) / duration
-            match = sensor.refine(match, step.twist + seen - _mean_twist(step))
+            slip = se2.log(se2.between(ekf.start, match.pose)) / duration - _mean_twist(step)
+            match = sensor.refine(match, step.twist + slip)
+            self._slip_changes.add(slip - self._slip, step)
+            R = match.cov + self._slip_changes.sweep_cov(step, sensor.sweep_s)
         self.counts_by_name["matched"] += 1
         self.counts_by_name["searched"] += bool(match.outlier_cov.any())
         self._is_blocked = step.is_standing and _is_contradicted(prior, cov, match)
         self.wheel_motion = replace(self.wheel_motion, cov=self.wheel_motion.cov + match.outlier_cov)
-        return ekf.update_scan(match.measured, match.cov, match.outlier_cov)
+        return ekf.update_scan(match.measured, R, match.outlier_cov)
 
     def _is_turning(self, motion: Motion) -> bool:
         """Whether ``motion`` turns enough to say something of the corrections."""
@@ -161,6 +167,32 @@ class EkfFusion:
 
     def map_points(self) -> FloatArray:
         return NO_POINTS if self._sensor is None else self._sensor.map_points()
+
+
+class _SlipChanges:
+    """How much of the wheels' noise is new in every step, by how far the slip of one scan is off that of the next.
+
+    Slip that lasts is in the twist that a sweep is deskewed with. What changes within the sweep is not: it bends the scan.
+    """
+
+    def __init__(self) -> None:
+        self._sum = self._weight = 1.0  # white, as the wheels' noise model has it, until measured
+
+    def add(self, change: FloatArray, step: Step) -> None:
+        """``change`` (3,) of the slip since the last scan [m/s, m/s, rad/s]."""
+        if not step.has_wheels or step.is_standing:
+            return
+        moved = change * step.duration  # white slip: twice the covariance of a step
+        ratio = float(moved @ np.linalg.solve(2.0 * step.predicted.cov, moved)) / 3.0
+        if ratio < _SIGMAS**2:  # beyond, scans or wheels are outliers
+            self._sum = _FORGETTING * self._sum + ratio
+            self._weight = _FORGETTING * self._weight + 1.0
+
+    def sweep_cov(self, step: Step, sweep_s: float) -> FloatArray:
+        """(3, 3) by which the pose of a bent scan is off: the mean over a sweep of T of a random walk about its middle, Q T / 12."""
+        if not step.has_wheels or step.is_standing:
+            return np.zeros((3, 3))
+        return np.asarray(self._sum / self._weight * step.predicted.cov / step.duration * sweep_s / 12.0)
 
 
 def _mean_twist(step: Step) -> FloatArray:

@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
 from localization.estimators.base import Estimate
-from localization.estimators.filter import KEY, PARAMS
+from localization.estimators.filter import PARAMS
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
 from localization.events import PositionSample
@@ -96,16 +96,14 @@ class GraphFusion:
         if self._is_smoothing and (not self._stamps_ns or step.end_ns > self._stamps_ns[-1]):
             self._steps.extend(ekf.pose)
             self._stamps_ns.append(step.end_ns)
-        delta, _ = ekf.motion_since(KEY)
+        delta, cov = ekf.drift_since_key()
         moved = math.hypot(delta[0], delta[1]) >= self._config.keyframe_distance_m or abs(delta[2]) >= self._config.keyframe_angle_rad
         self._is_keyframe_due = not self._graph.count or (moved and (step.scan is not None or self.lost is None))
         self._place_positions(step)
         A = se2.adjoint(se2.inverse(delta))
         pose = se2.compose(self._map_T_odom, ekf.pose)
         odometry = estimate.pose, estimate.covariance
-        return replace(
-            estimate, pose=pose, covariance=A @ self._key_cov @ A.T + ekf.drift_since_key(), odometry=odometry, map_T_odom=self._map_T_odom
-        )
+        return replace(estimate, pose=pose, covariance=A @ self._key_cov @ A.T + cov, odometry=odometry, map_T_odom=self._map_T_odom)
 
     def run_deferred(self) -> None:
         """What the last estimate need not wait for: the submap, a keyframe, loops, positions."""
@@ -121,11 +119,11 @@ class GraphFusion:
     def _add_keyframe(self) -> None:
         ekf, k = self.odometry.filter, self._graph.count
         if k:
-            delta, _ = ekf.motion_since(KEY)
+            delta, cov = ekf.drift_since_key()
             wheels = self._wheels.preintegrated(ekf.corrections)
             D = wheels.by_corrections[:, :-1]
             total = wheels.cov + D @ ekf.P[PARAMS:, PARAMS:] @ D.T
-            measured = _subtract_information(delta, ekf.drift_since_key(), wheels.delta, total)
+            measured = _subtract_information(delta, cov, wheels.delta, total)
             pose = se2.compose(self._graph.pose(k - 1), delta)
             update = Update(pose, wheels, self._walk(), (Between(k - 1, k, *measured),))
         else:

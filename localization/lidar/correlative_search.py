@@ -56,14 +56,8 @@ def draw_image(points: FloatArray, cell: float) -> LikelihoodImage:
     shape = np.ceil((points.max(axis=0) + margin - origin) / cell).astype(int) + 8
     fine = np.zeros(tuple((shape + step - 1) // step * step), np.float32)
     _draw(points, fine, origin, cell)
-    levels = [fine]
-    for _ in range(2):
-        image = levels[-1]
-        blocks = image.reshape(image.shape[0] // COARSE, COARSE, image.shape[1] // COARSE, COARSE).max((1, 3))
-        padded = np.pad(blocks, 1)
-        shifted = [padded[i : i + blocks.shape[0], j : j + blocks.shape[1]] for i in range(3) for j in range(3)]
-        levels.append(np.ascontiguousarray(np.max(shifted, axis=0)))
-    return LikelihoodImage(tuple(levels), origin, cell)
+    middle = _reduce(fine)
+    return LikelihoodImage((fine, middle, _reduce(middle)), origin, cell)
 
 
 def search(image: LikelihoodImage, points: FloatArray, prior: FloatArray, cov: FloatArray, limit: FloatArray) -> SearchResult:
@@ -133,6 +127,28 @@ def _draw(points: FloatArray, image: FloatArray, origin: FloatArray, cell: float
             for jy in range(int(y) - 2, int(y) + 3):
                 value = math.exp(-0.5 * ((jx + 0.5 - x) ** 2 + (jy + 0.5 - y) ** 2))
                 image[jx, jy] = max(image[jx, jy], value)
+
+
+@numba.njit(cache=True)
+def _reduce(image: FloatArray) -> FloatArray:
+    """The maxima of blocks of `COARSE` x `COARSE` cells, and of their neighbours."""
+    rows, columns = image.shape[0] // COARSE, image.shape[1] // COARSE
+    out = np.zeros((rows, columns), image.dtype)
+    for i in range(image.shape[0]):
+        for j in range(image.shape[1]):
+            if image[i, j] > out[i // COARSE, j // COARSE]:
+                out[i // COARSE, j // COARSE] = image[i, j]
+    for j in range(columns):  # maxima of three rows, then of three columns, in place
+        above = out[0, j]
+        for i in range(rows):
+            here, below = out[i, j], out[min(i + 1, rows - 1), j]
+            out[i, j], above = max(above, here, below), here
+    for i in range(rows):
+        left = out[i, 0]
+        for j in range(columns):
+            here, right = out[i, j], out[i, min(j + 1, columns - 1)]
+            out[i, j], left = max(left, here, right), here
+    return out
 
 
 @numba.njit(cache=True)

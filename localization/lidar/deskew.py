@@ -57,12 +57,17 @@ class Sweep:
         """(M, 2) what of the deskewed ``points`` (N, 3) is matched in the plane: a planar scan as it is, of a cloud the walls."""
         return np.ascontiguousarray(points[:, :2] if self.is_planar else extract_walls(points, _WALL_CELL_M))
 
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last point [s]."""
+        return float(np.ptp(self.times)) if len(self.times) else 0.0
+
     def displacement(self, twist: FloatArray) -> float:
         """How far an error of ``twist`` (3,) moves points of the sweep against each other [m]."""
         if not len(self.times):
             return 0.0
         reach = float(np.median(np.hypot(self.points[:, 0], self.points[:, 1])))
-        return float(np.ptp(self.times)) * (math.hypot(twist[0], twist[1]) + abs(float(twist[2])) * reach)
+        return self.duration_s * (math.hypot(twist[0], twist[1]) + abs(float(twist[2])) * reach)
 
 
 def extract_walls(points: FloatArray, cell: float, min_height: float = 0.3) -> FloatArray:

@@ -197,7 +197,7 @@ class ScanMatcher:
         return self._result(Fit(pose, H, np.zeros(3), *(float(value) for value in found)), np.zeros((3, 3)))
 
     def insert_key_scan(self, pose: FloatArray, points: FloatArray, map_cov: FloatArray | None = None) -> KeyScanError:
-        """Draw a scan from ``pose`` (3,). ``map_cov`` (3, 3) of the submap's error there: with it, scans of long ago stay while they fit."""
+        """Draw a scan from ``pose`` (3,). ``map_cov`` (3, 3) of the submap's error there: with it, old scans stay while they fit."""
         drawn = np.asarray(se2.transform(pose, points))
         scan = make_grid(drawn, self.cell, self._config.range_noise_m)
         share, new = (1.0, 0.0) if self._grid is None else measure_shares(self._grid, scan)

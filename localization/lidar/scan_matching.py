@@ -111,6 +111,11 @@ class ScanMatchingSensor:
         return np.empty((0, 2)) if self._matcher is None else self._matcher.points()
 
     @property
+    def sweep_s(self) -> float:
+        """From the first to the last point of the scan at hand [s]; 0 where the points have no times."""
+        return 0.0 if self._scan is None else self._scan.sweep.duration_s
+
+    @property
     def cell(self) -> float:
         """Edge of the submap's voxels [m]."""
         return 0.0 if self._matcher is None else self._matcher.cell

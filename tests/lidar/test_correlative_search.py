@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -119,3 +120,11 @@ def test_rival_of_a_square_room_is_as_good_as_the_best() -> None:
 def test_scan_of_another_place_scores_low() -> None:
     points = voxel_means(rooms.scan_from(LAB, np.array([0.5, 0.3, 0.7]), np.random.default_rng(0)), CELL)
     assert search(image_of(HALL), points, np.zeros(3), np.diag([0.5, 0.5, 0.3]) ** 2, ANYWHERE).score < 0.5
+
+
+def test_levels_of_the_image_are_maxima_of_blocks_and_their_neighbours() -> None:
+    image = draw_image(np.random.default_rng(0).uniform(-3.0, 3.0, (200, 2)), 0.1)
+    for fine, coarse in itertools.pairwise(image.levels):
+        blocks = np.pad(fine.reshape(fine.shape[0] // COARSE, COARSE, fine.shape[1] // COARSE, COARSE).max((1, 3)), 1)
+        for i, j in np.ndindex(coarse.shape):
+            assert coarse[i, j] == blocks[i : i + 3, j : j + 3].max()

@@ -105,6 +105,10 @@ _NO_SEARCH = (
     _attribute(scan_matcher, "_BASIN_RAD", math.inf),
 )
 PATCHES: Mapping[str, Patch] = {
+    "old key scans that fit": _wrap(
+        ScanMatcher, "_fitting_keys", lambda original, self, pose, points, map_cov: original(self, pose, points, None)
+    ),
+    "slip that changes within a sweep": _attribute(fusion._SlipChanges, "sweep_cov", lambda self, step, sweep_s: np.zeros((3, 3))),
     "second deskewing pass": _attribute(ScanMatchingSensor, "refine", lambda self, match, twist: match),
     "slip in the deskewing twist": _wrap(
         ScanMatchingSensor, "measure", lambda original, self, step, prior, cov, twist: original(self, step, prior, cov, step.twist)
