@@ -1,8 +1,9 @@
 """Consistency of the sensors with each other: wheels, gyro and LiDAR each measure the same motion.
 
-The turn rates of the three, and the direction of travel by wheels and LiDAR, are compared over the last seconds. A sensor that contradicts
-the two others is left out from then on; where only two can be compared, the covariance takes both into account. Each fault gives a warning
-with sensor, time and remedy, and widens the published covariance by the difference that it has made so far.
+The turn rates of the three, and the direction of travel by wheels and LiDAR, are compared over windows of seconds. A sensor that
+contradicts the two others in most windows of the last minutes is left out while that lasts; where only two can be compared, the covariance takes both
+into account. Each fault gives a warning with sensor, time and remedy, and widens the published covariance by the difference that it has
+made so far.
 
 The LiDAR's motion is that of `lidar.scan_motion`, which uses neither the filter nor the other sensors.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import NamedTuple
@@ -35,6 +37,9 @@ _WINDOW_BINS, _MIN_BINS = 24, 10
 """Bins that are compared (6 s), and the fewest (2.5 s)."""
 _MIN_LASTING_S = 1.0
 """Time for which a comparison must give the same result before a sensor is declared faulty."""
+_MEMORY_S, _MIN_CONTRADICTING = 120.0, 2.0 / 3.0
+"""How a sensor is mounted, wired and scaled does not change while driving: it is left out while at least this share of the comparisons
+of the last two minutes contradict it. (fr079 has single windows of 6 s in which the robot travels 14 deg off its wheels.)"""
 _MAX_BIAS_RAD_S = 0.05
 """Gyro bias that is no contradiction; ten times the prior sigma of the shipped robots."""
 _MIN_RATE_RAD_S = 0.001
@@ -70,20 +75,22 @@ _NS = 1e-9
 class Fault(Enum):
     """What is wrong, and what to do."""
 
-    GYRO_OPPOSITE = "the gyro turns opposite to {others}. It is not used from then on. Correct the IMU's mount, or the sign in its driver."
+    GYRO_OPPOSITE = (
+        "the gyro turns opposite to {others}. It is not used while that lasts. Correct the IMU's mount, or the sign in its driver."
+    )
     GYRO_UNIT = (
-        "the gyro's rates are {ratio:.2g} times those of {others} (deg/s?). It is not used from then on. Let its driver publish rad/s."
+        "the gyro's rates are {ratio:.2g} times those of {others} (deg/s?). It is not used while that lasts. Let its driver publish rad/s."
     )
     GYRO_STUCK = "the gyro repeats one value while {others} turn. It is not used as long as that lasts. Check the IMU and its driver."
     WHEELS_OPPOSITE = (
-        "the wheels turn opposite to {others}. They are not used from then on. Swap left and right in the robot file's [joints]."
+        "the wheels turn opposite to {others}. They are not used while that lasts. Swap left and right in the robot file's [joints]."
     )
     LIDAR_OPPOSITE = (
-        "the LiDAR turns opposite to {others}. Its scans are not used from then on. It is mounted upside down, or left and right wheels are"
-        " swapped: correct the roll of its frame in /tf_static or in the robot file's [mounts], or the robot file's [joints]."
+        "the LiDAR turns opposite to {others}. Its scans are not used while that lasts. It is mounted upside down, or left and right wheels"
+        " are swapped: correct the roll of its frame in /tf_static or in the robot file's [mounts], or the robot file's [joints]."
     )
     LIDAR_DIRECTION = (
-        "by the LiDAR the robot travels {degrees:.0f} deg to the {side} of where the wheels drive. Its scans are not used from then on."
+        "by the LiDAR the robot travels {degrees:.0f} deg to the {side} of where the wheels drive. Its scans are not used while that lasts."
         " Correct the yaw of its frame by {correction:+.0f} deg in /tf_static or in the robot file's [mounts]."
     )
     LIDAR_OWN_BODY = (
@@ -148,6 +155,7 @@ class SensorChecks:
         self._open = _Accumulator()
         self._is_gyro_stuck = self._has_scans = False
         self._shaking = ShakeDetector()
+        self._comparisons: dict[Fault, deque[tuple[float, bool]]] = {}  # time [s], and whether it contradicts
         self._suspected: dict[Fault, tuple[float, float]] = {}  # when first found, and start of the bins then [s]
         self.found: dict[Fault, Found] = {}
         self._start_ns: int | None = None
@@ -169,8 +177,7 @@ class SensorChecks:
             self._start_ns = step.start_ns
         step = self._without_own_body(step)
         self._record(step)
-        if self.found:
-            step = self._without_faulty(step)
+        step = self._without_faulty(step)
         return self._check_standstill(step)
 
     def widen(self, estimate: Estimate) -> Estimate:
@@ -215,7 +222,7 @@ class SensorChecks:
         return replace(step, scan=scan)
 
     def _without_faulty(self, step: Step) -> Step:
-        faults = self.found.keys()
+        faults = {fault for fault in self.found if self._is_contradicted(fault)}
         if faults & {Fault.GYRO_OPPOSITE, Fault.GYRO_UNIT} or (self._is_gyro_stuck and Fault.GYRO_STUCK in faults):
             step = replace(step, turn=None)
         if faults & {Fault.LIDAR_OPPOSITE, Fault.LIDAR_DIRECTION}:
@@ -294,13 +301,27 @@ class SensorChecks:
             side = "left" if degrees > 0.0 else "right"
             suspects[Fault.LIDAR_DIRECTION] = {"degrees": abs(degrees), "side": side, "correction": -degrees}
         first = now_s, max(now_s - float(seconds.sum()), 0.0)
+        self._compare(now_s, suspects.keys(), _confirmed(wheels_gyro, wheels_lidar, lidar_gyro, direction))
         self._suspected = {fault: self._suspected.get(fault, first) for fault in suspects}
         for fault, (first_s, since_s) in self._suspected.items():
-            if now_s - first_s >= _MIN_LASTING_S:
+            if now_s - first_s >= _MIN_LASTING_S and self._is_contradicted(fault):
                 self._declare(fault, since_s, suspects[fault])
         is_turn_confirmed = wheels_gyro.is_equal or wheels_lidar.is_equal or lidar_gyro.is_equal
         if not suspects and is_turn_confirmed and (direction is not None or not self._has_scans):
             self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)
+
+    def _compare(self, now_s: float, contradicted: AbstractSet[Fault], confirmed: AbstractSet[Fault]) -> None:
+        """Store what this window shows of each fault of installation: that it is there, that it is not, or nothing."""
+        for fault in contradicted | confirmed:
+            comparisons = self._comparisons.setdefault(fault, deque())
+            comparisons.append((now_s, fault in contradicted))
+            while comparisons[0][0] < now_s - _MEMORY_S:
+                comparisons.popleft()
+
+    def _is_contradicted(self, fault: Fault) -> bool:
+        """Whether most comparisons of the last minutes show ``fault``."""
+        comparisons = self._comparisons.get(fault, ())
+        return sum(is_there for _, is_there in comparisons) >= _MIN_CONTRADICTING * max(len(comparisons), 1)
 
     def _declare(self, fault: Fault, at_s: float, numbers: Mapping[str, float | str]) -> None:
         """Report ``fault`` once, and widen the covariance by how far the estimate is from the other sensors' dead reckoning."""
@@ -328,8 +349,9 @@ class _Accumulator:
         if step.duration == 0.0:
             return
         self.duration_s += step.duration
-        delta = step.predicted.delta if step.has_wheels else np.full(3, np.nan)
-        self._wheels = delta if self._wheels is None else se2.compose(self._wheels, delta)
+        before = np.zeros(3) if self._wheels is None else self._wheels
+        is_known = step.has_wheels and bool(np.isfinite(before).all())
+        self._wheels = se2.compose(before, step.predicted.delta) if is_known else np.full(3, np.nan)
         self._gyro += math.nan if step.turn is None else step.turn.angle
         self._is_standing &= step.is_standing
 
@@ -412,6 +434,20 @@ def _find_turn_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyr
         if relation.unit_ratio:
             found.append((Fault.GYRO_UNIT, {"others": others, "ratio": relation.unit_ratio}))
             break
+    return found
+
+
+def _confirmed(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation, direction: float | None) -> set[Fault]:
+    """Faults of installation that a window excludes."""
+    found: set[Fault] = set()
+    if wheels_gyro.is_equal or lidar_gyro.is_equal:
+        found |= {Fault.GYRO_OPPOSITE, Fault.GYRO_UNIT}
+    if wheels_gyro.is_equal or wheels_lidar.is_equal:
+        found.add(Fault.WHEELS_OPPOSITE)
+    if wheels_lidar.is_equal:
+        found.add(Fault.LIDAR_OPPOSITE)
+    if direction is not None and abs(direction) <= _MAX_DIRECTION_RAD:
+        found.add(Fault.LIDAR_DIRECTION)
     return found
 
 

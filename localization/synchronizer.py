@@ -24,6 +24,8 @@ from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
 _NS = 1e-9
+_MIN_REPORTED_S = 0.05
+"""Shorter times without wheel data are not reported: the first scan is often some milliseconds before the first wheel sample."""
 _SCAN_WAIT_NS = 1_000_000_000
 """From the first wheel sample on: a LiDAR that is silent for longer joins a drive that wheels have begun. Scanners have 2 Hz or more."""
 
@@ -118,7 +120,7 @@ class Synchronizer:
                 "instant: if the scanner sweeps, turns distort them. Let its driver publish the times (time_increment of a scan, a "
                 "field of a cloud)."
             )
-        if self._no_wheel_data_s > 0.0:
+        if self._no_wheel_data_s >= _MIN_REPORTED_S:
             found.append(f"no wheel data for {self._no_wheel_data_s:.1f} s in all: motion there is predicted with a wide covariance.")
         return [*found, *self._tilt.warnings(), *self.frames.warnings()]
 

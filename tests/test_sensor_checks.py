@@ -210,3 +210,16 @@ def test_beams_on_the_robot_are_left_out_and_reported() -> None:
     last = robot.applied[-1].scan
     assert last is not None
     assert np.hypot(last.points[:, 0], last.points[:, 1]).min() > 0.5
+
+
+def test_one_window_that_contradicts_among_many_that_agree_leaves_the_lidar_in() -> None:
+    """A robot that slides sideways for a few seconds after a minute of straight driving."""
+    checks = SensorChecks({}, LidarConfig())
+    for i in range(400):
+        checks._compare(
+            0.25 * i, {Fault.LIDAR_DIRECTION} if 300 <= i < 330 else set(), set() if 300 <= i < 330 else {Fault.LIDAR_DIRECTION}
+        )
+        assert not checks._is_contradicted(Fault.LIDAR_DIRECTION)
+    for i in range(400, 2000):
+        checks._compare(0.25 * i, here, nothing)
+    assert checks._is_contradicted(Fault.LIDAR_DIRECTION)

@@ -66,7 +66,7 @@ class LidarLosses:
     @property
     def summary(self) -> str:
         """Which part of the drive is without LiDAR, and where most of it."""
-        return f"LiDAR lost for {per_cent(self.share)} of the drive, longest {self.longest_s:.2g} s at t = {self.since_s:.0f} s"
+        return f"LiDAR lost for {per_cent(self.share)} of the drive, longest {_seconds(self.longest_s)} at t = {self.since_s:.0f} s"
 
     @property
     def advice(self) -> str:
@@ -96,6 +96,11 @@ class LidarLosses:
             "causes": dict(self.causes),
             "silences": self.silences,
         }
+
+
+def _seconds(value: float) -> str:
+    """Two digits, without a power of ten."""
+    return f"{value:.0f} s" if value >= 9.95 else f"{value:.2g} s"
 
 
 def is_long(share: float | None, longest_s: float | None) -> bool:
