@@ -16,7 +16,7 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def robot_toml(robot: Robot, sigmas: Mapping[str, Mapping[str, float]] | None = None, remarks: str = "") -> str:
-    """The whole of ``robot`` as TOML; `parse_robot` of it is equal to ``robot``.
+    """``robot`` as TOML, without entries that are the defaults; `parse_robot` of it is equal to ``robot``.
 
     ``sigmas``: model -> parameter -> standard deviation, written as a comment beside the value. ``remarks`` (any number of lines)
     come first, as comments: what it was calibrated on.
@@ -26,8 +26,11 @@ def robot_toml(robot: Robot, sigmas: Mapping[str, Mapping[str, float]] | None = 
     lines.append(f"name = {_value(robot.name)}")
     if robot.drive != Robot.drive:
         lines.append(f"drive = {_value(robot.drive)}")
-    for name in ("geometry", "driver", "topics", "joints", "wheel_noise", "gyro_noise", "clock"):
+    for name in ("geometry", "driver"):
         lines += _table(name, dataclasses.asdict(getattr(robot, name)))
+    for name in ("topics", "joints", "wheel_noise", "gyro_noise", "clock"):
+        entries = _not_default(getattr(robot, name))
+        lines += _table(name, entries) if entries else []
     if robot.arms is not None:
         lines += _table("arms", {name: value for name, value in dataclasses.asdict(robot.arms).items() if value != ()})
     for frame, mount in robot.mounts.items():
@@ -45,6 +48,11 @@ def relocated(robot: Robot, folder: Path) -> Robot:
     start, names = robot.folder, (robot.arms.urdf, robot.arms.postures)
     urdf, postures = (os.path.relpath(start / name, folder) if name and (start / name).exists() else name for name in names)
     return dataclasses.replace(robot, arms=dataclasses.replace(robot.arms, urdf=urdf, postures=postures), folder=folder)
+
+
+def _not_default(section: Any) -> dict[str, Any]:
+    """Entries of a ``section`` of a robot that differ from what they are where the file leaves them out."""
+    return {f.name: value for f in dataclasses.fields(section) if (value := getattr(section, f.name)) != f.default}
 
 
 def _table(header: str, values: Mapping[str, Any], sigmas: Mapping[str, float] | None = None) -> list[str]:
