@@ -54,25 +54,27 @@ def measure_outages(distro: str, domain: int, folder: Path, restarts: int, kills
     """Restarts in order and kills of robot and node in turn: seconds of the robot's drive until odometry comes again."""
     options = ("--state", folder / "outages.state", "--node.wait-s", "1")
     node, robot = start_skidloc(domain, *options), Robot(distro, domain)
-    await_service(robot)
     outages: dict[str, list[float]] = {}
     jobs = [(f"restart of {who}", signal.SIGINT) for who, _ in zip(itertools.cycle(("robot", "node")), range(restarts), strict=False)]
     jobs += [(f"kill of {who}", signal.SIGKILL) for who, _ in zip(itertools.cycle(("robot", "node")), range(kills), strict=False)]
-    for what, number in jobs:
-        process = robot if what.endswith("robot") else node
-        process.end(number)
-        begin = time.monotonic()
-        if process is robot:
-            robot = Robot(distro, domain)
-        else:
-            node = start_skidloc(domain, *options)
+    try:
         await_service(robot)
-        outages.setdefault(what, []).append(time.monotonic() - begin)
+        for what, number in jobs:
+            (robot if what.endswith("robot") else node).end(number)
+            begin = time.monotonic()
+            if what.endswith("robot"):
+                robot = Robot(distro, domain)
+            else:
+                node = start_skidloc(domain, *options)
+            await_service(robot)
+            outages.setdefault(what, []).append(time.monotonic() - begin)
+        node.end(signal.SIGINT)
+    finally:
+        robot.kill()
+        node.kill()
     for what, seconds in outages.items():
         outage = f"odometry again after {np.median(seconds):.1f} s (at most {max(seconds):.1f} s)"
         print(f"{distro}: {len(seconds)} times {what}: {outage}", flush=True)
-    robot.kill()
-    node.end(signal.SIGINT)
     print(f"{distro}: at the end the node {'ends in order' if node.process.returncode == 0 else node.text}")
 
 

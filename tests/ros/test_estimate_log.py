@@ -218,7 +218,7 @@ def test_states_that_do_not_fit_are_refused(killed, tmp_path, capsys):
     state.write_bytes(whole)
     os.truncate(tmp_path / ".fused.mcap.part", 208)
     assert online("--rate", "max", "--state", state, "--out", tmp_path / "fused.mcap") == 2
-    assert "estimates where the state counts on" in capsys.readouterr().err
+    assert "estimates where the state refers to" in capsys.readouterr().err
     out.write_text("precious")
     assert online("--rate", "max", "--out", out) == 2
     assert out.read_text() == "precious"
