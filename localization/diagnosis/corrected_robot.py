@@ -95,11 +95,10 @@ def check_handover(predictor: DrivePredictor, linearization: Linearization, name
     model = make_model(predictor.model.name, corrected.robot)
     after = DrivePredictor(dataclasses.replace(drive, robot=corrected.robot, maneuvers=maneuvers), model, has_inertia=predictor.has_inertia)
     rows = predictor.discrepancies(Hypothesis()), after.discrepancies(_of_sensors(hypothesis))
-    rms = [np.sqrt(np.nanmean(r[half:, :3] ** 2, axis=0)) for r in rows if np.isfinite(r[half:, 2]).any()]
-    if len(rms) < 2:
+    shown = [c for c in range(3) if all(np.isfinite(r[half:, c]).any() for r in rows)]
+    if not shown:
         return None
-    shown = [c for c in range(3) if np.isfinite(rms[0][c])]
-    before_rms, after_rms = ({CHANNELS[c]: float(r[c]) for c in shown} for r in rms)
+    before_rms, after_rms = ({CHANNELS[c]: float(np.sqrt(np.nanmean(r[half:, c] ** 2))) for c in shown} for r in rows)
     return HandoverCheck(before_rms, after_rms, len(drive.maneuvers) - half)
 
 

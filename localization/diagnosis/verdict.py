@@ -20,6 +20,7 @@ MAX_LEFT_OVER_NOISE = 1.5
 MAX_NOISE_OVER_REFERENCE = 3.0
 """Noise of the drive, over that of the motion reference by its own covariance: up to 1.5 where nothing is hidden, 3.1 to 200 for effects
 that no cause has (`tests.helpers.diagnosis_unknown`)."""
+_MODEL_ACCURACY = 0.05  # of a row: what the signature of a named cause may be off, as at a slope of 0.05 rad (3 %)
 _MAX_TREND_OVER_NOISE = 0.5  # a trend of half the noise adds 12 % to the root mean square of a row
 _MIN_ATTRIBUTED_SHARE = 0.1  # of a row's squares, for a cause to be listed beside it
 _MAX_ATTRIBUTIONS = 3
@@ -75,6 +76,8 @@ def attribute_rows(
         count = int(known.sum())
         p = float(chi2.sf(squares if c < _TESTED_CHANNELS else count, count))
         excess = _noise_excess(linearization, reference_sigmas, known, c)
+        if expected < _MODEL_ACCURACY * rms:
+            excess = min(excess, MAX_NOISE_OVER_REFERENCE)
         component = Component(CHANNEL_UNITS[c], rms, expected, p, left_rms, rest_rms, excess)
         if c < _TESTED_CHANNELS and (p < significance or excess > MAX_NOISE_OVER_REFERENCE):
             shares = parts[known, c].T @ scaled[known, c] / max(float(scaled[known, c] @ scaled[known, c]), 1e-12)

@@ -139,8 +139,8 @@ def test_diagnose_wet_patch_is_unexplained(diagnosed: Diagnosed) -> None:
     found = diagnosed({}, 433, route="slippery_patch")
     assert found.verdict == "unexplained"
     assert not found.findings
-    assert found.trends
-    assert all(trend.component == "yaw" for trend in found.trends)
+    assert found.discrepancy["yaw"].status == "unexplained"
+    assert "not in a way that has a name: " in found.sentence
 
 
 def test_diagnose_minor_second_cause_keeps_the_first(diagnosed: Diagnosed) -> None:
