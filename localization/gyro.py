@@ -13,14 +13,14 @@ from localization.events import ImuSample
 from motion_models.robot import GyroNoise, Mount
 
 _NS = 1e-9
-_LONGEST_GAP_NS, _LONGEST_HOLD_NS = 500_000_000, 100_000_000
+_MAX_GAP_NS, _MAX_HOLD_NS = 500_000_000, 100_000_000
 _FIRST_SAMPLES = 20
-_LEAST_GRAVITY, _MOST_GRAVITY = 8.0, 12.0  # m/s^2; drivers that publish none, or in other units, tell nothing of the mount
-_MOST_TILT = math.radians(30.0)
+_MIN_GRAVITY_M_S2, _MAX_GRAVITY_M_S2 = 8.0, 12.0  # m/s^2; drivers that publish none, or in other units, do not show the mount
+_MAX_TILT_RAD = math.radians(30.0)
 _JUMP_RAD_PER_S, _JUMP_RAD_PER_S2 = 2.0, 200.0  # noise and shaking, and how fast such a robot may begin to turn
-_MOST_JUMP_RAD_PER_S = 10.0  # at which none turns
-_SPIKES = 2  # that agree, in a row; a third is believed
-_TELLING_TURN = 0.5  # rad of turning by the wheels, after which they have told which way the gyro's axis points
+_MAX_JUMP_RAD_PER_S = 10.0  # at which none turns
+_MAX_SPIKES = 2  # that agree, in a row; a third is accepted
+_MIN_TURN_RAD = 0.5  # rad of turning by the wheels, after which they show which way the gyro's axis points
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,10 @@ class GyroBuffer:
     """The last seconds of the yaw rate.
 
     Gravity shows which axis of the IMU is upright. Where the mount says another one, the rate is that about gravity, and whether this
-    axis points up or down (some drivers publish gravity, not specific force) is seen by the turns of the wheels; until those have told,
+    axis points up or down (some drivers publish gravity, not specific force) is seen by the turns of the wheels; until these suffice,
     the gyro is not used.
 
-    A rate that no robot can have come to since the sample before is left out, unless it lasts: the third in a row is believed, and with
+    A rate that no robot can have come to since the sample before is left out, unless it lasts: the third in a row is accepted, and with
     it those before.
     """
 
@@ -52,7 +52,7 @@ class GyroBuffer:
         self._stamps: list[int] = []
         self._angles: list[float] = []
         self._rate = 0.0
-        self._doubted: list[tuple[int, float]] = []
+        self._pending: list[tuple[int, float]] = []
         self._spikes = 0
         self._frame: str | None = None
         self._force = np.zeros(3)
@@ -64,29 +64,29 @@ class GyroBuffer:
         """Take the next sample; one that does not come after the newest changes nothing."""
         if sample.frame_id != self._frame:
             self._begin(sample)
-        self._watch_gravity(sample)
-        self._weigh(sample.stamp_ns, float(self._axis @ sample.angular_velocity))
+        self._check_mount(sample)
+        self._filter_rate(sample.stamp_ns, float(self._axis @ sample.angular_velocity))
 
-    def _weigh(self, stamp_ns: int, rate: float) -> None:
-        """Take a rate, or doubt it."""
-        last_ns = self._doubted[-1][0] if self._doubted else self._stamps[-1] if self._stamps else None
+    def _filter_rate(self, stamp_ns: int, rate: float) -> None:
+        """Append a rate, or keep it pending until later ones agree with it."""
+        last_ns = self._pending[-1][0] if self._pending else self._stamps[-1] if self._stamps else None
         if last_ns is not None and stamp_ns <= last_ns:
             return
-        if self._stamps and stamp_ns - self._stamps[-1] > _LONGEST_GAP_NS:
-            self._forget()
+        if self._stamps and stamp_ns - self._stamps[-1] > _MAX_GAP_NS:
+            self._reset()
         if not self._stamps or _may_follow((self._stamps[-1], self._rate), (stamp_ns, rate)):
             self._reject()
             self._take(stamp_ns, rate)
             return
-        if self._doubted and not _may_follow(self._doubted[-1], (stamp_ns, rate)):
+        if self._pending and not _may_follow(self._pending[-1], (stamp_ns, rate)):
             self._reject()
-        self._doubted.append((stamp_ns, rate))
-        if len(self._doubted) > _SPIKES:
-            believed, self._doubted = self._doubted, []
-            if len(self._stamps) == 1:  # nothing but the first sample speaks against them
-                self._forget()
+        self._pending.append((stamp_ns, rate))
+        if len(self._pending) > _MAX_SPIKES:
+            accepted, self._pending = self._pending, []
+            if len(self._stamps) == 1:  # only the first sample contradicts them
+                self._reset()
                 self._spikes += 1
-            for entry in believed:
+            for entry in accepted:
                 self._take(*entry)
 
     def _take(self, stamp_ns: int, rate: float) -> None:
@@ -102,8 +102,8 @@ class GyroBuffer:
             del self._stamps[:n], self._angles[:n]
 
     def _reject(self) -> None:
-        self._spikes += len(self._doubted)
-        self._doubted = []
+        self._spikes += len(self._pending)
+        self._pending = []
 
     @property
     def newest_ns(self) -> int | None:
@@ -112,15 +112,15 @@ class GyroBuffer:
     def turn(self, start_ns: int, end_ns: int, by_wheels: float) -> Turn | None:
         """The turn from ``start_ns`` to ``end_ns``; ``by_wheels`` [rad] only tells which way is left, where the mount does not.
 
-        None where the gyro was not heard from before the start to (nearly) the end, or while its axis is not known.
+        None where the gyro has no sample from before the start to (nearly) the end, or while its axis is not known.
         """
-        if not self._stamps or start_ns < self._stamps[0] or end_ns > self._stamps[-1] + _LONGEST_HOLD_NS:
+        if not self._stamps or start_ns < self._stamps[0] or end_ns > self._stamps[-1] + _MAX_HOLD_NS:
             return None
         angle = self._angle(end_ns) - self._angle(start_ns)
         if self._contradicts:
             self._agreement += angle * by_wheels
             self._turned += abs(by_wheels)
-            if self._turned < _TELLING_TURN:
+            if self._turned < _MIN_TURN_RAD:
                 return None
             self._sign = math.copysign(1.0, self._agreement)
         dt = (end_ns - start_ns) * _NS
@@ -129,20 +129,20 @@ class GyroBuffer:
 
     def warnings(self) -> list[str]:
         """What a user should know about the IMU."""
-        said = []
+        found = []
         if self._spikes:
             plural = "s" * (self._spikes > 1)
-            said.append(f"IMU '{self._frame}': {self._spikes} reading{plural} dropped (the yaw rate jumped as no such robot's does).")
+            found.append(f"IMU '{self._frame}': {self._spikes} reading{plural} dropped (the yaw rate jumped as no such robot's does).")
         if not self._contradicts:
-            return said
-        if self._turned < _TELLING_TURN:
+            return found
+        if self._turned < _MIN_TURN_RAD:
             return [
-                *said,
+                *found,
                 f"the mount of IMU '{self._frame}' contradicts gravity, and the robot turned too little to tell its axis: it was not used.",
             ]
         axis = ", ".join(f"{value:+.2f}" for value in self._sign * self._axis)
         return [
-            *said,
+            *found,
             f"the mount of IMU '{self._frame}' contradicts gravity: the yaw rate was taken about [{axis}] in the IMU's frame. "
             "Correct its roll, pitch and yaw in /tf_static or in the robot file's [mounts].",
         ]
@@ -152,22 +152,22 @@ class GyroBuffer:
         self._frame, self._up = sample.frame_id, mount.rotation()[2]
         self._axis, self._force = self._up, np.zeros(3)
         self._contradicts, self._sign, self._n_force = False, 1.0, 0
-        self._forget()
+        self._reset()
 
-    def _watch_gravity(self, sample: ImuSample) -> None:
-        """Judge the mount once, by the mean of the first samples."""
+    def _check_mount(self, sample: ImuSample) -> None:
+        """Check the mount once, by the mean of the first samples."""
         if self._n_force >= _FIRST_SAMPLES:
             return
         self._force = self._force + sample.linear_acceleration
         self._n_force += 1
         strength = float(np.linalg.norm(self._force)) / self._n_force
-        if self._n_force == _FIRST_SAMPLES and _LEAST_GRAVITY < strength < _MOST_GRAVITY:
+        if self._n_force == _FIRST_SAMPLES and _MIN_GRAVITY_M_S2 < strength < _MAX_GRAVITY_M_S2:
             found = self._force / np.linalg.norm(self._force)
-            if found @ self._up < math.cos(_MOST_TILT):
+            if found @ self._up < math.cos(_MAX_TILT_RAD):
                 self._axis, self._contradicts = found, True
-                self._forget()
+                self._reset()
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         self._reject()
         self._stamps.clear()
         self._angles.clear()
@@ -185,4 +185,4 @@ class GyroBuffer:
 
 def _may_follow(before: tuple[int, float], after: tuple[int, float]) -> bool:
     """Whether a robot's rate can be ``after`` [ns, rad/s] where it was ``before``."""
-    return abs(after[1] - before[1]) <= min(_JUMP_RAD_PER_S + _JUMP_RAD_PER_S2 * (after[0] - before[0]) * _NS, _MOST_JUMP_RAD_PER_S)
+    return abs(after[1] - before[1]) <= min(_JUMP_RAD_PER_S + _JUMP_RAD_PER_S2 * (after[0] - before[0]) * _NS, _MAX_JUMP_RAD_PER_S)
