@@ -33,8 +33,10 @@ from motion_models.se2 import FloatArray
 _BIN_S = 0.25
 _WINDOW_BINS, _MIN_BINS = 24, 10
 """Bins that are compared (6 s), and the fewest (2.5 s)."""
-_MIN_LASTING_S = 1.0
-"""Time for which a comparison must give the same result before a sensor is declared faulty."""
+_MIN_LASTING_S, _MIN_LASTING_AFTER_AGREEMENT_S = 1.0, 12.0
+"""Time for which a comparison must give the same result before a sensor is declared faulty. Mounts, signs and units do not change in a drive:
+where they were right before, a contradiction is slip, or people before the LiDAR (fr079: 15 deg for some seconds), unless it lasts
+for two whole windows."""
 _MAX_BIAS_RAD_S = 0.05
 """Gyro bias that is no contradiction; ten times the prior sigma of the shipped robots."""
 _MIN_RATE_RAD_S = 0.001
@@ -149,6 +151,7 @@ class SensorChecks:
         self._is_gyro_stuck = self._has_scans = False
         self._shaking = ShakeDetector()
         self._suspected: dict[Fault, tuple[float, float]] = {}  # when first found, and start of the bins then [s]
+        self._confirmed: set[Fault] = set()  # faults that an agreement has ruled out
         self.found: dict[Fault, Found] = {}
         self._start_ns: int | None = None
         self._stood_s = 0.0  # time for which the wheels read zero
@@ -296,11 +299,22 @@ class SensorChecks:
         first = now_s, max(now_s - float(seconds.sum()), 0.0)
         self._suspected = {fault: self._suspected.get(fault, first) for fault in suspects}
         for fault, (first_s, since_s) in self._suspected.items():
-            if now_s - first_s >= _MIN_LASTING_S:
+            lasting_s = _MIN_LASTING_AFTER_AGREEMENT_S if fault in self._confirmed else _MIN_LASTING_S
+            if now_s - first_s >= lasting_s:
                 self._declare(fault, since_s, suspects[fault])
+        self._confirm(wheels_gyro.is_equal, wheels_lidar.is_equal, direction is not None and abs(direction) < _MAX_DIRECTION_RAD)
         is_turn_confirmed = wheels_gyro.is_equal or wheels_lidar.is_equal or lidar_gyro.is_equal
         if not suspects and is_turn_confirmed and (direction is not None or not self._has_scans):
             self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)
+
+    def _confirm(self, is_gyro_equal: bool, is_lidar_equal: bool, is_direction_equal: bool) -> None:
+        """Keep which faults an agreement has shown not to be there."""
+        if is_gyro_equal:
+            self._confirmed |= {Fault.GYRO_OPPOSITE, Fault.GYRO_UNIT, Fault.WHEELS_OPPOSITE}
+        if is_lidar_equal:
+            self._confirmed |= {Fault.LIDAR_OPPOSITE, Fault.WHEELS_OPPOSITE}
+        if is_direction_equal:
+            self._confirmed.add(Fault.LIDAR_DIRECTION)
 
     def _declare(self, fault: Fault, at_s: float, numbers: Mapping[str, float | str]) -> None:
         """Report ``fault`` once, and widen the covariance by how far the estimate is from the other sensors' dead reckoning."""
