@@ -35,8 +35,8 @@ _WINDOW_BINS, _MIN_BINS = 24, 10
 """Bins that are compared (6 s), and the fewest (2.5 s)."""
 _MIN_LASTING_S, _MIN_LASTING_AFTER_AGREEMENT_S = 1.0, 12.0
 """Time for which a comparison must give the same result before a sensor is declared faulty. Mounts, signs and units do not change in a drive:
-where they were right before, a contradiction is slip, or people before the LiDAR (fr079: 15 deg for some seconds), unless it lasts
-for two whole windows."""
+where they were right before, a contradiction is slip, or people near the LiDAR (fr079: 15 deg for some seconds), unless it lasts
+for two windows."""
 _MAX_BIAS_RAD_S = 0.05
 """Gyro bias that is no contradiction; ten times the prior sigma of the shipped robots."""
 _MIN_RATE_RAD_S = 0.001
@@ -151,7 +151,7 @@ class SensorChecks:
         self._is_gyro_stuck = self._has_scans = False
         self._shaking = ShakeDetector()
         self._suspected: dict[Fault, tuple[float, float]] = {}  # when first found, and start of the bins then [s]
-        self._confirmed: set[Fault] = set()  # faults that an agreement has ruled out
+        self._confirmed: dict[Fault, bool] = {}  # faults that an agreement has ruled out
         self.found: dict[Fault, Found] = {}
         self._start_ns: int | None = None
         self._stood_s = 0.0  # time for which the wheels read zero
@@ -310,11 +310,11 @@ class SensorChecks:
     def _confirm(self, is_gyro_equal: bool, is_lidar_equal: bool, is_direction_equal: bool) -> None:
         """Keep which faults an agreement has shown not to be there."""
         if is_gyro_equal:
-            self._confirmed |= {Fault.GYRO_OPPOSITE, Fault.GYRO_UNIT, Fault.WHEELS_OPPOSITE}
+            self._confirmed |= dict.fromkeys((Fault.GYRO_OPPOSITE, Fault.GYRO_UNIT, Fault.WHEELS_OPPOSITE), True)
         if is_lidar_equal:
-            self._confirmed |= {Fault.LIDAR_OPPOSITE, Fault.WHEELS_OPPOSITE}
+            self._confirmed |= dict.fromkeys((Fault.LIDAR_OPPOSITE, Fault.WHEELS_OPPOSITE), True)
         if is_direction_equal:
-            self._confirmed.add(Fault.LIDAR_DIRECTION)
+            self._confirmed[Fault.LIDAR_DIRECTION] = True
 
     def _declare(self, fault: Fault, at_s: float, numbers: Mapping[str, float | str]) -> None:
         """Report ``fault`` once, and widen the covariance by how far the estimate is from the other sensors' dead reckoning."""
@@ -337,18 +337,20 @@ class _Accumulator:
     _wheels: FloatArray | None = None
     _gyro: float = 0.0
     _is_standing: bool = True
+    _has_wheels: bool = True
 
     def add(self, step: Step) -> None:
         if step.duration == 0.0:
             return
         self.duration_s += step.duration
-        delta = step.predicted.delta if step.has_wheels else np.full(3, np.nan)
-        self._wheels = delta if self._wheels is None else se2.compose(self._wheels, delta)
+        self._has_wheels &= step.has_wheels and bool(np.isfinite(step.predicted.delta).all())
+        if self._has_wheels:
+            self._wheels = step.predicted.delta if self._wheels is None else se2.compose(self._wheels, step.predicted.delta)
         self._gyro += math.nan if step.turn is None else step.turn.angle
         self._is_standing &= step.is_standing
 
     def close(self, lidar: FloatArray) -> _Bin:
-        wheels = np.full(3, np.nan) if self._wheels is None else self._wheels
+        wheels = self._wheels if self._wheels is not None and self._has_wheels else np.full(3, np.nan)
         return _Bin(self.duration_s, wheels, self._gyro, lidar, self._is_standing)
 
 
