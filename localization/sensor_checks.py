@@ -13,7 +13,6 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +33,7 @@ _BIN_S = 0.25
 _WINDOW_BINS, _MIN_BINS = 24, 10
 """Bins that are compared (6 s), and the fewest (2.5 s)."""
 _MIN_LASTING_S, _MIN_LASTING_AFTER_AGREEMENT_S = 1.0, 12.0
-"""Time for which a comparison must give the same result before a sensor is declared faulty. Mounts, signs and units do not change in a drive:
+"""Time for which a comparison must give the same result before a sensor is declared faulty. Mounts, signs and units stay in a drive:
 where they were right before, a contradiction is slip, or people near the LiDAR (fr079: 15 deg for some seconds), unless it lasts
 for two windows."""
 _MAX_BIAS_RAD_S = 0.05
@@ -69,8 +68,8 @@ _UNKNOWN_SPEED = np.array([0.5, 0.5, 0.5])
 _NS = 1e-9
 
 
-class Fault(Enum):
-    """What is wrong, and what to do."""
+class Fault:
+    """Messages: what is wrong, and what to do. Each stands for its fault."""
 
     GYRO_OPPOSITE = "the gyro turns opposite to {others}. It is not used from then on. Correct the IMU's mount, or the sign in its driver."
     GYRO_UNIT = (
@@ -102,7 +101,7 @@ class Fault(Enum):
 class Found:
     """A fault with its time and numbers."""
 
-    fault: Fault
+    fault: str
     at_s: float
     """After the first step [s]."""
     message: str
@@ -150,9 +149,9 @@ class SensorChecks:
         self._open = _Accumulator()
         self._is_gyro_stuck = self._has_scans = False
         self._shaking = ShakeDetector()
-        self._suspected: dict[Fault, tuple[float, float]] = {}  # when first found, and start of the bins then [s]
-        self._confirmed: dict[Fault, bool] = {}  # faults that an agreement has ruled out
-        self.found: dict[Fault, Found] = {}
+        self._suspected: dict[str, tuple[float, float]] = {}  # when first found, and start of the bins then [s]
+        self._confirmed: dict[str, bool] = {}  # faults that an agreement has ruled out
+        self.found: dict[str, Found] = {}
         self._start_ns: int | None = None
         self._stood_s = 0.0  # time for which the wheels read zero
         self._standing_s = 0.0  # the same, while that is contradicted
@@ -316,11 +315,11 @@ class SensorChecks:
         if is_direction_equal:
             self._confirmed[Fault.LIDAR_DIRECTION] = True
 
-    def _declare(self, fault: Fault, at_s: float, numbers: Mapping[str, float | str]) -> None:
+    def _declare(self, fault: str, at_s: float, numbers: Mapping[str, float | str]) -> None:
         """Report ``fault`` once, and widen the covariance by how far the estimate is from the other sensors' dead reckoning."""
         if fault in self.found:
             return
-        self.found[fault] = Found(fault, max(at_s, 0.0), fault.value.format(**numbers))
+        self.found[fault] = Found(fault, max(at_s, 0.0), fault.format(**numbers))
         if fault == Fault.WHEELS_STANDING:
             return
         is_gyro = fault in (Fault.GYRO_OPPOSITE, Fault.GYRO_STUCK, Fault.GYRO_UNIT)
@@ -415,9 +414,9 @@ def _is_opposite(a: FloatArray, b: FloatArray) -> bool:
     return r <= _OPPOSITE_CORRELATION and t <= -_MIN_T
 
 
-def _find_turn_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation) -> list[tuple[Fault, dict[str, float | str]]]:
+def _find_turn_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation) -> list[tuple[str, dict[str, float | str]]]:
     """Faults by the relations of the turn rates: the sensor that contradicts the two others, or one of two."""
-    found: list[tuple[Fault, dict[str, float | str]]] = []
+    found: list[tuple[str, dict[str, float | str]]] = []
     if wheels_gyro.is_opposite and lidar_gyro.is_equal:
         found.append((Fault.WHEELS_OPPOSITE, {"others": "gyro and LiDAR"}))
     elif wheels_gyro.is_opposite:
