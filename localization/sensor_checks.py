@@ -107,7 +107,8 @@ class Found:
     message: str
 
 
-class _Bin(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Bin:
     """Motion over a quarter of a second or more."""
 
     duration_s: float
