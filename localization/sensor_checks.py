@@ -168,6 +168,8 @@ class SensorChecks:
 
     def apply(self, step: Step) -> Step:
         """``step`` without the sensors that are faulty, and with the motion of wheels in doubt widened."""
+        if not np.isfinite(step.predicted.delta).all():
+            return step  # the estimator refuses it
         if self._start_ns is None:
             self._start_ns = step.start_ns
         step = self._without_own_body(step)
