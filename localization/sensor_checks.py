@@ -1,9 +1,9 @@
 """Consistency of the sensors with each other: wheels, gyro and LiDAR each measure the same motion.
 
 The turn rates of the three, and the direction of travel by wheels and LiDAR, are compared over windows of seconds. A sensor that
-contradicts the two others in most windows of the last minutes is left out while that lasts; where only two can be compared, the covariance takes both
-into account. Each fault gives a warning with sensor, time and remedy, and widens the published covariance by the difference that it has
-made so far.
+contradicts the two others in most windows of the last minutes is left out while that lasts; where only two can be compared, the covariance
+takes both into account. Each fault gives a warning with sensor, time and remedy, and widens the published covariance by the difference that
+it has made so far.
 
 The LiDAR's motion is that of `lidar.scan_motion`, which uses neither the filter nor the other sensors.
 """
@@ -15,7 +15,6 @@ from collections import deque
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
-from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -38,8 +37,8 @@ _WINDOW_BINS, _MIN_BINS = 24, 10
 _MIN_LASTING_S = 1.0
 """Time for which a comparison must give the same result before a sensor is declared faulty."""
 _MEMORY_S, _MIN_CONTRADICTING = 120.0, 2.0 / 3.0
-"""How a sensor is mounted, wired and scaled does not change while driving: it is left out while at least this share of the comparisons
-of the last two minutes contradict it. (fr079 has single windows of 6 s in which the robot travels 14 deg off its wheels.)"""
+"""Mounts, signs and units stay in a drive: a sensor is left out while at least this share of the comparisons of the last two minutes
+contradict it. (fr079 has a window of 6 s in which the robot travels 14 deg off its wheels.)"""
 _MAX_BIAS_RAD_S = 0.05
 """Gyro bias that is no contradiction; ten times the prior sigma of the shipped robots."""
 _MIN_RATE_RAD_S = 0.001
@@ -72,12 +71,10 @@ _UNKNOWN_SPEED = np.array([0.5, 0.5, 0.5])
 _NS = 1e-9
 
 
-class Fault(Enum):
-    """What is wrong, and what to do."""
+class Fault:
+    """Messages: what is wrong, and what to do. Each stands for its fault."""
 
-    GYRO_OPPOSITE = (
-        "the gyro turns opposite to {others}. It is not used while that lasts. Correct the IMU's mount, or the sign in its driver."
-    )
+    GYRO_OPPOSITE = "the gyro turns opposite to {others}. It is not used while that lasts. Correct the IMU's mount, or its driver's sign."
     GYRO_UNIT = (
         "the gyro's rates are {ratio:.2g} times those of {others} (deg/s?). It is not used while that lasts. Let its driver publish rad/s."
     )
@@ -107,13 +104,14 @@ class Fault(Enum):
 class Found:
     """A fault with its time and numbers."""
 
-    fault: Fault
+    fault: str
     at_s: float
     """After the first step [s]."""
     message: str
 
 
-class _Bin(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Bin:
     """Motion over a quarter of a second or more."""
 
     duration_s: float
@@ -155,9 +153,9 @@ class SensorChecks:
         self._open = _Accumulator()
         self._is_gyro_stuck = self._has_scans = False
         self._shaking = ShakeDetector()
-        self._comparisons: dict[Fault, deque[tuple[float, bool]]] = {}  # time [s], and whether it contradicts
-        self._suspected: dict[Fault, tuple[float, float]] = {}  # when first found, and start of the bins then [s]
-        self.found: dict[Fault, Found] = {}
+        self._suspected: dict[str, tuple[float, float]] = {}  # when first found, and start of the bins then [s]
+        self._comparisons: dict[str, deque[tuple[float, bool]]] = {}  # by fault: time [s], and whether it is there
+        self.found: dict[str, Found] = {}
         self._start_ns: int | None = None
         self._stood_s = 0.0  # time for which the wheels read zero
         self._standing_s = 0.0  # the same, while that is contradicted
@@ -173,6 +171,8 @@ class SensorChecks:
 
     def apply(self, step: Step) -> Step:
         """``step`` without the sensors that are faulty, and with the motion of wheels in doubt widened."""
+        if not np.isfinite(step.predicted.delta).all():
+            return step  # the estimator refuses it
         if self._start_ns is None:
             self._start_ns = step.start_ns
         step = self._without_own_body(step)
@@ -301,7 +301,7 @@ class SensorChecks:
             side = "left" if degrees > 0.0 else "right"
             suspects[Fault.LIDAR_DIRECTION] = {"degrees": abs(degrees), "side": side, "correction": -degrees}
         first = now_s, max(now_s - float(seconds.sum()), 0.0)
-        self._compare(now_s, suspects.keys(), _confirmed(wheels_gyro, wheels_lidar, lidar_gyro, direction))
+        self._compare(now_s, suspects.keys(), _excluded_faults(wheels_gyro, wheels_lidar, lidar_gyro, direction))
         self._suspected = {fault: self._suspected.get(fault, first) for fault in suspects}
         for fault, (first_s, since_s) in self._suspected.items():
             if now_s - first_s >= _MIN_LASTING_S and self._is_contradicted(fault):
@@ -310,24 +310,24 @@ class SensorChecks:
         if not suspects and is_turn_confirmed and (direction is not None or not self._has_scans):
             self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)
 
-    def _compare(self, now_s: float, contradicted: AbstractSet[Fault], confirmed: AbstractSet[Fault]) -> None:
-        """Store what this window shows of each fault of installation: that it is there, that it is not, or nothing."""
-        for fault in contradicted | confirmed:
+    def _compare(self, now_s: float, present: AbstractSet[str], excluded: AbstractSet[str]) -> None:
+        """Store which faults a window shows, and which it excludes."""
+        for fault in present | excluded:
             comparisons = self._comparisons.setdefault(fault, deque())
-            comparisons.append((now_s, fault in contradicted))
+            comparisons.append((now_s, fault in present))
             while comparisons[0][0] < now_s - _MEMORY_S:
                 comparisons.popleft()
 
-    def _is_contradicted(self, fault: Fault) -> bool:
+    def _is_contradicted(self, fault: str) -> bool:
         """Whether most comparisons of the last minutes show ``fault``."""
         comparisons = self._comparisons.get(fault, ())
         return sum(is_there for _, is_there in comparisons) >= _MIN_CONTRADICTING * max(len(comparisons), 1)
 
-    def _declare(self, fault: Fault, at_s: float, numbers: Mapping[str, float | str]) -> None:
+    def _declare(self, fault: str, at_s: float, numbers: Mapping[str, float | str]) -> None:
         """Report ``fault`` once, and widen the covariance by how far the estimate is from the other sensors' dead reckoning."""
         if fault in self.found:
             return
-        self.found[fault] = Found(fault, max(at_s, 0.0), fault.value.format(**numbers))
+        self.found[fault] = Found(fault, max(at_s, 0.0), fault.format(**numbers))
         if fault == Fault.WHEELS_STANDING:
             return
         is_gyro = fault in (Fault.GYRO_OPPOSITE, Fault.GYRO_STUCK, Fault.GYRO_UNIT)
@@ -344,19 +344,20 @@ class _Accumulator:
     _wheels: FloatArray | None = None
     _gyro: float = 0.0
     _is_standing: bool = True
+    _has_wheels: bool = True
 
     def add(self, step: Step) -> None:
         if step.duration == 0.0:
             return
         self.duration_s += step.duration
-        before = np.zeros(3) if self._wheels is None else self._wheels
-        is_known = step.has_wheels and bool(np.isfinite(before).all())
-        self._wheels = se2.compose(before, step.predicted.delta) if is_known else np.full(3, np.nan)
+        self._has_wheels &= step.has_wheels and bool(np.isfinite(step.predicted.delta).all())
+        if self._has_wheels:
+            self._wheels = step.predicted.delta if self._wheels is None else se2.compose(self._wheels, step.predicted.delta)
         self._gyro += math.nan if step.turn is None else step.turn.angle
         self._is_standing &= step.is_standing
 
     def close(self, lidar: FloatArray) -> _Bin:
-        wheels = np.full(3, np.nan) if self._wheels is None else self._wheels
+        wheels = self._wheels if self._wheels is not None and self._has_wheels else np.full(3, np.nan)
         return _Bin(self.duration_s, wheels, self._gyro, lidar, self._is_standing)
 
 
@@ -421,9 +422,9 @@ def _is_opposite(a: FloatArray, b: FloatArray) -> bool:
     return r <= _OPPOSITE_CORRELATION and t <= -_MIN_T
 
 
-def _find_turn_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation) -> list[tuple[Fault, dict[str, float | str]]]:
+def _find_turn_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation) -> list[tuple[str, dict[str, float | str]]]:
     """Faults by the relations of the turn rates: the sensor that contradicts the two others, or one of two."""
-    found: list[tuple[Fault, dict[str, float | str]]] = []
+    found: list[tuple[str, dict[str, float | str]]] = []
     if wheels_gyro.is_opposite and lidar_gyro.is_equal:
         found.append((Fault.WHEELS_OPPOSITE, {"others": "gyro and LiDAR"}))
     elif wheels_gyro.is_opposite:
@@ -437,9 +438,9 @@ def _find_turn_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyr
     return found
 
 
-def _confirmed(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation, direction: float | None) -> set[Fault]:
+def _excluded_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation, direction: float | None) -> set[str]:
     """Faults of installation that a window excludes."""
-    found: set[Fault] = set()
+    found: set[str] = set()
     if wheels_gyro.is_equal or lidar_gyro.is_equal:
         found |= {Fault.GYRO_OPPOSITE, Fault.GYRO_UNIT}
     if wheels_gyro.is_equal or wheels_lidar.is_equal:

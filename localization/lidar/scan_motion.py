@@ -8,6 +8,7 @@ Sensor checks compare it with the other sensors; it is never fused.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numba
@@ -42,7 +43,8 @@ class ScanMotion(NamedTuple):
     """The scene has structure along both axes."""
 
 
-class _Profile(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Profile:
     """A planar scan by bearing about the sensor."""
 
     center: FloatArray

@@ -97,9 +97,10 @@ class SqliteFile:
         last, found = self.start_ns - 1, 0
         query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({','.join(map(str, wanted))}) ORDER BY timestamp"
         with closing(_connect(self._path)) as database:
-            rows = iter(database.execute(query))
+            rows: Iterator[Row] | None = None
             while True:
                 try:
+                    rows = database.execute(query) if rows is None else rows
                     key, stamp, data = next(rows)
                 except StopIteration:
                     self._compare(found, sum(self._counts[key] for key in wanted))

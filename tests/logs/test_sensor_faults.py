@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from localization.logs import Log, open_log
 from motion_models.robot import Mount, load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
-from tests.helpers.rooms import drive
+from tests.helpers.rooms import RADIUS, SPEED, TRACK, TURN, drive
 
 ROBOT = load_robot("vaultbot")
 
@@ -202,3 +203,80 @@ def test_lone_scans_stamped_wrongly_by_less_than_a_second_are_dropped(tmp_path: 
     assert all((stamp - START) % (S // 10) == 0 for stamp in stamps)
     assert len(stamps) == 200 - 16
     assert "/scan: 16 messages dropped (stamp that fits neither" in said(log)
+
+
+def doubled(
+    later_ms: int, second: Callable[[Any, int], Any], topic: str = "/joint_states", first: Callable[[Any], Any] = lambda m: m
+) -> list:
+    """A drive whose ``topic`` has another message ``later_ms`` after each of its own."""
+    found = []
+    for name, message, stamp in drive(20.0):
+        found.append((name, first(message) if name == topic else message, stamp))
+        if name == topic:
+            later = stamp + later_ms * 1_000_000
+            found.append((name, second(message, later), later))
+    return sorted(found, key=lambda record: record[2])
+
+
+def rates_only(message):
+    """The drive's wheel rates, or zeros."""
+    stamp = message.header.stamp.sec * S + message.header.stamp.nanosec
+    half = 0.5 * TRACK * 1.5
+    rates = np.repeat([SPEED - TURN * half, SPEED + TURN * half], 2) / RADIUS if message.position.any() else np.zeros(4)
+    return bags.joint_state(stamp, message.name, velocity=tuple(rates))
+
+
+def zeros(message, later: int):
+    return bags.joint_state(later, position=(0.0,) * 4, velocity=(0.0,) * 4)
+
+
+@pytest.mark.parametrize("first", [lambda m: m, rates_only], ids=["angles and rates", "rates"])
+def test_second_publisher_of_rates_alone_costs_no_distance(tmp_path: Path, first: Callable) -> None:
+    honest = wheels_of(opened(tmp_path, [(t, first(m) if t == "/joint_states" else m, s) for t, m, s in drive(20.0)]))
+    (tmp_path / "run.mcap").unlink()
+    log = opened(tmp_path, doubled(9, lambda m, later: rates_only(zeros(m, later)), first=first))
+    found = wheels_of(log)
+    if np.isfinite(honest[-1].position).all():
+        np.testing.assert_allclose(found[-1].position, honest[-1].position, rtol=0.02)
+    else:
+        np.testing.assert_allclose(np.mean([s.velocity for s in found], axis=0), honest[-1].velocity, rtol=0.03)
+    assert "of a second publisher whose wheels turn less, left out" in said(log)
+
+
+def test_second_publisher_of_odometry_costs_no_distance(tmp_path: Path) -> None:
+    records = []
+    for i in range(500):
+        stamp = START + i * S // 50
+        x = 0.5 * i / 50
+        records.append(("/odom", bags.odometry(stamp, x=x, vx=0.5), stamp))
+        records.append(("/odom", bags.odometry(stamp + 8_000_000, x=0.0, vx=0.0), stamp + 8_000_000))
+    log = opened(tmp_path, records)
+    found = wheels_of(log)
+    driven = (found[-1].position - found[0].position) * ROBOT.driver.wheel_radius_m
+    np.testing.assert_allclose(driven, 0.5 * 499 / 50, rtol=0.03)
+    assert "/odom: " in said(log)
+    assert "of a second publisher" in said(log)
+
+
+def test_odometry_that_stops_at_once_is_no_second_publisher(tmp_path: Path) -> None:
+    records = [
+        ("/odom", bags.odometry(START + i * S // 50, x=0.5 * min(i, 250) / 50, vx=0.5 if i < 250 else 0.0), START + i * S // 50)
+        for i in range(500)
+    ]
+    log = opened(tmp_path, records)
+    assert len(wheels_of(log)) == 500
+    assert log.warnings() == []
+
+
+def test_wheel_that_is_frozen_is_left_out_and_named(tmp_path: Path) -> None:
+    honest = wheels_of(opened(tmp_path, drive(20.0)))
+    (tmp_path / "run.mcap").unlink()
+    records = drive(20.0)
+    for topic, message, _ in records:
+        if topic == "/joint_states":
+            message.position = message.position * (np.arange(len(message.position)) > 0)
+    log = opened(tmp_path, records)
+    found = wheels_of(log)
+    np.testing.assert_allclose(found[-1].position, honest[-1].position, atol=0.05)
+    assert f"/joint_states, joint '{ROBOT.joints.left[0]}': " in said(log)
+    assert "its side turns; it was left out" in said(log)
