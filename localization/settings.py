@@ -35,10 +35,12 @@ class Below:
 
 
 def at_least(low: float) -> Allowed:
+    """Bound of a setting: ``low`` or more."""
     return Allowed(f"{low:g} or more", lambda value: value >= low)
 
 
 def up_to(high: float) -> Allowed:
+    """Bound of a setting: 0 to ``high``."""
     return Allowed(f"above 0 and at most {high:g}", lambda value: 0.0 < value <= high)
 
 

@@ -214,6 +214,7 @@ def parse_seconds(word: str, where: str) -> int:
 
 
 def parse_float(word: str, where: str) -> float:
+    """A finite number; ``where`` names its place. Raises `EvaluationError`."""
     try:
         return float(word)
     except ValueError as error:

@@ -40,6 +40,7 @@ def plain_table(*columns: str, title: str | None = None) -> Table:
 
 
 def row(table: Table, *cells: str) -> None:
+    """Add a row, its cells as plain text."""
     table.add_row(*map(escape, cells))
 
 
@@ -52,6 +53,7 @@ def show(console: Console, table: Table) -> None:
 
 
 def say(console: Console, text: str) -> None:
+    """Print one sentence without wrapping."""
     console.print(text, markup=False, soft_wrap=True)
 
 

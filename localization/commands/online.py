@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -76,29 +76,14 @@ class Online(OnlineSettings):
         made = made_by(trial, robot, log.mounts, has_lidar, self.config, f"log {fingerprint(path)[:12]}")
         pipeline = Pipeline(trial, robot, log.mounts, has_lidar, self.config)
         session = Session.start(files, SessionState(pipeline), f"{trial.model.name}_{trial.estimator}", made)
-        clock, began, shown, seconds, is_done = PlaybackClock(rate, sleep=stop.sleep), time.monotonic(), -math.inf, 0.0, False
-        first_ns = None
+        is_done = False
         try:
             if view is not None:
                 view.begin(robot, log.mounts)
                 session.view = view
             if session.head:
                 console.print(f"resumed from {files.state} after {session.count} events", markup=False, soft_wrap=True)
-            with Live(console=console, auto_refresh=False, transient=True) as live:
-                for event in self._rest(log.events(), session.count):
-                    clock.wait(event.stamp_ns)
-                    if stop.is_set():
-                        self._interrupt(console, session)
-                    session.process(event)
-                    session.save_state()
-                    first_ns = event.stamp_ns if first_ns is None else first_ns
-                    seconds, now = (event.stamp_ns - first_ns) * 1e-9, time.monotonic()
-                    if console.is_terminal or view is not None:
-                        session.observe(event)
-                    if console.is_terminal and now - shown >= _LINE_S:
-                        shown, speed = now, f"  {seconds / max(now - began, 1e-9):.1f}x"
-                        statuses = session.health.statuses(session.pipeline)
-                        live.update(terminal_view(session, seconds, statuses, extra=speed), refresh=True)
+            seconds = self._play_events(console, self._rest(log.events(), session.count), session, rate, stop)
             session.finish()
             count = session.write_output()
             is_done = True
@@ -107,6 +92,25 @@ class Online(OnlineSettings):
         for note in dict.fromkeys([*log.warnings(), *session.pipeline.warnings()]):
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         self._summarize(console, session, seconds, count)
+
+    def _play_events(self, console: Console, events: Iterable[Event], session: Session, rate: float, stop: StopSignal) -> float:
+        """Process ``events`` at ``rate``; the time of the log that was played [s]."""
+        clock, began, shown, seconds, first_ns = PlaybackClock(rate, sleep=stop.sleep), time.monotonic(), -math.inf, 0.0, None
+        with Live(console=console, auto_refresh=False, transient=True) as live:
+            for event in events:
+                clock.wait(event.stamp_ns)
+                if stop.is_set():
+                    self._interrupt(console, session)
+                session.process(event)
+                session.save_state()
+                first_ns = event.stamp_ns if first_ns is None else first_ns
+                seconds, now = (event.stamp_ns - first_ns) * 1e-9, time.monotonic()
+                if console.is_terminal or session.view is not None:
+                    session.observe(event)
+                if console.is_terminal and now - shown >= _LINE_S:
+                    shown, speed = now, f"  {seconds / max(now - began, 1e-9):.1f}x"
+                    live.update(terminal_view(session, seconds, session.health.statuses(session.pipeline), extra=speed), refresh=True)
+        return seconds
 
     def _rest(self, events: Iterator[Event], done: int) -> Iterator[Event]:
         """Those after the first ``done``. Raises `CheckpointError` where there are not so many."""

@@ -125,6 +125,7 @@ def percent(d: Difference, unit: str = "") -> str:
 
 
 def p_words(p: float) -> str:
+    """A p value in words."""
     return "1" if p >= 0.995 else f"{p:.2g}" if p >= 1e-4 else "less than 0.0001"
 
 

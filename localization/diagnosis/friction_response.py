@@ -8,9 +8,11 @@ where the wheels roll at nearly the same proportion. In `dynamic_twists` each wh
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from motion_models.calibration.maneuvers import IntArray
 from motion_models.errors import ModelError
@@ -25,6 +27,7 @@ _CREEP = 3e-3
 _NEWTON = 12
 _MAX_RESIDUAL = 1e-7  # m/s and rad/s
 _MIN_REDUCTION = 0.2  # slopes are good for as long as a step leaves no more than this
+_SOLVED = 1e-3  # m/s and rad/s; a step that is left farther off is the quasi-static one
 _DIFFERENCE = 1e-5
 _MAX_ROLL_CHANGE = 0.02  # of unit rolls between samples, for which the last solution starts the next
 
@@ -66,25 +69,30 @@ def _solve_quasi_static(wheels: FloatArray, cg: FloatArray, params: FloatArray, 
         out[i, 0], out[i, 1], out[i, 2] = (vx - wz * tracked_y) * speed, (vy + wz * tracked_x) * speed, wz * speed
 
 
-def dynamic_twists(
-    robot: Robot,
-    model: FrictionModel,
-    params: FloatArray,
-    dt: FloatArray,
-    wheels: FloatArray,
-    cg: FloatArray,
-    first: IntArray,
-    headings: FloatArray,
-    slope: tuple[float, float],
-    quasi_static: FloatArray,
-) -> FloatArray:
-    """Body twists (N, 3) of the wheelbase's centre for wheel rates (N, 2) in intervals ``dt`` (N,), CG (N, 2), ``params`` (12,).
+class ManeuverSamples(NamedTuple):
+    """Samples of maneuvers."""
 
-    The contact law is that of ``model``. Maneuvers begin at ``first`` (W + 1,), with the ``headings`` (W,) [rad]; ``slope`` is by how much
-    the floor rises along the x and y axes in which headings count [rad]. ``quasi_static`` (N, 3) are the twists without inertia: where each
-    maneuver starts, and the result where no step is found. Raises `CgError` and `ModelError` as `FrictionModel` does.
+    dt: FloatArray
+    """(N,) [s]."""
+    wheels: FloatArray
+    """(N, 2) wheel rates [rad/s]."""
+    cg: FloatArray
+    """(N, 2) [m]."""
+    first: IntArray
+    """(W + 1,) first sample of each maneuver."""
+    headings: FloatArray
+    """(W,) at the begin of each maneuver [rad]."""
+    slope: FloatArray
+    """(2,) rise of the floor along the x and y axes in which headings count [rad]."""
+
+
+def dynamic_twists(robot: Robot, model: FrictionModel, params: FloatArray, drive: ManeuverSamples, quasi_static: FloatArray) -> FloatArray:
+    """Body twists (N, 3) of the wheelbase's centre, with inertia, for ``params`` (12,) and the contact law of ``model``.
+
+    ``quasi_static`` (N, 3) are the twists without inertia: where each maneuver starts, and the result where no step is found. Raises
+    `CgError` and `ModelError` as `FrictionModel` does.
     """
-    check_parameters(cg, params)
+    check_parameters(drive.cg, params)
     dynamics = FrictionDynamics.from_robot(robot)
     body = _Body(
         float(params[3]),
@@ -97,113 +105,133 @@ def dynamic_twists(
         _CREEP,
         dynamics.rest_speed,
     )
-    out = np.empty((len(dt), 3))
-    _integrate(dt, wheels, cg, first, headings, np.array(slope), quasi_static, model.floor(params), body, out)
+    out = np.empty((len(drive.dt), 3))
+    _integrate(drive, quasi_static, model.floor(params), body, out)
     return out
 
 
 TRACKED = tuple(FrictionModel.param_names.index(name) for name in ("tracked_x", "tracked_y"))
 
 
+class _Problem(NamedTuple):
+    """One backward Euler step."""
+
+    before: FloatArray
+    """(3,) twist at its start."""
+    h: float
+    """Duration [s]."""
+    q_l: float
+    q_r: float
+    state: FloatArray
+    influence: FloatArray
+    floor: Floor
+    body: _Body
+
+
+class _Work(NamedTuple):
+    """Arrays of Newton's method, made once."""
+
+    jacobian: FloatArray
+    off: FloatArray
+    tried: FloatArray
+    off_tried: FloatArray
+    is_stale: NDArray[np.bool_]
+    """(1,) the Jacobian is of another drive, or of none."""
+
+
 @numba.njit(cache=True, error_model="numpy")
-def _integrate(
-    dt: FloatArray,
-    wheels: FloatArray,
-    cg: FloatArray,
-    first: IntArray,
-    headings: FloatArray,
-    slope: FloatArray,
-    quasi_static: FloatArray,
-    floor: Floor,
-    body: _Body,
-    out: FloatArray,
-) -> None:
-    state, influence = np.zeros(6), np.zeros(13)
+def _integrate(drive: ManeuverSamples, quasi_static: FloatArray, floor: Floor, body: _Body, out: FloatArray) -> None:
+    state, influence, now = np.zeros(6), np.zeros(13), np.empty(3)
     influence[12] = body.height
-    jacobian, off, off_tried, tried = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
-    weight = body.mass * body.gravity
-    for w in range(first.shape[0] - 1):
-        heading = headings[w]
-        before = quasi_static[first[w]].copy()
-        fresh = True  # the slopes are of another drive, or of none
-        for i in range(first[w], first[w + 1]):
-            q_l, q_r, h = wheels[i, 0], wheels[i, 1], dt[i]
+    work = _Work(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.ones(1, dtype=np.bool_))
+    weight, slope = body.mass * body.gravity, drive.slope
+    for w in range(drive.first.shape[0] - 1):
+        heading = drive.headings[w]
+        before = quasi_static[drive.first[w]].copy()
+        work.is_stale[0] = True
+        for i in range(drive.first[w], drive.first[w + 1]):
+            q_l, q_r, h = drive.wheels[i, 0], drive.wheels[i, 1], drive.dt[i]
             if q_l == 0.0 and q_r == 0.0:
                 before[:] = 0.0
                 out[i] = 0.0
                 continue
             c, s = math.cos(heading), math.sin(heading)
-            influence[0], influence[1] = cg[i, 0], cg[i, 1]
+            influence[0], influence[1] = drive.cg[i, 0], drive.cg[i, 1]
             influence[7] = -weight * (c * slope[0] + s * slope[1])
             influence[8] = -weight * (-s * slope[0] + c * slope[1])
-            influence[10], influence[11] = cg[i, 0], cg[i, 1]
-            # start as far from the quasi_static motion as the sample before was, or from it; by the slopes of the sample before, if they do
-            found = False
-            for start in range(2):
-                now = quasi_static[i].copy()
-                if start == 0 and i > first[w]:
-                    now += before - quasi_static[i - 1]
-                size = _misfit(now, before, h, q_l, q_r, state, influence, floor, body, off)
-                for _ in range(_NEWTON):
-                    if size < _MAX_RESIDUAL:
-                        break
-                    if not fresh:
-                        d0, d1, d2, regular = _solve(jacobian, off)
-                        tried[0], tried[1], tried[2] = now[0] - d0, now[1] - d1, now[2] - d2
-                        new = _misfit(tried, before, h, q_l, q_r, state, influence, floor, body, off_tried) if regular else math.inf
-                        if new < _MIN_REDUCTION * size:
-                            now[:] = tried
-                            off[:] = off_tried
-                            size = new
-                            continue
-                    for j in range(3):
-                        tried[:] = now
-                        tried[j] += _DIFFERENCE
-                        _misfit(tried, before, h, q_l, q_r, state, influence, floor, body, off_tried)
-                        for k in range(3):
-                            jacobian[k, j] = (off_tried[k] - off[k]) / _DIFFERENCE
-                    fresh = False
-                    d0, d1, d2, regular = _solve(jacobian, off)
-                    if not regular:
-                        break
-                    share, better = 1.0, False
-                    for _ in range(8):
-                        tried[0], tried[1], tried[2] = now[0] - share * d0, now[1] - share * d1, now[2] - share * d2
-                        new = _misfit(tried, before, h, q_l, q_r, state, influence, floor, body, off_tried)
-                        if new < size:
-                            better = True
-                            break
-                        share *= 0.4
-                    if not better:
-                        break
-                    now[:] = tried
-                    off[:] = off_tried
-                    size = new
-                if size < 1e-3:
-                    found = True
-                    break
-                fresh = True
+            influence[10], influence[11] = drive.cg[i, 0], drive.cg[i, 1]
+            problem = _Problem(before, h, q_l, q_r, state, influence, floor, body)
+            # start as far from the quasi-static motion as the sample before was
+            now[:] = quasi_static[i] + (before - quasi_static[i - 1]) if i > drive.first[w] else quasi_static[i]
+            found = _solve_step(now, problem, work)
+            if not found:
+                now[:] = quasi_static[i]
+                found = _solve_step(now, problem, work)
             out[i] = now if found else quasi_static[i]
             before[:] = out[i]
             heading += out[i, 2] * h
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _misfit(
-    twist: FloatArray,
-    before: FloatArray,
-    h: float,
-    q_l: float,
-    q_r: float,
-    state: FloatArray,
-    influence: FloatArray,
-    floor: Floor,
-    body: _Body,
-    off: FloatArray,
-) -> float:
+def _solve_step(now: FloatArray, problem: _Problem, work: _Work) -> bool:
+    """Twist at the end of a step by Newton's method from ``now`` (3,), which is overwritten; the Jacobian before is used while it helps."""
+    size = _misfit(now, problem, work.off)
+    for _ in range(_NEWTON):
+        if size < _MAX_RESIDUAL:
+            break
+        new = math.inf if work.is_stale[0] else _try(now, problem, work, 1.0)
+        if not new < _MIN_REDUCTION * size:
+            _differentiate(now, problem, work)
+            new = _search(now, problem, work, size)
+            if not new < size:
+                break
+        now[:] = work.tried
+        work.off[:] = work.off_tried
+        size = new
+    if not size < _SOLVED:
+        work.is_stale[0] = True
+    return bool(size < _SOLVED)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _try(now: FloatArray, problem: _Problem, work: _Work, share: float) -> float:
+    """Misfit after a ``share`` of Newton's step; inf where the Jacobian is singular."""
+    d0, d1, d2, regular = _solve(work.jacobian, work.off)
+    if not regular:
+        return math.inf
+    work.tried[0], work.tried[1], work.tried[2] = now[0] - share * d0, now[1] - share * d1, now[2] - share * d2
+    return _misfit(work.tried, problem, work.off_tried)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _search(now: FloatArray, problem: _Problem, work: _Work, size: float) -> float:
+    """Misfit of the first of shrinking steps that is below ``size``; inf where none is."""
+    share = 1.0
+    for _ in range(8):
+        new = _try(now, problem, work, share)
+        if new < size:
+            return new
+        share *= 0.4
+    return math.inf
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _differentiate(now: FloatArray, problem: _Problem, work: _Work) -> None:
+    for j in range(3):
+        work.tried[:] = now
+        work.tried[j] += _DIFFERENCE
+        _misfit(work.tried, problem, work.off_tried)
+        for k in range(3):
+            work.jacobian[k, j] = (work.off_tried[k] - work.off[k]) / _DIFFERENCE
+    work.is_stale[0] = False
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _misfit(twist: FloatArray, problem: _Problem, off: FloatArray) -> float:
     """Fill ``off`` (3,) with how far ``twist`` is off a backward Euler step [m/s, m/s, rad/s]; its length."""
+    state, before, h = problem.state, problem.before, problem.h
     state[3], state[4], state[5] = twist[0], twist[1], twist[2]
-    a_x, a_y, a_w, _ = _accelerations(state, q_l, q_r, influence, floor, body)
+    a_x, a_y, a_w, _ = _accelerations(state, problem.q_l, problem.q_r, problem.influence, problem.floor, problem.body)
     off[0], off[1], off[2] = twist[0] - before[0] - h * a_x, twist[1] - before[1] - h * a_y, twist[2] - before[2] - h * a_w
     return math.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2])
 

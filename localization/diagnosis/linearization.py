@@ -177,4 +177,5 @@ def _estimate_drive_noise(
 
 
 def group_of(cause: Cause) -> str:
+    """Name of the group of causes of which only one is tried at a time."""
     return cause.id if cause.id != "slope" else cause.key

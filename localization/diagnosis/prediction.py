@@ -11,7 +11,7 @@ import numpy as np
 from localization.diagnosis.causes import Cause, Hypothesis
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.encoder_dropout import REST_RATE_RAD_PER_S, find_dropouts
-from localization.diagnosis.friction_response import TRACKED, dynamic_twists, quasi_static_twists
+from localization.diagnosis.friction_response import TRACKED, ManeuverSamples, dynamic_twists, quasi_static_twists
 from motion_models import se2
 from motion_models.base import MotionModel, Twist
 from motion_models.calibration.maneuvers import Batch, IntArray, Maneuver, make_batch
@@ -299,7 +299,8 @@ class _HypothesisModel:
             x, y = params[TRACKED[0]], params[TRACKED[1]]
             middle = settled + settled[:, 2:] * np.array([y, -x, 0.0])
             batch = p.batch
-            twists = dynamic_twists(p.drive.robot, law, params, batch.dt, rates, cg, batch.first, p.headings, b.slope, middle)
+            drive = ManeuverSamples(batch.dt, rates, cg, batch.first, p.headings, np.array(b.slope))
+            twists = dynamic_twists(p.drive.robot, law, params, drive, middle)
             p._twists[key] = np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
         return p._twists[key]
 

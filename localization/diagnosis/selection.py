@@ -56,6 +56,7 @@ def search_causes(predictor: DrivePredictor, linearization: Linearization) -> di
 
 
 def refined_cost(predictor: DrivePredictor, linearization: Linearization, sizes: dict[Cause, float]) -> float:
+    """Cost of ``sizes`` by the predictor itself, not by its linearization."""
     return _refined_cost(predictor, linearization, sizes)[1]
 
 

@@ -149,13 +149,9 @@ def rank_subsets(problem: Regression, groups: list[str], allowed: FloatArray, ke
             set(itertools.combinations(range(p), k)) if k <= 2 else {tuple(sorted({*s, i})) for s in layer for i in range(p) if i not in s}
         )
         scored = sorted((cost(problem, groups, s), s) for s in tried if len({groups[i] for i in s}) == k)
-        layer = []
-        for c, s in scored:
-            if fits(s):
-                layer.append(s)
-                found.append((c, s))
-                if len(layer) >= kept:
-                    break
+        best = list(itertools.islice(((c, s) for c, s in scored if fits(s)), kept))
+        found += best
+        layer = [s for _, s in best]
         if not layer or found[-len(layer)][0] > min(c for c, _ in found) + 30.0:
             break
     return sorted(found)

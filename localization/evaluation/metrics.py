@@ -41,6 +41,8 @@ _MIN_MATCHES = 3
 
 @dataclass(frozen=True)
 class EvaluateConfig(Settings):
+    """Settings of the metrics."""
+
     max_gap_s: Positive = 1.0
     """Reference samples between two poses further apart than this [s] are not scored: there the estimate is only interpolation."""
     rpe_distances_m: tuple[float, ...] = ()

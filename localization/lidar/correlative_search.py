@@ -41,6 +41,8 @@ class LikelihoodImage:
 
 @dataclass(frozen=True)
 class SearchResult:
+    """Best pose of a search, and what competes with it."""
+
     pose: FloatArray
     """(3,) of the best score, prior included."""
     score: float

@@ -42,6 +42,8 @@ _AGREE_WITHIN = 12
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
+    """A keyframe of the graph, with its scan."""
+
     odometry: FloatArray
     """(3,) ``odom_T_body`` of the filter."""
     points: FloatArray

@@ -107,16 +107,29 @@ def find_nearest(grid: VoxelGrid, x: float, y: float, reach: float) -> int:
     ring = 0
     while ring == 0 or ((ring - 1) * cell + border) ** 2 < best:
         for di in range(-ring, ring + 1):
-            stride = 1 if abs(di) == ring else 2 * ring
-            for dj in range(-ring, ring + 1, max(stride, 1)):
-                v = find_voxel(grid.slots, i + di, j + dj)
-                if v >= 0:
-                    n = grid.sums[v, 0]
-                    d2 = (grid.sums[v, 1] / n - x) ** 2 + (grid.sums[v, 2] / n - y) ** 2
-                    if d2 < best:
-                        best, nearest = d2, v
+            d2, v = _nearest_in_row(grid, i + di, j, ring, 1 if abs(di) == ring else 2 * ring, x, y)
+            if d2 < best:
+                best, nearest = d2, v
         ring += 1
     return nearest
+
+
+@numba.njit(cache=True)
+def _nearest_in_row(grid: VoxelGrid, i: int, j: int, ring: int, stride: int, x: float, y: float) -> tuple[float, int]:
+    """Squared distance [m^2] and number of the voxel of row ``i``, columns j - ring to j + ring by ``stride``, whose mean is nearest."""
+    best, nearest = math.inf, -1
+    for dj in range(-ring, ring + 1, max(stride, 1)):
+        v = find_voxel(grid.slots, i, j + dj)
+        d2 = _squared_distance(grid, v, x, y) if v >= 0 else math.inf
+        if d2 < best:
+            best, nearest = d2, v
+    return best, nearest
+
+
+@numba.njit(cache=True)
+def _squared_distance(grid: VoxelGrid, v: int, x: float, y: float) -> float:
+    n = grid.sums[v, 0]
+    return (grid.sums[v, 1] / n - x) ** 2 + (grid.sums[v, 2] / n - y) ** 2  # type: ignore[no-any-return]
 
 
 @numba.njit(cache=True)
@@ -129,13 +142,12 @@ def fill_surface(grid: VoxelGrid, v: int) -> None:
     while found < POOLED_VOXELS and ring < MAX_RINGS:
         ring += 1
         found = 0
-        for di in range(-ring, ring + 1):
-            for dj in range(-ring, ring + 1):
-                w = find_voxel(grid.slots, grid.cells[v, 0] + di, grid.cells[v, 1] + dj)
-                if w >= 0:
-                    m = grid.sums[w, 0]
-                    d2s[found], rows[found] = (grid.sums[w, 1] / m - x) ** 2 + (grid.sums[w, 2] / m - y) ** 2, w
-                    found += 1
+        for k in range((2 * ring + 1) ** 2):
+            di, dj = k // (2 * ring + 1) - ring, k % (2 * ring + 1) - ring
+            w = find_voxel(grid.slots, grid.cells[v, 0] + di, grid.cells[v, 1] + dj)
+            if w >= 0:
+                d2s[found], rows[found] = _squared_distance(grid, w, x, y), w
+                found += 1
     total = np.zeros(6)
     for w in rows[np.argsort(d2s[:found])[:POOLED_VOXELS]]:
         total += grid.sums[w]

@@ -70,6 +70,7 @@ def frame_name(frame_id: str) -> str:
 
 
 def decode_imu(message: Any, stamp: int) -> ImuSample:
+    """sensor_msgs/Imu. Raises `UnusableError`."""
     w, a = message.angular_velocity, message.linear_acceleration
     if not math.isfinite(w.x + w.y + w.z + a.x + a.y + a.z):  # faster than numpy on six numbers
         raise UnusableError(Oddity.NOT_FINITE)
@@ -79,6 +80,7 @@ def decode_imu(message: Any, stamp: int) -> ImuSample:
 
 
 def decode_cg(message: Any, stamp: int) -> CgSample:
+    """geometry_msgs/PointStamped. Raises `UnusableError`."""
     x, y = message.point.x, message.point.y
     if not math.isfinite(x + y):
         raise UnusableError(Oddity.NOT_FINITE)
@@ -93,6 +95,7 @@ def yaw_of(q: Any) -> float:
 
 
 def decode_odometry(message: Any, stamp: int) -> OdometryReading:
+    """nav_msgs/Odometry. Raises `UnusableError`."""
     pose, twist = message.pose.pose, message.twist.twist
     where = pose.position.x, pose.position.y, yaw_of(pose.orientation)
     rate = twist.linear.x, twist.linear.y, twist.angular.z

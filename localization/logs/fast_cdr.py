@@ -25,16 +25,22 @@ _LASER_SCAN = struct.Struct("<7fI")
 
 
 class Stamp(NamedTuple):
+    """builtin_interfaces/Time."""
+
     sec: int
     nanosec: int
 
 
 class Header(NamedTuple):
+    """std_msgs/Header."""
+
     stamp: Stamp
     frame_id: str
 
 
 class Vector(NamedTuple):
+    """geometry_msgs/Vector3."""
+
     x: float
     y: float
     z: float

@@ -46,6 +46,8 @@ Row = Sequence[Cell]
 
 @dataclass(frozen=True)
 class Table:
+    """A table, folded away if it has a summary."""
+
     kind: ClassVar[str] = "table"
     header: Row
     rows: Sequence[Row]
@@ -55,6 +57,8 @@ class Table:
 
 @dataclass(frozen=True)
 class Item:
+    """One entry of a list."""
+
     text: str
     name: str = ""
     """Bold, before the text."""
@@ -62,6 +66,8 @@ class Item:
 
 @dataclass(frozen=True)
 class Bullets:
+    """A list."""
+
     kind: ClassVar[str] = "bullets"
     items: Sequence[Item]
     summary: str = ""
@@ -74,6 +80,8 @@ class Bullets:
 
 @dataclass(frozen=True)
 class Paragraph:
+    """A paragraph of text."""
+
     kind: ClassVar[str] = "paragraph"
     text: str
     is_small: bool = False
@@ -81,6 +89,8 @@ class Paragraph:
 
 @dataclass(frozen=True)
 class Definitions:
+    """Names and their values or explanations."""
+
     kind: ClassVar[str] = "definitions"
     entries: Mapping[str, str]
     is_glossary: bool = False
@@ -101,6 +111,8 @@ class LegendItem:
 
 @dataclass(frozen=True)
 class Figure:
+    """A picture with legend and caption."""
+
     kind: ClassVar[str] = "figure"
     svg: str
     title: str
@@ -128,6 +140,8 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
+    """Contents of a whole page."""
+
     title: str
     facts: str
     """One line below the title."""

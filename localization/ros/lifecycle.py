@@ -54,15 +54,18 @@ class ManagedNode:
                 if self._node.get_parameter("autostart").value and not self._start():
                     return _BAD_INPUT
                 while not (stop.is_set() or self._is_shut_down):
-                    if self._is_active:
-                        self._estimate(stop)
-                    else:
-                        self._transport.take(_IDLE_S)
+                    self._spin(stop)
                 return _BAD_INPUT if self._has_failed and self._node.get_parameter("autostart").value else 0
             finally:
                 self._transport.close()
                 self._node.destroy_node()
                 self._rclpy.try_shutdown()
+
+    def _spin(self, stop: StopSignal) -> None:
+        if self._is_active:
+            self._estimate(stop)
+        else:
+            self._transport.take(_IDLE_S)
 
     def configure(self) -> None:
         """Read the parameters and compile. Raises `SkidlocError`."""

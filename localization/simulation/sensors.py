@@ -27,6 +27,8 @@ _GRAVITY = 9.81
 
 @dataclass(frozen=True)
 class EncoderConfig(Settings):
+    """Settings of the wheel encoders."""
+
     rate_hz: Positive = 50.0
     """Joint states per second."""
     counts: int = 4096
@@ -37,6 +39,8 @@ class EncoderConfig(Settings):
 
 @dataclass(frozen=True)
 class ImuConfig(Settings):
+    """Settings of the IMU."""
+
     rate_hz: float = 50.0
     """Samples per second; 0 for no IMU."""
     gyro_noise: float = 5e-4
@@ -55,6 +59,8 @@ class ImuConfig(Settings):
 
 @dataclass(frozen=True)
 class GpsConfig(Settings):
+    """Settings of the GPS receiver."""
+
     rate_hz: float = 0.0
     """Fixes per second; 0 for no GPS."""
     noise_m: float = 0.3
@@ -285,6 +291,8 @@ class SensorConfig(Settings):
 
 
 class Sensor(Protocol):
+    """A sensor that makes messages of the true motion."""
+
     def messages(self, track: TrueMotion) -> Sequence[Message]:
         """What it has measured by the track's end and was not yet taken."""
 

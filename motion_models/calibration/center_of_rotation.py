@@ -26,6 +26,8 @@ _MAX_CONDITION = 1e14
 
 @dataclass(frozen=True)
 class CenterOfRotation:
+    """Centre of rotation in the body frame, with its covariance."""
+
     value: FloatArray
     """(2,) x_CR, y_CR in the body frame [m]."""
     cov: FloatArray

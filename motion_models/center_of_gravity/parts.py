@@ -58,6 +58,8 @@ class Payload:
 
 @dataclass(frozen=True)
 class CgEstimate:
+    """Centre of gravity in the body frame, with its covariance."""
+
     position: FloatArray
     """(2,) centre of gravity in the base's frame [m]."""
     covariance: FloatArray

@@ -26,6 +26,8 @@ _XACRO = "it is a xacro file, not a URDF; expand it first: xacro FILE.xacro > FI
 
 @dataclass(frozen=True)
 class Link:
+    """A link with its mass and centre of mass."""
+
     name: str
     mass: float
     """[kg]; 0 where the link has no <inertial>."""
@@ -44,6 +46,8 @@ class Mimic:
 
 @dataclass(frozen=True)
 class Joint:
+    """A joint between two links."""
+
     name: str
     kind: str
     """fixed, revolute, continuous or prismatic."""

@@ -31,6 +31,8 @@ class Scales:
 
 @dataclass(frozen=True)
 class WeighedCg:
+    """Centre of gravity by four scales, with its covariance."""
+
     mass: float
     """[kg]"""
     position: FloatArray

@@ -10,6 +10,7 @@ from launch_ros.substitutions import FindPackageShare
 
 
 def node(topics, condition):
+    """The lifecycle node with ``topics``, under ``condition``."""
     parameters = {
         "robot": ParameterValue(LaunchConfiguration("robot"), value_type=str),
         "estimator": ParameterValue(LaunchConfiguration("estimator"), value_type=str),
@@ -30,6 +31,7 @@ def node(topics, condition):
 
 
 def generate_launch_description():
+    """Entry point of ros2 launch."""
     own_params = PathJoinSubstitution([FindPackageShare("skidloc"), "params.yaml"])
     arguments = [
         DeclareLaunchArgument("robot", description="Name of a shipped robot, or path of a robot TOML file"),

@@ -7,6 +7,7 @@ from launch_ros.substitutions import FindPackageShare
 
 
 def generate_launch_description():
+    """Entry point of ros2 launch."""
     share = FindPackageShare("skidloc")
     arguments = {
         "robot": DeclareLaunchArgument("robot", description="Name of a shipped robot, or path of a robot TOML file"),

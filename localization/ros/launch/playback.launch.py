@@ -9,6 +9,7 @@ from launch_ros.substitutions import FindPackageShare
 
 
 def generate_launch_description():
+    """Entry point of ros2 launch."""
     share = FindPackageShare("skidloc")
     bag, rate = LaunchConfiguration("bag"), LaunchConfiguration("rate")
     play = ["ros2", "bag", "play", bag, "--rate", rate, "--clock", "100", "--remap", "/tf:=/tf_recorded"]

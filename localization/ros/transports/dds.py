@@ -274,16 +274,20 @@ def _bind_to(interface: str) -> Any:
     if interface != LOOPBACK:
         return
     for number in _sockets() - before:
-        with socket.socket(fileno=number) as opened:
-            try:
-                if opened.type == socket.SOCK_DGRAM:
-                    opened.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, LOOPBACK.encode() + b"\0")
-            except (AttributeError, OSError) as error:
-                raise TransportError(
-                    f"DDS cannot be restricted to this machine ({error}). If packets of others do no harm: --interface default."
-                ) from error
-            finally:
-                opened.detach()  # it stays Cyclone's
+        _bind_socket(number)
+
+
+def _bind_socket(number: int) -> None:
+    with socket.socket(fileno=number) as opened:
+        try:
+            if opened.type == socket.SOCK_DGRAM:
+                opened.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, LOOPBACK.encode() + b"\0")
+        except (AttributeError, OSError) as error:
+            raise TransportError(
+                f"DDS cannot be restricted to this machine ({error}). If packets of others do no harm: --interface default."
+            ) from error
+        finally:
+            opened.detach()  # it stays Cyclone's
 
 
 def _sockets() -> set[int]:
