@@ -19,6 +19,7 @@ PARTS = (
     "tests.studies.gentle_arcs",
     "tests.studies.contact_law",
     "tests.studies.graph_corrections",
+    "tests.studies.honesty",
     "tests.studies.terrain_track",
     "tests.studies.real_husky",
 )
