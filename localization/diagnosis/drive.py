@@ -279,7 +279,7 @@ def drive_of_table(name: str, robot: Robot, maneuvers: Sequence[Maneuver], kind:
     >>> rotations = rotations_as_maneuvers(read_rotation_table("tests/data/vaultbot/rotation_grid.csv"), robot)
     >>> found = diagnose(drive_of_table("rotation_grid.csv", robot, rotations, "rotations"), make_model("friction", robot))
     >>> strongest = found.findings[0]
-    >>> strongest.cause, round(strongest.size, 2), strongest.cause.unit
+    >>> strongest.cause, round(strongest.size, 2), strongest.definition.unit
     ('lidar_offset_x', 0.06, 'm')
     """
     factors = robot.geometry.radius_multipliers

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from localization.logs.topics import TopicOverrides
+from localization.logs.topic_roles import TopicOverrides
 from rosbags.typesys import Stores, get_typestore
 
 from localization.estimators import Estimate

@@ -49,6 +49,7 @@ class PoseSensor:
     """In place of `ScanMatchingSensor`: poses with noise of a covariance that it knows, in a submap that is exact."""
 
     cell = 0.0  # no voxels, and so no loops
+    sweep_s = 0.0  # poses at one instant
 
     def __init__(self) -> None:
         self.next: ScanMatch | None = None

@@ -344,7 +344,7 @@ def odometry_log(tmp_path: Path, poses: Any, twists: Any, dt: float = 0.1, keep:
     return open_log(bags.write_mcap(tmp_path / "run.mcap", records[keep]), ROBOT)
 
 
-RNG_RATES = np.random.default_rng(3).uniform(-4.0, 6.0, (60, 2))
+RNG_RATES = 1.0 + np.cumsum(np.random.default_rng(3).uniform(-1.0, 1.0, (60, 2)), axis=0)  # within what a robot can accelerate
 
 
 def test_odometry_is_turned_back_into_wheels(tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ def test_every_format_is_opened_by_rosbags_and_by_this_library(tmp_path, name, l
     assert types == {
         "/joint_states": "JointState",
         "/ground_truth/odom": "Odometry",
-        "/imu/data": "ImuSensor",
+        "/imu/data": "Imu",
         "/fix": "NavSatFix",
         "/tf_static": "TFMessage",
         "/center_of_gravity": "PointStamped",
