@@ -13,12 +13,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from localization.logs.topic_roles import TopicOverrides
 from rosbags.typesys import Stores, get_typestore
 
 from localization.estimators import Estimate
 from localization.logs import open_log
 from localization.logs.sources import open_source
+from localization.logs.topic_roles import TopicOverrides
 from localization.pipeline import Pipeline, Trial
 from localization.ros.node import Node
 from localization.ros.publisher import DIAGNOSTICS, MAP, ODOMETRY, PATH, POSE, PREDICTED_ODOMETRY
