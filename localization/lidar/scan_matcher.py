@@ -338,11 +338,11 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
 
     While the pose may still be off by ``spread`` [m] at a point, points are associated from so far, and residuals are weighed by it.
     """
-    H, g = np.zeros((3, 3)), np.zeros(3)
     c, s = math.cos(x[2]), math.sin(x[2])
     reach, loose = max(_REACH_CELLS * grid.cell, spread), (spread / _KERNEL) ** 2
     n, fitting, cost = points.shape[0], 0, 0.0
-    J, T, spurious = np.empty(3), np.empty(3), np.zeros((3, 3))
+    J, T = np.zeros((n, 3)), np.zeros((n, 3))  # derivatives of the distances across and along the surfaces
+    weights, e_weights, angle_weights = np.zeros((n, 1)), np.zeros(n), np.zeros((n, 1))
     mapped, block, squares, block_squares = 0, 0.0, 0.0, 0.0
     for i in range(n):
         px, py = points[i, 0], points[i, 1]
@@ -369,16 +369,12 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
             if fitting % _BLOCK == 0:
                 block_squares, block = block_squares + block * block, 0.0
         scale = _KERNEL**2 * var + loose
-        weight = (scale / (scale + e * e)) ** 2 / (var + loose)
-        J[0], J[1] = c * surface[2] + s * surface[3], -s * surface[2] + c * surface[3]  # the normal, seen from the body
-        J[2] = px * J[1] - py * J[0]
-        T[0], T[1] = -J[1], J[0]  # along the surface
-        T[2] = px * T[1] - py * T[0]
-        for a in range(3):
-            g[a] += weight * J[a] * e
-            for b in range(3):
-                H[a, b] += weight * J[a] * J[b]
-                spurious[a, b] += weight * min(surface[5], 1.0) * T[a] * T[b]
+        weights[i, 0] = (scale / (scale + e * e)) ** 2 / (var + loose)
+        e_weights[i], angle_weights[i, 0] = weights[i, 0] * e, weights[i, 0] * min(surface[5], 1.0)
+        nx, ny = c * surface[2] + s * surface[3], -s * surface[2] + c * surface[3]  # the normal in the body frame
+        J[i, 0], J[i, 1], J[i, 2] = nx, ny, px * ny - py * nx
+        T[i, 0], T[i, 1], T[i, 2] = -ny, nx, px * nx + py * ny
+    H, g, spurious = J.T @ (weights * J), J.T @ e_weights, T.T @ (angle_weights * T)
     found = np.array([fitting / max(n, 1), 0.5 * cost / CORRELATED_BEAMS, squares, block_squares, fitting, mapped])
     _discount(H, g, spurious)
     return H, g, found
