@@ -110,8 +110,8 @@ def find_nearest(grid: VoxelGrid, x: float, y: float, reach: float) -> int:
             gap_x = _gap(x, i + di, cell)
             stride = 1 if abs(di) == ring else 2 * ring
             for dj in range(-ring, ring + 1, max(stride, 1)):
-                if gap_x * gap_x + _gap(y, j + dj, cell) ** 2 < best:  # else no mean in this cell is nearer
-                    best, nearest = _nearer(sums, find_voxel(slots, i + di, j + dj), x, y, best, nearest)
+                is_near = gap_x * gap_x + _gap(y, j + dj, cell) ** 2 < best  # else no mean in this cell is nearer
+                best, nearest = _nearer(sums, find_voxel(slots, i + di, j + dj) if is_near else -1, x, y, best, nearest)
         ring += 1
     return nearest
 
@@ -147,9 +147,8 @@ def fill_surface(grid: VoxelGrid, v: int) -> None:
         for di in range(-ring, ring + 1):
             for dj in range(-ring, ring + 1, 1 if abs(di) == ring else max(2 * ring, 1)):
                 w = find_voxel(slots, i + di, j + dj)
-                if w >= 0:
-                    found += 1
-                    _insert_sorted(d2s, rows, _squared_distance(sums, w, x, y), w)
+                found += w >= 0
+                _insert_sorted(d2s, rows, _squared_distance(sums, w, x, y) if w >= 0 else math.inf, w)
         ring += 1
     total = np.zeros(6)
     for k in range(min(found, POOLED_VOXELS)):
