@@ -25,7 +25,7 @@ def tilted(pitch, scans: int = 24) -> LidarTilt:
     return found
 
 
-def test_clouds_that_are_tilted_are_told() -> None:
+def test_lidar_tilt_of_tilted_clouds_is_reported() -> None:
     assert tilted(lambda k: math.radians(0.4)).warnings() == []
     (note,) = tilted(lambda k: math.radians(3.0)).warnings()
     assert "by 3.0 deg (roll +0.0, pitch +3.0)" in note
@@ -36,7 +36,7 @@ def test_clouds_that_are_tilted_are_told() -> None:
     assert tilted(lambda k: math.radians(3.0), scans=9).warnings() == []  # a glimpse is not enough
 
 
-def test_a_mount_that_tells_the_tilt_is_believed() -> None:
+def test_lidar_tilt_with_tilted_mount_is_silent() -> None:
     points = rooms.cloud(LAB, np.zeros(3), 0, math.radians(5.0)) - np.array([0.0, 0.0, 0.8])
     found = LidarTilt({"laser": Mount(z=0.8, pitch=math.radians(5.0))})
     for k in range(12):
@@ -44,7 +44,7 @@ def test_a_mount_that_tells_the_tilt_is_believed() -> None:
     assert found.warnings() == []
 
 
-def test_only_a_ground_is_taken_for_one() -> None:
+def test_fit_ground_of_no_ground_is_none() -> None:
     rng = np.random.default_rng(0)
     across = rng.uniform(-8.0, 8.0, (2000, 2))
     level = np.array([-0.8, 0.05, -0.1])
