@@ -105,6 +105,10 @@ class GyroBuffer:
         self._spikes += len(self._pending)
         self._pending = []
 
+    def __len__(self) -> int:
+        """Stored samples."""
+        return len(self._stamps)
+
     @property
     def newest_ns(self) -> int | None:
         return self._stamps[-1] if self._stamps else None

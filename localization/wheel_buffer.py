@@ -23,6 +23,10 @@ class WheelBuffer:
         self._ends: list[int] = []
         self._intervals: list[tuple[int, float, float, float, float, bool]] = []  # start_ns, q_l, q_r, x_G, y_G, by angles
 
+    def __len__(self) -> int:
+        """Stored intervals."""
+        return len(self._intervals)
+
     @property
     def newest_ns(self) -> int | None:
         return None if self._last is None else self._last.stamp_ns

@@ -67,8 +67,9 @@ class Filter:
         self.P[BIAS, BIAS], self.P[SCALE, SCALE] = gyro.bias_sigma_rad_per_s**2, gyro.scale_sigma**2
         self.P[CLOCK, CLOCK] = config.clock_sigma_s**2
         self.P[PARAMS:, PARAMS:] = corrections.cov
-        self._consider = np.zeros(n, dtype=bool)
-        self._consider[MAP] = True
+        self.is_considered = np.zeros(n, dtype=bool)
+        """(n,) states that have no gain."""
+        self.is_considered[MAP] = True
         self._scan_noise: tuple[FloatArray, FloatArray] | None = None  # of the last scan: covariance with the errors (n, 3), own (3, 3)
 
     def predict(self, step: Step, is_turning: bool = True) -> None:
@@ -100,7 +101,7 @@ class Filter:
         pose = se2.compose(self.pose, motion.delta)
         _check(f"the motion of the wheels until stamp {step.end_ns} ns", pose, P)
         self.start, self.pose, self.P = self.pose, pose, P
-        self._consider[PARAMS:], self._scan_noise = not is_turning, None
+        self.is_considered[PARAMS:], self._scan_noise = not is_turning, None
 
     def update_turn(self, turn: Turn) -> float:
         """The gyro's turn since the start of the step. Returns the normalised innovation squared (NIS, 1 degree of freedom)."""
@@ -179,7 +180,7 @@ class Filter:
         S = H @ P @ H.T + R
         _check("a measurement", innovation, S)
         K = np.asarray(np.linalg.solve(S, H @ P).T, dtype=float)
-        K[self._consider] = 0.0
+        K[self.is_considered] = 0.0
         A = np.eye(len(P)) - K @ H
         self.P = _symmetric(A @ P @ A.T + K @ R @ K.T)
         _check("a measurement", self.P)

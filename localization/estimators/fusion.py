@@ -36,7 +36,7 @@ class EkfFusion:
         """``sensor``: None without a LiDAR; then there is no second clock until the gyro's first reading."""
         self._clock_sigma_s = config.clock_sigma_s if sensor is None else 0.0
         self.filter = Filter(robot.gyro_noise, corrections, replace(config, clock_sigma_s=0.0) if sensor is None else config)
-        self._sensor, self._model, self._corrections = sensor, model, corrections
+        self._sensor, self.model, self.corrections = sensor, model, corrections
         self._track_m = robot.geometry.track_width_m
         self._slip = np.zeros(3)  # twist that the wheels missed in the last step
         self._slip_changes = _SlipChanges()
@@ -51,7 +51,7 @@ class EkfFusion:
 
     @property
     def params(self) -> FloatArray:
-        return np.asarray(self._model.nominal + self._corrections.directions @ self.filter.corrections)
+        return np.asarray(self.model.nominal + self.corrections.directions @ self.filter.corrections)
 
     @property
     def scan_points(self) -> FloatArray:
@@ -121,7 +121,7 @@ class EkfFusion:
     def _is_turning(self, motion: Motion) -> bool:
         """Whether ``motion`` turns enough to say something of the corrections."""
         d = motion.delta
-        return bool(abs(d[2]) * self._track_m >= self._corrections.least_turn * math.hypot(d[0], d[1]))
+        return bool(abs(d[2]) * self._track_m >= self.corrections.least_turn * math.hypot(d[0], d[1]))
 
     def _check_standstill(self, step: Step) -> Step:
         """Wheels that read zero while gyro or scans show motion count as unknown."""
@@ -157,8 +157,8 @@ class EkfFusion:
             found["gyro_scale"] = ekf.scale, float(sigmas[SCALE])
         if self._sensor is not None or self._has_gyro:
             found["wheel_clock_offset_s"] = ekf.clock_offset, float(sigmas[CLOCK])
-        nominal = dict(zip(self._model.param_names, self._model.nominal, strict=True))
-        for i, name in enumerate(self._corrections.names):
+        nominal = dict(zip(self.model.param_names, self.model.nominal, strict=True))
+        for i, name in enumerate(self.corrections.names):
             found[name] = float(nominal.get(name, 0.0) + ekf.corrections[i]), float(sigmas[PARAMS + i])
         return found
 

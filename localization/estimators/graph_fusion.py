@@ -59,7 +59,7 @@ class GraphFusion:
         """``is_smoothing``: `finish` is to give the smoothed trajectory; memory then grows with the drive, 24 bytes a step."""
         self.odometry, self._corrections, self._lidar, self._config = odometry, corrections, lidar, config
         prior = block_diag(corrections.cov, _WHEEL_SCALE_SIGMA**2)
-        self._graph = PoseGraph(prior, np.array([config.antenna_x_m, config.antenna_y_m]))
+        self.graph = PoseGraph(prior, np.array([config.antenna_x_m, config.antenna_y_m]))
         self._loops: LoopDetector | None = None
         self._wheels = _KeyframeMotion(len(corrections.names))
         self._steps, self._stamps_ns = array("d"), array("q")  # the filter's poses, if they are to be smoothed
@@ -98,7 +98,7 @@ class GraphFusion:
             self._stamps_ns.append(step.end_ns)
         delta, cov = ekf.drift_since_key()
         moved = math.hypot(delta[0], delta[1]) >= self._config.keyframe_distance_m or abs(delta[2]) >= self._config.keyframe_angle_rad
-        self._is_keyframe_due = not self._graph.count or (moved and (step.scan is not None or self.lost is None))
+        self._is_keyframe_due = not self.graph.count or (moved and (step.scan is not None or self.lost is None))
         self._place_positions(step)
         A = se2.adjoint(se2.inverse(delta))
         pose = se2.compose(self._map_T_odom, ekf.pose)
@@ -117,28 +117,28 @@ class GraphFusion:
         self._waiting.append(sample)
 
     def _add_keyframe(self) -> None:
-        ekf, k = self.odometry.filter, self._graph.count
+        ekf, k = self.odometry.filter, self.graph.count
         if k:
             delta, cov = ekf.drift_since_key()
             wheels = self._wheels.preintegrated(ekf.corrections)
             D = wheels.by_corrections[:, :-1]
             total = wheels.cov + D @ ekf.P[PARAMS:, PARAMS:] @ D.T
             measured = _subtract_information(delta, cov, wheels.delta, total)
-            pose = se2.compose(self._graph.pose(k - 1), delta)
+            pose = se2.compose(self.graph.pose(k - 1), delta)
             update = Update(pose, wheels, self._walk(), (Between(k - 1, k, *measured),))
         else:
             update = Update(ekf.pose)
-        self._graph.apply(update)
+        self.graph.apply(update)
         self._nodes.append(len(self._stamps_ns) - 1)
         ekf.start_key()
         self._wheels = _KeyframeMotion(len(self._corrections.names))
         self._close_loops(Keyframe(ekf.pose, self.odometry.scan_points))
         self._align_positions()
         if len(self._corrections.names) and k:
-            mean, cov = self._graph.corrections()
+            mean, cov = self.graph.corrections()
             ekf.set_corrections(mean[:-1], cov[:-1, :-1])
-        self._map_T_odom = se2.compose(self._graph.pose(k), se2.inverse(ekf.pose))
-        self._key_cov = self._graph.marginal(k)
+        self._map_T_odom = se2.compose(self.graph.pose(k), se2.inverse(ekf.pose))
+        self._key_cov = self.graph.marginal(k)
 
     def _walk(self) -> FloatArray | None:
         """(c, c) by which the corrections may have changed, once a minute; None meanwhile."""
@@ -153,25 +153,25 @@ class GraphFusion:
             if self.odometry.cell == 0.0:
                 return
             self._loops = LoopDetector(self._lidar, self.odometry.cell)
-            self._loops.keyframes += [Keyframe(self._graph.pose(k), keyframe.points[:0]) for k in range(self._graph.count - 1)]
+            self._loops.keyframes += [Keyframe(self.graph.pose(k), keyframe.points[:0]) for k in range(self.graph.count - 1)]
         self._loops.add(keyframe)
-        loops = self._loops.detect(self._graph.poses, self._graph.marginal)
+        loops = self._loops.detect(self.graph.poses, self.graph.marginal)
         if loops:
             self.n_loops += len(loops)
             between = tuple(Between(loop.a, loop.b, loop.delta, np.asarray(np.linalg.inv(loop.cov)), is_loop=True) for loop in loops)
-            self._graph.apply(Update(betweens=between))
+            self.graph.apply(Update(betweens=between))
 
     def _place_positions(self, step: Step) -> None:
         """Positions up to the end of ``step`` are taken from the newest keyframe."""
         ekf = self.odometry.filter
         while self._waiting and self._waiting[0].stamp_ns <= step.end_ns:
             sample = self._waiting.pop(0)
-            if sample.stamp_ns < step.start_ns or not self._graph.count:
+            if sample.stamp_ns < step.start_ns or not self.graph.count:
                 continue
             part = (sample.stamp_ns - step.start_ns) / max(step.end_ns - step.start_ns, 1)
             pose = se2.interpolate(ekf.start, ekf.pose, np.array(part))
             offset = se2.between(ekf.key, pose)
-            self._positions.append((self._graph.count - 1, offset, sample.position, sample.covariance))
+            self._positions.append((self.graph.count - 1, offset, sample.position, sample.covariance))
 
     def _align_positions(self) -> None:
         """Positions enter the graph, the first time together with the heading that they give to the map."""
@@ -179,14 +179,14 @@ class GraphFusion:
             return
         alignment = None
         if not self._is_aligned:
-            ours = np.array([se2.compose(self._graph.pose(k), offset)[:2] for k, offset, _, _ in self._positions])
+            ours = np.array([se2.compose(self.graph.pose(k), offset)[:2] for k, offset, _, _ in self._positions])
             theirs = np.array([position for _, _, position, _ in self._positions])
             if len(ours) < _MIN_POSITIONS or np.hypot(*np.ptp(ours, axis=0)) < _MIN_BASELINE_M:
                 return
             alignment, self._is_aligned = _align(ours, theirs), True
         found = tuple(Position(*row) for row in self._positions)
         self.n_positions += len(found)
-        self._graph.apply(Update(positions=found, alignment=alignment))
+        self.graph.apply(Update(positions=found, alignment=alignment))
         self._positions = []
 
     def finish(self, moments: Trajectory | None = None) -> Trajectory | None:
@@ -194,20 +194,20 @@ class GraphFusion:
         if self._is_keyframe_due:
             self.run_deferred()
         self.odometry.run_deferred()
-        if not self._is_smoothing or moments is None or self._graph.count < 2:
+        if not self._is_smoothing or moments is None or self.graph.count < 2:
             return None
-        poses, covs = self._graph.smooth()
+        poses, covs = self.graph.smooth()
         if not (np.isfinite(poses).all() and np.isfinite(covs).all()):
             raise EstimatorError("the pose graph has no finite solution. Look at the log.")
         smoothed, smoothed_covs = _interpolate(np.array(self._nodes), poses, covs, np.array(self._steps).reshape(-1, 3))
         return Trajectory(moments.stamps_ns, smoothed, smoothed_covs)
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
-        mean, cov = self._graph.corrections()
+        mean, cov = self.graph.corrections()
         return {**self.odometry.parameters(), "wheel_radius_scale": (1.0 + float(mean[-1]), math.sqrt(float(cov[-1, -1])))}
 
     def counts(self) -> Mapping[str, int]:
-        found = {**self.odometry.counts(), "keyframes": self._graph.count}
+        found = {**self.odometry.counts(), "keyframes": self.graph.count}
         if self._loops is not None:
             found["loops"] = self.n_loops
         return {**found, "positions": self.n_positions} if self.n_positions else found
@@ -216,7 +216,7 @@ class GraphFusion:
         """(M, 2) the scans of all keyframes, where the graph has them [m]."""
         if self._loops is None:
             return self.odometry.map_points()
-        poses = self._graph.poses()
+        poses = self.graph.poses()
         drawn = [se2.transform(pose, key.points) for pose, key in zip(poses, self._loops.keyframes, strict=False) if len(key.points)]
         return np.vstack(drawn) if drawn else np.empty((0, 2))
 

@@ -146,6 +146,10 @@ class PoseGraph:
         """(3, 3) covariance of keyframe ``k``."""
         return np.asarray(self._isam.marginalCovariance(gtsam.symbol("x", k)))
 
+    def lever_arm(self) -> FloatArray:
+        """(2,) of the positions' antenna in the body frame [m]."""
+        return np.asarray(self._values.atPoint2(_LEVER)) if self._values.exists(_LEVER) else self.lever
+
     def corrections(self) -> tuple[FloatArray, FloatArray]:
         """Mean (c,) and covariance (c, c) of the corrections."""
         if not len(self.prior_cov) or not self.count:
@@ -160,7 +164,7 @@ class PoseGraph:
         for update in self.updates:
             graph.push_back(self._factors(update)[0])
         assert self.count == count
-        values = _levenberg_marquardt(graph, values)
+        values = levenberg_marquardt(graph, values)
         linear = graph.linearize(values)
         marginals = gtsam.Marginals(linear, linear.optimize())
         keys = [gtsam.symbol("x", k) for k in range(count)]
@@ -175,7 +179,7 @@ class PoseGraph:
         if update.walk_cov is not None:
             self._add_walk(update.walk_cov, factors, values)
         if update.wheels is not None:
-            factors.add(_wheel_factor(k - 1, k, gtsam.symbol("c", self._walks), update.wheels))
+            factors.add(wheel_factor(k - 1, k, gtsam.symbol("c", self._walks), update.wheels))
         for between in update.betweens:
             noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Information(between.information)
             if between.is_loop:
@@ -189,7 +193,7 @@ class PoseGraph:
             values.insert(_ALIGNMENT, gtsam.Pose2(*update.alignment))
             values.insert(_LEVER, self.lever)
         for position in update.positions:
-            factors.add(_position_factor(position))
+            factors.add(position_factor(position))
         return factors, values
 
     def _add_keyframe(self, pose: FloatArray, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
@@ -210,7 +214,7 @@ class PoseGraph:
         self._walks += 1
 
 
-def _wheel_factor(a: int, b: int, corrections: int, wheels: PreintegratedMotion) -> gtsam.CustomFactor:
+def wheel_factor(a: int, b: int, corrections: int, wheels: PreintegratedMotion) -> gtsam.CustomFactor:
     """log((delta exp(D (c - c0)))^-1 (x_a^-1 x_b)): the motion model's prediction as a factor of both poses and the corrections."""
     keys = [gtsam.symbol("x", a), gtsam.symbol("x", b)]
     has_corrections = wheels.by_corrections.any()
@@ -232,7 +236,7 @@ def _wheel_factor(a: int, b: int, corrections: int, wheels: PreintegratedMotion)
     return _robust_factor(keys, wheels.cov, error)
 
 
-def _position_factor(position: Position) -> gtsam.CustomFactor:
+def position_factor(position: Position) -> gtsam.CustomFactor:
     """t x_k (offset l) - p: where the antenna at lever arm l is, against the measured position."""
     key = gtsam.symbol("x", position.k)
 
@@ -257,7 +261,7 @@ def _robust_factor(keys: Sequence[int], cov: FloatArray, error: Callable[..., Fl
     return gtsam.CustomFactor(gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(cov)), list(keys), error)
 
 
-def _levenberg_marquardt(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+def levenberg_marquardt(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
     """GTSAM's own loop copies all values at every Python callback; this one does the same without: damped steps until the cost stays."""
     cost, damping = graph.error(values), 0.0
     for _ in range(_MAX_ITERATIONS):

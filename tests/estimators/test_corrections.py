@@ -154,11 +154,11 @@ def test_corrections_of_missing_parameter_are_refused():
 
 def test_pipeline_gives_synchronizer_the_filters_parameters():
     pipeline = Pipeline(Trial(make_model("friction", ROBOT), "ekf", OFFSET), ROBOT, {}, True)
-    assert isinstance(pipeline.synchronizer._model, CorrectedFriction)
-    np.testing.assert_array_equal(pipeline.synchronizer._params, pipeline.estimator.params)
+    assert isinstance(pipeline.synchronizer.model, CorrectedFriction)
+    np.testing.assert_array_equal(pipeline.synchronizer.params, pipeline.estimator.params)
     assert set(OFFSET.split("+")) <= set(pipeline.estimator.parameters())
     plain = Pipeline(Trial(make_model("friction", ROBOT), "ekf", "none"), ROBOT, {}, True)
-    assert isinstance(plain.synchronizer._model, FrictionModel)
+    assert isinstance(plain.synchronizer.model, FrictionModel)
 
 
 # --- learned where the motion shows it
@@ -178,7 +178,7 @@ def learned(form, hidden, seed, wheels=weave, steps=150):
         pass
     slow, P = slow_states(estimator)
     k = len(hidden)
-    return world.correction - slow[-k:], P[-k:, -k:], estimator._corrections.sigmas
+    return world.correction - slow[-k:], P[-k:, -k:], estimator.corrections.sigmas
 
 
 def test_cg_offset_of_hidden_load_is_estimated_within_sigma():
@@ -217,7 +217,7 @@ def test_corrections_with_wheel_noise_alone_keep_their_prior():
         sensor.next = match_at(pose, np.diag([0.005, 0.005, 0.001]) ** 2)
         estimator.step(step)
     slow, P = slow_states(estimator)
-    first = estimator._corrections.sigmas
+    first = estimator.corrections.sigmas
     assert (np.sqrt(np.diag(P)[-6:]) > 0.99 * first).all()
     assert (np.abs(slow[-6:]) < 0.1 * first).all()
 
@@ -227,7 +227,7 @@ def test_corrections_with_unexplained_lidar_finish_the_run():
     sensor = PoseSensor()
     estimator = make_physical(sensor, ALL, Noise().scaled(0.1))
     world, rng, stamp, pose = make_world(estimator, 0), np.random.default_rng(1), 0, np.zeros(3)
-    model = estimator._model
+    model = estimator.model
     none = Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, 14)))
     estimator.step(Step(0, 0, none, np.zeros(3), np.zeros(3), False, True, None, None))
     for _ in range(80):
@@ -235,7 +235,7 @@ def test_corrections_with_unexplained_lidar_finish_the_run():
         motion = preintegrate(model, dt, wheels, np.array([CG]), estimator.params, WheelNoise())
         pose = se2.compose(pose, motion.delta * [0.0, 0.0, 3.0] + [0.2, -0.2, 0.0] + 0.01 * rng.normal(size=3))
         sensor.next = match_at(pose, 1e-6 * np.eye(3))
-        scan = world._scan(stamp + 100_000_000)
+        scan = world.scan_at(stamp + 100_000_000)
         estimate = estimator.step(Step(stamp, stamp + 100_000_000, motion, np.zeros(3), np.zeros(3), False, True, None, scan))
         stamp += 100_000_000
         assert np.isfinite(estimate.pose).all()
@@ -251,7 +251,7 @@ def test_corrections_of_every_model_and_form_reduce_error(name, form):
     """What a drive both ways shows is known better than at first, and is where the truth is."""
     sensor = PoseSensor()
     estimator = make_filter(sensor, name, form)
-    names, sigmas = estimator._corrections.names, estimator._corrections.sigmas
+    names, sigmas = estimator.corrections.names, estimator.corrections.sigmas
     assert names
     run(estimator, sensor, 3, 100)
     found = estimator.parameters()
@@ -267,7 +267,7 @@ def test_corrections_on_gentle_arcs_keep_what_turns_gave():
         sensor = PoseSensor()
         estimator = make_filter(sensor)
         run(estimator, sensor, 2, 60, wheels=lambda t: (5.0 - turning, 5.0 + turning))  # noqa: B023
-        sigmas[turning] = estimator.parameters()["k_0"][1] / estimator._corrections.sigmas[0]
+        sigmas[turning] = estimator.parameters()["k_0"][1] / estimator.corrections.sigmas[0]
     assert sigmas[0.2] > 0.99
     assert sigmas[2.5] < 0.7
 
@@ -321,7 +321,7 @@ def round_trip(form, seed):
     """
     sensor, quiet = PoseSensor(), Noise().scaled(0.3)
     estimator = make_filter(sensor, "skid_steer", form, quiet)
-    model, field = estimator._model, corrections(estimator._model, "cg_field")
+    model, field = estimator.model, corrections(estimator.model, "cg_field")
     world = World(model, field, quiet, np.random.default_rng(seed), True, FilterConfig(), cg=posture)
     odometry, start, drifts, scalings = np.zeros(3), np.zeros(3), [], []
     estimator.step(world.first())

@@ -211,7 +211,7 @@ def states(ekf):
 
 def test_update_without_consider_states_equals_filterpy():
     ekf, measured = prepared(0)
-    ekf._consider[:] = False
+    ekf.is_considered[:] = False
     H = np.zeros((3, SIZE))
     H[:, POSE], H[:, MAP] = np.eye(3), -np.eye(3)
     other = KalmanFilter(SIZE, 3)

@@ -145,12 +145,12 @@ def test_graph_with_wrong_wheels_estimates_radius_scale() -> None:
 
 def test_graph_corrections_hold_for_next_prediction() -> None:
     _, pipeline = estimated()
-    names = pipeline.estimator.odometry._corrections.names
-    learned = pipeline.estimator._graph.corrections()[0][: len(names)]
+    names = pipeline.estimator.odometry.corrections.names
+    learned = pipeline.estimator.graph.corrections()[0][: len(names)]
     assert np.abs(learned).min() > 0.0
-    assert pipeline.synchronizer._params == pytest.approx(pipeline.estimator.params)
+    assert pipeline.synchronizer.params == pytest.approx(pipeline.estimator.params)
     nominal = make_model("diff_drive", rooms.ROBOT).nominal
-    assert not np.allclose(pipeline.synchronizer._params, nominal)
+    assert not np.allclose(pipeline.synchronizer.params, nominal)
 
 
 def test_graph_smoothed_has_consistent_nees() -> None:

@@ -85,7 +85,7 @@ def assert_jacobians_are_numeric(factor: gtsam.CustomFactor, values: gtsam.Value
 def test_wheel_factor_has_numeric_jacobians(seed: int) -> None:
     rng = np.random.default_rng(seed)
     wheels = PreintegratedMotion(rng.normal(size=3), np.eye(3), rng.normal(size=(3, 2)), 0.1 * rng.normal(size=2))
-    factor = pose_graph._wheel_factor(0, 1, gtsam.symbol("c", 0), wheels)
+    factor = pose_graph.wheel_factor(0, 1, gtsam.symbol("c", 0), wheels)
     start, values = 5.0 * rng.normal(size=3), gtsam.Values()
     values.insert(gtsam.symbol("x", 0), gtsam.Pose2(*start))
     values.insert(gtsam.symbol("x", 1), gtsam.Pose2(*se2.compose(start, se2.compose(wheels.delta, 0.1 * rng.normal(size=3)))))
@@ -98,7 +98,7 @@ def test_position_factor_has_numeric_jacobians(seed: int) -> None:
     rng = np.random.default_rng(seed)
     enu_T_map, pose, offset, lever = 5.0 * rng.normal(size=3), 5.0 * rng.normal(size=3), rng.normal(size=3), rng.normal(size=2)
     antenna = se2.transform(se2.compose(enu_T_map, se2.compose(pose, offset)), lever)
-    factor = pose_graph._position_factor(Position(3, offset, antenna + np.array([0.2, -0.3]), np.eye(2)))
+    factor = pose_graph.position_factor(Position(3, offset, antenna + np.array([0.2, -0.3]), np.eye(2)))
     values = gtsam.Values()
     values.insert(gtsam.symbol("t", 0), gtsam.Pose2(*enu_T_map))
     values.insert(gtsam.symbol("x", 3), gtsam.Pose2(*pose))
@@ -123,7 +123,7 @@ def test_levenberg_marquardt_where_gauss_newton_diverges_converges() -> None:
     values.insert(key, np.array([2.0]))
     undamped = values.retract(factors.linearize(values).optimize())
     assert factors.error(undamped) > factors.error(values)
-    found = pose_graph._levenberg_marquardt(factors, values)
+    found = pose_graph.levenberg_marquardt(factors, values)
     assert abs(found.atVector(key)[0]) < 1e-3
 
 
@@ -227,7 +227,7 @@ def test_pose_graph_with_positions_estimates_lever_arm(given: np.ndarray) -> Non
     lever = np.array([0.4, -0.3])
     graph = with_positions(lever=lever, given=given)[0]
     graph.smooth()
-    assert graph._values.atPoint2(gtsam.symbol("l", 0)) == pytest.approx(lever, abs=0.1)
+    assert graph.lever_arm() == pytest.approx(lever, abs=0.1)
 
 
 # --- checkpoints
