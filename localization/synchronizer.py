@@ -12,7 +12,7 @@ import numpy as np
 
 from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
 from localization.gyro import GyroBuffer
-from localization.lidar.frames import LidarFrames
+from localization.lidar.scan_checks import LidarFrames
 from localization.lidar.tilt import LidarTilt
 from localization.settings import Positive, Settings, at_least
 from localization.step import Step, StepInterval
@@ -98,7 +98,7 @@ class Synchronizer:
             self._wheels.set_cg(event)
         elif isinstance(event, Scan) and self.frames.admit(event):
             self._empty_scans += not len(event.points)
-            self._tilt.see(event)
+            self._tilt.add(event)
             # one that was overtaken goes where it belongs, if that still waits
             self._scans.insert(bisect.bisect_right(self._scans, event.middle_ns, key=lambda scan: scan[0]), (event.middle_ns, event))
 
@@ -209,7 +209,7 @@ class Synchronizer:
     def _widen(self, motion: Motion, missing_s: float, has_rates: bool) -> Motion:
         """``motion`` with the covariance of a velocity that is unknown for ``missing_s`` [s] of it, and lasts.
 
-        Such a velocity takes the robot as far as the time, however that is cut into steps. It may be as large as the last that was known.
+        Such a velocity takes the robot as far as the time, however that is cut into steps. It may be as large as the last measured one.
         """
         before, self._gap_s = self._gap_s, missing_s + (0.0 if has_rates else self._gap_s)
         if not missing_s:

@@ -5,9 +5,10 @@ with right perturbations: true pose = pose * exp(error).
 
     e = [ pose, start, map, key, gyro bias, gyro scale, clock offset, corrections ]
 
-`start` and `key` are clones of the pose (Roumeliotis & Burdick 2002, stochastic cloning) at the start of the step and at the last keyframe.
-`map` is the error of the submap around the robot, seen from the body. Scans that are matched to one submap share that error, so it is a
-consider state (Schmidt 1966): its covariance and correlations count, its gain is zero, as the submap stays where it is drawn.
+`start` and `key` are clones of the pose (Roumeliotis & Burdick 2002, stochastic cloning) at the start of the step and at the last
+keyframe. `map` is the error of the submap around the robot, as a right perturbation of the pose. Scans that are matched to one submap
+share that error, so it is a consider state (Schmidt 1966): its covariance and correlations count, its gain is zero, as the submap stays
+where it is drawn.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from motion_models.se2 import FloatArray
 POSE, START, MAP, KEY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 BIAS, SCALE, CLOCK, PARAMS = 12, 13, 14, 15
 _MIN_VARIANCE = 1e-14
-"""No relative motion is known better than a tenth of a micrometre or microradian [m^2, rad^2]."""
+"""Variance of a relative motion, at least: a tenth of a micrometre or microradian [m^2, rad^2]."""
 _MIN_DRIFT_SHARE = 0.01
 """Of the variance of a motion, at least: a tenth of its sigma, so that its information is finite."""
 _MAX_NUMBER = 1e12
@@ -77,7 +78,7 @@ class Filter:
 
         e_pose' = Ad(delta^-1) e_pose + (d delta / d clock) e_clock + (d delta / d params) e_params + slip.
 
-        Motion that is not ``is_turning`` says nothing of how the robot turns: until the next step, corrections are consider states.
+        Motion that is not ``is_turning`` does not excite the corrections: until the next step, they are consider states.
         """
         motion, dt = step.predicted, step.duration
         A = se2.adjoint(se2.inverse(motion.delta))
@@ -86,7 +87,7 @@ class Filter:
         F[POSE, CLOCK] = step.d_clock
         F[POSE, PARAMS:] = motion.d_params @ self._corrections.directions
         F[START, START], F[START, POSE] = 0.0, np.eye(3)  # the clone of the pose as it was
-        F[MAP, MAP] = A  # the same error of the submap, seen from where the body is now
+        F[MAP, MAP] = A  # the same error of the submap, as a perturbation of the present pose
         Q = np.zeros_like(self.P)
         Q[POSE, POSE] = motion.cov
         Q[BIAS, BIAS] = self._gyro.bias_walk_rad_per_s_sqrt_s**2 * dt

@@ -8,20 +8,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from localization.estimators.base import NO_POINTS, Estimate, mean_twist
+from localization.estimators.base import NO_POINTS, Estimate, Estimator, mean_twist
 from localization.estimators.filter import BIAS, CLOCK, MAP, PARAMS, POSE, SCALE, START, Filter, FilterConfig
-from localization.events import PositionSample
-from localization.lidar import LostScans, ScanMatch, ScanMatchingSensor
+from localization.lidar import LostScans, ScanMatchingSensor
 from localization.step import Step
-from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion, MotionModel
 from motion_models.online_calibration import Corrections
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
-_MAX_STANDSTILL_M, _MAX_STANDSTILL_RAD = 0.01, 0.01
-"""A scan or a turn of the gyro that is off by more, and by 5 sigma, contradicts wheels that stand [m, rad]."""
+_MIN_TURN_RAD = 0.01
+"""A turn of the gyro in one step that contradicts wheels that stand, if it is 5 sigma, too [rad]."""
 _SIGMAS = 5.0
 _FORGETTING = 0.98
 """Of the statistics of slip, per scan: they are a mean over the last 50 scans, as those of the matcher."""
@@ -29,7 +27,7 @@ _BLOCKED_SPEED = np.array([0.5, 0.5, 0.5])
 """Sigma of the twist where wheels read zero but the robot moves [m/s, m/s, rad/s]."""
 
 
-class EkfFusion:
+class EkfFusion(Estimator):
     """`step` after `step`: predict by the wheels, update by the gyro, match the scan, update by it; the submap grows afterwards."""
 
     def __init__(self, model: MotionModel, corrections: Corrections, robot: Robot, sensor: ScanMatchingSensor | None, config: FilterConfig):
@@ -40,7 +38,7 @@ class EkfFusion:
         self._track_m = robot.geometry.track_width_m
         self._slip = np.zeros(3)  # twist that the wheels missed in the last step
         self._slip_changes = _SlipChanges()
-        self._has_gyro = self._is_blocked = self._is_scan_pending = False
+        self._has_gyro = self._is_scan_pending = False
         self.wheel_motion, self.is_turning = Motion(np.zeros(3), np.zeros((3, 3))), True
         """Motion of the last step by the wheels, with the covariance that the filter gave it in the end; whether it corrects the model."""
         self.counts_by_name = dict.fromkeys(("scans", "matched", "standing", "searched"), 0)
@@ -114,24 +112,24 @@ class EkfFusion:
             R = match.cov + self._slip_changes.sweep_cov(step, sensor.sweep_s)
         self.counts_by_name["matched"] += 1
         self.counts_by_name["searched"] += bool(match.outlier_cov.any())
-        self._is_blocked = step.is_standing and _is_contradicted(prior, cov, match)
         self.wheel_motion = replace(self.wheel_motion, cov=self.wheel_motion.cov + match.outlier_cov)
         return ekf.update_scan(match.measured, R, match.outlier_cov)
 
     def _is_turning(self, motion: Motion) -> bool:
-        """Whether ``motion`` turns enough to say something of the corrections."""
+        """Whether ``motion`` turns enough to excite the corrections."""
         d = motion.delta
         return bool(abs(d[2]) * self._track_m >= self.corrections.least_turn * math.hypot(d[0], d[1]))
 
     def _check_standstill(self, step: Step) -> Step:
-        """Wheels that read zero while gyro or scans show motion count as unknown."""
+        """Wheels that read zero while the gyro turns count as unknown. (A scan that moved overrules them as any outlier of the wheels.)"""
         if not step.is_standing:
             return step
-        if step.turn is not None and self._has_gyro:
-            turned = abs(step.turn.angle - self.filter.bias * step.turn.duration)
-            sigma = math.sqrt(step.turn.variance + self.filter.P[BIAS, BIAS] * step.turn.duration**2)
-            self._is_blocked |= turned > max(_SIGMAS * sigma, _MAX_STANDSTILL_RAD)
-        if not self._is_blocked:
+        if step.turn is None or not self._has_gyro:
+            self.counts_by_name["standing"] += 1
+            return step
+        turned = abs(step.turn.angle - self.filter.bias * step.turn.duration)
+        sigma = math.sqrt(step.turn.variance + self.filter.P[BIAS, BIAS] * step.turn.duration**2)
+        if turned <= max(_SIGMAS * sigma, _MIN_TURN_RAD):
             self.counts_by_name["standing"] += 1
             return step
         unknown = np.diag((_BLOCKED_SPEED * step.duration) ** 2)
@@ -142,12 +140,6 @@ class EkfFusion:
         if not self._has_gyro:
             self._has_gyro = True
             self.filter.P[CLOCK, CLOCK] += self._clock_sigma_s**2
-
-    def add_position(self, sample: PositionSample) -> None:
-        return None
-
-    def finish(self, moments: Trajectory | None = None) -> None:
-        self.run_deferred()
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         ekf, found = self.filter, {}
@@ -198,9 +190,3 @@ class _SlipChanges:
 def _mean_twist(step: Step) -> FloatArray:
     """(3,) of the wheels over the step."""
     return se2.log(step.predicted.delta) / step.duration if step.duration > 0.0 else step.twist
-
-
-def _is_contradicted(prior: FloatArray, cov: FloatArray, match: ScanMatch) -> bool:
-    """Whether a scan shows that the robot moved although its wheels stand."""
-    off, sigma = np.abs(se2.log(se2.between(prior, match.measured))), np.sqrt(np.diagonal(cov + match.cov))
-    return bool((off > np.maximum(_SIGMAS * sigma, [_MAX_STANDSTILL_M, _MAX_STANDSTILL_M, _MAX_STANDSTILL_RAD])).any())

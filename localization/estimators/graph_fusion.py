@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
-from localization.estimators.base import Estimate
+from localization.estimators.base import Estimate, Estimator
 from localization.estimators.filter import PARAMS
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
@@ -28,10 +28,13 @@ from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.online_calibration import Corrections
-from motion_models.se2 import FloatArray
+from motion_models.types import FloatArray, Points2, Pose2
 
 _MIN_POSITIONS, _MIN_BASELINE_M = 3, 5.0
 """Positions, and the distance between them [m], from which they give the heading of the map."""
+_MAX_POSITION_SIGMAS = 5.0
+"""Positions that are farther off are reported."""
+_ALIGNMENT_ITERATIONS = 30
 _WHEEL_SCALE_SIGMA = 0.02
 """Relative error of the wheels' radius, both sides alike: wear and pressure of tyres. Positions and loops show it."""
 _WALK_S = 60.0
@@ -52,7 +55,7 @@ class GraphConfig(Settings):
     """The same, to its left [m]."""
 
 
-class GraphFusion:
+class GraphFusion(Estimator):
     """`EkfFusion` with a `PoseGraph` behind it."""
 
     def __init__(self, odometry: EkfFusion, corrections: Corrections, lidar: LidarConfig, config: GraphConfig, is_smoothing: bool):
@@ -87,7 +90,7 @@ class GraphFusion:
         return self.odometry.lost
 
     def step(self, step: Step) -> Estimate:
-        """The filter's estimate, seen from the map."""
+        """The filter's estimate in the frame of the map."""
         self.run_deferred()
         ekf = self.odometry.filter
         estimate = self.odometry.step(step)
@@ -181,9 +184,10 @@ class GraphFusion:
         if not self._is_aligned:
             ours = np.array([se2.compose(self.graph.pose(k), offset)[:2] for k, offset, _, _ in self._positions])
             theirs = np.array([position for _, _, position, _ in self._positions])
+            sigmas = np.sqrt([0.5 * np.trace(cov) for _, _, _, cov in self._positions])
             if len(ours) < _MIN_POSITIONS or np.hypot(*np.ptp(ours, axis=0)) < _MIN_BASELINE_M:
                 return
-            alignment, self._is_aligned = _align(ours, theirs), True
+            alignment, self._is_aligned = _align(ours, theirs, sigmas), True
         found = tuple(Position(*row) for row in self._positions)
         self.n_positions += len(found)
         self.graph.apply(Update(positions=found, alignment=alignment))
@@ -212,6 +216,16 @@ class GraphFusion:
             found["loops"] = self.n_loops
         return {**found, "positions": self.n_positions} if self.n_positions else found
 
+    def warnings(self) -> list[str]:
+        """Positions that could not be used, or contradict the other sensors."""
+        if not self.n_positions:
+            n = len(self._positions) + len(self._waiting)
+            unused = f"{n} positions could not be used: they give the map its heading after {_MIN_BASELINE_M:g} m of way."
+            return [unused] if n else []
+        n = int((self.graph.position_errors() > _MAX_POSITION_SIGMAS).sum())
+        contradicted = f"{n} of {self.n_positions} positions are more than {_MAX_POSITION_SIGMAS:g} sigma off wheels, gyro and LiDAR"
+        return [f"{contradicted}: they count little. Check the receiver, its covariance and the antenna's lever arm."] if n else []
+
     def map_points(self) -> FloatArray:
         """(M, 2) the scans of all keyframes, where the graph has them [m]."""
         if self._loops is None:
@@ -230,7 +244,7 @@ class _KeyframeMotion:
         self._prior = np.zeros((n, n))
 
     def add(self, motion: Motion, corrections: Corrections, is_turning: bool) -> None:
-        """The next step. What is nearly straight says nothing of the corrections: there they are one error of the whole motion."""
+        """Add the next step. Nearly straight motion does not excite the corrections: there they are one error of the whole motion."""
         A = se2.adjoint(se2.inverse(motion.delta))
         self._delta = se2.compose(self._delta, motion.delta)
         self._cov = A @ self._cov @ A.T + motion.cov
@@ -247,11 +261,11 @@ class _KeyframeMotion:
 
 
 def _subtract_information(delta: FloatArray, cov: FloatArray, prior: FloatArray, prior_cov: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What gyro and scans say of a motion, where they and the wheels' ``prior`` (3,) together give ``delta`` (3,): motion, information.
+    """Motion and information of gyro and scans alone, where they and the wheels' ``prior`` (3,) together give ``delta`` (3,).
 
     The wheels have a factor of their own, and must not be counted twice: information C^-1 - C_w^-1, where it is positive. Along directions
-    in which gyro and scans say less than the wheels, their share of the motion cannot be told: there it is at most as far from ``delta``
-    as the wheels are.
+    in which gyro and scans have less information than the wheels, their share of the motion is not observable: there it is at most as far
+    from ``delta`` as the wheels are.
     """
     root = np.linalg.cholesky(np.linalg.inv(prior_cov))
     whiten = np.linalg.inv(root)
@@ -262,12 +276,20 @@ def _subtract_information(delta: FloatArray, cov: FloatArray, prior: FloatArray,
     return se2.compose(delta, se2.exp(shift)), (to_axes.T * gained) @ to_axes
 
 
-def _align(ours: FloatArray, theirs: FloatArray) -> FloatArray:
-    """Pose (3,) that moves points ``ours`` (N, 2) onto ``theirs`` (N, 2) by least squares (Umeyama 1991, without scale)."""
-    a, b = ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)
-    yaw = math.atan2(float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), float(np.sum(a * b)))
-    turned = se2.transform(np.array([0.0, 0.0, yaw]), ours.mean(axis=0))
-    return np.array([*(theirs.mean(axis=0) - turned), yaw])
+def _align(ours: Points2, theirs: Points2, sigmas: FloatArray) -> Pose2:
+    """Pose (3,) that moves points ``ours`` (N, 2) onto ``theirs`` (N, 2) [m] (Umeyama 1991, without scale).
+
+    The sum of distances is minimised, not of their squares, by iterated weights 1 / distance: outliers among ``theirs`` do not pull.
+    Distances below ``sigmas`` (N,) [m] count alike.
+    """
+    weights, pose = 1.0 / sigmas, np.zeros(3)
+    for _ in range(_ALIGNMENT_ITERATIONS):
+        mean_a, mean_b = np.average(ours, axis=0, weights=weights), np.average(theirs, axis=0, weights=weights)
+        a, b = weights[:, None] * (ours - mean_a), theirs - mean_b
+        yaw = math.atan2(float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), float(np.sum(a * b)))
+        pose = np.array([*(mean_b - se2.transform(np.array([0.0, 0.0, yaw]), mean_a)), yaw])
+        weights = 1.0 / np.maximum(np.hypot(*(se2.transform(pose, ours) - theirs).T), sigmas)
+    return pose
 
 
 def _interpolate(nodes: FloatArray, poses: FloatArray, covs: FloatArray, odom: FloatArray) -> tuple[FloatArray, FloatArray]:

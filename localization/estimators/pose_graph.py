@@ -9,13 +9,15 @@ Incremental by ISAM2 (Kaess et al. 2012) on the way; Levenberg-Marquardt and mar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import gtsam
 import numpy as np
 
+from localization.errors import EstimatorError
 from localization.estimators.measurement_models import motion_residual, position_residual
 from motion_models import se2
 from motion_models.se2 import FloatArray
@@ -122,10 +124,11 @@ class PoseGraph:
         """Add ``update`` and solve."""
         self.updates.append(update)
         factors, values = self._factors(update)
-        self._isam.update(factors, values)
-        if any(between.is_loop for between in update.betweens) or update.alignment is not None:
-            self._iterate()
-        self._values = self._isam.calculateEstimate()
+        with _check_solvable():
+            self._isam.update(factors, values)
+            if any(between.is_loop for between in update.betweens) or update.alignment is not None:
+                self._iterate()
+            self._values = self._isam.calculateEstimate()
 
     def _iterate(self) -> None:
         """Until nothing changes: a robust loss gives what was just closed its weight only step by step."""
@@ -150,6 +153,11 @@ class PoseGraph:
         """(2,) of the positions' antenna in the body frame [m]."""
         return np.asarray(self._values.atPoint2(_LEVER)) if self._values.exists(_LEVER) else self.lever
 
+    def position_errors(self) -> FloatArray:
+        """(n,) normalised errors [sigma] of the positions by the present estimates."""
+        positions = [position_factor(position) for update in self.updates for position in update.positions]
+        return np.array([np.linalg.norm(factor.whitenedError(self._values)) for factor in positions])
+
     def corrections(self) -> tuple[FloatArray, FloatArray]:
         """Mean (c,) and covariance (c, c) of the corrections."""
         if not len(self.prior_cov) or not self.count:
@@ -164,9 +172,10 @@ class PoseGraph:
         for update in self.updates:
             graph.push_back(self._factors(update)[0])
         assert self.count == count
-        values = levenberg_marquardt(graph, values)
-        linear = graph.linearize(values)
-        marginals = gtsam.Marginals(linear, linear.optimize())
+        with _check_solvable():
+            values = levenberg_marquardt(graph, values)
+            linear = graph.linearize(values)
+            marginals = gtsam.Marginals(linear, linear.optimize())
         keys = [gtsam.symbol("x", k) for k in range(count)]
         self._values = values
         return self.poses(), np.array([marginals.marginalCovariance(key) for key in keys])
@@ -278,6 +287,18 @@ def levenberg_marquardt(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values)
         if is_done:
             break
     return values
+
+
+@contextlib.contextmanager
+def _check_solvable() -> Iterator[None]:
+    """Raises `EstimatorError` in place of GTSAM's error for systems that rounding makes singular."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise EstimatorError(
+            "the pose graph cannot be solved: some covariances are far smaller than others. Check those of the positions and the robot "
+            f"file's noise. (GTSAM: {str(error).strip().splitlines()[0]})"
+        ) from error
 
 
 def _array(pose: gtsam.Pose2) -> FloatArray:

@@ -108,7 +108,7 @@ class KissIcp:
 class AdaptiveThreshold:
     """KISS-ICP's adaptive threshold (eq. 5 to 7), with a state that can be saved: theirs is in C++ and cannot be read.
 
-    How far poses were off their guesses says how far to associate. Same methods as kiss-icp's class of this name.
+    The deviation of poses from their guesses sets the distance of associations. Same methods as kiss-icp's class of this name.
     """
 
     def __init__(self, initial: float, min_motion: float, max_range: float) -> None:

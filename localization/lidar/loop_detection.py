@@ -33,7 +33,7 @@ _MAX_SIGMA_M = 0.25
 _FLOOR_COV = np.diag([0.02, 0.02, 0.005]) ** 2
 """Submaps bend: covariance of a loop, at least [m^2, m^2, rad^2]."""
 _HEADING_WEIGHT = 0.3
-"""How much a turned scanner, which sees other walls, counts as distance: of the median range, per radian."""
+"""How much a turned scanner, whose beams hit other walls, counts as distance: of the median range, per radian."""
 _AGREE_M, _AGREE_RAD = 0.15, 0.06
 """Two loops agree where one predicts the other within this and 3 sigma."""
 _AGREE_WITHIN = 12
@@ -63,7 +63,7 @@ class LoopClosure:
 
 
 class LoopDetector:
-    """Give it each keyframe; it answers with the loops that two trials agree on."""
+    """`add` each keyframe, then `detect`: loops that two trials agree on."""
 
     def __init__(self, config: LidarConfig, cell: float) -> None:
         """``cell``: edge of voxels [m]."""
@@ -121,7 +121,7 @@ class LoopDetector:
         return np.vstack(moved)
 
     def _agree(self, one: LoopClosure, other: LoopClosure) -> bool:
-        """Whether both loops and the odometry between their ends close: a1^-1 a2 and b1^-1 b2 are known by odometry."""
+        """Whether both loops and the odometry between their ends close: a1^-1 a2 and b1^-1 b2 are given by the odometry."""
         a = se2.between(self.keyframes[one.a].odometry, self.keyframes[other.a].odometry)
         b = se2.between(self.keyframes[one.b].odometry, self.keyframes[other.b].odometry)
         error = se2.between(se2.compose(one.delta, b), se2.compose(a, other.delta))

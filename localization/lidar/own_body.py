@@ -38,12 +38,13 @@ class OwnBodyFilter:
         self._heading += float(delta[2])
 
     def filter(self, scan: Scan) -> Scan:
-        """``scan`` without the points that are known to be the robot itself. Only planar scans are examined."""
+        """``scan`` without the points that were recognized as the robot itself. Only planar scans are examined."""
         points = scan.points
         if not scan.is_planar or not len(points):
             return scan
-        r = np.hypot(points[:, 0], points[:, 1])
-        bins = np.floor(np.arctan2(points[:, 1], points[:, 0]) * (_BEARINGS / (2.0 * math.pi))).astype(np.intp) % _BEARINGS
+        r = np.nan_to_num(np.hypot(points[:, 0], points[:, 1]), nan=np.inf)
+        bearings = np.nan_to_num(np.arctan2(points[:, 1], points[:, 0]))  # a point that is not finite is on no part of the robot
+        bins = np.floor(bearings * (_BEARINGS / (2.0 * math.pi))).astype(np.intp) % _BEARINGS
         nearest = np.full(_BEARINGS, np.inf)
         np.minimum.at(nearest, bins, r)
         nearest[nearest > _MAX_RANGE_M] = np.nan

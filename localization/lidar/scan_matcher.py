@@ -258,7 +258,7 @@ class ScanMatcher:
         return None if best.rival_score >= _MAX_RIVAL * best.score else best.pose
 
     def _result(self, fit: Fit, outlier_cov: FloatArray) -> ScanMatch:
-        """What the scan alone says: one more Gauss-Newton step from the minimum, without the prior's pull."""
+        """The match of the scan alone: one more Gauss-Newton step from the minimum, without the prior's pull."""
         R = np.asarray(np.linalg.inv(fit.information + _OPEN_INFORMATION), dtype=float)
         measured = se2.compose(fit.pose, se2.exp(-R @ fit.gradient))
         self._residuals = _FORGETTING * self._residuals + [fit.squares, fit.block_squares, fit.fitting]

@@ -140,7 +140,7 @@ class ScanMatchingSensor:
         return matcher.match(scan.planar, self._prior, self._cov, guess)
 
     def _mount(self, frame: str) -> Mount:
-        """Where ``frame`` is mounted. A submap that was drawn before that was known is dropped."""
+        """Where ``frame`` is mounted. A submap that was drawn before its mount was given is dropped."""
         mount = self._mounts.get(frame)
         if mount is not None and not self._is_placed:
             self._matcher, self._kiss, self._last_key = None, None, None

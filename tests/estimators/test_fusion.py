@@ -346,6 +346,19 @@ def test_ekf_with_wrong_turns_of_wheels_follows_gyro() -> None:
     assert abs(mean - 5e-4) < 4.0 * sigma
 
 
+def test_ekf_with_standing_wheels_and_turning_gyro_follows_gyro() -> None:
+    """A robot that is turned by hand, without a LiDAR."""
+    pipeline = make_pipeline(rooms.drive_through(LAB, TOUR[:50], 0))
+    for k in range(300):
+        stamp = rooms.WALL_START_NS + k * S // 50
+        pipeline.process(WheelSample(stamp, np.zeros(2), np.zeros(2)))
+        rate = 0.5 if k > 100 else 0.0
+        pipeline.process(ImuSample(stamp + 1, np.array([0.0, 0.0, rate]), np.array([0.0, 0.0, 9.81])))
+    last = pipeline.finish()[-1]
+    turned = 0.5 * (last.stamp_ns - rooms.WALL_START_NS - 2 * S) / S
+    assert last.pose[2] == pytest.approx(turned, abs=0.1)
+
+
 def test_ekf_beginning_in_motion_follows_the_drive() -> None:
     """The log starts while the robot turns: the first sweep is deskewed by the wheels' twist."""
     drive = rooms.drive_through(LAB, rooms.path((6.0, 0.5, 0.6)), 0)

@@ -231,7 +231,24 @@ def test_graph_with_outlier_position_keeps_poses() -> None:
     clean, pipeline = driven_with(positions(around()))
     spoilt, _ = driven_with(positions(around(), spoil={40: np.array([50.0, 0.0])}))
     assert pipeline.estimator.counts()["positions"] > 70
+    assert pipeline.estimator.warnings() == []
     assert np.abs(spoilt - clean).max() < 0.3
+
+
+def test_graph_with_first_position_far_off_leaves_it_out() -> None:
+    """It is among those that give the map its heading."""
+    errors, pipeline = driven_with(positions(around(), spoil={1: np.array([1e5, 1e5])}))
+    assert np.sqrt(np.mean(errors**2)) < 0.5
+    (warning,) = pipeline.estimator.warnings()
+    assert warning.startswith("1 of ")
+
+
+def test_graph_with_positions_at_rest_reports_them_unused() -> None:
+    drive, pipeline = around(), make_pipeline(around(), has_lidar=False)
+    fixes = positions(drive)[:3]  # the first one comes before the first keyframe
+    wheels = [e for e in drive.events if isinstance(e, WheelSample) and e.stamp_ns <= fixes[-1].stamp_ns + 200_000_000]
+    run(pipeline, list(merge_positions(wheels, fixes)))
+    assert "2 positions could not be used" in pipeline.warnings()[-1]
 
 
 def test_graph_positions_wait_for_heading() -> None:

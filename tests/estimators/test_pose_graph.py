@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from localization.errors import EstimatorError
 from localization.estimators import pose_graph
 from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
 from localization.evaluation.consistency import nees
@@ -228,6 +229,14 @@ def test_pose_graph_with_positions_estimates_lever_arm(given: np.ndarray) -> Non
     graph = with_positions(lever=lever, given=given)[0]
     graph.smooth()
     assert graph.lever_arm() == pytest.approx(lever, abs=0.1)
+
+
+def test_pose_graph_with_singular_covariance_raises_estimator_error() -> None:
+    graph, truth, _ = with_positions()
+    exact = tuple(Position(k, np.zeros(3), truth[k, :2], 1e-24 * np.eye(2)) for k in range(5, 60, 5))
+    with pytest.raises(EstimatorError, match="cannot be solved"):  # noqa: PT012
+        graph.apply(Update(positions=exact))
+        graph.smooth()
 
 
 # --- checkpoints
