@@ -36,7 +36,7 @@ class EkfFusion(Estimator):
         self.filter = Filter(robot.gyro_noise, corrections, replace(config, clock_sigma_s=0.0) if sensor is None else config)
         self._sensor, self.model, self.corrections = sensor, model, corrections
         self._track_m = robot.geometry.track_width_m
-        self._slip = np.zeros(3)  # twist that the wheels missed in the last step
+        self._twist, self._slip = np.zeros(3), np.zeros(3)  # of the last step; what the wheels missed of it
         self._slip_changes = _SlipChanges()
         self._has_gyro = self._is_scan_pending = False
         self.wheel_motion, self.is_turning = Motion(np.zeros(3), np.zeros((3, 3))), True
@@ -80,7 +80,7 @@ class EkfFusion(Estimator):
             nis = self._update_scan(step, self._sensor)
         delta, cov = ekf.motion_since(START)
         twist, twist_cov = mean_twist(delta, cov, step.duration) if step.duration > 0.0 else (step.twist, None)
-        self._slip = twist - _mean_twist(step)
+        self._twist, self._slip = twist, twist - _mean_twist(step)
         return Estimate(step.end_ns, ekf.pose, ekf.P[POSE, POSE].copy(), twist, twist_cov, nis)
 
     def run_deferred(self) -> None:
@@ -100,7 +100,8 @@ class EkfFusion(Estimator):
         ekf, duration = self.filter, step.duration
         self.counts_by_name["scans"] += 1
         prior, cov = ekf.pose, ekf.map_relative_cov()
-        match = sensor.measure(step, prior, cov, step.twist + self._slip)
+        as_before = se2.exp(duration * self._twist)  # where wheels stall and catch up, the robot goes on as before
+        match = sensor.measure(step, prior, cov, step.twist + self._slip, se2.log(se2.between(step.predicted.delta, as_before)))
         self._is_scan_pending = True
         if match is None:
             return None

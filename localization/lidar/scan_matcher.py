@@ -19,7 +19,8 @@ from localization.lidar.correlative_search import CORRELATED_BEAMS, LikelihoodIm
 from localization.lidar.submap import VoxelGrid, fill_surface, find_nearest, make_grid, measure_shares, voxel_means
 from localization.settings import Allowed, Below, Count, Positive, Settings, Share
 from motion_models import se2
-from motion_models.se2 import FloatArray, Triple, triple
+from motion_models.se2 import Triple, triple
+from motion_models.types import Cov3, FloatArray, Points2, Pose2, Tangent2
 
 MIN_POINTS = 10
 """Points without which a scan is not matched."""
@@ -39,7 +40,8 @@ _OUTLIER_COST = 12.5
 """-log of the odds that the prior is an outlier (wheels that slip or count wrongly): a deviation of 5 sigma."""
 _SEARCH_FACTOR = 9.0
 _SEARCH_FLOOR = np.diag([0.1, 0.1, 0.03]) ** 2
-"""The search covers 3 sigma of 9 P + this [m^2, m^2, rad^2]."""
+"""The search covers 3 sigma of 9 P + this [m^2, m^2, rad^2] + j j^T, j from the prior to where the motion of the last step would lead."""
+_NO_JUMP = np.zeros(3)
 _SEARCH_LIMIT, _WIDEST_SEARCH = np.array([3.0, 3.0, 1.0]), np.array([15.0, 15.0, math.pi])
 """Half the window of a search at most, for a prior that may be an outlier, and for one that is wide itself [m, m, rad]."""
 _MAX_RIVAL = 0.9
@@ -161,11 +163,11 @@ class ScanMatcher:
         """Most of the last scan lies in unmapped space, the rest fits and the prior is narrow: it should be drawn at once."""
         self._residuals = np.full(3, 1e-3)  # sums over the last scans: squares, squares of blocks, points
 
-    def match(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray | None = None) -> ScanMatch | None:
+    def match(self, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2 | None = None, jump: Tangent2 = _NO_JUMP) -> ScanMatch | None:
         """The pose of ``points`` near ``prior`` (3,), whose error against the submap has covariance ``cov`` (3, 3); None where it is lost.
 
         Gauss-Newton starts from ``guess`` (3,), or from the prior. A pose is searched where the prior is wider than the basin of
-        convergence, or where the result does not fit.
+        convergence, or where the result does not fit. Where the prior is an outlier, the pose may be off it by ``jump`` (3,), too.
         """
         nothing = np.zeros((3, 3))
         fit = self._align(points, prior, cov, prior if guess is None else guess)
@@ -173,7 +175,7 @@ class ScanMatcher:
         is_near, agrees = _is_within_basin(fit, cov), _mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST
         if is_near and agrees and fit.overlap >= self._config.search_below:
             return self._result(fit, nothing)
-        outlier_cov = (_SEARCH_FACTOR - 1.0) * cov + _SEARCH_FLOOR
+        outlier_cov = (_SEARCH_FACTOR - 1.0) * cov + _SEARCH_FLOOR + np.outer(jump, jump)
         best = self._search(points, prior, cov + outlier_cov, cov)
         if best is not None:
             if not is_near and _mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:

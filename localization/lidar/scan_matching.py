@@ -15,7 +15,7 @@ from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfi
 from localization.step import Step
 from motion_models import se2
 from motion_models.robot import Mount
-from motion_models.se2 import FloatArray
+from motion_models.types import Cov3, FloatArray, Pose2, Tangent2, Twist2
 
 _MIN_DISPLACEMENT_M = 1e-3
 """Points that another twist moves by less are not deskewed again [m]."""
@@ -47,10 +47,10 @@ class ScanMatchingSensor:
         self._last_key: FloatArray | None = None
         self._stale, self.lost = StaleScans(), LostScans()
 
-    def measure(self, step: Step, prior: FloatArray, cov: FloatArray, twist: FloatArray) -> ScanMatch | None:
+    def measure(self, step: Step, prior: Pose2, cov: Cov3, twist: Twist2, jump: Tangent2) -> ScanMatch | None:
         """Match the scan of ``step`` near ``prior`` (3,) with its covariance (3, 3) against the submap; None where it is lost.
 
-        The sweep is deskewed with ``twist`` (3,), the body's at the middle of the sweep.
+        The sweep is deskewed with ``twist`` (3,), the body's at the middle of the sweep. ``jump`` (3,): see `ScanMatcher.match`.
         """
         assert step.scan is not None
         self._scan, self._prior, self._cov = None, prior, cov
@@ -67,7 +67,7 @@ class ScanMatchingSensor:
             self._begin(self._scan)
             self.lost.add_matched(step.end_ns)
             return None
-        found = self._match(self._matcher, self._scan)
+        found = self._match(self._matcher, self._scan, jump)
         if found is None:
             self.lost.add(step.end_ns, "lost")
         else:
@@ -131,13 +131,13 @@ class ScanMatchingSensor:
         if c.matcher == "kiss" or not scan.sweep.is_planar:
             self._kiss = KissIcp(c.voxel_size_m or choose_voxel_size(scan.points), c.max_range_m)
 
-    def _match(self, matcher: ScanMatcher, scan: _Scan) -> ScanMatch | None:
+    def _match(self, matcher: ScanMatcher, scan: _Scan, jump: Tangent2) -> ScanMatch | None:
         if self._kiss is None:
-            return matcher.match(scan.planar, self._prior, self._cov)
+            return matcher.match(scan.planar, self._prior, self._cov, jump=jump)
         guess = self._kiss.align(scan.points, self._prior)
         if self._config.matcher == "kiss":
             return matcher.evaluate(scan.planar, guess)
-        return matcher.match(scan.planar, self._prior, self._cov, guess)
+        return matcher.match(scan.planar, self._prior, self._cov, guess, jump)
 
     def _mount(self, frame: str) -> Mount:
         """Where ``frame`` is mounted. A submap that was drawn before its mount was given is dropped."""

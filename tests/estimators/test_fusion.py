@@ -167,6 +167,19 @@ def test_ekf_with_encoders_at_zero_follows_lidar() -> None:
     assert np.hypot(*(poses - drive.poses)[:, :2].T).max() < 0.1
 
 
+def test_ekf_with_wheels_that_stall_and_catch_up_loses_no_scan() -> None:
+    """A driver that repeats its odometry for 0.6 s, and then publishes all of the motion at once, while the robot drives and turns fast."""
+
+    def stalled(t: np.ndarray, twists: np.ndarray) -> np.ndarray:
+        return twists * np.where((t > 5.0) & (t < 5.6), 0.0, np.where((t > 5.6) & (t < 5.8), 4.0, 1.0))[:, None]
+
+    scanner = rooms.Beams(beams=361, view=math.pi, rate_hz=5.0, fill=0.0)
+    drive = rooms.drive_through(HALL, rooms.path((1, 0, 0), (7, 0.8, 0.9), (1, 0, 0)), 0, scanner=scanner, wheels=stalled)
+    result = ekf(drive)
+    assert result.counts["matched"] == result.counts["scans"] - 1
+    assert rooms.ate(drive, rooms.at_scans(drive, result)[0]) < 0.02
+
+
 def test_ekf_after_gap_of_8_s_is_within_5_sigma() -> None:
     """Neither wheels nor scans while the robot drives on: the covariance says so, and the submap is found again."""
     drive = rooms.drive_through(HALL, rooms.path((1, 0, 0), (6, 0.4, 0.2), (8, 0.4, -0.2), (6, 0.3, 0.3), (1, 0, 0)), 0)

@@ -55,7 +55,7 @@ class PoseSensor:
         self.next: ScanMatch | None = None
         self.lost = LostScans()
 
-    def measure(self, step, prior, cov, twist):
+    def measure(self, step, prior, cov, twist, jump):
         return self.next
 
     def refine(self, match, twist):

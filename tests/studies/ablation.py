@@ -141,7 +141,9 @@ PATCHES: Mapping[str, Patch] = {
     "slip that changes within a sweep": _attribute(fusion._SlipChanges, "sweep_cov", lambda self, step, sweep_s: np.zeros((3, 3))),
     "second deskewing pass": _attribute(ScanMatchingSensor, "refine", lambda self, match, twist: match),
     "slip in the deskewing twist": _wrap(
-        ScanMatchingSensor, "measure", lambda original, self, step, prior, cov, twist: original(self, step, prior, cov, step.twist)
+        ScanMatchingSensor,
+        "measure",
+        lambda original, self, step, prior, cov, twist, jump: original(self, step, prior, cov, step.twist, jump),
     ),
     "correlative search": lambda: _together(*_NO_SEARCH),
     "rival test of the search": _attribute(scan_matcher, "_MAX_RIVAL", math.inf),
