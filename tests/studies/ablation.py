@@ -2,11 +2,11 @@
 
 python -m tests.studies.ablation [--only NAME;...] [--seconds 300] [--minutes 10] [--cells FILE] [--write]
 
-Five drives, the first 300 s of each (`--seconds`): ACES (mean error of the relations), fr079 and MIT-CSAIL (ATE at the reference's
-instants), laps simulated by the physics of the tyres with nominal sensors, and laps over a slippery patch whose ranges are twice as noisy
-as assumed, with slip that the filter's noise model does not have (ATE, and mean NEES of the pose with 3 expected). Mechanisms of matcher
-and filter are measured by the EKF, those of the graph by its smoothed trajectory. Cells are stored in a file as they are computed: called
-again, the study goes on where it was stopped, or where `--minutes` ended. `--write` puts the table into
+Five drives, the first 300 s of each (`--seconds`): ACES (mean error of the relations), fr079 and MIT-CSAIL (ATE, and mean NEES, at the
+reference's instants), laps simulated by the physics of the tyres with nominal sensors, and laps over a slippery patch whose ranges are
+twice as noisy as assumed, with slip that the filter's noise model does not have (ATE, and mean NEES of the pose with 3 expected).
+Mechanisms of matcher and filter are measured by the EKF, those of the graph by its smoothed trajectory. Cells are stored in a file as
+they are computed: called again, the study goes on where it was stopped, or where `--minutes` ended. `--write` puts the table into
 `localization/estimators/README.md`.
 """
 
@@ -45,7 +45,7 @@ from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import ImuConfig, SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
 from motion_models.robot import load_robot
-from tests.studies.buildings import BUILDINGS, Drive, errors_of
+from tests.studies.buildings import BUILDINGS, Drive, errors_of, nees_at_instants
 
 README = Path(__file__).parents[2] / "localization/estimators/README.md"
 CELLS = Path(tempfile.gettempdir()) / "skidloc_ablation.json"
@@ -183,7 +183,7 @@ SETTINGS: Mapping[str, Mapping[str, Any]] = {
     "corrections to the motion model": {"corrections": "none"},
 }
 MECHANISMS = (*PATCHES, *SETTINGS, *GRAPH_PATCHES)
-COLUMNS = ("ACES: relations [m]", "fr079: ATE [m]", "CSAIL: ATE [m]", "laps: ATE [mm], NEES", "slippery, noisy: ATE [mm], NEES")
+COLUMNS = ("ACES: relations [m]", "fr079: ATE [m], NEES", "CSAIL: ATE [m], NEES", "laps: ATE [mm], NEES", "slippery, noisy: ATE [mm], NEES")
 
 
 def simulated(experiment: str, sensors: SensorConfig, seed: int) -> Drive:
@@ -210,9 +210,10 @@ def drives(seconds: float) -> Mapping[str, Drive]:
 def cell(name: str, drive: Drive, settings: Mapping[str, Any], estimator: str) -> str:
     """One number of the table, or two."""
     run = drive.run(estimator, "skid_steer", **settings)
-    if "NEES" not in name or not isinstance(drive.reference, ReferenceTrack):
-        error = errors_of(run.trajectory, drive.reference)[0]
-        return f"{error:.4f}" if "relations" in name else f"{error:.3f}"
+    if not isinstance(drive.reference, ReferenceTrack):
+        return f"{errors_of(run.trajectory, drive.reference)[0]:.4f}"
+    if "[m]" in name:
+        return f"{errors_of(run.trajectory, drive.reference)[0]:.3f}, {nees_at_instants(run.trajectory, drive.reference)[0]:.1f}"
     ate = evaluate(run.trajectory, drive.reference).ate_rmse_m or 0.0  # truth is exact at any time: interpolated
     found = pose_consistency(run.trajectory, drive.reference)
     return f"{1e3 * ate:.1f}, " + ("–" if found is None else f"{found.mean:.2f}")  # noqa: RUF001
