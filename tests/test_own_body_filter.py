@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from localization.events import Scan
-from localization.lidar.own_body import OwnBodyFilter
+from localization.sensor_checks import OwnBodyFilter
 
 ANGLES = np.linspace(-np.pi, np.pi, 360, endpoint=False)
 POST_RANGE_M = 0.3
