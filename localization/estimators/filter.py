@@ -27,7 +27,7 @@ from localization.step import Step
 from motion_models import se2
 from motion_models.online_calibration import Corrections
 from motion_models.robot import GyroNoise
-from motion_models.se2 import FloatArray
+from motion_models.types import Cov3, FloatArray, Pose2
 
 POSE, START, MAP, KEY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 BIAS, SCALE, CLOCK, PARAMS = 12, 13, 14, 15
@@ -111,7 +111,7 @@ class Filter:
         H[:, POSE], H[:, START], H[0, BIAS], H[0, SCALE] = by_pose, by_start, by_bias, by_scale
         return self._update(se2.wrap_angle(np.array([turn.angle - predicted])), H, np.array([[turn.variance]]))[0]
 
-    def update_scan(self, measured: FloatArray, R: FloatArray, outlier_cov: FloatArray) -> float:
+    def update_scan(self, measured: Pose2, R: Cov3, outlier_cov: Cov3) -> float:
         """The pose (3,) that a scan has in the submap, with the scan's covariance ``R`` (3, 3). Returns its NIS (3 degrees of freedom).
 
         ``outlier_cov`` (3, 3): what the wheels' motion is worse by than predicted.
@@ -148,19 +148,19 @@ class Filter:
         self.P[PARAMS:, :] = self.P[:, PARAMS:] = 0.0
         self.P[PARAMS:, PARAMS:] = cov
 
-    def map_relative_cov(self) -> FloatArray:
+    def map_relative_cov(self) -> Cov3:
         """(3, 3) covariance of the pose against the submap around the robot: that of the prior of a match."""
         P = self.P
         return np.asarray(P[POSE, POSE] + P[MAP, MAP] - P[POSE, MAP] - P[MAP, POSE])
 
-    def motion_since(self, clone: slice) -> tuple[FloatArray, FloatArray]:
+    def motion_since(self, clone: slice) -> tuple[Pose2, Cov3]:
         """Motion (3,) since the clone `START` or `KEY`, and its covariance (3, 3)."""
         delta = se2.between(self.start if clone == START else self.key, self.pose)
         A, P = se2.adjoint(se2.inverse(delta)), self.P
         cross = P[POSE, clone] @ A.T
         return delta, _positive(P[POSE, POSE] - cross - cross.T + A @ P[clone, clone] @ A.T)
 
-    def drift_since_key(self) -> tuple[FloatArray, FloatArray]:
+    def drift_since_key(self) -> tuple[Pose2, Cov3]:
         """Motion (3,) since the clone `KEY`, and the covariance (3, 3) that it adds to the pose's where motions are chained as independent.
 
         |P - A P_key A^T|, A = Ad(delta^-1), with the matrix' absolute value and at most 1 in units of `motion_since`'s covariance C. Scans

@@ -16,7 +16,7 @@ from motion_models import se2
 from motion_models.base import Motion, MotionModel
 from motion_models.online_calibration import Corrections
 from motion_models.robot import Robot
-from motion_models.se2 import FloatArray
+from motion_models.types import Cov3, FloatArray, Points2, Twist2
 
 _MIN_TURN_RAD = 0.01
 """A turn of the gyro in one step that contradicts wheels that stand, if it is 5 sigma, too [rad]."""
@@ -52,7 +52,7 @@ class EkfFusion(Estimator):
         return np.asarray(self.model.nominal + self.corrections.directions @ self.filter.corrections)
 
     @property
-    def scan_points(self) -> FloatArray:
+    def scan_points(self) -> Points2:
         """(M, 2) the last scan in the body frame [m], or (0, 2)."""
         return NO_POINTS if self._sensor is None else self._sensor.scan_points()
 
@@ -158,7 +158,7 @@ class EkfFusion(Estimator):
     def counts(self) -> Mapping[str, int]:
         return self.counts_by_name if self._sensor is None else {**self.counts_by_name, **self._sensor.lost.causes}
 
-    def map_points(self) -> FloatArray:
+    def map_points(self) -> Points2:
         return NO_POINTS if self._sensor is None else self._sensor.map_points()
 
 
@@ -171,7 +171,7 @@ class _SlipChanges:
     def __init__(self) -> None:
         self._sum = self._weight = 1.0  # white, as the wheels' noise model has it, until measured
 
-    def add(self, change: FloatArray, step: Step) -> None:
+    def add(self, change: Twist2, step: Step) -> None:
         """``change`` (3,) of the slip since the last scan [m/s, m/s, rad/s]."""
         if not step.has_wheels or step.is_standing:
             return
@@ -181,13 +181,13 @@ class _SlipChanges:
             self._sum = _FORGETTING * self._sum + ratio
             self._weight = _FORGETTING * self._weight + 1.0
 
-    def sweep_cov(self, step: Step, sweep_s: float) -> FloatArray:
+    def sweep_cov(self, step: Step, sweep_s: float) -> Cov3:
         """(3, 3) by which the pose of a bent scan is off: the mean over a sweep of T of a random walk about its middle, Q T / 12."""
         if not step.has_wheels or step.is_standing:
             return np.zeros((3, 3))
         return np.asarray(self._sum / self._weight * step.predicted.cov / step.duration * sweep_s / 12.0)
 
 
-def _mean_twist(step: Step) -> FloatArray:
+def _mean_twist(step: Step) -> Twist2:
     """(3,) of the wheels over the step."""
     return se2.log(step.predicted.delta) / step.duration if step.duration > 0.0 else step.twist

@@ -28,7 +28,7 @@ from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.online_calibration import Corrections
-from motion_models.types import FloatArray, Points2, Pose2
+from motion_models.types import Cov3, FloatArray, Points2, Pose2
 
 _MIN_POSITIONS, _MIN_BASELINE_M = 3, 5.0
 """Positions, and the distance between them [m], from which they give the heading of the map."""
@@ -226,7 +226,7 @@ class GraphFusion(Estimator):
         contradicted = f"{n} of {self.n_positions} positions are more than {_MAX_POSITION_SIGMAS:g} sigma off wheels, gyro and LiDAR"
         return [f"{contradicted}: they count little. Check the receiver, its covariance and the antenna's lever arm."] if n else []
 
-    def map_points(self) -> FloatArray:
+    def map_points(self) -> Points2:
         """(M, 2) the scans of all keyframes, where the graph has them [m]."""
         if self._loops is None:
             return self.odometry.map_points()
@@ -260,7 +260,7 @@ class _KeyframeMotion:
         return PreintegratedMotion(self._delta, cov, np.column_stack([self._by_corrections, by_scale]), np.append(at, 0.0))
 
 
-def _subtract_information(delta: FloatArray, cov: FloatArray, prior: FloatArray, prior_cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _subtract_information(delta: Pose2, cov: Cov3, prior: Pose2, prior_cov: Cov3) -> tuple[Pose2, Cov3]:
     """Motion and information of gyro and scans alone, where they and the wheels' ``prior`` (3,) together give ``delta`` (3,).
 
     The wheels have a factor of their own, and must not be counted twice: information C^-1 - C_w^-1, where it is positive. Along directions

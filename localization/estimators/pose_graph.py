@@ -20,7 +20,7 @@ import numpy as np
 from localization.errors import EstimatorError
 from localization.estimators.measurement_models import motion_residual, position_residual
 from motion_models import se2
-from motion_models.se2 import FloatArray
+from motion_models.types import Cov3, FloatArray, Pose2
 
 _ALIGNMENT, _LEVER = gtsam.symbol("t", 0), gtsam.symbol("l", 0)
 _FIRST_SIGMA = np.array([1e-3, 1e-3, 1e-4])
@@ -46,7 +46,7 @@ _CONVERGED = 1e-6
 class PreintegratedMotion:
     """The wheels' motion from keyframe to keyframe, by any motion model."""
 
-    delta: FloatArray
+    delta: Pose2
     """(3,) at the corrections ``at``."""
     cov: FloatArray
     """(3, 3)"""
@@ -62,7 +62,7 @@ class Between:
 
     a: int
     b: int
-    delta: FloatArray
+    delta: Pose2
     information: FloatArray
     is_loop: bool = False
 
@@ -83,14 +83,14 @@ class Position:
 class Update:
     """What enters the graph at once. Replayed in order, updates give the same graph to the last bit."""
 
-    pose: FloatArray | None = None
+    pose: Pose2 | None = None
     """(3,) initial value of the next keyframe, if there is one."""
     wheels: PreintegratedMotion | None = None
     walk_cov: FloatArray | None = None
     """(c, c) if the corrections go on as a new variable: how far they may have changed."""
     betweens: tuple[Between, ...] = ()
     positions: tuple[Position, ...] = ()
-    alignment: FloatArray | None = None
+    alignment: Pose2 | None = None
     """(3,) initial value of ``enu_T_map``, with the first positions."""
 
 
@@ -136,7 +136,7 @@ class PoseGraph:
             if not self._isam.update().getVariablesRelinearized():
                 break
 
-    def pose(self, k: int) -> FloatArray:
+    def pose(self, k: int) -> Pose2:
         """(3,) ``map_T_body`` of keyframe ``k``."""
         return _array(self._values.atPose2(gtsam.symbol("x", k)))
 
@@ -145,7 +145,7 @@ class PoseGraph:
         values = gtsam.utilities.extractPose2(self._values)  # in order of keys: before x, there may be t
         return np.asarray(values[len(values) - self.count :])
 
-    def marginal(self, k: int) -> FloatArray:
+    def marginal(self, k: int) -> Cov3:
         """(3, 3) covariance of keyframe ``k``."""
         return np.asarray(self._isam.marginalCovariance(gtsam.symbol("x", k)))
 
@@ -205,7 +205,7 @@ class PoseGraph:
             factors.add(position_factor(position))
         return factors, values
 
-    def _add_keyframe(self, pose: FloatArray, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+    def _add_keyframe(self, pose: Pose2, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
         key = gtsam.symbol("x", self.count)
         values.insert(key, gtsam.Pose2(*pose))
         if not self.count:

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from motion_models import se2
-from motion_models.types import FloatArray, Points2
+from motion_models.types import FloatArray, Points2, Pose2
 
 _BEARINGS = 180
 """Of 2 deg: each has a beam of any scanner in use, however its beams lie to the bins."""
@@ -37,7 +37,7 @@ _DAMPING = 1e-3
 class ScanMotion(NamedTuple):
     """Motion of the body from one scan to the next."""
 
-    delta: FloatArray
+    delta: Pose2
     """(3,) a_T_b [m, m, rad]."""
     has_translation: bool
     """The scene has structure along both axes."""
@@ -142,7 +142,7 @@ def _align_profiles(surface: FloatArray, normals: FloatArray, points: FloatArray
 
 @numba.njit(cache=True)
 def _normal_equations(
-    surface: FloatArray, normals: FloatArray, points: FloatArray, a_T_b: FloatArray, scale: float
+    surface: FloatArray, normals: FloatArray, points: FloatArray, a_T_b: Pose2, scale: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, int]:
     """J^T W J (3, 3) and J^T W r (3,) of the distances r of ``points`` (M, 2), moved by ``a_T_b`` (3,), from the lines of a profile.
 

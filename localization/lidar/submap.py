@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from localization.trajectory import IntArray
-from motion_models.se2 import FloatArray
+from motion_models.types import FloatArray, Points2
 
 POOLED_VOXELS = 5
 """Voxels whose points are pooled for one surface: fewer give no direction along sparse walls, more round off corners."""
@@ -41,7 +41,7 @@ class VoxelGrid(NamedTuple):
     until then."""
 
 
-def make_grid(points: FloatArray, cell: float, noise_m: float) -> VoxelGrid:
+def make_grid(points: Points2, cell: float, noise_m: float) -> VoxelGrid:
     """Voxels with edge ``cell`` [m] of ``points`` (N, 2) [m], whose ranges have sigma ``noise_m`` [m]."""
     origin = np.floor(points.mean(axis=0) / cell) * cell if len(points) else np.zeros(2)
     slots = np.full((1 << max(4, math.ceil(math.log2(2 * len(points) + 1))), 2), _EMPTY, dtype=np.int64)
@@ -50,7 +50,7 @@ def make_grid(points: FloatArray, cell: float, noise_m: float) -> VoxelGrid:
     return VoxelGrid(cell, noise_m**2, origin, slots, cells[:n], sums[:n], np.full((n, 6), np.nan))
 
 
-def voxel_means(points: FloatArray, cell: float) -> FloatArray:
+def voxel_means(points: Points2, cell: float) -> Points2:
     """(M, 2) the mean of ``points`` (N, 2) in each voxel with edge ``cell`` [m]."""
     grid = make_grid(points, cell, 0.0)
     return np.asarray(grid.sums[:, 1:3] / grid.sums[:, :1] + grid.origin)
@@ -76,7 +76,7 @@ def find_voxel(slots: IntArray, i: int, j: int) -> int:
 
 
 @numba.njit(cache=True)
-def _fill(points: FloatArray, cell: float, origin: FloatArray, slots: IntArray, cells: IntArray, sums: FloatArray) -> int:
+def _fill(points: Points2, cell: float, origin: FloatArray, slots: IntArray, cells: IntArray, sums: FloatArray) -> int:
     """Sort ``points`` into voxels; returns how many there are."""
     n = 0
     for p in range(points.shape[0]):
