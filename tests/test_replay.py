@@ -47,7 +47,7 @@ def husky(tmp_path_factory):
 
 
 @pytest.mark.xdist_group("aces")
-def test_aces_is_better_than_each_of_its_parts(aces):
+def test_replay_aces_fused_error_is_below_each_part(aces):
     found, metrics = results(aces)
     odometry, ekf = found["diff_drive", "odometry"], found["diff_drive", "ekf"]
     assert odometry["relations_all_translation_m"] == pytest.approx(0.549, abs=0.01)  # as measured before this project
@@ -69,7 +69,7 @@ def test_aces_is_better_than_each_of_its_parts(aces):
 
 
 @pytest.mark.xdist_group("husky")
-def test_husky_with_gyro_beats_its_odometry(husky):
+def test_replay_husky_with_gyro_error_is_below_its_odometry(husky):
     found, _ = results(husky)
     assert set(found) == {(m, e) for m in ("diff_drive", "skid_steer") for e in ("odometry", "ekf")}  # no LiDAR there
     assert found["diff_drive", "odometry"]["ate_rmse_m"] == pytest.approx(6.99, abs=0.01)
@@ -84,7 +84,7 @@ def test_husky_with_gyro_beats_its_odometry(husky):
 
 
 @pytest.mark.xdist_group("husky")
-def test_two_runs_give_the_same_bytes(husky, tmp_path):
+def test_replay_twice_gives_the_same_bytes(husky, tmp_path):
     again = tmp_path / "again"
     assert replay(HUSKY, again, "--robot", "husky_a200") == 0
     names = sorted(path.name for path in husky.iterdir())
@@ -94,7 +94,7 @@ def test_two_runs_give_the_same_bytes(husky, tmp_path):
 
 
 @pytest.mark.xdist_group("husky")
-def test_fused_log_opens_in_two_independent_readers(husky):
+def test_fused_log_is_readable_by_two_independent_readers(husky):
     with AnyReader([husky / "fused.mcap"], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         topics = {c.topic: c.msgcount for c in reader.connections}
     assert topics["/skid_steer_ekf/odometry"] == topics["/tf"] == len(read_tum(husky / "skid_steer_ekf.tum"))
@@ -105,7 +105,7 @@ def test_fused_log_opens_in_two_independent_readers(husky):
     assert message.pose.covariance[0] >= 0.0
 
 
-def test_report_needs_nothing_but_itself(tmp_path):
+def test_report_loads_no_other_file(tmp_path):
     log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(5.0))
     assert replay(log, tmp_path / "out", "--robot", "vaultbot", "--model", "diff_drive", "--estimator", "odometry") == 0
     report = (tmp_path / "out" / "report.html").read_text()
@@ -115,7 +115,7 @@ def test_report_needs_nothing_but_itself(tmp_path):
 
 
 @pytest.mark.parametrize("form", ["ros1", "sqlite3", "mcap-folder", "mcap"])
-def test_every_format_gives_the_same_estimate(form, tmp_path):
+def test_replay_every_format_gives_the_same_estimate(form, tmp_path):
     log = bags.FORMATS[form](tmp_path / "log", rooms.drive(10.0))
     assert replay(log, tmp_path / "out", "--robot", "vaultbot", "--model", "diff_drive", "--estimator", "ekf") == 0
     found, _ = results(tmp_path / "out")
@@ -126,7 +126,7 @@ def test_every_format_gives_the_same_estimate(form, tmp_path):
     assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
 
 
-def test_the_filter_learns_how_much_the_wheels_scrub(tmp_path):
+def test_replay_wheel_corrections_converge_to_the_slip(tmp_path):
     """The wheels turn 1.5 times as much as the robot; vaultbot's file says 1.875 times."""
     log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(30.0, multiplier=1.5))
     assert replay(log, tmp_path / "out", "--robot", "vaultbot", "--model", "diff_drive") == 0
@@ -167,7 +167,7 @@ def spoiled(kind):
 
 
 @pytest.mark.parametrize("kind", ["nan", "all nan", "empty", "backwards", "jump", "repeated", "vanishes", "frame"])
-def test_bad_scans_are_survived(kind, tmp_path, capsys):
+def test_replay_bad_scans_are_skipped(kind, tmp_path, capsys):
     log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(10.0, multiplier=1.875, spoil=spoiled(kind)))
     assert replay(log, tmp_path / "out", "--robot", "vaultbot", "--model", "diff_drive", "--estimator", "lidar,ekf") == 0
     found, _ = results(tmp_path / "out")
@@ -184,7 +184,7 @@ def test_bad_scans_are_survived(kind, tmp_path, capsys):
     assert told.get(kind, "") in capsys.readouterr().out
 
 
-def test_truncated_bag_is_replayed_as_far_as_it_goes(tmp_path, capsys):
+def test_replay_truncated_bag_ends_at_the_cut(tmp_path, capsys):
     log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(20.0))
     log.write_bytes(log.read_bytes()[: log.stat().st_size * 2 // 3])
     assert replay(log, tmp_path / "out", "--robot", "vaultbot", "--model", "diff_drive", "--estimator", "ekf") == 0
@@ -275,7 +275,7 @@ def a_setting_of_no_use(tmp_path):
         *(nothing_asked(option) for option in ("--model", "--estimator", "--corrections")),
     ],
 )
-def test_bad_input_is_told_and_nothing_is_written(case, tmp_path, capsys):
+def test_replay_bad_input_is_refused_and_no_file_written(case, tmp_path, capsys):
     arguments, hint = case(tmp_path)
     assert main(["replay", *arguments, "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
@@ -285,7 +285,7 @@ def test_bad_input_is_told_and_nothing_is_written(case, tmp_path, capsys):
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
-def test_nothing_is_overwritten(tmp_path, capsys):
+def test_replay_existing_output_is_refused(tmp_path, capsys):
     log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(2.0))
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "precious").write_text("1")
@@ -294,7 +294,7 @@ def test_nothing_is_overwritten(tmp_path, capsys):
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["precious"]
 
 
-def test_without_a_reference_scores_are_null(tmp_path):
+def test_replay_without_reference_has_null_scores(tmp_path):
     log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(3.0))
     assert replay(log, tmp_path / "out", "--robot", "vaultbot", "--model", "diff_drive", "--reference", "none") == 0
     found, metrics = results(tmp_path / "out")

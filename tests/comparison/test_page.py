@@ -37,7 +37,7 @@ def told(values, metric="ate_rmse_m"):
     return headline(found), closing(found)
 
 
-def test_the_verdict_counts_wins_and_weighs_the_gain_by_the_means():
+def test_summary_counts_wins_and_gain_of_the_means():
     factors = np.array([0.8, 0.9, 0.85, 0.9, 0.95, 0.9, 0.85, 1.02])  # worse on the last log, little
     first, rest = told({WORSE: HARD, BETTER: HARD * factors})
     gain = 100.0 * (1.0 - (HARD * factors).sum() / HARD.sum())
@@ -53,7 +53,7 @@ def test_the_verdict_counts_wins_and_weighs_the_gain_by_the_means():
     assert rest == ["Use ekf with skid_steer."]
 
 
-def test_intervals_of_the_gain_cover_the_truth():
+def test_gain_intervals_cover_the_true_gain():
     rng = np.random.default_rng(11)
     hits = 0
     for _ in range(100):
@@ -63,7 +63,7 @@ def test_intervals_of_the_gain_cover_the_truth():
     assert 84 <= hits <= 99
 
 
-def test_what_is_not_shown_is_not_claimed():
+def test_summary_without_significance_claims_nothing():
     noise = np.array([1.1, 0.9, 1.05, 0.93, 1.02, 0.97, 1.0, 1.01])
     first, rest = told({WORSE: HARD, BETTER: HARD * noise})
     assert "is not significant" in first
@@ -78,7 +78,7 @@ def test_what_is_not_shown_is_not_claimed():
     assert "share fewer than two logs" in first
 
 
-def test_the_simpler_of_two_equals_is_named_beside_the_best():
+def test_summary_of_two_equals_names_the_simpler_beside_the_best():
     equal = HARD * np.array([0.52, 0.49, 0.5, 0.48, 0.5, 0.49, 0.51, 0.52])
     _, rest = told({("diff_drive", "odometry"): 5.0 * HARD, WORSE: 0.5 * HARD, BETTER: equal})
     assert rest == ["Use ekf with skid_steer; it is not significantly better than ekf with diff_drive on these logs."]
@@ -99,7 +99,7 @@ def cases():
 
 
 @pytest.mark.parametrize("case", list(cases()))
-def test_page_is_well_formed_loads_nothing_and_begins_with_the_verdict(case):
+def test_page_is_well_formed_loads_nothing_and_starts_with_the_summary(case):
     found = find(rows(cases()[case]), "ate_rmse_m")
     made = comparison_page(HEAD, found)
     assert made == comparison_page(HEAD, found)
@@ -115,7 +115,7 @@ def test_page_is_well_formed_loads_nothing_and_begins_with_the_verdict(case):
     assert made.count(">position error (ATE) [m]<") == 1
 
 
-def test_every_log_and_every_failure_is_there():
+def test_page_lists_every_log_and_failure():
     found = find(rows(cases()["failing"]), "ate_rmse_m")
     text = Text(comparison_page(HEAD, found))
     by_log = {row[0]: row[1:] for row in text.tables[-1][1:]}
@@ -130,7 +130,7 @@ def test_every_log_and_every_failure_is_there():
     assert "3 of 16 runs failed, on 2 logs." in words
 
 
-def test_text_from_outside_is_escaped():
+def test_page_escapes_text_of_the_logs():
     evil = "<script>alert('x')</script>&\"'"
     made = rows({(evil, "ekf"): [1.0, None], (evil, evil): [2.0, 3.0]})
     for row in made:
@@ -141,7 +141,7 @@ def test_text_from_outside_is_escaped():
     Text(page)
 
 
-def test_only_a_report_of_a_comparison_is_written_over(tmp_path):
+def test_page_overwrites_only_a_report_of_a_comparison(tmp_path):
     path, found = tmp_path / "report.html", find(rows({WORSE: HARD, BETTER: 0.9 * HARD}), "ate_rmse_m")
     write_comparison_report(path, HEAD, found)
     assert path.read_text() == comparison_page(HEAD, found)

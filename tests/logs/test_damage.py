@@ -61,7 +61,7 @@ def said(log: Log) -> str:
 
 @pytest.mark.parametrize("compression", [None, "lz4", "bz2"])
 @pytest.mark.parametrize("fraction", [0.3, 0.75])
-def test_ros1_bag_that_was_cut_off(tmp_path: Path, compression: str | None, fraction: float) -> None:
+def test_ros1_truncated_is_read_to_the_cut(tmp_path: Path, compression: str | None, fraction: float) -> None:
     path = bags.write_ros1_bag(tmp_path / "run.bag", records(), compression, chunk_bytes=100_000)
     cut(path, fraction)
     log = open_log(path, ROBOT)
@@ -73,7 +73,7 @@ def test_ros1_bag_that_was_cut_off(tmp_path: Path, compression: str | None, frac
     assert f"{2 * steps}" in said(log) or f"{2 * steps + 1}" in said(log)
 
 
-def test_ros1_bag_of_a_recorder_that_was_killed(tmp_path: Path) -> None:
+def test_ros1_of_a_killed_recorder_is_read_without_index(tmp_path: Path) -> None:
     """rosbag leaves a file named .bag.active, whose header says that there is no index."""
     path = bags.write_ros1_bag(tmp_path / "run.bag", records(), chunk_bytes=100_000)
     data = bytearray(path.read_bytes())
@@ -87,7 +87,7 @@ def test_ros1_bag_of_a_recorder_that_was_killed(tmp_path: Path) -> None:
     assert "All of its 1200 messages could be read" in said(log)
 
 
-def test_ros1_bag_with_a_bad_chunk_loses_that_chunk_only(tmp_path: Path) -> None:
+def test_ros1_bad_chunk_loses_only_that_chunk(tmp_path: Path) -> None:
     path = bags.write_ros1_bag(tmp_path / "run.bag", records(), "bz2", chunk_bytes=100_000)
     data = bytearray(path.read_bytes())
     middle = data.index(b"BZh", len(data) // 2)
@@ -103,7 +103,7 @@ def test_ros1_bag_with_a_bad_chunk_loses_that_chunk_only(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("compression", [None, "storage"])
 @pytest.mark.parametrize("fraction", [0.3, 0.75])
-def test_mcap_that_was_cut_off(tmp_path: Path, compression: str | None, fraction: float) -> None:
+def test_mcap_truncated_is_read_to_the_cut(tmp_path: Path, compression: str | None, fraction: float) -> None:
     path = bags.write_mcap(tmp_path / "run.mcap", records(2 * COUNT), compression)
     cut(path, fraction)
     log = open_log(path, ROBOT)
@@ -113,7 +113,7 @@ def test_mcap_that_was_cut_off(tmp_path: Path, compression: str | None, fraction
     assert "run.mcap was read record by record" in said(log)
 
 
-def test_folder_of_an_mcap_that_was_cut_off(tmp_path: Path) -> None:
+def test_mcap_folder_truncated_is_read_to_the_cut(tmp_path: Path) -> None:
     path = bags.write_ros2_bag(tmp_path / "run", records(), "mcap")
     cut(path / "run.mcap", 0.5)
     log = open_log(path, ROBOT)
@@ -124,7 +124,7 @@ def test_folder_of_an_mcap_that_was_cut_off(tmp_path: Path) -> None:
 @pytest.mark.parametrize("compression", [None, "message"])
 @pytest.mark.parametrize("bare", [True, False])
 @pytest.mark.parametrize("fraction", [0.3, 0.9])
-def test_sqlite_that_was_cut_off(tmp_path: Path, compression: str | None, bare: bool, fraction: float) -> None:
+def test_sqlite_truncated_is_read_to_the_cut(tmp_path: Path, compression: str | None, bare: bool, fraction: float) -> None:
     """Wherever it was cut off: at 0.3, SQLite itself finds no row, for the page that leads to the first ones comes later."""
     path = bags.write_ros2_bag(tmp_path / "run", records(), "sqlite3", compression)
     with contextlib.closing(sqlite3.connect(path / "run.db3")) as database:
@@ -138,13 +138,13 @@ def test_sqlite_that_was_cut_off(tmp_path: Path, compression: str | None, bare: 
     assert "run.db3 was read page by page" in said(log)
 
 
-def test_rows_that_wait_beside_the_file_are_told_of(tmp_path: Path) -> None:
+def test_sqlite_write_ahead_log_beside_the_file_is_reported(tmp_path: Path) -> None:
     path = bags.write_ros2_bag(tmp_path / "run", records(20), "sqlite3")
     (path / "run.db3-wal").write_bytes(b"x")
     assert "run.db3-wal holds rows" in said(open_log(path, ROBOT))
 
 
-def test_sqlite_pages_give_the_rows_that_sqlite_gives(tmp_path: Path) -> None:
+def test_sqlite_pages_give_the_rows_of_the_library(tmp_path: Path) -> None:
     """Of every length from a tenth of a page to four pages, for what stays on the page depends on it in three ways."""
     messages = [bags.laser_scan(START + i * S // 10, np.linspace(1.0, 9.0, n)) for i, n in enumerate(range(100, 4000, 13))]
     path = bags.write_ros2_bag(tmp_path / "run", [("/scan", m, START + i * S // 10) for i, m in enumerate(messages)], "sqlite3") / "run.db3"
@@ -155,7 +155,7 @@ def test_sqlite_pages_give_the_rows_that_sqlite_gives(tmp_path: Path) -> None:
     assert recovered.channels[0].count == len(rows) == 300
 
 
-def test_sqlite_rows_longer_than_a_page_survive_a_cut(tmp_path: Path) -> None:
+def test_sqlite_truncated_keeps_rows_longer_than_a_page(tmp_path: Path) -> None:
     """Point clouds overflow onto further pages; one whose last page is missing is left out."""
     rng = np.random.default_rng(5)
     clouds = [np.ascontiguousarray(rng.normal(size=(1500, 3)).astype(np.float32)) for _ in range(40)]
@@ -173,7 +173,7 @@ def test_sqlite_rows_longer_than_a_page_survive_a_cut(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_storage_file_that_was_compressed_and_cut_off(tmp_path: Path, storage: str) -> None:
+def test_compressed_storage_file_truncated_is_read_to_the_cut(tmp_path: Path, storage: str) -> None:
     path = bags.write_ros2_bag(tmp_path / "run", records(2 * COUNT), storage, "file")
     cut(next(path.glob("*.zstd")), 0.5)
     log = open_log(path, ROBOT)
@@ -191,7 +191,7 @@ def test_folder_without_metadata_is_read_file_by_file(tmp_path: Path, storage: s
     assert "metadata.yaml is missing" in said(log)
 
 
-def test_split_recording_without_metadata_is_read_in_order(tmp_path: Path) -> None:
+def test_folder_split_without_metadata_is_read_in_order(tmp_path: Path) -> None:
     everything = list(records(120))
     folder = tmp_path / "run"
     folder.mkdir()
@@ -200,7 +200,7 @@ def test_split_recording_without_metadata_is_read_in_order(tmp_path: Path) -> No
     assert check_is_prefix(open_log(folder, ROBOT)) == 120
 
 
-def test_folder_whose_one_file_is_not_a_log_uses_the_others(tmp_path: Path) -> None:
+def test_folder_with_one_invalid_file_uses_the_others(tmp_path: Path) -> None:
     path = bags.write_ros2_bag(tmp_path / "run", records(50), "mcap")
     (path / "run_1.mcap").write_text("not a log")
     (path / "metadata.yaml").write_text("rosbag2_bagfile_information: 3")
@@ -209,7 +209,7 @@ def test_folder_whose_one_file_is_not_a_log_uses_the_others(tmp_path: Path) -> N
     assert "run_1.mcap' is not a log" in said(log)
 
 
-def test_mcap_with_a_bad_chunk_loses_that_chunk_only(tmp_path: Path) -> None:
+def test_mcap_bad_chunk_loses_only_that_chunk(tmp_path: Path) -> None:
     path = bags.write_mcap(tmp_path / "run.mcap", records(4 * COUNT), "storage")
     data = bytearray(path.read_bytes())
     middle = data.index(b"\x28\xb5\x2f\xfd", len(data) // 3)
@@ -224,7 +224,7 @@ def test_mcap_with_a_bad_chunk_loses_that_chunk_only(tmp_path: Path) -> None:
     assert "A chunk at byte" in said(log)
 
 
-def test_mcap_chunk_of_a_wrong_checksum_is_used_and_reported(tmp_path: Path) -> None:
+def test_mcap_chunk_with_wrong_checksum_is_used_and_reported(tmp_path: Path) -> None:
     """A flipped bit in a range looks like any other range: which message it is in cannot be known, and the others are right."""
     from mcap.writer import CompressionType, Writer
 
@@ -253,7 +253,7 @@ def test_mcap_chunk_of_a_wrong_checksum_is_used_and_reported(tmp_path: Path) -> 
     assert len(differing) <= 1
 
 
-def test_mcap_without_chunks_or_summary(tmp_path: Path) -> None:
+def test_mcap_without_chunks_or_summary_is_read(tmp_path: Path) -> None:
     """As rosbag2's fastest preset writes it; with messages out of order, which rosbags refuses."""
     from mcap.writer import Writer
 
@@ -274,7 +274,7 @@ def test_mcap_without_chunks_or_summary(tmp_path: Path) -> None:
     assert check_is_prefix(open_log(path, ROBOT)) == 300
 
 
-def test_mcap_of_ros1_messages(tmp_path: Path) -> None:
+def test_mcap_of_ros1_messages_is_read(tmp_path: Path) -> None:
     from mcap.writer import Writer
 
     path = tmp_path / "run.mcap"
@@ -293,7 +293,7 @@ def test_mcap_of_ros1_messages(tmp_path: Path) -> None:
     assert check_is_prefix(open_log(path, ROBOT)) == 100
 
 
-def test_mcap_that_is_not_of_ros_is_refused(tmp_path: Path) -> None:
+def test_mcap_without_ros_messages_is_refused(tmp_path: Path) -> None:
     from mcap.writer import Writer
 
     path = tmp_path / "run.mcap"
@@ -342,18 +342,18 @@ NOT_LOGS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("name", NOT_LOGS)
-def test_what_is_not_a_log_is_refused_by_name(tmp_path: Path, name: str) -> None:
+def test_path_that_is_no_log_is_refused_by_name(tmp_path: Path, name: str) -> None:
     NOT_LOGS[name](tmp_path / name)
     with pytest.raises(LogError, match=name.replace(".", r"\.")):
         open_log(tmp_path / name, ROBOT)
 
 
-def test_no_such_file(tmp_path: Path) -> None:
+def test_path_that_does_not_exist_is_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"gone\.bag.*no such file"):
         open_log(tmp_path / "gone.bag", ROBOT)
 
 
-def test_folder_of_ros1_bags_says_which(tmp_path: Path) -> None:
+def test_folder_of_ros1_bags_error_lists_them(tmp_path: Path) -> None:
     bags.write_ros1_bag(tmp_path / "run.bag", records(5))
     with pytest.raises(LogError, match=r"ROS 1 bags in it: run\.bag"):
         open_log(tmp_path, ROBOT)
@@ -361,7 +361,7 @@ def test_folder_of_ros1_bags_says_which(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", bags.FORMATS)
 @pytest.mark.parametrize("count", [0, 1])
-def test_log_of_no_or_one_message_is_refused(tmp_path: Path, name: str, count: int) -> None:
+def test_log_of_at_most_one_message_is_refused(tmp_path: Path, name: str, count: int) -> None:
     path = bags.FORMATS[name](tmp_path / "run", list(records(1))[:count])
     with pytest.raises(LogError, match="no message" if count == 0 else "only one message"):
         open_log(path, ROBOT)
@@ -374,7 +374,7 @@ FUZZED = {
 
 
 @pytest.mark.parametrize("name", FUZZED)
-def test_any_cut_and_any_flipped_byte_gives_events_or_our_error(tmp_path: Path, name: str) -> None:
+def test_log_any_cut_or_flipped_byte_gives_events_or_input_error(tmp_path: Path, name: str) -> None:
     """Sixty damages of each format: whatever happens, only `LogError` comes out, and stamps never decrease."""
     original = FUZZED[name](tmp_path / "run", records(40))
     storage = next(f for f in original.iterdir() if f.name != "metadata.yaml") if original.is_dir() else original

@@ -61,7 +61,7 @@ def check(events: list[Event], steps: int) -> None:
 
 
 @pytest.mark.parametrize("name", bags.FORMATS)
-def test_every_format_gives_the_same_events_twice(tmp_path: Path, name: str) -> None:
+def test_log_every_format_gives_the_same_events_twice(tmp_path: Path, name: str) -> None:
     log = open_log(bags.FORMATS[name](tmp_path / "run", records()), ROBOT)
     check(list(log.events()), 40)
     check(list(log.events()), 40)
@@ -70,7 +70,7 @@ def test_every_format_gives_the_same_events_twice(tmp_path: Path, name: str) -> 
     assert log.start_ns == START + 2_000_000
 
 
-def test_two_iterators_of_one_log_do_not_disturb_each_other(tmp_path: Path) -> None:
+def test_log_two_iterators_are_independent(tmp_path: Path) -> None:
     for name in ("ros1", "mcap", "sqlite3", "mcap-file"):
         log = open_log(bags.FORMATS[name](tmp_path / name, records()), ROBOT)
         both = list(zip(log.events(), log.events(), strict=True))
@@ -78,7 +78,7 @@ def test_two_iterators_of_one_log_do_not_disturb_each_other(tmp_path: Path) -> N
         check([other for _, other in both], 40)
 
 
-def test_ros1_bag_written_topic_by_topic_is_read_in_order_of_time(tmp_path: Path) -> None:
+def test_ros1_bag_written_topic_by_topic_is_read_in_time_order(tmp_path: Path) -> None:
     """As scripts that convert data sets write them; chunks of one topic lie far from those of the same time of another."""
     ordered = sorted(records(400), key=lambda record: record[0])
     path = bags.write_ros1_bag(tmp_path / "run.bag", ordered, chunk_bytes=4_000)
@@ -87,7 +87,7 @@ def test_ros1_bag_written_topic_by_topic_is_read_in_order_of_time(tmp_path: Path
     assert log.warnings() == []
 
 
-def test_definitions_of_the_log_are_used(tmp_path: Path) -> None:
+def test_log_own_message_definitions_are_used(tmp_path: Path) -> None:
     """A later ROS may add a field to a message; its bytes are not to be taken for the next message's."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -132,7 +132,7 @@ def _peak(path: Path) -> tuple[int, int]:
     ],
     ids=["ros1", "mcap", "sqlite3"],
 )
-def test_a_log_ten_times_as_long_takes_no_more_memory(tmp_path: Path, write: Callable[[Path, Iterator[Record]], Path]) -> None:
+def test_log_ten_times_longer_uses_no_more_memory(tmp_path: Path, write: Callable[[Path, Iterator[Record]], Path]) -> None:
     def long_records(steps: int) -> Iterator[Record]:
         ranges = np.linspace(1.0, 9.0, 2000)
         for i in range(steps):

@@ -53,7 +53,7 @@ def test_damaged_file_of_any_format_is_read_or_refused(tmp_path: Path, form: str
         assert stamps == sorted(stamps)
 
 
-def test_cases_of_a_seed_are_the_same_and_hold_all_faults() -> None:
+def test_hostile_cases_of_one_seed_repeat_and_contain_all_faults() -> None:
     chosen = cases(300, 0)
     assert chosen == cases(300, 0) != cases(300, 1)
     assert {case.sensor_fault for case in chosen} == set(SENSOR_FAULTS)

@@ -33,7 +33,7 @@ def opened(folder: Path, records: list[Record]) -> Log:
 
 
 @pytest.mark.parametrize("angles", [(0.0, 0.0), (0.0, 1.0), (0.5, -1.0)], ids=["no step", "step from the ends", "degrees"])
-def test_scan_whose_angles_cannot_be_is_dropped_and_reported(tmp_path: Path, angles: tuple[float, float]) -> None:
+def test_scan_with_impossible_angles_is_dropped_and_reported(tmp_path: Path, angles: tuple[float, float]) -> None:
     step, last = angles
 
     def spoil(number, scan, log_ns):
@@ -106,7 +106,7 @@ def test_static_transforms_that_agree_are_not_reported(tmp_path: Path) -> None:
     assert log.warnings() == []
 
 
-def test_mount_that_the_log_contradicts_is_taken_from_the_robot_file(tmp_path: Path) -> None:
+def test_mount_contradicting_the_log_is_that_of_the_robot_file(tmp_path: Path) -> None:
     frame = "laser"
     robot = load_robot("vaultbot")
     robot = type(robot)(**{**{f: getattr(robot, f) for f in robot.__dataclass_fields__}, "mounts": {frame: Mount(x=0.7)}})
@@ -139,7 +139,7 @@ def wheels_of(log: Log) -> list[WheelSample]:
 
 @pytest.mark.parametrize("offset_ms", [3, 10, 17])
 @pytest.mark.parametrize("rate", [10, 50])
-def test_second_publisher_of_zeros_costs_no_distance(tmp_path: Path, offset_ms: int, rate: int) -> None:
+def test_second_publisher_of_zeros_loses_no_distance(tmp_path: Path, offset_ms: int, rate: int) -> None:
     """As `joint_state_publisher` does. The drive is 8 m long."""
 
     def records() -> Iterator[Record]:
@@ -157,7 +157,7 @@ def test_second_publisher_of_zeros_costs_no_distance(tmp_path: Path, offset_ms: 
     assert "of a second publisher whose wheels turn less, left out" in said(log)
 
 
-def test_encoder_that_is_reset_is_no_second_publisher(tmp_path: Path) -> None:
+def test_encoder_reset_is_no_second_publisher(tmp_path: Path) -> None:
     records = drive(20.0)
     for i, (topic, message, _) in enumerate(records):
         if topic == "/joint_states" and i > len(records) // 2:
@@ -172,7 +172,7 @@ def test_encoder_that_is_reset_is_no_second_publisher(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("jump_s", [0.9, -0.9, 0.5, -0.5])
-def test_lidar_clock_that_jumps_by_less_than_a_second_is_set_back(tmp_path: Path, jump_s: float) -> None:
+def test_lidar_clock_jump_below_a_second_is_corrected(tmp_path: Path, jump_s: float) -> None:
     shift = round(jump_s * S)
 
     def spoil(number, scan, log_ns):
@@ -191,7 +191,7 @@ def test_lidar_clock_that_jumps_by_less_than_a_second_is_set_back(tmp_path: Path
 
 
 @pytest.mark.parametrize("jump_s", [0.9, -0.9])
-def test_lone_scans_stamped_wrongly_by_less_than_a_second_are_dropped(tmp_path: Path, jump_s: float) -> None:
+def test_scans_with_outlier_stamps_below_a_second_are_dropped(tmp_path: Path, jump_s: float) -> None:
     def spoil(number, scan, log_ns):
         if number > 30 and number % 10 == 0:
             stamp = log_ns + round(jump_s * S)
@@ -231,7 +231,7 @@ def zeros(message, later: int):
 
 
 @pytest.mark.parametrize("first", [lambda m: m, rates_only], ids=["angles and rates", "rates"])
-def test_second_publisher_of_rates_alone_costs_no_distance(tmp_path: Path, first: Callable) -> None:
+def test_second_publisher_of_rates_only_loses_no_distance(tmp_path: Path, first: Callable) -> None:
     honest = wheels_of(opened(tmp_path, [(t, first(m) if t == "/joint_states" else m, s) for t, m, s in drive(20.0)]))
     (tmp_path / "run.mcap").unlink()
     log = opened(tmp_path, doubled(9, lambda m, later: rates_only(zeros(m, later)), first=first))
@@ -243,7 +243,7 @@ def test_second_publisher_of_rates_alone_costs_no_distance(tmp_path: Path, first
     assert "of a second publisher whose wheels turn less, left out" in said(log)
 
 
-def test_second_publisher_of_odometry_costs_no_distance(tmp_path: Path) -> None:
+def test_second_publisher_of_odometry_loses_no_distance(tmp_path: Path) -> None:
     records = []
     for i in range(500):
         stamp = START + i * S // 50
@@ -268,7 +268,7 @@ def test_odometry_that_stops_at_once_is_no_second_publisher(tmp_path: Path) -> N
     assert log.warnings() == []
 
 
-def test_wheel_that_is_frozen_is_left_out_and_named(tmp_path: Path) -> None:
+def test_frozen_wheel_is_excluded_and_named(tmp_path: Path) -> None:
     honest = wheels_of(opened(tmp_path, drive(20.0)))
     (tmp_path / "run.mcap").unlink()
     records = drive(20.0)

@@ -140,7 +140,7 @@ class Text(HTMLParser):
 # ---- words
 
 
-def test_best_run_and_its_gains_are_told_from_the_numbers():
+def test_summary_names_the_best_run_and_its_gains():
     results = score(three_runs(), relations())
     errors = [r.accuracy.relations.all.translation_m for r in results]
     text = verdict(results, relations())
@@ -155,14 +155,14 @@ def test_best_run_and_its_gains_are_told_from_the_numbers():
     assert text.endswith("Use ekf with skid_steer.")
 
 
-def test_track_reference_is_named_with_ate_and_distance():
+def test_summary_names_a_track_reference_with_ate_and_distance():
     results = score(three_runs(), track())
     text = verdict(results, track())
     assert f"{results[2].accuracy.ate_rmse_m:.3f} m position error (ATE, root mean square) against /ground_truth/odom" in text
     assert f"over {results[2].accuracy.distance_m:.1f} m driven" in text
 
 
-def test_without_reference_nothing_is_called_best():
+def test_summary_without_reference_names_no_best():
     runs = three_runs()
     text = verdict(score(runs, None), None)
     assert text.startswith("No reference was given, so which run is right is unknown.")
@@ -173,7 +173,7 @@ def test_without_reference_nothing_is_called_best():
     assert f"by {farthest:.{2 if farthest > 0.995 else 3}f} m" in text
 
 
-def test_one_run_is_not_the_best_of_anything():
+def test_summary_of_one_run_names_no_best():
     text = verdict(score([run(noise=0.1)], track()), track())
     assert "Nothing else was run" in text
     assert "best" not in text
@@ -181,7 +181,7 @@ def test_one_run_is_not_the_best_of_anything():
     assert "its accuracy is unknown" in alone
 
 
-def test_equal_runs_are_a_tie_and_no_gain_is_claimed():
+def test_summary_of_equal_runs_is_a_tie():
     same = [run("diff_drive", "ekf", 0.1, 4), run("skid_steer", "ekf", 0.1, 4)]
     text = verdict(score(same, track()), track())
     assert "ekf with diff_drive has the smallest error" in text
@@ -191,7 +191,7 @@ def test_equal_runs_are_a_tie_and_no_gain_is_claimed():
     assert "which motion model is better in it is not significant on this drive" in text
 
 
-def test_a_difference_made_by_one_stretch_of_the_drive_is_not_proven():
+def test_summary_difference_from_one_stretch_is_not_significant():
     """Equal but for one tenth of the drive, where the other run is far off: lower in the mean, and no evidence."""
     first, second = run("diff_drive", "ekf", 0.1, 5), run("skid_steer", "ekf", 0.1, 6)
     poses = second.trajectory.poses.copy()
@@ -205,14 +205,14 @@ def test_a_difference_made_by_one_stretch_of_the_drive_is_not_proven():
     assert "Not proven worse by this one drive: ekf with skid_steer" in text
 
 
-def test_a_difference_all_along_the_drive_is_proven_though_small():
+def test_summary_small_difference_all_along_is_significant():
     """5 % less noise everywhere is a difference of 5 %: the same draws, scaled."""
     pair = [run("diff_drive", "ekf", 0.100, 7), run("skid_steer", "ekf", 0.105, 7)]
     text = verdict(score(pair, relations()), relations())
     assert text.startswith("ekf with diff_drive is best")
 
 
-def test_how_often_equal_filters_are_told_apart():
+def test_summary_false_positive_rate_for_equal_filters_is_small():
     """Two runs of one quality, other noise: at most a few of 100 may be called different (2.5 % is promised, one side)."""
     called = 0
     for seed in range(100):
@@ -229,27 +229,27 @@ def test_how_often_equal_filters_are_told_apart():
         (1.0, "Its covariances are consistent"),
     ],
 )
-def test_nis_decides_what_is_said_of_covariances(scale, said):
+def test_summary_of_covariances_follows_the_nis(scale, said):
     results = score([run(nis=honest(scale=scale), noise=0.01), run(estimator="odometry", noise=0.5, seed=2)], track(yaws=False))
     text = verdict(results, track(yaws=False))
     assert said in text
     assert f"mean NIS {results[0].nis_mean:.3g}" in text
 
 
-def test_factor_of_overconfidence_is_the_one_in_sigma():
+def test_summary_overconfidence_factor_is_in_sigma():
     """All innovations three times what the filter believes: NIS nine times too large."""
     text = verdict(score([run(nis=honest(scale=9.0), noise=0.01)], track(yaws=False)), track(yaws=False))
     assert re.search(r"innovations (2\.9|3\.0|3\.1) times their sigma", text)
 
 
-def test_a_few_outliers_are_not_mistaken_for_a_filter_that_is_wrong_throughout():
+def test_summary_few_outliers_are_no_overconfidence():
     nis = honest()
     nis[::40] = 400.0
     text = verdict(score([run(nis=nis, noise=0.01)], track(yaws=False)), track(yaws=False))
     assert "some outliers make it" in text
 
 
-def test_nees_of_one_drive_convicts_only_beyond_the_band_of_one_sample():
+def test_summary_nees_of_one_drive_fails_only_outside_its_band():
     def told(nees):
         (result,) = score([run(noise=0.01)], track())
         return verdict([dataclasses.replace(result, nees_mean=nees)], track())
@@ -260,19 +260,19 @@ def test_nees_of_one_drive_convicts_only_beyond_the_band_of_one_sample():
     assert "larger than need be" in told(0.2)
 
 
-def test_untestable_and_missing_covariances_are_told():
+def test_summary_untestable_or_missing_covariances_are_reported():
     assert "could not be tested" in verdict(score([run(noise=0.1)], track(yaws=False)), track(yaws=False))
     assert "gives no covariance" in verdict(score([run(estimator="lidar", covariance=False, noise=0.1)], track()), track())
 
 
-def test_lidar_that_makes_things_worse_is_told():
+def test_summary_lidar_that_increases_the_error_is_reported():
     runs = [run(estimator="odometry", noise=0.01, seed=1), run(estimator="ekf", noise=0.5, seed=2, points=[(0, 0), (1, 1)])]
     text = verdict(score(runs, relations()), relations())
     assert text.startswith("Dead reckoning with diff_drive is best")
     assert "check its mount" in text
 
 
-def test_short_overlap_is_told():
+def test_summary_short_overlap_is_reported():
     whole = track()
     part = ReferenceTrack(whole.stamps_ns[:100], whole.positions[:100], whole.yaws[:100], source="/gps")
     results = score([run(noise=0.1)], part)
@@ -282,7 +282,7 @@ def test_short_overlap_is_told():
 # ---- choice of runs
 
 
-def test_wheelless_runs_are_shown_once_and_styles_tell_models_and_estimators_apart():
+def test_runs_without_wheels_are_plotted_once_in_distinct_styles():
     runs = [run(m, e, 0.1) for e in ("odometry", "lidar", "ekf", "graph") for m in ("diff_drive", "skid_steer")]
     lines = plotted_runs(score(runs, None))
     assert [line.label for line in lines].count("lidar") == 1
@@ -291,7 +291,7 @@ def test_wheelless_runs_are_shown_once_and_styles_tell_models_and_estimators_apa
     assert len({line.colour for line in lines}) == 4
 
 
-def test_best_baseline_and_map_are_chosen_by_error():
+def test_runs_best_baseline_and_map_are_those_of_least_error():
     results = [
         with_error(0.3, "odometry", "skid_steer"),
         with_error(0.4, "odometry", "diff_drive"),
@@ -310,7 +310,7 @@ def test_best_baseline_and_map_are_chosen_by_error():
 # ---- what is drawn
 
 
-def test_ellipse_has_the_sizes_and_direction_of_the_turned_covariance():
+def test_ellipse_has_size_and_direction_of_the_rotated_covariance():
     """Against the plain way: turn the covariance into the plane, then decompose it."""
     rng = np.random.default_rng(0)
     for _ in range(50):
@@ -326,7 +326,7 @@ def test_ellipse_has_the_sizes_and_direction_of_the_turned_covariance():
         assert e.center == (pose[0], pose[1])
 
 
-def test_two_sigma_ellipse_holds_86_percent_of_right_perturbations():
+def test_ellipse_of_two_sigma_contains_86_percent_of_samples():
     rng = np.random.default_rng(1)
     pose, cov = np.array([3.0, -2.0, 2.2]), np.diag([0.09, 0.0025, 1e-6])
     e = ellipse(pose, cov)
@@ -336,7 +336,7 @@ def test_two_sigma_ellipse_holds_86_percent_of_right_perturbations():
     assert np.mean(along**2 + across**2 <= 1.0) == pytest.approx(1.0 - math.exp(-2.0), abs=0.01)
 
 
-def test_runs_map_and_ellipses_are_drawn_in_the_references_plane():
+def test_figures_runs_map_and_ellipses_are_in_the_reference_plane():
     shift = np.array([100.0, -50.0, 1.0])
     whole = track()
     moved = se2.compose(shift, whole.poses)
@@ -353,7 +353,7 @@ def test_runs_map_and_ellipses_are_drawn_in_the_references_plane():
     assert (view.high > moved[:, :2].max(0)).all()
 
 
-def test_a_lost_run_does_not_shrink_the_others():
+def test_figures_limits_ignore_a_diverged_run():
     lost = run("diff_drive", "odometry")
     lost = dataclasses.replace(lost, trajectory=Trajectory(lost.trajectory.stamps_ns, lost.trajectory.poses * [1000.0, 1000.0, 1.0]))
     lines = plotted_runs(score([lost, run("skid_steer", "ekf", 0.05, 3)], relations()))
@@ -373,7 +373,7 @@ def test_thinned_paths_keep_ends_and_shape():
     assert thin_path(np.zeros((10_000, 2)), 0.1).tolist() == [0, 9_999]  # a robot that stands
 
 
-def test_thinned_series_keep_every_stretch_s_peak():
+def test_thinned_series_keep_each_peak():
     values = np.zeros(50_000)
     values[[7, 31_234, 49_999]] = [5.0, -3.0, 2.0]
     kept = thin_series(values)
@@ -381,7 +381,7 @@ def test_thinned_series_keep_every_stretch_s_peak():
     assert len(kept) <= 700
 
 
-def test_relations_bins_hold_every_relation_and_their_mean_is_the_score():
+def test_relation_bins_contain_every_relation_and_the_score_is_their_mean():
     r = relations(span=3)
     more = relations(span=60)
     both = Relations(
@@ -395,7 +395,7 @@ def test_relations_bins_hold_every_relation_and_their_mean_is_the_score():
     assert weights @ found.rotation_deg == pytest.approx(results[0].accuracy.relations.all.rotation_deg)
 
 
-def test_means_of_nis_are_of_equal_groups():
+def test_nis_means_are_of_equal_groups():
     nis = np.full(400, np.nan)
     nis[::2] = np.arange(200.0)
     shown, means = nis_means(plotted_runs(score([run(nis=nis), run(estimator="odometry")], None)), limit=7.8)
@@ -409,7 +409,7 @@ def test_means_of_nis_are_of_equal_groups():
 # ---- tables
 
 
-def test_table_holds_the_given_numbers_and_a_dash_for_what_is_missing():
+def test_table_has_the_given_numbers_and_a_dash_for_missing_ones():
     results, _ = cases()["track"]
     table = Text(page_of("track")).tables[0]
     assert table[0][1].startswith("ATE")
@@ -422,13 +422,13 @@ def test_table_holds_the_given_numbers_and_a_dash_for_what_is_missing():
     assert [row[nis] for row in table[1:]] == [MISSING, MISSING, f"{results[2].nis_mean:.2f}"]
 
 
-def test_positions_only_leave_out_headings_and_say_so():
+def test_table_of_positions_only_leaves_out_headings_with_a_note():
     text = Text(page_of("positions"))
     assert not any("heading" in head for head in text.tables[0][0])
     assert "positions only" in "".join(text.words)
 
 
-def test_relations_table_holds_every_group():
+def test_table_of_relations_has_every_group():
     both = relations(span=60)  # 30 s
     results = score([run(noise=0.1)], both)
     text = Text(page(HEAD, results, both))
@@ -437,7 +437,7 @@ def test_relations_table_holds_every_group():
     assert not any("under 20 s" in head for head in text.tables[0][0])
 
 
-def test_parameters_counts_notes_and_provenance_are_told():
+def test_page_lists_parameters_counts_notes_and_provenance():
     told = run(parameters={"gyro_bias_rad_per_s": (0.0012, 0.00004)}, counts={"slips": 12345}, noise=0.1)
     words = " ".join(Text(page(HEAD, score([told], None), None)).words)
     for expected in ("0.001200 ± 0.000040", "rad/s", "12,345", "3 scans were empty.", "c0ffee", "vaultbot", "2026-01-02 03:04:05 UTC"):
@@ -448,7 +448,7 @@ def test_parameters_counts_notes_and_provenance_are_told():
     ("value", "digits", "text"),
     [(None, 3, "–"), (math.nan, 3, "–"), (math.inf, 2, "∞"), (0.0, 2, "0.00"), (0.0004, 3, "< 0.001"), (1234.5, 1, "1,234.5")],  # noqa: RUF001
 )
-def test_numbers(value, digits, text):
+def test_format_number_has_the_significant_digits(value, digits, text):
     assert number(value, digits) == text
 
 
@@ -461,12 +461,12 @@ def test_numbers(value, digits, text):
         (3.0, 0.0, "3.0000 ± 0.0000"),
     ],
 )
-def test_plus_minus(mean, sigma, text):
+def test_format_plus_minus_has_the_digits_of_sigma(mean, sigma, text):
     cell = plus_minus(mean, sigma)
     assert cell.text + (f" e{cell.power}" if cell.power else "") == text
 
 
-def test_units_come_from_the_ends_of_names():
+def test_unit_is_that_of_the_name_suffix():
     assert [unit_of(name) for name in ("gyro_bias_rad_per_s", "wheel_clock_offset_s", "x_cr_m", "k_0")] == ["rad/s", "s", "m", ""]
 
 
@@ -513,7 +513,7 @@ def test_page_is_well_formed_and_loads_nothing(case):
     assert len(first) < 2_000_000
 
 
-def test_page_begins_and_ends_with_the_verdict():
+def test_page_starts_and_ends_with_the_summary():
     results, _ = cases()["track"]
     words = "".join(Text(page_of("track")).words)
     first, last = html.unescape(verdict(results, track())).split(". ")[0], verdict(results, track())
@@ -521,7 +521,7 @@ def test_page_begins_and_ends_with_the_verdict():
     assert words.rindex(last) > words.index("Sources and versions")
 
 
-def test_text_from_outside_is_escaped():
+def test_page_escapes_text_of_the_log():
     evil = "<script>alert('x')</script>&\"'"
     head = ReportHead(evil, evil, evil, 1.0, [evil], {evil: evil}, evil)
     bad = run(model=evil, estimator=evil + "2", noise=0.1, parameters={evil: (1.0, 0.1)}, counts={evil: 1})
@@ -532,7 +532,7 @@ def test_text_from_outside_is_escaped():
     assert Text(made).words.count(evil) >= 5
 
 
-def test_every_axis_has_its_unit_and_every_run_its_line():
+def test_figures_axes_have_units_and_each_run_a_line():
     results, _ = cases()["track"]
     made = page_of("track")
     for label in ("x [m]", "y [m]", "position error [m]", "heading error [deg]", "time since the first pose [s]"):
@@ -542,13 +542,13 @@ def test_every_axis_has_its_unit_and_every_run_its_line():
         assert f"var(--{line.colour}" in made
 
 
-def test_colours_follow_the_page_into_the_dark():
+def test_figures_have_the_colours_of_the_page_in_dark_mode():
     made = page_of("track")
     assert "prefers-color-scheme:dark" in made
     assert not re.findall(r"(?:fill|stroke): ?#(?!f{6}|f{3}\b)[0-9a-f]{3,6}", made)  # every colour is the page's to change
 
 
-def test_large_logs_make_small_pages():
+def test_page_of_a_large_log_is_small():
     n = 100_000
     rng = np.random.default_rng(0)
     stamps = np.arange(n, dtype=np.int64) * 10_000_000
@@ -563,7 +563,7 @@ def test_large_logs_make_small_pages():
     assert len(page(HEAD, score(big, reference), reference)) < 2_000_000
 
 
-def test_files_are_written_once_and_never_over(tmp_path):
+def test_page_existing_file_is_refused(tmp_path):
     results, reference = cases()["track"]
     write_report(tmp_path / "report.html", HEAD, results, reference)
     assert (tmp_path / "report.html").read_text(encoding="utf-8") == page_of("track")
@@ -574,7 +574,7 @@ def test_files_are_written_once_and_never_over(tmp_path):
         write_report(tmp_path / "no" / "report.html", HEAD, [], None)
 
 
-def test_overview_is_a_picture_without_date_and_the_same_every_time(tmp_path):
+def test_overview_has_no_date_and_the_same_bytes(tmp_path):
     results = score(three_runs(), track())
     for name in ("a.png", "b.png"):
         overview_png(tmp_path / name, HEAD, results, track())
@@ -587,7 +587,7 @@ def test_overview_is_a_picture_without_date_and_the_same_every_time(tmp_path):
     assert {(0, 114, 178), (213, 94, 0), (204, 121, 167)} <= colours  # a bar of each estimator
 
 
-def test_same_bytes_from_another_process_and_another_user_s_style(tmp_path):
+def test_overview_of_another_process_and_style_has_the_same_bytes(tmp_path):
     """A matplotlibrc of the user's must not reach the report."""
     (tmp_path / "matplotlibrc").write_text("axes.facecolor: red\nxtick.major.size: 30\naxes.labelpad: 40\nsvg.fonttype: path\n")
     code = "import hashlib; from tests.report.test_replay_page import page_of; print(hashlib.sha256(page_of('track').encode()).hexdigest())"
