@@ -198,10 +198,10 @@ def test_gyro_mount_that_contradicts_gravity_is_replaced(case):
     body_R_imu, gravity, mount = WRONG[case]
     found, past = turns(samples(12.0, body_R_imu, gravity), {"imu_link": mount})
     sworn = [t for _, _, t in found if t is not None]
-    told = next(i for i, (a, _, t) in enumerate(found) if t is not None and a > 0.3)
-    check_all_right(found[told:], 0.0)
+    decided = next(i for i, (a, _, t) in enumerate(found) if t is not None and a > 0.3)
+    check_all_right(found[decided:], 0.0)
     assert len(sworn) > 80
-    by_then = sum(abs(turned(b) - turned(a)) for a, b, _ in found[2 : told + 1])
+    by_then = sum(abs(turned(b) - turned(a)) for a, b, _ in found[2 : decided + 1])
     assert 0.4 < by_then < 0.7  # it waits for half a radian of turning by the wheels, and not longer
     (note,) = past.warnings()
     assert "imu_link" in note

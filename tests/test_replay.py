@@ -173,7 +173,7 @@ def test_replay_bad_scans_are_skipped(kind, tmp_path, capsys):
     found, _ = results(tmp_path / "out")
     assert found["diff_drive", "ekf"]["ate_rmse_m"] < 0.05
     assert np.isfinite(read_tum(tmp_path / "out" / "diff_drive_lidar.tum").poses).all()
-    told = {
+    warnings = {
         "backwards": "/scan",
         "jump": "/scan",
         "repeated": "/scan",
@@ -181,7 +181,7 @@ def test_replay_bad_scans_are_skipped(kind, tmp_path, capsys):
         "all nan": "without a usable point",
         "frame": "frame 'nobody_knows' sits on the robot: 69 scans of it were not used",
     }
-    assert told.get(kind, "") in capsys.readouterr().out
+    assert warnings.get(kind, "") in capsys.readouterr().out
 
 
 def test_replay_truncated_bag_ends_at_the_cut(tmp_path, capsys):
@@ -278,9 +278,9 @@ def a_setting_of_no_use(tmp_path):
 def test_replay_bad_input_is_refused_and_no_file_written(case, tmp_path, capsys):
     arguments, hint = case(tmp_path)
     assert main(["replay", *arguments, "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("skidloc: ")
-    assert hint in said
+    printed = capsys.readouterr().err
+    assert printed.startswith("skidloc: ")
+    assert hint in printed
     assert not (tmp_path / "out").exists()
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 

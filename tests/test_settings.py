@@ -25,7 +25,7 @@ ROOTS = (ReplayConfig, SimulationConfig, DiagnosisConfig, WindowConfig, Evaluate
 
 
 @pytest.mark.parametrize(
-    ("config", "values", "said"),
+    ("config", "values", "message"),
     [
         (StepConfig, {"max_step_s": [0, -1, 1e-12]}, "0.001 or more"),
         (StepConfig, {"no_lidar_step_s": [0], "lost_speed_m_s": [-1], "lost_rate_rad_s": [0]}, "above 0"),
@@ -54,10 +54,10 @@ ROOTS = (ReplayConfig, SimulationConfig, DiagnosisConfig, WindowConfig, Evaluate
         (GpsConfig, {"latitude_deg": [-90]}, "from -89 to 89"),
     ],
 )
-def test_settings_invalid_numbers_are_named(config, values, said):
+def test_settings_invalid_numbers_are_named(config, values, message):
     for name, wrong in values.items():
         for value in wrong:
-            with pytest.raises(SettingError, match=f"{name} of {config.__name__} is {value:g}; it must be {said}"):
+            with pytest.raises(SettingError, match=f"{name} of {config.__name__} is {value:g}; it must be {message}"):
                 config(**{name: value})
 
 

@@ -1,4 +1,4 @@
-"""From events to steps: no motion is lost, none is counted twice, and what was not heard is not claimed."""
+"""From events to steps: no motion is lost, none is counted twice, and time without samples is unknown."""
 
 from __future__ import annotations
 
@@ -156,10 +156,10 @@ def test_wheel_buffer_angles_unchanged_over_a_gap_are_standstill():
 
 def test_wheel_buffer_samples_not_finite_are_ignored(recwarn):
     plain = [wheel(0.0, (0, 0)), wheel(0.2, (0.4, 0.4))]
-    deaf = [plain[0], wheel(0.1), wheel(0.15, (np.inf, np.nan)), plain[1]]
+    invalid = [plain[0], wheel(0.1), wheel(0.15, (np.inf, np.nan)), plain[1]]
     assert all(
         np.array_equal(a, b)
-        for a, b in zip(history(plain).window(T0, T0 + 200 * MS, 0.5), history(deaf).window(T0, T0 + 200 * MS, 0.5), strict=True)
+        for a, b in zip(history(plain).window(T0, T0 + 200 * MS, 0.5), history(invalid).window(T0, T0 + 200 * MS, 0.5), strict=True)
     )
     assert not recwarn.list
 
@@ -280,7 +280,7 @@ def test_scan_before_late_wheels_waits():
     cutter, found = stepper(), []
     for event in [*samples[:11], scan(0.0), scan(0.3)]:
         found += steps_after(event, cutter)
-    assert [s.end_ns for s in found] == [T0]  # wheels were heard up to 0.2 s
+    assert [s.end_ns for s in found] == [T0]  # wheels were received up to 0.2 s
     for event in samples[11:]:
         found += steps_after(event, cutter)
         if event.stamp_ns >= T0 + 300 * MS:
@@ -296,11 +296,11 @@ def test_wheels_missing_give_a_wide_covariance_and_a_warning():
     found, cutter = cut(in_order(wheels(2.0), scans), config=config)
     check_contiguous(found)
     assert found[-1].end_ns == scans[-1].stamp_ns  # every scan is used, without wheels
-    heard = [s for s in found if s.end_ns <= T0 + 2500 * MS]
-    deaf = [s for s in found if s.start_ns >= T0 + 2500 * MS]
-    assert all(s.has_wheels for s in heard)
-    assert not any(s.has_wheels or s.is_standing for s in deaf)
-    for step in deaf:
+    with_wheels = [s for s in found if s.end_ns <= T0 + 2500 * MS]
+    without_wheels = [s for s in found if s.start_ns >= T0 + 2500 * MS]
+    assert all(s.has_wheels for s in with_wheels)
+    assert not any(s.has_wheels or s.is_standing for s in without_wheels)
+    for step in without_wheels:
         assert np.sqrt(step.predicted.cov[0, 0]) >= config.lost_speed_m_s * step.duration * 0.999
         assert np.sqrt(step.predicted.cov[2, 2]) >= config.lost_rate_rad_s * step.duration * 0.999
         assert not step.predicted.delta.any()
@@ -326,9 +326,9 @@ def test_wheels_missing_covariance_grows_with_the_duration(scan_s):
 def test_wheels_missing_with_gyro_gives_the_turn():
     imu = [ImuSample(T0 + 10 * MS * i, np.array([0.0, 0.0, 0.3]), np.array([0.0, 0.0, 9.81])) for i in range(600)]
     found, _ = cut(in_order(wheels(2.0), imu, [scan(0.1 * i) for i in range(1, 55)]))
-    deaf = [s for s in found if s.start_ns >= T0 + 2500 * MS]
-    assert deaf
-    for step in deaf:
+    without_wheels = [s for s in found if s.start_ns >= T0 + 2500 * MS]
+    assert without_wheels
+    for step in without_wheels:
         np.testing.assert_allclose(step.twist, [0.0, 0.0, 0.3], atol=1e-9)
 
 
@@ -614,7 +614,7 @@ def test_step_length_is_zero_only_at_the_first_scan():
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda: WheelSample(7, NAN, np.zeros(4)), "WheelSample at 7 ns: position has shape (4,); it must be an array of shape (2,)"),
         (lambda: WheelSample(7, [1.0, 1.0], NAN), "velocity is a list; it must be an array of shape (2,)"),
@@ -632,8 +632,8 @@ def test_step_length_is_zero_only_at_the_first_scan():
         (lambda: ImuSample(7, np.zeros(3), np.array([0.0, 0.0, np.inf])), "linear_acceleration holds inf"),
     ],
 )
-def test_events_with_invalid_values_are_refused_by_the_constructor(make, said):
-    with pytest.raises(EventError, match=re.escape(said)):
+def test_events_with_invalid_values_are_refused_by_the_constructor(make, message):
+    with pytest.raises(EventError, match=re.escape(message)):
         make()
 
 

@@ -40,7 +40,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("[models.skidsteer]\nk_0 = 1.0", r"unknown entry skidsteer \(did you mean skid_steer\?\)"),
         ("[models.skid_steer]\nk0 = 1.0", r"\[models.skid_steer\]: unknown entry k0 \(did you mean k_0\?\)"),
@@ -56,10 +56,10 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (f"{'n' * 3000} = 1", "unknown entry n{60}\\.\\.\\.;"),
     ],
 )
-def test_robot_file_with_a_misspelt_key_is_refused_with_the_nearest(text: str, said: str) -> None:
+def test_robot_file_with_a_misspelt_key_is_refused_with_the_nearest(text: str, message: str) -> None:
     head = 'name = "r"\n[geometry]\nwheel_radius_m = 0.1\ntrack_width_m = 0.5\nwheelbase_m = 0.5\nmass_kg = 50\n'
     whole = f"{text}\n{head}" if "=" in text.split("\n")[0] else f"{head}{text}\n"
-    with pytest.raises(RobotError, match=said):
+    with pytest.raises(RobotError, match=message):
         parse_robot(whole, "r.toml")
 
 

@@ -37,7 +37,7 @@ TRUTH = make_model("friction", VAULTBOT)
 
 def run(tmp_path: Path, *arguments: object) -> dict[str, Any]:
     """The command's JSON; it must succeed."""
-    path = tmp_path / "told.json"
+    path = tmp_path / "result.json"
     path.unlink(missing_ok=True)
     assert main(["calibrate", *map(str, arguments), "--json", str(path)]) == 0
     return json.loads(path.read_text(encoding="utf-8"))
@@ -54,7 +54,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 def test_calibrate_regressions_are_those_of_the_thesis(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "robot.toml"
-    told = run(tmp_path, GRID, "--robot", "vaultbot", "--out", out)
+    result = run(tmp_path, GRID, "--robot", "vaultbot", "--out", out)
     printed = capsys.readouterr().out
     for number in (
         "2.1722 x_G -0.0635",
@@ -69,25 +69,25 @@ def test_calibrate_regressions_are_those_of_the_thesis(tmp_path: Path, capsys: p
     lines = [line.split() for line in printed.splitlines()]
     assert ["-0.06", "-1.2750", "0.0156"] in lines  # Table 4-7's first and last
     assert ["0.12", "-0.1300", "-0.0072"] in lines
-    assert told["rotations"] == 68
+    assert result["rotations"] == 68
     by_study = {v.variant: (v.ratio, v.x_cr, v.y_cr) for v in thesis_regressions.variant_errors()}
-    for name, rms in told["rms"].items():
+    for name, rms in result["rms"].items():
         if name.split()[0] in by_study:  # the study takes the thesis's rounded coefficients
             np.testing.assert_allclose(rms, by_study[name.split()[0]], atol=2e-4)
     read_back = make_model("skid_steer", load_robot(out))
-    assert dict(zip(read_back.param_names, read_back.nominal, strict=True)) == {n: p["value"] for n, p in told["parameters"].items()}
+    assert dict(zip(read_back.param_names, read_back.nominal, strict=True)) == {n: p["value"] for n, p in result["parameters"].items()}
     assert load_robot(out).arms == VAULTBOT.arms
 
 
 def test_calibrate_friction_on_rotations_fits_the_thesis_grid(tmp_path: Path) -> None:
     """Another solver, other weights, poses for twists: the study's four numbers, within its own sigmas."""
-    told = run(tmp_path, GRID, "--robot", "vaultbot", "--model", "friction")
+    result = run(tmp_path, GRID, "--robot", "vaultbot", "--model", "friction")
     study = friction_grid.fitted()[0]
     for name, value, sigma in zip(study.names, study.values, friction_grid.jackknife_sigma(), strict=True):
-        assert told["parameters"][name]["value"] == pytest.approx(value, abs=2 * sigma), name
-        assert 0 < told["parameters"][name]["sigma"] < 3 * sigma
-    before, after, gain = (told["errors"]["position_m"][key] for key in ("before", "after", "gain"))
-    assert told["heldout"]
+        assert result["parameters"][name]["value"] == pytest.approx(value, abs=2 * sigma), name
+        assert 0 < result["parameters"][name]["sigma"] < 3 * sigma
+    before, after, gain = (result["errors"]["position_m"][key] for key in ("before", "after", "gain"))
+    assert result["heldout"]
     assert after[0] < before[0] / 4
     assert gain[1] > 0
 
@@ -125,15 +125,17 @@ def shifted_slope(bag: Path) -> tuple[float, float]:
 
 
 def test_calibrate_husky_gyro_only_fits_k_and_no_distance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = run(tmp_path, HUSKY, "--out", tmp_path / "husky.toml", "--export", "diff_drive_controller", "--export-out", tmp_path / "c.yaml")
-    k = told["parameters"]["k_0"]
+    result = run(
+        tmp_path, HUSKY, "--out", tmp_path / "husky.toml", "--export", "diff_drive_controller", "--export-out", tmp_path / "c.yaml"
+    )
+    k = result["parameters"]["k_0"]
     slope, shift = shifted_slope(HUSKY)
     assert k["value"] == pytest.approx(slope, rel=0.02)
     assert 0.0026 < k["sigma"] < 0.012  # not below the half percent to which the gyro's scale is known
-    assert told["parameters"]["wheel_time_offset"]["value"] == pytest.approx(shift, abs=0.03)
-    assert {held["parameter"] for held in told["held"]} == {"x_cr_0", "y_cr_0", "wheel_radius_scale"}
-    assert set(told["errors"]) == {"heading_deg"}
-    assert told["errors"]["heading_deg"]["gain"][1] > 0  # held out
+    assert result["parameters"]["wheel_time_offset"]["value"] == pytest.approx(shift, abs=0.03)
+    assert {held["parameter"] for held in result["held"]} == {"x_cr_0", "y_cr_0", "wheel_radius_scale"}
+    assert set(result["errors"]) == {"heading_deg"}
+    assert result["errors"]["heading_deg"]["gain"][1] > 0  # held out
     assert "record a LiDAR or a reference" in capsys.readouterr().out
     # What is written drives as what was fitted.
     p = YAML(typ="safe").load((tmp_path / "c.yaml").read_text())["diff_drive_controller"]["ros__parameters"]
@@ -142,10 +144,10 @@ def test_calibrate_husky_gyro_only_fits_k_and_no_distance(tmp_path: Path, capsys
 
 
 def test_calibrate_gyro_only_refuses_unobservable_parameters(capsys: pytest.CaptureFixture[str]) -> None:
-    said = refused(capsys, HUSKY, "--model", "diff_drive", "--fit", "wheel_radius,wheel_separation_multiplier")
-    assert "cannot be told apart" in said
-    said = refused(capsys, HUSKY, "--fit", "x_cr_0")
-    assert "x_cr_0 does not show" in said
+    printed = refused(capsys, HUSKY, "--model", "diff_drive", "--fit", "wheel_radius,wheel_separation_multiplier")
+    assert "cannot be told apart" in printed
+    printed = refused(capsys, HUSKY, "--fit", "x_cr_0")
+    assert "x_cr_0 does not show" in printed
 
 
 @pytest.fixture(scope="module")
@@ -184,15 +186,15 @@ def heading_errors(robot_file: str) -> np.ndarray:
 
 
 def test_calibrate_scan_matching_improves_an_unseen_drive(tmp_path: Path, aces_part: Path) -> None:
-    told = run(tmp_path, aces_part, "--robot", "aces", "--model", "icr", "--out", tmp_path / "aces.toml")
-    assert told["witness"] == {"part": "scan matching of /scan"}
-    track, sigma = told["turning"]["effective_track_m"]
+    result = run(tmp_path, aces_part, "--robot", "aces", "--model", "icr", "--out", tmp_path / "aces.toml")
+    assert result["witness"] == {"part": "scan matching of /scan"}
+    track, sigma = result["turning"]["effective_track_m"]
     assert sigma < 0.01
     assert track == pytest.approx(0.5, abs=0.02)  # it has two wheels and does not skid: its own odometry's track
-    assert told["turning"]["forward_scale"][0] == pytest.approx(1.0, abs=0.03)
+    assert result["turning"]["forward_scale"][0] == pytest.approx(1.0, abs=0.03)
     before, after = (np.sqrt(np.mean(heading_errors(str(name)) ** 2)) for name in ("aces", tmp_path / "aces.toml"))
     assert after < 1.05 * before  # a robot that was calibrated well stays so
-    assert told["errors"]["heading_deg"]["gain"][1] > 0
+    assert result["errors"]["heading_deg"]["gain"][1] > 0
 
 
 # --- made logs: the truth is friction, what is fitted is not ----------------------------------------------------------------------
@@ -243,15 +245,15 @@ def test_calibrate_reference_fits_k_and_center_of_rotation_by_cg(tmp_path: Path)
         stamp = START + i * S // RATE
         records.append(("/mocap", bags.pose_stamped(stamp, *(poses[i] + rng.normal(0, [1e-3, 1e-3, 5e-4]))), stamp))
     bag = bags.write_mcap(tmp_path / "run.mcap", sorted(records, key=lambda r: r[2]))
-    told = run(tmp_path, bag, "--robot", "vaultbot", "--reference", "/mocap", "--out", tmp_path / "robot.toml")
-    assert told["witness"] == {"run.mcap": "reference /mocap"}
+    result = run(tmp_path, bag, "--robot", "vaultbot", "--reference", "/mocap", "--out", tmp_path / "robot.toml")
+    assert result["witness"] == {"run.mcap": "reference /mocap"}
     model = make_model("skid_steer", load_robot(tmp_path / "robot.toml"))
     k, x_cr, _ = model.rotation(np.array(cgs), model.nominal)
     want_k, want_x = np.transpose([in_place(at) for at in cgs])
     np.testing.assert_allclose(x_cr, want_x, atol=0.01)  # the slope is that of the physics, 2.17, by its line
     xs = [x for x, _ in cgs]
     np.testing.assert_allclose(k, np.polyval(np.polyfit(xs, want_k, 2), xs), rtol=0.015)  # the physics is no parabola, but 4.21 is
-    assert told["parameters"]["x_cr_1"]["value"] == pytest.approx(np.polyfit(xs, want_x, 1)[0], rel=0.05)
+    assert result["parameters"]["x_cr_1"]["value"] == pytest.approx(np.polyfit(xs, want_x, 1)[0], rel=0.05)
 
 
 def room_scans(poses: np.ndarray, lidar_x: float) -> list[Record]:
@@ -335,14 +337,14 @@ def test_calibrate_out_of_every_model_replays(tmp_path: Path, name: str) -> None
     """Fitted, written, read: the very numbers, and the ties among them."""
     table = tmp_path / "w.csv"
     table.write_text(windows_text(made_windows("icr")))
-    told = run(tmp_path, table, "--robot", "vaultbot", "--model", name, "--out", tmp_path / "new" / "robot.toml")
+    result = run(tmp_path, table, "--robot", "vaultbot", "--model", name, "--out", tmp_path / "new" / "robot.toml")
     robot = load_robot(tmp_path / "new" / "robot.toml")
     model = make_model(name, robot)
     read = dict(zip(model.param_names, model.nominal, strict=True))
     read["wheel_radius_scale"] = robot.geometry.wheel_radius_m / VAULTBOT.geometry.wheel_radius_m - 1.0
-    for parameter, entry in told["parameters"].items():
+    for parameter, entry in result["parameters"].items():
         assert read[parameter] == pytest.approx(entry["value"], rel=1e-12), parameter
-    assert told["parameters"]
+    assert result["parameters"]
     assert "# +- " in (tmp_path / "new" / "robot.toml").read_text()
 
 
@@ -367,10 +369,10 @@ def test_calibrate_several_tables_are_fitted_jointly_and_scored_alone(tmp_path: 
         ]
         paths.append(tmp_path / name)
         paths[-1].write_text(windows_text(slower))
-    told = run(tmp_path, *paths, "--robot", "vaultbot", "--model", "diff_drive")
-    floor, snow = (told["by_source"][path.name]["effective_track_m"][0] for path in paths)
+    result = run(tmp_path, *paths, "--robot", "vaultbot", "--model", "diff_drive")
+    floor, snow = (result["by_source"][path.name]["effective_track_m"][0] for path in paths)
     assert snow / floor == pytest.approx(1.25, rel=0.02)
-    assert floor < told["turning"]["effective_track_m"][0] < snow
+    assert floor < result["turning"]["effective_track_m"][0] < snow
     printed = capsys.readouterr().out
     assert "by each alone" in printed
     assert "snow.csv" in printed
@@ -380,9 +382,9 @@ def test_calibrate_husky_windows_fit(tmp_path: Path) -> None:
     """The DRIVE data set as a table: as well as the study that knows the data set, within 5 %."""
     path = tmp_path / "drive.csv"
     path.write_text(windows_text(drive_husky.maneuvers(mended=True)))
-    told = run(tmp_path, path, "--model", "full_linear")
-    assert told["maneuvers"] == 603
-    before, after = (told["errors"]["position_m"][key][0] for key in ("before", "after"))
+    result = run(tmp_path, path, "--model", "full_linear")
+    assert result["maneuvers"] == 603
+    before, after = (result["errors"]["position_m"][key][0] for key in ("before", "after"))
     assert after < 0.24 < 0.3 < before
 
 
@@ -396,10 +398,10 @@ def standing_log(tmp_path: Path) -> Path:
 
 
 def test_calibrate_log_without_motion_advises_a_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refused(capsys, standing_log(tmp_path), "--robot", "vaultbot")
-    assert "no motion to calibrate on" in said
-    assert "4 standing still" in said
-    assert "turning in place to each side" in said
+    printed = refused(capsys, standing_log(tmp_path), "--robot", "vaultbot")
+    assert "no motion to calibrate on" in printed
+    assert "4 standing still" in printed
+    assert "turning in place to each side" in printed
 
 
 def test_calibrate_log_without_motion_reference_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -419,11 +421,11 @@ def test_calibrate_straight_driving_leaves_turning_undetermined(tmp_path: Path, 
     pose, cov = np.array([[0.66, 0.0, 0.0]]), np.diag([1e-4] * 3)
     straight = [Maneuver(np.full(20, 0.1), np.full((20, 2), 2.0), pose, np.array([20]), cov=cov, group=str(i)) for i in range(6)]
     table.write_text(windows_text(straight))
-    told = run(tmp_path, table, "--robot", "vaultbot")
-    held = {each["parameter"]: each["why"] for each in told["held"]}
+    result = run(tmp_path, table, "--robot", "vaultbot")
+    held = {each["parameter"]: each["why"] for each in result["held"]}
     assert set(held) == {"k_0", "x_cr_0", "y_cr_0"}
     assert "turning in place" in held["k_0"]
-    assert told["parameters"]["wheel_radius_scale"]["value"] == pytest.approx(0.66 / (4.0 * 0.164) - 1.0, abs=1e-6)
+    assert result["parameters"]["wheel_radius_scale"]["value"] == pytest.approx(0.66 / (4.0 * 0.164) - 1.0, abs=1e-6)
     assert "k_0: k_0 does not show" in capsys.readouterr().out
 
 
@@ -439,9 +441,9 @@ def test_calibrate_skid_steer_fits_the_radius_if_distance_is_measured(tmp_path: 
         windows.append(Maneuver(np.full(20, 0.1), q, measured, np.array([20]), cov=np.diag([1e-6] * 3), group=str(i)))
     table, out = tmp_path / "w.csv", tmp_path / "robot.toml"
     table.write_text(windows_text(windows))
-    told = run(tmp_path, table, "--robot", "vaultbot", "--out", out)
-    assert told["recommended"]
-    assert told["parameters"]["wheel_radius_scale"]["value"] == pytest.approx(-0.04, abs=0.003)
+    result = run(tmp_path, table, "--robot", "vaultbot", "--out", out)
+    assert result["recommended"]
+    assert result["parameters"]["wheel_radius_scale"]["value"] == pytest.approx(-0.04, abs=0.003)
     assert load_robot(out).geometry.wheel_radius_m == pytest.approx(0.164 * 0.96, rel=0.003)
     assert load_robot(out).models["skid_steer"]["k_0"] == pytest.approx(true.nominal[0], rel=0.01)
 
@@ -457,9 +459,9 @@ def test_calibrate_fit_worse_on_held_out_data_is_not_recommended(tmp_path: Path,
         windows.append(Maneuver(np.full(20, 0.1), q, measured, np.array([20]), cov=np.diag([2.5e-3] * 3), group=str(i)))
     table, out = tmp_path / "w.csv", tmp_path / "robot.toml"
     table.write_text(windows_text(windows))
-    told = run(tmp_path, table, "--robot", "vaultbot", "--model", "diff_drive", "--out", out)
-    assert not told["recommended"]
-    assert told["gain"] < 1.0
+    result = run(tmp_path, table, "--robot", "vaultbot", "--model", "diff_drive", "--out", out)
+    assert not result["recommended"]
+    assert result["gain"] < 1.0
     printed = capsys.readouterr().out
     assert "NOT RECOMMENDED" in printed
     assert "The old values are kept" in printed

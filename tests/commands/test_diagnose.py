@@ -92,7 +92,7 @@ def test_diagnose_short_table_is_undecidable(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "empty"),
         ("window,dt_s\n1,0.1\n", "left_rad_per_s"),
@@ -101,12 +101,12 @@ def test_diagnose_short_table_is_undecidable(tmp_path: Path) -> None:
         ("cg_x_m,cg_y_m,rotation_ratio\n0,0,1\n", "cor_x_m"),
     ],
 )
-def test_diagnose_malformed_tables_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str) -> None:
+def test_diagnose_malformed_tables_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, message: str) -> None:
     table = tmp_path / "table.csv"
     table.write_text(text)
     assert main(["diagnose", str(table), "--robot", "vaultbot"]) == 2
     complaint = capsys.readouterr().err
-    assert said in complaint
+    assert message in complaint
     assert "Traceback" not in complaint
 
 

@@ -101,12 +101,12 @@ def test_compare_prints_means_and_differences(table, capsys, tmp_path):
     assert odometry["low"] <= odometry["mean"] <= odometry["high"]
     assert len(content["differences"]) == 1
     assert compare(tmp_path / "t.csv", "--estimator", "odometry", "--model", "diff_drive,skid_steer") == 0
-    said = " ".join(capsys.readouterr().out.split())
+    printed = " ".join(capsys.readouterr().out.split())
     assert re.search(
         r"The difference of dead reckoning with (\w+) and dead reckoning with (\w+) is not significant: the first is better on \d of 3",
-        said,
+        printed,
     )
-    assert "3 logs cannot show it: p is at least 0.25 for one pair. Take at least 6." in said
+    assert "3 logs cannot show it: p is at least 0.25 for one pair. Take at least 6." in printed
     assert (tmp_path / "t.html").read_text().startswith("<!DOCTYPE html>")
 
 
@@ -135,8 +135,8 @@ def test_compare_log_under_several_names_counts_once(table, tmp_path, monkeypatc
     otherwise = [os.path.join("..", logs(3)[0].parent.name, logs(3)[0].name), copy, linked]
     assert compare(tmp_path / "t.csv", of=[*logs(3), *otherwise, logs(3)[0]]) == 0
     assert (tmp_path / "t.csv").read_bytes() == table.read_bytes()
-    said = capsys.readouterr().out.splitlines()[:3]
-    assert said == [f"{other} is the same log as {first}: counted once." for other, first in zip(otherwise, logs(3), strict=True)]
+    printed = capsys.readouterr().out.splitlines()[:3]
+    assert printed == [f"{other} is the same log as {first}: counted once." for other, first in zip(otherwise, logs(3), strict=True)]
 
 
 def test_compare_half_a_table_is_completed(table, tmp_path):
@@ -154,9 +154,9 @@ def test_compare_broken_log_is_reported_and_the_others_finished(table, tmp_path,
     rows = rows_of(tmp_path / "t.csv")
     assert [r["status"] for r in rows] == ["failed"] * 2 + ["ok"] * 6 + ["failed"] * 2
     assert "no such file" in rows[-1]["error"]
-    said = " ".join(capsys.readouterr().out.split())
-    assert "absent.mcap" in said
-    assert "4 of 10 runs failed, on 2 logs." in said
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "absent.mcap" in printed
+    assert "4 of 10 runs failed, on 2 logs." in printed
     report = (tmp_path / "t.html").read_text()
     assert "no such file" in report
     assert report.count("failed</td>") == 4
@@ -227,7 +227,7 @@ def test_compare_interrupted_leaves_no_process():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["--estimator", "magic"], "no estimator 'magic'"),
         (["--model", "magic"], "magic"),
@@ -238,19 +238,19 @@ def test_compare_interrupted_leaves_no_process():
         (["--processes", "-3"], "--processes is -3"),
     ],
 )
-def test_compare_bad_arguments_are_refused(arguments, said, tmp_path, capsys):
+def test_compare_bad_arguments_are_refused(arguments, message, tmp_path, capsys):
     assert compare(tmp_path / "t.csv", *arguments) == 2
     shown = capsys.readouterr().err
-    assert said in shown
+    assert message in shown
     assert "Traceback" not in shown
 
 
 @pytest.mark.parametrize("metric", ["beauty", "log", "notes", "corrections"])
 def test_compare_unknown_or_text_metrics_are_refused(metric, table, capsys):
     assert compare(table, "--metric", metric) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert f"no result has a number '{metric}'" in said
-    assert "ate_rmse_m" in said
+    printed = " ".join(capsys.readouterr().err.split())
+    assert f"no result has a number '{metric}'" in printed
+    assert "ate_rmse_m" in printed
 
 
 def test_compare_file_that_is_no_table_is_not_overwritten(tmp_path, capsys):
@@ -301,9 +301,9 @@ def test_compare_parquet_with_failures_is_read_again(tmp_path):
 def test_compare_parquet_without_its_extra_names_it(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     assert compare(tmp_path / "t.parquet") == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert "pip install 'skidloc[parquet]'" in said
-    assert "Or name a .csv." in said
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "pip install 'skidloc[parquet]'" in printed
+    assert "Or name a .csv." in printed
 
 
 def test_compare_folder_gets_table_and_report(table, tmp_path, capsys):
@@ -388,15 +388,15 @@ def start(*command):
 
 
 def read_until(process, pattern, seconds=90.0):
-    end, said = time.monotonic() + seconds, ""
+    end, printed = time.monotonic() + seconds, ""
     while time.monotonic() < end:
         line = process.stdout.readline()
-        said += line
+        printed += line
         if (found := re.search(pattern, line)) is not None:
             return found
         if not line and process.poll() is not None:
             break
-    pytest.fail(said)
+    pytest.fail(printed)
 
 
 @contextmanager
@@ -433,8 +433,8 @@ def test_dask_killed_worker_gives_the_same_table(table, tmp_path):
     with cluster(2) as (address, _, workers):
         running = compare_until_a_log_is_done(out, address)
         workers[0].send_signal(signal.SIGKILL)
-        said = running.communicate(timeout=120)[0]
-    assert running.returncode == 0, said
+        printed = running.communicate(timeout=120)[0]
+    assert running.returncode == 0, printed
     assert out.read_bytes() == table.read_bytes()
 
 
@@ -443,9 +443,11 @@ def test_dask_lost_scheduler_ends_the_comparison_and_keeps_results(table, tmp_pa
     with cluster(1) as (address, scheduler, _):
         running = compare_until_a_log_is_done(out, address)
         scheduler.send_signal(signal.SIGKILL)
-        said = running.communicate(timeout=120)[0]
-    assert running.returncode == 2, said
-    assert re.fullmatch(rf"skidloc: the Dask scheduler at {address} went away \(.+\)\. What was done is kept: run the same again\.\n", said)
+        printed = running.communicate(timeout=120)[0]
+    assert running.returncode == 2, printed
+    assert re.fullmatch(
+        rf"skidloc: the Dask scheduler at {address} went away \(.+\)\. What was done is kept: run the same again\.\n", printed
+    )
     done = rows_of(out)
     assert 0 < len(done) < 6
     assert all(row in rows_of(table) for row in done)
@@ -461,9 +463,9 @@ def test_dask_missing_scheduler_is_refused(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(dask_executor, "_TIMEOUT_S", 1)
     for address in ("tcp://127.0.0.1:1", "nonsense", "nonsense://x:1", "tcp://127.0.0.1"):
         assert compare(tmp_path / "t.csv", "--dask", address) == 2
-        said = " ".join(capsys.readouterr().err.split())
-        assert f"no Dask scheduler answers at {address}" in said or f"'{address}' is not an address" in said
-        assert "Traceback" not in said
+        printed = " ".join(capsys.readouterr().err.split())
+        assert f"no Dask scheduler answers at {address}" in printed or f"'{address}' is not an address" in printed
+        assert "Traceback" not in printed
 
 
 def test_dask_missing_extra_is_named(tmp_path, capsys, monkeypatch):

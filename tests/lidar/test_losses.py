@@ -18,8 +18,8 @@ from localization.report.runs import best_run, plotted_runs
 from localization.report.summary import verdict
 from localization.ros.diagnostics import ERROR, OK, WARN, Health
 from motion_models.registry import make_model
+from tests.helpers.report import HEAD, relations, run, track
 from tests.helpers.rooms import ROBOT
-from tests.report.test_replay_page import HEAD, relations, run, track
 
 S = 10**9
 ALL_LOST = LidarLosses(1000, 400, 0.6, 60.0, 7.0, 0.0, {"lost": 600})

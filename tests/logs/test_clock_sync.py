@@ -383,10 +383,10 @@ def test_clock_sync_scans_of_a_bad_log_are_ordered_and_notes_complete(tmp_path: 
         "/scan: 1 message dropped (stamp that fits neither its neighbours nor the time of recording).",
         "/scan: 100 messages stamped after a jump of the clock, moved back by it.",
     ]
-    said = " ".join(inspect_log(log).problems)
-    assert "/imu/data: 3 of 300 messages have no stamp" in said
-    assert "/scan: 2 of 300 messages are stamped before the one before them" not in said  # the wild one, and that alone
-    assert "/scan: 1 of 300 messages are stamped before the one before them" in said
+    problems = " ".join(inspect_log(log).problems)
+    assert "/imu/data: 3 of 300 messages have no stamp" in problems
+    assert "/scan: 2 of 300 messages are stamped before the one before them" not in problems  # the wild one, and that alone
+    assert "/scan: 1 of 300 messages are stamped before the one before them" in problems
 
 
 def test_clock_sync_references_are_ordered_by_the_same_rules(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from localization.errors import LogError
 from localization.logs import inspect_log, open_log
 from motion_models.robot import load_robot
 from tests.helpers import bags, fuzz
-from tests.helpers.hostile_logs import BAD, FILE_FAULTS, SENSOR_FAULTS, SOURCES, Case, cases, run_case, truth_of, write_case
+from tests.helpers.hostile_logs import BAD, FILE_FAULTS, SENSOR_FAULTS, SOURCES, Case, cases, reference_of, run_case, write_case
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +33,9 @@ DECIDED_IN_LOGS = (
 def test_sensor_fault_decided_in_logs_is_never_silently_wrong(tmp_path: Path, truths: Path, fault: str) -> None:
     source = SOURCES[0]
     log = write_case(Case(0, source.name, "mcap", fault, ""), tmp_path, seed=0)
-    outcome = run_case(log, source.robot, truth_of(source.name, truths), tmp_path / "out")
+    outcome = run_case(log, source.robot, reference_of(source.name, truths), tmp_path / "out")
     assert outcome.kind not in BAD, outcome
-    assert outcome.said != ""
+    assert outcome.message != ""
 
 
 @pytest.mark.parametrize("form", bags.FORMATS)

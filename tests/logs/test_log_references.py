@@ -258,9 +258,9 @@ def test_info_log_with_gaps_reports_gaps_frames_and_missing_topics(tmp_path: Pat
     assert scan.frame_id == "strange_frame"
     camera = next(topic for topic in info.topics if topic.topic == "/camera")
     assert (camera.count, camera.used_as, camera.first_stamp_ns) == (200, None, None)
-    said = "\n".join(info.problems)
+    problems = "\n".join(info.problems)
     for expected in ("no wheels", "no IMU", "'strange_frame'", "[mounts.strange_frame]", "1 gap, the longest 3.10 s long"):
-        assert expected in said
+        assert expected in problems
 
 
 def test_info_truncated_log_reports_truncation(tmp_path: Path) -> None:
@@ -281,9 +281,9 @@ def test_info_sensor_that_ends_early_is_reported(tmp_path: Path) -> None:
         records.append(("/odom", bags.odometry(t), t))
         if 50 <= i < 200:
             records.append(("/scan", bags.laser_scan(t), t))
-    said = "\n".join(inspect_log(log_of(tmp_path, records)).problems)
-    assert "/scan begins 5.0 s after the other sensors" in said
-    assert "/scan ends 10.0 s before the other sensors" in said
+    problems = "\n".join(inspect_log(log_of(tmp_path, records)).problems)
+    assert "/scan begins 5.0 s after the other sensors" in problems
+    assert "/scan ends 10.0 s before the other sensors" in problems
 
 
 def test_info_reports_the_reference_that_replay_uses(tmp_path: Path) -> None:

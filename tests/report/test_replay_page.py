@@ -10,7 +10,6 @@ import os
 import re
 import subprocess
 import sys
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -20,122 +19,13 @@ from PIL import Image
 from localization.errors import OutputError
 from localization.evaluation.references import ReferenceTrack, Relations, with_noise
 from localization.evaluation.scores import Result, score
-from localization.pipeline import Run
 from localization.report.figure_data import map_view, nis_means, spans
 from localization.report.replay_page import ReportHead, overview_png, page, verdict, write_report
 from localization.report.runs import baseline_run, best_run, ellipse, plotted_runs, run_with_map, thin_path, thin_series
 from localization.report.tables import MISSING, number, plus_minus, unit_of
 from localization.trajectory import Trajectory
 from motion_models import se2
-
-SECOND = 10**9
-HEAD = ReportHead("corridor.mcap", "vaultbot", "2026-01-02 03:04:05 UTC", 200.0, ["3 scans were empty."], {"skidloc": "0.1.0"}, "c0ffee")
-
-
-def drive(n=400, turns=2.0):
-    """Laps on a circle of 5 m radius, one pose each half second."""
-    angle = np.linspace(0.0, 2.0 * math.pi * turns, n)
-    poses = np.column_stack([5.0 * np.sin(angle), 5.0 - 5.0 * np.cos(angle), angle])
-    return np.arange(n, dtype=np.int64) * (SECOND // 2), poses
-
-
-def run(
-    model="diff_drive",
-    estimator="ekf",
-    noise=0.0,
-    seed=0,
-    nis=None,
-    covariance=True,
-    n=400,
-    points=(),
-    parameters=(),
-    counts=(),
-    warnings=(),
-):
-    stamps, poses = drive(n)
-    rng = np.random.default_rng(seed)
-    poses = se2.compose(poses, se2.exp(rng.normal(size=(n, 3)) * [noise, noise, 0.1 * noise]))
-    spread = np.diag([0.04, 0.01, 0.001]) * np.linspace(0.0, 1.0, n)[:, None, None] + 1e-6 * np.eye(3)
-    return Run(
-        model=model,
-        estimator=estimator,
-        trajectory=Trajectory(stamps, poses, spread if covariance else None),
-        twists=np.zeros((n, 3)),
-        twist_covariances=np.zeros((n, 3, 3)),
-        nis=np.full(n, np.nan) if nis is None else np.asarray(nis, dtype=float),
-        parameters=dict(parameters),
-        counts=dict(counts),
-        map_points=np.array(points, dtype=float).reshape(-1, 2),
-        seconds=1.0,
-        warnings=warnings,
-    )
-
-
-def track(yaws=True):
-    stamps, poses = drive()
-    return ReferenceTrack(stamps, poses[:, :2], poses[:, 2] if yaws else None, source="/ground_truth/odom")
-
-
-def relations(span=8):
-    stamps, poses = drive()
-    start = np.arange(0, 400 - span)
-    return Relations(stamps[start], stamps[start + span], se2.between(poses[start], poses[start + span]), source="hand.relations")
-
-
-def honest(n=400, scale=1.0, seed=5):
-    return scale * np.random.default_rng(seed).chisquare(3, n)
-
-
-def three_runs():
-    return [
-        run("diff_drive", "odometry", 0.5, 1),
-        run("skid_steer", "lidar", 0.8, 2, points=[(0, 0), (1, 1)]),
-        run("skid_steer", "ekf", 0.05, 3, nis=honest(), points=np.random.default_rng(9).uniform(-8, 12, (500, 2))),
-    ]
-
-
-def with_error(value, estimator="ekf", model="diff_drive"):
-    """A result whose ATE is ``value`` whatever its poses say."""
-    result = score([run(model, estimator, 0.1)], track())[0]
-    return dataclasses.replace(result, accuracy=dataclasses.replace(result.accuracy, ate_rmse_m=value))
-
-
-class Text(HTMLParser):
-    """Cells of every table, the text, and the tags of a page; fails on tags that do not close."""
-
-    VOID = frozenset({"meta", "br", "input", "wbr", "path", "image", "use", "rect", "stop"})
-
-    def __init__(self, source):
-        super().__init__()
-        self.tables, self.open, self.tags, self.words = [], [], [], []
-        self.feed(source)
-        assert not self.open, f"never closed: {self.open}"
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-        if tag == "table":
-            self.tables.append([])
-        if tag == "tr":
-            self.tables[-1].append([])
-        if tag in ("td", "th"):
-            self.tables[-1][-1].append("")
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        if tag not in self.VOID:
-            assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if "style" in self.open:
-            return
-        self.words.append(data)
-        if "td" in self.open or "th" in self.open:
-            self.tables[-1][-1][-1] += data
-
+from tests.helpers.report import HEAD, PageText, chi_square_nis, relations, run, three_runs, track, with_error
 
 # ---- words
 
@@ -222,28 +112,28 @@ def test_summary_false_positive_rate_for_equal_filters_is_small():
 
 
 @pytest.mark.parametrize(
-    ("scale", "said"),
+    ("scale", "message"),
     [
         (4.0, "are overconfident"),
         (0.25, "Its covariances are not too small"),
         (1.0, "Its covariances are consistent"),
     ],
 )
-def test_summary_of_covariances_follows_the_nis(scale, said):
-    results = score([run(nis=honest(scale=scale), noise=0.01), run(estimator="odometry", noise=0.5, seed=2)], track(yaws=False))
+def test_summary_of_covariances_follows_the_nis(scale, message):
+    results = score([run(nis=chi_square_nis(scale=scale), noise=0.01), run(estimator="odometry", noise=0.5, seed=2)], track(yaws=False))
     text = verdict(results, track(yaws=False))
-    assert said in text
+    assert message in text
     assert f"mean NIS {results[0].nis_mean:.3g}" in text
 
 
 def test_summary_overconfidence_factor_is_in_sigma():
     """All innovations three times what the filter believes: NIS nine times too large."""
-    text = verdict(score([run(nis=honest(scale=9.0), noise=0.01)], track(yaws=False)), track(yaws=False))
+    text = verdict(score([run(nis=chi_square_nis(scale=9.0), noise=0.01)], track(yaws=False)), track(yaws=False))
     assert re.search(r"innovations (2\.9|3\.0|3\.1) times their sigma", text)
 
 
 def test_summary_few_outliers_are_no_overconfidence():
-    nis = honest()
+    nis = chi_square_nis()
     nis[::40] = 400.0
     text = verdict(score([run(nis=nis, noise=0.01)], track(yaws=False)), track(yaws=False))
     assert "some outliers make it" in text
@@ -411,7 +301,7 @@ def test_nis_means_are_of_equal_groups():
 
 def test_table_has_the_given_numbers_and_a_dash_for_missing_ones():
     results, _ = cases()["track"]
-    table = Text(page_of("track")).tables[0]
+    table = PageText(page_of("track")).tables[0]
     assert table[0][1].startswith("ATE")
     for row, result in zip(table[1:], results, strict=True):
         a = result.accuracy
@@ -423,7 +313,7 @@ def test_table_has_the_given_numbers_and_a_dash_for_missing_ones():
 
 
 def test_table_of_positions_only_leaves_out_headings_with_a_note():
-    text = Text(page_of("positions"))
+    text = PageText(page_of("positions"))
     assert not any("heading" in head for head in text.tables[0][0])
     assert "positions only" in "".join(text.words)
 
@@ -431,7 +321,7 @@ def test_table_of_positions_only_leaves_out_headings_with_a_note():
 def test_table_of_relations_has_every_group():
     both = relations(span=60)  # 30 s
     results = score([run(noise=0.1)], both)
-    text = Text(page(HEAD, results, both))
+    text = PageText(page(HEAD, results, both))
     assert f"{results[0].accuracy.relations.long.translation_m:.4f}" in text.tables[0][1]
     assert f"{results[0].accuracy.relations.long.translation_m2:.4f}" in text.tables[1][1]
     assert not any("under 20 s" in head for head in text.tables[0][0])
@@ -439,7 +329,7 @@ def test_table_of_relations_has_every_group():
 
 def test_page_lists_parameters_counts_notes_and_provenance():
     told = run(parameters={"gyro_bias_rad_per_s": (0.0012, 0.00004)}, counts={"slips": 12345}, noise=0.1)
-    words = " ".join(Text(page(HEAD, score([told], None), None)).words)
+    words = " ".join(PageText(page(HEAD, score([told], None), None)).words)
     for expected in ("0.001200 ± 0.000040", "rad/s", "12,345", "3 scans were empty.", "c0ffee", "vaultbot", "2026-01-02 03:04:05 UTC"):
         assert expected in words
 
@@ -499,7 +389,7 @@ def page_of(case):
 @pytest.mark.parametrize("case", list(cases()))
 def test_page_is_well_formed_and_loads_nothing(case):
     first = page_of(case)
-    text = Text(first)  # fails on unclosed tags
+    text = PageText(first)  # fails on unclosed tags
     assert not re.search(r"https?://|xlink|url\((?!#)|@import|\son\w+=", first)
     assert not [tag for tag, _ in text.tags if tag in ("script", "link", "iframe", "object")]
     for tag, attributes in text.tags:
@@ -515,7 +405,7 @@ def test_page_is_well_formed_and_loads_nothing(case):
 
 def test_page_starts_and_ends_with_the_summary():
     results, _ = cases()["track"]
-    words = "".join(Text(page_of("track")).words)
+    words = "".join(PageText(page_of("track")).words)
     first, last = html.unescape(verdict(results, track())).split(". ")[0], verdict(results, track())
     assert words.index(first) < words.index("Accuracy")
     assert words.rindex(last) > words.index("Sources and versions")
@@ -526,10 +416,10 @@ def test_page_escapes_text_of_the_log():
     head = ReportHead(evil, evil, evil, 1.0, [evil], {evil: evil}, evil)
     bad = run(model=evil, estimator=evil + "2", noise=0.1, parameters={evil: (1.0, 0.1)}, counts={evil: 1})
     reference = dataclasses.replace(track(), source=evil, warnings=(evil,))
-    mapped = dataclasses.replace(bad, map_points=np.ones((4, 2)), nis=honest())
+    mapped = dataclasses.replace(bad, map_points=np.ones((4, 2)), nis=chi_square_nis())
     made = page(head, score([mapped, run(noise=0.2, seed=1)], reference), reference)
     assert "<script" not in made
-    assert Text(made).words.count(evil) >= 5
+    assert PageText(made).words.count(evil) >= 5
 
 
 def test_figures_axes_have_units_and_each_run_a_line():
@@ -556,7 +446,7 @@ def test_page_of_a_large_log_is_small():
     poses = np.column_stack([30 * np.sin(angle), 20 * np.cos(angle), angle]) + rng.normal(size=(n, 3)) * 0.01
     points = rng.uniform(-40, 40, (60_000, 2))
     big = [
-        dataclasses.replace(run(m, e), trajectory=Trajectory(stamps, poses + 0.1 * i), nis=honest(n), map_points=points)
+        dataclasses.replace(run(m, e), trajectory=Trajectory(stamps, poses + 0.1 * i), nis=chi_square_nis(n), map_points=points)
         for i, (m, e) in enumerate((m, e) for m in ("diff_drive", "skid_steer") for e in ("odometry", "ekf", "graph", "other"))
     ]
     reference = ReferenceTrack(stamps[::20], poses[::20, :2], poses[::20, 2])

@@ -306,13 +306,13 @@ def test_faults_add_up_and_invalid_ones_are_refused():
     for text in ("slope", "slope=", "slope=steep", "slope=nan"):
         with pytest.raises(SimulationError, match="not of the form ID=SIZE"):
             parse_faults((text,))
-    for effects, said in (
+    for effects, message in (
         ({"gravity": 1.0}, r"no effect 'gravity'; there are\n  wheel_radius_scale \[1\]: all wheels"),
         ({"track_width": 3.0}, r"track_width of 3 m is out of reason; it may be -0.2 to 0.2"),
         ({"payload": -1.0}, "payload of -1 kg is out of reason; it may be 0 to 30"),
         ({"rolling_resistance": -0.1}, "cannot be negative"),
     ):
-        with pytest.raises(SimulationError, match=said):
+        with pytest.raises(SimulationError, match=message):
             Simulation(ARC, ROBOT, 0, effects, BLIND)
 
 
