@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 
 from localization.logs.chunks import RawMessage, merge_channels
-from localization.logs.decode import frame_name, stamp_ns
-from localization.logs.message_stats import UnusableError
+from localization.logs.decode import UnusableError, frame_name, stamp_ns
 from localization.logs.reader import open_log
 from localization.logs.serialization import Decoder
 from localization.logs.sources import open_source

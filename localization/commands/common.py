@@ -1,18 +1,33 @@
-"""What several commands share: opening a log of a robot, writing what is printed as JSON."""
+"""What commands share: a terminal that texts of logs cannot control, names separated by commas, new folders, JSON."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import math
+import re
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
+
 from localization.errors import SettingError
 from localization.output import output_errors, refuse_existing, write_text_file
+
+# Control characters but for line ends and tabs, marks that turn the direction of writing, and bytes of file names that are no text.
+_COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+class PlainConsole(Console):
+    """A console on which texts are text: what would move the cursor, set the title or hide a line is shown as a question mark."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else segment._replace(text=_COMMANDS.sub("\N{REPLACEMENT CHARACTER}", segment.text))
 
 
 def names(text: str, option: str) -> list[str]:

@@ -25,9 +25,8 @@ from localization.comparison.table import Table
 from localization.errors import EvaluationError, LogError, OutputError
 from localization.estimators import check_estimator
 from localization.logs import TopicOverrides
-from localization.output import check_outputs
+from localization.output import check_outputs, versions
 from localization.pipeline import ReplayConfig
-from localization.provenance import versions
 from motion_models.online_calibration import check_forms
 from motion_models.registry import make_model
 from motion_models.robot import load_robot

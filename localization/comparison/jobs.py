@@ -14,8 +14,8 @@ from localization.estimators import CORRECTING, check_estimator
 from localization.evaluation.references import ReferenceTrack, Relations, read_reference_file, reference_track
 from localization.evaluation.scores import score
 from localization.logs import Log, TopicOverrides, open_log
+from localization.output import fingerprint, versions
 from localization.pipeline import ReplayConfig, Trial, replay
-from localization.provenance import fingerprint, versions
 from motion_models.errors import SkidlocError
 from motion_models.online_calibration import Form
 from motion_models.registry import make_model

@@ -24,7 +24,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from localization.logs.message_stats import MessageStats, Oddity
+from localization.logs.decode import MessageStats, Oddity
 
 _SECOND = 1_000_000_000
 _MAX_STEP_NS = _SECOND

@@ -11,9 +11,8 @@ from localization.errors import LogError, TopicError
 from localization.events import Event, Reference
 from localization.logs.chunks import Source, merge_channels
 from localization.logs.clock_sync import ClockPlan, Item, merge, plan_clocks
-from localization.logs.decode import frame_name, stamp_ns
+from localization.logs.decode import MessageStats, UnusableError, frame_name, stamp_ns
 from localization.logs.event_decoder import EventDecoder, TopicDecoder, decode_item
-from localization.logs.message_stats import MessageStats, UnusableError
 from localization.logs.references import reference_decoder
 from localization.logs.serialization import Decoder
 from localization.logs.sources import open_source

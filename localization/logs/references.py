@@ -10,8 +10,7 @@ import numpy as np
 
 from localization.errors import LogError
 from localization.events import Event, PositionSample, Reference
-from localization.logs.decode import yaw_of
-from localization.logs.message_stats import Oddity, UnusableError
+from localization.logs.decode import Oddity, UnusableError, yaw_of
 from motion_models.se2 import FloatArray
 
 _SEMI_MAJOR_M = 6_378_137.0

@@ -11,8 +11,8 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from localization.logs.chunks import Channel, RawMessage
+from localization.logs.decode import Oddity, UnusableError
 from localization.logs.fast_cdr import fast_decoder
-from localization.logs.message_stats import Oddity, UnusableError
 from localization.logs.message_templates import STORE, STORE_ROS1
 
 _GRAPH_PACKAGE = "rmw_dds_common"

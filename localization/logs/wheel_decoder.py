@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import WheelSample
-from localization.logs.decode import JointReading, OdometryReading
-from localization.logs.message_stats import MessageStats, Oddity
+from localization.logs.decode import JointReading, MessageStats, Oddity, OdometryReading
 from motion_models.robot import Driver
 from motion_models.se2 import FloatArray
 

@@ -8,7 +8,7 @@ from localization.diagnosis.diagnose import DiagnosisResult
 from localization.diagnosis.findings import Diagnosis
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS
 from localization.report.figures import Axes, Figure, svg
-from localization.report.svg import COLOURS, WIDTH_IN
+from localization.report.page import COLOURS, WIDTH_IN
 from motion_models.se2 import FloatArray
 
 _NAMES = {"x": "along", "y": "sideways", "yaw": "heading", "gyro": "gyro - LiDAR"}

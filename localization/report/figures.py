@@ -19,8 +19,8 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from localization.evaluation.consistency import mean_band
 from localization.report.figure_data import MapView, NisMeans, Spans, Timeline, raster
+from localization.report.page import COLOURS, WIDTH_IN, for_page
 from localization.report.runs import PlottedRun, thin_path, thin_series
-from localization.report.svg import COLOURS, WIDTH_IN, for_page
 
 __all__ = [
     "Axes",

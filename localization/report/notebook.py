@@ -21,8 +21,8 @@ from localization.evaluation.scores import Result
 from localization.report import figures
 from localization.report.figure_data import map_view
 from localization.report.figures import Axes, Figure
+from localization.report.page import COLOURS
 from localization.report.runs import plotted_runs
-from localization.report.svg import COLOURS
 
 CYCLE = ("blue", "red", "green", "purple", "orange", "sky", "grey", "ink")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localization.evaluation.accuracy import Accuracy
+from localization.evaluation.metrics import Accuracy
 from localization.evaluation.scores import Result
 from localization.trajectory import IntArray
 from motion_models import se2

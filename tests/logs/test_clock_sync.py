@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.logs import Log, inspect_log, open_log
 from localization.logs.clock_sync import Item, merge, plan_clocks
-from localization.logs.message_stats import MessageStats, Oddity
+from localization.logs.decode import MessageStats, Oddity
 from motion_models.robot import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from localization.logs.decode import UnusableError
 from localization.logs.fast_cdr import FusedWriter, fast_decoder
-from localization.logs.fused_log import FusedEstimate, odometry_message, transform_message
-from localization.logs.message_stats import UnusableError
 from localization.logs.serialization import decoder, encode, make
+from localization.logs.writer import FusedEstimate, odometry_message, transform_message
 from tests.helpers.bags import STORE
 
 IMU, JOINTS, SCAN = "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState", "sensor_msgs/msg/LaserScan"
