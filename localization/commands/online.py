@@ -56,6 +56,7 @@ class Online(OnlineSettings):
     these variables demand, else `localhost`."""
 
     def run(self, console: Console) -> None:
+        """Run the command, with output on ``console``."""
         rate, run = parse_rate(self.rate), self.live_run()
         view = self._view()
         try:

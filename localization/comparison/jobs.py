@@ -37,6 +37,7 @@ class TrialSpec:
 
     @property
     def name(self) -> str:
+        """Model, estimator and corrections, as in tables."""
         form = f" ({self.corrections})" if self.estimator in CORRECTING else ""
         return f"{self.model} {self.estimator}{form}"
 

@@ -37,6 +37,7 @@ class Findings:
 
     @property
     def best(self) -> Mean:
+        """The combination of the smallest mean."""
         return self.means[0]
 
     @property
@@ -46,10 +47,12 @@ class Findings:
 
     @property
     def unit(self) -> str:
+        """Unit of the metric."""
         return unit_of(self.metric)
 
     @property
     def failed(self) -> list[Row]:
+        """Rows of runs that failed."""
         return [row for row in self.rows if row["status"] != OK]
 
     @property
@@ -69,6 +72,7 @@ class Findings:
         return next((d for d in self.tested if {d.better, d.worse} == pair), None)
 
     def is_shown(self, difference: Difference) -> bool:
+        """Whether a difference is significant."""
         return difference.p_value < _CERTAIN
 
     def least_p(self, n: int) -> float:

@@ -55,6 +55,7 @@ class Table:
         return row is not None and row["key"] == job.key and row["status"] == OK
 
     def put(self, rows: Iterable[Row]) -> None:
+        """Insert or replace rows."""
         for row in rows:
             self._rows[_name(row)] = row
 

@@ -4,7 +4,7 @@ A consistent estimator's normalised squared errors ``e^T P^-1 e`` follow chi-squ
 (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001, sec. 5.4). NEES takes errors against the
 truth, NIS innovations against their predicted covariance. Both are needed: innovations can be consistent while the state is not.
 
-The trap: the bands count independent samples. Innovations of a consistent filter are independent; pose errors along one run are not (this
+The bands are for independent samples. Innovations of a consistent filter are independent; pose errors along one run are not (this
 second's error is the last one's plus a little), so one run counts as one sample however long it is.
 
 Singular covariances: a direction of zero variance has no information. Where the error is zero too, it is not counted (one degree of
@@ -35,7 +35,7 @@ _SINGULAR = 1e-12
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Correlation of normalised innovations with their successors; beyond the bound the filter's model misses something."""
+    """Correlation of normalised innovations with their successors; beyond the bound the filter's model is wrong."""
 
     lag1: float
     """-1 to 1."""
@@ -45,6 +45,7 @@ class Whiteness:
 
     @property
     def is_white(self) -> bool:
+        """Whether the correlation is within the bound."""
         return abs(self.lag1) <= self.bound
 
 
@@ -67,6 +68,7 @@ class Consistency:
 
     @property
     def verdict(self) -> Literal["consistent", "overconfident", "conservative"]:
+        """Mean above the band, below it, or inside."""
         if self.mean > self.band[1]:
             return "overconfident"
         return "conservative" if self.mean < self.band[0] else "consistent"
@@ -223,7 +225,7 @@ def _moved(covariance: FloatArray, motions: FloatArray) -> FloatArray:
 
 
 def _in_body(covariances: FloatArray, yaws: FloatArray) -> FloatArray:
-    """(N, 3, 3) covariances of x, y, yaw in the plane, turned into the body frame; zero where they are not known."""
+    """(N, 3, 3) covariances of x, y, yaw in the plane, turned into the body frame; zero where unknown."""
     c, s, o = np.cos(yaws), np.sin(yaws), np.zeros_like(yaws)
     plane_T_body = np.stack([np.stack([c, -s, o], -1), np.stack([s, c, o], -1), np.stack([o, o, o + 1.0], -1)], axis=-2)
     known = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))

@@ -1,7 +1,7 @@
 """How well a trajectory agrees with a reference: ATE, RPE per distance, end error and drift, and the relations metric.
 
 Each metric is defined where it is computed. Numbers without a reference are None, never 0. The lever arm between the tracked point of
-the reference (a GPS antenna) and the robot's base is not known and not removed; it is part of the error.
+the reference (a GPS antenna) and the robot's base is unknown and not removed; it is part of the error.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def evaluate(trajectory: Trajectory, reference: ReferenceTrack | Relations, conf
 
 
 def match(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: float) -> tuple[FloatArray, ReferenceTrack]:
-    """The estimate (M, 3) at the reference's stamps, and the part of the reference that it could be had for.
+    """The estimate (M, 3) at the reference's stamps, and the part of the reference that it covers.
 
     The estimate is interpolated to the reference, never the other way: a constant twist between poses is close to the truth at an
     odometry's rate, and not at a GPS's. Raises `EvaluationError` if fewer than three samples match.

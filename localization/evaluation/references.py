@@ -1,5 +1,4 @@
-"""References of scores: a track of poses or positions, or verified relations between instants; and messages where one shares no time with a
-trajectory."""
+"""References of scores: a track of poses or positions, or verified relations between instants."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ _EPOCH_BEGINS_S = 1e8  # clocks below this (March 1973) count from the start of 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceTrack:
-    """Poses or positions of the robot by a trusted source, in order of time, everything finite."""
+    """Poses or positions of the robot by a reference system, in order of time, everything finite."""
 
     stamps_ns: IntArray
     """(N,) strictly increasing."""
@@ -34,9 +33,9 @@ class ReferenceTrack:
     yaws: FloatArray | None = None
     """(N,) [rad], or None where the source has positions only (GPS)."""
     covariances: FloatArray | None = None
-    """(N, 3, 3) of x, y, yaw in the reference's plane, NaN where unknown; None where nothing is known."""
+    """(N, 3, 3) of x, y, yaw in the reference's plane, NaN where unknown; None without covariances."""
     source: str = "reference"
-    """What errors call it: a topic or a file."""
+    """Its name in messages: a topic or a file."""
     n_dropped: int = 0
     """Samples left out because they were not finite or repeated a stamp."""
     warnings: tuple[str, ...] = ()
@@ -44,7 +43,7 @@ class ReferenceTrack:
 
     @property
     def poses(self) -> FloatArray:
-        """(N, 3) x, y, yaw. Raises `EvaluationError` where the yaw is not known."""
+        """(N, 3) x, y, yaw. Raises `EvaluationError` where the source has no yaw."""
         if self.yaws is None:
             raise EvaluationError(f"{self.source} has positions only; poses need a reference with heading.")
         return np.column_stack([self.positions, self.yaws])
@@ -77,7 +76,7 @@ def reference_track(references: Iterable[Reference], source: str = "reference") 
     """The track of reference events, sorted by header stamp.
 
     Samples that are not finite, and all but the first of those with one stamp, are left out and counted. If some samples have a
-    yaw, those without it count as not finite. Headings that cannot be headings (see `frozen_yaw`) are taken as unknown.
+    yaw, those without it count as not finite. Headings that never change (see `frozen_yaw`) are taken as unknown.
     Raises `EvaluationError` if nothing is left.
     """
     samples = list(references)
@@ -182,7 +181,7 @@ def _looks_like_tum(path: str | Path) -> bool:
 
 
 def describe_span(stamps_ns: IntArray) -> str:
-    """First and last stamp: as UTC where the clock is that of the world, else in seconds. ``stamps_ns`` (N,) ascending."""
+    """First and last stamp: as UTC where the clock counts from 1970, else in seconds. ``stamps_ns`` (N,) ascending."""
     if not len(stamps_ns):
         return "no time at all"
     first, last = int(stamps_ns[0]), int(stamps_ns[-1])
@@ -213,7 +212,7 @@ def _cause(trajectory_ns: IntArray, reference_ns: IntArray) -> str:
 
 
 def describe_instant(stamp_ns: int) -> str:
-    """As UTC where the clock is that of the world, else in seconds."""
+    """A stamp as UTC where the clock counts from 1970, else in seconds."""
     seconds = stamp_ns / 1e9
     if _EPOCH_BEGINS_S < seconds < 2e11:
         return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")

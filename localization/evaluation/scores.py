@@ -29,6 +29,7 @@ class Result:
 
     @property
     def name(self) -> str:
+        """Model and estimator, as in names of files."""
         return f"{self.run.model}_{self.run.estimator}"
 
     @property

@@ -170,11 +170,13 @@ class FusedWriter:
         self._odometry, self._transform = (Template(form, is_ros1=is_ros1) for form in (self._odometry_form, self._transform_form))
 
     def odometry(self, estimate: FusedEstimate) -> bytes:
+        """The bytes of `odometry_message`."""
         covariance = None if estimate.covariance is None else odom_axes(estimate.covariance, float(estimate.pose[2]))
         parts = (*_place(estimate), six_by_six(covariance), estimate.twist[:2], estimate.twist[2:], six_by_six(estimate.twist_covariance))
         return self._odometry.fill(Message(self._odometry_form, estimate.stamp_ns, estimate.stamp_ns, parts))
 
     def transform(self, estimate: FusedEstimate) -> bytes:
+        """The bytes of `transform_message`."""
         return self._transform.fill(Message(self._transform_form, estimate.stamp_ns, estimate.stamp_ns, _place(estimate)))
 
 

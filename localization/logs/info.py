@@ -70,7 +70,7 @@ class LogInfo:
     problems: list[str]
     """What is missing or suspect, as sentences."""
     warnings: list[str]
-    """What was chosen, mended or lost, as sentences."""
+    """What was chosen, corrected or lost, as sentences."""
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -122,7 +122,7 @@ class _StampStats:
 
 
 def inspect_log(log: Log) -> LogInfo:
-    """Go through the log once, reading no more of a message than its header."""
+    """Inspect a log: one pass, which reads the headers of messages only."""
     stamped = [channel.topic for channel in log.channels if channel.type in _STAMPED]
     stats_of = {topic: _StampStats() for topic in stamped}
     for raw in log.source.messages(stamped) if stamped else ():

@@ -76,6 +76,7 @@ class Log:
 
     @property
     def duration_s(self) -> float:
+        """From the first to the last message, by the time of recording [s]."""
         return (self.end_ns - self.start_ns) * 1e-9
 
     @property

@@ -143,9 +143,9 @@ class FusedEstimate:
     twist: FloatArray
     """(3,) vx, vy, wz of the body in its own axes [m/s, m/s, rad/s]."""
     covariance: FloatArray | None = None
-    """(3, 3) of the pose's right (body-frame) perturbation, or None where nothing is known of it."""
+    """(3, 3) of the pose's right (body-frame) perturbation, or None where it is unknown."""
     twist_covariance: FloatArray | None = None
-    """(3, 3) of the twist, or None where nothing is known of it."""
+    """(3, 3) of the twist, or None where it is unknown."""
     parent: str = PARENT_FRAME
     """Frame that the pose is in."""
 
@@ -154,11 +154,11 @@ def write_fused(path: str | Path, results: Mapping[str, Iterable[FusedEstimate]]
     """Write a new bag to ``path`` (.mcap), message by message, in order of stamps; same estimates, same bytes.
 
     ``results`` holds the estimates of each named result (`skid_steer_ekf` becomes the topic `/skid_steer_ekf/odometry`), in
-    strictly rising order of stamps; they may be lazy and are taken from side by side. ``tf_of`` names the result that goes to
+    strictly rising order of stamps; iterators are consumed in parallel. ``tf_of`` names the result that goes to
     /tf, the first one if None.
 
     Raises `OutputError`, and leaves nothing behind, where ``path`` exists or cannot be written, where nothing is to be written,
-    and for an estimate that no message should carry: values or covariances that are not finite, negative variances, stamps that
+    and for an invalid estimate: values or covariances that are not finite, negative variances, stamps that
     do not rise.
     """
     path = Path(path)
@@ -169,7 +169,7 @@ def write_fused(path: str | Path, results: Mapping[str, Iterable[FusedEstimate]]
     with output_errors(path):
         folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=".fused-")
     try:
-        bag = Path(folder.name) / path.stem  # rosbags writes folders; the file in it, named alike, is what we are after
+        bag = Path(folder.name) / path.stem  # rosbags writes folders; the result is the file in it, of the same name
         _write_bag(bag, path, results, tf_of)
         refuse_existing(path)
         with output_errors(path):
@@ -263,7 +263,7 @@ def _heading(theta: float) -> Quaternion:
 
 
 def _check_estimates(name: str, estimates: Iterable[FusedEstimate]) -> Iterator[tuple[str, FusedEstimate]]:
-    """The estimates with their result's name. Raises `OutputError` at the first that no message should carry."""
+    """The estimates with their result's name. Raises `OutputError` at the first invalid one."""
     last_ns = -1
     for estimate in estimates:
         where = f"result '{name}' at {estimate.stamp_ns * 1e-9:.6f} s"

@@ -1,4 +1,4 @@
-"""What the pictures show, as plain arrays: where the map's borders lie, errors over time, means over bins. No drawing here."""
+"""Data of the figures as plain arrays: borders of the map, errors over time, means over bins."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LEAST_IN_BIN = 5
 
 @dataclass(frozen=True, eq=False)
 class MapView:
-    """Everything in one plane: the reference's where the runs are aligned to one, else the world of the runs' common start."""
+    """Map, reference and paths in one plane: the reference's where the runs are aligned to one, else the world of the common start."""
 
     low: FloatArray
     """(2,) lower left corner [m]."""
@@ -40,7 +40,7 @@ class MapView:
     paths: tuple[FloatArray, ...]
     """(N, 2) for each line."""
     best: PlottedRun | None
-    """The run whose place is sure to be in the picture, with the map and the ellipses of its covariances if it has any."""
+    """The run that is always inside the borders, with its map and the ellipses of its covariances if it has any."""
     ellipses: tuple[Ellipse, ...]
     """Two sigmas of the best run's position, at equal distances along its path."""
     ranks: Mapping[int, int]
@@ -48,12 +48,12 @@ class MapView:
     start: tuple[float, float] | None
     """Where the best run (or the first) starts."""
     n_cut: int
-    """Lines that leave the picture."""
+    """Number of lines that leave the picture."""
 
 
 def map_view(lines: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> MapView:
-    """Borders hold the reference, the best run, and the map but for its strays. The others widen them by no more than a fifth: a run that
-    diverged must not make the rest too small.
+    """Borders hold the reference, the best run, and the map without its outliers. The others widen them by at most a fifth: a diverged
+    run must not make the rest too small.
     """
     best = best_run(lines) or run_with_map(lines) or (lines[-1] if lines else None)
     mapped = run_with_map(lines)

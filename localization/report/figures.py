@@ -226,7 +226,7 @@ def _dashes(line: PlottedRun) -> tuple[float, ...]:
 
 
 def plain_logs(axes: Axes) -> None:
-    """Powers of ten as people write them, and 2 and 5 between them where there are few."""
+    """Decimal labels of a logarithmic axis: powers of ten, and 2 and 5 between them where these are few."""
     plain = FuncFormatter(lambda value, _: f"{value:,.0f}" if value >= 1 else f"{value:g}")
     between = FuncFormatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
     for axis, scale in ((axes.xaxis, axes.get_xscale()), (axes.yaxis, axes.get_yscale())):

@@ -113,6 +113,7 @@ class Bullets:
 
     @classmethod
     def of(cls, texts: Sequence[str], summary: str = "") -> Bullets:
+        """A list of plain texts."""
         return cls([Item(text) for text in texts], summary)
 
 
