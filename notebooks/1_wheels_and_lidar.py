@@ -20,7 +20,7 @@ import itertools
 from scipy.stats import chi2
 
 from localization import Trial, open_log, read_reference_file, replay, score
-from localization.report.figure_data import nis_means, spans
+from localization.report.figure_data import nis_means, relation_bins
 from localization.report.notebook import Panel, Series, picture, table, trajectories
 from localization.report.replay_page import verdict
 from localization.report.runs import plotted_runs
@@ -70,7 +70,7 @@ table(
 
 # %%
 lines = plotted_runs(results)
-binned = [spans(line, truth) for line in lines]
+binned = [relation_bins(line, truth) for line in lines]
 metres = [Series(line.label, s.seconds, s.translation_m, line.colour, "o", line.dashes) for line, s in zip(lines, binned, strict=True)]
 degrees = [Series(line.label, s.seconds, s.rotation_deg, line.colour, "o", line.dashes) for line, s in zip(lines, binned, strict=True)]
 picture(

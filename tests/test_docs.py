@@ -37,7 +37,13 @@ def test_documents_have_commands() -> None:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_command_of_a_document_runs(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "tests").symlink_to(ROOT / "tests")
+    """The longest log is cut to its first fifth."""
+    data, long = Path("tests/data"), Path("tests/data/husky-outdoor-gps/test1.bag")
+    (tmp_path / long.parent).mkdir(parents=True)
+    (tmp_path / long).write_bytes((ROOT / long).read_bytes()[: (ROOT / long).stat().st_size // 5])
+    for folder in (ROOT / data).iterdir():
+        if folder.name != long.parent.name:
+            (tmp_path / data / folder.name).symlink_to(folder)
     monkeypatch.chdir(tmp_path)
     assert main(shlex.split(command, comments=True)[1:]) == 0
 

@@ -21,7 +21,7 @@ from localization.comparison.executors import run_local, run_on_cluster
 from localization.comparison.jobs import OK, Job, Row, job_key, run_job, trials
 from localization.comparison.page import CompareHead, check_report, write_comparison_report
 from localization.comparison.summary import Findings, against_best, closing, find, headline
-from localization.comparison.table import Table
+from localization.comparison.table import ResultTable
 from localization.errors import EvaluationError, LogError, OutputError
 from localization.estimators import check_estimator
 from localization.logs import TopicOverrides
@@ -69,7 +69,7 @@ class Compare:
             raise OutputError(f"--processes is {self.processes}; it must be 1 or more, or 0 for as many as there are cores.")
         table_path, report_path = places(self.out)
         check_report(report_path)
-        jobs, table = self._jobs(console), Table(table_path)
+        jobs, table = self._jobs(console), ResultTable(table_path)
         left = [dataclasses.replace(job, trials=missing) for job in jobs if (missing := table.missing(job))]
         done = sum(len(job.trials) for job in jobs) - sum(len(job.trials) for job in left)
         if done:
@@ -113,7 +113,7 @@ class Compare:
         there = [job for job in jobs if job not in absent]
         return itertools.chain(((job, run_job(job)) for job in absent), run_local(there, self.processes or os.cpu_count() or 1))
 
-    def _report(self, console: Console, table: Table, report: Path, rows: Sequence[Row]) -> None:
+    def _report(self, console: Console, table: ResultTable, report: Path, rows: Sequence[Row]) -> None:
         failed = [row for row in rows if row["status"] != OK]
         if len(failed) == len(rows):
             logs = len({row["log"] for row in rows})

@@ -23,7 +23,7 @@ from localization.report.page import (
     Cell,
     Definitions,
     Figure,
-    Item,
+    ListItem,
     Page,
     Paragraph,
     Section,
@@ -181,13 +181,13 @@ def _failures(found: Findings) -> list[Block]:
     items = []
     for (log, reason), names in reasons.items():
         which = "everything" if len(names) == len(found.words) else ", ".join(names)
-        items.append(Item(reason, f"{_short(log, found)} ({which})"))
+        items.append(ListItem(reason, f"{_short(log, found)} ({which})"))
     return [Bullets(items)] if items else []
 
 
 def _problems(found: Findings) -> list[Block]:
     notes = {r["log"]: r["notes"] for r in found.rows if r.get("notes")}
-    return [Bullets([Item(note, _short(log, found)) for log, note in notes.items()])] if notes else []
+    return [Bullets([ListItem(note, _short(log, found)) for log, note in notes.items()])] if notes else []
 
 
 def _name(name: str, found: Findings, styles: Mapping[str, tuple[str, int]], badge: str = "") -> Cell:

@@ -22,7 +22,7 @@ Name = tuple[str, str, str, str]
 """Log, model, estimator and corrections."""
 
 
-class Table:
+class ResultTable:
     """Rows by what was run. Reads what is there; `put` and `save`."""
 
     def __init__(self, path: Path) -> None:

@@ -121,7 +121,7 @@ def timeline(line: PlottedRun) -> Timeline | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Spans:
+class RelationBins:
     """Mean errors of relations, binned by the time that they span."""
 
     seconds: FloatArray
@@ -134,7 +134,7 @@ class Spans:
     """Relations in each bin."""
 
 
-def spans(line: PlottedRun, relations: Relations) -> Spans:
+def relation_bins(line: PlottedRun, relations: Relations) -> RelationBins:
     """Bins of equal width in the logarithm of the span; those of fewer than five relations are added to their neighbour."""
     found = relation_errors(line.result.run.trajectory, relations)
     span = np.maximum(found.spans_s, 1e-3)
@@ -147,7 +147,7 @@ def spans(line: PlottedRun, relations: Relations) -> Spans:
             merged[-1] = np.concatenate([merged[-1], group])
         else:
             merged.append(group)
-    return Spans(
+    return RelationBins(
         np.array([float(np.exp(np.log(span[g]).mean())) for g in merged]),
         np.array([float(found.translation_m[g].mean()) for g in merged]),
         np.array([float(np.degrees(found.rotation_rad[g]).mean()) for g in merged]),

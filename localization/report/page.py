@@ -94,7 +94,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Item:
+class ListItem:
     """One entry of a list."""
 
     text: str
@@ -107,14 +107,14 @@ class Bullets:
     """A list."""
 
     kind: ClassVar[str] = "bullets"
-    items: Sequence[Item]
+    items: Sequence[ListItem]
     summary: str = ""
     """As of a `Table`."""
 
     @classmethod
     def of(cls, texts: Sequence[str], summary: str = "") -> Bullets:
         """A list of plain texts."""
-        return cls([Item(text) for text in texts], summary)
+        return cls([ListItem(text) for text in texts], summary)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from localization.comparison import jobs as job_module
 from localization.comparison.executors import run_local
 from localization.comparison.jobs import Job, failed_rows, job_key, run_job, trials
 from localization.comparison.statistics import differences, means, sign_flip_p
-from localization.comparison.table import Table
+from localization.comparison.table import ResultTable
 from localization.errors import OutputError
 from localization.logs import TopicOverrides
 from localization.pipeline import ReplayConfig
@@ -283,18 +283,18 @@ def test_compare_parquet_equals_csv_and_is_continued(table, tmp_path, asked):
 def test_compare_parquet_with_failures_is_read_again(tmp_path):
     pytest.importorskip("pyarrow", reason="the extra 'parquet' is not installed")
     job = jobs(2)
-    out = Table(tmp_path / "t.parquet")
+    out = ResultTable(tmp_path / "t.parquet")
     out.put([row for j in job for row in failed_rows(j, "why")])
     out.save(job)  # no number yet
-    assert [row["error"] for row in Table(tmp_path / "t.parquet").rows(job)] == ["why"] * 2
+    assert [row["error"] for row in ResultTable(tmp_path / "t.parquet").rows(job)] == ["why"] * 2
     out.put([dict(row, status="ok", ate_rmse_m=0.1, n_matched=3) for row in out.rows(job)[:1]])
     out.save(job)
-    again = Table(tmp_path / "t.parquet").rows(job)
+    again = ResultTable(tmp_path / "t.parquet").rows(job)
     assert again == [dict(row, ate_rmse_m=row.get("ate_rmse_m"), n_matched=row.get("n_matched")) for row in out.rows(job)]
     for content in (b"nonsense", b"PAR1" + bytes(20) + b"PAR1", out.path.read_bytes()[:-9]):
         (tmp_path / "u.parquet").write_bytes(content)
         with pytest.raises(OutputError, match=r"u\.parquet"):
-            Table(tmp_path / "u.parquet")
+            ResultTable(tmp_path / "u.parquet")
 
 
 def test_compare_parquet_without_its_extra_names_it(tmp_path, capsys, monkeypatch):

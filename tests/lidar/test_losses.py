@@ -8,7 +8,7 @@ import pytest
 
 from localization.comparison.jobs import _scores
 from localization.comparison.summary import closing, find
-from localization.comparison.table import Table
+from localization.comparison.table import ResultTable
 from localization.evaluation.scores import score
 from localization.lidar import LostScans
 from localization.lidar.losses import LidarLosses, per_cent
@@ -156,11 +156,11 @@ def test_rows_of_a_comparison_are_numbers_that_the_table_reads_again(tmp_path) -
     scores = _scores(result.metrics(200.0, with_timing=False))
     assert (scores["lidar_lost_share"], scores["lidar_longest_lost_s"], scores["lidar_longest_lost_since_s"]) == (0.6, 60.0, 7.0)
     assert not any(isinstance(value, dict) for value in scores.values())
-    table = Table(tmp_path / "table.csv")
+    table = ResultTable(tmp_path / "table.csv")
     head = {"log": "a", "robot": "r", "model": "m", "estimator": "graph", "corrections": "", "key": "k", "status": "ok", "error": ""}
     table.put([{**head, **scores}])
     table.save([])
-    assert Table(tmp_path / "table.csv").path.exists()
+    assert ResultTable(tmp_path / "table.csv").path.exists()
 
 
 @pytest.mark.parametrize(

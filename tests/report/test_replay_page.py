@@ -19,7 +19,7 @@ from PIL import Image
 from localization.errors import OutputError
 from localization.evaluation.references import ReferenceTrack, Relations, with_noise
 from localization.evaluation.scores import Result, score
-from localization.report.figure_data import map_view, nis_means, spans
+from localization.report.figure_data import map_view, nis_means, relation_bins
 from localization.report.replay_page import ReportHead, overview_png, page, verdict, write_report
 from localization.report.runs import baseline_run, best_run, ellipse, plotted_runs, run_with_map, thin_path, thin_series
 from localization.report.tables import MISSING, number, plus_minus, unit_of
@@ -278,7 +278,7 @@ def test_relation_bins_contain_every_relation_and_the_score_is_their_mean():
         np.r_[r.starts_ns, more.starts_ns[:4]], np.r_[r.ends_ns, more.ends_ns[:4]], np.r_[r.motions, more.motions[:4]], source="both"
     )
     results = score([run(noise=0.1)], both)
-    found = spans(plotted_runs(results)[0], both)
+    found = relation_bins(plotted_runs(results)[0], both)
     assert sum(found.n) == len(both.starts_ns)
     weights = np.array(found.n) / sum(found.n)
     assert weights @ found.translation_m == pytest.approx(results[0].accuracy.relations.all.translation_m)

@@ -1,4 +1,4 @@
-"""The two big claims of the simulator: its calibration grid gives the closed model back, and its 84 drives win and lose as the thesis's."""
+"""The simulator against the closed model (calibration grid) and against the thesis (84 drives of two controllers)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 from tests.studies import simulated_controllers, simulated_grid
+
+# one process for the tests of one fixture, which takes half a minute
+GRID, CONTROLLERS = pytest.mark.xdist_group("simulated_grid"), pytest.mark.xdist_group("simulated_controllers")
 
 
 @pytest.fixture(scope="module")
@@ -18,15 +21,17 @@ def drives():
     return {row.trajectory: row for row in simulated_controllers.rows(simulated_controllers.scores())}
 
 
+@GRID
 def test_simulated_rotations_give_the_models_regressions(measured):
     """4.21, 4.22 and 4.25 through bag, scan matching and arcs: each coefficient within three of its stated sigmas."""
     z = []
-    for seen, said in simulated_grid.fits(measured).values():
-        z += ((seen.coefficients - said.coefficients) / np.sqrt(np.diagonal(seen.cov))).tolist()
+    for measurement, model in simulated_grid.fits(measured).values():
+        z += ((measurement.coefficients - model.coefficients) / np.sqrt(np.diagonal(measurement.cov))).tolist()
     assert len(z) == 8
     assert np.abs(z).max() < 3.0
 
 
+@GRID
 def test_simulated_rotations_are_within_their_stated_sigma(measured):
     """Against the vehicle at constant rates: what is left is measurement. 68 values of each: the RMS of z is 1 to within 0.3 or smaller."""
     value = np.array([[r.k, *r.cor] for r in measured])
@@ -38,13 +43,15 @@ def test_simulated_rotations_are_within_their_stated_sigma(measured):
     assert (simulated_grid.sigmas(measured).mean(axis=0) < [0.001, 0.004, 0.004]).all()
 
 
+@GRID
 def test_simulated_vehicle_differs_from_the_model_by_below_a_percent(measured):
-    """The closed model knows no inertia: at 0.3 rad/s that is worth some thousandths of k."""
+    """The closed model has no inertia: at 0.3 rad/s that changes k by some thousandths."""
     off = np.array([r.settled - r.model for r in measured])
     assert np.abs(off[:, 0]).max() < 0.01
     assert np.abs(off[:, 1:]).max() < 0.006
 
 
+@CONTROLLERS
 def test_simulated_heuristic_wins_where_that_of_the_thesis_did(drives):
     """Clearly on rotations and hard turns, in vision error."""
     for trajectory in ("rotate", "arc_3", "s_curve"):
@@ -53,12 +60,14 @@ def test_simulated_heuristic_wins_where_that_of_the_thesis_did(drives):
         assert drives[trajectory].wins("simulated") >= 6
 
 
+@CONTROLLERS
 def test_simulated_heuristic_does_not_win_on_gentle_arcs(drives):
     for trajectory in ("arc_1", "arc_2", "arc_4"):
         assert drives[trajectory].gain("simulated") < 0.0
         assert drives[trajectory].wins("simulated") <= 4
 
 
+@CONTROLLERS
 def test_simulated_scores_have_the_size_of_table_5_2_where_stated(drives):
     rotate = drives["rotate"]
     np.testing.assert_allclose(rotate.simulated[:, 1, 2], rotate.measured[:, 1, 2], rtol=0.3)  # by this the CGs were inferred
