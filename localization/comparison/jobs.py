@@ -29,7 +29,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class TrialSpec:
-    """What is run on a log."""
+    """Model, estimator and corrections to be run on a log."""
 
     model: str
     estimator: str
@@ -44,7 +44,7 @@ class TrialSpec:
 
 @dataclass(frozen=True)
 class Job:
-    """A log and what is run on it."""
+    """A log and the trials to be run on it."""
 
     log: str
     robot: Robot

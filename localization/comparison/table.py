@@ -1,4 +1,4 @@
-"""The table of a comparison on disk: CSV or Parquet, rewritten as a whole after each log, so that what is done is never lost."""
+"""The table of a comparison on disk: CSV or Parquet, rewritten as a whole after each log, so that results are not lost."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Name = tuple[str, str, str, str]
 
 
 class ResultTable:
-    """Rows by what was run. Reads what is there; `put` and `save`."""
+    """Rows by log and trial, read from an existing file; `put` and `save`."""
 
     def __init__(self, path: Path) -> None:
         """Raises `OutputError` for a file that is no table of a comparison, or a format that cannot be written here."""

@@ -30,7 +30,7 @@ from localization.trajectory import IntArray, Trajectory
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
-_SINGULAR = 1e-12
+_MAX_ZERO_EIGENVALUE = 1e-12  # of the largest
 
 
 @dataclass(frozen=True)
@@ -244,10 +244,10 @@ def normalize(errors: ArrayLike, covariances: ArrayLike) -> tuple[FloatArray, ND
     if not np.all(is_covariance(p)):
         i = int(np.flatnonzero(~is_covariance(p))[0])
         raise EvaluationError(f"covariance number {i} is not symmetric or has a negative eigenvalue; it is no covariance:\n{p[i]}")
-    free = (values > _SINGULAR * largest) & (largest > 0.0)
+    free = (values > _MAX_ZERO_EIGENVALUE * largest) & (largest > 0.0)
     along = np.einsum("nji,nj->ni", vectors, e / sigma)
     whitened = np.where(free, along / np.sqrt(np.where(free, values, 1.0)), 0.0)
-    broken = (~free & (np.abs(along) > 3.0 * math.sqrt(_SINGULAR))).any(axis=1)
+    broken = (~free & (np.abs(along) > 3.0 * math.sqrt(_MAX_ZERO_EIGENVALUE))).any(axis=1)
     squares = np.where(broken, np.inf, np.sum(whitened**2, axis=1))
     return squares, free.sum(axis=1), np.einsum("nij,nj->ni", vectors, whitened)
 

@@ -1,4 +1,4 @@
-"""How well a trajectory agrees with a reference: ATE, RPE per distance, end error and drift, and the relations metric.
+"""Errors of a trajectory against a reference: ATE, RPE per distance, end error and drift, and the relations metric.
 
 Each metric is defined where it is computed. Numbers without a reference are None, never 0. The lever arm between the tracked point of
 the reference (a GPS antenna) and the robot's base is unknown and not removed; it is part of the error.
@@ -30,7 +30,7 @@ class EvaluateConfig(Settings):
     rpe_distances_m: tuple[float, ...] = ()
     """Lengths of the sub-paths of the relative pose error [m]; without any, 1, 2, 5, 10, 20, 50, ... up to what was driven."""
     path_resolution_m: float = 0.05
-    """Steps of the path shorter than this [m] are the jitter of a robot that stands, and no distance."""
+    """Steps of the path shorter than this [m] are jitter at standstill, and no distance."""
     short_span_s: float = 20.0
     """Relations that span less than this [s] are scored on their own, too."""
 

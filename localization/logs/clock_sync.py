@@ -29,18 +29,18 @@ from localization.logs.decode import MessageStats, Oddity
 _SECOND = 1_000_000_000
 _MAX_STEP_NS = _SECOND
 _REORDER_WAIT_NS = _SECOND
-_MAX_CLOCK_OFFSET_NS = 10 * _SECOND
-_EQUAL_JUMP_NS = _SECOND // 4
+_MAX_CLOCK_OFFSET_NS = 10 * _SECOND  # more is another clock, not latency
+_EQUAL_JUMP_NS = _SECOND // 4  # jumps of two topics that differ by less have one cause
 _MIN_JUMPED_MESSAGES = 3
 _MIN_JUMP_NS = 3 * _SECOND // 10
 """A stamp that deviates from the even pace of its topic by more than this [ns], while the times of recording are even, is no latency but a
 clock that was set. Smaller jumps move a robot by less than 0.3 m at 1 m/s; estimators reject these."""
 _PACE_MESSAGES, _MIN_PACE_MESSAGES = 20, 8
 """Messages from which the pace is computed, and the fewest: scanners of 2 Hz have 8 in 4 s."""
-_MAX_PENDING_NS = 10 * _SECOND
+_MAX_PENDING_NS = 10 * _SECOND  # bounds the latency
 _MAX_BURST_NS = 5 * _SECOND
-_MAX_PENDING_MESSAGES = 1000
-_MAX_BUFFERED_WEIGHT = 20_000
+_MAX_PENDING_MESSAGES = 1000  # bounds the memory
+_MAX_BUFFERED_WEIGHT = 20_000  # bounds the memory: 200 scans
 
 
 @dataclass(frozen=True)

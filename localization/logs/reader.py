@@ -22,8 +22,8 @@ from motion_models.robot import Mount, Robot
 
 _GPS = "/fix"
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_TF_READ_NS = 10_000_000_000
-_JOINT_STATES_READ = 500
+_TF_READ_NS = 10_000_000_000  # of ROS 1, where static transforms are repeated every 0.1 to 1 s on /tf
+_JOINT_STATES_READ = 500  # first messages that are searched for joint names
 
 
 def open_log(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> Log:  # noqa: B008 (frozen)

@@ -13,7 +13,7 @@ from localization.events import Event, PositionSample, Reference
 from localization.logs.decode import Oddity, UnusableError, yaw_of
 from motion_models.se2 import FloatArray
 
-_SEMI_MAJOR_M = 6_378_137.0
+_SEMI_MAJOR_M = 6_378_137.0  # WGS84
 _FLATTENING = 1.0 / 298.257223563
 _ECCENTRICITY2 = _FLATTENING * (2.0 - _FLATTENING)
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])

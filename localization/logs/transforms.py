@@ -14,7 +14,7 @@ from motion_models.se2 import FloatArray
 
 _ROOTS = ("base_link", "base_footprint")
 _WORLDS = {"map", "odom", "world", "earth"}
-_SAME = 1e-6
+_MAX_CHANGE = 1e-6
 _AGREE_M, _AGREE_RAD = 0.01, math.radians(0.5)
 """Two chains to a frame that differ by less agree: drivers round, and publish a robot's model beside their own mounts."""
 _MIN_NORM, _MAX_NORM = 0.5, 2.0
@@ -50,7 +50,7 @@ class FixedTransforms:
                 self._fixed.add(edge)
             elif edge in self._fixed:
                 continue
-            elif before is not None and np.abs(before - matrix).max() > _SAME:
+            elif before is not None and np.abs(before - matrix).max() > _MAX_CHANGE:
                 self._moving.add(edge)
             self._edges[edge] = matrix
 

@@ -23,7 +23,7 @@ _MAX_SPEED_M_S = 5.0
 _MAX_TURN_RATE_RAD_S = 10.0
 _MIN_INTERVAL_S = 0.05  # stamps jitter by milliseconds: speeds over shorter times are noise
 _STATIONARY_M, _STATIONARY_RAD = 1e-9, 1e-9
-_WRAP_RAD, _WRAP_WITHOUT_RATE_RAD = 0.3, 1.0
+_MAX_WRAP_DEVIATION_RAD, _MAX_WRAPPED_STEP_WITHOUT_RATE_RAD = 0.3, 1.0
 
 
 _MAX_PUBLISHER_GAP_NS = 1_000_000_000  # of a second publisher, after its reading before; drivers publish at 10 Hz and more
@@ -202,7 +202,7 @@ class JointsToWheels:
         jumped = np.abs(step) * self._radius > _MAX_SPEED_M_S * max(dt, _MIN_INTERVAL_S)
         expected = np.nan_to_num(velocity) * dt
         wrapped = np.remainder(step + math.pi, math.tau) - math.pi
-        is_wrap = np.abs(wrapped - expected) < np.where(np.isfinite(velocity), _WRAP_RAD, _WRAP_WITHOUT_RATE_RAD)
+        is_wrap = np.abs(wrapped - expected) < np.where(np.isfinite(velocity), _MAX_WRAP_DEVIATION_RAD, _MAX_WRAPPED_STEP_WITHOUT_RATE_RAD)
         return np.where(jumped, np.where(is_wrap, wrapped, expected), step), bool((jumped & ~is_wrap).any())
 
     def _side_means(self, values: FloatArray) -> FloatArray:

@@ -14,13 +14,13 @@ from localization.report.runs import Ellipse, PlottedRun, best_run, ellipse, run
 from localization.trajectory import Trajectory
 from motion_models.se2 import FloatArray
 
-_N_ELLIPSES = 12
-_REACH = 0.2
+_MAX_ELLIPSES = 12
+_MAX_WIDENING = 0.2  # of the borders by other runs than the best, as a fraction of their size
 # half-way between white and black paper: the map is a raster, whose colour the page cannot set
 _MAP_GREY = (118, 125, 132)
-_N_MEANS = 90
-_N_BINS = 9
-_LEAST_IN_BIN = 5
+_MAX_MEANS = 90
+_MAX_BINS = 9
+_MIN_BIN_RELATIONS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ def map_view(lines: Sequence[PlottedRun], reference: ReferenceTrack | Relations 
     paths = tuple(line.placed(line.result.run.trajectory.poses)[:, :2] for line in lines)
     core = [part for part in (track, paths[best.number] if best else None, _without_strays(points)) if part is not None and len(part)]
     low, high = _borders(core or [np.zeros((1, 2))])
-    reach = _REACH * max(float((high - low).max()), 1.0)
+    reach = _MAX_WIDENING * max(float((high - low).max()), 1.0)
     all_low, all_high = _borders([*core, *(path for path in paths if len(path))] or [np.zeros((1, 2))])
     low, high = np.maximum(all_low, low - reach), np.minimum(all_high, high + reach)
     margin = 0.03 * max(float((high - low).max()), 1.0)
@@ -138,12 +138,12 @@ def relation_bins(line: PlottedRun, relations: Relations) -> RelationBins:
     """Bins of equal width in the logarithm of the span; those of fewer than five relations are added to their neighbour."""
     found = relation_errors(line.result.run.trajectory, relations)
     span = np.maximum(found.spans_s, 1e-3)
-    edges = np.geomspace(span.min(), span.max() * (1.0 + 1e-9), _N_BINS + 1)
-    bins = np.clip(np.searchsorted(edges, span, side="right") - 1, 0, _N_BINS - 1)
-    groups = [np.flatnonzero(bins == b) for b in range(_N_BINS)]
+    edges = np.geomspace(span.min(), span.max() * (1.0 + 1e-9), _MAX_BINS + 1)
+    bins = np.clip(np.searchsorted(edges, span, side="right") - 1, 0, _MAX_BINS - 1)
+    groups = [np.flatnonzero(bins == b) for b in range(_MAX_BINS)]
     merged: list[NDArray[np.intp]] = []
     for group in groups:
-        if merged and (len(group) < _LEAST_IN_BIN or len(merged[-1]) < _LEAST_IN_BIN):
+        if merged and (len(group) < _MIN_BIN_RELATIONS or len(merged[-1]) < _MIN_BIN_RELATIONS):
             merged[-1] = np.concatenate([merged[-1], group])
         else:
             merged.append(group)
@@ -173,7 +173,7 @@ def nis_means(lines: Sequence[PlottedRun], limit: float) -> tuple[list[PlottedRu
     """The lines that have innovations, and about ninety means of each; ``limit``: the 95 % quantile of one value."""
     known = [(line, np.isfinite(line.result.run.nis)) for line in lines]
     known = [(line, use) for line, use in known if use.any()]
-    group = max(1, -(-max((int(use.sum()) for _, use in known), default=0) // _N_MEANS))
+    group = max(1, -(-max((int(use.sum()) for _, use in known), default=0) // _MAX_MEANS))
     means = []
     for line, use in known:
         values, t = line.result.run.nis[use], _seconds(line.result.run.trajectory.stamps_ns[use], line.result.run.trajectory)
@@ -198,7 +198,7 @@ def _ellipses(line: PlottedRun) -> tuple[Ellipse, ...]:
     length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
     if length[-1] <= 0.0:
         return (ellipse(poses[-1], trajectory.covariances[-1]),)
-    at = np.unique(np.searchsorted(length, np.linspace(0.0, length[-1], _N_ELLIPSES + 1)[1:] * (1.0 - 1e-12)))
+    at = np.unique(np.searchsorted(length, np.linspace(0.0, length[-1], _MAX_ELLIPSES + 1)[1:] * (1.0 - 1e-12)))
     return tuple(ellipse(poses[i], trajectory.covariances[i]) for i in at)
 
 
