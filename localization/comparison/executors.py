@@ -45,7 +45,7 @@ def run_jobs(
 def _rows(future: Future[list[Row]], job: Job) -> list[Row]:
     """Rows of a future that has ended; an error of its process or worker becomes rows with that error."""
     error = future.exception()
-    return failed_rows(job, _describe(error)) if isinstance(error, Exception) else future.result()
+    return future.result() if error is None else failed_rows(job, _describe(error))
 
 
 def _describe(error: BaseException) -> str:
