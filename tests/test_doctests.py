@@ -1,4 +1,4 @@
-"""The examples in docstrings and in the README are true: they run, and print what they say."""
+"""Examples in docstrings and in the README run and print the stated output."""
 
 from __future__ import annotations
 

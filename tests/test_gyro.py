@@ -32,7 +32,7 @@ def turned(t):
 
 
 def samples(seconds, body_R_imu=None, gravity=9.81, hz=100.0, start_s=0.0, frame="imu_link", wz=rate):
-    """IMU samples of a robot that turns in the plane, as an IMU sees it whose axes stand in the body like ``body_R_imu`` (3, 3)."""
+    """IMU samples of a robot that turns in the plane, by an IMU whose axes in the body are ``body_R_imu`` (3, 3)."""
     R = np.eye(3) if body_R_imu is None else body_R_imu
     return [
         ImuSample(T0 + round((start_s + i / hz) * S), R.T @ (wz(start_s + i / hz) * UP), R.T @ (gravity * UP), frame)
@@ -123,7 +123,7 @@ def test_gyro_gap_if_short_is_interpolated_and_if_long_is_unknown():
 
 
 def spoiled(wild, hz=100.0):
-    """Four seconds of turning by 0.5 rad/s, with other samples in the place of those that ``wild`` [rad/s] says by index."""
+    """Four seconds of turning by 0.5 rad/s, with other samples in place of those at the indices of ``wild`` [rad/s]."""
     return [
         ImuSample(s.stamp_ns, wild[i] * UP, s.linear_acceleration, s.frame_id) if i in wild else s
         for i, s in enumerate(samples(4.0, hz=hz, wz=lambda t: 0.5))
@@ -137,7 +137,7 @@ def test_gyro_spikes_are_dropped_and_reported(wild, hz):
     assert past.turn(T0, T0 + 4 * S, 0.0).angle == pytest.approx(2.0, abs=1e-9)
     (note,) = past.warnings()
     assert note.startswith(f"IMU 'imu_link': {len(wild)} reading{'s' * (len(wild) > 1)} dropped")
-    # meanwhile the last rate that was believed holds
+    # meanwhile the last accepted rate holds
     begun = spoiled(wild, hz)[: min(wild) + 1]
     assert history(begun).turn(T0, begun[-1].stamp_ns, 0.0).angle == pytest.approx(0.5 * 20 / hz, abs=1e-9)
 
@@ -230,7 +230,7 @@ def test_gyro_axis_before_the_wheels_confirm_it_is_unused():
 
 @pytest.mark.parametrize("gravity", [0.0, 1.0, 981.0])
 def test_gyro_mount_without_gravity_is_used_as_given(gravity):
-    """Drivers that publish no acceleration, or one in other units, say nothing of the mount."""
+    """Drivers that publish no acceleration, or one in other units, give no information about the mount."""
     found, past = turns(samples(3.0, gravity=gravity), {"imu_link": Mount()}, wheels=lambda a, b: 0.0)
     check_all_right(found, 0.0)
     assert past.warnings() == []
@@ -241,7 +241,7 @@ def test_gyro_mount_without_gravity_is_used_as_given(gravity):
 
 @pytest.mark.parametrize("degrees", [10.0, -10.0])
 def test_gyro_mount_on_a_slope_of_10_degrees_is_kept(degrees):
-    """Gravity alone cannot tell a slope from a mount: the mount holds, and the scale is off by the cosine."""
+    """Gravity alone does not separate a slope from a mount: the mount is kept, and the scale is wrong by the cosine."""
     R = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
     found, past = turns(samples(3.0, R), {"imu_link": Mount()}, wheels=lambda a, b: 0.0)
     assert past.warnings() == []

@@ -1,4 +1,4 @@
-"""The notebooks run, and the .ipynb that are shown are the .py that are read."""
+"""The notebooks run, and each .ipynb is its .py, executed."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_notebook_runs(source, monkeypatch):
 
 @pytest.mark.parametrize("source", sources(), ids=lambda source: source.stem)
 def test_notebook_stored_output_matches_its_code(source):
-    """Mended by `python -m tests.helpers.notebooks NAME`."""
+    """Where it does not, run `python -m tests.helpers.notebooks NAME`."""
     shown = nbformat.read(source.with_suffix(".ipynb"), as_version=4)
     nbformat.validate(shown)
     assert [(c.cell_type, c.source) for c in shown.cells] == [(c.cell_type, c.source) for c in read(source).cells]

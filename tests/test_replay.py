@@ -137,7 +137,7 @@ def test_replay_every_format_gives_the_same_estimate(form, tmp_path, mcap_replay
 
 
 def test_replay_wheel_corrections_converge_to_the_slip(tmp_path):
-    """The wheels turn 1.5 times as much as the robot; vaultbot's file says 1.875 times."""
+    """The wheels turn 1.5 times as much as the robot; vaultbot's file has 1.875."""
     log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(30.0, multiplier=1.5))
     assert replay(log, tmp_path / "out", "--robot", "vaultbot", "--model", "diff_drive") == 0
     found, _ = results(tmp_path / "out")

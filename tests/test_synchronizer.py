@@ -313,7 +313,7 @@ def test_wheels_missing_give_a_wide_covariance_and_a_warning():
 
 @pytest.mark.parametrize("scan_s", [0.05, 0.1, 0.4])
 def test_wheels_missing_covariance_grows_with_the_duration(scan_s):
-    """A velocity that nobody knows lasts: how far it leads does not depend on how often a scanner looks meanwhile."""
+    """An unknown velocity is constant: its covariance of position does not depend on the rate of the scans."""
     config = StepConfig()
     gone = [w for w in wheels(20.0, turned=lambda t: (0.1 * (t > 12.5),) * 2) if not 2.0 < (w.stamp_ns - T0) * 1e-9 < 12.99]
     found, _ = cut(in_order(gone, [scan(scan_s * i) for i in range(round(15.0 / scan_s))]))
@@ -456,7 +456,7 @@ def test_events_in_any_order_give_steps_in_order(order):
 
 @pytest.mark.parametrize("late_s", [0.04, -0.04])
 def test_clock_offset_shifts_the_wheel_samples_used(late_s):
-    """Wheels whose stamps are late by so much give the same motion once the stepper knows it."""
+    """Wheels whose stamps are late by so much give the same motion once the synchronizer has their offset."""
     true = [WheelSample(w.stamp_ns, NAN, w.position) for w in wheels(4.0)]
     late = [WheelSample(w.stamp_ns + round(late_s * S), NAN, w.position) for w in true]
     scans = [scan(0.5 + 0.1 * i) for i in range(20)]
@@ -482,7 +482,7 @@ def test_d_clock_is_that_of_numerical_differences(model):
     for minus, at, plus in zip(*(by_offset[o] for o in (-h, 0.0, h)), strict=True):
         numerical = se2.log(se2.between(minus.predicted.delta, plus.predicted.delta)) / (2.0 * h)
         np.testing.assert_allclose(at.d_clock, numerical, rtol=1e-5, atol=1e-6)
-        assert np.abs(at.d_clock).max() > 1e-2  # the drive does tell the offset
+        assert np.abs(at.d_clock).max() > 1e-2  # the drive makes the offset observable
 
 
 def test_standstill_is_set_only_by_wheel_samples_without_motion():
@@ -498,7 +498,7 @@ def test_standstill_is_set_only_by_wheel_samples_without_motion():
             assert not step.d_clock.any()
         elif end > 1.02 and start < 1.98:
             assert not step.is_standing
-    assert not found[0].is_standing  # of length zero: no wheel was asked
+    assert not found[0].is_standing  # of length zero: no wheel sample was used
 
 
 def test_twist_is_that_of_the_end():
@@ -512,7 +512,7 @@ def test_twist_is_that_of_the_end():
 
 @pytest.mark.parametrize("scan_s", [0.0, -0.1, 0.1])
 def test_twist_of_the_first_scan_is_that_of_its_time(scan_s):
-    """Scans are swept from their stamp on, and the wheels of a robot that moves already tell how only by two samples."""
+    """Beams are measured from the stamp on, and the motion of a moving robot takes two wheel samples."""
     cutter, model = stepper(model="diff_drive"), make_model("diff_drive", ROBOT)
     turned = lambda t: (3.0 * t, 3.5 * t)  # noqa: E731
     assert not list(steps_after(scan(scan_s), cutter))
@@ -567,7 +567,7 @@ def test_scans_of_an_unknown_frame_are_reported_and_not_mixed():
     assert "7 scans of it were not used" in note
     assert "[mounts.top]" in note
     assert cutter.frames.lack is not None
-    # where none is known, they are all there is
+    # without any known frame they are used
     found, cutter = cut(in_order(ahead, strange))
     assert sum(s.scan is not None for s in found) == 7
     (note,) = cutter.warnings()
@@ -612,7 +612,7 @@ def test_step_length_is_zero_only_at_the_first_scan():
     assert math.isclose(sum(s.duration for s in found), (found[-1].end_ns - found[0].start_ns) * 1e-9)
 
 
-# --- events that nobody can use
+# --- invalid events
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What a user may type wrongly, or an attacker on purpose: told at once, by name, and nothing is left behind."""
+"""Wrong or malicious arguments and files: refused at once, by name, without leaving files."""
 
 from __future__ import annotations
 

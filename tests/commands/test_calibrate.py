@@ -44,7 +44,7 @@ def run(tmp_path: Path, *arguments: object) -> dict[str, Any]:
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """What the command says where it must fail."""
+    """The error message of the command."""
     assert main(["calibrate", *map(str, arguments)]) == 2
     return " ".join(capsys.readouterr().err.split())
 
@@ -131,7 +131,7 @@ def test_calibrate_husky_gyro_only_fits_k_and_no_distance(tmp_path: Path, capsys
     k = result["parameters"]["k_0"]
     slope, shift = shifted_slope(HUSKY)
     assert k["value"] == pytest.approx(slope, rel=0.02)
-    assert 0.0026 < k["sigma"] < 0.012  # not below the half percent to which the gyro's scale is known
+    assert 0.0026 < k["sigma"] < 0.012  # not below the half percent of the gyro's scale
     assert result["parameters"]["wheel_time_offset"]["value"] == pytest.approx(shift, abs=0.03)
     assert {held["parameter"] for held in result["held"]} == {"x_cr_0", "y_cr_0", "wheel_radius_scale"}
     assert set(result["errors"]) == {"heading_deg"}
@@ -379,7 +379,7 @@ def test_calibrate_several_tables_are_fitted_jointly_and_scored_alone(tmp_path: 
 
 
 def test_calibrate_husky_windows_fit(tmp_path: Path) -> None:
-    """The DRIVE data set as a table: as well as the study that knows the data set, within 5 %."""
+    """The DRIVE data set as a table: as good as the study of that data set, within 5 %."""
     path = tmp_path / "drive.csv"
     path.write_text(windows_text(drive_husky.maneuvers(mended=True)))
     result = run(tmp_path, path, "--model", "full_linear")

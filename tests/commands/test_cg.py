@@ -88,14 +88,14 @@ def test_cg_own_urdf_and_srdf_are_used(tmp_path: Path) -> None:
 
 
 def test_cg_weighed_in_one_posture_is_converted_to_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The base is heavier and lies elsewhere than the URDF says; the arms are as it says."""
+    """Mass and position of the base differ from the URDF; the arms do not."""
     stow, _ = urdf_reference.center_of_mass(URDF, POSTURES["stow_back"])
     ready, mass = urdf_reference.center_of_mass(URDF, POSTURES["ready"])
     extra, at = 10.0, np.array([0.1, -0.05])
     table = weigh(tmp_path, mass + extra, (stow[:2] * mass + extra * at) / (mass + extra))
     result = run(tmp_path, table, "--weighed-posture", "stow_back", "--posture", "ready")
     np.testing.assert_allclose(result["cg_m"], (ready[:2] * mass + extra * at) / (mass + extra), atol=1e-9)
-    # The static part that it prints is what a robot file wants, and gives the same.
+    # The printed static part, in a robot file, gives the same.
     static = result["static_part"]
     text = (FILES / "vaultbot.toml").read_text()
     text += f"static_mass_kg = {static['mass_kg']!r}\nstatic_x_m = {static['position_m'][0]!r}\nstatic_y_m = {static['position_m'][1]!r}\n"

@@ -1,4 +1,4 @@
-"""`skidloc diagnose`: what it prints and writes, what it says where it cannot know, and what it says of input that is none."""
+"""`skidloc diagnose`: outputs, undecidable drives, and bad input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`skidloc init` from end to end: what it guesses of real logs, what it says is missing, and that its file works."""
+"""`skidloc init` from end to end: values from real logs, reports of missing ones, and a robot file that works."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Many logs: the same table whatever the processes, whatever dies on the way; statistics that hold what they promise."""
+"""Many logs: the same table for any number of processes and after any loss of one; calibrated statistics."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_compare_broken_log_is_reported_and_the_others_finished(table, tmp_path,
 
 
 def test_compare_warnings_of_a_log_are_reported(tmp_path, capsys):
-    """A log that is cut off still counts: whoever reads the means must know."""
+    """A truncated log counts, and is reported beside the means."""
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(logs(1)[0].read_bytes()[:-4000])
     assert compare(tmp_path / "t.csv", of=[cut, *logs(1)]) == 0
@@ -194,7 +194,7 @@ def test_compare_bug_in_one_log_does_not_stop_the_others(monkeypatch):
 
 
 def test_compare_worker_in_another_folder_finds_the_given_paths(tmp_path, monkeypatch):
-    """As those of a cluster: log and reference are told relative to where the command is."""
+    """As those of a cluster: log and reference are relative to the folder of the command."""
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "run.mcap").symlink_to(logs(1)[0])
     (tmp_path / "run.tum").write_text("".join(f"{t} 0 0 0 0 0 0 1\n" for t in range(2, 20)))

@@ -1,4 +1,4 @@
-"""The report of a comparison says what the table says: words that can be checked, every log, what failed. It overwrites nothing else."""
+"""Report of a comparison: summary, every log, failures; it overwrites only reports."""
 
 from __future__ import annotations
 

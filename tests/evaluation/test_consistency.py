@@ -1,6 +1,6 @@
-"""Consistency tests are themselves tested by counting: honest errors pass as often as promised, dishonest ones are found out.
+"""Consistency tests, by counting: errors of the stated covariance pass at the stated rate, others fail.
 
-Bounds on counts are binomial at one in a million, so that an honest implementation fails with no seed in practice.
+Bounds on counts are binomial at one in a million, so that a correct implementation fails with no seed in practice.
 """
 
 import math
@@ -274,7 +274,7 @@ def test_pose_nees_of_one_run_counts_as_one_sample():
         found = pose_consistency(as_trajectory(estimate, p), as_track(truth))
         assert (found.n, found.n_independent, found.band) == (60, 1, mean_band(1, 3))
         verdicts.append(found.verdict)
-    # the mean of sixty correlated samples spreads less than one sample, so honest runs pass at least as often
+    # the mean of sixty correlated samples spreads less than one sample, so consistent runs pass at least as often
     assert verdicts.count("consistent") >= binom.ppf(1e-6, 200, 0.95)
 
 
@@ -287,7 +287,7 @@ def test_pose_nees_with_reference_noise_counts_it_where_given():
         seen = se2.compose([0, 0, 0.7], truth) + rng.multivariate_normal(np.zeros(3), noise, len(truth))
         found = pose_errors(as_trajectory(estimate, p), as_track(seen, covariances=np.broadcast_to(noise, (len(seen), 3, 3))))
         whitened.append(np.linalg.solve(np.linalg.cholesky(found.covariances[-1]), found.errors[-1]))
-    # 400 draws: a variance is known to 7 %, a correlation to 5 %; five of these
+    # 400 draws: a variance is estimated to 7 %, a correlation to 5 %; five of these
     np.testing.assert_allclose(np.cov(whitened, rowvar=False), np.eye(3), atol=0.35)
     unknown = np.full((11, 3, 3), np.nan)
     np.testing.assert_array_equal(pose_errors(as_trajectory(estimate, p), as_track(truths[0], covariances=unknown)).covariances, p[1:])

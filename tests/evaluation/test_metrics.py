@@ -1,4 +1,4 @@
-"""Scores: evo as the independent second opinion where definitions agree, and cases whose answer is known by construction.
+"""Scores: compared with evo where definitions agree, and on cases with an analytic answer.
 
 Where evo's definitions differ from ours, and so what is not compared: evo's relative pose error is not divided by the distance, takes
 the sample *nearest* to the wanted distance (ours: the first at or beyond it; the same on paths of equal steps that divide the distance),
@@ -284,7 +284,7 @@ def test_rpe_gap_in_the_reference_is_no_short_sub_path():
 
 
 def test_relations_errors_match_hand_calculation():
-    # facing north at (1, 1), one metre forward and a quarter turn; the relation says 1.1 m and 80 degrees
+    # facing north at (1, 1), one metre forward and a quarter turn; the relation is 1.1 m and 80 degrees
     trajectory = Trajectory(seconds(2), [[1, 1, math.pi / 2], [1, 2, math.pi]])
     relations = Relations(seconds(2)[:1], seconds(2)[1:], np.array([[1.1, 0.0, math.radians(80)]]))
     found = evaluate(trajectory, relations)

@@ -80,7 +80,7 @@ def three_runs():
 
 
 def with_error(value, estimator="ekf", model="diff_drive"):
-    """A result whose ATE is ``value`` whatever its poses say."""
+    """A result whose ATE is set to ``value``."""
     result = score([run(model, estimator, 0.1)], track())[0]
     return dataclasses.replace(result, accuracy=dataclasses.replace(result.accuracy, ate_rmse_m=value))
 

@@ -1,4 +1,4 @@
-"""The shipped ACES log says what its source says, and the script that made it makes it again."""
+"""The shipped ACES log matches its source, and its script reproduces it."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ def test_arm_cg_moving_joints_move_the_cg(tmp_path: Path, format_: str) -> None:
 
 
 def test_arm_cg_joints_of_arms_and_wheels_are_separated(tmp_path: Path) -> None:
-    """Left arm on its own topic, right arm on that of the wheels and even at their stamps; CGs begin once both arms were told."""
+    """Left arm on its own topic, right arm on that of the wheels and even at their stamps; CGs begin once both arms were published."""
     records: list[Record] = []
     for i in range(40):
         stamp = START + i * STEP
@@ -146,7 +146,7 @@ def test_arm_cg_missing_joint_delays_the_cg_until_it_is_published(tmp_path: Path
 
 
 def test_arm_cg_joints_in_degrees_are_reported_as_tipping(tmp_path: Path) -> None:
-    """A narrow robot: what arms at nonsense angles do to it is counted, not believed."""
+    """A narrow robot: CGs of arms at impossible angles are counted and dropped."""
     narrow = dataclasses.replace(ROBOT, geometry=dataclasses.replace(ROBOT.geometry, wheelbase_m=0.1))
     records: list[Record] = [("/joint_states", both(START + i * STEP, i), START + i * STEP) for i in range(40)]
     log = open_log(bags.write_mcap(tmp_path / "run.mcap", records), narrow)

@@ -27,7 +27,7 @@ HOUR = 3600 * S
 
 @dataclass(frozen=True)
 class Mark:
-    """A payload that knows where it came from and when it was really measured."""
+    """A payload with its topic and its true time of measurement."""
 
     stamp_ns: int
     topic: str

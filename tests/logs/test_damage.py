@@ -1,4 +1,4 @@
-"""Logs that are broken: what can be read is read, what is lost is said, and nothing but our own errors comes out."""
+"""Damaged logs: readable messages are read, lost ones reported, and only `LogError` is raised."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_ros1_truncated_is_read_to_the_cut(tmp_path: Path, compression: str | No
 
 
 def test_ros1_of_a_killed_recorder_is_read_without_index(tmp_path: Path) -> None:
-    """rosbag leaves a file named .bag.active, whose header says that there is no index."""
+    """rosbag leaves a file named .bag.active, whose header has no index."""
     path = bags.write_ros1_bag(tmp_path / "run.bag", numbered_records(), chunk_bytes=100_000)
     data = bytearray(path.read_bytes())
     at = data.index(b"index_pos=") + len(b"index_pos=")
@@ -210,7 +210,7 @@ def test_mcap_bad_chunk_loses_only_that_chunk(tmp_path: Path) -> None:
 
 
 def test_mcap_chunk_with_wrong_checksum_is_used_and_reported(tmp_path: Path) -> None:
-    """A flipped bit in a range looks like any other range: which message it is in cannot be known, and the others are right."""
+    """A flipped bit in a range is a valid range: the message cannot be identified, and the others are right."""
     from mcap.writer import CompressionType, Writer
 
     path = tmp_path / "run.mcap"

@@ -68,7 +68,7 @@ def test_scan_without_ranges_is_a_scan(tmp_path: Path, ranges: list[float]) -> N
 def test_scan_of_an_upside_down_scanner_turns_the_other_way(tmp_path: Path) -> None:
     (scan,), _ = scans_of(tmp_path, [bags.laser_scan(START, [2.0, 2.0], angle_min=0.5, angle_increment=-0.25)])
     np.testing.assert_allclose(np.arctan2(scan.points[:, 1], scan.points[:, 0]), [0.5, 0.25], rtol=1e-6)
-    assert scan.offsets.shape == (0,)  # it does not tell the beams' times
+    assert scan.offsets.shape == (0,)  # it has no time_increment
 
 
 def test_scan_nan_limits_are_unlimited_and_nan_angle_is_malformed(tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ UPTIME = 512.25
         ("timestamp", "<f8", START + SWEEP * 1e9),  # Livox, driver 2
         ("stamps", "<f8", SWEEP * 1e6),
         ("time", "<f4", SWEEP * 1e9),
-        ("timestamp", "<f8", UPTIME + SWEEP),  # a clock that nobody else knows: the sweep begins at the header's stamp
+        ("timestamp", "<f8", UPTIME + SWEEP),  # an unknown clock: the scan begins at the header's stamp
         ("t", "<u4", UPTIME * 1e9 % 2**32 + SWEEP * 1e9),
     ],
 )
@@ -295,7 +295,7 @@ WILD = "/joint_states: 4 messages with rates that wheels cannot reach; these wer
 
 
 def test_wheel_rates_beyond_any_wheel_are_dropped_and_reported(tmp_path: Path) -> None:
-    """Where angles are there, they tell; without angles nothing does, and the message is dropped."""
+    """Angles are used where the message has them; without, it is dropped."""
     position, velocity = 0.1 * np.arange(30)[:, None] * [1, 1, 1, 1], np.ones((30, 4))
     for i, wild in ((5, 1e300), (10, -1e5), (15, 80.0), (20, np.inf)):
         velocity[i, 2] = wild
@@ -355,7 +355,7 @@ def test_odometry_is_converted_to_wheel_rates(tmp_path: Path) -> None:
 
 
 def test_odometry_after_lost_messages_keeps_the_distance(tmp_path: Path) -> None:
-    """On a constant arc, two messages tell as much as sixty."""
+    """On a constant arc, two messages give the motion of sixty."""
     rates = np.tile([2.0, 3.0], (60, 1))
     poses, twists = drive(rates, 0.1, ROBOT.driver)
     wheels = wheels_of(odometry_log(tmp_path, poses, twists, keep=slice(None, None, 20)))
@@ -390,7 +390,7 @@ def test_odometry_reset_loses_one_increment(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("wild", [(1e5, 0.0), (0.0, -1e300), (6.0, 11.0)])
 def test_odometry_twists_beyond_any_wheel_are_dropped_and_reported(tmp_path: Path, wild: Any) -> None:
-    """The pose tells the motion; where it is NaN or never moves, the message is dropped, and its time is the next one's."""
+    """The pose gives the motion; where it is NaN or never moves, the message is dropped, and the next one covers its time."""
     rates = np.tile([4.0, 5.0], (60, 1))
     poses, twists = drive(rates, 0.1, ROBOT.driver)
     twists[[9, 29]] = wild  # of the messages 10 and 30
@@ -480,7 +480,7 @@ def test_events_arrays_are_not_shared_with_the_reader(tmp_path: Path) -> None:
 
 
 def test_message_type_defined_differently_is_dropped_and_counted(tmp_path: Path) -> None:
-    """The bytes are those of the log's definition, but there is nothing in them that an IMU would tell."""
+    """The bytes are those of the log's definition, but have no field of an IMU."""
     definition = "std_msgs/Header header\nfloat64 temperature\n" + "=" * 80 + "\n"
     definition += "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n" + "=" * 80 + "\n"
     definition += "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"

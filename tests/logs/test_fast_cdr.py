@@ -107,7 +107,7 @@ def garbled(data, where):
 
 @given(st.lists(joint_states(), min_size=1, max_size=4), st.integers(-8, 8), st.integers(0, 400))
 def test_joint_states_whole_cut_or_corrupted_are_read_as_by_rosbags(messages, longer, where):
-    decode = decoder(JOINTS)  # the same for all: it remembers the names of the one before
+    decode = decoder(JOINTS)  # one decoder for all: it caches the names of the last message
     for message in [*messages, *messages]:
         data = encode(message)
         assert read(decode, data) == content(message)

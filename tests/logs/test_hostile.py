@@ -138,7 +138,7 @@ def test_damaged_region_of_an_uncompressed_chunk_costs_its_messages_only(tmp_pat
 
 @pytest.mark.parametrize("kind", ["mcap", "mcap-folder"])
 def test_fewer_messages_than_the_index_lists_are_reported(tmp_path: Path, kind: str) -> None:
-    """A record in the middle whose kind was turned into one that nobody knows: all else is intact."""
+    """A record in the middle of an unknown kind: all else is intact."""
     path = bags.FORMATS[kind](tmp_path / "run", numbered_records(150))
     file = next(path.glob("*.mcap")) if path.is_dir() else path
     data = bytearray(file.read_bytes())

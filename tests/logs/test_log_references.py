@@ -1,4 +1,4 @@
-"""References, mounts, and what `info` tells."""
+"""References, mounts, and `skidloc info`."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_references_of_each_message_type_give_poses(tmp_path: Path, ros1: bool) 
         ("/pose", bags.pose_stamped(START, 1.0, 2.0, 0.7), None),
         ("/pose_cov", bags.pose_with_covariance(START, 1.0, 2.0, 0.7, COVARIANCE), planar),
         ("/odom", bags.odometry(START, 1.0, 2.0, 0.7, covariance=COVARIANCE), planar),
-        ("/zero_cov", bags.odometry(START, 1.0, 2.0, 0.7), None),  # all zeros: the driver does not know
+        ("/zero_cov", bags.odometry(START, 1.0, 2.0, 0.7), None),  # all zeros: a driver without covariance
         ("/vicon", transform, None),
     ]
     log = log_of(tmp_path, [(topic, message, START) for topic, message, _ in cases], ros1)

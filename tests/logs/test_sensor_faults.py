@@ -39,7 +39,7 @@ def test_scan_with_impossible_angles_is_dropped_and_reported(tmp_path: Path, ang
 
     log = opened(tmp_path, drive(3.0, spoil=spoil))
     scans = [e for e in log.events() if isinstance(e, Scan)]
-    if last == 1.0:  # the ends tell the step
+    if last == 1.0:  # the ends give the step
         assert len(scans) == 30
     else:
         assert scans == []
@@ -146,11 +146,11 @@ def test_second_publisher_of_zeros_loses_no_distance(tmp_path: Path, offset_ms: 
                 later = stamp + offset_ms * 1_000_000
                 yield topic, bags.joint_state(later, position=(0.0,) * 4, velocity=(0.0,) * 4), later
 
-    honest = wheels_of(opened(tmp_path, drive(20.0)))
+    single = wheels_of(opened(tmp_path, drive(20.0)))
     (tmp_path / "run.mcap").unlink()
     log = opened(tmp_path, sorted(records(), key=lambda record: record[2]))
     found = wheels_of(log)
-    np.testing.assert_allclose(found[-1].position, honest[-1].position, atol=2.0)  # of 40 to 60 rad; 0.25 m are not told apart at first
+    np.testing.assert_allclose(found[-1].position, single[-1].position, atol=2.0)  # of 40 to 60 rad; the first 0.25 m cannot be separated
     assert "of a second publisher whose wheels turn less, left out" in warnings_of(log)
 
 
@@ -229,14 +229,14 @@ def zeros(message, later: int):
 
 @pytest.mark.parametrize("first", [lambda m: m, rates_only], ids=["angles and rates", "rates"])
 def test_second_publisher_of_rates_only_loses_no_distance(tmp_path: Path, first: Callable) -> None:
-    honest = wheels_of(opened(tmp_path, [(t, first(m) if t == "/joint_states" else m, s) for t, m, s in drive(20.0)]))
+    single = wheels_of(opened(tmp_path, [(t, first(m) if t == "/joint_states" else m, s) for t, m, s in drive(20.0)]))
     (tmp_path / "run.mcap").unlink()
     log = opened(tmp_path, doubled(9, lambda m, later: rates_only(zeros(m, later)), first=first))
     found = wheels_of(log)
-    if np.isfinite(honest[-1].position).all():
-        np.testing.assert_allclose(found[-1].position, honest[-1].position, rtol=0.02)
+    if np.isfinite(single[-1].position).all():
+        np.testing.assert_allclose(found[-1].position, single[-1].position, rtol=0.02)
     else:
-        np.testing.assert_allclose(np.mean([s.velocity for s in found], axis=0), honest[-1].velocity, rtol=0.03)
+        np.testing.assert_allclose(np.mean([s.velocity for s in found], axis=0), single[-1].velocity, rtol=0.03)
     assert "of a second publisher whose wheels turn less, left out" in warnings_of(log)
 
 
@@ -266,7 +266,7 @@ def test_odometry_that_stops_at_once_is_no_second_publisher(tmp_path: Path) -> N
 
 
 def test_frozen_wheel_is_excluded_and_named(tmp_path: Path) -> None:
-    honest = wheels_of(opened(tmp_path, drive(20.0)))
+    single = wheels_of(opened(tmp_path, drive(20.0)))
     (tmp_path / "run.mcap").unlink()
     records = drive(20.0)
     for topic, message, _ in records:
@@ -274,6 +274,6 @@ def test_frozen_wheel_is_excluded_and_named(tmp_path: Path) -> None:
             message.position = message.position * (np.arange(len(message.position)) > 0)
     log = opened(tmp_path, records)
     found = wheels_of(log)
-    np.testing.assert_allclose(found[-1].position, honest[-1].position, atol=0.05)
+    np.testing.assert_allclose(found[-1].position, single[-1].position, atol=0.05)
     assert f"/joint_states, joint '{ROBOT.joints.left[0]}': " in warnings_of(log)
     assert "its side turns; it was left out" in warnings_of(log)

@@ -1,4 +1,4 @@
-"""Which topic plays which part, and what is said when one is missing."""
+"""Topic of each role, and errors where one is missing."""
 
 from __future__ import annotations
 

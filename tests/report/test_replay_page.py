@@ -1,4 +1,4 @@
-"""The report says what the numbers say: words, tables, pictures, and a page that is safe, whole and the same every time."""
+"""Report of a replay: summary, tables, figures, and a page that is valid, safe and reproducible."""
 
 import dataclasses
 import functools
@@ -103,7 +103,7 @@ def test_summary_small_difference_all_along_is_significant():
 
 
 def test_summary_false_positive_rate_for_equal_filters_is_small():
-    """Two runs of one quality, other noise: at most a few of 100 may be called different (2.5 % is promised, one side)."""
+    """Two runs of one quality, other noise: at most a few of 100 may be called different (2.5 % one-sided by the test)."""
     called = 0
     for seed in range(100):
         pair = [run("diff_drive", "ekf", 0.1, 1000 + seed), run("skid_steer", "ekf", 0.1, 5000 + seed)]
@@ -140,14 +140,14 @@ def test_summary_few_outliers_are_no_overconfidence():
 
 
 def test_summary_nees_of_one_drive_fails_only_outside_its_band():
-    def told(nees):
+    def summary_of_nees(nees):
         (result,) = score([run(noise=0.01)], track())
         return verdict([dataclasses.replace(result, nees_mean=nees)], track())
 
-    assert "overconfident" in told(9.5)
-    assert "overconfident" not in told(9.2)  # chi-square(3) has its 97.5 % quantile at 9.35
-    assert "overconfident" in told(math.inf)
-    assert "larger than need be" in told(0.2)
+    assert "overconfident" in summary_of_nees(9.5)
+    assert "overconfident" not in summary_of_nees(9.2)  # chi-square(3) has its 97.5 % quantile at 9.35
+    assert "overconfident" in summary_of_nees(math.inf)
+    assert "larger than need be" in summary_of_nees(0.2)
 
 
 def test_summary_untestable_or_missing_covariances_are_reported():
@@ -328,8 +328,8 @@ def test_table_of_relations_has_every_group():
 
 
 def test_page_lists_parameters_counts_notes_and_provenance():
-    told = run(parameters={"gyro_bias_rad_per_s": (0.0012, 0.00004)}, counts={"slips": 12345}, noise=0.1)
-    words = " ".join(PageText(page(HEAD, score([told], None), None)).words)
+    estimated = run(parameters={"gyro_bias_rad_per_s": (0.0012, 0.00004)}, counts={"slips": 12345}, noise=0.1)
+    words = " ".join(PageText(page(HEAD, score([estimated], None), None)).words)
     for expected in ("0.001200 ± 0.000040", "rad/s", "12,345", "3 scans were empty.", "c0ffee", "vaultbot", "2026-01-02 03:04:05 UTC"):
         assert expected in words
 

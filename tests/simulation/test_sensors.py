@@ -1,4 +1,4 @@
-"""Claims about the simulated sensors: what they report is the world from where the robot truly is, at that very moment."""
+"""Simulated sensors: their data are those of the world at the true pose and time."""
 
 from __future__ import annotations
 

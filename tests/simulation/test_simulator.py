@@ -1,4 +1,4 @@
-"""Claims about simulated logs: any reader opens them, one seed gives the same bytes, effects change the world and not the metadata."""
+"""Simulated logs: any reader opens them, one seed gives the same bytes, faults change the world and not the metadata."""
 
 from __future__ import annotations
 

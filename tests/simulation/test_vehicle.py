@@ -1,4 +1,4 @@
-"""Claims about the simulated vehicle: it obeys mechanics, agrees with the models it shares its law with, and its steps converge."""
+"""The simulated vehicle: it obeys mechanics, agrees with the models of the same contact law, and its steps converge."""
 
 from __future__ import annotations
 
@@ -333,7 +333,7 @@ def test_vehicle_payload_shifts_the_cg_and_adds_inertia():
     loaded = masses.cg(at)[0, :2]
     np.testing.assert_allclose(masses.nominal_cg(at)[0], empty)
     assert loaded[0] > empty[0] + 0.01
-    # the gripper is where the moments say: m p = (M + m) g - M n
+    # position of the gripper by the moments: m p = (M + m) g - M n
     p = ((118.84 + 10) * loaded - 118.84 * empty) / 10
     assert masses.payload_distance(5.0) == pytest.approx(np.hypot(*(p - loaded)), rel=1e-9)
     assert 0.3 < p[0] < 1.2

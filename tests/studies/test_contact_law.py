@@ -1,4 +1,4 @@
-"""Claims about contact laws on measured data (tests/studies/contact_law.py), and the second implementation behind them."""
+"""Contact laws on measured data (tests/studies/contact_law.py), and the second implementation behind them."""
 
 import numpy as np
 import pytest

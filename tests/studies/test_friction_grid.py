@@ -1,4 +1,4 @@
-"""Claims about the friction model on VaultBot's 68 rotations (tests/studies/friction_grid.py)."""
+"""The friction model on VaultBot's 68 rotations (tests/studies/friction_grid.py)."""
 
 import numpy as np
 import pytest
@@ -81,7 +81,7 @@ def test_grid_scrub_has_aliases_of_equal_error():
 
 
 def test_fit_of_simulated_data_returns_its_numbers():
-    """Rotations made by the model with known numbers, and noise of the real size: found within their sigmas."""
+    """Rotations simulated by the model with noise of the real size: parameters are within their sigmas."""
     rng = np.random.default_rng(2)
     truth = friction().nominal.copy()
     truth[[friction().param_names.index(n) for n in FITTED]] = wanted = np.array([0.05, -0.1, 0.6, 0.004])

@@ -1,4 +1,4 @@
-"""Claims about gentle arcs (tests/studies/gentle_arcs.py): what the friction model predicts of them, and what the thesis measured."""
+"""Gentle arcs (tests/studies/gentle_arcs.py): predictions of the friction model and measurements of the thesis."""
 
 import numpy as np
 import pytest

@@ -53,7 +53,7 @@ def test_husky_named_terms_reduce_the_error_below_23_cm(stored: list[Maneuver]) 
 
 
 def test_husky_stored_frame_is_rotated_as_described(stored: list[Maneuver], mended: list[Maneuver]) -> None:
-    """Where the heading wraps, the stored motion points elsewhere than the wheels drove, and the mended one does not."""
+    """Where the heading wraps, the stored motion points elsewhere than the wheels drove, and the corrected one does not."""
     data = drive_husky.columns()
     wraps = np.abs(np.diff(data["icp_yaw"][:, :5], axis=1)).max(axis=1) > 3.0
     assert wraps.sum() == 11

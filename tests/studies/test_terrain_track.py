@@ -1,4 +1,4 @@
-"""The effective track of a real Husky on five grounds, as far as the shipped runs tell."""
+"""The effective track of a real Husky on five grounds, from the shipped runs."""
 
 from __future__ import annotations
 
