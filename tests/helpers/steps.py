@@ -1,18 +1,12 @@
-"""Steps of a synchronizer, event by event; memory of buffers."""
+"""Steps of a synchronizer, event by event."""
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Iterable, Iterator
 
 from localization.events import Event
 from localization.step import Step
 from localization.synchronizer import Synchronizer
-
-
-def stored_bytes(buffer: object) -> int:
-    """Size of all that ``buffer`` stores [B]."""
-    return len(pickle.dumps(buffer))
 
 
 def steps(events: Iterable[Event], synchronizer: Synchronizer) -> Iterator[Step]:
