@@ -103,7 +103,7 @@ picture(
 # %% [markdown]
 # ## Step 3. Put causes together, as few as explain it
 #
-# The diagnosis tries sets of causes, weighs each by evidence (each cause must reduce the error enough) and gives for each found one its sigma,
+# The diagnosis tries sets of causes, weighs each by evidence (each must reduce the error) and gives for each found one its sigma,
 # the causes that fit this drive as well, and what it gains on held-out rows.
 
 # %%
@@ -185,7 +185,7 @@ f"turns least at x_G = {-500.0 * b / a:+.1f} mm; its centre of rotation is off b
 
 # %% [markdown]
 # All rotations were counter-clockwise. Had half of them been clockwise, the sigma of the treads' size would be 20 times smaller (sigma 0.0007
-# instead of 0.013), of any other cause at most 1.4 times: the simulator turned a robot with these errors 136 times, one way or both
+# instead of 0.013), of others at most 1.4 times: the simulator turned a robot with these errors 136 times, one way or both
 # (`python -m tests.helpers.diagnosis_rotations`).
 
 # %% [markdown]
