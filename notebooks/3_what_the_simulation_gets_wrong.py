@@ -184,7 +184,7 @@ _, b, a = rotation_ratio(grid).coefficients
 f"turns least at x_G = {-500.0 * b / a:+.1f} mm; its centre of rotation is off by {1000.0 * (grid.cor[:, 0] + vy / wz).mean():+.0f} mm"
 
 # %% [markdown]
-# All rotations were counter-clockwise. Had half of them been clockwise, the sigma of the treads' size would be 20 times smaller (sigma 0.0007
+# All rotations were counter-clockwise. Had half of them been clockwise, the sigma of the treads' size would be a 20th (sigma 0.0007
 # instead of 0.013), of others at most 1.4 times: the simulator turned a robot with these errors 136 times, one way or both
 # (`python -m tests.helpers.diagnosis_rotations`).
 
