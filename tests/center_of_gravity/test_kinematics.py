@@ -71,7 +71,7 @@ def test_center_of_mass_of_any_tree_is_that_of_a_plain_recursion(tree):
 
 @settings(max_examples=100, deadline=None)
 @given(trees())
-def test_jacobian_is_that_of_differences(tree):
+def test_jacobian_is_the_derivative(tree):
     text, positions = tree
     chain = flatten(parse_urdf(text, "r"), base_link="base")
     q, h = chain.posture(positions), 1e-5
@@ -104,7 +104,7 @@ def dh_arm_moment(joints, world_T_base):
     return moment, pose
 
 
-def test_vaultbot_arms_match_the_denavit_hartenberg_table_of_ur5():
+def test_vaultbots_arms_are_ur5s_by_their_denavit_hartenberg_table():
     chain = flatten(parse_urdf(VAULTBOT, "vaultbot.urdf"))
     rng = np.random.default_rng(5)
     zero = urdf_reference.link_poses(VAULTBOT, {})
@@ -122,7 +122,7 @@ def test_vaultbot_arms_match_the_denavit_hartenberg_table_of_ur5():
     np.testing.assert_allclose(differences, np.broadcast_to(differences[0], (5, 3)), atol=1e-9)
 
 
-def test_vaultbot_mass_and_wheelbase_are_those_of_the_thesis():
+def test_vaultbot_is_the_thesiss_robot():
     chain = flatten(parse_urdf(VAULTBOT, "vaultbot.urdf"))
     assert chain.mass == pytest.approx(118.84, abs=1e-9)  # Ebersole 2016, Appendix A
     poses = urdf_reference.link_poses(VAULTBOT, {})
@@ -134,7 +134,7 @@ def test_vaultbot_mass_and_wheelbase_are_those_of_the_thesis():
     assert chain.joint_names == tuple(f"{side}_{joint}" for side in ("left", "right") for joint in ARM[:5])
 
 
-def test_leading_axes_are_broadcast():
+def test_leading_axes_are_kept():
     chain = flatten(parse_urdf(VAULTBOT, "vaultbot.urdf"))
     q = np.random.default_rng(0).uniform(-3, 3, (2, 3, 10))
     com, jacobian = chain.center_of_mass(q), chain.center_of_mass_jacobian(q)
@@ -147,7 +147,7 @@ def test_leading_axes_are_broadcast():
 
 
 @pytest.mark.parametrize("function", ["center_of_mass", "center_of_mass_jacobian"])
-def test_center_of_mass_takes_less_than_10_microseconds(function):
+def test_an_evaluation_takes_less_than_10_microseconds(function):
     chain = flatten(parse_urdf(VAULTBOT, "vaultbot.urdf"))
     evaluate, q = getattr(chain, function), np.linspace(-1, 1, 10)
     evaluate(q)
@@ -172,7 +172,7 @@ SIMPLE = """<robot name="r">
 </robot>"""
 
 
-def test_joints_missing_are_at_the_limit_nearest_to_zero():
+def test_joints_that_are_left_out_stand_at_the_limit_nearest_to_zero():
     text = SIMPLE.replace("</robot>", '<link name="slide"><inertial><mass value="1"/></inertial></link>') + (
         '<joint name="lift" type="prismatic"><parent link="base_link"/><child link="slide"/><axis xyz="0 1 0"/></joint></robot>'
     )
@@ -182,7 +182,7 @@ def test_joints_missing_are_at_the_limit_nearest_to_zero():
     np.testing.assert_allclose(chain.center_of_mass(np.array([0.7])), expected, atol=1e-12)
 
 
-def test_joint_balanced_only_at_rest_is_kept():
+def test_a_joint_that_is_balanced_only_at_rest_matters():
     """A turret about z with a slide: with the slide at 0 all mass is on the turret's axis."""
     slide = (
         '<link name="mast"><inertial><mass value="3"/></inertial></link>'
@@ -197,14 +197,14 @@ def test_joint_balanced_only_at_rest_is_kept():
     )
 
 
-def test_robot_without_arms_has_a_constant_center_of_mass():
+def test_a_robot_without_arms_has_a_constant_center_of_mass():
     text = SIMPLE.replace('xyz="0.5 0 0"', 'xyz="0 0 0"').replace('<link name="tool"/>', "").split('<joint name="wrist"')[0] + "</robot>"
     chain = flatten(parse_urdf(text, "r"))
     assert chain.joint_names == ()
     np.testing.assert_allclose(chain.center_of_mass(np.empty(0)), [10 * 0.1 / 12, 0.0, 2 / 12])
 
 
-def test_posture_missing_unknown_or_impossible_joints_are_named():
+def test_posture_names_what_is_missing_unknown_and_impossible():
     chain = flatten(parse_urdf(SIMPLE, "r.urdf"))
     assert chain.posture({"shoulder": 0.5, "wrist": 9.0}) == pytest.approx([0.5])
     with pytest.raises(RobotError, match=r"no position of joint shoulder; r.urdf needs shoulder"):
@@ -232,7 +232,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_flatten_invalid_tree_is_refused(case):
+def test_flatten_refuses(case):
     text, options, message = BAD[case]
     with pytest.raises(RobotError, match=message):
         flatten(parse_urdf(text, "r.urdf"), **options)
@@ -279,17 +279,17 @@ MALFORMED = {
 
 
 @pytest.mark.parametrize("case", MALFORMED)
-def test_parse_invalid_urdf_is_refused(case):
+def test_parse_refuses(case):
     text, message = MALFORMED[case]
     with pytest.raises(RobotError, match=rf"r\.urdf.*{message}"):
         parse_urdf(text, "r.urdf")
 
 
-def test_xacro_namespace_without_macros_is_a_urdf():
+def test_xacro_declared_but_expanded_is_a_urdf():
     parse_urdf(change("<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"'), "r.urdf")
 
 
-def test_urdf_unreadable_is_refused(tmp_path):
+def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(RobotError, match=r"none.urdf' cannot be read: No such file"):
         load_urdf(tmp_path / "none.urdf")
     with pytest.raises(RobotError, match="cannot be read"):

@@ -60,7 +60,7 @@ def shaken(chain, rng, tolerances):
     return dataclasses.replace(chain, constants=constants)
 
 
-def test_static_part_weighing_minus_arms_plus_arms_is_the_robot():
+def test_weighing_minus_arms_plus_arms_is_the_robot():
     """Weigh the robot that the URDF describes, take its arms away, and find it again at every other posture."""
     cg = CHAIN.center_of_mass(CHAIN.posture(POSTURES["stow_back"]))
     weighed = cg_from_scales(readings_of(CHAIN.mass, cg)[None], CONTACTS)
@@ -81,7 +81,7 @@ def test_static_part_weighing_minus_arms_plus_arms_is_the_robot():
         np.testing.assert_allclose(model.cg(model.chain.posture(posture)), expected[:2], atol=1e-12)
 
 
-def test_static_part_overrides_the_urdf_and_wheels_count_once():
+def test_static_part_overrules_the_urdf_and_wheels_do_not_count_twice():
     static = StaticPart(50.0, np.array([0.03, -0.01]), np.zeros((3, 3)))
     model = cg_model(URDF, static=static)
     q = np.linspace(-1, 1, 10)
@@ -104,7 +104,7 @@ SOURCES = {
 
 
 @pytest.mark.parametrize("source", SOURCES)
-def test_covariance_of_a_weighing_is_that_of_simulated_weighings(source):
+def test_covariance_of_a_weighed_robot_is_that_of_many_weighed_robots(source):
     """The whole way: scales err, wheels stand elsewhere, the arms' masses are wrong in what is taken away and in what is added."""
     tolerances, scales = SOURCES[source]
     rng = np.random.default_rng(3)
@@ -125,7 +125,7 @@ def test_covariance_of_a_weighing_is_that_of_simulated_weighings(source):
     assert_covariance(np.array(found), estimate.covariance)
 
 
-def test_covariance_of_the_arms_cancels_at_the_weighed_posture():
+def test_errors_of_the_arms_cancel_at_the_posture_of_the_weighing():
     weighed = cg_from_scales(readings_of(118.84, [0.01, 0.0])[None], CONTACTS)
     static = static_part_from_weighing(weighed, CHAIN, POSTURES["stow_back"])
     model = cg_model(URDF, static=static, tolerances=Tolerances(0.2, 0.05, 0.0))
@@ -145,7 +145,7 @@ LOADED = {
 
 
 @pytest.mark.parametrize("source", LOADED)
-def test_covariance_of_a_urdf_with_payload_is_that_of_samples(source):
+def test_covariance_from_a_urdf_alone_with_a_payload(source):
     tolerances, mass_sigma, position_sigma = LOADED[source]
     rng = np.random.default_rng(4)
     payload = Payload("left_gripper", 3.0, (0.05, -0.02, 0.15), mass_sigma, position_sigma)
@@ -170,7 +170,7 @@ def test_covariance_of_a_urdf_with_payload_is_that_of_samples(source):
     assert estimate.mass == pytest.approx(118.84 + 3.0)
 
 
-def test_covariance_does_not_depend_on_the_frame():
+def test_covariance_does_not_depend_on_where_the_frame_is():
     payload = Payload("left_gripper", 3.0, (0.0, 0.0, 0.1), 0.5, 0.02)
     here, there = (cg_model(URDF, base, payload=payload, tolerances=Tolerances(0.1, 0.01, 0.01)) for base in ("base_link", "laser"))
     q = here.chain.posture(POSTURES["front_left"])
@@ -180,7 +180,7 @@ def test_covariance_does_not_depend_on_the_frame():
     np.testing.assert_allclose(there.estimate(q).covariance, here.estimate(q).covariance, rtol=1e-9, atol=1e-15)
 
 
-def test_payload_is_one_more_mass():
+def test_a_payload_is_one_more_mass():
     payload = Payload("left_gripper", 3.0, (0.05, -0.02, 0.15))
     posture = POSTURES["front_left"] | {"left_wrist_3_joint": 0.7}
     model = cg_model(URDF, payload=payload)
@@ -191,7 +191,7 @@ def test_payload_is_one_more_mass():
     np.testing.assert_allclose(model.estimate(model.chain.posture(posture)).position, expected[:2], atol=1e-12)
 
 
-def test_payload_on_the_static_part_adds_to_the_weighing():
+def test_a_payload_on_the_static_part_adds_to_a_weighed_one():
     static = StaticPart(80.0, np.array([0.0, 0.0]), np.diag([0.04, 1e-6, 4e-6]))
     payload = Payload("base_link", 20.0, (0.2, 0.1, 0.3), mass_sigma=0.5, position_sigma=0.02)
     without, with_load = (cg_model(URDF, static=static, tolerances=NOTHING, payload=p) for p in (None, payload))
@@ -207,7 +207,7 @@ def test_payload_on_the_static_part_adds_to_the_weighing():
     assert_covariance(np.array(found), with_load.estimate(q).covariance)
 
 
-def test_joints_by_name_include_wheels_and_idle_wrists():
+def test_joints_may_be_named_and_wheels_and_idle_wrists_among_them():
     names = tuple(POSTURES["ready"])
     static = StaticPart(50.0, np.array([0.03, -0.01]), np.zeros((3, 3)))
     named = cg_model(URDF, joints=(*names, "front_left_wheel"), static=static)
@@ -219,7 +219,7 @@ def test_joints_by_name_include_wheels_and_idle_wrists():
     np.testing.assert_allclose(left.cg(np.ones(5)), expected[:2], atol=1e-12)
 
 
-def test_weighing_of_a_robot_without_arms_is_its_cg():
+def test_a_robot_without_arms_that_was_weighed():
     husky = (
         '<robot><link name="base_link"><inertial><mass value="46"/></inertial></link>'
         '<link name="wheel"><inertial><mass value="2.6"/></inertial></link><joint name="w" type="continuous">'
@@ -232,14 +232,14 @@ def test_weighing_of_a_robot_without_arms_is_its_cg():
     np.testing.assert_allclose(estimate.covariance, np.diag([4e-6, 9e-6]), atol=1e-18)
 
 
-def test_jacobian_of_the_cg_is_that_of_differences():
+def test_jacobian_of_the_center_of_gravity():
     model = cg_model(URDF, payload=Payload("right_gripper", 5.0))
     q, h = np.linspace(-1, 1, 10), 1e-6
     steps = np.eye(10) * h
     np.testing.assert_allclose(model.jacobian(q), (model.cg(q + steps) - model.cg(q - steps)).T / (2 * h), atol=1e-9)
 
 
-def test_estimate_with_covariance_takes_less_than_10_microseconds():
+def test_an_estimate_with_covariance_takes_less_than_10_microseconds_too():
     model = cg_model(URDF, payload=Payload("right_gripper", 5.0))
     q, times = np.zeros(10), []
     model.estimate(q)
@@ -251,7 +251,7 @@ def test_estimate_with_covariance_takes_less_than_10_microseconds():
     assert min(times) < 10e-6
 
 
-def test_vaultbot_postures_are_where_their_names_indicate():
+def test_vaultbots_postures_are_where_their_names_say():
     """All seven of the thesis's arm configurations and its front stow, with centres of gravity between the wheels."""
     model = arms_model(VAULTBOT)
     cg = {name: model.cg(model.chain.posture(posture)) for name, posture in POSTURES.items()}
@@ -273,7 +273,7 @@ def test_vaultbot_postures_are_where_their_names_indicate():
     assert np.linalg.norm(cg["stow_back"]) == min(np.linalg.norm(v) for v in cg.values())
 
 
-def test_postures_keep_the_arms_off_each_other_and_the_robot():
+def test_named_postures_keep_the_arms_off_each_other_and_the_robot():
     """Along the lines of the links: each arm on its side, and above the bulkhead where it is over the robot."""
     for name, posture in POSTURES.items():
         poses = urdf_reference.link_poses(TEXT, posture)
@@ -302,14 +302,14 @@ def test_arms_reach_every_point_of_the_calibration_grid(x, y):
     assert min(np.abs(q - model.chain.posture(start)).max() for start in POSTURES.values()) < 1.0
 
 
-def test_cg_out_of_reach_is_refused():
+def test_a_center_of_gravity_out_of_reach():
     with pytest.raises(CgError, match=r"no arm posture puts the centre of gravity at \(0.400, 0.000\) m; the nearest .* \(0\.1"):
         posture_for(arms_model(VAULTBOT), np.array([0.4, 0.0]), POSTURES)
     with pytest.raises(CgError, match="no posture to start from"):
         posture_for(arms_model(VAULTBOT), np.zeros(2), {})
 
 
-def test_robot_that_tips_over_is_refused():
+def test_a_robot_that_tips_over():
     assert support_margin(np.array([[0.0, 0.0], [0.2, 0.0], [0.0, -0.3]]), 0.52, 0.56) == pytest.approx([0.26, 0.06, -0.02])
     require_support(np.array([0.26, 0.28]), 0.52, 0.56)
     heavy = Payload("base_link", 60.0, (1.0, 0.0, 0.0))
@@ -371,18 +371,18 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_refused(case):
+def test_bad_input(case):
     attempt, error, message = BAD[case]
     with pytest.raises(error, match=message):
         attempt()
 
 
-def test_static_part_of_a_urdf_without_base_is_refused():
+def test_static_part_cannot_be_had_from_a_urdf_without_base():
     model = cg_model(NO_BASE, static=StaticPart(9.0, np.array([0.1, 0.0]), np.zeros((3, 3))))
     np.testing.assert_allclose(model.cg(np.zeros(1)), [(0.9 + 1.0) / 10, 0.0], atol=1e-12)
 
 
-def test_robot_files_are_found_beside_the_robot_file(tmp_path):
+def test_files_of_a_robot_beside_its_robot_file(tmp_path):
     (tmp_path / "my.urdf").write_text(TEXT)
     (tmp_path / "my.srdf").write_text((resources.files("motion_models") / "robots" / "vaultbot.srdf").read_text())
     arms = Arms("my.urdf", postures="my.srdf", static_mass_kg=80.0, static_x_m=0.01, static_sigma_m=0.003, weighed_posture="stow_back")
@@ -394,7 +394,7 @@ def test_robot_files_are_found_beside_the_robot_file(tmp_path):
         arms_model(arms, tmp_path / "elsewhere")
 
 
-def test_weighings_file_gives_the_cg(tmp_path):
+def test_weighings_file_to_center_of_gravity(tmp_path):
     table = tmp_path / "weighings.csv"
     rows = [",".join(str(v) for v in readings_of(118.84, [0.03, -0.01])) for _ in range(5)]
     table.write_text("front_left_kg,front_right_kg,rear_left_kg,rear_right_kg\n" + "\n".join(rows))
@@ -406,7 +406,7 @@ def test_weighings_file_gives_the_cg(tmp_path):
 # --- along a log
 
 
-def test_tracker_accepts_joints_in_any_order_from_several_publishers():
+def test_tracker_takes_joints_in_any_order_and_from_several_publishers():
     model = arms_model(VAULTBOT)
     tracker = CgTracker(model)
     posture = POSTURES["front_left"]
@@ -430,7 +430,7 @@ def test_tracker_accepts_joints_in_any_order_from_several_publishers():
     np.testing.assert_array_equal(moved.position, model.cg(model.chain.posture({**posture, "right_elbow_joint": 0.3})))
 
 
-def test_tracker_messages_without_joints_or_invalid_are_ignored():
+def test_tracker_and_messages_that_tell_nothing_or_are_broken():
     tracker = CgTracker(arms_model(VAULTBOT))
     names = list(POSTURES["ready"])
     first = tracker.update(names, list(POSTURES["ready"].values()))
