@@ -9,10 +9,10 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -398,16 +398,18 @@ def read_until(process, pattern, seconds=90.0):
     pytest.fail(printed)
 
 
-@contextmanager
-def cluster(workers):
-    """A scheduler and so many workers, processes of their own; the scheduler's address, it and they."""
+@pytest.fixture(scope="module")
+def cluster():
+    """Address of a Dask scheduler, its process, and those of two workers. The tests end one process after the other."""
     pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     options = ("--host", "127.0.0.1", "--no-dashboard")
-    processes = [start(sys.executable, "-m", "distributed.cli.dask_scheduler", *options, "--port", "0")]
+    scheduler = (sys.executable, "-m", "distributed.cli.dask_scheduler", *options, "--port", address.rsplit(":", 1)[1])
+    worker = (sys.executable, "-m", "distributed.cli.dask_worker", address, *options, "--nthreads", "1", "--no-nanny")
+    processes = [start(*command) for command in (scheduler, worker, worker)]  # workers wait for the scheduler
     try:
-        address = read_until(processes[0], r"Scheduler at:\s+(tcp://\S+)")[1]
-        worker = (sys.executable, "-m", "distributed.cli.dask_worker", address, *options, "--nthreads", "1", "--no-nanny")
-        processes += [start(*worker) for _ in range(workers)]
         for process in processes[1:]:
             read_until(process, "Registered to")
         yield address, processes[0], processes[1:]
@@ -427,22 +429,23 @@ def compare_until_a_log_is_done(out, address):
     return running
 
 
-def test_dask_killed_worker_gives_the_same_table(table, tmp_path):
+def test_dask_killed_worker_gives_the_same_table(table, tmp_path, cluster):
     out = tmp_path / "table.csv"
-    with cluster(2) as (address, _, workers):
-        running = compare_until_a_log_is_done(out, address)
-        workers[0].send_signal(signal.SIGKILL)
-        printed = running.communicate(timeout=120)[0]
+    address, _, workers = cluster
+    running = compare_until_a_log_is_done(out, address)
+    workers[0].send_signal(signal.SIGKILL)
+    printed = running.communicate(timeout=120)[0]
     assert running.returncode == 0, printed
     assert out.read_bytes() == table.read_bytes()
 
 
-def test_dask_lost_scheduler_ends_the_comparison_and_keeps_results(table, tmp_path, asked):
+def test_dask_lost_scheduler_ends_the_comparison_and_keeps_results(table, tmp_path, asked, cluster):
     out = tmp_path / "table.csv"
-    with cluster(1) as (address, scheduler, _):
-        running = compare_until_a_log_is_done(out, address)
-        scheduler.send_signal(signal.SIGKILL)
-        printed = running.communicate(timeout=120)[0]
+    address, scheduler, workers = cluster
+    workers[0].kill()  # with one worker, other logs are not done when the first is
+    running = compare_until_a_log_is_done(out, address)
+    scheduler.send_signal(signal.SIGKILL)
+    printed = running.communicate(timeout=120)[0]
     assert running.returncode == 2, printed
     assert re.fullmatch(
         rf"skidloc: the Dask scheduler at {address} went away \(.+\)\. What was done is kept: run the same again\.\n", printed
