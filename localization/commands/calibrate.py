@@ -67,7 +67,6 @@ class Calibrate:
     """Write what is printed to this file as well."""
 
     def run(self, console: Console) -> None:
-        """Run the command, with output on ``console``."""
         self._check()
         robot = load_robot(self.robot)
         model = make_model(self.model, robot)

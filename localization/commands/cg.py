@@ -59,7 +59,6 @@ class Cg:
     """Write what is printed to this file as well."""
 
     def run(self, console: Console) -> None:
-        """Run the command, with output on ``console``."""
         robot = load_robot(self.robot)
         check_outputs(self.json)
         g = robot.geometry

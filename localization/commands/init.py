@@ -64,7 +64,6 @@ class Init:
     """Of the robot's own driver."""
 
     def run(self, console: Console) -> None:
-        """Run the command, with output on ``console``."""
         check_outputs(self.out)
         if self.out.suffix != ".toml":
             raise RobotError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")

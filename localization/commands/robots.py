@@ -29,7 +29,6 @@ class Robots:
     """Write the list to this file as well."""
 
     def run(self, console: Console) -> None:
-        """Run the command, with output on ``console``."""
         check_outputs(self.json)
         if self.name:
             if self.name not in robot_names():
