@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import rich.table
 import tyro
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from localization.commands.accuracy_table import accuracy_table
 from localization.commands.calibration_tables import WIDE, show
 from localization.commands.common import names, new_folder, write_json
 from localization.errors import EstimatorError, EvaluationError
@@ -38,7 +38,6 @@ from localization.logs.writer import MAP_FRAME, PARENT_FRAME, FusedEstimate, wri
 from localization.output import as_text, check_outputs, fingerprint, versions
 from localization.pipeline import ReplayConfig, Run, Trial, replay
 from localization.report.replay_page import ReportHead, overview_png, verdict, write_report
-from localization.report.tables import COLUMNS, MISSING, Column, with_values
 from localization.trajectory import write_tum
 from motion_models.online_calibration import check_forms
 from motion_models.prior import prior_notes
@@ -187,7 +186,7 @@ class Replay:
     def _print(self, console: Console, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
         for note in head.warnings:
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
-        show(console, _accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
+        show(console, accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
         console.print(verdict(results, reference), markup=False, soft_wrap=True)
         console.print(f"report: {self.out / 'report.html'}", markup=False, soft_wrap=True)
 
@@ -242,33 +241,3 @@ def _progress(console: Console, log: Log) -> Iterator[tuple[Iterator[Event], Cal
                 progress.update(task, completed=(stamp_ns - begin) * 1e-9)
 
         yield events, on_event
-
-
-_FIRST_LEFT_OUT = ("RPE deg/m", "speed x", "drift %", "ATE deg", "end m", "NEES", "LiDAR lost %")
-"""Titles of columns, in the order in which a narrow terminal leaves them out."""
-
-
-def _accuracy_table(results: Sequence[Result], duration_s: float, width: int) -> rich.table.Table:
-    """For rich's console: on a terminal narrower than ``width`` characters whole columns are left out, rather than digits."""
-    speed = Column("Speed", "", 0, lambda r: duration_s / r.run.seconds if r.run.seconds > 0 else None, "speed x", is_error=False)
-    columns = [column for column in with_values((*COLUMNS, speed), results) if column.terminal]
-    table = _table_of(results, columns)
-    for title in _FIRST_LEFT_OUT:
-        if Console(width=1000).measure(table).maximum <= width:
-            break
-        columns = [column for column in columns if column.terminal != title]
-        table = _table_of(results, columns)
-    return table
-
-
-def _table_of(results: Sequence[Result], columns: Sequence[Column]) -> rich.table.Table:
-    table = rich.table.Table(box=None, header_style="bold", pad_edge=False)
-    for title in ("model", "estimator"):
-        table.add_column(title, no_wrap=True)
-    for column in columns:
-        table.add_column(column.terminal, justify="right", no_wrap=True)
-    for result in results:
-        numbers = [(column.value(result), column.digits) for column in columns]
-        cells = [MISSING if number is None else f"{number:.{digits}f}" for number, digits in numbers]
-        table.add_row(result.run.model, result.run.estimator, *cells)
-    return table
