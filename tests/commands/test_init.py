@@ -1,4 +1,4 @@
-"""`skidloc init` from end to end: values from real logs, reports of missing ones, and a robot file that works."""
+"""`skidloc init` from end to end: what it guesses of real logs, what it says is missing, and that its file works."""
 
 from __future__ import annotations
 
@@ -69,9 +69,9 @@ def test_init_of_a_pioneer_finds_its_drivers_constants(tmp_path: Path, capsys: p
 
 def test_init_without_geometry_names_what_to_measure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["init", str(HUSKY_BAG), "--out", str(tmp_path / "husky.toml")]) == 2
-    printed = capsys.readouterr()
-    assert "--wheel-radius-m, --track-width-m, --wheelbase-m" in printed.err
-    assert "! mount of imu_link (/imu/data)" in printed.out
+    told = capsys.readouterr()
+    assert "--wheel-radius-m, --track-width-m, --wheelbase-m" in told.err
+    assert "! mount of imu_link (/imu/data)" in told.out
     assert not (tmp_path / "husky.toml").exists()
 
 
