@@ -91,8 +91,8 @@ def _shape(described: Any) -> Shape:
     return "sequence", _shape(inside[0])
 
 
-class Decoder:
-    """Raw messages to rosbags' message objects, by the definitions that the log carries, else by those of ROS 2 Humble (ROS 1: Noetic).
+class LogDeserializer:
+    """Deserializes raw messages by the definitions in the log, else by those of ROS 2 Humble (ROS 1: Noetic).
 
     A type's definition is parsed at its first message: a damaged definition affects that type only.
     """

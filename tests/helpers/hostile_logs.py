@@ -24,7 +24,7 @@ import numpy as np
 from localization.cli import main
 from localization.evaluation.references import read_reference_file, reference_track
 from localization.logs import open_log
-from localization.logs.serialization import Decoder
+from localization.logs.serialization import LogDeserializer
 from localization.logs.sources import open_source
 from localization.trajectory import read_tum
 from motion_models.robot import load_robot
@@ -69,7 +69,7 @@ def _recorded(path: Path, robot: str, begin_s: float, topics: Iterable[str]) -> 
     """`DRIVE_S` seconds of a real log, as messages."""
     source = open_source(path)
     used = [channel for channel in source.channels if channel.topic in set(topics)]
-    decode = Decoder(used, is_ros1=source.is_ros1)
+    decode = LogDeserializer(used, is_ros1=source.is_ros1)
     first = source.start_ns + int(begin_s * S)
     found = []
     for raw in source.messages([channel.topic for channel in used]):
@@ -329,7 +329,7 @@ def _relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _end_sigma_m(out: Path) -> float:
     """The last claimed position's standard deviation [m], of the larger axis."""
     source = open_source(out / "fused.mcap")
-    decode = Decoder(source.channels, is_ros1=False)
+    decode = LogDeserializer(source.channels, is_ros1=False)
     last = None
     for raw in source.messages(["/skid_steer_ekf/odometry"]):
         last = raw
