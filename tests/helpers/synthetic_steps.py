@@ -55,7 +55,7 @@ class PoseSensor:
         self.next: ScanMatch | None = None
         self.lost = LostScans()
 
-    def measure(self, step, prior, cov, twist):
+    def measure(self, step, prior, cov, twist, jump):
         return self.next
 
     def refine(self, match, twist):
@@ -117,9 +117,10 @@ class World:
 
     def first(self) -> Step:
         none = Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, len(self.model.param_names))))
-        return Step(0, 0, none, np.zeros(3), np.zeros(3), False, True, None, self._scan(0))
+        return Step(0, 0, none, np.zeros(3), np.zeros(3), False, True, None, self.scan_at(0))
 
-    def _scan(self, stamp_ns: int) -> Scan | None:
+    def scan_at(self, stamp_ns: int) -> Scan | None:
+        """A scan without points; None for a robot without a LiDAR."""
         return Scan(stamp_ns, np.zeros((0, 3))) if self.has_lidar else None
 
     def _rates(self, begin: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -170,7 +171,7 @@ class World:
         self.correction = self.correction + self._walk @ rng.normal(size=len(self.correction)) * math.sqrt(DT)
         if self.belief is not None:
             self.clock += rng.normal(0.0, self.belief.clock_walk_s_per_sqrt_s * math.sqrt(DT))
-        return Step(*stamps, predicted, d_clock, twist.value[-1], False, True, turn, self._scan(stamps[1])), match
+        return Step(*stamps, predicted, d_clock, twist.value[-1], False, True, turn, self.scan_at(stamps[1])), match
 
 
 def drive(world: World, estimator: Estimator, sensor: PoseSensor, steps: int):

@@ -60,7 +60,7 @@ def test_losses_of_a_lidar_that_dies_are_described_and_long() -> None:
     assert losses.numbers()["silences"] == 1
 
 
-def test_losses_without_lost_scans_are_silent() -> None:
+def test_describe_without_lost_scans_is_empty() -> None:
     losses = LidarLosses.of(counted("mmmm"))
     assert losses.describe() == losses.advice == ""
     assert not losses.is_long
@@ -184,7 +184,7 @@ def test_diagnostics_level_follows_lost_scans(matched: str, level: int, message:
     assert {"lost_share", "longest_lost_s", "lost_now_s"} <= set(status.values)
 
 
-def test_notes_of_core_say_what_was_lost_and_what_to_do() -> None:
+def test_pipeline_warnings_name_losses_and_remedy() -> None:
     pipeline = Pipeline(Trial(make_model("skid_steer", ROBOT), "ekf"), ROBOT, {}, has_lidar=True)
     assert pipeline.estimator.lost is not None
     vars(pipeline.estimator.lost).update(vars(counted("mmsm")))
@@ -195,7 +195,7 @@ def test_notes_of_core_say_what_was_lost_and_what_to_do() -> None:
     assert note.endswith("Check the LiDAR's driver.")
 
 
-def test_notes_of_dead_reckoning_say_nothing_of_the_lidar() -> None:
+def test_dead_reckoning_warnings_have_no_lidar() -> None:
     pipeline = Pipeline(Trial(make_model("diff_drive", ROBOT), "odometry"), ROBOT, {}, has_lidar=True)
     assert pipeline.lidar is None
     assert pipeline.warnings() == []
