@@ -1,7 +1,7 @@
 """A robot on DDS, in a process of its own: plays a log's messages in real time by ROS 2's names, and hears what is published of it.
 
-Its latched transforms are sent at once; for each number read from the standard input, the next so many seconds of the log. At the end of
-the input it prints one JSON line: what it heard, how long after each scan ("latencies_s": from before this process serialised the scan
+Its latched transforms are sent at once; for each number read from the standard input, the next so many seconds of the log, as soon as a
+subscriber is matched that was not there before, and until the last scans are answered. At the end of the input it prints one JSON line: what it heard, how long after each scan ("latencies_s": from before this process serialised the scan
 until it had read the answer), and when that was sent ("out_s": from the scan on the wire to the answer on the wire).
 
 Its types are written out by hand in cyclonedds' own IDL and serialised by it, so that it shares nothing with what it talks to but the
@@ -194,6 +194,7 @@ class ParticipantEntitiesInfo(IdlStruct, typename="rmw_dds_common.msg.dds_.Parti
 
 
 PERIOD_NS = 80_000_000  # of the scans
+_LAST_SCANS, _DEADLINE_S = 4, 60.0
 SENT = {"/joint_states": JointState, "/scan": LaserScan, "/imu/data": Imu, "/tf_static": TFMessage}
 _RELIABLE = Policy.Reliability.Reliable(duration(seconds=1))
 VOLATILE = Qos(_RELIABLE, Policy.Durability.Volatile, Policy.History.KeepLast(50))
@@ -225,6 +226,13 @@ def scan_of(estimate_ns, sent):
     """Stamp of the scan whose sweep was halfway at ``estimate_ns``: of the last that began before."""
     before = [stamp_ns for stamp_ns in list(sent)[-200:] if 0 <= estimate_ns - stamp_ns < PERIOD_NS]
     return before[-1] if before else None
+
+
+def wait(is_over) -> None:
+    """Until ``is_over`` or a deadline, which only a failure reaches."""
+    end = time.monotonic() + _DEADLINE_S
+    while not is_over() and time.monotonic() < end:
+        time.sleep(0.001)
 
 
 def main(path: str, domain: int) -> None:
@@ -266,7 +274,11 @@ def main(path: str, domain: int) -> None:
             writers[topic].write(message)
     left = deque(record for record in records if record[1] != "/tf_static")
     print("up", flush=True)
+    matched = set()
     for line in sys.stdin:
+        wait(lambda: set(writers["/scan"].get_matched_subscriptions()) - matched)
+        matched |= set(writers["/scan"].get_matched_subscriptions())
+        print("matched", flush=True)
         begin, first = time.monotonic(), left[0][0] if left else 0
         while left and left[0][0] < first + float(line) * 1e9:
             log_ns, topic, message = left.popleft()
@@ -277,7 +289,14 @@ def main(path: str, domain: int) -> None:
             writers[topic].write(message)
             if topic == "/scan":
                 scans_sent[stamp(message.header)] = before, time.time_ns()
-        end = time.monotonic() + 1.5
+        due = sorted(scans_sent)[-_LAST_SCANS]  # later ones wait for the wheels' next message
+
+        def is_answered(due=due) -> bool:
+            listen()
+            return max(answered, default=0) >= due
+
+        wait(is_answered)
+        end = time.monotonic() + 1.2  # diagnostics come every second
         while time.monotonic() < end:
             listen()
             time.sleep(0.001)
@@ -288,6 +307,7 @@ def main(path: str, domain: int) -> None:
             {
                 "sent_scans": len(scans_sent),
                 "answered_scans": len(answered),
+                "answered_stamps": sorted(answered),
                 "scans": [[stamp_ns, sent_s] for stamp_ns, (sent_s, _) in scans_sent.items()],
                 "arrivals_s": arrivals,
                 "predicted_stamps": [stamp(o.header) for o in heard["/skidloc/odometry_predicted"]],
