@@ -1,8 +1,9 @@
-"""A robot on DDS, in a process of its own: plays a log's messages in real time by ROS 2's names, and hears what is published of it.
+"""A robot on DDS, in a process of its own: plays a log's messages in real time by ROS 2's names, and receives what is published of it.
 
 Its latched transforms are sent at once; for each number read from the standard input, the next so many seconds of the log, as soon as a
-subscriber is matched that was not there before, and until the last scans are answered. At the end of the input it prints one JSON line: what it heard, how long after each scan ("latencies_s": from before this process serialised the scan
-until it had read the answer), and when that was sent ("out_s": from the scan on the wire to the answer on the wire).
+subscriber is matched that was not there before, and until the last scans are answered. At the end of the input it prints one JSON line:
+what it received, how long after each scan ("latencies_s": from before this process serialised the scan until it had read the answer), and
+when that was sent ("out_s": from the scan on the wire to the answer on the wire).
 
 Its types are written out by hand in cyclonedds' own IDL and serialised by it, so that it shares nothing with what it talks to but the
 wire.
@@ -274,10 +275,14 @@ def main(path: str, domain: int) -> None:
             writers[topic].write(message)
     left = deque(record for record in records if record[1] != "/tf_static")
     print("up", flush=True)
-    matched = set()
+    matched: set[int] = set()
+
+    def has_new_subscriber() -> bool:
+        return bool(set(writers["/scan"].get_matched_subscriptions()) - matched)
+
     for line in sys.stdin:
-        wait(lambda: set(writers["/scan"].get_matched_subscriptions()) - matched)
-        matched |= set(writers["/scan"].get_matched_subscriptions())
+        wait(has_new_subscriber)
+        matched.update(writers["/scan"].get_matched_subscriptions())
         print("matched", flush=True)
         begin, first = time.monotonic(), left[0][0] if left else 0
         while left and left[0][0] < first + float(line) * 1e9:
