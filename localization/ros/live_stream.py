@@ -12,14 +12,16 @@ from functools import partial
 from typing import Any
 
 from localization.errors import CheckpointError
-from localization.events import Event
+from localization.events import CgSample, Event
 from localization.logs.clock_sync import Merger
+from localization.logs.decode import ArmReading
 from localization.logs.event_decoder import EventDecoder, decode_item
 from localization.logs.message_stats import MessageStats, Oddity
 from localization.logs.serialization import decoder
 from localization.logs.topic_roles import TYPES, Sources
 from localization.logs.wheel_decoder import JointsToWheels, OdometryToWheels
 from localization.ros.discovery import DiscoveredTopics
+from localization.ros.payloads import Payloads
 from localization.ros.transports.base import Received
 from motion_models.robot import Robot
 
@@ -49,6 +51,7 @@ class LiveStream:
         self._merger = Merger(discovered.plan, tally, wait_ns=None)
         self._decoders = {source.topic: decoder(TYPES[source.kind], is_ros1=is_ros1) for source in parts.sources.used()}
         self._rates = {source.topic: _TopicRate() for source in parts.sources.used()}
+        self.payloads = Payloads(robot, parts.arms, discovered.mounts)
 
     @property
     def wheel_angles(self) -> WheelAngles:
@@ -66,9 +69,15 @@ class LiveStream:
         self._rates[received.topic].count(received.received_ns)
         wall_ns = received.received_ns + self._epoch_ns
         item = decode_item(received.topic, wall_ns, partial(decode, received.data), self._intake.decoders[received.topic], self._tally)
-        if item is not None:
-            for payload in self._merger.insert(item):
-                yield from self._intake.events(payload)
+        if item is None:
+            return
+        for reading in self._merger.insert(item):
+            if isinstance(reading, ArmReading):
+                self.payloads.insert_joints(reading)
+            for event in self._intake.events(reading):
+                loaded = self.payloads.apply(event) if isinstance(event, CgSample) else event
+                if loaded is not None:
+                    yield loaded
 
     def sender_stamp_ns(self, stamp_ns: int, *, by_lidar: bool) -> int:
         """A stamp of an event in the present clock of its sender, which may have been set since the start."""

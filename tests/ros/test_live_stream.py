@@ -116,7 +116,7 @@ def test_subscriptions_are_of_sensor_data_but_for_static_transforms(calm):
     subscribed = calm[0].subscribed
     assert [topic for topic, is_latched in subscribed.items() if is_latched] == ["/tf_static"]
     assert {"/joint_states", "/scan", "/points", "/imu/data", "/center_of_gravity"} <= set(subscribed)
-    commands = {"/set_pose", "/initialpose"}
+    commands = {"/set_pose", "/initialpose", *(f"/skidloc/{name}" for name in ("reset", "pause", "tare_payload", "payload"))}
     assert calm[0].kept == {"/joint_states", "/scan", "/imu/data", "/tf_static", "/tf", *commands}  # unused topics cost nothing
 
 
@@ -695,6 +695,7 @@ def test_rclpy_door_by_its_documented_interface(monkeypatch):
         "tf2_msgs": ["TFMessage"],
         "nav_msgs": ["Odometry"],
         "geometry_msgs": [],
+        "std_msgs": [],
         "diagnostic_msgs": [],
     }
     for package, kinds in packages.items():

@@ -12,7 +12,7 @@ from localization.errors import TransportError
 from localization.ros.transports.base import MonotonicTime, Received, ServiceHandler
 
 _LATEST, _LATCHED_DEPTH, _DEPTH = 50, 100, 10
-_MESSAGE_PACKAGES = ("sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "tf2_msgs")
+_MESSAGE_PACKAGES = ("std_msgs", "sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "tf2_msgs")
 _SERVICE_PACKAGES = ("std_srvs",)
 
 
