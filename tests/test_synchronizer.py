@@ -563,7 +563,7 @@ def test_scans_of_an_unknown_frame_are_told_and_not_mixed_with_others():
     assert "frame 'top'" in note
     assert "7 scans of it were not used" in note
     assert "[mounts.top]" in note
-    assert cutter.frames.lack is not None
+    assert cutter.frames.problem is not None
     # where none is known, they are all there is
     found, cutter = cut(in_order(ahead, strange))
     assert sum(s.scan is not None for s in found) == 7

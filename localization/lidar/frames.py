@@ -36,7 +36,7 @@ class LidarFrames:
         return not self._has_known
 
     @property
-    def lack(self) -> str | None:
+    def problem(self) -> str | None:
         """What a person should do about the frame of the newest scan, in a sentence; None where it is known."""
         frame = self._newest
         if frame is None or frame in self._mounts:

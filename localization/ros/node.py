@@ -55,8 +55,8 @@ class Node:
         self._tf_static, self._tf = names.resolve(TF_STATIC), names.resolve(TF)
         self._conflicts = TransformConflicts(run.node.frames.base_link_frame, is_ros1=transport.is_ros1)
         self._transforms = discovered.transforms
-        self._tally = MessageStats()
-        self._stream = LiveStream(discovered, run.robot, self._tally, transport.epoch_ns, is_ros1=transport.is_ros1)
+        self._stats = MessageStats()
+        self._stream = LiveStream(discovered, run.robot, self._stats, transport.epoch_ns, is_ros1=transport.is_ros1)
         self._made = made_by(trial, run.robot, discovered.mounts, self.has_lidar, run.config, "live topics")
         self._predictor = Predictor(trial.model, run.robot, run.config.step.max_hold_s) if run.node.predict else None
         self._commands = OperatorCommands(self, transport, names, report)
@@ -111,7 +111,7 @@ class Node:
         self._subscribe()
         state = SessionState(pipeline, StartPose(), self._stream.wheel_angles, self.payloads.loads)
         name = f"{self._trial.model.name}_{self._trial.estimator}"
-        self.session = Session.start(self._run.files, state, name, self._made, {"tally": self._tally}, self._report)
+        self.session = Session.start(self._run.files, state, name, self._made, {"stats": self._stats}, self._report)
         self.session.health = Health(config.max_latency_s)
         with ExitStack() as failing:
             failing.callback(self.session.close)
@@ -149,7 +149,7 @@ class Node:
         next_poll = 0.0
         while not is_over():
             has_estimate = False
-            for received in self._transport.take(_POLL_S, self._patience_s()):
+            for received in self._transport.take(_POLL_S, self._batch_s()):
                 has_estimate |= self._receive(received)
             now = time.monotonic()
             if now >= self._next_status + (0.0 if has_estimate else (_AFTER_ESTIMATE - 1.0) * _STATUS_PERIOD_S):
@@ -256,24 +256,24 @@ class Node:
     def _add_mounts(self, mounts: Mapping[str, Mount]) -> None:
         """Frames that become known only now have their mounts from here on, and so has the state."""
         pipeline = self.session.pipeline
-        was_missing = pipeline.synchronizer.frames.lack is not None
+        was_missing = pipeline.synchronizer.frames.problem is not None
         if not pipeline.add_mounts(mounts):
             return
         self.payloads.mounts = pipeline.mounts
         self._made.update(fingerprints(mounts=pipeline.mounts))
-        if was_missing and pipeline.synchronizer.frames.lack is None:
+        if was_missing and pipeline.synchronizer.frames.problem is None:
             self._report("/tf_static now has the mount of the LiDAR: its scans are placed by that from here on.")
         if self.session.view is not None:
             self.session.view.begin(self._run.robot, pipeline.mounts)
 
     def _check_frames(self) -> None:
-        for problem in (self.session.pipeline.synchronizer.frames.lack, self._transforms.problem):
+        for problem in (self.session.pipeline.synchronizer.frames.problem, self._transforms.problem):
             if problem is not None and problem not in self._problems:
                 self._problems.add(problem)
                 self._report(problem)
 
-    def _patience_s(self) -> float:
-        return 0.0 if self.session.pipeline.synchronizer.is_waiting else self._stream.patience_s(self._transport.now_ns())
+    def _batch_s(self) -> float:
+        return 0.0 if self.session.pipeline.synchronizer.is_waiting else self._stream.batch_s(self._transport.now_ns())
 
     def _head(self) -> Mapping[str, Any]:
         return {"stamp_ns": self._newest_ns, "topics": self.topics}

@@ -25,7 +25,7 @@ from motion_models import se2
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
-_CONSEQUENCES = {"state": "The state of before stays", "output": "The output lacks what is estimated meanwhile"}
+_CONSEQUENCES = {"state": "The state of before stays", "output": "Estimates made meanwhile are missing from the output"}
 
 
 class View(Protocol):
@@ -244,7 +244,7 @@ class Session:
             with self._files.beside() as bag:
                 write_fused(bag, {self.name: fused_estimates(stamps, table, parent)}, self.name)
         if self._report is not None and self._estimate_log.missing:
-            self._report(f"'{self._files.out}' lacks {self._estimate_log.missing} estimates, for which there was no room on the disk.")
+            self._report(f"'{self._files.out}': {self._estimate_log.missing} estimates are missing, for there was no room on the disk.")
         if self._checkpoints is not None:
             with self._writing("state"):
                 self._checkpoints.wait()  # it may refer to the rows

@@ -116,7 +116,7 @@ class LogTransport(MonotonicTime):
     def publishers(self) -> dict[str, set[str]]:
         return {topic: {kind} for topic, kind in self.types.items()}
 
-    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
+    def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
         """The first two seconds at once, then a tenth of a second at a time."""
         if not self._left:
             return []

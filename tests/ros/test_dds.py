@@ -190,8 +190,8 @@ def test_node_without_a_robot_reports_where_it_listens_and_ends():
     """By SIGTERM, in the domain of ROS's environment."""
     node = start_node("--node.wait-s", "0.5")
     text = " ".join((node.stdout.readline() + ended(node, signal.SIGTERM)).split())
-    assert "nothing comes on /joint_states (sensor_msgs/JointState)" in text
-    assert f"Nobody publishes anything in domain {DOMAIN} on interface lo." in text
+    assert "no messages come on /joint_states (sensor_msgs/JointState)" in text
+    assert f"No topic is published in domain {DOMAIN} on interface lo." in text
     assert "--interface default" in text
     assert node.returncode == 130
     assert "Traceback" not in text
@@ -323,8 +323,8 @@ def test_take_after_a_pause_returns_the_newest_200_with_their_times(chatter, tra
     assert np.median(came - sent) < delay_ns + 0.005 * S
 
 
-def test_take_with_patience_returns_at_once_for_urgent_topics(chatter, transport):
-    """Twenty messages of /a to one of /b; without patience each is taken when it comes."""
+def test_take_of_a_batch_returns_at_once_for_urgent_topics(chatter, transport):
+    """Twenty messages of /a to one of /b; without a batch each is taken when it comes."""
     chatter.match("ab", transport)
     transport.restrict(["/a", "/b"], ["/b"])
     begin = time.monotonic()

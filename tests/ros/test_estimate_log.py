@@ -43,7 +43,7 @@ def online(*arguments):
     return main(["online", str(drive_log()), "--robot", "vaultbot", *map(str, arguments)])
 
 
-def test_its_output_is_the_replays_to_the_last_byte(replayed, tmp_path, capsys):
+def test_online_of_a_log_writes_the_bytes_of_a_replay(replayed, tmp_path, capsys):
     assert online("--rate", "max", "--out", tmp_path / "fused.mcap") == 0  # a bag's name is written in it
     assert (tmp_path / "fused.mcap").read_bytes() == (replayed / "fused.mcap").read_bytes()
     assert online("--rate", "max", "--out", tmp_path / "run.tum") == 0
@@ -106,7 +106,7 @@ def test_state_on_disk_is_never_older_than_a_second(tmp_path, monkeypatch):
     session.close()
 
 
-def test_killed_twice_and_resumed_it_writes_the_same_bytes(replayed, killed, tmp_path, capsys):
+def test_online_killed_twice_and_resumed_writes_the_same_bytes(replayed, killed, tmp_path, capsys):
     shutil.copytree(killed, tmp_path, dirs_exist_ok=True)
     kill_after(tmp_path, read_head(tmp_path / "state")["events"] + 50)  # written by this process, not left by the one before
     assert online("--rate", "max", "--out", tmp_path / "fused.mcap", "--state", tmp_path / "state") == 0
@@ -115,7 +115,7 @@ def test_killed_twice_and_resumed_it_writes_the_same_bytes(replayed, killed, tmp
     assert [path.name for path in tmp_path.iterdir()] == ["fused.mcap"]
 
 
-def test_what_a_kill_left_of_an_output_is_replaced_by_the_next_run(tmp_path, monkeypatch):
+def test_output_that_a_killed_run_left_is_replaced(tmp_path, monkeypatch):
     written = []
 
     def write(path, *arguments):
@@ -131,7 +131,7 @@ def test_what_a_kill_left_of_an_output_is_replaced_by_the_next_run(tmp_path, mon
     assert [path.name for path in tmp_path.iterdir()] == ["fused.mcap"]
 
 
-def test_a_service_that_is_stopped_leaves_its_last_state(replayed, tmp_path, capsys):
+def test_online_stopped_by_sigterm_leaves_its_last_state(replayed, tmp_path, capsys):
     process = start(tmp_path, "1")
     wait_for_state(tmp_path, process, 100)
     for other in (["--out", tmp_path / "a.tum", "--state", tmp_path / "state"], ["--out", tmp_path / "fused.mcap"]):
@@ -147,7 +147,7 @@ def test_a_service_that_is_stopped_leaves_its_last_state(replayed, tmp_path, cap
     assert (tmp_path / "fused.mcap").read_bytes() == (replayed / "fused.mcap").read_bytes()
 
 
-def test_a_run_that_is_stopped_without_a_state_writes_what_it_has(replayed, tmp_path):
+def test_online_stopped_without_a_state_writes_its_estimates(replayed, tmp_path):
     out, estimate_log = tmp_path / "a.tum", tmp_path / ".a.tum.part"
     options = ("--robot", "vaultbot", "--rate", "2", "--out", out)
     process = subprocess.Popen([*COMMAND, drive_log(), *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -164,7 +164,7 @@ def test_a_run_that_is_stopped_without_a_state_writes_what_it_has(replayed, tmp_
     assert [path.name for path in tmp_path.iterdir()] == ["a.tum"]
 
 
-def test_files_that_cannot_be_kept_are_refused_at_the_start(tmp_path, capsys):
+def test_files_that_cannot_be_written_are_refused_at_the_start(tmp_path, capsys):
     out = tmp_path / "a.tum"
     for state, said in [
         (tmp_path / "no" / "state", "Name a file in a folder that is there"),
@@ -177,7 +177,7 @@ def test_files_that_cannot_be_kept_are_refused_at_the_start(tmp_path, capsys):
         assert list(tmp_path.iterdir()) == []
 
 
-def test_files_are_one_process_s_at_a_time(tmp_path):
+def test_files_claimed_by_another_process_are_refused(tmp_path):
     files = Files(tmp_path / "a.tum", tmp_path / "state")
     (tmp_path / ".state.lock").touch()  # of a process that was killed
     with files.claimed(), pytest.raises(OutputError, match=r"state' is in use by another process"), Files(state=files.state).claimed():
@@ -187,7 +187,7 @@ def test_files_are_one_process_s_at_a_time(tmp_path):
         pass
 
 
-def test_real_time_takes_its_time(tmp_path):
+def test_online_at_a_rate_takes_the_time_of_the_log(tmp_path):
     begin = time.monotonic()
     assert online("--rate", "40", "--estimator", "odometry", "--out", tmp_path / "a.tum") == 0
     assert time.monotonic() - begin > 20.0 / 40.0
@@ -209,14 +209,14 @@ def test_real_time_takes_its_time(tmp_path):
         (["--node.wait-s", "nan"], "setting wait_s of NodeConfig is nan"),
     ],
 )
-def test_bad_arguments_are_explained(arguments, said, capsys):
+def test_online_with_bad_arguments_is_refused(arguments, said, capsys):
     assert online(*arguments) == 2
     shown = capsys.readouterr()
     assert said in shown.err
     assert "Traceback" not in shown.err
 
 
-def test_states_that_do_not_fit_are_refused(killed, tmp_path, capsys):
+def test_online_with_a_state_of_another_run_is_refused(killed, tmp_path, capsys):
     shutil.copytree(killed, tmp_path, dirs_exist_ok=True)
     state, out = tmp_path / "state", tmp_path / "a.tum"
     for arguments, said in [
@@ -244,7 +244,7 @@ def test_states_that_do_not_fit_are_refused(killed, tmp_path, capsys):
     assert out.read_text() == "precious"
 
 
-def test_estimates_on_a_full_disk_are_whole_and_go_on_when_there_is_room(tmp_path):
+def test_estimate_log_on_a_full_disk_holds_whole_rows(tmp_path):
     estimate_log = EstimateLog.create(tmp_path / "part")
     estimates = [Estimate(stamp, np.array([stamp, 0.0, 0.0]), None, np.zeros(3), None) for stamp in range(1, 6)]
     with files_of_at_most(500):  # two rows and a part
@@ -264,14 +264,14 @@ def test_estimates_on_a_full_disk_are_whole_and_go_on_when_there_is_room(tmp_pat
     again.remove()
 
 
-def test_a_full_disk_ends_the_run_of_a_log_with_its_reason(tmp_path, monkeypatch, capsys):
+def test_online_of_a_log_on_a_full_disk_ends_with_the_reason(tmp_path, monkeypatch, capsys):
     fill_disk(monkeypatch, 50)
     assert online("--rate", "max", "--out", tmp_path / "a.tum") == 2
     assert ".a.tum.part': No space left on device." in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_doors_whose_libraries_are_missing_name_them(tmp_path):
+def test_transport_without_its_library_names_it(tmp_path):
     """In a process in which nothing of the extras can be imported."""
     code = (
         "import sys, importlib.util\n"
@@ -287,7 +287,7 @@ def test_doors_whose_libraries_are_missing_name_them(tmp_path):
     assert "Traceback" not in found.stderr
 
 
-def test_what_a_killed_run_has_left_keeps_no_other_from_starting(tmp_path):
+def test_hidden_files_of_a_killed_run_do_not_stop_the_next(tmp_path):
     """Hidden files beside the output, also links, of which nobody knows; the estimates are kept."""
     path, victim = tmp_path / ".a.tum.part", tmp_path / "victim"
     victim.write_text("precious")

@@ -94,8 +94,8 @@ def serviced(name, *requests):
     replies = []
     take = transport.take
 
-    def take_and_call(timeout_s, patience_s=0.0):
-        received = take(timeout_s, patience_s)
+    def take_and_call(timeout_s, batch_s=0.0):
+        received = take(timeout_s, batch_s)
         first = transport.first_ns
         for at in [at for at in calls if received and received[-1].received_ns - first > at * S]:
             replies.append(transport.services[name](calls.pop(at)))
@@ -108,7 +108,7 @@ def serviced(name, *requests):
     return transport, node, replies, reports
 
 
-def test_reset_begins_again_at_the_origin(calm):
+def test_reset_starts_a_new_estimate_at_the_origin(calm):
     transport, _, replies, reports = serviced("/skidloc/reset", True)
     assert replies[0].is_success
     assert "reset: begins anew at the origin." in reports

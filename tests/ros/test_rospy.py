@@ -72,7 +72,7 @@ def end(process):
 
 
 @with_ros
-def test_a_bag_is_played_and_the_estimates_are_recorded(ros, tmp_path):
+def test_rospy_node_follows_a_played_bag(ros, tmp_path):
     bag = tmp_path / "drive.bag"
     write_simulation(bag, Simulation(DRIVE, ROBOT, 0, {}, SimulationConfig()))
     online = (sys.executable, "-m", "localization.cli", "online", "--robot", "vaultbot", "--door", "rospy", "--node.wait-s", "1")
@@ -88,7 +88,7 @@ def test_a_bag_is_played_and_the_estimates_are_recorded(ros, tmp_path):
     end(recorder)
     said = waiting + end(node)
     assert node.returncode == 0, said
-    assert "nothing comes on /joint_states" in " ".join(waiting.split())
+    assert "no messages come on /joint_states" in " ".join(waiting.split())
     with AnyReader([tmp_path / "heard.bag"], default_typestore=get_typestore(Stores.ROS1_NOETIC)) as reader:
         found = {topic: [] for topic in topics}
         for connection, _, data in reader.messages():
@@ -112,7 +112,7 @@ def test_a_bag_is_played_and_the_estimates_are_recorded(ros, tmp_path):
 
 
 @with_ros
-def test_no_master_is_explained(capsys, monkeypatch):
+def test_online_without_a_ros_master_is_refused(capsys, monkeypatch):
     monkeypatch.setenv("ROS_MASTER_URI", "http://127.0.0.1:1")
     assert main(["online", "--robot", "vaultbot", "--door", "rospy"]) == 2
     assert "no ROS 1 master answers at http://127.0.0.1:1. Start roscore, or set ROS_MASTER_URI." in " ".join(
@@ -133,5 +133,5 @@ MD5 = {  # as `rosmsg md5` prints them in every ROS 1 installation
 
 
 @pytest.mark.parametrize("kind", MD5)
-def test_message_types_are_those_of_ros(kind):
+def test_definition_has_the_md5_sum_of_ros(kind):
     assert definition(kind, is_ros1=True)[1] == MD5[kind]

@@ -94,7 +94,7 @@ def test_keys_tokens_and_attachments_are_as_rmw_zenoh_documents_them(pair, route
     subscriber.undeclare()
 
 
-def test_publishers_that_leave_are_gone(pair):
+def test_publishers_without_those_that_left_are_found(pair):
     robot, node = pair
     robot.advertise("/chatter", STRING)
     wait_until(lambda: "/chatter" in node.publishers())
@@ -102,7 +102,7 @@ def test_publishers_that_leave_are_gone(pair):
     wait_until(lambda: "/chatter" not in node.publishers())
 
 
-def test_restrict_ends_other_subscriptions_and_take_returns_for_urgent_ones(pair):
+def test_restrict_ends_other_subscriptions_and_sets_urgent_ones(pair):
     robot, node = pair
     for topic in ("/a", "/b", "/c"):
         node.subscribe(topic, STRING, is_latched=False)
