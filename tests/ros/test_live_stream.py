@@ -377,12 +377,23 @@ def test_joint_states_without_wheel_joints_are_refused():
 
 
 def test_undecodable_messages_are_dropped_and_counted():
-    def garbled(messages):
-        return [m._replace(data=m.data[: len(m.data) // 2]) if m.topic == "/scan" and i % 50 == 0 else m for i, m in enumerate(messages)]
+    """Halves of messages and random bytes, on every topic that the node subscribes to."""
+    rng, others = np.random.default_rng(0), ("/tf", "/tf_static", "/set_pose", "/initialpose", "/skidloc/payload", "/skidloc/pause")
 
-    node, _ = run_node(LogTransport(drive_log(), garbled))
-    assert any("/scan" in note and "not of the type" in note for note in node.warnings())
+    def garbled(messages):
+        found = []
+        for i, message in enumerate(messages):
+            found.append(message)
+            if i % 50 == 49:
+                found.append(message._replace(data=message.data[: len(message.data) // 2]))
+                found.append(message._replace(topic=others[i // 50 % len(others)], data=rng.bytes(int(rng.integers(0, 300)))))
+        return found
+
+    transport = LogTransport(drive_log(), garbled, {"/tf": "tf2_msgs/msg/TFMessage"})
+    node, _ = run_node(transport)
+    assert any("not of the type" in note for note in node.warnings())
     assert node.session.pipeline.estimator.counts()["matched"] > 200
+    assert node.payloads.loads == {}
 
 
 def test_node_killed_and_resumed_continues_its_pose(tmp_path, calm):

@@ -161,6 +161,7 @@ class Robot:
             "sent": len(self.sent),
             "answered": len(self.latencies),
             "latencies_s": list(self.latencies.values()),
+            "answers_s": [[self.sent[stamp_ns], latency] for stamp_ns, latency in self.latencies.items()],
             "echo_latencies_s": self.echo_latencies,
             "first_s": self.first_s,
             "tf": sorted(set(self.tf)),
