@@ -250,7 +250,8 @@ class Node:
         if (is_predictable or estimates) and self._transport.now_ns() - received.received_ns < _MAX_PREDICTED_AGE_NS:
             self._publish_prediction()
         self.session.observe(event)
-        self._check_frames()
+        if isinstance(event, Scan):
+            self._check_frames()
         return bool(estimates)
 
     def _add_mounts(self, mounts: Mapping[str, Mount]) -> None:
@@ -294,6 +295,7 @@ class Node:
             self._publisher.publish_prediction(prediction, self._stream.sender_stamp_ns(prediction.stamp_ns, by_lidar=self.has_lidar))
 
     def _publish_status(self) -> None:
+        self._check_frames()
         health = self.session.health
         silent = self._stream.silent(self._transport.now_ns())
         self.statuses = health.statuses(self.session.pipeline, self._stream.dropped(), silent, self.session.troubles)
