@@ -2,7 +2,8 @@
 
 python robot.py MESSAGES, where MESSAGES is a pickle of (log time [ns], topic, type, bytes). Commands come on the standard input, one
 a line, and each is answered by one line: `play SECONDS`, `spin SECONDS`, `report` (JSON), `cloud BYTES COUNT` (PointCloud2 at 10 Hz),
-`payload KG`, `reset`, `set_pose X Y`, `drive SECONDS` (the same messages over and over, stamped by the clock on the wall), `clear` (what was received so far).
+`payload KG`, `reset`, `set_pose X Y`, `clear` (what was received so far), `drive SECONDS` (the same messages over and over, stamped by the
+clock on the wall).
 It imports nothing of this project.
 """
 
