@@ -245,28 +245,28 @@ def main(path: str, domain: int) -> None:
     writers = {
         topic: DataWriter(participant, Topic(participant, f"rt{topic}", kind), QUALITY.get(topic, VOLATILE)) for topic, kind in SENT.items()
     }
-    hear = {
+    subscribed = {
         "/skidloc/odometry": Odometry,
         "/skidloc/odometry_predicted": Odometry,
         "/tf": TFMessage,
         "/diagnostics": DiagnosticArray,
         "/skidloc/corrections": JointState,
     }
-    readers = {topic: DataReader(participant, Topic(participant, f"rt{topic}", kind), VOLATILE) for topic, kind in hear.items()}
-    heard = {topic: [] for topic in hear}
+    readers = {topic: DataReader(participant, Topic(participant, f"rt{topic}", kind), VOLATILE) for topic, kind in subscribed.items()}
+    received = {topic: [] for topic in subscribed}
     scans_sent, answered, latencies, out, arrivals = {}, set(), [], [], []
 
     def listen() -> None:
         for topic, reader in readers.items():
             for sample in reader.take(100):
-                if not isinstance(sample, hear[topic]):
+                if not isinstance(sample, subscribed[topic]):
                     continue
                 if topic == "/skidloc/odometry" and (sent := scan_of(stamp(sample.header), scans_sent)) is not None:
                     before, after_ns = scans_sent[sent]
                     answered.add(sent)
                     latencies.append(time.monotonic() - before)
                     out.append((sample.sample_info.source_timestamp - after_ns) * 1e-9)
-                heard[topic].append(sample)
+                received[topic].append(sample)
                 if topic == "/skidloc/odometry":
                     arrivals.append(time.monotonic())
 
@@ -306,7 +306,7 @@ def main(path: str, domain: int) -> None:
             listen()
             time.sleep(0.001)
         print("played", flush=True)
-    odometry = heard["/skidloc/odometry"]
+    odometry = received["/skidloc/odometry"]
     print(
         json.dumps(
             {
@@ -315,10 +315,10 @@ def main(path: str, domain: int) -> None:
                 "answered_stamps": sorted(answered),
                 "scans": [[stamp_ns, sent_s] for stamp_ns, (sent_s, _) in scans_sent.items()],
                 "arrivals_s": arrivals,
-                "predicted_stamps": [stamp(o.header) for o in heard["/skidloc/odometry_predicted"]],
+                "predicted_stamps": [stamp(o.header) for o in received["/skidloc/odometry_predicted"]],
                 "predicted_poses": [
                     [o.pose.pose.position.x, o.pose.pose.position.y, o.pose.pose.orientation.z]
-                    for o in heard["/skidloc/odometry_predicted"]
+                    for o in received["/skidloc/odometry_predicted"]
                 ],
                 "latencies_s": latencies,
                 "out_s": out,
@@ -327,11 +327,11 @@ def main(path: str, domain: int) -> None:
                 "twists": [[o.twist.twist.linear.x, o.twist.twist.linear.y, o.twist.twist.angular.z] for o in odometry],
                 "pose_variances": [[o.pose.covariance[0], o.pose.covariance[7], o.pose.covariance[35]] for o in odometry],
                 "frames": sorted({(o.header.frame_id, o.child_frame_id) for o in odometry}),
-                "tf": len(heard["/tf"]),
-                "corrections": [[c.name, c.position, c.effort] for c in heard["/skidloc/corrections"]][-1:],
+                "tf": len(received["/tf"]),
+                "corrections": [[c.name, c.position, c.effort] for c in received["/skidloc/corrections"]][-1:],
                 "diagnostics": [
                     {s.name: {"level": s.level, "message": s.message, **{v.key: v.value for v in s.values}} for s in d.status}
-                    for d in heard["/diagnostics"]
+                    for d in received["/diagnostics"]
                 ],
             }
         )

@@ -100,8 +100,8 @@ def test_checkpoint_resumed_by_another_process_gives_the_same_bits(tmp_path):
         pipeline.process(event)
     write_checkpoint(tmp_path / "state", pipeline, {"events": cut}, {}, {})
     rest = [numbers(e) for event in events[cut:] for e in pipeline.process(event)]
-    said = subprocess.run([sys.executable, "-c", _RESUME, tmp_path / "state", str(cut)], check=True, capture_output=True, text=True).stdout
-    assert said.split() == [str(len(rest)), hashlib.sha256(repr(rest).encode()).hexdigest()]
+    text = subprocess.run([sys.executable, "-c", _RESUME, tmp_path / "state", str(cut)], check=True, capture_output=True, text=True).stdout
+    assert text.split() == [str(len(rest)), hashlib.sha256(repr(rest).encode()).hexdigest()]
 
 
 def test_serialize_list_of_equal_classes_writes_columns():
@@ -239,14 +239,14 @@ def test_deserialize_of_random_bytes_is_refused(text, blob):
 def test_read_checkpoint_of_another_robot_or_model_is_refused(state):
     assert isinstance(read_checkpoint(state, made_by(), {}).value, Pipeline)
     heavier = dataclasses.replace(ROBOT, geometry=dataclasses.replace(ROBOT.geometry, mass_kg=120.0))
-    for other, told in [
+    for other, error in [
         (made_by(load_robot("husky_a200")), r"another .*robot \('vaultbot' \w+ then, 'husky_a200' \w+ now\)"),
         (made_by(heavier), "another robot"),
         (made_by(model="diff_drive"), "another model"),
         (made_by(config=ReplayConfig(step=StepConfig(wait_s=0.2))), "another configuration"),
         ({**made_by(), "version of numpy": "1.0"}, "another version of numpy"),
     ]:
-        with pytest.raises(CheckpointError, match=told):
+        with pytest.raises(CheckpointError, match=error):
             read_checkpoint(state, other, {})
     moved = dataclasses.replace(ROBOT, folder=state.parent)
     assert isinstance(read_checkpoint(state, made_by(moved), {}).value, Pipeline)

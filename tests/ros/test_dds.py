@@ -447,9 +447,9 @@ def test_node_and_type_hashes_are_published_as_by_ros2():
         "        for n in info.node_entities_info_seq:\n"
         "            node = n if n.node_name == 'rover' and n.reader_gid_seq and n.writer_gid_seq else node\n"
         "    ends = [(s.topic_name, data(s), list(s.key.bytes)) for q in b[:2] for s in q.read(99)]\n"
-        "said = [data(s) for s in b[2].read(9)]\n"
+        "user_data = [data(s) for s in b[2].read(9)]\n"
         "gids = [[list(g.data) for g in seq] for seq in (node.writer_gid_seq, node.reader_gid_seq)]\n"
-        "print(json.dumps([node.node_namespace, node.node_name, gids, ends, said]))\n"
+        "print(json.dumps([node.node_namespace, node.node_name, gids, ends, user_data]))\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, str(DOMAIN)], capture_output=True, text=True, cwd=Path(__file__).parents[2], timeout=_DEADLINE_S
@@ -466,9 +466,9 @@ def test_node_and_type_hashes_are_published_as_by_ros2():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "error"),
     [(["--domain", "999"], "the domain is 999"), (["--interface", "no_such_device"], "interface 'no_such_device'")],
 )
-def test_online_with_a_bad_domain_or_interface_is_refused(arguments, said, capsys):
+def test_online_with_a_bad_domain_or_interface_is_refused(arguments, error, capsys):
     assert main(["online", "--robot", "vaultbot", "--door", "dds", *arguments]) == 2
-    assert said in capsys.readouterr().err
+    assert error in capsys.readouterr().err

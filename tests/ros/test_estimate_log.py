@@ -138,11 +138,11 @@ def test_online_stopped_by_sigterm_leaves_its_last_state(replayed, tmp_path, cap
         assert online("--rate", "max", *other) == 2
         assert "is in use by another process that runs" in capsys.readouterr().err
     process.send_signal(signal.SIGTERM)
-    said, _ = process.communicate()
+    expected, _ = process.communicate()
     assert process.returncode == 130
-    assert "interrupted" in said
-    assert "the same command goes on from there" in said
-    assert "Traceback" not in said
+    assert "interrupted" in expected
+    assert "the same command goes on from there" in expected
+    assert "Traceback" not in expected
     assert online("--rate", "max", "--out", tmp_path / "fused.mcap", "--state", tmp_path / "state") == 0
     assert (tmp_path / "fused.mcap").read_bytes() == (replayed / "fused.mcap").read_bytes()
 
@@ -155,10 +155,10 @@ def test_online_stopped_without_a_state_writes_its_estimates(replayed, tmp_path)
     while time.monotonic() < end and not (estimate_log.exists() and estimate_log.stat().st_size > 15_000):
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    said, _ = process.communicate()
-    assert process.returncode == 130, said
+    expected, _ = process.communicate()
+    assert process.returncode == 130, expected
     lines = out.read_text().splitlines()
-    assert f"{len(lines) - 1} estimates, up to where the run was stopped" in said.replace("\n", " ")
+    assert f"{len(lines) - 1} estimates, up to where the run was stopped" in expected.replace("\n", " ")
     assert len(lines) > 50
     assert lines == (replayed / "skid_steer_ekf.tum").read_text().splitlines()[: len(lines)]
     assert [path.name for path in tmp_path.iterdir()] == ["a.tum"]
@@ -166,14 +166,14 @@ def test_online_stopped_without_a_state_writes_its_estimates(replayed, tmp_path)
 
 def test_files_that_cannot_be_written_are_refused_at_the_start(tmp_path, capsys):
     out = tmp_path / "a.tum"
-    for state, said in [
+    for state, expected in [
         (tmp_path / "no" / "state", "Name a file in a folder that is there"),
         (tmp_path, "is a folder"),
         (out, "is the output as well"),
         (tmp_path / "b" / ".." / ".a.tum.part", "is where the output grows as well"),
     ]:
         assert online("--out", out, "--state", state) == 2
-        assert said in capsys.readouterr().err.replace("\n", " ")
+        assert expected in capsys.readouterr().err.replace("\n", " ")
         assert list(tmp_path.iterdir()) == []
 
 
@@ -194,7 +194,7 @@ def test_online_at_a_rate_takes_the_time_of_the_log(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "expected"),
     [
         (["--rate", "0"], "--rate is '0'"),
         (["--rate", "nan"], "--rate is 'nan'"),
@@ -209,17 +209,17 @@ def test_online_at_a_rate_takes_the_time_of_the_log(tmp_path):
         (["--node.wait-s", "nan"], "setting wait_s of NodeConfig is nan"),
     ],
 )
-def test_online_with_bad_arguments_is_refused(arguments, said, capsys):
+def test_online_with_bad_arguments_is_refused(arguments, expected, capsys):
     assert online(*arguments) == 2
     shown = capsys.readouterr()
-    assert said in shown.err
+    assert expected in shown.err
     assert "Traceback" not in shown.err
 
 
 def test_online_with_a_state_of_another_run_is_refused(killed, tmp_path, capsys):
     shutil.copytree(killed, tmp_path, dirs_exist_ok=True)
     state, out = tmp_path / "state", tmp_path / "a.tum"
-    for arguments, said in [
+    for arguments, expected in [
         (["--estimator", "graph", "--state", state, "--out", tmp_path / "fused.mcap"], "made with another estimator (ekf then, graph now)"),
         (["--model", "diff_drive", "--state", state, "--out", tmp_path / "fused.mcap"], "made with another model"),
         (["--state", state], "with an --out"),
@@ -227,7 +227,7 @@ def test_online_with_a_state_of_another_run_is_refused(killed, tmp_path, capsys)
         (["--state", drive_log(), "--out", out], "no state of an estimator"),
     ]:
         assert online("--rate", "max", *arguments) == 2
-        assert said in capsys.readouterr().err.replace("\n", " ")
+        assert expected in capsys.readouterr().err.replace("\n", " ")
     other_log = drive_log(seed=1)
     assert main(["online", str(other_log), "--robot", "vaultbot", "--state", str(state), "--out", str(tmp_path / "fused.mcap")]) == 2
     assert "made with another source" in capsys.readouterr().err

@@ -46,8 +46,8 @@ pytestmark = pytest.mark.xdist_group("online")
 @functools.cache
 def undisturbed(estimator):
     transport = LogTransport(drive_log())
-    node, told = run_node(transport, estimator)
-    return transport, node, told
+    node, reports = run_node(transport, estimator)
+    return transport, node, reports
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def _wrapped(difference):
 
 
 def test_live_node_gives_the_numbers_of_a_replay(calm):
-    transport, node, told = calm
+    transport, node, reports = calm
     log = open_log(drive_log(), ROBOT)
     run = replay(log.events(), [Trial(make_model("skid_steer", ROBOT), "ekf")], ROBOT, log.mounts, True)[0]
     live = track(transport)
@@ -78,7 +78,7 @@ def test_live_node_gives_the_numbers_of_a_replay(calm):
         turn = np.array([[math.cos(pose[2]), -math.sin(pose[2])], [math.sin(pose[2]), math.cos(pose[2])]])
         in_odom = np.diag(turn @ covariance[:2, :2] @ turn.T)  # ROS's covariance is in the axes of odom
         np.testing.assert_allclose(live[stamp][1] ** 2, [*in_odom, covariance[2, 2]], rtol=1e-9, atol=1e-18)
-    assert told == []
+    assert reports == []
     assert node.warnings() == []
 
 
@@ -155,7 +155,7 @@ def restamped(message, shift_ns, kinds={"/scan": "LaserScan", "/joint_states": "
 def test_clock_jump_of_all_sensors_moves_the_pose_within_sigma(jump_s, calm):
     """Set forward and back: the pose hardly notices, and what is published bears the sender's new stamps.
 
-    Set back by less than a second, which nothing tells from jitter, it costs no more than was driven in that time.
+    Set back by less than a second, which cannot be distinguished from jitter, it costs no more than was driven in that time.
     """
 
     def jumping(messages):
@@ -295,11 +295,11 @@ def lidar_statuses(transport):
 
 def test_lidar_without_a_mount_is_an_error_and_a_warning():
     lost = LogTransport(drive_log(), silenced("/tf_static", 0.0, 99.0))
-    node, told = run_node(lost)
-    (said,) = told
-    assert "frame 'laser'" in said
-    assert "Publish it on /tf_static, or add [mounts.laser] to the robot file." in said
-    assert {(s.level, s.message) for s in lidar_statuses(lost)} == {(ERROR, said)}
+    node, reports = run_node(lost)
+    (text,) = reports
+    assert "frame 'laser'" in text
+    assert "Publish it on /tf_static, or add [mounts.laser] to the robot file." in text
+    assert {(s.level, s.message) for s in lidar_statuses(lost)} == {(ERROR, text)}
     (note,) = node.warnings()
     assert "frame 'laser'" in note
     assert f"{node.session.pipeline.estimator.counts()['scans']} scans of it were taken as if from the body's origin" in note
@@ -308,10 +308,10 @@ def test_lidar_without_a_mount_is_an_error_and_a_warning():
 @pytest.mark.parametrize("estimator", ["ekf", "graph"])
 def test_late_transforms_are_used_from_then_on(estimator, tmp_path):
     calm, late = undisturbed(estimator)[0], LogTransport(drive_log(), late_transforms)
-    node, told = run_node(late, estimator, Files(state=tmp_path / "state"))
-    assert len(told) == 2
-    assert "frame 'laser'" in told[0]
-    assert "now has the mount of the LiDAR" in told[1]
+    node, reports = run_node(late, estimator, Files(state=tmp_path / "state"))
+    assert len(reports) == 2
+    assert "frame 'laser'" in reports[0]
+    assert "now has the mount of the LiDAR" in reports[1]
     assert node.session.pipeline.mounts["laser"].x != 0.0
     (note,) = node.warnings()
     assert "/tf_static was late" in note
@@ -342,23 +342,23 @@ def test_discovery_of_silent_topics_reports_once_and_continues():
 
     quiet.take = late
     quiet.types = {}
-    _, told = run_node(quiet)
-    assert "no messages come on /joint_states (sensor_msgs/JointState)" in told[0]
-    assert "/scan (sensor_msgs/LaserScan)" in told[0]
-    assert len(told) == 1  # it is not said again and again
-    assert told[0].endswith(". No topic is published in a log. Look elsewhere.")
+    _, reports = run_node(quiet)
+    assert "no messages come on /joint_states (sensor_msgs/JointState)" in reports[0]
+    assert "/scan (sensor_msgs/LaserScan)" in reports[0]
+    assert len(reports) == 1  # it is not text again and again
+    assert reports[0].endswith(". No topic is published in a log. Look elsewhere.")
     named = LogTransport(drive_log(), silenced("/scan", 0.0, 5.0))
     named.types.pop("/scan")
-    _, told = run_node(named, topics=TopicOverrides(scan="/scan"))
-    assert told[0] == "waiting for /scan (no publisher)."
+    _, reports = run_node(named, topics=TopicOverrides(scan="/scan"))
+    assert reports[0] == "waiting for /scan (no publisher)."
 
 
 def test_discovery_names_topics_of_the_wanted_type():
     other = LogTransport(drive_log(), silenced("/scan", 0.0, 5.0), types={"/front/laser": "sensor_msgs/msg/LaserScan"})
     other.types.pop("/scan")
-    _, told = run_node(other, topics=TopicOverrides(scan="/scan"))
-    said = "waiting for /scan (no publisher). But /front/laser is sensor_msgs/LaserScan (--topic.scan /front/laser)."
-    assert told[0] == said
+    _, reports = run_node(other, topics=TopicOverrides(scan="/scan"))
+    text = "waiting for /scan (no publisher). But /front/laser is sensor_msgs/LaserScan (--topic.scan /front/laser)."
+    assert reports[0] == text
 
 
 def test_discovery_of_a_topic_of_another_type_is_refused():
@@ -410,9 +410,9 @@ def test_node_killed_and_resumed_continues_its_pose(tmp_path, calm):
     node.session.save_state(node._head, now=True)
     node.session._checkpoints.wait()  # kill -9 from here: no finish, no close
     second = LogTransport(drive_log(), part(10.5, 17.0))
-    node, told = run_node(second, files=files)
+    node, reports = run_node(second, files=files)
     assert node.finish() == len(read_tum(tmp_path / "run.tum"))
-    assert "resumed from" in told[-1]
+    assert "resumed from" in reports[-1]
     a, b = track(calm[0]), track(second)
     common = sorted(set(a) & set(b))
     for s in (common[10], common[-1]):
@@ -422,8 +422,8 @@ def test_node_killed_and_resumed_continues_its_pose(tmp_path, calm):
     assert len(read_tum(tmp_path / "run.tum")) > 0.65 * len(a)
     # it ended in order: what goes on from here has an output of its own
     third = LogTransport(drive_log(), part(17.5, 99.0))
-    node, told = run_node(third, files=Files(tmp_path / "more.tum", tmp_path / "state"))
-    assert "resumed from" in told[-1]
+    node, reports = run_node(third, files=Files(tmp_path / "more.tum", tmp_path / "state"))
+    assert "resumed from" in reports[-1]
     assert 20 < node.finish() < 0.4 * len(a)
 
 
@@ -459,10 +459,10 @@ def test_full_disk_does_not_stop_a_live_node(tmp_path, monkeypatch, calm):
     with monkeypatch.context() as disk:
         fill_disk(disk, after=10, name="fsync")  # two for each state
         fill_disk(disk, after=100, name="pwrite")
-        node, told = run_node(full, files=files)
+        node, reports = run_node(full, files=files)
         assert read_head(tmp_path / "state")["records"] <= 5
     assert len(track(full)) == len(track(calm[0]))
-    assert [said for said in told if "No space left" in said] == [
+    assert [text for text in reports if "No space left" in text] == [
         f"the state cannot be written to '{files.state}': No space left on device. The state of before stays; it is tried again.",
         f"an estimate cannot be written to '{files.estimate_log}': No space left on device. "
         "Estimates made meanwhile are missing from the output; it is tried again.",
@@ -473,20 +473,20 @@ def test_full_disk_does_not_stop_a_live_node(tmp_path, monkeypatch, calm):
     assert files_status.message.count("No space left on device") == 2
     count = node.finish()
     assert len(read_tum(tmp_path / "run.tum")) == count
-    assert f"{len(track(full)) - 100} estimates are missing" in told[-1]
+    assert f"{len(track(full)) - 100} estimates are missing" in reports[-1]
     assert read_head(tmp_path / "state")["events"] == node.session.count
     assert set(node.session.troubles) == {"output"}
 
 
 def test_state_of_another_time_is_refused(tmp_path):
     files = Files(state=tmp_path / "state")
-    for shift_s, said in ((7200.0, "2.0 h old"), (-60.0, "ahead of the robot's clock")):
+    for shift_s, text in ((7200.0, "2.0 h old"), (-60.0, "ahead of the robot's clock")):
         node, _ = run_node(LogTransport(drive_log(), lambda messages: messages[:1000]), files=files)
         node.finish()
         later = LogTransport(
             drive_log(), lambda messages, by=shift_s: [messages[0]] + [restamped(m, int((by + 30.0) * S)) for m in messages[1000:]]
         )
-        with pytest.raises(CheckpointError, match=said):
+        with pytest.raises(CheckpointError, match=text):
             run_node(later, files=Files(tmp_path / "run.tum", files.state))
         assert [path.name for path in tmp_path.iterdir()] == ["state"]  # once it is removed, nothing is in the way
         (tmp_path / "state").unlink()
@@ -506,8 +506,8 @@ def with_transform(parent, child):
 
 def test_second_publisher_of_the_transform_is_reported():
     transport = LogTransport(drive_log(), with_transform("odom", "base_link"), {"/tf": "tf2_msgs/msg/TFMessage"})
-    node, told = run_node(transport)
-    sentences = [said for said in told if "another node publishes 'odom' -> 'base_link' on /tf" in said]
+    node, reports = run_node(transport)
+    sentences = [text for text in reports if "another node publishes 'odom' -> 'base_link' on /tf" in text]
     assert len(sentences) == 1
     assert "--node.no-tf" in sentences[0]
     node._publish_status()
@@ -519,8 +519,8 @@ def test_second_publisher_of_the_transform_is_reported():
 def test_other_transforms_are_not_reported():
     for parent, child, config in (("map", "odom", None), ("odom", "base_link", NodeConfig(wait_s=0.0, predict=False, tf=False))):
         transport = LogTransport(drive_log(), with_transform(parent, child), {"/tf": "tf2_msgs/msg/TFMessage"})
-        _, told = run_node(transport, config=config)
-        assert not [said for said in told if "another node" in said]
+        _, reports = run_node(transport, config=config)
+        assert not [text for text in reports if "another node" in text]
 
 
 @pytest.mark.parametrize("frames", [Frames(), Frames("team_map", "team_odom", "team_base")])
@@ -567,7 +567,7 @@ def test_names_and_frames_apply_to_all_publications():
     config = NodeConfig(wait_s=0.0, predict=False, names=names, frames=Frames("team_map", "team_odom", "team_base"))
     transport = LogTransport(drive_log(), lambda messages: [m._replace(topic=renamed(m.topic)) for m in messages])
     transport.types = {renamed(topic): kind for topic, kind in transport.types.items()}
-    node, told = run_node(transport, config=config)
+    node, reports = run_node(transport, config=config)
     own = {f"/team/rover/{name}" for name in ("corrections", "path", "map")}
     assert set(transport.published) == {"/team/odom", "/tf", "/diagnostics", *own}
     assert set(node.topics) == {"/team/joint_states", "/front/scan", "/team/imu/data"}
@@ -575,7 +575,7 @@ def test_names_and_frames_apply_to_all_publications():
     odometry = store.deserialize_cdr(transport.published["/team/odom"][-1], "nav_msgs/msg/Odometry")
     (tf,) = store.deserialize_cdr(transport.published["/tf"][-1], "tf2_msgs/msg/TFMessage").transforms
     assert (odometry.header.frame_id, odometry.child_frame_id) == (tf.header.frame_id, tf.child_frame_id) == ("team_odom", "team_base")
-    assert [said for said in told if "base_link_frame 'team_base' is not on /tf_static" in said]
+    assert [text for text in reports if "base_link_frame 'team_base' is not on /tf_static" in text]
     calm = undisturbed("ekf")[0]
     assert odometry.pose.pose.position == published(calm, ODOMETRY)[-1].pose.pose.position
 

@@ -137,13 +137,13 @@ def test_two_sigmas_are_those_of_the_covariance(chunk):
 def test_view_file_that_exists_is_not_overwritten(chunk, tmp_path, capsys):
     kept = tmp_path / "kept.rrd"
     kept.write_bytes(b"precious")
-    for name, said in (
+    for name, text in (
         (kept, "exists already"),
         (tmp_path / "view.mp4", "must end in .rrd"),
         (tmp_path / "no" / "view.rrd", "cannot be written"),
     ):
         assert online("--view-file", name) == 2
-        assert said in " ".join(capsys.readouterr().err.split())
+        assert text in " ".join(capsys.readouterr().err.split())
     assert kept.read_bytes() == b"precious"
     assert online("--view-file", tmp_path / "new.rrd", "--topic.scan", "/nowhere") == 2
     assert [path.name for path in tmp_path.iterdir()] == ["kept.rrd"]

@@ -79,17 +79,17 @@ def test_rospy_node_follows_a_played_bag(ros, tmp_path):
     node = start(ros, *online, "--out", tmp_path / "live.mcap")
     waiting = node.stdout.readline()
     topics = ("/skidloc/odometry", "/tf", "/diagnostics", "/skidloc/corrections")
-    recorder = start(ros, "rosbag", "record", "-O", tmp_path / "heard.bag", *topics)
+    recorder = start(ros, "rosbag", "record", "-O", tmp_path / "recorded.bag", *topics)
     wait_until(lambda: all(subscribers(ros, topic) for topic in topics))
     played = ("/joint_states", "/scan", "/imu/data", "/tf_static")
     player = start(ros, "rosbag", "play", "--wait-for-subscribers", "--delay", "1", "-q", bag, "--topics", *played)
     player.communicate(timeout=_DEADLINE_S)
     time.sleep(1.0)
     end(recorder)
-    said = waiting + end(node)
-    assert node.returncode == 0, said
+    text = waiting + end(node)
+    assert node.returncode == 0, text
     assert "no messages come on /joint_states" in " ".join(waiting.split())
-    with AnyReader([tmp_path / "heard.bag"], default_typestore=get_typestore(Stores.ROS1_NOETIC)) as reader:
+    with AnyReader([tmp_path / "recorded.bag"], default_typestore=get_typestore(Stores.ROS1_NOETIC)) as reader:
         found = {topic: [] for topic in topics}
         for connection, _, data in reader.messages():
             found[connection.topic].append(reader.deserialize(data, connection.msgtype))
