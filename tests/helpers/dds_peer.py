@@ -276,6 +276,7 @@ def main(path: str, domain: int) -> None:
     left = deque(record for record in records if record[1] != "/tf_static")
     print("up", flush=True)
     matched: set[int] = set()
+    late_s = 0.0
 
     def has_new_subscriber() -> bool:
         return bool(set(writers["/scan"].get_matched_subscriptions()) - matched)
@@ -291,6 +292,7 @@ def main(path: str, domain: int) -> None:
                 listen()
                 time.sleep(0.0003)
             before = time.monotonic()
+            late_s = max(late_s, before - begin - (log_ns - first) * 1e-9)
             writers[topic].write(message)
             if topic == "/scan":
                 scans_sent[stamp(message.header)] = before, time.time_ns()
@@ -313,6 +315,7 @@ def main(path: str, domain: int) -> None:
                 "sent_scans": len(scans_sent),
                 "answered_scans": len(answered),
                 "answered_stamps": sorted(answered),
+                "late_s": late_s,
                 "scans": [[stamp_ns, sent_s] for stamp_ns, (sent_s, _) in scans_sent.items()],
                 "arrivals_s": arrivals,
                 "predicted_stamps": [stamp(o.header) for o in received["/skidloc/odometry_predicted"]],
