@@ -15,8 +15,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.markup import escape
 
-from localization.commands.online_line import live_line
-from localization.commands.online_terminal import terminal_view
+from localization.commands.online_terminal import live_line, terminal_view
 from localization.errors import CheckpointError, OutputError
 from localization.events import Event
 from localization.logs import open_log
