@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,8 +31,8 @@ _CENTER_X, _CENTER_Y = 0.10, 0.05
 rotations have their CoR 0.12 wheelbases behind its weighed CG (Ebersole 2016, 4.22)."""
 _DRIVEN_SIGMA = 0.02
 """Relative standard deviation of k of a robot with two driven wheels and a caster: its track. Freiburg's Pioneers, fr079: 1 %."""
-_TURN_RAD_PER_S = 0.5
-"""Yaw rate of the turning that a note recommends."""
+_CALIBRATION_TURN_S, _TURN_RAD_PER_S = 20.0, 0.5
+"""Duration [s] and yaw rate of the turning that a note recommends."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +154,30 @@ def slip_at_speed(robot: Robot, speed_m_per_s: float = 1.0, yaw_rate_rad_per_s: 
     return float((vy - vy_still) / (vx * wz)), float((1.0 - wz / wz_still) / abs(vx))
 
 
+class ScalingPrior(NamedTuple):
+    """k of a robot without a calibration."""
+
+    k: float
+    """Rotation scaling [-]."""
+    sigma: float
+    """Its standard deviation."""
+    sigma_after_turning: float
+    """The same after `_CALIBRATION_TURN_S` of turning: k sqrt(yaw variance per radian / turned angle)."""
+    source: str
+    """What k comes from."""
+
+
+def scaling_prior(robot: Robot, models: Sequence[str] = ("skid_steer",)) -> ScalingPrior | None:
+    """k of ``robot`` where it is no calibration and one of ``models`` uses it; else None."""
+    if not {"skid_steer", "icr"} & set(models) or "k_0" in robot.models.get("skid_steer", {}):
+        return None
+    prior = skid_prior(robot)
+    k, sigma = float(prior.coefficients[0]), float(prior.sigmas[0])
+    turned = _CALIBRATION_TURN_S * _TURN_RAD_PER_S
+    measured = k * math.sqrt(robot.wheel_noise.yaw_rad2_per_rad / turned)
+    return ScalingPrior(k, sigma, sigma * measured / math.hypot(sigma, measured), prior.source)
+
+
 def prior_notes(robot: Robot, models: Sequence[str] = ("skid_steer",)) -> list[str]:
     """A sentence for the user where k of ``robot`` is no calibration and one of ``models`` uses it; else none.
 
@@ -160,17 +185,13 @@ def prior_notes(robot: Robot, models: Sequence[str] = ("skid_steer",)) -> list[s
     >>> prior_notes(load_robot("vaultbot"))
     []
     """
-    if not {"skid_steer", "icr"} & set(models):
-        return []
-    if "k_0" in robot.models.get("skid_steer", {}):
+    found = scaling_prior(robot, models)
+    if found is None:
         return []
     if robot.drive == DIFF_DRIVE:
         return [f"{robot.name} has two driven wheels and a caster: diff_drive is its model, and skid_steer is the same with k = 1."]
-    prior = skid_prior(robot)
-    k, sigma = prior.coefficients[0], prior.sigmas[0]
-    turned = 20.0 * _TURN_RAD_PER_S
-    after = k * math.sqrt(robot.wheel_noise.yaw_rad2_per_rad / turned)
     return [
-        f"{robot.name}: [models.skid_steer] has no k_0, so k = {k:.2f} +- {sigma:.2f} from {prior.source}; "
-        f"20 s of turning make it +- {after:.2f} (`skidloc calibrate LOG --robot ... --out ROBOT.toml`)."
+        f"{robot.name}: [models.skid_steer] has no k_0, so k = {found.k:.2f} +- {found.sigma:.2f} from {found.source}; "
+        f"{_CALIBRATION_TURN_S:g} s of turning make it +- {found.sigma_after_turning:.2f} "
+        "(`skidloc calibrate LOG --robot ... --out ROBOT.toml`)."
     ]

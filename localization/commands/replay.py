@@ -34,7 +34,7 @@ from localization.provenance import fingerprint, versions
 from localization.report.replay_page import ReportHead, overview_png, verdict, write_report
 from localization.trajectory import write_tum
 from motion_models.online_calibration import check_forms
-from motion_models.prior import prior_notes
+from motion_models.prior import prior_notes, scaling_prior
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
 
@@ -162,6 +162,7 @@ class Replay:
         return read_positions(log.references(self.positions), self.positions)
 
     def _metrics(self, head: ReportHead, results: Sequence[Result]) -> dict[str, Any]:
+        prior = scaling_prior(load_robot(self.robot), names(self.model, "--model"))
         return {
             "log": head.log,
             "robot": head.robot,
@@ -169,6 +170,7 @@ class Replay:
             "distance_m": _distance(results),
             "results": [result.metrics(head.duration_s, self.timing) for result in results],
             "notes": list(head.warnings),
+            "k_prior": None if prior is None else prior._asdict(),
             "provenance": {
                 "log_fingerprint": head.log_fingerprint,
                 "versions": dict(head.versions),

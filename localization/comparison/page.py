@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,6 +51,8 @@ class CompareHead:
     table: str
     """Name of the table with all numbers."""
     versions: Mapping[str, str]
+    notes: Sequence[str] = ()
+    """On the robot, in sentences."""
 
 
 def write_comparison_report(path: Path, head: CompareHead, found: Findings) -> None:
@@ -83,7 +85,8 @@ def comparison_page(head: CompareHead, found: Findings) -> str:
         glossary(_TERMS),
         Section("Sources and versions", [Definitions(_provenance(head, found))]),
     ]
-    return render(Page(title, facts, [_unbroken(sentence) for sentence in (headline(found), *closing(found))], sections))
+    sentences = [_unbroken(sentence) for sentence in (headline(found), *closing(found), *head.notes)]
+    return render(Page(title, facts, sentences, sections))
 
 
 def _unbroken(sentence: str) -> str:
