@@ -134,8 +134,8 @@ def _named(model: MotionModel, form: Form) -> tuple[Correction, ...]:
     for name in names:
         if name not in available:
             raise ModelError(f"no correction '{name}' of {model.name}; there are {', '.join(available) or 'none'}.")
-        if lost := [p for p in available[name].along if p not in model.param_names]:
-            raise ModelError(f"{model.name} has no parameter '{lost[0]}' as it is: pass it through `correctable` first.")
+        if absent := [p for p in available[name].along if p not in model.param_names]:
+            raise ModelError(f"{model.name} has no parameter '{absent[0]}' as it is: pass it through `correctable` first.")
     return tuple(available[name] for name in dict.fromkeys(names))
 
 

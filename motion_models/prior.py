@@ -37,7 +37,7 @@ _CALIBRATION_TURN_S, _TURN_RAD_PER_S = 20.0, 0.5
 
 @dataclass(frozen=True)
 class Evidence:
-    """A robot whose k is known otherwise."""
+    """A robot whose k was measured, or is in its manufacturer's driver."""
 
     robot: str
     measured: float

@@ -399,7 +399,7 @@ def _build(kind: type[Section], table: Any, name: str, source: str) -> Section:
         if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING and f.name not in values
     ]
     if missing:
-        raise RobotError(f"{source}: [{name}] lacks {', '.join(missing)}.")
+        raise RobotError(f"{source}: [{name}] has no {', '.join(missing)}.")
     return kind(**values)
 
 

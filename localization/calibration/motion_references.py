@@ -33,7 +33,7 @@ _TURN_ERROR = 0.5
 """Sigma of a turn by the nominal model, as a share of the turn."""
 _OPEN_SIGMA_M = 0.05
 """Sigma of a position beyond which a scene counts as a corridor: matching then slides towards no motion at all [m]."""
-_RATE_GAPS = 20  # gaps between scans, by which their rate is known
+_RATE_GAPS = 20  # gaps between scans, by which their rate is measured
 _STANDSTILL_COV = np.diag([1e-12, 1e-12, 1e-12])
 
 
@@ -44,7 +44,7 @@ class Span:
     start_ns: int
     end_ns: int
     measured: FloatArray
-    """(3,) pose at the end seen from that at the start [m, m, rad]."""
+    """(3,) pose at the end relative to that at the start [m, m, rad]."""
     cov: FloatArray
     """(3, 3) of its right perturbation, inf on the diagonal for what is not measured."""
     is_valid: bool = True
@@ -129,7 +129,9 @@ class GyroMotionReference:
 
     def warnings(self) -> list[str]:
         if self._bias is None:
-            note = "the robot never stood still, so the gyro's bias is not known and counts as error; let it stand for a few seconds."
+            note = (
+                "the robot never stood still, so the gyro's bias could not be measured and counts as error; let it stand for a few seconds."
+            )
         else:
             note = f"the gyro's bias is {self._bias[0]:+.5f} rad/s, by {self._bias[1]:.0f} s of standing still; it was taken off."
         return [note, *self._gyro.warnings()]
@@ -183,8 +185,8 @@ class LidarMotionReference:
         if self._open:
             notes.append(f"{self._open} windows count by their heading alone: along walls and corridors scans do not fix the position.")
         if self._unmatched:
-            lost = f"{self._unmatched} of {self._scans} scans could not be matched with the first of their window"
-            notes.append(f"{lost}; windows that end in one were left out.")
+            unmatched = f"{self._unmatched} of {self._scans} scans could not be matched with the first of their window"
+            notes.append(f"{unmatched}; windows that end in one were left out.")
         return notes
 
     def _adapt_to_rate(self, stamp_ns: int) -> None:
@@ -271,10 +273,10 @@ class TrackMotionReference:
         end_ns = self._at_stamp(self._start_ns + self._window_ns)
         if newest < end_ns:
             return
-        known = bool(self._track.covers([self._start_ns, end_ns], self._max_gap_s).all())
+        is_covered = bool(self._track.covers([self._start_ns, end_ns], self._max_gap_s).all())
         start, end = self._track.at([self._start_ns, end_ns])
-        measured = se2.between(start, end) if known else np.zeros(3)
-        yield Span(self._start_ns, end_ns, measured, self._cov, is_valid=known)
+        measured = se2.between(start, end) if is_covered else np.zeros(3)
+        yield Span(self._start_ns, end_ns, measured, self._cov, is_valid=is_covered)
         self._start_ns = end_ns
 
     def _at_stamp(self, moment_ns: int) -> int:

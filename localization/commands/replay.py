@@ -16,9 +16,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from localization.commands.accuracy_table import accuracy_table
-from localization.commands.calibration_tables import WIDE, show
 from localization.commands.common import names, new_folder, write_json
+from localization.commands.tables import WIDE, accuracy_table, print_table
 from localization.errors import EstimatorError, EvaluationError
 from localization.estimators import CORRECTING, LOCALIZING, check_estimator
 from localization.evaluation.references import ReferenceTrack, Relations, read_reference_file, reference_track, with_noise
@@ -181,7 +180,7 @@ class Replay:
     def _print(self, console: Console, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
         for note in head.warnings:
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
-        show(console, accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
+        print_table(console, accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
         console.print(verdict(results, reference), markup=False, soft_wrap=True)
         console.print(f"report: {self.out / 'report.html'}", markup=False, soft_wrap=True)
 

@@ -59,7 +59,7 @@ class Fit:
         return sigmas | ties
 
     def residuals(self, maneuvers: Sequence[Maneuver]) -> FloatArray:
-        """(M, 3) predicted poses seen from the measured ones [m, m, rad]; these maneuvers need not be those of the fit."""
+        """(M, 3) predicted poses relative to the measured ones [m, m, rad]; these maneuvers need not be those of the fit."""
         batch = make_batch(maneuvers)
         poses, _, _ = predict(self.model, batch, self.params, self.reference_params, np.empty(0, dtype=np.int64), self.config.noise)
         return se2.between(batch.measured, poses)
@@ -119,9 +119,9 @@ def fit(
     # Residuals smaller than by the noise model are luck or simulation: the noise model then counts.
     information = np.einsum("nri,nrj->ij", J, J) / max(scale, 1.0) ** 2
     rate = float(np.sqrt(np.mean(batch.wheels**2)))
-    lost = weaknesses(problem.names, problem.sizes, information, lambda b: problem.derive(b, x), rate, batch.cg.mean(axis=0))
-    if lost and config.strict:
-        raise CalibrationError("\n".join(["this drive does not reveal every parameter:", *(w.text for w in lost)]))
+    unrevealed = weaknesses(problem.names, problem.sizes, information, lambda b: problem.derive(b, x), rate, batch.cg.mean(axis=0))
+    if unrevealed and config.strict:
+        raise CalibrationError("\n".join(["this drive does not reveal every parameter:", *(w.text for w in unrevealed)]))
 
     cov, is_sandwich = _covariance(r, J, weights, problem.components, batch.group, problem.prior)
     return Fit(
@@ -133,7 +133,7 @@ def fit(
         is_sandwich=is_sandwich,
         scale=scale,
         cost=problem.cost(r, x, KNEE[config.loss] * scale, scale) / scale**2,
-        weaknesses=lost,
+        weaknesses=unrevealed,
         seconds=float(batch.dt.sum()),
         config=config,
     )

@@ -36,7 +36,7 @@ class Weakness:
         """One sentence to act on."""
         names = " and ".join(self.combination)
         if len(self.combination) > 1:
-            what = f"{names} cannot be told apart"
+            what = f"{names} cannot be distinguished"
         elif np.isfinite(self.spread):
             what = f"{names} is uncertain by {self.spread:.1f} times its size"
         else:

@@ -23,7 +23,7 @@ _STEPS = 60
 _LEAST_MOTION = (0.05, 0.05)  # m, rad
 _UNMEASURED = 1e6  # m^2 or rad^2
 _SMALL = 0.1  # SI; what counts as large for a parameter whose nominal value is 0
-# Median length of vectors of 1, 2 and 3 unit normal numbers. Residual lengths are brought to the last before they meet the knee, beyond
+# Median length of vectors of 1, 2 and 3 unit normal numbers. Residual lengths are brought to the last before the knee, beyond
 # which 10 % of them lie with Huber's.
 _MEDIAN_LENGTH = np.array([0.6745, 1.1774, 1.5382])
 KNEE: dict[Loss, float] = {"linear": np.inf, "huber": 2.5, "cauchy": 4.0}

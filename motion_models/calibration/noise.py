@@ -21,7 +21,7 @@ _MIN_POSES = 20
 _FACTOR_BOUNDS = (0.05, 20.0)
 """Of a variance against the robot file's. Calibrated Huskies on floor and snow differ by 10 (`WheelNoise`)."""
 _QUANTILE, _CHI_SQUARE = 0.75, 1.3233
-"""Quantile of the normalized squared errors that is matched, and its value for one degree of freedom: a quarter of the errors may be lost
+"""Quantile of the normalized squared errors that is matched, and its value for one degree of freedom: a quarter of the errors may be wrong
 matches. Of fr079's positions by scan matching a tenth is beyond four sigma, and the median is that of the usual noise."""
 _BISECTIONS = 40
 
@@ -41,7 +41,7 @@ class LearnedNoise:
 
 
 def learn_noise(fit: Fit, maneuvers: Sequence[Maneuver], residuals: FloatArray) -> LearnedNoise:
-    """Both factors by the `_QUANTILE` of normalized ``residuals`` (M, 3) of ``maneuvers``, predicted by fits that have not seen them.
+    """Both factors by the `_QUANTILE` of normalized ``residuals`` (M, 3) of ``maneuvers``, predicted by fits without them.
 
     The covariance of a predicted pose is linear in the variances: C = a_yaw C_yaw + a_position C_position + R, with the measurement's R.
     Headings give a_yaw, positions then a_position. What is correlated within a maneuver (slip over 0.1 to 2 s) is in the errors at its

@@ -23,7 +23,7 @@ REFERENCE_PARAM_NAMES = ("wheel_time_offset", "wheel_lag", "lidar_offset_x", "li
 
 wheel_time_offset [s]: how late the wheels' stamps are; the motion at t is in the wheels' samples at t + offset;
 wheel_lag [s]: time constant with which the body follows the wheels (first order);
-lidar_offset_x, lidar_offset_y [m], lidar_yaw [rad]: pose of the tracked point in the body frame, as far as it is not known already.
+lidar_offset_x, lidar_offset_y [m], lidar_yaw [rad]: pose of the tracked point in the body frame, beyond that of its mount.
 """
 
 
@@ -87,7 +87,7 @@ def predict(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Predict every measured pose: poses (M, 3), their derivatives (M, 3, c) and covariances (M, 3, 3).
 
-    ``reference_params`` (5,) as in `REFERENCE_PARAM_NAMES`; ``columns`` (c,) are the wanted derivatives, indices into the model's k
+    ``reference_params`` (5,) as in `REFERENCE_PARAM_NAMES`; ``columns`` (c,) are the derivatives, indices into the model's k
     parameters followed by the reference's five. Derivatives and covariances are right perturbations; ``noise`` is the wheels' slip.
     """
     k = len(params)
@@ -118,16 +118,16 @@ def predict(
 
 
 def _track(poses: FloatArray, d: FloatArray, body_T_lidar: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
-    """The same motions as a point elsewhere on the body sees them: lidar_T_body * motion * body_T_lidar."""
-    seen = se2.compose(se2.compose(se2.inverse(body_T_lidar), poses), body_T_lidar)
+    """The same motions of a point elsewhere on the body: lidar_T_body * motion * body_T_lidar."""
+    of_lidar = se2.compose(se2.compose(se2.inverse(body_T_lidar), poses), body_T_lidar)
     d = se2.adjoint(se2.inverse(body_T_lidar)) @ d
-    by_mount = np.eye(3) - se2.adjoint(se2.inverse(seen))  # right perturbation of the mount
+    by_mount = np.eye(3) - se2.adjoint(se2.inverse(of_lidar))  # right perturbation of the mount
     c, s = np.cos(body_T_lidar[2]), np.sin(body_T_lidar[2])
     turned = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])  # offsets are given along the body's axes
     for i, column in enumerate(columns):
         if column >= 0:
             d[:, :, i] += (by_mount @ turned)[:, :, column]
-    return seen, d
+    return of_lidar, d
 
 
 @numba.njit(cache=True)

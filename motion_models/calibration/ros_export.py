@@ -72,7 +72,7 @@ def diff_drive_controller_yaml(
 ) -> str:
     """Parameters for ros2_controllers' diff_drive_controller: geometry, multipliers at the robot's nominal CG and twist covariance.
 
-    With ``cgs`` (n, 2) [m] the table of `multiplier_table` follows as comments. The controller knows neither vy = -wz x_CR nor a loss
+    With ``cgs`` (n, 2) [m] the table of `multiplier_table` follows as comments. The controller models neither vy = -wz x_CR nor a loss
     in arcs: what it does not model is in its covariance, from the robot's wheel noise.
     """
     m = multipliers(model, robot, robot.center_of_gravity, params)
@@ -122,7 +122,7 @@ def robot_localization_yaml(
         f"    {source}: {robot.topics.odometry}",
         "    # x, y, z, roll, pitch, yaw, vx, vy, vz, vroll, vpitch, vyaw, ax, ay, az",
         "    # vy stays out: the wheels' vy = 0 is an assumption and no measurement. If nothing else holds the filter sideways (no LiDAR",
-        "    # or visual odometry), put it in, but only with the variance below; or fuse an odometry that knows the true vy.",
+        "    # or visual odometry), put it in, but only with the variance below; or fuse an odometry with the true vy (`skidloc online`).",
         f"    {source}_config: [false, false, false,",
         "                   false, false, false,",
         "                   true,  false, false,",

@@ -7,7 +7,7 @@ One line an interval of constant wheel rates, in order of time; lines that follo
     dt_s               length of the interval [s]
     left_rad_per_s     wheel rate of the left side, the mean of its wheels [rad/s]
     right_rad_per_s    the same of the right side
-    x_m, y_m           optional: measured position of the body at the end of the line, seen from its pose at the start of the window
+    x_m, y_m           optional: measured position of the body at the end of the line, relative to its pose at the start of the window
     yaw_rad            measured heading in the same way
     cg_x_m, cg_y_m     optional: centre of gravity in the interval
     sigma_x_m, sigma_y_m, sigma_yaw_rad   optional: standard deviations of what was measured (default 0.02 m, 0.02 m, 0.01 rad)

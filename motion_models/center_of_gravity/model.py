@@ -1,7 +1,7 @@
 """Centre of gravity of a robot with arms at any joint positions, with covariance: static part + arms (+ payload).
 
 Ebersole 2016, sec. 4.2.1.2: the static part is a weighed total (`center_of_gravity.weighing`) minus the arms at the weighed posture, and
-the total at another posture is the static part plus the arms there. Without a weighing, the static part is what the URDF says of it.
+the total at another posture is the static part plus the arms there. Without a weighing, the static part is that of the URDF.
 "Arms" are all bodies that hang on a joint that can move the centre of mass; all else, wheels included, is the static part.
 """
 
@@ -27,7 +27,7 @@ from motion_models.se2 import FloatArray
 def static_part_from_weighing(weighed: WeighedCg, chain: Chain, posture: Mapping[str, float]) -> StaticPart:
     """What is left of a weighed robot when its arms, which stood at ``posture``, are taken away.
 
-    The covariance is the weighing's alone; how the arms' errors enter is told by ``weighed_at``. Raises `CgError` where the arms weigh
+    The covariance is the weighing's alone; ``weighed_at`` is how the arms' errors enter. Raises `CgError` where the arms weigh
     more than all, `RobotError` for joints that are missing or unknown.
     """
     q = chain.posture(posture)
@@ -97,7 +97,7 @@ def cg_model(
     payload: Payload | None = None,
     tolerances: Tolerances = TYPICAL,
 ) -> CgModel:
-    """The model of ``urdf``; ``joints`` as in `flatten`. ``static`` replaces what the URDF says of everything but the arms.
+    """The model of ``urdf``; ``joints`` as in `flatten`. ``static`` replaces the URDF's masses of everything but the arms.
 
     Raises `CgError` for a payload or a static part that cannot be, and whatever `flatten` does.
     """

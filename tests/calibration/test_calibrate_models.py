@@ -233,7 +233,7 @@ def test_a_lidar_offset_and_a_centre_of_rotation_are_told_to_be_alike() -> None:
     rng = np.random.default_rng(9)
     model = make_model("skid_steer", ROBOT)
     maneuvers = drive(model, model.nominal, rng)
-    with pytest.raises(CalibrationError, match=r"x_cr_0 and lidar_offset_x cannot be told apart|lidar_offset_x and x_cr_0"):
+    with pytest.raises(CalibrationError, match=r"x_cr_0 and lidar_offset_x cannot be distinguished|lidar_offset_x and x_cr_0"):
         fit(model, maneuvers, ("k_0", "x_cr_0", "lidar_offset_x"))
     loose = fit(model, maneuvers, ("k_0", "x_cr_0", "lidar_offset_x"), FitConfig(strict=False))
     assert set(loose.weaknesses[0].combination) == {"x_cr_0", "lidar_offset_x"}

@@ -416,7 +416,7 @@ def test_tracker_takes_joints_in_any_order_and_from_several_publishers():
     assert tracker.update(wheels, [100.0, 1e6, -3.0, math.nan]) is None
     assert tracker.update(left, [posture[name] for name in left]) is None
     assert tracker.missing == tuple(name for name in model.chain.joint_names if name.startswith("right"))
-    with pytest.raises(CgError, match=r"never told right_shoulder_pan_joint, .*name the arms' joints as the log does"):
+    with pytest.raises(CgError, match=r"never had right_shoulder_pan_joint, .*name the arms' joints as the log does"):
         tracker.require_all()
     mixed = [*reversed(right), *wheels]
     found = tracker.update(mixed, [*(posture[name] for name in reversed(right)), 1.0, 2.0, 3.0, 4.0])

@@ -143,7 +143,7 @@ def test_a_gyro_tells_k_of_a_real_husky_and_no_distance(tmp_path: Path, capsys: 
 
 def test_what_a_gyro_cannot_tell_is_refused_if_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
     said = refused(capsys, HUSKY, "--model", "diff_drive", "--fit", "wheel_radius,wheel_separation_multiplier")
-    assert "cannot be told apart" in said
+    assert "cannot be distinguished" in said
     said = refused(capsys, HUSKY, "--fit", "x_cr_0")
     assert "x_cr_0 does not show" in said
 
@@ -507,7 +507,7 @@ def test_bad_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         ((GRID, "--robot", "vaultbot", "--model", "icr", "--fit", "k_0"), "icr has no parameter k_0"),
         ((GRID, "--out", there), "exists already"),
         ((GRID, "--out", tmp_path / "robot.txt"), "must end in .toml"),
-        ((GRID, "--export-out", tmp_path / "x.yaml"), "does not say for which package"),
+        ((GRID, "--export-out", tmp_path / "x.yaml"), "names no package"),
         ((HUSKY, "--window-s", "0.1"), "maneuvers of 0.5 to 20 s"),
         ((HUSKY, "--window-s", "nan"), "maneuvers of 0.5 to 20 s"),
     ):
