@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from motion_models.base import MotionModel
-from motion_models.corrected_wheels import RADIUS_NAMES, CorrectedWheels
+from motion_models.corrected import RADIUS_NAMES, CorrectedFriction, CorrectedWheels
 from motion_models.errors import ModelError
-from motion_models.friction import CorrectedFriction, FrictionModel
+from motion_models.friction import FrictionModel
 from motion_models.se2 import FloatArray
 
 Form = str

@@ -23,7 +23,7 @@ from motion_models.calibration.least_squares import FitConfig
 from motion_models.calibration.maneuvers import IntArray, Maneuver
 from motion_models.calibration.noise import LearnedNoise, learn_noise
 from motion_models.calibration.plan import Calibration, calibrate, free_of
-from motion_models.corrected_wheels import CorrectedWheels
+from motion_models.corrected import CorrectedWheels
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
 from motion_models.robot import Robot, WheelNoise

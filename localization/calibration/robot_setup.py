@@ -187,11 +187,11 @@ def _choose_topics(draft: Draft, survey: Survey, given: TopicOverrides) -> None:
 
 
 def _take_topic(draft: Draft, survey: Survey, role: str, topic: str) -> None:
-    """The user's ``topic`` in ``role``; an empty one leaves the role out. Raises `RobotError` for one that the log has not."""
+    """The user's ``topic`` in ``role``. Raises `RobotError` for one that is not in the log."""
+    option = f"--topic.{role.replace('_', '-')}"
     if not topic:
-        return
+        raise RobotError(f"{option} is empty: no robot file leaves a role out. Give it to `skidloc replay` and the others instead.")
     if topic not in survey.topics:
-        option = f"--topic.{role.replace('_', '-')}"
         raise RobotError(f"{option} {topic}: {survey.name} has no such topic; it has {', '.join(survey.topics)}.")
     draft.topics[role] = topic
     draft.reasons.append(f"topics.{role} = {topic}: given.")

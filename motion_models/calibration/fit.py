@@ -14,7 +14,7 @@ from motion_models.calibration.identifiability import Weakness, weaknesses
 from motion_models.calibration.least_squares import KNEE, FitConfig, Loss, Problem, indices
 from motion_models.calibration.maneuvers import IntArray, Maneuver, make_batch
 from motion_models.calibration.prediction import predict
-from motion_models.corrected_wheels import RADIUS_NAMES
+from motion_models.corrected import RADIUS_NAMES
 from motion_models.errors import CalibrationError
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
