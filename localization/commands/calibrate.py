@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,6 +33,7 @@ from motion_models.se2 import FloatArray
 from motion_models.skid_steer import SkidSteer
 
 _TABLE = ".csv"
+_NODE_NAME = re.compile(r"/\*\*|/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _USUAL_ROBOT = "husky_a200"
 
 
@@ -59,6 +61,8 @@ class Calibrate:
     """Write the robot with its new parameters to this file; every command takes it as --robot."""
     export: Literal["diff_drive_controller", "robot_localization"] | None = None
     """Print the calibration as parameters of this ROS package."""
+    export_node: str = ""
+    """Name of the node in the exported parameters. Default: diff_drive_controller, or ekf_filter_node."""
     export_out: Annotated[Path | None, tyro.conf.arg(metavar="FILE.yaml")] = None
     """Write them to this file instead."""
     windows: Annotated[Path | None, tyro.conf.arg(metavar="FILE.csv")] = None
@@ -87,6 +91,12 @@ class Calibrate:
             raise CalibrationError(f"--window-s is {self.window_s:g}; maneuvers of 0.5 to 20 s make sense.")
         if self.export_out is not None and self.export is None:
             raise CalibrationError("--export-out names a file, but --export names no package.")
+        if self.export_node and self.export is None:
+            raise CalibrationError("--export-node names a node, but --export names no package.")
+        if self.export_node and not _NODE_NAME.fullmatch(self.export_node):
+            raise CalibrationError(
+                f"--export-node '{self.export_node}' is no name of a ROS node: letters, digits, _ and /, or /** for all."
+            )
         check_outputs(self.out, self.export_out, self.windows, self.json)
         if self.out is not None and self.out.suffix != ".toml":
             raise CalibrationError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")
@@ -143,9 +153,9 @@ class Calibrate:
             console.print(f"robot file: {self.out}", markup=False, soft_wrap=True)
         if self.export is not None:
             text = (
-                diff_drive_controller_yaml(model, new, model.nominal, _postures(new))
+                diff_drive_controller_yaml(model, new, model.nominal, _postures(new), sigmas, self.export_node)
                 if self.export == "diff_drive_controller"
-                else robot_localization_yaml(model, new, model.nominal)
+                else robot_localization_yaml(model, new, model.nominal, self.export_node)
             )
             if self.export_out is not None:
                 write_text_file(self.export_out, text)

@@ -65,8 +65,8 @@ def test_paths_in_a_robot_file_start_at_it_wherever_the_process_goes(tmp_path: P
 def _controller(text: str, wheels: np.ndarray) -> np.ndarray:
     """The controller's own odometry (ros2_controllers, diff_drive_controller/src/odometry.cpp) with the written parameters."""
     p = YAML(typ="safe").load(text)["diff_drive_controller"]["ros__parameters"]
-    left = wheels[0] * p["wheel_radius"] * p["left_wheel_radius_multiplier"]
-    right = wheels[1] * p["wheel_radius"] * p["right_wheel_radius_multiplier"]
+    left = wheels[0] * p["wheel_radius"] * p.get("left_wheel_radius_multiplier", 1.0)
+    right = wheels[1] * p["wheel_radius"] * p.get("right_wheel_radius_multiplier", 1.0)
     return np.array([(left + right) / 2.0, (right - left) / (p["wheel_separation"] * p["wheel_separation_multiplier"])])
 
 
@@ -109,7 +109,11 @@ def test_robot_localization_no_longer_believes_in_vy_zero() -> None:
     model = make_model("skid_steer", VAULTBOT)
     p = YAML(typ="safe").load(robot_localization_yaml(model, VAULTBOT, model.nominal))["ekf_filter_node"]["ros__parameters"]
     assert p["odom0_config"] == [i in (6, 11) for i in range(15)]  # vx and yaw rate
-    noise = p["process_noise_covariance"]
+    assert "process_noise_covariance" not in p  # its own is large enough for this vy
+
+    warthog = load_robot("warthog")
+    text = robot_localization_yaml(make_model("diff_drive", warthog), warthog, np.ones(1), "robot/ekf")
+    noise = YAML(typ="safe").load(text)["robot/ekf"]["ros__parameters"]["process_noise_covariance"]
     assert len(noise) == 225
     assert all(isinstance(v, float) for v in noise)  # ROS 2 refuses mixed lists
     matrix = np.reshape(noise, (15, 15))
@@ -120,6 +124,15 @@ def test_robot_localization_no_longer_believes_in_vy_zero() -> None:
     assert all(isinstance(v, float) for v in twist)
     # vy of turning at 0.3 rad/s is within two of the sigmas given.
     assert np.sqrt(twist[1]) > 0.5 * 0.3 * 0.0635
+
+
+def test_controller_yaml_is_rounded_to_sigmas_and_leaves_defaults_out() -> None:
+    model = make_model("skid_steer", VAULTBOT)
+    text = diff_drive_controller_yaml(model, VAULTBOT, model.nominal, sigmas={"k_0": 0.01}, node="base/wheels")
+    p = YAML(typ="safe").load(text)["base/wheels"]["ros__parameters"]
+    assert "wheel_separation_multiplier: 1.965\n" in text  # 1 / k = 1.96520, sigma 0.039
+    assert {*p} == {"wheel_separation", "wheel_radius", "wheel_separation_multiplier", "twist_covariance_diagonal"}
+    assert diff_drive_controller_yaml(model, VAULTBOT, model.nominal, publish_rate_hz=20.0).count("publish_rate: 20.0") == 1
 
 
 def test_a_model_that_no_controller_can_follow_is_refused() -> None:
