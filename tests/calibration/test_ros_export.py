@@ -112,7 +112,8 @@ def test_robot_localization_no_longer_believes_in_vy_zero() -> None:
     assert "process_noise_covariance" not in p  # its own is large enough for this vy
 
     warthog = load_robot("warthog")
-    text = robot_localization_yaml(make_model("diff_drive", warthog), warthog, np.ones(1), "robot/ekf")
+    model = make_model("diff_drive", warthog)
+    text = robot_localization_yaml(model, warthog, model.nominal, "robot/ekf")
     noise = YAML(typ="safe").load(text)["robot/ekf"]["ros__parameters"]["process_noise_covariance"]
     assert len(noise) == 225
     assert all(isinstance(v, float) for v in noise)  # ROS 2 refuses mixed lists
