@@ -85,7 +85,7 @@ def test_init_with_a_urdf_takes_geometry_mounts_and_joints(tmp_path: Path, capsy
     assert robot.topics.odometry == "/husky_velocity_controller/odom"
     assert (robot.mounts["imu_link"].x, robot.mounts["imu_link"].yaw) == pytest.approx((0.1, 1.5))
     printed = capsys.readouterr().out
-    assert "k = 0.63 +- 0.07 from geometry" in printed
+    assert "k = 0.63 +- 0.06 from geometry" in printed
     assert "Drive about 60 s" in printed
     assert "wheel_separation_multiplier: 1 is written" in printed
 
