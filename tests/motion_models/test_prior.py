@@ -8,8 +8,6 @@ import math
 import numpy as np
 import pytest
 
-from motion_models import se2
-from motion_models.friction import FrictionModel
 from motion_models.online_calibration import corrections
 from motion_models.prior import EVIDENCE, geometric_scaling, prior_notes, scaling_sigma, skid_prior, slip_at_speed
 from motion_models.registry import make_model
@@ -114,41 +112,3 @@ def test_skid_prior_of_driven_wheels_and_a_caster_has_no_slip() -> None:
 def test_skid_prior_with_the_cg_outside_its_wheels_falls_back_to_geometry() -> None:
     robot = Robot("far", Geometry(0.1, 0.4, 0.3, 10.0, cg_x_m=0.2), Driver(0.1, 0.4))
     assert skid_prior(robot).coefficients[0] == pytest.approx(geometric_scaling(0.3, 0.4))
-
-
-def test_zero_drive_warthog_holds_gentle_arcs_of_other_tyres() -> None:
-    """305 m of gentle arcs at 1.5 m/s, simulated by the friction model with softer tyres, a 3 % wider track and the centripetal force.
-
-    No coefficient of a Warthog is used. Without slip (k = 1) the same wheels lead 10 times further astray; 20 s of driving bring 2 m.
-    """
-    robot = load_robot("warthog")
-    truth = dataclasses.replace(FrictionModel.from_robot(robot), centripetal=True)
-    params = truth.nominal.copy()
-    params[FrictionModel.param_names.index("slip_stiffness")] = 6.0
-    params[FrictionModel.param_names.index("track_width")] *= 1.03
-    dt, n = 0.05, 4067
-    curvature = 0.12 * np.sin(2.0 * np.pi * np.arange(n) * dt / 40.0) + 0.02
-    half = curvature * robot.geometry.track_width_m / (2.0 * 0.6)
-    wheels = 1.5 * np.stack([1.0 - half, 1.0 + half], axis=-1) / robot.geometry.wheel_radius_m
-    path = _path(truth.twist(wheels, np.zeros(2), params).value, dt)
-    skid = make_model("skid_steer", robot)
-
-    def error(k: float) -> float:
-        coefficients = np.concatenate([[k], np.zeros(10)])
-        return float(np.sqrt(np.mean(np.sum((_path(skid.twist(wheels, np.zeros(2), coefficients).value, dt) - path)[:, :2] ** 2, axis=1))))
-
-    zero_drive = error(float(skid.nominal[0]))
-    assert zero_drive < 7.5
-    assert error(1.0) > 4.0 * zero_drive
-    seconds = np.arange(400)  # 20 s
-    turned = truth.twist(wheels[seconds], np.zeros(2), params).value[:, 2]
-    by_wheels = skid.twist(wheels[seconds], np.zeros(2), np.concatenate([[1.0], np.zeros(10)])).value[:, 2]
-    assert error(float(turned @ by_wheels / (by_wheels @ by_wheels))) < 2.0
-
-
-def _path(twists: np.ndarray, dt: float) -> np.ndarray:
-    """(n, 3) poses after each of ``twists`` (n, 3)."""
-    poses, pose = np.empty((len(twists), 3)), np.zeros(3)
-    for i, step in enumerate(se2.exp(twists * dt)):
-        pose = poses[i] = se2.compose(pose, step)
-    return poses
