@@ -69,10 +69,12 @@ class Calibrated:
 
     @property
     def measures_positions(self) -> bool:
+        """Whether any maneuver has a measured position, not only a heading."""
         return bool(self.position_known.any())
 
     @property
     def fit(self) -> Fit:
+        """The fit to all maneuvers."""
         return self.calibration.fit
 
     @property

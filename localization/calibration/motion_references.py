@@ -86,12 +86,14 @@ class GyroMotionReference:
     """Yaw by the gyro; its bias from the times at which the robot stood still. Positions are not measured."""
 
     def __init__(self, noise: GyroNoise, mounts: Mapping[str, Mount], window_s: float) -> None:
+        """``window_s``: length of the spans [s]."""
         self._noise, self._window_ns = noise, round(window_s / _NS)
         self._gyro = GyroBuffer(noise, mounts, keep_s=2.0 * window_s + 10.0)
         self._start_ns = self._newest_ns = None  # type: int | None
         self._bias: tuple[float, float] | None = None
 
     def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
+        """See `MotionReference.spans`."""
         if isinstance(event, ImuSample):
             self._gyro.insert(event)
             self._newest_ns = event.stamp_ns
@@ -109,6 +111,7 @@ class GyroMotionReference:
         self._start_ns = end_ns
 
     def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
+        """See `MotionReference.correct`."""
         seconds_of = [(span.end_ns - span.start_ns) * _NS for span in standing]
         valid = [s for s, t in zip(standing, seconds_of, strict=True) if s.is_valid and abs(float(s.measured[2])) < _MAX_GYRO_BIAS * t]
         bias, sigma = 0.0, self._noise.bias_sigma_rad_per_s
@@ -128,6 +131,7 @@ class GyroMotionReference:
         return corrected
 
     def warnings(self) -> list[str]:
+        """See `MotionReference.warnings`."""
         if self._bias is None:
             note = (
                 "the robot never stood still, so the gyro's bias could not be measured and counts as error; let it stand for a few seconds."
@@ -145,6 +149,7 @@ class LidarMotionReference:
     """
 
     def __init__(self, mounts: Mapping[str, Mount], window_s: float, config: LidarConfig | None = None) -> None:
+        """``window_s``: length of the spans [s]; each has one key scan, whatever ``config`` has."""
         self._mounts, self._window_ns = mounts, round(window_s / _NS)
         self._config = replace(config or LidarConfig(), key_scans=1)
         self._matcher: ScanMatcher | None = None
@@ -155,6 +160,7 @@ class LidarMotionReference:
         self._unmatched = self._scans = self._open = 0
 
     def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
+        """See `MotionReference.spans`."""
         if not isinstance(event, Scan) or wheels.buffer.newest_ns is None:
             return
         self._scans += 1
@@ -178,9 +184,11 @@ class LidarMotionReference:
             self._begin(stamp_ns, points)
 
     def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
+        """See `MotionReference.correct`."""
         return list(spans)
 
     def warnings(self) -> list[str]:
+        """See `MotionReference.warnings`."""
         notes = []
         if self._open:
             notes.append(f"{self._open} windows count by their heading alone: along walls and corridors scans do not fix the position.")
@@ -265,6 +273,7 @@ class TrackMotionReference:
         self._max_gap_s = max(_MAX_REFERENCE_GAP_S, _MAX_GAP_OVER_PERIOD * period_s)
 
     def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
+        """See `MotionReference.spans`."""
         newest = wheels.buffer.newest_ns
         if newest is None:
             return
@@ -285,7 +294,9 @@ class TrackMotionReference:
         return int(self._stamps[i]) if self._is_sparse and i < len(self._stamps) else moment_ns
 
     def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
+        """See `MotionReference.correct`."""
         return list(spans)
 
     def warnings(self) -> list[str]:
+        """See `MotionReference.warnings`."""
         return list(self._warnings)

@@ -71,6 +71,7 @@ class Calibrate:
     """Write what is printed to this file as well."""
 
     def run(self, console: Console) -> None:
+        """Run the command. Raises `SkidlocError` for input that cannot be used."""
         self._check()
         robot = load_robot(self.robot)
         model = make_model(self.model, robot)

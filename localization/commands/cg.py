@@ -59,6 +59,7 @@ class Cg:
     """Write what is printed to this file as well."""
 
     def run(self, console: Console) -> None:
+        """Run the command. Raises `SkidlocError` for input that cannot be used."""
         robot = load_robot(self.robot)
         check_outputs(self.json)
         g = robot.geometry

@@ -79,6 +79,7 @@ class Init:
     """Calibrate on this log at once, and write ROBOT_calibrated.toml besides."""
 
     def run(self, console: Console) -> None:
+        """Run the command. Raises `SkidlocError` for input that cannot be used."""
         check_outputs(self.out)
         if self.out.suffix != ".toml":
             raise RobotError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")

@@ -29,6 +29,7 @@ class Robots:
     """Write the list to this file as well."""
 
     def run(self, console: Console) -> None:
+        """Run the command. Raises `SkidlocError` for input that cannot be used."""
         check_outputs(self.json)
         if self.name:
             if self.name not in robot_names():

@@ -60,6 +60,7 @@ class Problem:
     """Residuals, derivatives and robust cost as functions of the free parameters x (c,)."""
 
     def __init__(self, model: MotionModel, batch: Batch, names: tuple[str, ...], config: FitConfig, start: FloatArray) -> None:
+        """``start`` (k,): all of the model's parameters. Raises `CalibrationError` for bad names and too little motion."""
         self.model, self.batch, self.names, self.config = model, batch, names, config
         self.columns = indices(model, names)
         tied = list(config.ties)
@@ -107,9 +108,11 @@ class Problem:
         return full
 
     def params(self, x: FloatArray) -> FloatArray:
+        """(k,) all of the model's parameters at ``x`` (c,)."""
         return self._full(x)[: -len(REFERENCE_PARAM_NAMES)]
 
     def reference_params(self, x: FloatArray) -> FloatArray:
+        """(5,) parameters of the motion reference at ``x`` (c,)."""
         return self._full(x)[-len(REFERENCE_PARAM_NAMES) :]
 
     def derive(self, batch: Batch, x: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -74,7 +74,8 @@ class Delayed(NamedTuple):
 class HasTwist(Protocol):
     """As much of a `MotionModel` as a prediction asks for."""
 
-    def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist: ...
+    def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
+        """See `MotionModel.twist`."""
 
 
 def predict(

@@ -272,6 +272,7 @@ class CgTracker:
     """Stores each joint's last position: on ROS robots wheels, left arm and right arm often publish joint states separately."""
 
     def __init__(self, model: CgModel) -> None:
+        """All joints of ``model`` are `missing` at first."""
         self.model = model
         self._positions = np.full(len(model.chain.joint_names), np.nan)
         self._columns: dict[tuple[str, ...], tuple[NDArray[np.intp], NDArray[np.intp]]] = {}

@@ -67,6 +67,7 @@ class Joint:
 
     @property
     def moves(self) -> bool:
+        """Whether the joint can move."""
         return self.kind != "fixed"
 
 
