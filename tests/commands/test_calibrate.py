@@ -52,7 +52,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 # --- a table of rotations ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_thesis_s_regressions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_of_the_grid_prints_the_regressions_of_the_thesis(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "robot.toml"
     told = run(tmp_path, GRID, "--robot", "vaultbot", "--out", out)
     printed = capsys.readouterr().out
@@ -79,7 +79,7 @@ def test_the_thesis_s_regressions(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert load_robot(out).arms == VAULTBOT.arms
 
 
-def test_the_friction_model_on_rotations(tmp_path: Path) -> None:
+def test_calibrate_of_the_grid_fits_the_friction_model(tmp_path: Path) -> None:
     """Another solver, other weights, poses for twists: the study's four numbers, within its own sigmas."""
     told = run(tmp_path, GRID, "--robot", "vaultbot", "--model", "friction")
     study = friction_grid.fitted()[0]
@@ -124,7 +124,7 @@ def shifted_slope(bag: Path) -> tuple[float, float]:
     return misfit(best)[1], float(best)
 
 
-def test_a_gyro_tells_k_of_a_real_husky_and_no_distance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_by_gyro_of_a_husky_fits_k_and_no_distance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     told = run(tmp_path, HUSKY, "--out", tmp_path / "husky.toml", "--export", "diff_drive_controller", "--export-out", tmp_path / "c.yaml")
     k = told["parameters"]["k_0"]
     slope, shift = shifted_slope(HUSKY)
@@ -141,7 +141,7 @@ def test_a_gyro_tells_k_of_a_real_husky_and_no_distance(tmp_path: Path, capsys: 
     assert make_model("skid_steer", load_robot(tmp_path / "husky.toml")).nominal[0] == k["value"]
 
 
-def test_what_a_gyro_cannot_tell_is_refused_if_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_by_gyro_of_distances_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     said = refused(capsys, HUSKY, "--model", "diff_drive", "--fit", "wheel_radius,wheel_separation_multiplier")
     assert "cannot be distinguished" in said
     said = refused(capsys, HUSKY, "--fit", "x_cr_0")
@@ -183,7 +183,7 @@ def heading_errors(robot_file: str) -> np.ndarray:
     return np.array(errors)
 
 
-def test_scan_matching_calibrates_a_real_robot_for_a_drive_it_has_not_seen(tmp_path: Path, aces_part: Path) -> None:
+def test_calibrate_by_lidar_betters_another_drive(tmp_path: Path, aces_part: Path) -> None:
     told = run(tmp_path, aces_part, "--robot", "aces", "--model", "icr", "--out", tmp_path / "aces.toml")
     assert told["witness"] == {"part": "scan matching of /scan"}
     track, sigma = told["turning"]["effective_track_m"]
@@ -234,7 +234,7 @@ def in_place(cg: tuple[float, float]) -> tuple[float, float]:
     return float(wz * g.track_width_m / (4.0 * g.wheel_radius_m)), float(-vy / wz)
 
 
-def test_a_reference_tells_how_k_and_the_centre_of_rotation_follow_the_cg(tmp_path: Path) -> None:
+def test_calibrate_by_reference_fits_the_change_with_the_cg(tmp_path: Path) -> None:
     cgs = [(x, 0.0) for x in (-0.06, -0.03, 0.0, 0.03, 0.06, 0.09)]
     wheels, cg, poses = drive(cgs)
     rng = np.random.default_rng(1)
@@ -281,7 +281,7 @@ def room_scans(poses: np.ndarray, lidar_x: float) -> list[Record]:
     return [("/tf_static", mount, START), *records]
 
 
-def test_scan_matching_and_gyro_agree_on_a_made_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_by_lidar_and_gyro_agree(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cg = (0.03, 0.0)
     wheels, cgs, poses = drive([cg, cg])
     robot = load_robot("vaultbot")
@@ -301,7 +301,7 @@ def test_scan_matching_and_gyro_agree_on_a_made_robot(tmp_path: Path, capsys: py
     assert by_lidar["turning"]["x_cr_m"][0] == pytest.approx(want_x, abs=0.01)
     assert by_lidar["turning"]["forward_scale"][0] == pytest.approx(1.0 - lost_to_rolling(cg), abs=0.01)
 
-    by_gyro = run(tmp_path, bag, "--robot", "vaultbot", "--model", "icr", "--witness", "gyro")
+    by_gyro = run(tmp_path, bag, "--robot", "vaultbot", "--model", "icr", "--motion-reference", "gyro")
     value, sigma = by_gyro["turning"]["effective_track_m"]
     assert value == pytest.approx(track, abs=max(3 * sigma, 0.01))
     assert any("bias is +0.01" in note for note in by_gyro["notes"]["run.mcap"])
@@ -331,7 +331,7 @@ def made_windows(model_name: str, n: int = 24, seed: int = 0) -> list[Maneuver]:
 
 
 @pytest.mark.parametrize("name", list(MODELS))
-def test_every_model_s_calibration_can_be_replayed(tmp_path: Path, name: str) -> None:
+def test_calibrate_out_of_every_model_is_read_back(tmp_path: Path, name: str) -> None:
     """Fitted, written, read: the very numbers, and the ties among them."""
     table = tmp_path / "w.csv"
     table.write_text(windows_text(made_windows("icr")))
@@ -346,7 +346,7 @@ def test_every_model_s_calibration_can_be_replayed(tmp_path: Path, name: str) ->
     assert "# +- " in (tmp_path / "new" / "robot.toml").read_text()
 
 
-def test_windows_survive_writing(tmp_path: Path) -> None:
+def test_windows_text_is_read_back(tmp_path: Path) -> None:
     path = tmp_path / "w.csv"
     path.write_text(windows_text(made_windows("skid_steer")))
     for a, b in zip(made_windows("skid_steer"), read_windows(path), strict=True):
@@ -356,7 +356,7 @@ def test_windows_survive_writing(tmp_path: Path) -> None:
         assert a.group == b.group
 
 
-def test_several_tables_are_fitted_together_and_told_one_by_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_of_several_tables_lists_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two floors: one on which the robot turns 20 % less."""
     paths = []
     for name, factor in (("floor.csv", 1.0), ("snow.csv", 0.8)):
@@ -376,7 +376,7 @@ def test_several_tables_are_fitted_together_and_told_one_by_one(tmp_path: Path, 
     assert "snow.csv" in printed
 
 
-def test_a_real_husky_s_windows(tmp_path: Path) -> None:
+def test_calibrate_of_drive_husky_windows_is_near_the_study(tmp_path: Path) -> None:
     """The DRIVE data set as a table: as well as the study that knows the data set, within 5 %."""
     path = tmp_path / "drive.csv"
     path.write_text(windows_text(drive_husky.maneuvers(mended=True)))
@@ -395,14 +395,14 @@ def standing_log(tmp_path: Path) -> Path:
     return bags.write_mcap(tmp_path / "still.mcap", sorted(records, key=lambda r: r[2]))
 
 
-def test_a_log_without_motion_says_what_to_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_without_motion_names_what_to_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refused(capsys, standing_log(tmp_path), "--robot", "vaultbot")
     assert "no motion to calibrate on" in said
     assert "4 standing still" in said
     assert "turning in place to each side" in said
 
 
-def test_a_log_without_a_witness_and_references_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_without_a_motion_reference_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wheels, cg, _ = drive([(0.0, 0.0)])
     bag = bags.write_mcap(tmp_path / "run.mcap", wheel_records(wheels, cg))
     assert "neither a LiDAR nor an IMU" in refused(capsys, bag, "--robot", "vaultbot")
@@ -414,7 +414,7 @@ def test_a_log_without_a_witness_and_references_that_are_none(tmp_path: Path, ca
     assert "has no reference topic /ground_truth/odom" in refused(capsys, bag, "--robot", "vaultbot", "--witness", "reference")
 
 
-def test_driving_straight_only_does_not_tell_how_it_turns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_of_straight_drives_holds_the_turning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = tmp_path / "w.csv"
     pose, cov = np.array([[0.66, 0.0, 0.0]]), np.diag([1e-4] * 3)
     straight = [Maneuver(np.full(20, 0.1), np.full((20, 2), 2.0), pose, np.array([20]), cov=cov, group=str(i)) for i in range(6)]
@@ -427,7 +427,7 @@ def test_driving_straight_only_does_not_tell_how_it_turns(tmp_path: Path, capsys
     assert "k_0: k_0 does not show" in capsys.readouterr().out
 
 
-def test_skid_steer_fits_the_wheel_radius_where_distance_is_measured(tmp_path: Path) -> None:
+def test_calibrate_with_distances_fits_the_wheel_radius(tmp_path: Path) -> None:
     """Tyres that are 4 % smaller than the robot file has them: the radius is found, k is not changed by it, and both are written."""
     small = dataclasses.replace(VAULTBOT, geometry=dataclasses.replace(VAULTBOT.geometry, wheel_radius_m=0.164 * 0.96))
     true, rng = make_model("skid_steer", small), np.random.default_rng(3)
@@ -446,7 +446,7 @@ def test_skid_steer_fits_the_wheel_radius_where_distance_is_measured(tmp_path: P
     assert load_robot(out).models["skid_steer"]["k_0"] == pytest.approx(true.nominal[0], rel=0.01)
 
 
-def test_a_fit_that_is_worse_on_held_out_data_is_not_recommended(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_worse_on_held_out_data_is_not_recommended(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Windows of pure noise about the robot file's own motion: the fit follows the noise, and the old numbers stay."""
     model, rng = make_model("diff_drive", VAULTBOT), np.random.default_rng(5)
     windows = []
@@ -489,14 +489,14 @@ BAD_TABLES = {
 
 
 @pytest.mark.parametrize("case", BAD_TABLES)
-def test_bad_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str) -> None:
+def test_calibrate_of_bad_tables_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str) -> None:
     text, complaint = BAD_TABLES[case]
     path = tmp_path / "bad.csv"
     path.write_text(text)
     assert complaint in refused(capsys, path, "--robot", "vaultbot")
 
 
-def test_bad_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_with_bad_options_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     there = tmp_path / "there.toml"
     there.write_text("")
     for arguments, complaint in (

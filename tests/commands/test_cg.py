@@ -44,7 +44,7 @@ def weigh(tmp_path: Path, mass: float, cg: np.ndarray, warp: float = 0.0, n: int
     return path
 
 
-def test_scales_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_cg_of_scales_alone_is_the_weighed_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     told = run(tmp_path, weigh(tmp_path, 118.84, np.array([0.02, -0.01]), warp=0.13))
     np.testing.assert_allclose(told["cg_m"], [0.02, -0.01], atol=1e-12)
     assert told["mass_kg"] == pytest.approx(118.84)
@@ -63,7 +63,7 @@ def test_scales_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 
 
 @pytest.mark.parametrize("posture", ["ready", "back_left"])
-def test_arms_at_a_posture_with_a_payload(tmp_path: Path, posture: str) -> None:
+def test_cg_of_a_posture_with_a_payload_moves_with_it(tmp_path: Path, posture: str) -> None:
     told = run(tmp_path, "--posture", posture, "--payload", 4, "--at", "left_gripper", "--payload-sigma", 0.1, "--offset", 0, 0, 0.1)
     com, mass = urdf_reference.center_of_mass(URDF, POSTURES[posture])
     gripper = urdf_reference.link_poses(URDF, POSTURES[posture])["left_gripper"] @ [0, 0, 0.1, 1]
@@ -75,19 +75,19 @@ def test_arms_at_a_posture_with_a_payload(tmp_path: Path, posture: str) -> None:
     np.testing.assert_allclose(loads @ (CORNERS * HALF) / loads.sum(), want[:2], atol=1e-9)  # they balance about the CG
 
 
-def test_a_joint_goes_before_the_posture(tmp_path: Path) -> None:
+def test_cg_joint_option_goes_before_the_posture(tmp_path: Path) -> None:
     told = run(tmp_path, "--posture", "ready", "--joint", "left_elbow_joint=-1.0", "--joint", "right_elbow_joint=1.0")
     want = urdf_reference.center_of_mass(URDF, {**POSTURES["ready"], "left_elbow_joint": -1.0, "right_elbow_joint": 1.0})[0]
     np.testing.assert_allclose(told["cg_m"], want[:2], atol=1e-9)
 
 
-def test_a_urdf_and_srdf_of_one_s_own(tmp_path: Path) -> None:
+def test_cg_of_own_urdf_and_srdf_uses_them(tmp_path: Path) -> None:
     (tmp_path / "my.urdf").write_text(URDF)
     told = run(tmp_path, "--urdf", tmp_path / "my.urdf", "--srdf", FILES / "vaultbot.srdf", "--posture", "front_left")
     np.testing.assert_allclose(told["cg_m"], urdf_reference.center_of_mass(URDF, POSTURES["front_left"])[0][:2], atol=1e-9)
 
 
-def test_weighed_in_one_posture_and_wanted_in_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_cg_of_another_posture_than_the_weighed_one_moves_arms(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The base is heavier and lies elsewhere than the URDF says; the arms are as it says."""
     stow, _ = urdf_reference.center_of_mass(URDF, POSTURES["stow_back"])
     ready, mass = urdf_reference.center_of_mass(URDF, POSTURES["ready"])
@@ -105,7 +105,7 @@ def test_weighed_in_one_posture_and_wanted_in_another(tmp_path: Path, capsys: py
     assert "static_mass_kg = 90.252" in capsys.readouterr().out
 
 
-def test_what_it_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_cg_of_bad_input_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bad = tmp_path / "bad.csv"
     header = "front_left_kg,front_right_kg,rear_left_kg,rear_right_kg"
     without = tmp_path / "without.urdf"

@@ -86,7 +86,7 @@ def test_corrections_of_an_uncalibrated_robot_start_at_its_prior() -> None:
     assert icr.sigmas[0] / make_model("icr", robot).nominal[0] == pytest.approx(scaling_sigma())
 
 
-def test_corrections_of_slip_at_speed_have_the_size_of_the_centripetal_force() -> None:
+def test_corrections_of_slip_at_speed_have_centripetal_size() -> None:
     robot = load_robot("husky_a200")
     found = corrections(make_model("full_linear", robot), "lateral_slip_speed+rotation_slip_speed")
     np.testing.assert_allclose(found.sigmas, np.abs(slip_at_speed(robot)))
@@ -109,6 +109,6 @@ def test_skid_prior_of_driven_wheels_and_a_caster_has_no_slip() -> None:
     assert "diff_drive is its model" in prior_notes(robot)[0]
 
 
-def test_skid_prior_with_the_cg_outside_its_wheels_falls_back_to_geometry() -> None:
+def test_skid_prior_of_a_cg_outside_its_wheels_is_geometric() -> None:
     robot = Robot("far", Geometry(0.1, 0.4, 0.3, 10.0, cg_x_m=0.2), Driver(0.1, 0.4))
     assert skid_prior(robot).coefficients[0] == pytest.approx(geometric_scaling(0.3, 0.4))
