@@ -144,7 +144,12 @@ def _integrate_all(dt: FloatArray, twist: FloatArray, by: FloatArray, noise: Flo
             a = spans.ends[i - 1]
         b = spans.ends[i]
         _integrate(dt[a:b], twist[a:b], by[a:b], noise, delta, cov, d)
-        found.poses[i], found.covs[i], found.derivatives[i] = delta, cov, d
+        for j in range(3):  # by element: numba compiles an assignment of slices, with its messages, for seven seconds
+            found.poses[i, j] = delta[j]
+            for k in range(3):
+                found.covs[i, j, k] = cov[j, k]
+            for k in range(d.shape[1]):
+                found.derivatives[i, j, k] = d[j, k]
 
 
 @numba.njit(cache=True)
@@ -155,7 +160,7 @@ def _low_pass(dt: FloatArray, wheels: FloatArray, lag: float) -> Smoothed:
     """
     n = len(dt)
     value, by_lag, middle = np.empty((n, 2)), np.zeros((n, 2)), np.empty(n)
-    value[0] = wheels[0]
+    value[0, 0], value[0, 1] = wheels[0, 0], wheels[0, 1]
     middle[0] = dt[0] / 2.0
     for i in range(1, n):
         h = (dt[i - 1] + dt[i]) / 2.0
@@ -180,7 +185,8 @@ def _interpolate(smooth: Smoothed, offset: float, found: Delayed) -> None:
         t = middle[i] + offset
         if t <= middle[0] or t >= middle[last]:
             end = 0 if t <= middle[0] else last
-            found.value[i], found.by_lag[i] = value[end], by_lag[end]
+            for j in range(2):
+                found.value[i, j], found.by_lag[i, j] = value[end, j], by_lag[end, j]
             continue
         while middle[k + 1] <= t:
             k += 1
