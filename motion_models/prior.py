@@ -29,6 +29,8 @@ _POINTS_X, _POINTS_Y = 7, 5
 _CENTER_X, _CENTER_Y = 0.10, 0.05
 """Standard deviations of the CoR at the nominal CG, over wheelbase and track: where the CG and the tracked point really are. VaultBot's
 rotations have their CoR 0.12 wheelbases behind its weighed CG (Ebersole 2016, 4.22)."""
+_CURVED, _SLOPE_SIGMA = [2, 4, 8, 10], 0.25
+"""k_2, x_cr_1, y_cr_s0 and y_cr_s2: their relative standard deviation. VaultBot's are within 25 % of those by geometry (a test)."""
 _DRIVEN_SIGMA = 0.02
 """Relative standard deviation of k of a robot with two driven wheels and a caster: its track. Freiburg's Pioneers, fr079: 1 %."""
 _CALIBRATION_TURN_S, _TURN_RAD_PER_S = 20.0, 0.5
@@ -110,7 +112,8 @@ def skid_prior(robot: Robot) -> SkidPrior:
     except (CgError, ModelError):  # a CG outside its wheels: their limit for a centred CG remains
         values[0] = geometric_scaling(g.wheelbase_m, g.track_width_m)
         source = "wheelbase and track alone"
-    sigmas[0], sigmas[3], sigmas[5] = scaling_sigma() * values[0], *center
+    sigmas[_CURVED] = _SLOPE_SIGMA * np.abs(values[_CURVED])
+    sigmas[0], sigmas[1], sigmas[3], sigmas[5] = scaling_sigma() * values[0], 2.0 * abs(values[2]) * center[0], *center
     return SkidPrior(values, sigmas, source)
 
 
