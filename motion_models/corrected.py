@@ -15,7 +15,7 @@ from motion_models.se2 import FloatArray
 RADIUS_NAMES = ("wheel_radius_scale", "wheel_radius_difference")
 _N = len(FrictionModel.param_names)
 _MU_RATIO = FrictionModel.param_names.index("mu_ratio")
-_LEAST_MU_RATIO = 0.05
+_LEAST_MU_RATIO = 0.05  # -; castors and free rollers
 _EDGE = 0.98  # of the way to where the robot tips over
 
 

@@ -24,6 +24,7 @@ FORMS: tuple[Form, ...] = ("none", "constant", "cg_field")
 # multipliers for one Husky range from 1.5 to 1.9; terrains differ by a quarter), absolute [m] for where it turns about.
 _TURNING, _CENTRE_X, _CENTRE_Y = 0.15, 0.05, 0.03
 _PRIOR_RETURNS_AFTER_S = 3600.0
+"""Time after which a correction's random walk has brought back its first standard deviation [s]: tyres and loads within an hour."""
 _WARP = 0.15  # VaultBot's chassis, as its rotations show it, moves 13 % of m g / 4 to two opposite wheels
 _MU_RATIO = 0.3
 _RADIUS_SCALE, _RADIUS_DIFFERENCE = 0.03, 0.01

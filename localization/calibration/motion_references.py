@@ -23,6 +23,7 @@ from motion_models.se2 import FloatArray
 
 _NS = 1e-9
 _MAX_SCAN_GAP_S, _MAX_REFERENCE_GAP_S = 1.0, 0.5
+"""Gaps in scans and references beyond which a window is not measured [s]."""
 _MAX_GAP_OVER_PERIOD = 2.5  # for references that are sparser than that: one missing measurement does not end a window
 _MAX_GYRO_BIAS = 0.05  # rad/s; a robot that turns faster by the gyro than any bias does not stand, whatever its wheels report
 HOLD_S = 0.5
@@ -35,6 +36,7 @@ _OPEN_SIGMA_M = 0.05
 """Sigma of a position beyond which a scene counts as a corridor: matching then slides towards no motion at all [m]."""
 _RATE_GAPS = 20  # gaps between scans, by which their rate is measured
 _STANDSTILL_COV = np.diag([1e-12, 1e-12, 1e-12])
+"""Of a robot whose wheels stand: a micrometre and a microradian [m^2, m^2, rad^2]."""
 
 
 @dataclass(frozen=True)

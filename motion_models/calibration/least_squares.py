@@ -20,7 +20,8 @@ from motion_models.se2 import FloatArray
 Loss = Literal["linear", "huber", "cauchy"]
 
 _STEPS = 60
-_LEAST_MOTION = (0.05, 0.05)  # m, rad
+"""Of Levenberg-Marquardt; fits of real logs take under 20."""
+_LEAST_MOTION = (0.05, 0.05)  # m, rad; below, encoders' resolution and the reference's noise are as large
 _UNMEASURED = 1e6  # m^2 or rad^2
 _SMALL = 0.1  # SI; what counts as large for a parameter whose nominal value is 0
 # Median length of vectors of 1, 2 and 3 unit normal numbers. Residual lengths are brought to the last before the knee, beyond

@@ -34,6 +34,7 @@ NEEDED = ("window", "dt_s", "left_rad_per_s", "right_rad_per_s", "yaw_rad")
 POSE = ("x_m", "y_m", "yaw_rad")
 CG = ("cg_x_m", "cg_y_m")
 SIGMA = {"sigma_x_m": 0.02, "sigma_y_m": 0.02, "sigma_yaw_rad": 0.01}
+"""Defaults of a table without standard deviations: motion capture and LiDAR ICP (DRIVE) scatter so."""
 
 _MIN_CHORD_M = 0.3
 """Displacement below which the direction of a window is too uncertain to be compared with that of its wheels [m]."""
@@ -41,6 +42,7 @@ _MAX_TURN_RAD, _PER_TURN = 0.55, 0.5
 """Direction of a displacement against that of the wheels: side slip and scatter [rad], and half the measured turn, of which the wheels do
 not show when it was made. Of 431 windows of DRIVE's Husky that moved so far, none exceeds this with its frames corrected."""
 _MAX_TURNED_SHARE, _MIN_COMPARED = 1.0 / 3.0, 5
+"""Share of turned windows among those compared beyond which the table as a whole is in another frame, and how many that takes."""
 
 Row = tuple[int, dict[str, str]]
 """Line number and cells by column."""

@@ -16,11 +16,17 @@ from motion_models.friction.contact import CREEP
 from motion_models.friction.equilibrium import Balance, Floor, Loads, Matrix3, balance, motion, newton, solve_3x3
 
 _EFFORT = 40
-_CLOSE = 1e-7  # the last step of Newton's method squares it
+"""Evaluations of the balance before the angle is enclosed instead."""
+_CLOSE = 1e-7
+"""Step of Newton's method [1], after which one more changes nothing: it squares the error."""
 _BALANCED = 1e-9
+"""Error of the angle [rad] up to which an enclosed solution counts."""
 _ENCLOSING = 40
+"""Steps of up to 0.4 rad towards the goal: more than a whole turn."""
 _CLOSING = 100
+"""Of Chandrupatla's method, at worst halves: down to rounding from any interval."""
 _CLOSE_ANGLE = 1e-14
+"""Rounding of an angle [rad]."""
 _FINEST = 1e-3
 """Least step of the centripetal force, as a share of it."""
 

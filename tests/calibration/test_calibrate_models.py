@@ -105,7 +105,7 @@ def test_predict_with_lag_and_offset_shifts_the_rates() -> None:
     def rates(at: FloatArray) -> FloatArray:
         return np.stack([3.0 * np.sin(1.7 * at) + np.sin(4.1 * at), 2.0 * np.cos(2.3 * at)], axis=-1)
 
-    # First-order response of 60 ms, by a fine Euler loop; the log says at t what was true at t - 30 ms.
+    # First-order response of 60 ms, by a fine Euler loop; the log has at t what was true at t - 30 ms.
     fine = np.arange(-200, 20 * n) * (h / 20)
     body, state = np.empty((len(fine), 2)), rates(fine[:1])[0]
     for i, at in enumerate(fine):
@@ -267,7 +267,7 @@ def _one(**changes: object) -> Maneuver:
 
 
 @pytest.mark.parametrize(
-    ("maneuver", "said"),
+    ("maneuver", "message"),
     [
         (_one(dt=np.array([0.1, 0.1, -0.1, 0.1])), "north.*interval is -0.1 s"),
         (_one(wheels=np.array([[1.0, 1.0], [np.nan, 1.0], [1.0, 1.0], [1.0, 1.0]])), "north.*wheels.*not finite"),
@@ -279,8 +279,8 @@ def _one(**changes: object) -> Maneuver:
         (_one(cov=np.full((3, 3), np.nan)), "cov.*not finite"),
     ],
 )
-def test_make_batch_of_malformed_maneuvers_names_them(maneuver: Maneuver, said: str) -> None:
-    with pytest.raises(CalibrationError, match=said):
+def test_make_batch_of_malformed_maneuvers_names_them(maneuver: Maneuver, message: str) -> None:
+    with pytest.raises(CalibrationError, match=message):
         make_batch([_one(), maneuver])
 
 

@@ -81,7 +81,7 @@ def test_subtree_jacobian_is_a_difference(tree):
 
 
 def dh_arm_moment(joints, world_T_base):
-    """(3,) first moment [kg m] of a UR5's six moving links, as Universal Robots' table tells: DH parameters, and centres in DH frames."""
+    """(3,) first moment [kg m] of a UR5's six moving links, as Universal Robots' table has: DH parameters, and centres in DH frames."""
     a = [0.0, -0.425, -0.39225, 0.0, 0.0, 0.0]
     d = [0.089159, 0.0, 0.0, 0.10915, 0.09465, 0.0823]
     alpha = [math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0]
@@ -130,7 +130,7 @@ def test_flatten_of_vaultbot_is_the_robot_of_the_thesis():
     assert (left - right)[1] == pytest.approx(0.56)
     assert (left - rear)[0] == pytest.approx(0.52)
     assert left[2] - poses["base_footprint"][2, 3] == pytest.approx(0.164)
-    # Wheels, and the wrists that turn about the gripper's axis, do not matter; a log need not tell them.
+    # Wheels, and the wrists that turn about the gripper's axis, do not matter; a log need not have them.
     assert chain.joint_names == tuple(f"{side}_{joint}" for side in ("left", "right") for joint in ARM[:5])
 
 

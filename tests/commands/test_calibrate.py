@@ -37,14 +37,14 @@ TRUTH = make_model("friction", VAULTBOT)
 
 def run(tmp_path: Path, *arguments: object) -> dict[str, Any]:
     """The command's JSON; it must succeed."""
-    path = tmp_path / "told.json"
+    path = tmp_path / "report.json"
     path.unlink(missing_ok=True)
     assert main(["calibrate", *map(str, arguments), "--json", str(path)]) == 0
     return json.loads(path.read_text(encoding="utf-8"))
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """What the command says where it must fail."""
+    """The error of the command, which must fail."""
     assert main(["calibrate", *map(str, arguments)]) == 2
     return " ".join(capsys.readouterr().err.split())
 
@@ -54,7 +54,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 def test_calibrate_of_the_grid_prints_the_regressions_of_the_thesis(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "robot.toml"
-    told = run(tmp_path, GRID, "--robot", "vaultbot", "--out", out)
+    report = run(tmp_path, GRID, "--robot", "vaultbot", "--out", out)
     printed = capsys.readouterr().out
     for number in (
         "2.1722 x_G -0.0635",
@@ -69,25 +69,25 @@ def test_calibrate_of_the_grid_prints_the_regressions_of_the_thesis(tmp_path: Pa
     lines = [line.split() for line in printed.splitlines()]
     assert ["-0.06", "-1.2750", "0.0156"] in lines  # Table 4-7's first and last
     assert ["0.12", "-0.1300", "-0.0072"] in lines
-    assert told["rotations"] == 68
+    assert report["rotations"] == 68
     by_study = {v.variant: (v.ratio, v.x_cr, v.y_cr) for v in thesis_regressions.variant_errors()}
-    for name, rms in told["rms"].items():
+    for name, rms in report["rms"].items():
         if name.split()[0] in by_study:  # the study takes the thesis's rounded coefficients
             np.testing.assert_allclose(rms, by_study[name.split()[0]], atol=2e-4)
     read_back = make_model("skid_steer", load_robot(out))
-    assert dict(zip(read_back.param_names, read_back.nominal, strict=True)) == {n: p["value"] for n, p in told["parameters"].items()}
+    assert dict(zip(read_back.param_names, read_back.nominal, strict=True)) == {n: p["value"] for n, p in report["parameters"].items()}
     assert load_robot(out).arms == VAULTBOT.arms
 
 
 def test_calibrate_of_the_grid_fits_the_friction_model(tmp_path: Path) -> None:
     """Another solver, other weights, poses for twists: the study's four numbers, within its own sigmas."""
-    told = run(tmp_path, GRID, "--robot", "vaultbot", "--model", "friction")
+    report = run(tmp_path, GRID, "--robot", "vaultbot", "--model", "friction")
     study = friction_grid.fitted()[0]
     for name, value, sigma in zip(study.names, study.values, friction_grid.jackknife_sigma(), strict=True):
-        assert told["parameters"][name]["value"] == pytest.approx(value, abs=2 * sigma), name
-        assert 0 < told["parameters"][name]["sigma"] < 3 * sigma
-    before, after, gain = (told["errors"]["position_m"][key] for key in ("before", "after", "gain"))
-    assert told["heldout"]
+        assert report["parameters"][name]["value"] == pytest.approx(value, abs=2 * sigma), name
+        assert 0 < report["parameters"][name]["sigma"] < 3 * sigma
+    before, after, gain = (report["errors"]["position_m"][key] for key in ("before", "after", "gain"))
+    assert report["heldout"]
     assert after[0] < before[0] / 4
     assert gain[1] > 0
 
@@ -125,15 +125,17 @@ def shifted_slope(bag: Path) -> tuple[float, float]:
 
 
 def test_calibrate_by_gyro_of_a_husky_fits_k_and_no_distance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = run(tmp_path, HUSKY, "--out", tmp_path / "husky.toml", "--export", "diff_drive_controller", "--export-out", tmp_path / "c.yaml")
-    k = told["parameters"]["k_0"]
+    report = run(
+        tmp_path, HUSKY, "--out", tmp_path / "husky.toml", "--export", "diff_drive_controller", "--export-out", tmp_path / "c.yaml"
+    )
+    k = report["parameters"]["k_0"]
     slope, shift = shifted_slope(HUSKY)
     assert k["value"] == pytest.approx(slope, rel=0.02)
     assert 0.0026 < k["sigma"] < 0.012  # not below the half percent to which the gyro's scale is known
-    assert told["parameters"]["wheel_time_offset"]["value"] == pytest.approx(shift, abs=0.03)
-    assert {held["parameter"] for held in told["held"]} == {"x_cr_0", "y_cr_0", "wheel_radius_scale"}
-    assert set(told["errors"]) == {"heading_deg"}
-    assert told["errors"]["heading_deg"]["gain"][1] > 0  # held out
+    assert report["parameters"]["wheel_time_offset"]["value"] == pytest.approx(shift, abs=0.03)
+    assert {held["parameter"] for held in report["held"]} == {"x_cr_0", "y_cr_0", "wheel_radius_scale"}
+    assert set(report["errors"]) == {"heading_deg"}
+    assert report["errors"]["heading_deg"]["gain"][1] > 0  # held out
     assert "record a LiDAR or a reference" in capsys.readouterr().out
     # What is written drives as what was fitted.
     p = YAML(typ="safe").load((tmp_path / "c.yaml").read_text())["diff_drive_controller"]["ros__parameters"]
@@ -142,10 +144,10 @@ def test_calibrate_by_gyro_of_a_husky_fits_k_and_no_distance(tmp_path: Path, cap
 
 
 def test_calibrate_by_gyro_of_distances_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    said = refused(capsys, HUSKY, "--model", "diff_drive", "--fit", "wheel_radius,wheel_separation_multiplier")
-    assert "cannot be distinguished" in said
-    said = refused(capsys, HUSKY, "--fit", "x_cr_0")
-    assert "x_cr_0 does not show" in said
+    message = refused(capsys, HUSKY, "--model", "diff_drive", "--fit", "wheel_radius,wheel_separation_multiplier")
+    assert "cannot be distinguished" in message
+    message = refused(capsys, HUSKY, "--fit", "x_cr_0")
+    assert "x_cr_0 does not show" in message
 
 
 @pytest.fixture(scope="module")
@@ -184,15 +186,15 @@ def heading_errors(robot_file: str) -> np.ndarray:
 
 
 def test_calibrate_by_lidar_betters_another_drive(tmp_path: Path, aces_part: Path) -> None:
-    told = run(tmp_path, aces_part, "--robot", "aces", "--model", "icr", "--out", tmp_path / "aces.toml")
-    assert told["witness"] == {"part": "scan matching of /scan"}
-    track, sigma = told["turning"]["effective_track_m"]
+    report = run(tmp_path, aces_part, "--robot", "aces", "--model", "icr", "--out", tmp_path / "aces.toml")
+    assert report["witness"] == {"part": "scan matching of /scan"}
+    track, sigma = report["turning"]["effective_track_m"]
     assert sigma < 0.01
     assert track == pytest.approx(0.5, abs=0.02)  # it has two wheels and does not skid: its own odometry's track
-    assert told["turning"]["forward_scale"][0] == pytest.approx(1.0, abs=0.03)
+    assert report["turning"]["forward_scale"][0] == pytest.approx(1.0, abs=0.03)
     before, after = (np.sqrt(np.mean(heading_errors(str(name)) ** 2)) for name in ("aces", tmp_path / "aces.toml"))
     assert after < 1.05 * before  # a robot that was calibrated well stays so
-    assert told["errors"]["heading_deg"]["gain"][1] > 0
+    assert report["errors"]["heading_deg"]["gain"][1] > 0
 
 
 # --- made logs: the truth is friction, what is fitted is not ----------------------------------------------------------------------
@@ -243,15 +245,15 @@ def test_calibrate_by_reference_fits_the_change_with_the_cg(tmp_path: Path) -> N
         stamp = START + i * S // RATE
         records.append(("/mocap", bags.pose_stamped(stamp, *(poses[i] + rng.normal(0, [1e-3, 1e-3, 5e-4]))), stamp))
     bag = bags.write_mcap(tmp_path / "run.mcap", sorted(records, key=lambda r: r[2]))
-    told = run(tmp_path, bag, "--robot", "vaultbot", "--reference", "/mocap", "--out", tmp_path / "robot.toml")
-    assert told["witness"] == {"run.mcap": "reference /mocap"}
+    report = run(tmp_path, bag, "--robot", "vaultbot", "--reference", "/mocap", "--out", tmp_path / "robot.toml")
+    assert report["witness"] == {"run.mcap": "reference /mocap"}
     model = make_model("skid_steer", load_robot(tmp_path / "robot.toml"))
     k, x_cr, _ = model.rotation(np.array(cgs), model.nominal)
     want_k, want_x = np.transpose([in_place(at) for at in cgs])
     np.testing.assert_allclose(x_cr, want_x, atol=0.01)  # the slope is that of the physics, 2.17, by its line
     xs = [x for x, _ in cgs]
     np.testing.assert_allclose(k, np.polyval(np.polyfit(xs, want_k, 2), xs), rtol=0.015)  # the physics is no parabola, but 4.21 is
-    assert told["parameters"]["x_cr_1"]["value"] == pytest.approx(np.polyfit(xs, want_x, 1)[0], rel=0.05)
+    assert report["parameters"]["x_cr_1"]["value"] == pytest.approx(np.polyfit(xs, want_x, 1)[0], rel=0.05)
 
 
 def room_scans(poses: np.ndarray, lidar_x: float) -> list[Record]:
@@ -335,14 +337,14 @@ def test_calibrate_out_of_every_model_is_read_back(tmp_path: Path, name: str) ->
     """Fitted, written, read: the very numbers, and the ties among them."""
     table = tmp_path / "w.csv"
     table.write_text(windows_text(made_windows("icr")))
-    told = run(tmp_path, table, "--robot", "vaultbot", "--model", name, "--out", tmp_path / "new" / "robot.toml")
+    report = run(tmp_path, table, "--robot", "vaultbot", "--model", name, "--out", tmp_path / "new" / "robot.toml")
     robot = load_robot(tmp_path / "new" / "robot.toml")
     model = make_model(name, robot)
     read = dict(zip(model.param_names, model.nominal, strict=True))
     read["wheel_radius_scale"] = robot.geometry.wheel_radius_m / VAULTBOT.geometry.wheel_radius_m - 1.0
-    for parameter, entry in told["parameters"].items():
+    for parameter, entry in report["parameters"].items():
         assert read[parameter] == pytest.approx(entry["value"], rel=1e-12), parameter
-    assert told["parameters"]
+    assert report["parameters"]
     assert "# +- " in (tmp_path / "new" / "robot.toml").read_text()
 
 
@@ -367,10 +369,10 @@ def test_calibrate_of_several_tables_lists_each(tmp_path: Path, capsys: pytest.C
         ]
         paths.append(tmp_path / name)
         paths[-1].write_text(windows_text(slower))
-    told = run(tmp_path, *paths, "--robot", "vaultbot", "--model", "diff_drive")
-    floor, snow = (told["by_source"][path.name]["effective_track_m"][0] for path in paths)
+    report = run(tmp_path, *paths, "--robot", "vaultbot", "--model", "diff_drive")
+    floor, snow = (report["by_source"][path.name]["effective_track_m"][0] for path in paths)
     assert snow / floor == pytest.approx(1.25, rel=0.02)
-    assert floor < told["turning"]["effective_track_m"][0] < snow
+    assert floor < report["turning"]["effective_track_m"][0] < snow
     printed = capsys.readouterr().out
     assert "by each alone" in printed
     assert "snow.csv" in printed
@@ -380,9 +382,9 @@ def test_calibrate_of_drive_husky_windows_is_near_the_study(tmp_path: Path) -> N
     """The DRIVE data set as a table: as well as the study that knows the data set, within 5 %."""
     path = tmp_path / "drive.csv"
     path.write_text(windows_text(drive_husky.maneuvers(mended=True)))
-    told = run(tmp_path, path, "--model", "full_linear")
-    assert told["maneuvers"] == 603
-    before, after = (told["errors"]["position_m"][key][0] for key in ("before", "after"))
+    report = run(tmp_path, path, "--model", "full_linear")
+    assert report["maneuvers"] == 603
+    before, after = (report["errors"]["position_m"][key][0] for key in ("before", "after"))
     assert after < 0.24 < 0.3 < before
 
 
@@ -396,10 +398,10 @@ def standing_log(tmp_path: Path) -> Path:
 
 
 def test_calibrate_without_motion_names_what_to_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refused(capsys, standing_log(tmp_path), "--robot", "vaultbot")
-    assert "no motion to calibrate on" in said
-    assert "4 standing still" in said
-    assert "turning in place to each side" in said
+    message = refused(capsys, standing_log(tmp_path), "--robot", "vaultbot")
+    assert "no motion to calibrate on" in message
+    assert "4 standing still" in message
+    assert "turning in place to each side" in message
 
 
 def test_calibrate_without_a_motion_reference_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -419,11 +421,11 @@ def test_calibrate_of_straight_drives_holds_the_turning(tmp_path: Path, capsys: 
     pose, cov = np.array([[0.66, 0.0, 0.0]]), np.diag([1e-4] * 3)
     straight = [Maneuver(np.full(20, 0.1), np.full((20, 2), 2.0), pose, np.array([20]), cov=cov, group=str(i)) for i in range(6)]
     table.write_text(windows_text(straight))
-    told = run(tmp_path, table, "--robot", "vaultbot")
-    held = {each["parameter"]: each["why"] for each in told["held"]}
+    report = run(tmp_path, table, "--robot", "vaultbot")
+    held = {each["parameter"]: each["why"] for each in report["held"]}
     assert set(held) == {"k_0", "x_cr_0", "y_cr_0"}
     assert "turning in place" in held["k_0"]
-    assert told["parameters"]["wheel_radius_scale"]["value"] == pytest.approx(0.66 / (4.0 * 0.164) - 1.0, abs=1e-6)
+    assert report["parameters"]["wheel_radius_scale"]["value"] == pytest.approx(0.66 / (4.0 * 0.164) - 1.0, abs=1e-6)
     assert "k_0: k_0 does not show" in capsys.readouterr().out
 
 
@@ -439,9 +441,9 @@ def test_calibrate_with_distances_fits_the_wheel_radius(tmp_path: Path) -> None:
         windows.append(Maneuver(np.full(20, 0.1), q, measured, np.array([20]), cov=np.diag([1e-6] * 3), group=str(i)))
     table, out = tmp_path / "w.csv", tmp_path / "robot.toml"
     table.write_text(windows_text(windows))
-    told = run(tmp_path, table, "--robot", "vaultbot", "--out", out)
-    assert told["recommended"]
-    assert told["parameters"]["wheel_radius_scale"]["value"] == pytest.approx(-0.04, abs=0.003)
+    report = run(tmp_path, table, "--robot", "vaultbot", "--out", out)
+    assert report["recommended"]
+    assert report["parameters"]["wheel_radius_scale"]["value"] == pytest.approx(-0.04, abs=0.003)
     assert load_robot(out).geometry.wheel_radius_m == pytest.approx(0.164 * 0.96, rel=0.003)
     assert load_robot(out).models["skid_steer"]["k_0"] == pytest.approx(true.nominal[0], rel=0.01)
 
@@ -457,9 +459,9 @@ def test_calibrate_worse_on_held_out_data_is_not_recommended(tmp_path: Path, cap
         windows.append(Maneuver(np.full(20, 0.1), q, measured, np.array([20]), cov=np.diag([2.5e-3] * 3), group=str(i)))
     table, out = tmp_path / "w.csv", tmp_path / "robot.toml"
     table.write_text(windows_text(windows))
-    told = run(tmp_path, table, "--robot", "vaultbot", "--model", "diff_drive", "--out", out)
-    assert not told["recommended"]
-    assert told["gain"] < 1.0
+    report = run(tmp_path, table, "--robot", "vaultbot", "--model", "diff_drive", "--out", out)
+    assert not report["recommended"]
+    assert report["gain"] < 1.0
     printed = capsys.readouterr().out
     assert "NOT RECOMMENDED" in printed
     assert "The old values are kept" in printed

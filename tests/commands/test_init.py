@@ -1,4 +1,4 @@
-"""`skidloc init` from end to end: what it guesses of real logs, what it says is missing, and that its file works."""
+"""`skidloc init` from end to end: what it guesses of real logs, what it reports as missing, and that its file works."""
 
 from __future__ import annotations
 
@@ -70,9 +70,9 @@ def test_init_of_a_pioneer_finds_its_drivers_constants(tmp_path: Path, capsys: p
 
 def test_init_without_geometry_names_what_to_measure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["init", str(HUSKY_BAG), "--out", str(tmp_path / "husky.toml")]) == 2
-    told = capsys.readouterr()
-    assert "--wheel-radius-m, --track-width-m, --wheelbase-m" in told.err
-    assert "! mount of imu_link (/imu/data)" in told.out
+    report = capsys.readouterr()
+    assert "--wheel-radius-m, --track-width-m, --wheelbase-m" in report.err
+    assert "! mount of imu_link (/imu/data)" in report.out
     assert not (tmp_path / "husky.toml").exists()
 
 

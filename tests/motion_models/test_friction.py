@@ -150,7 +150,7 @@ def test_friction_twist_of_faster_wheels_is_in_proportion(scale, direction, xi, 
 @given(st.floats(-6, 6), st.floats(-6, 6), inside, inside)
 @settings(deadline=None)
 def test_friction_twist_backwards_is_mirrored(q_l, q_r, xi, eta):
-    """A robot cannot tell its front from its rear."""
+    """A robot has no front and no rear."""
     here = move([q_l, q_r], np.array([xi, eta]) * HALF)
     there = move([-q_l, -q_r], np.array([-xi, eta]) * HALF)
     np.testing.assert_allclose(there, here * [-1, 1, -1], atol=1e-8)

@@ -217,7 +217,7 @@ def test_jit_cache_of_parallel_processes_can_be_loaded(tmp_path):
     code = "import numpy as np, se2; print(se2.compose(np.ones(3), np.ones(3)).tolist(), se2.log(np.ones(3)).tolist())"
     command, environment = [sys.executable, "-c", code], {**os.environ, "PYTHONPATH": str(tmp_path)}
     first = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
-    told = [process.communicate(timeout=120)[0] for process in first]
-    told.append(subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, timeout=120, check=False).stdout)
+    outputs = [process.communicate(timeout=120)[0] for process in first]
+    outputs.append(subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, timeout=120, check=False).stdout)
     expected = f"{se2.compose(np.ones(3), np.ones(3)).tolist()} {se2.log(np.ones(3)).tolist()}\n"
-    assert told == [expected] * 4
+    assert outputs == [expected] * 4
