@@ -36,8 +36,9 @@ class LearnedNoise:
     """Of the longitudinal and lateral ones, and of `floor_m2_per_s`."""
 
     def scaled(self, noise: WheelNoise) -> WheelNoise:
-        """``noise`` with its variances multiplied."""
-        return WheelNoise(**{name: value * (self.yaw if name in _YAW else self.position) for name, value in _values(noise).items()})
+        """``noise`` with its variances multiplied, to three digits: a variance is known no better."""
+        factors = {name: self.yaw if name in _YAW else self.position for name in _values(noise)}
+        return WheelNoise(**{name: float(f"{value * factors[name]:.3g}") for name, value in _values(noise).items()})
 
 
 def learn_noise(fit: Fit, maneuvers: Sequence[Maneuver], residuals: FloatArray) -> LearnedNoise:

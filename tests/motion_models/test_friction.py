@@ -277,9 +277,9 @@ def test_friction_twist_takes_microseconds():
     MODEL.twist(wheels, cg, NOMINAL)
     seconds = []
     for _ in range(30):
-        start = time.perf_counter()
+        start = time.thread_time()
         MODEL.twist(wheels, cg, NOMINAL)
-        seconds.append(time.perf_counter() - start)
+        seconds.append(time.thread_time() - start)
     assert min(seconds) / 1000 < 10e-6
 
 
