@@ -27,6 +27,7 @@ from motion_models.center_of_gravity.urdf import parse_urdf
 from motion_models.errors import RobotError
 from motion_models.robot import DIFF_DRIVE, Driver, Geometry, Joints, Mount, Robot, Topics
 from motion_models.se2 import FloatArray
+from motion_models.text_files import read_text
 from motion_models.wheel_geometry import WheelGeometry, link_poses, sides, wheel_geometry
 
 DRIVE_60_S = (
@@ -142,7 +143,7 @@ def _decoded(decode: Decoder, raw: Any) -> Any:
 def draft_robot(survey: Survey, given: Given, path: Path) -> Draft:
     """Guess everything that a robot file needs. Raises `RobotError` for a URDF that cannot be used."""
     draft = Draft()
-    text = None if given.urdf is None else given.urdf.read_text(encoding="utf-8")
+    text = None if given.urdf is None else _read_urdf(given.urdf)
     urdf = None if text is None else wheel_geometry(text, str(given.urdf), given.base_link)
     _choose_topics(draft, survey, given.topics)
     _choose_joints(draft, survey, given, urdf)
@@ -150,6 +151,13 @@ def draft_robot(survey: Survey, given: Given, path: Path) -> Draft:
     _choose_geometry(draft, given, urdf, driver)
     _choose_mounts(draft, survey, {} if text is None else _urdf_mounts(text, given))
     return draft
+
+
+def _read_urdf(path: Path) -> str:
+    try:
+        return read_text(path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise RobotError(f"URDF '{path}' cannot be read: {error}. Expand xacro files first.") from error
 
 
 def _choose_topics(draft: Draft, survey: Survey, given: TopicOverrides) -> None:

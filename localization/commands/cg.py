@@ -25,6 +25,7 @@ from motion_models.friction.contact import loads
 from motion_models.robot import Robot, load_robot
 from motion_models.se2 import FloatArray
 from motion_models.skid_steer import SkidSteer
+from motion_models.text_files import read_text
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class Cg:
     def _postures(self, arms: Arms, folder: Path | None) -> dict[str, Posture]:
         if self.srdf is not None:
             try:
-                return dict(parse_postures(self.srdf.read_text(encoding="utf-8"), str(self.srdf)))
+                return dict(parse_postures(read_text(self.srdf), str(self.srdf)))
             except (OSError, UnicodeDecodeError) as error:
                 raise CgError(f"SRDF '{self.srdf}' cannot be read: {error}.") from error
         return dict(arms_postures(arms, folder))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from ruamel.yaml import YAML
 from localization.cli import main
 from localization.evaluation.references import read_relations
 from localization.events import ImuSample, WheelSample
-from localization.logs import open_log
+from localization.logs import TopicOverrides, open_log
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.calibration.maneuvers import Maneuver
@@ -166,16 +167,22 @@ def aces_part(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@functools.cache
+def aces_wheels() -> tuple[WheelBuffer, int]:
+    """The wheels of the ACES log, which a calibration of `icr` does not change, and its start."""
+    log, history = open_log(DATA / "aces" / "aces.mcap", load_robot("aces"), TopicOverrides(scan="")), WheelBuffer(np.zeros(2), keep_s=1e9)
+    for event in log.events():
+        if isinstance(event, WheelSample):
+            history.insert(event)
+    return history, log.start_ns
+
+
 def heading_errors(robot_file: str) -> np.ndarray:
     """Of dead reckoning over the hand-verified relations of the rest of the ACES log [rad]."""
     robot = load_robot(robot_file)
     model = make_model("icr", robot)
-    log, relations = open_log(DATA / "aces" / "aces.mcap", robot), read_relations(DATA / "aces" / "aces.relations")
-    history = WheelBuffer(np.zeros(2), keep_s=1e9)
-    for event in log.events():
-        if isinstance(event, WheelSample):
-            history.insert(event)
-    short = (relations.ends_ns - relations.starts_ns < 20 * S) & (relations.starts_ns > log.start_ns + 400 * S)
+    (history, start_ns), relations = aces_wheels(), read_relations(DATA / "aces" / "aces.relations")
+    short = (relations.ends_ns - relations.starts_ns < 20 * S) & (relations.starts_ns > start_ns + 400 * S)
     errors = []
     for start, end, motion in zip(relations.starts_ns[short], relations.ends_ns[short], relations.motions[short], strict=True):
         dt, rates, cg, _ = history.window(int(start), int(end), 0.5)

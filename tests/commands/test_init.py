@@ -95,7 +95,9 @@ def test_init_refuses_half_of_the_joints_and_lengths_below_zero(tmp_path: Path, 
     assert main([*base, "--left", "a_wheel"]) == 2
     assert main([*base, "--track-width-m", "-1"]) == 2
     assert main([*base, "--urdf", str(tmp_path / "none.urdf")]) == 2
-    assert capsys.readouterr().err.count("skidloc:") == 3
+    assert main([*base, "--urdf", str(HUSKY_BAG)]) == 2
+    assert main([*base, "--mass-kg", "nan"]) == 2
+    assert capsys.readouterr().err.count("skidloc:") == 5
 
 
 def answer(monkeypatch: pytest.MonkeyPatch, answers: Iterable[str]) -> None:
