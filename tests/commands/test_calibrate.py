@@ -140,7 +140,7 @@ def test_calibrate_by_gyro_of_a_husky_fits_k_and_no_distance(tmp_path: Path, cap
     assert "record a LiDAR or a reference" in capsys.readouterr().out
     # What is written drives as what was fitted.
     p = YAML(typ="safe").load((tmp_path / "c.yaml").read_text())["diff_drive_controller"]["ros__parameters"]
-    assert p["wheel_separation_multiplier"] == pytest.approx(1 / k["value"], rel=1e-5)
+    assert p["wheel_separation_multiplier"] == pytest.approx(1 / k["value"], abs=5.01e-4)  # three decimals: sigma is 0.012
     assert make_model("skid_steer", load_robot(tmp_path / "husky.toml")).nominal[0] == k["value"]
 
 
