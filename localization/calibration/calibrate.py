@@ -23,7 +23,7 @@ from motion_models.calibration.least_squares import FitConfig
 from motion_models.calibration.maneuvers import IntArray, Maneuver
 from motion_models.calibration.noise import LearnedNoise, learn_noise
 from motion_models.calibration.plan import Calibration, calibrate, free_of
-from motion_models.corrected import CorrectedWheels
+from motion_models.corrected import RADIUS_NAMES, CorrectedWheels
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
 from motion_models.robot import Robot, WheelNoise
@@ -177,7 +177,7 @@ def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequ
     if not maneuvers:
         sources = " ".join(f"{each.source}: {each.warnings[0]}" if each.warnings else each.source for each in cuts)
         raise CalibrationError(f"no motion to calibrate on. {sources} {ADVICE}")
-    if model.name == "skid_steer" and not of_rotations:
+    if (model.name == "skid_steer" and not of_rotations) or set(free) & set(RADIUS_NAMES):
         model = CorrectedWheels(model)
     wanted = tuple(free) or free_of(model, maneuvers, of_rotations)
     # In a table of rotations nothing slips at random: every row has the same wheels, and its own errors.

@@ -73,7 +73,8 @@ class Fit:
         everything = dict(zip(self.model.param_names, (float(p) for p in self.params), strict=True))
         table = {name: value for name, value in everything.items() if name in fitted and name not in RADIUS_NAMES}
         found = dataclasses.replace(robot, models={**robot.models, self.model.name: table})
-        return _with_radius(found, 1.0 + everything.get("wheel_radius_scale", 0.0))
+        found = _with_radius(found, 1.0 + everything.get("wheel_radius_scale", 0.0))
+        return _with_difference(found, everything.get("wheel_radius_difference", 0.0))
 
 
 def _with_radius(robot: Robot, scale: float) -> Robot:
@@ -83,6 +84,15 @@ def _with_radius(robot: Robot, scale: float) -> Robot:
     icr = {name: value / scale if name.startswith("alpha") else value for name, value in robot.models.get("icr", {}).items()}
     geometry = dataclasses.replace(robot.geometry, wheel_radius_m=robot.geometry.wheel_radius_m * scale)
     return dataclasses.replace(robot, geometry=geometry, models={**robot.models, **({"icr": icr} if icr else {})})
+
+
+def _with_difference(robot: Robot, difference: float) -> Robot:
+    """``robot`` with left wheels larger than right ones by ``difference`` of their mean, beside what its file has already."""
+    if difference == 0.0:
+        return robot
+    left, right = robot.geometry.radius_multipliers * np.array([1.0 + difference / 2.0, 1.0 - difference / 2.0])
+    geometry = dataclasses.replace(robot.geometry, left_wheel_radius_multiplier=float(left), right_wheel_radius_multiplier=float(right))
+    return dataclasses.replace(robot, geometry=geometry)
 
 
 def fit(
