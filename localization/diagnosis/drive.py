@@ -240,7 +240,9 @@ def drive_of_log(
 
 def _describe_windows(windows: Windows, spans: IntArray, config: WindowConfig) -> str:
     length_s = float(np.median(spans[:, 1] - spans[:, 0])) * _NS if len(spans) else config.window_s
-    text = f"{len(windows.maneuvers)} windows of {length_s:.2g} s; left out: {windows.standing} standing, {windows.lost} not measured."
+    text = (
+        f"{len(windows.maneuvers)} windows of {length_s:.2g} s; left out: {windows.standing} standing, {windows.unmeasured} not measured."
+    )
     if length_s > 1.3 * config.window_s:
         text += f" The motion reference is sparse, so that windows of {config.window_s:g} s were extended to its stamps."
     return text

@@ -28,6 +28,7 @@ from localization.ros.settings import LiveRun
 from localization.ros.transforms import TF, TF_STATIC, TF_TYPE, TransformConflicts
 from localization.ros.transports.base import Received, Transport
 from motion_models.errors import RobotError
+from motion_models.prior import prior_notes
 from motion_models.robot import Mount
 
 _STATUS_PERIOD_S, _POLL_S = 1.0, 0.2
@@ -90,9 +91,10 @@ class Node:
         publisher = EstimatePublisher(transport, config.names, config.frames, with_tf=config.tf)
         needed = read_head(state_file).get("topics", []) if state_file is not None and state_file.exists() else []
         discovered = discovery.discover(config.wait_s, needed, report, is_over)
-        for warning in discovered.parts.warnings:
+        trial = run.make_trial(discovered.parts.sources.lidar is not None)
+        for warning in (*prior_notes(run.robot, [trial.model.name]), *discovered.parts.warnings):
             report(warning)
-        node = cls(transport, run, discovered, run.make_trial(discovered.parts.sources.lidar is not None), publisher, report)
+        node = cls(transport, run, discovered, trial, publisher, report)
         node._open_session(discovered, view)
         return node
 
