@@ -15,7 +15,7 @@ from localization.diagnosis.subset_selection import Regression, regression
 from motion_models.base import MotionModel
 from motion_models.diff_drive import DiffDrive
 from motion_models.friction import FrictionModel
-from motion_models.robot import Robot
+from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
 
 SKIDDING = frozenset(
@@ -23,7 +23,6 @@ SKIDDING = frozenset(
     | {"lateral_force_law", "diagonal_load", "tread_asymmetry", "rolling_resistance", "slope", "rotation_slip_speed"}
 )
 """Causes that act by the friction of wheels that skid: none of a robot with casters, whose track is a scale of its rotation."""
-_CASTER_TOLERANCE = 0.02  # of the separation multiplier: what is calibrated on a robot with casters
 
 
 @dataclass(frozen=True)
@@ -46,10 +45,8 @@ class Linearization:
 
 
 def is_skid_steer(robot: Robot) -> bool:
-    """Whether the robot's wheels skid in turns; a robot with casters turns by its geometry (separation multiplier 1 in its file)."""
-    model = DiffDrive.from_robot(robot)
-    multiplier = float(model.nominal[model.param_names.index("wheel_separation_multiplier")])
-    return robot.arms is not None or abs(multiplier - 1.0) > _CASTER_TOLERANCE
+    """Whether the robot's wheels skid in turns; a robot with casters turns by its geometry."""
+    return robot.drive != DIFF_DRIVE
 
 
 def default_model(robot: Robot) -> str:

@@ -23,12 +23,12 @@ from scipy import stats
 from localization.calibration.windows import driven
 from localization.diagnosis.causes import CAUSES, Cause, Hypothesis
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.linearization import Linearization, candidate_causes, is_skid_steer, linearize, make_predictor
+from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor
 from localization.diagnosis.prediction import DrivePredictor
 from motion_models.errors import CalibrationError
 from motion_models.friction import FrictionModel
 from motion_models.registry import make_model
-from motion_models.robot import Robot
+from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
 
 MIN_TURN_RAD = 2.0 * math.pi
@@ -185,8 +185,10 @@ def corrected_hypothesis(found: DrivenWeighing) -> Hypothesis:
 def _check(drive: Drive) -> float:
     """Turning of the wheels [rad]; raises `CalibrationError` where the drive cannot show the CG."""
     robot, name = drive.robot, drive.name
-    if not is_skid_steer(robot):
-        raise CalibrationError(f"robot '{robot.name}' turns on casters (separation multiplier 1 in its file): its CG does not change how.")
+    if robot.drive == DIFF_DRIVE:
+        raise CalibrationError(
+            f"robot '{robot.name}' turns on casters (drive = {DIFF_DRIVE} in its file): how it turns does not show its CG."
+        )
     if drive.is_gyro_reference or drive.motion_reference == "none":
         raise CalibrationError(
             f"{name} has no positions, only headings, and these do not show about which point the robot turns: "

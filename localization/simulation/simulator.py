@@ -197,11 +197,15 @@ class Simulation:
         times = self.time_s + np.linspace(0.0, config.step_s * (len(commands) * steps - 1), len(commands) * steps)
         model = self._controllers[controller]
         nominal = self._masses.nominal_cg(times[:1])[0]
-        wheels = model.wheels(commands, nominal, model.nominal).repeat(steps, axis=0)
-        payload = self._masses.payload_kg, self._masses.payload_distance(float(times[0]))
-        rows = advance(self._state, self._body, config, wheels, self._masses.cg(times, config.step_s), payload, self.world.patches)
+        rows = self._move(times, model.wheels(commands, nominal, model.nominal).repeat(steps, axis=0))
         self._track.append(rows)
         self._check_walls(rows[-1, POSE])
+
+    def _move(self, times: FloatArray, wheels: FloatArray) -> FloatArray:
+        """Records (n, 13) of the vehicle at the ends of steps that begin at ``times`` (n,), with commanded rates ``wheels`` (n, 2)."""
+        config = self.config.vehicle
+        payload = self._masses.payload_kg, self._masses.payload_distance(float(times[0]))
+        return advance(self._state, self._body, config, wheels, self._masses.cg(times, config.step_s), payload, self.world.patches)
 
     @staticmethod
     def _control_steps(duration_s: float) -> int:
