@@ -133,9 +133,8 @@ def _xml(true: TrueRobot, robot: Robot) -> str:
             f'solreffriction="{_FRICTION_TIME_S} 1"/>'
         )
         servos.append(f'<velocity joint="{name}" kv="{_SERVO_GAIN * mass * 9.81 * radius}"/>')
-    load = (
-        f'<body pos="{0.5 * g.wheelbase_m} 0 {height}"><inertial pos="0 0 0" mass="{true.payload_kg}" diaginertia="1e-3 1e-3 1e-3"/></body>'
-    )
+    edge = f"{0.5 * g.wheelbase_m} 0 {height}"
+    load = f'<body pos="{edge}"><inertial pos="0 0 0" mass="{true.payload_kg}" diaginertia="1e-3 1e-3 1e-3"/></body>'
     gravity = f"{-9.81 * math.sin(body.slope)} 0 {-9.81 * math.cos(body.slope)}"
     return f"""
 <mujoco>

@@ -113,7 +113,8 @@ def _line(case: BlindCase) -> str:
     found = "-" if case.found is None else f"{case.found:+.4g}"
     named = ", ".join(case.named) or "nothing"
     mark = " " if case.is_right else "!"
-    return f"{mark} {case.robot:10} {case.route:9} {case.cause or 'nothing':24} {case.size:+8.4g} {found:>8} {case.verdict}: {named} {case.others}"
+    hidden_cause = f"{case.cause or 'nothing':24} {case.size:+8.4g} {found:>8}"
+    return f"{mark} {case.robot:10} {case.route:9} {hidden_cause} {case.verdict}: {named} {case.others or ''}"
 
 
 def main() -> None:
@@ -126,7 +127,9 @@ def main() -> None:
     for case in found:
         print(_line(case))
     right, quiet = sum(c.is_right for c in hidden_cases), sum(c.is_right for c in nulls)
-    print(f"{right} of {len(hidden_cases)} hidden causes named ({100 * right / max(len(hidden_cases), 1):.0f} %), {quiet} of {len(nulls)} nulls quiet")
+    print(
+        f"{right} of {len(hidden_cases)} hidden causes named ({100 * right / max(len(hidden_cases), 1):.0f} %), {quiet} of {len(nulls)} nulls quiet"
+    )
 
 
 if __name__ == "__main__":

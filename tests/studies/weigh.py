@@ -151,13 +151,9 @@ def main() -> None:
     z, sigmas = np.array([c.z for c in found]), np.sqrt([np.diagonal(c.covariance) for c in found])
     inside = np.mean([c.is_inside for c in found])
     held = np.mean(np.abs(z) < 1.96, axis=0)
-    print(
-        f"{len(found)} hidden loads: 95 % ellipses hold {100 * inside:.0f} %, intervals of x {100 * held[0]:.0f} %, of y {100 * held[1]:.0f} %"
-    )
-    print(
-        f"sigma x median {1e3 * np.median(sigmas[:, 0]):.1f}, largest {1e3 * sigmas[:, 0].max():.1f} mm; "
-        f"y median {1e3 * np.median(sigmas[:, 1]):.1f}, largest {1e3 * sigmas[:, 1].max():.1f} mm; rms z {np.sqrt(np.mean(z**2, axis=0)).round(2)}"
-    )
+    print(f"{len(found)} hidden loads: 95 % ellipses hold {100 * inside:.0f} %, intervals of x and y {(100 * held).round()} %")
+    middle, largest, rms = (1e3 * np.median(sigmas, axis=0)).round(1), (1e3 * sigmas.max(axis=0)).round(1), np.sqrt(np.mean(z**2, axis=0))
+    print(f"sigmas of x and y: median {middle} mm, largest {largest} mm; errors over sigmas {rms.round(2)} (RMS)")
     for robot in ROBOTS:
         own = np.array([c.z for c in found if c.robot == robot])
         if len(own):
