@@ -1,6 +1,6 @@
 """Causes: what may differ on robot, floor or sensors. Each has a signature, the change that it makes in the predicted motions.
 
-A `Hypothesis` holds everything that may be otherwise than the robot file says; a cause adds its size to one place of it. The predictor that
+A `Hypothesis` holds everything that may differ from the robot file; a cause adds its size to one place of it. The predictor that
 predicts motions from a hypothesis is in `localization.diagnosis.prediction`.
 """
 
@@ -156,7 +156,7 @@ _RANGE_SCALE_SIGMA, _RANGE_BIAS_SIGMA_M = 0.015, 0.05
 _CAUSES = (
     Cause(
         "wheel_radius_scale",
-        *("1", "all wheels roll farther by this share than the robot file says", 0.02, 0.002, _add_radii(1.0, 1.0)),
+        *("1", "all wheels roll farther by this share than by the robot file", 0.02, 0.002, _add_radii(1.0, 1.0)),
         (f"all wheels roll {{}} farther {_FILE}", f"all wheels roll {{}} less far {_FILE}"),
     ),
     Cause(
@@ -187,12 +187,12 @@ _CAUSES = (
     ),
     Cause(
         "lidar_offset_x",
-        *("m", "the tracked sensor sits farther ahead than its transform says", 0.05, 0.005, _add_item("lidar_offset", 0)),
+        *("m", "the tracked sensor sits farther ahead than by its transform", 0.05, 0.005, _add_item("lidar_offset", 0)),
         (f"the tracked sensor sits {{}} farther ahead {_TRANSFORM}", f"the tracked sensor sits {{}} farther back {_TRANSFORM}"),
     ),
     Cause(
         "lidar_offset_y",
-        *("m", "the tracked sensor sits farther left than its transform says", 0.05, 0.005, _add_item("lidar_offset", 1)),
+        *("m", "the tracked sensor sits farther left than by its transform", 0.05, 0.005, _add_item("lidar_offset", 1)),
         (f"the tracked sensor sits {{}} farther left {_TRANSFORM}", f"the tracked sensor sits {{}} farther right {_TRANSFORM}"),
     ),
     Cause(
@@ -355,7 +355,7 @@ _WINDOW_CAUSES = (
     ),
     Cause(
         "rotation_scale",
-        *("1", "the robot turns farther than the model says by this share, at any speed", 0.1, 0.01, _add_item("rotation_coefficients", 0)),
+        *("1", "the robot turns farther than predicted by this share, at any speed", 0.1, 0.01, _add_item("rotation_coefficients", 0)),
         ("the robot turns {} more than the model predicts, at any speed", "the robot turns {} less than the model predicts, at any speed"),
     ),
     Cause(

@@ -138,9 +138,13 @@ class Trend:
     p_value: float
     over_noise: float
     """Its root mean square over the noise of the component."""
+    instead_of: str = ""
+    """The finding that it explains the drive better than; empty for a trend beside the findings."""
 
     @property
     def text(self) -> str:
+        if self.instead_of:
+            return f"{self.component} follows {self.along} better than {self.instead_of} (t = {self.t:+.1f}, p = {self.p_value:.2g})"
         size = f"{self.over_noise:.2g} times its noise"
         return f"the {self.component} left over follows {self.along} (t = {self.t:+.1f}, p = {self.p_value:.2g}, {size})"
 

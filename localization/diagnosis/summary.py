@@ -10,7 +10,7 @@ import numpy as np
 from localization.diagnosis.causes import CAUSES, MISSING_MESSAGES, WINDOW_CAUSES, Cause
 from localization.diagnosis.drive import MessageLoss, StandstillTurn
 from localization.diagnosis.findings import Component, Diagnosis, Finding
-from localization.diagnosis.noise import Noise
+from localization.diagnosis.linearization import Noise
 from localization.diagnosis.prediction import CHANNELS
 from localization.diagnosis.verdict import MAX_NOISE_OVER_REFERENCE
 from motion_models.se2 import FloatArray

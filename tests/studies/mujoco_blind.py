@@ -127,9 +127,8 @@ def main() -> None:
     for case in found:
         print(_line(case))
     right, quiet = sum(c.is_right for c in hidden_cases), sum(c.is_right for c in nulls)
-    print(
-        f"{right} of {len(hidden_cases)} hidden causes named ({100 * right / max(len(hidden_cases), 1):.0f} %), {quiet} of {len(nulls)} nulls quiet"
-    )
+    share = 100 * right / max(len(hidden_cases), 1)
+    print(f"{right} of {len(hidden_cases)} hidden causes named ({share:.0f} %), {quiet} of {len(nulls)} nulls quiet")
 
 
 if __name__ == "__main__":
