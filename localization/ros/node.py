@@ -17,6 +17,7 @@ from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import fingerprints, read_head
 from localization.ros.diagnostics import ERROR, WARN, Health, Status
 from localization.ros.discovery import DiscoveredTopics, TopicDiscovery
+from localization.ros.doctor import Doctor
 from localization.ros.jit_warm_up import warm_up
 from localization.ros.live_stream import LiveStream, WheelAngles, check_age
 from localization.ros.operator_commands import OperatorCommands
@@ -112,6 +113,7 @@ class Node:
         name = f"{self._trial.model.name}_{self._trial.estimator}"
         self.session = Session.start(self._run.files, state, name, self._made, {"tally": self._tally}, self._report)
         self.session.health = Health(config.max_latency_s)
+        self._doctor = Doctor(self._run.robot, self._trial.model.name, mounts, 60.0 * config.diagnose_every_min)
         with ExitStack() as failing:
             failing.callback(self.session.close)
             if view is not None:
@@ -160,6 +162,7 @@ class Node:
 
     def finish(self) -> int | None:
         """Write the output and the last state; returns how many estimates there were, if an output was wanted."""
+        self._doctor.close()
         try:
             return self.session.write_output()
         finally:
@@ -234,6 +237,7 @@ class Node:
         if (is_predictable or estimates) and self._transport.now_ns() - received.received_ns < _MAX_PREDICTED_AGE_NS:
             self._publish_prediction()
         self.session.observe(event)
+        self._doctor.observe(event)
         self._check_frames()
         return bool(estimates)
 
@@ -244,6 +248,7 @@ class Node:
         if not pipeline.add_mounts(mounts):
             return
         self._made.update(fingerprints(mounts=pipeline.mounts))
+        self._doctor.add_mounts(pipeline.mounts)
         if was_missing and pipeline.synchronizer.frames.lack is None:
             self._report("/tf_static now has the mount of the LiDAR: its scans are placed by that from here on.")
         if self.session.view is not None:
@@ -282,6 +287,7 @@ class Node:
         self.statuses = health.statuses(self.session.pipeline, self._stream.dropped(), silent, self.session.troubles)
         problems = [problem for problem in (self._conflicts.current(), self._transforms.problem) if problem is not None]
         self.statuses.append(Status("transforms", ERROR, " ".join(problems)) if problems else Status("transforms"))
+        self.statuses += self._doctor.statuses()
         if self.is_paused:
             self.statuses.append(Status("pause", WARN, "paused: no messages are used. Call ~/pause with data: false to continue."))
         stamp_ns = self._stream.sender_stamp_ns(self._newest_ns, by_lidar=True)
