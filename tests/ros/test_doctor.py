@@ -13,12 +13,15 @@ from localization.events import Scan, WheelSample
 from localization.logs import open_log
 from localization.ros.diagnostics import OK, WARN, Status
 from localization.ros.doctor import Doctor, Request, diagnose_events
+from localization.ros.publisher import DIAGNOSTICS, ODOMETRY
+from localization.ros.settings import NodeConfig
+from localization.ros.topic_names import Names
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from motion_models.robot import load_robot
 from tests.helpers.diagnosis_drives import drive
-from tests.helpers.online import ROBOT
+from tests.helpers.online import ROBOT, LogTransport, drive_log, published, run_node
 
 
 def _echo(connection: Connection, request: Request) -> None:
@@ -97,3 +100,21 @@ def test_doctor_short_drive_reports_why() -> None:
     assert [s.level for s in doctor.statuses()] == [OK]
     status = diagnose_events(_wheels(50), Request(ROBOT, "friction", {}))
     assert status.level == OK
+
+
+def test_node_with_doctor_publishes_the_same_estimates(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("localization.ros.doctor._MIN_SPAN_S", 2.0)
+    transports = []
+    for minutes in (0.0, 1e-6):
+        transports.append(LogTransport(drive_log(), lambda messages: messages[: len(messages) // 2]))
+        node, _ = run_node(transports[-1], config=NodeConfig(wait_s=0.0, predict=False, diagnose_every_min=minutes))
+        node._publish_status()
+        assert node._doctor.is_running == (minutes > 0.0)
+        node.finish()
+        assert not node._doctor.is_running
+    plain, watched = transports
+    topic = Names().resolve(ODOMETRY)
+    assert len(plain.published[topic]) > 50
+    assert plain.published[topic] == watched.published[topic]
+    names = [{s.name.rpartition("/")[2].rpartition(" ")[2] for s in m.status} for m in (published(t, DIAGNOSTICS)[-1] for t in transports)]
+    assert names[1] - names[0] == {"diagnosis"}
