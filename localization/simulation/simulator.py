@@ -12,12 +12,22 @@ import numpy as np
 from localization.errors import SimulationError
 from localization.logs.message_templates import Message, text
 from localization.logs.writer import write_bag
-from localization.simulation.drives import MoveArms, OpenLoop, Phase, PickUp, Pursuit, Rest, Route, turn_command
-from localization.simulation.experiments import Experiment, ExperimentConfig, find_experiment
+from localization.simulation.experiments import (
+    Experiment,
+    ExperimentConfig,
+    MoveArms,
+    OpenLoop,
+    Phase,
+    PickUp,
+    Pursuit,
+    Rest,
+    Route,
+    find_experiment,
+    turn_command,
+)
 from localization.simulation.faults import TrueRobot, apply_faults
 from localization.simulation.sensors import START_NS, SensorConfig, make_sensors, nominal_mounts, transforms
-from localization.simulation.track import RUN_HZ, RunRecord, TrueMotion
-from localization.simulation.vehicle import CG, COLUMNS, POSE, Body, MassDistribution, VehicleConfig, VehicleState, advance
+from localization.simulation.vehicle import CG, COLUMNS, POSE, Body, MassDistribution, TrueMotion, VehicleConfig, VehicleState, advance
 from localization.simulation.world import clearance
 from motion_models.center_of_gravity.parts import require_support
 from motion_models.errors import CgError
@@ -32,6 +42,32 @@ _STEERING_PERIOD_S = 0.1
 _FLUSH_S = 2.0
 _KEEP_S = 1.0
 _SETTLE_S = 1.0
+
+
+RUN_HZ = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class RunRecord:
+    """True motion of one named phase, 20 times a second from the body's rest before it to its rest after it."""
+
+    name: str
+    start_s: float
+    """[s] since the simulation's beginning."""
+    poses: FloatArray
+    """(n, 3) of the body in the world."""
+    wheel_angles: FloatArray
+    """(n, 2) left and right, exact [rad]."""
+    cg: FloatArray
+    """(n, 2) true CG [m]."""
+    nominal_cg: FloatArray
+    """(2,) as the robot has it [m]."""
+    command: OpenLoop | Route
+
+    @property
+    def times_s(self) -> FloatArray:
+        """(n,) since the start of the run."""
+        return np.asarray(np.arange(len(self.poses)) / RUN_HZ)
 
 
 @dataclass(frozen=True)

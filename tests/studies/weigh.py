@@ -22,8 +22,7 @@ from scipy.optimize import least_squares
 from localization.diagnosis.drive import drive_of_log
 from localization.diagnosis.weigh import PRIOR_SIGMAS, DrivenWeighing, weigh
 from localization.logs import open_log
-from localization.simulation.drives import OpenLoop, Phase, Rest, constant
-from localization.simulation.experiments import Experiment, ExperimentConfig
+from localization.simulation.experiments import Experiment, ExperimentConfig, OpenLoop, Phase, Rest, constant
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
