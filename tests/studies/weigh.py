@@ -124,17 +124,18 @@ def cases(count: int, record: Path | None = None) -> list[Case]:
     return [done[seed] for seed in range(count)]
 
 
-def left_out_cgs() -> FloatArray:
-    """(68, 2) errors [m] of the CG of each rotation of the thesis, by how it turned and the friction model fitted to the other 67."""
+def left_out_cgs(every: int = 1) -> FloatArray:
+    """(68, 2) errors [m] of the CG of each (or each ``every``-th) rotation of the thesis, by how it turned and the friction model fitted
+    to the other 67."""
     table, seen = grid(), friction_grid.measured(grid())
-    errors = np.zeros((len(seen), 2))
-    for i in range(len(seen)):
+    errors = []
+    for i in range(0, len(seen), every):
         others = np.arange(len(seen)) != i
         params = friction_grid.fit(friction_grid.FITTED, table.cg[others], seen[others]).params
         scatter = (friction_grid.predict(table.cg[others], params)[0] - seen[others]).std(axis=0)
         found = least_squares(_misfit, np.zeros(2), args=(seen[i], params, scatter), bounds=(-0.2, 0.2))
-        errors[i] = found.x - table.cg[i]
-    return errors
+        errors.append(found.x - table.cg[i])
+    return np.array(errors)
 
 
 def _misfit(cg: FloatArray, seen: FloatArray, params: FloatArray, scatter: FloatArray) -> FloatArray:
