@@ -26,8 +26,10 @@ _ARMATURE = 30.0
 """Inertia of a motor behind its gears, over the wheel's mass times its radius squared."""
 _SERVO_GAIN = 20.0
 """Torque of a wheel's servo per rad/s of error, over m g r."""
-_FRICTION_TIME_S = 0.2
-"""Time in which friction would stop a slip: MuJoCo's tyre compliance. Below it wheels hop, as its cones couple slip to the normal force."""
+_CONTACT = 'solref="0.01 1" solimp="0.05 0.05 0.001" solreffriction="0.016 1"'
+"""Soft contacts that stop a slip within 5 to 9 ms. Twice as stiff, wheels hop: MuJoCo's cones couple slip to the normal force."""
+_FLATTENING = 0.0034
+"""How much smaller the rolling radius is than the geometry's, by the contacts' depth: measured, the same for all robots to 0.0001."""
 _WHEELS = (("fl", 1.0, 1.0), ("fr", 1.0, -1.0), ("rl", -1.0, 1.0), ("rr", -1.0, -1.0))
 _PHYSICAL = frozenset(
     {"wheel_radius_scale", "wheel_radius_difference", "track_width", "payload", "cg_offset_x", "cg_offset_y", "split_friction", "scrub"}
@@ -66,7 +68,7 @@ class MujocoSimulation(Simulation):
     def _move(self, times: FloatArray, wheels: FloatArray) -> FloatArray:
         config, rows = self.config.vehicle, np.empty((len(wheels), COLUMNS))
         substeps = round(config.step_s / _STEP_S)
-        radii = np.array([self._body.radius_left, self._body.radius_right] * 2)
+        radii = np.array([self._body.radius_left, self._body.radius_right] * 2) * (1.0 + _FLATTENING)
         self._model.geom_size[self._geoms, 0] = self._model.geom_size[self._geoms, 2] = radii
         ramp = config.acceleration_m_s2 / float(radii.mean()) * config.step_s
         for row, target in zip(rows, wheels, strict=True):
@@ -121,7 +123,7 @@ def _xml(true: TrueRobot, robot: Robot) -> str:
     inertia, twisting = body.inertia, mu * body.param("scrub")
     wheels, servos, contacts = [], [], []
     for name, front, left in _WHEELS:
-        own_radius = body.radius_left if left > 0.0 else body.radius_right
+        own_radius = (body.radius_left if left > 0.0 else body.radius_right) * (1.0 + _FLATTENING)
         grip = mu * (1.0 + 0.5 * body.grip_split * left)
         wheels.append(f"""
    <body name="{name}" pos="{front * half_wheelbase} {left * half_track} 0">
@@ -129,8 +131,7 @@ def _xml(true: TrueRobot, robot: Robot) -> str:
     <geom name="{name}" type="ellipsoid" size="{own_radius} {0.25 * radius} {own_radius}" mass="{wheel_mass}" contype="0"/>
    </body>""")
         contacts.append(
-            f'<pair geom1="floor" geom2="{name}" condim="{4 if twisting > 0.0 else 3}" friction="{grip} {grip} {twisting} 0 0" '
-            f'solreffriction="{_FRICTION_TIME_S} 1"/>'
+            f'<pair geom1="floor" geom2="{name}" condim="{4 if twisting > 0.0 else 3}" friction="{grip} {grip} {twisting} 0 0" {_CONTACT}/>'
         )
         servos.append(f'<velocity joint="{name}" kv="{_SERVO_GAIN * mass * 9.81 * radius}"/>')
     edge = f"{0.5 * g.wheelbase_m} 0 {height}"
