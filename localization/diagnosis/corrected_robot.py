@@ -14,6 +14,7 @@ from localization.diagnosis.linearization import Linearization, make_regression
 from localization.diagnosis.prediction import CHANNELS, DrivePredictor, with_sizes
 from motion_models.base import MotionModel
 from motion_models.center_of_gravity.parts import Arms
+from motion_models.errors import CgError, ModelError
 from motion_models.friction import FrictionModel
 from motion_models.friction.contact import SATURATION
 from motion_models.registry import MODELS, make_model
@@ -244,8 +245,13 @@ def _matched(
     size = np.maximum(np.abs(params), 0.05)
     scale = float(np.sqrt(np.mean(wanted**2))) or 1.0
     anchor = np.eye(len(params)) * _ANCHOR_WEIGHT * scale * np.sqrt(len(rows)) * _TWIST**0.5
+    valid = params
     for _ in range(_ROUNDS):
-        twist = model.twist(rates, cg + shift, params)
+        try:
+            twist = model.twist(rates, cg + shift, params)
+        except (CgError, ModelError):  # no coefficients that a robot can have give such twists
+            return dict(zip(model.param_names, (float(v) for v in valid), strict=True))
+        valid = params
         off = ((wanted - twist.value) * weight).ravel()
         slopes = (twist.d_params * weight[:, None]).reshape(-1, len(params)) * size * is_free
         design = np.vstack([slopes, anchor])

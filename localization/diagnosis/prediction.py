@@ -122,6 +122,7 @@ class DrivePredictor:
         self._lost_time = float((self._lost.max(axis=1) * rolls) @ self.batch.dt / max(float(rolls @ self.batch.dt), 1e-9))
         self.headings = self._headings()
         first, lead = self.batch.first, self.batch.lead
+        self._last = self.batch.ends[np.searchsorted(self.batch.owner, np.arange(len(first) - 1), side="right") - 1]
         self._times = np.empty(len(self.batch.dt))
         for w, start in enumerate(self.drive.starts_s):
             inside = slice(first[w], first[w + 1])
@@ -369,7 +370,7 @@ class _HypothesisModel:
             x, y = params[TRACKED[0]], params[TRACKED[1]]
             middle = settled + settled[:, 2:] * np.array([y, -x, 0.0])
             batch = p.batch
-            drive = ManeuverSamples(batch.dt, rates, cg, batch.first, p.headings, np.array(b.slope))
+            drive = ManeuverSamples(batch.dt, rates, cg, batch.first, p._last, p.headings, np.array(b.slope))
             twists = dynamic_twists(p.drive.robot, law, params, drive, middle)
             p._twists[key] = np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
         return p._twists[key]

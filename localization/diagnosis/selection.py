@@ -214,7 +214,7 @@ def aliases_of(predictor: DrivePredictor, linearization: Linearization, chosen: 
     costs = []
     for _, j in found.values():
         sizes, cost = _refined_cost(predictor, linearization, _linear_sizes(linearization, (*others, j)))
-        if cost - best <= tolerance:
+        if cost - best <= tolerance and abs(sizes[causes[j]]) <= causes[j].largest_plausible:
             costs.append((cost, causes[j].id, sizes[causes[j]]))
     return tuple((name, size) for _, name, size in sorted(costs))
 

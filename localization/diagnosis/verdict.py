@@ -103,10 +103,11 @@ def find_trends(
 
 
 def find_better_trends(predictor: DrivePredictor, linearization: Linearization, chosen: tuple[int, ...]) -> tuple[Trend, ...]:
-    """Trends that explain the drive better than one of the causes ``chosen`` does in its place.
+    """Trends that explain the drive better than one of the causes ``chosen`` does in its place, or than all of several.
 
     Where a cause of the catalogue is at work, no shape without a cause fits better but by chance: both are compared by their likelihood
-    ratio against the other causes, beyond what so many trends gain by chance and the accuracy of signatures.
+    ratio against the other causes, beyond what so many trends gain by chance and the accuracy of signatures. In place of several causes a
+    trend is simpler, and is preferred where it fits as well.
     """
     trends, names = _trend_columns(predictor, linearization.linear)
     y = linearization.noise.whiten(linearization.linear).ravel()
@@ -115,16 +116,19 @@ def find_better_trends(predictor: DrivePredictor, linearization: Linearization, 
     n, spreads = len(names), linearization.problem.scale
     problem = regression(y, s, z, np.r_[np.ones(n), spreads], np.r_[np.zeros(n), spreads * linearization.problem.tolerance])
     found = []
-    for i in chosen:
-        others = tuple(n + j for j in chosen if j != i)
-        own = float(statistics(problem, others, [n + i])[0]) ** 2
+    for replaced in ([i] for i in chosen) if len(chosen) < 2 else (*([i] for i in chosen), list(chosen)):
+        others = tuple(n + j for j in chosen if j not in replaced)
+        score, cov = problem.scores(others, [n + i for i in replaced])
+        own = float(score @ np.linalg.solve(cov + 1e-9 * np.eye(len(replaced)), score))
         t = statistics(problem, others, list(range(n)))
         best = int(np.argmax(np.abs(t)))
         lead = float(t[best]) ** 2 - own
-        if lead > max(_LEAD_LOG_ODDS + 2.0 * math.log(n), _LEAD_SHARE * own):
-            p = min(1.0, n * float(chi2.sf(lead, 1)))
+        margin = max(_LEAD_LOG_ODDS + 2.0 * math.log(n), _LEAD_SHARE * own) if len(replaced) == 1 else 0.0
+        if lead > margin:
+            p = min(1.0, n * float(chi2.sf(max(lead, 0.0), 1)))
+            names_replaced = " and ".join(dict.fromkeys(linearization.causes[i].id for i in replaced))
             over = math.sqrt(lead / len(linearization.rows))
-            found.append(Trend(*names[best], float(t[best]), p, over, linearization.causes[i].id))
+            found.append(Trend(*names[best], float(t[best]), p, over, names_replaced))
     return tuple(found)
 
 

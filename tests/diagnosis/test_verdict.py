@@ -20,8 +20,8 @@ def finding(cause: str = "track_width", size: float = 0.03, aliases: tuple[tuple
     return Finding(CAUSES[cause], size, 0.002, 1e-9, aliases, "", GAIN)
 
 
-def trend(over_noise: float) -> Trend:
-    return Trend("yaw", "turning", 10.0, 1e-6, over_noise)
+def trend(over_noise: float, instead_of: str = "") -> Trend:
+    return Trend("yaw", "turning", 10.0, 1e-6, over_noise, instead_of)
 
 
 @pytest.mark.parametrize(
@@ -34,6 +34,7 @@ def trend(over_noise: float) -> Trend:
         ((finding(),), (), (row("attributed"), row("unexplained")), "unexplained"),
         ((finding(),), (trend(0.2),), (row("attributed"),), "explained"),
         ((finding(),), (trend(0.8),), (row("attributed"),), "unexplained"),
+        ((finding(),), (trend(0.2, "track_width"),), (row("attributed"),), "unexplained"),
         ((finding(aliases=(("scrub", 0.02),)),), (), (row("attributed"),), "ambiguous"),
         ((finding(size=0.25),), (), (row("attributed"),), "unexplained"),
     ],
