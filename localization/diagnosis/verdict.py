@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -255,15 +256,22 @@ def _attributed(
     return component.with_status("attributed" if any(a.is_named for a in by.values()) else "within tolerance", tuple(by.values()))
 
 
-def decide(
-    findings: Sequence[Finding], trends: Sequence[Trend], trend_share: float, rows: Sequence[Component], undetectable_share: float
-) -> Verdict:
-    """The verdict that the table shows: unexplained where a significant row or trend is left, or a size is not plausible, else by what was
-    named."""
-    if any(not f.is_plausible for f in findings) or any(t.instead_of for t in trends):
-        return "unexplained"
-    is_left = any(row.status == "unexplained" for row in rows) or any(t.over_noise > _MAX_TREND_OVER_NOISE for t in trends)
-    if is_left or (trends and (not findings or trend_share > _MAX_TREND_SHARE)):
+def mark_trends(rows: Mapping[str, Component], trends: Sequence[Trend], trend_share: float, has_findings: bool) -> dict[str, Component]:
+    """The table, with rows as unexplained that follow a trend which no cause has; ``trend_share`` as `Diagnosis.left_share`.
+
+    Beside findings, trends that are less than the noise are within the accuracy of signatures.
+    """
+    found = dict(rows)
+    for trend in trends:
+        if trend.instead_of or trend.over_noise > _MAX_TREND_OVER_NOISE or not has_findings or trend_share > _MAX_TREND_SHARE:
+            row = found[trend.component]
+            found[trend.component] = dataclasses.replace(row, status="unexplained", trend=row.trend or trend.along)
+    return found
+
+
+def decide(findings: Sequence[Finding], rows: Sequence[Component], undetectable_share: float) -> Verdict:
+    """The verdict that the table shows: unexplained where a row is, or where a size is not plausible, else by what was named."""
+    if any(not f.is_plausible for f in findings) or any(row.status == "unexplained" for row in rows):
         return "unexplained"
     if any(f.aliases for f in findings):
         return "ambiguous"
