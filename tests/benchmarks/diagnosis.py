@@ -3,7 +3,8 @@
 `python -m tests.benchmarks.diagnosis [--cases A:B] [--out FILE.jsonl] [--rivals]` runs cases A to B-1 of 1,500 (default: all) and appends a
 row for each to FILE (default: diagnosis-benchmark.jsonl); cases that FILE has are not run again, so that it can be stopped at any time.
 A case is determined by its number. No robot is exactly as its file: beside what is hidden, geometry, mounts, clocks, floor and gyro of each
-deviate by as much as the diagnosis takes for the accuracy of robot files (`TOLERANCES`), and intervals are to hold the hidden size. Tables come from the rows: `--report` prints them without running anything.
+deviate by as much as the diagnosis takes for the accuracy of robot files (`TOLERANCES`), and intervals are to hold the hidden size.
+Tables come from the rows: `--report` prints them without running anything.
 """
 
 from __future__ import annotations
