@@ -269,10 +269,7 @@ class _HypothesisModel:
             rates = rates * (1.0 + b.wheel_radius_drift * p._times / max(float(p.drive.starts_s[-1]), 1e-9))[:, None]
         if b.encoder_loss:
             rates = rates * (1.0 + b.encoder_loss / max(p._lost_time, 1e-9) * p._lost)
-        key = (*self._rates_key(), "model")
-        if key not in p._twists:
-            p._twists[key] = p.model.twist(rates, cg, params).value
-        value = p._twists[key] + self._floor(rates, cg)
+        value = self._of_model(rates, cg, params) + self._floor(rates, cg)
         if any(b.rotation_coefficients):
             energy = 2.0 * np.maximum(np.sum(rates**2, axis=-1), 1e-12)
             straight = 1.0 - (rates[:, 1] - rates[:, 0]) ** 2 / energy
@@ -291,6 +288,16 @@ class _HypothesisModel:
             value = np.stack([vx * (1.0 - forward * np.abs(wz)), vy + lateral * vx * wz, wz * (1.0 - rotation * np.abs(vx))], axis=-1)
         n, k = len(value), len(params)
         return Twist(np.ascontiguousarray(value), np.zeros((n, 3, 2)), np.zeros((n, 3, 2)), np.zeros((n, 3, k)))
+
+    def _of_model(self, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+        """(N, 3) by the motion model; cached, and without derivatives for the friction model."""
+        model, twists = self._p.model, self._p._twists
+        if isinstance(model, FrictionModel):
+            return self._quasi_static(model, rates, cg, params)
+        key = (*self._rates_key(), "model")
+        if key not in twists:
+            twists[key] = model.twist(rates, cg, params).value
+        return twists[key]
 
     def _floor(self, rates: FloatArray, cg: FloatArray) -> FloatArray:
         """(N, 3) change of the friction model's twists by causes of the floor, and by inertia."""

@@ -89,7 +89,7 @@ def _unit_of(name: str) -> str:
 
 
 def sentence(d: Diagnosis) -> str:
-    """What to do, in one or two sentences: findings that a trend contests or that no robot has are not to be corrected."""
+    """What to do, in one or two sentences: nothing is corrected beside sizes that no robot has, or that a trend contests."""
     contradiction = f" {d.contradictions[0][0].upper()}{d.contradictions[0][1:]}" if d.contradictions else ""
     if d.verdict == "undecidable":
         return f"This drive cannot show what is wrong with {d.model}. {d.next_drive}{contradiction}"
@@ -97,8 +97,9 @@ def sentence(d: Diagnosis) -> str:
         text = f"Nothing beyond tolerances is wrong with {d.model} on this drive that {d.windows} windows could show"
         tolerated = describe_tolerated(d)
         return text + (f"; within tolerance: {', '.join(tolerated)}." if tolerated else ".")
-    contested = {name for t in d.trends for name in t.instead_of.split(" and ")}
-    estimated = [f for f in d.findings if f.cause != MISSING_MESSAGES.id and f.cause not in contested and f.is_plausible]
+    estimated = [f for f in d.findings if f.cause != MISSING_MESSAGES.id]
+    if any(t.instead_of for t in d.trends) or not all(f.is_plausible for f in estimated):
+        estimated = []
     missing = [f"{f.description} ({f.evidence})" for f in d.findings if f.cause == MISSING_MESSAGES.id]
     parts = [f"{part[0].upper()}{part[1:]}" for part in ([_correction(d, estimated)] if estimated else []) + missing]
     left = _left(d) if d.verdict == "unexplained" else ""
@@ -125,9 +126,9 @@ def _left(d: Diagnosis) -> str:
     """What no cause accounts for: trends, else rows of the table."""
     if d.trends:
         return d.trends[0].text
-    implausible = [f"{f.cause} {f.size:+.2g} is more than robots have" for f in d.findings if not f.is_plausible]
+    implausible = [f"{f.cause} {f.size:+.2g}" for f in d.findings if not f.is_plausible]
     if implausible:
-        return f"what is named here stands for something else ({'; '.join(implausible)})"
+        return f"{' and '.join(implausible)} would fit, but are more than robots have"
     rows = [
         f"{name} {row.unattributed_rms:.2g} {row.unit}, noise {row.expected_rms:.2g}, {describe_row(row).removeprefix('unexplained: ')}"
         for name, row in d.discrepancy.items()
