@@ -177,7 +177,7 @@ def _manual_steps(robot: Robot, h: Hypothesis, lidar_frame: str) -> list[str]:
             f"move {lidar_frame} by ({x:+.4f} m, {y:+.4f} m, {yaw:+.4f} rad) where /tf_static comes from: a log's "
             "transforms go before [mounts].",
         ),
-        (late, f"stamps are late ({late}): [clock] corrects them; synchronize the clocks or mend the driver, and remove it."),
+        (late, f"stamps are late ({late}): [clock] corrects them; synchronize the clocks or correct the driver, and remove it."),
         (h.wheel_lag_s, f"the body follows the wheels {1e3 * h.wheel_lag_s:.0f} ms late."),
         (h.gyro_bias, f"the gyro's bias is {h.gyro_bias:+.5f} rad/s; let the driver zero it while the robot stands."),
         (h.gyro_scale, f"divide the gyro's rates by {1.0 + h.gyro_scale:.4f} in its driver."),

@@ -48,7 +48,7 @@ class DiagnosisConfig(Settings):
     significance: Probability = 0.01
     """Family-wise probability of naming any cause where there is none."""
     fewest_windows: Count = 8
-    """Fewer measured windows than this decide nothing."""
+    """Least number of measured windows; fewer are undecidable."""
     moments: Count = 9
     """Number of moments at which a change of the floor is tried."""
     seed: Seed = 0

@@ -302,8 +302,8 @@ class _HypothesisModel:
     def _floor(self, rates: FloatArray, cg: FloatArray) -> FloatArray:
         """(N, 3) change of the friction model's twists by causes of the floor, and by inertia."""
         p, b = self._p, self._b
-        is_otherwise = b.friction or any(b.cg) or b.payload_kg or b.friction_change or b.other_contact_law or b.split_friction
-        if not (is_otherwise or any(b.slope) or p.has_inertia):
+        is_changed = b.friction or any(b.cg) or b.payload_kg or b.friction_change or b.other_contact_law or b.split_friction
+        if not (is_changed or any(b.slope) or p.has_inertia):
             return np.zeros((len(rates), 3))
         friction = p._friction
         params = friction.nominal.copy()
