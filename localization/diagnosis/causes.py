@@ -54,6 +54,7 @@ class Hypothesis:
 
 
 _PRIOR_FACTOR = 4.0  # sigma of a size's prior, over the typical size, where no physical limit is given
+_PLAUSIBLE_SIGMAS = 4.0  # of the typical size, or of a physical prior: one robot of 16,000 has more
 _SHOWN_UNITS: Mapping[str, tuple[float, str]] = {"1": (100.0, "%"), "m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg"), "s": (1e3, "ms")}
 """Factor and unit in sentences, by the SI unit of a size."""
 
@@ -97,9 +98,9 @@ class Cause:
 
     @property
     def largest_plausible(self) -> float:
-        """Magnitude beyond which another cause is more likely that is not in the catalogue: five times the typical size, or four sigma of
+        """Magnitude beyond which another cause is more likely that is not in the catalogue: four times the typical size, or four sigma of
         a physical prior; rotations differ from the geometry's by up to all of it on skid-steer robots."""
-        return 1.0 if self.id == "rotation_scale" else min(5.0 * self.typical, 4.0 * self.prior_sigma or math.inf)
+        return 1.0 if self.id == "rotation_scale" else _PLAUSIBLE_SIGMAS * (self.prior_sigma or self.typical)
 
     def describe(self, size: float, sigma: float = 0.0) -> str:
         """The effect of ``size`` in words, with its direction, and with its ``sigma`` where that is given.

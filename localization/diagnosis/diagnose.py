@@ -18,7 +18,15 @@ from localization.diagnosis.prediction import DrivePredictor, with_sizes
 from localization.diagnosis.recommendations import general_advice, separating_drive
 from localization.diagnosis.selection import aliases_of, heldout_gain, max_statistic, p_value, refined_cost, search_causes, statistic
 from localization.diagnosis.summary import describe_loss, describe_standstill_turn, evidence, sentence
-from localization.diagnosis.verdict import attribute_rows, decide, find_better_trends, find_outliers, find_trends, tolerated_sizes
+from localization.diagnosis.verdict import (
+    attribute_rows,
+    decide,
+    find_better_trends,
+    find_outliers,
+    find_trends,
+    mark_trends,
+    tolerated_sizes,
+)
 from localization.settings import Count, Probability, Seed, Settings
 from motion_models.base import MotionModel
 from motion_models.se2 import FloatArray
@@ -40,7 +48,7 @@ class DiagnosisConfig(Settings):
     significance: Probability = 0.01
     """Family-wise probability of naming any cause where there is none."""
     fewest_windows: Count = 8
-    """Fewer measured windows than this decide nothing."""
+    """Least number of measured windows; fewer are undecidable."""
     moments: Count = 9
     """Number of moments at which a change of the floor is tried."""
     seed: Seed = 0
@@ -169,7 +177,8 @@ def _conclude(
     trends = (*find_better_trends(predictor, linearization, chosen), *trends)
     detectable = _detectable_sizes(linearization)
     undetectable = [e for e in causes if detectable[e.id] > e.typical]
-    verdict = decide(findings, trends, share, tuple(rows.values()), len(undetectable) / max(len(causes), 1))
+    rows = mark_trends(rows, trends, share, bool(findings))
+    verdict = decide(findings, tuple(rows.values()), len(undetectable) / max(len(causes), 1))
     if findings:
         next_drive = separating_drive(predictor, findings, linearization, chosen)
     else:

@@ -110,6 +110,8 @@ class Component:
     """Noise of the drive over that of the motion reference by its own covariance."""
     status: RowStatus = "noise"
     attributions: tuple[Attribution, ...] = ()
+    trend: str = ""
+    """Along what a part follows that no cause has, where that makes the row unexplained."""
 
     def with_status(self, status: RowStatus, attributions: tuple[Attribution, ...]) -> Component:
         return dataclasses.replace(self, status=status, attributions=attributions)
@@ -125,6 +127,7 @@ class Component:
             "noise_over_reference": self.noise_over_reference,
             "status": self.status,
             "attributions": [a._asdict() for a in self.attributions],
+            "trend": self.trend,
         }
 
 

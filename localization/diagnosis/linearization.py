@@ -369,7 +369,7 @@ def _nuisances(rows: FloatArray) -> FloatArray:
 def _estimate_drive_noise(
     predictor: DrivePredictor, linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, causes: tuple[Cause, ...]
 ) -> Noise:
-    """Estimated from what all causes together leave, in a few rounds as sizes and noise hang on each other."""
+    """Estimated from what all causes together leave, in a few rounds, as sizes and noise depend on each other."""
     batch, drive = predictor.batch, predictor.drive
     g = drive.robot.geometry
     features = variance_regressors(batch, g.wheel_radius_m, g.track_width_m)

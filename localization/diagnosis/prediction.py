@@ -122,6 +122,7 @@ class DrivePredictor:
         self._lost_time = float((self._lost.max(axis=1) * rolls) @ self.batch.dt / max(float(rolls @ self.batch.dt), 1e-9))
         self.headings = self._headings()
         first, lead = self.batch.first, self.batch.lead
+        self._last = self.batch.ends[np.searchsorted(self.batch.owner, np.arange(len(first) - 1), side="right") - 1]
         self._times = np.empty(len(self.batch.dt))
         for w, start in enumerate(self.drive.starts_s):
             inside = slice(first[w], first[w + 1])
@@ -268,10 +269,7 @@ class _HypothesisModel:
             rates = rates * (1.0 + b.wheel_radius_drift * p._times / max(float(p.drive.starts_s[-1]), 1e-9))[:, None]
         if b.encoder_loss:
             rates = rates * (1.0 + b.encoder_loss / max(p._lost_time, 1e-9) * p._lost)
-        key = (*self._rates_key(), "model")
-        if key not in p._twists:
-            p._twists[key] = p.model.twist(rates, cg, params).value
-        value = p._twists[key] + self._floor(rates, cg)
+        value = self._of_model(rates, cg, params) + self._floor(rates, cg)
         if any(b.rotation_coefficients):
             energy = 2.0 * np.maximum(np.sum(rates**2, axis=-1), 1e-12)
             straight = 1.0 - (rates[:, 1] - rates[:, 0]) ** 2 / energy
@@ -291,11 +289,21 @@ class _HypothesisModel:
         n, k = len(value), len(params)
         return Twist(np.ascontiguousarray(value), np.zeros((n, 3, 2)), np.zeros((n, 3, 2)), np.zeros((n, 3, k)))
 
+    def _of_model(self, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+        """(N, 3) by the motion model; cached, and without derivatives for the friction model."""
+        model, twists = self._p.model, self._p._twists
+        if isinstance(model, FrictionModel):
+            return self._quasi_static(model, rates, cg, params)
+        key = (*self._rates_key(), "model")
+        if key not in twists:
+            twists[key] = model.twist(rates, cg, params).value
+        return twists[key]
+
     def _floor(self, rates: FloatArray, cg: FloatArray) -> FloatArray:
         """(N, 3) change of the friction model's twists by causes of the floor, and by inertia."""
         p, b = self._p, self._b
-        is_otherwise = b.friction or any(b.cg) or b.payload_kg or b.friction_change or b.other_contact_law or b.split_friction
-        if not (is_otherwise or any(b.slope) or p.has_inertia):
+        is_changed = b.friction or any(b.cg) or b.payload_kg or b.friction_change or b.other_contact_law or b.split_friction
+        if not (is_changed or any(b.slope) or p.has_inertia):
             return np.zeros((len(rates), 3))
         friction = p._friction
         params = friction.nominal.copy()
@@ -369,7 +377,7 @@ class _HypothesisModel:
             x, y = params[TRACKED[0]], params[TRACKED[1]]
             middle = settled + settled[:, 2:] * np.array([y, -x, 0.0])
             batch = p.batch
-            drive = ManeuverSamples(batch.dt, rates, cg, batch.first, p.headings, np.array(b.slope))
+            drive = ManeuverSamples(batch.dt, rates, cg, batch.first, p._last, p.headings, np.array(b.slope))
             twists = dynamic_twists(p.drive.robot, law, params, drive, middle)
             p._twists[key] = np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
         return p._twists[key]

@@ -145,7 +145,7 @@ def heldout_squares(
 _MIN_ALIAS_CORRELATION = 0.7  # signatures that correlate less than this are no aliases, however short the drive
 _ALIAS_LOG_ODDS = 7.0  # twice the log-likelihood by which a rival may be worse: odds of 1 to 33
 _ALIAS_SHARE = 0.02  # or this share of what the cause explains: accuracy of the model
-_REFINED_SETS = 2  # sets of each number of causes that are tried for real
+_REFINED_SETS = 2  # sets of each number of causes that are tried by full prediction
 _MAX_MISSING_SHARE = 0.1  # share of what signatures promise that may be missing
 _FEW_CAUSES, _EXTRA_SETS = 2, 4  # then so many sets of up to so many causes are tried by full prediction
 _NEAR_LOG_EVIDENCE = 30.0
@@ -214,7 +214,7 @@ def aliases_of(predictor: DrivePredictor, linearization: Linearization, chosen: 
     costs = []
     for _, j in found.values():
         sizes, cost = _refined_cost(predictor, linearization, _linear_sizes(linearization, (*others, j)))
-        if cost - best <= tolerance:
+        if cost - best <= tolerance and abs(sizes[causes[j]]) <= causes[j].largest_plausible:
             costs.append((cost, causes[j].id, sizes[causes[j]]))
     return tuple((name, size) for _, name, size in sorted(costs))
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,10 +104,11 @@ def find_trends(
 
 
 def find_better_trends(predictor: DrivePredictor, linearization: Linearization, chosen: tuple[int, ...]) -> tuple[Trend, ...]:
-    """Trends that explain the drive better than one of the causes ``chosen`` does in its place.
+    """Trends that explain the drive better than one of the causes ``chosen`` does in its place, or than all of several.
 
     Where a cause of the catalogue is at work, no shape without a cause fits better but by chance: both are compared by their likelihood
-    ratio against the other causes, beyond what so many trends gain by chance and the accuracy of signatures.
+    ratio against the other causes, beyond what so many trends gain by chance and the accuracy of signatures. In place of several causes a
+    trend is simpler, and is preferred where it fits as well.
     """
     trends, names = _trend_columns(predictor, linearization.linear)
     y = linearization.noise.whiten(linearization.linear).ravel()
@@ -115,16 +117,19 @@ def find_better_trends(predictor: DrivePredictor, linearization: Linearization, 
     n, spreads = len(names), linearization.problem.scale
     problem = regression(y, s, z, np.r_[np.ones(n), spreads], np.r_[np.zeros(n), spreads * linearization.problem.tolerance])
     found = []
-    for i in chosen:
-        others = tuple(n + j for j in chosen if j != i)
-        own = float(statistics(problem, others, [n + i])[0]) ** 2
+    for replaced in ([i] for i in chosen) if len(chosen) < 2 else (*([i] for i in chosen), list(chosen)):
+        others = tuple(n + j for j in chosen if j not in replaced)
+        score, cov = problem.scores(others, [n + i for i in replaced])
+        own = float(score @ np.linalg.solve(cov + 1e-9 * np.eye(len(replaced)), score))
         t = statistics(problem, others, list(range(n)))
         best = int(np.argmax(np.abs(t)))
         lead = float(t[best]) ** 2 - own
-        if lead > max(_LEAD_LOG_ODDS + 2.0 * math.log(n), _LEAD_SHARE * own):
-            p = min(1.0, n * float(chi2.sf(lead, 1)))
+        margin = max(_LEAD_LOG_ODDS + 2.0 * math.log(n), _LEAD_SHARE * own) if len(replaced) == 1 else 0.0
+        if lead > margin:
+            p = min(1.0, n * float(chi2.sf(max(lead, 0.0), 1)))
+            names_replaced = " and ".join(dict.fromkeys(linearization.causes[i].id for i in replaced))
             over = math.sqrt(lead / len(linearization.rows))
-            found.append(Trend(*names[best], float(t[best]), p, over, linearization.causes[i].id))
+            found.append(Trend(*names[best], float(t[best]), p, over, names_replaced))
     return tuple(found)
 
 
@@ -155,7 +160,7 @@ MAX_LEFT_OVER_NOISE = 1.5
 """Root mean square that may be left of a row, over its noise: at 1.5 what has no cause is as large as the noise (1.5^2 = 1 + 1.1^2)."""
 MAX_NOISE_OVER_REFERENCE = 3.0
 """Noise of the drive, over that of the motion reference by its own covariance: up to 1.5 where nothing is hidden, 3.1 to 200 for effects
-that no cause has (`tests.helpers.diagnosis_unknown`)."""
+that no cause has (`tests.studies.unknown_effects --develop`)."""
 _MODEL_ACCURACY = 0.05  # of a row: what the signature of a named cause may be off, as at a slope of 0.05 rad (3 %)
 _MAX_TREND_OVER_NOISE = 0.5  # a trend of half the noise adds 12 % to the root mean square of a row
 _MIN_ATTRIBUTED_SHARE = 0.1  # of a row's squares, for a cause to be listed beside it
@@ -251,15 +256,22 @@ def _attributed(
     return component.with_status("attributed" if any(a.is_named for a in by.values()) else "within tolerance", tuple(by.values()))
 
 
-def decide(
-    findings: Sequence[Finding], trends: Sequence[Trend], trend_share: float, rows: Sequence[Component], undetectable_share: float
-) -> Verdict:
-    """The verdict that the table shows: unexplained where a significant row or trend is left, or a size is not plausible, else by what was
-    named."""
-    if any(not f.is_plausible for f in findings) or any(t.instead_of for t in trends):
-        return "unexplained"
-    is_left = any(row.status == "unexplained" for row in rows) or any(t.over_noise > _MAX_TREND_OVER_NOISE for t in trends)
-    if is_left or (trends and (not findings or trend_share > _MAX_TREND_SHARE)):
+def mark_trends(rows: Mapping[str, Component], trends: Sequence[Trend], trend_share: float, has_findings: bool) -> dict[str, Component]:
+    """The table, with rows as unexplained that follow a trend which no cause has; ``trend_share`` as `Diagnosis.left_share`.
+
+    Beside findings, trends that are less than the noise are within the accuracy of signatures.
+    """
+    found = dict(rows)
+    for trend in trends:
+        if trend.instead_of or trend.over_noise > _MAX_TREND_OVER_NOISE or not has_findings or trend_share > _MAX_TREND_SHARE:
+            row = found[trend.component]
+            found[trend.component] = dataclasses.replace(row, status="unexplained", trend=row.trend or trend.along)
+    return found
+
+
+def decide(findings: Sequence[Finding], rows: Sequence[Component], undetectable_share: float) -> Verdict:
+    """The verdict that the table shows: unexplained where a row is, or where a size is not plausible, else by what was named."""
+    if any(not f.is_plausible for f in findings) or any(row.status == "unexplained" for row in rows):
         return "unexplained"
     if any(f.aliases for f in findings):
         return "ambiguous"

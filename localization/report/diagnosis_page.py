@@ -88,7 +88,8 @@ def _components(d: Diagnosis) -> list[Block]:
     rows = []
     for name, c in d.discrepancy.items():
         numbers = (f"{c.rms:.4g}", f"{c.expected_rms:.4g}", f"{c.unattributed_rms:.4g}", f"{c.p_value:.2g}")
-        rows.append([Cell(text) for text in (name, c.unit, *numbers, describe_row(c))])
+        status = Cell(c.status, describe_row(c).removeprefix(c.status).strip(": "))
+        rows.append([*(Cell(text) for text in (name, c.unit, *numbers)), status])
     return [Table([Cell(title) for title in ("Component", "Unit", "RMS", "Noise", "Left", "p", "Attributed to")], rows)]
 
 

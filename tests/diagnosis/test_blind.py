@@ -35,7 +35,7 @@ def test_diagnose_hidden_cause_is_named_with_its_size(diagnosed: Diagnosed, caus
     first = found.findings[0]
     named = {first.cause: first.size, **dict(first.aliases)}
     assert cause in named
-    # to a fifth, as a spell of silence is not exactly as long as its share says, or else within what the diagnosis itself claims
+    # to a fifth, as the lost share of a drive scatters about the nominal one, or within three of its own sigmas
     assert abs(named[cause] - size) < max(0.2 * abs(size), 3.0 * first.sigma)
     assert first.gain.relative > 0.05
     assert found.gain is not None

@@ -107,5 +107,3 @@ VERIFYING: Mapping[str, Callable[[Drive], Drive]] = {
     "turns slip from time to time": _by_wheels(lambda m, h, t: (m, h * (1.0 + 0.12 * np.sin(6.0 * math.pi * t)))),
 }
 """Effects that no threshold of the diagnosis was chosen on."""
-INSEPARABLE = frozenset({"slip with the square of speed"})
-"""Those that a drive at two speeds shows as a wheel radius, 8 % off."""
