@@ -49,6 +49,8 @@ class SearchResult:
     """Mean likelihood of the points, 0 to 1."""
     rival_score: float
     """The best score of a pose elsewhere."""
+    margin: float
+    """Logarithm of the ratio of both poses' likelihoods."""
 
 
 def draw_image(points: FloatArray, cell: float) -> LikelihoodImage:
@@ -105,7 +107,8 @@ def _pick(prior: FloatArray, shifts: FloatArray, scores: FloatArray, n: int, inf
     away = shifts - shifts[best]
     is_elsewhere = (np.hypot(away[:, 0], away[:, 1]) > _APART_CELLS * step[0]) | (np.abs(away[:, 2]) > _APART_CELLS * step[2])
     rival = float(scores[is_elsewhere].max()) if is_elsewhere.any() else 0.0
-    return SearchResult(prior + shifts[best], float(scores[best]), rival)
+    margin = n / CORRELATED_BEAMS * math.log(max(float(scores[best]), 1e-6) / max(rival, 1e-6))
+    return SearchResult(prior + shifts[best], float(scores[best]), rival, margin)
 
 
 def _to_world(yaw: float, cov: FloatArray) -> FloatArray:

@@ -179,7 +179,8 @@ class ScanMatcher:
             if not is_near and _mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:
                 outlier_cov = nothing
             found = self._align(points, prior, cov + outlier_cov, best)
-            if found.overlap >= self._config.lost_below and (not is_near or _is_better(found, fit, prior, cov)):
+            least = self._config.lost_below if is_near else self._config.search_below
+            if found.overlap >= least and (not is_near or _is_better(found, fit, prior, cov)):
                 return self._result(found, outlier_cov)
         return self._result(fit, nothing) if is_near and fit.overlap >= self._config.lost_below else None
 
@@ -255,7 +256,8 @@ class ScanMatcher:
             self._image = draw_image(self.points(), self.cell)
         limit = np.minimum(np.maximum(_SEARCH_LIMIT, 3.0 * np.sqrt(np.diagonal(cov))), _WIDEST_SEARCH)
         best = search(self._image, voxel_means(points, self.cell), prior, wide, limit)
-        return None if best.rival_score >= _MAX_RIVAL * best.score else best.pose
+        is_clear = best.margin >= _OUTLIER_COST if not _is_narrow(cov) else best.rival_score < _MAX_RIVAL * best.score
+        return best.pose if is_clear else None
 
     def _result(self, fit: Fit, outlier_cov: FloatArray) -> ScanMatch:
         """What the scan alone says: one more Gauss-Newton step from the minimum, without the prior's pull."""

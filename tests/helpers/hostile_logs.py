@@ -12,6 +12,7 @@ import multiprocessing
 import queue
 import re
 import resource
+import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterable
@@ -30,20 +31,14 @@ from motion_models.robot import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import Record, S
 from tests.helpers.rooms import drive
+from tests.helpers.sensor_faults import SENSOR_FAULTS
 
 DATA = Path(__file__).parents[1] / "data"
 DRIVE_S = 12.0
-_SCAN_EVERY = 3
-"""Of the drives' scans (10 to 12 a second), to keep three hundred replays short."""
 FAR_M, MOST_SIGMA = 1.0, 5.0
 """An end error beyond either, without a warning, is silently wrong."""
 _MOST_SECONDS = 120.0
 _MOST_BYTES = 4 << 30  # of address space: numba, gtsam and the log itself take 2 GB of it, and a fault may take 2 GB more
-
-_SCORED = ("/ground_truth/odom", "/fix")
-"""Topics that no fault changes."""
-
-Mutation = Callable[[list[Record], np.random.Generator], list[Record]]
 
 
 class Source(NamedTuple):
@@ -53,7 +48,9 @@ class Source(NamedTuple):
     robot: str
     records: Callable[[], list[Record]]
     reference: str
-    """Topic."""
+    """Topic; empty for the estimate without a fault."""
+    scan_every: int
+    """One scan of so many is used, to keep three hundred replays short."""
 
 
 @functools.cache
@@ -113,138 +110,33 @@ def _husky() -> list[Record]:
     return _recorded(path, "husky_a200", 20.0, topics)
 
 
+@functools.cache
+def _laps() -> list[Record]:
+    """Simulated laps with wheels, gyro, LiDAR and the truth."""
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "laps.mcap"
+        with contextlib.redirect_stdout(io.StringIO()):
+            assert main(["simulate", "laps", "--out", str(log)]) == 0
+        topics = [channel.topic for channel in open_source(log).channels]
+        return _recorded(log, "vaultbot", 20.0, topics)
+
+
+def _building(folder: str, name: str, begin_s: float) -> Callable[[], list[Record]]:
+    def records() -> list[Record]:
+        place = DATA / folder
+        return _recorded(place / f"{name}.mcap", str(place / f"{name}.toml"), begin_s, ("/odom", "/scan", "/tf_static", "/reference/pose"))
+
+    return functools.cache(records)
+
+
 SOURCES = (
-    Source("room", "vaultbot", _room, "/ground_truth/odom"),
-    Source("aces", "aces", _aces, ""),
-    Source("husky", "husky_a200", _husky, ""),
+    Source("room", "vaultbot", _room, "/ground_truth/odom", 3),
+    Source("aces", "aces", _aces, "", 3),
+    Source("husky", "husky_a200", _husky, "", 3),
+    Source("laps", "vaultbot", _laps, "/ground_truth/odom", 3),
+    Source("fr079", str(DATA / "fr079" / "fr079.toml"), _building("fr079", "fr079", 60.0), "", 1),
+    Source("csail", str(DATA / "mit-csail" / "csail.toml"), _building("mit-csail", "csail", 60.0), "", 1),
 )
-
-
-# Faults of sensors. Each takes the records of a drive and gives them back spoiled; messages are copies.
-
-
-def _each(kinds: tuple[str, ...], change: Callable[[Any, float], Any]) -> Mutation:
-    """``change`` for each message of ``kinds`` with its part of the drive (0 to 1); None drops it."""
-
-    def mutate(records: list[Record], rng: np.random.Generator) -> list[Record]:
-        begin, end = records[0][2], records[-1][2]
-        found = []
-        for topic, message, stamp in records:
-            if message.__msgtype__.rsplit("/", 1)[1] in kinds and topic not in _SCORED:
-                message = change(message, (stamp - begin) / max(end - begin, 1))
-            if message is not None:
-                found.append((topic, message, stamp))
-        return found
-
-    return mutate
-
-
-def _set(message: Any, **values: Any) -> Any:
-    for name, value in values.items():
-        holder, parts = message, name.split("__")
-        for part in parts[:-1]:
-            holder = getattr(holder, part)
-        setattr(holder, parts[-1], value)
-    return message
-
-
-def _moved(message: Any, seconds: float) -> Any:
-    stamp = message.header.stamp.sec * S + message.header.stamp.nanosec + round(seconds * S)
-    return _set(message, header__stamp__sec=stamp // S, header__stamp__nanosec=stamp % S)
-
-
-def _gyro(message: Any, factor: float) -> Any:
-    w = message.angular_velocity
-    return _set(message, angular_velocity__x=w.x * factor, angular_velocity__y=w.y * factor, angular_velocity__z=w.z * factor)
-
-
-def _stopped(message: Any) -> Any:
-    """Wheels that read as if they stood at the first reading."""
-    if hasattr(message, "position"):
-        return _set(message, position=np.zeros_like(message.position), velocity=np.zeros_like(message.velocity))
-    return _set(
-        message, twist__twist=bags.T["geometry_msgs/msg/Twist"](linear=bags.vector(), angular=bags.vector()), pose__pose=bags.pose()
-    )
-
-
-def _own_beams(message: Any, part: float) -> Any:
-    ranges = message.ranges.copy()
-    ranges[: int(part * len(ranges))] = 0.3
-    return _set(message, ranges=ranges)
-
-
-def _transform(*edges: tuple) -> Mutation:
-    def mutate(records: list[Record], rng: np.random.Generator) -> list[Record]:
-        frame = next((m.header.frame_id for _, m, _ in records if m.__msgtype__.endswith("LaserScan")), "imu_link")
-        first = records[0][2]
-        found = [(p.replace("LASER", frame), c.replace("LASER", frame), where, turn) for p, c, where, turn in edges]
-        return [*(("/tf_static", bags.tf(first, [edge]), first) for edge in found), *records]
-
-    return mutate
-
-
-def _second_publisher(records: list[Record], rng: np.random.Generator) -> list[Record]:
-    zeros = []
-    for topic, message, stamp in records:
-        if message.__msgtype__.endswith("JointState"):
-            later = stamp + 7_000_000
-            n = len(message.name)
-            zeros.append((topic, bags.joint_state(later, message.name, np.zeros(n), np.zeros(n)), later))
-    return sorted([*records, *zeros], key=lambda record: record[2])
-
-
-def _silent(seconds: float) -> Mutation:
-    def mutate(records: list[Record], rng: np.random.Generator) -> list[Record]:
-        begin = records[0][2] + int(rng.uniform(2.0, 3.5) * S)
-        return [r for r in records if r[0] in _SCORED or not begin < r[2] < begin + seconds * S]
-
-    return mutate
-
-
-def _quaternion(norm: float) -> Any:
-    return bags.T["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=norm)
-
-
-_WHEELS, _SCANS, _IMU = ("JointState",), ("LaserScan",), ("Imu",)
-_ALL_WHEELS = (*_WHEELS, "Odometry")
-_LEVEL = bags.quaternion()
-SENSOR_FAULTS: dict[str, Mutation] = {
-    "none": lambda records, rng: records,
-    "all silent 5 s": _silent(5.0),
-    "all silent 8 s": _silent(8.0),
-    "wheels read zero": _each(_ALL_WHEELS, lambda m, at: _stopped(m)),
-    "wheels stop half way": _each(_ALL_WHEELS, lambda m, at: None if at > 0.5 else m),
-    "wheels NaN half way": _each(
-        _WHEELS, lambda m, at: _set(m, position=m.position * np.nan, velocity=m.velocity * np.nan) if at > 0.5 else m
-    ),
-    "one wheel frozen": _each(_WHEELS, lambda m, at: _set(m, position=np.where(np.arange(len(m.position)) == 0, 0.0, m.position))),
-    "second publisher of joint states": _second_publisher,
-    "LiDAR turned 20 deg": _each(_SCANS, lambda m, at: _set(m, angle_min=m.angle_min + math.radians(20.0))),
-    "LiDAR turned 180 deg": _each(_SCANS, lambda m, at: _set(m, angle_min=m.angle_min + math.pi)),
-    "LiDAR upside down": _each(_SCANS, lambda m, at: _set(m, ranges=m.ranges[::-1].copy())),
-    "LiDAR stamps jump 0.9 s": _each(_SCANS, lambda m, at: _moved(m, 0.9) if at > 0.5 else m),
-    "LiDAR stamps jump back 0.9 s": _each(_SCANS, lambda m, at: _moved(m, -0.9) if at > 0.5 else m),
-    "LiDAR stamps jump 100 s": _each(_SCANS, lambda m, at: _moved(m, 100.0) if at > 0.5 else m),
-    "LiDAR angle_increment 0": _each(_SCANS, lambda m, at: _set(m, angle_increment=0.0, angle_max=m.angle_min)),
-    "LiDAR in degrees": _each(
-        _SCANS, lambda m, at: _set(m, angle_min=math.degrees(m.angle_min), angle_increment=math.degrees(m.angle_increment))
-    ),
-    "LiDAR in millimetres": _each(_SCANS, lambda m, at: _set(m, ranges=m.ranges * 1000.0)),
-    "LiDAR frozen half way": _each(_SCANS, lambda m, at: _set(m, ranges=np.full_like(m.ranges, 3.0)) if at > 0.5 else m),
-    "LiDAR only in the last tenth": _each(_SCANS, lambda m, at: m if at > 0.9 else None),
-    "no scan usable": _each(_SCANS, lambda m, at: _set(m, ranges=m.ranges * np.nan)),
-    "30 % of beams on the robot": _each(_SCANS, lambda m, at: _own_beams(m, 0.3)),
-    "gyro in deg/s": _each(_IMU, lambda m, at: _gyro(m, 180.0 / math.pi)),
-    "gyro stuck": _each(_IMU, lambda m, at: _gyro(m, 0.0)),
-    "gyro flipped": _each(_IMU, lambda m, at: _gyro(m, -1.0)),
-    "transform twice": _transform(
-        ("base_link", "LASER", (0.0, 0.0, 0.0), _LEVEL), ("base_link", "LASER", (-0.5, 0.3, 0.0), bags.quaternion(1.0))
-    ),
-    "transform of two parents": _transform(("base_link", "mast", (1.0, 0.0, 0.0), _LEVEL), ("mast", "LASER", (0.5, 0.0, 0.0), _LEVEL)),
-    "transforms in a circle": _transform(("base_link", "mast", (1.0, 0.0, 0.0), _LEVEL), ("mast", "base_link", (1.0, 0.0, 0.0), _LEVEL)),
-    "quaternion of norm 1e-6": _transform(("base_link", "LASER", (0.0, 0.0, 0.0), _quaternion(1e-6))),
-    "quaternion of norm 0": _transform(("base_link", "LASER", (0.0, 0.0, 0.0), _quaternion(0.0))),
-}
 
 
 # Faults of files.
@@ -320,7 +212,7 @@ def copied(source: Source) -> list[Record]:
     found, scans = [], 0
     for topic, message, stamp in source.records():
         scans += message.__msgtype__.endswith("LaserScan")
-        if not message.__msgtype__.endswith("LaserScan") or scans % _SCAN_EVERY == 0:
+        if not message.__msgtype__.endswith("LaserScan") or scans % source.scan_every == 0:
             found.append((topic, _standard(message, message.__msgtype__), stamp))
     return found
 
