@@ -70,19 +70,24 @@ class Weigh:
 
 
 def describe(found: DrivenWeighing, at: tuple[float, float] | None) -> str:
-    """The result in one sentence."""
+    """The result in one sentence.
+
+    >>> offset, cov = np.array([0.036, 0.0004]), np.diag([0.001, 0.003]) ** 2
+    >>> describe(DrivenWeighing("a.bag", "husky_a200", "scans", 28, 49.0, np.zeros(2), offset, cov, 46.0, 1.0, {}), None)
+    'centre of gravity at x = +36 +- 1 mm, y = +0 +- 3 mm: 36 mm farther ahead than in the robot file, as by a load of 1.7 kg m ahead.'
+    """
     (x, y), (sx, sy) = 1e3 * found.position, 1e3 * found.sigmas
-    where = f"centre of gravity at x = {x:+.0f} +- {sx:.0f} mm, y = {y:+.0f} +- {sy:.0f} mm"
-    if found.p_value > _SIGNIFICANCE:
+    where = f"centre of gravity at x = {round(x):+d} +- {sx:.0f} mm, y = {round(y):+d} +- {sy:.0f} mm"
+    is_shown = np.abs(found.offset) > _TWO_SIDED_95 * found.sigmas
+    if found.p_value > _SIGNIFICANCE or not is_shown.any():
         least = _TWO_SIDED_95 * found.mass_kg * found.sigmas.max()
-        return f"{where}: where the robot file has it, within the interval (a load of {least:.1f} kg m would show)."
-    (dx, dy), (mx, my) = 1e3 * found.offset, np.abs(found.moment)
-    ahead, left = "ahead" if dx > 0 else "back", "left" if dy > 0 else "right"
-    load = "" if at is None else " By its place, {:.1f} +- {:.1f} kg.".format(*found.payload(*at))
-    return (
-        f"{where}: {abs(dx):.0f} mm farther {ahead} and {abs(dy):.0f} mm farther {left} than the robot file has it, as a load of "
-        f"{mx:.2g} kg m {ahead} and {my:.2g} kg m to the {left} makes it (mass times distance from this centre of gravity).{load}"
-    )
+        return f"{where}: that of the robot file, within the interval (a load of {least:.1f} kg m would show)."
+    sides = [names[int(offset < 0.0)] for names, offset in zip((("ahead", "back"), ("left", "right")), found.offset, strict=True)]
+    shown = [i for i in range(2) if is_shown[i]]
+    shift = " and ".join(f"{abs(1e3 * found.offset[i]):.0f} mm farther {sides[i]}" for i in shown)
+    load = " and ".join(f"{abs(found.moment[i]):.2g} kg m {sides[i]}" for i in shown)
+    mass = "" if at is None else " At the given place it weighs {:.1f} +- {:.1f} kg.".format(*found.payload(*at))
+    return f"{where}: {shift} than in the robot file, as by a load of {load}.{mass}"
 
 
 def print_weighing(console: Console, found: DrivenWeighing, at: tuple[float, float] | None) -> None:
@@ -100,6 +105,7 @@ def print_weighing(console: Console, found: DrivenWeighing, at: tuple[float, flo
         low, high = value - _TWO_SIDED_95 * sigma, value + _TWO_SIDED_95 * sigma
         table.add_row(name, unit, given, f"{value:+.{digits}f}", f"{sigma:.{digits}f}", f"{low:+.{digits}f} to {high:+.{digits}f}")
     console.print(table)
+    console.print("load moment: mass times distance from this centre of gravity", markup=False, soft_wrap=True)
     about = f"{found.windows} windows, {found.turned_rad:.0f} rad of turning by the wheels, motion by {found.motion_reference}"
     console.print(about, markup=False, soft_wrap=True)
     for note in found.warnings:
