@@ -8,6 +8,7 @@ A cause counts as named where it is the first finding or among its aliases. Need
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import tempfile
 from collections.abc import Mapping
@@ -22,7 +23,7 @@ from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import SimulationConfig, write_simulation
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot import Robot, load_robot
 from tests.helpers.diagnosis_drives import ONE_SIDED, TYPICAL, drive
 from tests.helpers.mujoco_vehicle import EFFECTS, MujocoSimulation
 
@@ -31,6 +32,7 @@ ROUTES = ("tour", "random_4", "random_9")
 _MISSING_SHARE = 0.2
 _PAYLOAD_SHARE = 0.15  # of the robot's mass: 8 kg on a Husky
 _CG_SHARE = {"cg_offset_x": ("wheelbase_m", 0.08), "cg_offset_y": ("track_width_m", 0.06)}
+_SLIP_STIFFNESS = 30.0  # k and vx of healthy robots on tight and gentle arcs: 20 to 40
 _NULL_EVERY = 5  # every fifth case hides nothing
 
 
@@ -76,9 +78,16 @@ def hidden(number: int) -> tuple[str, str, str, float]:
     return robot, route, cause, -size if is_negative else size
 
 
+def mujoco_robot(name: str) -> Robot:
+    """The file of a shipped robot with the stiffness of MuJoCo's contacts, as a healthy drive shows it."""
+    robot = load_robot(name)
+    friction = {**robot.models.get("friction", {}), "slip_stiffness": _SLIP_STIFFNESS}
+    return dataclasses.replace(robot, models={**robot.models, "friction": friction})
+
+
 def diagnose_mujoco(robot_name: str, route: str, effects: Mapping[str, float], seed: int) -> Diagnosis:
     """Simulate in MuJoCo with hidden ``effects``, and diagnose by the bag and the robot file."""
-    robot = load_robot(robot_name)
+    robot = mujoco_robot(robot_name)
     config = SimulationConfig(sensors=SensorConfig(scanner=ScannerConfig(rate_hz=6.25, beams=191)))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.mcap"
