@@ -136,10 +136,13 @@ class Doctor:
         """In a thread: most of the time it waits for the process, and between two events others run."""
         context = multiprocessing.get_context("spawn")
         here, there = context.Pipe()
-        self._process = context.Process(target=self._run, args=(there, self._request), name="skidloc-doctor", daemon=True)
-        self._process.start()
-        there.close()
+        process = context.Process(target=self._run, args=(there, self._request), name="skidloc-doctor", daemon=True)
         try:
+            process.start()
+            there.close()
+            self._process = process
+            if self._period_s <= 0.0:  # closed meanwhile
+                process.terminate()
             for event in events:
                 here.send(event)
             here.send(None)
@@ -148,7 +151,8 @@ class Doctor:
             self._status = Status(_NAME, OK, f"not finished: it took more than {_MAX_CPU_S} s of processor time, or was stopped")
         finally:
             here.close()
-            self._process.join()
+            if process.pid is not None:
+                process.join()
 
 
 def _thinned(scan: Scan) -> Scan:
