@@ -1,6 +1,6 @@
 """Blind diagnoses of drives whose physics are MuJoCo's: a cause is hidden in the robot, and the diagnosis has the bag and the robot file.
 
-python -m tests.studies.mujoco_blind [--cases 64] [--record FILE.jsonl]
+python -m tests.studies.mujoco_blind [--cases 64] [--record FILE.jsonl] [--new 10]
 
 A cause counts as named where it is the first finding or among its aliases. Needs the extra `mujoco`.
 """
@@ -103,19 +103,17 @@ def run_case(number: int) -> BlindCase:
     return BlindCase(number, robot, route, cause, size, found.verdict, tuple(sizes), sizes.get(cause), others)
 
 
-def cases(count: int, record: Path | None = None) -> list[BlindCase]:
-    """The first ``count`` cases; those in ``record`` are taken from there, and new ones are added to it."""
+def cases(count: int, record: Path | None = None, new: int | None = None) -> list[BlindCase]:
+    """The first ``count`` cases; those in ``record`` are taken from there, and at most ``new`` others are run and added to it."""
     rows = record.read_text().splitlines() if record is not None and record.exists() else []
     done = {row["number"]: BlindCase(**{**row, "named": tuple(row["named"])}) for row in map(json.loads, rows)}
-    for number in range(count):
-        if number in done:
-            continue
+    for number in [i for i in range(count) if i not in done][:new]:
         done[number] = case = run_case(number)
         print(_line(case), flush=True)
         if record is not None:
             with record.open("a") as file:
                 file.write(json.dumps(asdict(case)) + "\n")
-    return [done[number] for number in range(count)]
+    return [done[i] for i in range(count) if i in done]
 
 
 def _line(case: BlindCase) -> str:
@@ -130,8 +128,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", type=int, default=64)
     parser.add_argument("--record", type=Path, default=None)
+    parser.add_argument("--new", type=int, default=None, help="at most so many cases that are not in the record")
     given = parser.parse_args()
-    found = cases(given.cases, given.record)
+    found = cases(given.cases, given.record, given.new)
     hidden_cases, nulls = [c for c in found if c.cause], [c for c in found if not c.cause]
     for case in found:
         print(_line(case))

@@ -1,6 +1,6 @@
 """Weighing by driving: hidden loads on simulated robots, and the thesis's 68 rotations with their known centres of gravity.
 
-python -m tests.studies.weigh [--cases 100] [--record FILE.jsonl]
+python -m tests.studies.weigh [--cases 100] [--record FILE.jsonl] [--new 10]
 
 Hidden loads: five robots, each with its CG moved by up to a sixth of wheelbase and track and with what else may differ from a robot file
 drawn from the priors of `localization.diagnosis.weigh`; a minute of turning by the simulator's own tyre dynamics; LiDAR, wheels and gyro go
@@ -106,22 +106,20 @@ def run_case(seed: int) -> Case:
     return Case(name, np.array([effects["cg_offset_x"], effects["cg_offset_y"]]), found.offset, found.covariance)
 
 
-def cases(count: int, record: Path | None = None) -> list[Case]:
-    """The first ``count`` cases; those in ``record`` are taken from there, and new ones are added to it."""
+def cases(count: int, record: Path | None = None, new: int | None = None) -> list[Case]:
+    """The first ``count`` cases; those in ``record`` are taken from there, and at most ``new`` others are run and added to it."""
     done: dict[int, Case] = {}
     if record is not None and record.exists():
         for line in record.read_text().splitlines():
             row = json.loads(line)
             done[row["seed"]] = Case(row["robot"], *(np.array(row[name]) for name in ("truth", "found", "covariance")))
-    for seed in range(count):
-        if seed in done:
-            continue
+    for seed in [i for i in range(count) if i not in done][:new]:
         done[seed] = case = run_case(seed)
         if record is not None:
             row = {"seed": seed, "robot": case.robot, **{n: getattr(case, n).tolist() for n in ("truth", "found", "covariance")}}
             with record.open("a") as file:
                 file.write(json.dumps(row) + "\n")
-    return [done[seed] for seed in range(count)]
+    return [done[i] for i in range(count) if i in done]
 
 
 def left_out_cgs(every: int = 1) -> FloatArray:
@@ -146,8 +144,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", type=int, default=100)
     parser.add_argument("--record", type=Path, default=None)
+    parser.add_argument("--new", type=int, default=None, help="at most so many cases that are not in the record")
     given = parser.parse_args()
-    found = cases(given.cases, given.record)
+    found = cases(given.cases, given.record, given.new)
     z, sigmas = np.array([c.z for c in found]), np.sqrt([np.diagonal(c.covariance) for c in found])
     inside = np.mean([c.is_inside for c in found])
     held = np.mean(np.abs(z) < 1.96, axis=0)
