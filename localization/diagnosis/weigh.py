@@ -50,21 +50,24 @@ PRIOR_SIGMAS: Mapping[str, float] = {
     "gyro_bias": 0.01,
     "gyro_scale": 0.01,
     "friction_anisotropy": 0.2,
-    "scrub": 0.02,
     "diagonal_load": 0.15,
     "tread_asymmetry": 0.02,
     "rolling_resistance": 0.01,
     "split_friction": 0.02,
     "slope": 0.005,
 }
-"""How far robots, floors and mounts differ from their files, as a sigma in the cause's unit: what the weighing must not take for a load."""
+"""How far robots, floors and mounts differ from their files, as a sigma in the cause's unit: what the weighing must not take for a load.
+
+Scrub has the effect of friction_anisotropy (`tests.studies.friction_grid`), and no derivative at its usual value, 0."""
 _SLIP_STIFFNESS_SIGMA = 0.3
 """Of the tyres' slip stiffness, relative: 7.7 to 13.3 on the robots of `tests.studies.contact_law`."""
 _MAX_PRIOR_SIGMAS = 4.0
 """Beyond it a size is held: steps of Gauss-Newton may be too long for the friction model."""
 _SYSTEMATIC_SIGMA_M = 0.0015
 """Added to each axis: what errors of scan matching that last for the whole drive make of the CG of robots whose files are right."""
-_ROUNDS = 8
+_MAX_CG_STEP = 0.15
+"""Longest step of the CG, over the sigma of its prior: 2 cm on a Husky. Longer ones overshoot where loads differ much."""
+_ROUNDS = 16
 _CONVERGED_M = 1e-4
 _MAX_NOISE_RATIO = 3.0
 """Noise of the drive over that of its motion reference beyond which the friction model does not describe the drive."""
@@ -155,15 +158,13 @@ def weigh(drive: Drive) -> tuple[DrivenWeighing, DrivePredictor]:
     robot = drive.robot
     predictor = make_predictor(drive, make_model("friction", robot))
     causes = _causes(predictor, robot)
-    sizes: dict[Cause, float] = {}
-    everything = tuple(range(len(causes)))
+    values, everything = np.zeros(len(causes)), tuple(range(len(causes)))
     for _ in range(_ROUNDS):
-        linearization = linearize(predictor, causes, sizes, tolerance=1.0)
-        values, cov, _ = linearization.problem.fit(everything)
-        values = _held(values, causes, predictor)
-        change = np.abs(values[:2] - [sizes.get(cause, 0.0) for cause in causes[:2]]).max()
-        sizes = dict(zip(causes, (float(v) for v in values), strict=True))
-        if change < _CONVERGED_M:
+        linearization = linearize(predictor, causes, dict(zip(causes, values.tolist(), strict=True)), tolerance=1.0)
+        wanted, cov, _ = linearization.problem.fit(everything)
+        step, share = _limited(wanted - values, causes)
+        values = _held(values + step, causes, predictor)
+        if share == 1.0 and np.abs(step[:2]).max() < _CONVERGED_M:
             break
     ratio = _noise_ratio(predictor, linearization)
     found = DrivenWeighing(
@@ -227,6 +228,13 @@ def _slip_stiffness(nominal: float) -> Cause:
     words = "the tyres' slip stiffness is {} more", "the tyres' slip stiffness is {} less"
     meaning = "the slip stiffness of the tyres is more by this share"
     return Cause("slip_stiffness", "1", meaning, _SLIP_STIFFNESS_SIGMA, 0.03, inject, words, prior_sigma=_SLIP_STIFFNESS_SIGMA)
+
+
+def _limited(step: FloatArray, causes: tuple[Cause, ...]) -> tuple[FloatArray, float]:
+    """``step`` (p,) of Gauss-Newton shortened to where the friction model is about linear in the CG, and its share of the whole."""
+    limits = np.array([(_MAX_CG_STEP if cause.id in _CG else 1.0) * cause.prior_sigma for cause in causes])
+    share = min(1.0, float(np.min(limits / np.maximum(np.abs(step), 1e-12))))
+    return share * step, share
 
 
 def _held(values: FloatArray, causes: tuple[Cause, ...], predictor: DrivePredictor) -> FloatArray:

@@ -2,9 +2,10 @@
 
 python -m tests.studies.weigh [--cases 100] [--record FILE.jsonl] [--new 10]
 
-Hidden loads: five robots, each with its CG moved by up to a sixth of wheelbase and track and with what else may differ from a robot file
-drawn from the priors of `localization.diagnosis.weigh`; a minute of turning by the simulator's own tyre dynamics; LiDAR, wheels and gyro go
-through a bag. Rotations: the friction model is fitted to 67, and the centre of gravity of the other follows from how it turned.
+Hidden loads: five robots, each with its CG moved by up to a sixth of wheelbase and track, with what else may differ from a robot file
+drawn from the priors of `localization.diagnosis.weigh`, and with a scrub, which that does not estimate; a minute of turning by the
+simulator's own tyre dynamics; LiDAR, wheels and gyro go through a bag. Rotations: the friction model is fitted to 67, and the centre of
+gravity of the other follows from how it turned.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ HIDDEN = (
     *("lidar_time_offset", "wheel_time_offset", "friction_anisotropy", "scrub", "diagonal_load", "tread_asymmetry"),
     *("rolling_resistance", "split_friction", "slope", "gyro_scale"),
 )
+_SIGMAS = {**PRIOR_SIGMAS, "scrub": 0.01}
 _NOT_NEGATIVE = ("scrub", "rolling_resistance")
 _LARGEST_SIGMAS = 2.0  # beyond it priors are cut, where the simulator's limits and the robots' stability are near
 _CG_SHARE = 1.0 / 6.0
@@ -85,7 +87,7 @@ def hidden(seed: int) -> tuple[str, dict[str, float]]:
     g = load_robot(name).geometry
     cg = rng.uniform(-1.0, 1.0, 2) * _CG_SHARE * np.array([g.wheelbase_m, g.track_width_m])
     drawn = np.clip(rng.standard_normal(len(HIDDEN)), -_LARGEST_SIGMAS, _LARGEST_SIGMAS)
-    others = {effect: float(z * PRIOR_SIGMAS[effect]) for effect, z in zip(HIDDEN, drawn, strict=True)}
+    others = {effect: float(z * _SIGMAS[effect]) for effect, z in zip(HIDDEN, drawn, strict=True)}
     others |= {effect: abs(others[effect]) for effect in _NOT_NEGATIVE}
     return name, {"cg_offset_x": float(cg[0]), "cg_offset_y": float(cg[1]), **others}
 
