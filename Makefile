@@ -38,3 +38,4 @@ benchmark: .venv/ready
 
 clean:
 	rm -rf .venv .ros2 $(DEMO)
+	find . \( -name "*.nbi" -o -name "*.nbc" \) -delete

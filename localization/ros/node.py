@@ -12,7 +12,7 @@ from typing import Any
 from localization.errors import CheckpointError
 from localization.estimators import Estimate
 from localization.events import Event, Scan
-from localization.logs.message_stats import MessageStats
+from localization.logs.decode import MessageStats
 from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import fingerprints, read_head
 from localization.ros.diagnostics import ERROR, WARN, Health, Status
@@ -240,17 +240,17 @@ class Node:
     def _add_mounts(self, mounts: Mapping[str, Mount]) -> None:
         """Frames that become known only now have their mounts from here on, and so has the state."""
         pipeline = self.session.pipeline
-        was_missing = pipeline.synchronizer.frames.lack is not None
+        was_missing = pipeline.synchronizer.frames.problem is not None
         if not pipeline.add_mounts(mounts):
             return
         self._made.update(fingerprints(mounts=pipeline.mounts))
-        if was_missing and pipeline.synchronizer.frames.lack is None:
+        if was_missing and pipeline.synchronizer.frames.problem is None:
             self._report("/tf_static now has the mount of the LiDAR: its scans are placed by that from here on.")
         if self.session.view is not None:
             self.session.view.begin(self._run.robot, pipeline.mounts)
 
     def _check_frames(self) -> None:
-        for problem in (self.session.pipeline.synchronizer.frames.lack, self._transforms.problem):
+        for problem in (self.session.pipeline.synchronizer.frames.problem, self._transforms.problem):
             if problem is not None and problem not in self._problems:
                 self._problems.add(problem)
                 self._report(problem)

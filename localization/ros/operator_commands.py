@@ -8,10 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from localization.logs.decode import frame_name
-from localization.logs.fused_log import odom_axes
-from localization.logs.message_stats import UnusableError
+from localization.logs.decode import UnusableError, frame_name
 from localization.logs.serialization import decoder
+from localization.logs.writer import odom_axes
 from localization.ros.start_pose import StartPose
 from localization.ros.topic_names import Names
 from localization.ros.transports.base import Received, ServiceReply, Transport

@@ -1,4 +1,4 @@
-"""Mutated logs by seed: faults of sensors, clocks, transforms and files, put into honest drives; and what a replay makes of them."""
+"""Logs with faults by seed (sensors, clocks, transforms, files), made from drives without faults; and the outcome of their replay."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import multiprocessing
 import queue
 import re
 import resource
+import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterable
@@ -23,37 +24,33 @@ import numpy as np
 from localization.cli import main
 from localization.evaluation.references import read_reference_file, reference_track
 from localization.logs import open_log
-from localization.logs.serialization import Decoder
+from localization.logs.serialization import LogDeserializer
 from localization.logs.sources import open_source
 from localization.trajectory import read_tum
 from motion_models.robot import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import Record, S
 from tests.helpers.rooms import drive
+from tests.helpers.sensor_faults import SENSOR_FAULTS
 
 DATA = Path(__file__).parents[1] / "data"
 DRIVE_S = 12.0
-_SCAN_EVERY = 3
-"""Of the drives' scans (10 to 12 a second), to keep three hundred replays short."""
 FAR_M, MOST_SIGMA = 1.0, 5.0
 """An end error beyond either, without a warning, is silently wrong."""
 _MOST_SECONDS = 120.0
 _MOST_BYTES = 4 << 30  # of address space: numba, gtsam and the log itself take 2 GB of it, and a fault may take 2 GB more
 
-_SCORED = ("/ground_truth/odom", "/fix")
-"""Topics that no fault changes."""
-
-Mutation = Callable[[list[Record], np.random.Generator], list[Record]]
-
 
 class Source(NamedTuple):
-    """An honest drive."""
+    """A drive without faults."""
 
     name: str
     robot: str
     records: Callable[[], list[Record]]
     reference: str
-    """Topic."""
+    """Topic; empty for the estimate without a fault."""
+    scan_every: int
+    """One scan of so many is used, to keep three hundred replays short."""
 
 
 @functools.cache
@@ -72,7 +69,7 @@ def _recorded(path: Path, robot: str, begin_s: float, topics: Iterable[str]) -> 
     """`DRIVE_S` seconds of a real log, as messages."""
     source = open_source(path)
     used = [channel for channel in source.channels if channel.topic in set(topics)]
-    decode = Decoder(used, is_ros1=source.is_ros1)
+    decode = LogDeserializer(used, is_ros1=source.is_ros1)
     first = source.start_ns + int(begin_s * S)
     found = []
     for raw in source.messages([channel.topic for channel in used]):
@@ -113,138 +110,33 @@ def _husky() -> list[Record]:
     return _recorded(path, "husky_a200", 20.0, topics)
 
 
+@functools.cache
+def _laps() -> list[Record]:
+    """Simulated laps with wheels, gyro, LiDAR and the truth."""
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "laps.mcap"
+        with contextlib.redirect_stdout(io.StringIO()):
+            assert main(["simulate", "laps", "--out", str(log)]) == 0
+        topics = [channel.topic for channel in open_source(log).channels]
+        return _recorded(log, "vaultbot", 20.0, topics)
+
+
+def _building(folder: str, name: str, begin_s: float) -> Callable[[], list[Record]]:
+    def records() -> list[Record]:
+        place = DATA / folder
+        return _recorded(place / f"{name}.mcap", str(place / f"{name}.toml"), begin_s, ("/odom", "/scan", "/tf_static", "/reference/pose"))
+
+    return functools.cache(records)
+
+
 SOURCES = (
-    Source("room", "vaultbot", _room, "/ground_truth/odom"),
-    Source("aces", "aces", _aces, ""),
-    Source("husky", "husky_a200", _husky, ""),
+    Source("room", "vaultbot", _room, "/ground_truth/odom", 3),
+    Source("aces", "aces", _aces, "", 3),
+    Source("husky", "husky_a200", _husky, "", 3),
+    Source("laps", "vaultbot", _laps, "/ground_truth/odom", 3),
+    Source("fr079", str(DATA / "fr079" / "fr079.toml"), _building("fr079", "fr079", 60.0), "", 1),
+    Source("csail", str(DATA / "mit-csail" / "csail.toml"), _building("mit-csail", "csail", 60.0), "", 1),
 )
-
-
-# Faults of sensors. Each takes the records of a drive and gives them back spoiled; messages are copies.
-
-
-def _each(kinds: tuple[str, ...], change: Callable[[Any, float], Any]) -> Mutation:
-    """``change`` for each message of ``kinds`` with its part of the drive (0 to 1); None drops it."""
-
-    def mutate(records: list[Record], rng: np.random.Generator) -> list[Record]:
-        begin, end = records[0][2], records[-1][2]
-        found = []
-        for topic, message, stamp in records:
-            if message.__msgtype__.rsplit("/", 1)[1] in kinds and topic not in _SCORED:
-                message = change(message, (stamp - begin) / max(end - begin, 1))
-            if message is not None:
-                found.append((topic, message, stamp))
-        return found
-
-    return mutate
-
-
-def _set(message: Any, **values: Any) -> Any:
-    for name, value in values.items():
-        holder, parts = message, name.split("__")
-        for part in parts[:-1]:
-            holder = getattr(holder, part)
-        setattr(holder, parts[-1], value)
-    return message
-
-
-def _moved(message: Any, seconds: float) -> Any:
-    stamp = message.header.stamp.sec * S + message.header.stamp.nanosec + round(seconds * S)
-    return _set(message, header__stamp__sec=stamp // S, header__stamp__nanosec=stamp % S)
-
-
-def _gyro(message: Any, factor: float) -> Any:
-    w = message.angular_velocity
-    return _set(message, angular_velocity__x=w.x * factor, angular_velocity__y=w.y * factor, angular_velocity__z=w.z * factor)
-
-
-def _stopped(message: Any) -> Any:
-    """Wheels that read as if they stood at the first reading."""
-    if hasattr(message, "position"):
-        return _set(message, position=np.zeros_like(message.position), velocity=np.zeros_like(message.velocity))
-    return _set(
-        message, twist__twist=bags.T["geometry_msgs/msg/Twist"](linear=bags.vector(), angular=bags.vector()), pose__pose=bags.pose()
-    )
-
-
-def _own_beams(message: Any, part: float) -> Any:
-    ranges = message.ranges.copy()
-    ranges[: int(part * len(ranges))] = 0.3
-    return _set(message, ranges=ranges)
-
-
-def _transform(*edges: tuple) -> Mutation:
-    def mutate(records: list[Record], rng: np.random.Generator) -> list[Record]:
-        frame = next((m.header.frame_id for _, m, _ in records if m.__msgtype__.endswith("LaserScan")), "imu_link")
-        first = records[0][2]
-        found = [(p.replace("LASER", frame), c.replace("LASER", frame), where, turn) for p, c, where, turn in edges]
-        return [*(("/tf_static", bags.tf(first, [edge]), first) for edge in found), *records]
-
-    return mutate
-
-
-def _second_publisher(records: list[Record], rng: np.random.Generator) -> list[Record]:
-    zeros = []
-    for topic, message, stamp in records:
-        if message.__msgtype__.endswith("JointState"):
-            later = stamp + 7_000_000
-            n = len(message.name)
-            zeros.append((topic, bags.joint_state(later, message.name, np.zeros(n), np.zeros(n)), later))
-    return sorted([*records, *zeros], key=lambda record: record[2])
-
-
-def _silent(seconds: float) -> Mutation:
-    def mutate(records: list[Record], rng: np.random.Generator) -> list[Record]:
-        begin = records[0][2] + int(rng.uniform(2.0, 3.5) * S)
-        return [r for r in records if r[0] in _SCORED or not begin < r[2] < begin + seconds * S]
-
-    return mutate
-
-
-def _quaternion(norm: float) -> Any:
-    return bags.T["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=norm)
-
-
-_WHEELS, _SCANS, _IMU = ("JointState",), ("LaserScan",), ("Imu",)
-_ALL_WHEELS = (*_WHEELS, "Odometry")
-_LEVEL = bags.quaternion()
-SENSOR_FAULTS: dict[str, Mutation] = {
-    "none": lambda records, rng: records,
-    "all silent 5 s": _silent(5.0),
-    "all silent 8 s": _silent(8.0),
-    "wheels read zero": _each(_ALL_WHEELS, lambda m, at: _stopped(m)),
-    "wheels stop half way": _each(_ALL_WHEELS, lambda m, at: None if at > 0.5 else m),
-    "wheels NaN half way": _each(
-        _WHEELS, lambda m, at: _set(m, position=m.position * np.nan, velocity=m.velocity * np.nan) if at > 0.5 else m
-    ),
-    "one wheel frozen": _each(_WHEELS, lambda m, at: _set(m, position=np.where(np.arange(len(m.position)) == 0, 0.0, m.position))),
-    "second publisher of joint states": _second_publisher,
-    "LiDAR turned 20 deg": _each(_SCANS, lambda m, at: _set(m, angle_min=m.angle_min + math.radians(20.0))),
-    "LiDAR turned 180 deg": _each(_SCANS, lambda m, at: _set(m, angle_min=m.angle_min + math.pi)),
-    "LiDAR upside down": _each(_SCANS, lambda m, at: _set(m, ranges=m.ranges[::-1].copy())),
-    "LiDAR stamps jump 0.9 s": _each(_SCANS, lambda m, at: _moved(m, 0.9) if at > 0.5 else m),
-    "LiDAR stamps jump back 0.9 s": _each(_SCANS, lambda m, at: _moved(m, -0.9) if at > 0.5 else m),
-    "LiDAR stamps jump 100 s": _each(_SCANS, lambda m, at: _moved(m, 100.0) if at > 0.5 else m),
-    "LiDAR angle_increment 0": _each(_SCANS, lambda m, at: _set(m, angle_increment=0.0, angle_max=m.angle_min)),
-    "LiDAR in degrees": _each(
-        _SCANS, lambda m, at: _set(m, angle_min=math.degrees(m.angle_min), angle_increment=math.degrees(m.angle_increment))
-    ),
-    "LiDAR in millimetres": _each(_SCANS, lambda m, at: _set(m, ranges=m.ranges * 1000.0)),
-    "LiDAR frozen half way": _each(_SCANS, lambda m, at: _set(m, ranges=np.full_like(m.ranges, 3.0)) if at > 0.5 else m),
-    "LiDAR only in the last tenth": _each(_SCANS, lambda m, at: m if at > 0.9 else None),
-    "no scan usable": _each(_SCANS, lambda m, at: _set(m, ranges=m.ranges * np.nan)),
-    "30 % of beams on the robot": _each(_SCANS, lambda m, at: _own_beams(m, 0.3)),
-    "gyro in deg/s": _each(_IMU, lambda m, at: _gyro(m, 180.0 / math.pi)),
-    "gyro stuck": _each(_IMU, lambda m, at: _gyro(m, 0.0)),
-    "gyro flipped": _each(_IMU, lambda m, at: _gyro(m, -1.0)),
-    "transform twice": _transform(
-        ("base_link", "LASER", (0.0, 0.0, 0.0), _LEVEL), ("base_link", "LASER", (-0.5, 0.3, 0.0), bags.quaternion(1.0))
-    ),
-    "transform of two parents": _transform(("base_link", "mast", (1.0, 0.0, 0.0), _LEVEL), ("mast", "LASER", (0.5, 0.0, 0.0), _LEVEL)),
-    "transforms in a circle": _transform(("base_link", "mast", (1.0, 0.0, 0.0), _LEVEL), ("mast", "base_link", (1.0, 0.0, 0.0), _LEVEL)),
-    "quaternion of norm 1e-6": _transform(("base_link", "LASER", (0.0, 0.0, 0.0), _quaternion(1e-6))),
-    "quaternion of norm 0": _transform(("base_link", "LASER", (0.0, 0.0, 0.0), _quaternion(0.0))),
-}
 
 
 # Faults of files.
@@ -320,7 +212,7 @@ def copied(source: Source) -> list[Record]:
     found, scans = [], 0
     for topic, message, stamp in source.records():
         scans += message.__msgtype__.endswith("LaserScan")
-        if not message.__msgtype__.endswith("LaserScan") or scans % _SCAN_EVERY == 0:
+        if not message.__msgtype__.endswith("LaserScan") or scans % source.scan_every == 0:
             found.append((topic, _standard(message, message.__msgtype__), stamp))
     return found
 
@@ -343,24 +235,25 @@ class Outcome(NamedTuple):
     """survived, reported, refused, or what must not be: wrong, traceback, hang, memory."""
     error_m: float
     sigmas: float
-    said: str
+    message: str
+    """Warnings that the drive without the fault does not give, or the error."""
 
 
 BAD = ("wrong", "traceback", "hang", "memory")
 
 
-def truth_of(source: str, folder: Path) -> Path:
-    """A TUM file to score a source's drives against: its own reference, or, for lack of one, what an honest log gives."""
+def reference_of(source: str, folder: Path) -> Path:
+    """A TUM file to score a source's drives against: its own reference, else the estimate from the log without faults."""
     path = folder / f"{source}.tum"
     if not path.exists():
         found = next(s for s in SOURCES if s.name == source)
         log = bags.write_mcap(folder / f"{source}.mcap", copied(found))
-        out = folder / f"{source}-honest"
+        out = folder / f"{source}-without-fault"
         with contextlib.redirect_stdout(io.StringIO()):
             code = main(["replay", str(log), "--robot", found.robot, "--out", str(out), "--model", "skid_steer", "--estimator", "ekf"])
         assert code == 0
-        honest = json.loads((out / "metrics.json").read_text())["notes"]
-        path.with_suffix(".json").write_text(json.dumps([_without_numbers(note) for note in honest]))
+        notes = json.loads((out / "metrics.json").read_text())["notes"]
+        path.with_suffix(".json").write_text(json.dumps([_without_numbers(note) for note in notes]))
         if found.reference:
             track = reference_track(open_log(log, load_robot(found.robot)).references(found.reference), found.reference)
             assert track.yaws is not None
@@ -373,7 +266,7 @@ def truth_of(source: str, folder: Path) -> Path:
 
 
 def run_case(log: Path, robot: str, truth: Path, out: Path) -> Outcome:
-    """Replay by the EKF, as a user would, and hold its end against the truth."""
+    """Replay by the EKF from the command line, and compare the last pose with the reference ``truth``."""
     printed, complaints = io.StringIO(), io.StringIO()
     arguments = [
         "replay",
@@ -397,20 +290,19 @@ def run_case(log: Path, robot: str, truth: Path, out: Path) -> Outcome:
     except BaseException:
         return Outcome("traceback", math.nan, math.nan, traceback.format_exc(limit=-3))
     if code != 0:
-        is_told = complaints.getvalue().startswith("skidloc: ")
-        return Outcome("refused" if is_told else "traceback", math.nan, math.nan, complaints.getvalue().strip())
-    honest = json.loads(truth.with_suffix(".json").read_text())
-    warnings = [n for n in json.loads((out / "metrics.json").read_text())["notes"] if _without_numbers(n) not in honest]
+        is_input_error = complaints.getvalue().startswith("skidloc: ")
+        return Outcome("refused" if is_input_error else "traceback", math.nan, math.nan, complaints.getvalue().strip())
+    usual = json.loads(truth.with_suffix(".json").read_text())
+    warnings = [n for n in json.loads((out / "metrics.json").read_text())["notes"] if _without_numbers(n) not in usual]
     error_m, sigmas = _end_error(out, truth)
     is_right = error_m <= FAR_M and sigmas <= MOST_SIGMA
-    said = " | ".join(warnings)
     if warnings:
-        return Outcome("survived" if is_right else "reported", error_m, sigmas, said)
-    return Outcome("survived" if is_right else "wrong", error_m, sigmas, said)
+        return Outcome("survived" if is_right else "reported", error_m, sigmas, " | ".join(warnings))
+    return Outcome("survived" if is_right else "wrong", error_m, sigmas, " | ".join(warnings))
 
 
 def _without_numbers(note: str) -> str:
-    """A note that an honest drive gives too is no warning of a fault, however many messages it counts."""
+    """``note`` with its numbers replaced: a note that a drive without faults gives too, of other counts, is no warning of a fault."""
     return re.sub(r"[0-9.]+", "#", note)
 
 
@@ -437,7 +329,7 @@ def _relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _end_sigma_m(out: Path) -> float:
     """The last claimed position's standard deviation [m], of the larger axis."""
     source = open_source(out / "fused.mcap")
-    decode = Decoder(source.channels, is_ros1=False)
+    decode = LogDeserializer(source.channels, is_ros1=False)
     last = None
     for raw in source.messages(["/skid_steer_ekf/odometry"]):
         last = raw

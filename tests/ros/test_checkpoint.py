@@ -75,7 +75,7 @@ def test_places_that_are_told_late_reach_whoever_was_resumed(estimator):
         assert not goes_on.add_mounts({"laser": Mount(x=9.0)})  # a frame that has its place keeps it
         rest += [numbers(e) for event in events[met : met + AHEAD] for e in goes_on.process(event)]
         found.append(rest)
-        assert goes_on.synchronizer.frames.lack is None
+        assert goes_on.synchronizer.frames.problem is None
         assert "/tf_static was late" in goes_on.synchronizer.warnings()[-1]
     assert found[0] == found[1]
     assert len(before) > 50
