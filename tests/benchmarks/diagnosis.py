@@ -39,7 +39,7 @@ _SEED = 7_000_000
 _MIN_FACTOR, _MAX_FACTOR = 0.25, 2.0  # of the typical size
 _DEVIATING = (
     *("wheel_radius_scale", "wheel_radius_difference", "track_width", "cg_offset_x", "cg_offset_y", "lidar_offset_x", "lidar_offset_y"),
-    *("lidar_yaw", "lidar_time_offset", "wheel_time_offset", "friction_anisotropy", "diagonal_load", "tread_asymmetry", "gyro_bias"),
+    *("lidar_yaw", "lidar_time_offset", "wheel_time_offset", "friction_anisotropy", "diagonal_load", "tread_asymmetry"),
     "gyro_scale",
 )
 _PAYLOAD_SHARE = 10.0 / 119.0  # of the robot's mass: the typical payload is that of VaultBot
