@@ -67,7 +67,7 @@ class Diagnose:
         model = make_model(self.model or default_model(robot), robot)
         with console.status("reading"):
             drive = self._drive(robot)
-        with console.status("looking for causes"):
+        with console.status("searching for causes"):
             found = examine(drive, model, self.config)
         print_diagnosis(console, found.diagnosis)
         content = found.diagnosis.to_dict()

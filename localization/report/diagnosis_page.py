@@ -32,11 +32,11 @@ from motion_models.se2 import FloatArray
 _COMPONENTS = {"x": "along", "y": "sideways", "yaw": "heading", "gyro": "gyro - LiDAR"}
 _MAX_PANELS = 4
 _VERDICTS = {
-    "consistent": "Wheels and reference agree within their noise.",
-    "explained": "What they disagree about has a cause with a name.",
-    "ambiguous": "What they disagree about is explained, but by more than one cause; this drive cannot tell them apart.",
-    "unexplained": "They disagree in a way that no known cause explains.",
-    "undecidable": "This drive cannot show what is right and what is wrong.",
+    "consistent": "No discrepancy exceeds noise and tolerances; the table shows each component.",
+    "explained": "Each discrepancy that exceeds its noise has a cause with a name.",
+    "ambiguous": "The discrepancies are explained, but by more than one cause; this drive cannot separate them.",
+    "unexplained": "The discrepancies have a part that no cause explains.",
+    "undecidable": "This drive cannot show whether the model is right.",
 }
 _TERMS = {
     "Discrepancy": "What the reference measured in a window of the drive minus the model's prediction from the wheels in that window.",
@@ -58,6 +58,7 @@ def diagnosis_page(found: DiagnosisResult) -> str:
     d = found.diagnosis
     sections = [
         Section("Findings", _findings(d)),
+        Section("Components", _components(d)),
         Section("Next drive", [Paragraph(d.next_drive)] if d.next_drive else []),
         *_figures(found),
         Section("Corrected robot: before and after", _handover(d)),
@@ -73,7 +74,7 @@ def diagnosis_page(found: DiagnosisResult) -> str:
 
 
 def _figures(found: DiagnosisResult) -> list[Section]:
-    """Discrepancies, components and gains, as far as there are any."""
+    """Discrepancies and gains, as far as there are any."""
     d, sections = found.diagnosis, []
     if found.residuals is not None:
         colours = "Red: as found; blue: once corrected."
@@ -84,7 +85,6 @@ def _figures(found: DiagnosisResult) -> list[Section]:
         sections += [
             Section("Discrepancies over time", [over_time]),
             Section("Discrepancies by motion", [by_motion]),
-            Section("Components", _components(d)),
         ]
     if d.findings:
         caption = "Each finding beside all others; the line is its 95 % interval, by bootstrap over blocks of windows."
@@ -109,7 +109,8 @@ def _components(d: Diagnosis) -> list[Block]:
     rows = []
     for name, c in d.discrepancy.items():
         numbers = (f"{c.rms:.4g}", f"{c.expected_rms:.4g}", f"{c.unattributed_rms:.4g}", f"{c.p_value:.2g}")
-        rows.append([Cell(text) for text in (name, c.unit, *numbers, describe_row(c))])
+        status = Cell(c.status, describe_row(c).removeprefix(c.status).strip(": "))
+        rows.append([*(Cell(text) for text in (name, c.unit, *numbers)), status])
     return [Table([Cell(title) for title in ("Component", "Unit", "RMS", "Noise", "Left", "p", "Attributed to")], rows)]
 
 

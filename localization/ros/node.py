@@ -17,6 +17,7 @@ from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import fingerprints, read_head
 from localization.ros.diagnostics import ERROR, WARN, Health, Status
 from localization.ros.discovery import DiscoveredTopics, TopicDiscovery
+from localization.ros.doctor import Doctor
 from localization.ros.jit_warm_up import warm_up
 from localization.ros.live_stream import LiveStream, WheelAngles, check_age
 from localization.ros.operator_commands import OperatorCommands
@@ -115,6 +116,7 @@ class Node:
         name = f"{self._trial.model.name}_{self._trial.estimator}"
         self.session = Session.start(self._run.files, state, name, self._made, {"stats": self._stats}, self._report)
         self.session.health = Health(config.max_latency_s)
+        self._doctor = Doctor(self._run.robot, self._trial.model.name, mounts, 60.0 * config.diagnose_every_min)
         with ExitStack() as failing:
             failing.callback(self.session.close)
             if view is not None:
@@ -164,6 +166,7 @@ class Node:
 
     def finish(self) -> int | None:
         """Write the output and the last state; returns how many estimates there were, if an output was wanted."""
+        self._doctor.close()
         try:
             return self.session.write_output()
         finally:
@@ -252,6 +255,7 @@ class Node:
         if (is_predictable or estimates) and self._transport.now_ns() - received.received_ns < _MAX_PREDICTED_AGE_NS:
             self._publish_prediction()
         self.session.observe(event)
+        self._doctor.observe(event)
         if isinstance(event, Scan):
             self._check_frames()
         return bool(estimates)
@@ -264,6 +268,7 @@ class Node:
             return
         self.payloads.mounts = pipeline.mounts
         self._made.update(fingerprints(mounts=pipeline.mounts))
+        self._doctor.add_mounts(pipeline.mounts)
         if was_missing and pipeline.synchronizer.frames.problem is None:
             self._report("/tf_static now has the mount of the LiDAR: its scans are placed by that from here on.")
         if self.session.view is not None:
@@ -305,6 +310,7 @@ class Node:
         self.statuses.append(Status("transforms", ERROR, " ".join(problems)) if problems else Status("transforms"))
         if self.payloads.loads:
             self.statuses.append(Status("payload", message=self.payloads.summary))
+        self.statuses += self._doctor.statuses()
         if self.is_paused:
             self.statuses.append(Status("pause", WARN, "paused: no messages are used. Call ~/pause with data: false to continue."))
         stamp_ns = self._stream.sender_stamp_ns(self._newest_ns, by_lidar=True)

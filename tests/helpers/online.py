@@ -28,8 +28,7 @@ from localization.ros.settings import LiveRun, NodeConfig
 from localization.ros.topic_names import Names
 from localization.ros.transforms import TF
 from localization.ros.transports.base import MonotonicTime, Received, ServiceHandler
-from localization.simulation.drives import MoveArms, OpenLoop, Rest, constant
-from localization.simulation.experiments import Experiment
+from localization.simulation.experiments import Experiment, MoveArms, OpenLoop, Rest, constant
 from localization.simulation.sensors import EncoderConfig, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from motion_models.registry import make_model

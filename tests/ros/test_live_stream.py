@@ -104,6 +104,7 @@ def test_node_publishes_odometry_transforms_and_diagnostics(calm):
         "skidloc: files",
         "skidloc: messages",
         "skidloc: transforms",
+        "skidloc: diagnosis",
     }
     values = {v.key: v.value for v in statuses["skidloc: lidar"].values}
     assert {"degeneracy", "nis_mean", "lost_share"} <= set(values)
