@@ -498,6 +498,7 @@ class ShakeDetector:
 
     @property
     def lasted_s(self) -> float:
+        """Duration of the fault so far [s]."""
         return 0.0 if self._since_ns is None else (self._now_ns - self._since_ns) * _NS
 
     def insert(self, sample: ImuSample) -> None:
