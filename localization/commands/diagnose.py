@@ -59,6 +59,7 @@ class Diagnose:
     """Write what is printed to this file as well."""
 
     def run(self, console: Console) -> None:
+        """Run the command, with output on ``console``."""
         if not 0.5 <= self.window_s <= 20.0:
             raise CalibrationError(f"--window-s is {self.window_s:g}; windows of 0.5 to 20 s make sense.")
         check_outputs(self.out, self.json)
@@ -66,7 +67,7 @@ class Diagnose:
         model = make_model(self.model or default_model(robot), robot)
         with console.status("reading"):
             drive = self._drive(robot)
-        with console.status("looking for causes"):
+        with console.status("searching for causes"):
             found = examine(drive, model, self.config)
         print_diagnosis(console, found.diagnosis)
         content = found.diagnosis.to_dict()

@@ -15,19 +15,19 @@ from rich.console import Console
 from rich.live import Live
 from rich.markup import escape
 
-from localization.commands.online_line import live_line
-from localization.commands.online_terminal import terminal_view
+from localization.commands.online_terminal import live_line, terminal_view
 from localization.errors import CheckpointError, OutputError
 from localization.events import Event
 from localization.logs import open_log
+from localization.output import fingerprint
 from localization.pipeline import Pipeline
-from localization.provenance import fingerprint
 from localization.ros.node import Node
 from localization.ros.run_control import PlaybackClock, StopSignal
 from localization.ros.session import Session, SessionState, View, made_by
 from localization.ros.settings import LiveRun, OnlineSettings
 from localization.ros.transports import TransportName, open_transport
 from localization.ros.transports.sim_time import SimTimeTransport
+from motion_models.prior import prior_notes
 
 _LINE_S = 0.25
 _SLOWEST = 0.001  # a second of the log in a quarter of an hour
@@ -56,6 +56,7 @@ class Online(OnlineSettings):
     these variables demand, else `localhost`."""
 
     def run(self, console: Console) -> None:
+        """Run the command, with output on ``console``."""
         rate, run = parse_rate(self.rate), self.live_run()
         view = self._view()
         try:
@@ -89,7 +90,7 @@ class Online(OnlineSettings):
             is_done = True
         finally:
             session.close(forget=is_done)
-        for note in dict.fromkeys([*log.warnings(), *session.pipeline.warnings()]):
+        for note in dict.fromkeys([*prior_notes(robot, [trial.model.name]), *log.warnings(), *session.pipeline.warnings()]):
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         self._summarize(console, session, seconds, count)
 

@@ -1,6 +1,6 @@
 """Causes: what may differ on robot, floor or sensors. Each has a signature, the change that it makes in the predicted motions.
 
-A `Hypothesis` holds everything that may be otherwise than the robot file says; a cause adds its size to one place of it. The predictor that
+A `Hypothesis` holds everything that may differ from the robot file; a cause adds its size to one place of it. The predictor that
 predicts motions from a hypothesis is in `localization.diagnosis.prediction`.
 """
 
@@ -54,6 +54,7 @@ class Hypothesis:
 
 
 _PRIOR_FACTOR = 4.0  # sigma of a size's prior, over the typical size, where no physical limit is given
+_PLAUSIBLE_SIGMAS = 4.0  # of the typical size, or of a physical prior: one robot of 16,000 has more
 _SHOWN_UNITS: Mapping[str, tuple[float, str]] = {"1": (100.0, "%"), "m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg"), "s": (1e3, "ms")}
 """Factor and unit in sentences, by the SI unit of a size."""
 
@@ -97,12 +98,12 @@ class Cause:
 
     @property
     def largest_plausible(self) -> float:
-        """Magnitude beyond which another cause is more likely that is not in the catalogue: five times the typical size, or four sigma of
+        """Magnitude beyond which another cause is more likely that is not in the catalogue: four times the typical size, or four sigma of
         a physical prior; rotations differ from the geometry's by up to all of it on skid-steer robots."""
-        return 1.0 if self.id == "rotation_scale" else min(5.0 * self.typical, 4.0 * self.prior_sigma or math.inf)
+        return 1.0 if self.id == "rotation_scale" else _PLAUSIBLE_SIGMAS * (self.prior_sigma or self.typical)
 
-    def describe(self, size: float) -> str:
-        """The effect of ``size`` in words, with its direction.
+    def describe(self, size: float, sigma: float = 0.0) -> str:
+        """The effect of ``size`` in words, with its direction, and with its ``sigma`` where that is given.
 
         >>> CAUSES["track_width"].describe(-0.012)
         'the left and right contacts are 12 mm closer together than the robot file has it'
@@ -110,7 +111,8 @@ class Cause:
         factor, unit = (1.0, self.unit) if self.is_coefficient else _SHOWN_UNITS.get(self.unit, (1.0, self.unit))
         amount = abs(size) * factor
         decimals = max(0, 1 - math.floor(math.log10(max(amount, 1e-12))))  # two digits at least
-        return self.words[size < 0.0].format(f"{amount:.{decimals}f}" + ("" if unit == "1" else f" {unit}"))
+        spread = f" +- {sigma * factor:.{decimals}f}" if sigma else ""
+        return self.words[size < 0.0].format(f"{amount:.{decimals}f}{spread}" + ("" if unit == "1" else f" {unit}"))
 
     @property
     def is_coefficient(self) -> bool:
@@ -156,7 +158,7 @@ _RANGE_SCALE_SIGMA, _RANGE_BIAS_SIGMA_M = 0.015, 0.05
 _CAUSES = (
     Cause(
         "wheel_radius_scale",
-        *("1", "all wheels roll farther by this share than the robot file says", 0.02, 0.002, _add_radii(1.0, 1.0)),
+        *("1", "all wheels roll farther by this share than by the robot file", 0.02, 0.002, _add_radii(1.0, 1.0)),
         (f"all wheels roll {{}} farther {_FILE}", f"all wheels roll {{}} less far {_FILE}"),
     ),
     Cause(
@@ -187,12 +189,12 @@ _CAUSES = (
     ),
     Cause(
         "lidar_offset_x",
-        *("m", "the tracked sensor sits farther ahead than its transform says", 0.05, 0.005, _add_item("lidar_offset", 0)),
+        *("m", "the tracked sensor sits farther ahead than by its transform", 0.05, 0.005, _add_item("lidar_offset", 0)),
         (f"the tracked sensor sits {{}} farther ahead {_TRANSFORM}", f"the tracked sensor sits {{}} farther back {_TRANSFORM}"),
     ),
     Cause(
         "lidar_offset_y",
-        *("m", "the tracked sensor sits farther left than its transform says", 0.05, 0.005, _add_item("lidar_offset", 1)),
+        *("m", "the tracked sensor sits farther left than by its transform", 0.05, 0.005, _add_item("lidar_offset", 1)),
         (f"the tracked sensor sits {{}} farther left {_TRANSFORM}", f"the tracked sensor sits {{}} farther right {_TRANSFORM}"),
     ),
     Cause(
@@ -355,7 +357,7 @@ _WINDOW_CAUSES = (
     ),
     Cause(
         "rotation_scale",
-        *("1", "the robot turns farther than the model says by this share, at any speed", 0.1, 0.01, _add_item("rotation_coefficients", 0)),
+        *("1", "the robot turns farther than predicted by this share, at any speed", 0.1, 0.01, _add_item("rotation_coefficients", 0)),
         ("the robot turns {} more than the model predicts, at any speed", "the robot turns {} less than the model predicts, at any speed"),
     ),
     Cause(

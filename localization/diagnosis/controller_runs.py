@@ -25,7 +25,7 @@ from motion_models.se2 import FloatArray
 
 COLUMNS = ("trajectory", "arm_configuration", "controller", "vision_error_m")
 _STEP_S = 0.05
-_SIGMA_M = 0.01  # of a vision error, before the runs' own scatter is known
+_SIGMA_M = 0.01  # of a vision error, before the runs' own scatter is estimated
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from localization.diagnosis.linearization import Linearization, make_regression
 from localization.diagnosis.prediction import CHANNELS, DrivePredictor, with_sizes
 from motion_models.base import MotionModel
 from motion_models.center_of_gravity.parts import Arms
+from motion_models.errors import CgError, ModelError
 from motion_models.friction import FrictionModel
 from motion_models.friction.contact import SATURATION
 from motion_models.registry import MODELS, make_model
@@ -176,7 +177,7 @@ def _manual_steps(robot: Robot, h: Hypothesis, lidar_frame: str) -> list[str]:
             f"move {lidar_frame} by ({x:+.4f} m, {y:+.4f} m, {yaw:+.4f} rad) where /tf_static comes from: a log's "
             "transforms go before [mounts].",
         ),
-        (late, f"stamps are late ({late}): [clock] corrects them; synchronize the clocks or mend the driver, and remove it."),
+        (late, f"stamps are late ({late}): [clock] corrects them; synchronize the clocks or correct the driver, and remove it."),
         (h.wheel_lag_s, f"the body follows the wheels {1e3 * h.wheel_lag_s:.0f} ms late."),
         (h.gyro_bias, f"the gyro's bias is {h.gyro_bias:+.5f} rad/s; let the driver zero it while the robot stands."),
         (h.gyro_scale, f"divide the gyro's rates by {1.0 + h.gyro_scale:.4f} in its driver."),
@@ -244,8 +245,13 @@ def _matched(
     size = np.maximum(np.abs(params), 0.05)
     scale = float(np.sqrt(np.mean(wanted**2))) or 1.0
     anchor = np.eye(len(params)) * _ANCHOR_WEIGHT * scale * np.sqrt(len(rows)) * _TWIST**0.5
+    valid = params
     for _ in range(_ROUNDS):
-        twist = model.twist(rates, cg + shift, params)
+        try:
+            twist = model.twist(rates, cg + shift, params)
+        except (CgError, ModelError):  # no coefficients that a robot can have give such twists
+            return dict(zip(model.param_names, (float(v) for v in valid), strict=True))
+        valid = params
         off = ((wanted - twist.value) * weight).ravel()
         slopes = (twist.d_params * weight[:, None]).reshape(-1, len(params)) * size * is_free
         design = np.vstack([slopes, anchor])

@@ -9,43 +9,48 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localization.diagnosis.causes import CAUSES, MISSING_MESSAGES, WINDOW_CAUSES, Cause
+from localization.diagnosis.causes import MISSING_MESSAGES, Cause
 from localization.diagnosis.corrected_robot import check_handover
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, with_tolerance
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
 from localization.diagnosis.recommendations import general_advice, separating_drive
-from localization.diagnosis.selection import aliases_of, refined_cost, search_causes
-from localization.diagnosis.subset_selection import heldout_gain, max_statistic, p_value, statistic
+from localization.diagnosis.selection import aliases_of, heldout_gain, max_statistic, p_value, refined_cost, search_causes, statistic
 from localization.diagnosis.summary import describe_loss, describe_standstill_turn, evidence, sentence
-from localization.diagnosis.trends import find_trends
-from localization.diagnosis.verdict import attribute_rows, decide, find_outliers, tolerated_sizes
+from localization.diagnosis.verdict import (
+    attribute_rows,
+    decide,
+    find_better_trends,
+    find_outliers,
+    find_trends,
+    mark_trends,
+    tolerated_sizes,
+)
 from localization.settings import Count, Probability, Seed, Settings
 from motion_models.base import MotionModel
 from motion_models.se2 import FloatArray
 
 _ROUNDS = 5
-TOLERANCES = (0.35, 0.1)  # sigma of causes that nobody names, over what is negligible: first as robots are, then as files say
+TOLERANCES = (0.35, 0.1)  # sigma of unnamed causes, over what is negligible: first the spread of robots, then the accuracy of their files
 _STRICT_FACTOR = 2.0  # with the stricter of them, sizes must be so many times what is negligible
 _SYSTEMATIC_SHARE = 1.0 / 3.0  # systematic part of a size's sigma, over what is negligible: clocks, mounts and physics are no better
 _MIN_HELDOUT_GAIN = 0.003  # least held-out gain of a finding
 _CLEAR_HELDOUT_GAIN = 0.05
 _FEW_WINDOWS = 64
-_YAW_CAUSES = ("rotation_scale", "wheel_radius_difference", "wheel_time_offset", "gyro_bias", "rotation_slip_speed")
 _MIN_GAPS = 3  # fewer gaps between messages are pauses
 
 
 @dataclass(frozen=True)
 class DiagnosisConfig(Settings):
-    """How sure a diagnosis must be."""
+    """Thresholds of a diagnosis."""
 
     significance: Probability = 0.01
     """Family-wise probability of naming any cause where there is none."""
     fewest_windows: Count = 8
-    """Fewer measured windows than this decide nothing."""
+    """Least number of measured windows; fewer are undecidable."""
     moments: Count = 9
-    """At how many moments a change of the floor is looked for."""
+    """Number of moments at which a change of the floor is tried."""
     seed: Seed = 0
     """Of the random numbers in tests and intervals."""
 
@@ -72,14 +77,14 @@ class DiagnosisResult:
 
     diagnosis: Diagnosis
     predictor: DrivePredictor | None
-    """None where there was too little to look at."""
+    """None where too little was measured."""
     residuals: Residuals | None
     linearization: Linearization | None = None
-    """The last look at the drive: its signatures, and its noise."""
+    """The last linearization of the drive: its signatures, and its noise."""
 
 
 def diagnose(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None) -> Diagnosis:
-    """What is wrong with ``model`` on ``drive``, why, and what saying so gains."""
+    """What is wrong with ``model`` on ``drive``, why, and the gain of correcting it."""
     return examine(drive, model, config).diagnosis
 
 
@@ -93,7 +98,7 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
     causes = candidate_causes(predictor, config.moments)
     first = linearize(predictor, causes, {}, TOLERANCES[0])
     found = _diagnose_within(predictor, first, config)
-    if found.diagnosis.verdict == "consistent":  # within what robots are: is it what their files say?
+    if found.diagnosis.verdict == "consistent":  # within the spread of robots: also within the accuracy of their files?
         strict = _diagnose_within(predictor, with_tolerance(first, TOLERANCES[1]), config)
         if strict.diagnosis.verdict in ("explained", "ambiguous"):  # stricter tolerances name causes; they do not contradict the table
             return strict
@@ -101,7 +106,7 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
 
 
 def _diagnose_within(predictor: DrivePredictor, first: Linearization, config: DiagnosisConfig) -> DiagnosisResult:
-    """With everything that is not named within the tolerance of the ``first`` look."""
+    """With unnamed causes within the tolerance of the ``first`` linearization."""
     rng = np.random.default_rng(config.seed)
     causes, tolerance = first.causes, first.tolerance
     linearization = first
@@ -119,7 +124,7 @@ def _diagnose_within(predictor: DrivePredictor, first: Linearization, config: Di
         if keys in visited_keys:
             break
         visited_keys.append(keys)
-    if len(visited) > 1:  # later looks need not be better: all that were preferred once are compared by one noise
+    if len(visited) > 1:  # later rounds need not be better: all sets that were preferred once are compared by one noise
         best = min(visited, key=lambda sizes: refined_cost(predictor, linearization, sizes))
         if set(best) != set(current):
             current = best
@@ -132,7 +137,7 @@ def _diagnose_within(predictor: DrivePredictor, first: Linearization, config: Di
 def _drop_insignificant(
     linearization: Linearization, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig
 ) -> tuple[int, ...]:
-    """``chosen``, less what does not stand up to the test."""
+    """``chosen`` without causes that are not significant."""
     while chosen:
         p = []
         for i in chosen:
@@ -169,9 +174,11 @@ def _conclude(
     spreads = problem.scale * np.where(np.isin(np.arange(len(causes)), chosen), 1.0, problem.tolerance)
     trends, left_gain = find_trends(predictor, linearization.noise, left, linearization.signatures, linearization.nuisances, spreads, rng)
     share = left_gain / max(left_gain + gained, 1e-9) if trends else 0.0
+    trends = (*find_better_trends(predictor, linearization, chosen), *trends)
     detectable = _detectable_sizes(linearization)
     undetectable = [e for e in causes if detectable[e.id] > e.typical]
-    verdict = decide(findings, trends, share, tuple(rows.values()), len(undetectable) / max(len(causes), 1))
+    rows = mark_trends(rows, trends, share, bool(findings))
+    verdict = decide(findings, tuple(rows.values()), len(undetectable) / max(len(causes), 1))
     if findings:
         next_drive = separating_drive(predictor, findings, linearization, chosen)
     else:
@@ -244,22 +251,8 @@ def _make_findings(
         p = _p_value(linearization, others, i, rng)
         aliases = aliases_of(predictor, linearization, chosen, i)
         text = evidence(cause, linearization.signatures[..., i] * size, linearization.noise, problem.gain(chosen) - problem.gain(others))
-        finding = Finding(cause, size, sigma, p, aliases, text, gains[n])
-        found.append(_shown_by_yaw(finding) if predictor.drive.is_gyro_reference else finding)
+        found.append(Finding(cause, size, sigma, p, aliases, text, gains[n]))
     return _merge_slopes(sorted(found, key=lambda f: f.gain.relative, reverse=True))
-
-
-def _shown_by_yaw(finding: Finding) -> Finding:
-    """``finding`` under the name of what headings alone show, where its first name is one of several physical reasons for that."""
-    sizes = dict(finding.aliases)
-    name = next((name for name in _YAW_CAUSES if name in sizes), None)
-    if name is None or finding.cause in _YAW_CAUSES:
-        return finding
-    definition = CAUSES.get(name) or WINDOW_CAUSES[name]
-    others = tuple((alias, size) for alias, size in finding.aliases if alias != name)
-    sigma = finding.sigma * abs(sizes[name] / finding.size) if finding.size else finding.sigma
-    aliases = ((finding.cause, finding.size), *others)
-    return dataclasses.replace(finding, definition=definition, size=sizes[name], sigma=sigma, aliases=aliases)
 
 
 def _detectable_sizes(linearization: Linearization) -> dict[str, float]:
@@ -298,7 +291,7 @@ def _with_data_errors(d: Diagnosis, drive: Drive) -> Diagnosis:
 
 
 def _is_gain_significant(gain: Gain, windows: int) -> bool:
-    """On windows that sizes were not fitted to. An interval from a few blocks of windows is wider than it says: there a clear gain does."""
+    """On windows that sizes were not fitted to. An interval from a few blocks of windows is too wide: there a clear gain is enough."""
     return gain.relative >= _MIN_HELDOUT_GAIN and (gain.low > 0.0 or (windows < _FEW_WINDOWS and gain.relative > _CLEAR_HELDOUT_GAIN))
 
 
@@ -318,7 +311,7 @@ def _undecidable(drive: Drive, model: MotionModel, why: str) -> Diagnosis:
         *(drive.name, drive.robot.name, model.name, drive.motion_reference, "undecidable", {}, (), ()),
         left_share=0.0,
         next_drive=advice,
-        sentence=f"Nothing can be said of {model.name} on this drive: {why} {advice}",
+        sentence=f"{model.name} cannot be diagnosed on this drive: {why} {advice}",
         windows=len(drive.maneuvers),
         warnings=drive.warnings,
     )

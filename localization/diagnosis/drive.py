@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from localization.calibration.calibrate import MotionReferenceName, make_motion_reference
-from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, MotionReference, Span, Wheels
+from localization.calibration.motion_references import GyroMotionReference, MotionReference, Span, Wheels
 from localization.calibration.windows import WindowConfig, Windows, cut
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.gyro import GyroBuffer
@@ -28,8 +28,6 @@ _NS = 1e-9
 _FOREVER_S = 1e6
 _GRIPPERS = ("left_gripper", "gripper", "tool0", "left_tool0")
 _MIN_GRAVITY, _MAX_GRAVITY = 8.0, 12.0
-_RANGE_STEP_M = 0.05  # added to all ranges for the scene's derivative: about the ranging error of common scanners
-_MAX_SHIFTED_WINDOWS = 60  # windows whose scans are matched twice, once with longer ranges
 _MAX_STANDSTILL_RATE = 0.05  # rad/s; five sigma of plausible gyro biases (`causes`): a robot that turns while its wheels stand
 _MIN_REGULAR_SHARE = 0.6  # of the intervals between messages that must be near their median for messages to have a period
 _MAX_PAUSE_S = 5.0  # longer gaps are pauses of the driver, not lost messages
@@ -90,25 +88,21 @@ class Drive:
     warnings: tuple[str, ...] = ()
 
     @property
-    def poses(self) -> int:
-        return sum(len(m.ends) for m in self.maneuvers)
+    def has_positions(self) -> bool:
+        """Whether the motion reference measured positions anywhere, and not headings alone."""
+        return any(bool(np.isfinite(m.cov[..., 0, 0]).any()) for m in self.maneuvers)
 
 
 class _Recorder:
-    """A motion reference that records which spans became maneuvers, and how a change of all ranges would change what it measures."""
+    """A motion reference that records which spans became maneuvers, and during which the wheels stood."""
 
-    def __init__(self, inner: MotionReference, shifted: MotionReference | None) -> None:
-        """``shifted``: the same kind of LiDAR reference, which is given longer ranges; None for other references."""
-        self._inner, self._shifted = inner, shifted
+    def __init__(self, inner: MotionReference) -> None:
+        self._inner = inner
         self.used: list[Span] = []
         self.standing: list[Span] = []
-        self._shifted_spans: dict[tuple[int, int], Span] = {}
 
     def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
         yield from self._inner.spans(event, wheels)
-        if self._shifted is not None and len(self._shifted_spans) < _MAX_SHIFTED_WINDOWS:
-            longer = _with_longer_ranges(event) if isinstance(event, Scan) else event
-            self._shifted_spans.update({(s.start_ns, s.end_ns): s for s in self._shifted.spans(longer, wheels) if s.is_valid})
 
     def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
         self.used, self.standing = list(spans), list(standing)
@@ -118,20 +112,11 @@ class _Recorder:
         return self._inner.warnings()
 
     def range_slopes(self) -> FloatArray | None:
-        """See `Drive.range_slopes`; beyond the first windows by their mean share of the path, as matching twice takes twice as long."""
-        pairs = [(s, self._shifted_spans[key]) for s in self.used if (key := (s.start_ns, s.end_ns)) in self._shifted_spans]
-        if not pairs:
+        """See `Drive.range_slopes`."""
+        slopes = [s.range_slope for s in self.used]
+        if not any(slope is not None for slope in slopes):
             return None
-        slopes = {(a.start_ns, a.end_ns): (b.measured - a.measured) / _RANGE_STEP_M for a, b in pairs}
-        paths = np.array([a.measured[:2] for a, _ in pairs])
-        changes = np.array([slope[:2] for slope in slopes.values()])
-        share = float(np.sum(changes * paths) / max(float(np.sum(paths**2)), 1e-9))
-        return np.array([slopes.get((s.start_ns, s.end_ns), np.array([*(share * s.measured[:2]), 0.0])) for s in self.used])
-
-
-def _with_longer_ranges(scan: Scan) -> Scan:
-    ranges = np.maximum(np.linalg.norm(scan.points, axis=1, keepdims=True), 1e-9)
-    return dataclasses.replace(scan, points=scan.points * (1.0 + _RANGE_STEP_M / ranges))
+        return np.array([np.zeros(3) if slope is None else slope for slope in slopes])
 
 
 class _Imu:
@@ -189,21 +174,33 @@ def drive_of_log(
     if motion_reference == "auto" and reference is None and log.sources.lidar is None and log.sources.imu is None:
         alone = f"{log.path.name} has neither a LiDAR nor an IMU, and no reference was named: nothing measures what the wheels do."
         return Drive(log.path.name, robot, (), "none", warnings=(alone, *log.warnings()))
-    inner, words = make_motion_reference(log, robot, motion_reference, reference, config)
-    by_lidar = isinstance(inner, LidarMotionReference)
-    recorder = _Recorder(inner, LidarMotionReference(log.mounts, config.window_s) if by_lidar else None)
-    imu = _Imu(robot, log.mounts)
+    inner = make_motion_reference(log, robot, motion_reference, reference, config)
     postures = None
     if log._arms is not None:
         postures = _Postures(log._arms)
         log._arms = postures  # type: ignore[assignment]
+    drive = drive_of_events(log.events(), log.path.name, robot, log.mounts, inner, config, postures)
+    return dataclasses.replace(drive, warnings=(*drive.warnings, *log.warnings()))
 
+
+def drive_of_events(
+    events: Iterable[Event],
+    name: str,
+    robot: Robot,
+    mounts: Mapping[str, Mount],
+    reference: tuple[MotionReference, str],
+    config: WindowConfig,
+    postures: _Postures | None = None,
+) -> Drive:
+    """Cut ``events`` into windows whose motion the ``reference`` (and its name) measures, and store what else was measured in each."""
+    inner, words = reference
+    recorder, imu = _Recorder(inner), _Imu(robot, mounts)
     frame = ""
     wheel_stamps: list[int] = []
 
     def record_events() -> Iterable[Event]:
         nonlocal frame
-        for event in log.events():
+        for event in events:
             if isinstance(event, ImuSample):
                 imu.insert(event)
             elif isinstance(event, WheelSample):
@@ -212,14 +209,14 @@ def drive_of_log(
                 frame = event.frame_id
             yield event
 
-    windows = cut(record_events(), recorder, make_model("diff_drive", robot), robot, config, log.path.name)
+    windows = cut(record_events(), recorder, make_model("diff_drive", robot), robot, config, name)
     spans = np.array([(s.start_ns, s.end_ns) for s in recorder.used], dtype=np.int64).reshape(-1, 2)
     left = _describe_windows(windows, spans, config)
-    mount = log.mounts.get(frame, Mount())
+    mount = mounts.get(frame, Mount())
     by_gyro = isinstance(inner, GyroMotionReference)
     has_gyro = bool(imu.stamps) and not by_gyro
     return Drive(
-        name=log.path.name,
+        name=name,
         robot=robot,
         maneuvers=windows.maneuvers,
         motion_reference=words,
@@ -234,13 +231,15 @@ def drive_of_log(
         standstill_turn=find_standstill_turn(imu.gyro, recorder.standing) if imu.stamps else None,
         lidar_frame=frame,
         lidar_at=(mount.x, mount.y),
-        warnings=(left, *windows.warnings, *log.warnings()),
+        warnings=(left, *windows.warnings),
     )
 
 
 def _describe_windows(windows: Windows, spans: IntArray, config: WindowConfig) -> str:
     length_s = float(np.median(spans[:, 1] - spans[:, 0])) * _NS if len(spans) else config.window_s
-    text = f"{len(windows.maneuvers)} windows of {length_s:.2g} s; left out: {windows.standing} standing, {windows.lost} not measured."
+    text = (
+        f"{len(windows.maneuvers)} windows of {length_s:.2g} s; left out: {windows.standing} standing, {windows.unmeasured} not measured."
+    )
     if length_s > 1.3 * config.window_s:
         text += f" The motion reference is sparse, so that windows of {config.window_s:g} s were extended to its stamps."
     return text
@@ -270,8 +269,8 @@ def find_standstill_turn(gyro: GyroBuffer, standing: Sequence[Span]) -> Standsti
 
 
 def drive_of_table(name: str, robot: Robot, maneuvers: Sequence[Maneuver], kind: str) -> Drive:
-    """Maneuvers that were measured by somebody else. Windows with several poses are cut at them, so that each counts for itself and the
-    wheels before it are known.
+    """Maneuvers of a table. Windows with several poses are cut at them, so that each counts for itself and the wheels before it are
+    available.
 
     >>> from localization.diagnosis.diagnose import diagnose
     >>> from motion_models import load_robot, make_model, read_rotation_table, rotations_as_maneuvers

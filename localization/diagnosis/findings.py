@@ -110,6 +110,8 @@ class Component:
     """Noise of the drive over that of the motion reference by its own covariance."""
     status: RowStatus = "noise"
     attributions: tuple[Attribution, ...] = ()
+    trend: str = ""
+    """Along what a part follows that no cause has, where that makes the row unexplained."""
 
     def with_status(self, status: RowStatus, attributions: tuple[Attribution, ...]) -> Component:
         return dataclasses.replace(self, status=status, attributions=attributions)
@@ -125,6 +127,7 @@ class Component:
             "noise_over_reference": self.noise_over_reference,
             "status": self.status,
             "attributions": [a._asdict() for a in self.attributions],
+            "trend": self.trend,
         }
 
 
@@ -138,9 +141,13 @@ class Trend:
     p_value: float
     over_noise: float
     """Its root mean square over the noise of the component."""
+    instead_of: str = ""
+    """The finding that it explains the drive better than; empty for a trend beside the findings."""
 
     @property
     def text(self) -> str:
+        if self.instead_of:
+            return f"{self.component} follows {self.along} better than {self.instead_of} (t = {self.t:+.1f}, p = {self.p_value:.2g})"
         size = f"{self.over_noise:.2g} times its noise"
         return f"the {self.component} left over follows {self.along} (t = {self.t:+.1f}, p = {self.p_value:.2g}, {size})"
 

@@ -25,7 +25,7 @@ from motion_models.se2 import FloatArray
 
 _CREEP = 3e-3
 _NEWTON = 12
-_MAX_RESIDUAL = 1e-7  # m/s and rad/s
+_MAX_RESIDUAL = 1e-6  # m/s and rad/s; steps of numeric differences change twists by 1e-4 and more
 _MIN_REDUCTION = 0.2  # slopes are good for as long as a step leaves no more than this
 _SOLVED = 1e-3  # m/s and rad/s; a step that is left farther off is the quasi-static one
 _DIFFERENCE = 1e-5
@@ -80,6 +80,8 @@ class ManeuverSamples(NamedTuple):
     """(N, 2) [m]."""
     first: IntArray
     """(W + 1,) first sample of each maneuver."""
+    last: IntArray
+    """(W,) index after the last sample of each maneuver whose motion is wanted."""
     headings: FloatArray
     """(W,) at the begin of each maneuver [rad]."""
     slope: FloatArray
@@ -149,7 +151,8 @@ def _integrate(drive: ManeuverSamples, quasi_static: FloatArray, floor: Floor, b
         heading = drive.headings[w]
         before = quasi_static[drive.first[w]].copy()
         work.is_stale[0] = True
-        for i in range(drive.first[w], drive.first[w + 1]):
+        out[drive.last[w] : drive.first[w + 1]] = quasi_static[drive.last[w] : drive.first[w + 1]]
+        for i in range(drive.first[w], drive.last[w]):
             q_l, q_r, h = drive.wheels[i, 0], drive.wheels[i, 1], drive.dt[i]
             if q_l == 0.0 and q_r == 0.0:
                 before[:] = 0.0

@@ -4,26 +4,247 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause, Hypothesis, friction_change, slope_across
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.noise import Noise, estimate_noise, given_noise, variance_regressors
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
-from localization.diagnosis.subset_selection import Regression, regression
 from motion_models.base import MotionModel
+from motion_models.calibration.maneuvers import Batch
 from motion_models.diff_drive import DiffDrive
 from motion_models.friction import FrictionModel
-from motion_models.robot import Robot
+from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
+
+MAX_TOLERANCE_SIGMAS = 3.0
+"""Largest size of a cause that is not named, over the sigma of its tolerance: about what is negligible (see `diagnose.TOLERANCES`)."""
+_ROUNDS = 8
+_MOTION = 3  # channels of the motion itself
+_MIN_FREE_SHARE = 0.1  # of all numbers, however many causes there are
+_CLAIMED_WINDOWS = 4.0  # number of windows that a motion reference's own covariance counts for
+_MIN_SIGMA_OVER_CLAIMED = 0.5  # least sigma, as a share of the one that the motion reference gives
+_CLIP = 9.0  # squares beyond this many variances are outliers, and count as this much
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Whitens rows of discrepancies, channel by channel: by size, by correlation between channels, and from window to window."""
+
+    sigmas: FloatArray
+    """(M, 6) standard deviation of each number; 1 where nothing was measured."""
+    mixing: FloatArray
+    """(6, 6) lower triangular: makes the channels of one window independent."""
+    autocorrelation: FloatArray
+    """(6,) share of the error of the window before that is still in the next."""
+    follows: NDArray[np.bool_]
+    """(M,) whether a window begins where the one before ended."""
+    weights: FloatArray
+    """(M,) below 1 for windows with outliers."""
+    freedom: float = 1e6
+    """Degrees of freedom of the noise estimate, in that channel of the motion which has fewest."""
+
+    def whiten(self, rows: FloatArray) -> FloatArray:
+        """(M, 6, ...) rows as independent numbers of unit variance; 0 where they are NaN."""
+        shape = (slice(None), slice(None)) + (None,) * (rows.ndim - 2)
+        scaled = np.nan_to_num(rows / self.sigmas[shape], nan=0.0)
+        mixed = np.einsum("ij,nj...->ni...", self.mixing, scaled)
+        before = np.zeros_like(mixed)
+        before[1:] = mixed[:-1] * self.follows[1:].reshape(-1, *(1,) * (rows.ndim - 1))
+        autocorrelation = self.autocorrelation.reshape(1, -1, *(1,) * (rows.ndim - 2))
+        unmixed = (mixed - autocorrelation * before) / np.sqrt(1.0 - autocorrelation**2)
+        return np.asarray(unmixed * self.weights.reshape(-1, *(1,) * (rows.ndim - 1)))
+
+
+def variance_regressors(batch: Batch, wheel_radius: float, track: float) -> FloatArray:
+    """(M, 3) what variances may grow with: constant, metres driven, radians by the wheels' difference."""
+    driven, turned = np.zeros(len(batch.ends)), np.zeros(len(batch.ends))
+    for i, (end, owner) in enumerate(zip(batch.ends, batch.owner, strict=True)):
+        a = batch.first[owner] + batch.lead[owner]
+        ways = batch.wheels[a:end] * batch.dt[a:end, None] * wheel_radius
+        driven[i] = np.abs(ways.mean(axis=1)).sum()
+        turned[i] = np.abs(ways[:, 1] - ways[:, 0]).sum() / track
+    return np.column_stack([np.ones(len(driven)), driven, turned])
+
+
+def given_noise(rows: FloatArray, sigmas: FloatArray, follows: NDArray[np.bool_]) -> Noise:
+    """Independent numbers with the given ``sigmas`` (M, 6)."""
+    return Noise(np.where(np.isfinite(rows), sigmas, 1.0), np.eye(rows.shape[1]), np.zeros(rows.shape[1]), follows, np.ones(len(rows)))
+
+
+def estimate_noise(left: FloatArray, features: FloatArray, follows: NDArray[np.bool_], spent: FloatArray, claimed: FloatArray) -> Noise:
+    """By ``left`` (M, 6), what the richest explanation leaves, which has used up ``spent`` (6,) degrees of freedom in each channel.
+
+    The sigmas that the motion references give, ``claimed`` (M, 6), count as much as a few windows: short drives show little of their noise.
+    The estimate may be smaller than they are, but not by much.
+    """
+    known = np.isfinite(left)
+    counts = known.sum(axis=0)
+    free = np.maximum(counts - spent, np.maximum(_MIN_FREE_SHARE * counts, 1.0))
+    inflate = np.where(counts > 0, counts / free, 1.0)
+    sigmas = np.ones_like(left)
+    for channel in range(left.shape[1]):
+        use = known[:, channel]
+        if use.sum() < 4:
+            continue
+        squares = left[use, channel] ** 2 * inflate[channel]
+        f = features[use]
+        variance = np.full(len(squares), max(float(np.median(squares)) / 0.455, 1e-14))
+        for _ in range(_ROUNDS):
+            clipped = np.minimum(squares, _CLIP * variance)
+            found = nnls(f / variance[:, None], clipped / variance)[0]
+            variance = np.maximum(f @ found, 0.2 * float(np.median(variance)))
+        given = claimed[use, channel]
+        pooled = (free[channel] * variance + _CLAIMED_WINDOWS * given**2) / (free[channel] + _CLAIMED_WINDOWS)
+        sigmas[use, channel] = np.maximum(np.sqrt(pooled), _MIN_SIGMA_OVER_CLAIMED * given)
+    z = np.nan_to_num(left * np.sqrt(inflate) / sigmas, nan=0.0)
+    lengths = np.abs(z).max(axis=1)
+    weights = np.minimum(1.0, 4.0 / np.maximum(lengths, 1e-9))
+    z = z * weights[:, None]
+    mixing = _mixing(z, known)
+    z = z @ mixing.T
+    autocorrelation = np.zeros(left.shape[1])
+    for channel in range(left.shape[1]):
+        pairs = follows[1:] & known[1:, channel] & known[:-1, channel]
+        if pairs.sum() > 20:
+            a, b = z[1:, channel][pairs], z[:-1, channel][pairs]
+            rho = float(a @ b / max(np.sqrt((a @ a) * (b @ b)), 1e-12))
+            autocorrelation[channel] = min(max(rho - 1.0 / np.sqrt(pairs.sum()), 0.0), 0.8)
+    motion = [float(free[c]) for c in range(_MOTION) if counts[c]]
+    return Noise(sigmas, mixing, autocorrelation, follows, weights, min(motion, default=1.0) + _CLAIMED_WINDOWS)
+
+
+def _mixing(z: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
+    """Inverse Cholesky factor of the channels' correlation, shrunk to the identity where few windows were measured."""
+    n = known.astype(float).T @ known.astype(float)
+    scale = np.sqrt(np.maximum(np.diag(z.T @ z) / np.maximum(np.diag(n), 1.0), 1e-12))
+    scale = np.where(np.diag(n) > 0, scale, 1.0)
+    correlation = (z.T @ z) / np.maximum(n, 1.0) / np.outer(scale, scale)
+    shrink = n / (n + 20.0)
+    correlation = np.where(np.eye(len(scale), dtype=bool), 1.0, correlation * shrink)
+    values, vectors = np.linalg.eigh(correlation)
+    correlation = (vectors * np.maximum(values, 0.05)) @ vectors.T
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(correlation)))
+
 
 SKIDDING = frozenset(
     {"track_width", "payload", "cg_offset_x", "cg_offset_y", "friction_anisotropy", "friction_change", "split_friction", "scrub"}
     | {"lateral_force_law", "diagonal_load", "tread_asymmetry", "rolling_resistance", "slope", "rotation_slip_speed"}
 )
 """Causes that act by the friction of wheels that skid: none of a robot with casters, whose track is a scale of its rotation."""
-_CASTER_TOLERANCE = 0.02  # of the separation multiplier: what is calibrated on a robot with casters
+_SHOWN_BY_HEADINGS = frozenset(
+    {"rotation_scale", "rotation_slip_speed", "rotation_slip_rate", "rotation_slip_curvature", "wheel_radius_difference"}
+    | {"wheel_time_offset", "gyro_time_offset", "gyro_bias", "gyro_scale", "encoder_dropout"}
+)
+"""Causes of a drive of which headings alone were measured: how far a robot turns has many physical reasons that only positions separate."""
+
+
+@dataclass(frozen=True)
+class Regression:
+    """Whitened discrepancies and signatures in normal form; nuisances are already projected out, sizes are in units of their sigma
+    a priori.
+
+    Every cause is always present, if only within its tolerance: robot files, mounts and clocks are no more accurate. To name a cause
+    is to let it have any size. So subsets are weighed by their evidence (marginal likelihood), in which causes outside of the subset
+    are noise of a known shape.
+    """
+
+    gram: FloatArray
+    """(p, p)"""
+    moment: FloatArray
+    """(p,)"""
+    rest: float
+    """Sum of squares of the discrepancies without nuisances."""
+    count: int
+    """How many numbers were measured."""
+    scale: FloatArray
+    """(p,) prior sigma of each cause in its own unit."""
+    tolerance: FloatArray
+    """(p,) sigma of each cause that is not named, in units of its prior's."""
+
+    def _variances(self, subset: tuple[int, ...]) -> FloatArray:
+        variances = np.square(self.tolerance)
+        variances[list(subset)] = 1.0
+        return variances
+
+    def _evidence(self, subset: tuple[int, ...]) -> tuple[FloatArray, FloatArray, float]:
+        """Factor of the posterior's information, mean of all sizes, and twice the log-evidence but for a constant."""
+        variances = self._variances(subset)
+        factor = np.linalg.cholesky(self.gram + np.diag(1.0 / variances))
+        half = np.linalg.solve(factor, self.moment)
+        twice = float(half @ half) - 2.0 * float(np.log(np.diagonal(factor)).sum()) - float(np.log(variances).sum())
+        return np.asarray(factor), np.asarray(half), twice
+
+    @cached_property
+    def _evidence_of_nothing(self) -> float:
+        return self._evidence(())[2]
+
+    def fit(self, subset: tuple[int, ...]) -> tuple[FloatArray, FloatArray, float]:
+        """Sizes in own units, their covariance, and twice the log-evidence gained over naming nothing."""
+        if not subset:
+            return np.zeros(0), np.zeros((0, 0)), 0.0
+        i = list(subset)
+        factor, half, twice = self._evidence(subset)
+        sizes = np.linalg.solve(factor.T, half)[i]
+        inverse = np.linalg.solve(factor, np.eye(len(factor))[:, i])
+        scale = self.scale[i]
+        return sizes * scale, (inverse.T @ inverse) * np.outer(scale, scale), twice - self._evidence_of_nothing
+
+    def posterior(self, subset: tuple[int, ...]) -> FloatArray:
+        """(p,) posterior means of all sizes, in own units, with those outside of ``subset`` held to their tolerance."""
+        factor, half, _ = self._evidence(subset)
+        return np.asarray(np.linalg.solve(factor.T, half) * self.scale)
+
+    def posterior_sigmas(self, subset: tuple[int, ...]) -> FloatArray:
+        """(p,) standard deviations of `posterior`."""
+        factor, _, _ = self._evidence(subset)
+        return np.asarray(np.linalg.norm(np.linalg.solve(factor, np.eye(len(factor))), axis=0) * self.scale)
+
+    def gain(self, subset: tuple[int, ...]) -> float:
+        """Twice the log-evidence gained over naming nothing."""
+        return self._evidence(subset)[2] - self._evidence_of_nothing if subset else 0.0
+
+    def misfit(self) -> float:
+        """Sum of squares that is left where every cause keeps within its tolerance, and what that takes.
+
+        A prior does not hold a size against much data: beyond `MAX_TOLERANCE_SIGMAS` a size would not be tolerated, and is cut there.
+        """
+        factor, half, _ = self._evidence(())
+        x = np.linalg.solve(factor.T, half)
+        limit = MAX_TOLERANCE_SIGMAS * self.tolerance
+        if np.all(np.abs(x) <= limit):
+            return self.rest - float(half @ half)
+        x = np.clip(x, -limit, limit)
+        return self.rest + float(x @ self.gram @ x - 2.0 * x @ self.moment + np.sum(np.square(x / self.tolerance)))
+
+    def scores(self, given: tuple[int, ...], wanted: list[int]) -> tuple[FloatArray, FloatArray]:
+        """(n,) scores of the ``wanted`` causes with those ``given`` free and all others within tolerance, and their (n, n) covariance if
+        they were zero."""
+        others = [i for i in range(len(self.moment)) if i not in wanted or i in given]
+        variances = self._variances(given)[others]
+        variances[[n for n, i in enumerate(others) if i in given]] = 1e6
+        a = self.gram[np.ix_(others, others)] + np.diag(1.0 / variances)
+        across = np.linalg.solve(a, self.gram[np.ix_(others, wanted)])
+        cov = self.gram[np.ix_(wanted, wanted)] - self.gram[np.ix_(wanted, others)] @ across
+        return self.moment[wanted] - across.T @ self.moment[others], cov
+
+
+def regression(
+    y: FloatArray, signatures: FloatArray, nuisances: FloatArray, scale: FloatArray, tolerance: FloatArray | None = None
+) -> Regression:
+    """From whitened rows (K,), signatures (K, p) and nuisances (K, q); ``scale`` and ``tolerance`` (p,) in the causes' own units."""
+    s = signatures * scale
+    used = np.linalg.norm(nuisances, axis=0) > 1e-9 if nuisances.size else np.zeros(0, dtype=bool)
+    if used.any():
+        q, r = np.linalg.qr(nuisances[:, used])
+        q = q[:, np.abs(np.diag(r)) > 1e-9 * np.abs(np.diag(r)).max()]
+        y, s = y - q @ (q.T @ y), s - q @ (q.T @ s)
+    count = int(np.count_nonzero(np.abs(signatures).sum(axis=1) + np.abs(y)))
+    within = np.full(len(scale), 1e-6) if tolerance is None else np.maximum(tolerance / scale, 1e-6)
+    return Regression(s.T @ s, s.T @ y, float(y @ y), count, scale, within)
 
 
 @dataclass(frozen=True)
@@ -46,10 +267,8 @@ class Linearization:
 
 
 def is_skid_steer(robot: Robot) -> bool:
-    """Whether the robot's wheels skid in turns; a robot with casters turns by its geometry (separation multiplier 1 in its file)."""
-    model = DiffDrive.from_robot(robot)
-    multiplier = float(model.nominal[model.param_names.index("wheel_separation_multiplier")])
-    return robot.arms is not None or abs(multiplier - 1.0) > _CASTER_TOLERANCE
+    """Whether the robot's wheels skid in turns; a robot with casters turns by its geometry."""
+    return robot.drive != DIFF_DRIVE
 
 
 def default_model(robot: Robot) -> str:
@@ -97,11 +316,13 @@ def candidate_causes(predictor: DrivePredictor, moments: int) -> tuple[Cause, ..
     if drive.kind == "runs":
         out = {"wheel_radius_difference", "tread_asymmetry", "lidar_yaw", "gyro_bias", "encoder_dropout"}
         return tuple(e for e in found if e.id not in out)
+    if not drive.has_positions:
+        return tuple(e for e in (*found, *WINDOW_CAUSES.values()) if e.id in _SHOWN_BY_HEADINGS)
     if not is_skid_steer(drive.robot):
         found = [e for e in found if e.id not in SKIDDING]
     if drive.kind == "windows":
         found += list(WINDOW_CAUSES.values())
-    elif predictor.model.name != "friction" or drive.is_gyro_reference:  # its own number for how far it turns is not the floor's
+    elif predictor.model.name != "friction":  # its own number for how far it turns is not the floor's
         found.append(WINDOW_CAUSES["rotation_scale"])
     return tuple(found)
 
@@ -148,7 +369,7 @@ def _nuisances(rows: FloatArray) -> FloatArray:
 def _estimate_drive_noise(
     predictor: DrivePredictor, linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, causes: tuple[Cause, ...]
 ) -> Noise:
-    """Estimated from what all causes together leave, in a few rounds as sizes and noise hang on each other."""
+    """Estimated from what all causes together leave, in a few rounds, as sizes and noise depend on each other."""
     batch, drive = predictor.batch, predictor.drive
     g = drive.robot.geometry
     features = variance_regressors(batch, g.wheel_radius_m, g.track_width_m)

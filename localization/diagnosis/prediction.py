@@ -6,11 +6,11 @@ import dataclasses
 import math
 from dataclasses import dataclass, field
 
+import numba
 import numpy as np
 
 from localization.diagnosis.causes import Cause, Hypothesis
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.encoder_dropout import REST_RATE_RAD_PER_S, find_dropouts
 from localization.diagnosis.friction_response import TRACKED, ManeuverSamples, dynamic_twists, quasi_static_twists
 from motion_models import se2
 from motion_models.base import MotionModel, Twist
@@ -18,6 +18,76 @@ from motion_models.calibration.maneuvers import Batch, IntArray, Maneuver, make_
 from motion_models.calibration.prediction import predict
 from motion_models.friction import FrictionModel
 from motion_models.se2 import FloatArray
+
+_DROP = (0.4, 0.62)  # one of two encoders silent; the rate of a side is their mean
+_LEAST_RATE = 0.5  # rad/s
+REST_RATE_RAD_PER_S = 0.25  # rad/s
+_LONGEST_S = 3.0
+
+
+def find_dropouts(batch: Batch) -> FloatArray:
+    """(N, 2) what would have to be added to each rate, as a share of it: 1 where half of a side's counts are missing, else 0.
+
+    A spell begins where a side's rate falls to about half between two samples while the other's stays, and ends where it doubles.
+    """
+    found = np.zeros_like(batch.wheels)
+    for w in range(len(batch.first) - 1):
+        inside = slice(batch.first[w], batch.first[w + 1])
+        for side in (0, 1):
+            found[inside, side] = _spells(batch.wheels[inside, side], batch.wheels[inside, 1 - side], batch.dt[inside])
+    return found
+
+
+@numba.njit(cache=True)
+def _spells(rate: FloatArray, other: FloatArray, dt: FloatArray) -> FloatArray:
+    share = np.zeros_like(rate)
+    n = len(rate)
+    if n < 3:
+        return share
+    jumps = [(0, 0) for _ in range(0)]  # (index, +1 for a rise, -1 for a fall)
+    for i in range(1, n):
+        before, after = rate[i - 1], rate[i]
+        earlier, later = rate[max(i - 2, 0)], rate[min(i + 1, n - 1)]
+        if abs(other[i] - other[i - 1]) > 0.15 * max(abs(other[i]), _LEAST_RATE) or before * after <= 0.0:
+            continue
+        # a step between two samples, level on both sides of it: no wheel accelerates so
+        falls, rises = after / before, before / after
+        level = _like(before, earlier) and _like(after, later)
+        if level and abs(before) > _LEAST_RATE and _DROP[0] < falls < _DROP[1]:
+            jumps.append((i, -1))
+        elif level and abs(after) > _LEAST_RATE and _DROP[0] < rises < _DROP[1]:
+            jumps.append((i, 1))
+    # steps do not show while wheels hardly turn, so that every spell ends at a rest
+    rests = np.flatnonzero(np.abs(rate) < REST_RATE_RAD_PER_S)
+    spells = [(0, 0) for _ in range(0)]
+    start = -1  # none
+    if jumps and jumps[0][1] == 1:
+        resting = rests[rests < jumps[0][0]]
+        start = int(resting[-1]) + 1 if len(resting) else 0  # it was silent when the window began, or when the wheels began to turn
+    for i, kind in jumps:
+        if start >= 0:
+            spells.append((start, _until(rests, start, i)))
+        start = i if kind == -1 else -1
+    if start >= 0:
+        spells.append((start, _until(rests, start, n)))
+    for a, b in spells:
+        if dt[a:b].sum() < _LONGEST_S:
+            share[a:b] = 1.0
+    return share
+
+
+@numba.njit(cache=True)
+def _until(rests: IntArray, start: int, end: int) -> int:
+    """``end``, or the first rest between it and ``start``."""
+    between = rests[(rests > start) & (rests < end)]
+    return int(between[0]) if len(between) else end
+
+
+@numba.njit(cache=True)
+def _like(a: float, b: float) -> bool:
+    """Nearly the same rate."""
+    return abs(a - b) < 0.12 * max(abs(a), abs(b)) + 0.05
+
 
 CHANNELS = ("x", "y", "yaw", "gyro", "force_x", "force_y")
 CHANNEL_UNITS = ("m", "m", "rad", "rad", "m/s^2", "m/s^2")
@@ -31,7 +101,7 @@ _NO_COLUMNS: IntArray = np.empty(0, dtype=np.int64)
 class DrivePredictor:
     """Predicts a drive's motions with one model; discrepancies are measured minus predicted.
 
-    Causes of the floor act through the friction model whatever the model is: what they change there is added to what the model says.
+    Causes of the floor act through the friction model whatever the model is: what they change there is added to the model's prediction.
     ``has_inertia`` adds what constant-rate models leave out by their nature: inertia, and the load that accelerations shift.
     """
 
@@ -52,6 +122,7 @@ class DrivePredictor:
         self._lost_time = float((self._lost.max(axis=1) * rolls) @ self.batch.dt / max(float(rolls @ self.batch.dt), 1e-9))
         self.headings = self._headings()
         first, lead = self.batch.first, self.batch.lead
+        self._last = self.batch.ends[np.searchsorted(self.batch.owner, np.arange(len(first) - 1), side="right") - 1]
         self._times = np.empty(len(self.batch.dt))
         for w, start in enumerate(self.drive.starts_s):
             inside = slice(first[w], first[w + 1])
@@ -91,7 +162,7 @@ class DrivePredictor:
         return np.asarray(np.cumsum(yaw) - yaw)
 
     def _accelerations(self) -> FloatArray:
-        """(W, 2) mean of what accelerometers feel of the motion itself, by the wheels [m/s^2]."""
+        """(W, 2) mean specific force of the motion itself, by the wheels [m/s^2]."""
         batch = self.batch
         found = np.zeros((len(batch.first) - 1, 2))
         for w in range(len(found)):
@@ -163,12 +234,12 @@ class DrivePredictor:
         return dx + x - (c * x - s * y), dy + y - (s * x + c * y), yaw
 
     def corrected_twist(self, hypothesis: Hypothesis) -> FloatArray:
-        """(N, 3) what the model says of every interval once ``hypothesis`` is put in [m/s, m/s, rad/s]."""
+        """(N, 3) the model's twists in every interval under ``hypothesis`` [m/s, m/s, rad/s]."""
         changed = _HypothesisModel(self, hypothesis)
         return changed.twist(self.batch.wheels, self.batch.cg, changed.nominal).value
 
     def signature(self, hypothesis: Hypothesis, cause: Cause, base: FloatArray | None = None) -> FloatArray:
-        """(M, 6) change of the discrepancy per unit of ``cause`` around ``hypothesis``, where its sign says what correcting it removes."""
+        """(M, 6) change of the discrepancy per unit of ``cause`` around ``hypothesis``, with the sign of what a correction removes."""
         if cause.is_clock:
             step = 0.5 * cause.typical
             behind, ahead = (self.discrepancies(cause.inject(hypothesis, s)) for s in (-step, step))
@@ -198,10 +269,7 @@ class _HypothesisModel:
             rates = rates * (1.0 + b.wheel_radius_drift * p._times / max(float(p.drive.starts_s[-1]), 1e-9))[:, None]
         if b.encoder_loss:
             rates = rates * (1.0 + b.encoder_loss / max(p._lost_time, 1e-9) * p._lost)
-        key = (*self._rates_key(), "model")
-        if key not in p._twists:
-            p._twists[key] = p.model.twist(rates, cg, params).value
-        value = p._twists[key] + self._floor(rates, cg)
+        value = self._of_model(rates, cg, params) + self._floor(rates, cg)
         if any(b.rotation_coefficients):
             energy = 2.0 * np.maximum(np.sum(rates**2, axis=-1), 1e-12)
             straight = 1.0 - (rates[:, 1] - rates[:, 0]) ** 2 / energy
@@ -221,11 +289,21 @@ class _HypothesisModel:
         n, k = len(value), len(params)
         return Twist(np.ascontiguousarray(value), np.zeros((n, 3, 2)), np.zeros((n, 3, 2)), np.zeros((n, 3, k)))
 
+    def _of_model(self, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+        """(N, 3) by the motion model; cached, and without derivatives for the friction model."""
+        model, twists = self._p.model, self._p._twists
+        if isinstance(model, FrictionModel):
+            return self._quasi_static(model, rates, cg, params)
+        key = (*self._rates_key(), "model")
+        if key not in twists:
+            twists[key] = model.twist(rates, cg, params).value
+        return twists[key]
+
     def _floor(self, rates: FloatArray, cg: FloatArray) -> FloatArray:
-        """(N, 3) what the friction model says is otherwise: causes of the floor, and inertia."""
+        """(N, 3) change of the friction model's twists by causes of the floor, and by inertia."""
         p, b = self._p, self._b
-        is_otherwise = b.friction or any(b.cg) or b.payload_kg or b.friction_change or b.other_contact_law or b.split_friction
-        if not (is_otherwise or any(b.slope) or p.has_inertia):
+        is_changed = b.friction or any(b.cg) or b.payload_kg or b.friction_change or b.other_contact_law or b.split_friction
+        if not (is_changed or any(b.slope) or p.has_inertia):
             return np.zeros((len(rates), 3))
         friction = p._friction
         params = friction.nominal.copy()
@@ -299,7 +377,7 @@ class _HypothesisModel:
             x, y = params[TRACKED[0]], params[TRACKED[1]]
             middle = settled + settled[:, 2:] * np.array([y, -x, 0.0])
             batch = p.batch
-            drive = ManeuverSamples(batch.dt, rates, cg, batch.first, p.headings, np.array(b.slope))
+            drive = ManeuverSamples(batch.dt, rates, cg, batch.first, p._last, p.headings, np.array(b.slope))
             twists = dynamic_twists(p.drive.robot, law, params, drive, middle)
             p._twists[key] = np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
         return p._twists[key]

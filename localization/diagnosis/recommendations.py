@@ -1,4 +1,4 @@
-"""Experiment design: the short maneuver in which the causes that explain a drive alike predict most differently."""
+"""Experiment design: the short maneuver in which the causes that explain a drive equally well predict most differently."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def candidate_maneuvers(speed: float, radius: float, cg: FloatArray, has_arms: b
 
 
 def separating_drive(predictor: DrivePredictor, findings: Sequence[Finding], linearization: Any, chosen: tuple[int, ...]) -> str:
-    """In words; empty where nothing is left to tell apart."""
+    """In words; empty where nothing is left to separate."""
     rivals = [f for f in findings if f.aliases]
     if not rivals:
         return ""
@@ -105,7 +105,7 @@ def _named(name: str) -> Cause | None:
 
 
 def general_advice(verdict: str, blind: Sequence[str]) -> str:
-    """What to drive where the drive itself is what lacks."""
+    """What to drive where the drive itself shows too little."""
     if verdict == "undecidable":
         return (
             "Record two minutes with LiDAR and IMU: 20 s straight on and back, 20 s of turning in place to each side, gentle arcs to both "

@@ -1,24 +1,153 @@
-"""The search_causes for causes: sets by evidence on their signatures, and the best of them by the predictor itself."""
+"""Which causes: best subsets by evidence on their signatures, tests corrected for their number, and the best sets by full prediction."""
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 
 from localization.diagnosis.causes import Cause
-from localization.diagnosis.linearization import Linearization, group_of, make_regression
+from localization.diagnosis.findings import Gain
+from localization.diagnosis.linearization import Linearization, Noise, Regression, group_of, make_regression
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
-from localization.diagnosis.subset_selection import MOST_CAUSES, rank_subsets, signature_correlation
 from motion_models.errors import CgError, ModelError
 from motion_models.se2 import FloatArray
 
-_MIN_ALIAS_CORRELATION = 0.7  # signatures less alike than this are no aliases, however short the drive
+MOST_CAUSES = 7
+_MANY = 1500  # as many numbers must be measured for sets of more than _FEW causes
+_FEW = 4
+_DRAWS = 4000
+_KEPT = 12
+_BLOCK_WINDOWS, _FOLDS, _BOOTSTRAP_DRAWS = 4, 5, 1000
+
+
+def cost(problem: Regression, groups: list[str], subset: tuple[int, ...]) -> float:
+    """Twice the negative log-odds of ``subset`` against naming nothing: every number of causes is as likely as the next, and so are all
+    sets of one number (the prior of the extended BIC of Chen & Chen 2008, with gamma = 1)."""
+    k = len(subset)
+    return 2.0 * math.log(math.comb(len(set(groups)), k)) + k * math.log(max(problem.count, 2)) - problem.gain(subset)
+
+
+def rank_subsets(problem: Regression, groups: list[str], allowed: FloatArray, kept: int = _KEPT) -> list[tuple[float, tuple[int, ...]]]:
+    """The best sets of causes by `cost`, best first, the empty one among them. Causes of one group exclude each other; ``allowed`` (p, 2)
+    bounds sizes in own units."""
+    p = len(groups)
+
+    def fits(subset: tuple[int, ...]) -> bool:
+        if len({groups[i] for i in subset}) < len(subset):
+            return False
+        sizes = problem.fit(subset)[0]
+        return all(allowed[i, 0] <= size <= allowed[i, 1] for i, size in zip(subset, sizes, strict=True))
+
+    found: list[tuple[float, tuple[int, ...]]] = [(0.0, ())]
+    layer: list[tuple[int, ...]] = [()]
+    for k in range(1, (MOST_CAUSES if problem.count >= _MANY else _FEW) + 1):
+        # all pairs; beyond that, what extends the best sets of the size before
+        tried = (
+            set(itertools.combinations(range(p), k)) if k <= 2 else {tuple(sorted({*s, i})) for s in layer for i in range(p) if i not in s}
+        )
+        scored = sorted((cost(problem, groups, s), s) for s in tried if len({groups[i] for i in s}) == k)
+        best = list(itertools.islice(((c, s) for c, s in scored if fits(s)), kept))
+        found += best
+        layer = [s for _, s in best]
+        if not layer or found[-len(layer)][0] > min(c for c, _ in found) + 30.0:
+            break
+    return sorted(found)
+
+
+def max_statistic(problem: Regression, given: tuple[int, ...], rng: np.random.Generator, df: float, among: int | None = None) -> FloatArray:
+    """(draws,) largest |t| over all causes (or the first ``among``) not ``given`` that noise alone would show, as correlated as their
+    signatures are."""
+    left = [i for i in range(len(problem.moment) if among is None else among) if i not in given]
+    cov = problem.scores(given, left)[1]
+    sigma = np.sqrt(np.maximum(np.diag(cov), 1e-12))
+    is_observable = np.diag(cov) > 1e-6
+    correlation = cov[np.ix_(is_observable, is_observable)] / np.outer(sigma[is_observable], sigma[is_observable])
+    if not is_observable.any():
+        return np.zeros(_DRAWS)
+    values, vectors = np.linalg.eigh(correlation)
+    draws = rng.standard_normal((_DRAWS, int(is_observable.sum()))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    draws /= np.sqrt(rng.chisquare(df, size=(_DRAWS, 1)) / df)
+    return np.asarray(np.abs(draws).max(axis=1))
+
+
+def statistic(problem: Regression, given: tuple[int, ...], cause: int) -> float:
+    """t of ``cause`` beside those ``given``."""
+    score, cov = problem.scores(given, [cause])
+    return float(score[0] / math.sqrt(max(float(cov[0, 0]), 1e-12)))
+
+
+def statistics(problem: Regression, given: tuple[int, ...], wanted: list[int]) -> FloatArray:
+    """(n,) t of each of the ``wanted`` causes beside those ``given``, without the other wanted ones."""
+    score, cov = problem.scores(given, wanted)
+    return np.asarray(score / np.sqrt(np.maximum(np.diagonal(cov), 1e-12)))
+
+
+def p_value(t: float, draws: FloatArray, df: float) -> float:
+    """Family-wise; beyond the ``draws`` (of ``df`` degrees of freedom) by the tail that their upper part has."""
+    above = float(np.mean(draws >= abs(t)))
+    if above >= 20.0 / len(draws):
+        return above
+    q = df * np.log1p(np.quantile(draws, [0.9, 0.99]) ** 2 / df)  # in which tails of Student's t are straight
+    slope = math.log(10.0) / max(q[1] - q[0], 1e-9)
+    return float(min(0.01 * math.exp(-slope * (df * math.log1p(t**2 / df) - q[1])), 1.0))
+
+
+def signature_correlation(problem: Regression, given: tuple[int, ...], a: int, b: int) -> float:
+    """Correlation of two signatures once those ``given`` are taken out of both."""
+    cov = problem.scores(given, [a, b])[1]
+    return float(cov[0, 1] / math.sqrt(max(float(cov[0, 0] * cov[1, 1]), 1e-18)))
+
+
+def heldout_gain(
+    linear: FloatArray,
+    signatures: FloatArray,
+    nuisances: FloatArray,
+    noise: Noise,
+    scale: FloatArray,
+    chosen: tuple[int, ...],
+    others: tuple[int, ...],
+    rng: np.random.Generator,
+) -> Gain:
+    """Root mean square of held-out whitened discrepancies by ``others`` and by ``chosen``; folds are of blocks of 4 windows."""
+    squares = [heldout_squares(linear, signatures, nuisances, noise, scale, subset) for subset in (others, chosen)]
+    n = len(linear)
+    block = np.arange(n) // _BLOCK_WINDOWS
+    counts = np.bincount(block, weights=np.isfinite(linear).sum(axis=1))
+    sums = [np.bincount(block, weights=s) for s in squares]
+    rms = [float(np.sqrt(s.sum() / counts.sum())) for s in sums]
+    draws = rng.multinomial(len(counts), np.full(len(counts), 1.0 / len(counts)), size=_BOOTSTRAP_DRAWS)
+    before, after = (np.sqrt((draws @ s) / np.maximum(draws @ counts, 1.0)) for s in sums)
+    low, high = np.quantile(1.0 - after / np.maximum(before, 1e-12), [0.025, 0.975])
+    return Gain(rms[0], rms[1], 1.0 - rms[1] / max(rms[0], 1e-12), float(low), float(high))
+
+
+def heldout_squares(
+    linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, noise: Noise, scale: FloatArray, subset: tuple[int, ...]
+) -> FloatArray:
+    """(M,) sum of squares of each window."""
+    y = noise.whiten(linear)
+    columns = [noise.whiten(signatures[..., list(subset)]) * scale[list(subset)], noise.whiten(nuisances) * 1e3]
+    design = np.concatenate(columns, axis=-1)
+    fold = (np.arange(len(y)) // _BLOCK_WINDOWS) % _FOLDS
+    out = np.zeros(len(y))
+    for f in range(_FOLDS):
+        held = fold == f
+        if not held.any() or held.all():
+            continue
+        a = design[~held].reshape(-1, design.shape[-1])
+        x = np.linalg.solve(a.T @ a + np.eye(a.shape[1]), a.T @ y[~held].ravel())
+        out[held] = np.sum((y[held] - design[held] @ x) ** 2, axis=1)
+    return out
+
+
+_MIN_ALIAS_CORRELATION = 0.7  # signatures that correlate less than this are no aliases, however short the drive
 _ALIAS_LOG_ODDS = 7.0  # twice the log-likelihood by which a rival may be worse: odds of 1 to 33
-_ALIAS_SHARE = 0.02  # or this share of what the cause explains, which no model is right about
-_REFINED_SETS = 2  # sets of each number of causes that are tried for real
+_ALIAS_SHARE = 0.02  # or this share of what the cause explains: accuracy of the model
+_REFINED_SETS = 2  # sets of each number of causes that are tried by full prediction
 _MAX_MISSING_SHARE = 0.1  # share of what signatures promise that may be missing
-_FEW_CAUSES, _EXTRA_SETS = 2, 4  # then so many sets of up to so many causes are tried whatever signatures say
+_FEW_CAUSES, _EXTRA_SETS = 2, 4  # then so many sets of up to so many causes are tried by full prediction
 _NEAR_LOG_EVIDENCE = 30.0
 _CLEAR_LOG_EVIDENCE = 200.0  # lead in twice the log-evidence that needs no trial
 _MAX_STEPS = 4
@@ -85,7 +214,7 @@ def aliases_of(predictor: DrivePredictor, linearization: Linearization, chosen: 
     costs = []
     for _, j in found.values():
         sizes, cost = _refined_cost(predictor, linearization, _linear_sizes(linearization, (*others, j)))
-        if cost - best <= tolerance:
+        if cost - best <= tolerance and abs(sizes[causes[j]]) <= causes[j].largest_plausible:
             costs.append((cost, causes[j].id, sizes[causes[j]]))
     return tuple((name, size) for _, name, size in sorted(costs))
 

@@ -10,7 +10,7 @@ import numpy as np
 from localization.diagnosis.causes import CAUSES, MISSING_MESSAGES, WINDOW_CAUSES, Cause
 from localization.diagnosis.drive import MessageLoss, StandstillTurn
 from localization.diagnosis.findings import Component, Diagnosis, Finding
-from localization.diagnosis.noise import Noise
+from localization.diagnosis.linearization import Noise
 from localization.diagnosis.prediction import CHANNELS
 from localization.diagnosis.verdict import MAX_NOISE_OVER_REFERENCE
 from motion_models.se2 import FloatArray
@@ -65,6 +65,8 @@ def describe_row(row: Component) -> str:
     by = ", ".join(f"{a.cause} {100 * a.share:.0f} %" for a in row.attributions)
     if row.status == "unexplained" and row.noise_over_reference > MAX_NOISE_OVER_REFERENCE:
         return f"unexplained: the noise is {row.noise_over_reference:.1f} times the reference's own"
+    if row.trend:
+        return f"unexplained: follows {row.trend}" + (f" beside {by}" if by else "")
     if row.status == "unexplained":
         return f"unexplained ({by} and no more)" if by else "unexplained"
     return f"{by} (within tolerance)" if row.status == "within tolerance" else by
@@ -87,7 +89,7 @@ def _unit_of(name: str) -> str:
 
 
 def sentence(d: Diagnosis) -> str:
-    """One sentence to act on."""
+    """What to do, in one or two sentences: nothing is corrected beside sizes that no robot has, or that a trend contests."""
     contradiction = f" {d.contradictions[0][0].upper()}{d.contradictions[0][1:]}" if d.contradictions else ""
     if d.verdict == "undecidable":
         return f"This drive cannot show what is wrong with {d.model}. {d.next_drive}{contradiction}"
@@ -95,16 +97,16 @@ def sentence(d: Diagnosis) -> str:
         text = f"Nothing beyond tolerances is wrong with {d.model} on this drive that {d.windows} windows could show"
         tolerated = describe_tolerated(d)
         return text + (f"; within tolerance: {', '.join(tolerated)}." if tolerated else ".")
-    if not d.findings:
-        left = _left(d)
-        text = f"{d.model} is wrong here, but not in a way that has a name: {left}." if left else ""
-        return (text + contradiction).strip()
     estimated = [f for f in d.findings if f.cause != MISSING_MESSAGES.id]
+    if any(t.instead_of for t in d.trends) or not all(f.is_plausible for f in estimated):
+        estimated = []
     missing = [f"{f.description} ({f.evidence})" for f in d.findings if f.cause == MISSING_MESSAGES.id]
-    parts = ([_correction(d, estimated)] if estimated else []) + missing
-    if d.verdict == "unexplained" and _left(d):
-        parts.append(f"Something without a name is left: {_left(d)}")
-    return ". ".join(part[0].upper() + part[1:] for part in parts) + "." + contradiction
+    parts = [f"{part[0].upper()}{part[1:]}" for part in ([_correction(d, estimated)] if estimated else []) + missing]
+    left = _left(d) if d.verdict == "unexplained" else ""
+    if left:
+        unnamed = "Something without a name is left" if parts else f"{d.model} is wrong here, but not in a way that has a name"
+        parts.append(f"{unnamed}: {left}")
+    return (". ".join(parts) + "." * bool(parts) + contradiction).strip()
 
 
 def _correction(d: Diagnosis, findings: Sequence[Finding]) -> str:
@@ -124,9 +126,9 @@ def _left(d: Diagnosis) -> str:
     """What no cause accounts for: trends, else rows of the table."""
     if d.trends:
         return d.trends[0].text
-    implausible = [f"{f.cause} {f.size:+.2g} is more than robots have" for f in d.findings if not f.is_plausible]
+    implausible = [f"{f.cause} {f.size:+.2g}" for f in d.findings if not f.is_plausible]
     if implausible:
-        return f"what is named here stands for something else ({'; '.join(implausible)})"
+        return f"{' and '.join(implausible)} would fit, but are more than robots have"
     rows = [
         f"{name} {row.unattributed_rms:.2g} {row.unit}, noise {row.expected_rms:.2g}, {describe_row(row).removeprefix('unexplained: ')}"
         for name, row in d.discrepancy.items()

@@ -1,8 +1,10 @@
-"""From sizes to a verdict: the causes behind every significant row of the table of discrepancies, and whether they account for it."""
+"""From sizes to a verdict: trends that no cause has, the causes behind every significant row of the table, and what is left of it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,22 +12,161 @@ from scipy.stats import chi2
 
 from localization.diagnosis.causes import Cause
 from localization.diagnosis.findings import Attribution, Component, Finding, Trend, Verdict
-from localization.diagnosis.linearization import Linearization
-from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS
-from localization.diagnosis.subset_selection import MAX_TOLERANCE_SIGMAS
+from localization.diagnosis.linearization import MAX_TOLERANCE_SIGMAS, Linearization, Noise, regression
+from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, DrivePredictor
+from localization.diagnosis.selection import max_statistic, p_value, statistics
+from motion_models.calibration.maneuvers import IntArray
 from motion_models.se2 import FloatArray
+
+_SIGNIFICANT = 0.01
+_COMPONENTS = 3
+_LEAD_LOG_ODDS = 7.0  # twice the log-likelihood by which a trend must be better than a cause, beside the choice among trends: odds of 33
+_LEAD_SHARE = 0.05  # or this share of what the cause explains: accuracy of its signature
+_MIN_VARIANCE = 0.01  # of what is left of a channel, over the noise's
+
+
+def features(predictor: DrivePredictor) -> dict[str, FloatArray]:
+    """Trends by name, each (M,) a number per measured pose."""
+    batch = predictor.batch
+    twist, cg = predictor._base, batch.cg
+    rows: list[list[float]] = []
+    for end, owner in zip(batch.ends, batch.owner, strict=True):
+        a = batch.first[owner] + batch.lead[owner]
+        t, dt = twist[a:end], batch.dt[a:end]
+        v, w = t[:, 0], t[:, 2]
+        whole = dt.sum()
+        heading = predictor.headings[owner]
+        clock = predictor.drive.starts_s[owner]
+        driven, turned = float(v @ dt), float(w @ dt)
+        x, y = float(cg[a:end, 0] @ dt / whole), float(cg[a:end, 1] @ dt / whole)
+        rows.append(
+            [
+                *(whole, driven, abs(driven), turned, abs(turned)),
+                *(float((v * w) @ dt), float((v * np.abs(w)) @ dt), float((np.abs(v) * w) @ dt), float((w * np.abs(w)) @ dt)),
+                *(float((v * np.abs(v)) @ dt), turned * x, turned * y, abs(turned) * x, abs(turned) * y, driven * x, driven * y),
+                *(clock, clock * driven, clock * turned, np.cos(heading) * whole, np.sin(heading) * whole),
+                *(np.cos(heading) * driven, np.sin(heading) * driven, np.cos(heading) * turned, np.sin(heading) * turned),
+                *(float(v[-1] - v[0]), float(w[-1] - w[0])),
+            ]
+        )
+    names = (
+        *("time that passes", "distance", "distance either way", "turning", "turning either way"),
+        *("v wz", "v |wz|", "|v| wz", "wz |wz|"),
+        *("v |v|", "turning x CG x", "turning x CG y", "turning either way x CG x", "turning either way x CG y"),
+        *("distance x CG x", "distance x CG y"),
+        *("time into the drive", "distance x time into the drive", "turning x time into the drive"),
+        *("heading (cosine)", "heading (sine)", "distance x heading (cosine)", "distance x heading (sine)"),
+        *("turning x heading (cosine)", "turning x heading (sine)", "gain in speed", "gain in turning rate"),
+    )
+    table = np.array(rows)
+    return {name: table[:, i] for i, name in enumerate(names) if np.ptp(table[:, i]) > 1e-9 or i == 0}
+
+
+def find_trends(
+    predictor: DrivePredictor,
+    noise: Noise,
+    left: FloatArray,
+    signatures: FloatArray,
+    nuisances: FloatArray,
+    spreads: FloatArray,
+    rng: np.random.Generator,
+) -> tuple[tuple[Trend, ...], float]:
+    """Significant trends of ``left`` (M, 6), strongest first, beyond what causes of ``signatures`` (M, 6, p) make within their ``spreads``
+    (p,) and ``nuisances`` (M, 6, q) at any size; and twice the log-likelihood that they would gain."""
+    trends, names = _trend_columns(predictor, left)
+    y = noise.whiten(left).ravel()
+    s = noise.whiten(np.concatenate([trends, signatures], axis=-1)).reshape(len(y), -1)
+    z = noise.whiten(nuisances).reshape(len(y), -1)
+    n = len(names)
+    scale = np.r_[np.ones(n), spreads]
+    problem = regression(y, s, z, scale, np.r_[np.zeros(n), spreads])
+    whitened = noise.whiten(left)
+    rest = np.column_stack([np.sum(whitened**2, axis=0), np.isfinite(left).sum(axis=0)]).astype(float)  # squares and degrees of freedom
+    t_channels = np.array([CHANNELS.index(channel) for channel, _ in names])
+    given: tuple[int, ...] = ()
+    result = []
+    gained = 0.0
+    for _ in range(3):
+        t = np.zeros(n)
+        free = [i for i in range(n) if i not in given]
+        t[free] = statistics(problem, given, free) / _residual_sigmas(rest, t_channels[free], statistics(problem, given, free))
+        best = int(np.argmax(np.abs(t)))
+        freedom = max(min(noise.freedom, rest[t_channels[best], 1] - 1.0), 1.0)
+        p = p_value(float(t[best]), max_statistic(problem, given, rng, freedom, n), freedom)
+        if p > _SIGNIFICANT:
+            break
+        rest[t_channels[best], 0] -= float(statistics(problem, given, [best])[0]) ** 2
+        rest[t_channels[best], 1] -= 1.0
+        gained += float(t[best]) ** 2
+        result.append(Trend(*names[best], float(t[best]), p, abs(float(t[best])) / math.sqrt(len(left))))
+        given = (*given, best)
+    return tuple(result), gained
+
+
+def find_better_trends(predictor: DrivePredictor, linearization: Linearization, chosen: tuple[int, ...]) -> tuple[Trend, ...]:
+    """Trends that explain the drive better than one of the causes ``chosen`` does in its place, or than all of several.
+
+    Where a cause of the catalogue is at work, no shape without a cause fits better but by chance: both are compared by their likelihood
+    ratio against the other causes, beyond what so many trends gain by chance and the accuracy of signatures. In place of several causes a
+    trend is simpler, and is preferred where it fits as well.
+    """
+    trends, names = _trend_columns(predictor, linearization.linear)
+    y = linearization.noise.whiten(linearization.linear).ravel()
+    s = linearization.noise.whiten(np.concatenate([trends, linearization.signatures], axis=-1)).reshape(len(y), -1)
+    z = linearization.noise.whiten(linearization.nuisances).reshape(len(y), -1)
+    n, spreads = len(names), linearization.problem.scale
+    problem = regression(y, s, z, np.r_[np.ones(n), spreads], np.r_[np.zeros(n), spreads * linearization.problem.tolerance])
+    found = []
+    for replaced in ([i] for i in chosen) if len(chosen) < 2 else (*([i] for i in chosen), list(chosen)):
+        others = tuple(n + j for j in chosen if j not in replaced)
+        score, cov = problem.scores(others, [n + i for i in replaced])
+        own = float(score @ np.linalg.solve(cov + 1e-9 * np.eye(len(replaced)), score))
+        t = statistics(problem, others, list(range(n)))
+        best = int(np.argmax(np.abs(t)))
+        lead = float(t[best]) ** 2 - own
+        margin = max(_LEAD_LOG_ODDS + 2.0 * math.log(n), _LEAD_SHARE * own) if len(replaced) == 1 else 0.0
+        if lead > margin:
+            p = min(1.0, n * float(chi2.sf(max(lead, 0.0), 1)))
+            names_replaced = " and ".join(dict.fromkeys(linearization.causes[i].id for i in replaced))
+            over = math.sqrt(lead / len(linearization.rows))
+            found.append(Trend(*names[best], float(t[best]), p, over, names_replaced))
+    return tuple(found)
+
+
+def _trend_columns(predictor: DrivePredictor, rows: FloatArray) -> tuple[FloatArray, list[tuple[str, str]]]:
+    """(M, 6, n) trends of unit root mean square, each in one component of the motion, and their components and names."""
+    columns, names = [], []
+    for channel in range(_COMPONENTS):
+        if not np.isfinite(rows[:, channel]).any():
+            continue
+        for name, values in features(predictor).items():
+            column = np.zeros(rows.shape)
+            column[:, channel] = values / max(float(np.sqrt(np.mean(values**2))), 1e-12)
+            columns.append(np.where(np.isfinite(rows), column, np.nan))
+            names.append((CHANNELS[channel], name))
+    return np.stack(columns, axis=-1), names
+
+
+def _residual_sigmas(rest: FloatArray, channels: IntArray, t: FloatArray) -> FloatArray:
+    """(n,) standard deviation that is left of each trend's channel with the trend taken out, in units of the noise; at most 1.
+
+    Noise that was estimated while the trend was in it is too large. ``rest`` (6, 2) are each channel's squares and degrees of freedom.
+    """
+    squares, freedom = rest[channels].T
+    return np.asarray(np.sqrt(np.clip((squares - t**2) / np.maximum(freedom - 1.0, 1.0), _MIN_VARIANCE, 1.0)))
+
 
 MAX_LEFT_OVER_NOISE = 1.5
 """Root mean square that may be left of a row, over its noise: at 1.5 what has no cause is as large as the noise (1.5^2 = 1 + 1.1^2)."""
 MAX_NOISE_OVER_REFERENCE = 3.0
 """Noise of the drive, over that of the motion reference by its own covariance: up to 1.5 where nothing is hidden, 3.1 to 200 for effects
-that no cause has (`tests.helpers.diagnosis_unknown`)."""
+that no cause has (`tests.studies.unknown_effects --develop`)."""
 _MODEL_ACCURACY = 0.05  # of a row: what the signature of a named cause may be off, as at a slope of 0.05 rad (3 %)
 _MAX_TREND_OVER_NOISE = 0.5  # a trend of half the noise adds 12 % to the root mean square of a row
 _MIN_ATTRIBUTED_SHARE = 0.1  # of a row's squares, for a cause to be listed beside it
 _MAX_ATTRIBUTIONS = 3
 _MAX_TREND_SHARE = 0.3  # of twice the log-likelihood of all that can be predicted
-_OUTLIER_WEIGHT = 0.5  # of a window whose largest discrepancy is eight sigma (see `noise`)
+_OUTLIER_WEIGHT = 0.5  # of a window whose largest discrepancy is eight sigma (see `linearization.estimate_noise`)
 _MAX_OUTLIER_SHARE = 0.2
 _TESTED_CHANNELS = 4  # accelerometers only support the slope: their biases are unknown
 
@@ -55,7 +196,7 @@ def attribute_rows(
 ) -> dict[str, Component]:
     """Each channel over the whole drive but its outliers, with the causes that account for it; ``sizes`` (k,) of those ``chosen``.
 
-    ``reference_sigmas`` (M, 3) are those of the motion reference, inf where it measured nothing; None where they are not known.
+    ``reference_sigmas`` (M, 3) are those of the motion reference, inf where it measured nothing; None where they are not given.
     """
     regular = ~find_outliers(linearization)
     every = tolerated_sizes(linearization, chosen)
@@ -88,7 +229,7 @@ def attribute_rows(
 
 
 def _noise_excess(linearization: Linearization, reference_sigmas: FloatArray | None, known: NDArray[np.bool_], channel: int) -> float:
-    """Median of the estimated noise over that of the reference; 1 where the latter is not known."""
+    """Median of the estimated noise over that of the reference; 1 where the latter is not given."""
     if reference_sigmas is None or channel >= reference_sigmas.shape[1]:
         return 1.0
     given = reference_sigmas[known, channel]
@@ -115,15 +256,22 @@ def _attributed(
     return component.with_status("attributed" if any(a.is_named for a in by.values()) else "within tolerance", tuple(by.values()))
 
 
-def decide(
-    findings: Sequence[Finding], trends: Sequence[Trend], trend_share: float, rows: Sequence[Component], undetectable_share: float
-) -> Verdict:
-    """The verdict that the table shows: unexplained where a significant row or trend is left, or a size is not plausible, else by what was
-    named."""
-    if any(not f.is_plausible for f in findings):
-        return "unexplained"
-    is_left = any(row.status == "unexplained" for row in rows) or any(t.over_noise > _MAX_TREND_OVER_NOISE for t in trends)
-    if is_left or (trends and (not findings or trend_share > _MAX_TREND_SHARE)):
+def mark_trends(rows: Mapping[str, Component], trends: Sequence[Trend], trend_share: float, has_findings: bool) -> dict[str, Component]:
+    """The table, with rows as unexplained that follow a trend which no cause has; ``trend_share`` as `Diagnosis.left_share`.
+
+    Beside findings, trends that are less than the noise are within the accuracy of signatures.
+    """
+    found = dict(rows)
+    for trend in trends:
+        if trend.instead_of or trend.over_noise > _MAX_TREND_OVER_NOISE or not has_findings or trend_share > _MAX_TREND_SHARE:
+            row = found[trend.component]
+            found[trend.component] = dataclasses.replace(row, status="unexplained", trend=row.trend or trend.along)
+    return found
+
+
+def decide(findings: Sequence[Finding], rows: Sequence[Component], undetectable_share: float) -> Verdict:
+    """The verdict that the table shows: unexplained where a row is, or where a size is not plausible, else by what was named."""
+    if any(not f.is_plausible for f in findings) or any(row.status == "unexplained" for row in rows):
         return "unexplained"
     if any(f.aliases for f in findings):
         return "ambiguous"

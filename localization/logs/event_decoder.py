@@ -12,7 +12,10 @@ from localization.logs.clock_sync import Item
 from localization.logs.decode import (
     ArmReading,
     JointReading,
+    MessageStats,
+    Oddity,
     OdometryReading,
+    UnusableError,
     arm_decoder,
     decode_cg,
     decode_cloud,
@@ -22,12 +25,10 @@ from localization.logs.decode import (
     scan_decoder,
     stamp_ns,
 )
-from localization.logs.message_stats import MessageStats, Oddity, UnusableError
 from localization.logs.topic_roles import Sources, TopicSource
 from localization.logs.wheel_decoder import JointsToWheels, OdometryToWheels
-from motion_models.center_of_gravity.model import CgModel
+from motion_models.center_of_gravity.model import CgModel, CgTracker
 from motion_models.center_of_gravity.parts import support_margin
-from motion_models.center_of_gravity.tracker import CgTracker
 from motion_models.robot import Clock, Geometry, Robot
 
 _RANKS = {"joint_states": 0, "odometry": 0, "center_of_gravity": 1, "imu": 2, "scan": 3, "points": 3}

@@ -1,4 +1,4 @@
-"""`skidloc diagnose`: what it prints and writes, what it says where it cannot know, and what it says of input that is none."""
+"""`skidloc diagnose`: output and files, undecidable drives, and errors of invalid input."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DATA = Path(__file__).parents[1] / "data"
 GRID = DATA / "vaultbot" / "rotation_grid.csv"
 
 
-def test_a_table_becomes_findings_a_page_and_a_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_diagnose_table_writes_findings_page_and_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, again = tmp_path / "out", tmp_path / "again"
     assert main(["diagnose", str(GRID), "--robot", "vaultbot", "--out", str(out), "--json", str(tmp_path / "d.json")]) == 0
     printed = capsys.readouterr().out
@@ -34,7 +34,7 @@ def test_a_table_becomes_findings_a_page_and_a_robot(tmp_path: Path, capsys: pyt
         assert (out / name).read_bytes() == (again / name).read_bytes()
 
 
-def test_the_corrected_robot_has_less_to_correct(tmp_path: Path) -> None:
+def test_diagnose_corrected_robot_names_its_causes_no_more(tmp_path: Path) -> None:
     """The patch is in: under it, the floor's causes that were named are gone."""
     out, second = tmp_path / "out", tmp_path / "second.json"
     assert main(["diagnose", str(GRID), "--robot", "vaultbot", "--out", str(out)]) == 0
@@ -45,7 +45,7 @@ def test_the_corrected_robot_has_less_to_correct(tmp_path: Path) -> None:
     assert not {"diagonal_load", "track_width"} & after
 
 
-def test_a_corrected_robot_replays(tmp_path: Path) -> None:
+def test_replay_corrected_robot_has_smaller_error(tmp_path: Path) -> None:
     log = bag(tmp_path / "drive.mcap", {"wheel_radius_scale": 0.05}, 1, "husky_a200")
     out = tmp_path / "out"
     assert main(["diagnose", str(log), "--robot", "husky_a200", "--out", str(out)]) == 0
@@ -73,7 +73,7 @@ def test_diagnose_out_hands_radii_and_clock_to_diff_drive(tmp_path: Path, capsys
     assert "before and after" in (out / "diagnosis.html").read_text()
 
 
-def test_a_drive_without_a_witness_is_undecidable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_diagnose_without_motion_reference_is_undecidable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = bag(tmp_path / "drive.mcap", {}, 1, lidar="none", imu_hz=0.0)
     assert main(["diagnose", str(log), "--robot", "vaultbot", "--json", str(tmp_path / "d.json")]) == 0
     content = json.loads((tmp_path / "d.json").read_text())
@@ -82,7 +82,7 @@ def test_a_drive_without_a_witness_is_undecidable(tmp_path: Path, capsys: pytest
     assert "turning in place" in capsys.readouterr().out
 
 
-def test_a_table_that_is_too_short_is_undecidable(tmp_path: Path) -> None:
+def test_diagnose_short_table_is_undecidable(tmp_path: Path) -> None:
     short = tmp_path / "short.csv"
     short.write_text("\n".join(GRID.read_text().splitlines()[:5]) + "\n")
     out = tmp_path / "out"
@@ -92,7 +92,7 @@ def test_a_table_that_is_too_short_is_undecidable(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "empty"),
         ("window,dt_s\n1,0.1\n", "left_rad_per_s"),
@@ -101,20 +101,20 @@ def test_a_table_that_is_too_short_is_undecidable(tmp_path: Path) -> None:
         ("cg_x_m,cg_y_m,rotation_ratio\n0,0,1\n", "cor_x_m"),
     ],
 )
-def test_malformed_tables_are_refused_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str) -> None:
+def test_diagnose_malformed_table_exits_with_error(tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, message: str) -> None:
     table = tmp_path / "table.csv"
     table.write_text(text)
     assert main(["diagnose", str(table), "--robot", "vaultbot"]) == 2
-    complaint = capsys.readouterr().err
-    assert said in complaint
-    assert "Traceback" not in complaint
+    error = capsys.readouterr().err
+    assert message in error
+    assert "Traceback" not in error
 
 
-def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_diagnose_existing_out_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["diagnose", str(GRID), "--robot", "vaultbot", "--out", str(tmp_path)]) == 2
     assert "exists already" in capsys.readouterr().err
 
 
-def test_windows_that_are_no_length_of_time_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_diagnose_invalid_window_length_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["diagnose", str(tmp_path / "table.csv"), "--robot", "vaultbot", "--window-s", "nan"]) == 2
     assert "--window-s is nan; windows of 0.5 to 20 s make sense" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Blind diagnoses: the simulator, with its own physics, hides a cause in a bag; the diagnosis sees only the bag and the nominal robot."""
+"""Blind diagnoses: the simulator, with its own physics, hides a cause in a bag; the diagnosis gets only the bag and the nominal robot."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_diagnose_hidden_cause_is_named_with_its_size(diagnosed: Diagnosed, caus
     first = found.findings[0]
     named = {first.cause: first.size, **dict(first.aliases)}
     assert cause in named
-    # to a fifth, as a spell of silence is not exactly as long as its share says, or else within what the diagnosis itself claims
+    # to a fifth, as the lost share of a drive scatters about the nominal one, or within three of its own sigmas
     assert abs(named[cause] - size) < max(0.2 * abs(size), 3.0 * first.sigma)
     assert first.gain.relative > 0.05
     assert found.gain is not None
@@ -117,8 +117,8 @@ def test_diagnose_without_gyro_shows_clock_difference(diagnosed: Diagnosed) -> N
     assert sizes["wheel_time_offset"] == pytest.approx(-0.05, abs=0.01)
 
 
-def test_diagnose_turns_in_place_show_one_number(diagnosed: Diagnosed) -> None:
-    """How much less the robot turns: by its track, by the floor, or by scrubbing, who knows."""
+def test_diagnose_turns_in_place_are_ambiguous(diagnosed: Diagnosed) -> None:
+    """Track, floor and scrubbing all make the robot turn less: turns in place cannot separate them."""
     found = diagnosed({"track_width": 0.04}, 431, "husky_a200", "spin")
     assert found.verdict == "ambiguous"
     first = found.findings[0]

@@ -37,7 +37,7 @@ def of_rotations() -> Diagnosis:
     return diagnose(drive, make_model("friction", drive.robot))
 
 
-def test_the_thesis_tracked_a_point_ahead_of_the_wheelbase_and_stood_on_a_warped_chassis(of_rotations: Diagnosis) -> None:
+def test_diagnose_68_rotations_names_tracked_point_and_warp(of_rotations: Diagnosis) -> None:
     sizes = {f.cause: f.size for f in of_rotations.findings}
     assert of_rotations.findings[0].cause == "lidar_offset_x"
     assert sizes["lidar_offset_x"] == pytest.approx(0.065, abs=0.005)
@@ -54,7 +54,7 @@ def runs(contact: str) -> Diagnosis:
     return diagnose(drive, make_model("friction", robot))
 
 
-def test_the_84_runs_name_the_lateral_force_law_where_the_robot_file_has_the_thesis_law() -> None:
+def test_diagnose_84_runs_with_thesis_law_names_force_law() -> None:
     found = runs("thesis")
     assert found.windows == 84
     assert found.sentence.startswith("Correct lateral_force_law by")
@@ -62,7 +62,7 @@ def test_the_84_runs_name_the_lateral_force_law_where_the_robot_file_has_the_the
     assert found.findings[0].gain.low > 0.5
 
 
-def test_the_84_runs_do_not_ask_for_another_law_where_the_robot_file_has_the_isotropic_one() -> None:
+def test_diagnose_84_runs_with_isotropic_law_keeps_it() -> None:
     found = runs("isotropic")
     assert "lateral_force_law" not in {f.cause for f in found.findings} | {name for f in found.findings for name, _ in f.aliases}
     assert found.discrepancy["x"].rms < 0.75 * runs("thesis").discrepancy["x"].rms
@@ -77,20 +77,20 @@ def test_the_84_runs_do_not_ask_for_another_law_where_the_robot_file_has_the_iso
         ("arc_1,ready,skid_steer,", "line 2: vision_error_m must be a distance in metres, found ''"),
     ],
 )
-def test_a_run_that_cannot_be_read_is_named(tmp_path: Path, cell: str, message: str) -> None:
+def test_read_runs_invalid_cell_is_named(tmp_path: Path, cell: str, message: str) -> None:
     path = tmp_path / "runs.csv"
     path.write_text(f"trajectory,arm_configuration,controller,vision_error_m\n{cell}\n", encoding="utf-8")
     with pytest.raises(CalibrationError, match=message):
         read_runs(path)
 
 
-def test_neither_treads_nor_the_centre_of_gravity_explain_the_rotations(of_rotations: Diagnosis) -> None:
+def test_diagnose_68_rotations_names_neither_treads_nor_cg(of_rotations: Diagnosis) -> None:
     """Two of the thesis's own guesses; the third, rotational inertia, takes no part in a rotation at a constant rate."""
-    said = {f.cause for f in of_rotations.findings} | {name for f in of_rotations.findings for name, _ in f.aliases}
-    assert not said & {"tread_asymmetry", "cg_offset_x", "cg_offset_y", "lidar_yaw"}
+    named = {f.cause for f in of_rotations.findings} | {name for f in of_rotations.findings for name, _ in f.aliases}
+    assert not named & {"tread_asymmetry", "cg_offset_x", "cg_offset_y", "lidar_yaw"}
 
 
-def test_a_real_husky_turns_less_and_loses_way_on_tight_arcs() -> None:
+def test_diagnose_drive_husky_turns_less_and_slips_on_arcs() -> None:
     """Ends of a fifth of the windows; the whole is in the benchmark."""
     robot = drive_husky.robot()
     windows = drive_husky.maneuvers(mended=True)[::3]
@@ -103,13 +103,13 @@ def test_a_real_husky_turns_less_and_loses_way_on_tight_arcs() -> None:
     assert found.gain.low > 0.6
 
 
-def test_the_clock_between_a_huskys_wheels_and_its_gyro() -> None:
+def test_diagnose_husky_with_gyro_names_wheel_clock() -> None:
     robot = load_robot("husky_a200")
     drive = drive_of_log(open_log(DATA / "husky-outdoor-gps" / "test1.bag", robot))
     found = diagnose(drive, make_model("diff_drive", robot))
     clock = found.findings[0]
     assert clock.cause == "wheel_time_offset"
-    # a second way to it: shift the gyro's turns against the wheels' and see where they fit best
+    # a second way to it: shift the gyro's turns against the wheels' and take the best fit
     rates = np.concatenate([m.wheels[m.lead : m.lead + int(m.ends[-1])] for m in drive.maneuvers])
     assert np.abs(rates).max() > 1.0
     best = min(np.arange(-0.3, 0.31, 0.02), key=lambda late: _misfit(drive, float(late)))
@@ -130,8 +130,8 @@ def _misfit(drive: Drive, late_s: float) -> float:
     return float(np.median(np.abs(y - x * (x @ y) / (x @ x))[np.abs(x) > 0.3]))
 
 
-def test_what_is_corrected_is_not_found_again() -> None:
-    """A table of the same rotations, seen from where the LiDAR really is."""
+def test_diagnose_corrected_robot_is_not_corrected_again() -> None:
+    """A table of the same rotations, with the LiDAR where it really is."""
     drive = rotations()
     robot = drive.robot
     moved = dataclasses.replace(robot, models={**robot.models, "friction": {"tracked_x": 0.066}})
@@ -139,8 +139,8 @@ def test_what_is_corrected_is_not_found_again() -> None:
     assert "lidar_offset_x" not in {f.cause for f in found.findings}
 
 
-def test_what_clockwise_rotations_would_add() -> None:
-    """Treads, and little else: the warp is told from them already by how its traces change with the centre of gravity."""
+def test_diagnose_clockwise_rotations_separate_treads() -> None:
+    """Treads, and little else: the warp is separated from them by how its effect changes with the centre of gravity."""
     one, both = (known(rotations_driven(rates, 0)) for rates in ((0.3, 0.3), (0.3, -0.3)))
     better = {name: one.sigma[name] / both.sigma[name] for name in one.sigma}
     assert better.pop("tread_asymmetry") > 10.0
@@ -149,8 +149,8 @@ def test_what_clockwise_rotations_would_add() -> None:
         assert {f.cause for f in table.diagnosis.findings} == {"lidar_offset_x", "diagonal_load", "track_width"}
 
 
-def test_poses_and_wheels_of_a_real_husky_are_both_late() -> None:
-    """A clock between them is named; the gyro, which the diagnosis did not see, shows that both are late, and the wheels are more so."""
+def test_diagnose_drive_husky_clock_agrees_with_gyro() -> None:
+    """A clock between them is named; the gyro, which was no input, shows that both are late, the wheels more so."""
     robot = drive_husky.robot()
     windows = drive_husky.maneuvers(mended=True)
     found = diagnose(drive_of_table("husky", robot, windows, "windows"), make_model("diff_drive", robot))

@@ -7,7 +7,7 @@ import pytest
 from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES
 from localization.diagnosis.findings import Attribution, Component, Finding, Gain, RowStatus, Trend
 from localization.diagnosis.summary import describe_row
-from localization.diagnosis.verdict import decide
+from localization.diagnosis.verdict import decide, mark_trends
 
 GAIN = Gain(2.0, 1.0, 0.5, 0.4, 0.6)
 
@@ -20,8 +20,8 @@ def finding(cause: str = "track_width", size: float = 0.03, aliases: tuple[tuple
     return Finding(CAUSES[cause], size, 0.002, 1e-9, aliases, "", GAIN)
 
 
-def trend(over_noise: float) -> Trend:
-    return Trend("yaw", "turning", 10.0, 1e-6, over_noise)
+def trend(over_noise: float, instead_of: str = "") -> Trend:
+    return Trend("yaw", "turning", 10.0, 1e-6, over_noise, instead_of)
 
 
 @pytest.mark.parametrize(
@@ -34,6 +34,7 @@ def trend(over_noise: float) -> Trend:
         ((finding(),), (), (row("attributed"), row("unexplained")), "unexplained"),
         ((finding(),), (trend(0.2),), (row("attributed"),), "explained"),
         ((finding(),), (trend(0.8),), (row("attributed"),), "unexplained"),
+        ((finding(),), (trend(0.2, "track_width"),), (row("attributed"),), "unexplained"),
         ((finding(aliases=(("scrub", 0.02),)),), (), (row("attributed"),), "ambiguous"),
         ((finding(size=0.25),), (), (row("attributed"),), "unexplained"),
     ],
@@ -41,11 +42,17 @@ def trend(over_noise: float) -> Trend:
 def test_decide_table_gives_verdict(
     findings: tuple[Finding, ...], trends: tuple[Trend, ...], rows: tuple[Component, ...], verdict: str
 ) -> None:
-    assert decide(findings, trends, 0.0, rows, 0.0) == verdict
+    table = {"yaw": rows[0], **{str(i): row for i, row in enumerate(rows[1:])}}
+    assert decide(findings, tuple(mark_trends(table, trends, 0.0, bool(findings)).values()), 0.0) == verdict
 
 
 def test_decide_few_detectable_causes_is_undecidable() -> None:
-    assert decide((), (), 0.0, (row("noise"),), 0.8) == "undecidable"
+    assert decide((), (row("noise"),), 0.8) == "undecidable"
+
+
+def test_mark_trends_contested_finding_makes_row_unexplained() -> None:
+    marked = mark_trends({"yaw": row("attributed")}, (trend(0.2, "track_width"),), 0.0, True)["yaw"]
+    assert describe_row(marked) == "unexplained: follows turning beside gyro_bias 90 %"
 
 
 def test_describe_row_tolerated_names_cause_and_share() -> None:

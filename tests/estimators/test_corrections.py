@@ -15,13 +15,15 @@ from localization.pipeline import Pipeline, Trial
 from localization.step import Step
 from motion_models import se2
 from motion_models.base import Motion
+from motion_models.corrected import CorrectedFriction
 from motion_models.errors import CgError, ModelError
-from motion_models.friction import CorrectedFriction, FrictionModel
+from motion_models.friction import FrictionModel
 from motion_models.online_calibration import check_forms, correctable, corrections
 from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import WheelNoise, load_robot
 from motion_models.se2 import between, log
+from tests.helpers.motion_models import assert_one_agrees, differences, some_drive, some_params
 from tests.helpers.synthetic_steps import (
     DT,
     Noise,
@@ -37,7 +39,6 @@ from tests.helpers.synthetic_steps import (
     straight,
     weave,
 )
-from tests.motion_models.test_model_laws import assert_one_agrees, differences, some_drive, some_params
 
 ROBOT = load_robot("vaultbot")
 OFFSET = "mu_ratio+cg_offset_x+cg_offset_y"

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from localization.estimate_table import EstimateTable, trajectory
 from localization.estimators import Estimate
+from localization.estimators.base import EstimateTable, trajectory
 from localization.estimators.graph_fusion import _interpolate, _subtract_information
 from localization.evaluation.consistency import nees
 from localization.events import PositionSample, Scan, WheelSample

@@ -17,7 +17,7 @@ from localization.diagnosis.causes import CAUSES, Cause, friction_change
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.linearization import Linearization
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
-from localization.diagnosis.subset_selection import heldout_gain, heldout_squares
+from localization.diagnosis.selection import heldout_gain, heldout_squares
 from motion_models.se2 import FloatArray
 
 NONE = "nothing"

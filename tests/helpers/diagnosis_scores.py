@@ -1,13 +1,14 @@
-"""From the benchmark's rows to its tables and its picture. `python -m tests.helpers.diagnosis_scores ROWS.csv PICTURE.png`."""
+"""From the rows of the diagnosis benchmark to its tables and its picture.
+
+`python -m tests.helpers.diagnosis_scores ROWS.jsonl PICTURE.png [A:B]`
+"""
 
 from __future__ import annotations
 
-import csv
 import json
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,63 +18,53 @@ from localization.report import figures
 from tests.helpers.diagnosis_drives import TYPICAL
 from tests.helpers.diagnosis_rivals import NONE
 
-COLUMNS = ("key", "kind", "truth", "alike", "verdict", "findings", "seconds", "rivals", "gain", "oracle", "significance", "rms")
+Row = dict[str, Any]
 STRONG = 3.0
-METHODS = ("diagnosis", "stepwise", "stlsq", "gp", "noise")
+_CONFIDENT = ("explained", "ambiguous")
 
 
-@dataclass(frozen=True)
-class Row:
-    """One case, as read."""
-
-    kind: str
-    verdict: str
-    truth: dict[str, float]
-    alike: tuple[str, ...]
-    findings: list[dict[str, Any]]
-    rivals: dict[str, tuple[str, float]]
-    gain: float
-    oracle: float
-    significance: float
-    """The weakest hidden cause's; inf for a cause that the drive should show and whose traces were not found."""
-    rms: float
-    """Of the weakest hidden cause over its channels' noise, in the channel where it shows most."""
-    seconds: float
-
-    @property
-    def first(self) -> str:
-        return self.findings[0]["cause"] if self.findings else NONE
-
-    @property
-    def open(self) -> set[str]:
-        """The first finding and its aliases."""
-        return {self.first, *self.findings[0]["aliases"]} if self.findings else {NONE}
-
-    @property
-    def said(self) -> set[str]:
-        return {name for f in self.findings for name in (f["cause"], *f["aliases"])}
-
-    @property
-    def cause(self) -> str:
-        return next(iter(self.truth), NONE)
+def significance(row: Row) -> float:
+    """Of the weakest hidden cause; inf for one that the drive does not show at all."""
+    return min((np.inf if s is None else s for s in row.get("significance", {}).values()), default=0.0)
 
 
-def read(path: Path) -> list[Row]:
-    with path.open(newline="") as file:
-        return [_row(r) for r in csv.DictReader(file)]
+def is_beyond_tolerance(row: Row) -> bool:
+    """Whether every hidden cause is larger than what robot files and mounts are accurate to, which is never named."""
+    return all(abs(size) > (row["tolerated"][name] or 0.0) for name, size in row["truth"].items())
 
 
-def _row(r: dict[str, str]) -> Row:
-    strengths = json.loads(r["significance"] or "{}").values()
-    return Row(
-        *(r["kind"], r["verdict"], json.loads(r["truth"]), tuple(json.loads(r["alike"])), json.loads(r["findings"])),
-        rivals={name: (said, gain) for name, (said, gain) in json.loads(r["rivals"] or "{}").items()},
-        gain=float(r["gain"] or 0.0),
-        oracle=float(r["oracle"] or 0.0),
-        significance=min((np.inf if s is None else s for s in strengths), default=0.0),
-        rms=min((np.inf if s is None else s for s in json.loads(r["rms"] or "{}").values()), default=0.0),
-        seconds=float(r["seconds"]),
-    )
+def names_of(finding: dict[str, Any]) -> set[str]:
+    """The finding and its aliases."""
+    return {finding["cause"], *finding["aliases"]}
+
+
+def is_named(row: Row, cause: str) -> bool:
+    return any(cause in names_of(f) for f in row["findings"])
+
+
+def is_first(row: Row) -> bool:
+    """Whether the hidden cause is the first finding or one of its aliases."""
+    return bool(row["findings"]) and bool(names_of(row["findings"][0]) & set(row["truth"]))
+
+
+def is_wrong(row: Row) -> bool:
+    """A verdict with names, none of which is hidden, nor the alias of one."""
+    return row["verdict"] in _CONFIDENT and not any(is_named(row, cause) for cause in row["truth"])
+
+
+def has_extra_name(row: Row) -> bool:
+    """A verdict with names, one of which is neither hidden nor the alias of what is."""
+    return row["verdict"] in _CONFIDENT and any(not names_of(f) & set(row["truth"]) for f in row["findings"])
+
+
+def is_alarm(row: Row) -> bool:
+    """Something is reported, with a name or without."""
+    return row["verdict"] not in ("consistent", "undecidable")
+
+
+def is_inside(row: Row, finding: dict[str, Any]) -> bool:
+    """Whether the 95 % interval of a named cause holds the true size."""
+    return bool(abs(finding["size"] - row["truth"][finding["cause"]]) <= 1.96 * finding["sigma"])
 
 
 def share(hits: Sequence[bool]) -> str:
@@ -81,81 +72,72 @@ def share(hits: Sequence[bool]) -> str:
     return f"{100.0 * sum(hits) / len(hits):.1f} % ({sum(hits)}/{len(hits)})" if hits else "-"
 
 
-def report(path: Path, picture: Path | None = None) -> str:
-    """Tables in Markdown; and the confusion matrix as a picture."""
-    rows = read(path)
-    single = [r for r in rows if r.kind == "single"]
-    strong = [r for r in single if r.significance >= STRONG]
-    nulls = [r for r in rows if r.kind == "null"]
+def report(rows: Sequence[Row]) -> str:
+    """Tables in Markdown."""
+    single, pairs, nulls = ([r for r in rows if r["kind"] == kind] for kind in ("single", "pair", "null"))
+    strong = [r for r in single if significance(r) >= STRONG and is_beyond_tolerance(r)]
+    inside = [is_inside(r, f) for r in rows for f in r["findings"] if f["cause"] in r["truth"]]
     lines = [
-        "| method | right name first, effects >= 3 sigma | right name first, all | false alarms | held-out gain over the oracle's |",
+        f"{len(rows)} cases: {len(single)} with one cause, {len(pairs)} with two, {len(nulls)} with none",
+        "",
+        "| figure | measured |",
+        "|---|---|",
+        f"| right name or alias set first, over 3 sigma and tolerance | {share([is_first(r) for r in strong])} |",
+        f"| the same, all sizes | {share([is_first(r) for r in single])} |",
+        f"| pairs over 3 sigma and tolerance: both named | {share([all(is_named(r, c) for c in r['truth']) for r in _strong(pairs)])} |",
+        f"| false alarms where nothing is hidden | {share([is_alarm(r) for r in nulls])} |",
+        f"| wrong confident names | {share([is_wrong(r) for r in rows])} |",
+        f"| a confident name beside the right one | {share([has_extra_name(r) and not is_wrong(r) for r in rows])} |",
+        f"| 95 % intervals that hold the true size | {share(inside)} |",
+        f"| CPU of a case, simulation included, median and most | {_seconds(rows)} |",
+        "",
+        "| sigmas of the effect | right | something else | unexplained without a name | nothing |",
         "|---|---|---|---|---|",
     ]
-    for method in METHODS:
-        lines.append(
-            f"| {method} | {share([_right(r, method) for r in strong])} | {share([_right(r, method) for r in single])} "
-            f"| {share([_alarms(r, method) for r in nulls])} | {_gains(strong, method)} |"
-        )
-    lines += ["", "| predicted significance | named first | named among aliases only | something else | nothing |", "|---|---|---|---|---|"]
     for low, high in ((0.0, 3.0), (3.0, 5.0), (5.0, 10.0), (10.0, 30.0), (30.0, np.inf)):
-        some = [r for r in single if low <= r.significance < high]
+        some = [r for r in single if low <= significance(r) < high]
+        named = [r["findings"] != [] for r in some]
+        right = [is_first(r) for r in some]
         parts = (
-            [r.first == r.cause for r in some],
-            [r.first != r.cause and r.cause in r.open for r in some],
-            [r.first != NONE and r.cause not in r.open for r in some],
-            [r.first == NONE for r in some],
+            right,
+            [n and not hit for n, hit in zip(named, right, strict=True)],
+            [not n and is_alarm(r) for n, r in zip(named, some, strict=True)],
+            [not n and not is_alarm(r) for n, r in zip(named, some, strict=True)],
         )
         lines.append(f"| {low:g} to {high:g} | {' | '.join(share(p) for p in parts)} |")
-    loud = [r for r in single if r.rms >= STRONG]
-    lines += [
-        "",
-        f"right name first where the effect's RMS is 3 times the noise of a window or more: {share([r.cause in r.open for r in loud])}",
-    ]
-    hits = [(f, r.truth[f["cause"]]) for r in rows if r.kind in ("single", "pair") for f in r.findings if f["cause"] in r.truth]
-    covered = [abs(f["size"] - size) <= 1.96 * f["sigma"] for f, size in hits]
-    clear = [c for c, (f, _) in zip(covered, hits, strict=True) if f["cause"] not in ("encoder_dropout",)]
-    spurious = [len({f["cause"] for f in r.findings} - set(r.truth) - set(r.alike)) for r in rows if r.kind == "single"]
-    pairs = [r for r in rows if r.kind == "pair"]
-    lines += [
-        "",
-        f"95 % intervals that hold the true size: {share(covered)}; without encoder_dropout: {share(clear)}",
-        f"names beside the true one, on average: {np.mean(spurious) if spurious else 0.0:.3f} a drive; aliases of the first: "
-        f"{np.mean([len(r.open) - 1 for r in single if r.findings] or [0.0]):.2f}",
-        f"pairs of causes, both named: {share([set(r.truth) <= r.said for r in pairs])}, "
-        f"both among those >= 3 sigma: {share([set(r.truth) <= r.said for r in pairs if r.significance >= STRONG])}",
-        f"indistinguishable causes left open: {share([set(r.alike) <= r.open for r in rows if r.kind == 'alike'])}",
-        f"CPU of a diagnosis, median and most: {np.median([r.seconds for r in rows]):.1f} s, {max(r.seconds for r in rows):.1f} s",
-    ]
-    if picture is not None:
-        picture.write_bytes(_picture(strong, nulls))
-    return "\n".join(lines)
+    return "\n".join([*lines, *_rivals(strong, nulls)])
 
 
-def _name(r: Row, method: str) -> str:
-    return r.first if method == "diagnosis" else r.rivals.get(method, (NONE, 0.0))[0]
+def _strong(rows: Sequence[Row]) -> list[Row]:
+    return [r for r in rows if significance(r) >= STRONG and is_beyond_tolerance(r)]
 
 
-def _alarms(r: Row, method: str) -> bool:
-    """It says that something is wrong, with a name or without."""
-    return r.verdict not in ("consistent", "undecidable") if method == "diagnosis" else _name(r, method) != NONE
+def _seconds(rows: Sequence[Row]) -> str:
+    seconds = [r["seconds"] for r in rows] or [0.0]
+    return f"{np.median(seconds):.1f} s, {max(seconds):.1f} s"
 
 
-def _right(r: Row, method: str) -> bool:
-    """The true cause first, or (for all methods) a name that the diagnosis says is an alias of it on that drive."""
-    name = _name(r, method)
-    return name == r.cause or (r.cause in r.open and name in r.open)
+def _rivals(strong: Sequence[Row], nulls: Sequence[Row]) -> list[str]:
+    """The other methods' table, of the rows that have them."""
+    measured = [r for r in strong if "rivals" in r]
+    if not measured:
+        return []
+    lines = ["", "| method | right name first | false alarms | held-out gain over that of the true sizes, median |", "|---|---|---|---|"]
+    for method in measured[0]["rivals"]:
+        right = [r["rivals"][method][0] in r["truth"] for r in measured]
+        alarms = [r["rivals"][method][0] != NONE for r in nulls if "rivals" in r]
+        gains = [r["rivals"][method][1] / r["oracle"] for r in measured if r["oracle"] > 0.02]
+        lines.append(f"| {method} | {share(right)} | {share(alarms)} | {100.0 * np.median(gains or [0.0]):.0f} % |")
+    return lines
 
 
-def _gains(rows: Sequence[Row], method: str) -> str:
-    shares = [(r.gain if method == "diagnosis" else r.rivals.get(method, (NONE, 0.0))[1]) / r.oracle for r in rows if r.oracle > 0.02]
-    return f"{100.0 * np.median(shares):.0f} % ({100.0 * np.mean(np.array(shares) >= 0.8):.0f} % of drives reach 80 %)" if shares else "-"
-
-
-def _picture(strong: Sequence[Row], nulls: Sequence[Row]) -> bytes:
-    counts = Counter((r.cause, r.cause if r.cause in r.open else r.first) for r in [*strong, *nulls])
+def picture(rows: Sequence[Row]) -> bytes:
+    """Confusion matrix of the cases over 3 sigma and of those with nothing hidden, as PNG."""
+    shown = [r for r in rows if r["kind"] == "null" or (r["kind"] == "single" and significance(r) >= STRONG and is_beyond_tolerance(r))]
+    counts = Counter((_hidden(r), _hidden(r) if is_first(r) else _first(r)) for r in shown)
     names = [*TYPICAL, NONE]
-    columns = [*names, *sorted({said for _, said in counts} - set(names))]
-    table = np.array([[counts[truth, said] for said in columns] for truth in names], dtype=float)
+    columns = [*names, *sorted({named for _, named in counts} - set(names))]
+    table = np.array([[counts[hidden, named] for named in columns] for hidden in names], dtype=float)
     whole = np.maximum(table.sum(axis=1, keepdims=True), 1.0)
 
     def draw(figure: figures.Figure) -> None:
@@ -172,5 +154,20 @@ def _picture(strong: Sequence[Row], nulls: Sequence[Row]) -> bytes:
     return figures.picture(6.4, 6.0, draw)
 
 
+def _hidden(row: Row) -> str:
+    return next(iter(row["truth"]), NONE)
+
+
+def _first(row: Row) -> str:
+    if row["findings"]:
+        return str(row["findings"][0]["cause"])
+    return "unexplained" if is_alarm(row) else NONE
+
+
 if __name__ == "__main__":
-    print(report(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else None))
+    chosen = [json.loads(line) for line in Path(sys.argv[1]).read_text().splitlines()]
+    if len(sys.argv) > 3:
+        first, last = (int(number) for number in sys.argv[3].split(":"))
+        chosen = [row for row in chosen if first <= row["number"] < last]
+    Path(sys.argv[2]).write_bytes(picture(chosen))
+    print(report(chosen))

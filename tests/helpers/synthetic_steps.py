@@ -1,4 +1,4 @@
-"""Steps from an independent generator: a true robot whose parameters, noise and sensors are drawn from what the estimators believe.
+"""Steps from an independent generator: a true robot whose parameters, noise and sensors are drawn from the priors of the estimators.
 
 Nothing here uses the estimators' own prediction: the truth is composed from small intervals with slip drawn in each, and what a Step says
 comes from `Synchronizer`'s own parts (`integrate_twists`) at the parameters that the estimator hands back.
@@ -46,7 +46,7 @@ class Noise:
 
 
 class PoseSensor:
-    """In place of `ScanMatchingSensor`: poses with noise of a covariance that it knows, in a submap that is exact."""
+    """In place of `ScanMatchingSensor`: poses with noise of a given covariance, in an exact submap."""
 
     cell = 0.0  # no voxels, and so no loops
     sweep_s = 0.0  # poses at one instant
@@ -148,7 +148,7 @@ class World:
             delta = se2.compose(delta, se2.compose(se2.exp(xi * h), se2.exp(rng.normal(size=3) * np.sqrt(var))))
         self.pose = se2.compose(self.pose, delta)
 
-        # the log's wheels: at stamp s they tell the rates of true time s - clock; the reader adds its own belief
+        # the log's wheels: at stamp s they have the rates of true time s - clock; the reader adds its own estimate
         shifted = self.t + clock_offset - self.clock
         dt, rates, cg = self._rates(shifted)
         twist = self.model.twist(rates, cg, params)

@@ -8,7 +8,7 @@ import pytest
 
 from localization.comparison.jobs import _scores
 from localization.comparison.summary import closing, find
-from localization.comparison.table import Table
+from localization.comparison.table import ResultTable
 from localization.evaluation.scores import score
 from localization.lidar import LostScans
 from localization.lidar.losses import LidarLosses, per_cent
@@ -18,8 +18,8 @@ from localization.report.runs import best_run, plotted_runs
 from localization.report.summary import verdict
 from localization.ros.diagnostics import ERROR, OK, WARN, Health
 from motion_models.registry import make_model
+from tests.helpers.report import HEAD, relations, run, track
 from tests.helpers.rooms import ROBOT
-from tests.report.test_replay_page import HEAD, relations, run, track
 
 S = 10**9
 ALL_LOST = LidarLosses(1000, 400, 0.6, 60.0, 7.0, 0.0, {"lost": 600})
@@ -156,11 +156,11 @@ def test_rows_of_a_comparison_are_numbers_that_the_table_reads_again(tmp_path) -
     scores = _scores(result.metrics(200.0, with_timing=False))
     assert (scores["lidar_lost_share"], scores["lidar_longest_lost_s"], scores["lidar_longest_lost_since_s"]) == (0.6, 60.0, 7.0)
     assert not any(isinstance(value, dict) for value in scores.values())
-    table = Table(tmp_path / "table.csv")
+    table = ResultTable(tmp_path / "table.csv")
     head = {"log": "a", "robot": "r", "model": "m", "estimator": "graph", "corrections": "", "key": "k", "status": "ok", "error": ""}
     table.put([{**head, **scores}])
     table.save([])
-    assert Table(tmp_path / "table.csv").path.exists()
+    assert ResultTable(tmp_path / "table.csv").path.exists()
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from motion_models.errors import SkidlocError
 from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import WheelNoise, load_robot
+from tests.helpers.motion_models import assert_one_agrees, differences, some_drive, some_params
 
 ROBOT = load_robot("vaultbot")
 MIRROR = np.array([1.0, -1.0, -1.0])  # vx, vy, wz of a robot seen in a mirror along its x axis
@@ -17,21 +18,6 @@ pytestmark = pytest.mark.parametrize("name", list(MODELS))
 # Numbers come from a generator and not from hypothesis, whose round ones sit on kinks (a wheel that just lifts off).
 drawn = given(seed=st.integers(0, 2**32 - 1))
 few = settings(max_examples=25, deadline=None)
-
-
-def some_params(model, rng):
-    """A robot like the nominal one, but without its symmetries."""
-    p = model.nominal
-    found = p * (1 + 0.1 * rng.uniform(-1, 1, p.shape)) + np.where(p == 0, 0.02 * rng.uniform(-1, 1, p.shape), 0)
-    if "scrub" in model.param_names:  # a moment that helped a turn would allow two motions for one pair of wheel rates
-        found[model.param_names.index("scrub")] *= np.sign(found[model.param_names.index("scrub")])
-    return found
-
-
-def some_drive(rng, n):
-    """Wheel rates (n, 2) of all kinds, and CGs (n, 2) over most of the wheelbase."""
-    wheels = rng.uniform(-6, 6, (n, 2))
-    return wheels, rng.uniform(-1, 1, (n, 2)) * [0.2, 0.2]
 
 
 def mirrored(wheels, cg):
@@ -64,22 +50,9 @@ def identify(model, wheels, cg, value, start):
     return p
 
 
-def differences(f, x, j):
-    """Central differences of f by x[..., j] with four steps: one is too long where f bends, another drowns in rounding."""
-    e = np.zeros(x.shape[-1])
-    e[j] = 1.0
-    scale = max(1.0, float(np.max(np.abs(x[..., j]))))
-    return [(f(x + h * e) - f(x - h * e)) / (2 * h) for h in scale * 10.0 ** np.arange(-4, -8, -1)]
-
-
-def assert_one_agrees(exact, quotients):
-    error = np.min([np.abs(q - exact) / (1 + np.abs(exact)) for q in quotients], axis=0)
-    assert error.max() < 1e-6
-
-
 @drawn
 @few
-def test_jacobians_are_those_of_differences(name, seed):
+def test_twist_derivatives_of_every_model_are_differences(name, seed):
     rng = np.random.default_rng(seed)
     model = make_model(name, ROBOT)
     params = some_params(model, rng)
@@ -94,7 +67,7 @@ def test_jacobians_are_those_of_differences(name, seed):
 
 @drawn
 @few
-def test_still_wheels_are_a_still_robot(name, seed):
+def test_twist_of_still_wheels_is_zero(name, seed):
     rng = np.random.default_rng(seed)
     model = make_model(name, ROBOT)
     twist = model.twist(np.zeros((4, 2)), some_drive(rng, 4)[1], some_params(model, rng))
@@ -106,7 +79,7 @@ def test_still_wheels_are_a_still_robot(name, seed):
 
 @drawn
 @settings(max_examples=5, deadline=None)
-def test_the_mirror_image_of_a_robot_is_a_robot_and_a_symmetric_one_is_its_own(name, seed):
+def test_twist_of_a_mirrored_robot_is_mirrored(name, seed):
     """Whatever is deliberately lopsided in a model (a warp, unlike sides) must be in its parameters: so a mirrored robot has some too."""
     rng = np.random.default_rng(seed)
     model = make_model(name, ROBOT)
@@ -124,7 +97,7 @@ def test_the_mirror_image_of_a_robot_is_a_robot_and_a_symmetric_one_is_its_own(n
 
 @drawn
 @few
-def test_time_may_be_cut_into_pieces(name, seed):
+def test_preintegrate_of_cut_intervals_is_that_of_whole_ones(name, seed):
     rng = np.random.default_rng(seed)
     model = make_model(name, ROBOT)
     params = some_params(model, rng)
@@ -140,7 +113,7 @@ def test_time_may_be_cut_into_pieces(name, seed):
 
 @drawn
 @few
-def test_the_inverse_gives_wheel_rates_that_do_what_was_wanted(name, seed):
+def test_wheels_of_a_command_give_the_command(name, seed):
     rng = np.random.default_rng(seed)
     model = make_model(name, ROBOT)
     params = some_params(model, rng)
@@ -153,7 +126,7 @@ def test_the_inverse_gives_wheel_rates_that_do_what_was_wanted(name, seed):
 
 @drawn
 @few
-def test_a_batch_is_a_loop(name, seed):
+def test_twist_of_a_batch_is_a_loop(name, seed):
     rng = np.random.default_rng(seed)
     model = make_model(name, ROBOT)
     params = some_params(model, rng)
@@ -172,7 +145,7 @@ def test_a_batch_is_a_loop(name, seed):
 
 @drawn
 @settings(max_examples=5, deadline=None)
-def test_identification_recovers_the_parameters_from_clean_data(name, seed):
+def test_fit_of_clean_data_recovers_the_parameters(name, seed):
     rng = np.random.default_rng(seed)
     model = make_model(name, ROBOT)
     truth = some_params(model, rng)
