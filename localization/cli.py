@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 
-from localization.commands.terminal import PlainConsole
+from localization.commands.common import PlainConsole
 from motion_models.errors import SkidlocError
 
 _BAD_INPUT = 2

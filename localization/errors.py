@@ -4,7 +4,7 @@ from motion_models.errors import SkidlocError
 
 
 class LogError(SkidlocError):
-    """A log that cannot be used: not there, not a bag, nothing readable in it, only one message."""
+    """A log that cannot be used: it does not exist, is no bag, has no readable message, or only one."""
 
 
 class TopicError(LogError):
@@ -16,15 +16,15 @@ class EvaluationError(SkidlocError):
 
 
 class SettingError(SkidlocError):
-    """A setting that nothing can be computed with: a number out of its range or not finite, a list of names with none in it."""
+    """An invalid setting: a number out of its range or not finite, an empty list of names."""
 
 
 class EventError(SkidlocError):
-    """An event that no estimator can use: an array of another shape, numbers that are not finite, a matrix that is no covariance."""
+    """An invalid event: an array of another shape, numbers that are not finite, a matrix that is no covariance."""
 
 
 class OutputError(SkidlocError):
-    """An output path that already holds something, or that cannot be written."""
+    """An output path that exists already, or that cannot be written."""
 
 
 class EstimatorError(SkidlocError):
@@ -40,4 +40,4 @@ class CheckpointError(SkidlocError):
 
 
 class TransportError(SkidlocError):
-    """A live source or sink that cannot be used: its library is missing, nobody is there, or another type of message comes."""
+    """A live source or sink that cannot be used: its library or peer is missing, or messages have another type."""

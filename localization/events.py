@@ -1,7 +1,7 @@
 """Events of a log, one at a time, in SI units and header time.
 
 Stamps are integer nanoseconds of the message's header. Arrays are float64 and finite unless a field says otherwise; events are
-never changed after they are made. Making one that estimators would compute with and that is not so raises `EventError`.
+never changed after they are made. The constructors raise `EventError` for arrays that are not so.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class CgSample:
 
 @dataclass(frozen=True)
 class Scan:
-    """One sweep of a LiDAR, planar or not. Points that were not finite or out of range are already gone."""
+    """One scan of a LiDAR, planar or not, without points that are not finite or out of range."""
 
     stamp_ns: int
     """Header stamp. For a LaserScan the time of the first beam; a PointCloud2 has `offsets`."""
@@ -70,17 +70,17 @@ class Scan:
 
     @property
     def middle_s(self) -> float:
-        """Middle of the sweep, after `stamp_ns` [s]."""
+        """Middle of the scan duration, after `stamp_ns` [s]."""
         return 0.5 * (float(self.offsets.min()) + float(self.offsets.max())) if len(self.offsets) else 0.0
 
     @property
     def middle_ns(self) -> int:
-        """Middle of the sweep: the moment of which a scan measures the pose."""
+        """Middle of the scan duration: the time at which a scan measures the pose."""
         return self.stamp_ns + round(self.middle_s * 1e9)
 
     @property
     def times_from_middle(self) -> FloatArray:
-        """(N,) time of each point after the middle of the sweep [s], or (0,) where the log has none."""
+        """(N,) time of each point after the middle of the scan duration [s], or (0,) where the log has none."""
         return self.offsets - self.middle_s if len(self.offsets) else self.offsets
 
     def __post_init__(self) -> None:
@@ -107,7 +107,7 @@ class ImuSample:
 
 @dataclass(frozen=True)
 class PositionSample:
-    """A position by a source that is to be fused, as GPS, in a plane of its own."""
+    """A position to be fused, as of GPS, in a plane of its own."""
 
     stamp_ns: int
     position: FloatArray
@@ -122,7 +122,7 @@ class PositionSample:
 
 @dataclass(frozen=True)
 class Reference:
-    """Pose of the robot by a trusted source. Used to score, never to estimate."""
+    """Pose of the robot by a reference system. Used to score, never to estimate."""
 
     stamp_ns: int
     position: FloatArray

@@ -38,8 +38,8 @@ class Turn:
 class GyroBuffer:
     """The last seconds of the yaw rate.
 
-    Gravity shows which axis of the IMU is upright. Where the mount says another one, the rate is that about gravity, and whether this
-    axis points up or down (some drivers publish gravity, not specific force) is seen by the turns of the wheels; until these suffice,
+    Gravity shows which axis of the IMU is upright. Where the mount gives another one, the rate is that about gravity, and whether this
+    axis points up or down (some drivers publish gravity, not specific force) follows from the turns of the wheels; until these suffice,
     the gyro is not used.
 
     A rate that no robot can have come to since the sample before is left out, unless it lasts: the third in a row is accepted, and with
@@ -105,12 +105,16 @@ class GyroBuffer:
         self._spikes += len(self._pending)
         self._pending = []
 
+    def __len__(self) -> int:
+        """Stored samples."""
+        return len(self._stamps)
+
     @property
     def newest_ns(self) -> int | None:
         return self._stamps[-1] if self._stamps else None
 
     def turn(self, start_ns: int, end_ns: int, by_wheels: float) -> Turn | None:
-        """The turn from ``start_ns`` to ``end_ns``; ``by_wheels`` [rad] only tells which way is left, where the mount does not.
+        """The turn from ``start_ns`` to ``end_ns``; ``by_wheels`` [rad] gives its sign alone, where the mount does not.
 
         None where the gyro has no sample from before the start to (nearly) the end, or while its axis is not known.
         """
@@ -128,7 +132,7 @@ class GyroBuffer:
         return Turn(self._sign * angle, variance, dt)
 
     def warnings(self) -> list[str]:
-        """What a user should know about the IMU."""
+        """Problems of the IMU and their remedy."""
         found = []
         if self._spikes:
             plural = "s" * (self._spikes > 1)
@@ -138,7 +142,7 @@ class GyroBuffer:
         if self._turned < _MIN_TURN_RAD:
             return [
                 *found,
-                f"the mount of IMU '{self._frame}' contradicts gravity, and the robot turned too little to tell its axis: it was not used.",
+                f"the mount of IMU '{self._frame}' contradicts gravity, and the robot turned too little to find its axis: it was not used.",
             ]
         axis = ", ".join(f"{value:+.2f}" for value in self._sign * self._axis)
         return [

@@ -1,19 +1,22 @@
-"""Logs and trajectories are written to places that nothing stands in, whole or not at all; errors name the place."""
+"""Output files, written whole or not at all and over nothing; versions of libraries and fingerprints of logs, as provenance of results."""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import BinaryIO
 
 from localization.errors import OutputError
 
-_LONGEST_NAME = 255
-"""Of a file [B], on the file systems of Linux, macOS and Windows."""
+_LIBRARIES = ("skidloc", "numpy", "numba", "filterpy", "gtsam", "kiss-icp", "rosbags")
+_FINGERPRINT_BYTES = 1 << 20  # of the begin and of the end of each file
+_MAX_NAME_BYTES = 255  # on the file systems of Linux, macOS and Windows
 
 
 def refuse_existing(path: Path) -> None:
@@ -26,8 +29,8 @@ def check_outputs(*paths: Path | None) -> None:
     """Raises `OutputError` where a command could not write all of ``paths`` at its end: something is there, or no file can be made."""
     given = [path for path in paths if path is not None]
     for path in given:
-        if len(os.fsencode(path.name)) > _LONGEST_NAME:
-            raise OutputError(f"output '{path.name[:40]}...' has a name of more than {_LONGEST_NAME} bytes. Choose a shorter one.")
+        if len(os.fsencode(path.name)) > _MAX_NAME_BYTES:
+            raise OutputError(f"output '{path.name[:40]}...' has a name of more than {_MAX_NAME_BYTES} bytes. Choose a shorter one.")
         with output_errors(path):
             refuse_existing(path)
             parent = next(parent for parent in path.absolute().parents if parent.exists())
@@ -41,7 +44,7 @@ def check_outputs(*paths: Path | None) -> None:
 
 
 def unwritable(path: Path, error: OSError) -> OutputError:
-    """What went wrong, and where."""
+    """The error of an output that cannot be written: where and why."""
     return OutputError(f"output '{path}' cannot be written: {error.strerror or error}.")
 
 
@@ -56,10 +59,10 @@ def output_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def whole_file(path: Path, *, replace: bool = False) -> Iterator[BinaryIO]:
-    """A file to write that gets its name ``path`` at the end: it is whole, or it is not there. Raises `OutputError`.
+    """A file to write that is moved to ``path`` at the end: it is whole, or it does not exist. Raises `OutputError`.
 
-    Until then it is beside its place, under a name that nobody can foresee, newly made: no link that stands there is followed. ``replace``:
-    over what is there; else that is refused.
+    Until then it is a new file of a random name in the same folder, so that no link is followed. ``replace``: overwrite an existing file;
+    else that is refused.
     """
     if not replace:
         refuse_existing(path)
@@ -79,7 +82,7 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[BinaryIO]:
 
 
 def write_text_file(path: Path, text: str, *, replace: bool = False) -> None:
-    """Write ``text`` as UTF-8, and make the folders above; bytes of file names that are none appear as escapes. Raises `OutputError`."""
+    """Write ``text`` as UTF-8, and make its folders; bytes that are no text are written as escapes. Raises `OutputError`."""
     with output_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path, replace=replace) as file:
@@ -87,5 +90,26 @@ def write_text_file(path: Path, text: str, *, replace: bool = False) -> None:
 
 
 def as_text(name: str) -> str:
-    """A file's name with escapes for bytes that are no text, which no file of text can hold."""
+    """A file's name with escapes in place of bytes that are no text."""
     return name.encode("utf-8", errors="backslashreplace").decode()
+
+
+def versions() -> dict[str, str]:
+    """Versions of this library and of those that results depend on, by name."""
+    return {name: version(name) for name in _LIBRARIES}
+
+
+def fingerprint(path: Path) -> str:
+    """SHA-256 of a log, independent of its name: over sizes, first and last MiB of its files, and names of files in a folder.
+
+    Reading all of a large bag would take minutes.
+    """
+    digest = hashlib.sha256()
+    for file in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
+        size = file.stat().st_size
+        digest.update(os.fsencode(file.relative_to(path)) + f"\0{size}\0".encode())
+        with file.open("rb") as data:
+            digest.update(data.read(_FINGERPRINT_BYTES))
+            data.seek(max(size - _FINGERPRINT_BYTES, 0))
+            digest.update(data.read(_FINGERPRINT_BYTES))
+    return digest.hexdigest()

@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from localization.errors import LogError
-from localization.estimate_table import NIS, TWIST, TWIST_COV, EstimateTable, trajectory
 from localization.estimators import CORRECTING, LOCALIZING, Estimate, Estimator, EstimatorConfig, make_estimator
+from localization.estimators.base import NIS, TWIST, TWIST_COV, EstimateTable, trajectory
 from localization.events import Event, ImuSample, PositionSample
 from localization.lidar.losses import LidarLosses
 from localization.sensor_checks import SensorChecks
@@ -42,7 +42,7 @@ class Trial:
     model: MotionModel
     estimator: str
     corrections: Form = "constant"
-    """What a fusing estimator learns of the motion model: a form of `motion_models.online_calibration`."""
+    """What a fusing estimator corrects of the motion model: a form of `motion_models.online_calibration`."""
 
 
 class Pipeline:
@@ -95,7 +95,7 @@ class Pipeline:
             yield estimate  # publish
 
     def _feed_back(self, step: Step) -> None:
-        """What the estimator has learned of wheels and clocks is used from the next step on."""
+        """Use the estimated corrections and clock offset from the next step on."""
         self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
         if step.duration > 0.0:
             self.wheel_twist = se2.log(step.predicted.delta) / step.duration if step.has_wheels else None
@@ -120,10 +120,11 @@ class Pipeline:
         """Problems of the sensors so far."""
         losses = self.lidar
         description = "" if losses is None else losses.describe()
-        return [*self.synchronizer.warnings(), *self.checks.warnings(), *([f"{self._name}: {description}"] if description else [])]
+        found = [*self.estimator.warnings(), *([description] if description else [])]
+        return [*self.synchronizer.warnings(), *self.checks.warnings(), *(f"{self._name}: {problem}" for problem in found)]
 
     def add_mounts(self, mounts: Mapping[str, Mount]) -> bool:
-        """Add mounts of frames that become known only now; a known one is not changed. Returns whether there were any."""
+        """Add mounts of new frames; those of known frames are not changed. Returns whether there were any."""
         new = {frame: mount for frame, mount in mounts.items() if frame not in self.mounts}
         self.mounts.update(new)
         return bool(new)

@@ -20,9 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.estimators import Estimate
-from localization.events import ImuSample
+from localization.events import ImuSample, Scan
 from localization.lidar import LidarConfig, Sweep
-from localization.lidar.own_body import OwnBodyFilter
 from localization.lidar.scan_motion import ScanOdometry
 from localization.step import Step
 from localization.trajectory import Trajectory
@@ -34,11 +33,14 @@ from motion_models.se2 import FloatArray
 _BIN_S = 0.25
 _WINDOW_BINS, _MIN_BINS = 24, 10
 """Bins that are compared (6 s), and the fewest (2.5 s)."""
+_MAX_BIN_S = 1.0
+"""How long a bin waits for a scan: LiDARs give 2 to 40 scans a second."""
 _MIN_LASTING_S = 1.0
 """Time for which a comparison must give the same result before a sensor is declared faulty."""
-_MEMORY_S, _MIN_CONTRADICTING = 120.0, 2.0 / 3.0
-"""Mounts, signs and units stay in a drive: a sensor is left out while at least this share of the comparisons of the last two minutes
-contradict it. (fr079 has a window of 6 s in which the robot travels 14 deg off its wheels.)"""
+_MEMORY_S, _SLIP_MEMORY_S, _MIN_CONTRADICTING = 3.0, 120.0, 2.0 / 3.0
+"""A sensor is left out while at least this share of the comparisons of the last seconds contradict it. Signs and units are never off by
+chance for so long (Husky, ACES, fr079, CSAIL: one of 8,964 comparisons); a direction of travel is, where the robot slides (fr079: 14 deg
+for 7 s), and is compared over two minutes."""
 _MAX_BIAS_RAD_S = 0.05
 """Gyro bias that is no contradiction; ten times the prior sigma of the shipped robots."""
 _MIN_RATE_RAD_S = 0.001
@@ -60,14 +62,31 @@ _MIN_TRAVEL_BINS = 6
 _MAX_CURVATURE_RAD_M = 0.6
 """Sharper turns slide sideways."""
 _MAX_DIRECTION_RAD, _MIN_COHERENCE = math.radians(12.0), 0.9
-"""Honest drives (ACES) have 0.5 deg over 340 pairs of scans; a robot on a side slope or in curves slides by a few degrees."""
+"""A robot on a side slope or in curves slides by a few degrees."""
+_MAX_SLIDE_RAD = math.radians(20.0)
+"""Directions that no slide explains are compared over `_MEMORY_S`: 99.9 % of the windows of CSAIL, fr079 and ACES are below 17 deg."""
+_GROSS_DIRECTION = "gross direction"
 _MIN_OWN_SHARE = 0.05
 _STANDING_SPEED_M_S = 0.1
 _SHAKE_M_S2, _SHAKE_SAMPLES = 0.4, 20
 """Standard deviation of the specific force over a second: Husky outdoors at rest 0.005 to 0.11, driving 0.51 to 1.6 (5 to 95 %)."""
 _SHAKE_S = 2.0
+_DISAGREEMENT_S, _MIN_DISAGREEING_SCANS = 5.0, 8
+_MAX_SQUARE, _MAX_MEAN_SQUARE = 25.0, 10.0
+"""Mean over 5 s of the squared distance between the wheels' motion and the estimate's, in sigmas, each at most 5 sigma; 3 is expected.
+1.4 % of the time of CSAIL and 3.9 % of fr079 are above, none of ACES and simulated laps."""
+_SCAN_NOISE = np.diag([0.02, 0.02, 0.01]) ** 2
+"""Of the motion from scan to scan [m^2, m^2, rad^2]."""
 _UNKNOWN_SPEED = np.array([0.5, 0.5, 0.5])
 """Sigma of a twist that no sensor measures [m/s, m/s, rad/s], as `StepConfig.lost_speed_m_s`."""
+_BODY_BEARINGS = 360
+_MAX_BODY_RANGE_M = 1.0
+"""Parts of a robot of 1 m are nearer to its LiDAR."""
+_SAME_RANGE_M = 0.03
+_MIN_BODY_TRAVEL_M, _MIN_BODY_TURN_RAD = 1.5, 0.4
+"""A wall keeps its range only while the robot drives along it without turning. On ACES, 0.15 rad leave 3 % of the beams on a wall at 0.9 m
+that is hit at a right angle; 0.4 rad change these by 8 %."""
+_MIN_BODY_SHARE = 0.01
 _NS = 1e-9
 
 
@@ -93,6 +112,10 @@ class Fault:
     LIDAR_OWN_BODY = (
         "{percent:.0f} % of the LiDAR's points are the robot itself (same ranges while it drives and turns). They are left out"
         " from then on. Remove what covers the LiDAR, or filter these beams in its driver (laser_filters)."
+    )
+    DISAGREEMENT = (
+        "the motion by the scans and that by the wheels differ by {sigmas:.1f} sigma over 5 s ({metres:.2f} m, {degrees:.0f} deg)."
+        " Wheels slip, or a sensor is mounted, stamped or scaled otherwise than its driver says: run `skidloc diagnose` on the log."
     )
     WHEELS_STANDING = (
         "the wheels read zero while {others} moved. They count as unknown there. Check the encoders, the driver of the wheels and the"
@@ -152,9 +175,10 @@ class SensorChecks:
         self._bins: deque[_Bin] = deque(maxlen=_WINDOW_BINS)
         self._open = _Accumulator()
         self._is_gyro_stuck = self._has_scans = False
-        self._shaking = ShakeDetector()
+        self._shaking, self._disagreement = ShakeDetector(), _Disagreement()
+        self._step: Step | None = None
         self._suspected: dict[str, tuple[float, float]] = {}  # when first found, and start of the bins then [s]
-        self._comparisons: dict[str, deque[tuple[float, bool]]] = {}  # by fault: time [s], and whether it is there
+        self._comparisons: dict[str, _Comparisons] = {}  # by fault
         self.found: dict[str, Found] = {}
         self._start_ns: int | None = None
         self._stood_s = 0.0  # time for which the wheels read zero
@@ -170,20 +194,22 @@ class SensorChecks:
         self._shaking.insert(sample)
 
     def apply(self, step: Step) -> Step:
-        """``step`` without the sensors that are faulty, and with the motion of wheels in doubt widened."""
+        """``step`` without the sensors that are faulty, and with the motion of uncertain wheels widened."""
         if not np.isfinite(step.predicted.delta).all():
             return step  # the estimator refuses it
         if self._start_ns is None:
             self._start_ns = step.start_ns
         step = self._without_own_body(step)
         self._record(step)
-        step = self._without_faulty(step)
-        return self._check_standstill(step)
+        self._step = self._check_standstill(self._without_faulty(step))
+        return self._step
 
     def widen(self, estimate: Estimate) -> Estimate:
         """``estimate`` with the covariance of what faulty sensors have done to it."""
         own = estimate.pose if estimate.odometry is None else estimate.odometry[0]
         delta = np.zeros(3) if self._pose is None else se2.between(self._pose, own)
+        if self._pose is not None:
+            self._check_disagreement(delta, estimate.nis)
         self._pose, self._estimated = own, se2.compose(self._estimated, delta)
         A = se2.adjoint(se2.inverse(delta))
         self._spread = A @ self._spread @ A.T + self._pending
@@ -250,6 +276,21 @@ class SensorChecks:
         self._declare(Fault.WHEELS_STANDING, self._now_s(step) - self._standing_s, {"others": others})
         return self._with_unknown_motion(step, self._standing_s**2 - before**2)
 
+    def _check_disagreement(self, delta: FloatArray, nis: float | None) -> None:
+        """Compare ``delta`` (3,), the last step by the estimate, with the wheels' motion."""
+        step = self._step
+        if step is None or step.scan is None or not step.has_wheels or step.is_standing or step.duration == 0.0:
+            return
+        found = self._disagreement.add(step, delta, nis or 0.0)
+        if found is None or Fault.DISAGREEMENT in self.found:
+            return
+        mean_square, off = found
+        numbers = {"sigmas": math.sqrt(mean_square), "metres": math.hypot(off[0], off[1]), "degrees": abs(math.degrees(off[2]))}
+        self.found[Fault.DISAGREEMENT] = Found(
+            Fault.DISAGREEMENT, max(self._now_s(step) - _DISAGREEMENT_S, 0.0), Fault.DISAGREEMENT.format(**numbers)
+        )
+        self._pending = self._pending + np.outer(off, off)
+
     def _with_unknown_motion(self, step: Step, seconds2: float) -> Step:
         """``step`` with the covariance of a lasting unknown twist, which grows by ``seconds2`` [s^2]."""
         motion = step.predicted
@@ -272,7 +313,7 @@ class SensorChecks:
         self._open.add(step)
         self._has_scans |= step.scan is not None
         waits_for_scan = self._has_scans and step.scan is None
-        if self._open.duration_s < (2.0 * _BIN_S if waits_for_scan else _BIN_S):
+        if self._open.duration_s < (_MAX_BIN_S if waits_for_scan else _BIN_S):
             return
         lidar = np.full(3, np.nan)
         if step.scan is not None:
@@ -302,6 +343,8 @@ class SensorChecks:
             suspects[Fault.LIDAR_DIRECTION] = {"degrees": abs(degrees), "side": side, "correction": -degrees}
         first = now_s, max(now_s - float(seconds.sum()), 0.0)
         self._compare(now_s, suspects.keys(), _excluded_faults(wheels_gyro, wheels_lidar, lidar_gyro, direction))
+        if direction is not None:
+            self._comparisons.setdefault(_GROSS_DIRECTION, _Comparisons(_MEMORY_S)).add(now_s, abs(direction) > _MAX_SLIDE_RAD)
         self._suspected = {fault: self._suspected.get(fault, first) for fault in suspects}
         for fault, (first_s, since_s) in self._suspected.items():
             if now_s - first_s >= _MIN_LASTING_S and self._is_contradicted(fault):
@@ -313,15 +356,13 @@ class SensorChecks:
     def _compare(self, now_s: float, present: AbstractSet[str], excluded: AbstractSet[str]) -> None:
         """Store which faults a window shows, and which it excludes."""
         for fault in present | excluded:
-            comparisons = self._comparisons.setdefault(fault, deque())
-            comparisons.append((now_s, fault in present))
-            while comparisons[0][0] < now_s - _MEMORY_S:
-                comparisons.popleft()
+            memory_s = _SLIP_MEMORY_S if fault == Fault.LIDAR_DIRECTION else _MEMORY_S
+            self._comparisons.setdefault(fault, _Comparisons(memory_s)).add(now_s, fault in present)
 
     def _is_contradicted(self, fault: str) -> bool:
-        """Whether most comparisons of the last minutes show ``fault``."""
-        comparisons = self._comparisons.get(fault, ())
-        return sum(is_there for _, is_there in comparisons) >= _MIN_CONTRADICTING * max(len(comparisons), 1)
+        """Whether most comparisons of the last seconds show ``fault``."""
+        keys = (fault, _GROSS_DIRECTION) if fault == Fault.LIDAR_DIRECTION else (fault,)
+        return any(self._comparisons[key].is_majority for key in keys if key in self._comparisons)
 
     def _declare(self, fault: str, at_s: float, numbers: Mapping[str, float | str]) -> None:
         """Report ``fault`` once, and widen the covariance by how far the estimate is from the other sensors' dead reckoning."""
@@ -333,6 +374,25 @@ class SensorChecks:
         is_gyro = fault in (Fault.GYRO_OPPOSITE, Fault.GYRO_STUCK, Fault.GYRO_UNIT)
         difference = se2.log(se2.between(self._estimated, self._by_wheels if is_gyro else self._by_gyro))
         self._pending = self._pending + np.outer(difference, difference)
+
+
+class _Comparisons:
+    """Which of the comparisons of the last ``memory_s`` [s] show a fault."""
+
+    def __init__(self, memory_s: float) -> None:
+        self._memory_s = memory_s
+        self._results: deque[tuple[float, bool]] = deque()
+
+    def add(self, now_s: float, is_there: bool) -> None:
+        """Result of a comparison at ``now_s`` [s]."""
+        self._results.append((now_s, is_there))
+        while self._results[0][0] < now_s - self._memory_s:
+            self._results.popleft()
+
+    @property
+    def is_majority(self) -> bool:
+        """Whether the fault is there in `_MIN_CONTRADICTING` of them or more."""
+        return sum(is_there for _, is_there in self._results) >= _MIN_CONTRADICTING * max(len(self._results), 1)
 
 
 @dataclass
@@ -359,6 +419,73 @@ class _Accumulator:
     def close(self, lidar: FloatArray) -> _Bin:
         wheels = self._wheels if self._wheels is not None and self._has_wheels else np.full(3, np.nan)
         return _Bin(self.duration_s, wheels, self._gyro, lidar, self._is_standing)
+
+
+class _Disagreement:
+    """Distance of the estimate's motion from the wheels', over the last seconds."""
+
+    def __init__(self) -> None:
+        self._rows: deque[tuple[float, float, FloatArray, FloatArray]] = deque()  # time [s], square, motion by wheels and estimate
+
+    def add(self, step: Step, delta: FloatArray, nis: float) -> tuple[float, FloatArray] | None:
+        """``delta`` (3,) of ``step`` by the estimate, and its NIS: mean square and difference (3,) where that is too large."""
+        off = se2.log(se2.between(step.predicted.delta, delta))
+        square = max(float(off @ np.linalg.solve(step.predicted.cov + _SCAN_NOISE, off)), nis)
+        self._rows.append((step.end_ns * _NS, min(square, _MAX_SQUARE), step.predicted.delta, delta))
+        while self._rows[0][0] < self._rows[-1][0] - _DISAGREEMENT_S:
+            self._rows.popleft()
+        mean = sum(row[1] for row in self._rows) / len(self._rows)
+        is_short = self._rows[-1][0] - self._rows[0][0] < 0.9 * _DISAGREEMENT_S or len(self._rows) < _MIN_DISAGREEING_SCANS
+        if is_short or mean <= _MAX_MEAN_SQUARE:
+            return None
+        wheels, estimated = np.zeros(3), np.zeros(3)
+        for _, _, by_wheels, by_estimate in self._rows:
+            wheels, estimated = se2.compose(wheels, by_wheels), se2.compose(estimated, by_estimate)
+        return mean, se2.log(se2.between(estimated, wheels))
+
+
+class OwnBodyFilter:
+    """Removes points of the robot itself from scans: their beams have the same range while the robot drives and turns."""
+
+    def __init__(self) -> None:
+        self._range = np.full(_BODY_BEARINGS, np.nan)
+        self._travel = np.zeros(_BODY_BEARINGS)
+        self._headings = np.zeros((2, _BODY_BEARINGS))  # least and greatest since the range is the same [rad]
+        self._is_own = np.zeros(_BODY_BEARINGS, dtype=bool)
+        self._travelled = self._heading = 0.0
+        self.share = 0.0
+        """Largest share of a scan's points that were the robot itself, 0 to 1."""
+
+    def add_motion(self, delta: FloatArray) -> None:
+        """Motion (3,) of the body since the last call."""
+        self._travelled += math.hypot(delta[0], delta[1])
+        self._heading += float(delta[2])
+
+    def filter(self, scan: Scan) -> Scan:
+        """``scan`` without the points that were recognized as the robot itself. Only planar scans are examined."""
+        points = scan.points
+        if not scan.is_planar or not len(points):
+            return scan
+        r = np.nan_to_num(np.hypot(points[:, 0], points[:, 1]), nan=np.inf)
+        bearings = np.nan_to_num(np.arctan2(points[:, 1], points[:, 0]))  # a point that is not finite is on no part of the robot
+        bins = np.floor(bearings * (_BODY_BEARINGS / (2.0 * math.pi))).astype(np.intp) % _BODY_BEARINGS
+        nearest = np.full(_BODY_BEARINGS, np.inf)
+        np.minimum.at(nearest, bins, r)
+        nearest[nearest > _MAX_BODY_RANGE_M] = np.nan
+        is_same = np.abs(nearest - self._range) <= _SAME_RANGE_M
+        self._travel = np.where(is_same, self._travel + self._travelled, 0.0)
+        least, greatest = self._headings
+        self._headings = np.where(is_same, [np.minimum(least, self._heading), np.maximum(greatest, self._heading)], self._heading)
+        self._range = np.where(is_same, self._range, nearest)
+        self._travelled = 0.0
+        has_turned = self._headings[1] - self._headings[0] >= _MIN_BODY_TURN_RAD
+        self._is_own = is_same & (self._is_own | ((self._travel >= _MIN_BODY_TRAVEL_M) & has_turned))
+        is_own = self._is_own[bins] & (np.abs(r - self._range[bins]) <= _SAME_RANGE_M)
+        share = float(is_own.mean())
+        if share < _MIN_BODY_SHARE:
+            return scan
+        self.share = max(self.share, share)
+        return replace(scan, points=points[~is_own], offsets=scan.offsets[~is_own] if len(scan.offsets) else scan.offsets)
 
 
 class ShakeDetector:

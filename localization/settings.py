@@ -1,4 +1,4 @@
-"""Numbers that a user may set: each is held against what makes sense as soon as it is set, on the command line or in code."""
+"""Settings: dataclasses whose numbers are checked against their bounds when they are set, on the command line or in code."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import Annotated, Any, get_type_hints
 from localization.errors import SettingError
 
 _LARGEST = 1e9
-"""Of a number, in SI units or ratios: no length, time, rate, weight or variance of a robot, its sensors or its drive is larger."""
+"""Upper bound of a number in SI units or of a ratio, without a bound of its own."""
 _MOST = 1_000_000
-"""Of a whole number: iterations, nodes, windows; a day's drive has as many scans."""
+"""Upper bound of a whole number (iterations, nodes, windows): the scans of a day."""
 
 
 @dataclass(frozen=True)
 class Allowed:
-    """What a number may be besides finite."""
+    """Bounds of a finite number."""
 
     what: str
     test: Callable[[float], bool]
@@ -56,7 +56,7 @@ _NOT_NEGATIVE = at_least(0)  # the default of a field
 class Settings:
     """Base of the dataclasses of settings. Their fields have bounds by `Annotated`; without one, a number is 0 or more.
 
-    Making one raises `SettingError` for the first number that nothing can be computed with.
+    The constructor raises `SettingError` for the first number outside its bounds.
     """
 
     def __post_init__(self) -> None:
@@ -64,7 +64,7 @@ class Settings:
 
 
 def check_settings(settings: object) -> None:
-    """Raises `SettingError` naming the first number of the dataclass ``settings`` that is not what it may be."""
+    """Raises `SettingError` naming the first number of the dataclass ``settings`` that is outside its bounds."""
     rules = rules_of(type(settings))
     numbers: dict[str, float] = {name: value for name in rules if isinstance(value := getattr(settings, name), Real)}  # type: ignore[misc]
     for name, value in numbers.items():
@@ -90,6 +90,6 @@ def _refusal(settings: object, name: str, wanted: str) -> SettingError:
 
 
 def rules_of(kind: type) -> Mapping[str, tuple[Any, ...]]:
-    """Of each field, what it is annotated with."""
+    """Annotations of each field."""
     hints = get_type_hints(kind, include_extras=True)
     return {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}

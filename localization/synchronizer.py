@@ -12,7 +12,7 @@ import numpy as np
 
 from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
 from localization.gyro import GyroBuffer
-from localization.lidar.frames import LidarFrames
+from localization.lidar.scan_checks import LidarFrames
 from localization.lidar.tilt import LidarTilt
 from localization.settings import Positive, Settings, at_least
 from localization.step import Step, StepInterval
@@ -56,8 +56,8 @@ class Synchronizer:
 
     def __init__(self, model: MotionModel, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: StepConfig | None = None):
         self.config = config or StepConfig()
-        self._model, self._robot = model, robot
-        self._params = model.nominal
+        self.model, self._robot = model, robot
+        self.params = model.nominal
         self._wheels = WheelBuffer(robot.center_of_gravity)
         self._gyro = GyroBuffer(robot.gyro_noise, mounts)
         self.frames = LidarFrames(mounts)
@@ -80,7 +80,7 @@ class Synchronizer:
         ``clock_offset_s``: the wheels' stamps are late by this much [s]; what happened at t is stamped t + offset.
         """
         if params is not None:
-            self._params = params
+            self.params = params
         self._clock_offset_s = clock_offset_s
 
     def insert(self, event: Event) -> None:
@@ -98,9 +98,14 @@ class Synchronizer:
             self._wheels.set_cg(event)
         elif isinstance(event, Scan) and self.frames.admit(event):
             self._empty_scans += not len(event.points)
-            self._tilt.see(event)
+            self._tilt.add(event)
             # one that was overtaken goes where it belongs, if that still waits
             self._scans.insert(bisect.bisect_right(self._scans, event.middle_ns, key=lambda scan: scan[0]), (event.middle_ns, event))
+
+    @property
+    def stored_samples(self) -> int:
+        """Samples of wheels and gyro, and scans, that are stored; bounded."""
+        return len(self._wheels) + len(self._gyro) + len(self._scans)
 
     @property
     def is_waiting(self) -> bool:
@@ -170,7 +175,7 @@ class Synchronizer:
         motion, d_clock, last = self._integrate(start_ns + shift, dt, rates, cg)
         if start_ns == end_ns:  # the first scan of a drive: its sweep needs a twist
             rates, cg = self._wheels.at(end_ns + shift, self.config.max_hold_s)
-            last = self._model.twist(rates, cg, self._params).value.sum(axis=0)
+            last = self.model.twist(rates, cg, self.params).value.sum(axis=0)
         is_standing = bool(len(dt)) and missing == 0.0 and not rates.any()
         has_wheels = missing == 0.0 and bool(len(rates))
         motion = self._widen(motion, missing, has_rates=bool(len(dt)))
@@ -191,10 +196,10 @@ class Synchronizer:
         less that just before the start, expressed in the body frame at the end. It is not zero where each window has one wheel sample.
         """
         if not len(dt):
-            return Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, len(self._params)))), np.zeros(3), np.zeros(3)
+            return Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, len(self.params)))), np.zeros(3), np.zeros(3)
         before, before_cg = self._wheels.at(start_ns - 1, self.config.max_hold_s)
         n = len(before)
-        twist = self._model.twist(np.vstack([before, rates]), np.vstack([before_cg, cg]), self._params)
+        twist = self.model.twist(np.vstack([before, rates]), np.vstack([before_cg, cg]), self.params)
         cg_cov = self._wheels.cg_cov
         inside = Twist(twist.value[n:], twist.d_wheels[n:], twist.d_cg[n:], twist.d_params[n:])
         motion = integrate_twists(dt, inside, self._robot.wheel_noise, cg_cov if cg_cov.any() else None)
@@ -204,7 +209,7 @@ class Synchronizer:
     def _widen(self, motion: Motion, missing_s: float, has_rates: bool) -> Motion:
         """``motion`` with the covariance of a velocity that is unknown for ``missing_s`` [s] of it, and lasts.
 
-        Such a velocity takes the robot as far as the time, however that is cut into steps. It may be as large as the last that was known.
+        Such a velocity takes the robot as far as the time, however that is cut into steps. It may be as large as the last measured one.
         """
         before, self._gap_s = self._gap_s, missing_s + (0.0 if has_rates else self._gap_s)
         if not missing_s:

@@ -36,7 +36,7 @@ class Trajectory:
     poses: FloatArray
     """(N, 3) x, y, theta [m, m, rad]."""
     covariances: FloatArray | None = None
-    """(N, 3, 3) of the right (body-frame) perturbation, or None where nothing is known of it."""
+    """(N, 3, 3) of the right (body-frame) perturbation, or None where it is unknown."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "stamps_ns", np.asarray(self.stamps_ns, dtype=np.int64))
@@ -61,6 +61,7 @@ class Trajectory:
 
     @property
     def duration_s(self) -> float:
+        """From the first to the last pose [s]."""
         return float(self.stamps_ns[-1] - self.stamps_ns[0]) * 1e-9 if len(self) else 0.0
 
     def distance(self, resolution_m: float = 0.0) -> float:
@@ -119,7 +120,7 @@ def path_nodes(positions: FloatArray, resolution_m: float) -> tuple[NDArray[np.i
     """Samples of a path at a resolution, and the distance driven at each.
 
     A sample (of ``positions`` (N, 2), N > 0) is a node when it lies ``resolution_m`` or more from the node before; the rest is jitter.
-    Without this a robot that stands still under a noisy sensor would drive for miles.
+    Without this the noise of a robot at standstill would add up to distance.
 
     Returns indices (K,), the first of which is 0, and distances (K,) [m] along the polyline of nodes. At resolution 0 that is the
     plain length, without repeated points.
@@ -138,8 +139,8 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     """Write a TUM file: same trajectory, same bytes.
 
     Stamps keep every nanosecond and positions every bit; the heading passes through a quaternion and comes back wrapped and equal to
-    the last digit or two. The file is whole or not there: it is written beside its place and moved. Raises `OutputError` if there is
-    such a file already or it cannot be written.
+    the last digit or two. The file is written under another name and moved, so that it is whole or does not exist. Raises `OutputError`
+    if it exists already or cannot be written.
     """
     path = Path(path)
     lines = [f"# {' '.join(_TUM_COLUMNS)}\n"]
@@ -229,7 +230,7 @@ def yaw_of_quaternion(x: float, y: float, z: float, w: float) -> float:
 
 
 def _wrapped(poses: FloatArray) -> FloatArray:
-    """Angles brought into [-pi, pi], untouched (not even by rounding) where they are there already."""
+    """Angles wrapped to [-pi, pi]; those inside are unchanged to the last bit."""
     theta = poses[..., 2]
     wrapped = np.where(np.abs(theta) <= math.pi, theta, se2.wrap_angle(theta))
     return np.concatenate([poses[..., :2], wrapped[..., None]], axis=-1)

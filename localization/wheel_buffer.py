@@ -23,13 +23,17 @@ class WheelBuffer:
         self._ends: list[int] = []
         self._intervals: list[tuple[int, float, float, float, float, bool]] = []  # start_ns, q_l, q_r, x_G, y_G, by angles
 
+    def __len__(self) -> int:
+        """Stored intervals."""
+        return len(self._intervals)
+
     @property
     def newest_ns(self) -> int | None:
         return None if self._last is None else self._last.stamp_ns
 
     @property
     def rates_known_until_ns(self) -> int | None:
-        """Up to when rates are known; None before two samples tell the first of them."""
+        """Up to when rates are known; None before two samples."""
         return self._ends[-1] if self._ends else None
 
     def set_cg(self, sample: CgSample) -> None:
@@ -40,7 +44,7 @@ class WheelBuffer:
         return self._cg_cov
 
     def insert(self, sample: WheelSample) -> None:
-        """Take the next sample. One that does not come after the newest, or that tells nothing of a side, changes nothing."""
+        """Store the next sample. One that does not come after the newest, or has no number for a side, changes nothing."""
         # plain numbers: numpy takes five times as long on two of them, and this is done for every message of the wheels
         position, velocity = sample.position.tolist(), sample.velocity.tolist()
         if not all(isfinite(p) or isfinite(v) for p, v in zip(position, velocity, strict=True)):
@@ -49,7 +53,7 @@ class WheelBuffer:
         if last is None:
             self._last = sample
             return
-        if sample.stamp_ns <= last.stamp_ns:  # what it says of the motion is in the next sample's angles as well
+        if sample.stamp_ns <= last.stamp_ns:  # its motion is in the next sample's angles as well
             return
         self._last = sample
         seconds = (sample.stamp_ns - last.stamp_ns) * _NS
@@ -74,10 +78,10 @@ class WheelBuffer:
         return table[:, :2], table[:, 2:]
 
     def window(self, start_ns: int, end_ns: int, max_hold_s: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        """Intervals (n,) [s], rates (n, 2), CG (n, 2) from ``start_ns`` to ``end_ns``, and the seconds that nothing is known of.
+        """Intervals (n,) [s], rates (n, 2), CG (n, 2) from ``start_ns`` to ``end_ns``, and the seconds without data.
 
         Without a sample, rates hold for at most ``max_hold_s``, be it past the newest sample or between two of them. Angles on both sides
-        of a longer gap still tell the mean rates in it, but not how they were spread: it counts as unknown, unless no wheel moved.
+        of a longer gap still give the mean rates in it, but not how they were spread: it counts as unknown, unless no wheel moved.
         """
         hold_ns = round(max_hold_s / _NS)
         rows: list[tuple[float, float, float, float, float]] = []
@@ -86,12 +90,12 @@ class WheelBuffer:
             began, q_l, q_r, x, y, by_angles = self._intervals[i]
             if began >= end_ns:
                 break
-            heard = min(self._ends[i], end_ns) if by_angles and q_l == q_r == 0.0 else min(self._ends[i], end_ns, began + hold_ns)
-            begin, end = max(began, known), min(self._ends[i], end_ns) if by_angles else heard
+            held_until = min(self._ends[i], end_ns) if by_angles and q_l == q_r == 0.0 else min(self._ends[i], end_ns, began + hold_ns)
+            begin, end = max(began, known), min(self._ends[i], end_ns) if by_angles else held_until
             if end <= begin:
                 continue
             rows.append(((end - begin) * _NS, q_l, q_r, x, y))
-            covered += max(heard - begin, 0) * _NS
+            covered += max(held_until - begin, 0) * _NS
             known = end
         if known < end_ns and self._ends:
             _, q_l, q_r, x, y, _ = self._intervals[-1]

@@ -29,9 +29,10 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from motion_models.types import FloatArray as FloatArray
+
 Triple = tuple[float, float, float]
 """A pose or tangent in compiled loops."""
 

@@ -12,7 +12,7 @@
 # better than either.**
 #
 # The log is real: 23 minutes through the ACES building (University of Texas at Austin, recorded by P. Beeson), with a planar laser of 5
-# scans a second and the wheels' odometry. What is true was checked by hand: 1,279 relative poses (R. Kümmerle et al., 2009).
+# scans a second and the wheels' odometry. The reference was verified by hand: 1,279 relative poses (R. Kümmerle et al., 2009).
 
 # %%
 import itertools
@@ -20,7 +20,7 @@ import itertools
 from scipy.stats import chi2
 
 from localization import Trial, open_log, read_reference_file, replay, score
-from localization.report.figure_data import nis_means, spans
+from localization.report.figure_data import nis_means, relation_bins
 from localization.report.notebook import Panel, Series, picture, table, trajectories
 from localization.report.replay_page import verdict
 from localization.report.runs import plotted_runs
@@ -63,14 +63,14 @@ table(
 )
 
 # %% [markdown]
-# ## Who is wrong, and when
+# ## Errors over time
 #
 # Over a few seconds the wheels are as good as the filter, and the LiDAR alone is already lost in some places. Over minutes the wheels'
 # heading drifts away; only the filter comes back to where it was.
 
 # %%
 lines = plotted_runs(results)
-binned = [spans(line, truth) for line in lines]
+binned = [relation_bins(line, truth) for line in lines]
 metres = [Series(line.label, s.seconds, s.translation_m, line.colour, "o", line.dashes) for line, s in zip(lines, binned, strict=True)]
 degrees = [Series(line.label, s.seconds, s.rotation_deg, line.colour, "o", line.dashes) for line, s in zip(lines, binned, strict=True)]
 picture(
@@ -82,8 +82,8 @@ picture(
 # ## Are the innovations consistent?
 #
 # A consistent filter has innovations whose normalised square (NIS) is 3 on average, and within the band as a mean of
-# so many. Above it, LiDAR and prediction differ by more than their covariances allow; below, the covariances are larger than they
-# had to be.
+# so many. Above it, LiDAR and prediction differ by more than their covariances allow; below, the covariances are larger than
+# the errors.
 
 # %%
 shown, means = nis_means(lines, float(chi2.ppf(0.95, 3)))
@@ -93,7 +93,7 @@ band = tuple(chi2.ppf([0.025, 0.975], 3 * count) / count)
 picture(Panel("time [s]", f"NIS, means of {count}", nis, log_y=True, band=band, level=3.0), columns=1, row_in=2.6)
 
 # %% [markdown]
-# ## What the filter has learned on the way
+# ## What the filter estimated
 #
 # The wheels' clock is off against the LiDAR's, and the robot turns less than its wheels predict. Both were estimated from the innovations
 # alone.

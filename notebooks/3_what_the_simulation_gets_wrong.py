@@ -9,7 +9,7 @@
 # # 3. What the simulation gets wrong about 68 rotations, and why
 #
 # **Claim: physics with nothing fitted gets the centre of rotation wrong by 6 cm. Its errors have a shape, and shapes have causes: the
-# LiDAR sits 6.4 cm farther ahead than was thought, the chassis is warped, the track is 3 cm wider. Neither rotational inertia nor the
+# LiDAR sits 6.4 cm farther ahead than assumed, the chassis is warped, the track is 3 cm wider. Neither rotational inertia nor the
 # tyres' treads, which the thesis blamed, explain it.**
 #
 # `skidloc diagnose rotation_grid.csv --robot vaultbot` does this in a second; here it is step by step.
@@ -68,9 +68,9 @@ def shown(rows, title):
 picture(*shown(before, "nothing fitted"), columns=3, row_in=3.0, width_in=10.0)
 
 # %% [markdown]
-# ## Step 2. Ask every cause for its signature
+# ## Step 2. The signature of every cause
 #
-# Each cause that one could think of changes these 68 numbers times three in its own way. Alone, how much of the discrepancy could each
+# Each cause of the catalogue changes these 68 numbers times three in its own way. Alone, how much of the discrepancy could each
 # explain? Every one is fitted by itself.
 
 # %%
@@ -103,7 +103,7 @@ picture(
 # %% [markdown]
 # ## Step 3. Put causes together, as few as explain it
 #
-# The diagnosis tries sets of causes, weighs each by evidence (one more cause must pay for itself) and gives for each found one its sigma,
+# The diagnosis tries sets of causes, weighs each by evidence (each must reduce the error) and gives for each found one its sigma,
 # the causes that fit this drive as well, and what it gains on held-out rows.
 
 # %%
@@ -184,8 +184,8 @@ _, b, a = rotation_ratio(grid).coefficients
 f"turns least at x_G = {-500.0 * b / a:+.1f} mm; its centre of rotation is off by {1000.0 * (grid.cor[:, 0] + vy / wz).mean():+.0f} mm"
 
 # %% [markdown]
-# All rotations were counter-clockwise. Had half of them been clockwise, the treads' size would be known 20 times better (sigma 0.0007
-# instead of 0.013), any other cause's at most 1.4 times: the simulator turned a robot with these errors 136 times, one way or both
+# All rotations were counter-clockwise. Had half of them been clockwise, the sigma of the treads' size would be a 20th (sigma 0.0007
+# instead of 0.013), of others at most 1.4 times: the simulator turned a robot with these errors 136 times, one way or both
 # (`python -m tests.helpers.diagnosis_rotations`).
 
 # %% [markdown]

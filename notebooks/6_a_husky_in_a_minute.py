@@ -55,12 +55,12 @@ table(
 )
 
 # %%
-says = turning(found, robot)
+calibrated_turning = turning(found, robot)
 table(
     ["in words", "value", "sigma"],
-    ["effective track [m] (the wheels stand 0.57 m apart)", *says.effective_track_m],
-    ["centre of rotation ahead of the middle [m]", *says.x_cr_m],
-    ["metres driven straight on for each metre that the wheels roll", *says.forward_scale],
+    ["effective track [m] (the wheels stand 0.57 m apart)", *calibrated_turning.effective_track_m],
+    ["centre of rotation ahead of the middle [m]", *calibrated_turning.x_cr_m],
+    ["metres driven straight on for each metre that the wheels roll", *calibrated_turning.forward_scale],
 )
 
 # %% [markdown]
@@ -145,7 +145,7 @@ table(
 )
 
 # %% [markdown]
-# ## Which terms earn their place
+# ## Which terms reduce the error
 #
 # All models, trained on nine tenths of the steps and scored on the rest, ten times. Slip is what matters: how much less the robot turns
 # than its wheels predict, about which point, and how much less far it goes on tight arcs: four numbers are as good as twelve.

@@ -1,4 +1,4 @@
-"""The examples in docstrings and in the README are true: they run, and print what they say."""
+"""Examples in docstrings and in the README run and print the stated output."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MODULES = sorted(
 )
 
 
-def test_there_are_examples_of_what_a_user_calls_first():
+def test_doctests_of_the_public_functions_exist():
     assert {"motion_models.se2", "motion_models.registry", "localization.evaluation.scores", "localization.calibration.calibrate"} <= set(
         MODULES
     )
@@ -34,7 +34,7 @@ def test_docstring_examples_are_true(name, monkeypatch):
     assert not result.failed
 
 
-def test_the_python_of_the_readme_runs(monkeypatch):
+def test_readme_python_code_runs(monkeypatch):
     monkeypatch.chdir(ROOT)
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     assert blocks

@@ -1,4 +1,4 @@
-"""The notebooks run, and the .ipynb that are shown are the .py that are read."""
+"""The notebooks run, and each .ipynb is its .py, executed."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ import pytest
 
 from tests.helpers.notebooks import FOLDER, read, sources
 
-# What makes a notebook long, and what it is here: the same cells, fewer seconds.
+# Replacements that make a notebook shorter: the same cells, less data.
 SHORTER = {
     "1": {"LOG_S = 1400.0": "LOG_S = 100.0"},
-    "4": {'TRIED = ("wheel_radius_difference", "cg_offset_x", "lidar_time_offset", "friction_anisotropy")': 'TRIED = ("cg_offset_x",)'},
+    "4": {
+        'TRIED = ("wheel_radius_difference", "cg_offset_x", "lidar_time_offset", "friction_anisotropy")': 'TRIED = ("lidar_yaw",)',
+        "diagnosed({name: TYPICAL[name]}, seed=1).diagnosis for name": "d for name",
+    },
     "5": {
         "RUNS, STEPS = 40, 150": "RUNS, STEPS = 3, 30",
         "LAPS = 7": "LAPS = 1",
@@ -24,17 +27,17 @@ SHORTER = {
     "7": {"LAPS = 12": "LAPS = 3"},
 }
 # absolute paths of Linux, macOS and Windows; but not topics
-PLACE = re.compile(r"(?<![\w.])/(?:home|root|tmp|work|usr|opt|var|mnt|Users)/|[A-Z]:\\\\")
+ABSOLUTE_PATH = re.compile(r"(?<![\w.])/(?:home|root|tmp|work|usr|opt|var|mnt|Users)/|[A-Z]:\\\\")
 
 
-def test_there_are_eight_and_each_is_one_claim():
+def test_notebooks_are_eight_and_each_title_is_one_claim():
     assert [source.name[0] for source in sources()] == list("12345678")
     for source in sources():
         assert len(re.findall(r"^# \*\*Claim: ", source.read_text(encoding="utf-8"), flags=re.MULTILINE)) == 1
 
 
 @pytest.mark.parametrize("source", sources(), ids=lambda source: source.stem)
-def test_it_runs(source, monkeypatch):
+def test_notebook_runs(source, monkeypatch):
     """As a script, in its own folder."""
     monkeypatch.chdir(FOLDER)
     monkeypatch.setattr(sys, "path", [str(FOLDER), *sys.path])
@@ -44,8 +47,8 @@ def test_it_runs(source, monkeypatch):
 
 
 @pytest.mark.parametrize("source", sources(), ids=lambda source: source.stem)
-def test_what_is_shown_is_what_was_run(source):
-    """Mended by `python -m tests.helpers.notebooks NAME`."""
+def test_notebook_stored_output_matches_its_code(source):
+    """Where it does not, run `python -m tests.helpers.notebooks NAME`."""
     shown = nbformat.read(source.with_suffix(".ipynb"), as_version=4)
     nbformat.validate(shown)
     assert [(c.cell_type, c.source) for c in shown.cells] == [(c.cell_type, c.source) for c in read(source).cells]
@@ -56,17 +59,17 @@ def test_what_is_shown_is_what_was_run(source):
     for output in outputs:
         assert output.output_type in ("execute_result", "display_data", "stream")
         assert output.get("name") != "stderr"
-    assert not PLACE.search(source.with_suffix(".ipynb").read_text(encoding="utf-8"))
+    assert not ABSOLUTE_PATH.search(source.with_suffix(".ipynb").read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("name", ["worlds.svg", "cg.png", "corrections.png"])
-def test_the_readmes_pictures_are_small(name):
+def test_readme_pictures_are_small(name):
     picture = (FOLDER / "figures" / name).read_bytes()
     assert 10_000 < len(picture) < 150_000
     assert picture.startswith((b"<svg", b"\x89PNG"))
 
 
-def test_the_test_of_places_finds_places():
-    assert PLACE.search("File /home/me/x.py")
-    assert PLACE.search(r'"C:\\Users"')
-    assert not PLACE.search("/odom /scan ../tests/data/aces")
+def test_absolute_path_pattern_matches_paths_and_no_topics():
+    assert ABSOLUTE_PATH.search("File /home/me/x.py")
+    assert ABSOLUTE_PATH.search(r'"C:\\Users"')
+    assert not ABSOLUTE_PATH.search("/odom /scan ../tests/data/aces")

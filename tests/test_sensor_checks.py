@@ -222,3 +222,24 @@ def test_one_window_that_contradicts_among_many_that_agree_leaves_the_lidar_in()
     for i in range(400, 2000):
         checks._compare(0.25 * i, here, nothing)
     assert checks._is_contradicted(Fault.LIDAR_DIRECTION)
+
+
+def test_wheels_far_from_the_estimate_are_reported_and_widen_it() -> None:
+    """Wheels that count three times too far: a metre a second, over the 4.5 s that must be there."""
+    robot = Robot(wheels=lambda v, w: (3.0 * v, w))
+    checks = robot.drive()
+    assert list(checks.found) == [Fault.DISAGREEMENT]
+    metres = re.search(r"\(([0-9.]+) m", checks.warnings()[0])
+    assert metres is not None
+    assert float(metres[1]) == pytest.approx(4.5, abs=0.1)
+    cov = robot.estimates[-1].covariance
+    assert cov is not None
+    assert math.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]) == pytest.approx(float(metres[1]), rel=0.01)
+
+
+def test_gyro_in_degrees_from_half_way_on_is_left_out_within_five_seconds() -> None:
+    gyro_of = iter([*[1.0] * 120, *[math.degrees(1.0)] * 120])
+    robot = Robot(gyro=lambda w: next(gyro_of) * w)
+    checks = robot.drive(24.0)
+    assert Fault.GYRO_UNIT in checks.found
+    assert all(step.turn is None for step in robot.applied[-70:])

@@ -25,7 +25,7 @@ ROOTS = (ReplayConfig, SimulationConfig, DiagnosisConfig, WindowConfig, Evaluate
 
 
 @pytest.mark.parametrize(
-    ("config", "values", "said"),
+    ("config", "values", "message"),
     [
         (StepConfig, {"max_step_s": [0, -1, 1e-12]}, "0.001 or more"),
         (StepConfig, {"no_lidar_step_s": [0], "lost_speed_m_s": [-1], "lost_rate_rad_s": [0]}, "above 0"),
@@ -54,10 +54,10 @@ ROOTS = (ReplayConfig, SimulationConfig, DiagnosisConfig, WindowConfig, Evaluate
         (GpsConfig, {"latitude_deg": [-90]}, "from -89 to 89"),
     ],
 )
-def test_numbers_that_nothing_can_be_computed_with_are_named(config, values, said):
+def test_settings_invalid_numbers_are_named(config, values, message):
     for name, wrong in values.items():
         for value in wrong:
-            with pytest.raises(SettingError, match=f"{name} of {config.__name__} is {value:g}; it must be {said}"):
+            with pytest.raises(SettingError, match=f"{name} of {config.__name__} is {value:g}; it must be {message}"):
                 config(**{name: value})
 
 
@@ -73,7 +73,7 @@ def with_numbers(settings):
     [found for root in ROOTS for found in with_numbers(root())],
     ids=lambda settings: type(settings).__name__,
 )
-def test_no_number_that_can_be_set_is_other_than_finite(settings):
+def test_settings_infinite_or_nan_is_refused(settings):
     numbers = {name: value for name, value in vars(settings).items() if type(value) in (int, float)}
     for name in numbers:
         for value in (math.nan, math.inf, -math.inf):

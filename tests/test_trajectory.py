@@ -29,7 +29,7 @@ def circle(stamps_ns, radius=2.0, rate=0.3):
     return np.column_stack([radius * np.sin(angle), -radius * np.cos(angle), se2.wrap_angle(angle)])
 
 
-def test_a_circle_is_followed_exactly_between_distant_poses():
+def test_circle_between_distant_poses_is_interpolated_exactly():
     stamps = np.arange(0, 60 * SECOND, 7 * SECOND)  # 2.1 rad apart: chords would miss by a metre
     between = np.arange(0, stamps[-1], SECOND // 3)
     found = Trajectory(stamps, circle(stamps)).at(between)
@@ -37,20 +37,20 @@ def test_a_circle_is_followed_exactly_between_distant_poses():
     np.testing.assert_allclose(np.exp(1j * found[:, 2]), np.exp(1j * circle(between)[:, 2]), atol=1e-12)
 
 
-def test_its_own_stamps_give_the_stored_poses_back_bit_for_bit():
+def test_poses_at_own_stamps_are_bitwise_equal():
     rng = np.random.default_rng(0)
     stamps = np.cumsum(rng.integers(1, SECOND, 50)) + 1_432_235_498_027_976_030
     poses = np.column_stack([rng.normal(0, 1e4, (50, 2)), rng.uniform(-math.pi, math.pi, 50)])
     np.testing.assert_array_equal(Trajectory(stamps, poses).at(stamps), poses)
 
 
-def test_nanoseconds_count_at_epoch_times():
+def test_stamps_at_epoch_times_keep_nanoseconds():
     start = 1_432_235_498_027_976_030  # a float of these seconds is 200 ns coarse
     poses = Trajectory([start, start + 100], [[0, 0, 0], [100.0, 0, 0]]).at(start + np.arange(0, 101, 10))
     np.testing.assert_allclose(poses[:, 0], np.arange(0, 101, 10), atol=1e-12)
 
 
-def test_nothing_is_extrapolated_and_gaps_are_told():
+def test_poses_outside_or_in_gaps_are_unknown():
     trajectory = Trajectory([0, 1 * SECOND, 5 * SECOND], np.zeros((3, 3)))
     asked = np.array([-1, 0, SECOND // 2, SECOND, 2 * SECOND, 5 * SECOND, 5 * SECOND + 1])
     np.testing.assert_array_equal(trajectory.covers(asked), [False, True, True, True, True, True, False])
@@ -58,7 +58,7 @@ def test_nothing_is_extrapolated_and_gaps_are_told():
     np.testing.assert_array_equal(np.isnan(trajectory.at(asked)).all(axis=1), ~trajectory.covers(asked))
 
 
-def test_one_pose_and_none_are_trajectories_too():
+def test_trajectory_of_one_or_no_pose_is_valid():
     one = Trajectory([5], [[1.0, 2.0, 3.0]])
     np.testing.assert_array_equal(one.at([4, 5, 6]), [[np.nan] * 3, [1, 2, 3], [np.nan] * 3])
     none = Trajectory(np.empty(0), np.empty((0, 3)))
@@ -66,7 +66,7 @@ def test_one_pose_and_none_are_trajectories_too():
     assert (none.distance(), none.duration_s, len(none)) == (0.0, 0.0, 0)
 
 
-def test_covariances_between_poses():
+def test_covariances_between_poses_are_interpolated():
     trajectory = Trajectory([0, 10], np.zeros((2, 3)), np.stack([np.eye(3), 3.0 * np.eye(3)]))
     np.testing.assert_allclose(trajectory.covariances_at([0, 5, 10]), np.array([1, 2, 3])[:, None, None] * np.eye(3))
     assert np.isnan(trajectory.covariances_at([11])).all()
@@ -85,12 +85,12 @@ def test_covariances_between_poses():
         ([0, 1], np.zeros((2, 3)), np.full((2, 3, 3), np.inf), "covariances must be finite: number 0"),
     ],
 )
-def test_arrays_that_are_no_trajectory_are_refused(stamps, poses, covariances, complaint):
+def test_arrays_of_wrong_shape_or_values_are_refused(stamps, poses, covariances, complaint):
     with pytest.raises(EvaluationError, match=complaint):
         Trajectory(stamps, poses, covariances)
 
 
-def test_distance_of_a_square_and_of_a_jittering_robot():
+def test_distance_of_a_square_and_of_a_jittering_robot_is_right():
     square = np.array([[0, 0, 0], [3, 0, 0], [3, 3, 0], [0, 3, 0], [0, 0, 0]], dtype=float)
     assert Trajectory(np.arange(5), square).distance() == 12.0
     rng = np.random.default_rng(1)
@@ -100,7 +100,7 @@ def test_distance_of_a_square_and_of_a_jittering_robot():
     assert trajectory.distance(resolution_m=0.05) == 0.0
 
 
-def test_nodes_of_a_path_are_as_far_apart_as_its_resolution():
+def test_path_nodes_are_spaced_by_the_resolution():
     positions = np.cumsum(np.random.default_rng(2).normal(0, 0.03, (5_000, 2)), axis=0)
     nodes, distance = path_nodes(positions, 0.1)
     steps = np.hypot(*np.diff(positions[nodes], axis=0).T)
@@ -115,7 +115,7 @@ STAMPS = st.lists(st.integers(-(2**62), 2**62), min_size=1, max_size=5, unique=T
 
 
 @law(STAMPS, st.data())
-def test_tum_files_return_what_was_written(stamps, data):
+def test_tum_file_round_trip_is_exact(stamps, data):
     n = len(stamps)
     poses = np.array(data.draw(st.lists(st.tuples(COORDINATES, COORDINATES, st.floats(-math.pi, math.pi)), min_size=n, max_size=n)))
     with tempfile.TemporaryDirectory() as folder:
@@ -132,7 +132,7 @@ def random_trajectory(n=200, seed=3):
     return Trajectory(stamps, np.column_stack([rng.normal(0, 50, (n, 2)), rng.uniform(-9, 9, n)]))
 
 
-def test_same_trajectory_same_bytes(tmp_path):
+def test_tum_file_of_same_trajectory_has_same_bytes(tmp_path):
     for name in ("a.tum", "b.tum"):
         write_tum(tmp_path / name, random_trajectory())
     assert (tmp_path / "a.tum").read_bytes() == (tmp_path / "b.tum").read_bytes()
@@ -140,7 +140,7 @@ def test_same_trajectory_same_bytes(tmp_path):
     assert first.split()[0] == f"{random_trajectory().stamps_ns[0] // SECOND}.{random_trajectory().stamps_ns[0] % SECOND:09d}"
 
 
-def test_evo_reads_the_same_trajectory(tmp_path):
+def test_tum_file_is_read_alike_by_evo(tmp_path):
     trajectory = random_trajectory()
     write_tum(tmp_path / "a.tum", trajectory)
     other = file_interface.read_tum_trajectory_file(str(tmp_path / "a.tum"))
@@ -150,7 +150,7 @@ def test_evo_reads_the_same_trajectory(tmp_path):
         np.testing.assert_allclose(pose[:2, 0], [math.cos(theta), math.sin(theta)], atol=1e-14)
 
 
-def test_reading_tolerates_what_other_tools_write(tmp_path):
+def test_tum_file_of_other_tools_is_read(tmp_path):
     path = tmp_path / "a.tum"
     path.write_bytes(
         b"\xef\xbb\xbf# a comment\r\n\r\n1.5 1 2 0.3 0 0 0 1  # standing\r\n1.403636579763555527e+09\t1 2 0 0 0 0.7071068 0.7071068\n"
@@ -160,7 +160,7 @@ def test_reading_tolerates_what_other_tools_write(tmp_path):
     np.testing.assert_allclose(found.poses, [[1, 2, 0], [1, 2, math.pi / 2]])
 
 
-def test_a_tilted_pose_is_seen_from_above(tmp_path):
+def test_tum_file_tilted_pose_is_projected_to_the_plane(tmp_path):
     # yaw 30 degrees, then pitch 20: Rz(yaw) Ry(pitch) keeps its heading
     yaw, pitch = math.radians(30), math.radians(20)
     cy, sy, cp, sp = math.cos(yaw / 2), math.sin(yaw / 2), math.cos(pitch / 2), math.sin(pitch / 2)
@@ -185,13 +185,13 @@ def test_a_tilted_pose_is_seen_from_above(tmp_path):
         ("# nothing\n\n", "holds no data"),
     ],
 )
-def test_malformed_files_name_file_and_line(tmp_path, text, complaint):
+def test_tum_file_malformed_error_names_file_and_line(tmp_path, text, complaint):
     (tmp_path / "bad.tum").write_text(text)
     with pytest.raises(EvaluationError, match=complaint):
         read_tum(tmp_path / "bad.tum")
 
 
-def test_files_that_are_not_there_or_not_text(tmp_path):
+def test_tum_file_missing_or_binary_is_refused(tmp_path):
     with pytest.raises(EvaluationError, match=r"none\.tum' cannot be read: No such file"):
         read_tum(tmp_path / "none.tum")
     with pytest.raises(EvaluationError, match="cannot be read"):
@@ -201,7 +201,7 @@ def test_files_that_are_not_there_or_not_text(tmp_path):
         read_tum(tmp_path / "a.bag")
 
 
-def test_nothing_is_overwritten(tmp_path):
+def test_tum_file_existing_is_not_overwritten(tmp_path):
     (tmp_path / "a.tum").write_text("precious")
     with pytest.raises(OutputError, match="exists already"):
         write_tum(tmp_path / "a.tum", random_trajectory())
@@ -210,7 +210,7 @@ def test_nothing_is_overwritten(tmp_path):
         write_tum(tmp_path / "no" / "a.tum", random_trajectory())
 
 
-def test_a_file_is_whole_or_not_there(tmp_path):
+def test_tum_file_interrupted_write_leaves_no_file(tmp_path):
     whole = random_trajectory()
     with files_of_at_most(1000), pytest.raises(OutputError, match=r"a\.tum' cannot be written: File too large"):
         write_tum(tmp_path / "a.tum", whole)

@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 
 from localization.logs.chunks import RawMessage, merge_channels
-from localization.logs.decode import frame_name, stamp_ns
-from localization.logs.message_stats import UnusableError
+from localization.logs.decode import UnusableError, frame_name, stamp_ns
 from localization.logs.reader import open_log
-from localization.logs.serialization import Decoder
+from localization.logs.serialization import LogDeserializer
 from localization.logs.sources import open_source
 from localization.logs.topic_roles import TYPES
 from motion_models.center_of_gravity.urdf import parse_urdf
@@ -107,7 +106,7 @@ def survey_log(path: Path) -> Survey:
     source = open_source(path)
     channels = merge_channels(source.channels)
     topics = {c.topic: (c.type, c.count) for c in sorted(channels, key=lambda c: c.count) if c.count}
-    decode = Decoder(channels, is_ros1=source.is_ros1)
+    decode = LogDeserializer(channels, is_ros1=source.is_ros1)
     names: dict[str, dict[str, None]] = {}
     frames: dict[str, str] = {}
     for topic, (kind, _) in topics.items():
@@ -124,13 +123,13 @@ def survey_log(path: Path) -> Survey:
     return Survey(path.name, topics, {topic: tuple(found) for topic, found in names.items()}, frames, mounts)
 
 
-def _first_messages(raws: Iterable[RawMessage], decode: Decoder, count: int) -> list[Any]:
+def _first_messages(raws: Iterable[RawMessage], decode: LogDeserializer, count: int) -> list[Any]:
     """The first ``count`` messages that can be decoded."""
     decoded = (_decoded(decode, raw) for raw in raws)
     return list(itertools.islice((message for message in decoded if message is not None), count))
 
 
-def _decoded(decode: Decoder, raw: Any) -> Any:
+def _decoded(decode: LogDeserializer, raw: Any) -> Any:
     try:
         return decode(raw)
     except UnusableError:
@@ -287,7 +286,7 @@ def fit_driver(path: Path, draft: Draft) -> tuple[float, float] | None:
 def _rates_and_twists(path: Path, states: str, odometry: str, joints: Joints) -> tuple[FloatArray, FloatArray]:
     """(n, 3) stamp [s], left and right rate [rad/s]; and (m, 3) stamp [s], vx [m/s], wz [rad/s]."""
     source = open_source(path)
-    decode = Decoder(merge_channels(source.channels), is_ros1=source.is_ros1)
+    decode = LogDeserializer(merge_channels(source.channels), is_ros1=source.is_ros1)
     rates: list[tuple[float, float, float]] = []
     twists: list[tuple[float, float, float]] = []
     for raw in source.messages([states, odometry]):

@@ -1,22 +1,38 @@
-"""What several commands share: opening a log of a robot, writing what is printed as JSON."""
+"""What commands share: a terminal that texts of logs cannot control, names separated by commas, new folders, JSON."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import math
+import re
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
+
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
 
 from localization.errors import SettingError
 from localization.output import output_errors, refuse_existing, write_text_file
 
+# Control characters but for line ends and tabs, marks that turn the direction of writing, and bytes of file names that are no text.
+_COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+class PlainConsole(Console):
+    """A console that prints control characters, which could move the cursor, set the title or hide a line, as question marks."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """As `Console.render`, without control characters."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else segment._replace(text=_COMMANDS.sub("\N{REPLACEMENT CHARACTER}", segment.text))
+
 
 def names(text: str, option: str) -> list[str]:
-    """Those in ``text``, separated by commas, each once. Raises `SettingError` where there is none."""
+    """Names in ``text``, separated by commas, each once. Raises `SettingError` where there is none."""
     found = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
     if not found:
         raise SettingError(f"{option} is '{text}', which names nothing; it must be one name, or several separated by commas.")
@@ -25,7 +41,7 @@ def names(text: str, option: str) -> list[str]:
 
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """A folder to write into that gets its name ``path`` once all is written: it is complete, or it is not there. Raises `OutputError`."""
+    """A new folder that is renamed to ``path`` at the end: it is complete, or it does not exist. Raises `OutputError`."""
     refuse_existing(path)
     with output_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)

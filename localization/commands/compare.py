@@ -17,17 +17,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table as Grid
 
 from localization.commands.common import names, write_json
+from localization.comparison.executors import run_local, run_on_cluster
 from localization.comparison.jobs import OK, Job, Row, job_key, run_job, trials
 from localization.comparison.page import CompareHead, check_report, write_comparison_report
-from localization.comparison.process_executor import run_local
 from localization.comparison.summary import Findings, against_best, closing, find, headline
-from localization.comparison.table import Table
+from localization.comparison.table import ResultTable
 from localization.errors import EvaluationError, LogError, OutputError
 from localization.estimators import check_estimator
 from localization.logs import TopicOverrides
-from localization.output import check_outputs
+from localization.output import check_outputs, versions
 from localization.pipeline import ReplayConfig
-from localization.provenance import versions
 from motion_models.online_calibration import check_forms
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
@@ -49,7 +48,7 @@ class Compare:
     estimator: str = "odometry,ekf"
     """Estimators, separated by commas."""
     corrections: str = "constant"
-    """What ekf and graph learn of the motion model: none, constant, cg_field; forms separated by commas."""
+    """What ekf and graph estimate of the motion model: none, constant, cg_field; forms separated by commas."""
     reference: str | None = None
     """Topic, or file (.tum, .relations) in whose name {stem} stands for the log's. Default: the robot file's topic."""
     metric: str = "ate_rmse_m"
@@ -64,12 +63,13 @@ class Compare:
     """Write means and differences to this file as well."""
 
     def run(self, console: Console) -> None:
+        """Run the command, with output on ``console``."""
         check_outputs(self.json)
         if self.processes < 0:
             raise OutputError(f"--processes is {self.processes}; it must be 1 or more, or 0 for as many as there are cores.")
         table_path, report_path = places(self.out)
         check_report(report_path)
-        jobs, table = self._jobs(console), Table(table_path)
+        jobs, table = self._jobs(console), ResultTable(table_path)
         left = [dataclasses.replace(job, trials=missing) for job in jobs if (missing := table.missing(job))]
         done = sum(len(job.trials) for job in jobs) - sum(len(job.trials) for job in left)
         if done:
@@ -108,14 +108,12 @@ class Compare:
 
     def _run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, list[Row]]]:
         if self.dask is not None:
-            from localization.comparison.dask_executor import run_on_cluster
-
             return run_on_cluster(jobs, self.dask)
         absent = [job for job in jobs if not Path(job.log).exists()]  # no process needs to be started for that
         there = [job for job in jobs if job not in absent]
         return itertools.chain(((job, run_job(job)) for job in absent), run_local(there, self.processes or os.cpu_count() or 1))
 
-    def _report(self, console: Console, table: Table, report: Path, rows: Sequence[Row]) -> None:
+    def _report(self, console: Console, table: ResultTable, report: Path, rows: Sequence[Row]) -> None:
         failed = [row for row in rows if row["status"] != OK]
         if len(failed) == len(rows):
             logs = len({row["log"] for row in rows})

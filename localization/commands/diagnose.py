@@ -59,6 +59,7 @@ class Diagnose:
     """Write what is printed to this file as well."""
 
     def run(self, console: Console) -> None:
+        """Run the command, with output on ``console``."""
         if not 0.5 <= self.window_s <= 20.0:
             raise CalibrationError(f"--window-s is {self.window_s:g}; windows of 0.5 to 20 s make sense.")
         check_outputs(self.out, self.json)

@@ -32,6 +32,7 @@ class Info:
     """Write what is printed to this file as well."""
 
     def run(self, console: Console) -> None:
+        """Run the command, with output on ``console``."""
         check_outputs(self.json)
         with console.status("reading the log"):
             robot = load_robot(self.robot)

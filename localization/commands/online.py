@@ -19,8 +19,8 @@ from localization.commands.online_terminal import live_line, terminal_view
 from localization.errors import CheckpointError, OutputError
 from localization.events import Event
 from localization.logs import open_log
+from localization.output import fingerprint
 from localization.pipeline import Pipeline
-from localization.provenance import fingerprint
 from localization.ros.node import Node
 from localization.ros.run_control import PlaybackClock, StopSignal
 from localization.ros.session import Session, SessionState, View, made_by
@@ -55,6 +55,7 @@ class Online(OnlineSettings):
     these variables demand, else `localhost`."""
 
     def run(self, console: Console) -> None:
+        """Run the command, with output on ``console``."""
         rate, run = parse_rate(self.rate), self.live_run()
         view = self._view()
         try:

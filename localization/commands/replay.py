@@ -1,4 +1,4 @@
-"""`skidloc replay`: the main job. All pairs of motion model and estimator over one log, scored, drawn and written."""
+"""`skidloc replay`: all pairs of motion model and estimator over one log, scored, plotted and written."""
 
 from __future__ import annotations
 
@@ -21,16 +21,22 @@ from localization.commands.calibration_tables import WIDE, show
 from localization.commands.common import names, new_folder, write_json
 from localization.errors import EstimatorError, EvaluationError
 from localization.estimators import CORRECTING, LOCALIZING, check_estimator
-from localization.evaluation.references import ReferenceTrack, Relations, read_reference_file, reference_track, with_noise
+from localization.evaluation.references import (
+    ReferenceTrack,
+    Relations,
+    describe_instant,
+    no_overlap_message,
+    read_reference_file,
+    reference_track,
+    with_noise,
+)
 from localization.evaluation.scores import Result, score
-from localization.evaluation.time_overlap import describe_instant, no_overlap_message
 from localization.events import Event, PositionSample
 from localization.logs import Log, TopicOverrides, open_log
-from localization.logs.fused_log import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
 from localization.logs.references import merge_positions, read_positions
-from localization.output import as_text, check_outputs
+from localization.logs.writer import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
+from localization.output import as_text, check_outputs, fingerprint, versions
 from localization.pipeline import ReplayConfig, Run, Trial, replay
-from localization.provenance import fingerprint, versions
 from localization.report.replay_page import ReportHead, overview_png, verdict, write_report
 from localization.trajectory import write_tum
 from motion_models.online_calibration import check_forms
@@ -57,13 +63,13 @@ class Replay:
     estimator: str = "odometry,lidar,ekf"
     """Estimators, separated by commas; `lidar` is left out where the log has no scans, unless asked for."""
     corrections: str = "constant"
-    """What ekf and graph learn of the motion model, forms separated by commas: none, constant (k and centre of rotation as slowly
-    changing constants), cg_field (their regressions on the centre of gravity, remembered from posture to posture), or single ones by name,
+    """What ekf and graph estimate of the motion model, forms separated by commas: none, constant (k and centre of rotation as slowly
+    changing constants), cg_field (their regressions on the centre of gravity, kept from posture to posture), or single ones by name,
     joined by + (the friction model's: mu_ratio, tracked_x, tracked_y, warp, cg_offset_x, cg_offset_y; as constant+cg_offset_x)."""
     reference: str | None = None
     """Topic of the log, or file (.tum, .relations), to score against; `none` for no score. Default: the robot file's topic, if any."""
     reference_sigma: tuple[float, float] | None = None
-    """Noise of the poses of a reference without covariances [m, deg], as 0.02 0.5: NEES takes such a reference as exact otherwise."""
+    """Noise of the poses of a reference without covariances [m, deg], as 0.02 0.5: without it the NEES assumes an exact reference."""
     positions: str | None = None
     """Topic of positions (NavSatFix, poses) that `graph` is to fuse, as GPS: `/fix`. The lever arm of the antenna is
     --config.estimator.graph.antenna-x-m and -y-m. Do not score against the same topic."""
@@ -75,6 +81,7 @@ class Replay:
     """Write a copy of metrics.json to this file as well."""
 
     def run(self, console: Console) -> None:
+        """Run the command, with output on ``console``."""
         robot = load_robot(self.robot)
         check_outputs(self.out, self.json)
         log = open_log(self.log, robot, self.topic)
@@ -135,7 +142,7 @@ class Replay:
         return found
 
     def _reference(self, log: Log) -> ReferenceTrack | Relations | None:
-        """By topic or by file; read before the run, so that a wrong name costs no time."""
+        """The reference, by topic or file; read before the run, so that a wrong name is reported at once."""
         name = self.reference if self.reference is not None else log.reference_topic
         if name is None or name == "none":
             return None
@@ -197,7 +204,7 @@ def check_overlap(reference: ReferenceTrack | Relations, log: Log) -> None:
 
 
 def _distance(results: Sequence[Result]) -> float | None:
-    """By the reference; without one, by the last estimate, in steps that a standing robot's jitter does not make."""
+    """Distance driven [m] by the reference, else by the last estimate, at a resolution above the jitter at standstill."""
     known = [r.accuracy.distance_m for r in results if r.accuracy and r.accuracy.distance_m is not None]
     return known[-1] if known else results[-1].run.trajectory.distance(0.05)
 
@@ -219,7 +226,7 @@ def _estimates(run: Run) -> Iterator[FusedEstimate]:
 
 @contextlib.contextmanager
 def _progress(console: Console, log: Log) -> Iterator[tuple[Iterator[Event], Callable[[int], None]]]:
-    """The log's events, and what moves the bar as they are used."""
+    """The log's events, which advance the progress bar."""
     events = log.events()
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:

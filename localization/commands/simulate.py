@@ -43,6 +43,7 @@ class Simulate:
     """Write what is printed, and when each run began and ended, to this file as well."""
 
     def run(self, console: Console) -> None:
+        """Run the command, with output on ``console``."""
         check_outputs(self.out, self.json)
         robot, effects = load_robot(self.robot), parse_faults(self.effect)
         simulation = simulate(self.experiment, robot, self.seed, effects, self.config)

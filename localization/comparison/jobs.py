@@ -14,8 +14,8 @@ from localization.estimators import CORRECTING, check_estimator
 from localization.evaluation.references import ReferenceTrack, Relations, read_reference_file, reference_track
 from localization.evaluation.scores import score
 from localization.logs import Log, TopicOverrides, open_log
+from localization.output import fingerprint, versions
 from localization.pipeline import ReplayConfig, Trial, replay
-from localization.provenance import fingerprint, versions
 from motion_models.errors import SkidlocError
 from motion_models.online_calibration import Form
 from motion_models.registry import make_model
@@ -29,7 +29,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class TrialSpec:
-    """What is run on a log."""
+    """Model, estimator and corrections to be run on a log."""
 
     model: str
     estimator: str
@@ -37,13 +37,14 @@ class TrialSpec:
 
     @property
     def name(self) -> str:
+        """Model, estimator and corrections, as in tables."""
         form = f" ({self.corrections})" if self.estimator in CORRECTING else ""
         return f"{self.model} {self.estimator}{form}"
 
 
 @dataclass(frozen=True)
 class Job:
-    """A log and what is run on it."""
+    """A log and the trials to be run on it."""
 
     log: str
     robot: Robot

@@ -1,24 +1,29 @@
-"""Report of a comparison over many logs: summary, means, tests, every log, failures."""
+"""Report of a comparison over many logs: summary, figures, means, tests, every log, failures."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from localization.comparison.figures import gains_svg, means_svg
+import numpy as np
+
 from localization.comparison.statistics import Difference, Mean, by_combination, combination
 from localization.comparison.summary import Findings, against_best, closing, headline, p_words, percent
 from localization.errors import OutputError
 from localization.output import write_text_file
+from localization.report.figures import Axes, plain_logs, svg
+from localization.report.figures import Figure as Canvas
 from localization.report.page import (
+    COLOURS,
+    WIDTH_IN,
     Block,
     Bullets,
     Cell,
     Definitions,
     Figure,
-    Item,
+    ListItem,
     Page,
     Paragraph,
     Section,
@@ -30,6 +35,9 @@ from localization.report.page import (
 from localization.report.runs import capitalize, estimator_colours
 from localization.report.tables import MISSING, number
 
+_MARKERS = "osD^v"  # of matplotlib, by motion model
+_LOG_SCALE_RATIO = 8.0  # of the largest value to the smallest: from here on the axis is logarithmic
+_ROW_HEIGHT_IN = 0.42
 _TITLE = "Comparison over"
 _BEST, _EQUAL, _LOST = "best", "not significant", "LiDAR lost"
 _TERMS = {
@@ -93,7 +101,7 @@ def _unbroken(sentence: str) -> str:
 
 def _means_figure(found: Findings, styles: Mapping[str, tuple[str, int]]) -> Figure:
     caption = "Large: mean over logs, the line its 95 % interval. Small: each log. Colours are estimators, shapes are motion models."
-    return Figure(means_svg(found, styles), f"Mean {found.measure} by combination", caption)
+    return Figure(_means_svg(found, styles), f"Mean {found.measure} by combination", caption)
 
 
 def _gains_figure(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[Block]:
@@ -102,7 +110,7 @@ def _gains_figure(found: Findings, styles: Mapping[str, tuple[str, int]]) -> lis
     if not others:
         return []
     caption = "Lines are 95 % intervals over logs; where one reaches 0, these logs do not show that the best is better."
-    return [Figure(gains_svg(found, others, styles), f"By how much the {found.measure} of the best is smaller", caption)]
+    return [Figure(_gains_svg(found, others, styles), f"By how much the {found.measure} of the best is smaller", caption)]
 
 
 def _tests(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[Block]:
@@ -173,13 +181,13 @@ def _failures(found: Findings) -> list[Block]:
     items = []
     for (log, reason), names in reasons.items():
         which = "everything" if len(names) == len(found.words) else ", ".join(names)
-        items.append(Item(reason, f"{_short(log, found)} ({which})"))
+        items.append(ListItem(reason, f"{_short(log, found)} ({which})"))
     return [Bullets(items)] if items else []
 
 
 def _problems(found: Findings) -> list[Block]:
     notes = {r["log"]: r["notes"] for r in found.rows if r.get("notes")}
-    return [Bullets([Item(note, _short(log, found)) for log, note in notes.items()])] if notes else []
+    return [Bullets([ListItem(note, _short(log, found)) for log, note in notes.items()])] if notes else []
 
 
 def _name(name: str, found: Findings, styles: Mapping[str, tuple[str, int]], badge: str = "") -> Cell:
@@ -212,3 +220,67 @@ def _short(log: str, found: Findings) -> str:
 
 def _provenance(head: CompareHead, found: Findings) -> dict[str, str]:
     return {"robot": head.robot, "metric": found.metric, "reference": head.reference, "all numbers": head.table, **head.versions}
+
+
+def _means_svg(found: Findings, styles: Mapping[str, tuple[str, int]]) -> str:
+    """A row for each combination, the best on top: a dot for each log, the mean and its 95 % interval. ``styles``: colour's name and
+    number of the motion model, by name of the combination."""
+    values = {name: np.array(list(table.values())) for name, table in by_combination(found.rows, found.metric).items()}
+
+    def draw(figure: Canvas) -> None:
+        axes = figure.add_subplot()
+        for row, mean in enumerate(found.means):
+            colour, model = styles[mean.name]
+            axes.plot(values[mean.name], _spread(row, mean.n), ".", color=COLOURS[colour], alpha=0.45, markersize=4.0)
+            _interval(axes, row, mean.mean, (mean.low, mean.high), colour, _MARKERS[model % len(_MARKERS)])
+        everything = np.concatenate([values[mean.name] for mean in found.means])
+        least, most = everything.min(), everything.max()
+        if least > 0.0 and most > _LOG_SCALE_RATIO * least:
+            axes.set(xscale="log", xlim=(least / 1.2, most * 1.2))
+            plain_logs(axes)
+        else:
+            axes.set_xlim(min(0.0, 1.05 * least), 1.05 * most or 1.0)
+        _rows(axes, [found.words[mean.name] for mean in found.means])
+        axes.set_xlabel(_with_unit(found))
+
+    return svg("means", WIDTH_IN, _ROW_HEIGHT_IN * len(found.means) + 0.75, draw)
+
+
+def _gains_svg(found: Findings, others: Sequence[Mean], styles: Mapping[str, tuple[str, int]]) -> str:
+    """By how much the best is smaller than each of ``others``, with 95 % intervals: those that reach 0 show nothing."""
+
+    def draw(figure: Canvas) -> None:
+        axes = figure.add_subplot()
+        for row, mean in enumerate(others):
+            d = found.against_best(mean.name)
+            assert d is not None
+            sign = 1.0 if d.better == found.best.name else -1.0
+            low, high = sorted(100.0 * sign * part for part in (d.relative_low, d.relative_high))
+            colour, model = styles[mean.name]
+            _interval(axes, row, 100.0 * sign * d.relative, (low, high), colour, _MARKERS[model % len(_MARKERS)])
+        axes.axvline(0.0, color=COLOURS["ink"], linewidth=0.9)
+        _rows(axes, [f"than {found.words[mean.name]}" for mean in others])
+        axes.set_xlabel(f"smaller by [%]: {found.measure} of {found.words[found.best.name]}")
+
+    return svg("gains", WIDTH_IN, _ROW_HEIGHT_IN * len(others) + 0.75, draw)
+
+
+def _interval(axes: Axes, row: int, value: float, interval: tuple[float, float], colour: str, marker: str) -> None:
+    axes.plot(interval, [row, row], color=COLOURS[colour], linewidth=2.0, solid_capstyle="butt")
+    axes.plot(value, row, marker, color=COLOURS[colour], markersize=6.5, markeredgecolor=COLOURS["ink"], markeredgewidth=0.6)
+
+
+def _rows(axes: Axes, names: Sequence[str]) -> None:
+    axes.set(yticks=range(len(names)), yticklabels=names, ylim=(len(names) - 0.4, -0.6))
+    axes.grid(visible=False, axis="y")
+    axes.tick_params(axis="y", length=0)
+    axes.spines["left"].set_visible(False)
+
+
+def _spread(row: int, n: int) -> np.ndarray:
+    """Heights in a row, so that equal numbers do not hide each other."""
+    return row + 0.24 * (np.arange(n) % 3 - 1.0)
+
+
+def _with_unit(found: Findings) -> str:
+    return f"{found.measure} [{found.unit}]" if found.unit else found.measure

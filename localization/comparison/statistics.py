@@ -1,7 +1,7 @@
 """Statistics of a table of many logs: means with intervals over logs, and whether one is better than another on the same logs.
 
 A log is the unit: errors within one are correlated, logs are not. Intervals are percentiles of the bootstrap over logs; differences
-are tested by flipping their signs log by log (exact for few logs), for which it does not matter how errors are distributed. With n logs no
+are tested by flipping their signs log by log (exact for few logs), which assumes no distribution of errors. With n logs no
 p-value can be below 2^(1-n); several of them are corrected after Holm.
 """
 
@@ -23,7 +23,7 @@ _EXACT_UP_TO = 14
 
 @dataclass(frozen=True)
 class Mean:
-    """Of one combination over logs."""
+    """Mean of one combination over logs, with its interval."""
 
     name: str
     n: int
@@ -36,7 +36,7 @@ class Mean:
 
 @dataclass(frozen=True)
 class Difference:
-    """Of two combinations on the logs that both have."""
+    """Difference of two combinations on the logs that both have."""
 
     better: str
     worse: str
@@ -52,11 +52,11 @@ class Difference:
     relative_low: float
     relative_high: float
     p_value: float
-    """Of a mean as far from zero if neither were better; corrected for all differences of the table."""
+    """Probability of a mean as far from zero if neither were better; corrected for all differences of the table."""
 
 
 def combination(row: Row) -> str:
-    """What a row is about, without the log."""
+    """Name of a row's model, estimator and corrections."""
     return f"{row['model']} {row['estimator']}" + (f" ({row['corrections']})" if row["corrections"] else "")
 
 

@@ -12,7 +12,7 @@ from localization.lidar.losses import is_long, per_cent
 from localization.report.runs import capitalize, describe_run, join_words
 from localization.report.tables import unit_of
 
-_CERTAIN = 0.05
+_SIGNIFICANCE_LEVEL = 0.05
 _MEASURES = {
     "ate_rmse_m": "position error (ATE)",
     "ate_rmse_deg": "heading error (ATE)",
@@ -33,10 +33,11 @@ class Findings:
     """The smallest first."""
     tested: Sequence[Difference]
     words: Mapping[str, str]
-    """By name of a combination: its name in a sentence."""
+    """Name of each combination in a sentence."""
 
     @property
     def best(self) -> Mean:
+        """The combination of the smallest mean."""
         return self.means[0]
 
     @property
@@ -46,15 +47,17 @@ class Findings:
 
     @property
     def unit(self) -> str:
+        """Unit of the metric."""
         return unit_of(self.metric)
 
     @property
     def failed(self) -> list[Row]:
+        """Rows of runs that failed."""
         return [row for row in self.rows if row["status"] != OK]
 
     @property
     def damaged(self) -> dict[str, str]:
-        """What of a log could not be read, by log; of those that count nevertheless."""
+        """Parts of logs that could not be read, by log; the rest of such a log counts."""
         return {row["log"]: row["damage"] for row in self.rows if row.get("damage")}
 
     def lost(self, name: str) -> list[Row]:
@@ -64,15 +67,16 @@ class Findings:
         ]
 
     def against_best(self, name: str) -> Difference | None:
-        """None where the two have fewer than two logs in common."""
+        """Difference of a combination and the best; None where they have fewer than two logs in common."""
         pair = {name, self.best.name}
         return next((d for d in self.tested if {d.better, d.worse} == pair), None)
 
     def is_shown(self, difference: Difference) -> bool:
-        return difference.p_value < _CERTAIN
+        """Whether a difference is significant."""
+        return difference.p_value < _SIGNIFICANCE_LEVEL
 
     def least_p(self, n: int) -> float:
-        """What no corrected p-value of ``n`` logs can be below."""
+        """Smallest possible corrected p-value of ``n`` logs."""
         return min(1.0, len(self.tested) * 2.0 ** (1 - n))
 
 
@@ -96,7 +100,7 @@ def headline(found: Findings) -> str:
 
 
 def against_best(other: Mean, found: Findings) -> str:
-    """A sentence on the best and one that is not."""
+    """Sentence that compares the best with another one."""
     difference = found.against_best(other.name)
     if difference is None:
         names = f"{capitalize(found.words[found.best.name])} and {found.words[other.name]}"
@@ -184,8 +188,8 @@ def _advice(found: Findings) -> str:
         return f"Use {found.words[best.name]}."
     if len(equal) < len(pairs):
         return f"Use {found.words[best.name]}; it is not significantly better than {join_words(equal, 'or')} on these logs."
-    if (least := found.least_p(best.n)) >= _CERTAIN:
-        enough = next(n for n in range(2, 99) if found.least_p(n) < _CERTAIN)
+    if (least := found.least_p(best.n)) >= _SIGNIFICANCE_LEVEL:
+        enough = next(n for n in range(2, 99) if found.least_p(n) < _SIGNIFICANCE_LEVEL)
         return f"{_logs(best.n)} cannot show it: p is at least {p_words(least)} for {_pairs(len(found.tested))}. Take at least {enough}."
     return "No difference is significant on these logs: take the simplest, or record more drives."
 

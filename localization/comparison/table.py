@@ -1,4 +1,4 @@
-"""The table of a comparison on disk: CSV or Parquet, rewritten as a whole after each log, so that what is done is never lost."""
+"""The table of a comparison on disk: CSV or Parquet, rewritten as a whole after each log, so that results are not lost."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ Name = tuple[str, str, str, str]
 """Log, model, estimator and corrections."""
 
 
-class Table:
-    """Rows by what was run. Reads what is there; `put` and `save`."""
+class ResultTable:
+    """Rows by log and trial, read from an existing file; `put` and `save`."""
 
     def __init__(self, path: Path) -> None:
         """Raises `OutputError` for a file that is no table of a comparison, or a format that cannot be written here."""
@@ -55,6 +55,7 @@ class Table:
         return row is not None and row["key"] == job.key and row["status"] == OK
 
     def put(self, rows: Iterable[Row]) -> None:
+        """Insert or replace rows."""
         for row in rows:
             self._rows[_name(row)] = row
 

@@ -5,9 +5,10 @@ with right perturbations: true pose = pose * exp(error).
 
     e = [ pose, start, map, key, gyro bias, gyro scale, clock offset, corrections ]
 
-`start` and `key` are clones of the pose (Roumeliotis & Burdick 2002, stochastic cloning) at the start of the step and at the last keyframe.
-`map` is the error of the submap around the robot, seen from the body. Scans that are matched to one submap share that error, so it is a
-consider state (Schmidt 1966): its covariance and correlations count, its gain is zero, as the submap stays where it is drawn.
+`start` and `key` are clones of the pose (Roumeliotis & Burdick 2002, stochastic cloning) at the start of the step and at the last
+keyframe. `map` is the error of the submap around the robot, as a right perturbation of the pose. Scans that are matched to one submap
+share that error, so it is a consider state (Schmidt 1966): its covariance and correlations count, its gain is zero, as the submap stays
+where it is drawn.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from localization.step import Step
 from motion_models import se2
 from motion_models.online_calibration import Corrections
 from motion_models.robot import GyroNoise
-from motion_models.se2 import FloatArray
+from motion_models.types import Cov3, FloatArray, Pose2
 
 POSE, START, MAP, KEY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 BIAS, SCALE, CLOCK, PARAMS = 12, 13, 14, 15
 _MIN_VARIANCE = 1e-14
-"""No relative motion is known better than a tenth of a micrometre or microradian [m^2, rad^2]."""
+"""Variance of a relative motion, at least: a tenth of a micrometre or microradian [m^2, rad^2]."""
 _MIN_DRIFT_SHARE = 0.01
 """Of the variance of a motion, at least: a tenth of its sigma, so that its information is finite."""
 _MAX_NUMBER = 1e12
@@ -67,8 +68,9 @@ class Filter:
         self.P[BIAS, BIAS], self.P[SCALE, SCALE] = gyro.bias_sigma_rad_per_s**2, gyro.scale_sigma**2
         self.P[CLOCK, CLOCK] = config.clock_sigma_s**2
         self.P[PARAMS:, PARAMS:] = corrections.cov
-        self._consider = np.zeros(n, dtype=bool)
-        self._consider[MAP] = True
+        self.is_considered = np.zeros(n, dtype=bool)
+        """(n,) states that have no gain."""
+        self.is_considered[MAP] = True
         self._scan_noise: tuple[FloatArray, FloatArray] | None = None  # of the last scan: covariance with the errors (n, 3), own (3, 3)
 
     def predict(self, step: Step, is_turning: bool = True) -> None:
@@ -76,7 +78,7 @@ class Filter:
 
         e_pose' = Ad(delta^-1) e_pose + (d delta / d clock) e_clock + (d delta / d params) e_params + slip.
 
-        Motion that is not ``is_turning`` says nothing of how the robot turns: until the next step, corrections are consider states.
+        Motion that is not ``is_turning`` does not excite the corrections: until the next step, they are consider states.
         """
         motion, dt = step.predicted, step.duration
         A = se2.adjoint(se2.inverse(motion.delta))
@@ -85,7 +87,7 @@ class Filter:
         F[POSE, CLOCK] = step.d_clock
         F[POSE, PARAMS:] = motion.d_params @ self._corrections.directions
         F[START, START], F[START, POSE] = 0.0, np.eye(3)  # the clone of the pose as it was
-        F[MAP, MAP] = A  # the same error of the submap, seen from where the body is now
+        F[MAP, MAP] = A  # the same error of the submap, as a perturbation of the present pose
         Q = np.zeros_like(self.P)
         Q[POSE, POSE] = motion.cov
         Q[BIAS, BIAS] = self._gyro.bias_walk_rad_per_s_sqrt_s**2 * dt
@@ -100,7 +102,7 @@ class Filter:
         pose = se2.compose(self.pose, motion.delta)
         _check(f"the motion of the wheels until stamp {step.end_ns} ns", pose, P)
         self.start, self.pose, self.P = self.pose, pose, P
-        self._consider[PARAMS:], self._scan_noise = not is_turning, None
+        self.is_considered[PARAMS:], self._scan_noise = not is_turning, None
 
     def update_turn(self, turn: Turn) -> float:
         """The gyro's turn since the start of the step. Returns the normalised innovation squared (NIS, 1 degree of freedom)."""
@@ -109,7 +111,7 @@ class Filter:
         H[:, POSE], H[:, START], H[0, BIAS], H[0, SCALE] = by_pose, by_start, by_bias, by_scale
         return self._update(se2.wrap_angle(np.array([turn.angle - predicted])), H, np.array([[turn.variance]]))[0]
 
-    def update_scan(self, measured: FloatArray, R: FloatArray, outlier_cov: FloatArray) -> float:
+    def update_scan(self, measured: Pose2, R: Cov3, outlier_cov: Cov3) -> float:
         """The pose (3,) that a scan has in the submap, with the scan's covariance ``R`` (3, 3). Returns its NIS (3 degrees of freedom).
 
         ``outlier_cov`` (3, 3): what the wheels' motion is worse by than predicted.
@@ -146,19 +148,19 @@ class Filter:
         self.P[PARAMS:, :] = self.P[:, PARAMS:] = 0.0
         self.P[PARAMS:, PARAMS:] = cov
 
-    def map_relative_cov(self) -> FloatArray:
+    def map_relative_cov(self) -> Cov3:
         """(3, 3) covariance of the pose against the submap around the robot: that of the prior of a match."""
         P = self.P
         return np.asarray(P[POSE, POSE] + P[MAP, MAP] - P[POSE, MAP] - P[MAP, POSE])
 
-    def motion_since(self, clone: slice) -> tuple[FloatArray, FloatArray]:
+    def motion_since(self, clone: slice) -> tuple[Pose2, Cov3]:
         """Motion (3,) since the clone `START` or `KEY`, and its covariance (3, 3)."""
         delta = se2.between(self.start if clone == START else self.key, self.pose)
         A, P = se2.adjoint(se2.inverse(delta)), self.P
         cross = P[POSE, clone] @ A.T
         return delta, _positive(P[POSE, POSE] - cross - cross.T + A @ P[clone, clone] @ A.T)
 
-    def drift_since_key(self) -> tuple[FloatArray, FloatArray]:
+    def drift_since_key(self) -> tuple[Pose2, Cov3]:
         """Motion (3,) since the clone `KEY`, and the covariance (3, 3) that it adds to the pose's where motions are chained as independent.
 
         |P - A P_key A^T|, A = Ad(delta^-1), with the matrix' absolute value and at most 1 in units of `motion_since`'s covariance C. Scans
@@ -179,7 +181,7 @@ class Filter:
         S = H @ P @ H.T + R
         _check("a measurement", innovation, S)
         K = np.asarray(np.linalg.solve(S, H @ P).T, dtype=float)
-        K[self._consider] = 0.0
+        K[self.is_considered] = 0.0
         A = np.eye(len(P)) - K @ H
         self.P = _symmetric(A @ P @ A.T + K @ R @ K.T)
         _check("a measurement", self.P)

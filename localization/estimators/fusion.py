@@ -8,20 +8,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from localization.estimators.base import NO_POINTS, Estimate, mean_twist
+from localization.estimators.base import NO_POINTS, Estimate, Estimator, mean_twist
 from localization.estimators.filter import BIAS, CLOCK, MAP, PARAMS, POSE, SCALE, START, Filter, FilterConfig
-from localization.events import PositionSample
-from localization.lidar import LostScans, ScanMatch, ScanMatchingSensor
+from localization.lidar import LostScans, ScanMatchingSensor
 from localization.step import Step
-from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion, MotionModel
 from motion_models.online_calibration import Corrections
 from motion_models.robot import Robot
-from motion_models.se2 import FloatArray
+from motion_models.types import Cov3, FloatArray, Points2, Twist2
 
-_MAX_STANDSTILL_M, _MAX_STANDSTILL_RAD = 0.01, 0.01
-"""A scan or a turn of the gyro that is off by more, and by 5 sigma, contradicts wheels that stand [m, rad]."""
+_MIN_TURN_RAD = 0.01
+"""A turn of the gyro in one step that contradicts wheels that stand, if it is 5 sigma, too [rad]."""
 _SIGMAS = 5.0
 _FORGETTING = 0.98
 """Of the statistics of slip, per scan: they are a mean over the last 50 scans, as those of the matcher."""
@@ -29,18 +27,18 @@ _BLOCKED_SPEED = np.array([0.5, 0.5, 0.5])
 """Sigma of the twist where wheels read zero but the robot moves [m/s, m/s, rad/s]."""
 
 
-class EkfFusion:
+class EkfFusion(Estimator):
     """`step` after `step`: predict by the wheels, update by the gyro, match the scan, update by it; the submap grows afterwards."""
 
     def __init__(self, model: MotionModel, corrections: Corrections, robot: Robot, sensor: ScanMatchingSensor | None, config: FilterConfig):
         """``sensor``: None without a LiDAR; then there is no second clock until the gyro's first reading."""
         self._clock_sigma_s = config.clock_sigma_s if sensor is None else 0.0
         self.filter = Filter(robot.gyro_noise, corrections, replace(config, clock_sigma_s=0.0) if sensor is None else config)
-        self._sensor, self._model, self._corrections = sensor, model, corrections
+        self._sensor, self.model, self.corrections = sensor, model, corrections
         self._track_m = robot.geometry.track_width_m
-        self._slip = np.zeros(3)  # twist that the wheels missed in the last step
+        self._twist, self._slip = np.zeros(3), np.zeros(3)  # of the last step; what the wheels missed of it
         self._slip_changes = _SlipChanges()
-        self._has_gyro = self._is_blocked = self._is_scan_pending = False
+        self._has_gyro = self._is_scan_pending = False
         self.wheel_motion, self.is_turning = Motion(np.zeros(3), np.zeros((3, 3))), True
         """Motion of the last step by the wheels, with the covariance that the filter gave it in the end; whether it corrects the model."""
         self.counts_by_name = dict.fromkeys(("scans", "matched", "standing", "searched"), 0)
@@ -51,10 +49,10 @@ class EkfFusion:
 
     @property
     def params(self) -> FloatArray:
-        return np.asarray(self._model.nominal + self._corrections.directions @ self.filter.corrections)
+        return np.asarray(self.model.nominal + self.corrections.directions @ self.filter.corrections)
 
     @property
-    def scan_points(self) -> FloatArray:
+    def scan_points(self) -> Points2:
         """(M, 2) the last scan in the body frame [m], or (0, 2)."""
         return NO_POINTS if self._sensor is None else self._sensor.scan_points()
 
@@ -82,7 +80,7 @@ class EkfFusion:
             nis = self._update_scan(step, self._sensor)
         delta, cov = ekf.motion_since(START)
         twist, twist_cov = mean_twist(delta, cov, step.duration) if step.duration > 0.0 else (step.twist, None)
-        self._slip = twist - _mean_twist(step)
+        self._twist, self._slip = twist, twist - _mean_twist(step)
         return Estimate(step.end_ns, ekf.pose, ekf.P[POSE, POSE].copy(), twist, twist_cov, nis)
 
     def run_deferred(self) -> None:
@@ -102,7 +100,8 @@ class EkfFusion:
         ekf, duration = self.filter, step.duration
         self.counts_by_name["scans"] += 1
         prior, cov = ekf.pose, ekf.map_relative_cov()
-        match = sensor.measure(step, prior, cov, step.twist + self._slip)
+        as_before = se2.exp(duration * self._twist)  # where wheels stall and catch up, the robot goes on as before
+        match = sensor.measure(step, prior, cov, step.twist + self._slip, se2.log(se2.between(step.predicted.delta, as_before)))
         self._is_scan_pending = True
         if match is None:
             return None
@@ -114,24 +113,24 @@ class EkfFusion:
             R = match.cov + self._slip_changes.sweep_cov(step, sensor.sweep_s)
         self.counts_by_name["matched"] += 1
         self.counts_by_name["searched"] += bool(match.outlier_cov.any())
-        self._is_blocked = step.is_standing and _is_contradicted(prior, cov, match)
         self.wheel_motion = replace(self.wheel_motion, cov=self.wheel_motion.cov + match.outlier_cov)
         return ekf.update_scan(match.measured, R, match.outlier_cov)
 
     def _is_turning(self, motion: Motion) -> bool:
-        """Whether ``motion`` turns enough to say something of the corrections."""
+        """Whether ``motion`` turns enough to excite the corrections."""
         d = motion.delta
-        return bool(abs(d[2]) * self._track_m >= self._corrections.least_turn * math.hypot(d[0], d[1]))
+        return bool(abs(d[2]) * self._track_m >= self.corrections.least_turn * math.hypot(d[0], d[1]))
 
     def _check_standstill(self, step: Step) -> Step:
-        """Wheels that read zero while gyro or scans show motion count as unknown."""
+        """Wheels that read zero while the gyro turns count as unknown. (A scan that moved overrules them as any outlier of the wheels.)"""
         if not step.is_standing:
             return step
-        if step.turn is not None and self._has_gyro:
-            turned = abs(step.turn.angle - self.filter.bias * step.turn.duration)
-            sigma = math.sqrt(step.turn.variance + self.filter.P[BIAS, BIAS] * step.turn.duration**2)
-            self._is_blocked |= turned > max(_SIGMAS * sigma, _MAX_STANDSTILL_RAD)
-        if not self._is_blocked:
+        if step.turn is None or not self._has_gyro:
+            self.counts_by_name["standing"] += 1
+            return step
+        turned = abs(step.turn.angle - self.filter.bias * step.turn.duration)
+        sigma = math.sqrt(step.turn.variance + self.filter.P[BIAS, BIAS] * step.turn.duration**2)
+        if turned <= max(_SIGMAS * sigma, _MIN_TURN_RAD):
             self.counts_by_name["standing"] += 1
             return step
         unknown = np.diag((_BLOCKED_SPEED * step.duration) ** 2)
@@ -143,12 +142,6 @@ class EkfFusion:
             self._has_gyro = True
             self.filter.P[CLOCK, CLOCK] += self._clock_sigma_s**2
 
-    def add_position(self, sample: PositionSample) -> None:
-        return None
-
-    def finish(self, moments: Trajectory | None = None) -> None:
-        self.run_deferred()
-
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         ekf, found = self.filter, {}
         sigmas = np.sqrt(np.diagonal(ekf.P))
@@ -157,15 +150,15 @@ class EkfFusion:
             found["gyro_scale"] = ekf.scale, float(sigmas[SCALE])
         if self._sensor is not None or self._has_gyro:
             found["wheel_clock_offset_s"] = ekf.clock_offset, float(sigmas[CLOCK])
-        nominal = dict(zip(self._model.param_names, self._model.nominal, strict=True))
-        for i, name in enumerate(self._corrections.names):
+        nominal = dict(zip(self.model.param_names, self.model.nominal, strict=True))
+        for i, name in enumerate(self.corrections.names):
             found[name] = float(nominal.get(name, 0.0) + ekf.corrections[i]), float(sigmas[PARAMS + i])
         return found
 
     def counts(self) -> Mapping[str, int]:
         return self.counts_by_name if self._sensor is None else {**self.counts_by_name, **self._sensor.lost.causes}
 
-    def map_points(self) -> FloatArray:
+    def map_points(self) -> Points2:
         return NO_POINTS if self._sensor is None else self._sensor.map_points()
 
 
@@ -178,7 +171,7 @@ class _SlipChanges:
     def __init__(self) -> None:
         self._sum = self._weight = 1.0  # white, as the wheels' noise model has it, until measured
 
-    def add(self, change: FloatArray, step: Step) -> None:
+    def add(self, change: Twist2, step: Step) -> None:
         """``change`` (3,) of the slip since the last scan [m/s, m/s, rad/s]."""
         if not step.has_wheels or step.is_standing:
             return
@@ -188,19 +181,13 @@ class _SlipChanges:
             self._sum = _FORGETTING * self._sum + ratio
             self._weight = _FORGETTING * self._weight + 1.0
 
-    def sweep_cov(self, step: Step, sweep_s: float) -> FloatArray:
+    def sweep_cov(self, step: Step, sweep_s: float) -> Cov3:
         """(3, 3) by which the pose of a bent scan is off: the mean over a sweep of T of a random walk about its middle, Q T / 12."""
         if not step.has_wheels or step.is_standing:
             return np.zeros((3, 3))
         return np.asarray(self._sum / self._weight * step.predicted.cov / step.duration * sweep_s / 12.0)
 
 
-def _mean_twist(step: Step) -> FloatArray:
+def _mean_twist(step: Step) -> Twist2:
     """(3,) of the wheels over the step."""
     return se2.log(step.predicted.delta) / step.duration if step.duration > 0.0 else step.twist
-
-
-def _is_contradicted(prior: FloatArray, cov: FloatArray, match: ScanMatch) -> bool:
-    """Whether a scan shows that the robot moved although its wheels stand."""
-    off, sigma = np.abs(se2.log(se2.between(prior, match.measured))), np.sqrt(np.diagonal(cov + match.cov))
-    return bool((off > np.maximum(_SIGMAS * sigma, [_MAX_STANDSTILL_M, _MAX_STANDSTILL_M, _MAX_STANDSTILL_RAD])).any())

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
-from localization.estimators.base import Estimate
+from localization.estimators.base import Estimate, Estimator
 from localization.estimators.filter import PARAMS
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
@@ -28,10 +28,13 @@ from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.online_calibration import Corrections
-from motion_models.se2 import FloatArray
+from motion_models.types import Cov3, FloatArray, Points2, Pose2
 
 _MIN_POSITIONS, _MIN_BASELINE_M = 3, 5.0
 """Positions, and the distance between them [m], from which they give the heading of the map."""
+_MAX_POSITION_SIGMAS = 5.0
+"""Positions that are farther off are reported."""
+_ALIGNMENT_ITERATIONS = 30
 _WHEEL_SCALE_SIGMA = 0.02
 """Relative error of the wheels' radius, both sides alike: wear and pressure of tyres. Positions and loops show it."""
 _WALK_S = 60.0
@@ -52,14 +55,14 @@ class GraphConfig(Settings):
     """The same, to its left [m]."""
 
 
-class GraphFusion:
+class GraphFusion(Estimator):
     """`EkfFusion` with a `PoseGraph` behind it."""
 
     def __init__(self, odometry: EkfFusion, corrections: Corrections, lidar: LidarConfig, config: GraphConfig, is_smoothing: bool):
         """``is_smoothing``: `finish` is to give the smoothed trajectory; memory then grows with the drive, 24 bytes a step."""
         self.odometry, self._corrections, self._lidar, self._config = odometry, corrections, lidar, config
         prior = block_diag(corrections.cov, _WHEEL_SCALE_SIGMA**2)
-        self._graph = PoseGraph(prior, np.array([config.antenna_x_m, config.antenna_y_m]))
+        self.graph = PoseGraph(prior, np.array([config.antenna_x_m, config.antenna_y_m]))
         self._loops: LoopDetector | None = None
         self._wheels = _KeyframeMotion(len(corrections.names))
         self._steps, self._stamps_ns = array("d"), array("q")  # the filter's poses, if they are to be smoothed
@@ -87,7 +90,7 @@ class GraphFusion:
         return self.odometry.lost
 
     def step(self, step: Step) -> Estimate:
-        """The filter's estimate, seen from the map."""
+        """The filter's estimate in the frame of the map."""
         self.run_deferred()
         ekf = self.odometry.filter
         estimate = self.odometry.step(step)
@@ -98,7 +101,7 @@ class GraphFusion:
             self._stamps_ns.append(step.end_ns)
         delta, cov = ekf.drift_since_key()
         moved = math.hypot(delta[0], delta[1]) >= self._config.keyframe_distance_m or abs(delta[2]) >= self._config.keyframe_angle_rad
-        self._is_keyframe_due = not self._graph.count or (moved and (step.scan is not None or self.lost is None))
+        self._is_keyframe_due = not self.graph.count or (moved and (step.scan is not None or self.lost is None))
         self._place_positions(step)
         A = se2.adjoint(se2.inverse(delta))
         pose = se2.compose(self._map_T_odom, ekf.pose)
@@ -117,28 +120,28 @@ class GraphFusion:
         self._waiting.append(sample)
 
     def _add_keyframe(self) -> None:
-        ekf, k = self.odometry.filter, self._graph.count
+        ekf, k = self.odometry.filter, self.graph.count
         if k:
             delta, cov = ekf.drift_since_key()
             wheels = self._wheels.preintegrated(ekf.corrections)
             D = wheels.by_corrections[:, :-1]
             total = wheels.cov + D @ ekf.P[PARAMS:, PARAMS:] @ D.T
             measured = _subtract_information(delta, cov, wheels.delta, total)
-            pose = se2.compose(self._graph.pose(k - 1), delta)
+            pose = se2.compose(self.graph.pose(k - 1), delta)
             update = Update(pose, wheels, self._walk(), (Between(k - 1, k, *measured),))
         else:
             update = Update(ekf.pose)
-        self._graph.apply(update)
+        self.graph.apply(update)
         self._nodes.append(len(self._stamps_ns) - 1)
         ekf.start_key()
         self._wheels = _KeyframeMotion(len(self._corrections.names))
         self._close_loops(Keyframe(ekf.pose, self.odometry.scan_points))
         self._align_positions()
         if len(self._corrections.names) and k:
-            mean, cov = self._graph.corrections()
+            mean, cov = self.graph.corrections()
             ekf.set_corrections(mean[:-1], cov[:-1, :-1])
-        self._map_T_odom = se2.compose(self._graph.pose(k), se2.inverse(ekf.pose))
-        self._key_cov = self._graph.marginal(k)
+        self._map_T_odom = se2.compose(self.graph.pose(k), se2.inverse(ekf.pose))
+        self._key_cov = self.graph.marginal(k)
 
     def _walk(self) -> FloatArray | None:
         """(c, c) by which the corrections may have changed, once a minute; None meanwhile."""
@@ -153,25 +156,25 @@ class GraphFusion:
             if self.odometry.cell == 0.0:
                 return
             self._loops = LoopDetector(self._lidar, self.odometry.cell)
-            self._loops.keyframes += [Keyframe(self._graph.pose(k), keyframe.points[:0]) for k in range(self._graph.count - 1)]
+            self._loops.keyframes += [Keyframe(self.graph.pose(k), keyframe.points[:0]) for k in range(self.graph.count - 1)]
         self._loops.add(keyframe)
-        loops = self._loops.detect(self._graph.poses, self._graph.marginal)
+        loops = self._loops.detect(self.graph.poses, self.graph.marginal)
         if loops:
             self.n_loops += len(loops)
             between = tuple(Between(loop.a, loop.b, loop.delta, np.asarray(np.linalg.inv(loop.cov)), is_loop=True) for loop in loops)
-            self._graph.apply(Update(betweens=between))
+            self.graph.apply(Update(betweens=between))
 
     def _place_positions(self, step: Step) -> None:
         """Positions up to the end of ``step`` are taken from the newest keyframe."""
         ekf = self.odometry.filter
         while self._waiting and self._waiting[0].stamp_ns <= step.end_ns:
             sample = self._waiting.pop(0)
-            if sample.stamp_ns < step.start_ns or not self._graph.count:
+            if sample.stamp_ns < step.start_ns or not self.graph.count:
                 continue
             part = (sample.stamp_ns - step.start_ns) / max(step.end_ns - step.start_ns, 1)
             pose = se2.interpolate(ekf.start, ekf.pose, np.array(part))
             offset = se2.between(ekf.key, pose)
-            self._positions.append((self._graph.count - 1, offset, sample.position, sample.covariance))
+            self._positions.append((self.graph.count - 1, offset, sample.position, sample.covariance))
 
     def _align_positions(self) -> None:
         """Positions enter the graph, the first time together with the heading that they give to the map."""
@@ -179,14 +182,15 @@ class GraphFusion:
             return
         alignment = None
         if not self._is_aligned:
-            ours = np.array([se2.compose(self._graph.pose(k), offset)[:2] for k, offset, _, _ in self._positions])
+            ours = np.array([se2.compose(self.graph.pose(k), offset)[:2] for k, offset, _, _ in self._positions])
             theirs = np.array([position for _, _, position, _ in self._positions])
+            sigmas = np.sqrt([0.5 * np.trace(cov) for _, _, _, cov in self._positions])
             if len(ours) < _MIN_POSITIONS or np.hypot(*np.ptp(ours, axis=0)) < _MIN_BASELINE_M:
                 return
-            alignment, self._is_aligned = _align(ours, theirs), True
+            alignment, self._is_aligned = _align(ours, theirs, sigmas), True
         found = tuple(Position(*row) for row in self._positions)
         self.n_positions += len(found)
-        self._graph.apply(Update(positions=found, alignment=alignment))
+        self.graph.apply(Update(positions=found, alignment=alignment))
         self._positions = []
 
     def finish(self, moments: Trajectory | None = None) -> Trajectory | None:
@@ -194,29 +198,39 @@ class GraphFusion:
         if self._is_keyframe_due:
             self.run_deferred()
         self.odometry.run_deferred()
-        if not self._is_smoothing or moments is None or self._graph.count < 2:
+        if not self._is_smoothing or moments is None or self.graph.count < 2:
             return None
-        poses, covs = self._graph.smooth()
+        poses, covs = self.graph.smooth()
         if not (np.isfinite(poses).all() and np.isfinite(covs).all()):
             raise EstimatorError("the pose graph has no finite solution. Look at the log.")
         smoothed, smoothed_covs = _interpolate(np.array(self._nodes), poses, covs, np.array(self._steps).reshape(-1, 3))
         return Trajectory(moments.stamps_ns, smoothed, smoothed_covs)
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
-        mean, cov = self._graph.corrections()
+        mean, cov = self.graph.corrections()
         return {**self.odometry.parameters(), "wheel_radius_scale": (1.0 + float(mean[-1]), math.sqrt(float(cov[-1, -1])))}
 
     def counts(self) -> Mapping[str, int]:
-        found = {**self.odometry.counts(), "keyframes": self._graph.count}
+        found = {**self.odometry.counts(), "keyframes": self.graph.count}
         if self._loops is not None:
             found["loops"] = self.n_loops
         return {**found, "positions": self.n_positions} if self.n_positions else found
 
-    def map_points(self) -> FloatArray:
+    def warnings(self) -> list[str]:
+        """Positions that could not be used, or contradict the other sensors."""
+        if not self.n_positions:
+            n = len(self._positions) + len(self._waiting)
+            unused = f"{n} positions could not be used: they give the map its heading after {_MIN_BASELINE_M:g} m of way."
+            return [unused] if n else []
+        n = int((self.graph.position_errors() > _MAX_POSITION_SIGMAS).sum())
+        contradicted = f"{n} of {self.n_positions} positions are more than {_MAX_POSITION_SIGMAS:g} sigma off wheels, gyro and LiDAR"
+        return [f"{contradicted}: they count little. Check the receiver, its covariance and the antenna's lever arm."] if n else []
+
+    def map_points(self) -> Points2:
         """(M, 2) the scans of all keyframes, where the graph has them [m]."""
         if self._loops is None:
             return self.odometry.map_points()
-        poses = self._graph.poses()
+        poses = self.graph.poses()
         drawn = [se2.transform(pose, key.points) for pose, key in zip(poses, self._loops.keyframes, strict=False) if len(key.points)]
         return np.vstack(drawn) if drawn else np.empty((0, 2))
 
@@ -230,7 +244,7 @@ class _KeyframeMotion:
         self._prior = np.zeros((n, n))
 
     def add(self, motion: Motion, corrections: Corrections, is_turning: bool) -> None:
-        """The next step. What is nearly straight says nothing of the corrections: there they are one error of the whole motion."""
+        """Add the next step. Nearly straight motion does not excite the corrections: there they are one error of the whole motion."""
         A = se2.adjoint(se2.inverse(motion.delta))
         self._delta = se2.compose(self._delta, motion.delta)
         self._cov = A @ self._cov @ A.T + motion.cov
@@ -246,12 +260,12 @@ class _KeyframeMotion:
         return PreintegratedMotion(self._delta, cov, np.column_stack([self._by_corrections, by_scale]), np.append(at, 0.0))
 
 
-def _subtract_information(delta: FloatArray, cov: FloatArray, prior: FloatArray, prior_cov: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What gyro and scans say of a motion, where they and the wheels' ``prior`` (3,) together give ``delta`` (3,): motion, information.
+def _subtract_information(delta: Pose2, cov: Cov3, prior: Pose2, prior_cov: Cov3) -> tuple[Pose2, Cov3]:
+    """Motion and information of gyro and scans alone, where they and the wheels' ``prior`` (3,) together give ``delta`` (3,).
 
     The wheels have a factor of their own, and must not be counted twice: information C^-1 - C_w^-1, where it is positive. Along directions
-    in which gyro and scans say less than the wheels, their share of the motion cannot be told: there it is at most as far from ``delta``
-    as the wheels are.
+    in which gyro and scans have less information than the wheels, their share of the motion is not observable: there it is at most as far
+    from ``delta`` as the wheels are.
     """
     root = np.linalg.cholesky(np.linalg.inv(prior_cov))
     whiten = np.linalg.inv(root)
@@ -262,12 +276,20 @@ def _subtract_information(delta: FloatArray, cov: FloatArray, prior: FloatArray,
     return se2.compose(delta, se2.exp(shift)), (to_axes.T * gained) @ to_axes
 
 
-def _align(ours: FloatArray, theirs: FloatArray) -> FloatArray:
-    """Pose (3,) that moves points ``ours`` (N, 2) onto ``theirs`` (N, 2) by least squares (Umeyama 1991, without scale)."""
-    a, b = ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)
-    yaw = math.atan2(float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), float(np.sum(a * b)))
-    turned = se2.transform(np.array([0.0, 0.0, yaw]), ours.mean(axis=0))
-    return np.array([*(theirs.mean(axis=0) - turned), yaw])
+def _align(ours: Points2, theirs: Points2, sigmas: FloatArray) -> Pose2:
+    """Pose (3,) that moves points ``ours`` (N, 2) onto ``theirs`` (N, 2) [m] (Umeyama 1991, without scale).
+
+    The sum of distances is minimised, not of their squares, by iterated weights 1 / distance: outliers among ``theirs`` do not pull.
+    Distances below ``sigmas`` (N,) [m] count alike.
+    """
+    weights, pose = 1.0 / sigmas, np.zeros(3)
+    for _ in range(_ALIGNMENT_ITERATIONS):
+        mean_a, mean_b = np.average(ours, axis=0, weights=weights), np.average(theirs, axis=0, weights=weights)
+        a, b = weights[:, None] * (ours - mean_a), theirs - mean_b
+        yaw = math.atan2(float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), float(np.sum(a * b)))
+        pose = np.array([*(mean_b - se2.transform(np.array([0.0, 0.0, yaw]), mean_a)), yaw])
+        weights = 1.0 / np.maximum(np.hypot(*(se2.transform(pose, ours) - theirs).T), sigmas)
+    return pose
 
 
 def _interpolate(nodes: FloatArray, poses: FloatArray, covs: FloatArray, odom: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -7,26 +7,20 @@ from collections.abc import Mapping
 import numpy as np
 
 from localization.errors import EstimatorError
-from localization.estimators.base import NO_POINTS, Estimate
-from localization.events import PositionSample
+from localization.estimators.base import NO_POINTS, Estimate, Estimator
 from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
 from localization.lidar.scan_matcher import MIN_POINTS
 from localization.step import Step
-from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.robot import Mount
-from motion_models.se2 import FloatArray
+from motion_models.types import Points2
 
 _FALLBACK_VOXEL_M = 0.5
 """Voxel where the first scan has too few points to choose one."""
 
 
-class LidarOdometry:
+class LidarOdometry(Estimator):
     """A pose for each scan; between scans it stays where it was. No covariance: KISS-ICP has none."""
-
-    clock_offset_s = 0.0
-    params = None
-    lost = None
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig | None = None) -> None:
         self._mounts, self._config = mounts, config or LidarConfig()
@@ -52,20 +46,8 @@ class LidarOdometry:
             self._n_scans += 1
         return Estimate(step.end_ns, self._pose, None, self._twist, None)
 
-    def run_deferred(self) -> None:
-        return None
-
-    def add_position(self, sample: PositionSample) -> None:
-        return None
-
-    def finish(self, moments: Trajectory | None = None) -> None:
-        return None
-
-    def parameters(self) -> Mapping[str, tuple[float, float]]:
-        return {}
-
     def counts(self) -> Mapping[str, int]:
         return {"scans": self._n_scans}
 
-    def map_points(self) -> FloatArray:
+    def map_points(self) -> Points2:
         return NO_POINTS if self._kiss is None else self._kiss.point_cloud()[:, :2]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from localization.errors import EstimatorError
@@ -14,7 +14,7 @@ from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.estimators.lidar_odometry import LidarOdometry
 from localization.lidar import LidarConfig, ScanMatchingSensor
 from motion_models.base import MotionModel
-from motion_models.online_calibration import Corrections, Form, corrections
+from motion_models.online_calibration import Form, corrections
 from motion_models.robot import Mount, Robot
 
 
@@ -27,31 +27,7 @@ class EstimatorConfig:
     lidar: LidarConfig = field(default_factory=LidarConfig)
 
 
-_Maker = Callable[[MotionModel, Corrections, Robot, Mapping[str, Mount], bool, EstimatorConfig, bool], Estimator]
-
-
-def _make_ekf(
-    model: MotionModel,
-    corrected: Corrections,
-    robot: Robot,
-    mounts: Mapping[str, Mount],
-    has_lidar: bool,
-    config: EstimatorConfig,
-    is_smoothing: bool,
-) -> EkfFusion:
-    sensor = ScanMatchingSensor(mounts, config.lidar) if has_lidar else None
-    return EkfFusion(model, corrected, robot, sensor, config.ekf)
-
-
-ESTIMATORS: Mapping[str, _Maker] = {
-    "odometry": lambda model, corrected, robot, mounts, has_lidar, config, is_smoothing: DeadReckoning(),
-    "lidar": lambda model, corrected, robot, mounts, has_lidar, config, is_smoothing: LidarOdometry(mounts, config.lidar),
-    "ekf": _make_ekf,
-    "graph": lambda model, corrected, robot, mounts, has_lidar, config, is_smoothing: GraphFusion(
-        _make_ekf(model, corrected, robot, mounts, has_lidar, config, is_smoothing), corrected, config.lidar, config.graph, is_smoothing
-    ),
-}
-
+ESTIMATORS = ("odometry", "lidar", "ekf", "graph")
 CORRECTING = ("ekf", "graph")
 """Those that correct the motion model on the way."""
 LOCALIZING = ("graph",)
@@ -78,7 +54,14 @@ def make_estimator(
     config: EstimatorConfig | None = None,
     is_smoothing: bool = False,
 ) -> Estimator:
-    """The estimator ``name`` at the origin, with corrections of ``form``; with ``is_smoothing``, `Estimator.finish` is to give
-    the smoothed trajectory. Raises what `check_estimator` and `corrections` do."""
+    """The estimator ``name`` at the origin, with corrections of ``form``; with ``is_smoothing``, `Estimator.finish` is to give the
+    smoothed trajectory. Raises what `check_estimator` and `corrections` do."""
     check_estimator(name, has_lidar)
-    return ESTIMATORS[name](model, corrections(model, form), robot, mounts, has_lidar, config or EstimatorConfig(), is_smoothing)
+    config = config or EstimatorConfig()
+    if name == "odometry":
+        return DeadReckoning()
+    if name == "lidar":
+        return LidarOdometry(mounts, config.lidar)
+    corrected, sensor = corrections(model, form), ScanMatchingSensor(mounts, config.lidar) if has_lidar else None
+    ekf = EkfFusion(model, corrected, robot, sensor, config.ekf)
+    return ekf if name == "ekf" else GraphFusion(ekf, corrected, config.lidar, config.graph, is_smoothing)

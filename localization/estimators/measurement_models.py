@@ -6,13 +6,13 @@ import numpy as np
 
 from localization.gyro import Turn
 from motion_models import se2
-from motion_models.se2 import FloatArray
+from motion_models.types import FloatArray, Pose2
 
 _YAW = np.array([0.0, 0.0, 1.0])
 
 
 def predict_turn(
-    world_T_start: FloatArray, world_T_now: FloatArray, turn: Turn, bias: float, scale: float
+    world_T_start: Pose2, world_T_now: Pose2, turn: Turn, bias: float, scale: float
 ) -> tuple[float, FloatArray, FloatArray, float, float]:
     """What a gyro measures from start to now [rad]: (1 + scale) (yaw_now - yaw_start) + bias dt.
 
@@ -22,7 +22,7 @@ def predict_turn(
     return (1.0 + scale) * turned + bias * turn.duration, (1.0 + scale) * _YAW, -(1.0 + scale) * _YAW, turn.duration, turned
 
 
-def subtract_map_error(odom_T_body: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def subtract_map_error(odom_T_body: Pose2, measured: Pose2) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Innovation log(pose^-1 measured) (3,) of a pose ``measured`` in a submap, with its Jacobians (3, 3) by the errors of pose and submap.
 
     To first order the innovation is e_pose - e_map - n, where n is the scan's own noise.
@@ -30,7 +30,7 @@ def subtract_map_error(odom_T_body: FloatArray, measured: FloatArray) -> tuple[F
     return se2.log(se2.between(odom_T_body, measured)), np.eye(3), -np.eye(3)
 
 
-def motion_residual(world_T_a: FloatArray, world_T_b: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def motion_residual(world_T_a: Pose2, world_T_b: Pose2, measured: Pose2) -> tuple[FloatArray, FloatArray, FloatArray]:
     """How far the motion from a to b is off the ``measured`` one: log(measured^-1 (a^-1 b)), (3,), with its Jacobians (3, 3) by a and b."""
     a_T_b = se2.between(world_T_a, world_T_b)
     error = se2.log(se2.between(measured, a_T_b))
@@ -38,7 +38,7 @@ def motion_residual(world_T_a: FloatArray, world_T_b: FloatArray, measured: Floa
     return error, -by_b @ se2.adjoint(se2.inverse(a_T_b)), by_b
 
 
-def position_residual(world_T_a: FloatArray, lever: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def position_residual(world_T_a: Pose2, lever: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """How far the point ``lever`` (2,) of the body at a is off a measured ``position`` (2,) [m].
 
     Returns it with its Jacobians by a (2, 3) and by the lever (2, 2).

@@ -9,16 +9,18 @@ Incremental by ISAM2 (Kaess et al. 2012) on the way; Levenberg-Marquardt and mar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import gtsam
 import numpy as np
 
+from localization.errors import EstimatorError
 from localization.estimators.measurement_models import motion_residual, position_residual
 from motion_models import se2
-from motion_models.se2 import FloatArray
+from motion_models.types import Cov3, FloatArray, Pose2
 
 _ALIGNMENT, _LEVER = gtsam.symbol("t", 0), gtsam.symbol("l", 0)
 _FIRST_SIGMA = np.array([1e-3, 1e-3, 1e-4])
@@ -44,7 +46,7 @@ _CONVERGED = 1e-6
 class PreintegratedMotion:
     """The wheels' motion from keyframe to keyframe, by any motion model."""
 
-    delta: FloatArray
+    delta: Pose2
     """(3,) at the corrections ``at``."""
     cov: FloatArray
     """(3, 3)"""
@@ -60,7 +62,7 @@ class Between:
 
     a: int
     b: int
-    delta: FloatArray
+    delta: Pose2
     information: FloatArray
     is_loop: bool = False
 
@@ -81,14 +83,14 @@ class Position:
 class Update:
     """What enters the graph at once. Replayed in order, updates give the same graph to the last bit."""
 
-    pose: FloatArray | None = None
+    pose: Pose2 | None = None
     """(3,) initial value of the next keyframe, if there is one."""
     wheels: PreintegratedMotion | None = None
     walk_cov: FloatArray | None = None
     """(c, c) if the corrections go on as a new variable: how far they may have changed."""
     betweens: tuple[Between, ...] = ()
     positions: tuple[Position, ...] = ()
-    alignment: FloatArray | None = None
+    alignment: Pose2 | None = None
     """(3,) initial value of ``enu_T_map``, with the first positions."""
 
 
@@ -122,10 +124,11 @@ class PoseGraph:
         """Add ``update`` and solve."""
         self.updates.append(update)
         factors, values = self._factors(update)
-        self._isam.update(factors, values)
-        if any(between.is_loop for between in update.betweens) or update.alignment is not None:
-            self._iterate()
-        self._values = self._isam.calculateEstimate()
+        with _check_solvable():
+            self._isam.update(factors, values)
+            if any(between.is_loop for between in update.betweens) or update.alignment is not None:
+                self._iterate()
+            self._values = self._isam.calculateEstimate()
 
     def _iterate(self) -> None:
         """Until nothing changes: a robust loss gives what was just closed its weight only step by step."""
@@ -133,7 +136,7 @@ class PoseGraph:
             if not self._isam.update().getVariablesRelinearized():
                 break
 
-    def pose(self, k: int) -> FloatArray:
+    def pose(self, k: int) -> Pose2:
         """(3,) ``map_T_body`` of keyframe ``k``."""
         return _array(self._values.atPose2(gtsam.symbol("x", k)))
 
@@ -142,9 +145,18 @@ class PoseGraph:
         values = gtsam.utilities.extractPose2(self._values)  # in order of keys: before x, there may be t
         return np.asarray(values[len(values) - self.count :])
 
-    def marginal(self, k: int) -> FloatArray:
+    def marginal(self, k: int) -> Cov3:
         """(3, 3) covariance of keyframe ``k``."""
         return np.asarray(self._isam.marginalCovariance(gtsam.symbol("x", k)))
+
+    def lever_arm(self) -> FloatArray:
+        """(2,) of the positions' antenna in the body frame [m]."""
+        return np.asarray(self._values.atPoint2(_LEVER)) if self._values.exists(_LEVER) else self.lever
+
+    def position_errors(self) -> FloatArray:
+        """(n,) normalised errors [sigma] of the positions by the present estimates."""
+        positions = [position_factor(position) for update in self.updates for position in update.positions]
+        return np.array([np.linalg.norm(factor.whitenedError(self._values)) for factor in positions])
 
     def corrections(self) -> tuple[FloatArray, FloatArray]:
         """Mean (c,) and covariance (c, c) of the corrections."""
@@ -160,9 +172,10 @@ class PoseGraph:
         for update in self.updates:
             graph.push_back(self._factors(update)[0])
         assert self.count == count
-        values = _levenberg_marquardt(graph, values)
-        linear = graph.linearize(values)
-        marginals = gtsam.Marginals(linear, linear.optimize())
+        with _check_solvable():
+            values = levenberg_marquardt(graph, values)
+            linear = graph.linearize(values)
+            marginals = gtsam.Marginals(linear, linear.optimize())
         keys = [gtsam.symbol("x", k) for k in range(count)]
         self._values = values
         return self.poses(), np.array([marginals.marginalCovariance(key) for key in keys])
@@ -175,7 +188,7 @@ class PoseGraph:
         if update.walk_cov is not None:
             self._add_walk(update.walk_cov, factors, values)
         if update.wheels is not None:
-            factors.add(_wheel_factor(k - 1, k, gtsam.symbol("c", self._walks), update.wheels))
+            factors.add(wheel_factor(k - 1, k, gtsam.symbol("c", self._walks), update.wheels))
         for between in update.betweens:
             noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Information(between.information)
             if between.is_loop:
@@ -189,10 +202,10 @@ class PoseGraph:
             values.insert(_ALIGNMENT, gtsam.Pose2(*update.alignment))
             values.insert(_LEVER, self.lever)
         for position in update.positions:
-            factors.add(_position_factor(position))
+            factors.add(position_factor(position))
         return factors, values
 
-    def _add_keyframe(self, pose: FloatArray, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+    def _add_keyframe(self, pose: Pose2, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
         key = gtsam.symbol("x", self.count)
         values.insert(key, gtsam.Pose2(*pose))
         if not self.count:
@@ -210,7 +223,7 @@ class PoseGraph:
         self._walks += 1
 
 
-def _wheel_factor(a: int, b: int, corrections: int, wheels: PreintegratedMotion) -> gtsam.CustomFactor:
+def wheel_factor(a: int, b: int, corrections: int, wheels: PreintegratedMotion) -> gtsam.CustomFactor:
     """log((delta exp(D (c - c0)))^-1 (x_a^-1 x_b)): the motion model's prediction as a factor of both poses and the corrections."""
     keys = [gtsam.symbol("x", a), gtsam.symbol("x", b)]
     has_corrections = wheels.by_corrections.any()
@@ -232,7 +245,7 @@ def _wheel_factor(a: int, b: int, corrections: int, wheels: PreintegratedMotion)
     return _robust_factor(keys, wheels.cov, error)
 
 
-def _position_factor(position: Position) -> gtsam.CustomFactor:
+def position_factor(position: Position) -> gtsam.CustomFactor:
     """t x_k (offset l) - p: where the antenna at lever arm l is, against the measured position."""
     key = gtsam.symbol("x", position.k)
 
@@ -257,7 +270,7 @@ def _robust_factor(keys: Sequence[int], cov: FloatArray, error: Callable[..., Fl
     return gtsam.CustomFactor(gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(cov)), list(keys), error)
 
 
-def _levenberg_marquardt(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+def levenberg_marquardt(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
     """GTSAM's own loop copies all values at every Python callback; this one does the same without: damped steps until the cost stays."""
     cost, damping = graph.error(values), 0.0
     for _ in range(_MAX_ITERATIONS):
@@ -274,6 +287,18 @@ def _levenberg_marquardt(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
         if is_done:
             break
     return values
+
+
+@contextlib.contextmanager
+def _check_solvable() -> Iterator[None]:
+    """Raises `EstimatorError` in place of GTSAM's error for systems that rounding makes singular."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise EstimatorError(
+            "the pose graph cannot be solved: some covariances are far smaller than others. Check those of the positions and the robot "
+            f"file's noise. (GTSAM: {str(error).strip().splitlines()[0]})"
+        ) from error
 
 
 def _array(pose: gtsam.Pose2) -> FloatArray:

@@ -4,10 +4,13 @@ A consistent estimator's normalised squared errors ``e^T P^-1 e`` follow chi-squ
 (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001, sec. 5.4). NEES takes errors against the
 truth, NIS innovations against their predicted covariance. Both are needed: innovations can be consistent while the state is not.
 
-The trap: the bands count independent samples. Innovations of a consistent filter are independent; pose errors along one run are not (this
+The bands are for independent samples. Innovations of a consistent filter are independent; pose errors along one run are not (this
 second's error is the last one's plus a little), so one run counts as one sample however long it is.
 
-Singular covariances are treated in `localization.evaluation.normalized_errors`.
+Singular covariances: a direction of zero variance has no information. Where the error is zero too, it is not counted (one degree of
+freedom less); where it is not, the square is infinite (a plain pseudo-inverse would take it as zero). Zero is to rounding: each component
+is first scaled to its own variance, so that metres and radians do not mix, then eigenvalues below 1e-12 of the largest are zero, as are
+errors within three standard deviations of that (3e-6).
 """
 
 from __future__ import annotations
@@ -22,16 +25,17 @@ from scipy.stats import chi2, norm
 
 from localization.errors import EvaluationError
 from localization.evaluation.metrics import match
-from localization.evaluation.normalized_errors import is_covariance, normalize
 from localization.evaluation.references import ReferenceTrack
 from localization.trajectory import IntArray, Trajectory
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
+_MAX_ZERO_EIGENVALUE = 1e-12  # of the largest
+
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Correlation of normalised innovations with their successors; beyond the bound the filter's model misses something."""
+    """Correlation of normalised innovations with their successors; beyond the bound the filter's model is wrong."""
 
     lag1: float
     """-1 to 1."""
@@ -41,6 +45,7 @@ class Whiteness:
 
     @property
     def is_white(self) -> bool:
+        """Whether the correlation is within the bound."""
         return abs(self.lag1) <= self.bound
 
 
@@ -63,6 +68,7 @@ class Consistency:
 
     @property
     def verdict(self) -> Literal["consistent", "overconfident", "conservative"]:
+        """Mean above the band, below it, or inside."""
         if self.mean > self.band[1]:
             return "overconfident"
         return "conservative" if self.mean < self.band[0] else "consistent"
@@ -219,9 +225,53 @@ def _moved(covariance: FloatArray, motions: FloatArray) -> FloatArray:
 
 
 def _in_body(covariances: FloatArray, yaws: FloatArray) -> FloatArray:
-    """(N, 3, 3) covariances of x, y, yaw in the plane, turned into the body frame; zero where they are not known."""
+    """(N, 3, 3) covariances of x, y, yaw in the plane, turned into the body frame; zero where unknown."""
     c, s, o = np.cos(yaws), np.sin(yaws), np.zeros_like(yaws)
     plane_T_body = np.stack([np.stack([c, -s, o], -1), np.stack([s, c, o], -1), np.stack([o, o, o + 1.0], -1)], axis=-2)
     known = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
     turned: FloatArray = np.swapaxes(plane_T_body, 1, 2) @ np.where(known[:, None, None], covariances, 0.0) @ plane_T_body
     return turned
+
+
+def normalize(errors: ArrayLike, covariances: ArrayLike) -> tuple[FloatArray, NDArray[np.int64], FloatArray]:
+    """Normalised squares (N,), degrees of freedom (N,) and errors brought to unit covariance (N, d), singular directions as above."""
+    e, p = np.asarray(errors, dtype=float), np.asarray(covariances, dtype=float)
+    if e.ndim != 2 or p.shape != (*e.shape, e.shape[-1]):
+        raise EvaluationError(f"errors must have shape (N, d) and covariances (N, d, d), found {e.shape} and {p.shape}.")
+    _check_finite(e, p)
+    sigma, values, vectors = _spectrum(p)
+    largest = values[:, -1:]
+    if not np.all(is_covariance(p)):
+        i = int(np.flatnonzero(~is_covariance(p))[0])
+        raise EvaluationError(f"covariance number {i} is not symmetric or has a negative eigenvalue; it is no covariance:\n{p[i]}")
+    free = (values > _MAX_ZERO_EIGENVALUE * largest) & (largest > 0.0)
+    along = np.einsum("nji,nj->ni", vectors, e / sigma)
+    whitened = np.where(free, along / np.sqrt(np.where(free, values, 1.0)), 0.0)
+    broken = (~free & (np.abs(along) > 3.0 * math.sqrt(_MAX_ZERO_EIGENVALUE))).any(axis=1)
+    squares = np.where(broken, np.inf, np.sum(whitened**2, axis=1))
+    return squares, free.sum(axis=1), np.einsum("nij,nj->ni", vectors, whitened)
+
+
+def _check_finite(e: FloatArray, p: FloatArray) -> None:
+    if not len(p):
+        return
+    for name, array in (("error", e), ("covariance", p)):
+        infinite = np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))
+        if infinite.size:
+            raise EvaluationError(f"{name} number {infinite[0]} (and {infinite.size - 1} more) is not finite.")
+
+
+def is_covariance(p: FloatArray) -> NDArray[np.bool_]:
+    """(N,) True for matrices (N, d, d) that are symmetric and have no negative eigenvalue, but for rounding."""
+    sigma, values, _ = _spectrum(p)
+    lopsided = np.abs(p - np.swapaxes(p, 1, 2)) > 1e-6 * sigma[:, :, None] * sigma[:, None, :]
+    return np.asarray(~lopsided.any(axis=(1, 2)) & (values >= -1e-9 * np.maximum(values[:, -1:], 0.0)).all(axis=1))
+
+
+def _spectrum(p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Standard deviations (N, d), 1 where the variance is zero, and eigenvalues, eigenvectors of the correlations (zero where it is)."""
+    variance = np.diagonal(p, axis1=1, axis2=2)
+    sigma = np.sqrt(np.where(variance > 0.0, variance, 1.0))
+    correlations = p / (sigma[:, :, None] * sigma[:, None, :])
+    values, vectors = np.linalg.eigh(0.5 * (correlations + np.swapaxes(correlations, 1, 2)))
+    return sigma, values, vectors

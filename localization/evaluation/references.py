@@ -1,4 +1,4 @@
-"""References of scores: a track of trusted poses or positions, or hand-verified relations between instants."""
+"""References of scores: a track of poses or positions, or verified relations between instants."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +19,12 @@ from motion_models.se2 import FloatArray
 _RELATION_COLUMNS = ("t1", "t2", "dx", "dy", "dz", "droll", "dpitch", "dyaw")
 
 
+_EPOCH_BEGINS_S = 1e8  # clocks below this (March 1973) count from the start of a run, not from 1970
+
+
 @dataclass(frozen=True, eq=False)
 class ReferenceTrack:
-    """Poses or positions of the robot by a trusted source, in order of time, everything finite."""
+    """Poses or positions of the robot by a reference system, in order of time, everything finite."""
 
     stamps_ns: IntArray
     """(N,) strictly increasing."""
@@ -29,9 +33,9 @@ class ReferenceTrack:
     yaws: FloatArray | None = None
     """(N,) [rad], or None where the source has positions only (GPS)."""
     covariances: FloatArray | None = None
-    """(N, 3, 3) of x, y, yaw in the reference's plane, NaN where unknown; None where nothing is known."""
+    """(N, 3, 3) of x, y, yaw in the reference's plane, NaN where unknown; None without covariances."""
     source: str = "reference"
-    """What errors call it: a topic or a file."""
+    """Its name in messages: a topic or a file."""
     n_dropped: int = 0
     """Samples left out because they were not finite or repeated a stamp."""
     warnings: tuple[str, ...] = ()
@@ -39,7 +43,7 @@ class ReferenceTrack:
 
     @property
     def poses(self) -> FloatArray:
-        """(N, 3) x, y, yaw. Raises `EvaluationError` where the yaw is not known."""
+        """(N, 3) x, y, yaw. Raises `EvaluationError` where the source has no yaw."""
         if self.yaws is None:
             raise EvaluationError(f"{self.source} has positions only; poses need a reference with heading.")
         return np.column_stack([self.positions, self.yaws])
@@ -72,7 +76,7 @@ def reference_track(references: Iterable[Reference], source: str = "reference") 
     """The track of reference events, sorted by header stamp.
 
     Samples that are not finite, and all but the first of those with one stamp, are left out and counted. If some samples have a
-    yaw, those without it count as not finite. Headings that cannot be headings (see `frozen_yaw`) are taken as unknown.
+    yaw, those without it count as not finite. Headings that never change (see `frozen_yaw`) are taken as unknown.
     Raises `EvaluationError` if nothing is left.
     """
     samples = list(references)
@@ -174,3 +178,42 @@ def _looks_like_tum(path: str | Path) -> bool:
         if norm == 0.0 and second >= first:
             return False  # a relation without rotation: the second column is a time too
     return True
+
+
+def describe_span(stamps_ns: IntArray) -> str:
+    """First and last stamp: as UTC where the clock counts from 1970, else in seconds. ``stamps_ns`` (N,) ascending."""
+    if not len(stamps_ns):
+        return "no time at all"
+    first, last = int(stamps_ns[0]), int(stamps_ns[-1])
+    return f"{describe_instant(first)} to {describe_instant(last)} ({(last - first) * 1e-9:.1f} s)"
+
+
+def no_overlap_message(trajectory_ns: IntArray, reference_ns: IntArray, source: str, n_inside: int) -> str:
+    """Why a reference could not be matched: both spans, and the likely cause. Stamps (N,), (M,) ascending."""
+    found = "none lies" if n_inside == 0 else f"only {n_inside} {'lies' if n_inside == 1 else 'lie'}"
+    spans = f"Trajectory: {describe_span(trajectory_ns)}; {source}: {describe_span(reference_ns)}."
+    return f"of {len(reference_ns)} stamps of {source} {found} within the trajectory's time. {spans} {_cause(trajectory_ns, reference_ns)}"
+
+
+def _cause(trajectory_ns: IntArray, reference_ns: IntArray) -> str:
+    if not len(trajectory_ns):
+        return "The trajectory is empty: nothing was estimated."
+    if trajectory_ns[0] <= reference_ns[-1] and reference_ns[0] <= trajectory_ns[-1]:
+        return "They do overlap, so one of them is too sparse or too short to be compared."
+    begins = [float(stamps[0]) * 1e-9 for stamps in (trajectory_ns, reference_ns)]
+    worldly = [begin > _EPOCH_BEGINS_S for begin in begins]
+    if worldly[0] != worldly[1]:
+        return "One clock counts from 1970 and the other from the start of a run: add the start time to the latter."
+    offset = begins[1] - begins[0]
+    hours = round(offset / 1800.0) / 2.0
+    if hours and abs(hours) <= 14.0 and abs(offset - hours * 3600.0) < 60.0:
+        return f"They are {hours:+g} hours apart: one of them is probably in local time."
+    return "The reference is probably of another run, or its clock was not set."
+
+
+def describe_instant(stamp_ns: int) -> str:
+    """A stamp as UTC where the clock counts from 1970, else in seconds."""
+    seconds = stamp_ns / 1e9
+    if _EPOCH_BEGINS_S < seconds < 2e11:
+        return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    return f"{seconds:.3f} s"

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from localization.evaluation.accuracy import Accuracy
 from localization.evaluation.consistency import pose_consistency
-from localization.evaluation.metrics import evaluate
+from localization.evaluation.metrics import Accuracy, evaluate
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.pipeline import Run
 
@@ -30,6 +29,7 @@ class Result:
 
     @property
     def name(self) -> str:
+        """Model and estimator, as in names of files."""
         return f"{self.run.model}_{self.run.estimator}"
 
     @property

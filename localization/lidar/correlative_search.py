@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from motion_models import se2
-from motion_models.se2 import FloatArray
+from motion_models.types import Cov3, FloatArray, Points2, Pose2
 
 COARSE = 4
 """Cells of a coarse step, and again from level to level."""
@@ -43,7 +43,7 @@ class LikelihoodImage:
 class SearchResult:
     """Best pose of a search, and what competes with it."""
 
-    pose: FloatArray
+    pose: Pose2
     """(3,) of the best score, prior included."""
     score: float
     """Mean likelihood of the points, 0 to 1."""
@@ -53,7 +53,7 @@ class SearchResult:
     """Logarithm of the ratio of both poses' likelihoods."""
 
 
-def draw_image(points: FloatArray, cell: float) -> LikelihoodImage:
+def draw_image(points: Points2, cell: float) -> LikelihoodImage:
     """The image of ``points`` (N, 2) [m]."""
     margin, step = 8 * cell, COARSE**2
     origin = points.min(axis=0) - margin
@@ -64,7 +64,7 @@ def draw_image(points: FloatArray, cell: float) -> LikelihoodImage:
     return LikelihoodImage((fine, middle, _reduce(middle)), origin, cell)
 
 
-def search(image: LikelihoodImage, points: FloatArray, prior: FloatArray, cov: FloatArray, limit: FloatArray) -> SearchResult:
+def search(image: LikelihoodImage, points: Points2, prior: Pose2, cov: Cov3, limit: FloatArray) -> SearchResult:
     """The best pose of ``points`` (N, 2) of the body frame within 3 sigma of ``prior`` (3,), at most ``limit`` (3,) [m, m, rad] from it.
 
     ``cov`` (3, 3) is that of the prior's right perturbation. Every score counts as the log-likelihood of N / 6 independent points.
@@ -101,7 +101,7 @@ def _count(half: FloatArray, yaws: int, step: float) -> float:
     return float((2.0 * half[0] / step + 3.0) * (2.0 * half[1] / step + 3.0) * yaws)
 
 
-def _pick(prior: FloatArray, shifts: FloatArray, scores: FloatArray, n: int, information: FloatArray, step: FloatArray) -> SearchResult:
+def _pick(prior: Pose2, shifts: FloatArray, scores: FloatArray, n: int, information: FloatArray, step: FloatArray) -> SearchResult:
     log_likelihood = n / CORRELATED_BEAMS * np.log(np.maximum(scores, 1e-6))
     best = int(np.argmax(log_likelihood - 0.5 * np.einsum("ki,ij,kj->k", shifts, information, shifts)))
     away = shifts - shifts[best]
@@ -111,21 +111,21 @@ def _pick(prior: FloatArray, shifts: FloatArray, scores: FloatArray, n: int, inf
     return SearchResult(prior + shifts[best], float(scores[best]), rival, margin)
 
 
-def _to_world(yaw: float, cov: FloatArray) -> FloatArray:
+def _to_world(yaw: float, cov: Cov3) -> FloatArray:
     """``cov`` (3, 3) of a right perturbation, along the world's axes."""
     R = np.eye(3)
     R[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
     return np.asarray(R @ cov @ R.T)
 
 
-def _turned_points(points: FloatArray, prior: FloatArray, yaws: FloatArray) -> FloatArray:
+def _turned_points(points: Points2, prior: Pose2, yaws: FloatArray) -> FloatArray:
     """(Y, N, 2) the points where the prior has them, turned by each of the ``yaws`` (Y,)."""
     poses = np.column_stack([np.tile(prior[:2], (len(yaws), 1)), prior[2] + yaws])
     return np.asarray(se2.transform(poses[:, None, :], points))
 
 
 @numba.njit(cache=True)
-def _draw(points: FloatArray, image: FloatArray, origin: FloatArray, cell: float) -> None:
+def _draw(points: Points2, image: FloatArray, origin: FloatArray, cell: float) -> None:
     for i in range(points.shape[0]):
         x, y = (points[i, 0] - origin[0]) / cell, (points[i, 1] - origin[1]) / cell
         for jx in range(int(x) - 2, int(x) + 3):

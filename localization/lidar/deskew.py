@@ -11,7 +11,7 @@ import numpy as np
 from localization.events import Scan
 from motion_models import se2
 from motion_models.robot import Mount
-from motion_models.se2 import FloatArray
+from motion_models.types import FloatArray, Twist2
 
 _WALL_CELL_M = 0.2
 """Cell in which a cloud has to span a height to be a wall [m]."""
@@ -41,7 +41,7 @@ class Sweep:
         kept = (r2 >= min_range_m**2) & (r2 <= max_range_m**2)
         return self if kept.all() else Sweep(self.points[kept], self.times[kept] if len(self.times) else self.times, self.is_planar)
 
-    def deskew(self, twist: FloatArray) -> FloatArray:
+    def deskew(self, twist: Twist2) -> FloatArray:
         """(N, 3) the points in the body frame at the middle of the sweep, during which the body moves with constant ``twist`` (3,).
 
         Each point's own time is used, so that a sweep that fills part of the scan period is not over-corrected. About the middle, an error
@@ -62,7 +62,7 @@ class Sweep:
         """From the first to the last point [s]."""
         return float(np.ptp(self.times)) if len(self.times) else 0.0
 
-    def displacement(self, twist: FloatArray) -> float:
+    def displacement(self, twist: Twist2) -> float:
         """How far an error of ``twist`` (3,) moves points of the sweep against each other [m]."""
         if not len(self.times):
             return 0.0
@@ -88,7 +88,7 @@ def extract_walls(points: FloatArray, cell: float, min_height: float = 0.3) -> F
 
 
 @numba.njit(cache=True)
-def _move(points: FloatArray, times: FloatArray, twist: FloatArray, out: FloatArray) -> None:
+def _move(points: FloatArray, times: FloatArray, twist: Twist2, out: FloatArray) -> None:
     """Fill ``out`` (N, 3) with ``points`` after the motion at ``twist`` (3,) for ``times`` (N,)."""
     for i in range(points.shape[0]):
         t = times[i]

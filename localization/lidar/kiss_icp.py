@@ -15,7 +15,7 @@ import numpy as np
 from kiss_icp.config import load_config
 from kiss_icp.kiss_icp import KissICP
 
-from motion_models.se2 import FloatArray
+from motion_models.types import FloatArray, Pose2
 
 _NO_STAMPS = np.empty(0)
 _INITIAL_THRESHOLD_M, _MIN_MOTION_M = 0.5, 0.01
@@ -57,12 +57,12 @@ class KissIcp:
         self._threshold = AdaptiveThreshold(_INITIAL_THRESHOLD_M, _MIN_MOTION_M, max_range)
         self._kiss.adaptive_threshold = self._threshold
 
-    def register_frame(self, points: FloatArray) -> FloatArray:
+    def register_frame(self, points: FloatArray) -> Pose2:
         """The pose of the next frame as KISS-ICP alone finds it, from its own constant-velocity guess; the map grows."""
         self._kiss.register_frame(points, _NO_STAMPS)
         return _planar(self._kiss.last_pose)
 
-    def align(self, points: FloatArray, guess: FloatArray) -> FloatArray:
+    def align(self, points: FloatArray, guess: Pose2) -> Pose2:
         """The pose of ``points`` in the map, searched from ``guess`` (3,)."""
         kiss, sigma = self._kiss, self._threshold.get_threshold()
         source, _ = kiss.voxelize(kiss.preprocessor.preprocess(points, _NO_STAMPS, np.eye(4)))
@@ -76,7 +76,7 @@ class KissIcp:
         self._threshold.update_model_deviation(np.linalg.inv(_matrix(guess)) @ pose)
         return _planar(pose)
 
-    def insert(self, points: FloatArray, pose: FloatArray) -> None:
+    def insert(self, points: FloatArray, pose: Pose2) -> None:
         """Add ``points``, measured from ``pose`` (3,), to the map."""
         kiss = self._kiss
         downsampled = kiss.voxelize(kiss.preprocessor.preprocess(points, _NO_STAMPS, np.eye(4)))[1]
@@ -108,7 +108,7 @@ class KissIcp:
 class AdaptiveThreshold:
     """KISS-ICP's adaptive threshold (eq. 5 to 7), with a state that can be saved: theirs is in C++ and cannot be read.
 
-    How far poses were off their guesses says how far to associate. Same methods as kiss-icp's class of this name.
+    The deviation of poses from their guesses sets the distance of associations. Same methods as kiss-icp's class of this name.
     """
 
     def __init__(self, initial: float, min_motion: float, max_range: float) -> None:
@@ -131,7 +131,7 @@ class AdaptiveThreshold:
             self._count += 1
 
 
-def _matrix(pose: FloatArray) -> FloatArray:
+def _matrix(pose: Pose2) -> FloatArray:
     c, s = math.cos(pose[2]), math.sin(pose[2])
     return np.array([[c, -s, 0.0, pose[0]], [s, c, 0.0, pose[1]], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 

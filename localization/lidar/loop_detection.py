@@ -12,7 +12,7 @@ from localization.lidar.correlative_search import draw_image, search
 from localization.lidar.scan_matcher import LidarConfig, align_points
 from localization.lidar.submap import make_grid, voxel_means
 from motion_models import se2
-from motion_models.se2 import FloatArray
+from motion_models.types import Cov3, FloatArray, Points2, Pose2
 
 _MIN_KEYFRAMES = 25
 """Keyframes that must lie between both visits: what is nearer in time is in the filter's own submap."""
@@ -33,7 +33,7 @@ _MAX_SIGMA_M = 0.25
 _FLOOR_COV = np.diag([0.02, 0.02, 0.005]) ** 2
 """Submaps bend: covariance of a loop, at least [m^2, m^2, rad^2]."""
 _HEADING_WEIGHT = 0.3
-"""How much a turned scanner, which sees other walls, counts as distance: of the median range, per radian."""
+"""How much a turned scanner, whose beams hit other walls, counts as distance: of the median range, per radian."""
 _AGREE_M, _AGREE_RAD = 0.15, 0.06
 """Two loops agree where one predicts the other within this and 3 sigma."""
 _AGREE_WITHIN = 12
@@ -44,9 +44,9 @@ _AGREE_WITHIN = 12
 class Keyframe:
     """A keyframe of the graph, with its scan."""
 
-    odometry: FloatArray
+    odometry: Pose2
     """(3,) ``odom_T_body`` of the filter."""
-    points: FloatArray
+    points: Points2
     """(N, 2) of its scan, in the body frame [m]."""
 
 
@@ -56,14 +56,14 @@ class LoopClosure:
 
     a: int
     b: int
-    delta: FloatArray
+    delta: Pose2
     """(3,) ``a_T_b``."""
-    cov: FloatArray
+    cov: Cov3
     """(3, 3) of its right perturbation."""
 
 
 class LoopDetector:
-    """Give it each keyframe; it answers with the loops that two trials agree on."""
+    """`add` each keyframe, then `detect`: loops that two trials agree on."""
 
     def __init__(self, config: LidarConfig, cell: float) -> None:
         """``cell``: edge of voxels [m]."""
@@ -121,7 +121,7 @@ class LoopDetector:
         return np.vstack(moved)
 
     def _agree(self, one: LoopClosure, other: LoopClosure) -> bool:
-        """Whether both loops and the odometry between their ends close: a1^-1 a2 and b1^-1 b2 are known by odometry."""
+        """Whether both loops and the odometry between their ends close: a1^-1 a2 and b1^-1 b2 are given by the odometry."""
         a = se2.between(self.keyframes[one.a].odometry, self.keyframes[other.a].odometry)
         b = se2.between(self.keyframes[one.b].odometry, self.keyframes[other.b].odometry)
         error = se2.between(se2.compose(one.delta, b), se2.compose(a, other.delta))
@@ -129,7 +129,7 @@ class LoopDetector:
         return bool(math.hypot(error[0], error[1]) < _AGREE_M + 3.0 * sigma and abs(error[2]) < _AGREE_RAD)
 
 
-def _within_reach(place: FloatArray, points: FloatArray, prior: FloatArray, cov: FloatArray, limit: FloatArray) -> FloatArray:
+def _within_reach(place: Points2, points: Points2, prior: Pose2, cov: Cov3, limit: FloatArray) -> FloatArray:
     """Those of ``place`` (N, 2) where `search` with the same arguments can put ``points`` (M, 2): no larger image is needed."""
     moved = se2.transform(prior, points)
     half = np.minimum(3.0 * np.sqrt([np.trace(cov[:2, :2]), np.trace(cov[:2, :2]), cov[2, 2]]), limit)

@@ -19,7 +19,8 @@ from localization.lidar.correlative_search import CORRELATED_BEAMS, LikelihoodIm
 from localization.lidar.submap import VoxelGrid, fill_surface, find_nearest, make_grid, measure_shares, voxel_means
 from localization.settings import Allowed, Below, Count, Positive, Settings, Share
 from motion_models import se2
-from motion_models.se2 import FloatArray, Triple, triple
+from motion_models.se2 import Triple, triple
+from motion_models.types import Cov3, FloatArray, Points2, Pose2, Tangent2
 
 MIN_POINTS = 10
 """Points without which a scan is not matched."""
@@ -39,7 +40,8 @@ _OUTLIER_COST = 12.5
 """-log of the odds that the prior is an outlier (wheels that slip or count wrongly): a deviation of 5 sigma."""
 _SEARCH_FACTOR = 9.0
 _SEARCH_FLOOR = np.diag([0.1, 0.1, 0.03]) ** 2
-"""The search covers 3 sigma of 9 P + this [m^2, m^2, rad^2]."""
+"""The search covers 3 sigma of 9 P + this [m^2, m^2, rad^2] + j j^T, j from the prior to where the motion of the last step would lead."""
+_NO_JUMP = np.zeros(3)
 _SEARCH_LIMIT, _WIDEST_SEARCH = np.array([3.0, 3.0, 1.0]), np.array([15.0, 15.0, math.pi])
 """Half the window of a search at most, for a prior that may be an outlier, and for one that is wide itself [m, m, rad]."""
 _MAX_RIVAL = 0.9
@@ -84,15 +86,15 @@ class LidarConfig(Settings):
 class ScanMatch:
     """Where a scan fits into the submap."""
 
-    pose: FloatArray
+    pose: Pose2
     """(3,) ``odom_T_body`` that scan and prior give together."""
-    measured: FloatArray
+    measured: Pose2
     """(3,) the pose that the scan alone gives: the prior's share is taken off."""
-    cov: FloatArray
+    cov: Cov3
     """(3, 3) of the right perturbation of ``measured``; wide open along directions that the scene leaves open."""
     overlap: float
     """Share of points within 3 sigma of a surface of the submap."""
-    outlier_cov: FloatArray
+    outlier_cov: Cov3
     """(3, 3) to be added to the prior's covariance where the search showed that it was an outlier; else zero."""
 
 
@@ -102,9 +104,9 @@ class KeyScanError:
 
     share: float
     """s, 0 to 1: the scan's share of its surroundings in the submap."""
-    noise_cov: FloatArray
+    noise_cov: Cov3
     """(3, 3) of n, the scan's own noise, if it was not matched. W is `select_measured`."""
-    new_cov: FloatArray
+    new_cov: Cov3
     """(3, 3) of m: places that were not mapped before hang on this scan alone."""
 
 
@@ -112,14 +114,14 @@ class KeyScanError:
 class KeyScan:
     """A scan of the submap."""
 
-    points: FloatArray
+    points: Points2
     """(N, 2) in the odometry frame [m]."""
-    pose: FloatArray
+    pose: Pose2
     """(3,) from which it was drawn."""
-    map_cov: FloatArray
+    map_cov: Cov3
     """(3, 3) covariance of the submap's error around it, before it was drawn; a right perturbation."""
 
-    def drift_variance(self, pose: FloatArray, map_cov: FloatArray, range_m: float) -> float:
+    def drift_variance(self, pose: Pose2, map_cov: Cov3, range_m: float) -> float:
         """Variance [m^2] by which points at ``range_m`` have drifted from this scan to the submap around ``pose`` (3,)."""
         A = se2.adjoint(se2.inverse(se2.between(self.pose, pose)))
         grown = map_cov - A @ self.map_cov @ A.T
@@ -130,10 +132,10 @@ class KeyScan:
 class Fit:
     """A minimum of the cost above."""
 
-    pose: FloatArray
+    pose: Pose2
     information: FloatArray
     """(3, 3) of the points alone."""
-    gradient: FloatArray
+    gradient: Tangent2
     """(3,) of the points' cost, which the prior balances."""
     overlap: float
     cost: float
@@ -161,11 +163,11 @@ class ScanMatcher:
         """Most of the last scan lies in unmapped space, the rest fits and the prior is narrow: it should be drawn at once."""
         self._residuals = np.full(3, 1e-3)  # sums over the last scans: squares, squares of blocks, points
 
-    def match(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray | None = None) -> ScanMatch | None:
+    def match(self, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2 | None = None, jump: Tangent2 = _NO_JUMP) -> ScanMatch | None:
         """The pose of ``points`` near ``prior`` (3,), whose error against the submap has covariance ``cov`` (3, 3); None where it is lost.
 
         Gauss-Newton starts from ``guess`` (3,), or from the prior. A pose is searched where the prior is wider than the basin of
-        convergence, or where the result does not fit.
+        convergence, or where the result does not fit. Where the prior is an outlier, the pose may be off it by ``jump`` (3,), too.
         """
         nothing = np.zeros((3, 3))
         fit = self._align(points, prior, cov, prior if guess is None else guess)
@@ -173,7 +175,7 @@ class ScanMatcher:
         is_near, agrees = _is_within_basin(fit, cov), _mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST
         if is_near and agrees and fit.overlap >= self._config.search_below:
             return self._result(fit, nothing)
-        outlier_cov = (_SEARCH_FACTOR - 1.0) * cov + _SEARCH_FLOOR
+        outlier_cov = (_SEARCH_FACTOR - 1.0) * cov + _SEARCH_FLOOR + np.outer(jump, jump)
         best = self._search(points, prior, cov + outlier_cov, cov)
         if best is not None:
             if not is_near and _mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:
@@ -184,12 +186,12 @@ class ScanMatcher:
                 return self._result(found, outlier_cov)
         return self._result(fit, nothing) if is_near and fit.overlap >= self._config.lost_below else None
 
-    def refine(self, points: FloatArray, prior: FloatArray, cov: FloatArray, match: ScanMatch) -> ScanMatch | None:
+    def refine(self, points: Points2, prior: Pose2, cov: Cov3, match: ScanMatch) -> ScanMatch | None:
         """``match`` again, for the same scan deskewed anew."""
         fit = self._align(points, prior, cov + match.outlier_cov, match.pose)
         return None if fit.overlap < self._config.lost_below else self._result(fit, match.outlier_cov)
 
-    def evaluate(self, points: FloatArray, pose: FloatArray) -> ScanMatch | None:
+    def evaluate(self, points: Points2, pose: Pose2) -> ScanMatch | None:
         """The match of ``points`` at ``pose`` (3,), which another method has found; None where too few of them fit there."""
         assert self._grid is not None
         H, _, found = linearize(self._grid, points, triple(pose), 0.0)
@@ -197,7 +199,7 @@ class ScanMatcher:
             return None
         return self._result(Fit(pose, H, np.zeros(3), *(float(value) for value in found)), np.zeros((3, 3)))
 
-    def insert_key_scan(self, pose: FloatArray, points: FloatArray, map_cov: FloatArray | None = None) -> KeyScanError:
+    def insert_key_scan(self, pose: Pose2, points: Points2, map_cov: Cov3 | None = None) -> KeyScanError:
         """Draw a scan from ``pose`` (3,). ``map_cov`` (3, 3) of the submap's error there: with it, old scans stay while they fit."""
         drawn = np.asarray(se2.transform(pose, points))
         scan = make_grid(drawn, self.cell, self._config.range_noise_m)
@@ -210,7 +212,7 @@ class ScanMatcher:
         W = select_measured(noise)
         return KeyScanError(share, noise, new * W @ noise @ W.T)
 
-    def _fitting_keys(self, pose: FloatArray, points: FloatArray, map_cov: FloatArray | None) -> list[KeyScan]:
+    def _fitting_keys(self, pose: Pose2, points: Points2, map_cov: Cov3 | None) -> list[KeyScan]:
         """The key scans that stay beside a new one: the last ones, and older ones from which the drift is below the noise of a range.
 
         These thicken no surface; the drift does not grow where the robot comes back to them.
@@ -246,11 +248,11 @@ class ScanMatcher:
     def _draw(self) -> None:
         self._grid, self._image = make_grid(self.points(), self.cell, self._config.range_noise_m), None
 
-    def _align(self, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray) -> Fit:
+    def _align(self, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2) -> Fit:
         assert self._grid is not None
         return align_points(self._grid, points, prior, cov, guess)
 
-    def _search(self, points: FloatArray, prior: FloatArray, wide: FloatArray, cov: FloatArray) -> FloatArray | None:
+    def _search(self, points: Points2, prior: Pose2, wide: FloatArray, cov: Cov3) -> Pose2 | None:
         """The best pose (3,) within 3 sigma of ``wide`` (3, 3), limited unless ``cov`` (3, 3) is wider; None where it is ambiguous."""
         if self._image is None:
             self._image = draw_image(self.points(), self.cell)
@@ -259,31 +261,31 @@ class ScanMatcher:
         is_clear = best.margin >= _OUTLIER_COST if not _is_narrow(cov) else best.rival_score < _MAX_RIVAL * best.score
         return best.pose if is_clear else None
 
-    def _result(self, fit: Fit, outlier_cov: FloatArray) -> ScanMatch:
-        """What the scan alone says: one more Gauss-Newton step from the minimum, without the prior's pull."""
+    def _result(self, fit: Fit, outlier_cov: Cov3) -> ScanMatch:
+        """The match of the scan alone: one more Gauss-Newton step from the minimum, without the prior's pull."""
         R = np.asarray(np.linalg.inv(fit.information + _OPEN_INFORMATION), dtype=float)
         measured = se2.compose(fit.pose, se2.exp(-R @ fit.gradient))
         self._residuals = _FORGETTING * self._residuals + [fit.squares, fit.block_squares, fit.fitting]
         return ScanMatch(fit.pose, measured, R * self._variance_ratio(0), fit.overlap, outlier_cov)
 
 
-def select_measured(noise_cov: FloatArray) -> FloatArray:
+def select_measured(noise_cov: Cov3) -> FloatArray:
     """W (3, 3): the directions along which noise of ``noise_cov`` (3, 3) moves a scan's surfaces: not those that the scene leaves open."""
     return np.asarray(np.linalg.inv(np.eye(3) + noise_cov @ _MAPPED_INFORMATION), dtype=float)
 
 
-def align_points(grid: VoxelGrid, points: FloatArray, prior: FloatArray, cov: FloatArray, guess: FloatArray) -> Fit:
+def align_points(grid: VoxelGrid, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2) -> Fit:
     """Gauss-Newton from ``guess`` (3,) for ``points`` (N, 2), with the ``prior`` (3,) of covariance ``cov`` (3, 3)."""
     pose, H, g, found = _align(grid, points, prior, cov, np.asarray(np.linalg.inv(cov), dtype=float), guess)
     return Fit(pose, H, g, *(float(value) for value in found))
 
 
-def choose_cell(config: LidarConfig, points: FloatArray) -> float:
+def choose_cell(config: LidarConfig, points: Points2) -> float:
     """Edge of the voxels [m] for a submap that begins with ``points`` (N, 2) of the body frame."""
     return config.voxel_size_m or max(_CELL_OF_RANGE * float(np.median(np.hypot(points[:, 0], points[:, 1]))), _MIN_CELL_M)
 
 
-def _is_within_basin(fit: Fit, cov: FloatArray) -> bool:
+def _is_within_basin(fit: Fit, cov: Cov3) -> bool:
     """Whether Gauss-Newton from a prior with ``cov`` (3, 3) may be trusted: what the scan takes off the prior is within its basin.
 
     Along directions that the scene leaves open, a prior may be as wide as it likes.
@@ -291,21 +293,21 @@ def _is_within_basin(fit: Fit, cov: FloatArray) -> bool:
     return _is_narrow(cov - np.linalg.inv(np.linalg.inv(cov) + fit.information))
 
 
-def _is_narrow(cov: FloatArray) -> bool:
+def _is_narrow(cov: Cov3) -> bool:
     """Whether a pose with ``cov`` (3, 3) is within the basin of Gauss-Newton."""
     return bool(np.linalg.eigvalsh(cov[:2, :2])[-1] < _BASIN_M**2 and cov[2, 2] < _BASIN_RAD**2)
 
 
-def _is_better(found: Fit, fit: Fit, prior: FloatArray, cov: FloatArray) -> bool:
+def _is_better(found: Fit, fit: Fit, prior: Pose2, cov: Cov3) -> bool:
     """Whether the pose that was ``found`` is more probable than ``fit``, where the prior may be an outlier."""
     return _total_cost(found, prior, cov) < _total_cost(fit, prior, cov)
 
 
-def _total_cost(fit: Fit, prior: FloatArray, cov: FloatArray) -> float:
+def _total_cost(fit: Fit, prior: Pose2, cov: Cov3) -> float:
     return fit.cost + min(_mahalanobis(prior, fit.pose, cov) / 2.0, _OUTLIER_COST)
 
 
-def _mahalanobis(prior: FloatArray, pose: FloatArray, cov: FloatArray) -> float:
+def _mahalanobis(prior: Pose2, pose: Pose2, cov: Cov3) -> float:
     """Squared distance of ``pose`` from ``prior`` in sigmas of ``cov``."""
     off = se2.log(se2.between(prior, pose))
     return float(off @ np.linalg.solve(cov, off))
@@ -313,7 +315,7 @@ def _mahalanobis(prior: FloatArray, pose: FloatArray, cov: FloatArray) -> float:
 
 @numba.njit(cache=True)
 def _align(
-    grid: VoxelGrid, points: FloatArray, prior: FloatArray, cov: FloatArray, information: FloatArray, guess: FloatArray
+    grid: VoxelGrid, points: Points2, prior: Pose2, cov: Cov3, information: FloatArray, guess: Pose2
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Gauss-Newton from ``guess`` (3,): pose (3,), information (3, 3) and gradient (3,) of the points there, numbers of the fit."""
     least = _REACH_CELLS * grid.cell
@@ -335,16 +337,16 @@ def _align(
 
 
 @numba.njit(cache=True)
-def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def linearize(grid: VoxelGrid, points: Points2, x: Triple, spread: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Information (3, 3) and gradient (3,) of the points at ``x``; overlap, cost and variance ratio.
 
     While the pose may still be off by ``spread`` [m] at a point, points are associated from so far, and residuals are weighed by it.
     """
-    H, g = np.zeros((3, 3)), np.zeros(3)
     c, s = math.cos(x[2]), math.sin(x[2])
     reach, loose = max(_REACH_CELLS * grid.cell, spread), (spread / _KERNEL) ** 2
     n, fitting, cost = points.shape[0], 0, 0.0
-    J, T, spurious = np.empty(3), np.empty(3), np.zeros((3, 3))
+    J, T = np.zeros((n, 3)), np.zeros((n, 3))  # derivatives of the distances across and along the surfaces
+    weights, e_weights, angle_weights = np.zeros((n, 1)), np.zeros(n), np.zeros((n, 1))
     mapped, block, squares, block_squares = 0, 0.0, 0.0, 0.0
     for i in range(n):
         px, py = points[i, 0], points[i, 1]
@@ -371,16 +373,12 @@ def linearize(grid: VoxelGrid, points: FloatArray, x: Triple, spread: float) -> 
             if fitting % _BLOCK == 0:
                 block_squares, block = block_squares + block * block, 0.0
         scale = _KERNEL**2 * var + loose
-        weight = (scale / (scale + e * e)) ** 2 / (var + loose)
-        J[0], J[1] = c * surface[2] + s * surface[3], -s * surface[2] + c * surface[3]  # the normal, seen from the body
-        J[2] = px * J[1] - py * J[0]
-        T[0], T[1] = -J[1], J[0]  # along the surface
-        T[2] = px * T[1] - py * T[0]
-        for a in range(3):
-            g[a] += weight * J[a] * e
-            for b in range(3):
-                H[a, b] += weight * J[a] * J[b]
-                spurious[a, b] += weight * min(surface[5], 1.0) * T[a] * T[b]
+        weights[i, 0] = (scale / (scale + e * e)) ** 2 / (var + loose)
+        e_weights[i], angle_weights[i, 0] = weights[i, 0] * e, weights[i, 0] * min(surface[5], 1.0)
+        nx, ny = c * surface[2] + s * surface[3], -s * surface[2] + c * surface[3]  # the normal in the body frame
+        J[i, 0], J[i, 1], J[i, 2] = nx, ny, px * ny - py * nx
+        T[i, 0], T[i, 1], T[i, 2] = -ny, nx, px * nx + py * ny
+    H, g, spurious = J.T @ (weights * J), J.T @ e_weights, T.T @ (angle_weights * T)
     found = np.array([fitting / max(n, 1), 0.5 * cost / CORRELATED_BEAMS, squares, block_squares, fitting, mapped])
     _discount(H, g, spurious)
     return H, g, found

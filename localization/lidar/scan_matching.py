@@ -15,7 +15,7 @@ from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfi
 from localization.step import Step
 from motion_models import se2
 from motion_models.robot import Mount
-from motion_models.se2 import FloatArray
+from motion_models.types import Cov3, FloatArray, Points2, Pose2, Tangent2, Twist2
 
 _MIN_DISPLACEMENT_M = 1e-3
 """Points that another twist moves by less are not deskewed again [m]."""
@@ -26,7 +26,7 @@ class _Scan:
     """The scan at hand, deskewed."""
 
     sweep: Sweep
-    twist: FloatArray
+    twist: Twist2
     """(3,) with which it was deskewed."""
     points: FloatArray
     """(N, 3) at the middle of the sweep."""
@@ -47,10 +47,10 @@ class ScanMatchingSensor:
         self._last_key: FloatArray | None = None
         self._stale, self.lost = StaleScans(), LostScans()
 
-    def measure(self, step: Step, prior: FloatArray, cov: FloatArray, twist: FloatArray) -> ScanMatch | None:
+    def measure(self, step: Step, prior: Pose2, cov: Cov3, twist: Twist2, jump: Tangent2) -> ScanMatch | None:
         """Match the scan of ``step`` near ``prior`` (3,) with its covariance (3, 3) against the submap; None where it is lost.
 
-        The sweep is deskewed with ``twist`` (3,), the body's at the middle of the sweep.
+        The sweep is deskewed with ``twist`` (3,), the body's at the middle of the sweep. ``jump`` (3,): see `ScanMatcher.match`.
         """
         assert step.scan is not None
         self._scan, self._prior, self._cov = None, prior, cov
@@ -67,14 +67,14 @@ class ScanMatchingSensor:
             self._begin(self._scan)
             self.lost.add_matched(step.end_ns)
             return None
-        found = self._match(self._matcher, self._scan)
+        found = self._match(self._matcher, self._scan, jump)
         if found is None:
             self.lost.add(step.end_ns, "lost")
         else:
             self.lost.add_matched(step.end_ns)
         return found
 
-    def refine(self, match: ScanMatch, twist: FloatArray) -> ScanMatch:
+    def refine(self, match: ScanMatch, twist: Twist2) -> ScanMatch:
         """``match`` again, its sweep deskewed with ``twist`` (3,); the same where that moves no point."""
         assert self._scan is not None
         assert self._matcher is not None
@@ -83,7 +83,7 @@ class ScanMatchingSensor:
         self._scan = self._deskew(self._scan.sweep, twist)
         return self._matcher.refine(self._scan.planar, self._prior, self._cov, match) or match
 
-    def is_key(self, pose: FloatArray) -> bool:
+    def is_key(self, pose: Pose2) -> bool:
         """Whether the scan at hand, taken from ``pose`` (3,), is to enter the submap."""
         if self._scan is None:
             return False
@@ -93,7 +93,7 @@ class ScanMatchingSensor:
         c = self._config
         return bool(math.hypot(moved[0], moved[1]) > c.key_distance_m or abs(moved[2]) > c.key_angle_rad)
 
-    def insert_key_scan(self, pose: FloatArray, map_cov: FloatArray) -> KeyScanError:
+    def insert_key_scan(self, pose: Pose2, map_cov: Cov3) -> KeyScanError:
         """Draw the scan at hand from ``pose`` (3,), where the submap's error has covariance ``map_cov`` (3, 3)."""
         assert self._scan is not None
         assert self._matcher is not None
@@ -102,11 +102,11 @@ class ScanMatchingSensor:
             self._kiss.insert(self._scan.points, pose)
         return self._matcher.insert_key_scan(pose, self._scan.planar, map_cov)
 
-    def scan_points(self) -> FloatArray:
+    def scan_points(self) -> Points2:
         """(M, 2) the scan at hand in the body frame, or (0, 2)."""
         return np.empty((0, 2)) if self._scan is None else self._scan.planar
 
-    def map_points(self) -> FloatArray:
+    def map_points(self) -> Points2:
         """(M, 2) the submap in the odometry frame [m]."""
         return np.empty((0, 2)) if self._matcher is None else self._matcher.points()
 
@@ -120,7 +120,7 @@ class ScanMatchingSensor:
         """Edge of the submap's voxels [m]."""
         return 0.0 if self._matcher is None else self._matcher.cell
 
-    def _deskew(self, sweep: Sweep, twist: FloatArray) -> _Scan:
+    def _deskew(self, sweep: Sweep, twist: Twist2) -> _Scan:
         points = sweep.deskew(twist)
         return _Scan(sweep, twist, points, sweep.project(points))
 
@@ -131,16 +131,16 @@ class ScanMatchingSensor:
         if c.matcher == "kiss" or not scan.sweep.is_planar:
             self._kiss = KissIcp(c.voxel_size_m or choose_voxel_size(scan.points), c.max_range_m)
 
-    def _match(self, matcher: ScanMatcher, scan: _Scan) -> ScanMatch | None:
+    def _match(self, matcher: ScanMatcher, scan: _Scan, jump: Tangent2) -> ScanMatch | None:
         if self._kiss is None:
-            return matcher.match(scan.planar, self._prior, self._cov)
+            return matcher.match(scan.planar, self._prior, self._cov, jump=jump)
         guess = self._kiss.align(scan.points, self._prior)
         if self._config.matcher == "kiss":
             return matcher.evaluate(scan.planar, guess)
-        return matcher.match(scan.planar, self._prior, self._cov, guess)
+        return matcher.match(scan.planar, self._prior, self._cov, guess, jump)
 
     def _mount(self, frame: str) -> Mount:
-        """Where ``frame`` is mounted. A submap that was drawn before that was known is dropped."""
+        """Where ``frame`` is mounted. A submap that was drawn before its mount was given is dropped."""
         mount = self._mounts.get(frame)
         if mount is not None and not self._is_placed:
             self._matcher, self._kiss, self._last_key = None, None, None

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from motion_models import se2
-from motion_models.se2 import FloatArray
+from motion_models.types import FloatArray, Points2, Pose2
 
 _BEARINGS = 180
 """Of 2 deg: each has a beam of any scanner in use, however its beams lie to the bins."""
@@ -37,7 +37,7 @@ _DAMPING = 1e-3
 class ScanMotion(NamedTuple):
     """Motion of the body from one scan to the next."""
 
-    delta: FloatArray
+    delta: Pose2
     """(3,) a_T_b [m, m, rad]."""
     has_translation: bool
     """The scene has structure along both axes."""
@@ -76,25 +76,29 @@ class ScanOdometry:
         return None if math.isnan(turn) else _refine(last, now, turn)
 
 
-def _make_profile(points: FloatArray, center: FloatArray) -> _Profile | None:
+def _make_profile(points: Points2, center: FloatArray) -> _Profile | None:
     """None for too few points."""
-    r = np.hypot(points[:, 0], points[:, 1])
-    points, r = points[r > 1e-3], r[r > 1e-3]
-    bins = np.floor(np.arctan2(points[:, 1], points[:, 0]) / _BIN_RAD).astype(np.intp) % _BEARINGS
-    ranges = np.full(_BEARINGS, np.inf)
-    np.minimum.at(ranges, bins, r)
-    ranges[~np.isfinite(ranges)] = np.nan
-    if np.isfinite(ranges).sum() < _MIN_BEARINGS:
-        return None
-    is_nearest = r == ranges[bins]
-    surface = np.full((_BEARINGS, 2), np.nan)
-    surface[bins[is_nearest]] = points[is_nearest]
-    along = np.roll(surface, -1, axis=0) - np.roll(surface, 1, axis=0)
-    length = np.hypot(along[:, 0], along[:, 1])
-    is_edge = ~(length < 0.1 + 0.5 * ranges)  # from one surface to another, or unknown
-    normals = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(length, 1e-6)[:, None]
-    normals[is_edge] = np.nan
-    return _Profile(center, surface, ranges, normals)
+    surface, ranges, normals = _fill_profile(points)
+    return None if np.isfinite(ranges).sum() < _MIN_BEARINGS else _Profile(center, surface, ranges, normals)
+
+
+@numba.njit(cache=True)
+def _fill_profile(points: Points2) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Nearest points (180, 2), their ranges (180,) and normals (180, 2) by bearing; NaN where there is none."""
+    surface, ranges, normals = np.full((_BEARINGS, 2), np.nan), np.full(_BEARINGS, np.nan), np.full((_BEARINGS, 2), np.nan)
+    for i in range(points.shape[0]):
+        x, y = points[i, 0], points[i, 1]
+        r = math.hypot(x, y)
+        k = math.floor(math.atan2(y, x) / _BIN_RAD) % _BEARINGS
+        if r > 1e-3 and not r >= ranges[k]:
+            surface[k, 0], surface[k, 1], ranges[k] = x, y, r
+    for k in range(_BEARINGS):
+        before, after = surface[k - 1], surface[(k + 1) % _BEARINGS]
+        dx, dy = after[0] - before[0], after[1] - before[1]
+        length = math.hypot(dx, dy)
+        if length < 0.1 + 0.5 * ranges[k]:  # else from one surface to another, or unknown
+            normals[k, 0], normals[k, 1] = -dy / max(length, 1e-6), dx / max(length, 1e-6)
+    return surface, ranges, normals
 
 
 @numba.njit(cache=True)
@@ -114,16 +118,9 @@ def _correlate(a: FloatArray, b: FloatArray) -> float:
 
 
 def _refine(a: _Profile, b: _Profile, turn: float) -> ScanMotion | None:
-    """a_T_b of the body by point-to-line Gauss-Newton from a pure ``turn`` [rad]."""
-    a_T_b = np.array([0.0, 0.0, turn])
-    A = np.zeros((3, 3))
-    inliers = 0
-    for scale in np.geomspace(_FIRST_SCALE_M, _LAST_SCALE_M, _ITERATIONS):
-        A, gradient, structure, inliers = _normal_equations(a.points, a.normals, b.points, a_T_b, float(scale))
-        if inliers < _MIN_BEARINGS // 2:
-            return None
-        a_T_b = a_T_b - np.linalg.solve(A + _DAMPING * inliers * np.eye(3), gradient)
-    if inliers < _MIN_INLIERS * np.isfinite(b.ranges).sum() or not np.isfinite(a_T_b).all():
+    """a_T_b of the body by point-to-line Gauss-Newton from a pure ``turn`` [rad]; None where the scans do not fit."""
+    a_T_b, structure, inliers = _align_profiles(a.points, a.normals, b.points, turn)
+    if inliers < max(_MIN_INLIERS * np.isfinite(b.ranges).sum(), 1) or not np.isfinite(a_T_b).all():
         return None
     body_T_sensor = np.array([a.center[0], a.center[1], 0.0])
     moved = se2.compose(se2.compose(body_T_sensor, a_T_b), se2.inverse(body_T_sensor))
@@ -131,8 +128,21 @@ def _refine(a: _Profile, b: _Profile, turn: float) -> ScanMotion | None:
 
 
 @numba.njit(cache=True)
+def _align_profiles(surface: FloatArray, normals: FloatArray, points: FloatArray, turn: float) -> tuple[FloatArray, FloatArray, int]:
+    """Motion (3,) of the sensor, sum of n n^T (2, 2) over the inliers, and their number: 0 where too few points are associated."""
+    a_T_b, structure, inliers = np.array([0.0, 0.0, turn]), np.zeros((2, 2)), 0
+    for k in range(_ITERATIONS):
+        scale = _FIRST_SCALE_M * (_LAST_SCALE_M / _FIRST_SCALE_M) ** (k / (_ITERATIONS - 1))
+        A, gradient, structure, inliers = _normal_equations(surface, normals, points, a_T_b, scale)
+        if inliers < _MIN_BEARINGS // 2:
+            return a_T_b, structure, 0
+        a_T_b = a_T_b - np.linalg.solve(A + _DAMPING * inliers * np.eye(3), gradient)
+    return a_T_b, structure, inliers
+
+
+@numba.njit(cache=True)
 def _normal_equations(
-    surface: FloatArray, normals: FloatArray, points: FloatArray, a_T_b: FloatArray, scale: float
+    surface: FloatArray, normals: FloatArray, points: FloatArray, a_T_b: Pose2, scale: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, int]:
     """J^T W J (3, 3) and J^T W r (3,) of the distances r of ``points`` (M, 2), moved by ``a_T_b`` (3,), from the lines of a profile.
 
@@ -159,5 +169,8 @@ def _normal_equations(
                 A[p, q] += weight * J[p] * J[q]
         if abs(r) < max(scale, _INLIER_M):
             inliers += 1
-            structure += np.array([[nx * nx, nx * ny], [nx * ny, ny * ny]])
+            structure[0, 0] += nx * nx
+            structure[0, 1] += nx * ny
+            structure[1, 0] += nx * ny
+            structure[1, 1] += ny * ny
     return A, gradient, structure, inliers

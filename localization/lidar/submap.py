@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from localization.trajectory import IntArray
-from motion_models.se2 import FloatArray
+from motion_models.types import FloatArray, Points2
 
 POOLED_VOXELS = 5
 """Voxels whose points are pooled for one surface: fewer give no direction along sparse walls, more round off corners."""
@@ -41,7 +41,7 @@ class VoxelGrid(NamedTuple):
     until then."""
 
 
-def make_grid(points: FloatArray, cell: float, noise_m: float) -> VoxelGrid:
+def make_grid(points: Points2, cell: float, noise_m: float) -> VoxelGrid:
     """Voxels with edge ``cell`` [m] of ``points`` (N, 2) [m], whose ranges have sigma ``noise_m`` [m]."""
     origin = np.floor(points.mean(axis=0) / cell) * cell if len(points) else np.zeros(2)
     slots = np.full((1 << max(4, math.ceil(math.log2(2 * len(points) + 1))), 2), _EMPTY, dtype=np.int64)
@@ -50,7 +50,7 @@ def make_grid(points: FloatArray, cell: float, noise_m: float) -> VoxelGrid:
     return VoxelGrid(cell, noise_m**2, origin, slots, cells[:n], sums[:n], np.full((n, 6), np.nan))
 
 
-def voxel_means(points: FloatArray, cell: float) -> FloatArray:
+def voxel_means(points: Points2, cell: float) -> Points2:
     """(M, 2) the mean of ``points`` (N, 2) in each voxel with edge ``cell`` [m]."""
     grid = make_grid(points, cell, 0.0)
     return np.asarray(grid.sums[:, 1:3] / grid.sums[:, :1] + grid.origin)
@@ -76,7 +76,7 @@ def find_voxel(slots: IntArray, i: int, j: int) -> int:
 
 
 @numba.njit(cache=True)
-def _fill(points: FloatArray, cell: float, origin: FloatArray, slots: IntArray, cells: IntArray, sums: FloatArray) -> int:
+def _fill(points: Points2, cell: float, origin: FloatArray, slots: IntArray, cells: IntArray, sums: FloatArray) -> int:
     """Sort ``points`` into voxels; returns how many there are."""
     n = 0
     for p in range(points.shape[0]):
@@ -100,57 +100,59 @@ def _fill(points: FloatArray, cell: float, origin: FloatArray, slots: IntArray, 
 @numba.njit(cache=True)
 def find_nearest(grid: VoxelGrid, x: float, y: float, reach: float) -> int:
     """The voxel whose mean is nearest to (x, y) [m, from the grid's origin], or -1 where none is within ``reach`` [m]."""
-    cell = grid.cell
+    cell, slots, sums = grid.cell, grid.slots, grid.sums
     i, j = math.floor(x / cell), math.floor(y / cell)
     border = min(x - i * cell, (i + 1) * cell - x, y - j * cell, (j + 1) * cell - y)
     best, nearest = reach * reach, -1
     ring = 0
     while ring == 0 or ((ring - 1) * cell + border) ** 2 < best:
         for di in range(-ring, ring + 1):
-            d2, v = _nearest_in_row(grid, i + di, j, ring, 1 if abs(di) == ring else 2 * ring, x, y)
-            if d2 < best:
-                best, nearest = d2, v
+            gap_x = _gap(x, i + di, cell)
+            stride = 1 if abs(di) == ring else 2 * ring
+            for dj in range(-ring, ring + 1, max(stride, 1)):
+                is_near = gap_x * gap_x + _gap(y, j + dj, cell) ** 2 < best  # else no mean in this cell is nearer
+                best, nearest = _nearer(sums, find_voxel(slots, i + di, j + dj) if is_near else -1, x, y, best, nearest)
         ring += 1
     return nearest
 
 
 @numba.njit(cache=True)
-def _nearest_in_row(grid: VoxelGrid, i: int, j: int, ring: int, stride: int, x: float, y: float) -> tuple[float, int]:
-    """Squared distance [m^2] and number of the voxel of row ``i``, columns j - ring to j + ring by ``stride``, whose mean is nearest."""
-    best, nearest = math.inf, -1
-    for dj in range(-ring, ring + 1, max(stride, 1)):
-        v = find_voxel(grid.slots, i, j + dj)
-        d2 = _squared_distance(grid, v, x, y) if v >= 0 else math.inf
-        if d2 < best:
-            best, nearest = d2, v
-    return best, nearest
+def _gap(x: float, i: int, cell: float) -> float:
+    """Distance [m] of ``x`` from cell ``i`` along one axis; 0 inside."""
+    return max(i * cell - x, x - (i + 1) * cell, 0.0)
 
 
 @numba.njit(cache=True)
-def _squared_distance(grid: VoxelGrid, v: int, x: float, y: float) -> float:
-    n = grid.sums[v, 0]
-    return (grid.sums[v, 1] / n - x) ** 2 + (grid.sums[v, 2] / n - y) ** 2  # type: ignore[no-any-return]
+def _nearer(sums: FloatArray, v: int, x: float, y: float, best: float, nearest: int) -> tuple[float, int]:
+    """Squared distance [m^2] and row of the nearer one of voxel ``v``, if it is one, and of the ``nearest`` so far."""
+    d2 = _squared_distance(sums, v, x, y) if v >= 0 else math.inf
+    return (d2, v) if d2 < best else (best, nearest)
+
+
+@numba.njit(cache=True)
+def _squared_distance(sums: FloatArray, v: int, x: float, y: float) -> float:
+    n = sums[v, 0]
+    return (sums[v, 1] / n - x) ** 2 + (sums[v, 2] / n - y) ** 2  # type: ignore[no-any-return]
 
 
 @numba.njit(cache=True)
 def fill_surface(grid: VoxelGrid, v: int) -> None:
     """Pool the points of the `POOLED_VOXELS` voxels nearest to voxel ``v``: mean, direction of least spread, and the spread along it."""
-    n = grid.sums[v, 0]
-    x, y = grid.sums[v, 1] / n, grid.sums[v, 2] / n
-    found, d2s, rows = 0, np.empty((2 * MAX_RINGS + 1) ** 2), np.empty((2 * MAX_RINGS + 1) ** 2, dtype=np.int64)
-    ring = 0
-    while found < POOLED_VOXELS and ring < MAX_RINGS:
+    slots, sums = grid.slots, grid.sums
+    i, j, n = grid.cells[v, 0], grid.cells[v, 1], sums[v, 0]
+    x, y = sums[v, 1] / n, sums[v, 2] / n
+    d2s, rows = np.full(POOLED_VOXELS, math.inf), np.zeros(POOLED_VOXELS, dtype=np.int64)  # the nearest so far, in order
+    found, ring = 0, 0
+    while ring == 0 or (found < POOLED_VOXELS and ring <= MAX_RINGS):
+        for di in range(-ring, ring + 1):
+            for dj in range(-ring, ring + 1, 1 if abs(di) == ring else max(2 * ring, 1)):
+                w = find_voxel(slots, i + di, j + dj)
+                found += w >= 0
+                _insert_sorted(d2s, rows, _squared_distance(sums, w, x, y) if w >= 0 else math.inf, w)
         ring += 1
-        found = 0
-        for k in range((2 * ring + 1) ** 2):
-            di, dj = k // (2 * ring + 1) - ring, k % (2 * ring + 1) - ring
-            w = find_voxel(grid.slots, grid.cells[v, 0] + di, grid.cells[v, 1] + dj)
-            if w >= 0:
-                d2s[found], rows[found] = _squared_distance(grid, w, x, y), w
-                found += 1
     total = np.zeros(6)
-    for w in rows[np.argsort(d2s[:found])[:POOLED_VOXELS]]:
-        total += grid.sums[w]
+    for k in range(min(found, POOLED_VOXELS)):
+        total += sums[rows[k]]
     mx, my = total[1] / total[0], total[2] / total[0]
     xx, xy, yy = total[3] / total[0] - mx * mx, total[4] / total[0] - mx * my, total[5] / total[0] - my * my
     angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
@@ -159,6 +161,18 @@ def fill_surface(grid: VoxelGrid, v: int) -> None:
     out[0], out[1], out[2], out[3] = mx, my, -math.sin(angle), math.cos(angle)
     out[4] = max(least, 0.0) + grid.noise if found >= 3 else math.inf  # two voxels have a direction, but no thickness
     out[5] = out[4] / (total[0] * most) if most > 0.0 else math.inf  # of a line fit: variance across over the spread along
+
+
+@numba.njit(cache=True)
+def _insert_sorted(d2s: FloatArray, rows: IntArray, d2: float, row: int) -> None:
+    """Insert ``d2`` and ``row`` into both, sorted by ``d2``; the largest drops out."""
+    k = len(d2s) - 1
+    if not d2 < d2s[k]:
+        return
+    while k > 0 and d2 < d2s[k - 1]:
+        d2s[k], rows[k] = d2s[k - 1], rows[k - 1]
+        k -= 1
+    d2s[k], rows[k] = d2, row
 
 
 @numba.njit(cache=True)

@@ -1,4 +1,4 @@
-"""Robot logs behind one door: `open_log` reads ROS 1 bags, ROS 2 folders and bare .mcap files as streams of events."""
+"""Robot logs: `open_log` reads ROS 1 bags, ROS 2 folders and bare .mcap files as streams of events."""
 
 from localization.logs.info import LogInfo, TopicInfo, inspect_log
 from localization.logs.reader import Log, open_log

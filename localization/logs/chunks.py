@@ -1,7 +1,7 @@
 """Common ground of all file formats: channels, raw messages, and chunks of messages that are read one at a time.
 
-ROS 1 bags and MCAP files keep their messages in chunks of about a megabyte, each with the span of log time that it covers. That is
-all one needs to go through a log of any length in order of log time while holding only the chunks that overlap.
+ROS 1 bags and MCAP files keep their messages in chunks of about a megabyte, each with the span of log time that it covers. With
+these a log of any length is read in order of log time while only chunks that overlap are in memory.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ else:
 
 
 class RawMessage(NamedTuple):
-    """A message as it stands in the file."""
+    """A message as recorded, not decoded."""
 
     log_ns: int
     """When it was recorded."""
@@ -58,20 +58,28 @@ class Source(Protocol):
     """A log that can be opened and read; reading it twice gives the same messages twice."""
 
     @property
-    def is_ros1(self) -> bool: ...
+    def is_ros1(self) -> bool:
+        """Whether messages are encoded as in ROS 1."""
+        ...
 
     @property
-    def channels(self) -> list[Channel]: ...
+    def channels(self) -> list[Channel]:
+        """Topics and types of the log."""
+        ...
 
     @property
-    def start_ns(self) -> int: ...
+    def start_ns(self) -> int:
+        """Time of recording of the first message."""
+        ...
 
     @property
-    def end_ns(self) -> int: ...
+    def end_ns(self) -> int:
+        """Time of recording of the last message."""
+        ...
 
     @property
     def warnings(self) -> list[str]:
-        """What was lost or odd so far, as warnings."""
+        """Warnings about what was lost so far."""
         ...
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
@@ -97,8 +105,8 @@ class DamagedError(Exception):
 
 
 _MAX_BUFFERED_BYTES = 512 << 20
-"""Of messages that wait for their turn [B]. Recorders' chunks overlap by seconds (a few MB); where they overlap by more than this, the
-oldest message is given out early, and `merge` reports what then comes too late."""
+"""Of messages that are held to be sorted [B]. Recorders' chunks overlap by seconds (a few MB); where they overlap by more than this, the
+oldest message is yielded early, and `merge` reports those that then come too late."""
 
 
 def in_log_order(chunks: Iterable[Chunk], load: Callable[[Chunk], Iterable[RawMessage]]) -> Iterator[RawMessage]:
@@ -120,7 +128,7 @@ def in_log_order(chunks: Iterable[Chunk], load: Callable[[Chunk], Iterable[RawMe
 
 MAX_DECOMPRESSED_BYTES = 256 << 20
 """Of a chunk or of a message, decompressed [B]. Recorders make chunks of 0.8 to 16 MB, and the largest messages of robots (maps, stitched
-clouds) have 100 MB; what is larger is read uncompressed only, where it needs the memory that it takes on the disk."""
+clouds) have 100 MB; larger ones are read only where they are not compressed."""
 _MAX_COMPRESSION_RATIO = 1000
 """Decompressed to compressed size, of more than `_UNLIMITED_RATIO_BYTES`. Sensor data compress by 2 to 10, joint states of a robot at rest
 by 100; an empty map compresses by 10,000, but has 16 MB."""
@@ -129,7 +137,7 @@ _PIECE_BYTES = 1 << 20
 
 
 def max_decompressed_bytes(packed: int) -> int:
-    """What ``packed`` bytes may decompress to [B], if they are no bomb."""
+    """Largest size [B] to which ``packed`` bytes may decompress; more is a decompression bomb."""
     return max(_UNLIMITED_RATIO_BYTES, _MAX_COMPRESSION_RATIO * packed)
 
 
@@ -142,7 +150,7 @@ def decompress(data: bytes, compression: str) -> bytes:
 
 
 def decompress_head(data: bytes, compression: str) -> tuple[bytes, bool]:
-    """As much as can be had of a chunk whose end may be missing, and whether that is all of it. Raises `DamagedError`."""
+    """The decompressed bytes of a chunk whose end may be missing, and whether that is all of it. Raises `DamagedError`."""
     if compression in ("", "none"):
         return data, True
     makers: dict[str, Callable[[], Any]] = {
@@ -174,7 +182,7 @@ def decompress_message(data: bytes) -> bytes:
 
 
 def decompress_file(path: Path, target: Path) -> str:
-    """Decompress a zstd file into ``target`` as far as it goes; the reason why it went no further, or nothing."""
+    """Decompress a zstd file into ``target`` as far as it is valid; returns why it stopped, or nothing."""
     most = max_decompressed_bytes(path.stat().st_size)
     try:
         with path.open("rb") as packed, target.open("wb") as plain:

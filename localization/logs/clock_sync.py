@@ -1,17 +1,17 @@
 """Several topics in order of their header stamps, within bounded memory, for clocks with offsets and jumps.
 
-Messages come in the order in which they were recorded; their headers say when they were measured, which is earlier by an unknown
-latency, and some are wrong. Three steps:
+Messages come in the order of recording. Their headers hold the time of measurement, which is earlier by an unknown latency; some are
+wrong. Three steps:
 
 - Each topic's clock is monitored (`TopicClock`). A stamp is plausible if it lies within a second of the stamp before it, or if it is as
   far from the time of recording as the stamps before it were, to a second. (The first holds when the recorder stalls, the second
   when the driver pauses.) It is not if it leaves the topic's even pace by more than 0.3 s while messages are recorded evenly. One or
-  two that are not are outliers, and dropped; three in a row that agree are a clock that was set, and from there on the topic is moved
-  back by the jump. A burst gives no information about clocks and waits for what comes after it: if that is plausible and continues
-  it, the burst was merely late.
-- A topic without stamps gets the time of recording, and so does, by a constant shift, one whose clock is far from all others'.
-- Plausible messages wait in a heap until nothing older can come: one second after the slowest topic's usual latency. On a robot, where
-  an estimate is wanted now, they do not wait.
+  two implausible stamps are outliers, and dropped; three in a row that agree are a clock that was set, and from there on the topic is
+  shifted back by the jump. A burst gives no information about clocks and is held until the next message: if that is plausible and
+  continues it, the burst was late.
+- A topic without stamps gets the time of recording; one whose clock is far from all others is shifted by a constant.
+- Plausible messages are held in a heap until nothing older can come: one second after the slowest topic's usual latency. Live they are
+  passed on at once.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from localization.logs.message_stats import MessageStats, Oddity
+from localization.logs.decode import MessageStats, Oddity
 
 _SECOND = 1_000_000_000
 _MAX_STEP_NS = _SECOND
 _REORDER_WAIT_NS = _SECOND
-_MAX_CLOCK_OFFSET_NS = 10 * _SECOND
-_EQUAL_JUMP_NS = _SECOND // 4
+_MAX_CLOCK_OFFSET_NS = 10 * _SECOND  # more is another clock, not latency
+_EQUAL_JUMP_NS = _SECOND // 4  # jumps of two topics that differ by less have one cause
 _MIN_JUMPED_MESSAGES = 3
 _MIN_JUMP_NS = 3 * _SECOND // 10
-"""A stamp that leaves the even pace of its topic by more than this, while recording goes on evenly, is no latency but a clock that was set
-[ns]. Smaller jumps move a robot by less than 0.3 m at 1 m/s; estimators weigh these."""
+"""A stamp that deviates from the even pace of its topic by more than this [ns], while the times of recording are even, is no latency but a
+clock that was set. Smaller jumps move a robot by less than 0.3 m at 1 m/s; estimators reject these."""
 _PACE_MESSAGES, _MIN_PACE_MESSAGES = 20, 8
-"""Messages of which the pace is known, and the fewest: scanners of 2 Hz have 8 in 4 s."""
-_MAX_PENDING_NS = 10 * _SECOND
+"""Messages from which the pace is computed, and the fewest: scanners of 2 Hz have 8 in 4 s."""
+_MAX_PENDING_NS = 10 * _SECOND  # bounds the latency
 _MAX_BURST_NS = 5 * _SECOND
-_MAX_PENDING_MESSAGES = 1000
-_MAX_BUFFERED_WEIGHT = 20_000
+_MAX_PENDING_MESSAGES = 1000  # bounds the memory
+_MAX_BUFFERED_WEIGHT = 20_000  # bounds the memory: 200 scans
 
 
 @dataclass(frozen=True)
 class Item:
-    """An event on its way, with what it is ordered by."""
+    """An event to be merged, and the keys of its order."""
 
     log_ns: int
     stamp_ns: int
@@ -65,7 +65,7 @@ class ClockPlan:
     offset_ns: int = 0
     """Header stamp minus time of recording, where that is more than latency (a log that was recorded while another was played)."""
     shifts_ns: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    """To be added to the stamps of a topic whose clock is far from the others'."""
+    """Shift of the stamps of each topic whose clock is far from the others'."""
     latency_ns: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """First header stamp, shifted, minus its time of recording."""
 
@@ -85,7 +85,7 @@ def plan_clocks(first: Mapping[str, tuple[int, int]]) -> ClockPlan:
 
 
 class TopicClock:
-    """The stamps of one topic, brought onto the common clock."""
+    """The stamps of one topic, converted to the common clock."""
 
     def __init__(self, topic: str, plan: ClockPlan, jumps: list[int], stats: MessageStats) -> None:
         self._topic, self._stats = topic, stats
@@ -106,11 +106,11 @@ class TopicClock:
 
     @property
     def shift_ns(self) -> int:
-        """What is added to the stamps of this topic now."""
+        """Shift of the stamps of this topic."""
         return self._shift
 
     def horizon(self, log_ns: int) -> int:
-        """No message recorded after ``log_ns`` is expected to have an older stamp than this, less some waiting.
+        """Lower bound of the stamps of messages recorded after ``log_ns``.
 
         Messages that have been pending for ten seconds are dropped, so that they do not hold all others.
         """
@@ -124,7 +124,7 @@ class TopicClock:
         return min(since, first.stamp_ns + self._shift) if self._may_be_late() else since
 
     def insert(self, item: Item) -> list[Item]:
-        """Take the next message; returns those that are plausible now, with their final stamps."""
+        """Insert the next message; returns those that are plausible now, with their final stamps."""
         if item.stamp_ns == 0:
             self._stats.count(self._topic, Oddity.NO_STAMP)
             return [_restamped(item, item.log_ns + self._common)]
@@ -142,7 +142,7 @@ class TopicClock:
         return self._release()
 
     def flush(self) -> list[Item]:
-        """What is pending at the end, where it is enough for a clock that was set; else it is dropped."""
+        """Release the pending messages at the end if they are enough for a clock that was set, else drop them."""
         if len(self._pending) >= _MIN_JUMPED_MESSAGES:
             self._set_clock()
         else:
@@ -150,18 +150,18 @@ class TopicClock:
         return self._release()
 
     def drop_pending(self) -> None:
-        """Drop what is pending as outliers."""
+        """Drop the pending messages as outliers."""
         if self._pending:
             self._stats.count(self._topic, Oddity.OUTLIER, len(self._pending))
             self._pending = []
 
     def _is_plausible(self, item: Item) -> bool:
         stamp = item.stamp_ns + self._shift
-        known = (self.offset_ns, self._min_latency_offset_ns)  # after a burst, messages are no longer late
+        offsets = (self.offset_ns, self._min_latency_offset_ns)  # after a burst, messages are no longer late
         return not self._is_sudden(item) and (
             self._last is None
             or abs(stamp - self._last) <= _MAX_STEP_NS
-            or any(abs(stamp - item.log_ns - offset) <= _MAX_STEP_NS for offset in known)
+            or any(abs(stamp - item.log_ns - offset) <= _MAX_STEP_NS for offset in offsets)
         )
 
     def _is_sudden(self, item: Item) -> bool:
@@ -181,15 +181,15 @@ class TopicClock:
         return [self._accept(i) for i in released]
 
     def _may_be_late(self) -> bool:
-        """Whether what is pending comes after the last plausible message."""
+        """Whether the pending messages are stamped after the last plausible one."""
         return bool(self._pending) and self._last is not None and self._last <= self._pending[0].stamp_ns + self._shift
 
     def _is_continued_by(self, item: Item) -> bool:
-        """Whether ``item``, which is plausible, comes soon after what is pending, and that after the last plausible message."""
+        """Whether the plausible ``item`` is stamped soon after the pending messages, and these after the last plausible one."""
         return self._may_be_late() and 0 <= item.stamp_ns - self._pending[-1].stamp_ns <= _MAX_STEP_NS
 
     def _is_burst(self) -> bool:
-        """Whether what is pending came in less than half the time over which it was measured. None is long: it may be a bag's at a rate."""
+        """Whether the pending messages were recorded in less than half the time over which they were measured (long: a replayed bag)."""
         first, last = self._pending[0], self._pending[-1]
         is_fast = last.log_ns - first.log_ns < min((last.stamp_ns - first.stamp_ns) / 2, _MAX_BURST_NS)
         n = len(self._pending)
@@ -217,7 +217,7 @@ class TopicClock:
         deviation = statistics.median_low([i.stamp_ns + self._shift - i.log_ns - self.offset_ns for i in first])
         shift = self._shift - deviation
         # The latency jitters. Where another topic made the same jump, or this one a jump back, the same shift keeps them aligned.
-        same = [known for known in (0, *self._jumps) if abs(known - shift) <= _EQUAL_JUMP_NS]
+        same = [jump for jump in (0, *self._jumps) if abs(jump - shift) <= _EQUAL_JUMP_NS]
         self._shift = same[0] if same else shift
         self._rebased = self._shift != 0
         if not same:
@@ -227,9 +227,8 @@ class TopicClock:
 class Merger:
     """Merges items by stamp: `insert` an item, take the payloads that are due. A topic's payloads always have increasing stamps.
 
-    With ``wait_ns`` [ns] (a log) the payloads of all topics come in order of stamps, never decreasing. Without (a robot) each is given
-    out at once, in order of arrival: one that comes after a newer one of its own topic is dropped, and what is late against the other
-    topics is the estimator's to use.
+    With ``wait_ns`` [ns] (a log) the payloads of all topics come in order of stamps, never decreasing. Without (live) each is yielded at
+    once, in order of arrival: one that comes after a newer one of its own topic is dropped; those late against other topics are passed on.
     """
 
     def __init__(self, plan: ClockPlan, stats: MessageStats, wait_ns: int | None = _REORDER_WAIT_NS) -> None:
@@ -242,7 +241,7 @@ class Merger:
         self._newest = -(2**63)
 
     def insert(self, item: Item) -> Iterator[Any]:
-        """Take the next item by time of recording; what is yielded must be taken before the next."""
+        """Insert the next item by time of recording; the yielded payloads must be consumed before the next."""
         clock = self._clocks.get(item.topic)
         if clock is None:  # a topic without stamps
             clock = self._clocks[item.topic] = TopicClock(item.topic, self._plan, self._jumps, self._stats)
@@ -255,11 +254,11 @@ class Merger:
             yield from self._release(min(c.horizon(self._now) for c in self._clocks.values()) - self._wait_ns, _MAX_BUFFERED_WEIGHT)
 
     def shift_ns(self, topic: str) -> int:
-        """What is added to the stamps of ``topic`` now, because its clock was set or is not the others'."""
+        """Shift of the stamps of ``topic``, whose clock was set or is not the common one."""
         return self._clocks[topic].shift_ns if topic in self._clocks else 0
 
     def flush(self) -> Iterator[Any]:
-        """All that is held, for nothing more will come."""
+        """Release everything that is held, at the end of the messages."""
         for clock in self._clocks.values():
             self._hold(clock.flush())
         yield from self._release(2**63 - 1, 0)

@@ -1,10 +1,15 @@
-"""Messages to events: a driver's message in this project's types. Stateless; what needs the message before is in `wheel_decoder`."""
+"""Messages to events: a driver's message in this project's types. Stateless; what needs the message before is in `wheel_decoder`.
+
+`MessageStats` counts messages that were dropped or corrected on the way, by topic and `Oddity`.
+"""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum
 from functools import lru_cache
 from typing import Any
 
@@ -12,16 +17,70 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.events import CgSample, ImuSample, Scan
-from localization.logs.message_stats import Oddity, UnusableError
 from motion_models.se2 import FloatArray
 
-MAX_SWEEP_S = 2.0
+MAX_SCAN_DURATION_S = 2.0
 _MAX_RATE_RAD_S = math.radians(2000.0)  # rad/s, the full scale of gyros on robots
 _MAX_SPECIFIC_FORCE_M_S2 = 1e5  # m/s^2; drivers use other units, in which this may be 100 g (cm/s^2)
-_MIN_SQUARED_NORM = 0.01  # of a rotation, whose quaternion need not be normalised; what is smaller is the noise of one not filled in
+_MIN_SQUARED_NORM = 0.01  # of a rotation, as its quaternion need not be normalised; a smaller one was not filled in
 _MAX_BEAMS = 1_000_000  # of a planar scan; the finest scanners have 20,000
 _MAX_FIELD_OF_VIEW_RAD = math.tau * 1.1  # from first to last beam; scanners that turn on a little overlap their first beam
 _MAX_CACHED_NAMES = 100  # of joint lists; bounds the memory where they change with every message
+
+
+class Oddity(Enum):
+    """Defects of messages; the value completes the sentence "TOPIC: N messages ..."."""
+
+    UNDECODABLE = "dropped (bytes that are not of the type)"
+    MALFORMED = "dropped (fields that contradict each other)"
+    NO_ANGLES = "dropped (angle_increment is zero, or makes more than a full turn: in degrees?); correct the driver's angles"
+    NOT_FINITE = "dropped (NaN or inf)"
+    BEYOND = "dropped (beyond what such a sensor can measure)"
+    NO_FIX = "left out (no GPS fix)"
+    NO_STAMP = "without a header stamp, placed by the time of recording"
+    FOREIGN_CLOCK = "stamped by another clock than the other topics', moved to the time of recording"
+    OUT_OF_ORDER = "recorded out of order, and sorted"
+    REPEATED = "dropped (stamp repeated)"
+    LATE = "dropped (recorded more than a second after newer ones)"
+    OUTLIER = "dropped (stamp that fits neither its neighbours nor the time of recording)"
+    REBASED = "stamped after a jump of the clock, moved back by it"
+    POSE_JUMP = "with a pose that wheels cannot reach (a reset); the increment was taken from the rates"
+    NO_POSE = "with rates but a pose that never moves; the increment was taken from the rates"
+    NO_TWIST = "with a moving pose but no rates; these were taken from the pose"
+    TIPPING = "with arms at which the robot would tip over (joints in degrees?); their centre of gravity was left out"
+    TIPPING_CG = "with a centre of gravity at which the robot would tip over (not in metres, or not from base_link?); it was left out"
+    WHEEL_RATE = "with rates that wheels cannot reach; these were left out"
+    SECOND_PUBLISHER = "of a second publisher whose wheels turn less, left out; stop one of the two (`ros2 topic info --verbose`)"
+    FROZEN_WHEEL = "with an angle that never changes while another wheel of its side turns; it was left out (check its encoder)"
+    WHEEL_JUMP = "with a wheel angle that wheels cannot reach (a reset); the increment was taken from the rates"
+
+
+class UnusableError(Exception):
+    """A message without usable content. Raised and caught within this package."""
+
+    def __init__(self, oddity: Oddity) -> None:
+        super().__init__(oddity.value)
+        self.oddity = oddity
+
+
+class MessageStats:
+    """Counts by topic and oddity."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[tuple[str, Oddity]] = Counter()
+
+    def count(self, topic: str, oddity: Oddity, n: int = 1) -> None:
+        """Count ``n`` messages of ``topic``."""
+        self._counts[topic, oddity] += n
+
+    def of(self, topic: str, oddity: Oddity) -> int:
+        """Count of ``topic`` and ``oddity``."""
+        return self._counts[topic, oddity]
+
+    def describe(self) -> list[str]:
+        """One sentence for each topic and oddity."""
+        ordered = sorted(self._counts.items(), key=lambda entry: (entry[0][0], list(Oddity).index(entry[0][1])))
+        return [f"{topic}: {n} message{'s' if n > 1 else ''} {oddity.value}." for (topic, oddity), n in ordered if n]
 
 
 @dataclass(frozen=True)
@@ -37,7 +96,7 @@ class JointReading:
 
 @dataclass(frozen=True)
 class ArmReading:
-    """Joints of the arms at one instant, those of one message."""
+    """Joints of the arms in one message."""
 
     stamp_ns: int
     names: tuple[str, ...]
@@ -88,7 +147,7 @@ def decode_cg(message: Any, stamp: int) -> CgSample:
 
 
 def yaw_of(q: Any) -> float:
-    """Heading of a quaternion [rad]; NaN if it is no rotation, as one that was never filled in."""
+    """Heading of a quaternion [rad]; NaN if it is no rotation (drivers that do not fill it in publish zeros)."""
     if not q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w >= _MIN_SQUARED_NORM:
         return math.nan
     return math.atan2(2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
@@ -184,7 +243,7 @@ def scan_decoder() -> Callable[[Any, int], Scan]:
         if direction is None:
             angle = first + step * np.arange(len(ranges))
             direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(ranges))], axis=1)
-            directions.clear()  # a scanner whose beams change with every scan must not fill the memory
+            directions.clear()  # bounds the memory where the beams change with every scan
             directions[key] = direction
         # A comparison with NaN is false. A range at the maximum is a beam without a return.
         shortest, longest = float(message.range_min), float(message.range_max)
@@ -193,7 +252,7 @@ def scan_decoder() -> Callable[[Any, int], Scan]:
         points = direction.take(kept, axis=0)
         points *= ranges.take(kept)[:, None]
         beam_s = float(message.time_increment)
-        if abs(beam_s) * len(ranges) > MAX_SWEEP_S:
+        if abs(beam_s) * len(ranges) > MAX_SCAN_DURATION_S:
             raise UnusableError(Oddity.MALFORMED)
         offsets: FloatArray = np.empty(0)
         if math.isfinite(beam_s) and beam_s != 0.0:
@@ -206,12 +265,12 @@ def scan_decoder() -> Callable[[Any, int], Scan]:
 # sensor_msgs/PointField: datatype 1..8
 _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "offset_time", "time_offset", "stamp", "stamps")
-_MAX_POINTS = 10_000_000  # of a sweep; LiDARs have up to 300,000, and as numbers these take 1 GB
-_MAX_START_OFFSET_S = 0.5  # a sweep begins at its header's stamp, or ends there
+_MAX_POINTS = 10_000_000  # points; LiDARs have up to 300,000 a scan, and this many take 1 GB as float64
+_MAX_START_OFFSET_S = 0.5  # a scan begins at the stamp of its header, or ends there
 
 
 def decode_cloud(message: Any, stamp: int) -> Scan:
-    """Raises `UnusableError` if it has no x, y, z, if its sizes contradict each other, or if its points' times are of no one sweep."""
+    """Raises `UnusableError` if it has no x, y, z, if its sizes contradict each other, or if its points' times span more than one scan."""
     table = _table(message)
     with np.errstate(invalid="ignore"):  # signalling NaNs
         points = np.stack([table[name].astype(float).ravel() for name in ("x", "y", "z")], axis=1)
@@ -223,13 +282,13 @@ def decode_cloud(message: Any, stamp: int) -> Scan:
         if np.isfinite(times[good]).any():
             good &= np.isfinite(times)
             offsets = times[good]
-            if np.ptp(offsets) > MAX_SWEEP_S:
+            if np.ptp(offsets) > MAX_SCAN_DURATION_S:
                 raise UnusableError(Oddity.MALFORMED)
     return Scan(stamp, np.ascontiguousarray(points[good]), offsets, frame_name(message.header.frame_id), is_planar=False)
 
 
 def _table(message: Any) -> Any:
-    """(height, width) structured array of x, y, z and the time, if any, over the message's bytes."""
+    """(height, width) structured view of the message's bytes: x, y, z and the time, if any."""
     fields = {f.name.lower(): f for f in message.fields if int(f.datatype) in _DTYPES and int(f.count) <= 1}
     wanted = ["x", "y", "z", *[name for name in _TIME_FIELDS if name in fields][:1]]
     height, width = int(message.height), int(message.width)
@@ -253,7 +312,7 @@ def _table(message: Any) -> Any:
                 "itemsize": step,
             }
         )
-    except ValueError as error:  # a field beyond the point's end
+    except ValueError as error:  # a field outside of the point
         raise UnusableError(Oddity.MALFORMED) from error
     return np.ndarray((height, width), dtype=dtype, buffer=data.data, strides=(row_step, step))
 
@@ -261,9 +320,9 @@ def _table(message: Any) -> Any:
 def _offsets(times: Any, good: Any, stamp: int) -> FloatArray:
     """Seconds after the header's stamp of each point's time, whatever its unit and origin are.
 
-    Whole numbers are nanoseconds. Real ones are seconds unless they are too large, or spread too far for one sweep. Times are
+    Integers are nanoseconds. Floats are seconds unless they are too large, or spread too far for one scan. Times are
     relative to the header if they are small, absolute if they are near the header's stamp; else their origin is unknown, and
-    the sweep is taken to begin at the header's stamp.
+    the scan is assumed to begin at the header's stamp.
     """
     if not good.any():
         return np.zeros(len(times))
@@ -280,10 +339,10 @@ def _offsets(times: Any, good: Any, stamp: int) -> FloatArray:
     largest, spread = float(np.abs(known).max()), float(np.ptp(known))
     unit = next((u for limit, u in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)) if largest > limit), 0.0)
     if unit == 0.0:
-        unit = next((u for u in (1.0, 1e-3, 1e-6, 1e-9) if spread * u <= MAX_SWEEP_S), 1e-9)
+        unit = next((u for u in (1.0, 1e-3, 1e-6, 1e-9) if spread * u <= MAX_SCAN_DURATION_S), 1e-9)
     seconds, first = values * unit, float(known.min()) * unit
     if abs(first) <= _MAX_START_OFFSET_S:
         return np.asarray(seconds, dtype=float)
-    # A double holds the seconds since 1970 to a quarter of a microsecond.
+    # A double resolves the seconds since 1970 to a quarter of a microsecond.
     origin_s = stamp * 1e-9 if abs(first - stamp * 1e-9) <= _MAX_START_OFFSET_S else first
     return np.asarray(seconds - origin_s, dtype=float)

@@ -12,7 +12,10 @@ from localization.logs.clock_sync import Item
 from localization.logs.decode import (
     ArmReading,
     JointReading,
+    MessageStats,
+    Oddity,
     OdometryReading,
+    UnusableError,
     arm_decoder,
     decode_cg,
     decode_cloud,
@@ -22,7 +25,6 @@ from localization.logs.decode import (
     scan_decoder,
     stamp_ns,
 )
-from localization.logs.message_stats import MessageStats, Oddity, UnusableError
 from localization.logs.topic_roles import Sources, TopicSource
 from localization.logs.wheel_decoder import JointsToWheels, OdometryToWheels
 from motion_models.center_of_gravity.model import CgModel

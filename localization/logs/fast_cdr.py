@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from localization.logs.fused_log import BODY_FRAME, PARENT_FRAME, FusedEstimate, odom_axes, odometry_message, six_by_six, transform_message
 from localization.logs.message_templates import Message, MessageLayout, Template
+from localization.logs.writer import BODY_FRAME, PARENT_FRAME, FusedEstimate, odom_axes, odometry_message, six_by_six, transform_message
 from motion_models.se2 import FloatArray
 
 _CDR, _FIRST = b"\0\1\0\0", 4  # little endian; places are counted from behind these bytes
@@ -170,11 +170,13 @@ class FusedWriter:
         self._odometry, self._transform = (Template(form, is_ros1=is_ros1) for form in (self._odometry_form, self._transform_form))
 
     def odometry(self, estimate: FusedEstimate) -> bytes:
+        """The bytes of `odometry_message`."""
         covariance = None if estimate.covariance is None else odom_axes(estimate.covariance, float(estimate.pose[2]))
         parts = (*_place(estimate), six_by_six(covariance), estimate.twist[:2], estimate.twist[2:], six_by_six(estimate.twist_covariance))
         return self._odometry.fill(Message(self._odometry_form, estimate.stamp_ns, estimate.stamp_ns, parts))
 
     def transform(self, estimate: FusedEstimate) -> bytes:
+        """The bytes of `transform_message`."""
         return self._transform.fill(Message(self._transform_form, estimate.stamp_ns, estimate.stamp_ns, _place(estimate)))
 
 

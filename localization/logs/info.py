@@ -16,7 +16,7 @@ _STAMPED = {*TYPES.values(), *REFERENCE_TYPES}
 _GAP_PERIODS, _MIN_GAP_S, _MAX_GAPS = 5.0, 0.25, 10
 _PERIOD_MESSAGES = 200
 _MAX_CLOCK_OFFSET_S = 10.0
-_MAX_UNEVEN_S = 2.0
+_MAX_SENSOR_START_DIFFERENCE_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class LogInfo:
     problems: list[str]
     """What is missing or suspect, as sentences."""
     warnings: list[str]
-    """What was chosen, mended or lost, as sentences."""
+    """What was chosen, corrected or lost, as sentences."""
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -122,7 +122,7 @@ class _StampStats:
 
 
 def inspect_log(log: Log) -> LogInfo:
-    """Go through the log once, reading no more of a message than its header."""
+    """Inspect a log: one pass, which reads the headers of messages only."""
     stamped = [channel.topic for channel in log.channels if channel.type in _STAMPED]
     stats_of = {topic: _StampStats() for topic in stamped}
     for raw in log.source.messages(stamped) if stamped else ():
@@ -251,6 +251,6 @@ def _find_uneven_spans(log: Log, topics: list[TopicInfo]) -> list[str]:
     found = []
     for topic, first, last in known:
         for apart_s, what in (((first - begin) * 1e-9, "begins {:.1f} s after"), ((end - last) * 1e-9, "ends {:.1f} s before")):
-            if apart_s > _MAX_UNEVEN_S:
+            if apart_s > _MAX_SENSOR_START_DIFFERENCE_S:
                 found.append(f"{topic.topic} {what.format(apart_s)} the other sensors.")
     return found

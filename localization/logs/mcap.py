@@ -1,8 +1,7 @@
 """MCAP files, chunk by chunk, of ROS 2 and ROS 1, whole or cut off.
 
-Chunks are taken from the file's own index where that is whole; where it is not, the index is made anew by going through the file once,
-and messages outside of chunks are taken together in runs of a megabyte, which then are chunks like the others. What a damaged chunk
-still holds is searched for. Format: https://mcap.dev/spec.
+Chunks are taken from the file's index where that is valid; else the index is rebuilt in one pass over the file. Messages outside of chunks
+are grouped in runs of a megabyte, which are treated as chunks. Damaged chunks are searched for messages. Format: https://mcap.dev/spec.
 
 The stream reader of the library `mcap` recovers less: of 6 copies each of two files that were cut off, flipped, zeroed or overwritten in
 part, it gave 1,458 of the 2,423 and 198,924 of the 240,783 messages that this reader gives, as it ends at the first damage.
@@ -52,7 +51,7 @@ class _Topic(NamedTuple):
 
 
 class McapFile:
-    """As much of an MCAP file as can be read. Raises `LogError` if that is nothing."""
+    """An MCAP file, as far as it can be read. Raises `LogError` if nothing can."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -84,6 +83,7 @@ class McapFile:
             self.warnings.insert(0, f"{path.name} was read record by record ({reason}): {totals.total()} messages of it are used{lost}.")
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """As `Source.messages`."""
         wanted = {key: t for key, t in self._topics.items() if t.name in topics}
         with self._path.open("rb") as file:
 
@@ -101,7 +101,7 @@ class McapFile:
             yield from in_log_order((c for c in self._chunks if not wanted.keys().isdisjoint(c.counts)), load)
 
     def _is_ros1(self, totals: Counter[int], reason: str) -> bool:
-        """Whether most messages are encoded as ROS 1's. Raises `LogError` where there are neither these nor those of ROS 2."""
+        """Whether most messages are encoded as in ROS 1. Raises `LogError` where none is of ROS 1 or ROS 2."""
         encodings = Counter({t.encoding: 0 for t in self._described.values()})
         for key, topic in self._described.items():
             encodings[topic.encoding] += totals[key]
@@ -144,7 +144,7 @@ class McapFile:
             raise DamagedError("its index does not describe all topics")
 
     def _index(self, file: BinaryIO) -> int:
-        """Go through the file; the bytes at its end that could not be read."""
+        """Scan the file for chunks; returns the number of bytes at its end that could not be read."""
         end = file.seek(0, 2)
         position, op = len(MAGIC), 0
         while position + 9 <= end:
@@ -197,8 +197,8 @@ class McapFile:
     def _entries(self, record: bytes) -> tuple[list[Entry], str]:
         """Messages of a chunk record or of a run of messages, as far as they are whole, and what is damaged, or nothing.
 
-        Topics that it describes are taken in. A chunk that is cut off gives what it has. A damaged compressed chunk is
-        dropped; in a damaged uncompressed one messages are searched for.
+        Topics that it describes are added. Of a truncated chunk the first part is read. A damaged compressed chunk is
+        dropped; a damaged uncompressed one is searched for messages.
         """
         if record[:1] != bytes([_CHUNK]):
             return _whole_messages(record), ""
@@ -298,7 +298,7 @@ def _indexed_chunk(record: bytes, end: int) -> Chunk:
 
 
 def _plain(record: bytes) -> tuple[bytes, tuple[int, int], str]:
-    """Records of a chunk record, the span of time that it covers, and what is damaged. Raises `DamagedError` where nothing is to be had."""
+    """Records of a chunk record, the span of time that it covers, and what is damaged. Raises `DamagedError` where nothing can be read."""
     try:
         size, start_ns, end_ns, _, crc = struct.unpack_from("<QQQQI", record, 1)
         compression, at = _string(record, 9 + 28)
@@ -320,7 +320,7 @@ def _plain(record: bytes) -> tuple[bytes, tuple[int, int], str]:
 
 
 def _entry(plain: bytes, position: int, after: int) -> Entry | None:
-    """The message record between two places; None if they are not those of one."""
+    """The message record between two positions; None if there is none."""
     if after - position < 9 + 22 or after > len(plain):
         return None
     key, _, log_ns, _ = struct.unpack_from("<HIQQ", plain, position + 9)

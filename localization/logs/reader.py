@@ -11,11 +11,10 @@ from localization.errors import LogError, TopicError
 from localization.events import Event, Reference
 from localization.logs.chunks import Source, merge_channels
 from localization.logs.clock_sync import ClockPlan, Item, merge, plan_clocks
-from localization.logs.decode import frame_name, stamp_ns
+from localization.logs.decode import MessageStats, UnusableError, frame_name, stamp_ns
 from localization.logs.event_decoder import EventDecoder, TopicDecoder, decode_item
-from localization.logs.message_stats import MessageStats, UnusableError
 from localization.logs.references import reference_decoder
-from localization.logs.serialization import Decoder
+from localization.logs.serialization import LogDeserializer
 from localization.logs.sources import open_source
 from localization.logs.topic_roles import REFERENCE_TYPES, TopicChooser, TopicOverrides, choose_roles
 from localization.logs.transforms import FixedTransforms
@@ -23,8 +22,8 @@ from motion_models.robot import Mount, Robot
 
 _GPS = "/fix"
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_TF_READ_NS = 10_000_000_000
-_JOINT_STATES_READ = 500
+_TF_READ_NS = 10_000_000_000  # of ROS 1, where static transforms are repeated every 0.1 to 1 s on /tf
+_JOINT_STATES_READ = 500  # first messages that are searched for joint names
 
 
 def open_log(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> Log:  # noqa: B008 (frozen)
@@ -77,6 +76,7 @@ class Log:
 
     @property
     def duration_s(self) -> float:
+        """From the first to the last message, by the time of recording [s]."""
         return (self.end_ns - self.start_ns) * 1e-9
 
     @property
@@ -114,7 +114,7 @@ class Log:
         transforms = FixedTransforms()
         tf = [channel for channel in self.channels if channel.type in _TF_TYPES]
         static = [channel for channel in tf if channel.topic.endswith("tf_static")]
-        decode = Decoder(tf, is_ros1=self.source.is_ros1)
+        decode = LogDeserializer(tf, is_ros1=self.source.is_ros1)
         left = sum(channel.count for channel in static)
         for raw in self.source.messages([channel.topic for channel in static]) if left else ():
             left -= 1
@@ -150,7 +150,7 @@ class Log:
             yield from decoder.events(payload)
 
     def _items(self, decoders: Mapping[str, TopicDecoder], stats: MessageStats) -> Iterator[Item]:
-        decode = Decoder([c for c in self.channels if c.topic in decoders], is_ros1=self.source.is_ros1)
+        decode = LogDeserializer([c for c in self.channels if c.topic in decoders], is_ros1=self.source.is_ros1)
         for raw in self.source.messages(decoders.keys()):
             if raw.type == self.types[raw.topic]:
                 item = decode_item(raw.topic, raw.log_ns, partial(decode, raw), decoders[raw.topic], stats)
@@ -159,7 +159,7 @@ class Log:
 
     def _first_messages(self, topic: str, most: int) -> Iterator[tuple[int, Any]]:
         """The first decodable messages of a topic, with their time of recording."""
-        decode = Decoder([c for c in self.channels if c.topic == topic], is_ros1=self.source.is_ros1)
+        decode = LogDeserializer([c for c in self.channels if c.topic == topic], is_ros1=self.source.is_ros1)
         for number, raw in enumerate(self.source.messages([topic])):
             if number >= most:
                 return

@@ -10,11 +10,10 @@ import numpy as np
 
 from localization.errors import LogError
 from localization.events import Event, PositionSample, Reference
-from localization.logs.decode import yaw_of
-from localization.logs.message_stats import Oddity, UnusableError
+from localization.logs.decode import Oddity, UnusableError, yaw_of
 from motion_models.se2 import FloatArray
 
-_SEMI_MAJOR_M = 6_378_137.0
+_SEMI_MAJOR_M = 6_378_137.0  # WGS84
 _FLATTENING = 1.0 / 298.257223563
 _ECCENTRICITY2 = _FLATTENING * (2.0 - _FLATTENING)
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
@@ -91,7 +90,7 @@ def east_north(latitude: float, longitude: float) -> FloatArray:
 _UNKNOWN_SIGMA_M = 2.5
 """Of a source without covariance [m]: a GPS receiver without corrections (GPS Standard Positioning Service, 2020: 95 % within 8 m)."""
 _MIN_SIGMA_M = 0.01
-"""No receiver is better, whatever its covariance [m]."""
+"""Smallest sigma of a receiver, whatever its covariance [m]."""
 
 
 def read_positions(references: Iterable[Reference], source: str) -> list[PositionSample]:

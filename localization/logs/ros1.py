@@ -1,8 +1,8 @@
 """ROS 1 bags, chunk by chunk.
 
 rosbags keeps 160 bytes of index for every message and refuses bags whose index is missing, as that of any recording that was cut
-off is. This reader keeps one entry per chunk instead, takes it from the bag's own index where that is whole, and makes it anew
-from the records where it is not. Format: http://wiki.ros.org/Bags/Format/2.0.
+off is. This reader keeps one entry per chunk instead, from the bag's own index where that is valid, else
+rebuilt from the records. Format: http://wiki.ros.org/Bags/Format/2.0.
 """
 
 from __future__ import annotations
@@ -70,6 +70,7 @@ class Ros1Bag:
         self.end_ns = max((c.end_ns for c in filled), default=0)
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """As `Source.messages`."""
         wanted = {key: c for key, c in self._connections.items() if c.topic in topics}
         with self._path.open("rb") as file:
 
@@ -102,7 +103,7 @@ class Ros1Bag:
             raise DamagedError("there is no chunk at its place in the index")
         data = file.read(min(size, self._size - file.tell()))
         compression = header.get(b"compression", b"none").decode(errors="replace")
-        # The last chunk of a bag that was cut off is the only one that may be short, and its messages are known to be readable.
+        # Only the last chunk of a truncated bag may be short; its messages were readable when the index was rebuilt.
         return decompress_head(data, compression)[0] if len(data) < size else decompress(data, compression)
 
     def _read_index(self, file: BinaryIO) -> None:
@@ -194,7 +195,7 @@ class _Message(NamedTuple):
 
 
 def _entries(plain: bytes) -> Iterator[_Message | tuple[int, _Connection]]:
-    """The whole messages and connections of a chunk's bytes. What is none is skipped, up to where a message begins again."""
+    """The whole messages and connections of a chunk's bytes. Bytes that are none are skipped up to the next message."""
     position = 0
     while position + 8 <= len(plain):
         try:
@@ -207,8 +208,18 @@ def _entries(plain: bytes) -> Iterator[_Message | tuple[int, _Connection]]:
             position = _next_message(plain, position + 1)
 
 
-def _record(plain: bytes, position: int) -> tuple[int, Fields, bytes, int]:
-    """Kind, header and body of a chunk's record, and where the next one begins. Raises `DamagedError`."""
+class _Record(NamedTuple):
+    op: int
+    """Kind of the record."""
+    fields: Fields
+    """Of its header."""
+    body: bytes
+    end: int
+    """Position of the next record."""
+
+
+def _record(plain: bytes, position: int) -> _Record:
+    """The record of a chunk at ``position``. Raises `DamagedError`."""
     body = position + 8 + int.from_bytes(plain[position : position + 4], "little")
     if body > len(plain):
         raise DamagedError("a record's header breaks off")
@@ -219,7 +230,7 @@ def _record(plain: bytes, position: int) -> tuple[int, Fields, bytes, int]:
     op = fields.get(b"op", b"")
     if len(op) != 1:
         raise DamagedError("a record has no kind")
-    return op[0], fields, plain[body:after], after
+    return _Record(op[0], fields, plain[body:after], after)
 
 
 def _next_message(plain: bytes, position: int) -> int:

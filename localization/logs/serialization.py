@@ -11,8 +11,8 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from localization.logs.chunks import Channel, RawMessage
+from localization.logs.decode import Oddity, UnusableError
 from localization.logs.fast_cdr import fast_decoder
-from localization.logs.message_stats import Oddity, UnusableError
 from localization.logs.message_templates import STORE, STORE_ROS1
 
 _GRAPH_PACKAGE = "rmw_dds_common"
@@ -91,8 +91,8 @@ def _shape(described: Any) -> Shape:
     return "sequence", _shape(inside[0])
 
 
-class Decoder:
-    """Raw messages to rosbags' message objects, by the definitions that the log carries, else by those of ROS 2 Humble (ROS 1: Noetic).
+class LogDeserializer:
+    """Deserializes raw messages by the definitions in the log, else by those of ROS 2 Humble (ROS 1: Noetic).
 
     A type's definition is parsed at its first message: a damaged definition affects that type only.
     """
@@ -122,12 +122,12 @@ def _deserializer(kind: str, form: MessageDefinitionFormat, text: str, is_ros1: 
     try:
         types = _parse_definition(kind, form, text)
         if not _is_bounded(types):
-            raise ValueError("a definition with arrays that no robot sends")
+            raise ValueError("a definition with arrays longer than any of ROS")
         store.register(types)
         if not _has_fields(store.fielddefs, standard.fielddefs, kind):
             raise ValueError("a definition without the fields that the type has")
         store.get_msgdef(kind)
-    except Exception:  # no definition, or one that the parser does not understand (it lets out anything): the standard one will do
+    except Exception:  # no definition, or an invalid one (the parser raises errors of any type): use the standard one
         store = standard
     deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
     return lambda data: deserialize(data, kind)
@@ -149,7 +149,7 @@ def _parse_definition(kind: str, form: MessageDefinitionFormat, text: str) -> di
 
 
 def _is_bounded(types: Mapping[str, Any]) -> bool:
-    """Whether no array is too long to generate a reader for, and none has elements without bytes, whose number has no bound."""
+    """Whether no array is too long to generate a reader for, and none has elements of no bytes, of which there could be any number."""
     for _, fields in types.values():
         for _, (node, inside) in fields:
             if node not in (Nodetype.ARRAY, Nodetype.SEQUENCE):
@@ -163,7 +163,7 @@ def _is_bounded(types: Mapping[str, Any]) -> bool:
 
 
 def _has_bytes(types: Mapping[str, Any], name: str, depth: int) -> bool:
-    """Whether a message of the type takes any. One that is not among ``types`` does, as it is of ROS's own basic ones."""
+    """Whether messages of the type have at least one byte. Types that are not among ``types`` are basic ones of ROS, which have."""
     if name not in types:
         return True
     return depth > 0 and any(

@@ -21,7 +21,7 @@ _MAX_METADATA_BYTES = 4 << 20
 
 
 def open_source(path: Path) -> Source:
-    """The log at ``path``. Raises `LogError` if it is not there, not a log, or nothing in it can be read."""
+    """Open the log at ``path``. Raises `LogError` if it does not exist, is no log, or nothing in it can be read."""
     if not path.exists():
         raise LogError(f"no log '{path}': there is no such file or folder.")
     try:
@@ -31,7 +31,7 @@ def open_source(path: Path) -> Source:
 
 
 def _open_folder(path: Path) -> Source:
-    """A ROS 2 folder: the files that metadata.yaml names, in its order, or, where that is damaged, all that there are, by name."""
+    """A ROS 2 folder: the files that metadata.yaml names, in its order, or, where that is damaged, all storage files, by name."""
     try:
         names, listed = _read_metadata(path / "metadata.yaml")
         missing = [name for name in names if not (path / name).exists()]
@@ -59,7 +59,7 @@ def _read_metadata(path: Path) -> tuple[list[str], int]:
         names, listed = content["relative_file_paths"], content["message_count"]
     except FileNotFoundError:
         raise
-    except Exception as error:  # the parser lets out errors of its own, of types and of recursion
+    except Exception as error:  # the parser raises its own errors, type errors and recursion errors
         raise DamagedError("metadata.yaml is damaged") from error
     if not isinstance(names, list) or not names or not all(isinstance(name, str) and name for name in names) or type(listed) is not int:
         raise DamagedError("metadata.yaml is damaged")
@@ -95,7 +95,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 
 def require_file(path: Path) -> None:
-    """Raises `LogError` for what is there but is no file: to read it may never end."""
+    """Raises `LogError` for a path that is no regular file (reading a FIFO may never end)."""
     try:
         check_file(path)
     except FileNotFoundError:
@@ -123,7 +123,7 @@ def _open_file(path: Path) -> Source:
 
 
 class DecompressedSource:
-    """A storage file that the recorder compressed as a whole, as much of it as can be had."""
+    """A storage file that the recorder compressed as a whole, as far as it decompresses."""
 
     def __init__(self, path: Path) -> None:
         self._folder = tempfile.TemporaryDirectory()  # removed when this object is
@@ -141,9 +141,11 @@ class DecompressedSource:
 
     @property
     def warnings(self) -> list[str]:
+        """As `Source.warnings`."""
         return [*self._warnings, *self._inner.warnings]
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """As `Source.messages`."""
         return self._inner.messages(topics)
 
 
@@ -160,8 +162,10 @@ class SplitSource:
 
     @property
     def warnings(self) -> list[str]:
+        """As `Source.warnings`."""
         return [*self._warnings, *chain.from_iterable(part.warnings for part in self._parts)]
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """As `Source.messages`."""
         for part in self._parts:
             yield from part.messages(topics)

@@ -1,7 +1,7 @@
-"""SQLite storage files of ROS 2: read by SQLite, or, where they were cut off or hold bad pages, page by page, as far as they go.
+"""SQLite storage files of ROS 2: read by SQLite, or, where they were cut off or hold bad pages, page by page.
 
-A table's rows hang on a tree whose inner pages lie anywhere in the file, so that SQLite finds nothing in many a file that was cut off.
-Its leaves, which hold the rows, lie in the order in which they were recorded. Format: https://www.sqlite.org/fileformat2.html.
+A table is a tree whose inner pages are anywhere in the file, so that SQLite finds nothing in many truncated files. Its leaf pages, which
+hold the rows, are in the order of recording. Format: https://www.sqlite.org/fileformat2.html.
 A database can hold code (views, computed columns); only plain tables are read, and with bounds.
 """
 
@@ -31,7 +31,7 @@ Row = tuple[int, int, bytes]
 
 
 def _connect(path: Path) -> sqlite3.Connection:
-    """For reading alone. What is in a row has a bound, and functions that could do harm cannot be called by what the file holds."""
+    """Open read-only. Sizes of rows are bounded, and the file's contents cannot call unsafe functions."""
     database = sqlite3.connect(f"file:{quote(bytes(path.resolve()))}?immutable=1", uri=True)
     database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_DECOMPRESSED_BYTES)
     database.execute("PRAGMA trusted_schema=OFF")
@@ -67,7 +67,7 @@ def _channels(topics: dict[int, tuple[str, str]], definitions: dict[str, Message
 
 
 class SqliteFile:
-    """A whole .db3 file. Raises `DamagedError` for any other; damage that shows later costs what SQLite does not find behind it."""
+    """A whole .db3 file. Raises `DamagedError` for any other; rows that SQLite does not find behind later damage are lost and reported."""
 
     is_ros1 = False
 
@@ -93,6 +93,7 @@ class SqliteFile:
         self._rest: RecoveredSqlite | None = None
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """As `Source.messages`."""
         wanted = {key: topic for key, topic in self._topics.items() if topic[0] in topics}
         last, found = self.start_ns - 1, 0
         query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({','.join(map(str, wanted))}) ORDER BY timestamp"
@@ -149,6 +150,7 @@ class RecoveredSqlite:
         ]
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """As `Source.messages`."""
         wanted = {key: topic for key, topic in self._topics.items() if topic[0] in topics}
         for key, log_ns, data in self._rows():
             if key in wanted:

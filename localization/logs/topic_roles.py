@@ -54,7 +54,7 @@ class TopicSource:
 
     topic: str
     kind: str
-    """The entry of the robot file's [topics] that it stands for; this sets its message type (`TYPES`)."""
+    """Its entry in [topics] of the robot file, which sets the message type (`TYPES`)."""
     chosen_by: str
     """"option", "robot" or "only" (the only one of its type in the log)."""
 
@@ -91,6 +91,7 @@ class TopicChooser:
         self.warnings: list[str] = []
 
     def of_type(self, *types: str) -> list[str]:
+        """Topics of one of these types, sorted."""
         return sorted(topic for topic, kind in self._types.items() if kind in types)
 
     def find_named(self, kind: str) -> TopicSource | None:
@@ -150,9 +151,9 @@ class TopicRoles:
     joints: Sides
     """Wheel joints that the log has; empty where the wheels are not joint states."""
     wheels_error: TopicError | None
-    """Why the wheels cannot be used although they seem to be meant."""
+    """Why the wheels cannot be used, where the log has joint states."""
     arms: CgModel | None
-    """What turns the joint states of `Sources.arms` into centres of gravity."""
+    """CG model for the joint states of `Sources.arms`."""
     warnings: list[str]
 
 
@@ -246,7 +247,7 @@ class _RoleChooser:
         return self._odometry(named, known, bool(candidates) and not fitting)
 
     def _odometry(self, joint_states: TopicSource | None, known: set[str], is_missing_joints: bool) -> TopicSource | None:
-        """The odometry, where joint states will not do."""
+        """The odometry, where no joint states have the wheels."""
         missing_joints = (
             f"no joint states of {self._log} have the wheel joints: robot '{self._robot.name}' names"
             f" {', '.join((*self._robot.joints.left, *self._robot.joints.right))}; joints in it: {', '.join(sorted(known)) or 'none'}"

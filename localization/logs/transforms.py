@@ -14,11 +14,11 @@ from motion_models.se2 import FloatArray
 
 _ROOTS = ("base_link", "base_footprint")
 _WORLDS = {"map", "odom", "world", "earth"}
-_SAME = 1e-6
+_MAX_CHANGE = 1e-6
 _AGREE_M, _AGREE_RAD = 0.01, math.radians(0.5)
-"""Two ways to a frame that differ by less are one: drivers round, and publish a robot's model beside their own mounts."""
+"""Two chains to a frame that differ by less agree: drivers round, and publish a robot's model beside their own mounts."""
 _MIN_NORM, _MAX_NORM = 0.5, 2.0
-"""Of a quaternion that is a rotation. Those of drivers differ from 1 by rounding; some are typed in by hand with two digits."""
+"""Norms of quaternions that are accepted as rotations: drivers round, and some are typed by hand with two digits."""
 
 Edges = dict[tuple[str, str], FloatArray]
 
@@ -34,7 +34,7 @@ class FixedTransforms:
         self._no_rotations: dict[str, str] = {}
 
     def add(self, message: Any, *, is_static: bool) -> None:
-        """Take in a TFMessage. On a static topic the last transform counts, on /tf what changes is no mount."""
+        """Insert a TFMessage. On a static topic the last transform counts; on /tf one that changes is no mount."""
         for transform in message.transforms:
             edge = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
             matrix = _matrix(transform.transform)
@@ -50,7 +50,7 @@ class FixedTransforms:
                 self._fixed.add(edge)
             elif edge in self._fixed:
                 continue
-            elif before is not None and np.abs(before - matrix).max() > _SAME:
+            elif before is not None and np.abs(before - matrix).max() > _MAX_CHANGE:
                 self._moving.add(edge)
             self._edges[edge] = matrix
 
@@ -65,7 +65,7 @@ class FixedTransforms:
             if (parent, child) not in self._moving:
                 neighbours.setdefault(parent, []).append((child, parent_T_child))
                 upwards = neighbours.setdefault(child, [])
-                if (parent, child) in self._fixed:  # what only seems fixed may be a robot that stands still in the world
+                if (parent, child) in self._fixed:  # a fixed transform from the world is a robot that stands still
                     upwards.append((parent, np.asarray(np.linalg.inv(parent_T_child), dtype=float)))
         root = body if body in neighbours else _root(neighbours)
         if root is None:
@@ -90,7 +90,7 @@ class FixedTransforms:
         return [*self._contradictions.values(), *self._no_rotations.values()]
 
     def _compare(self, poses: dict[str, FloatArray]) -> None:
-        """Frames with two parents, and chains that lead back to themselves, must lead to one place."""
+        """Check that all chains to a frame (of two parents, or in a cycle) give one pose."""
         for (parent, child), parent_T_child in sorted(self._edges.items(), key=lambda e: e[0]):
             if (
                 (parent, child) in self._fixed

@@ -1,7 +1,7 @@
-"""Readings of joints or of a driver's odometry, in order of time, to wheel samples: side means, and angles that lose nothing.
+"""Readings of joints or of a driver's odometry, in order of time, to wheel samples: means of each side, angles unwrapped.
 
-Angles are sums of increments, so that a reading that the wheels cannot have made (an encoder or an odometry that was reset) costs its
-own increment only, which is then taken from the rates. An angle that wrapped costs nothing. Rates that wheels cannot reach are left out,
+Angles are sums of increments: of a reading that wheels cannot reach (a reset encoder or odometry) only that increment is lost, and is
+taken from the rates. An angle that wrapped loses nothing. Rates that wheels cannot reach are left out,
 and with them a reading that has nothing else.
 """
 
@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import WheelSample
-from localization.logs.decode import JointReading, OdometryReading
-from localization.logs.message_stats import MessageStats, Oddity
+from localization.logs.decode import JointReading, MessageStats, Oddity, OdometryReading
 from motion_models.robot import Driver
 from motion_models.se2 import FloatArray
 
@@ -24,14 +23,14 @@ _MAX_SPEED_M_S = 5.0
 _MAX_TURN_RATE_RAD_S = 10.0
 _MIN_INTERVAL_S = 0.05  # stamps jitter by milliseconds: speeds over shorter times are noise
 _STATIONARY_M, _STATIONARY_RAD = 1e-9, 1e-9
-_WRAP_RAD, _WRAP_WITHOUT_RATE_RAD = 0.3, 1.0
+_MAX_WRAP_DEVIATION_RAD, _MAX_WRAPPED_STEP_WITHOUT_RATE_RAD = 0.3, 1.0
 
 
 _MAX_PUBLISHER_GAP_NS = 1_000_000_000  # of a second publisher, after its reading before; drivers publish at 10 Hz and more
 
 
 _MIN_SWAPS = 6
-"""From one publisher to the other and back, before one is left out."""
+"""Changes from one publisher to the other and back, before one is left out."""
 _VELOCITY_NOISE, _MAX_ACCELERATION = 0.05, 5.0
 """Of readings without angles, and of a driver's twist [m/s, m/s^2; rad/s, rad/s^2]. Robots of this size brake at up to 3 m/s^2."""
 _FROZEN_AFTER_RAD = 0.5
@@ -51,7 +50,7 @@ class _PublisherState:
 
 
 class _Motion(NamedTuple):
-    """What one publisher has sent last."""
+    """Last reading of one publisher."""
 
     velocity: FloatArray
     """(n,) [m/s, or rad/s in the last entry of a twist]; NaN where absent."""
@@ -68,9 +67,9 @@ class _Publisher:
 
 
 class PublisherSeparator:
-    """Separates the readings of two publishers that share a topic: velocities and poses leap to and fro between them.
+    """Separates the readings of two publishers that share a topic: velocities and poses alternate between them.
 
-    The one whose wheels travel more is used. A single leap is a reset, a stop, or noise.
+    The one whose wheels travel more is used. A single step to other values is a reset, a stop, or noise.
     """
 
     def __init__(self) -> None:
@@ -111,8 +110,8 @@ def _may_follow(publisher: _Publisher, stamp_ns: int, motion: _Motion) -> bool:
 class JointsToWheels:
     """Converter of readings whose first ``left`` joints are the left side's and the next ``right`` the right side's.
 
-    Where two publishers share the topic, angles leap to and fro between what either of them publishes. The one whose wheels turn more is
-    used: a second one is mostly a `joint_state_publisher` that fills in zeros.
+    Where two publishers share the topic, angles alternate between theirs. The one whose wheels turn more is used: the other is mostly a
+    `joint_state_publisher` that publishes zeros.
     """
 
     def __init__(self, left: Sequence[str], right: Sequence[str], wheel_radius_m: float, topic: str, stats: MessageStats) -> None:
@@ -126,6 +125,7 @@ class JointsToWheels:
         self._is_working = np.ones(len(self._names), dtype=bool)
 
     def __call__(self, reading: JointReading) -> Iterator[WheelSample]:
+        """The wheel sample of the next reading; none where it is not used."""
         has_angles = all(map(math.isfinite, reading.position.tolist()))
         velocity = reading.velocity
         if any(abs(rate) * self._radius > _MAX_SPEED_M_S for rate in velocity.tolist()):
@@ -202,7 +202,7 @@ class JointsToWheels:
         jumped = np.abs(step) * self._radius > _MAX_SPEED_M_S * max(dt, _MIN_INTERVAL_S)
         expected = np.nan_to_num(velocity) * dt
         wrapped = np.remainder(step + math.pi, math.tau) - math.pi
-        is_wrap = np.abs(wrapped - expected) < np.where(np.isfinite(velocity), _WRAP_RAD, _WRAP_WITHOUT_RATE_RAD)
+        is_wrap = np.abs(wrapped - expected) < np.where(np.isfinite(velocity), _MAX_WRAP_DEVIATION_RAD, _MAX_WRAPPED_STEP_WITHOUT_RATE_RAD)
         return np.where(jumped, np.where(is_wrap, wrapped, expected), step), bool((jumped & ~is_wrap).any())
 
     def _side_means(self, values: FloatArray) -> FloatArray:
@@ -216,7 +216,7 @@ class JointsToWheels:
 class OdometryToWheels:
     """Converter by the driver's own geometry, inverted: q = (vx -+ wz w_s d/2)/r (Ebersole 2016, eq. 1.4-1.8).
 
-    Angles come from the pose, of which messages that were lost take nothing away, rates from the twist. A driver may fill only
+    Angles come from the pose, which has all the motion though messages were lost, rates from the twist. A driver may fill only
     one of the two.
     """
 
@@ -230,6 +230,7 @@ class OdometryToWheels:
         self._publishers = PublisherSeparator()
 
     def __call__(self, reading: OdometryReading) -> Iterator[WheelSample]:
+        """The wheel sample of the next reading; none where it is not used."""
         if not self._publishers.admit(reading.stamp_ns, _Motion(reading.twist, reading.pose), float(np.hypot(*reading.twist[:2]))):
             self._stats.count(self._topic, Oddity.SECOND_PUBLISHER)
             return

@@ -4,12 +4,33 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from localization.diagnosis.diagnose import DiagnosisResult
 from localization.diagnosis.findings import Diagnosis
+from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS
 from localization.diagnosis.summary import describe_outliers, describe_row, describe_tolerated
-from localization.report.diagnosis_figures import dependence_svg, discrepancy_svg, gain_svg
-from localization.report.page import Block, Cell, Figure, Page, Paragraph, Section, Table, bullets, glossary, render, write_new
+from localization.report.figures import Axes, svg
+from localization.report.figures import Figure as Canvas
+from localization.report.page import (
+    COLOURS,
+    WIDTH_IN,
+    Block,
+    Cell,
+    Figure,
+    Page,
+    Paragraph,
+    Section,
+    Table,
+    bullets,
+    glossary,
+    render,
+    write_new,
+)
+from motion_models.se2 import FloatArray
 
+_COMPONENTS = {"x": "along", "y": "sideways", "yaw": "heading", "gyro": "gyro - LiDAR"}
+_MAX_PANELS = 4
 _VERDICTS = {
     "consistent": "Wheels and reference agree within their noise.",
     "explained": "What they disagree about has a cause with a name.",
@@ -57,9 +78,9 @@ def _figures(found: DiagnosisResult) -> list[Section]:
     if found.residuals is not None:
         colours = "Red: as found; blue: once corrected."
         over_time = Figure(
-            discrepancy_svg(found), "Discrepancies over time", f"Measured minus predicted. {colours} The band is two sigmas of noise."
+            _discrepancy_svg(found), "Discrepancies over time", f"Measured minus predicted. {colours} The band is two sigmas of noise."
         )
-        by_motion = Figure(dependence_svg(found), "Discrepancies by motion", f"One point for each window. {colours}")
+        by_motion = Figure(_dependence_svg(found), "Discrepancies by motion", f"One point for each window. {colours}")
         sections += [
             Section("Discrepancies over time", [over_time]),
             Section("Discrepancies by motion", [by_motion]),
@@ -67,7 +88,7 @@ def _figures(found: DiagnosisResult) -> list[Section]:
         ]
     if d.findings:
         caption = "Each finding beside all others; the line is its 95 % interval, by bootstrap over blocks of windows."
-        sections.append(Section("Held-out gain", [Figure(gain_svg(d), "Held-out gain of each finding", caption)]))
+        sections.append(Section("Held-out gain", [Figure(_gain_svg(d), "Held-out gain of each finding", caption)]))
     return sections
 
 
@@ -103,3 +124,77 @@ def _handover(d: Diagnosis) -> list[Block]:
 def _detectable(d: Diagnosis) -> list[Block]:
     rows = [[Cell(name, is_code=True), Cell(f"{size:.3g}")] for name, size in d.detectable_sizes.items()]
     return [Table([Cell("Cause"), Cell("Smallest size that this drive would show (3 sigma)")], rows)] if rows else []
+
+
+def _discrepancy_svg(found: DiagnosisResult) -> str:
+    """Each component window by window: as found, once corrected, and the band of noise."""
+    assert found.predictor is not None
+    assert found.residuals is not None
+    r = found.residuals
+    owner = found.predictor.batch.owner
+    seconds = found.predictor.drive.starts_s[owner]
+    shown = [c for c in range(_MAX_PANELS) if np.isfinite(r.rows[:, c]).any()]
+
+    def draw(figure: Canvas) -> None:
+        panels = np.atleast_1d(figure.subplots(len(shown), 1, sharex=True))
+        for axes, c in zip(panels, shown, strict=True):
+            _band(axes, seconds, 2.0 * r.sigmas[:, c])
+            axes.plot(seconds, r.rows[:, c], ".", color=COLOURS["red"], markersize=4.0)
+            axes.plot(seconds, r.left[:, c], ".", color=COLOURS["blue"], markersize=3.0)
+            axes.set_ylabel(f"{_COMPONENTS[CHANNELS[c]]} [{CHANNEL_UNITS[c]}]")
+        panels[-1].set_xlabel("time since the first window [s]" if found.diagnosis.windows and seconds.any() else "maneuver")
+
+    return svg("discrepancy", WIDTH_IN, 1.35 * len(shown) + 0.5, draw)
+
+
+def _dependence_svg(found: DiagnosisResult) -> str:
+    """Each component against what the wheels did: distance and turn by their rates, before and after."""
+    assert found.predictor is not None
+    assert found.residuals is not None
+    r = found.residuals
+    driven, turned = _motion(found)
+    shown = [c for c in range(3) if np.isfinite(r.rows[:, c]).any()]
+
+    def draw(figure: Canvas) -> None:
+        panels = np.reshape(figure.subplots(len(shown), 2, sharex="col", sharey="row", squeeze=False), (len(shown), 2))
+        for row, c in enumerate(shown):
+            for axes, along in zip(panels[row], (driven, turned), strict=True):
+                axes.plot(along, r.rows[:, c], ".", color=COLOURS["red"], markersize=4.0)
+                axes.plot(along, r.left[:, c], ".", color=COLOURS["blue"], markersize=3.0)
+            panels[row][0].set_ylabel(f"{_COMPONENTS[CHANNELS[c]]} [{CHANNEL_UNITS[c]}]")
+        panels[-1][0].set_xlabel("driven in the window [m]")
+        panels[-1][1].set_xlabel("turned in the window [rad]")
+
+    return svg("dependence", WIDTH_IN, 1.6 * len(shown) + 0.5, draw)
+
+
+def _gain_svg(d: Diagnosis) -> str:
+    """What each finding takes off the held-out discrepancy, with its interval."""
+
+    def draw(figure: Canvas) -> None:
+        axes = figure.add_subplot()
+        for row, f in enumerate(d.findings):
+            gain, low, high = (100.0 * v for v in (f.gain.relative, f.gain.low, f.gain.high))
+            axes.barh(row, gain, height=0.5, color=COLOURS["green"])
+            axes.plot([low, high], [row, row], color=COLOURS["ink"], linewidth=1.0)
+        axes.set(yticks=range(len(d.findings)), yticklabels=[f.cause for f in d.findings], xlabel="held-out discrepancy taken off [%]")
+        axes.invert_yaxis()
+
+    return svg("gain", WIDTH_IN, 0.4 * len(d.findings) + 0.7, draw)
+
+
+def _band(axes: Axes, seconds: FloatArray, width: FloatArray) -> None:
+    axes.fill_between(seconds, -width, width, facecolor=COLOURS["band"], edgecolor="none", zorder=0.5)
+    axes.axhline(0.0, color=COLOURS["soft"], linewidth=0.6, zorder=0.6)
+
+
+def _motion(found: DiagnosisResult) -> tuple[FloatArray, FloatArray]:
+    assert found.predictor is not None
+    batch = found.predictor.batch
+    twist = found.predictor.nominal_twist
+    parts = []
+    for end, owner in zip(batch.ends, batch.owner, strict=True):
+        inside = slice(batch.first[owner] + batch.lead[owner], end)
+        parts.append(twist[inside].T @ batch.dt[inside])
+    moved = np.array(parts)
+    return moved[:, 0], moved[:, 2]

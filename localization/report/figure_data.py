@@ -1,4 +1,4 @@
-"""What the pictures show, as plain arrays: where the map's borders lie, errors over time, means over bins. No drawing here."""
+"""Data of the figures as plain arrays: borders of the map, errors over time, means over bins."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from localization.report.runs import Ellipse, PlottedRun, best_run, ellipse, run
 from localization.trajectory import Trajectory
 from motion_models.se2 import FloatArray
 
-_N_ELLIPSES = 12
-_REACH = 0.2
+_MAX_ELLIPSES = 12
+_MAX_WIDENING = 0.2  # of the borders by other runs than the best, as a fraction of their size
 # half-way between white and black paper: the map is a raster, whose colour the page cannot set
 _MAP_GREY = (118, 125, 132)
-_N_MEANS = 90
-_N_BINS = 9
-_LEAST_IN_BIN = 5
+_MAX_MEANS = 90
+_MAX_BINS = 9
+_MIN_BIN_RELATIONS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class MapView:
-    """Everything in one plane: the reference's where the runs are aligned to one, else the world of the runs' common start."""
+    """Map, reference and paths in one plane: the reference's where the runs are aligned to one, else the world of the common start."""
 
     low: FloatArray
     """(2,) lower left corner [m]."""
@@ -40,7 +40,7 @@ class MapView:
     paths: tuple[FloatArray, ...]
     """(N, 2) for each line."""
     best: PlottedRun | None
-    """The run whose place is sure to be in the picture, with the map and the ellipses of its covariances if it has any."""
+    """The run that is always inside the borders, with its map and the ellipses of its covariances if it has any."""
     ellipses: tuple[Ellipse, ...]
     """Two sigmas of the best run's position, at equal distances along its path."""
     ranks: Mapping[int, int]
@@ -48,12 +48,12 @@ class MapView:
     start: tuple[float, float] | None
     """Where the best run (or the first) starts."""
     n_cut: int
-    """Lines that leave the picture."""
+    """Number of lines that leave the picture."""
 
 
 def map_view(lines: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> MapView:
-    """Borders hold the reference, the best run, and the map but for its strays. The others widen them by no more than a fifth: a run that
-    diverged must not make the rest too small.
+    """Borders hold the reference, the best run, and the map without its outliers. The others widen them by at most a fifth: a diverged
+    run must not make the rest too small.
     """
     best = best_run(lines) or run_with_map(lines) or (lines[-1] if lines else None)
     mapped = run_with_map(lines)
@@ -65,7 +65,7 @@ def map_view(lines: Sequence[PlottedRun], reference: ReferenceTrack | Relations 
     paths = tuple(line.placed(line.result.run.trajectory.poses)[:, :2] for line in lines)
     core = [part for part in (track, paths[best.number] if best else None, _without_strays(points)) if part is not None and len(part)]
     low, high = _borders(core or [np.zeros((1, 2))])
-    reach = _REACH * max(float((high - low).max()), 1.0)
+    reach = _MAX_WIDENING * max(float((high - low).max()), 1.0)
     all_low, all_high = _borders([*core, *(path for path in paths if len(path))] or [np.zeros((1, 2))])
     low, high = np.maximum(all_low, low - reach), np.minimum(all_high, high + reach)
     margin = 0.03 * max(float((high - low).max()), 1.0)
@@ -121,7 +121,7 @@ def timeline(line: PlottedRun) -> Timeline | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Spans:
+class RelationBins:
     """Mean errors of relations, binned by the time that they span."""
 
     seconds: FloatArray
@@ -134,20 +134,20 @@ class Spans:
     """Relations in each bin."""
 
 
-def spans(line: PlottedRun, relations: Relations) -> Spans:
+def relation_bins(line: PlottedRun, relations: Relations) -> RelationBins:
     """Bins of equal width in the logarithm of the span; those of fewer than five relations are added to their neighbour."""
     found = relation_errors(line.result.run.trajectory, relations)
     span = np.maximum(found.spans_s, 1e-3)
-    edges = np.geomspace(span.min(), span.max() * (1.0 + 1e-9), _N_BINS + 1)
-    bins = np.clip(np.searchsorted(edges, span, side="right") - 1, 0, _N_BINS - 1)
-    groups = [np.flatnonzero(bins == b) for b in range(_N_BINS)]
+    edges = np.geomspace(span.min(), span.max() * (1.0 + 1e-9), _MAX_BINS + 1)
+    bins = np.clip(np.searchsorted(edges, span, side="right") - 1, 0, _MAX_BINS - 1)
+    groups = [np.flatnonzero(bins == b) for b in range(_MAX_BINS)]
     merged: list[NDArray[np.intp]] = []
     for group in groups:
-        if merged and (len(group) < _LEAST_IN_BIN or len(merged[-1]) < _LEAST_IN_BIN):
+        if merged and (len(group) < _MIN_BIN_RELATIONS or len(merged[-1]) < _MIN_BIN_RELATIONS):
             merged[-1] = np.concatenate([merged[-1], group])
         else:
             merged.append(group)
-    return Spans(
+    return RelationBins(
         np.array([float(np.exp(np.log(span[g]).mean())) for g in merged]),
         np.array([float(found.translation_m[g].mean()) for g in merged]),
         np.array([float(np.degrees(found.rotation_rad[g]).mean()) for g in merged]),
@@ -173,7 +173,7 @@ def nis_means(lines: Sequence[PlottedRun], limit: float) -> tuple[list[PlottedRu
     """The lines that have innovations, and about ninety means of each; ``limit``: the 95 % quantile of one value."""
     known = [(line, np.isfinite(line.result.run.nis)) for line in lines]
     known = [(line, use) for line, use in known if use.any()]
-    group = max(1, -(-max((int(use.sum()) for _, use in known), default=0) // _N_MEANS))
+    group = max(1, -(-max((int(use.sum()) for _, use in known), default=0) // _MAX_MEANS))
     means = []
     for line, use in known:
         values, t = line.result.run.nis[use], _seconds(line.result.run.trajectory.stamps_ns[use], line.result.run.trajectory)
@@ -198,7 +198,7 @@ def _ellipses(line: PlottedRun) -> tuple[Ellipse, ...]:
     length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
     if length[-1] <= 0.0:
         return (ellipse(poses[-1], trajectory.covariances[-1]),)
-    at = np.unique(np.searchsorted(length, np.linspace(0.0, length[-1], _N_ELLIPSES + 1)[1:] * (1.0 - 1e-12)))
+    at = np.unique(np.searchsorted(length, np.linspace(0.0, length[-1], _MAX_ELLIPSES + 1)[1:] * (1.0 - 1e-12)))
     return tuple(ellipse(poses[i], trajectory.covariances[i]) for i in at)
 
 

@@ -18,9 +18,9 @@ from matplotlib.patches import Ellipse as EllipsePatch
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from localization.evaluation.consistency import mean_band
-from localization.report.figure_data import MapView, NisMeans, Spans, Timeline, raster
+from localization.report.figure_data import MapView, NisMeans, RelationBins, Timeline, raster
+from localization.report.page import COLOURS, WIDTH_IN, for_page
 from localization.report.runs import PlottedRun, thin_path, thin_series
-from localization.report.svg import COLOURS, WIDTH_IN, for_page
 
 __all__ = [
     "Axes",
@@ -30,7 +30,7 @@ __all__ = [
     "overview",
     "picture",
     "plain_logs",
-    "spans_svg",
+    "relation_bins_svg",
     "svg",
     "timeline_svg",
 ]
@@ -107,12 +107,12 @@ def timeline_svg(lines: Sequence[PlottedRun], timelines: Sequence[Timeline]) -> 
     return svg("time", WIDTH_IN, 2.2 * rows + 0.4, draw)
 
 
-def spans_svg(lines: Sequence[PlottedRun], spans: Sequence[Spans]) -> str:
+def relation_bins_svg(lines: Sequence[PlottedRun], bins: Sequence[RelationBins]) -> str:
     """Mean error of relations against the time that they span, both axes logarithmic."""
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, 2)
-        for line, span in zip(lines, spans, strict=True):
+        for line, span in zip(lines, bins, strict=True):
             for axes, values in zip(panels, (span.translation_m, span.rotation_deg), strict=True):
                 _plot(axes, line, span.seconds, np.maximum(values, 1e-6), marker="o", markersize=3.0)
         for axes, name in zip(panels, ("translation error [m]", "rotation error [deg]"), strict=True):
@@ -226,7 +226,7 @@ def _dashes(line: PlottedRun) -> tuple[float, ...]:
 
 
 def plain_logs(axes: Axes) -> None:
-    """Powers of ten as people write them, and 2 and 5 between them where there are few."""
+    """Decimal labels of a logarithmic axis: powers of ten, and 2 and 5 between them where these are few."""
     plain = FuncFormatter(lambda value, _: f"{value:,.0f}" if value >= 1 else f"{value:g}")
     between = FuncFormatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
     for axis, scale in ((axes.xaxis, axes.get_xscale()), (axes.yaxis, axes.get_yscale())):

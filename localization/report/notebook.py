@@ -1,6 +1,6 @@
 """Figures and tables of the notebooks: data in, one style, no computation.
 
-Colours are names of `localization.report.svg.COLOURS` (Okabe and Ito's); markers and dashes distinguish them in grey.
+Colours are names of `localization.report.page.COLOURS` (Okabe and Ito's); markers and dashes distinguish them in grey.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from localization.evaluation.scores import Result
 from localization.report import figures
 from localization.report.figure_data import map_view
 from localization.report.figures import Axes, Figure
+from localization.report.page import COLOURS
 from localization.report.runs import plotted_runs
-from localization.report.svg import COLOURS
 
 CYCLE = ("blue", "red", "green", "purple", "orange", "sky", "grey", "ink")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
@@ -91,7 +91,7 @@ class Bars:
     colours: Sequence[str] = CYCLE
     legend: Place = "best"
     room: float = 0.14
-    """Kept free beyond the longest bar, as a share of it."""
+    """Margin beyond the longest bar, as a fraction of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +107,7 @@ class Picture:
         return "a picture"
 
     def save(self, path: str | Path) -> None:
+        """Write the PNG."""
         Path(path).write_bytes(self.png)
 
 

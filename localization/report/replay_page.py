@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result
 from localization.report import figures
-from localization.report.figure_data import MapView, map_view, nis_means, spans, timeline
+from localization.report.figure_data import MapView, map_view, nis_means, relation_bins, timeline
 from localization.report.page import (
     Block,
     Definitions,
@@ -161,13 +161,17 @@ def _error_figure(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relati
         scored = [run for run in runs if run.result.accuracy is not None]
         if not scored:
             return []
-        binned = [spans(run, reference) for run in scored]
+        binned = [relation_bins(run, reference) for run in scored]
         numbers = ", ".join(f"{n:,}" for n in binned[0].n)
         caption = (
             "Mean errors of the relations by the time that they span; both axes are logarithmic. "
             f"Relations in each point, from left: {numbers}."
         )
-        return [Figure(figures.spans_svg(scored, binned), "Errors of the relations by the time that they span", caption, _legend(scored))]
+        return [
+            Figure(
+                figures.relation_bins_svg(scored, binned), "Errors of the relations by the time that they span", caption, _legend(scored)
+            )
+        ]
     timelines = [(run, found) for run in runs if (found := timeline(run)) is not None]
     if not timelines:
         return []

@@ -1,4 +1,4 @@
-"""The runs as a report shows them: one line each, with its words, its colour, its headline number and its place in the picture."""
+"""Runs as plotted in a report: name, colour, headline error and path of each."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localization.evaluation.accuracy import Accuracy
+from localization.evaluation.metrics import Accuracy
 from localization.evaluation.scores import Result
 from localization.trajectory import IntArray
 from motion_models import se2
@@ -28,7 +28,7 @@ _DASHES: tuple[tuple[float, ...], ...] = ((), (4.0, 1.8), (1.2, 1.4), (5.0, 1.5,
 
 @dataclass(frozen=True, eq=False)
 class PlottedRun:
-    """One run as it is drawn and named everywhere in a report."""
+    """One run with the name and style that it has everywhere in a report."""
 
     number: int
     result: Result
@@ -64,7 +64,7 @@ class PlottedRun:
         return losses is not None and losses.is_long
 
     def placed(self, poses: FloatArray) -> FloatArray:
-        """Poses (N, 3) of the run's world in the reference's plane where the alignment is known, else as they are."""
+        """Poses (N, 3) of the run's world in the reference's plane where they are aligned to one, else as they are."""
         alignment = self.result.accuracy.reference_T_world if self.result.accuracy else None
         return poses if alignment is None else se2.compose(alignment, poses)
 
@@ -139,7 +139,7 @@ def run_with_map(lines: Sequence[PlottedRun]) -> PlottedRun | None:
 
 
 def baseline_run(lines: Sequence[PlottedRun]) -> PlottedRun | None:
-    """Dead reckoning with the ideal differential drive, else with whatever model: what every other run has to beat."""
+    """Dead reckoning with the ideal differential drive, else with whatever model: the baseline of all other runs."""
     reckoned = [line for line in lines if line.result.run.estimator == DEAD_RECKONING]
     return min(reckoned, key=lambda line: (line.model != "diff_drive", line.number)) if reckoned else None
 
@@ -158,8 +158,8 @@ class Ellipse:
 def ellipse(pose: FloatArray, covariance: FloatArray, sigmas: float = 2.0) -> Ellipse:
     """The ellipse of ``sigmas`` standard deviations of the position of ``pose`` (3,), of the covariance (3, 3) of its right perturbation.
 
-    The perturbation lives in the body frame, so its block of x and y is turned by the heading: R P R^T. In the plane, two sigmas hold
-    the truth in 86 % of all cases, not in 95 %.
+    The perturbation lives in the body frame, so its block of x and y is rotated by the heading: R P R^T. In the plane two sigmas
+    contain 86 % of all cases, not 95 %.
     """
     values, vectors = np.linalg.eigh(covariance[:2, :2])
     small, large = np.sqrt(np.maximum(values, 0.0)) * sigmas

@@ -1,9 +1,9 @@
 """Summary of a replay in words: which run is best and by how much, whether its covariances are consistent, and what to do.
 
-A difference is called one only if the log can show it. Errors along a drive are correlated and a few large ones (closed loops) make most
+A difference is reported as one only if it is significant. Errors along a drive are correlated and a few large ones (closed loops) make most
 of their mean, so runs are compared by blocks and by ranks: the drive is cut into ten stretches of equally many samples, and the
 differences of two runs' mean errors in them are tested by Wilcoxon's signed ranks, which takes the blocks and not the samples as
-independent and assumes nothing of their distribution. Two runs whose errors differ by less than 2 % are called equally good too.
+independent and assumes no distribution of them. Two runs whose errors differ by less than 2 % are called equally good too.
 """
 
 from __future__ import annotations
@@ -32,20 +32,19 @@ from localization.report.runs import (
 from localization.trajectory import IntArray
 from motion_models.se2 import FloatArray
 
-_DOF = 3
-_BLOCKS = 10
-_SAME = 0.02
-# The band of thousands of innovations is so narrow that every filter leaves it: below this factor in sigma nobody need act.
-_NOTABLE = 1.25
+_DOF = 3  # x, y, heading
+_BLOCKS = 10  # of a drive; errors in different tenths are taken as independent
+_EQUAL_RELATIVE_ERROR = 0.02  # a smaller difference of errors has no consequence
+_MIN_SIGMA_FACTOR = 1.25  # the band of thousands of innovations is so narrow that every filter leaves it; smaller factors are not reported
 
 
 def verdict(results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> str:
-    """One paragraph that a person can act on, from the numbers alone."""
+    """The summary as one paragraph."""
     return " ".join(verdict_sentences(results, reference))
 
 
 def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> list[str]:
-    """The paragraph's sentences, what matters most first."""
+    """Sentences of the summary, the most important first."""
     lines = plotted_runs(results)
     if not lines:
         return ["Nothing was run."]
@@ -78,7 +77,7 @@ def equally_good(lines: Sequence[PlottedRun], best: PlottedRun, reference: Refer
 
 
 def metres(value: float) -> str:
-    """A length in metres to three digits, never in the notation of machines."""
+    """A length in metres to three digits, never in scientific notation."""
     if not math.isfinite(value):
         return "an infinite distance"
     if value and value < 0.0095:
@@ -88,12 +87,12 @@ def metres(value: float) -> str:
 
 
 def is_close(line: PlottedRun, best: PlottedRun) -> bool:
-    """True if the errors differ by less than 2 %, whatever can be shown of that."""
-    return _error(line) - _error(best) <= _SAME * _error(best)
+    """True if the errors differ by less than 2 %, significant or not."""
+    return _error(line) - _error(best) <= _EQUAL_RELATIVE_ERROR * _error(best)
 
 
 def _is_worse(line: PlottedRun, best: PlottedRun, reference: ReferenceTrack | Relations) -> bool:
-    """True if ``line``'s errors exceed those of ``best`` over so much of the drive that it is no accident, at 95 % two-sided."""
+    """True if ``line``'s errors exceed those of ``best`` over most blocks of the drive, significant at 95 % (two-sided)."""
     difference = _differences(line, best, reference)
     if len(difference) < 2 * _BLOCKS:
         return False
@@ -207,7 +206,7 @@ def _consistency(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
     if len(known) >= 20:
         verdict_, text = _test("NIS", float(known.mean()), mean_band(len(known), _DOF), "innovations")
         middle, expected = float(np.median(known)), float(chi2.median(_DOF))
-        if verdict_ == "over" and middle < expected * _NOTABLE**2:
+        if verdict_ == "over" and middle < expected * _MIN_SIGMA_FACTOR**2:
             text += f" in the mean, but most fit (median {middle:.1f}, {expected:.1f} expected), so some outliers make it"
         results_.append((verdict_, text))
     if nees is not None and not math.isnan(nees):
@@ -242,9 +241,9 @@ def _test(name: str, mean: float, band: tuple[float, float], what: str) -> tuple
     factor = math.sqrt(mean / _DOF)
     value = "infinite" if math.isinf(mean) else f"{mean:.3g}" if mean < 99.5 else f"{mean:,.0f}"
     text = f"mean {name} {value}, where {_DOF} is expected"
-    if mean > band[1] and factor > _NOTABLE:
+    if mean > band[1] and factor > _MIN_SIGMA_FACTOR:
         return "over", text if math.isinf(mean) else f"{text}, {what} {factor:.1f} times their sigma"
-    if mean < band[0] and factor < 1.0 / _NOTABLE:
+    if mean < band[0] and factor < 1.0 / _MIN_SIGMA_FACTOR:
         return "under", f"{text}, {what} {factor:.2g} times their sigma"
     return "fits", text
 
@@ -264,7 +263,7 @@ def _advice(lines: Sequence[PlottedRun], best: PlottedRun, equals: Sequence[Plot
 
 
 def _unscored(lines: Sequence[PlottedRun]) -> list[str]:
-    """Without a reference: how far the runs lie apart."""
+    """Summary without a reference: how far apart the runs end."""
     advice = "Pass --reference with a pose or GPS topic, a TUM file or a relations file to have them scored."
     if len(lines) == 1:
         line = lines[0]

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from localization.errors import CheckpointError
-from localization.provenance import versions
+from localization.output import versions
 from localization.ros.deserialize import deserialize
 from localization.ros.serialize import serialize, serialize_parts
 from motion_models.robot import Robot

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 from localization.errors import TransportError
 from localization.logs.clock_sync import ClockPlan, plan_clocks
-from localization.logs.decode import stamp_ns
-from localization.logs.message_stats import UnusableError
+from localization.logs.decode import UnusableError, stamp_ns
 from localization.logs.serialization import decoder, live_channel
 from localization.logs.topic_roles import TYPES, TopicChooser, TopicOverrides, TopicRoles, choose_roles, short_type
 from localization.ros.topic_names import Names

@@ -14,9 +14,8 @@ from typing import Any
 from localization.errors import CheckpointError
 from localization.events import CgSample, Event
 from localization.logs.clock_sync import Merger
-from localization.logs.decode import ArmReading
+from localization.logs.decode import ArmReading, MessageStats, Oddity
 from localization.logs.event_decoder import EventDecoder, decode_item
-from localization.logs.message_stats import MessageStats, Oddity
 from localization.logs.serialization import decoder
 from localization.logs.topic_roles import TYPES, Sources
 from localization.logs.wheel_decoder import JointsToWheels, OdometryToWheels

@@ -12,7 +12,7 @@ from typing import Any
 from localization.errors import CheckpointError
 from localization.estimators import Estimate
 from localization.events import Event, Scan
-from localization.logs.message_stats import MessageStats
+from localization.logs.decode import MessageStats
 from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import fingerprints, read_head
 from localization.ros.diagnostics import ERROR, WARN, Health, Status

@@ -11,10 +11,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from localization.logs.decode import frame_name
-from localization.logs.fused_log import odom_axes
-from localization.logs.message_stats import UnusableError
+from localization.logs.decode import UnusableError, frame_name
 from localization.logs.serialization import decoder
+from localization.logs.writer import odom_axes
 from localization.ros.payloads import Load, Payloads
 from localization.ros.session import StartPose
 from localization.ros.topic_names import Names

@@ -11,8 +11,8 @@ import numpy as np
 
 from localization.estimators import Estimate
 from localization.logs.fast_cdr import FusedWriter
-from localization.logs.fused_log import FusedEstimate, odom_axes, six_by_six
 from localization.logs.serialization import encode, make
+from localization.logs.writer import FusedEstimate, odom_axes, six_by_six
 from localization.ros.diagnostics import Status
 from localization.ros.settings import Frames
 from localization.ros.topic_names import Names

@@ -10,10 +10,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from localization.errors import CheckpointError, OutputError
-from localization.estimate_table import trajectory
 from localization.estimators import Estimate
+from localization.estimators.base import trajectory
 from localization.events import Event
-from localization.logs.fused_log import MAP_FRAME, PARENT_FRAME, write_fused
+from localization.logs.writer import MAP_FRAME, PARENT_FRAME, write_fused
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.checkpoint import Checkpoint, CheckpointWriter, fingerprints, read_checkpoint, remove_checkpoint
 from localization.ros.diagnostics import Health

@@ -7,8 +7,7 @@ import difflib
 import time
 from collections.abc import Iterable, Mapping
 
-from localization.logs.decode import frame_name
-from localization.logs.message_stats import UnusableError
+from localization.logs.decode import UnusableError, frame_name
 from localization.logs.serialization import decoder
 from localization.logs.transforms import FixedTransforms
 from motion_models.robot import Mount

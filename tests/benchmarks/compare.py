@@ -10,8 +10,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from localization.comparison.executors import run_local
 from localization.comparison.jobs import Job, job_key, trials
-from localization.comparison.process_executor import run_local
 from localization.logs import TopicOverrides
 from localization.pipeline import ReplayConfig
 from localization.simulation.experiments import ExperimentConfig

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from tests.helpers.hostile_logs import BAD, SOURCES, Case, cases, run_guarded, truth_of, write_case
+from tests.helpers.hostile_logs import BAD, SOURCES, Case, cases, reference_of, run_guarded, write_case
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -32,7 +32,7 @@ def _campaign(folder: Path, chosen: list[Case], seed: int, verbose: bool) -> Non
     bad: list[str] = []
     seconds = []
     robots = {source.name: source.robot for source in SOURCES}
-    truths = {name: truth_of(name, folder) for name in sorted({case.source for case in chosen})}
+    truths = {name: reference_of(name, folder) for name in sorted({case.source for case in chosen})}
 
     def jobs() -> Iterator[tuple[Any, ...]]:
         for case in chosen:
@@ -43,7 +43,7 @@ def _campaign(folder: Path, chosen: list[Case], seed: int, verbose: bool) -> Non
     for case, outcome, took in run_guarded(jobs()):
         counts[outcome.kind] += 1
         seconds.append(took)
-        line = f"{outcome.kind}: {case} ({outcome.error_m:.3f} m, {outcome.sigmas:.1f} sigma, {took:.1f} s) {outcome.said[:300]}"
+        line = f"{outcome.kind}: {case} ({outcome.error_m:.3f} m, {outcome.sigmas:.1f} sigma, {took:.1f} s) {outcome.message[:300]}"
         if outcome.kind in BAD:
             bad.append(line)
         if verbose:

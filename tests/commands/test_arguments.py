@@ -1,4 +1,4 @@
-"""What a user may type wrongly, or an attacker on purpose: told at once, by name, and nothing is left behind."""
+"""Wrong or malicious arguments and files: refused at once, by name, without leaving files."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("[models.skidsteer]\nk_0 = 1.0", r"unknown entry skidsteer \(did you mean skid_steer\?\)"),
         ("[models.skid_steer]\nk0 = 1.0", r"\[models.skid_steer\]: unknown entry k0 \(did you mean k_0\?\)"),
@@ -56,10 +56,10 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (f"{'n' * 3000} = 1", "unknown entry n{60}\\.\\.\\.;"),
     ],
 )
-def test_robot_file_with_a_mistake_is_refused_with_what_was_meant(text: str, said: str) -> None:
+def test_robot_file_with_a_misspelt_key_is_refused_with_the_nearest(text: str, message: str) -> None:
     head = 'name = "r"\n[geometry]\nwheel_radius_m = 0.1\ntrack_width_m = 0.5\nwheelbase_m = 0.5\nmass_kg = 50\n'
     whole = f"{text}\n{head}" if "=" in text.split("\n")[0] else f"{head}{text}\n"
-    with pytest.raises(RobotError, match=said):
+    with pytest.raises(RobotError, match=message):
         parse_robot(whole, "r.toml")
 
 
@@ -87,7 +87,7 @@ def test_urdf_that_expands_without_end_is_refused(tmp_path: Path, capsys: pytest
 
 
 @pytest.mark.parametrize("value", [1e300, -1e300, 10**400, 10**9])
-def test_setting_beyond_all_reason_is_refused(value: float) -> None:
+def test_setting_of_absurd_size_is_refused(value: float) -> None:
     with pytest.raises(SettingError, match=r"keyframe_distance_m.*must be"):
         GraphConfig(keyframe_distance_m=value)
     if value != 10**9:
@@ -116,7 +116,7 @@ def test_json_that_cannot_be_written_is_refused_before_the_run(tmp_path: Path, c
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "there.json"]
 
 
-def test_outputs_that_are_one_are_refused(tmp_path: Path) -> None:
+def test_outputs_with_one_path_are_refused(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="are one"):
         check_outputs(tmp_path / "a", tmp_path / "." / "a")
 
@@ -148,7 +148,7 @@ def test_link_beside_an_output_is_not_followed(tmp_path: Path) -> None:
         file.write(b"x")
 
 
-def test_names_that_are_too_long_or_no_text_are_survived(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_names_too_long_or_not_text_are_accepted(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments in (
         ("info", "n" * 300),
         ("info", log, "--robot", "n" * 300 + ".toml"),
@@ -166,7 +166,7 @@ def test_names_that_are_too_long_or_no_text_are_survived(log: Path, tmp_path: Pa
     assert json.loads((tmp_path / "m.json").read_text())["log"] == "run-\\udcff\\udcfe.mcap"
 
 
-def test_escapes_in_a_log_do_not_reach_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_escapes_in_a_log_are_not_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     evil = "\x1b]0;owned\x07\x1b[2J\u202e\x9b31m"
     records = [(f"/{evil}", m, s) if t == "/scan" else (t, m, s) for t, m, s in drive(3.0)]
     for _, message, _ in records:
@@ -180,9 +180,7 @@ def test_escapes_in_a_log_do_not_reach_the_terminal(tmp_path: Path, capsys: pyte
     assert "owned" in shown.out
 
 
-def test_unforeseen_errors_of_the_system_are_told_without_traceback(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unexpected_os_errors_are_printed_without_traceback(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def fail(*_: object) -> None:
         raise OSError(5, "Input/output error", "/dev/disk")
 

@@ -16,7 +16,7 @@ from ruamel.yaml import YAML
 from localization.cli import main
 from localization.evaluation.references import read_relations
 from localization.events import ImuSample, WheelSample
-from localization.logs import open_log
+from localization.logs import TopicOverrides, open_log
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.calibration.maneuvers import Maneuver
@@ -168,7 +168,7 @@ def heading_errors(robot_file: str) -> np.ndarray:
     """Of dead reckoning over the hand-verified relations of the rest of the ACES log [rad]."""
     robot = load_robot(robot_file)
     model = make_model("icr", robot)
-    log, relations = open_log(DATA / "aces" / "aces.mcap", robot), read_relations(DATA / "aces" / "aces.relations")
+    log, relations = open_log(DATA / "aces" / "aces.mcap", robot, TopicOverrides(scan="")), read_relations(DATA / "aces" / "aces.relations")
     history = WheelBuffer(np.zeros(2), keep_s=1e9)
     for event in log.events():
         if isinstance(event, WheelSample):

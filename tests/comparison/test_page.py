@@ -1,4 +1,4 @@
-"""The report of a comparison says what the table says: words that can be checked, every log, what failed. It overwrites nothing else."""
+"""Report of a comparison: summary, every log, failures; it overwrites only reports."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from localization.comparison.page import CompareHead, comparison_page, write_comparison_report
 from localization.comparison.summary import closing, find, headline
 from localization.errors import OutputError
-from tests.report.test_replay_page import Text
+from tests.helpers.report import PageText
 
 HEAD = CompareHead("vaultbot", "/ground_truth/odom", "table.csv", {"skidloc": "0.1.0"})
 LOGS = [f"runs/drive_{i}.mcap" for i in range(20)]
@@ -22,8 +22,8 @@ def rows(values, metric="ate_rmse_m", corrections="constant"):
     for (model, estimator), numbers in values.items():
         form = corrections if estimator in ("ekf", "graph") else ""
         for log, value in zip(LOGS, numbers, strict=False):
-            said = {"status": "ok", "error": ""} if value is not None else {"status": "failed", "error": f"{log} is broken"}
-            found.append({"log": log, "robot": "vaultbot", "model": model, "estimator": estimator, "corrections": form, "key": "k", **said})
+            end = {"status": "ok", "error": ""} if value is not None else {"status": "failed", "error": f"{log} is broken"}
+            found.append({"log": log, "robot": "vaultbot", "model": model, "estimator": estimator, "corrections": form, "key": "k", **end})
             found[-1][metric] = value
     return found
 
@@ -32,14 +32,14 @@ HARD = np.array([0.5, 1.0, 2.0, 4.0, 0.7, 1.5, 3.0, 0.9])
 BETTER, WORSE = ("skid_steer", "ekf"), ("diff_drive", "ekf")
 
 
-def told(values, metric="ate_rmse_m"):
+def summary_of(values, metric="ate_rmse_m"):
     found = find(rows(values, metric), metric)
     return headline(found), closing(found)
 
 
-def test_the_verdict_counts_wins_and_weighs_the_gain_by_the_means():
+def test_summary_counts_wins_and_gain_of_the_means():
     factors = np.array([0.8, 0.9, 0.85, 0.9, 0.95, 0.9, 0.85, 1.02])  # worse on the last log, little
-    first, rest = told({WORSE: HARD, BETTER: HARD * factors})
+    first, rest = summary_of({WORSE: HARD, BETTER: HARD * factors})
     gain = 100.0 * (1.0 - (HARD * factors).sum() / HARD.sum())
     numbers = re.fullmatch(
         r"ekf with skid_steer beats ekf with diff_drive on 7 of 8 logs, by (\d+) % \[(\d+), (\d+)\] of position error \(ATE\), "
@@ -53,7 +53,7 @@ def test_the_verdict_counts_wins_and_weighs_the_gain_by_the_means():
     assert rest == ["Use ekf with skid_steer."]
 
 
-def test_intervals_of_the_gain_cover_the_truth():
+def test_gain_intervals_cover_the_true_gain():
     rng = np.random.default_rng(11)
     hits = 0
     for _ in range(100):
@@ -63,24 +63,24 @@ def test_intervals_of_the_gain_cover_the_truth():
     assert 84 <= hits <= 99
 
 
-def test_what_is_not_shown_is_not_claimed():
+def test_summary_without_significance_claims_nothing():
     noise = np.array([1.1, 0.9, 1.05, 0.93, 1.02, 0.97, 1.0, 1.01])
-    first, rest = told({WORSE: HARD, BETTER: HARD * noise})
+    first, rest = summary_of({WORSE: HARD, BETTER: HARD * noise})
     assert "is not significant" in first
     assert rest == ["No difference is significant on these logs: take the simplest, or record more drives."]
-    first, rest = told({WORSE: HARD[:4], BETTER: 0.5 * HARD[:4]})  # clear, but on four logs only
+    first, rest = summary_of({WORSE: HARD[:4], BETTER: 0.5 * HARD[:4]})  # clear, but on four logs only
     assert "is not significant: the first is better on 4 of 4 logs" in first
     assert rest == ["4 logs cannot show it: p is at least 0.12 for one pair. Take at least 6."]
-    first, rest = told({WORSE: HARD})
+    first, rest = summary_of({WORSE: HARD})
     assert first.startswith("ekf with diff_drive: mean position error (ATE) 1.7 [")
     assert "over 8 logs" in first
-    first, _ = told({WORSE: HARD[:1], BETTER: HARD[:1] * 0.5})
+    first, _ = summary_of({WORSE: HARD[:1], BETTER: HARD[:1] * 0.5})
     assert "share fewer than two logs" in first
 
 
-def test_the_simpler_of_two_equals_is_named_beside_the_best():
+def test_summary_of_two_equals_names_the_simpler_beside_the_best():
     equal = HARD * np.array([0.52, 0.49, 0.5, 0.48, 0.5, 0.49, 0.51, 0.52])
-    _, rest = told({("diff_drive", "odometry"): 5.0 * HARD, WORSE: 0.5 * HARD, BETTER: equal})
+    _, rest = summary_of({("diff_drive", "odometry"): 5.0 * HARD, WORSE: 0.5 * HARD, BETTER: equal})
     assert rest == ["Use ekf with skid_steer; it is not significantly better than ekf with diff_drive on these logs."]
 
 
@@ -99,11 +99,11 @@ def cases():
 
 
 @pytest.mark.parametrize("case", list(cases()))
-def test_page_is_well_formed_loads_nothing_and_begins_with_the_verdict(case):
+def test_page_is_well_formed_loads_nothing_and_starts_with_the_summary(case):
     found = find(rows(cases()[case]), "ate_rmse_m")
     made = comparison_page(HEAD, found)
     assert made == comparison_page(HEAD, found)
-    text = Text(made)
+    text = PageText(made)
     assert not re.search(r"https?://|xlink|url\((?!#)|@import|\son\w+=", made)
     assert not [tag for tag, _ in text.tags if tag in ("script", "link", "iframe", "object")]
     ids = [attributes["id"] for _, attributes in text.tags if "id" in attributes]
@@ -115,9 +115,9 @@ def test_page_is_well_formed_loads_nothing_and_begins_with_the_verdict(case):
     assert made.count(">position error (ATE) [m]<") == 1
 
 
-def test_every_log_and_every_failure_is_there():
+def test_page_lists_every_log_and_failure():
     found = find(rows(cases()["failing"]), "ate_rmse_m")
-    text = Text(comparison_page(HEAD, found))
+    text = PageText(comparison_page(HEAD, found))
     by_log = {row[0]: row[1:] for row in text.tables[-1][1:]}
     assert list(by_log) == [f"drive_{i}.mcap" for i in range(8)]
     shown = [mean.name for mean in found.means]
@@ -130,7 +130,7 @@ def test_every_log_and_every_failure_is_there():
     assert "3 of 16 runs failed, on 2 logs." in words
 
 
-def test_text_from_outside_is_escaped():
+def test_page_escapes_text_of_the_logs():
     evil = "<script>alert('x')</script>&\"'"
     made = rows({(evil, "ekf"): [1.0, None], (evil, evil): [2.0, 3.0]})
     for row in made:
@@ -138,10 +138,10 @@ def test_text_from_outside_is_escaped():
         row["error"] = evil
     page = comparison_page(CompareHead(evil, evil, evil, {evil: evil}), find(made, "ate_rmse_m"))
     assert "<script" not in page
-    Text(page)
+    PageText(page)
 
 
-def test_only_a_report_of_a_comparison_is_written_over(tmp_path):
+def test_page_overwrites_only_a_report_of_a_comparison(tmp_path):
     path, found = tmp_path / "report.html", find(rows({WORSE: HARD, BETTER: 0.9 * HARD}), "ate_rmse_m")
     write_comparison_report(path, HEAD, found)
     assert path.read_text() == comparison_page(HEAD, found)

@@ -22,6 +22,7 @@ from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import WheelNoise, load_robot
 from motion_models.se2 import between, log
+from tests.helpers.motion_models import assert_one_agrees, differences, some_drive, some_params
 from tests.helpers.synthetic_steps import (
     DT,
     Noise,
@@ -37,7 +38,6 @@ from tests.helpers.synthetic_steps import (
     straight,
     weave,
 )
-from tests.motion_models.test_model_laws import assert_one_agrees, differences, some_drive, some_params
 
 ROBOT = load_robot("vaultbot")
 OFFSET = "mu_ratio+cg_offset_x+cg_offset_y"
@@ -55,7 +55,7 @@ def corrected_friction():
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=25, deadline=None)
-def test_its_derivatives_are_those_of_differences(seed):
+def test_friction_correction_derivatives_equal_differences(seed):
     rng = np.random.default_rng(seed)
     model = corrected_friction()
     params = some_params(model, rng)
@@ -70,7 +70,7 @@ def test_its_derivatives_are_those_of_differences(seed):
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=25, deadline=None)
-def test_derivatives_of_a_whole_motion_too(seed):
+def test_friction_motion_derivatives_equal_differences(seed):
     """What filter and graph are given: the preintegrated motion, as a right perturbation."""
     rng = np.random.default_rng(seed)
     model = corrected_friction()
@@ -88,7 +88,7 @@ def test_derivatives_of_a_whole_motion_too(seed):
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=25, deadline=None)
-def test_an_offset_is_a_cg_that_is_elsewhere(seed):
+def test_cg_offset_equals_cg_moved_by_it(seed):
     rng = np.random.default_rng(seed)
     model, inner = corrected_friction(), make_model("friction", ROBOT)
     wheels, cg = some_drive(rng, 5)
@@ -102,7 +102,7 @@ def test_an_offset_is_a_cg_that_is_elsewhere(seed):
 
 
 @pytest.mark.parametrize(("name", "value"), [("mu_ratio", -0.4), ("cg_offset_x", 0.6), ("cg_offset_y", -3.0)])
-def test_a_belief_where_no_robot_is_moves_as_one_at_the_edge_and_nothing_there_teaches(name, value):
+def test_cg_offset_beyond_wheels_is_clamped_without_derivative(name, value):
     model = corrected_friction()
     i = model.param_names.index(name)
     params, further = model.nominal, model.nominal
@@ -114,7 +114,7 @@ def test_a_belief_where_no_robot_is_moves_as_one_at_the_edge_and_nothing_there_t
     np.testing.assert_array_equal(twist.value, model.twist(wheels, cg, further).value)
 
 
-def test_a_cg_that_is_said_to_be_outside_is_still_refused():
+def test_measured_cg_outside_wheels_is_refused():
     model = corrected_friction()
     with pytest.raises(CgError, match="tips over"):
         model.twist(np.array([1.0, 2.0]), np.array([0.4, 0.0]), model.nominal)
@@ -125,7 +125,7 @@ def test_a_cg_that_is_said_to_be_outside_is_still_refused():
 # --- switched on by name
 
 
-def test_names_say_what_is_learned_and_in_which_order():
+def test_corrections_by_name_keep_their_order():
     model = correctable(make_model("friction", ROBOT), ALL)
     assert corrections(model, "constant").names == ("mu_ratio", "tracked_x", "tracked_y")
     assert corrections(model, ALL).names == ("mu_ratio", "tracked_x", "tracked_y", "warp", "cg_offset_x", "cg_offset_y")
@@ -138,12 +138,12 @@ def test_names_say_what_is_learned_and_in_which_order():
 
 
 @pytest.mark.parametrize("form", ["", "+", "cg_offset", "constant+none", "cg_field+warp", "mu_ratio+", "constant+constant+x"])
-def test_forms_that_do_not_exist_are_refused(form):
+def test_corrections_of_unknown_form_are_refused(form):
     with pytest.raises(ModelError, match="cg_offset_x"):
         check_forms([form])
 
 
-def test_what_a_model_does_not_have_is_refused():
+def test_corrections_of_missing_parameter_are_refused():
     with pytest.raises(ModelError, match="wheel_separation_multiplier"):
         corrections(make_model("diff_drive", ROBOT), "warp")
     with pytest.raises(ModelError, match="correctable"):
@@ -152,13 +152,13 @@ def test_what_a_model_does_not_have_is_refused():
         Pipeline(Trial(make_model("icr", ROBOT), "ekf", "warp"), ROBOT, {}, True)
 
 
-def test_pair_gives_synchronizer_and_filter_the_same_parameters():
+def test_pipeline_gives_synchronizer_the_filters_parameters():
     pipeline = Pipeline(Trial(make_model("friction", ROBOT), "ekf", OFFSET), ROBOT, {}, True)
-    assert isinstance(pipeline.synchronizer._model, CorrectedFriction)
-    np.testing.assert_array_equal(pipeline.synchronizer._params, pipeline.estimator.params)
+    assert isinstance(pipeline.synchronizer.model, CorrectedFriction)
+    np.testing.assert_array_equal(pipeline.synchronizer.params, pipeline.estimator.params)
     assert set(OFFSET.split("+")) <= set(pipeline.estimator.parameters())
     plain = Pipeline(Trial(make_model("friction", ROBOT), "ekf", "none"), ROBOT, {}, True)
-    assert isinstance(plain.synchronizer._model, FrictionModel)
+    assert isinstance(plain.synchronizer.model, FrictionModel)
 
 
 # --- learned where the motion shows it
@@ -178,10 +178,10 @@ def learned(form, hidden, seed, wheels=weave, steps=150):
         pass
     slow, P = slow_states(estimator)
     k = len(hidden)
-    return world.correction - slow[-k:], P[-k:, -k:], estimator._corrections.sigmas
+    return world.correction - slow[-k:], P[-k:, -k:], estimator.corrections.sigmas
 
 
-def test_hidden_offset_of_the_cg_is_learned_within_its_sigma():
+def test_cg_offset_of_hidden_load_is_estimated_within_sigma():
     """Twelve drives, the CG 4 cm ahead and 2 cm to the right of where its message has it, with a floor of another grip."""
     hidden = np.array([0.15, 0.04, -0.02])
     found = [learned(OFFSET, hidden, seed) for seed in range(12)]
@@ -197,7 +197,7 @@ def test_hidden_offset_of_the_cg_is_learned_within_its_sigma():
     assert (np.abs(errors.mean(axis=0)) < 0.3 * np.abs(hidden)).all()  # nowhere near the prior's 0
 
 
-def test_straight_motion_shows_nothing_of_the_physics():
+def test_corrections_on_straight_motion_keep_their_prior():
     error, cov, first = learned(ALL, np.zeros(6), 0, straight)
     sigmas = np.sqrt(np.diag(cov))
     np.testing.assert_allclose(sigmas, first, rtol=0.01)  # they walk a little
@@ -205,7 +205,7 @@ def test_straight_motion_shows_nothing_of_the_physics():
     assert (np.abs(error) < 0.01 * first + 3.0 * first * math.sqrt(15.0 / 3600.0)).all()  # it is the truth that walked
 
 
-def test_wheels_that_differ_by_their_noise_alone_teach_nothing():
+def test_corrections_with_wheel_noise_alone_keep_their_prior():
     """Nearly straight: derivatives there are of noise. The LiDAR measures a turn that no wheel made, over and over."""
     sensor = PoseSensor()
     estimator = make_physical(sensor, ALL, Noise())
@@ -217,17 +217,17 @@ def test_wheels_that_differ_by_their_noise_alone_teach_nothing():
         sensor.next = match_at(pose, np.diag([0.005, 0.005, 0.001]) ** 2)
         estimator.step(step)
     slow, P = slow_states(estimator)
-    first = estimator._corrections.sigmas
+    first = estimator.corrections.sigmas
     assert (np.sqrt(np.diag(P)[-6:]) > 0.99 * first).all()
     assert (np.abs(slow[-6:]) < 0.1 * first).all()
 
 
-def test_lidar_that_no_parameters_explain_does_not_end_the_run():
+def test_corrections_with_unexplained_lidar_finish_the_run():
     """Motions that no offset and no grip explains: the parameters go where no robot is, the estimate goes on."""
     sensor = PoseSensor()
     estimator = make_physical(sensor, ALL, Noise().scaled(0.1))
     world, rng, stamp, pose = make_world(estimator, 0), np.random.default_rng(1), 0, np.zeros(3)
-    model = estimator._model
+    model = estimator.model
     none = Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, 14)))
     estimator.step(Step(0, 0, none, np.zeros(3), np.zeros(3), False, True, None, None))
     for _ in range(80):
@@ -235,7 +235,7 @@ def test_lidar_that_no_parameters_explain_does_not_end_the_run():
         motion = preintegrate(model, dt, wheels, np.array([CG]), estimator.params, WheelNoise())
         pose = se2.compose(pose, motion.delta * [0.0, 0.0, 3.0] + [0.2, -0.2, 0.0] + 0.01 * rng.normal(size=3))
         sensor.next = match_at(pose, 1e-6 * np.eye(3))
-        scan = world._scan(stamp + 100_000_000)
+        scan = world.scan_at(stamp + 100_000_000)
         estimate = estimator.step(Step(stamp, stamp + 100_000_000, motion, np.zeros(3), np.zeros(3), False, True, None, scan))
         stamp += 100_000_000
         assert np.isfinite(estimate.pose).all()
@@ -247,11 +247,11 @@ def test_lidar_that_no_parameters_explain_does_not_end_the_run():
 
 @pytest.mark.parametrize("form", ["constant", "cg_field"])
 @pytest.mark.parametrize("name", MODELS)
-def test_every_model_learns_in_every_form(name, form):
+def test_corrections_of_every_model_and_form_reduce_error(name, form):
     """What a drive both ways shows is known better than at first, and is where the truth is."""
     sensor = PoseSensor()
     estimator = make_filter(sensor, name, form)
-    names, sigmas = estimator._corrections.names, estimator._corrections.sigmas
+    names, sigmas = estimator.corrections.names, estimator.corrections.sigmas
     assert names
     run(estimator, sensor, 3, 100)
     found = estimator.parameters()
@@ -261,13 +261,13 @@ def test_every_model_learns_in_every_form(name, form):
     assert np.isfinite(estimator.params).all()
 
 
-def test_gentle_arcs_do_not_teach_what_was_measured_on_turns():
+def test_corrections_on_gentle_arcs_keep_what_turns_gave():
     sigmas = {}
     for turning in (0.2, 2.5):
         sensor = PoseSensor()
         estimator = make_filter(sensor)
         run(estimator, sensor, 2, 60, wheels=lambda t: (5.0 - turning, 5.0 + turning))  # noqa: B023
-        sigmas[turning] = estimator.parameters()["k_0"][1] / estimator._corrections.sigmas[0]
+        sigmas[turning] = estimator.parameters()["k_0"][1] / estimator.corrections.sigmas[0]
     assert sigmas[0.2] > 0.99
     assert sigmas[2.5] < 0.7
 
@@ -286,7 +286,7 @@ def consistency():
 
 
 @pytest.mark.parametrize("level", range(len(LEVELS)))
-def test_nees_is_in_its_band_at_every_level_of_noise(consistency, level):
+def test_corrections_nees_at_each_noise_level_is_in_band(consistency, level):
     """Twelve means of pose, parameters and all: the band holds all of them together with 95 %."""
     values, _, dof = consistency
     for part, d in enumerate(dof):
@@ -294,7 +294,7 @@ def test_nees_is_in_its_band_at_every_level_of_noise(consistency, level):
         assert low < values[level, :, part].mean() < high
 
 
-def test_nees_over_all_levels_is_in_its_band(consistency):
+def test_corrections_nees_over_all_levels_is_in_band(consistency):
     values, inside, dof = consistency
     for part, d in enumerate(dof):
         low, high = mean_band(SEEDS * len(LEVELS), d, 1.0 - 0.05 / 3)
@@ -321,7 +321,7 @@ def round_trip(form, seed):
     """
     sensor, quiet = PoseSensor(), Noise().scaled(0.3)
     estimator = make_filter(sensor, "skid_steer", form, quiet)
-    model, field = estimator._model, corrections(estimator._model, "cg_field")
+    model, field = estimator.model, corrections(estimator.model, "cg_field")
     world = World(model, field, quiet, np.random.default_rng(seed), True, FilterConfig(), cg=posture)
     odometry, start, drifts, scalings = np.zeros(3), np.zeros(3), [], []
     estimator.step(world.first())
@@ -341,7 +341,7 @@ def round_trip(form, seed):
     return np.array(drifts), np.stack([each[:, :3].mean(axis=1), each[:, -3:].mean(axis=1)], axis=1)
 
 
-def test_corrections_of_a_posture_are_there_when_the_arms_return():
+def test_cg_field_of_a_posture_returns_with_the_posture():
     found = {form: [round_trip(form, seed) for seed in range(5)] for form in ("constant", "cg_field")}
     drift = {form: np.array([d for d, _ in runs])[:, 3:] for form, runs in found.items()}
     metres = {form: np.hypot(d[..., 0], d[..., 1]).mean() for form, d in drift.items()}

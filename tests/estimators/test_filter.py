@@ -93,7 +93,7 @@ def random_covariance(rng, scale=1e-3):
 # --- prediction
 
 
-def test_predict_moves_the_covariance_along_the_derivatives_of_the_motion():
+def test_predict_propagates_covariance_by_motion_derivatives():
     """F by differences: the error that a wrong pose, clock or parameter leaves after a step that the synchronizer cuts with it."""
     h, config = 1e-5, FilterConfig(clock_walk_s_per_sqrt_s=0.0)
     rng = np.random.default_rng(0)
@@ -129,7 +129,7 @@ def test_predict_moves_the_covariance_along_the_derivatives_of_the_motion():
         np.testing.assert_array_equal(ekf.start, pose)
 
 
-def test_drift_without_measurements_grows_as_dead_reckoning_has_it():
+def test_predict_without_updates_equals_dead_reckoning():
     ekf, cov = filter_at(config=FilterConfig(clock_sigma_s=0.0)), np.zeros((3, 3))
     ekf.P[PARAMS:, PARAMS:] = 0.0
     for step in winding_steps(10.0):
@@ -141,7 +141,7 @@ def test_drift_without_measurements_grows_as_dead_reckoning_has_it():
 
 
 @pytest.mark.parametrize("clone", [START, KEY])
-def test_motion_since_a_clone_has_the_covariance_of_its_derivatives(clone):
+def test_motion_since_clone_has_first_order_covariance(clone):
     rng = np.random.default_rng(1)
     ekf = filter_at(rng.normal(size=3))
     ekf.start, ekf.key, ekf.P = rng.normal(size=3), rng.normal(size=3), random_covariance(rng)
@@ -173,7 +173,7 @@ def test_start_key_clones_the_pose():
     np.testing.assert_array_equal(ekf.P[np.ix_(others, others)], before[np.ix_(others, others)])
 
 
-def test_drift_since_key_of_wheels_alone_is_the_motions_covariance():
+def test_drift_since_key_of_wheels_alone_equals_motion_cov():
     ekf, rng = filter_at(np.array([1.0, 2.0, 0.3])), np.random.default_rng(0)
     ekf.P = np.zeros_like(ekf.P)
     ekf.P[POSE, POSE] = np.diag([0.1, 0.2, 0.05]) ** 2
@@ -209,9 +209,9 @@ def states(ekf):
     return np.concatenate([ekf.pose, ekf.start, ekf.key, [ekf.bias, ekf.scale, ekf.clock_offset], ekf.corrections])
 
 
-def test_update_is_filterpys_where_no_state_is_a_consider_state():
+def test_update_without_consider_states_equals_filterpy():
     ekf, measured = prepared(0)
-    ekf._consider[:] = False
+    ekf.is_considered[:] = False
     H = np.zeros((3, SIZE))
     H[:, POSE], H[:, MAP] = np.eye(3), -np.eye(3)
     other = KalmanFilter(SIZE, 3)
@@ -228,7 +228,7 @@ def test_update_is_filterpys_where_no_state_is_a_consider_state():
     np.testing.assert_allclose(ekf.corrections, error[PARAMS:], atol=1e-15)
 
 
-def test_update_of_consider_states_is_schmidts():
+def test_update_with_consider_states_equals_schmidt():
     """By his partitioned formulas (Schmidt 1966): no gain, the same covariance, correlations that shrink."""
     ekf, measured = prepared(1)
     P, innovation = ekf.P.copy(), se2.log(se2.between(ekf.pose, measured))
@@ -249,7 +249,7 @@ def test_update_of_consider_states_is_schmidts():
 
 
 @pytest.mark.parametrize("is_turning", [True, False])
-def test_corrections_have_no_gain_where_the_motion_does_not_turn(is_turning):
+def test_update_without_turning_leaves_corrections(is_turning):
     ekf, _ = prepared(2)
     ekf.predict(step_of([0.1, 0.0, 0.01]), is_turning)
     before, P = ekf.corrections.copy(), ekf.P[PARAMS:, PARAMS:].copy()
@@ -259,7 +259,7 @@ def test_corrections_have_no_gain_where_the_motion_does_not_turn(is_turning):
     assert np.allclose(ekf.P[PARAMS:, PARAMS:], P, rtol=1e-9) == (not is_turning)
 
 
-def test_turn_updates_like_a_scalar_kalman_filter():
+def test_update_turn_equals_scalar_kalman_filter():
     ekf, _ = prepared(3)
     ekf.start = se2.compose(ekf.pose, np.array([-0.1, 0.0, -0.3]))
     P, turn = ekf.P.copy(), Turn(0.301, 1e-6, 0.1)
@@ -277,7 +277,7 @@ def test_turn_updates_like_a_scalar_kalman_filter():
     assert nis == pytest.approx(0.001**2 / S)
 
 
-def test_outlier_covariance_widens_the_pose_before_the_update():
+def test_update_scan_with_outlier_cov_widens_pose_first():
     wide, (plain, measured) = prepared(4)[0], prepared(4)
     outlier = np.diag([0.1, 0.1, 0.05]) ** 2
     wide.P[POSE, POSE] += outlier
@@ -299,7 +299,7 @@ def assert_scatter(errors, P):
 
 
 @pytest.mark.parametrize("is_matched", [True, False])
-def test_covariance_is_the_scatter_of_errors_by_monte_carlo(is_matched):
+def test_covariance_equals_monte_carlo_scatter(is_matched):
     """Errors drawn, updated with the gain and put into the submap, e_map' = (1 - s) e_map + s (e_pose - W n) + m, one by one."""
     ekf, measured = prepared(5)
     rng = np.random.default_rng(0)
@@ -320,14 +320,14 @@ def test_covariance_is_the_scatter_of_errors_by_monte_carlo(is_matched):
     assert_scatter(e, ekf.P)
 
 
-def test_map_relative_covariance_is_that_of_the_difference():
+def test_map_relative_cov_equals_cov_of_difference():
     ekf, _ = prepared(6)
     J = np.zeros((3, SIZE))
     J[:, POSE], J[:, MAP] = np.eye(3), -np.eye(3)
     np.testing.assert_allclose(ekf.map_relative_cov(), J @ ekf.P @ J.T, rtol=1e-9)
 
 
-def test_first_key_scan_makes_the_map_err_as_the_pose():
+def test_insert_key_scan_of_first_gives_map_the_pose_error():
     """Drawn where the robot is, an error of the pose is one of the submap: against it, the pose is known but for the scan's noise."""
     ekf, _ = prepared(7)
     ekf.P[MAP], ekf.P[:, MAP] = 0.0, 0.0
@@ -345,7 +345,7 @@ def check_covariance(P):
     assert np.linalg.eigvalsh(P / np.outer(scale, scale)).min() > -1e-9
 
 
-def test_covariance_stays_one_over_thousands_of_random_steps():
+def test_covariance_over_random_steps_stays_positive():
     rng = np.random.default_rng(3)
     ekf, drives = filter_at(), winding_steps(20.0)
     for i in range(4000):
@@ -370,7 +370,7 @@ def test_covariance_stays_one_over_thousands_of_random_steps():
 # --- standing still
 
 
-def test_standing_freezes_the_pose_and_shows_the_gyros_bias():
+def test_predict_standing_keeps_pose_and_shows_gyro_bias():
     rng, bias = np.random.default_rng(5), 8e-4
     ekf = filter_at()
     for step in winding_steps(5.0):
@@ -391,7 +391,7 @@ def test_standing_freezes_the_pose_and_shows_the_gyros_bias():
     assert np.trace(ekf.P[POSE, POSE]) < 1.05 * np.trace(wide)
 
 
-def test_standing_estimates_nothing_of_the_model():
+def test_predict_standing_keeps_corrections():
     ekf = filter_at()
     before = ekf.P[PARAMS:, PARAMS:].copy()
     for step in standing(20.0):
@@ -457,7 +457,7 @@ PARTS = {
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_nees_is_inside_its_band(worlds, part):
+def test_filter_nees_is_in_band(worlds, part):
     """Every part of the state, at the end of 15 s, over independent seeds; 99.8 % band, so that seven of them hold together."""
     of = np.array(PARTS[part])
     at = [i if i < 3 else 3 + i - BIAS for i in of]  # where the part stands in the vector of errors
@@ -467,7 +467,7 @@ def test_nees_is_inside_its_band(worlds, part):
     assert np.mean(np.array(values) < chi2.ppf(0.95, len(of))) > 0.85
 
 
-def test_nis_is_inside_its_band(worlds):
+def test_filter_nis_is_in_band(worlds):
     lidar, gyro = (np.concatenate([w[i] for w in worlds]) for i in (2, 3))
     for values, dof in ((lidar, 3), (gyro, 1)):
         low, high = mean_band(len(values), dof, 0.998)
@@ -475,7 +475,7 @@ def test_nis_is_inside_its_band(worlds):
     assert np.mean(lidar > chi2.ppf(0.95, 3)) == pytest.approx(0.05, abs=0.012)
 
 
-def test_calibration_states_are_learned(worlds):
+def test_filter_estimates_calibration_states(worlds):
     """What began at sigma is known several times better; the clock's sign is part of its error above."""
     for index, sigma, share in (
         (CLOCK, FilterConfig().clock_sigma_s, 0.3),
@@ -487,7 +487,7 @@ def test_calibration_states_are_learned(worlds):
         assert np.mean([math.sqrt(P[index, index]) for _, P, *_ in worlds]) < share * sigma
 
 
-def test_innovations_are_white(worlds):
+def test_filter_innovations_are_white(worlds):
     rhos = [lag1_whiteness(w[4], np.broadcast_to(np.cov(w[4].T), (len(w[4]), 3, 3))).lag1 for w in worlds]
     n = len(worlds[0][4])
     assert abs(np.mean(rhos)) < 4.0 / math.sqrt(3 * n * SEEDS) + 2.0 / n
@@ -501,7 +501,7 @@ HOSTILE = st.sampled_from([math.nan, math.inf, -math.inf, 1e300, -1e300, 1e150, 
 
 @given(st.data())
 @settings(max_examples=150, deadline=None)
-def test_no_input_makes_the_state_non_finite(data):
+def test_filter_with_any_input_stays_finite(data):
     def draw(*shape):
         return np.array(data.draw(st.lists(HOSTILE, min_size=int(np.prod(shape)), max_size=int(np.prod(shape))))).reshape(shape)
 
@@ -522,7 +522,7 @@ def test_no_input_makes_the_state_non_finite(data):
             assert np.isfinite(part).all()
 
 
-def test_motion_that_is_not_finite_is_refused_with_its_stamp():
+def test_predict_of_infinite_motion_is_refused_with_stamp():
     ekf = filter_at()
     with pytest.raises(EstimatorError, match=f"the motion of the wheels until stamp {T0 + S // 10} ns"):
         ekf.predict(step_of([np.nan, 0.0, 0.0]))

@@ -76,7 +76,7 @@ def driven() -> rooms.Drive:
 
 
 @pytest.mark.parametrize("walls", [pytest.param(LAB), HALL])
-def test_errors_in_rooms_are_millimetres(walls: np.ndarray) -> None:
+def test_ekf_in_rooms_errs_by_millimetres(walls: np.ndarray) -> None:
     """Also where wheels slip by a fifth of their turning, changing twice a second. Root mean square of three drives."""
     for noise, most_rad in ((NO_SLIP, math.radians(0.03)), (WheelNoise(), math.radians(0.05))):
         drives = [rooms.drive_through(walls, TOUR, seed, noise=noise) for seed in (1, 2, 3)]
@@ -87,7 +87,7 @@ def test_errors_in_rooms_are_millimetres(walls: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("walls", [LAB, HALL])
-def test_nees_of_poses_in_rooms_is_that_of_their_covariances(walls: np.ndarray) -> None:
+def test_ekf_in_rooms_has_consistent_nees(walls: np.ndarray) -> None:
     """Eight drives of 10 s but for the first two seconds; errors of one drive are correlated, so the band is that of eight drives."""
     few, means = rooms.Beams(beams=240, rate_hz=6.25), []
     for seed in range(8):
@@ -101,7 +101,7 @@ def test_nees_of_poses_in_rooms_is_that_of_their_covariances(walls: np.ndarray) 
 
 @pytest.mark.parametrize("offset_s", [0.06, -0.06])
 @pytest.mark.parametrize("wheel_every", [1, 4])
-def test_clock_offset_is_learned(offset_s: float, wheel_every: int) -> None:
+def test_ekf_with_shifted_wheels_estimates_clock_offset(offset_s: float, wheel_every: int) -> None:
     """What happened at t bears t + offset in the wheels' stamps; with 50 samples a second, and with one per scan."""
     scanner = rooms.Beams(beams=240)
     drive = rooms.drive_through(LAB, rooms.path(*[(1.5, 0.4, 0.5), (1.5, 0.1, -0.6)] * 7), 0, scanner=scanner)
@@ -113,7 +113,7 @@ def test_clock_offset_is_learned(offset_s: float, wheel_every: int) -> None:
     assert abs(mean - offset_s) < max(4.0 * sigma, 0.01)
 
 
-def test_deskewing_by_the_filters_twist_follows_slip() -> None:
+def test_ekf_with_beam_times_follows_slip() -> None:
     drive = rooms.drive_through(LAB, TOUR, 0)
     scans = [replace(scan, stamp_ns=scan.middle_ns, offsets=np.empty(0)) for scan in scans_of(drive)]
     wheels = [e for e in drive.events if not isinstance(e, Scan)]
@@ -126,7 +126,7 @@ def test_deskewing_by_the_filters_twist_follows_slip() -> None:
 # --- scenes that leave directions open
 
 
-def test_bare_corridor_is_as_long_as_the_wheels_measure() -> None:
+def test_ekf_in_bare_corridor_keeps_the_wheels_length() -> None:
     noise = WheelNoise(lateral_m2_per_m=1e-6, yaw_rad2_per_m=1e-5)
     drive = rooms.drive_through(CORRIDOR, rooms.path((1, 0, 0), (30, 0.5, 0.0), (1, 0, 0)), 0, (0.0, 0.1, 0.02), noise=noise)
     runs = rooms.results(drive, "lidar", "ekf")
@@ -143,7 +143,7 @@ def test_bare_corridor_is_as_long_as_the_wheels_measure() -> None:
 # --- wheels that contradict
 
 
-def test_wheels_that_spin_on_the_spot_do_no_harm() -> None:
+def test_ekf_with_spinning_wheels_follows_lidar() -> None:
     def spinning(t: np.ndarray, twists: np.ndarray) -> np.ndarray:
         return twists + np.where((t > 6) & (t < 10), 0.5, 0.0)[:, None] * [1.0, 0.0, 0.0]
 
@@ -155,7 +155,7 @@ def test_wheels_that_spin_on_the_spot_do_no_harm() -> None:
     assert off["ekf"] < 0.02
 
 
-def test_encoders_that_read_zero_while_the_robot_moves_are_overruled() -> None:
+def test_ekf_with_encoders_at_zero_follows_lidar() -> None:
     def stuck(t: np.ndarray, twists: np.ndarray) -> np.ndarray:
         return twists * np.where((t > 5) & (t < 9), 0.0, 1.0)[:, None]
 
@@ -167,7 +167,20 @@ def test_encoders_that_read_zero_while_the_robot_moves_are_overruled() -> None:
     assert np.hypot(*(poses - drive.poses)[:, :2].T).max() < 0.1
 
 
-def test_gap_of_8_s_stays_inside_five_sigma() -> None:
+def test_ekf_with_wheels_that_stall_and_catch_up_loses_no_scan() -> None:
+    """A driver that repeats its odometry for 0.6 s, and then publishes all of the motion at once, while the robot drives and turns fast."""
+
+    def stalled(t: np.ndarray, twists: np.ndarray) -> np.ndarray:
+        return twists * np.where((t > 5.0) & (t < 5.6), 0.0, np.where((t > 5.6) & (t < 5.8), 4.0, 1.0))[:, None]
+
+    scanner = rooms.Beams(beams=361, view=math.pi, rate_hz=5.0, fill=0.0)
+    drive = rooms.drive_through(HALL, rooms.path((1, 0, 0), (7, 0.8, 0.9), (1, 0, 0)), 0, scanner=scanner, wheels=stalled)
+    result = ekf(drive)
+    assert result.counts["matched"] == result.counts["scans"] - 1
+    assert rooms.ate(drive, rooms.at_scans(drive, result)[0]) < 0.02
+
+
+def test_ekf_after_gap_of_8_s_is_within_5_sigma() -> None:
     """Neither wheels nor scans while the robot drives on: the covariance says so, and the submap is found again."""
     drive = rooms.drive_through(HALL, rooms.path((1, 0, 0), (6, 0.4, 0.2), (8, 0.4, -0.2), (6, 0.3, 0.3), (1, 0, 0)), 0)
     begin, end = rooms.WALL_START_NS + 6 * S, rooms.WALL_START_NS + 14 * S
@@ -185,7 +198,7 @@ def test_gap_of_8_s_stays_inside_five_sigma() -> None:
 # --- spoilt scans
 
 
-def test_frozen_scanner_is_found_out(driven: rooms.Drive) -> None:
+def test_ekf_with_frozen_scanner_counts_stale_scans(driven: rooms.Drive) -> None:
     frozen = scans_of(driven)[SPOILT.start]
     estimates, pipeline = run(driven, lambda k, s: replace(s, points=frozen.points, offsets=frozen.offsets) if k in SPOILT else s)
     assert pipeline.estimator.counts()["stale"] == len(SPOILT) - 1
@@ -196,7 +209,7 @@ def test_frozen_scanner_is_found_out(driven: rooms.Drive) -> None:
     assert f"{len(SPOILT) - 1} repeated the ranges of the scan before" in note
 
 
-def test_scanner_that_froze_on_the_way_stays_stale_at_rest() -> None:
+def test_ekf_with_scanner_frozen_before_rest_stays_stale() -> None:
     drive = rooms.drive_through(LAB, rooms.path((1.5, 0.4, 0.2), (2.5, 0.0, 0.0), (1.5, 0.4, 0.2), (1.0, 0.0, 0.0)), 1)
     frozen = scans_of(drive)[8]
     estimates, pipeline = run(drive, lambda k, s: replace(s, points=frozen.points, offsets=frozen.offsets) if k > 8 else s)
@@ -206,7 +219,7 @@ def test_scanner_that_froze_on_the_way_stays_stale_at_rest() -> None:
     assert worst(drive, estimates, 0, len(drive.poses)) < 0.1  # by wheels
 
 
-def test_equal_scans_of_a_robot_at_rest_are_matched() -> None:
+def test_ekf_with_equal_scans_at_rest_matches_them() -> None:
     """As in a simulator without noise."""
     drive = rooms.drive_through(LAB, rooms.path((1.0, 0.0, 0.0)), 1, scanner=rooms.Beams(noise=0.0))
     assert all(np.array_equal(scan.points, scans_of(drive)[0].points) for scan in scans_of(drive))
@@ -216,7 +229,7 @@ def test_equal_scans_of_a_robot_at_rest_are_matched() -> None:
     assert counts["matched"] == counts["scans"] - 1 == len(drive.stamps) - 1  # the first begins the submap
 
 
-def test_scans_that_jump_are_not_followed(driven: rooms.Drive) -> None:
+def test_ekf_with_jumping_scans_keeps_its_pose(driven: rooms.Drive) -> None:
     off = np.array([0.9, 0.4, 0.3])
 
     def jump(k: int, scan: Scan) -> Scan:
@@ -230,7 +243,7 @@ def test_scans_that_jump_are_not_followed(driven: rooms.Drive) -> None:
     assert max(np.hypot(*(at[int(driven.stamps[k])] - driven.poses[k])[:2]) for k in after if k > 64) < 0.03
 
 
-def test_robot_that_was_carried_is_found_again(driven: rooms.Drive) -> None:
+def test_ekf_of_carried_robot_finds_it_again(driven: rooms.Drive) -> None:
     """Half a second is cut out of a log: .2 m from one scan to the next, that no wheel measured."""
     at, gap = int(driven.stamps[60]) + 1, 480_000_000
     before: list[Event] = [e for e in driven.events if e.stamp_ns < at]
@@ -245,7 +258,7 @@ def test_robot_that_was_carried_is_found_again(driven: rooms.Drive) -> None:
     np.testing.assert_allclose(poses[-20:, :2], driven.poses[-20:, :2], atol=0.02)
 
 
-def test_without_scans_the_wheels_carry_on(driven: rooms.Drive) -> None:
+def test_ekf_without_scans_follows_wheels(driven: rooms.Drive) -> None:
     nothing = np.empty((0, 3))
     for spoil in (
         lambda k, s: None if k in SPOILT else s,
@@ -256,7 +269,7 @@ def test_without_scans_the_wheels_carry_on(driven: rooms.Drive) -> None:
         assert pipeline.estimator.counts()["matched"] >= len(driven.stamps) - len(SPOILT) - 2
 
 
-def test_scans_with_nothing_to_match_are_counted_as_sparse(driven: rooms.Drive) -> None:
+def test_ekf_with_few_points_counts_sparse_scans(driven: rooms.Drive) -> None:
     """Clouds of the floor alone, and a few points: neither is a scan without a point."""
     clouds = [rooms.cloud(LAB, np.zeros(3), k) for k in range(10)]
     floors = [
@@ -274,7 +287,7 @@ def test_scans_with_nothing_to_match_are_counted_as_sparse(driven: rooms.Drive) 
         assert "10 of 10 scans: 10 had too few points on walls" in note
 
 
-def test_scans_of_changing_size_are_matched(driven: rooms.Drive) -> None:
+def test_ekf_with_scans_of_changing_size_matches_them(driven: rooms.Drive) -> None:
     """All but the first, and one whose few points lie mostly in unmapped space: it is drawn at once."""
     rng = np.random.default_rng(0)
 
@@ -290,7 +303,7 @@ def test_scans_of_changing_size_are_matched(driven: rooms.Drive) -> None:
 # --- other sensors
 
 
-def test_two_lidars_are_fused() -> None:
+def test_ekf_with_two_lidars_uses_both() -> None:
     """Back to back, half a period apart: each in its own frame, one submap."""
     front = rooms.drive_through(LAB, TOUR[:4000], 3)
     back = rooms.drive_through(LAB, TOUR[:4000], 3, scanner=rooms.Beams(mount=Mount(x=-0.4, yaw=math.pi)))
@@ -303,7 +316,7 @@ def test_two_lidars_are_fused() -> None:
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.03])
-def test_clouds_give_poses_whose_errors_are_their_sigmas(tilt: float) -> None:
+def test_ekf_with_clouds_errs_by_centimetres(tilt: float) -> None:
     """The floor is most of a cloud and holds nothing; a robot that pitches by 2 degrees is still where it is."""
     pipeline, mounts = None, {"laser": Mount(z=0.8)}
     drive = rooms.drive_through(LAB, rooms.path((1.0, 0.0, 0.0), (4.0, 0.3, 0.2)), 0, noise=NO_SLIP)
@@ -321,14 +334,14 @@ def test_clouds_give_poses_whose_errors_are_their_sigmas(tilt: float) -> None:
     assert np.abs(errors[:, 2]).max() < 0.01
 
 
-def test_matcher_kiss_is_centimetres_off() -> None:
+def test_ekf_with_matcher_kiss_errs_by_centimetres() -> None:
     drive = rooms.drive_through(HALL, TOUR, 1)
     result = ekf(drive, matcher="kiss")
     assert result.counts["matched"] > 0.95 * result.counts["scans"]
     assert rooms.ate(drive, rooms.at_scans(drive, result)[0]) < 0.05
 
 
-def test_gyro_replaces_wheels_that_do_not_turn_as_they_should() -> None:
+def test_ekf_with_wrong_turns_of_wheels_follows_gyro() -> None:
     """Wheels that overstate turns by 60 %, and no LiDAR's help for half of the drive: bias and turns come from the gyro."""
     drive = rooms.drive_through(LAB, TOUR, 0, wheels=lambda t, twists: twists * [1.0, 1.0, 1.6])
     yaw = np.unwrap(drive.track[:, 2])
@@ -346,7 +359,20 @@ def test_gyro_replaces_wheels_that_do_not_turn_as_they_should() -> None:
     assert abs(mean - 5e-4) < 4.0 * sigma
 
 
-def test_drive_that_begins_in_motion_is_followed() -> None:
+def test_ekf_with_standing_wheels_and_turning_gyro_follows_gyro() -> None:
+    """A robot that is turned by hand, without a LiDAR."""
+    pipeline = make_pipeline(rooms.drive_through(LAB, TOUR[:50], 0))
+    for k in range(300):
+        stamp = rooms.WALL_START_NS + k * S // 50
+        pipeline.process(WheelSample(stamp, np.zeros(2), np.zeros(2)))
+        rate = 0.5 if k > 100 else 0.0
+        pipeline.process(ImuSample(stamp + 1, np.array([0.0, 0.0, rate]), np.array([0.0, 0.0, 9.81])))
+    last = pipeline.finish()[-1]
+    turned = 0.5 * (last.stamp_ns - rooms.WALL_START_NS - 2 * S) / S
+    assert last.pose[2] == pytest.approx(turned, abs=0.1)
+
+
+def test_ekf_beginning_in_motion_follows_the_drive() -> None:
     """The log starts while the robot turns: the first sweep is deskewed by the wheels' twist."""
     drive = rooms.drive_through(LAB, rooms.path((6.0, 0.5, 0.6)), 0)
     poses, _ = rooms.at_scans(drive, ekf(drive))
@@ -354,7 +380,7 @@ def test_drive_that_begins_in_motion_is_followed() -> None:
     assert rooms.ate(drive, poses) < 0.02
 
 
-def test_mount_that_is_late_begins_a_new_submap(driven: rooms.Drive) -> None:
+def test_ekf_with_late_mount_begins_a_new_submap(driven: rooms.Drive) -> None:
     """/tf_static comes after 2 s: scans before it were drawn at the body's origin, and must not be matched to those after."""
     pipeline, poses = make_pipeline(driven, {}), {}
     for event in driven.events:
@@ -368,7 +394,7 @@ def test_mount_that_is_late_begins_a_new_submap(driven: rooms.Drive) -> None:
     assert np.hypot(*moved[:, :2].T).max() < 0.02
 
 
-def test_input_that_is_not_finite_is_refused(driven: rooms.Drive) -> None:
+def test_ekf_with_infinite_input_is_refused(driven: rooms.Drive) -> None:
     pipeline = make_pipeline(driven)
     for event in driven.events[:100]:
         pipeline.process(event)
@@ -377,7 +403,7 @@ def test_input_that_is_not_finite_is_refused(driven: rooms.Drive) -> None:
         list(map(pipeline.process, [*leaps, *scans_of(driven)[20:40]]))
 
 
-def test_lidar_that_dies_on_the_way_is_lost_until_the_end(driven: rooms.Drive) -> None:
+def test_ekf_with_dying_lidar_is_lost_until_the_end(driven: rooms.Drive) -> None:
     """Scans for 4.8 s of 12 s; the wheels go on."""
     _, pipeline = run(driven, lambda k, scan: scan if k < 60 else None)
     losses = pipeline.lidar

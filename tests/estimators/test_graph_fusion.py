@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from localization.estimate_table import EstimateTable, trajectory
 from localization.estimators import Estimate
+from localization.estimators.base import EstimateTable, trajectory
 from localization.estimators.graph_fusion import _interpolate, _subtract_information
 from localization.evaluation.consistency import nees
 from localization.events import PositionSample, Scan, WheelSample
@@ -94,7 +94,7 @@ def errors(drive: rooms.Drive, stamps: list[int], poses: np.ndarray) -> np.ndarr
 # --- loops about a building
 
 
-def test_loop_about_a_building_closes() -> None:
+def test_graph_around_building_closes_loop() -> None:
     """After it, the live pose is nearer the truth than the odometry's drift, and so is the smoothed one."""
     drive, (estimates, pipeline) = around(), estimated()
     stamps = [e.stamp_ns for e in estimates]
@@ -108,7 +108,7 @@ def test_loop_about_a_building_closes() -> None:
     assert np.sqrt(np.mean(after**2)) < 0.9 * np.sqrt(np.mean(odometry**2))
 
 
-def test_loop_moves_the_map_and_never_the_odometry() -> None:
+def test_graph_with_loop_moves_map_and_not_odometry() -> None:
     """The pose in the map jumps where the loop closes; odom -> base_link moves as the robot does (REP-105)."""
     estimates, _ = estimated()
     odometry = np.array([e.odometry[0] for e in estimates])
@@ -120,7 +120,7 @@ def test_loop_moves_the_map_and_never_the_odometry() -> None:
     assert np.abs(se2.between(chained, np.array([e.pose for e in estimates]))).max() < 1e-12
 
 
-def test_odometry_is_that_of_a_filter_that_gets_the_corrections_alone() -> None:
+def test_graph_odometry_equals_filter_with_same_corrections() -> None:
     """Until the first keyframes the graph's odometry is the filter's, to the last bit."""
     drive = around().until(rooms.WALL_START_NS + 2 * 10**9)
     ours = run(make_pipeline(drive), drive.events)
@@ -129,7 +129,7 @@ def test_odometry_is_that_of_a_filter_that_gets_the_corrections_alone() -> None:
     assert all(np.array_equal(a.odometry[0], b.pose) for a, b in zip(ours[:8], theirs[:8], strict=True))
 
 
-def test_wheels_that_are_wrong_are_learned() -> None:
+def test_graph_with_wrong_wheels_estimates_radius_scale() -> None:
     """Radius by the scans along the way, k by the turns; both within 3 sigma, and with more certainty than at first."""
     estimates, pipeline = estimated()
     del estimates
@@ -143,17 +143,17 @@ def test_wheels_that_are_wrong_are_learned() -> None:
     assert abs(mean - nominal * TURN_ERROR) < abs(mean - nominal)
 
 
-def test_corrections_of_the_graph_are_those_of_the_next_prediction() -> None:
+def test_graph_corrections_hold_for_next_prediction() -> None:
     _, pipeline = estimated()
-    names = pipeline.estimator.odometry._corrections.names
-    learned = pipeline.estimator._graph.corrections()[0][: len(names)]
+    names = pipeline.estimator.odometry.corrections.names
+    learned = pipeline.estimator.graph.corrections()[0][: len(names)]
     assert np.abs(learned).min() > 0.0
-    assert pipeline.synchronizer._params == pytest.approx(pipeline.estimator.params)
+    assert pipeline.synchronizer.params == pytest.approx(pipeline.estimator.params)
     nominal = make_model("diff_drive", rooms.ROBOT).nominal
-    assert not np.allclose(pipeline.synchronizer._params, nominal)
+    assert not np.allclose(pipeline.synchronizer.params, nominal)
 
 
-def test_nees_of_smoothed_poses_is_that_of_their_covariances() -> None:
+def test_graph_smoothed_has_consistent_nees() -> None:
     """The middle and the end of five drives, of 3 degrees of freedom each."""
     found = []
     for seed in range(5):
@@ -172,7 +172,7 @@ def test_nees_of_smoothed_poses_is_that_of_their_covariances() -> None:
 # --- what may be missing
 
 
-def test_scans_without_points_are_keyframes_and_close_no_loops() -> None:
+def test_graph_with_empty_scans_closes_no_loops() -> None:
     drive = around()
     blind = [
         replace(e, points=e.points[:0], offsets=e.offsets[:0]) if isinstance(e, Scan) and i % 3 else e for i, e in enumerate(drive.events)
@@ -184,7 +184,7 @@ def test_scans_without_points_are_keyframes_and_close_no_loops() -> None:
     assert np.isfinite(smoothed(estimates, pipeline).poses).all()
 
 
-def test_wheels_alone_make_a_graph() -> None:
+def test_graph_of_wheels_alone_has_keyframes() -> None:
     """Without LiDAR and positions it is dead reckoning, with a covariance that grows."""
     drive = around()
     pipeline = make_pipeline(drive, has_lidar=False)
@@ -221,20 +221,37 @@ def driven_with(fixes: list[PositionSample]) -> tuple[np.ndarray, Pipeline]:
     return np.hypot(*(at - drive.poses[:, :2]).T), pipeline
 
 
-def test_positions_pull_wheels_that_are_wrong() -> None:
+def test_graph_with_positions_corrects_wrong_wheels() -> None:
     without, with_fixes = driven_with([])[0], driven_with(positions(around()))[0]
     assert without.max() > 2.0
     assert np.sqrt(np.mean(with_fixes**2)) < 0.2 * np.sqrt(np.mean(without**2))
 
 
-def test_an_outlier_among_positions_does_not_pull() -> None:
+def test_graph_with_outlier_position_keeps_poses() -> None:
     clean, pipeline = driven_with(positions(around()))
     spoilt, _ = driven_with(positions(around(), spoil={40: np.array([50.0, 0.0])}))
     assert pipeline.estimator.counts()["positions"] > 70
+    assert pipeline.estimator.warnings() == []
     assert np.abs(spoilt - clean).max() < 0.3
 
 
-def test_positions_before_the_map_has_a_heading_wait() -> None:
+def test_graph_with_first_position_far_off_leaves_it_out() -> None:
+    """It is among those that give the map its heading."""
+    errors, pipeline = driven_with(positions(around(), spoil={1: np.array([1e5, 1e5])}))
+    assert np.sqrt(np.mean(errors**2)) < 0.5
+    (warning,) = pipeline.estimator.warnings()
+    assert warning.startswith("1 of ")
+
+
+def test_graph_with_positions_at_rest_reports_them_unused() -> None:
+    drive, pipeline = around(), make_pipeline(around(), has_lidar=False)
+    fixes = positions(drive)[:3]  # the first one comes before the first keyframe
+    wheels = [e for e in drive.events if isinstance(e, WheelSample) and e.stamp_ns <= fixes[-1].stamp_ns + 200_000_000]
+    run(pipeline, list(merge_positions(wheels, fixes)))
+    assert "2 positions could not be used" in pipeline.warnings()[-1]
+
+
+def test_graph_positions_wait_for_heading() -> None:
     """From a robot that has not moved by 5 m they do not tell where the map is turned to."""
     drive = around()
     pipeline = make_pipeline(drive, is_smoothing=False)
@@ -251,7 +268,7 @@ def numbers(estimate: Estimate) -> tuple:
     return estimate.stamp_ns, *(array.tobytes() for array in arrays)
 
 
-def test_cut_after_its_loops_and_resumed_the_graph_goes_on_to_the_last_bit() -> None:
+def test_graph_resumed_after_loops_equals_uncut_bitwise() -> None:
     drive = around()
     fixed = list(merge_positions(drive.events, positions(drive)))
     pipeline, cut = make_pipeline(drive), int(0.97 * len(fixed))
@@ -264,7 +281,7 @@ def test_cut_after_its_loops_and_resumed_the_graph_goes_on_to_the_last_bit() -> 
     assert dict(pipeline.estimator.parameters()) == dict(resumed.estimator.parameters())
 
 
-def test_replay_is_what_was_estimated_live_to_the_last_bit() -> None:
+def test_graph_replay_equals_live_bitwise() -> None:
     drive, (estimates, pipeline) = around(), estimated()
     live = make_pipeline(drive, is_smoothing=False)
     found = []
@@ -282,7 +299,7 @@ def test_replay_is_what_was_estimated_live_to_the_last_bit() -> None:
 # --- parts
 
 
-def test_motion_less_the_wheels_share_gives_the_filters_motion_with_it() -> None:
+def test_subtract_information_with_wheels_gives_filters_motion() -> None:
     wheels, wheel_cov = np.array([1.0, 0.0, 0.1]), np.diag([0.05, 0.05, 0.03]) ** 2
     delta, cov = np.array([1.01, 0.005, 0.11]), np.diag([0.01, 0.01, 0.002]) ** 2
     measured, information = _subtract_information(delta, cov, wheels, wheel_cov)
@@ -294,7 +311,7 @@ def test_motion_less_the_wheels_share_gives_the_filters_motion_with_it() -> None
 
 
 @pytest.mark.parametrize("gain", [0.5, 0.999, 1.0, 1.001, 1.5])
-def test_motion_less_the_wheels_share_is_no_farther_off_than_the_wheels(gain: float) -> None:
+def test_subtract_information_stays_within_wheels_distance(gain: float) -> None:
     """Also where scans say next to nothing along x: a difference is not divided by nothing."""
     wheels, wheel_cov = np.array([1.1, 0.0, 0.0]), np.diag([0.02, 0.02, 0.05]) ** 2
     delta, cov = np.array([1.0, 0.0, 0.0]), wheel_cov * [[1.0 / gain], [0.1], [0.1]]
@@ -303,7 +320,7 @@ def test_motion_less_the_wheels_share_is_no_farther_off_than_the_wheels(gain: fl
     assert (np.linalg.eigvalsh(information) > 0.0).all()
 
 
-def test_poses_between_keyframes_are_moved_as_far_as_was_travelled() -> None:
+def test_interpolate_moves_poses_by_travelled_share() -> None:
     odom = np.column_stack([[0.0, 1.0, 1.0, 2.0], np.zeros(4), np.zeros(4)])  # it rests in between
     poses, covs = np.array([[0.0, 0.0, 0.0], [2.2, 0.0, 0.0]]), np.array([0.01 * np.eye(3), 0.03 * np.eye(3)])
     found, mixed = _interpolate(np.array([0, 3]), poses, covs, odom)

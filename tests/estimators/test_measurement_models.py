@@ -34,7 +34,7 @@ def test_motion_residual_has_exact_jacobians(a, b, off):
 
 @given(POSES, st.floats(-1.5, 1.5), st.floats(-0.5, 0.5), st.floats(-0.1, 0.1), st.floats(0.01, 2.0))
 @settings(max_examples=60, deadline=None)
-def test_turn_has_exact_jacobians(a, angle, bias, scale, duration):
+def test_predict_turn_has_exact_jacobians(a, angle, bias, scale, duration):
     b, turn = se2.compose(a, np.array([0.3, 0.1, angle])), Turn(0.0, 1.0, duration)
     value, by_now, by_start, by_bias, by_scale = predict_turn(a, b, turn, bias, scale)
     assert value == pytest.approx((1.0 + scale) * angle + bias * duration, abs=1e-9)
@@ -45,7 +45,7 @@ def test_turn_has_exact_jacobians(a, angle, bias, scale, duration):
         assert by == pytest.approx((predict_turn(a, b, turn, *more)[0] - predict_turn(a, b, turn, *less)[0]) / (2 * h), abs=1e-6)
 
 
-def test_turn_across_the_half_circle_is_small():
+def test_predict_turn_across_half_circle_is_small():
     turn = Turn(0.0, 1.0, 1.0)
     assert predict_turn(np.array([0, 0, 3.1]), np.array([0, 0, -3.1]), turn, 0.0, 0.0)[0] == pytest.approx(2 * math.pi - 6.2, abs=1e-12)
 
@@ -63,7 +63,7 @@ def test_position_residual_has_exact_jacobians(pose, lever, position):
 
 @given(POSES, *[st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-1, 1)).map(lambda e: 1e-4 * np.array(e))] * 3)
 @settings(max_examples=40, deadline=None)
-def test_innovation_of_a_scan_is_pose_less_map_less_noise(true, e_pose, e_map, noise):
+def test_subtract_map_error_equals_pose_less_map_less_noise(true, e_pose, e_map, noise):
     """An estimate that is off by e_pose, in a submap whose errors put the scan at e_map: true pose = estimate exp(e)."""
     estimate = se2.compose(true, se2.inverse(se2.exp(e_pose)))
     measured = se2.compose(true, se2.exp(-e_map - noise))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from localization.errors import EstimatorError
 from localization.estimators import pose_graph
 from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
 from localization.evaluation.consistency import nees
@@ -82,10 +83,10 @@ def assert_jacobians_are_numeric(factor: gtsam.CustomFactor, values: gtsam.Value
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_wheel_factor_jacobians_are_the_numeric_ones(seed: int) -> None:
+def test_wheel_factor_has_numeric_jacobians(seed: int) -> None:
     rng = np.random.default_rng(seed)
     wheels = PreintegratedMotion(rng.normal(size=3), np.eye(3), rng.normal(size=(3, 2)), 0.1 * rng.normal(size=2))
-    factor = pose_graph._wheel_factor(0, 1, gtsam.symbol("c", 0), wheels)
+    factor = pose_graph.wheel_factor(0, 1, gtsam.symbol("c", 0), wheels)
     start, values = 5.0 * rng.normal(size=3), gtsam.Values()
     values.insert(gtsam.symbol("x", 0), gtsam.Pose2(*start))
     values.insert(gtsam.symbol("x", 1), gtsam.Pose2(*se2.compose(start, se2.compose(wheels.delta, 0.1 * rng.normal(size=3)))))
@@ -94,11 +95,11 @@ def test_wheel_factor_jacobians_are_the_numeric_ones(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_position_factor_jacobians_are_the_numeric_ones(seed: int) -> None:
+def test_position_factor_has_numeric_jacobians(seed: int) -> None:
     rng = np.random.default_rng(seed)
     enu_T_map, pose, offset, lever = 5.0 * rng.normal(size=3), 5.0 * rng.normal(size=3), rng.normal(size=3), rng.normal(size=2)
     antenna = se2.transform(se2.compose(enu_T_map, se2.compose(pose, offset)), lever)
-    factor = pose_graph._position_factor(Position(3, offset, antenna + np.array([0.2, -0.3]), np.eye(2)))
+    factor = pose_graph.position_factor(Position(3, offset, antenna + np.array([0.2, -0.3]), np.eye(2)))
     values = gtsam.Values()
     values.insert(gtsam.symbol("t", 0), gtsam.Pose2(*enu_T_map))
     values.insert(gtsam.symbol("x", 3), gtsam.Pose2(*pose))
@@ -109,7 +110,7 @@ def test_position_factor_jacobians_are_the_numeric_ones(seed: int) -> None:
 # --- solutions
 
 
-def test_optimization_of_a_cost_on_which_gauss_newton_diverges_ends_at_the_minimum() -> None:
+def test_levenberg_marquardt_where_gauss_newton_diverges_converges() -> None:
     """atan(x): undamped steps from beyond 1.39 lead ever farther away."""
     key, factors, values = gtsam.symbol("c", 0), gtsam.NonlinearFactorGraph(), gtsam.Values()
 
@@ -123,11 +124,11 @@ def test_optimization_of_a_cost_on_which_gauss_newton_diverges_ends_at_the_minim
     values.insert(key, np.array([2.0]))
     undamped = values.retract(factors.linearize(values).optimize())
     assert factors.error(undamped) > factors.error(values)
-    found = pose_graph._levenberg_marquardt(factors, values)
+    found = pose_graph.levenberg_marquardt(factors, values)
     assert abs(found.atVector(key)[0]) < 1e-3
 
 
-def test_a_loop_spreads_the_drift_over_the_way() -> None:
+def test_pose_graph_with_loop_spreads_the_drift() -> None:
     graph, truth = circles(41, np.random.default_rng(1))
     before = distances(graph.poses(), truth)
     sigma = np.sqrt(np.trace(graph.marginal(40)[:2, :2]))
@@ -144,7 +145,7 @@ def test_a_loop_spreads_the_drift_over_the_way() -> None:
     assert distances(poses, truth)[-1] < 0.3 * before[-1]
 
 
-def test_a_wrong_loop_among_right_ones_does_not_pull() -> None:
+def test_pose_graph_with_wrong_loop_keeps_poses() -> None:
     graph, truth = circles(41, np.random.default_rng(2))
     right = tuple(loop(truth, k, k + 20, np.zeros(3)) for k in range(10, 20))
     graph.apply(Update(betweens=right))
@@ -153,7 +154,7 @@ def test_a_wrong_loop_among_right_ones_does_not_pull() -> None:
     assert distances(graph.smooth()[0], alone).max() < 0.02
 
 
-def test_corrections_are_learned_from_turns_by_wheels_and_scans() -> None:
+def test_pose_graph_on_turns_estimates_corrections() -> None:
     """Wheels turn by a tenth more than they say; k is a factor of turns, known to a tenth at first."""
     graph, pose = PoseGraph(np.diag([0.1, 0.02]) ** 2), np.zeros(3)
     graph.apply(Update(pose))
@@ -176,7 +177,7 @@ def test_corrections_are_learned_from_turns_by_wheels_and_scans() -> None:
 
 
 @pytest.mark.parametrize("is_smoothed", [False, True])
-def test_nees_of_poses_over_fifty_drives_is_that_of_their_covariances(is_smoothed: bool) -> None:
+def test_pose_graph_over_fifty_drives_has_consistent_nees(is_smoothed: bool) -> None:
     """Of one pose of each drive, after loops: independent, so that their sum has 3 x 50 degrees of freedom. Cauchy's loss counts right
     loops as less than they are, so that covariances may be too wide: by half at most."""
     found = []
@@ -208,7 +209,7 @@ def with_positions(
     return graph, truth, enu_T_map
 
 
-def test_positions_pull_a_drifting_odometry() -> None:
+def test_pose_graph_with_positions_reduces_drift() -> None:
     alone, truth = circles(61, np.random.default_rng(4), scale=3.0)
     graph = with_positions()[0]
     before, after = distances(alone.poses(), truth).max(), distances(graph.smooth()[0], truth).max()
@@ -216,24 +217,32 @@ def test_positions_pull_a_drifting_odometry() -> None:
     assert after < 0.5 * before
 
 
-def test_an_outlier_among_positions_does_not_pull() -> None:
+def test_graph_with_outlier_position_keeps_poses() -> None:
     poses, spoilt = (with_positions(outlier)[0].smooth()[0] for outlier in (0.0, 50.0))
     assert distances(poses, spoilt).max() < 0.1
 
 
 @pytest.mark.parametrize("given", [np.zeros(2), np.array([0.4, -0.3])])
-def test_lever_arm_of_the_antenna_is_estimated(given: np.ndarray) -> None:
+def test_pose_graph_with_positions_estimates_lever_arm(given: np.ndarray) -> None:
     """Turning tells it from the alignment."""
     lever = np.array([0.4, -0.3])
     graph = with_positions(lever=lever, given=given)[0]
     graph.smooth()
-    assert graph._values.atPoint2(gtsam.symbol("l", 0)) == pytest.approx(lever, abs=0.1)
+    assert graph.lever_arm() == pytest.approx(lever, abs=0.1)
+
+
+def test_pose_graph_with_singular_covariance_raises_estimator_error() -> None:
+    graph, truth, _ = with_positions()
+    exact = tuple(Position(k, np.zeros(3), truth[k, :2], 1e-24 * np.eye(2)) for k in range(5, 60, 5))
+    with pytest.raises(EstimatorError, match="cannot be solved"):  # noqa: PT012
+        graph.apply(Update(positions=exact))
+        graph.smooth()
 
 
 # --- checkpoints
 
 
-def test_graph_that_was_frozen_goes_on_to_the_last_bit() -> None:
+def test_pose_graph_deserialized_equals_original_bitwise() -> None:
     graph, truth = circles(30, np.random.default_rng(5))
     graph.apply(Update(betweens=(loop(truth, 2, 22, np.zeros(3)),)))
     resumed = deserialize(*serialize(graph))

@@ -1,6 +1,6 @@
-"""Consistency tests are themselves tested by counting: honest errors pass as often as promised, dishonest ones are found out.
+"""Consistency tests, by counting: errors of the stated covariance pass at the stated rate, others fail.
 
-Bounds on counts are binomial at one in a million, so that an honest implementation fails with no seed in practice.
+Bounds on counts are binomial at one in a million, so that a correct implementation fails with no seed in practice.
 """
 
 import math
@@ -42,7 +42,7 @@ def as_often_as(count, n, probability):
     return low <= count <= high
 
 
-def test_values_are_those_of_the_inverse():
+def test_nees_is_that_of_the_inverse_covariance():
     rng = np.random.default_rng(0)
     p = random_covariances(rng, 100)
     e = rng.normal(size=(100, 3))
@@ -51,14 +51,14 @@ def test_values_are_those_of_the_inverse():
     np.testing.assert_array_equal(nis(e, p), nees(e, p))
 
 
-def test_values_do_not_depend_on_units():
+def test_nees_does_not_depend_on_units():
     rng = np.random.default_rng(1)
     p, scale = random_covariances(rng, 50), np.array([1e3, 1.0, 180 / math.pi])
     e = draw(rng, p)
     np.testing.assert_allclose(nees(e * scale, p * np.outer(scale, scale)), nees(e, p), rtol=1e-9)
 
 
-def test_correctly_drawn_errors_are_chi_square():
+def test_nees_of_drawn_errors_is_chi_square():
     rng = np.random.default_rng(2)
     p = random_covariances(rng, 20_000)
     values = nees(draw(rng, p), p)
@@ -67,7 +67,7 @@ def test_correctly_drawn_errors_are_chi_square():
 
 
 @pytest.mark.parametrize("probability", [0.8, 0.95, 0.99])
-def test_honest_runs_are_found_consistent_as_often_as_promised(probability):
+def test_is_consistent_right_covariance_passes_at_the_stated_rate(probability):
     inside = 0
     for seed in range(400):
         rng = np.random.default_rng(seed)
@@ -77,7 +77,7 @@ def test_honest_runs_are_found_consistent_as_often_as_promised(probability):
 
 
 @pytest.mark.parametrize(("factor", "verdict"), [(0.5, "overconfident"), (2.0, "conservative")])
-def test_a_variance_wrong_by_two_is_found_out(factor, verdict):
+def test_is_consistent_variance_wrong_by_two_fails(factor, verdict):
     found = []
     for seed in range(200):
         rng = np.random.default_rng(seed)
@@ -89,7 +89,7 @@ def test_a_variance_wrong_by_two_is_found_out(factor, verdict):
     assert all((c.fraction_inside < 0.95) == (verdict == "overconfident") for c in found if abs(c.fraction_inside - 0.95) > 0.05)
 
 
-def test_the_band_is_that_of_the_mean():
+def test_band_is_that_of_the_mean():
     rng = np.random.default_rng(3)
     means = chi2.rvs(3, size=(20_000, 10), random_state=rng).mean(axis=1)
     low, high = mean_band(10, 3)
@@ -99,7 +99,7 @@ def test_the_band_is_that_of_the_mean():
     assert np.round(mean_band(50, 2), 1).tolist() == [1.5, 2.6]
 
 
-def test_the_mean_over_runs_keeps_to_its_band_at_each_instant():
+def test_mean_nees_over_runs_is_in_its_band_at_each_instant():
     rng = np.random.default_rng(4)
     p = np.broadcast_to(np.diag([0.1, 0.2, 0.3]), (25, 2_000, 3, 3)).reshape(-1, 3, 3)
     values = nees(draw(rng, p), p).reshape(25, 2_000)
@@ -109,7 +109,7 @@ def test_the_mean_over_runs_keeps_to_its_band_at_each_instant():
     assert mean_band(25, 3) == (low, high)
 
 
-def test_runs_may_be_stacked():
+def test_nees_accepts_stacked_runs():
     rng = np.random.default_rng(5)
     p = random_covariances(rng, 60)
     e = draw(rng, p)
@@ -122,7 +122,7 @@ def test_runs_may_be_stacked():
 # --- singular covariances
 
 
-def test_a_direction_of_no_variance_is_not_counted_while_the_error_keeps_to_it():
+def test_nees_direction_of_zero_variance_without_error_is_not_counted():
     rng = np.random.default_rng(6)
     basis = np.linalg.qr(rng.normal(size=(5_000, 3, 3)))[0][:, :, :2]  # errors lie in a plane, another one each time
     p = basis @ np.array([[0.4, 0.1], [0.1, 0.2]]) @ np.swapaxes(basis, 1, 2)
@@ -133,7 +133,7 @@ def test_a_direction_of_no_variance_is_not_counted_while_the_error_keeps_to_it()
     assert (found.dof, found.verdict) == (2.0, "consistent")
 
 
-def test_a_broken_claim_of_certainty_is_infinitely_wrong():
+def test_nees_direction_of_zero_variance_with_error_is_infinite():
     p = np.diag([0.01, 0.0, 0.01])
     assert nees([[0.1, 0.0, 0.0]], [p])[0] == pytest.approx(1.0)
     assert nees([[0.1, 1e-3, 0.0]], [p])[0] == np.inf
@@ -143,7 +143,7 @@ def test_a_broken_claim_of_certainty_is_infinitely_wrong():
     assert consistency([[1.0, 0.0, 0.0]], np.zeros((1, 3, 3))).verdict == "overconfident"
 
 
-def test_certain_samples_without_error_say_nothing():
+def test_nees_of_certain_samples_without_error_is_untested():
     rng = np.random.default_rng(7)
     p = random_covariances(rng, 10)
     e = draw(rng, p)
@@ -166,13 +166,13 @@ def test_certain_samples_without_error_say_nothing():
         ([[0.0, 0.0]], [[[0.0, 0.1], [0.1, 1.0]]], "no covariance"),
     ],
 )
-def test_what_is_no_covariance_is_refused(errors, covariances, complaint):
+def test_nees_invalid_covariance_is_refused(errors, covariances, complaint):
     with pytest.raises(EvaluationError, match=complaint):
         nees(errors, covariances)
 
 
 @pytest.mark.parametrize(("n", "dof", "probability"), [(0, 3, 0.95), (5, 0, 0.95), (5, 3, 1.0)])
-def test_no_band_for_nothing(n, dof, probability):
+def test_band_of_no_samples_is_refused(n, dof, probability):
     with pytest.raises(EvaluationError, match="no band"):
         mean_band(n, dof, probability)
 
@@ -180,7 +180,7 @@ def test_no_band_for_nothing(n, dof, probability):
 # --- whiteness
 
 
-def test_white_innovations_are_found_white_as_often_as_promised():
+def test_whiteness_of_white_innovations_passes_at_the_stated_rate():
     white = 0
     for seed in range(400):
         rng = np.random.default_rng(1000 + seed)
@@ -189,7 +189,7 @@ def test_white_innovations_are_found_white_as_often_as_promised():
     assert as_often_as(white, 400, 0.95)
 
 
-def test_correlated_innovations_are_found_out_and_measured():
+def test_whiteness_of_correlated_innovations_fails_with_its_measure():
     rng = np.random.default_rng(8)
     z = np.zeros((5_000, 3))
     for k in range(1, 5_000):
@@ -238,7 +238,7 @@ def as_trajectory(estimate, covariances):
     return Trajectory(np.arange(len(estimate)) * SECOND, estimate, covariances)
 
 
-def test_errors_count_from_the_first_match_in_the_frame_of_the_estimate():
+def test_pose_errors_start_at_the_first_match_in_the_estimate_frame():
     truth, estimate, covariances = odometry_run(9)
     found = pose_errors(as_trajectory(estimate, covariances), as_track(truth))
     assert len(found.errors) == 60  # the first match is the alignment itself
@@ -250,7 +250,7 @@ def test_errors_count_from_the_first_match_in_the_frame_of_the_estimate():
 
 
 @pytest.mark.parametrize("first", [None, np.diag([0.04, 0.01, 0.01])])
-def test_honest_odometry_passes_over_many_runs_whatever_its_first_uncertainty(first):
+def test_pose_nees_of_right_odometry_passes_whatever_its_first_sigma(first):
     truths, estimate, p = odometry_runs(14, runs=200, first_covariance=first)
     found = [pose_errors(as_trajectory(estimate, p), as_track(truth)) for truth in truths]
     values = np.array([nees(f.errors, f.covariances) for f in found])
@@ -259,7 +259,7 @@ def test_honest_odometry_passes_over_many_runs_whatever_its_first_uncertainty(fi
     assert np.all((means[[0, 30, 59]] > low) & (means[[0, 30, 59]] < high))
 
 
-def test_odometry_that_claims_half_the_variance_is_found_out_over_runs():
+def test_pose_nees_of_half_the_variance_fails_over_runs():
     truths, estimate, p = odometry_runs(15, runs=100)
     found = [pose_errors(as_trajectory(estimate, 0.5 * p), as_track(truth)) for truth in truths]
     values = [nees(f.errors, f.covariances) for f in found]
@@ -267,18 +267,18 @@ def test_odometry_that_claims_half_the_variance_is_found_out_over_runs():
     assert np.all(means > high)
 
 
-def test_one_run_counts_as_one_sample():
+def test_pose_nees_of_one_run_counts_as_one_sample():
     verdicts = []
     truths, estimate, p = odometry_runs(16, runs=200)
     for truth in truths:
         found = pose_consistency(as_trajectory(estimate, p), as_track(truth))
         assert (found.n, found.n_independent, found.band) == (60, 1, mean_band(1, 3))
         verdicts.append(found.verdict)
-    # the mean of sixty correlated samples spreads less than one sample, so honest runs pass at least as often
+    # the mean of sixty correlated samples spreads less than one sample, so consistent runs pass at least as often
     assert verdicts.count("consistent") >= binom.ppf(1e-6, 200, 0.95)
 
 
-def test_noise_of_the_reference_is_part_of_the_error_where_it_is_told():
+def test_pose_nees_with_reference_noise_counts_it_where_given():
     noise = np.diag([0.09, 0.0009, 0.0025])  # along and across the plane's x, not the robot's
     truths, estimate, p = odometry_runs(17, runs=400, n=10)
     rng = np.random.default_rng(18)
@@ -287,13 +287,13 @@ def test_noise_of_the_reference_is_part_of_the_error_where_it_is_told():
         seen = se2.compose([0, 0, 0.7], truth) + rng.multivariate_normal(np.zeros(3), noise, len(truth))
         found = pose_errors(as_trajectory(estimate, p), as_track(seen, covariances=np.broadcast_to(noise, (len(seen), 3, 3))))
         whitened.append(np.linalg.solve(np.linalg.cholesky(found.covariances[-1]), found.errors[-1]))
-    # 400 draws: a variance is known to 7 %, a correlation to 5 %; five of these
+    # 400 draws: a variance is estimated to 7 %, a correlation to 5 %; five of these
     np.testing.assert_allclose(np.cov(whitened, rowvar=False), np.eye(3), atol=0.35)
     unknown = np.full((11, 3, 3), np.nan)
     np.testing.assert_array_equal(pose_errors(as_trajectory(estimate, p), as_track(truths[0], covariances=unknown)).covariances, p[1:])
 
 
-def test_standing_before_the_first_motion_is_left_out():
+def test_pose_nees_before_the_first_motion_is_left_out():
     truth, estimate, p = odometry_run(10)
     stands = 20
     truth, estimate = (np.vstack([np.repeat(a[:1], stands, axis=0), a]) for a in (truth, estimate))
@@ -304,7 +304,7 @@ def test_standing_before_the_first_motion_is_left_out():
     assert math.isfinite(found.mean)
 
 
-def test_certainty_that_grows_is_left_out_and_counted():
+def test_pose_nees_shrinking_covariance_is_left_out_and_counted():
     truth, estimate, p = odometry_run(12, first_covariance=np.diag([0.04, 0.01, 0.01]))
     p[40] = 1e-3 * np.eye(3)  # an absolute fix: less than the start's uncertainty carried along
     found = pose_errors(as_trajectory(estimate, p), as_track(truth))
@@ -312,7 +312,7 @@ def test_certainty_that_grows_is_left_out_and_counted():
     assert 40 * SECOND not in found.stamps_ns
 
 
-def test_what_cannot_be_tested_is_none_or_refused():
+def test_pose_nees_untestable_is_none_or_refused():
     truth, estimate, p = odometry_run(13)
     positions = ReferenceTrack(np.arange(61) * SECOND, truth[:, :2])
     assert pose_consistency(as_trajectory(estimate, p), positions) is None

@@ -1,4 +1,4 @@
-"""Scores: evo as the independent second opinion where definitions agree, and cases whose answer is known by construction.
+"""Scores: compared with evo where definitions agree, and on cases with an analytic answer.
 
 Where evo's definitions differ from ours, and so what is not compared: evo's relative pose error is not divided by the distance, takes
 the sample *nearest* to the wanted distance (ours: the first at or beyond it; the same on paths of equal steps that divide the distance),
@@ -66,7 +66,7 @@ def evo_path(poses):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_evo_agrees_on_ate(seed):
+def test_ate_is_that_of_evo(seed):
     truth = planar_path(seed)
     estimate = disturbed(truth, seed)
     found = evaluate(Trajectory(seconds(400), estimate), track(truth))
@@ -85,7 +85,7 @@ def test_evo_agrees_on_ate(seed):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("length", [1.0, 2.0, 5.0, 50.0])
-def test_evo_agrees_on_rpe(seed, length):
+def test_rpe_is_that_of_evo(seed, length):
     truth = planar_path(seed)
     estimate = disturbed(truth, seed)
     found = evaluate(Trajectory(seconds(400), estimate), track(truth), EvaluateConfig(rpe_distances_m=(length,)))
@@ -100,7 +100,7 @@ def test_evo_agrees_on_rpe(seed, length):
         assert mean == pytest.approx(rpe.get_statistic(metrics.StatisticsType.mean), abs=1e-9)
 
 
-def test_no_other_rigid_motion_aligns_better():
+def test_align_no_other_rigid_motion_has_less_error():
     truth = planar_path(7)
     estimate = disturbed(truth, 7, size=0.1)
 
@@ -114,7 +114,7 @@ def test_no_other_rigid_motion_aligns_better():
         np.testing.assert_allclose(found[:2], best.x[:2], atol=1e-3)
 
 
-def test_a_perfect_estimate_in_another_plane_has_no_error():
+def test_score_perfect_estimate_in_another_plane_has_no_error():
     truth = planar_path(1)
     moved = se2.compose([10.0, -20.0, 2.5], truth)
     found = evaluate(Trajectory(seconds(400), moved), track(truth))
@@ -123,7 +123,7 @@ def test_a_perfect_estimate_in_another_plane_has_no_error():
     np.testing.assert_allclose(se2.compose(found.reference_T_world, moved), truth, atol=1e-9)
 
 
-def test_scores_do_not_depend_on_either_plane():
+def test_score_does_not_depend_on_either_plane():
     truth = planar_path(2)
     estimate = disturbed(truth, 2)
     here = evaluate(Trajectory(seconds(400), estimate), track(truth)).numbers()
@@ -135,7 +135,7 @@ def test_scores_do_not_depend_on_either_plane():
             assert here[name] == pytest.approx(there[name], rel=1e-9), name
 
 
-def test_a_wheel_too_large_by_two_percent_drifts_two_percent():
+def test_score_wheel_two_percent_too_large_drifts_two_percent():
     truth = np.column_stack([np.linspace(0, 100, 1001), np.zeros(1001), np.zeros(1001)])
     found = evaluate(Trajectory(seconds(1001), truth * [1.02, 1, 1]), track(truth))
     assert found.rpe_translation_percent == pytest.approx(2.0)
@@ -148,7 +148,7 @@ def test_a_wheel_too_large_by_two_percent_drifts_two_percent():
     assert found.ate_rmse_m == pytest.approx(2.0 / math.sqrt(12.0), rel=2e-3)
 
 
-def test_a_heading_that_drifts_by_a_degree_per_metre():
+def test_score_heading_drift_of_a_degree_per_metre_is_measured():
     truth = np.column_stack([np.linspace(0, 20, 201), np.zeros(201), np.zeros(201)])
     curve = [np.zeros(3)]
     for _ in range(200):
@@ -165,7 +165,7 @@ def test_a_heading_that_drifts_by_a_degree_per_metre():
     )
 
 
-def test_positions_alone_leave_the_rest_unknown():
+def test_score_positions_only_has_no_heading_errors():
     truth = planar_path(3)
     estimate = disturbed(truth, 3)
     trajectory = Trajectory(seconds(400), estimate)
@@ -179,7 +179,7 @@ def test_positions_alone_leave_the_rest_unknown():
     assert without.drift_percent == pytest.approx(100 * without.end_error_m / without.distance_m)
 
 
-def test_noise_of_a_positioning_system_is_no_distance():
+def test_distance_of_noisy_positions_does_not_count_the_noise():
     rng = np.random.default_rng(4)
     truth = np.column_stack([np.linspace(0, 50, 1000), np.zeros(1000), np.zeros(1000)])
     gps = positions_only(truth + rng.normal(0, 1.0, truth.shape))
@@ -188,7 +188,7 @@ def test_noise_of_a_positioning_system_is_no_distance():
     assert found.ate_rmse_m == pytest.approx(math.sqrt(2.0), rel=0.1)
 
 
-def test_the_estimate_is_interpolated_to_the_reference():
+def test_score_interpolates_the_estimate_at_the_reference():
     # a fast estimate on a circle, a slow reference between its stamps
     def circle(t):
         return np.column_stack([np.cos(t), np.sin(t), se2.wrap_angle(t + math.pi / 2)])
@@ -201,7 +201,7 @@ def test_the_estimate_is_interpolated_to_the_reference():
     assert found.n_matched == found.n_reference == len(asked)
 
 
-def test_gaps_in_the_estimate_are_not_scored():
+def test_score_gaps_in_the_estimate_are_left_out():
     truth = planar_path(5, n=100)
     keep = np.r_[0:40, 60:100]
     stamps = seconds(100)[keep]
@@ -215,7 +215,7 @@ def test_gaps_in_the_estimate_are_not_scored():
         evaluate(Trajectory(stamps, truth[keep]), ReferenceTrack(seconds(40) + SECOND // 2, truth[:40, :2]), EvaluateConfig(max_gap_s=0.1))
 
 
-def test_overlap_is_the_part_of_the_run_that_was_checked():
+def test_overlap_is_the_fraction_of_the_run_that_was_scored():
     truth = planar_path(6, n=101)
     half = ReferenceTrack(seconds(51), truth[:51, :2], truth[:51, 2])
     assert evaluate(Trajectory(seconds(101), truth), half).overlap == pytest.approx(0.5)
@@ -230,7 +230,7 @@ def test_overlap_is_the_part_of_the_run_that_was_checked():
         (1000, "another run"),
     ],
 )
-def test_no_common_time_tells_both_spans_and_the_likely_cause(shift_s, complaint):
+def test_score_without_common_time_error_has_spans_and_cause(shift_s, complaint):
     truth = planar_path(8, n=100)
     reference = ReferenceTrack(seconds(100) + shift_s * SECOND, truth[:, :2], source="/gps/fix")
     with pytest.raises(EvaluationError, match=complaint) as caught:
@@ -238,7 +238,7 @@ def test_no_common_time_tells_both_spans_and_the_likely_cause(shift_s, complaint
     assert "of 100 stamps of /gps/fix none lies" in str(caught.value)
 
 
-def test_too_few_matches_and_an_empty_trajectory():
+def test_score_too_few_matches_or_empty_trajectory_is_refused():
     truth = planar_path(9, n=10)
     with pytest.raises(EvaluationError, match=r"only 2 lie within.*too sparse or too short"):
         evaluate(Trajectory(seconds(10), truth), ReferenceTrack(np.array([0, 5, 20]) * SECOND, np.zeros((3, 2))))
@@ -246,7 +246,7 @@ def test_too_few_matches_and_an_empty_trajectory():
         evaluate(Trajectory(np.empty(0), np.empty((0, 3))), track(truth))
 
 
-def test_turning_on_the_spot_is_aligned_by_heading():
+def test_align_turn_in_place_uses_the_headings():
     angles = np.linspace(0, 6, 61)
     truth = np.column_stack([np.zeros(61), np.zeros(61), se2.wrap_angle(angles)])
     found = evaluate(Trajectory(seconds(61), se2.compose([1, 2, 0.7], truth)), track(truth))
@@ -256,14 +256,14 @@ def test_turning_on_the_spot_is_aligned_by_heading():
     assert (found.rpe, found.rpe_translation_percent, found.drift_percent, found.distance_m) == ((), None, None, 0.0)
 
 
-def test_a_position_reference_that_never_moves_scores_the_spread_of_the_estimate():
+def test_score_standing_position_reference_measures_the_spread():
     estimate = np.column_stack([np.tile([1.0, -1.0], 50), np.zeros(100), np.zeros(100)])
     found = evaluate(Trajectory(seconds(100), estimate), ReferenceTrack(seconds(100), np.full((100, 2), 7.0)))
     assert found.ate_rmse_m == pytest.approx(1.0)
     assert found.reference_T_world[2] == 0.0
 
 
-def test_jitter_of_a_standing_robot_is_no_sub_path():
+def test_rpe_jitter_of_a_standing_robot_is_no_sub_path():
     rng = np.random.default_rng(10)
     truth = np.column_stack([np.append(np.zeros(500), np.linspace(0, 10, 500)), np.zeros(1000), np.zeros(1000)])
     noisy = truth + np.column_stack([rng.normal(0, 1e-3, (1000, 2)), np.zeros(1000)])
@@ -272,7 +272,7 @@ def test_jitter_of_a_standing_robot_is_no_sub_path():
     assert found.rpe_translation_percent == pytest.approx(5.0, abs=0.2)
 
 
-def test_a_gap_in_the_reference_is_no_short_sub_path():
+def test_rpe_gap_in_the_reference_is_no_short_sub_path():
     truth = np.column_stack([np.r_[np.linspace(0, 3, 31), np.linspace(40, 43, 31)], np.zeros(62), np.zeros(62)])
     found = evaluate(Trajectory(seconds(62), truth), track(truth), EvaluateConfig(rpe_distances_m=(1.0, 30.0)))
     assert [score.n for score in found.rpe] == [2 * 21, 31]  # 1 m: within either half; 30 m: over the gap, from its near side only
@@ -283,8 +283,8 @@ def test_a_gap_in_the_reference_is_no_short_sub_path():
 # --- relations
 
 
-def test_relations_by_hand():
-    # facing north at (1, 1), one metre forward and a quarter turn; the relation says 1.1 m and 80 degrees
+def test_relations_errors_match_hand_calculation():
+    # facing north at (1, 1), one metre forward and a quarter turn; the relation is 1.1 m and 80 degrees
     trajectory = Trajectory(seconds(2), [[1, 1, math.pi / 2], [1, 2, math.pi]])
     relations = Relations(seconds(2)[:1], seconds(2)[1:], np.array([[1.1, 0.0, math.radians(80)]]))
     found = evaluate(trajectory, relations)
@@ -301,7 +301,7 @@ def test_relations_by_hand():
     assert numbers["ate_rmse_m"] is None
 
 
-def test_relations_split_by_their_span():
+def test_relations_are_grouped_by_their_span():
     poses = planar_path(11, n=100)
     starts, ends = np.array([0, 10, 50, 60]), np.array([5, 29, 70, 95])  # spans of 5, 19, 20, 35 s
     wrong = se2.compose(se2.between(poses[starts], poses[ends]), [[1.0, 0, 0], [3.0, 0, 0], [5.0, 0, 0], [7.0, 0, 0]])
@@ -315,7 +315,7 @@ def test_relations_split_by_their_span():
     assert evaluate(Trajectory(seconds(100), poses), relations, EvaluateConfig(short_span_s=6.0)).relations.short.n == 1
 
 
-def test_relations_are_those_of_matrices():
+def test_relations_errors_match_matrices():
     rng = np.random.default_rng(12)
     relation, motion = rng.uniform(-3, 3, (2, 50, 3))
 
@@ -336,7 +336,7 @@ def test_relations_outside_the_trajectory_are_counted():
         evaluate(Trajectory(seconds(11) - 100 * SECOND, np.zeros((11, 3))), relations)
 
 
-def test_the_freiburg_file_of_aces_is_read_whole():
+def test_relations_file_of_aces_is_read_whole():
     relations = read_reference_file(ACES)
     assert isinstance(relations, Relations)
     assert len(relations.motions) == 1279
@@ -348,7 +348,7 @@ def test_the_freiburg_file_of_aces_is_read_whole():
 # --- reading references
 
 
-def test_a_track_is_sorted_and_cleaned_and_says_so():
+def test_track_is_sorted_and_cleaned_with_a_note():
     samples = [
         Reference(3, np.array([3.0, 0.0]), 0.3),
         Reference(1, np.array([1.0, 0.0]), 0.1),
@@ -369,7 +369,7 @@ def test_a_track_is_sorted_and_cleaned_and_says_so():
         reference_track([])
 
 
-def test_dropped_samples_reach_the_scores():
+def test_track_dropped_samples_are_counted_in_the_scores():
     truth = planar_path(13, n=50)
     samples = [Reference(i * SECOND, p[:2] if i % 5 else np.array([np.inf, 0.0]), p[2]) for i, p in enumerate(truth)]
     found = evaluate(Trajectory(seconds(50), truth), reference_track(samples))
@@ -378,7 +378,7 @@ def test_dropped_samples_reach_the_scores():
     assert "10 of 50" in found.warnings[0]
 
 
-def test_gps_samples_make_a_track_of_positions_with_covariance():
+def test_track_of_gps_is_positions_with_covariance():
     covariance = np.diag([0.8, 0.8, np.nan])
     found = reference_track([Reference(i, np.array([i, 0.0]), None, covariance) for i in range(5)])
     assert found.yaws is None
@@ -387,7 +387,7 @@ def test_gps_samples_make_a_track_of_positions_with_covariance():
         _ = found.poses
 
 
-def test_a_heading_that_never_changes_on_a_bent_path_is_none():
+def test_track_constant_heading_on_a_curved_path_is_dropped():
     path = planar_path(14)
     frozen = [Reference(i * SECOND, p[:2], 0.0) for i, p in enumerate(path)]
     found = reference_track(frozen, "/rtk/pose")
@@ -400,7 +400,7 @@ def test_a_heading_that_never_changes_on_a_bent_path_is_none():
     assert reference_track(parked).yaws is not None
 
 
-def test_files_are_told_apart_by_suffix_and_by_content(tmp_path):
+def test_reference_format_is_detected_by_suffix_and_content(tmp_path):
     truth = planar_path(15, n=20)
     for name in ("pose.tum", "pose.txt"):
         write_tum(tmp_path / name, Trajectory(seconds(20), truth))
@@ -414,7 +414,7 @@ def test_files_are_told_apart_by_suffix_and_by_content(tmp_path):
     assert read_reference_file(tmp_path / "pairs.txt").ends_ns[1] == 3_500_000_000
 
 
-def test_a_tum_file_with_gaps_is_a_reference_all_the_same(tmp_path):
+def test_reference_tum_file_with_gaps_is_accepted(tmp_path):
     (tmp_path / "a.tum").write_text("0 0 0 0 0 0 0 1\n2 2 0 0 0 0 0.6 0.8\n1 nan nan nan nan nan nan nan\n1 1 0 0 0 0 0.6 0.8\n")
     found = read_reference_file(tmp_path / "a.tum")
     np.testing.assert_array_equal(found.stamps_ns, seconds(3))
@@ -433,13 +433,13 @@ def test_a_tum_file_with_gaps_is_a_reference_all_the_same(tmp_path):
         ("", "holds no data"),
     ],
 )
-def test_malformed_relations_name_file_and_line(tmp_path, text, complaint):
+def test_relations_malformed_error_names_file_and_line(tmp_path, text, complaint):
     (tmp_path / "r.relations").write_text(text)
     with pytest.raises(EvaluationError, match=complaint):
         read_relations(tmp_path / "r.relations")
 
 
-def test_a_log_given_as_a_reference_file_is_refused(tmp_path):
+def test_reference_file_that_is_a_log_is_refused(tmp_path):
     (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(range(256)))
     with pytest.raises(EvaluationError, match=r"a\.bag' is not a text file"):
         read_reference_file(tmp_path / "a.bag")
@@ -447,7 +447,7 @@ def test_a_log_given_as_a_reference_file_is_refused(tmp_path):
         read_reference_file(tmp_path / "missing.tum")
 
 
-def test_every_score_defaults_to_unknown():
+def test_scores_default_to_none():
     scores = {
         k: v
         for k, v in dataclasses.asdict(Accuracy()).items()

@@ -97,7 +97,7 @@ FORMATS = {
 
 
 class Unknown:
-    """A message of a type that nobody knows, with bytes that mean nothing."""
+    """A message of an unknown type with arbitrary bytes."""
 
     def __init__(
         self, type: str = "acme_msgs/msg/Gizmo", definition: str = "uint8 state\nfloat64[] values\n", data: bytes = b"\x00\x01\x02"

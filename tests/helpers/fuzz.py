@@ -1,4 +1,4 @@
-"""Bytes of logs, flipped, cut and moved by hypothesis: a reader reads or refuses whatever it is given, in bounded time."""
+"""Log files changed by hypothesis (bits flipped, cut, moved): a reader reads or refuses them in bounded time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from localization.errors import LogError
 from localization.logs import inspect_log, open_log
 from motion_models.robot import load_robot
 from tests.helpers import bags
-from tests.logs.test_formats import records
+from tests.helpers.logs import records_of_every_kind
 
 ROBOT = load_robot("vaultbot")
 MOST_SECONDS = 10.0
@@ -29,14 +29,14 @@ CHANGES = st.lists(
     min_size=1,
     max_size=6,
 )
-"""What, where, whence (both as parts of the file), and a byte."""
+"""Change, position, source position (both as fractions of the file), and a byte."""
 
 
 @functools.cache
-def honest(form: str) -> dict[str, bytes]:
+def valid_files(form: str) -> dict[str, bytes]:
     """The files of a small log with all sensors, by name; a bare file has the name "run"."""
     with tempfile.TemporaryDirectory() as name:
-        path = bags.FORMATS[form](Path(name) / "run", [r for r in records() if not isinstance(r[1], bags.Unknown)])
+        path = bags.FORMATS[form](Path(name) / "run", [r for r in records_of_every_kind() if not isinstance(r[1], bags.Unknown)])
         files = path.iterdir() if path.is_dir() else [path]
         return {file.name: file.read_bytes() for file in files}
 
@@ -63,8 +63,8 @@ def changed(data: bytes, changes: list[tuple[str, float, float, int]]) -> bytes:
 
 
 def check(form: str, changes: list[tuple[str, float, float, int]], of_metadata: bool = False) -> None:
-    """Read a changed log wholly. Raises whatever is not a `LogError`."""
-    files = honest(form)
+    """Read a changed log wholly. Errors other than `LogError` are raised."""
+    files = valid_files(form)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "run" if len(files) > 1 else Path(name)
         folder.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""Mutated logs by seed: faults of sensors, clocks, transforms and files, put into honest drives; and what a replay makes of them."""
+"""Logs with faults by seed (sensors, clocks, transforms, files), made from drives without faults; and the outcome of their replay."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ import numpy as np
 from localization.cli import main
 from localization.evaluation.references import read_reference_file, reference_track
 from localization.logs import open_log
-from localization.logs.serialization import Decoder
+from localization.logs.serialization import LogDeserializer
 from localization.logs.sources import open_source
 from localization.trajectory import read_tum
 from motion_models.robot import load_robot
@@ -42,7 +42,7 @@ _MOST_BYTES = 4 << 30  # of address space: numba, gtsam and the log itself take 
 
 
 class Source(NamedTuple):
-    """An honest drive."""
+    """A drive without faults."""
 
     name: str
     robot: str
@@ -69,7 +69,7 @@ def _recorded(path: Path, robot: str, begin_s: float, topics: Iterable[str]) -> 
     """`DRIVE_S` seconds of a real log, as messages."""
     source = open_source(path)
     used = [channel for channel in source.channels if channel.topic in set(topics)]
-    decode = Decoder(used, is_ros1=source.is_ros1)
+    decode = LogDeserializer(used, is_ros1=source.is_ros1)
     first = source.start_ns + int(begin_s * S)
     found = []
     for raw in source.messages([channel.topic for channel in used]):
@@ -235,24 +235,25 @@ class Outcome(NamedTuple):
     """survived, reported, refused, or what must not be: wrong, traceback, hang, memory."""
     error_m: float
     sigmas: float
-    said: str
+    message: str
+    """Warnings that the drive without the fault does not give, or the error."""
 
 
 BAD = ("wrong", "traceback", "hang", "memory")
 
 
-def truth_of(source: str, folder: Path) -> Path:
-    """A TUM file to score a source's drives against: its own reference, or, for lack of one, what an honest log gives."""
+def reference_of(source: str, folder: Path) -> Path:
+    """A TUM file to score a source's drives against: its own reference, else the estimate from the log without faults."""
     path = folder / f"{source}.tum"
     if not path.exists():
         found = next(s for s in SOURCES if s.name == source)
         log = bags.write_mcap(folder / f"{source}.mcap", copied(found))
-        out = folder / f"{source}-honest"
+        out = folder / f"{source}-without-fault"
         with contextlib.redirect_stdout(io.StringIO()):
             code = main(["replay", str(log), "--robot", found.robot, "--out", str(out), "--model", "skid_steer", "--estimator", "ekf"])
         assert code == 0
-        honest = json.loads((out / "metrics.json").read_text())["notes"]
-        path.with_suffix(".json").write_text(json.dumps([_without_numbers(note) for note in honest]))
+        notes = json.loads((out / "metrics.json").read_text())["notes"]
+        path.with_suffix(".json").write_text(json.dumps([_without_numbers(note) for note in notes]))
         if found.reference:
             track = reference_track(open_log(log, load_robot(found.robot)).references(found.reference), found.reference)
             assert track.yaws is not None
@@ -265,7 +266,7 @@ def truth_of(source: str, folder: Path) -> Path:
 
 
 def run_case(log: Path, robot: str, truth: Path, out: Path) -> Outcome:
-    """Replay by the EKF, as a user would, and hold its end against the truth."""
+    """Replay by the EKF from the command line, and compare the last pose with the reference ``truth``."""
     printed, complaints = io.StringIO(), io.StringIO()
     arguments = [
         "replay",
@@ -289,20 +290,19 @@ def run_case(log: Path, robot: str, truth: Path, out: Path) -> Outcome:
     except BaseException:
         return Outcome("traceback", math.nan, math.nan, traceback.format_exc(limit=-3))
     if code != 0:
-        is_told = complaints.getvalue().startswith("skidloc: ")
-        return Outcome("refused" if is_told else "traceback", math.nan, math.nan, complaints.getvalue().strip())
-    honest = json.loads(truth.with_suffix(".json").read_text())
-    warnings = [n for n in json.loads((out / "metrics.json").read_text())["notes"] if _without_numbers(n) not in honest]
+        is_input_error = complaints.getvalue().startswith("skidloc: ")
+        return Outcome("refused" if is_input_error else "traceback", math.nan, math.nan, complaints.getvalue().strip())
+    usual = json.loads(truth.with_suffix(".json").read_text())
+    warnings = [n for n in json.loads((out / "metrics.json").read_text())["notes"] if _without_numbers(n) not in usual]
     error_m, sigmas = _end_error(out, truth)
     is_right = error_m <= FAR_M and sigmas <= MOST_SIGMA
-    said = " | ".join(warnings)
     if warnings:
-        return Outcome("survived" if is_right else "reported", error_m, sigmas, said)
-    return Outcome("survived" if is_right else "wrong", error_m, sigmas, said)
+        return Outcome("survived" if is_right else "reported", error_m, sigmas, " | ".join(warnings))
+    return Outcome("survived" if is_right else "wrong", error_m, sigmas, " | ".join(warnings))
 
 
 def _without_numbers(note: str) -> str:
-    """A note that an honest drive gives too is no warning of a fault, however many messages it counts."""
+    """``note`` with its numbers replaced: a note that a drive without faults gives too, of other counts, is no warning of a fault."""
     return re.sub(r"[0-9.]+", "#", note)
 
 
@@ -329,7 +329,7 @@ def _relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _end_sigma_m(out: Path) -> float:
     """The last claimed position's standard deviation [m], of the larger axis."""
     source = open_source(out / "fused.mcap")
-    decode = Decoder(source.channels, is_ros1=False)
+    decode = LogDeserializer(source.channels, is_ros1=False)
     last = None
     for raw in source.messages(["/skid_steer_ekf/odometry"]):
         last = raw

@@ -162,7 +162,7 @@ def run_node(
 
 
 def reseal(state: Path, name: str, value: object) -> None:
-    """``value`` for what the state's head tells of ``name``, with a check sum that is right."""
+    """Replace ``name`` in the header of a state file by ``value``, with a valid check sum."""
     magic, _, head, rest = state.read_bytes().split(b"\n", 3)
     body = json.dumps({**json.loads(head), name: value}).encode() + b"\n" + rest
     state.write_bytes(b"\n".join([magic, hashlib.sha256(body).hexdigest().encode(), body]))

@@ -50,7 +50,7 @@ def drive(
     seed: int = 0,
     spoil: Callable[[int, Any, int], tuple[Any, int] | None] = lambda number, scan, log_ns: (scan, log_ns),
 ) -> list[bags.Record]:
-    """Wheels at 50 Hz, scans at 10 Hz, truth at 10 Hz. ``multiplier``: how much more the wheels differ than their track says.
+    """Wheels at 50 Hz, scans at 10 Hz, truth at 10 Hz. ``multiplier``: how much more the wheels differ than by their track.
 
     ``spoil`` gets the number of each scan, the scan and its time of recording, and gives back what is recorded instead.
     """
@@ -78,13 +78,13 @@ def drive(
 WALL_START_NS = 1_000_000_000
 _STEP_S = 0.002
 _WHEEL_EVERY = 10  # steps: 50 Hz
-_SLIP_S = 0.5  # slip lasts for about so long: wheels meet one patch of floor, then another
+_SLIP_S = 0.5  # correlation time of slip: wheels roll from one patch of floor to another
 ROBOT = load_robot("vaultbot")
 
 
 @dataclass(frozen=True)
 class Beams:
-    """A planar scanner: a SICK LMS511 at its full resolution, whose mirror turns on where it does not look."""
+    """A planar scanner: a SICK LMS511 at its full resolution, whose mirror also turns outside of its field of view."""
 
     beams: int = 760
     view: float = math.radians(190.0)

@@ -1,4 +1,4 @@
-"""Steps from an independent generator: a true robot whose parameters, noise and sensors are drawn from what the estimators believe.
+"""Steps from an independent generator: a true robot whose parameters, noise and sensors are drawn from the priors of the estimators.
 
 Nothing here uses the estimators' own prediction: the truth is composed from small intervals with slip drawn in each, and what a Step says
 comes from `Synchronizer`'s own parts (`integrate_twists`) at the parameters that the estimator hands back.
@@ -46,7 +46,7 @@ class Noise:
 
 
 class PoseSensor:
-    """In place of `ScanMatchingSensor`: poses with noise of a covariance that it knows, in a submap that is exact."""
+    """In place of `ScanMatchingSensor`: poses with noise of a given covariance, in an exact submap."""
 
     cell = 0.0  # no voxels, and so no loops
     sweep_s = 0.0  # poses at one instant
@@ -55,7 +55,7 @@ class PoseSensor:
         self.next: ScanMatch | None = None
         self.lost = LostScans()
 
-    def measure(self, step, prior, cov, twist):
+    def measure(self, step, prior, cov, twist, jump):
         return self.next
 
     def refine(self, match, twist):
@@ -117,9 +117,10 @@ class World:
 
     def first(self) -> Step:
         none = Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, len(self.model.param_names))))
-        return Step(0, 0, none, np.zeros(3), np.zeros(3), False, True, None, self._scan(0))
+        return Step(0, 0, none, np.zeros(3), np.zeros(3), False, True, None, self.scan_at(0))
 
-    def _scan(self, stamp_ns: int) -> Scan | None:
+    def scan_at(self, stamp_ns: int) -> Scan | None:
+        """A scan without points; None for a robot without a LiDAR."""
         return Scan(stamp_ns, np.zeros((0, 3))) if self.has_lidar else None
 
     def _rates(self, begin: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -147,7 +148,7 @@ class World:
             delta = se2.compose(delta, se2.compose(se2.exp(xi * h), se2.exp(rng.normal(size=3) * np.sqrt(var))))
         self.pose = se2.compose(self.pose, delta)
 
-        # the log's wheels: at stamp s they tell the rates of true time s - clock; the reader adds its own belief
+        # the log's wheels: at stamp s they have the rates of true time s - clock; the reader adds its own estimate
         shifted = self.t + clock_offset - self.clock
         dt, rates, cg = self._rates(shifted)
         twist = self.model.twist(rates, cg, params)
@@ -170,7 +171,7 @@ class World:
         self.correction = self.correction + self._walk @ rng.normal(size=len(self.correction)) * math.sqrt(DT)
         if self.belief is not None:
             self.clock += rng.normal(0.0, self.belief.clock_walk_s_per_sqrt_s * math.sqrt(DT))
-        return Step(*stamps, predicted, d_clock, twist.value[-1], False, True, turn, self._scan(stamps[1])), match
+        return Step(*stamps, predicted, d_clock, twist.value[-1], False, True, turn, self.scan_at(stamps[1])), match
 
 
 def drive(world: World, estimator: Estimator, sensor: PoseSensor, steps: int):

@@ -33,7 +33,7 @@ def brute_scores(image, points: np.ndarray, pose: np.ndarray) -> float:
     return float(image.levels[0][tuple(at[is_inside].T)].sum() / len(points))
 
 
-def test_image_is_one_at_points_and_falls_off_over_a_cell() -> None:
+def test_draw_image_is_one_at_points_and_decays() -> None:
     points = np.random.default_rng(0).uniform(-1.0, 1.0, (40, 2))
     image = draw_image(points, CELL)
     centres = image.origin + CELL * (np.indices(image.levels[0].shape).reshape(2, -1).T + 0.5)
@@ -47,7 +47,7 @@ def test_image_is_one_at_points_and_falls_off_over_a_cell() -> None:
     assert found.max() <= 1.0
 
 
-def test_coarse_scores_are_never_below_the_fine_ones_within() -> None:
+def test_search_coarse_scores_bound_fine_scores() -> None:
     image, rng = image_of(LAB), np.random.default_rng(1)
     points = se2.transform(np.array([0.3, -0.2, 0.4]), voxel_means(rooms.scan_from(LAB, np.zeros(3), rng), CELL)) - image.origin
     turned, rows = points[None], np.zeros(300, int)
@@ -62,7 +62,7 @@ def test_coarse_scores_are_never_below_the_fine_ones_within() -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_search_finds_the_best_of_all_poses(seed: int) -> None:
+def test_search_equals_exhaustive_search(seed: int) -> None:
     """Every cell and yaw of the window, scored one by one, with the prior."""
     rng, image = np.random.default_rng(seed), image_of(HALL)
     points = voxel_means(rooms.scan_from(HALL, np.array([0.1, -0.1, 0.2]), rng), CELL)
@@ -80,7 +80,7 @@ def test_search_finds_the_best_of_all_poses(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_search_of_a_wide_window_finds_the_robot(seed: int) -> None:
+def test_search_of_wide_window_finds_the_pose(seed: int) -> None:
     """Sigmas of 1.5 m and .5 rad: 4.5 m and 1.5 rad to either side."""
     rng = np.random.default_rng(seed)
     true = np.array([0.2, 0.1, -0.1])
@@ -93,7 +93,7 @@ def test_search_of_a_wide_window_finds_the_robot(seed: int) -> None:
     assert found.rival_score < 0.9 * found.score
 
 
-def test_search_stays_inside_its_limit() -> None:
+def test_search_with_limit_stays_inside() -> None:
     true = np.array([0.2, 0.1, -0.1])
     points = voxel_means(rooms.scan_from(HALL, true, np.random.default_rng(0)), CELL)
     limit, prior, step = np.array([0.4, 0.4, 0.1]), np.array([2.2, 0.1, -0.1]), np.array([4 * CELL, 4 * CELL, 0.05])
@@ -110,19 +110,19 @@ def square(seed: int, spread: float) -> SearchResult:
     )
 
 
-def test_rival_of_a_square_room_is_as_good_as_the_best() -> None:
+def test_search_in_square_room_has_equal_rival() -> None:
     result = square(0, 0.8)
     assert result.rival_score > 0.9 * result.score
     result = square(0, 0.05)
     assert result.rival_score < 0.9 * result.score
 
 
-def test_scan_of_another_place_scores_low() -> None:
+def test_search_of_another_place_scores_low() -> None:
     points = voxel_means(rooms.scan_from(LAB, np.array([0.5, 0.3, 0.7]), np.random.default_rng(0)), CELL)
     assert search(image_of(HALL), points, np.zeros(3), np.diag([0.5, 0.5, 0.3]) ** 2, ANYWHERE).score < 0.5
 
 
-def test_levels_of_the_image_are_maxima_of_blocks_and_their_neighbours() -> None:
+def test_draw_image_levels_are_maxima_of_neighbouring_blocks() -> None:
     image = draw_image(np.random.default_rng(0).uniform(-3.0, 3.0, (200, 2)), 0.1)
     for fine, coarse in itertools.pairwise(image.levels):
         blocks = np.pad(fine.reshape(fine.shape[0] // COARSE, COARSE, fine.shape[1] // COARSE, COARSE).max((1, 3)), 1)

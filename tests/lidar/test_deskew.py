@@ -37,7 +37,7 @@ def test_deskew_moves_each_point_by_its_own_time() -> None:
     np.testing.assert_array_equal(found[:, 2], body[:, 2])
 
 
-def test_deskewed_walls_are_straight() -> None:
+def test_deskew_makes_walls_straight() -> None:
     """A turning robot in a room: with the sweep's own times the walls are straight; with none, or as if the sweep filled all of the scan's
     period, they are not."""
     drive = rooms.drive_through(world.box(-4, -3, 5, 3), rooms.path((1.0, 0.3, 1.0)), 0, noise=NO_SLIP, scanner=rooms.Beams(noise=0.0))
@@ -55,7 +55,7 @@ def test_deskewed_walls_are_straight() -> None:
     assert rms_from_walls(scan.offsets / fill) > 0.01
 
 
-def test_wrong_twist_does_not_turn_a_sweep_about_its_middle() -> None:
+def test_deskew_with_wrong_twist_does_not_turn_the_sweep() -> None:
     """Points all around, a twist that errs by 0.1 rad/s over 0.1 s: about the start, the mean turn would be 5 mrad."""
     angles = np.linspace(-math.pi, math.pi, 361)
     points = np.column_stack([5.0 * np.cos(angles), 5.0 * np.sin(angles), np.zeros(361)])
@@ -67,7 +67,7 @@ def test_wrong_twist_does_not_turn_a_sweep_about_its_middle() -> None:
     assert sweep.displacement(np.array([0.0, 0.0, 0.1])) == pytest.approx(0.1 * 0.1 * 5.0, rel=1e-6)
 
 
-def test_deskew_without_times_or_motion_leaves_points() -> None:
+def test_deskew_without_times_or_motion_keeps_points() -> None:
     points = np.random.default_rng(0).normal(size=(5, 3))
     still = Sweep.from_scan(Scan(0, points, np.linspace(0.0, 0.1, 5)), Mount())
     np.testing.assert_array_equal(still.deskew(np.zeros(3)), points)
@@ -77,7 +77,7 @@ def test_deskew_without_times_or_motion_leaves_points() -> None:
 
 
 @pytest.mark.parametrize("times", [True, False])
-def test_points_that_are_not_finite_are_left_out(times: bool) -> None:
+def test_sweep_with_infinite_points_leaves_them_out(times: bool) -> None:
     points = np.ones((6, 3))
     points[1, 0], points[3, 2], points[4, 1] = math.nan, math.inf, -math.inf
     sweep = Sweep.from_scan(Scan(0, points, np.arange(6.0) if times else np.empty(0)), Mount(x=1.0))
@@ -86,14 +86,14 @@ def test_points_that_are_not_finite_are_left_out(times: bool) -> None:
     assert Sweep.from_scan(Scan(0, np.full((4, 3), math.nan)), Mount()).deskew(np.ones(3)).shape == (0, 3)
 
 
-def test_within_keeps_points_in_range() -> None:
+def test_sweep_within_keeps_points_in_range() -> None:
     points = np.array([[0.05, 0.0, 0.0], [1.0, 0.0, 0.0], [60.0, 0.0, 0.0], [0.0, 2.0, 1.0]])
     sweep = Sweep.from_scan(Scan(0, points, np.arange(4.0)), Mount()).within(0.1, 50.0)
     np.testing.assert_array_equal(sweep.points, points[[1, 3]])
     np.testing.assert_array_equal(sweep.times, [-0.5, 1.5])
 
 
-def test_walls_are_means_of_cells_that_span_a_height() -> None:
+def test_extract_walls_gives_means_of_high_cells() -> None:
     points, cell, height = rooms.cloud(LAB, np.zeros(3), 0), 0.2, 0.3
     cells: dict[tuple[int, int], list[np.ndarray]] = defaultdict(list)
     for p in points:

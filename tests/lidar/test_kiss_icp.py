@@ -31,7 +31,7 @@ def test_register_frame_follows_the_robot() -> None:
     assert np.abs(se2.log(se2.between(POSES, found))).max() < 0.03
 
 
-def test_align_reaches_the_pose_from_a_prior() -> None:
+def test_align_from_prior_reaches_the_pose() -> None:
     kiss, scans = KissIcp(0.3, 50.0), frames()
     for scan, pose in zip(scans[:10], POSES, strict=False):
         kiss.insert(scan, pose)
@@ -42,7 +42,7 @@ def test_align_reaches_the_pose_from_a_prior() -> None:
     assert error[2] < 0.005
 
 
-def test_state_is_resumed_bit_by_bit() -> None:
+def test_kiss_icp_deserialized_equals_original_bitwise() -> None:
     kiss, scans = KissIcp(0.3, 50.0), frames()
     for scan in scans[:12]:
         kiss.register_frame(scan)
@@ -51,7 +51,7 @@ def test_state_is_resumed_bit_by_bit() -> None:
         np.testing.assert_array_equal(kiss.register_frame(scan), again.register_frame(scan))
 
 
-def test_threshold_is_that_of_kiss_icp() -> None:
+def test_adaptive_threshold_equals_kiss_icps() -> None:
     from kiss_icp.config import load_config
 
     config = load_config(None)
@@ -67,7 +67,7 @@ def test_threshold_is_that_of_kiss_icp() -> None:
         assert ours.get_threshold() == pytest.approx(theirs.get_threshold(), rel=1e-9)
 
 
-def test_environment_variables_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kiss_icp_ignores_environment_variables(monkeypatch: pytest.MonkeyPatch) -> None:
     scans = frames()
     plain = KissIcp(0.3, 50.0)
     monkeypatch.setenv("KISS_ICP_MAPPING", '{"voxel_size": 3.0}')
@@ -78,7 +78,7 @@ def test_environment_variables_change_nothing(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize(("median_m", "voxel_m"), [(1.0, 0.1), (4.0, 0.2), (100.0, 1.0)])
-def test_voxel_is_a_share_of_the_median_range(median_m: float, voxel_m: float) -> None:
+def test_choose_voxel_size_is_share_of_median_range(median_m: float, voxel_m: float) -> None:
     angles = np.linspace(0.0, 6.0, 101)
     ranges = median_m * np.linspace(0.5, 1.5, 101)
     assert choose_voxel_size(np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])) == pytest.approx(voxel_m)

@@ -44,7 +44,7 @@ def there_and_back(
 
 
 @pytest.mark.parametrize("drift", [np.zeros(3), np.array([0.5, -0.3, 0.08])])
-def test_place_that_is_visited_again_is_found_with_its_pose(drift: np.ndarray) -> None:
+def test_detect_at_revisited_place_gives_its_pose(drift: np.ndarray) -> None:
     frames = there_and_back(LAB, LAB)
     truth = np.array([pose for pose, _ in frames])
     poses = truth.copy()
@@ -58,14 +58,14 @@ def test_place_that_is_visited_again_is_found_with_its_pose(drift: np.ndarray) -
     assert len({(loop.a, loop.b) for loop in found}) == len(found)
 
 
-def test_first_trial_alone_closes_nothing() -> None:
+def test_detect_without_confirmation_closes_no_loop() -> None:
     """A second one has to agree."""
     frames = there_and_back(LAB, LAB)[:39]
     assert detect(frames, np.array([pose for pose, _ in frames]), NEAR) == []
 
 
 @pytest.mark.parametrize("is_unsure", [True, False])
-def test_rooms_that_are_alike_close_a_loop_only_where_the_graph_tells_them_apart(is_unsure: bool) -> None:
+def test_detect_in_equal_rooms_uses_the_graphs_covariance(is_unsure: bool) -> None:
     """Two equal rooms, 2.8 m apart, both visited before; a third visit is in one of them."""
     room = world.box(-1.3, -1.3, 1.3, 1.3)
     pair = np.concatenate([room, room + np.array([2.8, 0.0, 2.8, 0.0, 0.0])])
@@ -75,25 +75,25 @@ def test_rooms_that_are_alike_close_a_loop_only_where_the_graph_tells_them_apart
     assert bool(found) is not is_unsure
 
 
-def test_room_that_is_another_closes_no_loop() -> None:
+def test_detect_in_another_room_closes_no_loop() -> None:
     """Where the graph takes the one for the other: another furniture, another size."""
     other = np.concatenate([world.box(-3, -2.5, 3.5, 3.0), world.pillar(1.5, 2.0), world.box(-3, 1, -2, 3.0)])
     frames = there_and_back(LAB, other)
     assert detect(frames, np.array([pose for pose, _ in frames]), NEAR) == []
 
 
-def test_corridor_closes_no_loop_along_which_it_is_open() -> None:
+def test_detect_in_open_corridor_closes_no_loop() -> None:
     walls = np.concatenate([world.line(-60, -1.2, 60, -1.2), world.line(-60, 1.2, 60, 1.2)])
     frames = there_and_back(walls, walls)
     assert detect(frames, np.array([pose for pose, _ in frames]), WIDE) == []
 
 
-def test_keyframes_that_follow_one_another_are_no_loop() -> None:
+def test_detect_among_successive_keyframes_closes_no_loop() -> None:
     frames = visit(LAB, 8, 1) * 3
     assert detect(frames, np.array([pose for pose, _ in frames]), NEAR) == []
 
 
-def test_scans_without_points_close_no_loops_and_spoil_none() -> None:
+def test_detect_with_empty_scans_closes_only_true_loops() -> None:
     frames = there_and_back(LAB, LAB)
     truth = np.array([pose for pose, _ in frames])
     for k in (2, 40, 43):
@@ -104,7 +104,7 @@ def test_scans_without_points_close_no_loops_and_spoil_none() -> None:
 
 
 @pytest.mark.parametrize("cov", [NEAR, WIDE])
-def test_search_finds_the_same_where_only_what_it_reaches_is_drawn(cov: np.ndarray) -> None:
+def test_within_reach_leaves_search_result_unchanged(cov: np.ndarray) -> None:
     rng = np.random.default_rng(3)
     place = np.vstack([rooms.scan_from(LAB, np.zeros(3), rng), rng.uniform(-60.0, 60.0, (500, 2))])
     points, prior = rooms.scan_from(LAB, np.array([0.4, 0.2, 0.1]), rng, beams=180), np.array([0.3, 0.3, 0.12])

@@ -8,7 +8,7 @@ import pytest
 
 from localization.comparison.jobs import _scores
 from localization.comparison.summary import closing, find
-from localization.comparison.table import Table
+from localization.comparison.table import ResultTable
 from localization.evaluation.scores import score
 from localization.lidar import LostScans
 from localization.lidar.losses import LidarLosses, per_cent
@@ -18,8 +18,8 @@ from localization.report.runs import best_run, plotted_runs
 from localization.report.summary import verdict
 from localization.ros.diagnostics import ERROR, OK, WARN, Health
 from motion_models.registry import make_model
+from tests.helpers.report import HEAD, relations, run, track
 from tests.helpers.rooms import ROBOT
-from tests.report.test_replay_page import HEAD, relations, run, track
 
 S = 10**9
 ALL_LOST = LidarLosses(1000, 400, 0.6, 60.0, 7.0, 0.0, {"lost": 600})
@@ -60,7 +60,7 @@ def test_losses_of_a_lidar_that_dies_are_described_and_long() -> None:
     assert losses.numbers()["silences"] == 1
 
 
-def test_losses_without_lost_scans_are_silent() -> None:
+def test_describe_without_lost_scans_is_empty() -> None:
     losses = LidarLosses.of(counted("mmmm"))
     assert losses.describe() == losses.advice == ""
     assert not losses.is_long
@@ -156,11 +156,11 @@ def test_rows_of_a_comparison_are_numbers_that_the_table_reads_again(tmp_path) -
     scores = _scores(result.metrics(200.0, with_timing=False))
     assert (scores["lidar_lost_share"], scores["lidar_longest_lost_s"], scores["lidar_longest_lost_since_s"]) == (0.6, 60.0, 7.0)
     assert not any(isinstance(value, dict) for value in scores.values())
-    table = Table(tmp_path / "table.csv")
+    table = ResultTable(tmp_path / "table.csv")
     head = {"log": "a", "robot": "r", "model": "m", "estimator": "graph", "corrections": "", "key": "k", "status": "ok", "error": ""}
     table.put([{**head, **scores}])
     table.save([])
-    assert Table(tmp_path / "table.csv").path.exists()
+    assert ResultTable(tmp_path / "table.csv").path.exists()
 
 
 @pytest.mark.parametrize(
@@ -184,7 +184,7 @@ def test_diagnostics_level_follows_lost_scans(matched: str, level: int, message:
     assert {"lost_share", "longest_lost_s", "lost_now_s"} <= set(status.values)
 
 
-def test_notes_of_core_say_what_was_lost_and_what_to_do() -> None:
+def test_pipeline_warnings_name_losses_and_remedy() -> None:
     pipeline = Pipeline(Trial(make_model("skid_steer", ROBOT), "ekf"), ROBOT, {}, has_lidar=True)
     assert pipeline.estimator.lost is not None
     vars(pipeline.estimator.lost).update(vars(counted("mmsm")))
@@ -195,7 +195,7 @@ def test_notes_of_core_say_what_was_lost_and_what_to_do() -> None:
     assert note.endswith("Check the LiDAR's driver.")
 
 
-def test_notes_of_dead_reckoning_say_nothing_of_the_lidar() -> None:
+def test_dead_reckoning_warnings_have_no_lidar() -> None:
     pipeline = Pipeline(Trial(make_model("diff_drive", ROBOT), "odometry"), ROBOT, {}, has_lidar=True)
     assert pipeline.lidar is None
     assert pipeline.warnings() == []

@@ -16,19 +16,19 @@ def scan(seed: int, n: int = 5) -> Scan:
     return Scan(0, np.random.default_rng(seed).normal(size=(n, 3)))
 
 
-def test_same_ranges_of_a_driving_robot_are_stale() -> None:
+def test_is_stale_with_same_ranges_while_driving_is_true() -> None:
     checks = StaleScans()
     found = [checks.is_stale(scan(seed), False) for seed in (0, 1, 1, 1, 2, 1)]
     assert found == [False, False, True, True, False, False]
 
 
-def test_same_ranges_of_a_standing_robot_are_not() -> None:
+def test_is_stale_with_same_ranges_at_rest_is_false() -> None:
     """As in a simulator without noise."""
     checks = StaleScans()
     assert not any(checks.is_stale(scan(0), True) for _ in range(5))
 
 
-def test_scanner_that_froze_on_the_way_stays_stale_when_the_robot_stands() -> None:
+def test_is_stale_after_freezing_on_the_way_stays_true_at_rest() -> None:
     checks = StaleScans()
     found = [
         checks.is_stale(scan(seed), standing) for seed, standing in ((0, False), (0, False), (0, True), (0, True), (1, True), (1, True))
@@ -36,12 +36,12 @@ def test_scanner_that_froze_on_the_way_stays_stale_when_the_robot_stands() -> No
     assert found == [False, True, True, True, False, False]
 
 
-def test_empty_scans_are_not_stale() -> None:
+def test_is_stale_with_empty_scans_is_false() -> None:
     checks = StaleScans()
     assert not any(checks.is_stale(scan(0, 0), False) for _ in range(3))
 
 
-def test_time_without_a_match_runs_from_match_to_match() -> None:
+def test_lost_scans_time_runs_from_match_to_match() -> None:
     lost = LostScans()
     matched = [True, True, False, False, True, True, False, True, True, False, False, False]
     for t, is_matched in enumerate(matched):
@@ -55,7 +55,7 @@ def test_time_without_a_match_runs_from_match_to_match() -> None:
     assert lost.longest == (3.0, 8.0)  # of two that are as long, the later
 
 
-def test_lidar_that_never_matches_is_lost_all_the_time() -> None:
+def test_lost_scans_without_match_share_is_one() -> None:
     lost = LostScans()
     for t in range(5):
         lost.add(t * S, "lost")
@@ -63,7 +63,7 @@ def test_lidar_that_never_matches_is_lost_all_the_time() -> None:
     assert lost.longest == (4.0, 0.0)
 
 
-def test_no_scan_or_one_is_no_time() -> None:
+def test_lost_scans_of_one_scan_have_no_time() -> None:
     lost = LostScans()
     assert (lost.share, lost.longest) == (0.0, (0.0, 0.0))
     lost.add(7 * S, "sparse")
@@ -71,7 +71,7 @@ def test_no_scan_or_one_is_no_time() -> None:
     assert lost.causes == {"sparse": 1}
 
 
-def test_no_scans_for_seconds_is_lost_until_they_come_back() -> None:
+def test_lost_scans_count_silence_until_next_scan() -> None:
     """Scans at 10 Hz until 2 s and from 7 s to 8 s; the last 4 s of 12 s without any."""
     lost, tenth = LostScans(), S // 10
     for k in range(120):
@@ -88,7 +88,7 @@ def test_no_scans_for_seconds_is_lost_until_they_come_back() -> None:
     assert lost.ongoing_s == pytest.approx(3.9)
 
 
-def test_gap_is_counted_when_the_next_scan_comes_without_steps_between() -> None:
+def test_lost_scans_count_gap_without_steps_between() -> None:
     """Also where that scan is not matched; gaps as they are between few scans are none."""
     lost = LostScans()
     for t in (0, 1, 2, 3, 9, 10):

@@ -49,7 +49,7 @@ def error_of(true: np.ndarray, pose: np.ndarray) -> np.ndarray:
 # --- the cost
 
 
-def test_gradient_is_that_of_the_cost_by_differences() -> None:
+def test_linearize_gradient_equals_cost_differences() -> None:
     """Geman-McClure's loss over distances from the nearest surfaces, computed here."""
     rng = np.random.default_rng(0)
     drawn = rooms.scan_from(LAB, np.zeros(3), rng)
@@ -83,7 +83,7 @@ def test_gradient_is_that_of_the_cost_by_differences() -> None:
 
 
 @pytest.mark.parametrize("walls", [LAB, HALL])
-def test_match_near_the_prior_is_millimetres_off(walls: np.ndarray) -> None:
+def test_match_near_prior_errs_by_millimetres(walls: np.ndarray) -> None:
     for seed in range(6):
         rng = np.random.default_rng(seed)
         matcher, true = mapped(walls, rng, (rng.uniform(-2, 0), rng.uniform(-1, 1), rng.uniform(-3, 3)))
@@ -96,7 +96,7 @@ def test_match_near_the_prior_is_millimetres_off(walls: np.ndarray) -> None:
         assert not found.outlier_cov.any()
 
 
-def test_match_from_a_wide_prior_is_searched() -> None:
+def test_match_from_wide_prior_is_searched() -> None:
     """Sigmas of 1 m and .3 rad, far beyond Gauss-Newton's basin."""
     (matcher, true), right = lab(), 0
     for seed in range(12):
@@ -108,7 +108,7 @@ def test_match_from_a_wide_prior_is_searched() -> None:
 
 
 @pytest.mark.parametrize("off", [(0.5, 0.0, 0.0), (-0.35, 0.35, 0.0), (0.0, 0.0, 0.2), (0.35, -0.35, -0.2), (1.0, 0.0, 0.0)])
-def test_prior_that_is_an_outlier_is_overruled(off: tuple[float, float, float]) -> None:
+def test_match_with_outlier_prior_overrules_it(off: tuple[float, float, float]) -> None:
     """10 to 50 sigma off: the match says by how much wider the prior has to be."""
     matcher, true = lab()
     prior, cov = se2.compose(true, np.array(off)), np.diag([0.02, 0.02, 0.01]) ** 2
@@ -123,14 +123,14 @@ def test_prior_that_is_an_outlier_is_overruled(off: tuple[float, float, float]) 
 
 @pytest.mark.parametrize("off", [(4.0, 2.0, 0.8), (0.0, 0.0, 1.6), (30.0, 0.0, 0.0)])
 @pytest.mark.parametrize("sigma", [0.02, 0.5])
-def test_hopeless_prior_gives_no_wrong_pose(off: tuple[float, float, float], sigma: float) -> None:
+def test_match_with_hopeless_prior_gives_no_wrong_pose(off: tuple[float, float, float], sigma: float) -> None:
     matcher, true = lab()
     cov = np.diag([sigma, sigma, 0.4 * sigma]) ** 2
     found = matcher.match(rooms.scan_from(LAB, true, np.random.default_rng(0)), se2.compose(true, np.array(off)), cov)
     assert found is None or np.hypot(*error_of(true, found.pose)[:2]) < 0.01
 
 
-def test_scan_of_another_place_is_lost() -> None:
+def test_match_of_another_place_is_lost() -> None:
     matcher, true = lab()
     elsewhere = rooms.scan_from(HALL, np.array([0.5, 0.5, 1.0]), np.random.default_rng(0))
     assert matcher.match(elsewhere, true, NARROW) is None
@@ -144,12 +144,12 @@ def one_place(walls: np.ndarray, cov: np.ndarray) -> ScanMatch | None:
     return matcher.match(rooms.scan_from(walls, np.zeros(3), rng), np.zeros(3), cov)
 
 
-def test_place_that_is_ambiguous_is_lost() -> None:
+def test_match_in_ambiguous_place_is_lost() -> None:
     """Turns of a quarter look alike in a square room."""
     assert one_place(world.box(-3.0, -3.0, 3.0, 3.0), np.diag([0.3, 0.3, 1.0]) ** 2) is None
 
 
-def test_wide_prior_in_a_bare_corridor_stays_open() -> None:
+def test_match_with_wide_prior_in_corridor_stays_open() -> None:
     found = one_place(CORRIDOR, WIDE)
     assert found is None or np.sqrt(np.linalg.eigvalsh(found.cov)[-1]) > 1.0
 
@@ -157,7 +157,7 @@ def test_wide_prior_in_a_bare_corridor_stays_open() -> None:
 # --- what the scan alone measures
 
 
-def test_measured_does_not_depend_on_the_prior() -> None:
+def test_match_measured_is_independent_of_prior() -> None:
     """Priors 10 mm off that are as sure as the scan or surer: the pose gives way to them by up to 15 sigma, the measured pose by a tenth of
     that, as surfaces are associated where the pose is."""
     matcher, true = lab()
@@ -192,7 +192,7 @@ def matches(walls: np.ndarray, noise: float, n: int = 24) -> tuple[np.ndarray, n
 
 
 @pytest.mark.parametrize(("walls", "noise"), [(LAB, 0.005), (LAB, 0.03), (HALL, 0.012)])
-def test_covariance_is_that_of_the_errors(walls: np.ndarray, noise: float) -> None:
+def test_match_cov_equals_scatter_of_errors(walls: np.ndarray, noise: float) -> None:
     """Against a submap of true poses, whatever the noise of the scanner. The surfaces are averaged over voxels and their noise is an upper
     bound, so the scan may be up to twice as good as it says, in the mean of squares; it must not be worse."""
     errors, covs = matches(walls, noise)
@@ -201,7 +201,7 @@ def test_covariance_is_that_of_the_errors(walls: np.ndarray, noise: float) -> No
 
 
 @pytest.mark.parametrize(("walls", "start"), [(CORRIDOR, (0.0, 0.2, 0.4)), (CORRIDOR, (0.0, 0.0, 1.5)), (WALL, (0.0, 0.0, 0.3))])
-def test_covariance_is_open_along_walls_that_hold_nothing(walls: np.ndarray, start: tuple[float, float, float]) -> None:
+def test_match_cov_along_bare_walls_is_open(walls: np.ndarray, start: tuple[float, float, float]) -> None:
     matcher, true = mapped(walls, np.random.default_rng(0), start)
     prior = se2.compose(true, np.array([0.05 * math.cos(true[2]), -0.05 * math.sin(true[2]), 0.0]))  # off along the walls
     found = matcher.match(rooms.scan_from(walls, true, np.random.default_rng(1)), prior, np.diag([0.1, 0.1, 0.02]) ** 2)
@@ -217,7 +217,7 @@ def test_covariance_is_open_along_walls_that_hold_nothing(walls: np.ndarray, sta
 
 
 @pytest.mark.parametrize("walls", [LAB, HALL])
-def test_covariance_is_not_open_in_a_room(walls: np.ndarray) -> None:
+def test_match_cov_in_a_room_is_closed(walls: np.ndarray) -> None:
     matcher, true = mapped(walls, np.random.default_rng(0))
     found = matcher.match(rooms.scan_from(walls, true, np.random.default_rng(1)), true, NARROW)
     assert found is not None
@@ -228,7 +228,7 @@ def test_covariance_is_not_open_in_a_room(walls: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("n", [1, 4])
-def test_share_of_a_key_scan_is_that_of_its_place(n: int) -> None:
+def test_insert_key_scan_share_is_that_of_its_place(n: int) -> None:
     """After n scans from one place, the next has a share of 1 / (n + 1). A little more, as noise
     moves some of its points to voxels that were empty."""
     rng, matcher = np.random.default_rng(0), ScanMatcher(LidarConfig(), CELL)
@@ -242,7 +242,7 @@ def test_share_of_a_key_scan_is_that_of_its_place(n: int) -> None:
     assert np.sqrt(np.linalg.eigvalsh(key.noise_cov).max()) < 0.01
 
 
-def test_submap_holds_the_last_key_scans_only() -> None:
+def test_submap_holds_last_key_scans_only() -> None:
     rng, matcher = np.random.default_rng(0), ScanMatcher(LidarConfig(key_scans=3), CELL)
     for k in range(5):
         matcher.insert_key_scan(np.array([10.0 * k, 0.0, 0.0]), rng.uniform(-1.0, 1.0, (100, 2)))
@@ -251,7 +251,7 @@ def test_submap_holds_the_last_key_scans_only() -> None:
 
 
 @pytest.mark.parametrize(("drift_m", "stays"), [(0.01, True), (0.03, False)])
-def test_old_key_scan_stays_while_drift_is_below_range_noise(drift_m: float, stays: bool) -> None:
+def test_submap_keeps_old_scan_while_drift_is_small(drift_m: float, stays: bool) -> None:
     """The noise of a range is 0.02 m. Three submaps' worth of old key scans stay at most."""
     rng, matcher = np.random.default_rng(0), ScanMatcher(LidarConfig(key_scans=2), CELL)
     for k in range(20):
@@ -262,7 +262,7 @@ def test_old_key_scan_stays_while_drift_is_below_range_noise(drift_m: float, sta
     assert matcher.points().shape == (800, 2)
 
 
-def test_drift_of_the_yaw_counts_by_the_range_of_the_points() -> None:
+def test_drift_variance_of_yaw_counts_by_range() -> None:
     """An error of 1 mrad moves walls at 5 m by 5 mm, at 50 m by 50 mm; the same error carried along to another place is no drift."""
     cov = np.diag([0.0, 0.0, 1e-6])
     key = KeyScan(np.zeros((1, 2)), np.zeros(3), np.zeros((3, 3)))
@@ -281,7 +281,7 @@ def test_drift_of_the_yaw_counts_by_the_range_of_the_points() -> None:
     [np.tile([[1.0, 1.0]], (200, 1)), np.zeros((200, 2)), np.column_stack([np.linspace(30.0, 50.0, 50), np.zeros(50)])],
     ids=["one place", "the origin", "far away"],
 )
-def test_odd_points_give_no_confident_pose(points: np.ndarray) -> None:
+def test_match_of_odd_points_is_not_confident(points: np.ndarray) -> None:
     matcher, true = mapped(LAB, np.random.default_rng(7))
 
     def check(found: ScanMatch | None) -> None:

@@ -18,7 +18,7 @@ def scan(pose: np.ndarray, sensor: np.ndarray, rng: np.random.Generator) -> np.n
 
 @pytest.mark.parametrize("motion", [(0.1, 0.0, 0.0), (0.2, 0.0, 0.2), (0.0, 0.0, -0.6), (-0.3, 0.1, 0.05), (0.0, 0.0, 0.0)])
 @pytest.mark.parametrize("sensor", [(0.0, 0.0, 0.0), (0.4, -0.1, 0.7)])
-def test_motion_between_two_scans_is_that_of_the_body(motion: tuple, sensor: tuple) -> None:
+def test_register_between_scans_gives_body_motion(motion: tuple, sensor: tuple) -> None:
     rng, odometry, mount = np.random.default_rng(0), ScanOdometry(), np.array(sensor)
     assert odometry.register(scan(np.zeros(3), mount, rng), mount[:2]) is None
     found = odometry.register(scan(np.array(motion), mount, rng), mount[:2])
@@ -27,7 +27,7 @@ def test_motion_between_two_scans_is_that_of_the_body(motion: tuple, sensor: tup
     np.testing.assert_allclose(found.delta, motion, atol=0.02)
 
 
-def test_motion_along_a_corridor_is_unknown() -> None:
+def test_register_in_corridor_has_no_translation() -> None:
     rng, odometry = np.random.default_rng(0), ScanOdometry()
     with np.errstate(divide="ignore"):
         r = np.minimum(1.2 / np.abs(np.sin(ANGLES)), 200.0)
@@ -42,7 +42,7 @@ def test_motion_along_a_corridor_is_unknown() -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 50])
-def test_scan_with_too_few_points_gives_no_motion(n: int) -> None:
+def test_register_with_few_points_gives_none(n: int) -> None:
     rng, odometry = np.random.default_rng(0), ScanOdometry()
     points = scan(np.zeros(3), np.zeros(3), rng)
     odometry.register(points, np.zeros(2))
@@ -50,7 +50,7 @@ def test_scan_with_too_few_points_gives_no_motion(n: int) -> None:
     assert odometry.register(points, np.zeros(2)) is None
 
 
-def test_scan_of_another_place_gives_no_motion() -> None:
+def test_register_of_another_place_gives_none() -> None:
     rng, odometry = np.random.default_rng(0), ScanOdometry()
     odometry.register(scan(np.zeros(3), np.zeros(3), rng), np.zeros(2))
     elsewhere = rng.uniform(-8.0, 8.0, (360, 2))

@@ -34,7 +34,7 @@ def cells_of(points: np.ndarray, origin: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_voxel_means_are_those_of_grouped_points(seed: int) -> None:
+def test_voxel_means_equal_grouped_points(seed: int) -> None:
     points = scatter(seed)
     grid = make_grid(points, CELL, NOISE_M)
     cells, which = np.unique(cells_of(points, grid.origin), axis=0, return_inverse=True)
@@ -47,7 +47,7 @@ def test_voxel_means_are_those_of_grouped_points(seed: int) -> None:
 
 
 @pytest.mark.parametrize("reach", [0.05, 0.3, 2.0])
-def test_find_nearest_is_that_of_a_tree(reach: float) -> None:
+def test_find_nearest_equals_kd_tree(reach: float) -> None:
     points = scatter(0)
     grid, means = make_grid(points, CELL, NOISE_M), voxel_means(points, CELL)
     tree = cKDTree(means)
@@ -59,7 +59,7 @@ def test_find_nearest_is_that_of_a_tree(reach: float) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_surface_is_that_of_the_pooled_points(seed: int) -> None:
+def test_fill_surface_equals_pooled_points(seed: int) -> None:
     """Mean and least eigenvalue of the points in the nearest voxels of the smallest square of rings that has enough of them."""
     points = scatter(seed)
     grid, means = make_grid(points, CELL, NOISE_M), voxel_means(points, CELL)
@@ -82,7 +82,7 @@ def test_surface_is_that_of_the_pooled_points(seed: int) -> None:
         assert variance == pytest.approx(values[0] + NOISE_M**2, rel=1e-6)
 
 
-def test_surface_of_a_thick_wall_has_its_thickness() -> None:
+def test_fill_surface_of_thick_wall_has_its_thickness() -> None:
     rng, thickness = np.random.default_rng(0), 0.05
     across = rng.uniform(-0.5, 0.5, 20_000) * math.sqrt(12.0) * thickness
     wall = np.column_stack([rng.uniform(0.0, 4.0, 20_000), 0.2 + across])  # in one row of cells
@@ -94,14 +94,14 @@ def test_surface_of_a_thick_wall_has_its_thickness() -> None:
     assert np.abs(grid.surfaces[inner, 3]).min() > 0.99
 
 
-def test_surface_of_two_voxels_has_no_thickness() -> None:
+def test_fill_surface_of_two_voxels_has_no_thickness() -> None:
     grid = make_grid(np.array([[0.01, 0.01], [0.11, 0.01], [0.02, 0.03], [5.0, 5.0]]), CELL, NOISE_M)
     for v in range(len(grid.cells)):
         fill_surface(grid, v)
     assert np.isinf(grid.surfaces[:, 4]).all()
 
 
-def test_shares_are_those_of_counted_points() -> None:
+def test_measure_shares_equal_counted_points() -> None:
     rng = np.random.default_rng(2)
     mapped, scan = rng.uniform(-2.0, 2.0, (3000, 2)), rng.uniform(-1.0, 3.0, (500, 2))
     grid, drawn = make_grid(mapped, CELL, NOISE_M), make_grid(scan, CELL, NOISE_M)
@@ -116,7 +116,7 @@ def test_shares_are_those_of_counted_points() -> None:
 
 
 @pytest.mark.parametrize("copies", [1, 3, 9])
-def test_share_of_a_place_mapped_n_times_is_one_of_n_and_one(copies: int) -> None:
+def test_measure_shares_of_place_mapped_n_times_is_1_of_n_plus_1(copies: int) -> None:
     points = scatter(3)
     share, new = measure_shares(make_grid(np.tile(points, (copies, 1)), CELL, NOISE_M), make_grid(points, CELL, NOISE_M))
     assert share == pytest.approx(1.0 / (copies + 1))

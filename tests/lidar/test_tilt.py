@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from localization.events import Scan
-from localization.lidar.tilt import LidarTilt, ground
+from localization.lidar.tilt import LidarTilt, fit_ground
 from localization.simulation import world
 from motion_models.robot import Mount
 from tests.helpers import rooms
@@ -21,11 +21,11 @@ def tilted(pitch, scans: int = 24) -> LidarTilt:
     found = LidarTilt({"laser": Mount(z=0.8)})
     for k in range(scans):
         points = rooms.cloud(LAB, np.array([0.05 * k, 0.02 * k, 0.03 * k]), k, pitch(k)) - np.array([0.0, 0.0, 0.8])
-        found.see(Scan(k * 500_000_000, points, frame_id="laser", is_planar=False))
+        found.add(Scan(k * 500_000_000, points, frame_id="laser", is_planar=False))
     return found
 
 
-def test_clouds_that_are_tilted_are_told() -> None:
+def test_lidar_tilt_of_tilted_clouds_is_reported() -> None:
     assert tilted(lambda k: math.radians(0.4)).warnings() == []
     (note,) = tilted(lambda k: math.radians(3.0)).warnings()
     assert "by 3.0 deg (roll +0.0, pitch +3.0)" in note
@@ -36,23 +36,23 @@ def test_clouds_that_are_tilted_are_told() -> None:
     assert tilted(lambda k: math.radians(3.0), scans=9).warnings() == []  # a glimpse is not enough
 
 
-def test_a_mount_that_tells_the_tilt_is_believed() -> None:
+def test_lidar_tilt_with_tilted_mount_is_silent() -> None:
     points = rooms.cloud(LAB, np.zeros(3), 0, math.radians(5.0)) - np.array([0.0, 0.0, 0.8])
     found = LidarTilt({"laser": Mount(z=0.8, pitch=math.radians(5.0))})
     for k in range(12):
-        found.see(Scan(k * 500_000_000, points, frame_id="laser", is_planar=False))
+        found.add(Scan(k * 500_000_000, points, frame_id="laser", is_planar=False))
     assert found.warnings() == []
 
 
-def test_only_a_ground_is_taken_for_one() -> None:
+def test_fit_ground_of_no_ground_is_none() -> None:
     rng = np.random.default_rng(0)
     across = rng.uniform(-8.0, 8.0, (2000, 2))
     level = np.array([-0.8, 0.05, -0.1])
     flat = np.column_stack([across, level[0] + across @ level[1:] + 0.01 * rng.normal(size=2000)])
-    np.testing.assert_allclose(ground(flat), level, atol=0.01)
+    np.testing.assert_allclose(fit_ground(flat), level, atol=0.01)
     steep = np.column_stack([across, 0.5 * across[:, 0]])
     heap = np.column_stack([across, rng.uniform(-2.0, 2.0, 2000)])
     strip = flat[np.abs(across[:, 1]) < 0.5]
     shelf = np.concatenate([flat, flat[np.abs(across).max(axis=1) < 3.5] - [20.0, 0.0, 3.0]])  # there is more below
     for none in (np.empty((0, 3)), flat[:5], steep, heap, strip, shelf):
-        assert ground(none) is None
+        assert fit_ground(none) is None

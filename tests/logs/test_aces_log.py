@@ -1,4 +1,4 @@
-"""The shipped ACES log says what its source says, and the script that made it makes it again."""
+"""The shipped ACES log matches its source, and its script reproduces it."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def log() -> Log:
     return read_with_rosbags(BAG)
 
 
-def test_counts_and_times_are_those_of_the_source(log: Log) -> None:
+def test_aces_counts_and_times_match_the_source(log: Log) -> None:
     scans, odometry = stamps(log, "/scan"), stamps(log, "/odom")
     assert len(scans) == 7374
     assert len(odometry) == 7375
@@ -72,19 +72,19 @@ def test_counts_and_times_are_those_of_the_source(log: Log) -> None:
     assert (len(scans) - 1) / ((scans[-1] - scans[0]) * 1e-9) == pytest.approx(5.40, abs=0.005)
 
 
-def test_stamps_of_each_topic_rise_but_for_the_one_pair_that_repeats(log: Log) -> None:
+def test_aces_stamps_rise_except_one_repeated_pair(log: Log) -> None:
     assert np.diff(stamps(log, "/scan")).min() > 0
     steps = np.diff(stamps(log, "/odom"))
     assert steps.min() == 0
     assert [stamps(log, "/odom")[i] for i in np.flatnonzero(steps == 0)] == [1_380_220_000_000]
 
 
-def test_path_is_325_m_long(log: Log) -> None:
+def test_aces_path_is_325_m_long(log: Log) -> None:
     positions = np.array([[m.pose.pose.position.x, m.pose.pose.position.y] for _, m in log["/odom"]])
     assert np.hypot(*np.diff(positions, axis=0).T).sum() == pytest.approx(325.0, abs=0.5)
 
 
-def test_scan_and_frames(log: Log) -> None:
+def test_aces_scan_and_frames_match_the_source(log: Log) -> None:
     for _, scan in log["/scan"]:
         assert len(scan.ranges) == 180
         assert scan.header.frame_id == "laser"
@@ -110,7 +110,7 @@ def test_scan_and_frames(log: Log) -> None:
         (7373, 1_435_809_999_000, [1.52, 1.52, 1.57, 1.57], [1.02, 1.02, 1.02, 1.02]),
     ],
 )
-def test_ranges_are_those_of_the_text(log: Log, index: int, stamp_ns: int, first: list[float], last: list[float]) -> None:
+def test_aces_ranges_match_the_source_text(log: Log, index: int, stamp_ns: int, first: list[float], last: list[float]) -> None:
     """Literals copied from the text of the source: the first and the last four readings of three lines."""
     scan = log["/scan"][index][1]
     assert stamp(scan) == stamp_ns
@@ -126,7 +126,7 @@ def test_ranges_are_those_of_the_text(log: Log, index: int, stamp_ns: int, first
         (7374, 1_435_900_000_000, (-17.805700, -3.180960, 2.478771)),
     ],
 )
-def test_odometry_is_that_of_the_text(log: Log, index: int, stamp_ns: int, pose: tuple[float, float, float]) -> None:
+def test_aces_odometry_matches_the_source_text(log: Log, index: int, stamp_ns: int, pose: tuple[float, float, float]) -> None:
     message = log["/odom"][index][1]
     assert stamp(message) == stamp_ns
     assert (message.pose.pose.position.x, message.pose.pose.position.y) == pose[:2]
@@ -134,14 +134,14 @@ def test_odometry_is_that_of_the_text(log: Log, index: int, stamp_ns: int, pose:
     assert (message.twist.twist.linear.x, message.twist.twist.angular.z) == (0, 0)
 
 
-def test_both_times_of_each_relation_are_a_scan(log: Log) -> None:
+def test_aces_relation_times_are_scan_stamps(log: Log) -> None:
     times = np.loadtxt(BAG.with_suffix(".relations"), usecols=(0, 1))
     assert times.shape == (1279, 2)
     wanted = {round(t * 1e6) * 1000 for t in times.ravel()}
     assert wanted <= set(stamps(log, "/scan"))
 
 
-def test_an_independent_reader_reads_the_same(log: Log) -> None:
+def test_aces_independent_reader_gives_the_same_messages(log: Log) -> None:
     other = read_with_mcap(BAG)
     assert other.keys() == log.keys()
     for topic in ("/scan", "/odom"):
@@ -153,7 +153,7 @@ def test_an_independent_reader_reads_the_same(log: Log) -> None:
     assert [yaw(m) for _, m in other["/odom"]] == [yaw(m) for _, m in log["/odom"]]
 
 
-def test_the_script_makes_the_same_bytes_again_and_the_shipped_messages(log: Log, tmp_path: Path) -> None:
+def test_aces_script_reproduces_the_shipped_bytes(log: Log, tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     first, second = tmp_path / "a" / "aces.mcap", tmp_path / "b" / "aces.mcap"
@@ -175,7 +175,7 @@ def test_the_script_makes_the_same_bytes_again_and_the_shipped_messages(log: Log
     assert all(shipped_yaws[stamp(m)] == yaw(m) for _, m in made["/odom"])
 
 
-def test_messages_come_in_the_order_of_the_file(tmp_path: Path) -> None:
+def test_aces_messages_are_in_file_order(tmp_path: Path) -> None:
     """The excerpt holds places where the next line's time is earlier than the last one's."""
     out = tmp_path / "aces.mcap"
     assert make_bag(EXCERPT, out).returncode == 0
@@ -188,7 +188,7 @@ def test_messages_come_in_the_order_of_the_file(tmp_path: Path) -> None:
     assert [t for _, t in order] != sorted(t for _, t in order)
 
 
-def test_the_script_does_not_overwrite(tmp_path: Path) -> None:
+def test_aces_script_existing_output_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "aces.mcap"
     out.write_text("mine")
     done = make_bag(EXCERPT, out)

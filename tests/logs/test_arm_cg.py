@@ -57,7 +57,7 @@ URDF = (Path(urdf_reference.__file__).parents[2] / "motion_models" / "robots" / 
 
 
 @pytest.mark.parametrize("format_", ["ros1", "mcap"])
-def test_the_centre_of_gravity_follows_the_arms(tmp_path: Path, format_: str) -> None:
+def test_arm_cg_moving_joints_move_the_cg(tmp_path: Path, format_: str) -> None:
     records: list[Record] = [("/joint_states", both(START + i * STEP, i), START + i * STEP) for i in range(40)]
     log = open_log(bags.FORMATS[format_](tmp_path / "run", records), ROBOT)
     events = list(log.events())
@@ -76,8 +76,8 @@ def test_the_centre_of_gravity_follows_the_arms(tmp_path: Path, format_: str) ->
     assert info.parts["center_of_gravity"] == {"topic": "/joint_states", "kind": "joint_states", "chosen_by": "arms"}
 
 
-def test_arms_that_are_told_apart_from_the_wheels_and_from_each_other(tmp_path: Path) -> None:
-    """Left arm on its own topic, right arm on that of the wheels and even at their stamps; CGs begin once both arms were told."""
+def test_arm_cg_joints_of_arms_and_wheels_are_separated(tmp_path: Path) -> None:
+    """Left arm on its own topic, right arm on that of the wheels and even at their stamps; CGs begin once both arms were published."""
     records: list[Record] = []
     for i in range(40):
         stamp = START + i * STEP
@@ -97,7 +97,7 @@ def test_arms_that_are_told_apart_from_the_wheels_and_from_each_other(tmp_path: 
     assert {t.topic: t.used_as for t in inspect_log(log).topics} == {"/joint_states": "wheels", "/left_arm/joint_states": "arms"}
 
 
-def test_a_topic_that_repeats_what_another_tells_is_left_out(tmp_path: Path) -> None:
+def test_arm_cg_topic_that_repeats_another_is_left_out(tmp_path: Path) -> None:
     records: list[Record] = []
     for i in range(10):
         stamp = START + i * STEP
@@ -106,7 +106,7 @@ def test_a_topic_that_repeats_what_another_tells_is_left_out(tmp_path: Path) -> 
     np.testing.assert_allclose([s.position for s in samples], [expected(i) for i in range(10)], atol=1e-12)
 
 
-def test_a_topic_with_the_centre_of_gravity_goes_before_the_arms(tmp_path: Path) -> None:
+def test_arm_cg_topic_with_the_cg_overrides_the_arms(tmp_path: Path) -> None:
     records: list[Record] = []
     for i in range(10):
         stamp = START + i * STEP
@@ -116,7 +116,7 @@ def test_a_topic_with_the_centre_of_gravity_goes_before_the_arms(tmp_path: Path)
     assert cgs(open_log(path, ROBOT, TopicOverrides(center_of_gravity=""))) == []
 
 
-def test_joints_of_other_names_are_told(tmp_path: Path) -> None:
+def test_arm_cg_unknown_joint_names_are_reported(tmp_path: Path) -> None:
     at = {f"ur5_{name}": value for name, value in posture(0).items()}
     records: list[Record] = [("/joint_states", wheels(START + i * STEP, i), START + i * STEP) for i in range(10)]
     records += [("/arms", arm(START + i * STEP, list(at), at), START + i * STEP) for i in range(10)]
@@ -129,7 +129,7 @@ def test_joints_of_other_names_are_told(tmp_path: Path) -> None:
     assert any("has arms, but no joint states have their angles" in problem for problem in inspect_log(log).problems)
 
 
-def test_one_joint_that_is_never_told_leaves_the_centre_of_gravity_alone_until_it_need_not_be(tmp_path: Path) -> None:
+def test_arm_cg_missing_joint_delays_the_cg_until_it_is_published(tmp_path: Path) -> None:
     names = [name for name in (*LEFT, *RIGHT) if name != "left_elbow_joint"]
     records: list[Record] = []
     for i in range(10):
@@ -145,8 +145,8 @@ def test_one_joint_that_is_never_told_leaves_the_centre_of_gravity_alone_until_i
     np.testing.assert_allclose(samples[3].position, urdf_reference.center_of_mass(URDF, {**posture(3), "left_elbow_joint": 0.0})[0][:2])
 
 
-def test_joints_in_degrees_tip_the_robot_over_and_are_told(tmp_path: Path) -> None:
-    """A narrow robot: what arms at nonsense angles do to it is counted, not believed."""
+def test_arm_cg_joints_in_degrees_are_reported_as_tipping(tmp_path: Path) -> None:
+    """A narrow robot: CGs of arms at impossible angles are counted and dropped."""
     narrow = dataclasses.replace(ROBOT, geometry=dataclasses.replace(ROBOT.geometry, wheelbase_m=0.1))
     records: list[Record] = [("/joint_states", both(START + i * STEP, i), START + i * STEP) for i in range(40)]
     log = open_log(bags.write_mcap(tmp_path / "run.mcap", records), narrow)
@@ -156,7 +156,7 @@ def test_joints_in_degrees_tip_the_robot_over_and_are_told(tmp_path: Path) -> No
     assert any(f"{40 - len(kept)} messages with arms at which the robot would tip over" in note for note in log.warnings())
 
 
-def test_messages_without_positions_tell_nothing(tmp_path: Path) -> None:
+def test_arm_cg_messages_without_positions_are_ignored(tmp_path: Path) -> None:
     records: list[Record] = []
     for i in range(10):
         stamp = START + i * STEP
@@ -169,14 +169,14 @@ def test_messages_without_positions_tell_nothing(tmp_path: Path) -> None:
     assert sum(isinstance(event, CgSample) for event in events) == 5
 
 
-def test_a_robot_file_whose_urdf_is_not_there_is_refused(tmp_path: Path) -> None:
+def test_arm_cg_robot_file_with_missing_urdf_is_refused(tmp_path: Path) -> None:
     robot = dataclasses.replace(ROBOT, arms=dataclasses.replace(ROBOT.arms, urdf="lost.urdf"), folder=tmp_path)
     records: list[Record] = [("/joint_states", both(START + i * STEP, i), START + i * STEP) for i in range(10)]
     with pytest.raises(RobotError, match=r"lost\.urdf"):
         open_log(bags.write_mcap(tmp_path / "run.mcap", records), robot)
 
 
-def test_a_centre_of_gravity_that_is_not_in_metres_is_left_out_and_told(tmp_path: Path) -> None:
+def test_cg_topic_not_in_metres_is_dropped_and_reported(tmp_path: Path) -> None:
     """Half the wheelbase is 0.26 m: neither millimetres nor 0.4 m can be true."""
     places = [(0.05, -0.01), (20.0, 10.0), (0.4, 0.0), (0.0, -0.3), (1e200, 0.0), (0.06, 0.01)]
     records: list[Record] = []

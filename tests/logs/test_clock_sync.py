@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.logs import Log, inspect_log, open_log
 from localization.logs.clock_sync import Item, merge, plan_clocks
-from localization.logs.message_stats import MessageStats, Oddity
+from localization.logs.decode import MessageStats, Oddity
 from motion_models.robot import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
@@ -27,7 +27,7 @@ HOUR = 3600 * S
 
 @dataclass(frozen=True)
 class Mark:
-    """A payload that knows where it came from and when it was really measured."""
+    """A payload with its topic and its true time of measurement."""
 
     stamp_ns: int
     topic: str
@@ -62,7 +62,7 @@ def ticks(topic: str, seconds: float, rate: float, latency: int = 5 * MS, start:
     return [mark(topic, start + int(i * S / rate), start + int(i * S / rate) + latency) for i in range(int(seconds * rate))]
 
 
-def test_latencies_up_to_a_second_are_sorted_out() -> None:
+def test_clock_sync_latencies_up_to_a_second_are_sorted() -> None:
     rng = np.random.default_rng(1)
     items = [
         mark(topic, START + i * S // rate, START + i * S // rate + int(rng.uniform(0, worst) * S))
@@ -75,7 +75,7 @@ def test_latencies_up_to_a_second_are_sorted_out() -> None:
     assert {oddity for oddity in Oddity if any(stats.of(t, oddity) for t in ("/wheels", "/scan", "/imu"))} <= {Oddity.OUT_OF_ORDER}
 
 
-def test_a_topic_that_is_always_three_seconds_late_is_waited_for() -> None:
+def test_clock_sync_topic_always_3_s_late_is_waited_for() -> None:
     """As a slow driver on another computer may be: its usual latency is learnt."""
     marks, stats = run([*ticks("/wheels", 20, 50), *ticks("/points", 20, 10, latency=3 * S)])
     check_order(marks)
@@ -83,7 +83,7 @@ def test_a_topic_that_is_always_three_seconds_late_is_waited_for() -> None:
     assert stats.describe() == []
 
 
-def test_a_recorder_that_stalls_loses_nothing() -> None:
+def test_clock_sync_stalled_recorder_loses_nothing() -> None:
     """For four seconds nothing is written; then all that waited, at once. The headers were right all the time."""
     items = [*ticks("/wheels", 20, 50), *ticks("/scan", 20, 10, latency=60 * MS)]
     stalled = [
@@ -103,7 +103,7 @@ def test_a_recorder_that_stalls_loses_nothing() -> None:
 
 @pytest.mark.parametrize("rate", [50, 10, 4])
 @pytest.mark.parametrize("lost_s", [(8.0, 12.0), (8.0, 10.5), (10.0, 12.5), (9.0, 15.5), (12.0, 16.0)])
-def test_what_comes_late_in_a_burst_is_no_clock_that_was_set(rate: int, lost_s: tuple[float, float]) -> None:
+def test_clock_sync_late_burst_is_no_clock_jump(rate: int, lost_s: tuple[float, float]) -> None:
     """The network holds everything for eight seconds, and of what it held a part is lost."""
     kept = [i for i in ticks("/wheels", 30, rate) if not lost_s[0] * S < i.stamp_ns - START < lost_s[1] * S]
     held = [
@@ -118,7 +118,7 @@ def test_what_comes_late_in_a_burst_is_no_clock_that_was_set(rate: int, lost_s: 
 
 
 @pytest.mark.parametrize("ends", [0, 100])
-def test_a_clock_that_was_set_is_seen_behind_a_burst(ends: int) -> None:
+def test_clock_sync_jump_behind_a_burst_is_detected(ends: int) -> None:
     """What comes after it agrees with the last ``ends`` messages in it."""
     items = []
     for i in range(1500):
@@ -134,7 +134,7 @@ def test_a_clock_that_was_set_is_seen_behind_a_burst(ends: int) -> None:
 
 
 @pytest.mark.parametrize("batch", [S // 5, S, 4 * S, 60 * S])
-def test_a_clock_that_is_set_is_seen_in_a_log_written_in_batches(batch: int) -> None:
+def test_clock_sync_jump_in_a_log_written_in_batches_is_detected(batch: int) -> None:
     """All of a batch bears one time of recording, when it was written."""
     items = []
     for i in range(3000):
@@ -147,7 +147,7 @@ def test_a_clock_that_is_set_is_seen_in_a_log_written_in_batches(batch: int) -> 
     assert max(abs(m.stamp_ns - m.true_ns) for m in marks) <= 2 * S // 50  # what came at once may have been measured two periods apart
 
 
-def test_a_driver_that_pauses_is_no_jump() -> None:
+def test_clock_sync_driver_pause_is_no_jump() -> None:
     items = [i for i in ticks("/scan", 60, 10) if not START + 20 * S < i.stamp_ns < START + 45 * S]
     marks, stats = run([*items, *ticks("/wheels", 60, 50)])
     assert len(marks) == len(items) + 3000
@@ -155,7 +155,7 @@ def test_a_driver_that_pauses_is_no_jump() -> None:
 
 
 @pytest.mark.parametrize("jump", [HOUR, -HOUR, 5 * S, -5 * S, 10 * 365 * 24 * HOUR])
-def test_a_clock_that_is_set_is_set_back(jump: int) -> None:
+def test_clock_sync_jump_is_corrected(jump: int) -> None:
     """From 10 s on the scanner's clock is off; its scans stay where they were measured, to the jitter of the latency."""
     rng = np.random.default_rng(2)
     scans = [
@@ -173,7 +173,7 @@ def test_a_clock_that_is_set_is_set_back(jump: int) -> None:
     assert stats.of("/scan", Oddity.OUTLIER) == 0
 
 
-def test_topics_that_jump_together_stay_together() -> None:
+def test_clock_sync_topics_that_jump_together_stay_aligned() -> None:
     """A computer's clock is set: all its topics jump by the same amount, and are set back by exactly the same."""
     rng = np.random.default_rng(3)
     items = [
@@ -190,7 +190,7 @@ def test_topics_that_jump_together_stay_together() -> None:
     assert len({m.stamp_ns - m.true_ns for m in marks if m.true_ns > START + 6 * S}) == 1
 
 
-def test_a_jump_there_and_back_ends_at_the_true_stamps() -> None:
+def test_clock_sync_jump_and_return_ends_at_true_stamps() -> None:
     items = [mark("/scan", t, t + 20 * MS, t + (HOUR if 100 <= i < 200 else 0)) for i, t in ((i, START + i * S // 10) for i in range(300))]
     marks, stats = run([*ticks("/wheels", 30, 50), *items])
     check_order(marks)
@@ -199,7 +199,7 @@ def test_a_jump_there_and_back_ends_at_the_true_stamps() -> None:
     assert stats.of("/scan", Oddity.REBASED) == 100
 
 
-def test_lone_wild_stamps_are_dropped_and_counted() -> None:
+def test_clock_sync_single_outlier_stamps_are_dropped_and_counted() -> None:
     wild = {50: HOUR, 51: -HOUR, 120: 10 * S, 121: 10 * S, 200: -7 * S}
     items = [mark("/scan", t, t + 20 * MS, t + wild.get(i, 0)) for i, t in ((i, START + i * S // 10) for i in range(300))]
     marks, stats = run([*ticks("/wheels", 30, 50), *items])
@@ -210,7 +210,7 @@ def test_lone_wild_stamps_are_dropped_and_counted() -> None:
     assert stats.describe() == ["/scan: 5 messages dropped (stamp that fits neither its neighbours nor the time of recording)."]
 
 
-def test_a_wild_first_stamp_does_not_move_the_others() -> None:
+def test_clock_sync_outlier_first_stamp_does_not_shift_the_rest() -> None:
     items = [mark("/scan", t, t + 20 * MS, t + (HOUR if i == 0 else 0)) for i, t in ((i, START + i * S // 10) for i in range(100))]
     marks, _ = run([*ticks("/wheels", 10, 50), *items])
     check_order(marks)
@@ -218,7 +218,7 @@ def test_a_wild_first_stamp_does_not_move_the_others() -> None:
     assert all(m.stamp_ns == m.true_ns for m in marks if m.true_ns > START)
 
 
-def test_stamps_that_repeat_are_dropped_and_counted() -> None:
+def test_clock_sync_repeated_stamps_are_dropped_and_counted() -> None:
     items = ticks("/scan", 10, 10)
     again = [mark("/scan", i.stamp_ns, i.log_ns + 3 * MS) for i in items[::4]]
     marks, stats = run([*items, *again, *ticks("/wheels", 10, 50)])
@@ -227,13 +227,13 @@ def test_stamps_that_repeat_are_dropped_and_counted() -> None:
     assert stats.of("/scan", Oddity.REPEATED) == 25
 
 
-def test_a_clock_that_stands_still_gives_one_event() -> None:
+def test_clock_sync_frozen_clock_gives_one_event() -> None:
     marks, stats = run([mark("/scan", START, START + i * S // 10) for i in range(100)])
     assert len(marks) == 1
     assert stats.of("/scan", Oddity.REPEATED) == 99
 
 
-def test_stamps_that_go_backwards_a_little_are_sorted() -> None:
+def test_clock_sync_slightly_reversed_stamps_are_sorted() -> None:
     items = ticks("/scan", 10, 10)
     swapped = [mark("/scan", items[i ^ 1].stamp_ns, items[i].log_ns) for i in range(100)]
     marks, stats = run(swapped)
@@ -242,7 +242,7 @@ def test_stamps_that_go_backwards_a_little_are_sorted() -> None:
     assert stats.of("/scan", Oddity.OUT_OF_ORDER) == 50
 
 
-def test_a_message_that_is_far_too_late_is_dropped_and_counted() -> None:
+def test_clock_sync_far_too_late_message_is_dropped_and_counted() -> None:
     items = ticks("/wheels", 20, 50)
     late = mark("/wheels", START + 5 * S + 1, START + 5 * S + 950 * MS)
     # In time: within a second. Too late: trusted, for its neighbour is near, but all others are gone by.
@@ -255,14 +255,14 @@ def test_a_message_that_is_far_too_late_is_dropped_and_counted() -> None:
     assert len(marks) == 1039
 
 
-def test_zero_stamps_are_replaced_by_the_time_of_recording() -> None:
+def test_clock_sync_zero_stamps_get_the_recording_time() -> None:
     marks, stats = run([*ticks("/wheels", 5, 50), *(mark("/cg", START + i * S, START + i * S + MS, 0) for i in range(5))])
     check_order(marks)
     assert [m.stamp_ns for m in marks if m.topic == "/cg"] == [START + i * S + MS for i in range(5)]
     assert stats.of("/cg", Oddity.NO_STAMP) == 5
 
 
-def test_zero_stamps_in_a_log_of_a_replay_join_the_others_clock() -> None:
+def test_clock_sync_zero_stamps_in_a_replayed_log_get_the_others_clock() -> None:
     """A log recorded while an old one was played: headers of years ago, and one topic without any."""
     old = START - 3 * 365 * 24 * HOUR
     wheels = [mark("/wheels", old + i * S // 50, START + i * S // 50) for i in range(250)]
@@ -272,7 +272,7 @@ def test_zero_stamps_in_a_log_of_a_replay_join_the_others_clock() -> None:
     assert all(m.stamp_ns == m.true_ns for m in marks)
 
 
-def test_a_topic_with_a_clock_of_its_own_is_moved_onto_the_common_one() -> None:
+def test_clock_sync_topic_with_its_own_clock_is_shifted_to_the_common_one() -> None:
     """A LiDAR without time synchronisation stamps by its uptime."""
     lidar = [mark("/points", t, t + 50 * MS, t - START + 100 * S) for t in (START + i * S // 10 for i in range(100))]
     marks, stats = run([*ticks("/wheels", 10, 50), *lidar])
@@ -282,7 +282,7 @@ def test_a_topic_with_a_clock_of_its_own_is_moved_onto_the_common_one() -> None:
     assert stats.of("/points", Oddity.FOREIGN_CLOCK) == 100
 
 
-def test_headers_that_are_all_of_another_time_are_kept() -> None:
+def test_clock_sync_all_stamps_of_another_time_are_kept() -> None:
     old = START - 5 * HOUR
     items = [
         mark(topic, old + i * S // rate, START + i * S // rate + latency)
@@ -296,14 +296,14 @@ def test_headers_that_are_all_of_another_time_are_kept() -> None:
     assert stats.describe() == []
 
 
-def test_equal_stamps_come_in_order_of_rank() -> None:
+def test_clock_sync_equal_stamps_are_ordered_by_rank() -> None:
     items = [Item(START + 9 - rank, START, f"/{rank}", rank, 1, Mark(START, f"/{rank}", START)) for rank in (3, 0, 2, 1)]
     marks, _ = run(items)
     assert [m.topic for m in marks] == ["/0", "/1", "/2", "/3"]
 
 
 @pytest.mark.parametrize("case", ["same log time", "same stamp step of 1 ns", "random stamps", "log time runs away"])
-def test_memory_is_bounded_whatever_happens(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clock_sync_any_input_uses_bounded_memory(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("localization.logs.clock_sync._MAX_BUFFERED_WEIGHT", 2000)
     rng = np.random.default_rng(4)
 
@@ -339,7 +339,7 @@ stamped = st.tuples(
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(stamped, max_size=60))
-def test_any_stamps_at_all_come_out_in_order_and_are_accounted_for(entries: list[tuple[str, int, int | None]]) -> None:
+def test_clock_sync_any_stamps_are_ordered_and_counted(entries: list[tuple[str, int, int | None]]) -> None:
     """Nothing is lost silently: what goes in comes out, or is counted."""
     items = [mark(topic, START + at, START + at, 0 if late is None else START + at - late) for topic, at, late in entries]
     marks, stats = run(items)
@@ -356,7 +356,7 @@ def log_of(tmp_path: Path, records: list[Record]) -> Log:
     return open_log(bags.write_ros1_bag(tmp_path / "run.bag", ordered), ROBOT)
 
 
-def test_scans_of_a_bad_log_are_in_order_and_the_notes_tell_all(tmp_path: Path) -> None:
+def test_clock_sync_scans_of_a_bad_log_are_ordered_and_notes_complete(tmp_path: Path) -> None:
     """Backward, repeated, wild and missing stamps in one log, of which the rest is unharmed."""
     records: list[Record] = []
     for i in range(300):
@@ -383,13 +383,13 @@ def test_scans_of_a_bad_log_are_in_order_and_the_notes_tell_all(tmp_path: Path) 
         "/scan: 1 message dropped (stamp that fits neither its neighbours nor the time of recording).",
         "/scan: 100 messages stamped after a jump of the clock, moved back by it.",
     ]
-    said = " ".join(inspect_log(log).problems)
-    assert "/imu/data: 3 of 300 messages have no stamp" in said
-    assert "/scan: 2 of 300 messages are stamped before the one before them" not in said  # the wild one, and that alone
-    assert "/scan: 1 of 300 messages are stamped before the one before them" in said
+    problems = " ".join(inspect_log(log).problems)
+    assert "/imu/data: 3 of 300 messages have no stamp" in problems
+    assert "/scan: 2 of 300 messages are stamped before the one before them" not in problems  # the wild one, and that alone
+    assert "/scan: 1 of 300 messages are stamped before the one before them" in problems
 
 
-def test_references_are_ordered_by_the_same_rules(tmp_path: Path) -> None:
+def test_clock_sync_references_are_ordered_by_the_same_rules(tmp_path: Path) -> None:
     records: list[Record] = [("/scan", bags.laser_scan(START + i * S), START + i * S) for i in range(10)]
     for i in range(100):
         t = START + i * S // 10

@@ -1,11 +1,11 @@
-"""Logs that are broken: what can be read is read, what is lost is said, and nothing but our own errors comes out."""
+"""Damaged logs: readable messages are read, lost ones reported, and only `LogError` is raised."""
 
 from __future__ import annotations
 
 import contextlib
 import sqlite3
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,22 +17,11 @@ from localization.logs import Log, inspect_log, open_log
 from localization.logs.sqlite import RecoveredSqlite
 from motion_models.robot import load_robot
 from tests.helpers import bags
-from tests.helpers.bags import START, Record, S
+from tests.helpers.bags import START, S
+from tests.helpers.logs import numbered_records, warnings_of
 
 ROBOT = load_robot("vaultbot")
-COUNT = 600
-
-
-def records(count: int = COUNT) -> Iterator[Record]:
-    """Wheels at 10 Hz that turn 0.1 rad a message and scans that tell their number by their first range: about 2.5 kB a step."""
-    rng = np.random.default_rng(7)
-    for i in range(count):
-        stamp = START + i * S // 10
-        angles = [0.1 * i] * 4
-        yield "/joint_states", bags.joint_state(stamp, position=angles, velocity=[1.0] * 4), stamp + S // 200
-        ranges = rng.uniform(1.0, 9.0, 500)
-        ranges[0] = 1.0 + 0.01 * i
-        yield "/scan", bags.laser_scan(stamp, ranges, angle_increment=0.01, time_increment=1e-4), stamp + S // 100
+COUNT = 600  # steps of `numbered_records`
 
 
 def check_is_prefix(log: Log) -> int:
@@ -55,27 +44,23 @@ def cut(path: Path, fraction: float) -> int:
     return int(len(data) * fraction)
 
 
-def said(log: Log) -> str:
-    return " ".join(log.warnings())
-
-
 @pytest.mark.parametrize("compression", [None, "lz4", "bz2"])
 @pytest.mark.parametrize("fraction", [0.3, 0.75])
-def test_ros1_bag_that_was_cut_off(tmp_path: Path, compression: str | None, fraction: float) -> None:
-    path = bags.write_ros1_bag(tmp_path / "run.bag", records(), compression, chunk_bytes=100_000)
+def test_ros1_truncated_is_read_to_the_cut(tmp_path: Path, compression: str | None, fraction: float) -> None:
+    path = bags.write_ros1_bag(tmp_path / "run.bag", numbered_records(), compression, chunk_bytes=100_000)
     cut(path, fraction)
     log = open_log(path, ROBOT)
     steps = check_is_prefix(log)
     # Uncompressed bytes are readable to the last whole record (the bag's head and its indexes are as long as some three steps);
     # of compressed ones the last chunk, of 100 kB in 1.5 MB, may be lost.
     assert fraction * COUNT - (4 if compression is None else 50) <= steps <= fraction * COUNT + 1
-    assert "run.bag is damaged" in said(log)
-    assert f"{2 * steps}" in said(log) or f"{2 * steps + 1}" in said(log)
+    assert "run.bag is damaged" in warnings_of(log)
+    assert f"{2 * steps}" in warnings_of(log) or f"{2 * steps + 1}" in warnings_of(log)
 
 
-def test_ros1_bag_of_a_recorder_that_was_killed(tmp_path: Path) -> None:
-    """rosbag leaves a file named .bag.active, whose header says that there is no index."""
-    path = bags.write_ros1_bag(tmp_path / "run.bag", records(), chunk_bytes=100_000)
+def test_ros1_of_a_killed_recorder_is_read_without_index(tmp_path: Path) -> None:
+    """rosbag leaves a file named .bag.active, whose header has no index."""
+    path = bags.write_ros1_bag(tmp_path / "run.bag", numbered_records(), chunk_bytes=100_000)
     data = bytearray(path.read_bytes())
     at = data.index(b"index_pos=") + len(b"index_pos=")
     index = int.from_bytes(data[at : at + 8], "little")
@@ -84,11 +69,11 @@ def test_ros1_bag_of_a_recorder_that_was_killed(tmp_path: Path) -> None:
     active.write_bytes(data[:index])
     log = open_log(active, ROBOT)
     assert check_is_prefix(log) == COUNT
-    assert "All of its 1200 messages could be read" in said(log)
+    assert "All of its 1200 messages could be read" in warnings_of(log)
 
 
-def test_ros1_bag_with_a_bad_chunk_loses_that_chunk_only(tmp_path: Path) -> None:
-    path = bags.write_ros1_bag(tmp_path / "run.bag", records(), "bz2", chunk_bytes=100_000)
+def test_ros1_bad_chunk_loses_only_that_chunk(tmp_path: Path) -> None:
+    path = bags.write_ros1_bag(tmp_path / "run.bag", numbered_records(), "bz2", chunk_bytes=100_000)
     data = bytearray(path.read_bytes())
     middle = data.index(b"BZh", len(data) // 2)
     data[middle + 2000 : middle + 2100] = bytes(100)
@@ -98,35 +83,35 @@ def test_ros1_bag_with_a_bad_chunk_loses_that_chunk_only(tmp_path: Path) -> None
     assert COUNT - 60 < len(scans) < COUNT
     assert scans[-1].stamp_ns == START + (COUNT - 1) * S // 10
     lost = 2 * (COUNT - len(scans))
-    assert any(f"A chunk of {n} messages" in said(log) for n in (lost - 1, lost, lost + 1))
+    assert any(f"A chunk of {n} messages" in warnings_of(log) for n in (lost - 1, lost, lost + 1))
 
 
 @pytest.mark.parametrize("compression", [None, "storage"])
 @pytest.mark.parametrize("fraction", [0.3, 0.75])
-def test_mcap_that_was_cut_off(tmp_path: Path, compression: str | None, fraction: float) -> None:
-    path = bags.write_mcap(tmp_path / "run.mcap", records(2 * COUNT), compression)
+def test_mcap_truncated_is_read_to_the_cut(tmp_path: Path, compression: str | None, fraction: float) -> None:
+    path = bags.write_mcap(tmp_path / "run.mcap", numbered_records(2 * COUNT), compression)
     cut(path, fraction)
     log = open_log(path, ROBOT)
     steps = check_is_prefix(log)
     # The file ends with its index, which is about a hundredth of it. zstd gives whole blocks of 128 kB (about 50 steps) only.
     assert fraction * 2 * COUNT - (2 if compression is None else 60) <= steps <= 1.02 * fraction * 2 * COUNT
-    assert "run.mcap was read record by record" in said(log)
+    assert "run.mcap was read record by record" in warnings_of(log)
 
 
-def test_folder_of_an_mcap_that_was_cut_off(tmp_path: Path) -> None:
-    path = bags.write_ros2_bag(tmp_path / "run", records(), "mcap")
+def test_mcap_folder_truncated_is_read_to_the_cut(tmp_path: Path) -> None:
+    path = bags.write_ros2_bag(tmp_path / "run", numbered_records(), "mcap")
     cut(path / "run.mcap", 0.5)
     log = open_log(path, ROBOT)
     assert 0.49 * COUNT <= check_is_prefix(log) <= 0.52 * COUNT
-    assert "run.mcap was read record by record" in said(log)
+    assert "run.mcap was read record by record" in warnings_of(log)
 
 
 @pytest.mark.parametrize("compression", [None, "message"])
 @pytest.mark.parametrize("bare", [True, False])
 @pytest.mark.parametrize("fraction", [0.3, 0.9])
-def test_sqlite_that_was_cut_off(tmp_path: Path, compression: str | None, bare: bool, fraction: float) -> None:
+def test_sqlite_truncated_is_read_to_the_cut(tmp_path: Path, compression: str | None, bare: bool, fraction: float) -> None:
     """Wherever it was cut off: at 0.3, SQLite itself finds no row, for the page that leads to the first ones comes later."""
-    path = bags.write_ros2_bag(tmp_path / "run", records(), "sqlite3", compression)
+    path = bags.write_ros2_bag(tmp_path / "run", numbered_records(), "sqlite3", compression)
     with contextlib.closing(sqlite3.connect(path / "run.db3")) as database:
         rows = [row[0] for row in database.execute("SELECT data FROM messages ORDER BY id")]
     cut(path / "run.db3", fraction)
@@ -135,16 +120,16 @@ def test_sqlite_that_was_cut_off(tmp_path: Path, compression: str | None, bare: 
     log = open_log(path / "run.db3" if bare else path, ROBOT)
     # Rows of 2 kB lie in one piece: those that are in the bytes that were kept, and no others, are to be read.
     assert check_is_prefix(log) == sum(row in whole_pages for row in rows[1::2]) > 0.25 * COUNT
-    assert "run.db3 was read page by page" in said(log)
+    assert "run.db3 was read page by page" in warnings_of(log)
 
 
-def test_rows_that_wait_beside_the_file_are_told_of(tmp_path: Path) -> None:
-    path = bags.write_ros2_bag(tmp_path / "run", records(20), "sqlite3")
+def test_sqlite_write_ahead_log_beside_the_file_is_reported(tmp_path: Path) -> None:
+    path = bags.write_ros2_bag(tmp_path / "run", numbered_records(20), "sqlite3")
     (path / "run.db3-wal").write_bytes(b"x")
-    assert "run.db3-wal holds rows" in said(open_log(path, ROBOT))
+    assert "run.db3-wal holds rows" in warnings_of(open_log(path, ROBOT))
 
 
-def test_sqlite_pages_give_the_rows_that_sqlite_gives(tmp_path: Path) -> None:
+def test_sqlite_pages_give_the_rows_of_the_library(tmp_path: Path) -> None:
     """Of every length from a tenth of a page to four pages, for what stays on the page depends on it in three ways."""
     messages = [bags.laser_scan(START + i * S // 10, np.linspace(1.0, 9.0, n)) for i, n in enumerate(range(100, 4000, 13))]
     path = bags.write_ros2_bag(tmp_path / "run", [("/scan", m, START + i * S // 10) for i, m in enumerate(messages)], "sqlite3") / "run.db3"
@@ -155,7 +140,7 @@ def test_sqlite_pages_give_the_rows_that_sqlite_gives(tmp_path: Path) -> None:
     assert recovered.channels[0].count == len(rows) == 300
 
 
-def test_sqlite_rows_longer_than_a_page_survive_a_cut(tmp_path: Path) -> None:
+def test_sqlite_truncated_keeps_rows_longer_than_a_page(tmp_path: Path) -> None:
     """Point clouds overflow onto further pages; one whose last page is missing is left out."""
     rng = np.random.default_rng(5)
     clouds = [np.ascontiguousarray(rng.normal(size=(1500, 3)).astype(np.float32)) for _ in range(40)]
@@ -173,26 +158,26 @@ def test_sqlite_rows_longer_than_a_page_survive_a_cut(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_storage_file_that_was_compressed_and_cut_off(tmp_path: Path, storage: str) -> None:
-    path = bags.write_ros2_bag(tmp_path / "run", records(2 * COUNT), storage, "file")
+def test_compressed_storage_file_truncated_is_read_to_the_cut(tmp_path: Path, storage: str) -> None:
+    path = bags.write_ros2_bag(tmp_path / "run", numbered_records(2 * COUNT), storage, "file")
     cut(next(path.glob("*.zstd")), 0.5)
     log = open_log(path, ROBOT)
     assert 0.9 * COUNT <= check_is_prefix(log) <= 1.1 * COUNT
-    assert "it was cut off" in said(log)
+    assert "it was cut off" in warnings_of(log)
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_folder_without_metadata_is_read_file_by_file(tmp_path: Path, storage: str) -> None:
     """What a crash leaves: the recorder writes metadata.yaml when it stops."""
-    path = bags.write_ros2_bag(tmp_path / "run", records(), storage)
+    path = bags.write_ros2_bag(tmp_path / "run", numbered_records(), storage)
     (path / "metadata.yaml").unlink()
     log = open_log(path, ROBOT)
     assert check_is_prefix(log) == COUNT
-    assert "metadata.yaml is missing" in said(log)
+    assert "metadata.yaml is missing" in warnings_of(log)
 
 
-def test_split_recording_without_metadata_is_read_in_order(tmp_path: Path) -> None:
-    everything = list(records(120))
+def test_folder_split_without_metadata_is_read_in_order(tmp_path: Path) -> None:
+    everything = list(numbered_records(120))
     folder = tmp_path / "run"
     folder.mkdir()
     for number, first in enumerate(range(0, 240, 20)):  # run_2 comes before run_10
@@ -200,17 +185,17 @@ def test_split_recording_without_metadata_is_read_in_order(tmp_path: Path) -> No
     assert check_is_prefix(open_log(folder, ROBOT)) == 120
 
 
-def test_folder_whose_one_file_is_not_a_log_uses_the_others(tmp_path: Path) -> None:
-    path = bags.write_ros2_bag(tmp_path / "run", records(50), "mcap")
+def test_folder_with_one_invalid_file_uses_the_others(tmp_path: Path) -> None:
+    path = bags.write_ros2_bag(tmp_path / "run", numbered_records(50), "mcap")
     (path / "run_1.mcap").write_text("not a log")
     (path / "metadata.yaml").write_text("rosbag2_bagfile_information: 3")
     log = open_log(path, ROBOT)
     assert check_is_prefix(log) == 50
-    assert "run_1.mcap' is not a log" in said(log)
+    assert "run_1.mcap' is not a log" in warnings_of(log)
 
 
-def test_mcap_with_a_bad_chunk_loses_that_chunk_only(tmp_path: Path) -> None:
-    path = bags.write_mcap(tmp_path / "run.mcap", records(4 * COUNT), "storage")
+def test_mcap_bad_chunk_loses_only_that_chunk(tmp_path: Path) -> None:
+    path = bags.write_mcap(tmp_path / "run.mcap", numbered_records(4 * COUNT), "storage")
     data = bytearray(path.read_bytes())
     middle = data.index(b"\x28\xb5\x2f\xfd", len(data) // 3)
     data[middle + 5000 : middle + 5200] = bytes(200)
@@ -221,11 +206,11 @@ def test_mcap_with_a_bad_chunk_loses_that_chunk_only(tmp_path: Path) -> None:
     assert stamps == sorted(set(stamps))
     assert stamps[-1] == START + (4 * COUNT - 1) * S // 10
     assert 3 * COUNT < len(scans) < 4 * COUNT
-    assert "A chunk at byte" in said(log)
+    assert "A chunk at byte" in warnings_of(log)
 
 
-def test_mcap_chunk_of_a_wrong_checksum_is_used_and_reported(tmp_path: Path) -> None:
-    """A flipped bit in a range looks like any other range: which message it is in cannot be known, and the others are right."""
+def test_mcap_chunk_with_wrong_checksum_is_used_and_reported(tmp_path: Path) -> None:
+    """A flipped bit in a range is a valid range: the message cannot be identified, and the others are right."""
     from mcap.writer import CompressionType, Writer
 
     path = tmp_path / "run.mcap"
@@ -233,7 +218,7 @@ def test_mcap_chunk_of_a_wrong_checksum_is_used_and_reported(tmp_path: Path) -> 
         writer = Writer(file, chunk_size=50_000, compression=CompressionType.NONE)
         writer.start("ros2", "test")
         ids: dict[str, int] = {}
-        for topic, message, log_ns in records(100):
+        for topic, message, log_ns in numbered_records(100):
             kind = message.__msgtype__
             if topic not in ids:
                 schema = writer.register_schema(kind, "ros2msg", bags.STORE.generate_msgdef(kind, ros_version=2)[0].encode())
@@ -248,12 +233,12 @@ def test_mcap_chunk_of_a_wrong_checksum_is_used_and_reported(tmp_path: Path) -> 
     log = open_log(path, ROBOT)
     scans = {e.stamp_ns: e for e in log.events() if isinstance(e, Scan)}
     assert len(scans) >= 99
-    assert "is damaged (its checksum is wrong)" in said(log)
+    assert "is damaged (its checksum is wrong)" in warnings_of(log)
     differing = [s for s in whole if s.stamp_ns not in scans or not np.array_equal(s.points, scans[s.stamp_ns].points)]
     assert len(differing) <= 1
 
 
-def test_mcap_without_chunks_or_summary(tmp_path: Path) -> None:
+def test_mcap_without_chunks_or_summary_is_read(tmp_path: Path) -> None:
     """As rosbag2's fastest preset writes it; with messages out of order, which rosbags refuses."""
     from mcap.writer import Writer
 
@@ -262,7 +247,7 @@ def test_mcap_without_chunks_or_summary(tmp_path: Path) -> None:
         writer = Writer(file, use_chunking=False, use_summary_offsets=False, use_statistics=False, repeat_channels=False)
         writer.start("ros2", "test")
         ids: dict[str, int] = {}
-        everything = list(records(300))
+        everything = list(numbered_records(300))
         everything[10], everything[12] = everything[12], everything[10]
         for topic, message, log_ns in everything:
             kind = message.__msgtype__
@@ -274,7 +259,7 @@ def test_mcap_without_chunks_or_summary(tmp_path: Path) -> None:
     assert check_is_prefix(open_log(path, ROBOT)) == 300
 
 
-def test_mcap_of_ros1_messages(tmp_path: Path) -> None:
+def test_mcap_of_ros1_messages_is_read(tmp_path: Path) -> None:
     from mcap.writer import Writer
 
     path = tmp_path / "run.mcap"
@@ -282,7 +267,7 @@ def test_mcap_of_ros1_messages(tmp_path: Path) -> None:
         writer = Writer(file)
         writer.start("ros1", "test")
         ids: dict[str, int] = {}
-        for topic, message, log_ns in records(100):
+        for topic, message, log_ns in numbered_records(100):
             kind = message.__msgtype__
             if topic not in ids:
                 text = bags.STORE_ROS1.generate_msgdef(kind)[0]
@@ -293,7 +278,7 @@ def test_mcap_of_ros1_messages(tmp_path: Path) -> None:
     assert check_is_prefix(open_log(path, ROBOT)) == 100
 
 
-def test_mcap_that_is_not_of_ros_is_refused(tmp_path: Path) -> None:
+def test_mcap_without_ros_messages_is_refused(tmp_path: Path) -> None:
     from mcap.writer import Writer
 
     path = tmp_path / "run.mcap"
@@ -342,27 +327,27 @@ NOT_LOGS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("name", NOT_LOGS)
-def test_what_is_not_a_log_is_refused_by_name(tmp_path: Path, name: str) -> None:
+def test_path_that_is_no_log_is_refused_by_name(tmp_path: Path, name: str) -> None:
     NOT_LOGS[name](tmp_path / name)
     with pytest.raises(LogError, match=name.replace(".", r"\.")):
         open_log(tmp_path / name, ROBOT)
 
 
-def test_no_such_file(tmp_path: Path) -> None:
+def test_path_that_does_not_exist_is_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"gone\.bag.*no such file"):
         open_log(tmp_path / "gone.bag", ROBOT)
 
 
-def test_folder_of_ros1_bags_says_which(tmp_path: Path) -> None:
-    bags.write_ros1_bag(tmp_path / "run.bag", records(5))
+def test_folder_of_ros1_bags_error_lists_them(tmp_path: Path) -> None:
+    bags.write_ros1_bag(tmp_path / "run.bag", numbered_records(5))
     with pytest.raises(LogError, match=r"ROS 1 bags in it: run\.bag"):
         open_log(tmp_path, ROBOT)
 
 
 @pytest.mark.parametrize("name", bags.FORMATS)
 @pytest.mark.parametrize("count", [0, 1])
-def test_log_of_no_or_one_message_is_refused(tmp_path: Path, name: str, count: int) -> None:
-    path = bags.FORMATS[name](tmp_path / "run", list(records(1))[:count])
+def test_log_of_at_most_one_message_is_refused(tmp_path: Path, name: str, count: int) -> None:
+    path = bags.FORMATS[name](tmp_path / "run", list(numbered_records(1))[:count])
     with pytest.raises(LogError, match="no message" if count == 0 else "only one message"):
         open_log(path, ROBOT)
 
@@ -374,9 +359,9 @@ FUZZED = {
 
 
 @pytest.mark.parametrize("name", FUZZED)
-def test_any_cut_and_any_flipped_byte_gives_events_or_our_error(tmp_path: Path, name: str) -> None:
+def test_log_any_cut_or_flipped_byte_gives_events_or_input_error(tmp_path: Path, name: str) -> None:
     """Sixty damages of each format: whatever happens, only `LogError` comes out, and stamps never decrease."""
-    original = FUZZED[name](tmp_path / "run", records(40))
+    original = FUZZED[name](tmp_path / "run", numbered_records(40))
     storage = next(f for f in original.iterdir() if f.name != "metadata.yaml") if original.is_dir() else original
     data = storage.read_bytes()
     rng = np.random.default_rng(11)

@@ -46,7 +46,7 @@ def table(rows: Any, extra: list[tuple[str, str]] = [], coordinate: str = "<f4")
 # Laser scans
 
 
-def test_ranges_that_are_no_hits_are_dropped(tmp_path: Path) -> None:
+def test_scan_ranges_without_hit_are_dropped(tmp_path: Path) -> None:
     ranges = [1.0, np.nan, np.inf, -np.inf, 0.05, 0.0, -1.0, 30.0, 31.0, 29.9, 0.1]
     (scan,), log = scans_of(tmp_path, [bags.laser_scan(START, ranges, angle_min=0.0, angle_increment=0.0625, time_increment=0.001)])
     kept = np.array([0, 9, 10])
@@ -59,19 +59,19 @@ def test_ranges_that_are_no_hits_are_dropped(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ranges", [[], [np.nan] * 5, [40.0] * 5])
-def test_an_empty_scan_is_a_scan(tmp_path: Path, ranges: list[float]) -> None:
+def test_scan_without_ranges_is_a_scan(tmp_path: Path, ranges: list[float]) -> None:
     (scan,), _ = scans_of(tmp_path, [bags.laser_scan(START, ranges, time_increment=0.001)])
     assert scan.points.shape == (0, 3)
     assert scan.offsets.shape == (0,)
 
 
-def test_a_scanner_that_is_mounted_upside_down_turns_the_other_way(tmp_path: Path) -> None:
+def test_scan_of_an_upside_down_scanner_turns_the_other_way(tmp_path: Path) -> None:
     (scan,), _ = scans_of(tmp_path, [bags.laser_scan(START, [2.0, 2.0], angle_min=0.5, angle_increment=-0.25)])
     np.testing.assert_allclose(np.arctan2(scan.points[:, 1], scan.points[:, 0]), [0.5, 0.25], rtol=1e-6)
-    assert scan.offsets.shape == (0,)  # it does not tell the beams' times
+    assert scan.offsets.shape == (0,)  # it has no time_increment
 
 
-def test_nan_limits_are_no_limits_and_a_nan_angle_is_malformed(tmp_path: Path) -> None:
+def test_scan_nan_limits_are_unlimited_and_nan_angle_is_malformed(tmp_path: Path) -> None:
     good = bags.laser_scan(START, [2.0, 3.0], range_min=np.nan, range_max=np.nan)
     bad = bags.laser_scan(START + S, [2.0, 3.0], angle_min=np.nan)
     scans, log = scans_of(tmp_path, [good, bad])
@@ -80,7 +80,7 @@ def test_nan_limits_are_no_limits_and_a_nan_angle_is_malformed(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(("beam_s", "count"), [(1e30, 0), (-1e30, 0), (np.inf, 0), (1.1, 0), (0.9, 1), (np.nan, 1)])
-def test_a_sweep_that_lasts_for_seconds_is_malformed(tmp_path: Path, beam_s: float, count: int) -> None:
+def test_scan_that_lasts_seconds_is_malformed(tmp_path: Path, beam_s: float, count: int) -> None:
     """NaN is no time, and the scan one without times."""
     scans, log = scans_of(tmp_path, [bags.laser_scan(START, [2.0, 3.0], time_increment=beam_s)])
     assert len(scans) == count
@@ -88,7 +88,7 @@ def test_a_sweep_that_lasts_for_seconds_is_malformed(tmp_path: Path, beam_s: flo
     assert [len(scan.offsets) for scan in scans] == [0 if np.isnan(beam_s) else 2] * count
 
 
-def test_directions_follow_a_scanner_that_is_reconfigured(tmp_path: Path) -> None:
+def test_scan_directions_follow_a_changed_angle_increment(tmp_path: Path) -> None:
     messages = [bags.laser_scan(START + i * S // 10, [1.0] * n, angle_min=0.0, angle_increment=0.5) for i, n in enumerate((2, 3, 2))]
     scans, _ = scans_of(tmp_path, messages)
     for scan, n in zip(scans, (2, 3, 2), strict=True):
@@ -101,7 +101,7 @@ ROWS = [(1.0, 2.0, 3.0), (-4.0, 5.0, -6.0), (7.0, -8.0, 9.0)]
 
 
 @pytest.mark.parametrize("coordinate", ["<f4", ">f4", "<f8", ">f8"])
-def test_byte_orders_and_widths(tmp_path: Path, coordinate: str) -> None:
+def test_cloud_any_byte_order_and_width_is_decoded(tmp_path: Path, coordinate: str) -> None:
     (scan,), _ = scans_of(tmp_path, [bags.cloud(START, table(ROWS, coordinate=coordinate))], "/points")
     np.testing.assert_array_equal(scan.points, ROWS)
     assert scan.points.dtype == np.float64
@@ -111,7 +111,7 @@ def test_byte_orders_and_widths(tmp_path: Path, coordinate: str) -> None:
     assert scan.frame_id == "lidar"
 
 
-def test_other_fields_padding_and_order_do_not_matter(tmp_path: Path) -> None:
+def test_cloud_other_fields_padding_and_order_are_ignored(tmp_path: Path) -> None:
     layout = np.dtype(
         {
             "names": ["intensity", "z", "x", "ring", "y"],
@@ -127,7 +127,7 @@ def test_other_fields_padding_and_order_do_not_matter(tmp_path: Path) -> None:
     np.testing.assert_array_equal(scan.points, [(x, 10.0, 20.0) for x in range(6)])
 
 
-def test_points_that_are_no_hits_are_dropped_with_their_times(tmp_path: Path) -> None:
+def test_cloud_points_without_hit_are_dropped_with_their_times(tmp_path: Path) -> None:
     rows = [(1, 2, 3, 10), (np.nan, 2, 3, 20), (0, 0, 0, 30), (1, np.inf, 3, 40), (4, 5, 6, 50)]
     (scan,), _ = scans_of(tmp_path, [bags.cloud(START, table(rows, [("t", "<u4")]))], "/points")
     np.testing.assert_array_equal(scan.points, [(1, 2, 3), (4, 5, 6)])
@@ -148,24 +148,24 @@ UPTIME = 512.25
         ("timestamp", "<f8", START + SWEEP * 1e9),  # Livox, driver 2
         ("stamps", "<f8", SWEEP * 1e6),
         ("time", "<f4", SWEEP * 1e9),
-        ("timestamp", "<f8", UPTIME + SWEEP),  # a clock that nobody else knows: the sweep begins at the header's stamp
+        ("timestamp", "<f8", UPTIME + SWEEP),  # an unknown clock: the scan begins at the header's stamp
         ("t", "<u4", UPTIME * 1e9 % 2**32 + SWEEP * 1e9),
     ],
 )
-def test_times_of_points_in_every_dialect(tmp_path: Path, field: str, kind: str, values: Any) -> None:
+def test_cloud_times_of_each_driver_are_seconds_from_the_header(tmp_path: Path, field: str, kind: str, values: Any) -> None:
     rows = [(*row, value) for row, value in zip(ROWS, values, strict=True)]
     (scan,), _ = scans_of(tmp_path, [bags.cloud(START, table(rows, [(field, kind)]))], "/points")
     np.testing.assert_allclose(scan.offsets, SWEEP, atol=2e-6)
 
 
-def test_times_before_the_header_are_negative(tmp_path: Path) -> None:
+def test_cloud_times_before_the_header_are_negative(tmp_path: Path) -> None:
     """Velodyne's stamp is that of the last point in some drivers."""
     rows = [(*row, value) for row, value in zip(ROWS, SWEEP - 0.1, strict=True)]
     (scan,), _ = scans_of(tmp_path, [bags.cloud(START, table(rows, [("time", "<f4")]))], "/points")
     np.testing.assert_allclose(scan.offsets, SWEEP - 0.1, atol=1e-7)
 
 
-def test_times_that_are_all_nan_are_no_times(tmp_path: Path) -> None:
+def test_cloud_times_all_nan_are_no_times(tmp_path: Path) -> None:
     rows = [(*row, np.nan) for row in ROWS]
     (scan,), _ = scans_of(tmp_path, [bags.cloud(START, table(rows, [("time", "<f4")]))], "/points")
     assert scan.points.shape == (3, 3)
@@ -173,7 +173,7 @@ def test_times_that_are_all_nan_are_no_times(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("kind", "last"), [("<f4", 1e30), ("<f8", -1e300), ("<u4", 4e9), ("<i4", -2e9)])
-def test_times_of_points_that_are_of_no_one_sweep_are_malformed(tmp_path: Path, kind: str, last: float) -> None:
+def test_cloud_times_longer_than_one_scan_are_malformed(tmp_path: Path, kind: str, last: float) -> None:
     rows = [(*row, value) for row, value in zip(ROWS, (0.0, 3.0, last), strict=True)]
     scans, log = scans_of(tmp_path, [bags.cloud(START, table(rows, [("t", kind)]))], "/points")
     assert scans == []
@@ -196,13 +196,13 @@ def _broken_clouds() -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", _broken_clouds())
-def test_clouds_that_contradict_themselves_are_dropped_and_counted(tmp_path: Path, name: str) -> None:
+def test_cloud_inconsistent_sizes_are_dropped_and_counted(tmp_path: Path, name: str) -> None:
     scans, log = scans_of(tmp_path, [_broken_clouds()[name]], "/points")
     assert scans == []
     assert log.warnings() == ["/points: 1 message dropped (fields that contradict each other)."]
 
 
-def test_an_empty_cloud_is_a_scan(tmp_path: Path) -> None:
+def test_cloud_without_points_is_a_scan(tmp_path: Path) -> None:
     (scan,), _ = scans_of(tmp_path, [bags.cloud(START, table([]))], "/points")
     assert scan.points.shape == (0, 3)
 
@@ -210,7 +210,7 @@ def test_an_empty_cloud_is_a_scan(tmp_path: Path) -> None:
 # IMU and centre of gravity
 
 
-def test_samples_that_are_not_finite_are_dropped_and_counted(tmp_path: Path) -> None:
+def test_samples_not_finite_are_dropped_and_counted(tmp_path: Path) -> None:
     messages = [
         bags.imu(START),
         bags.imu(START + 1000, (np.nan, 0, 0)),
@@ -225,7 +225,7 @@ def test_samples_that_are_not_finite_are_dropped_and_counted(tmp_path: Path) -> 
     assert len(list(log.events())) == 1
 
 
-def test_samples_beyond_what_sensors_measure_are_dropped_and_counted(tmp_path: Path) -> None:
+def test_samples_beyond_sensor_range_are_dropped_and_counted(tmp_path: Path) -> None:
     messages = [
         bags.imu(START, (0.0, 0.0, 34.0), (0.0, 0.0, 9810.0)),
         bags.imu(START + 1000, (0.0, 0.0, -36.0)),
@@ -238,7 +238,7 @@ def test_samples_beyond_what_sensors_measure_are_dropped_and_counted(tmp_path: P
     assert log.warnings() == ["/imu/data: 3 messages dropped (beyond what such a sensor can measure)."]
 
 
-def test_bytes_that_are_not_the_message_are_dropped_and_counted(tmp_path: Path) -> None:
+def test_bytes_of_another_type_are_dropped_and_counted(tmp_path: Path) -> None:
     definition = bags.STORE.generate_msgdef("sensor_msgs/msg/Imu", ros_version=2)[0]
     messages = [
         bags.Unknown("sensor_msgs/msg/Imu", definition, data) for data in (b"", b"\x00\x01\x00\x00", b"\x00\x01\x00\x00" + bytes(40))
@@ -251,7 +251,7 @@ def test_bytes_that_are_not_the_message_are_dropped_and_counted(tmp_path: Path) 
 # Joint states
 
 
-def test_missing_positions_or_velocities_are_nan(tmp_path: Path) -> None:
+def test_joint_state_missing_positions_or_velocities_are_nan(tmp_path: Path) -> None:
     messages = [
         bags.joint_state(START, velocity=[1, 2, 3, 4]),
         bags.joint_state(START + S, position=[0.1, 0.2, 0.3, 0.4]),
@@ -281,7 +281,7 @@ def test_wheel_angles_that_wrap_are_unwrapped(tmp_path: Path, wrapped: Any, with
     np.testing.assert_allclose(moved, np.array([3.25, 4.25]) * 199 / 20, rtol=1e-9)
 
 
-def test_encoders_that_are_reset_cost_one_increment(tmp_path: Path) -> None:
+def test_wheel_angles_after_encoder_reset_lose_one_increment(tmp_path: Path) -> None:
     messages = []
     for i in range(40):
         angle = 0.2 * i if i < 20 else 0.2 * (i - 20)  # reset to zero at 20, having turned 4 rad
@@ -294,8 +294,8 @@ def test_encoders_that_are_reset_cost_one_increment(tmp_path: Path) -> None:
 WILD = "/joint_states: 4 messages with rates that wheels cannot reach; these were left out."
 
 
-def test_rates_that_wheels_cannot_reach_are_left_out_and_told(tmp_path: Path) -> None:
-    """Where angles are there, they tell; without angles nothing does, and the message is dropped."""
+def test_wheel_rates_beyond_any_wheel_are_dropped_and_reported(tmp_path: Path) -> None:
+    """Angles are used where the message has them; without, it is dropped."""
     position, velocity = 0.1 * np.arange(30)[:, None] * [1, 1, 1, 1], np.ones((30, 4))
     for i, wild in ((5, 1e300), (10, -1e5), (15, 80.0), (20, np.inf)):
         velocity[i, 2] = wild
@@ -347,15 +347,15 @@ def odometry_log(tmp_path: Path, poses: Any, twists: Any, dt: float = 0.1, keep:
 RNG_RATES = 1.0 + np.cumsum(np.random.default_rng(3).uniform(-1.0, 1.0, (60, 2)), axis=0)  # within what a robot can accelerate
 
 
-def test_odometry_is_turned_back_into_wheels(tmp_path: Path) -> None:
+def test_odometry_is_converted_to_wheel_rates(tmp_path: Path) -> None:
     poses, twists = drive(RNG_RATES, 0.1, ROBOT.driver)
     wheels = wheels_of(odometry_log(tmp_path, poses, twists))
     np.testing.assert_allclose([w.velocity for w in wheels[1:]], RNG_RATES, atol=1e-9)
     np.testing.assert_allclose(np.diff([w.position for w in wheels], axis=0), RNG_RATES * 0.1, atol=1e-9)
 
 
-def test_messages_that_were_lost_take_no_motion_away(tmp_path: Path) -> None:
-    """On a constant arc, two messages tell as much as sixty."""
+def test_odometry_after_lost_messages_keeps_the_distance(tmp_path: Path) -> None:
+    """On a constant arc, two messages give the motion of sixty."""
     rates = np.tile([2.0, 3.0], (60, 1))
     poses, twists = drive(rates, 0.1, ROBOT.driver)
     wheels = wheels_of(odometry_log(tmp_path, poses, twists, keep=slice(None, None, 20)))
@@ -363,7 +363,7 @@ def test_messages_that_were_lost_take_no_motion_away(tmp_path: Path) -> None:
     np.testing.assert_allclose(wheels[-1].position, [12.0, 18.0], rtol=1e-9)
 
 
-def test_a_driver_without_twist_is_understood_from_its_pose(tmp_path: Path) -> None:
+def test_odometry_without_twist_uses_its_poses(tmp_path: Path) -> None:
     poses, twists = drive(RNG_RATES, 0.1, ROBOT.driver)
     log = odometry_log(tmp_path, poses, 0.0 * twists)
     wheels = wheels_of(log)
@@ -372,14 +372,14 @@ def test_a_driver_without_twist_is_understood_from_its_pose(tmp_path: Path) -> N
     assert any("60 messages with a moving pose but no rates" in note for note in log.warnings())
 
 
-def test_a_driver_without_pose_is_understood_from_its_twist(tmp_path: Path) -> None:
+def test_odometry_without_pose_uses_its_twists(tmp_path: Path) -> None:
     poses, twists = drive(RNG_RATES, 0.1, ROBOT.driver)
     log = odometry_log(tmp_path, 0.0 * poses, twists)
     np.testing.assert_allclose(np.diff([w.position for w in wheels_of(log)], axis=0), RNG_RATES * 0.1, atol=1e-9)
     assert any("pose that never moves" in note for note in log.warnings())
 
 
-def test_an_odometry_that_is_reset_costs_one_increment(tmp_path: Path) -> None:
+def test_odometry_reset_loses_one_increment(tmp_path: Path) -> None:
     rates = np.tile([4.0, 5.0], (60, 1))
     poses, twists = drive(rates, 0.1, ROBOT.driver)
     poses[30:] = se2.compose(se2.inverse(poses[30]), poses[30:])  # back to the origin, 2 m away, where it goes on
@@ -389,8 +389,8 @@ def test_an_odometry_that_is_reset_costs_one_increment(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("wild", [(1e5, 0.0), (0.0, -1e300), (6.0, 11.0)])
-def test_twists_that_wheels_cannot_reach_are_left_out_and_told(tmp_path: Path, wild: Any) -> None:
-    """The pose tells the motion; where it is NaN or never moves, the message is dropped, and its time is the next one's."""
+def test_odometry_twists_beyond_any_wheel_are_dropped_and_reported(tmp_path: Path, wild: Any) -> None:
+    """The pose gives the motion; where it is NaN or never moves, the message is dropped, and the next one covers its time."""
     rates = np.tile([4.0, 5.0], (60, 1))
     poses, twists = drive(rates, 0.1, ROBOT.driver)
     twists[[9, 29]] = wild  # of the messages 10 and 30
@@ -407,7 +407,7 @@ def test_twists_that_wheels_cannot_reach_are_left_out_and_told(tmp_path: Path, w
         np.testing.assert_allclose(wheels[-1].position - wheels[0].position, [24.0, 30.0], rtol=1e-9)
 
 
-def test_a_reset_without_twist_is_no_motion(tmp_path: Path) -> None:
+def test_odometry_reset_without_twist_is_no_motion(tmp_path: Path) -> None:
     poses = np.zeros((20, 3))
     poses[:, 0] = 0.05 * np.arange(20)
     poses[10:, 1] += 40.0
@@ -418,14 +418,14 @@ def test_a_reset_without_twist_is_no_motion(tmp_path: Path) -> None:
     np.testing.assert_allclose(increments, expected, atol=1e-9)
 
 
-def test_standing_still_is_no_motion_and_nothing_odd(tmp_path: Path) -> None:
+def test_odometry_standing_still_is_no_motion_without_warning(tmp_path: Path) -> None:
     log = odometry_log(tmp_path, np.tile([5.0, 6.0, 1.0], (20, 1)), np.zeros((19, 2)))
     wheels = wheels_of(log)
     assert all((w.position == 0.0).all() and (w.velocity == 0.0).all() for w in wheels)
     assert log.warnings() == []
 
 
-def test_poses_that_are_nan_are_bridged_by_the_twist(tmp_path: Path) -> None:
+def test_odometry_nan_poses_are_replaced_by_the_twist(tmp_path: Path) -> None:
     rates = np.tile([2.0, 3.0], (20, 1))
     poses, twists = drive(rates, 0.1, ROBOT.driver)
     poses[7] = np.nan
@@ -438,7 +438,7 @@ def test_poses_that_are_nan_are_bridged_by_the_twist(tmp_path: Path) -> None:
     st.lists(st.tuples(st.floats(-0.4, 0.4), st.floats(-0.9, 0.9)), min_size=1, max_size=20),
     st.floats(-3.0, 3.0),
 )
-def test_arcs_are_measured_exactly(steps: list[tuple[float, float]], heading: float) -> None:
+def test_odometry_arcs_are_converted_exactly(steps: list[tuple[float, float]], heading: float) -> None:
     """An arc's signed length and angle come back from its end points, forwards and backwards, through any heading."""
     from localization.logs.wheel_decoder import arc
 
@@ -451,7 +451,7 @@ def test_arcs_are_measured_exactly(steps: list[tuple[float, float]], heading: fl
         pose = following
 
 
-def test_the_huskys_wheels_drive_its_own_odometry_again() -> None:
+def test_husky_wheel_rates_reproduce_its_odometry() -> None:
     """Real log: the recovered wheels, integrated by the driver's geometry, give back the pose that the driver published."""
     robot = load_robot("husky_a200")
     path = Path(__file__).parents[1] / "data" / "husky-outdoor-gps" / "test1.bag"
@@ -472,15 +472,15 @@ def test_the_huskys_wheels_drive_its_own_odometry_again() -> None:
     assert log.warnings() == []
 
 
-def test_events_are_ours_alone(tmp_path: Path) -> None:
+def test_events_arrays_are_not_shared_with_the_reader(tmp_path: Path) -> None:
     """Readings on their way to wheel samples never come out."""
     poses, twists = drive(RNG_RATES, 0.1, ROBOT.driver)
     events: list[Event] = list(odometry_log(tmp_path, poses, twists).events())
     assert {type(event) for event in events} == {WheelSample}
 
 
-def test_a_type_that_the_log_defines_otherwise_is_dropped_and_counted(tmp_path: Path) -> None:
-    """The bytes are those of the log's definition, but there is nothing in them that an IMU would tell."""
+def test_message_type_defined_differently_is_dropped_and_counted(tmp_path: Path) -> None:
+    """The bytes are those of the log's definition, but have no field of an IMU."""
     definition = "std_msgs/Header header\nfloat64 temperature\n" + "=" * 80 + "\n"
     definition += "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n" + "=" * 80 + "\n"
     definition += "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
@@ -494,7 +494,7 @@ def test_a_type_that_the_log_defines_otherwise_is_dropped_and_counted(tmp_path: 
     assert log.warnings() == ["/imu/data: 3 messages dropped (bytes that are not of the type)."]
 
 
-def test_two_types_and_two_publishers_on_one_topic(tmp_path: Path) -> None:
+def test_topic_with_two_types_and_two_publishers_is_decoded(tmp_path: Path) -> None:
     """The more frequent type is the topic's; its publishers are one."""
     records: list[Any] = [("/scan", bags.laser_scan(START + i * S // 10), START + i * S // 10) for i in range(10)]
     records.insert(5, ("/scan", bags.imu(START + S // 2), START + S // 2))

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from localization.logs.decode import UnusableError
 from localization.logs.fast_cdr import FusedWriter, fast_decoder
-from localization.logs.fused_log import FusedEstimate, odometry_message, transform_message
-from localization.logs.message_stats import UnusableError
 from localization.logs.serialization import decoder, encode, make
+from localization.logs.writer import FusedEstimate, odometry_message, transform_message
 from tests.helpers.bags import STORE
 
 IMU, JOINTS, SCAN = "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState", "sensor_msgs/msg/LaserScan"
@@ -106,8 +106,8 @@ def garbled(data, where):
 
 
 @given(st.lists(joint_states(), min_size=1, max_size=4), st.integers(-8, 8), st.integers(0, 400))
-def test_joint_states_are_read_as_by_rosbags_whole_cut_and_garbled(messages, longer, where):
-    decode = decoder(JOINTS)  # the same for all: it remembers the names of the one before
+def test_joint_states_whole_cut_or_corrupted_are_read_as_by_rosbags(messages, longer, where):
+    decode = decoder(JOINTS)  # one decoder for all: it caches the names of the last message
     for message in [*messages, *messages]:
         data = encode(message)
         assert read(decode, data) == content(message)
@@ -119,7 +119,7 @@ def test_joint_states_are_read_as_by_rosbags_whole_cut_and_garbled(messages, lon
 
 @pytest.mark.parametrize("kind", [IMU, SCAN])
 @given(data=st.data(), longer=st.integers(-8, 8), where=st.integers(0, 400))
-def test_imus_and_scans_are_read_as_by_rosbags_whole_cut_and_garbled(kind, data, longer, where):
+def test_imus_and_scans_whole_cut_or_corrupted_are_read_as_by_rosbags(kind, data, longer, where):
     message = data.draw(MESSAGES[kind])
     decode, whole = decoder(kind), encode(message)
     assert fast_decoder(kind)(whole) is not None
@@ -132,7 +132,7 @@ def test_imus_and_scans_are_read_as_by_rosbags_whole_cut_and_garbled(kind, data,
 
 @pytest.mark.parametrize("kind", [IMU, JOINTS, SCAN])
 @given(data=st.data())
-def test_the_other_order_of_bytes_is_left_to_rosbags(kind, data):
+def test_cdr_of_the_other_byte_order_is_read_by_rosbags(kind, data):
     message = data.draw(MESSAGES[kind])
     turned = bytes(STORE.serialize_cdr(message, kind, little_endian=False))
     quick = fast_decoder(kind)
@@ -146,14 +146,14 @@ numbers = arrays(np.float64, 3, elements=st.floats(-1e3, 1e3))
 
 @pytest.mark.parametrize("is_ros1", [False, True])
 @given(pose=numbers, twist=numbers, covariance=covariances, twist_covariance=covariances, stamp=st.integers(0, 2**31 * 10**9 - 1))
-def test_estimates_are_written_as_by_rosbags(is_ros1, pose, twist, covariance, twist_covariance, stamp):
+def test_estimates_are_serialized_as_by_rosbags(is_ros1, pose, twist, covariance, twist_covariance, stamp):
     estimate = FusedEstimate(stamp, pose, twist, covariance, twist_covariance)
     writer = FusedWriter(is_ros1=is_ros1)
     assert writer.odometry(estimate) == encode(odometry_message(estimate), is_ros1=is_ros1)
     assert writer.transform(estimate) == encode(transform_message(estimate), is_ros1=is_ros1)
 
 
-def test_a_heading_beyond_a_turn_is_written_as_by_rosbags():
+def test_estimate_with_heading_beyond_a_turn_is_serialized_as_by_rosbags():
     estimate = FusedEstimate(5, np.array([0.0, -0.0, 9.0 * math.pi]), np.zeros(3))
     writer = FusedWriter(is_ros1=False)
     assert writer.odometry(estimate) == encode(odometry_message(estimate))

@@ -14,24 +14,9 @@ from localization.logs import inspect_log, open_log
 from motion_models.robot import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
+from tests.helpers.logs import records_of_every_kind
 
 ROBOT = load_robot("vaultbot")
-
-
-def records(steps: int = 40) -> Iterator[Record]:
-    """Every kind of event, and two topics that are none of ours: one of an unknown type, one of a definition that nobody can parse."""
-    for i in range(steps):
-        stamp = START + i * S // 10
-        yield "/imu/data", bags.imu(stamp, (0.01 * i, 0.0, -0.3), (0.0, 0.1, 9.8)), stamp + 2_000_000
-        yield (
-            "/joint_states",
-            bags.joint_state(stamp, position=[0.1 * i, 0.2 * i, 0.3 * i, 0.4 * i], velocity=[1, 2, 3, 4]),
-            stamp + 5_000_000,
-        )
-        yield "/gizmo", bags.Unknown(), stamp + 6_000_000
-        yield "/center_of_gravity", bags.point_stamped(stamp, 0.01 * (i % 20), -0.02), stamp + 7_000_000
-        yield "/nonsense", bags.Unknown("acme_msgs/msg/Broken", "this is ( not a definition\n"), stamp + 8_000_000
-        yield "/scan", bags.laser_scan(stamp, [1.0, 2.0, 3.0 + i], angle_min=0.0, angle_increment=np.pi / 2), stamp + 50_000_000
 
 
 def check(events: list[Event], steps: int) -> None:
@@ -61,8 +46,8 @@ def check(events: list[Event], steps: int) -> None:
 
 
 @pytest.mark.parametrize("name", bags.FORMATS)
-def test_every_format_gives_the_same_events_twice(tmp_path: Path, name: str) -> None:
-    log = open_log(bags.FORMATS[name](tmp_path / "run", records()), ROBOT)
+def test_log_every_format_gives_the_same_events_twice(tmp_path: Path, name: str) -> None:
+    log = open_log(bags.FORMATS[name](tmp_path / "run", records_of_every_kind()), ROBOT)
     check(list(log.events()), 40)
     check(list(log.events()), 40)
     assert log.warnings() == []
@@ -70,24 +55,24 @@ def test_every_format_gives_the_same_events_twice(tmp_path: Path, name: str) -> 
     assert log.start_ns == START + 2_000_000
 
 
-def test_two_iterators_of_one_log_do_not_disturb_each_other(tmp_path: Path) -> None:
+def test_log_two_iterators_are_independent(tmp_path: Path) -> None:
     for name in ("ros1", "mcap", "sqlite3", "mcap-file"):
-        log = open_log(bags.FORMATS[name](tmp_path / name, records()), ROBOT)
+        log = open_log(bags.FORMATS[name](tmp_path / name, records_of_every_kind()), ROBOT)
         both = list(zip(log.events(), log.events(), strict=True))
         check([one for one, _ in both], 40)
         check([other for _, other in both], 40)
 
 
-def test_ros1_bag_written_topic_by_topic_is_read_in_order_of_time(tmp_path: Path) -> None:
+def test_ros1_bag_written_topic_by_topic_is_read_in_time_order(tmp_path: Path) -> None:
     """As scripts that convert data sets write them; chunks of one topic lie far from those of the same time of another."""
-    ordered = sorted(records(400), key=lambda record: record[0])
+    ordered = sorted(records_of_every_kind(400), key=lambda record: record[0])
     path = bags.write_ros1_bag(tmp_path / "run.bag", ordered, chunk_bytes=4_000)
     log = open_log(path, ROBOT)
     check(list(log.events()), 400)
     assert log.warnings() == []
 
 
-def test_definitions_of_the_log_are_used(tmp_path: Path) -> None:
+def test_log_own_message_definitions_are_used(tmp_path: Path) -> None:
     """A later ROS may add a field to a message; its bytes are not to be taken for the next message's."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -132,7 +117,7 @@ def _peak(path: Path) -> tuple[int, int]:
     ],
     ids=["ros1", "mcap", "sqlite3"],
 )
-def test_a_log_ten_times_as_long_takes_no_more_memory(tmp_path: Path, write: Callable[[Path, Iterator[Record]], Path]) -> None:
+def test_log_ten_times_longer_uses_no_more_memory(tmp_path: Path, write: Callable[[Path, Iterator[Record]], Path]) -> None:
     def long_records(steps: int) -> Iterator[Record]:
         ranges = np.linspace(1.0, 9.0, 2000)
         for i in range(steps):

@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from localization.errors import OutputError
-from localization.logs.fused_log import MAP_FRAME, UNKNOWN_VARIANCE, FusedEstimate, write_fused
+from localization.logs.writer import MAP_FRAME, UNKNOWN_VARIANCE, FusedEstimate, write_fused
 from motion_models import se2
 
 COVARIANCE = np.array([[4e-2, 1e-3, 2e-3], [1e-3, 1e-2, -3e-3], [2e-3, -3e-3, 5e-3]])
@@ -61,7 +61,7 @@ READERS = pytest.mark.parametrize("read", [with_rosbags, with_mcap])
 
 
 @READERS
-def test_odometry_holds_pose_twist_and_stamp(tmp_path: Path, read: Any) -> None:
+def test_odometry_message_has_pose_twist_and_stamp(tmp_path: Path, read: Any) -> None:
     path = tmp_path / "fused.mcap"
     write_fused(path, {"skid_steer_ekf": estimates()})
     messages = [(t, m) for topic, t, m in read(path) if topic == "/skid_steer_ekf/odometry"]
@@ -77,7 +77,7 @@ def test_odometry_holds_pose_twist_and_stamp(tmp_path: Path, read: Any) -> None:
         assert (angular.x, angular.y, angular.z) == (0, 0, estimate.twist[2])
 
 
-def test_poses_of_a_localization_are_in_the_map(tmp_path: Path) -> None:
+def test_odometry_of_a_map_estimator_has_frame_map(tmp_path: Path) -> None:
     """Side by side with an odometry, whose frame is another one."""
     path = tmp_path / "fused.mcap"
     in_map = [replace(estimate, parent=MAP_FRAME) for estimate in estimates()]
@@ -90,7 +90,7 @@ def test_poses_of_a_localization_are_in_the_map(tmp_path: Path) -> None:
 
 
 @READERS
-def test_twist_covariance_stays_in_the_body_and_the_rest_is_unknown(tmp_path: Path, read: Any) -> None:
+def test_twist_covariance_is_in_the_body_frame_and_rest_unknown(tmp_path: Path, read: Any) -> None:
     path = tmp_path / "fused.mcap"
     write_fused(path, {"ekf": estimates(1)})
     message = next(m for topic, _, m in read(path) if topic == "/ekf/odometry")
@@ -104,7 +104,7 @@ def test_twist_covariance_stays_in_the_body_and_the_rest_is_unknown(tmp_path: Pa
 
 
 @pytest.mark.parametrize("theta", [0.0, 0.7, math.pi / 2, -2.9])
-def test_pose_covariance_is_the_spread_of_positions_in_the_axes_of_odom(tmp_path: Path, theta: float) -> None:
+def test_pose_covariance_matches_the_spread_of_sampled_positions(tmp_path: Path, theta: float) -> None:
     """Second way to the number: draw body-frame perturbations, apply them, and take the covariance of x, y, yaw in odom."""
     covariance = COVARIANCE * 1e-4  # small, so that first order holds
     pose = np.array([3.0, -2.0, theta])
@@ -122,7 +122,7 @@ def test_pose_covariance_is_the_spread_of_positions_in_the_axes_of_odom(tmp_path
     assert (np.abs(np.cov(scattered.T) - written) < tolerance).all()
 
 
-def test_heading_of_a_quarter_turn_swaps_the_axes(tmp_path: Path) -> None:
+def test_pose_covariance_at_90_degrees_swaps_the_axes(tmp_path: Path) -> None:
     path = tmp_path / "fused.mcap"
     ahead_unsure = np.diag([9.0, 1.0, 0.25])
     write_fused(path, {"ekf": [FusedEstimate(0, np.array([0, 0, math.pi / 2]), np.zeros(3), ahead_unsure)]})
@@ -130,7 +130,7 @@ def test_heading_of_a_quarter_turn_swaps_the_axes(tmp_path: Path) -> None:
     assert np.diag(np.array(message.pose.covariance).reshape(6, 6)) == pytest.approx([1, 9, 1e6, 1e6, 1e6, 0.25])
 
 
-def test_estimate_without_covariance_is_unknown_not_certain(tmp_path: Path) -> None:
+def test_odometry_without_covariance_is_marked_unknown(tmp_path: Path) -> None:
     path = tmp_path / "fused.mcap"
     write_fused(path, {"lidar": [FusedEstimate(5, np.zeros(3), np.zeros(3))]})
     message = next(m for topic, _, m in with_rosbags(path) if topic == "/lidar/odometry")
@@ -139,7 +139,7 @@ def test_estimate_without_covariance_is_unknown_not_certain(tmp_path: Path) -> N
 
 
 @READERS
-def test_tf_is_that_of_one_result(tmp_path: Path, read: Any) -> None:
+def test_tf_with_named_result_is_that_result(tmp_path: Path, read: Any) -> None:
     path = tmp_path / "fused.mcap"
     write_fused(path, {"a": estimates(), "b": estimates(lean=0.5)}, tf_of="b")
     transforms = [m.transforms for topic, _, m in read(path) if topic == "/tf"]
@@ -151,14 +151,14 @@ def test_tf_is_that_of_one_result(tmp_path: Path, read: Any) -> None:
         assert se2.wrap_angle(yaw(transform.transform.rotation) - estimate.pose[2]) == pytest.approx(0, abs=1e-12)
 
 
-def test_the_first_result_goes_to_tf_where_none_is_named(tmp_path: Path) -> None:
+def test_tf_without_named_result_is_the_first(tmp_path: Path) -> None:
     path = tmp_path / "fused.mcap"
     write_fused(path, {"b": estimates(lean=0.5), "a": estimates()})
     first = next(m for topic, _, m in with_rosbags(path) if topic == "/tf")
     assert first.transforms[0].transform.translation.x == 0.5
 
 
-def test_results_of_different_rates_come_in_order_of_time(tmp_path: Path) -> None:
+def test_fused_log_results_of_different_rates_are_in_time_order(tmp_path: Path) -> None:
     path = tmp_path / "fused.mcap"
     write_fused(path, {"slow": estimates(10, step_ns=300), "fast": estimates(30, step_ns=100)})
     with path.open("rb") as stream:  # in the order of the file itself, not sorted by the reader
@@ -167,7 +167,7 @@ def test_results_of_different_rates_come_in_order_of_time(tmp_path: Path) -> Non
     assert times == sorted(times)
 
 
-def test_same_estimates_same_bytes_and_nothing_else_left(tmp_path: Path) -> None:
+def test_fused_log_same_estimates_give_same_bytes_and_one_file(tmp_path: Path) -> None:
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
         write_fused(tmp_path / folder / "run.1.mcap", {"ekf": estimates(2000), "graph": estimates(1000)})
@@ -176,7 +176,7 @@ def test_same_estimates_same_bytes_and_nothing_else_left(tmp_path: Path) -> None
     assert [f.name for f in first.parent.iterdir()] == ["run.1.mcap"]
 
 
-def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
+def test_fused_log_ten_times_longer_uses_no_more_memory(tmp_path: Path) -> None:
     """Five times the estimates, made one at a time: more memory by less than a tenth of what the messages take."""
 
     def many(count: int) -> Iterator[FusedEstimate]:
@@ -194,7 +194,7 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     assert peaks[1] < peaks[0] + whole / 10
 
 
-def test_nothing_is_overwritten(tmp_path: Path) -> None:
+def test_fused_log_existing_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "fused.mcap"
     path.write_text("mine")
     with pytest.raises(OutputError, match="exists already"):
@@ -202,7 +202,7 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     assert path.read_text() == "mine"
 
 
-def test_a_file_that_appears_while_writing_is_not_overwritten(tmp_path: Path) -> None:
+def test_fused_log_file_created_while_writing_is_not_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "fused.mcap"
 
     def slow() -> Iterator[FusedEstimate]:
@@ -250,18 +250,18 @@ def spoiled(values: Any, index: Any, value: float) -> Any:
         ([], "nothing to write"),
     ],
 )
-def test_bad_estimates_are_refused_and_leave_nothing(tmp_path: Path, bad: list[FusedEstimate], message: str) -> None:
+def test_fused_log_invalid_estimates_are_refused_and_no_file_left(tmp_path: Path, bad: list[FusedEstimate], message: str) -> None:
     with pytest.raises(OutputError, match=message):
         write_fused(tmp_path / "fused.mcap", {"ekf": bad})
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_error_says_which_result_and_when(tmp_path: Path) -> None:
+def test_fused_log_error_names_result_and_time(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"result 'graph' at 20\.000000 s"):
         write_fused(tmp_path / "fused.mcap", {"ekf": estimates(), "graph": one(pose=np.full(3, np.nan))})
 
 
-def test_names_and_paths_that_cannot_be(tmp_path: Path) -> None:
+def test_fused_log_invalid_names_and_paths_are_refused(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="no result"):
         write_fused(tmp_path / "fused.mcap", {})
     with pytest.raises(OutputError, match=r"'skid steer'.*becomes a topic"):
@@ -275,7 +275,7 @@ def test_names_and_paths_that_cannot_be(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_error_of_the_estimator_passes_as_it_is(tmp_path: Path) -> None:
+def test_fused_log_estimator_error_is_passed_on(tmp_path: Path) -> None:
     """An OSError of a lazy result is not about the output; it must not be reported as if it were."""
 
     def failing() -> Iterator[FusedEstimate]:

@@ -23,7 +23,7 @@ from localization.logs.chunks import MAX_DECOMPRESSED_BYTES, DamagedError, decom
 from motion_models.robot import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, S
-from tests.logs.test_damage import records, said
+from tests.helpers.logs import numbered_records, warnings_of
 
 ROBOT = load_robot("vaultbot")
 
@@ -54,11 +54,11 @@ def read_all(path: Path) -> tuple[list, str]:
         log = open_log(path, ROBOT)
         events = list(log.events())
         inspect_log(log)
-        return events, said(log)
+        return events, warnings_of(log)
 
 
 def test_sqlite_row_with_endless_header_is_skipped(tmp_path: Path) -> None:
-    path = bags.write_ros2_bag(tmp_path / "run", records(60), "sqlite3") / "run.db3"
+    path = bags.write_ros2_bag(tmp_path / "run", numbered_records(60), "sqlite3") / "run.db3"
     data = bytearray(path.read_bytes())
     for i in range(60):
         at = data.find(struct.pack(">Q", START + i * S // 10 + S // 200))
@@ -100,7 +100,7 @@ def test_sqlite_with_a_view_instead_of_a_table_is_refused(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("offset", [2**64 - 1, 2**63, 10**12, 3])
 def test_mcap_footer_that_points_nowhere_costs_the_index_only(tmp_path: Path, offset: int) -> None:
-    path = bags.write_mcap(tmp_path / "run.mcap", records(60))
+    path = bags.write_mcap(tmp_path / "run.mcap", numbered_records(60))
     data = bytearray(path.read_bytes())
     data[-28:-20] = struct.pack("<Q", offset)
     path.write_bytes(data)
@@ -109,9 +109,9 @@ def test_mcap_footer_that_points_nowhere_costs_the_index_only(tmp_path: Path, of
     assert "run.mcap was read record by record" in notes
 
 
-def test_ros1_chunk_position_past_the_end_costs_that_chunk_only(tmp_path: Path) -> None:
+def test_ros1_chunk_position_past_the_end_loses_that_chunk_only(tmp_path: Path) -> None:
     for position in (2**64 - 1, 2**63 - 1, 10**12):
-        path = bags.write_ros1_bag(tmp_path / f"run{position}.bag", records(200), chunk_bytes=50_000)
+        path = bags.write_ros1_bag(tmp_path / f"run{position}.bag", numbered_records(200), chunk_bytes=50_000)
         data = bytearray(path.read_bytes())
         at = data.rindex(b"chunk_pos=") + len(b"chunk_pos=")
         data[at : at + 8] = struct.pack("<Q", position)
@@ -125,7 +125,7 @@ def test_ros1_chunk_position_past_the_end_costs_that_chunk_only(tmp_path: Path) 
 def test_damaged_region_of_an_uncompressed_chunk_costs_its_messages_only(tmp_path: Path, kind: str) -> None:
     """One chunk holds the whole log: 300 spoiled bytes, at some boundary of messages or not, must not cost more than a few of them."""
     for shift in range(0, 2400, 300):
-        path = bags.FORMATS[kind](tmp_path / f"{kind}{shift}", records(150))
+        path = bags.FORMATS[kind](tmp_path / f"{kind}{shift}", numbered_records(150))
         data = bytearray(path.read_bytes())
         data[len(data) // 2 + shift : len(data) // 2 + shift + 300] = bytes(range(1, 101)) * 3
         path.write_bytes(data)
@@ -138,11 +138,11 @@ def test_damaged_region_of_an_uncompressed_chunk_costs_its_messages_only(tmp_pat
 
 @pytest.mark.parametrize("kind", ["mcap", "mcap-folder"])
 def test_fewer_messages_than_the_index_lists_are_reported(tmp_path: Path, kind: str) -> None:
-    """A record in the middle whose kind was turned into one that nobody knows: all else is intact."""
-    path = bags.FORMATS[kind](tmp_path / "run", records(150))
+    """A record in the middle of an unknown kind: all else is intact."""
+    path = bags.FORMATS[kind](tmp_path / "run", numbered_records(150))
     file = next(path.glob("*.mcap")) if path.is_dir() else path
     data = bytearray(file.read_bytes())
-    size = len(bags.STORE.serialize_cdr(next(r[1] for r in records(1) if r[0] == "/scan"), "sensor_msgs/msg/LaserScan"))
+    size = len(bags.STORE.serialize_cdr(next(r[1] for r in numbered_records(1) if r[0] == "/scan"), "sensor_msgs/msg/LaserScan"))
     mark, at = b"\x05" + struct.pack("<Q", size + 22), 0
     for number in range(150):
         at = data.index(mark, at + 1)
@@ -164,7 +164,7 @@ def test_decompression_bomb_is_refused_within_bounds(name: str, pack) -> None:
         decompress(packed, name)
 
 
-def test_honest_chunk_of_a_large_size_passes() -> None:
+def test_large_valid_chunk_passes() -> None:
     """100 MB that compress 4 to 1, and 60 MB of nothing (an empty map) that compress 10,000 to 1."""
     rng = np.random.default_rng(1)
     sensor = np.repeat(rng.integers(0, 256, 25 << 20, dtype=np.uint8), 4).tobytes()
@@ -174,7 +174,7 @@ def test_honest_chunk_of_a_large_size_passes() -> None:
 
 def test_message_that_is_a_bomb_is_dropped_and_counted(tmp_path: Path) -> None:
     def with_bomb() -> Iterator[bags.Record]:
-        for i, record in enumerate(records(30)):
+        for i, record in enumerate(numbered_records(30)):
             yield record
             if i == 20:
                 yield "/scan", bags.Unknown("sensor_msgs/msg/LaserScan", text, zstd.compress(BOMB)), record[2] + 1
@@ -188,7 +188,7 @@ def test_message_that_is_a_bomb_is_dropped_and_counted(tmp_path: Path) -> None:
 
 
 def test_storage_file_that_is_a_bomb_is_refused(tmp_path: Path) -> None:
-    path = bags.write_ros2_bag(tmp_path / "run", records(10), "sqlite3", "file")
+    path = bags.write_ros2_bag(tmp_path / "run", numbered_records(10), "sqlite3", "file")
     file = next(path.glob("*.zstd"))
     plain = zstd.decompress(file.read_bytes())
     file.write_bytes(zstd.compress(plain) + b"".join(zstd.compress(bytes(64 << 20)) for _ in range(30)))
@@ -212,7 +212,7 @@ def test_arrays_of_billions_of_empty_elements_are_dropped(tmp_path: Path, is_ros
     for count in (b"\xff\xff\xff\xff", b"\xff\xff\xff\x0f"):
         messages = [("/imu/data", bags.Unknown(kind, text, data[:24] + count + data[24:]), START + i) for i in range(3)]
         write = bags.write_ros1_bag if is_ros1 else bags.write_ros2_bag
-        events, notes = read_all(write(tmp_path / f"run{count[-1]}{'.bag' * is_ros1}", [*messages, *records(5)]))
+        events, notes = read_all(write(tmp_path / f"run{count[-1]}{'.bag' * is_ros1}", [*messages, *numbered_records(5)]))
         assert sum(isinstance(e, Scan) for e in events) == 5
         assert "/imu/data: 3 messages dropped" in notes
 
@@ -230,7 +230,7 @@ def test_definition_with_a_huge_fixed_array_is_replaced(tmp_path: Path, size: in
     def as_bytes(message) -> bags.Unknown:
         return bags.Unknown(kind, hostile, bytes(bags.STORE.serialize_cdr(message, kind)))
 
-    messages = [(topic, as_bytes(m) if topic == "/scan" else m, stamp) for topic, m, stamp in records(20)]
+    messages = [(topic, as_bytes(m) if topic == "/scan" else m, stamp) for topic, m, stamp in numbered_records(20)]
     events, _ = read_all(bags.write_ros2_bag(tmp_path / "run", messages))
     assert sum(isinstance(e, Scan) for e in events) == 20
 
@@ -238,7 +238,7 @@ def test_definition_with_a_huge_fixed_array_is_replaced(tmp_path: Path, size: in
 @pytest.mark.parametrize("name", ["header", "stamp", "frame_id", "name", "position", "ranges", "angle_increment", "float32"])
 def test_damaged_definition_is_replaced_by_the_standard_one(tmp_path: Path, name: str) -> None:
     def spoiled() -> Iterator[bags.Record]:
-        for topic, message, stamp in records(20):
+        for topic, message, stamp in numbered_records(20):
             kind = message.__msgtype__
             text = bags.STORE.generate_msgdef(kind, ros_version=2)[0].replace(name, name[:-1] + "q")
             yield topic, bags.Unknown(kind, text, bytes(bags.STORE.serialize_cdr(message, kind))), stamp
@@ -252,7 +252,7 @@ def test_fifo_and_device_are_refused_at_once(tmp_path: Path) -> None:
     for path, what in ((tmp_path / "run.bag", "a FIFO"), (Path("/dev/zero"), "a device")):
         with limits(5), pytest.raises(LogError, match=what):
             open_log(path, ROBOT)
-    folder = bags.write_ros2_bag(tmp_path / "run", records(5), "sqlite3")
+    folder = bags.write_ros2_bag(tmp_path / "run", numbered_records(5), "sqlite3")
     (folder / "run.db3").unlink()
     os.mkfifo(folder / "run.db3")
     with limits(5), pytest.raises(LogError, match="a FIFO"):
@@ -260,7 +260,7 @@ def test_fifo_and_device_are_refused_at_once(tmp_path: Path) -> None:
 
 
 def test_metadata_of_millions_of_brackets_is_not_parsed(tmp_path: Path) -> None:
-    path = bags.write_ros2_bag(tmp_path / "run", records(20), "mcap")
+    path = bags.write_ros2_bag(tmp_path / "run", numbered_records(20), "mcap")
     for text in ("[" * 20_000, "a: &a [x]\n" * 1000, " " * (8 << 20)):
         (path / "metadata.yaml").write_text(text)
         events, notes = read_all(path)
@@ -278,7 +278,7 @@ def test_whole_mcap_of_another_writer_is_read_by_its_index(tmp_path: Path, compr
         writer = Writer(file, chunk_size=50_000, compression=CompressionType[compression])
         writer.start("ros2", "test")
         ids: dict[str, int] = {}
-        for topic, message, log_ns in records(100):
+        for topic, message, log_ns in numbered_records(100):
             kind = message.__msgtype__
             if topic not in ids:
                 schema = writer.register_schema(kind, "ros2msg", bags.STORE.generate_msgdef(kind, ros_version=2)[0].encode())

@@ -12,7 +12,7 @@ from localization.errors import LogError
 from localization.logs import inspect_log, open_log
 from motion_models.robot import load_robot
 from tests.helpers import bags, fuzz
-from tests.helpers.hostile_logs import BAD, FILE_FAULTS, SENSOR_FAULTS, SOURCES, Case, cases, run_case, truth_of, write_case
+from tests.helpers.hostile_logs import BAD, FILE_FAULTS, SENSOR_FAULTS, SOURCES, Case, cases, reference_of, run_case, write_case
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +33,9 @@ DECIDED_IN_LOGS = (
 def test_sensor_fault_decided_in_logs_is_never_silently_wrong(tmp_path: Path, truths: Path, fault: str) -> None:
     source = SOURCES[0]
     log = write_case(Case(0, source.name, "mcap", fault, ""), tmp_path, seed=0)
-    outcome = run_case(log, source.robot, truth_of(source.name, truths), tmp_path / "out")
+    outcome = run_case(log, source.robot, reference_of(source.name, truths), tmp_path / "out")
     assert outcome.kind not in BAD, outcome
-    assert outcome.said != ""
+    assert outcome.message != ""
 
 
 @pytest.mark.parametrize("form", bags.FORMATS)
@@ -53,7 +53,7 @@ def test_damaged_file_of_any_format_is_read_or_refused(tmp_path: Path, form: str
         assert stamps == sorted(stamps)
 
 
-def test_cases_of_a_seed_are_the_same_and_hold_all_faults() -> None:
+def test_hostile_cases_of_one_seed_repeat_and_contain_all_faults() -> None:
     chosen = cases(300, 0)
     assert chosen == cases(300, 0) != cases(300, 1)
     assert {case.sensor_fault for case in chosen} == set(SENSOR_FAULTS)

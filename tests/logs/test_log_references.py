@@ -1,4 +1,4 @@
-"""References, mounts, and what `info` tells."""
+"""References, mounts, and `skidloc info`."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ COVARIANCE = COVARIANCE @ COVARIANCE.T + np.eye(6)
 
 
 @pytest.mark.parametrize("ros1", [False, True])
-def test_poses_of_every_type(tmp_path: Path, ros1: bool) -> None:
+def test_references_of_each_message_type_give_poses(tmp_path: Path, ros1: bool) -> None:
     transform = bags.tf(START, [("map", "robot", (1.0, 2.0, 0.5), bags.quaternion(0.7))]).transforms[0]
     planar = COVARIANCE[np.ix_([0, 1, 5], [0, 1, 5])]
     cases = [
         ("/pose", bags.pose_stamped(START, 1.0, 2.0, 0.7), None),
         ("/pose_cov", bags.pose_with_covariance(START, 1.0, 2.0, 0.7, COVARIANCE), planar),
         ("/odom", bags.odometry(START, 1.0, 2.0, 0.7, covariance=COVARIANCE), planar),
-        ("/zero_cov", bags.odometry(START, 1.0, 2.0, 0.7), None),  # all zeros: the driver does not know
+        ("/zero_cov", bags.odometry(START, 1.0, 2.0, 0.7), None),  # all zeros: a driver without covariance
         ("/vicon", transform, None),
     ]
     log = log_of(tmp_path, [(topic, message, START) for topic, message, _ in cases], ros1)
@@ -56,7 +56,7 @@ def test_poses_of_every_type(tmp_path: Path, ros1: bool) -> None:
         np.testing.assert_allclose(reference.covariance, np.full((3, 3), np.nan) if expected is None else expected)
 
 
-def test_heading_survives_tilt_and_unnormalised_quaternions(tmp_path: Path) -> None:
+def test_references_tilted_or_unnormalised_quaternion_keep_heading(tmp_path: Path) -> None:
     tilted = bags.pose_stamped(START, 0, 0, 0)
     tilted.pose.orientation = bags.quaternion(-2.5, pitch=0.2, roll=-0.1)
     scaled = bags.pose_stamped(START + S, 0, 0, 0)
@@ -67,7 +67,7 @@ def test_heading_survives_tilt_and_unnormalised_quaternions(tmp_path: Path) -> N
     assert references[1].yaw == pytest.approx(3.1)
 
 
-def test_poses_that_are_none_are_dropped_and_counted(tmp_path: Path) -> None:
+def test_references_invalid_poses_are_dropped_and_counted(tmp_path: Path) -> None:
     nothing = bags.pose_stamped(START + S, 1, 1, 0)
     q = nothing.pose.orientation
     nothing.pose.orientation = type(q)(x=0.0, y=0.0, z=0.0, w=0.0)
@@ -76,7 +76,7 @@ def test_poses_that_are_none_are_dropped_and_counted(tmp_path: Path) -> None:
     assert log.warnings() == ["/ref: 2 messages dropped (NaN or inf)."]
 
 
-def test_gps_is_east_and_north_of_the_first_fix_in_metres(tmp_path: Path) -> None:
+def test_references_gps_fixes_are_metres_east_and_north_of_the_first(tmp_path: Path) -> None:
     """Against the ellipsoid's radii of curvature (Snyder 1987, eq. 4-18 and 4-20), which hold for small steps."""
     a, e2 = 6_378_137.0, 6.694379990141e-3
     latitude, longitude, height = 42.4, -71.1, 120.0
@@ -94,18 +94,18 @@ def test_gps_is_east_and_north_of_the_first_fix_in_metres(tmp_path: Path) -> Non
     assert all(r.yaw is None for r in references)
 
 
-def test_gps_far_away_is_a_tangent_plane_not_a_map(tmp_path: Path) -> None:
+def test_references_gps_far_away_is_on_the_tangent_plane(tmp_path: Path) -> None:
     """On the equator, a degree to the east is the sine of a degree, times the equator's radius."""
     references, _ = references_of(tmp_path, [bags.fix(START, 0.0, 10.0), bags.fix(START + S, 0.0, 11.0)])
     np.testing.assert_allclose(references[1].position, [6_378_137.0 * math.sin(math.radians(1.0)), 0.0], atol=1e-6)
 
 
-def test_gps_over_the_date_line(tmp_path: Path) -> None:
+def test_references_gps_across_the_date_line_is_continuous(tmp_path: Path) -> None:
     references, _ = references_of(tmp_path, [bags.fix(START, 0.0, 179.9999), bags.fix(START + S, 0.0, -179.9999)])
     assert references[1].position[0] == pytest.approx(6_378_137.0 * math.radians(2e-4), rel=1e-6)
 
 
-def test_gps_without_a_fix_is_left_out_and_cannot_be_the_origin(tmp_path: Path) -> None:
+def test_references_gps_without_fix_is_dropped_and_never_the_origin(tmp_path: Path) -> None:
     messages = [
         bags.fix(START, 0.0, 0.0, status=-1),
         bags.fix(START + S, np.nan, 8.0),
@@ -121,7 +121,7 @@ def test_gps_without_a_fix_is_left_out_and_cannot_be_the_origin(tmp_path: Path) 
     assert log.warnings() == ["/ref: 2 messages left out (no GPS fix)."]
 
 
-def test_the_huskys_gps_covers_the_ground_that_its_source_tells() -> None:
+def test_references_gps_of_the_husky_log_spans_the_published_area() -> None:
     references = list(open_log(HUSKY_BAG, load_robot("husky_a200")).references("/fix"))
     assert len(references) == 989
     np.testing.assert_allclose(np.ptp([r.position for r in references], axis=0), [57.5, 146.3], rtol=5e-3)
@@ -143,7 +143,7 @@ def close(mount: Mount, **expected: float) -> None:
         assert getattr(mount, name) == pytest.approx(expected.get(name, 0.0), abs=1e-9), name
 
 
-def test_mounts_follow_chains_down_from_the_body(tmp_path: Path) -> None:
+def test_transforms_chain_of_frames_gives_the_mount(tmp_path: Path) -> None:
     edges = [
         ("plate", "laser", (0.1, 0.0, 0.2), bags.quaternion(math.pi / 2)),
         ("base_footprint", "base_link", (0.0, 0.0, 0.13), bags.quaternion()),
@@ -159,26 +159,26 @@ def test_mounts_follow_chains_down_from_the_body(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ros1", [False, True])
-def test_mounts_of_a_robot_whose_body_is_its_footprint(tmp_path: Path, ros1: bool) -> None:
+def test_transforms_body_named_footprint_gives_the_mount(tmp_path: Path, ros1: bool) -> None:
     close(mounts_of(tmp_path, [("base_footprint", "laser", (0.5, 0.0, 0.2), bags.quaternion(0.3))], ros1)["laser"], x=0.5, z=0.2, yaw=0.3)
 
 
-def test_slashes_before_frames_are_those_of_tf1(tmp_path: Path) -> None:
+def test_transforms_leading_slashes_of_tf1_are_ignored(tmp_path: Path) -> None:
     close(mounts_of(tmp_path, [("/base_link", "/laser", (0.5, 0.0, 0.0), bags.quaternion())], ros1=True)["laser"], x=0.5)
 
 
 @pytest.mark.parametrize("angles", [(0.3, -0.4, 2.0), (-1.570796327, 0.0, 1.570796327), (0.0, math.pi / 2, 0.0), (3.0, -math.pi / 2, 0.5)])
-def test_a_mounts_angles_give_back_its_rotation(tmp_path: Path, angles: tuple[float, float, float]) -> None:
+def test_mount_angles_of_any_rotation_give_it_back(tmp_path: Path, angles: tuple[float, float, float]) -> None:
     roll, pitch, yaw = angles
     mount = mounts_of(tmp_path, [("base_link", "imu", (0.0, 0.0, 0.0), bags.quaternion(yaw, pitch, roll))])["imu"]
     np.testing.assert_allclose(mount.rotation(), Mount(roll=roll, pitch=pitch, yaw=yaw).rotation(), atol=1e-8)
 
 
-def test_mount_of_the_identity_has_no_negative_zeros() -> None:
+def test_mount_of_identity_has_no_negative_zeros() -> None:
     assert all(math.copysign(1.0, v) == 1.0 for v in vars(mount_of(np.eye(4))).values())
 
 
-def test_the_log_goes_before_the_robot_file(tmp_path: Path) -> None:
+def test_mount_in_log_and_robot_file_is_that_of_the_log(tmp_path: Path) -> None:
     robot = parse_robot(
         """name = "r"
 [geometry]
@@ -198,7 +198,7 @@ x = 8.0
     assert (mounts["laser"].x, mounts["imu_link"].x, mounts["base_link"].x) == (0.5, 8.0, 0.0)
 
 
-def test_transforms_of_ros1_that_never_change_are_mounts_and_those_that_do_are_not(tmp_path: Path) -> None:
+def test_transforms_of_ros1_that_move_are_no_mounts(tmp_path: Path) -> None:
     records: list[Record] = []
     for i in range(100):
         t = START + i * S // 10
@@ -215,14 +215,14 @@ def test_transforms_of_ros1_that_never_change_are_mounts_and_those_that_do_are_n
     assert "laser" not in log_of(tmp_path / "2", pad(records), ros1=False).mounts  # ROS 2 has /tf_static for this
 
 
-def test_transforms_that_are_none_are_passed_over(tmp_path: Path) -> None:
+def test_transforms_invalid_are_ignored(tmp_path: Path) -> None:
     zero = bags.quaternion()
     zero = type(zero)(x=0.0, y=0.0, z=0.0, w=0.0)
     edges = [("base_link", "a", (0.0, 0.0, 0.0), zero), ("base_link", "b", (np.nan, 0.0, 0.0), bags.quaternion())]
     assert not {"a", "b"} & mounts_of(tmp_path, edges).keys()
 
 
-def test_a_loop_of_transforms_ends(tmp_path: Path) -> None:
+def test_transforms_in_a_cycle_are_no_mount(tmp_path: Path) -> None:
     edges = [("base_link", "a", (1.0, 0.0, 0.0), bags.quaternion()), ("a", "base_link", (-1.0, 0.0, 0.0), bags.quaternion())]
     close(mounts_of(tmp_path, edges)["a"], x=1.0)
 
@@ -230,7 +230,7 @@ def test_a_loop_of_transforms_ends(tmp_path: Path) -> None:
 # Info
 
 
-def test_info_of_the_husky() -> None:
+def test_info_husky_log_lists_topics_and_rates() -> None:
     info = inspect_log(open_log(HUSKY_BAG, load_robot("husky_a200")))
     by_topic = {topic.topic: topic for topic in info.topics}
     odometry, gps, inertial = by_topic["/husky_velocity_controller/odom"], by_topic["/fix"], by_topic["/imu/data"]
@@ -245,7 +245,7 @@ def test_info_of_the_husky() -> None:
     assert json.loads(json.dumps(info.to_dict(), allow_nan=False))["parts"]["wheels"]["topic"] == "/husky_velocity_controller/odom"
 
 
-def test_info_finds_gaps_frames_and_what_is_missing(tmp_path: Path) -> None:
+def test_info_log_with_gaps_reports_gaps_frames_and_missing_topics(tmp_path: Path) -> None:
     records: list[Record] = []
     for i in range(200):
         t = START + i * S // 10
@@ -258,12 +258,12 @@ def test_info_finds_gaps_frames_and_what_is_missing(tmp_path: Path) -> None:
     assert scan.frame_id == "strange_frame"
     camera = next(topic for topic in info.topics if topic.topic == "/camera")
     assert (camera.count, camera.used_as, camera.first_stamp_ns) == (200, None, None)
-    said = "\n".join(info.problems)
+    problems = "\n".join(info.problems)
     for expected in ("no wheels", "no IMU", "'strange_frame'", "[mounts.strange_frame]", "1 gap, the longest 3.10 s long"):
-        assert expected in said
+        assert expected in problems
 
 
-def test_info_of_a_log_that_was_cut_off_says_so(tmp_path: Path) -> None:
+def test_info_truncated_log_reports_truncation(tmp_path: Path) -> None:
     data = HUSKY_BAG.read_bytes()
     path = tmp_path / "test1.bag"
     path.write_bytes(data[: len(data) // 2])
@@ -274,19 +274,19 @@ def test_info_of_a_log_that_was_cut_off_says_so(tmp_path: Path) -> None:
     json.dumps(info.to_dict(), allow_nan=False)
 
 
-def test_info_tells_which_sensor_ends_early(tmp_path: Path) -> None:
+def test_info_sensor_that_ends_early_is_reported(tmp_path: Path) -> None:
     records: list[Record] = []
     for i in range(300):
         t = START + i * S // 10
         records.append(("/odom", bags.odometry(t), t))
         if 50 <= i < 200:
             records.append(("/scan", bags.laser_scan(t), t))
-    said = "\n".join(inspect_log(log_of(tmp_path, records)).problems)
-    assert "/scan begins 5.0 s after the other sensors" in said
-    assert "/scan ends 10.0 s before the other sensors" in said
+    problems = "\n".join(inspect_log(log_of(tmp_path, records)).problems)
+    assert "/scan begins 5.0 s after the other sensors" in problems
+    assert "/scan ends 10.0 s before the other sensors" in problems
 
 
-def test_info_names_the_reference_that_will_be_used(tmp_path: Path) -> None:
+def test_info_reports_the_reference_that_replay_uses(tmp_path: Path) -> None:
     records = pad([("/ground_truth/odom", bags.odometry(START + i * S), START + i * S) for i in range(5)])
     info = inspect_log(log_of(tmp_path, records))
     assert next(topic for topic in info.topics if topic.topic == "/ground_truth/odom").used_as == "reference"

@@ -16,7 +16,7 @@ def reference(stamp_ns: int, position: tuple[float, float] = (1.0, 2.0), cov: np
     return Reference(stamp_ns, np.array(position), None, cov)
 
 
-def test_positions_are_sorted_and_repeated_stamps_left_out() -> None:
+def test_positions_unsorted_or_repeated_are_sorted_and_unique() -> None:
     found = read_positions([reference(3), reference(1, (5.0, 6.0)), reference(3, (9.0, 9.0))], "/fix")
     assert [sample.stamp_ns for sample in found] == [1, 3]
     assert found[0].position == pytest.approx([5.0, 6.0])
@@ -25,24 +25,24 @@ def test_positions_are_sorted_and_repeated_stamps_left_out() -> None:
 
 
 @pytest.mark.parametrize("position", [(np.nan, 0.0), (0.0, np.inf)])
-def test_positions_that_are_not_finite_are_left_out(position: tuple[float, float]) -> None:
+def test_positions_not_finite_are_dropped(position: tuple[float, float]) -> None:
     assert len(read_positions([reference(1), reference(2, position)], "/fix")) == 1
     with pytest.raises(LogError, match="/fix has no usable position"):
         read_positions([reference(2, position)], "/fix")
 
 
 @pytest.mark.parametrize("cov", [np.full((3, 3), np.nan), np.zeros((3, 3)), -KNOWN])
-def test_position_without_a_covariance_gets_that_of_a_plain_receiver(cov: np.ndarray) -> None:
+def test_position_without_covariance_has_that_of_a_plain_receiver(cov: np.ndarray) -> None:
     (sample,) = read_positions([reference(1, cov=cov)], "/fix")
     assert np.sqrt(np.diag(sample.covariance)) == pytest.approx([2.5, 2.5], rel=1e-3)
 
 
-def test_position_far_off_is_kept_for_the_graph_to_judge() -> None:
+def test_position_far_off_is_kept() -> None:
     (sample,) = read_positions([reference(1, (4.5e5, 5.4e6))], "/fix")
     assert sample.position == pytest.approx([4.5e5, 5.4e6])
 
 
-def test_positions_stand_before_the_first_later_event() -> None:
+def test_positions_come_before_the_first_later_event() -> None:
     none = np.full(2, np.nan)
     wheels = [WheelSample(stamp, none, np.zeros(2)) for stamp in (10, 20, 30)]
     fixes = [PositionSample(stamp, np.zeros(2), np.eye(2)) for stamp in (5, 20, 25, 99)]

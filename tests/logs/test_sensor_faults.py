@@ -16,13 +16,10 @@ from localization.logs import Log, open_log
 from motion_models.robot import Mount, load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
+from tests.helpers.logs import warnings_of
 from tests.helpers.rooms import RADIUS, SPEED, TRACK, TURN, drive
 
 ROBOT = load_robot("vaultbot")
-
-
-def said(log: Log) -> str:
-    return " ".join(log.warnings())
 
 
 def opened(folder: Path, records: list[Record]) -> Log:
@@ -33,7 +30,7 @@ def opened(folder: Path, records: list[Record]) -> Log:
 
 
 @pytest.mark.parametrize("angles", [(0.0, 0.0), (0.0, 1.0), (0.5, -1.0)], ids=["no step", "step from the ends", "degrees"])
-def test_scan_whose_angles_cannot_be_is_dropped_and_reported(tmp_path: Path, angles: tuple[float, float]) -> None:
+def test_scan_with_impossible_angles_is_dropped_and_reported(tmp_path: Path, angles: tuple[float, float]) -> None:
     step, last = angles
 
     def spoil(number, scan, log_ns):
@@ -42,11 +39,11 @@ def test_scan_whose_angles_cannot_be_is_dropped_and_reported(tmp_path: Path, ang
 
     log = opened(tmp_path, drive(3.0, spoil=spoil))
     scans = [e for e in log.events() if isinstance(e, Scan)]
-    if last == 1.0:  # the ends tell the step
+    if last == 1.0:  # the ends give the step
         assert len(scans) == 30
     else:
         assert scans == []
-        assert "/scan: 30 messages dropped (angle_increment is zero, or makes more than a full turn" in said(log)
+        assert "/scan: 30 messages dropped (angle_increment is zero, or makes more than a full turn" in warnings_of(log)
 
 
 # /tf_static
@@ -90,7 +87,7 @@ HERE, THERE = (0.3, 0.0, 0.2), (-0.3, 0.0, 0.2)
 def test_static_transforms_that_contradict_are_reported(tmp_path: Path, edges: list, expected: str) -> None:
     log = opened(tmp_path, with_tf(*edges))
     assert isinstance(log.mounts, dict)
-    assert expected in said(log)
+    assert expected in warnings_of(log)
 
 
 def test_static_transforms_that_agree_are_not_reported(tmp_path: Path) -> None:
@@ -106,14 +103,14 @@ def test_static_transforms_that_agree_are_not_reported(tmp_path: Path) -> None:
     assert log.warnings() == []
 
 
-def test_mount_that_the_log_contradicts_is_taken_from_the_robot_file(tmp_path: Path) -> None:
+def test_mount_contradicting_the_log_is_that_of_the_robot_file(tmp_path: Path) -> None:
     frame = "laser"
     robot = load_robot("vaultbot")
     robot = type(robot)(**{**{f: getattr(robot, f) for f in robot.__dataclass_fields__}, "mounts": {frame: Mount(x=0.7)}})
     edges = [("base_link", frame, HERE, bags.quaternion()), ("base_link", frame, THERE, bags.quaternion())]
     log = open_log(bags.write_mcap(tmp_path / "run.mcap", with_tf(*edges)), robot)
     assert log.mounts[frame] == Mount(x=0.7)
-    assert "contradicts itself" in said(log)
+    assert "contradicts itself" in warnings_of(log)
 
 
 @pytest.mark.parametrize("norm", [0.0, 1e-6])
@@ -127,7 +124,7 @@ def test_reference_with_quaternions_of_no_length_is_reported(tmp_path: Path, nor
     log = opened(tmp_path, records)
     track = reference_track(log.references("/pose"), "/pose")
     assert track.yaws == pytest.approx(np.full(10, 0.5))
-    assert "/pose: 10 messages dropped" in said(log)
+    assert "/pose: 10 messages dropped" in warnings_of(log)
 
 
 # two publishers of one topic
@@ -139,7 +136,7 @@ def wheels_of(log: Log) -> list[WheelSample]:
 
 @pytest.mark.parametrize("offset_ms", [3, 10, 17])
 @pytest.mark.parametrize("rate", [10, 50])
-def test_second_publisher_of_zeros_costs_no_distance(tmp_path: Path, offset_ms: int, rate: int) -> None:
+def test_second_publisher_of_zeros_loses_no_distance(tmp_path: Path, offset_ms: int, rate: int) -> None:
     """As `joint_state_publisher` does. The drive is 8 m long."""
 
     def records() -> Iterator[Record]:
@@ -149,30 +146,30 @@ def test_second_publisher_of_zeros_costs_no_distance(tmp_path: Path, offset_ms: 
                 later = stamp + offset_ms * 1_000_000
                 yield topic, bags.joint_state(later, position=(0.0,) * 4, velocity=(0.0,) * 4), later
 
-    honest = wheels_of(opened(tmp_path, drive(20.0)))
+    single = wheels_of(opened(tmp_path, drive(20.0)))
     (tmp_path / "run.mcap").unlink()
     log = opened(tmp_path, sorted(records(), key=lambda record: record[2]))
     found = wheels_of(log)
-    np.testing.assert_allclose(found[-1].position, honest[-1].position, atol=2.0)  # of 40 to 60 rad; 0.25 m are not told apart at first
-    assert "of a second publisher whose wheels turn less, left out" in said(log)
+    np.testing.assert_allclose(found[-1].position, single[-1].position, atol=2.0)  # of 40 to 60 rad; the first 0.25 m cannot be separated
+    assert "of a second publisher whose wheels turn less, left out" in warnings_of(log)
 
 
-def test_encoder_that_is_reset_is_no_second_publisher(tmp_path: Path) -> None:
+def test_encoder_reset_is_no_second_publisher(tmp_path: Path) -> None:
     records = drive(20.0)
     for i, (topic, message, _) in enumerate(records):
         if topic == "/joint_states" and i > len(records) // 2:
             message.position = message.position - 30.0
     log = opened(tmp_path, records)
     assert len(wheels_of(log)) == 1000
-    assert "second publisher" not in said(log)
-    assert "/joint_states: 1 message with a wheel angle that wheels cannot reach" in said(log)
+    assert "second publisher" not in warnings_of(log)
+    assert "/joint_states: 1 message with a wheel angle that wheels cannot reach" in warnings_of(log)
 
 
 # LiDAR stamps that jump by less than the second that latencies may have
 
 
 @pytest.mark.parametrize("jump_s", [0.9, -0.9, 0.5, -0.5])
-def test_lidar_clock_that_jumps_by_less_than_a_second_is_set_back(tmp_path: Path, jump_s: float) -> None:
+def test_lidar_clock_jump_below_a_second_is_corrected(tmp_path: Path, jump_s: float) -> None:
     shift = round(jump_s * S)
 
     def spoil(number, scan, log_ns):
@@ -187,11 +184,11 @@ def test_lidar_clock_that_jumps_by_less_than_a_second_is_set_back(tmp_path: Path
     wrong = [abs(stamp - START - round((stamp - START) / (S / 10)) * S // 10) for stamp in stamps]
     assert max(wrong) <= 0.02 * S
     assert stamps[-1] == pytest.approx(START + 19.9 * S, abs=0.02 * S)
-    assert "stamped after a jump of the clock, moved back by it" in said(log)
+    assert "stamped after a jump of the clock, moved back by it" in warnings_of(log)
 
 
 @pytest.mark.parametrize("jump_s", [0.9, -0.9])
-def test_lone_scans_stamped_wrongly_by_less_than_a_second_are_dropped(tmp_path: Path, jump_s: float) -> None:
+def test_scans_with_outlier_stamps_below_a_second_are_dropped(tmp_path: Path, jump_s: float) -> None:
     def spoil(number, scan, log_ns):
         if number > 30 and number % 10 == 0:
             stamp = log_ns + round(jump_s * S)
@@ -202,7 +199,7 @@ def test_lone_scans_stamped_wrongly_by_less_than_a_second_are_dropped(tmp_path: 
     stamps = [e.stamp_ns for e in log.events() if isinstance(e, Scan)]
     assert all((stamp - START) % (S // 10) == 0 for stamp in stamps)
     assert len(stamps) == 200 - 16
-    assert "/scan: 16 messages dropped (stamp that fits neither" in said(log)
+    assert "/scan: 16 messages dropped (stamp that fits neither" in warnings_of(log)
 
 
 def doubled(
@@ -231,19 +228,19 @@ def zeros(message, later: int):
 
 
 @pytest.mark.parametrize("first", [lambda m: m, rates_only], ids=["angles and rates", "rates"])
-def test_second_publisher_of_rates_alone_costs_no_distance(tmp_path: Path, first: Callable) -> None:
-    honest = wheels_of(opened(tmp_path, [(t, first(m) if t == "/joint_states" else m, s) for t, m, s in drive(20.0)]))
+def test_second_publisher_of_rates_only_loses_no_distance(tmp_path: Path, first: Callable) -> None:
+    single = wheels_of(opened(tmp_path, [(t, first(m) if t == "/joint_states" else m, s) for t, m, s in drive(20.0)]))
     (tmp_path / "run.mcap").unlink()
     log = opened(tmp_path, doubled(9, lambda m, later: rates_only(zeros(m, later)), first=first))
     found = wheels_of(log)
-    if np.isfinite(honest[-1].position).all():
-        np.testing.assert_allclose(found[-1].position, honest[-1].position, rtol=0.02)
+    if np.isfinite(single[-1].position).all():
+        np.testing.assert_allclose(found[-1].position, single[-1].position, rtol=0.02)
     else:
-        np.testing.assert_allclose(np.mean([s.velocity for s in found], axis=0), honest[-1].velocity, rtol=0.03)
-    assert "of a second publisher whose wheels turn less, left out" in said(log)
+        np.testing.assert_allclose(np.mean([s.velocity for s in found], axis=0), single[-1].velocity, rtol=0.03)
+    assert "of a second publisher whose wheels turn less, left out" in warnings_of(log)
 
 
-def test_second_publisher_of_odometry_costs_no_distance(tmp_path: Path) -> None:
+def test_second_publisher_of_odometry_loses_no_distance(tmp_path: Path) -> None:
     records = []
     for i in range(500):
         stamp = START + i * S // 50
@@ -254,8 +251,8 @@ def test_second_publisher_of_odometry_costs_no_distance(tmp_path: Path) -> None:
     found = wheels_of(log)
     driven = (found[-1].position - found[0].position) * ROBOT.driver.wheel_radius_m
     np.testing.assert_allclose(driven, 0.5 * 499 / 50, rtol=0.03)
-    assert "/odom: " in said(log)
-    assert "of a second publisher" in said(log)
+    assert "/odom: " in warnings_of(log)
+    assert "of a second publisher" in warnings_of(log)
 
 
 def test_odometry_that_stops_at_once_is_no_second_publisher(tmp_path: Path) -> None:
@@ -268,8 +265,8 @@ def test_odometry_that_stops_at_once_is_no_second_publisher(tmp_path: Path) -> N
     assert log.warnings() == []
 
 
-def test_wheel_that_is_frozen_is_left_out_and_named(tmp_path: Path) -> None:
-    honest = wheels_of(opened(tmp_path, drive(20.0)))
+def test_frozen_wheel_is_excluded_and_named(tmp_path: Path) -> None:
+    single = wheels_of(opened(tmp_path, drive(20.0)))
     (tmp_path / "run.mcap").unlink()
     records = drive(20.0)
     for topic, message, _ in records:
@@ -277,6 +274,6 @@ def test_wheel_that_is_frozen_is_left_out_and_named(tmp_path: Path) -> None:
             message.position = message.position * (np.arange(len(message.position)) > 0)
     log = opened(tmp_path, records)
     found = wheels_of(log)
-    np.testing.assert_allclose(found[-1].position, honest[-1].position, atol=0.05)
-    assert f"/joint_states, joint '{ROBOT.joints.left[0]}': " in said(log)
-    assert "its side turns; it was left out" in said(log)
+    np.testing.assert_allclose(found[-1].position, single[-1].position, atol=0.05)
+    assert f"/joint_states, joint '{ROBOT.joints.left[0]}': " in warnings_of(log)
+    assert "its side turns; it was left out" in warnings_of(log)

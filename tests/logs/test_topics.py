@@ -1,4 +1,4 @@
-"""Which topic plays which part, and what is said when one is missing."""
+"""Topic of each role, and errors where one is missing."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def parts(log: Log) -> dict[str, tuple[str, str] | None]:
     }
 
 
-def test_the_robot_files_topics_are_used(tmp_path: Path) -> None:
+def test_topics_of_the_robot_file_are_used(tmp_path: Path) -> None:
     log = log_of(
         tmp_path, {"/joint_states": "joints", "/odom": "odom", "/scan": "scan", "/points": "points", "/imu/data": "imu", "/b": "imu"}
     )
@@ -63,45 +63,45 @@ def test_the_robot_files_topics_are_used(tmp_path: Path) -> None:
     assert log.warnings() == []
 
 
-def test_an_option_goes_before_the_robot_file(tmp_path: Path) -> None:
+def test_topic_option_overrides_the_robot_file(tmp_path: Path) -> None:
     topics = {"/joint_states": "joints", "/odom": "odom", "/scan": "scan", "/points": "points", "/imu/data": "imu", "/b": "imu"}
     log = log_of(tmp_path, topics, TopicOverrides(odometry="/odom", points="/points", imu="/b"))
     assert parts(log) == {"wheels": ("/odom", "option"), "lidar": ("/points", "option"), "imu": ("/b", "option"), "cg": None}
 
 
-def test_the_only_topic_of_a_type_is_used_and_noted(tmp_path: Path) -> None:
+def test_topic_only_one_of_its_type_is_used_with_a_note(tmp_path: Path) -> None:
     log = log_of(tmp_path, {"/husky/joints": "joints", "/velodyne": "points", "/microstrain": "imu"})
     assert parts(log) == {"wheels": ("/husky/joints", "only"), "lidar": ("/velodyne", "only"), "imu": ("/microstrain", "only"), "cg": None}
     for topic in ("/husky/joints", "/velodyne", "/microstrain"):
         assert any(topic in note and "only topic of its type" in note for note in log.warnings())
 
 
-def test_two_candidates_are_not_guessed_between(tmp_path: Path) -> None:
+def test_topic_two_candidates_are_refused(tmp_path: Path) -> None:
     log = log_of(tmp_path, {"/joint_states": "joints", "/front": "scan", "/rear": "scan"})
     assert log.sources.lidar is None
     assert any("/front, /rear" in note and "--topic.scan" in note for note in log.warnings())
 
 
-def test_the_reference_is_not_taken_for_the_wheels(tmp_path: Path) -> None:
+def test_topic_reference_is_not_used_for_wheels(tmp_path: Path) -> None:
     log = log_of(tmp_path, {"/ground_truth/odom": "odom", "/scan": "scan"})
     assert log.sources.wheels is None
     assert [type(e) for e in log.events()] == [Scan] * 20
 
 
-def test_a_topic_of_the_robot_file_with_another_type_is_passed_over(tmp_path: Path) -> None:
+def test_topic_of_the_robot_file_with_wrong_type_is_ignored(tmp_path: Path) -> None:
     log = log_of(tmp_path, {"/joint_states": "joints", "/scan": "points"})
     assert parts(log)["lidar"] == ("/scan", "only")
     assert log.sources.lidar is not None
     assert log.sources.lidar.kind == "points"
 
 
-def test_a_missing_topic_is_named_with_those_that_fit(tmp_path: Path) -> None:
+def test_topic_missing_error_lists_candidates(tmp_path: Path) -> None:
     with pytest.raises(TopicError, match=r"no topic '/points' in run\.mcap.*PointCloud2 in it: /ouster/points.*--topic\.points"):
         log_of(tmp_path, {"/joint_states": "joints", "/ouster/points": "points"}, TopicOverrides(points="/points"))
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_a_topic_without_messages_plays_no_part(tmp_path: Path, storage: str) -> None:
+def test_topic_without_messages_is_ignored(tmp_path: Path, storage: str) -> None:
     """Recorders list the topics that they subscribed to, whether anything came or not."""
     from rosbags import rosbag2
 
@@ -117,13 +117,13 @@ def test_a_topic_without_messages_plays_no_part(tmp_path: Path, storage: str) ->
         open_log(tmp_path / "run", ROBOT, TopicOverrides(scan="/scan"))
 
 
-def test_two_topics_with_the_wheel_joints_are_not_guessed_between(tmp_path: Path) -> None:
+def test_topic_two_with_wheel_joints_are_refused(tmp_path: Path) -> None:
     log = log_of(tmp_path, {"/a/joints": "joints", "/b/joints": "joints", "/odom": "odom"})
     assert parts(log)["wheels"] == ("/odom", "robot")
     assert any("/a/joints, /b/joints" in note for note in log.warnings())
 
 
-def test_a_topic_of_the_wrong_type_says_so(tmp_path: Path) -> None:
+def test_topic_option_of_wrong_type_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
         TopicError, match=r"'/pose' in run\.mcap carries geometry_msgs/PoseStamped, not sensor_msgs/Imu.*no topic of type.*--topic\.imu"
     ):
@@ -131,28 +131,28 @@ def test_a_topic_of_the_wrong_type_says_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("field", [f.name for f in dataclasses.fields(TopicOverrides) if f.name != "reference"])
-def test_every_override_is_checked(tmp_path: Path, field: str) -> None:
+def test_topic_options_each_are_checked(tmp_path: Path, field: str) -> None:
     with pytest.raises(TopicError, match="--topic." + field.replace("_", "-")):
         log_of(tmp_path, {"/a": "pose"}, TopicOverrides(**{field: "/a"}))
 
 
-def test_overrides_have_the_fields_of_the_robot_file() -> None:
+def test_topic_options_have_the_fields_of_the_robot_file() -> None:
     assert [f.name for f in dataclasses.fields(TopicOverrides)] == [f.name for f in dataclasses.fields(Topics)]
 
 
-def test_an_empty_option_leaves_a_part_out(tmp_path: Path) -> None:
+def test_topic_option_empty_disables_its_sensor(tmp_path: Path) -> None:
     topics = {"/joint_states": "joints", "/odom": "odom", "/scan": "scan", "/imu/data": "imu"}
     log = log_of(tmp_path, topics, TopicOverrides(joint_states="", imu=""))
     assert parts(log) == {"wheels": ("/odom", "robot"), "lidar": ("/scan", "robot"), "imu": None, "cg": None}
 
 
-def test_joint_states_of_an_arm_give_way_to_odometry(tmp_path: Path) -> None:
+def test_topic_joint_states_of_an_arm_fall_back_to_odometry(tmp_path: Path) -> None:
     log = log_of(tmp_path, {"/joint_states": "arm", "/odom": "odom"})
     assert parts(log)["wheels"] == ("/odom", "robot")
     assert any("shoulder_pan_joint" in note and "/odom" in note for note in log.warnings())
 
 
-def test_unknown_joints_without_odometry_are_listed_when_wheels_are_asked_for(tmp_path: Path) -> None:
+def test_joints_unknown_without_odometry_are_listed_in_the_error(tmp_path: Path) -> None:
     log = log_of(tmp_path, {"/joint_states": "arm", "/scan": "scan"})
     with pytest.raises(TopicError, match=r"front_left_wheel.*elbow_joint, shoulder_pan_joint.*\[joints\]"):
         log.events()
@@ -162,12 +162,12 @@ def test_unknown_joints_without_odometry_are_listed_when_wheels_are_asked_for(tm
     assert len(list(without.events())) == 20
 
 
-def test_unknown_joints_in_an_option_are_refused_at_once(tmp_path: Path) -> None:
+def test_joints_unknown_in_an_option_are_refused_before_reading(tmp_path: Path) -> None:
     with pytest.raises(TopicError, match="elbow_joint"):
         log_of(tmp_path, {"/arm": "arm", "/odom": "odom"}, TopicOverrides(joint_states="/arm"))
 
 
-def test_arms_and_wheels_that_share_a_topic_are_told_apart(tmp_path: Path) -> None:
+def test_joints_arm_and_wheels_on_one_topic_are_separated(tmp_path: Path) -> None:
     records: list[Record] = []
     for i in range(20):
         stamp = START + i * S // 10
@@ -179,7 +179,7 @@ def test_arms_and_wheels_that_share_a_topic_are_told_apart(tmp_path: Path) -> No
     assert log.warnings() == []
 
 
-def test_a_side_is_the_mean_of_those_of_its_joints_that_the_log_has(tmp_path: Path) -> None:
+def test_joints_side_rate_is_the_mean_of_its_recorded_joints(tmp_path: Path) -> None:
     robot = dataclasses.replace(ROBOT, joints=Joints(("front_left_wheel", "lost_left"), ("front_right_wheel", "rear_right_wheel")))
     records = [
         ("/joint_states", bags.joint_state(START + i * S, position=[0.1 * i, 0.2 * i, 9.0, 0.4 * i], velocity=[1, 2, 9, 4]), START + i * S)
@@ -193,14 +193,14 @@ def test_a_side_is_the_mean_of_those_of_its_joints_that_the_log_has(tmp_path: Pa
     assert any("lost_left" in note for note in log.warnings())
 
 
-def test_a_log_without_lidar_or_without_wheels_opens(tmp_path: Path) -> None:
+def test_log_without_lidar_or_without_wheels_opens(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     assert len(list(log_of(tmp_path / "a", {"/scan": "scan"}).events())) == 20
     assert len(list(log_of(tmp_path / "b", {"/odom": "odom"}).events())) == 20
 
 
-def test_reference_topics_are_checked(tmp_path: Path) -> None:
+def test_reference_topic_missing_or_of_wrong_type_is_refused(tmp_path: Path) -> None:
     log = log_of(tmp_path, {"/joint_states": "joints", "/vicon": "pose"})
     with pytest.raises(TopicError, match=r"no topic '/fix'.*/vicon.*--reference"):
         log.references("/fix")

@@ -9,6 +9,7 @@ from motion_models.errors import SkidlocError
 from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import WheelNoise, load_robot
+from tests.helpers.motion_models import assert_one_agrees, differences, some_drive, some_params
 
 ROBOT = load_robot("vaultbot")
 MIRROR = np.array([1.0, -1.0, -1.0])  # vx, vy, wz of a robot seen in a mirror along its x axis
@@ -17,21 +18,6 @@ pytestmark = pytest.mark.parametrize("name", list(MODELS))
 # Numbers come from a generator and not from hypothesis, whose round ones sit on kinks (a wheel that just lifts off).
 drawn = given(seed=st.integers(0, 2**32 - 1))
 few = settings(max_examples=25, deadline=None)
-
-
-def some_params(model, rng):
-    """A robot like the nominal one, but without its symmetries."""
-    p = model.nominal
-    found = p * (1 + 0.1 * rng.uniform(-1, 1, p.shape)) + np.where(p == 0, 0.02 * rng.uniform(-1, 1, p.shape), 0)
-    if "scrub" in model.param_names:  # a moment that helped a turn would allow two motions for one pair of wheel rates
-        found[model.param_names.index("scrub")] *= np.sign(found[model.param_names.index("scrub")])
-    return found
-
-
-def some_drive(rng, n):
-    """Wheel rates (n, 2) of all kinds, and CGs (n, 2) over most of the wheelbase."""
-    wheels = rng.uniform(-6, 6, (n, 2))
-    return wheels, rng.uniform(-1, 1, (n, 2)) * [0.2, 0.2]
 
 
 def mirrored(wheels, cg):
@@ -62,19 +48,6 @@ def identify(model, wheels, cg, value, start):
             if damping > 1e9:
                 break
     return p
-
-
-def differences(f, x, j):
-    """Central differences of f by x[..., j] with four steps: one is too long where f bends, another drowns in rounding."""
-    e = np.zeros(x.shape[-1])
-    e[j] = 1.0
-    scale = max(1.0, float(np.max(np.abs(x[..., j]))))
-    return [(f(x + h * e) - f(x - h * e)) / (2 * h) for h in scale * 10.0 ** np.arange(-4, -8, -1)]
-
-
-def assert_one_agrees(exact, quotients):
-    error = np.min([np.abs(q - exact) / (1 + np.abs(exact)) for q in quotients], axis=0)
-    assert error.max() < 1e-6
 
 
 @drawn

@@ -1,4 +1,4 @@
-"""The report says what the numbers say: words, tables, pictures, and a page that is safe, whole and the same every time."""
+"""Report of a replay: summary, tables, figures, and a page that is valid, safe and reproducible."""
 
 import dataclasses
 import functools
@@ -10,7 +10,6 @@ import os
 import re
 import subprocess
 import sys
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -20,127 +19,18 @@ from PIL import Image
 from localization.errors import OutputError
 from localization.evaluation.references import ReferenceTrack, Relations, with_noise
 from localization.evaluation.scores import Result, score
-from localization.pipeline import Run
-from localization.report.figure_data import map_view, nis_means, spans
+from localization.report.figure_data import map_view, nis_means, relation_bins
 from localization.report.replay_page import ReportHead, overview_png, page, verdict, write_report
 from localization.report.runs import baseline_run, best_run, ellipse, plotted_runs, run_with_map, thin_path, thin_series
 from localization.report.tables import MISSING, number, plus_minus, unit_of
 from localization.trajectory import Trajectory
 from motion_models import se2
-
-SECOND = 10**9
-HEAD = ReportHead("corridor.mcap", "vaultbot", "2026-01-02 03:04:05 UTC", 200.0, ["3 scans were empty."], {"skidloc": "0.1.0"}, "c0ffee")
-
-
-def drive(n=400, turns=2.0):
-    """Laps on a circle of 5 m radius, one pose each half second."""
-    angle = np.linspace(0.0, 2.0 * math.pi * turns, n)
-    poses = np.column_stack([5.0 * np.sin(angle), 5.0 - 5.0 * np.cos(angle), angle])
-    return np.arange(n, dtype=np.int64) * (SECOND // 2), poses
-
-
-def run(
-    model="diff_drive",
-    estimator="ekf",
-    noise=0.0,
-    seed=0,
-    nis=None,
-    covariance=True,
-    n=400,
-    points=(),
-    parameters=(),
-    counts=(),
-    warnings=(),
-):
-    stamps, poses = drive(n)
-    rng = np.random.default_rng(seed)
-    poses = se2.compose(poses, se2.exp(rng.normal(size=(n, 3)) * [noise, noise, 0.1 * noise]))
-    spread = np.diag([0.04, 0.01, 0.001]) * np.linspace(0.0, 1.0, n)[:, None, None] + 1e-6 * np.eye(3)
-    return Run(
-        model=model,
-        estimator=estimator,
-        trajectory=Trajectory(stamps, poses, spread if covariance else None),
-        twists=np.zeros((n, 3)),
-        twist_covariances=np.zeros((n, 3, 3)),
-        nis=np.full(n, np.nan) if nis is None else np.asarray(nis, dtype=float),
-        parameters=dict(parameters),
-        counts=dict(counts),
-        map_points=np.array(points, dtype=float).reshape(-1, 2),
-        seconds=1.0,
-        warnings=warnings,
-    )
-
-
-def track(yaws=True):
-    stamps, poses = drive()
-    return ReferenceTrack(stamps, poses[:, :2], poses[:, 2] if yaws else None, source="/ground_truth/odom")
-
-
-def relations(span=8):
-    stamps, poses = drive()
-    start = np.arange(0, 400 - span)
-    return Relations(stamps[start], stamps[start + span], se2.between(poses[start], poses[start + span]), source="hand.relations")
-
-
-def honest(n=400, scale=1.0, seed=5):
-    return scale * np.random.default_rng(seed).chisquare(3, n)
-
-
-def three_runs():
-    return [
-        run("diff_drive", "odometry", 0.5, 1),
-        run("skid_steer", "lidar", 0.8, 2, points=[(0, 0), (1, 1)]),
-        run("skid_steer", "ekf", 0.05, 3, nis=honest(), points=np.random.default_rng(9).uniform(-8, 12, (500, 2))),
-    ]
-
-
-def with_error(value, estimator="ekf", model="diff_drive"):
-    """A result whose ATE is ``value`` whatever its poses say."""
-    result = score([run(model, estimator, 0.1)], track())[0]
-    return dataclasses.replace(result, accuracy=dataclasses.replace(result.accuracy, ate_rmse_m=value))
-
-
-class Text(HTMLParser):
-    """Cells of every table, the text, and the tags of a page; fails on tags that do not close."""
-
-    VOID = frozenset({"meta", "br", "input", "wbr", "path", "image", "use", "rect", "stop"})
-
-    def __init__(self, source):
-        super().__init__()
-        self.tables, self.open, self.tags, self.words = [], [], [], []
-        self.feed(source)
-        assert not self.open, f"never closed: {self.open}"
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-        if tag == "table":
-            self.tables.append([])
-        if tag == "tr":
-            self.tables[-1].append([])
-        if tag in ("td", "th"):
-            self.tables[-1][-1].append("")
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        if tag not in self.VOID:
-            assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if "style" in self.open:
-            return
-        self.words.append(data)
-        if "td" in self.open or "th" in self.open:
-            self.tables[-1][-1][-1] += data
-
+from tests.helpers.report import HEAD, PageText, chi_square_nis, relations, run, three_runs, track, with_error
 
 # ---- words
 
 
-def test_best_run_and_its_gains_are_told_from_the_numbers():
+def test_summary_names_the_best_run_and_its_gains():
     results = score(three_runs(), relations())
     errors = [r.accuracy.relations.all.translation_m for r in results]
     text = verdict(results, relations())
@@ -155,14 +45,14 @@ def test_best_run_and_its_gains_are_told_from_the_numbers():
     assert text.endswith("Use ekf with skid_steer.")
 
 
-def test_track_reference_is_named_with_ate_and_distance():
+def test_summary_names_a_track_reference_with_ate_and_distance():
     results = score(three_runs(), track())
     text = verdict(results, track())
     assert f"{results[2].accuracy.ate_rmse_m:.3f} m position error (ATE, root mean square) against /ground_truth/odom" in text
     assert f"over {results[2].accuracy.distance_m:.1f} m driven" in text
 
 
-def test_without_reference_nothing_is_called_best():
+def test_summary_without_reference_names_no_best():
     runs = three_runs()
     text = verdict(score(runs, None), None)
     assert text.startswith("No reference was given, so which run is right is unknown.")
@@ -173,7 +63,7 @@ def test_without_reference_nothing_is_called_best():
     assert f"by {farthest:.{2 if farthest > 0.995 else 3}f} m" in text
 
 
-def test_one_run_is_not_the_best_of_anything():
+def test_summary_of_one_run_names_no_best():
     text = verdict(score([run(noise=0.1)], track()), track())
     assert "Nothing else was run" in text
     assert "best" not in text
@@ -181,7 +71,7 @@ def test_one_run_is_not_the_best_of_anything():
     assert "its accuracy is unknown" in alone
 
 
-def test_equal_runs_are_a_tie_and_no_gain_is_claimed():
+def test_summary_of_equal_runs_is_a_tie():
     same = [run("diff_drive", "ekf", 0.1, 4), run("skid_steer", "ekf", 0.1, 4)]
     text = verdict(score(same, track()), track())
     assert "ekf with diff_drive has the smallest error" in text
@@ -191,7 +81,7 @@ def test_equal_runs_are_a_tie_and_no_gain_is_claimed():
     assert "which motion model is better in it is not significant on this drive" in text
 
 
-def test_a_difference_made_by_one_stretch_of_the_drive_is_not_proven():
+def test_summary_difference_from_one_stretch_is_not_significant():
     """Equal but for one tenth of the drive, where the other run is far off: lower in the mean, and no evidence."""
     first, second = run("diff_drive", "ekf", 0.1, 5), run("skid_steer", "ekf", 0.1, 6)
     poses = second.trajectory.poses.copy()
@@ -205,15 +95,15 @@ def test_a_difference_made_by_one_stretch_of_the_drive_is_not_proven():
     assert "Not proven worse by this one drive: ekf with skid_steer" in text
 
 
-def test_a_difference_all_along_the_drive_is_proven_though_small():
+def test_summary_small_difference_all_along_is_significant():
     """5 % less noise everywhere is a difference of 5 %: the same draws, scaled."""
     pair = [run("diff_drive", "ekf", 0.100, 7), run("skid_steer", "ekf", 0.105, 7)]
     text = verdict(score(pair, relations()), relations())
     assert text.startswith("ekf with diff_drive is best")
 
 
-def test_how_often_equal_filters_are_told_apart():
-    """Two runs of one quality, other noise: at most a few of 100 may be called different (2.5 % is promised, one side)."""
+def test_summary_false_positive_rate_for_equal_filters_is_small():
+    """Two runs of one quality, other noise: at most a few of 100 may be called different (2.5 % one-sided by the test)."""
     called = 0
     for seed in range(100):
         pair = [run("diff_drive", "ekf", 0.1, 1000 + seed), run("skid_steer", "ekf", 0.1, 5000 + seed)]
@@ -222,57 +112,57 @@ def test_how_often_equal_filters_are_told_apart():
 
 
 @pytest.mark.parametrize(
-    ("scale", "said"),
+    ("scale", "message"),
     [
         (4.0, "are overconfident"),
         (0.25, "Its covariances are not too small"),
         (1.0, "Its covariances are consistent"),
     ],
 )
-def test_nis_decides_what_is_said_of_covariances(scale, said):
-    results = score([run(nis=honest(scale=scale), noise=0.01), run(estimator="odometry", noise=0.5, seed=2)], track(yaws=False))
+def test_summary_of_covariances_follows_the_nis(scale, message):
+    results = score([run(nis=chi_square_nis(scale=scale), noise=0.01), run(estimator="odometry", noise=0.5, seed=2)], track(yaws=False))
     text = verdict(results, track(yaws=False))
-    assert said in text
+    assert message in text
     assert f"mean NIS {results[0].nis_mean:.3g}" in text
 
 
-def test_factor_of_overconfidence_is_the_one_in_sigma():
+def test_summary_overconfidence_factor_is_in_sigma():
     """All innovations three times what the filter believes: NIS nine times too large."""
-    text = verdict(score([run(nis=honest(scale=9.0), noise=0.01)], track(yaws=False)), track(yaws=False))
+    text = verdict(score([run(nis=chi_square_nis(scale=9.0), noise=0.01)], track(yaws=False)), track(yaws=False))
     assert re.search(r"innovations (2\.9|3\.0|3\.1) times their sigma", text)
 
 
-def test_a_few_outliers_are_not_mistaken_for_a_filter_that_is_wrong_throughout():
-    nis = honest()
+def test_summary_few_outliers_are_no_overconfidence():
+    nis = chi_square_nis()
     nis[::40] = 400.0
     text = verdict(score([run(nis=nis, noise=0.01)], track(yaws=False)), track(yaws=False))
     assert "some outliers make it" in text
 
 
-def test_nees_of_one_drive_convicts_only_beyond_the_band_of_one_sample():
-    def told(nees):
+def test_summary_nees_of_one_drive_fails_only_outside_its_band():
+    def summary_of_nees(nees):
         (result,) = score([run(noise=0.01)], track())
         return verdict([dataclasses.replace(result, nees_mean=nees)], track())
 
-    assert "overconfident" in told(9.5)
-    assert "overconfident" not in told(9.2)  # chi-square(3) has its 97.5 % quantile at 9.35
-    assert "overconfident" in told(math.inf)
-    assert "larger than need be" in told(0.2)
+    assert "overconfident" in summary_of_nees(9.5)
+    assert "overconfident" not in summary_of_nees(9.2)  # chi-square(3) has its 97.5 % quantile at 9.35
+    assert "overconfident" in summary_of_nees(math.inf)
+    assert "larger than need be" in summary_of_nees(0.2)
 
 
-def test_untestable_and_missing_covariances_are_told():
+def test_summary_untestable_or_missing_covariances_are_reported():
     assert "could not be tested" in verdict(score([run(noise=0.1)], track(yaws=False)), track(yaws=False))
     assert "gives no covariance" in verdict(score([run(estimator="lidar", covariance=False, noise=0.1)], track()), track())
 
 
-def test_lidar_that_makes_things_worse_is_told():
+def test_summary_lidar_that_increases_the_error_is_reported():
     runs = [run(estimator="odometry", noise=0.01, seed=1), run(estimator="ekf", noise=0.5, seed=2, points=[(0, 0), (1, 1)])]
     text = verdict(score(runs, relations()), relations())
     assert text.startswith("Dead reckoning with diff_drive is best")
     assert "check its mount" in text
 
 
-def test_short_overlap_is_told():
+def test_summary_short_overlap_is_reported():
     whole = track()
     part = ReferenceTrack(whole.stamps_ns[:100], whole.positions[:100], whole.yaws[:100], source="/gps")
     results = score([run(noise=0.1)], part)
@@ -282,7 +172,7 @@ def test_short_overlap_is_told():
 # ---- choice of runs
 
 
-def test_wheelless_runs_are_shown_once_and_styles_tell_models_and_estimators_apart():
+def test_runs_without_wheels_are_plotted_once_in_distinct_styles():
     runs = [run(m, e, 0.1) for e in ("odometry", "lidar", "ekf", "graph") for m in ("diff_drive", "skid_steer")]
     lines = plotted_runs(score(runs, None))
     assert [line.label for line in lines].count("lidar") == 1
@@ -291,7 +181,7 @@ def test_wheelless_runs_are_shown_once_and_styles_tell_models_and_estimators_apa
     assert len({line.colour for line in lines}) == 4
 
 
-def test_best_baseline_and_map_are_chosen_by_error():
+def test_runs_best_baseline_and_map_are_those_of_least_error():
     results = [
         with_error(0.3, "odometry", "skid_steer"),
         with_error(0.4, "odometry", "diff_drive"),
@@ -310,7 +200,7 @@ def test_best_baseline_and_map_are_chosen_by_error():
 # ---- what is drawn
 
 
-def test_ellipse_has_the_sizes_and_direction_of_the_turned_covariance():
+def test_ellipse_has_size_and_direction_of_the_rotated_covariance():
     """Against the plain way: turn the covariance into the plane, then decompose it."""
     rng = np.random.default_rng(0)
     for _ in range(50):
@@ -326,7 +216,7 @@ def test_ellipse_has_the_sizes_and_direction_of_the_turned_covariance():
         assert e.center == (pose[0], pose[1])
 
 
-def test_two_sigma_ellipse_holds_86_percent_of_right_perturbations():
+def test_ellipse_of_two_sigma_contains_86_percent_of_samples():
     rng = np.random.default_rng(1)
     pose, cov = np.array([3.0, -2.0, 2.2]), np.diag([0.09, 0.0025, 1e-6])
     e = ellipse(pose, cov)
@@ -336,7 +226,7 @@ def test_two_sigma_ellipse_holds_86_percent_of_right_perturbations():
     assert np.mean(along**2 + across**2 <= 1.0) == pytest.approx(1.0 - math.exp(-2.0), abs=0.01)
 
 
-def test_runs_map_and_ellipses_are_drawn_in_the_references_plane():
+def test_figures_runs_map_and_ellipses_are_in_the_reference_plane():
     shift = np.array([100.0, -50.0, 1.0])
     whole = track()
     moved = se2.compose(shift, whole.poses)
@@ -353,7 +243,7 @@ def test_runs_map_and_ellipses_are_drawn_in_the_references_plane():
     assert (view.high > moved[:, :2].max(0)).all()
 
 
-def test_a_lost_run_does_not_shrink_the_others():
+def test_figures_limits_ignore_a_diverged_run():
     lost = run("diff_drive", "odometry")
     lost = dataclasses.replace(lost, trajectory=Trajectory(lost.trajectory.stamps_ns, lost.trajectory.poses * [1000.0, 1000.0, 1.0]))
     lines = plotted_runs(score([lost, run("skid_steer", "ekf", 0.05, 3)], relations()))
@@ -373,7 +263,7 @@ def test_thinned_paths_keep_ends_and_shape():
     assert thin_path(np.zeros((10_000, 2)), 0.1).tolist() == [0, 9_999]  # a robot that stands
 
 
-def test_thinned_series_keep_every_stretch_s_peak():
+def test_thinned_series_keep_each_peak():
     values = np.zeros(50_000)
     values[[7, 31_234, 49_999]] = [5.0, -3.0, 2.0]
     kept = thin_series(values)
@@ -381,21 +271,21 @@ def test_thinned_series_keep_every_stretch_s_peak():
     assert len(kept) <= 700
 
 
-def test_relations_bins_hold_every_relation_and_their_mean_is_the_score():
+def test_relation_bins_contain_every_relation_and_the_score_is_their_mean():
     r = relations(span=3)
     more = relations(span=60)
     both = Relations(
         np.r_[r.starts_ns, more.starts_ns[:4]], np.r_[r.ends_ns, more.ends_ns[:4]], np.r_[r.motions, more.motions[:4]], source="both"
     )
     results = score([run(noise=0.1)], both)
-    found = spans(plotted_runs(results)[0], both)
+    found = relation_bins(plotted_runs(results)[0], both)
     assert sum(found.n) == len(both.starts_ns)
     weights = np.array(found.n) / sum(found.n)
     assert weights @ found.translation_m == pytest.approx(results[0].accuracy.relations.all.translation_m)
     assert weights @ found.rotation_deg == pytest.approx(results[0].accuracy.relations.all.rotation_deg)
 
 
-def test_means_of_nis_are_of_equal_groups():
+def test_nis_means_are_of_equal_groups():
     nis = np.full(400, np.nan)
     nis[::2] = np.arange(200.0)
     shown, means = nis_means(plotted_runs(score([run(nis=nis), run(estimator="odometry")], None)), limit=7.8)
@@ -409,9 +299,9 @@ def test_means_of_nis_are_of_equal_groups():
 # ---- tables
 
 
-def test_table_holds_the_given_numbers_and_a_dash_for_what_is_missing():
+def test_table_has_the_given_numbers_and_a_dash_for_missing_ones():
     results, _ = cases()["track"]
-    table = Text(page_of("track")).tables[0]
+    table = PageText(page_of("track")).tables[0]
     assert table[0][1].startswith("ATE")
     for row, result in zip(table[1:], results, strict=True):
         a = result.accuracy
@@ -422,24 +312,24 @@ def test_table_holds_the_given_numbers_and_a_dash_for_what_is_missing():
     assert [row[nis] for row in table[1:]] == [MISSING, MISSING, f"{results[2].nis_mean:.2f}"]
 
 
-def test_positions_only_leave_out_headings_and_say_so():
-    text = Text(page_of("positions"))
+def test_table_of_positions_only_leaves_out_headings_with_a_note():
+    text = PageText(page_of("positions"))
     assert not any("heading" in head for head in text.tables[0][0])
     assert "positions only" in "".join(text.words)
 
 
-def test_relations_table_holds_every_group():
+def test_table_of_relations_has_every_group():
     both = relations(span=60)  # 30 s
     results = score([run(noise=0.1)], both)
-    text = Text(page(HEAD, results, both))
+    text = PageText(page(HEAD, results, both))
     assert f"{results[0].accuracy.relations.long.translation_m:.4f}" in text.tables[0][1]
     assert f"{results[0].accuracy.relations.long.translation_m2:.4f}" in text.tables[1][1]
     assert not any("under 20 s" in head for head in text.tables[0][0])
 
 
-def test_parameters_counts_notes_and_provenance_are_told():
-    told = run(parameters={"gyro_bias_rad_per_s": (0.0012, 0.00004)}, counts={"slips": 12345}, noise=0.1)
-    words = " ".join(Text(page(HEAD, score([told], None), None)).words)
+def test_page_lists_parameters_counts_notes_and_provenance():
+    estimated = run(parameters={"gyro_bias_rad_per_s": (0.0012, 0.00004)}, counts={"slips": 12345}, noise=0.1)
+    words = " ".join(PageText(page(HEAD, score([estimated], None), None)).words)
     for expected in ("0.001200 ± 0.000040", "rad/s", "12,345", "3 scans were empty.", "c0ffee", "vaultbot", "2026-01-02 03:04:05 UTC"):
         assert expected in words
 
@@ -448,7 +338,7 @@ def test_parameters_counts_notes_and_provenance_are_told():
     ("value", "digits", "text"),
     [(None, 3, "–"), (math.nan, 3, "–"), (math.inf, 2, "∞"), (0.0, 2, "0.00"), (0.0004, 3, "< 0.001"), (1234.5, 1, "1,234.5")],  # noqa: RUF001
 )
-def test_numbers(value, digits, text):
+def test_format_number_has_the_significant_digits(value, digits, text):
     assert number(value, digits) == text
 
 
@@ -461,12 +351,12 @@ def test_numbers(value, digits, text):
         (3.0, 0.0, "3.0000 ± 0.0000"),
     ],
 )
-def test_plus_minus(mean, sigma, text):
+def test_format_plus_minus_has_the_digits_of_sigma(mean, sigma, text):
     cell = plus_minus(mean, sigma)
     assert cell.text + (f" e{cell.power}" if cell.power else "") == text
 
 
-def test_units_come_from_the_ends_of_names():
+def test_unit_is_that_of_the_name_suffix():
     assert [unit_of(name) for name in ("gyro_bias_rad_per_s", "wheel_clock_offset_s", "x_cr_m", "k_0")] == ["rad/s", "s", "m", ""]
 
 
@@ -499,7 +389,7 @@ def page_of(case):
 @pytest.mark.parametrize("case", list(cases()))
 def test_page_is_well_formed_and_loads_nothing(case):
     first = page_of(case)
-    text = Text(first)  # fails on unclosed tags
+    text = PageText(first)  # fails on unclosed tags
     assert not re.search(r"https?://|xlink|url\((?!#)|@import|\son\w+=", first)
     assert not [tag for tag, _ in text.tags if tag in ("script", "link", "iframe", "object")]
     for tag, attributes in text.tags:
@@ -513,26 +403,26 @@ def test_page_is_well_formed_and_loads_nothing(case):
     assert len(first) < 2_000_000
 
 
-def test_page_begins_and_ends_with_the_verdict():
+def test_page_starts_and_ends_with_the_summary():
     results, _ = cases()["track"]
-    words = "".join(Text(page_of("track")).words)
+    words = "".join(PageText(page_of("track")).words)
     first, last = html.unescape(verdict(results, track())).split(". ")[0], verdict(results, track())
     assert words.index(first) < words.index("Accuracy")
     assert words.rindex(last) > words.index("Sources and versions")
 
 
-def test_text_from_outside_is_escaped():
+def test_page_escapes_text_of_the_log():
     evil = "<script>alert('x')</script>&\"'"
     head = ReportHead(evil, evil, evil, 1.0, [evil], {evil: evil}, evil)
     bad = run(model=evil, estimator=evil + "2", noise=0.1, parameters={evil: (1.0, 0.1)}, counts={evil: 1})
     reference = dataclasses.replace(track(), source=evil, warnings=(evil,))
-    mapped = dataclasses.replace(bad, map_points=np.ones((4, 2)), nis=honest())
+    mapped = dataclasses.replace(bad, map_points=np.ones((4, 2)), nis=chi_square_nis())
     made = page(head, score([mapped, run(noise=0.2, seed=1)], reference), reference)
     assert "<script" not in made
-    assert Text(made).words.count(evil) >= 5
+    assert PageText(made).words.count(evil) >= 5
 
 
-def test_every_axis_has_its_unit_and_every_run_its_line():
+def test_figures_axes_have_units_and_each_run_a_line():
     results, _ = cases()["track"]
     made = page_of("track")
     for label in ("x [m]", "y [m]", "position error [m]", "heading error [deg]", "time since the first pose [s]"):
@@ -542,13 +432,13 @@ def test_every_axis_has_its_unit_and_every_run_its_line():
         assert f"var(--{line.colour}" in made
 
 
-def test_colours_follow_the_page_into_the_dark():
+def test_figures_have_the_colours_of_the_page_in_dark_mode():
     made = page_of("track")
     assert "prefers-color-scheme:dark" in made
     assert not re.findall(r"(?:fill|stroke): ?#(?!f{6}|f{3}\b)[0-9a-f]{3,6}", made)  # every colour is the page's to change
 
 
-def test_large_logs_make_small_pages():
+def test_page_of_a_large_log_is_small():
     n = 100_000
     rng = np.random.default_rng(0)
     stamps = np.arange(n, dtype=np.int64) * 10_000_000
@@ -556,14 +446,14 @@ def test_large_logs_make_small_pages():
     poses = np.column_stack([30 * np.sin(angle), 20 * np.cos(angle), angle]) + rng.normal(size=(n, 3)) * 0.01
     points = rng.uniform(-40, 40, (60_000, 2))
     big = [
-        dataclasses.replace(run(m, e), trajectory=Trajectory(stamps, poses + 0.1 * i), nis=honest(n), map_points=points)
+        dataclasses.replace(run(m, e), trajectory=Trajectory(stamps, poses + 0.1 * i), nis=chi_square_nis(n), map_points=points)
         for i, (m, e) in enumerate((m, e) for m in ("diff_drive", "skid_steer") for e in ("odometry", "ekf", "graph", "other"))
     ]
     reference = ReferenceTrack(stamps[::20], poses[::20, :2], poses[::20, 2])
     assert len(page(HEAD, score(big, reference), reference)) < 2_000_000
 
 
-def test_files_are_written_once_and_never_over(tmp_path):
+def test_page_existing_file_is_refused(tmp_path):
     results, reference = cases()["track"]
     write_report(tmp_path / "report.html", HEAD, results, reference)
     assert (tmp_path / "report.html").read_text(encoding="utf-8") == page_of("track")
@@ -574,7 +464,7 @@ def test_files_are_written_once_and_never_over(tmp_path):
         write_report(tmp_path / "no" / "report.html", HEAD, [], None)
 
 
-def test_overview_is_a_picture_without_date_and_the_same_every_time(tmp_path):
+def test_overview_has_no_date_and_the_same_bytes(tmp_path):
     results = score(three_runs(), track())
     for name in ("a.png", "b.png"):
         overview_png(tmp_path / name, HEAD, results, track())
@@ -587,7 +477,7 @@ def test_overview_is_a_picture_without_date_and_the_same_every_time(tmp_path):
     assert {(0, 114, 178), (213, 94, 0), (204, 121, 167)} <= colours  # a bar of each estimator
 
 
-def test_same_bytes_from_another_process_and_another_user_s_style(tmp_path):
+def test_overview_of_another_process_and_style_has_the_same_bytes(tmp_path):
     """A matplotlibrc of the user's must not reach the report."""
     (tmp_path / "matplotlibrc").write_text("axes.facecolor: red\nxtick.major.size: 30\naxes.labelpad: 40\nsvg.fonttype: path\n")
     code = "import hashlib; from tests.report.test_replay_page import page_of; print(hashlib.sha256(page_of('track').encode()).hexdigest())"

@@ -16,7 +16,7 @@ import pytest
 from localization.cli import main
 from localization.errors import OutputError
 from localization.estimators import Estimate
-from localization.logs.fused_log import write_fused
+from localization.logs.writer import write_fused
 from localization.ros.checkpoint import read_head
 from localization.ros.estimate_log import EstimateLog
 from localization.ros.session import Session, SessionState

@@ -18,8 +18,8 @@ from localization.errors import CheckpointError, SettingError, TopicError, Trans
 from localization.estimators import Estimate
 from localization.events import Scan, WheelSample
 from localization.logs import TopicOverrides, open_log
-from localization.logs.fused_log import FusedEstimate, transform_message
 from localization.logs.serialization import encode
+from localization.logs.writer import FusedEstimate, transform_message
 from localization.pipeline import Trial, replay
 from localization.ros.checkpoint import CheckpointWriter, read_head
 from localization.ros.diagnostics import ERROR, OK, WARN, degeneracy

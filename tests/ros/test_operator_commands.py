@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from localization.logs.fused_log import six_by_six
 from localization.logs.serialization import encode, make
+from localization.logs.writer import six_by_six
 from localization.ros.operator_commands import POSE_TYPE
 from localization.ros.publisher import DIAGNOSTICS, MAP, PATH, PREDICTED_ODOMETRY, occupancy_grid
 from localization.ros.session_files import Files

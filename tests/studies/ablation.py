@@ -1,19 +1,23 @@
-"""What each mechanism of filter and scan matching is worth: one is switched off at a time, all else stays at its defaults.
+"""What each mechanism of matcher, filter and graph is worth: one is switched off at a time, all else stays at its defaults.
 
-python -m tests.studies.ablation [--only NAME,...] [--seconds 300] [--write]
+python -m tests.studies.ablation [--only NAME;...] [--seconds 300] [--minutes 10] [--cells FILE] [--write]
 
-Five drives, the first 300 s of each (`--seconds`): ACES (mean error of the relations), fr079 and MIT-CSAIL (ATE at the reference's
-instants), laps simulated by the physics of the tyres with nominal sensors, and laps over a slippery patch whose ranges are twice as noisy
-as assumed, with slip that the filter's noise model does not have (ATE, and mean NEES of the pose with 3 expected). `--write` puts the table
-into `localization/estimators/README.md`.
+Five drives, the first 300 s of each (`--seconds`): ACES (mean error of the relations), fr079 and MIT-CSAIL (ATE, and mean NEES, at the
+reference's instants), laps simulated by the physics of the tyres with nominal sensors, and laps over a slippery patch whose ranges are
+twice as noisy as assumed, with slip that the filter's noise model does not have (ATE, and mean NEES of the pose with 3 expected).
+Mechanisms of matcher and filter are measured by the EKF, those of the graph by its smoothed trajectory. Cells are stored in a file as
+they are computed: called again, the study goes on where it was stopped, or where `--minutes` ended. `--write` puts the table into
+`localization/estimators/README.md`.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import math
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,12 +27,15 @@ from unittest import mock
 import numba
 import numpy as np
 
-from localization.estimators import fusion
-from localization.estimators.filter import MAP, Filter
+from localization.estimators import filter as filter_module
+from localization.estimators import fusion, graph_fusion, pose_graph
+from localization.estimators.filter import KEY, MAP, Filter
+from localization.estimators.fusion import EkfFusion
 from localization.evaluation.consistency import pose_consistency
 from localization.evaluation.metrics import evaluate
 from localization.evaluation.references import ReferenceTrack, reference_track
-from localization.lidar import scan_matcher
+from localization.lidar import loop_detection, scan_matcher
+from localization.lidar.loop_detection import LoopDetector
 from localization.lidar.scan_matcher import ScanMatcher
 from localization.lidar.scan_matching import ScanMatchingSensor
 from localization.lidar.submap import VoxelGrid, fill_surface, make_grid
@@ -38,12 +45,15 @@ from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import ImuConfig, SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
 from motion_models.robot import load_robot
-from tests.studies.buildings import BUILDINGS, Drive, errors_of
+from tests.studies.buildings import BUILDINGS, Drive, errors_of, nees_at_instants
 
 README = Path(__file__).parents[2] / "localization/estimators/README.md"
+CELLS = Path(tempfile.gettempdir()) / "skidloc_ablation.json"
 BEGIN, END = "<!-- ablation: begin -->", "<!-- ablation: end -->"
 _NO_PRIOR = 1e6 * np.eye(3)
 """Covariance of a prior that says nothing [m^2, m^2, rad^2]."""
+_NO_LOSS = 1e6
+"""Scale of a robust loss [sigma] that never acts."""
 _LAPS = 1
 
 Patch = Callable[[], contextlib.AbstractContextManager[Any]]
@@ -80,16 +90,23 @@ def _without_new(original: Callable[..., None], ekf: Filter, error: scan_matcher
 
 
 @numba.njit(cache=True)
-def _fill_thin(grid: VoxelGrid) -> None:
+def _fill_surfaces(grid: VoxelGrid, column: int, value: float) -> None:
     for v in range(grid.sums.shape[0]):
         fill_surface(grid, v)
         if not math.isinf(grid.surfaces[v, 4]):
-            grid.surfaces[v, 4] = grid.noise
+            grid.surfaces[v, column] = value
 
 
 def _thin_grid(*arguments: Any) -> VoxelGrid:
+    """All surfaces have the variance of a range."""
     grid = make_grid(*arguments)
-    _fill_thin(grid)
+    _fill_surfaces(grid, 4, grid.noise)
+    return grid
+
+
+def _exact_normals(*arguments: Any) -> VoxelGrid:
+    grid = make_grid(*arguments)
+    _fill_surfaces(grid, 5, 0.0)
     return grid
 
 
@@ -97,6 +114,19 @@ def _align_freely(original: Callable[..., Any], self: ScanMatcher, points: Any, 
     """The prior sets the reach of associations but does not pull."""
     pose, H, g, found = scan_matcher._align(self._grid, points, prior, cov, np.linalg.inv(_NO_PRIOR), guess)
     return scan_matcher.Fit(pose, H, g, *(float(value) for value in found))
+
+
+def _match_without_new_place(original: Callable[..., Any], self: ScanMatcher, *rest: Any) -> Any:
+    found = original(self, *rest)
+    self.is_new_place = False
+    return found
+
+
+def _detect_unconfirmed(original: Callable[..., Any], self: LoopDetector, poses: Callable[[], Any], marginal: Callable[[int], Any]) -> Any:
+    """Every loop that fits is taken, without a second one that agrees."""
+    k = len(self.keyframes) - 1
+    found = self._match(k, poses(), marginal(k)) if k > loop_detection._MIN_KEYFRAMES and len(self.keyframes[k].points) else None
+    return [] if found is None else [found]
 
 
 _NO_SEARCH = (
@@ -111,7 +141,9 @@ PATCHES: Mapping[str, Patch] = {
     "slip that changes within a sweep": _attribute(fusion._SlipChanges, "sweep_cov", lambda self, step, sweep_s: np.zeros((3, 3))),
     "second deskewing pass": _attribute(ScanMatchingSensor, "refine", lambda self, match, twist: match),
     "slip in the deskewing twist": _wrap(
-        ScanMatchingSensor, "measure", lambda original, self, step, prior, cov, twist: original(self, step, prior, cov, step.twist)
+        ScanMatchingSensor,
+        "measure",
+        lambda original, self, step, prior, cov, twist, jump: original(self, step, prior, cov, step.twist, jump),
     ),
     "correlative search": lambda: _together(*_NO_SEARCH),
     "rival test of the search": _attribute(scan_matcher, "_MAX_RIVAL", math.inf),
@@ -125,13 +157,33 @@ PATCHES: Mapping[str, Patch] = {
     "submap's error": _attribute(Filter, "insert_key_scan", lambda self, error: None),
     "submap's error as consider state (independent noise, instead)": _wrap(Filter, "predict", _independent),
     "new surfaces' error of key scans": _wrap(Filter, "insert_key_scan", _without_new),
-    "check of wheels that stand": _attribute(fusion.EkfFusion, "_check_standstill", lambda self, step: step),
-    "excitation gate of corrections": _attribute(fusion.EkfFusion, "_is_turning", lambda self, motion: True),
+    "check of wheels that stand": _attribute(EkfFusion, "_check_standstill", lambda self, step: step),
+    "excitation gate of corrections": _attribute(EkfFusion, "_is_turning", lambda self, motion: True),
+    "noise of normals": _attribute(scan_matcher, "make_grid", _exact_normals),
+    "noise of key scans in the submap": _attribute(filter_module, "select_measured", np.zeros_like),
+    "key scans of new places at once": _wrap(ScanMatcher, "match", _match_without_new_place),
+}
+GRAPH_PATCHES: Mapping[str, Patch] = {
+    "loop closures": _attribute(LoopDetector, "detect", lambda self, poses, marginal: []),
+    "second loop that confirms": _wrap(LoopDetector, "detect", _detect_unconfirmed),
+    "robust loss of loops": _attribute(pose_graph, "_CAUCHY", _NO_LOSS),
+    "robust loss of wheels": _attribute(pose_graph, "_HUBER", _NO_LOSS),
+    "drift since the keyframe (covariance of the motion, instead)": _attribute(
+        Filter, "drift_since_key", lambda self: self.motion_since(KEY)
+    ),
+    "wheels' share taken off the filter's motion": _attribute(
+        graph_fusion, "_subtract_information", lambda delta, cov, prior, prior_cov: (delta, np.linalg.inv(cov))
+    ),
+    "corrections of the graph in the filter": _attribute(Filter, "set_corrections", lambda self, mean, cov: None),
+    "radius of the wheels as a variable": _attribute(graph_fusion, "_WHEEL_SCALE_SIGMA", 1e-6),
+    "random walk of the corrections": _attribute(graph_fusion, "_WALK_S", math.inf),
 }
 SETTINGS: Mapping[str, Mapping[str, Any]] = {
     "clock offset": {"clock_sigma_s": 0.0, "clock_walk_s_per_sqrt_s": 0.0},
     "corrections to the motion model": {"corrections": "none"},
 }
+MECHANISMS = (*PATCHES, *SETTINGS, *GRAPH_PATCHES)
+COLUMNS = ("ACES: relations [m]", "fr079: ATE [m], NEES", "CSAIL: ATE [m], NEES", "laps: ATE [mm], NEES", "slippery, noisy: ATE [mm], NEES")
 
 
 def simulated(experiment: str, sensors: SensorConfig, seed: int) -> Drive:
@@ -150,36 +202,50 @@ def drives(seconds: float) -> Mapping[str, Drive]:
     """The first ``seconds`` of all five, by the heads of their columns."""
     imu = ImuConfig(rate_hz=0.0)
     noisy = ScannerConfig(noise_m=0.04)  # twice `LidarConfig.range_noise_m`
-    found = {
-        "ACES: relations [m]": BUILDINGS["aces"].open(),
-        "fr079: ATE [m]": BUILDINGS["fr079"].open(),
-        "CSAIL: ATE [m]": BUILDINGS["csail"].open(),
-        "laps: ATE [mm], NEES": simulated("laps", SensorConfig(imu=imu), 0),
-        "slippery, noisy: ATE [mm], NEES": simulated("slippery_patch", SensorConfig(imu=imu, scanner=noisy), 1),
-    }
-    return {name: drive.until(seconds) for name, drive in found.items()}
+    found = [BUILDINGS[name].open() for name in ("aces", "fr079", "csail")]
+    found += [simulated("laps", SensorConfig(imu=imu), 0), simulated("slippery_patch", SensorConfig(imu=imu, scanner=noisy), 1)]
+    return {column: drive.until(seconds) for column, drive in zip(COLUMNS, found, strict=True)}
 
 
-def cell(name: str, drive: Drive, settings: Mapping[str, Any]) -> str:
+def cell(name: str, drive: Drive, settings: Mapping[str, Any], estimator: str) -> str:
     """One number of the table, or two."""
-    run = drive.run("ekf", "skid_steer", **settings)
-    if "NEES" not in name or not isinstance(drive.reference, ReferenceTrack):
-        error = errors_of(run.trajectory, drive.reference)[0]
-        return f"{error:.4f}" if "relations" in name else f"{error:.3f}"
+    run = drive.run(estimator, "skid_steer", **settings)
+    if not isinstance(drive.reference, ReferenceTrack):
+        return f"{errors_of(run.trajectory, drive.reference)[0]:.4f}"
+    if "[m]" in name:
+        return f"{errors_of(run.trajectory, drive.reference)[0]:.3f}, {nees_at_instants(run.trajectory, drive.reference)[0]:.1f}"
     ate = evaluate(run.trajectory, drive.reference).ate_rmse_m or 0.0  # truth is exact at any time: interpolated
     found = pose_consistency(run.trajectory, drive.reference)
     return f"{1e3 * ate:.1f}, " + ("–" if found is None else f"{found.mean:.2f}")  # noqa: RUF001
 
 
-def table(names: Sequence[str], seconds: float) -> Iterator[str]:
-    """Lines of the table, as they are computed."""
-    logs = drives(seconds)
-    yield f"| without | {' | '.join(logs)} |"
-    yield "|---" * (len(logs) + 1) + "|"
-    for name in ("nothing", *names):
-        settings = SETTINGS.get(name, {})
-        with PATCHES.get(name, contextlib.nullcontext)():
-            yield f"| {name} | {' | '.join(cell(log, drive, settings) for log, drive in logs.items())} |"
+def rows(names: Sequence[str]) -> list[tuple[str, str, str]]:
+    """Label, mechanism ("" for none) and estimator of each row; the rows with everything come first."""
+    ekf = [("nothing (EKF)", "", "ekf"), *((name, name, "ekf") for name in names if name not in GRAPH_PATCHES)]
+    graph = [("nothing (graph, smoothed)", "", "graph"), *((name, name, "graph") for name in names if name in GRAPH_PATCHES)]
+    return [*(ekf if len(ekf) > 1 else []), *(graph if len(graph) > 1 else [])]
+
+
+def compute(names: Sequence[str], seconds: float, minutes: float, cells: dict[str, str], store: Callable[[], None]) -> None:
+    """Add the missing ``cells``, by "row | column", until ``minutes`` are over; `store` is called after each."""
+    end = time.monotonic() + 60.0 * minutes
+    missing = [(f"{label} | {column}", mechanism, estimator) for label, mechanism, estimator in rows(names) for column in COLUMNS]
+    missing = [entry for entry in missing if entry[0] not in cells]
+    logs = drives(seconds) if missing else {}
+    for key, mechanism, estimator in missing:
+        if time.monotonic() > end:
+            return
+        column = key.split(" | ")[1]
+        with {**PATCHES, **GRAPH_PATCHES}.get(mechanism, contextlib.nullcontext)():
+            cells[key] = cell(column, logs[column], SETTINGS.get(mechanism, {}), estimator)
+        store()
+        print(key, cells[key], flush=True)
+
+
+def table(names: Sequence[str], cells: Mapping[str, str]) -> list[str]:
+    """Lines of the table; a cell that is not computed yet is empty."""
+    head = [f"| without | {' | '.join(COLUMNS)} |", "|---" * (len(COLUMNS) + 1) + "|"]
+    return [*head, *(f"| {label} | {' | '.join(cells.get(f'{label} | {c}', '') for c in COLUMNS)} |" for label, _, _ in rows(names))]
 
 
 def write_into(text: str, lines: Sequence[str]) -> str:
@@ -190,14 +256,19 @@ def write_into(text: str, lines: Sequence[str]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--only", default=",".join([*PATCHES, *SETTINGS]), help="mechanisms, separated by commas")
+    parser.add_argument("--only", default=";".join(MECHANISMS), help="mechanisms, separated by semicolons")
     parser.add_argument("--seconds", type=float, default=300.0, help="of each drive")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="after which no further cell is begun")
+    parser.add_argument("--cells", type=Path, default=CELLS, help="file of the cells that are computed already")
     parser.add_argument("--write", action="store_true", help="write the table into the README of the estimators")
     options = parser.parse_args()
-    lines = []
-    for line in table([name for name in [*PATCHES, *SETTINGS] if name in options.only], options.seconds):
-        lines.append(line)
-        print(line, flush=True)
+    names = options.only.split(";")
+    if unknown := [name for name in names if name not in MECHANISMS]:
+        parser.error(f"no mechanism '{unknown[0]}'; there are {', '.join(MECHANISMS)}.")
+    cells = json.loads(options.cells.read_text()) if options.cells.exists() else {}
+    compute(names, options.seconds, options.minutes, cells, lambda: options.cells.write_text(json.dumps(cells, indent=1)) and None)
+    lines = table(names, cells)
+    print("\n".join(lines))
     if options.write:
         README.write_text(write_into(README.read_text(encoding="utf-8"), lines), encoding="utf-8")
 

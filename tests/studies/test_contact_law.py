@@ -1,4 +1,4 @@
-"""Claims about contact laws on measured data (tests/studies/contact_law.py), and the second implementation behind them."""
+"""Contact laws on measured data (tests/studies/contact_law.py), and the second implementation behind them."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ LAWS = (shipped("thesis", 13.333), shipped("isotropic", 10.0))
 
 
 @pytest.mark.parametrize("centripetal", [False, True])
-def test_the_second_implementation_moves_as_the_shipped_one(centripetal):
+def test_second_implementation_gives_the_shipped_motion(centripetal):
     rng = np.random.default_rng(0)
     params = friction().nominal + np.eye(12)[8] * 0.1 + np.eye(12)[7] * 0.01 + np.eye(12)[10] * 0.05
     wheels, cg = rng.uniform(-4, 4, (500, 2)), rng.uniform(-0.1, 0.1, (500, 2))
@@ -33,18 +33,18 @@ def test_the_second_implementation_moves_as_the_shipped_one(centripetal):
 
 
 @pytest.mark.parametrize("shape", list(SHAPES))
-def test_a_rival_starts_proportional_and_ends_saturated(shape):
+def test_rival_law_is_proportional_first_and_saturates(shape):
     z = np.array([0.0, 1e-6, 50.0])
     np.testing.assert_allclose(SHAPES[shape](z), [0.0, 1e-6, 1.0], rtol=1e-5)
 
 
-def test_the_grid_cannot_tell_the_brush_tyre_from_the_exponential():
+def test_grid_does_not_separate_brush_and_exponential_tyre():
     brush = fitted(FITTED, rival("brush", 8.0).model("VaultBot"))[1]
     exponential = fitted(FITTED)[1]
     assert brush.ratio == pytest.approx(exponential.ratio, rel=0.15)
 
 
-def test_k_of_two_huskies_does_not_fall_on_gentle_arcs_as_the_thesis_law_says():
+def test_k_of_two_huskies_does_not_fall_on_gentle_arcs():
     """DRIVE by ICP and BorealTC by gyro: k over that of the sharpest turns, on the two gentlest kinds of arc together."""
     for bins in (husky_curvature(LAWS), terrain_curvature(LAWS)):
         found = [relative(b, bins[-1]) for b in bins[:2]]
@@ -56,12 +56,12 @@ def test_k_of_two_huskies_does_not_fall_on_gentle_arcs_as_the_thesis_law_says():
         assert share - by_thesis > 3.5 * sigma
 
 
-def test_the_husky_is_predicted_as_well_unfitted_as_by_the_thesis_law():
+def test_husky_unfitted_error_is_that_of_the_thesis_law():
     errors = husky_errors(LAWS[1].model("Husky"))
     assert np.sqrt(2.0) * rms(errors[:, :2]) <= 0.31
 
 
-def test_stiffness_is_chosen_without_the_data_it_is_scored_on():
+def test_stiffness_is_chosen_without_the_data_that_score_it():
     scores = np.array([[1.0, 9.0, 9.0], [9.0, 1.0, 1.0], [3.0, 3.0, 3.0]])
     assert choose_stiffness(scores, 0) == 1
     assert choose_stiffness(scores, 1) == 0 or choose_stiffness(scores, 1) == 1
@@ -69,7 +69,7 @@ def test_stiffness_is_chosen_without_the_data_it_is_scored_on():
     assert choose_stiffness(scores, 1) == 0
 
 
-def test_a_gain_is_that_of_the_errors_with_an_interval_around_it():
+def test_gain_is_that_of_the_errors_with_an_interval():
     rng = np.random.default_rng(1)
     before = rng.normal(size=(200, 2))
     gain, low, high = paired_gain(before, 0.8 * before + 0.05 * rng.normal(size=(200, 2)), np.arange(200) // 4)

@@ -1,4 +1,4 @@
-"""Claims about the friction model on VaultBot's 68 rotations (tests/studies/friction_grid.py)."""
+"""The friction model on VaultBot's 68 rotations (tests/studies/friction_grid.py)."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from tests.studies.friction_grid import ALIASES, FITTED, fit, fitted, friction, 
 THESIS = friction("thesis")
 
 
-def test_with_the_thesis_constants_and_nothing_fitted():
+def test_grid_with_thesis_constants_unfitted_has_the_documented_error():
     errors, slope = unfitted()
     assert errors.ratio <= 0.0315
     assert slope == pytest.approx(2.17, rel=0.01)
@@ -20,7 +20,7 @@ def test_with_the_thesis_constants_and_nothing_fitted():
     assert slope == pytest.approx(2.17, rel=0.01)
 
 
-def test_with_the_default_stiffness_and_nothing_fitted():
+def test_grid_with_default_stiffness_unfitted_has_the_documented_error():
     assert unfitted(with_stiffness(STIFFNESS["isotropic"]))[0].ratio <= 0.0153
 
 
@@ -31,7 +31,7 @@ def with_stiffness(value):
 
 
 @pytest.mark.parametrize("axis", [0, 1], ids=["rows of constant x_G", "rows of constant y_G"])
-def test_four_fitted_numbers_predict_rows_that_they_have_not_seen(axis):
+def test_grid_four_fitted_numbers_predict_held_out_rows(axis):
     errors, heuristic = left_out(FITTED, axis), left_out(None, axis)
     assert errors.ratio <= 0.0108
     assert errors.x_cr <= 0.0072
@@ -46,7 +46,7 @@ def test_four_fitted_numbers_predict_rows_that_they_have_not_seen(axis):
     assert errors.y_cr < heuristic.y_cr
 
 
-def test_the_fitted_numbers():
+def test_grid_fitted_numbers_are_the_documented_ones():
     for model, values in ((friction(), [0.064, 0.130, 0.5856, 0.0043]), (THESIS, [0.065, 0.135, 0.583, 0.0031])):
         found, _ = fitted(model=model)
         sigma = jackknife_sigma(model=model)
@@ -56,14 +56,14 @@ def test_the_fitted_numbers():
         assert np.all(np.abs(found.values - [0, 0, 0.56, 0]) > 4 * sigma)
 
 
-def test_the_rotations_ask_for_nearly_the_stiffness_of_appendix_a():
+def test_grid_fitted_stiffness_is_near_that_of_appendix_a():
     names = (*FITTED, "slip_stiffness")
     found, _ = fitted(names)
     assert found.values[-1] == pytest.approx(12.6, abs=0.1)
     assert abs(found.values[-1] - 13.333) < 2 * jackknife_sigma(names)[-1]
 
 
-def test_each_fitted_number_is_needed_for_its_own_component():
+def test_grid_each_fitted_number_reduces_its_own_component():
     _, full = fitted()
     without = {name: fitted(tuple(n for n in FITTED if n != name))[1] for name in FITTED}
     assert without["tracked_x"].x_cr > 5 * full.x_cr
@@ -74,14 +74,14 @@ def test_each_fitted_number_is_needed_for_its_own_component():
     assert fitted((*FITTED[:1], "tread", *FITTED[2:]))[1].y_cr > 2 * full.y_cr
 
 
-def test_scrub_has_aliases_that_fit_as_well():
+def test_grid_scrub_has_aliases_of_equal_error():
     _, full = fitted()
     for name in ALIASES:
         assert fitted((*FITTED[:3], name))[1].ratio == pytest.approx(full.ratio, rel=0.1)
 
 
-def test_the_fit_recovers_numbers_that_it_was_given():
-    """Rotations made by the model with known numbers, and noise of the real size: found within their sigmas."""
+def test_fit_of_simulated_data_returns_its_numbers():
+    """Rotations simulated by the model with noise of the real size: parameters are within their sigmas."""
     rng = np.random.default_rng(2)
     truth = friction().nominal.copy()
     truth[[friction().param_names.index(n) for n in FITTED]] = wanted = np.array([0.05, -0.1, 0.6, 0.004])
@@ -92,7 +92,7 @@ def test_the_fit_recovers_numbers_that_it_was_given():
     assert np.all(np.abs(found.values - wanted) < 4 * found.sigma)
 
 
-def test_the_derivative_of_the_prediction():
+def test_prediction_derivative_is_that_of_differences():
     params, cg = friction().nominal, grid().cg
     _, derivative = predict(cg, params)
     for j in range(params.size):
@@ -101,7 +101,7 @@ def test_the_derivative_of_the_prediction():
         np.testing.assert_allclose(derivative[:, :, j], difference, atol=1e-6)
 
 
-def test_leaving_out_leaves_out(monkeypatch):
+def test_leave_out_excludes_the_row(monkeypatch):
     """A row that is wrong must not improve its own prediction: corrupt one, and only its errors grow by that much."""
     before = left_out(FITTED, 1)
     table = grid()

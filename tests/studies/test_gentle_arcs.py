@@ -1,4 +1,4 @@
-"""Claims about gentle arcs (tests/studies/gentle_arcs.py): what the friction model predicts of them, and what the thesis measured."""
+"""Gentle arcs (tests/studies/gentle_arcs.py): predictions of the friction model and measurements of the thesis."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def thesis_rows():
 
 
 @KINDS
-def test_k_on_gentle_arcs_with_a_centred_cg_is_that_in_place(kind):
+def test_k_on_gentle_arcs_with_centred_cg_is_that_in_place(kind):
     by_arc = {(loss.vx, loss.wz): loss for loss in losses(FITTED if kind == "four fitted" else MODEL.nominal)}
     for wz in (0.5, 0.2, 0.1, 0.05):
         assert by_arc[0.5, wz].k_centred == pytest.approx(1.0, abs=0.02)
@@ -48,7 +48,7 @@ def test_k_on_gentle_arcs_with_a_centred_cg_is_that_in_place(kind):
 
 
 @KINDS
-def test_the_thesis_law_takes_a_quarter_off_k_on_a_gentle_arc(kind):
+def test_k_on_gentle_arcs_by_the_thesis_law_is_a_quarter_less(kind):
     by_arc = {(loss.vx, loss.wz): loss for loss in losses(FITTED_THESIS if kind == "four fitted" else THESIS.nominal, THESIS)}
     gentle = by_arc[0.5, 0.1]
     assert gentle.k_centred == pytest.approx(0.75, abs=0.03)
@@ -57,7 +57,7 @@ def test_the_thesis_law_takes_a_quarter_off_k_on_a_gentle_arc(kind):
     assert k == sorted(k, reverse=True)
 
 
-def test_table_5_2_decides_where_the_prediction_is_decided(rows):
+def test_table_5_2_winners_are_those_of_the_prediction(rows):
     """The heuristic must win on sharp turns, and does; on gentle arcs neither prediction nor measurement is beyond the scatter."""
     verdicts = {row.trajectory: row.verdict for row in rows}
     assert {name for name, verdict in verdicts.items() if verdict == "undecided"} == set(GENTLE)
@@ -67,7 +67,7 @@ def test_table_5_2_decides_where_the_prediction_is_decided(rows):
             assert row.measured_loss[0] < 0
 
 
-def test_gentle_arcs_of_the_84_runs_are_predicted_four_times_as_well_as_by_the_thesis_law(rows, thesis_rows):
+def test_gentle_arcs_errors_are_a_fourth_of_the_thesis_law(rows, thesis_rows):
     def rms(found, names):
         return float(np.sqrt(np.mean([(row.predicted - row.measured) ** 2 for row in found if row.trajectory in names])))
 
@@ -77,11 +77,11 @@ def test_gentle_arcs_of_the_84_runs_are_predicted_four_times_as_well_as_by_the_t
     assert rms(rows, TRAJECTORIES) <= 0.038
 
 
-def test_the_thesis_law_wants_the_heuristic_to_lose_on_the_gentle_arcs_and_only_there(thesis_rows):
+def test_heuristic_by_the_thesis_law_loses_on_gentle_arcs_only(thesis_rows):
     assert {row.trajectory for row in thesis_rows if row.predicted_loss > 0} == set(GENTLE)
 
 
-def test_by_the_thesis_law_it_must_lose_there_wherever_the_centres_of_gravity_were():
+def test_heuristic_by_the_thesis_law_loses_there_at_any_cg():
     """Not only at the configurations' inferred CGs: as a mean over the thesis's whole grid too."""
     skid, diff = (make_model(name, load_robot("vaultbot")) for name in ("skid_steer", "diff_drive"))
     cg = grid().cg
@@ -91,7 +91,7 @@ def test_by_the_thesis_law_it_must_lose_there_wherever_the_centres_of_gravity_we
     assert {name for name, (by_skid, by_diff) in errors.items() if by_skid > by_diff} == set(GENTLE)
 
 
-def test_what_it_lost_and_won_of_the_six(rows):
+def test_heuristic_wins_and_losses_of_the_six_are_the_documented_ones(rows):
     measured = {row.trajectory: row.measured_loss for row in rows}
     assert {name for name, (loss, _) in measured.items() if loss > 0} == {"arc_1", "arc_4"}
     # On the two that it lost, it lost by less than the scatter over configurations.
@@ -103,7 +103,7 @@ def test_what_it_lost_and_won_of_the_six(rows):
     assert share_left(rows, gentle=True) == pytest.approx(1.0, abs=0.02)
 
 
-def test_the_means_of_table_5_2_are_those_of_the_model_reference(rows):
+def test_table_5_2_means_are_those_of_the_model_reference(rows):
     means = {row.trajectory: row.measured.mean(axis=0).round(3).tolist() for row in rows}
     assert means == {
         "arc_1": [0.038, 0.031],
@@ -116,7 +116,7 @@ def test_the_means_of_table_5_2_are_those_of_the_model_reference(rows):
     assert len(table_5_2()) == 84
 
 
-def test_the_inferred_centres_of_gravity_agree_with_what_the_text_says_of_one():
+def test_inferred_cgs_agree_with_the_one_in_the_text():
     """Sec. 5.2: under diff-drive the ready configuration turned by 133.39 degrees where 86.70 were wanted: a ratio of 1.54."""
     ready = configurations(FITTED)["ready"]
     diff = make_model("diff_drive", load_robot("vaultbot"))
@@ -124,7 +124,7 @@ def test_the_inferred_centres_of_gravity_agree_with_what_the_text_says_of_one():
     assert friction().twist(wheels, ready, FITTED).value[2] / 0.3 == pytest.approx(133.39 / 86.70, rel=0.05)
 
 
-def test_which_configurations_win_in_reverse_is_predicted(rows):
+def test_winners_in_reverse_are_predicted(rows):
     """arc_4 is driven backwards: a CG ahead, which wins forwards, loses there, and the other way round."""
     row = next(r for r in rows if r.trajectory == "arc_4")
     loss = [r[:, 0] - r[:, 1] for r in (row.predicted, row.measured)]
@@ -133,7 +133,7 @@ def test_which_configurations_win_in_reverse_is_predicted(rows):
     assert np.corrcoef(*(r[:, 0] - r[:, 1] for r in (rotate.predicted, rotate.measured)))[0, 1] > 0.95
 
 
-def test_a_path_is_the_composition_of_its_steps():
+def test_path_is_the_composition_of_its_steps():
     twist = np.random.default_rng(0).normal(size=(40, 3))
     pose = np.zeros(3)
     for i, step in enumerate(twist):

@@ -30,19 +30,19 @@ def rmse(row: Row, windows: list[Maneuver], folds: int = 10) -> float:
     return float(np.sqrt(score(row, windows, folds).squared_distance.mean()))
 
 
-def test_there_are_201_steps_of_three_windows(stored: list[Maneuver]) -> None:
+def test_husky_data_have_201_steps_of_three_windows(stored: list[Maneuver]) -> None:
     groups = [m.group for m in stored]
     assert len(groups) == 603
     assert {groups.count(name) for name in set(groups)} == {3}
 
 
-def test_known_results_are_reproduced(stored: list[Maneuver]) -> None:
+def test_husky_documented_results_are_reproduced(stored: list[Maneuver]) -> None:
     assert rmse(GEOMETRY, stored, 2) == pytest.approx(0.545, abs=0.001)
     # 0.264, with an unsaid choice of the last sample (0.262) or gt_icp (0.269) as reference.
     assert rmse(K_SCALE_X, stored) == pytest.approx(0.264, abs=0.005)
 
 
-def test_named_terms_get_below_23_centimetres_and_gain_surely(stored: list[Maneuver]) -> None:
+def test_husky_named_terms_reduce_the_error_below_23_cm(stored: list[Maneuver]) -> None:
     before, turning, best = (score(row, stored) for row in (K_SCALE_X, V_TIMES_W, BEST))
     assert np.sqrt(turning.squared_distance.mean()) <= 0.23
     assert np.sqrt(best.squared_distance.mean()) <= 0.225
@@ -52,8 +52,8 @@ def test_named_terms_get_below_23_centimetres_and_gain_surely(stored: list[Maneu
     assert interval.low < interval.value < interval.high
 
 
-def test_the_stored_frame_is_turned_as_described(stored: list[Maneuver], mended: list[Maneuver]) -> None:
-    """Where the heading wraps, the stored motion points elsewhere than the wheels drove, and the mended one does not."""
+def test_husky_stored_frame_is_rotated_as_described(stored: list[Maneuver], mended: list[Maneuver]) -> None:
+    """Where the heading wraps, the stored motion points elsewhere than the wheels drove, and the corrected one does not."""
     data = drive_husky.columns()
     wraps = np.abs(np.diff(data["icp_yaw"][:, :5], axis=1)).max(axis=1) > 3.0
     assert wraps.sum() == 11
@@ -73,7 +73,7 @@ def test_the_stored_frame_is_turned_as_described(stored: list[Maneuver], mended:
     assert rmse(BEST, mended, 5) <= 0.19
 
 
-def test_the_fitted_numbers_are_those_of_straight_drives_and_of_whole_turns(mended: list[Maneuver]) -> None:
+def test_husky_fitted_numbers_are_those_of_straights_and_whole_turns(mended: list[Maneuver]) -> None:
     """Two numbers of the fit by another way each: distance of straight windows, and yaw over wheel difference of all of them."""
     fit = BEST.train(mended)
     value = dict(zip(fit.names, fit.values, strict=True))
@@ -91,7 +91,7 @@ def test_the_fitted_numbers_are_those_of_straight_drives_and_of_whole_turns(mend
     assert -value["wz_left"] == pytest.approx(k, abs=0.005)
 
 
-def test_a_minute_of_driving_is_nearly_as_good_as_twenty(mended: list[Maneuver]) -> None:
+def test_husky_one_minute_calibrates_nearly_as_well_as_twenty(mended: list[Maneuver]) -> None:
     curve = learning_curve(BEST, mended, (2, 10, 150), 10)
     two, ten, many = (np.median(curve[n]) for n in (2, 10, 150))
     assert ten < 1.08 * many

@@ -1,4 +1,4 @@
-"""The effective track of a real Husky on five grounds, as far as the shipped runs tell."""
+"""The effective track of a real Husky on five grounds, from the shipped runs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TURNING = ("FLOORING", "ASPHALT", "ICE")
 
 
 @pytest.mark.parametrize("terrain", TURNING)
-def test_two_ways_agree_where_the_robot_turns(terrain: str) -> None:
+def test_track_width_of_two_methods_agrees_while_turning(terrain: str) -> None:
     run = load(terrain)
     plain, fitted = by_seconds(run, np.random.default_rng(0)), fitted_track(by_fit(run))
     assert plain is not None
@@ -22,14 +22,14 @@ def test_two_ways_agree_where_the_robot_turns(terrain: str) -> None:
 
 
 @pytest.mark.parametrize("terrain", ["ASPHALT", "ICE"])
-def test_one_run_agrees_with_all_runs_of_the_data_set(terrain: str) -> None:
+def test_track_width_of_one_run_agrees_with_all_runs(terrain: str) -> None:
     track = by_seconds(load(terrain), np.random.default_rng(0))
     assert track is not None
     assert track.low <= TERRAINS[terrain] <= track.high
 
 
 @pytest.mark.parametrize("terrain", ["SANDY_LOAM", "SNOW"])
-def test_a_run_without_turns_is_refused_with_what_to_drive(terrain: str) -> None:
+def test_run_without_turns_is_refused_with_the_drive_needed(terrain: str) -> None:
     run = load(terrain)
     assert by_seconds(run, np.random.default_rng(0)) is None
     with pytest.raises(CalibrationError, match=r"wheel_separation_multiplier .*turning in place"):

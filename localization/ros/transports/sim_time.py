@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 
-from localization.logs.message_stats import UnusableError
+from localization.logs.decode import UnusableError
 from localization.logs.serialization import decoder
 from localization.ros.transports.base import Received, ServiceHandler, Transport
 

@@ -1,0 +1,37 @@
+"""Beams that hit the robot itself."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from localization.events import Scan
+from localization.sensor_checks import OwnBodyFilter
+
+ANGLES = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+POST_RANGE_M = 0.3
+
+
+def scan(k: int, rng: np.random.Generator) -> Scan:
+    """Walls at ranges that change, a post on the robot over 20 beams, and a point that is not finite."""
+    ranges = rng.uniform(2.0, 8.0, len(ANGLES))
+    ranges[:20] = POST_RANGE_M
+    points = np.column_stack([ranges * np.cos(ANGLES), ranges * np.sin(ANGLES), np.zeros(len(ANGLES))])
+    points[100] = np.nan
+    return Scan(1_000_000_000 + k, points)
+
+
+def test_filter_of_post_on_driving_and_turning_robot_removes_it() -> None:
+    body, rng = OwnBodyFilter(), np.random.default_rng(0)
+    sizes = []
+    for k in range(30):
+        body.add_motion(np.array([0.1, 0.0, 0.05]))
+        sizes.append(len(body.filter(scan(k, rng)).points))
+    assert sizes[0] == len(ANGLES)
+    assert sizes[-1] == len(ANGLES) - 20
+    assert body.share == 20 / len(ANGLES)
+
+
+def test_filter_of_robot_at_rest_removes_nothing() -> None:
+    body, rng = OwnBodyFilter(), np.random.default_rng(0)
+    assert all(len(body.filter(scan(k, rng)).points) == len(ANGLES) for k in range(30))
+    assert body.share == 0.0
