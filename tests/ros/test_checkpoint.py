@@ -76,7 +76,7 @@ def test_resumed_pipeline_with_late_mounts_gives_the_same_bits(estimator):
         rest += [numbers(e) for event in events[met : met + AHEAD] for e in goes_on.process(event)]
         found.append(rest)
         assert goes_on.synchronizer.frames.problem is None
-        assert "/tf_static was late" in goes_on.synchronizer.warnings()[-1]
+        assert "/tf_static gave the mount of the LiDAR's frame 'laser' late" in goes_on.synchronizer.warnings()[-1]
     assert found[0] == found[1]
     assert len(before) > 50
 

@@ -315,7 +315,7 @@ def test_late_transforms_are_used_from_then_on(estimator, tmp_path):
     assert "now has the mount of the LiDAR" in reports[1]
     assert node.session.pipeline.mounts["laser"].x != 0.0
     (note,) = node.warnings()
-    assert "/tf_static was late" in note
+    assert "/tf_static gave the mount of the LiDAR's frame 'laser' late" in note
     # what was wrong until then stays; from then on it is as right as it says
     a, b = track(calm), track(late)
     begin, *_, last = sorted(s for s in set(a) & set(b) if s > min(a) + 5 * S)
