@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from motion_models.lazy import exports
+from motion_models import exports
 
 if TYPE_CHECKING:
     from localization.estimators import ESTIMATORS, EstimatorConfig

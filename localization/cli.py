@@ -20,6 +20,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "compare": ("Compare", "Compare motion models and estimators over many logs."),
     "calibrate": ("Calibrate", "Fit a motion model to logs or tables and write the robot file."),
     "diagnose": ("Diagnose", "Find what a motion model gets wrong on a log, its cause, and the gain of correcting it."),
+    "weigh": ("Weigh", "Estimate the centre of gravity and an unknown load from how the robot turns."),
     "init": ("Init", "Write a robot file for a new robot from a log and a URDF."),
     "robots": ("Robots", "List the robots that are shipped, with the source of every number."),
     "cg": ("Cg", "Compute the centre of gravity from scales, arms and payload."),

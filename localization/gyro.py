@@ -111,6 +111,7 @@ class GyroBuffer:
 
     @property
     def newest_ns(self) -> int | None:
+        """Stamp of the newest sample; None before the first."""
         return self._stamps[-1] if self._stamps else None
 
     def turn(self, start_ns: int, end_ns: int, by_wheels: float) -> Turn | None:

@@ -466,12 +466,16 @@ class OwnBodyFilter:
         points = scan.points
         if not scan.is_planar or not len(points):
             return scan
-        r = np.nan_to_num(np.hypot(points[:, 0], points[:, 1]), nan=np.inf)
-        bearings = np.nan_to_num(np.arctan2(points[:, 1], points[:, 0]))  # a point that is not finite is on no part of the robot
-        bins = np.floor(bearings * (_BODY_BEARINGS / (2.0 * math.pi))).astype(np.intp) % _BODY_BEARINGS
+        r2 = points[:, 0] ** 2 + points[:, 1] ** 2
+        near = np.flatnonzero(r2 < _MAX_BODY_RANGE_M**2)  # no point that is not finite
+        if not len(near):
+            self._range, self._travelled = np.full(_BODY_BEARINGS, np.nan), 0.0
+            return scan
+        r = np.sqrt(r2[near])
+        bins = np.floor(np.arctan2(points[near, 1], points[near, 0]) * (_BODY_BEARINGS / (2.0 * math.pi))).astype(np.intp) % _BODY_BEARINGS
         nearest = np.full(_BODY_BEARINGS, np.inf)
         np.minimum.at(nearest, bins, r)
-        nearest[nearest > _MAX_BODY_RANGE_M] = np.nan
+        nearest[np.isinf(nearest)] = np.nan
         is_same = np.abs(nearest - self._range) <= _SAME_RANGE_M
         self._travel = np.where(is_same, self._travel + self._travelled, 0.0)
         least, greatest = self._headings
@@ -480,7 +484,8 @@ class OwnBodyFilter:
         self._travelled = 0.0
         has_turned = self._headings[1] - self._headings[0] >= _MIN_BODY_TURN_RAD
         self._is_own = is_same & (self._is_own | ((self._travel >= _MIN_BODY_TRAVEL_M) & has_turned))
-        is_own = self._is_own[bins] & (np.abs(r - self._range[bins]) <= _SAME_RANGE_M)
+        is_own = np.zeros(len(points), dtype=bool)
+        is_own[near] = self._is_own[bins] & (np.abs(r - self._range[bins]) <= _SAME_RANGE_M)
         share = float(is_own.mean())
         if share < _MIN_BODY_SHARE:
             return scan
@@ -498,6 +503,7 @@ class ShakeDetector:
 
     @property
     def lasted_s(self) -> float:
+        """Duration of the fault so far [s]."""
         return 0.0 if self._since_ns is None else (self._now_ns - self._since_ns) * _NS
 
     def insert(self, sample: ImuSample) -> None:
@@ -592,10 +598,9 @@ def _is_constant(gyro: FloatArray, wheels: FloatArray) -> bool:
 
 def _travel_direction(bins: list[_Bin]) -> float | None:
     """Direction [rad] of the LiDAR's travel against the wheels', where both agree among themselves; None where it is not known."""
-    rows = [b for b in bins if np.isfinite(b.wheels).all() and np.isfinite(b.lidar).all()]
-    wheels = np.array([complex(b.wheels[0], b.wheels[1]) for b in rows])
-    lidar = np.array([complex(b.lidar[0], b.lidar[1]) for b in rows])
-    turned = np.array([abs(b.wheels[2]) for b in rows])
+    rows = np.array([(*b.wheels, *b.lidar) for b in bins])
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    wheels, turned, lidar = rows[:, 0] + 1j * rows[:, 1], np.abs(rows[:, 2]), rows[:, 3] + 1j * rows[:, 4]
     is_long = (np.abs(wheels) >= _MIN_TRAVEL_M) & (np.abs(lidar) >= _MIN_TRAVEL_M) & (turned <= _MAX_CURVATURE_RAD_M * np.abs(wheels))
     if is_long.sum() < _MIN_TRAVEL_BINS:
         return None

@@ -29,6 +29,7 @@ class WheelBuffer:
 
     @property
     def newest_ns(self) -> int | None:
+        """Stamp of the newest sample; None before the first."""
         return None if self._last is None else self._last.stamp_ns
 
     @property
@@ -37,10 +38,12 @@ class WheelBuffer:
         return self._ends[-1] if self._ends else None
 
     def set_cg(self, sample: CgSample) -> None:
+        """Set the CG of the samples to come."""
         self._cg, self._cg_cov = sample.position, sample.covariance
 
     @property
     def cg_cov(self) -> FloatArray:
+        """(2, 2) covariance of the CG [m^2]."""
         return self._cg_cov
 
     def insert(self, sample: WheelSample) -> None:

@@ -1,8 +1,10 @@
 """Motion models of skid-steer robots whose centre of gravity moves: pure functions of wheels, CG and parameters."""
 
-from typing import TYPE_CHECKING
+from __future__ import annotations
 
-from motion_models.lazy import exports
+import importlib
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from motion_models.base import Motion, MotionModel, Twist
@@ -16,10 +18,9 @@ if TYPE_CHECKING:
     from motion_models.calibration.ros_export import diff_drive_controller_yaml, multiplier_table, multipliers, robot_localization_yaml
     from motion_models.calibration.windows_table import read_windows, windows_text
     from motion_models.center_of_gravity.files import arms_model, arms_postures, urdf_cg, weighed_cg
-    from motion_models.center_of_gravity.model import CgModel, cg_model, static_part_from_weighing
+    from motion_models.center_of_gravity.model import CgModel, CgTracker, cg_model, static_part_from_weighing
     from motion_models.center_of_gravity.parts import Arms, CgEstimate, Payload, StaticPart, Tolerances, support_margin
     from motion_models.center_of_gravity.postures import posture_for
-    from motion_models.center_of_gravity.tracker import CgTracker
     from motion_models.center_of_gravity.weighing import Scales, WeighedCg, cg_from_scales, read_weighings, wheel_contacts
     from motion_models.diff_drive import DiffDrive
     from motion_models.errors import CalibrationError, CgError, ModelError, RobotError, SkidlocError
@@ -119,10 +120,9 @@ _MODULES = {
     "motion_models.calibration.ros_export": "diff_drive_controller_yaml multiplier_table multipliers robot_localization_yaml",
     "motion_models.calibration.windows_table": "read_windows windows_text",
     "motion_models.center_of_gravity.files": "arms_model arms_postures urdf_cg weighed_cg",
-    "motion_models.center_of_gravity.model": "CgModel cg_model static_part_from_weighing",
+    "motion_models.center_of_gravity.model": "CgModel CgTracker cg_model static_part_from_weighing",
     "motion_models.center_of_gravity.parts": "Arms CgEstimate Payload StaticPart Tolerances support_margin",
     "motion_models.center_of_gravity.postures": "posture_for",
-    "motion_models.center_of_gravity.tracker": "CgTracker",
     "motion_models.center_of_gravity.weighing": "Scales WeighedCg cg_from_scales read_weighings wheel_contacts",
     "motion_models.diff_drive": "DiffDrive",
     "motion_models.errors": "CalibrationError CgError ModelError RobotError SkidlocError",
@@ -137,4 +137,20 @@ _MODULES = {
     "motion_models.robot_file": "robot_toml",
     "motion_models.skid_steer": "SkidSteer thesis_coefficients",
 }
+
+
+def exports(package: str, module_by_name: Mapping[str, str]) -> Callable[[str], Any]:
+    """``__getattr__`` of ``package`` (PEP 562): each name from its module on first use; `skidloc --help` needs no numerical library.
+
+    Raises `AttributeError` for other names.
+    """
+
+    def get(name: str) -> Any:
+        if name not in module_by_name:
+            raise AttributeError(f"module '{package}' has no attribute '{name}'")
+        return getattr(importlib.import_module(module_by_name[name]), name)
+
+    return get
+
+
 __getattr__ = exports(__name__, {name: module for module, names in _MODULES.items() for name in names.split()})

@@ -51,7 +51,7 @@ class Motion:
     """A relative motion with its covariance: what wheels predict, and what a LiDAR measures, between two moments."""
 
     delta: FloatArray
-    """(3,) pose of the end seen from the start [m, m, rad]."""
+    """(3,) pose of the end relative to the start [m, m, rad]."""
     cov: FloatArray
     """(3, 3) of the right perturbation of ``delta``."""
     d_params: FloatArray = field(default_factory=lambda: np.zeros((3, 0)))

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from motion_models.base import MotionModel
-from motion_models.corrected_wheels import RADIUS_NAMES, CorrectedWheels
+from motion_models.corrected import RADIUS_NAMES, CorrectedFriction, CorrectedWheels
 from motion_models.errors import ModelError
-from motion_models.friction import CorrectedFriction, FrictionModel
+from motion_models.friction import FrictionModel
 from motion_models.se2 import FloatArray
 
 Form = str
@@ -24,6 +24,7 @@ FORMS: tuple[Form, ...] = ("none", "constant", "cg_field")
 # multipliers for one Husky range from 1.5 to 1.9; terrains differ by a quarter), absolute [m] for where it turns about.
 _TURNING, _CENTRE_X, _CENTRE_Y = 0.15, 0.05, 0.03
 _PRIOR_RETURNS_AFTER_S = 3600.0
+"""Time after which a correction's random walk has brought back its first standard deviation [s]: tyres and loads within an hour."""
 _WARP = 0.15  # VaultBot's chassis, as its rotations show it, moves 13 % of m g / 4 to two opposite wheels
 _MU_RATIO = 0.3
 _RADIUS_SCALE, _RADIUS_DIFFERENCE = 0.03, 0.01
@@ -134,8 +135,8 @@ def _named(model: MotionModel, form: Form) -> tuple[Correction, ...]:
     for name in names:
         if name not in available:
             raise ModelError(f"no correction '{name}' of {model.name}; there are {', '.join(available) or 'none'}.")
-        if lost := [p for p in available[name].along if p not in model.param_names]:
-            raise ModelError(f"{model.name} has no parameter '{lost[0]}' as it is: pass it through `correctable` first.")
+        if absent := [p for p in available[name].along if p not in model.param_names]:
+            raise ModelError(f"{model.name} has no parameter '{absent[0]}' as it is: pass it through `correctable` first.")
     return tuple(available[name] for name in dict.fromkeys(names))
 
 

@@ -26,6 +26,7 @@ _LARGEST = 1e9
 _LONGEST_M = 100.0
 """Of a length of a robot [m]; the largest mining vehicles have 20."""
 _LARGEST_CLOCK_OFFSET_S = 10.0
+"""Beyond it clocks are not synchronized, and no offset is constant [s]."""
 _LONGEST_SHOWN = 60  # characters of what a user wrote, in a message
 DIFF_DRIVE = "diff_drive"
 """`Robot.drive` of two driven wheels and casters."""
@@ -399,7 +400,7 @@ def _build(kind: type[Section], table: Any, name: str, source: str) -> Section:
         if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING and f.name not in values
     ]
     if missing:
-        raise RobotError(f"{source}: [{name}] lacks {', '.join(missing)}.")
+        raise RobotError(f"{source}: [{name}] has no {', '.join(missing)}.")
     return kind(**values)
 
 

@@ -27,14 +27,14 @@ def robot_toml(robot: Robot, sigmas: Mapping[str, Mapping[str, float]] | None = 
     if robot.drive != Robot.drive:
         lines.append(f"drive = {_value(robot.drive)}")
     for name in ("geometry", "driver"):
-        lines += _table(name, dataclasses.asdict(getattr(robot, name)))
+        lines += _table(name, _not_default(getattr(robot, name)))
     for name in ("topics", "joints", "wheel_noise", "gyro_noise", "clock"):
         entries = _not_default(getattr(robot, name))
         lines += _table(name, entries) if entries else []
     if robot.arms is not None:
         lines += _table("arms", {name: value for name, value in dataclasses.asdict(robot.arms).items() if value != ()})
     for frame, mount in robot.mounts.items():
-        lines += _table(f"mounts.{_key(frame)}", dataclasses.asdict(mount))
+        lines += _table(f"mounts.{_key(frame)}", _not_default(mount))
     for model in [*robot.models, *(name for name in robot.options if name not in robot.models)]:
         entries = {**robot.options.get(model, {}), **robot.models.get(model, {})}
         lines += _table(f"models.{_key(model)}", entries, sigmas.get(model, {}))

@@ -217,7 +217,7 @@ def inverse(a_T_b: ArrayLike) -> FloatArray:
 
 
 def between(world_T_a: ArrayLike, world_T_b: ArrayLike) -> FloatArray:
-    """``a_T_b`` (..., 3): where b is, seen from a."""
+    """``a_T_b`` (..., 3): pose of b relative to a."""
     return compose(inverse(world_T_a), world_T_b)
 
 

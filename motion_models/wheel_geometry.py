@@ -76,11 +76,11 @@ def wheel_geometry(text: str, source: str, base_link: str = "base_link") -> Whee
         raise RobotError(f"{source}: no driven wheels on both sides (continuous joints with 'wheel' in their names: {found}).")
     across = statistics.mean(wheels[name][1] for name in left) - statistics.mean(wheels[name][1] for name in right)
     along = max(x for x, _ in wheels.values()) - min(x for x, _ in wheels.values())
-    known = [radius for radius in radii if math.isfinite(radius)]
+    finite = [radius for radius in radii if math.isfinite(radius)]
     return WheelGeometry(
         left=left,
         right=right,
-        wheel_radius_m=statistics.median(known) if known else math.nan,
+        wheel_radius_m=statistics.median(finite) if finite else math.nan,
         track_width_m=across,
         wheelbase_m=along if along > _SAME_M else math.nan,
         mass_kg=sum(link.mass for link in urdf.links.values()) or math.nan,

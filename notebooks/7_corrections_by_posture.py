@@ -27,7 +27,7 @@ import numpy as np
 from localization import open_log, reference_track
 from localization.report.notebook import CYCLE, MARKERS, Panel, Series, picture, table
 from localization.simulation import Experiment, ExperimentConfig, SensorConfig, Simulation, SimulationConfig, write_simulation
-from localization.simulation.drives import MoveArms, Rest, Route, TurnTo
+from localization.simulation.experiments import MoveArms, Rest, Route, TurnTo
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import START_NS
 from motion_models import load_robot

@@ -1,4 +1,4 @@
-"""Calibration of a motion model by logs: maneuvers, the fit of what they reveal, and how well it predicts maneuvers it has not seen."""
+"""Calibration of a motion model by logs: maneuvers, the fit of what they reveal, and how well it predicts held-out maneuvers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from motion_models.calibration.least_squares import FitConfig
 from motion_models.calibration.maneuvers import IntArray, Maneuver
 from motion_models.calibration.noise import LearnedNoise, learn_noise
 from motion_models.calibration.plan import Calibration, calibrate, free_of
-from motion_models.corrected_wheels import CorrectedWheels
+from motion_models.corrected import RADIUS_NAMES, CorrectedWheels
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
 from motion_models.robot import Robot, WheelNoise
@@ -53,7 +53,7 @@ class Calibrated:
     model: MotionModel
     calibration: Calibration
     before: FloatArray
-    """(M, 3) predicted poses seen from the measured ones, by the robot file's own numbers [m, m, rad]."""
+    """(M, 3) predicted poses relative to the measured ones, by the robot file's own numbers [m, m, rad]."""
     inside: FloatArray
     """(M, 3) the same by the fit, of the maneuvers that it was fitted to."""
     group: IntArray
@@ -61,7 +61,7 @@ class Calibrated:
     position_known: BoolArray
     """(M,) whether the position was measured, not only the heading."""
     heldout: HeldOut | None
-    """The same by fits that have not seen the maneuver's group; None for too few groups to leave any out."""
+    """The same by fits without the maneuver's group; None for too few groups to leave any out."""
     systematic: dict[str, float]
     """Sigma by parameter that no number of maneuvers averages out: the gyro's scale; empty without a gyro."""
     noise: LearnedNoise
@@ -69,10 +69,12 @@ class Calibrated:
 
     @property
     def measures_positions(self) -> bool:
+        """Whether any maneuver has a measured position, not only a heading."""
         return bool(self.position_known.any())
 
     @property
     def fit(self) -> Fit:
+        """The fit to all maneuvers."""
         return self.calibration.fit
 
     @property
@@ -108,7 +110,7 @@ def cut_log(
 ) -> Cut:
     """The maneuvers of a log, as measured by ``reference_name``; "auto" is the reference if one is named, else the LiDAR, else the gyro.
 
-    A reference, even one that the robot file names, is never used unless the user says so: what is calibrated on it cannot be scored
+    A reference, even one that the robot file names, is never used unless the user names it: what is calibrated on it cannot be scored
     against it. Raises `CalibrationError` where nothing measures the motion, and what opening the log does.
     """
     config = config or WindowConfig()
@@ -122,14 +124,14 @@ def cut_log(
     events = log.events()
     windows = cut(events, motion_reference, make_model("diff_drive", robot), robot, config, log.path.name)
     kept = f"{len(windows.maneuvers)} windows of {config.window_s:g} s"
-    left = f"{kept}; left out: {windows.standing} standing still, {windows.lost} not measured."
+    left = f"{kept}; left out: {windows.standing} standing still, {windows.unmeasured} not measured."
     return Cut(log.path.name, windows.maneuvers, words, (left, *windows.warnings, *log.warnings()))
 
 
 def make_motion_reference(
     log: Log, robot: Robot, name: MotionReferenceName, reference: str | None, config: WindowConfig
 ) -> tuple[MotionReference, str]:
-    """What measures the motion of ``log``, and its name in words. Raises `CalibrationError` where the log lacks it."""
+    """What measures the motion of ``log``, and its name in words. Raises `CalibrationError` where the log has none."""
     if name == "reference" or (name == "auto" and reference is not None):
         track = _track(log, reference)
         return TrackMotionReference(track, config.window_s), f"reference {track.source}"
@@ -138,9 +140,9 @@ def make_motion_reference(
         return LidarMotionReference(log.mounts, config.window_s), f"scan matching of {sources.lidar.topic}"
     if sources.imu is not None and name in ("auto", "gyro"):
         return GyroMotionReference(robot.gyro_noise, log.mounts, config.window_s), f"gyro {sources.imu.topic}"
-    wanted = {"auto": "neither a LiDAR nor an IMU", "lidar": "no LiDAR", "gyro": "no IMU"}.get(name, "no motion reference")
+    absent = {"auto": "neither a LiDAR nor an IMU", "lidar": "no LiDAR", "gyro": "no IMU"}.get(name, "no motion reference")
     raise CalibrationError(
-        f"{log.path.name} has {wanted}, so nothing measures what the wheels do; name a reference with headings with --reference, or topics"
+        f"{log.path.name} has {absent}, so nothing measures what the wheels do; name a reference with headings with --reference, or topics"
         " with --topic.scan, --topic.points or --topic.imu. `skidloc info` lists them."
     )
 
@@ -173,17 +175,17 @@ def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequ
     """
     maneuvers = [m for each in cuts for m in each.maneuvers]
     if not maneuvers:
-        told = " ".join(f"{each.source}: {each.warnings[0]}" if each.warnings else each.source for each in cuts)
-        raise CalibrationError(f"no motion to calibrate on. {told} {ADVICE}")
-    if model.name == "skid_steer" and not of_rotations:
+        sources = " ".join(f"{each.source}: {each.warnings[0]}" if each.warnings else each.source for each in cuts)
+        raise CalibrationError(f"no motion to calibrate on. {sources} {ADVICE}")
+    if (model.name == "skid_steer" and not of_rotations) or set(free) & set(RADIUS_NAMES):
         model = CorrectedWheels(model)
     wanted = tuple(free) or free_of(model, maneuvers, of_rotations)
     # In a table of rotations nothing slips at random: every row has the same wheels, and its own errors.
     config = FitConfig(noise=_NO_SLIP if of_rotations else robot.wheel_noise)
     found = calibrate(model, maneuvers, wanted, config, insist=bool(free))
     if not free:
-        unseen = tuple((name, _UNSEEN) for name in free_of(model, maneuvers[:0]) if name not in wanted and _only_turns(maneuvers))
-        found = dataclasses.replace(found, held=(*unseen, *found.held))
+        unrevealed = tuple((name, _NO_DISTANCE) for name in free_of(model, maneuvers[:0]) if name not in wanted and _only_turns(maneuvers))
+        found = dataclasses.replace(found, held=(*unrevealed, *found.held))
     chosen = dataclasses.replace(found.fit.config, strict=False)
 
     def train(some: Sequence[Maneuver]) -> Fit:
@@ -209,7 +211,7 @@ def _least_error(residuals: FloatArray) -> float:
 _FINEST_ERROR = 1e-4
 """Of a position [m] or heading [rad]; what the best references resolve."""
 _NO_SLIP = WheelNoise(*(0.0,) * 8)
-_UNSEEN = "headings alone were measured, and no distance: record a LiDAR or a reference with positions to reveal it."
+_NO_DISTANCE = "headings alone were measured, and no distance: record a LiDAR or a reference with positions to reveal it."
 
 
 def _only_turns(maneuvers: Sequence[Maneuver]) -> bool:
@@ -235,7 +237,7 @@ def _gyro_scale(
 
 @dataclass(frozen=True)
 class Turning:
-    """What a calibration says of turning in place at the robot's nominal CG, and of driving straight on; each with its sigma."""
+    """Turning in place by a calibration at the robot's nominal CG, and of driving straight on; each with its sigma."""
 
     effective_track_m: tuple[float, float]
     """Distance of two wheels without slip that would turn the robot as fast."""

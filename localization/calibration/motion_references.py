@@ -23,6 +23,7 @@ from motion_models.se2 import FloatArray
 
 _NS = 1e-9
 _MAX_SCAN_GAP_S, _MAX_REFERENCE_GAP_S = 1.0, 0.5
+"""Gaps in scans and references beyond which a window is not measured [s]."""
 _MAX_GAP_OVER_PERIOD = 2.5  # for references that are sparser than that: one missing measurement does not end a window
 _MAX_GYRO_BIAS = 0.05  # rad/s; a robot that turns faster by the gyro than any bias does not stand, whatever its wheels report
 HOLD_S = 0.5
@@ -33,12 +34,13 @@ _TURN_ERROR = 0.5
 """Sigma of a turn by the nominal model, as a share of the turn."""
 _OPEN_SIGMA_M = 0.05
 """Sigma of a position beyond which a scene counts as a corridor: matching then slides towards no motion at all [m]."""
-_RATE_GAPS = 20  # gaps between scans, by which their rate is known
+_RATE_GAPS = 20  # gaps between scans, by which their rate is measured
 _MAX_UNMATCHED_S, _MAX_UNMATCHED_M, _MAX_UNMATCHED_RAD = 0.3, 0.15, 0.15
 """Scans within a window only lead to its last one: those nearer than this to the last matched one, by the wheels, are left out."""
 _RANGE_STEP_M = 0.05
 """Added to all ranges for the scene's derivative: about the ranging error of common scanners [m]."""
 _STANDSTILL_COV = np.diag([1e-12, 1e-12, 1e-12])
+"""Of a robot whose wheels stand: a micrometre and a microradian [m^2, m^2, rad^2]."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Span:
     start_ns: int
     end_ns: int
     measured: FloatArray
-    """(3,) pose at the end seen from that at the start [m, m, rad]."""
+    """(3,) pose at the end relative to that at the start [m, m, rad]."""
     cov: FloatArray
     """(3, 3) of its right perturbation, inf on the diagonal for what is not measured."""
     is_valid: bool = True
@@ -92,12 +94,14 @@ class GyroMotionReference:
     """Yaw by the gyro; its bias from the times at which the robot stood still. Positions are not measured."""
 
     def __init__(self, noise: GyroNoise, mounts: Mapping[str, Mount], window_s: float) -> None:
+        """``window_s``: length of the spans [s]."""
         self._noise, self._window_ns = noise, round(window_s / _NS)
         self._gyro = GyroBuffer(noise, mounts, keep_s=2.0 * window_s + 10.0)
         self._start_ns = self._newest_ns = None  # type: int | None
         self._bias: tuple[float, float] | None = None
 
     def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
+        """See `MotionReference.spans`."""
         if isinstance(event, ImuSample):
             self._gyro.insert(event)
             self._newest_ns = event.stamp_ns
@@ -115,6 +119,7 @@ class GyroMotionReference:
         self._start_ns = end_ns
 
     def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
+        """See `MotionReference.correct`."""
         seconds_of = [(span.end_ns - span.start_ns) * _NS for span in standing]
         valid = [s for s, t in zip(standing, seconds_of, strict=True) if s.is_valid and abs(float(s.measured[2])) < _MAX_GYRO_BIAS * t]
         bias, sigma = 0.0, self._noise.bias_sigma_rad_per_s
@@ -134,8 +139,11 @@ class GyroMotionReference:
         return corrected
 
     def warnings(self) -> list[str]:
+        """See `MotionReference.warnings`."""
         if self._bias is None:
-            note = "the robot never stood still, so the gyro's bias is not known and counts as error; let it stand for a few seconds."
+            note = (
+                "the robot never stood still, so the gyro's bias could not be measured and counts as error; let it stand for a few seconds."
+            )
         else:
             note = f"the gyro's bias is {self._bias[0]:+.5f} rad/s, by {self._bias[1]:.0f} s of standing still; it was taken off."
         return [note, *self._gyro.warnings()]
@@ -149,6 +157,7 @@ class LidarMotionReference:
     """
 
     def __init__(self, mounts: Mapping[str, Mount], window_s: float, config: LidarConfig | None = None) -> None:
+        """``window_s``: length of the spans [s]; each has one key scan, whatever ``config`` has."""
         self._mounts, self._window_ns = mounts, round(window_s / _NS)
         self._config = replace(config or LidarConfig(), key_scans=1)
         self._matcher: ScanMatcher | None = None
@@ -160,6 +169,7 @@ class LidarMotionReference:
         self._unmatched = self._scans = self._open = 0
 
     def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
+        """See `MotionReference.spans`."""
         if not isinstance(event, Scan) or wheels.buffer.newest_ns is None:
             return
         self._scans += 1
@@ -185,15 +195,17 @@ class LidarMotionReference:
             self._begin(stamp_ns, points)
 
     def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
+        """See `MotionReference.correct`."""
         return list(spans)
 
     def warnings(self) -> list[str]:
+        """See `MotionReference.warnings`."""
         notes = []
         if self._open:
             notes.append(f"{self._open} windows count by their heading alone: along walls and corridors scans do not fix the position.")
         if self._unmatched:
-            lost = f"{self._unmatched} of {self._scans} scans could not be matched with the first of their window"
-            notes.append(f"{lost}; windows that end in one were left out.")
+            unmatched = f"{self._unmatched} of {self._scans} scans could not be matched with the first of their window"
+            notes.append(f"{unmatched}; windows that end in one were left out.")
         return notes
 
     def _adapt_to_rate(self, stamp_ns: int) -> None:
@@ -296,6 +308,7 @@ class TrackMotionReference:
         self._max_gap_s = max(_MAX_REFERENCE_GAP_S, _MAX_GAP_OVER_PERIOD * period_s)
 
     def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
+        """See `MotionReference.spans`."""
         newest = wheels.buffer.newest_ns
         if newest is None:
             return
@@ -304,10 +317,10 @@ class TrackMotionReference:
         end_ns = self._at_stamp(self._start_ns + self._window_ns)
         if newest < end_ns:
             return
-        known = bool(self._track.covers([self._start_ns, end_ns], self._max_gap_s).all())
+        is_covered = bool(self._track.covers([self._start_ns, end_ns], self._max_gap_s).all())
         start, end = self._track.at([self._start_ns, end_ns])
-        measured = se2.between(start, end) if known else np.zeros(3)
-        yield Span(self._start_ns, end_ns, measured, self._cov, is_valid=known)
+        measured = se2.between(start, end) if is_covered else np.zeros(3)
+        yield Span(self._start_ns, end_ns, measured, self._cov, is_valid=is_covered)
         self._start_ns = end_ns
 
     def _at_stamp(self, moment_ns: int) -> int:
@@ -316,7 +329,9 @@ class TrackMotionReference:
         return int(self._stamps[i]) if self._is_sparse and i < len(self._stamps) else moment_ns
 
     def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
+        """See `MotionReference.correct`."""
         return list(spans)
 
     def warnings(self) -> list[str]:
+        """See `MotionReference.warnings`."""
         return list(self._warnings)

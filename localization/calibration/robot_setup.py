@@ -21,10 +21,12 @@ from localization.logs.decode import UnusableError, frame_name, stamp_ns
 from localization.logs.reader import open_log
 from localization.logs.serialization import LogDeserializer
 from localization.logs.sources import open_source
-from localization.logs.topic_roles import TYPES
+from localization.logs.topic_roles import TYPES, TopicOverrides
 from motion_models.center_of_gravity.urdf import parse_urdf
+from motion_models.errors import RobotError
 from motion_models.robot import DIFF_DRIVE, Driver, Geometry, Joints, Mount, Robot, Topics
 from motion_models.se2 import FloatArray
+from motion_models.text_files import read_text
 from motion_models.wheel_geometry import WheelGeometry, link_poses, sides, wheel_geometry
 
 DRIVE_60_S = (
@@ -46,7 +48,7 @@ _MIN_MOTION = 0.05
 
 @dataclass(frozen=True)
 class Given:
-    """What the user says; None for what is to be found."""
+    """What the user gives; None for what is to be found."""
 
     name: str | None = None
     drive: str | None = None
@@ -61,6 +63,7 @@ class Given:
     base_link: str = "base_link"
     like: Robot | None = None
     """A robot whose geometry, driver and joints count where neither log nor URDF has any."""
+    topics: TopicOverrides = field(default_factory=TopicOverrides)
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,7 @@ class Survey:
 
 @dataclass
 class Draft:
-    """A robot as far as it is known."""
+    """A robot as far as log, URDF and user give it."""
 
     values: dict[str, float] = field(default_factory=dict)
     """Entries of [geometry] and the driver's, by name."""
@@ -139,9 +142,9 @@ def _decoded(decode: LogDeserializer, raw: Any) -> Any:
 def draft_robot(survey: Survey, given: Given, path: Path) -> Draft:
     """Guess everything that a robot file needs. Raises `RobotError` for a URDF that cannot be used."""
     draft = Draft()
-    text = None if given.urdf is None else given.urdf.read_text(encoding="utf-8")
+    text = None if given.urdf is None else _read_urdf(given.urdf)
     urdf = None if text is None else wheel_geometry(text, str(given.urdf), given.base_link)
-    _choose_topics(draft, survey)
+    _choose_topics(draft, survey, given.topics)
     _choose_joints(draft, survey, given, urdf)
     driver = fit_driver(path, draft)
     _choose_geometry(draft, given, urdf, driver)
@@ -149,24 +152,37 @@ def draft_robot(survey: Survey, given: Given, path: Path) -> Draft:
     return draft
 
 
-def _choose_topics(draft: Draft, survey: Survey) -> None:
-    for kind, message_type in TYPES.items():
+def _read_urdf(path: Path) -> str:
+    try:
+        return read_text(path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise RobotError(f"URDF '{path}' cannot be read: {error}. Expand xacro files first.") from error
+
+
+def _choose_topics(draft: Draft, survey: Survey, given: TopicOverrides) -> None:
+    for role, message_type in TYPES.items():
+        named = getattr(given, role)
+        if named is not None:
+            _take_topic(draft, survey, role, named)
+            continue
         found = [topic for topic, (type_, _) in survey.topics.items() if type_ == message_type]
-        if kind == "joint_states":
+        if role == "joint_states":
             found = [topic for topic in found if all(sides(survey.joint_names.get(topic, ())))] or found
-        if kind == "odometry":
+        if role == "odometry":
             found = [topic for topic in found if not _NOT_THE_DRIVERS.search(topic)] or found
-        if kind == "imu":
+        if role == "imu":
             found = [topic for topic in found if not _RAW.search(topic)] or found
         if not found:
             continue
         best = max(found, key=lambda topic: survey.topics[topic][1])
         others = [topic for topic in found if topic != best]
         why = "the only one of its type" if not others else f"the most messages; others: {', '.join(others)}"
-        draft.topics[kind] = best
-        draft.reasons.append(f"topics.{kind} = {best}: {why}.")
+        draft.topics[role] = best
+        draft.reasons.append(f"topics.{role} = {best}: {why}.")
+    if given.reference is not None:
+        _take_topic(draft, survey, "reference", given.reference)
     references = [t for t in survey.topics if _REFERENCE.search(t) and t not in draft.topics.values()]
-    if references:
+    if references and given.reference is None:
         draft.topics["reference"] = references[-1]
         draft.reasons.append(f"topics.reference = {references[-1]}: by its name; results are scored against it, never estimated from it.")
     if not {"joint_states", "odometry"} & draft.topics.keys():
@@ -175,6 +191,17 @@ def _choose_topics(draft: Draft, survey: Survey) -> None:
         draft.missing.append("LiDAR: none in the log; without it or a gyro nothing measures slip.")
     if "imu" not in draft.topics:
         draft.missing.append("IMU: none in the log; its yaw rate makes turns better.")
+
+
+def _take_topic(draft: Draft, survey: Survey, role: str, topic: str) -> None:
+    """The user's ``topic`` in ``role``. Raises `RobotError` for one that is not in the log."""
+    option = f"--topic.{role.replace('_', '-')}"
+    if not topic:
+        raise RobotError(f"{option} is empty: no robot file leaves a role out. Give it to `skidloc replay` and the others instead.")
+    if topic not in survey.topics:
+        raise RobotError(f"{option} {topic}: {survey.name} has no such topic; it has {', '.join(survey.topics)}.")
+    draft.topics[role] = topic
+    draft.reasons.append(f"topics.{role} = {topic}: given.")
 
 
 def _choose_joints(draft: Draft, survey: Survey, given: Given, urdf: WheelGeometry | None) -> None:
@@ -265,7 +292,7 @@ def _mount(rotation: FloatArray, translation: FloatArray) -> Mount:
 def fit_driver(path: Path, draft: Draft) -> tuple[float, float] | None:
     """Wheel radius [m] and effective track (track times multiplier) [m] by which a driver makes its odometry of the wheels' rates.
 
-    Least squares of the odometry's twists on the joint states' rates; None where the log lacks one of them or does not move.
+    Least squares of the odometry's twists on the joint states' rates; None where the log has only one of them or does not move.
     """
     states, odometry = draft.topics.get("joint_states"), draft.topics.get("odometry")
     if states is None or odometry is None or draft.joints is None:

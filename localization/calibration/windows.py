@@ -42,7 +42,7 @@ class Windows:
     maneuvers: tuple[Maneuver, ...]
     standing: int
     """Windows that were left out because the robot stood still in them."""
-    lost: int
+    unmeasured: int
     """Windows that were left out because wheels or reference had no data, or no valid measurement."""
     warnings: tuple[str, ...]
     """Limits of the motion reference, in sentences for the user."""
@@ -67,14 +67,14 @@ def cut(
     waiting: list[Span] = []
     found: list[tuple[Span, Maneuver]] = []
     still: list[Span] = []
-    lost = 0
+    unmeasured = 0
 
     def take(until_ns: int | None) -> Iterator[Span]:
         while waiting and (until_ns is None or waiting[0].end_ns + around <= until_ns):
             yield waiting.pop(0)
 
     def use(span: Span) -> int:
-        """1 if the span is lost."""
+        """1 if the span was not measured."""
         window = _window(history, span, around)
         if window is None:
             return 1
@@ -97,9 +97,9 @@ def cut(
         waiting.extend(reference.spans(event, wheels))
         if history.newest_ns is not None:
             for span in take(history.newest_ns):
-                lost += use(span)
+                unmeasured += use(span)
     for span in take(None):
-        lost += use(span)
+        unmeasured += use(span)
     corrected = reference.correct([span for span, _ in found], still)
     first = found[0][0].start_ns if found else 0
     maneuvers = []
@@ -107,7 +107,7 @@ def cut(
         number = int((span.start_ns - first) * _NS / (config.window_s * config.per_group))
         group = f"{name}, {number * config.window_s * config.per_group:g} s"
         maneuvers.append(dataclasses.replace(maneuver, measured=span.measured[None], cov=span.cov, group=group))
-    return Windows(tuple(maneuvers), len(still), lost, tuple(reference.warnings()))
+    return Windows(tuple(maneuvers), len(still), unmeasured, tuple(reference.warnings()))
 
 
 def _window(history: WheelBuffer, span: Span, around: int) -> tuple[FloatArray, FloatArray, FloatArray, int, int] | None:

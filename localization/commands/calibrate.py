@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,7 @@ from rich.console import Console
 
 from localization.calibration.calibrate import Calibrated, Cut, MotionReferenceName, Turning, calibrated, cut_log, turning
 from localization.calibration.windows import WindowConfig
-from localization.commands.calibration_tables import numbers, print_by_source, print_cuts, print_fit, print_rotation_errors
+from localization.commands.calibration_tables import calibration_numbers, print_by_source, print_cuts, print_fit, print_rotation_errors
 from localization.commands.common import write_json
 from localization.commands.regression_tables import print_regressions, regression_numbers
 from localization.logs import TopicOverrides
@@ -22,7 +23,7 @@ from localization.output import check_outputs, write_text_file
 from motion_models.base import MotionModel
 from motion_models.calibration.regressions import RotationTable, read_rotation_table, rotations_as_maneuvers, skid_steer_fit
 from motion_models.calibration.ros_export import diff_drive_controller_yaml, robot_localization_yaml
-from motion_models.calibration.windows_table import read_windows, table_columns, windows_text
+from motion_models.calibration.windows_table import read_windows, table_columns, windows_text, without_turned_frames
 from motion_models.center_of_gravity.files import arms_model, arms_postures
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
@@ -32,6 +33,7 @@ from motion_models.se2 import FloatArray
 from motion_models.skid_steer import SkidSteer
 
 _TABLE = ".csv"
+_NODE_NAME = re.compile(r"/\*\*|/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _USUAL_ROBOT = "husky_a200"
 
 
@@ -48,7 +50,7 @@ class Calibrate:
     """Motion model to fit."""
     fit: str = ""
     """Parameters to fit, separated by commas; all of them must show. Default: the model's usual ones, as far as the drive reveals them."""
-    witness: MotionReferenceName = "auto"
+    motion_reference: Annotated[MotionReferenceName, tyro.conf.arg(aliases=["--witness"])] = "auto"
     """What measured the real motion in logs: the reference if one is named, else the LiDAR, else the gyro (headings alone)."""
     reference: str | None = None
     """Topic or TUM file with positions and headings, as the motion reference. Never used unless named."""
@@ -59,6 +61,8 @@ class Calibrate:
     """Write the robot with its new parameters to this file; every command takes it as --robot."""
     export: Literal["diff_drive_controller", "robot_localization"] | None = None
     """Print the calibration as parameters of this ROS package."""
+    export_node: str = ""
+    """Name of the node in the exported parameters. Default: diff_drive_controller, or ekf_filter_node."""
     export_out: Annotated[Path | None, tyro.conf.arg(metavar="FILE.yaml")] = None
     """Write them to this file instead."""
     windows: Annotated[Path | None, tyro.conf.arg(metavar="FILE.csv")] = None
@@ -67,6 +71,7 @@ class Calibrate:
     """Write what is printed to this file as well."""
 
     def run(self, console: Console) -> None:
+        """Run the command. Raises `SkidlocError` for input that cannot be used."""
         self._check()
         robot = load_robot(self.robot)
         model = make_model(self.model, robot)
@@ -75,10 +80,10 @@ class Calibrate:
             raise CalibrationError(f"logs, tables of windows and tables of rotations cannot be calibrated on together: {', '.join(kinds)}.")
         (kind,) = kinds
         if kind == "rotations" and self.model == "skid_steer" and not self.fit:
-            new, sigmas, told = self._regressions(console, robot)
+            new, sigmas, numbers = self._regressions(console, robot)
         else:
-            new, sigmas, told = self._fit(console, robot, model, kind)
-        self._write(console, robot, new, sigmas, told)
+            new, sigmas, numbers = self._fit(console, robot, model, kind)
+        self._write(console, robot, new, sigmas, numbers)
 
     def _check(self) -> None:
         if not self.source:
@@ -86,7 +91,13 @@ class Calibrate:
         if not 0.5 <= self.window_s <= 20.0:
             raise CalibrationError(f"--window-s is {self.window_s:g}; maneuvers of 0.5 to 20 s make sense.")
         if self.export_out is not None and self.export is None:
-            raise CalibrationError("--export-out names a file, but --export does not say for which package.")
+            raise CalibrationError("--export-out names a file, but --export names no package.")
+        if self.export_node and self.export is None:
+            raise CalibrationError("--export-node names a node, but --export names no package.")
+        if self.export_node and not _NODE_NAME.fullmatch(self.export_node):
+            raise CalibrationError(
+                f"--export-node '{self.export_node}' is no name of a ROS node: letters, digits, _ and /, or /** for all."
+            )
         check_outputs(self.out, self.export_out, self.windows, self.json)
         if self.out is not None and self.out.suffix != ".toml":
             raise CalibrationError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")
@@ -106,20 +117,20 @@ class Calibrate:
         print_by_source(console, by_source)
         if self.windows is not None:
             write_text_file(self.windows, windows_text([m for each in cuts for m in each.maneuvers]))
-        told = {"robot": robot.name, "model": model.name, **numbers(found, about, cuts, by_source)}
+        numbers = {"robot": robot.name, "model": model.name, **calibration_numbers(found, about, cuts, by_source)}
         if not found.is_recommended:
-            return robot, {}, told
+            return robot, {}, numbers
         calibrated_robot = found.fit.robot(robot)
-        return dataclasses.replace(calibrated_robot, wheel_noise=found.noise.scaled(robot.wheel_noise)), found.sigmas, told
+        return dataclasses.replace(calibrated_robot, wheel_noise=found.noise.scaled(robot.wheel_noise)), found.sigmas, numbers
 
     def _cut(self, path: Path, robot: Robot, kind: str) -> Cut:
         if kind == "log":
-            return cut_log(path, robot, self.topic, self.witness, self.reference, WindowConfig(window_s=self.window_s))
+            return cut_log(path, robot, self.topic, self.motion_reference, self.reference, WindowConfig(window_s=self.window_s))
         if kind == "rotations":
             table = read_rotation_table(path)
             return Cut(path.name, tuple(rotations_as_maneuvers(table, robot)), f"the table of {len(table.ratio)} rotations")
-        maneuvers = read_windows(path)
-        return Cut(path.name, tuple(maneuvers), f"the table of {len(maneuvers)} windows")
+        maneuvers, notes = without_turned_frames(read_windows(path), robot.geometry.wheel_radius_m)
+        return Cut(path.name, tuple(maneuvers), f"the table of {len(maneuvers)} windows", tuple(notes))
 
     def _regressions(self, console: Console, robot: Robot) -> tuple[Robot, dict[str, float], dict[str, Any]]:
         """The thesis's regressions; what is written are the coefficients by all rows at once, with their sigmas."""
@@ -129,10 +140,10 @@ class Calibrate:
         print_regressions(console, table, found, robot)
         sigmas = dict(zip(SkidSteer.param_names, (float(s) for s in np.sqrt(np.diagonal(found.cov))), strict=True))
         values = dict(zip(SkidSteer.param_names, (float(c) for c in found.coefficients), strict=True))
-        told = {"robot": robot.name, "model": "skid_steer", **regression_numbers(table, found, values, sigmas, multiplier)}
-        return dataclasses.replace(robot, models={**robot.models, "skid_steer": values}), sigmas, told
+        numbers = {"robot": robot.name, "model": "skid_steer", **regression_numbers(table, found, values, sigmas, multiplier)}
+        return dataclasses.replace(robot, models={**robot.models, "skid_steer": values}), sigmas, numbers
 
-    def _write(self, console: Console, robot: Robot, new: Robot, sigmas: dict[str, float], told: dict[str, Any]) -> None:
+    def _write(self, console: Console, robot: Robot, new: Robot, sigmas: dict[str, float], numbers: dict[str, Any]) -> None:
         model = make_model(self.model, new)
         if self.out is not None:
             sources = ", ".join(path.name for path in self.source)
@@ -143,9 +154,9 @@ class Calibrate:
             console.print(f"robot file: {self.out}", markup=False, soft_wrap=True)
         if self.export is not None:
             text = (
-                diff_drive_controller_yaml(model, new, model.nominal, _postures(new))
+                diff_drive_controller_yaml(model, new, model.nominal, _postures(new), sigmas, self.export_node)
                 if self.export == "diff_drive_controller"
-                else robot_localization_yaml(model, new, model.nominal)
+                else robot_localization_yaml(model, new, model.nominal, self.export_node)
             )
             if self.export_out is not None:
                 write_text_file(self.export_out, text)
@@ -153,7 +164,7 @@ class Calibrate:
             else:
                 console.print(text, markup=False, soft_wrap=True)
         if self.json is not None:
-            write_json(self.json, {"source": [path.name for path in self.source], **told})
+            write_json(self.json, {"source": [path.name for path in self.source], **numbers})
 
 
 def _kind(path: Path) -> str:
@@ -178,10 +189,10 @@ def _postures(robot: Robot) -> FloatArray | None:
 
 def _each(found: Calibrated, cuts: Sequence[Cut], robot: Robot) -> list[tuple[str, Turning | None]]:
     """Turning by each log alone: what the floor under it does."""
-    told: list[tuple[str, Turning | None]] = []
+    turnings: list[tuple[str, Turning | None]] = []
     for each in cuts:
         try:
-            told.append((each.source, turning(calibrated(found.model, [each], robot, found.fit.names), robot)))
+            turnings.append((each.source, turning(calibrated(found.model, [each], robot, found.fit.names), robot)))
         except CalibrationError:
-            told.append((each.source, None))
-    return told
+            turnings.append((each.source, None))
+    return turnings

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from localization.calibration.calibrate import Calibrated, Cut, Turning
 from localization.calibration.windows import driven
+from localization.commands.tables import add_row, plain_table, print_line, print_table
 from motion_models.base import MotionModel
 from motion_models.calibration.cross_validation import Interval, root_mean, root_mean_gain
 from motion_models.calibration.noise import LearnedNoise
@@ -25,49 +25,17 @@ Trial = tuple[float, float]
 _MANY_TIMES = 1.5  # a noise model that is wrong by less is right
 
 
-WIDE = 200
-"""Characters a line where nobody's screen is in the way."""
-
-
-def plain_table(*columns: str, title: str | None = None) -> Table:
-    """With its first column to the left and all others to the right; texts are no markup."""
-    names = [escape(name) for name in columns]
-    heading = None if title is None else escape(title)
-    table = Table(*names, box=None, header_style="bold", pad_edge=False, title=heading, title_justify="left", title_style="")
-    for column in table.columns[1:]:
-        column.justify = "right"
-    return table
-
-
-def row(table: Table, *cells: str) -> None:
-    """Add a row, its cells as plain text."""
-    table.add_row(*map(escape, cells))
-
-
-def show(console: Console, table: Table) -> None:
-    """Where nobody's screen is in the way, a row stays one line."""
-    if console.is_terminal:
-        console.print(table)
-    else:
-        Console(file=console.file, width=WIDE, highlight=False).print(table)
-
-
-def say(console: Console, text: str) -> None:
-    """Print one sentence without wrapping."""
-    console.print(text, markup=False, soft_wrap=True)
-
-
 def print_cuts(console: Console, robot: Robot, cuts: Sequence[Cut]) -> None:
     """What was fitted on."""
     g = robot.geometry
     for each in cuts:
         seconds, metres, radians = driven(each.maneuvers, g.wheel_radius_m, g.track_width_m)
-        say(
+        print_line(
             console,
             f"{each.source}: {seconds:.0f} s of motion, {metres:.1f} m and {radians:.1f} rad by the wheels, measured by {each.measured_by}",
         )
         for note in each.warnings:
-            say(console, f"  {note}")
+            print_line(console, f"  {note}")
 
 
 def print_fit(console: Console, found: Calibrated, about: Turning, cuts: Sequence[Cut]) -> None:
@@ -78,39 +46,41 @@ def print_fit(console: Console, found: Calibrated, about: Turning, cuts: Sequenc
     )
     table.columns[4].justify = "left"
     for name, (before, value, sigma) in _parameters(found).items():
-        row(table, name, f"{before:.5g}", f"{value:.5g}", f"{sigma:.2g}", MEANING.get(name, ""))
-    show(console, table)
+        add_row(table, name, f"{before:.5g}", f"{value:.5g}", f"{sigma:.2g}", MEANING.get(name, ""))
+    print_table(console, table)
     if found.calibration.held:
-        say(console, "\nNot revealed by this drive, and held:")
+        print_line(console, "\nNot revealed by this drive, and held:")
         for name, why in found.calibration.held:
-            say(console, f"  {name}: {why}")
-    say(console, f"\nTurning in place it needs an effective track of {_pm(about.effective_track_m)} m.")
+            print_line(console, f"  {name}: {why}")
+    print_line(console, f"\nTurning in place it needs an effective track of {_pm(about.effective_track_m)} m.")
     if found.measures_positions:
         x, y, forward = _pm(about.x_cr_m), _pm(about.y_cr_m), _pm(about.forward_scale, 4)
-        say(console, f"It then turns about ({x}, {y}) m, and drives {forward} m for each metre that its wheels roll.")
+        print_line(console, f"It then turns about ({x}, {y}) m, and drives {forward} m for each metre that its wheels roll.")
     if any("scan matching" in each.measured_by for each in cuts):
-        say(
+        print_line(
             console,
-            "A LiDAR that sits further ahead than its mount says looks like a centre of rotation that far ahead; only measuring the mount,"
-            " or turns with the centre of gravity moved, tell them apart.",
+            "A LiDAR that sits further ahead than its mount gives looks like a centre of rotation that far ahead; only measuring the mount,"
+            " or turns with the centre of gravity moved, distinguish them.",
         )
-    show(console, _errors_table(found))
+    print_table(console, _errors_table(found))
     if found.heldout is None:
-        say(console, "Too few groups of maneuvers to hold any out: these errors are of the maneuvers that were fitted. Drive longer.")
+        print_line(
+            console, "Too few groups of maneuvers to hold any out: these errors are of the maneuvers that were fitted. Drive longer."
+        )
     if found.gain is not None and not found.is_recommended:
-        say(
+        print_line(
             console,
             f"NOT RECOMMENDED: on maneuvers that it was not fitted to, this fit errs {1.0 / found.gain:.2f} times as much as the robot"
             " file's own numbers. The old values are kept. Drive longer, on the same floor, or fit fewer parameters with --fit.",
         )
     if found.noise != LearnedNoise(1.0, 1.0):
-        say(
+        print_line(
             console,
             f"Wheel noise learned from held-out maneuvers: yaw variances {found.noise.yaw:.2g} times the robot file's, position variances"
             f" {found.noise.position:.2g} times.",
         )
     if fit.scale > _MANY_TIMES:
-        say(
+        print_line(
             console,
             f"What is left is {fit.scale:.1f} times what the robot file's wheel_noise and the reference's noise explain; `skidloc diagnose`"
             " finds what this model gets wrong.",
@@ -131,19 +101,19 @@ def errors(found: Calibrated) -> dict[str, dict[str, Interval]]:
     After is held out, if there were enough groups.
     """
     after = found.inside if found.heldout is None else found.heldout.residuals
-    told: dict[str, dict[str, Interval]] = {}
+    found_errors: dict[str, dict[str, Interval]] = {}
     for name, pick, unit in (("position_m", slice(0, 2), 1.0), ("heading_deg", slice(2, 3), 180.0 / math.pi)):
         if name == "position_m" and not found.measures_positions:
             continue
         scored = found.position_known if name == "position_m" else np.ones(len(after), dtype=bool)
         squares = [np.sum(r[scored, pick] ** 2, axis=1) * unit**2 for r in (found.before, after)]
         group = found.group[scored]
-        told[name] = {
+        found_errors[name] = {
             "before": root_mean(squares[0], group, np.random.default_rng(0)),
             "after": root_mean(squares[1], group, np.random.default_rng(0)),
             "gain": root_mean_gain(squares[0], squares[1], group, np.random.default_rng(0)),
         }
-    return told
+    return found_errors
 
 
 def _errors_table(found: Calibrated) -> Table:
@@ -151,7 +121,7 @@ def _errors_table(found: Calibrated) -> Table:
     table = plain_table("RMS error [95 %]", "before", f"after, {kind}", "gain", title="")
     for name, values in errors(found).items():
         quantity, unit = name.split("_")
-        row(table, f"{quantity} [{unit}]", str(values["before"]), str(values["after"]), str(values["gain"]))
+        add_row(table, f"{quantity} [{unit}]", str(values["before"]), str(values["after"]), str(values["gain"]))
     return table
 
 
@@ -162,14 +132,16 @@ def print_by_source(console: Console, by_source: Sequence[tuple[str, Turning | N
     table = plain_table("by each alone", "effective track [m]", "95 %", title="")
     for source, about in by_source:
         if about is None:
-            row(table, source, "-", "not revealed")
+            add_row(table, source, "-", "not revealed")
         else:
             value, sigma = about.effective_track_m
-            row(table, source, f"{value:.3f}", f"{value - 1.96 * sigma:.3f} .. {value + 1.96 * sigma:.3f}")
-    show(console, table)
+            add_row(table, source, f"{value:.3f}", f"{value - 1.96 * sigma:.3f} .. {value + 1.96 * sigma:.3f}")
+    print_table(console, table)
 
 
-def numbers(found: Calibrated, about: Turning, cuts: Sequence[Cut], by_source: Sequence[tuple[str, Turning | None]]) -> dict[str, Any]:
+def calibration_numbers(
+    found: Calibrated, about: Turning, cuts: Sequence[Cut], by_source: Sequence[tuple[str, Turning | None]]
+) -> dict[str, Any]:
     """All of it for JSON."""
     return {
         "seconds": found.fit.seconds,
@@ -214,8 +186,8 @@ def print_rotation_errors(console: Console, found: Calibrated, rotations: Rotati
     """Errors over the table, before and after."""
     table = plain_table(f"RMS over {len(rotations.ratio)} rotations", "ratio", "x_CR [m]", "y_CR [m]", title="")
     for what, params in (("before", found.model.nominal), ("fitted", found.fit.params)):
-        row(table, what, *(f"{e:.4f}" for e in rotation_errors(found.model, params, rotations, robot)))
-    show(console, table)
+        add_row(table, what, *(f"{e:.4f}" for e in rotation_errors(found.model, params, rotations, robot)))
+    print_table(console, table)
 
 
 def _pm(value: Trial, digits: int = 3) -> str:

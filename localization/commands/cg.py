@@ -11,8 +11,8 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from localization.commands.calibration_tables import plain_table, row, say, show
 from localization.commands.common import write_json
+from localization.commands.tables import add_row, plain_table, print_line, print_table
 from localization.output import check_outputs
 from motion_models.center_of_gravity.files import arms_model, arms_postures, weighed_cg
 from motion_models.center_of_gravity.model import static_part_from_weighing
@@ -25,6 +25,7 @@ from motion_models.friction.contact import loads
 from motion_models.robot import Robot, load_robot
 from motion_models.se2 import FloatArray
 from motion_models.skid_steer import SkidSteer
+from motion_models.text_files import read_text
 
 
 @dataclass(frozen=True)
@@ -59,26 +60,27 @@ class Cg:
     """Write what is printed to this file as well."""
 
     def run(self, console: Console) -> None:
+        """Run the command. Raises `SkidlocError` for input that cannot be used."""
         robot = load_robot(self.robot)
         check_outputs(self.json)
         g = robot.geometry
         weighed = None if self.weighings is None else weighed_cg(self.weighings, g.wheelbase_m, g.track_width_m)
-        wants_arms = bool(self.posture or self.joint or self.payload or self.urdf or self.weighed_posture)
-        if weighed is None and not wants_arms:
+        uses_arms = bool(self.posture or self.joint or self.payload or self.urdf or self.weighed_posture)
+        if weighed is None and not uses_arms:
             raise CgError("nothing to find a centre of gravity by: name a CSV of weighings, a --posture, or joints by --joint NAME=VALUE.")
         source, static = [], None
         if weighed is not None:
             source.append(f"{weighed.weighings} weighing{'s' if weighed.weighings > 1 else ''}")
-        if weighed is not None and not wants_arms:
+        if weighed is not None and not uses_arms:
             estimate = CgEstimate(weighed.position, weighed.covariance[1:, 1:], weighed.mass)
         else:
-            estimate, static, said = self._with_arms(robot, weighed)
-            source += said
+            estimate, static, steps = self._with_arms(robot, weighed)
+            source += steps
         require_support(estimate.position, g.wheelbase_m, g.track_width_m)
-        told = self._told(robot, estimate, weighed, static, source)
-        _print(console, robot, estimate, weighed, static, told)
+        numbers = self._numbers(robot, estimate, weighed, static, source)
+        _print(console, robot, estimate, weighed, static, numbers)
         if self.json is not None:
-            write_json(self.json, told)
+            write_json(self.json, numbers)
 
     def _with_arms(self, robot: Robot, weighed: WeighedCg | None) -> tuple[CgEstimate, StaticPart | None, list[str]]:
         arms, folder = robot.arms, robot.folder
@@ -87,34 +89,34 @@ class Cg:
         if arms is None:
             raise CgError(f"robot '{robot.name}' has no arms; name a URDF with --urdf, or give its file a section [arms].")
         postures = self._postures(arms, folder)
-        payload, said = self._payload(), []
+        payload, steps = self._payload(), []
         model = arms_model(arms, folder, payload)
         static = None
         if weighed is not None:
             if not self.weighed_posture:
-                raise CgError("to move the arms after a weighing, say how they stood on the scales: --weighed-posture NAME.")
+                raise CgError("to move the arms after a weighing, name their posture on the scales: --weighed-posture NAME.")
             chain = arms_model(arms, folder).chain
             static = static_part_from_weighing(weighed, chain, _named(postures, self.weighed_posture))
             model = arms_model(arms, folder, payload, static)
-            said.append(f"the arms of {Path(chain.source).name} off at '{self.weighed_posture}'")
+            steps.append(f"the arms of {Path(chain.source).name} off at '{self.weighed_posture}'")
         at: dict[str, float] = dict(_named(postures, self.posture)) if self.posture else {}
         at |= self._joints(model.chain.joint_names)
         estimate = model.estimate(model.chain.posture({name: q for name, q in at.items() if name in model.chain.joint_names}))
         if self.posture or self.joint:
-            said.append("arms at " + " with ".join([*([f"'{self.posture}'"] if self.posture else []), *self.joint]))
+            steps.append("arms at " + " with ".join([*([f"'{self.posture}'"] if self.posture else []), *self.joint]))
         if payload is not None:
-            said.append(f"{payload.mass:g} kg at {payload.link}")
-        return estimate, static, said or [f"the masses of {Path(model.chain.source).name}"]
+            steps.append(f"{payload.mass:g} kg at {payload.link}")
+        return estimate, static, steps or [f"the masses of {Path(model.chain.source).name}"]
 
     def _postures(self, arms: Arms, folder: Path | None) -> dict[str, Posture]:
         if self.srdf is not None:
             try:
-                return dict(parse_postures(self.srdf.read_text(encoding="utf-8"), str(self.srdf)))
+                return dict(parse_postures(read_text(self.srdf), str(self.srdf)))
             except (OSError, UnicodeDecodeError) as error:
                 raise CgError(f"SRDF '{self.srdf}' cannot be read: {error}.") from error
         return dict(arms_postures(arms, folder))
 
-    def _joints(self, known: tuple[str, ...]) -> dict[str, float]:
+    def _joints(self, movable: tuple[str, ...]) -> dict[str, float]:
         found = {}
         for text in self.joint:
             name, _, value = text.partition("=")
@@ -124,9 +126,9 @@ class Cg:
                 found[name.strip()] = math.nan
             if not math.isfinite(found[name.strip()]):
                 raise CgError(f"--joint {text}: must be NAME=VALUE with a number [rad or m].")
-        unknown = sorted(set(found) - set(known))
+        unknown = sorted(set(found) - set(movable))
         if unknown:
-            raise CgError(f"no joint {', '.join(unknown)} that moves mass; such joints are {', '.join(known) or 'none'}.")
+            raise CgError(f"no joint {', '.join(unknown)} that moves mass; such joints are {', '.join(movable) or 'none'}.")
         return found
 
     def _payload(self) -> Payload | None:
@@ -136,12 +138,12 @@ class Cg:
             raise CgError(f"--payload {self.payload:g} hangs in the air: name the link that holds it with --at.")
         return Payload(self.at, self.payload, self.offset, self.payload_sigma)
 
-    def _told(
+    def _numbers(
         self, robot: Robot, estimate: CgEstimate, weighed: WeighedCg | None, static: StaticPart | None, source: list[str]
     ) -> dict[str, Any]:
         g, cg = robot.geometry, estimate.position
         sigma = np.sqrt(np.diagonal(estimate.covariance))
-        told: dict[str, Any] = {
+        numbers: dict[str, Any] = {
             "robot": robot.name,
             "source": source,
             "mass_kg": estimate.mass,
@@ -155,11 +157,15 @@ class Cg:
         }
         if weighed is not None and self.weighings is not None:
             readings = read_weighings(self.weighings).mean(axis=0)
-            told["weighed_loads_kg"] = dict(zip(WHEELS, readings.tolist(), strict=True))
-            told["warp"] = float(readings @ [1.0, -1.0, -1.0, 1.0] / readings.sum())
+            numbers["weighed_loads_kg"] = dict(zip(WHEELS, readings.tolist(), strict=True))
+            numbers["warp"] = float(readings @ [1.0, -1.0, -1.0, 1.0] / readings.sum())
         if static is not None:
-            told["static_part"] = {"mass_kg": static.mass, "position_m": static.position.tolist(), "covariance": static.covariance.tolist()}
-        return told
+            numbers["static_part"] = {
+                "mass_kg": static.mass,
+                "position_m": static.position.tolist(),
+                "covariance": static.covariance.tolist(),
+            }
+        return numbers
 
 
 def wheel_loads(robot: Robot, estimate: CgEstimate) -> dict[str, float]:
@@ -196,34 +202,39 @@ def _named(postures: dict[str, Posture], name: str) -> Posture:
 
 
 def _print(
-    console: Console, robot: Robot, estimate: CgEstimate, weighed: WeighedCg | None, static: StaticPart | None, told: dict[str, Any]
+    console: Console, robot: Robot, estimate: CgEstimate, weighed: WeighedCg | None, static: StaticPart | None, numbers: dict[str, Any]
 ) -> None:
-    (x, y), (sx, sy) = estimate.position, told["sigma_m"]
-    say(console, f"{robot.name}, by {', '.join(told['source'])}: {estimate.mass:.2f} kg")
-    say(console, f"centre of gravity: x {x:+.4f} +- {sx:.4f} m, y {y:+.4f} +- {sy:.4f} m")
-    margin = told["margin_m"]
+    (x, y), (sx, sy) = estimate.position, numbers["sigma_m"]
+    print_line(console, f"{robot.name}, by {', '.join(numbers['source'])}: {estimate.mass:.2f} kg")
+    print_line(console, f"centre of gravity: x {x:+.4f} +- {sx:.4f} m, y {y:+.4f} +- {sy:.4f} m")
+    margin = numbers["margin_m"]
     across = sx if robot.geometry.wheelbase_m / 2.0 - abs(x) == margin else sy
-    say(console, f"tipping margin: {margin:.3f} m ({margin / max(across, 1e-9):.0f} sigma), a slope of {told['tipping_slope_deg']:.0f} deg")
+    print_line(
+        console,
+        f"tipping margin: {margin:.3f} m ({margin / max(across, 1e-9):.0f} sigma), a slope of {numbers['tipping_slope_deg']:.0f} deg",
+    )
     if weighed is not None and weighed.scatter > 1.5:
-        say(
+        print_line(
             console, f"The weighings differ {weighed.scatter:.1f} times more than scales of 0.1 kg should: lift the robot off between them."
         )
     if static is not None:
         mass, (at_x, at_y), s = static.mass, static.position, np.sqrt(np.diagonal(static.covariance))
-        say(console, "static part, for [arms] of the robot file:")
-        say(console, f"  static_mass_kg = {mass:.3f}  # +- {s[0]:.2g}")
-        say(console, f"  static_x_m = {at_x:.5f}  # +- {s[1]:.2g}")
-        say(console, f"  static_y_m = {at_y:.5f}  # +- {s[2]:.2g}")
+        print_line(console, "static part, for [arms] of the robot file:")
+        print_line(console, f"  static_mass_kg = {mass:.3f}  # +- {s[0]:.2g}")
+        print_line(console, f"  static_x_m = {at_x:.5f}  # +- {s[1]:.2g}")
+        print_line(console, f"  static_y_m = {at_y:.5f}  # +- {s[2]:.2g}")
     table = plain_table("load [kg]", *(wheel.replace("_", " ") for wheel in WHEELS), title="")
-    row(table, "equally stiff wheels", *(f"{load:.2f}" for load in told["wheel_loads_kg"].values()))
-    if "weighed_loads_kg" in told:
-        row(table, "on the scales", *(f"{load:.2f}" for load in told["weighed_loads_kg"].values()))
-    show(console, table)
-    if "warp" in told:
-        say(console, f"A twisted chassis puts {told['warp']:+.3f} of m g / 4 on the front left and rear right wheels (friction's warp).")
+    add_row(table, "equally stiff wheels", *(f"{load:.2f}" for load in numbers["wheel_loads_kg"].values()))
+    if "weighed_loads_kg" in numbers:
+        add_row(table, "on the scales", *(f"{load:.2f}" for load in numbers["weighed_loads_kg"].values()))
+    print_table(console, table)
+    if "warp" in numbers:
+        print_line(
+            console, f"A twisted chassis puts {numbers['warp']:+.3f} of m g / 4 on the front left and rear right wheels (friction's warp)."
+        )
     own = "k_0" in robot.models.get("skid_steer", {})
     title = "\nskid_steer (4.21-4.25)" + ("" if own else ", from the robot's geometry by the friction model: the robot file has no k_0")
     what = plain_table("", f"nominal ({robot.geometry.cg_x_m:g}, {robot.geometry.cg_y_m:g}) m", "here", "sigma by the CG", title=title)
-    for name, value in told["skid_steer"].items():
-        row(what, name.replace("_m", " [m]"), f"{value['nominal']:+.4f}", f"{value['here']:+.4f}", f"{value['sigma']:.4f}")
-    show(console, what)
+    for name, value in numbers["skid_steer"].items():
+        add_row(what, name.replace("_m", " [m]"), f"{value['nominal']:+.4f}", f"{value['here']:+.4f}", f"{value['sigma']:.4f}")
+    print_table(console, what)

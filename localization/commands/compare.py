@@ -28,6 +28,7 @@ from localization.logs import TopicOverrides
 from localization.output import check_outputs, versions
 from localization.pipeline import ReplayConfig
 from motion_models.online_calibration import check_forms
+from motion_models.prior import prior_notes
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
 
@@ -70,6 +71,8 @@ class Compare:
         table_path, report_path = places(self.out)
         check_report(report_path)
         jobs, table = self._jobs(console), ResultTable(table_path)
+        for note in self._notes():
+            console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         left = [dataclasses.replace(job, trials=missing) for job in jobs if (missing := table.missing(job))]
         done = sum(len(job.trials) for job in jobs) - sum(len(job.trials) for job in left)
         if done:
@@ -132,11 +135,16 @@ class Compare:
             console.print(sentence, markup=False, soft_wrap=True)
         if failed:
             console.print(f"The reasons of what failed are in {table.path}.", markup=False, soft_wrap=True)
-        head = CompareHead(load_robot(self.robot).name, self.reference or "the robot file's topic", table.path.name, versions())
+        reference = self.reference or "the robot file's topic"
+        head = CompareHead(load_robot(self.robot).name, reference, table.path.name, versions(), self._notes())
         write_comparison_report(report, head, found)
         console.print(f"report: {report}", markup=False, soft_wrap=True)
         if self.json is not None:
-            write_json(self.json, _content(found))
+            write_json(self.json, {**_content(found), "notes": self._notes()})
+
+    def _notes(self) -> list[str]:
+        """On the robot: where k comes from if its file has none."""
+        return prior_notes(load_robot(self.robot), names(self.model, "--model"))
 
 
 def places(out: Path) -> tuple[Path, Path]:

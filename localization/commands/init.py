@@ -3,35 +3,47 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
-from rich.prompt import FloatPrompt
+from rich.markup import escape
+from rich.prompt import Confirm, Prompt
 
-from localization.calibration.robot_setup import DRIVE_60_S, Draft, Given, draft_robot, finish_robot, survey_log
-from localization.commands.calibration_tables import say
+from localization.calibration.robot_setup import DRIVE_60_S, Draft, Given, Survey, draft_robot, finish_robot, survey_log
+from localization.commands.calibrate import Calibrate
+from localization.commands.tables import print_line
+from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from motion_models.errors import RobotError
 from motion_models.prior import prior_notes
-from motion_models.robot import load_robot
+from motion_models.robot import DIFF_DRIVE, DRIVES, Robot, load_robot, parse_robot
 from motion_models.robot_file import robot_toml
 
 _NEEDED = {
-    "wheel_radius_m": "wheel radius [m]",
-    "track_width_m": "distance of the left and right wheels' contacts [m]",
-    "wheelbase_m": "distance of the front and rear wheels' contacts [m]",
+    "wheel_radius_m": "Wheel radius [m]",
+    "track_width_m": "Distance between the left and the right wheels' contacts [m]",
+    "wheelbase_m": "Distance between the front and the rear wheels' contacts [m]",
 }
+_BOUNDS = {
+    **dict.fromkeys(_NEEDED, (0.005, 20.0)),
+    "mass_kg": (0.1, 1e6),
+    "wheel_separation_multiplier": (0.1, 10.0),
+}
+"""Smallest and largest sensible answer: from desk-top robots to the largest mining vehicles."""
+_MAX_ANSWERS = 5
+"""Answers to one question before it is given up."""
 
 
 @dataclass(frozen=True)
 class Init:
     """Write a robot file for a new robot from a log and a URDF.
 
-    Topics, joints, frames, mounts and geometry are guessed and explained. In a terminal, lengths that neither the log nor a URDF has are
-    asked for; elsewhere each has an option.
+    Topics, joints, frames, mounts and geometry are guessed and explained. In a terminal, what neither the log nor a URDF has is asked for;
+    each question has an option too.
     """
 
     log: tyro.conf.Positional[Path]
@@ -61,45 +73,66 @@ class Init:
     mass_kg: float | None = None
     """Mass of the robot [kg]."""
     wheel_separation_multiplier: float | None = None
-    """Of the robot's own driver."""
+    """Of the robot's own driver: by how much it takes the track to be wider than it is."""
+    topic: TopicOverrides = field(default_factory=TopicOverrides)
+    calibrate: bool = False
+    """Calibrate on this log at once, and write ROBOT_calibrated.toml besides."""
 
     def run(self, console: Console) -> None:
+        """Run the command. Raises `SkidlocError` for input that cannot be used."""
         check_outputs(self.out)
         if self.out.suffix != ".toml":
             raise RobotError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")
         if self.urdf is not None and not self.urdf.is_file():
             raise RobotError(f"--urdf '{self.urdf}': there is no such file.")
+        calibrated = self.out.with_name(f"{self.out.stem}_calibrated.toml")
+        if self.calibrate:
+            check_outputs(calibrated)
         given = self._given()
         with console.status("reading the log"):
             survey = survey_log(self.log)
             draft = draft_robot(survey, given, self.log)
-        _ask(console, draft)
+        is_interactive = console.is_terminal and sys.stdin.isatty()
+        if is_interactive:
+            answered = _ask(console, survey, draft, given)
+            draft = draft if answered == given else draft_robot(survey, answered, self.log)
+            given = answered
         for reason in draft.reasons:
-            say(console, f"  {reason}")
-        for what in draft.missing:
-            say(console, f"! {what}")
-        lost = [name for name in _NEEDED if name not in draft.values]
-        if lost:
-            options = ", ".join("--" + name.replace("_", "-") for name in lost)
-            raise RobotError(f"{survey.name} and what was given have no {', '.join(lost)}; measure and give {options}, or name a --urdf.")
-        robot = finish_robot(draft, given, self.out.stem)
-        remarks = [f"Written by skidloc init from {survey.name}.", *draft.reasons, *(f"MISSING: {what}" for what in draft.missing)]
-        write_text_file(self.out, robot_toml(robot, remarks="\n".join(remarks)))
-        say(console, f"robot file: {self.out}")
+            print_line(console, f"  {reason}")
+        for gap in draft.missing:
+            print_line(console, f"! {gap}")
+        robot = self._write(console, survey, draft, given)
         for note in prior_notes(robot):
-            say(console, note)
-        if robot.drive == "skid_steer":
-            say(console, DRIVE_60_S)
-            say(console, f"Then: skidloc calibrate DRIVE --robot {self.out} --out {self.out.stem}_calibrated.toml")
+            print_line(console, note)
+        model = "diff_drive" if robot.drive == DIFF_DRIVE else "skid_steer"
+        if self.calibrate or (is_interactive and _wants_calibration(console, draft)):
+            Calibrate((self.log,), str(self.out), model, out=calibrated).run(console)
+            return
+        print_line(console, DRIVE_60_S)
+        print_line(console, f"Then: skidloc calibrate DRIVE --robot {self.out} --model {model} --out {calibrated}")
+
+    def _write(self, console: Console, survey: Survey, draft: Draft, given: Given) -> Robot:
+        """The robot, written to its file. Raises `RobotError` where lengths are missing."""
+        absent = [name for name in _NEEDED if name not in draft.values]
+        if absent:
+            options = ", ".join("--" + name.replace("_", "-") for name in absent)
+            raise RobotError(f"{survey.name} and the options have no {', '.join(absent)}; measure and give {options}, or name a --urdf.")
+        robot = finish_robot(draft, given, self.out.stem)
+        remarks = [f"Written by skidloc init from {survey.name}.", *draft.reasons, *(f"MISSING: {gap}" for gap in draft.missing)]
+        text = robot_toml(robot, remarks="\n".join(remarks))
+        parse_robot(text, str(self.out))  # refuses what no robot can have before it is written
+        write_text_file(self.out, text)
+        print_line(console, f"robot file: {self.out}")
+        return robot
 
     def _given(self) -> Given:
         left, right = (tuple(n.strip() for n in text.split(",") if n.strip()) for text in (self.left, self.right))
         if bool(left) != bool(right):
             raise RobotError("--left and --right go together: both sides have wheels.")
-        for name in (*_NEEDED, "mass_kg", "wheel_separation_multiplier"):
+        for name, (low, high) in _BOUNDS.items():
             value = getattr(self, name)
-            if value is not None and not value > 0.0:
-                raise RobotError(f"--{name.replace('_', '-')} is {value:g}; it must be positive.")
+            if value is not None and not low <= value <= high:
+                raise RobotError(f"--{name.replace('_', '-')} is {value:g}; it must be {low:g} to {high:g}.")
         return Given(
             self.name,
             self.drive,
@@ -113,15 +146,73 @@ class Init:
             self.urdf,
             self.base_link,
             None if self.like is None else load_robot(self.like),
+            self.topic,
         )
 
 
-def _ask(console: Console, draft: Draft) -> None:
-    """Ask for the lengths that are missing, in a terminal alone."""
-    if not (console.is_terminal and sys.stdin.isatty()):
-        return
-    for name, text in _NEEDED.items():
-        if name not in draft.values:
-            value = FloatPrompt.ask(text, console=console)
-            draft.choose(name, [(value, "given")])
-            draft.missing[:] = [what for what in draft.missing if not what.startswith(f"{name}:")]
+def _ask(console: Console, survey: Survey, draft: Draft, given: Given) -> Given:
+    """``given`` with the user's answers to what is missing. Raises `RobotError` where the input ends or an answer cannot be used."""
+    names = survey.joint_names.get(draft.topics.get("joint_states", ""), ())
+    if given.drive is None and given.like is None and draft.joints is None:
+        text = "Does it skid (skid_steer), or drive on two wheels and casters (diff_drive)?"
+        given = replace(given, drive=_answer(console, text, DRIVES))
+    if draft.joints is None and names:
+        print_line(console, f"Joints of the log: {', '.join(names)}")
+        left, right = (_ask_joints(console, side, names) for side in ("left", "right"))
+        given = replace(given, left=left, right=right) if left and right else given
+    answers: dict[str, Any] = {name: _ask_number(console, name, text) for name, text in _NEEDED.items() if name not in draft.values}
+    if "mass_kg" not in draft.values:
+        answers["mass_kg"] = _ask_number(console, "mass_kg", "Mass of the whole robot [kg] (Enter: unknown)", is_needed=False)
+    if "wheel_separation_multiplier" not in draft.values and "joint_states" not in draft.topics:
+        text = "wheel_separation_multiplier of the robot's driver (Enter: unknown, 1)"
+        answers["wheel_separation_multiplier"] = _ask_number(console, "wheel_separation_multiplier", text, is_needed=False)
+    return replace(given, **answers)
+
+
+def _ask_number(console: Console, name: str, text: str, is_needed: bool = True) -> float | None:
+    """A number within `_BOUNDS`; None for an empty answer where it is not needed."""
+    low, high = _BOUNDS[name]
+    for _ in range(_MAX_ANSWERS):
+        answer = _answer(console, text)
+        if not answer and not is_needed:
+            return None
+        try:
+            value = float(answer)
+        except ValueError:
+            value = float("nan")
+        if low <= value <= high:
+            return value
+        print_line(console, f"'{answer}' is no number from {low:g} to {high:g}.")
+    raise RobotError(f"no usable answer for {name}; give --{name.replace('_', '-')}.")
+
+
+def _ask_joints(console: Console, side: str, names: Sequence[str]) -> tuple[str, ...]:
+    """Joints of one side; empty for an empty answer."""
+    for _ in range(_MAX_ANSWERS):
+        chosen = tuple(
+            name.strip() for name in _answer(console, f"Joints of the {side} wheels, separated by commas").split(",") if name.strip()
+        )
+        unknown = [name for name in chosen if name not in names]
+        if not unknown:
+            return chosen
+        print_line(console, f"The log has no joint {', '.join(unknown)}.")
+    raise RobotError(f"no usable answer for the {side} wheels' joints; give --left and --right.")
+
+
+def _wants_calibration(console: Console, draft: Draft) -> bool:
+    if not {"scan", "points", "imu"} & draft.topics.keys():
+        return False
+    try:
+        return Confirm.ask("Calibrate on this log now?", console=console, default=False)
+    except EOFError:
+        return False
+
+
+def _answer(console: Console, text: str, choices: Sequence[str] = ()) -> str:
+    """The answer to one question. Raises `RobotError` where the input ends."""
+    try:
+        if choices:
+            return Prompt.ask(escape(text), console=console, choices=list(choices), default=choices[0])
+        return Prompt.ask(escape(text), console=console, default="", show_default=False).strip()
+    except (EOFError, UnicodeDecodeError):
+        raise RobotError("the input ended before all questions were answered; give the options instead (`skidloc init --help`).") from None

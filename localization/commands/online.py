@@ -15,8 +15,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.markup import escape
 
-from localization.commands.online_line import live_line
-from localization.commands.online_terminal import terminal_view
+from localization.commands.online_terminal import live_line, terminal_view
 from localization.errors import CheckpointError, OutputError
 from localization.events import Event
 from localization.logs import open_log
@@ -28,6 +27,7 @@ from localization.ros.session import Session, SessionState, View, made_by
 from localization.ros.settings import LiveRun, OnlineSettings
 from localization.ros.transports import TransportName, open_transport
 from localization.ros.transports.sim_time import SimTimeTransport
+from motion_models.prior import prior_notes
 
 _LINE_S = 0.25
 _SLOWEST = 0.001  # a second of the log in a quarter of an hour
@@ -90,7 +90,7 @@ class Online(OnlineSettings):
             is_done = True
         finally:
             session.close(forget=is_done)
-        for note in dict.fromkeys([*log.warnings(), *session.pipeline.warnings()]):
+        for note in dict.fromkeys([*prior_notes(robot, [trial.model.name]), *log.warnings(), *session.pipeline.warnings()]):
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         self._summarize(console, session, seconds, count)
 

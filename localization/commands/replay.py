@@ -16,9 +16,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from localization.commands.accuracy_table import accuracy_table
-from localization.commands.calibration_tables import WIDE, show
 from localization.commands.common import names, new_folder, write_json
+from localization.commands.tables import WIDE, accuracy_table, print_table
 from localization.errors import EstimatorError, EvaluationError
 from localization.estimators import CORRECTING, LOCALIZING, check_estimator
 from localization.evaluation.references import (
@@ -40,7 +39,7 @@ from localization.pipeline import ReplayConfig, Run, Trial, replay
 from localization.report.replay_page import ReportHead, overview_png, verdict, write_report
 from localization.trajectory import write_tum
 from motion_models.online_calibration import check_forms
-from motion_models.prior import prior_notes
+from motion_models.prior import prior_notes, scaling_prior
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
 
@@ -169,6 +168,7 @@ class Replay:
         return read_positions(log.references(self.positions), self.positions)
 
     def _metrics(self, head: ReportHead, results: Sequence[Result]) -> dict[str, Any]:
+        prior = scaling_prior(load_robot(self.robot), names(self.model, "--model"))
         return {
             "log": head.log,
             "robot": head.robot,
@@ -176,6 +176,7 @@ class Replay:
             "distance_m": _distance(results),
             "results": [result.metrics(head.duration_s, self.timing) for result in results],
             "notes": list(head.warnings),
+            "k_prior": None if prior is None else prior._asdict(),
             "provenance": {
                 "log_fingerprint": head.log_fingerprint,
                 "versions": dict(head.versions),
@@ -186,7 +187,7 @@ class Replay:
     def _print(self, console: Console, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
         for note in head.warnings:
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
-        show(console, accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
+        print_table(console, accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
         console.print(verdict(results, reference), markup=False, soft_wrap=True)
         console.print(f"report: {self.out / 'report.html'}", markup=False, soft_wrap=True)
 

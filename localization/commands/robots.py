@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from localization.commands.calibration_tables import plain_table, row, say, show
 from localization.commands.common import write_json
+from localization.commands.tables import add_row, plain_table, print_line, print_table
 from localization.output import check_outputs
 from motion_models.errors import RobotError
 from motion_models.prior import scaling_sigma
@@ -29,24 +29,25 @@ class Robots:
     """Write the list to this file as well."""
 
     def run(self, console: Console) -> None:
+        """Run the command. Raises `SkidlocError` for input that cannot be used."""
         check_outputs(self.json)
         if self.name:
             if self.name not in robot_names():
                 raise RobotError(f"no robot '{self.name}'; shipped are {', '.join(robot_names())}.")
-            say(console, (resources.files("motion_models") / "robots" / f"{self.name}.toml").read_text(encoding="utf-8"))
+            print_line(console, (resources.files("motion_models") / "robots" / f"{self.name}.toml").read_text(encoding="utf-8"))
             return
         found = [summary(load_robot(name)) for name in robot_names()]
         table = plain_table("robot", "drive", "radius [m]", "track [m]", "wheelbase [m]", "mass [kg]", "k", "+-", "k from")
         for each in found:
             lengths = [f"{each[key]:.4g}" for key in ("wheel_radius_m", "track_width_m", "wheelbase_m", "mass_kg")]
-            row(table, each["robot"], each["drive"], *lengths, f"{each['k']:.3f}", f"{each['k_sigma']:.3f}", each["k_from"])
-        show(console, table)
-        say(
+            add_row(table, each["robot"], each["drive"], *lengths, f"{each['k']:.3f}", f"{each['k_sigma']:.3f}", each["k_from"])
+        print_table(console, table)
+        print_line(
             console,
-            f"k from geometry is known to {100.0 * scaling_sigma():.0f} % (one sigma over robots); `skidloc calibrate` measures it.",
+            f"k from geometry has a standard deviation of {100.0 * scaling_sigma():.0f} % over robots; `skidloc calibrate` measures it.",
         )
-        say(console, "diff_drive: two driven wheels and a caster do not slide, and --model diff_drive is right for them.")
-        say(
+        print_line(console, "diff_drive: two driven wheels and a caster do not slide, and --model diff_drive is right for them.")
+        print_line(
             console, "`skidloc robots NAME` prints a file with the source of every number; `skidloc init LOG` writes one for another robot."
         )
         if self.json is not None:

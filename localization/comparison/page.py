@@ -59,6 +59,8 @@ class CompareHead:
     table: str
     """Name of the table with all numbers."""
     versions: Mapping[str, str]
+    notes: Sequence[str] = ()
+    """On the robot, in sentences."""
 
 
 def write_comparison_report(path: Path, head: CompareHead, found: Findings) -> None:
@@ -91,7 +93,8 @@ def comparison_page(head: CompareHead, found: Findings) -> str:
         glossary(_TERMS),
         Section("Sources and versions", [Definitions(_provenance(head, found))]),
     ]
-    return render(Page(title, facts, [_unbroken(sentence) for sentence in (headline(found), *closing(found))], sections))
+    sentences = [_unbroken(sentence) for sentence in (headline(found), *closing(found), *head.notes)]
+    return render(Page(title, facts, sentences, sections))
 
 
 def _unbroken(sentence: str) -> str:

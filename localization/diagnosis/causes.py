@@ -102,8 +102,8 @@ class Cause:
         a physical prior; rotations differ from the geometry's by up to all of it on skid-steer robots."""
         return 1.0 if self.id == "rotation_scale" else _PLAUSIBLE_SIGMAS * (self.prior_sigma or self.typical)
 
-    def describe(self, size: float) -> str:
-        """The effect of ``size`` in words, with its direction.
+    def describe(self, size: float, sigma: float = 0.0) -> str:
+        """The effect of ``size`` in words, with its direction, and with its ``sigma`` where that is given.
 
         >>> CAUSES["track_width"].describe(-0.012)
         'the left and right contacts are 12 mm closer together than the robot file has it'
@@ -111,7 +111,8 @@ class Cause:
         factor, unit = (1.0, self.unit) if self.is_coefficient else _SHOWN_UNITS.get(self.unit, (1.0, self.unit))
         amount = abs(size) * factor
         decimals = max(0, 1 - math.floor(math.log10(max(amount, 1e-12))))  # two digits at least
-        return self.words[size < 0.0].format(f"{amount:.{decimals}f}" + ("" if unit == "1" else f" {unit}"))
+        spread = f" +- {sigma * factor:.{decimals}f}" if sigma else ""
+        return self.words[size < 0.0].format(f"{amount:.{decimals}f}{spread}" + ("" if unit == "1" else f" {unit}"))
 
     @property
     def is_coefficient(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -174,20 +174,33 @@ def drive_of_log(
     if motion_reference == "auto" and reference is None and log.sources.lidar is None and log.sources.imu is None:
         alone = f"{log.path.name} has neither a LiDAR nor an IMU, and no reference was named: nothing measures what the wheels do."
         return Drive(log.path.name, robot, (), "none", warnings=(alone, *log.warnings()))
-    inner, words = make_motion_reference(log, robot, motion_reference, reference, config)
-    recorder = _Recorder(inner)
-    imu = _Imu(robot, log.mounts)
+    inner = make_motion_reference(log, robot, motion_reference, reference, config)
     postures = None
     if log._arms is not None:
         postures = _Postures(log._arms)
         log._arms = postures  # type: ignore[assignment]
+    drive = drive_of_events(log.events(), log.path.name, robot, log.mounts, inner, config, postures)
+    return dataclasses.replace(drive, warnings=(*drive.warnings, *log.warnings()))
 
+
+def drive_of_events(
+    events: Iterable[Event],
+    name: str,
+    robot: Robot,
+    mounts: Mapping[str, Mount],
+    reference: tuple[MotionReference, str],
+    config: WindowConfig,
+    postures: _Postures | None = None,
+) -> Drive:
+    """Cut ``events`` into windows whose motion the ``reference`` (and its name) measures, and store what else was measured in each."""
+    inner, words = reference
+    recorder, imu = _Recorder(inner), _Imu(robot, mounts)
     frame = ""
     wheel_stamps: list[int] = []
 
     def record_events() -> Iterable[Event]:
         nonlocal frame
-        for event in log.events():
+        for event in events:
             if isinstance(event, ImuSample):
                 imu.insert(event)
             elif isinstance(event, WheelSample):
@@ -196,14 +209,14 @@ def drive_of_log(
                 frame = event.frame_id
             yield event
 
-    windows = cut(record_events(), recorder, make_model("diff_drive", robot), robot, config, log.path.name)
+    windows = cut(record_events(), recorder, make_model("diff_drive", robot), robot, config, name)
     spans = np.array([(s.start_ns, s.end_ns) for s in recorder.used], dtype=np.int64).reshape(-1, 2)
     left = _describe_windows(windows, spans, config)
-    mount = log.mounts.get(frame, Mount())
+    mount = mounts.get(frame, Mount())
     by_gyro = isinstance(inner, GyroMotionReference)
     has_gyro = bool(imu.stamps) and not by_gyro
     return Drive(
-        name=log.path.name,
+        name=name,
         robot=robot,
         maneuvers=windows.maneuvers,
         motion_reference=words,
@@ -218,13 +231,15 @@ def drive_of_log(
         standstill_turn=find_standstill_turn(imu.gyro, recorder.standing) if imu.stamps else None,
         lidar_frame=frame,
         lidar_at=(mount.x, mount.y),
-        warnings=(left, *windows.warnings, *log.warnings()),
+        warnings=(left, *windows.warnings),
     )
 
 
 def _describe_windows(windows: Windows, spans: IntArray, config: WindowConfig) -> str:
     length_s = float(np.median(spans[:, 1] - spans[:, 0])) * _NS if len(spans) else config.window_s
-    text = f"{len(windows.maneuvers)} windows of {length_s:.2g} s; left out: {windows.standing} standing, {windows.lost} not measured."
+    text = (
+        f"{len(windows.maneuvers)} windows of {length_s:.2g} s; left out: {windows.standing} standing, {windows.unmeasured} not measured."
+    )
     if length_s > 1.3 * config.window_s:
         text += f" The motion reference is sparse, so that windows of {config.window_s:g} s were extended to its stamps."
     return text

@@ -17,7 +17,7 @@ from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import Batch
 from motion_models.diff_drive import DiffDrive
 from motion_models.friction import FrictionModel
-from motion_models.robot import Robot
+from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
 
 MAX_TOLERANCE_SIGMAS = 3.0
@@ -140,7 +140,6 @@ _SHOWN_BY_HEADINGS = frozenset(
     | {"wheel_time_offset", "gyro_time_offset", "gyro_bias", "gyro_scale", "encoder_dropout"}
 )
 """Causes of a drive of which headings alone were measured: how far a robot turns has many physical reasons that only positions separate."""
-_CASTER_TOLERANCE = 0.02  # of the separation multiplier: what is calibrated on a robot with casters
 
 
 @dataclass(frozen=True)
@@ -268,10 +267,8 @@ class Linearization:
 
 
 def is_skid_steer(robot: Robot) -> bool:
-    """Whether the robot's wheels skid in turns; a robot with casters turns by its geometry (separation multiplier 1 in its file)."""
-    model = DiffDrive.from_robot(robot)
-    multiplier = float(model.nominal[model.param_names.index("wheel_separation_multiplier")])
-    return robot.arms is not None or abs(multiplier - 1.0) > _CASTER_TOLERANCE
+    """Whether the robot's wheels skid in turns; a robot with casters turns by its geometry."""
+    return robot.drive != DIFF_DRIVE
 
 
 def default_model(robot: Robot) -> str:

@@ -125,6 +125,7 @@ class EstimateTable:
         self._stamps, self._numbers = array("q"), array("d")
 
     def add(self, estimate: Estimate) -> None:
+        """Append an estimate, unless it is not later than the last."""
         if self._stamps and estimate.stamp_ns <= self._stamps[-1]:
             return
         self._stamps.append(estimate.stamp_ns)

@@ -16,6 +16,7 @@ class DeadReckoning(Estimator):
         self._pose, self._cov = np.zeros(3), np.zeros((3, 3))
 
     def step(self, step: Step) -> Estimate:
+        """As `Estimator.step`."""
         motion = step.predicted
         A = se2.adjoint(se2.inverse(motion.delta))
         self._pose = se2.compose(self._pose, motion.delta)

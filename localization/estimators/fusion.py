@@ -45,10 +45,12 @@ class EkfFusion(Estimator):
 
     @property
     def clock_offset_s(self) -> float:
+        """Estimated offset of the wheels' clock [s]."""
         return self.filter.clock_offset
 
     @property
     def params(self) -> FloatArray:
+        """Parameters of the motion model with their corrections."""
         return np.asarray(self.model.nominal + self.corrections.directions @ self.filter.corrections)
 
     @property
@@ -143,6 +145,7 @@ class EkfFusion(Estimator):
             self.filter.P[CLOCK, CLOCK] += self._clock_sigma_s**2
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
+        """As `Estimator.parameters`."""
         ekf, found = self.filter, {}
         sigmas = np.sqrt(np.diagonal(ekf.P))
         if self._has_gyro:
@@ -156,9 +159,11 @@ class EkfFusion(Estimator):
         return found
 
     def counts(self) -> Mapping[str, int]:
+        """As `Estimator.counts`."""
         return self.counts_by_name if self._sensor is None else {**self.counts_by_name, **self._sensor.lost.causes}
 
     def map_points(self) -> Points2:
+        """As `Estimator.map_points`."""
         return NO_POINTS if self._sensor is None else self._sensor.map_points()
 
 

@@ -78,10 +78,12 @@ class GraphFusion(Estimator):
 
     @property
     def clock_offset_s(self) -> float:
+        """Estimated offset of the wheels' clock [s]."""
         return self.odometry.clock_offset_s
 
     @property
     def params(self) -> FloatArray:
+        """Parameters of the motion model with their corrections."""
         return self.odometry.params
 
     @property
@@ -207,10 +209,12 @@ class GraphFusion(Estimator):
         return Trajectory(moments.stamps_ns, smoothed, smoothed_covs)
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
+        """As `Estimator.parameters`."""
         mean, cov = self.graph.corrections()
         return {**self.odometry.parameters(), "wheel_radius_scale": (1.0 + float(mean[-1]), math.sqrt(float(cov[-1, -1])))}
 
     def counts(self) -> Mapping[str, int]:
+        """As `Estimator.counts`."""
         found = {**self.odometry.counts(), "keyframes": self.graph.count}
         if self._loops is not None:
             found["loops"] = self.n_loops

@@ -30,6 +30,7 @@ class LidarOdometry(Estimator):
         self._n_scans = 0
 
     def step(self, step: Step) -> Estimate:
+        """As `Estimator.step`."""
         if step.scan is not None:
             frame, c = step.scan.frame_id, self._config
             mount = self._used.setdefault(frame, self._mounts.get(frame, Mount()))
@@ -47,7 +48,9 @@ class LidarOdometry(Estimator):
         return Estimate(step.end_ns, self._pose, None, self._twist, None)
 
     def counts(self) -> Mapping[str, int]:
+        """As `Estimator.counts`."""
         return {"scans": self._n_scans}
 
     def map_points(self) -> Points2:
+        """As `Estimator.map_points`."""
         return NO_POINTS if self._kiss is None else self._kiss.point_cloud()[:, :2]

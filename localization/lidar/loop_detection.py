@@ -73,6 +73,7 @@ class LoopDetector:
         self._closed: dict[tuple[int, int], None] = {}  # as checkpoints take it
 
     def add(self, keyframe: Keyframe) -> None:
+        """Append a keyframe."""
         self.keyframes.append(keyframe)
 
     def detect(self, poses: Callable[[], FloatArray], marginal: Callable[[int], FloatArray]) -> list[LoopClosure]:

@@ -27,9 +27,8 @@ from localization.logs.decode import (
 )
 from localization.logs.topic_roles import Sources, TopicSource
 from localization.logs.wheel_decoder import JointsToWheels, OdometryToWheels
-from motion_models.center_of_gravity.model import CgModel
+from motion_models.center_of_gravity.model import CgModel, CgTracker
 from motion_models.center_of_gravity.parts import support_margin
-from motion_models.center_of_gravity.tracker import CgTracker
 from motion_models.robot import Clock, Geometry, Robot
 
 _RANKS = {"joint_states": 0, "odometry": 0, "center_of_gravity": 1, "imu": 2, "scan": 3, "points": 3}

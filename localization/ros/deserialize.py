@@ -127,7 +127,7 @@ class _Reader:
 
 
 def _class(module: str, name: str) -> type[Any]:
-    """One of our modules, loaded already, and defined there: an imported name would be somebody else's class."""
+    """One of our modules, loaded already, and defined there: an imported name would be a class of another module."""
     found: Any = sys.modules.get(module) if module.startswith(PACKAGES) else None
     for part in name.split("."):
         found = getattr(found, part, None)

@@ -64,7 +64,7 @@ class TopicDiscovery:
     def discover(
         self, wait_s: float, needed: Iterable[str], report: Callable[[str], None], is_over: Callable[[], bool]
     ) -> DiscoveredTopics:
-        """Wait for wheels or a LiDAR, for the topics ``needed``, and for at most ``wait_s`` [s] for others that somebody publishes.
+        """Wait for wheels or a LiDAR, for the topics ``needed``, and for at most ``wait_s`` [s] for others that are published.
 
         Silent ones are reported when they change and every half minute. Raises `TransportError` for a topic that carries another type,
         `KeyboardInterrupt` when ``is_over``.
@@ -123,13 +123,13 @@ class TopicDiscovery:
     def _silence(self, published: Mapping[str, set[str]], silent: Sequence[str]) -> str:
         there = sorted(topic for topic in published if topic in self.candidates)
         if silent:
-            idle, missing = "published, but no message comes", "nobody publishes it"
+            idle, missing = "published, but no message comes", "no publisher"
             entries = ", ".join(f"{topic} ({idle if topic in published else missing})" for topic in silent)
             return f"waiting for {entries}." + self._others(published, {self.candidates[topic] for topic in silent})
         wanted = ", ".join(f"{topic} ({short_type(kind)})" for topic, kind in self.candidates.items() if kind in _MOTION_TYPES)
-        waiting = f"waiting for wheels or a LiDAR: nothing comes on {wanted}."
+        waiting = f"waiting for wheels or a LiDAR: no messages come on {wanted}."
         if not published:
-            return f"{waiting} Nobody publishes anything in {self._transport.place}. {self._transport.elsewhere}".rstrip()
+            return f"{waiting} No topic is published in {self._transport.place}. {self._transport.elsewhere}".rstrip()
         return waiting + (f" Published are {', '.join(there)}." if there else "") + self._others(published, _MOTION_TYPES)
 
     def _others(self, published: Mapping[str, set[str]], kinds: set[str]) -> str:

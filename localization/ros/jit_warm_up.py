@@ -16,6 +16,8 @@ from localization.ros.settings import LiveRun
 from motion_models.center_of_gravity.files import arms_model
 from motion_models.se2 import FloatArray
 
+_compiled: set[tuple[str, ...]] = set()
+"""What this process has warmed up."""
 _ROOM_M, _SPEED_M_S = 8.0, 0.5
 _PERIOD_NS = 10_000_000
 _EVENTS_PER_SCAN = 10
@@ -25,8 +27,14 @@ def warm_up(run: LiveRun) -> None:
     """Process short synthetic drives with every kind of sensor that the robot may have, and discard the results.
 
     Once with planar scans, once with clouds and once without a LiDAR (where the estimator works without one), each with a gap in the
-    scans, after which the matcher searches a wide prior. The centre of gravity of the robot's arms first.
+    scans, after which the matcher searches a wide prior. The centre of gravity of the robot's arms first. A process does it once for each
+    model and estimator.
     """
+    trial = run.make_trial(True)
+    settings = (trial.estimator, trial.model.name, trial.corrections, repr(run.config), repr(run.robot.arms))
+    if settings in _compiled:
+        return
+    _compiled.add(settings)
     if run.robot.arms is not None:
         model = arms_model(run.robot.arms, run.robot.folder)
         model.estimate(np.zeros_like(model.chain.lower))

@@ -12,14 +12,15 @@ from functools import partial
 from typing import Any
 
 from localization.errors import CheckpointError
-from localization.events import Event
+from localization.events import CgSample, Event
 from localization.logs.clock_sync import Merger
-from localization.logs.decode import MessageStats, Oddity
+from localization.logs.decode import ArmReading, MessageStats, Oddity
 from localization.logs.event_decoder import EventDecoder, decode_item
 from localization.logs.serialization import decoder
 from localization.logs.topic_roles import TYPES, Sources
 from localization.logs.wheel_decoder import JointsToWheels, OdometryToWheels
 from localization.ros.discovery import DiscoveredTopics
+from localization.ros.payloads import Payloads
 from localization.ros.transports.base import Received
 from motion_models.robot import Robot
 
@@ -41,22 +42,23 @@ class WheelAngles:
 class LiveStream:
     """Messages in, events out."""
 
-    def __init__(self, discovered: DiscoveredTopics, robot: Robot, tally: MessageStats, epoch_ns: int, *, is_ros1: bool) -> None:
+    def __init__(self, discovered: DiscoveredTopics, robot: Robot, stats: MessageStats, epoch_ns: int, *, is_ros1: bool) -> None:
         """``epoch_ns``: what turns times of receiving into the time of ROS."""
-        parts, self._tally, self._epoch_ns = discovered.parts, tally, epoch_ns
+        parts, self._stats, self._epoch_ns = discovered.parts, stats, epoch_ns
         self.sources: Sources = parts.sources
-        self._intake = EventDecoder(parts.sources, parts.joints, parts.arms, robot, tally)
-        self._merger = Merger(discovered.plan, tally, wait_ns=None)
+        self._event_decoder = EventDecoder(parts.sources, parts.joints, parts.arms, robot, stats)
+        self._merger = Merger(discovered.plan, stats, wait_ns=None)
         self._decoders = {source.topic: decoder(TYPES[source.kind], is_ros1=is_ros1) for source in parts.sources.used()}
         self._rates = {source.topic: _TopicRate() for source in parts.sources.used()}
+        self.payloads = Payloads(robot, parts.arms, discovered.mounts)
 
     @property
     def wheel_angles(self) -> WheelAngles:
-        return WheelAngles(self._intake.from_joints, self._intake.from_odometry)
+        return WheelAngles(self._event_decoder.from_joints, self._event_decoder.from_odometry)
 
     def restore(self, angles: WheelAngles) -> None:
         """Continue from the angles of another stream."""
-        self._intake.from_joints, self._intake.from_odometry = angles.joints, angles.odometry
+        self._event_decoder.from_joints, self._event_decoder.from_odometry = angles.joints, angles.odometry
 
     def events(self, received: Received) -> Iterator[Event]:
         """The events that ``received`` makes, none or several."""
@@ -65,10 +67,18 @@ class LiveStream:
             return
         self._rates[received.topic].count(received.received_ns)
         wall_ns = received.received_ns + self._epoch_ns
-        item = decode_item(received.topic, wall_ns, partial(decode, received.data), self._intake.decoders[received.topic], self._tally)
-        if item is not None:
-            for payload in self._merger.insert(item):
-                yield from self._intake.events(payload)
+        item = decode_item(
+            received.topic, wall_ns, partial(decode, received.data), self._event_decoder.decoders[received.topic], self._stats
+        )
+        if item is None:
+            return
+        for reading in self._merger.insert(item):
+            if isinstance(reading, ArmReading):
+                self.payloads.insert_joints(reading)
+            for event in self._event_decoder.events(reading):
+                loaded = self.payloads.apply(event) if isinstance(event, CgSample) else event
+                if loaded is not None:
+                    yield loaded
 
     def sender_stamp_ns(self, stamp_ns: int, *, by_lidar: bool) -> int:
         """A stamp of an event in the present clock of its sender, which may have been set since the start."""
@@ -84,7 +94,7 @@ class LiveStream:
         """Messages per second of the topics in use, by their last dozen [Hz]; 0 of one that never came twice."""
         return {topic: watch.rate_hz for topic, watch in self._rates.items()}
 
-    def patience_s(self, now_ns: int) -> float:
+    def batch_s(self, now_ns: int) -> float:
         """How long messages that are not urgent may wait for others [s]: until shortly before the next scan. 0 without a LiDAR.
 
         To wake up for each takes longer than to read a few.
@@ -97,7 +107,7 @@ class LiveStream:
         found = []
         for topic in self._rates:
             for oddity in Oddity:
-                if (count := self._tally.of(topic, oddity)) and oddity is not Oddity.OUT_OF_ORDER:
+                if (count := self._stats.of(topic, oddity)) and oddity is not Oddity.OUT_OF_ORDER:
                     what = _LATE if oddity is Oddity.LATE else oddity.value
                     found.append(f"{topic}: {count} message{'s' * (count > 1)} {what}.")
         return found

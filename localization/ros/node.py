@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from typing import Any
 
@@ -17,16 +17,19 @@ from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import fingerprints, read_head
 from localization.ros.diagnostics import ERROR, WARN, Health, Status
 from localization.ros.discovery import DiscoveredTopics, TopicDiscovery
+from localization.ros.doctor import Doctor
 from localization.ros.jit_warm_up import warm_up
 from localization.ros.live_stream import LiveStream, WheelAngles, check_age
 from localization.ros.operator_commands import OperatorCommands
+from localization.ros.payloads import Payloads
 from localization.ros.predictor import Predictor
 from localization.ros.publisher import EstimatePublisher
-from localization.ros.session import Session, SessionState, View, made_by
+from localization.ros.session import Session, SessionState, StartPose, View, made_by
 from localization.ros.settings import LiveRun
-from localization.ros.start_pose import StartPose
 from localization.ros.transforms import TF, TF_STATIC, TF_TYPE, TransformConflicts
 from localization.ros.transports.base import Received, Transport
+from motion_models.errors import RobotError
+from motion_models.prior import prior_notes
 from motion_models.robot import Mount
 
 _STATUS_PERIOD_S, _POLL_S = 1.0, 0.2
@@ -54,8 +57,8 @@ class Node:
         self._tf_static, self._tf = names.resolve(TF_STATIC), names.resolve(TF)
         self._conflicts = TransformConflicts(run.node.frames.base_link_frame, is_ros1=transport.is_ros1)
         self._transforms = discovered.transforms
-        self._tally = MessageStats()
-        self._stream = LiveStream(discovered, run.robot, self._tally, transport.epoch_ns, is_ros1=transport.is_ros1)
+        self._stats = MessageStats()
+        self._stream = LiveStream(discovered, run.robot, self._stats, transport.epoch_ns, is_ros1=transport.is_ros1)
         self._made = made_by(trial, run.robot, discovered.mounts, self.has_lidar, run.config, "live topics")
         self._predictor = Predictor(trial.model, run.robot, run.config.step.max_hold_s) if run.node.predict else None
         self._commands = OperatorCommands(self, transport, names, report)
@@ -89,9 +92,10 @@ class Node:
         publisher = EstimatePublisher(transport, config.names, config.frames, with_tf=config.tf)
         needed = read_head(state_file).get("topics", []) if state_file is not None and state_file.exists() else []
         discovered = discovery.discover(config.wait_s, needed, report, is_over)
-        for warning in discovered.parts.warnings:
+        trial = run.make_trial(discovered.parts.sources.lidar is not None)
+        for warning in (*prior_notes(run.robot, [trial.model.name]), *discovered.parts.warnings):
             report(warning)
-        node = cls(transport, run, discovered, run.make_trial(discovered.parts.sources.lidar is not None), publisher, report)
+        node = cls(transport, run, discovered, trial, publisher, report)
         node._open_session(discovered, view)
         return node
 
@@ -108,10 +112,11 @@ class Node:
             has_map=bool(config.map_period_s) and self.has_lidar,
         )
         self._subscribe()
-        state = SessionState(pipeline, StartPose(), self._stream.wheel_angles)
+        state = SessionState(pipeline, StartPose(), self._stream.wheel_angles, self.payloads.loads)
         name = f"{self._trial.model.name}_{self._trial.estimator}"
-        self.session = Session.start(self._run.files, state, name, self._made, {"tally": self._tally}, self._report)
+        self.session = Session.start(self._run.files, state, name, self._made, {"stats": self._stats}, self._report)
         self.session.health = Health(config.max_latency_s)
+        self._doctor = Doctor(self._run.robot, self._trial.model.name, mounts, 60.0 * config.diagnose_every_min)
         with ExitStack() as failing:
             failing.callback(self.session.close)
             if view is not None:
@@ -140,6 +145,7 @@ class Node:
             raise CheckpointError(f"the state in '{path}' is of a log. Remove it to start anew.")
         age = check_age(head, start_ns, str(path))
         self._stream.restore(state.angles)
+        self.payloads.loads = state.loads
         self._report(f"resumed from {path}, {age:.1f} s later.")
 
     def spin(self, is_over: Callable[[], bool] = lambda: False, on_poll: Callable[[Node], None] = lambda node: None) -> None:
@@ -147,7 +153,7 @@ class Node:
         next_poll = 0.0
         while not is_over():
             has_estimate = False
-            for received in self._transport.take(_POLL_S, self._patience_s()):
+            for received in self._transport.take(_POLL_S, self._batch_s()):
                 has_estimate |= self._receive(received)
             now = time.monotonic()
             if now >= self._next_status + (0.0 if has_estimate else (_AFTER_ESTIMATE - 1.0) * _STATUS_PERIOD_S):
@@ -160,6 +166,7 @@ class Node:
 
     def finish(self) -> int | None:
         """Write the output and the last state; returns how many estimates there were, if an output was wanted."""
+        self._doctor.close()
         try:
             return self.session.write_output()
         finally:
@@ -174,9 +181,23 @@ class Node:
         """Begin anew at ``start``: with a new map, and nothing learned of the motion model."""
         pipeline = Pipeline(self._trial, self._run.robot, self.session.pipeline.mounts, self.has_lidar, self._run.config)
         self.session.restart(pipeline, start)
+        self.insert_present_cg()
         self._publisher.restart()
         if self._predictor is not None:
             self._predictor.stop()
+
+    @property
+    def payloads(self) -> Payloads:
+        """Loads that the robot holds."""
+        return self._stream.payloads
+
+    def insert_present_cg(self) -> None:
+        """Give the pipeline the centre of gravity with the present payloads, if all joints that it depends on have positions."""
+        with suppress(RobotError):
+            sample = self.payloads.sample(self._newest_ns)
+            self.session.process(sample)
+            if self._predictor is not None:
+                self._predictor.insert(sample)
 
     @property
     def frames(self) -> Any:
@@ -234,7 +255,9 @@ class Node:
         if (is_predictable or estimates) and self._transport.now_ns() - received.received_ns < _MAX_PREDICTED_AGE_NS:
             self._publish_prediction()
         self.session.observe(event)
-        self._check_frames()
+        self._doctor.observe(event)
+        if isinstance(event, Scan):
+            self._check_frames()
         return bool(estimates)
 
     def _add_mounts(self, mounts: Mapping[str, Mount]) -> None:
@@ -243,7 +266,9 @@ class Node:
         was_missing = pipeline.synchronizer.frames.problem is not None
         if not pipeline.add_mounts(mounts):
             return
+        self.payloads.mounts = pipeline.mounts
         self._made.update(fingerprints(mounts=pipeline.mounts))
+        self._doctor.add_mounts(pipeline.mounts)
         if was_missing and pipeline.synchronizer.frames.problem is None:
             self._report("/tf_static now has the mount of the LiDAR: its scans are placed by that from here on.")
         if self.session.view is not None:
@@ -255,8 +280,8 @@ class Node:
                 self._problems.add(problem)
                 self._report(problem)
 
-    def _patience_s(self) -> float:
-        return 0.0 if self.session.pipeline.synchronizer.is_waiting else self._stream.patience_s(self._transport.now_ns())
+    def _batch_s(self) -> float:
+        return 0.0 if self.session.pipeline.synchronizer.is_waiting else self._stream.batch_s(self._transport.now_ns())
 
     def _head(self) -> Mapping[str, Any]:
         return {"stamp_ns": self._newest_ns, "topics": self.topics}
@@ -277,11 +302,15 @@ class Node:
             self._publisher.publish_prediction(prediction, self._stream.sender_stamp_ns(prediction.stamp_ns, by_lidar=self.has_lidar))
 
     def _publish_status(self) -> None:
+        self._check_frames()
         health = self.session.health
         silent = self._stream.silent(self._transport.now_ns())
         self.statuses = health.statuses(self.session.pipeline, self._stream.dropped(), silent, self.session.troubles)
         problems = [problem for problem in (self._conflicts.current(), self._transforms.problem) if problem is not None]
         self.statuses.append(Status("transforms", ERROR, " ".join(problems)) if problems else Status("transforms"))
+        if self.payloads.loads:
+            self.statuses.append(Status("payload", message=self.payloads.summary))
+        self.statuses += self._doctor.statuses()
         if self.is_paused:
             self.statuses.append(Status("pause", WARN, "paused: no messages are used. Call ~/pause with data: false to continue."))
         stamp_ns = self._stream.sender_stamp_ns(self._newest_ns, by_lidar=True)

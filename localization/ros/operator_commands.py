@@ -1,4 +1,7 @@
-"""Commands of an operator to a running node: a pose on /initialpose or /set_pose; the services reset, pause and tare_payload."""
+"""Commands of an operator to a running node: a pose on /initialpose or /set_pose, payloads, reset, pause and tare, by topics and services.
+
+Topics work with every transport, services with rclpy alone.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +14,25 @@ import numpy as np
 from localization.logs.decode import UnusableError, frame_name
 from localization.logs.serialization import decoder
 from localization.logs.writer import odom_axes
-from localization.ros.start_pose import StartPose
+from localization.ros.payloads import Load, Payloads
+from localization.ros.session import StartPose
 from localization.ros.topic_names import Names
 from localization.ros.transports.base import Received, ServiceReply, Transport
+from motion_models.errors import CgError, RobotError
 from motion_models.se2 import FloatArray
 
 SET_POSE, INITIAL_POSE = "set_pose", "initialpose"
 """As of robot_localization, and as of RViz and nav2."""
 POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-RESET, PAUSE, TARE_PAYLOAD = "~/reset", "~/pause", "~/tare_payload"
+RESET, PAUSE, TARE_PAYLOAD, PAYLOAD = "~/reset", "~/pause", "~/tare_payload", "~/payload"
+_TOPIC_TYPES = {
+    SET_POSE: POSE_TYPE,
+    INITIAL_POSE: POSE_TYPE,
+    RESET: "std_msgs/msg/Empty",
+    PAUSE: "std_msgs/msg/Bool",
+    TARE_PAYLOAD: "std_msgs/msg/Empty",
+    PAYLOAD: "geometry_msgs/msg/InertiaStamped",
+}
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 _MIN_SIGMA = 1e-3
 """Sigmas of a pose without a covariance: RViz sends one, `ros2 topic pub` mostly zeros [m, rad]."""
@@ -36,7 +49,12 @@ class CommandedNode(Protocol):
     @property
     def session(self) -> Any: ...
 
+    @property
+    def payloads(self) -> Payloads: ...
+
     def restart(self, start: StartPose) -> None: ...
+
+    def insert_present_cg(self) -> None: ...
 
 
 class OperatorCommands:
@@ -44,27 +62,49 @@ class OperatorCommands:
 
     def __init__(self, node: CommandedNode, transport: Transport, names: Names, report: Callable[[str], None]) -> None:
         self._node, self._report = node, report
-        self._decode = decoder(POSE_TYPE, is_ros1=transport.is_ros1)
-        self.topics = [names.resolve(SET_POSE), names.resolve(INITIAL_POSE)]
-        for topic in self.topics:
-            transport.subscribe(topic, POSE_TYPE, is_latched=False)
+        self._commands = {names.resolve(topic): topic for topic in _TOPIC_TYPES}
+        self._decoders = {topic: decoder(kind, is_ros1=transport.is_ros1) for topic, kind in _TOPIC_TYPES.items()}
+        self.topics = list(self._commands)
+        for full, topic in self._commands.items():
+            transport.subscribe(full, _TOPIC_TYPES[topic], is_latched=False)
         transport.offer_service(names.resolve(RESET), "std_srvs/srv/Empty", self.reset)
         transport.offer_service(names.resolve(PAUSE), "std_srvs/srv/SetBool", self.pause)
         transport.offer_service(names.resolve(TARE_PAYLOAD), "std_srvs/srv/Trigger", self.tare_payload)
 
     def execute(self, received: Received) -> bool:
-        """Set the pose that ``received`` holds; False where it is of another topic."""
-        if received.topic not in self.topics:
+        """Execute the command that ``received`` holds; False where it is of another topic."""
+        topic = self._commands.get(received.topic)
+        if topic is None:
             return False
         try:
-            message = self._decode(received.data)
-            pose, cov = _planar(message.pose)
-        except (UnusableError, ValueError) as error:
-            self._report(f"{received.topic}: the pose is ignored, for {error}.")
+            message = self._decoders[topic](received.data)
+            reply = self._execute(topic, message)
+        except (UnusableError, ValueError, CgError, RobotError) as error:
+            self._report(f"{received.topic}: the message is ignored: {error}")
             return True
-        reply = self.set_pose(pose, cov, frame_name(message.header.frame_id))
-        self._report(f"{received.topic}: {reply.message}")
+        if topic in (SET_POSE, INITIAL_POSE, PAYLOAD):
+            self._report(f"{received.topic}: {reply.message}")
         return True
+
+    def _execute(self, topic: str, message: Any) -> ServiceReply:
+        """Raises `ValueError`, `CgError` and `RobotError` for content that cannot be used."""
+        if topic == RESET:
+            return self.reset()
+        if topic == PAUSE:
+            return self.pause(bool(message.data))
+        if topic == TARE_PAYLOAD:
+            return self.tare_payload()
+        frame = frame_name(message.header.frame_id)
+        if topic == PAYLOAD:
+            com = message.inertia.com
+            return self.set_payload(frame, Load(float(message.inertia.m), (float(com.x), float(com.y), float(com.z))))
+        return self.set_pose(*_planar(message.pose), frame)
+
+    def set_payload(self, frame: str, load: Load) -> ServiceReply:
+        """Hold ``load`` at ``frame`` from now on. Raises `CgError` and `RobotError`."""
+        self._node.payloads.set(frame, load)
+        self._node.insert_present_cg()
+        return ServiceReply(True, self._node.payloads.summary)
 
     def set_pose(self, pose: FloatArray, cov: FloatArray, frame: str) -> ServiceReply:
         """Begin anew at ``pose`` (3,) in ``frame``, with covariance ``cov`` (3, 3) of its right perturbation.
@@ -97,12 +137,15 @@ class OperatorCommands:
         return ServiceReply(True, text)
 
     def tare_payload(self, _: bool = True) -> ServiceReply:
-        """Discard what was learned of the motion model, which holds for another payload; the pose and its covariance stay."""
+        """Remove all payloads that were set, and discard what was learned of the motion model with them; pose and covariance stay."""
+        if self._node.payloads.loads:
+            self._node.payloads.loads.clear()
+            self._node.insert_present_cg()
         (odom, odom_cov), estimate = self._present_odometry(), self._node.session.health.estimate
         in_map = (odom, odom_cov) if estimate is None else (estimate.pose, _known(estimate.covariance))
         self._node.restart(StartPose(odom, odom_cov, *in_map))
-        self._report("tare_payload: the motion model is learned anew from here on.")
-        return ServiceReply(True, "the motion model is learned anew from the present pose on")
+        self._report("tare_payload: no payload is set; the motion model is learned anew from here on.")
+        return ServiceReply(True, "no payload is set; the motion model is learned anew from the present pose on")
 
     def _present_odometry(self) -> tuple[FloatArray, FloatArray]:
         estimate = self._node.session.health.estimate
@@ -122,13 +165,13 @@ def _planar(stamped: Any) -> tuple[FloatArray, FloatArray]:
     p, q = stamped.pose.position, stamped.pose.orientation
     norm = math.hypot(q.x, q.y, q.z, q.w)
     if not (math.isfinite(norm) and 0.5 < norm < 2.0):
-        raise ValueError("its orientation is no unit quaternion")
+        raise ValueError("its orientation is no unit quaternion.")
     yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), norm**2 - 2.0 * (q.y**2 + q.z**2))
     pose = np.array([p.x, p.y, yaw])
     in_parent = np.asarray(stamped.covariance, dtype=float).reshape(6, 6)[_PLANAR]
     if not (np.isfinite(pose).all() and np.isfinite(in_parent).all()):
-        raise ValueError("it holds numbers that are not finite")
+        raise ValueError("it holds numbers that are not finite.")
     in_parent = (in_parent + in_parent.T) / 2 + _MIN_SIGMA**2 * np.eye(3)
     if np.linalg.eigvalsh(in_parent)[0] < 0.0:
-        raise ValueError("its covariance has negative eigenvalues")
+        raise ValueError("its covariance has negative eigenvalues.")
     return pose, odom_axes(in_parent, -yaw)  # the inverse turn: from the axes of the parent to those of the body

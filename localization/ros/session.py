@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
+
+import numpy as np
 
 from localization.errors import CheckpointError, OutputError
 from localization.estimators import Estimate
@@ -16,12 +18,14 @@ from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.checkpoint import Checkpoint, CheckpointWriter, fingerprints, read_checkpoint, remove_checkpoint
 from localization.ros.diagnostics import Health
 from localization.ros.estimate_log import EstimateLog, fused_estimates
+from localization.ros.payloads import Load
 from localization.ros.session_files import Files
-from localization.ros.start_pose import StartPose
 from localization.trajectory import write_tum
+from motion_models import se2
 from motion_models.robot import Mount, Robot
+from motion_models.se2 import FloatArray
 
-_CONSEQUENCES = {"state": "The state of before stays", "output": "The output lacks what is estimated meanwhile"}
+_CONSEQUENCES = {"state": "The state of before stays", "output": "Estimates made meanwhile are missing from the output"}
 
 
 class View(Protocol):
@@ -48,6 +52,48 @@ def made_by(trial: Trial, robot: Robot, mounts: Mapping[str, Mount], has_lidar: 
     )
 
 
+def _origin() -> FloatArray:
+    return np.zeros(3)
+
+
+def _no_cov() -> FloatArray:
+    return np.zeros((3, 3))
+
+
+@dataclass(frozen=True)
+class StartPose:
+    """Start frame of an estimator in the frames that are published. Estimators begin at zero, with zero covariance."""
+
+    odom_T_start: FloatArray = field(default_factory=_origin)
+    """(3,)"""
+    odom_cov: FloatArray = field(default_factory=_no_cov)
+    """(3, 3) of its right perturbation."""
+    map_T_start: FloatArray = field(default_factory=_origin)
+    """(3,) of estimators that localize in a map."""
+    map_cov: FloatArray = field(default_factory=_no_cov)
+    """(3, 3) of its right perturbation."""
+
+    def apply(self, estimate: Estimate) -> Estimate:
+        """``estimate``, which is relative to the start, in the published frames; the covariances of start and motion are added."""
+        if not any(array.any() for array in (self.odom_T_start, self.odom_cov, self.map_T_start, self.map_cov)):
+            return estimate
+        if estimate.odometry is None or estimate.map_T_odom is None:
+            pose, cov = _moved(self.odom_T_start, self.odom_cov, estimate.pose, estimate.covariance)
+            return replace(estimate, pose=pose, covariance=cov)
+        odometry = _moved(self.odom_T_start, self.odom_cov, *estimate.odometry)
+        pose, cov = _moved(self.map_T_start, self.map_cov, estimate.pose, estimate.covariance)
+        map_T_odom = se2.compose(se2.compose(self.map_T_start, estimate.map_T_odom), se2.inverse(self.odom_T_start))
+        return replace(estimate, pose=pose, covariance=cov, odometry=odometry, map_T_odom=map_T_odom)
+
+
+def _moved(
+    world_T_start: FloatArray, start_cov: FloatArray, start_T_body: FloatArray, cov: FloatArray | None
+) -> tuple[FloatArray, FloatArray | None]:
+    """``world_T_body`` and its covariance: an error of the start reaches the body by Ad(start_T_body^-1)."""
+    A = se2.adjoint(se2.inverse(start_T_body))
+    return se2.compose(world_T_start, start_T_body), None if cov is None else cov + A @ start_cov @ A.T
+
+
 @dataclass
 class SessionState:
     """What a checkpoint holds."""
@@ -56,6 +102,8 @@ class SessionState:
     start: StartPose = field(default_factory=StartPose)
     angles: Any = None
     """`WheelAngles` of a live session."""
+    loads: dict[str, Load] = field(default_factory=dict)
+    """Payloads by frame, of a live session."""
 
 
 class Session:
@@ -196,7 +244,7 @@ class Session:
             with self._files.beside() as bag:
                 write_fused(bag, {self.name: fused_estimates(stamps, table, parent)}, self.name)
         if self._report is not None and self._estimate_log.missing:
-            self._report(f"'{self._files.out}' lacks {self._estimate_log.missing} estimates, for which there was no room on the disk.")
+            self._report(f"'{self._files.out}': {self._estimate_log.missing} estimates are missing, for there was no room on the disk.")
         if self._checkpoints is not None:
             with self._writing("state"):
                 self._checkpoints.wait()  # it may refer to the rows

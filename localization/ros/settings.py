@@ -7,6 +7,9 @@ import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from localization.errors import SettingError
 from localization.estimators import check_estimator
@@ -59,6 +62,8 @@ class NodeConfig(Settings):
     """Time between two messages on `~/path` [s]; 0: none."""
     map_period_s: float = 10.0
     """Time between two messages on `~/map` [s]; 0: none."""
+    diagnose_every_min: Annotated[float, tyro.conf.arg(aliases=["--diagnose-every"])] = 5.0
+    """Minutes between two diagnoses of the last two minutes, which a process of lowest priority makes and diagnostics report; 0: none."""
     use_sim_time: bool = False
     """Take the time from /clock, as of a simulator or `ros2 bag play --clock`."""
     frames: Frames = field(default_factory=Frames)

@@ -4,8 +4,7 @@ from localization.simulation.experiments import EXPERIMENTS, Experiment, Experim
 from localization.simulation.faults import FAULTS, Fault
 from localization.simulation.open_loop_scores import OpenLoopScore, score_open_loop_runs
 from localization.simulation.sensors import SensorConfig
-from localization.simulation.simulator import Simulation, SimulationConfig, simulate, write_simulation
-from localization.simulation.track import RunRecord
+from localization.simulation.simulator import RunRecord, Simulation, SimulationConfig, simulate, write_simulation
 from localization.simulation.vehicle import VehicleConfig
 from localization.simulation.world import WORLDS, World, world_svg
 

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localization.simulation.drives import OpenLoop
-from localization.simulation.simulator import Simulation
-from localization.simulation.track import RunRecord
+from localization.simulation.experiments import OpenLoop
+from localization.simulation.simulator import RunRecord, Simulation
 from motion_models import se2
 from motion_models.registry import make_model
 from motion_models.se2 import FloatArray

@@ -13,14 +13,33 @@ from numpy.typing import NDArray
 from localization.logs import message_templates
 from localization.logs.message_templates import Message
 from localization.settings import Below, Count, Positive, Settings, Share, Signed, at_least
-from localization.simulation.track import SampleClock, TrueMotion, pose_at, seconds
+from localization.simulation.vehicle import SampleClock, TrueMotion, pose_at, seconds
 from localization.simulation.world import Grid, World, cast, cast_at_people, make_grid
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
 
 @dataclass(frozen=True)
-class ScannerConfig(Settings):
+class RangeErrors(Settings):
+    """Errors of a scanner's ranges."""
+
+    noise_m: float = 0.012
+    """Standard deviation of a range [m]."""
+    dropout: Share = 0.002
+    """Share of beams that do not come back."""
+    range_scale: Signed = 0.0
+    """Share by which the ranges are too long."""
+    range_bias_m: Signed = 0.0
+    """By how much they are too long whatever the distance [m]."""
+
+    def measure(self, ranges: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """``ranges`` [m] with these errors, but for beams that do not come back."""
+        noise = rng.normal(0.0, self.noise_m, ranges.shape) if self.noise_m > 0.0 else 0.0
+        return np.asarray((1.0 + self.range_scale) * ranges + self.range_bias_m + noise)
+
+
+@dataclass(frozen=True)
+class ScannerConfig(RangeErrors):
     """A planar scanner; by default a SICK LMS511 at half its resolution."""
 
     rate_hz: Positive = 12.5
@@ -31,16 +50,8 @@ class ScannerConfig(Settings):
     """Angle from the first to the last beam, middle ahead [deg]."""
     sweep_deg: Positive = 360.0
     """Angle that the mirror turns from scan to scan: the sweep fills field of view / this of the time [deg]."""
-    noise_m: float = 0.012
-    """Standard deviation of a range [m]."""
     resolution_m: float = 0.001
     """Ranges are rounded to this [m]."""
-    dropout: Share = 0.002
-    """Share of beams that do not come back."""
-    range_scale: Signed = 0.0
-    """Share by which the ranges are too long."""
-    range_bias_m: Signed = 0.0
-    """By how much they are too long whatever the distance [m]."""
     min_range_m: Annotated[float, Below("max_range_m")] = 0.1
     """Least range [m]."""
     max_range_m: Positive = 40.0
@@ -48,7 +59,7 @@ class ScannerConfig(Settings):
 
 
 @dataclass(frozen=True)
-class SpinningConfig(Settings):
+class SpinningConfig(RangeErrors):
     """A spinning scanner; by default like a Velodyne VLP-16 at a third of its points."""
 
     rate_hz: Positive = 10.0
@@ -65,10 +76,6 @@ class SpinningConfig(Settings):
     """Standard deviation of a range [m]."""
     dropout: Share = 0.005
     """Share of beams that do not come back."""
-    range_scale: Signed = 0.0
-    """Share by which the ranges are too long."""
-    range_bias_m: Signed = 0.0
-    """By how much they are too long whatever the distance [m]."""
     min_range_m: Annotated[float, Below("max_range_m")] = 0.5
     """Least range [m]."""
     max_range_m: Positive = 100.0
@@ -109,9 +116,7 @@ class PlanarScanner:
         ranges = np.empty((len(starts), c.beams))
         beams = BeamPattern(self.beam_s, self._first, self._step, self._mount, c.max_range_m)
         _cast_sweeps(seconds(starts), beams, Scene(self._grid, self._world.people, track.rows, track.start_s, track.step_s), ranges)
-        ranges *= 1.0 + c.range_scale
-        ranges += c.range_bias_m
-        ranges += self._rng.normal(0.0, c.noise_m, ranges.shape) if c.noise_m > 0.0 else 0.0
+        ranges = c.measure(ranges, self._rng)
         if c.resolution_m > 0.0:
             ranges = np.round(ranges / c.resolution_m) * c.resolution_m
         lost = (ranges < c.min_range_m) | (ranges > c.max_range_m)
@@ -214,8 +219,7 @@ class SpinningScanner:
             flat = np.where(up > 0.0, (self._world.ceiling_m - self._height) / up, np.where(up < 0.0, -self._height / up, np.inf))
             flat = np.minimum(level, flat)
             ranges = flat / np.cos(self._elevation)[:, None]
-            ranges = (1.0 + c.range_scale) * ranges + c.range_bias_m
-            ranges = ranges + self._rng.normal(0.0, c.noise_m, ranges.shape)
+            ranges = c.measure(ranges, self._rng)
             lost = ~((ranges > c.min_range_m) & (ranges < c.max_range_m)) | (self._rng.random(ranges.shape) < c.dropout)
         ranges[lost] = np.nan
         azimuth = math.pi + step * np.arange(c.columns)

@@ -1,4 +1,4 @@
-"""Wheel encoders, arm joints, IMU, GPS, and the truth."""
+"""Wheel encoders, arm joints, IMU, GPS, and the ground truth."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from localization.logs.message_templates import Message
 from localization.settings import Allowed, Positive, Settings, Share, Signed
 from localization.simulation.faults import TrueRobot
 from localization.simulation.scanners import PlanarScanner, ScannerConfig, SpinningConfig, SpinningScanner
-from localization.simulation.track import SampleClock, TrueMotion, seconds
-from localization.simulation.vehicle import ANGLES, POSE, TWIST, MassDistribution
+from localization.simulation.vehicle import ANGLES, POSE, TWIST, MassDistribution, SampleClock, TrueMotion, seconds
 from localization.simulation.world import World
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
@@ -278,7 +277,7 @@ class SensorConfig(Settings):
     center_of_gravity: bool = False
     """Publish the nominal CG, by arms and robot file, on its topic."""
     truth_hz: Positive = 25.0
-    """Rate of the truth."""
+    """Rate of the ground truth [Hz]."""
     encoders: EncoderConfig = field(default_factory=EncoderConfig)
     scanner: ScannerConfig = field(default_factory=ScannerConfig)
     spinning: SpinningConfig = field(default_factory=SpinningConfig)

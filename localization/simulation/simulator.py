@@ -12,12 +12,22 @@ import numpy as np
 from localization.errors import SimulationError
 from localization.logs.message_templates import Message, text
 from localization.logs.writer import write_bag
-from localization.simulation.drives import MoveArms, OpenLoop, Phase, PickUp, Pursuit, Rest, Route, turn_command
-from localization.simulation.experiments import Experiment, ExperimentConfig, find_experiment
+from localization.simulation.experiments import (
+    Experiment,
+    ExperimentConfig,
+    MoveArms,
+    OpenLoop,
+    Phase,
+    PickUp,
+    Pursuit,
+    Rest,
+    Route,
+    find_experiment,
+    turn_command,
+)
 from localization.simulation.faults import TrueRobot, apply_faults
 from localization.simulation.sensors import START_NS, SensorConfig, make_sensors, nominal_mounts, transforms
-from localization.simulation.track import RUN_HZ, RunRecord, TrueMotion
-from localization.simulation.vehicle import CG, COLUMNS, POSE, Body, MassDistribution, VehicleConfig, VehicleState, advance
+from localization.simulation.vehicle import CG, COLUMNS, POSE, Body, MassDistribution, TrueMotion, VehicleConfig, VehicleState, advance
 from localization.simulation.world import clearance
 from motion_models.center_of_gravity.parts import require_support
 from motion_models.errors import CgError
@@ -32,6 +42,32 @@ _STEERING_PERIOD_S = 0.1
 _FLUSH_S = 2.0
 _KEEP_S = 1.0
 _SETTLE_S = 1.0
+
+
+RUN_HZ = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class RunRecord:
+    """True motion of one named phase, 20 times a second from the body's rest before it to its rest after it."""
+
+    name: str
+    start_s: float
+    """[s] since the simulation's beginning."""
+    poses: FloatArray
+    """(n, 3) of the body in the world."""
+    wheel_angles: FloatArray
+    """(n, 2) left and right, exact [rad]."""
+    cg: FloatArray
+    """(n, 2) true CG [m]."""
+    nominal_cg: FloatArray
+    """(2,) as the robot has it [m]."""
+    command: OpenLoop | Route
+
+    @property
+    def times_s(self) -> FloatArray:
+        """(n,) since the start of the run."""
+        return np.asarray(np.arange(len(self.poses)) / RUN_HZ)
 
 
 @dataclass(frozen=True)
@@ -197,11 +233,15 @@ class Simulation:
         times = self.time_s + np.linspace(0.0, config.step_s * (len(commands) * steps - 1), len(commands) * steps)
         model = self._controllers[controller]
         nominal = self._masses.nominal_cg(times[:1])[0]
-        wheels = model.wheels(commands, nominal, model.nominal).repeat(steps, axis=0)
-        payload = self._masses.payload_kg, self._masses.payload_distance(float(times[0]))
-        rows = advance(self._state, self._body, config, wheels, self._masses.cg(times, config.step_s), payload, self.world.patches)
+        rows = self._move(times, model.wheels(commands, nominal, model.nominal).repeat(steps, axis=0))
         self._track.append(rows)
         self._check_walls(rows[-1, POSE])
+
+    def _move(self, times: FloatArray, wheels: FloatArray) -> FloatArray:
+        """Records (n, 13) of the vehicle at the ends of steps that begin at ``times`` (n,), with commanded rates ``wheels`` (n, 2)."""
+        config = self.config.vehicle
+        payload = self._masses.payload_kg, self._masses.payload_distance(float(times[0]))
+        return advance(self._state, self._body, config, wheels, self._masses.cg(times, config.step_s), payload, self.world.patches)
 
     @staticmethod
     def _control_steps(duration_s: float) -> int:

@@ -55,8 +55,8 @@ def center_from_end_poses(
     value, jacobian = _final_point(start_T_end)
     cov = np.zeros((3, 3))
     if cov_start is not None:
-        seen_from_end = adjoint(inverse(start_T_end))
-        cov = cov + seen_from_end @ np.asarray(cov_start, dtype=float) @ seen_from_end.T
+        in_end_frame = adjoint(inverse(start_T_end))
+        cov = cov + in_end_frame @ np.asarray(cov_start, dtype=float) @ in_end_frame.T
     if cov_end is not None:
         cov = cov + np.asarray(cov_end, dtype=float)
     return CenterOfRotation(value, jacobian @ cov @ jacobian.T)
@@ -138,7 +138,7 @@ def _residuals(
     """Whitened error (n, 3) of the poses, its derivative (n, 3) by the true headings and (n, 3, 4) by c and w."""
     n = poses.shape[0]
     turn = _rotation(heading)  # (n, 2, 2) world_R_body
-    body = np.einsum("kji,kj->ki", turn, poses[:, :2] - fixed)  # the fixed point, seen from the body, is at -body
+    body = np.einsum("kji,kj->ki", turn, poses[:, :2] - fixed)  # the fixed point is at -body in the body frame
     error = np.column_stack([body + center, wrap_angle(poses[:, 2] - heading)])
     by_heading = np.column_stack([body[:, 1], -body[:, 0], -np.ones(n)])
     by_point = np.zeros((n, 3, 4))

@@ -1,4 +1,4 @@
-"""How well a calibration predicts drives that it has not seen, with confidence intervals."""
+"""How well a calibration predicts drives that it was not fitted to, with confidence intervals."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Predictor(Protocol):
     """What training returns; `motion_models.calibration.fit.Fit` is one."""
 
     def residuals(self, maneuvers: Sequence[Maneuver]) -> FloatArray:
-        """(M, 3) predicted poses seen from the measured ones."""
+        """(M, 3) predicted poses relative to the measured ones."""
 
 
 Train = Callable[[Sequence[Maneuver]], Predictor]
-"""The whole procedure, choices included: what is chosen outside it has seen the held-out maneuvers."""
+"""The whole procedure, choices included: a choice made outside it would have used the held-out maneuvers."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,10 @@ class Interval:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Errors of every measured pose, each predicted by a fit that saw nothing of its group."""
+    """Errors of every measured pose, each predicted by a fit without its group."""
 
     residuals: FloatArray
-    """(M, 3) predicted poses seen from the measured ones [m, m, rad], in the order of the maneuvers."""
+    """(M, 3) predicted poses relative to the measured ones [m, m, rad], in the order of the maneuvers."""
     group: NDArray[np.int64]
     """(M,) group of each."""
     predictors: tuple[Predictor, ...]

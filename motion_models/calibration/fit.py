@@ -14,7 +14,7 @@ from motion_models.calibration.identifiability import Weakness, weaknesses
 from motion_models.calibration.least_squares import KNEE, FitConfig, Loss, Problem, indices
 from motion_models.calibration.maneuvers import IntArray, Maneuver, make_batch
 from motion_models.calibration.prediction import predict
-from motion_models.corrected_wheels import RADIUS_NAMES
+from motion_models.corrected import RADIUS_NAMES
 from motion_models.errors import CalibrationError
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -59,7 +59,7 @@ class Fit:
         return sigmas | ties
 
     def residuals(self, maneuvers: Sequence[Maneuver]) -> FloatArray:
-        """(M, 3) predicted poses seen from the measured ones [m, m, rad]; these maneuvers need not be those of the fit."""
+        """(M, 3) predicted poses relative to the measured ones [m, m, rad]; these maneuvers need not be those of the fit."""
         batch = make_batch(maneuvers)
         poses, _, _ = predict(self.model, batch, self.params, self.reference_params, np.empty(0, dtype=np.int64), self.config.noise)
         return se2.between(batch.measured, poses)
@@ -73,7 +73,8 @@ class Fit:
         everything = dict(zip(self.model.param_names, (float(p) for p in self.params), strict=True))
         table = {name: value for name, value in everything.items() if name in fitted and name not in RADIUS_NAMES}
         found = dataclasses.replace(robot, models={**robot.models, self.model.name: table})
-        return _with_radius(found, 1.0 + everything.get("wheel_radius_scale", 0.0))
+        found = _with_radius(found, 1.0 + everything.get("wheel_radius_scale", 0.0))
+        return _with_difference(found, everything.get("wheel_radius_difference", 0.0))
 
 
 def _with_radius(robot: Robot, scale: float) -> Robot:
@@ -83,6 +84,15 @@ def _with_radius(robot: Robot, scale: float) -> Robot:
     icr = {name: value / scale if name.startswith("alpha") else value for name, value in robot.models.get("icr", {}).items()}
     geometry = dataclasses.replace(robot.geometry, wheel_radius_m=robot.geometry.wheel_radius_m * scale)
     return dataclasses.replace(robot, geometry=geometry, models={**robot.models, **({"icr": icr} if icr else {})})
+
+
+def _with_difference(robot: Robot, difference: float) -> Robot:
+    """``robot`` with left wheels larger than right ones by ``difference`` of their mean, beside what its file has already."""
+    if difference == 0.0:
+        return robot
+    left, right = robot.geometry.radius_multipliers * np.array([1.0 + difference / 2.0, 1.0 - difference / 2.0])
+    geometry = dataclasses.replace(robot.geometry, left_wheel_radius_multiplier=float(left), right_wheel_radius_multiplier=float(right))
+    return dataclasses.replace(robot, geometry=geometry)
 
 
 def fit(
@@ -119,9 +129,9 @@ def fit(
     # Residuals smaller than by the noise model are luck or simulation: the noise model then counts.
     information = np.einsum("nri,nrj->ij", J, J) / max(scale, 1.0) ** 2
     rate = float(np.sqrt(np.mean(batch.wheels**2)))
-    lost = weaknesses(problem.names, problem.sizes, information, lambda b: problem.derive(b, x), rate, batch.cg.mean(axis=0))
-    if lost and config.strict:
-        raise CalibrationError("\n".join(["this drive does not reveal every parameter:", *(w.text for w in lost)]))
+    unrevealed = weaknesses(problem.names, problem.sizes, information, lambda b: problem.derive(b, x), rate, batch.cg.mean(axis=0))
+    if unrevealed and config.strict:
+        raise CalibrationError("\n".join(["this drive does not reveal every parameter:", *(w.text for w in unrevealed)]))
 
     cov, is_sandwich = _covariance(r, J, weights, problem.components, batch.group, problem.prior)
     return Fit(
@@ -133,7 +143,7 @@ def fit(
         is_sandwich=is_sandwich,
         scale=scale,
         cost=problem.cost(r, x, KNEE[config.loss] * scale, scale) / scale**2,
-        weaknesses=lost,
+        weaknesses=unrevealed,
         seconds=float(batch.dt.sum()),
         config=config,
     )

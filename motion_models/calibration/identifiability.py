@@ -10,7 +10,7 @@ import numpy as np
 from motion_models.calibration.maneuvers import Batch, Maneuver, make_batch
 from motion_models.se2 import FloatArray
 
-_SECONDS = 5.0
+_SECONDS = 5.0  # s; duration of the maneuvers that are tried as advice
 _MAX_MANEUVER_S = 600.0  # s; a maneuver that must last longer is no advice
 _MIN_SHARE = 0.3  # parameters with less than this part in a direction are not named
 
@@ -36,7 +36,7 @@ class Weakness:
         """One sentence to act on."""
         names = " and ".join(self.combination)
         if len(self.combination) > 1:
-            what = f"{names} cannot be told apart"
+            what = f"{names} cannot be distinguished"
         elif np.isfinite(self.spread):
             what = f"{names} is uncertain by {self.spread:.1f} times its size"
         else:

@@ -20,10 +20,11 @@ from motion_models.se2 import FloatArray
 Loss = Literal["linear", "huber", "cauchy"]
 
 _STEPS = 60
-_LEAST_MOTION = (0.05, 0.05)  # m, rad
+"""Of Levenberg-Marquardt; fits of real logs take under 20."""
+_LEAST_MOTION = (0.05, 0.05)  # m, rad; below, encoders' resolution and the reference's noise are as large
 _UNMEASURED = 1e6  # m^2 or rad^2
 _SMALL = 0.1  # SI; what counts as large for a parameter whose nominal value is 0
-# Median length of vectors of 1, 2 and 3 unit normal numbers. Residual lengths are brought to the last before they meet the knee, beyond
+# Median length of vectors of 1, 2 and 3 unit normal numbers. Residual lengths are brought to the last before the knee, beyond
 # which 10 % of them lie with Huber's.
 _MEDIAN_LENGTH = np.array([0.6745, 1.1774, 1.5382])
 KNEE: dict[Loss, float] = {"linear": np.inf, "huber": 2.5, "cauchy": 4.0}
@@ -60,6 +61,7 @@ class Problem:
     """Residuals, derivatives and robust cost as functions of the free parameters x (c,)."""
 
     def __init__(self, model: MotionModel, batch: Batch, names: tuple[str, ...], config: FitConfig, start: FloatArray) -> None:
+        """``start`` (k,): all of the model's parameters. Raises `CalibrationError` for bad names and too little motion."""
         self.model, self.batch, self.names, self.config = model, batch, names, config
         self.columns = indices(model, names)
         tied = list(config.ties)
@@ -107,9 +109,11 @@ class Problem:
         return full
 
     def params(self, x: FloatArray) -> FloatArray:
+        """(k,) all of the model's parameters at ``x`` (c,)."""
         return self._full(x)[: -len(REFERENCE_PARAM_NAMES)]
 
     def reference_params(self, x: FloatArray) -> FloatArray:
+        """(5,) parameters of the motion reference at ``x`` (c,)."""
         return self._full(x)[-len(REFERENCE_PARAM_NAMES) :]
 
     def derive(self, batch: Batch, x: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -20,7 +20,7 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Maneuver:
-    """One short drive. Its start is the end of interval ``lead``; poses are seen from the body's pose there."""
+    """One short drive. Its start is the end of interval ``lead``; poses are relative to the body's pose there."""
 
     dt: FloatArray
     """(n,) lengths of the intervals [s]."""
@@ -43,7 +43,7 @@ class Maneuver:
 
 @dataclass(frozen=True)
 class Batch:
-    """Many maneuvers end to end, as the compiled loops want them."""
+    """Many maneuvers end to end, as the compiled loops take them."""
 
     dt: FloatArray
     """(N,)"""
@@ -130,9 +130,9 @@ def _check(m: Maneuver, index: int) -> None:
     ]
     for what, array, allowed in shapes:
         if array.shape not in allowed:
-            wanted = " or ".join(str(shape) for shape in allowed)
+            expected = " or ".join(str(shape) for shape in allowed)
             raise CalibrationError(
-                f"{_called(m, index)}: {what} has shape {array.shape}; with {n} intervals and {poses} poses it must be {wanted}."
+                f"{_called(m, index)}: {what} has shape {array.shape}; with {n} intervals and {poses} poses it must be {expected}."
             )
     ends = m.ends.tolist()
     if not ends or not 0 <= m.lead < n or ends != sorted(set(ends)) or ends[0] < 1 or ends[-1] > n - m.lead:

@@ -21,7 +21,7 @@ _MIN_POSES = 20
 _FACTOR_BOUNDS = (0.05, 20.0)
 """Of a variance against the robot file's. Calibrated Huskies on floor and snow differ by 10 (`WheelNoise`)."""
 _QUANTILE, _CHI_SQUARE = 0.75, 1.3233
-"""Quantile of the normalized squared errors that is matched, and its value for one degree of freedom: a quarter of the errors may be lost
+"""Quantile of the normalized squared errors that is matched, and its value for one degree of freedom: a quarter of the errors may be wrong
 matches. Of fr079's positions by scan matching a tenth is beyond four sigma, and the median is that of the usual noise."""
 _BISECTIONS = 40
 
@@ -36,12 +36,13 @@ class LearnedNoise:
     """Of the longitudinal and lateral ones, and of `floor_m2_per_s`."""
 
     def scaled(self, noise: WheelNoise) -> WheelNoise:
-        """``noise`` with its variances multiplied."""
-        return WheelNoise(**{name: value * (self.yaw if name in _YAW else self.position) for name, value in _values(noise).items()})
+        """``noise`` with its variances multiplied, to three digits: a variance is known no better."""
+        factors = {name: self.yaw if name in _YAW else self.position for name in _values(noise)}
+        return WheelNoise(**{name: float(f"{value * factors[name]:.3g}") for name, value in _values(noise).items()})
 
 
 def learn_noise(fit: Fit, maneuvers: Sequence[Maneuver], residuals: FloatArray) -> LearnedNoise:
-    """Both factors by the `_QUANTILE` of normalized ``residuals`` (M, 3) of ``maneuvers``, predicted by fits that have not seen them.
+    """Both factors by the `_QUANTILE` of normalized ``residuals`` (M, 3) of ``maneuvers``, predicted by fits without them.
 
     The covariance of a predicted pose is linear in the variances: C = a_yaw C_yaw + a_position C_position + R, with the measurement's R.
     Headings give a_yaw, positions then a_position. What is correlated within a maneuver (slip over 0.1 to 2 s) is in the errors at its

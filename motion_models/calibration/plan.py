@@ -132,7 +132,8 @@ def calibrate(
 ) -> Calibration:
     """Fit as many of the ``wanted`` parameters as these maneuvers reveal, those named first before the others.
 
-    With ``insist`` all of them or none. Raises what `fit` raises; `CalibrationError` where nothing is revealed.
+    What an uncalibrated robot has by its geometry (`motion_models.prior`) is the prior of the fit. With ``insist`` all of them or none.
+    Raises what `fit` raises; `CalibrationError` where nothing is revealed.
     """
     free = list(wanted)
     held: list[tuple[str, str]] = []
@@ -142,6 +143,10 @@ def calibrate(
 
     if insist:
         return Calibration(fit(model, maneuvers, free, dataclasses.replace(config, ties={**ties(), **config.ties})), ())
+    by_geometry = zip(model.param_names, getattr(model, "sigmas", ()), strict=False)
+    config = dataclasses.replace(
+        config, prior_sigma={n: float(s) for n, s in by_geometry if s > 0.0 and n in free} | dict(config.prior_sigma)
+    )
     if CLOCK in free:
         config = dataclasses.replace(config, prior_sigma={CLOCK: CLOCK_SIGMA_S, **config.prior_sigma})
     config = dataclasses.replace(config, sizes={**{n: s for n, s in _SIZES.items() if n in model.param_names}, **config.sizes})

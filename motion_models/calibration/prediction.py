@@ -23,7 +23,7 @@ REFERENCE_PARAM_NAMES = ("wheel_time_offset", "wheel_lag", "lidar_offset_x", "li
 
 wheel_time_offset [s]: how late the wheels' stamps are; the motion at t is in the wheels' samples at t + offset;
 wheel_lag [s]: time constant with which the body follows the wheels (first order);
-lidar_offset_x, lidar_offset_y [m], lidar_yaw [rad]: pose of the tracked point in the body frame, as far as it is not known already.
+lidar_offset_x, lidar_offset_y [m], lidar_yaw [rad]: pose of the tracked point in the body frame, beyond that of its mount.
 """
 
 
@@ -74,7 +74,8 @@ class Delayed(NamedTuple):
 class HasTwist(Protocol):
     """As much of a `MotionModel` as a prediction asks for."""
 
-    def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist: ...
+    def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
+        """See `MotionModel.twist`."""
 
 
 def predict(
@@ -87,7 +88,7 @@ def predict(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Predict every measured pose: poses (M, 3), their derivatives (M, 3, c) and covariances (M, 3, 3).
 
-    ``reference_params`` (5,) as in `REFERENCE_PARAM_NAMES`; ``columns`` (c,) are the wanted derivatives, indices into the model's k
+    ``reference_params`` (5,) as in `REFERENCE_PARAM_NAMES`; ``columns`` (c,) are the derivatives, indices into the model's k
     parameters followed by the reference's five. Derivatives and covariances are right perturbations; ``noise`` is the wheels' slip.
     """
     k = len(params)
@@ -118,16 +119,16 @@ def predict(
 
 
 def _track(poses: FloatArray, d: FloatArray, body_T_lidar: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
-    """The same motions as a point elsewhere on the body sees them: lidar_T_body * motion * body_T_lidar."""
-    seen = se2.compose(se2.compose(se2.inverse(body_T_lidar), poses), body_T_lidar)
+    """The same motions of a point elsewhere on the body: lidar_T_body * motion * body_T_lidar."""
+    of_lidar = se2.compose(se2.compose(se2.inverse(body_T_lidar), poses), body_T_lidar)
     d = se2.adjoint(se2.inverse(body_T_lidar)) @ d
-    by_mount = np.eye(3) - se2.adjoint(se2.inverse(seen))  # right perturbation of the mount
+    by_mount = np.eye(3) - se2.adjoint(se2.inverse(of_lidar))  # right perturbation of the mount
     c, s = np.cos(body_T_lidar[2]), np.sin(body_T_lidar[2])
     turned = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])  # offsets are given along the body's axes
     for i, column in enumerate(columns):
         if column >= 0:
             d[:, :, i] += (by_mount @ turned)[:, :, column]
-    return seen, d
+    return of_lidar, d
 
 
 @numba.njit(cache=True)
@@ -143,7 +144,12 @@ def _integrate_all(dt: FloatArray, twist: FloatArray, by: FloatArray, noise: Flo
             a = spans.ends[i - 1]
         b = spans.ends[i]
         _integrate(dt[a:b], twist[a:b], by[a:b], noise, delta, cov, d)
-        found.poses[i], found.covs[i], found.derivatives[i] = delta, cov, d
+        for j in range(3):  # by element: numba compiles an assignment of slices, with its messages, for seven seconds
+            found.poses[i, j] = delta[j]
+            for k in range(3):
+                found.covs[i, j, k] = cov[j, k]
+            for k in range(d.shape[1]):
+                found.derivatives[i, j, k] = d[j, k]
 
 
 @numba.njit(cache=True)
@@ -154,7 +160,7 @@ def _low_pass(dt: FloatArray, wheels: FloatArray, lag: float) -> Smoothed:
     """
     n = len(dt)
     value, by_lag, middle = np.empty((n, 2)), np.zeros((n, 2)), np.empty(n)
-    value[0] = wheels[0]
+    value[0, 0], value[0, 1] = wheels[0, 0], wheels[0, 1]
     middle[0] = dt[0] / 2.0
     for i in range(1, n):
         h = (dt[i - 1] + dt[i]) / 2.0
@@ -179,7 +185,8 @@ def _interpolate(smooth: Smoothed, offset: float, found: Delayed) -> None:
         t = middle[i] + offset
         if t <= middle[0] or t >= middle[last]:
             end = 0 if t <= middle[0] else last
-            found.value[i], found.by_lag[i] = value[end], by_lag[end]
+            for j in range(2):
+                found.value[i, j], found.by_lag[i, j] = value[end, j], by_lag[end, j]
             continue
         while middle[k + 1] <= t:
             k += 1

@@ -99,18 +99,22 @@ class Regression:
 
     @property
     def residual_df(self) -> int:
+        """Degrees of freedom of the residuals."""
         return self.observations - len(self.names)
 
     @property
     def regression_df(self) -> int:
+        """Degrees of freedom of the regression, without its constant."""
         return len(self.names) - ("1" in self.names)
 
     @property
     def r_squared(self) -> float:
+        """Share of the variance that is explained."""
         return 1.0 - self.residual_ss / self.total_ss
 
     @property
     def adjusted_r_squared(self) -> float:
+        """R^2 corrected for the number of coefficients."""
         return 1.0 - (1.0 - self.r_squared) * (self.residual_df + self.regression_df) / self.residual_df
 
     @property
@@ -125,6 +129,7 @@ class Regression:
 
     @property
     def f_statistic(self) -> float:
+        """Explained over residual mean square."""
         return (self.total_ss - self.residual_ss) / self.regression_df / self.standard_error**2
 
     @property
@@ -134,10 +139,12 @@ class Regression:
 
     @property
     def t_statistics(self) -> FloatArray:
+        """(p,) coefficients over their standard errors."""
         return np.asarray(self.coefficients / self.sigma)
 
     @property
     def p_values(self) -> FloatArray:
+        """(p,) two-sided probabilities of t as large for coefficients of 0."""
         return np.asarray(2.0 * stats.t.sf(np.abs(self.t_statistics), self.residual_df))
 
     def interval(self, confidence: float = 0.95) -> FloatArray:

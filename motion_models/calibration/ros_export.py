@@ -6,7 +6,9 @@ github.com/cra-ros-pkg/robot_localization, params/ekf.yaml. Both exist in ROS 1 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
@@ -19,7 +21,14 @@ _SPEED = (0.3, 0.3)  # m/s and rad/s at which the multipliers are read off a mod
 _TURN_IN = 0.3  # s within which a turn, and its sideways speed, sets in
 # The defaults of robot_localization's process_noise_covariance.
 _PROCESS_NOISE = (0.05, 0.05, 0.06, 0.03, 0.03, 0.06, 0.025, 0.025, 0.04, 0.01, 0.01, 0.02, 0.01, 0.01, 0.015)
+_VY = 7  # place of vy among the filter's 15 states
 _UNUSED = 1e3  # variance of what wheels do not measure (z, roll, pitch)
+_PUBLISH_RATE_HZ = 50.0
+"""Default of ros2_controllers' diff_drive_controller."""
+_DIGITS = 6
+"""Decimals of multipliers at most: a micrometre per metre."""
+DEFAULT_NODES = {"diff_drive_controller": "diff_drive_controller", "robot_localization": "ekf_filter_node"}
+"""Name of the node by package, as its own examples have it."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +62,25 @@ def multipliers(model: MotionModel, robot: Robot, cg: FloatArray, params: FloatA
     return found
 
 
+def _multiplier_sigmas(model: MotionModel, robot: Robot, params: FloatArray, sigmas: Mapping[str, float]) -> FloatArray:
+    """(3,) standard deviations of `Multipliers` by those of the parameters, taken as independent; 0 without any."""
+    variance, cg = np.zeros(3), robot.center_of_gravity
+    for i, name in enumerate(model.param_names):
+        sigma = sigmas.get(name, 0.0)
+        if sigma > 0.0:
+            step = np.zeros(len(params))
+            step[i] = 1e-3 * sigma
+            ahead, behind = (np.array(astuple(multipliers(model, robot, cg, params + sign * step))) for sign in (1.0, -1.0))
+            variance += ((ahead - behind) / 2e-3) ** 2
+    return np.asarray(np.sqrt(variance))
+
+
+def _rounded(value: float, sigma: float) -> str:
+    """``value`` with decimals down to a tenth of ``sigma``: rounding then adds less than half a percent to the error."""
+    digits = _DIGITS if sigma <= 0.0 else min(_DIGITS, max(1, math.ceil(-math.log10(sigma)) + 1))
+    return f"{value:.{digits}f}"
+
+
 def multiplier_table(model: MotionModel, robot: Robot, params: FloatArray, cgs: FloatArray) -> str:
     """CSV of the multipliers against the centre of gravity, for ``cgs`` (n, 2) [m]: what to set after the arms have moved."""
     lines = ["cg_x_m,cg_y_m,wheel_separation_multiplier,left_wheel_radius_multiplier,right_wheel_radius_multiplier"]
@@ -67,30 +95,34 @@ def diff_drive_controller_yaml(
     robot: Robot,
     params: FloatArray,
     cgs: FloatArray | None = None,
-    node: str = "diff_drive_controller",
-    publish_rate_hz: float = 50.0,
+    sigmas: Mapping[str, float] | None = None,
+    node: str = "",
+    publish_rate_hz: float = _PUBLISH_RATE_HZ,
 ) -> str:
     """Parameters for ros2_controllers' diff_drive_controller: geometry, multipliers at the robot's nominal CG and twist covariance.
 
-    With ``cgs`` (n, 2) [m] the table of `multiplier_table` follows as comments. The controller knows neither vy = -wz x_CR nor a loss
-    in arcs: what it does not model is in its covariance, from the robot's wheel noise.
+    Numbers are rounded to what ``sigmas`` of the parameters leave of them; multipliers that are 1 and other defaults are left out.
+    ``node``: by default that of `DEFAULT_NODES`. With ``cgs`` (n, 2) [m] the table of `multiplier_table` follows as comments. The
+    controller models neither vy = -wz x_CR nor a loss in arcs: what it does not model is in its covariance, from the robot's wheel noise.
     """
-    m = multipliers(model, robot, robot.center_of_gravity, params)
+    node = node or DEFAULT_NODES["diff_drive_controller"]
+    found = astuple(multipliers(model, robot, robot.center_of_gravity, params))
+    names = ("wheel_separation_multiplier", "left_wheel_radius_multiplier", "right_wheel_radius_multiplier")
+    texts = [_rounded(value, sigma) for value, sigma in zip(found, _multiplier_sigmas(model, robot, params, sigmas or {}), strict=True)]
     twist = _diagonal(twist_variances(model, robot, params, publish_rate_hz))
     lines = [
         f"# {robot.name}: calibrated with the model '{model.name}'. Exact straight ahead and in the yaw rate of turning in place; on arcs",
-        "# as near as this controller comes. Goes into its parameter file; keep what else is there.",
+        f"# as near as this controller comes. Parameters of the node '{node}'; keep its others. Multipliers of 1 are left out.",
         f"{node}:",
         "  ros__parameters:",
         f"    wheel_separation: {_float(robot.driver.track_width_m)}",
         f"    wheel_radius: {_float(robot.driver.wheel_radius_m)}",
-        f"    wheel_separation_multiplier: {m.wheel_separation:.6f}",
-        f"    left_wheel_radius_multiplier: {m.left_radius:.6f}",
-        f"    right_wheel_radius_multiplier: {m.right_radius:.6f}",
+        *(f"    {name}: {text}" for name, text in zip(names, texts, strict=True) if float(text) != 1.0),
         "    # x, y, z, roll, pitch, yaw; y is no measurement of this controller, see the robot_localization patch.",
         f"    twist_covariance_diagonal: {twist}",
-        f"    publish_rate: {_float(publish_rate_hz)}",
     ]
+    if publish_rate_hz != _PUBLISH_RATE_HZ:
+        lines.append(f"    publish_rate: {_float(publish_rate_hz)}")
     if cgs is not None:
         lines += ["#", "# The same against the centre of gravity; set them when the arms have moved."]
         lines += [f"# {line}" for line in multiplier_table(model, robot, params, cgs).splitlines()]
@@ -101,40 +133,40 @@ def robot_localization_yaml(
     model: MotionModel,
     robot: Robot,
     params: FloatArray,
-    node: str = "ekf_filter_node",
+    node: str = "",
     source: str = "odom0",
-    publish_rate_hz: float = 50.0,
+    publish_rate_hz: float = _PUBLISH_RATE_HZ,
 ) -> str:
     """A patch for robot_localization: fuse vx and yaw rate of the wheels, never their vy = 0, and not their integrated pose.
 
     A diff-drive controller reports vy = 0 with the variance that it was given, often 0 or 1e-3. A skid-steer robot's vy is
-    -wz x_CR, many sigmas away, and the filter follows the wheels.
+    -wz x_CR, many sigmas away, and the filter follows the wheels. ``node``: by default that of `DEFAULT_NODES`. Defaults of the
+    package are left out, its process noise too where it is large enough.
     """
     variances = twist_variances(model, robot, params, publish_rate_hz)
-    noise = list(_PROCESS_NOISE)
-    noise[7] = max(noise[7], _sideways(model, robot, params) ** 2 / _TURN_IN)
-    rows = [", ".join(_float(noise[i] if i == j else 0.0) for j in range(15)) for i in range(15)]
     lines = [
         f"# {robot.name}: changes to robot_localization's parameters, for a robot that slides sideways when it turns.",
-        f"{node}:",
+        f"{node or DEFAULT_NODES['robot_localization']}:",
         "  ros__parameters:",
         "    two_d_mode: true",
         f"    {source}: {robot.topics.odometry}",
         "    # x, y, z, roll, pitch, yaw, vx, vy, vz, vroll, vpitch, vyaw, ax, ay, az",
         "    # vy stays out: the wheels' vy = 0 is an assumption and no measurement. If nothing else holds the filter sideways (no LiDAR",
-        "    # or visual odometry), put it in, but only with the variance below; or fuse an odometry that knows the true vy.",
+        "    # or visual odometry), put it in, but only with the variance below; or fuse an odometry with the true vy (`skidloc online`).",
         f"    {source}_config: [false, false, false,",
         "                   false, false, false,",
         "                   true,  false, false,",
         "                   false, false, true,",
         "                   false, false, false]",
-        f"    {source}_differential: false",
-        f"    {source}_relative: false",
         "    # The filter takes variances from the messages. Where the driver's are constants, set them there (diff_drive_controller):",
         f"    #   twist_covariance_diagonal: {_diagonal(variances)}",
-        "    # The filter's own defaults, but for vy: how fast it sets in when the robot starts to turn.",
-        f"    process_noise_covariance: [{(',' + chr(10) + ' ' * 31).join(rows)}]",
     ]
+    vy_noise = _sideways(model, robot, params) ** 2 / _TURN_IN
+    if vy_noise > _PROCESS_NOISE[_VY]:
+        noise = [*_PROCESS_NOISE[:_VY], vy_noise, *_PROCESS_NOISE[_VY + 1 :]]
+        rows = [", ".join(_float(noise[i] if i == j else 0.0) for j in range(15)) for i in range(15)]
+        lines.append("    # The filter's own defaults, but for vy: how fast it sets in when the robot starts to turn.")
+        lines.append(f"    process_noise_covariance: [{(',' + chr(10) + ' ' * 31).join(rows)}]")
     return "\n".join(lines) + "\n"
 
 

@@ -20,7 +20,7 @@ from motion_models.text_files import read_text
 def arms_model(arms: Arms, folder: Path | None = None, payload: Payload | None = None, static: StaticPart | None = None) -> CgModel:
     """The model that a robot file's ``arms`` describe. ``folder`` is where that file is; None for a robot that is shipped.
 
-    ``static`` goes before what ``arms`` say of everything else.
+    ``static`` replaces the masses that ``arms`` give to everything else.
 
     A name that is not in the folder may be that of a file that is shipped: robots derived from one can be kept anywhere.
 

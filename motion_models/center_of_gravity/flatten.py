@@ -19,7 +19,7 @@ _NO_LEVER = 1e-12
 def flatten(urdf: Urdf, base_link: str = "base_link", joints: tuple[str, ...] | None = None) -> Chain:
     """The chain of ``urdf`` in the frame of ``base_link``.
 
-    ``joints`` are those whose positions will be told; by default all that can move the centre of mass. The others stay at 0, or at
+    ``joints`` are those whose positions will be given; by default all that can move the centre of mass. The others stay at 0, or at
     their limit nearest to it. Joints that mimic others follow them. Raises `RobotError` for a link or a joint that is not there, a base
     that moves, and arms without masses.
     """
@@ -29,15 +29,15 @@ def flatten(urdf: Urdf, base_link: str = "base_link", joints: tuple[str, ...] | 
         raise RobotError(f"{urdf.source}: no link has an <inertial> with a mass; links are {', '.join(urdf.links)}.")
     moving = [joint for joint in urdf.joints if joint.moves]
     masters = {joint.name: _master(urdf, joint)[0] for joint in moving}
-    told = tuple(joint.name for joint in moving if joint.mimic is None)
-    unknown = [name for name in joints or () if name not in told]
+    free = tuple(joint.name for joint in moving if joint.mimic is None)
+    unknown = [name for name in joints or () if name not in free]
     if unknown:
-        raise RobotError(f"{urdf.source}: no joint {', '.join(unknown)} to tell positions of; there are {', '.join(told) or 'none'}.")
+        raise RobotError(f"{urdf.source}: no joint {', '.join(unknown)} that moves mass; there are {', '.join(free) or 'none'}.")
 
     idle, carried = _idle_joints(urdf)
     heavy = {masters[joint.name] for joint in moving if carried[joint.name] > 0.0}
     needed = {masters[joint.name] for joint in moving if joint.name not in idle}
-    names = tuple(name for name in told if name in needed and (joints is None or name in joints))
+    names = tuple(name for name in free if name in needed and (joints is None or name in joints))
     below = _moving_links(urdf)
     massless = tuple(name for name in urdf.links if name in below and urdf.links[name].mass == 0.0)
     useless = sorted(name for name in joints or () if name not in heavy)
@@ -105,7 +105,7 @@ def _master(urdf: Urdf, joint: Joint) -> tuple[str, float, float]:
 
 
 def _rest(urdf: Urdf, joint: Joint) -> float:
-    """Position of a joint that nobody tells: 0, or the limit nearest to it, of the joint that it follows."""
+    """Position of a joint whose position is not given: 0, or the limit nearest to it, of the joint that it follows."""
     name, multiplier, offset = _master(urdf, joint)
     master = next(j for j in urdf.joints if j.name == name)
     return multiplier * min(max(0.0, master.lower), master.upper) + offset

@@ -1,19 +1,21 @@
 """Centre of gravity of a robot with arms at any joint positions, with covariance: static part + arms (+ payload).
 
 Ebersole 2016, sec. 4.2.1.2: the static part is a weighed total (`center_of_gravity.weighing`) minus the arms at the weighed posture, and
-the total at another posture is the static part plus the arms there. Without a weighing, the static part is what the URDF says of it.
+the total at another posture is the static part plus the arms there. Without a weighing, the static part is that of the URDF.
 "Arms" are all bodies that hang on a joint that can move the centre of mass; all else, wheels included, is the static part.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from motion_models.center_of_gravity.flatten import flatten
 from motion_models.center_of_gravity.kinematics import COM, MASS, Chain, IntArray, body_moment, forward, subtree_jacobian
@@ -27,7 +29,7 @@ from motion_models.se2 import FloatArray
 def static_part_from_weighing(weighed: WeighedCg, chain: Chain, posture: Mapping[str, float]) -> StaticPart:
     """What is left of a weighed robot when its arms, which stood at ``posture``, are taken away.
 
-    The covariance is the weighing's alone; how the arms' errors enter is told by ``weighed_at``. Raises `CgError` where the arms weigh
+    The covariance is the weighing's alone; ``weighed_at`` is how the arms' errors enter. Raises `CgError` where the arms weigh
     more than all, `RobotError` for joints that are missing or unknown.
     """
     q = chain.posture(posture)
@@ -97,7 +99,7 @@ def cg_model(
     payload: Payload | None = None,
     tolerances: Tolerances = TYPICAL,
 ) -> CgModel:
-    """The model of ``urdf``; ``joints`` as in `flatten`. ``static`` replaces what the URDF says of everything but the arms.
+    """The model of ``urdf``; ``joints`` as in `flatten`. ``static`` replaces the URDF's masses of everything but the arms.
 
     Raises `CgError` for a payload or a static part that cannot be, and whatever `flatten` does.
     """
@@ -264,3 +266,55 @@ def _add_payload(at: _Posed, load: FloatArray, cov: FloatArray) -> None:
     _add_outer(cov, lever, 1.0)
     for row in range(2):
         cov[row, row] += (load[6] * load[4] / at.mass) ** 2
+
+
+class CgTracker:
+    """Stores each joint's last position: on ROS robots wheels, left arm and right arm often publish joint states separately."""
+
+    def __init__(self, model: CgModel) -> None:
+        """All joints of ``model`` are `missing` at first."""
+        self.model = model
+        self._positions = np.full(len(model.chain.joint_names), np.nan)
+        self._columns: dict[tuple[str, ...], tuple[NDArray[np.intp], NDArray[np.intp]]] = {}
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Joints that no message has had yet."""
+        return tuple(name for name, q in zip(self.model.chain.joint_names, self._positions, strict=True) if np.isnan(q))
+
+    def update(self, names: Sequence[str], positions: ArrayLike) -> CgEstimate | None:
+        """Take one joint-state message: ``names`` and ``positions`` [rad or m] in any order, with other joints among them.
+
+        The centre of gravity; None where the message has nothing of the arms (no joint of theirs, no positions, which ROS allows, or
+        none that is finite), and as long as joints are `missing`. Raises `CgError` where names and positions differ in number.
+        """
+        values = np.asarray(positions, dtype=float)
+        if values.size == 0:
+            return None
+        if values.shape != (len(names),):
+            raise CgError(f"joint state with {len(names)} names ({', '.join(names)}) but positions of shape {values.shape}.")
+        key = tuple(names)
+        if key not in self._columns:
+            known = {name: i for i, name in enumerate(self.model.chain.joint_names)}
+            pairs = [(column, known[name]) for column, name in enumerate(key) if name in known]
+            self._columns[key] = (np.array([p[0] for p in pairs], dtype=np.intp), np.array([p[1] for p in pairs], dtype=np.intp))
+        columns, joints = self._columns[key]
+        given = values[columns]
+        finite = [*map(math.isfinite, given.tolist())]  # quicker than numpy's, on a handful
+        if not any(finite):
+            return None
+        if all(finite):
+            self._positions[joints] = given
+        else:
+            self._positions[joints[finite]] = given[finite]
+        if any(map(math.isnan, self._positions.tolist())):
+            return None
+        return self.model.estimate(self._positions)
+
+    def require_all(self) -> None:
+        """Raises `CgError` where joints are `missing`; for the end of a log that gave no centre of gravity."""
+        if self.missing:
+            raise CgError(
+                f"the joint states never had {', '.join(self.missing)}, which the centre of gravity needs ({self.model.chain.source}); "
+                "name the arms' joints as the log does, or give the centre of gravity by topic."
+            )

@@ -13,7 +13,7 @@ from motion_models.se2 import FloatArray
 
 @dataclass(frozen=True)
 class Tolerances:
-    """How well masses and joints are known, as standard deviations. Bodies err independently."""
+    """Standard deviations of masses and joints. Bodies err independently."""
 
     mass_fraction: float = 0.02
     """Relative error of the mass of each body in the URDF."""
@@ -38,7 +38,7 @@ class StaticPart:
     """(3, 3) of mass, x, y [kg, m, m]."""
     weighed_at: Mapping[str, float] | None = None
     """Joint positions at which the arms were subtracted from a weighing. What is wrong with the arms' masses then cancels at this
-    posture, and matters elsewhere by what has moved since. None: the static part is known by itself."""
+    posture, and matters elsewhere by what has moved since. None: the static part was measured by itself."""
 
 
 @dataclass(frozen=True)
@@ -88,14 +88,14 @@ def require_support(cg: FloatArray, wheelbase: float, track_width: float) -> Non
 
 @dataclass(frozen=True)
 class Arms:
-    """What a robot file says of its arms."""
+    """The arms of a robot file."""
 
     urdf: str
     """URDF with the arms' masses: a path from the robot file's folder, or a file that is shipped. xacro must be expanded first."""
     base_link: str = "base_link"
     """Link of the URDF whose frame is the body frame: its origin below or above the wheelbase's centre, x forward, y left."""
     joints: tuple[str, ...] = ()
-    """Joints whose positions the log tells; by default all that can move the centre of gravity. Others are taken to stand at 0."""
+    """Joints whose positions are in the log; by default all that can move the centre of gravity. Others are taken to stand at 0."""
     postures: str = ""
     """SRDF with named postures, a path in the same way."""
     static_mass_kg: float = 0.0

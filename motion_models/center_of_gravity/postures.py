@@ -1,7 +1,7 @@
-"""Named postures of arms (from SRDF files), and postures that bring the centre of gravity where it is wanted.
+"""Named postures of arms (from SRDF files), and postures that bring the centre of gravity to a given place.
 
 Ebersole 2016, sec. 4.2.1.2, moved the arms by hand until the computed CG was close enough to each point of a grid; twelve joints for two
-coordinates leave the choice of posture open, and here it is the one near a posture that is known to be good.
+coordinates leave the choice of posture open, and here it is the one near a given posture.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a URDF says about masses: links with mass and centre of mass, and the joints between them.
+"""Masses of a URDF: links with mass and centre of mass, and the joints between them.
 
 Read with the standard library: of a URDF's content only names, origins, axes, limits, mimics and masses matter here, and the readers
 that there are bring mesh loaders with them. Format: http://wiki.ros.org/urdf/XML. Errors are `RobotError`s that name file and element.
@@ -67,6 +67,7 @@ class Joint:
 
     @property
     def moves(self) -> bool:
+        """Whether the joint can move."""
         return self.kind != "fixed"
 
 
@@ -106,7 +107,7 @@ def load_urdf(path: str | Path) -> Urdf:
 def parse_urdf(text: str, source: str) -> Urdf:
     """The URDF of an XML text; ``source`` names it in errors. Raises `RobotError`."""
     try:
-        # ElementTree wants bytes where the XML declares an encoding.
+        # ElementTree takes bytes where the XML declares an encoding.
         root = ET.fromstring(text.encode())
     except ET.ParseError as error:
         # An old xacro file may not declare its namespace, which is an error of XML already.
@@ -155,14 +156,14 @@ def _tree(links: dict[str, Link], joints: list[Joint], source: str) -> tuple[str
         raise RobotError(f"{source}: joints {', '.join(loop)} form a loop; a URDF is a tree.")
 
     for joint in joints:
-        seen, follower = {joint.name}, joint
+        visited, follower = {joint.name}, joint
         while follower.mimic is not None:
             if follower.mimic.joint not in by_name or not by_name[follower.mimic.joint].moves:
                 raise RobotError(f"{source}: joint '{follower.name}' mimics '{follower.mimic.joint}', which is not a moving joint of it.")
             follower = by_name[follower.mimic.joint]
-            if follower.name in seen:
+            if follower.name in visited:
                 raise RobotError(f"{source}: joint '{joint.name}' mimics itself, by way of '{follower.name}'.")
-            seen.add(follower.name)
+            visited.add(follower.name)
     return roots[0], links, tuple(order)
 
 
@@ -206,7 +207,7 @@ def _joint(element: ET.Element, source: str, links: Mapping[str, Link]) -> Joint
     lower, upper = -math.inf, math.inf
     limit = element.find("limit")
     if limit is not None and kind in ("revolute", "prismatic"):
-        # The format's default of a missing bound is 0; a limit with neither bound tells of effort and velocity only.
+        # The format's default of a missing bound is 0; a limit with neither bound is of effort and velocity only.
         if "lower" in limit.attrib or "upper" in limit.attrib:
             lower, upper = (_numbers(limit, bound, 1, "0", where)[0] for bound in ("lower", "upper"))
         if lower > upper:
@@ -243,6 +244,6 @@ def _numbers(element: ET.Element, attribute: str, count: int, default: str | Non
     except ValueError:
         numbers = []
     if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
-        wanted = "a finite number" if count == 1 else f"{count} finite numbers"
-        raise RobotError(f"{where}: {attribute} of <{element.tag}> must be {wanted}, found {text!r}.")
+        expected = "a finite number" if count == 1 else f"{count} finite numbers"
+        raise RobotError(f"{where}: {attribute} of <{element.tag}> must be {expected}, found {text!r}.")
     return numbers

@@ -19,7 +19,7 @@ WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 
 @dataclass(frozen=True)
 class Scales:
-    """How well scales and wheels are known, as standard deviations."""
+    """Standard deviations of scales and wheels."""
 
     reading_sigma_kg: float = 0.1
     """Noise of one reading: what lifting the robot off and putting it back changes. Repeating averages it."""

@@ -1,6 +1,5 @@
 """Four skidding wheels: contact laws, their equilibrium forward and inverse, the motion model, and its dynamic form."""
 
-from motion_models.friction.corrected import CorrectedFriction
 from motion_models.friction.model import FrictionModel, check_parameters, floor_of
 
-__all__ = ["CorrectedFriction", "FrictionModel", "check_parameters", "floor_of"]
+__all__ = ["FrictionModel", "check_parameters", "floor_of"]

@@ -67,6 +67,20 @@ class Balance(NamedTuple):
     m_right: float
 
 
+class Matrix3(NamedTuple):
+    """Derivatives of x, y, z (rows) by u, v, w (columns)."""
+
+    xu: float
+    xv: float
+    xw: float
+    yu: float
+    yv: float
+    yw: float
+    zu: float
+    zv: float
+    zw: float
+
+
 COLUMNS = 18
 """Of `sensitivities`; the last three, from `_VX` on, are the balance's own derivatives by vx, vy, wz."""
 _VX = 15
@@ -126,16 +140,22 @@ def balance(vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def solved(b: Balance, x: float, y: float, m: float) -> tuple[float, float, float]:
-    """The twist by which the balance changes by ``x, y, m``: its derivative matrix, inverted and applied. NaN where it is singular."""
-    c00 = b.y_vy * b.m_wz - b.y_wz * b.m_vy
-    c10 = b.y_wz * b.m_vx - b.y_vx * b.m_wz
-    c20 = b.y_vx * b.m_vy - b.y_vy * b.m_vx
-    whole = 1.0 / (b.x_vx * c00 + b.x_vy * c10 + b.x_wz * c20)
-    vx = c00 * x + (b.x_wz * b.m_vy - b.x_vy * b.m_wz) * y + (b.x_vy * b.y_wz - b.x_wz * b.y_vy) * m
-    vy = c10 * x + (b.x_vx * b.m_wz - b.x_wz * b.m_vx) * y + (b.x_wz * b.y_vx - b.x_vx * b.y_wz) * m
-    wz = c20 * x + (b.x_vy * b.m_vx - b.x_vx * b.m_vy) * y + (b.x_vx * b.y_vy - b.x_vy * b.y_vx) * m
-    return vx * whole, vy * whole, wz * whole
+def solve_3x3(a: Matrix3, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Solution of the linear equations with matrix ``a`` and right side ``x, y, z``, by Cramer's rule. NaN where it is singular."""
+    c00 = a.yv * a.zw - a.yw * a.zv
+    c10 = a.yw * a.zu - a.yu * a.zw
+    c20 = a.yu * a.zv - a.yv * a.zu
+    whole = 1.0 / (a.xu * c00 + a.xv * c10 + a.xw * c20)
+    u = c00 * x + (a.xw * a.zv - a.xv * a.zw) * y + (a.xv * a.yw - a.xw * a.yv) * z
+    v = c10 * x + (a.xu * a.zw - a.xw * a.zu) * y + (a.xw * a.yu - a.xu * a.yw) * z
+    w = c20 * x + (a.xv * a.zu - a.xu * a.zv) * y + (a.xu * a.yv - a.xv * a.yu) * z
+    return u * whole, v * whole, w * whole
+
+
+@numba.njit(cache=True, error_model="numpy")
+def twist_change(b: Balance, x: float, y: float, m: float) -> tuple[float, float, float]:
+    """The twist by which the balance changes by ``x, y, m``. NaN where its derivative is singular."""
+    return solve_3x3(Matrix3(b.x_vx, b.x_vy, b.x_wz, b.y_vx, b.y_vy, b.y_wz, b.m_vx, b.m_vy, b.m_wz), x, y, m)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -152,7 +172,7 @@ def newton(
         now = b.x * b.x + b.y * b.y + b.m * b.m / (arm * arm)
         if now < (1.0 - 1e-4 * fraction) * left or now < 1e-26:
             vx, vy, wz, left = x, y, w, now
-            dx, dy, dw = solved(b, -b.x, -b.y, -b.m)
+            dx, dy, dw = twist_change(b, -b.x, -b.y, -b.m)
             size = max(abs(dx), abs(dy), abs(dw) * arm)
             if size < _CLOSE:
                 return vx + dx, vy + dy, wz + dw, True
@@ -265,7 +285,7 @@ def sensitivities(at: Steady, load: Loads, tilt: tuple[float, float, float], flo
         *(0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     )
     for j in range(columns):
-        by[0, j], by[1, j], by[2, j] = solved(b, -by[0, j], -by[1, j], -by[2, j])
+        by[0, j], by[1, j], by[2, j] = twist_change(b, -by[0, j], -by[1, j], -by[2, j])
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -1,8 +1,8 @@
-"""Wheel speeds for a wanted motion: the inverse of `equilibrium.motion`.
+"""Wheel speeds for a commanded motion: the inverse of `equilibrium.motion`.
 
 The balance is solved for the wheels' speeds and the sideways motion that go with a forward speed and a turn: three equations again, by
 Newton's method. Where it does not converge, the wheels' directions are enclosed: without a centripetal force the balance does not depend
-on speed, so what is wanted is a direction (forward speed against turning) and what is sought is one too, how unlike the two sides roll.
+on speed, so the command is a direction (forward speed against turning) and the unknown is one too, how unlike the two sides roll.
 The first grows with the second, so it can be enclosed and cannot be missed; the speed follows by scale.
 """
 
@@ -13,14 +13,20 @@ import math
 import numba
 
 from motion_models.friction.contact import CREEP
-from motion_models.friction.equilibrium import Balance, Floor, Loads, balance, motion, newton
+from motion_models.friction.equilibrium import Balance, Floor, Loads, Matrix3, balance, motion, newton, solve_3x3
 
 _EFFORT = 40
-_CLOSE = 1e-7  # the last step of Newton's method squares it
+"""Evaluations of the balance before the angle is enclosed instead."""
+_CLOSE = 1e-7
+"""Step of Newton's method [1], after which one more changes nothing: it squares the error."""
 _BALANCED = 1e-9
+"""Error of the angle [rad] up to which an enclosed solution counts."""
 _ENCLOSING = 40
+"""Steps of up to 0.4 rad towards the goal: more than a whole turn."""
 _CLOSING = 100
+"""Of Chandrupatla's method, at worst halves: down to rounding from any interval."""
 _CLOSE_ANGLE = 1e-14
+"""Rounding of an angle [rad]."""
 _FINEST = 1e-3
 """Least step of the centripetal force, as a share of it."""
 
@@ -31,11 +37,11 @@ def rolls_for(vx: float, wz: float, load: Loads, floor: Floor) -> tuple[float, f
 
     ``load.pull`` is that of wheels at 1 m/s.
     """
-    wanted = math.hypot(vx, floor.half_track * wz)
-    if wanted == 0.0:
+    commanded = math.hypot(vx, floor.half_track * wz)
+    if commanded == 0.0:
         return 0.0, 0.0
-    to_x, to_w = vx / wanted, wz / wanted
-    unit = load.pull * wanted * wanted
+    to_x, to_w = vx / commanded, wz / commanded
+    unit = load.pull * commanded * commanded
     angle, drift, share = _linear_start(to_x, to_w, load, floor)
     angle, drift, share, found = _solve(angle, drift, share, to_x, to_w, unit, load, floor)
     if not found:
@@ -44,7 +50,7 @@ def rolls_for(vx: float, wz: float, load: Loads, floor: Floor) -> tuple[float, f
             angle, drift, share, found = _pulled(angle, drift, share, to_x, to_w, unit, load, floor)
     if not found:
         return math.nan, math.nan
-    speed = wanted / share
+    speed = commanded / share
     return speed * (math.cos(angle) - math.sin(angle)), speed * (math.cos(angle) + math.sin(angle))
 
 
@@ -105,13 +111,7 @@ def _step(b: Balance, c: float, s: float, v: float, r: float, to_x: float, to_w:
         y_r -= p * (vx - gy * w) * w
         m_r -= p * (gx * vx + gy * v) * w
     x_v, y_v, m_v = b.x_vy, b.y_vy, b.m_vy
-    c00, c10, c20 = y_v * m_r - y_r * m_v, y_r * m_a - y_a * m_r, y_a * m_v - y_v * m_a
-    whole = -1.0 / (x_a * c00 + x_v * c10 + x_r * c20)
-    return (
-        whole * (c00 * b.x + (x_r * m_v - x_v * m_r) * b.y + (x_v * y_r - x_r * y_v) * b.m),
-        whole * (c10 * b.x + (x_a * m_r - x_r * m_a) * b.y + (x_r * y_a - x_a * y_r) * b.m),
-        whole * (c20 * b.x + (x_v * m_a - x_a * m_v) * b.y + (x_a * y_v - x_v * y_a) * b.m),
-    )
+    return solve_3x3(Matrix3(x_a, x_v, x_r, y_a, y_v, y_r, m_a, m_v, m_r), -b.x, -b.y, -b.m)
 
 
 @numba.njit(cache=True, error_model="numpy")

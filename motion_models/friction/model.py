@@ -78,10 +78,12 @@ class FrictionModel:
         """
         check_parameters(cg, params)
         twist = Twist.from_kernel(_twist, self._constants(), wheels, cg, params)
-        lost = np.isnan(twist.value[..., 2]) & np.isfinite(np.asarray(wheels)).all(axis=-1)
-        if np.any(lost):
+        unsolved = np.isnan(twist.value[..., 2]) & np.isfinite(np.asarray(wheels)).all(axis=-1)
+        if np.any(unsolved):
             at = {name: float(value) for name, value in zip(self.param_names, params, strict=True)}
-            raise ModelError(f"no balance of forces found for {np.count_nonzero(lost)} of {lost.size} samples, with parameters {at}.")
+            raise ModelError(
+                f"no balance of forces found for {np.count_nonzero(unsolved)} of {unsolved.size} samples, with parameters {at}."
+            )
         return twist
 
     def wheels(self, command: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
@@ -95,9 +97,9 @@ class FrictionModel:
         flat = [np.array(np.broadcast_to(a, (*lead, 2)), dtype=np.float64, order="C").reshape(-1, 2) for a in (command, cg)]
         rates = np.zeros((math.prod(lead), 2))
         _wheels(flat[0], flat[1], np.array(params, dtype=np.float64), self._constants(), rates)
-        lost = np.isnan(rates).any(axis=-1) & np.isfinite(flat[0]).all(axis=-1)
-        if np.any(lost):
-            (vx, wz), (x, y) = flat[0][lost][0], flat[1][lost][0]
+        unsolved = np.isnan(rates).any(axis=-1) & np.isfinite(flat[0]).all(axis=-1)
+        if np.any(unsolved):
+            (vx, wz), (x, y) = flat[0][unsolved][0], flat[1][unsolved][0]
             raise ModelError(
                 f"no wheel rates found for vx = {vx:.3g} m/s, wz = {wz:.3g} rad/s with the centre of gravity at ({x:.3f}, {y:.3f}) m: "
                 "the floor holds this robot too firmly. Is rolling_resistance above mu, mu_ratio or scrub too large, the CG over a side?"

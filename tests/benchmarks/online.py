@@ -78,7 +78,8 @@ def over_dds(path: Path, estimator: str, folder: Path) -> tuple[np.ndarray, np.n
     before, begin = _cpu_seconds(node.pid), time.monotonic()
     peer.stdin.write("60\n")
     peer.stdin.flush()
-    peer.stdout.readline()
+    peer.stdout.readline()  # matched
+    peer.stdout.readline()  # played
     cpu = (_cpu_seconds(node.pid) - before) / (time.monotonic() - begin)
     heard = json.loads(peer.communicate()[0])
     node.terminate()

@@ -50,6 +50,25 @@ def measure_latency(distro: str, domain: int, folder: Path) -> None:
         print(f"{distro}: {name}: scan sent to odometry received p50 {p50:.1f}, p99 {p99:.1f}, max {most:.1f} ms", flush=True)
 
 
+def measure_stop(distro: str, domain: int, folder: Path) -> None:
+    """SIGSTOP of 5 s in a drive: seconds until the first estimate of a scan that was sent after it."""
+    node, robot = start_skidloc(domain, "--state", folder / "stop.state", "--node.wait-s", "1"), Robot(distro, domain)
+    try:
+        await_service(robot)
+        robot.begin("drive 20")
+        time.sleep(8.0)
+        node.process.send_signal(signal.SIGSTOP)
+        time.sleep(5.0)
+        node.process.send_signal(signal.SIGCONT)
+        resumed_s = time.monotonic()
+        robot.line("done")
+        after = min(sent_s + latency for sent_s, latency in robot.report()["answers_s"] if sent_s > resumed_s) - resumed_s
+        print(f"{distro}: stopped for 5 s: first estimate of a scan sent after it {after:.2f} s after it", flush=True)
+    finally:
+        robot.kill()
+        node.kill()
+
+
 def measure_outages(distro: str, domain: int, folder: Path, restarts: int, kills: int) -> None:
     """Restarts in order and kills of robot and node in turn: seconds of the robot's drive until odometry comes again."""
     options = ("--state", folder / "outages.state", "--node.wait-s", "1")
@@ -119,6 +138,7 @@ def main(distro: str = "kilted", restarts: str = "10", kills: str = "20") -> Non
     print(f"{distro}: load of this machine {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores", flush=True)
     with tempfile.TemporaryDirectory() as name:
         measure_latency(distro, domain, Path(name))
+        measure_stop(distro, domain + 3, Path(name))
         measure_clouds(distro, domain + 1)
         measure_outages(distro, domain + 2, Path(name), int(restarts), int(kills))
 

@@ -82,7 +82,7 @@ class SimulatedRobot(MonotonicTime):
     def publishers(self) -> Mapping[str, set[str]]:
         return {topic: {kind} for topic, kind in self._types.items()}
 
-    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
+    def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
         """The first two seconds at once, as a robot that has been there; then message by message."""
         self._busy_s += time.perf_counter() - self._returned
         found = self._first() if not self._is_begun else [received for received in [next(self._received(), None)] if received]

@@ -59,7 +59,7 @@ QUIET = WheelNoise(**dict.fromkeys(WheelNoise.__dataclass_fields__, 0.0))
 
 
 @pytest.mark.parametrize("name", sorted(WHEEL_FREE))
-def test_prediction_is_preintegration_and_its_derivatives_are_differences(name: str) -> None:
+def test_predict_is_preintegration_with_exact_derivatives(name: str) -> None:
     rng = np.random.default_rng(1)
     model = make_model(name, ROBOT)
     params = model.nominal * (1.0 + 0.1 * rng.normal(size=len(model.nominal))) + 0.01 * rng.normal(size=len(model.nominal))
@@ -69,7 +69,7 @@ def test_prediction_is_preintegration_and_its_derivatives_are_differences(name: 
         ends = np.array([5, 12, 30 - lead])
         maneuvers.append(Maneuver(rng.uniform(0.02, 0.08, 30), wheels, np.zeros((3, 3)), ends, rng.normal(size=(30, 2)) * 0.03, lead=lead))
     batch = make_batch(maneuvers)
-    witness = np.array([0.013, 0.04, 0.1, -0.05, 0.2])
+    reference_params = np.array([0.013, 0.04, 0.1, -0.05, 0.2])
     k = len(params)
     columns = np.arange(k + 5)
 
@@ -83,8 +83,8 @@ def test_prediction_is_preintegration_and_its_derivatives_are_differences(name: 
             np.testing.assert_allclose(cov[row], motion.cov, rtol=1e-12)
             row += 1
 
-    poses, d, _ = predict(model, batch, params, witness, columns, ROBOT.wheel_noise)
-    both, step = np.concatenate([params, witness]), 1e-6
+    poses, d, _ = predict(model, batch, params, reference_params, columns, ROBOT.wheel_noise)
+    both, step = np.concatenate([params, reference_params]), 1e-6
     for column in columns:
         moved = []
         for sign in (1.0, -1.0):
@@ -95,7 +95,7 @@ def test_prediction_is_preintegration_and_its_derivatives_are_differences(name: 
         np.testing.assert_allclose(d[:, :, column], difference, atol=2e-6 * max(1.0, float(np.abs(difference).max())))
 
 
-def test_a_lag_and_an_offset_mean_what_they_say() -> None:
+def test_predict_with_lag_and_offset_shifts_the_rates() -> None:
     """Body rates that follow the wheels' by 60 ms, and stamps that are 30 ms late, are found as such from rates alone."""
     rng = np.random.default_rng(2)
     model = make_model("diff_drive", ROBOT)
@@ -105,7 +105,7 @@ def test_a_lag_and_an_offset_mean_what_they_say() -> None:
     def rates(at: FloatArray) -> FloatArray:
         return np.stack([3.0 * np.sin(1.7 * at) + np.sin(4.1 * at), 2.0 * np.cos(2.3 * at)], axis=-1)
 
-    # First-order response of 60 ms, by a fine Euler loop; the log says at t what was true at t - 30 ms.
+    # First-order response of 60 ms, by a fine Euler loop; the log has at t what was true at t - 30 ms.
     fine = np.arange(-200, 20 * n) * (h / 20)
     body, state = np.empty((len(fine), 2)), rates(fine[:1])[0]
     for i, at in enumerate(fine):
@@ -123,7 +123,7 @@ def test_a_lag_and_an_offset_mean_what_they_say() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(WHEEL_FREE))
-def test_what_was_true_is_found_and_95_percent_intervals_hold_it(name: str) -> None:
+def test_fit_of_simulated_drives_covers_the_truth(name: str) -> None:
     rng = np.random.default_rng(3)
     model = make_model(name, ROBOT)
     free = WHEEL_FREE[name]
@@ -142,7 +142,7 @@ def test_what_was_true_is_found_and_95_percent_intervals_hold_it(name: str) -> N
     assert 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / 40) < inside / total <= 1.0
 
 
-def test_errors_shared_within_groups_widen_the_sigmas() -> None:
+def test_fit_of_errors_shared_in_groups_has_wider_sigmas() -> None:
     """Ten maneuvers of a group repeat one error: the sandwich over groups must know, the plain inverse cannot."""
     rng = np.random.default_rng(4)
     model = make_model("diff_drive", ROBOT)
@@ -159,7 +159,7 @@ def test_errors_shared_within_groups_widen_the_sigmas() -> None:
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
-def test_robust_losses_stand_outliers(loss: str) -> None:
+def test_fit_with_robust_loss_withstands_outliers(loss: str) -> None:
     rng = np.random.default_rng(5)
     model = make_model("icr", ROBOT)
     maneuvers = drive(model, model.nominal, rng, 60)
@@ -173,7 +173,7 @@ def test_robust_losses_stand_outliers(loss: str) -> None:
     assert errors[loss] < 0.1 * errors["linear"]
 
 
-def test_ties_make_a_robot_symmetric() -> None:
+def test_fit_with_ties_keeps_a_robot_symmetric() -> None:
     rng = np.random.default_rng(6)
     model = make_model("full_linear", ROBOT)
     ties = {"vx_right": ("vx_left", 1.0), "wz_right": ("wz_left", -1.0)}
@@ -185,7 +185,7 @@ def test_ties_make_a_robot_symmetric() -> None:
     np.testing.assert_allclose(result.params, model.nominal, atol=1e-3)
 
 
-def test_a_prior_weighs_as_much_as_it_says() -> None:
+def test_fit_with_a_prior_weighs_it_by_its_sigma() -> None:
     """One parameter, linear in it: the posterior mean is the weighted mean of prior and measurement."""
     model = make_model("diff_drive", ROBOT)
     n, h = 40, 0.05
@@ -207,7 +207,7 @@ def test_a_prior_weighs_as_much_as_it_says() -> None:
     assert between == pytest.approx(0.5, abs=0.05)  # the errors' size is itself estimated, from the median of 200
 
 
-def test_straight_driving_does_not_reveal_turning_and_the_advice_does() -> None:
+def test_fit_of_straight_drives_refuses_turning_with_advice() -> None:
     """Follow the advice of the error, and the fit works and is right."""
     rng = np.random.default_rng(8)
     model = make_model("icr", ROBOT)
@@ -229,18 +229,18 @@ def test_straight_driving_does_not_reveal_turning_and_the_advice_does() -> None:
     np.testing.assert_allclose(result.params, params, atol=5e-3)
 
 
-def test_a_lidar_offset_and_a_centre_of_rotation_are_told_to_be_alike() -> None:
+def test_fit_of_lidar_offset_and_x_cr_is_refused() -> None:
     rng = np.random.default_rng(9)
     model = make_model("skid_steer", ROBOT)
     maneuvers = drive(model, model.nominal, rng)
-    with pytest.raises(CalibrationError, match=r"x_cr_0 and lidar_offset_x cannot be told apart|lidar_offset_x and x_cr_0"):
+    with pytest.raises(CalibrationError, match=r"x_cr_0 and lidar_offset_x cannot be distinguished|lidar_offset_x and x_cr_0"):
         fit(model, maneuvers, ("k_0", "x_cr_0", "lidar_offset_x"))
     loose = fit(model, maneuvers, ("k_0", "x_cr_0", "lidar_offset_x"), FitConfig(strict=False))
     assert set(loose.weaknesses[0].combination) == {"x_cr_0", "lidar_offset_x"}
     assert loose.params[0] == pytest.approx(model.nominal[0], abs=2e-3)
 
 
-def test_a_gyro_alone_calibrates_turning() -> None:
+def test_fit_of_headings_alone_calibrates_turning() -> None:
     """Positions that are not measured (inf) count for nothing, whatever stands there."""
     rng = np.random.default_rng(10)
     model = make_model("diff_drive", ROBOT)
@@ -267,7 +267,7 @@ def _one(**changes: object) -> Maneuver:
 
 
 @pytest.mark.parametrize(
-    ("maneuver", "said"),
+    ("maneuver", "message"),
     [
         (_one(dt=np.array([0.1, 0.1, -0.1, 0.1])), "north.*interval is -0.1 s"),
         (_one(wheels=np.array([[1.0, 1.0], [np.nan, 1.0], [1.0, 1.0], [1.0, 1.0]])), "north.*wheels.*not finite"),
@@ -279,12 +279,12 @@ def _one(**changes: object) -> Maneuver:
         (_one(cov=np.full((3, 3), np.nan)), "cov.*not finite"),
     ],
 )
-def test_malformed_maneuvers_are_named(maneuver: Maneuver, said: str) -> None:
-    with pytest.raises(CalibrationError, match=said):
+def test_make_batch_of_malformed_maneuvers_names_them(maneuver: Maneuver, message: str) -> None:
+    with pytest.raises(CalibrationError, match=message):
         make_batch([_one(), maneuver])
 
 
-def test_too_little_to_fit_is_said() -> None:
+def test_fit_of_too_little_motion_is_refused() -> None:
     model = make_model("diff_drive", ROBOT)
     still = _one(wheels=np.zeros((4, 2)))
     with pytest.raises(CalibrationError, match=r"too little motion.*0 m and turned 0 rad"):
@@ -301,7 +301,7 @@ def test_too_little_to_fit_is_said() -> None:
         cross_validate(lambda ms: fit(model, ms, ("wheel_radius",)), [_one(), _one(group="south")], 5)
 
 
-def test_nothing_of_a_held_out_group_is_seen_in_training() -> None:
+def test_cross_validate_trains_without_the_held_out_group() -> None:
     rng = np.random.default_rng(11)
     model = make_model("diff_drive", ROBOT)
     maneuvers = drive(model, model.nominal, rng, 30, groups=7)
@@ -321,7 +321,7 @@ def test_nothing_of_a_held_out_group_is_seen_in_training() -> None:
     np.testing.assert_array_equal(out.residuals[:, 0], [float(m.group) for m in maneuvers])
 
 
-def test_bootstrap_intervals_hold_the_truth_95_percent_of_the_time() -> None:
+def test_root_mean_intervals_cover() -> None:
     """Errors with a part that a group shares: true RMS is 1; a bootstrap over single errors would be too narrow."""
     rng = np.random.default_rng(12)
     group = np.repeat(np.arange(80), 3)
@@ -336,14 +336,14 @@ def test_bootstrap_intervals_hold_the_truth_95_percent_of_the_time() -> None:
     assert 0.0 < gain.low < gain.value < gain.high
 
 
-def test_the_same_data_give_the_same_bytes() -> None:
+def test_fit_of_the_same_data_gives_the_same_bytes() -> None:
     model = make_model("icr", ROBOT)
     results = [fit(model, drive(model, model.nominal, np.random.default_rng(13)), WHEEL_FREE["icr"]) for _ in range(2)]
     assert results[0].params.tobytes() == results[1].params.tobytes()
     assert results[0].cov.tobytes() == results[1].cov.tobytes()
 
 
-def test_witness_terms_are_found_beside_the_model() -> None:
+def test_fit_of_reference_terms_beside_the_model_finds_both() -> None:
     rng = np.random.default_rng(14)
     model = make_model("diff_drive", ROBOT)
     mount = np.array([0.2, -0.1, 0.05])

@@ -34,7 +34,7 @@ angle = st.floats(0.05, 3.0).flatmap(lambda a: st.sampled_from([a, -a]))
 
 @given(coordinate, coordinate, coordinate, angle)
 @settings(deadline=None)
-def test_both_rules_find_the_centre_of_a_perfect_arc(x, y, heading, turn):
+def test_centers_of_a_perfect_arc_are_exact(x, y, heading, turn):
     poses = arc((x, y), [0.3, -1.2, heading], np.linspace(0, turn, 12))
     by_ends = center_from_end_poses(poses[0], poses[-1], COV, COV)
     by_all = center_of_arc(poses, COV)
@@ -47,14 +47,14 @@ def test_both_rules_find_the_centre_of_a_perfect_arc(x, y, heading, turn):
 
 @given(coordinate, coordinate, angle)
 @settings(deadline=None)
-def test_two_poses_are_an_arc(x, y, turn):
+def test_center_of_arc_of_two_poses_is_that_of_end_poses(x, y, turn):
     poses = arc((x, y), [0.0, 0.0, 0.0], [0, turn])
     by_ends, by_all = center_from_end_poses(*poses, COV, COV), center_of_arc(poses, COV)
     np.testing.assert_allclose(by_all.value, by_ends.value, atol=1e-6)
     np.testing.assert_allclose(by_all.cov, by_ends.cov, rtol=1e-3, atol=1e-9 + 1e-3 * by_ends.cov.max())
 
 
-def test_the_thesis_formula_as_printed():
+def test_center_from_end_poses_is_the_formula_of_the_thesis():
     """4.4 and 4.5 with the start at the origin, typed in again."""
     x, y, t = 0.31, -0.12, 0.7
     value = center_from_end_poses([0, 0, 0], [x, y, t]).value
@@ -65,7 +65,7 @@ def test_the_thesis_formula_as_printed():
 
 @given(coordinate, coordinate, angle)
 @settings(deadline=None)
-def test_the_derivative_is_that_of_differences(x, y, turn):
+def test_center_from_end_poses_derivative_is_a_difference(x, y, turn):
     delta = arc((x, y), [0, 0, 0], [turn])[0]
     _, jacobian = _final_point(delta)
     h = 1e-6
@@ -76,7 +76,7 @@ def test_the_derivative_is_that_of_differences(x, y, turn):
 
 
 @pytest.mark.parametrize("turn", [0.02, 0.1, 1.5, 4.0])
-def test_the_covariance_of_the_final_point_covers(turn):
+def test_center_from_end_poses_covariance_covers(turn):
     rng = np.random.default_rng(3)
     truth = np.array([-0.1, 0.4])
     poses = arc(truth, [1.0, 2.0, 0.4], [0, turn])
@@ -89,7 +89,7 @@ def test_the_covariance_of_the_final_point_covers(turn):
 
 
 @pytest.mark.parametrize("turn", [0.05, 0.3, 1.5, 7.0])
-def test_the_covariance_of_the_arc_covers_and_its_residuals_are_as_large_as_they_should_be(turn):
+def test_center_of_arc_covariance_and_chi_square_cover(turn):
     rng = np.random.default_rng(4)
     truth = np.array([-0.1, 0.4])
     poses = arc(truth, [1.0, 2.0, 0.4], np.linspace(0, turn, 25))
@@ -107,7 +107,7 @@ def test_the_covariance_of_the_arc_covers_and_its_residuals_are_as_large_as_they
     assert np.all(np.abs(np.mean(errors, axis=0)) < 4 * np.sqrt(np.diagonal(np.mean(covs, axis=0)) / 1000))
 
 
-def test_the_uncertainty_grows_as_one_over_the_angle():
+def test_center_sigma_of_small_turns_grows_as_one_over_angle():
     turns = np.array([0.02, 0.01, 0.005, 0.0025])
     sigma = []
     for turn in turns:
@@ -117,7 +117,7 @@ def test_the_uncertainty_grows_as_one_over_the_angle():
     assert slope == pytest.approx(-1.0, abs=0.01)
 
 
-def test_without_a_turn_there_is_no_centre():
+def test_centers_without_a_turn_are_refused():
     with pytest.raises(CalibrationError, match="without a turn"):
         center_from_end_poses([0, 0, 0.3], [1, 0, 0.3])
     with pytest.raises(CalibrationError, match="without a turn"):
@@ -125,18 +125,18 @@ def test_without_a_turn_there_is_no_centre():
 
 
 @pytest.mark.parametrize("poses", [[[0, 0, 0]], [[0, 0, 0], [np.nan, 0, 1]], [[0, 0], [1, 1]], []])
-def test_poses_that_are_none_are_refused(poses):
+def test_center_of_arc_of_bad_poses_is_refused(poses):
     with pytest.raises(CalibrationError, match="two finite poses"):
         center_of_arc(poses, COV)
 
 
-def test_a_pose_that_claims_certainty_is_refused():
+def test_center_of_arc_of_certain_poses_is_refused():
     with pytest.raises(CalibrationError, match="positive definite"):
         center_of_arc(arc((0.1, 0), [0, 0, 0], [0, 1]), np.zeros((3, 3)))
 
 
 @pytest.mark.parametrize("turn", [1e-3, 1e-4])
-def test_an_arc_of_less_than_its_noise_is_refused_or_uncertain(turn):
+def test_center_of_arc_below_its_noise_is_refused_or_uncertain(turn):
     """Turned by half a sigma of one heading, and by a twentieth: never a centre that claims to be known to a decimetre."""
     rng = np.random.default_rng(5)
     poses = arc((0.1, 0.4), [0, 0, 0], np.linspace(0, turn, 5))

@@ -42,7 +42,7 @@ def test_learn_noise_finds_the_variances_that_made_the_errors(scale: float) -> N
     noise = learn_noise(found, maneuvers, found.residuals(maneuvers))
     assert noise.yaw == pytest.approx(scale, rel=0.3)
     assert noise.position == pytest.approx(scale, rel=0.3)
-    assert noise.scaled(WheelNoise()).yaw_rad2_per_m == pytest.approx(noise.yaw * WheelNoise().yaw_rad2_per_m)
+    assert noise.scaled(WheelNoise()).yaw_rad2_per_m == pytest.approx(noise.yaw * WheelNoise().yaw_rad2_per_m, rel=5e-3)  # three digits
 
 
 def test_learn_noise_covers_slip_that_is_correlated_over_neighbours() -> None:
@@ -53,7 +53,7 @@ def test_learn_noise_covers_slip_that_is_correlated_over_neighbours() -> None:
     assert 1.8 < noise.position < 3.6
 
 
-def test_learn_noise_is_not_set_by_a_few_lost_matches() -> None:
+def test_learn_noise_of_a_few_wrong_matches_is_unchanged() -> None:
     found, maneuvers = made(1.0, np.random.default_rng(2), outliers=3)
     assert learn_noise(found, maneuvers, found.residuals(maneuvers)).yaw < 2.0
 

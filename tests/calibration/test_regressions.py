@@ -19,15 +19,15 @@ from tests.studies.thesis_regressions import DATA, grid, k_deviation, printed_nu
 
 
 @pytest.mark.parametrize("number", printed_numbers(), ids=lambda n: n.what)
-def test_a_number_of_the_thesis_is_met_to_every_printed_digit(number):
+def test_regressions_of_the_thesis_give_every_printed_digit(number):
     assert number.agrees
 
 
-def test_k_is_met_to_a_thousandth_over_the_grid():
+def test_rotation_ratio_over_the_grid_is_that_of_the_thesis():
     assert k_deviation() < 1e-3
 
 
-def test_a_wrong_digit_would_show():
+def test_regressions_with_a_wrong_digit_differ():
     import dataclasses
 
     for number in printed_numbers():
@@ -35,14 +35,14 @@ def test_a_wrong_digit_would_show():
         assert not dataclasses.replace(number, value=number.value + 1.01 * step).agrees
 
 
-def test_the_errors_of_the_heuristics_variants():
+def test_cor_y_variants_have_the_errors_of_the_thesis():
     errors = {e.variant: e for e in variant_errors()}
     for e in errors.values():
         assert (e.ratio, e.x_cr) == (pytest.approx(0.02676, abs=5e-6), pytest.approx(0.01144, abs=5e-6))
     assert [errors[v].y_cr for v in ("multivariate", "full", "symmetric")] == pytest.approx([0.01105, 0.00565, 0.01277], abs=5e-6)
 
 
-def test_a_line_is_that_of_scipy():
+def test_regression_of_a_line_is_that_of_scipy():
     rng = np.random.default_rng(0)
     x = rng.normal(size=30)
     y = 2 * x + rng.normal(size=30)
@@ -54,7 +54,7 @@ def test_a_line_is_that_of_scipy():
     assert ours.significance == pytest.approx(theirs.pvalue)  # F = t^2 for a line
 
 
-def test_intervals_cover():
+def test_regression_intervals_cover():
     """95 % of them contain the truth; 3000 draws, three coefficients."""
     rng = np.random.default_rng(1)
     x = np.linspace(-1, 1, 12)
@@ -67,7 +67,7 @@ def test_intervals_cover():
     assert np.all(np.abs(inside / 3000 - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 3000))
 
 
-def test_the_skid_steer_fit_returns_the_model_that_made_the_table():
+def test_skid_steer_fit_of_a_simulated_table_returns_its_model():
     table = grid()
     truth = thesis_coefficients("full")
     model = SkidSteer.from_robot(load_robot("vaultbot"))
@@ -78,7 +78,7 @@ def test_the_skid_steer_fit_returns_the_model_that_made_the_table():
     np.testing.assert_allclose(fit.cov, 0.0, atol=1e-12)
 
 
-def test_the_skid_steer_fit_of_the_measurements_is_no_worse_than_the_thesis():
+def test_skid_steer_fit_of_the_grid_is_no_worse_than_the_thesis():
     """By definition of least squares, on the rows; and its covariance is that of its residuals."""
     table = grid()
     fit = skid_steer_fit(table)
@@ -94,7 +94,7 @@ def write(path, rows, header=COLUMNS):
     return path
 
 
-def test_columns_may_come_in_any_order(tmp_path):
+def test_read_rotation_table_takes_columns_in_any_order(tmp_path):
     order = COLUMNS[::-1]
     table = read_rotation_table(write(tmp_path / "t.csv", [[5, 4, 3, 2, 1]], order))
     np.testing.assert_array_equal(table.cg, [[1, 2]])
@@ -113,7 +113,7 @@ def test_columns_may_come_in_any_order(tmp_path):
         ([], COLUMNS, r"no rows below its header"),
     ],
 )
-def test_a_bad_table_is_refused_with_the_place(tmp_path, rows, header, message):
+def test_read_rotation_table_of_bad_cells_names_the_place(tmp_path, rows, header, message):
     with pytest.raises(CalibrationError, match=message):
         read_rotation_table(write(tmp_path / "bad.csv", rows, header))
 
@@ -121,14 +121,14 @@ def test_a_bad_table_is_refused_with_the_place(tmp_path, rows, header, message):
 @pytest.mark.parametrize(
     "make", [lambda p: None, lambda p: p.write_bytes(b"\xff\xfe\x00\x01"), lambda p: p.write_text(""), lambda p: p.mkdir()]
 )
-def test_a_file_that_is_no_table_is_refused(tmp_path, make):
+def test_read_rotation_table_of_other_files_is_refused(tmp_path, make):
     path = tmp_path / "x.csv"
     make(path)
     with pytest.raises(CalibrationError, match=r"x\.csv"):
         read_rotation_table(path)
 
 
-def test_too_few_rows_and_rows_that_do_not_tell():
+def test_regressions_of_too_few_rows_are_refused():
     with pytest.raises(CalibrationError, match="3 rows are too few for the 3 coefficients"):
         polynomial(np.ones(3), np.arange(3.0), 2)
     with pytest.raises(CalibrationError, match="do not separate 1 and x_G"):

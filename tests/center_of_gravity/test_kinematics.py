@@ -60,7 +60,7 @@ def trees(draw):
 
 @settings(max_examples=150, deadline=None)
 @given(trees())
-def test_center_of_mass_of_any_tree_is_that_of_a_plain_recursion(tree):
+def test_forward_of_any_tree_is_a_plain_recursion(tree):
     text, positions = tree
     chain = flatten(parse_urdf(text, "r"), base_link="base")
     expected, mass = urdf_reference.center_of_mass(text, positions, "base")
@@ -71,7 +71,7 @@ def test_center_of_mass_of_any_tree_is_that_of_a_plain_recursion(tree):
 
 @settings(max_examples=100, deadline=None)
 @given(trees())
-def test_jacobian_is_the_derivative(tree):
+def test_subtree_jacobian_is_a_difference(tree):
     text, positions = tree
     chain = flatten(parse_urdf(text, "r"), base_link="base")
     q, h = chain.posture(positions), 1e-5
@@ -81,7 +81,7 @@ def test_jacobian_is_the_derivative(tree):
 
 
 def dh_arm_moment(joints, world_T_base):
-    """(3,) first moment [kg m] of a UR5's six moving links, as Universal Robots' table tells: DH parameters, and centres in DH frames."""
+    """(3,) first moment [kg m] of a UR5's six moving links, as Universal Robots' table has: DH parameters, and centres in DH frames."""
     a = [0.0, -0.425, -0.39225, 0.0, 0.0, 0.0]
     d = [0.089159, 0.0, 0.0, 0.10915, 0.09465, 0.0823]
     alpha = [math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0]
@@ -104,7 +104,7 @@ def dh_arm_moment(joints, world_T_base):
     return moment, pose
 
 
-def test_vaultbots_arms_are_ur5s_by_their_denavit_hartenberg_table():
+def test_flatten_of_vaultbot_has_the_ur5_arms():
     chain = flatten(parse_urdf(VAULTBOT, "vaultbot.urdf"))
     rng = np.random.default_rng(5)
     zero = urdf_reference.link_poses(VAULTBOT, {})
@@ -122,7 +122,7 @@ def test_vaultbots_arms_are_ur5s_by_their_denavit_hartenberg_table():
     np.testing.assert_allclose(differences, np.broadcast_to(differences[0], (5, 3)), atol=1e-9)
 
 
-def test_vaultbot_is_the_thesiss_robot():
+def test_flatten_of_vaultbot_is_the_robot_of_the_thesis():
     chain = flatten(parse_urdf(VAULTBOT, "vaultbot.urdf"))
     assert chain.mass == pytest.approx(118.84, abs=1e-9)  # Ebersole 2016, Appendix A
     poses = urdf_reference.link_poses(VAULTBOT, {})
@@ -130,11 +130,11 @@ def test_vaultbot_is_the_thesiss_robot():
     assert (left - right)[1] == pytest.approx(0.56)
     assert (left - rear)[0] == pytest.approx(0.52)
     assert left[2] - poses["base_footprint"][2, 3] == pytest.approx(0.164)
-    # Wheels, and the wrists that turn about the gripper's axis, do not matter; a log need not tell them.
+    # Wheels, and the wrists that turn about the gripper's axis, do not matter; a log need not have them.
     assert chain.joint_names == tuple(f"{side}_{joint}" for side in ("left", "right") for joint in ARM[:5])
 
 
-def test_leading_axes_are_kept():
+def test_forward_of_a_batch_keeps_leading_axes():
     chain = flatten(parse_urdf(VAULTBOT, "vaultbot.urdf"))
     q = np.random.default_rng(0).uniform(-3, 3, (2, 3, 10))
     com, jacobian = chain.center_of_mass(q), chain.center_of_mass_jacobian(q)
@@ -147,7 +147,7 @@ def test_leading_axes_are_kept():
 
 
 @pytest.mark.parametrize("function", ["center_of_mass", "center_of_mass_jacobian"])
-def test_an_evaluation_takes_less_than_10_microseconds(function):
+def test_forward_takes_microseconds(function):
     chain = flatten(parse_urdf(VAULTBOT, "vaultbot.urdf"))
     evaluate, q = getattr(chain, function), np.linspace(-1, 1, 10)
     evaluate(q)
@@ -172,7 +172,7 @@ SIMPLE = """<robot name="r">
 </robot>"""
 
 
-def test_joints_that_are_left_out_stand_at_the_limit_nearest_to_zero():
+def test_flatten_of_joints_left_out_takes_the_nearest_limit():
     text = SIMPLE.replace("</robot>", '<link name="slide"><inertial><mass value="1"/></inertial></link>') + (
         '<joint name="lift" type="prismatic"><parent link="base_link"/><child link="slide"/><axis xyz="0 1 0"/></joint></robot>'
     )
@@ -182,7 +182,7 @@ def test_joints_that_are_left_out_stand_at_the_limit_nearest_to_zero():
     np.testing.assert_allclose(chain.center_of_mass(np.array([0.7])), expected, atol=1e-12)
 
 
-def test_a_joint_that_is_balanced_only_at_rest_matters():
+def test_flatten_keeps_a_joint_that_is_balanced_only_at_rest():
     """A turret about z with a slide: with the slide at 0 all mass is on the turret's axis."""
     slide = (
         '<link name="mast"><inertial><mass value="3"/></inertial></link>'
@@ -197,14 +197,14 @@ def test_a_joint_that_is_balanced_only_at_rest_matters():
     )
 
 
-def test_a_robot_without_arms_has_a_constant_center_of_mass():
+def test_forward_of_a_robot_without_arms_is_constant():
     text = SIMPLE.replace('xyz="0.5 0 0"', 'xyz="0 0 0"').replace('<link name="tool"/>', "").split('<joint name="wrist"')[0] + "</robot>"
     chain = flatten(parse_urdf(text, "r"))
     assert chain.joint_names == ()
     np.testing.assert_allclose(chain.center_of_mass(np.empty(0)), [10 * 0.1 / 12, 0.0, 2 / 12])
 
 
-def test_posture_names_what_is_missing_unknown_and_impossible():
+def test_posture_of_missing_or_unknown_joints_is_refused():
     chain = flatten(parse_urdf(SIMPLE, "r.urdf"))
     assert chain.posture({"shoulder": 0.5, "wrist": 9.0}) == pytest.approx([0.5])
     with pytest.raises(RobotError, match=r"no position of joint shoulder; r.urdf needs shoulder"):
@@ -232,7 +232,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_flatten_refuses(case):
+def test_flatten_of_bad_trees_is_refused(case):
     text, options, message = BAD[case]
     with pytest.raises(RobotError, match=message):
         flatten(parse_urdf(text, "r.urdf"), **options)
@@ -279,17 +279,17 @@ MALFORMED = {
 
 
 @pytest.mark.parametrize("case", MALFORMED)
-def test_parse_refuses(case):
+def test_parse_urdf_of_bad_text_is_refused(case):
     text, message = MALFORMED[case]
     with pytest.raises(RobotError, match=rf"r\.urdf.*{message}"):
         parse_urdf(text, "r.urdf")
 
 
-def test_xacro_declared_but_expanded_is_a_urdf():
+def test_parse_urdf_of_expanded_xacro_is_read():
     parse_urdf(change("<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"'), "r.urdf")
 
 
-def test_files_that_cannot_be_read(tmp_path):
+def test_read_urdf_of_unreadable_files_is_refused(tmp_path):
     with pytest.raises(RobotError, match=r"none.urdf' cannot be read: No such file"):
         load_urdf(tmp_path / "none.urdf")
     with pytest.raises(RobotError, match="cannot be read"):

@@ -14,10 +14,9 @@ import pytest
 from motion_models.center_of_gravity.files import arms_model, arms_postures, urdf_cg, weighed_cg
 from motion_models.center_of_gravity.flatten import flatten
 from motion_models.center_of_gravity.kinematics import COM, MASS
-from motion_models.center_of_gravity.model import cg_model, static_part_from_weighing
+from motion_models.center_of_gravity.model import CgTracker, cg_model, static_part_from_weighing
 from motion_models.center_of_gravity.parts import Arms, Payload, StaticPart, Tolerances, require_support, support_margin
 from motion_models.center_of_gravity.postures import parse_postures, posture_for
-from motion_models.center_of_gravity.tracker import CgTracker
 from motion_models.center_of_gravity.urdf import parse_urdf
 from motion_models.center_of_gravity.weighing import Scales, WeighedCg, cg_from_scales, wheel_contacts
 from motion_models.errors import CgError, RobotError
@@ -60,7 +59,7 @@ def shaken(chain, rng, tolerances):
     return dataclasses.replace(chain, constants=constants)
 
 
-def test_weighing_minus_arms_plus_arms_is_the_robot():
+def test_cg_model_of_weighing_minus_and_plus_arms_is_the_robot():
     """Weigh the robot that the URDF describes, take its arms away, and find it again at every other posture."""
     cg = CHAIN.center_of_mass(CHAIN.posture(POSTURES["stow_back"]))
     weighed = cg_from_scales(readings_of(CHAIN.mass, cg)[None], CONTACTS)
@@ -81,7 +80,7 @@ def test_weighing_minus_arms_plus_arms_is_the_robot():
         np.testing.assert_allclose(model.cg(model.chain.posture(posture)), expected[:2], atol=1e-12)
 
 
-def test_static_part_overrules_the_urdf_and_wheels_do_not_count_twice():
+def test_cg_model_with_a_static_part_replaces_the_urdf():
     static = StaticPart(50.0, np.array([0.03, -0.01]), np.zeros((3, 3)))
     model = cg_model(URDF, static=static)
     q = np.linspace(-1, 1, 10)
@@ -104,7 +103,7 @@ SOURCES = {
 
 
 @pytest.mark.parametrize("source", SOURCES)
-def test_covariance_of_a_weighed_robot_is_that_of_many_weighed_robots(source):
+def test_cg_covariance_of_a_weighed_robot_is_that_of_samples(source):
     """The whole way: scales err, wheels stand elsewhere, the arms' masses are wrong in what is taken away and in what is added."""
     tolerances, scales = SOURCES[source]
     rng = np.random.default_rng(3)
@@ -125,7 +124,7 @@ def test_covariance_of_a_weighed_robot_is_that_of_many_weighed_robots(source):
     assert_covariance(np.array(found), estimate.covariance)
 
 
-def test_errors_of_the_arms_cancel_at_the_posture_of_the_weighing():
+def test_cg_covariance_at_the_weighed_posture_has_no_arms():
     weighed = cg_from_scales(readings_of(118.84, [0.01, 0.0])[None], CONTACTS)
     static = static_part_from_weighing(weighed, CHAIN, POSTURES["stow_back"])
     model = cg_model(URDF, static=static, tolerances=Tolerances(0.2, 0.05, 0.0))
@@ -145,7 +144,7 @@ LOADED = {
 
 
 @pytest.mark.parametrize("source", LOADED)
-def test_covariance_from_a_urdf_alone_with_a_payload(source):
+def test_cg_covariance_of_a_urdf_with_payload_is_that_of_samples(source):
     tolerances, mass_sigma, position_sigma = LOADED[source]
     rng = np.random.default_rng(4)
     payload = Payload("left_gripper", 3.0, (0.05, -0.02, 0.15), mass_sigma, position_sigma)
@@ -170,7 +169,7 @@ def test_covariance_from_a_urdf_alone_with_a_payload(source):
     assert estimate.mass == pytest.approx(118.84 + 3.0)
 
 
-def test_covariance_does_not_depend_on_where_the_frame_is():
+def test_cg_covariance_in_another_frame_is_the_same():
     payload = Payload("left_gripper", 3.0, (0.0, 0.0, 0.1), 0.5, 0.02)
     here, there = (cg_model(URDF, base, payload=payload, tolerances=Tolerances(0.1, 0.01, 0.01)) for base in ("base_link", "laser"))
     q = here.chain.posture(POSTURES["front_left"])
@@ -180,7 +179,7 @@ def test_covariance_does_not_depend_on_where_the_frame_is():
     np.testing.assert_allclose(there.estimate(q).covariance, here.estimate(q).covariance, rtol=1e-9, atol=1e-15)
 
 
-def test_a_payload_is_one_more_mass():
+def test_cg_model_with_a_payload_is_one_more_mass():
     payload = Payload("left_gripper", 3.0, (0.05, -0.02, 0.15))
     posture = POSTURES["front_left"] | {"left_wrist_3_joint": 0.7}
     model = cg_model(URDF, payload=payload)
@@ -191,7 +190,7 @@ def test_a_payload_is_one_more_mass():
     np.testing.assert_allclose(model.estimate(model.chain.posture(posture)).position, expected[:2], atol=1e-12)
 
 
-def test_a_payload_on_the_static_part_adds_to_a_weighed_one():
+def test_cg_model_with_a_payload_on_the_static_part_adds_it():
     static = StaticPart(80.0, np.array([0.0, 0.0]), np.diag([0.04, 1e-6, 4e-6]))
     payload = Payload("base_link", 20.0, (0.2, 0.1, 0.3), mass_sigma=0.5, position_sigma=0.02)
     without, with_load = (cg_model(URDF, static=static, tolerances=NOTHING, payload=p) for p in (None, payload))
@@ -207,7 +206,7 @@ def test_a_payload_on_the_static_part_adds_to_a_weighed_one():
     assert_covariance(np.array(found), with_load.estimate(q).covariance)
 
 
-def test_joints_may_be_named_and_wheels_and_idle_wrists_among_them():
+def test_cg_model_with_named_joints_takes_wheels_and_wrists():
     names = tuple(POSTURES["ready"])
     static = StaticPart(50.0, np.array([0.03, -0.01]), np.zeros((3, 3)))
     named = cg_model(URDF, joints=(*names, "front_left_wheel"), static=static)
@@ -219,7 +218,7 @@ def test_joints_may_be_named_and_wheels_and_idle_wrists_among_them():
     np.testing.assert_allclose(left.cg(np.ones(5)), expected[:2], atol=1e-12)
 
 
-def test_a_robot_without_arms_that_was_weighed():
+def test_cg_model_of_a_weighed_robot_without_arms_is_constant():
     husky = (
         '<robot><link name="base_link"><inertial><mass value="46"/></inertial></link>'
         '<link name="wheel"><inertial><mass value="2.6"/></inertial></link><joint name="w" type="continuous">'
@@ -232,14 +231,14 @@ def test_a_robot_without_arms_that_was_weighed():
     np.testing.assert_allclose(estimate.covariance, np.diag([4e-6, 9e-6]), atol=1e-18)
 
 
-def test_jacobian_of_the_center_of_gravity():
+def test_cg_jacobian_is_a_difference():
     model = cg_model(URDF, payload=Payload("right_gripper", 5.0))
     q, h = np.linspace(-1, 1, 10), 1e-6
     steps = np.eye(10) * h
     np.testing.assert_allclose(model.jacobian(q), (model.cg(q + steps) - model.cg(q - steps)).T / (2 * h), atol=1e-9)
 
 
-def test_an_estimate_with_covariance_takes_less_than_10_microseconds_too():
+def test_cg_estimate_takes_microseconds():
     model = cg_model(URDF, payload=Payload("right_gripper", 5.0))
     q, times = np.zeros(10), []
     model.estimate(q)
@@ -251,7 +250,7 @@ def test_an_estimate_with_covariance_takes_less_than_10_microseconds_too():
     assert min(times) < 10e-6
 
 
-def test_vaultbots_postures_are_where_their_names_say():
+def test_postures_of_vaultbot_are_where_their_names_place_them():
     """All seven of the thesis's arm configurations and its front stow, with centres of gravity between the wheels."""
     model = arms_model(VAULTBOT)
     cg = {name: model.cg(model.chain.posture(posture)) for name, posture in POSTURES.items()}
@@ -273,7 +272,7 @@ def test_vaultbots_postures_are_where_their_names_say():
     assert np.linalg.norm(cg["stow_back"]) == min(np.linalg.norm(v) for v in cg.values())
 
 
-def test_named_postures_keep_the_arms_off_each_other_and_the_robot():
+def test_postures_of_vaultbot_keep_the_arms_apart():
     """Along the lines of the links: each arm on its side, and above the bulkhead where it is over the robot."""
     for name, posture in POSTURES.items():
         poses = urdf_reference.link_poses(TEXT, posture)
@@ -291,7 +290,7 @@ def test_named_postures_keep_the_arms_off_each_other_and_the_robot():
 
 @pytest.mark.parametrize("x", np.arange(-0.06, 0.121, 0.02).round(3))
 @pytest.mark.parametrize("y", np.arange(-0.03, 0.031, 0.01).round(3))
-def test_arms_reach_every_point_of_the_calibration_grid(x, y):
+def test_posture_for_every_point_of_the_grid_is_found(x, y):
     model = arms_model(VAULTBOT)
     posture = posture_for(model, np.array([x, y]), POSTURES)
     found, _ = urdf_reference.center_of_mass(TEXT, posture)
@@ -302,14 +301,14 @@ def test_arms_reach_every_point_of_the_calibration_grid(x, y):
     assert min(np.abs(q - model.chain.posture(start)).max() for start in POSTURES.values()) < 1.0
 
 
-def test_a_center_of_gravity_out_of_reach():
+def test_posture_for_a_cg_out_of_reach_is_refused():
     with pytest.raises(CgError, match=r"no arm posture puts the centre of gravity at \(0.400, 0.000\) m; the nearest .* \(0\.1"):
         posture_for(arms_model(VAULTBOT), np.array([0.4, 0.0]), POSTURES)
     with pytest.raises(CgError, match="no posture to start from"):
         posture_for(arms_model(VAULTBOT), np.zeros(2), {})
 
 
-def test_a_robot_that_tips_over():
+def test_require_support_of_a_tipping_robot_is_refused():
     assert support_margin(np.array([[0.0, 0.0], [0.2, 0.0], [0.0, -0.3]]), 0.52, 0.56) == pytest.approx([0.26, 0.06, -0.02])
     require_support(np.array([0.26, 0.28]), 0.52, 0.56)
     heavy = Payload("base_link", 60.0, (1.0, 0.0, 0.0))
@@ -371,18 +370,18 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input(case):
+def test_cg_model_of_bad_input_is_refused(case):
     attempt, error, message = BAD[case]
     with pytest.raises(error, match=message):
         attempt()
 
 
-def test_static_part_cannot_be_had_from_a_urdf_without_base():
+def test_cg_model_of_a_urdf_without_base_is_refused():
     model = cg_model(NO_BASE, static=StaticPart(9.0, np.array([0.1, 0.0]), np.zeros((3, 3))))
     np.testing.assert_allclose(model.cg(np.zeros(1)), [(0.9 + 1.0) / 10, 0.0], atol=1e-12)
 
 
-def test_files_of_a_robot_beside_its_robot_file(tmp_path):
+def test_arms_model_takes_files_beside_the_robot_file(tmp_path):
     (tmp_path / "my.urdf").write_text(TEXT)
     (tmp_path / "my.srdf").write_text((resources.files("motion_models") / "robots" / "vaultbot.srdf").read_text())
     arms = Arms("my.urdf", postures="my.srdf", static_mass_kg=80.0, static_x_m=0.01, static_sigma_m=0.003, weighed_posture="stow_back")
@@ -394,7 +393,7 @@ def test_files_of_a_robot_beside_its_robot_file(tmp_path):
         arms_model(arms, tmp_path / "elsewhere")
 
 
-def test_weighings_file_to_center_of_gravity(tmp_path):
+def test_weighed_cg_of_a_file_is_that_of_its_rows(tmp_path):
     table = tmp_path / "weighings.csv"
     rows = [",".join(str(v) for v in readings_of(118.84, [0.03, -0.01])) for _ in range(5)]
     table.write_text("front_left_kg,front_right_kg,rear_left_kg,rear_right_kg\n" + "\n".join(rows))
@@ -406,7 +405,7 @@ def test_weighings_file_to_center_of_gravity(tmp_path):
 # --- along a log
 
 
-def test_tracker_takes_joints_in_any_order_and_from_several_publishers():
+def test_cg_tracker_takes_joints_of_several_publishers():
     model = arms_model(VAULTBOT)
     tracker = CgTracker(model)
     posture = POSTURES["front_left"]
@@ -416,7 +415,7 @@ def test_tracker_takes_joints_in_any_order_and_from_several_publishers():
     assert tracker.update(wheels, [100.0, 1e6, -3.0, math.nan]) is None
     assert tracker.update(left, [posture[name] for name in left]) is None
     assert tracker.missing == tuple(name for name in model.chain.joint_names if name.startswith("right"))
-    with pytest.raises(CgError, match=r"never told right_shoulder_pan_joint, .*name the arms' joints as the log does"):
+    with pytest.raises(CgError, match=r"never had right_shoulder_pan_joint, .*name the arms' joints as the log does"):
         tracker.require_all()
     mixed = [*reversed(right), *wheels]
     found = tracker.update(mixed, [*(posture[name] for name in reversed(right)), 1.0, 2.0, 3.0, 4.0])
@@ -430,7 +429,7 @@ def test_tracker_takes_joints_in_any_order_and_from_several_publishers():
     np.testing.assert_array_equal(moved.position, model.cg(model.chain.posture({**posture, "right_elbow_joint": 0.3})))
 
 
-def test_tracker_and_messages_that_tell_nothing_or_are_broken():
+def test_cg_tracker_of_empty_or_broken_messages_gives_none():
     tracker = CgTracker(arms_model(VAULTBOT))
     names = list(POSTURES["ready"])
     first = tracker.update(names, list(POSTURES["ready"].values()))

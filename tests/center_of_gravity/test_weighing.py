@@ -24,19 +24,19 @@ def loads(x, y, warp=0.0):
 
 
 @given(st.floats(-0.1, 0.12), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
-def test_any_way_of_standing_gives_the_same_center_of_gravity(x, y, warp):
+def test_cg_from_scales_of_any_warp_is_the_same(x, y, warp):
     found = cg_from_scales(loads(x, y, warp)[None], CONTACTS)
     assert found.mass == pytest.approx(MASS)
     np.testing.assert_allclose(found.position, [x, y], atol=1e-12)
 
 
-def test_order_of_the_wheels():
+def test_cg_from_scales_takes_the_order_of_the_wheels():
     front_left_heavy = cg_from_scales(np.array([[40.0, 20.0, 30.0, 10.0]]), CONTACTS)
     assert front_left_heavy.position[0] == pytest.approx((60 - 40) / 100 * 0.26)
     assert front_left_heavy.position[1] == pytest.approx((70 - 30) / 100 * 0.28)
 
 
-def test_covariance_is_that_of_many_weighed_robots():
+def test_cg_from_scales_covariance_is_that_of_samples():
     """4,000 robots, each with its own scales and wheels, weighed five times as in the thesis."""
     rng = np.random.default_rng(1)
     scales = Scales(reading_sigma_kg=0.3, calibration_sigma=0.004, contact_sigma_m=0.004)
@@ -54,7 +54,7 @@ def test_covariance_is_that_of_many_weighed_robots():
     np.testing.assert_allclose(np.cov(whitened), np.eye(3), atol=5 * math.sqrt(2 / 4000))  # five sigma
 
 
-def test_repeating_averages_the_readings_but_not_scales_and_wheels():
+def test_cg_from_scales_of_repeats_averages_readings_alone():
     truth = loads(0.05, -0.02)
 
     def covariance(n, scales):
@@ -67,7 +67,7 @@ def test_repeating_averages_the_readings_but_not_scales_and_wheels():
         assert np.trace(covariance(1, systematic)) > 0.0
 
 
-def test_weighings_that_differ_too_much_widen_the_covariance():
+def test_cg_from_scales_of_scattered_readings_widens():
     rng = np.random.default_rng(2)
     readings = loads(0.0, 0.0) + rng.normal(0, 2.0, (40, 4))
     honest, hopeful = (cg_from_scales(readings, CONTACTS, Scales(sigma, 0.0, 0.0)) for sigma in (2.0, 0.1))
@@ -81,7 +81,7 @@ def test_weighings_that_differ_too_much_widen_the_covariance():
 HEADER = "front_left_kg,front_right_kg,rear_left_kg,rear_right_kg,note\n"
 
 
-def test_table_is_read_whatever_its_order_spaces_and_other_columns(tmp_path):
+def test_read_weighings_takes_any_order_and_other_columns(tmp_path):
     path = tmp_path / "weighings.csv"
     path.write_text(
         "note, rear_right_kg,front_left_kg ,front_right_kg,rear_left_kg\nfirst,4,1, 2,3\nsecond,8,5,6,7.5\n\n", encoding="utf-8-sig"
@@ -105,7 +105,7 @@ BAD_TABLES = {
 
 
 @pytest.mark.parametrize("case", BAD_TABLES)
-def test_bad_tables(tmp_path, case):
+def test_read_weighings_of_bad_tables_is_refused(tmp_path, case):
     text, message = BAD_TABLES[case]
     path = tmp_path / "weighings.csv"
     path.write_text(text)
@@ -113,7 +113,7 @@ def test_bad_tables(tmp_path, case):
         read_weighings(path)
 
 
-def test_files_that_cannot_be_read(tmp_path):
+def test_read_weighings_of_unreadable_files_is_refused(tmp_path):
     with pytest.raises(CgError, match="cannot be read: No such file"):
         read_weighings(tmp_path / "none.csv")
     (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00\x01")
@@ -131,11 +131,11 @@ def test_files_that_cannot_be_read(tmp_path):
         ([[0.0, 0.0, 0.0, 0.0]], r"weighing 1: all four scales show 0 kg"),
     ],
 )
-def test_bad_readings(readings, message):
+def test_cg_from_scales_of_bad_readings_is_refused(readings, message):
     with pytest.raises(CgError, match=message):
         cg_from_scales(readings, CONTACTS)
 
 
-def test_a_weighing_without_any_uncertainty_says_so():
+def test_cg_from_scales_without_uncertainty_has_none():
     none = dataclasses.replace(Scales(), reading_sigma_kg=0.0, calibration_sigma=0.0, contact_sigma_m=0.0)
     np.testing.assert_array_equal(cg_from_scales(np.tile(loads(0, 0), (3, 1)), CONTACTS, none).covariance, np.zeros((3, 3)))

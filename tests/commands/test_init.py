@@ -1,7 +1,8 @@
-"""`skidloc init` from end to end: what it guesses of real logs, what it says is missing, and that its file works."""
+"""`skidloc init` from end to end: what it guesses of real logs, what it reports as missing, and that its file works."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -69,9 +70,9 @@ def test_init_of_a_pioneer_finds_its_drivers_constants(tmp_path: Path, capsys: p
 
 def test_init_without_geometry_names_what_to_measure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["init", str(HUSKY_BAG), "--out", str(tmp_path / "husky.toml")]) == 2
-    told = capsys.readouterr()
-    assert "--wheel-radius-m, --track-width-m, --wheelbase-m" in told.err
-    assert "! mount of imu_link (/imu/data)" in told.out
+    report = capsys.readouterr()
+    assert "--wheel-radius-m, --track-width-m, --wheelbase-m" in report.err
+    assert "! mount of imu_link (/imu/data)" in report.out
     assert not (tmp_path / "husky.toml").exists()
 
 
@@ -84,7 +85,7 @@ def test_init_with_a_urdf_takes_geometry_mounts_and_joints(tmp_path: Path, capsy
     assert robot.topics.odometry == "/husky_velocity_controller/odom"
     assert (robot.mounts["imu_link"].x, robot.mounts["imu_link"].yaw) == pytest.approx((0.1, 1.5))
     printed = capsys.readouterr().out
-    assert "k = 0.63 +- 0.07 from geometry" in printed
+    assert "k = 0.63 +- 0.06 from geometry" in printed
     assert "Drive about 60 s" in printed
     assert "wheel_separation_multiplier: 1 is written" in printed
 
@@ -94,4 +95,51 @@ def test_init_refuses_half_of_the_joints_and_lengths_below_zero(tmp_path: Path, 
     assert main([*base, "--left", "a_wheel"]) == 2
     assert main([*base, "--track-width-m", "-1"]) == 2
     assert main([*base, "--urdf", str(tmp_path / "none.urdf")]) == 2
-    assert capsys.readouterr().err.count("skidloc:") == 3
+    assert main([*base, "--urdf", str(HUSKY_BAG)]) == 2
+    assert main([*base, "--mass-kg", "nan"]) == 2
+    assert capsys.readouterr().err.count("skidloc:") == 5
+
+
+def answer(monkeypatch: pytest.MonkeyPatch, answers: Iterable[str]) -> None:
+    """A terminal whose user types ``answers``, and then the end of the input."""
+    lines = iter(answers)
+
+    def read(*_: object, **__: object) -> str:
+        try:
+            return next(lines)
+        except StopIteration:
+            raise EOFError from None
+
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr("rich.console.Console.is_terminal", True)
+    monkeypatch.setattr("rich.console.Console.input", read)
+
+
+def test_init_in_a_terminal_asks_again_after_hostile_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    answer(monkeypatch, ["maybe", "diff_drive", "-3", "nan", "0.1", "33", "[bold]", "0.33", "1e999", "", "0.25", "", "2", "n"])
+    out = tmp_path / "r.toml"
+    assert main(["init", str(DATA / "aces" / "aces.mcap"), "--out", str(out)]) == 0
+    robot = load_robot(out)
+    g = robot.geometry
+    assert (g.wheel_radius_m, g.track_width_m, g.wheelbase_m, robot.drive) == (0.1, 0.33, 0.25, "diff_drive")
+    assert robot.driver.wheel_separation_multiplier == 2.0
+
+
+@pytest.mark.parametrize("answers", [[], ["skid_steer", "0.1"], ["skid_steer", *["x"] * 9]], ids=["end", "end later", "no number"])
+def test_init_in_a_terminal_without_answers_names_the_options(
+    answers: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answer(monkeypatch, answers)
+    assert main(["init", str(DATA / "aces" / "aces.mcap"), "--out", str(tmp_path / "r.toml")]) == 2
+    assert "give" in capsys.readouterr().err
+    assert not (tmp_path / "r.toml").exists()
+
+
+def test_init_topic_options_go_before_guesses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["--track-width-m", "0.33", "--wheelbase-m", "0.25", "--wheel-radius-m", "0.1"]
+    base = ["init", str(PIONEER), "--out", str(tmp_path / "r.toml"), *given]
+    assert main([*base, "--topic.imu", "/gone"]) == 2
+    assert "--topic.imu /gone: fr079.mcap has no such topic; it has" in capsys.readouterr().err
+    assert main([*base, "--topic.joint-states", ""]) == 2
+    assert main([*base, "--topic.reference", "/odom"]) == 0
+    assert load_robot(tmp_path / "r.toml").topics.reference == "/odom"

@@ -1,8 +1,9 @@
-"""A robot on DDS, in a process of its own: plays a log's messages in real time by ROS 2's names, and hears what is published of it.
+"""A robot on DDS, in a process of its own: plays a log's messages in real time by ROS 2's names, and receives what is published of it.
 
-Its latched transforms are sent at once; for each number read from the standard input, the next so many seconds of the log. At the end of
-the input it prints one JSON line: what it heard, how long after each scan ("latencies_s": from before this process serialised the scan
-until it had read the answer), and when that was sent ("out_s": from the scan on the wire to the answer on the wire).
+Its latched transforms are sent at once; for each number read from the standard input, the next so many seconds of the log, as soon as a
+subscriber is matched that was not there before, and until the last scans are answered. At the end of the input it prints one JSON line:
+what it received, how long after each scan ("latencies_s": from before this process serialised the scan until it had read the answer), and
+when that was sent ("out_s": from the scan on the wire to the answer on the wire).
 
 Its types are written out by hand in cyclonedds' own IDL and serialised by it, so that it shares nothing with what it talks to but the
 wire.
@@ -194,6 +195,7 @@ class ParticipantEntitiesInfo(IdlStruct, typename="rmw_dds_common.msg.dds_.Parti
 
 
 PERIOD_NS = 80_000_000  # of the scans
+_LAST_SCANS, _DEADLINE_S = 4, 60.0
 SENT = {"/joint_states": JointState, "/scan": LaserScan, "/imu/data": Imu, "/tf_static": TFMessage}
 _RELIABLE = Policy.Reliability.Reliable(duration(seconds=1))
 VOLATILE = Qos(_RELIABLE, Policy.Durability.Volatile, Policy.History.KeepLast(50))
@@ -227,6 +229,13 @@ def scan_of(estimate_ns, sent):
     return before[-1] if before else None
 
 
+def wait(is_over) -> None:
+    """Until ``is_over`` or a deadline, which only a failure reaches."""
+    end = time.monotonic() + _DEADLINE_S
+    while not is_over() and time.monotonic() < end:
+        time.sleep(0.001)
+
+
 def main(path: str, domain: int) -> None:
     with AnyReader([Path(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         connections = [c for c in reader.connections if c.topic in SENT]
@@ -236,28 +245,28 @@ def main(path: str, domain: int) -> None:
     writers = {
         topic: DataWriter(participant, Topic(participant, f"rt{topic}", kind), QUALITY.get(topic, VOLATILE)) for topic, kind in SENT.items()
     }
-    hear = {
+    subscribed = {
         "/skidloc/odometry": Odometry,
         "/skidloc/odometry_predicted": Odometry,
         "/tf": TFMessage,
         "/diagnostics": DiagnosticArray,
         "/skidloc/corrections": JointState,
     }
-    readers = {topic: DataReader(participant, Topic(participant, f"rt{topic}", kind), VOLATILE) for topic, kind in hear.items()}
-    heard = {topic: [] for topic in hear}
+    readers = {topic: DataReader(participant, Topic(participant, f"rt{topic}", kind), VOLATILE) for topic, kind in subscribed.items()}
+    received = {topic: [] for topic in subscribed}
     scans_sent, answered, latencies, out, arrivals = {}, set(), [], [], []
 
     def listen() -> None:
         for topic, reader in readers.items():
             for sample in reader.take(100):
-                if not isinstance(sample, hear[topic]):
+                if not isinstance(sample, subscribed[topic]):
                     continue
                 if topic == "/skidloc/odometry" and (sent := scan_of(stamp(sample.header), scans_sent)) is not None:
                     before, after_ns = scans_sent[sent]
                     answered.add(sent)
                     latencies.append(time.monotonic() - before)
                     out.append((sample.sample_info.source_timestamp - after_ns) * 1e-9)
-                heard[topic].append(sample)
+                received[topic].append(sample)
                 if topic == "/skidloc/odometry":
                     arrivals.append(time.monotonic())
 
@@ -266,7 +275,16 @@ def main(path: str, domain: int) -> None:
             writers[topic].write(message)
     left = deque(record for record in records if record[1] != "/tf_static")
     print("up", flush=True)
+    matched: set[int] = set()
+    late_s = 0.0
+
+    def has_new_subscriber() -> bool:
+        return bool(set(writers["/scan"].get_matched_subscriptions()) - matched)
+
     for line in sys.stdin:
+        wait(has_new_subscriber)
+        matched.update(writers["/scan"].get_matched_subscriptions())
+        print("matched", flush=True)
         begin, first = time.monotonic(), left[0][0] if left else 0
         while left and left[0][0] < first + float(line) * 1e9:
             log_ns, topic, message = left.popleft()
@@ -274,26 +292,36 @@ def main(path: str, domain: int) -> None:
                 listen()
                 time.sleep(0.0003)
             before = time.monotonic()
+            late_s = max(late_s, before - begin - (log_ns - first) * 1e-9)
             writers[topic].write(message)
             if topic == "/scan":
                 scans_sent[stamp(message.header)] = before, time.time_ns()
-        end = time.monotonic() + 1.5
+        due = sorted(scans_sent)[-_LAST_SCANS]  # later ones wait for the wheels' next message
+
+        def is_answered(due=due) -> bool:
+            listen()
+            return max(answered, default=0) >= due
+
+        wait(is_answered)
+        end = time.monotonic() + 1.2  # diagnostics come every second
         while time.monotonic() < end:
             listen()
             time.sleep(0.001)
         print("played", flush=True)
-    odometry = heard["/skidloc/odometry"]
+    odometry = received["/skidloc/odometry"]
     print(
         json.dumps(
             {
                 "sent_scans": len(scans_sent),
                 "answered_scans": len(answered),
+                "answered_stamps": sorted(answered),
+                "late_s": late_s,
                 "scans": [[stamp_ns, sent_s] for stamp_ns, (sent_s, _) in scans_sent.items()],
                 "arrivals_s": arrivals,
-                "predicted_stamps": [stamp(o.header) for o in heard["/skidloc/odometry_predicted"]],
+                "predicted_stamps": [stamp(o.header) for o in received["/skidloc/odometry_predicted"]],
                 "predicted_poses": [
                     [o.pose.pose.position.x, o.pose.pose.position.y, o.pose.pose.orientation.z]
-                    for o in heard["/skidloc/odometry_predicted"]
+                    for o in received["/skidloc/odometry_predicted"]
                 ],
                 "latencies_s": latencies,
                 "out_s": out,
@@ -302,11 +330,11 @@ def main(path: str, domain: int) -> None:
                 "twists": [[o.twist.twist.linear.x, o.twist.twist.linear.y, o.twist.twist.angular.z] for o in odometry],
                 "pose_variances": [[o.pose.covariance[0], o.pose.covariance[7], o.pose.covariance[35]] for o in odometry],
                 "frames": sorted({(o.header.frame_id, o.child_frame_id) for o in odometry}),
-                "tf": len(heard["/tf"]),
-                "corrections": [[c.name, c.position, c.effort] for c in heard["/skidloc/corrections"]][-1:],
+                "tf": len(received["/tf"]),
+                "corrections": [[c.name, c.position, c.effort] for c in received["/skidloc/corrections"]][-1:],
                 "diagnostics": [
                     {s.name: {"level": s.level, "message": s.message, **{v.key: v.value for v in s.values}} for s in d.status}
-                    for d in heard["/diagnostics"]
+                    for d in received["/diagnostics"]
                 ],
             }
         )

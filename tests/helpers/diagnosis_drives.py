@@ -12,8 +12,7 @@ import numpy as np
 from localization.diagnosis.diagnose import DiagnosisResult, examine
 from localization.diagnosis.drive import drive_of_log
 from localization.logs import open_log
-from localization.simulation.drives import MoveArms, OpenLoop, Phase, Rest, constant, sine
-from localization.simulation.experiments import EXPERIMENTS, Experiment, ExperimentConfig
+from localization.simulation.experiments import EXPERIMENTS, Experiment, ExperimentConfig, MoveArms, OpenLoop, Phase, Rest, constant, sine
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import ImuConfig, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation

@@ -16,8 +16,7 @@ from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import Drive, drive_of_table
 from localization.diagnosis.findings import Diagnosis
 from localization.diagnosis.selection import signature_correlation
-from localization.simulation.drives import MoveArms, OpenLoop, Phase, Rest, constant
-from localization.simulation.experiments import Experiment, ExperimentConfig, grid_points
+from localization.simulation.experiments import Experiment, ExperimentConfig, MoveArms, OpenLoop, Phase, Rest, constant, grid_points
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig
 from motion_models import se2

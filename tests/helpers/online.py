@@ -22,13 +22,13 @@ from localization.logs.topic_roles import TopicOverrides
 from localization.pipeline import Pipeline, Trial
 from localization.ros.node import Node
 from localization.ros.publisher import DIAGNOSTICS, MAP, ODOMETRY, PATH, POSE, PREDICTED_ODOMETRY
+from localization.ros.session import View
 from localization.ros.session_files import Files
 from localization.ros.settings import LiveRun, NodeConfig
 from localization.ros.topic_names import Names
 from localization.ros.transforms import TF
 from localization.ros.transports.base import MonotonicTime, Received, ServiceHandler
-from localization.simulation.drives import MoveArms, OpenLoop, Rest, constant
-from localization.simulation.experiments import Experiment
+from localization.simulation.experiments import Experiment, MoveArms, OpenLoop, Rest, constant
 from localization.simulation.sensors import EncoderConfig, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from motion_models.registry import make_model
@@ -115,7 +115,7 @@ class LogTransport(MonotonicTime):
     def publishers(self) -> dict[str, set[str]]:
         return {topic: {kind} for topic, kind in self.types.items()}
 
-    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
+    def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
         """The first two seconds at once, then a tenth of a second at a time."""
         if not self._left:
             return []
@@ -144,6 +144,7 @@ def run_node(
     files: Files | None = None,
     config: NodeConfig | None = None,
     topics: TopicOverrides | None = None,
+    view: View | None = None,
 ) -> tuple[Node, list[str]]:
     """A node over all that ``transport`` holds, and what it reported. It publishes no predictions unless ``config`` has it so."""
     reports: list[str] = []
@@ -154,7 +155,7 @@ def run_node(
         topics or TopicOverrides(),
         node=config or NodeConfig(wait_s=0.0, predict=False),
     )
-    node = Node.start(transport, run, reports.append)
+    node = Node.start(transport, run, reports.append, view=view)
     node.spin(transport.is_empty)
     return node, reports
 

@@ -29,7 +29,7 @@ def influence(cg=(0.0, 0.0), velocity=(0.0, 0.0), acceleration=(0.0, 0.0, 0.0), 
 @pytest.mark.parametrize("wheels", [(-1.0, 1.0), (1.0, 2.0), (2.0, 2.0), (0.5, -1.5)])
 @pytest.mark.parametrize("cg", [(0.0, 0.0), (0.08, 0.02)])
 @pytest.mark.parametrize("saturation", [0.0, 1.0, 0.4])
-def test_the_quasi_static_limit_is_the_closed_solution(wheels, cg, saturation):
+def test_dynamics_settle_to_the_quasi_static_solution(wheels, cg, saturation):
     """At constant wheel rates the robot settles. What then still differs is the CG's height: it falls with the square of the speed."""
     model = FrictionModel(BODY.params, saturation, centripetal=True)
     off = []
@@ -48,7 +48,7 @@ def test_the_quasi_static_limit_is_the_closed_solution(wheels, cg, saturation):
 
 @pytest.mark.parametrize("law", list(SATURATION))
 @pytest.mark.parametrize("wheels", [(4.0, 9.0), (-5.0, 8.0), (10.0, 2.0)])
-def test_a_robot_with_its_cg_on_the_floor_settles_to_the_closed_solution_at_speed(wheels, law):
+def test_dynamics_at_speed_settle_to_the_centripetal_solution(wheels, law):
     """With the centripetal force the closed solution is that of the dynamics, not its limit."""
     q, cg = np.array(wheels), np.array([0.06, -0.03])
     body = dataclasses.replace(FLAT, rest_speed=1e-6, saturation=SATURATION[law])
@@ -61,7 +61,7 @@ def test_a_robot_with_its_cg_on_the_floor_settles_to_the_closed_solution_at_spee
 
 @given(st.floats(-3, 3), st.floats(-3, 3), st.floats(-0.15, 0.15), st.floats(-0.15, 0.15))
 @settings(max_examples=50, deadline=None)
-def test_the_closed_solution_has_no_acceleration_but_that_of_its_own_turn(q_l, q_r, x, y):
+def test_accelerations_of_the_steady_motion_are_zero(q_l, q_r, x, y):
     """Without the centripetal terms (an infinitely heavy gravity, so to say) the balance is the model's."""
     q, cg = np.array([q_l, q_r]), np.array([x, y])
     speed = 0.164 * math.hypot(*q) / math.sqrt(2)
@@ -75,7 +75,7 @@ def test_the_closed_solution_has_no_acceleration_but_that_of_its_own_turn(q_l, q
     np.testing.assert_allclose(got, [vy * wz + x * wz**2, -vx * wz + y * wz**2, 0.0], atol=1e-5)
 
 
-def test_the_longest_step_is_long_enough_and_not_too_long():
+def test_longest_step_is_stable_and_a_longer_one_is_not():
     """Rolling straight on from a disturbance: stable at the named step, and not at ten times it."""
     wheels, cg = np.array([2.0, 2.0]), Influence.of_cg(np.zeros(2))
     for saturation, too_long in ((1.0, 10.0), (0.0, 10.0 / (CREEP * BODY.params[5]))):
@@ -94,7 +94,7 @@ def energy(body, state, cg):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_locked_wheels_only_ever_take_energy(seed):
+def test_dynamics_of_locked_wheels_only_take_energy(seed):
     rng = np.random.default_rng(seed)
     cg = rng.uniform(-0.1, 0.1, 2)
     params = BODY.params + np.eye(12)[8] * 0.2 + np.eye(12)[9] * 0.3
@@ -111,7 +111,7 @@ def test_locked_wheels_only_ever_take_energy(seed):
     assert before < 1e-6 * start  # and it stops
 
 
-def test_runge_kutta_converges_with_the_fourth_order():
+def test_advance_converges_with_the_fourth_order():
     """Where nothing switches: a robot that slides through its turn, on rounded friction, and with a CG that moves."""
     body = dataclasses.replace(BODY, creep=0.2, cg_height=0.1)
     start = np.array([0.1, -0.2, 0.3, 0.2, 0.05, 0.4])
@@ -123,7 +123,7 @@ def test_runge_kutta_converges_with_the_fourth_order():
     assert slope == pytest.approx(-4.0, abs=0.3)
 
 
-def test_a_locked_robot_slides_to_a_halt_as_coulomb_says():
+def test_dynamics_of_a_locked_robot_follow_coulomb():
     """Second way: v^2 / (2 mu (1 - exp(-K)) g), the distance of a block."""
     v = 0.6
     state, _ = FLAT.advance(np.array([0, 0, 0, 0, v, 0.0]), 0.2, 40_000, STILL, Influence.of_cg(np.zeros(2)))
@@ -131,7 +131,7 @@ def test_a_locked_robot_slides_to_a_halt_as_coulomb_says():
     np.testing.assert_allclose(state[[0, 2, 3, 5]], 0.0, atol=1e-12)
 
 
-def test_a_force_at_the_gripper_pushes_as_newton_says():
+def test_dynamics_of_a_force_at_the_gripper_follow_newton():
     """With wheels that have no grip: F = m a at the CG, and a moment about it."""
     params = BODY.params.copy()
     params[3], params[6] = 1e-9, 0.0
@@ -142,7 +142,7 @@ def test_a_force_at_the_gripper_pushes_as_newton_says():
     np.testing.assert_allclose(got, [10.0 / body.mass + 0.02 * alpha, -4.0 / body.mass - 0.1 * alpha, alpha], rtol=1e-6)
 
 
-def test_arms_that_move_their_mass_move_the_base_the_other_way():
+def test_dynamics_of_moving_arms_move_the_base_back():
     """Momentum of a frictionless robot is kept while its CG moves ahead in its body."""
     params = BODY.params.copy()
     params[3], params[6] = 1e-9, 0.0
@@ -152,7 +152,7 @@ def test_arms_that_move_their_mass_move_the_base_the_other_way():
     np.testing.assert_allclose(state[:2], base, atol=1e-8)
 
 
-def test_a_turning_robot_without_grip_keeps_its_momentum_while_its_cg_moves():
+def test_dynamics_without_grip_keep_the_momentum():
     """3.18 and 3.19 with all their Coriolis terms, against the plain statement that the CG of a free body goes straight on."""
     params = BODY.params.copy()
     params[3], params[6] = 1e-9, 0.0
@@ -171,7 +171,7 @@ def test_a_turning_robot_without_grip_keeps_its_momentum_while_its_cg_moves():
     assert np.linalg.norm(at[1] - at[0]) > 0.05
 
 
-def test_braking_loads_the_front_and_a_high_robot_tips():
+def test_dynamics_of_braking_load_the_front_and_tip():
     """Locked wheels at speed: deceleration mu g moves the load by mu z_G, beyond the wheelbase once z_G > W / (2 mu)."""
     v = np.array([1.0, 0.0, 0.0])
     for height, tips in ((0.1, False), (0.25, False), (0.32, True)):
@@ -183,7 +183,7 @@ def test_braking_loads_the_front_and_a_high_robot_tips():
 
 @given(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.integers(0, 10_000))
 @settings(max_examples=60, deadline=None)
-def test_loads_and_accelerations_agree_with_each_other(x, y, seed):
+def test_dynamics_loads_agree_with_accelerations(x, y, seed):
     """3.21 to 3.26 written out for the accelerations that came out: a lower CG gives the same forces from loads moved by hand."""
     rng = np.random.default_rng(seed)
     wheels, twist = rng.uniform(-2, 2, 2), rng.uniform(-0.5, 0.5, 3)
@@ -205,7 +205,7 @@ def test_loads_and_accelerations_agree_with_each_other(x, y, seed):
     assert body.inertia * alpha == pytest.approx(moment, abs=1e-8)
 
 
-def test_bad_input_is_refused():
+def test_dynamics_of_bad_input_are_refused():
     with pytest.raises(CgError, match="tips over"):
         BODY.accelerations(STILL, np.zeros(3), Influence.of_cg(np.array([0.3, 0.0])))
     assert BODY.creep == CREEP

@@ -44,7 +44,7 @@ def rotation_scaling(model, params, angles, cg=(0.0, 0.0)):
 
 @pytest.mark.parametrize("size", list(SIZES))
 @pytest.mark.parametrize("stiffness", [1.0, 10.0, 1000.0])
-def test_k_in_place_is_that_of_the_geometry_at_any_stiffness(size, stiffness):
+def test_isotropic_k_in_place_is_that_of_the_geometry(size, stiffness):
     """Proportional tyres and sliding ones have the same k = 1 / (1 + (wheelbase / track)^2), if the contact is isotropic."""
     track, wheelbase = SIZES[size]
     params = with_params(track_width=track, wheelbase=wheelbase, slip_stiffness=stiffness, rolling_resistance=0.0)
@@ -52,7 +52,7 @@ def test_k_in_place_is_that_of_the_geometry_at_any_stiffness(size, stiffness):
 
 
 @pytest.mark.parametrize("size", list(SIZES))
-def test_k_of_gentle_arcs_is_that_of_the_geometry(size):
+def test_isotropic_k_of_gentle_arcs_is_that_of_the_geometry(size):
     track, wheelbase = SIZES[size]
     params = with_params(track_width=track, wheelbase=wheelbase, rolling_resistance=0.0)
     assert rotation_scaling(MODEL, params, np.array([1e-4]))[0] == pytest.approx(1 / (1 + (wheelbase / track) ** 2), rel=1e-3)
@@ -61,7 +61,7 @@ def test_k_of_gentle_arcs_is_that_of_the_geometry(size):
 
 
 @LAWS
-def test_k_falls_steadily_from_a_turn_in_place_to_gentle_arcs(saturation):
+def test_isotropic_k_from_turns_to_arcs_falls_steadily(saturation):
     """With a CG ahead; and by the thesis's law with a centred one, too."""
     model = FrictionModel(MODEL.nominal, saturation)
     params = with_params(rolling_resistance=0.0)
@@ -71,14 +71,14 @@ def test_k_falls_steadily_from_a_turn_in_place_to_gentle_arcs(saturation):
         assert k[0] < 0.9 * k[-1]
 
 
-def test_the_thesis_law_loses_the_turn_on_gentle_arcs():
+def test_thesis_law_on_gentle_arcs_loses_the_turn():
     thesis = FrictionModel(MODEL.nominal, SATURATION["thesis"])
     k = rotation_scaling(thesis, with_params(rolling_resistance=0.0), np.array([0.02, 0.05, 0.1, math.pi / 2]))
     assert k[0] < 0.4 * k[-1]
     assert k[2] < 0.85 * k[-1]
 
 
-def test_x_cr_moves_twice_as_far_as_the_cg_in_place_and_as_far_on_gentle_arcs():
+def test_x_cr_in_place_moves_twice_as_far_as_the_cg():
     params = with_params(rolling_resistance=0.0)
     for angle, low, high in ((math.pi / 2, 1.9, 2.3), (1e-3, 0.95, 1.1)):
         _, vy, wz = MODEL.twist(wheels_at(np.array(angle)), np.array([0.02, 0.0]), params).value
@@ -87,7 +87,7 @@ def test_x_cr_moves_twice_as_far_as_the_cg_in_place_and_as_far_on_gentle_arcs():
 
 @given(st.floats(0.0, 2 * math.pi), st.floats(1e-6, 0.9), st.floats(1.0, 30.0))
 @settings(deadline=None)
-def test_the_isotropic_force_opposes_the_slip_and_has_one_size_in_all_directions(direction, size, stiffness):
+def test_isotropic_force_opposes_the_slip_in_all_directions(direction, size, stiffness):
     on = tyre(stiffness, 1.0, 0.0, 0.0)
     slip, drift = -abs(size * math.cos(direction)), size * math.sin(direction)  # a braking wheel: V is its own speed
     f = contact(slip, drift, 1.0, on, CREEP)
@@ -96,7 +96,7 @@ def test_the_isotropic_force_opposes_the_slip_and_has_one_size_in_all_directions
     assert math.hypot(f.x, f.y) == pytest.approx(abs(along.x), rel=1e-9)
 
 
-def test_the_isotropic_force_is_continuous_through_zero_slip_and_the_thesis_lateral_one_is_not():
+def test_isotropic_force_at_zero_slip_is_continuous():
     for direction in np.linspace(0, 2 * math.pi, 9):
         c, s = 1e-5 * math.cos(direction), 1e-5 * math.sin(direction)
         f = contact(c, s, 1.0, tyre(10.0, 1.0, 0.0, 0.0), CREEP)
@@ -109,7 +109,7 @@ def test_the_isotropic_force_is_continuous_through_zero_slip_and_the_thesis_late
 @LAWS
 @given(speeds, speeds, speeds, st.floats(0.1, 50.0), st.floats(0.3, 2.0), st.floats(-0.9, 0.9))
 @settings(deadline=None)
-def test_a_contact_never_creates_power(saturation, slip, drift, roll, stiffness, mu_ratio, tread):
+def test_contact_force_never_creates_power(saturation, slip, drift, roll, stiffness, mu_ratio, tread):
     f = contact(slip, drift, roll, tyre(stiffness, mu_ratio, tread, saturation), CREEP)
     assert f.x * slip + f.y * drift <= 0.0
     assert math.hypot(f.x, f.y) <= max(1.0, mu_ratio) * (1.0 + abs(tread)) + 1e-12
@@ -118,7 +118,7 @@ def test_a_contact_never_creates_power(saturation, slip, drift, roll, stiffness,
 @LAWS
 @given(speeds, speeds, speeds, st.floats(1.0, 20.0))
 @settings(deadline=None)
-def test_force_derivatives_are_those_of_differences(saturation, slip, drift, roll, stiffness):
+def test_contact_force_derivatives_are_differences(saturation, slip, drift, roll, stiffness):
     if min(abs(slip), abs(slip + 2 * roll), abs(roll)) < 1e-3:  # V has kinks there
         return
     h, creep = 1e-6, 0.02
@@ -135,7 +135,7 @@ def test_force_derivatives_are_those_of_differences(saturation, slip, drift, rol
 
 @LAWS
 @pytest.mark.parametrize("centripetal", [False, True])
-def test_twist_derivatives_are_those_of_differences(saturation, centripetal):
+def test_friction_twist_derivatives_are_differences(saturation, centripetal):
     rng = np.random.default_rng(3)
     model = FrictionModel(MODEL.nominal, saturation, centripetal)
     params = with_params(warp=0.1, tread=0.1, scrub=0.01, mu_ratio=1.1, tracked_x=0.1, tracked_y=-0.05)
@@ -158,7 +158,7 @@ def test_twist_derivatives_are_those_of_differences(saturation, centripetal):
 
 
 @LAWS
-def test_without_the_centripetal_force_speed_scales_and_with_it_not(saturation):
+def test_friction_twist_scales_with_speed_unless_centripetal(saturation):
     wheels, cg = np.array([[2.0, 5.0], [-1.0, 3.0], [4.0, 4.5]]), np.array([0.03, -0.01])
     model = FrictionModel(MODEL.nominal, saturation)
     slow = model.twist(wheels, cg, MODEL.nominal).value
@@ -169,7 +169,7 @@ def test_without_the_centripetal_force_speed_scales_and_with_it_not(saturation):
     assert np.abs(at_speed - 4.0 * slow).max() > 0.01
 
 
-def test_the_centripetal_force_moves_the_centre_of_rotation_forward():
+def test_centripetal_force_moves_the_centre_of_rotation_forward():
     """m v w pushes outwards, so the contacts have to slip outwards."""
     pulled = dataclasses.replace(MODEL, centripetal=True)
     for wheels in ([10.0, 14.0], [14.0, 10.0]):
@@ -178,7 +178,7 @@ def test_the_centripetal_force_moves_the_centre_of_rotation_forward():
 
 
 @pytest.mark.parametrize(("saturation", "centripetal"), [(0.0, False), (0.4, False), (1.0, False), (0.0, True)])
-def test_the_inverse_finds_wheel_rates_at_any_speed(saturation, centripetal):
+def test_friction_wheels_at_any_speed_give_the_command(saturation, centripetal):
     rng = np.random.default_rng(8)
     model = FrictionModel(MODEL.nominal, saturation, centripetal)
     command, cg = rng.uniform([-2, -1.5], [2, 1.5], (500, 2)), rng.uniform(-0.1, 0.1, (500, 2))
@@ -186,7 +186,7 @@ def test_the_inverse_finds_wheel_rates_at_any_speed(saturation, centripetal):
     np.testing.assert_allclose(model.twist(wheels, cg, MODEL.nominal).value[:, [0, 2]], command, atol=1e-7)
 
 
-def test_a_robot_file_chooses_the_law():
+def test_friction_model_takes_the_law_of_the_robot_file():
     text = robot_toml(HUSKY)
     thesis = parse_robot(text + '[models.friction]\ncontact = "thesis"\ncentripetal = true\nwarp = 0.1\n', "test.toml")
     model = FrictionModel.from_robot(thesis)
@@ -207,13 +207,13 @@ def test_a_robot_file_chooses_the_law():
         ('slip_stiffness = "soft"', "models.friction.slip_stiffness must be a finite number of at most 1e.09, found 'soft'"),
     ],
 )
-def test_a_choice_that_does_not_exist_is_named(entry, message):
+def test_friction_model_of_an_unknown_law_is_refused(entry, message):
     with pytest.raises(RobotError, match=message):
         make_model("friction", parse_robot(f"{robot_toml(HUSKY)}[models.friction]\n{entry}\n", "test.toml"))
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0])
-def test_a_stiffness_that_is_not_positive_is_named(value):
+def test_friction_twist_without_positive_stiffness_is_refused(value):
     robot = parse_robot(f"{robot_toml(HUSKY)}[models.friction]\nslip_stiffness = {value}\n", "test.toml")
     model = make_model("friction", robot)
     with pytest.raises(ModelError, match=f"must be positive .* slip_stiffness = {value:g}"):

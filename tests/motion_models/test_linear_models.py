@@ -19,7 +19,7 @@ SLIP = np.array([0.04, 0.1, 0.2, 0.03, 0.05, 0.15])
 
 @settings(deadline=None)  # the first example compiles
 @given(RATE, RATE, st.floats(0.3, 1.5), st.floats(-1.5, -0.3), st.floats(-0.2, 0.2), st.floats(0.8, 1.2), st.floats(0.8, 1.2))
-def test_each_tread_does_not_slip_lengthwise_at_its_icr(
+def test_icr_tread_at_its_icr_does_not_slip_lengthwise(
     left: float, right: float, y_l: float, y_r: float, x: float, a_l: float, a_r: float
 ) -> None:
     """The definition of the ICRs, checked on the twist: the body at (x_icr, y_s) moves as the tread does, and not sideways."""
@@ -31,7 +31,7 @@ def test_each_tread_does_not_slip_lengthwise_at_its_icr(
     assert vy + wz * x == pytest.approx(0.0, abs=1e-12)
 
 
-def test_without_slip_terms_both_are_the_robots_own_diff_drive() -> None:
+def test_linear_models_without_slip_are_the_diff_drive() -> None:
     rng = np.random.default_rng(0)
     wheels = rng.uniform(-8.0, 8.0, (50, 2))
     base = make_model("diff_drive", ROBOT)
@@ -41,7 +41,7 @@ def test_without_slip_terms_both_are_the_robots_own_diff_drive() -> None:
         np.testing.assert_allclose(model.twist(wheels, CG, model.nominal).value, expected, atol=1e-12)
 
 
-def test_the_icr_model_is_one_of_the_full_linear_ones() -> None:
+def test_full_linear_holds_the_icr_model() -> None:
     icr, linear = make_model("icr", ROBOT), make_model("full_linear", ROBOT)
     params = np.array([0.7, -0.6, -0.05, 0.95, 1.02])
     matrix = icr.twist(np.zeros(2), CG, params).d_wheels
@@ -51,7 +51,7 @@ def test_the_icr_model_is_one_of_the_full_linear_ones() -> None:
 
 
 @given(RATE, RATE, st.floats(0.1, 10.0))
-def test_curvature_losses_do_not_care_for_speed_and_the_others_do(left: float, right: float, factor: float) -> None:
+def test_full_linear_curvature_losses_are_independent_of_speed(left: float, right: float, factor: float) -> None:
     model = make_model("full_linear", ROBOT)
     curvature, speed = model.nominal.copy(), model.nominal.copy()
     curvature[[8, 11]] = 0.3, 0.2
@@ -64,7 +64,7 @@ def test_curvature_losses_do_not_care_for_speed_and_the_others_do(left: float, r
     np.testing.assert_allclose(more, factor**2 * once, atol=1e-9)
 
 
-def test_the_losses_are_what_the_formulas_say() -> None:
+def test_full_linear_losses_are_those_of_the_formulas() -> None:
     """At one side standing, by hand: T = 1/2."""
     model = make_model("full_linear", ROBOT)
     params = model.nominal.copy()
@@ -78,7 +78,7 @@ def test_the_losses_are_what_the_formulas_say() -> None:
 
 
 @given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
-def test_the_inverse_gives_the_command_back_with_all_terms(vx: float, wz: float) -> None:
+def test_full_linear_wheels_with_all_terms_give_the_command(vx: float, wz: float) -> None:
     model = make_model("full_linear", ROBOT)
     params = model.nominal.copy()
     params[6:] = SLIP
@@ -86,7 +86,7 @@ def test_the_inverse_gives_the_command_back_with_all_terms(vx: float, wz: float)
     np.testing.assert_allclose(model.twist(wheels, CG, params).value[[0, 2]], [vx, wz], atol=1e-9)
 
 
-def test_commands_that_no_wheels_give_are_refused() -> None:
+def test_full_linear_wheels_of_impossible_commands_are_refused() -> None:
     model = make_model("full_linear", ROBOT)
     params = model.nominal.copy()
     params[7] = 2.0  # all forward motion is lost at half a radian per second

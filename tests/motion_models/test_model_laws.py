@@ -52,7 +52,7 @@ def identify(model, wheels, cg, value, start):
 
 @drawn
 @few
-def test_jacobians_are_those_of_differences(name, seed):
+def test_twist_derivatives_of_every_model_are_differences(name, seed):
     rng = np.random.default_rng(seed)
     model = make_model(name, ROBOT)
     params = some_params(model, rng)
@@ -67,7 +67,7 @@ def test_jacobians_are_those_of_differences(name, seed):
 
 @drawn
 @few
-def test_still_wheels_are_a_still_robot(name, seed):
+def test_twist_of_still_wheels_is_zero(name, seed):
     rng = np.random.default_rng(seed)
     model = make_model(name, ROBOT)
     twist = model.twist(np.zeros((4, 2)), some_drive(rng, 4)[1], some_params(model, rng))
@@ -79,7 +79,7 @@ def test_still_wheels_are_a_still_robot(name, seed):
 
 @drawn
 @settings(max_examples=5, deadline=None)
-def test_the_mirror_image_of_a_robot_is_a_robot_and_a_symmetric_one_is_its_own(name, seed):
+def test_twist_of_a_mirrored_robot_is_mirrored(name, seed):
     """Whatever is deliberately lopsided in a model (a warp, unlike sides) must be in its parameters: so a mirrored robot has some too."""
     rng = np.random.default_rng(seed)
     model = make_model(name, ROBOT)
@@ -97,7 +97,7 @@ def test_the_mirror_image_of_a_robot_is_a_robot_and_a_symmetric_one_is_its_own(n
 
 @drawn
 @few
-def test_time_may_be_cut_into_pieces(name, seed):
+def test_preintegrate_of_cut_intervals_is_that_of_whole_ones(name, seed):
     rng = np.random.default_rng(seed)
     model = make_model(name, ROBOT)
     params = some_params(model, rng)
@@ -113,7 +113,7 @@ def test_time_may_be_cut_into_pieces(name, seed):
 
 @drawn
 @few
-def test_the_inverse_gives_wheel_rates_that_do_what_was_wanted(name, seed):
+def test_wheels_of_a_command_give_the_command(name, seed):
     rng = np.random.default_rng(seed)
     model = make_model(name, ROBOT)
     params = some_params(model, rng)
@@ -126,7 +126,7 @@ def test_the_inverse_gives_wheel_rates_that_do_what_was_wanted(name, seed):
 
 @drawn
 @few
-def test_a_batch_is_a_loop(name, seed):
+def test_twist_of_a_batch_is_a_loop(name, seed):
     rng = np.random.default_rng(seed)
     model = make_model(name, ROBOT)
     params = some_params(model, rng)
@@ -145,7 +145,7 @@ def test_a_batch_is_a_loop(name, seed):
 
 @drawn
 @settings(max_examples=5, deadline=None)
-def test_identification_recovers_the_parameters_from_clean_data(name, seed):
+def test_fit_of_clean_data_recovers_the_parameters(name, seed):
     rng = np.random.default_rng(seed)
     model = make_model(name, ROBOT)
     truth = some_params(model, rng)

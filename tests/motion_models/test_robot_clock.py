@@ -32,6 +32,6 @@ def test_parse_robot_bad_clock_is_refused(line: str, message: str) -> None:
 
 
 def test_parse_robot_multiplier_far_from_one_is_refused() -> None:
-    text = robot_toml(load_robot("husky_a200")).replace("left_wheel_radius_multiplier = 1.0", "left_wheel_radius_multiplier = 0.0")
+    text = robot_toml(load_robot("husky_a200")).replace("[geometry]\n", "[geometry]\nleft_wheel_radius_multiplier = 0.0\n")
     with pytest.raises(RobotError, match="must be near 1"):
         parse_robot(text, "test")

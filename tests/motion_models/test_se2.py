@@ -58,7 +58,7 @@ def assert_same_pose(a, b, atol=ROUNDING):
 
 
 @law(POSES)
-def test_exp_is_the_matrix_exponential(tangent):
+def test_exp_of_tangents_is_the_matrix_exponential(tangent):
     np.testing.assert_allclose(matrix(se2.exp(tangent)), expm(twist_matrix(tangent)), atol=1e-11)
 
 
@@ -73,17 +73,17 @@ def test_log_of_exp_is_the_tangent(tangent):
 
 
 @law(POSES)
-def test_log_is_the_shortest_turn(pose):
+def test_log_of_any_pose_is_the_shortest_turn(pose):
     assert -math.pi <= se2.log(pose)[2] < math.pi
 
 
 @law(POSES, POSES, POSES)
-def test_composition_is_associative(a, b, c):
+def test_compose_of_three_poses_is_associative(a, b, c):
     assert_same_pose(se2.compose(se2.compose(a, b), c), se2.compose(a, se2.compose(b, c)))
 
 
 @law(POSES)
-def test_identity_and_inverse(pose):
+def test_inverse_composed_with_its_pose_is_the_identity(pose):
     identity = np.zeros(3)
     assert_same_pose(se2.compose(pose, identity), pose)
     assert_same_pose(se2.compose(identity, pose), pose)
@@ -93,18 +93,18 @@ def test_identity_and_inverse(pose):
 
 
 @law(POSES, POSES)
-def test_composition_and_inverse_are_those_of_matrices(a, b):
+def test_compose_and_inverse_are_those_of_matrices(a, b):
     np.testing.assert_allclose(matrix(se2.compose(a, b)), matrix(a) @ matrix(b), atol=ROUNDING)
     np.testing.assert_allclose(matrix(se2.inverse(a)), np.linalg.inv(matrix(a)), atol=ROUNDING)
 
 
 @law(POSES, POSES)
-def test_between_undoes_compose(a, b):
+def test_between_of_composed_poses_is_the_motion(a, b):
     assert_same_pose(se2.between(a, se2.compose(a, b)), b)
 
 
 @law(POSES, POSES, st.tuples(LENGTHS, LENGTHS).map(np.array))
-def test_transform_carries_points_as_compose_carries_origins(a, b, point):
+def test_transform_of_points_is_compose_of_origins(a, b, point):
     np.testing.assert_allclose(se2.transform(se2.compose(a, b), point), se2.transform(a, se2.transform(b, point)), atol=ROUNDING)
     np.testing.assert_allclose(se2.transform(a, b[:2]), se2.compose(a, b)[:2], atol=ROUNDING)
 
@@ -117,7 +117,7 @@ def test_adjoint_moves_a_tangent_to_the_other_side(pose, tangent):
 
 
 @law(POSES, POSES)
-def test_adjoint_is_a_homomorphism(a, b):
+def test_adjoint_of_composed_poses_is_the_product(a, b):
     np.testing.assert_allclose(se2.adjoint(se2.compose(a, b)), se2.adjoint(a) @ se2.adjoint(b), atol=1e-11)
     np.testing.assert_allclose(se2.adjoint(se2.inverse(a)), np.linalg.inv(se2.adjoint(a)), atol=1e-9)
 
@@ -142,13 +142,13 @@ def test_right_jacobian_inverse_is_the_derivative_of_log(tangent):
 
 
 @law(POSES, POSES)
-def test_interpolation_ends_where_it_should(a, b):
+def test_interpolate_at_both_ends_gives_the_poses(a, b):
     assert_same_pose(se2.interpolate(a, b, 0.0), a)
     assert_same_pose(se2.interpolate(a, b, 1.0), b, atol=1e-11)
 
 
 @law(POSES, st.tuples(LENGTHS, LENGTHS, st.floats(-3.0, 3.0)).map(np.array), st.floats(0.0, 1.0))
-def test_interpolation_has_a_constant_twist(a, twist, fraction):
+def test_interpolate_between_poses_has_a_constant_twist(a, twist, fraction):
     pose = se2.interpolate(a, se2.compose(a, se2.exp(twist)), fraction)
     assert_same_pose(pose, se2.compose(a, se2.exp(fraction * twist)), atol=1e-11)
 
@@ -159,7 +159,7 @@ def series(t, offset, odd):
 
 
 @pytest.mark.parametrize("theta", [0.0, 1e-300, 1e-9, 9.9e-5, 9.9999999e-5, 1e-4, 1.0001e-4, 2e-4, 1e-3, 1e-2, 0.1, 0.5, -1.1e-4, -1e-3])
-def test_no_digits_are_lost_at_small_angles(theta):
+def test_exp_and_log_at_small_angles_keep_all_digits(theta):
     sine, cosine = series(theta, 1, False), series(theta, 1, True)  # sin(t)/t, (1 - cos t)/t
     np.testing.assert_allclose(se2.exp([1.0, 0.0, theta]), [sine, cosine, theta], rtol=0, atol=1e-15)
     f, g = series(theta, 2, True), series(theta, 2, False)  # (t - sin t)/t^2, (1 - cos t)/t^2
@@ -167,20 +167,20 @@ def test_no_digits_are_lost_at_small_angles(theta):
 
 
 @law(POSES)
-def test_scalar_exp_is_exp(tangent):
+def test_scalar_exp_of_tangents_is_exp(tangent):
     # not bit for bit: numpy's and the compiler's sine may differ in the last place
     np.testing.assert_allclose(se2.scalar_exp(tuple(tangent)), se2.exp(tangent), rtol=1e-15, atol=1e-13)
 
 
 @law(st.floats(-100.0, 100.0))
-def test_wrapped_angles_are_the_same_angle_in_the_half_open_interval(angle):
+def test_wrap_angle_of_any_angle_is_in_the_half_open_interval(angle):
     wrapped = float(se2.wrap_angle(angle))
     assert -math.pi <= wrapped < math.pi
     turns = (angle - wrapped) / (2 * math.pi)
     assert abs(turns - round(turns)) < 1e-14 * 20
 
 
-def test_wrapping_stays_in_the_interval_at_the_cut():
+def test_wrap_angle_at_the_cut_stays_in_the_interval():
     just_below = np.nextafter(-math.pi, -4.0)
     assert np.all(np.abs(se2.wrap_angle([just_below, -math.pi, math.pi, np.nextafter(math.pi, 4.0)]) + math.pi) < 1e-15)
 
@@ -189,7 +189,7 @@ BATCHES = arrays(float, (4, 3), elements=st.floats(-3.0, 3.0))
 
 
 @law(BATCHES, BATCHES)
-def test_a_batch_is_a_loop(a, b):
+def test_se2_functions_of_a_batch_are_a_loop(a, b):
     # vector instructions may round the last place differently
     assert_equal = partial(np.testing.assert_allclose, rtol=1e-13, atol=1e-13)
     for function in (se2.exp, se2.log, se2.inverse, se2.adjoint, se2.right_jacobian, se2.right_jacobian_inverse):
@@ -204,20 +204,20 @@ def test_a_batch_is_a_loop(a, b):
 
 
 @law(POSES, POSES)
-def test_inputs_are_left_alone(a, b):
+def test_se2_functions_leave_inputs_unchanged(a, b):
     before = a.copy(), b.copy()
     se2.compose(a, b), se2.interpolate(a, b, 0.3), se2.log(a), se2.exp(a), se2.right_jacobian(a), se2.transform(a, b[:2])
     assert np.array_equal(a, before[0])
     assert np.array_equal(b, before[1])
 
 
-def test_processes_that_compile_at_the_same_time_leave_what_others_can_load(tmp_path):
+def test_jit_cache_of_parallel_processes_can_be_loaded(tmp_path):
     """Without a lock, two in three such starts end with a crash, and so does every later one."""
     shutil.copy(se2.__file__, tmp_path / "se2.py")
     code = "import numpy as np, se2; print(se2.compose(np.ones(3), np.ones(3)).tolist(), se2.log(np.ones(3)).tolist())"
     command, environment = [sys.executable, "-c", code], {**os.environ, "PYTHONPATH": str(tmp_path)}
     first = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
-    told = [process.communicate(timeout=120)[0] for process in first]
-    told.append(subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, timeout=120, check=False).stdout)
+    outputs = [process.communicate(timeout=120)[0] for process in first]
+    outputs.append(subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, timeout=120, check=False).stdout)
     expected = f"{se2.compose(np.ones(3), np.ones(3)).tolist()} {se2.log(np.ones(3)).tolist()}\n"
-    assert told == [expected] * 4
+    assert outputs == [expected] * 4

@@ -34,7 +34,7 @@ AHEAD = 300  # events after a cut that are compared: some 30 scans
 
 
 @pytest.mark.parametrize("kind", KINDS, ids="-".join)
-def test_cut_anywhere_and_resumed_the_results_are_the_same_to_the_last_bit(kind):
+def test_pipeline_cut_and_resumed_gives_the_same_bits(kind):
     events, _ = drive_events()
     cuts = {0, 1, 2, 60, *np.random.default_rng(3).integers(3, len(events), 9).tolist(), len(events)}
     pipeline, whole, states, made = new_core(*kind), [], {}, []
@@ -61,7 +61,7 @@ def test_cut_anywhere_and_resumed_the_results_are_the_same_to_the_last_bit(kind)
 
 
 @pytest.mark.parametrize("estimator", [name for name in ESTIMATORS if name != "odometry"])
-def test_places_that_are_told_late_reach_whoever_was_resumed(estimator):
+def test_resumed_pipeline_with_late_mounts_gives_the_same_bits(estimator):
     """Frames are unknown to all parts of a pipeline until one moment: cut shortly before, or not."""
     events, mounts = drive_events()
     cut, met = 1000, 1100
@@ -93,18 +93,18 @@ print(len(found), hashlib.sha256(repr(found).encode()).hexdigest())
 """
 
 
-def test_another_process_resumes_it(tmp_path):
+def test_checkpoint_resumed_by_another_process_gives_the_same_bits(tmp_path):
     events, _ = drive_events()
     cut, pipeline = 1500, new_core("ekf")
     for event in events[:cut]:
         pipeline.process(event)
     write_checkpoint(tmp_path / "state", pipeline, {"events": cut}, {}, {})
     rest = [numbers(e) for event in events[cut:] for e in pipeline.process(event)]
-    said = subprocess.run([sys.executable, "-c", _RESUME, tmp_path / "state", str(cut)], check=True, capture_output=True, text=True).stdout
-    assert said.split() == [str(len(rest)), hashlib.sha256(repr(rest).encode()).hexdigest()]
+    text = subprocess.run([sys.executable, "-c", _RESUME, tmp_path / "state", str(cut)], check=True, capture_output=True, text=True).stdout
+    assert text.split() == [str(len(rest)), hashlib.sha256(repr(rest).encode()).hexdigest()]
 
 
-def test_a_list_of_many_alike_is_written_down_as_columns():
+def test_serialize_list_of_equal_classes_writes_columns():
     """One by one, each with names and shapes of its own, they would take seconds and megabytes of text."""
     rng = np.random.default_rng(0)
     samples = [WheelSample(i, rng.normal(size=2), rng.normal(size=2)) for i in range(20_000)]
@@ -125,11 +125,11 @@ values = st.recursive(
 
 @given(values)
 @settings(max_examples=60, deadline=None)
-def test_plain_values_come_back_as_they_were(value):
+def test_deserialize_of_plain_values_returns_them(value):
     assert repr(deserialize(*serialize(value))) == repr(value)
 
 
-def test_what_is_held_twice_stays_one_and_views_stay_views():
+def test_deserialize_keeps_shared_objects_and_views():
     base = np.arange(24.0).reshape(4, 6).copy()
     a, b, view, turned = deserialize(*serialize([base, base, base[1:, ::2], np.asfortranarray(base)]))
     assert a is b
@@ -141,7 +141,7 @@ def test_what_is_held_twice_stays_one_and_views_stay_views():
 
 
 @pytest.mark.parametrize("strange", [print, object(), {1, 2}, np.array([object()]), sys])
-def test_what_cannot_be_written_down_is_named(strange):
+def test_serialize_of_a_foreign_object_is_refused_by_name(strange):
     with pytest.raises(CheckpointError, match="holds a"):
         serialize([strange])
 
@@ -157,7 +157,7 @@ def made_by(robot=ROBOT, model="skid_steer", config=None):
     return fingerprints(robot=robot, model=make_model(model, robot), estimator="ekf", configuration=config or ReplayConfig())
 
 
-def test_damage_anywhere_is_noticed(state):
+def test_read_checkpoint_with_any_damage_is_refused(state):
     content = bytearray(state.read_bytes())
     rng = np.random.default_rng(1)
     for at in [0, 8, 20, 90, 200, len(content) - 1, *rng.integers(0, len(content), 30)]:
@@ -191,14 +191,14 @@ def test_damage_anywhere_is_noticed(state):
         ("topics", [1]),
     ],
 )
-def test_an_odd_head_is_refused_though_its_check_sum_is_right(state, name, value):
+def test_read_checkpoint_with_a_malformed_head_is_refused(state, name, value):
     reseal(state, name, value)
     for read in (read_head, lambda path: read_checkpoint(path, made_by(), {})):
         with pytest.raises(CheckpointError, match="no readable head"):
             read(state)
 
 
-def test_foreign_files_are_refused_and_run_no_code(tmp_path):
+def test_read_checkpoint_of_a_foreign_file_runs_no_code(tmp_path):
     path, trap = tmp_path / "x", tmp_path / "trap"
 
     class Trap:
@@ -220,7 +220,7 @@ def test_foreign_files_are_refused_and_run_no_code(tmp_path):
 @pytest.mark.parametrize(
     "kind", [["c", "os", "system", {}], ["c", "subprocess", "Popen", {}], ["c", "localization.pipeline", "Nobody", {}]]
 )
-def test_only_classes_of_this_project_are_made(kind):
+def test_deserialize_of_a_foreign_class_is_refused(kind):
     text = json.dumps({"root": ["o", 0], "objects": [kind], "arrays": []}).encode()
     with pytest.raises(CheckpointError, match="does not have"):
         deserialize(text, b"")
@@ -231,28 +231,28 @@ def test_only_classes_of_this_project_are_made(kind):
 
 
 @given(st.binary(max_size=60), st.binary(max_size=20))
-def test_bytes_that_mean_nothing_are_refused_whatever_they_are(text, blob):
+def test_deserialize_of_random_bytes_is_refused(text, blob):
     with pytest.raises(CheckpointError):
         deserialize(text, blob)
 
 
-def test_the_state_of_another_robot_model_or_configuration_is_refused(state):
+def test_read_checkpoint_of_another_robot_or_model_is_refused(state):
     assert isinstance(read_checkpoint(state, made_by(), {}).value, Pipeline)
     heavier = dataclasses.replace(ROBOT, geometry=dataclasses.replace(ROBOT.geometry, mass_kg=120.0))
-    for other, told in [
+    for other, error in [
         (made_by(load_robot("husky_a200")), r"another .*robot \('vaultbot' \w+ then, 'husky_a200' \w+ now\)"),
         (made_by(heavier), "another robot"),
         (made_by(model="diff_drive"), "another model"),
         (made_by(config=ReplayConfig(step=StepConfig(wait_s=0.2))), "another configuration"),
         ({**made_by(), "version of numpy": "1.0"}, "another version of numpy"),
     ]:
-        with pytest.raises(CheckpointError, match=told):
+        with pytest.raises(CheckpointError, match=error):
             read_checkpoint(state, other, {})
     moved = dataclasses.replace(ROBOT, folder=state.parent)
     assert isinstance(read_checkpoint(state, made_by(moved), {}).value, Pipeline)
 
 
-def test_the_old_state_stays_until_the_new_one_is_whole(state, monkeypatch):
+def test_write_checkpoint_interrupted_keeps_the_old_state(state, monkeypatch):
     before = state.read_bytes()
 
     def full_disk(number):
@@ -265,7 +265,7 @@ def test_the_old_state_stays_until_the_new_one_is_whole(state, monkeypatch):
     assert [path.name for path in state.parent.iterdir()] == ["state"]
 
 
-def test_dumper_writes_no_more_often_than_it_is_told_and_reports_a_full_disk(tmp_path, monkeypatch):
+def test_checkpoint_writer_keeps_its_period_and_reports_a_full_disk(tmp_path, monkeypatch):
     checkpoints = CheckpointWriter(tmp_path / "state", {}, {}, every_s=30.0)
     assert checkpoints.is_due()
     checkpoints.write([1.5], {"events": 7})
@@ -285,7 +285,7 @@ def test_dumper_writes_no_more_often_than_it_is_told_and_reports_a_full_disk(tmp
     assert read_checkpoint(tmp_path / "state", {}, {}).value == [1.5]
 
 
-def test_submap_is_written_as_key_scans_and_matches_bit_by_bit():
+def test_serialized_submap_is_key_scans_and_matches_bit_by_bit():
     """Voxels, their surfaces and the image of the search follow from the points."""
     rng, matcher = np.random.default_rng(0), ScanMatcher(LidarConfig(), 0.1)
     angles = np.linspace(-3.1, 3.1, 400)
@@ -305,7 +305,7 @@ def test_submap_is_written_as_key_scans_and_matches_bit_by_bit():
     assert deserialize(*serialize(ScanMatcher(LidarConfig(), 0.1))).points().shape == (0, 2)
 
 
-def test_pair_is_shared_not_written():
+def test_serialize_does_not_write_shared_objects():
     model = make_model("skid_steer", ROBOT)
     pair = Trial(model, "ekf")
     assert deserialize(*serialize([pair, model], {"model": model}), {"model": model})[1] is model

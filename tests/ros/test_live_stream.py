@@ -46,8 +46,8 @@ pytestmark = pytest.mark.xdist_group("online")
 @functools.cache
 def undisturbed(estimator):
     transport = LogTransport(drive_log())
-    node, told = run_node(transport, estimator)
-    return transport, node, told
+    node, reports = run_node(transport, estimator)
+    return transport, node, reports
 
 
 @pytest.fixture
@@ -67,8 +67,8 @@ def _wrapped(difference):
     return np.array([difference[0], difference[1], math.remainder(difference[2], math.tau)])
 
 
-def test_live_and_replay_give_the_same_numbers(calm):
-    transport, node, told = calm
+def test_live_node_gives_the_numbers_of_a_replay(calm):
+    transport, node, reports = calm
     log = open_log(drive_log(), ROBOT)
     run = replay(log.events(), [Trial(make_model("skid_steer", ROBOT), "ekf")], ROBOT, log.mounts, True)[0]
     live = track(transport)
@@ -78,11 +78,11 @@ def test_live_and_replay_give_the_same_numbers(calm):
         turn = np.array([[math.cos(pose[2]), -math.sin(pose[2])], [math.sin(pose[2]), math.cos(pose[2])]])
         in_odom = np.diag(turn @ covariance[:2, :2] @ turn.T)  # ROS's covariance is in the axes of odom
         np.testing.assert_allclose(live[stamp][1] ** 2, [*in_odom, covariance[2, 2]], rtol=1e-9, atol=1e-18)
-    assert told == []
+    assert reports == []
     assert node.warnings() == []
 
 
-def test_what_is_published(calm):
+def test_node_publishes_odometry_transforms_and_diagnostics(calm):
     transport, node, _ = calm
     odometry, tf = published(transport, ODOMETRY), published(transport, TF)
     assert len(odometry) == len(tf) > 250
@@ -104,6 +104,7 @@ def test_what_is_published(calm):
         "skidloc: files",
         "skidloc: messages",
         "skidloc: transforms",
+        "skidloc: diagnosis",
     }
     values = {v.key: v.value for v in statuses["skidloc: lidar"].values}
     assert {"degeneracy", "nis_mean", "lost_share"} <= set(values)
@@ -112,16 +113,16 @@ def test_what_is_published(calm):
     assert node.session.health.latency_p99_s > 0.0
 
 
-def test_subscriptions_are_of_sensor_data_but_for_static_transforms(calm):
+def test_node_subscribes_as_sensor_data_but_to_tf_static(calm):
     subscribed = calm[0].subscribed
     assert [topic for topic, is_latched in subscribed.items() if is_latched] == ["/tf_static"]
     assert {"/joint_states", "/scan", "/points", "/imu/data", "/center_of_gravity"} <= set(subscribed)
-    commands = {"/set_pose", "/initialpose"}
+    commands = {"/set_pose", "/initialpose", *(f"/skidloc/{name}" for name in ("reset", "pause", "tare_payload", "payload"))}
     assert calm[0].kept == {"/joint_states", "/scan", "/imu/data", "/tf_static", "/tf", *commands}  # unused topics cost nothing
 
 
 @pytest.mark.parametrize(("estimator", "seed"), [("ekf", 0), ("ekf", 1), ("graph", 2)])
-def test_loss_duplicates_and_reordering_change_the_pose_by_less_than_its_sigma(estimator, seed):
+def test_lost_doubled_and_late_messages_move_the_pose_within_sigma(estimator, seed):
     faulty = LogTransport(drive_log(), lambda messages: shaken(messages, seed))
     node, _ = run_node(faulty, estimator)
     ratio, share = worst(faulty, undisturbed(estimator)[0])
@@ -152,10 +153,10 @@ def restamped(message, shift_ns, kinds={"/scan": "LaserScan", "/joint_states": "
 
 
 @pytest.mark.parametrize("jump_s", [500.0, -0.9, 3.0])
-def test_the_clock_of_all_sensors_jumps(jump_s, calm):
+def test_clock_jump_of_all_sensors_moves_the_pose_within_sigma(jump_s, calm):
     """Set forward and back: the pose hardly notices, and what is published bears the sender's new stamps.
 
-    Set back by less than a second, which nothing tells from jitter, it costs no more than was driven in that time.
+    Set back by less than a second, which cannot be distinguished from jitter, it costs no more than was driven in that time.
     """
 
     def jumping(messages):
@@ -174,7 +175,7 @@ def test_the_clock_of_all_sensors_jumps(jump_s, calm):
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "graph"])
-def test_what_the_network_held_comes_at_once_and_the_clocks_stay(estimator):
+def test_burst_after_a_silent_network_leaves_the_clocks(estimator):
     """For six seconds nothing comes, then all that its queues could keep: of wheels and IMU the newer half."""
 
     def held(messages):
@@ -204,7 +205,7 @@ def silenced(topic, begin_s, end_s):
 
 
 @pytest.mark.parametrize("topic", ["/scan", "/imu/data", "/joint_states"])
-def test_a_sensor_vanishes_and_returns(topic, calm):
+def test_sensor_that_vanishes_and_returns_is_used_again(topic, calm):
     transport = LogTransport(drive_log(), silenced(topic, 6.0, 10.0))
     node, _ = run_node(transport)
     a, b = track(calm[0]), track(transport)
@@ -219,7 +220,7 @@ def test_a_sensor_vanishes_and_returns(topic, calm):
     assert node.session.pipeline.estimator.counts()["matched"] > 150
 
 
-def test_messages_wait_for_the_next_scan(calm):
+def test_batch_s_ends_shortly_before_the_next_scan(calm):
     """They are looked at once before it is due; at once when it is late, or if there is no LiDAR."""
     stream = calm[1]._stream
     scans = stream._rates["/scan"]
@@ -227,29 +228,29 @@ def test_messages_wait_for_the_next_scan(calm):
     assert period == pytest.approx(0.08, rel=0.1)
 
     def rests():
-        return [stream.patience_s(last + int(part * period * S)) / period for part in (0.0, 0.3, 0.93, 0.97, 1.05, 1.15, 50.0)]
+        return [stream.batch_s(last + int(part * period * S)) / period for part in (0.0, 0.3, 0.93, 0.97, 1.05, 1.15, 50.0)]
 
     assert rests() == pytest.approx([0.95, 0.65, 0.02, 0.13, 0.05, 0.0, 0.0], abs=1e-6)
     alone = LogTransport(drive_log(), silenced("/scan", 0.0, 99.0))
     alone.types.pop("/scan")
     node, _ = run_node(alone)
-    assert node._stream.patience_s(node._stream._rates["/joint_states"]._last_ns) == 0.0
+    assert node._stream.batch_s(node._stream._rates["/joint_states"]._last_ns) == 0.0
 
 
-def test_nobody_is_patient_while_a_scan_waits_for_the_wheels():
+def test_batch_s_is_zero_while_a_scan_waits_for_the_wheels():
     """A scan that is ahead of the wheels is used with the very next message that they send."""
     node, _ = run_node(LogTransport(drive_log()))
     scan, newest_ns = node.session.health._scan, node._newest_ns
     node._stream._rates["/scan"]._last_ns = time.monotonic_ns()
-    assert node._patience_s() > 0.0
+    assert node._batch_s() > 0.0
     assert node.session.process(dataclasses.replace(scan, stamp_ns=newest_ns + S)) == []
-    assert node._patience_s() == 0.0
+    assert node._batch_s() == 0.0
     assert node.session.process(WheelSample(newest_ns + S + S // 10, np.zeros(2), np.full(2, np.nan)))
     node._stream._rates["/scan"]._last_ns = time.monotonic_ns()
-    assert node._patience_s() > 0.0
+    assert node._batch_s() > 0.0
 
 
-def test_diagnostics_say_which_topic_is_silent(calm):
+def test_silent_topic_is_an_error_that_names_it(calm):
     _, node, _ = calm
     watches = node._stream._rates
     assert node._stream.silent(max(w._last_ns for w in watches.values())) == {}
@@ -260,7 +261,7 @@ def test_diagnostics_say_which_topic_is_silent(calm):
     assert "/scan" in status.message
 
 
-def test_degeneracy_tells_corridors_from_rooms(calm):
+def test_degeneracy_of_corridors_is_below_that_of_rooms(calm):
     rng = np.random.default_rng(0)
     angle = np.radians(np.linspace(-135.0, 135.0, 760))
 
@@ -293,25 +294,25 @@ def lidar_statuses(transport):
     return [s for m in published(transport, DIAGNOSTICS) for s in m.status if s.name == "skidloc: lidar"]
 
 
-def test_a_lidar_whose_place_nobody_tells_is_an_error_and_a_note():
+def test_lidar_without_a_mount_is_an_error_and_a_warning():
     lost = LogTransport(drive_log(), silenced("/tf_static", 0.0, 99.0))
-    node, told = run_node(lost)
-    (said,) = told
-    assert "frame 'laser'" in said
-    assert "Publish it on /tf_static, or add [mounts.laser] to the robot file." in said
-    assert {(s.level, s.message) for s in lidar_statuses(lost)} == {(ERROR, said)}
+    node, reports = run_node(lost)
+    (text,) = reports
+    assert "frame 'laser'" in text
+    assert "Publish it on /tf_static, or add [mounts.laser] to the robot file." in text
+    assert {(s.level, s.message) for s in lidar_statuses(lost)} == {(ERROR, text)}
     (note,) = node.warnings()
     assert "frame 'laser'" in note
     assert f"{node.session.pipeline.estimator.counts()['scans']} scans of it were taken as if from the body's origin" in note
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "graph"])
-def test_transforms_that_come_late_are_used_from_then_on(estimator, tmp_path):
+def test_late_transforms_are_used_from_then_on(estimator, tmp_path):
     calm, late = undisturbed(estimator)[0], LogTransport(drive_log(), late_transforms)
-    node, told = run_node(late, estimator, Files(state=tmp_path / "state"))
-    assert len(told) == 2
-    assert "frame 'laser'" in told[0]
-    assert "now has the mount of the LiDAR" in told[1]
+    node, reports = run_node(late, estimator, Files(state=tmp_path / "state"))
+    assert len(reports) == 2
+    assert "frame 'laser'" in reports[0]
+    assert "now has the mount of the LiDAR" in reports[1]
     assert node.session.pipeline.mounts["laser"].x != 0.0
     (note,) = node.warnings()
     assert "/tf_static was late" in note
@@ -330,38 +331,38 @@ def test_transforms_that_come_late_are_used_from_then_on(estimator, tmp_path):
     assert "resumed from" in run_node(again, estimator, Files(state=tmp_path / "state"))[1][-1]
 
 
-def test_silence_is_told_and_then_the_run_begins():
+def test_discovery_of_silent_topics_reports_once_and_continues():
     quiet = LogTransport(drive_log())
     polls = 0
     take = quiet.take
 
-    def late(timeout_s, patience_s=0.0):
+    def late(timeout_s, batch_s=0.0):
         nonlocal polls
         polls += 1
-        return take(timeout_s, patience_s) if polls > 3 else []
+        return take(timeout_s, batch_s) if polls > 3 else []
 
     quiet.take = late
     quiet.types = {}
-    _, told = run_node(quiet)
-    assert "nothing comes on /joint_states (sensor_msgs/JointState)" in told[0]
-    assert "/scan (sensor_msgs/LaserScan)" in told[0]
-    assert len(told) == 1  # it is not said again and again
-    assert told[0].endswith(". Nobody publishes anything in a log. Look elsewhere.")
+    _, reports = run_node(quiet)
+    assert "no messages come on /joint_states (sensor_msgs/JointState)" in reports[0]
+    assert "/scan (sensor_msgs/LaserScan)" in reports[0]
+    assert len(reports) == 1  # it is not text again and again
+    assert reports[0].endswith(". No topic is published in a log. Look elsewhere.")
     named = LogTransport(drive_log(), silenced("/scan", 0.0, 5.0))
     named.types.pop("/scan")
-    _, told = run_node(named, topics=TopicOverrides(scan="/scan"))
-    assert told[0] == "waiting for /scan (nobody publishes it)."
+    _, reports = run_node(named, topics=TopicOverrides(scan="/scan"))
+    assert reports[0] == "waiting for /scan (no publisher)."
 
 
-def test_topics_of_other_names_are_offered():
+def test_discovery_names_topics_of_the_wanted_type():
     other = LogTransport(drive_log(), silenced("/scan", 0.0, 5.0), types={"/front/laser": "sensor_msgs/msg/LaserScan"})
     other.types.pop("/scan")
-    _, told = run_node(other, topics=TopicOverrides(scan="/scan"))
-    said = "waiting for /scan (nobody publishes it). But /front/laser is sensor_msgs/LaserScan (--topic.scan /front/laser)."
-    assert told[0] == said
+    _, reports = run_node(other, topics=TopicOverrides(scan="/scan"))
+    text = "waiting for /scan (no publisher). But /front/laser is sensor_msgs/LaserScan (--topic.scan /front/laser)."
+    assert reports[0] == text
 
 
-def test_a_topic_of_another_type_is_refused():
+def test_discovery_of_a_topic_of_another_type_is_refused():
     transport = LogTransport(drive_log(), silenced("/scan", 0.0, 99.0), types={"/scan": "sensor_msgs/msg/PointCloud2"})
     with pytest.raises(
         TransportError, match=r"'/scan' carries sensor_msgs/PointCloud2, not sensor_msgs/LaserScan. Pass --topic.points /scan"
@@ -369,23 +370,34 @@ def test_a_topic_of_another_type_is_refused():
         run_node(transport)
 
 
-def test_joint_states_without_the_wheels_are_refused():
+def test_joint_states_without_wheel_joints_are_refused():
     robot = dataclasses.replace(ROBOT, joints=dataclasses.replace(ROBOT.joints, left=("no_wheel",)))
     pair = Trial(make_model("skid_steer", ROBOT), "ekf")
     with pytest.raises(TopicError, match="no joint states of the live topics have the wheel joints"):
         Node.start(LogTransport(drive_log()), LiveRun(robot, lambda has_lidar: pair, node=NodeConfig(wait_s=0.0)), print)
 
 
-def test_bytes_that_are_no_message_are_dropped_and_counted():
+def test_undecodable_messages_are_dropped_and_counted():
+    """Halves of messages and random bytes, on every topic that the node subscribes to."""
+    rng, others = np.random.default_rng(0), ("/tf", "/tf_static", "/set_pose", "/initialpose", "/skidloc/payload", "/skidloc/pause")
+
     def garbled(messages):
-        return [m._replace(data=m.data[: len(m.data) // 2]) if m.topic == "/scan" and i % 50 == 0 else m for i, m in enumerate(messages)]
+        found = []
+        for i, message in enumerate(messages):
+            found.append(message)
+            if i % 50 == 49:
+                found.append(message._replace(data=message.data[: len(message.data) // 2]))
+                found.append(message._replace(topic=others[i // 50 % len(others)], data=rng.bytes(int(rng.integers(0, 300)))))
+        return found
 
-    node, _ = run_node(LogTransport(drive_log(), garbled))
-    assert any("/scan" in note and "not of the type" in note for note in node.warnings())
+    transport = LogTransport(drive_log(), garbled, {"/tf": "tf2_msgs/msg/TFMessage"})
+    node, _ = run_node(transport)
+    assert any("not of the type" in note for note in node.warnings())
     assert node.session.pipeline.estimator.counts()["matched"] > 200
+    assert node.payloads.loads == {}
 
 
-def test_a_node_that_is_killed_goes_on_where_it_was(tmp_path, calm):
+def test_node_killed_and_resumed_continues_its_pose(tmp_path, calm):
     """Without its pipeline, by the state on disk alone; the second node hears only what comes after."""
     files = Files(tmp_path / "run.tum", tmp_path / "state")
 
@@ -399,9 +411,9 @@ def test_a_node_that_is_killed_goes_on_where_it_was(tmp_path, calm):
     node.session.save_state(node._head, now=True)
     node.session._checkpoints.wait()  # kill -9 from here: no finish, no close
     second = LogTransport(drive_log(), part(10.5, 17.0))
-    node, told = run_node(second, files=files)
+    node, reports = run_node(second, files=files)
     assert node.finish() == len(read_tum(tmp_path / "run.tum"))
-    assert "resumed from" in told[-1]
+    assert "resumed from" in reports[-1]
     a, b = track(calm[0]), track(second)
     common = sorted(set(a) & set(b))
     for s in (common[10], common[-1]):
@@ -411,13 +423,13 @@ def test_a_node_that_is_killed_goes_on_where_it_was(tmp_path, calm):
     assert len(read_tum(tmp_path / "run.tum")) > 0.65 * len(a)
     # it ended in order: what goes on from here has an output of its own
     third = LogTransport(drive_log(), part(17.5, 99.0))
-    node, told = run_node(third, files=Files(tmp_path / "more.tum", tmp_path / "state"))
-    assert "resumed from" in told[-1]
+    node, reports = run_node(third, files=Files(tmp_path / "more.tum", tmp_path / "state"))
+    assert "resumed from" in reports[-1]
     assert 20 < node.finish() < 0.4 * len(a)
 
 
 @pytest.mark.parametrize("left", ["nothing", "half", "hidden files"])
-def test_files_that_a_killed_run_left_do_not_stop_a_new_one(tmp_path, left):
+def test_files_of_a_killed_run_do_not_stop_a_live_node(tmp_path, left):
     """State and estimates that do not fit each other, as after a power cut, and hidden files of any kind."""
     files = Files(tmp_path / "run.tum", tmp_path / "state")
     node, _ = run_node(LogTransport(drive_log(), lambda messages: messages[:1200]), files=files)
@@ -441,20 +453,20 @@ def test_files_that_a_killed_run_left_do_not_stop_a_new_one(tmp_path, left):
     assert (tmp_path / "state").is_file()
 
 
-def test_a_full_disk_does_not_stop_the_robot_from_knowing_where_it_is(tmp_path, monkeypatch, calm):
+def test_full_disk_does_not_stop_a_live_node(tmp_path, monkeypatch, calm):
     files = Files(tmp_path / "run.tum", tmp_path / "state")
     monkeypatch.setattr(CheckpointWriter, "is_due", lambda self: True)
     full = LogTransport(drive_log())
     with monkeypatch.context() as disk:
         fill_disk(disk, after=10, name="fsync")  # two for each state
         fill_disk(disk, after=100, name="pwrite")
-        node, told = run_node(full, files=files)
+        node, reports = run_node(full, files=files)
         assert read_head(tmp_path / "state")["records"] <= 5
     assert len(track(full)) == len(track(calm[0]))
-    assert [said for said in told if "No space left" in said] == [
+    assert [text for text in reports if "No space left" in text] == [
         f"the state cannot be written to '{files.state}': No space left on device. The state of before stays; it is tried again.",
         f"an estimate cannot be written to '{files.estimate_log}': No space left on device. "
-        "The output lacks what is estimated meanwhile; it is tried again.",
+        "Estimates made meanwhile are missing from the output; it is tried again.",
     ]
     node._publish_status()
     files_status = next(s for s in published(full, DIAGNOSTICS)[-1].status if s.name == "skidloc: files")
@@ -462,20 +474,20 @@ def test_a_full_disk_does_not_stop_the_robot_from_knowing_where_it_is(tmp_path, 
     assert files_status.message.count("No space left on device") == 2
     count = node.finish()
     assert len(read_tum(tmp_path / "run.tum")) == count
-    assert f"lacks {len(track(full)) - 100} estimates" in told[-1]
+    assert f"{len(track(full)) - 100} estimates are missing" in reports[-1]
     assert read_head(tmp_path / "state")["events"] == node.session.count
     assert set(node.session.troubles) == {"output"}
 
 
-def test_a_state_of_another_time_is_refused(tmp_path):
+def test_state_of_another_time_is_refused(tmp_path):
     files = Files(state=tmp_path / "state")
-    for shift_s, said in ((7200.0, "2.0 h old"), (-60.0, "ahead of the robot's clock")):
+    for shift_s, text in ((7200.0, "2.0 h old"), (-60.0, "ahead of the robot's clock")):
         node, _ = run_node(LogTransport(drive_log(), lambda messages: messages[:1000]), files=files)
         node.finish()
         later = LogTransport(
             drive_log(), lambda messages, by=shift_s: [messages[0]] + [restamped(m, int((by + 30.0) * S)) for m in messages[1000:]]
         )
-        with pytest.raises(CheckpointError, match=said):
+        with pytest.raises(CheckpointError, match=text):
             run_node(later, files=Files(tmp_path / "run.tum", files.state))
         assert [path.name for path in tmp_path.iterdir()] == ["state"]  # once it is removed, nothing is in the way
         (tmp_path / "state").unlink()
@@ -493,10 +505,10 @@ def with_transform(parent, child):
     return spoil
 
 
-def test_node_reports_another_publisher_of_its_transform():
+def test_second_publisher_of_the_transform_is_reported():
     transport = LogTransport(drive_log(), with_transform("odom", "base_link"), {"/tf": "tf2_msgs/msg/TFMessage"})
-    node, told = run_node(transport)
-    sentences = [said for said in told if "another node publishes 'odom' -> 'base_link' on /tf" in said]
+    node, reports = run_node(transport)
+    sentences = [text for text in reports if "another node publishes 'odom' -> 'base_link' on /tf" in text]
     assert len(sentences) == 1
     assert "--node.no-tf" in sentences[0]
     node._publish_status()
@@ -505,11 +517,11 @@ def test_node_reports_another_publisher_of_its_transform():
     assert "enable_odom_tf" in status.message
 
 
-def test_node_accepts_other_transforms_and_without_tf_any():
+def test_other_transforms_are_not_reported():
     for parent, child, config in (("map", "odom", None), ("odom", "base_link", NodeConfig(wait_s=0.0, predict=False, tf=False))):
         transport = LogTransport(drive_log(), with_transform(parent, child), {"/tf": "tf2_msgs/msg/TFMessage"})
-        _, told = run_node(transport, config=config)
-        assert not [said for said in told if "another node" in said]
+        _, reports = run_node(transport, config=config)
+        assert not [text for text in reports if "another node" in text]
 
 
 @pytest.mark.parametrize("frames", [Frames(), Frames("team_map", "team_odom", "team_base")])
@@ -550,13 +562,13 @@ def planar(stamped):
     return np.array([place.x, place.y, 2.0 * math.atan2(turn.z, turn.w)])
 
 
-def test_names_and_frames_are_used_for_all_that_is_published():
+def test_names_and_frames_apply_to_all_publications():
     """In a namespace, with a remapped scan: other topics and frames, the same estimates."""
     names = Names("rover", "/team", ("scan:=/front/scan", "~/odometry:=odom"))
     config = NodeConfig(wait_s=0.0, predict=False, names=names, frames=Frames("team_map", "team_odom", "team_base"))
     transport = LogTransport(drive_log(), lambda messages: [m._replace(topic=renamed(m.topic)) for m in messages])
     transport.types = {renamed(topic): kind for topic, kind in transport.types.items()}
-    node, told = run_node(transport, config=config)
+    node, reports = run_node(transport, config=config)
     own = {f"/team/rover/{name}" for name in ("corrections", "path", "map")}
     assert set(transport.published) == {"/team/odom", "/tf", "/diagnostics", *own}
     assert set(node.topics) == {"/team/joint_states", "/front/scan", "/team/imu/data"}
@@ -564,7 +576,7 @@ def test_names_and_frames_are_used_for_all_that_is_published():
     odometry = store.deserialize_cdr(transport.published["/team/odom"][-1], "nav_msgs/msg/Odometry")
     (tf,) = store.deserialize_cdr(transport.published["/tf"][-1], "tf2_msgs/msg/TFMessage").transforms
     assert (odometry.header.frame_id, odometry.child_frame_id) == (tf.header.frame_id, tf.child_frame_id) == ("team_odom", "team_base")
-    assert [said for said in told if "base_link_frame 'team_base' is not on /tf_static" in said]
+    assert [text for text in reports if "base_link_frame 'team_base' is not on /tf_static" in text]
     calm = undisturbed("ekf")[0]
     assert odometry.pose.pose.position == published(calm, ODOMETRY)[-1].pose.pose.position
 
@@ -594,7 +606,7 @@ def test_frames_that_tf2_refuses_are_refused(frames):
         Frames(*frames)
 
 
-def test_pace_keeps_the_logs_time_and_skips_its_pauses():
+def test_playback_clock_keeps_the_logs_time_and_cuts_pauses():
     now, slept = [100.0], []
 
     def sleep(seconds):
@@ -614,7 +626,7 @@ def test_pace_keeps_the_logs_time_and_skips_its_pauses():
     assert slept == []
 
 
-def test_scans_of_the_drive_are_what_the_tests_believe():
+def test_drive_log_has_the_scans_that_tests_need():
     events, _ = drive_events()
     scans = [e for e in events if isinstance(e, Scan)]
     assert len(scans) > 250
@@ -681,7 +693,7 @@ class _FakeRclpy(types.ModuleType):
             self.subscriptions[topic][1](data)
 
 
-def test_rclpy_door_by_its_documented_interface(monkeypatch):
+def test_rclpy_transport_calls_the_documented_interface(monkeypatch):
     fake, quality, signals, executors = _FakeRclpy(), *(types.ModuleType(f"rclpy.{name}") for name in ("qos", "signals", "executors"))
     signals.SignalHandlerOptions = types.SimpleNamespace(NO="none")
     executors.SingleThreadedExecutor = lambda: fake
@@ -695,6 +707,7 @@ def test_rclpy_door_by_its_documented_interface(monkeypatch):
         "tf2_msgs": ["TFMessage"],
         "nav_msgs": ["Odometry"],
         "geometry_msgs": [],
+        "std_msgs": [],
         "diagnostic_msgs": [],
     }
     for package, kinds in packages.items():

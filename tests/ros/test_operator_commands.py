@@ -9,6 +9,7 @@ from localization.logs.serialization import encode, make
 from localization.logs.writer import six_by_six
 from localization.ros.operator_commands import POSE_TYPE
 from localization.ros.publisher import DIAGNOSTICS, MAP, PATH, PREDICTED_ODOMETRY, occupancy_grid
+from localization.ros.session_files import Files
 from localization.ros.settings import NodeConfig
 from localization.ros.transports.base import Received
 from motion_models import se2
@@ -77,7 +78,7 @@ def test_initialpose_moves_the_map_and_leaves_odom_without_a_jump():
         (pose_message([0.0, 0.0, 0.0], "map"), "its frame is 'map', and this estimator has odom"),
         (pose_message([np.nan, 0.0, 0.0], "odom"), "it holds numbers that are not finite"),
         (pose_message([0.0, 0.0, 0.0], "odom", -np.eye(3)), "negative eigenvalues"),
-        (b"no message", "/set_pose: the pose is ignored"),
+        (b"no message", "/set_pose: the message is ignored"),
     ],
 )
 def test_set_pose_with_wrong_content_is_ignored_with_a_reason(data, reason, calm):
@@ -93,8 +94,8 @@ def serviced(name, *requests):
     replies = []
     take = transport.take
 
-    def take_and_call(timeout_s, patience_s=0.0):
-        received = take(timeout_s, patience_s)
+    def take_and_call(timeout_s, batch_s=0.0):
+        received = take(timeout_s, batch_s)
         first = transport.first_ns
         for at in [at for at in calls if received and received[-1].received_ns - first > at * S]:
             replies.append(transport.services[name](calls.pop(at)))
@@ -107,7 +108,7 @@ def serviced(name, *requests):
     return transport, node, replies, reports
 
 
-def test_reset_begins_again_at_the_origin(calm):
+def test_reset_starts_a_new_estimate_at_the_origin(calm):
     transport, _, replies, reports = serviced("/skidloc/reset", True)
     assert replies[0].is_success
     assert "reset: begins anew at the origin." in reports
@@ -142,6 +143,75 @@ def test_diagnostics_of_a_paused_node_name_the_service():
     node._publish_status()
     (status,) = [s for s in published(transport, DIAGNOSTICS)[-1].status if s.name == "skidloc: pause"]
     assert "~/pause with data: false" in status.message
+
+
+def payload_message(frame, mass, position=(0.0, 0.0, 0.0)):
+    com = make("geometry_msgs/msg/Vector3", **dict(zip("xyz", position, strict=True)))
+    inertia = make("geometry_msgs/msg/Inertia", m=mass, com=com, ixx=0.0, ixy=0.0, ixz=0.0, iyy=0.0, iyz=0.0, izz=0.0)
+    header = make("std_msgs/msg/Header", stamp=make("builtin_interfaces/msg/Time", sec=0, nanosec=0), frame_id=frame)
+    return encode(make("geometry_msgs/msg/InertiaStamped", header=header, inertia=inertia))
+
+
+def test_payload_on_its_topic_moves_the_cg_until_it_is_tared(tmp_path):
+    """By the topic; the state on disk holds it too."""
+    files = Files(state=tmp_path / "state")
+
+    def spoil(messages):
+        at = messages[0].received_ns + 8 * S
+        load = Received("/skidloc/payload", at, payload_message("left_gripper", 20.0))
+        return sorted([*messages[: len(messages) // 2], load], key=lambda m: m.received_ns)
+
+    transport = LogTransport(drive_log(), spoil)
+    node, reports = run_node(transport, files=files, config=NodeConfig(wait_s=0.0))
+    assert "/skidloc/payload: 20 kg at 'left_gripper'" in reports
+    alone, loaded = node.payloads._unloaded.position, node.payloads.sample(0).position
+    assert np.hypot(*(loaded - alone)) > 0.01
+    assert node.session.pipeline.synchronizer._wheels._cg == pytest.approx(loaded)
+    node._publish_status()
+    (status,) = [s for s in published(transport, DIAGNOSTICS)[-1].status if s.name == "skidloc: payload"]
+    assert status.message == "20 kg at 'left_gripper'"
+    node.finish()
+
+    tare = Received("/skidloc/tare_payload", 0, encode(make("std_msgs/msg/Empty", structure_needs_at_least_one_member=0)))
+
+    def rest(messages):
+        later = [messages[0], *messages[len(messages) // 2 :]]
+        return [*later, tare._replace(received_ns=later[-1].received_ns)]
+
+    node, reports = run_node(LogTransport(drive_log(), rest), files=files, config=NodeConfig(wait_s=0.0))
+    assert any("resumed from" in text for text in reports)
+    assert any("no payload is set" in text for text in reports)
+    assert node.payloads.loads == {}
+    assert node.session.pipeline.synchronizer._wheels._cg == pytest.approx(node.payloads._unloaded.position)
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (payload_message("left_griper", 3.0), "no link 'left_griper'"),
+        (payload_message("left_gripper", 300.0), "would tip over"),
+        (payload_message("left_gripper", np.nan), "must be finite"),
+        (b"no message", "/skidloc/payload: the message is ignored"),
+    ],
+)
+def test_payload_with_wrong_content_is_ignored_with_a_reason(data, reason):
+    _, node, reports = commanded("odometry", "/skidloc/payload", data)
+    assert any(reason in text for text in reports)
+    assert node.payloads.loads == {}
+
+
+def test_commands_by_topics_do_what_the_services_do():
+    """Reset, pause and its end."""
+    empty, (off, on) = (
+        make("std_msgs/msg/Empty", structure_needs_at_least_one_member=0),
+        (make("std_msgs/msg/Bool", data=d) for d in (0, 1)),
+    )
+    _, node, reports = commanded("odometry", "/skidloc/reset", encode(empty))
+    assert "reset: begins anew at the origin." in reports
+    _, node, reports = commanded("odometry", "/skidloc/pause", encode(on))
+    assert node.is_paused
+    assert node._commands.execute(Received("/skidloc/pause", 0, encode(off)))
+    assert not node.is_paused
 
 
 def test_path_and_map_are_published_in_the_frame_of_the_estimates():

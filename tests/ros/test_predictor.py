@@ -23,14 +23,23 @@ S = 1_000_000_000
 pytestmark = pytest.mark.xdist_group("online")
 
 
-@functools.cache
-def driven(estimator, predict):
-    transport = LogTransport(drive_log())
-    return transport, run_node(transport, estimator, config=NodeConfig(wait_s=0.0, predict=predict))[0]
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory):
+    """A transport and a node with an output after the drive, by estimator and whether it predicts."""
+    folder = tmp_path_factory.mktemp("driven")
+
+    @functools.cache
+    def drive(estimator, predict):
+        transport, out = LogTransport(drive_log()), folder / f"{estimator}_{predict}.tum"
+        node, _ = run_node(transport, estimator, Files(out), NodeConfig(wait_s=0.0, predict=predict))
+        node.finish()
+        return transport, node, out
+
+    return drive
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "graph"])
-def test_odometry_is_published_at_the_rate_of_the_wheels_in_order(estimator):
+def test_odometry_is_published_at_the_rate_of_the_wheels_in_order(estimator, driven):
     stamps = np.array([stamp_of(m) for m in published(driven(estimator, True)[0], PREDICTED_ODOMETRY)])
     assert (np.diff(stamps) > 0).all()
     stamps = stamps[stamps > stamps[0] + 3 * S]  # what came before the start is estimated, not predicted
@@ -40,7 +49,7 @@ def test_odometry_is_published_at_the_rate_of_the_wheels_in_order(estimator):
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "graph"])
-def test_estimates_are_the_same_to_the_last_bit_with_prediction(estimator):
+def test_estimates_are_the_same_to_the_last_bit_with_prediction(estimator, driven):
     with_prediction, without = (track(driven(estimator, predict)[0]) for predict in (True, False))
     assert list(with_prediction) == list(without)
     for stamp in without:
@@ -48,16 +57,28 @@ def test_estimates_are_the_same_to_the_last_bit_with_prediction(estimator):
         assert np.array_equal(with_prediction[stamp][1], without[stamp][1])
 
 
-def test_output_is_the_same_to_the_last_byte_with_prediction(tmp_path):
-    for predict in (True, False):
-        transport = LogTransport(drive_log())
-        node, _ = run_node(transport, files=Files(tmp_path / f"{predict}.tum"), config=NodeConfig(wait_s=0.0, predict=predict))
-        node.finish()
-    assert (tmp_path / "True.tum").read_bytes() == (tmp_path / "False.tum").read_bytes()
-    assert len(read_tum(tmp_path / "True.tum")) > 200
+def test_output_is_the_same_to_the_last_byte_with_prediction(driven):
+    outputs = [driven("ekf", predict)[2] for predict in (True, False)]
+    assert outputs[0].read_bytes() == outputs[1].read_bytes()
+    assert len(read_tum(outputs[0])) > 200
 
 
-def test_odometry_moves_by_no_more_than_motion_and_correction():
+def test_odometry_without_a_lidar_has_true_vy_at_the_wheels_rate():
+    """Instead of diff_drive_controller's: joint states alone, each answered by a twist with covariance."""
+    transport = LogTransport(drive_log(), lambda messages: [m for m in messages if m.topic == "/joint_states"])
+    transport.types = {"/joint_states": transport.types["/joint_states"]}
+    run_node(transport, "odometry", config=NodeConfig(wait_s=0.0))
+    messages = published(transport, PREDICTED_ODOMETRY)
+    stamps = np.array([stamp_of(m) for m in messages])
+    assert np.median(np.diff(stamps)) <= 0.0201 * S
+    assert len(stamps) > 0.9 * len(LogTransport(drive_log(), lambda found: [m for m in found if m.topic == "/joint_states"])._left) - 150
+    turning = [m.twist.twist for m in messages if abs(m.twist.twist.angular.z) > 0.3]
+    assert np.median([abs(twist.linear.y / twist.angular.z) for twist in turning]) > 0.003
+    moving = [m.twist.covariance.reshape(6, 6) for m in messages if abs(m.twist.twist.linear.x) > 0.1]
+    assert all(np.linalg.eigvalsh(cov[np.ix_((0, 1, 5), (0, 1, 5))])[0] > 0.0 for cov in moving)
+
+
+def test_odometry_moves_by_no_more_than_motion_and_correction(driven):
     """0.5 m/s and 1 rad/s are this robot's bounds; corrections of the filter are below 5 mm and 5 mrad here."""
     messages = list(track(driven("ekf", True)[0], PREDICTED_ODOMETRY).items())
     stamps, poses = np.array([stamp for stamp, _ in messages]), np.array([pose for _, (pose, _) in messages])
@@ -66,15 +87,15 @@ def test_odometry_moves_by_no_more_than_motion_and_correction():
     assert (np.abs(step[:, 2]) <= 1.2 * seconds + 0.005).all()
 
 
-def test_predicted_odometry_has_a_covariance_at_each_stamp():
+def test_predicted_odometry_has_a_covariance_at_each_stamp(driven):
     sigmas = np.array([sigma for _, sigma in track(driven("ekf", True)[0], PREDICTED_ODOMETRY).values()])
     assert (sigmas[-1000:] > 0.0).all()  # the drive begins with a standstill
     assert sigmas.max() < 0.1
 
 
-def test_transforms_of_a_graph_reach_the_map_at_every_stamp():
+def test_transforms_of_a_graph_reach_the_map_at_every_stamp(driven):
     """`map` -> `odom` is repeated with each transform of the body: else tf2 must extrapolate. Its pose has a covariance of its own."""
-    transport, node = driven("graph", True)
+    transport, node, _ = driven("graph", True)
     links = [(m.transforms[0].header.frame_id, stamp_of(m.transforms[0])) for m in published(transport, TF)]
     in_odom, in_map = ([stamp for frame, stamp in links if frame == name] for name in ("odom", "map"))
     assert in_map == in_odom[-len(in_map) :]

@@ -55,7 +55,7 @@ def column(batches, ending):
     return values
 
 
-def test_a_recording_holds_every_pose_scan_path_map_and_correction(chunk, recorded):
+def test_recording_holds_all_poses_scans_and_corrections(chunk, recorded):
     rows = rows_of(chunk, recorded / "drive.rrd")
     track = read_tum(recorded / "drive.tum")
     places = np.array([value[0] for value in column(rows["world/robot"], "translation")])
@@ -76,12 +76,12 @@ def test_a_recording_holds_every_pose_scan_path_map_and_correction(chunk, record
     assert len(column(rows["estimate/nis"], "scalars")) > 200
 
 
-def test_it_changes_no_estimate(recorded, tmp_path):
+def test_recording_changes_no_estimate(recorded, tmp_path):
     assert online("--out", tmp_path / "drive.tum") == 0
     assert (tmp_path / "drive.tum").read_bytes() == (recorded / "drive.tum").read_bytes()
 
 
-def test_a_live_node_shows_the_same(chunk, tmp_path):
+def test_live_node_records_all_estimates(chunk, tmp_path):
     from localization.ros.rerun_view import RerunView
 
     view = RerunView(tmp_path / "live.rrd")
@@ -92,7 +92,7 @@ def test_a_live_node_shows_the_same(chunk, tmp_path):
     assert len(places) == len(published(transport, ODOMETRY)) > 250
 
 
-def test_the_viewer_listens_to_this_machine_only_and_may_be_closed_before_the_end(chunk, monkeypatch, tmp_path):
+def test_viewer_listens_to_this_machine_and_may_be_closed(chunk, monkeypatch, tmp_path):
     """Its server without the window stands in for it."""
     from localization.ros import rerun_view as module
 
@@ -113,7 +113,7 @@ def test_the_viewer_listens_to_this_machine_only_and_may_be_closed_before_the_en
     view.close()
 
 
-def test_a_viewer_that_cannot_be_opened_is_explained(chunk, capsys, monkeypatch):
+def test_viewer_that_cannot_be_opened_is_refused(chunk, capsys, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     assert online("--view", "rerun") == 2
@@ -134,22 +134,22 @@ def test_two_sigmas_are_those_of_the_covariance(chunk):
     np.testing.assert_allclose(distances, 4.0)
 
 
-def test_what_is_there_is_not_overwritten_and_nothing_empty_is_left(chunk, tmp_path, capsys):
+def test_view_file_that_exists_is_not_overwritten(chunk, tmp_path, capsys):
     kept = tmp_path / "kept.rrd"
     kept.write_bytes(b"precious")
-    for name, said in (
+    for name, text in (
         (kept, "exists already"),
         (tmp_path / "view.mp4", "must end in .rrd"),
         (tmp_path / "no" / "view.rrd", "cannot be written"),
     ):
         assert online("--view-file", name) == 2
-        assert said in " ".join(capsys.readouterr().err.split())
+        assert text in " ".join(capsys.readouterr().err.split())
     assert kept.read_bytes() == b"precious"
     assert online("--view-file", tmp_path / "new.rrd", "--topic.scan", "/nowhere") == 2
     assert [path.name for path in tmp_path.iterdir()] == ["kept.rrd"]
 
 
-def test_the_extra_is_named_where_it_is_missing(tmp_path, capsys, monkeypatch):
+def test_view_without_its_extra_names_it(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.delitem(sys.modules, "localization.ros.rerun_view", raising=False)
     for arguments in (("--view", "rerun"), ("--view-file", tmp_path / "a.rrd")):

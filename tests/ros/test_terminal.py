@@ -17,7 +17,7 @@ pytestmark = pytest.mark.xdist_group("online")
 STATUSES = [
     Status("lidar"),
     Status("wheels", WARN, "they turn otherwise than the robot moves: slip"),
-    Status("messages", ERROR, "nothing comes on /imu/data, /center_of_gravity_by_the_arms"),
+    Status("messages", ERROR, "no messages come on /imu/data, /center_of_gravity_by_the_arms"),
 ]
 
 

@@ -13,6 +13,7 @@ from localization.cli import main
 zenoh = pytest.importorskip("zenoh", reason="the extra 'zenoh' (eclipse-zenoh) is not installed")
 from localization.ros.transports.zenoh import ZenohTransport, read_publisher_token  # noqa: E402
 
+_DEADLINE_S = 120.0  # only a failure waits for so long
 ENDPOINT = f"tcp/127.0.0.1:{20000 + os.getpid() % 20000}"
 STRING, STRING_HASH = "std_msgs/msg/String", "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"  # as ROS 2 ships it
 
@@ -35,14 +36,14 @@ def pair():
     node.close()
 
 
-def taken(transport, wanted, timeout_s=10.0):
+def taken(transport, wanted, timeout_s=_DEADLINE_S):
     found, end = [], time.monotonic() + timeout_s
     while len(found) < wanted and time.monotonic() < end:
         found += transport.take(0.1)
     return found
 
 
-def wait_until(condition, timeout_s=10.0):
+def wait_until(condition, timeout_s=_DEADLINE_S):
     end = time.monotonic() + timeout_s
     while not condition() and time.monotonic() < end:
         time.sleep(0.02)
@@ -93,7 +94,7 @@ def test_keys_tokens_and_attachments_are_as_rmw_zenoh_documents_them(pair, route
     subscriber.undeclare()
 
 
-def test_publishers_that_leave_are_gone(pair):
+def test_publishers_without_those_that_left_are_found(pair):
     robot, node = pair
     robot.advertise("/chatter", STRING)
     wait_until(lambda: "/chatter" in node.publishers())
@@ -101,7 +102,7 @@ def test_publishers_that_leave_are_gone(pair):
     wait_until(lambda: "/chatter" not in node.publishers())
 
 
-def test_restrict_ends_other_subscriptions_and_take_returns_for_urgent_ones(pair):
+def test_restrict_ends_other_subscriptions_and_sets_urgent_ones(pair):
     robot, node = pair
     for topic in ("/a", "/b", "/c"):
         node.subscribe(topic, STRING, is_latched=False)
@@ -113,8 +114,8 @@ def test_restrict_ends_other_subscriptions_and_take_returns_for_urgent_ones(pair
     robot.publish("/c", b"c")
     robot.publish("/a", b"a")
     robot.publish("/b", b"b")
-    found = node.take(1.0, 20.0)
-    assert time.monotonic() - begin < 5.0
+    found = node.take(1.0, 2 * _DEADLINE_S)
+    assert time.monotonic() - begin < _DEADLINE_S
     assert "/b" in {received.topic for received in found}
     assert "/c" not in {received.topic for received in [*found, *node.take(0.3)]}
 

@@ -2,7 +2,8 @@
 
 python robot.py MESSAGES, where MESSAGES is a pickle of (log time [ns], topic, type, bytes). Commands come on the standard input, one
 a line, and each is answered by one line: `play SECONDS`, `spin SECONDS`, `report` (JSON), `cloud BYTES COUNT` (PointCloud2 at 10 Hz),
-`drive SECONDS` (the same messages over and over, stamped by the clock on the wall), `clear` (what was received so far).
+`payload KG`, `reset`, `set_pose X Y`, `clear` (what was received so far), `drive SECONDS` (the same messages over and over, stamped by the
+clock on the wall).
 It imports nothing of this project.
 """
 
@@ -17,11 +18,12 @@ from collections import deque
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import InertiaStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import Empty
 from tf2_msgs.msg import TFMessage
 
 PERIOD_NS = 80_000_000  # of the scans
@@ -46,6 +48,8 @@ class Robot:
             self.node.create_subscription(kind, topic, getattr(self, f"on_{kind.__name__}"), 50)
         self.node.create_subscription(Odometry, "/skidloc/odometry_predicted", lambda m: self.predicted.append(stamp(m)), 50)
         self.initial_pose = self.node.create_publisher(PoseWithCovarianceStamped, "/set_pose", 1)
+        self.payloads = self.node.create_publisher(InertiaStamped, "/skidloc/payload", 1)
+        self.resets = self.node.create_publisher(Empty, "/skidloc/reset", 1)
         kinds = {topic: kind for _, topic, kind, _ in messages}
         self.publishers = {topic: self.publisher(topic, kind) for topic, kind in kinds.items()}
         for _, topic, _, data in messages:
@@ -83,6 +87,18 @@ class Robot:
         message.header.frame_id = "odom"
         message.pose.pose.position.x, message.pose.pose.position.y, message.pose.pose.orientation.w = x, y, 1.0
         self.initial_pose.publish(message)
+        self.spin(0.5)
+
+    def payload(self, mass):
+        """Command the payload on the body, by its topic."""
+        message = InertiaStamped()
+        message.header.frame_id, message.inertia.m = "base_link", mass
+        self.payloads.publish(message)
+        self.spin(0.5)
+
+    def reset(self):
+        """Command a reset, by its topic."""
+        self.resets.publish(Empty())
         self.spin(0.5)
 
     def spin(self, seconds):
@@ -161,6 +177,7 @@ class Robot:
             "sent": len(self.sent),
             "answered": len(self.latencies),
             "latencies_s": list(self.latencies.values()),
+            "answers_s": [[self.sent[stamp_ns], latency] for stamp_ns, latency in self.latencies.items()],
             "echo_latencies_s": self.echo_latencies,
             "first_s": self.first_s,
             "tf": sorted(set(self.tf)),

@@ -89,7 +89,7 @@ class Manager(Process):
         return answer
 
 
-def test_dds_door_receives_all_clouds_of_4_mb_at_10_hz(distro, running):
+def test_dds_transport_receives_all_clouds_of_4_mb_at_10_hz(distro, running):
     domain = own_domain(2)
     code = (
         "import sys, time\n"
@@ -110,10 +110,10 @@ def test_dds_door_receives_all_clouds_of_4_mb_at_10_hz(distro, running):
     assert int(receiver.line("clouds").split()[1]) == 40
 
 
-def test_rclpy_door_waits_runs_and_ends_by_sigint(distro, running, tmp_path):
+def test_rclpy_transport_waits_runs_and_ends_by_sigint(distro, running, tmp_path):
     domain, out = own_domain(3), tmp_path / "run.tum"
     node = running(start_skidloc(domain, "--out", out, python=ros2_python(distro), door="rclpy", ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST"))
-    node.line("Nobody publishes anything", timeout_s=_COMPILED_S)
+    node.line("No topic is published", timeout_s=_COMPILED_S)
     robot = running(Robot(distro, domain))
     robot.do("spin 2")
     robot.do("play 8")
@@ -125,7 +125,7 @@ def test_rclpy_door_waits_runs_and_ends_by_sigint(distro, running, tmp_path):
         assert unwanted not in node.text
 
 
-def test_rclpy_door_without_tf2_msgs_names_the_package_to_install(distro):
+def test_rclpy_transport_without_tf2_msgs_names_its_package(distro):
     code = (
         "import sys; sys.modules['tf2_msgs'] = sys.modules['tf2_msgs.msg'] = None\n"
         "from localization.cli import main\n"
@@ -239,10 +239,10 @@ def test_colcon_build_installs_a_package_that_ros2_finds_and_starts(distro, runn
     assert "nobot" in node.text
 
 
-def test_dds_door_beside_robots_that_leave_come_late_and_restart(distro, running):
+def test_dds_transport_with_late_and_restarted_robots_is_served(distro, running):
     """35 s without a robot but for one that leaves; then one that drives, is killed, and is there again."""
     node, domain, begin = running(_waiting[distro].node), _waiting[distro].domain, _waiting[distro].begin
-    node.line("Nobody publishes anything", timeout_s=_COMPILED_S)
+    node.line("No topic is published", timeout_s=_COMPILED_S)
     Robot(distro, domain).leave()
     time.sleep(max(begin + 35.0 - time.monotonic(), 0.0))
     assert node.process.poll() is None, node.text
@@ -269,6 +269,13 @@ def test_dds_door_beside_robots_that_leave_come_late_and_restart(distro, running
     again.do("play 4")
     found = again.report()
     assert found["answered"] >= 0.9 * found["sent"] > 40
+    again.do("payload 3")
+    again.do("reset")
+    again.do("play 2")
+    found = again.report()
+    assert found["statuses"]["skidloc: payload"]["message"] == "3 kg at 'base_link'"
+    assert np.hypot(*found["poses"][-1]) < 1.5
     assert node.end(signal.SIGINT) == 0, node.text
+    assert "reset: begins anew at the origin" in node.text
     assert "Traceback" not in node.text
     assert "invalid type object" not in node.text

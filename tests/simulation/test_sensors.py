@@ -23,8 +23,7 @@ from localization.simulation.sensors import (
     TruthSensor,
     quaternion,
 )
-from localization.simulation.track import SampleClock, TrueMotion
-from localization.simulation.vehicle import COLUMNS, MassDistribution
+from localization.simulation.vehicle import COLUMNS, MassDistribution, SampleClock, TrueMotion
 from localization.simulation.world import (
     GLASS,
     WORLDS,
@@ -82,7 +81,7 @@ def read(message):
 
 @given(st.integers(0, 10**6))
 @settings(max_examples=60, deadline=None)
-def test_rays_meet_what_geometry_says(seed):
+def test_cast_random_rays_match_brute_force_geometry(seed):
     rng = np.random.default_rng(seed)
     walls = np.column_stack([rng.uniform(-6, 6, (12, 4)), np.zeros(12)])
     grid = make_grid(walls, cell=float(rng.uniform(0.2, 2.0)))
@@ -91,24 +90,24 @@ def test_rays_meet_what_geometry_says(seed):
 
 
 @pytest.mark.parametrize("angle", [0.0, math.pi / 2, math.pi, -math.pi / 2, math.pi / 4])
-def test_rays_along_the_grid_and_through_its_corners(angle):
+def test_cast_along_grid_lines_and_corners_hits_the_wall(angle):
     walls = box(-2, -2, 2, 2)
     assert cast(0.0, 0.0, angle, 50.0, make_grid(walls, cell=0.5)) == pytest.approx(brute_force(0, 0, angle, walls), rel=1e-12)
 
 
-def test_rays_end_at_their_longest_range_and_in_an_empty_world():
+def test_cast_beyond_longest_range_or_empty_world_is_infinite():
     grid = make_grid(box(-2, -2, 2, 2))
     assert cast(0.0, 0.0, 0.0, 1.9, grid) == math.inf
     assert cast(0.0, 0.0, 0.0, 50.0, make_grid(np.zeros((0, 5)))) == math.inf
 
 
-def test_glass_mirrors_beams_near_its_normal_and_lets_others_through():
+def test_cast_at_glass_returns_only_near_its_normal():
     grid = make_grid(np.concatenate([box(-5, -5, 5, 5), line(2, -5, 2, 5, GLASS)]))
     assert cast(0.0, 0.0, 0.05, 50.0, grid) == pytest.approx(2.0 / math.cos(0.05))
     assert cast(0.0, 0.0, 0.5, 50.0, grid) == pytest.approx(5.0 / math.cos(0.5))
 
 
-def test_people_walk_to_and_fro_and_are_as_thick_as_they_are():
+def test_people_over_time_walk_to_and_fro_as_cylinders():
     person = np.array([1.0, 0.0, 3.0, 0.0, 0.5, 0.25])
     assert [round(person_at(person, t)[0], 9) for t in (0.0, 2.0, 4.0, 6.0, 8.0)] == [1.0, 2.0, 3.0, 2.0, 1.0]
     people = person[None]
@@ -119,7 +118,7 @@ def test_people_walk_to_and_fro_and_are_as_thick_as_they_are():
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_worlds_are_closed_and_their_grids_lose_no_wall(name):
+def test_worlds_are_closed_and_grids_hold_every_wall(name):
     world = WORLDS[name]()
     grid = make_grid(world.walls)
     assert set(grid.items.tolist()) == set(range(len(world.walls)))
@@ -128,7 +127,7 @@ def test_worlds_are_closed_and_their_grids_lose_no_wall(name):
     assert all(cast(*start, a, 200.0, grid) < 200.0 for a in np.linspace(-3.1, 3.1, 50))
 
 
-def test_every_beam_leaves_from_where_the_robot_is_at_its_own_moment():
+def test_planar_scanner_moving_robot_casts_each_beam_at_its_own_time():
     """While turning at 1 rad/s, points laid out with the pose of each beam's time lie on the walls; with that of the scan's start, not."""
     walls = np.concatenate([box(-4, -3, 4, 3), pillar(2, 1)])
     mount, track = Mount(x=0.4, y=-0.1, yaw=0.2), moving_track()
@@ -150,7 +149,7 @@ def test_every_beam_leaves_from_where_the_robot_is_at_its_own_moment():
     assert off["start"] > 0.02
 
 
-def test_a_sweep_fills_only_its_part_of_the_period_and_is_sent_when_it_is_over():
+def test_planar_scanner_sweep_is_sent_once_complete():
     scanner = PlanarScanner(EXACT, "/scan", "laser", Mount(), World(box(-4, -3, 4, 3)), 0.0, 10**9, np.random.default_rng(0))
     message = scanner.messages(moving_track())[3]
     scan = read(message)
@@ -163,7 +162,7 @@ def test_a_sweep_fills_only_its_part_of_the_period_and_is_sent_when_it_is_over()
     assert scan.angle_max == pytest.approx(math.radians(95))
 
 
-def test_ranges_have_the_noise_the_rounding_and_the_dropouts_that_are_set():
+def test_planar_scanner_ranges_have_configured_noise_and_dropouts():
     config = ScannerConfig(noise_m=0.02, resolution_m=0.005, dropout=0.05)
     still = moving_track(twist=(0.0, 0.0, 0.0), seconds=8.0)
     truth = read(
@@ -180,7 +179,7 @@ def test_ranges_have_the_noise_the_rounding_and_the_dropouts_that_are_set():
     np.testing.assert_allclose(np.round(ranges[~lost] / 0.005), ranges[~lost] / 0.005, atol=1e-3)
 
 
-def test_a_spinning_scanner_sees_walls_floor_and_ceiling_where_they_are():
+def test_spinning_scanner_measures_walls_floor_and_ceiling():
     walls, mount, track = box(-4, -3, 4, 3), Mount(x=0.1, z=0.8, yaw=0.3), moving_track()
     config = SpinningConfig(noise_m=0.0, dropout=0.0, min_range_m=0.1)
     world = World(walls, ceiling_m=1.5)
@@ -213,7 +212,7 @@ def encoders(counts=4096, late=0.0, lost=0.0, rate=50.0):
 
 @pytest.mark.parametrize("rate", [50.0, 100.0, 200.0])
 @pytest.mark.parametrize("counts", [64, 4096])
-def test_encoders_count_the_wheels_angle_and_lose_nothing(rate, counts):
+def test_encoders_any_rate_count_the_wheel_angle(rate, counts):
     track = moving_track(seconds=10.0)
     found = [read(m) for m in encoders(counts, rate=rate).messages(track)]
     assert len(found) == 10 * rate + 1
@@ -230,7 +229,7 @@ def test_encoders_count_the_wheels_angle_and_lose_nothing(rate, counts):
     assert np.abs(rates - 2.0).max() <= unit * rate + 1e-9
 
 
-def test_exact_encoders_are_exact_and_chunks_make_no_difference():
+def test_encoders_without_counts_are_exact_in_any_chunks():
     whole = encoders().messages(moving_track(seconds=4.0))
     pieces, device = [], encoders()
     for seconds in (1.0, 2.503, 4.0):
@@ -242,14 +241,14 @@ def test_exact_encoders_are_exact_and_chunks_make_no_difference():
     np.testing.assert_allclose(exact[-1].parts[0][:4], [2.0, 2.0, 3.0, 3.0], rtol=1e-12)
 
 
-def test_a_loose_encoder_plug_loses_its_share_of_one_wheels_counts():
+def test_encoders_with_dropout_lose_its_share_of_one_wheels_counts():
     found = encoders(lost=0.3).messages(moving_track(seconds=300.0))
     last = found[-1].parts[0]
     assert last[0] / 600.0 == pytest.approx(0.7, abs=0.06)  # some 1000 spells
     np.testing.assert_allclose(last[1:4], [600.0, 900.0, 900.0], atol=0.01)
 
 
-def test_ticks_are_handed_out_once_and_only_when_they_are_over():
+def test_sample_clock_returns_each_complete_sample_once():
     ticks = SampleClock(12.5, takes_s=0.05)
     assert ticks.due(0.049).tolist() == []
     assert ticks.due(0.05).tolist() == [0]
@@ -263,7 +262,7 @@ def quiet_imu(mount=None, bias=0.0, tilt=0.0):
     return ImuSensor(config, "/imu", "imu_link", mount or Mount(), bias, tilt, 0, np.random.default_rng(0))
 
 
-def test_an_imu_feels_gravity_turning_and_its_own_lever_arm():
+def test_imu_off_centre_measures_gravity_turning_and_lever_arm():
     mount = Mount(x=0.3, y=-0.2, z=0.5)
     rate, force = quiet_imu(mount).messages(moving_track(twist=(0.5, 0.1, 1.0)))[150].parts
     np.testing.assert_allclose(rate, [0, 0, 1.0], atol=1e-12)
@@ -271,7 +270,7 @@ def test_an_imu_feels_gravity_turning_and_its_own_lever_arm():
     np.testing.assert_allclose(force, [-0.1 - 0.3, 0.5 + 0.2, 9.81], atol=1e-9)
 
 
-def test_an_imu_on_its_side_measures_in_its_own_axes():
+def test_imu_mounted_on_its_side_measures_in_its_own_axes():
     mount = load_robot("husky_a200").mounts["imu_link"]
     rate, force = quiet_imu(mount).messages(moving_track(twist=(0, 0, 0.7)))[150].parts
     np.testing.assert_allclose(mount.rotation() @ rate, [0, 0, 0.7], atol=1e-9)
@@ -279,7 +278,7 @@ def test_an_imu_on_its_side_measures_in_its_own_axes():
     assert force[1] == pytest.approx(9.81, abs=1e-6)  # gravity on its +y
 
 
-def test_gyro_bias_and_slope_are_in_the_imu():
+def test_imu_with_bias_and_slope_measures_both():
     still = moving_track(twist=(0, 0, 0), start=(0, 0, math.pi / 2))
     rate, force = quiet_imu(bias=0.03, tilt=0.1).messages(still)[10].parts
     np.testing.assert_allclose(rate, [0, 0, 0.03], atol=1e-12)
@@ -287,7 +286,7 @@ def test_gyro_bias_and_slope_are_in_the_imu():
     np.testing.assert_allclose(force, [0, -9.81 * math.sin(0.1), 9.81 * math.cos(0.1)], atol=1e-9)
 
 
-def test_imu_noise_is_as_large_as_its_density_says():
+def test_imu_noise_matches_its_density():
     config = ImuConfig(100.0, gyro_noise=1e-3, gyro_bias_sigma=0.0, gyro_bias_walk=0.0, force_noise=5e-3)
     still = moving_track(twist=(0, 0, 0), seconds=60.0)
     parts = [m.parts for m in ImuSensor(config, "/imu", "imu_link", Mount(), 0.0, 0.0, 0, np.random.default_rng(2)).messages(still)]
@@ -295,7 +294,7 @@ def test_imu_noise_is_as_large_as_its_density_says():
     assert np.std([p[1] for p in parts], axis=0) == pytest.approx(np.full(3, 5e-2), rel=0.05)
 
 
-def test_gps_fixes_lead_back_to_the_path():
+def test_gps_fixes_convert_back_to_the_path():
     """By the library's own reading of NavSatFix, which has its own geodesy."""
     track = moving_track(twist=(3.0, 0.0, 0.1), seconds=40.0)
     config = GpsConfig(5.0, noise_m=0.0, drift_m=0.0)
@@ -307,7 +306,7 @@ def test_gps_fixes_lead_back_to_the_path():
     assert np.ptp(truth[:, 0]) > 30.0
 
 
-def test_truth_is_the_track_and_the_cg_topic_is_the_nominal_cg():
+def test_truth_sensor_publishes_motion_and_nominal_cg():
     track, masses = moving_track(), MassDistribution(ROBOT)
     messages = TruthSensor(25.0, ROBOT, masses, True, 10**9).messages(track)
     odometry = [m for m in messages if m.layout.type.endswith("Odometry")]
@@ -321,7 +320,7 @@ def test_truth_is_the_track_and_the_cg_topic_is_the_nominal_cg():
     np.testing.assert_allclose(cgs[3].parts[0][:2], masses.nominal_cg(np.array([0.0]))[0])
 
 
-def test_quaternions_of_mounts_turn_as_the_mounts_do():
+def test_quaternion_of_mount_matches_its_rotation():
     mount = Mount(roll=0.3, pitch=-0.7, yaw=2.0)
     x, y, z, w = quaternion(mount)
     matrix = np.array(
@@ -335,7 +334,7 @@ def test_quaternions_of_mounts_turn_as_the_mounts_do():
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_pictures_of_worlds_show_every_wall_person_and_patch(name):
+def test_world_svg_draws_every_wall_person_and_patch(name):
     world = WORLDS[name]()
     root = ElementTree.fromstring(world_svg(world, [np.array([[0.0, 0.0, 0.1], [1.0, 0.5, 0.2]])]))
     count = {tag: len(root.findall(f"{{http://www.w3.org/2000/svg}}{tag}")) for tag in ("line", "circle", "rect", "polyline")}

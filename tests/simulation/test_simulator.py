@@ -18,8 +18,20 @@ from localization.errors import OutputError, SimulationError
 from localization.events import CgSample, ImuSample, Scan, WheelSample
 from localization.logs import open_log
 from localization.logs.writer import write_bag
-from localization.simulation.drives import MoveArms, OpenLoop, PickUp, Rest, Route, TurnTo, constant
-from localization.simulation.experiments import CONFIGURATION_CGS, EXPERIMENTS, Experiment, ExperimentConfig, grid_points
+from localization.simulation.experiments import (
+    CONFIGURATION_CGS,
+    EXPERIMENTS,
+    Experiment,
+    ExperimentConfig,
+    MoveArms,
+    OpenLoop,
+    PickUp,
+    Rest,
+    Route,
+    TurnTo,
+    constant,
+    grid_points,
+)
 from localization.simulation.faults import FAULTS, parse_faults
 from localization.simulation.open_loop_scores import correction_time, score_open_loop_runs
 from localization.simulation.sensors import START_NS, SensorConfig
@@ -51,7 +63,7 @@ def driven(experiment=ARC, effects=None, robot=ROBOT, config=BLIND, seed=0):
 
 @pytest.mark.parametrize("name", ["run.bag", "run.mcap", "run"])
 @pytest.mark.parametrize("lidar", ["2d", "3d"])
-def test_every_format_is_opened_by_rosbags_and_by_this_library(tmp_path, name, lidar):
+def test_simulation_every_format_is_read_by_rosbags_and_reader(tmp_path, name, lidar):
     config = SimulationConfig(sensors=SensorConfig(lidar=lidar, center_of_gravity=True))
     simulation = Simulation(dataclasses.replace(ARC, with_gps=True), ROBOT, 1, {}, config)
     count = write_simulation(tmp_path / name, simulation)
@@ -84,7 +96,7 @@ def test_every_format_is_opened_by_rosbags_and_by_this_library(tmp_path, name, l
     assert log.reference_topic == "/ground_truth/odom"
 
 
-def test_the_mcap_readers_of_others_decode_every_message(tmp_path):
+def test_simulation_mcap_is_decoded_by_other_readers(tmp_path):
     simulation = Simulation(ARC, ROBOT, 1, {}, SimulationConfig())
     count = write_simulation(tmp_path / "run.mcap", simulation)
     with open(tmp_path / "run.mcap", "rb") as file:
@@ -99,7 +111,7 @@ def test_the_mcap_readers_of_others_decode_every_message(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["run.bag", "run.mcap", "run"])
-def test_the_same_seed_gives_the_same_bytes_and_another_seed_other_noise(tmp_path, name):
+def test_simulation_same_seed_gives_same_bytes(tmp_path, name):
     def content(folder, seed):
         (tmp_path / folder).mkdir()
         write_simulation(tmp_path / folder / name, Simulation(ARC, ROBOT, seed, {}, SimulationConfig()))
@@ -111,7 +123,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_other_noise(tmp_pat
     assert first != other
 
 
-def test_the_log_says_when_each_run_begins_and_ends():
+def test_simulation_log_marks_begin_and_end_of_each_run():
     simulation, messages = driven(
         short(Rest(0.5), OpenLoop("a", constant(0.3, 0.0), 2.7), Rest(1.0), OpenLoop("b", constant(0.0, 0.3), 2.0))
     )
@@ -122,7 +134,7 @@ def test_the_log_says_when_each_run_begins_and_ends():
     assert [run.start_s for run in simulation.runs] == pytest.approx([0.5, 5.2])
 
 
-def test_one_sensor_more_leaves_the_noise_of_the_others_as_it_is():
+def test_simulation_additional_sensor_keeps_noise_of_others():
     _, blind = driven()
     _, seeing = driven(config=SimulationConfig(sensors=SensorConfig(lidar="3d", center_of_gravity=True)))
     for topic in ("/imu/data", "/joint_states", "/ground_truth/odom"):
@@ -131,14 +143,14 @@ def test_one_sensor_more_leaves_the_noise_of_the_others_as_it_is():
         assert all(np.array_equal(p, q) for m, n in zip(a, b, strict=True) for p, q in zip(m.parts, n.parts, strict=True))
 
 
-def test_a_simulation_that_fails_leaves_no_log_behind(tmp_path):
+def test_simulation_failing_leaves_no_log(tmp_path):
     into_wall = short(OpenLoop("ahead", constant(1.0, 0.0), 30.0), world="lab")
     with pytest.raises(SimulationError, match=r"hits a wall of 'lab' at x = \d.* s into short"):
         write_simulation(tmp_path / "run.mcap", Simulation(into_wall, ROBOT, 0, {}, BLIND))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_outputs_are_never_overwritten_and_bad_ones_are_named(tmp_path):
+def test_simulate_existing_or_bad_output_is_refused(tmp_path):
     (tmp_path / "run.mcap").write_text("mine")
     with pytest.raises(OutputError, match=r"run.mcap' exists already"):
         write_simulation(tmp_path / "run.mcap", Simulation(ARC, ROBOT, 0, {}, BLIND))
@@ -172,7 +184,7 @@ def parts(messages, topic, part):
 
 
 @pytest.mark.parametrize("effect", FAULTS)
-def test_effects_are_nowhere_in_the_logs_metadata(effect):
+def test_simulation_effects_leave_metadata_nominal(effect):
     size = {"payload": 5.0, "encoder_dropout": 0.3}.get(effect, 0.02)
     config = SimulationConfig(sensors=SensorConfig(lidar="2d", center_of_gravity=True))
     (_, plain), (_, changed) = driven(config=config), driven(effects={effect: size}, config=config)
@@ -188,16 +200,16 @@ def test_effects_are_nowhere_in_the_logs_metadata(effect):
     assert now[0] != now[1]
 
 
-def test_larger_wheels_drive_farther():
+def test_wheel_radius_scale_larger_drives_farther():
     assert distance(driven(STRAIGHT, {"wheel_radius_scale": 0.05})[0]) / distance(driven(STRAIGHT)[0]) == pytest.approx(1.05, abs=0.002)
 
 
-def test_unequal_wheels_turn_a_straight_drive_to_the_smaller_side():
+def test_wheel_radius_difference_turns_to_the_smaller_side():
     assert path_of(driven(STRAIGHT, {"wheel_radius_difference": 0.04})[0])[-1, 2] < -0.02  # left wheels are the larger ones
 
 
 @pytest.mark.parametrize(("effect", "axis"), [("cg_offset_x", 0), ("cg_offset_y", 1)])
-def test_a_shifted_cg_moves_the_centre_of_rotation_as_the_closed_model_says(effect, axis):
+def test_cg_offset_moves_centre_of_rotation_as_friction_model(effect, axis):
     simulation, _ = driven(TURN, {effect: 0.04})
     vx, vy, wz = settled(simulation)
     model = make_model("friction", ROBOT)
@@ -208,14 +220,14 @@ def test_a_shifted_cg_moves_the_centre_of_rotation_as_the_closed_model_says(effe
     np.testing.assert_allclose(simulation.runs[-1].cg[0], cg, atol=1e-9)
 
 
-def test_a_payload_is_weight_in_the_gripper():
+def test_payload_adds_mass_in_the_gripper():
     simulation, _ = driven(TURN, {"payload": 10.0})
     assert np.hypot(*(simulation.runs[-1].cg[0] - simulation.runs[-1].nominal_cg)) > 0.01
     husky, _ = driven(TURN, {"payload": 10.0}, HUSKY)
     np.testing.assert_allclose(husky.runs[-1].cg[0], [10 / 56.034 * 0.256, 0.0], atol=1e-9)
 
 
-def test_a_moved_lidar_sees_from_where_it_is():
+def test_lidar_offset_measures_from_its_true_place():
     config = SimulationConfig()
     still = short(Rest(1.0))
     (_, a), (_, b) = driven(still, config=config), driven(still, {"lidar_offset_x": 0.1, "lidar_yaw": 0.0}, config=config)
@@ -228,7 +240,7 @@ def test_a_moved_lidar_sees_from_where_it_is():
 
 
 @pytest.mark.parametrize(("effect", "topic"), [("lidar_time_offset", "/scan"), ("wheel_time_offset", "/joint_states")])
-def test_late_stamps_are_late_and_the_messages_are_not(effect, topic):
+def test_time_offset_delays_stamps_but_not_messages(effect, topic):
     config = SimulationConfig()
     (_, plain), (_, late) = driven(config=config), driven(effects={effect: 0.03}, config=config)
     for a, b in zip(plain, late, strict=True):
@@ -236,7 +248,7 @@ def test_late_stamps_are_late_and_the_messages_are_not(effect, topic):
         assert b.stamp_ns - a.stamp_ns == (30_000_000 if a.layout.topic == topic else 0)
 
 
-def test_more_grip_to_the_side_turns_less_and_from_the_middle_on_only_then():
+def test_friction_anisotropy_and_change_turn_less():
     plain = k_of(driven(TURN)[0])
     assert k_of(driven(TURN, {"friction_anisotropy": 0.3})[0]) < 0.95 * plain
     twice = short(Rest(0.5), OpenLoop("first", constant(0.0, 0.4), 4.0), Rest(0.5), OpenLoop("second", constant(0.0, 0.4), 4.0))
@@ -254,7 +266,7 @@ def test_more_grip_to_the_side_turns_less_and_from_the_middle_on_only_then():
         *(("track_width", 0.05, "track_width"), ("friction_anisotropy", 0.3, "mu_ratio")),
     ],
 )
-def test_chassis_and_tyres_change_the_turn_as_the_closed_model_says(effect, size, name):
+def test_chassis_and_tyre_faults_turn_as_friction_model(effect, size, name):
     simulation, _ = driven(short(MoveArms("ready"), OpenLoop("turn", constant(0.0, 0.4), 4.0)), {effect: size})
     model = make_model("friction", ROBOT)
     params = model.nominal.copy()
@@ -268,18 +280,18 @@ def test_chassis_and_tyres_change_the_turn_as_the_closed_model_says(effect, size
     assert np.abs(e - plain).max() > 1e-3
 
 
-def test_rolling_resistance_makes_driving_wheels_slip():
+def test_rolling_resistance_larger_makes_wheels_slip():
     (easy, _), (hard, _) = driven(STRAIGHT), driven(STRAIGHT, {"rolling_resistance": 0.2})
     assert distance(hard) < 0.99 * distance(easy)
 
 
-def test_a_slope_pulls_the_robot_and_shows_in_the_imu():
+def test_slope_moves_robot_and_tilts_imu():
     simulation, messages = driven(STRAIGHT, {"slope": 0.2})
     assert distance(simulation) < distance(driven(STRAIGHT)[0])
     assert np.median(parts(messages, "/imu/data", 1)[:10, 0]) == pytest.approx(9.81 * math.sin(0.2), abs=0.05)
 
 
-def test_a_biased_gyro_turns_at_rest():
+def test_gyro_bias_at_rest_measures_a_rate():
     (_, plain), (_, biased) = driven(short(Rest(2.0))), driven(short(Rest(2.0)), {"gyro_bias": 0.05})
     difference = parts(biased, "/imu/data", 0) - parts(plain, "/imu/data", 0)
     np.testing.assert_allclose(difference, np.tile([0, 0, 0.05], (len(difference), 1)), atol=1e-12)
@@ -293,7 +305,7 @@ def test_a_biased_gyro_turns_at_rest():
         ("longitudinal_slip_turning", lambda v: (v[0] * (1 - 0.2 * abs(v[2])), v[1], v[2])),
     ],
 )
-def test_loose_floor_is_in_truth_and_gyro_alike(effect, value):
+def test_loose_floor_is_in_truth_and_gyro(effect, value):
     (plain, _), (loose, messages) = driven(), driven(effects={effect: 0.2})
     np.testing.assert_allclose(settled(loose), value(settled(plain)), atol=2e-3)
     gyro = parts(messages, "/imu/data", 0)[75:125, 2]
@@ -301,7 +313,7 @@ def test_loose_floor_is_in_truth_and_gyro_alike(effect, value):
     assert gyro.mean() == pytest.approx(truth.mean(), abs=0.02)  # its bias
 
 
-def test_effects_add_up_and_bad_ones_are_told():
+def test_effects_add_up_and_invalid_ones_are_refused():
     assert parse_faults(("slope=0.1", "payload=2", "slope=0.05")) == {"slope": pytest.approx(0.15), "payload": 2.0}
     for text in ("slope", "slope=", "slope=steep", "slope=nan"):
         with pytest.raises(SimulationError, match="not of the form ID=SIZE"):
@@ -316,7 +328,7 @@ def test_effects_add_up_and_bad_ones_are_told():
             Simulation(ARC, ROBOT, 0, effects, BLIND)
 
 
-def test_a_cg_that_tips_the_robot_is_told_before_and_during_the_drive():
+def test_cg_outside_wheels_is_refused_before_and_in_the_drive():
     with pytest.raises(SimulationError, match=r"0.0 s into the drive: centre of gravity \(0.3.* would tip over"):
         Simulation(ARC, HUSKY, 0, {"cg_offset_x": 0.2, "payload": 30.0}, BLIND)
     loaded = short(Rest(1.0), PickUp(900.0), OpenLoop("arc", constant(0.4, 0.4), 2.0))
@@ -326,22 +338,22 @@ def test_a_cg_that_tips_the_robot_is_told_before_and_during_the_drive():
         driven(short(MoveArms(np.array([0.25, 0.0]))))
 
 
-def test_a_robot_that_cannot_get_there_says_so():
+def test_route_out_of_reach_is_an_error():
     with pytest.raises(SimulationError, match="does not reach its way point"):
         driven(short(Route(np.array([[3.0, 0.0]])), world="slippery"), {"slope": 0.4}, HUSKY)  # a wet patch is steeper than it grips
 
 
-def test_a_step_that_does_not_divide_the_control_period_is_refused():
+def test_step_not_dividing_control_period_is_refused():
     with pytest.raises(SimulationError, match=r"step_s is 0.003 s; it must divide the control period, 0.02 s"):
         Simulation(ARC, ROBOT, 0, {}, SimulationConfig(vehicle=VehicleConfig(step_s=0.003)))
 
 
-def test_seeds_are_not_negative():
+def test_seed_negative_is_refused():
     with pytest.raises(SimulationError, match="seed is -1"):
         Simulation(ARC, ROBOT, -1, {}, BLIND)
 
 
-def test_routes_and_turns_lead_where_they_should():
+def test_route_and_turn_end_at_their_goals():
     way = short(Route(np.array([[2.0, 0.0], [2.0, 2.0]]), name="way"), TurnTo(math.pi))
     simulation, messages = driven(way)
     end = simulation.runs[-1].poses[-1]
@@ -350,7 +362,7 @@ def test_routes_and_turns_lead_where_they_should():
     assert abs(abs(2 * math.atan2(*last.parts[1])) - math.pi) < 0.05
 
 
-def test_the_grid_is_the_thesiss_and_every_cg_of_it_can_be_reached():
+def test_grid_points_are_the_thesis_grid_and_reachable():
     assert sorted(map(tuple, grid_points().tolist())) == sorted(map(tuple, grid().cg.tolist()))
     simulation = Simulation(ARC, ROBOT, 0, {}, BLIND)
     for cg in (*grid_points()[::7], *(np.array(c) for c in CONFIGURATION_CGS.values())):
@@ -358,7 +370,7 @@ def test_the_grid_is_the_thesiss_and_every_cg_of_it_can_be_reached():
 
 
 @pytest.mark.parametrize("name", sorted(set(EXPERIMENTS) - {"controller_evaluation", "rotation_grid"}))
-def test_every_experiment_is_driven_to_its_end(name):
+def test_experiment_each_is_driven_to_its_end(name):
     """The shortest form of each, by the robot with arms and by one without."""
     config = dataclasses.replace(BLIND, experiment=ExperimentConfig(laps=1, hours=0.03))
     for robot in (ROBOT, HUSKY):
@@ -369,7 +381,7 @@ def test_every_experiment_is_driven_to_its_end(name):
     assert simulate(name.replace("_", "-"), ROBOT).experiment.name == name
 
 
-def test_scores_of_a_robot_that_does_as_it_is_told_are_zero_but_for_the_motors_lag():
+def test_open_loop_scores_ideal_robot_are_zero_but_for_motor_lag():
     """Straight on, with the model that skids least; and a hand-made correction."""
     simulation, _ = driven(STRAIGHT)
     (score,) = score_open_loop_runs(simulation)
@@ -382,7 +394,7 @@ def test_scores_of_a_robot_that_does_as_it_is_told_are_zero_but_for_the_motors_l
     assert correction_time(np.array([0.1, 0.0, 0.3]), np.array([0.0, 0.0, 0.6]), 2.0) == pytest.approx(0.5)
 
 
-def test_the_command_writes_a_log_and_its_story(tmp_path, capsys):
+def test_simulate_command_writes_log_and_summary(tmp_path, capsys):
     arguments = ["simulate", "laps", "--out", str(tmp_path / "laps.mcap"), "--json", str(tmp_path / "laps.json"), "--effect", "slope=0.01"]
     assert main([*arguments, "--config.experiment.laps", "1", "--seed", "3"]) == 0
     story = json.loads((tmp_path / "laps.json").read_text())

@@ -64,7 +64,7 @@ def drive(wheels, seconds, cg=(0.0, 0.0), body=BODY, config=CONFIG, twist=(0, 0,
 @given(st.integers(0, 10**6))
 @example(64649)  # converges slowly
 @settings(max_examples=200, deadline=None)
-def test_once_its_tyres_have_given_way_its_accelerations_are_those_of_the_rigid_friction_dynamics(seed):
+def test_accelerations_settled_tyres_match_rigid_friction_dynamics(seed):
     rng = np.random.default_rng(seed)
     wheels, twist, cg = rng.uniform(-3, 3, 2), rng.uniform(-0.5, 0.5, 3), rng.uniform(-0.1, 0.1, 2)
     expected, margin = PLAIN.accelerations(wheels, twist, Influence.of_cg(cg))
@@ -83,7 +83,7 @@ def test_once_its_tyres_have_given_way_its_accelerations_are_those_of_the_rigid_
 
 @given(st.integers(0, 10**6))
 @settings(max_examples=100, deadline=None)
-def test_derivatives_are_those_of_differences(seed):
+def test_derivatives_match_finite_differences(seed):
     rng = np.random.default_rng(seed)
     chassis = BODY.chassis(CONFIG)
     soft = chassis.tyre._replace(tread=0.2, saturation=float(rng.choice([0.0, 0.3, 1.0])))
@@ -100,7 +100,7 @@ def test_derivatives_are_those_of_differences(seed):
 
 @pytest.mark.parametrize("wheels", [(-1.0, 1.0), (1.0, 2.0), (2.0, 2.0), (0.5, -1.5)])
 @pytest.mark.parametrize("cg", [(0.0, 0.0), (0.08, 0.02)])
-def test_the_quasi_static_limit_is_the_closed_solution(wheels, cg):
+def test_steady_motion_matches_quasi_static_friction_model(wheels, cg):
     """What differs at speed is centripetal, and falls with its square."""
     model, off = make_model("friction", ROBOT), []
     for scale in (1.0, 0.5):
@@ -115,7 +115,7 @@ def test_the_quasi_static_limit_is_the_closed_solution(wheels, cg):
 SMOOTH = {"wheels": (1.0, 3.0), "seconds": 0.2, "cg": (0.05, 0.01), "twist": (0.2, 0.05, 0.4)}
 
 
-def test_steps_converge_with_the_second_order_to_an_explicit_integrator_of_another_order():
+def test_integrate_smaller_steps_converge_with_second_order():
     """Where nothing switches: a robot with its CG on the floor that slides through its turn on rounded friction."""
     body, plain = dataclasses.replace(BODY, cg_height=0.0), dataclasses.replace(PLAIN, creep=0.2, cg_height=0.0)
     start = np.array([0, 0, 0, *SMOOTH["twist"]])
@@ -126,14 +126,14 @@ def test_steps_converge_with_the_second_order_to_an_explicit_integrator_of_anoth
     assert errors[-1] < 1e-5
 
 
-def test_steps_converge_with_the_second_order_while_the_loads_shift():
+def test_integrate_shifting_loads_converge_with_second_order():
     exact = drive(**SMOOTH, config=VehicleConfig(1e-5, creep=0.2))[-1, :6]
     steps = np.array([4e-3, 2e-3, 1e-3, 5e-4])
     errors = [np.abs(drive(**SMOOTH, config=VehicleConfig(h, creep=0.2))[-1, :6] - exact).max() for h in steps.tolist()]
     assert np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(2.0, abs=0.2)
 
 
-def test_where_a_rigid_robot_has_no_loads_that_agree_tyres_find_them():
+def test_integrate_painleve_case_is_solved_with_soft_tyres():
     """Painleve's paradox: a high CG on a floor that grips much more sideways than along, in a turn that the wheels reverse."""
     body = BODY.with_param("mu_ratio", 1.5)
     rows = drive((0.5, 4.4), 3.0, (0.1, 0.0), body, twist=(0.55, -0.1, 0.58))
@@ -142,7 +142,7 @@ def test_where_a_rigid_robot_has_no_loads_that_agree_tyres_find_them():
     assert np.isfinite(rows).all()
 
 
-def test_at_the_default_step_a_drive_ends_within_a_millimetre_of_where_it_ends_with_steps_ten_times_smaller():
+def test_integrate_default_step_is_exact_to_a_millimetre():
     """With all switching that a real drive has: starts, a change of direction, stops."""
     ends = []
     for h in (0.005, 0.0005):
@@ -154,7 +154,7 @@ def test_at_the_default_step_a_drive_ends_within_a_millimetre_of_where_it_ends_w
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-3)
 
 
-def test_wheels_follow_ramps_through_their_lag_exactly():
+def test_wheel_response_to_ramp_is_exact():
     """Against small Euler steps of q' = (target - q) / lag."""
     q, angle, lag, h = 0.7, 0.0, 0.08, 1e-5
     for i in range(10_000):
@@ -165,14 +165,14 @@ def test_wheels_follow_ramps_through_their_lag_exactly():
     assert turned == pytest.approx(angle, abs=1e-4)
 
 
-def test_wheels_speed_up_no_faster_than_the_controller_lets_them():
+def test_wheels_accelerate_no_faster_than_the_ramp():
     rows = drive((5.0, 5.0), 1.0, is_rolling=False)
     rates = np.diff(rows[:, 6], prepend=0.0) / CONFIG.step_s
     assert rates.max() * 0.164 <= CONFIG.acceleration_m_s2 * (1 + 1e-9)
     assert rates.max() * 0.164 > 0.95 * CONFIG.acceleration_m_s2
 
 
-def test_the_tyres_follow_the_law_of_the_robot_file_and_an_effect_turns_it_into_the_other():
+def test_contact_law_follows_robot_file_and_fault():
     reality = {law: TrueRobot(Body.from_robot(robot), Mount()) for law, robot in ROBOTS.items()}
     for law, other in (("isotropic", "thesis"), ("thesis", "isotropic")):
         assert reality[law].body.chassis(CONFIG).tyre.saturation == SATURATION[law]
@@ -188,7 +188,7 @@ def energy(rows, body, cg):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_locked_wheels_only_ever_take_energy(seed):
+def test_locked_wheels_never_add_energy(seed):
     """Whatever patches of floor are under them."""
     rng = np.random.default_rng(seed)
     cg, twist = rng.uniform(-0.1, 0.1, 2), np.array([*rng.uniform(-1, 1, 2), rng.uniform(-2, 2)])
@@ -217,7 +217,7 @@ def wheel_forces(body: Chassis, row, cg, share, law):
 
 
 @pytest.mark.parametrize("law", list(SATURATION))
-def test_the_change_of_momentum_is_the_impulse_of_the_forces_that_the_law_prints(law):
+def test_momentum_change_equals_impulse_of_contact_forces(law):
     """A sliding robot with a CG on the floor, whose loads are then those of standing: m dv of the CG in the world = sum of F dt."""
     body = dataclasses.replace(BODY, cg_height=0.0, saturation=SATURATION[law])
     cg, config = np.array([0.06, 0.02]), VehicleConfig(step_s=0.001)
@@ -238,21 +238,21 @@ def test_the_change_of_momentum_is_the_impulse_of_the_forces_that_the_law_prints
     np.testing.assert_allclose(summed, changed, atol=0.01 * np.abs(changed).max())
 
 
-def test_a_robot_without_grip_slides_down_a_slope_as_galileo_says():
+def test_slope_without_grip_accelerates_by_gravity():
     slick = dataclasses.replace(BODY.with_param("mu", 1e-9).with_param("rolling_resistance", 0.0), slope=0.1)
     rows = drive((0.0, 0.0), 1.0, (0.05, 0.0), slick, pose=(0, 0, 0.7))
     down = -0.5 * 9.81 * math.sin(0.1)
     np.testing.assert_allclose(rows[-1, POSE], [down, 0.0, 0.7], atol=1e-6)
 
 
-def test_a_parked_robot_stays_on_a_slope_and_leans_on_its_lower_wheels():
+def test_slope_parked_robot_stays_and_loads_lower_wheels():
     rows = drive((0.0, 0.0), 2.0, body=dataclasses.replace(BODY, slope=0.1))
     assert np.abs(rows[-1, POSE]).max() < 1e-4
     # uphill is ahead: the load of the front falls by z_G tan(slope) / (W/2)
     assert rows[-1, MARGIN] == pytest.approx(1 - 0.35 * math.tan(0.1) / 0.26, abs=1e-3)
 
 
-def test_slippery_floor_under_one_side_turns_a_braking_robot_towards_the_other():
+def test_slippery_patch_under_one_side_turns_braking_robot():
     half = np.array([[-10.0, 0.0, 10.0, 10.0, 0.2]])  # the left is slippery
     even = drive((0.0, 0.0), 1.0, twist=(1.0, 0.0, 0.0), body=dataclasses.replace(BODY, cg_height=0.1))
     split = drive((0.0, 0.0), 1.0, twist=(1.0, 0.0, 0.0), body=dataclasses.replace(BODY, cg_height=0.1), patches=half)
@@ -261,7 +261,7 @@ def test_slippery_floor_under_one_side_turns_a_braking_robot_towards_the_other()
     assert split[-1, 0] > even[-1, 0]
 
 
-def test_a_slope_or_a_payload_beyond_the_wheels_is_refused():
+def test_slope_or_payload_beyond_wheels_is_refused():
     with pytest.raises(CgError, match="tips over"):
         drive((1.0, 1.0), 0.1, (0.3, 0.0))
     high = dataclasses.replace(BODY, cg_height=0.5)
@@ -269,19 +269,19 @@ def test_a_slope_or_a_payload_beyond_the_wheels_is_refused():
         drive((0.0, 0.0), 0.5, body=high, twist=(2.0, 0.0, 0.0))
 
 
-def test_a_jerk_that_lifts_wheels_for_a_moment_tips_nobody():
+def test_tipping_brief_lift_is_tolerated():
     rows = drive((0.0, 0.0), 0.3, body=dataclasses.replace(BODY, cg_height=0.33), twist=(0.4, 0.0, 0.0))
     assert rows[:, MARGIN].min() < 0.0
     assert np.abs(rows[-1, TWIST]).max() < 1e-3
 
 
-def test_radii_of_each_side_count_by_themselves():
+def test_wheel_radii_act_on_their_own_side():
     wide = dataclasses.replace(BODY, radius_left=0.170, radius_right=0.158)
     assert drive((2.0, 2.0), 2.0, body=wide)[-1, 5] < -1e-3
     np.testing.assert_allclose(drive((2.0, 2.0 * 0.17 / 0.158), 2.0, body=wide)[-1, TWIST][2], 0.0, atol=1e-9)
 
 
-def test_loose_floor_shears_as_it_says():
+def test_loose_floor_shears_by_its_coefficients():
     plain = drive((1.0, 2.0), 2.0)[-1, TWIST]
     for index, expected in enumerate(
         [
@@ -298,7 +298,7 @@ def test_loose_floor_shears_as_it_says():
         assert np.hypot(*speed[-1]) == pytest.approx(np.hypot(*rows[-1, 3:5]), rel=1e-4)
 
 
-def test_the_cg_moves_with_the_arms_as_its_own_velocity_and_acceleration_say():
+def test_cg_moving_arms_velocity_and_acceleration_match_differences():
     masses = MassDistribution(ROBOT)
     masses.move(masses.posture("ready"), 1.0, 2.0)
     t = np.linspace(0.5, 3.5, 3001)
@@ -312,7 +312,7 @@ def test_the_cg_moves_with_the_arms_as_its_own_velocity_and_acceleration_say():
     np.testing.assert_allclose(rows[-1, :2], masses.nominal_cg(t[-1:])[0], atol=1e-12)
 
 
-def test_moving_arms_push_a_robot_without_grip_the_other_way_and_leave_its_cg_where_it_is():
+def test_moving_arms_without_grip_keep_the_cg_in_place():
     slick = BODY.with_param("mu", 1e-9).with_param("rolling_resistance", 0.0)
     masses = MassDistribution(ROBOT)
     masses.move(masses.posture("ready"), 0.2, 2.0)
@@ -324,7 +324,7 @@ def test_moving_arms_push_a_robot_without_grip_the_other_way_and_leave_its_cg_wh
     np.testing.assert_allclose(world_cg, world_cg[0] * np.ones((500, 1)), atol=2e-5)
 
 
-def test_a_payload_shifts_the_cg_by_its_share_and_adds_its_inertia():
+def test_payload_shifts_cg_and_adds_inertia():
     masses = MassDistribution(ROBOT)
     masses.move(masses.posture("ready"), 0.0, 1.0)
     at = np.array([5.0])
@@ -341,7 +341,7 @@ def test_a_payload_shifts_the_cg_by_its_share_and_adds_its_inertia():
     np.testing.assert_allclose(masses.cg(at)[0, :2], empty)
 
 
-def test_a_robot_without_arms_moves_a_ballast_and_knows_no_postures():
+def test_ballast_of_robot_without_arms_moves_and_has_no_postures():
     masses = MassDistribution(load_robot("husky_a200"))
     masses.move(masses.reach(np.array([0.05, 0.0])), 0.0, 1.0)
     np.testing.assert_allclose(masses.cg(np.array([2.0]))[0, :2], [0.05, 0.0])

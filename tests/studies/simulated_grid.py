@@ -21,8 +21,7 @@ from localization.lidar import LidarConfig, ScanMatcher, Sweep, choose_cell
 from localization.logs import open_log
 from localization.simulation.experiments import grid_points
 from localization.simulation.sensors import START_NS
-from localization.simulation.simulator import simulate, write_simulation
-from localization.simulation.track import RunRecord
+from localization.simulation.simulator import RunRecord, simulate, write_simulation
 from localization.simulation.vehicle import TWIST, Body, VehicleConfig, VehicleState, advance
 from localization.trajectory import IntArray
 from motion_models import se2

@@ -1,4 +1,7 @@
-"""The two big claims of the simulator: its calibration grid gives the closed model back, and its 84 drives win and lose as the thesis's."""
+"""The two big claims of the simulator: its calibration grid gives the closed model back, and its 84 drives win and lose as the thesis's.
+
+Groups of tests share a fixture of half a minute: they run in one process.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,8 @@ def drives():
     return {row.trajectory: row for row in simulated_controllers.rows(simulated_controllers.scores())}
 
 
-def test_rotations_measured_by_scan_matching_give_the_closed_models_regressions_back(measured):
+@pytest.mark.xdist_group("simulated_grid")
+def test_rotations_by_scan_matching_reproduce_the_regressions(measured):
     """4.21, 4.22 and 4.25 through bag, scan matching and arcs: each coefficient within three of its stated sigmas."""
     z = []
     for seen, said in simulated_grid.fits(measured).values():
@@ -27,7 +31,8 @@ def test_rotations_measured_by_scan_matching_give_the_closed_models_regressions_
     assert np.abs(z).max() < 3.0
 
 
-def test_every_rotation_is_measured_within_its_stated_sigma(measured):
+@pytest.mark.xdist_group("simulated_grid")
+def test_rotations_by_scan_matching_are_within_their_sigmas(measured):
     """Against the vehicle at constant rates: what is left is measurement. 68 values of each: the RMS of z is 1 to within 0.3 or smaller."""
     value = np.array([[r.k, *r.cor] for r in measured])
     z = (value - [r.settled for r in measured]) / simulated_grid.sigmas(measured)
@@ -38,14 +43,16 @@ def test_every_rotation_is_measured_within_its_stated_sigma(measured):
     assert (simulated_grid.sigmas(measured).mean(axis=0) < [0.001, 0.004, 0.004]).all()
 
 
-def test_what_separates_the_closed_model_from_the_vehicle_is_less_than_a_percent(measured):
+@pytest.mark.xdist_group("simulated_grid")
+def test_closed_model_differs_from_vehicle_by_less_than_a_percent(measured):
     """The closed model knows no inertia: at 0.3 rad/s that is worth some thousandths of k."""
     off = np.array([r.settled - r.model for r in measured])
     assert np.abs(off[:, 0]).max() < 0.01
     assert np.abs(off[:, 1:]).max() < 0.006
 
 
-def test_the_heuristic_wins_where_the_thesiss_did(drives):
+@pytest.mark.xdist_group("simulated_controllers")
+def test_skid_steer_on_hard_turns_wins_as_in_the_thesis(drives):
     """Clearly on rotations and hard turns, in vision error."""
     for trajectory in ("rotate", "arc_3", "s_curve"):
         assert drives[trajectory].gain("measured") > 0.1
@@ -53,13 +60,15 @@ def test_the_heuristic_wins_where_the_thesiss_did(drives):
         assert drives[trajectory].wins("simulated") >= 6
 
 
-def test_the_heuristic_does_not_win_on_gentle_arcs(drives):
+@pytest.mark.xdist_group("simulated_controllers")
+def test_skid_steer_on_gentle_arcs_does_not_win(drives):
     for trajectory in ("arc_1", "arc_2", "arc_4"):
         assert drives[trajectory].gain("simulated") < 0.0
         assert drives[trajectory].wins("simulated") <= 4
 
 
-def test_the_scores_are_of_the_size_of_table_5_2_where_the_study_says_so(drives):
+@pytest.mark.xdist_group("simulated_controllers")
+def test_controller_scores_have_the_size_of_table_5_2(drives):
     rotate = drives["rotate"]
     np.testing.assert_allclose(rotate.simulated[:, 1, 2], rotate.measured[:, 1, 2], rtol=0.3)  # by this the CGs were inferred
     assert rotate.simulated[:, 1, 1].mean() == pytest.approx(rotate.measured[:, 1, 1].mean(), rel=0.3)  # by nothing

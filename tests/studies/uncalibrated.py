@@ -23,7 +23,7 @@ from motion_models.calibration.least_squares import FitConfig
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.calibration.plan import CLOCK, calibrate, free_of
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
-from motion_models.corrected_wheels import CorrectedWheels
+from motion_models.corrected import CorrectedWheels
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
 from motion_models.robot import Robot, load_robot

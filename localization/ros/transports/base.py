@@ -51,10 +51,10 @@ class Transport(Protocol):
     def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
         """Answer requests of ``kind`` (`std_srvs/srv/Trigger`) by ``handler``, inside `take`; False where the transport has no services."""
 
-    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
+    def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
         """Messages that came since the last call; waits for at most ``timeout_s`` if there are none.
 
-        It may let others wait for ``patience_s`` unless an urgent one comes: to wake up for each costs more than to read it.
+        It may let others wait for ``batch_s`` unless an urgent one comes: to wake up for each costs more than to read it.
         """
 
     def publishers(self) -> Mapping[str, set[str]]:

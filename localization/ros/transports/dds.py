@@ -98,9 +98,9 @@ class DdsTransport(MonotonicTime):
     def publish(self, topic: str, data: bytes) -> None:
         _write(self._writers[topic], data)
 
-    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
+    def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
         """In the order of sending: after a pause, the messages of one topic must not all come before another's."""
-        is_urgent = patience_s > 0.0 and self._urgent.wait(round(patience_s * 1e9))
+        is_urgent = batch_s > 0.0 and self._urgent.wait(round(batch_s * 1e9))
         is_there = is_urgent or self._waiting.wait(round(timeout_s * 1e9))
         since, self._last_take_ns = self._last_take_ns, time.monotonic_ns()
         if not is_there:

@@ -12,7 +12,7 @@ from localization.errors import TransportError
 from localization.ros.transports.base import MonotonicTime, Received, ServiceHandler
 
 _LATEST, _LATCHED_DEPTH, _DEPTH = 50, 100, 10
-_MESSAGE_PACKAGES = ("sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "tf2_msgs")
+_MESSAGE_PACKAGES = ("std_msgs", "sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "tf2_msgs")
 _SERVICE_PACKAGES = ("std_srvs",)
 
 
@@ -47,7 +47,7 @@ class RclpyTransport(MonotonicTime):
 
     @classmethod
     def on_node(cls, node: Any) -> RclpyTransport:
-        """On a node of somebody else, which `close` leaves alone."""
+        """On a node that exists, which `close` leaves alone."""
         made = cls.__new__(cls)
         made._attach(node)
         made._rclpy = None
@@ -97,7 +97,7 @@ class RclpyTransport(MonotonicTime):
     def publish(self, topic: str, data: bytes) -> None:
         self._writers[topic].publish(data)
 
-    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
+    def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
         self._executor.spin_once(timeout_sec=timeout_s)
         while self._received:
             before = len(self._received)

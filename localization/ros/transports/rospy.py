@@ -77,7 +77,7 @@ class RospyTransport(MonotonicTime):
         message._buff = data
         writer.publish(message)
 
-    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
+    def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
         found = []
         try:
             found.append(self._received.get(timeout=timeout_s))

@@ -35,8 +35,8 @@ class SimTimeTransport:
     def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
         return self._transport.offer_service(name, kind, handler)
 
-    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
-        """Without patience: its times would be those of the wall."""
+    def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
+        """At once: times of batches would be those of the wall."""
         found = []
         for received in self._transport.take(timeout_s):
             if received.topic == CLOCK:

@@ -99,9 +99,9 @@ class ZenohTransport(MonotonicTime):
     def publish(self, topic: str, data: bytes) -> None:
         self._writers[topic].put(data)
 
-    def take(self, timeout_s: float, patience_s: float = 0.0) -> list[Received]:
+    def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
         """In the order of sending: each topic has a callback of its own."""
-        if patience_s > 0.0 and self._has_urgent.wait(patience_s):
+        if batch_s > 0.0 and self._has_urgent.wait(batch_s):
             timeout_s = 0.0
         self._has_urgent.clear()
         found: list[tuple[int, Received]] = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from motion_models.corrected_wheels import RADIUS_NAMES, CorrectedWheels
+from motion_models.corrected import RADIUS_NAMES, CorrectedWheels
 from motion_models.errors import ModelError
 from motion_models.online_calibration import correctable, corrections
 from motion_models.registry import MODELS, make_model

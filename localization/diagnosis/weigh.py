@@ -1,0 +1,260 @@
+"""Centre of gravity and unknown load of a robot from how it turns, without scales.
+
+A skid-steer robot turns about a centre of rotation that moves with its centre of gravity (CG): in place x_CR = 2.2 x_G, on gentle arcs
+x_CR = 1.2 x_G, and how far it turns, k, grows with x_G squared (Ebersole 2016, 4.21 to 4.25; `motion_models.friction` predicts all three).
+The CG is estimated together with everything else that could turn the robot in the same way, each within what robots differ by from their
+files, as one maximum a posteriori estimate by Gauss-Newton (Barfoot 2017, eqs. 4.14 and 4.15), with z discrepancies of the predicted
+motions, S their derivatives and R the noise of the drive:
+
+    P = (S^T R^-1 S + diag(1 / sigma_i^2))^-1,    x = P S^T R^-1 z
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from localization.calibration.windows import driven
+from localization.diagnosis.causes import CAUSES, Cause, Hypothesis
+from localization.diagnosis.drive import Drive
+from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor
+from localization.diagnosis.prediction import DrivePredictor
+from motion_models.errors import CalibrationError
+from motion_models.friction import FrictionModel
+from motion_models.registry import make_model
+from motion_models.robot import DIFF_DRIVE, Robot
+from motion_models.se2 import FloatArray
+
+MIN_TURN_RAD = 2.0 * math.pi
+"""Least turning, by the difference of the wheels: below it the sigma of the CG comes from the prior."""
+MIN_WINDOWS = 8
+_CG = ("cg_offset_x", "cg_offset_y")
+_CG_SIGMA_SHARE = 0.25
+"""Sigma of the CG's prior, over wheelbase and track width: a third of the way to an axle."""
+PRIOR_SIGMAS: Mapping[str, float] = {
+    "wheel_radius_scale": 0.02,
+    "wheel_radius_difference": 0.005,
+    "track_width": 0.02,
+    "lidar_offset_x": 0.01,
+    "lidar_offset_y": 0.005,
+    "lidar_yaw": 0.02,
+    "lidar_time_offset": 0.02,
+    "wheel_time_offset": 0.02,
+    "gyro_time_offset": 0.02,
+    "gyro_bias": 0.01,
+    "gyro_scale": 0.01,
+    "friction_anisotropy": 0.2,
+    "diagonal_load": 0.15,
+    "tread_asymmetry": 0.02,
+    "rolling_resistance": 0.01,
+    "split_friction": 0.02,
+    "slope": 0.005,
+}
+"""How far robots, floors and mounts differ from their files, as a sigma in the cause's unit: what the weighing must not take for a load.
+
+Scrub has the effect of friction_anisotropy (`tests.studies.friction_grid`), and no derivative at its usual value, 0."""
+_SLIP_STIFFNESS_SIGMA = 0.3
+"""Of the tyres' slip stiffness, relative: 7.7 to 13.3 on the robots of `tests.studies.contact_law`."""
+_MAX_PRIOR_SIGMAS = 4.0
+"""Beyond it a size is held: steps of Gauss-Newton may be too long for the friction model."""
+_SYSTEMATIC_SIGMA_M = 0.0015
+"""Added to each axis: what errors of scan matching that last for the whole drive make of the CG of robots whose files are right."""
+_MAX_CG_STEP = 0.15
+"""Longest step of the CG, over the sigma of its prior: 2 cm on a Husky. Longer ones overshoot where loads differ much."""
+_ROUNDS = 16
+_CONVERGED_M = 1e-4
+_MAX_NOISE_RATIO = 3.0
+"""Noise of the drive over that of its motion reference beyond which the friction model does not describe the drive."""
+_CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class DrivenWeighing:
+    """Centre of gravity by a drive, and the load that would explain how far it is from where the robot file has it."""
+
+    log: str
+    robot: str
+    motion_reference: str
+    windows: int
+    turned_rad: float
+    """By the difference of the wheels over the track width, both directions added."""
+    given: FloatArray
+    """(2,) CG by robot file and arms, mean over the drive [m]."""
+    offset: FloatArray
+    """(2,) of the CG from there [m]."""
+    covariance: FloatArray
+    """(2, 2) of the offset [m^2]."""
+    mass_kg: float
+    """By the robot file."""
+    noise_ratio: float
+    """Noise of the drive over that of the motion reference by its own covariance."""
+    corrections: Mapping[str, tuple[float, float]]
+    """What else was estimated with the CG: size and sigma by cause."""
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def position(self) -> FloatArray:
+        """(2,) CG in the body frame [m]."""
+        return np.asarray(self.given + self.offset)
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(2,) [m]"""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance)))
+
+    @property
+    def moment(self) -> FloatArray:
+        """(2,) mass of an unknown load times its distance from the CG of the loaded robot [kg m].
+
+        Exact: with M the mass in the file and g the CG of all, m (p - g) = M (g - g_0).
+        """
+        return np.asarray(self.mass_kg * self.offset)
+
+    @property
+    def p_value(self) -> float:
+        """Probability that a robot whose CG lies where its file has it shows as large an offset."""
+        return float(stats.chi2.sf(self.offset @ np.linalg.solve(self.covariance, self.offset), 2))
+
+    def payload(self, x: float, y: float) -> tuple[float, float]:
+        """Mass of a load at ``x, y`` in the body frame, and its sigma [kg]: least squares on the two moments."""
+        lever = np.array([x, y]) - self.position
+        weight = np.linalg.inv(self.mass_kg**2 * self.covariance)
+        information = float(lever @ weight @ lever)
+        return float(lever @ weight @ self.moment) / information, 1.0 / math.sqrt(information)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "log": self.log,
+            "robot": self.robot,
+            "witness": self.motion_reference,
+            "windows": self.windows,
+            "turned_rad": self.turned_rad,
+            "cg_m": list(self.position),
+            "cg_sigma_m": list(self.sigmas),
+            "cg_given_m": list(self.given),
+            "cg_offset_m": list(self.offset),
+            "cg_covariance_m2": [list(row) for row in self.covariance],
+            "load_moment_kg_m": list(self.moment),
+            "load_moment_sigma_kg_m": list(self.mass_kg * self.sigmas),
+            "p_value": self.p_value,
+            "noise_over_reference": self.noise_ratio,
+            "corrections": {name: {"size": size, "sigma": sigma} for name, (size, sigma) in self.corrections.items()},
+            "notes": list(self.warnings),
+        }
+
+
+def weigh(drive: Drive) -> tuple[DrivenWeighing, DrivePredictor]:
+    """The CG on ``drive``, and the predictor by which it was found.
+
+    Raises `CalibrationError` for a drive that does not show it: without positions, turning or windows, or of a robot with casters.
+    """
+    turned = _check(drive)
+    robot = drive.robot
+    predictor = make_predictor(drive, make_model("friction", robot))
+    causes = _causes(predictor, robot)
+    values, everything = np.zeros(len(causes)), tuple(range(len(causes)))
+    for _ in range(_ROUNDS):
+        linearization = linearize(predictor, causes, dict(zip(causes, values.tolist(), strict=True)), tolerance=1.0)
+        wanted, cov, _ = linearization.problem.fit(everything)
+        step, share = _limited(wanted - values, causes)
+        values = _held(values + step, causes, predictor)
+        if share == 1.0 and np.abs(step[:2]).max() < _CONVERGED_M:
+            break
+    ratio = _noise_ratio(predictor, linearization)
+    found = DrivenWeighing(
+        *(drive.name, robot.name, drive.motion_reference, len(drive.maneuvers), turned),
+        given=predictor.batch.cg.mean(axis=0),
+        offset=values[:2],
+        covariance=cov[:2, :2] + _SYSTEMATIC_SIGMA_M**2 * np.eye(2),
+        mass_kg=robot.geometry.mass_kg,
+        noise_ratio=ratio,
+        corrections={c.key: (float(v), math.sqrt(s)) for c, v, s in zip(causes[2:], values[2:], np.diagonal(cov)[2:], strict=True)},
+        warnings=(*_warnings(ratio), *drive.warnings),
+    )
+    return found, predictor
+
+
+def corrected_hypothesis(found: DrivenWeighing) -> Hypothesis:
+    """The robot file with the CG that was found, and nothing else changed."""
+    return Hypothesis(cg=(float(found.offset[0]), float(found.offset[1])))
+
+
+def _check(drive: Drive) -> float:
+    """Turning of the wheels [rad]; raises `CalibrationError` where the drive cannot show the CG."""
+    robot, name = drive.robot, drive.name
+    if robot.drive == DIFF_DRIVE:
+        raise CalibrationError(
+            f"robot '{robot.name}' turns on casters (drive = {DIFF_DRIVE} in its file): how it turns does not show its CG."
+        )
+    if drive.is_gyro_reference or drive.motion_reference == "none":
+        raise CalibrationError(
+            f"{name} has no positions, only headings, and these do not show about which point the robot turns: "
+            "record a LiDAR, or name a --reference."
+        )
+    g = robot.geometry
+    turned = driven(drive.maneuvers, g.wheel_radius_m, g.track_width_m)[2]
+    if turned < MIN_TURN_RAD or len(drive.maneuvers) < MIN_WINDOWS:
+        raise CalibrationError(
+            f"{name}: the wheels turn the robot by {turned:.1f} rad in {len(drive.maneuvers)} measured windows; it takes "
+            f"{MIN_TURN_RAD:.1f} rad in {MIN_WINDOWS}. Turn in place for 15 s to each side, then drive tight arcs to both."
+        )
+    return turned
+
+
+def _causes(predictor: DrivePredictor, robot: Robot) -> tuple[Cause, ...]:
+    """Offsets of the CG, and what else may turn the robot in the same way, with their priors."""
+    g = robot.geometry
+    cg = (_CG_SIGMA_SHARE * g.wheelbase_m, _CG_SIGMA_SHARE * g.track_width_m)
+    shown = candidate_causes(predictor, moments=0)
+    friction = FrictionModel.from_robot(robot)
+    stiffness = _slip_stiffness(float(friction.nominal[friction.param_names.index("slip_stiffness")]))
+    others = [dataclasses.replace(c, prior_sigma=PRIOR_SIGMAS[c.id]) for c in shown if c.id in PRIOR_SIGMAS]
+    return (*(dataclasses.replace(CAUSES[name], prior_sigma=s) for name, s in zip(_CG, cg, strict=True)), *others, stiffness)
+
+
+def _slip_stiffness(nominal: float) -> Cause:
+    """Slip stiffness of the tyres, relative to the ``nominal`` one; as a logarithm, which keeps it positive."""
+
+    def inject(b: Hypothesis, size: float) -> Hypothesis:
+        now = nominal + b.friction.get("slip_stiffness", 0.0)
+        return dataclasses.replace(b, friction={**b.friction, "slip_stiffness": now * math.exp(size) - nominal})
+
+    words = "the tyres' slip stiffness is {} more", "the tyres' slip stiffness is {} less"
+    meaning = "the slip stiffness of the tyres is more by this share"
+    return Cause("slip_stiffness", "1", meaning, _SLIP_STIFFNESS_SIGMA, 0.03, inject, words, prior_sigma=_SLIP_STIFFNESS_SIGMA)
+
+
+def _limited(step: FloatArray, causes: tuple[Cause, ...]) -> tuple[FloatArray, float]:
+    """``step`` (p,) of Gauss-Newton shortened to where the friction model is about linear in the CG, and its share of the whole."""
+    limits = np.array([(_MAX_CG_STEP if cause.id in _CG else 1.0) * cause.prior_sigma for cause in causes])
+    share = min(1.0, float(np.min(limits / np.maximum(np.abs(step), 1e-12))))
+    return share * step, share
+
+
+def _held(values: FloatArray, causes: tuple[Cause, ...], predictor: DrivePredictor) -> FloatArray:
+    """``values`` (p,) within `_MAX_PRIOR_SIGMAS`, and the CG at most 0.9 of the way to an axle or a side."""
+    g, given = predictor.drive.robot.geometry, predictor.batch.cg.mean(axis=0)
+    edge = 0.45 * np.array([g.wheelbase_m, g.track_width_m])
+    limits = _MAX_PRIOR_SIGMAS * np.array([cause.prior_sigma for cause in causes])
+    cg = np.clip(given + values[:2], -edge, edge) - given
+    return np.concatenate([cg, np.clip(values, -limits, limits)[2:]])
+
+
+def _noise_ratio(predictor: DrivePredictor, linearization: Linearization) -> float:
+    """Of x, y and yaw, the median over the windows."""
+    claimed = np.sqrt(np.diagonal(predictor.batch.cov, axis1=1, axis2=2))
+    known = np.isfinite(linearization.rows[:, :3]) & (claimed > 0.0) & np.isfinite(claimed)
+    return float(np.median((linearization.noise.sigmas[:, :3] / np.where(known, claimed, 1.0))[known])) if known.any() else 1.0
+
+
+def _warnings(noise_ratio: float) -> tuple[str, ...]:
+    if noise_ratio <= _MAX_NOISE_RATIO:
+        return ()
+    text = f"{noise_ratio:.1f} times the noise of the motion reference is left: something else turns this robot. Run `skidloc diagnose`."
+    return (text,)

@@ -1,0 +1,46 @@
+"""Frames of the positions in tables of windows."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from motion_models import se2
+from motion_models.calibration.maneuvers import Maneuver
+from motion_models.calibration.windows_table import without_turned_frames
+from motion_models.errors import CalibrationError
+from tests.studies import drive_husky
+
+RADIUS_M = 0.165
+
+
+def turned(maneuver: Maneuver, angle: float) -> Maneuver:
+    """The same with its position in a frame that is turned by ``angle`` [rad]."""
+    pose = se2.compose(np.array([0.0, 0.0, angle]), maneuver.measured)
+    return dataclasses.replace(maneuver, measured=np.column_stack([pose[:, :2], maneuver.measured[:, 2]]))
+
+
+def test_turned_frames_of_the_drive_husky_are_found() -> None:
+    """The origin's parser turned the positions of 11 windows by up to pi; five of them moved far enough to show it."""
+    raw = drive_husky.maneuvers(mended=False)
+    kept, (note,) = without_turned_frames(raw, RADIUS_M)
+    left_out = {i for i, m in enumerate(raw) if not any(m is other for other in kept)}
+    turn = np.abs(se2.wrap_angle(drive_husky.frame_turn(drive_husky.columns())))
+    assert len(left_out) == 5
+    assert left_out <= set(np.flatnonzero(turn > 1.0))
+    assert "5 of 431 windows lie off the direction of their wheels" in note
+
+
+def test_turned_frames_of_corrected_windows_are_none() -> None:
+    corrected = drive_husky.maneuvers(mended=True)
+    assert without_turned_frames(corrected, RADIUS_M) == (corrected, [])
+
+
+@pytest.mark.parametrize("angles", [np.full(603, np.pi / 2), np.random.default_rng(0).uniform(-np.pi, np.pi, 603)], ids=["axes", "world"])
+def test_turned_frames_of_most_windows_are_refused(angles: np.ndarray) -> None:
+    """A sensor's own axes, and positions in a world frame."""
+    windows = [turned(m, float(angle)) for m, angle in zip(drive_husky.maneuvers(mended=True), angles, strict=True)]
+    with pytest.raises(CalibrationError, match="must be in the frame of the body at the start of the window"):
+        without_turned_frames(windows, RADIUS_M)

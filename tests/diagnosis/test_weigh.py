@@ -1,0 +1,96 @@
+"""Weighing by driving: hidden loads of simulated robots, the thesis's rotations, and what the command prints, writes and refuses."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from localization.cli import main
+from localization.diagnosis.weigh import DrivenWeighing
+from localization.simulation.experiments import Experiment, ExperimentConfig, OpenLoop, Phase, Rest, constant
+from localization.simulation.scanners import ScannerConfig
+from localization.simulation.sensors import SensorConfig
+from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
+from motion_models.robot import DIFF_DRIVE, Robot, load_robot
+from motion_models.robot_file import robot_toml
+from tests.studies.weigh import left_out_cgs
+
+_PAYLOAD_KG = 8.0
+
+
+def _turns(robot: Robot, config: ExperimentConfig) -> Iterator[Phase]:
+    yield Rest(1.0)
+    for sign in (1.0, -1.0):
+        yield OpenLoop(f"turn {sign:+g}", constant(0.0, 0.5 * sign), 8.0)
+        yield OpenLoop(f"arc {sign:+g}", constant(0.4, 0.5 * sign), 5.0)
+        yield OpenLoop(f"arc back {sign:+g}", constant(-0.4, -0.5 * sign), 5.0)
+
+
+def _straight(robot: Robot, config: ExperimentConfig) -> Iterator[Phase]:
+    yield OpenLoop("ahead", constant(0.3, 0.0), 20.0)
+
+
+def _bag(folder: Path, phases, effects: dict[str, float], lidar: str = "2d") -> Path:
+    path = folder / "drive.mcap"
+    sensors = SensorConfig(lidar=lidar, scanner=ScannerConfig(rate_hz=5.0, beams=121))
+    experiment = Experiment("turns", "for tests", "hall", (-3.0, 0.0, 0.0), phases)
+    write_simulation(path, Simulation(experiment, load_robot("husky_a200"), 12, effects, SimulationConfig(sensors=sensors)))
+    return path
+
+
+def test_weigh_hidden_payload_reports_cg_load_and_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag, robot = _bag(tmp_path, _turns, {"payload": _PAYLOAD_KG}), load_robot("husky_a200")
+    out, numbers = tmp_path / "loaded.toml", tmp_path / "weighing.json"
+    edge = 0.5 * robot.geometry.wheelbase_m
+    options = ["--robot", "husky_a200", "--at", str(edge), "0", "--out", str(out), "--json", str(numbers)]
+    assert main(["weigh", str(bag), *options]) == 0
+    truth = np.array([_PAYLOAD_KG * edge / (_PAYLOAD_KG + robot.geometry.mass_kg), 0.0])
+    found = json.loads(numbers.read_text())
+    assert np.all(np.abs(np.array(found["cg_m"]) - truth) < 3.0 * np.array(found["cg_sigma_m"]))
+    assert max(found["cg_sigma_m"]) < 0.01
+    mass, sigma = found["load_kg"]
+    assert abs(mass - _PAYLOAD_KG) < 3.0 * sigma
+    assert load_robot(str(out)).center_of_gravity == pytest.approx(found["cg_m"])
+    printed = capsys.readouterr().out
+    assert "farther ahead" in printed
+    assert "centre of gravity x" in printed
+
+
+def _weighing(offset: tuple[float, float]) -> DrivenWeighing:
+    return DrivenWeighing("a.bag", "husky_a200", "scans", 20, 30.0, np.zeros(2), np.array(offset), 1e-6 * np.eye(2), 46.0, 1.0, {})
+
+
+@pytest.mark.parametrize(("mass", "place"), [(5.0, (0.4, 0.0)), (12.0, (-0.1, 0.2))])
+def test_weighing_of_known_offset_gives_the_payload(mass: float, place: tuple[float, float]) -> None:
+    found = _weighing(tuple(mass * np.array(place) / (46.0 + mass)))
+    assert found.payload(*place)[0] == pytest.approx(mass)
+    assert found.moment == pytest.approx(mass * (np.array(place) - found.position))
+    assert found.p_value < 1e-6
+
+
+def test_weigh_left_out_rotations_of_the_thesis_have_their_cg() -> None:
+    errors = left_out_cgs(every=6)
+    assert len(errors) == 12
+    assert np.sqrt(np.mean(errors**2, axis=0)).max() < 0.01
+
+
+def test_weigh_straight_drive_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["weigh", str(_bag(tmp_path, _straight, {})), "--robot", "husky_a200"]) == 2
+    assert "Turn in place for 15 s to each side" in capsys.readouterr().err
+
+
+def test_weigh_headings_alone_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["weigh", str(_bag(tmp_path, _turns, {}, lidar="none")), "--robot", "husky_a200"]) == 2
+    assert "record a LiDAR, or name a --reference" in capsys.readouterr().err
+
+
+def test_weigh_robot_with_casters_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    robot = tmp_path / "casters.toml"
+    robot.write_text(robot_toml(dataclasses.replace(load_robot("husky_a200"), drive=DIFF_DRIVE)))
+    assert main(["weigh", str(_bag(tmp_path, _straight, {})), "--robot", str(robot)]) == 2
+    assert "turns on casters" in capsys.readouterr().err

@@ -1,0 +1,153 @@
+"""A second vehicle for blind tests: four wheels in MuJoCo, whose rigid bodies and contacts share nothing with our friction model.
+
+World, drives and sensors are the simulator's. MuJoCo moves the robot: a chassis on a free joint, four wheels in hinges
+with velocity servos, and elliptic friction cones at their soft contacts with a plane.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+
+from localization.errors import SimulationError
+from localization.simulation.experiments import Experiment
+from localization.simulation.faults import TrueRobot
+from localization.simulation.simulator import Simulation, SimulationConfig
+from localization.simulation.vehicle import ANGLES, CG, COLUMNS, POSE, RATES, TWIST
+from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
+
+_STEP_S = 0.00125
+_WHEEL_MASS_SHARE = 0.02
+_ARMATURE = 30.0
+"""Inertia of a motor behind its gears, over the wheel's mass times its radius squared."""
+_SERVO_GAIN = 20.0
+"""Torque of a wheel's servo per rad/s of error, over m g r."""
+_CONTACT = 'solref="0.01 1" solimp="0.05 0.05 0.001" solreffriction="0.016 1"'
+"""Soft contacts that stop a slip within 5 to 9 ms. Twice as stiff, wheels hop: MuJoCo's cones couple slip to the normal force."""
+_FLATTENING = 0.0034
+"""How much smaller the rolling radius is than the geometry's, by the contacts' depth: measured, the same for all robots to 0.0001."""
+_WHEELS = (("fl", 1.0, 1.0), ("fr", 1.0, -1.0), ("rl", -1.0, 1.0), ("rr", -1.0, -1.0))
+_PHYSICAL = frozenset(
+    {"wheel_radius_scale", "wheel_radius_difference", "track_width", "payload", "cg_offset_x", "cg_offset_y", "split_friction", "scrub"}
+    | {"rolling_resistance", "slope", "wheel_radius_drift"}
+)
+_OF_SENSORS = frozenset(
+    {"lidar_offset_x", "lidar_offset_y", "lidar_yaw", "lidar_time_offset", "wheel_time_offset", "gyro_bias", "gyro_scale"}
+    | {"gyro_time_offset", "range_scale", "range_bias", "encoder_dropout", "missing_joint_messages"}
+)
+EFFECTS = _PHYSICAL | _OF_SENSORS
+"""Ids of the faults that can be hidden in it."""
+
+
+class MujocoSimulation(Simulation):
+    """`Simulation` of a robot without arms that MuJoCo moves."""
+
+    def __init__(
+        self, experiment: Experiment, robot: Robot, seed: int, effects: Mapping[str, float], config: SimulationConfig | None = None
+    ) -> None:
+        unknown = sorted(set(effects) - EFFECTS)
+        if unknown or robot.arms is not None:
+            raise SimulationError(f"MuJoCo's vehicle has no {', '.join(unknown) or 'arms'}.")
+        super().__init__(experiment, robot, seed, effects, config)
+        self._model = mujoco.MjModel.from_xml_string(_xml(self.reality, robot))
+        self._data = mujoco.MjData(self._model)
+        x, y, yaw = experiment.start
+        self._data.qpos[:7] = (x, y, self._data.qpos[2], math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw))
+        self._heading = yaw
+        self._set_points = np.zeros(2)
+        self._hinges = [self._model.joint(name).id for name, _, _ in _WHEELS]
+        self._angles_at = [self._model.jnt_qposadr[j] for j in self._hinges]
+        self._rates_at = [self._model.jnt_dofadr[j] for j in self._hinges]
+        self._geoms = [self._model.geom(name).id for name, _, _ in _WHEELS]
+        self._bodies = [self._model.body(name).id for name, _, _ in _WHEELS]
+
+    def _move(self, times: FloatArray, wheels: FloatArray) -> FloatArray:
+        config, rows = self.config.vehicle, np.empty((len(wheels), COLUMNS))
+        substeps = round(config.step_s / _STEP_S)
+        radii = np.array([self._body.radius_left, self._body.radius_right] * 2) * (1.0 + _FLATTENING)
+        self._model.geom_size[self._geoms, 0] = self._model.geom_size[self._geoms, 2] = radii
+        ramp = config.acceleration_m_s2 / float(radii.mean()) * config.step_s
+        for row, target in zip(rows, wheels, strict=True):
+            self._set_points += np.clip(target - self._set_points, -ramp, ramp)
+            keep = math.exp(-config.step_s / config.motor_lag_s)
+            self._data.ctrl[:] = keep * self._data.ctrl + (1.0 - keep) * np.tile(self._set_points, 2)
+            self._oppose_rolling()
+            for _ in range(substeps):
+                mujoco.mj_step(self._model, self._data)
+            self._record(row)
+        self._state.numbers[:3] = rows[-1, POSE]
+        self._state.steps += len(rows)
+        return rows
+
+    def _oppose_rolling(self) -> None:
+        """Rolling resistance: a force along the wheel's rolling direction, f_r N (Ebersole 2016, 3.17)."""
+        share, data = self._body.param("rolling_resistance"), self._data
+        loads, force = np.zeros(4), np.zeros(6)
+        for i in range(data.ncon):
+            mujoco.mj_contactForce(self._model, data, i, force)
+            for geom in data.contact[i].geom:
+                if geom in self._geoms:
+                    loads[self._geoms.index(geom)] += force[0]
+        speeds = data.qvel[self._rates_at] * self._model.geom_size[self._geoms, 0]
+        ahead = np.array([math.cos(self._heading), math.sin(self._heading)])
+        data.xfrc_applied[self._bodies, :2] = -(share * loads * np.tanh(speeds / 0.02))[:, None] * ahead
+
+    def _record(self, row: FloatArray) -> None:
+        data = self._data
+        w, _, _, z = data.qpos[3:7]
+        turned = 2.0 * math.atan2(z, w) - self._heading
+        self._heading += math.remainder(turned, 2.0 * math.pi)
+        c, s = math.cos(self._heading), math.sin(self._heading)
+        vx, vy = data.qvel[:2]
+        rates, angles = data.qvel[self._rates_at], data.qpos[self._angles_at]
+        row[POSE] = (*data.qpos[:2], self._heading)
+        row[TWIST] = (c * vx + s * vy, -s * vx + c * vy, data.qvel[5])
+        row[RATES], row[ANGLES] = (rates[:2] + rates[2:]) / 2.0, (angles[:2] + angles[2:]) / 2.0
+        row[CG], row[-1] = self._masses.cg(np.zeros(1))[0, :2] + np.array(self._body.cg_offset), 1.0
+
+
+def _xml(true: TrueRobot, robot: Robot) -> str:
+    """MJCF of the robot as it truly is, on a plane."""
+    body, g = true.body, robot.geometry
+    mass, mu = body.mass, body.param("mu")
+    wheel_mass = _WHEEL_MASS_SHARE * mass
+    chassis_mass = mass - 4.0 * wheel_mass
+    radius = 0.5 * (body.radius_left + body.radius_right)
+    half_wheelbase, half_track = 0.5 * body.param("wheelbase"), 0.5 * body.param("track_width")
+    x, y = ((np.array([g.cg_x_m, g.cg_y_m]) + body.cg_offset) * mass / chassis_mass).tolist()
+    height = (body.cg_height - radius) * mass / chassis_mass
+    inertia, twisting = body.inertia, mu * body.param("scrub")
+    wheels, servos, contacts = [], [], []
+    for name, front, left in _WHEELS:
+        own_radius = (body.radius_left if left > 0.0 else body.radius_right) * (1.0 + _FLATTENING)
+        grip = mu * (1.0 + 0.5 * body.grip_split * left)
+        wheels.append(f"""
+   <body name="{name}" pos="{front * half_wheelbase} {left * half_track} 0">
+    <joint name="{name}" type="hinge" axis="0 1 0" armature="{_ARMATURE * wheel_mass * radius**2}"/>
+    <geom name="{name}" type="ellipsoid" size="{own_radius} {0.25 * radius} {own_radius}" mass="{wheel_mass}" contype="0"/>
+   </body>""")
+        contacts.append(
+            f'<pair geom1="floor" geom2="{name}" condim="{4 if twisting > 0.0 else 3}" friction="{grip} {grip} {twisting} 0 0" {_CONTACT}/>'
+        )
+        servos.append(f'<velocity joint="{name}" kv="{_SERVO_GAIN * mass * 9.81 * radius}"/>')
+    edge = f"{0.5 * g.wheelbase_m} 0 {height}"
+    load = f'<body pos="{edge}"><inertial pos="0 0 0" mass="{true.payload_kg}" diaginertia="1e-3 1e-3 1e-3"/></body>'
+    gravity = f"{-9.81 * math.sin(body.slope)} 0 {-9.81 * math.cos(body.slope)}"
+    return f"""
+<mujoco>
+ <option timestep="{_STEP_S}" integrator="implicitfast" cone="elliptic" gravity="{gravity}"/>
+ <worldbody>
+  <geom name="floor" type="plane" size="100 100 1" contype="0"/>
+  <body name="base" pos="0 0 {radius}">
+   <freejoint/>
+   <inertial pos="{x} {y} {height}" mass="{chassis_mass}" diaginertia="{0.6 * inertia} {0.8 * inertia} {inertia}"/>
+   {load if true.payload_kg > 0.0 else ""}{"".join(wheels)}
+  </body>
+ </worldbody>
+ <contact>{"".join(contacts)}</contact>
+ <actuator>{"".join(servos)}</actuator>
+</mujoco>"""

@@ -1,0 +1,81 @@
+"""The vehicle in MuJoCo: a healthy one turns as the friction model predicts, and each fault moves it to its side."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco", reason="needs the extra 'mujoco'")
+
+from localization.errors import SimulationError
+from localization.simulation.experiments import Experiment, ExperimentConfig, OpenLoop, Phase, Rest, constant
+from localization.simulation.sensors import SensorConfig
+from localization.simulation.simulator import RunRecord, SimulationConfig
+from motion_models.registry import make_model
+from motion_models.robot import Robot, load_robot
+from tests.helpers.mujoco_vehicle import EFFECTS, MujocoSimulation
+
+_SETTLED = slice(30, 60)  # records 20 times a second, of a run of 3 s: without its start
+
+
+def _phases(robot: Robot, config: ExperimentConfig) -> Iterator[Phase]:
+    yield Rest(0.5)
+    yield OpenLoop("turn", constant(0.0, 0.4), 3.0)
+    yield OpenLoop("ahead", constant(0.4, 0.0), 3.0)
+
+
+def _runs(robot: str = "husky_a200", **effects: float) -> list[RunRecord]:
+    config = SimulationConfig(sensors=SensorConfig(lidar="none"))
+    experiment = Experiment("short", "for tests", "hall", (-3.0, 0.0, 0.0), _phases)
+    simulation = MujocoSimulation(experiment, load_robot(robot), 0, effects, config)
+    for _ in simulation.messages():
+        pass
+    return simulation.runs
+
+
+def _motion(run: RunRecord) -> tuple[np.ndarray, np.ndarray]:
+    """Change of the wheels' angles (2,) and of the pose (3,), in the first heading, while the rates are constant."""
+    poses, angles = run.poses[_SETTLED], run.wheel_angles[_SETTLED]
+    x, y, turned = poses[-1] - poses[0]
+    c, s = np.cos(poses[0, 2]), np.sin(poses[0, 2])
+    return angles[-1] - angles[0], np.array([c * x + s * y, -s * x + c * y, turned])
+
+
+@pytest.mark.parametrize("name", ["husky_a200", "jackal"])
+def test_mujoco_healthy_robot_turns_as_the_friction_model(name: str) -> None:
+    robot = load_robot(name)
+    turn, ahead = _runs(name)
+    model = make_model("friction", robot)
+    wheels, (_, _, turned) = _motion(turn)
+    predicted = model.twist(wheels, robot.center_of_gravity, model.nominal).value
+    assert turned == pytest.approx(predicted[2], rel=0.02)
+    wheels, (x, y, turned) = _motion(ahead)
+    assert x == pytest.approx(robot.geometry.wheel_radius_m * wheels.mean(), rel=0.01)
+    assert abs(y) < 1e-3
+    assert abs(turned) < 1e-3
+
+
+def test_mujoco_cg_ahead_moves_the_centre_of_rotation_ahead() -> None:
+    robot = load_robot("husky_a200")
+    model = make_model("friction", robot)
+    wheels, (x, y, turned) = _motion(_runs(cg_offset_x=0.04)[0])
+    centre = 0.5 * x - 0.5 * y / np.tan(0.5 * turned)  # 4.5, along x
+    twist = model.twist(wheels, np.array([0.04, 0.0]), model.nominal).value
+    assert centre == pytest.approx(-twist[1] / twist[2], rel=0.2)
+
+
+def test_mujoco_smaller_left_wheels_turn_left() -> None:
+    robot = load_robot("husky_a200")
+    model = make_model("friction", robot)
+    wheels, (_, _, turned) = _motion(_runs(wheel_radius_difference=-0.04)[1])
+    predicted = model.twist(wheels * [0.98, 1.02], robot.center_of_gravity, model.nominal).value
+    assert predicted[2] > 0.0
+    assert turned == pytest.approx(predicted[2], rel=0.1)
+
+
+def test_mujoco_fault_that_it_does_not_have_is_refused() -> None:
+    assert "friction_anisotropy" not in EFFECTS
+    with pytest.raises(SimulationError, match="no friction_anisotropy"):
+        _runs(friction_anisotropy=0.2)
