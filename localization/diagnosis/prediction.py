@@ -193,7 +193,8 @@ class DrivePredictor:
         out[:, :3] = np.where(known, off, np.nan)
         if drive.is_gyro_reference:
             seconds = np.array([float(m.dt[m.lead : m.lead + int(m.ends[-1])].sum()) for m in drive.maneuvers])
-            out[:, 2] -= hypothesis.gyro_bias * seconds + batch.measured[:, 2] * hypothesis.gyro_scale / (1.0 + hypothesis.gyro_scale)
+            # times the predicted turn: times the measured one, its own noise and all slip would look like a scale
+            out[:, 2] -= hypothesis.gyro_bias * seconds + poses[:, 2] * hypothesis.gyro_scale
         if drive.gyro is not None:
             late = round((hypothesis.lidar_time_offset_s - hypothesis.gyro_time_offset_s) * 1e9)
             for i, (a, b) in enumerate(drive.spans_ns):

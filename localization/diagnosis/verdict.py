@@ -22,6 +22,7 @@ _SIGNIFICANT = 0.01
 _COMPONENTS = 3
 _LEAD_LOG_ODDS = 7.0  # twice the log-likelihood by which a trend must be better than a cause, beside the choice among trends: odds of 33
 _LEAD_SHARE = 0.05  # or this share of what the cause explains: accuracy of its signature
+_SHAPES_OF_CAUSES = ("distance", "turning")  # trends that wheel_radius_scale and rotation_scale follow
 _MIN_VARIANCE = 0.01  # of what is left of a channel, over the noise's
 
 
@@ -107,21 +108,23 @@ def find_better_trends(predictor: DrivePredictor, linearization: Linearization, 
     """Trends that explain the drive better than one of the causes ``chosen`` does in its place, or than all of several.
 
     Where a cause of the catalogue is at work, no shape without a cause fits better but by chance: both are compared by their likelihood
-    ratio against the other causes, beyond what so many trends gain by chance and the accuracy of signatures. In place of several causes a
-    trend is simpler, and is preferred where it fits as well.
+    ratio against the other causes, beyond what so many trends gain by chance and the accuracy of signatures. Distance and turning are not
+    compared: causes of the catalogue have these shapes (radii, rotation), so that they are no sign of an unknown effect. In place of
+    several causes a trend is simpler, and is preferred where it fits as well.
     """
     trends, names = _trend_columns(predictor, linearization.linear)
     y = linearization.noise.whiten(linearization.linear).ravel()
     s = linearization.noise.whiten(np.concatenate([trends, linearization.signatures], axis=-1)).reshape(len(y), -1)
     z = linearization.noise.whiten(linearization.nuisances).reshape(len(y), -1)
     n, spreads = len(names), linearization.problem.scale
+    is_rival = np.array([name not in _SHAPES_OF_CAUSES for _, name in names])
     problem = regression(y, s, z, np.r_[np.ones(n), spreads], np.r_[np.zeros(n), spreads * linearization.problem.tolerance])
     found = []
     for replaced in ([i] for i in chosen) if len(chosen) < 2 else (*([i] for i in chosen), list(chosen)):
         others = tuple(n + j for j in chosen if j not in replaced)
         score, cov = problem.scores(others, [n + i for i in replaced])
         own = float(score @ np.linalg.solve(cov + 1e-9 * np.eye(len(replaced)), score))
-        t = statistics(problem, others, list(range(n)))
+        t = np.where(is_rival, statistics(problem, others, list(range(n))), 0.0)
         best = int(np.argmax(np.abs(t)))
         lead = float(t[best]) ** 2 - own
         margin = max(_LEAD_LOG_ODDS + 2.0 * math.log(n), _LEAD_SHARE * own) if len(replaced) == 1 else 0.0
