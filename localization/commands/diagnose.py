@@ -44,10 +44,10 @@ class Diagnose:
     robot: str
     """Name of a shipped robot, or path of a robot TOML file."""
     model: str = ""
-    """Motion model to diagnose; by default friction, or diff_drive for a robot with casters (separation multiplier 1 in its file)."""
+    """Motion model to diagnose; by default friction, or diff_drive for a robot with casters (`drive = "diff_drive"` in its file)."""
     out: Path | None = None
     """New folder for diagnosis.json, diagnosis.html and robot.toml, the robot with the findings in it, which every command takes."""
-    witness: MotionReferenceName = "auto"
+    motion_reference: Annotated[MotionReferenceName, tyro.conf.arg(aliases=["--witness"])] = "auto"
     """What measured the real motion in logs: the reference if one is named, else the LiDAR, else the gyro (headings alone)."""
     reference: str | None = None
     """Topic or TUM file with positions and headings, as the motion reference. Never used unless named."""
@@ -84,7 +84,7 @@ class Diagnose:
         name = self.source.name
         if self.source.suffix.lower() != ".csv":
             return drive_of_log(
-                open_log(self.source, robot, self.topic), self.witness, self.reference, WindowConfig(window_s=self.window_s)
+                open_log(self.source, robot, self.topic), self.motion_reference, self.reference, WindowConfig(window_s=self.window_s)
             )
         columns = table_columns(self.source)
         if "vision_error_m" in columns:

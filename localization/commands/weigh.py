@@ -36,7 +36,7 @@ class Weigh:
     """Name of a shipped robot, or path of a robot TOML file: what it weighs, and where its centre of gravity would be without the load."""
     at: tuple[float, float] | None = None
     """Where the load is, x and y in the body frame [m]; its mass is then estimated."""
-    witness: MotionReferenceName = "auto"
+    motion_reference: MotionReferenceName = "auto"
     """What measured the real motion: the reference if one is named, else the LiDAR. A gyro alone does not show the centre of rotation."""
     reference: str | None = None
     """Topic or TUM file with positions and headings, as the motion reference. Never used unless named."""
@@ -52,7 +52,7 @@ class Weigh:
             raise CalibrationError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")
         robot = load_robot(self.robot)
         with console.status("reading"):
-            drive = drive_of_log(open_log(self.log, robot, self.topic), self.witness, self.reference)
+            drive = drive_of_log(open_log(self.log, robot, self.topic), self.motion_reference, self.reference)
         with console.status("weighing"):
             found, predictor = weigh(drive)
         print_weighing(console, found, self.at)

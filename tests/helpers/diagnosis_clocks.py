@@ -24,7 +24,7 @@ _VARIES = 0.7  # quantile
 
 @dataclass(frozen=True)
 class Late:
-    """Of one witness against another."""
+    """Of one motion reference against another."""
 
     late_s: float
     low_s: float
