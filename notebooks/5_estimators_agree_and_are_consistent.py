@@ -43,8 +43,8 @@ class OptimisticSensor(PoseSensor):
         super().__init__()
         self.factor = factor
 
-    def measure(self, step, prior, cov, twist):
-        found = super().measure(step, prior, cov, twist)
+    def measure(self, step, prior, cov, twist, jump):
+        found = super().measure(step, prior, cov, twist, jump)
         return None if found is None else replace(found, cov=found.cov * self.factor**2)
 
 

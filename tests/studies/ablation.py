@@ -116,8 +116,8 @@ def _align_freely(original: Callable[..., Any], self: ScanMatcher, points: Any, 
     return scan_matcher.Fit(pose, H, g, *(float(value) for value in found))
 
 
-def _match_without_new_place(original: Callable[..., Any], self: ScanMatcher, *rest: Any) -> Any:
-    found = original(self, *rest)
+def _match_without_new_place(original: Callable[..., Any], self: ScanMatcher, *rest: Any, **named: Any) -> Any:
+    found = original(self, *rest, **named)
     self.is_new_place = False
     return found
 
