@@ -390,10 +390,11 @@ def _discount(H: FloatArray, g: FloatArray, spurious: FloatArray) -> None:
     In the directions where the share m of ``spurious`` in ``H`` is largest, information is scaled by 1 - 2 m, at least 0: it is as likely
     to be false as not from m = 1/2 on. Directions are those of both matrices' generalised eigenvectors.
     """
-    d, U = np.linalg.eigh(H + 1e-6 * np.eye(3))  # eigenvectors alone: each other function of numpy.linalg compiles for seconds
-    root, whiten = U * np.sqrt(d), U / np.sqrt(d)
-    m, V = np.linalg.eigh(whiten.T @ spurious @ whiten)
+    L = np.linalg.cholesky(H + 1e-6 * np.eye(3))
+    whitened = np.linalg.solve(L, np.linalg.solve(L, spurious).T)
+    m, V = np.linalg.eigh(0.5 * (whitened + whitened.T))
     kept = np.maximum(1.0 - 2.0 * m, 0.0)
-    scaled = (root @ V) * kept  # columns
-    H[:, :] = scaled @ (root @ V).T
-    g[:] = scaled @ ((whiten @ V).T @ g)
+    root = L @ V
+    scaled = root * kept  # columns
+    H[:, :] = scaled @ root.T
+    g[:] = scaled @ np.linalg.solve(root, g)
