@@ -212,7 +212,7 @@ def test_beams_on_the_robot_are_left_out_and_reported() -> None:
     assert np.hypot(last.points[:, 0], last.points[:, 1]).min() > 0.5
 
 
-def test_one_window_that_contradicts_among_many_that_agree_leaves_the_lidar_in() -> None:
+def test_lidar_one_contradicting_window_among_many_leaves_it_in() -> None:
     """A robot that slides sideways for a few seconds after a minute of straight driving."""
     checks = SensorChecks({}, LidarConfig())
     here, nothing = {Fault.LIDAR_DIRECTION}, set[str]()
