@@ -14,8 +14,7 @@ from localization.calibration.calibrate import Calibrated, Cut, Turning
 from localization.calibration.windows import driven
 from localization.commands.tables import add_row, plain_table, print_line, print_table
 from motion_models.base import MotionModel
-from motion_models.calibration.cross_validation import Interval, root_mean, root_mean_gain
-from motion_models.calibration.noise import LearnedNoise
+from motion_models.calibration.cross_validation import Interval, LearnedNoise, root_mean, root_mean_gain
 from motion_models.calibration.plan import MEANING
 from motion_models.calibration.regressions import COMMANDED_RAD_PER_S, RotationTable
 from motion_models.robot import Robot

@@ -23,8 +23,8 @@ from localization.diagnosis.summary import describe_outliers, describe_row, desc
 from localization.logs import TopicOverrides, open_log
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
+from motion_models.calibration.maneuvers import read_windows, table_columns
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
-from motion_models.calibration.windows_table import read_windows, table_columns
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
 from motion_models.robot import Robot, load_robot

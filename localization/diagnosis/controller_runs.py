@@ -16,8 +16,7 @@ import numpy as np
 from localization.diagnosis.drive import Drive, drive_of_table
 from localization.simulation.experiments import CONFIGURATION_CGS, CONTROLLERS, TRAJECTORIES
 from motion_models import se2
-from motion_models.calibration.maneuvers import Maneuver
-from motion_models.calibration.windows_table import read_rows
+from motion_models.calibration.maneuvers import Maneuver, read_rows
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
 from motion_models.robot import Robot

@@ -16,7 +16,7 @@ from motion_models import se2
 from motion_models.base import Motion, MotionModel
 from motion_models.online_calibration import Corrections
 from motion_models.robot import Robot
-from motion_models.types import Cov3, FloatArray, Points2, Twist2
+from motion_models.se2 import Cov3, FloatArray, Points2, Twist2
 
 _MIN_TURN_RAD = 0.01
 """A turn of the gyro in one step that contradicts wheels that stand, if it is 5 sigma, too [rad]."""

@@ -28,7 +28,7 @@ from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.online_calibration import Corrections
-from motion_models.types import Cov3, FloatArray, Points2, Pose2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 _MIN_POSITIONS, _MIN_BASELINE_M = 3, 5.0
 """Positions, and the distance between them [m], from which they give the heading of the map."""

@@ -13,7 +13,7 @@ from localization.lidar.scan_matcher import MIN_POINTS
 from localization.step import Step
 from motion_models import se2
 from motion_models.robot import Mount
-from motion_models.types import Points2
+from motion_models.se2 import Points2
 
 _FALLBACK_VOXEL_M = 0.5
 """Voxel where the first scan has too few points to choose one."""

@@ -11,7 +11,7 @@ import numpy as np
 from localization.events import Scan
 from motion_models import se2
 from motion_models.robot import Mount
-from motion_models.types import FloatArray, Twist2
+from motion_models.se2 import FloatArray, Twist2
 
 _WALL_CELL_M = 0.2
 """Cell in which a cloud has to span a height to be a wall [m]."""

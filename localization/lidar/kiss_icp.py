@@ -15,7 +15,7 @@ import numpy as np
 from kiss_icp.config import load_config
 from kiss_icp.kiss_icp import KissICP
 
-from motion_models.types import FloatArray, Pose2
+from motion_models.se2 import FloatArray, Pose2
 
 _NO_STAMPS = np.empty(0)
 _INITIAL_THRESHOLD_M, _MIN_MOTION_M = 0.5, 0.01

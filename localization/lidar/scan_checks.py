@@ -8,7 +8,7 @@ import numpy as np
 
 from localization.events import Scan
 from motion_models.robot import Mount
-from motion_models.types import FloatArray
+from motion_models.se2 import FloatArray
 
 _MAX_SCAN_GAP_S = 1.0
 """Time without a scan that counts as lost [s]: scanners give 5 to 40 scans a second, and in this time wheels alone err by the few

@@ -19,8 +19,7 @@ from localization.lidar.correlative_search import CORRELATED_BEAMS, LikelihoodIm
 from localization.lidar.submap import VoxelGrid, fill_surface, find_nearest, make_grid, measure_shares, voxel_means
 from localization.settings import Allowed, Below, Count, Positive, Settings, Share
 from motion_models import se2
-from motion_models.se2 import Triple, triple
-from motion_models.types import Cov3, FloatArray, Points2, Pose2, Tangent2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, Triple, triple
 
 MIN_POINTS = 10
 """Points without which a scan is not matched."""

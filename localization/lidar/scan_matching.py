@@ -15,7 +15,7 @@ from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfi
 from localization.step import Step
 from motion_models import se2
 from motion_models.robot import Mount
-from motion_models.types import Cov3, FloatArray, Points2, Pose2, Tangent2, Twist2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, Twist2
 
 _MIN_DISPLACEMENT_M = 1e-3
 """Points that another twist moves by less are not deskewed again [m]."""

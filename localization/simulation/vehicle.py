@@ -19,9 +19,8 @@ from localization.errors import SimulationError
 from localization.settings import Positive, Settings, up_to
 from localization.simulation.dynamics import Chassis, DynamicsInput, Plant, derivatives, integrate
 from motion_models.center_of_gravity.files import arms_model, arms_postures
-from motion_models.center_of_gravity.model import CgModel
+from motion_models.center_of_gravity.model import CgModel, Posture, posture_for
 from motion_models.center_of_gravity.parts import Payload
-from motion_models.center_of_gravity.postures import Posture, posture_for
 from motion_models.friction.contact import tyre
 from motion_models.friction.dynamics import FrictionDynamics
 from motion_models.friction.model import FrictionModel, check_parameters

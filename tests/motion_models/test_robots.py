@@ -9,7 +9,7 @@ import pytest
 
 from localization.cli import main
 from motion_models.robot import DIFF_DRIVE, load_robot, robot_names
-from motion_models.robot_reference import reference
+from motion_models.robot_file import reference
 
 # Wheel radius, track, wheelbase [m], mass [kg], product of the driver's track and multiplier [m], from the sources in each file.
 SOURCES = {
@@ -65,7 +65,7 @@ def test_robots_with_a_name_prints_the_file(capsys: pytest.CaptureFixture[str]) 
 
 
 def test_reference_of_robot_files_is_up_to_date() -> None:
-    """Else: python -m motion_models.robot_reference > motion_models/robots/README.md"""
+    """Else: python -m motion_models.robot_file > motion_models/robots/README.md"""
     assert (resources.files("motion_models") / "robots" / "README.md").read_text(encoding="utf-8") == reference()
 
 
