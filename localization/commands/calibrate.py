@@ -15,9 +15,16 @@ from rich.console import Console
 
 from localization.calibration.calibrate import Calibrated, Cut, MotionReferenceName, Turning, calibrated, cut_log, turning
 from localization.calibration.windows import WindowConfig
-from localization.commands.calibration_tables import calibration_numbers, print_by_source, print_cuts, print_fit, print_rotation_errors
+from localization.commands.calibration_tables import (
+    calibration_numbers,
+    print_by_source,
+    print_cuts,
+    print_fit,
+    print_regressions,
+    print_rotation_errors,
+    regression_numbers,
+)
 from localization.commands.common import write_json
-from localization.commands.regression_tables import print_regressions, regression_numbers
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from motion_models.base import MotionModel

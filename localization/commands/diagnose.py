@@ -13,13 +13,11 @@ from rich.table import Table
 from localization.calibration.calibrate import MotionReferenceName
 from localization.calibration.windows import WindowConfig
 from localization.commands.common import new_folder, write_json
-from localization.diagnosis.controller_runs import drive_of_runs, read_runs
 from localization.diagnosis.corrected_robot import correct_robot
 from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
-from localization.diagnosis.drive import Drive, drive_of_log, drive_of_table
-from localization.diagnosis.findings import Diagnosis
+from localization.diagnosis.drive import Drive, drive_of_log, drive_of_runs, drive_of_table, read_runs
+from localization.diagnosis.findings import Diagnosis, describe_outliers, describe_row, describe_tolerated
 from localization.diagnosis.linearization import default_model
-from localization.diagnosis.summary import describe_outliers, describe_row, describe_tolerated
 from localization.logs import TopicOverrides, open_log
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from localization.diagnosis.causes import Cause
-from localization.diagnosis.findings import Attribution, Component, Finding, Trend, Verdict
+from localization.diagnosis.findings import MAX_NOISE_OVER_REFERENCE, Attribution, Component, Finding, Trend, Verdict
 from localization.diagnosis.linearization import MAX_TOLERANCE_SIGMAS, Linearization, Noise, regression
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, DrivePredictor
 from localization.diagnosis.selection import max_statistic, p_value, statistics
@@ -161,9 +161,6 @@ def _residual_sigmas(rest: FloatArray, channels: IntArray, t: FloatArray) -> Flo
 
 MAX_LEFT_OVER_NOISE = 1.5
 """Root mean square that may be left of a row, over its noise: at 1.5 what has no cause is as large as the noise (1.5^2 = 1 + 1.1^2)."""
-MAX_NOISE_OVER_REFERENCE = 3.0
-"""Noise of the drive, over that of the motion reference by its own covariance: up to 1.5 where nothing is hidden, 3.1 to 200 for effects
-that no cause has (`tests.studies.unknown_effects --develop`)."""
 _MODEL_ACCURACY = 0.05  # of a row: what the signature of a named cause may be off, as at a slope of 0.05 rad (3 %)
 _MAX_TREND_OVER_NOISE = 0.5  # a trend of half the noise adds 12 % to the root mean square of a row
 _MIN_ATTRIBUTED_SHARE = 0.1  # of a row's squares, for a cause to be listed beside it

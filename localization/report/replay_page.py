@@ -11,7 +11,6 @@ from scipy.stats import chi2
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result
 from localization.report import figures
-from localization.report.figure_data import MapView, map_view, nis_means, relation_bins, timeline
 from localization.report.page import (
     Block,
     Definitions,
@@ -26,7 +25,7 @@ from localization.report.page import (
     render,
     write_new,
 )
-from localization.report.runs import PlottedRun, best_run, plotted_runs
+from localization.report.runs import MapView, PlottedRun, best_run, map_view, nis_means, plotted_runs, relation_bins, timeline
 from localization.report.summary import is_close, metres, verdict, verdict_sentences
 from localization.report.tables import accuracy_tables, count_table, parameter_table
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from localization.estimators import Estimate
 from localization.events import Event, Scan
-from localization.lidar.losses import MAX_LOST_S, LidarLosses
+from localization.lidar.scan_checks import MAX_LOST_S, LidarLosses
 from localization.pipeline import Pipeline
 from motion_models.se2 import FloatArray
 
