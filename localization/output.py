@@ -34,8 +34,10 @@ def check_outputs(*paths: Path | None) -> None:
         with output_errors(path):
             refuse_existing(path)
             parent = next(parent for parent in path.absolute().parents if parent.exists())
-        if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-            raise OutputError(f"output '{path}' cannot be written: '{parent}' is no folder in which you may make files.")
+        try:
+            tempfile.TemporaryFile(dir=parent).close()
+        except OSError as error:
+            raise OutputError(f"output '{path}' cannot be written: '{parent}' is no folder in which you may make files.") from error
     for i, path in enumerate(given):
         for other in given[:i]:
             one, two = path.absolute(), other.absolute()

@@ -10,6 +10,7 @@ The LiDAR's motion is that of `lidar.scan_motion`, which uses neither the filter
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import deque
 from collections.abc import Mapping
@@ -214,22 +215,28 @@ class SensorChecks:
         A = se2.adjoint(se2.inverse(delta))
         self._spread = A @ self._spread @ A.T + self._pending
         self._pending = np.zeros((3, 3))
-        if not self._spread.any():
+        spread = self._total_spread()
+        if not spread.any():
             return estimate
         if self._spread_since_ns is None:
             self._spread_since_ns = estimate.stamp_ns
-        cov = None if estimate.covariance is None else estimate.covariance + self._spread
+        cov = None if estimate.covariance is None else estimate.covariance + spread
         odometry = estimate.odometry
         if odometry is not None and odometry[1] is not None:
-            odometry = odometry[0], odometry[1] + self._spread
+            odometry = odometry[0], odometry[1] + spread
         return replace(estimate, covariance=cov, odometry=odometry)
+
+    def _total_spread(self) -> FloatArray:
+        """Covariance (3, 3) of what past faults have done to the pose, and of how far a lasting disagreement has taken it."""
+        off = self._disagreement.difference
+        return self._spread if off is None else self._spread + np.outer(off, off)
 
     def widen_trajectory(self, smoothed: Trajectory) -> Trajectory:
         """``smoothed`` with the same covariance at its end, from the first fault on, in the world's axes."""
         if self._spread_since_ns is None or smoothed.covariances is None:
             return smoothed
         covariances = smoothed.covariances.copy()
-        world = _turned(self._spread, float(smoothed.poses[-1, 2]))
+        world = _turned(self._total_spread(), float(smoothed.poses[-1, 2]))
         for i in np.flatnonzero(smoothed.stamps_ns >= self._spread_since_ns):
             covariances[i] += _turned(world, -float(smoothed.poses[i, 2]))
         return Trajectory(smoothed.stamps_ns, smoothed.poses, covariances)
@@ -278,18 +285,17 @@ class SensorChecks:
 
     def _check_disagreement(self, delta: FloatArray, nis: float | None) -> None:
         """Compare ``delta`` (3,), the last step by the estimate, with the wheels' motion."""
-        step = self._step
-        if step is None or step.scan is None or not step.has_wheels or step.is_standing or step.duration == 0.0:
+        step, before = self._step, self._disagreement.difference
+        if step is None or step.duration == 0.0:
             return
-        found = self._disagreement.add(step, delta, nis or 0.0)
-        if found is None or Fault.DISAGREEMENT in self.found:
-            return
-        mean_square, off = found
-        numbers = {"sigmas": math.sqrt(mean_square), "metres": math.hypot(off[0], off[1]), "degrees": abs(math.degrees(off[2]))}
-        self.found[Fault.DISAGREEMENT] = Found(
-            Fault.DISAGREEMENT, max(self._now_s(step) - _DISAGREEMENT_S, 0.0), Fault.DISAGREEMENT.format(**numbers)
-        )
-        self._pending = self._pending + np.outer(off, off)
+        self._disagreement.add(step, delta, nis)
+        off, mean_square = self._disagreement.difference, self._disagreement.mean_square
+        if off is None:
+            self._pending = self._pending + (0.0 if before is None else np.outer(before, before))
+        elif Fault.DISAGREEMENT not in self.found:
+            numbers = {"sigmas": math.sqrt(mean_square), "metres": math.hypot(off[0], off[1]), "degrees": abs(math.degrees(off[2]))}
+            begin_s = self._disagreement.began_s - (self._start_ns or 0) * _NS
+            self.found[Fault.DISAGREEMENT] = Found(Fault.DISAGREEMENT, begin_s, Fault.DISAGREEMENT.format(**numbers))
 
     def _with_unknown_motion(self, step: Step, seconds2: float) -> Step:
         """``step`` with the covariance of a lasting unknown twist, which grows by ``seconds2`` [s^2]."""
@@ -426,22 +432,38 @@ class _Disagreement:
 
     def __init__(self) -> None:
         self._rows: deque[tuple[float, float, FloatArray, FloatArray]] = deque()  # time [s], square, motion by wheels and estimate
+        self._motions: tuple[FloatArray, FloatArray] | None = None
+        self.mean_square = 0.0
 
-    def add(self, step: Step, delta: FloatArray, nis: float) -> tuple[float, FloatArray] | None:
-        """``delta`` (3,) of ``step`` by the estimate, and its NIS: mean square and difference (3,) where that is too large."""
-        off = se2.log(se2.between(step.predicted.delta, delta))
-        square = max(float(off @ np.linalg.solve(step.predicted.cov + _SCAN_NOISE, off)), nis)
-        self._rows.append((step.end_ns * _NS, min(square, _MAX_SQUARE), step.predicted.delta, delta))
+    @property
+    def difference(self) -> FloatArray | None:
+        """Of the motion by the wheels from that by the estimate (3,), since they began to disagree; None where they agree."""
+        return None if self._motions is None else se2.log(se2.between(self._motions[1], self._motions[0]))
+
+    @property
+    def began_s(self) -> float:
+        """Time of the first step of the last seconds at which they differ [s]."""
+        return next((row[0] for row in self._rows if row[1] > _MAX_MEAN_SQUARE), math.nan)
+
+    def add(self, step: Step, delta: FloatArray, nis: float | None) -> None:
+        """``delta`` (3,) of ``step`` by the estimate, and its NIS. Steps without scans or moving wheels are not compared."""
+        wheels = step.predicted.delta if step.has_wheels else delta
+        if self._motions is not None:
+            self._motions = se2.compose(self._motions[0], wheels), se2.compose(self._motions[1], delta)
+        if step.scan is None or not step.has_wheels or step.is_standing:
+            return
+        off = se2.log(se2.between(wheels, delta))
+        square = max(float(off @ np.linalg.solve(step.predicted.cov + _SCAN_NOISE, off)), nis or 0.0)
+        self._rows.append((step.end_ns * _NS, min(square, _MAX_SQUARE), wheels, delta))
         while self._rows[0][0] < self._rows[-1][0] - _DISAGREEMENT_S:
             self._rows.popleft()
-        mean = sum(row[1] for row in self._rows) / len(self._rows)
+        self.mean_square = sum(row[1] for row in self._rows) / len(self._rows)
         is_short = self._rows[-1][0] - self._rows[0][0] < 0.9 * _DISAGREEMENT_S or len(self._rows) < _MIN_DISAGREEING_SCANS
-        if is_short or mean <= _MAX_MEAN_SQUARE:
-            return None
-        wheels, estimated = np.zeros(3), np.zeros(3)
-        for _, _, by_wheels, by_estimate in self._rows:
-            wheels, estimated = se2.compose(wheels, by_wheels), se2.compose(estimated, by_estimate)
-        return mean, se2.log(se2.between(estimated, wheels))
+        if is_short or self.mean_square <= _MAX_MEAN_SQUARE:
+            self._motions = None
+        elif self._motions is None:
+            wheels, estimated = (functools.reduce(se2.compose, (row[i] for row in self._rows), np.zeros(3)) for i in (2, 3))
+            self._motions = wheels, estimated
 
 
 class OwnBodyFilter:

@@ -152,6 +152,7 @@ class Synchronizer:
             return None
         end_ns = self._wheels.newest_ns - round(self._clock_offset_s / _NS)
         if self._has_lidar:
+            end_ns = min(end_ns, self._now_ns)  # wheels stamped too early must not overtake a scan that is still to come
             least = self.config.max_step_s + (0.0 if is_last else self.config.wait_s)
             return None if end_ns - self._start_ns < least / _NS else (self._start_ns + round(self.config.max_step_s / _NS), None)
         # the gyro's clock may be ahead of the wheels': holding its last rate would hide the offset between the two clocks

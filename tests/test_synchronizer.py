@@ -235,7 +235,8 @@ def test_steps_cut_anywhere_sum_to_the_whole_motion(scan_ms, wheel_ms, seed):
     found, _ = cut(arrivals)
     kept = [e for e in arrivals if isinstance(e, Scan)]
     check_contiguous(found)
-    is_lidar_late = kept[0].stamp_ns > samples[0].stamp_ns + S  # then the wheels begin
+    before = itertools.takewhile(lambda e: e is not kept[0], arrivals)
+    is_lidar_late = any(e.stamp_ns > samples[0].stamp_ns + S for e in before)  # then the wheels begin
     assert found[0].start_ns == (samples if is_lidar_late else kept)[0].stamp_ns
     assert [s.scan.stamp_ns for s in found if s.scan is not None] == [e.stamp_ns for e in kept]
     assert max(s.duration for s in found) < 3.1
@@ -465,6 +466,17 @@ def test_clock_offset_shifts_the_wheels_window(late_s):
     scanned = [[s.predicted.delta for s in steps_ if s.scan is not None] for steps_ in (expected, found, uncorrected)]
     np.testing.assert_allclose(scanned[1], scanned[0], atol=1e-12)
     assert np.abs(np.array(scanned[2]) - scanned[0]).max() > 1e-4
+
+
+@pytest.mark.parametrize("late_s", [-0.6, -0.4, 0.4])
+def test_clock_offset_makes_no_scan_late(late_s):
+    """Wheels that are stamped much too early must not take the time past a scan that has not come yet."""
+    cutter = stepper()
+    cutter.set_calibration(None, late_s)
+    scans = [scan(0.5 + 0.3 * i) for i in range(20)]
+    found = list(steps(in_order(wheels(8.0), scans), cutter))
+    assert [s.scan for s in found if s.scan is not None] == scans
+    assert not any("came after later ones" in note for note in cutter.warnings())
 
 
 @pytest.mark.parametrize("model", ["diff_drive", "skid_steer", "full_linear"])

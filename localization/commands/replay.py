@@ -147,6 +147,8 @@ class Replay:
         """The reference, by topic or file; read before the run, so that a wrong name is reported at once."""
         name = self.reference if self.reference is not None else log.reference_topic
         if name is None or name == "none":
+            if self.reference_sigma is not None:
+                raise EvaluationError("--reference-sigma is the noise of a reference, and there is none. Name one with --reference.")
             return None
         if name in log.types:
             found: ReferenceTrack | Relations = reference_track(log.references(name), name)

@@ -25,9 +25,14 @@ MAGIC = b"SQLite format 3\x00"
 _TABLE_LEAF = 13
 _MAX_TOPICS = 100_000  # robots have tens to hundreds
 _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
+_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # the latter where SQLite's message quotes a damaged name
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
 Row = tuple[int, int, bytes]
+
+
+def _reason(error: Exception) -> str:
+    return "a name in its schema is not text" if isinstance(error, UnicodeDecodeError) else str(error)
 
 
 def _connect(path: Path) -> sqlite3.Connection:
@@ -78,8 +83,8 @@ class SqliteFile:
                 self._topics, definitions = _describe(database)
                 count = database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id").fetchall()
                 span = database.execute("SELECT min(timestamp), max(timestamp) FROM messages").fetchone()
-        except sqlite3.Error as error:
-            raise DamagedError(str(error)) from error
+        except _ERRORS as error:
+            raise DamagedError(_reason(error)) from error
         self._counts = Counter({key: n for key, n in count if key in self._topics})
         self.channels = _channels(self._topics, definitions, self._counts)
         self.start_ns, self.end_ns = (int(stamp) if isinstance(stamp, int) else 0 for stamp in span)
@@ -106,8 +111,8 @@ class SqliteFile:
                 except StopIteration:
                     self._compare(found, sum(self._counts[key] for key in wanted))
                     return
-                except sqlite3.Error as error:
-                    reason = str(error)
+                except _ERRORS as error:
+                    reason = _reason(error)
                     break
                 found += 1
                 if isinstance(stamp, int) and isinstance(data, bytes):
@@ -136,8 +141,8 @@ class RecoveredSqlite:
                 # SQLite refuses a file that is shorter than its header says, unless the schema is declared writable.
                 database.execute("PRAGMA writable_schema=ON")
                 self._topics, definitions = _describe(database)
-        except (sqlite3.Error, DamagedError) as error:
-            raise LogError(f"'{path}' cannot be read: {reason}; not even its list of topics can ({error}).") from error
+        except (*_ERRORS, DamagedError) as error:
+            raise LogError(f"'{path}' cannot be read: {reason}; not even its list of topics can ({_reason(error)}).") from error
         counts: Counter[int] = Counter()
         start, end = 2**63 - 1, 0
         for topic, log_ns, _ in self._rows():

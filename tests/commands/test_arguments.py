@@ -116,6 +116,17 @@ def test_json_that_cannot_be_written_is_refused_before_the_run(tmp_path: Path, c
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "there.json"]
 
 
+def test_folder_in_which_no_file_can_be_made_is_refused_before_the_run() -> None:
+    with pytest.raises(OutputError, match="'/proc' is no folder in which you may make files"):
+        check_outputs(Path("/proc/out"))
+
+
+def test_noise_of_a_reference_that_is_not_there_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = Path(__file__).parents[1] / "data" / "aces" / "aces.mcap"
+    assert run("replay", log, "--robot", "aces", "--out", tmp_path / "o", "--reference-sigma", 0.02, 0.5) == 2
+    assert "there is none. Name one with --reference" in capsys.readouterr().err
+
+
 def test_outputs_with_one_path_are_refused(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="are one"):
         check_outputs(tmp_path / "a", tmp_path / "." / "a")

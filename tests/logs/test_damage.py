@@ -123,6 +123,16 @@ def test_sqlite_truncated_is_read_to_the_cut(tmp_path: Path, compression: str | 
     assert "run.db3 was read page by page" in warnings_of(log)
 
 
+def test_sqlite_schema_with_names_that_are_not_text_is_refused(tmp_path: Path) -> None:
+    """SQLite's message quotes the name, and Python's sqlite3 cannot decode it."""
+    path = bags.write_ros2_bag(tmp_path / "run", numbered_records(20), "sqlite3")
+    file = path / "run.db3"
+    data = file.read_bytes().replace(b"CREATE TABLE topics", b"CREATE TABL\x81 topics").replace(b"topicstopics", b"\x81opicstopics")
+    file.write_bytes(data)
+    with pytest.raises(LogError, match="a name in its schema is not text"):
+        open_log(path, ROBOT)
+
+
 def test_sqlite_write_ahead_log_beside_the_file_is_reported(tmp_path: Path) -> None:
     path = bags.write_ros2_bag(tmp_path / "run", numbered_records(20), "sqlite3")
     (path / "run.db3-wal").write_bytes(b"x")
