@@ -5,11 +5,10 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
-from localization.events import ImuSample
+from localization.events import ImuSample, Turn
 from motion_models.robot import GyroNoise, Mount
 
 _NS = 1e-9
@@ -21,18 +20,6 @@ _JUMP_RAD_PER_S, _JUMP_RAD_PER_S2 = 2.0, 200.0  # noise and shaking, and how fas
 _MAX_JUMP_RAD_PER_S = 10.0  # at which none turns
 _MAX_SPIKES = 2  # that agree, in a row; a third is accepted
 _MIN_TURN_RAD = 0.5  # rad of turning by the wheels, after which they show which way the gyro's axis points
-
-
-@dataclass(frozen=True)
-class Turn:
-    """Yaw about the body's z axis, summed up from a gyro; its bias is still in it."""
-
-    angle: float
-    """[rad]"""
-    variance: float
-    """[rad^2], of white noise and scale; without the bias."""
-    duration: float
-    """Time that the bias acted [s]."""
 
 
 class GyroBuffer:

@@ -21,10 +21,9 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.estimators import Estimate
-from localization.events import ImuSample, Scan
+from localization.events import ImuSample, Scan, Step
 from localization.lidar import LidarConfig, Sweep
 from localization.lidar.scan_motion import ScanOdometry
-from localization.step import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion

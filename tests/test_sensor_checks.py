@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from localization.estimators import Estimate
-from localization.events import ImuSample, Scan
-from localization.gyro import Turn
+from localization.events import ImuSample, Scan, Step, Turn
 from localization.lidar import LidarConfig
 from localization.sensor_checks import Fault, SensorChecks
-from localization.step import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion

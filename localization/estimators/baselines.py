@@ -8,9 +8,9 @@ import numpy as np
 
 from localization.errors import EstimatorError
 from localization.estimators.base import NO_POINTS, Estimate, Estimator, mean_twist
+from localization.events import Step
 from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
 from localization.lidar.scan_matcher import MIN_POINTS
-from localization.step import Step
 from motion_models import se2
 from motion_models.robot import Mount
 from motion_models.se2 import Points2

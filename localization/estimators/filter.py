@@ -20,10 +20,9 @@ from filterpy.kalman import predict as predict_linear
 
 from localization.errors import EstimatorError
 from localization.estimators.measurement_models import predict_turn, subtract_map_error
-from localization.gyro import Turn
+from localization.events import Step, Turn
 from localization.lidar import KeyScanError, select_measured
 from localization.settings import Settings
-from localization.step import Step
 from motion_models import se2
 from motion_models.online_calibration import Corrections
 from motion_models.robot import GyroNoise

@@ -10,8 +10,8 @@ import numpy as np
 
 from localization.estimators.base import NO_POINTS, Estimate, Estimator, mean_twist
 from localization.estimators.filter import BIAS, CLOCK, MAP, PARAMS, POSE, SCALE, START, Filter, FilterConfig
+from localization.events import Step
 from localization.lidar import LostScans, ScanMatchingSensor
-from localization.step import Step
 from motion_models import se2
 from motion_models.base import Motion, MotionModel
 from motion_models.online_calibration import Corrections

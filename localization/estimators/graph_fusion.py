@@ -19,11 +19,10 @@ from localization.estimators.base import Estimate, Estimator
 from localization.estimators.filter import PARAMS
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
-from localization.events import PositionSample
+from localization.events import PositionSample, Step
 from localization.lidar import LidarConfig, LostScans
 from localization.lidar.loop_detection import Keyframe, LoopDetector
 from localization.settings import Positive, Settings, Signed
-from localization.step import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion

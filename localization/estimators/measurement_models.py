@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from localization.gyro import Turn
+from localization.events import Turn
 from motion_models import se2
 from motion_models.se2 import FloatArray, Pose2
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from localization.estimators.filter import FilterConfig
 from localization.evaluation.consistency import mean_band
+from localization.events import Step
 from localization.pipeline import Pipeline, Trial
-from localization.step import Step
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.errors import CgError, ModelError
