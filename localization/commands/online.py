@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -24,15 +24,17 @@ from localization.logs import open_log
 from localization.output import fingerprint
 from localization.pipeline import Pipeline
 from localization.ros.diagnostics import ERROR, OK, WARN, Status
-from localization.ros.node import Node
-from localization.ros.run_control import PlaybackClock, StopSignal
+from localization.ros.node import Node, StopSignal
 from localization.ros.session import Session, SessionState, View, made_by
 from localization.ros.settings import LiveRun, OnlineSettings
 from localization.ros.transports import TransportName, open_transport
-from localization.ros.transports.sim_time import SimTimeTransport
+from localization.ros.transports.base import SimTimeTransport
 from motion_models.prior import prior_notes
 
 _LINE_S = 0.25
+_MAX_GAP_S = 5.0
+"""Longer pauses of a log are cut to this [s]."""
+_NS = 1e-9
 _SLOWEST = 0.001  # a second of the log in a quarter of an hour
 
 _LEARNED = 8  # corrections that are shown; grids of them have dozens
@@ -170,6 +172,29 @@ class Online(OnlineSettings):
         console.print(live_line(session, seconds, []), soft_wrap=True)
         if count is not None:
             console.print(f"{self.out}: {count} estimates", markup=False, soft_wrap=True)
+
+
+class PlaybackClock:
+    """``rate`` times as fast as the log was recorded; infinite: without waiting."""
+
+    def __init__(self, rate: float, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep) -> None:
+        self._rate, self._clock, self._sleep = rate, clock, sleep
+        self._last_ns: int | None = None
+        self._due = 0.0
+
+    def wait(self, stamp_ns: int) -> None:
+        """Sleep until the event of ``stamp_ns`` is due; return at once where it is overdue."""
+        if math.isinf(self._rate):
+            return
+        now = self._clock()
+        if self._last_ns is None:
+            self._due = now
+        else:
+            gap = min(max((stamp_ns - self._last_ns) * _NS, 0.0), _MAX_GAP_S)
+            self._due += gap / self._rate
+        self._last_ns = stamp_ns if self._last_ns is None else max(stamp_ns, self._last_ns)
+        if self._due > now:
+            self._sleep(self._due - now)
 
 
 def parse_rate(text: str) -> float:

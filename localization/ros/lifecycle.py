@@ -12,14 +12,10 @@ from typing import Any
 
 from localization.errors import SettingError
 from localization.ros.jit_warm_up import warm_up
-from localization.ros.node import Node
-from localization.ros.parameters import make_settings, nearest, parameters
-from localization.ros.run_control import StopSignal
-from localization.ros.settings import LiveRun, ManagedNodeSettings
-from localization.ros.topic_names import Names
-from localization.ros.transports.base import Transport
+from localization.ros.node import Node, StopSignal
+from localization.ros.settings import LiveRun, ManagedNodeSettings, Names, make_settings, nearest, parameters
+from localization.ros.transports.base import SimTimeTransport, Transport
 from localization.ros.transports.rclpy import RclpyTransport, import_rclpy
-from localization.ros.transports.sim_time import SimTimeTransport
 from motion_models.errors import SkidlocError
 
 _IDLE_S = 0.2

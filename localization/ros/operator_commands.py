@@ -16,7 +16,7 @@ from localization.logs.serialization import decoder
 from localization.logs.writer import odom_axes
 from localization.ros.payloads import Load, Payloads
 from localization.ros.session import StartPose
-from localization.ros.topic_names import Names
+from localization.ros.settings import Names
 from localization.ros.transports.base import Received, ServiceReply, Transport
 from motion_models.errors import CgError, RobotError
 from motion_models.se2 import FloatArray

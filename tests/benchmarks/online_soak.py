@@ -16,7 +16,7 @@ import numpy as np
 from localization.logs.message_templates import Form, Message, Template
 from localization.pipeline import Trial
 from localization.ros.node import Node
-from localization.ros.session_files import Files
+from localization.ros.session import Files
 from localization.ros.settings import LiveRun, NodeConfig
 from localization.ros.transports.base import MonotonicTime, Received
 from localization.simulation.experiments import ExperimentConfig

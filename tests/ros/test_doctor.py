@@ -14,8 +14,7 @@ from localization.logs import open_log
 from localization.ros.diagnostics import OK, WARN, Status
 from localization.ros.doctor import Doctor, Request, diagnose_events
 from localization.ros.publisher import DIAGNOSTICS, ODOMETRY
-from localization.ros.settings import NodeConfig
-from localization.ros.topic_names import Names
+from localization.ros.settings import Names, NodeConfig
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
