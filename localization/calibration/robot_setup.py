@@ -18,9 +18,8 @@ import numpy as np
 
 from localization.logs.chunks import RawMessage, merge_channels
 from localization.logs.decode import UnusableError, frame_name, stamp_ns
-from localization.logs.reader import open_log
+from localization.logs.reader import open_log, open_source
 from localization.logs.serialization import LogDeserializer
-from localization.logs.sources import open_source
 from localization.logs.topic_roles import TYPES, TopicOverrides
 from motion_models.center_of_gravity.urdf import WheelGeometry, link_poses, parse_urdf, sides, wheel_geometry
 from motion_models.errors import RobotError

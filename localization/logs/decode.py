@@ -1,4 +1,4 @@
-"""Messages to events: a driver's message in this project's types. Stateless; what needs the message before is in `wheel_decoder`.
+"""Messages to events: a driver's message in this project's types. Stateless; what needs the message before is in `event_decoder`.
 
 `MessageStats` counts messages that were dropped or corrected on the way, by topic and `Oddity`.
 """

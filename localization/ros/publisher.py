@@ -13,8 +13,7 @@ import numpy as np
 from localization.estimators import Estimate
 from localization.estimators.base import mean_twist
 from localization.events import CgSample, Event, WheelSample
-from localization.logs.fast_cdr import FusedWriter
-from localization.logs.serialization import encode, make
+from localization.logs.serialization import FusedWriter, encode, make
 from localization.logs.writer import FusedEstimate, odom_axes, six_by_six
 from localization.ros.diagnostics import Status
 from localization.ros.discovery import TF, TF_TYPE

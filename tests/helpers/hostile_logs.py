@@ -24,8 +24,8 @@ import numpy as np
 from localization.cli import main
 from localization.evaluation.references import read_reference_file, reference_track
 from localization.logs import open_log
+from localization.logs.reader import open_source
 from localization.logs.serialization import LogDeserializer
-from localization.logs.sources import open_source
 from localization.trajectory import read_tum
 from motion_models.robot import load_robot
 from tests.helpers import bags

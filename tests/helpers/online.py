@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from localization.estimators import Estimate
 from localization.logs import open_log
-from localization.logs.sources import open_source
+from localization.logs.reader import open_source
 from localization.logs.topic_roles import TopicOverrides
 from localization.pipeline import Pipeline, Trial
 from localization.ros.discovery import TF
