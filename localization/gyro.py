@@ -23,7 +23,7 @@ _MIN_TURN_RAD = 0.5  # rad of turning by the wheels, after which they show which
 
 
 class GyroBuffer:
-    """The last seconds of the yaw rate.
+    """The last seconds of the yaw rate: ``keep_s`` of them [s], of IMUs that sit at ``mounts`` (by frame).
 
     Gravity shows which axis of the IMU is upright. Where the mount gives another one, the rate is that about gravity, and whether this
     axis points up or down (some drivers publish gravity, not specific force) follows from the turns of the wheels; until these suffice,

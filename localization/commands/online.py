@@ -175,7 +175,7 @@ class Online(OnlineSettings):
 
 
 class PlaybackClock:
-    """``rate`` times as fast as the log was recorded; infinite: without waiting."""
+    """``rate`` times as fast as the log was recorded; infinite: without waiting. ``clock`` and ``sleep`` are in seconds."""
 
     def __init__(self, rate: float, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep) -> None:
         self._rate, self._clock, self._sleep = rate, clock, sleep

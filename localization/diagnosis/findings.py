@@ -44,6 +44,7 @@ class Gain:
     high: float
 
     def to_dict(self) -> dict[str, Any]:
+        """For `diagnose --json`."""
         return {
             "heldout_rms_before": self.before,
             "heldout_rms_after": self.after,
@@ -68,6 +69,7 @@ class Finding:
 
     @property
     def cause(self) -> str:
+        """The cause's id."""
         return self.definition.id
 
     @property
@@ -81,6 +83,7 @@ class Finding:
         return self.definition.describe(self.size)
 
     def to_dict(self) -> dict[str, Any]:
+        """For `diagnose --json`; the size is in the unit of the cause."""
         return {
             "cause": self.cause,
             "meaning": self.definition.meaning,
@@ -132,9 +135,11 @@ class Component:
     """Along what a part follows that no cause has, where that makes the row unexplained."""
 
     def with_status(self, status: RowStatus, attributions: tuple[Attribution, ...]) -> Component:
+        """The same row, attributed."""
         return dataclasses.replace(self, status=status, attributions=attributions)
 
     def to_dict(self) -> dict[str, Any]:
+        """For `diagnose --json`; root mean squares are in ``unit``."""
         return {
             "unit": self.unit,
             "rms": self.rms,
@@ -164,6 +169,7 @@ class Trend:
 
     @property
     def text(self) -> str:
+        """The trend in a sentence, with t and p."""
         if self.instead_of:
             return f"{self.component} follows {self.along} better than {self.instead_of} (t = {self.t:+.1f}, p = {self.p_value:.2g})"
         size = f"{self.over_noise:.2g} times its noise"
@@ -185,10 +191,12 @@ class HandoverCheck:
         return math.prod(self.after[c] / max(self.before[c], 1e-12) for c in self.before) < 1.0
 
     def describe(self) -> str:
+        """Errors of the second half before and after, as a sentence without a stop."""
         rows = ", ".join(f"{c} {self.before[c]:.3g} -> {self.after[c]:.3g} {'rad' if c == 'yaw' else 'm'}" for c in self.before)
         return f"second half of the drive ({self.windows} windows), corrected by the first half alone: {rows} (root mean square)"
 
     def to_dict(self) -> dict[str, Any]:
+        """For `diagnose --json`; root mean squares by component [m or rad]."""
         return {"windows": self.windows, "rms_before": self.before, "rms_after": self.after, "is_better": self.is_better}
 
 
@@ -227,6 +235,7 @@ class Diagnosis:
     """What the corrected robot gains on the second half of the drive."""
 
     def to_dict(self) -> dict[str, Any]:
+        """The format of `diagnose --json`, whose keys stay as they are."""
         left: dict[str, Any] = {"share": self.left_share, "shapes": [vars(s) for s in self.trends], "text": [s.text for s in self.trends]}
         return {
             "log": self.log,

@@ -36,7 +36,10 @@ class DeadReckoning(Estimator):
 
 
 class LidarOdometry(Estimator):
-    """A pose for each scan; between scans it stays where it was. No covariance: KISS-ICP has none."""
+    """A pose for each scan; between scans it stays where it was. No covariance: KISS-ICP has none.
+
+    ``mounts`` of the LiDARs are by frame; a frame without one is the body's.
+    """
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig | None = None) -> None:
         self._mounts, self._config = mounts, config or LidarConfig()

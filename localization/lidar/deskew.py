@@ -111,7 +111,7 @@ def _move(points: FloatArray, times: FloatArray, twist: Twist2, out: FloatArray)
 
 
 class LidarTilt:
-    """`add` every scan; memory is bounded."""
+    """`add` every scan; memory is bounded. ``mounts`` of the LiDARs are by frame."""
 
     def __init__(self, mounts: Mapping[str, Mount]) -> None:
         self._mounts = mounts

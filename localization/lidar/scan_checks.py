@@ -140,7 +140,7 @@ class LostScans:
 
 
 class LidarFrames:
-    """`admit` every scan. ``mounts`` may grow meanwhile: a frame is known from then on."""
+    """`admit` every scan. ``mounts`` (by frame) may grow meanwhile: a frame is known from then on."""
 
     def __init__(self, mounts: Mapping[str, Mount]) -> None:
         self._mounts = mounts

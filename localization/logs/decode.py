@@ -56,7 +56,7 @@ class Oddity(Enum):
 
 
 class UnusableError(Exception):
-    """A message without usable content. Raised and caught within this package."""
+    """A message without usable content. Raised and caught within this package. ``oddity`` is what it is counted as."""
 
     def __init__(self, oddity: Oddity) -> None:
         super().__init__(oddity.value)

@@ -245,7 +245,7 @@ class DecompressedSource:
 
 
 class SplitSource:
-    """Several files one after the other, as a recorder splits a long log."""
+    """Several files one after the other, as a recorder splits a long log. ``notes`` are warnings about files that are not among them."""
 
     def __init__(self, parts: list[Source], notes: list[str]) -> None:
         self._parts, self._warnings = parts, notes

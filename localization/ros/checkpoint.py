@@ -169,6 +169,8 @@ def _is_head(head: Any, most_bytes: int) -> bool:
 class CheckpointWriter:
     """Writes a state at most once every ``every_s`` [s] of the clock on the wall.
 
+    ``made_by`` and ``shared`` are those of `write_checkpoint`.
+
     The state is written down at once, in milliseconds; the disk is waited for in a thread, so that no estimate waits for it.
     """
 
@@ -179,6 +181,7 @@ class CheckpointWriter:
         self._writing: Future[None] | None = None
 
     def is_due(self) -> bool:
+        """Whether the last state is old enough, and on disk: `write` then does not wait."""
         is_idle = self._writing is None or self._writing.done()
         return is_idle and time.monotonic() - self._last >= self._every_s
 

@@ -98,6 +98,7 @@ class Health:
 
     @property
     def latency_p99_s(self) -> float | None:
+        """99 % quantile of the last latencies [s]; None before the first."""
         return float(np.quantile(self._latencies, 0.99)) if self._latencies else None
 
     def statuses(

@@ -89,6 +89,7 @@ class Doctor:
 
     @property
     def is_running(self) -> bool:
+        """Whether a diagnosis is being made."""
         return self._thread is not None and self._thread.is_alive()
 
     def observe(self, event: Event) -> None:

@@ -73,6 +73,7 @@ class ManagedNode:
         self._settings = settings
 
     def activate(self) -> None:
+        """Let the run begin as soon as it is back from this callback."""
         self._is_active = True
 
     def deactivate(self) -> None:
@@ -80,9 +81,11 @@ class ManagedNode:
         self._is_active = False
 
     def shut_down(self) -> None:
+        """End the run, and the process after it."""
         self._is_active, self._is_shut_down = False, True
 
     def report_error(self, error: Exception) -> None:
+        """Write ``error`` to the node's log."""
         self._log.error(str(error))
 
     def _start(self) -> bool:

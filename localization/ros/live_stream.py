@@ -53,6 +53,7 @@ class LiveStream:
 
     @property
     def wheel_angles(self) -> WheelAngles:
+        """Angles of the wheels up to now, which a checkpoint stores."""
         return WheelAngles(self._event_decoder.from_joints, self._event_decoder.from_odometry)
 
     def restore(self, angles: WheelAngles) -> None:

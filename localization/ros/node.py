@@ -207,6 +207,7 @@ class Node:
 
     @property
     def has_lidar(self) -> bool:
+        """Whether scans or clouds are among the topics in use."""
         return self._sources.lidar is not None
 
     @property
@@ -354,6 +355,7 @@ class StopSignal:
         self._is_requested.set()
 
     def is_set(self) -> bool:
+        """Whether a signal has come."""
         return self._is_requested.is_set()
 
     def sleep(self, seconds: float) -> None:

@@ -44,21 +44,26 @@ class CommandedNode(Protocol):
     is_paused: bool
 
     @property
-    def frames(self) -> Any: ...
+    def frames(self) -> Any:
+        """`settings.Frames` of what is published."""
 
     @property
-    def session(self) -> Any: ...
+    def session(self) -> Any:
+        """The `Session` that is running."""
 
     @property
-    def payloads(self) -> Payloads: ...
+    def payloads(self) -> Payloads:
+        """Loads that the robot holds."""
 
-    def restart(self, start: StartPose) -> None: ...
+    def restart(self, start: StartPose) -> None:
+        """Begin anew at ``start``."""
 
-    def insert_present_cg(self) -> None: ...
+    def insert_present_cg(self) -> None:
+        """Give the pipeline the centre of gravity with the present payloads."""
 
 
 class OperatorCommands:
-    """Subscribes to the topics and offers the services."""
+    """Subscribes to the topics and offers the services; ``report`` gets a line on each command that was done or refused."""
 
     def __init__(self, node: CommandedNode, transport: Transport, names: Names, report: Callable[[str], None]) -> None:
         self._node, self._report = node, report

@@ -38,11 +38,14 @@ _SUFFIXES = (".mcap", ".tum")
 class View(Protocol):
     """Shows a session while it runs. It is called after estimates are published, so that none waits for it."""
 
-    def begin(self, robot: Robot, mounts: Mapping[str, Mount]) -> None: ...
+    def begin(self, robot: Robot, mounts: Mapping[str, Mount]) -> None:
+        """Show what stays as it is. Called once, before the first event."""
 
-    def show(self, event: Event | None, estimates: Sequence[Estimate], pipeline: Pipeline) -> None: ...
+    def show(self, event: Event | None, estimates: Sequence[Estimate], pipeline: Pipeline) -> None:
+        """``event`` has gone in (None: no more will come), ``estimates`` have come out."""
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """No more will come."""
 
 
 def made_by(trial: Trial, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig, source: str) -> dict[str, str]:
@@ -168,6 +171,7 @@ class Session:
 
     @property
     def pipeline(self) -> Pipeline:
+        """The one that runs; `restart` replaces it."""
         return self.state.pipeline
 
     def restart(self, pipeline: Pipeline, start: StartPose) -> None:

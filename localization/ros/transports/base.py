@@ -55,7 +55,8 @@ class Transport(Protocol):
     def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
         """Open ``topic`` for `publish`. ``is_latched``: the last message is kept for those who subscribe later."""
 
-    def publish(self, topic: str, data: bytes) -> None: ...
+    def publish(self, topic: str, data: bytes) -> None:
+        """Send a message on a topic that was advertised; it never waits for those who receive it."""
 
     def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
         """Answer requests of ``kind`` (`std_srvs/srv/Trigger`) by ``handler``, inside `take`; False where the transport has no services."""
@@ -76,7 +77,8 @@ class Transport(Protocol):
     def epoch_ns(self) -> int:
         """What turns that clock into the time of ROS, which stamps are compared with."""
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Leave the network. No other method may be called afterwards."""
 
 
 class MonotonicTime:
@@ -85,15 +87,18 @@ class MonotonicTime:
     _epoch_ns: int | None = None
 
     def now_ns(self) -> int:
+        """As `Transport.now_ns`."""
         return time.monotonic_ns()
 
     @property
     def epoch_ns(self) -> int:
+        """As `Transport.epoch_ns`, read once: a wall clock that is set meanwhile moves nothing."""
         if self._epoch_ns is None:
             self._epoch_ns = time.time_ns() - time.monotonic_ns()
         return self._epoch_ns
 
     def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
+        """Never: there are no services."""
         return False
 
 
@@ -117,18 +122,23 @@ class SimTimeTransport:
         transport.subscribe(CLOCK, CLOCK_TYPE, is_latched=False)
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
+        """As the wrapped transport's."""
         self._transport.subscribe(topic, kind, is_latched=is_latched)
 
     def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
+        """As the wrapped transport's; /clock stays."""
         self._transport.restrict([*topics, CLOCK], urgent)
 
     def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
+        """As the wrapped transport's."""
         self._transport.advertise(topic, kind, is_latched=is_latched)
 
     def publish(self, topic: str, data: bytes) -> None:
+        """As the wrapped transport's."""
         self._transport.publish(topic, data)
 
     def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
+        """As the wrapped transport's."""
         return self._transport.offer_service(name, kind, handler)
 
     def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
@@ -149,14 +159,18 @@ class SimTimeTransport:
         self._now_ns = clock.sec * 10**9 + clock.nanosec
 
     def publishers(self) -> Mapping[str, set[str]]:
+        """As the wrapped transport's, without /clock."""
         return {topic: kinds for topic, kinds in self._transport.publishers().items() if topic != CLOCK}
 
     def now_ns(self) -> int:
+        """The newest time of /clock; 0 before the first."""
         return self._now_ns
 
     @property
     def epoch_ns(self) -> int:
+        """0: /clock is the time of ROS."""
         return 0
 
     def close(self) -> None:
+        """As the wrapped transport's."""
         self._transport.close()
