@@ -1,8 +1,8 @@
 """A state on disk: written as a whole or not at all, and resumed by another process to the last bit.
 
 The file: a line with the format's name and version, one with the SHA-256 of all that follows, a line of JSON (what made the state, and how
-far it had come), then the state (`serialize`). It is written beside its place, forced to disk, and moved there: whoever kills the process
-at any moment finds the old state or the new one.
+far it had come), then the state (`state_serialization`). It is written beside its place, forced to disk, and moved there: whoever kills the
+process at any moment finds the old state or the new one.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from typing import Any
 
 from localization.errors import CheckpointError
 from localization.output import versions
-from localization.ros.deserialize import deserialize
-from localization.ros.serialize import serialize, serialize_parts
+from localization.ros.state_serialization import deserialize, serialize, serialize_parts
 from motion_models.robot import Robot
 
 _MAGIC = b"skidloc state 1\n"
