@@ -376,7 +376,7 @@ def _locked(path: Path, lock: Path) -> TextIO:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             file.close()
-            raise OutputError(f"'{path}' is in use by another process that runs. StopSignal that, or name another file.") from error
+            raise OutputError(f"'{path}' is in use by another process that runs. Stop that, or name another file.") from error
         except OSError:
             return file  # a file system without locks is no reason not to work
         with contextlib.suppress(FileNotFoundError):
