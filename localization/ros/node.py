@@ -18,9 +18,8 @@ from localization.events import Event, Scan
 from localization.logs.decode import MessageStats
 from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import fingerprints, read_head
-from localization.ros.diagnostics import ERROR, WARN, Health, Status
+from localization.ros.diagnostics import ERROR, WARN, Doctor, Health, Status
 from localization.ros.discovery import TF, TF_STATIC, TF_TYPE, DiscoveredTopics, TopicDiscovery, TransformConflicts
-from localization.ros.doctor import Doctor
 from localization.ros.jit_warm_up import warm_up
 from localization.ros.live_stream import LiveStream, WheelAngles, check_age
 from localization.ros.operator_commands import OperatorCommands
