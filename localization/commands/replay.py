@@ -36,8 +36,7 @@ from localization.logs.references import merge_positions, read_positions
 from localization.logs.writer import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
 from localization.output import as_text, check_outputs, fingerprint, versions
 from localization.pipeline import ReplayConfig, Run, Trial, replay
-from localization.report.replay_page import ReportHead, overview_png, verdict, write_report
-from localization.report.tables import COLUMNS, MISSING, Column, with_values
+from localization.report.replay_page import COLUMNS, MISSING, Column, ReportHead, overview_png, verdict, with_values, write_report
 from localization.trajectory import write_tum
 from motion_models.online_calibration import check_forms
 from motion_models.prior import prior_notes, scaling_prior

@@ -42,8 +42,8 @@ from localization.report.page import (
     glossary,
     render,
 )
+from localization.report.replay_page import MISSING, number
 from localization.report.runs import capitalize, estimator_colours
-from localization.report.tables import MISSING, number
 
 _MARKERS = "osD^v"  # of matplotlib, by motion model
 _LOG_SCALE_RATIO = 8.0  # of the largest value to the smallest: from here on the axis is logarithmic

@@ -16,8 +16,8 @@ import numpy as np
 
 from localization.comparison.jobs import OK, Row
 from localization.lidar.scan_checks import is_long, per_cent
+from localization.report.replay_page import unit_of
 from localization.report.runs import capitalize, describe_run, join_words
-from localization.report.tables import unit_of
 from motion_models.se2 import FloatArray
 
 _DRAWS = 10_000

@@ -19,7 +19,7 @@ from PIL import Image
 from localization.errors import OutputError
 from localization.evaluation.references import ReferenceTrack, Relations, with_noise
 from localization.evaluation.scores import Result, score
-from localization.report.replay_page import ReportHead, overview_png, page, verdict, write_report
+from localization.report.replay_page import MISSING, ReportHead, number, overview_png, page, plus_minus, unit_of, verdict, write_report
 from localization.report.runs import (
     baseline_run,
     best_run,
@@ -32,7 +32,6 @@ from localization.report.runs import (
     thin_path,
     thin_series,
 )
-from localization.report.tables import MISSING, number, plus_minus, unit_of
 from localization.trajectory import Trajectory
 from motion_models import se2
 from tests.helpers.report import HEAD, PageText, chi_square_nis, relations, run, three_runs, track, with_error
