@@ -180,7 +180,7 @@ class ScanMatcher:
             if not is_near and _mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:
                 outlier_cov = nothing
             found = self._align(points, prior, cov + outlier_cov, best)
-            least = self._config.lost_below if _is_narrow(cov) else self._config.search_below  # else the place may be one that is not mapped
+            least = self._config.lost_below if _is_narrow(cov) else self._config.search_below  # the place may not be mapped
             if found.overlap >= least and (not is_near or _is_better(found, fit, prior, cov)):
                 return self._result(found, outlier_cov)
         return self._result(fit, nothing) if is_near and fit.overlap >= self._config.lost_below else None
