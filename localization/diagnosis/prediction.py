@@ -324,7 +324,7 @@ class _HypothesisModel:
             mass = p.drive.robot.geometry.mass_kg
             moved = cg + np.array(b.cg) + (p.drive.payload_arms * (b.payload_kg / (mass + b.payload_kg)) if b.payload_kg else 0.0)
         if b.split_friction:
-            moved = _shifted_by_grip(moved, 0.5 * params[1], b.split_friction)
+            moved, params[8] = _shifted_by_grip(moved, (0.5 * params[2], 0.5 * params[1]), params[8], b.split_friction)
         if moved is not cg:
             half = 0.49 * np.array([params[2], params[1]])
             moved = np.clip(moved, -half, half)
@@ -378,20 +378,27 @@ class _HypothesisModel:
             x, y = params[TRACKED[0]], params[TRACKED[1]]
             middle = settled + settled[:, 2:] * np.array([y, -x, 0.0])
             batch = p.batch
-            drive = ManeuverSamples(batch.dt, rates, cg, batch.first, p._last, p.headings, np.array(b.slope))
+            turned = np.r_[0.0, np.cumsum(settled[:, 2] * batch.dt)]
+            headings = p.headings - (turned[batch.first[:-1] + batch.lead] - turned[batch.first[:-1]])
+            drive = ManeuverSamples(batch.dt, rates, cg, batch.first, p._last, headings, np.array(b.slope))
             twists = dynamic_twists(p.drive.robot, law, params, drive, middle)
             p._twists[key] = np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
         return p._twists[key]
 
 
-def _shifted_by_grip(cg: FloatArray, half_track: float, split: float) -> FloatArray:
-    """(N, 2) centres of the contact forces where the left wheels grip ``split`` more than the right ones, over the mean of both.
+def _shifted_by_grip(cg: FloatArray, half: tuple[float, float], warp: float, split: float) -> tuple[FloatArray, float]:
+    """(N, 2) centres of the contact forces where the left wheels grip ``split`` more than the right ones, over the mean of both; and the
+    warp of these forces.
 
-    A contact's force goes with its load times its friction: unequal friction acts like a load that is shifted to the side with more grip.
+    A contact's force goes with its load times its friction. With g = split / 2, loads (1 + sx xi + sy eta + sx sy t) / 4 as in
+    `motion_models.friction.contact.loads` times (1 + sy g) have the same form: xi' = (xi + g t) / n, eta' = (eta + g) / n and
+    t' = (t + g xi) / n with n = 1 + g eta. ``half`` are half wheelbase and half track; the warp is that at the mean centre of gravity.
     """
-    left = (1.0 + cg[:, 1] / half_track) * (1.0 + 0.5 * split)
-    right = (1.0 - cg[:, 1] / half_track) * (1.0 - 0.5 * split)
-    return np.column_stack([cg[:, 0], half_track * (left - right) / (left + right)])
+    g = 0.5 * split
+    xi, eta = (cg / np.array(half)).T
+    n = 1.0 + g * eta
+    shifted = np.column_stack([(xi + g * warp) / n, (eta + g) / n]) * np.array(half)
+    return shifted, (warp + g * float(xi.mean())) / float(n.mean())
 
 
 def with_sizes(sizes: dict[Cause, float]) -> Hypothesis:
