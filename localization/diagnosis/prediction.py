@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numba
 import numpy as np
@@ -92,6 +94,8 @@ def _like(a: float, b: float) -> bool:
 CHANNELS = ("x", "y", "yaw", "gyro", "force_x", "force_y")
 CHANNEL_UNITS = ("m", "m", "rad", "rad", "m/s^2", "m/s^2")
 _GRAVITY = 9.81
+_GYRO_TURN_SIGMA_RAD = 1e-3  # of a window's turn by the gyro against the motion reference
+_GYRO_SCALE_SIGMA = 0.03  # sensitivity tolerance of MEMS gyros (see `causes`)
 _MAX_CACHED_TWISTS = 100
 _MAX_CONTACT_LAW = 1.3  # share of the other contact law; beyond 1 for the search only
 _NO_COLUMNS: IntArray = np.empty(0, dtype=np.int64)
@@ -108,6 +112,8 @@ class DrivePredictor:
     drive: Drive
     model: MotionModel
     has_inertia: bool
+    baseline: Hypothesis = field(default_factory=Hypothesis)
+    """How the robot differs from its file when nothing is wrong (`localization.diagnosis.baseline`); hypotheses count from there."""
     batch: Batch = field(init=False)
     headings: FloatArray = field(init=False)
     """(W,) at the start of each maneuver, counted from the first [rad]."""
@@ -147,18 +153,20 @@ class DrivePredictor:
         return int(np.count_nonzero(np.diff(self._lost, axis=0) > 0.0))
 
     def _headings(self) -> FloatArray:
-        """By the gyro less its mean difference to the reference_params; else by the reference_params's own turns, one after the other."""
+        """By the gyro less its bias and scale against the motion reference; else by the reference's own turns, one after the other."""
         batch, drive = self.batch, self.drive
         last = np.r_[batch.owner[1:] != batch.owner[:-1], True]
         yaw = batch.measured[last, 2]
         if drive.gyro is not None:
             turns = [drive.gyro.turn(int(a), int(b), float(t)) for (a, b), t in zip(drive.spans_ns, yaw, strict=True)]
-            known = [(t.angle - y, t.duration) for t, y in zip(turns, yaw, strict=True) if t is not None]
+            known = [(t.angle - y, y, t.duration) for t, y in zip(turns, yaw, strict=True) if t is not None]
             if known:
-                bias = sum(k[0] for k in known) / sum(k[1] for k in known)
+                prior = (0.0, _GYRO_TURN_SIGMA_RAD / _GYRO_SCALE_SIGMA, 0.0)  # of the scale, where the robot hardly turns
+                off, *columns = np.array([*known, prior]).T
+                (scale, bias), *_ = np.linalg.lstsq(np.column_stack(columns), off, rcond=None)
                 origin = int(drive.spans_ns[0, 0])
                 found = [drive.gyro.turn(origin, int(a), 0.0) for a in drive.spans_ns[:, 0]]
-                return np.array([0.0 if t is None else t.angle - bias * t.duration for t in found])
+                return np.array([0.0 if t is None else (t.angle - bias * t.duration) / (1.0 + scale) for t in found])
         return np.asarray(np.cumsum(yaw) - yaw)
 
     def _accelerations(self) -> FloatArray:
@@ -176,6 +184,7 @@ class DrivePredictor:
 
     def discrepancies(self, hypothesis: Hypothesis) -> FloatArray:
         """(M, 6) measured minus predicted, as `CHANNELS`: motion in the predicted end's frame; NaN where nothing was measured."""
+        hypothesis = _added(self.baseline, hypothesis)
         batch, drive = self.batch, self.drive
         out = np.full((len(batch.ends), len(CHANNELS)), np.nan)
         reference_params = np.array([self._wheel_shift(hypothesis), hypothesis.wheel_lag_s, *self._tracked(hypothesis)])
@@ -399,6 +408,22 @@ def _shifted_by_grip(cg: FloatArray, half: tuple[float, float], warp: float, spl
     n = 1.0 + g * eta
     shifted = np.column_stack([(xi + g * warp) / n, (eta + g) / n]) * np.array(half)
     return shifted, (warp + g * float(xi.mean())) / float(n.mean())
+
+
+def _added(a: Hypothesis, b: Hypothesis) -> Hypothesis:
+    """Both deviations at once."""
+    if a == Hypothesis():
+        return b
+    found: dict[str, Any] = {}
+    for name in (f.name for f in dataclasses.fields(Hypothesis)):
+        one, other = getattr(a, name), getattr(b, name)
+        if isinstance(one, tuple):
+            found[name] = tuple(x + y for x, y in zip(one, other, strict=True))
+        elif isinstance(one, Mapping):
+            found[name] = {key: one.get(key, 0.0) + other.get(key, 0.0) for key in {**one, **other}}
+        else:
+            found[name] = one + other
+    return Hypothesis(**found)
 
 
 def with_sizes(sizes: dict[Cause, float]) -> Hypothesis:
