@@ -20,8 +20,13 @@ from motion_models.errors import CalibrationError
 from motion_models.friction import FrictionModel
 
 _MIN_WINDOWS = 16
-_SLIPS: Mapping[str, float] = {"lateral_slip_speed": 0.05, "rotation_slip_speed": 0.1, "longitudinal_slip_turning": 0.1}
-"""Sigma of slips that grow with speed: their typical sizes, in their units."""
+_SLIPS: Mapping[str, float] = {
+    "lateral_slip_speed": 0.05,
+    "rotation_slip_speed": 0.1,
+    "longitudinal_slip_turning": 0.1,
+    "rotation_scale": 0.5,
+}
+"""Sigma of slips that grow with speed: their typical sizes, in their units; and of rotations that no friction model predicts."""
 _CG_SIGMA_M = 0.01
 """Of the centre of gravity by robot files, with batteries and cables that these do not have."""
 _LOG_STIFFNESS_SIGMA = 1.0

@@ -102,21 +102,21 @@ def drive_mujoco(robot: Robot, experiment: Experiment, effects: Mapping[str, flo
 
 
 @functools.cache
-def healthy(robot_name: str) -> Hypothesis:
+def healthy(robot_name: str, experiment: Experiment = HEALTHY) -> Hypothesis:
     """How the healthy robot in MuJoCo differs from its file."""
     robot = load_robot(robot_name)
-    return estimate_baseline(drive_mujoco(robot, HEALTHY, {}, _HEALTHY_SEED), make_model("friction", robot))
+    return estimate_baseline(drive_mujoco(robot, experiment, {}, _HEALTHY_SEED), make_model("friction", robot))
 
 
-def diagnose_mujoco(robot_name: str, route: str, effects: Mapping[str, float], seed: int) -> Diagnosis:
-    """Diagnosis of a drive in MuJoCo with hidden ``effects``, by the bag, the robot file and the healthy robot's drive."""
+def diagnose_mujoco(robot_name: str, route: str, effects: Mapping[str, float], seed: int, baseline: Hypothesis) -> Diagnosis:
+    """Diagnosis of a drive in MuJoCo with hidden ``effects``, by the bag, the robot file and the ``baseline`` of the healthy robot."""
     robot = load_robot(robot_name)
-    return diagnose(drive_mujoco(robot, drive(route), effects, seed), make_model("friction", robot), baseline=healthy(robot_name))
+    return diagnose(drive_mujoco(robot, drive(route), effects, seed), make_model("friction", robot), baseline=baseline)
 
 
 def run_case(number: int) -> BlindCase:
     robot, route, cause, size = hidden(number)
-    found = diagnose_mujoco(robot, route, {cause: size} if cause else {}, 7000 + number)
+    found = diagnose_mujoco(robot, route, {cause: size} if cause else {}, 7000 + number, healthy(robot))
     sizes = {found.findings[0].cause: found.findings[0].size, **dict(found.findings[0].aliases)} if found.findings else {}
     others = tuple(f.cause for f in found.findings[1:])
     return BlindCase(number, robot, route, cause, size, found.verdict, tuple(sizes), sizes.get(cause), others)
