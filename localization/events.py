@@ -1,4 +1,4 @@
-"""Events of a log, one at a time, in SI units and header time.
+"""Events of a log, one at a time, in SI units and header time; and a step: an interval of time with what each sensor measured of it.
 
 Stamps are integer nanoseconds of the message's header. Arrays are float64 and finite unless a field says otherwise; events are
 never changed after they are made. The constructors raise `EventError` for arrays that are not so.
@@ -7,18 +7,20 @@ never changed after they are made. The constructors raise `EventError` for array
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from localization.errors import EventError
+from motion_models.base import Motion
 from motion_models.se2 import FloatArray
+
+_NS = 1e-9
+_ROUNDING = 1e-9  # of a covariance, over its largest entry
 
 
 def _no_floats() -> FloatArray:
     return np.empty(0)
-
-
-_ROUNDING = 1e-9  # of a covariance, over its largest entry
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,52 @@ class Reference:
 
 
 Event = WheelSample | CgSample | Scan | ImuSample | PositionSample | Reference
+
+
+@dataclass(frozen=True)
+class Turn:
+    """Yaw about the body's z axis, summed up from a gyro; its bias is still in it."""
+
+    angle: float
+    """[rad]"""
+    variance: float
+    """[rad^2], of white noise and scale; without the bias."""
+    duration: float
+    """Time that the bias acted [s]."""
+
+
+class StepInterval(NamedTuple):
+    """Time of one step, and the scan at its end."""
+
+    start_ns: int
+    end_ns: int
+    scan: Scan | None
+
+
+@dataclass(frozen=True)
+class Step:
+    """The time from ``start_ns`` to ``end_ns``, and what each sensor measured of it."""
+
+    start_ns: int
+    end_ns: int
+    predicted: Motion
+    """By the wheels and the motion model, at its nominal parameters."""
+    d_clock: FloatArray
+    """(3,) change of the predicted motion (right perturbation) per second by which the wheels' clock is shifted [m/s, m/s, rad/s]."""
+    twist: FloatArray
+    """(3,) body twist at the end, by the wheels; of a step of no duration, by the nearest wheel sample. Without wheel data zero, but for
+    the mean turn rate by the gyro."""
+    is_standing: bool
+    """No wheel moved during the step."""
+    has_wheels: bool
+    """Wheel data cover all of the step; of no duration, they are near it."""
+    turn: Turn | None = None
+    scan: Scan | None = None
+
+    @property
+    def duration(self) -> float:
+        """[s]"""
+        return (self.end_ns - self.start_ns) * _NS
 
 
 def _check_shape(event: Event, name: str, shape: tuple[int, ...]) -> None:

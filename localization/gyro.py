@@ -5,11 +5,10 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
-from localization.events import ImuSample
+from localization.events import ImuSample, Turn
 from motion_models.robot import GyroNoise, Mount
 
 _NS = 1e-9
@@ -23,20 +22,8 @@ _MAX_SPIKES = 2  # that agree, in a row; a third is accepted
 _MIN_TURN_RAD = 0.5  # rad of turning by the wheels, after which they show which way the gyro's axis points
 
 
-@dataclass(frozen=True)
-class Turn:
-    """Yaw about the body's z axis, summed up from a gyro; its bias is still in it."""
-
-    angle: float
-    """[rad]"""
-    variance: float
-    """[rad^2], of white noise and scale; without the bias."""
-    duration: float
-    """Time that the bias acted [s]."""
-
-
 class GyroBuffer:
-    """The last seconds of the yaw rate.
+    """The last seconds of the yaw rate: ``keep_s`` of them [s], of IMUs that sit at ``mounts`` (by frame).
 
     Gravity shows which axis of the IMU is upright. Where the mount gives another one, the rate is that about gravity, and whether this
     axis points up or down (some drivers publish gravity, not specific force) follows from the turns of the wheels; until these suffice,

@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -21,10 +21,9 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.estimators import Estimate
-from localization.events import ImuSample, Scan
+from localization.events import ImuSample, Scan, Step
 from localization.lidar import LidarConfig, Sweep
 from localization.lidar.scan_motion import ScanOdometry
-from localization.step import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion
@@ -116,8 +115,9 @@ class Fault:
         " from then on. Remove what covers the LiDAR, or filter these beams in its driver (laser_filters)."
     )
     DISAGREEMENT = (
-        "the motion by the scans and that by the wheels differ by {sigmas:.1f} sigma over 5 s ({metres:.2f} m, {degrees:.0f} deg)."
-        " Wheels slip, or a sensor is mounted, stamped or scaled otherwise than its driver says: run `skidloc diagnose` on the log."
+        "for {seconds:.0f} s the motion by the scans and that by the wheels differ ({sigmas:.1f} sigma in the mean, {metres:.2f} m and"
+        " {degrees:.0f} deg at the end{others}). Wheels slip, or a sensor is mounted, stamped or scaled otherwise than its driver says: run"
+        " `skidloc diagnose` on the log."
     )
     WHEELS_STANDING = (
         "the wheels read zero while {others} moved. They count as unknown there. Check the encoders, the driver of the wheels and the"
@@ -133,6 +133,28 @@ class Found:
     at_s: float
     """After the first step [s]."""
     message: str
+
+
+class _Episode(NamedTuple):
+    """A time in which scans and wheels disagree."""
+
+    begin_s: float
+    end_s: float
+    difference: FloatArray
+    """(3,) of the motion by the wheels from that by the estimate."""
+    mean_square: float
+    """Of the last 5 s, in sigmas."""
+
+    def message(self, episodes: Sequence[_Episode]) -> str:
+        """For the largest of the ``episodes``."""
+        seconds = sum(episode.end_s - episode.begin_s for episode in episodes)
+        return Fault.DISAGREEMENT.format(
+            seconds=self.end_s - self.begin_s,
+            sigmas=math.sqrt(self.mean_square),
+            metres=math.hypot(self.difference[0], self.difference[1]),
+            degrees=abs(math.degrees(self.difference[2])),
+            others=f"; the largest of {len(episodes)} such times, {seconds:.0f} s in all" if len(episodes) > 1 else "",
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +209,7 @@ class SensorChecks:
         self._standing_s = 0.0  # the same, while that is contradicted
         self._pose: FloatArray | None = None
         self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)  # motion since the sensors last agreed
+        self._episodes: list[_Episode] = []
         self._pending = np.zeros((3, 3))
         self._spread = np.zeros((3, 3))
         self._spread_since_ns: int | None = None
@@ -290,13 +313,14 @@ class SensorChecks:
         if step is None or step.duration == 0.0:
             return
         self._disagreement.add(step, delta, nis)
-        off, mean_square = self._disagreement.difference, self._disagreement.mean_square
+        off = self._disagreement.difference
         if off is None:
             self._pending = self._pending + (0.0 if before is None else np.outer(before, before))
-        elif Fault.DISAGREEMENT not in self.found:
-            numbers = {"sigmas": math.sqrt(mean_square), "metres": math.hypot(off[0], off[1]), "degrees": abs(math.degrees(off[2]))}
-            begin_s = self._disagreement.began_s - (self._start_ns or 0) * _NS
-            self.found[Fault.DISAGREEMENT] = Found(Fault.DISAGREEMENT, begin_s, Fault.DISAGREEMENT.format(**numbers))
+            return
+        episode = _Episode(self._disagreement.began_s - (self._start_ns or 0) * _NS, self._now_s(step), off, self._disagreement.mean_square)
+        self._episodes = [*(self._episodes if before is None else self._episodes[:-1]), episode]
+        largest = max(self._episodes, key=lambda e: float(np.hypot(e.difference[0], e.difference[1])))
+        self.found[Fault.DISAGREEMENT] = Found(Fault.DISAGREEMENT, largest.begin_s, largest.message(self._episodes))
 
     def _with_unknown_motion(self, step: Step, seconds2: float) -> Step:
         """``step`` with the covariance of a lasting unknown twist, which grows by ``seconds2`` [s^2]."""
@@ -435,16 +459,13 @@ class _Disagreement:
         self._rows: deque[tuple[float, float, FloatArray, FloatArray]] = deque()  # time [s], square, motion by wheels and estimate
         self._motions: tuple[FloatArray, FloatArray] | None = None
         self.mean_square = 0.0
+        self.began_s = 0.0
+        """Time of the first step at which they differ [s]."""
 
     @property
     def difference(self) -> FloatArray | None:
         """Of the motion by the wheels from that by the estimate (3,), since they began to disagree; None where they agree."""
         return None if self._motions is None else se2.log(se2.between(self._motions[1], self._motions[0]))
-
-    @property
-    def began_s(self) -> float:
-        """Time of the first step of the last seconds at which they differ [s]."""
-        return next((row[0] for row in self._rows if row[1] > _MAX_MEAN_SQUARE), math.nan)
 
     def add(self, step: Step, delta: FloatArray, nis: float | None) -> None:
         """``delta`` (3,) of ``step`` by the estimate, and its NIS. Steps without scans or moving wheels are not compared."""
@@ -465,6 +486,7 @@ class _Disagreement:
         elif self._motions is None:
             wheels, estimated = (functools.reduce(se2.compose, (row[i] for row in self._rows), np.zeros(3)) for i in (2, 3))
             self._motions = wheels, estimated
+            self.began_s = next(row[0] for row in self._rows if row[1] > _MAX_MEAN_SQUARE)
 
 
 class OwnBodyFilter:

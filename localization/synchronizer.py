@@ -10,12 +10,11 @@ from typing import Annotated
 
 import numpy as np
 
-from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
+from localization.events import CgSample, Event, ImuSample, Scan, Step, StepInterval, WheelSample
 from localization.gyro import GyroBuffer
+from localization.lidar.deskew import LidarTilt
 from localization.lidar.scan_checks import LidarFrames
-from localization.lidar.tilt import LidarTilt
 from localization.settings import Positive, Settings, at_least
-from localization.step import Step, StepInterval
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.base import Motion, MotionModel, Twist

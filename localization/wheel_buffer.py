@@ -14,7 +14,10 @@ _NS = 1e-9
 
 
 class WheelBuffer:
-    """The last seconds of wheel motion as intervals of constant rates, with the centre of gravity that held in each."""
+    """The last seconds of wheel motion as intervals of constant rates, with the centre of gravity that held in each.
+
+    ``cg`` (2,) holds from the start on [m]; after ``keep_s`` [s] intervals are dropped.
+    """
 
     def __init__(self, cg: FloatArray, keep_s: float = 10.0) -> None:
         self._cg, self._cg_cov = cg, np.zeros((2, 2))

@@ -8,19 +8,23 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from motion_models.base import Motion, MotionModel, Twist
-    from motion_models.calibration.center_of_rotation import CenterOfRotation, center_from_end_poses, center_of_arc
     from motion_models.calibration.cross_validation import HeldOut, Interval, cross_validate, root_mean, root_mean_gain
-    from motion_models.calibration.fit import Fit, fit
-    from motion_models.calibration.least_squares import FitConfig
-    from motion_models.calibration.maneuvers import Maneuver
+    from motion_models.calibration.fit import Fit, FitConfig, fit
+    from motion_models.calibration.maneuvers import Maneuver, read_windows, windows_text
     from motion_models.calibration.prediction import REFERENCE_PARAM_NAMES
-    from motion_models.calibration.regressions import RotationTable, read_rotation_table, rotations_as_maneuvers, skid_steer_fit
+    from motion_models.calibration.regressions import (
+        CenterOfRotation,
+        RotationTable,
+        center_from_end_poses,
+        center_of_arc,
+        read_rotation_table,
+        rotations_as_maneuvers,
+        skid_steer_fit,
+    )
     from motion_models.calibration.ros_export import diff_drive_controller_yaml, multiplier_table, multipliers, robot_localization_yaml
-    from motion_models.calibration.windows_table import read_windows, windows_text
     from motion_models.center_of_gravity.files import arms_model, arms_postures, urdf_cg, weighed_cg
-    from motion_models.center_of_gravity.model import CgModel, CgTracker, cg_model, static_part_from_weighing
+    from motion_models.center_of_gravity.model import CgModel, CgTracker, cg_model, posture_for, static_part_from_weighing
     from motion_models.center_of_gravity.parts import Arms, CgEstimate, Payload, StaticPart, Tolerances, support_margin
-    from motion_models.center_of_gravity.postures import posture_for
     from motion_models.center_of_gravity.weighing import Scales, WeighedCg, cg_from_scales, read_weighings, wheel_contacts
     from motion_models.diff_drive import DiffDrive
     from motion_models.errors import CalibrationError, CgError, ModelError, RobotError, SkidlocError
@@ -110,19 +114,16 @@ __all__ = [
 
 _MODULES = {
     "motion_models.base": "Motion MotionModel Twist",
-    "motion_models.calibration.center_of_rotation": "CenterOfRotation center_from_end_poses center_of_arc",
     "motion_models.calibration.cross_validation": "HeldOut Interval cross_validate root_mean root_mean_gain",
-    "motion_models.calibration.fit": "Fit fit",
-    "motion_models.calibration.least_squares": "FitConfig",
-    "motion_models.calibration.maneuvers": "Maneuver",
+    "motion_models.calibration.fit": "Fit FitConfig fit",
+    "motion_models.calibration.maneuvers": "Maneuver read_windows windows_text",
     "motion_models.calibration.prediction": "REFERENCE_PARAM_NAMES",
-    "motion_models.calibration.regressions": "RotationTable read_rotation_table rotations_as_maneuvers skid_steer_fit",
+    "motion_models.calibration.regressions": "CenterOfRotation RotationTable center_from_end_poses center_of_arc read_rotation_table"
+    " rotations_as_maneuvers skid_steer_fit",
     "motion_models.calibration.ros_export": "diff_drive_controller_yaml multiplier_table multipliers robot_localization_yaml",
-    "motion_models.calibration.windows_table": "read_windows windows_text",
     "motion_models.center_of_gravity.files": "arms_model arms_postures urdf_cg weighed_cg",
-    "motion_models.center_of_gravity.model": "CgModel CgTracker cg_model static_part_from_weighing",
+    "motion_models.center_of_gravity.model": "CgModel CgTracker cg_model posture_for static_part_from_weighing",
     "motion_models.center_of_gravity.parts": "Arms CgEstimate Payload StaticPart Tolerances support_margin",
-    "motion_models.center_of_gravity.postures": "posture_for",
     "motion_models.center_of_gravity.weighing": "Scales WeighedCg cg_from_scales read_weighings wheel_contacts",
     "motion_models.diff_drive": "DiffDrive",
     "motion_models.errors": "CalibrationError CgError ModelError RobotError SkidlocError",

@@ -1,4 +1,4 @@
-"""SE(2): the only home of this project's pose and tangent conventions.
+"""SE(2): the only home of this project's pose and tangent conventions, and the shapes of arrays on public interfaces.
 
 A pose is ``[x, y, theta]``; a tangent vector is ``[x, y, theta]`` too, in that order, expressed in the body frame (metres,
 radians). Perturbations act on the right: ``pose = compose(mean, exp(error))``. All functions take arrays of shape (..., 3),
@@ -8,6 +8,9 @@ broadcast over the leading axes and never change their input. Names of poses rea
 Source: Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics", 2018, appendix A. The maths stands in compiled
 functions of three numbers, for compiled loops (`scalar_exp`, `fill_adjoint` and so on), and these in generalised ufuncs (`_exp`), which
 numpy broadcasts: a single pose costs a microsecond or two, as filters need.
+
+Shapes (`Pose2`, `Cov3`): all arrays are float64; type checkers take them as `FloatArray`, readers as what they hold. Arrays of poses and
+covariances have the same names where all leading axes are given in the docstring.
 
 >>> quarter_turn = exp([0.0, 0.0, math.pi / 2])
 >>> compose([1.0, 2.0, math.pi / 2], [1.0, 0.0, 0.0]).round(6).tolist()
@@ -29,9 +32,20 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from motion_models.types import FloatArray as FloatArray
+FloatArray = NDArray[np.float64]
+"""Any shape; the docstring gives it."""
+Pose2 = FloatArray
+"""(3,) x, y, yaw [m, m, rad]: a pose or a motion of SE(2); its name reads ``world_T_body``."""
+Twist2 = FloatArray
+"""(3,) vx, vy, wz in the body frame [m/s, m/s, rad/s]."""
+Tangent2 = FloatArray
+"""(3,) of the Lie algebra se(2): a right perturbation or a residual [m, m, rad]."""
+Cov3 = FloatArray
+"""(3, 3) covariance of a `Tangent2` [m^2, m rad, rad^2]."""
+Points2 = FloatArray
+"""(N, 2) points of a plane [m]."""
 
 Triple = tuple[float, float, float]
 """A pose or tangent in compiled loops."""

@@ -20,10 +20,9 @@ import itertools
 from scipy.stats import chi2
 
 from localization import Trial, open_log, read_reference_file, replay, score
-from localization.report.figure_data import nis_means, relation_bins
 from localization.report.notebook import Panel, Series, picture, table, trajectories
 from localization.report.replay_page import verdict
-from localization.report.runs import plotted_runs
+from localization.report.runs import nis_means, plotted_runs, relation_bins
 from motion_models import load_robot, make_model
 
 LOG_S = 1400.0  # all of it

@@ -22,7 +22,7 @@ from localization.diagnosis.drive import drive_of_table
 from localization.report.notebook import CYCLE, MARKERS, Bars, Panel, Series, picture, table
 from localization.simulation import SensorConfig, SimulationConfig, simulate
 from motion_models import center_from_end_poses, fit, load_robot, make_model, read_rotation_table, rotations_as_maneuvers
-from motion_models.calibration.least_squares import FitConfig
+from motion_models.calibration.fit import FitConfig
 from motion_models.calibration.regressions import rotation_ratio
 from motion_models.robot import WheelNoise
 

@@ -28,8 +28,8 @@ from pathlib import Path
 
 import numpy as np
 
-from localization.diagnosis.controller_runs import drive_of_runs, read_runs
 from localization.diagnosis.diagnose import examine
+from localization.diagnosis.drive import drive_of_runs, read_runs
 from localization.report.notebook import Bars, Panel, Series, picture, table
 from motion_models import FrictionModel, load_robot, make_model
 

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from localization.estimators import Estimate
-from localization.events import ImuSample, Scan
-from localization.gyro import Turn
+from localization.events import ImuSample, Scan, Step, Turn
 from localization.lidar import LidarConfig
 from localization.sensor_checks import Fault, SensorChecks
-from localization.step import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion
@@ -226,32 +224,35 @@ def test_lidar_one_contradicting_window_among_many_leaves_it_in() -> None:
 
 
 def test_wheels_far_from_the_estimate_are_reported_and_widen_it() -> None:
-    """Wheels that count three times too far, by a metre a second: reported after 5 s, and the covariance has the whole difference."""
+    """Wheels that count three times too far, by a metre a second: the covariance has the whole difference."""
     robot = Robot(wheels=lambda v, w: (3.0 * v, w))
     checks = robot.drive()
     assert list(checks.found) == [Fault.DISAGREEMENT]
-    metres = re.search(r"\(([0-9.]+) m", checks.warnings()[0])
-    assert metres is not None
-    assert float(metres[1]) == pytest.approx(4.5, abs=0.1)
     by_wheels = functools.reduce(se2.compose, (step.predicted.delta for step in robot.applied[1:]))
     by_scans = se2.between(robot.estimates[0].pose, robot.estimates[-1].pose)
-    cov = robot.estimates[-1].covariance
-    assert cov is not None
     difference_m = np.linalg.norm(se2.log(se2.between(by_scans, by_wheels))[:2])
     assert difference_m > 10.0
+    found = re.search(r"for (\d+) s .* ([0-9.]+) m and", checks.warnings()[0])
+    assert found is not None
+    assert int(found[1]) == 12
+    assert float(found[2]) == pytest.approx(difference_m, abs=0.01)
+    cov = robot.estimates[-1].covariance
+    assert cov is not None
     assert math.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]) == pytest.approx(difference_m, rel=0.01)
 
 
-def test_disagreement_that_ends_leaves_its_difference_in_the_covariance() -> None:
-    """Wheels that count three times too far from 4 to 8 s: 4 m, and no more after it."""
+def test_disagreements_that_end_stay_in_the_covariance() -> None:
+    """Wheels that count three times too far from 4 to 8 s and from 20 to 22.5 s: 4 and 2.5 m, and no more after it."""
     robot = Robot()
-    robot.wheels = lambda v, w: ((3.0 if 4.0 <= 0.1 * len(robot.applied) < 8.0 else 1.0) * v, w)
-    checks = robot.drive(20.0)
+    factors = ((4.0, 8.0), (20.0, 22.5))
+    robot.wheels = lambda v, w: ((3.0 if any(a <= 0.1 * len(robot.applied) < b for a, b in factors) else 1.0) * v, w)
+    checks = robot.drive(30.0)
     assert list(checks.found) == [Fault.DISAGREEMENT]
     assert checks.found[Fault.DISAGREEMENT].at_s == pytest.approx(4.0, abs=0.2)
+    assert "the largest of 2 such times" in checks.warnings()[0]
     cov = robot.estimates[-1].covariance
     assert cov is not None
-    assert math.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]) == pytest.approx(4.0, rel=0.05)
+    assert math.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]) == pytest.approx(math.hypot(4.0, 2.5), rel=0.05)
 
 
 def test_gyro_in_degrees_from_half_way_on_is_left_out_within_five_seconds() -> None:

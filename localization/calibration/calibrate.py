@@ -17,14 +17,12 @@ from localization.evaluation.references import ReferenceTrack, read_reference_fi
 from localization.logs import Log, TopicOverrides, open_log
 from localization.trajectory import BoolArray
 from motion_models.base import MotionModel
-from motion_models.calibration.cross_validation import HeldOut, cross_validate
-from motion_models.calibration.fit import Fit, fit
-from motion_models.calibration.least_squares import FitConfig
+from motion_models.calibration.cross_validation import HeldOut, LearnedNoise, cross_validate, learn_noise
+from motion_models.calibration.fit import Fit, FitConfig, fit
 from motion_models.calibration.maneuvers import IntArray, Maneuver
-from motion_models.calibration.noise import LearnedNoise, learn_noise
 from motion_models.calibration.plan import Calibration, calibrate, free_of
-from motion_models.corrected import RADIUS_NAMES, CorrectedWheels
 from motion_models.errors import CalibrationError
+from motion_models.online_calibration import RADIUS_NAMES, CorrectedWheels
 from motion_models.registry import make_model
 from motion_models.robot import Robot, WheelNoise
 from motion_models.se2 import FloatArray

@@ -18,16 +18,14 @@ import numpy as np
 
 from localization.logs.chunks import RawMessage, merge_channels
 from localization.logs.decode import UnusableError, frame_name, stamp_ns
-from localization.logs.reader import open_log
+from localization.logs.reader import open_log, open_source
 from localization.logs.serialization import LogDeserializer
-from localization.logs.sources import open_source
 from localization.logs.topic_roles import TYPES, TopicOverrides
-from motion_models.center_of_gravity.urdf import parse_urdf
+from motion_models.center_of_gravity.urdf import WheelGeometry, link_poses, parse_urdf, sides, wheel_geometry
 from motion_models.errors import RobotError
 from motion_models.robot import DIFF_DRIVE, Driver, Geometry, Joints, Mount, Robot, Topics
 from motion_models.se2 import FloatArray
 from motion_models.text_files import read_text
-from motion_models.wheel_geometry import WheelGeometry, link_poses, sides, wheel_geometry
 
 DRIVE_60_S = (
     "Drive about 60 s for the calibration: stand 3 s; 10 s straight ahead; stand 2 s; 10 s of turning in place to the left; stand 2 s; "

@@ -15,15 +15,22 @@ from rich.console import Console
 
 from localization.calibration.calibrate import Calibrated, Cut, MotionReferenceName, Turning, calibrated, cut_log, turning
 from localization.calibration.windows import WindowConfig
-from localization.commands.calibration_tables import calibration_numbers, print_by_source, print_cuts, print_fit, print_rotation_errors
+from localization.commands.calibration_tables import (
+    calibration_numbers,
+    print_by_source,
+    print_cuts,
+    print_fit,
+    print_regressions,
+    print_rotation_errors,
+    regression_numbers,
+)
 from localization.commands.common import write_json
-from localization.commands.regression_tables import print_regressions, regression_numbers
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from motion_models.base import MotionModel
+from motion_models.calibration.maneuvers import read_windows, table_columns, windows_text, without_turned_frames
 from motion_models.calibration.regressions import RotationTable, read_rotation_table, rotations_as_maneuvers, skid_steer_fit
 from motion_models.calibration.ros_export import diff_drive_controller_yaml, robot_localization_yaml
-from motion_models.calibration.windows_table import read_windows, table_columns, windows_text, without_turned_frames
 from motion_models.center_of_gravity.files import arms_model, arms_postures
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model

@@ -11,13 +11,11 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from localization.commands.common import write_json
-from localization.commands.tables import add_row, plain_table, print_line, print_table
+from localization.commands.common import add_row, plain_table, print_line, print_table, write_json
 from localization.output import check_outputs
 from motion_models.center_of_gravity.files import arms_model, arms_postures, weighed_cg
-from motion_models.center_of_gravity.model import static_part_from_weighing
+from motion_models.center_of_gravity.model import Posture, parse_postures, static_part_from_weighing
 from motion_models.center_of_gravity.parts import Arms, CgEstimate, Payload, StaticPart, require_support
-from motion_models.center_of_gravity.postures import Posture, parse_postures
 from motion_models.center_of_gravity.weighing import WHEELS, WeighedCg, read_weighings
 from motion_models.errors import CgError
 from motion_models.friction import FrictionModel

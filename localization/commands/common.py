@@ -1,4 +1,4 @@
-"""What commands share: a terminal that texts of logs cannot control, names separated by commas, new folders, JSON."""
+"""What commands share: a terminal that texts of logs cannot control, tables on it, names separated by commas, new folders, JSON."""
 
 from __future__ import annotations
 
@@ -13,13 +13,18 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
+from rich.markup import escape
 from rich.segment import Segment
+from rich.table import Table
 
 from localization.errors import SettingError
 from localization.output import output_errors, refuse_existing, write_text_file
 
 # Control characters but for line ends and tabs, marks that turn the direction of writing, and bytes of file names that are no text.
 _COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+
+WIDE = 200
+"""Characters a line where the output is no terminal."""
 
 
 class PlainConsole(Console):
@@ -69,3 +74,31 @@ def _finite(content: Any) -> Any:
     if isinstance(content, float):
         return content if math.isfinite(content) else None
     return content
+
+
+def plain_table(*columns: str, title: str | None = None) -> Table:
+    """With its first column to the left and all others to the right; texts are no markup."""
+    names = [escape(name) for name in columns]
+    heading = None if title is None else escape(title)
+    table = Table(*names, box=None, header_style="bold", pad_edge=False, title=heading, title_justify="left", title_style="")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    return table
+
+
+def add_row(table: Table, *cells: str) -> None:
+    """Add a row, its cells as plain text."""
+    table.add_row(*map(escape, cells))
+
+
+def print_table(console: Console, table: Table) -> None:
+    """Print ``table``; where the output is no terminal, a row stays one line."""
+    if console.is_terminal:
+        console.print(table)
+    else:
+        Console(file=console.file, width=WIDE, highlight=False).print(table)
+
+
+def print_line(console: Console, text: str) -> None:
+    """Print one sentence without wrapping."""
+    console.print(text, markup=False, soft_wrap=True)

@@ -17,10 +17,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table as Grid
 
 from localization.commands.common import names, write_json
-from localization.comparison.executors import run_local, run_on_cluster
-from localization.comparison.jobs import OK, Job, Row, job_key, run_job, trials
+from localization.comparison.jobs import OK, Job, Row, job_key, run_job, run_local, run_on_cluster, trials
 from localization.comparison.page import CompareHead, check_report, write_comparison_report
-from localization.comparison.summary import Findings, against_best, closing, find, headline
+from localization.comparison.statistics import Findings, against_best, closing, find, headline
 from localization.comparison.table import ResultTable
 from localization.errors import EvaluationError, LogError, OutputError
 from localization.estimators import check_estimator

@@ -14,18 +14,16 @@ from localization.calibration.calibrate import MotionReferenceName
 from localization.calibration.windows import WindowConfig
 from localization.commands.common import new_folder, write_json
 from localization.diagnosis.baseline import estimate_baseline
-from localization.diagnosis.controller_runs import drive_of_runs, read_runs
 from localization.diagnosis.corrected_robot import correct_robot
 from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
-from localization.diagnosis.drive import Drive, drive_of_log, drive_of_table
-from localization.diagnosis.findings import Diagnosis
+from localization.diagnosis.drive import Drive, drive_of_log, drive_of_runs, drive_of_table, read_runs
+from localization.diagnosis.findings import Diagnosis, describe_outliers, describe_row, describe_tolerated
 from localization.diagnosis.linearization import default_model
-from localization.diagnosis.summary import describe_outliers, describe_row, describe_tolerated
 from localization.logs import TopicOverrides, open_log
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
+from motion_models.calibration.maneuvers import read_windows, table_columns
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
-from motion_models.calibration.windows_table import read_windows, table_columns
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
 from motion_models.robot import Robot, load_robot

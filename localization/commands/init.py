@@ -15,7 +15,7 @@ from rich.prompt import Confirm, Prompt
 
 from localization.calibration.robot_setup import DRIVE_60_S, Draft, Given, Survey, draft_robot, finish_robot, survey_log
 from localization.commands.calibrate import Calibrate
-from localization.commands.tables import print_line
+from localization.commands.common import print_line
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from motion_models.errors import RobotError

@@ -1,36 +1,43 @@
-"""`skidloc online`: the estimator live, from ROS 2, ROS 1, or a log at a rate."""
+"""`skidloc online`: the estimator live, from ROS 2, ROS 1, or a log at a rate; and what the terminal shows of it."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal, NoReturn
 
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.live import Live
 from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
 
-from localization.commands.online_terminal import live_line, terminal_view
 from localization.errors import CheckpointError, OutputError
 from localization.events import Event
 from localization.logs import open_log
 from localization.output import fingerprint
 from localization.pipeline import Pipeline
-from localization.ros.node import Node
-from localization.ros.run_control import PlaybackClock, StopSignal
+from localization.ros.diagnostics import ERROR, OK, WARN, Status
+from localization.ros.node import Node, StopSignal
 from localization.ros.session import Session, SessionState, View, made_by
 from localization.ros.settings import LiveRun, OnlineSettings
 from localization.ros.transports import TransportName, open_transport
-from localization.ros.transports.sim_time import SimTimeTransport
+from localization.ros.transports.base import SimTimeTransport
 from motion_models.prior import prior_notes
 
 _LINE_S = 0.25
+_MAX_GAP_S = 5.0
+"""Longer pauses of a log are cut to this [s]."""
+_NS = 1e-9
 _SLOWEST = 0.001  # a second of the log in a quarter of an hour
+
+_LEARNED = 8  # corrections that are shown; grids of them have dozens
 
 
 @dataclass(frozen=True)
@@ -167,6 +174,29 @@ class Online(OnlineSettings):
             console.print(f"{self.out}: {count} estimates", markup=False, soft_wrap=True)
 
 
+class PlaybackClock:
+    """``rate`` times as fast as the log was recorded; infinite: without waiting. ``clock`` and ``sleep`` are in seconds."""
+
+    def __init__(self, rate: float, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep) -> None:
+        self._rate, self._clock, self._sleep = rate, clock, sleep
+        self._last_ns: int | None = None
+        self._due = 0.0
+
+    def wait(self, stamp_ns: int) -> None:
+        """Sleep until the event of ``stamp_ns`` is due; return at once where it is overdue."""
+        if math.isinf(self._rate):
+            return
+        now = self._clock()
+        if self._last_ns is None:
+            self._due = now
+        else:
+            gap = min(max((stamp_ns - self._last_ns) * _NS, 0.0), _MAX_GAP_S)
+            self._due += gap / self._rate
+        self._last_ns = stamp_ns if self._last_ns is None else max(stamp_ns, self._last_ns)
+        if self._due > now:
+            self._sleep(self._due - now)
+
+
 def parse_rate(text: str) -> float:
     """Times real time; infinite for `max`. Raises `OutputError`."""
     try:
@@ -176,3 +206,59 @@ def parse_rate(text: str) -> float:
     if not rate >= _SLOWEST:
         raise OutputError(f"--rate is '{text}'; it must be a number from {_SLOWEST} (1 is real time), or max.")
     return rate
+
+
+def live_line(session: Session, seconds: float, statuses: list[Status], extra: str = "") -> Text:
+    """One line of the terminal after ``seconds`` of the robot's time."""
+    e = session.health.estimate
+    if e is None:
+        return Text(f"{seconds:8.1f} s  no estimate yet{extra}")
+    x, y, yaw = e.pose
+    text = f"{seconds:8.1f} s  x {x:+8.3f}  y {y:+8.3f} m  yaw {math.degrees(math.remainder(yaw, math.tau)):+7.2f} deg"
+    if e.covariance is not None:
+        sigma = np.sqrt(np.diag(e.covariance))
+        text += f"  +-{1e3 * math.hypot(sigma[0], sigma[1]):.0f} mm {math.degrees(sigma[2]):.2f} deg"
+    text += f"  v {e.twist[0]:+5.2f} m/s  wz {e.twist[2]:+5.2f} rad/s"
+    if session.health.nis is not None:
+        text += f"  NIS {session.health.nis:4.1f}"
+    line = Text(text + extra, no_wrap=True, overflow="ellipsis")
+    for status in statuses:
+        if status.level != OK:
+            line.append(f"  {status.name}: {status.message}", style="yellow" if status.level == WARN else "red")
+    return line
+
+
+def terminal_view(
+    session: Session, seconds: float, statuses: Sequence[Status], rates: Mapping[str, float] | None = None, extra: str = ""
+) -> Table:
+    """Rows for the estimator after ``seconds`` of the robot's time. ``rates``: messages per second by topic [Hz]."""
+    view = Table.grid(padding=(0, 2))
+    view.add_column(style="bold", no_wrap=True)
+    view.add_column(overflow="fold")
+    _row(view, "state", [session.name, f"{seconds:.1f} s", extra])
+    e = session.health.estimate
+    if e is None:
+        _row(view, "pose", ["no estimate yet: it begins with wheels that turn or a second scan"])
+    else:
+        x, y, yaw = e.pose
+        _row(view, "pose", [f"x {x:+.3f} m", f"y {y:+.3f} m", f"yaw {math.degrees(math.remainder(yaw, math.tau)):+.2f} deg"])
+        if e.covariance is not None:
+            sigma_x, sigma_y, sigma_yaw = np.sqrt(np.diag(e.covariance))
+            nis = "" if session.health.nis is None else f"NIS {session.health.nis:.1f} (3 expected)"
+            _row(view, "sigma", [f"{1e3 * sigma_x:.0f} mm", f"{1e3 * sigma_y:.0f} mm", f"{math.degrees(sigma_yaw):.2f} deg", nis])
+        _row(view, "motion", [f"vx {e.twist[0]:+.2f} m/s", f"vy {e.twist[1]:+.2f} m/s", f"wz {e.twist[2]:+.2f} rad/s"])
+    _row(view, "rates", [f"{topic} {rate:.1f} Hz" for topic, rate in (rates or {}).items()])
+    learned = list(session.pipeline.estimator.parameters().items())
+    more = f"and {len(learned) - _LEARNED} more" if len(learned) > _LEARNED else ""
+    _row(view, "learned", [*(f"{name} {mean:.4g} +- {sigma:.2g}" for name, (mean, sigma) in learned[:_LEARNED]), more])
+    for status in statuses:
+        if status.level != OK:
+            _row(view, status.name, [status.message], style="red" if status.level == ERROR else "yellow")
+    return view
+
+
+def _row(view: Table, label: str, parts: Sequence[str], style: str = "") -> None:
+    """A row, unless there is nothing in it."""
+    text = "  ".join(part.strip() for part in parts if part)
+    if text:
+        view.add_row(Text(label, style=style), Text(text, style=style))

@@ -15,9 +15,9 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
 
-from localization.commands.common import names, new_folder, write_json
-from localization.commands.tables import WIDE, accuracy_table, print_table
+from localization.commands.common import WIDE, names, new_folder, print_table, write_json
 from localization.errors import EstimatorError, EvaluationError
 from localization.estimators import CORRECTING, LOCALIZING, check_estimator
 from localization.evaluation.references import (
@@ -36,7 +36,7 @@ from localization.logs.references import merge_positions, read_positions
 from localization.logs.writer import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
 from localization.output import as_text, check_outputs, fingerprint, versions
 from localization.pipeline import ReplayConfig, Run, Trial, replay
-from localization.report.replay_page import ReportHead, overview_png, verdict, write_report
+from localization.report.replay_page import COLUMNS, MISSING, Column, ReportHead, overview_png, verdict, with_values, write_report
 from localization.trajectory import write_tum
 from motion_models.online_calibration import check_forms
 from motion_models.prior import prior_notes, scaling_prior
@@ -45,6 +45,8 @@ from motion_models.robot import load_robot
 
 _WHEELLESS = "lidar"
 _PROGRESS_NS = 500_000_000
+_FIRST_LEFT_OUT = ("RPE deg/m", "speed x", "drift %", "ATE deg", "end m", "NEES", "LiDAR lost %")
+"""Titles of columns, in the order in which a narrow terminal leaves them out."""
 
 
 @dataclass(frozen=True)
@@ -204,6 +206,32 @@ def check_overlap(reference: ReferenceTrack | Relations, log: Log) -> None:
     slack = 10_000_000_000  # recording may begin later and end earlier than the stamps
     if stamps[0] > span[1] + slack or stamps[-1] < span[0] - slack:
         raise EvaluationError(no_overlap_message(span, stamps, reference.source, 0))
+
+
+def accuracy_table(results: Sequence[Result], duration_s: float, width: int) -> Table:
+    """For rich's console: on a terminal narrower than ``width`` characters whole columns are left out, rather than digits."""
+    speed = Column("Speed", "", 0, lambda r: duration_s / r.run.seconds if r.run.seconds > 0 else None, "speed x", is_error=False)
+    columns = [column for column in with_values((*COLUMNS, speed), results) if column.terminal]
+    table = _accuracy_cells(results, columns)
+    for title in _FIRST_LEFT_OUT:
+        if Console(width=1000).measure(table).maximum <= width:
+            break
+        columns = [column for column in columns if column.terminal != title]
+        table = _accuracy_cells(results, columns)
+    return table
+
+
+def _accuracy_cells(results: Sequence[Result], columns: Sequence[Column]) -> Table:
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for title in ("model", "estimator"):
+        table.add_column(title, no_wrap=True)
+    for column in columns:
+        table.add_column(column.terminal, justify="right", no_wrap=True)
+    for result in results:
+        numbers = [(column.value(result), column.digits) for column in columns]
+        cells = [MISSING if number is None else f"{number:.{digits}f}" for number, digits in numbers]
+        table.add_row(result.run.model, result.run.estimator, *cells)
+    return table
 
 
 def _distance(results: Sequence[Result]) -> float | None:

@@ -10,8 +10,7 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from localization.commands.common import write_json
-from localization.commands.tables import add_row, plain_table, print_line, print_table
+from localization.commands.common import add_row, plain_table, print_line, print_table, write_json
 from localization.output import check_outputs
 from motion_models.errors import RobotError
 from motion_models.prior import scaling_sigma

@@ -47,6 +47,7 @@ class Weigh:
     """Write what is printed to this file as well."""
 
     def run(self, console: Console) -> None:
+        """Read the log, weigh, print, and write what was asked for. Raises `CalibrationError` where the drive does not determine it."""
         check_outputs(self.out, self.json)
         if self.out is not None and self.out.suffix != ".toml":
             raise CalibrationError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")

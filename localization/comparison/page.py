@@ -9,8 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
-from localization.comparison.statistics import Difference, Mean, by_combination, combination
-from localization.comparison.summary import Findings, against_best, closing, headline, p_words, percent
+from localization.comparison.statistics import (
+    Difference,
+    Findings,
+    Mean,
+    against_best,
+    by_combination,
+    closing,
+    combination,
+    headline,
+    p_words,
+    percent,
+)
 from localization.errors import OutputError
 from localization.output import write_text_file
 from localization.report.figures import Axes, plain_logs, svg
@@ -32,8 +42,8 @@ from localization.report.page import (
     glossary,
     render,
 )
+from localization.report.replay_page import MISSING, number
 from localization.report.runs import capitalize, estimator_colours
-from localization.report.tables import MISSING, number
 
 _MARKERS = "osD^v"  # of matplotlib, by motion model
 _LOG_SCALE_RATIO = 8.0  # of the largest value to the smallest: from here on the axis is logarithmic

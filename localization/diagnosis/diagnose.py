@@ -12,19 +12,19 @@ import numpy as np
 from localization.diagnosis.causes import MISSING_MESSAGES, Cause, Hypothesis
 from localization.diagnosis.corrected_robot import check_handover
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain
+from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain, describe_loss, describe_standstill_turn, evidence, sentence
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, with_tolerance
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
-from localization.diagnosis.recommendations import general_advice, separating_drive
 from localization.diagnosis.selection import aliases_of, heldout_gain, max_statistic, p_value, refined_cost, search_causes, statistic
-from localization.diagnosis.summary import describe_loss, describe_standstill_turn, evidence, sentence
 from localization.diagnosis.verdict import (
     attribute_rows,
     decide,
     find_better_trends,
     find_outliers,
     find_trends,
+    general_advice,
     mark_trends,
+    separating_drive,
     tolerated_sizes,
 )
 from localization.settings import Count, Probability, Seed, Settings

@@ -1,10 +1,17 @@
-"""The data of a diagnosis: windows of wheel motion, and what LiDAR, gyro and accelerometers measured of the same seconds."""
+"""The data of a diagnosis: windows of wheel motion with what LiDAR, gyro and accelerometers measured, or runs under a controller.
+
+Of runs of a trajectory under a controller only the vision error was measured (Ebersole 2016, sec. 5.2 and Table 5-2). One line of a table
+is a run: trajectory, arm_configuration, controller and vision_error_m, the mean distance between the path that was driven and that of
+the controller's odometry. Wheel rates follow from command and controller, the odometry's path from the controller's own model.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +22,9 @@ from localization.calibration.windows import WindowConfig, Windows, cut
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.gyro import GyroBuffer
 from localization.logs.reader import Log
+from localization.simulation.experiments import CONFIGURATION_CGS, CONTROLLERS, TRAJECTORIES
 from motion_models import se2
-from motion_models.calibration.maneuvers import IntArray, Maneuver
+from motion_models.calibration.maneuvers import IntArray, Maneuver, read_rows
 from motion_models.center_of_gravity.files import arms_model
 from motion_models.center_of_gravity.parts import Payload
 from motion_models.errors import CalibrationError, SkidlocError
@@ -31,6 +39,10 @@ _MIN_GRAVITY, _MAX_GRAVITY = 8.0, 12.0
 _MAX_STANDSTILL_RATE = 0.05  # rad/s; five sigma of plausible gyro biases (`causes`): a robot that turns while its wheels stand
 _MIN_REGULAR_SHARE = 0.6  # of the intervals between messages that must be near their median for messages to have a period
 _MAX_PAUSE_S = 5.0  # longer gaps are pauses of the driver, not lost messages
+
+COLUMNS = ("trajectory", "arm_configuration", "controller", "vision_error_m")
+_STEP_S = 0.05
+_SIGMA_M = 0.01  # of a vision error, before the runs' own scatter is estimated
 
 
 class MessageLoss(NamedTuple):
@@ -338,3 +350,71 @@ def _payload_arms(robot: Robot, maneuvers: Sequence[Maneuver], postures: _Postur
             known[key] = (estimate.position - unique[i]) * estimate.mass
         levers[i] = known[key]
     return np.asarray(levers[np.ravel(inverse)])
+
+
+@dataclass(frozen=True)
+class Run:
+    """One line of the table."""
+
+    trajectory: str
+    arm_configuration: str
+    controller: str
+    vision_error_m: float
+
+
+def read_runs(path: Path) -> list[Run]:
+    """The table's runs. Raises `CalibrationError`, naming line and column."""
+    columns, rows = read_rows(path)
+    missing = [name for name in COLUMNS if name not in columns]
+    if missing:
+        raise CalibrationError(f"table '{path}' has no column {', '.join(missing)}; it has {', '.join(columns)}.")
+    allowed = dict(zip(COLUMNS, (TRAJECTORIES, CONFIGURATION_CGS, CONTROLLERS), strict=False))
+    found = []
+    for line, cells in rows:
+        for column, names in allowed.items():
+            if cells[column] not in names:
+                raise CalibrationError(f"table '{path}', line {line}: no {column} '{cells[column]}'; there are {', '.join(names)}.")
+        try:
+            error = float(cells["vision_error_m"])
+        except ValueError:
+            error = math.nan
+        if not (math.isfinite(error) and error >= 0.0):
+            raise CalibrationError(
+                f"table '{path}', line {line}: vision_error_m must be a distance in metres, found {cells['vision_error_m']!r}."
+            )
+        found.append(Run(cells["trajectory"], cells["arm_configuration"], cells["controller"], error))
+    if not found:
+        raise CalibrationError(f"table '{path}' has no rows below its header.")
+    return found
+
+
+def drive_of_runs(name: str, robot: Robot, runs: list[Run]) -> Drive:
+    """Each run as a maneuver that ends with the odometry's path."""
+    maneuvers, paths = [], []
+    for run in runs:
+        profile, duration = TRAJECTORIES[run.trajectory]
+        middles = (np.arange(round(duration / _STEP_S), dtype=np.float64) + 0.5) * _STEP_S
+        command = profile(middles)
+        cg = np.array(CONFIGURATION_CGS[run.arm_configuration])
+        controller = make_model(run.controller, robot)
+        wheels = controller.wheels(command, np.broadcast_to(cg, command.shape), controller.nominal)
+        path = path_of(controller.twist(wheels, cg, controller.nominal).value * _STEP_S)
+        n = len(middles)
+        cov = np.diag([_SIGMA_M**2, math.inf, math.inf])
+        maneuvers.append(Maneuver(np.full(n, _STEP_S), wheels, path[-1:], np.array([n]), cg, cov, group=run.arm_configuration))
+        paths.append(path)
+    drive = drive_of_table(name, robot, maneuvers, "runs")
+    errors = np.array([run.vision_error_m for run in runs])
+    note = "x is the vision error; centres of gravity are those inferred for the seven configurations from `rotate` under diff_drive."
+    return dataclasses.replace(drive, paths=tuple(paths), path_errors=errors, warnings=(note,))
+
+
+def path_of(steps: FloatArray) -> FloatArray:
+    """(n, 3) poses after each of the ``steps`` (n, 3), twists times their durations."""
+    moves = se2.exp(steps)
+    poses = np.empty_like(moves)
+    pose = np.zeros(3)
+    for i, move in enumerate(moves):
+        pose = se2.compose(pose, move)
+        poses[i] = pose
+    return poses

@@ -145,6 +145,7 @@ class DrivePredictor:
 
     @property
     def has_dropouts(self) -> bool:
+        """Whether an encoder lost counts anywhere in the drive."""
         return bool(self._lost.any())
 
     @property

@@ -130,6 +130,7 @@ class DrivenWeighing:
         return float(lever @ weight @ self.moment) / information, 1.0 / math.sqrt(information)
 
     def to_dict(self) -> dict[str, Any]:
+        """For `weigh --json`: m, kg and rad, as the names of the keys have it."""
         return {
             "log": self.log,
             "robot": self.robot,

@@ -1,6 +1,68 @@
-"""Estimators: dead reckoning, LiDAR alone, and the extended Kalman filter that fuses both."""
+"""Estimators by name: dead reckoning, LiDAR alone, the extended Kalman filter that fuses both, and the graph above it."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from localization.errors import EstimatorError
 from localization.estimators.base import Estimate, Estimator
-from localization.estimators.make import CORRECTING, ESTIMATORS, LOCALIZING, EstimatorConfig, check_estimator, make_estimator
+from localization.estimators.baselines import DeadReckoning, LidarOdometry
+from localization.estimators.filter import FilterConfig
+from localization.estimators.fusion import EkfFusion
+from localization.estimators.graph_fusion import GraphConfig, GraphFusion
+from localization.lidar import LidarConfig, ScanMatchingSensor
+from motion_models.base import MotionModel
+from motion_models.online_calibration import Form, corrections
+from motion_models.robot import Mount, Robot
 
 __all__ = ["CORRECTING", "ESTIMATORS", "LOCALIZING", "Estimate", "Estimator", "EstimatorConfig", "check_estimator", "make_estimator"]
+
+
+@dataclass(frozen=True)
+class EstimatorConfig:
+    """Settings of all estimators."""
+
+    ekf: FilterConfig = field(default_factory=FilterConfig)
+    graph: GraphConfig = field(default_factory=GraphConfig)
+    lidar: LidarConfig = field(default_factory=LidarConfig)
+
+
+ESTIMATORS = ("odometry", "lidar", "ekf", "graph")
+CORRECTING = ("ekf", "graph")
+"""Those that correct the motion model on the way."""
+LOCALIZING = ("graph",)
+"""Those whose poses are ``map_T_body``; the others' are ``odom_T_body``."""
+
+
+def check_estimator(name: str, has_lidar: bool) -> None:
+    """Raises `EstimatorError` for a name that does not exist, or for one that needs a LiDAR without one."""
+    if name not in ESTIMATORS:
+        raise EstimatorError(f"no estimator '{name}'; there are {', '.join(ESTIMATORS)}.")
+    if name == "lidar" and not has_lidar:
+        raise EstimatorError(
+            "the estimator 'lidar' needs scans, and there are none in this log. Use odometry, ekf or graph, or pass --topic.scan."
+        )
+
+
+def make_estimator(
+    name: str,
+    model: MotionModel,
+    form: Form,
+    robot: Robot,
+    mounts: Mapping[str, Mount],
+    has_lidar: bool,
+    config: EstimatorConfig | None = None,
+    is_smoothing: bool = False,
+) -> Estimator:
+    """The estimator ``name`` at the origin, with corrections of ``form``; with ``is_smoothing``, `Estimator.finish` is to give the
+    smoothed trajectory. Raises what `check_estimator` and `corrections` do."""
+    check_estimator(name, has_lidar)
+    config = config or EstimatorConfig()
+    if name == "odometry":
+        return DeadReckoning()
+    if name == "lidar":
+        return LidarOdometry(mounts, config.lidar)
+    corrected, sensor = corrections(model, form), ScanMatchingSensor(mounts, config.lidar) if has_lidar else None
+    ekf = EkfFusion(model, corrected, robot, sensor, config.ekf)
+    return ekf if name == "ekf" else GraphFusion(ekf, corrected, config.lidar, config.graph, is_smoothing)

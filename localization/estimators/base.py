@@ -9,12 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localization.events import PositionSample
+from localization.events import PositionSample, Step
 from localization.lidar import LostScans
-from localization.step import Step
 from localization.trajectory import IntArray, Trajectory
 from motion_models import se2
-from motion_models.types import Cov3, FloatArray, Points2, Pose2, Twist2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Twist2
 
 NO_POINTS = np.empty((0, 2))
 

@@ -20,14 +20,13 @@ from filterpy.kalman import predict as predict_linear
 
 from localization.errors import EstimatorError
 from localization.estimators.measurement_models import predict_turn, subtract_map_error
-from localization.gyro import Turn
+from localization.events import Step, Turn
 from localization.lidar import KeyScanError, select_measured
 from localization.settings import Settings
-from localization.step import Step
 from motion_models import se2
 from motion_models.online_calibration import Corrections
 from motion_models.robot import GyroNoise
-from motion_models.types import Cov3, FloatArray, Pose2
+from motion_models.se2 import Cov3, FloatArray, Pose2
 
 POSE, START, MAP, KEY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 BIAS, SCALE, CLOCK, PARAMS = 12, 13, 14, 15

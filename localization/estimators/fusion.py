@@ -10,13 +10,13 @@ import numpy as np
 
 from localization.estimators.base import NO_POINTS, Estimate, Estimator, mean_twist
 from localization.estimators.filter import BIAS, CLOCK, MAP, PARAMS, POSE, SCALE, START, Filter, FilterConfig
+from localization.events import Step
 from localization.lidar import LostScans, ScanMatchingSensor
-from localization.step import Step
 from motion_models import se2
 from motion_models.base import Motion, MotionModel
 from motion_models.online_calibration import Corrections
 from motion_models.robot import Robot
-from motion_models.types import Cov3, FloatArray, Points2, Twist2
+from motion_models.se2 import Cov3, FloatArray, Points2, Twist2
 
 _MIN_TURN_RAD = 0.01
 """A turn of the gyro in one step that contradicts wheels that stand, if it is 5 sigma, too [rad]."""

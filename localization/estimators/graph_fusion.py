@@ -19,16 +19,15 @@ from localization.estimators.base import Estimate, Estimator
 from localization.estimators.filter import PARAMS
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
-from localization.events import PositionSample
+from localization.events import PositionSample, Step
 from localization.lidar import LidarConfig, LostScans
 from localization.lidar.loop_detection import Keyframe, LoopDetector
 from localization.settings import Positive, Settings, Signed
-from localization.step import Step
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.online_calibration import Corrections
-from motion_models.types import Cov3, FloatArray, Points2, Pose2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 _MIN_POSITIONS, _MIN_BASELINE_M = 3, 5.0
 """Positions, and the distance between them [m], from which they give the heading of the map."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from localization.gyro import Turn
+from localization.events import Turn
 from motion_models import se2
-from motion_models.types import FloatArray, Pose2
+from motion_models.se2 import FloatArray, Pose2
 
 _YAW = np.array([0.0, 0.0, 1.0])
 

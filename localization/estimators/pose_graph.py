@@ -20,7 +20,7 @@ import numpy as np
 from localization.errors import EstimatorError
 from localization.estimators.measurement_models import motion_residual, position_residual
 from motion_models import se2
-from motion_models.types import Cov3, FloatArray, Pose2
+from motion_models.se2 import Cov3, FloatArray, Pose2
 
 _ALIGNMENT, _LEVER = gtsam.symbol("t", 0), gtsam.symbol("l", 0)
 _FIRST_SIGMA = np.array([1e-3, 1e-3, 1e-4])

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from motion_models import se2
-from motion_models.types import Cov3, FloatArray, Points2, Pose2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 COARSE = 4
 """Cells of a coarse step, and again from level to level."""

@@ -15,7 +15,7 @@ import numpy as np
 from kiss_icp.config import load_config
 from kiss_icp.kiss_icp import KissICP
 
-from motion_models.types import FloatArray, Pose2
+from motion_models.se2 import FloatArray, Pose2
 
 _NO_STAMPS = np.empty(0)
 _INITIAL_THRESHOLD_M, _MIN_MOTION_M = 0.5, 0.01
@@ -43,7 +43,10 @@ def choose_voxel_size(points: FloatArray) -> float:
 
 
 class KissIcp:
-    """One KISS-ICP pipeline and its local map. Poses are planar (3,), points (N, 3) in the body frame [m]."""
+    """One KISS-ICP pipeline and its local map. Poses are planar (3,), points (N, 3) in the body frame [m].
+
+    ``voxel_size`` is the edge of the map's voxels, points beyond ``max_range`` are left out [m].
+    """
 
     def __init__(self, voxel_size: float, max_range: float) -> None:
         self._made = voxel_size, max_range

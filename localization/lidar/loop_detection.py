@@ -12,7 +12,7 @@ from localization.lidar.correlative_search import draw_image, search
 from localization.lidar.scan_matcher import LidarConfig, align_points
 from localization.lidar.submap import make_grid, voxel_means
 from motion_models import se2
-from motion_models.types import Cov3, FloatArray, Points2, Pose2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 _MIN_KEYFRAMES = 25
 """Keyframes that must lie between both visits: what is nearer in time is in the filter's own submap."""

@@ -19,8 +19,7 @@ from localization.lidar.correlative_search import CORRELATED_BEAMS, LikelihoodIm
 from localization.lidar.submap import VoxelGrid, fill_surface, find_nearest, make_grid, measure_shares, voxel_means
 from localization.settings import Allowed, Below, Count, Positive, Settings, Share
 from motion_models import se2
-from motion_models.se2 import Triple, triple
-from motion_models.types import Cov3, FloatArray, Points2, Pose2, Tangent2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, Triple, triple
 
 MIN_POINTS = 10
 """Points without which a scan is not matched."""
@@ -28,6 +27,8 @@ _KERNEL = 3.0
 """Scale of Geman-McClure's loss, and residuals that count as fitting, in sigmas."""
 _REACH_CELLS = 2.5
 """How far a point may be from the voxel that it is associated with [cells]."""
+_MAX_ASSOCIATION_M = 3.0
+"""Surfaces farther from a point are not associated with it, however wide the prior is: from there Gauss-Newton does not converge."""
 _ITERATIONS = 20
 _CELL_OF_RANGE, _MIN_CELL_M = 0.02, 0.04
 """Voxel of a submap, as a share of the first scan's median range, and at least [m]."""
@@ -181,7 +182,7 @@ class ScanMatcher:
             if not is_near and _mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:
                 outlier_cov = nothing
             found = self._align(points, prior, cov + outlier_cov, best)
-            least = self._config.lost_below if _is_narrow(cov) else self._config.search_below  # else the place may be one that is not mapped
+            least = self._config.lost_below if _is_narrow(cov) else self._config.search_below  # the place may not be mapped
             if found.overlap >= least and (not is_near or _is_better(found, fit, prior, cov)):
                 return self._result(found, outlier_cov)
         return self._result(fit, nothing) if is_near and fit.overlap >= self._config.lost_below else None
@@ -320,7 +321,8 @@ def _align(
     """Gauss-Newton from ``guess`` (3,): pose (3,), information (3, 3) and gradient (3,) of the points there, numbers of the fit."""
     least = _REACH_CELLS * grid.cell
     r2 = points[:, 0] ** 2 + points[:, 1] ** 2
-    spread = 3.0 * math.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2] * np.median(r2))  # how far the prior may move a point
+    # how far the prior may move a point
+    spread = min(3.0 * math.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2] * np.median(r2)), _MAX_ASSOCIATION_M)
     x, jacobian = triple(guess), np.empty((3, 3))
     for _ in range(_ITERATIONS):
         H, g, _found = linearize(grid, points, x, spread)

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from localization.events import Step
 from localization.lidar.deskew import Sweep
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
 from localization.lidar.scan_checks import LostScans, StaleScans
 from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher, choose_cell
-from localization.step import Step
 from motion_models import se2
 from motion_models.robot import Mount
-from motion_models.types import Cov3, FloatArray, Points2, Pose2, Tangent2, Twist2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, Twist2
 
 _MIN_DISPLACEMENT_M = 1e-3
 """Points that another twist moves by less are not deskewed again [m]."""

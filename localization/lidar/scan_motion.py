@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from motion_models import se2
-from motion_models.types import FloatArray, Points2, Pose2
+from motion_models.se2 import FloatArray, Points2, Pose2
 
 _BEARINGS = 180
 """Of 2 deg: each has a beam of any scanner in use, however its beams lie to the bins."""

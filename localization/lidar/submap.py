@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from localization.trajectory import IntArray
-from motion_models.types import FloatArray, Points2
+from motion_models.se2 import FloatArray, Points2
 
 POOLED_VOXELS = 5
 """Voxels whose points are pooled for one surface: fewer give no direction along sparse walls, more round off corners."""

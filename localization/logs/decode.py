@@ -1,4 +1,4 @@
-"""Messages to events: a driver's message in this project's types. Stateless; what needs the message before is in `wheel_decoder`.
+"""Messages to events: a driver's message in this project's types. Stateless; what needs the message before is in `event_decoder`.
 
 `MessageStats` counts messages that were dropped or corrected on the way, by topic and `Oddity`.
 """
@@ -56,7 +56,7 @@ class Oddity(Enum):
 
 
 class UnusableError(Exception):
-    """A message without usable content. Raised and caught within this package."""
+    """A message without usable content. Raised and caught within this package. ``oddity`` is what it is counted as."""
 
     def __init__(self, oddity: Oddity) -> None:
         super().__init__(oddity.value)

@@ -130,7 +130,10 @@ class SqliteFile:
 
 
 class RecoveredSqlite:
-    """As many rows of a .db3 file as can be read, in the order in which they were recorded. Raises `LogError` if there are none."""
+    """As many rows of a .db3 file as can be read, in the order in which they were recorded. Raises `LogError` if there are none.
+
+    ``reason`` is why SQLite cannot read the file: it is part of the warning or the error.
+    """
 
     is_ros1 = False
 

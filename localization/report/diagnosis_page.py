@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from localization.diagnosis.diagnose import DiagnosisResult
-from localization.diagnosis.findings import Diagnosis
+from localization.diagnosis.findings import Diagnosis, describe_outliers, describe_row, describe_tolerated
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS
-from localization.diagnosis.summary import describe_outliers, describe_row, describe_tolerated
 from localization.report.figures import Axes, svg
 from localization.report.figures import Figure as Canvas
 from localization.report.page import (

@@ -1,6 +1,6 @@
 """Figures of reports, by matplotlib without pyplot's state, as SVG that takes its colours from the page.
 
-The same data give the same bytes: no date, no random names. `localization.report.figure_data` prepares the data. No other module imports
+The same data give the same bytes: no date, no random names. `localization.report.runs` prepares the data. No other module imports
 matplotlib.
 """
 
@@ -18,9 +18,8 @@ from matplotlib.patches import Ellipse as EllipsePatch
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from localization.evaluation.consistency import mean_band
-from localization.report.figure_data import MapView, NisMeans, RelationBins, Timeline, raster
 from localization.report.page import COLOURS, WIDTH_IN, for_page
-from localization.report.runs import PlottedRun, thin_path, thin_series
+from localization.report.runs import MapView, NisMeans, PlottedRun, RelationBins, Timeline, raster, thin_path, thin_series
 
 __all__ = [
     "Axes",

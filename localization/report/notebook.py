@@ -19,10 +19,9 @@ from numpy.typing import ArrayLike
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result
 from localization.report import figures
-from localization.report.figure_data import map_view
 from localization.report.figures import Axes, Figure
 from localization.report.page import COLOURS
-from localization.report.runs import plotted_runs
+from localization.report.runs import map_view, plotted_runs
 
 CYCLE = ("blue", "red", "green", "purple", "orange", "sky", "grey", "ink")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")

@@ -1,8 +1,8 @@
 """A state on disk: written as a whole or not at all, and resumed by another process to the last bit.
 
 The file: a line with the format's name and version, one with the SHA-256 of all that follows, a line of JSON (what made the state, and how
-far it had come), then the state (`serialize`). It is written beside its place, forced to disk, and moved there: whoever kills the process
-at any moment finds the old state or the new one.
+far it had come), then the state (`state_serialization`). It is written beside its place, forced to disk, and moved there: whoever kills the
+process at any moment finds the old state or the new one.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from typing import Any
 
 from localization.errors import CheckpointError
 from localization.output import versions
-from localization.ros.deserialize import deserialize
-from localization.ros.serialize import serialize, serialize_parts
+from localization.ros.state_serialization import deserialize, serialize, serialize_parts
 from motion_models.robot import Robot
 
 _MAGIC = b"skidloc state 1\n"
@@ -169,6 +168,8 @@ def _is_head(head: Any, most_bytes: int) -> bool:
 class CheckpointWriter:
     """Writes a state at most once every ``every_s`` [s] of the clock on the wall.
 
+    ``made_by`` and ``shared`` are those of `write_checkpoint`.
+
     The state is written down at once, in milliseconds; the disk is waited for in a thread, so that no estimate waits for it.
     """
 
@@ -179,6 +180,7 @@ class CheckpointWriter:
         self._writing: Future[None] | None = None
 
     def is_due(self) -> bool:
+        """Whether the last state is old enough, and on disk: `write` then does not wait."""
         is_idle = self._writing is None or self._writing.done()
         return is_idle and time.monotonic() - self._last >= self._every_s
 

@@ -1,18 +1,35 @@
-"""Diagnostics (REP-107): latency, consistency, degeneracy of the scene, slip, silent topics and dropped messages."""
+"""Diagnostics (REP-107): latency, consistency, degeneracy of the scene, slip, silent topics; and a diagnosis of the last minutes.
+
+`Doctor` keeps the last events, thinned to a bounded size. When a diagnosis is due, a thread hands them one by one to a new process, which
+runs what `skidloc diagnose` runs and sends back one status; that is published with the others, with what to do about each finding.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import math
+import multiprocessing
+import os
+import resource
+import threading
+import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from typing import NamedTuple
 
 import numpy as np
 
+from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, MotionReference
+from localization.calibration.windows import WindowConfig
 from localization.estimators import Estimate
 from localization.events import Event, Scan
-from localization.lidar.losses import MAX_LOST_S, LidarLosses
+from localization.lidar.scan_checks import MAX_LOST_S, LidarLosses
 from localization.pipeline import Pipeline
+from motion_models.errors import SkidlocError
+from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
 OK, WARN, ERROR = 0, 1, 2
@@ -31,6 +48,43 @@ _ERROR_RATIO = 10.0
 """Error above this many times the latency of a warning."""
 _MAX_SIGMA_M, _MAX_SIGMA_RAD = 1.0, 0.5
 """Larger sigmas are reported: a pose that is known worse does not lead a robot through a door [m, rad]."""
+
+WINDOW_S = 120.0
+"""Length of the drive that is diagnosed."""
+_MIN_SPAN_S = 30.0
+_MIN_GAP_NS: Mapping[bool, int] = {True: 150_000_000, False: 9_000_000}
+"""Least time between two events of one kind: of scans (True), and of wheels and IMU."""
+_MAX_POINTS = 1500
+"""Of a scan: with 800 scans in the window, 40 MB."""
+_MAX_CPU_S = 300
+_LOWEST_PRIORITY = 19
+_NAME = "diagnosis"
+_REMEDIES: Mapping[str, str] = {
+    "wheel_radius_scale": "check the tyres' pressure, or set wheel_radius_m = {g.wheel_radius_m:.4f}",
+    "wheel_radius_difference": "inflate the smaller tyres, or set left_wheel_radius_multiplier = {g.left_wheel_radius_multiplier:.4f} and "
+    "right_wheel_radius_multiplier = {g.right_wheel_radius_multiplier:.4f}",
+    "wheel_radius_drift": "check the tyres' pressure: one of them may lose air",
+    "track_width": "measure the distance of the wheels, or set track_width_m = {g.track_width_m:.4f}",
+    "payload": "weigh the robot (`skidloc weigh`), and add the load to its file",
+    "cg_offset_x": "weigh the robot (`skidloc weigh`), or set cg_x_m = {g.cg_x_m:.4f}",
+    "cg_offset_y": "weigh the robot (`skidloc weigh`), or set cg_y_m = {g.cg_y_m:.4f}",
+    "lidar_offset_x": "measure the LiDAR's mount, and correct its transform",
+    "lidar_offset_y": "measure the LiDAR's mount, and correct its transform",
+    "lidar_yaw": "measure the LiDAR's mount, and correct its transform",
+    "lidar_time_offset": "synchronize the clocks, or set lidar_time_offset_s = {c.lidar_time_offset_s:.3f} in [clock]",
+    "wheel_time_offset": "synchronize the clocks, or set wheel_time_offset_s = {c.wheel_time_offset_s:.3f} in [clock]",
+    "gyro_time_offset": "synchronize the clocks, or set gyro_time_offset_s = {c.gyro_time_offset_s:.3f} in [clock]",
+    "gyro_bias": "let the driver zero the gyro while the robot stands",
+    "gyro_scale": "correct the scale of the gyro in its driver",
+    "range_scale": "correct the scale of the ranges in the LiDAR's driver",
+    "range_bias": "correct the offset of the ranges in the LiDAR's driver",
+    "encoder_dropout": "check the cables of the wheels' encoders",
+    "missing_joint_messages": "check the driver of the wheels and the network",
+    "split_friction": "compare the tyres of both sides, and the floor under them",
+    "diagonal_load": "check the chassis and the tyres' pressure",
+}
+"""What to do, by cause; ``g`` is the corrected robot's geometry and ``c`` its clock."""
+_OTHER_REMEDY = "record this drive, and run `skidloc diagnose --out DIR`: robot.toml has the correction"
 
 
 @dataclass(frozen=True)
@@ -98,6 +152,7 @@ class Health:
 
     @property
     def latency_p99_s(self) -> float | None:
+        """99 % quantile of the last latencies [s]; None before the first."""
         return float(np.quantile(self._latencies, 0.99)) if self._latencies else None
 
     def statuses(
@@ -177,6 +232,118 @@ class Health:
         return Status("wheels", values=values)
 
 
+def degeneracy(points: FloatArray) -> float | None:
+    """Smallest eigenvalue of the mean n n^T over the normals n of a planar scan ``points`` (N, 2), in the order of the beams.
+
+    0.5 in a round room, 0 where all walls are parallel. Normals are those of chords of about half a metre that are straight. None
+    where there are hardly any.
+    """
+    if len(points) < 10:
+        return None
+    gaps = np.hypot(*np.diff(points, axis=0).T)
+    apart = int(np.clip(_CHORD_M / max(float(np.median(gaps)), 1e-3), 2, len(points) // 4))
+    chord = points[apart:] - points[:-apart]
+    length = np.hypot(chord[:, 0], chord[:, 1])
+    middle = points[apart // 2 : len(points) - apart + apart // 2] - points[:-apart]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        off = np.abs(chord[:, 0] * middle[:, 1] - chord[:, 1] * middle[:, 0]) / length
+    straight = (length > 0.2 * _CHORD_M) & (length < 8.0 * _CHORD_M) & (off < _STRAIGHT_M)
+    if np.count_nonzero(straight) < 5:
+        return None
+    normals = chord[straight] / length[straight, None]  # a turn by 90 degrees changes no eigenvalue
+    return float(np.linalg.eigvalsh(normals.T @ normals / len(normals))[0])
+
+
+class Request(NamedTuple):
+    """What a diagnosis needs besides the events."""
+
+    robot: Robot
+    model: str
+    mounts: dict[str, Mount]
+
+
+class Doctor:
+    """Diagnoses the last minutes every ``period_s``; 0 never does. ``run`` is what the process runs."""
+
+    def __init__(self, robot: Robot, model: str, mounts: Mapping[str, Mount], period_s: float, run: Run | None = None) -> None:
+        self._request = Request(robot, model, dict(mounts))
+        self._period_s, self._run = period_s, run or run_diagnosis
+        self._events: deque[Event] = deque()
+        self._last_ns: dict[type, int] = {}
+        self._next_s = time.monotonic() + period_s
+        self._thread: threading.Thread | None = None
+        self._process: multiprocessing.process.BaseProcess | None = None
+        self._status = Status(_NAME, OK, f"none yet: one is made every {period_s / 60.0:.3g} min")
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a diagnosis is being made."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def observe(self, event: Event) -> None:
+        """Keep ``event``, if it is not too close to the last one of its kind; takes microseconds."""
+        if self._period_s <= 0.0:
+            return
+        kind, is_scan = type(event), isinstance(event, Scan)
+        if event.stamp_ns - self._last_ns.get(kind, -_MIN_GAP_NS[True]) < _MIN_GAP_NS[is_scan]:
+            return
+        self._last_ns[kind] = event.stamp_ns
+        self._events.append(_thinned(event) if isinstance(event, Scan) else event)
+        while self._events[0].stamp_ns < event.stamp_ns - WINDOW_S * 1e9:
+            self._events.popleft()
+
+    def add_mounts(self, mounts: Mapping[str, Mount]) -> None:
+        """Mounts that became known after the start."""
+        self._request = self._request._replace(mounts=dict(mounts))
+
+    def statuses(self) -> list[Status]:
+        """The last diagnosis, as one status or none; starts the next one where that is due."""
+        if self._period_s <= 0.0:
+            return []
+        if not self.is_running and time.monotonic() >= self._next_s and self._span_s() >= _MIN_SPAN_S:
+            self.start()
+        return [self._status]
+
+    def start(self) -> None:
+        """Diagnose what is known now."""
+        self._next_s = time.monotonic() + self._period_s
+        self._thread = threading.Thread(target=self._diagnose, args=(list(self._events),), name="doctor", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End a diagnosis that is running."""
+        self._period_s = 0.0
+        if self._process is not None and self._process.is_alive():
+            self._process.terminate()
+        if self._thread is not None:
+            self._thread.join(timeout=5.0)
+
+    def _span_s(self) -> float:
+        return (self._events[-1].stamp_ns - self._events[0].stamp_ns) * 1e-9 if self._events else 0.0
+
+    def _diagnose(self, events: Sequence[Event]) -> None:
+        """In a thread: most of the time it waits for the process, and between two events others run."""
+        context = multiprocessing.get_context("spawn")
+        here, there = context.Pipe()
+        process = context.Process(target=self._run, args=(there, self._request), name="skidloc-doctor", daemon=True)
+        try:
+            process.start()
+            there.close()
+            self._process = process
+            if self._period_s <= 0.0:  # closed meanwhile
+                process.terminate()
+            for event in events:
+                here.send(event)
+            here.send(None)
+            self._status = here.recv()
+        except (EOFError, OSError):  # it was ended, by `close` or by its limits
+            self._status = Status(_NAME, OK, f"not finished: it took more than {_MAX_CPU_S} s of processor time, or was stopped")
+        finally:
+            here.close()
+            if process.pid is not None:
+                process.join()
+
+
 def _wide_covariance(estimate: Estimate) -> list[tuple[int, str]]:
     if estimate.covariance is None:
         return []
@@ -211,23 +378,60 @@ def _of_messages(dropped: Sequence[str], silent: Mapping[str, float]) -> Status:
     return Status("messages", WARN if dropped else OK, "some were corrected or dropped: " + dropped[0] if dropped else "ok", values)
 
 
-def degeneracy(points: FloatArray) -> float | None:
-    """Smallest eigenvalue of the mean n n^T over the normals n of a planar scan ``points`` (N, 2), in the order of the beams.
+Run = Callable[[Connection, Request], None]
 
-    0.5 in a round room, 0 where all walls are parallel. Normals are those of chords of about half a metre that are straight. None
-    where there are hardly any.
-    """
-    if len(points) < 10:
-        return None
-    gaps = np.hypot(*np.diff(points, axis=0).T)
-    apart = int(np.clip(_CHORD_M / max(float(np.median(gaps)), 1e-3), 2, len(points) // 4))
-    chord = points[apart:] - points[:-apart]
-    length = np.hypot(chord[:, 0], chord[:, 1])
-    middle = points[apart // 2 : len(points) - apart + apart // 2] - points[:-apart]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        off = np.abs(chord[:, 0] * middle[:, 1] - chord[:, 1] * middle[:, 0]) / length
-    straight = (length > 0.2 * _CHORD_M) & (length < 8.0 * _CHORD_M) & (off < _STRAIGHT_M)
-    if np.count_nonzero(straight) < 5:
-        return None
-    normals = chord[straight] / length[straight, None]  # a turn by 90 degrees changes no eigenvalue
-    return float(np.linalg.eigvalsh(normals.T @ normals / len(normals))[0])
+
+def _thinned(scan: Scan) -> Scan:
+    """At most `_MAX_POINTS` of its points, evenly."""
+    stride = -(-len(scan.points) // _MAX_POINTS)
+    if stride <= 1:
+        return scan
+    return dataclasses.replace(scan, points=scan.points[::stride].copy(), offsets=scan.offsets[::stride].copy())
+
+
+def run_diagnosis(connection: Connection, request: Request) -> None:
+    """In the process: receive events until None, send a `Status`."""
+    os.nice(_LOWEST_PRIORITY)
+    resource.setrlimit(resource.RLIMIT_CPU, (_MAX_CPU_S, _MAX_CPU_S))
+    events: list[Event] = []
+    with contextlib.suppress(EOFError):
+        while (event := connection.recv()) is not None:
+            events.append(event)
+        connection.send(diagnose_events(events, request))
+
+
+def diagnose_events(events: Sequence[Event], request: Request) -> Status:
+    """The diagnosis of ``events`` as a status: findings with their remedies."""
+    from localization.diagnosis.diagnose import examine
+    from localization.diagnosis.drive import drive_of_events
+    from motion_models.registry import make_model
+
+    robot, mounts, config = request.robot, request.mounts, WindowConfig()
+    has_lidar = any(isinstance(event, Scan) for event in events)
+    reference: MotionReference = (
+        LidarMotionReference(mounts, config.window_s) if has_lidar else GyroMotionReference(robot.gyro_noise, mounts, config.window_s)
+    )
+    name = f"the last {(events[-1].stamp_ns - events[0].stamp_ns) * 1e-9:.0f} s"
+    try:
+        drive = drive_of_events(events, name, robot, mounts, (reference, "scan matching" if has_lidar else "gyro"), config)
+        found = examine(drive, make_model(request.model, robot))
+    except SkidlocError as error:
+        return Status(_NAME, OK, f"{name} cannot be diagnosed: {error}")
+    d = found.diagnosis
+    values = {"verdict": d.verdict, "windows": str(d.windows), "model": d.model}
+    if not d.findings:
+        is_good = d.verdict in ("consistent", "undecidable")
+        return Status(_NAME, OK if is_good else WARN, f"{d.verdict}, {name}: {d.sentence}", values)
+    from localization.diagnosis.corrected_robot import correct_robot
+
+    assert found.predictor is not None  # where there are findings
+    corrected = correct_robot(found.predictor, d.hypothesis).robot
+    texts = []
+    for i, finding in enumerate(d.findings, 1):
+        remedy = _REMEDIES.get(finding.cause, _OTHER_REMEDY).format(g=corrected.geometry, c=corrected.clock)
+        texts.append(f"{finding.definition.describe(finding.size, finding.sigma)}: {remedy}.")
+        values[f"finding_{i}"] = f"{finding.cause} {finding.size:+.4g} +- {finding.sigma:.2g} {finding.definition.unit}"
+        values[f"remedy_{i}"] = remedy
+        if finding.aliases:
+            values[f"or_{i}"] = ", ".join(f"{alias} {size:+.3g}" for alias, size in finding.aliases)
+    return Status(_NAME, WARN, f"{name}: {' '.join(texts)}", values)

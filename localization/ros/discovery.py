@@ -1,7 +1,9 @@
-"""Discovery before the start: which of a robot's topics are published, and the first messages of each."""
+"""Discovery before the start: which of a robot's topics are published, the first messages of each, and transforms of other nodes."""
 
 from __future__ import annotations
 
+import contextlib
+import difflib
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -9,17 +11,21 @@ from dataclasses import dataclass
 
 from localization.errors import TransportError
 from localization.logs.clock_sync import ClockPlan, plan_clocks
-from localization.logs.decode import UnusableError, stamp_ns
+from localization.logs.decode import UnusableError, frame_name, stamp_ns
 from localization.logs.serialization import decoder, live_channel
 from localization.logs.topic_roles import TYPES, TopicChooser, TopicOverrides, TopicRoles, choose_roles, short_type
-from localization.ros.topic_names import Names
-from localization.ros.transforms import TF_STATIC, TF_TYPE, LiveTransforms
+from localization.logs.transforms import FixedTransforms
+from localization.ros.settings import Names
 from localization.ros.transports.base import Received, Transport
 from motion_models.robot import Mount, Robot
 
 _POLL_S, _SETTLE_S, _REPORT_PERIOD_S = 0.1, 1.0, 30.0
 _MAX_BACKLOG = 20_000
 """Messages that are stored before the start; the oldest are dropped."""
+
+TF, TF_STATIC, TF_TYPE = "/tf", "/tf_static", "tf2_msgs/msg/TFMessage"
+_CURRENT_S = 5.0
+"""A conflict is reported for this long after the last foreign transform [s]."""
 
 
 @dataclass(frozen=True)
@@ -161,3 +167,65 @@ class TopicDiscovery:
 
 
 _MOTION_TYPES = {TYPES[kind] for kind in ("joint_states", "odometry", "scan", "points")}
+
+
+class LiveTransforms:
+    """Fixed transforms received on /tf_static."""
+
+    def __init__(self, body: str, *, is_ros1: bool) -> None:
+        """``body``: the robot's frame."""
+        self._decode, self._fixed, self._body = decoder(TF_TYPE, is_ros1=is_ros1), FixedTransforms(), body
+
+    def insert(self, data: bytes) -> None:
+        """Add the transforms of a message; bytes that are no message are ignored."""
+        with contextlib.suppress(UnusableError):
+            self._fixed.add(self._decode(data), is_static=True)
+
+    def mounts(self) -> Mapping[str, Mount]:
+        """Mounts by frame, of all frames that are connected to the body's."""
+        return self._fixed.mounts(self._body)
+
+    @property
+    def problem(self) -> str | None:
+        """A message where there are transforms, but none of the robot's frame."""
+        frames = sorted(self._fixed.frames())
+        if not frames or self._body in frames:
+            return None
+        near = difflib.get_close_matches(self._body, frames, n=1)
+        nearest = f" Did you mean '{near[0]}'?" if near else ""
+        return f"base_link_frame '{self._body}' is not on /tf_static, which has {', '.join(frames)}.{nearest}"
+
+
+class TransformConflicts:
+    """Transforms of other nodes that end in the body's frame: a frame has one parent, published by one node (tf2)."""
+
+    def __init__(self, body: str, *, is_ros1: bool) -> None:
+        self._body = body
+        self._decode = decoder(TF_TYPE, is_ros1=is_ros1)
+        self._message: str | None = None
+        self._until = 0.0
+
+    def check(self, data: bytes, own: Iterable[bytes]) -> str | None:
+        """A message where ``data`` of /tf holds such a transform for the first time.
+
+        ``own``: what this node published in the last seconds, which some transports return.
+        """
+        if self._body.encode() not in data or any(data.startswith(mine) for mine in own):
+            return None
+        try:
+            transforms = self._decode(data).transforms
+        except UnusableError:
+            return None
+        parents = [frame_name(t.header.frame_id) for t in transforms if frame_name(t.child_frame_id) == self._body]
+        if not parents:
+            return None
+        before, self._until = self._message, time.monotonic() + _CURRENT_S
+        self._message = (
+            f"another node publishes '{parents[0]}' -> '{self._body}' on /tf as well: the robot jumps between the two. Pass --node.no-tf "
+            "(publish_tf: false), or switch it off there (diff_drive_controller: enable_odom_tf: false)."
+        )
+        return None if before == self._message else self._message
+
+    def current(self) -> str | None:
+        """The message, while such transforms arrive."""
+        return self._message if time.monotonic() < self._until else None

@@ -25,7 +25,10 @@ def old_estimate_log(path: Path) -> Path:
 
 
 class EstimateLog:
-    """Rows of estimates in a file that grows by whole rows at once. They survive the process; a checkpoint refers to the first so many."""
+    """Rows of estimates in a file that grows by whole rows at once. They survive the process; a checkpoint refers to the first so many.
+
+    Made by `create` or `resume`.
+    """
 
     def __init__(self, path: Path, file: FileIO, count: int, last_ns: int) -> None:
         self.path, self._file, self.count, self._last_ns = path, file, count, last_ns
@@ -95,9 +98,11 @@ class EstimateLog:
         return table["stamp_ns"], table["numbers"]
 
     def close(self) -> None:
+        """Close the file, which stays."""
         self._file.close()
 
     def remove(self) -> None:
+        """Close the file and delete it."""
         self.close()
         self.path.unlink(missing_ok=True)
 

@@ -11,7 +11,7 @@ import numpy as np
 from localization.errors import EstimatorError
 from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
 from localization.pipeline import Pipeline
-from localization.ros.predictor import Predictor
+from localization.ros.publisher import Predictor
 from localization.ros.settings import LiveRun
 from motion_models.center_of_gravity.files import arms_model
 from motion_models.se2 import FloatArray

@@ -12,14 +12,10 @@ from typing import Any
 
 from localization.errors import SettingError
 from localization.ros.jit_warm_up import warm_up
-from localization.ros.node import Node
-from localization.ros.parameters import make_settings, nearest, parameters
-from localization.ros.run_control import StopSignal
-from localization.ros.settings import LiveRun, ManagedNodeSettings
-from localization.ros.topic_names import Names
-from localization.ros.transports.base import Transport
+from localization.ros.node import Node, StopSignal
+from localization.ros.settings import LiveRun, ManagedNodeSettings, Names, make_settings, nearest, parameters
+from localization.ros.transports.base import SimTimeTransport, Transport
 from localization.ros.transports.rclpy import RclpyTransport, import_rclpy
-from localization.ros.transports.sim_time import SimTimeTransport
 from motion_models.errors import SkidlocError
 
 _IDLE_S = 0.2
@@ -77,6 +73,7 @@ class ManagedNode:
         self._settings = settings
 
     def activate(self) -> None:
+        """Let the run begin as soon as it is back from this callback."""
         self._is_active = True
 
     def deactivate(self) -> None:
@@ -84,9 +81,11 @@ class ManagedNode:
         self._is_active = False
 
     def shut_down(self) -> None:
+        """End the run, and the process after it."""
         self._is_active, self._is_shut_down = False, True
 
     def report_error(self, error: Exception) -> None:
+        """Write ``error`` to the node's log."""
         self._log.error(str(error))
 
     def _start(self) -> bool:

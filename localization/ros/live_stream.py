@@ -15,10 +15,9 @@ from localization.errors import CheckpointError
 from localization.events import CgSample, Event
 from localization.logs.clock_sync import Merger
 from localization.logs.decode import ArmReading, MessageStats, Oddity
-from localization.logs.event_decoder import EventDecoder, decode_item
+from localization.logs.event_decoder import EventDecoder, JointsToWheels, OdometryToWheels, decode_item
 from localization.logs.serialization import decoder
 from localization.logs.topic_roles import TYPES, Sources
-from localization.logs.wheel_decoder import JointsToWheels, OdometryToWheels
 from localization.ros.discovery import DiscoveredTopics
 from localization.ros.payloads import Payloads
 from localization.ros.transports.base import Received
@@ -54,6 +53,7 @@ class LiveStream:
 
     @property
     def wheel_angles(self) -> WheelAngles:
+        """Angles of the wheels up to now, which a checkpoint stores."""
         return WheelAngles(self._event_decoder.from_joints, self._event_decoder.from_odometry)
 
     def restore(self, angles: WheelAngles) -> None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import gc
+import signal
+import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from functools import partial
+from types import FrameType
 from typing import Any
 
 from localization.errors import CheckpointError
@@ -15,18 +18,15 @@ from localization.events import Event, Scan
 from localization.logs.decode import MessageStats
 from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import fingerprints, read_head
-from localization.ros.diagnostics import ERROR, WARN, Health, Status
-from localization.ros.discovery import DiscoveredTopics, TopicDiscovery
-from localization.ros.doctor import Doctor
+from localization.ros.diagnostics import ERROR, WARN, Doctor, Health, Status
+from localization.ros.discovery import TF, TF_STATIC, TF_TYPE, DiscoveredTopics, TopicDiscovery, TransformConflicts
 from localization.ros.jit_warm_up import warm_up
 from localization.ros.live_stream import LiveStream, WheelAngles, check_age
 from localization.ros.operator_commands import OperatorCommands
 from localization.ros.payloads import Payloads
-from localization.ros.predictor import Predictor
-from localization.ros.publisher import EstimatePublisher
+from localization.ros.publisher import EstimatePublisher, Predictor
 from localization.ros.session import Session, SessionState, StartPose, View, made_by
 from localization.ros.settings import LiveRun
-from localization.ros.transforms import TF, TF_STATIC, TF_TYPE, TransformConflicts
 from localization.ros.transports.base import Received, Transport
 from motion_models.errors import RobotError
 from motion_models.prior import prior_notes
@@ -206,6 +206,7 @@ class Node:
 
     @property
     def has_lidar(self) -> bool:
+        """Whether scans or clouds are among the topics in use."""
         return self._sources.lidar is not None
 
     @property
@@ -330,3 +331,32 @@ class Node:
         if config.map_period_s and self.has_lidar and now >= self._next_map:
             self._next_map = now + config.map_period_s
             self._publisher.publish_map(self.session.pipeline.estimator.map_points(), stamp_ns)
+
+
+class StopSignal:
+    """SIGINT and SIGTERM, stored until the present event is processed: half an event is no state. The second one interrupts at once."""
+
+    def __init__(self) -> None:
+        self._is_requested = threading.Event()
+        self._handlers_before: dict[int, Any] = {}
+
+    def __enter__(self) -> StopSignal:
+        self._handlers_before = {number: signal.signal(number, self._request) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._handlers_before.items():
+            signal.signal(number, handler)
+
+    def _request(self, number: int, frame: FrameType | None) -> None:
+        if self._is_requested.is_set():
+            raise KeyboardInterrupt
+        self._is_requested.set()
+
+    def is_set(self) -> bool:
+        """Whether a signal has come."""
+        return self._is_requested.is_set()
+
+    def sleep(self, seconds: float) -> None:
+        """Sleep, or until a signal comes."""
+        self._is_requested.wait(seconds)

@@ -16,7 +16,7 @@ from localization.logs.serialization import decoder
 from localization.logs.writer import odom_axes
 from localization.ros.payloads import Load, Payloads
 from localization.ros.session import StartPose
-from localization.ros.topic_names import Names
+from localization.ros.settings import Names
 from localization.ros.transports.base import Received, ServiceReply, Transport
 from motion_models.errors import CgError, RobotError
 from motion_models.se2 import FloatArray
@@ -44,21 +44,26 @@ class CommandedNode(Protocol):
     is_paused: bool
 
     @property
-    def frames(self) -> Any: ...
+    def frames(self) -> Any:
+        """`settings.Frames` of what is published."""
 
     @property
-    def session(self) -> Any: ...
+    def session(self) -> Any:
+        """The `Session` that is running."""
 
     @property
-    def payloads(self) -> Payloads: ...
+    def payloads(self) -> Payloads:
+        """Loads that the robot holds."""
 
-    def restart(self, start: StartPose) -> None: ...
+    def restart(self, start: StartPose) -> None:
+        """Begin anew at ``start``."""
 
-    def insert_present_cg(self) -> None: ...
+    def insert_present_cg(self) -> None:
+        """Give the pipeline the centre of gravity with the present payloads."""
 
 
 class OperatorCommands:
-    """Subscribes to the topics and offers the services."""
+    """Subscribes to the topics and offers the services; ``report`` gets a line on each command that was done or refused."""
 
     def __init__(self, node: CommandedNode, transport: Transport, names: Names, report: Callable[[str], None]) -> None:
         self._node, self._report = node, report

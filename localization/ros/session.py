@@ -1,11 +1,16 @@
-"""A pipeline at work: events in, estimates recorded, its health monitored, its state on disk at most a second old."""
+"""A pipeline at work: events in, estimates recorded, its health monitored, its state on disk at most a second old; and its files."""
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import os
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any, Protocol, TextIO
 
 import numpy as np
 
@@ -14,12 +19,12 @@ from localization.estimators import Estimate
 from localization.estimators.base import trajectory
 from localization.events import Event
 from localization.logs.writer import MAP_FRAME, PARENT_FRAME, write_fused
+from localization.output import output_errors, refuse_existing
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.checkpoint import Checkpoint, CheckpointWriter, fingerprints, read_checkpoint, remove_checkpoint
 from localization.ros.diagnostics import Health
 from localization.ros.estimate_log import EstimateLog, fused_estimates
 from localization.ros.payloads import Load
-from localization.ros.session_files import Files
 from localization.trajectory import write_tum
 from motion_models import se2
 from motion_models.robot import Mount, Robot
@@ -27,15 +32,20 @@ from motion_models.se2 import FloatArray
 
 _CONSEQUENCES = {"state": "The state of before stays", "output": "Estimates made meanwhile are missing from the output"}
 
+_SUFFIXES = (".mcap", ".tum")
+
 
 class View(Protocol):
     """Shows a session while it runs. It is called after estimates are published, so that none waits for it."""
 
-    def begin(self, robot: Robot, mounts: Mapping[str, Mount]) -> None: ...
+    def begin(self, robot: Robot, mounts: Mapping[str, Mount]) -> None:
+        """Show what stays as it is. Called once, before the first event."""
 
-    def show(self, event: Event | None, estimates: Sequence[Estimate], pipeline: Pipeline) -> None: ...
+    def show(self, event: Event | None, estimates: Sequence[Estimate], pipeline: Pipeline) -> None:
+        """``event`` has gone in (None: no more will come), ``estimates`` have come out."""
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """No more will come."""
 
 
 def made_by(trial: Trial, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig, source: str) -> dict[str, str]:
@@ -161,6 +171,7 @@ class Session:
 
     @property
     def pipeline(self) -> Pipeline:
+        """The one that runs; `restart` replaces it."""
         return self.state.pipeline
 
     def restart(self, pipeline: Pipeline, start: StartPose) -> None:
@@ -273,6 +284,64 @@ class Session:
                 (self._estimate_log.close if is_needed else self._estimate_log.remove)()
 
 
+@dataclass(frozen=True)
+class Files:
+    """What a session writes. Raises `OutputError` for an output of unknown kind, a state that is a folder, and two that are one file."""
+
+    out: Path | None = None
+    """Trajectory, .mcap or .tum, written at the end."""
+    state: Path | None = None
+    """Resumed at the start if it is there."""
+
+    def __post_init__(self) -> None:
+        if self.out is not None and self.out.suffix not in _SUFFIXES:
+            raise OutputError(f"output '{self.out}': its name must end in {' or '.join(_SUFFIXES)}.")
+        if self.state is not None and self.state.is_dir():
+            raise OutputError(f"the state '{self.state}' is a folder. Name a file in it.")
+        if self.out is not None and self.estimate_log is not None and self.state is not None:
+            for taken, what in ((self.out, "the output"), (self.estimate_log, "where the output grows")):
+                if self.state.resolve() == taken.resolve():
+                    raise OutputError(f"the state '{self.state}' is {what} as well. Give the state a name of its own.")
+
+    @property
+    def estimate_log(self) -> Path | None:
+        """Where the estimates are until the end."""
+        return None if self.out is None else self.out.with_name(f".{self.out.name}.part")
+
+    @contextlib.contextmanager
+    def beside(self) -> Iterator[Path]:
+        """Where to write what becomes the output at the end, under its name, for a bag holds that. What a process that was killed has left
+        there is removed. Raises `OutputError`."""
+        assert self.out is not None
+        folder = self.out.with_name(f".{self.out.name}.new")
+        with output_errors(self.out):
+            if folder.is_symlink() or folder.is_file():
+                folder.unlink()
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+        try:
+            yield folder / self.out.name
+            refuse_existing(self.out)
+            with output_errors(self.out):
+                (folder / self.out.name).replace(self.out)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    @contextlib.contextmanager
+    def claimed(self) -> Iterator[None]:
+        """Inside, they are this process's alone. Raises `OutputError` where they cannot be written, for an output that exists, and where
+        another process has them."""
+        if self.out is not None:
+            refuse_existing(self.out)
+        with contextlib.ExitStack() as stack:
+            for path in (self.out, self.state):
+                if path is not None:
+                    lock = path.with_name(f".{path.name}.lock")
+                    stack.enter_context(_locked(path, lock))
+                    stack.callback(lock.unlink, missing_ok=True)  # while it is locked
+            yield
+
+
 def _resume_log(files: Files, found: Checkpoint, report: Callable[[str], None] | None) -> tuple[EstimateLog | None, Mapping[str, Any]]:
     """The estimates up to the checkpoint ``found``, and its head. Raises `CheckpointError` and `OutputError`.
 
@@ -293,3 +362,24 @@ def _resume_log(files: Files, found: Checkpoint, report: Callable[[str], None] |
             raise
         report(f"{error} This run continues from the state; its output begins here.")
         return EstimateLog.create(files.estimate_log), {**found.head, "records": None}
+
+
+def _locked(path: Path, lock: Path) -> TextIO:
+    """The file ``lock``, which is another than ``path``, for a state is replaced again and again. The lock ends with the process, however
+    that ends."""
+    while True:
+        try:
+            file = os.fdopen(os.open(lock, os.O_CREAT | os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644), "a")
+        except OSError as error:
+            raise OutputError(f"'{path}' cannot be written: {error.strerror}. Name a file in a folder that is there and yours.") from error
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            file.close()
+            raise OutputError(f"'{path}' is in use by another process that runs. Stop that, or name another file.") from error
+        except OSError:
+            return file  # a file system without locks is no reason not to work
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file.fileno()), lock.stat()):
+                return file
+        file.close()  # whoever had it removed it meanwhile

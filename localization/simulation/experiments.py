@@ -87,7 +87,8 @@ def sine(vx: float, wz: float, period_s: float) -> Profile:
 
 
 class Pursuit:
-    """Pure pursuit (Coulter, 1992) of a polyline."""
+    """Pure pursuit (Coulter, 1992) of a polyline from the pose ``start`` (3,): steers to the point ``look_ahead_m`` ahead on it, and turns
+    by at most ``turn_limit`` [rad/s]."""
 
     def __init__(self, start: FloatArray, route: Route, look_ahead_m: float = 0.8, turn_limit: float = 0.6) -> None:
         points = np.vstack([start[:2], route.points])
@@ -185,6 +186,7 @@ class Experiment:
     with_gps: bool = False
 
     def make_world(self) -> World:
+        """The world by its name."""
         return WORLDS[self.world]()
 
 

@@ -32,6 +32,7 @@ class OpenLoopScore:
     """Mean distance between the actual path, as tracked by the LiDAR, and the path of the controller's odometry."""
 
     def to_dict(self) -> dict[str, float | str]:
+        """For `simulate`'s JSON: m and s, as the names of the keys have it."""
         return {name: getattr(self, name) for name in ("run", "drive_error_m", "correction_time_s", "vision_error_m")}
 
 

@@ -286,6 +286,7 @@ class SensorConfig(Settings):
 
     @property
     def lidar_frame(self) -> str:
+        """Frame of the scans or clouds."""
         return CLOUD if self.lidar == "3d" else LASER
 
 

@@ -19,9 +19,8 @@ from localization.errors import SimulationError
 from localization.settings import Positive, Settings, up_to
 from localization.simulation.dynamics import Chassis, DynamicsInput, Plant, derivatives, integrate
 from motion_models.center_of_gravity.files import arms_model, arms_postures
-from motion_models.center_of_gravity.model import CgModel
+from motion_models.center_of_gravity.model import CgModel, Posture, posture_for
 from motion_models.center_of_gravity.parts import Payload
-from motion_models.center_of_gravity.postures import Posture, posture_for
 from motion_models.friction.contact import tyre
 from motion_models.friction.dynamics import FrictionDynamics
 from motion_models.friction.model import FrictionModel, check_parameters
@@ -97,6 +96,7 @@ class Body:
         return dataclasses.replace(self, radius_left=start.radius_left * factor, radius_right=start.radius_right * factor)
 
     def param(self, name: str) -> float:
+        """A parameter of the friction model by its name."""
         return float(self.params[FrictionModel.param_names.index(name)])
 
     def chassis(self, config: VehicleConfig) -> Chassis:
@@ -135,14 +135,17 @@ class VehicleState:
 
     @classmethod
     def at(cls, pose: FloatArray) -> VehicleState:
+        """At rest at ``pose`` (3,)."""
         return cls(0, np.concatenate([pose, np.zeros(9), np.full(4, np.nan)]).astype(float))
 
     @property
     def pose(self) -> FloatArray:
+        """(3,) of the body in the world."""
         return self.numbers[0:3]
 
     @property
     def is_standing(self) -> bool:
+        """Whether twist and wheel rates are all below 0.001 [m/s, rad/s]."""
         return bool(np.abs(self.numbers[3:8]).max() < 1e-3)
 
 
@@ -351,7 +354,10 @@ class MassDistribution:
 
 
 class TrueMotion:
-    """Records of the vehicle at even steps, linear in between. Steps are milliseconds long: linear is exact to micrometres."""
+    """Records of the vehicle at even steps, linear in between. Steps are milliseconds long: linear is exact to micrometres.
+
+    ``first`` (COLUMNS,) is the record at the start, ``step_s`` the time between two [s].
+    """
 
     def __init__(self, first: FloatArray, step_s: float) -> None:
         self.step_s = step_s
@@ -365,9 +371,11 @@ class TrueMotion:
 
     @property
     def start_s(self) -> float:
+        """From when on the motion is known [s]."""
         return self.first_step * self.step_s
 
     def append(self, rows: FloatArray) -> None:
+        """Add records (n, COLUMNS) of the next steps."""
         self.rows = np.concatenate([self.rows, rows])
 
     def drop_before(self, before_s: float) -> None:
@@ -399,7 +407,10 @@ def pose_at(rows: FloatArray, start_s: float, step_s: float, t: float) -> tuple[
 
 
 class SampleClock:
-    """Sample times k / rate, in integer nanoseconds since the start, each handed out once, when it is over."""
+    """Sample times k / rate, in integer nanoseconds since the start, each handed out once, when it is over.
+
+    ``takes_s`` is how long a sample takes from its time on [s]: a sweep.
+    """
 
     def __init__(self, rate_hz: float, takes_s: float = 0.0) -> None:
         self._rate, self._takes_s = rate_hz, takes_s

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from motion_models.base import MotionModel
-from motion_models.calibration.fit import Fit, fit
+from motion_models.calibration.fit import Fit, FitConfig, fit
 from motion_models.calibration.identifiability import Weakness
-from motion_models.calibration.least_squares import FitConfig
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.errors import CalibrationError
 

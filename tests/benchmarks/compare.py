@@ -10,8 +10,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from localization.comparison.executors import run_local
-from localization.comparison.jobs import Job, job_key, trials
+from localization.comparison.jobs import Job, job_key, run_local, trials
 from localization.logs import TopicOverrides
 from localization.pipeline import ReplayConfig
 from localization.simulation.experiments import ExperimentConfig

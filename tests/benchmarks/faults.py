@@ -1,4 +1,4 @@
-"""A campaign of mutated logs: three drives, faults of sensors and of files, all formats, by seed. Prints what was survived.
+"""A campaign of mutated logs: faults of sensors and of files, all drives, formats and models, by seed. Prints what was survived.
 
 python -m tests.benchmarks.faults [--count 300] [--seed 0] [--only TEXT] [--verbose]
 """

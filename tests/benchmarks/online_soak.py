@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from localization.logs.message_templates import Form, Message, Template
+from localization.logs.message_templates import Message, MessageLayout, Template
 from localization.pipeline import Trial
 from localization.ros.node import Node
-from localization.ros.session_files import Files
+from localization.ros.session import Files
 from localization.ros.settings import LiveRun, NodeConfig
 from localization.ros.transports.base import MonotonicTime, Received
 from localization.simulation.experiments import ExperimentConfig
@@ -53,7 +53,7 @@ class SimulatedRobot(MonotonicTime):
         simulation = simulate("soak", load_robot("vaultbot"), 0, {}, SimulationConfig(ExperimentConfig(hours=hours), sensors=sensors))
         self._runs = simulation.runs
         self._messages = simulation.messages()
-        self._templates: dict[int, tuple[Form, Template]] = {}
+        self._templates: dict[int, tuple[MessageLayout, Template]] = {}
         self._types: dict[str, str] = {}
         self._topics: set[str] = set()
         self._base_ns = time.monotonic_ns()

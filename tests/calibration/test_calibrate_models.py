@@ -10,9 +10,8 @@ import pytest
 from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.calibration.cross_validation import cross_validate, root_mean, root_mean_gain
-from motion_models.calibration.fit import fit
+from motion_models.calibration.fit import FitConfig, fit
 from motion_models.calibration.identifiability import candidates
-from motion_models.calibration.least_squares import FitConfig
 from motion_models.calibration.maneuvers import Maneuver, make_batch
 from motion_models.calibration.prediction import REFERENCE_PARAM_NAMES, predict
 from motion_models.errors import CalibrationError

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from motion_models.center_of_gravity.flatten import flatten
+from motion_models.center_of_gravity.kinematics import flatten
 from motion_models.center_of_gravity.urdf import load_urdf, parse_urdf
 from motion_models.errors import RobotError
 from tests.helpers import urdf_reference

@@ -20,8 +20,7 @@ from localization.events import ImuSample, WheelSample
 from localization.logs import TopicOverrides, open_log
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
-from motion_models.calibration.maneuvers import Maneuver
-from motion_models.calibration.windows_table import read_windows, windows_text
+from motion_models.calibration.maneuvers import Maneuver, read_windows, windows_text
 from motion_models.preintegration import integrate_twists
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import WheelNoise, load_robot

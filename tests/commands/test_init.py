@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from localization.cli import main
+from motion_models.center_of_gravity.urdf import sides, wheel_geometry
 from motion_models.robot import load_robot
-from motion_models.wheel_geometry import sides, wheel_geometry
 
 DATA = Path(__file__).parents[1] / "data"
 HUSKY_BAG = DATA / "husky-outdoor-gps" / "test1.bag"

@@ -20,8 +20,7 @@ from scipy.stats import ttest_rel
 
 from localization.cli import main
 from localization.comparison import jobs as job_module
-from localization.comparison.executors import run_local
-from localization.comparison.jobs import Job, failed_rows, job_key, run_job, trials
+from localization.comparison.jobs import Job, failed_rows, job_key, run_job, run_local, trials
 from localization.comparison.statistics import differences, means, sign_flip_p
 from localization.comparison.table import ResultTable
 from localization.errors import OutputError
@@ -461,7 +460,7 @@ def test_dask_lost_scheduler_ends_the_comparison_and_keeps_results(table, tmp_pa
 
 def test_dask_missing_scheduler_is_refused(tmp_path, capsys, monkeypatch):
     pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
-    monkeypatch.setattr("localization.comparison.executors.CONNECT_TIMEOUT_S", 1.0)
+    monkeypatch.setattr("localization.comparison.jobs.CONNECT_TIMEOUT_S", 1.0)
     for address in ("tcp://127.0.0.1:1", "nonsense", "nonsense://x:1", "tcp://127.0.0.1"):
         assert compare(tmp_path / "t.csv", "--dask", address) == 2
         printed = " ".join(capsys.readouterr().err.split())

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from localization.diagnosis.controller_runs import drive_of_runs, read_runs
 from localization.diagnosis.diagnose import diagnose
-from localization.diagnosis.drive import Drive, drive_of_log, drive_of_table
+from localization.diagnosis.drive import Drive, drive_of_log, drive_of_runs, drive_of_table, read_runs
 from localization.diagnosis.findings import Diagnosis
 from localization.logs import open_log
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers

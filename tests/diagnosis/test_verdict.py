@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES
-from localization.diagnosis.findings import Attribution, Component, Finding, Gain, RowStatus, Trend
-from localization.diagnosis.summary import describe_row
+from localization.diagnosis.findings import Attribution, Component, Finding, Gain, RowStatus, Trend, describe_row
 from localization.diagnosis.verdict import decide, mark_trends
 
 GAIN = Gain(2.0, 1.0, 0.5, 0.4, 0.6)

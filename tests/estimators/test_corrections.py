@@ -11,14 +11,13 @@ from hypothesis import strategies as st
 
 from localization.estimators.filter import FilterConfig
 from localization.evaluation.consistency import mean_band
+from localization.events import Step
 from localization.pipeline import Pipeline, Trial
-from localization.step import Step
 from motion_models import se2
 from motion_models.base import Motion
-from motion_models.corrected import CorrectedFriction
 from motion_models.errors import CgError, ModelError
 from motion_models.friction import FrictionModel
-from motion_models.online_calibration import check_forms, correctable, corrections
+from motion_models.online_calibration import CorrectedFriction, check_forms, correctable, corrections
 from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import WheelNoise, load_robot

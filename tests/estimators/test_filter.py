@@ -17,10 +17,8 @@ from scipy.stats import chi2
 from localization.errors import EstimatorError
 from localization.estimators.filter import BIAS, CLOCK, KEY, MAP, PARAMS, POSE, SCALE, START, Filter, FilterConfig
 from localization.evaluation.consistency import lag1_whiteness, mean_band
-from localization.events import Scan, WheelSample
-from localization.gyro import Turn
+from localization.events import Scan, Step, Turn, WheelSample
 from localization.lidar import KeyScanError, select_measured
-from localization.step import Step
 from localization.synchronizer import Synchronizer
 from motion_models import se2
 from motion_models.base import Motion

@@ -16,8 +16,7 @@ from localization.evaluation.consistency import nees
 from localization.events import PositionSample, Scan, WheelSample
 from localization.logs.references import merge_positions
 from localization.pipeline import Pipeline, Trial, replay
-from localization.ros.deserialize import deserialize
-from localization.ros.serialize import serialize
+from localization.ros.state_serialization import deserialize, serialize
 from localization.simulation import world
 from localization.trajectory import Trajectory
 from motion_models import se2

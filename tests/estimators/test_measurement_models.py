@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from localization.estimators.measurement_models import motion_residual, position_residual, predict_turn, subtract_map_error
-from localization.gyro import Turn
+from localization.events import Turn
 from motion_models import se2
 
 POSES = st.tuples(st.floats(-20, 20), st.floats(-20, 20), st.floats(-3.1, 3.1)).map(np.array)

@@ -14,8 +14,7 @@ from localization.errors import EstimatorError
 from localization.estimators import pose_graph
 from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
 from localization.evaluation.consistency import nees
-from localization.ros.deserialize import deserialize
-from localization.ros.serialize import serialize
+from localization.ros.state_serialization import deserialize, serialize
 from motion_models import se2
 
 COV = np.diag([0.02, 0.02, 0.01]) ** 2

@@ -1,4 +1,4 @@
-"""Logs with faults by seed (sensors, clocks, transforms, files), made from drives without faults; and the outcome of their replay."""
+"""Logs with faults by seed (sensors, clocks, transforms, files), made from drives without faults, and the outcome of their replay."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ import numpy as np
 from localization.cli import main
 from localization.evaluation.references import read_reference_file, reference_track
 from localization.logs import open_log
+from localization.logs.reader import open_source
 from localization.logs.serialization import LogDeserializer
-from localization.logs.sources import open_source
 from localization.trajectory import read_tum
 from motion_models.robot import load_robot
 from tests.helpers import bags
@@ -35,6 +35,8 @@ from tests.helpers.sensor_faults import SENSOR_FAULTS
 
 DATA = Path(__file__).parents[1] / "data"
 DRIVE_S = 12.0
+MODELS, ESTIMATORS = ("skid_steer", "diff_drive", "icr"), ("ekf", "ekf", "graph")
+"""That replay the mutated logs."""
 FAR_M, MOST_SIGMA = 1.0, 5.0
 """An end error beyond either, without a warning, is silently wrong."""
 _MOST_SECONDS = 120.0
@@ -187,13 +189,16 @@ class Case:
     sensor_fault: str
     file_fault: str
     """Empty for none."""
+    model: str = "skid_steer"
+    estimator: str = "ekf"
 
     def __str__(self) -> str:
-        return f"{self.number}: {self.source}, {self.form}, {self.sensor_fault}{', ' + self.file_fault if self.file_fault else ''}"
+        fault = self.file_fault or self.sensor_fault
+        return f"{self.number}: {self.source}, {self.form}, {self.estimator} ({self.model}), {fault}"
 
 
 def cases(count: int, seed: int) -> list[Case]:
-    """``count`` cases: every second one a damaged file, all formats and sources in turn, faults by ``seed``."""
+    """``count`` cases by ``seed``: every second one a damaged file, the others one sensor fault each, on a drive that has that sensor."""
     rng = np.random.default_rng(seed)
     forms, sensors, files = list(bags.FORMATS), list(SENSOR_FAULTS), list(FILE_FAULTS)
     order = [sensors[i] for _ in range(count // len(sensors) + 1) for i in rng.permutation(len(sensors))]
@@ -201,10 +206,24 @@ def cases(count: int, seed: int) -> list[Case]:
     for number in range(count):
         file_fault = files[int(rng.integers(len(files)))] if number % 2 else ""
         sensor_fault = "none" if file_fault else order[number // 2]
-        found.append(
-            Case(number, SOURCES[int(rng.integers(len(SOURCES)))].name, forms[int(rng.integers(len(forms)))], sensor_fault, file_fault)
-        )
+        suited = [s.name for s in SOURCES if sensor_fault == "none" or is_affected(s.name, sensor_fault)]
+        model, estimator = MODELS[int(rng.integers(len(MODELS)))], ESTIMATORS[int(rng.integers(len(ESTIMATORS)))]
+        source, form = suited[int(rng.integers(len(suited)))], forms[int(rng.integers(len(forms)))]
+        found.append(Case(number, source, form, sensor_fault, file_fault, model, estimator))
     return found
+
+
+@functools.cache
+def is_affected(source: str, sensor_fault: str) -> bool:
+    """Whether the fault changes any message of the drive: not every drive has every sensor."""
+    every_tenth = next(s for s in SOURCES if s.name == source).records()[::10]
+    records = [(topic, _standard(message, message.__msgtype__), stamp) for topic, message, stamp in every_tenth]
+    before = _fingerprint(records)
+    return _fingerprint(SENSOR_FAULTS[sensor_fault](records, np.random.default_rng(0))) != before
+
+
+def _fingerprint(records: list[Record]) -> int:
+    return hash(tuple((topic, stamp, bytes(bags.STORE.serialize_cdr(m, m.__msgtype__))) for topic, m, stamp in records))
 
 
 def copied(source: Source) -> list[Record]:
@@ -252,8 +271,6 @@ def reference_of(source: str, folder: Path) -> Path:
         with contextlib.redirect_stdout(io.StringIO()):
             code = main(["replay", str(log), "--robot", found.robot, "--out", str(out), "--model", "skid_steer", "--estimator", "ekf"])
         assert code == 0
-        notes = json.loads((out / "metrics.json").read_text())["notes"]
-        path.with_suffix(".json").write_text(json.dumps([_without_numbers(note) for note in notes]))
         if found.reference:
             track = reference_track(open_log(log, load_robot(found.robot)).references(found.reference), found.reference)
             assert track.yaws is not None
@@ -265,23 +282,11 @@ def reference_of(source: str, folder: Path) -> Path:
     return path
 
 
-def run_case(log: Path, robot: str, truth: Path, out: Path) -> Outcome:
-    """Replay by the EKF from the command line, and compare the last pose with the reference ``truth``."""
+def run_case(case: Case, log: Path, robot: str, truth: Path, out: Path) -> Outcome:
+    """Replay from the command line, and compare the last pose with the reference ``truth``."""
     printed, complaints = io.StringIO(), io.StringIO()
-    arguments = [
-        "replay",
-        str(log),
-        "--robot",
-        robot,
-        "--out",
-        str(out),
-        "--model",
-        "skid_steer",
-        "--estimator",
-        "ekf",
-        "--reference",
-        "none",
-    ]
+    arguments = ["replay", str(log), "--robot", robot, "--out", str(out), "--reference", "none"]
+    arguments += ["--model", case.model, "--estimator", case.estimator]
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(complaints):
             code = main(arguments)
@@ -292,13 +297,26 @@ def run_case(log: Path, robot: str, truth: Path, out: Path) -> Outcome:
     if code != 0:
         is_input_error = complaints.getvalue().startswith("skidloc: ")
         return Outcome("refused" if is_input_error else "traceback", math.nan, math.nan, complaints.getvalue().strip())
-    usual = json.loads(truth.with_suffix(".json").read_text())
+    usual = _usual_notes(case, robot, truth.parent)
     warnings = [n for n in json.loads((out / "metrics.json").read_text())["notes"] if _without_numbers(n) not in usual]
-    error_m, sigmas = _end_error(out, truth)
+    error_m, sigmas = _end_error(out, f"{case.model}_{case.estimator}", truth)
     is_right = error_m <= FAR_M and sigmas <= MOST_SIGMA
     if warnings:
         return Outcome("survived" if is_right else "reported", error_m, sigmas, " | ".join(warnings))
     return Outcome("survived" if is_right else "wrong", error_m, sigmas, " | ".join(warnings))
+
+
+def _usual_notes(case: Case, robot: str, folder: Path) -> list[str]:
+    """Notes of the same replay of the drive without faults."""
+    path = folder / f"{case.source}-{case.model}-{case.estimator}.json"
+    if not path.exists():
+        out, log = path.with_suffix(""), folder / f"{case.source}.mcap"
+        arguments = ["replay", log, "--robot", robot, "--out", out, "--model", case.model, "--estimator", case.estimator]
+        with contextlib.redirect_stdout(io.StringIO()):
+            assert main([*map(str, arguments), "--reference", "none"]) == 0
+        notes = json.loads((out / "metrics.json").read_text())["notes"]
+        path.write_text(json.dumps([_without_numbers(note) for note in notes]))
+    return list(json.loads(path.read_text()))
 
 
 def _without_numbers(note: str) -> str:
@@ -306,9 +324,9 @@ def _without_numbers(note: str) -> str:
     return re.sub(r"[0-9.]+", "#", note)
 
 
-def _end_error(out: Path, truth: Path) -> tuple[float, float]:
+def _end_error(out: Path, name: str, truth: Path) -> tuple[float, float]:
     """Distance [m] of the last pose from the truth, both from where the estimate begins, and the same in standard deviations."""
-    found, reference = read_tum(out / "skid_steer_ekf.tum"), read_reference_file(truth)
+    found, reference = read_tum(out / f"{name}.tum"), read_reference_file(truth)
     stamps = np.array(reference.stamps_ns)  # type: ignore[union-attr]
     true = np.column_stack([reference.positions, reference.yaws])  # type: ignore[union-attr]
     inside = np.flatnonzero((found.stamps_ns >= stamps[0]) & (found.stamps_ns <= stamps[-1]))
@@ -318,7 +336,7 @@ def _end_error(out: Path, truth: Path) -> tuple[float, float]:
     at = [np.array([np.interp(found.stamps_ns[k], stamps, c) for c in (true[:, 0], true[:, 1], np.unwrap(true[:, 2]))]) for k in (i, j)]
     moved, ought = _relative(found.poses[i], found.poses[j]), _relative(at[0], at[1])
     error = moved - ought
-    return float(np.linalg.norm(error)), float(np.linalg.norm(error)) / max(_end_sigma_m(out), 1e-3)
+    return float(np.linalg.norm(error)), float(np.linalg.norm(error)) / max(_end_sigma_m(out, name), 1e-3)
 
 
 def _relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -326,12 +344,12 @@ def _relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.array([[c, s], [-s, c]]) @ (b[:2] - a[:2])
 
 
-def _end_sigma_m(out: Path) -> float:
+def _end_sigma_m(out: Path, name: str) -> float:
     """The last claimed position's standard deviation [m], of the larger axis."""
     source = open_source(out / "fused.mcap")
     decode = LogDeserializer(source.channels, is_ros1=False)
     last = None
-    for raw in source.messages(["/skid_steer_ekf/odometry"]):
+    for raw in source.messages([f"/{name}/odometry"]):
         last = raw
     assert last is not None
     cov = np.asarray(decode(last).pose.covariance).reshape(6, 6)[:2, :2]
@@ -344,7 +362,7 @@ def run_guarded(jobs: Iterable[tuple[Case, Path, str, Path, Path]]) -> Iterable[
     for case, *job in jobs:
         worker = worker or _Worker()
         begin = time.monotonic()
-        outcome = worker.run(job)
+        outcome = worker.run([case, *job])
         if outcome.kind in ("hang", "memory"):
             worker.stop()
             worker = None

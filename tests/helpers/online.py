@@ -17,16 +17,14 @@ from rosbags.typesys import Stores, get_typestore
 
 from localization.estimators import Estimate
 from localization.logs import open_log
-from localization.logs.sources import open_source
+from localization.logs.reader import open_source
 from localization.logs.topic_roles import TopicOverrides
 from localization.pipeline import Pipeline, Trial
+from localization.ros.discovery import TF
 from localization.ros.node import Node
 from localization.ros.publisher import DIAGNOSTICS, MAP, ODOMETRY, PATH, POSE, PREDICTED_ODOMETRY
-from localization.ros.session import View
-from localization.ros.session_files import Files
-from localization.ros.settings import LiveRun, NodeConfig
-from localization.ros.topic_names import Names
-from localization.ros.transforms import TF
+from localization.ros.session import Files, View
+from localization.ros.settings import LiveRun, Names, NodeConfig
 from localization.ros.transports.base import MonotonicTime, Received, ServiceHandler
 from localization.simulation.experiments import Experiment, MoveArms, OpenLoop, Rest, constant
 from localization.simulation.sensors import EncoderConfig, SensorConfig

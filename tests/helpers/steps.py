@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from localization.events import Event
-from localization.step import Step
+from localization.events import Event, Step
 from localization.synchronizer import Synchronizer
 
 

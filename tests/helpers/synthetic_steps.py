@@ -14,10 +14,8 @@ import numpy as np
 from localization.estimators.base import Estimator
 from localization.estimators.filter import BIAS, POSE, FilterConfig
 from localization.estimators.fusion import EkfFusion
-from localization.events import Scan
-from localization.gyro import Turn
+from localization.events import Scan, Step, Turn
 from localization.lidar import LostScans, ScanMatch
-from localization.step import Step
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.online_calibration import Corrections, corrections

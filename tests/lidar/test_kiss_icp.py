@@ -10,8 +10,7 @@ from kiss_icp.threshold import get_threshold_estimator
 
 from localization.lidar import KissIcp, choose_voxel_size
 from localization.lidar.kiss_icp import AdaptiveThreshold
-from localization.ros.deserialize import deserialize
-from localization.ros.serialize import serialize
+from localization.ros.state_serialization import deserialize, serialize
 from localization.simulation import world
 from motion_models import se2
 from tests.helpers import rooms

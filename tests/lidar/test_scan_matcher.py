@@ -137,6 +137,13 @@ def test_match_of_another_place_is_lost() -> None:
     assert matcher.match(elsewhere, true, WIDE) is None
 
 
+def test_match_of_an_unmapped_place_with_unlimited_prior_ends() -> None:
+    """After minutes without any sensor the prior is a kilometre wide, and no surface is looked for so far from a point."""
+    matcher, true = lab()
+    points = rooms.scan_from(HALL, np.array([30.0, 20.0, 0.5]), np.random.default_rng(3))
+    assert matcher.match(points + np.array([500.0, 300.0]), true, np.diag([1e3, 1e3, 10.0]) ** 2) is None
+
+
 def one_place(walls: np.ndarray, cov: np.ndarray) -> ScanMatch | None:
     """A second scan from the place of the only key scan."""
     rng, matcher = np.random.default_rng(0), ScanMatcher(LidarConfig(), CELL)

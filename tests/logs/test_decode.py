@@ -440,7 +440,7 @@ def test_odometry_nan_poses_are_replaced_by_the_twist(tmp_path: Path) -> None:
 )
 def test_odometry_arcs_are_converted_exactly(steps: list[tuple[float, float]], heading: float) -> None:
     """An arc's signed length and angle come back from its end points, forwards and backwards, through any heading."""
-    from localization.logs.wheel_decoder import arc
+    from localization.logs.event_decoder import arc
 
     pose = np.array([1.0, 2.0, heading])
     for length, turn in steps:

@@ -12,7 +12,18 @@ from localization.errors import LogError
 from localization.logs import inspect_log, open_log
 from motion_models.robot import load_robot
 from tests.helpers import bags, fuzz
-from tests.helpers.hostile_logs import BAD, FILE_FAULTS, SENSOR_FAULTS, SOURCES, Case, cases, reference_of, run_case, write_case
+from tests.helpers.hostile_logs import (
+    BAD,
+    FILE_FAULTS,
+    SENSOR_FAULTS,
+    SOURCES,
+    Case,
+    cases,
+    is_affected,
+    reference_of,
+    run_case,
+    write_case,
+)
 
 
 @pytest.fixture(scope="module")
@@ -32,8 +43,9 @@ DECIDED_IN_LOGS = (
 @pytest.mark.parametrize("fault", DECIDED_IN_LOGS)
 def test_sensor_fault_decided_in_logs_is_never_silently_wrong(tmp_path: Path, truths: Path, fault: str) -> None:
     source = SOURCES[0]
-    log = write_case(Case(0, source.name, "mcap", fault, ""), tmp_path, seed=0)
-    outcome = run_case(log, source.robot, reference_of(source.name, truths), tmp_path / "out")
+    case = Case(0, source.name, "mcap", fault, "")
+    log = write_case(case, tmp_path, seed=0)
+    outcome = run_case(case, log, source.robot, reference_of(source.name, truths), tmp_path / "out")
     assert outcome.kind not in BAD, outcome
     assert outcome.message != ""
 
@@ -60,6 +72,7 @@ def test_hostile_cases_of_one_seed_repeat_and_contain_all_faults() -> None:
     assert {case.file_fault for case in chosen} == {"", *FILE_FAULTS}
     assert {case.form for case in chosen} == set(bags.FORMATS)
     assert {case.source for case in chosen} == {source.name for source in SOURCES}
+    assert all(case.file_fault or case.sensor_fault == "none" or is_affected(case.source, case.sensor_fault) for case in chosen)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from motion_models.calibration.least_squares import FitConfig
+from motion_models.calibration.fit import FitConfig
 from motion_models.calibration.plan import calibrate, free_of
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.online_calibration import corrections

@@ -1,15 +1,17 @@
-"""The gallery: every number of its robots has a source beside it and is the manufacturer's."""
+"""Robot files: shipped ones, their reference, [clock] and the wheels' radius multipliers."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from importlib import resources
 
 import pytest
 
 from localization.cli import main
-from motion_models.robot import DIFF_DRIVE, load_robot, robot_names
-from motion_models.robot_reference import reference
+from motion_models.errors import RobotError
+from motion_models.robot import DIFF_DRIVE, Clock, load_robot, parse_robot, robot_names
+from motion_models.robot_file import reference, robot_toml
 
 # Wheel radius, track, wheelbase [m], mass [kg], product of the driver's track and multiplier [m], from the sources in each file.
 SOURCES = {
@@ -65,7 +67,7 @@ def test_robots_with_a_name_prints_the_file(capsys: pytest.CaptureFixture[str]) 
 
 
 def test_reference_of_robot_files_is_up_to_date() -> None:
-    """Else: python -m motion_models.robot_reference > motion_models/robots/README.md"""
+    """Else: python -m motion_models.robot_file > motion_models/robots/README.md"""
     assert (resources.files("motion_models") / "robots" / "README.md").read_text(encoding="utf-8") == reference()
 
 
@@ -73,3 +75,29 @@ def test_reference_explains_every_key() -> None:
     rows = [line for line in reference().splitlines() if line.startswith("| `")]
     assert len(rows) > 80
     assert all(line.split("|")[-2].strip() for line in rows)
+
+
+def test_robot_toml_clock_and_multipliers_round_trip() -> None:
+    robot = load_robot("husky_a200")
+    geometry = dataclasses.replace(robot.geometry, left_wheel_radius_multiplier=1.01, right_wheel_radius_multiplier=0.99)
+    changed = dataclasses.replace(robot, geometry=geometry, clock=Clock(wheel_time_offset_s=-0.114))
+    assert parse_robot(robot_toml(changed), "test") == changed
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("[clock]\nwheel_time_offset_s = 60.0", "clock.wheel_time_offset_s is 60"),
+        ("[clock]\nwheels = 0.1", "unknown entry wheels"),
+        ('[clock]\nwheel_time_offset_s = "late"', "clock.wheel_time_offset_s must be a finite number"),
+    ],
+)
+def test_parse_robot_bad_clock_is_refused(line: str, message: str) -> None:
+    with pytest.raises(RobotError, match=message):
+        parse_robot(robot_toml(load_robot("husky_a200")).split("\n[clock]")[0] + "\n" + line + "\n", "test")
+
+
+def test_parse_robot_multiplier_far_from_one_is_refused() -> None:
+    text = robot_toml(load_robot("husky_a200")).replace("[geometry]\n", "[geometry]\nleft_wheel_radius_multiplier = 0.0\n")
+    with pytest.raises(RobotError, match="must be near 1"):
+        parse_robot(text, "test")

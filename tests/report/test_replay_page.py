@@ -19,10 +19,19 @@ from PIL import Image
 from localization.errors import OutputError
 from localization.evaluation.references import ReferenceTrack, Relations, with_noise
 from localization.evaluation.scores import Result, score
-from localization.report.figure_data import map_view, nis_means, relation_bins
-from localization.report.replay_page import ReportHead, overview_png, page, verdict, write_report
-from localization.report.runs import baseline_run, best_run, ellipse, plotted_runs, run_with_map, thin_path, thin_series
-from localization.report.tables import MISSING, number, plus_minus, unit_of
+from localization.report.replay_page import MISSING, ReportHead, number, overview_png, page, plus_minus, unit_of, verdict, write_report
+from localization.report.runs import (
+    baseline_run,
+    best_run,
+    ellipse,
+    map_view,
+    nis_means,
+    plotted_runs,
+    relation_bins,
+    run_with_map,
+    thin_path,
+    thin_series,
+)
 from localization.trajectory import Trajectory
 from motion_models import se2
 from tests.helpers.report import HEAD, PageText, chi_square_nis, relations, run, three_runs, track, with_error

@@ -22,8 +22,7 @@ from localization.lidar import LidarConfig
 from localization.lidar.scan_matcher import ScanMatcher
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.checkpoint import CheckpointWriter, fingerprints, read_checkpoint, read_head, write_checkpoint
-from localization.ros.deserialize import deserialize
-from localization.ros.serialize import serialize
+from localization.ros.state_serialization import deserialize, serialize
 from localization.synchronizer import StepConfig
 from motion_models.registry import make_model
 from motion_models.robot import Mount, load_robot

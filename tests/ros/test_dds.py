@@ -22,13 +22,15 @@ from localization.cli import main
 from localization.errors import TransportError
 from localization.logs import open_log
 from localization.pipeline import Trial, replay
-from localization.ros.transports.dds_settings import choose_interface, configuration, default_domain
+from localization.ros.transports.base import default_domain
 from localization.trajectory import read_tum
 from motion_models import se2
 from motion_models.registry import make_model
 from tests.helpers.online import ROBOT, drive_log
 
 pytest.importorskip("cyclonedds", reason="the extra 'ros2' (cyclonedds) is not installed")
+from localization.ros.transports.dds import choose_interface, configuration
+
 pytestmark = pytest.mark.xdist_group("online")
 S = 1_000_000_000
 DOMAIN = 100 + os.getpid() % 100  # not that of another run of these tests

@@ -1,15 +1,30 @@
-"""Levels of diagnostics: latency and covariance of the estimates."""
+"""Levels of diagnostics: latency and covariance of the estimates.
+
+The diagnosis beside a live run: what it reports, and that it stays out of the estimator's way.
+"""
 
 from __future__ import annotations
 
 import functools
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from localization.estimators import Estimate
-from localization.ros.diagnostics import ERROR, OK, WARN, Health
-from tests.helpers.online import drive_events, new_core
+from localization.events import Scan, WheelSample
+from localization.logs import open_log
+from localization.ros.diagnostics import ERROR, OK, WARN, Doctor, Health, Request, Status, diagnose_events
+from localization.ros.publisher import DIAGNOSTICS, ODOMETRY
+from localization.ros.settings import Names, NodeConfig
+from localization.simulation.scanners import ScannerConfig
+from localization.simulation.sensors import SensorConfig
+from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
+from motion_models.robot import load_robot
+from tests.helpers.diagnosis_drives import drive
+from tests.helpers.online import ROBOT, LogTransport, drive_events, drive_log, new_core, published, run_node
 
 
 @functools.cache
@@ -54,3 +69,99 @@ def test_levels_of_a_quiet_drive_are_ok():
             health.add_estimate(estimate, core)
         health.observe_event(event)
     assert [status.level for status in health.statuses(core)] == [OK] * 5
+
+
+def _echo(connection: Connection, request: Request) -> None:
+    count = 0
+    while connection.recv() is not None:
+        count += 1
+    connection.send(Status("diagnosis", WARN, f"{count} events of {request.robot.name}"))
+
+
+def _hang(connection: Connection, request: Request) -> None:
+    time.sleep(600.0)
+
+
+def _wheels(count: int, first_ns: int = 0, period_ns: int = 20_000_000) -> list[WheelSample]:
+    return [WheelSample(first_ns + i * period_ns, np.zeros(2), np.zeros(2)) for i in range(count)]
+
+
+def test_doctor_tyres_differ_reports_remedy(tmp_path: Path) -> None:
+    robot = load_robot("husky_a200")
+    sensors = SensorConfig(scanner=ScannerConfig(rate_hz=5.0, beams=121))
+    path = tmp_path / "drive.mcap"
+    write_simulation(path, Simulation(drive("40s"), robot, 3, {"wheel_radius_difference": -0.02}, SimulationConfig(sensors=sensors)))
+    log = open_log(path, robot)
+    status = diagnose_events(list(log.events()), Request(robot, "friction", dict(log.mounts)))
+    assert status.level == WARN
+    assert "the left wheels are 2" in status.message
+    assert "smaller than the right ones: inflate" in status.message
+    multiplier = float(status.message.split("left_wheel_radius_multiplier = ")[1].split()[0])
+    assert multiplier == pytest.approx(0.99, abs=0.003)
+    assert status.values["finding_1"].startswith("wheel_radius_difference -0.0")
+
+
+def test_doctor_process_receives_thinned_events() -> None:
+    doctor = Doctor(ROBOT, "icr", {}, period_s=60.0, run=_echo)
+    points = np.ones((40_000, 3))
+    for sample in _wheels(6000, period_ns=1_000_000):
+        doctor.observe(sample)
+    for i in range(20):
+        doctor.observe(Scan(i * 100_000_000, points, np.zeros(len(points))))
+    assert max(len(e.points) for e in doctor._events if isinstance(e, Scan)) <= 1500
+    doctor.start()
+    deadline = time.monotonic() + 60.0
+    while doctor.is_running and time.monotonic() < deadline:
+        time.sleep(0.02)
+    (status,) = doctor.statuses()
+    assert status.message == f"{667 + 10} events of {ROBOT.name}"
+    doctor.close()
+
+
+def test_doctor_drops_events_older_than_its_window() -> None:
+    doctor = Doctor(ROBOT, "icr", {}, period_s=60.0)
+    for sample in _wheels(400, period_ns=1_000_000_000):
+        doctor.observe(sample)
+    assert len(doctor._events) == 121
+
+
+def test_doctor_closed_ends_its_process() -> None:
+    doctor = Doctor(ROBOT, "icr", {}, period_s=60.0, run=_hang)
+    doctor.start()
+    deadline = time.monotonic() + 30.0
+    while (doctor._process is None or doctor._process.pid is None) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    doctor.close()
+    assert not doctor.is_running
+
+
+def test_doctor_switched_off_has_no_status() -> None:
+    doctor = Doctor(ROBOT, "icr", {}, period_s=0.0)
+    doctor.observe(_wheels(1)[0])
+    assert doctor.statuses() == []
+    assert not doctor._events
+
+
+def test_doctor_short_drive_reports_why() -> None:
+    doctor = Doctor(ROBOT, "friction", {}, period_s=60.0)
+    assert [s.level for s in doctor.statuses()] == [OK]
+    status = diagnose_events(_wheels(50), Request(ROBOT, "friction", {}))
+    assert status.level == OK
+
+
+def test_node_with_doctor_publishes_the_same_estimates(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("localization.ros.diagnostics._MIN_SPAN_S", 2.0)
+    transports = []
+    for minutes in (0.0, 1e-6):
+        transports.append(LogTransport(drive_log(), lambda messages: messages[: len(messages) // 2]))
+        node, _ = run_node(transports[-1], config=NodeConfig(wait_s=0.0, predict=False, diagnose_every_min=minutes))
+        node._publish_status()
+        assert node._doctor.is_running == (minutes > 0.0)
+        node.finish()
+        assert not node._doctor.is_running
+    plain, watched = transports
+    topic = Names().resolve(ODOMETRY)
+    assert len(plain.published[topic]) > 50
+    assert plain.published[topic] == watched.published[topic]
+    names = [{s.name.rpartition("/")[2].rpartition(" ")[2] for s in m.status} for m in (published(t, DIAGNOSTICS)[-1] for t in transports)]
+    assert names[1] - names[0] == {"diagnosis"}

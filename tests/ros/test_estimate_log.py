@@ -19,8 +19,7 @@ from localization.estimators import Estimate
 from localization.logs.writer import write_fused
 from localization.ros.checkpoint import read_head
 from localization.ros.estimate_log import EstimateLog
-from localization.ros.session import Session, SessionState
-from localization.ros.session_files import Files
+from localization.ros.session import Files, Session, SessionState
 from tests.helpers.disks import files_of_at_most, fill_disk
 from tests.helpers.online import drive_events, drive_log, new_core, reseal
 

@@ -11,7 +11,7 @@ from numba.core.registry import CPUDispatcher
 from localization.ros.jit_warm_up import warm_up
 from localization.ros.node import Node
 from localization.ros.settings import LiveRun, NodeConfig
-from localization.ros.session_files import Files
+from localization.ros.session import Files
 from localization.pipeline import Trial
 from motion_models.registry import make_model
 from tests.helpers.online import ROBOT, LogTransport, drive_log

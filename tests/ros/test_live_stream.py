@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+from localization.commands.online import PlaybackClock
 from localization.errors import CheckpointError, SettingError, TopicError, TransportError
 from localization.estimators import Estimate
 from localization.events import Scan, WheelSample
@@ -23,14 +24,12 @@ from localization.logs.writer import FusedEstimate, transform_message
 from localization.pipeline import Trial, replay
 from localization.ros.checkpoint import CheckpointWriter, read_head
 from localization.ros.diagnostics import ERROR, OK, WARN, degeneracy
+from localization.ros.discovery import TF
 from localization.ros.estimate_log import old_estimate_log
 from localization.ros.node import Node
 from localization.ros.publisher import CORRECTIONS, DIAGNOSTICS, ODOMETRY, EstimatePublisher
-from localization.ros.run_control import PlaybackClock
-from localization.ros.session_files import Files
-from localization.ros.settings import Frames, LiveRun, NodeConfig
-from localization.ros.topic_names import Names
-from localization.ros.transforms import TF
+from localization.ros.session import Files
+from localization.ros.settings import Frames, LiveRun, Names, NodeConfig
 from localization.ros.transports.base import Received, ServiceReply
 from localization.trajectory import read_tum
 from motion_models import se2

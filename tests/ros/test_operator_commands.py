@@ -9,7 +9,7 @@ from localization.logs.serialization import encode, make
 from localization.logs.writer import six_by_six
 from localization.ros.operator_commands import POSE_TYPE
 from localization.ros.publisher import DIAGNOSTICS, MAP, PATH, PREDICTED_ODOMETRY, occupancy_grid
-from localization.ros.session_files import Files
+from localization.ros.session import Files
 from localization.ros.settings import NodeConfig
 from localization.ros.transports.base import Received
 from motion_models import se2

@@ -14,15 +14,14 @@ import pytest
 from ruamel.yaml import YAML
 
 from localization.errors import SettingError
-from localization.ros.parameters import PARAMS_FILE, defaults, make_settings, parameters, to_yaml
-from localization.ros.topic_names import Names
+from localization.ros.settings import PARAMS_FILE, Names, defaults, make_settings, parameters, to_yaml
 
 ROOT = Path(__file__).parents[2]
 LAUNCH = sorted((ROOT / "localization" / "ros" / "launch").glob("*.launch.py"))
 
 
 def test_params_file_is_what_the_settings_make():
-    assert PARAMS_FILE.read_text() == to_yaml()  # else: python -m localization.ros.parameters
+    assert PARAMS_FILE.read_text() == to_yaml()  # else: python -m localization.ros.settings
 
 
 def test_params_file_holds_all_parameters_with_their_types():

@@ -16,7 +16,7 @@ import threading
 import time
 from pathlib import Path
 
-from localization.logs.sources import open_source
+from localization.logs.reader import open_source
 from tests.helpers.online import drive_log
 from tests.ros2.environment import HERE, ROOT, clean_environment, ros2_python
 

@@ -14,8 +14,7 @@ import numpy as np
 
 from motion_models.base import MotionModel
 from motion_models.calibration.cross_validation import HeldOut, cross_validate, root_mean, root_mean_gain
-from motion_models.calibration.fit import Fit, fit
-from motion_models.calibration.least_squares import FitConfig
+from motion_models.calibration.fit import Fit, FitConfig, fit
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import Driver, WheelNoise

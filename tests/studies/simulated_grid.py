@@ -25,8 +25,7 @@ from localization.simulation.simulator import RunRecord, simulate, write_simulat
 from localization.simulation.vehicle import TWIST, Body, VehicleConfig, VehicleState, advance
 from localization.trajectory import IntArray
 from motion_models import se2
-from motion_models.calibration.center_of_rotation import center_from_end_poses
-from motion_models.calibration.regressions import Regression, regress
+from motion_models.calibration.regressions import Regression, center_from_end_poses, regress
 from motion_models.registry import make_model
 from motion_models.robot import Mount, load_robot
 from motion_models.se2 import FloatArray

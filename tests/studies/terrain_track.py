@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from motion_models.calibration.cross_validation import Interval
-from motion_models.calibration.fit import Fit, fit
-from motion_models.calibration.least_squares import FitConfig
+from motion_models.calibration.fit import Fit, FitConfig, fit
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model

@@ -18,13 +18,12 @@ import numpy as np
 
 from motion_models.base import MotionModel
 from motion_models.calibration.cross_validation import cross_validate
-from motion_models.calibration.fit import Fit, fit
-from motion_models.calibration.least_squares import FitConfig
+from motion_models.calibration.fit import Fit, FitConfig, fit
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.calibration.plan import CLOCK, calibrate, free_of
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
-from motion_models.corrected import CorrectedWheels
 from motion_models.errors import CalibrationError
+from motion_models.online_calibration import CorrectedWheels
 from motion_models.registry import make_model
 from motion_models.robot import Robot, load_robot
 from motion_models.se2 import FloatArray

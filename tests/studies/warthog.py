@@ -19,12 +19,12 @@ import numpy as np
 from localization.evaluation.metrics import align
 from motion_models import se2
 from motion_models.base import MotionModel
-from motion_models.calibration.least_squares import FitConfig
+from motion_models.calibration.fit import FitConfig
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.calibration.plan import calibrate, free_of
-from motion_models.corrected import CorrectedWheels
 from motion_models.errors import CalibrationError
 from motion_models.friction import FrictionModel
+from motion_models.online_calibration import CorrectedWheels
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
 from motion_models.se2 import FloatArray

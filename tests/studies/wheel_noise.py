@@ -2,9 +2,9 @@
 
 python -m tests.studies.wheel_noise [--log csail,aces,fr079] [--model diff_drive]
 
-The factors are those that `skidloc calibrate` writes (`motion_models.calibration.noise`), learned on the first half; NIS is of the second
-half, with 3 degrees of freedom. ATE and NEES are of the whole log, NEES with a reference noise of 2 cm and 0.5 deg; for ACES, which has
-relations alone, ATE is their mean translation error.
+The factors are those that `skidloc calibrate` writes (`motion_models.calibration.cross_validation`), learned on the first half; NIS is of
+the second half, with 3 degrees of freedom. ATE and NEES are of the whole log, NEES with a reference noise of 2 cm and 0.5 deg; for ACES,
+which has relations alone, ATE is their mean translation error.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from localization.calibration.motion_references import LidarMotionReference
 from localization.calibration.windows import WindowConfig, cut
 from localization.evaluation.references import ReferenceTrack, with_noise
 from localization.evaluation.scores import score
-from motion_models.calibration.noise import LearnedNoise
+from motion_models.calibration.cross_validation import LearnedNoise
 from motion_models.registry import make_model
 from tests.studies.buildings import BUILDINGS, Drive, errors_of
 

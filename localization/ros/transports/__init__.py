@@ -5,8 +5,8 @@ from __future__ import annotations
 import importlib.util
 from typing import Literal
 
-from localization.ros.topic_names import Names
-from localization.ros.transports.base import Transport
+from localization.ros.settings import Names
+from localization.ros.transports.base import Transport, default_domain
 
 TransportName = Literal["auto", "dds", "rclpy", "zenoh", "rospy"]
 
@@ -14,7 +14,7 @@ TransportName = Literal["auto", "dds", "rclpy", "zenoh", "rospy"]
 def open_transport(kind: TransportName, names: Names, domain: int | None, interface: str | None) -> Transport:
     """The transport ``kind``; `auto` is rclpy where a ROS 2 is sourced, else dds.
 
-    ``domain`` (dds, zenoh): by default that of ROS_DOMAIN_ID, or 0. ``interface``: see `dds_settings.choose_interface`; of zenoh the
+    ``domain`` (dds, zenoh): by default that of ROS_DOMAIN_ID, or 0. ``interface``: see `dds.choose_interface`; of zenoh the
     endpoint of its router. Raises `TransportError`.
     """
     if kind == "auto":
@@ -27,13 +27,11 @@ def open_transport(kind: TransportName, names: Names, domain: int | None, interf
         from localization.ros.transports.rclpy import RclpyTransport
 
         return RclpyTransport(names.name, names.namespace)
-    from localization.ros.transports.dds_settings import choose_interface, default_domain
-
     domain = default_domain() if domain is None else domain
     if kind == "zenoh":
         from localization.ros.transports.zenoh import ZenohTransport
 
         return ZenohTransport(domain, interface, names.name, names.namespace)
-    from localization.ros.transports.dds import DdsTransport
+    from localization.ros.transports.dds import DdsTransport, choose_interface
 
     return DdsTransport(domain, choose_interface(interface), names.name, names.namespace)

@@ -1,10 +1,19 @@
-"""What a transport to a robot must do: bytes of topics in and out. All else is the same for ROS 2 and ROS 1 (`node`)."""
+"""What a transport to a robot must do: bytes of topics in and out; their times by the system's clock or a simulated one."""
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Collection, Mapping
 from typing import NamedTuple, Protocol
+
+from localization.errors import TransportError
+from localization.logs.decode import UnusableError
+from localization.logs.serialization import decoder
+
+LAST_DOMAIN = 230
+
+CLOCK, CLOCK_TYPE = "/clock", "rosgraph_msgs/msg/Clock"
 
 
 class Received(NamedTuple):
@@ -46,7 +55,8 @@ class Transport(Protocol):
     def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
         """Open ``topic`` for `publish`. ``is_latched``: the last message is kept for those who subscribe later."""
 
-    def publish(self, topic: str, data: bytes) -> None: ...
+    def publish(self, topic: str, data: bytes) -> None:
+        """Send a message on a topic that was advertised; it never waits for those who receive it."""
 
     def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
         """Answer requests of ``kind`` (`std_srvs/srv/Trigger`) by ``handler``, inside `take`; False where the transport has no services."""
@@ -67,7 +77,8 @@ class Transport(Protocol):
     def epoch_ns(self) -> int:
         """What turns that clock into the time of ROS, which stamps are compared with."""
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Leave the network. No other method may be called afterwards."""
 
 
 class MonotonicTime:
@@ -76,13 +87,90 @@ class MonotonicTime:
     _epoch_ns: int | None = None
 
     def now_ns(self) -> int:
+        """As `Transport.now_ns`."""
         return time.monotonic_ns()
 
     @property
     def epoch_ns(self) -> int:
+        """As `Transport.epoch_ns`, read once: a wall clock that is set meanwhile moves nothing."""
         if self._epoch_ns is None:
             self._epoch_ns = time.time_ns() - time.monotonic_ns()
         return self._epoch_ns
 
     def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
+        """Never: there are no services."""
         return False
+
+
+def default_domain(environment: Mapping[str, str] = os.environ) -> int:
+    """ROS 2's domain by ROS_DOMAIN_ID, 0 without it. Raises `TransportError`."""
+    value = environment.get("ROS_DOMAIN_ID") or "0"
+    if not (value.isdecimal() and int(value) <= LAST_DOMAIN):
+        raise TransportError(
+            f"ROS_DOMAIN_ID is '{value}'; ROS 2's domains are the numbers 0 to {LAST_DOMAIN}. Correct it, or pass --domain."
+        )
+    return int(value)
+
+
+class SimTimeTransport:
+    """See `Transport`. Messages before the first of /clock are dropped, for their time is not known (use_sim_time of ROS 2)."""
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport, self._now_ns = transport, 0
+        self._decode = decoder(CLOCK_TYPE, is_ros1=transport.is_ros1)
+        self.is_ros1, self.place, self.elsewhere = transport.is_ros1, transport.place, transport.elsewhere
+        transport.subscribe(CLOCK, CLOCK_TYPE, is_latched=False)
+
+    def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
+        """As the wrapped transport's."""
+        self._transport.subscribe(topic, kind, is_latched=is_latched)
+
+    def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
+        """As the wrapped transport's; /clock stays."""
+        self._transport.restrict([*topics, CLOCK], urgent)
+
+    def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
+        """As the wrapped transport's."""
+        self._transport.advertise(topic, kind, is_latched=is_latched)
+
+    def publish(self, topic: str, data: bytes) -> None:
+        """As the wrapped transport's."""
+        self._transport.publish(topic, data)
+
+    def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
+        """As the wrapped transport's."""
+        return self._transport.offer_service(name, kind, handler)
+
+    def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
+        """At once: times of batches would be those of the wall."""
+        found = []
+        for received in self._transport.take(timeout_s):
+            if received.topic == CLOCK:
+                self._set_clock(received.data)
+            elif self._now_ns or received.topic.endswith("tf_static"):
+                found.append(received._replace(received_ns=self._now_ns))
+        return found
+
+    def _set_clock(self, data: bytes) -> None:
+        try:
+            clock = self._decode(data).clock
+        except UnusableError:
+            return
+        self._now_ns = clock.sec * 10**9 + clock.nanosec
+
+    def publishers(self) -> Mapping[str, set[str]]:
+        """As the wrapped transport's, without /clock."""
+        return {topic: kinds for topic, kinds in self._transport.publishers().items() if topic != CLOCK}
+
+    def now_ns(self) -> int:
+        """The newest time of /clock; 0 before the first."""
+        return self._now_ns
+
+    @property
+    def epoch_ns(self) -> int:
+        """0: /clock is the time of ROS."""
+        return 0
+
+    def close(self) -> None:
+        """As the wrapped transport's."""
+        self._transport.close()

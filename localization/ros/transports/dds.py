@@ -1,15 +1,18 @@
-"""ROS 2 topics without a ROS installation: DDS through cyclonedds (extra `ros2`).
+"""ROS 2 topics without a ROS installation: DDS through cyclonedds (extra `ros2`), as ROS 2's own middlewares interoperate with it.
 
 A ROS 2 topic `/scan` is DDS's `rt/scan`, a type `pkg/msg/Type` is `pkg::msg::dds_::Type_`. Messages pass as bytes, which
 `logs.serialization` reads and writes as it does those of logs; cyclonedds gets the types' fields only for peers that ask for them.
 
 There are no services: Fast DDS relates a reply to its request by an inline QoS of the sample (related_sample_identity), which cyclonedds's
 Python API cannot write. A service that is discovered but never answers would be worse than none.
+
+Every setting of Cyclone DDS was found necessary with Fast DDS 2.14 (Jazzy) or 3.2 (Kilted) as the other side.
 """
 
 from __future__ import annotations
 
 import contextlib
+import difflib
 import functools
 import os
 import re
@@ -18,13 +21,13 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from localization.errors import TransportError
 from localization.logs.serialization import Shape, encode, fields, make, type_hash
-from localization.ros.transports.base import MonotonicTime, Received
-from localization.ros.transports.dds_settings import LAST_DOMAIN, LOOPBACK, configuration
+from localization.ros.transports.base import LAST_DOMAIN, MonotonicTime, Received
 
 try:
     import cyclonedds.core as dds
@@ -46,6 +49,22 @@ _FASTEST_DRIFT = 1e-4  # of one clock against another
 _TYPE = re.compile(r"(\w+)::(?:msg::)dds_::(\w+)_")
 _GRAPH_TOPIC, _GRAPH_TYPE = "ros_discovery_info", "rmw_dds_common/msg/ParticipantEntitiesInfo"
 
+LOOPBACK, DEFAULT = "lo", "default"
+_LOOPBACK_NAMES = ("lo", "localhost", "127.0.0.1")
+_RANGES = ("LOCALHOST", "SUBNET", "SYSTEM_DEFAULT", "OFF")
+
+# Fast DDS 3.2 sends type objects that Cyclone 11 cannot parse (`ddsi_xt_type_add_typeobj with invalid type object`): nothing is delivered.
+# Topics are matched by type name here, so that they are not needed. 1.15: messages of Fast DDS (vendor 1.15) only.
+_COMPATIBILITY = "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
+# A cloud of 4 MB is one burst of datagrams. The kernel grants at most net.core.rmem_max; less is no error.
+_BUFFER = '<Internal><SocketReceiveBufferSize min="default" max="4MB"/></Internal>'
+# Without multicast a participant is found only by asking its port. By default Cyclone stops asking after 30 s: robots that start later, or
+# again, were never found (9 of 9 restarts); like this they are within 0.5 s.
+_ASKING = (
+    "<SPDPInterval>1s</SPDPInterval><InitialLocatorPruneDelay>inf</InitialLocatorPruneDelay>"
+    "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>"
+)
+
 
 class DdsTransport(MonotonicTime):
     """See `Transport`. One participant with one node, ``name`` in ``namespace``, which ROS 2's node list shows."""
@@ -53,7 +72,7 @@ class DdsTransport(MonotonicTime):
     is_ros1 = False
 
     def __init__(self, domain: int = 0, interface: str = LOOPBACK, name: str = "skidloc", namespace: str = "/") -> None:
-        """``interface`` is one of `dds_settings.choose_interface`; `lo` leaves nothing open to other machines. Raises `TransportError`."""
+        """``interface`` is one of `choose_interface`; `lo` leaves nothing open to other machines. Raises `TransportError`."""
         if not 0 <= domain <= LAST_DOMAIN:
             raise TransportError(f"the domain is {domain}; ROS 2's domains are 0 to {LAST_DOMAIN}.")
         self.place = f"domain {domain} on interface {interface}"
@@ -75,6 +94,7 @@ class DdsTransport(MonotonicTime):
         self._graph = None if os.environ.get("ROS_DISTRO") == "humble" else self._writer(_GRAPH_TOPIC, _GRAPH_TYPE, _latched_output())
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
+        """As `Transport.subscribe`: transient local and reliable where ``is_latched``, else best effort."""
         quality = _latched() if is_latched else _sensor_data()
         reader = DataReader(self._participant, self._topic(_dds_name(topic), kind), _hashed(quality, kind))
         is_new = dds.ReadCondition(reader, dds.ViewState.Any | dds.InstanceState.Any | dds.SampleState.NotRead)
@@ -83,6 +103,7 @@ class DdsTransport(MonotonicTime):
         self._publish_graph()
 
     def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
+        """As `Transport.restrict`."""
         for topic, _, is_new in self._readers:
             if topic not in topics:
                 self._waiting.detach(is_new)
@@ -92,10 +113,12 @@ class DdsTransport(MonotonicTime):
         self._publish_graph()
 
     def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
+        """As `Transport.advertise`: reliable, and transient local where ``is_latched``."""
         self._writers[topic] = self._writer(_dds_name(topic), kind, _latched_output() if is_latched else _reliable())
         self._publish_graph()
 
     def publish(self, topic: str, data: bytes) -> None:
+        """As `Transport.publish`; a reader that is too slow loses the message."""
         _write(self._writers[topic], data)
 
     def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
@@ -117,6 +140,7 @@ class DdsTransport(MonotonicTime):
         return [received for _, received in found]
 
     def publishers(self) -> Mapping[str, set[str]]:
+        """As `Transport.publishers`, by what came since the last call."""
         found: dict[str, set[str]] = {}
         for publication in self._found.read(1000):
             if publication.sample_info.instance_state != dds.InstanceState.Alive:
@@ -127,6 +151,7 @@ class DdsTransport(MonotonicTime):
         return found
 
     def close(self) -> None:
+        """As `Transport.close`."""
         self._readers.clear()
         self._writers.clear()
         self._topics.clear()
@@ -297,3 +322,81 @@ def _sockets() -> set[int]:
             if str(entry.readlink()).startswith("socket:"):
                 found.add(int(entry.name))
     return found
+
+
+def choose_interface(interface: str | None, environment: Mapping[str, str] = os.environ) -> str:
+    """`lo`, `default`, or the name or address of one network interface.
+
+    ``interface``: `lo` or `localhost`, `default` (what ROS_LOCALHOST_ONLY and ROS_AUTOMATIC_DISCOVERY_RANGE demand, the subnet without
+    them), a device or an address; None as `default`, but `lo` where neither variable is set. Raises `TransportError`.
+    """
+    if interface in _LOOPBACK_NAMES:
+        return LOOPBACK
+    if interface is None or interface == DEFAULT:
+        return _interface_of_environment(environment, unset=LOOPBACK if interface is None else DEFAULT)
+    devices = [name for _, name in socket.if_nameindex()]
+    if interface not in devices and not _is_address(interface):
+        near = difflib.get_close_matches(interface, [*devices, *_LOOPBACK_NAMES, DEFAULT], n=1)
+        nearest = f" Did you mean '{near[0]}'?" if near else ""
+        raise TransportError(
+            f"DDS cannot be used on interface '{interface}': there are {', '.join(devices)}.{nearest} "
+            "--interface also takes localhost, default, or an address of this machine."
+        )
+    return interface
+
+
+def _interface_of_environment(environment: Mapping[str, str], unset: str) -> str:
+    """ROS_LOCALHOST_ONLY goes before ROS_AUTOMATIC_DISCOVERY_RANGE, as in rcl."""
+    if environment.get("ROS_LOCALHOST_ONLY") == "1":
+        return LOOPBACK
+    reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
+    if not reach:
+        return unset
+    if reach not in _RANGES:
+        near = difflib.get_close_matches(reach, _RANGES, n=1)
+        nearest = f" Did you mean {near[0]}?" if near else ""
+        raise TransportError(f"ROS_AUTOMATIC_DISCOVERY_RANGE is '{reach}'; it may be {', '.join(_RANGES)}.{nearest}")
+    if reach == "OFF":
+        raise TransportError(
+            "ROS_AUTOMATIC_DISCOVERY_RANGE is OFF: no topic can be discovered. Set it to LOCALHOST or SUBNET, or pass --interface."
+        )
+    return LOOPBACK if reach == "LOCALHOST" else DEFAULT
+
+
+def configuration(interface: str, environment: Mapping[str, str] = os.environ) -> str:
+    """Configuration of a domain for Cyclone DDS: XML fragments, of which later ones overrule earlier ones.
+
+    ``interface`` is one of `choose_interface`. For `default` the user's CYCLONEDDS_URI comes last; the others leave it out, for it may name
+    another interface.
+    """
+    peers = _static_peers(environment)
+    if interface == LOOPBACK:
+        return _xml("<Interfaces><NetworkInterface address='127.0.0.1'/></Interfaces><AllowMulticast>false</AllowMulticast>", ["127.0.0.1"])
+    # A participant with ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST on this machine is reached at the loopback address only.
+    if interface == DEFAULT:
+        uri = environment.get("CYCLONEDDS_URI", "")
+        return _xml("", ["localhost", *peers]) + ("," + uri if uri else "")
+    chosen = f"address={quoteattr(interface)}" if _is_address(interface) else f"name={quoteattr(interface)}"
+    return _xml(f"<Interfaces><NetworkInterface {chosen}/></Interfaces>", peers)
+
+
+def _xml(general: str, peers: Sequence[str]) -> str:
+    listed = "".join(f"<Peer address={quoteattr(peer)}/>" for peer in peers)
+    discovery = _ASKING + (f"<Peers>{listed}</Peers>" if listed else "")
+    parts = f"{_COMPATIBILITY}<General>{general}</General><Discovery>{discovery}</Discovery>{_BUFFER}"
+    return f"<CycloneDDS><Domain>{parts}</Domain></CycloneDDS>"
+
+
+def _static_peers(environment: Mapping[str, str]) -> list[str]:
+    """Of ROS_STATIC_PEERS, which are parted by semicolons."""
+    return [peer.strip() for peer in environment.get("ROS_STATIC_PEERS", "").split(";") if peer.strip()]
+
+
+def _is_address(text: str) -> bool:
+    for family in (socket.AF_INET, socket.AF_INET6):
+        try:
+            socket.inet_pton(family, text)
+        except OSError:
+            continue
+        return True
+    return False

@@ -63,6 +63,7 @@ class RclpyTransport(MonotonicTime):
         self._services: list[Any] = []
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
+        """As `Transport.subscribe`: transient local and reliable where ``is_latched``, else best effort."""
         q = self._qos
         quality = q.QoSProfile(
             depth=_LATCHED_DEPTH if is_latched else _LATEST,
@@ -76,15 +77,19 @@ class RclpyTransport(MonotonicTime):
         self._subscriptions[topic] = self._node.create_subscription(_interface_class(kind), topic, on_message, quality, raw=True)
 
     def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
+        """As `Transport.restrict`; none is urgent, for `take` waits for no batch."""
         for topic in set(self._subscriptions) - set(topics):
             self._node.destroy_subscription(self._subscriptions.pop(topic))
 
     def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
+        """As `Transport.advertise`: reliable, and transient local where ``is_latched``."""
         q = self._qos
         latched = q.QoSProfile(depth=1, reliability=q.ReliabilityPolicy.RELIABLE, durability=q.DurabilityPolicy.TRANSIENT_LOCAL)
         self._writers[topic] = self._node.create_publisher(_interface_class(kind), topic, latched if is_latched else _DEPTH)
 
     def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
+        """As `Transport.offer_service`; always offered."""
+
         def answer(request: Any, response: Any) -> Any:
             reply = handler(getattr(request, "data", True))
             if hasattr(response, "success"):
@@ -95,9 +100,11 @@ class RclpyTransport(MonotonicTime):
         return True
 
     def publish(self, topic: str, data: bytes) -> None:
+        """As `Transport.publish`."""
         self._writers[topic].publish(data)
 
     def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
+        """In the order in which the executor has them; ``batch_s`` is not used."""
         self._executor.spin_once(timeout_sec=timeout_s)
         while self._received:
             before = len(self._received)
@@ -114,6 +121,7 @@ class RclpyTransport(MonotonicTime):
         return {topic: kinds for topic, kinds in found.items() if kinds}
 
     def close(self) -> None:
+        """As `Transport.close`; a node that was given lives on."""
         self.release()
         self._executor.remove_node(self._node)
         self._executor.shutdown()

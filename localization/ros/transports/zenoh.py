@@ -65,6 +65,7 @@ class ZenohTransport(MonotonicTime):
         self._discovery = self._session.liveliness().declare_subscriber(tokens, self._on_token, history=True)
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
+        """As `Transport.subscribe`: with the history of late publishers where ``is_latched``."""
         key = f"{self._domain}{topic}/{_dds_type(kind)}/*"  # any hash: that of Humble is none
 
         def on_sample(sample: Any) -> None:
@@ -84,12 +85,14 @@ class ZenohTransport(MonotonicTime):
         self._subscribers[topic] = [subscriber, self._session.liveliness().declare_token(self._token("MS", topic, kind, quality))]
 
     def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
+        """As `Transport.restrict`."""
         self._urgent = frozenset(urgent)
         for topic in set(self._subscribers) - set(topics):
             for declared in self._subscribers.pop(topic):
                 declared.undeclare()
 
     def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
+        """As `Transport.advertise`: with a cache of one message where ``is_latched``."""
         token = self._token("MP", topic, kind, _LATCHED.format(1) if is_latched else _RELIABLE.format(_DEPTH))
         key = f"{self._domain}{topic}/{_dds_type(kind)}/{type_hash(kind)}"
         cache = ext.CacheConfig(1) if is_latched else None
@@ -97,6 +100,7 @@ class ZenohTransport(MonotonicTime):
         self._writers[topic] = _Writer(publisher, self._session.liveliness().declare_token(token), token)
 
     def publish(self, topic: str, data: bytes) -> None:
+        """As `Transport.publish`."""
         self._writers[topic].put(data)
 
     def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
@@ -113,6 +117,7 @@ class ZenohTransport(MonotonicTime):
             return [received for _, received in sorted(found, key=lambda entry: entry[0])]
 
     def publishers(self) -> Mapping[str, set[str]]:
+        """As `Transport.publishers`, by the liveliness tokens of other sessions."""
         found: dict[str, set[str]] = {}
         with self._lock:
             entries = list(self._published.values())
@@ -122,6 +127,7 @@ class ZenohTransport(MonotonicTime):
         return found
 
     def close(self) -> None:
+        """As `Transport.close`."""
         self._session.close()
 
     def _drop_oldest(self) -> None:

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from localization.logs.decode import UnusableError
-from localization.logs.fast_cdr import FusedWriter, fast_decoder
-from localization.logs.serialization import decoder, encode, make
+from localization.logs.serialization import FusedWriter, decoder, encode, fast_decoder, make
 from localization.logs.writer import FusedEstimate, odometry_message, transform_message
 from tests.helpers.bags import STORE
 

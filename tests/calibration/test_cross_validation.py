@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from motion_models import se2
-from motion_models.calibration.fit import Fit, fit
-from motion_models.calibration.least_squares import FitConfig
+from motion_models.calibration.cross_validation import learn_noise
+from motion_models.calibration.fit import Fit, FitConfig, fit
 from motion_models.calibration.maneuvers import Maneuver
-from motion_models.calibration.noise import learn_noise
 from motion_models.preintegration import preintegrate
 from motion_models.registry import make_model
 from motion_models.robot import WheelNoise, load_robot

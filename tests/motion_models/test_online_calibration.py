@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from motion_models.corrected import RADIUS_NAMES, CorrectedWheels
 from motion_models.errors import ModelError
-from motion_models.online_calibration import correctable, corrections
+from motion_models.online_calibration import RADIUS_NAMES, CorrectedWheels, correctable, corrections
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import load_robot
 

@@ -8,8 +8,7 @@ import pytest
 from localization.logs.serialization import encode, make
 from localization.ros.publisher import ODOMETRY
 from localization.ros.settings import NodeConfig
-from localization.ros.transports.base import Received
-from localization.ros.transports.sim_time import CLOCK, CLOCK_TYPE, SimTimeTransport
+from localization.ros.transports.base import CLOCK, CLOCK_TYPE, Received, SimTimeTransport
 from tests.helpers.online import LogTransport, drive_log, run_node, track
 
 S = 1_000_000_000

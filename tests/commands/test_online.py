@@ -9,7 +9,7 @@ import pytest
 from rich.cells import cell_len
 from rich.console import Console
 
-from localization.commands.online_terminal import terminal_view
+from localization.commands.online import terminal_view
 from localization.ros.diagnostics import ERROR, WARN, Status
 from tests.helpers.online import LogTransport, drive_log, run_node
 

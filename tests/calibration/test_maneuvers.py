@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from motion_models import se2
-from motion_models.calibration.maneuvers import Maneuver
-from motion_models.calibration.windows_table import without_turned_frames
+from motion_models.calibration.maneuvers import Maneuver, without_turned_frames
 from motion_models.errors import CalibrationError
 from tests.studies import drive_husky
 

@@ -9,11 +9,10 @@ import pytest
 
 from localization.estimators import Estimate
 from localization.events import WheelSample
-from localization.ros.predictor import Predictor
-from localization.ros.publisher import ODOMETRY, POSE, PREDICTED_ODOMETRY
-from localization.ros.session_files import Files
+from localization.ros.discovery import TF
+from localization.ros.publisher import ODOMETRY, POSE, PREDICTED_ODOMETRY, Predictor
+from localization.ros.session import Files
 from localization.ros.settings import NodeConfig
-from localization.ros.transforms import TF
 from localization.trajectory import read_tum
 from motion_models import se2
 from motion_models.registry import make_model

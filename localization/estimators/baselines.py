@@ -1,4 +1,4 @@
-"""LiDAR alone: KISS-ICP as it comes, from its own constant-velocity guess. A baseline; wheels are not used."""
+"""Baselines: dead reckoning by the motion model alone, and LiDAR alone (KISS-ICP as it comes). Neither fuses anything."""
 
 from __future__ import annotations
 
@@ -7,20 +7,39 @@ from collections.abc import Mapping
 import numpy as np
 
 from localization.errors import EstimatorError
-from localization.estimators.base import NO_POINTS, Estimate, Estimator
+from localization.estimators.base import NO_POINTS, Estimate, Estimator, mean_twist
+from localization.events import Step
 from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
 from localization.lidar.scan_matcher import MIN_POINTS
-from localization.step import Step
 from motion_models import se2
 from motion_models.robot import Mount
-from motion_models.types import Points2
+from motion_models.se2 import Points2
 
 _FALLBACK_VOXEL_M = 0.5
 """Voxel where the first scan has too few points to choose one."""
 
 
+class DeadReckoning(Estimator):
+    """Composes the predicted motions; the covariance follows P' = Ad(delta^-1) P Ad(delta^-1)^T + Q."""
+
+    def __init__(self) -> None:
+        self._pose, self._cov = np.zeros(3), np.zeros((3, 3))
+
+    def step(self, step: Step) -> Estimate:
+        """As `Estimator.step`."""
+        motion = step.predicted
+        A = se2.adjoint(se2.inverse(motion.delta))
+        self._pose = se2.compose(self._pose, motion.delta)
+        self._cov = A @ self._cov @ A.T + motion.cov
+        twist, twist_cov = mean_twist(motion.delta, motion.cov, step.duration) if step.duration > 0 else (step.twist, None)
+        return Estimate(step.end_ns, self._pose, self._cov, twist, twist_cov)
+
+
 class LidarOdometry(Estimator):
-    """A pose for each scan; between scans it stays where it was. No covariance: KISS-ICP has none."""
+    """A pose for each scan; between scans it stays where it was. No covariance: KISS-ICP has none.
+
+    ``mounts`` of the LiDARs are by frame; a frame without one is the body's.
+    """
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig | None = None) -> None:
         self._mounts, self._config = mounts, config or LidarConfig()
