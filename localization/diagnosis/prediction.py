@@ -114,6 +114,8 @@ class DrivePredictor:
     has_inertia: bool
     baseline: Hypothesis = field(default_factory=Hypothesis)
     """How the robot differs from its file when nothing is wrong (`localization.diagnosis.baseline`); hypotheses count from there."""
+    is_gyro_scaled: bool = False
+    """Whether headings are corrected by the gyro's scale against the motion reference: turning for a minute, 1 % makes 0.1 rad."""
     batch: Batch = field(init=False)
     headings: FloatArray = field(init=False)
     """(W,) at the start of each maneuver, counted from the first [rad]."""
@@ -154,7 +156,7 @@ class DrivePredictor:
         return int(np.count_nonzero(np.diff(self._lost, axis=0) > 0.0))
 
     def _headings(self) -> FloatArray:
-        """By the gyro less its bias and scale against the motion reference; else by the reference's own turns, one after the other."""
+        """By the gyro less its bias (and scale) against the motion reference; else by the reference's own turns, one after the other."""
         batch, drive = self.batch, self.drive
         last = np.r_[batch.owner[1:] != batch.owner[:-1], True]
         yaw = batch.measured[last, 2]
@@ -162,9 +164,11 @@ class DrivePredictor:
             turns = [drive.gyro.turn(int(a), int(b), float(t)) for (a, b), t in zip(drive.spans_ns, yaw, strict=True)]
             known = [(t.angle - y, y, t.duration) for t, y in zip(turns, yaw, strict=True) if t is not None]
             if known:
-                prior = (0.0, _GYRO_TURN_SIGMA_RAD / _GYRO_SCALE_SIGMA, 0.0)  # of the scale, where the robot hardly turns
-                off, *columns = np.array([*known, prior]).T
-                (scale, bias), *_ = np.linalg.lstsq(np.column_stack(columns), off, rcond=None)
+                scale, bias = 0.0, sum(k[0] for k in known) / sum(k[2] for k in known)
+                if self.is_gyro_scaled:
+                    prior = (0.0, _GYRO_TURN_SIGMA_RAD / _GYRO_SCALE_SIGMA, 0.0)  # of the scale, where the robot hardly turns
+                    off, *columns = np.array([*known, prior]).T
+                    (scale, bias), *_ = np.linalg.lstsq(np.column_stack(columns), off, rcond=None)
                 origin = int(drive.spans_ns[0, 0])
                 found = [drive.gyro.turn(origin, int(a), 0.0) for a in drive.spans_ns[:, 0]]
                 return np.array([0.0 if t is None else (t.angle - bias * t.duration) / (1.0 + scale) for t in found])

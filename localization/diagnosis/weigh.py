@@ -158,7 +158,7 @@ def weigh(drive: Drive) -> tuple[DrivenWeighing, DrivePredictor]:
     """
     turned = _check(drive)
     robot = drive.robot
-    predictor = make_predictor(drive, make_model("friction", robot))
+    predictor = dataclasses.replace(make_predictor(drive, make_model("friction", robot)), is_gyro_scaled=True)
     estimate = estimate_map(predictor, _causes(predictor, robot))
     causes, values, cov = estimate.causes, estimate.sizes, estimate.covariance
     ratio = _noise_ratio(predictor, estimate.linearization)
