@@ -13,6 +13,7 @@ from rich.table import Table
 from localization.calibration.calibrate import MotionReferenceName
 from localization.calibration.windows import WindowConfig
 from localization.commands.common import new_folder, write_json
+from localization.diagnosis.baseline import estimate_baseline
 from localization.diagnosis.corrected_robot import correct_robot
 from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_runs, drive_of_table, read_runs
@@ -49,6 +50,9 @@ class Diagnose:
     """What measured the real motion in logs: the reference if one is named, else the LiDAR, else the gyro (headings alone)."""
     reference: str | None = None
     """Topic or TUM file with positions and headings, as the motion reference. Never used unless named."""
+    healthy: Annotated[Path | None, tyro.conf.arg(metavar="LOG")] = None
+    """Log of the same robot without a fault, about two minutes of arcs and turns: causes then count from how it moved there, and not from
+    the robot file."""
     window_s: float = 2.0
     """Length of the windows that logs are cut into [s]."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
@@ -65,8 +69,12 @@ class Diagnose:
         model = make_model(self.model or default_model(robot), robot)
         with console.status("reading"):
             drive = self._drive(robot)
+        baseline = None
+        if self.healthy is not None:
+            with console.status("reading the healthy drive"):
+                baseline = estimate_baseline(self._drive_of_log(self.healthy, robot), model)
         with console.status("searching for causes"):
-            found = examine(drive, model, self.config)
+            found = examine(drive, model, self.config, baseline)
         print_diagnosis(console, found.diagnosis)
         content = found.diagnosis.to_dict()
         if self.out is not None:
@@ -81,9 +89,9 @@ class Diagnose:
     def _drive(self, robot: Robot) -> Drive:
         name = self.source.name
         if self.source.suffix.lower() != ".csv":
-            return drive_of_log(
-                open_log(self.source, robot, self.topic), self.motion_reference, self.reference, WindowConfig(window_s=self.window_s)
-            )
+            return self._drive_of_log(self.source, robot)
+        if self.healthy is not None:
+            raise CalibrationError(f"{name} is a table: --healthy takes the log of another drive to compare a log with.")
         columns = table_columns(self.source)
         if "vision_error_m" in columns:
             return drive_of_runs(name, robot, read_runs(self.source))
@@ -91,6 +99,10 @@ class Diagnose:
             maneuvers = rotations_as_maneuvers(read_rotation_table(self.source), robot)
             return drive_of_table(name, robot, maneuvers, "rotations")
         return drive_of_table(name, robot, read_windows(self.source), "windows")
+
+    def _drive_of_log(self, path: Path, robot: Robot) -> Drive:
+        log = open_log(path, robot, self.topic)
+        return drive_of_log(log, self.motion_reference, self.reference, WindowConfig(window_s=self.window_s))
 
     def _write_robot(self, folder: Path, found: DiagnosisResult, robot: Robot) -> None:
         d = found.diagnosis

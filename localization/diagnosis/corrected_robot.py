@@ -94,7 +94,8 @@ def check_handover(predictor: DrivePredictor, linearization: Linearization, name
     factors = corrected.robot.geometry.radius_multipliers / drive.robot.geometry.radius_multipliers
     maneuvers = tuple(dataclasses.replace(m, wheels=m.wheels * factors, cg=m.cg + corrected.cg_shift) for m in drive.maneuvers)
     model = make_model(predictor.model.name, corrected.robot)
-    after = DrivePredictor(dataclasses.replace(drive, robot=corrected.robot, maneuvers=maneuvers), model, has_inertia=predictor.has_inertia)
+    corrected_drive = dataclasses.replace(drive, robot=corrected.robot, maneuvers=maneuvers)
+    after = DrivePredictor(corrected_drive, model, has_inertia=predictor.has_inertia, baseline=predictor.baseline)
     rows = predictor.discrepancies(Hypothesis()), after.discrepancies(_of_sensors(hypothesis))
     shown = [c for c in range(3) if all(np.isfinite(r[half:, c]).any() for r in rows)]
     if not shown:

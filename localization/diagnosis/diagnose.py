@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localization.diagnosis.causes import MISSING_MESSAGES, Cause
+from localization.diagnosis.causes import MISSING_MESSAGES, Cause, Hypothesis
 from localization.diagnosis.corrected_robot import check_handover
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain, describe_loss, describe_standstill_turn, evidence, sentence
@@ -83,18 +83,19 @@ class DiagnosisResult:
     """The last linearization of the drive: its signatures, and its noise."""
 
 
-def diagnose(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None) -> Diagnosis:
-    """What is wrong with ``model`` on ``drive``, why, and the gain of correcting it."""
-    return examine(drive, model, config).diagnosis
+def diagnose(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None, baseline: Hypothesis | None = None) -> Diagnosis:
+    """What is wrong with ``model`` on ``drive``, why, and the gain of correcting it; causes count from ``baseline``, by default the robot
+    file (see `localization.diagnosis.baseline`)."""
+    return examine(drive, model, config, baseline).diagnosis
 
 
-def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None) -> DiagnosisResult:
+def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None, baseline: Hypothesis | None = None) -> DiagnosisResult:
     """The same, with what pictures, patches and other methods start from."""
     config = config or DiagnosisConfig()
     if len(drive.maneuvers) < config.fewest_windows:
         why = f"only {len(drive.maneuvers)} windows of motion were measured; it takes {config.fewest_windows}."
         return DiagnosisResult(_undecidable(drive, model, drive.warnings[0] if drive.motion_reference == "none" else why), None, None)
-    predictor = make_predictor(drive, model)
+    predictor = make_predictor(drive, model, baseline)
     causes = candidate_causes(predictor, config.moments)
     first = linearize(predictor, causes, {}, TOLERANCES[0])
     found = _diagnose_within(predictor, first, config)

@@ -276,12 +276,14 @@ def default_model(robot: Robot) -> str:
     return FrictionModel.name if is_skid_steer(robot) else DiffDrive.name
 
 
-def make_predictor(drive: Drive, model: MotionModel) -> DrivePredictor:
-    """With inertia where that describes the drive better (or is what the friction model leaves out by its nature)."""
-    plain = DrivePredictor(drive, model, has_inertia=False)
+def make_predictor(drive: Drive, model: MotionModel, baseline: Hypothesis | None = None) -> DrivePredictor:
+    """From ``baseline`` (by default the robot file), with inertia where that describes the drive better, or is what the friction model
+    leaves out by its nature."""
+    start = baseline or Hypothesis()
+    plain = DrivePredictor(drive, model, has_inertia=False, baseline=start)
     if drive.kind != "log" or not is_skid_steer(drive.robot):
         return plain
-    with_inertia = DrivePredictor(drive, model, has_inertia=True)
+    with_inertia = DrivePredictor(drive, model, has_inertia=True, baseline=start)
     squares = []
     for predictor in (plain, with_inertia):
         rows = predictor.discrepancies(Hypothesis())[:, :3]

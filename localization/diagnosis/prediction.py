@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numba
 import numpy as np
@@ -92,6 +94,8 @@ def _like(a: float, b: float) -> bool:
 CHANNELS = ("x", "y", "yaw", "gyro", "force_x", "force_y")
 CHANNEL_UNITS = ("m", "m", "rad", "rad", "m/s^2", "m/s^2")
 _GRAVITY = 9.81
+_GYRO_TURN_SIGMA_RAD = 1e-3  # of a window's turn by the gyro against the motion reference
+_GYRO_SCALE_SIGMA = 0.03  # sensitivity tolerance of MEMS gyros (see `causes`)
 _MAX_CACHED_TWISTS = 100
 _MAX_CONTACT_LAW = 1.3  # share of the other contact law; beyond 1 for the search only
 _NO_COLUMNS: IntArray = np.empty(0, dtype=np.int64)
@@ -108,6 +112,10 @@ class DrivePredictor:
     drive: Drive
     model: MotionModel
     has_inertia: bool
+    baseline: Hypothesis = field(default_factory=Hypothesis)
+    """How the robot differs from its file when nothing is wrong (`localization.diagnosis.baseline`); hypotheses count from there."""
+    is_gyro_scaled: bool = False
+    """Whether headings are corrected by the gyro's scale against the motion reference: turning for a minute, 1 % makes 0.1 rad."""
     batch: Batch = field(init=False)
     headings: FloatArray = field(init=False)
     """(W,) at the start of each maneuver, counted from the first [rad]."""
@@ -148,18 +156,22 @@ class DrivePredictor:
         return int(np.count_nonzero(np.diff(self._lost, axis=0) > 0.0))
 
     def _headings(self) -> FloatArray:
-        """By the gyro less its mean difference to the reference_params; else by the reference_params's own turns, one after the other."""
+        """By the gyro less its bias (and scale) against the motion reference; else by the reference's own turns, one after the other."""
         batch, drive = self.batch, self.drive
         last = np.r_[batch.owner[1:] != batch.owner[:-1], True]
         yaw = batch.measured[last, 2]
         if drive.gyro is not None:
             turns = [drive.gyro.turn(int(a), int(b), float(t)) for (a, b), t in zip(drive.spans_ns, yaw, strict=True)]
-            known = [(t.angle - y, t.duration) for t, y in zip(turns, yaw, strict=True) if t is not None]
+            known = [(t.angle - y, y, t.duration) for t, y in zip(turns, yaw, strict=True) if t is not None]
             if known:
-                bias = sum(k[0] for k in known) / sum(k[1] for k in known)
+                scale, bias = 0.0, sum(k[0] for k in known) / sum(k[2] for k in known)
+                if self.is_gyro_scaled:
+                    prior = (0.0, _GYRO_TURN_SIGMA_RAD / _GYRO_SCALE_SIGMA, 0.0)  # of the scale, where the robot hardly turns
+                    off, *columns = np.array([*known, prior]).T
+                    (scale, bias), *_ = np.linalg.lstsq(np.column_stack(columns), off, rcond=None)
                 origin = int(drive.spans_ns[0, 0])
                 found = [drive.gyro.turn(origin, int(a), 0.0) for a in drive.spans_ns[:, 0]]
-                return np.array([0.0 if t is None else t.angle - bias * t.duration for t in found])
+                return np.array([0.0 if t is None else (t.angle - bias * t.duration) / (1.0 + scale) for t in found])
         return np.asarray(np.cumsum(yaw) - yaw)
 
     def _accelerations(self) -> FloatArray:
@@ -177,6 +189,7 @@ class DrivePredictor:
 
     def discrepancies(self, hypothesis: Hypothesis) -> FloatArray:
         """(M, 6) measured minus predicted, as `CHANNELS`: motion in the predicted end's frame; NaN where nothing was measured."""
+        hypothesis = _added(self.baseline, hypothesis)
         batch, drive = self.batch, self.drive
         out = np.full((len(batch.ends), len(CHANNELS)), np.nan)
         reference_params = np.array([self._wheel_shift(hypothesis), hypothesis.wheel_lag_s, *self._tracked(hypothesis)])
@@ -325,7 +338,7 @@ class _HypothesisModel:
             mass = p.drive.robot.geometry.mass_kg
             moved = cg + np.array(b.cg) + (p.drive.payload_arms * (b.payload_kg / (mass + b.payload_kg)) if b.payload_kg else 0.0)
         if b.split_friction:
-            moved = _shifted_by_grip(moved, 0.5 * params[1], b.split_friction)
+            moved, params[8] = _shifted_by_grip(moved, (0.5 * params[2], 0.5 * params[1]), params[8], b.split_friction)
         if moved is not cg:
             half = 0.49 * np.array([params[2], params[1]])
             moved = np.clip(moved, -half, half)
@@ -379,20 +392,43 @@ class _HypothesisModel:
             x, y = params[TRACKED[0]], params[TRACKED[1]]
             middle = settled + settled[:, 2:] * np.array([y, -x, 0.0])
             batch = p.batch
-            drive = ManeuverSamples(batch.dt, rates, cg, batch.first, p._last, p.headings, np.array(b.slope))
+            turned = np.r_[0.0, np.cumsum(settled[:, 2] * batch.dt)]
+            headings = p.headings - (turned[batch.first[:-1] + batch.lead] - turned[batch.first[:-1]])
+            drive = ManeuverSamples(batch.dt, rates, cg, batch.first, p._last, headings, np.array(b.slope))
             twists = dynamic_twists(p.drive.robot, law, params, drive, middle)
             p._twists[key] = np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
         return p._twists[key]
 
 
-def _shifted_by_grip(cg: FloatArray, half_track: float, split: float) -> FloatArray:
-    """(N, 2) centres of the contact forces where the left wheels grip ``split`` more than the right ones, over the mean of both.
+def _shifted_by_grip(cg: FloatArray, half: tuple[float, float], warp: float, split: float) -> tuple[FloatArray, float]:
+    """(N, 2) centres of the contact forces where the left wheels grip ``split`` more than the right ones, over the mean of both; and the
+    warp of these forces.
 
-    A contact's force goes with its load times its friction: unequal friction acts like a load that is shifted to the side with more grip.
+    A contact's force goes with its load times its friction. With g = split / 2, loads (1 + sx xi + sy eta + sx sy t) / 4 as in
+    `motion_models.friction.contact.loads` times (1 + sy g) have the same form: xi' = (xi + g t) / n, eta' = (eta + g) / n and
+    t' = (t + g xi) / n with n = 1 + g eta. ``half`` are half wheelbase and half track; the warp is that at the mean centre of gravity.
     """
-    left = (1.0 + cg[:, 1] / half_track) * (1.0 + 0.5 * split)
-    right = (1.0 - cg[:, 1] / half_track) * (1.0 - 0.5 * split)
-    return np.column_stack([cg[:, 0], half_track * (left - right) / (left + right)])
+    g = 0.5 * split
+    xi, eta = (cg / np.array(half)).T
+    n = 1.0 + g * eta
+    shifted = np.column_stack([(xi + g * warp) / n, (eta + g) / n]) * np.array(half)
+    return shifted, (warp + g * float(xi.mean())) / float(n.mean())
+
+
+def _added(a: Hypothesis, b: Hypothesis) -> Hypothesis:
+    """Both deviations at once."""
+    if a == Hypothesis():
+        return b
+    found: dict[str, Any] = {}
+    for name in (f.name for f in dataclasses.fields(Hypothesis)):
+        one, other = getattr(a, name), getattr(b, name)
+        if isinstance(one, tuple):
+            found[name] = tuple(x + y for x, y in zip(one, other, strict=True))
+        elif isinstance(one, Mapping):
+            found[name] = {key: one.get(key, 0.0) + other.get(key, 0.0) for key in {**one, **other}}
+        else:
+            found[name] = one + other
+    return Hypothesis(**found)
 
 
 def with_sizes(sizes: dict[Cause, float]) -> Hypothesis:

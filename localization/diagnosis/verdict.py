@@ -346,7 +346,7 @@ def separating_drive(predictor: DrivePredictor, findings: Sequence[Finding], lin
         speed, robot.geometry.wheel_radius_m, cg, robot.arms is not None, robot.geometry.track_width_m
     ):
         table = drive_of_table("next", robot, maneuvers, "windows")
-        tried = DrivePredictor(table, predictor.model, predictor.has_inertia)
+        tried = DrivePredictor(table, predictor.model, predictor.has_inertia, predictor.baseline)
         base = with_sizes(others)
         start = tried.discrepancies(base)[:, :3]
         moved = [(start - tried.discrepancies(e.inject(base, s))[:, :3]) / _SIGMA for e, s in pairs if e is not None]

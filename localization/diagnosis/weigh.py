@@ -15,7 +15,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -53,12 +53,13 @@ PRIOR_SIGMAS: Mapping[str, float] = {
     "diagonal_load": 0.15,
     "tread_asymmetry": 0.02,
     "rolling_resistance": 0.01,
+    "scrub": 0.01,
     "split_friction": 0.02,
     "slope": 0.005,
 }
 """How far robots, floors and mounts differ from their files, as a sigma in the cause's unit: what the weighing must not take for a load.
 
-Scrub has the effect of friction_anisotropy (`tests.studies.friction_grid`), and no derivative at its usual value, 0."""
+Scrub cannot be negative: its prior is cut there (see `_truncated`)."""
 _SLIP_STIFFNESS_SIGMA = 0.3
 """Of the tyres' slip stiffness, relative: 7.7 to 13.3 on the robots of `tests.studies.contact_law`."""
 _MAX_PRIOR_SIGMAS = 4.0
@@ -67,7 +68,7 @@ _SYSTEMATIC_SIGMA_M = 0.0015
 """Added to each axis: what errors of scan matching that last for the whole drive make of the CG of robots whose files are right."""
 _MAX_CG_STEP = 0.15
 """Longest step of the CG, over the sigma of its prior: 2 cm on a Husky. Longer ones overshoot where loads differ much."""
-_ROUNDS = 16
+_ROUNDS = 30
 _CONVERGED_M = 1e-4
 _MAX_NOISE_RATIO = 3.0
 """Noise of the drive over that of its motion reference beyond which the friction model does not describe the drive."""
@@ -157,28 +158,55 @@ def weigh(drive: Drive) -> tuple[DrivenWeighing, DrivePredictor]:
     """
     turned = _check(drive)
     robot = drive.robot
-    predictor = make_predictor(drive, make_model("friction", robot))
-    causes = _causes(predictor, robot)
-    values, everything = np.zeros(len(causes)), tuple(range(len(causes)))
-    for _ in range(_ROUNDS):
-        linearization = linearize(predictor, causes, dict(zip(causes, values.tolist(), strict=True)), tolerance=1.0)
-        wanted, cov, _ = linearization.problem.fit(everything)
-        step, share = _limited(wanted - values, causes)
-        values = _held(values + step, causes, predictor)
-        if share == 1.0 and np.abs(step[:2]).max() < _CONVERGED_M:
-            break
-    ratio = _noise_ratio(predictor, linearization)
+    predictor = dataclasses.replace(make_predictor(drive, make_model("friction", robot)), is_gyro_scaled=True)
+    estimate = estimate_map(predictor, _causes(predictor, robot))
+    causes, values, cov = estimate.causes, estimate.sizes, estimate.covariance
+    ratio = _noise_ratio(predictor, estimate.linearization)
     found = DrivenWeighing(
         *(drive.name, robot.name, drive.motion_reference, len(drive.maneuvers), turned),
         given=predictor.batch.cg.mean(axis=0),
         offset=values[:2],
-        covariance=cov[:2, :2] + _SYSTEMATIC_SIGMA_M**2 * np.eye(2),
+        covariance=cov[:2, :2] * _student_factor(estimate.linearization) + _SYSTEMATIC_SIGMA_M**2 * np.eye(2),
         mass_kg=robot.geometry.mass_kg,
         noise_ratio=ratio,
         corrections={c.key: (float(v), math.sqrt(s)) for c, v, s in zip(causes[2:], values[2:], np.diagonal(cov)[2:], strict=True)},
         warnings=(*_warnings(ratio), *drive.warnings),
     )
     return found, predictor
+
+
+class MapEstimate(NamedTuple):
+    """Sizes of causes by their priors and a drive."""
+
+    causes: tuple[Cause, ...]
+    sizes: FloatArray
+    """(p,) in the causes' units."""
+    covariance: FloatArray
+    """(p, p)"""
+    linearization: Linearization
+    """The last one."""
+
+
+def estimate_map(predictor: DrivePredictor, causes: tuple[Cause, ...]) -> MapEstimate:
+    """All ``causes`` together, by Gauss-Newton on the drive of ``predictor``; their `Cause.plausible` are the priors' sigmas."""
+    values, everything = np.zeros(len(causes)), tuple(range(len(causes)))
+    scrub = next((i for i, cause in enumerate(causes) if cause.id == "scrub"), None)
+    is_cg = np.array([cause.id in _CG for cause in causes])
+    for _ in range(_ROUNDS):
+        linearization = linearize(predictor, causes, dict(zip(causes, values.tolist(), strict=True)), tolerance=1.0)
+        wanted, cov, _ = linearization.problem.fit(everything)
+        if scrub is not None:
+            wanted, cov = _truncated(wanted, cov, scrub, -_nominal(predictor.drive.robot, "scrub"))
+        step, share = _limited(wanted - values, causes)
+        values = _held(values + step, causes, predictor)
+        if share == 1.0 and np.abs(step[is_cg]).max(initial=0.0) < _CONVERGED_M:
+            break
+    return MapEstimate(causes, values, cov, linearization)
+
+
+def _nominal(robot: Robot, name: str) -> float:
+    """Parameter ``name`` of the friction model by the robot file."""
+    return float(FrictionModel.from_robot(robot).nominal[FrictionModel.param_names.index(name)])
 
 
 def corrected_hypothesis(found: DrivenWeighing) -> Hypothesis:
@@ -213,14 +241,14 @@ def _causes(predictor: DrivePredictor, robot: Robot) -> tuple[Cause, ...]:
     g = robot.geometry
     cg = (_CG_SIGMA_SHARE * g.wheelbase_m, _CG_SIGMA_SHARE * g.track_width_m)
     shown = candidate_causes(predictor, moments=0)
-    friction = FrictionModel.from_robot(robot)
-    stiffness = _slip_stiffness(float(friction.nominal[friction.param_names.index("slip_stiffness")]))
+    stiffness = slip_stiffness_cause(robot)
     others = [dataclasses.replace(c, prior_sigma=PRIOR_SIGMAS[c.id]) for c in shown if c.id in PRIOR_SIGMAS]
     return (*(dataclasses.replace(CAUSES[name], prior_sigma=s) for name, s in zip(_CG, cg, strict=True)), *others, stiffness)
 
 
-def _slip_stiffness(nominal: float) -> Cause:
-    """Slip stiffness of the tyres, relative to the ``nominal`` one; as a logarithm, which keeps it positive."""
+def slip_stiffness_cause(robot: Robot) -> Cause:
+    """Slip stiffness of the tyres, relative to the robot file's; as a logarithm, which keeps it positive."""
+    nominal = _nominal(robot, "slip_stiffness")
 
     def inject(b: Hypothesis, size: float) -> Hypothesis:
         now = nominal + b.friction.get("slip_stiffness", 0.0)
@@ -231,9 +259,29 @@ def _slip_stiffness(nominal: float) -> Cause:
     return Cause("slip_stiffness", "1", meaning, _SLIP_STIFFNESS_SIGMA, 0.03, inject, words, prior_sigma=_SLIP_STIFFNESS_SIGMA)
 
 
+def _truncated(mean: FloatArray, cov: FloatArray, i: int, least: float) -> tuple[FloatArray, FloatArray]:
+    """Moments of the Gaussian with ``mean`` (p,) and ``cov`` (p, p) where its number ``i`` is at least ``least``.
+
+    Given x_i the others are Gaussian as before, so that all moments follow from the two of the truncated x_i (Kotz, Balakrishnan & Johnson
+    2000, Continuous Multivariate Distributions, ch. 45).
+    """
+    variance = cov[i, i]
+    sigma = math.sqrt(variance)
+    bound = (least - mean[i]) / sigma
+    m, v = (float(moment) for moment in stats.truncnorm.stats(bound, math.inf, loc=mean[i], scale=sigma, moments="mv"))
+    by = cov[:, i] / variance
+    return mean + by * (m - mean[i]), cov + np.outer(by, by) * (v - variance)
+
+
+def _student_factor(linearization: Linearization) -> float:
+    """Variance of Student's t: the noise was estimated on as few numbers as its degrees of freedom."""
+    freedom = linearization.noise.freedom
+    return freedom / (freedom - 2.0) if freedom > 4.0 else 2.0
+
+
 def _limited(step: FloatArray, causes: tuple[Cause, ...]) -> tuple[FloatArray, float]:
     """``step`` (p,) of Gauss-Newton shortened to where the friction model is about linear in the CG, and its share of the whole."""
-    limits = np.array([(_MAX_CG_STEP if cause.id in _CG else 1.0) * cause.prior_sigma for cause in causes])
+    limits = np.array([(_MAX_CG_STEP if cause.id in _CG else 1.0) * cause.plausible for cause in causes])
     share = min(1.0, float(np.min(limits / np.maximum(np.abs(step), 1e-12))))
     return share * step, share
 
@@ -242,9 +290,12 @@ def _held(values: FloatArray, causes: tuple[Cause, ...], predictor: DrivePredict
     """``values`` (p,) within `_MAX_PRIOR_SIGMAS`, and the CG at most 0.9 of the way to an axle or a side."""
     g, given = predictor.drive.robot.geometry, predictor.batch.cg.mean(axis=0)
     edge = 0.45 * np.array([g.wheelbase_m, g.track_width_m])
-    limits = _MAX_PRIOR_SIGMAS * np.array([cause.prior_sigma for cause in causes])
-    cg = np.clip(given + values[:2], -edge, edge) - given
-    return np.concatenate([cg, np.clip(values, -limits, limits)[2:]])
+    held = np.clip(values, *(sign * _MAX_PRIOR_SIGMAS * np.array([cause.plausible for cause in causes]) for sign in (-1.0, 1.0)))
+    for i, cause in enumerate(causes):
+        if cause.id in _CG:
+            axis = _CG.index(cause.id)
+            held[i] = np.clip(given[axis] + values[i], -edge[axis], edge[axis]) - given[axis]
+    return np.asarray(held)
 
 
 def _noise_ratio(predictor: DrivePredictor, linearization: Linearization) -> float:

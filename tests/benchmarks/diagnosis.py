@@ -1,7 +1,8 @@
 """How often the diagnosis is right: every cause on four robots, from a quarter of its typical size to twice it, pairs and nulls.
 
-`python -m tests.benchmarks.diagnosis [--cases A:B] [--out FILE.jsonl] [--rivals]` runs cases A to B-1 of 1,500 (default: all) and appends a
-row for each to FILE (default: diagnosis-benchmark.jsonl); cases that FILE has are not run again, so that it can be stopped at any time.
+`python -m tests.benchmarks.diagnosis [--cases A:B[:STEP]] [--out FILE.jsonl] [--rivals]` runs cases A to B-1 of 1,500 (default: all; a STEP
+such as 37 takes a share of them with all causes, robots and kinds) and appends a row for each to FILE (default: diagnosis-benchmark.jsonl);
+cases that FILE has are not run again, so that it can be stopped at any time.
 A case is determined by its number. No robot is exactly as its file: beside what is hidden, geometry, mounts, clocks, floor and gyro of each
 deviate by as much as the diagnosis takes for the accuracy of robot files (`TOLERANCES`), and intervals are to hold the hidden size.
 Tables come from the rows: `--report` prints them without running anything.
@@ -158,15 +159,15 @@ def _is_true(effect: Cause, state: Linearization) -> bool:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", default=f"0:{CASES}", metavar="A:B")
+    parser.add_argument("--cases", default=f"0:{CASES}", metavar="A:B[:STEP]")
     parser.add_argument("--out", type=Path, default=Path("diagnosis-benchmark.jsonl"), metavar="FILE")
     parser.add_argument("--rivals", action="store_true", help="other methods on the same signatures as well")
     parser.add_argument("--report", action="store_true")
     options = parser.parse_args(arguments if arguments is not None else ([] if __name__ != "__main__" else None))
-    start, end = (int(number) for number in options.cases.split(":"))
+    numbers = range(*(int(number) for number in options.cases.split(":")))
     rows = [json.loads(line) for line in options.out.read_text().splitlines()] if options.out.exists() else []
     done = {row["number"] for row in rows}
-    for number in range(start, end) if not options.report else ():
+    for number in numbers if not options.report else ():
         if number in done:
             continue
         row = run(case_of(number), options.rivals)
@@ -176,7 +177,7 @@ def main(arguments: list[str] | None = None) -> None:
         named = ", ".join(f"{f['cause']} {f['size']:+.3g}" for f in row["findings"])
         hidden = ", ".join(f"{name} {size:+.3g}" for name, size in row["truth"].items()) or "nothing"
         print(f"{number:5d} {row['robot']:10s} {hidden:40s} -> {row['verdict']:12s} {named}", flush=True)
-    print(report([row for row in rows if start <= row["number"] < end]))
+    print(report([row for row in rows if row["number"] in numbers]))
 
 
 if __name__ == "__main__":

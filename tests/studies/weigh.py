@@ -1,11 +1,10 @@
 """Weighing by driving: hidden loads on simulated robots, and the thesis's 68 rotations with their known centres of gravity.
 
-python -m tests.studies.weigh [--cases 100] [--record FILE.jsonl] [--new 10]
+python -m tests.studies.weigh [--cases 0:100] [--record FILE.jsonl] [--new 10]
 
 Hidden loads: five robots, each with its CG moved by up to a sixth of wheelbase and track, with what else may differ from a robot file
-drawn from the priors of `localization.diagnosis.weigh`, and with a scrub, which that does not estimate; a minute of turning by the
-simulator's own tyre dynamics; LiDAR, wheels and gyro go through a bag. Rotations: the friction model is fitted to 67, and the centre of
-gravity of the other follows from how it turned.
+drawn from the priors of `localization.diagnosis.weigh`; a minute of turning by the simulator's own tyre dynamics; LiDAR, wheels and gyro go
+through a bag. Rotations: the friction model is fitted to 67, and the centre of gravity of the other follows from how it turned.
 """
 
 from __future__ import annotations
@@ -38,7 +37,6 @@ HIDDEN = (
     *("lidar_time_offset", "wheel_time_offset", "friction_anisotropy", "scrub", "diagonal_load", "tread_asymmetry"),
     *("rolling_resistance", "split_friction", "slope", "gyro_scale"),
 )
-_SIGMAS = {**PRIOR_SIGMAS, "scrub": 0.01}
 _NOT_NEGATIVE = ("scrub", "rolling_resistance")
 _LARGEST_SIGMAS = 2.0  # beyond it priors are cut, where the simulator's limits and the robots' stability are near
 _CG_SHARE = 1.0 / 6.0
@@ -87,7 +85,7 @@ def hidden(seed: int) -> tuple[str, dict[str, float]]:
     g = load_robot(name).geometry
     cg = rng.uniform(-1.0, 1.0, 2) * _CG_SHARE * np.array([g.wheelbase_m, g.track_width_m])
     drawn = np.clip(rng.standard_normal(len(HIDDEN)), -_LARGEST_SIGMAS, _LARGEST_SIGMAS)
-    others = {effect: float(z * _SIGMAS[effect]) for effect, z in zip(HIDDEN, drawn, strict=True)}
+    others = {effect: float(z * PRIOR_SIGMAS[effect]) for effect, z in zip(HIDDEN, drawn, strict=True)}
     others |= {effect: abs(others[effect]) for effect in _NOT_NEGATIVE}
     return name, {"cg_offset_x": float(cg[0]), "cg_offset_y": float(cg[1]), **others}
 
@@ -108,20 +106,20 @@ def run_case(seed: int) -> Case:
     return Case(name, np.array([effects["cg_offset_x"], effects["cg_offset_y"]]), found.offset, found.covariance)
 
 
-def cases(count: int, record: Path | None = None, new: int | None = None) -> list[Case]:
-    """The first ``count`` cases; those in ``record`` are taken from there, and at most ``new`` others are run and added to it."""
+def cases(seeds: range, record: Path | None = None, new: int | None = None) -> list[Case]:
+    """The cases of ``seeds``; those in ``record`` are taken from there, and at most ``new`` others are run and added to it."""
     done: dict[int, Case] = {}
     if record is not None and record.exists():
         for line in record.read_text().splitlines():
             row = json.loads(line)
             done[row["seed"]] = Case(row["robot"], *(np.array(row[name]) for name in ("truth", "found", "covariance")))
-    for seed in [i for i in range(count) if i not in done][:new]:
+    for seed in [i for i in seeds if i not in done][:new]:
         done[seed] = case = run_case(seed)
         if record is not None:
             row = {"seed": seed, "robot": case.robot, **{n: getattr(case, n).tolist() for n in ("truth", "found", "covariance")}}
             with record.open("a") as file:
                 file.write(json.dumps(row) + "\n")
-    return [done[i] for i in range(count) if i in done]
+    return [done[i] for i in seeds if i in done]
 
 
 def left_out_cgs(every: int = 1) -> FloatArray:
@@ -144,11 +142,11 @@ def _misfit(cg: FloatArray, seen: FloatArray, params: FloatArray, scatter: Float
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--cases", type=int, default=100)
+    parser.add_argument("--cases", default="0:100", metavar="A:B", help="seeds; the estimate was developed on 0 to 49")
     parser.add_argument("--record", type=Path, default=None)
     parser.add_argument("--new", type=int, default=None, help="at most so many cases that are not in the record")
     given = parser.parse_args()
-    found = cases(given.cases, given.record, given.new)
+    found = cases(range(*map(int, given.cases.split(":"))), given.record, given.new)
     z, sigmas = np.array([c.z for c in found]), np.sqrt([np.diagonal(c.covariance) for c in found])
     inside = np.mean([c.is_inside for c in found])
     held = np.mean(np.abs(z) < 1.96, axis=0)

@@ -1,0 +1,52 @@
+"""How a healthy robot differs from its file: estimated on a drive without faults, and taken off before later drives are diagnosed.
+
+Floors, tyres and contacts differ from the friction model in small ways that nobody calls a fault. All lasting causes are estimated together
+by `estimate_map` of `localization.diagnosis.weigh`, each with its prior; how a difference is shared among causes that turn the robot alike
+does not matter, as only the motion that they predict together is used.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+from localization.diagnosis.causes import Hypothesis
+from localization.diagnosis.drive import Drive
+from localization.diagnosis.linearization import candidate_causes, make_predictor
+from localization.diagnosis.prediction import with_sizes
+from localization.diagnosis.weigh import PRIOR_SIGMAS, estimate_map, slip_stiffness_cause
+from motion_models.base import MotionModel
+from motion_models.errors import CalibrationError
+from motion_models.friction import FrictionModel
+
+_MIN_WINDOWS = 16
+_SLIPS: Mapping[str, float] = {
+    "lateral_slip_speed": 0.05,
+    "rotation_slip_speed": 0.1,
+    "longitudinal_slip_turning": 0.1,
+    "rotation_scale": 0.5,
+}
+"""Sigma of slips that grow with speed: their typical sizes, in their units; and of rotations that no friction model predicts."""
+_CG_SIGMA_M = 0.01
+"""Of the centre of gravity by robot files, with batteries and cables that these do not have."""
+_LOG_STIFFNESS_SIGMA = 1.0
+"""Of the logarithm of the slip stiffness, whatever the floor: a factor of 3 either way."""
+_PASSING = frozenset({"gyro_bias", "slope"})
+"""Of one drive alone."""
+
+
+def estimate_baseline(drive: Drive, model: MotionModel) -> Hypothesis:
+    """Differences of the robot of ``drive`` from its file that last.
+
+    Raises `CalibrationError` for a drive with too few windows.
+    """
+    if len(drive.maneuvers) < _MIN_WINDOWS:
+        measured = f"only {len(drive.maneuvers)} windows of motion were measured"
+        raise CalibrationError(f"{drive.name}: {measured}; a healthy drive to compare with takes {_MIN_WINDOWS}.")
+    predictor = make_predictor(drive, model)
+    sigmas = {**PRIOR_SIGMAS, **_SLIPS, "cg_offset_x": _CG_SIGMA_M, "cg_offset_y": _CG_SIGMA_M}
+    causes = [dataclasses.replace(c, prior_sigma=sigmas[c.id]) for c in candidate_causes(predictor, moments=0) if c.id in sigmas]
+    if model.name == FrictionModel.name:
+        causes.append(dataclasses.replace(slip_stiffness_cause(drive.robot), prior_sigma=_LOG_STIFFNESS_SIGMA))
+    found = estimate_map(predictor, tuple(causes))
+    return with_sizes({c: float(v) for c, v in zip(found.causes, found.sizes, strict=True) if c.id not in _PASSING})
