@@ -43,6 +43,9 @@ chance for so long (Husky, ACES, fr079, CSAIL: one of 8,964 comparisons); a dire
 for 7 s), and is compared over two minutes."""
 _MAX_BIAS_RAD_S = 0.05
 """Gyro bias that is no contradiction; ten times the prior sigma of the shipped robots."""
+_MAX_RATE_OFF_RAD_S, _MAX_RATE_OFF_SHARE = 2.0, 3.0
+"""Difference of the gyro's rate from the wheels' that no slip explains, at least so large and so many times the wheels' rate. On the Husky
+outdoors it is 0.22 rad/s at most."""
 _MIN_RATE_RAD_S = 0.001
 """Root mean square of the slower turn rate, from where on signs are compared: none of 65 windows of the Husky outdoors, straight or not,
 has a correlation below -0.3."""
@@ -97,6 +100,10 @@ class Fault:
     GYRO_OPPOSITE = "the gyro turns opposite to {others}. It is not used while that lasts. Correct the IMU's mount, or its driver's sign."
     GYRO_UNIT = (
         "the gyro's rates are {ratio:.2g} times those of {others} (deg/s?). It is not used while that lasts. Let its driver publish rad/s."
+    )
+    GYRO_RATE = (
+        "the gyro turns by {rate:.1f} rad/s against the wheels, more than slip explains. It is not used for 3 s after each time. Check"
+        " the units of the IMU's driver."
     )
     GYRO_STUCK = "the gyro repeats one value while {others} turn. It is not used as long as that lasts. Check the IMU and its driver."
     WHEELS_OPPOSITE = (
@@ -199,6 +206,7 @@ class SensorChecks:
         self._bins: deque[_Bin] = deque(maxlen=_WINDOW_BINS)
         self._open = _Accumulator()
         self._is_gyro_stuck = self._has_scans = False
+        self._impossible_s = -math.inf  # when the gyro's rate was last one that no slip explains
         self._shaking, self._disagreement = ShakeDetector(), _Disagreement()
         self._step: Step | None = None
         self._suspected: dict[str, tuple[float, float]] = {}  # when first found, and start of the bins then [s]
@@ -279,6 +287,8 @@ class SensorChecks:
         return replace(step, scan=scan)
 
     def _without_faulty(self, step: Step) -> Step:
+        if self._is_gyro_impossible(step):
+            step = replace(step, turn=None)
         faults = {fault for fault in self.found if self._is_contradicted(fault)}
         if faults & {Fault.GYRO_OPPOSITE, Fault.GYRO_UNIT} or (self._is_gyro_stuck and Fault.GYRO_STUCK in faults):
             step = replace(step, turn=None)
@@ -287,6 +297,18 @@ class SensorChecks:
         if Fault.WHEELS_OPPOSITE in faults:
             step = self._with_unknown_motion(step, step.duration**2)
         return step
+
+    def _is_gyro_impossible(self, step: Step) -> bool:
+        """Whether the gyro's rate is one that no slip explains, or was within the last `_MEMORY_S`."""
+        now_s = self._now_s(step)
+        if step.turn is not None and step.has_wheels and step.duration > 0.0:
+            by_wheels = float(step.predicted.delta[2]) / step.duration
+            off = abs(step.turn.angle / step.duration - by_wheels)
+            if off > max(_MAX_RATE_OFF_RAD_S, _MAX_RATE_OFF_SHARE * abs(by_wheels)):
+                self._impossible_s = now_s
+                if Fault.GYRO_UNIT not in self.found:
+                    self._declare(Fault.GYRO_RATE, now_s, {"rate": off})
+        return now_s - self._impossible_s < _MEMORY_S
 
     def _check_standstill(self, step: Step) -> Step:
         """Wheels that read zero while LiDAR or IMU show motion count as unknown, for as long as that lasts."""
@@ -400,9 +422,11 @@ class SensorChecks:
         if fault in self.found:
             return
         self.found[fault] = Found(fault, max(at_s, 0.0), fault.format(**numbers))
+        if fault == Fault.GYRO_UNIT:
+            self.found.pop(Fault.GYRO_RATE, None)  # it is explained
         if fault == Fault.WHEELS_STANDING:
             return
-        is_gyro = fault in (Fault.GYRO_OPPOSITE, Fault.GYRO_STUCK, Fault.GYRO_UNIT)
+        is_gyro = fault in (Fault.GYRO_OPPOSITE, Fault.GYRO_STUCK, Fault.GYRO_UNIT, Fault.GYRO_RATE)
         difference = se2.log(se2.between(self._estimated, self._by_wheels if is_gyro else self._by_gyro))
         self._pending = self._pending + np.outer(difference, difference)
 

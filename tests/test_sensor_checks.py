@@ -255,6 +255,16 @@ def test_disagreements_that_end_stay_in_the_covariance() -> None:
     assert math.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]) == pytest.approx(math.hypot(4.0, 2.5), rel=0.05)
 
 
+def test_gyro_rate_that_no_slip_explains_is_left_out_at_once() -> None:
+    """Rates of 3 rad/s for half a second while the wheels drive straight on."""
+    robot = Robot(wheels=lambda v, w: (v, 0.0))
+    robot.gyro = lambda w: 3.0 if 40 <= len(robot.applied) < 45 else 0.0
+    checks = robot.drive(9.0)
+    assert Fault.GYRO_RATE in checks.found
+    assert checks.found[Fault.GYRO_RATE].at_s == pytest.approx(4.1, abs=0.11)
+    assert [k for k, step in enumerate(robot.applied) if step.turn is None] == list(range(40, 74))  # and for 3 s more
+
+
 def test_gyro_in_degrees_from_half_way_on_is_left_out_within_five_seconds() -> None:
     gyro_of = iter([*[1.0] * 120, *[math.degrees(1.0)] * 120])
     robot = Robot(gyro=lambda w: next(gyro_of) * w)
