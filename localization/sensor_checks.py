@@ -56,8 +56,9 @@ _MIN_EXCITED_RAD_S = 0.03
 _OPPOSITE_CORRELATION, _EQUAL_CORRELATION = -0.6, 0.6
 _REPEATED_RAD_S, _MIN_STUCK_WHEELS_RAD_S = 1e-7, 0.002
 """A gyro's mean rates never repeat to the last digit, but for its noise; over a whole window it is stuck if the wheels turn at all."""
-_DEG_PER_RAD_RANGE = (25.0, 130.0)
-"""Ratio of turn rates that only a wrong unit explains: 57.3, with the factor of 0.45 to 2.3 by which wheels may be off on loose floor."""
+_DEG_PER_RAD_RANGE = (12.0, 130.0)
+"""Ratio of turn rates that only a wrong unit explains: 57.3, with the factor of 0.45 to 2.3 by which wheels may be off on loose floor, and
+half of it while half of the window is of before the fault."""
 _MAX_EQUAL_RATIO = 2.5
 _MIN_TRAVEL_M = 0.05
 """Of wheels and LiDAR in a bin, for its direction to count."""
