@@ -151,6 +151,21 @@ def one_place(walls: np.ndarray, cov: np.ndarray) -> ScanMatch | None:
     return matcher.match(rooms.scan_from(walls, np.zeros(3), rng), np.zeros(3), cov)
 
 
+@pytest.mark.parametrize(("prior_cov", "is_lost"), [(NARROW, False), (WIDE, True)], ids=["narrow", "wide"])
+def test_match_of_half_a_scan_needs_a_narrow_prior(prior_cov: np.ndarray, is_lost: bool) -> None:
+    """The other half hangs in unmapped space: people around the robot, or another place of which half looks alike."""
+    matcher, pose = lab()
+    rng = np.random.default_rng(3)
+    points = rooms.scan_from(LAB, pose, rng)
+    is_elsewhere = np.arange(len(points)) % 2 == 0
+    points[is_elsewhere] = 0.4 * points[is_elsewhere] + 0.05 * rng.normal(size=(int(is_elsewhere.sum()), 2))
+    match = matcher.match(points, pose, prior_cov)
+    assert (match is None) == is_lost
+    if match is not None:
+        assert LidarConfig().lost_below < match.overlap < LidarConfig().search_below
+        assert np.hypot(*error_of(pose, match.pose)[:2]) < 0.01
+
+
 def test_match_in_ambiguous_place_is_lost() -> None:
     """Turns of a quarter look alike in a square room."""
     assert one_place(world.box(-3.0, -3.0, 3.0, 3.0), np.diag([0.3, 0.3, 1.0]) ** 2) is None
