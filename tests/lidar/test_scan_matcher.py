@@ -13,7 +13,6 @@ from localization.lidar.scan_matcher import _KERNEL, KeyScan, linearize
 from localization.lidar.submap import fill_surface, find_nearest, make_grid
 from localization.simulation import world
 from motion_models import se2
-from motion_models.se2 import triple
 from tests.helpers import rooms
 
 LAB, HALL = world.lab().walls, world.hall().walls
@@ -70,7 +69,7 @@ def test_linearize_gradient_equals_cost_differences() -> None:
         u = residuals(d) ** 2
         return float(0.5 * np.sum(u * _KERNEL**2 / (_KERNEL**2 + u)))
 
-    H, g, found = linearize(grid, points, triple(x), 0.0)
+    H, g, found = linearize(grid, points, x, 0.0)
     h = 1e-6
     np.testing.assert_allclose(g, [(cost(h * e) - cost(-h * e)) / (2 * h) for e in np.eye(3)], rtol=1e-5, atol=1e-4)
     J = np.stack([(residuals(h * e) - residuals(-h * e)) / (2 * h) for e in np.eye(3)], axis=-1)

@@ -45,6 +45,7 @@ from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import ImuConfig, SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
 from motion_models.robot import load_robot
+from motion_models.se2 import triple
 from tests.studies.buildings import BUILDINGS, Drive, errors_of, nees_at_instants
 
 README = Path(__file__).parents[2] / "localization/estimators/README.md"
@@ -112,8 +113,10 @@ def _exact_normals(*arguments: Any) -> VoxelGrid:
 
 def _align_freely(original: Callable[..., Any], self: ScanMatcher, points: Any, prior: Any, cov: Any, guess: Any) -> Any:
     """The prior sets the reach of associations but does not pull."""
-    pose, H, g, found = scan_matcher._align(self._grid, points, prior, cov, np.linalg.inv(_NO_PRIOR), guess)
-    return scan_matcher.Fit(pose, H, g, *(float(value) for value in found))
+    spread = scan_matcher._first_spread(points, cov)
+    pose = np.array(scan_matcher._align(self._grid, points, triple(prior), np.linalg.inv(_NO_PRIOR), triple(guess), spread))
+    H, g, found = scan_matcher.linearize(self._grid, points, pose, 0.0)
+    return scan_matcher.Fit(pose, H, g, *map(float, found))
 
 
 def _match_without_new_place(original: Callable[..., Any], self: ScanMatcher, *rest: Any, **named: Any) -> Any:
