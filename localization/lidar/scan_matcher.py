@@ -50,6 +50,9 @@ _MAX_RIVAL = 0.9
 """A search is ambiguous where a pose elsewhere scores more than this share of the best."""
 _BASIN_M, _BASIN_RAD = 0.15, 0.15
 """Sigma of a prior from which Gauss-Newton alone may end elsewhere: from .3 m, .15 rad it does in 14 to 31 % of trials."""
+_MIN_PLACE_OVERLAP = 0.6
+"""Share of points on the submap, below which a place found from a wide prior is not taken, as Cartographer's least score of a place without a
+prior (`global_localization_min_score`)."""
 _MAX_OLD_SUBMAPS = 3
 """Key scans older than the last ones, at most, in units of their number."""
 _OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
@@ -182,15 +185,15 @@ class ScanMatcher:
         if best is not None:
             if not is_near and _mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:
                 outlier_cov = nothing
-            found = self._align(points, prior, cov + outlier_cov, best)
-            least = self._config.lost_below if _is_narrow(cov) else self._config.search_below  # the place may not be mapped
+            found = self._align(points, prior, cov + outlier_cov, best, self.cell)
+            least = self._config.lost_below if _is_narrow(cov) else _MIN_PLACE_OVERLAP  # the place may not be mapped
             if found.overlap >= least and (not is_near or _is_better(found, fit, prior, cov)):
                 return self._result(found, outlier_cov)
         return self._result(fit, nothing) if is_near and fit.overlap >= self._config.lost_below else None
 
     def refine(self, points: Points2, prior: Pose2, cov: Cov3, match: ScanMatch) -> ScanMatch | None:
         """``match`` again, for the same scan deskewed anew."""
-        fit = self._align(points, prior, cov + match.outlier_cov, match.pose)
+        fit = self._align(points, prior, cov + match.outlier_cov, match.pose, 0.0)
         return None if fit.overlap < self._config.lost_below else self._result(fit, match.outlier_cov)
 
     def evaluate(self, points: Points2, pose: Pose2) -> ScanMatch | None:
@@ -250,9 +253,9 @@ class ScanMatcher:
     def _draw(self) -> None:
         self._grid, self._image = make_grid(self.points(), self.cell, self._config.range_noise_m), None
 
-    def _align(self, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2) -> Fit:
+    def _align(self, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2, spread: float | None = None) -> Fit:
         assert self._grid is not None
-        return align_points(self._grid, points, prior, cov, guess)
+        return align_points(self._grid, points, prior, cov, guess, spread)
 
     def _search(self, points: Points2, prior: Pose2, wide: FloatArray, cov: Cov3) -> Pose2 | None:
         """The best pose (3,) within 3 sigma of ``wide`` (3, 3), limited unless ``cov`` (3, 3) is wider; None where it is ambiguous."""
@@ -276,10 +279,14 @@ def select_measured(noise_cov: Cov3) -> FloatArray:
     return np.asarray(np.linalg.inv(np.eye(3) + noise_cov @ _MAPPED_INFORMATION), dtype=float)
 
 
-def align_points(grid: VoxelGrid, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2) -> Fit:
-    """Gauss-Newton from ``guess`` (3,) for ``points`` (N, 2), with the ``prior`` (3,) of covariance ``cov`` (3, 3)."""
+def align_points(grid: VoxelGrid, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2, spread: float | None = None) -> Fit:
+    """Gauss-Newton from ``guess`` (3,) for ``points`` (N, 2), with the ``prior`` (3,) of covariance ``cov`` (3, 3).
+
+    ``spread``: how far the guess may be off at a point [m]; None for a guess that is as uncertain as the prior.
+    """
     information = np.asarray(np.linalg.inv(cov), dtype=float)
-    pose = np.asarray(_align(grid, points, triple(prior), information, triple(guess), _first_spread(points, cov)), dtype=float)
+    first = _first_spread(points, cov) if spread is None else spread
+    pose = np.asarray(_align(grid, points, triple(prior), information, triple(guess), first), dtype=float)
     H, g, found = linearize(grid, points, pose, 0.0)
     return Fit(pose, H, g, *(float(value) for value in found))
 
