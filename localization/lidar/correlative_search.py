@@ -136,9 +136,7 @@ def _draw(points: Points2, image: FloatArray, origin: FloatArray, cell: float) -
             along_y[k] = math.exp(-0.5 * (first_y + k + 0.5 - y) ** 2)
         for jx in range(5):
             for jy in range(5):
-                value = along_x[jx] * along_y[jy]
-                if value > image[first_x + jx, first_y + jy]:
-                    image[first_x + jx, first_y + jy] = value
+                image[first_x + jx, first_y + jy] = max(image[first_x + jx, first_y + jy], along_x[jx] * along_y[jy])
 
 
 @numba.njit(cache=True)

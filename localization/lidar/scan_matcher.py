@@ -51,8 +51,8 @@ _MAX_RIVAL = 0.9
 _BASIN_M, _BASIN_RAD = 0.15, 0.15
 """Sigma of a prior from which Gauss-Newton alone may end elsewhere: from .3 m, .15 rad it does in 14 to 31 % of trials."""
 _MIN_PLACE_OVERLAP = 0.6
-"""Share of points on the submap, below which a place found from a wide prior is not taken, as Cartographer's least score of a place without a
-prior (`global_localization_min_score`)."""
+"""Share of points on the submap, below which a place found from a wide prior is not taken: Cartographer's least score of a place without
+a prior (`global_localization_min_score`)."""
 _MAX_OLD_SUBMAPS = 3
 """Key scans older than the last ones, at most, in units of their number."""
 _OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
