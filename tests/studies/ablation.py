@@ -141,7 +141,7 @@ PATCHES: Mapping[str, Patch] = {
     "old key scans that fit": _wrap(
         ScanMatcher, "_fitting_keys", lambda original, self, pose, points, map_cov: original(self, pose, points, None)
     ),
-    "slip that changes within a sweep": _attribute(fusion._SlipChanges, "sweep_cov", lambda self, step, sweep_s: np.zeros((3, 3))),
+    "slip that changes within a sweep": _attribute(fusion._SlipChanges, "sweep_cov", lambda *a: np.zeros((3, 3))),
     "second deskewing pass": _attribute(ScanMatchingSensor, "refine", lambda self, match, twist: match),
     "slip in the deskewing twist": _wrap(
         ScanMatchingSensor,
@@ -160,6 +160,7 @@ PATCHES: Mapping[str, Patch] = {
     "submap's error": _attribute(Filter, "insert_key_scan", lambda self, error: None),
     "submap's error as consider state (independent noise, instead)": _wrap(Filter, "predict", _independent),
     "new surfaces' error of key scans": _wrap(Filter, "insert_key_scan", _without_new),
+    "scale of the wheel noise": _attribute(filter_module, "_MAX_WHEEL_SCALE", 1.0),
     "check of wheels that stand": _attribute(EkfFusion, "_check_standstill", lambda self, step: step),
     "excitation gate of corrections": _attribute(EkfFusion, "_is_turning", lambda self, motion: True),
     "noise of normals": _attribute(scan_matcher, "make_grid", _exact_normals),
