@@ -176,7 +176,7 @@ class ScanMatcher:
         """
         nothing = np.zeros((3, 3))
         fit = self._align(points, prior, cov, prior if guess is None else guess)
-        self.is_new_place = fit.mapped < 0.5 * len(points) and fit.fitting >= 0.5 * fit.mapped and _is_narrow(cov)
+        self.is_new_place = fit.mapped < 0.5 * len(points) and fit.fitting >= 0.5 * fit.mapped and is_narrow(cov)
         is_near, agrees = _is_within_basin(fit, cov), _mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST
         if is_near and agrees and fit.overlap >= self._config.search_below:
             return self._result(fit, nothing)
@@ -186,7 +186,7 @@ class ScanMatcher:
             if not is_near and _mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:
                 outlier_cov = nothing
             found = self._align(points, prior, cov + outlier_cov, best, self.cell)
-            least = self._config.lost_below if _is_narrow(cov) else _MIN_PLACE_OVERLAP  # the place may not be mapped
+            least = self._config.lost_below if is_narrow(cov) else _MIN_PLACE_OVERLAP  # the place may not be mapped
             if found.overlap >= least and (not is_near or _is_better(found, fit, prior, cov)):
                 return self._result(found, outlier_cov)
         return self._result(fit, nothing) if is_near and fit.overlap >= self._config.lost_below else None
@@ -263,7 +263,7 @@ class ScanMatcher:
             self._image = draw_image(self.points(), self.cell)
         limit = np.minimum(np.maximum(_SEARCH_LIMIT, 3.0 * np.sqrt(np.diagonal(cov))), _WIDEST_SEARCH)
         best = search(self._image, voxel_means(points, self.cell), prior, wide, limit)
-        is_clear = best.margin >= _OUTLIER_COST if not _is_narrow(cov) else best.rival_score < _MAX_RIVAL * best.score
+        is_clear = best.margin >= _OUTLIER_COST if not is_narrow(cov) else best.rival_score < _MAX_RIVAL * best.score
         return best.pose if is_clear else None
 
     def _result(self, fit: Fit, outlier_cov: Cov3) -> ScanMatch:
@@ -307,10 +307,10 @@ def _is_within_basin(fit: Fit, cov: Cov3) -> bool:
 
     Along directions that the scene leaves open, a prior may be as wide as it likes.
     """
-    return _is_narrow(cov - np.linalg.inv(np.linalg.inv(cov) + fit.information))
+    return is_narrow(cov - np.linalg.inv(np.linalg.inv(cov) + fit.information))
 
 
-def _is_narrow(cov: Cov3) -> bool:
+def is_narrow(cov: Cov3) -> bool:
     """Whether a pose with ``cov`` (3, 3) is within the basin of Gauss-Newton."""
     return bool(np.linalg.eigvalsh(cov[:2, :2])[-1] < _BASIN_M**2 and cov[2, 2] < _BASIN_RAD**2)
 
