@@ -111,9 +111,9 @@ def _exact_normals(*arguments: Any) -> VoxelGrid:
     return grid
 
 
-def _align_freely(original: Callable[..., Any], self: ScanMatcher, points: Any, prior: Any, cov: Any, guess: Any) -> Any:
+def _align_freely(original: Callable[..., Any], self: ScanMatcher, points: Any, prior: Any, cov: Any, guess: Any, first: Any = None) -> Any:
     """The prior sets the reach of associations but does not pull."""
-    spread = scan_matcher._first_spread(points, cov)
+    spread = scan_matcher._first_spread(points, cov) if first is None else first
     pose = np.array(scan_matcher._align(self._grid, points, triple(prior), np.linalg.inv(_NO_PRIOR), triple(guess), spread))
     H, g, found = scan_matcher.linearize(self._grid, points, pose, 0.0)
     return scan_matcher.Fit(pose, H, g, *map(float, found))
