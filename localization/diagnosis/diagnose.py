@@ -15,7 +15,16 @@ from localization.diagnosis.drive import Drive
 from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain, describe_loss, describe_standstill_turn, evidence, sentence
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, with_tolerance
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
-from localization.diagnosis.selection import aliases_of, heldout_gain, max_statistic, p_value, refined_cost, search_causes, statistic
+from localization.diagnosis.selection import (
+    aliases_of,
+    has_tolerated_substitute,
+    heldout_gain,
+    max_statistic,
+    p_value,
+    refined_cost,
+    search_causes,
+    statistic,
+)
 from localization.diagnosis.verdict import (
     attribute_rows,
     decide,
@@ -25,7 +34,6 @@ from localization.diagnosis.verdict import (
     general_advice,
     mark_trends,
     separating_drive,
-    tolerated_sizes,
 )
 from localization.settings import Count, Probability, Seed, Settings
 from motion_models.base import MotionModel
@@ -184,7 +192,7 @@ def _conclude(
         next_drive = separating_drive(predictor, findings, linearization, chosen)
     else:
         next_drive = general_advice(verdict, [e.id for e in undetectable])
-    within = {**dropped, **_within_tolerance(linearization, chosen, rows)}
+    within = {**dropped, **_within_tolerance(linearization, chosen, sizes, rows)}
     result = Diagnosis(
         *(drive.name, drive.robot.name, predictor.model.name, drive.motion_reference, verdict, rows, tuple(findings), trends),
         left_share=share,
@@ -208,9 +216,10 @@ def _conclude(
     return DiagnosisResult(dataclasses.replace(result, sentence=sentence(result)), predictor, residuals, linearization)
 
 
-def _heldout(linearization: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], config: DiagnosisConfig) -> Gain:
-    data = linearization.linear, linearization.signatures, linearization.nuisances, linearization.noise, linearization.problem.scale
-    return heldout_gain(*data, chosen, others, np.random.default_rng(config.seed))
+def _heldout(
+    linearization: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], config: DiagnosisConfig, is_tolerant: bool = False
+) -> Gain:
+    return heldout_gain(linearization, chosen, others, np.random.default_rng(config.seed), is_tolerant)
 
 
 def _tolerated_size(linearization: Linearization, cause: Cause) -> float:
@@ -220,18 +229,25 @@ def _tolerated_size(linearization: Linearization, cause: Cause) -> float:
 def _keep_useful(
     linearization: Linearization, chosen: tuple[int, ...], config: DiagnosisConfig
 ) -> tuple[tuple[int, ...], list[Gain], dict[str, tuple[float, float]]]:
-    """``chosen`` without those within tolerance or without held-out gain; the gain of each; size and sigma of those within tolerance."""
+    """``chosen`` without those within tolerance, those for which another cause within its tolerance would do, and those without a held-out
+    gain, over the robot file or over all that is tolerated; the first gain of each; size and sigma of those within tolerance."""
     within: dict[str, tuple[float, float]] = {}
-    causes = linearization.causes
+    causes, windows = linearization.causes, len(linearization.rows)
+    largest = np.array([_tolerated_size(linearization, e) for e in causes])
     while True:
         sizes, cov, _ = linearization.problem.fit(chosen)
-        gains = [_heldout(linearization, chosen, tuple(j for j in chosen if j != i), config) for i in chosen]
-        tolerated = [abs(size) < _tolerated_size(linearization, causes[i]) for size, i in zip(sizes, chosen, strict=True)]
-        small = [n for n in range(len(chosen)) if tolerated[n] or not _is_gain_significant(gains[n], len(linearization.rows))]
+        without = [tuple(j for j in chosen if j != i) for i in chosen]
+        gains = [_heldout(linearization, chosen, others, config) for others in without]
+        own_gains = [_heldout(linearization, chosen, others, config, is_tolerant=True) for others in without]
+        tolerated = [
+            abs(size) < largest[i] or has_tolerated_substitute(linearization, chosen, i, largest)
+            for size, i in zip(sizes, chosen, strict=True)
+        ]
+        small = [n for n in range(len(chosen)) if tolerated[n] or not any(_is_gain_significant(g[n], windows) for g in (gains, own_gains))]
         if not small:
             return chosen, gains, within
-        worst = min(small, key=lambda n: gains[n].relative)
-        if tolerated[worst]:
+        worst = min(small, key=lambda n: own_gains[n].relative)
+        if abs(sizes[worst]) < largest[chosen[worst]]:
             within[causes[chosen[worst]].id] = float(sizes[worst]), float(math.sqrt(cov[worst, worst]))
         chosen = tuple(i for n, i in enumerate(chosen) if n != worst)
 
@@ -266,11 +282,11 @@ def _detectable_sizes(linearization: Linearization) -> dict[str, float]:
 
 
 def _within_tolerance(
-    linearization: Linearization, chosen: tuple[int, ...], rows: Mapping[str, Component]
+    linearization: Linearization, chosen: tuple[int, ...], named: FloatArray, rows: Mapping[str, Component]
 ) -> dict[str, tuple[float, float]]:
-    """Size and sigma of the causes that are not named and yet account for a part of a significant row."""
+    """Size and sigma of the causes that are not named, beside the sizes ``named`` (k,), and yet account for a part of a significant row."""
     listed = {a.cause for row in rows.values() for a in row.attributions if not a.is_named}
-    sizes, sigmas = tolerated_sizes(linearization, chosen), linearization.problem.posterior_sigmas(chosen)
+    sizes, sigmas = linearization.problem.tolerated(chosen, named), linearization.problem.posterior_sigmas(chosen)
     found: dict[str, tuple[float, float]] = {}
     for i, cause in enumerate(linearization.causes):
         if cause.id in listed and i not in chosen and abs(sizes[i]) > abs(found.get(cause.id, (0.0, 0.0))[0]):

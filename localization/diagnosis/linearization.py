@@ -6,6 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
@@ -27,6 +28,7 @@ _MOTION = 3  # channels of the motion itself
 _MIN_FREE_SHARE = 0.1  # of all numbers, however many causes there are
 _CLAIMED_WINDOWS = 4.0  # number of windows that a motion reference's own covariance counts for
 _MIN_SIGMA_OVER_CLAIMED = 0.5  # least sigma, as a share of the one that the motion reference gives
+_MAX_SWEEPS, _MAX_LAST_GAIN = 2000, 1e-8  # of the search for tolerated sizes, the latter in squares of whitened numbers
 _CLIP = 9.0  # squares beyond this many variances are outliers, and count as this much
 
 
@@ -193,13 +195,8 @@ class Regression:
         scale = self.scale[i]
         return sizes * scale, (inverse.T @ inverse) * np.outer(scale, scale), twice - self._evidence_of_nothing
 
-    def posterior(self, subset: tuple[int, ...]) -> FloatArray:
-        """(p,) posterior means of all sizes, in own units, with those outside of ``subset`` held to their tolerance."""
-        factor, half, _ = self._evidence(subset)
-        return np.asarray(np.linalg.solve(factor.T, half) * self.scale)
-
     def posterior_sigmas(self, subset: tuple[int, ...]) -> FloatArray:
-        """(p,) standard deviations of `posterior`."""
+        """(p,) posterior sigmas of all sizes, in own units, with those outside of ``subset`` held to their tolerance."""
         factor, _, _ = self._evidence(subset)
         return np.asarray(np.linalg.norm(np.linalg.solve(factor, np.eye(len(factor))), axis=0) * self.scale)
 
@@ -208,17 +205,21 @@ class Regression:
         return self._evidence(subset)[2] - self._evidence_of_nothing if subset else 0.0
 
     def misfit(self) -> float:
-        """Sum of squares that is left where every cause keeps within its tolerance, and what that takes.
-
-        A prior does not hold a size against much data: beyond `MAX_TOLERANCE_SIGMAS` a size would not be tolerated, and is cut there.
-        """
-        factor, half, _ = self._evidence(())
-        x = np.linalg.solve(factor.T, half)
-        limit = MAX_TOLERANCE_SIGMAS * self.tolerance
-        if np.all(np.abs(x) <= limit):
-            return self.rest - float(half @ half)
-        x = np.clip(x, -limit, limit)
+        """Sum of squares that is left where every cause keeps within its tolerance, and what that takes."""
+        x = self.tolerated((), np.zeros(0)) / self.scale
         return self.rest + float(x @ self.gram @ x - 2.0 * x @ self.moment + np.sum(np.square(x / self.tolerance)))
+
+    def tolerated(self, chosen: tuple[int, ...], sizes: FloatArray) -> FloatArray:
+        """(p,) most likely sizes, in own units, of all causes that are not named, beside those ``chosen`` with their ``sizes`` (k,); 0 for
+        these.
+
+        A prior does not hold a size against much data: beyond `MAX_TOLERANCE_SIGMAS` a size would not be tolerated, and ends there.
+        """
+        i = list(chosen)
+        limit = MAX_TOLERANCE_SIGMAS * self.tolerance
+        limit[i] = 0.0
+        moment = self.moment - self.gram[:, i] @ (sizes / self.scale[i])
+        return np.asarray(bounded_minimum(self.gram + np.diag(1.0 / np.square(self.tolerance)), moment, limit) * self.scale)
 
     def scores(self, given: tuple[int, ...], wanted: list[int]) -> tuple[FloatArray, FloatArray]:
         """(n,) scores of the ``wanted`` causes with those ``given`` free and all others within tolerance, and their (n, n) covariance if
@@ -230,6 +231,24 @@ class Regression:
         across = np.linalg.solve(a, self.gram[np.ix_(others, wanted)])
         cov = self.gram[np.ix_(wanted, wanted)] - self.gram[np.ix_(wanted, others)] @ across
         return self.moment[wanted] - across.T @ self.moment[others], cov
+
+
+@numba.njit(cache=True)
+def bounded_minimum(a: FloatArray, b: FloatArray, limit: FloatArray) -> FloatArray:
+    """(p,) x within +- ``limit`` (p,) where x' a x / 2 - b' x is least, by coordinate descent; ``a`` (p, p) is positive definite."""
+    x = np.zeros_like(b)
+    slope = -b
+    for _ in range(_MAX_SWEEPS):
+        moved = 0.0
+        for i in range(len(b)):
+            step = min(max(x[i] - slope[i] / a[i, i], -limit[i]), limit[i]) - x[i]
+            if step != 0.0:
+                x[i] += step
+                slope += step * a[i]
+                moved = max(moved, step * step * a[i, i])
+        if moved < _MAX_LAST_GAIN:
+            break
+    return x
 
 
 def regression(

@@ -9,7 +9,15 @@ import numpy as np
 
 from localization.diagnosis.causes import Cause
 from localization.diagnosis.findings import Gain
-from localization.diagnosis.linearization import Linearization, Noise, Regression, group_of, make_regression
+from localization.diagnosis.linearization import (
+    MAX_TOLERANCE_SIGMAS,
+    Linearization,
+    Noise,
+    Regression,
+    bounded_minimum,
+    group_of,
+    make_regression,
+)
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
 from motion_models.errors import CgError, ModelError
 from motion_models.se2 import FloatArray
@@ -101,20 +109,19 @@ def signature_correlation(problem: Regression, given: tuple[int, ...], a: int, b
 
 
 def heldout_gain(
-    linear: FloatArray,
-    signatures: FloatArray,
-    nuisances: FloatArray,
-    noise: Noise,
-    scale: FloatArray,
-    chosen: tuple[int, ...],
-    others: tuple[int, ...],
-    rng: np.random.Generator,
+    state: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], rng: np.random.Generator, is_tolerant: bool = False
 ) -> Gain:
-    """Root mean square of held-out whitened discrepancies by ``others`` and by ``chosen``; folds are of blocks of 4 windows."""
-    squares = [heldout_squares(linear, signatures, nuisances, noise, scale, subset) for subset in (others, chosen)]
-    n = len(linear)
-    block = np.arange(n) // _BLOCK_WINDOWS
-    counts = np.bincount(block, weights=np.isfinite(linear).sum(axis=1))
+    """Root mean square of held-out whitened discrepancies by ``others`` and by ``chosen``; folds are of blocks of 4 windows. Where it
+    ``is_tolerant``, all other causes may be fitted as well, within what is tolerated of them."""
+    problem = state.problem
+    squares = []
+    for subset in (others, chosen):
+        is_named = np.isin(np.arange(len(problem.scale)), subset)
+        spreads = problem.scale * np.where(is_named, 1.0, problem.tolerance if is_tolerant else 0.0)
+        limits = np.where(is_named, np.inf, MAX_TOLERANCE_SIGMAS)
+        squares.append(heldout_squares(state.linear, state.signatures, state.nuisances, state.noise, spreads, limits))
+    block = np.arange(len(state.linear)) // _BLOCK_WINDOWS
+    counts = np.bincount(block, weights=np.isfinite(state.linear).sum(axis=1))
     sums = [np.bincount(block, weights=s) for s in squares]
     rms = [float(np.sqrt(s.sum() / counts.sum())) for s in sums]
     draws = rng.multinomial(len(counts), np.full(len(counts), 1.0 / len(counts)), size=_BOOTSTRAP_DRAWS)
@@ -124,12 +131,15 @@ def heldout_gain(
 
 
 def heldout_squares(
-    linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, noise: Noise, scale: FloatArray, subset: tuple[int, ...]
+    linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, noise: Noise, spreads: FloatArray, limits: FloatArray
 ) -> FloatArray:
-    """(M,) sum of squares of each window."""
+    """(M,) sum of squares of each window, predicted from the others by causes with the prior sigmas ``spreads`` (p,), 0 for none, that end
+    at ``limits`` (p,) of them."""
     y = noise.whiten(linear)
-    columns = [noise.whiten(signatures[..., list(subset)]) * scale[list(subset)], noise.whiten(nuisances) * 1e3]
+    used = spreads > 0.0
+    columns = [noise.whiten(signatures[..., used]) * spreads[used], noise.whiten(nuisances) * 1e3]
     design = np.concatenate(columns, axis=-1)
+    within = np.r_[limits[used], np.full(nuisances.shape[-1], np.inf)]
     fold = (np.arange(len(y)) // _BLOCK_WINDOWS) % _FOLDS
     out = np.zeros(len(y))
     for f in range(_FOLDS):
@@ -137,7 +147,7 @@ def heldout_squares(
         if not held.any() or held.all():
             continue
         a = design[~held].reshape(-1, design.shape[-1])
-        x = np.linalg.solve(a.T @ a + np.eye(a.shape[1]), a.T @ y[~held].ravel())
+        x = bounded_minimum(a.T @ a + np.eye(a.shape[1]), a.T @ y[~held].ravel(), within)
         out[held] = np.sum((y[held] - design[held] @ x) ** 2, axis=1)
     return out
 
@@ -196,9 +206,8 @@ def aliases_of(predictor: DrivePredictor, linearization: Linearization, chosen: 
     base, own = problem.gain(others), problem.gain(chosen)
     tolerance = max(_ALIAS_LOG_ODDS, _ALIAS_SHARE * (own - base))
     found: dict[str, tuple[float, int]] = {}
-    for j, cause in enumerate(causes):
-        if j in chosen or group_of(cause) == group_of(causes[i]) or any(group_of(cause) == group_of(causes[k]) for k in others):
-            continue
+    for j in _substitutes(causes, chosen):
+        cause = causes[j]
         if abs(signature_correlation(problem, others, i, j)) < _MIN_ALIAS_CORRELATION:
             continue
         subset = (*others, j)
@@ -217,6 +226,28 @@ def aliases_of(predictor: DrivePredictor, linearization: Linearization, chosen: 
         if cost - best <= tolerance and abs(sizes[causes[j]]) <= causes[j].largest_plausible:
             costs.append((cost, causes[j].id, sizes[causes[j]]))
     return tuple((name, size) for _, name, size in sorted(costs))
+
+
+def has_tolerated_substitute(linearization: Linearization, chosen: tuple[int, ...], i: int, largest: FloatArray) -> bool:
+    """Whether one cause no larger than what is tolerated of it, ``largest`` (p,), explains the drive about as well as ``i``, or as ``i``
+    and another one of those ``chosen`` together, as where these two nearly cancel."""
+    problem, causes = linearization.problem, linearization.causes
+    groups = [group_of(e) for e in causes]
+    most = cost(problem, groups, chosen) + _ALIAS_LOG_ODDS
+    for k in chosen:
+        rest = tuple(j for j in chosen if j not in (i, k))
+        for j in _substitutes(causes, chosen):
+            size = float(problem.fit((*rest, j))[0][-1])
+            is_tolerated = abs(size) <= largest[j] and not (causes[j].one_sided and size < 0.0)
+            if is_tolerated and cost(problem, groups, (*rest, j)) <= most:
+                return True
+    return False
+
+
+def _substitutes(causes: tuple[Cause, ...], chosen: tuple[int, ...]) -> list[int]:
+    """Causes that could take the place of one of those ``chosen``."""
+    groups = {group_of(causes[k]) for k in chosen}
+    return [j for j, cause in enumerate(causes) if group_of(cause) not in groups]
 
 
 def _cost(linearization: Linearization, sizes: dict[Cause, float], rows: FloatArray) -> float:
@@ -241,16 +272,20 @@ def _refine_sizes(
     predictor: DrivePredictor, linearization: Linearization, sizes: dict[Cause, float]
 ) -> tuple[dict[Cause, float], FloatArray]:
     """Gauss-Newton on the sizes by the real predictor, with the signatures that are at hand until a step is long; and the discrepancies
-    (M, 6) that they leave."""
+    (M, 6) that they leave. All other causes may take what they are tolerated."""
     order = list(sizes)
+    own = [linearization.causes.index(e) for e in order]
     limits = _bounds(tuple(order))
     values = np.array([_bounded(e, sizes[e]) for e in order])
     rows = predictor.discrepancies(with_sizes(dict(zip(order, values, strict=True))))
-    own = linearization.signatures[..., [linearization.causes.index(e) for e in order]]
+    signatures = linearization.signatures
     typical = np.array([e.typical for e in order])
     for _ in range(_MAX_STEPS if order else 0):
-        problem = make_regression(rows, own, linearization.nuisances, linearization.noise, tuple(order), linearization.tolerance)
-        change = np.linalg.solve(problem.gram + 1e-9 * np.eye(len(order)), problem.moment) * problem.scale
+        problem = make_regression(
+            rows, signatures, linearization.nuisances, linearization.noise, linearization.causes, linearization.tolerance
+        )
+        score, information = problem.scores((), own)
+        change = np.linalg.solve(information + 1e-9 * np.eye(len(order)), score) * problem.scale[own]
         new = np.clip(values + change, limits[:, 0], limits[:, 1])
         moved = float(np.max(np.abs(new - values) / typical))
         if moved < _CONVERGED_STEP:
@@ -259,7 +294,8 @@ def _refine_sizes(
         hypothesis = with_sizes(dict(zip(order, values, strict=True)))
         rows = predictor.discrepancies(hypothesis)
         if moved > _LONG_STEP:
-            own = np.stack([predictor.signature(hypothesis, e, rows) for e in order], axis=-1)
+            signatures = signatures.copy()
+            signatures[..., own] = np.stack([predictor.signature(hypothesis, e, rows) for e in order], axis=-1)
     return dict(zip(order, (float(v) for v in values), strict=True)), rows
 
 
