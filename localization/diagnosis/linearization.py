@@ -13,7 +13,7 @@ from scipy.optimize import nnls
 
 from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause, Hypothesis, friction_change, slope_across
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.prediction import DrivePredictor, with_sizes
+from localization.diagnosis.prediction import CHANNELS, DrivePredictor, with_sizes
 from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import Batch
 from motion_models.diff_drive import DiffDrive
@@ -29,6 +29,11 @@ _MIN_FREE_SHARE = 0.1  # of all numbers, however many causes there are
 _CLAIMED_WINDOWS = 4.0  # number of windows that a motion reference's own covariance counts for
 _MIN_SIGMA_OVER_CLAIMED = 0.5  # least sigma, as a share of the one that the motion reference gives
 _MAX_SWEEPS, _MAX_LAST_GAIN = 2000, 1e-8  # of the search for tolerated sizes, the latter in squares of whitened numbers
+_MEASURED_SPEED_M_PER_S = 0.05
+_TURN_ERROR_OVER_LOG_SPEED = 0.065
+"""How far a robot turns for the same way of the wheels, over the logarithm of their speed: DRIVE's Husky, by its gyro, turns 0.42 of the
+geometry's angle where the sides' speeds differ from their mean by 0.4 to 0.8 m/s, and 0.49 where by 0.03 to 0.1 m/s; slower, there is
+no data of turns in place."""
 _CLIP = 9.0  # squares beyond this many variances are outliers, and count as this much
 
 
@@ -72,13 +77,29 @@ def variance_regressors(batch: Batch, wheel_radius: float, track: float) -> Floa
     return np.column_stack([np.ones(len(driven)), driven, turned])
 
 
+def slow_turn_sigmas(predictor: DrivePredictor) -> FloatArray:
+    """(M,) error of the predicted turn where wheels roll more slowly than the friction model was ever measured, and than the drive does
+    else [rad]: by the model a robot turns as far by slow wheels as by fast ones, but contacts creep."""
+    batch = predictor.batch
+    speeds = predictor.drive.robot.geometry.wheel_radius_m * np.sqrt(np.mean(np.square(batch.wheels), axis=1))
+    turned = np.abs(predictor.nominal_twist[:, 2]) * batch.dt
+    order = np.argsort(speeds)
+    middle = speeds[order][np.searchsorted(np.cumsum(turned[order]), 0.5 * turned.sum())] if turned.any() else 0.0
+    slower = np.log(np.maximum(min(_MEASURED_SPEED_M_PER_S, middle) / np.maximum(speeds, 1e-9), 1.0))
+    total = np.r_[0.0, np.cumsum(turned * slower)]
+    return np.asarray(_TURN_ERROR_OVER_LOG_SPEED * (total[batch.ends] - total[batch.first[batch.owner] + batch.lead[batch.owner]]))
+
+
 def given_noise(rows: FloatArray, sigmas: FloatArray, follows: NDArray[np.bool_]) -> Noise:
     """Independent numbers with the given ``sigmas`` (M, 6)."""
     return Noise(np.where(np.isfinite(rows), sigmas, 1.0), np.eye(rows.shape[1]), np.zeros(rows.shape[1]), follows, np.ones(len(rows)))
 
 
-def estimate_noise(left: FloatArray, features: FloatArray, follows: NDArray[np.bool_], spent: FloatArray, claimed: FloatArray) -> Noise:
-    """By ``left`` (M, 6), what the richest explanation leaves, which has used up ``spent`` (6,) degrees of freedom in each channel.
+def estimate_noise(
+    left: FloatArray, features: FloatArray, follows: NDArray[np.bool_], spent: FloatArray, claimed: FloatArray, creep: FloatArray
+) -> Noise:
+    """By ``left`` (M, 6), what the richest explanation leaves, which has used up ``spent`` (6,) degrees of freedom in each channel; errors
+    of the model with the sigmas ``creep`` (M, 6) come on top.
 
     The sigmas that the motion references give, ``claimed`` (M, 6), count as much as a few windows: short drives show little of their noise.
     The estimate may be smaller than they are, but not by much.
@@ -101,7 +122,7 @@ def estimate_noise(left: FloatArray, features: FloatArray, follows: NDArray[np.b
             variance = np.maximum(f @ found, 0.2 * float(np.median(variance)))
         given = claimed[use, channel]
         pooled = (free[channel] * variance + _CLAIMED_WINDOWS * given**2) / (free[channel] + _CLAIMED_WINDOWS)
-        sigmas[use, channel] = np.maximum(np.sqrt(pooled), _MIN_SIGMA_OVER_CLAIMED * given)
+        sigmas[use, channel] = np.hypot(np.maximum(np.sqrt(pooled), _MIN_SIGMA_OVER_CLAIMED * given), creep[use, channel])
     z = np.nan_to_num(left * np.sqrt(inflate) / sigmas, nan=0.0)
     lengths = np.abs(z).max(axis=1)
     weights = np.minimum(1.0, 4.0 / np.maximum(lengths, 1e-9))
@@ -403,7 +424,9 @@ def _estimate_drive_noise(
     sigmas[:, :3] = given
     sigmas[:, 3] = np.hypot(given[:, 2], 1e-3)
     sigmas[:, 4:] = 0.05
-    noise = given_noise(linear, sigmas, follows)
+    creep = np.zeros_like(linear)
+    creep[:, CHANNELS.index("yaw")] = slow_turn_sigmas(predictor)
+    noise = given_noise(linear, np.hypot(sigmas, creep), follows)
     scale = np.array([e.plausible for e in causes])
     known = np.isfinite(linear)
     for _ in range(3):
@@ -414,7 +437,7 @@ def _estimate_drive_noise(
         spent = np.sum((design @ inverse) * design, axis=1).reshape(linear.shape).sum(axis=0)
         p = len(causes)
         left = linear - signatures @ (x[:p] * scale) - nuisances @ (x[p:] * 1e3)
-        noise = estimate_noise(np.where(known, left, np.nan), features, follows, spent, sigmas)
+        noise = estimate_noise(np.where(known, left, np.nan), features, follows, spent, sigmas, creep)
     return noise
 
 
