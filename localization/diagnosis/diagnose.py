@@ -13,7 +13,7 @@ from localization.diagnosis.causes import MISSING_MESSAGES, Cause, Hypothesis
 from localization.diagnosis.corrected_robot import check_handover
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain, describe_loss, describe_standstill_turn, evidence, sentence
-from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, with_tolerance
+from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
 from localization.diagnosis.selection import (
     aliases_of,
@@ -40,8 +40,7 @@ from motion_models.base import MotionModel
 from motion_models.se2 import FloatArray
 
 _ROUNDS = 5
-TOLERANCES = (0.35, 0.1)  # sigma of unnamed causes, over what is negligible: first the spread of robots, then the accuracy of their files
-_STRICT_FACTOR = 2.0  # with the stricter of them, sizes must be so many times what is negligible
+TOLERANCE = 0.35  # sigma of unnamed causes, over what is negligible: the spread of robots about their files
 _SYSTEMATIC_SHARE = 1.0 / 3.0  # systematic part of a size's sigma, over what is negligible: clocks, mounts and physics are no better
 _MIN_HELDOUT_GAIN = 0.003  # least held-out gain of a finding
 _CLEAR_HELDOUT_GAIN = 0.05
@@ -105,20 +104,15 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
         return DiagnosisResult(_undecidable(drive, model, drive.warnings[0] if drive.motion_reference == "none" else why), None, None)
     predictor = make_predictor(drive, model, baseline)
     causes = candidate_causes(predictor, config.moments)
-    first = linearize(predictor, causes, {}, TOLERANCES[0])
-    found = _diagnose_within(predictor, first, config)
-    if found.diagnosis.verdict == "consistent":  # within the spread of robots: also within the accuracy of their files?
-        strict = _diagnose_within(predictor, with_tolerance(first, TOLERANCES[1]), config)
-        if strict.diagnosis.verdict in ("explained", "ambiguous"):  # stricter tolerances name causes; they do not contradict the table
-            return strict
-    return found
-
-
-def _diagnose_within(predictor: DrivePredictor, first: Linearization, config: DiagnosisConfig) -> DiagnosisResult:
-    """With unnamed causes within the tolerance of the ``first`` linearization."""
+    first = linearize(predictor, causes, {}, TOLERANCE)
     rng = np.random.default_rng(config.seed)
-    causes, tolerance = first.causes, first.tolerance
-    linearization = first
+    linearization, chosen = _choose_causes(predictor, first)
+    return _conclude(predictor, first, linearization, _drop_insignificant(linearization, chosen, rng, config), rng, config)
+
+
+def _choose_causes(predictor: DrivePredictor, first: Linearization) -> tuple[Linearization, tuple[int, ...]]:
+    """The best set of causes, and the drive linearized about a hypothesis that hardly differs from it."""
+    causes, linearization = first.causes, first
     current: dict[Cause, float] = {}
     visited: list[dict[Cause, float]] = []
     visited_keys: list[frozenset[str]] = []
@@ -129,7 +123,7 @@ def _diagnose_within(predictor: DrivePredictor, first: Linearization, config: Di
             break
         current = sizes
         visited.append(sizes)
-        linearization = linearize(predictor, causes, current, tolerance)
+        linearization = linearize(predictor, causes, current, TOLERANCE)
         if keys in visited_keys:
             break
         visited_keys.append(keys)
@@ -137,10 +131,9 @@ def _diagnose_within(predictor: DrivePredictor, first: Linearization, config: Di
         best = min(visited, key=lambda sizes: refined_cost(predictor, linearization, sizes))
         if set(best) != set(current):
             current = best
-            linearization = linearize(predictor, causes, current, tolerance)
+            linearization = linearize(predictor, causes, current, TOLERANCE)
     index = {e.key: i for i, e in enumerate(causes)}
-    chosen = _drop_insignificant(linearization, tuple(sorted(index[e.key] for e in current)), rng, config)
-    return _conclude(predictor, first, linearization, chosen, rng, config)
+    return linearization, tuple(sorted(index[e.key] for e in current))
 
 
 def _drop_insignificant(
@@ -199,7 +192,7 @@ def _conclude(
         next_drive=next_drive,
         sentence="",
         within=within,
-        tolerances={e.id: _tolerated_size(linearization, e) for e in causes if e.id in within},
+        tolerances={e.id: e.negligible for e in causes if e.id in within},
         detectable_sizes=detectable,
         gain=_heldout(linearization, chosen, (), config) if chosen else None,
         contradictions=() if drive.standstill_turn is None else (describe_standstill_turn(drive.standstill_turn),),
@@ -222,10 +215,6 @@ def _heldout(
     return heldout_gain(linearization, chosen, others, np.random.default_rng(config.seed), is_tolerant)
 
 
-def _tolerated_size(linearization: Linearization, cause: Cause) -> float:
-    return (1.0 if linearization.tolerance >= TOLERANCES[0] else _STRICT_FACTOR) * cause.negligible
-
-
 def _keep_useful(
     linearization: Linearization, chosen: tuple[int, ...], config: DiagnosisConfig
 ) -> tuple[tuple[int, ...], list[Gain], dict[str, tuple[float, float]]]:
@@ -233,7 +222,7 @@ def _keep_useful(
     gain, over the robot file or over all that is tolerated; the first gain of each; size and sigma of those within tolerance."""
     within: dict[str, tuple[float, float]] = {}
     causes, windows = linearization.causes, len(linearization.rows)
-    largest = np.array([_tolerated_size(linearization, e) for e in causes])
+    largest = np.array([e.negligible for e in causes])
     while True:
         sizes, cov, _ = linearization.problem.fit(chosen)
         without = [tuple(j for j in chosen if j != i) for i in chosen]

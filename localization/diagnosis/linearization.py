@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,7 +21,7 @@ from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
 
 MAX_TOLERANCE_SIGMAS = 3.0
-"""Largest size of a cause that is not named, over the sigma of its tolerance: about what is negligible (see `diagnose.TOLERANCES`)."""
+"""Largest size of a cause that is not named, over the sigma of its tolerance: about what is negligible (see `diagnose.TOLERANCE`)."""
 _ROUNDS = 8
 _MOTION = 3  # channels of the motion itself
 _MIN_FREE_SHARE = 0.1  # of all numbers, however many causes there are
@@ -381,14 +380,6 @@ def linearize(predictor: DrivePredictor, causes: tuple[Cause, ...], sizes: dict[
     noise = _estimate_drive_noise(predictor, linear, signatures, nuisances, causes)
     problem = make_regression(linear, signatures, nuisances, noise, causes, tolerance)
     return Linearization(causes, rows, linear, signatures, nuisances, noise, tolerance, problem)
-
-
-def with_tolerance(linearization: Linearization, tolerance: float) -> Linearization:
-    """The same, with unnamed causes held to another ``tolerance``."""
-    problem = make_regression(
-        linearization.linear, linearization.signatures, linearization.nuisances, linearization.noise, linearization.causes, tolerance
-    )
-    return dataclasses.replace(linearization, tolerance=tolerance, problem=problem)
 
 
 def make_regression(

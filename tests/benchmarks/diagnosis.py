@@ -5,7 +5,7 @@
 diagnosis-benchmark.jsonl); cases that FILE has are not run again, so that it can be stopped at any time. Drives are kept in FOLDER, if one
 is given: to diagnose them again takes a third of the time.
 A case is determined by its number. No robot is exactly as its file: beside what is hidden, geometry, mounts, clocks, floor and gyro of each
-deviate by as much as the diagnosis takes for the accuracy of robot files (`TOLERANCES`), and intervals are to hold the hidden size.
+deviate by as much as the diagnosis takes for the accuracy of robot files (`TOLERANCE`), and intervals are to hold the hidden size.
 Tables come from the rows: `--report` prints them without running anything.
 """
 
@@ -25,7 +25,7 @@ from typing import Any, Literal
 import numpy as np
 
 from localization.diagnosis.causes import CAUSES, Cause
-from localization.diagnosis.diagnose import TOLERANCES, DiagnosisResult, examine
+from localization.diagnosis.diagnose import TOLERANCE, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log
 from localization.diagnosis.linearization import Linearization, linearize, make_regression
 from localization.logs import open_log
@@ -77,7 +77,7 @@ def case_of(number: int) -> Case:
         first = number % len(causes)
         chosen = [causes[first]] if kind == "single" else [causes[first], causes[(first + int(rng.integers(1, len(causes)))) % len(causes)]]
         effects = {name: _size(name, robot, rng) for name in chosen}
-    deviations = {name: float(rng.normal(0.0, TOLERANCES[0] * CAUSES[name].negligible)) for name in _DEVIATING}
+    deviations = {name: float(rng.normal(0.0, TOLERANCE * CAUSES[name].negligible)) for name in _DEVIATING}
     return Case(number, kind, effects, robot, route, deviations)
 
 
@@ -143,8 +143,8 @@ def nominal_state(found: DiagnosisResult) -> Linearization:
     assert found.predictor is not None
     assert found.linearization is not None
     last = found.linearization
-    first = linearize(found.predictor, last.causes, {}, TOLERANCES[0])
-    problem = make_regression(first.linear, first.signatures, first.nuisances, last.noise, first.causes, TOLERANCES[0])
+    first = linearize(found.predictor, last.causes, {}, TOLERANCE)
+    problem = make_regression(first.linear, first.signatures, first.nuisances, last.noise, first.causes, TOLERANCE)
     return dataclasses.replace(first, noise=last.noise, problem=problem)
 
 
