@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from localization.diagnosis.causes import Cause
+from localization.diagnosis.causes import Cause, Hypothesis
 from localization.diagnosis.findings import Gain
 from localization.diagnosis.linearization import (
     MAX_TOLERANCE_SIGMAS,
@@ -160,7 +160,7 @@ _MAX_MISSING_SHARE = 0.1  # share of what signatures promise that may be missing
 _FEW_CAUSES, _EXTRA_SETS = 2, 4  # then so many sets of up to so many causes are tried by full prediction
 _NEAR_LOG_EVIDENCE = 30.0
 _CLEAR_LOG_EVIDENCE = 200.0  # lead in twice the log-evidence that needs no trial
-_MAX_STEPS = 4
+_MAX_STEPS, _SHORTER_STEP = 6, 0.3
 _CONVERGED_STEP, _LONG_STEP = 0.02, 0.2  # steps, over typical sizes: one that ends, and one after which signatures are taken anew
 
 
@@ -170,7 +170,9 @@ def search_causes(predictor: DrivePredictor, linearization: Linearization) -> di
     groups = [group_of(e) for e in causes]
     ranked = rank_subsets(problem, groups, _bounds(causes))
     least, best = ranked[0]
-    nothing = problem.misfit()
+    sizes = _linear_sizes(linearization, best)
+    left = linearization.linear - linearization.signatures[..., list(best)] @ np.array(list(sizes.values()))
+    promised = _cost(linearization, sizes, left)
     results: dict[tuple[int, ...], tuple[float, dict[Cause, float]]] = {}
 
     def cost_of(subset: tuple[int, ...]) -> float:
@@ -181,10 +183,13 @@ def search_causes(predictor: DrivePredictor, linearization: Linearization) -> di
         return results[subset][0]
 
     is_sure = len(ranked) < 2 or ranked[1][0] - least > _CLEAR_LOG_EVIDENCE
-    is_nearly_linear = cost_of(best) < nothing + least + max(_MAX_MISSING_SHARE * abs(least), _ALIAS_LOG_ODDS)
-    cost_of(())
+    missing = cost_of(best) - promised
+    is_nearly_linear = missing < max(_MAX_MISSING_SHARE * (cost_of(()) - promised), _ALIAS_LOG_ODDS)
     margin = max(_NEAR_LOG_EVIDENCE, _MAX_MISSING_SHARE * abs(least)) if is_nearly_linear else _CLEAR_LOG_EVIDENCE
     near = [s for c, s in ranked if c - least < margin]
+    if not is_nearly_linear:  # single causes also from the edge, where their signatures lead beyond it
+        for i in sorted(range(len(causes)), key=lambda i: cost(problem, groups, (i,)))[:_EXTRA_SETS]:
+            cost_of((i,))
     for size in range(1, MOST_CAUSES):
         alike = [s for s in near if len(s) == size][:_REFINED_SETS] if not is_sure else []
         if not is_nearly_linear and size <= _FEW_CAUSES:  # where signatures bend, few causes may do what many seem to
@@ -252,11 +257,14 @@ def _substitutes(causes: tuple[Cause, ...], chosen: tuple[int, ...]) -> list[int
 
 def _cost(linearization: Linearization, sizes: dict[Cause, float], rows: FloatArray) -> float:
     """What ``rows`` (M, 6), which ``sizes`` leave, are off beyond all tolerances, and the price of so many causes."""
-    whole = make_regression(
-        rows, linearization.signatures, linearization.nuisances, linearization.noise, linearization.causes, linearization.tolerance
-    )
+    whole = _regression_of(linearization, rows, linearization.signatures)
     k, groups = len(sizes), len({group_of(e) for e in linearization.causes})
     return whole.misfit() + k * math.log(max(whole.count, 2)) + 2.0 * math.log(math.comb(groups, k))
+
+
+def _regression_of(linearization: Linearization, rows: FloatArray, signatures: FloatArray) -> Regression:
+    """Of other ``rows`` (M, 6) and ``signatures`` (M, 6, p) in the same noise."""
+    return make_regression(rows, signatures, linearization.nuisances, linearization.noise, linearization.causes, linearization.tolerance)
 
 
 def _refined_cost(predictor: DrivePredictor, linearization: Linearization, start: dict[Cause, float]) -> tuple[dict[Cause, float], float]:
@@ -271,31 +279,47 @@ def _refined_cost(predictor: DrivePredictor, linearization: Linearization, start
 def _refine_sizes(
     predictor: DrivePredictor, linearization: Linearization, sizes: dict[Cause, float]
 ) -> tuple[dict[Cause, float], FloatArray]:
-    """Gauss-Newton on the sizes by the real predictor, with the signatures that are at hand until a step is long; and the discrepancies
-    (M, 6) that they leave. All other causes may take what they are tolerated."""
+    """Gauss-Newton on the sizes, with their priors, by the real predictor; and the discrepancies (M, 6) that they leave.
+
+    All other causes may take what they are tolerated. The signatures at hand are used until a step is long or makes it worse; then a step
+    is shortened.
+    """
     order = list(sizes)
     own = [linearization.causes.index(e) for e in order]
-    limits = _bounds(tuple(order))
-    values = np.array([_bounded(e, sizes[e]) for e in order])
-    rows = predictor.discrepancies(with_sizes(dict(zip(order, values, strict=True))))
-    signatures = linearization.signatures
-    typical = np.array([e.typical for e in order])
+    limits, typical = _bounds(tuple(order)), np.array([e.typical for e in order])
+    signatures, share, is_fresh = linearization.signatures, 1.0, False
+
+    def predict(values: FloatArray) -> tuple[Hypothesis, FloatArray]:
+        hypothesis = with_sizes(dict(zip(order, values, strict=True)))
+        return hypothesis, predictor.discrepancies(hypothesis)
+
+    def with_own(hypothesis: Hypothesis, rows: FloatArray) -> FloatArray:
+        changed = signatures.copy()
+        changed[..., own] = np.stack([predictor.signature(hypothesis, e, rows) for e in order], axis=-1)
+        return changed
+
+    values = np.clip([sizes[e] for e in order], limits[:, 0], limits[:, 1]) if order else np.zeros(0)
+    hypothesis, rows = predict(values)
+    problem = _regression_of(linearization, rows, signatures)
+    scale = problem.scale[own]
+    least = problem.misfit() + float(np.sum(np.square(values / scale)))
     for _ in range(_MAX_STEPS if order else 0):
-        problem = make_regression(
-            rows, signatures, linearization.nuisances, linearization.noise, linearization.causes, linearization.tolerance
-        )
         score, information = problem.scores((), own)
-        change = np.linalg.solve(information + 1e-9 * np.eye(len(order)), score) * problem.scale[own]
-        new = np.clip(values + change, limits[:, 0], limits[:, 1])
+        change = np.linalg.solve(information + np.eye(len(order)), score - values / scale) * scale
+        new = np.clip(values + share * change, limits[:, 0], limits[:, 1])
         moved = float(np.max(np.abs(new - values) / typical))
         if moved < _CONVERGED_STEP:
             break
-        values = new
-        hypothesis = with_sizes(dict(zip(order, values, strict=True)))
-        rows = predictor.discrepancies(hypothesis)
-        if moved > _LONG_STEP:
-            signatures = signatures.copy()
-            signatures[..., own] = np.stack([predictor.signature(hypothesis, e, rows) for e in order], axis=-1)
+        tried_hypothesis, tried_rows = predict(new)
+        tried = _regression_of(linearization, tried_rows, signatures)
+        off = tried.misfit() + float(np.sum(np.square(new / scale)))
+        if off <= least:
+            values, hypothesis, rows, problem, least, share, is_fresh = new, tried_hypothesis, tried_rows, tried, off, 1.0, False
+        elif is_fresh:
+            share *= _SHORTER_STEP
+        if not is_fresh and (off > least or moved > _LONG_STEP):
+            signatures, is_fresh = with_own(hypothesis, rows), True
+            problem = _regression_of(linearization, rows, signatures)
     return dict(zip(order, (float(v) for v in values), strict=True)), rows
 
 
@@ -305,7 +329,3 @@ def _linear_sizes(linearization: Linearization, subset: tuple[int, ...]) -> dict
 
 def _bounds(causes: tuple[Cause, ...]) -> FloatArray:
     return np.array([(0.0 if e.one_sided else -e.largest, e.largest) for e in causes])
-
-
-def _bounded(cause: Cause, size: float) -> float:
-    return max(size, 0.0) if cause.one_sided else size
