@@ -28,6 +28,7 @@ from localization.diagnosis.causes import CAUSES, Cause
 from localization.diagnosis.diagnose import TOLERANCE, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log
 from localization.diagnosis.linearization import Linearization, linearize, make_regression
+from localization.diagnosis.prediction import with_sizes
 from localization.logs import open_log
 from motion_models.registry import make_model
 from tests.helpers.diagnosis_drives import ONE_SIDED, TYPICAL, bag, drive, robot_named
@@ -131,19 +132,24 @@ def run(case: Case, has_rivals: bool, kept_in: Path | None = None) -> dict[str, 
         name: max((e.negligible for e in found.linearization.causes if e.id == name), default=None) for name in case.effects
     }
     if has_rivals:
-        pipeline, nominal = found.predictor, nominal_state(found)
+        pipeline, nominal = found.predictor, nominal_state(found, {})
         row["gain"] = round(d.gain.relative, 5) if d.gain is not None else 0.0
         row["oracle"] = round(oracle(pipeline, nominal, dict(case.effects)), 5)
         row["rivals"] = {name: [first, round(gain, 5)] for name, (first, gain) in rivals(measured, pipeline, nominal).items()}
     return row
 
 
-def nominal_state(found: DiagnosisResult) -> Linearization:
-    """The drive of ``found`` about the robot file, in the noise that was left in the end."""
+def nominal_state(found: DiagnosisResult, effects: Mapping[str, float]) -> Linearization:
+    """The drive of ``found`` about the robot file, in the noise that was left in the end; signatures of the ``effects`` are those of their
+    whole sizes, as some bend."""
     assert found.predictor is not None
     assert found.linearization is not None
     last = found.linearization
     first = linearize(found.predictor, last.causes, {}, TOLERANCE)
+    for name, size in effects.items():
+        for i in _columns(first, name):
+            ahead = found.predictor.discrepancies(with_sizes({first.causes[i]: size}))
+            first.signatures[..., i] = (first.rows - ahead) / size
     problem = make_regression(first.linear, first.signatures, first.nuisances, last.noise, first.causes, TOLERANCE)
     return dataclasses.replace(first, noise=last.noise, problem=problem)
 
@@ -153,7 +159,7 @@ def significances(found: DiagnosisResult, effects: Mapping[str, float]) -> dict[
     free and all others keep within their tolerance. None for a cause that the drive does not show at all."""
     if not effects or found.linearization is None:
         return {}
-    state = nominal_state(found)
+    state = nominal_state(found, effects)
     result: dict[str, float | None] = {}
     for name, size in effects.items():
         own = _columns(state, name)
