@@ -372,7 +372,7 @@ def linearize(predictor: DrivePredictor, causes: tuple[Cause, ...], sizes: dict[
     """Everything around the hypothesis that causes have these ``sizes``."""
     hypothesis = with_sizes(sizes)
     rows = predictor.discrepancies(hypothesis)
-    signatures = np.stack([predictor.signature(hypothesis, e, rows) for e in causes], axis=-1)
+    signatures = np.stack([_signature(predictor, e, sizes, rows) for e in causes], axis=-1)
     linear = rows.copy()
     for cause, size in sizes.items():
         linear += signatures[..., [e.key for e in causes].index(cause.key)] * size
@@ -380,6 +380,13 @@ def linearize(predictor: DrivePredictor, causes: tuple[Cause, ...], sizes: dict[
     noise = _estimate_drive_noise(predictor, linear, signatures, nuisances, causes)
     problem = make_regression(linear, signatures, nuisances, noise, causes, tolerance)
     return Linearization(causes, rows, linear, signatures, nuisances, noise, tolerance, problem)
+
+
+def _signature(predictor: DrivePredictor, cause: Cause, sizes: dict[Cause, float], rows: FloatArray) -> FloatArray:
+    """(M, 6) of ``cause`` where causes have these ``sizes``, which leave ``rows`` (M, 6); without another one of its group, whose place it
+    would take: a floor that changes at another moment does not change at both."""
+    others = {e: size for e, size in sizes.items() if e.key == cause.key or group_of(e) != group_of(cause)}
+    return predictor.signature(with_sizes(others), cause, rows if len(others) == len(sizes) else None)
 
 
 def make_regression(
