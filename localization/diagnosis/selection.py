@@ -117,7 +117,9 @@ def heldout_gain(
     squares = []
     for subset in (others, chosen):
         is_named = np.isin(np.arange(len(problem.scale)), subset)
-        spreads = problem.scale * np.where(is_named, 1.0, problem.tolerance if is_tolerant else 0.0)
+        groups = {group_of(state.causes[i]) for i in subset}  # of which one cause is at work, and no other beside it
+        is_tolerated = np.array([is_tolerant and group_of(e) not in groups for e in state.causes])
+        spreads = problem.scale * np.where(is_named, 1.0, problem.tolerance * is_tolerated)
         limits = np.where(is_named, np.inf, MAX_TOLERANCE_SIGMAS)
         squares.append(heldout_squares(state.linear, state.signatures, state.nuisances, state.noise, spreads, limits))
     block = np.arange(len(state.linear)) // _BLOCK_WINDOWS

@@ -203,6 +203,7 @@ def attribute_rows(
     rest = named - np.nan_to_num(linearization.signatures) @ every
     every[list(chosen)] = sizes
     white, white_rest = linearization.noise.whiten(first.rows), linearization.noise.whiten(rest)
+    weighed = rest * linearization.noise.weights[:, None]  # as in the fit: a single window between four and eight sigma is no shape
     parts = np.nan_to_num(linearization.signatures) * every / linearization.noise.sigmas[..., None]
     scaled = np.nan_to_num(first.rows) / linearization.noise.sigmas
     found = {}
@@ -210,7 +211,7 @@ def attribute_rows(
         known = np.isfinite(first.rows[:, c]) & regular
         if not known.any():
             continue
-        rms, left_rms, rest_rms = (_rms(rows[known, c], c) for rows in (first.rows, named, rest))
+        rms, left_rms, rest_rms = (_rms(rows[known, c], c) for rows in (first.rows, named, weighed))
         expected = float(np.sqrt(np.mean(linearization.noise.sigmas[known, c] ** 2)))
         squares = float(np.sum(white[known, c] ** 2))
         count = int(known.sum())
