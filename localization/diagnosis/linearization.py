@@ -77,19 +77,16 @@ def variance_regressors(batch: Batch, wheel_radius: float, track: float) -> Floa
 
 
 def slow_turn_sigmas(predictor: DrivePredictor) -> FloatArray:
-    """(M,) error of the predicted turn of windows whose wheels roll more slowly than the friction model was ever measured, and than they do
-    elsewhere [rad]: by the model a robot turns as far by slow wheels as by fast ones, but contacts creep."""
+    """(M,) error of the predicted turn where wheels roll more slowly than the friction model was ever measured, and than the drive does
+    else [rad]: by the model a robot turns as far by slow wheels as by fast ones, but contacts creep."""
     batch = predictor.batch
     speeds = predictor.drive.robot.geometry.wheel_radius_m * np.sqrt(np.mean(np.square(batch.wheels), axis=1))
     turned = np.abs(predictor.nominal_twist[:, 2]) * batch.dt
     order = np.argsort(speeds)
     middle = speeds[order][np.searchsorted(np.cumsum(turned[order]), 0.5 * turned.sum())] if turned.any() else 0.0
-    begins = batch.first[batch.owner] + batch.lead[batch.owner]
-    way, angle = (np.r_[0.0, np.cumsum(values)] for values in (turned * speeds, turned))
-    whole = angle[batch.ends] - angle[begins]
-    mean = (way[batch.ends] - way[begins]) / np.maximum(whole, 1e-9)
-    slower = np.log(np.maximum(min(_MEASURED_SPEED_M_PER_S, middle) / np.maximum(mean, 1e-9), 1.0))
-    return np.asarray(_TURN_ERROR_OVER_LOG_SPEED * whole * slower)
+    slower = np.log(np.maximum(min(_MEASURED_SPEED_M_PER_S, middle) / np.maximum(speeds, 1e-9), 1.0))
+    total = np.r_[0.0, np.cumsum(turned * slower)]
+    return np.asarray(_TURN_ERROR_OVER_LOG_SPEED * (total[batch.ends] - total[batch.first[batch.owner] + batch.lead[batch.owner]]))
 
 
 def given_noise(rows: FloatArray, sigmas: FloatArray, follows: NDArray[np.bool_]) -> Noise:
