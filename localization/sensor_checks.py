@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -124,8 +124,8 @@ class Fault:
     )
     DISAGREEMENT = (
         "for {seconds:.0f} s the motion by the scans and that by the wheels differ ({sigmas:.1f} sigma in the mean, {metres:.2f} m and"
-        " {degrees:.0f} deg at the end{others}). Wheels slip, or a sensor is mounted, stamped or scaled otherwise than its driver says: run"
-        " `skidloc diagnose` on the log."
+        " {degrees:.0f} deg at the end{others}). Wheels slip, or the mount, the stamps or the scale of a sensor are wrong: run `skidloc"
+        " diagnose` on the log."
     )
     WHEELS_STANDING = (
         "the wheels read zero while {others} moved. They count as unknown there. Check the encoders, the driver of the wheels and the"
@@ -153,16 +153,36 @@ class _Episode(NamedTuple):
     mean_square: float
     """Of the last 5 s, in sigmas."""
 
-    def message(self, episodes: Sequence[_Episode]) -> str:
-        """For the largest of the ``episodes``."""
-        seconds = sum(episode.end_s - episode.begin_s for episode in episodes)
-        return Fault.DISAGREEMENT.format(
-            seconds=self.end_s - self.begin_s,
-            sigmas=math.sqrt(self.mean_square),
-            metres=math.hypot(self.difference[0], self.difference[1]),
-            degrees=abs(math.degrees(self.difference[2])),
-            others=f"; the largest of {len(episodes)} such times, {seconds:.0f} s in all" if len(episodes) > 1 else "",
+    @property
+    def distance(self) -> float:
+        """Length of the difference [m]."""
+        return math.hypot(self.difference[0], self.difference[1])
+
+
+class _Episodes(NamedTuple):
+    """The largest of several times of disagreement, and their sum."""
+
+    number: int = 0
+    seconds: float = 0.0
+    largest: _Episode | None = None
+
+    def including(self, episode: _Episode) -> _Episodes:
+        """These and ``episode``."""
+        is_larger = self.largest is None or episode.distance > self.largest.distance
+        return _Episodes(self.number + 1, self.seconds + episode.end_s - episode.begin_s, episode if is_larger else self.largest)
+
+    def found(self) -> Found | None:
+        """The largest; None without any."""
+        if self.largest is None:
+            return None
+        message = Fault.DISAGREEMENT.format(
+            seconds=self.largest.end_s - self.largest.begin_s,
+            sigmas=math.sqrt(self.largest.mean_square),
+            metres=self.largest.distance,
+            degrees=abs(math.degrees(self.largest.difference[2])),
+            others=f"; the largest of {self.number} such times, {self.seconds:.0f} s in all" if self.number > 1 else "",
         )
+        return Found(Fault.DISAGREEMENT, self.largest.begin_s, message)
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,13 +232,14 @@ class SensorChecks:
         self._step: Step | None = None
         self._suspected: dict[str, tuple[float, float]] = {}  # when first found, and start of the bins then [s]
         self._comparisons: dict[str, _Comparisons] = {}  # by fault
-        self.found: dict[str, Found] = {}
+        self._declared: dict[str, Found] = {}
         self._start_ns: int | None = None
         self._stood_s = 0.0  # time for which the wheels read zero
         self._standing_s = 0.0  # the same, while that is contradicted
         self._pose: FloatArray | None = None
         self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)  # motion since the sensors last agreed
-        self._episodes: list[_Episode] = []
+        self._episodes = _Episodes()  # that have ended
+        self._episode: _Episode | None = None
         self._pending = np.zeros((3, 3))
         self._spread = np.zeros((3, 3))
         self._spread_since_ns: int | None = None
@@ -278,6 +299,13 @@ class SensorChecks:
         """Faults so far."""
         return [f"at t = {found.at_s:.1f} s: {found.message}" for found in self.found.values()]
 
+    @property
+    def found(self) -> dict[str, Found]:
+        """Faults so far, by their messages in `Fault`."""
+        episodes = self._episodes if self._episode is None else self._episodes.including(self._episode)
+        disagreement = episodes.found()
+        return self._declared if disagreement is None else {**self._declared, Fault.DISAGREEMENT: disagreement}
+
     def _without_own_body(self, step: Step) -> Step:
         self._own_body.add_motion(step.predicted.delta)
         if step.scan is None:
@@ -290,7 +318,7 @@ class SensorChecks:
     def _without_faulty(self, step: Step) -> Step:
         if self._is_gyro_impossible(step):
             step = replace(step, turn=None)
-        faults = {fault for fault in self.found if self._is_contradicted(fault)}
+        faults = {fault for fault in self._declared if self._is_contradicted(fault)}
         if faults & {Fault.GYRO_OPPOSITE, Fault.GYRO_UNIT} or (self._is_gyro_stuck and Fault.GYRO_STUCK in faults):
             step = replace(step, turn=None)
         if faults & {Fault.LIDAR_OPPOSITE, Fault.LIDAR_DIRECTION}:
@@ -302,12 +330,12 @@ class SensorChecks:
     def _is_gyro_impossible(self, step: Step) -> bool:
         """Whether the gyro's rate is one that no slip explains, or was within the last `_MEMORY_S`."""
         now_s = self._now_s(step)
-        if step.turn is not None and step.has_wheels and step.duration > 0.0:
+        if step.turn is not None and step.has_wheels and step.duration > 0.0 and not step.is_standing:
             by_wheels = float(step.predicted.delta[2]) / step.duration
             off = abs(step.turn.angle / step.duration - by_wheels)
             if off > max(_MAX_RATE_OFF_RAD_S, _MAX_RATE_OFF_SHARE * abs(by_wheels)):
                 self._impossible_s = now_s
-                if Fault.GYRO_UNIT not in self.found:
+                if Fault.GYRO_UNIT not in self._declared:
                     self._declare(Fault.GYRO_RATE, now_s, {"rate": off})
         return now_s - self._impossible_s < _MEMORY_S
 
@@ -332,18 +360,17 @@ class SensorChecks:
 
     def _check_disagreement(self, delta: FloatArray, nis: float | None) -> None:
         """Compare ``delta`` (3,), the last step by the estimate, with the wheels' motion."""
-        step, before = self._step, self._disagreement.difference
+        step = self._step
         if step is None or step.duration == 0.0:
             return
         self._disagreement.add(step, delta, nis)
         off = self._disagreement.difference
-        if off is None:
-            self._pending = self._pending + (0.0 if before is None else np.outer(before, before))
-            return
-        episode = _Episode(self._disagreement.began_s - (self._start_ns or 0) * _NS, self._now_s(step), off, self._disagreement.mean_square)
-        self._episodes = [*(self._episodes if before is None else self._episodes[:-1]), episode]
-        largest = max(self._episodes, key=lambda e: float(np.hypot(e.difference[0], e.difference[1])))
-        self.found[Fault.DISAGREEMENT] = Found(Fault.DISAGREEMENT, largest.begin_s, largest.message(self._episodes))
+        if off is not None:
+            begin_s = self._disagreement.began_s - (self._start_ns or 0) * _NS
+            self._episode = _Episode(begin_s, self._now_s(step), off, self._disagreement.mean_square)
+        elif self._episode is not None:
+            self._pending = self._pending + np.outer(self._episode.difference, self._episode.difference)
+            self._episodes, self._episode = self._episodes.including(self._episode), None
 
     def _with_unknown_motion(self, step: Step, seconds2: float) -> Step:
         """``step`` with the covariance of a lasting unknown twist, which grows by ``seconds2`` [s^2]."""
@@ -420,11 +447,11 @@ class SensorChecks:
 
     def _declare(self, fault: str, at_s: float, numbers: Mapping[str, float | str]) -> None:
         """Report ``fault`` once, and widen the covariance by how far the estimate is from the other sensors' dead reckoning."""
-        if fault in self.found:
+        if fault in self._declared:
             return
-        self.found[fault] = Found(fault, max(at_s, 0.0), fault.format(**numbers))
+        self._declared[fault] = Found(fault, max(at_s, 0.0), fault.format(**numbers))
         if fault == Fault.GYRO_UNIT:
-            self.found.pop(Fault.GYRO_RATE, None)  # it is explained
+            self._declared.pop(Fault.GYRO_RATE, None)  # it is explained
         if fault == Fault.WHEELS_STANDING:
             return
         is_gyro = fault in (Fault.GYRO_OPPOSITE, Fault.GYRO_STUCK, Fault.GYRO_UNIT, Fault.GYRO_RATE)

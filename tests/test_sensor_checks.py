@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import pickle
 import re
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from localization.estimators import Estimate
 from localization.events import ImuSample, Scan, Step, Turn
 from localization.lidar import LidarConfig
+from localization.ros.state_serialization import deserialize, serialize
 from localization.sensor_checks import Fault, SensorChecks
 from localization.trajectory import Trajectory
 from motion_models import se2
@@ -271,3 +273,44 @@ def test_gyro_in_degrees_from_half_way_on_is_left_out_within_five_seconds() -> N
     checks = robot.drive(24.0)
     assert Fault.GYRO_UNIT in checks.found
     assert all(step.turn is None for step in robot.applied[-70:])
+
+
+def test_gyro_is_used_while_the_wheels_read_zero_and_the_robot_spins() -> None:
+    """Encoders that are dead at 2.5 rad/s: the gyro is right."""
+    robot = Robot(gyro=lambda w: 2.5 + w, wheels=lambda v, w: (0.0, 0.0), has_scans=False)
+    checks = robot.drive(5.0)
+    assert Fault.GYRO_RATE not in checks.found
+    assert all(step.turn is not None for step in robot.applied)
+
+
+def test_gyro_in_degrees_from_half_way_on_is_found_beside_wheels_that_turn_twice_as_far() -> None:
+    gyro_of = iter([*[1.0] * 120, *[math.degrees(1.0)] * 120])
+    robot = Robot(gyro=lambda w: next(gyro_of) * w, wheels=lambda v, w: (v, 2.0 * w))
+    checks = robot.drive(24.0)
+    assert Fault.GYRO_UNIT in checks.found
+    assert all(step.turn is None for step in robot.applied[-70:])
+
+
+def test_memory_stays_flat_over_many_disagreements() -> None:
+    """Wheels that count three times too far for 3 of every 9 s."""
+    sizes = []
+    for times in (2, 3):
+        robot = Robot()
+        robot.wheels = lambda v, w, robot=robot: ((3.0 if 40 <= len(robot.applied) % 90 < 70 else 1.0) * v, w)
+        checks = robot.drive(9.0 * times)
+        assert f"the largest of {times} such times" in checks.warnings()[0]
+        sizes.append(len(pickle.dumps(checks._episodes)))
+    assert sizes[0] == sizes[1]
+
+
+def test_checks_are_restored_from_a_checkpoint_during_and_after_a_disagreement() -> None:
+    for seconds in (8.0, 20.0):
+        robot = Robot()
+        robot.wheels = lambda v, w, robot=robot: ((3.0 if len(robot.applied) < 90 else 1.0) * v, w)
+        checks = robot.drive(seconds)
+        restored = deserialize(*serialize(checks))
+        assert "the motion by the scans and that by the wheels differ" in checks.warnings()[0]
+        assert restored.warnings() == checks.warnings()
+        last = robot.estimates[-1]
+        ahead = Estimate(last.stamp_ns + S, se2.compose(last.pose, np.array([0.1, 0.0, 0.0])), last.covariance, np.zeros(3), None)
+        assert np.array_equal(restored.widen(ahead).covariance, checks.widen(ahead).covariance)

@@ -13,6 +13,7 @@ where it is drawn.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +37,13 @@ _MIN_DRIFT_SHARE = 0.01
 """Of the variance of a motion, at least: a tenth of its sigma, so that its information is finite."""
 _MAX_NUMBER = 1e12
 """No state or covariance of a robot on Earth is larger, in SI units."""
+_FORGETTING, _MIN_INFORMATION = 0.98, 30.0
+"""Of the wheels' scale, per measurement: information of the last 50, at least that of ten scans, as the prior's."""
+_MAX_SQUARE = 25.0
+"""Innovations squared count as so many times their expectation at most: beyond 5 sigma wheels or scans are outliers."""
+_MAX_WHEEL_SCALE = 20.0
+"""As of `calibrate`. The least is 1: slip lasts, and what fits the innovation of one scan is too small for the sum of many (ACES with a
+least scale of 1/4 for each axis: 0.099 -> 0.138 m)."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +78,9 @@ class Filter:
         self.is_considered = np.zeros(n, dtype=bool)
         """(n,) states that have no gain."""
         self.is_considered[MAP] = True
+        self.wheel_scale = 1.0
+        """Factor on the robot file's wheel noise, estimated from the innovations."""
+        self._scale_information, self._slip_cov = 0.0, np.zeros((n, n))  # Fisher information; the part of P that is this step's slip
         self._scan_noise: tuple[FloatArray, FloatArray] | None = None  # of the last scan: covariance with the errors (n, 3), own (3, 3)
 
     def predict(self, step: Step, is_turning: bool = True) -> None:
@@ -88,7 +99,8 @@ class Filter:
         F[START, START], F[START, POSE] = 0.0, np.eye(3)  # the clone of the pose as it was
         F[MAP, MAP] = A  # the same error of the submap, as a perturbation of the present pose
         Q = np.zeros_like(self.P)
-        Q[POSE, POSE] = motion.cov
+        Q[POSE, POSE] = self.wheel_cov(step)
+        self._slip_cov = Q * (step.has_wheels and not step.is_standing)
         Q[BIAS, BIAS] = self._gyro.bias_walk_rad_per_s_sqrt_s**2 * dt
         if self._config.clock_sigma_s:
             Q[CLOCK, CLOCK] = self._config.clock_walk_s_per_sqrt_s**2 * dt
@@ -102,6 +114,10 @@ class Filter:
         _check(f"the motion of the wheels until stamp {step.end_ns} ns", pose, P)
         self.start, self.pose, self.P = self.pose, pose, P
         self.is_considered[PARAMS:], self._scan_noise = not is_turning, None
+
+    def wheel_cov(self, step: Step) -> Cov3:
+        """(3, 3) of the wheels' motion in ``step``, with the estimated scale."""
+        return step.predicted.cov * (self.wheel_scale if step.has_wheels and not step.is_standing else 1.0)
 
     def update_turn(self, turn: Turn) -> float:
         """The gyro's turn since the start of the step. Returns the normalised innovation squared (NIS, 1 degree of freedom)."""
@@ -184,8 +200,24 @@ class Filter:
         A = np.eye(len(P)) - K @ H
         self.P = _symmetric(A @ P @ A.T + K @ R @ K.T)
         _check("a measurement", self.P)
+        self._adapt_wheel_scale(innovation, np.asarray(np.linalg.inv(S), dtype=float), H @ self._slip_cov @ H.T)
+        self._slip_cov = A @ self._slip_cov @ A.T
         self._move(K @ innovation)
         return float(innovation @ np.linalg.solve(S, innovation)), K
+
+    def _adapt_wheel_scale(self, innovation: FloatArray, S_inv: FloatArray, slip_cov: FloatArray) -> None:
+        """One step of Fisher scoring for log a, where S = a dS/da + ..., ``slip_cov`` = a dS/da (maximum likelihood; Mehra 1970):
+
+        2 d log p / d log a = y^T S^-1 (a dS/da) S^-1 y - tr(S^-1 a dS/da), information tr((S^-1 a dS/da)^2), innovation y.
+
+        Where slip has little share in S (wide priors, directions that the scene leaves open), there is little information.
+        """
+        share, gain = S_inv @ slip_cov, S_inv @ innovation
+        expected = float(np.trace(share))
+        score = min(float(gain @ slip_cov @ gain), _MAX_SQUARE * expected) - expected
+        self._scale_information = _FORGETTING * self._scale_information + float(np.trace(share @ share))
+        step = score / max(self._scale_information, _MIN_INFORMATION)
+        self.wheel_scale = min(max(self.wheel_scale * math.exp(step), 1.0), _MAX_WHEEL_SCALE)
 
     def _move(self, error: FloatArray) -> None:
         """Move the means by the estimated ``error`` (n,)."""

@@ -82,7 +82,8 @@ def search(image: LikelihoodImage, points: Points2, prior: Pose2, cov: Cov3, lim
     turned = _turned_points(points, prior, yaws) - image.origin
     rows = a.ravel()
     while True:
-        scores = _score(image.levels[level], turned, rows, offsets, image.cell * COARSE**level)
+        step = image.cell * COARSE**level
+        scores = _score(image.levels[level], turned / step, rows, offsets / step)
         if level == 0:
             break
         best = np.argsort(-scores, kind="stable")[: _KEPT if level == 1 else 20 * _KEPT]
@@ -126,12 +127,16 @@ def _turned_points(points: Points2, prior: Pose2, yaws: FloatArray) -> FloatArra
 
 @numba.njit(cache=True)
 def _draw(points: Points2, image: FloatArray, origin: FloatArray, cell: float) -> None:
+    along_x, along_y = np.empty(5), np.empty(5)
     for i in range(points.shape[0]):
         x, y = (points[i, 0] - origin[0]) / cell, (points[i, 1] - origin[1]) / cell
-        for jx in range(int(x) - 2, int(x) + 3):
-            for jy in range(int(y) - 2, int(y) + 3):
-                value = math.exp(-0.5 * ((jx + 0.5 - x) ** 2 + (jy + 0.5 - y) ** 2))
-                image[jx, jy] = max(image[jx, jy], value)
+        first_x, first_y = int(x) - 2, int(y) - 2
+        for k in range(5):
+            along_x[k] = math.exp(-0.5 * (first_x + k + 0.5 - x) ** 2)
+            along_y[k] = math.exp(-0.5 * (first_y + k + 0.5 - y) ** 2)
+        for jx in range(5):
+            for jy in range(5):
+                image[first_x + jx, first_y + jy] = max(image[first_x + jx, first_y + jy], along_x[jx] * along_y[jy])
 
 
 @numba.njit(cache=True)
@@ -157,13 +162,13 @@ def _reduce(image: FloatArray) -> FloatArray:
 
 
 @numba.njit(cache=True)
-def _score(image: FloatArray, points: FloatArray, rows: FloatArray, offsets: FloatArray, step: float) -> FloatArray:
-    """(K,) mean of the image where ``points`` (Y, N, 2) of rows (K,) lie, moved by ``offsets`` (K, 2) [m]; cells have edge ``step``."""
+def _score(image: FloatArray, points: FloatArray, rows: FloatArray, offsets: FloatArray) -> FloatArray:
+    """(K,) mean of the image where ``points`` (Y, N, 2) of rows (K,) lie, moved by ``offsets`` (K, 2) [cells]."""
     out = np.empty(len(rows))
     for k in range(len(rows)):
-        total = 0.0
-        for i in range(points.shape[1]):
-            x, y = (points[rows[k], i, 0] + offsets[k, 0]) / step, (points[rows[k], i, 1] + offsets[k, 1]) / step
+        total, dx, dy, row = 0.0, offsets[k, 0], offsets[k, 1], points[rows[k]]
+        for i in range(row.shape[0]):
+            x, y = row[i, 0] + dx, row[i, 1] + dy
             if x >= 0.0 and y >= 0.0 and x < image.shape[0] and y < image.shape[1]:
                 total += image[int(x), int(y)]
         out[k] = total / points.shape[1]

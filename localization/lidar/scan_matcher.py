@@ -19,6 +19,7 @@ from localization.lidar.correlative_search import CORRELATED_BEAMS, LikelihoodIm
 from localization.lidar.submap import VoxelGrid, fill_surface, find_nearest, make_grid, measure_shares, voxel_means
 from localization.settings import Allowed, Below, Count, Positive, Settings, Share
 from motion_models import se2
+from motion_models.linear_equations import Matrix3, diagonalize, multiply, solve_3x3, transform_symmetric
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, Triple, triple
 
 MIN_POINTS = 10
@@ -49,6 +50,9 @@ _MAX_RIVAL = 0.9
 """A search is ambiguous where a pose elsewhere scores more than this share of the best."""
 _BASIN_M, _BASIN_RAD = 0.15, 0.15
 """Sigma of a prior from which Gauss-Newton alone may end elsewhere: from .3 m, .15 rad it does in 14 to 31 % of trials."""
+_MIN_PLACE_OVERLAP = 0.6
+"""Share of points on the submap, below which a place found from a wide prior is not taken: Cartographer's least score of a place without
+a prior (`global_localization_min_score`)."""
 _MAX_OLD_SUBMAPS = 3
 """Key scans older than the last ones, at most, in units of their number."""
 _OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
@@ -172,7 +176,7 @@ class ScanMatcher:
         """
         nothing = np.zeros((3, 3))
         fit = self._align(points, prior, cov, prior if guess is None else guess)
-        self.is_new_place = fit.mapped < 0.5 * len(points) and fit.fitting >= 0.5 * fit.mapped and _is_narrow(cov)
+        self.is_new_place = fit.mapped < 0.5 * len(points) and fit.fitting >= 0.5 * fit.mapped and is_narrow(cov)
         is_near, agrees = _is_within_basin(fit, cov), _mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST
         if is_near and agrees and fit.overlap >= self._config.search_below:
             return self._result(fit, nothing)
@@ -181,21 +185,21 @@ class ScanMatcher:
         if best is not None:
             if not is_near and _mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:
                 outlier_cov = nothing
-            found = self._align(points, prior, cov + outlier_cov, best)
-            least = self._config.lost_below if _is_narrow(cov) else self._config.search_below  # the place may not be mapped
+            found = self._align(points, prior, cov + outlier_cov, best, self.cell)
+            least = self._config.lost_below if is_narrow(cov) else _MIN_PLACE_OVERLAP  # the place may not be mapped
             if found.overlap >= least and (not is_near or _is_better(found, fit, prior, cov)):
                 return self._result(found, outlier_cov)
         return self._result(fit, nothing) if is_near and fit.overlap >= self._config.lost_below else None
 
     def refine(self, points: Points2, prior: Pose2, cov: Cov3, match: ScanMatch) -> ScanMatch | None:
         """``match`` again, for the same scan deskewed anew."""
-        fit = self._align(points, prior, cov + match.outlier_cov, match.pose)
+        fit = self._align(points, prior, cov + match.outlier_cov, match.pose, 0.0)
         return None if fit.overlap < self._config.lost_below else self._result(fit, match.outlier_cov)
 
     def evaluate(self, points: Points2, pose: Pose2) -> ScanMatch | None:
         """The match of ``points`` at ``pose`` (3,), which another method has found; None where too few of them fit there."""
         assert self._grid is not None
-        H, _, found = linearize(self._grid, points, triple(pose), 0.0)
+        H, _, found = linearize(self._grid, points, pose, 0.0)
         if found[0] < self._config.lost_below:
             return None
         return self._result(Fit(pose, H, np.zeros(3), *(float(value) for value in found)), np.zeros((3, 3)))
@@ -208,7 +212,7 @@ class ScanMatcher:
         self._keys = [*self._fitting_keys(pose, points, map_cov), KeyScan(drawn, pose, np.zeros((3, 3)) if map_cov is None else map_cov)]
         self._draw()
         assert self._grid is not None
-        H = linearize(self._grid, points, triple(pose), 0.0)[0]
+        H = linearize(self._grid, points, pose, 0.0)[0]
         noise = np.asarray(np.linalg.inv(H + _OPEN_INFORMATION) * self._variance_ratio(1), dtype=float)
         W = select_measured(noise)
         return KeyScanError(share, noise, new * W @ noise @ W.T)
@@ -249,9 +253,9 @@ class ScanMatcher:
     def _draw(self) -> None:
         self._grid, self._image = make_grid(self.points(), self.cell, self._config.range_noise_m), None
 
-    def _align(self, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2) -> Fit:
+    def _align(self, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2, spread: float | None = None) -> Fit:
         assert self._grid is not None
-        return align_points(self._grid, points, prior, cov, guess)
+        return align_points(self._grid, points, prior, cov, guess, spread)
 
     def _search(self, points: Points2, prior: Pose2, wide: FloatArray, cov: Cov3) -> Pose2 | None:
         """The best pose (3,) within 3 sigma of ``wide`` (3, 3), limited unless ``cov`` (3, 3) is wider; None where it is ambiguous."""
@@ -259,7 +263,7 @@ class ScanMatcher:
             self._image = draw_image(self.points(), self.cell)
         limit = np.minimum(np.maximum(_SEARCH_LIMIT, 3.0 * np.sqrt(np.diagonal(cov))), _WIDEST_SEARCH)
         best = search(self._image, voxel_means(points, self.cell), prior, wide, limit)
-        is_clear = best.margin >= _OUTLIER_COST if not _is_narrow(cov) else best.rival_score < _MAX_RIVAL * best.score
+        is_clear = best.margin >= _OUTLIER_COST if not is_narrow(cov) else best.rival_score < _MAX_RIVAL * best.score
         return best.pose if is_clear else None
 
     def _result(self, fit: Fit, outlier_cov: Cov3) -> ScanMatch:
@@ -275,10 +279,22 @@ def select_measured(noise_cov: Cov3) -> FloatArray:
     return np.asarray(np.linalg.inv(np.eye(3) + noise_cov @ _MAPPED_INFORMATION), dtype=float)
 
 
-def align_points(grid: VoxelGrid, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2) -> Fit:
-    """Gauss-Newton from ``guess`` (3,) for ``points`` (N, 2), with the ``prior`` (3,) of covariance ``cov`` (3, 3)."""
-    pose, H, g, found = _align(grid, points, prior, cov, np.asarray(np.linalg.inv(cov), dtype=float), guess)
+def align_points(grid: VoxelGrid, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2, spread: float | None = None) -> Fit:
+    """Gauss-Newton from ``guess`` (3,) for ``points`` (N, 2), with the ``prior`` (3,) of covariance ``cov`` (3, 3).
+
+    ``spread``: how far the guess may be off at a point [m]; None for a guess that is as uncertain as the prior.
+    """
+    information = np.asarray(np.linalg.inv(cov), dtype=float)
+    first = _first_spread(points, cov) if spread is None else spread
+    pose = np.asarray(_align(grid, points, triple(prior), information, triple(guess), first), dtype=float)
+    H, g, found = linearize(grid, points, pose, 0.0)
     return Fit(pose, H, g, *(float(value) for value in found))
+
+
+def _first_spread(points: Points2, cov: Cov3) -> float:
+    """How far a prior of ``cov`` (3, 3) may move a point of ``points`` (N, 2) [m]."""
+    r2 = float(np.median(np.einsum("ij,ij->i", points, points)))
+    return min(3.0 * math.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2] * r2), _MAX_ASSOCIATION_M)
 
 
 def choose_cell(config: LidarConfig, points: Points2) -> float:
@@ -291,10 +307,10 @@ def _is_within_basin(fit: Fit, cov: Cov3) -> bool:
 
     Along directions that the scene leaves open, a prior may be as wide as it likes.
     """
-    return _is_narrow(cov - np.linalg.inv(np.linalg.inv(cov) + fit.information))
+    return is_narrow(cov - np.linalg.inv(np.linalg.inv(cov) + fit.information))
 
 
-def _is_narrow(cov: Cov3) -> bool:
+def is_narrow(cov: Cov3) -> bool:
     """Whether a pose with ``cov`` (3, 3) is within the basin of Gauss-Newton."""
     return bool(np.linalg.eigvalsh(cov[:2, :2])[-1] < _BASIN_M**2 and cov[2, 2] < _BASIN_RAD**2)
 
@@ -314,43 +330,57 @@ def _mahalanobis(prior: Pose2, pose: Pose2, cov: Cov3) -> float:
     return float(off @ np.linalg.solve(cov, off))
 
 
-@numba.njit(cache=True)
-def _align(
-    grid: VoxelGrid, points: Points2, prior: Pose2, cov: Cov3, information: FloatArray, guess: Pose2
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Gauss-Newton from ``guess`` (3,): pose (3,), information (3, 3) and gradient (3,) of the points there, numbers of the fit."""
-    least = _REACH_CELLS * grid.cell
-    r2 = points[:, 0] ** 2 + points[:, 1] ** 2
-    # how far the prior may move a point
-    spread = min(3.0 * math.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2] * np.median(r2)), _MAX_ASSOCIATION_M)
-    x, jacobian = triple(guess), np.empty((3, 3))
-    for _ in range(_ITERATIONS):
-        H, g, _found = linearize(grid, points, x, spread)
-        off = se2.scalar_log(se2.scalar_between(triple(prior), x))
-        se2.fill_right_jacobian_inverse(off, jacobian)
-        pull = jacobian.T @ information
-        step = np.linalg.solve(H + pull @ jacobian, g + pull @ np.array(off))
-        x = se2.scalar_compose(x, se2.scalar_exp((-step[0], -step[1], -step[2])))
-        if abs(step[0]) + abs(step[1]) < 1e-4 and abs(step[2]) < 1e-5 and spread < least / 3.0:
-            break
-        spread = spread / 2.0 if spread > least / 4.0 else 0.0
-    H, g, found = linearize(grid, points, x, 0.0)
-    return np.array(x), H, g, found
-
-
-@numba.njit(cache=True)
-def linearize(grid: VoxelGrid, points: Points2, x: Triple, spread: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Information (3, 3) and gradient (3,) of the points at ``x``; overlap, cost and variance ratio.
+def linearize(grid: VoxelGrid, points: Points2, x: Pose2, spread: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Information (3, 3) and gradient (3,) of the points at ``x`` (3,); overlap, cost, squares, those of blocks, fitting and mapped points.
 
     While the pose may still be off by ``spread`` [m] at a point, points are associated from so far, and residuals are weighed by it.
     """
-    c, s = math.cos(x[2]), math.sin(x[2])
+    H, g, n = np.zeros((3, 3)), np.zeros(3), max(len(points), 1)
+    fitting, mapped, cost, squares, block_squares = _linearize(grid, points, triple(x), spread, H, g)
+    return H, g, np.array([fitting / n, 0.5 * cost / CORRELATED_BEAMS, squares, block_squares, fitting, mapped])
+
+
+@numba.njit(cache=True)
+def _align(grid: VoxelGrid, points: Points2, prior: Triple, information: FloatArray, guess: Triple, spread: float) -> Triple:
+    """The pose of least cost, from ``guess``; ``information`` (3, 3) of the prior, and how far it may move a point [m]."""
+    least, x, jacobian = _REACH_CELLS * grid.cell, guess, np.empty((3, 3))
+    H, g = np.empty((3, 3)), np.empty(3)
+    for _ in range(_ITERATIONS):
+        _linearize(grid, points, x, spread, H, g)
+        off = se2.scalar_log(se2.scalar_between(prior, x))
+        se2.fill_right_jacobian_inverse(off, jacobian)
+        _add_prior(information, off, jacobian, H, g)
+        a, b, c = solve_3x3(Matrix3(H[0, 0], H[0, 1], H[0, 2], H[1, 0], H[1, 1], H[1, 2], H[2, 0], H[2, 1], H[2, 2]), g[0], g[1], g[2])
+        x = se2.scalar_compose(x, se2.scalar_exp((-a, -b, -c)))
+        if abs(a) + abs(b) < 1e-4 and abs(c) < 1e-5 and spread < least / 3.0:
+            break
+        spread = spread / 2.0 if spread > least / 4.0 else 0.0
+    return x
+
+
+@numba.njit(cache=True)
+def _add_prior(information: FloatArray, off: Triple, jacobian: FloatArray, H: FloatArray, g: FloatArray) -> None:
+    """Add J^T P^-1 J to ``H`` (3, 3) and J^T P^-1 ``off`` to ``g`` (3,)."""
+    for a in range(3):
+        for b in range(3):
+            pull = 0.0
+            for c in range(3):
+                pull += jacobian[c, a] * information[c, b]
+            g[a] += pull * off[b]
+            for c in range(3):
+                H[a, c] += pull * jacobian[b, c]
+
+
+@numba.njit(cache=True)
+def _linearize(
+    grid: VoxelGrid, points: Points2, x: Triple, spread: float, H: FloatArray, g: FloatArray
+) -> tuple[int, int, float, float, float]:
+    """Fill ``H`` (3, 3) and ``g`` (3,), and return numbers of the fit: see `linearize`."""
+    spurious, c, s = np.zeros((3, 3)), math.cos(x[2]), math.sin(x[2])
+    H[:], g[:] = 0.0, 0.0
     reach, loose = max(_REACH_CELLS * grid.cell, spread), (spread / _KERNEL) ** 2
-    n, fitting, cost = points.shape[0], 0, 0.0
-    J, T = np.zeros((n, 3)), np.zeros((n, 3))  # derivatives of the distances across and along the surfaces
-    weights, e_weights, angle_weights = np.zeros((n, 1)), np.zeros(n), np.zeros((n, 1))
-    mapped, block, squares, block_squares = 0, 0.0, 0.0, 0.0
-    for i in range(n):
+    fitting, mapped, cost, block, squares, block_squares = 0, 0, 0.0, 0.0, 0.0, 0.0
+    for i in range(points.shape[0]):
         px, py = points[i, 0], points[i, 1]
         wx, wy = x[0] + c * px - s * py - grid.origin[0], x[1] + s * px + c * py - grid.origin[1]
         v = find_nearest(grid, wx, wy, reach)
@@ -375,15 +405,14 @@ def linearize(grid: VoxelGrid, points: Points2, x: Triple, spread: float) -> tup
             if fitting % _BLOCK == 0:
                 block_squares, block = block_squares + block * block, 0.0
         scale = _KERNEL**2 * var + loose
-        weights[i, 0] = (scale / (scale + e * e)) ** 2 / (var + loose)
-        e_weights[i], angle_weights[i, 0] = weights[i, 0] * e, weights[i, 0] * min(surface[5], 1.0)
+        weight = (scale / (scale + e * e)) ** 2 / (var + loose)
         nx, ny = c * surface[2] + s * surface[3], -s * surface[2] + c * surface[3]  # the normal in the body frame
-        J[i, 0], J[i, 1], J[i, 2] = nx, ny, px * ny - py * nx
-        T[i, 0], T[i, 1], T[i, 2] = -ny, nx, px * nx + py * ny
-    H, g, spurious = J.T @ (weights * J), J.T @ e_weights, T.T @ (angle_weights * T)
-    found = np.array([fitting / max(n, 1), 0.5 * cost / CORRELATED_BEAMS, squares, block_squares, fitting, mapped])
+        across, along = (nx, ny, px * ny - py * nx), (-ny, nx, px * nx + py * ny)  # derivatives of the distances
+        _add_outer(H, across, weight)
+        _add_outer(spurious, along, weight * min(surface[5], 1.0))
+        g[0], g[1], g[2] = g[0] + weight * nx * e, g[1] + weight * ny * e, g[2] + weight * across[2] * e
     _discount(H, g, spurious)
-    return H, g, found
+    return fitting, mapped, cost, squares, block_squares
 
 
 @numba.njit(cache=True)
@@ -393,11 +422,27 @@ def _discount(H: FloatArray, g: FloatArray, spurious: FloatArray) -> None:
     In the directions where the share m of ``spurious`` in ``H`` is largest, information is scaled by 1 - 2 m, at least 0: it is as likely
     to be false as not from m = 1/2 on. Directions are those of both matrices' generalised eigenvectors.
     """
-    L = np.linalg.cholesky(H + 1e-6 * np.eye(3))
-    whitened = np.linalg.solve(L, np.linalg.solve(L, spurious).T)
-    m, V = np.linalg.eigh(0.5 * (whitened + whitened.T))
-    kept = np.maximum(1.0 - 2.0 * m, 0.0)
-    root = L @ V
-    scaled = root * kept  # columns
-    H[:, :] = scaled @ root.T
-    g[:] = scaled @ np.linalg.solve(root, g)
+    V, old = diagonalize(H), triple(g)
+    size = (math.sqrt(max(H[0, 0], 1e-6)), math.sqrt(max(H[1, 1], 1e-6)), math.sqrt(max(H[2, 2], 1e-6)))
+    for a in range(3):
+        for i in range(3):
+            V[i, a] /= size[a]  # V^T H V = 1
+    whitened = transform_symmetric(V, spurious)
+    U = diagonalize(whitened)
+    H[:], g[:] = 0.0, 0.0
+    for a in range(3):
+        kept, v = max(1.0 - 2.0 * whitened[a, a], 0.0), (U[0, a], U[1, a], U[2, a])
+        root = multiply(V, (v[0] * size[0] ** 2, v[1] * size[1] ** 2, v[2] * size[2] ** 2))
+        inverse = multiply(V, v)
+        pull = kept * (inverse[0] * old[0] + inverse[1] * old[1] + inverse[2] * old[2])
+        _add_outer(H, root, kept)
+        for i in range(3):
+            g[i] += pull * root[i]
+
+
+@numba.njit(cache=True)
+def _add_outer(total: FloatArray, v: Triple, weight: float) -> None:
+    """Add ``weight`` v v^T to ``total`` (3, 3)."""
+    for a in range(3):
+        for b in range(3):
+            total[a, b] += weight * v[a] * v[b]

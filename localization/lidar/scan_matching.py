@@ -11,8 +11,8 @@ import numpy as np
 from localization.events import Step
 from localization.lidar.deskew import Sweep
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
-from localization.lidar.scan_checks import LostScans, StaleScans
-from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher, choose_cell
+from localization.lidar.scan_checks import MAX_LOST_S, LostScans, StaleScans
+from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher, choose_cell, is_narrow
 from motion_models import se2
 from motion_models.robot import Mount
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, Twist2
@@ -45,6 +45,8 @@ class ScanMatchingSensor:
         self._scan: _Scan | None = None
         self._prior, self._cov = np.zeros(3), np.eye(3)
         self._last_key: FloatArray | None = None
+        self._searching_since_s: float | None = None
+        self._is_searching = False  # the scan at hand was not found from a wide prior: a place is still to be found
         self._stale, self.lost = StaleScans(), LostScans()
 
     def measure(self, step: Step, prior: Pose2, cov: Cov3, twist: Twist2, jump: Tangent2) -> ScanMatch | None:
@@ -68,11 +70,20 @@ class ScanMatchingSensor:
             self.lost.add_matched(step.end_ns)
             return None
         found = self._match(self._matcher, self._scan, jump)
+        self._note_search(found is None and not is_narrow(cov), step.end_ns * 1e-9)
         if found is None:
             self.lost.add(step.end_ns, "lost")
         else:
             self.lost.add_matched(step.end_ns)
         return found
+
+    def _note_search(self, is_searching: bool, now_s: float) -> None:
+        """Scans that may be anywhere do not enter the submap for some seconds: drawn there, they would rival their true place."""
+        if not is_searching:
+            self._searching_since_s = None
+        elif self._searching_since_s is None:
+            self._searching_since_s = now_s
+        self._is_searching = self._searching_since_s is not None and now_s - self._searching_since_s < MAX_LOST_S
 
     def refine(self, match: ScanMatch, twist: Twist2) -> ScanMatch:
         """``match`` again, its sweep deskewed with ``twist`` (3,); the same where that moves no point."""
@@ -85,7 +96,7 @@ class ScanMatchingSensor:
 
     def is_key(self, pose: Pose2) -> bool:
         """Whether the scan at hand, taken from ``pose`` (3,), is to enter the submap."""
-        if self._scan is None:
+        if self._scan is None or self._is_searching:
             return False
         if self._last_key is None or (self._matcher is not None and self._matcher.is_new_place):
             return True

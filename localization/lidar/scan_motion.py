@@ -127,7 +127,6 @@ def _refine(a: _Profile, b: _Profile, turn: float) -> ScanMotion | None:
     return ScanMotion(moved, float(np.linalg.eigvalsh(structure / inliers)[0]) >= _MIN_STRUCTURE)
 
 
-@numba.njit(cache=True)
 def _align_profiles(surface: FloatArray, normals: FloatArray, points: FloatArray, turn: float) -> tuple[FloatArray, FloatArray, int]:
     """Motion (3,) of the sensor, sum of n n^T (2, 2) over the inliers, and their number: 0 where too few points are associated."""
     a_T_b, structure, inliers = np.array([0.0, 0.0, turn]), np.zeros((2, 2)), 0

@@ -109,7 +109,8 @@ class _Writer:
         if kind is slice:
             return ["s", value.start, value.stop, value.step]
         if kind.__module__.startswith(PACKAGES) and not isinstance(value, Enum):
-            return ["c", kind.__module__, kind.__qualname__, self.put(_state(value))]
+            state = tuple(value) if isinstance(value, tuple) else _state(value)
+            return ["c", kind.__module__, kind.__qualname__, self.put(state)]
         raise CheckpointError(f"the state holds a {kind.__module__}.{kind.__qualname__}, which cannot be written down")
 
     def _packed(self, values: list[Any]) -> list[Json] | None:
@@ -255,6 +256,9 @@ class _Reader:
 
     def _instance(self, index: int, module: str, name: str, state: Json) -> None:
         found = _class(module, name)
+        if issubclass(found, tuple):  # a NamedTuple
+            self._made[index] = found(*self.get(state))
+            return
         made: Any = object.__new__(found)
         self._made[index] = made
         content = self.get(state)

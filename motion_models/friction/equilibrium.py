@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numba
 
 from motion_models.friction.contact import CREEP, Tyre, contact, rolling
+from motion_models.linear_equations import Matrix3, solve_3x3
 from motion_models.se2 import FloatArray
 
 
@@ -65,20 +66,6 @@ class Balance(NamedTuple):
     x_right: float
     y_right: float
     m_right: float
-
-
-class Matrix3(NamedTuple):
-    """Derivatives of x, y, z (rows) by u, v, w (columns)."""
-
-    xu: float
-    xv: float
-    xw: float
-    yu: float
-    yv: float
-    yw: float
-    zu: float
-    zv: float
-    zw: float
 
 
 COLUMNS = 18
@@ -137,19 +124,6 @@ def balance(vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load:
         *(bx, by, bm, x_vx, x_vy, x_wz, y_vx, y_vy, y_wz, m_vx, m_vy, m_wz),
         *(x_left, y_left, m_left, x_right, y_right, m_right),
     )
-
-
-@numba.njit(cache=True, error_model="numpy")
-def solve_3x3(a: Matrix3, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Solution of the linear equations with matrix ``a`` and right side ``x, y, z``, by Cramer's rule. NaN where it is singular."""
-    c00 = a.yv * a.zw - a.yw * a.zv
-    c10 = a.yw * a.zu - a.yu * a.zw
-    c20 = a.yu * a.zv - a.yv * a.zu
-    whole = 1.0 / (a.xu * c00 + a.xv * c10 + a.xw * c20)
-    u = c00 * x + (a.xw * a.zv - a.xv * a.zw) * y + (a.xv * a.yw - a.xw * a.yv) * z
-    v = c10 * x + (a.xu * a.zw - a.xw * a.zu) * y + (a.xw * a.yu - a.xu * a.yw) * z
-    w = c20 * x + (a.xv * a.zu - a.xu * a.zv) * y + (a.xu * a.yv - a.xv * a.yu) * z
-    return u * whole, v * whole, w * whole
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -28,14 +28,13 @@ from motion_models.friction.equilibrium import (
     Balance,
     Floor,
     Loads,
-    Matrix3,
     Steady,
     balance,
     motion,
     newton,
     sensitivities,
-    solve_3x3,
 )
+from motion_models.linear_equations import Matrix3, solve_3x3
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 

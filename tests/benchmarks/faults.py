@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from tests.helpers.hostile_logs import BAD, SOURCES, Case, cases, reference_of, run_guarded, write_case
+from tests.helpers.hostile_logs import BAD, Case, cases, run_guarded, write_case
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -31,14 +31,12 @@ def _campaign(folder: Path, chosen: list[Case], seed: int, verbose: bool) -> Non
     counts: Counter[str] = Counter()
     bad: list[str] = []
     seconds = []
-    robots = {source.name: source.robot for source in SOURCES}
-    truths = {name: reference_of(name, folder) for name in sorted({case.source for case in chosen})}
 
     def jobs() -> Iterator[tuple[Any, ...]]:
         for case in chosen:
             place = folder / str(case.number)
             place.mkdir()
-            yield case, write_case(case, place, seed), robots[case.source], truths[case.source], place / "out"
+            yield case, write_case(case, place, seed), folder, place / "out"
 
     for case, outcome, took in run_guarded(jobs()):
         counts[outcome.kind] += 1

@@ -101,7 +101,7 @@ def main() -> None:
         alone, fused = kiss_seconds(), ekf_seconds()
         ratios.append(fused / alone)
         print(f"{'':52} {alone:8.2f} s       {fused:8.2f} s     {ratios[-1]:7.2f}")
-    print(f"median ratio {statistics.median(ratios):.2f} (at most 3 is wanted)\n")
+    print(f"median ratio {statistics.median(ratios):.2f} (at most 2 is wanted)\n")
     for model in MODELS:
         print(f"preintegration of {model:12} {samples_per_second(model):12,.0f} wheel samples/s")
     with tempfile.TemporaryDirectory() as folder:

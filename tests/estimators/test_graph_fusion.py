@@ -101,7 +101,7 @@ def test_graph_around_building_closes_loop() -> None:
     live = errors(drive, stamps, np.array([e.pose for e in estimates]))
     whole = smoothed(estimates, pipeline)
     assert pipeline.estimator.counts()["loops"] >= 2
-    assert odometry[-20:].mean() > 0.03
+    assert odometry[-20:].mean() > 0.01  # there is something to correct
     assert live[-20:].mean() < 0.5 * odometry[-20:].mean()
     after = errors(drive, whole.stamps_ns.tolist(), whole.poses)
     assert np.sqrt(np.mean(after**2)) < 0.9 * np.sqrt(np.mean(odometry**2))

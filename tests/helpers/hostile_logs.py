@@ -261,30 +261,38 @@ class Outcome(NamedTuple):
 BAD = ("wrong", "traceback", "hang", "memory")
 
 
-def reference_of(source: str, folder: Path) -> Path:
+def _replay_without_fault(source: str, model: str, estimator: str, folder: Path) -> Path:
+    """Output folder of the replay of a source's drive without faults; made once."""
+    out, log = folder / f"{source}-{model}-{estimator}", folder / f"{source}.mcap"
+    if not (out / "metrics.json").exists():
+        found = next(s for s in SOURCES if s.name == source)
+        if not log.exists():
+            bags.write_mcap(log, copied(found))
+        arguments = ["replay", log, "--robot", found.robot, "--out", out, "--model", model, "--estimator", estimator]
+        with contextlib.redirect_stdout(io.StringIO()):
+            assert main([*map(str, arguments), "--reference", "none"]) == 0
+    return out
+
+
+def _reference_of(source: str, folder: Path) -> Path:
     """A TUM file to score a source's drives against: its own reference, else the estimate from the log without faults."""
+    out, found = _replay_without_fault(source, "skid_steer", "ekf", folder), next(s for s in SOURCES if s.name == source)
+    if not found.reference:
+        return out / "skid_steer_ekf.tum"
     path = folder / f"{source}.tum"
     if not path.exists():
-        found = next(s for s in SOURCES if s.name == source)
-        log = bags.write_mcap(folder / f"{source}.mcap", copied(found))
-        out = folder / f"{source}-without-fault"
-        with contextlib.redirect_stdout(io.StringIO()):
-            code = main(["replay", str(log), "--robot", found.robot, "--out", str(out), "--model", "skid_steer", "--estimator", "ekf"])
-        assert code == 0
-        if found.reference:
-            track = reference_track(open_log(log, load_robot(found.robot)).references(found.reference), found.reference)
-            assert track.yaws is not None
-            rows = zip(track.stamps_ns.tolist(), track.positions.tolist(), track.yaws.tolist(), strict=True)
-            text = [f"{t // S}.{t % S:09d} {x!r} {y!r} 0 0 0 {math.sin(yaw / 2)!r} {math.cos(yaw / 2)!r}\n" for t, (x, y), yaw in rows]
-            path.write_text("".join(text))
-        else:
-            (out / "skid_steer_ekf.tum").rename(path)
+        track = reference_track(open_log(folder / f"{source}.mcap", load_robot(found.robot)).references(found.reference), found.reference)
+        assert track.yaws is not None
+        rows = zip(track.stamps_ns.tolist(), track.positions.tolist(), track.yaws.tolist(), strict=True)
+        text = [f"{t // S}.{t % S:09d} {x!r} {y!r} 0 0 0 {math.sin(yaw / 2)!r} {math.cos(yaw / 2)!r}\n" for t, (x, y), yaw in rows]
+        path.write_text("".join(text))
     return path
 
 
-def run_case(case: Case, log: Path, robot: str, truth: Path, out: Path) -> Outcome:
-    """Replay from the command line, and compare the last pose with the reference ``truth``."""
+def run_case(case: Case, log: Path, truths: Path, out: Path) -> Outcome:
+    """Replay from the command line, and compare with the drive without faults, whose replays are kept in the folder ``truths``."""
     printed, complaints = io.StringIO(), io.StringIO()
+    robot = next(source.robot for source in SOURCES if source.name == case.source)
     arguments = ["replay", str(log), "--robot", robot, "--out", str(out), "--reference", "none"]
     arguments += ["--model", case.model, "--estimator", case.estimator]
     try:
@@ -297,26 +305,18 @@ def run_case(case: Case, log: Path, robot: str, truth: Path, out: Path) -> Outco
     if code != 0:
         is_input_error = complaints.getvalue().startswith("skidloc: ")
         return Outcome("refused" if is_input_error else "traceback", math.nan, math.nan, complaints.getvalue().strip())
-    usual = _usual_notes(case, robot, truth.parent)
+    usual = _notes_of(_replay_without_fault(case.source, case.model, case.estimator, truths))
     warnings = [n for n in json.loads((out / "metrics.json").read_text())["notes"] if _without_numbers(n) not in usual]
-    error_m, sigmas = _end_error(out, f"{case.model}_{case.estimator}", truth)
+    error_m, sigmas = _end_error(out, f"{case.model}_{case.estimator}", _reference_of(case.source, truths))
     is_right = error_m <= FAR_M and sigmas <= MOST_SIGMA
     if warnings:
         return Outcome("survived" if is_right else "reported", error_m, sigmas, " | ".join(warnings))
     return Outcome("survived" if is_right else "wrong", error_m, sigmas, " | ".join(warnings))
 
 
-def _usual_notes(case: Case, robot: str, folder: Path) -> list[str]:
-    """Notes of the same replay of the drive without faults."""
-    path = folder / f"{case.source}-{case.model}-{case.estimator}.json"
-    if not path.exists():
-        out, log = path.with_suffix(""), folder / f"{case.source}.mcap"
-        arguments = ["replay", log, "--robot", robot, "--out", out, "--model", case.model, "--estimator", case.estimator]
-        with contextlib.redirect_stdout(io.StringIO()):
-            assert main([*map(str, arguments), "--reference", "none"]) == 0
-        notes = json.loads((out / "metrics.json").read_text())["notes"]
-        path.write_text(json.dumps([_without_numbers(note) for note in notes]))
-    return list(json.loads(path.read_text()))
+def _notes_of(out: Path) -> list[str]:
+    """Notes of a replay, without numbers."""
+    return [_without_numbers(note) for note in json.loads((out / "metrics.json").read_text())["notes"]]
 
 
 def _without_numbers(note: str) -> str:
@@ -356,7 +356,7 @@ def _end_sigma_m(out: Path, name: str) -> float:
     return math.sqrt(float(np.linalg.eigvalsh(cov)[-1]))
 
 
-def run_guarded(jobs: Iterable[tuple[Case, Path, str, Path, Path]]) -> Iterable[tuple[Case, Outcome, float]]:
+def run_guarded(jobs: Iterable[tuple[Case, Path, Path, Path]]) -> Iterable[tuple[Case, Outcome, float]]:
     """`run_case` of each in another process, which is replaced where it hangs or dies."""
     worker: _Worker | None = None
     for case, *job in jobs:

@@ -55,8 +55,8 @@ def test_search_coarse_scores_bound_fine_scores() -> None:
     for level in (1, 2):
         step = CELL * COARSE**level
         within = offsets + rng.integers(-(COARSE**level) // 2, COARSE**level // 2 + 1, (300, 2)) * CELL
-        coarse = _score(image.levels[level], turned, rows, offsets, step)
-        fine = _score(image.levels[0], turned, rows, within, CELL)
+        coarse = _score(image.levels[level], turned / step, rows, offsets / step)
+        fine = _score(image.levels[0], turned / CELL, rows, within / CELL)
         assert (coarse >= fine - 1e-6).all()
         assert (coarse < 1.0).all()
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from localization.errors import CheckpointError
 from localization.estimators import CORRECTING, ESTIMATORS
-from localization.events import WheelSample
+from localization.events import StepInterval, WheelSample
 from localization.lidar import LidarConfig
 from localization.lidar.scan_matcher import ScanMatcher
 from localization.pipeline import Pipeline, ReplayConfig, Trial
@@ -126,6 +126,14 @@ values = st.recursive(
 @settings(max_examples=60, deadline=None)
 def test_deserialize_of_plain_values_returns_them(value):
     assert repr(deserialize(*serialize(value))) == repr(value)
+
+
+def test_deserialize_of_named_tuples_keeps_their_class():
+    interval = StepInterval(*range(len(StepInterval._fields)))
+    kept, again = deserialize(*serialize([interval, interval]))
+    assert type(kept) is StepInterval
+    assert kept == interval
+    assert again is kept
 
 
 def test_deserialize_keeps_shared_objects_and_views():

@@ -45,6 +45,7 @@ from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import ImuConfig, SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
 from motion_models.robot import load_robot
+from motion_models.se2 import triple
 from tests.studies.buildings import BUILDINGS, Drive, errors_of, nees_at_instants
 
 README = Path(__file__).parents[2] / "localization/estimators/README.md"
@@ -112,8 +113,10 @@ def _exact_normals(*arguments: Any) -> VoxelGrid:
 
 def _align_freely(original: Callable[..., Any], self: ScanMatcher, points: Any, prior: Any, cov: Any, guess: Any) -> Any:
     """The prior sets the reach of associations but does not pull."""
-    pose, H, g, found = scan_matcher._align(self._grid, points, prior, cov, np.linalg.inv(_NO_PRIOR), guess)
-    return scan_matcher.Fit(pose, H, g, *(float(value) for value in found))
+    spread = scan_matcher._first_spread(points, cov)
+    pose = np.array(scan_matcher._align(self._grid, points, triple(prior), np.linalg.inv(_NO_PRIOR), triple(guess), spread))
+    H, g, found = scan_matcher.linearize(self._grid, points, pose, 0.0)
+    return scan_matcher.Fit(pose, H, g, *map(float, found))
 
 
 def _match_without_new_place(original: Callable[..., Any], self: ScanMatcher, *rest: Any, **named: Any) -> Any:
@@ -138,7 +141,7 @@ PATCHES: Mapping[str, Patch] = {
     "old key scans that fit": _wrap(
         ScanMatcher, "_fitting_keys", lambda original, self, pose, points, map_cov: original(self, pose, points, None)
     ),
-    "slip that changes within a sweep": _attribute(fusion._SlipChanges, "sweep_cov", lambda self, step, sweep_s: np.zeros((3, 3))),
+    "slip that changes within a sweep": _attribute(fusion._SlipChanges, "sweep_cov", lambda *a: np.zeros((3, 3))),
     "second deskewing pass": _attribute(ScanMatchingSensor, "refine", lambda self, match, twist: match),
     "slip in the deskewing twist": _wrap(
         ScanMatchingSensor,
@@ -157,6 +160,7 @@ PATCHES: Mapping[str, Patch] = {
     "submap's error": _attribute(Filter, "insert_key_scan", lambda self, error: None),
     "submap's error as consider state (independent noise, instead)": _wrap(Filter, "predict", _independent),
     "new surfaces' error of key scans": _wrap(Filter, "insert_key_scan", _without_new),
+    "scale of the wheel noise": _attribute(filter_module, "_MAX_WHEEL_SCALE", 1.0),
     "check of wheels that stand": _attribute(EkfFusion, "_check_standstill", lambda self, step: step),
     "excitation gate of corrections": _attribute(EkfFusion, "_is_turning", lambda self, motion: True),
     "noise of normals": _attribute(scan_matcher, "make_grid", _exact_normals),

@@ -1,0 +1,61 @@
+"""Which scans enter the submap."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from localization.events import Scan, Step
+from localization.lidar import LidarConfig, ScanMatchingSensor
+from localization.lidar.scan_checks import MAX_LOST_S
+from localization.simulation import world
+from motion_models.base import Motion
+from tests.helpers import rooms
+
+LAB, HALL = world.lab().walls, world.hall().walls
+NARROW, WIDE = np.diag([0.03, 0.03, 0.02]) ** 2, np.diag([1.0, 1.0, 0.3]) ** 2
+AHEAD = np.array([0.6, 0.0, 0.0])
+"""Farther than key scans are apart."""
+
+
+def step_at(seconds: float, walls: np.ndarray, pose: np.ndarray) -> Step:
+    """A scan of ``walls`` from ``pose`` (3,)."""
+    points = rooms.scan_from(walls, pose, np.random.default_rng(round(10 * seconds)))
+    stamp_ns = round(seconds * 1e9)
+    scan = Scan(stamp_ns, np.column_stack([points, np.zeros(len(points))]))
+    return Step(stamp_ns - 100_000_000, stamp_ns, Motion(np.zeros(3), 1e-6 * np.eye(3)), np.zeros(3), np.zeros(3), False, True, None, scan)
+
+
+@pytest.fixture
+def sensor() -> ScanMatchingSensor:
+    """With a submap of the lab from its origin."""
+    made = ScanMatchingSensor({}, LidarConfig())
+    assert made.measure(step_at(0.1, LAB, np.zeros(3)), np.zeros(3), NARROW, np.zeros(3), np.zeros(3)) is None
+    assert made.is_key(np.zeros(3))
+    made.insert_key_scan(np.zeros(3), np.zeros((3, 3)))
+    return made
+
+
+def measure(sensor: ScanMatchingSensor, seconds: float, walls: np.ndarray, cov: np.ndarray) -> bool:
+    """Whether a scan of ``walls`` from a little ahead is matched by a prior of ``cov`` (3, 3) there."""
+    return sensor.measure(step_at(seconds, walls, AHEAD), AHEAD, cov, np.zeros(3), np.zeros(3)) is not None
+
+
+def test_scan_that_is_lost_from_a_wide_prior_is_no_key_scan_for_some_seconds(sensor: ScanMatchingSensor) -> None:
+    assert not measure(sensor, 1.0, HALL, WIDE)
+    assert not sensor.is_key(AHEAD)
+    assert not measure(sensor, 0.9 + MAX_LOST_S, HALL, WIDE)
+    assert not sensor.is_key(AHEAD)
+    assert not measure(sensor, 1.1 + MAX_LOST_S, HALL, WIDE)
+    assert sensor.is_key(AHEAD)
+
+
+def test_scan_that_is_lost_from_a_narrow_prior_is_a_key_scan(sensor: ScanMatchingSensor) -> None:
+    assert not measure(sensor, 1.0, HALL, NARROW)
+    assert sensor.is_key(AHEAD)
+
+
+def test_scan_that_is_found_again_is_a_key_scan(sensor: ScanMatchingSensor) -> None:
+    assert not measure(sensor, 1.0, HALL, WIDE)
+    assert measure(sensor, 1.1, LAB, WIDE)
+    assert sensor.is_key(AHEAD)
