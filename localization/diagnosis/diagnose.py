@@ -13,9 +13,18 @@ from localization.diagnosis.causes import MISSING_MESSAGES, Cause, Hypothesis
 from localization.diagnosis.corrected_robot import check_handover
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain, describe_loss, describe_standstill_turn, evidence, sentence
-from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, with_tolerance
+from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
-from localization.diagnosis.selection import aliases_of, heldout_gain, max_statistic, p_value, refined_cost, search_causes, statistic
+from localization.diagnosis.selection import (
+    aliases_of,
+    has_tolerated_substitute,
+    heldout_gain,
+    max_statistic,
+    p_value,
+    refined_cost,
+    search_causes,
+    statistic,
+)
 from localization.diagnosis.verdict import (
     attribute_rows,
     decide,
@@ -25,15 +34,13 @@ from localization.diagnosis.verdict import (
     general_advice,
     mark_trends,
     separating_drive,
-    tolerated_sizes,
 )
 from localization.settings import Count, Probability, Seed, Settings
 from motion_models.base import MotionModel
 from motion_models.se2 import FloatArray
 
 _ROUNDS = 5
-TOLERANCES = (0.35, 0.1)  # sigma of unnamed causes, over what is negligible: first the spread of robots, then the accuracy of their files
-_STRICT_FACTOR = 2.0  # with the stricter of them, sizes must be so many times what is negligible
+TOLERANCE = 0.35  # sigma of unnamed causes, over what is negligible: the spread of robots about their files
 _SYSTEMATIC_SHARE = 1.0 / 3.0  # systematic part of a size's sigma, over what is negligible: clocks, mounts and physics are no better
 _MIN_HELDOUT_GAIN = 0.003  # least held-out gain of a finding
 _CLEAR_HELDOUT_GAIN = 0.05
@@ -97,20 +104,15 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
         return DiagnosisResult(_undecidable(drive, model, drive.warnings[0] if drive.motion_reference == "none" else why), None, None)
     predictor = make_predictor(drive, model, baseline)
     causes = candidate_causes(predictor, config.moments)
-    first = linearize(predictor, causes, {}, TOLERANCES[0])
-    found = _diagnose_within(predictor, first, config)
-    if found.diagnosis.verdict == "consistent":  # within the spread of robots: also within the accuracy of their files?
-        strict = _diagnose_within(predictor, with_tolerance(first, TOLERANCES[1]), config)
-        if strict.diagnosis.verdict in ("explained", "ambiguous"):  # stricter tolerances name causes; they do not contradict the table
-            return strict
-    return found
-
-
-def _diagnose_within(predictor: DrivePredictor, first: Linearization, config: DiagnosisConfig) -> DiagnosisResult:
-    """With unnamed causes within the tolerance of the ``first`` linearization."""
+    first = linearize(predictor, causes, {}, TOLERANCE)
     rng = np.random.default_rng(config.seed)
-    causes, tolerance = first.causes, first.tolerance
-    linearization = first
+    linearization, chosen = _choose_causes(predictor, first)
+    return _conclude(predictor, first, linearization, _drop_insignificant(linearization, chosen, rng, config), rng, config)
+
+
+def _choose_causes(predictor: DrivePredictor, first: Linearization) -> tuple[Linearization, tuple[int, ...]]:
+    """The best set of causes, and the drive linearized about a hypothesis that hardly differs from it."""
+    causes, linearization = first.causes, first
     current: dict[Cause, float] = {}
     visited: list[dict[Cause, float]] = []
     visited_keys: list[frozenset[str]] = []
@@ -121,7 +123,7 @@ def _diagnose_within(predictor: DrivePredictor, first: Linearization, config: Di
             break
         current = sizes
         visited.append(sizes)
-        linearization = linearize(predictor, causes, current, tolerance)
+        linearization = linearize(predictor, causes, current, TOLERANCE)
         if keys in visited_keys:
             break
         visited_keys.append(keys)
@@ -129,10 +131,9 @@ def _diagnose_within(predictor: DrivePredictor, first: Linearization, config: Di
         best = min(visited, key=lambda sizes: refined_cost(predictor, linearization, sizes))
         if set(best) != set(current):
             current = best
-            linearization = linearize(predictor, causes, current, tolerance)
+            linearization = linearize(predictor, causes, current, TOLERANCE)
     index = {e.key: i for i, e in enumerate(causes)}
-    chosen = _drop_insignificant(linearization, tuple(sorted(index[e.key] for e in current)), rng, config)
-    return _conclude(predictor, first, linearization, chosen, rng, config)
+    return linearization, tuple(sorted(index[e.key] for e in current))
 
 
 def _drop_insignificant(
@@ -184,14 +185,14 @@ def _conclude(
         next_drive = separating_drive(predictor, findings, linearization, chosen)
     else:
         next_drive = general_advice(verdict, [e.id for e in undetectable])
-    within = {**dropped, **_within_tolerance(linearization, chosen, rows)}
+    within = {**dropped, **_within_tolerance(linearization, chosen, sizes, rows)}
     result = Diagnosis(
         *(drive.name, drive.robot.name, predictor.model.name, drive.motion_reference, verdict, rows, tuple(findings), trends),
         left_share=share,
         next_drive=next_drive,
         sentence="",
         within=within,
-        tolerances={e.id: _tolerated_size(linearization, e) for e in causes if e.id in within},
+        tolerances={e.id: e.negligible for e in causes if e.id in within},
         detectable_sizes=detectable,
         gain=_heldout(linearization, chosen, (), config) if chosen else None,
         contradictions=() if drive.standstill_turn is None else (describe_standstill_turn(drive.standstill_turn),),
@@ -208,30 +209,34 @@ def _conclude(
     return DiagnosisResult(dataclasses.replace(result, sentence=sentence(result)), predictor, residuals, linearization)
 
 
-def _heldout(linearization: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], config: DiagnosisConfig) -> Gain:
-    data = linearization.linear, linearization.signatures, linearization.nuisances, linearization.noise, linearization.problem.scale
-    return heldout_gain(*data, chosen, others, np.random.default_rng(config.seed))
-
-
-def _tolerated_size(linearization: Linearization, cause: Cause) -> float:
-    return (1.0 if linearization.tolerance >= TOLERANCES[0] else _STRICT_FACTOR) * cause.negligible
+def _heldout(
+    linearization: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], config: DiagnosisConfig, is_tolerant: bool = False
+) -> Gain:
+    return heldout_gain(linearization, chosen, others, np.random.default_rng(config.seed), is_tolerant)
 
 
 def _keep_useful(
     linearization: Linearization, chosen: tuple[int, ...], config: DiagnosisConfig
 ) -> tuple[tuple[int, ...], list[Gain], dict[str, tuple[float, float]]]:
-    """``chosen`` without those within tolerance or without held-out gain; the gain of each; size and sigma of those within tolerance."""
+    """``chosen`` without those within tolerance, those for which another cause within its tolerance would do, and those without a held-out
+    gain, over the robot file or over all that is tolerated; the first gain of each; size and sigma of those within tolerance."""
     within: dict[str, tuple[float, float]] = {}
-    causes = linearization.causes
+    causes, windows = linearization.causes, len(linearization.rows)
+    largest = np.array([e.negligible for e in causes])
     while True:
         sizes, cov, _ = linearization.problem.fit(chosen)
-        gains = [_heldout(linearization, chosen, tuple(j for j in chosen if j != i), config) for i in chosen]
-        tolerated = [abs(size) < _tolerated_size(linearization, causes[i]) for size, i in zip(sizes, chosen, strict=True)]
-        small = [n for n in range(len(chosen)) if tolerated[n] or not _is_gain_significant(gains[n], len(linearization.rows))]
+        without = [tuple(j for j in chosen if j != i) for i in chosen]
+        gains = [_heldout(linearization, chosen, others, config) for others in without]
+        own_gains = [_heldout(linearization, chosen, others, config, is_tolerant=True) for others in without]
+        tolerated = [
+            abs(size) < largest[i] or has_tolerated_substitute(linearization, chosen, i, largest)
+            for size, i in zip(sizes, chosen, strict=True)
+        ]
+        small = [n for n in range(len(chosen)) if tolerated[n] or not any(_is_gain_significant(g[n], windows) for g in (gains, own_gains))]
         if not small:
             return chosen, gains, within
-        worst = min(small, key=lambda n: gains[n].relative)
-        if tolerated[worst]:
+        worst = min(small, key=lambda n: own_gains[n].relative)
+        if abs(sizes[worst]) < largest[chosen[worst]]:
             within[causes[chosen[worst]].id] = float(sizes[worst]), float(math.sqrt(cov[worst, worst]))
         chosen = tuple(i for n, i in enumerate(chosen) if n != worst)
 
@@ -266,11 +271,11 @@ def _detectable_sizes(linearization: Linearization) -> dict[str, float]:
 
 
 def _within_tolerance(
-    linearization: Linearization, chosen: tuple[int, ...], rows: Mapping[str, Component]
+    linearization: Linearization, chosen: tuple[int, ...], named: FloatArray, rows: Mapping[str, Component]
 ) -> dict[str, tuple[float, float]]:
-    """Size and sigma of the causes that are not named and yet account for a part of a significant row."""
+    """Size and sigma of the causes that are not named, beside the sizes ``named`` (k,), and yet account for a part of a significant row."""
     listed = {a.cause for row in rows.values() for a in row.attributions if not a.is_named}
-    sizes, sigmas = tolerated_sizes(linearization, chosen), linearization.problem.posterior_sigmas(chosen)
+    sizes, sigmas = linearization.problem.tolerated(chosen, named), linearization.problem.posterior_sigmas(chosen)
     found: dict[str, tuple[float, float]] = {}
     for i, cause in enumerate(linearization.causes):
         if cause.id in listed and i not in chosen and abs(sizes[i]) > abs(found.get(cause.id, (0.0, 0.0))[0]):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from motion_models.calibration.maneuvers import IntArray
 from motion_models.errors import ModelError
-from motion_models.friction.contact import CREEP
+from motion_models.friction.contact import CREEP, rolling
 from motion_models.friction.dynamics import FrictionDynamics, _accelerations, _Body
 from motion_models.friction.equilibrium import Floor, motion, newton
 from motion_models.friction.model import FrictionModel, check_parameters, loads_at, pull_of, unit_rolls
@@ -78,6 +78,8 @@ class ManeuverSamples(NamedTuple):
     """(N, 2) wheel rates [rad/s]."""
     cg: FloatArray
     """(N, 2) [m]."""
+    grip_center: FloatArray
+    """(N, 2) the centre of gravity at which the loads would be as the contact forces are; ``cg`` where all wheels grip alike [m]."""
     first: IntArray
     """(W + 1,) first sample of each maneuver."""
     last: IntArray
@@ -126,6 +128,8 @@ class _Problem(NamedTuple):
     q_r: float
     state: FloatArray
     influence: FloatArray
+    shift: FloatArray
+    """(2,) from the centre of gravity to that of the grip [m]."""
     floor: Floor
     body: _Body
 
@@ -143,7 +147,7 @@ class _Work(NamedTuple):
 
 @numba.njit(cache=True, error_model="numpy")
 def _integrate(drive: ManeuverSamples, quasi_static: FloatArray, floor: Floor, body: _Body, out: FloatArray) -> None:
-    state, influence, now = np.zeros(6), np.zeros(13), np.empty(3)
+    state, influence, shift, now = np.zeros(6), np.zeros(13), np.zeros(2), np.empty(3)
     influence[12] = body.height
     work = _Work(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.ones(1, dtype=np.bool_))
     weight, slope = body.mass * body.gravity, drive.slope
@@ -159,11 +163,12 @@ def _integrate(drive: ManeuverSamples, quasi_static: FloatArray, floor: Floor, b
                 out[i] = 0.0
                 continue
             c, s = math.cos(heading), math.sin(heading)
-            influence[0], influence[1] = drive.cg[i, 0], drive.cg[i, 1]
+            influence[0], influence[1] = drive.grip_center[i, 0], drive.grip_center[i, 1]
+            shift[0], shift[1] = influence[0] - drive.cg[i, 0], influence[1] - drive.cg[i, 1]
             influence[7] = -weight * (c * slope[0] + s * slope[1])
             influence[8] = -weight * (-s * slope[0] + c * slope[1])
-            influence[10], influence[11] = drive.cg[i, 0], drive.cg[i, 1]
-            problem = _Problem(before, h, q_l, q_r, state, influence, floor, body)
+            influence[10], influence[11] = influence[0], influence[1]
+            problem = _Problem(before, h, q_l, q_r, state, influence, shift, floor, body)
             # start as far from the quasi-static motion as the sample before was
             now[:] = quasi_static[i] + (before - quasi_static[i - 1]) if i > drive.first[w] else quasi_static[i]
             found = _solve_step(now, problem, work)
@@ -235,8 +240,29 @@ def _misfit(twist: FloatArray, problem: _Problem, off: FloatArray) -> float:
     state, before, h = problem.state, problem.before, problem.h
     state[3], state[4], state[5] = twist[0], twist[1], twist[2]
     a_x, a_y, a_w, _ = _accelerations(state, problem.q_l, problem.q_r, problem.influence, problem.floor, problem.body)
+    if problem.shift[0] != 0.0 or problem.shift[1] != 0.0:
+        a_x, a_y, a_w = _about_cg(twist, a_x, a_y, a_w, problem)
     off[0], off[1], off[2] = twist[0] - before[0] - h * a_x, twist[1] - before[1] - h * a_y, twist[2] - before[2] - h * a_w
     return math.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _about_cg(twist: FloatArray, a_x: float, a_y: float, a_w: float, problem: _Problem) -> tuple[float, float, float]:
+    """Accelerations of the wheelbase's centre, which were worked out as if mass and inertia sat at the grip's centre, with these at the
+    centre of gravity: contact forces are the same, their moment is taken about it, and rolling resistance goes with the load alone."""
+    influence, shift, floor, body, w = problem.influence, problem.shift, problem.floor, problem.body, twist[2]
+    x, y = influence[0], influence[1]
+    force_x = body.mass * (a_x - twist[1] * w - y * a_w - x * w * w) - influence[7]
+    force_y = body.mass * (a_y + twist[0] * w + x * a_w - y * w * w) - influence[8]
+    moment = body.inertia * a_w + shift[0] * force_y - shift[1] * force_x
+    speed = body.radius * math.sqrt(0.5 * (problem.q_l * problem.q_l + problem.q_r * problem.q_r))
+    ahead_l, ahead_r = rolling(body.radius * problem.q_l / speed)[0], rolling(body.radius * problem.q_r / speed)[0]
+    drag = 0.5 * shift[1] * floor.drag * body.mu * body.mass * body.gravity  # too much on the left, times the half track
+    force_x += drag / floor.half_track * (ahead_l - ahead_r)
+    moment -= drag * (ahead_l + ahead_r)
+    cg_x, cg_y, alpha = (force_x + influence[7]) / body.mass, (force_y + influence[8]) / body.mass, moment / body.inertia
+    x, y = x - shift[0], y - shift[1]
+    return cg_x + y * alpha + x * w * w + twist[1] * w, cg_y - x * alpha + y * w * w - twist[0] * w, alpha
 
 
 @numba.njit(cache=True, error_model="numpy")

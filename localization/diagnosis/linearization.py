@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause, Hypothesis, friction_change, slope_across
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.prediction import DrivePredictor, with_sizes
+from localization.diagnosis.prediction import CHANNELS, DrivePredictor, with_sizes
 from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import Batch
 from motion_models.diff_drive import DiffDrive
@@ -21,12 +21,18 @@ from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
 
 MAX_TOLERANCE_SIGMAS = 3.0
-"""Largest size of a cause that is not named, over the sigma of its tolerance: about what is negligible (see `diagnose.TOLERANCES`)."""
+"""Largest size of a cause that is not named, over the sigma of its tolerance: about what is negligible (see `diagnose.TOLERANCE`)."""
 _ROUNDS = 8
 _MOTION = 3  # channels of the motion itself
 _MIN_FREE_SHARE = 0.1  # of all numbers, however many causes there are
 _CLAIMED_WINDOWS = 4.0  # number of windows that a motion reference's own covariance counts for
 _MIN_SIGMA_OVER_CLAIMED = 0.5  # least sigma, as a share of the one that the motion reference gives
+_MAX_SWEEPS, _MAX_LAST_GAIN = 2000, 1e-8  # of the search for tolerated sizes, the latter in squares of whitened numbers
+_MEASURED_SPEED_M_PER_S = 0.05
+_TURN_ERROR_OVER_LOG_SPEED = 0.065
+"""How far a robot turns for the same way of the wheels, over the logarithm of their speed: DRIVE's Husky, by its gyro, turns 0.42 of the
+geometry's angle where the sides' speeds differ from their mean by 0.4 to 0.8 m/s, and 0.49 where by 0.03 to 0.1 m/s; slower, there is
+no data of turns in place."""
 _CLIP = 9.0  # squares beyond this many variances are outliers, and count as this much
 
 
@@ -70,13 +76,29 @@ def variance_regressors(batch: Batch, wheel_radius: float, track: float) -> Floa
     return np.column_stack([np.ones(len(driven)), driven, turned])
 
 
+def slow_turn_sigmas(predictor: DrivePredictor) -> FloatArray:
+    """(M,) error of the predicted turn where wheels roll more slowly than the friction model was ever measured, and than the drive does
+    else [rad]: by the model a robot turns as far by slow wheels as by fast ones, but contacts creep."""
+    batch = predictor.batch
+    speeds = predictor.drive.robot.geometry.wheel_radius_m * np.sqrt(np.mean(np.square(batch.wheels), axis=1))
+    turned = np.abs(predictor.nominal_twist[:, 2]) * batch.dt
+    order = np.argsort(speeds)
+    middle = speeds[order][np.searchsorted(np.cumsum(turned[order]), 0.5 * turned.sum())] if turned.any() else 0.0
+    slower = np.log(np.maximum(min(_MEASURED_SPEED_M_PER_S, middle) / np.maximum(speeds, 1e-9), 1.0))
+    total = np.r_[0.0, np.cumsum(turned * slower)]
+    return np.asarray(_TURN_ERROR_OVER_LOG_SPEED * (total[batch.ends] - total[batch.first[batch.owner] + batch.lead[batch.owner]]))
+
+
 def given_noise(rows: FloatArray, sigmas: FloatArray, follows: NDArray[np.bool_]) -> Noise:
     """Independent numbers with the given ``sigmas`` (M, 6)."""
     return Noise(np.where(np.isfinite(rows), sigmas, 1.0), np.eye(rows.shape[1]), np.zeros(rows.shape[1]), follows, np.ones(len(rows)))
 
 
-def estimate_noise(left: FloatArray, features: FloatArray, follows: NDArray[np.bool_], spent: FloatArray, claimed: FloatArray) -> Noise:
-    """By ``left`` (M, 6), what the richest explanation leaves, which has used up ``spent`` (6,) degrees of freedom in each channel.
+def estimate_noise(
+    left: FloatArray, features: FloatArray, follows: NDArray[np.bool_], spent: FloatArray, claimed: FloatArray, creep: FloatArray
+) -> Noise:
+    """By ``left`` (M, 6), what the richest explanation leaves, which has used up ``spent`` (6,) degrees of freedom in each channel; errors
+    of the model with the sigmas ``creep`` (M, 6) come on top.
 
     The sigmas that the motion references give, ``claimed`` (M, 6), count as much as a few windows: short drives show little of their noise.
     The estimate may be smaller than they are, but not by much.
@@ -99,7 +121,7 @@ def estimate_noise(left: FloatArray, features: FloatArray, follows: NDArray[np.b
             variance = np.maximum(f @ found, 0.2 * float(np.median(variance)))
         given = claimed[use, channel]
         pooled = (free[channel] * variance + _CLAIMED_WINDOWS * given**2) / (free[channel] + _CLAIMED_WINDOWS)
-        sigmas[use, channel] = np.maximum(np.sqrt(pooled), _MIN_SIGMA_OVER_CLAIMED * given)
+        sigmas[use, channel] = np.hypot(np.maximum(np.sqrt(pooled), _MIN_SIGMA_OVER_CLAIMED * given), creep[use, channel])
     z = np.nan_to_num(left * np.sqrt(inflate) / sigmas, nan=0.0)
     lengths = np.abs(z).max(axis=1)
     weights = np.minimum(1.0, 4.0 / np.maximum(lengths, 1e-9))
@@ -193,13 +215,8 @@ class Regression:
         scale = self.scale[i]
         return sizes * scale, (inverse.T @ inverse) * np.outer(scale, scale), twice - self._evidence_of_nothing
 
-    def posterior(self, subset: tuple[int, ...]) -> FloatArray:
-        """(p,) posterior means of all sizes, in own units, with those outside of ``subset`` held to their tolerance."""
-        factor, half, _ = self._evidence(subset)
-        return np.asarray(np.linalg.solve(factor.T, half) * self.scale)
-
     def posterior_sigmas(self, subset: tuple[int, ...]) -> FloatArray:
-        """(p,) standard deviations of `posterior`."""
+        """(p,) posterior sigmas of all sizes, in own units, with those outside of ``subset`` held to their tolerance."""
         factor, _, _ = self._evidence(subset)
         return np.asarray(np.linalg.norm(np.linalg.solve(factor, np.eye(len(factor))), axis=0) * self.scale)
 
@@ -208,17 +225,21 @@ class Regression:
         return self._evidence(subset)[2] - self._evidence_of_nothing if subset else 0.0
 
     def misfit(self) -> float:
-        """Sum of squares that is left where every cause keeps within its tolerance, and what that takes.
-
-        A prior does not hold a size against much data: beyond `MAX_TOLERANCE_SIGMAS` a size would not be tolerated, and is cut there.
-        """
-        factor, half, _ = self._evidence(())
-        x = np.linalg.solve(factor.T, half)
-        limit = MAX_TOLERANCE_SIGMAS * self.tolerance
-        if np.all(np.abs(x) <= limit):
-            return self.rest - float(half @ half)
-        x = np.clip(x, -limit, limit)
+        """Sum of squares that is left where every cause keeps within its tolerance, and what that takes."""
+        x = self.tolerated((), np.zeros(0)) / self.scale
         return self.rest + float(x @ self.gram @ x - 2.0 * x @ self.moment + np.sum(np.square(x / self.tolerance)))
+
+    def tolerated(self, chosen: tuple[int, ...], sizes: FloatArray) -> FloatArray:
+        """(p,) most likely sizes, in own units, of all causes that are not named, beside those ``chosen`` with their ``sizes`` (k,); 0 for
+        these.
+
+        A prior does not hold a size against much data: beyond `MAX_TOLERANCE_SIGMAS` a size would not be tolerated, and ends there.
+        """
+        i = list(chosen)
+        limit = MAX_TOLERANCE_SIGMAS * self.tolerance
+        limit[i] = 0.0
+        moment = self.moment - self.gram[:, i] @ (sizes / self.scale[i])
+        return np.asarray(bounded_minimum(self.gram + np.diag(1.0 / np.square(self.tolerance)), moment, limit) * self.scale)
 
     def scores(self, given: tuple[int, ...], wanted: list[int]) -> tuple[FloatArray, FloatArray]:
         """(n,) scores of the ``wanted`` causes with those ``given`` free and all others within tolerance, and their (n, n) covariance if
@@ -230,6 +251,24 @@ class Regression:
         across = np.linalg.solve(a, self.gram[np.ix_(others, wanted)])
         cov = self.gram[np.ix_(wanted, wanted)] - self.gram[np.ix_(wanted, others)] @ across
         return self.moment[wanted] - across.T @ self.moment[others], cov
+
+
+@numba.njit(cache=True)
+def bounded_minimum(a: FloatArray, b: FloatArray, limit: FloatArray) -> FloatArray:
+    """(p,) x within +- ``limit`` (p,) where x' a x / 2 - b' x is least, by coordinate descent; ``a`` (p, p) is positive definite."""
+    x = np.zeros_like(b)
+    slope = -b
+    for _ in range(_MAX_SWEEPS):
+        moved = 0.0
+        for i in range(len(b)):
+            step = min(max(x[i] - slope[i] / a[i, i], -limit[i]), limit[i]) - x[i]
+            if step != 0.0:
+                x[i] += step
+                slope += step * a[i]
+                moved = max(moved, step * step * a[i, i])
+        if moved < _MAX_LAST_GAIN:
+            break
+    return x
 
 
 def regression(
@@ -333,7 +372,7 @@ def linearize(predictor: DrivePredictor, causes: tuple[Cause, ...], sizes: dict[
     """Everything around the hypothesis that causes have these ``sizes``."""
     hypothesis = with_sizes(sizes)
     rows = predictor.discrepancies(hypothesis)
-    signatures = np.stack([predictor.signature(hypothesis, e, rows) for e in causes], axis=-1)
+    signatures = np.stack([_signature(predictor, e, sizes, rows) for e in causes], axis=-1)
     linear = rows.copy()
     for cause, size in sizes.items():
         linear += signatures[..., [e.key for e in causes].index(cause.key)] * size
@@ -343,12 +382,11 @@ def linearize(predictor: DrivePredictor, causes: tuple[Cause, ...], sizes: dict[
     return Linearization(causes, rows, linear, signatures, nuisances, noise, tolerance, problem)
 
 
-def with_tolerance(linearization: Linearization, tolerance: float) -> Linearization:
-    """The same, with unnamed causes held to another ``tolerance``."""
-    problem = make_regression(
-        linearization.linear, linearization.signatures, linearization.nuisances, linearization.noise, linearization.causes, tolerance
-    )
-    return dataclasses.replace(linearization, tolerance=tolerance, problem=problem)
+def _signature(predictor: DrivePredictor, cause: Cause, sizes: dict[Cause, float], rows: FloatArray) -> FloatArray:
+    """(M, 6) of ``cause`` where causes have these ``sizes``, which leave ``rows`` (M, 6); without another one of its group, whose place it
+    would take: a floor that changes at another moment does not change at both."""
+    others = {e: size for e, size in sizes.items() if e.key == cause.key or group_of(e) != group_of(cause)}
+    return predictor.signature(with_sizes(others), cause, rows if len(others) == len(sizes) else None)
 
 
 def make_regression(
@@ -384,7 +422,9 @@ def _estimate_drive_noise(
     sigmas[:, :3] = given
     sigmas[:, 3] = np.hypot(given[:, 2], 1e-3)
     sigmas[:, 4:] = 0.05
-    noise = given_noise(linear, sigmas, follows)
+    creep = np.zeros_like(linear)
+    creep[:, CHANNELS.index("yaw")] = slow_turn_sigmas(predictor)
+    noise = given_noise(linear, np.hypot(sigmas, creep), follows)
     scale = np.array([e.plausible for e in causes])
     known = np.isfinite(linear)
     for _ in range(3):
@@ -395,7 +435,7 @@ def _estimate_drive_noise(
         spent = np.sum((design @ inverse) * design, axis=1).reshape(linear.shape).sum(axis=0)
         p = len(causes)
         left = linear - signatures @ (x[:p] * scale) - nuisances @ (x[p:] * 1e3)
-        noise = estimate_noise(np.where(known, left, np.nan), features, follows, spent, sigmas)
+        noise = estimate_noise(np.where(known, left, np.nan), features, follows, spent, sigmas, creep)
     return noise
 
 

@@ -337,18 +337,22 @@ class _HypothesisModel:
         if any(b.cg) or b.payload_kg:
             mass = p.drive.robot.geometry.mass_kg
             moved = cg + np.array(b.cg) + (p.drive.payload_arms * (b.payload_kg / (mass + b.payload_kg)) if b.payload_kg else 0.0)
-        if b.split_friction:
-            moved, params[8] = _shifted_by_grip(moved, (0.5 * params[2], 0.5 * params[1]), params[8], b.split_friction)
+        half = 0.49 * np.array([params[2], params[1]])
         if moved is not cg:
-            half = 0.49 * np.array([params[2], params[1]])
             moved = np.clip(moved, -half, half)
+        grip = moved
+        if b.split_friction:
+            shifted, params[8] = _shifted_by_grip(moved, (0.5 * params[2], 0.5 * params[1]), params[8], b.split_friction)
+            grip = np.clip(shifted, -half, half)
+        centers = moved, grip
         if not b.friction_change:
-            return self._with_inertia(law, rates, moved, params) - nominal
+            return self._with_inertia(law, rates, centers, params) - nominal
         later = params.copy()
         later[4] = max(later[4] * (1.0 + b.friction_change), 0.05)
         is_after_change = (p._times >= b.friction_change_at_s)[:, None]
         return np.asarray(
-            np.where(is_after_change, self._with_inertia(law, rates, moved, later), self._with_inertia(law, rates, moved, params)) - nominal
+            np.where(is_after_change, self._with_inertia(law, rates, centers, later), self._with_inertia(law, rates, centers, params))
+            - nominal
         )
 
     def _quasi_static(self, law: FrictionModel, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
@@ -374,10 +378,13 @@ class _HypothesisModel:
         p, b = self._p, self._b
         return b.left_radius_scale, b.right_radius_scale, b.encoder_loss, b.wheel_radius_drift, p._wheel_shift(b), b.wheel_lag_s
 
-    def _with_inertia(self, law: FrictionModel, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
-        """(N, 3) twists of the tracked point, with inertia where that counts."""
+    def _with_inertia(
+        self, law: FrictionModel, rates: FloatArray, centers: tuple[FloatArray, FloatArray], params: FloatArray
+    ) -> FloatArray:
+        """(N, 3) twists of the tracked point, with inertia where that counts; ``centers`` (N, 2) of gravity and of the grip."""
         p, b = self._p, self._b
-        settled = self._quasi_static(law, rates, cg, params)
+        cg, grip = centers
+        settled = self._quasi_static(law, rates, grip, params)
         if not (p.has_inertia or any(b.slope)):
             return settled
         key = (
@@ -385,7 +392,7 @@ class _HypothesisModel:
             law.saturation,
             params.tobytes(),
             b.slope,
-            *(self._load_key() if cg is not p.batch.cg else ()),
+            *(self._load_key() if grip is not p.batch.cg else ()),
             "inertia",
         )
         if key not in p._twists:
@@ -394,7 +401,7 @@ class _HypothesisModel:
             batch = p.batch
             turned = np.r_[0.0, np.cumsum(settled[:, 2] * batch.dt)]
             headings = p.headings - (turned[batch.first[:-1] + batch.lead] - turned[batch.first[:-1]])
-            drive = ManeuverSamples(batch.dt, rates, cg, batch.first, p._last, headings, np.array(b.slope))
+            drive = ManeuverSamples(batch.dt, rates, cg, grip, batch.first, p._last, headings, np.array(b.slope))
             twists = dynamic_twists(p.drive.robot, law, params, drive, middle)
             p._twists[key] = np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
         return p._twists[key]

@@ -7,9 +7,17 @@ import math
 
 import numpy as np
 
-from localization.diagnosis.causes import Cause
+from localization.diagnosis.causes import Cause, Hypothesis
 from localization.diagnosis.findings import Gain
-from localization.diagnosis.linearization import Linearization, Noise, Regression, group_of, make_regression
+from localization.diagnosis.linearization import (
+    MAX_TOLERANCE_SIGMAS,
+    Linearization,
+    Noise,
+    Regression,
+    bounded_minimum,
+    group_of,
+    make_regression,
+)
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
 from motion_models.errors import CgError, ModelError
 from motion_models.se2 import FloatArray
@@ -101,20 +109,21 @@ def signature_correlation(problem: Regression, given: tuple[int, ...], a: int, b
 
 
 def heldout_gain(
-    linear: FloatArray,
-    signatures: FloatArray,
-    nuisances: FloatArray,
-    noise: Noise,
-    scale: FloatArray,
-    chosen: tuple[int, ...],
-    others: tuple[int, ...],
-    rng: np.random.Generator,
+    state: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], rng: np.random.Generator, is_tolerant: bool = False
 ) -> Gain:
-    """Root mean square of held-out whitened discrepancies by ``others`` and by ``chosen``; folds are of blocks of 4 windows."""
-    squares = [heldout_squares(linear, signatures, nuisances, noise, scale, subset) for subset in (others, chosen)]
-    n = len(linear)
-    block = np.arange(n) // _BLOCK_WINDOWS
-    counts = np.bincount(block, weights=np.isfinite(linear).sum(axis=1))
+    """Root mean square of held-out whitened discrepancies by ``others`` and by ``chosen``; folds are of blocks of 4 windows. Where it
+    ``is_tolerant``, all other causes may be fitted as well, within what is tolerated of them."""
+    problem = state.problem
+    squares = []
+    for subset in (others, chosen):
+        is_named = np.isin(np.arange(len(problem.scale)), subset)
+        groups = {group_of(state.causes[i]) for i in subset}  # of which one cause is at work, and no other beside it
+        is_tolerated = np.array([is_tolerant and group_of(e) not in groups for e in state.causes])
+        spreads = problem.scale * np.where(is_named, 1.0, problem.tolerance * is_tolerated)
+        limits = np.where(is_named, np.inf, MAX_TOLERANCE_SIGMAS)
+        squares.append(heldout_squares(state.linear, state.signatures, state.nuisances, state.noise, spreads, limits))
+    block = np.arange(len(state.linear)) // _BLOCK_WINDOWS
+    counts = np.bincount(block, weights=np.isfinite(state.linear).sum(axis=1))
     sums = [np.bincount(block, weights=s) for s in squares]
     rms = [float(np.sqrt(s.sum() / counts.sum())) for s in sums]
     draws = rng.multinomial(len(counts), np.full(len(counts), 1.0 / len(counts)), size=_BOOTSTRAP_DRAWS)
@@ -124,12 +133,15 @@ def heldout_gain(
 
 
 def heldout_squares(
-    linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, noise: Noise, scale: FloatArray, subset: tuple[int, ...]
+    linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, noise: Noise, spreads: FloatArray, limits: FloatArray
 ) -> FloatArray:
-    """(M,) sum of squares of each window."""
+    """(M,) sum of squares of each window, predicted from the others by causes with the prior sigmas ``spreads`` (p,), 0 for none, that end
+    at ``limits`` (p,) of them."""
     y = noise.whiten(linear)
-    columns = [noise.whiten(signatures[..., list(subset)]) * scale[list(subset)], noise.whiten(nuisances) * 1e3]
+    used = spreads > 0.0
+    columns = [noise.whiten(signatures[..., used]) * spreads[used], noise.whiten(nuisances) * 1e3]
     design = np.concatenate(columns, axis=-1)
+    within = np.r_[limits[used], np.full(nuisances.shape[-1], np.inf)]
     fold = (np.arange(len(y)) // _BLOCK_WINDOWS) % _FOLDS
     out = np.zeros(len(y))
     for f in range(_FOLDS):
@@ -137,7 +149,7 @@ def heldout_squares(
         if not held.any() or held.all():
             continue
         a = design[~held].reshape(-1, design.shape[-1])
-        x = np.linalg.solve(a.T @ a + np.eye(a.shape[1]), a.T @ y[~held].ravel())
+        x = bounded_minimum(a.T @ a + np.eye(a.shape[1]), a.T @ y[~held].ravel(), within)
         out[held] = np.sum((y[held] - design[held] @ x) ** 2, axis=1)
     return out
 
@@ -150,7 +162,7 @@ _MAX_MISSING_SHARE = 0.1  # share of what signatures promise that may be missing
 _FEW_CAUSES, _EXTRA_SETS = 2, 4  # then so many sets of up to so many causes are tried by full prediction
 _NEAR_LOG_EVIDENCE = 30.0
 _CLEAR_LOG_EVIDENCE = 200.0  # lead in twice the log-evidence that needs no trial
-_MAX_STEPS = 4
+_MAX_STEPS, _SHORTER_STEP = 6, 0.3
 _CONVERGED_STEP, _LONG_STEP = 0.02, 0.2  # steps, over typical sizes: one that ends, and one after which signatures are taken anew
 
 
@@ -160,7 +172,9 @@ def search_causes(predictor: DrivePredictor, linearization: Linearization) -> di
     groups = [group_of(e) for e in causes]
     ranked = rank_subsets(problem, groups, _bounds(causes))
     least, best = ranked[0]
-    nothing = problem.misfit()
+    sizes = _linear_sizes(linearization, best)
+    left = linearization.linear - linearization.signatures[..., list(best)] @ np.array(list(sizes.values()))
+    promised = _cost(linearization, sizes, left)
     results: dict[tuple[int, ...], tuple[float, dict[Cause, float]]] = {}
 
     def cost_of(subset: tuple[int, ...]) -> float:
@@ -171,10 +185,13 @@ def search_causes(predictor: DrivePredictor, linearization: Linearization) -> di
         return results[subset][0]
 
     is_sure = len(ranked) < 2 or ranked[1][0] - least > _CLEAR_LOG_EVIDENCE
-    is_nearly_linear = cost_of(best) < nothing + least + max(_MAX_MISSING_SHARE * abs(least), _ALIAS_LOG_ODDS)
-    cost_of(())
+    missing = cost_of(best) - promised
+    is_nearly_linear = missing < max(_MAX_MISSING_SHARE * (cost_of(()) - promised), _ALIAS_LOG_ODDS)
     margin = max(_NEAR_LOG_EVIDENCE, _MAX_MISSING_SHARE * abs(least)) if is_nearly_linear else _CLEAR_LOG_EVIDENCE
     near = [s for c, s in ranked if c - least < margin]
+    if not is_nearly_linear:  # single causes also from the edge, where their signatures lead beyond it
+        for i in sorted(range(len(causes)), key=lambda i: cost(problem, groups, (i,)))[:_EXTRA_SETS]:
+            cost_of((i,))
     for size in range(1, MOST_CAUSES):
         alike = [s for s in near if len(s) == size][:_REFINED_SETS] if not is_sure else []
         if not is_nearly_linear and size <= _FEW_CAUSES:  # where signatures bend, few causes may do what many seem to
@@ -196,9 +213,8 @@ def aliases_of(predictor: DrivePredictor, linearization: Linearization, chosen: 
     base, own = problem.gain(others), problem.gain(chosen)
     tolerance = max(_ALIAS_LOG_ODDS, _ALIAS_SHARE * (own - base))
     found: dict[str, tuple[float, int]] = {}
-    for j, cause in enumerate(causes):
-        if j in chosen or group_of(cause) == group_of(causes[i]) or any(group_of(cause) == group_of(causes[k]) for k in others):
-            continue
+    for j in _substitutes(causes, chosen):
+        cause = causes[j]
         if abs(signature_correlation(problem, others, i, j)) < _MIN_ALIAS_CORRELATION:
             continue
         subset = (*others, j)
@@ -219,13 +235,38 @@ def aliases_of(predictor: DrivePredictor, linearization: Linearization, chosen: 
     return tuple((name, size) for _, name, size in sorted(costs))
 
 
+def has_tolerated_substitute(linearization: Linearization, chosen: tuple[int, ...], i: int, largest: FloatArray) -> bool:
+    """Whether one cause no larger than what is tolerated of it, ``largest`` (p,), explains the drive about as well as ``i``, or as ``i``
+    and another one of those ``chosen`` together, as where these two nearly cancel."""
+    problem, causes = linearization.problem, linearization.causes
+    groups = [group_of(e) for e in causes]
+    most = cost(problem, groups, chosen) + _ALIAS_LOG_ODDS
+    for k in chosen:
+        rest = tuple(j for j in chosen if j not in (i, k))
+        for j in _substitutes(causes, chosen):
+            size = float(problem.fit((*rest, j))[0][-1])
+            is_tolerated = abs(size) <= largest[j] and not (causes[j].one_sided and size < 0.0)
+            if is_tolerated and cost(problem, groups, (*rest, j)) <= most:
+                return True
+    return False
+
+
+def _substitutes(causes: tuple[Cause, ...], chosen: tuple[int, ...]) -> list[int]:
+    """Causes that could take the place of one of those ``chosen``."""
+    groups = {group_of(causes[k]) for k in chosen}
+    return [j for j, cause in enumerate(causes) if group_of(cause) not in groups]
+
+
 def _cost(linearization: Linearization, sizes: dict[Cause, float], rows: FloatArray) -> float:
     """What ``rows`` (M, 6), which ``sizes`` leave, are off beyond all tolerances, and the price of so many causes."""
-    whole = make_regression(
-        rows, linearization.signatures, linearization.nuisances, linearization.noise, linearization.causes, linearization.tolerance
-    )
+    whole = _regression_of(linearization, rows, linearization.signatures)
     k, groups = len(sizes), len({group_of(e) for e in linearization.causes})
     return whole.misfit() + k * math.log(max(whole.count, 2)) + 2.0 * math.log(math.comb(groups, k))
+
+
+def _regression_of(linearization: Linearization, rows: FloatArray, signatures: FloatArray) -> Regression:
+    """Of other ``rows`` (M, 6) and ``signatures`` (M, 6, p) in the same noise."""
+    return make_regression(rows, signatures, linearization.nuisances, linearization.noise, linearization.causes, linearization.tolerance)
 
 
 def _refined_cost(predictor: DrivePredictor, linearization: Linearization, start: dict[Cause, float]) -> tuple[dict[Cause, float], float]:
@@ -240,26 +281,47 @@ def _refined_cost(predictor: DrivePredictor, linearization: Linearization, start
 def _refine_sizes(
     predictor: DrivePredictor, linearization: Linearization, sizes: dict[Cause, float]
 ) -> tuple[dict[Cause, float], FloatArray]:
-    """Gauss-Newton on the sizes by the real predictor, with the signatures that are at hand until a step is long; and the discrepancies
-    (M, 6) that they leave."""
+    """Gauss-Newton on the sizes, with their priors, by the real predictor; and the discrepancies (M, 6) that they leave.
+
+    All other causes may take what they are tolerated. The signatures at hand are used until a step is long or makes it worse; then a step
+    is shortened.
+    """
     order = list(sizes)
-    limits = _bounds(tuple(order))
-    values = np.array([_bounded(e, sizes[e]) for e in order])
-    rows = predictor.discrepancies(with_sizes(dict(zip(order, values, strict=True))))
-    own = linearization.signatures[..., [linearization.causes.index(e) for e in order]]
-    typical = np.array([e.typical for e in order])
+    own = [linearization.causes.index(e) for e in order]
+    limits, typical = _bounds(tuple(order)), np.array([e.typical for e in order])
+    signatures, share, is_fresh = linearization.signatures, 1.0, False
+
+    def predict(values: FloatArray) -> tuple[Hypothesis, FloatArray]:
+        hypothesis = with_sizes(dict(zip(order, values, strict=True)))
+        return hypothesis, predictor.discrepancies(hypothesis)
+
+    def with_own(hypothesis: Hypothesis, rows: FloatArray) -> FloatArray:
+        changed = signatures.copy()
+        changed[..., own] = np.stack([predictor.signature(hypothesis, e, rows) for e in order], axis=-1)
+        return changed
+
+    values = np.clip([sizes[e] for e in order], limits[:, 0], limits[:, 1]) if order else np.zeros(0)
+    hypothesis, rows = predict(values)
+    problem = _regression_of(linearization, rows, signatures)
+    scale = problem.scale[own]
+    least = problem.misfit() + float(np.sum(np.square(values / scale)))
     for _ in range(_MAX_STEPS if order else 0):
-        problem = make_regression(rows, own, linearization.nuisances, linearization.noise, tuple(order), linearization.tolerance)
-        change = np.linalg.solve(problem.gram + 1e-9 * np.eye(len(order)), problem.moment) * problem.scale
-        new = np.clip(values + change, limits[:, 0], limits[:, 1])
+        score, information = problem.scores((), own)
+        change = np.linalg.solve(information + np.eye(len(order)), score - values / scale) * scale
+        new = np.clip(values + share * change, limits[:, 0], limits[:, 1])
         moved = float(np.max(np.abs(new - values) / typical))
         if moved < _CONVERGED_STEP:
             break
-        values = new
-        hypothesis = with_sizes(dict(zip(order, values, strict=True)))
-        rows = predictor.discrepancies(hypothesis)
-        if moved > _LONG_STEP:
-            own = np.stack([predictor.signature(hypothesis, e, rows) for e in order], axis=-1)
+        tried_hypothesis, tried_rows = predict(new)
+        tried = _regression_of(linearization, tried_rows, signatures)
+        off = tried.misfit() + float(np.sum(np.square(new / scale)))
+        if off <= least:
+            values, hypothesis, rows, problem, least, share, is_fresh = new, tried_hypothesis, tried_rows, tried, off, 1.0, False
+        elif is_fresh:
+            share *= _SHORTER_STEP
+        if not is_fresh and (off > least or moved > _LONG_STEP):
+            signatures, is_fresh = with_own(hypothesis, rows), True
+            problem = _regression_of(linearization, rows, signatures)
     return dict(zip(order, (float(v) for v in values), strict=True)), rows
 
 
@@ -269,7 +331,3 @@ def _linear_sizes(linearization: Linearization, subset: tuple[int, ...]) -> dict
 
 def _bounds(causes: tuple[Cause, ...]) -> FloatArray:
     return np.array([(0.0 if e.one_sided else -e.largest, e.largest) for e in causes])
-
-
-def _bounded(cause: Cause, size: float) -> float:
-    return max(size, 0.0) if cause.one_sided else size

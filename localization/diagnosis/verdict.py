@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause
 from localization.diagnosis.drive import drive_of_table
 from localization.diagnosis.findings import MAX_NOISE_OVER_REFERENCE, Attribution, Component, Finding, Trend, Verdict
-from localization.diagnosis.linearization import MAX_TOLERANCE_SIGMAS, Linearization, Noise, regression
+from localization.diagnosis.linearization import Linearization, Noise, regression
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, DrivePredictor, with_sizes
 from localization.diagnosis.selection import max_statistic, p_value, statistics
 from motion_models.calibration.maneuvers import IntArray, Maneuver
@@ -185,15 +185,6 @@ def find_outliers(linearization: Linearization) -> NDArray[np.bool_]:
     return found if found.mean() <= _MAX_OUTLIER_SHARE else np.zeros_like(found)
 
 
-def tolerated_sizes(linearization: Linearization, chosen: tuple[int, ...]) -> FloatArray:
-    """(p,) estimated sizes of the causes that are not named, which are held to their tolerances; 0 for those ``chosen``."""
-    problem = linearization.problem
-    limit = MAX_TOLERANCE_SIGMAS * problem.tolerance * problem.scale
-    sizes = np.clip(problem.posterior(chosen), -limit, limit)
-    sizes[list(chosen)] = 0.0
-    return sizes
-
-
 def attribute_rows(
     first: Linearization,
     linearization: Linearization,
@@ -207,11 +198,12 @@ def attribute_rows(
     ``reference_sigmas`` (M, 3) are those of the motion reference, inf where it measured nothing; None where they are not given.
     """
     regular = ~find_outliers(linearization)
-    every = tolerated_sizes(linearization, chosen)
+    every = linearization.problem.tolerated(chosen, sizes)
     named = linearization.linear - linearization.signatures[..., list(chosen)] @ sizes
     rest = named - np.nan_to_num(linearization.signatures) @ every
     every[list(chosen)] = sizes
     white, white_rest = linearization.noise.whiten(first.rows), linearization.noise.whiten(rest)
+    weighed = rest * linearization.noise.weights[:, None]  # as in the fit: a single window between four and eight sigma is no shape
     parts = np.nan_to_num(linearization.signatures) * every / linearization.noise.sigmas[..., None]
     scaled = np.nan_to_num(first.rows) / linearization.noise.sigmas
     found = {}
@@ -219,7 +211,7 @@ def attribute_rows(
         known = np.isfinite(first.rows[:, c]) & regular
         if not known.any():
             continue
-        rms, left_rms, rest_rms = (_rms(rows[known, c], c) for rows in (first.rows, named, rest))
+        rms, left_rms, rest_rms = (_rms(rows[known, c], c) for rows in (first.rows, named, weighed))
         expected = float(np.sqrt(np.mean(linearization.noise.sigmas[known, c] ** 2)))
         squares = float(np.sum(white[known, c] ** 2))
         count = int(known.sum())

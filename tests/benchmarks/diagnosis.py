@@ -1,10 +1,11 @@
 """How often the diagnosis is right: every cause on four robots, from a quarter of its typical size to twice it, pairs and nulls.
 
-`python -m tests.benchmarks.diagnosis [--cases A:B[:STEP]] [--out FILE.jsonl] [--rivals]` runs cases A to B-1 of 1,500 (default: all; a STEP
-such as 37 takes a share of them with all causes, robots and kinds) and appends a row for each to FILE (default: diagnosis-benchmark.jsonl);
-cases that FILE has are not run again, so that it can be stopped at any time.
+`python -m tests.benchmarks.diagnosis [--cases A:B[:STEP]] [--out FILE.jsonl] [--drives FOLDER] [--rivals]` runs cases A to B-1 of 1,500
+(default: all; a STEP such as 37 takes a share of them with all causes, robots and kinds) and appends a row for each to FILE (default:
+diagnosis-benchmark.jsonl); cases that FILE has are not run again, so that it can be stopped at any time. Drives are kept in FOLDER, if one
+is given: to diagnose them again takes a third of the time.
 A case is determined by its number. No robot is exactly as its file: beside what is hidden, geometry, mounts, clocks, floor and gyro of each
-deviate by as much as the diagnosis takes for the accuracy of robot files (`TOLERANCES`), and intervals are to hold the hidden size.
+deviate by as much as the diagnosis takes for the accuracy of robot files (`TOLERANCE`), and intervals are to hold the hidden size.
 Tables come from the rows: `--report` prints them without running anything.
 """
 
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import pickle
 import tempfile
 import time
 from collections.abc import Mapping
@@ -23,9 +25,10 @@ from typing import Any, Literal
 import numpy as np
 
 from localization.diagnosis.causes import CAUSES, Cause
-from localization.diagnosis.diagnose import TOLERANCES, examine
+from localization.diagnosis.diagnose import TOLERANCE, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log
 from localization.diagnosis.linearization import Linearization, linearize, make_regression
+from localization.diagnosis.prediction import with_sizes
 from localization.logs import open_log
 from motion_models.registry import make_model
 from tests.helpers.diagnosis_drives import ONE_SIDED, TYPICAL, bag, drive, robot_named
@@ -75,7 +78,7 @@ def case_of(number: int) -> Case:
         first = number % len(causes)
         chosen = [causes[first]] if kind == "single" else [causes[first], causes[(first + int(rng.integers(1, len(causes)))) % len(causes)]]
         effects = {name: _size(name, robot, rng) for name in chosen}
-    deviations = {name: float(rng.normal(0.0, TOLERANCES[0] * CAUSES[name].negligible)) for name in _DEVIATING}
+    deviations = {name: float(rng.normal(0.0, TOLERANCE * CAUSES[name].negligible)) for name in _DEVIATING}
     return Case(number, kind, effects, robot, route, deviations)
 
 
@@ -89,8 +92,14 @@ def _size(cause: str, robot: str, rng: np.random.Generator) -> float:
     return round(sign * factor * typical, 6)
 
 
-def drive_of(case: Case) -> Drive:
-    """What the diagnosis gets: the log alone, and the nominal robot."""
+def drive_of(case: Case, kept_in: Path | None = None) -> Drive:
+    """What the diagnosis gets: the log alone, and the nominal robot; read from the folder ``kept_in`` if it is there."""
+    if kept_in is not None:
+        kept = kept_in / f"{case.number}.pickle"
+        if not kept.exists():
+            kept_in.mkdir(parents=True, exist_ok=True)
+            kept.write_bytes(pickle.dumps(drive_of(case)))
+        return pickle.loads(kept.read_bytes())  # type: ignore[no-any-return]
     robot = robot_named(case.robot)
     with tempfile.TemporaryDirectory() as folder:
         sizes = {name: case.effects.get(name, 0.0) + case.deviations.get(name, 0.0) for name in {**case.effects, **case.deviations}}
@@ -98,10 +107,10 @@ def drive_of(case: Case) -> Drive:
         return drive_of_log(open_log(log, robot))
 
 
-def run(case: Case, has_rivals: bool) -> dict[str, Any]:
+def run(case: Case, has_rivals: bool, kept_in: Path | None = None) -> dict[str, Any]:
     """One row."""
     begin = time.process_time()
-    measured = drive_of(case)
+    measured = drive_of(case, kept_in)
     found = examine(measured, make_model("friction", measured.robot))
     seconds = time.process_time() - begin
     d = found.diagnosis
@@ -118,30 +127,46 @@ def run(case: Case, has_rivals: bool) -> dict[str, Any]:
     }
     if found.predictor is None or found.linearization is None:
         return row
-    if case.effects or has_rivals:
-        pipeline, last = found.predictor, found.linearization
-        first = linearize(pipeline, last.causes, {}, TOLERANCES[0])
-        problem = make_regression(first.linear, first.signatures, first.nuisances, last.noise, first.causes, TOLERANCES[0])
-        nominal = dataclasses.replace(first, noise=last.noise, problem=problem)
-        row["significance"] = {name: significance(nominal, case.effects, name) for name in case.effects}
-        row["tolerated"] = {name: max((e.negligible for e in last.causes if e.id == name), default=None) for name in case.effects}
-        if has_rivals:
-            row["gain"] = round(d.gain.relative, 5) if d.gain is not None else 0.0
-            row["oracle"] = round(oracle(pipeline, nominal, dict(case.effects)), 5)
-            row["rivals"] = {name: [first, round(gain, 5)] for name, (first, gain) in rivals(measured, pipeline, nominal).items()}
+    row["significance"] = significances(found, case.effects)
+    row["tolerated"] = {
+        name: max((e.negligible for e in found.linearization.causes if e.id == name), default=None) for name in case.effects
+    }
+    if has_rivals:
+        pipeline, nominal = found.predictor, nominal_state(found, {})
+        row["gain"] = round(d.gain.relative, 5) if d.gain is not None else 0.0
+        row["oracle"] = round(oracle(pipeline, nominal, dict(case.effects)), 5)
+        row["rivals"] = {name: [first, round(gain, 5)] for name, (first, gain) in rivals(measured, pipeline, nominal).items()}
     return row
 
 
-def significance(state: Linearization, effects: Mapping[str, float], name: str) -> float | None:
-    """Of effect ``name``: its size over the sigma with which this drive can measure it, while the other hidden causes are free and all
-    others keep within their tolerance. None if the drive does not show the cause at all."""
-    problem = state.problem
-    own = _columns(state, name)
-    if not own:
-        return None
-    given = tuple(i for other in effects if other != name for i in _columns(state, other))
-    cov = problem.scores(given, own)[1]
-    return round(float(np.sqrt(cov[0, 0]) * abs(effects[name]) / problem.scale[own[0]]), 2)
+def nominal_state(found: DiagnosisResult, effects: Mapping[str, float]) -> Linearization:
+    """The drive of ``found`` about the robot file, in the noise that was left in the end; signatures of the ``effects`` are those of their
+    whole sizes, as some bend."""
+    assert found.predictor is not None
+    assert found.linearization is not None
+    last = found.linearization
+    first = linearize(found.predictor, last.causes, {}, TOLERANCE)
+    for name, size in effects.items():
+        for i in _columns(first, name):
+            ahead = found.predictor.discrepancies(with_sizes({first.causes[i]: size}))
+            first.signatures[..., i] = (first.rows - ahead) / size
+    problem = make_regression(first.linear, first.signatures, first.nuisances, last.noise, first.causes, TOLERANCE)
+    return dataclasses.replace(first, noise=last.noise, problem=problem)
+
+
+def significances(found: DiagnosisResult, effects: Mapping[str, float]) -> dict[str, float | None]:
+    """Of each of the hidden ``effects``: its size over the sigma with which this drive can measure it, while the other hidden causes are
+    free and all others keep within their tolerance. None for a cause that the drive does not show at all."""
+    if not effects or found.linearization is None:
+        return {}
+    state = nominal_state(found, effects)
+    result: dict[str, float | None] = {}
+    for name, size in effects.items():
+        own = _columns(state, name)
+        given = tuple(i for other in effects if other != name for i in _columns(state, other))
+        cov = state.problem.scores(given, own)[1]
+        result[name] = round(float(np.sqrt(cov[0, 0]) * abs(size) / state.problem.scale[own[0]]), 2) if own else None
+    return result
 
 
 def _columns(state: Linearization, name: str) -> list[int]:
@@ -161,6 +186,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", default=f"0:{CASES}", metavar="A:B[:STEP]")
     parser.add_argument("--out", type=Path, default=Path("diagnosis-benchmark.jsonl"), metavar="FILE")
+    parser.add_argument("--drives", type=Path, default=None, metavar="FOLDER")
     parser.add_argument("--rivals", action="store_true", help="other methods on the same signatures as well")
     parser.add_argument("--report", action="store_true")
     options = parser.parse_args(arguments if arguments is not None else ([] if __name__ != "__main__" else None))
@@ -170,7 +196,7 @@ def main(arguments: list[str] | None = None) -> None:
     for number in numbers if not options.report else ():
         if number in done:
             continue
-        row = run(case_of(number), options.rivals)
+        row = run(case_of(number), options.rivals, options.drives)
         rows.append(row)
         with options.out.open("a") as file:
             file.write(json.dumps(row) + "\n")

@@ -26,7 +26,7 @@ def _drive(folder: Path, effects: dict[str, float], seed: int, route: str) -> Dr
 def test_diagnose_from_healthy_drive_names_the_fault_alone(tmp_path: Path) -> None:
     model = make_model("friction", load_robot("husky_a200"))
     cause, size = _FAULT
-    later = _drive(tmp_path, {**_USUAL, cause: size}, 32, "tour")
+    later = _drive(tmp_path, {**_USUAL, cause: size}, 32, "40s")
     baseline = estimate_baseline(_drive(tmp_path, _USUAL, 31, "random_3"), model)
     found = diagnose(later, model, baseline=baseline)
     assert [f.cause for f in found.findings] == [cause]

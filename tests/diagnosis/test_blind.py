@@ -119,11 +119,18 @@ def test_diagnose_without_gyro_shows_clock_difference(diagnosed: Diagnosed) -> N
 
 def test_diagnose_turns_in_place_are_ambiguous(diagnosed: Diagnosed) -> None:
     """Track, floor and scrubbing all make the robot turn less: turns in place cannot separate them."""
-    found = diagnosed({"track_width": 0.04}, 431, "husky_a200", "spin")
+    found = diagnosed({"track_width": 0.1}, 431, "husky_a200", "spin")
     assert found.verdict == "ambiguous"
     first = found.findings[0]
     assert {first.cause, *dict(first.aliases)} >= {"track_width", "friction_anisotropy", "scrub"}
     assert found.next_drive
+
+
+def test_diagnose_turns_that_a_tolerated_floor_explains_are_consistent(diagnosed: Diagnosed) -> None:
+    found = diagnosed({"track_width": 0.04}, 431, "husky_a200", "spin")
+    assert found.verdict == "consistent"
+    size, _ = found.within["friction_anisotropy"]
+    assert 0.005 < size < found.tolerances["friction_anisotropy"]
 
 
 def test_diagnose_nonlinear_cause_has_its_size(diagnosed: Diagnosed) -> None:

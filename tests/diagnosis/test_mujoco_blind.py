@@ -14,7 +14,7 @@ from tests.studies.mujoco_blind import diagnose_mujoco, healthy
     ("cause", "size"), [("wheel_radius_difference", -0.02), ("lidar_offset_x", 0.05)], ids=["wheel_radius_difference", "lidar_offset_x"]
 )
 def test_diagnose_mujoco_hidden_cause_is_named(cause: str, size: float) -> None:
-    found = diagnose_mujoco("husky_a200", "40s", {cause: size}, 7, healthy("husky_a200", drive("tour")))
+    found = diagnose_mujoco("husky_a200", "40s", {cause: size}, 7, healthy("husky_a200", drive("tour"))).diagnosis
     first = found.findings[0]
     named = {first.cause: first.size, **dict(first.aliases)}
     assert cause in named

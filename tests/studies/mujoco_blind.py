@@ -4,6 +4,7 @@ a drive of the healthy robot on another route.
 python -m tests.studies.mujoco_blind [--cases 0:64] [--record FILE.jsonl] [--new 10]
 
 A cause counts as named where it is the first finding or among its aliases; a drive in which nothing is hidden, where no cause is named.
+Causes are also counted by themselves where their size is 3 sigma and more of what the drive shows, as in `tests.benchmarks.diagnosis`.
 Needs the extra `mujoco`.
 """
 
@@ -19,9 +20,8 @@ from pathlib import Path
 
 from localization.diagnosis.baseline import estimate_baseline
 from localization.diagnosis.causes import Hypothesis
-from localization.diagnosis.diagnose import diagnose
+from localization.diagnosis.diagnose import DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log
-from localization.diagnosis.findings import Diagnosis
 from localization.logs import open_log
 from localization.simulation.experiments import Experiment, ExperimentConfig, Phase
 from localization.simulation.faults import FAULTS
@@ -30,7 +30,9 @@ from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import SimulationConfig, write_simulation
 from motion_models.registry import make_model
 from motion_models.robot import Robot, load_robot
+from tests.benchmarks.diagnosis import significances
 from tests.helpers.diagnosis_drives import ONE_SIDED, TYPICAL, drive
+from tests.helpers.diagnosis_scores import STRONG
 from tests.helpers.mujoco_vehicle import EFFECTS, MujocoSimulation
 
 ROBOTS = ("husky_a200", "jackal", "warthog", "scout_2")
@@ -59,10 +61,17 @@ class BlindCase:
     """Size of the hidden cause by the first finding, if that names it."""
     others: tuple[str, ...] = ()
     """Further findings."""
+    significance: float | None = None
+    """Size over the sigma with which the drive can measure it; None where it does not act on the motion, or nothing was hidden."""
 
     @property
     def is_right(self) -> bool:
         return self.cause in self.named if self.cause else not self.named
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether the drive shows the hidden cause at its size."""
+        return self.significance is None or self.significance >= STRONG
 
 
 def hidden(number: int) -> tuple[str, str, str, float]:
@@ -108,18 +117,20 @@ def healthy(robot_name: str, experiment: Experiment = HEALTHY) -> Hypothesis:
     return estimate_baseline(drive_mujoco(robot, experiment, {}, _HEALTHY_SEED), make_model("friction", robot))
 
 
-def diagnose_mujoco(robot_name: str, route: str, effects: Mapping[str, float], seed: int, baseline: Hypothesis) -> Diagnosis:
+def diagnose_mujoco(robot_name: str, route: str, effects: Mapping[str, float], seed: int, baseline: Hypothesis) -> DiagnosisResult:
     """Diagnosis of a drive in MuJoCo with hidden ``effects``, by the bag, the robot file and the ``baseline`` of the healthy robot."""
     robot = load_robot(robot_name)
-    return diagnose(drive_mujoco(robot, drive(route), effects, seed), make_model("friction", robot), baseline=baseline)
+    return examine(drive_mujoco(robot, drive(route), effects, seed), make_model("friction", robot), baseline=baseline)
 
 
 def run_case(number: int) -> BlindCase:
     robot, route, cause, size = hidden(number)
-    found = diagnose_mujoco(robot, route, {cause: size} if cause else {}, 7000 + number, healthy(robot))
+    effects = {cause: size} if cause else {}
+    result = diagnose_mujoco(robot, route, effects, 7000 + number, healthy(robot))
+    found, significance = result.diagnosis, significances(result, effects).get(cause)
     sizes = {found.findings[0].cause: found.findings[0].size, **dict(found.findings[0].aliases)} if found.findings else {}
     others = tuple(f.cause for f in found.findings[1:])
-    return BlindCase(number, robot, route, cause, size, found.verdict, tuple(sizes), sizes.get(cause), others)
+    return BlindCase(number, robot, route, cause, size, found.verdict, tuple(sizes), sizes.get(cause), others, significance)
 
 
 def cases(numbers: range, record: Path | None = None, new: int | None = None) -> list[BlindCase]:
@@ -155,6 +166,8 @@ def main() -> None:
         print(_line(case))
     right, quiet = sum(c.is_right for c in hidden_cases), sum(c.is_right for c in nulls)
     share = 100 * right / max(len(hidden_cases), 1)
+    shown = [c for c in hidden_cases if c.is_shown]
+    print(f"{sum(c.is_right for c in shown)} of {len(shown)} hidden causes over {STRONG:g} sigma named")
     print(f"{right} of {len(hidden_cases)} hidden causes named ({share:.0f} %), {quiet} of {len(nulls)} drives without one have no finding")
 
 
