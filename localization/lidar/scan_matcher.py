@@ -151,6 +151,8 @@ class Fit:
     """Sum of squares of the sums of e over blocks of neighbouring points that fit."""
     fitting: float
     """How many points fit."""
+    mapped: float
+    """How many points have a surface of the submap near them."""
 
 
 class ScanMatcher:
@@ -162,6 +164,8 @@ class ScanMatcher:
         self._keys: list[KeyScan] = []
         self._grid: VoxelGrid | None = None
         self._image: LikelihoodImage | None = None
+        self.is_new_place = False
+        """Most of the last scan lies in unmapped space, the rest fits and the prior is narrow: it should be drawn at once."""
         self._residuals = np.full(3, 1e-3)  # sums over the last scans: squares, squares of blocks, points
 
     def match(self, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2 | None = None, jump: Tangent2 = _NO_JUMP) -> ScanMatch | None:
@@ -172,6 +176,7 @@ class ScanMatcher:
         """
         nothing = np.zeros((3, 3))
         fit = self._align(points, prior, cov, prior if guess is None else guess)
+        self.is_new_place = fit.mapped < 0.5 * len(points) and fit.fitting >= 0.5 * fit.mapped and is_narrow(cov)
         is_near, agrees = _is_within_basin(fit, cov), _mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST
         if is_near and agrees and fit.overlap >= self._config.search_below:
             return self._result(fit, nothing)
@@ -326,13 +331,13 @@ def _mahalanobis(prior: Pose2, pose: Pose2, cov: Cov3) -> float:
 
 
 def linearize(grid: VoxelGrid, points: Points2, x: Pose2, spread: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Information (3, 3) and gradient (3,) of the points at ``x`` (3,); overlap, cost, squares, those of blocks, fitting points.
+    """Information (3, 3) and gradient (3,) of the points at ``x`` (3,); overlap, cost, squares, those of blocks, fitting and mapped points.
 
     While the pose may still be off by ``spread`` [m] at a point, points are associated from so far, and residuals are weighed by it.
     """
     H, g, n = np.zeros((3, 3)), np.zeros(3), max(len(points), 1)
-    fitting, cost, squares, block_squares = _linearize(grid, points, triple(x), spread, H, g)
-    return H, g, np.array([fitting / n, 0.5 * cost / CORRELATED_BEAMS, squares, block_squares, fitting])
+    fitting, mapped, cost, squares, block_squares = _linearize(grid, points, triple(x), spread, H, g)
+    return H, g, np.array([fitting / n, 0.5 * cost / CORRELATED_BEAMS, squares, block_squares, fitting, mapped])
 
 
 @numba.njit(cache=True)
@@ -367,12 +372,14 @@ def _add_prior(information: FloatArray, off: Triple, jacobian: FloatArray, H: Fl
 
 
 @numba.njit(cache=True)
-def _linearize(grid: VoxelGrid, points: Points2, x: Triple, spread: float, H: FloatArray, g: FloatArray) -> tuple[int, float, float, float]:
+def _linearize(
+    grid: VoxelGrid, points: Points2, x: Triple, spread: float, H: FloatArray, g: FloatArray
+) -> tuple[int, int, float, float, float]:
     """Fill ``H`` (3, 3) and ``g`` (3,), and return numbers of the fit: see `linearize`."""
     spurious, c, s = np.zeros((3, 3)), math.cos(x[2]), math.sin(x[2])
     H[:], g[:] = 0.0, 0.0
     reach, loose = max(_REACH_CELLS * grid.cell, spread), (spread / _KERNEL) ** 2
-    fitting, cost, block, squares, block_squares = 0, 0.0, 0.0, 0.0, 0.0
+    fitting, mapped, cost, block, squares, block_squares = 0, 0, 0.0, 0.0, 0.0, 0.0
     for i in range(points.shape[0]):
         px, py = points[i, 0], points[i, 1]
         wx, wy = x[0] + c * px - s * py - grid.origin[0], x[1] + s * px + c * py - grid.origin[1]
@@ -387,6 +394,7 @@ def _linearize(grid: VoxelGrid, points: Points2, x: Triple, spread: float, H: Fl
         if math.isinf(var):
             cost += _KERNEL**2
             continue
+        mapped += 1
         e = surface[2] * (wx - surface[0]) + surface[3] * (wy - surface[1])
         square = e * e / var
         cost += min(square, _KERNEL**2)
@@ -404,7 +412,7 @@ def _linearize(grid: VoxelGrid, points: Points2, x: Triple, spread: float, H: Fl
         _add_outer(spurious, along, weight * min(surface[5], 1.0))
         g[0], g[1], g[2] = g[0] + weight * nx * e, g[1] + weight * ny * e, g[2] + weight * across[2] * e
     _discount(H, g, spurious)
-    return fitting, cost, squares, block_squares
+    return fitting, mapped, cost, squares, block_squares
 
 
 @numba.njit(cache=True)

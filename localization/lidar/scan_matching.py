@@ -98,7 +98,7 @@ class ScanMatchingSensor:
         """Whether the scan at hand, taken from ``pose`` (3,), is to enter the submap."""
         if self._scan is None or self._is_searching:
             return False
-        if self._last_key is None:
+        if self._last_key is None or (self._matcher is not None and self._matcher.is_new_place):
             return True
         moved = se2.between(self._last_key, pose)
         c = self._config

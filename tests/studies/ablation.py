@@ -119,6 +119,12 @@ def _align_freely(original: Callable[..., Any], self: ScanMatcher, points: Any, 
     return scan_matcher.Fit(pose, H, g, *map(float, found))
 
 
+def _match_without_new_place(original: Callable[..., Any], self: ScanMatcher, *rest: Any, **named: Any) -> Any:
+    found = original(self, *rest, **named)
+    self.is_new_place = False
+    return found
+
+
 def _detect_unconfirmed(original: Callable[..., Any], self: LoopDetector, poses: Callable[[], Any], marginal: Callable[[int], Any]) -> Any:
     """Every loop that fits is taken, without a second one that agrees."""
     k = len(self.keyframes) - 1
@@ -159,6 +165,7 @@ PATCHES: Mapping[str, Patch] = {
     "excitation gate of corrections": _attribute(EkfFusion, "_is_turning", lambda self, motion: True),
     "noise of normals": _attribute(scan_matcher, "make_grid", _exact_normals),
     "noise of key scans in the submap": _attribute(filter_module, "select_measured", np.zeros_like),
+    "key scans of new places at once": _wrap(ScanMatcher, "match", _match_without_new_place),
 }
 GRAPH_PATCHES: Mapping[str, Patch] = {
     "loop closures": _attribute(LoopDetector, "detect", lambda self, poses, marginal: []),
