@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -195,6 +195,6 @@ def test_unexpected_os_errors_are_printed_without_traceback(monkeypatch: pytest.
     def fail(*_: object) -> None:
         raise OSError(5, "Input/output error", "/dev/disk")
 
-    monkeypatch.setattr(sys.modules["localization.commands.info"], "load_robot", fail)
+    monkeypatch.setattr(importlib.import_module("localization.commands.info"), "load_robot", fail)
     assert run("info", "x") == 2
     assert capsys.readouterr().err == "skidloc: '/dev/disk': Input/output error.\n"
