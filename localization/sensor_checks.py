@@ -263,7 +263,7 @@ class SensorChecks:
         """``estimate`` with the covariance of what faulty sensors have done to it."""
         own = estimate.pose if estimate.odometry is None else estimate.odometry[0]
         delta = np.zeros(3) if self._pose is None else se2.between(self._pose, own)
-        if self._pose is not None:
+        if self._pose is not None and estimate.covariance is not None:  # the LiDAR alone may be lost: that says nothing of the wheels
             self._check_disagreement(delta, estimate.nis)
         self._pose, self._estimated = own, se2.compose(self._estimated, delta)
         A = se2.adjoint(se2.inverse(delta))

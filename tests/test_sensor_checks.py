@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 import pickle
@@ -314,3 +315,14 @@ def test_checks_are_restored_from_a_checkpoint_during_and_after_a_disagreement()
         last = robot.estimates[-1]
         ahead = Estimate(last.stamp_ns + S, se2.compose(last.pose, np.array([0.1, 0.0, 0.0])), last.covariance, np.zeros(3), None)
         assert np.array_equal(restored.widen(ahead).covariance, checks.widen(ahead).covariance)
+
+
+def test_estimate_without_covariance_is_not_compared_with_the_wheels() -> None:
+    """LiDAR alone, which may be lost."""
+    robot = Robot(wheels=lambda v, w: (3.0 * v, w))
+    robot.checks.widen = functools.partial(_without_covariance, robot.checks.widen)  # type: ignore[method-assign]
+    assert robot.drive().found == {}
+
+
+def _without_covariance(widen, estimate: Estimate) -> Estimate:
+    return widen(dataclasses.replace(estimate, covariance=None))
