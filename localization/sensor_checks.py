@@ -260,10 +260,12 @@ class SensorChecks:
         return self._step
 
     def widen(self, estimate: Estimate) -> Estimate:
-        """``estimate`` with the covariance of what faulty sensors have done to it."""
+        """``estimate`` with the covariance of what faulty sensors have done to it; unchanged without one (LiDAR alone)."""
+        if estimate.covariance is None:
+            return estimate
         own = estimate.pose if estimate.odometry is None else estimate.odometry[0]
         delta = np.zeros(3) if self._pose is None else se2.between(self._pose, own)
-        if self._pose is not None and estimate.covariance is not None:  # the LiDAR alone may be lost: that says nothing of the wheels
+        if self._pose is not None:
             self._check_disagreement(delta, estimate.nis)
         self._pose, self._estimated = own, se2.compose(self._estimated, delta)
         A = se2.adjoint(se2.inverse(delta))
@@ -274,11 +276,10 @@ class SensorChecks:
             return estimate
         if self._spread_since_ns is None:
             self._spread_since_ns = estimate.stamp_ns
-        cov = None if estimate.covariance is None else estimate.covariance + spread
         odometry = estimate.odometry
         if odometry is not None and odometry[1] is not None:
             odometry = odometry[0], odometry[1] + spread
-        return replace(estimate, covariance=cov, odometry=odometry)
+        return replace(estimate, covariance=estimate.covariance + spread, odometry=odometry)
 
     def _total_spread(self) -> FloatArray:
         """Covariance (3, 3) of what past faults have done to the pose, and of how far a lasting disagreement has taken it."""

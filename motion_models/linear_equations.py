@@ -38,6 +38,13 @@ def solve_3x3(a: Matrix3, x: float, y: float, z: float) -> tuple[float, float, f
     return u * whole, v * whole, w * whole
 
 
+@numba.njit(cache=True)
+def solve(a: FloatArray, b: FloatArray) -> Triple:
+    """`solve_3x3` of arrays: ``a`` (3, 3) and ``b`` (3,)."""
+    rows = Matrix3(a[0, 0], a[0, 1], a[0, 2], a[1, 0], a[1, 1], a[1, 2], a[2, 0], a[2, 1], a[2, 2])
+    return solve_3x3(rows, b[0], b[1], b[2])
+
+
 _SWEEPS = 6
 """Jacobi's method converges quadratically: three sweeps give single precision, six double."""
 

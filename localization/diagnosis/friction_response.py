@@ -20,6 +20,7 @@ from motion_models.friction.contact import CREEP, rolling
 from motion_models.friction.dynamics import FrictionDynamics, _accelerations, _Body
 from motion_models.friction.equilibrium import Floor, motion, newton
 from motion_models.friction.model import FrictionModel, check_parameters, loads_at, pull_of, unit_rolls
+from motion_models.linear_equations import solve
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -204,8 +205,8 @@ def _solve_step(now: FloatArray, problem: _Problem, work: _Work) -> bool:
 @numba.njit(cache=True, error_model="numpy")
 def _try(now: FloatArray, problem: _Problem, work: _Work, share: float) -> float:
     """Misfit after a ``share`` of Newton's step; inf where the Jacobian is singular."""
-    d0, d1, d2, regular = _solve(work.jacobian, work.off)
-    if not regular:
+    d0, d1, d2 = solve(work.jacobian, work.off)
+    if not math.isfinite(d0 + d1 + d2):
         return math.inf
     work.tried[0], work.tried[1], work.tried[2] = now[0] - share * d0, now[1] - share * d1, now[2] - share * d2
     return _misfit(work.tried, problem, work.off_tried)
@@ -263,18 +264,3 @@ def _about_cg(twist: FloatArray, a_x: float, a_y: float, a_w: float, problem: _P
     cg_x, cg_y, alpha = (force_x + influence[7]) / body.mass, (force_y + influence[8]) / body.mass, moment / body.inertia
     x, y = x - shift[0], y - shift[1]
     return cg_x + y * alpha + x * w * w + twist[1] * w, cg_y - x * alpha + y * w * w - twist[0] * w, alpha
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _solve(a: FloatArray, b: FloatArray) -> tuple[float, float, float, bool]:
-    """x of a x = b, by Cramer's rule."""
-    c0 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
-    c1 = a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2]
-    c2 = a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0]
-    det = a[0, 0] * c0 + a[0, 1] * c1 + a[0, 2] * c2
-    if det == 0.0 or not math.isfinite(det):
-        return 0.0, 0.0, 0.0, False
-    x = b[0] * c0 + a[0, 1] * (a[1, 2] * b[2] - b[1] * a[2, 2]) + a[0, 2] * (b[1] * a[2, 1] - a[1, 1] * b[2])
-    y = a[0, 0] * (b[1] * a[2, 2] - a[1, 2] * b[2]) + b[0] * c1 + a[0, 2] * (a[1, 0] * b[2] - b[1] * a[2, 0])
-    z = a[0, 0] * (a[1, 1] * b[2] - b[1] * a[2, 1]) + a[0, 1] * (b[1] * a[2, 0] - a[1, 0] * b[2]) + b[0] * c2
-    return x / det, y / det, z / det, True

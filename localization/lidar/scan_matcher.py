@@ -19,7 +19,7 @@ from localization.lidar.correlative_search import CORRELATED_BEAMS, LikelihoodIm
 from localization.lidar.submap import VoxelGrid, fill_surface, find_nearest, make_grid, measure_shares, voxel_means
 from localization.settings import Allowed, Below, Count, Positive, Settings, Share
 from motion_models import se2
-from motion_models.linear_equations import Matrix3, diagonalize, multiply, solve_3x3, transform_symmetric
+from motion_models.linear_equations import diagonalize, multiply, solve, transform_symmetric
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, Triple, triple
 
 MIN_POINTS = 10
@@ -199,7 +199,7 @@ class ScanMatcher:
     def evaluate(self, points: Points2, pose: Pose2) -> ScanMatch | None:
         """The match of ``points`` at ``pose`` (3,), which another method has found; None where too few of them fit there."""
         assert self._grid is not None
-        H, _, found = linearize(self._grid, points, pose, 0.0)
+        H, _, found = linearize(self._grid, points, pose)
         if found[0] < self._config.lost_below:
             return None
         return self._result(Fit(pose, H, np.zeros(3), *(float(value) for value in found)), np.zeros((3, 3)))
@@ -212,7 +212,7 @@ class ScanMatcher:
         self._keys = [*self._fitting_keys(pose, points, map_cov), KeyScan(drawn, pose, np.zeros((3, 3)) if map_cov is None else map_cov)]
         self._draw()
         assert self._grid is not None
-        H = linearize(self._grid, points, pose, 0.0)[0]
+        H = linearize(self._grid, points, pose)[0]
         noise = np.asarray(np.linalg.inv(H + _OPEN_INFORMATION) * self._variance_ratio(1), dtype=float)
         W = select_measured(noise)
         return KeyScanError(share, noise, new * W @ noise @ W.T)
@@ -287,7 +287,7 @@ def align_points(grid: VoxelGrid, points: Points2, prior: Pose2, cov: Cov3, gues
     information = np.asarray(np.linalg.inv(cov), dtype=float)
     first = _first_spread(points, cov) if spread is None else spread
     pose = np.asarray(_align(grid, points, triple(prior), information, triple(guess), first), dtype=float)
-    H, g, found = linearize(grid, points, pose, 0.0)
+    H, g, found = linearize(grid, points, pose)
     return Fit(pose, H, g, *(float(value) for value in found))
 
 
@@ -330,13 +330,10 @@ def _mahalanobis(prior: Pose2, pose: Pose2, cov: Cov3) -> float:
     return float(off @ np.linalg.solve(cov, off))
 
 
-def linearize(grid: VoxelGrid, points: Points2, x: Pose2, spread: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Information (3, 3) and gradient (3,) of the points at ``x`` (3,); overlap, cost, squares, those of blocks, fitting and mapped points.
-
-    While the pose may still be off by ``spread`` [m] at a point, points are associated from so far, and residuals are weighed by it.
-    """
+def linearize(grid: VoxelGrid, points: Points2, x: Pose2) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Information (3, 3) and gradient (3,) of the points at ``x`` (3,), and the numbers of `Fit` from the overlap on."""
     H, g, n = np.zeros((3, 3)), np.zeros(3), max(len(points), 1)
-    fitting, mapped, cost, squares, block_squares = _linearize(grid, points, triple(x), spread, H, g)
+    fitting, mapped, cost, squares, block_squares = _linearize(grid, points, triple(x), 0.0, H, g)
     return H, g, np.array([fitting / n, 0.5 * cost / CORRELATED_BEAMS, squares, block_squares, fitting, mapped])
 
 
@@ -350,7 +347,7 @@ def _align(grid: VoxelGrid, points: Points2, prior: Triple, information: FloatAr
         off = se2.scalar_log(se2.scalar_between(prior, x))
         se2.fill_right_jacobian_inverse(off, jacobian)
         _add_prior(information, off, jacobian, H, g)
-        a, b, c = solve_3x3(Matrix3(H[0, 0], H[0, 1], H[0, 2], H[1, 0], H[1, 1], H[1, 2], H[2, 0], H[2, 1], H[2, 2]), g[0], g[1], g[2])
+        a, b, c = solve(H, g)
         x = se2.scalar_compose(x, se2.scalar_exp((-a, -b, -c)))
         if abs(a) + abs(b) < 1e-4 and abs(c) < 1e-5 and spread < least / 3.0:
             break
@@ -375,7 +372,10 @@ def _add_prior(information: FloatArray, off: Triple, jacobian: FloatArray, H: Fl
 def _linearize(
     grid: VoxelGrid, points: Points2, x: Triple, spread: float, H: FloatArray, g: FloatArray
 ) -> tuple[int, int, float, float, float]:
-    """Fill ``H`` (3, 3) and ``g`` (3,), and return numbers of the fit: see `linearize`."""
+    """Fill ``H`` (3, 3) and ``g`` (3,), and return fitting and mapped points, cost, squares and those of blocks.
+
+    While the pose may still be off by ``spread`` [m] at a point, points are associated from so far, and residuals are weighed by it.
+    """
     spurious, c, s = np.zeros((3, 3)), math.cos(x[2]), math.sin(x[2])
     H[:], g[:] = 0.0, 0.0
     reach, loose = max(_REACH_CELLS * grid.cell, spread), (spread / _KERNEL) ** 2

@@ -78,7 +78,7 @@ class ScanMatchingSensor:
         return found
 
     def _note_search(self, is_searching: bool, now_s: float) -> None:
-        """Scans that may be anywhere do not enter the submap for some seconds: drawn there, they would rival their true place."""
+        """Scans that may be anywhere do not enter the submap for some seconds: drawn there, they compete with their true place."""
         if not is_searching:
             self._searching_since_s = None
         elif self._searching_since_s is None:

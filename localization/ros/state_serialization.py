@@ -109,8 +109,7 @@ class _Writer:
         if kind is slice:
             return ["s", value.start, value.stop, value.step]
         if kind.__module__.startswith(PACKAGES) and not isinstance(value, Enum):
-            state = tuple(value) if isinstance(value, tuple) else _state(value)
-            return ["c", kind.__module__, kind.__qualname__, self.put(state)]
+            return ["c", kind.__module__, kind.__qualname__, self.put(_state(value))]
         raise CheckpointError(f"the state holds a {kind.__module__}.{kind.__qualname__}, which cannot be written down")
 
     def _packed(self, values: list[Any]) -> list[Json] | None:
@@ -177,6 +176,8 @@ def _frozen_fields(value: Any) -> list[str]:
 
 
 def _state(value: Any) -> Any:
+    if isinstance(value, tuple):  # a NamedTuple
+        return tuple(value)
     state = value.__getstate__()
     if state is None:
         return {}

@@ -226,6 +226,10 @@ def _fingerprint(records: list[Record]) -> int:
     return hash(tuple((topic, stamp, bytes(bags.STORE.serialize_cdr(m, m.__msgtype__))) for topic, m, stamp in records))
 
 
+def _source_named(name: str) -> Source:
+    return next(source for source in SOURCES if source.name == name)
+
+
 def copied(source: Source) -> list[Record]:
     """Messages that may be changed."""
     found, scans = [], 0
@@ -239,8 +243,7 @@ def copied(source: Source) -> list[Record]:
 def write_case(case: Case, folder: Path, seed: int) -> Path:
     """The mutated log."""
     rng = np.random.default_rng([seed, case.number])
-    source = next(source for source in SOURCES if source.name == case.source)
-    records = copied(source)
+    records = copied(_source_named(case.source))
     records = SENSOR_FAULTS[case.sensor_fault](records, rng)
     path = bags.FORMATS[case.form](folder / "run", records)
     if case.file_fault:
@@ -265,7 +268,7 @@ def _replay_without_fault(source: str, model: str, estimator: str, folder: Path)
     """Output folder of the replay of a source's drive without faults; made once."""
     out, log = folder / f"{source}-{model}-{estimator}", folder / f"{source}.mcap"
     if not (out / "metrics.json").exists():
-        found = next(s for s in SOURCES if s.name == source)
+        found = _source_named(source)
         if not log.exists():
             bags.write_mcap(log, copied(found))
         arguments = ["replay", log, "--robot", found.robot, "--out", out, "--model", model, "--estimator", estimator]
@@ -276,7 +279,7 @@ def _replay_without_fault(source: str, model: str, estimator: str, folder: Path)
 
 def _reference_of(source: str, folder: Path) -> Path:
     """A TUM file to score a source's drives against: its own reference, else the estimate from the log without faults."""
-    out, found = _replay_without_fault(source, "skid_steer", "ekf", folder), next(s for s in SOURCES if s.name == source)
+    out, found = _replay_without_fault(source, "skid_steer", "ekf", folder), _source_named(source)
     if not found.reference:
         return out / "skid_steer_ekf.tum"
     path = folder / f"{source}.tum"
@@ -292,7 +295,7 @@ def _reference_of(source: str, folder: Path) -> Path:
 def run_case(case: Case, log: Path, truths: Path, out: Path) -> Outcome:
     """Replay from the command line, and compare with the drive without faults, whose replays are kept in the folder ``truths``."""
     printed, complaints = io.StringIO(), io.StringIO()
-    robot = next(source.robot for source in SOURCES if source.name == case.source)
+    robot = _source_named(case.source).robot
     arguments = ["replay", str(log), "--robot", robot, "--out", str(out), "--reference", "none"]
     arguments += ["--model", case.model, "--estimator", case.estimator]
     try:

@@ -69,7 +69,7 @@ def test_linearize_gradient_equals_cost_differences() -> None:
         u = residuals(d) ** 2
         return float(0.5 * np.sum(u * _KERNEL**2 / (_KERNEL**2 + u)))
 
-    H, g, found = linearize(grid, points, x, 0.0)
+    H, g, found = linearize(grid, points, x)
     h = 1e-6
     np.testing.assert_allclose(g, [(cost(h * e) - cost(-h * e)) / (2 * h) for e in np.eye(3)], rtol=1e-5, atol=1e-4)
     J = np.stack([(residuals(h * e) - residuals(-h * e)) / (2 * h) for e in np.eye(3)], axis=-1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from motion_models.linear_equations import Matrix3, diagonalize, multiply, solve_3x3, transform_symmetric
+from motion_models.linear_equations import Matrix3, diagonalize, multiply, solve, solve_3x3, transform_symmetric
 
 
 def random_matrices(n: int = 200) -> list[np.ndarray]:
@@ -36,6 +36,7 @@ def test_solve_multiply_and_transform_agree_with_numpy() -> None:
         b = A @ [1.0, -2.0, 0.5]
         assert np.allclose(multiply(A, (1.0, -2.0, 0.5)), b, rtol=1e-12)
         assert np.allclose(solve_3x3(Matrix3(*A.ravel()), *b), [1.0, -2.0, 0.5], rtol=1e-6)
+        assert solve(A, b) == solve_3x3(Matrix3(*A.ravel()), *b)
         S = A + A.T
         assert np.allclose(transform_symmetric(A, S), A.T @ S @ A, rtol=1e-9, atol=1e-12 * np.abs(A).max() ** 3)
 

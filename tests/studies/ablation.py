@@ -115,7 +115,7 @@ def _align_freely(original: Callable[..., Any], self: ScanMatcher, points: Any, 
     """The prior sets the reach of associations but does not pull."""
     spread = scan_matcher._first_spread(points, cov) if first is None else first
     pose = np.array(scan_matcher._align(self._grid, points, triple(prior), np.linalg.inv(_NO_PRIOR), triple(guess), spread))
-    H, g, found = scan_matcher.linearize(self._grid, points, pose, 0.0)
+    H, g, found = scan_matcher.linearize(self._grid, points, pose)
     return scan_matcher.Fit(pose, H, g, *map(float, found))
 
 
