@@ -172,16 +172,18 @@ class ScanMatcher:
         """The pose of ``points`` near ``prior`` (3,), whose error against the submap has covariance ``cov`` (3, 3); None where it is lost.
 
         Gauss-Newton starts from ``guess`` (3,), or from the prior. A pose is searched where the prior is wider than the basin of
-        convergence, or where the result does not fit. Where the prior is an outlier, the pose may be off it by ``jump`` (3,), too.
+        convergence, or where the result does not fit; one that fits far from the prior is aligned again with the prior as an outlier,
+        which the pose may be off by ``jump`` (3,), too.
         """
         nothing = np.zeros((3, 3))
         fit = self._align(points, prior, cov, prior if guess is None else guess)
         self.is_new_place = fit.mapped < 0.5 * len(points) and fit.fitting >= 0.5 * fit.mapped and is_narrow(cov)
         is_near, agrees = _is_within_basin(fit, cov), _mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST
-        if is_near and agrees and fit.overlap >= self._config.search_below:
+        fits = is_near and fit.overlap >= self._config.search_below
+        if fits and agrees:
             return self._result(fit, nothing)
         outlier_cov = (_SEARCH_FACTOR - 1.0) * cov + _SEARCH_FLOOR + np.outer(jump, jump)
-        best = self._search(points, prior, cov + outlier_cov, cov)
+        best = fit.pose if fits else self._search(points, prior, cov + outlier_cov, cov)
         if best is not None:
             if not is_near and _mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:
                 outlier_cov = nothing
@@ -259,8 +261,9 @@ class ScanMatcher:
 
     def _search(self, points: Points2, prior: Pose2, wide: FloatArray, cov: Cov3) -> Pose2 | None:
         """The best pose (3,) within 3 sigma of ``wide`` (3, 3), limited unless ``cov`` (3, 3) is wider; None where it is ambiguous."""
+        assert self._grid is not None
         if self._image is None:
-            self._image = draw_image(self.points(), self.cell)
+            self._image = draw_image(self._grid.means, self.cell)
         limit = np.minimum(np.maximum(_SEARCH_LIMIT, 3.0 * np.sqrt(np.diagonal(cov))), _WIDEST_SEARCH)
         best = search(self._image, voxel_means(points, self.cell), prior, wide, limit)
         is_clear = best.margin >= _OUTLIER_COST if not is_narrow(cov) else best.rival_score < _MAX_RIVAL * best.score
@@ -349,7 +352,7 @@ def _align(grid: VoxelGrid, points: Points2, prior: Triple, information: FloatAr
         _add_prior(information, off, jacobian, H, g)
         a, b, c = solve(H, g)
         x = se2.scalar_compose(x, se2.scalar_exp((-a, -b, -c)))
-        if abs(a) + abs(b) < 1e-4 and abs(c) < 1e-5 and spread < least / 3.0:
+        if abs(a) + abs(b) < 3e-4 and abs(c) < 3e-5 and spread < least / 3.0:
             break
         spread = spread / 2.0 if spread > least / 4.0 else 0.0
     return x

@@ -40,6 +40,11 @@ class VoxelGrid(NamedTuple):
     """(V, 6) mean (2), normal (2), variance along it [m^2] and variance of its angle [rad^2] around each voxel. Filled when first used: NaN
     until then."""
 
+    @property
+    def means(self) -> Points2:
+        """(V, 2) of the points in each voxel [m]."""
+        return np.asarray(self.sums[:, 1:3] / self.sums[:, :1] + self.origin)
+
 
 def make_grid(points: Points2, cell: float, noise_m: float) -> VoxelGrid:
     """Voxels with edge ``cell`` [m] of ``points`` (N, 2) [m], whose ranges have sigma ``noise_m`` [m]."""
@@ -52,8 +57,7 @@ def make_grid(points: Points2, cell: float, noise_m: float) -> VoxelGrid:
 
 def voxel_means(points: Points2, cell: float) -> Points2:
     """(M, 2) the mean of ``points`` (N, 2) in each voxel with edge ``cell`` [m]."""
-    grid = make_grid(points, cell, 0.0)
-    return np.asarray(grid.sums[:, 1:3] / grid.sums[:, :1] + grid.origin)
+    return make_grid(points, cell, 0.0).means
 
 
 @numba.njit(cache=True)
