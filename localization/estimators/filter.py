@@ -22,7 +22,7 @@ from filterpy.kalman import predict as predict_linear
 from localization.errors import EstimatorError
 from localization.estimators.measurement_models import predict_turn, subtract_map_error
 from localization.events import Step, Turn
-from localization.lidar import KeyScanError, select_measured
+from localization.lidar import KeyScanError
 from localization.settings import Settings
 from motion_models import se2
 from motion_models.online_calibration import Corrections
@@ -33,8 +33,6 @@ POSE, START, MAP, KEY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 BIAS, SCALE, CLOCK, PARAMS = 12, 13, 14, 15
 _MIN_VARIANCE = 1e-14
 """Variance of a relative motion, at least: a tenth of a micrometre or microradian [m^2, rad^2]."""
-_MIN_DRIFT_SHARE = 0.01
-"""Of the variance of a motion, at least: a tenth of its sigma, so that its information is finite."""
 _MAX_NUMBER = 1e12
 """No state or covariance of a robot on Earth is larger, in SI units."""
 _FORGETTING, _MIN_INFORMATION = 0.98, 30.0
@@ -81,7 +79,6 @@ class Filter:
         self.wheel_scale = 1.0
         """Factor on the robot file's wheel noise, estimated from the innovations."""
         self._scale_information, self._slip_cov = 0.0, np.zeros((n, n))  # Fisher information; the part of P that is this step's slip
-        self._scan_noise: tuple[FloatArray, FloatArray] | None = None  # of the last scan: covariance with the errors (n, 3), own (3, 3)
 
     def predict(self, step: Step, is_turning: bool = True) -> None:
         """Move by the wheels' motion (delta, covariance, derivatives) of ``step``:
@@ -113,7 +110,7 @@ class Filter:
         pose = se2.compose(self.pose, motion.delta)
         _check(f"the motion of the wheels until stamp {step.end_ns} ns", pose, P)
         self.start, self.pose, self.P = self.pose, pose, P
-        self.is_considered[PARAMS:], self._scan_noise = not is_turning, None
+        self.is_considered[PARAMS:] = not is_turning
 
     def wheel_cov(self, step: Step) -> Cov3:
         """(3, 3) of the wheels' motion in ``step``, with the estimated scale."""
@@ -124,7 +121,7 @@ class Filter:
         predicted, by_pose, by_start, by_bias, by_scale = predict_turn(self.start, self.pose, turn, self.bias, self.scale)
         H = np.zeros((1, len(self.P)))
         H[:, POSE], H[:, START], H[0, BIAS], H[0, SCALE] = by_pose, by_start, by_bias, by_scale
-        return self._update(se2.wrap_angle(np.array([turn.angle - predicted])), H, np.array([[turn.variance]]))[0]
+        return self._update(se2.wrap_angle(np.array([turn.angle - predicted])), H, np.array([[turn.variance]]))
 
     def update_scan(self, measured: Pose2, R: Cov3, outlier_cov: Cov3) -> float:
         """The pose (3,) that a scan has in the submap, with the scan's covariance ``R`` (3, 3). Returns its NIS (3 degrees of freedom).
@@ -135,20 +132,13 @@ class Filter:
         innovation, by_pose, by_map = subtract_map_error(self.pose, measured)
         H = np.zeros((3, len(self.P)))
         H[:, POSE], H[:, MAP] = by_pose, by_map
-        nis, K = self._update(innovation, H, R)
-        self._scan_noise = K @ R, R
-        return nis
+        return self._update(innovation, H, R)
 
     def insert_key_scan(self, error: KeyScanError) -> None:
-        """The last scan is drawn into the submap from the pose as it is: e_map' = (1 - s) e_map + s (e_pose - W n) + m.
-
-        n is the scan's own noise. Where the scan was matched, the pose's error contains it already, by the gain K: cov(e, n) = K R.
-        """
-        C, R = self._scan_noise or (np.zeros((len(self.P), 3)), error.noise_cov)
-        G, B = np.eye(len(self.P)), np.zeros((len(self.P), 3))
+        """The last scan is drawn into the submap from the pose as it is: e_map' = (1 - s) e_map + s e_pose + m."""
+        G = np.eye(len(self.P))
         G[MAP, MAP], G[MAP, POSE] = (1.0 - error.share) * np.eye(3), error.share * np.eye(3)
-        B[MAP] = -error.share * select_measured(R)
-        self.P = _symmetric(G @ self.P @ G.T + G @ C @ B.T + B @ C.T @ G.T + B @ R @ B.T)
+        self.P = G @ self.P @ G.T
         self.P[MAP, MAP] += error.new_cov
 
     def start_key(self) -> None:
@@ -175,23 +165,8 @@ class Filter:
         cross = P[POSE, clone] @ A.T
         return delta, _positive(P[POSE, POSE] - cross - cross.T + A @ P[clone, clone] @ A.T)
 
-    def drift_since_key(self) -> tuple[Pose2, Cov3]:
-        """Motion (3,) since the clone `KEY`, and the covariance (3, 3) that it adds to the pose's where motions are chained as independent.
-
-        |P - A P_key A^T|, A = Ad(delta^-1), with the matrix' absolute value and at most 1 in units of `motion_since`'s covariance C. Scans
-        that are matched to one submap share its error: C holds the noise of the scans at both ends, which a chain would count anew with
-        every motion. What the pose's covariance has shrunk by, later scans have found out about the clone alone.
-        """
-        delta, cov = self.motion_since(KEY)
-        A = se2.adjoint(se2.inverse(delta))
-        root = np.linalg.cholesky(cov)
-        whiten = np.linalg.inv(root)
-        shares, axes = np.linalg.eigh(_symmetric(whiten @ (self.P[POSE, POSE] - A @ self.P[KEY, KEY] @ A.T) @ whiten.T))
-        kept = root @ axes
-        return delta, np.asarray((kept * np.clip(np.abs(shares), _MIN_DRIFT_SHARE, 1.0)) @ kept.T)
-
-    def _update(self, innovation: FloatArray, H: FloatArray, R: FloatArray) -> tuple[float, FloatArray]:
-        """Schmidt-Kalman update in Joseph's form; consider states have no gain. Returns NIS and gain. Raises `EstimatorError`."""
+    def _update(self, innovation: FloatArray, H: FloatArray, R: FloatArray) -> float:
+        """Schmidt-Kalman update in Joseph's form; consider states have no gain. Returns the NIS. Raises `EstimatorError`."""
         P = self.P
         S = H @ P @ H.T + R
         _check("a measurement", innovation, S)
@@ -203,7 +178,7 @@ class Filter:
         self._adapt_wheel_scale(innovation, np.asarray(np.linalg.inv(S), dtype=float), H @ self._slip_cov @ H.T)
         self._slip_cov = A @ self._slip_cov @ A.T
         self._move(K @ innovation)
-        return float(innovation @ np.linalg.solve(S, innovation)), K
+        return float(innovation @ np.linalg.solve(S, innovation))
 
     def _adapt_wheel_scale(self, innovation: FloatArray, S_inv: FloatArray, slip_cov: FloatArray) -> None:
         """One step of Fisher scoring for log a, where S = a dS/da + ..., ``slip_cov`` = a dS/da (maximum likelihood; Mehra 1970):

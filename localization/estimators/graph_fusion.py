@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
 from localization.estimators.base import Estimate, Estimator
-from localization.estimators.filter import PARAMS
+from localization.estimators.filter import KEY, PARAMS
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
 from localization.events import PositionSample, Step
@@ -100,7 +100,7 @@ class GraphFusion(Estimator):
         if self._is_smoothing and (not self._stamps_ns or step.end_ns > self._stamps_ns[-1]):
             self._steps.extend(ekf.pose)
             self._stamps_ns.append(step.end_ns)
-        delta, cov = ekf.drift_since_key()
+        delta, cov = ekf.motion_since(KEY)
         moved = math.hypot(delta[0], delta[1]) >= self._config.keyframe_distance_m or abs(delta[2]) >= self._config.keyframe_angle_rad
         self._is_keyframe_due = not self.graph.count or (moved and (step.scan is not None or self.lost is None))
         self._place_positions(step)
@@ -123,7 +123,7 @@ class GraphFusion(Estimator):
     def _add_keyframe(self) -> None:
         ekf, k = self.odometry.filter, self.graph.count
         if k:
-            delta, cov = ekf.drift_since_key()
+            delta, cov = ekf.motion_since(KEY)
             wheels = self._wheels.preintegrated(ekf.corrections)
             D = wheels.by_corrections[:, :-1]
             total = wheels.cov + D @ ekf.P[PARAMS:, PARAMS:] @ D.T

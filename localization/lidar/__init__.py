@@ -3,7 +3,7 @@
 from localization.lidar.deskew import Sweep
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
 from localization.lidar.scan_checks import LostScans
-from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher, choose_cell, select_measured
+from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher, choose_cell
 from localization.lidar.scan_matching import ScanMatchingSensor
 
 __all__ = [
@@ -18,5 +18,4 @@ __all__ = [
     "Sweep",
     "choose_cell",
     "choose_voxel_size",
-    "select_measured",
 ]

@@ -259,8 +259,9 @@ def test_insert_key_scan_share_is_that_of_its_place(n: int) -> None:
         matcher.insert_key_scan(np.zeros(3), rooms.scan_from(LAB, np.zeros(3), rng))
     key = matcher.insert_key_scan(np.zeros(3), rooms.scan_from(LAB, np.zeros(3), rng))
     assert 0.95 / (n + 1) < key.share < 1.35 / (n + 1)
-    assert np.linalg.eigvalsh(key.noise_cov).min() > 0.0
-    assert np.sqrt(np.linalg.eigvalsh(key.noise_cov).max()) < 0.01
+    assert np.linalg.eigvalsh(first.new_cov).min() > 0.0
+    assert np.sqrt(np.linalg.eigvalsh(first.new_cov).max()) < 0.01
+    assert np.trace(key.new_cov) < np.trace(first.new_cov)
 
 
 def test_submap_holds_last_key_scans_only() -> None:

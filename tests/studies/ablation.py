@@ -29,7 +29,7 @@ import numpy as np
 
 from localization.estimators import filter as filter_module
 from localization.estimators import fusion, graph_fusion, pose_graph
-from localization.estimators.filter import KEY, MAP, Filter
+from localization.estimators.filter import MAP, Filter
 from localization.estimators.fusion import EkfFusion
 from localization.evaluation.consistency import pose_consistency
 from localization.evaluation.metrics import evaluate
@@ -164,7 +164,6 @@ PATCHES: Mapping[str, Patch] = {
     "check of wheels that stand": _attribute(EkfFusion, "_check_standstill", lambda self, step: step),
     "excitation gate of corrections": _attribute(EkfFusion, "_is_turning", lambda self, motion: True),
     "noise of normals": _attribute(scan_matcher, "make_grid", _exact_normals),
-    "noise of key scans in the submap": _attribute(filter_module, "select_measured", np.zeros_like),
     "key scans of new places at once": _wrap(ScanMatcher, "match", _match_without_new_place),
 }
 GRAPH_PATCHES: Mapping[str, Patch] = {
@@ -172,9 +171,6 @@ GRAPH_PATCHES: Mapping[str, Patch] = {
     "second loop that confirms": _wrap(LoopDetector, "detect", _detect_unconfirmed),
     "robust loss of loops": _attribute(pose_graph, "_CAUCHY", _NO_LOSS),
     "robust loss of wheels": _attribute(pose_graph, "_HUBER", _NO_LOSS),
-    "drift since the keyframe (covariance of the motion, instead)": _attribute(
-        Filter, "drift_since_key", lambda self: self.motion_since(KEY)
-    ),
     "wheels' share taken off the filter's motion": _attribute(
         graph_fusion, "_subtract_information", lambda delta, cov, prior, prior_cov: (delta, np.linalg.inv(cov))
     ),
