@@ -12,7 +12,7 @@ import numpy as np
 
 from localization.events import CgSample, Event, ImuSample, Scan, Step, StepInterval, WheelSample
 from localization.gyro import GyroBuffer
-from localization.lidar.scan_checks import LidarFrames
+from localization.lidar.frames import LidarFrames
 from localization.settings import Positive, Settings, at_least
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
