@@ -89,11 +89,11 @@ class _Episodes(NamedTuple):
 
 
 def _include(episodes: _Episodes | None, episode: _Episode) -> _Episodes:
-    seconds = episode.end_s - episode.begin_s
+    """``episodes`` and ``episode``."""
     if episodes is None:
-        return _Episodes(1, seconds, episode)
+        return _Episodes(1, episode.end_s - episode.begin_s, episode)
     larger = episode if episode.distance > episodes.largest.distance else episodes.largest
-    return _Episodes(episodes.number + 1, episodes.seconds + seconds, larger)
+    return _Episodes(episodes.number + 1, episodes.seconds + episode.end_s - episode.begin_s, larger)
 
 
 class MotionDistance:

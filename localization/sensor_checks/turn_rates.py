@@ -74,11 +74,10 @@ class TurnRates(Check):
         """Declare faults that last; whether some turn rates are equal and none contradicts another."""
         wheels, gyro, lidar = window.turn_rates
         relations = _relate(wheels, gyro), _relate(wheels, lidar), _relate(lidar, gyro)
-        found = _find_faults(*relations)
+        found, excluded = _find_faults(*relations), _excluded_faults(*relations)
         self._is_gyro_stuck = _is_constant(gyro, wheels)
         if self._is_gyro_stuck:
             found[GYRO_STUCK] = {"others": "the wheels"}
-        excluded = _excluded_faults(*relations)
         for fault, evidence in self._evidence.items():
             is_there = True if fault in found else False if fault in excluded else None
             evidence.add(is_there, window.end_s, window.begin_s)
