@@ -15,7 +15,7 @@ from localization.errors import LogError
 from localization.estimators import CORRECTING, LOCALIZING, Estimate, Estimator, EstimatorConfig, make_estimator
 from localization.estimators.base import NIS, TWIST, TWIST_COV, EstimateTable, trajectory
 from localization.events import Event, ImuSample, PositionSample, Step
-from localization.lidar.scan_checks import LidarLosses
+from localization.lidar.losses import LidarLosses
 from localization.sensor_checks import SensorChecks
 from localization.synchronizer import StepConfig, Synchronizer
 from localization.trajectory import Trajectory

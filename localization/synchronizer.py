@@ -12,8 +12,7 @@ import numpy as np
 
 from localization.events import CgSample, Event, ImuSample, Scan, Step, StepInterval, WheelSample
 from localization.gyro import GyroBuffer
-from localization.lidar.deskew import LidarTilt
-from localization.lidar.scan_checks import LidarFrames
+from localization.lidar.frames import LidarFrames
 from localization.settings import Positive, Settings, at_least
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
@@ -61,7 +60,6 @@ class Synchronizer:
         self._gyro = GyroBuffer(robot.gyro_noise, mounts)
         self.frames = LidarFrames(mounts)
         """Of the scans."""
-        self._tilt = LidarTilt(mounts)
         self._has_lidar = has_lidar
         self._scans: deque[tuple[int, Scan]] = deque()  # and the middle of its sweep
         self._empty_scans, self._late_scans, self._no_wheel_data_s = 0, 0, 0.0
@@ -97,7 +95,6 @@ class Synchronizer:
             self._wheels.set_cg(event)
         elif isinstance(event, Scan) and self.frames.admit(event):
             self._empty_scans += not len(event.points)
-            self._tilt.add(event)
             # one that was overtaken goes where it belongs, if that still waits
             self._scans.insert(bisect.bisect_right(self._scans, event.middle_ns, key=lambda scan: scan[0]), (event.middle_ns, event))
 
@@ -126,7 +123,7 @@ class Synchronizer:
             )
         if self._no_wheel_data_s >= _MIN_REPORTED_S:
             found.append(f"no wheel data for {self._no_wheel_data_s:.1f} s in all: motion there is predicted with a wide covariance.")
-        return [*found, *self._tilt.warnings(), *self.frames.warnings()]
+        return [*found, *self.frames.warnings()]
 
     def next_interval(self, is_last: bool) -> StepInterval | None:
         """The next step's time, or None while it must wait for more events; with ``is_last`` no more will come."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from localization.comparison.jobs import OK, Row
-from localization.lidar.scan_checks import is_long, per_cent
+from localization.lidar.losses import is_long, per_cent
 from localization.report.replay_page import unit_of
 from localization.report.runs import capitalize, describe_run, join_words
 from motion_models.se2 import FloatArray

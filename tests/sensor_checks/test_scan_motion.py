@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from localization.lidar.scan_motion import ScanOdometry
+from localization.sensor_checks.scan_motion import ScanOdometry
 from motion_models import se2
 from tests.helpers.rooms import ANGLES, ranges
 

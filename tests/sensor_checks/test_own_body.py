@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from localization.events import Scan
-from localization.sensor_checks import OwnBodyFilter
+from localization.sensor_checks.own_body import LIDAR_OWN_BODY, OwnBodyFilter
+from tests.helpers import checked_drive, rooms
 
 ANGLES = np.linspace(-np.pi, np.pi, 360, endpoint=False)
 POST_RANGE_M = 0.3
@@ -35,3 +36,18 @@ def test_filter_of_robot_at_rest_removes_nothing() -> None:
     body, rng = OwnBodyFilter(), np.random.default_rng(0)
     assert all(len(body.filter(scan(k, rng)).points) == len(ANGLES) for k in range(30))
     assert body.share == 0.0
+
+
+def test_beams_on_the_robot_are_left_out_and_reported() -> None:
+    def cover(points: np.ndarray) -> np.ndarray:
+        points = points.copy()
+        points[:100] = 0.3 * np.column_stack([np.cos(rooms.ANGLES[:100]), np.sin(rooms.ANGLES[:100]), np.zeros(100)])
+        return points
+
+    robot = checked_drive.CheckedDrive(scan=cover)
+    checks = robot.drive()
+    assert list(checks.found) == [LIDAR_OWN_BODY]
+    assert "28 % of the LiDAR's points are the robot itself" in checks.warnings()[0]
+    last = robot.applied[-1].scan
+    assert last is not None
+    assert np.hypot(last.points[:, 0], last.points[:, 1]).min() > 0.5

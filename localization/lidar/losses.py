@@ -1,0 +1,108 @@
+"""How long the LiDAR was lost in a run, in words and numbers for reports."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from localization.lidar.scan_checks import MAX_LOST_S, MAX_LOST_SHARE, LostScans
+
+_CAUSES: Mapping[str, tuple[str, str]] = {
+    "lost": (
+        "fitted the map nowhere or in several places",
+        "Check the LiDAR's mount, its stamps and the wheels; in open or repetitive places take a longer range (lidar.max_range_m).",
+    ),
+    "sparse": (
+        "had too few points on walls",
+        "Check what covers the LiDAR, and lidar.min_range_m and lidar.max_range_m.",
+    ),
+    "stale": (
+        "repeated the ranges of the scan before while the robot drove",
+        "Check the LiDAR's driver.",
+    ),
+}
+"""What happened and what to do, by cause."""
+_SILENCE_ADVICE = "Check the LiDAR's driver, cable and topic."
+
+
+@dataclass(frozen=True)
+class LidarLosses:
+    """Scans of a run that were not matched, and the time without a match."""
+
+    scans: int
+    """All of them."""
+    matched: int
+    share: float
+    """Of the time from the first scan to the last without a matched scan, 0 to 1."""
+    longest_s: float
+    """The longest time without a match [s]."""
+    since_s: float
+    """When that began, after the first scan [s]."""
+    ongoing_s: float
+    """Time since the last match, up to the last scan [s]."""
+    causes: Mapping[str, int]
+    """Scans that were not matched, by cause: lost, sparse, stale."""
+    silences: int = 0
+    """Times in which no scan came for a second or more."""
+
+    @classmethod
+    def of(cls, lost: LostScans) -> LidarLosses:
+        """Up to now."""
+        causes = {name: n for name, n in lost.causes.items() if n}
+        return cls(lost.scans, lost.scans - sum(causes.values()), lost.share, *lost.longest, lost.ongoing_s, causes, lost.silences)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether so much is missing that the run is not to be recommended."""
+        return is_long(self.share, self.longest_s)
+
+    @property
+    def summary(self) -> str:
+        """Which part of the drive is without LiDAR, and where most of it."""
+        return f"LiDAR lost for {per_cent(self.share)} of the drive, longest {_seconds(self.longest_s)} at t = {self.since_s:.0f} s"
+
+    @property
+    def advice(self) -> str:
+        """What to do against missing scans, else against the most frequent cause; "" where nothing was lost."""
+        if self.silences:
+            return _SILENCE_ADVICE
+        return _CAUSES[max(self.causes, key=lambda name: self.causes[name])][1] if self.causes else ""
+
+    def describe(self) -> str:
+        """What happened, where, why, and what to do; "" where every scan came and was matched."""
+        found = []
+        if self.causes:
+            parts = ", ".join(f"{n} {_CAUSES[name][0]}" for name, n in self.causes.items())
+            found.append(f"{sum(self.causes.values())} of {self.scans} scans: {parts}")
+        if self.silences:
+            found.append("no scans came for a second or more" + (f", {self.silences} times" if self.silences > 1 else ""))
+        return f"{self.summary} ({'; '.join(found)}). Wheels carried on alone. {self.advice}" if found else ""
+
+    def numbers(self) -> dict[str, Any]:
+        """As in `metrics.json`."""
+        return {
+            "scans": self.scans,
+            "matched": self.matched,
+            "lost_share": self.share,
+            "longest_lost_s": self.longest_s,
+            "longest_lost_since_s": self.since_s,
+            "causes": dict(self.causes),
+            "silences": self.silences,
+        }
+
+
+def _seconds(value: float) -> str:
+    """Two digits, without a power of ten."""
+    return f"{value:.0f} s" if value >= 9.95 else f"{value:.2g} s"
+
+
+def is_long(share: float | None, longest_s: float | None) -> bool:
+    """Whether a run that lost the LiDAR for this ``share`` of the time, and ``longest_s`` [s] at once, is not to be recommended."""
+    return (share is not None and share > MAX_LOST_SHARE) or (longest_s is not None and longest_s > MAX_LOST_S)
+
+
+def per_cent(share: float) -> str:
+    """Two digits, without a power of ten."""
+    value = 100.0 * share
+    return f"{value:.0f} %" if value >= 9.95 else f"{value:.2g} %" if value >= 0.01 or not value else "less than 0.01 %"

@@ -1,0 +1,92 @@
+"""The checks, in the order in which they are applied."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from localization.estimators import Estimate
+from localization.events import ImuSample, Step
+from localization.lidar import LidarConfig
+from localization.sensor_checks.check import Check
+from localization.sensor_checks.disagreement import Disagreement
+from localization.sensor_checks.faults import Fault, FaultLog, Found
+from localization.sensor_checks.gyro_rate import GyroRate
+from localization.sensor_checks.lidar_tilt import LidarTilt
+from localization.sensor_checks.own_body import OwnBody
+from localization.sensor_checks.standstill import Standstill
+from localization.sensor_checks.travel_direction import TravelDirection
+from localization.sensor_checks.turn_rates import TurnRates
+from localization.sensor_checks.widening import Widening
+from localization.sensor_checks.window import Window
+from localization.trajectory import Trajectory
+from motion_models import se2
+from motion_models.robot import Mount
+from motion_models.se2 import Pose2
+
+
+class SensorChecks:
+    """`apply` to each step before the estimator, `widen` its estimate afterwards."""
+
+    def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig) -> None:
+        self._widening = Widening()
+        self._faults = faults = FaultLog(self._widening)
+        self._window = window = Window(mounts, config)
+        self._checks: tuple[Check, ...] = (
+            LidarTilt(mounts),
+            OwnBody(faults),
+            GyroRate(faults),
+            TurnRates(faults),
+            TravelDirection(faults),
+            Standstill(faults, window),
+            Disagreement(faults),
+        )
+        self._step: Step | None = None
+        self._pose: Pose2 | None = None
+
+    def insert_imu(self, sample: ImuSample) -> None:
+        """Specific force shows whether the robot moves."""
+        for check in self._checks:
+            check.insert_imu(sample)
+
+    def apply(self, step: Step) -> Step:
+        """``step`` without the sensors that are faulty, and with the motion of uncertain wheels widened."""
+        if not np.isfinite(step.predicted.delta).all():
+            return step  # the estimator refuses it
+        self._faults.start_step(step)
+        for check in self._checks:
+            step = check.prepare(step)
+        self._widening.add_step(step)
+        if self._window.add(step, self._faults.now_s):
+            agreements = [check.compare(self._window) for check in self._checks]
+            if all(agreements):
+                self._widening.restart()
+        for check in self._checks:
+            step = check.apply(step)
+        self._step = step
+        return step
+
+    def widen(self, estimate: Estimate) -> Estimate:
+        """``estimate`` with the covariance of what faulty sensors have done to it; unchanged without one (LiDAR alone)."""
+        if estimate.covariance is None:
+            return estimate
+        before, self._pose = self._pose, estimate.pose if estimate.odometry is None else estimate.odometry[0]
+        delta = np.zeros(3) if before is None else se2.between(before, self._pose)
+        if before is not None and self._step is not None:
+            for check in self._checks:
+                check.compare_estimate(self._step, delta, estimate.nis)
+        return self._widening.widen(estimate, delta)
+
+    def widen_trajectory(self, smoothed: Trajectory) -> Trajectory:
+        """``smoothed`` with the same covariance at its end, from the first fault on."""
+        return self._widening.widen_trajectory(smoothed)
+
+    def warnings(self) -> list[str]:
+        """Problems so far."""
+        return [*(warning for check in self._checks for warning in check.warnings()), *self._faults.warnings()]
+
+    @property
+    def found(self) -> Mapping[Fault, Found]:
+        """Faults so far."""
+        return self._faults.found

@@ -1,0 +1,133 @@
+"""Times in which the motion by the scans, as the estimate has it, and that by the wheels disagree."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from localization.events import Step
+from localization.sensor_checks.check import Check
+from localization.sensor_checks.faults import Fault, FaultLog, Found
+from motion_models import se2
+from motion_models.se2 import FloatArray
+
+DISAGREEMENT = Fault(
+    "for {seconds:.0f} s the motion by the scans and that by the wheels differ ({sigmas:.1f} sigma in the mean, {metres:.2f} m and"
+    " {degrees:.0f} deg at the end{others}). Wheels slip, or the mount, the stamps or the scale of a sensor are wrong: run `skidloc"
+    " diagnose` on the log."
+)
+
+_DISAGREEMENT_S, _MIN_DISAGREEING_SCANS = 5.0, 8
+_MAX_SQUARE, _MAX_MEAN_SQUARE = 25.0, 10.0
+"""Mean over 5 s of the squared distance between the wheels' motion and the estimate's, in sigmas, each at most 5 sigma; 3 is expected.
+1.4 % of the time of CSAIL and 3.9 % of fr079 are above, none of ACES and simulated laps."""
+_SCAN_NOISE = np.diag([0.02, 0.02, 0.01]) ** 2
+"""Of the motion from scan to scan [m^2, m^2, rad^2]."""
+_NS = 1e-9
+
+
+class Disagreement(Check):
+    """Leaves out nothing, as either may be right; the covariance has the difference."""
+
+    def __init__(self, faults: FaultLog) -> None:
+        self._faults, self._distance = faults, MotionDistance()
+        self._ended: _Episodes | None = None
+        self._episode: _Episode | None = None
+
+    def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
+        """Report the largest disagreement so far, with how often there was one."""
+        if step.duration == 0.0:
+            return
+        self._distance.add(step, delta, nis)
+        off = self._distance.difference
+        self._faults.widening.ongoing = off
+        if off is not None:
+            self._episode = _Episode(self._distance.began_s - self._faults.start_s, self._faults.now_s, off, self._distance.mean_square)
+            self._faults.revise(_include(self._ended, self._episode).found())
+        elif self._episode is not None:
+            self._faults.widening.add(self._episode.difference)
+            self._ended, self._episode = _include(self._ended, self._episode), None
+
+
+class _Episode(NamedTuple):
+    """A time in which scans and wheels disagree."""
+
+    begin_s: float
+    end_s: float
+    difference: FloatArray
+    """(3,) of the motion by the wheels from that by the estimate."""
+    mean_square: float
+    """Of the last 5 s, in sigmas."""
+
+    @property
+    def distance(self) -> float:
+        """Length of the difference [m]."""
+        return math.hypot(self.difference[0], self.difference[1])
+
+
+class _Episodes(NamedTuple):
+    """The largest of several times of disagreement, and their sum."""
+
+    number: int
+    seconds: float
+    largest: _Episode
+
+    def found(self) -> Found:
+        """The largest."""
+        message = DISAGREEMENT.message.format(
+            seconds=self.largest.end_s - self.largest.begin_s,
+            sigmas=math.sqrt(self.largest.mean_square),
+            metres=self.largest.distance,
+            degrees=abs(math.degrees(self.largest.difference[2])),
+            others=f"; the largest of {self.number} such times, {self.seconds:.0f} s in all" if self.number > 1 else "",
+        )
+        return Found(DISAGREEMENT, self.largest.begin_s, message)
+
+
+def _include(episodes: _Episodes | None, episode: _Episode) -> _Episodes:
+    """``episodes`` and ``episode``."""
+    if episodes is None:
+        return _Episodes(1, episode.end_s - episode.begin_s, episode)
+    larger = episode if episode.distance > episodes.largest.distance else episodes.largest
+    return _Episodes(episodes.number + 1, episodes.seconds + episode.end_s - episode.begin_s, larger)
+
+
+class MotionDistance:
+    """Distance of the estimate's motion from the wheels', over the last seconds."""
+
+    def __init__(self) -> None:
+        self._rows: deque[tuple[float, float, FloatArray, FloatArray]] = deque()  # time [s], square, motion by wheels and estimate
+        self._motions: tuple[FloatArray, FloatArray] | None = None
+        self.mean_square = 0.0
+        self.began_s = 0.0
+        """Time of the first step at which they differ [s]."""
+
+    @property
+    def difference(self) -> FloatArray | None:
+        """Of the motion by the wheels from that by the estimate (3,), since they began to disagree; None where they agree."""
+        return None if self._motions is None else se2.log(se2.between(self._motions[1], self._motions[0]))
+
+    def add(self, step: Step, delta: FloatArray, nis: float | None) -> None:
+        """``delta`` (3,) of ``step`` by the estimate, and its NIS. Steps without scans or moving wheels are not compared."""
+        wheels = step.predicted.delta if step.has_wheels else delta
+        if self._motions is not None:
+            self._motions = se2.compose(self._motions[0], wheels), se2.compose(self._motions[1], delta)
+        if step.scan is None or not step.has_wheels or step.is_standing:
+            return
+        off = se2.log(se2.between(wheels, delta))
+        square = max(float(off @ np.linalg.solve(step.predicted.cov + _SCAN_NOISE, off)), nis or 0.0)
+        self._rows.append((step.end_ns * _NS, min(square, _MAX_SQUARE), wheels, delta))
+        while self._rows[0][0] < self._rows[-1][0] - _DISAGREEMENT_S:
+            self._rows.popleft()
+        self.mean_square = sum(row[1] for row in self._rows) / len(self._rows)
+        is_short = self._rows[-1][0] - self._rows[0][0] < 0.9 * _DISAGREEMENT_S or len(self._rows) < _MIN_DISAGREEING_SCANS
+        if is_short or self.mean_square <= _MAX_MEAN_SQUARE:
+            self._motions = None
+        elif self._motions is None:
+            wheels, estimated = (functools.reduce(se2.compose, (row[i] for row in self._rows), np.zeros(3)) for i in (2, 3))
+            self._motions = wheels, estimated
+            self.began_s = next(row[0] for row in self._rows if row[1] > _MAX_MEAN_SQUARE)

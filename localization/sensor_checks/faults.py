@@ -1,0 +1,120 @@
+"""Faults of sensors: what is reported of one, for how long comparisons have shown it, and which were found."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from localization.events import Step
+from localization.sensor_checks.widening import DeadReckoning, Widening
+
+MEMORY_S = 3.0
+"""A sensor is left out while most comparisons of the last seconds contradict it. Signs and units are never off by chance for so long
+(Husky, ACES, fr079, CSAIL: one of 8,964 comparisons)."""
+_MIN_CONTRADICTING = 2.0 / 3.0
+"""At least this share of them."""
+_MIN_LASTING_S = 1.0
+"""Time for which a comparison must give the same result before a sensor is declared faulty."""
+_NS = 1e-9
+
+
+class Fault(NamedTuple):
+    """A kind of fault; each check has its own."""
+
+    message: str
+    """What is wrong, and what to do, with places for numbers."""
+    reference: DeadReckoning | None = None
+    """Its sensors are right: the estimate's distance from it widens the covariance when the fault is found."""
+    explains: Fault | None = None
+    """A fault that is no longer reported where this one is."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """A fault with its time and numbers."""
+
+    fault: Fault
+    at_s: float
+    """After the first step [s]."""
+    message: str
+
+
+class FaultLog:
+    """Faults so far. `start_step`, then the checks `declare` what they find."""
+
+    def __init__(self, widening: Widening) -> None:
+        self.widening = widening
+        self.start_s = self.now_s = 0.0
+        """Stamp of the first step's begin [s], and end of the present one after it [s]."""
+        self._start_ns: int | None = None
+        self._declared: dict[Fault, Found] = {}
+        self._revised: dict[Fault, Found] = {}
+
+    def start_step(self, step: Step) -> None:
+        """What is declared from now on is of ``step``."""
+        if self._start_ns is None:
+            self._start_ns, self.start_s = step.start_ns, step.start_ns * _NS
+        self.now_s = (step.end_ns - self._start_ns) * _NS
+
+    def __contains__(self, fault: Fault) -> bool:
+        return fault in self._declared
+
+    def declare(self, fault: Fault, at_s: float, numbers: Mapping[str, float | str]) -> None:
+        """Report ``fault`` once, and widen the covariance by how far the estimate is from the other sensors' dead reckoning."""
+        if fault in self._declared or any(other.explains == fault for other in self._declared):
+            return
+        self._declared[fault] = Found(fault, max(at_s, 0.0), fault.message.format(**numbers))
+        if fault.explains is not None:
+            self._declared.pop(fault.explains, None)
+        if fault.reference is not None:
+            self.widening.add_distance_from(fault.reference)
+
+    def revise(self, found: Found) -> None:
+        """Report ``found`` in place of what was reported of the same fault."""
+        self._revised[found.fault] = found
+
+    @property
+    def found(self) -> dict[Fault, Found]:
+        """All so far, those last whose numbers change."""
+        return {**self._declared, **self._revised}
+
+    def warnings(self) -> list[str]:
+        """All so far, in sentences."""
+        return [f"at t = {found.at_s:.1f} s: {found.message}" for found in self.found.values()]
+
+
+class Evidence:
+    """What the comparisons of the last ``memory_s`` [s] show of one fault."""
+
+    def __init__(self, memory_s: float = MEMORY_S) -> None:
+        self._memory_s = memory_s
+        self._results: deque[tuple[float, bool]] = deque()
+        self._first_s: float | None = None
+        self._now_s = 0.0
+        self.since_s = 0.0
+        """Begin of the window that showed it first, if it lasts [s]."""
+
+    def add(self, is_there: bool | None, now_s: float, begin_s: float) -> None:
+        """Result of a comparison over the window from ``begin_s`` to ``now_s`` [s]; None where it shows nothing."""
+        self._now_s = now_s
+        if not is_there:
+            self._first_s = None
+        elif self._first_s is None:
+            self._first_s, self.since_s = now_s, begin_s
+        if is_there is None:
+            return
+        self._results.append((now_s, is_there))
+        while self._results[0][0] < now_s - self._memory_s:
+            self._results.popleft()
+
+    @property
+    def is_lasting(self) -> bool:
+        """Whether all comparisons of the last second have shown it."""
+        return self._first_s is not None and self._now_s - self._first_s >= _MIN_LASTING_S
+
+    @property
+    def is_majority(self) -> bool:
+        """Whether most of the comparisons show it."""
+        return sum(is_there for _, is_there in self._results) >= _MIN_CONTRADICTING * max(len(self._results), 1)

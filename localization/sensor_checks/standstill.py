@@ -1,0 +1,87 @@
+"""Wheels that read zero while the LiDAR moves or the IMU shakes."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from localization.events import ImuSample, Step
+from localization.sensor_checks.check import Check, with_unknown_motion
+from localization.sensor_checks.faults import Fault, FaultLog
+from localization.sensor_checks.window import Window
+from motion_models.se2 import FloatArray
+
+WHEELS_STANDING = Fault(
+    "the wheels read zero while {others} moved. They count as unknown there. Check the encoders, the driver of the wheels and the"
+    " joints' names in the robot file's [joints]."
+)
+
+_RECENT_BINS, _MIN_LIDAR_S = 8, 1.0
+"""Bins in which the LiDAR's speed is measured while the wheels read zero, and the least time in them [s]."""
+_STANDING_SPEED_M_S = 0.1
+_SHAKE_M_S2, _SHAKE_SAMPLES = 0.4, 20
+"""Standard deviation of the specific force over a second: Husky outdoors at rest 0.005 to 0.11, driving 0.51 to 1.6 (5 to 95 %)."""
+_SHAKE_S = 2.0
+_NS = 1e-9
+
+
+class Standstill(Check):
+    """Such wheels count as unknown, for as long as that lasts."""
+
+    def __init__(self, faults: FaultLog, window: Window) -> None:
+        self._faults, self._window, self._shaking = faults, window, ShakeDetector()
+        self._stood_s = 0.0  # time for which the wheels read zero
+        self._unknown_s = 0.0  # the same, while that is contradicted
+
+    def insert_imu(self, sample: ImuSample) -> None:
+        """Specific force shows whether the robot moves."""
+        self._shaking.insert(sample)
+
+    def apply(self, step: Step) -> Step:
+        """``step`` with unknown wheels where another sensor shows motion."""
+        if not step.is_standing:
+            self._unknown_s = self._stood_s = 0.0
+            return step
+        self._stood_s += step.duration
+        bins = [b for b in list(self._window.bins)[-_RECENT_BINS:] if b.is_standing and np.isfinite(b.lidar[0])]
+        travelled, lasted = sum(math.hypot(b.lidar[0], b.lidar[1]) for b in bins), sum(b.duration_s for b in bins)
+        is_lidar_moving = lasted >= _MIN_LIDAR_S and travelled >= _STANDING_SPEED_M_S * lasted
+        is_shaking = not bins and min(self._shaking.lasted_s, self._stood_s) >= _SHAKE_S
+        if not is_lidar_moving and not is_shaking:
+            self._unknown_s = 0.0
+            return step
+        before, self._unknown_s = self._unknown_s, self._stood_s
+        others = "the LiDAR" if is_lidar_moving else "the IMU shakes as if it"
+        self._faults.declare(WHEELS_STANDING, self._faults.now_s - self._unknown_s, {"others": others})
+        return with_unknown_motion(step, self._unknown_s**2 - before**2)
+
+
+class ShakeDetector:
+    """How long the IMU's specific force has varied as it does on a robot that drives."""
+
+    def __init__(self) -> None:
+        self._forces: deque[tuple[int, FloatArray]] = deque(maxlen=400)
+        self._since_ns: int | None = None
+        self._now_ns = 0
+
+    @property
+    def lasted_s(self) -> float:
+        """Duration of the fault so far [s]."""
+        return 0.0 if self._since_ns is None else (self._now_ns - self._since_ns) * _NS
+
+    def insert(self, sample: ImuSample) -> None:
+        """Evaluated once for each second of samples."""
+        self._now_ns = sample.stamp_ns
+        self._forces.append((sample.stamp_ns, sample.linear_acceleration))
+        start_ns = self._forces[0][0]
+        if sample.stamp_ns - start_ns < 1 / _NS:
+            return
+        forces = np.array([force for _, force in self._forces])
+        self._forces.clear()
+        is_shaking = len(forces) >= _SHAKE_SAMPLES and float(np.linalg.norm(forces.std(axis=0))) > _SHAKE_M_S2
+        if not is_shaking:
+            self._since_ns = None
+        elif self._since_ns is None:
+            self._since_ns = start_ns

@@ -1,0 +1,76 @@
+"""Direction of travel by the LiDAR against that by the wheels: a LiDAR whose yaw is wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from localization.events import Step
+from localization.sensor_checks.check import Check
+from localization.sensor_checks.faults import Evidence, Fault, FaultLog
+from localization.sensor_checks.window import Bin, Window
+
+LIDAR_DIRECTION = Fault(
+    "by the LiDAR the robot travels {degrees:.0f} deg to the {side} of where the wheels drive. Its scans are not used while that lasts."
+    " Correct the yaw of its frame by {correction:+.0f} deg in /tf_static or in the robot file's [mounts].",
+    reference="wheels and gyro",
+)
+
+_MEMORY_S = 120.0
+"""A robot that slides has a direction of travel that is wrong (fr079: 14 deg for 7 s); it is compared over two minutes."""
+_MAX_DIRECTION_RAD, _MIN_COHERENCE = math.radians(12.0), 0.9
+"""A robot on a side slope or in curves slides by a few degrees."""
+_MAX_SLIDE_RAD = math.radians(20.0)
+"""Directions that no slide explains are compared over seconds: 99.9 % of the windows of CSAIL, fr079 and ACES are below 17 deg. Windows
+of 3 s would take a time for a turned LiDAR in which the wheels of fr079 count backwards as forwards (6 s, ATE .13 -> .18 m)."""
+_MIN_TRAVEL_M = 0.05
+"""Of wheels and LiDAR in a bin, for its direction to count."""
+_MIN_TRAVEL_BINS = 6
+_MAX_CURVATURE_RAD_M = 0.6
+"""Sharper turns slide sideways."""
+
+
+class TravelDirection(Check):
+    """Leaves out scans while most comparisons show another direction than the wheels."""
+
+    def __init__(self, faults: FaultLog) -> None:
+        self._faults = faults
+        self._off, self._far_off = Evidence(_MEMORY_S), Evidence()
+
+    def compare(self, window: Window) -> bool:
+        """Declare a fault that lasts; whether the directions agree, or no scans have come."""
+        direction = _travel_direction(window.bins)
+        size = None if direction is None else abs(direction)
+        for evidence, most in ((self._off, _MAX_DIRECTION_RAD), (self._far_off, _MAX_SLIDE_RAD)):
+            evidence.add(None if size is None else size > most, window.end_s, window.begin_s)
+        if direction is None:
+            return not window.has_scans
+        if self._off.is_lasting and self._is_contradicted:
+            degrees = math.degrees(direction)
+            numbers = {"degrees": abs(degrees), "side": "left" if degrees > 0.0 else "right", "correction": -degrees}
+            self._faults.declare(LIDAR_DIRECTION, self._off.since_s, numbers)
+        return abs(direction) <= _MAX_DIRECTION_RAD
+
+    def apply(self, step: Step) -> Step:
+        """``step`` without its scan."""
+        return replace(step, scan=None) if LIDAR_DIRECTION in self._faults and self._is_contradicted else step
+
+    @property
+    def _is_contradicted(self) -> bool:
+        return self._off.is_majority or self._far_off.is_majority
+
+
+def _travel_direction(bins: Iterable[Bin]) -> float | None:
+    """Direction [rad] of the LiDAR's travel against the wheels', where both agree among themselves; None where it is not known."""
+    rows = np.array([(*b.wheels, *b.lidar) for b in bins])
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    wheels, turned, lidar = rows[:, 0] + 1j * rows[:, 1], np.abs(rows[:, 2]), rows[:, 3] + 1j * rows[:, 4]
+    is_long = (np.abs(wheels) >= _MIN_TRAVEL_M) & (np.abs(lidar) >= _MIN_TRAVEL_M) & (turned <= _MAX_CURVATURE_RAD_M * np.abs(wheels))
+    if is_long.sum() < _MIN_TRAVEL_BINS:
+        return None
+    offset = lidar[is_long] * np.conj(wheels[is_long])
+    unit = offset / np.abs(offset)
+    return float(np.angle(offset.sum())) if abs(unit.mean()) >= _MIN_COHERENCE else None

@@ -1,0 +1,190 @@
+"""Turn rates of wheels, gyro and LiDAR: opposite signs, wrong units, a gyro that is stuck.
+
+Of three sensors the one that contradicts the two others is at fault, of two the gyro or the LiDAR.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from localization.events import Step
+from localization.sensor_checks.check import Check, with_unknown_motion
+from localization.sensor_checks.faults import Evidence, Fault, FaultLog
+from localization.sensor_checks.gyro_rate import GYRO_RATE
+from localization.sensor_checks.window import MIN_BINS, WINDOW_BINS, Window
+from motion_models.se2 import FloatArray
+
+GYRO_OPPOSITE = Fault(
+    "the gyro turns opposite to {others}. It is not used while that lasts. Correct the IMU's mount, or its driver's sign.",
+    reference="wheels",
+)
+GYRO_UNIT = Fault(
+    "the gyro's rates are {ratio:.2g} times those of {others} (deg/s?). It is not used while that lasts. Let its driver publish rad/s.",
+    reference="wheels",
+    explains=GYRO_RATE,
+)
+GYRO_STUCK = Fault(
+    "the gyro repeats one value while {others} turn. It is not used as long as that lasts. Check the IMU and its driver.",
+    reference="wheels",
+)
+WHEELS_OPPOSITE = Fault(
+    "the wheels turn opposite to {others}. They are not used while that lasts. Swap left and right in the robot file's [joints].",
+    reference="wheels and gyro",
+)
+LIDAR_OPPOSITE = Fault(
+    "the LiDAR turns opposite to {others}. Its scans are not used while that lasts. It is mounted upside down, or left and right wheels"
+    " are swapped: correct the roll of its frame in /tf_static or in the robot file's [mounts], or the robot file's [joints].",
+    reference="wheels and gyro",
+)
+
+_MAX_BIAS_RAD_S = 0.05
+"""Gyro bias that is no contradiction; ten times the prior sigma of the shipped robots."""
+_MIN_RATE_RAD_S = 0.001
+"""Root mean square of the slower turn rate, from where on signs are compared: none of 65 windows of the Husky outdoors, straight or not,
+has a correlation below -0.3."""
+_MIN_EXCITED_RAD_S = 0.03
+"""The same for the scale: above it all windows have correlations of 0.8 and more (Husky outdoors, 32 windows; simulated laps)."""
+_MIN_T = 4.0
+"""Student's t of a correlation that is no chance."""
+_OPPOSITE_CORRELATION, _EQUAL_CORRELATION = -0.6, 0.6
+_MAX_EQUAL_RATIO = 2.5
+_DEG_PER_RAD_RANGE = (12.0, 130.0)
+"""Ratio of turn rates that only a wrong unit explains: 57.3, with the factor of 0.45 to 2.3 by which wheels may be off on loose floor, and
+half of it while half of the window is of before the fault."""
+_REPEATED_RAD_S, _MIN_STUCK_WHEELS_RAD_S = 1e-7, 0.002
+"""A gyro's mean rates never repeat to the last digit, but for its noise; over a whole window it is stuck if the wheels turn at all."""
+
+Numbers = Mapping[str, float | str]
+
+
+class TurnRates(Check):
+    """Leaves out what contradicts the other sensors in most comparisons of the last seconds."""
+
+    def __init__(self, faults: FaultLog) -> None:
+        self._faults = faults
+        self._evidence = {fault: Evidence() for fault in (GYRO_OPPOSITE, GYRO_UNIT, GYRO_STUCK, WHEELS_OPPOSITE, LIDAR_OPPOSITE)}
+        self._is_gyro_stuck = False
+
+    def compare(self, window: Window) -> bool:
+        """Declare faults that last; whether some turn rates are equal and none contradicts another."""
+        wheels, gyro, lidar = window.turn_rates
+        relations = _relate(wheels, gyro), _relate(wheels, lidar), _relate(lidar, gyro)
+        found, excluded = _find_faults(*relations), _excluded_faults(*relations)
+        self._is_gyro_stuck = _is_constant(gyro, wheels)
+        if self._is_gyro_stuck:
+            found[GYRO_STUCK] = {"others": "the wheels"}
+        for fault, evidence in self._evidence.items():
+            is_there = True if fault in found else False if fault in excluded else None
+            evidence.add(is_there, window.end_s, window.begin_s)
+        for fault, numbers in found.items():
+            evidence = self._evidence[fault]
+            if evidence.is_lasting and evidence.is_majority:
+                self._faults.declare(fault, evidence.since_s, numbers)
+        return not found and any(relation.is_equal for relation in relations)
+
+    def apply(self, step: Step) -> Step:
+        """``step`` without gyro or scan, or with unknown wheels."""
+        faults = {fault for fault, evidence in self._evidence.items() if fault in self._faults and evidence.is_majority}
+        if faults & {GYRO_OPPOSITE, GYRO_UNIT} or (self._is_gyro_stuck and GYRO_STUCK in faults):
+            step = replace(step, turn=None)
+        if LIDAR_OPPOSITE in faults:
+            step = replace(step, scan=None)
+        if WHEELS_OPPOSITE in faults:
+            step = with_unknown_motion(step, step.duration**2)
+        return step
+
+
+class _Relation(NamedTuple):
+    """How the turn rates of two sensors relate: correlation, and ratio of the second to the first."""
+
+    correlation: float
+    ratio: float
+    is_excited: bool
+    """Both turn enough for a scale."""
+    is_opposite: bool
+    unit_ratio: float
+    """Ratio of the second to the first that only a wrong unit explains; 0 where there is none."""
+
+    @property
+    def is_equal(self) -> bool:
+        return self.is_excited and self.correlation >= _EQUAL_CORRELATION and 1.0 / _MAX_EQUAL_RATIO <= self.ratio <= _MAX_EQUAL_RATIO
+
+
+_NO_RELATION = _Relation(0.0, 1.0, False, False, 0.0)
+
+
+def _relate(a: FloatArray, b: FloatArray) -> _Relation:
+    """Relation of two turn rates (n,), up to a bias of the second [rad/s]."""
+    both = np.isfinite(a) & np.isfinite(b)
+    if both.sum() < MIN_BINS:
+        return _NO_RELATION
+    a, b = a[both], b[both]
+    bias = float((b - a).mean())
+    b = b - min(max(bias, -_MAX_BIAS_RAD_S), _MAX_BIAS_RAD_S)
+    size_a, size_b = math.sqrt(float(a @ a) / len(a)), math.sqrt(float(b @ b) / len(b))
+    if min(size_a, size_b) < _MIN_RATE_RAD_S:
+        return _NO_RELATION
+    r = float(a @ b) / len(a) / (size_a * size_b)
+    is_opposite = _is_opposite(a, b) if abs(bias) > _MAX_BIAS_RAD_S else _is_opposite(a - a.mean(), b - b.mean())
+    unit_ratio = _unit_ratio(a, b) or _unit_ratio(a - a.mean(), b - b.mean())
+    return _Relation(r, size_b / size_a, min(size_a, size_b) >= _MIN_EXCITED_RAD_S, is_opposite, unit_ratio)
+
+
+def _unit_ratio(a: FloatArray, b: FloatArray) -> float:
+    """Ratio of turn rate ``b`` to ``a`` (n,) where they agree but for a factor as between degrees and radians; else 0."""
+    size_a, size_b = math.sqrt(float(a @ a)), math.sqrt(float(b @ b))
+    if min(size_a, size_b) < _MIN_RATE_RAD_S * math.sqrt(len(a)) or float(a @ b) < _EQUAL_CORRELATION * size_a * size_b:
+        return 0.0
+    low, high = _DEG_PER_RAD_RANGE
+    return size_b / size_a if low <= max(size_b / size_a, size_a / size_b) <= high else 0.0
+
+
+def _is_opposite(a: FloatArray, b: FloatArray) -> bool:
+    """Whether two turn rates (n,) have opposite signs, and not by chance. Means that a bias explains must be taken out before."""
+    r = min(max(float(a @ b) / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-12), -1.0), 1.0)
+    t = r * math.sqrt((len(a) - 2) / max(1.0 - r * r, 1e-9))
+    return r <= _OPPOSITE_CORRELATION and t <= -_MIN_T
+
+
+def _find_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation) -> dict[Fault, Numbers]:
+    """Faults by the relations of the turn rates: the sensor that contradicts the two others, or one of two."""
+    found: dict[Fault, Numbers] = {}
+    if wheels_gyro.is_opposite and lidar_gyro.is_equal:
+        found[WHEELS_OPPOSITE] = {"others": "gyro and LiDAR"}
+    elif wheels_gyro.is_opposite:
+        found[GYRO_OPPOSITE] = {"others": "wheels and LiDAR" if wheels_lidar.is_equal else "the wheels"}
+    elif wheels_lidar.is_opposite:
+        found[LIDAR_OPPOSITE] = {"others": "wheels and gyro" if wheels_gyro.is_equal else "the wheels"}
+    for relation, others in ((wheels_gyro, "the wheels"), (lidar_gyro, "the LiDAR")):
+        if relation.unit_ratio:
+            found[GYRO_UNIT] = {"others": others, "ratio": relation.unit_ratio}
+            break
+    return found
+
+
+def _excluded_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation) -> set[Fault]:
+    """Faults of installation that a window excludes."""
+    found: set[Fault] = set()
+    if wheels_gyro.is_equal or lidar_gyro.is_equal:
+        found |= {GYRO_OPPOSITE, GYRO_UNIT}
+    if wheels_gyro.is_equal or wheels_lidar.is_equal:
+        found.add(WHEELS_OPPOSITE)
+    if wheels_lidar.is_equal:
+        found.add(LIDAR_OPPOSITE)
+    return found
+
+
+def _is_constant(gyro: FloatArray, wheels: FloatArray) -> bool:
+    """Whether the gyro's rates (n,) are one and the same value while the wheels' (n,) turn by something else."""
+    both = np.isfinite(gyro) & np.isfinite(wheels)
+    n = int(both.sum())
+    if n < MIN_BINS or float(np.ptp(gyro[both])) > _REPEATED_RAD_S:
+        return False
+    off = wheels[both] - gyro[both]
+    is_turning = math.sqrt(float(off @ off) / n) > _MAX_BIAS_RAD_S or float(wheels[both].std()) > _MIN_EXCITED_RAD_S
+    return is_turning or (n == WINDOW_BINS and float(wheels[both].std()) > _MIN_STUCK_WHEELS_RAD_S)

@@ -1,0 +1,85 @@
+"""Covariance of what faulty sensors have done to the estimate."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from localization.estimators import Estimate
+from localization.events import Step
+from localization.trajectory import Trajectory
+from motion_models import se2
+from motion_models.se2 import Cov3, FloatArray, Pose2
+
+DeadReckoning = Literal["wheels", "wheels and gyro"]
+"""Motion by the wheels alone, and that with the turns by the gyro."""
+
+
+class Widening:
+    """Differences that were added, carried along with the body as the covariance of an estimate is."""
+
+    def __init__(self) -> None:
+        self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)  # motion since the sensors last agreed
+        self._pending, self._spread = np.zeros((3, 3)), np.zeros((3, 3))
+        self._since_ns: int | None = None
+        self.ongoing: FloatArray | None = None
+        """(3,) difference of a disagreement that lasts."""
+
+    def restart(self) -> None:
+        """All sensors agree: measure from here on how far faults lead the estimate away."""
+        self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)
+
+    def add_step(self, step: Step) -> None:
+        """Dead reckoning by the sensors."""
+        delta = step.predicted.delta
+        self._by_wheels = se2.compose(self._by_wheels, delta)
+        if step.turn is not None:
+            delta = np.array([delta[0], delta[1], step.turn.angle])
+        self._by_gyro = se2.compose(self._by_gyro, delta)
+
+    def add_distance_from(self, reference: DeadReckoning) -> None:
+        """Widen by how far the estimate is from ``reference``."""
+        self.add(se2.log(se2.between(self._estimated, self._by_wheels if reference == "wheels" else self._by_gyro)))
+
+    def add(self, difference: FloatArray) -> None:
+        """Widen by ``difference`` (3,), of which the direction is known and the sign is not."""
+        self._pending = self._pending + np.outer(difference, difference)
+
+    def widen(self, estimate: Estimate, delta: Pose2) -> Estimate:
+        """``estimate``, which moved by ``delta`` (3,) in the last step, with the covariance of all differences so far."""
+        self._estimated = se2.compose(self._estimated, delta)
+        A = se2.adjoint(se2.inverse(delta))
+        self._spread = A @ self._spread @ A.T + self._pending
+        self._pending = np.zeros((3, 3))
+        spread = self._total()
+        if not spread.any() or estimate.covariance is None:
+            return estimate
+        if self._since_ns is None:
+            self._since_ns = estimate.stamp_ns
+        odometry = estimate.odometry
+        if odometry is not None and odometry[1] is not None:
+            odometry = odometry[0], odometry[1] + spread
+        return replace(estimate, covariance=estimate.covariance + spread, odometry=odometry)
+
+    def widen_trajectory(self, smoothed: Trajectory) -> Trajectory:
+        """``smoothed`` with the same covariance at its end, from the first fault on, in the world's axes."""
+        if self._since_ns is None or smoothed.covariances is None:
+            return smoothed
+        covariances = smoothed.covariances.copy()
+        world = _turn(self._total(), float(smoothed.poses[-1, 2]))
+        for i in np.flatnonzero(smoothed.stamps_ns >= self._since_ns):
+            covariances[i] += _turn(world, -float(smoothed.poses[i, 2]))
+        return Trajectory(smoothed.stamps_ns, smoothed.poses, covariances)
+
+    def _total(self) -> Cov3:
+        """Covariance (3, 3) of what past faults have done to the pose, and of how far a lasting disagreement has taken it."""
+        return self._spread if self.ongoing is None else self._spread + np.outer(self.ongoing, self.ongoing)
+
+
+def _turn(cov: Cov3, angle: float) -> Cov3:
+    c, s = math.cos(angle), math.sin(angle)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(R @ cov @ R.T)

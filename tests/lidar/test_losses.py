@@ -1,0 +1,202 @@
+"""Lost LiDAR: what terminal, metrics, report, comparison and diagnostics publish of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from localization.comparison.jobs import _scores
+from localization.comparison.statistics import closing, find
+from localization.comparison.table import ResultTable
+from localization.evaluation.scores import score
+from localization.lidar import LostScans
+from localization.lidar.losses import LidarLosses, per_cent
+from localization.pipeline import Pipeline, Trial
+from localization.report.replay_page import page
+from localization.report.runs import best_run, plotted_runs
+from localization.report.summary import verdict
+from localization.ros.diagnostics import ERROR, OK, WARN, Health
+from motion_models.registry import make_model
+from tests.helpers.report import HEAD, relations, run, track
+from tests.helpers.rooms import ROBOT
+
+S = 1_000_000_000
+
+ALL_LOST = LidarLosses(1000, 400, 0.6, 60.0, 7.0, 0.0, {"lost": 600})
+BRIEFLY = LidarLosses(1000, 998, 0.002, 0.2, 50.0, 0.0, {"sparse": 2})
+
+
+def counted(matched: str) -> LostScans:
+    """One scan a second: `m` matched, `l` lost, `s` stale."""
+    lost = LostScans()
+    for second, kind in enumerate(matched):
+        lost.add_matched(second * S) if kind == "m" else lost.add(second * S, {"l": "lost", "s": "stale"}[kind])
+    return lost
+
+
+def test_losses_of_scans_have_share_and_longest_gap() -> None:
+    """From the match at 2 s to that at 5 s, and from 6 s to the end at 8 s."""
+    losses = LidarLosses.of(counted("mmmllmmsl"))
+    assert (losses.scans, losses.matched) == (9, 5)
+    assert losses.share == pytest.approx(5.0 / 8.0)
+    assert (losses.longest_s, losses.since_s, losses.ongoing_s) == (3.0, 2.0, 2.0)
+    assert losses.causes == {"lost": 3, "stale": 1}
+    assert losses.describe().startswith("LiDAR lost for 62 % of the drive, longest 3 s at t = 2 s (4 of 9 scans: 3 fitted the map nowhere")
+    assert losses.describe().endswith(losses.advice)
+
+
+def test_losses_of_a_lidar_that_dies_are_described_and_long() -> None:
+    """Ten scans, then nothing while the wheels turn for 6 s more."""
+    lost = counted("mmmmmmmmmm")
+    for half in range(1, 13):
+        lost.add_no_scan(9 * S + half * S // 2)
+    losses = LidarLosses.of(lost)
+    assert (losses.scans, losses.matched, losses.ongoing_s) == (10, 10, 6.0)
+    assert losses.is_long
+    assert losses.describe() == (
+        "LiDAR lost for 40 % of the drive, longest 6 s at t = 9 s (no scans came for a second or more). Wheels carried on alone. "
+        "Check the LiDAR's driver, cable and topic."
+    )
+    assert losses.numbers()["silences"] == 1
+
+
+def test_describe_without_lost_scans_is_empty() -> None:
+    losses = LidarLosses.of(counted("mmmm"))
+    assert losses.describe() == losses.advice == ""
+    assert not losses.is_long
+
+
+@pytest.mark.parametrize(
+    ("share", "longest_s", "expected"), [(0.049, 4.9, False), (0.051, 1.0, True), (0.01, 5.1, True)], ids=["brief", "often", "at once"]
+)
+def test_is_long_from_5_percent_or_5_s_on(share: float, longest_s: float, expected: bool) -> None:
+    assert LidarLosses(100, 90, share, longest_s, 0.0, 0.0, {"lost": 10}).is_long == expected
+
+
+def test_per_cent_has_two_digits() -> None:
+    assert [per_cent(x) for x in (0.0, 1e-6, 0.003, 0.034, 0.12, 1.0)] == ["0 %", "less than 0.01 %", "0.3 %", "3.4 %", "12 %", "100 %"]
+
+
+def lost_and_found() -> list:
+    return [replace(run("skid_steer", "ekf", 0.01), lidar=ALL_LOST), replace(run("diff_drive", "ekf", 0.2, seed=1), lidar=BRIEFLY)]
+
+
+@pytest.mark.parametrize("reference", [track(), relations()], ids=["track", "relations"])
+def test_verdict_with_lost_best_run_recommends_another(reference) -> None:
+    """The run without LiDAR has the smallest error here."""
+    results = score(lost_and_found(), reference)
+    text = verdict(results, reference)
+    assert best_run(plotted_runs(results)).result is results[1]
+    assert text.startswith("ekf with diff_drive is best of the runs that can be recommended")
+    assert "Not recommended is ekf with skid_steer" in text
+    assert "LiDAR lost for 60 % of the drive, longest 60 s at t = 7 s" in text
+    assert "Check the LiDAR's mount" in text
+    assert "Use ekf with skid_steer" not in text
+
+
+def test_verdict_with_all_runs_lost_recommends_none() -> None:
+    text = verdict(score([replace(run(), lidar=ALL_LOST)], track()), track())
+    assert text.startswith("Not recommended is ekf with diff_drive")
+    assert text.endswith("No run can be recommended.")
+
+
+def test_verdict_without_reference_reports_lost_lidar() -> None:
+    text = verdict(score(lost_and_found(), None), None)
+    assert "Not recommended is ekf with skid_steer: LiDAR lost for 60 %" in text
+
+
+def test_page_with_lost_run_marks_it() -> None:
+    text = page(HEAD, score(lost_and_found(), track()), track())
+    assert text.count('<span class="badge soft">LiDAR lost</span>') == 1
+    assert text.count('<span class="badge">best</span>') == 1
+    assert "60.00" in text
+
+
+def test_metrics_of_lost_run_have_its_losses() -> None:
+    lost, reckoned = score([lost_and_found()[0], run(estimator="odometry")], track())
+    assert lost.metrics(200.0, with_timing=False)["lidar"] == {
+        "scans": 1000,
+        "matched": 400,
+        "lost_share": 0.6,
+        "longest_lost_s": 60.0,
+        "longest_lost_since_s": 7.0,
+        "causes": {"lost": 600},
+        "silences": 0,
+    }
+    assert reckoned.metrics(200.0, with_timing=False)["lidar"] is None
+
+
+def compared(lost_share: float | None) -> list[dict]:
+    """EKF, the better one on three logs, and odometry."""
+    rows = []
+    for log in ("a", "b", "c"):
+        for estimator, ate in (("ekf", 0.1), ("odometry", 1.0)):
+            lost = lost_share if estimator == "ekf" and log == "b" else None
+            losses = {"lidar_lost_share": lost, "lidar_longest_lost_s": None if lost is None else 4.0, "lidar_longest_lost_since_s": 3.0}
+            head = {"log": log, "model": "diff_drive", "estimator": estimator, "corrections": "", "status": "ok"}
+            rows.append({**head, "ate_rmse_m": ate, **losses})
+    return rows
+
+
+def test_comparison_with_lost_best_combination_advises_another() -> None:
+    text = " ".join(closing(find(compared(0.2), "ate_rmse_m")))
+    assert "Not recommended is ekf with diff_drive: LiDAR lost for long on 1 log (20 % of b, longest 4 s at t = 3 s)." in text
+    assert "Of the others, dead reckoning with diff_drive has the smallest mean" in text
+
+
+@pytest.mark.parametrize("share", [None, 0.04])
+def test_comparison_without_long_losses_is_silent(share: float | None) -> None:
+    assert not any("recommended" in sentence for sentence in closing(find(compared(share), "ate_rmse_m")))
+
+
+def test_rows_of_a_comparison_are_numbers_that_the_table_reads_again(tmp_path) -> None:
+    """Also of a run with live poses besides the smoothed ones."""
+    smoothed = replace(lost_and_found()[0], moments=run().trajectory)
+    (result,) = score([smoothed], track())
+    scores = _scores(result.metrics(200.0, with_timing=False))
+    assert (scores["lidar_lost_share"], scores["lidar_longest_lost_s"], scores["lidar_longest_lost_since_s"]) == (0.6, 60.0, 7.0)
+    assert not any(isinstance(value, dict) for value in scores.values())
+    table = ResultTable(tmp_path / "table.csv")
+    head = {"log": "a", "robot": "r", "model": "m", "estimator": "graph", "corrections": "", "key": "k", "status": "ok", "error": ""}
+    table.put([{**head, **scores}])
+    table.save([])
+    assert ResultTable(tmp_path / "table.csv").path.exists()
+
+
+@pytest.mark.parametrize(
+    ("matched", "level", "message"),
+    [
+        ("m" * 100, OK, "ok"),
+        ("m" * 100 + "l", WARN, "lost for 1.0 s"),
+        ("m" * 100 + "l" * 6, ERROR, "lost for 6 s"),
+        ("m" * 10 + "l" * 6 + "m" * 100, WARN, "LiDAR lost for 6.1 % of the drive, longest 7 s at t = 9 s"),
+    ],
+    ids=["matched", "just lost", "lost", "was lost"],
+)
+def test_diagnostics_level_follows_lost_scans(matched: str, level: int, message: str) -> None:
+    pipeline = Pipeline(Trial(make_model("diff_drive", ROBOT), "ekf"), ROBOT, {}, has_lidar=True)
+    lost = pipeline.estimator.lost
+    assert lost is not None
+    vars(lost).update(vars(counted(matched)))
+    status = next(s for s in Health().statuses(pipeline) if s.name == "lidar")
+    assert status.level == level
+    assert status.message.startswith(message)
+    assert {"lost_share", "longest_lost_s", "lost_now_s"} <= set(status.values)
+
+
+def test_pipeline_warnings_name_losses_and_remedy() -> None:
+    pipeline = Pipeline(Trial(make_model("skid_steer", ROBOT), "ekf"), ROBOT, {}, has_lidar=True)
+    assert pipeline.estimator.lost is not None
+    vars(pipeline.estimator.lost).update(vars(counted("mmsm")))
+    (note,) = pipeline.warnings()
+    assert note.startswith(
+        "ekf (skid_steer): LiDAR lost for 67 % of the drive, longest 2 s at t = 1 s (1 of 4 scans: 1 repeated the ranges"
+    )
+    assert note.endswith("Check the LiDAR's driver.")
+
+
+def test_dead_reckoning_warnings_have_no_lidar() -> None:
+    pipeline = Pipeline(Trial(make_model("diff_drive", ROBOT), "odometry"), ROBOT, {}, has_lidar=True)
+    assert pipeline.lidar is None
+    assert pipeline.warnings() == []

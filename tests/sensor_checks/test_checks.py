@@ -1,0 +1,34 @@
+"""All checks together: sensors that agree, and state on disk."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from localization.estimators import Estimate
+from localization.ros.state_serialization import deserialize, serialize
+from motion_models import se2
+from tests.helpers.checked_drive import CheckedDrive, S
+
+
+@pytest.mark.parametrize("has_scans", [True, False])
+def test_sensors_that_agree_are_all_used_and_not_reported(has_scans: bool) -> None:
+    """Wheels that slip by half, a gyro with a bias."""
+    robot = CheckedDrive(gyro=lambda w: w + 0.02, wheels=lambda v, w: (0.9 * v, 1.5 * w), has_scans=has_scans)
+    checks = robot.drive()
+    assert checks.warnings() == []
+    assert all(step.turn is not None and (step.scan is not None) == has_scans for step in robot.applied)
+    assert all(np.array_equal(e.covariance, 1e-6 * np.eye(3)) for e in robot.estimates)
+
+
+def test_checks_are_restored_from_a_checkpoint_during_and_after_a_disagreement() -> None:
+    for seconds in (8.0, 20.0):
+        robot = CheckedDrive()
+        robot.wheels = lambda v, w, robot=robot: ((3.0 if len(robot.applied) < 90 else 1.0) * v, w)
+        checks = robot.drive(seconds)
+        restored = deserialize(*serialize(checks))
+        assert "the motion by the scans and that by the wheels differ" in checks.warnings()[0]
+        assert restored.warnings() == checks.warnings()
+        last = robot.estimates[-1]
+        ahead = Estimate(last.stamp_ns + S, se2.compose(last.pose, np.array([0.1, 0.0, 0.0])), last.covariance, np.zeros(3), None)
+        assert np.array_equal(restored.widen(ahead).covariance, checks.widen(ahead).covariance)

@@ -1,0 +1,44 @@
+"""Wheels that read zero on a robot that moves."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from localization.events import ImuSample
+from localization.sensor_checks.standstill import WHEELS_STANDING
+from tests.helpers.checked_drive import CheckedDrive, S
+
+
+def test_wheels_that_read_zero_while_the_lidar_moves_are_unknown() -> None:
+    robot = CheckedDrive(wheels=lambda v, w: (0.0, 0.0))
+    checks = robot.drive(8.0)
+    assert WHEELS_STANDING in checks.found
+    last = robot.applied[-1]
+    assert not last.is_standing
+    total = sum(step.predicted.cov[0, 0] for step in robot.applied)
+    assert math.sqrt(total) == pytest.approx(0.5 * 8.0, rel=0.05)  # 0.5 m/s for as long as they read zero
+
+
+@pytest.mark.parametrize(("shake_m_s2", "is_found"), [(0.7, True), (0.05, False)])
+def test_wheels_that_read_zero_while_the_imu_shakes_are_unknown(shake_m_s2: float, is_found: bool) -> None:
+    robot = CheckedDrive(wheels=lambda v, w: (0.0, 0.0), gyro=lambda w: 0.0, has_scans=False)
+    rng = np.random.default_rng(1)
+    for k in range(300):
+        robot.checks.insert_imu(ImuSample(k * S // 50, np.zeros(3), np.array([0.0, 0.0, 9.8]) + shake_m_s2 * rng.normal(size=3)))
+    checks = robot.drive(6.0)
+    assert (WHEELS_STANDING in checks.found) == is_found
+
+
+def test_robot_that_brakes_is_not_taken_for_one_that_shakes() -> None:
+    """The seconds before were driven."""
+    robot = CheckedDrive(has_scans=False)
+    rng = np.random.default_rng(1)
+    for k in range(300):
+        robot.checks.insert_imu(ImuSample(k * S // 50, np.zeros(3), 0.7 * rng.normal(size=3)))
+    robot.drive(5.0)
+    robot.wheels, robot.gyro = lambda v, w: (0.0, 0.0), lambda w: 0.0
+    robot.drive(1.5)
+    assert robot.checks.found == {}

@@ -1,0 +1,70 @@
+"""Turn rates that contradict each other: which sensor is left out."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from localization.sensor_checks.faults import Fault
+from localization.sensor_checks.turn_rates import GYRO_OPPOSITE, GYRO_STUCK, GYRO_UNIT, LIDAR_OPPOSITE, WHEELS_OPPOSITE
+from tests.helpers.checked_drive import CheckedDrive
+
+
+@pytest.mark.parametrize(
+    ("gyro", "fault"),
+    [
+        (lambda w: -w, GYRO_OPPOSITE),
+        (lambda w: math.degrees(w), GYRO_UNIT),
+        (lambda w: math.radians(w), GYRO_UNIT),
+        (lambda w: 0.0, GYRO_STUCK),
+        (lambda w: 0.31, GYRO_STUCK),
+    ],
+    ids=["flipped", "deg/s", "radians twice", "stuck at zero", "stuck at a turn"],
+)
+@pytest.mark.parametrize("has_scans", [True, False])
+def test_gyro_that_contradicts_wheels_is_left_out(gyro, fault: Fault, has_scans: bool) -> None:
+    robot = CheckedDrive(gyro=gyro, has_scans=has_scans)
+    checks = robot.drive()
+    assert list(checks.found) == [fault]
+    assert robot.applied[-1].turn is None
+    assert robot.applied[-1].has_wheels
+    (warning,) = checks.warnings()
+    assert warning.startswith("at t = ")
+    assert "gyro" in warning
+
+
+@pytest.mark.parametrize("gyro", [lambda w: w, None], ids=["gyro", "no gyro"])
+def test_lidar_that_is_upside_down_is_left_out(gyro) -> None:
+    robot = CheckedDrive(gyro=gyro, scan=lambda points: points * (1.0, -1.0, 1.0))
+    checks = robot.drive()
+    assert LIDAR_OPPOSITE in checks.found
+    assert "upside down" in " ".join(checks.warnings())
+    assert robot.applied[-1].scan is None
+
+
+def test_wheels_that_are_swapped_are_left_out_where_gyro_and_lidar_agree() -> None:
+    robot = CheckedDrive(wheels=lambda v, w: (v, -w))
+    checks = robot.drive()
+    assert list(checks.found) == [WHEELS_OPPOSITE]
+    step = robot.applied[-1]
+    assert step.turn is not None
+    assert step.scan is not None
+    assert not step.has_wheels
+    assert step.predicted.cov[2, 2] > 1e-3
+
+
+def test_gyro_in_degrees_from_half_way_on_is_left_out_within_five_seconds() -> None:
+    gyro_of = iter([*[1.0] * 120, *[math.degrees(1.0)] * 120])
+    robot = CheckedDrive(gyro=lambda w: next(gyro_of) * w)
+    checks = robot.drive(24.0)
+    assert GYRO_UNIT in checks.found
+    assert all(step.turn is None for step in robot.applied[-70:])
+
+
+def test_gyro_in_degrees_from_half_way_on_is_found_beside_wheels_that_turn_twice_as_far() -> None:
+    gyro_of = iter([*[1.0] * 120, *[math.degrees(1.0)] * 120])
+    robot = CheckedDrive(gyro=lambda w: next(gyro_of) * w, wheels=lambda v, w: (v, 2.0 * w))
+    checks = robot.drive(24.0)
+    assert GYRO_UNIT in checks.found
+    assert all(step.turn is None for step in robot.applied[-70:])

@@ -1,0 +1,40 @@
+"""Covariance of what faults have done."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from localization.estimators import Estimate
+from localization.sensor_checks.travel_direction import LIDAR_DIRECTION
+from localization.trajectory import Trajectory
+from motion_models import se2
+from tests.helpers.checked_drive import SPEED, CheckedDrive, turned
+
+
+def test_fault_widens_the_covariance_by_what_it_has_done() -> None:
+    """The estimate followed a LiDAR that is turned by 30 deg; wheels and gyro lead elsewhere."""
+    robot = CheckedDrive(scan=lambda points: turned(points, 30.0))
+    world_T_drive = np.array([0.0, 0.0, math.radians(30.0)])
+    own = robot.checks.widen
+    robot.checks.widen = lambda e: own(  # type: ignore[method-assign]
+        Estimate(e.stamp_ns, se2.compose(se2.compose(world_T_drive, e.pose), se2.inverse(world_T_drive)), e.covariance, e.twist, None)
+    )
+    robot.drive()
+    found = next(iter(robot.checks.found.values()))
+    assert found.fault == LIDAR_DIRECTION
+    sigma = np.sqrt([np.linalg.eigvalsh(e.covariance[:2, :2])[-1] for e in robot.estimates])  # type: ignore[index]
+    assert sigma[0] == pytest.approx(1e-3)
+    assert sigma[-1] > 0.3 * 2.0 * math.sin(math.radians(15.0)) * SPEED * 3.0  # declared after 3.5 s or later
+    end = robot.estimates[-1]
+    smooth = Trajectory(
+        np.array([e.stamp_ns for e in robot.estimates]),
+        np.array([e.pose for e in robot.estimates]),
+        np.tile(1e-6 * np.eye(3), (len(robot.estimates), 1, 1)),
+    )
+    widened = robot.checks.widen_trajectory(smooth)
+    assert widened.covariances is not None
+    np.testing.assert_allclose(widened.covariances[-1], end.covariance, atol=1e-9)
+    np.testing.assert_allclose(widened.covariances[0], 1e-6 * np.eye(3))
