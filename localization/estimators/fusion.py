@@ -18,16 +18,12 @@ from motion_models.online_calibration import Corrections
 from motion_models.robot import Robot
 from motion_models.se2 import Cov3, FloatArray, Points2, Twist2
 
-_MIN_TURN_RAD = 0.01
-"""A turn of the gyro in one step that contradicts wheels that stand, if it is 5 sigma, too [rad]."""
 _SIGMAS = 5.0
 _FORGETTING = 0.98
 """Of the statistics of slip, per scan: they are a mean over the last 50 scans, as those of the matcher."""
 _PRIOR_SCANS = 0.2
 """Weight of white slip, as the wheels' noise model has it, in scans: the first key scans are drawn by then, and their error stays (NEES of
 simulated rooms with weight 1: 1.6, with 0.2: 1.9; with white slip 4.7 and 4.8)."""
-_BLOCKED_SPEED = np.array([0.5, 0.5, 0.5])
-"""Sigma of the twist where wheels read zero but the robot moves [m/s, m/s, rad/s]."""
 
 
 class EkfFusion(Estimator):
@@ -75,7 +71,7 @@ class EkfFusion(Estimator):
         """Predict, update by the gyro, update by the scan."""
         self.run_deferred()
         ekf, nis = self.filter, None
-        step = self._check_standstill(step)
+        self.counts_by_name["standing"] += step.is_standing
         self.wheel_motion, self.is_turning = replace(step.predicted, cov=ekf.wheel_cov(step)), self._is_turning(step.predicted)
         ekf.predict(step, self.is_turning)
         if step.turn is not None:
@@ -125,21 +121,6 @@ class EkfFusion(Estimator):
         """Whether ``motion`` turns enough to excite the corrections."""
         d = motion.delta
         return bool(abs(d[2]) * self._track_m >= self.corrections.least_turn * math.hypot(d[0], d[1]))
-
-    def _check_standstill(self, step: Step) -> Step:
-        """Wheels that read zero while the gyro turns count as unknown. (A scan that moved overrules them as any outlier of the wheels.)"""
-        if not step.is_standing:
-            return step
-        if step.turn is None or not self._has_gyro:
-            self.counts_by_name["standing"] += 1
-            return step
-        turned = abs(step.turn.angle - self.filter.bias * step.turn.duration)
-        sigma = math.sqrt(step.turn.variance + self.filter.P[BIAS, BIAS] * step.turn.duration**2)
-        if turned <= max(_SIGMAS * sigma, _MIN_TURN_RAD):
-            self.counts_by_name["standing"] += 1
-            return step
-        unknown = np.diag((_BLOCKED_SPEED * step.duration) ** 2)
-        return replace(step, predicted=Motion(step.predicted.delta, step.predicted.cov + unknown, step.predicted.d_params))
 
     def _start_gyro(self) -> None:
         """With the gyro's first reading there is a second clock, from which the wheels' may be off."""

@@ -1,4 +1,4 @@
-"""Wheels that read zero while the LiDAR moves or the IMU shakes."""
+"""Wheels that read zero while the LiDAR moves, the IMU shakes or the gyro turns."""
 
 from __future__ import annotations
 
@@ -14,13 +14,17 @@ from localization.sensor_checks.window import Window
 from motion_models.se2 import FloatArray
 
 WHEELS_STANDING = Fault(
-    "the wheels read zero while {others} moved. They count as unknown there. Check the encoders, the driver of the wheels and the"
+    "the wheels read zero while {others}. They count as unknown there. Check the encoders, the driver of the wheels and the"
     " joints' names in the robot file's [joints]."
 )
 
 _RECENT_BINS, _MIN_LIDAR_S = 8, 1.0
 """Bins in which the LiDAR's speed is measured while the wheels read zero, and the least time in them [s]."""
 _STANDING_SPEED_M_S = 0.1
+_MAX_STANDING_RATE_RAD_S, _SIGMAS = 0.1, 5.0
+"""Rate of a gyro at rest at most, beside its noise: twenty times the prior sigma of the shipped robots' bias."""
+_MIN_TURNING_S = 1.0
+"""Time for which the gyro must turn to be reported: with clocks 0.1 s apart it does for a moment at the end of each turn."""
 _SHAKE_M_S2, _SHAKE_SAMPLES = 0.4, 20
 """Standard deviation of the specific force over a second: Husky outdoors at rest 0.005 to 0.11, driving 0.51 to 1.6 (5 to 95 %)."""
 _SHAKE_S = 2.0
@@ -33,6 +37,7 @@ class Standstill(Check):
     def __init__(self, faults: FaultLog, window: Window) -> None:
         self._faults, self._window, self._shaking = faults, window, ShakeDetector()
         self._stood_s = 0.0  # time for which the wheels read zero
+        self._turned_s = 0.0  # the same, while the gyro turns
         self._unknown_s = 0.0  # the same, while that is contradicted
 
     def insert_imu(self, sample: ImuSample) -> None:
@@ -42,20 +47,36 @@ class Standstill(Check):
     def apply(self, step: Step) -> Step:
         """``step`` with unknown wheels where another sensor shows motion."""
         if not step.is_standing:
-            self._unknown_s = self._stood_s = 0.0
+            self._unknown_s = self._turned_s = self._stood_s = 0.0
             return step
         self._stood_s += step.duration
+        self._turned_s = self._turned_s + step.duration if _is_turning(step) else 0.0
+        before, self._unknown_s = self._unknown_s, self._turned_s
+        others = self._moving()
+        if others:
+            self._unknown_s = self._stood_s
+        elif self._turned_s >= _MIN_TURNING_S:
+            others = "the gyro turned"
+        if others:
+            self._faults.declare(WHEELS_STANDING, self._faults.now_s - self._unknown_s, {"others": others})
+        if not self._unknown_s:
+            return step
+        return with_unknown_motion(step, max(self._unknown_s**2 - before**2, step.duration**2))
+
+    def _moving(self) -> str:
+        """What shows that the robot drives; "" where nothing does."""
         bins = [b for b in list(self._window.bins)[-_RECENT_BINS:] if b.is_standing and np.isfinite(b.lidar[0])]
         travelled, lasted = sum(math.hypot(b.lidar[0], b.lidar[1]) for b in bins), sum(b.duration_s for b in bins)
-        is_lidar_moving = lasted >= _MIN_LIDAR_S and travelled >= _STANDING_SPEED_M_S * lasted
+        if lasted >= _MIN_LIDAR_S and travelled >= _STANDING_SPEED_M_S * lasted:
+            return "the LiDAR moved"
         is_shaking = not bins and min(self._shaking.lasted_s, self._stood_s) >= _SHAKE_S
-        if not is_lidar_moving and not is_shaking:
-            self._unknown_s = 0.0
-            return step
-        before, self._unknown_s = self._unknown_s, self._stood_s
-        others = "the LiDAR" if is_lidar_moving else "the IMU shakes as if it"
-        self._faults.declare(WHEELS_STANDING, self._faults.now_s - self._unknown_s, {"others": others})
-        return with_unknown_motion(step, self._unknown_s**2 - before**2)
+        return "the IMU shakes as if it moved" if is_shaking else ""
+
+
+def _is_turning(step: Step) -> bool:
+    """Whether the gyro turns by more than its noise and bias."""
+    turn = step.turn
+    return turn is not None and abs(turn.angle) > _MAX_STANDING_RATE_RAD_S * turn.duration + _SIGMAS * math.sqrt(turn.variance)
 
 
 class ShakeDetector:

@@ -32,6 +32,29 @@ def test_wheels_that_read_zero_while_the_imu_shakes_are_unknown(shake_m_s2: floa
     assert (WHEELS_STANDING in checks.found) == is_found
 
 
+@pytest.mark.parametrize(("rate", "is_found"), [(0.3, True), (0.06, False)])
+def test_wheels_that_read_zero_while_the_gyro_turns_are_unknown(rate: float, is_found: bool) -> None:
+    """A robot that is turned by hand, or a gyro with a large bias."""
+    robot = CheckedDrive(wheels=lambda v, w: (0.0, 0.0), gyro=lambda w: rate, has_scans=False)
+    checks = robot.drive(3.0)
+    assert (WHEELS_STANDING in checks.found) == is_found
+    total = sum(step.predicted.cov[2, 2] for step in robot.applied)
+    assert (math.sqrt(total) == pytest.approx(0.5 * 3.0, rel=0.05)) == is_found
+
+
+def test_gyro_that_turns_on_for_a_moment_is_not_reported() -> None:
+    """The wheels' stamps are early: they read zero while the robot turns on."""
+    robot = CheckedDrive(has_scans=False)
+    robot.drive(3.0)
+    robot.wheels, robot.gyro = lambda v, w: (0.0, 0.0), lambda w: 0.5
+    robot.drive(0.3)
+    assert not robot.applied[-1].has_wheels  # unknown meanwhile
+    robot.gyro = lambda w: 0.0
+    robot.drive(2.0)
+    assert robot.checks.found == {}
+    assert robot.applied[-1].is_standing
+
+
 def test_robot_that_brakes_is_not_taken_for_one_that_shakes() -> None:
     """The seconds before were driven."""
     robot = CheckedDrive(has_scans=False)

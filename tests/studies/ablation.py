@@ -161,7 +161,6 @@ PATCHES: Mapping[str, Patch] = {
     "submap's error as consider state (independent noise, instead)": _wrap(Filter, "predict", _independent),
     "new surfaces' error of key scans": _wrap(Filter, "insert_key_scan", _without_new),
     "scale of the wheel noise": _attribute(filter_module, "_MAX_WHEEL_SCALE", 1.0),
-    "check of wheels that stand": _attribute(EkfFusion, "_check_standstill", lambda self, step: step),
     "excitation gate of corrections": _attribute(EkfFusion, "_is_turning", lambda self, motion: True),
     "noise of normals": _attribute(scan_matcher, "make_grid", _exact_normals),
     "key scans of new places at once": _wrap(ScanMatcher, "match", _match_without_new_place),
