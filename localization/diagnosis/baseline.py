@@ -10,11 +10,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 
-from localization.diagnosis.causes import Hypothesis
+import numpy as np
+
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.linearization import candidate_causes, make_predictor
-from localization.diagnosis.prediction import with_sizes
-from localization.diagnosis.weigh import PRIOR_SIGMAS, estimate_map, slip_stiffness_cause
+from localization.diagnosis.linearization import Noise, candidate_causes, make_predictor
+from localization.diagnosis.prediction import Baseline, DrivePredictor, with_sizes
+from localization.diagnosis.weigh import PRIOR_SIGMAS, estimate_map, slip_stiffness_cause, stiffness_exponent_cause
 from motion_models.base import MotionModel
 from motion_models.errors import CalibrationError
 from motion_models.friction import FrictionModel
@@ -31,12 +32,14 @@ _CG_SIGMA_M = 0.01
 """Of the centre of gravity by robot files, with batteries and cables that these do not have."""
 _LOG_STIFFNESS_SIGMA = 1.0
 """Of the logarithm of the slip stiffness, whatever the floor: a factor of 3 either way."""
+_STIFFNESS_EXPONENT_SIGMA = 0.5
+"""Of the power with which the stiffness grows with speed: 0 for tyres by way, 1 for contacts by rate (`friction_response`)."""
 _PASSING = frozenset({"gyro_bias", "slope"})
 """Of one drive alone."""
 
 
-def estimate_baseline(drive: Drive, model: MotionModel) -> Hypothesis:
-    """Differences of the robot of ``drive`` from its file that last.
+def estimate_baseline(drive: Drive, model: MotionModel) -> Baseline:
+    """Differences of the robot of ``drive`` from its file that last, and what noise they leave.
 
     Raises `CalibrationError` for a drive with too few windows.
     """
@@ -48,5 +51,18 @@ def estimate_baseline(drive: Drive, model: MotionModel) -> Hypothesis:
     causes = [dataclasses.replace(c, prior_sigma=sigmas[c.id]) for c in candidate_causes(predictor, moments=0) if c.id in sigmas]
     if model.name == FrictionModel.name:
         causes.append(dataclasses.replace(slip_stiffness_cause(drive.robot), prior_sigma=_LOG_STIFFNESS_SIGMA))
+        causes.append(dataclasses.replace(stiffness_exponent_cause(), prior_sigma=_STIFFNESS_EXPONENT_SIGMA))
     found = estimate_map(predictor, tuple(causes))
-    return with_sizes({c: float(v) for c, v in zip(found.causes, found.sizes, strict=True) if c.id not in _PASSING})
+    lasting = with_sizes({c: float(v) for c, v in zip(found.causes, found.sizes, strict=True) if c.id not in _PASSING})
+    noise = found.linearization.noise
+    return Baseline(lasting, _noise_over_reference(predictor, noise), noise.freedom)
+
+
+def _noise_over_reference(predictor: DrivePredictor, noise: Noise) -> tuple[float, float, float]:
+    """Median over the windows of the noise of x, y and yaw, over the motion reference's; 1 where that measured nothing."""
+    given = np.sqrt(np.diagonal(predictor.batch.cov, axis1=1, axis2=2))
+    ratios = []
+    for channel in range(3):
+        usable = np.isfinite(given[:, channel]) & (given[:, channel] > 0.0)
+        ratios.append(float(np.median(noise.sigmas[usable, channel] / given[usable, channel])) if usable.any() else 1.0)
+    return ratios[0], ratios[1], ratios[2]

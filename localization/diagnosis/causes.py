@@ -22,6 +22,8 @@ class Hypothesis:
     right_radius_scale: float = 0.0
     friction: Mapping[str, float] = field(default_factory=dict)
     """Additions to parameters of `FrictionModel`."""
+    stiffness_exponent: float = 0.0
+    """Power of the wheels' speed with which the slip stiffness grows (`friction_response`)."""
     cg: tuple[float, float] = (0.0, 0.0)
     payload_kg: float = 0.0
     lidar_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -9,20 +9,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localization.diagnosis.causes import MISSING_MESSAGES, Cause, Hypothesis
+from localization.diagnosis.causes import MISSING_MESSAGES, Cause
 from localization.diagnosis.corrected_robot import check_handover
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain, describe_loss, describe_standstill_turn, evidence, sentence
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor
-from localization.diagnosis.prediction import DrivePredictor, with_sizes
+from localization.diagnosis.prediction import Baseline, DrivePredictor, with_sizes
 from localization.diagnosis.selection import (
     aliases_of,
+    bent_causes,
     has_tolerated_substitute,
     heldout_gain,
     max_statistic,
     p_value,
     refined_cost,
     search_causes,
+    simplest_set,
     statistic,
 )
 from localization.diagnosis.verdict import (
@@ -90,13 +92,13 @@ class DiagnosisResult:
     """The last linearization of the drive: its signatures, and its noise."""
 
 
-def diagnose(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None, baseline: Hypothesis | None = None) -> Diagnosis:
+def diagnose(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None, baseline: Baseline | None = None) -> Diagnosis:
     """What is wrong with ``model`` on ``drive``, why, and the gain of correcting it; causes count from ``baseline``, by default the robot
     file (see `localization.diagnosis.baseline`)."""
     return examine(drive, model, config, baseline).diagnosis
 
 
-def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None, baseline: Hypothesis | None = None) -> DiagnosisResult:
+def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None, baseline: Baseline | None = None) -> DiagnosisResult:
     """The same, with what pictures, patches and other methods start from."""
     config = config or DiagnosisConfig()
     if len(drive.maneuvers) < config.fewest_windows:
@@ -112,12 +114,12 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
 
 def _choose_causes(predictor: DrivePredictor, first: Linearization) -> tuple[Linearization, tuple[int, ...]]:
     """The best set of causes, and the drive linearized about a hypothesis that hardly differs from it."""
-    causes, linearization = first.causes, first
+    causes, linearization, bent = first.causes, first, bent_causes(predictor, first)
     current: dict[Cause, float] = {}
     visited: list[dict[Cause, float]] = []
     visited_keys: list[frozenset[str]] = []
     for _ in range(_ROUNDS):
-        sizes = search_causes(predictor, linearization)
+        sizes = search_causes(predictor, linearization, bent)
         keys = frozenset(e.key for e in sizes)
         if keys == frozenset(e.key for e in current):
             break
@@ -128,7 +130,8 @@ def _choose_causes(predictor: DrivePredictor, first: Linearization) -> tuple[Lin
             break
         visited_keys.append(keys)
     if len(visited) > 1:  # later rounds need not be better: all sets that were preferred once are compared by one noise
-        best = min(visited, key=lambda sizes: refined_cost(predictor, linearization, sizes))
+        tried = [(refined_cost(predictor, linearization, sizes), sizes) for sizes in visited]
+        best = simplest_set(tried, refined_cost(predictor, linearization, {}), predictor)
         if set(best) != set(current):
             current = best
             linearization = linearize(predictor, causes, current, TOLERANCE)
@@ -170,7 +173,8 @@ def _conclude(
     chosen, gains, dropped = _keep_useful(linearization, chosen, config)
     sizes, _, gained = problem.fit(chosen)
     findings = _make_findings(predictor, linearization, chosen, gains, rng)
-    reference_sigmas = np.sqrt(np.diagonal(predictor.batch.cov, axis1=1, axis2=2)) if drive.kind == "log" else None
+    given = np.sqrt(np.diagonal(predictor.batch.cov, axis1=1, axis2=2)) * np.array(predictor.baseline.noise_over_reference)
+    reference_sigmas = given if drive.kind == "log" else None
     rows = attribute_rows(first, linearization, chosen, sizes, config.significance, reference_sigmas)
     left = linearization.linear - linearization.signatures[..., list(chosen)] @ sizes
     spreads = problem.scale * np.where(np.isin(np.arange(len(causes)), chosen), 1.0, problem.tolerance)

@@ -3,6 +3,11 @@
 `quasi_static_twists` solves the balance of `motion_models.friction.model` by the same Newton's method; it starts from the sample before
 where the wheels roll at nearly the same proportion. In `dynamic_twists` each wheel sample is one implicit (backward Euler) step of
 `motion_models.friction.dynamics`: stiff contact forces cannot make it unstable, and a long step ends at the quasi-static motion.
+
+By the friction model forces depend on slip over rolling speed, as of tyres whose tread is sheared by the way that it travels. Contacts that
+creep by rate, as rubber and MuJoCo's do, depend on the speed of the slip. In between, the slip stiffness K grows with the wheels' speed v:
+
+    K(v) = K (v / v_0)^n,   n = 0 by the friction model, n = 1 for forces that depend on the speed of the slip alone
 """
 
 from __future__ import annotations
@@ -16,7 +21,7 @@ from numpy.typing import NDArray
 
 from motion_models.calibration.maneuvers import IntArray
 from motion_models.errors import ModelError
-from motion_models.friction.contact import CREEP, rolling
+from motion_models.friction.contact import CREEP, rolling, tyre
 from motion_models.friction.dynamics import FrictionDynamics, _accelerations, _Body
 from motion_models.friction.equilibrium import Floor, motion, newton
 from motion_models.friction.model import FrictionModel, check_parameters, loads_at, pull_of, unit_rolls
@@ -31,16 +36,21 @@ _MIN_REDUCTION = 0.2  # slopes are good for as long as a step leaves no more tha
 _SOLVED = 1e-3  # m/s and rad/s; a step that is left farther off is the quasi-static one
 _DIFFERENCE = 1e-5
 _MAX_ROLL_CHANGE = 0.02  # of unit rolls between samples, for which the last solution starts the next
+_RATED_SPEED_M_PER_S = 0.3  # v_0, at which stiffnesses are given: a common speed of wheels
+_MIN_SPEED_M_PER_S = 0.005  # below it stiffness falls no further
 
 
-def quasi_static_twists(model: FrictionModel, params: FloatArray, wheels: FloatArray, cg: FloatArray) -> FloatArray:
-    """Body twists (N, 3) of the tracked point for wheel rates (N, 2), CG (N, 2) and ``params`` (12,), by the contact law of ``model``.
+def quasi_static_twists(
+    model: FrictionModel, params: FloatArray, wheels: FloatArray, cg: FloatArray, stiffness_exponent: float = 0.0
+) -> FloatArray:
+    """Body twists (N, 3) of the tracked point for wheel rates (N, 2), CG (N, 2) and ``params`` (12,), by the contact law of ``model``; the
+    slip stiffness grows with this power of the wheels' speed.
 
     Raises `CgError` and `ModelError` as `FrictionModel.twist` does.
     """
     check_parameters(cg, params)
     out = np.empty((len(wheels), 3))
-    _solve_quasi_static(wheels, cg, params, model.floor(params), float(model.centripetal), out)
+    _solve_quasi_static(wheels, cg, params, model.floor(params), stiffness_exponent, float(model.centripetal), out)
     lost = np.isnan(out[:, 2]) & np.isfinite(wheels).all(axis=1)
     if np.any(lost):
         raise ModelError(f"no balance of forces found for {np.count_nonzero(lost)} of {lost.size} samples.")
@@ -48,7 +58,20 @@ def quasi_static_twists(model: FrictionModel, params: FloatArray, wheels: FloatA
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _solve_quasi_static(wheels: FloatArray, cg: FloatArray, params: FloatArray, floor: Floor, centripetal: float, out: FloatArray) -> None:
+def _floor_at(speed: float, floor: Floor, exponent: float) -> Floor:
+    """``floor`` for wheels of this ``speed`` [m/s]."""
+    if exponent == 0.0:
+        return floor
+    on = floor.tyre
+    stiffness = on.stiffness * (max(speed, _MIN_SPEED_M_PER_S) / _RATED_SPEED_M_PER_S) ** exponent
+    rated = tyre(stiffness, on.mu_ratio, on.tread, on.saturation)
+    return Floor(floor.half_track, floor.half_wheelbase, rated, floor.drag, floor.scrub)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _solve_quasi_static(
+    wheels: FloatArray, cg: FloatArray, params: FloatArray, rated: Floor, exponent: float, centripetal: float, out: FloatArray
+) -> None:
     radius, mu, warp, tracked_x, tracked_y = params[0], params[3], params[8], params[10], params[11]
     vx = vy = wz = previous_l = previous_r = 0.0
     for i in range(wheels.shape[0]):
@@ -56,12 +79,15 @@ def _solve_quasi_static(wheels: FloatArray, cg: FloatArray, params: FloatArray, 
         if speed == 0.0:
             out[i] = 0.0
             continue
+        floor = _floor_at(speed, rated, exponent)
         load, _ = loads_at(cg[i, 0], cg[i, 1], warp, floor, pull_of(speed, mu, centripetal))
         found = False
         if abs(roll_l - previous_l) < _MAX_ROLL_CHANGE and abs(roll_r - previous_r) < _MAX_ROLL_CHANGE:
             vx, vy, wz, found = newton(vx, vy, wz, roll_l, roll_r, load, floor, CREEP)
         if not found:
             vx, vy, wz, found = motion(roll_l, roll_r, load, floor)
+        if not found:  # contacts that creep so much hardly balance rolling resistance
+            vx, vy, wz, found = motion(roll_l, roll_r, load, rated)
         if not found:
             out[i] = math.nan
             previous_l = previous_r = 0.0
@@ -89,6 +115,8 @@ class ManeuverSamples(NamedTuple):
     """(W,) at the begin of each maneuver [rad]."""
     slope: FloatArray
     """(2,) rise of the floor along the x and y axes in which headings count [rad]."""
+    stiffness_exponent: float
+    """Power of the wheels' speed with which the slip stiffness grows."""
 
 
 def dynamic_twists(robot: Robot, model: FrictionModel, params: FloatArray, drive: ManeuverSamples, quasi_static: FloatArray) -> FloatArray:
@@ -147,7 +175,7 @@ class _Work(NamedTuple):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _integrate(drive: ManeuverSamples, quasi_static: FloatArray, floor: Floor, body: _Body, out: FloatArray) -> None:
+def _integrate(drive: ManeuverSamples, quasi_static: FloatArray, rated: Floor, body: _Body, out: FloatArray) -> None:
     state, influence, shift, now = np.zeros(6), np.zeros(13), np.zeros(2), np.empty(3)
     influence[12] = body.height
     work = _Work(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.ones(1, dtype=np.bool_))
@@ -163,6 +191,7 @@ def _integrate(drive: ManeuverSamples, quasi_static: FloatArray, floor: Floor, b
                 before[:] = 0.0
                 out[i] = 0.0
                 continue
+            floor = _floor_at(body.radius * math.hypot(q_l, q_r) * math.sqrt(0.5), rated, drive.stiffness_exponent)
             c, s = math.cos(heading), math.sin(heading)
             influence[0], influence[1] = drive.grip_center[i, 0], drive.grip_center[i, 1]
             shift[0], shift[1] = influence[0] - drive.cg[i, 0], influence[1] - drive.cg[i, 1]

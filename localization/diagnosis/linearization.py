@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 
 from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause, Hypothesis, friction_change, slope_across
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.prediction import CHANNELS, DrivePredictor, with_sizes
+from localization.diagnosis.prediction import CHANNELS, Baseline, DrivePredictor, with_sizes
 from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import Batch
 from motion_models.diff_drive import DiffDrive
@@ -25,7 +25,6 @@ MAX_TOLERANCE_SIGMAS = 3.0
 _ROUNDS = 8
 _MOTION = 3  # channels of the motion itself
 _MIN_FREE_SHARE = 0.1  # of all numbers, however many causes there are
-_CLAIMED_WINDOWS = 4.0  # number of windows that a motion reference's own covariance counts for
 _MIN_SIGMA_OVER_CLAIMED = 0.5  # least sigma, as a share of the one that the motion reference gives
 _MAX_SWEEPS, _MAX_LAST_GAIN = 2000, 1e-8  # of the search for tolerated sizes, the latter in squares of whitened numbers
 _MEASURED_SPEED_M_PER_S = 0.05
@@ -95,14 +94,20 @@ def given_noise(rows: FloatArray, sigmas: FloatArray, follows: NDArray[np.bool_]
 
 
 def estimate_noise(
-    left: FloatArray, features: FloatArray, follows: NDArray[np.bool_], spent: FloatArray, claimed: FloatArray, creep: FloatArray
+    left: FloatArray,
+    features: FloatArray,
+    follows: NDArray[np.bool_],
+    spent: FloatArray,
+    claimed: tuple[FloatArray, float],
+    creep: FloatArray,
 ) -> Noise:
     """By ``left`` (M, 6), what the richest explanation leaves, which has used up ``spent`` (6,) degrees of freedom in each channel; errors
     of the model with the sigmas ``creep`` (M, 6) come on top.
 
-    The sigmas that the motion references give, ``claimed`` (M, 6), count as much as a few windows: short drives show little of their noise.
-    The estimate may be smaller than they are, but not by much.
+    The sigmas ``claimed`` (M, 6), which the motion references give or a drive without faults had, count for so many windows: short drives
+    show little of their noise. The estimate may be smaller than they are, but not by much.
     """
+    claimed_sigmas, windows = claimed
     known = np.isfinite(left)
     counts = known.sum(axis=0)
     free = np.maximum(counts - spent, np.maximum(_MIN_FREE_SHARE * counts, 1.0))
@@ -119,8 +124,8 @@ def estimate_noise(
             clipped = np.minimum(squares, _CLIP * variance)
             found = nnls(f / variance[:, None], clipped / variance)[0]
             variance = np.maximum(f @ found, 0.2 * float(np.median(variance)))
-        given = claimed[use, channel]
-        pooled = (free[channel] * variance + _CLAIMED_WINDOWS * given**2) / (free[channel] + _CLAIMED_WINDOWS)
+        given = claimed_sigmas[use, channel]
+        pooled = (free[channel] * variance + windows * given**2) / (free[channel] + windows)
         sigmas[use, channel] = np.hypot(np.maximum(np.sqrt(pooled), _MIN_SIGMA_OVER_CLAIMED * given), creep[use, channel])
     z = np.nan_to_num(left * np.sqrt(inflate) / sigmas, nan=0.0)
     lengths = np.abs(z).max(axis=1)
@@ -136,7 +141,7 @@ def estimate_noise(
             rho = float(a @ b / max(np.sqrt((a @ a) * (b @ b)), 1e-12))
             autocorrelation[channel] = min(max(rho - 1.0 / np.sqrt(pairs.sum()), 0.0), 0.8)
     motion = [float(free[c]) for c in range(_MOTION) if counts[c]]
-    return Noise(sigmas, mixing, autocorrelation, follows, weights, min(motion, default=1.0) + _CLAIMED_WINDOWS)
+    return Noise(sigmas, mixing, autocorrelation, follows, weights, min(motion, default=1.0) + windows)
 
 
 def _mixing(z: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
@@ -315,10 +320,10 @@ def default_model(robot: Robot) -> str:
     return FrictionModel.name if is_skid_steer(robot) else DiffDrive.name
 
 
-def make_predictor(drive: Drive, model: MotionModel, baseline: Hypothesis | None = None) -> DrivePredictor:
+def make_predictor(drive: Drive, model: MotionModel, baseline: Baseline | None = None) -> DrivePredictor:
     """From ``baseline`` (by default the robot file), with inertia where that describes the drive better, or is what the friction model
     leaves out by its nature."""
-    start = baseline or Hypothesis()
+    start = baseline or Baseline()
     plain = DrivePredictor(drive, model, has_inertia=False, baseline=start)
     if drive.kind != "log" or not is_skid_steer(drive.robot):
         return plain
@@ -419,7 +424,7 @@ def _estimate_drive_noise(
         follows = np.r_[False, drive.spans_ns[1:, 0] - drive.spans_ns[:-1, 1] < 10_000_000]
     given = np.sqrt(np.where(np.isfinite(np.diagonal(batch.cov, axis1=1, axis2=2)), np.diagonal(batch.cov, axis1=1, axis2=2), 1.0))
     sigmas = np.ones_like(linear)
-    sigmas[:, :3] = given
+    sigmas[:, :3] = given * np.array(predictor.baseline.noise_over_reference)
     sigmas[:, 3] = np.hypot(given[:, 2], 1e-3)
     sigmas[:, 4:] = 0.05
     creep = np.zeros_like(linear)
@@ -435,7 +440,7 @@ def _estimate_drive_noise(
         spent = np.sum((design @ inverse) * design, axis=1).reshape(linear.shape).sum(axis=0)
         p = len(causes)
         left = linear - signatures @ (x[:p] * scale) - nuisances @ (x[p:] * 1e3)
-        noise = estimate_noise(np.where(known, left, np.nan), features, follows, spent, sigmas, creep)
+        noise = estimate_noise(np.where(known, left, np.nan), features, follows, spent, (sigmas, predictor.baseline.windows), creep)
     return noise
 
 

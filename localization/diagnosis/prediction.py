@@ -101,6 +101,17 @@ _MAX_CONTACT_LAW = 1.3  # share of the other contact law; beyond 1 for the searc
 _NO_COLUMNS: IntArray = np.empty(0, dtype=np.int64)
 
 
+@dataclass(frozen=True)
+class Baseline:
+    """How a robot differs from its file when nothing is wrong (`localization.diagnosis.baseline`)."""
+
+    hypothesis: Hypothesis = field(default_factory=Hypothesis)
+    noise_over_reference: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """What is left of x, y and yaw on a drive without faults, over the motion reference's own sigma."""
+    windows: float = 4.0
+    """Number of windows that these sigmas count for."""
+
+
 @dataclass
 class DrivePredictor:
     """Predicts a drive's motions with one model; discrepancies are measured minus predicted.
@@ -112,8 +123,8 @@ class DrivePredictor:
     drive: Drive
     model: MotionModel
     has_inertia: bool
-    baseline: Hypothesis = field(default_factory=Hypothesis)
-    """How the robot differs from its file when nothing is wrong (`localization.diagnosis.baseline`); hypotheses count from there."""
+    baseline: Baseline = field(default_factory=Baseline)
+    """Hypotheses count from there."""
     is_gyro_scaled: bool = False
     """Whether headings are corrected by the gyro's scale against the motion reference: turning for a minute, 1 % makes 0.1 rad."""
     batch: Batch = field(init=False)
@@ -139,6 +150,11 @@ class DrivePredictor:
         self._base = quasi_static_twists(self._friction, self._friction.nominal, self.batch.wheels, self.batch.cg)
         self._kinematic_forces = self._accelerations()
         self._twists: dict[tuple[object, ...], FloatArray] = {}
+
+    @property
+    def has_baseline(self) -> bool:
+        """Whether the robot differs from its file when nothing is wrong."""
+        return self.baseline != Baseline()
 
     @property
     def nominal_twist(self) -> FloatArray:
@@ -189,7 +205,7 @@ class DrivePredictor:
 
     def discrepancies(self, hypothesis: Hypothesis) -> FloatArray:
         """(M, 6) measured minus predicted, as `CHANNELS`: motion in the predicted end's frame; NaN where nothing was measured."""
-        hypothesis = _added(self.baseline, hypothesis)
+        hypothesis = _added(self.baseline.hypothesis, hypothesis)
         batch, drive = self.batch, self.drive
         out = np.full((len(batch.ends), len(CHANNELS)), np.nan)
         reference_params = np.array([self._wheel_shift(hypothesis), hypothesis.wheel_lag_s, *self._tracked(hypothesis)])
@@ -308,7 +324,7 @@ class _HypothesisModel:
         """(N, 3) by the motion model; cached, and without derivatives for the friction model."""
         model, twists = self._p.model, self._p._twists
         if isinstance(model, FrictionModel):
-            return self._quasi_static(model, rates, cg, params)
+            return self._quasi_static(model, rates, cg, params, 0.0)
         key = (*self._rates_key(), "model")
         if key not in twists:
             twists[key] = model.twist(rates, cg, params).value
@@ -318,6 +334,7 @@ class _HypothesisModel:
         """(N, 3) change of the friction model's twists by causes of the floor, and by inertia."""
         p, b = self._p, self._b
         is_changed = b.friction or any(b.cg) or b.payload_kg or b.friction_change or b.other_contact_law or b.split_friction
+        is_changed = is_changed or b.stiffness_exponent
         if not (is_changed or any(b.slope) or p.has_inertia):
             return np.zeros((len(rates), 3))
         friction = p._friction
@@ -332,7 +349,7 @@ class _HypothesisModel:
         if b.other_contact_law:
             share = min(b.other_contact_law, _MAX_CONTACT_LAW)
             law = dataclasses.replace(friction, saturation=friction.saturation + (1.0 - 2.0 * friction.saturation) * share)
-        nominal = self._quasi_static(friction, rates, cg, friction.nominal)
+        nominal = self._quasi_static(friction, rates, cg, friction.nominal, 0.0)
         moved = cg
         if any(b.cg) or b.payload_kg:
             mass = p.drive.robot.geometry.mass_kg
@@ -355,19 +372,20 @@ class _HypothesisModel:
             - nominal
         )
 
-    def _quasi_static(self, law: FrictionModel, rates: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+    def _quasi_static(self, law: FrictionModel, rates: FloatArray, cg: FloatArray, params: FloatArray, exponent: float) -> FloatArray:
         """(N, 3) twists of the tracked point without inertia; cached, as many hypotheses share them."""
         p = self._p
         key = (
             *self._rates_key(),
             law.saturation,
+            exponent,
             params.tobytes(),
             *(self._load_key() if cg is not p.batch.cg else ()),
         )
         if key not in p._twists:
             if len(p._twists) > _MAX_CACHED_TWISTS:
                 p._twists.clear()
-            p._twists[key] = quasi_static_twists(law, params, rates, cg)
+            p._twists[key] = quasi_static_twists(law, params, rates, cg, exponent)
         return p._twists[key]
 
     def _load_key(self) -> tuple[object, ...]:
@@ -384,12 +402,13 @@ class _HypothesisModel:
         """(N, 3) twists of the tracked point, with inertia where that counts; ``centers`` (N, 2) of gravity and of the grip."""
         p, b = self._p, self._b
         cg, grip = centers
-        settled = self._quasi_static(law, rates, grip, params)
+        settled = self._quasi_static(law, rates, grip, params, b.stiffness_exponent)
         if not (p.has_inertia or any(b.slope)):
             return settled
         key = (
             *self._rates_key(),
             law.saturation,
+            b.stiffness_exponent,
             params.tobytes(),
             b.slope,
             *(self._load_key() if grip is not p.batch.cg else ()),
@@ -401,7 +420,7 @@ class _HypothesisModel:
             batch = p.batch
             turned = np.r_[0.0, np.cumsum(settled[:, 2] * batch.dt)]
             headings = p.headings - (turned[batch.first[:-1] + batch.lead] - turned[batch.first[:-1]])
-            drive = ManeuverSamples(batch.dt, rates, cg, grip, batch.first, p._last, headings, np.array(b.slope))
+            drive = ManeuverSamples(batch.dt, rates, cg, grip, batch.first, p._last, headings, np.array(b.slope), b.stiffness_exponent)
             twists = dynamic_twists(p.drive.robot, law, params, drive, middle)
             p._twists[key] = np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
         return p._twists[key]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -33,8 +34,12 @@ _BLOCK_WINDOWS, _FOLDS, _BOOTSTRAP_DRAWS = 4, 5, 1000
 def cost(problem: Regression, groups: list[str], subset: tuple[int, ...]) -> float:
     """Twice the negative log-odds of ``subset`` against naming nothing: every number of causes is as likely as the next, and so are all
     sets of one number (the prior of the extended BIC of Chen & Chen 2008, with gamma = 1)."""
-    k = len(subset)
-    return 2.0 * math.log(math.comb(len(set(groups)), k)) + k * math.log(max(problem.count, 2)) - problem.gain(subset)
+    return price(problem.count, len(set(groups)), len(subset)) - problem.gain(subset)
+
+
+def price(count: int, choices: int, k: int) -> float:
+    """Twice the negative log-prior of one set of ``k`` of so many ``choices``, on ``count`` numbers."""
+    return 2.0 * math.log(math.comb(choices, k)) + k * math.log(max(count, 2))
 
 
 def rank_subsets(problem: Regression, groups: list[str], allowed: FloatArray, kept: int = _KEPT) -> list[tuple[float, tuple[int, ...]]]:
@@ -157,17 +162,42 @@ def heldout_squares(
 _MIN_ALIAS_CORRELATION = 0.7  # signatures that correlate less than this are no aliases, however short the drive
 _ALIAS_LOG_ODDS = 7.0  # twice the log-likelihood by which a rival may be worse: odds of 1 to 33
 _ALIAS_SHARE = 0.02  # or this share of what the cause explains: accuracy of the model
+_BASELINE_SHARE = 0.05  # the same for a robot that does not follow the friction model when nothing is wrong
 _REFINED_SETS = 2  # sets of each number of causes that are tried by full prediction
 _MAX_MISSING_SHARE = 0.1  # share of what signatures promise that may be missing
 _FEW_CAUSES, _EXTRA_SETS = 2, 4  # then so many sets of up to so many causes are tried by full prediction
+_MAX_BEND = 0.3  # of the whole change: of sizes off by so much other causes make up for the rest
 _NEAR_LOG_EVIDENCE = 30.0
 _CLEAR_LOG_EVIDENCE = 200.0  # lead in twice the log-evidence that needs no trial
 _MAX_STEPS, _SHORTER_STEP = 6, 0.3
 _CONVERGED_STEP, _LONG_STEP = 0.02, 0.2  # steps, over typical sizes: one that ends, and one after which signatures are taken anew
 
 
-def search_causes(predictor: DrivePredictor, linearization: Linearization) -> dict[Cause, float]:
-    """Sizes of the best set of causes: the best few sets by signatures are compared by full predictions at their own sizes."""
+def bent_causes(predictor: DrivePredictor, first: Linearization) -> tuple[int, ...]:
+    """Causes whose signatures about the robot file mislead at their typical sizes: how far a robot turns grows with the square of how far
+    its load lies off the middle, so that a step of a tenth need not even have the sign of the whole."""
+    return tuple(i for i, cause in enumerate(first.causes) if any(_is_bent(predictor, first, i, start) for start in _half_sizes(cause)))
+
+
+def _half_sizes(cause: Cause) -> tuple[float, ...]:
+    """Half the typical size, to both sides where it has two."""
+    return (0.5 * cause.typical,) if cause.one_sided else (0.5 * cause.typical, -0.5 * cause.typical)
+
+
+def _is_bent(predictor: DrivePredictor, first: Linearization, i: int, half: float) -> bool:
+    """Whether twice the size ``half`` of cause ``i`` does not act as its signature promises, or is one that no such robot can have."""
+    size = 2.0 * half
+    try:
+        whole = first.noise.whiten(first.rows - predictor.discrepancies(with_sizes({first.causes[i]: size})))
+    except (CgError, ModelError):
+        return True
+    off = float(np.sum((whole - first.noise.whiten(first.signatures[..., i] * size)) ** 2))
+    return off > max(_MAX_BEND**2 * float(np.sum(whole**2)), _ALIAS_LOG_ODDS)
+
+
+def search_causes(predictor: DrivePredictor, linearization: Linearization, bent: tuple[int, ...] = ()) -> dict[Cause, float]:
+    """Sizes of the best set of causes: the best few sets by signatures are compared by full predictions at their own sizes, and so is each
+    of the ``bent`` causes alone, from half its typical size to both sides."""
     causes, problem = linearization.causes, linearization.problem
     groups = [group_of(e) for e in causes]
     ranked = rank_subsets(problem, groups, _bounds(causes))
@@ -198,7 +228,23 @@ def search_causes(predictor: DrivePredictor, linearization: Linearization) -> di
             alike += [s for _, s in ranked if len(s) == size][:_EXTRA_SETS]
         for subset in alike:
             cost_of(subset)
-    return min(results.values(), key=lambda r: r[0])[1]
+    for i in bent:
+        for start in _half_sizes(causes[i]):
+            refined, single_cost = _refined_cost(predictor, linearization, {causes[i]: start})
+            if single_cost < results.get((i,), (math.inf, {}))[0]:
+                results[(i,)] = single_cost, refined
+    return simplest_set(list(results.values()), cost_of(()), predictor)
+
+
+def simplest_set(tried: Sequence[tuple[float, dict[Cause, float]]], nothing: float, predictor: DrivePredictor) -> dict[Cause, float]:
+    """The set with the least of the costs ``tried``; of a robot that does not follow the friction model, the best one of the fewest causes
+    that explain as much of ``nothing``, the cost of no cause, but for the model's accuracy.
+
+    By more causes a set would only repair how this robot responds to one of them.
+    """
+    least = min(cost for cost, _ in tried)
+    margin = max(_ALIAS_LOG_ODDS, _BASELINE_SHARE * (nothing - least)) if predictor.has_baseline else 0.0
+    return min(((len(sizes), cost, sizes) for cost, sizes in tried if cost <= least + margin), key=lambda s: s[:2])[2]
 
 
 def refined_cost(predictor: DrivePredictor, linearization: Linearization, sizes: dict[Cause, float]) -> float:
@@ -212,6 +258,8 @@ def aliases_of(predictor: DrivePredictor, linearization: Linearization, chosen: 
     others = tuple(j for j in chosen if j != i)
     base, own = problem.gain(others), problem.gain(chosen)
     tolerance = max(_ALIAS_LOG_ODDS, _ALIAS_SHARE * (own - base))
+    # without faults the robot does not follow the model: signatures may miss more, and the predictor itself decides
+    promised = max(tolerance, _MAX_MISSING_SHARE * (own - base)) if predictor.has_baseline else tolerance
     found: dict[str, tuple[float, int]] = {}
     for j in _substitutes(causes, chosen):
         cause = causes[j]
@@ -220,13 +268,16 @@ def aliases_of(predictor: DrivePredictor, linearization: Linearization, chosen: 
         subset = (*others, j)
         gain = problem.gain(subset)
         size = float(problem.fit(subset)[0][-1])
-        if own - gain > tolerance or (cause.one_sided and size < 0.0) or abs(size) > cause.largest:
+        if own - gain > promised or (cause.one_sided and size < 0.0) or abs(size) > cause.largest:
             continue
         if cause.id not in found or gain > found[cause.id][0]:
             found[cause.id] = gain, j
     if not found:
         return ()
     best = refined_cost(predictor, linearization, _linear_sizes(linearization, chosen))
+    if predictor.has_baseline:
+        explained = refined_cost(predictor, linearization, _linear_sizes(linearization, others)) - best
+        tolerance = max(_ALIAS_LOG_ODDS, _BASELINE_SHARE * explained)
     costs = []
     for _, j in found.values():
         sizes, cost = _refined_cost(predictor, linearization, _linear_sizes(linearization, (*others, j)))
@@ -260,8 +311,7 @@ def _substitutes(causes: tuple[Cause, ...], chosen: tuple[int, ...]) -> list[int
 def _cost(linearization: Linearization, sizes: dict[Cause, float], rows: FloatArray) -> float:
     """What ``rows`` (M, 6), which ``sizes`` leave, are off beyond all tolerances, and the price of so many causes."""
     whole = _regression_of(linearization, rows, linearization.signatures)
-    k, groups = len(sizes), len({group_of(e) for e in linearization.causes})
-    return whole.misfit() + k * math.log(max(whole.count, 2)) + 2.0 * math.log(math.comb(groups, k))
+    return whole.misfit() + price(whole.count, len({group_of(e) for e in linearization.causes}), len(sizes))
 
 
 def _regression_of(linearization: Linearization, rows: FloatArray, signatures: FloatArray) -> Regression:

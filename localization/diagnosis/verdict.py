@@ -14,9 +14,9 @@ from scipy.stats import chi2
 from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause
 from localization.diagnosis.drive import drive_of_table
 from localization.diagnosis.findings import MAX_NOISE_OVER_REFERENCE, Attribution, Component, Finding, Trend, Verdict
-from localization.diagnosis.linearization import Linearization, Noise, regression
+from localization.diagnosis.linearization import Linearization, Noise, group_of, regression
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, DrivePredictor, with_sizes
-from localization.diagnosis.selection import max_statistic, p_value, statistics
+from localization.diagnosis.selection import max_statistic, p_value, price, statistics
 from motion_models.calibration.maneuvers import IntArray, Maneuver
 from motion_models.se2 import FloatArray
 
@@ -34,41 +34,60 @@ _MAX_S = 120.0
 _ENOUGH = 9.0  # twice the log-likelihood that decides
 
 
-def features(predictor: DrivePredictor) -> dict[str, FloatArray]:
-    """Trends by name, each (M,) a number per measured pose."""
-    batch = predictor.batch
-    twist, cg = predictor._base, batch.cg
-    rows: list[list[float]] = []
+def trend_motions(predictor: DrivePredictor) -> dict[str, FloatArray]:
+    """Trends by name, each (M, 3, 3): what a twist that follows the trend moves at every measured pose, in the predicted end's frame, by
+    the component of the twist (last axis). On arcs a slip along x is seen in y as well, and one of the turning rate in all three."""
+    batch, twist = predictor.batch, predictor.nominal_twist
+    rows = []
     for end, owner in zip(batch.ends, batch.owner, strict=True):
         a = batch.first[owner] + batch.lead[owner]
         t, dt = twist[a:end], batch.dt[a:end]
-        v, w = t[:, 0], t[:, 2]
-        whole = dt.sum()
-        heading = predictor.headings[owner]
-        clock = predictor.drive.starts_s[owner]
-        driven, turned = float(v @ dt), float(w @ dt)
-        x, y = float(cg[a:end, 0] @ dt / whole), float(cg[a:end, 1] @ dt / whole)
-        rows.append(
-            [
-                *(whole, driven, abs(driven), turned, abs(turned)),
-                *(float((v * w) @ dt), float((v * np.abs(w)) @ dt), float((np.abs(v) * w) @ dt), float((w * np.abs(w)) @ dt)),
-                *(float((v * np.abs(v)) @ dt), turned * x, turned * y, abs(turned) * x, abs(turned) * y, driven * x, driven * y),
-                *(clock, clock * driven, clock * turned, np.cos(heading) * whole, np.sin(heading) * whole),
-                *(np.cos(heading) * driven, np.sin(heading) * driven, np.cos(heading) * turned, np.sin(heading) * turned),
-                *(float(v[-1] - v[0]), float(w[-1] - w[0])),
-            ]
-        )
-    names = (
-        *("time that passes", "distance", "distance either way", "turning", "turning either way"),
-        *("v wz", "v |wz|", "|v| wz", "wz |wz|"),
-        *("v |v|", "turning x CG x", "turning x CG y", "turning either way x CG x", "turning either way x CG y"),
-        *("distance x CG x", "distance x CG y"),
-        *("time into the drive", "distance x time into the drive", "turning x time into the drive"),
-        *("heading (cosine)", "heading (sine)", "distance x heading (cosine)", "distance x heading (sine)"),
-        *("turning x heading (cosine)", "turning x heading (sine)", "gain in speed", "gain in turning rate"),
+        turned = np.cumsum(t[:, 2] * dt) - 0.5 * t[:, 2] * dt
+        heading, clock = predictor.headings[owner] + turned, predictor.drive.starts_s[owner]
+        rows.append(_moved_by(t, dt, _increments(t, dt, batch.cg[a:end], heading, float(clock))))
+    table = np.stack(rows)
+    return {name: table[..., i] for i, name in enumerate(_TREND_NAMES) if np.ptp(table[:, 2, 2, i]) > 1e-9 or i == 0}
+
+
+_TREND_NAMES = (
+    *("time that passes", "distance", "distance either way", "turning", "turning either way"),
+    *("v wz", "v |wz|", "|v| wz", "wz |wz|"),
+    *("v |v|", "turning x CG x", "turning x CG y", "turning either way x CG x", "turning either way x CG y"),
+    *("distance x CG x", "distance x CG y"),
+    *("time into the drive", "distance x time into the drive", "turning x time into the drive"),
+    *("heading (cosine)", "heading (sine)", "distance x heading (cosine)", "distance x heading (sine)"),
+    *("turning x heading (cosine)", "turning x heading (sine)", "gain in speed", "gain in turning rate"),
+)
+
+
+def _increments(twist: FloatArray, dt: FloatArray, cg: FloatArray, heading: FloatArray, clock: float) -> FloatArray:
+    """(n, K) what each trend of `_TREND_NAMES` adds in each interval of a window: its density times the interval."""
+    v, w = twist[:, 0], twist[:, 2]
+    c, s = np.cos(heading), np.sin(heading)
+    density = (
+        *(np.ones(len(dt)), v, np.abs(v), w, np.abs(w)),
+        *(v * w, v * np.abs(w), np.abs(v) * w, w * np.abs(w)),
+        *(v * np.abs(v), w * cg[:, 0], w * cg[:, 1], np.abs(w) * cg[:, 0], np.abs(w) * cg[:, 1]),
+        *(v * cg[:, 0], v * cg[:, 1]),
+        *(np.full(len(dt), clock), clock * v, clock * w),
+        *(c, s, c * v, s * v, c * w, s * w),
     )
-    table = np.array(rows)
-    return {name: table[:, i] for i, name in enumerate(names) if np.ptp(table[:, i]) > 1e-9 or i == 0}
+    gains = np.diff(v, prepend=v[0]), np.diff(w, prepend=w[0])
+    return np.column_stack([*(d * dt for d in density), *gains])
+
+
+def _moved_by(twist: FloatArray, dt: FloatArray, increments: FloatArray) -> FloatArray:
+    """(3, 3, K) change of a window's last pose, in its frame, by the ``increments`` (n, K) of each component (second axis) of the twist."""
+    turned = np.cumsum(twist[:, 2] * dt)
+    before = turned - 0.5 * twist[:, 2] * dt - turned[-1]
+    c, s = np.cos(before), np.sin(before)
+    steps = np.column_stack([c * twist[:, 0] - s * twist[:, 1], s * twist[:, 0] + c * twist[:, 1]]) * dt[:, None]
+    ahead = steps[::-1].cumsum(axis=0)[::-1] - 0.5 * steps
+    moved = np.zeros((3, 3, increments.shape[1]))
+    moved[0, 0], moved[1, 0] = c @ increments, s @ increments
+    moved[0, 1], moved[1, 1] = -s @ increments, c @ increments
+    moved[0, 2], moved[1, 2], moved[2, 2] = -ahead[:, 1] @ increments, ahead[:, 0] @ increments, increments.sum(axis=0)
+    return moved
 
 
 def find_trends(
@@ -92,19 +111,22 @@ def find_trends(
     whitened = noise.whiten(left)
     rest = np.column_stack([np.sum(whitened**2, axis=0), np.isfinite(left).sum(axis=0)]).astype(float)  # squares and degrees of freedom
     t_channels = np.array([CHANNELS.index(channel) for channel, _ in names])
+    squares = np.sum(noise.whiten(trends) ** 2, axis=0)
+    own_shares = squares[t_channels, np.arange(n)] / np.maximum(squares.sum(axis=0), 1e-12)
     given: tuple[int, ...] = ()
     result = []
     gained = 0.0
     for _ in range(3):
         t = np.zeros(n)
         free = [i for i in range(n) if i not in given]
-        t[free] = statistics(problem, given, free) / _residual_sigmas(rest, t_channels[free], statistics(problem, given, free))
+        alone = statistics(problem, given, free)
+        t[free] = alone / _residual_sigmas(rest, t_channels[free], alone * np.sqrt(own_shares[free]))
         best = int(np.argmax(np.abs(t)))
         freedom = max(min(noise.freedom, rest[t_channels[best], 1] - 1.0), 1.0)
         p = p_value(float(t[best]), max_statistic(problem, given, rng, freedom, n), freedom)
         if p > _SIGNIFICANT:
             break
-        rest[t_channels[best], 0] -= float(statistics(problem, given, [best])[0]) ** 2
+        rest[t_channels[best], 0] -= own_shares[best] * float(statistics(problem, given, [best])[0]) ** 2
         rest[t_channels[best], 1] -= 1.0
         gained += float(t[best]) ** 2
         result.append(Trend(*names[best], float(t[best]), p, abs(float(t[best])) / math.sqrt(len(left))))
@@ -118,7 +140,7 @@ def find_better_trends(predictor: DrivePredictor, linearization: Linearization, 
     Where a cause of the catalogue is at work, no shape without a cause fits better but by chance: both are compared by their likelihood
     ratio against the other causes, beyond what so many trends gain by chance and the accuracy of signatures. Distance and turning are not
     compared: causes of the catalogue have these shapes (radii, rotation), so that they are no sign of an unknown effect. In place of
-    several causes a trend is simpler, and is preferred where it fits as well.
+    several causes a trend is simpler: both pay for their number as in the search for causes.
     """
     trends, names = _trend_columns(predictor, linearization.linear)
     y = linearization.noise.whiten(linearization.linear).ravel()
@@ -127,6 +149,7 @@ def find_better_trends(predictor: DrivePredictor, linearization: Linearization, 
     n, spreads = len(names), linearization.problem.scale
     is_rival = np.array([name not in _SHAPES_OF_CAUSES for _, name in names])
     problem = regression(y, s, z, np.r_[np.ones(n), spreads], np.r_[np.zeros(n), spreads * linearization.problem.tolerance])
+    groups = len({group_of(cause) for cause in linearization.causes})
     found = []
     for replaced in ([i] for i in chosen) if len(chosen) < 2 else (*([i] for i in chosen), list(chosen)):
         others = tuple(n + j for j in chosen if j not in replaced)
@@ -135,31 +158,36 @@ def find_better_trends(predictor: DrivePredictor, linearization: Linearization, 
         t = np.where(is_rival, statistics(problem, others, list(range(n))), 0.0)
         best = int(np.argmax(np.abs(t)))
         lead = float(t[best]) ** 2 - own
-        margin = max(_LEAD_LOG_ODDS + 2.0 * math.log(n), _LEAD_SHARE * own) if len(replaced) == 1 else 0.0
+        if len(replaced) == 1:
+            margin = max(_LEAD_LOG_ODDS + 2.0 * math.log(n), _LEAD_SHARE * own)
+        else:
+            margin = price(problem.count, n, 1) - price(problem.count, groups, len(replaced))
         if lead > margin:
             p = min(1.0, n * float(chi2.sf(max(lead, 0.0), 1)))
             names_replaced = " and ".join(dict.fromkeys(linearization.causes[i].id for i in replaced))
-            over = math.sqrt(lead / len(linearization.rows))
+            over = math.sqrt(max(lead, 0.0) / len(linearization.rows))
             found.append(Trend(*names[best], float(t[best]), p, over, names_replaced))
     return tuple(found)
 
 
 def _trend_columns(predictor: DrivePredictor, rows: FloatArray) -> tuple[FloatArray, list[tuple[str, str]]]:
-    """(M, 6, n) trends of unit root mean square, each in one component of the motion, and their components and names."""
+    """(M, 6, n) trends of unit root mean square, each of one component of the twist, and their components and names."""
     columns, names = [], []
+    motions = trend_motions(predictor)
     for channel in range(_COMPONENTS):
         if not np.isfinite(rows[:, channel]).any():
             continue
-        for name, values in features(predictor).items():
+        for name, moved in motions.items():
             column = np.zeros(rows.shape)
-            column[:, channel] = values / max(float(np.sqrt(np.mean(values**2))), 1e-12)
+            column[:, :_COMPONENTS] = moved[:, :, channel] / max(float(np.sqrt(np.mean(moved[:, channel, channel] ** 2))), 1e-12)
             columns.append(np.where(np.isfinite(rows), column, np.nan))
             names.append((CHANNELS[channel], name))
     return np.stack(columns, axis=-1), names
 
 
 def _residual_sigmas(rest: FloatArray, channels: IntArray, t: FloatArray) -> FloatArray:
-    """(n,) standard deviation that is left of each trend's channel with the trend taken out, in units of the noise; at most 1.
+    """(n,) standard deviation that is left of each trend's channel with its part ``t`` (n,) of the trend taken out, in units of the noise;
+    at most 1.
 
     Noise that was estimated while the trend was in it is too large. ``rest`` (6, 2) are each channel's squares and degrees of freedom.
     """

@@ -60,6 +60,7 @@ PRIOR_SIGMAS: Mapping[str, float] = {
 """How far robots, floors and mounts differ from their files, as a sigma in the cause's unit: what the weighing must not take for a load.
 
 Scrub cannot be negative: its prior is cut there (see `_truncated`)."""
+STIFFNESS_EXPONENT = "stiffness_exponent"
 _SLIP_STIFFNESS_SIGMA = 0.3
 """Of the tyres' slip stiffness, relative: 7.7 to 13.3 on the robots of `tests.studies.contact_law`."""
 _MAX_PRIOR_SIGMAS = 4.0
@@ -259,6 +260,17 @@ def slip_stiffness_cause(robot: Robot) -> Cause:
     return Cause("slip_stiffness", "1", meaning, _SLIP_STIFFNESS_SIGMA, 0.03, inject, words, prior_sigma=_SLIP_STIFFNESS_SIGMA)
 
 
+def stiffness_exponent_cause() -> Cause:
+    """How the slip stiffness grows with the wheels' speed."""
+
+    def inject(b: Hypothesis, size: float) -> Hypothesis:
+        return dataclasses.replace(b, stiffness_exponent=b.stiffness_exponent + size)
+
+    words = "the tyres' slip stiffness grows with speed, by the power {}", "the tyres' slip stiffness falls with speed, by the power {}"
+    meaning = "power of the wheels' speed with which the slip stiffness grows"
+    return Cause(STIFFNESS_EXPONENT, "1", meaning, 0.5, 0.1, inject, words)
+
+
 def _truncated(mean: FloatArray, cov: FloatArray, i: int, least: float) -> tuple[FloatArray, FloatArray]:
     """Moments of the Gaussian with ``mean`` (p,) and ``cov`` (p, p) where its number ``i`` is at least ``least``.
 
@@ -287,7 +299,7 @@ def _limited(step: FloatArray, causes: tuple[Cause, ...]) -> tuple[FloatArray, f
 
 
 def _held(values: FloatArray, causes: tuple[Cause, ...], predictor: DrivePredictor) -> FloatArray:
-    """``values`` (p,) within `_MAX_PRIOR_SIGMAS`, and the CG at most 0.9 of the way to an axle or a side."""
+    """``values`` (p,) within `_MAX_PRIOR_SIGMAS`, the CG at most 0.9 of the way to an axle or a side, stiffness between both laws."""
     g, given = predictor.drive.robot.geometry, predictor.batch.cg.mean(axis=0)
     edge = 0.45 * np.array([g.wheelbase_m, g.track_width_m])
     held = np.clip(values, *(sign * _MAX_PRIOR_SIGMAS * np.array([cause.plausible for cause in causes]) for sign in (-1.0, 1.0)))
@@ -295,6 +307,8 @@ def _held(values: FloatArray, causes: tuple[Cause, ...], predictor: DrivePredict
         if cause.id in _CG:
             axis = _CG.index(cause.id)
             held[i] = np.clip(given[axis] + values[i], -edge[axis], edge[axis]) - given[axis]
+        elif cause.id == STIFFNESS_EXPONENT:
+            held[i] = np.clip(values[i], 0.0, 1.0)
     return np.asarray(held)
 
 

@@ -14,18 +14,30 @@ from typing import Any
 
 import numpy as np
 
+from localization.diagnosis.diagnose import TOLERANCE
 from localization.report import figures
 from tests.helpers.diagnosis_drives import TYPICAL
 from tests.helpers.diagnosis_rivals import NONE
 
 Row = dict[str, Any]
-STRONG = 3.0
+STRONG, CLEAR = 3.0, 5.0  # sigmas
 _CONFIDENT = ("explained", "ambiguous")
 
 
 def significance(row: Row) -> float:
     """Of the weakest hidden cause; inf for one that the drive does not show at all."""
     return min((np.inf if s is None else s for s in row.get("significance", {}).values()), default=0.0)
+
+
+def significance_beyond_tolerance(row: Row) -> float:
+    """Of the weakest hidden cause, where a robot of the same file may have a part of it without any fault: over the drive's sigma and the
+    sigma that is tolerated of the cause itself, which `significance` leaves out."""
+    found = []
+    for name, of_drive in row.get("significance", {}).items():
+        size = abs(row["truth"][name])
+        sigma = 0.0 if of_drive is None else size / max(of_drive, 1e-9)
+        found.append(size / max(float(np.hypot(sigma, TOLERANCE * (row["tolerated"][name] or 0.0))), 1e-9))
+    return min(found, default=0.0)
 
 
 def is_beyond_tolerance(row: Row) -> bool:
@@ -76,6 +88,7 @@ def report(rows: Sequence[Row]) -> str:
     """Tables in Markdown."""
     single, pairs, nulls = ([r for r in rows if r["kind"] == kind] for kind in ("single", "pair", "null"))
     strong = [r for r in single if significance(r) >= STRONG and is_beyond_tolerance(r)]
+    clear = [r for r in strong if significance_beyond_tolerance(r) >= CLEAR]
     inside = [is_inside(r, f) for r in rows for f in r["findings"] if f["cause"] in r["truth"]]
     lines = [
         f"{len(rows)} cases: {len(single)} with one cause, {len(pairs)} with two, {len(nulls)} with none",
@@ -83,6 +96,8 @@ def report(rows: Sequence[Row]) -> str:
         "| figure | measured |",
         "|---|---|",
         f"| right name or alias set first, over 3 sigma and tolerance | {share([is_first(r) for r in strong])} |",
+        f"| over 5 sigma | {share([is_first(r) for r in strong if significance(r) >= CLEAR])} |",
+        f"| over 5 sigma of drive and tolerance together | {share([is_first(r) for r in clear])} |",
         f"| the same, all sizes | {share([is_first(r) for r in single])} |",
         f"| pairs over 3 sigma and tolerance: both named | {share([all(is_named(r, c) for c in r['truth']) for r in _strong(pairs)])} |",
         f"| false alarms where nothing is hidden | {share([is_alarm(r) for r in nulls])} |",

@@ -107,3 +107,9 @@ VERIFYING: Mapping[str, Callable[[Drive], Drive]] = {
     "turns slip from time to time": _by_wheels(lambda m, h, t: (m, h * (1.0 + 0.12 * np.sin(6.0 * math.pi * t)))),
 }
 """Effects that no threshold of the diagnosis was chosen on."""
+FURTHER: Mapping[str, Callable[[Drive], Drive]] = {
+    "pull to the left with the square of speed": _by_wheels(lambda m, h, t: (m, h - 0.006 * m * np.abs(m))),
+    "wheels slip in the third quarter": _by_wheels(lambda m, h, t: (np.where((t > 0.5) & (t < 0.75), 1.06 * m, m), h)),
+    "map sheared along diagonals": _by_reference(lambda p, t, h: p + np.array([0.0, 0.05 * p[0] * math.sin(2.0 * h), 0.0])),
+}
+"""Effects that were invented after all of the above were used."""

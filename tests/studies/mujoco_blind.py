@@ -19,9 +19,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from localization.diagnosis.baseline import estimate_baseline
-from localization.diagnosis.causes import Hypothesis
 from localization.diagnosis.diagnose import DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log
+from localization.diagnosis.prediction import Baseline
 from localization.logs import open_log
 from localization.simulation.experiments import Experiment, ExperimentConfig, Phase
 from localization.simulation.faults import FAULTS
@@ -111,13 +111,13 @@ def drive_mujoco(robot: Robot, experiment: Experiment, effects: Mapping[str, flo
 
 
 @functools.cache
-def healthy(robot_name: str, experiment: Experiment = HEALTHY) -> Hypothesis:
+def healthy(robot_name: str, experiment: Experiment = HEALTHY) -> Baseline:
     """How the healthy robot in MuJoCo differs from its file."""
     robot = load_robot(robot_name)
     return estimate_baseline(drive_mujoco(robot, experiment, {}, _HEALTHY_SEED), make_model("friction", robot))
 
 
-def diagnose_mujoco(robot_name: str, route: str, effects: Mapping[str, float], seed: int, baseline: Hypothesis) -> DiagnosisResult:
+def diagnose_mujoco(robot_name: str, route: str, effects: Mapping[str, float], seed: int, baseline: Baseline) -> DiagnosisResult:
     """Diagnosis of a drive in MuJoCo with hidden ``effects``, by the bag, the robot file and the ``baseline`` of the healthy robot."""
     robot = load_robot(robot_name)
     return examine(drive_mujoco(robot, drive(route), effects, seed), make_model("friction", robot), baseline=baseline)

@@ -1,7 +1,8 @@
 """What the diagnosis makes of effects that no cause describes, on several robots and drives. `python -m tests.studies.unknown_effects`.
 
 Thresholds were developed on the effects of `UNKNOWN` (`--develop`); without it the study takes those of `VERIFYING`, other robots, drives
-and seeds. Drives are kept in --folder, so that a second run takes less time.
+and seeds. `--further` adds effects that were invented later, on drives of their own. Drives are kept in --folder, so that a second run
+takes less time.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from localization.diagnosis.drive import Drive, drive_of_log
 from localization.logs import open_log
 from motion_models.registry import make_model
 from tests.helpers.diagnosis_drives import bag, drive, robot_named
-from tests.helpers.diagnosis_unknown import UNKNOWN, VERIFYING
+from tests.helpers.diagnosis_unknown import FURTHER, UNKNOWN, VERIFYING
 
 DEVELOPING_DRIVES = (("husky_a200", "tour", 508), ("vaultbot", "random_11", 509), ("warthog", "random_12", 510))
 VERIFYING_DRIVES = (
@@ -25,6 +26,12 @@ VERIFYING_DRIVES = (
     ("warthog", "tour", 812),
     ("vaultbot", "random_703", 813),
     ("husky_a200", "random_704", 814),
+)
+FURTHER_DRIVES = (
+    ("jackal", "random_801", 911),
+    ("vaultbot", "tour", 912),
+    ("scout_2", "random_802", 913),
+    ("husky_a200", "random_803", 914),
 )
 
 
@@ -42,9 +49,12 @@ def nominal(robot: str, route: str, seed: int, folder: Path) -> Drive:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--develop", action="store_true")
+    parser.add_argument("--further", action="store_true")
     parser.add_argument("--folder", type=Path, default=Path("unknown-effects"))
     options = parser.parse_args()
     effects, drives = (UNKNOWN, DEVELOPING_DRIVES) if options.develop else (VERIFYING, VERIFYING_DRIVES)
+    if options.further:
+        effects, drives = {**VERIFYING, **FURTHER}, FURTHER_DRIVES
     verdicts: Counter[str] = Counter()
     for robot, route, seed in drives:
         plain = nominal(robot, route, seed, options.folder)
