@@ -156,7 +156,7 @@ class Filter:
     def map_relative_cov(self) -> Cov3:
         """(3, 3) covariance of the pose against the submap around the robot: that of the prior of a match."""
         P = self.P
-        return np.asarray(P[POSE, POSE] + P[MAP, MAP] - P[POSE, MAP] - P[MAP, POSE])
+        return _positive(P[POSE, POSE] + P[MAP, MAP] - P[POSE, MAP] - P[MAP, POSE])
 
     def motion_since(self, clone: slice) -> tuple[Pose2, Cov3]:
         """Motion (3,) since the clone `START` or `KEY`, and its covariance (3, 3)."""

@@ -209,7 +209,7 @@ class ScanMatcher:
         """Draw a scan from ``pose`` (3,). ``map_cov`` (3, 3) of the submap's error there: with it, old scans stay while they fit."""
         drawn = np.asarray(se2.transform(pose, points))
         scan = make_grid(drawn, self.cell, self._config.range_noise_m)
-        share, new = (1.0, 1.0) if self._grid is None else measure_shares(self._grid, scan)
+        share, new = (1.0, 0.0) if self._grid is None else measure_shares(self._grid, scan)
         self._keys = [*self._fitting_keys(pose, points, map_cov), KeyScan(drawn, pose, np.zeros((3, 3)) if map_cov is None else map_cov)]
         self._draw()
         assert self._grid is not None
