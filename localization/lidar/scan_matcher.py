@@ -265,7 +265,7 @@ class ScanMatcher:
             self._image = draw_image(self._grid.means, self.cell)
         limit = np.minimum(np.maximum(_SEARCH_LIMIT, 3.0 * np.sqrt(np.diagonal(cov))), _WIDEST_SEARCH)
         best = search(self._image, voxel_means(points, self.cell), prior, wide, limit)
-        is_clear = best.margin >= _OUTLIER_COST if not is_narrow(cov) else best.rival_score < _MAX_RIVAL * best.score
+        is_clear = best.rival_score < _MAX_RIVAL * best.score if _is_within_search(cov) else best.margin >= _OUTLIER_COST
         return best.pose if is_clear else None
 
     def _result(self, fit: Fit, outlier_cov: Cov3) -> ScanMatch:
@@ -310,6 +310,11 @@ def _is_within_basin(fit: Fit, cov: Cov3) -> bool:
 def is_narrow(cov: Cov3) -> bool:
     """Whether a pose with ``cov`` (3, 3) is within the basin of Gauss-Newton."""
     return bool(np.linalg.eigvalsh(cov[:2, :2])[-1] < _BASIN_M**2 and cov[2, 2] < _BASIN_RAD**2)
+
+
+def _is_within_search(cov: Cov3) -> bool:
+    """Whether the window of a search covers 3 sigma of ``cov`` (3, 3): else a place is to be found, and has to be clear."""
+    return bool((3.0 * np.sqrt(np.diagonal(cov)) <= _SEARCH_LIMIT).all())
 
 
 def _is_better(found: Fit, fit: Fit, prior: Pose2, cov: Cov3) -> bool:
