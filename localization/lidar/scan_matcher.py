@@ -48,7 +48,8 @@ _NO_JUMP = np.zeros(3)
 _SEARCH_LIMIT, _WIDEST_SEARCH = np.array([3.0, 3.0, 1.0]), np.array([15.0, 15.0, math.pi])
 """Half the window of a search at most, for a prior that may be an outlier, and for one that is wide itself [m, m, rad]."""
 _MAX_RIVAL = 0.9
-"""A search is ambiguous where a pose elsewhere scores more than this share of the best."""
+"""A search is ambiguous where a pose elsewhere scores more than this share of the best; where the prior is wider than its window, where one
+is more probable than exp(-`_OUTLIER_COST`) of the best."""
 _BASIN_M, _BASIN_RAD = 0.15, 0.15
 """Sigma of a prior from which Gauss-Newton alone may end elsewhere: from .3 m, .15 rad it does in 14 to 31 % of trials."""
 _MIN_PLACE_OVERLAP = 0.6
@@ -263,10 +264,12 @@ class ScanMatcher:
         assert self._grid is not None
         if self._image is None:
             self._image = draw_image(self._grid.means, self.cell)
-        limit = np.minimum(np.maximum(_SEARCH_LIMIT, 3.0 * np.sqrt(np.diagonal(cov))), _WIDEST_SEARCH)
+        reach = 3.0 * np.sqrt(np.diagonal(cov))
+        limit = np.minimum(np.maximum(_SEARCH_LIMIT, reach), _WIDEST_SEARCH)
         best = search(self._image, voxel_means(points, self.cell), prior, wide, limit)
-        is_clear = best.rival_score < _MAX_RIVAL * best.score if _is_within_search(cov) else best.margin >= _OUTLIER_COST
-        return best.pose if is_clear else None
+        if (reach <= _SEARCH_LIMIT).all():
+            return best.pose if best.rival_score < _MAX_RIVAL * best.score else None
+        return best.pose if best.margin >= _OUTLIER_COST else None  # the place is unknown
 
     def _result(self, fit: Fit, outlier_cov: Cov3) -> ScanMatch:
         """The match of the scan alone: one more Gauss-Newton step from the minimum, without the prior's pull."""
@@ -310,11 +313,6 @@ def _is_within_basin(fit: Fit, cov: Cov3) -> bool:
 def is_narrow(cov: Cov3) -> bool:
     """Whether a pose with ``cov`` (3, 3) is within the basin of Gauss-Newton."""
     return bool(np.linalg.eigvalsh(cov[:2, :2])[-1] < _BASIN_M**2 and cov[2, 2] < _BASIN_RAD**2)
-
-
-def _is_within_search(cov: Cov3) -> bool:
-    """Whether the window of a search covers 3 sigma of ``cov`` (3, 3): else a place is to be found, and has to be clear."""
-    return bool((3.0 * np.sqrt(np.diagonal(cov)) <= _SEARCH_LIMIT).all())
 
 
 def _is_better(found: Fit, fit: Fit, prior: Pose2, cov: Cov3) -> bool:

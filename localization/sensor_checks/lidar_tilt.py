@@ -27,7 +27,7 @@ _MIN_CLOUDS, _MIN_REPORTED_RAD = 10, math.radians(1.0)
 
 
 class LidarTilt(Check):
-    """`add` every scan; memory is bounded. ``mounts`` of the LiDARs are by frame."""
+    """Fits the ground in clouds; memory is bounded. ``mounts`` of the LiDARs are by frame."""
 
     def __init__(self, mounts: Mapping[str, Mount]) -> None:
         self._mounts = mounts

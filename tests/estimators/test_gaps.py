@@ -1,4 +1,4 @@
-"""Times without any sensor in a real building: the place is found again, or the covariance stays open."""
+"""Times without any sensor, and turns that the wheels miss, in a real building: the place is found again, or the covariance stays open."""
 
 from __future__ import annotations
 
@@ -49,3 +49,17 @@ def test_gap_of_all_sensors_error_is_within_five_sigma(
     assert P is not None
     error = se2.log(se2.between(found[last].pose, reference[last].pose))
     assert float(error @ np.linalg.solve(P + NOISE, error)) < 5.0**2
+
+
+def test_turn_that_the_wheels_miss_loses_no_scan(log: tuple[list[Event], dict[str, Mount]]) -> None:
+    """Wheels stall while the robot turns on: yaw is then uncertain by 0.15 rad, but the place is not unknown."""
+    events, mounts = log
+    begin = events[0].stamp_ns + 60 * S
+    pipeline = Pipeline(Trial(make_model("skid_steer", ROBOT), "ekf"), ROBOT, dict(mounts), has_lidar=True)
+    for event in events:
+        if begin <= event.stamp_ns <= begin + 12 * S:
+            pipeline.process(event)
+    pipeline.finish()
+    counts = pipeline.estimator.counts()
+    assert counts["searched"] > 0
+    assert counts["matched"] == counts["scans"] - 1  # the first begins the submap

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from localization.lidar import LidarConfig, ScanMatch, ScanMatcher
+from localization.lidar import LidarConfig, ScanMatch, ScanMatcher, scan_matcher
 from localization.lidar.scan_matcher import _KERNEL, KeyScan, linearize
 from localization.lidar.submap import fill_surface, find_nearest, make_grid
 from localization.simulation import world
@@ -235,6 +235,18 @@ def test_match_cov_along_bare_walls_is_open(walls: np.ndarray, start: tuple[floa
     along, across = se2.transform(np.array([0.0, 0.0, true[2]]), error_of(prior, found.pose)[None, :2])[0]
     assert abs(along) < 0.01  # the prior holds it
     assert abs(across) < 0.01
+
+
+def test_match_that_fits_far_from_the_prior_needs_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eight sigma off a narrow prior, Gauss-Newton finds the pose by itself: the prior is an outlier."""
+    monkeypatch.setattr(scan_matcher, "search", lambda *a: pytest.fail("searched"))
+    matcher, true = mapped(LAB, np.random.default_rng(0))
+    cov = np.diag([0.003, 0.003, 0.002]) ** 2
+    prior = se2.compose(true, np.array([0.024, -0.016, 0.01]))
+    found = matcher.match(rooms.scan_from(LAB, true, np.random.default_rng(1)), prior, cov)
+    assert found is not None
+    assert found.outlier_cov.any()
+    assert np.abs(error_of(true, found.pose)).max() < 0.003
 
 
 @pytest.mark.parametrize("walls", [LAB, HALL])
