@@ -326,6 +326,16 @@ CAUSES: Mapping[str, Cause] = {cause.id: cause for cause in _CAUSES}
 """All causes that hold for the whole of a drive, by id."""
 
 
+_TOLERATED_LOAD = 0.01
+"""Share of the robot's mass that is tolerated as payload: over the front edge it moves the centre of gravity of the robots that come with
+skidloc by 2 to 6 mm, and 3 mm are tolerated of `cg_offset_x` [-]."""
+
+
+def payload(mass_kg: float) -> Cause:
+    """The payload of a robot of this mass."""
+    return dataclasses.replace(CAUSES["payload"], negligible=_TOLERATED_LOAD * mass_kg)
+
+
 def friction_change(at_s: float) -> Cause:
     """The sideways grip changes ``at_s`` after the drive's beginning."""
 

@@ -26,9 +26,11 @@ from localization.diagnosis.selection import (
     search_causes,
     simplest_set,
     statistic,
+    strongest_beyond_tolerance,
 )
 from localization.diagnosis.verdict import (
     attribute_rows,
+    confirming_drive,
     decide,
     find_better_trends,
     find_outliers,
@@ -47,6 +49,7 @@ _SYSTEMATIC_SHARE = 1.0 / 3.0  # systematic part of a size's sigma, over what is
 _MIN_HELDOUT_GAIN = 0.003  # least held-out gain of a finding
 _CLEAR_HELDOUT_GAIN = 0.05
 _FEW_WINDOWS = 64
+_SUSPICION = 0.2  # family-wise p of a cause that is mentioned, but not named
 _MIN_GAPS = 3  # fewer gaps between messages are pauses
 
 
@@ -185,8 +188,11 @@ def _conclude(
     undetectable = [e for e in causes if detectable[e.id] > e.typical]
     rows = mark_trends(rows, trends, share, bool(findings))
     verdict = decide(findings, tuple(rows.values()), len(undetectable) / max(len(causes), 1))
-    if findings:
-        next_drive = separating_drive(predictor, findings, linearization, chosen)
+    suspected = _suspect(predictor, linearization, rng) if verdict == "consistent" and not findings else None
+    if suspected is not None:
+        next_drive = suspected[1]
+    elif findings:
+        next_drive = separating_drive(predictor, findings)
     else:
         next_drive = general_advice(verdict, [e.id for e in undetectable])
     within = {**dropped, **_within_tolerance(linearization, chosen, sizes, rows)}
@@ -204,6 +210,7 @@ def _conclude(
         windows=len(drive.maneuvers),
         warnings=drive.warnings,
         hypothesis=with_sizes({causes[i]: float(size) for i, size in zip(chosen, sizes, strict=True)}),
+        suspected=None if suspected is None else suspected[0],
     )
     result = _with_data_errors(result, drive)
     handover = check_handover(predictor, linearization, [causes[i].key for i in chosen])
@@ -263,6 +270,18 @@ def _make_findings(
         text = evidence(cause, linearization.signatures[..., i] * size, linearization.noise, problem.gain(chosen) - problem.gain(others))
         found.append(Finding(cause, size, sigma, p, aliases, text, gains[n]))
     return _merge_slopes(sorted(found, key=lambda f: f.gain.relative, reverse=True))
+
+
+def _suspect(predictor: DrivePredictor, linearization: Linearization, rng: np.random.Generator) -> tuple[Finding, str] | None:
+    """The strongest cause, where nothing is named and fewer healthy drives than `_SUSPICION` would show one as strong; and the drive that
+    would settle it, in words."""
+    i, p = strongest_beyond_tolerance(linearization.problem, rng, linearization.noise.freedom)
+    if p > _SUSPICION:
+        return None
+    found = _make_findings(predictor, linearization, (i,), [heldout_gain(linearization, (i,), (), rng)], rng)[0]
+    if not found.is_plausible or (found.definition.one_sided and found.size < 0.0):
+        return None
+    return dataclasses.replace(found, p_value=p), confirming_drive(predictor, linearization, i, found.size)
 
 
 def _detectable_sizes(linearization: Linearization) -> dict[str, float]:

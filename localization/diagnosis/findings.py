@@ -231,6 +231,8 @@ class Diagnosis:
     windows: int = 0
     warnings: tuple[str, ...] = ()
     hypothesis: Hypothesis = field(default_factory=Hypothesis)
+    suspected: Finding | None = None
+    """Where the verdict is consistent: the strongest cause, too weak to be named, but stronger than four in five healthy drives show."""
     handover: HandoverCheck | None = None
     """What the corrected robot gains on the second half of the drive."""
 
@@ -246,6 +248,7 @@ class Diagnosis:
             "findings": [f.to_dict() for f in self.findings],
             "gain": None if self.gain is None else self.gain.to_dict(),
             "left_unexplained": left if self.trends else {},
+            "suspected": None if self.suspected is None else self.suspected.to_dict(),
             "next_drive": self.next_drive,
             "sentence": self.sentence,
             "tolerances": dict(self.tolerances),
@@ -331,7 +334,8 @@ def sentence(d: Diagnosis) -> str:
     if d.verdict == "consistent":
         text = f"Nothing beyond tolerances is wrong with {d.model} on this drive that {d.windows} windows could show"
         tolerated = describe_tolerated(d)
-        return text + (f"; within tolerance: {', '.join(tolerated)}." if tolerated else ".")
+        text += f"; within tolerance: {', '.join(tolerated)}." if tolerated else "."
+        return text if d.suspected is None else f"{text} {_suspicion(d.suspected)}"
     estimated = [f for f in d.findings if f.cause != MISSING_MESSAGES.id]
     if any(t.instead_of for t in d.trends) or not all(f.is_plausible for f in estimated):
         estimated = []
@@ -355,6 +359,13 @@ def _correction(d: Diagnosis, findings: Sequence[Finding]) -> str:
     if len(findings) > 1:
         text += f". Then {', '.join(f'{f.cause} by {f.size:+.3g} ({f.description})' for f in findings[1:])}"
     return text
+
+
+def _suspicion(f: Finding) -> str:
+    """What shows, but may be noise."""
+    aliases = "".join(f" or {name} {size:+.3g}{_unit_of(name)}" for name, size in f.aliases)
+    size = f"{f.size:+.3g}{_unit_of(f.cause)} (+- {f.sigma:.1g})"
+    return f"Too weak to be named is {f.cause} {size}{aliases}: up to {100 * f.p_value:.0f} % of healthy drives show as much."
 
 
 def _left(d: Diagnosis) -> str:

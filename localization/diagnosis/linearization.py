@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause, Hypothesis, friction_change, slope_across
+from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause, Hypothesis, friction_change, payload, slope_across
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.prediction import CHANNELS, Baseline, DrivePredictor, with_sizes
 from motion_models.base import MotionModel
@@ -353,7 +353,8 @@ def candidate_causes(predictor: DrivePredictor, moments: int) -> tuple[Cause, ..
         out |= {"lidar_offset_x", "lidar_offset_y", "lidar_yaw", "lidar_time_offset", "lateral_slip_speed", "longitudinal_slip_turning"}
     if drive.kind in ("rotations", "runs"):
         out |= {"lidar_time_offset", "wheel_time_offset", "slope", "lateral_slip_speed", "rotation_slip_speed", "longitudinal_slip_turning"}
-    found = [e for e in CAUSES.values() if e.id not in out]
+    catalogue = {**CAUSES, "payload": payload(drive.robot.geometry.mass_kg)}
+    found = [e for e in catalogue.values() if e.id not in out]
     if drive.kind == "log" and not drive.is_gyro_reference:
         found.append(slope_across())
         length = float(drive.starts_s[-1])

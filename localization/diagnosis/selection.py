@@ -73,7 +73,11 @@ def max_statistic(problem: Regression, given: tuple[int, ...], rng: np.random.Ge
     """(draws,) largest |t| over all causes (or the first ``among``) not ``given`` that noise alone would show, as correlated as their
     signatures are."""
     left = [i for i in range(len(problem.moment) if among is None else among) if i not in given]
-    cov = problem.scores(given, left)[1]
+    return _largest_of_noise(problem.scores(given, left)[1], rng, df)
+
+
+def _largest_of_noise(cov: FloatArray, rng: np.random.Generator, df: float) -> FloatArray:
+    """(draws,) largest |t| of numbers with the covariance ``cov`` (n, n), of which those without a variance are never seen."""
     sigma = np.sqrt(np.maximum(np.diag(cov), 1e-12))
     is_observable = np.diag(cov) > 1e-6
     correlation = cov[np.ix_(is_observable, is_observable)] / np.outer(sigma[is_observable], sigma[is_observable])
@@ -83,6 +87,21 @@ def max_statistic(problem: Regression, given: tuple[int, ...], rng: np.random.Ge
     draws = rng.standard_normal((_DRAWS, int(is_observable.sum()))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
     draws /= np.sqrt(rng.chisquare(df, size=(_DRAWS, 1)) / df)
     return np.asarray(np.abs(draws).max(axis=1))
+
+
+def strongest_beyond_tolerance(problem: Regression, rng: np.random.Generator, df: float) -> tuple[int, float]:
+    """The cause whose size is largest for what is tolerated of it, and the family-wise p of a robot all of whose causes are tolerated.
+
+    With prior T = diag(tolerance^2) and posterior V = (G + T^-1)^-1, G the information of the drive, estimates x = V m of such a robot
+    have the covariance T - V.
+    """
+    T = np.diag(np.square(problem.tolerance))
+    V = np.linalg.inv(problem.gram + np.linalg.inv(T))
+    cov = (T - V) / np.outer(problem.tolerance, problem.tolerance)
+    x = V @ problem.moment / problem.tolerance
+    z = x / np.sqrt(np.maximum(np.diagonal(cov), 1e-6))
+    i = int(np.argmax(np.abs(z)))
+    return i, p_value(float(z[i]), _largest_of_noise(cov, rng, df), df)
 
 
 def statistic(problem: Regression, given: tuple[int, ...], cause: int) -> float:
@@ -105,12 +124,6 @@ def p_value(t: float, draws: FloatArray, df: float) -> float:
     q = df * np.log1p(np.quantile(draws, [0.9, 0.99]) ** 2 / df)  # in which tails of Student's t are straight
     slope = math.log(10.0) / max(q[1] - q[0], 1e-9)
     return float(min(0.01 * math.exp(-slope * (df * math.log1p(t**2 / df) - q[1])), 1.0))
-
-
-def signature_correlation(problem: Regression, given: tuple[int, ...], a: int, b: int) -> float:
-    """Correlation of two signatures once those ``given`` are taken out of both."""
-    cov = problem.scores(given, [a, b])[1]
-    return float(cov[0, 1] / math.sqrt(max(float(cov[0, 0] * cov[1, 1]), 1e-18)))
 
 
 def heldout_gain(
@@ -159,7 +172,6 @@ def heldout_squares(
     return out
 
 
-_MIN_ALIAS_CORRELATION = 0.7  # signatures that correlate less than this are no aliases, however short the drive
 _ALIAS_LOG_ODDS = 7.0  # twice the log-likelihood by which a rival may be worse: odds of 1 to 33
 _ALIAS_SHARE = 0.02  # or this share of what the cause explains: accuracy of the model
 _BASELINE_SHARE = 0.05  # the same for a robot that does not follow the friction model when nothing is wrong
@@ -263,8 +275,6 @@ def aliases_of(predictor: DrivePredictor, linearization: Linearization, chosen: 
     found: dict[str, tuple[float, int]] = {}
     for j in _substitutes(causes, chosen):
         cause = causes[j]
-        if abs(signature_correlation(problem, others, i, j)) < _MIN_ALIAS_CORRELATION:
-            continue
         subset = (*others, j)
         gain = problem.gain(subset)
         size = float(problem.fit(subset)[0][-1])

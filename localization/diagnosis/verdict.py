@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause
+from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause, Hypothesis
 from localization.diagnosis.drive import drive_of_table
 from localization.diagnosis.findings import MAX_NOISE_OVER_REFERENCE, Attribution, Component, Finding, Trend, Verdict
 from localization.diagnosis.linearization import Linearization, Noise, group_of, regression
@@ -31,7 +30,8 @@ _SECONDS, _DT = 20.0, 0.1
 _WINDOW = 20  # intervals
 _SIGMA = np.array([0.004, 0.004, 0.003])
 _MAX_S = 120.0
-_ENOUGH = 9.0  # twice the log-likelihood that decides
+_ENOUGH = 9.0  # twice the log-likelihood that decides between causes
+_CLEAR_SIGMAS = 4.5  # of a cause that is named in four of five drives: the threshold is near 3.7
 
 
 def trend_motions(predictor: DrivePredictor) -> dict[str, FloatArray]:
@@ -348,47 +348,59 @@ def candidate_maneuvers(speed: float, radius: float, cg: FloatArray, has_arms: b
     return found
 
 
-def separating_drive(predictor: DrivePredictor, findings: Sequence[Finding], linearization: Any, chosen: tuple[int, ...]) -> str:
-    """In words; empty where nothing is left to separate."""
+def separating_drive(predictor: DrivePredictor, findings: Sequence[Finding]) -> str:
+    """The drive that separates the first finding with aliases from these, in words; empty where nothing is left to separate."""
     rivals = [f for f in findings if f.aliases]
     if not rivals:
         return ""
     finding = rivals[0]
-    drive = predictor.drive
-    wheels = predictor.batch.wheels
-    robot = drive.robot
-    speed = robot.geometry.wheel_radius_m * float(np.quantile(np.abs(wheels.mean(axis=1)), 0.75))
-    cg = predictor.batch.cg.mean(axis=0)
-    others = {f.definition: f.size for f in findings if f is not finding}
-    pairs = [(finding.definition, finding.size), *((_named(name), size) for name, size in finding.aliases[:4])]
-    best = ("", 0.0)
-    for text, maneuvers in candidate_maneuvers(
-        speed, robot.geometry.wheel_radius_m, cg, robot.arms is not None, robot.geometry.track_width_m
-    ):
-        table = drive_of_table("next", robot, maneuvers, "windows")
-        tried = DrivePredictor(table, predictor.model, predictor.has_inertia, predictor.baseline)
-        base = with_sizes(others)
+    named = [(CAUSES.get(name) or WINDOW_CAUSES.get(name), size) for name, size in finding.aliases[:4]]
+    pairs = [(finding.definition, finding.size), *((cause, size) for cause, size in named if cause is not None)]
+    base = with_sizes({f.definition: f.size for f in findings if f is not finding})
+    best = ("", 1e-3)
+    for text, tried in _candidate_drives(predictor):
         start = tried.discrepancies(base)[:, :3]
-        moved = [(start - tried.discrepancies(e.inject(base, s))[:, :3]) / _SIGMA for e, s in pairs if e is not None]
-        informations = []
-        for other in moved[1:]:
-            # the rival may take whatever size it likes in the new drive, but then it no longer fits the old one
-            informations.append(float(np.sum((moved[0] - other) ** 2)))
-        information = min(informations) if informations else 0.0
-        if information > max(1.05 * best[1], 1e-3):
+        moved = [(start - tried.discrepancies(cause.inject(base, size))[:, :3]) / _SIGMA for cause, size in pairs]
+        # a rival may take whatever size it likes in the new drive, but then it no longer fits the old one
+        information = min((float(np.sum((moved[0] - other) ** 2)) for other in moved[1:]), default=0.0)
+        if information > 1.05 * best[1]:
             best = text, information
-    names = [e.id for e, _ in pairs if e is not None]
+    names = [cause.id for cause, _ in pairs]
     listed = ", ".join(names[:-1]) + " and " + names[-1]
-    if not best[0]:
-        return f"No short drive separates {listed}: measure one of them directly."
     seconds = max(_SECONDS, 5.0 * math.ceil(_SECONDS * _ENOUGH / best[1] / 5.0))
-    if seconds > _MAX_S:
+    if not best[0] or seconds > _MAX_S:
         return f"No drive of two minutes separates {listed}: measure one of them directly."
     return f"To separate {listed}, record about {seconds:.0f} s of {best[0]}."
 
 
-def _named(name: str) -> Cause | None:
-    return CAUSES.get(name) or WINDOW_CAUSES.get(name)
+def confirming_drive(predictor: DrivePredictor, linearization: Linearization, i: int, size: float) -> str:
+    """The drive that would show cause ``i``, if it has this ``size``, to `_CLEAR_SIGMAS` beside all that is tolerated, in words."""
+    problem, causes = linearization.problem, linearization.causes
+    best = ("", _MAX_S + _SECONDS, 0.0)
+    for text, tried in _candidate_drives(predictor):
+        rows = tried.discrepancies(Hypothesis())
+        signatures = np.stack([tried.signature(Hypothesis(), cause, rows)[:, :3] / _SIGMA for cause in causes], axis=-1) * problem.scale
+        S = np.nan_to_num(signatures).reshape(-1, len(causes))
+        for seconds in np.arange(_SECONDS, _MAX_S + 1.0, _SECONDS):
+            both = dataclasses.replace(problem, gram=problem.gram + seconds / _SECONDS * S.T @ S)
+            variance = 1.0 / max(float(both.scores((), [i])[1][0, 0]), 1e-12) + float(problem.tolerance[i]) ** 2
+            sigmas = abs(size) / float(problem.scale[i]) / math.sqrt(variance)
+            if sigmas > _CLEAR_SIGMAS:
+                best = min(best, (text, float(seconds), sigmas), key=lambda b: (b[1], -b[2]))
+                break
+    if not best[0]:
+        return f"No drive of two minutes would settle it: measure {causes[i].id} directly."
+    return f"To settle it, record about {best[1]:.0f} s of {best[0]}."
+
+
+def _candidate_drives(predictor: DrivePredictor) -> Iterator[tuple[str, DrivePredictor]]:
+    """`candidate_maneuvers` for the robot and at the speed of a drive, each with its name."""
+    g = predictor.drive.robot.geometry
+    speed = g.wheel_radius_m * float(np.quantile(np.abs(predictor.batch.wheels.mean(axis=1)), 0.75))
+    cg, has_arms = predictor.batch.cg.mean(axis=0), predictor.drive.robot.arms is not None
+    for text, maneuvers in candidate_maneuvers(speed, g.wheel_radius_m, cg, has_arms, g.track_width_m):
+        table = drive_of_table("next", predictor.drive.robot, maneuvers, "windows")
+        yield text, DrivePredictor(table, predictor.model, predictor.has_inertia, predictor.baseline)
 
 
 def general_advice(verdict: str, blind: Sequence[str]) -> str:

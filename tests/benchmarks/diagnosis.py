@@ -27,6 +27,7 @@ import numpy as np
 from localization.diagnosis.causes import CAUSES, Cause
 from localization.diagnosis.diagnose import TOLERANCE, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log
+from localization.diagnosis.findings import Finding
 from localization.diagnosis.linearization import Linearization, linearize, make_regression
 from localization.diagnosis.prediction import with_sizes
 from localization.logs import open_log
@@ -121,7 +122,8 @@ def run(case: Case, has_rivals: bool, kept_in: Path | None = None) -> dict[str, 
         "drive": case.drive,
         "truth": dict(case.effects),
         "verdict": d.verdict,
-        "findings": [{"cause": f.cause, "size": f.size, "sigma": f.sigma, "p": f.p_value, "aliases": dict(f.aliases)} for f in d.findings],
+        "findings": [finding_row(f) for f in d.findings],
+        "suspected": [finding_row(f) for f in (d.suspected,) if f is not None],
         "left": [t.text for t in d.trends] + [f"{name} row" for name, c in d.discrepancy.items() if c.status == "unexplained"],
         "seconds": round(seconds, 2),
     }
@@ -137,6 +139,11 @@ def run(case: Case, has_rivals: bool, kept_in: Path | None = None) -> dict[str, 
         row["oracle"] = round(oracle(pipeline, nominal, dict(case.effects)), 5)
         row["rivals"] = {name: [first, round(gain, 5)] for name, (first, gain) in rivals(measured, pipeline, nominal).items()}
     return row
+
+
+def finding_row(f: Finding) -> dict[str, Any]:
+    """A finding in a row of the table."""
+    return {"cause": f.cause, "size": f.size, "sigma": f.sigma, "p": f.p_value, "aliases": dict(f.aliases)}
 
 
 def nominal_state(found: DiagnosisResult, effects: Mapping[str, float]) -> Linearization:

@@ -91,6 +91,18 @@ def test_diagnose_light_payload_names_its_alias(diagnosed: Diagnosed) -> None:
     assert {first.cause, *dict(first.aliases)} >= {"payload", "cg_offset_x"}
 
 
+def test_diagnose_weak_cause_is_suspected_but_not_named(diagnosed: Diagnosed) -> None:
+    found = diagnosed({"diagonal_load": 0.045}, 451)
+    assert found.verdict == "consistent"
+    assert not found.findings
+    assert found.suspected is not None
+    assert found.suspected.cause == "diagonal_load"
+    assert found.suspected.size == pytest.approx(0.045, abs=3.0 * found.suspected.sigma)
+    assert 0.01 < found.suspected.p_value < 0.2
+    assert "Too weak to be named is diagonal_load" in found.sentence
+    assert found.next_drive
+
+
 def test_diagnose_missing_messages_reports_their_share(diagnosed: Diagnosed) -> None:
     found = diagnosed({"missing_joint_messages": 0.2}, 507)
     assert found.verdict == "explained"

@@ -15,7 +15,6 @@ import numpy as np
 from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import Drive, drive_of_table
 from localization.diagnosis.findings import Diagnosis
-from localization.diagnosis.selection import signature_correlation
 from localization.simulation.experiments import Experiment, ExperimentConfig, MoveArms, OpenLoop, Phase, Rest, constant, grid_points
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig
@@ -78,8 +77,9 @@ def known(drive: Drive) -> Known:
     problem, names = found.linearization.problem, [e.id for e in found.linearization.causes]
     free = np.sqrt(np.diagonal(np.linalg.inv(problem.gram + np.eye(len(names))))) * problem.scale
     given = tuple(names.index(name) for name in ("lidar_offset_x", "track_width"))
-    alike = signature_correlation(problem, given, names.index("diagonal_load"), names.index("tread_asymmetry"))
-    return Known(found.diagnosis, dict(zip(names, (float(v) for v in free), strict=True)), alike)
+    cov = problem.scores(given, [names.index("diagonal_load"), names.index("tread_asymmetry")])[1]
+    alike = cov[0, 1] / np.sqrt(cov[0, 0] * cov[1, 1])
+    return Known(found.diagnosis, dict(zip(names, (float(v) for v in free), strict=True)), float(alike))
 
 
 def main() -> None:

@@ -59,6 +59,16 @@ def is_first(row: Row) -> bool:
     return bool(row["findings"]) and bool(names_of(row["findings"][0]) & set(row["truth"]))
 
 
+def has_suspicion(row: Row) -> bool:
+    """Whether nothing is named, but a cause is mentioned as too weak for it."""
+    return bool(row.get("suspected"))
+
+
+def is_suspected(row: Row) -> bool:
+    """Whether that is the hidden cause or an alias of it."""
+    return has_suspicion(row) and bool(names_of(row["suspected"][0]) & set(row["truth"]))
+
+
 def is_wrong(row: Row) -> bool:
     """A verdict with names, none of which is hidden, nor the alias of one."""
     return row["verdict"] in _CONFIDENT and not any(is_named(row, cause) for cause in row["truth"])
@@ -96,11 +106,14 @@ def report(rows: Sequence[Row]) -> str:
         "| figure | measured |",
         "|---|---|",
         f"| right name or alias set first, over 3 sigma and tolerance | {share([is_first(r) for r in strong])} |",
+        f"| the same, or suspected first where nothing is named | {share([is_first(r) or is_suspected(r) for r in strong])} |",
         f"| over 5 sigma | {share([is_first(r) for r in strong if significance(r) >= CLEAR])} |",
         f"| over 5 sigma of drive and tolerance together | {share([is_first(r) for r in clear])} |",
-        f"| the same, all sizes | {share([is_first(r) for r in single])} |",
+        f"| right name or alias set first, all sizes | {share([is_first(r) for r in single])} |",
         f"| pairs over 3 sigma and tolerance: both named | {share([all(is_named(r, c) for c in r['truth']) for r in _strong(pairs)])} |",
         f"| false alarms where nothing is hidden | {share([is_alarm(r) for r in nulls])} |",
+        f"| suspicions where nothing is hidden | {share([has_suspicion(r) for r in nulls])} |",
+        f"| suspicions that are right, where one cause is hidden | {share([is_suspected(r) for r in single if has_suspicion(r)])} |",
         f"| wrong confident names | {share([is_wrong(r) for r in rows])} |",
         f"| a confident name beside the right one | {share([has_extra_name(r) and not is_wrong(r) for r in rows])} |",
         f"| 95 % intervals that hold the true size | {share(inside)} |",
