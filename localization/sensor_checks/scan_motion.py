@@ -11,10 +11,10 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from motion_models import se2
+from motion_models.compiled import kernel
 from motion_models.se2 import FloatArray, Points2, Pose2
 
 _BEARINGS = 180
@@ -82,7 +82,7 @@ def _make_profile(points: Points2, center: FloatArray) -> _Profile | None:
     return None if np.isfinite(ranges).sum() < _MIN_BEARINGS else _Profile(center, surface, ranges, normals)
 
 
-@numba.njit(cache=True)
+@kernel
 def _fill_profile(points: Points2) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Nearest points (180, 2), their ranges (180,) and normals (180, 2) by bearing; NaN where there is none."""
     surface, ranges, normals = np.full((_BEARINGS, 2), np.nan), np.full(_BEARINGS, np.nan), np.full((_BEARINGS, 2), np.nan)
@@ -101,7 +101,7 @@ def _fill_profile(points: Points2) -> tuple[FloatArray, FloatArray, FloatArray]:
     return surface, ranges, normals
 
 
-@numba.njit(cache=True)
+@kernel
 def _correlate(a: FloatArray, b: FloatArray) -> float:
     """Turn [rad] from profile ``a`` to ``b``, log-ranges (180,), at their least mean difference; NaN where they share too few bearings."""
     best, turn = np.inf, np.nan
@@ -139,7 +139,7 @@ def _align_profiles(surface: FloatArray, normals: FloatArray, points: FloatArray
     return a_T_b, structure, inliers
 
 
-@numba.njit(cache=True)
+@kernel
 def _normal_equations(
     surface: FloatArray, normals: FloatArray, points: FloatArray, a_T_b: Pose2, scale: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, int]:

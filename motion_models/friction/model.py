@@ -17,10 +17,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numba
 import numpy as np
 
 from motion_models.base import Twist
+from motion_models.compiled import kernel, subroutine
 from motion_models.errors import CgError, ModelError
 from motion_models.friction.contact import CREEP, SATURATION, loads, tyre
 from motion_models.friction.equilibrium import (
@@ -160,7 +160,7 @@ def check_parameters(cg: FloatArray, params: FloatArray) -> None:
         )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _twist(
     wheels: FloatArray,
     cg: FloatArray,
@@ -214,14 +214,14 @@ def _twist(
             d_params[i, k, 9] = by[k, 11] * speed
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def floor_of(params: FloatArray, saturation: float) -> Floor:
     """The parameters (12,) that the balance depends on, with the contact law of ``saturation``."""
     mu, mu_ratio, stiffness, rolling_resistance, scrub = params[3], params[4], params[5], params[6], params[7]
     return Floor(params[1] / 2.0, params[2] / 2.0, tyre(stiffness, mu_ratio, params[9], saturation), rolling_resistance / mu, scrub)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def unit_rolls(radius: float, q_l: float, q_r: float) -> tuple[float, float, float]:
     """Root mean square of the wheels' speeds [m/s], and the speeds of left and right over it (0 where both stand)."""
     speed = radius * math.hypot(q_l, q_r) * math.sqrt(0.5)
@@ -230,20 +230,20 @@ def unit_rolls(radius: float, q_l: float, q_r: float) -> tuple[float, float, flo
     return speed, radius * q_l / speed, radius * q_r / speed
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def pull_of(speed: float, mu: float, centripetal: float) -> float:
     """`Loads.pull` at a speed of the wheels [m/s]; ``centripetal`` is 0 or 1."""
     return centripetal * speed * speed / (mu * GRAVITY)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def loads_at(x: float, y: float, warp: float, floor: Floor, pull: float) -> tuple[Loads, tuple[float, float, float]]:
     """The loads with the CG at ``x, y`` [m], and the derivatives of their diagonal term by xi, eta and warp (see `contact.loads`)."""
     fl, fr, rl, rr, t, t_xi, t_eta = loads(x / floor.half_wheelbase, y / floor.half_track, warp)
     return Loads(fl, fr, rl, rr, x, y, pull), (t_xi, t_eta, 1.0 if t == warp else 0.0)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _wheels(command: FloatArray, cg: FloatArray, params: FloatArray, constants: FloatArray, rates: FloatArray) -> None:
     """Fill ``rates`` (n, 2) for ``command`` (n, 2) and ``cg`` (n, 2)."""
     radius, mu, warp, tracked_y = params[0], params[3], params[8], params[11]
@@ -256,7 +256,7 @@ def _wheels(command: FloatArray, cg: FloatArray, params: FloatArray, constants: 
         rates[i, 0], rates[i, 1] = roll_l / radius, roll_r / radius
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def rolls_for(vx: float, wz: float, load: Loads, floor: Floor) -> tuple[float, float]:
     """Speeds [m/s] at which the left and right wheels have to roll for ``vx`` [m/s] and ``wz`` [rad/s]; NaN if there are none.
 
@@ -279,7 +279,7 @@ def rolls_for(vx: float, wz: float, load: Loads, floor: Floor) -> tuple[float, f
     return speed * (math.cos(angle) - math.sin(angle)), speed * (math.cos(angle) + math.sin(angle))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _linear_start(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[float, float, float]:
     """What `_solve` starts from: the inverse of `equilibrium.linear_motion`."""
     x = floor.half_wheelbase * (load.fl + load.fr - load.rl - load.rr)
@@ -293,7 +293,7 @@ def _linear_start(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[
     return math.atan2(roll_r - roll_l, roll_r + roll_l), -to_w * x / size, 1.0 / size
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _solve(
     angle: float, drift: float, share: float, to_x: float, to_w: float, unit: float, load: Loads, floor: Floor
 ) -> tuple[float, float, float, bool]:
@@ -324,7 +324,7 @@ def _solve(
     return angle, drift, share, False
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _step(b: Balance, c: float, s: float, v: float, r: float, to_x: float, to_w: float, load: Loads) -> tuple[float, float, float]:
     """The step in angle, vy and share that balances in first order."""
     by_l, by_r = -s - c, c - s
@@ -339,7 +339,7 @@ def _step(b: Balance, c: float, s: float, v: float, r: float, to_x: float, to_w:
     return solve_3x3(Matrix3(x_a, x_v, x_r, y_a, y_v, y_r, m_a, m_v, m_r), -b.x, -b.y, -b.m)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _pulled(
     angle: float, drift: float, share: float, to_x: float, to_w: float, unit: float, load: Loads, floor: Floor
 ) -> tuple[float, float, float, bool]:
@@ -358,7 +358,7 @@ def _pulled(
     return angle, drift, share, True
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _enclosed(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:
     """Angle, vy and share without a centripetal force, by enclosing the angle."""
     still = Loads(load.fl, load.fr, load.rl, load.rr, load.cg_x, load.cg_y, 0.0)
@@ -409,7 +409,7 @@ def _enclosed(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[floa
     return low, y, math.hypot(x, floor.half_track * w), abs(error) < _BALANCED
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _miss(angle: float, goal: float, x: float, y: float, w: float, load: Loads, floor: Floor) -> tuple[float, float, float, float]:
     """By how much wheels at ``angle`` miss the ``goal``, and their twist.
 
