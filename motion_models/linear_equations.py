@@ -55,7 +55,8 @@ def diagonalize(a: FloatArray) -> FloatArray:
 
     Jacobi's cyclic method (Golub and Van Loan 2013, 8.5).
     """
-    vectors = np.zeros((3, 3))
+    vectors = np.empty((3, 3))
+    vectors[:] = 0.0
     vectors[0, 0] = vectors[1, 1] = vectors[2, 2] = 1.0
     for _ in range(_SWEEPS):
         for p in range(2):

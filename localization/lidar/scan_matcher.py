@@ -376,8 +376,8 @@ def _linearize(
 
     While the pose may still be off by ``spread`` [m] at a point, points are associated from so far, and residuals are weighed by it.
     """
-    spurious, c, s = np.zeros((3, 3)), math.cos(x[2]), math.sin(x[2])
-    H[:], g[:] = 0.0, 0.0
+    spurious, c, s = np.empty((3, 3)), math.cos(x[2]), math.sin(x[2])
+    H[:], g[:], spurious[:] = 0.0, 0.0, 0.0
     reach, loose = max(_REACH_CELLS * grid.cell, spread), (spread / _KERNEL) ** 2
     fitting, mapped, cost, block, squares, block_squares = 0, 0, 0.0, 0.0, 0.0, 0.0
     for i in range(points.shape[0]):

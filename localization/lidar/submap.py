@@ -145,7 +145,8 @@ def fill_surface(grid: VoxelGrid, v: int) -> None:
     slots, sums = grid.slots, grid.sums
     i, j, n = grid.cells[v, 0], grid.cells[v, 1], sums[v, 0]
     x, y = sums[v, 1] / n, sums[v, 2] / n
-    d2s, rows = np.full(POOLED_VOXELS, math.inf), np.zeros(POOLED_VOXELS, dtype=np.int64)  # the nearest so far, in order
+    d2s, rows, total = np.empty(POOLED_VOXELS), np.empty(POOLED_VOXELS, dtype=np.int64), np.empty(6)  # the nearest so far, in order
+    d2s[:], total[:] = math.inf, 0.0
     found, ring = 0, 0
     while ring == 0 or (found < POOLED_VOXELS and ring <= MAX_RINGS):
         for di in range(-ring, ring + 1):
@@ -154,9 +155,9 @@ def fill_surface(grid: VoxelGrid, v: int) -> None:
                 found += w >= 0
                 _insert_sorted(d2s, rows, _squared_distance(sums, w, x, y) if w >= 0 else math.inf, w)
         ring += 1
-    total = np.zeros(6)
     for k in range(min(found, POOLED_VOXELS)):
-        total += sums[rows[k]]
+        for c in range(6):
+            total[c] += sums[rows[k], c]
     mx, my = total[1] / total[0], total[2] / total[0]
     xx, xy, yy = total[3] / total[0] - mx * mx, total[4] / total[0] - mx * my, total[5] / total[0] - my * my
     angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
