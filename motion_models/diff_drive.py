@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numba
 import numpy as np
 
 from motion_models.base import Twist
+from motion_models.compiled import kernel
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -48,7 +48,7 @@ class DiffDrive:
         return np.asarray(np.stack([vx - half, vx + half], axis=-1) / r)
 
 
-@numba.njit(cache=True)
+@kernel
 def _twist(
     wheels: FloatArray,
     cg: FloatArray,

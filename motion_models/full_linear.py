@@ -11,10 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-import numba
 import numpy as np
 
 from motion_models.base import Twist
+from motion_models.compiled import kernel, subroutine
 from motion_models.errors import ModelError
 from motion_models.prior import slip_at_speed
 from motion_models.robot import DIFF_DRIVE, Robot
@@ -117,12 +117,12 @@ class FullLinear:
         return np.asarray(self.twist(rates, cg, params).value[:, [0, 2]] - wanted)
 
 
-@numba.njit(cache=True)
+@subroutine
 def _sign(value: float) -> float:
     return 1.0 if value > 0.0 else (-1.0 if value < 0.0 else 0.0)
 
 
-@numba.njit(cache=True)
+@kernel
 def _twist(
     wheels: FloatArray,
     cg: FloatArray,

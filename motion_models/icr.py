@@ -11,10 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-import numba
 import numpy as np
 
 from motion_models.base import Twist
+from motion_models.compiled import kernel
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 from motion_models.skid_steer import SkidSteer
@@ -66,7 +66,7 @@ class Icr:
         return np.asarray(np.stack([left, right], axis=-1) / self.wheel_radius)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _twist(
     wheels: FloatArray,
     cg: FloatArray,

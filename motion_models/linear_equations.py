@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from motion_models.compiled import subroutine
 from motion_models.se2 import FloatArray, Triple
 
 
@@ -25,7 +25,7 @@ class Matrix3(NamedTuple):
     zw: float
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def solve_3x3(a: Matrix3, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Solution of the linear equations with matrix ``a`` and right side ``x, y, z``, by Cramer's rule. NaN where it is singular."""
     c00 = a.yv * a.zw - a.yw * a.zv
@@ -38,7 +38,7 @@ def solve_3x3(a: Matrix3, x: float, y: float, z: float) -> tuple[float, float, f
     return u * whole, v * whole, w * whole
 
 
-@numba.njit(cache=True)
+@subroutine
 def solve(a: FloatArray, b: FloatArray) -> Triple:
     """`solve_3x3` of arrays: ``a`` (3, 3) and ``b`` (3,)."""
     rows = Matrix3(a[0, 0], a[0, 1], a[0, 2], a[1, 0], a[1, 1], a[1, 2], a[2, 0], a[2, 1], a[2, 2])
@@ -49,13 +49,14 @@ _SWEEPS = 6
 """Jacobi's method converges quadratically: three sweeps give single precision, six double."""
 
 
-@numba.njit(cache=True)
+@subroutine
 def diagonalize(a: FloatArray) -> FloatArray:
     """Eigenvectors (3, 3) of the symmetric ``a`` (3, 3), in columns; its eigenvalues are left on its diagonal.
 
     Jacobi's cyclic method (Golub and Van Loan 2013, 8.5).
     """
-    vectors = np.zeros((3, 3))
+    vectors = np.empty((3, 3))
+    vectors[:] = 0.0
     vectors[0, 0] = vectors[1, 1] = vectors[2, 2] = 1.0
     for _ in range(_SWEEPS):
         for p in range(2):
@@ -64,7 +65,7 @@ def diagonalize(a: FloatArray) -> FloatArray:
     return vectors
 
 
-@numba.njit(cache=True)
+@subroutine
 def _rotate(a: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
     """Turn axes ``p`` and ``q`` so that ``a[p, q]`` becomes 0."""
     angle = 0.5 * math.atan2(2.0 * a[p, q], a[q, q] - a[p, p])
@@ -76,7 +77,7 @@ def _rotate(a: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
         a[p, k], a[q, k] = c * a[p, k] - s * a[q, k], s * a[p, k] + c * a[q, k]
 
 
-@numba.njit(cache=True)
+@subroutine
 def multiply(a: FloatArray, v: Triple) -> Triple:
     """``a @ v`` for ``a`` (3, 3)."""
     return (
@@ -86,7 +87,7 @@ def multiply(a: FloatArray, v: Triple) -> Triple:
     )
 
 
-@numba.njit(cache=True)
+@subroutine
 def transform_symmetric(a: FloatArray, s: FloatArray) -> FloatArray:
     """``a.T @ s @ a`` for the symmetric ``s`` (3, 3)."""
     out = np.empty((3, 3))

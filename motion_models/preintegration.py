@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from motion_models.base import Motion, MotionModel, Twist
+from motion_models.compiled import kernel
 from motion_models.robot import WheelNoise
 from motion_models.se2 import FloatArray, scalar_exp
 
@@ -58,7 +58,7 @@ def integrate_twists(dt: FloatArray, twist: Twist, noise: WheelNoise, cg_cov: Fl
     return Motion(delta, cov, d[:, :k])
 
 
-@numba.njit(cache=True)
+@kernel
 def _integrate(
     dt: FloatArray, twist: FloatArray, by: FloatArray, noise: FloatArray, delta: FloatArray, cov: FloatArray, d: FloatArray
 ) -> None:

@@ -143,7 +143,7 @@ def _polynomials(robot: Robot) -> FloatArray:
 
 def _rotation(model: FrictionModel, wheels: FloatArray, cg: FloatArray, track_width_m: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """k [-], x_CR and y_CR [m], each (n,), of a rotation in place at ``cg`` (n, 2)."""
-    vx, vy, wz = model.twist(wheels, cg, model.nominal).value.T
+    vx, vy, wz = model.interpret_twist(wheels, cg, model.nominal).value.T
     return wz * track_width_m / (model.nominal[0] * (wheels[1] - wheels[0])), -vy / wz, vx / wz
 
 

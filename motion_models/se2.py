@@ -34,6 +34,8 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from motion_models.compiled import subroutine
+
 FloatArray = NDArray[np.float64]
 """Any shape; the docstring gives it."""
 Pose2 = FloatArray
@@ -81,13 +83,13 @@ def _parts(layout: str) -> list[str]:
     return [part.strip("()") for part in layout.replace("->", ",").replace("),(", ")|(").split("|")]
 
 
-@numba.njit(cache=True)
+@subroutine
 def triple(v: FloatArray) -> Triple:
     """``v`` (3,)"""
     return v[0], v[1], v[2]
 
 
-@numba.njit(cache=True)
+@subroutine
 def scalar_wrap(angle: float) -> float:
     """`wrap_angle` of one angle."""
     wrapped = (angle + math.pi) % (2.0 * math.pi) - math.pi
@@ -95,7 +97,7 @@ def scalar_wrap(angle: float) -> float:
     return -math.pi if wrapped >= math.pi else wrapped
 
 
-@numba.njit(cache=True)
+@subroutine
 def _sinc_terms(theta: float) -> tuple[float, float]:
     """``sin(t)/t`` and ``(1 - cos(t))/t``, smooth through t = 0."""
     if abs(theta) < _SMALL_ANGLE:
@@ -104,7 +106,7 @@ def _sinc_terms(theta: float) -> tuple[float, float]:
     return math.sin(theta) / theta, 2.0 * math.sin(0.5 * theta) ** 2 / theta
 
 
-@numba.njit(cache=True)
+@subroutine
 def _curl_terms(theta: float) -> tuple[float, float]:
     """``(t - sin(t))/t^2`` and ``(1 - cos(t))/t^2``, smooth through t = 0."""
     if abs(theta) < _SMALL_ANGLE:
@@ -112,14 +114,14 @@ def _curl_terms(theta: float) -> tuple[float, float]:
     return (theta - math.sin(theta)) / (theta * theta), _sinc_terms(theta)[1] / theta
 
 
-@numba.njit(cache=True)
+@subroutine
 def scalar_exp(v: Triple) -> Triple:
     """`exp` of one tangent vector, for compiled loops."""
     a, b = _sinc_terms(v[2])
     return a * v[0] - b * v[1], b * v[0] + a * v[1], v[2]
 
 
-@numba.njit(cache=True)
+@subroutine
 def scalar_log(p: Triple) -> Triple:
     """`log` of one pose."""
     x, y, theta = p[0], p[1], scalar_wrap(p[2])
@@ -128,27 +130,27 @@ def scalar_log(p: Triple) -> Triple:
     return scale * (a * x + b * y), scale * (a * y - b * x), theta
 
 
-@numba.njit(cache=True)
+@subroutine
 def scalar_compose(a: Triple, b: Triple) -> Triple:
     """`compose` of two poses."""
     c, s = math.cos(a[2]), math.sin(a[2])
     return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], scalar_wrap(a[2] + b[2])
 
 
-@numba.njit(cache=True)
+@subroutine
 def scalar_inverse(p: Triple) -> Triple:
     """`inverse` of one pose."""
     c, s = math.cos(p[2]), math.sin(p[2])
     return -c * p[0] - s * p[1], s * p[0] - c * p[1], scalar_wrap(-p[2])
 
 
-@numba.njit(cache=True)
+@subroutine
 def scalar_between(a: Triple, b: Triple) -> Triple:
     """`between` of two poses."""
     return scalar_compose(scalar_inverse(a), b)
 
 
-@numba.njit(cache=True)
+@subroutine
 def fill_adjoint(p: Triple, out: FloatArray) -> None:
     """`adjoint` of one pose into ``out`` (3, 3)."""
     c, s = math.cos(p[2]), math.sin(p[2])
@@ -157,7 +159,7 @@ def fill_adjoint(p: Triple, out: FloatArray) -> None:
     out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
 
 
-@numba.njit(cache=True)
+@subroutine
 def fill_right_jacobian(v: Triple, out: FloatArray) -> None:
     """`right_jacobian` of one tangent vector into ``out`` (3, 3)."""
     f, g = _curl_terms(v[2])
@@ -167,7 +169,7 @@ def fill_right_jacobian(v: Triple, out: FloatArray) -> None:
     out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
 
 
-@numba.njit(cache=True)
+@subroutine
 def fill_right_jacobian_inverse(v: Triple, out: FloatArray) -> None:
     """`right_jacobian_inverse` of one tangent vector into ``out`` (3, 3)."""
     f, g = _curl_terms(v[2])

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
-import numba
 import numpy as np
 
 from motion_models.base import Twist
+from motion_models.compiled import kernel
 from motion_models.prior import skid_prior
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -88,7 +88,7 @@ class SkidSteer:
         return np.stack([forward - half, forward + half], axis=-1) / self.wheel_radius  # 4.17, 4.18
 
 
-@numba.njit(cache=True)
+@kernel
 def _twist(
     wheels: FloatArray,
     cg: FloatArray,

@@ -15,11 +15,11 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from motion_models.calibration.maneuvers import IntArray
+from motion_models.compiled import kernel, subroutine
 from motion_models.errors import ModelError
 from motion_models.friction.contact import CREEP, rolling, tyre
 from motion_models.friction.dynamics import FrictionDynamics, _accelerations, _Body
@@ -57,7 +57,7 @@ def quasi_static_twists(
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _floor_at(speed: float, floor: Floor, exponent: float) -> Floor:
     """``floor`` for wheels of this ``speed`` [m/s]."""
     if exponent == 0.0:
@@ -68,7 +68,7 @@ def _floor_at(speed: float, floor: Floor, exponent: float) -> Floor:
     return Floor(floor.half_track, floor.half_wheelbase, rated, floor.drag, floor.scrub)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _solve_quasi_static(
     wheels: FloatArray, cg: FloatArray, params: FloatArray, rated: Floor, exponent: float, centripetal: float, out: FloatArray
 ) -> None:
@@ -174,7 +174,7 @@ class _Work(NamedTuple):
     """(1,) the Jacobian is of another drive, or of none."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _integrate(drive: ManeuverSamples, quasi_static: FloatArray, rated: Floor, body: _Body, out: FloatArray) -> None:
     state, influence, shift, now = np.zeros(6), np.zeros(13), np.zeros(2), np.empty(3)
     influence[12] = body.height
@@ -210,7 +210,7 @@ def _integrate(drive: ManeuverSamples, quasi_static: FloatArray, rated: Floor, b
             heading += out[i, 2] * h
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _solve_step(now: FloatArray, problem: _Problem, work: _Work) -> bool:
     """Twist at the end of a step by Newton's method from ``now`` (3,), which is overwritten; the Jacobian before is used while it helps."""
     size = _misfit(now, problem, work.off)
@@ -231,7 +231,7 @@ def _solve_step(now: FloatArray, problem: _Problem, work: _Work) -> bool:
     return bool(size < _SOLVED)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _try(now: FloatArray, problem: _Problem, work: _Work, share: float) -> float:
     """Misfit after a ``share`` of Newton's step; inf where the Jacobian is singular."""
     d0, d1, d2 = solve(work.jacobian, work.off)
@@ -241,7 +241,7 @@ def _try(now: FloatArray, problem: _Problem, work: _Work, share: float) -> float
     return _misfit(work.tried, problem, work.off_tried)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _search(now: FloatArray, problem: _Problem, work: _Work, size: float) -> float:
     """Misfit of the first of shrinking steps that is below ``size``; inf where none is."""
     share = 1.0
@@ -253,7 +253,7 @@ def _search(now: FloatArray, problem: _Problem, work: _Work, size: float) -> flo
     return math.inf
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _differentiate(now: FloatArray, problem: _Problem, work: _Work) -> None:
     for j in range(3):
         work.tried[:] = now
@@ -264,7 +264,7 @@ def _differentiate(now: FloatArray, problem: _Problem, work: _Work) -> None:
     work.is_stale[0] = False
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _misfit(twist: FloatArray, problem: _Problem, off: FloatArray) -> float:
     """Fill ``off`` (3,) with how far ``twist`` is off a backward Euler step [m/s, m/s, rad/s]; its length."""
     state, before, h = problem.state, problem.before, problem.h
@@ -276,7 +276,7 @@ def _misfit(twist: FloatArray, problem: _Problem, off: FloatArray) -> float:
     return math.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _about_cg(twist: FloatArray, a_x: float, a_y: float, a_w: float, problem: _Problem) -> tuple[float, float, float]:
     """Accelerations of the wheelbase's centre, which were worked out as if mass and inertia sat at the grip's centre, with these at the
     centre of gravity: contact forces are the same, their moment is taken about it, and rolling resistance goes with the load alone."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
@@ -15,6 +14,7 @@ from localization.diagnosis.drive import Drive
 from localization.diagnosis.prediction import CHANNELS, Baseline, DrivePredictor, with_sizes
 from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import Batch
+from motion_models.compiled import kernel
 from motion_models.diff_drive import DiffDrive
 from motion_models.friction import FrictionModel
 from motion_models.robot import DIFF_DRIVE, Robot
@@ -258,7 +258,7 @@ class Regression:
         return self.moment[wanted] - across.T @ self.moment[others], cov
 
 
-@numba.njit(cache=True)
+@kernel
 def bounded_minimum(a: FloatArray, b: FloatArray, limit: FloatArray) -> FloatArray:
     """(p,) x within +- ``limit`` (p,) where x' a x / 2 - b' x is least, by coordinate descent; ``a`` (p, p) is positive definite."""
     x = np.zeros_like(b)

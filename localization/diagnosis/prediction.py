@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numba
 import numpy as np
 
 from localization.diagnosis.causes import Cause, Hypothesis
@@ -18,6 +17,7 @@ from motion_models import se2
 from motion_models.base import MotionModel, Twist
 from motion_models.calibration.maneuvers import Batch, IntArray, Maneuver, make_batch
 from motion_models.calibration.prediction import predict
+from motion_models.compiled import kernel, subroutine
 from motion_models.friction import FrictionModel
 from motion_models.se2 import FloatArray
 
@@ -40,7 +40,7 @@ def find_dropouts(batch: Batch) -> FloatArray:
     return found
 
 
-@numba.njit(cache=True)
+@kernel
 def _spells(rate: FloatArray, other: FloatArray, dt: FloatArray) -> FloatArray:
     share = np.zeros_like(rate)
     n = len(rate)
@@ -78,14 +78,14 @@ def _spells(rate: FloatArray, other: FloatArray, dt: FloatArray) -> FloatArray:
     return share
 
 
-@numba.njit(cache=True)
+@subroutine
 def _until(rests: IntArray, start: int, end: int) -> int:
     """``end``, or the first rest between it and ``start``."""
     between = rests[(rests > start) & (rests < end)]
     return int(between[0]) if len(between) else end
 
 
-@numba.njit(cache=True)
+@subroutine
 def _like(a: float, b: float) -> bool:
     """Nearly the same rate."""
     return abs(a - b) < 0.12 * max(abs(a), abs(b)) + 0.05

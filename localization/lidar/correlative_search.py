@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from motion_models import se2
+from motion_models.compiled import kernel
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 COARSE = 4
@@ -125,7 +125,7 @@ def _turned_points(points: Points2, prior: Pose2, yaws: FloatArray) -> FloatArra
     return np.asarray(se2.transform(poses[:, None, :], points))
 
 
-@numba.njit(cache=True)
+@kernel
 def _draw(points: Points2, image: FloatArray, origin: FloatArray, cell: float) -> None:
     along_x, along_y = np.empty(5), np.empty(5)
     for i in range(points.shape[0]):
@@ -139,7 +139,7 @@ def _draw(points: Points2, image: FloatArray, origin: FloatArray, cell: float) -
                 image[first_x + jx, first_y + jy] = max(image[first_x + jx, first_y + jy], along_x[jx] * along_y[jy])
 
 
-@numba.njit(cache=True)
+@kernel
 def _reduce(image: FloatArray) -> FloatArray:
     """The maxima of blocks of `COARSE` x `COARSE` cells, and of their neighbours."""
     rows, columns = image.shape[0] // COARSE, image.shape[1] // COARSE
@@ -161,7 +161,7 @@ def _reduce(image: FloatArray) -> FloatArray:
     return out
 
 
-@numba.njit(cache=True)
+@kernel
 def _score(image: FloatArray, points: FloatArray, rows: FloatArray, offsets: FloatArray) -> FloatArray:
     """(K,) mean of the image where ``points`` (Y, N, 2) of rows (K,) lie, moved by ``offsets`` (K, 2) [cells]."""
     out = np.empty(len(rows))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from localization.events import Scan
 from motion_models import se2
+from motion_models.compiled import kernel
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray, Twist2
 
@@ -87,7 +87,7 @@ def extract_walls(points: FloatArray, cell: float, min_height: float = 0.3) -> F
     return np.asarray(means[heights >= min_height])
 
 
-@numba.njit(cache=True)
+@kernel
 def _move(points: FloatArray, times: FloatArray, twist: Twist2, out: FloatArray) -> None:
     """Fill ``out`` (N, 3) with ``points`` after the motion at ``twist`` (3,) for ``times`` (N,)."""
     for i in range(points.shape[0]):

@@ -12,13 +12,13 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-import numba
 import numpy as np
 
 from localization.lidar.correlative_search import CORRELATED_BEAMS, LikelihoodImage, draw_image, search
 from localization.lidar.submap import VoxelGrid, fill_surface, find_nearest, make_grid, measure_shares, voxel_means
 from localization.settings import Allowed, Below, Count, Positive, Settings, Share
 from motion_models import se2
+from motion_models.compiled import kernel, subroutine
 from motion_models.linear_equations import diagonalize, multiply, solve, transform_symmetric
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, Triple, triple
 
@@ -337,7 +337,7 @@ def linearize(grid: VoxelGrid, points: Points2, x: Pose2) -> tuple[FloatArray, F
     return H, g, np.array([fitting / n, 0.5 * cost / CORRELATED_BEAMS, squares, block_squares, fitting, mapped])
 
 
-@numba.njit(cache=True)
+@kernel
 def _align(grid: VoxelGrid, points: Points2, prior: Triple, information: FloatArray, guess: Triple, spread: float) -> Triple:
     """The pose of least cost, from ``guess``; ``information`` (3, 3) of the prior, and how far it may move a point [m]."""
     least, x, jacobian = _REACH_CELLS * grid.cell, guess, np.empty((3, 3))
@@ -355,7 +355,7 @@ def _align(grid: VoxelGrid, points: Points2, prior: Triple, information: FloatAr
     return x
 
 
-@numba.njit(cache=True)
+@subroutine
 def _add_prior(information: FloatArray, off: Triple, jacobian: FloatArray, H: FloatArray, g: FloatArray) -> None:
     """Add J^T P^-1 J to ``H`` (3, 3) and J^T P^-1 ``off`` to ``g`` (3,)."""
     for a in range(3):
@@ -368,7 +368,7 @@ def _add_prior(information: FloatArray, off: Triple, jacobian: FloatArray, H: Fl
                 H[a, c] += pull * jacobian[b, c]
 
 
-@numba.njit(cache=True)
+@kernel
 def _linearize(
     grid: VoxelGrid, points: Points2, x: Triple, spread: float, H: FloatArray, g: FloatArray
 ) -> tuple[int, int, float, float, float]:
@@ -376,8 +376,8 @@ def _linearize(
 
     While the pose may still be off by ``spread`` [m] at a point, points are associated from so far, and residuals are weighed by it.
     """
-    spurious, c, s = np.zeros((3, 3)), math.cos(x[2]), math.sin(x[2])
-    H[:], g[:] = 0.0, 0.0
+    spurious, c, s = np.empty((3, 3)), math.cos(x[2]), math.sin(x[2])
+    H[:], g[:], spurious[:] = 0.0, 0.0, 0.0
     reach, loose = max(_REACH_CELLS * grid.cell, spread), (spread / _KERNEL) ** 2
     fitting, mapped, cost, block, squares, block_squares = 0, 0, 0.0, 0.0, 0.0, 0.0
     for i in range(points.shape[0]):
@@ -415,7 +415,7 @@ def _linearize(
     return fitting, mapped, cost, squares, block_squares
 
 
-@numba.njit(cache=True)
+@subroutine
 def _discount(H: FloatArray, g: FloatArray, spurious: FloatArray) -> None:
     """Take off, in place, the information that comes from the noise of normals: along a bare wall it would hold the robot where it is.
 
@@ -440,7 +440,7 @@ def _discount(H: FloatArray, g: FloatArray, spurious: FloatArray) -> None:
             g[i] += pull * root[i]
 
 
-@numba.njit(cache=True)
+@subroutine
 def _add_outer(total: FloatArray, v: Triple, weight: float) -> None:
     """Add ``weight`` v v^T to ``total`` (3, 3)."""
     for a in range(3):

@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from localization.trajectory import IntArray
+from motion_models.compiled import kernel, subroutine
 from motion_models.se2 import FloatArray, Points2
 
 POOLED_VOXELS = 5
@@ -60,7 +60,7 @@ def voxel_means(points: Points2, cell: float) -> Points2:
     return make_grid(points, cell, 0.0).means
 
 
-@numba.njit(cache=True)
+@subroutine
 def find_slot(slots: IntArray, i: int, j: int) -> int:
     """Index of the slot that holds cell (i, j), or of the empty one where it belongs."""
     key = (i << 32) ^ (j & 0xFFFFFFFF)
@@ -72,14 +72,14 @@ def find_slot(slots: IntArray, i: int, j: int) -> int:
     return int(at)
 
 
-@numba.njit(cache=True)
+@subroutine
 def find_voxel(slots: IntArray, i: int, j: int) -> int:
     """Row of the voxel in cell (i, j); -1 where there is none."""
     at = find_slot(slots, i, j)
     return int(slots[at, 1]) if slots[at, 0] != _EMPTY else -1
 
 
-@numba.njit(cache=True)
+@kernel
 def _fill(points: Points2, cell: float, origin: FloatArray, slots: IntArray, cells: IntArray, sums: FloatArray) -> int:
     """Sort ``points`` into voxels; returns how many there are."""
     n = 0
@@ -101,7 +101,7 @@ def _fill(points: Points2, cell: float, origin: FloatArray, slots: IntArray, cel
     return n
 
 
-@numba.njit(cache=True)
+@subroutine
 def find_nearest(grid: VoxelGrid, x: float, y: float, reach: float) -> int:
     """The voxel whose mean is nearest to (x, y) [m, from the grid's origin], or -1 where none is within ``reach`` [m]."""
     cell, slots, sums = grid.cell, grid.slots, grid.sums
@@ -120,32 +120,33 @@ def find_nearest(grid: VoxelGrid, x: float, y: float, reach: float) -> int:
     return nearest
 
 
-@numba.njit(cache=True)
+@subroutine
 def _gap(x: float, i: int, cell: float) -> float:
     """Distance [m] of ``x`` from cell ``i`` along one axis; 0 inside."""
     return max(i * cell - x, x - (i + 1) * cell, 0.0)
 
 
-@numba.njit(cache=True)
+@subroutine
 def _nearer(sums: FloatArray, v: int, x: float, y: float, best: float, nearest: int) -> tuple[float, int]:
     """Squared distance [m^2] and row of the nearer one of voxel ``v``, if it is one, and of the ``nearest`` so far."""
     d2 = _squared_distance(sums, v, x, y) if v >= 0 else math.inf
     return (d2, v) if d2 < best else (best, nearest)
 
 
-@numba.njit(cache=True)
+@subroutine
 def _squared_distance(sums: FloatArray, v: int, x: float, y: float) -> float:
     n = sums[v, 0]
     return (sums[v, 1] / n - x) ** 2 + (sums[v, 2] / n - y) ** 2  # type: ignore[no-any-return]
 
 
-@numba.njit(cache=True)
+@subroutine
 def fill_surface(grid: VoxelGrid, v: int) -> None:
     """Pool the points of the `POOLED_VOXELS` voxels nearest to voxel ``v``: mean, direction of least spread, and the spread along it."""
     slots, sums = grid.slots, grid.sums
     i, j, n = grid.cells[v, 0], grid.cells[v, 1], sums[v, 0]
     x, y = sums[v, 1] / n, sums[v, 2] / n
-    d2s, rows = np.full(POOLED_VOXELS, math.inf), np.zeros(POOLED_VOXELS, dtype=np.int64)  # the nearest so far, in order
+    d2s, rows, total = np.empty(POOLED_VOXELS), np.empty(POOLED_VOXELS, dtype=np.int64), np.empty(6)  # the nearest so far, in order
+    d2s[:], total[:] = math.inf, 0.0
     found, ring = 0, 0
     while ring == 0 or (found < POOLED_VOXELS and ring <= MAX_RINGS):
         for di in range(-ring, ring + 1):
@@ -154,9 +155,9 @@ def fill_surface(grid: VoxelGrid, v: int) -> None:
                 found += w >= 0
                 _insert_sorted(d2s, rows, _squared_distance(sums, w, x, y) if w >= 0 else math.inf, w)
         ring += 1
-    total = np.zeros(6)
     for k in range(min(found, POOLED_VOXELS)):
-        total += sums[rows[k]]
+        for c in range(6):
+            total[c] += sums[rows[k], c]
     mx, my = total[1] / total[0], total[2] / total[0]
     xx, xy, yy = total[3] / total[0] - mx * mx, total[4] / total[0] - mx * my, total[5] / total[0] - my * my
     angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
@@ -167,7 +168,7 @@ def fill_surface(grid: VoxelGrid, v: int) -> None:
     out[5] = out[4] / (total[0] * most) if most > 0.0 else math.inf  # of a line fit: variance across over the spread along
 
 
-@numba.njit(cache=True)
+@subroutine
 def _insert_sorted(d2s: FloatArray, rows: IntArray, d2: float, row: int) -> None:
     """Insert ``d2`` and ``row`` into both, sorted by ``d2``; the largest drops out."""
     k = len(d2s) - 1
@@ -179,7 +180,7 @@ def _insert_sorted(d2s: FloatArray, rows: IntArray, d2: float, row: int) -> None
     d2s[k], rows[k] = d2, row
 
 
-@numba.njit(cache=True)
+@kernel
 def measure_shares(grid: VoxelGrid, scan: VoxelGrid) -> tuple[float, float]:
     """Shares, 0 to 1, of the points of ``scan``, which has the cells of ``grid``.
 

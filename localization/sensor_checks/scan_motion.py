@@ -11,10 +11,10 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from motion_models import se2
+from motion_models.compiled import kernel
 from motion_models.se2 import FloatArray, Points2, Pose2
 
 _BEARINGS = 180
@@ -78,14 +78,14 @@ class ScanOdometry:
 
 def _make_profile(points: Points2, center: FloatArray) -> _Profile | None:
     """None for too few points."""
-    surface, ranges, normals = _fill_profile(points)
+    surface, ranges, normals = np.full((_BEARINGS, 2), np.nan), np.full(_BEARINGS, np.nan), np.full((_BEARINGS, 2), np.nan)
+    _fill_profile(points, surface, ranges, normals)
     return None if np.isfinite(ranges).sum() < _MIN_BEARINGS else _Profile(center, surface, ranges, normals)
 
 
-@numba.njit(cache=True)
-def _fill_profile(points: Points2) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Nearest points (180, 2), their ranges (180,) and normals (180, 2) by bearing; NaN where there is none."""
-    surface, ranges, normals = np.full((_BEARINGS, 2), np.nan), np.full(_BEARINGS, np.nan), np.full((_BEARINGS, 2), np.nan)
+@kernel
+def _fill_profile(points: Points2, surface: FloatArray, ranges: FloatArray, normals: FloatArray) -> None:
+    """Nearest points (180, 2), their ranges (180,) and normals (180, 2) by bearing; they stay NaN where there is none."""
     for i in range(points.shape[0]):
         x, y = points[i, 0], points[i, 1]
         r = math.hypot(x, y)
@@ -98,10 +98,9 @@ def _fill_profile(points: Points2) -> tuple[FloatArray, FloatArray, FloatArray]:
         length = math.hypot(dx, dy)
         if length < 0.1 + 0.5 * ranges[k]:  # else from one surface to another, or unknown
             normals[k, 0], normals[k, 1] = -dy / max(length, 1e-6), dx / max(length, 1e-6)
-    return surface, ranges, normals
 
 
-@numba.njit(cache=True)
+@kernel
 def _correlate(a: FloatArray, b: FloatArray) -> float:
     """Turn [rad] from profile ``a`` to ``b``, log-ranges (180,), at their least mean difference; NaN where they share too few bearings."""
     best, turn = np.inf, np.nan
@@ -132,22 +131,32 @@ def _align_profiles(surface: FloatArray, normals: FloatArray, points: FloatArray
     a_T_b, structure, inliers = np.array([0.0, 0.0, turn]), np.zeros((2, 2)), 0
     for k in range(_ITERATIONS):
         scale = _FIRST_SCALE_M * (_LAST_SCALE_M / _FIRST_SCALE_M) ** (k / (_ITERATIONS - 1))
-        A, gradient, structure, inliers = _normal_equations(surface, normals, points, a_T_b, scale)
+        A, gradient, structure = np.zeros((3, 3)), np.zeros(3), np.zeros((2, 2))
+        inliers = _add_normal_equations(surface, normals, points, a_T_b, scale, A, gradient, structure)
         if inliers < _MIN_BEARINGS // 2:
             return a_T_b, structure, 0
         a_T_b = a_T_b - np.linalg.solve(A + _DAMPING * inliers * np.eye(3), gradient)
     return a_T_b, structure, inliers
 
 
-@numba.njit(cache=True)
-def _normal_equations(
-    surface: FloatArray, normals: FloatArray, points: FloatArray, a_T_b: Pose2, scale: float
-) -> tuple[FloatArray, FloatArray, FloatArray, int]:
-    """J^T W J (3, 3) and J^T W r (3,) of the distances r of ``points`` (M, 2), moved by ``a_T_b`` (3,), from the lines of a profile.
+@kernel
+def _add_normal_equations(
+    surface: FloatArray,
+    normals: FloatArray,
+    points: FloatArray,
+    a_T_b: Pose2,
+    scale: float,
+    A: FloatArray,
+    gradient: FloatArray,
+    structure: FloatArray,
+) -> int:
+    """Add J^T W J to ``A`` (3, 3) and J^T W r to ``gradient`` (3,), for the distances r of ``points`` (M, 2), moved by ``a_T_b`` (3,), from
+    the lines of a profile.
 
-    Also the sum of n n^T (2, 2) over the inliers, and their number: nearer to their line than the larger of ``scale`` and `_INLIER_M`.
+    Also n n^T to ``structure`` (2, 2) over the inliers, whose number is returned: nearer to their line than the larger of ``scale`` and
+    `_INLIER_M`.
     """
-    A, gradient, structure, inliers = np.zeros((3, 3)), np.zeros(3), np.zeros((2, 2)), 0
+    inliers = 0
     c, s = math.cos(a_T_b[2]), math.sin(a_T_b[2])
     for i in range(points.shape[0]):
         tx, ty = c * points[i, 0] - s * points[i, 1], s * points[i, 0] + c * points[i, 1]
@@ -172,4 +181,4 @@ def _normal_equations(
             structure[0, 1] += nx * ny
             structure[1, 0] += nx * ny
             structure[1, 1] += ny * ny
-    return A, gradient, structure, inliers
+    return inliers

@@ -11,9 +11,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from motion_models.compiled import kernel, subroutine
 from motion_models.friction.contact import Tyre, contact, loads, rolling
 from motion_models.se2 import FloatArray
 
@@ -86,7 +86,7 @@ class Derivatives(NamedTuple):
     w_wz: float
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def derivatives(vx: float, vy: float, wz: float, xi: float, eta: float, now: DynamicsInput, body: Chassis) -> Derivatives:
     """Accelerations of the wheelbase's centre in the body frame at the twist ``vx, vy, wz`` and the tilt ``xi, eta``.
 
@@ -156,7 +156,7 @@ _NEWTON_TOLERANCE_M_S = 1e-9  # m/s; the last step of Newton squares it
 _HALVINGS = 10
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def implicit_stage(
     guess: tuple[float, float, float], base: tuple[float, float, float], h: float, xi: float, eta: float, now: DynamicsInput, body: Chassis
 ) -> tuple[float, float, float, float, float, bool]:
@@ -190,7 +190,7 @@ def implicit_stage(
     return vx, vy, wz, to_xi, to_eta, False
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def wheel_response(q: float, target: float, slope: float, lag: float, t: float) -> tuple[float, float]:
     """A wheel's rate after ``t`` seconds, and the angle it turned, where its speed loop follows ``target`` + ``slope`` t with a ``lag``."""
     behind = q - target + slope * lag
@@ -199,7 +199,7 @@ def wheel_response(q: float, target: float, slope: float, lag: float, t: float) 
     return rate, target * t + 0.5 * slope * t * t - slope * lag * t + behind * lag * (1.0 - left)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _grip(x: float, y: float, patches: FloatArray) -> float:
     for i in range(patches.shape[0] - 1, -1, -1):
         if patches[i, 0] <= x <= patches[i, 2] and patches[i, 1] <= y <= patches[i, 3]:
@@ -226,7 +226,7 @@ class Plant(NamedTuple):
     """Largest change of the wheel rates' set points [rad/s^2]."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def integrate(state: FloatArray, wheels: FloatArray, cg: FloatArray, out: FloatArray, h: float, plant: Plant) -> int:
     """Advance ``state`` (16,) by steps of ``h`` [s], fill ``out`` (n, 13); the index of the step that failed, or -1."""
     body, targets, slopes = plant.body, np.empty(2), np.empty(2)
@@ -257,7 +257,7 @@ def integrate(state: FloatArray, wheels: FloatArray, cg: FloatArray, out: FloatA
     return -1
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _wheel_grips(state: FloatArray, body: Chassis, patches: FloatArray) -> tuple[float, float, float, float]:
     """Factors of the friction under front left, front right, rear left and rear right wheel."""
     left, right = 1.0 + 0.5 * body.grip_split, 1.0 - 0.5 * body.grip_split
@@ -273,12 +273,12 @@ def _wheel_grips(state: FloatArray, body: Chassis, patches: FloatArray) -> tuple
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _sheared(vx: float, vy: float, wz: float, yields: FloatArray) -> tuple[float, float, float]:
     return vx - yields[2] * vx * abs(wz), vy + yields[0] * vx * wz, wz * (1.0 - yields[1] * abs(vx))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _inputs_at(
     t: float, rolls: tuple[float, float], heading: float, cg: FloatArray, grips: tuple[float, float, float, float], plant: Plant
 ) -> DynamicsInput:
@@ -304,7 +304,7 @@ def _inputs_at(
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _step(
     state: FloatArray,
     targets: FloatArray,

@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-import numba
 import numpy as np
 
 from localization.errors import SimulationError
 from localization.settings import Count, Positive, Settings, up_to
 from localization.simulation.world import WORLDS, World
 from motion_models import se2
+from motion_models.compiled import kernel, subroutine
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -112,7 +112,7 @@ class Pursuit:
         return None if math.isnan(vx) else np.array([vx, wz])
 
 
-@numba.njit(cache=True)
+@kernel
 def _pursue(
     pose: FloatArray, points: FloatArray, along: FloatArray, done: float, speed: float, ahead: float, limit: float
 ) -> tuple[float, float, float]:
@@ -141,7 +141,7 @@ def _pursue(
     return here, vx, wz
 
 
-@numba.njit(cache=True)
+@subroutine
 def _point_on_route(at: float, points: FloatArray, along: FloatArray) -> tuple[float, float]:
     """The point ``at`` [m] along the route; beyond its end it goes straight on."""
     k = 0

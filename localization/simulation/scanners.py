@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +14,7 @@ from localization.logs.message_templates import Message
 from localization.settings import Below, Count, Positive, Settings, Share, Signed, at_least
 from localization.simulation.vehicle import SampleClock, TrueMotion, pose_at, seconds
 from localization.simulation.world import Grid, World, cast, cast_at_people, make_grid
+from motion_models.compiled import kernel
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
@@ -154,7 +154,7 @@ class Scene(NamedTuple):
     step_s: float
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _cast_sweeps(starts: FloatArray, sweep: BeamPattern, scene: Scene, ranges: FloatArray) -> None:
     """True distances (scans, beams) into ``ranges``; inf where nothing is hit."""
     mount = sweep.mount

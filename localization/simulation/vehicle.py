@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +20,7 @@ from localization.simulation.dynamics import Chassis, DynamicsInput, Plant, deri
 from motion_models.center_of_gravity.files import arms_model, arms_postures
 from motion_models.center_of_gravity.model import CgModel, Posture, posture_for
 from motion_models.center_of_gravity.parts import Payload
+from motion_models.compiled import subroutine
 from motion_models.friction.contact import tyre
 from motion_models.friction.dynamics import FrictionDynamics
 from motion_models.friction.model import FrictionModel, check_parameters
@@ -393,7 +393,7 @@ class TrueMotion:
         return np.asarray((1.0 - f) * self.rows[i] + f * self.rows[np.minimum(i + 1, len(self.rows) - 1)])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def pose_at(rows: FloatArray, start_s: float, step_s: float, t: float) -> tuple[float, float, float]:
     """`TrueMotion.at` of one moment, the pose only."""
     where = min(max((t - start_s) / step_s, 0.0), rows.shape[0] - 1.0)

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from motion_models.compiled import kernel, subroutine
 from motion_models.se2 import FloatArray
 
 OPAQUE, GLASS = 0.0, 1.0
@@ -199,7 +199,7 @@ def make_grid(walls: FloatArray, cell: float = 0.5) -> Grid:
     return Grid(float(low[0]), float(low[1]), cell, columns, rows, first, items, np.ascontiguousarray(walls))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def cast(x: float, y: float, angle: float, longest: float, grid: Grid) -> float:
     """Distance to the first wall that returns the beam from ``x, y`` along ``angle``; inf if none does within ``longest`` [m]."""
     ux, uy = math.cos(angle), math.sin(angle)
@@ -255,7 +255,7 @@ def cast(x: float, y: float, angle: float, longest: float, grid: Grid) -> float:
     return nearest if nearest <= longest else math.inf
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def cast_at_people(x: float, y: float, angle: float, t: float, people: FloatArray) -> float:
     """Distance to the nearest person at time ``t`` [s]; inf if the beam hits none."""
     ux, uy = math.cos(angle), math.sin(angle)
@@ -270,7 +270,7 @@ def cast_at_people(x: float, y: float, angle: float, t: float, people: FloatArra
     return nearest
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def person_at(person: FloatArray, t: float) -> tuple[float, float]:
     """Where a person of `World.people` is at time ``t`` [s]."""
     ex, ey = person[2] - person[0], person[3] - person[1]
@@ -280,7 +280,7 @@ def person_at(person: FloatArray, t: float) -> tuple[float, float]:
     return person[0] + f * ex, person[1] + f * ey
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def clearance(x: float, y: float, walls: FloatArray) -> float:
     """Distance of ``x, y`` to the nearest wall [m]; inf without walls."""
     least = math.inf
@@ -289,7 +289,7 @@ def clearance(x: float, y: float, walls: FloatArray) -> float:
     return least
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _distance(x: float, y: float, xa: float, ya: float, xb: float, yb: float) -> float:
     ex, ey = xb - xa, yb - ya
     square = ex * ex + ey * ey

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-import numba
 import numpy as np
 
 from motion_models import se2
 from motion_models.base import Twist
 from motion_models.calibration.maneuvers import Batch, IntArray
+from motion_models.compiled import kernel
 from motion_models.preintegration import _integrate, noise_vector
 from motion_models.robot import WheelNoise
 from motion_models.se2 import FloatArray
@@ -131,7 +131,7 @@ def _track(poses: FloatArray, d: FloatArray, body_T_lidar: FloatArray, columns: 
     return of_lidar, d
 
 
-@numba.njit(cache=True)
+@kernel
 def _integrate_all(dt: FloatArray, twist: FloatArray, by: FloatArray, noise: FloatArray, spans: Spans, found: Motions) -> None:
     """Integrate every maneuver from its start; store pose, covariance and derivatives at each of its ends."""
     delta, cov, d = np.zeros(3), np.zeros((3, 3)), np.zeros((3, by.shape[2]))
@@ -152,7 +152,7 @@ def _integrate_all(dt: FloatArray, twist: FloatArray, by: FloatArray, noise: Flo
                 found.derivatives[i, j, k] = d[j, k]
 
 
-@numba.njit(cache=True)
+@kernel
 def _low_pass(dt: FloatArray, wheels: FloatArray, lag: float) -> Smoothed:
     """First-order low-pass of the rates (n, 2) of one maneuver. A rate counts for the middle of its interval.
 
@@ -175,7 +175,7 @@ def _low_pass(dt: FloatArray, wheels: FloatArray, lag: float) -> Smoothed:
     return Smoothed(middle, value, by_lag)
 
 
-@numba.njit(cache=True)
+@kernel
 def _interpolate(smooth: Smoothed, offset: float, found: Delayed) -> None:
     """Read the rates ``offset`` later, linearly between the middles of intervals; at both ends of a maneuver they are held."""
     middle, value, by_lag = smooth.middle, smooth.value, smooth.by_lag

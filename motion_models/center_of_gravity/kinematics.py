@@ -9,11 +9,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from motion_models.center_of_gravity.urdf import Joint, Urdf
+from motion_models.compiled import kernel, subroutine
 from motion_models.errors import RobotError
 from motion_models.se2 import FloatArray
 
@@ -119,7 +119,7 @@ class Chain:
         return q.reshape(math.prod(q.shape[:-1]), q.shape[-1]), q.shape[:-1]
 
 
-@numba.njit(cache=True)
+@kernel
 def forward(layout: IntArray, constants: FloatArray, positions: FloatArray, rotations: FloatArray, translations: FloatArray) -> None:
     """Poses of all bodies in the base's frame at ``positions`` (n,), into ``rotations`` (b, 3, 3) and ``translations`` (b, 3)."""
     for row in range(3):
@@ -148,7 +148,7 @@ def forward(layout: IntArray, constants: FloatArray, positions: FloatArray, rota
                 rotations[i, row, 1] = cosine * y - sine * x
 
 
-@numba.njit(cache=True)
+@subroutine
 def body_moment(constants: FloatArray, rotations: FloatArray, translations: FloatArray, body: int, row: int) -> float:
     """First moment of one body along axis ``row`` of the base's frame [kg m]."""
     turned = 0.0
@@ -157,7 +157,7 @@ def body_moment(constants: FloatArray, rotations: FloatArray, translations: Floa
     return float(constants[body, MASS] * (translations[body, row] + turned))
 
 
-@numba.njit(cache=True)
+@kernel
 def _center_of_mass(layout: IntArray, constants: FloatArray, positions: FloatArray, out: FloatArray) -> None:
     """`Chain.center_of_mass` of ``positions`` (N, n) into ``out`` (N, 3)."""
     bodies = layout.shape[0]
@@ -174,7 +174,7 @@ def _center_of_mass(layout: IntArray, constants: FloatArray, positions: FloatArr
             out[sample, row] = moment / mass
 
 
-@numba.njit(cache=True)
+@subroutine
 def subtree_jacobian(layout: IntArray, constants: FloatArray, rotations: FloatArray, translations: FloatArray, out: FloatArray) -> None:
     """Derivative of the chain's first moment [kg m] by the joints, added to ``out`` (3, n).
 
@@ -202,7 +202,7 @@ def subtree_jacobian(layout: IntArray, constants: FloatArray, rotations: FloatAr
         out[2, joint] += rate * dz
 
 
-@numba.njit(cache=True)
+@kernel
 def _jacobian(layout: IntArray, constants: FloatArray, positions: FloatArray, out: FloatArray) -> None:
     """`Chain.center_of_mass_jacobian` of ``positions`` (N, n) into ``out`` (N, 3, n), which starts at zero."""
     bodies = layout.shape[0]

@@ -17,7 +17,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -25,6 +24,7 @@ from motion_models.center_of_gravity.kinematics import COM, MASS, Chain, IntArra
 from motion_models.center_of_gravity.parts import TYPICAL, CgEstimate, Payload, StaticPart, Tolerances
 from motion_models.center_of_gravity.urdf import Link, Urdf
 from motion_models.center_of_gravity.weighing import WeighedCg
+from motion_models.compiled import kernel, subroutine
 from motion_models.errors import CgError, RobotError
 from motion_models.se2 import FloatArray
 
@@ -181,7 +181,7 @@ class _Posed(NamedTuple):
     """Of all bodies [kg]."""
 
 
-@numba.njit(cache=True)
+@kernel
 def _estimate(
     layout: IntArray,
     constants: FloatArray,
@@ -219,7 +219,7 @@ def _estimate(
         _add_payload(at, load, cov)
 
 
-@numba.njit(cache=True)
+@subroutine
 def _add_outer(cov: FloatArray, vector: FloatArray, variance: float) -> None:
     """Add ``variance`` times the outer square of ``vector`` (2,) to ``cov`` (2, 2)."""
     for row in range(2):
@@ -227,7 +227,7 @@ def _add_outer(cov: FloatArray, vector: FloatArray, variance: float) -> None:
             cov[row, column] += variance * vector[row] * vector[column]
 
 
-@numba.njit(cache=True)
+@subroutine
 def _add_static_part(at: _Posed, arms: FloatArray, static_cov: FloatArray, cov: FloatArray) -> None:
     """The static part's place moves the CG by its share of the mass, its mass by its lever."""
     share = arms[0, MASS] / at.mass
@@ -243,7 +243,7 @@ def _add_static_part(at: _Posed, arms: FloatArray, static_cov: FloatArray, cov: 
             )
 
 
-@numba.njit(cache=True)
+@subroutine
 def _add_arm_body(at: _Posed, arms: FloatArray, weighed_poses: FloatArray, body: int, tolerances: FloatArray, cov: FloatArray) -> None:
     """Errors of an arm's body in mass and centre of mass. They were in the weighed total too, and so count by what moved since."""
     weighed = weighed_poses.shape[0] > 0
@@ -263,7 +263,7 @@ def _add_arm_body(at: _Posed, arms: FloatArray, weighed_poses: FloatArray, body:
         _add_outer(cov, spread[:, column], (tolerances[1] * mass / at.mass) ** 2)
 
 
-@numba.njit(cache=True)
+@subroutine
 def _add_payload(at: _Posed, load: FloatArray, cov: FloatArray) -> None:
     """Errors of the payload's mass and place; ``load`` (7,) as in `CgModel.numbers`."""
     body = int(load[0])

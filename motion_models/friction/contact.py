@@ -24,7 +24,7 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import numba
+from motion_models.compiled import subroutine
 
 CREEP = 1e-3
 """Slip, as a fraction of the wheels' speed, at which the thesis's friction is fully there. A tyre's own is larger."""
@@ -65,7 +65,7 @@ class Force(NamedTuple):
     y_tread: float
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def loads(xi: float, eta: float, warp: float) -> tuple[float, float, float, float, float, float, float]:
     """Shares of the weight on the four wheels, then the diagonal term t that is in them and its derivatives by xi and eta.
 
@@ -91,20 +91,20 @@ def loads(xi: float, eta: float, warp: float) -> tuple[float, float, float, floa
     return fl, fr, rl, rr, t, t_xi, t_eta
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def tyre(stiffness: float, mu_ratio: float, tread: float, saturation: float) -> Tyre:
     """A `Tyre` with its force at a locked wheel worked out."""
     return Tyre(stiffness, 1.0 - math.exp(-stiffness), mu_ratio, tread, saturation)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def rolling(roll: float) -> tuple[float, float]:
     """Direction in which a wheel rolls, rounded through zero, and its derivative: the missing sign of 3.17."""
     whole = 1.0 / math.sqrt(roll * roll + ROLLING * ROLLING)
     return roll * whole, ROLLING * ROLLING * whole * whole * whole
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@subroutine
 def _fastest(slip: float, roll: float, creep: float) -> tuple[float, float, float]:
     """V = max(|s_x + r q|, |r q|, creep), with its derivatives by s_x and by r q."""
     over = slip + roll
@@ -116,7 +116,7 @@ def _fastest(slip: float, roll: float, creep: float) -> tuple[float, float, floa
     return creep, 0.0, 0.0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def contact(slip: float, drift: float, roll: float, on: Tyre, creep: float) -> Force:
     """Forces at a wheel that slips by ``slip`` = s_x and ``drift`` = s_y while its rim moves at ``roll`` = r q, rounded over ``creep``."""
     whole = 1.0 / math.sqrt(slip * slip + drift * drift + creep * creep)

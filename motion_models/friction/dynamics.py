@@ -14,9 +14,9 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from motion_models.compiled import kernel, subroutine
 from motion_models.friction.contact import CREEP, contact, loads, rolling
 from motion_models.friction.equilibrium import Floor
 from motion_models.friction.model import GRAVITY, FrictionModel, check_parameters, floor_of
@@ -143,7 +143,7 @@ class _WheelSums(NamedTuple):
     """Yaw moment about the CG [m]."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _wheel_sums(
     vx: float, vy: float, wz: float, rolls: tuple[float, float], cg: tuple[float, float], floor: Floor, creep: float
 ) -> _WheelSums:
@@ -165,13 +165,13 @@ def _wheel_sums(
     return _WheelSums((x_0, x_xi, x_eta, x_t), (y_0, y_xi, y_eta, y_t), (m_0, m_xi, m_eta, m_t))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _weighted(sums: tuple[float, float, float, float], xi: float, eta: float, t: float) -> float:
     """Sum of the wheels' forces at loads (1, ``xi``, ``eta``, ``t``)."""
     return sums[0] + sums[1] * xi + sums[2] * eta + sums[3] * t
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _shifted_loads(xi_0: float, eta_0: float, lean_x: float, lean_y: float, warp: float, sums: _WheelSums) -> tuple[float, float]:
     """xi and eta of loads that shift under the acceleration which they cause: 3.21-3.23 with 3.24 and 3.25, linear until a wheel lifts.
 
@@ -194,7 +194,7 @@ def _shifted_loads(xi_0: float, eta_0: float, lean_x: float, lean_y: float, warp
     return xi, eta
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _accelerations(
     state: FloatArray, q_l: float, q_r: float, influence: FloatArray, floor: Floor, body: _Body
 ) -> tuple[float, float, float, float]:
@@ -230,13 +230,13 @@ def _accelerations(
     return base_x + state[4] * w, base_y - state[3] * w, alpha, 1.0 - max(lean)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _inside(share: float) -> float:
     """``share``, or the edge of the wheelbase where it lies beyond."""
     return min(1.0, max(-1.0, share))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _advance(state: FloatArray, dt: float, steps: int, q_l: float, q_r: float, influence: FloatArray, floor: Floor, body: _Body) -> float:
     """Change ``state`` (6,) in place; the smallest tipping margin."""
     h, margin = dt / steps, math.inf

@@ -12,8 +12,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
-
+from motion_models.compiled import subroutine
 from motion_models.friction.contact import CREEP, Tyre, contact, rolling
 from motion_models.linear_equations import Matrix3, solve_3x3
 from motion_models.se2 import FloatArray
@@ -81,7 +80,7 @@ _FINEST = 1e-4
 """Least step of the centripetal force, as a share of it."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def balance(vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load: Loads, floor: Floor, creep: float) -> Balance:
     """The balance at the twist ``vx, vy, wz`` [1, 1, 1/m] of wheels that roll at ``roll_l`` and ``roll_r`` [1]."""
     bx = by = bm = x_vx = x_vy = x_wz = y_vx = y_vy = y_wz = m_vx = m_vy = m_wz = 0.0
@@ -126,13 +125,13 @@ def balance(vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load:
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def twist_change(b: Balance, x: float, y: float, m: float) -> tuple[float, float, float]:
     """The twist by which the balance changes by ``x, y, m``. NaN where its derivative is singular."""
     return solve_3x3(Matrix3(b.x_vx, b.x_vy, b.x_wz, b.y_vx, b.y_vy, b.y_wz, b.m_vx, b.m_vy, b.m_wz), x, y, m)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def newton(
     vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load: Loads, floor: Floor, creep: float
 ) -> tuple[float, float, float, bool]:
@@ -158,7 +157,7 @@ def newton(
     return vx, vy, wz, False
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def linear_motion(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[float, float, float]:
     """The twist of wheels whose force is proportional to slip and load: with the CG at the centre k = 1 / (1 + (wheelbase / track)^2)."""
     left, right = roll_l * (load.fl + load.rl), roll_r * (load.fr + load.rr)
@@ -170,7 +169,7 @@ def linear_motion(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tu
     return forward + wz * y, -wz * x, wz
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def motion(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:
     """The twist [1, 1, 1/m] of wheels that roll at ``roll_l, roll_r`` (root mean square 1, or both 0), and whether it was found."""
     if roll_l == 0.0 and roll_r == 0.0:
@@ -188,7 +187,7 @@ def motion(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[flo
     return vx, vy, wz, found
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _narrowed(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:
     """`motion` by friction that is rounded less and less."""
     from_x, from_y, from_w = 0.5 * (roll_l + roll_r), 0.0, 0.0
@@ -206,7 +205,7 @@ def _narrowed(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[
     return from_x, from_y, from_w, False
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _pulled(vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:
     """`motion` from the twist without a centripetal force, by one that grows."""
     share, step = 0.0, 1.0
@@ -235,7 +234,7 @@ class Steady(NamedTuple):
     roll_r: float
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def sensitivities(at: Steady, load: Loads, tilt: tuple[float, float, float], floor: Floor, by: FloatArray) -> None:
     """Derivatives of the solved twist, by the implicit function theorem: -(balance by twist)^-1 (balance by what moves it).
 
@@ -262,7 +261,7 @@ def sensitivities(at: Steady, load: Loads, tilt: tuple[float, float, float], flo
         by[0, j], by[1, j], by[2, j] = twist_change(b, -by[0, j], -by[1, j], -by[2, j])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _add_wheels(at: Steady, load: Loads, tilt: tuple[float, float, float], floor: Floor, by: FloatArray) -> None:
     """Derivatives of the contact forces' balance; arguments as in `sensitivities`."""
     for left in (True, False):
@@ -293,7 +292,7 @@ def _add_wheels(at: Steady, load: Loads, tilt: tuple[float, float, float], floor
             _add(by, _VX + 2, x * xd - y * xs, x * yd - y * ys, x, y)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _add_pull(at: Steady, load: Loads, by: FloatArray) -> None:
     """Derivatives of the centripetal force's balance."""
     vx, vy, wz, p, gx, gy = at.vx, at.vy, at.wz, load.pull, load.cg_x, load.cg_y
@@ -306,7 +305,7 @@ def _add_pull(at: Steady, load: Loads, by: FloatArray) -> None:
     by[2, _VX + 2] -= p * (gx * vx + gy * vy)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _add(by: FloatArray, column: int, x: float, y: float, at_x: float, at_y: float) -> None:
     """Add a force of a wheel at ``at_x, at_y`` to the balance in a column."""
     by[0, column] += x

@@ -13,14 +13,14 @@ two sides roll. The first grows with the second, so it can be enclosed and canno
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numba
 import numpy as np
 
 from motion_models.base import Twist
+from motion_models.compiled import kernel, subroutine
 from motion_models.errors import CgError, ModelError
 from motion_models.friction.contact import CREEP, SATURATION, loads, tyre
 from motion_models.friction.equilibrium import (
@@ -106,8 +106,16 @@ class FrictionModel:
 
         Raises `CgError` for a CG that is not between the wheels and `ModelError` for parameters that no robot can have.
         """
+        return self._solve(_twist, wheels, cg, params)
+
+    def interpret_twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
+        """`twist` without compiled code, for a few samples once: 0.5 ms each, where compiling takes 8 s."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return self._solve(_solve_samples, wheels, cg, params)
+
+    def _solve(self, loop: Callable[..., None], wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
         check_parameters(cg, params)
-        twist = Twist.from_kernel(_twist, self._constants(), wheels, cg, params)
+        twist = Twist.from_kernel(loop, self._constants(), wheels, cg, params)
         unsolved = np.isnan(twist.value[..., 2]) & np.isfinite(np.asarray(wheels)).all(axis=-1)
         if np.any(unsolved):
             at = {name: float(value) for name, value in zip(self.param_names, params, strict=True)}
@@ -160,8 +168,7 @@ def check_parameters(cg: FloatArray, params: FloatArray) -> None:
         )
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _twist(
+def _solve_samples(
     wheels: FloatArray,
     cg: FloatArray,
     params: FloatArray,
@@ -214,14 +221,17 @@ def _twist(
             d_params[i, k, 9] = by[k, 11] * speed
 
 
-@numba.njit(cache=True, error_model="numpy")
+_twist = kernel(_solve_samples)
+
+
+@subroutine
 def floor_of(params: FloatArray, saturation: float) -> Floor:
     """The parameters (12,) that the balance depends on, with the contact law of ``saturation``."""
     mu, mu_ratio, stiffness, rolling_resistance, scrub = params[3], params[4], params[5], params[6], params[7]
     return Floor(params[1] / 2.0, params[2] / 2.0, tyre(stiffness, mu_ratio, params[9], saturation), rolling_resistance / mu, scrub)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def unit_rolls(radius: float, q_l: float, q_r: float) -> tuple[float, float, float]:
     """Root mean square of the wheels' speeds [m/s], and the speeds of left and right over it (0 where both stand)."""
     speed = radius * math.hypot(q_l, q_r) * math.sqrt(0.5)
@@ -230,20 +240,20 @@ def unit_rolls(radius: float, q_l: float, q_r: float) -> tuple[float, float, flo
     return speed, radius * q_l / speed, radius * q_r / speed
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def pull_of(speed: float, mu: float, centripetal: float) -> float:
     """`Loads.pull` at a speed of the wheels [m/s]; ``centripetal`` is 0 or 1."""
     return centripetal * speed * speed / (mu * GRAVITY)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def loads_at(x: float, y: float, warp: float, floor: Floor, pull: float) -> tuple[Loads, tuple[float, float, float]]:
     """The loads with the CG at ``x, y`` [m], and the derivatives of their diagonal term by xi, eta and warp (see `contact.loads`)."""
     fl, fr, rl, rr, t, t_xi, t_eta = loads(x / floor.half_wheelbase, y / floor.half_track, warp)
     return Loads(fl, fr, rl, rr, x, y, pull), (t_xi, t_eta, 1.0 if t == warp else 0.0)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _wheels(command: FloatArray, cg: FloatArray, params: FloatArray, constants: FloatArray, rates: FloatArray) -> None:
     """Fill ``rates`` (n, 2) for ``command`` (n, 2) and ``cg`` (n, 2)."""
     radius, mu, warp, tracked_y = params[0], params[3], params[8], params[11]
@@ -256,7 +266,7 @@ def _wheels(command: FloatArray, cg: FloatArray, params: FloatArray, constants: 
         rates[i, 0], rates[i, 1] = roll_l / radius, roll_r / radius
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def rolls_for(vx: float, wz: float, load: Loads, floor: Floor) -> tuple[float, float]:
     """Speeds [m/s] at which the left and right wheels have to roll for ``vx`` [m/s] and ``wz`` [rad/s]; NaN if there are none.
 
@@ -279,7 +289,7 @@ def rolls_for(vx: float, wz: float, load: Loads, floor: Floor) -> tuple[float, f
     return speed * (math.cos(angle) - math.sin(angle)), speed * (math.cos(angle) + math.sin(angle))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _linear_start(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[float, float, float]:
     """What `_solve` starts from: the inverse of `equilibrium.linear_motion`."""
     x = floor.half_wheelbase * (load.fl + load.fr - load.rl - load.rr)
@@ -293,7 +303,7 @@ def _linear_start(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[
     return math.atan2(roll_r - roll_l, roll_r + roll_l), -to_w * x / size, 1.0 / size
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _solve(
     angle: float, drift: float, share: float, to_x: float, to_w: float, unit: float, load: Loads, floor: Floor
 ) -> tuple[float, float, float, bool]:
@@ -324,7 +334,7 @@ def _solve(
     return angle, drift, share, False
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _step(b: Balance, c: float, s: float, v: float, r: float, to_x: float, to_w: float, load: Loads) -> tuple[float, float, float]:
     """The step in angle, vy and share that balances in first order."""
     by_l, by_r = -s - c, c - s
@@ -339,7 +349,7 @@ def _step(b: Balance, c: float, s: float, v: float, r: float, to_x: float, to_w:
     return solve_3x3(Matrix3(x_a, x_v, x_r, y_a, y_v, y_r, m_a, m_v, m_r), -b.x, -b.y, -b.m)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _pulled(
     angle: float, drift: float, share: float, to_x: float, to_w: float, unit: float, load: Loads, floor: Floor
 ) -> tuple[float, float, float, bool]:
@@ -358,7 +368,7 @@ def _pulled(
     return angle, drift, share, True
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _enclosed(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:
     """Angle, vy and share without a centripetal force, by enclosing the angle."""
     still = Loads(load.fl, load.fr, load.rl, load.rr, load.cg_x, load.cg_y, 0.0)
@@ -409,7 +419,7 @@ def _enclosed(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[floa
     return low, y, math.hypot(x, floor.half_track * w), abs(error) < _BALANCED
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subroutine
 def _miss(angle: float, goal: float, x: float, y: float, w: float, load: Loads, floor: Floor) -> tuple[float, float, float, float]:
     """By how much wheels at ``angle`` miss the ``goal``, and their twist.
 

@@ -13,12 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import root
 
+from motion_models.compiled import kernel
+from motion_models.friction import equilibrium
 from motion_models.friction.contact import CREEP, loads
-from motion_models.friction.equilibrium import Floor, Loads, balance
+from motion_models.friction.equilibrium import Floor, Loads
 from motion_models.friction.model import FrictionModel
 from motion_models.robot import load_robot
 from motion_models.se2 import FloatArray
 
+balance = kernel(equilibrium.balance)
 THESIS_SECONDS = 70.0  # Ebersole 2016, Sec. 3.4
 
 

@@ -8,13 +8,15 @@ import math
 import numpy as np
 import pytest
 
-from localization.lidar import LidarConfig, ScanMatch, ScanMatcher, scan_matcher
+from localization.lidar import LidarConfig, ScanMatch, ScanMatcher, scan_matcher, submap
 from localization.lidar.scan_matcher import _KERNEL, KeyScan, linearize
-from localization.lidar.submap import fill_surface, find_nearest, make_grid
+from localization.lidar.submap import make_grid
 from localization.simulation import world
 from motion_models import se2
+from motion_models.compiled import kernel
 from tests.helpers import rooms
 
+fill_surface, find_nearest = kernel(submap.fill_surface), kernel(submap.find_nearest)
 LAB, HALL = world.lab().walls, world.hall().walls
 CORRIDOR = np.concatenate([world.line(-60, -1.2, 60, -1.2), world.line(-60, 1.2, 60, 1.2)])
 WALL = world.line(-60, 2.0, 60, 2.0)

@@ -8,17 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from localization.lidar.submap import (
-    MAX_RINGS,
-    POOLED_VOXELS,
-    fill_surface,
-    find_nearest,
-    find_voxel,
-    make_grid,
-    measure_shares,
-    voxel_means,
-)
+from localization.lidar import submap
+from localization.lidar.submap import MAX_RINGS, POOLED_VOXELS, make_grid, measure_shares, voxel_means
+from motion_models.compiled import kernel
 
+fill_surface, find_nearest, find_voxel = kernel(submap.fill_surface), kernel(submap.find_nearest), kernel(submap.find_voxel)
 CELL, NOISE_M = 0.1, 0.02
 
 

@@ -270,6 +270,17 @@ def test_friction_wheels_of_a_robot_that_cannot_roll_are_refused():
         MODEL.wheels(np.array([0.5, 0.1]), np.zeros(2), with_params(rolling_resistance=1.5))
 
 
+@pytest.mark.parametrize("law", SATURATION)
+def test_friction_interpreted_twist_equals_the_compiled(law):
+    """To the last digit, since priors of robots are interpreted; also with the CG almost over a wheel, and with soft and hard tyres."""
+    cgs = np.array([(x, y) for x in np.linspace(-0.999, 0.999, 7) for y in np.linspace(-0.999, 0.999, 7)]) * HALF
+    for stiffness in (3.0, 10.0, 100.0):
+        params = with_params(slip_stiffness=stiffness)
+        compiled = LAWS[law].twist(np.array([-1.0, 1.0]), cgs, params)
+        interpreted = LAWS[law].interpret_twist(np.array([-1.0, 1.0]), cgs, params)
+        np.testing.assert_array_equal(interpreted.value, compiled.value)
+
+
 def test_friction_twist_takes_microseconds():
     """The thesis's solver took 70 s. About 2 us on an idle core; the best of many rounds, as other processes may run."""
     rng = np.random.default_rng(0)

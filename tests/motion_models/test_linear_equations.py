@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from motion_models.linear_equations import Matrix3, diagonalize, multiply, solve, solve_3x3, transform_symmetric
+from motion_models import linear_equations
+from motion_models.compiled import kernel
+from motion_models.linear_equations import Matrix3
+
+diagonalize, multiply, transform_symmetric = (
+    kernel(f) for f in (linear_equations.diagonalize, linear_equations.multiply, linear_equations.transform_symmetric)
+)
+solve, solve_3x3 = kernel(linear_equations.solve), kernel(linear_equations.solve_3x3)
 
 
 def random_matrices(n: int = 200) -> list[np.ndarray]:
