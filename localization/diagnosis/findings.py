@@ -290,9 +290,11 @@ def describe_standstill_turn(turn: StandstillTurn) -> str:
 
 
 def describe_tolerated(d: Diagnosis) -> list[str]:
-    """One line for each cause that is significant but within its tolerance."""
+    """One line for each cause that is significant but within its tolerance, and not suspected."""
     found = []
     for name, (size, sigma) in d.within.items():
+        if d.suspected is not None and name == d.suspected.cause:
+            continue
         unit = _unit_of(name)
         found.append(f"{name} {size:+.2g} +- {sigma:.1g}{unit} (tolerated {d.tolerances.get(name, math.nan):.2g}{unit})")
     return found
@@ -364,7 +366,7 @@ def _correction(d: Diagnosis, findings: Sequence[Finding]) -> str:
 def _suspicion(f: Finding) -> str:
     """What shows, but may be noise."""
     aliases = "".join(f" or {name} {size:+.3g}{_unit_of(name)}" for name, size in f.aliases)
-    size = f"{f.size:+.3g}{_unit_of(f.cause)} (+- {f.sigma:.1g})"
+    size = f"{f.size:+.3g}{_unit_of(f.cause)} (+- {f.sigma:.1g}, tolerated {f.definition.negligible:.2g})"
     return f"Too weak to be named is {f.cause} {size}{aliases}: up to {100 * f.p_value:.0f} % of healthy drives show as much."
 
 
