@@ -365,8 +365,8 @@ def separating_drive(predictor: DrivePredictor, findings: Sequence[Finding]) -> 
         information = min((float(np.sum((moved[0] - other) ** 2)) for other in moved[1:]), default=0.0)
         if information > 1.05 * best[1]:
             best = text, information
-    names = [cause.id for cause, _ in pairs]
-    listed = ", ".join(names[:-1]) + " and " + names[-1]
+    *names, last = finding.cause, *(name for name, _ in finding.aliases[:4])
+    listed = f"{', '.join(names)} and {last}"
     seconds = max(_SECONDS, 5.0 * math.ceil(_SECONDS * _ENOUGH / best[1] / 5.0))
     if not best[0] or seconds > _MAX_S:
         return f"No drive of two minutes separates {listed}: measure one of them directly."
