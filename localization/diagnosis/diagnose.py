@@ -12,7 +12,17 @@ import numpy as np
 from localization.diagnosis.causes import MISSING_MESSAGES, Cause
 from localization.diagnosis.corrected_robot import check_handover
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.findings import Component, Diagnosis, Finding, Gain, describe_loss, describe_standstill_turn, evidence, sentence
+from localization.diagnosis.findings import (
+    MAX_NOISE_OVER_REFERENCE,
+    Component,
+    Diagnosis,
+    Finding,
+    Gain,
+    describe_loss,
+    describe_standstill_turn,
+    evidence,
+    sentence,
+)
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor
 from localization.diagnosis.prediction import Baseline, DrivePredictor, with_sizes
 from localization.diagnosis.selection import (
@@ -20,8 +30,10 @@ from localization.diagnosis.selection import (
     bent_causes,
     has_tolerated_substitute,
     heldout_gain,
+    heldout_log_odds,
     max_statistic,
     p_value,
+    problems_without_a_fold,
     refined_cost,
     search_causes,
     simplest_set,
@@ -37,6 +49,7 @@ from localization.diagnosis.verdict import (
     find_trends,
     general_advice,
     mark_trends,
+    noise_excess,
     separating_drive,
 )
 from localization.settings import Count, Probability, Seed, Settings
@@ -47,8 +60,6 @@ _ROUNDS = 5
 TOLERANCE = 0.35  # sigma of unnamed causes, over what is negligible: the spread of robots about their files
 _SYSTEMATIC_SHARE = 1.0 / 3.0  # systematic part of a size's sigma, over what is negligible: clocks, mounts and physics are no better
 _MIN_HELDOUT_GAIN = 0.003  # least held-out gain of a finding
-_CLEAR_HELDOUT_GAIN = 0.05
-_FEW_WINDOWS = 64
 _SUSPICION = 0.2  # family-wise p of a cause that is mentioned, but not named
 _MIN_GAPS = 3  # fewer gaps between messages are pauses
 
@@ -173,11 +184,12 @@ def _conclude(
 ) -> DiagnosisResult:
     """Findings, the table with its attributions, and the verdict that follows from it."""
     drive, problem, causes = predictor.drive, linearization.problem, linearization.causes
-    chosen, gains, dropped = _keep_useful(linearization, chosen, config)
-    sizes, _, gained = problem.fit(chosen)
-    findings = _make_findings(predictor, linearization, chosen, gains, rng)
     given = np.sqrt(np.diagonal(predictor.batch.cov, axis1=1, axis2=2)) * np.array(predictor.baseline.noise_over_reference)
     reference_sigmas = given if drive.kind == "log" else None
+    excess = [noise_excess(linearization, reference_sigmas, np.isfinite(first.rows[:, c]), c) for c in range(3)]
+    chosen, gains, dropped = _keep_useful(linearization, chosen, config, max(excess) <= MAX_NOISE_OVER_REFERENCE)
+    sizes, _, gained = problem.fit(chosen)
+    findings = _make_findings(predictor, linearization, chosen, gains, rng)
     rows = attribute_rows(first, linearization, chosen, sizes, config.significance, reference_sigmas)
     left = linearization.linear - linearization.signatures[..., list(chosen)] @ sizes
     spreads = problem.scale * np.where(np.isin(np.arange(len(causes)), chosen), 1.0, problem.tolerance)
@@ -220,33 +232,36 @@ def _conclude(
     return DiagnosisResult(dataclasses.replace(result, sentence=sentence(result)), predictor, residuals, linearization)
 
 
-def _heldout(
-    linearization: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], config: DiagnosisConfig, is_tolerant: bool = False
-) -> Gain:
-    return heldout_gain(linearization, chosen, others, np.random.default_rng(config.seed), is_tolerant)
+def _heldout(linearization: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], config: DiagnosisConfig) -> Gain:
+    return heldout_gain(linearization, chosen, others, np.random.default_rng(config.seed))
 
 
 def _keep_useful(
-    linearization: Linearization, chosen: tuple[int, ...], config: DiagnosisConfig
+    linearization: Linearization, chosen: tuple[int, ...], config: DiagnosisConfig, is_noise_own: bool
 ) -> tuple[tuple[int, ...], list[Gain], dict[str, tuple[float, float]]]:
-    """``chosen`` without those within tolerance, those for which another cause within its tolerance would do, and those without a held-out
-    gain, over the robot file or over all that is tolerated; the first gain of each; size and sigma of those within tolerance."""
+    """``chosen`` without those within tolerance, those for which another cause within its tolerance would do, and those that do not predict
+    windows to which they were not fitted; the gain of each; size and sigma of those within tolerance.
+
+    In short drives what is tolerated hides the gain in discrepancies, but not in likelihood, where the noise is the reference's own.
+    """
     within: dict[str, tuple[float, float]] = {}
-    causes, windows = linearization.causes, len(linearization.rows)
+    causes, problem = linearization.causes, linearization.problem
     largest = np.array([e.negligible for e in causes])
+    folds = problems_without_a_fold(linearization)
     while True:
-        sizes, cov, _ = linearization.problem.fit(chosen)
+        sizes, cov, _ = problem.fit(chosen)
         without = [tuple(j for j in chosen if j != i) for i in chosen]
         gains = [_heldout(linearization, chosen, others, config) for others in without]
-        own_gains = [_heldout(linearization, chosen, others, config, is_tolerant=True) for others in without]
+        odds = [heldout_log_odds(problem, folds, chosen, others) for others in without]
         tolerated = [
             abs(size) < largest[i] or has_tolerated_substitute(linearization, chosen, i, largest)
             for size, i in zip(sizes, chosen, strict=True)
         ]
-        small = [n for n in range(len(chosen)) if tolerated[n] or not any(_is_gain_significant(g[n], windows) for g in (gains, own_gains))]
+        predicts = [_is_gain_significant(gain) or (is_noise_own and odd > 0.0) for gain, odd in zip(gains, odds, strict=True)]
+        small = [n for n in range(len(chosen)) if tolerated[n] or not predicts[n]]
         if not small:
             return chosen, gains, within
-        worst = min(small, key=lambda n: own_gains[n].relative)
+        worst = min(small, key=lambda n: odds[n])
         if abs(sizes[worst]) < largest[chosen[worst]]:
             within[causes[chosen[worst]].id] = float(sizes[worst]), float(math.sqrt(cov[worst, worst]))
         chosen = tuple(i for n, i in enumerate(chosen) if n != worst)
@@ -319,9 +334,9 @@ def _with_data_errors(d: Diagnosis, drive: Drive) -> Diagnosis:
     return dataclasses.replace(d, verdict=verdict, findings=findings)
 
 
-def _is_gain_significant(gain: Gain, windows: int) -> bool:
-    """On windows that sizes were not fitted to. An interval from a few blocks of windows is too wide: there a clear gain is enough."""
-    return gain.relative >= _MIN_HELDOUT_GAIN and (gain.low > 0.0 or (windows < _FEW_WINDOWS and gain.relative > _CLEAR_HELDOUT_GAIN))
+def _is_gain_significant(gain: Gain) -> bool:
+    """On windows that sizes were not fitted to."""
+    return gain.relative >= _MIN_HELDOUT_GAIN and gain.low > 0.0
 
 
 def _merge_slopes(findings: list[Finding]) -> list[Finding]:

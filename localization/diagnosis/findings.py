@@ -21,6 +21,8 @@ MAX_NOISE_OVER_REFERENCE = 3.0
 """Noise of the drive, over that of the motion reference by its own covariance: up to 1.5 where nothing is hidden, 3.1 to 200 for effects
 that no cause has (`tests.studies.unknown_effects --develop`)."""
 
+_SHOWN_GAIN = 0.01  # smallest gain that is told: in short drives what is tolerated hides it
+
 _CHANNEL_WORDS = {
     "x": "along the drive",
     "y": "sideways",
@@ -355,7 +357,8 @@ def _correction(d: Diagnosis, findings: Sequence[Finding]) -> str:
     first = findings[0]
     text = f"Correct {first.cause} by {first.size:+.3g}{_unit_of(first.cause)} (+- {first.sigma:.1g}): {first.description}"
     whole = d.gain or first.gain
-    text += f"; held-out discrepancies fall by {100 * whole.relative:.0f} %"
+    if whole.relative >= _SHOWN_GAIN:
+        text += f"; held-out discrepancies fall by {100 * whole.relative:.0f} %"
     if first.aliases:
         text += f". This drive cannot separate it from {', '.join(f'{name} {size:+.3g}' for name, size in first.aliases)}"
     if len(findings) > 1:

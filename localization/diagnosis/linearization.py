@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -32,6 +33,7 @@ _TURN_ERROR_OVER_LOG_SPEED = 0.065
 """How far a robot turns for the same way of the wheels, over the logarithm of their speed: DRIVE's Husky, by its gyro, turns 0.42 of the
 geometry's angle where the sides' speeds differ from their mean by 0.4 to 0.8 m/s, and 0.49 where by 0.03 to 0.1 m/s; slower, there is
 no data of turns in place."""
+_NO_SIZE = 1e-6  # sigma of a size that is not there, in units of its prior's
 _CLIP = 9.0  # squares beyond this many variances are outliers, and count as this much
 
 
@@ -229,6 +231,12 @@ class Regression:
         """Twice the log-evidence gained over naming nothing."""
         return self._evidence(subset)[2] - self._evidence_of_nothing if subset else 0.0
 
+    def gain_over(self, subset: tuple[int, ...], others: tuple[int, ...]) -> float:
+        """Twice the log-evidence gained over naming the ``others`` alone, where the rest of ``subset`` has no size at all."""
+        tolerance = self.tolerance.copy()
+        tolerance[[i for i in subset if i not in others]] = _NO_SIZE
+        return self._evidence(subset)[2] - dataclasses.replace(self, tolerance=tolerance)._evidence(others)[2]
+
     def misfit(self) -> float:
         """Sum of squares that is left where every cause keeps within its tolerance, and what that takes."""
         x = self.tolerated((), np.zeros(0)) / self.scale
@@ -287,7 +295,7 @@ def regression(
         q = q[:, np.abs(np.diag(r)) > 1e-9 * np.abs(np.diag(r)).max()]
         y, s = y - q @ (q.T @ y), s - q @ (q.T @ s)
     count = int(np.count_nonzero(np.abs(signatures).sum(axis=1) + np.abs(y)))
-    within = np.full(len(scale), 1e-6) if tolerance is None else np.maximum(tolerance / scale, 1e-6)
+    within = np.full(len(scale), _NO_SIZE) if tolerance is None else np.maximum(tolerance / scale, _NO_SIZE)
     return Regression(s.T @ s, s.T @ y, float(y @ y), count, scale, within)
 
 

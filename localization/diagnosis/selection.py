@@ -11,13 +11,12 @@ import numpy as np
 from localization.diagnosis.causes import Cause, Hypothesis
 from localization.diagnosis.findings import Gain
 from localization.diagnosis.linearization import (
-    MAX_TOLERANCE_SIGMAS,
     Linearization,
     Noise,
     Regression,
-    bounded_minimum,
     group_of,
     make_regression,
+    regression,
 )
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
 from motion_models.errors import CgError, ModelError
@@ -126,20 +125,32 @@ def p_value(t: float, draws: FloatArray, df: float) -> float:
     return float(min(0.01 * math.exp(-slope * (df * math.log1p(t**2 / df) - q[1])), 1.0))
 
 
-def heldout_gain(
-    state: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], rng: np.random.Generator, is_tolerant: bool = False
-) -> Gain:
-    """Root mean square of held-out whitened discrepancies by ``others`` and by ``chosen``; folds are of blocks of 4 windows. Where it
-    ``is_tolerant``, all other causes may be fitted as well, within what is tolerated of them."""
+def problems_without_a_fold(state: Linearization) -> list[Regression]:
+    """The drive without each fold of its windows; folds are of blocks of 4."""
+    y, s, z = (state.noise.whiten(rows) for rows in (state.linear, state.signatures, state.nuisances))
+    fold = (np.arange(len(y)) // _BLOCK_WINDOWS) % _FOLDS
+    found = []
+    for kept in (fold != f for f in range(_FOLDS)):
+        if kept.any() and not kept.all():
+            count = int(kept.sum()) * y.shape[1]
+            parts = (y[kept].reshape(count), s[kept].reshape(count, -1), z[kept].reshape(count, -1))
+            found.append(regression(*parts, state.problem.scale, state.problem.scale * state.problem.tolerance))
+    return found
+
+
+def heldout_log_odds(problem: Regression, without: Sequence[Regression], chosen: tuple[int, ...], others: tuple[int, ...]) -> float:
+    """Twice the log-odds of the causes ``chosen`` against ``others`` alone by windows that sizes were not fitted to, beside all that is
+    tolerated: of each fold given the rest, p(fold | rest) = p(all) / p(rest), with the regressions ``without`` one."""
+    return sum(problem.gain_over(chosen, others) - rest.gain_over(chosen, others) for rest in without)
+
+
+def heldout_gain(state: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], rng: np.random.Generator) -> Gain:
+    """Root mean square of held-out whitened discrepancies by ``others`` and by ``chosen``; folds are of blocks of 4 windows."""
     problem = state.problem
     squares = []
     for subset in (others, chosen):
-        is_named = np.isin(np.arange(len(problem.scale)), subset)
-        groups = {group_of(state.causes[i]) for i in subset}  # of which one cause is at work, and no other beside it
-        is_tolerated = np.array([is_tolerant and group_of(e) not in groups for e in state.causes])
-        spreads = problem.scale * np.where(is_named, 1.0, problem.tolerance * is_tolerated)
-        limits = np.where(is_named, np.inf, MAX_TOLERANCE_SIGMAS)
-        squares.append(heldout_squares(state.linear, state.signatures, state.nuisances, state.noise, spreads, limits))
+        spreads = problem.scale * np.isin(np.arange(len(problem.scale)), subset)
+        squares.append(heldout_squares(state.linear, state.signatures, state.nuisances, state.noise, spreads))
     block = np.arange(len(state.linear)) // _BLOCK_WINDOWS
     counts = np.bincount(block, weights=np.isfinite(state.linear).sum(axis=1))
     sums = [np.bincount(block, weights=s) for s in squares]
@@ -150,16 +161,12 @@ def heldout_gain(
     return Gain(rms[0], rms[1], 1.0 - rms[1] / max(rms[0], 1e-12), float(low), float(high))
 
 
-def heldout_squares(
-    linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, noise: Noise, spreads: FloatArray, limits: FloatArray
-) -> FloatArray:
-    """(M,) sum of squares of each window, predicted from the others by causes with the prior sigmas ``spreads`` (p,), 0 for none, that end
-    at ``limits`` (p,) of them."""
+def heldout_squares(linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, noise: Noise, spreads: FloatArray) -> FloatArray:
+    """(M,) sum of squares of each window, predicted from the others by causes with the prior sigmas ``spreads`` (p,), 0 for none."""
     y = noise.whiten(linear)
     used = spreads > 0.0
     columns = [noise.whiten(signatures[..., used]) * spreads[used], noise.whiten(nuisances) * 1e3]
     design = np.concatenate(columns, axis=-1)
-    within = np.r_[limits[used], np.full(nuisances.shape[-1], np.inf)]
     fold = (np.arange(len(y)) // _BLOCK_WINDOWS) % _FOLDS
     out = np.zeros(len(y))
     for f in range(_FOLDS):
@@ -167,7 +174,7 @@ def heldout_squares(
         if not held.any() or held.all():
             continue
         a = design[~held].reshape(-1, design.shape[-1])
-        x = bounded_minimum(a.T @ a + np.eye(a.shape[1]), a.T @ y[~held].ravel(), within)
+        x = np.linalg.solve(a.T @ a + np.eye(a.shape[1]), a.T @ y[~held].ravel())
         out[held] = np.sum((y[held] - design[held] @ x) ** 2, axis=1)
     return out
 

@@ -244,7 +244,7 @@ def attribute_rows(
         squares = float(np.sum(white[known, c] ** 2))
         count = int(known.sum())
         p = float(chi2.sf(squares if c < _TESTED_CHANNELS else count, count))
-        excess = _noise_excess(linearization, reference_sigmas, known, c)
+        excess = noise_excess(linearization, reference_sigmas, known, c)
         if expected < _MODEL_ACCURACY * rms:
             excess = min(excess, MAX_NOISE_OVER_REFERENCE)
         component = Component(CHANNEL_UNITS[c], rms, expected, p, left_rms, rest_rms, excess)
@@ -256,7 +256,7 @@ def attribute_rows(
     return found
 
 
-def _noise_excess(linearization: Linearization, reference_sigmas: FloatArray | None, known: NDArray[np.bool_], channel: int) -> float:
+def noise_excess(linearization: Linearization, reference_sigmas: FloatArray | None, known: NDArray[np.bool_], channel: int) -> float:
     """Median of the estimated noise over that of the reference; 1 where the latter is not given."""
     if reference_sigmas is None or channel >= reference_sigmas.shape[1]:
         return 1.0

@@ -6,30 +6,66 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from localization.diagnosis.causes import CAUSES
-from localization.diagnosis.linearization import Regression, given_noise, make_regression
-from localization.diagnosis.selection import strongest_beyond_tolerance
+from localization.diagnosis.linearization import Linearization, given_noise, make_regression
+from localization.diagnosis.selection import heldout_log_odds, problems_without_a_fold, strongest_beyond_tolerance
 from motion_models.se2 import FloatArray
 
 WINDOWS, SIGMA, TOLERANCE = 40, 0.01, 0.35
 USED = tuple(CAUSES[name] for name in ("track_width", "cg_offset_x", "lidar_yaw", "gyro_bias"))
+OWN = np.array([cause.plausible for cause in USED])
 WITHIN = TOLERANCE * np.array([cause.negligible for cause in USED])
 
 
-def made_up(sizes: FloatArray, rng: np.random.Generator) -> Regression:
-    """Causes with ``sizes`` (4,), of which each shifts x by about one sigma of a window's noise at a tolerated size."""
+def made_up(sizes: FloatArray, rng: np.random.Generator, windows: slice = slice(None)) -> Linearization:
+    """Causes with ``sizes`` (4,) that act in some ``windows``; each shifts x by about one sigma of a window's noise at a tolerated size."""
     signatures = np.full((WINDOWS, 6, len(USED)), np.nan)
     signatures[:, 0] = rng.normal(0.0, 1.0, (WINDOWS, len(USED))) * SIGMA / WITHIN
+    acting = np.zeros((WINDOWS, 1))
+    acting[windows] = 1.0
     rows = np.full((WINDOWS, 6), np.nan)
-    rows[:, 0] = signatures[:, 0] @ sizes + rng.normal(0.0, SIGMA, WINDOWS)
+    rows[:, 0] = (signatures[:, 0] * acting) @ sizes + rng.normal(0.0, SIGMA, WINDOWS)
     noise = given_noise(rows, np.full(rows.shape, SIGMA), np.zeros(WINDOWS, dtype=bool))
-    return make_regression(rows, signatures, np.zeros((WINDOWS, 6, 0)), noise, USED, TOLERANCE)
+    nuisances = np.zeros((WINDOWS, 6, 0))
+    problem = make_regression(rows, signatures, nuisances, noise, USED, TOLERANCE)
+    return Linearization(USED, rows, rows, signatures, nuisances, noise, TOLERANCE, problem)
+
+
+def predictive_log_density(state: Linearization, chosen: tuple[int, ...]) -> float:
+    """Of every fold of five, by the mean and the covariance that the rest predicts, from the definition; the first cause is not
+    tolerated."""
+    y, s = state.rows[:, 0] / SIGMA, state.signatures[:, 0] / SIGMA
+    number = np.arange(len(USED))
+    prior = np.diag(np.where(np.isin(number, chosen), OWN, np.where(number == 0, 1e-6 * OWN, WITHIN)) ** 2)
+    fold = (np.arange(WINDOWS) // 4) % 5
+    total = 0.0
+    for f in range(5):
+        a, b = s[fold != f], s[fold == f]
+        V = np.linalg.inv(a.T @ a + np.linalg.inv(prior))
+        total += multivariate_normal(b @ V @ a.T @ y[fold != f], b @ V @ b.T + np.eye(len(b))).logpdf(y[fold == f])
+    return total
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_heldout_log_odds_are_of_predicted_folds(seed: int) -> None:
+    state = made_up(np.array([0.02, 0.0, 0.0, 0.0]), np.random.default_rng(seed))
+    odds = heldout_log_odds(state.problem, problems_without_a_fold(state), (0, 2), (2,))
+    assert 0.5 * odds == pytest.approx(predictive_log_density(state, (0, 2)) - predictive_log_density(state, (2,)), rel=1e-6)
+    assert odds > 20.0
+
+
+def test_heldout_log_odds_of_what_acts_in_one_block_are_negative() -> None:
+    state = made_up(np.array([0.1, 0.0, 0.0, 0.0]), np.random.default_rng(0), slice(8, 12))
+    problem = state.problem
+    assert problem.gain((0,)) > 10.0
+    assert heldout_log_odds(problem, problems_without_a_fold(state), (0,), ()) < 0.0
 
 
 def test_strongest_beyond_tolerance_p_is_uniform_for_tolerated_sizes() -> None:
     rng = np.random.default_rng(1)
-    p = [strongest_beyond_tolerance(made_up(rng.normal(0.0, WITHIN), rng), rng, 1e6)[1] for _ in range(300)]
+    p = [strongest_beyond_tolerance(made_up(rng.normal(0.0, WITHIN), rng).problem, rng, 1e6)[1] for _ in range(300)]
     assert np.mean(np.array(p) < 0.2) == pytest.approx(0.2, abs=3.0 * np.sqrt(0.16 / 300))
     assert np.mean(p) == pytest.approx(0.5, abs=3.0 / np.sqrt(12 * 300))
 
@@ -39,7 +75,7 @@ def test_strongest_beyond_tolerance_is_the_hidden_cause(cause: int) -> None:
     rng = np.random.default_rng(cause)
     sizes = np.zeros(len(USED))
     sizes[cause] = 5.0 * WITHIN[cause]
-    problem = made_up(sizes, rng)
+    problem = made_up(sizes, rng).problem
     found, p = strongest_beyond_tolerance(problem, rng, 1e6)
     assert found == cause
     assert p < 1e-3
