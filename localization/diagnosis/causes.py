@@ -328,7 +328,7 @@ CAUSES: Mapping[str, Cause] = {cause.id: cause for cause in _CAUSES}
 
 _TOLERATED_LOAD = 0.01
 """Share of the robot's mass that is tolerated as payload: over the front edge it moves the centre of gravity of the robots that come with
-skidloc by 2 to 6 mm, and 3 mm are tolerated of `cg_offset_x` [-]."""
+skidloc by 1 to 5 mm, and 3 mm are tolerated of `cg_offset_x` [-]."""
 
 
 def payload(mass_kg: float) -> Cause:

@@ -242,7 +242,7 @@ def _keep_useful(
     """``chosen`` without those within tolerance, those for which another cause within its tolerance would do, and those that do not predict
     windows to which they were not fitted; the gain of each; size and sigma of those within tolerance.
 
-    In short drives what is tolerated hides the gain in discrepancies, but not in likelihood, where the noise is the reference's own.
+    In short drives tolerated differences mask the gain in discrepancies, but not in likelihood, if the noise is that of the reference.
     """
     within: dict[str, tuple[float, float]] = {}
     causes, problem = linearization.causes, linearization.problem

@@ -21,7 +21,7 @@ MAX_NOISE_OVER_REFERENCE = 3.0
 """Noise of the drive, over that of the motion reference by its own covariance: up to 1.5 where nothing is hidden, 3.1 to 200 for effects
 that no cause has (`tests.studies.unknown_effects --develop`)."""
 
-_SHOWN_GAIN = 0.01  # smallest gain that is told: in short drives what is tolerated hides it
+_SHOWN_GAIN = 0.01  # smallest gain that a sentence reports: in short drives tolerated differences mask it
 
 _CHANNEL_WORDS = {
     "x": "along the drive",

@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from localization.diagnosis.causes import Cause, Hypothesis
 from localization.diagnosis.findings import Gain
@@ -125,16 +126,21 @@ def p_value(t: float, draws: FloatArray, df: float) -> float:
     return float(min(0.01 * math.exp(-slope * (df * math.log1p(t**2 / df) - q[1])), 1.0))
 
 
+def folds(windows: int) -> list[NDArray[np.bool_]]:
+    """Which of so many ``windows`` are held out together, (windows,) for each fold: every fifth block of 4, as neighbours err alike. None
+    where all windows are in one block."""
+    fold = (np.arange(windows) // _BLOCK_WINDOWS) % _FOLDS
+    return [fold == f for f in range(_FOLDS) if (fold == f).any() and (fold != f).any()]
+
+
 def problems_without_a_fold(state: Linearization) -> list[Regression]:
-    """The drive without each fold of its windows; folds are of blocks of 4."""
+    """The drive without each fold of its windows."""
     y, s, z = (state.noise.whiten(rows) for rows in (state.linear, state.signatures, state.nuisances))
-    fold = (np.arange(len(y)) // _BLOCK_WINDOWS) % _FOLDS
     found = []
-    for kept in (fold != f for f in range(_FOLDS)):
-        if kept.any() and not kept.all():
-            count = int(kept.sum()) * y.shape[1]
-            parts = (y[kept].reshape(count), s[kept].reshape(count, -1), z[kept].reshape(count, -1))
-            found.append(regression(*parts, state.problem.scale, state.problem.scale * state.problem.tolerance))
+    for held in folds(len(y)):
+        rest = y[~held].ravel()
+        parts = s[~held].reshape(len(rest), -1), z[~held].reshape(len(rest), -1)
+        found.append(regression(rest, *parts, state.problem.scale, state.problem.scale * state.problem.tolerance))
     return found
 
 
@@ -145,7 +151,7 @@ def heldout_log_odds(problem: Regression, without: Sequence[Regression], chosen:
 
 
 def heldout_gain(state: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], rng: np.random.Generator) -> Gain:
-    """Root mean square of held-out whitened discrepancies by ``others`` and by ``chosen``; folds are of blocks of 4 windows."""
+    """Root mean square of held-out whitened discrepancies by ``others`` and by ``chosen``."""
     problem = state.problem
     squares = []
     for subset in (others, chosen):
@@ -167,12 +173,8 @@ def heldout_squares(linear: FloatArray, signatures: FloatArray, nuisances: Float
     used = spreads > 0.0
     columns = [noise.whiten(signatures[..., used]) * spreads[used], noise.whiten(nuisances) * 1e3]
     design = np.concatenate(columns, axis=-1)
-    fold = (np.arange(len(y)) // _BLOCK_WINDOWS) % _FOLDS
     out = np.zeros(len(y))
-    for f in range(_FOLDS):
-        held = fold == f
-        if not held.any() or held.all():
-            continue
+    for held in folds(len(y)):
         a = design[~held].reshape(-1, design.shape[-1])
         x = np.linalg.solve(a.T @ a + np.eye(a.shape[1]), a.T @ y[~held].ravel())
         out[held] = np.sum((y[held] - design[held] @ x) ** 2, axis=1)

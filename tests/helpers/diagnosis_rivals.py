@@ -17,12 +17,11 @@ from localization.diagnosis.causes import CAUSES, Cause, friction_change
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.linearization import Linearization
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
-from localization.diagnosis.selection import heldout_gain, heldout_squares
+from localization.diagnosis.selection import folds, heldout_gain, heldout_squares
 from motion_models.se2 import FloatArray
 
 NONE = "nothing"
 _MOST = 7
-_BLOCK, _FOLDS = 4, 5
 
 
 def rivals(drive: Drive, pipeline: DrivePredictor, state: Linearization) -> dict[str, tuple[str, float]]:
@@ -32,8 +31,7 @@ def rivals(drive: Drive, pipeline: DrivePredictor, state: Linearization) -> dict
     s = state.noise.whiten(state.signatures).reshape(len(y), -1) * scale
 
     def gain(subset: tuple[int, ...]) -> float:
-        data = state.linear, state.signatures, state.nuisances, state.noise, scale
-        return heldout_gain(*data, subset, (), np.random.default_rng(0)).relative if subset else 0.0
+        return heldout_gain(state, subset, (), np.random.default_rng(0)).relative if subset else 0.0
 
     found = {}
     for name, subset in (("stepwise", _stepwise(y, s)), ("stlsq", _stlsq(y, s, 0.5 / 4.0))):
@@ -53,9 +51,8 @@ def oracle(pipeline: DrivePredictor, state: Linearization, truth: dict[str, floa
     for name, size in truth.items():
         effects = moment if name == "friction_change" else [CAUSES[name]]
         options = [{**option, effect: size} for option in options for effect in effects]
-    data = state.signatures, state.nuisances, state.noise, state.problem.scale, ()
-    left = min(float(heldout_squares(pipeline.discrepancies(with_sizes(option)), *data).sum()) for option in options)
-    before = float(heldout_squares(state.rows, *data).sum())
+    left = min(_unexplained_squares(state, pipeline.discrepancies(with_sizes(option))) for option in options)
+    before = _unexplained_squares(state, state.rows)
     return 1.0 - float(np.sqrt(left / before))
 
 
@@ -89,6 +86,11 @@ def _stlsq(y: FloatArray, s: FloatArray, threshold: float) -> list[int]:
     return [int(i) for i in np.flatnonzero(keep)]
 
 
+def _unexplained_squares(state: Linearization, rows: FloatArray) -> float:
+    """Held-out squares of the whitened ``rows`` (M, 6) by no cause at all."""
+    return float(heldout_squares(rows, state.signatures, state.nuisances, state.noise, np.zeros(len(state.causes))).sum())
+
+
 def _gp_gain(drive: Drive, state: Linearization) -> float:
     """A squared-exponential Gaussian process on (distance, turn, CG) of each window and a constant, one for each channel."""
     inputs = []
@@ -101,14 +103,11 @@ def _gp_gain(drive: Drive, state: Linearization) -> float:
     x = (x - x.mean(axis=0)) / np.maximum(x.std(axis=0), 1e-9)
     distance = np.sum((x[:, None] - x[None]) ** 2, axis=-1)
     y = state.noise.whiten(state.linear)
-    fold = (np.arange(len(y)) // _BLOCK) % _FOLDS
-    before = float(heldout_squares(state.linear, state.signatures, state.nuisances, state.noise, state.problem.scale, ()).sum())
+    before = _unexplained_squares(state, state.linear)
     after = 0.0
     for c in range(y.shape[1]):
         kernel = max(float(np.var(y[:, c])) - 1.0, 0.01) * np.exp(-0.5 * distance) + float(np.mean(y[:, c] ** 2))
-        for f in range(_FOLDS):
-            held = fold == f
-            if held.any() and not held.all():
-                weights = np.linalg.solve(kernel[np.ix_(~held, ~held)] + np.eye(int((~held).sum())), y[~held, c])
-                after += float(np.sum((y[held, c] - kernel[np.ix_(held, ~held)] @ weights) ** 2))
+        for held in folds(len(y)):
+            weights = np.linalg.solve(kernel[np.ix_(~held, ~held)] + np.eye(int((~held).sum())), y[~held, c])
+            after += float(np.sum((y[held, c] - kernel[np.ix_(held, ~held)] @ weights) ** 2))
     return 1.0 - float(np.sqrt(after / before))
