@@ -8,7 +8,7 @@ with right perturbations: true pose = pose * exp(error).
 `start` and `key` are clones of the pose (Roumeliotis & Burdick 2002, stochastic cloning) at the start of the step and at the last
 keyframe. `map` is the error of the submap around the robot, as a right perturbation of the pose. Scans that are matched to one submap
 share that error, so it is a consider state (Schmidt 1966): its covariance and correlations count, its gain is zero, as the submap stays
-where it is drawn.
+where it is drawn. So is `key`: motions from keyframe to keyframe then add up to the filter's own trajectory.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Filter:
         self.P[PARAMS:, PARAMS:] = corrections.cov
         self.is_considered = np.zeros(n, dtype=bool)
         """(n,) states that have no gain."""
-        self.is_considered[MAP] = True
+        self.is_considered[MAP] = self.is_considered[KEY] = True
         self.wheel_scale = 1.0
         """Factor on the robot file's wheel noise, estimated from the innovations."""
         self._scale_information, self._slip_cov = 0.0, np.zeros((n, n))  # Fisher information; the part of P that is this step's slip
@@ -198,7 +198,6 @@ class Filter:
         """Move the means by the estimated ``error`` (n,)."""
         self.pose = se2.compose(self.pose, se2.exp(error[POSE]))
         self.start = se2.compose(self.start, se2.exp(error[START]))
-        self.key = se2.compose(self.key, se2.exp(error[KEY]))
         self.bias += float(error[BIAS])
         self.scale += float(error[SCALE])
         self.clock_offset += float(error[CLOCK])

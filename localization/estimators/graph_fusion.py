@@ -67,7 +67,7 @@ class GraphFusion(Estimator):
         self._steps, self._stamps_ns = array("d"), array("q")  # the filter's poses, if they are to be smoothed
         self._nodes = array("q")  # which of them are keyframes
         self._is_smoothing = is_smoothing
-        self._is_keyframe_due = False
+        self._is_keyframe_due = self._is_matched = False
         self._map_T_odom, self._key_cov = np.zeros(3), np.zeros((3, 3))
         self._walked_s = 0.0
         self._positions: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []  # keyframe, offset, position, cov: not aligned yet
@@ -95,6 +95,7 @@ class GraphFusion(Estimator):
         self.run_deferred()
         ekf = self.odometry.filter
         estimate = self.odometry.step(step)
+        self._is_matched = estimate.nis is not None
         self._wheels.add(self.odometry.wheel_motion, self._corrections, self.odometry.is_turning)
         self._walked_s += step.duration
         if self._is_smoothing and (not self._stamps_ns or step.end_ns > self._stamps_ns[-1]):
@@ -125,9 +126,10 @@ class GraphFusion(Estimator):
         if k:
             delta, cov = ekf.motion_since(KEY)
             wheels = self._wheels.preintegrated(ekf.corrections)
-            D = wheels.by_corrections[:, :-1]
-            total = wheels.cov + D @ ekf.P[PARAMS:, PARAMS:] @ D.T
-            measured = _subtract_information(delta, cov, wheels.delta, total)
+            measured = delta, np.asarray(np.linalg.inv(cov))
+            if not self._is_matched:
+                D = wheels.by_corrections[:, :-1]
+                measured = _subtract_information(delta, cov, wheels.delta, wheels.cov + D @ ekf.P[PARAMS:, PARAMS:] @ D.T)
             pose = se2.compose(self.graph.pose(k - 1), delta)
             update = Update(pose, wheels, self._walk(), (Between(k - 1, k, *measured),))
         else:
@@ -266,9 +268,10 @@ class _KeyframeMotion:
 def _subtract_information(delta: Pose2, cov: Cov3, prior: Pose2, prior_cov: Cov3) -> tuple[Pose2, Cov3]:
     """Motion and information of gyro and scans alone, where they and the wheels' ``prior`` (3,) together give ``delta`` (3,).
 
-    The wheels have a factor of their own, and must not be counted twice: information C^-1 - C_w^-1, where it is positive. Along directions
-    in which gyro and scans have less information than the wheels, their share of the motion is not observable: there it is at most as far
-    from ``delta`` as the wheels are.
+    The wheels have a factor of their own, and must not be counted twice where no scan was matched: information C^-1 - C_w^-1, where it is
+    positive. Along directions in which gyro and scans have less information than the wheels, their share of the motion is not observable:
+    there it is at most as far from ``delta`` as the wheels are. After a matched scan the whole motion counts: errors of scans are against
+    the submap, so that they do not add up from keyframe to keyframe as those of the wheels do.
     """
     root = np.linalg.cholesky(np.linalg.inv(prior_cov))
     whiten = np.linalg.inv(root)

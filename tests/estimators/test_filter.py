@@ -173,6 +173,19 @@ def test_start_key_clones_the_pose():
     np.testing.assert_array_equal(ekf.P[np.ix_(others, others)], before[np.ix_(others, others)])
 
 
+def test_motions_since_keys_add_up_to_the_trajectory():
+    """Scans after a keyframe do not move the clone: a chain of these motions is where the filter was."""
+    rng = np.random.default_rng(4)
+    ekf, chain = filter_at(rng.normal(size=3)), None
+    for i, step in enumerate(winding_steps(20.0)):
+        ekf.predict(step)
+        ekf.update_scan(se2.compose(ekf.pose, se2.exp(rng.normal(0.0, 0.01, 3))), LIDAR, NOTHING)
+        if i % 10 == 0:
+            chain = ekf.pose if chain is None else se2.compose(chain, ekf.motion_since(KEY)[0])
+            np.testing.assert_allclose(se2.between(chain, ekf.pose), 0.0, atol=1e-9)
+            ekf.start_key()
+
+
 # --- updates
 
 
@@ -182,6 +195,9 @@ def prepared(seed):
     ekf = filter_at(rng.normal(size=3))
     ekf.start, ekf.key, ekf.P = rng.normal(size=3), rng.normal(size=3), random_covariance(rng)
     return ekf, se2.compose(ekf.pose, se2.exp(1e-3 * rng.normal(size=3)))
+
+
+CONSIDERED = np.r_[MAP, KEY]
 
 
 def states(ekf):
@@ -196,13 +212,13 @@ def test_update_without_consider_states_equals_filterpy():
     other = KalmanFilter(SIZE, 3)
     other.P, other.H, other.R = ekf.P.copy(), H, LIDAR
     other.update(se2.log(se2.between(ekf.pose, measured)))
-    pose, key = ekf.pose, ekf.key
+    pose, start = ekf.pose, ekf.start
     nis = ekf.update_scan(measured, LIDAR, NOTHING)
     np.testing.assert_allclose(ekf.P, other.P, rtol=1e-9, atol=1e-15)
     assert nis == pytest.approx(other.mahalanobis**2)
     error = other.x.ravel()
     np.testing.assert_allclose(ekf.pose, se2.compose(pose, se2.exp(error[POSE])), atol=1e-12)
-    np.testing.assert_allclose(ekf.key, se2.compose(key, se2.exp(error[KEY])), atol=1e-12)
+    np.testing.assert_allclose(ekf.start, se2.compose(start, se2.exp(error[START])), atol=1e-12)
     np.testing.assert_allclose([ekf.bias, ekf.scale, ekf.clock_offset], error[BIAS:PARAMS], atol=1e-15)
     np.testing.assert_allclose(ekf.corrections, error[PARAMS:], atol=1e-15)
 
@@ -211,19 +227,20 @@ def test_update_with_consider_states_equals_schmidt():
     """By his partitioned formulas (Schmidt 1966): no gain, the same covariance, correlations that shrink."""
     ekf, measured = prepared(1)
     P, innovation = ekf.P.copy(), se2.log(se2.between(ekf.pose, measured))
-    c = np.arange(MAP.start, MAP.stop)
+    c = CONSIDERED
     x = np.setdiff1d(np.arange(SIZE), c)
-    Hx, Hc = np.zeros((3, len(x))), -np.eye(3)
-    Hx[:, :3] = np.eye(3)
+    Hx, Hc = np.zeros((3, len(x))), np.zeros((3, len(c)))
+    Hx[:, :3], Hc[:, :3] = np.eye(3), -np.eye(3)  # pose less map
     Pxx, Pxc, Pcc = P[np.ix_(x, x)], P[np.ix_(x, c)], P[np.ix_(c, c)]
     S = Hx @ Pxx @ Hx.T + Hx @ Pxc @ Hc.T + Hc @ Pxc.T @ Hx.T + Hc @ Pcc @ Hc.T + LIDAR
     K = (Pxx @ Hx.T + Pxc @ Hc.T) @ np.linalg.inv(S)
-    before = ekf.bias
+    before, key = ekf.bias, ekf.key
     nis = ekf.update_scan(measured, LIDAR, NOTHING)
     np.testing.assert_allclose(ekf.P[np.ix_(x, x)], Pxx - K @ (Hx @ Pxx + Hc @ Pxc.T), rtol=1e-7, atol=1e-14)
     np.testing.assert_allclose(ekf.P[np.ix_(x, c)], Pxc - K @ (Hx @ Pxc + Hc @ Pcc), rtol=1e-7, atol=1e-14)
     np.testing.assert_array_equal(ekf.P[np.ix_(c, c)], 0.5 * (Pcc + Pcc.T))
-    assert ekf.bias - before == pytest.approx((K @ innovation)[BIAS - 3])
+    assert ekf.bias - before == pytest.approx((K @ innovation)[BIAS - len(c)])
+    np.testing.assert_array_equal(ekf.key, key)
     assert nis == pytest.approx(innovation @ np.linalg.inv(S) @ innovation)
 
 
@@ -244,10 +261,9 @@ def test_update_turn_equals_scalar_kalman_filter():
     P, turn = ekf.P.copy(), Turn(0.301, 1e-6, 0.1)
     H = np.zeros((1, SIZE))
     H[0, 2], H[0, 5], H[0, BIAS], H[0, SCALE] = 1.0, -1.0, 0.1, 0.3
-    c = np.zeros(SIZE, bool)
-    c[MAP] = True
     S = float((H @ P @ H.T)[0, 0]) + 1e-6
-    K = np.where(c, 0.0, (P @ H.T)[:, 0] / S)
+    K = (P @ H.T)[:, 0] / S
+    K[CONSIDERED] = 0.0
     A = np.eye(SIZE) - np.outer(K, H)
     nis = ekf.update_turn(turn)
     np.testing.assert_allclose(ekf.P, A @ P @ A.T + 1e-6 * np.outer(K, K), rtol=1e-7, atol=1e-14)
@@ -286,7 +302,7 @@ def test_covariance_equals_monte_carlo_scatter():
     H = np.zeros((3, SIZE))
     H[:, POSE], H[:, MAP] = np.eye(3), -np.eye(3)
     K = np.linalg.solve(H @ ekf.P @ H.T + LIDAR, H @ ekf.P).T
-    K[MAP] = 0.0
+    K[CONSIDERED] = 0.0
     e = e - (e @ H.T - n) @ K.T
     ekf.update_scan(measured, LIDAR, NOTHING)
     assert_scatter(e, ekf.P)
