@@ -110,8 +110,8 @@ class EkfFusion(Estimator):
         if duration > 0.0:
             slip = se2.log(se2.between(ekf.start, match.pose)) / duration - _mean_twist(step)
             match = sensor.refine(match, step.twist + slip)
-            self._slip_changes.add(slip - self._slip, match.cov, step)
-            R = match.cov + self._slip_changes.sweep_cov(step, match.cov, sensor.sweep_s)
+            self._slip_changes.add(slip - self._slip, match.cov, step, sensor.sweep_s)
+            R = match.cov + sensor.bend_cov(match, self._slip_changes.rate(step))
         self.counts_by_name["matched"] += 1
         self.counts_by_name["searched"] += bool(match.outlier_cov.any())
         self.wheel_motion = replace(self.wheel_motion, cov=self.wheel_motion.cov + match.outlier_cov)
@@ -160,28 +160,26 @@ class _SlipChanges:
     def __init__(self) -> None:
         self._sum, self._weight = np.full(3, _PRIOR_SCANS), np.full(3, _PRIOR_SCANS)  # white, until measured
 
-    def add(self, change: Twist2, scan_cov: Cov3, step: Step) -> None:
-        """``change`` (3,) of the slip since the last scan [m/s, m/s, rad/s]; ``scan_cov`` (3, 3) of the scans that measured it."""
+    def add(self, change: Twist2, scan_cov: Cov3, step: Step, sweep_s: float) -> None:
+        """``change`` (3,) of the slip since the last scan [m/s, m/s, rad/s]; ``scan_cov`` (3, 3) of the scans that measured it.
+
+        A scan gives the mean over its sweep of T: second differences of a random walk's means have 2 - T / dt of its variance over dt.
+        """
         if not step.has_wheels or step.is_standing:
             return
-        white, scans = 2.0 * np.diagonal(step.predicted.cov), 6.0 * np.diagonal(scan_cov)  # of second differences: 1 + 4 + 1
+        white = (2.0 - min(sweep_s / step.duration, 1.0)) * np.diagonal(step.predicted.cov)
+        scans = 6.0 * np.diagonal(scan_cov)  # 1 + 4 + 1
         squares = (change * step.duration) ** 2
         is_inlier = squares < _SIGMAS**2 * (white + scans)  # beyond, scans or wheels are outliers
         self._sum = np.where(is_inlier, _FORGETTING * self._sum + (squares - scans) / white, self._sum)
         self._weight = np.where(is_inlier, _FORGETTING * self._weight + 1.0, self._weight)
 
-    def sweep_cov(self, step: Step, scan_cov: Cov3, sweep_s: float) -> Cov3:
-        """(3, 3) by which the pose of a bent scan is off: the mean over a sweep of T of a random walk about its middle, Q T / 12.
-
-        Bent in yaw, the walls are displaced as well, by their distance r: r^2 Q_yaw T / 105, with r^2 = R_xy / R_yaw of the scan.
-        """
+    def rate(self, step: Step) -> Cov3:
+        """(3, 3) covariance a second of the slip in ``step`` that changes within a sweep, as a random walk."""
         if not step.has_wheels or step.is_standing:
             return np.zeros((3, 3))
         root = np.sqrt(np.maximum(self._sum / self._weight, 0.0))
-        bend = root[:, None] * step.predicted.cov * root * sweep_s / step.duration
-        cov = bend / 12.0
-        cov[:2, :2] += bend[2, 2] / 105.0 * scan_cov[:2, :2] / scan_cov[2, 2]
-        return np.asarray(cov)
+        return np.asarray(root[:, None] * step.predicted.cov * root / step.duration)
 
 
 def _mean_twist(step: Step) -> Twist2:

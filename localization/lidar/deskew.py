@@ -55,7 +55,14 @@ class Sweep:
 
     def project(self, points: FloatArray) -> FloatArray:
         """(M, 2) what of the deskewed ``points`` (N, 3) is matched in the plane: a planar scan as it is, of a cloud the walls."""
-        return np.ascontiguousarray(points[:, :2] if self.is_planar else extract_walls(points, _WALL_CELL_M))
+        return self.project_with_times(points)[0]
+
+    def project_with_times(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """`project`, and when each of these points was measured, after the middle of the sweep (M,) [s]; (0,) without times."""
+        if self.is_planar:
+            return np.ascontiguousarray(points[:, :2]), self.times
+        walls = extract_walls(np.column_stack([points, self.times]) if len(self.times) else points, _WALL_CELL_M)
+        return np.ascontiguousarray(walls[:, :2]), walls[:, 2:].ravel()
 
     @property
     def duration_s(self) -> float:
@@ -73,17 +80,18 @@ class Sweep:
 def extract_walls(points: FloatArray, cell: float, min_height: float = 0.3) -> FloatArray:
     """(M, 2) the upright structure in a 3D cloud ``points`` (N, 3): one mean point for each ``cell`` [m] that spans ``min_height`` [m].
 
-    Floors and ceilings span no height in a cell; walls, trees and poles do. What is left is a planar scan.
+    Floors and ceilings span no height in a cell; walls, trees and poles do. What is left is a planar scan. Further columns (N, 3 + k) are
+    averaged as well (M, 2 + k).
     """
     if len(points) == 0:
-        return np.empty((0, 2))
+        return np.empty((0, points.shape[1] - 1))
     index = np.floor(points[:, :2] / cell).astype(np.int64)
     order = np.lexsort((index[:, 1], index[:, 0]))
     is_first = np.any(np.diff(index[order], axis=0, prepend=index[order[:1]] - 1) != 0, axis=1)
     starts = np.flatnonzero(is_first)
     ordered = points[order]
     heights = np.maximum.reduceat(ordered[:, 2], starts) - np.minimum.reduceat(ordered[:, 2], starts)
-    means = np.add.reduceat(ordered[:, :2], starts) / np.diff(starts, append=len(points))[:, None]
+    means = np.add.reduceat(np.delete(ordered, 2, axis=1), starts) / np.diff(starts, append=len(points))[:, None]
     return np.asarray(means[heights >= min_height])
 
 

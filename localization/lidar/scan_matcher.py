@@ -55,6 +55,8 @@ _BASIN_M, _BASIN_RAD = 0.15, 0.15
 _MIN_PLACE_OVERLAP = 0.6
 """Share of points on the submap, below which a place found from a wide prior is not taken: Cartographer's least score of a place without
 a prior (`global_localization_min_score`)."""
+_SWEEP_PARTS = 8
+"""Of a sweep, over which slip within it is summed: 24 parts change no sigma of a bent scan by more than 3 %."""
 _MAX_OLD_SUBMAPS = 3
 """Key scans older than the last ones, at most, in units of their number."""
 _OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
@@ -197,6 +199,25 @@ class ScanMatcher:
         """``match`` again, for the same scan deskewed anew."""
         fit = self._align(points, prior, cov + match.outlier_cov, match.pose, 0.0)
         return None if fit.overlap < self._config.lost_below else self._result(fit, match.outlier_cov)
+
+    def bend_cov(self, points: Points2, times: FloatArray, pose: Pose2, slip_rate: Cov3) -> Cov3:
+        """(3, 3) covariance of the match of a scan that is bent: it was deskewed with one twist, while the body's motion is a random walk w
+        about it, of covariance ``slip_rate`` (3, 3) a second. ``times`` (N,) of the ``points`` are from the middle of the sweep, where w is
+        zero and ``pose`` (3,) is matched. Part k of the sweep, with information H_k, pulls the pose by w(t_k):
+
+            e = R sum_k H_k w(t_k),  R = (sum_k H_k)^-1,  cov = R sum_g |t_g+1 - t_g| M_g Q M_g^T R,
+
+        where M_g is the information of all parts beyond gap g, seen from the middle, as a step of w there displaces them all.
+        """
+        assert self._grid is not None
+        order, H = np.argsort(times, kind="stable"), np.empty((_SWEEP_PARTS, 3, 3))
+        _fill_informations(self._grid, points[order], triple(pose), H)
+        t = times[order[(np.arange(0.5, _SWEEP_PARTS) * len(points) / _SWEEP_PARTS).astype(np.intp)]]  # of the middle of each part
+        later, earlier = H[::-1].cumsum(axis=0)[::-1][1:], H.cumsum(axis=0)[:-1]
+        after, before = np.diff(np.maximum(t, 0.0)), np.diff(np.minimum(t, 0.0))  # how much of each gap is on either side of the middle
+        spread = sum(np.einsum("g,gij,jk,glk->il", gap, M, slip_rate, M) for gap, M in ((after, later), (before, earlier)))
+        R = np.linalg.inv(H.sum(axis=0) + _OPEN_INFORMATION)
+        return np.asarray(R @ spread @ R)
 
     def evaluate(self, points: Points2, pose: Pose2) -> ScanMatch | None:
         """The match of ``points`` at ``pose`` (3,), which another method has found; None where too few of them fit there."""
@@ -413,6 +434,14 @@ def _linearize(
         g[0], g[1], g[2] = g[0] + weight * nx * e, g[1] + weight * ny * e, g[2] + weight * across[2] * e
     _discount(H, g, spurious)
     return fitting, mapped, cost, squares, block_squares
+
+
+@kernel
+def _fill_informations(grid: VoxelGrid, points: Points2, x: Triple, H: FloatArray) -> None:
+    """Fill ``H`` (n, 3, 3) with the information of each n-th part of the ``points``."""
+    gradient, size = np.empty(3), points.shape[0] / len(H)
+    for k in range(len(H)):
+        _linearize(grid, points[int(k * size) : int((k + 1) * size)], x, 0.0, H[k], gradient)
 
 
 @subroutine

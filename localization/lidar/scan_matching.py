@@ -32,6 +32,8 @@ class _Scan:
     """(N, 3) at the middle of the sweep."""
     planar: FloatArray
     """(M, 2) what is matched in the plane."""
+    times: FloatArray
+    """(M,) when these were measured, after the middle of the sweep [s]; (0,) without times."""
 
 
 class ScanMatchingSensor:
@@ -94,6 +96,12 @@ class ScanMatchingSensor:
         self._scan = self._deskew(self._scan.sweep, twist)
         return self._matcher.refine(self._scan.planar, self._prior, self._cov, match) or match
 
+    def bend_cov(self, match: ScanMatch, slip_rate: Cov3) -> Cov3:
+        """(3, 3) by which slip within the sweep, white with ``slip_rate`` (3, 3) a second, puts off the ``match`` of the scan at hand."""
+        if self._scan is None or self._matcher is None or not len(self._scan.times) or not slip_rate.any():
+            return np.zeros((3, 3))
+        return self._matcher.bend_cov(self._scan.planar, self._scan.times, match.pose, slip_rate)
+
     def is_key(self, pose: Pose2) -> bool:
         """Whether the scan at hand, taken from ``pose`` (3,), is to enter the submap."""
         if self._scan is None or self._is_searching:
@@ -133,7 +141,7 @@ class ScanMatchingSensor:
 
     def _deskew(self, sweep: Sweep, twist: Twist2) -> _Scan:
         points = sweep.deskew(twist)
-        return _Scan(sweep, twist, points, sweep.project(points))
+        return _Scan(sweep, twist, points, *sweep.project_with_times(points))
 
     def _begin(self, scan: _Scan) -> None:
         """The first scan sets the size of the voxels."""

@@ -420,37 +420,43 @@ def test_ekf_with_dying_lidar_is_lost_until_the_end(driven: rooms.Drive) -> None
 # --- slip that changes within a sweep
 
 
-def sweep_cov(slips: FloatArray, scan_sigma: float = 1e-9, seed: int = 0) -> FloatArray:
-    """(3, 3) after steps of 0.1 s whose motion is off by ``slips`` (n, 3), measured by scans with noise ``scan_sigma`` [m, m, rad]."""
+def slip_rate(slips: FloatArray, scan_sigma: float = 1e-9, seed: int = 0, sweep_s: float = 0.0) -> FloatArray:
+    """(3,) after steps of 0.1 s whose motion is off by ``slips`` (n, 3), measured by scans with noise ``scan_sigma`` [m, m, rad]."""
     rng, changes = np.random.default_rng(seed), _SlipChanges()
     motion = Motion(np.array([0.05, 0.0, 0.0]), np.diag(_STEP_SIGMA**2), np.zeros((3, 0)))
     step = Step(0, S // 10, motion, np.zeros(3), np.zeros(3), False, True)
     measured = slips + np.diff(rng.normal(0.0, scan_sigma, (len(slips) + 1, 3)), axis=0)
     for change in np.diff(measured, axis=0) / 0.1:
-        changes.add(change, scan_sigma**2 * np.eye(3), step)
-    return changes.sweep_cov(step, np.diag([4e-6, 1e-6, 1e-6]), 0.1)
+        changes.add(change, scan_sigma**2 * np.eye(3), step, sweep_s)
+    return np.diagonal(changes.rate(step))
 
 
 _STEP_SIGMA = np.array([0.005, 0.003, 0.02])
-_BENT = np.array([4.0, 1.0, 0.0]) * _STEP_SIGMA[2] ** 2 / 105.0
-"""Displacement of walls at r^2 = 4 and 1 m^2 by white slip in yaw."""
 
 
-def test_sweep_cov_with_white_slip_is_that_of_a_random_walk() -> None:
+def test_slip_rate_of_white_slip_is_that_of_the_wheels() -> None:
     white = np.random.default_rng(1).normal(0.0, _STEP_SIGMA, (3000, 3))
-    found = np.mean([np.diagonal(sweep_cov(part)) for part in np.split(white, 10)], axis=0)
-    np.testing.assert_allclose(found, _STEP_SIGMA**2 / 12.0 + _BENT, rtol=0.2)
+    found = np.mean([slip_rate(part) for part in np.split(white, 10)], axis=0)
+    np.testing.assert_allclose(found, _STEP_SIGMA**2 / 0.1, rtol=0.2)
 
 
-def test_sweep_cov_counts_each_axis_by_itself() -> None:
-    """White slip along x, lasting in yaw: the scan is not bent in yaw."""
+def test_slip_rate_of_means_over_sweeps_is_that_of_the_wheels() -> None:
+    """What a scanner that turns all the time measures: means of the random walk over each sweep of 0.1 s."""
+    walk = np.cumsum(np.random.default_rng(1).normal(0.0, _STEP_SIGMA / 10.0, (300_000, 3)), axis=0)
+    means = walk.reshape(-1, 100, 3).mean(axis=1)
+    found = np.mean([slip_rate(part, sweep_s=0.1) for part in np.split(np.diff(means, axis=0)[:2990], 10)], axis=0)
+    np.testing.assert_allclose(found, _STEP_SIGMA**2 / 0.1, rtol=0.2)
+
+
+def test_slip_rate_counts_each_axis_by_itself() -> None:
+    """White slip along x, lasting in yaw."""
     slips = np.random.default_rng(1).normal(0.0, _STEP_SIGMA, (300, 3)) * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.02]
-    found = np.diagonal(sweep_cov(slips))
-    assert found[0] == pytest.approx(_STEP_SIGMA[0] ** 2 / 12.0, rel=0.5)
-    assert found[2] < 0.01 * _STEP_SIGMA[2] ** 2 / 12.0
+    found = slip_rate(slips)
+    assert found[0] == pytest.approx(_STEP_SIGMA[0] ** 2 / 0.1, rel=0.5)
+    assert found[2] < 0.01 * _STEP_SIGMA[2] ** 2 / 0.1
 
 
-def test_sweep_cov_takes_off_the_noise_of_scans() -> None:
+def test_slip_rate_takes_off_the_noise_of_scans() -> None:
     """No slip, measured by scans as noisy as the wheels: counted as slip, second differences alone would be three times white slip."""
-    found = np.mean([np.diagonal(sweep_cov(np.zeros((300, 3)), 0.005, seed)) for seed in range(10)], axis=0)
-    assert found[0] < _STEP_SIGMA[0] ** 2 / 12.0
+    found = np.mean([slip_rate(np.zeros((300, 3)), 0.005, seed) for seed in range(10)], axis=0)
+    assert found[0] < _STEP_SIGMA[0] ** 2 / 0.1

@@ -305,15 +305,15 @@ def test_graph_without_loops_is_as_certain_as_the_filter(has_lidar: bool) -> Non
     trials = [Trial(make_model("diff_drive", rooms.ROBOT), name, "none") for name in ("ekf", "graph")]
     ekf, graph = replay(drive.events, trials, rooms.ROBOT, drive.mounts, has_lidar)
     assert graph.moments is not None
-    for trajectory in (graph.moments, graph.trajectory):
+    for found in (graph.moments, graph.trajectory):
         assert ekf.trajectory.covariances is not None
-        assert trajectory.covariances is not None
-        certain, ours = (np.sqrt(np.diagonal(t.covariances[-1])) for t in (ekf.trajectory, trajectory))
+        assert found.covariances is not None
+        certain, ours = (np.sqrt(np.diagonal(t.covariances[-1])) for t in (ekf.trajectory, found))
         by_radius = 0.0 if has_lidar else 0.02 * np.hypot(*drive.poses[-1, :2])
         expected = np.hypot(certain, [by_radius, 0.0, 0.0])
         assert (ours > 0.9 * expected).all()
         assert (ours < 1.7 * expected).all()
-        assert np.abs(se2.between(ekf.trajectory.poses[-1], trajectory.poses[-1])[:2]).max() < certain[:2].max()
+        assert np.abs(se2.between(ekf.trajectory.poses[-1], found.poses[-1])[:2]).max() < certain[:2].max()
 
 
 def test_subtract_information_with_wheels_gives_filters_motion() -> None:

@@ -330,3 +330,29 @@ def test_match_of_odd_points_is_not_confident(points: np.ndarray) -> None:
     good = matcher.match(rooms.scan_from(LAB, true, np.random.default_rng(0)), true, NARROW)
     assert good is not None
     assert np.abs(error_of(true, good.pose)).max() < 0.005
+
+
+# --- scans that slip has bent
+
+
+@pytest.mark.parametrize("walls", [LAB, HALL], ids=["lab", "hall"])
+@pytest.mark.parametrize("axes", [[0.06, 0.03, 0.0], [0.0, 0.0, 0.01], [0.03, 0.02, 0.01]], ids=["xy", "yaw", "all"])
+def test_bend_cov_equals_scatter_of_bent_scans(walls: np.ndarray, axes: list[float]) -> None:
+    """One scan, its beams 0.1 s from first to last, bent by random walks about its middle, by less than the kernel of the loss."""
+    rng = np.random.default_rng(3)
+    matcher, pose = mapped(walls, rng)
+    points = rooms.scan_from(walls, pose, rng)
+    times = np.linspace(-0.05, 0.05, len(points))
+    sigmas = np.array(axes)
+    straight = matcher.match(points, pose, NARROW)
+    assert straight is not None
+    found = []
+    for _ in range(400):
+        walk = np.cumsum(rng.normal(size=(len(points), 3)) * sigmas * np.sqrt(times[1] - times[0]), axis=0)
+        bent = [se2.transform(se2.exp(-w), p) for w, p in zip(walk - walk[len(walk) // 2], points, strict=True)]
+        match = matcher.match(np.array(bent), pose, NARROW)
+        assert match is not None
+        found.append(error_of(straight.measured, match.measured))
+    cov = matcher.bend_cov(points, times, straight.pose, np.diag(sigmas**2))
+    scatter = np.sqrt(np.mean(np.square(found), axis=0))
+    np.testing.assert_allclose(scatter, np.sqrt(np.diagonal(cov)), rtol=0.2)

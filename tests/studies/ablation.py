@@ -141,7 +141,7 @@ PATCHES: Mapping[str, Patch] = {
     "old key scans that fit": _wrap(
         ScanMatcher, "_fitting_keys", lambda original, self, pose, points, map_cov: original(self, pose, points, None)
     ),
-    "slip that changes within a sweep": _attribute(fusion._SlipChanges, "sweep_cov", lambda *a: np.zeros((3, 3))),
+    "slip that changes within a sweep": _attribute(fusion._SlipChanges, "rate", lambda *a: np.zeros((3, 3))),
     "second deskewing pass": _attribute(ScanMatchingSensor, "refine", lambda self, match, twist: match),
     "slip in the deskewing twist": _wrap(
         ScanMatchingSensor,
