@@ -170,8 +170,8 @@ GRAPH_PATCHES: Mapping[str, Patch] = {
     "second loop that confirms": _wrap(LoopDetector, "detect", _detect_unconfirmed),
     "robust loss of loops": _attribute(pose_graph, "_CAUCHY", _NO_LOSS),
     "robust loss of wheels": _attribute(pose_graph, "_HUBER", _NO_LOSS),
-    "all of the filter's motion after a matched scan (less the wheels' share, instead)": _attribute(
-        graph_fusion.GraphFusion, "_is_matched", property(lambda self: False, lambda self, value: None)
+    "all of the filter's motion after a matched scan (less the wheels' share, instead)": lambda: mock.patch.object(
+        graph_fusion.GraphFusion, "_is_matched", property(lambda self: False, lambda self, value: None), create=True
     ),
     "corrections of the graph in the filter": _attribute(Filter, "set_corrections", lambda self, mean, cov: None),
     "radius of the wheels as a variable": _attribute(graph_fusion, "_WHEEL_SCALE_SIGMA", 1e-6),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.studies.ablation import BEGIN, END, PATCHES, README, SETTINGS, write_into
+from tests.studies.ablation import BEGIN, END, GRAPH_PATCHES, PATCHES, README, SETTINGS, write_into
 from tests.studies.buildings import BUILDINGS, Drive
 
 _SECONDS = 25.0
@@ -29,6 +29,14 @@ def test_patch_runs_and_leaves_nothing_behind(name: str, drive: Drive, poses: np
     assert changed.shape == poses.shape
     assert np.isfinite(changed).all()
     assert np.array_equal(drive.until(5.0).run("ekf", "skid_steer").trajectory.poses, poses[: _scans(drive, 5.0)])
+
+
+@pytest.mark.parametrize("name", GRAPH_PATCHES)
+def test_patch_of_graph_runs(name: str, drive: Drive) -> None:
+    with GRAPH_PATCHES[name]():
+        changed = drive.run("graph", "skid_steer")
+    assert np.isfinite(changed.trajectory.poses).all()
+    assert changed.counts["keyframes"] > 10
 
 
 @pytest.mark.parametrize("name", ["submap's error", "prior in the least squares", "thickness of surfaces", "block variance ratio"])
