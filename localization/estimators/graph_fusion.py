@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
@@ -65,7 +66,7 @@ class GraphFusion(Estimator):
         self._loops: LoopDetector | None = None
         self._wheels = _KeyframeMotion(len(corrections.names))
         self._steps, self._stamps_ns = array("d"), array("q")  # the filter's poses, if they are to be smoothed
-        self._nodes = array("q")  # which of them are keyframes
+        self._nodes, self._key_covs = array("q"), array("d")  # which of them are keyframes; their live covariances
         self._is_smoothing = is_smoothing
         self._is_keyframe_due = self._is_matched = False
         self._map_T_odom, self._key_cov = np.zeros(3), np.zeros((3, 3))
@@ -145,6 +146,7 @@ class GraphFusion(Estimator):
             ekf.set_corrections(mean[:-1], cov[:-1, :-1])
         self._map_T_odom = se2.compose(self.graph.pose(k), se2.inverse(ekf.pose))
         self._key_cov = self.graph.marginal(k)
+        self._key_covs.extend(self._key_cov.ravel())
 
     def _walk(self) -> FloatArray | None:
         """(c, c) by which the corrections may have changed, once a minute; None meanwhile."""
@@ -206,7 +208,10 @@ class GraphFusion(Estimator):
         poses, covs = self.graph.smooth()
         if not (np.isfinite(poses).all() and np.isfinite(covs).all()):
             raise EstimatorError("the pose graph has no finite solution. Look at the log.")
-        smoothed, smoothed_covs = _interpolate(np.array(self._nodes), poses, covs, np.array(self._steps).reshape(-1, 3))
+        nodes, odom = np.array(self._nodes), np.array(self._steps).reshape(-1, 3)
+        smoothed, smoothed_covs = _interpolate(nodes, poses, covs, odom)
+        if moments.covariances is not None:
+            smoothed_covs += _cov_between_nodes(nodes, odom, moments.covariances, np.array(self._key_covs).reshape(-1, 3, 3))
         return Trajectory(moments.stamps_ns, smoothed, smoothed_covs)
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
@@ -303,12 +308,30 @@ def _interpolate(nodes: FloatArray, poses: FloatArray, covs: FloatArray, odom: F
 
     What the motion between two keyframes has changed by grows evenly along it, and not where the robot stands.
     """
-    steps = se2.between(odom[:-1], odom[1:])
-    travelled = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]) + np.abs(steps[:, 2]) + 1e-9)])
-    k = np.clip(np.searchsorted(nodes, np.arange(len(odom)), side="right") - 1, 0, len(nodes) - 2)
+    k, part = _shares(nodes, odom)
     since, until = se2.between(odom[nodes[k]], odom), se2.between(odom, odom[nodes[k + 1]])
-    part = np.clip((travelled - travelled[nodes[k]]) / (travelled[nodes[k + 1]] - travelled[nodes[k]]), 0.0, 1.0)
     forward, backward = se2.compose(poses[k], since), se2.compose(poses[k + 1], se2.inverse(until))
     A, B = se2.adjoint(se2.inverse(since)), se2.adjoint(until)
     mixed = (1.0 - part)[:, None, None] * (A @ covs[k] @ A.swapaxes(-1, -2)) + part[:, None, None] * (B @ covs[k + 1] @ B.swapaxes(-1, -2))
     return se2.compose(forward, se2.exp(part[:, None] * se2.log(se2.between(forward, backward)))), mixed
+
+
+def _cov_between_nodes(nodes: FloatArray, odom: FloatArray, live: FloatArray, key_covs: FloatArray) -> FloatArray:
+    """(N, 3, 3) noise of poses between keyframes: that of the motion since the last one, the less of it the nearer the next one is.
+
+    The motion's is the growth of the ``live`` covariances (N, 3, 3) since those of the keyframes (K, 3, 3), which smoothing replaces.
+    """
+    k, part = _shares(nodes, odom)
+    A = se2.adjoint(se2.inverse(se2.between(odom[nodes[k]], odom)))
+    grown = (1.0 - part)[:, None, None] * (live - A @ key_covs[k] @ A.swapaxes(-1, -2))
+    grown[nodes] = 0.0
+    values, vectors = np.linalg.eigh(grown)  # rounding leaves negative eigenvalues
+    return np.asarray((vectors * np.maximum(values, 0.0)[:, None]) @ vectors.swapaxes(-1, -2))
+
+
+def _shares(nodes: FloatArray, odom: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+    """The keyframe (N,) before each step, and the share (N,) of the way from there to the next one."""
+    steps = se2.between(odom[:-1], odom[1:])
+    travelled = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]) + np.abs(steps[:, 2]) + 1e-9)])
+    k = np.clip(np.searchsorted(nodes, np.arange(len(odom)), side="right") - 1, 0, len(nodes) - 2)
+    return k, np.clip((travelled - travelled[nodes[k]]) / (travelled[nodes[k + 1]] - travelled[nodes[k]]), 0.0, 1.0)

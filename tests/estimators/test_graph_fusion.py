@@ -11,7 +11,7 @@ import pytest
 
 from localization.estimators import Estimate
 from localization.estimators.base import EstimateTable, trajectory
-from localization.estimators.graph_fusion import _interpolate, _subtract_information
+from localization.estimators.graph_fusion import _cov_between_nodes, _interpolate, _subtract_information
 from localization.evaluation.consistency import nees
 from localization.events import PositionSample, Scan, WheelSample
 from localization.logs.references import merge_positions
@@ -314,6 +314,28 @@ def test_graph_without_loops_is_as_certain_as_the_filter(has_lidar: bool) -> Non
         assert (ours > 0.9 * expected).all()
         assert (ours < 1.7 * expected).all()
         assert np.abs(se2.between(ekf.trajectory.poses[-1], found.poses[-1])[:2]).max() < certain[:2].max()
+
+
+def test_smoothed_poses_between_keyframes_have_the_noise_of_scans() -> None:
+    """A robot that rests, and creeps, before the second keyframe: the first one is the origin, and has no noise."""
+    drive = rooms.drive_through(world.lab().walls, rooms.path((5, 0, 0), (8, 0.01, 0.0), (6, 0.5, 0.2), (1, 0, 0)), 0)
+    (run,) = replay(drive.events, [Trial(make_model("diff_drive", rooms.ROBOT), "graph")], rooms.ROBOT, drive.mounts, True)
+    poses, covs = rooms.at_scans(drive, run)
+    assert covs is not None
+    early = (drive.stamps > drive.stamps[0] + 2e9) & (drive.stamps < drive.stamps[0] + 12e9)
+    found = nees(se2.log(se2.between(drive.poses, poses))[early], covs[early])
+    assert found.mean() < 8.0
+    live = np.searchsorted(run.moments.stamps_ns, drive.stamps)
+    assert (np.sqrt(covs[early, 0, 0]) > 0.4 * np.sqrt(run.moments.covariances[live][early, 0, 0])).all()
+
+
+def test_cov_between_nodes_is_that_of_the_motion_less_its_share() -> None:
+    odom = np.column_stack([[0.0, 0.5, 1.0, 1.5, 2.0], np.zeros(5), np.zeros(5)])
+    key_covs, noise = np.array([0.01 * np.eye(3), 0.02 * np.eye(3)]), np.diag([1e-4, 2e-4, 3e-5])
+    A = se2.adjoint(se2.inverse(odom))
+    live = A @ key_covs[0] @ A.swapaxes(-1, -2) + noise
+    found = _cov_between_nodes(np.array([0, 4]), odom, live, key_covs)
+    np.testing.assert_allclose(found, np.array([0.0, 0.75, 0.5, 0.25, 0.0])[:, None, None] * noise, atol=1e-12)
 
 
 def test_subtract_information_with_wheels_gives_filters_motion() -> None:
