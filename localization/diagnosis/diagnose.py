@@ -23,7 +23,7 @@ from localization.diagnosis.findings import (
     evidence,
     sentence,
 )
-from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor
+from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, slow_turn_sigmas
 from localization.diagnosis.prediction import Baseline, DrivePredictor, with_sizes
 from localization.diagnosis.selection import (
     aliases_of,
@@ -184,8 +184,7 @@ def _conclude(
 ) -> DiagnosisResult:
     """Findings, the table with its attributions, and the verdict that follows from it."""
     drive, problem, causes = predictor.drive, linearization.problem, linearization.causes
-    given = np.sqrt(np.diagonal(predictor.batch.cov, axis1=1, axis2=2)) * np.array(predictor.baseline.noise_over_reference)
-    reference_sigmas = given if drive.kind == "log" else None
+    reference_sigmas = _reference_sigmas(predictor) if drive.kind == "log" else None
     excess = [noise_excess(linearization, reference_sigmas, np.isfinite(first.rows[:, c]), c) for c in range(3)]
     chosen, gains, dropped = _keep_useful(linearization, chosen, config, max(excess) <= MAX_NOISE_OVER_REFERENCE)
     sizes, _, gained = problem.fit(chosen)
@@ -230,6 +229,13 @@ def _conclude(
     scale = np.sqrt(np.diagonal(problem.gram) + 1e-12)
     residuals = Residuals(first.rows, left, linearization.noise.sigmas, tuple(e.key for e in causes), problem.gram / np.outer(scale, scale))
     return DiagnosisResult(dataclasses.replace(result, sentence=sentence(result)), predictor, residuals, linearization)
+
+
+def _reference_sigmas(predictor: DrivePredictor) -> FloatArray:
+    """(M, 3) noise that a drive has to have: of the motion reference, and of turns by wheels so slow that the model was never measured."""
+    given = np.sqrt(np.diagonal(predictor.batch.cov, axis1=1, axis2=2)) * np.array(predictor.baseline.noise_over_reference)
+    given[:, 2] = np.hypot(given[:, 2], slow_turn_sigmas(predictor))
+    return np.asarray(given)
 
 
 def _heldout(linearization: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], config: DiagnosisConfig) -> Gain:

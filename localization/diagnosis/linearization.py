@@ -119,12 +119,13 @@ def estimate_noise(
         use = known[:, channel]
         if use.sum() < 4:
             continue
-        squares = left[use, channel] ** 2 * inflate[channel]
+        squares, by_model = left[use, channel] ** 2 * inflate[channel], creep[use, channel] ** 2
         f = features[use]
         variance = np.full(len(squares), max(float(np.median(squares)) / 0.455, 1e-14))
         for _ in range(_ROUNDS):
-            clipped = np.minimum(squares, _CLIP * variance)
-            found = nnls(f / variance[:, None], clipped / variance)[0]
+            total = variance + by_model
+            clipped = np.minimum(squares, _CLIP * total)
+            found = nnls(f / total[:, None], (clipped - by_model) / total)[0]
             variance = np.maximum(f @ found, 0.2 * float(np.median(variance)))
         given = claimed_sigmas[use, channel]
         pooled = (free[channel] * variance + windows * given**2) / (free[channel] + windows)
