@@ -324,6 +324,8 @@ _CAUSES = (
 )
 CAUSES: Mapping[str, Cause] = {cause.id: cause for cause in _CAUSES}
 """All causes that hold for the whole of a drive, by id."""
+STIFFNESS_EXPONENT = "stiffness_exponent"
+"""Of a healthy drive alone (`weigh.stiffness_exponent_cause`): how slow turns differ from fast ones."""
 
 
 _TOLERATED_LOAD = 0.01

@@ -10,7 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause, Hypothesis, friction_change, payload, slope_across
+from localization.diagnosis.causes import (
+    CAUSES,
+    STIFFNESS_EXPONENT,
+    WINDOW_CAUSES,
+    Cause,
+    Hypothesis,
+    friction_change,
+    payload,
+    slope_across,
+)
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.prediction import CHANNELS, Baseline, DrivePredictor, with_sizes
 from motion_models.base import MotionModel
@@ -438,7 +447,8 @@ def _estimate_drive_noise(
     sigmas[:, 3] = np.hypot(given[:, 2], 1e-3)
     sigmas[:, 4:] = 0.05
     creep = np.zeros_like(linear)
-    creep[:, CHANNELS.index("yaw")] = slow_turn_sigmas(predictor)
+    if not any(cause.id == STIFFNESS_EXPONENT for cause in causes):  # else slow turns are part of the model
+        creep[:, CHANNELS.index("yaw")] = slow_turn_sigmas(predictor)
     noise = given_noise(linear, np.hypot(sigmas, creep), follows)
     scale = np.array([e.plausible for e in causes])
     known = np.isfinite(linear)

@@ -21,7 +21,7 @@ import numpy as np
 from scipy import stats
 
 from localization.calibration.windows import driven
-from localization.diagnosis.causes import CAUSES, Cause, Hypothesis
+from localization.diagnosis.causes import CAUSES, STIFFNESS_EXPONENT, Cause, Hypothesis
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor
 from localization.diagnosis.prediction import DrivePredictor
@@ -60,7 +60,6 @@ PRIOR_SIGMAS: Mapping[str, float] = {
 """How far robots, floors and mounts differ from their files, as a sigma in the cause's unit: what the weighing must not take for a load.
 
 Scrub cannot be negative: its prior is cut there (see `_truncated`)."""
-STIFFNESS_EXPONENT = "stiffness_exponent"
 _SLIP_STIFFNESS_SIGMA = 0.3
 """Of the tyres' slip stiffness, relative: 7.7 to 13.3 on the robots of `tests.studies.contact_law`."""
 _MAX_PRIOR_SIGMAS = 4.0
