@@ -127,8 +127,8 @@ def p_value(t: float, draws: FloatArray, df: float) -> float:
 
 
 def folds(windows: int) -> list[NDArray[np.bool_]]:
-    """Which of so many ``windows`` are held out together, (windows,) for each fold: every fifth block of 4, as neighbours err alike. None
-    where all windows are in one block."""
+    """Which of so many ``windows`` are held out together, (windows,) for each fold: every fifth block of 4, as neighbours err alike. No
+    fold where all windows are in one block."""
     fold = (np.arange(windows) // _BLOCK_WINDOWS) % _FOLDS
     return [fold == f for f in range(_FOLDS) if (fold == f).any() and (fold != f).any()]
 
