@@ -156,14 +156,14 @@ class Filter:
     def map_relative_cov(self) -> Cov3:
         """(3, 3) covariance of the pose against the submap around the robot: that of the prior of a match."""
         P = self.P
-        return _positive(P[POSE, POSE] + P[MAP, MAP] - P[POSE, MAP] - P[MAP, POSE])
+        return positive(P[POSE, POSE] + P[MAP, MAP] - P[POSE, MAP] - P[MAP, POSE])
 
     def motion_since(self, clone: slice) -> tuple[Pose2, Cov3]:
         """Motion (3,) since the clone `START` or `KEY`, and its covariance (3, 3)."""
         delta = se2.between(self.start if clone == START else self.key, self.pose)
         A, P = se2.adjoint(se2.inverse(delta)), self.P
         cross = P[POSE, clone] @ A.T
-        return delta, _positive(P[POSE, POSE] - cross - cross.T + A @ P[clone, clone] @ A.T)
+        return delta, positive(P[POSE, POSE] - cross - cross.T + A @ P[clone, clone] @ A.T)
 
     def _update(self, innovation: FloatArray, H: FloatArray, R: FloatArray) -> float:
         """Schmidt-Kalman update in Joseph's form; consider states have no gain. Returns the NIS. Raises `EstimatorError`."""
@@ -204,14 +204,14 @@ class Filter:
         self.corrections = self.corrections + error[PARAMS:]
 
 
-def _positive(cov: FloatArray) -> FloatArray:
-    """``cov`` (n, n), a difference of large covariances, without the negative eigenvalues that rounding leaves in it."""
+def positive(cov: FloatArray, least: float = _MIN_VARIANCE) -> FloatArray:
+    """``cov`` (..., n, n), a difference of large covariances, with eigenvalues of at ``least`` so much: rounding leaves negative ones."""
     values, vectors = np.linalg.eigh(_symmetric(cov))
-    return np.asarray((vectors * np.maximum(values, _MIN_VARIANCE)) @ vectors.T, dtype=float)
+    return np.asarray((vectors * np.maximum(values, least)[..., None, :]) @ vectors.swapaxes(-1, -2), dtype=float)
 
 
 def _symmetric(P: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (P + P.T))
+    return np.asarray(0.5 * (P + P.swapaxes(-1, -2)))
 
 
 def _check(what: str, *arrays: FloatArray) -> None:

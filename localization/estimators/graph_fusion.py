@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
 from localization.estimators.base import Estimate, Estimator
-from localization.estimators.filter import KEY, PARAMS
+from localization.estimators.filter import KEY, PARAMS, positive
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
 from localization.events import PositionSample, Step
@@ -325,8 +325,7 @@ def _cov_between_nodes(nodes: FloatArray, odom: FloatArray, live: FloatArray, ke
     A = se2.adjoint(se2.inverse(se2.between(odom[nodes[k]], odom)))
     grown = (1.0 - part)[:, None, None] * (live - A @ key_covs[k] @ A.swapaxes(-1, -2))
     grown[nodes] = 0.0
-    values, vectors = np.linalg.eigh(grown)  # rounding leaves negative eigenvalues
-    return np.asarray((vectors * np.maximum(values, 0.0)[:, None]) @ vectors.swapaxes(-1, -2))
+    return positive(grown, least=0.0)
 
 
 def _shares(nodes: FloatArray, odom: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
