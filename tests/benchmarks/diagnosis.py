@@ -31,6 +31,7 @@ from localization.diagnosis.findings import Finding
 from localization.diagnosis.linearization import Linearization, linearize, make_regression
 from localization.diagnosis.prediction import with_sizes
 from localization.logs import open_log
+from localization.simulation.faults import FAULTS
 from motion_models.registry import make_model
 from tests.helpers.diagnosis_drives import ONE_SIDED, TYPICAL, bag, drive, robot_named
 from tests.helpers.diagnosis_rivals import oracle, rivals
@@ -66,6 +67,11 @@ class Case:
     def seed(self) -> int:
         return _SEED + self.number
 
+    @property
+    def simulated(self) -> dict[str, float]:
+        """What is hidden and what deviates, together."""
+        return {name: self.effects.get(name, 0.0) + self.deviations.get(name, 0.0) for name in {**self.effects, **self.deviations}}
+
 
 def case_of(number: int) -> Case:
     """The case of this number: each cause, robot and kind in turn, sizes and routes by chance."""
@@ -84,13 +90,13 @@ def case_of(number: int) -> Case:
 
 
 def _size(cause: str, robot: str, rng: np.random.Generator) -> float:
-    """Log-uniform from a quarter of the typical size to twice it."""
+    """Log-uniform from a quarter of the typical size to twice it, or to what the simulator applies."""
     factor = float(np.exp(rng.uniform(np.log(_MIN_FACTOR), np.log(_MAX_FACTOR))))
     typical = _PAYLOAD_SHARE * robot_named(robot).geometry.mass_kg if cause == "payload" else TYPICAL[cause]
     if cause == "lateral_force_law":
         factor = min(factor, 1.0)  # the whole of the other law
     sign = 1.0 if cause in ONE_SIDED or rng.random() < 0.5 else -1.0
-    return round(sign * factor * typical, 6)
+    return round(sign * min(factor * typical, FAULTS[cause].largest), 6)
 
 
 def drive_of(case: Case, kept_in: Path | None = None) -> Drive:
@@ -103,8 +109,7 @@ def drive_of(case: Case, kept_in: Path | None = None) -> Drive:
         return pickle.loads(kept.read_bytes())  # type: ignore[no-any-return]
     robot = robot_named(case.robot)
     with tempfile.TemporaryDirectory() as folder:
-        sizes = {name: case.effects.get(name, 0.0) + case.deviations.get(name, 0.0) for name in {**case.effects, **case.deviations}}
-        log = bag(Path(folder) / "drive.mcap", sizes, case.seed, case.robot, drive(case.drive))
+        log = bag(Path(folder) / "drive.mcap", case.simulated, case.seed, case.robot, drive(case.drive))
         return drive_of_log(open_log(log, robot))
 
 
