@@ -19,6 +19,8 @@ from motion_models.se2 import FloatArray
 _compiled: set[tuple[str, ...]] = set()
 """What this process has warmed up."""
 _ROOM_M, _SPEED_M_S = 8.0, 0.5
+_PUSH = np.array([0.6, 0.4, 0.2])
+"""Far enough that scans do not fit until they are searched [m, m, rad]."""
 _PERIOD_NS = 10_000_000
 _EVENTS_PER_SCAN = 10
 
@@ -26,9 +28,9 @@ _EVENTS_PER_SCAN = 10
 def warm_up(run: LiveRun) -> None:
     """Process short synthetic drives with every kind of sensor that the robot may have, and discard the results.
 
-    Once with planar scans, once with clouds and once without a LiDAR (where the estimator works without one), each with a gap in the
-    scans, after which the matcher searches a wide prior. The centre of gravity of the robot's arms first. A process does it once for each
-    model and estimator.
+    Once with planar scans, once with clouds and once without a LiDAR (where the estimator works without one), each with a push that
+    the wheels do not see, after which the matcher searches. The centre of gravity of the robot's arms first. A process does it once for
+    each model and estimator.
     """
     trial = run.make_trial(True)
     settings = (trial.estimator, trial.model.name, trial.corrections, repr(run.config), repr(run.robot.arms))
@@ -58,7 +60,7 @@ def warm_up(run: LiveRun) -> None:
 
 
 def synthetic_drive(has_lidar: bool, is_planar: bool) -> Iterator[Event]:
-    """Some seconds of a drive along an arc in a square room: a standstill, motion over several keyframes, and a second without scans."""
+    """Some seconds of a drive along an arc in a square room: a standstill, motion over several keyframes, and a push in the middle."""
     room = _room(is_planar)
     stamp, pose, turned = 1_000_000_000, np.zeros(3), np.zeros(2)
     yield CgSample(stamp, np.zeros(2))
@@ -69,7 +71,9 @@ def synthetic_drive(has_lidar: bool, is_planar: bool) -> Iterator[Event]:
         stamp, turned = stamp + _PERIOD_NS, turned + rates * _PERIOD_NS * 1e-9
         yield WheelSample(stamp, rates, turned)
         yield ImuSample(stamp, np.array([0.0, 0.0, 0.3 * speed]), np.array([0.0, 0.0, 9.81]), "imu_link")
-        if has_lidar and i % _EVENTS_PER_SCAN == 9 and not 300 < i < 400:
+        if i == 300:
+            pose = pose + _PUSH
+        if has_lidar and i % _EVENTS_PER_SCAN == 9:
             yield replace(room, stamp_ns=stamp, points=_from_pose(room.points, pose))
 
 
