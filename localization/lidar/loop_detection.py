@@ -8,8 +8,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localization.lidar.correlative_search import draw_image, search
-from localization.lidar.scan_matcher import LidarConfig, align_points
+from localization.lidar.correlative_search import draw_image
+from localization.lidar.scan_matcher import (
+    MIN_PLACE_OVERLAP,
+    SEARCH_FLOOR,
+    LidarConfig,
+    align_points,
+    find_place,
+    is_narrow,
+    mahalanobis,
+    outlier_cov,
+    search_limit,
+)
 from localization.lidar.submap import make_grid, voxel_means
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
@@ -20,24 +30,12 @@ _AROUND = 8
 """Keyframes before and after the old one whose scans make its submap."""
 _RECENT = 5
 """Keyframes whose scans are matched together: one scan fits many places, five of them few."""
-_CHAIN_SCALE = 4.0
-"""Variance of the drift since the old visit, over the graph's marginal: only the size of the search depends on it."""
-_PLACE_COV = np.diag([0.05, 0.05, 0.01]) ** 2
-_LIMIT_CELLS, _LIMIT_RAD = 40.0, 0.5
-"""Half the widest window of a search."""
-_MAX_RIVAL = 0.85
-"""A loop is ambiguous where a pose elsewhere scores more than this share of the best."""
-_MIN_OVERLAP = 0.65
-_MAX_SIGMA_M = 0.25
-"""Scenes that leave a direction open to more than this close no loop [m]."""
 _FLOOR_COV = np.diag([0.02, 0.02, 0.005]) ** 2
 """Submaps bend: covariance of a loop, at least [m^2, m^2, rad^2]."""
-_HEADING_WEIGHT = 0.3
-"""How much a turned scanner, whose beams hit other walls, counts as distance: of the median range, per radian."""
-_AGREE_M, _AGREE_RAD = 0.15, 0.06
-"""Two loops agree where one predicts the other within this and 3 sigma."""
-_AGREE_WITHIN = 12
-"""Keyframes within which a second loop has to agree."""
+_AGREE_SQUARE = 9.0
+"""Two loops agree where they and the odometry between them close within 3 sigma."""
+_REACH = 1.5
+"""How far from its place a scan still shows the same walls [median range]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +81,7 @@ class LoopDetector:
         if k <= _MIN_KEYFRAMES or not len(self.keyframes[k].points):
             return []
         found = self._match(k, poses(), marginal(k))
-        self._pending = [loop for loop in self._pending if k - loop.b <= _AGREE_WITHIN]
+        self._pending = [loop for loop in self._pending if k - loop.b <= _AROUND]
         if found is None:
             return []
         self._pending.append(found)
@@ -97,22 +95,21 @@ class LoopDetector:
         median = float(np.median(np.hypot(points[:, 0], points[:, 1])))
         old = poses[: k - _MIN_KEYFRAMES + 1]
         distance = np.hypot(*(old[:, :2] - poses[k, :2]).T)
-        turned = np.abs(se2.wrap_angle(old[:, 2] - poses[k, 2]))
-        j = int(np.argmin(distance + _HEADING_WEIGHT * median * turned))
+        j = int(np.argmin(distance))
         prior = se2.between(poses[j], poses[k])
-        cov = _CHAIN_SCALE * marginal + _PLACE_COV
-        if distance[j] > 3.0 * math.sqrt(float(np.linalg.eigvalsh(marginal[:2, :2])[-1])) + 1.5 * median:
+        if distance[j] > 3.0 * math.sqrt(float(np.linalg.eigvalsh(marginal[:2, :2])[-1])) + _REACH * median:
             return None
         place = self._merge(range(max(0, j - _AROUND), min(k - _MIN_KEYFRAMES, j + _AROUND) + 1), poses, j)
         recent = voxel_means(self._merge(range(max(0, k - _RECENT + 1), k + 1), poses, k), 1.5 * self._cell)
-        limit = np.array([_LIMIT_CELLS * self._cell, _LIMIT_CELLS * self._cell, _LIMIT_RAD])
-        best = search(draw_image(_within_reach(place, recent, prior, cov, limit), self._cell), recent, prior, cov, limit)
-        if best.rival_score > _MAX_RIVAL * best.score:
+        wide = marginal + outlier_cov(marginal)
+        reachable = _within_reach(place, recent, prior, wide, search_limit(marginal))
+        found = find_place(draw_image(reachable, self._cell), recent, prior, wide, marginal)
+        if found is None:
             return None
         near = np.diag([2.0 * self._cell, 2.0 * self._cell, 0.03]) ** 2
-        fit = align_points(make_grid(place, self._cell, self._config.range_noise_m), recent, best.pose, near, best.pose)
-        own_cov = np.linalg.inv(fit.information + 1e-6 * np.eye(3))
-        if fit.overlap < _MIN_OVERLAP or math.sqrt(float(np.linalg.eigvalsh(own_cov[:2, :2])[-1])) > _MAX_SIGMA_M:
+        fit = align_points(make_grid(place, self._cell, self._config.range_noise_m), recent, found, near, found)
+        own_cov = np.asarray(np.linalg.inv(fit.information + 1e-6 * np.eye(3)), dtype=float)
+        if fit.overlap < MIN_PLACE_OVERLAP or not is_narrow(own_cov):  # the latter where the scene leaves a direction open
             return None
         return LoopClosure(j, k, fit.pose, own_cov + _FLOOR_COV)
 
@@ -125,9 +122,8 @@ class LoopDetector:
         """Whether both loops and the odometry between their ends close: a1^-1 a2 and b1^-1 b2 are given by the odometry."""
         a = se2.between(self.keyframes[one.a].odometry, self.keyframes[other.a].odometry)
         b = se2.between(self.keyframes[one.b].odometry, self.keyframes[other.b].odometry)
-        error = se2.between(se2.compose(one.delta, b), se2.compose(a, other.delta))
-        sigma = math.sqrt(float(np.trace(one.cov[:2, :2]) + np.trace(other.cov[:2, :2])))
-        return bool(math.hypot(error[0], error[1]) < _AGREE_M + 3.0 * sigma and abs(error[2]) < _AGREE_RAD)
+        cov = one.cov + other.cov + SEARCH_FLOOR
+        return mahalanobis(se2.compose(one.delta, b), se2.compose(a, other.delta), cov) < _AGREE_SQUARE
 
 
 def _within_reach(place: Points2, points: Points2, prior: Pose2, cov: Cov3, limit: FloatArray) -> FloatArray:

@@ -42,7 +42,7 @@ _FORGETTING = 0.98
 _OUTLIER_COST = 12.5
 """-log of the odds that the prior is an outlier (wheels that slip or count wrongly): a deviation of 5 sigma."""
 _SEARCH_FACTOR = 9.0
-_SEARCH_FLOOR = np.diag([0.1, 0.1, 0.03]) ** 2
+SEARCH_FLOOR = np.diag([0.1, 0.1, 0.03]) ** 2
 """The search covers 3 sigma of 9 P + this [m^2, m^2, rad^2] + j j^T, j from the prior to where the motion of the last step would lead."""
 _NO_JUMP = np.zeros(3)
 _SEARCH_LIMIT, _WIDEST_SEARCH = np.array([3.0, 3.0, 1.0]), np.array([15.0, 15.0, math.pi])
@@ -52,7 +52,7 @@ _MAX_RIVAL = 0.9
 is more probable than exp(-`_OUTLIER_COST`) of the best."""
 _BASIN_M, _BASIN_RAD = 0.15, 0.15
 """Sigma of a prior from which Gauss-Newton alone may end elsewhere: from .3 m, .15 rad it does in 14 to 31 % of trials."""
-_MIN_PLACE_OVERLAP = 0.6
+MIN_PLACE_OVERLAP = 0.6
 """Share of points on the submap, below which a place found from a wide prior is not taken: Cartographer's least score of a place without
 a prior (`global_localization_min_score`)."""
 _SWEEP_PARTS = 8
@@ -180,19 +180,19 @@ class ScanMatcher:
         nothing = np.zeros((3, 3))
         fit = self._align(points, prior, cov, prior if guess is None else guess)
         self.is_new_place = fit.mapped < 0.5 * len(points) and fit.fitting >= 0.5 * fit.mapped and is_narrow(cov)
-        is_near, agrees = _is_within_basin(fit, cov), _mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST
+        is_near, agrees = _is_within_basin(fit, cov), mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST
         fits = is_near and fit.overlap >= self._config.search_below
         if fits and agrees:
             return self._result(fit, nothing)
-        outlier_cov = (_SEARCH_FACTOR - 1.0) * cov + _SEARCH_FLOOR + np.outer(jump, jump)
-        best = fit.pose if fits else self._search(points, prior, cov + outlier_cov, cov)
+        added = outlier_cov(cov) + np.outer(jump, jump)
+        best = fit.pose if fits else self._search(points, prior, cov + added, cov)
         if best is not None:
-            if not is_near and _mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:
-                outlier_cov = nothing
-            found = self._align(points, prior, cov + outlier_cov, best, self.cell)
-            least = self._config.lost_below if is_narrow(cov) else _MIN_PLACE_OVERLAP  # the place may not be mapped
+            if not is_near and mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:
+                added = nothing
+            found = self._align(points, prior, cov + added, best, self.cell)
+            least = self._config.lost_below if is_narrow(cov) else MIN_PLACE_OVERLAP  # the place may not be mapped
             if found.overlap >= least and (not is_near or _is_better(found, fit, prior, cov)):
-                return self._result(found, outlier_cov)
+                return self._result(found, added)
         return self._result(fit, nothing) if is_near and fit.overlap >= self._config.lost_below else None
 
     def refine(self, points: Points2, prior: Pose2, cov: Cov3, match: ScanMatch) -> ScanMatch | None:
@@ -281,16 +281,11 @@ class ScanMatcher:
         return align_points(self._grid, points, prior, cov, guess, spread)
 
     def _search(self, points: Points2, prior: Pose2, wide: FloatArray, cov: Cov3) -> Pose2 | None:
-        """The best pose (3,) within 3 sigma of ``wide`` (3, 3), limited unless ``cov`` (3, 3) is wider; None where it is ambiguous."""
+        """As `find_place`, in the submap."""
         assert self._grid is not None
         if self._image is None:
             self._image = draw_image(self._grid.means, self.cell)
-        reach = 3.0 * np.sqrt(np.diagonal(cov))
-        limit = np.minimum(np.maximum(_SEARCH_LIMIT, reach), _WIDEST_SEARCH)
-        best = search(self._image, voxel_means(points, self.cell), prior, wide, limit)
-        if (reach <= _SEARCH_LIMIT).all():
-            return best.pose if best.rival_score < _MAX_RIVAL * best.score else None
-        return best.pose if best.margin >= _OUTLIER_COST else None  # the place is unknown
+        return find_place(self._image, voxel_means(points, self.cell), prior, wide, cov)
 
     def _result(self, fit: Fit, outlier_cov: Cov3) -> ScanMatch:
         """The match of the scan alone: one more Gauss-Newton step from the minimum, without the prior's pull."""
@@ -318,6 +313,25 @@ def _first_spread(points: Points2, cov: Cov3) -> float:
     return min(3.0 * math.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2] * r2), _MAX_ASSOCIATION_M)
 
 
+def find_place(image: LikelihoodImage, points: Points2, prior: Pose2, wide: FloatArray, cov: Cov3) -> Pose2 | None:
+    """The best pose (3,) of ``points`` (N, 2) within 3 sigma of ``wide`` (3, 3) from the ``prior`` (3,), limited by `search_limit`; None
+    where it is ambiguous. ``cov`` (3, 3) of the prior itself."""
+    best = search(image, points, prior, wide, search_limit(cov))
+    if (3.0 * np.sqrt(np.diagonal(cov)) <= _SEARCH_LIMIT).all():
+        return best.pose if best.rival_score < _MAX_RIVAL * best.score else None
+    return best.pose if best.margin >= _OUTLIER_COST else None  # the place is unknown
+
+
+def search_limit(cov: Cov3) -> FloatArray:
+    """(3,) half the window of a search at most [m, m, rad], for a prior with ``cov`` (3, 3)."""
+    return np.asarray(np.minimum(np.maximum(_SEARCH_LIMIT, 3.0 * np.sqrt(np.diagonal(cov))), _WIDEST_SEARCH))
+
+
+def outlier_cov(cov: Cov3) -> Cov3:
+    """(3, 3) to be added to the covariance ``cov`` (3, 3) of a prior that may be an outlier."""
+    return np.asarray((_SEARCH_FACTOR - 1.0) * cov + SEARCH_FLOOR)
+
+
 def choose_cell(config: LidarConfig, points: Points2) -> float:
     """Edge of the voxels [m] for a submap that begins with ``points`` (N, 2) of the body frame."""
     return config.voxel_size_m or max(_CELL_OF_RANGE * float(np.median(np.hypot(points[:, 0], points[:, 1]))), _MIN_CELL_M)
@@ -342,10 +356,10 @@ def _is_better(found: Fit, fit: Fit, prior: Pose2, cov: Cov3) -> bool:
 
 
 def _total_cost(fit: Fit, prior: Pose2, cov: Cov3) -> float:
-    return fit.cost + min(_mahalanobis(prior, fit.pose, cov) / 2.0, _OUTLIER_COST)
+    return fit.cost + min(mahalanobis(prior, fit.pose, cov) / 2.0, _OUTLIER_COST)
 
 
-def _mahalanobis(prior: Pose2, pose: Pose2, cov: Cov3) -> float:
+def mahalanobis(prior: Pose2, pose: Pose2, cov: Cov3) -> float:
     """Squared distance of ``pose`` from ``prior`` in sigmas of ``cov``."""
     off = se2.log(se2.between(prior, pose))
     return float(off @ np.linalg.solve(cov, off))
