@@ -197,7 +197,7 @@ def _residual_sigmas(rest: FloatArray, channels: IntArray, t: FloatArray) -> Flo
 
 MAX_LEFT_OVER_NOISE = 1.5
 """Root mean square that may be left of a row, over its noise: at 1.5 what has no cause is as large as the noise (1.5^2 = 1 + 1.1^2)."""
-_MODEL_ACCURACY = 0.05  # of a row: what the signature of a named cause may be off, as at a slope of 0.05 rad (3 %)
+_MODEL_ACCURACY = 0.03  # of a row: what the signature of a named cause may be off, as at a slope of 0.05 rad
 _MAX_TREND_OVER_NOISE = 0.5  # a trend of half the noise adds 12 % to the root mean square of a row
 _MIN_ATTRIBUTED_SHARE = 0.1  # of a row's squares, for a cause to be listed beside it
 _MAX_ATTRIBUTIONS = 3
