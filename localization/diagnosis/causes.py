@@ -273,7 +273,7 @@ _CAUSES = (
     ),
     Cause(
         "encoder_dropout",
-        *("1", "share of its rolling time in which an encoder loses its counts", 0.1, 0.01, _add("encoder_loss")),
+        *("1", "share of its rolling time in which an encoder loses its counts", 0.1, 0.001, _add("encoder_loss")),
         ("an encoder loses its counts in {} of its rolling time", "{} fewer counts are lost"),
         one_sided=True,
     ),

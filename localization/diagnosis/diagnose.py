@@ -72,7 +72,7 @@ class DiagnosisConfig(Settings):
     """Family-wise probability of naming any cause where there is none."""
     fewest_windows: Count = 8
     """Least number of measured windows; fewer are undecidable."""
-    moments: Count = 9
+    moments: Count = 7
     """Number of moments at which a change of the floor is tried."""
     seed: Seed = 0
     """Of the random numbers in tests and intervals."""
@@ -279,7 +279,7 @@ def _make_findings(
     """Findings, by their held-out gain."""
     problem, causes = linearization.problem, linearization.causes
     sizes, cov, _ = problem.fit(chosen)
-    found = []
+    found, gained = [], []
     for n, i in enumerate(chosen):
         cause, size = causes[i], float(sizes[n])
         sigma = math.hypot(math.sqrt(cov[n, n]), _SYSTEMATIC_SHARE * cause.negligible)
@@ -288,9 +288,10 @@ def _make_findings(
         others = tuple(j for j in chosen if j != i)
         p = _p_value(linearization, others, i, rng)
         aliases = aliases_of(predictor, linearization, chosen, i)
-        text = evidence(cause, linearization.signatures[..., i] * size, linearization.noise, problem.gain(chosen) - problem.gain(others))
+        gained.append(problem.gain(chosen) - problem.gain(others))
+        text = evidence(cause, linearization.signatures[..., i] * size, linearization.noise, gained[-1])
         found.append(Finding(cause, size, sigma, p, aliases, text, gains[n]))
-    return _merge_slopes(sorted(found, key=lambda f: f.gain.relative, reverse=True))
+    return _merge_slopes([found[n] for n in np.argsort(-np.array(gained), kind="stable")])
 
 
 def _suspect(predictor: DrivePredictor, linearization: Linearization, rng: np.random.Generator) -> tuple[Finding, str] | None:
@@ -333,7 +334,7 @@ def _with_data_errors(d: Diagnosis, drive: Drive) -> Diagnosis:
     if loss is not None and loss.share > MISSING_MESSAGES.negligible and loss.gaps >= _MIN_GAPS:
         none = Gain(*(float("nan"),) * 2, 0.0, 0.0, 0.0) if d.gain is None else Gain(d.gain.after, d.gain.after, 0.0, 0.0, 0.0)
         sigma = loss.share * math.sqrt(2.0 / loss.gaps)
-        findings = (*findings, Finding(MISSING_MESSAGES, loss.share, sigma, 0.0, (), describe_loss(loss), none))
+        findings = (Finding(MISSING_MESSAGES, loss.share, sigma, 0.0, (), describe_loss(loss), none), *findings)
         verdict = "explained" if verdict in ("consistent", "undecidable") else verdict
     if d.contradictions and verdict == "consistent":
         verdict = "unexplained"

@@ -377,7 +377,7 @@ def candidate_causes(predictor: DrivePredictor, moments: int) -> tuple[Cause, ..
         found.append(slope_across())
         length = float(drive.starts_s[-1])
         if len(drive.maneuvers) >= 24:
-            found += [friction_change(length * q) for q in np.linspace(0.1, 0.9, moments)]
+            found += [friction_change(length * q) for q in np.linspace(0.2, 0.8, moments)]
     if drive.kind == "runs":
         out = {"wheel_radius_difference", "tread_asymmetry", "lidar_yaw", "gyro_bias", "encoder_dropout"}
         return tuple(e for e in found if e.id not in out)
