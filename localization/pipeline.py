@@ -155,7 +155,7 @@ class Run:
     """Computing time of this trial, without reading the log."""
     corrections: str | None = None
     """Form of the corrections to the motion model, or None where the estimator makes none."""
-    moments: Trajectory | None = None
+    filtered: Trajectory | None = None
     """Filtered poses, as they were estimated at each moment and published live, where ``trajectory`` is smoothed."""
     lidar: LidarLosses | None = None
     """How long the LiDAR was lost; None where no scans were matched to a map."""

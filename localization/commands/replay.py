@@ -241,7 +241,7 @@ def _distance(results: Sequence[Result]) -> float | None:
 
 
 def _estimates(run: Run) -> Iterator[FusedEstimate]:
-    t = run.trajectory if run.moments is None else run.moments  # what would have been published
+    t = run.trajectory if run.filtered is None else run.filtered  # what would have been published
     parent = MAP_FRAME if run.estimator in LOCALIZING else PARENT_FRAME
     for i in range(len(t)):
         twist_cov = run.twist_covariances[i]

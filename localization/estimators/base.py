@@ -54,10 +54,10 @@ class Estimator(ABC):
         """Add a measured position; estimators without a map frame leave it out."""
         return
 
-    def finish(self, moments: Trajectory | None = None) -> Trajectory | None:
+    def finish(self, filtered: Trajectory | None = None) -> Trajectory | None:
         """Return the smoothed trajectory, or None where the estimator does not smooth.
 
-        ``moments``: the filtered estimates of each moment, which the estimator does not store. Raises `EstimatorError`."""
+        ``filtered``: the estimates as they were published, which the estimator does not store. Raises `EstimatorError`."""
         self.run_deferred()
         return None
 

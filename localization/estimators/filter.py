@@ -20,9 +20,9 @@ import numpy as np
 from filterpy.kalman import predict as predict_linear
 
 from localization.errors import EstimatorError
-from localization.estimators.measurement_models import predict_turn, subtract_map_error
+from localization.estimators.measurement_models import predict_turn, submap_residual
 from localization.events import Step, Turn
-from localization.lidar import KeyScanError
+from localization.lidar import FORGETTING, OUTLIER_SIGMAS, KeyScanError
 from localization.settings import Settings
 from motion_models import se2
 from motion_models.online_calibration import Corrections
@@ -35,11 +35,9 @@ _MIN_VARIANCE = 1e-14
 """Variance of a relative motion, at least: a tenth of a micrometre or microradian [m^2, rad^2]."""
 _MAX_NUMBER = 1e12
 """No state or covariance of a robot on Earth is larger, in SI units."""
-_FORGETTING, _MIN_INFORMATION = 0.98, 30.0
-"""Of the wheels' scale, per measurement: information of the last 50, at least that of ten scans, as the prior's."""
-_MAX_SQUARE = 25.0
-"""Innovations squared count as so many times their expectation at most: beyond 5 sigma wheels or scans are outliers."""
-_MAX_WHEEL_SCALE = 20.0
+_MIN_INFORMATION = 30.0
+"""Of the factor on the wheels' noise: that of ten scans, as the prior's."""
+_MAX_NOISE_SCALE = 20.0
 """As of `calibrate`. The least is 1: slip lasts, and what fits the innovation of one scan is too small for the sum of many (ACES with a
 least scale of 1/4 for each axis: 0.099 -> 0.138 m)."""
 
@@ -49,7 +47,7 @@ class FilterConfig(Settings):
     """Prior and process noise of the filter."""
 
     clock_sigma_s: float = 0.1
-    """Sigma of the offset between the clocks of wheels and LiDAR at first [s]; 0 takes them as one."""
+    """Sigma of the offset between the clocks of the wheels and of LiDAR or gyro at first [s]; 0 takes them as one."""
     clock_walk_s_per_sqrt_s: float = 1e-4
     """Random walk of the clock offset."""
     standstill_m2_per_s: float = 1e-6
@@ -76,7 +74,7 @@ class Filter:
         self.is_considered = np.zeros(n, dtype=bool)
         """(n,) states that have no gain."""
         self.is_considered[MAP] = self.is_considered[KEY] = True
-        self.wheel_scale = 1.0
+        self.wheel_noise_scale = 1.0
         """Factor on the robot file's wheel noise, estimated from the innovations."""
         self._scale_information, self._slip_cov = 0.0, np.zeros((n, n))  # Fisher information; the part of P that is this step's slip
 
@@ -99,7 +97,7 @@ class Filter:
         Q[POSE, POSE] = self.wheel_cov(step)
         self._slip_cov = Q * (step.has_wheels and not step.is_standing)
         Q[BIAS, BIAS] = self._gyro.bias_walk_rad_per_s_sqrt_s**2 * dt
-        if self._config.clock_sigma_s:
+        if self.P[CLOCK, CLOCK]:  # else there is one clock
             Q[CLOCK, CLOCK] = self._config.clock_walk_s_per_sqrt_s**2 * dt
         if step.is_standing:
             c = self._config
@@ -114,7 +112,7 @@ class Filter:
 
     def wheel_cov(self, step: Step) -> Cov3:
         """(3, 3) of the wheels' motion in ``step``, with the estimated scale."""
-        return step.predicted.cov * (self.wheel_scale if step.has_wheels and not step.is_standing else 1.0)
+        return step.predicted.cov * (self.wheel_noise_scale if step.has_wheels and not step.is_standing else 1.0)
 
     def update_turn(self, turn: Turn) -> float:
         """The gyro's turn since the start of the step. Returns the normalised innovation squared (NIS, 1 degree of freedom)."""
@@ -129,7 +127,7 @@ class Filter:
         ``outlier_cov`` (3, 3): what the wheels' motion is worse by than predicted.
         """
         self.P[POSE, POSE] += outlier_cov
-        innovation, by_pose, by_map = subtract_map_error(self.pose, measured)
+        innovation, by_pose, by_map = submap_residual(self.pose, measured)
         H = np.zeros((3, len(self.P)))
         H[:, POSE], H[:, MAP] = by_pose, by_map
         return self._update(innovation, H, R)
@@ -142,7 +140,7 @@ class Filter:
         self.P[MAP, MAP] += error.new_cov
 
     def start_key(self) -> None:
-        """Clone the pose: `key_motion` counts from here on."""
+        """Clone the pose: `motion_since` (KEY) counts from here on."""
         F = np.eye(len(self.P))
         F[KEY, KEY], F[KEY, POSE] = 0.0, np.eye(3)
         self.key, self.P = self.pose, F @ self.P @ F.T
@@ -175,12 +173,12 @@ class Filter:
         A = np.eye(len(P)) - K @ H
         self.P = _symmetric(A @ P @ A.T + K @ R @ K.T)
         _check("a measurement", self.P)
-        self._adapt_wheel_scale(innovation, np.asarray(np.linalg.inv(S), dtype=float), H @ self._slip_cov @ H.T)
+        self._adapt_wheel_noise_scale(innovation, np.asarray(np.linalg.inv(S), dtype=float), H @ self._slip_cov @ H.T)
         self._slip_cov = A @ self._slip_cov @ A.T
         self._move(K @ innovation)
         return float(innovation @ np.linalg.solve(S, innovation))
 
-    def _adapt_wheel_scale(self, innovation: FloatArray, S_inv: FloatArray, slip_cov: FloatArray) -> None:
+    def _adapt_wheel_noise_scale(self, innovation: FloatArray, S_inv: FloatArray, slip_cov: FloatArray) -> None:
         """One step of Fisher scoring for log a, where S = a dS/da + ..., ``slip_cov`` = a dS/da (maximum likelihood; Mehra 1970):
 
         2 d log p / d log a = y^T S^-1 (a dS/da) S^-1 y - tr(S^-1 a dS/da), information tr((S^-1 a dS/da)^2), innovation y.
@@ -189,10 +187,10 @@ class Filter:
         """
         share, gain = S_inv @ slip_cov, S_inv @ innovation
         expected = float(np.trace(share))
-        score = min(float(gain @ slip_cov @ gain), _MAX_SQUARE * expected) - expected
-        self._scale_information = _FORGETTING * self._scale_information + float(np.trace(share @ share))
+        score = min(float(gain @ slip_cov @ gain), OUTLIER_SIGMAS**2 * expected) - expected
+        self._scale_information = FORGETTING * self._scale_information + float(np.trace(share @ share))
         step = score / max(self._scale_information, _MIN_INFORMATION)
-        self.wheel_scale = min(max(self.wheel_scale * math.exp(step), 1.0), _MAX_WHEEL_SCALE)
+        self.wheel_noise_scale = min(max(self.wheel_noise_scale * math.exp(step), 1.0), _MAX_NOISE_SCALE)
 
     def _move(self, error: FloatArray) -> None:
         """Move the means by the estimated ``error`` (n,)."""

@@ -11,16 +11,13 @@ import numpy as np
 from localization.estimators.base import NO_POINTS, Estimate, Estimator, mean_twist
 from localization.estimators.filter import BIAS, CLOCK, MAP, PARAMS, POSE, SCALE, START, Filter, FilterConfig
 from localization.events import Step
-from localization.lidar import LostScans, ScanMatchingSensor
+from localization.lidar import FORGETTING, OUTLIER_SIGMAS, LostScans, ScanMatchingSensor
 from motion_models import se2
 from motion_models.base import Motion, MotionModel
 from motion_models.online_calibration import Corrections
 from motion_models.robot import Robot
 from motion_models.se2 import Cov3, FloatArray, Points2, Twist2
 
-_SIGMAS = 5.0
-_FORGETTING = 0.98
-"""Of the statistics of slip, per scan: they are a mean over the last 50 scans, as those of the matcher."""
 _PRIOR_SCANS = 0.2
 """Weight of white slip, as the wheels' noise model has it, in scans: the first key scans are drawn by then, and their error stays (NEES of
 simulated rooms with weight 1: 1.6, with 0.2: 1.9; with white slip 4.7 and 4.8)."""
@@ -37,7 +34,7 @@ class EkfFusion(Estimator):
         self._track_m = robot.geometry.track_width_m
         self._twist, self._slip = np.zeros(3), np.zeros(3)  # of the last step; what the wheels missed of it
         self._slip_changes = _SlipChanges()
-        self._has_gyro = self._is_scan_pending = False
+        self._is_slip_measured = self._has_gyro = self._is_scan_pending = False
         self.wheel_motion, self.is_turning = Motion(np.zeros(3), np.zeros((3, 3))), True
         """Motion of the last step by the wheels, with the covariance that the filter gave it in the end; whether it corrects the model."""
         self.counts_by_name = dict.fromkeys(("scans", "matched", "standing", "searched"), 0)
@@ -81,7 +78,7 @@ class EkfFusion(Estimator):
             nis = self._update_scan(step, self._sensor)
         delta, cov = ekf.motion_since(START)
         twist, twist_cov = mean_twist(delta, cov, step.duration) if step.duration > 0.0 else (step.twist, None)
-        self._twist, self._slip = twist, twist - _mean_twist(step)
+        self._twist, self._slip, self._is_slip_measured = twist, twist - _mean_twist(step), nis is not None
         return Estimate(step.end_ns, ekf.pose, ekf.P[POSE, POSE].copy(), twist, twist_cov, nis)
 
     def run_deferred(self) -> None:
@@ -110,7 +107,8 @@ class EkfFusion(Estimator):
         if duration > 0.0:
             slip = se2.log(se2.between(ekf.start, match.pose)) / duration - _mean_twist(step)
             match = sensor.refine(match, step.twist + slip)
-            self._slip_changes.add(slip - self._slip, match.cov, step, sensor.sweep_s)
+            if self._is_slip_measured:
+                self._slip_changes.add(slip - self._slip, match.cov, step, sensor.sweep_s)
             R = match.cov + sensor.bend_cov(match, self._slip_changes.rate(step))
         self.counts_by_name["matched"] += 1
         self.counts_by_name["searched"] += bool(match.outlier_cov.any())
@@ -170,9 +168,9 @@ class _SlipChanges:
         white = (2.0 - min(sweep_s / step.duration, 1.0)) * np.diagonal(step.predicted.cov)
         scans = 6.0 * np.diagonal(scan_cov)  # 1 + 4 + 1
         squares = (change * step.duration) ** 2
-        is_inlier = squares < _SIGMAS**2 * (white + scans)  # beyond, scans or wheels are outliers
-        self._sum = np.where(is_inlier, _FORGETTING * self._sum + (squares - scans) / white, self._sum)
-        self._weight = np.where(is_inlier, _FORGETTING * self._weight + 1.0, self._weight)
+        is_inlier = squares < OUTLIER_SIGMAS**2 * (white + scans)  # beyond, scans or wheels are outliers
+        self._sum = np.where(is_inlier, FORGETTING * self._sum + (squares - scans) / white, self._sum)
+        self._weight = np.where(is_inlier, FORGETTING * self._weight + 1.0, self._weight)
 
     def rate(self, step: Step) -> Cov3:
         """(3, 3) covariance a second of the slip in ``step`` that changes within a sweep, as a random walk."""

@@ -21,7 +21,7 @@ from localization.estimators.filter import KEY, PARAMS, positive
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
 from localization.events import PositionSample, Step
-from localization.lidar import LidarConfig, LostScans
+from localization.lidar import OUTLIER_SIGMAS, LidarConfig, LostScans
 from localization.lidar.loop_detection import Keyframe, LoopDetector
 from localization.settings import Positive, Settings, Signed
 from localization.trajectory import Trajectory
@@ -32,11 +32,10 @@ from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 _MIN_POSITIONS, _MIN_BASELINE_M = 3, 5.0
 """Positions, and the distance between them [m], from which they give the heading of the map."""
-_MAX_POSITION_SIGMAS = 5.0
-"""Positions that are farther off are reported."""
 _ALIGNMENT_ITERATIONS = 30
-_WHEEL_SCALE_SIGMA = 0.02
+_RADIUS_SIGMA = 0.02
 """Relative error of the wheels' radius, both sides alike: wear and pressure of tyres. Positions and loops show it."""
+_KNOWN_RADIUS_SIGMA = 1e-6
 _WALK_S = 60.0
 """Corrections are constant for this long [s]; as a random walk of an hour they change by an eighth of their prior sigma meanwhile."""
 
@@ -59,11 +58,12 @@ class GraphFusion(Estimator):
     """`EkfFusion` with a `PoseGraph` behind it."""
 
     def __init__(self, odometry: EkfFusion, corrections: Corrections, lidar: LidarConfig, config: GraphConfig, is_smoothing: bool):
-        """``is_smoothing``: `finish` is to give the smoothed trajectory; memory then grows with the drive, 24 bytes a step."""
-        self.odometry, self._corrections, self._lidar, self._config = odometry, corrections, lidar, config
-        prior = block_diag(corrections.cov, _WHEEL_SCALE_SIGMA**2)
+        """``is_smoothing``: `finish` is to give the smoothed trajectory; memory then grows with the drive, 32 bytes a step."""
+        self.odometry, self._corrections, self._config = odometry, corrections, config
+        self._has_radius = "wheel_radius_scale" not in corrections.names  # else it is one of them
+        prior = block_diag(corrections.cov, (_RADIUS_SIGMA if self._has_radius else _KNOWN_RADIUS_SIGMA) ** 2)
         self.graph = PoseGraph(prior, np.array([config.antenna_x_m, config.antenna_y_m]))
-        self._loops: LoopDetector | None = None
+        self._loops = LoopDetector(lidar)
         self._wheels = _KeyframeMotion(len(corrections.names))
         self._steps, self._stamps_ns = array("d"), array("q")  # the filter's poses, if they are to be smoothed
         self._nodes, self._key_covs = array("q"), array("d")  # which of them are keyframes; their live covariances
@@ -74,7 +74,7 @@ class GraphFusion(Estimator):
         self._positions: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []  # keyframe, offset, position, cov: not aligned yet
         self._waiting: list[PositionSample] = []
         self._is_aligned = False
-        self.n_loops = self.n_positions = 0
+        self.n_loops = self.n_positions = self._n_late = 0
 
     @property
     def clock_offset_s(self) -> float:
@@ -98,7 +98,7 @@ class GraphFusion(Estimator):
         estimate = self.odometry.step(step)
         self._is_matched = estimate.nis is not None
         self._wheels.add(self.odometry.wheel_motion, self._corrections, self.odometry.is_turning)
-        self._walked_s += step.duration
+        self._walked_s += 0.0 if step.is_standing else step.duration
         if self._is_smoothing and (not self._stamps_ns or step.end_ns > self._stamps_ns[-1]):
             self._steps.extend(ekf.pose)
             self._stamps_ns.append(step.end_ns)
@@ -157,13 +157,8 @@ class GraphFusion(Estimator):
         return np.asarray(cov + 1e-12 * np.eye(len(cov)))
 
     def _close_loops(self, keyframe: Keyframe) -> None:
-        if self._loops is None:
-            if self.odometry.cell == 0.0:
-                return
-            self._loops = LoopDetector(self._lidar, self.odometry.cell)
-            self._loops.keyframes += [Keyframe(self.graph.pose(k), keyframe.points[:0]) for k in range(self.graph.count - 1)]
         self._loops.add(keyframe)
-        loops = self._loops.detect(self.graph.poses, self.graph.marginal)
+        loops = self._loops.detect(self.odometry.cell, self.graph.poses, self.graph.marginal)
         if loops:
             self.n_loops += len(loops)
             between = tuple(Between(loop.a, loop.b, loop.delta, np.asarray(np.linalg.inv(loop.cov)), is_loop=True) for loop in loops)
@@ -174,7 +169,10 @@ class GraphFusion(Estimator):
         ekf = self.odometry.filter
         while self._waiting and self._waiting[0].stamp_ns <= step.end_ns:
             sample = self._waiting.pop(0)
-            if sample.stamp_ns < step.start_ns or not self.graph.count:
+            if not self.graph.count:
+                continue
+            if sample.stamp_ns < step.start_ns:
+                self._n_late += 1
                 continue
             part = (sample.stamp_ns - step.start_ns) / max(step.end_ns - step.start_ns, 1)
             pose = se2.interpolate(ekf.start, ekf.pose, np.array(part))
@@ -198,48 +196,51 @@ class GraphFusion(Estimator):
         self.graph.apply(Update(positions=found, alignment=alignment))
         self._positions = []
 
-    def finish(self, moments: Trajectory | None = None) -> Trajectory | None:
-        """The smoothed trajectory at the stamps of ``moments``; None where nothing was asked for or nothing ties the drive but odometry."""
-        if self._is_keyframe_due:
-            self.run_deferred()
-        self.odometry.run_deferred()
-        if not self._is_smoothing or moments is None or self.graph.count < 2:
+    def finish(self, filtered: Trajectory | None = None) -> Trajectory | None:
+        """The smoothed trajectory at the stamps of ``filtered``; None unless smoothing, or with fewer than two keyframes."""
+        self.run_deferred()
+        if not self._is_smoothing or filtered is None or self.graph.count < 2:
             return None
         poses, covs = self.graph.smooth()
         if not (np.isfinite(poses).all() and np.isfinite(covs).all()):
             raise EstimatorError("the pose graph has no finite solution. Look at the log.")
         nodes, odom = np.array(self._nodes), np.array(self._steps).reshape(-1, 3)
         smoothed, smoothed_covs = _interpolate(nodes, poses, covs, odom)
-        if moments.covariances is not None:
-            smoothed_covs += _cov_between_nodes(nodes, odom, moments.covariances, np.array(self._key_covs).reshape(-1, 3, 3))
-        return Trajectory(moments.stamps_ns, smoothed, smoothed_covs)
+        if filtered.covariances is not None:
+            smoothed_covs += _cov_between_nodes(nodes, odom, filtered.covariances, np.array(self._key_covs).reshape(-1, 3, 3))
+        return Trajectory(filtered.stamps_ns, smoothed, smoothed_covs)
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         """As `Estimator.parameters`."""
+        found = self.odometry.parameters()
+        if not self._has_radius:
+            return found
         mean, cov = self.graph.corrections()
-        return {**self.odometry.parameters(), "wheel_radius_scale": (1.0 + float(mean[-1]), math.sqrt(float(cov[-1, -1])))}
+        return {**found, "wheel_radius_scale": (1.0 + float(mean[-1]), math.sqrt(float(cov[-1, -1])))}
 
     def counts(self) -> Mapping[str, int]:
         """As `Estimator.counts`."""
         found = {**self.odometry.counts(), "keyframes": self.graph.count}
-        if self._loops is not None:
+        if self.lost is not None:
             found["loops"] = self.n_loops
         return {**found, "positions": self.n_positions} if self.n_positions else found
 
     def warnings(self) -> list[str]:
         """Positions that could not be used, or contradict the other sensors."""
-        if not self.n_positions:
-            n = len(self._positions) + len(self._waiting)
-            unused = f"{n} positions could not be used: they give the map its heading after {_MIN_BASELINE_M:g} m of way."
-            return [unused] if n else []
-        n = int((self.graph.position_errors() > _MAX_POSITION_SIGMAS).sum())
-        contradicted = f"{n} of {self.n_positions} positions are more than {_MAX_POSITION_SIGMAS:g} sigma off wheels, gyro and LiDAR"
-        return [f"{contradicted}: they count little. Check the receiver, its covariance and the antenna's lever arm."] if n else []
+        found, n = [], len(self._positions) + len(self._waiting)
+        if n and not self.n_positions:
+            found.append(f"{n} positions could not be used: they give the map its heading after {_MIN_BASELINE_M:g} m of way.")
+        if self._n_late:
+            late = "1 position" if self._n_late == 1 else f"{self._n_late} positions"
+            found.append(f"{late} came after the estimate of a later stamp and had to be left out. Check the stamps.")
+        n = int((self.graph.position_errors() > OUTLIER_SIGMAS).sum()) if self.n_positions else 0
+        if n:
+            contradicted = f"{n} of {self.n_positions} positions are more than {OUTLIER_SIGMAS:g} sigma off wheels, gyro and LiDAR"
+            found.append(f"{contradicted}: they count little. Check the receiver, its covariance and the antenna's lever arm.")
+        return found
 
     def map_points(self) -> Points2:
         """(M, 2) the scans of all keyframes, where the graph has them [m]."""
-        if self._loops is None:
-            return self.odometry.map_points()
         poses = self.graph.poses()
         drawn = [se2.transform(pose, key.points) for pose, key in zip(poses, self._loops.keyframes, strict=False) if len(key.points)]
         return np.vstack(drawn) if drawn else np.empty((0, 2))
@@ -264,7 +265,7 @@ class _KeyframeMotion:
         self._prior = corrections.cov
 
     def preintegrated(self, at: FloatArray) -> PreintegratedMotion:
-        """All of it, with the corrections ``at`` which the steps were predicted."""
+        """All of it. ``at``: the corrections with which the last step was predicted; those of the others hardly differ."""
         cov = self._cov + self._straight @ self._prior @ self._straight.T + 1e-10 * np.eye(3)
         by_scale = se2.log(self._delta) * [1.0, 1.0, 0.0]  # turns have a scale of their own: k
         return PreintegratedMotion(self._delta, cov, np.column_stack([self._by_corrections, by_scale]), np.append(at, 0.0))

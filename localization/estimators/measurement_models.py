@@ -1,4 +1,4 @@
-"""Measurement models: predicted values and exact Jacobians, the same for filter and graph. Perturbations act on the right."""
+"""Measurement models of filter and graph, with Jacobians. Perturbations act on the right."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def predict_turn(
     return (1.0 + scale) * turned + bias * turn.duration, (1.0 + scale) * _YAW, -(1.0 + scale) * _YAW, turn.duration, turned
 
 
-def subtract_map_error(odom_T_body: Pose2, measured: Pose2) -> tuple[FloatArray, FloatArray, FloatArray]:
+def submap_residual(odom_T_body: Pose2, measured: Pose2) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Innovation log(pose^-1 measured) (3,) of a pose ``measured`` in a submap, with its Jacobians (3, 3) by the errors of pose and submap.
 
     To first order the innovation is e_pose - e_map - n, where n is the scan's own noise.

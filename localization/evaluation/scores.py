@@ -24,7 +24,7 @@ class Result:
     nees_mean: float | None
     """Mean of the pose's normalised error squared since the first match, 3 expected; None where the reference has no headings.
     Of the filtered poses, where the trajectory is smoothed."""
-    moments: Accuracy | None = None
+    filtered: Accuracy | None = None
     """Of the filtered poses, where the run's trajectory is smoothed."""
 
     @property
@@ -49,7 +49,7 @@ class Result:
             **{name: numbers.pop(name) for name in first},
             "nees_mean": self.nees_mean,
             "nis_mean": self.nis_mean,
-            "moments": None if self.moments is None else self.moments.numbers(),
+            "moments": None if self.filtered is None else self.filtered.numbers(),
             "real_time_factor": duration_s / self.run.seconds if with_timing and self.run.seconds > 0 else None,
             "parameters": {name: list(value) for name, value in self.run.parameters.items()},
             "counts": dict(self.run.counts),
@@ -77,7 +77,7 @@ def _score(run: Run, reference: ReferenceTrack | Relations | None) -> Result:
     if reference is None:
         return Result(run, None, None)
     accuracy = evaluate(run.trajectory, reference)
-    filtered = run.trajectory if run.moments is None else run.moments  # their errors grow by increments, as the NEES here assumes
+    filtered = run.trajectory if run.filtered is None else run.filtered  # their errors grow by increments, as the NEES here assumes
     found = None if isinstance(reference, Relations) else pose_consistency(filtered, reference)
-    moments = None if run.moments is None else evaluate(run.moments, reference)
-    return Result(run, accuracy, None if found is None else found.mean, moments)
+    published = None if run.filtered is None else evaluate(run.filtered, reference)
+    return Result(run, accuracy, None if found is None else found.mean, published)

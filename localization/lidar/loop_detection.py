@@ -63,9 +63,8 @@ class LoopClosure:
 class LoopDetector:
     """`add` each keyframe, then `detect`: loops that two trials agree on."""
 
-    def __init__(self, config: LidarConfig, cell: float) -> None:
-        """``cell``: edge of voxels [m]."""
-        self._config, self._cell = config, cell
+    def __init__(self, config: LidarConfig) -> None:
+        self._config = config
         self.keyframes: list[Keyframe] = []
         self._pending: list[LoopClosure] = []
         self._closed: dict[tuple[int, int], None] = {}  # as checkpoints take it
@@ -74,13 +73,13 @@ class LoopDetector:
         """Append a keyframe."""
         self.keyframes.append(keyframe)
 
-    def detect(self, poses: Callable[[], FloatArray], marginal: Callable[[int], FloatArray]) -> list[LoopClosure]:
-        """Loops that end at the newest keyframe, or shortly before. ``poses()`` (K, 3) are the graph's,
+    def detect(self, cell: float, poses: Callable[[], FloatArray], marginal: Callable[[int], FloatArray]) -> list[LoopClosure]:
+        """Loops that end at the newest keyframe, or shortly before. ``cell``: edge of voxels [m]; ``poses()`` (K, 3) are the graph's,
         ``marginal(k)`` (3, 3) is the covariance of one."""
         k = len(self.keyframes) - 1
         if k <= _MIN_KEYFRAMES or not len(self.keyframes[k].points):
             return []
-        found = self._match(k, poses(), marginal(k))
+        found = self._match(k, cell, poses(), marginal(k))
         self._pending = [loop for loop in self._pending if k - loop.b <= _AROUND]
         if found is None:
             return []
@@ -90,24 +89,25 @@ class LoopDetector:
         self._closed |= dict.fromkeys((loop.a, loop.b) for loop in new)
         return new
 
-    def _match(self, k: int, poses: FloatArray, marginal: FloatArray) -> LoopClosure | None:
+    def _match(self, k: int, cell: float, poses: FloatArray, marginal: FloatArray) -> LoopClosure | None:
         points = self.keyframes[k].points
         median = float(np.median(np.hypot(points[:, 0], points[:, 1])))
         old = poses[: k - _MIN_KEYFRAMES + 1]
-        distance = np.hypot(*(old[:, :2] - poses[k, :2]).T)
+        has_points = [len(keyframe.points) > 0 for keyframe in self.keyframes[: len(old)]]
+        distance = np.where(has_points, np.hypot(*(old[:, :2] - poses[k, :2]).T), math.inf)
         j = int(np.argmin(distance))
         prior = se2.between(poses[j], poses[k])
         if distance[j] > 3.0 * math.sqrt(float(np.linalg.eigvalsh(marginal[:2, :2])[-1])) + _REACH * median:
             return None
         place = self._merge(range(max(0, j - _AROUND), min(k - _MIN_KEYFRAMES, j + _AROUND) + 1), poses, j)
-        recent = voxel_means(self._merge(range(max(0, k - _RECENT + 1), k + 1), poses, k), 1.5 * self._cell)
+        recent = voxel_means(self._merge(range(max(0, k - _RECENT + 1), k + 1), poses, k), 1.5 * cell)
         wide = marginal + outlier_cov(marginal)
         reachable = _within_reach(place, recent, prior, wide, search_limit(marginal))
-        found = find_place(draw_image(reachable, self._cell), recent, prior, wide, marginal)
+        found = find_place(draw_image(reachable, cell), recent, prior, wide, marginal)
         if found is None:
             return None
-        near = np.diag([2.0 * self._cell, 2.0 * self._cell, 0.03]) ** 2
-        fit = align_points(make_grid(place, self._cell, self._config.range_noise_m), recent, found, near, found)
+        near = np.diag([2.0 * cell, 2.0 * cell, 0.03]) ** 2
+        fit = align_points(make_grid(place, cell, self._config.range_noise_m), recent, found, near, found)
         own_cov = np.asarray(np.linalg.inv(fit.information + 1e-6 * np.eye(3)), dtype=float)
         if fit.overlap < MIN_PLACE_OVERLAP or not is_narrow(own_cov):  # the latter where the scene leaves a direction open
             return None

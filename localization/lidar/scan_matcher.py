@@ -37,10 +37,12 @@ _CELL_OF_RANGE, _MIN_CELL_M = 0.02, 0.04
 _BLOCK = 30
 """Neighbouring beams whose residuals are summed, to measure how they err together [beams]: the residuals of real scans are correlated over
 10 to 20 beams, those of simulated rooms over 1 to 10."""
-_FORGETTING = 0.98
-"""Of the residuals' statistics, per scan: they are a mean over the last 50 scans."""
-_OUTLIER_COST = 12.5
-"""-log of the odds that the prior is an outlier (wheels that slip or count wrongly): a deviation of 5 sigma."""
+FORGETTING = 0.98
+"""Of statistics of residuals, innovations and slip, per scan: they are means over the last 50."""
+OUTLIER_SIGMAS = 5.0
+"""What is farther off is an outlier: scans, wheels that slip or count wrongly, positions."""
+_OUTLIER_COST = 0.5 * OUTLIER_SIGMAS**2
+"""-log of the odds that the prior is an outlier."""
 _SEARCH_FACTOR = 9.0
 SEARCH_FLOOR = np.diag([0.1, 0.1, 0.03]) ** 2
 """The search covers 3 sigma of 9 P + this [m^2, m^2, rad^2] + j j^T, j from the prior to where the motion of the last step would lead."""
@@ -150,7 +152,7 @@ class Fit:
     squares: float
     """Sum of e^2 over the points that fit."""
     block_squares: float
-    """Sum of squares of the sums of e over blocks of neighbouring points that fit."""
+    """Sum of squares of the sums of e over blocks of `_BLOCK` neighbouring points that fit."""
     fitting: float
     """How many points fit."""
     mapped: float
@@ -187,7 +189,7 @@ class ScanMatcher:
         added = outlier_cov(cov) + np.outer(jump, jump)
         best = fit.pose if fits else self._search(points, prior, cov + added, cov)
         if best is not None:
-            if not is_near and mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:
+            if not is_near and mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:  # a wide prior has its covariance already
                 added = nothing
             found = self._align(points, prior, cov + added, best, self.cell)
             least = self._config.lost_below if is_narrow(cov) else MIN_PLACE_OVERLAP  # the place may not be mapped
@@ -236,7 +238,7 @@ class ScanMatcher:
         self._draw()
         assert self._grid is not None
         H = linearize(self._grid, points, pose)[0]
-        noise = np.asarray(np.linalg.inv(H + _OPEN_INFORMATION) * self._variance_ratio(1), dtype=float)
+        noise = np.asarray(np.linalg.inv(H + _OPEN_INFORMATION) * self._block_variance, dtype=float)
         W = np.linalg.inv(np.eye(3) + noise @ _MAPPED_INFORMATION)  # not along directions that the scene leaves open
         return KeyScanError(share, new * W @ noise @ W.T)
 
@@ -262,12 +264,15 @@ class ScanMatcher:
         if self._keys:
             self._draw()
 
-    def _variance_ratio(self, which: int) -> float:
-        """Variance of a match over that of independent points with the assumed noise, by the residuals of the last scans.
+    @property
+    def _residual_variance(self) -> float:
+        """Mean square of the residuals of the last scans, in units of the assumed noise."""
+        return float(self._residuals[0] / self._residuals[2])
 
-        The variance of sums over blocks of neighbouring beams, which contains how these err together (batch means).
-        """
-        return float(self._residuals[which] / self._residuals[2])
+    @property
+    def _block_variance(self) -> float:
+        """The same of sums over blocks of neighbouring beams, which contains how these err together (batch means)."""
+        return float(self._residuals[1] / self._residuals[2])
 
     def points(self) -> FloatArray:
         """(M, 2) of the submap, in the odometry frame [m]."""
@@ -291,8 +296,8 @@ class ScanMatcher:
         """The match of the scan alone: one more Gauss-Newton step from the minimum, without the prior's pull."""
         R = np.asarray(np.linalg.inv(fit.information + _OPEN_INFORMATION), dtype=float)
         measured = se2.compose(fit.pose, se2.exp(-R @ fit.gradient))
-        self._residuals = _FORGETTING * self._residuals + [fit.squares, fit.block_squares, fit.fitting]
-        return ScanMatch(fit.pose, measured, R * self._variance_ratio(0), fit.overlap, outlier_cov)
+        self._residuals = FORGETTING * self._residuals + [fit.squares, fit.block_squares, fit.fitting]
+        return ScanMatch(fit.pose, measured, R * self._residual_variance, fit.overlap, outlier_cov)
 
 
 def align_points(grid: VoxelGrid, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2, spread: float | None = None) -> Fit:
@@ -447,7 +452,7 @@ def _linearize(
         _add_outer(spurious, along, weight * min(surface[5], 1.0))
         g[0], g[1], g[2] = g[0] + weight * nx * e, g[1] + weight * ny * e, g[2] + weight * across[2] * e
     _discount(H, g, spurious)
-    return fitting, mapped, cost, squares, block_squares
+    return fitting, mapped, cost, squares, block_squares + block * block
 
 
 @kernel

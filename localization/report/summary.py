@@ -182,7 +182,7 @@ def _losses(lines: Sequence[PlottedRun]) -> list[str]:
 
 def _smoothing(best: PlottedRun) -> list[str]:
     """Error of the filtered poses, where loop closures have smoothed them."""
-    loops, then = best.result.run.counts.get("loops", 0), headline(best.result.moments)
+    loops, then = best.result.run.counts.get("loops", 0), headline(best.result.filtered)
     if not loops or then is None:
         return []
     places = "a place" if loops == 1 else f"{loops} places"

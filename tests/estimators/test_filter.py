@@ -427,7 +427,7 @@ class World:
             innovations.append(se2.log(se2.between(ekf.pose, measured)))
             nis.append(ekf.update_scan(measured, LIDAR, NOTHING))
         off = [bias - ekf.bias, scale - ekf.scale, clock - ekf.clock_offset]
-        self.wheel_scale = ekf.wheel_scale
+        self.wheel_noise_scale = ekf.wheel_noise_scale
         return np.concatenate([se2.log(se2.between(ekf.pose, pose)), off, params - ekf.corrections]), ekf.P, nis, turns, innovations
 
 
@@ -437,7 +437,7 @@ SEEDS = 80
 @pytest.fixture(scope="module")
 def worlds():
     """With the wheel noise at its prior, which is the true one: NIS and NEES are then those of the equations alone."""
-    with mock.patch.object(filter_module, "_MAX_WHEEL_SCALE", 1.0):
+    with mock.patch.object(filter_module, "_MAX_NOISE_SCALE", 1.0):
         return [tuple(map(np.array, World(np.random.default_rng(100 + seed)).run())) for seed in range(SEEDS)]
 
 
@@ -535,16 +535,16 @@ def scale_and_nis(slip_variance):
     """Scale at the end of 30 s, and mean NIS of the scans of the second half, over six seeds."""
     found = [World(np.random.default_rng(seed), 30.0, slip_variance) for seed in range(6)]
     nis = [np.array(world.run()[2]) for world in found]
-    return np.mean([world.wheel_scale for world in found]), np.mean([values[len(values) // 2 :] for values in nis])
+    return np.mean([world.wheel_noise_scale for world in found]), np.mean([values[len(values) // 2 :] for values in nis])
 
 
-def test_wheel_scale_with_slip_of_six_times_variance_is_estimated():
+def test_wheel_noise_scale_with_slip_of_six_times_variance_is_estimated():
     scale, nis = scale_and_nis(6.0)
     assert scale == pytest.approx(6.0, rel=0.2)
     assert 2.5 < nis < 3.5
 
 
-def test_wheel_scale_with_less_slip_than_assumed_stays_one():
+def test_wheel_noise_scale_with_less_slip_than_assumed_stays_one():
     """Slip that lasts is small in one step and large over many: the robot file's variance is the least."""
     scale, nis = scale_and_nis(0.2)
     assert 1.0 <= scale < 1.01
@@ -557,31 +557,31 @@ def one_scan(off, R=LIDAR, outlier_cov=NOTHING):
     for _ in range(20):
         ekf.predict(step_of([0.1, 0.0, 0.0]))
         ekf.update_scan(se2.compose(ekf.pose, se2.exp(np.asarray(off))), R, outlier_cov)
-    return ekf.wheel_scale
+    return ekf.wheel_noise_scale
 
 
-def test_wheel_scale_is_learned_from_informative_innovations_alone():
+def test_wheel_noise_scale_is_learned_from_informative_innovations_alone():
     off = np.array([0.03, 0.0, 0.0])  # three sigma of the slip
     assert one_scan(off) > 1.5
     assert one_scan(off, R=np.diag([10.0, 10.0, 1.0]) ** 2) == pytest.approx(1.0, abs=1e-3)  # the scene is open
     assert one_scan(off, outlier_cov=np.eye(3)) == pytest.approx(1.0, abs=1e-3)  # the search has found an outlier of the wheels
 
 
-def test_wheel_scale_after_outlier_is_bounded():
-    assert one_scan(np.array([5.0, 0.0, 0.0])) == filter_module._MAX_WHEEL_SCALE
+def test_wheel_noise_scale_after_outlier_is_bounded():
+    assert one_scan(np.array([5.0, 0.0, 0.0])) == filter_module._MAX_NOISE_SCALE
     ekf = filter_at(config=FilterConfig(clock_sigma_s=0.0))
     ekf.predict(step_of([0.1, 0.0, 0.0]))
     ekf.update_scan(np.array([5.1, 0.0, 0.0]), LIDAR, NOTHING)  # once: 500 sigma count as five
-    assert ekf.wheel_scale < 1.0 + 25.0 * 3.0 / 30.0 * 5.0
+    assert ekf.wheel_noise_scale < 1.0 + 25.0 * 3.0 / 30.0 * 5.0
 
 
-def test_wheel_scale_does_not_change_steps_without_wheels():
+def test_wheel_noise_scale_does_not_change_steps_without_wheels():
     ekf = filter_at()
-    ekf.wheel_scale = 4.0
+    ekf.wheel_noise_scale = 4.0
     driven = step_of([0.1, 0.0, 0.0])
     np.testing.assert_allclose(ekf.wheel_cov(driven), 4.0 * driven.predicted.cov)
     for step in (dataclasses.replace(driven, has_wheels=False), dataclasses.replace(driven, is_standing=True)):
         np.testing.assert_array_equal(ekf.wheel_cov(step), step.predicted.cov)
         ekf.predict(step)
         ekf.update_scan(se2.compose(ekf.pose, np.array([0.5, 0.0, 0.0])), LIDAR, NOTHING)
-        assert ekf.wheel_scale == 4.0
+        assert ekf.wheel_noise_scale == 4.0

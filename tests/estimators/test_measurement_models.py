@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from localization.estimators.measurement_models import motion_residual, position_residual, predict_turn, subtract_map_error
+from localization.estimators.measurement_models import motion_residual, position_residual, predict_turn, submap_residual
 from localization.events import Turn
 from motion_models import se2
 
@@ -63,9 +63,9 @@ def test_position_residual_has_exact_jacobians(pose, lever, position):
 
 @given(POSES, *[st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-1, 1)).map(lambda e: 1e-4 * np.array(e))] * 3)
 @settings(max_examples=40, deadline=None)
-def test_subtract_map_error_equals_pose_less_map_less_noise(true, e_pose, e_map, noise):
+def test_submap_residual_equals_pose_less_map_less_noise(true, e_pose, e_map, noise):
     """An estimate that is off by e_pose, in a submap whose errors put the scan at e_map: true pose = estimate exp(e)."""
     estimate = se2.compose(true, se2.inverse(se2.exp(e_pose)))
     measured = se2.compose(true, se2.exp(-e_map - noise))
-    innovation, by_pose, by_map = subtract_map_error(estimate, measured)
+    innovation, by_pose, by_map = submap_residual(estimate, measured)
     np.testing.assert_allclose(innovation, by_pose @ e_pose + by_map @ e_map - noise, atol=1e-6)

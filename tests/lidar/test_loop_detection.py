@@ -27,10 +27,10 @@ def visit(walls: np.ndarray, n: int, seed: int, start: tuple[float, float] = (-1
 
 def detect(frames: list[tuple[np.ndarray, np.ndarray]], poses: np.ndarray, marginal: np.ndarray) -> list[LoopClosure]:
     """What is found on the way along keyframes that a drifting graph has at ``poses`` (n, 3)."""
-    detector, found = LoopDetector(LidarConfig(), CELL), []
+    detector, found = LoopDetector(LidarConfig()), []
     for k, (pose, points) in enumerate(frames):
         detector.add(Keyframe(poses[k], points))
-        found += detector.detect(lambda k=k: poses[: k + 1], lambda k: marginal)
+        found += detector.detect(CELL, lambda k=k: poses[: k + 1], lambda k: marginal)
         del pose
     return found
 
@@ -101,6 +101,14 @@ def test_detect_with_empty_scans_closes_only_true_loops() -> None:
     found = detect(frames, truth, NEAR)
     assert found
     assert not {2, 40, 43} & {loop.b for loop in found}
+
+
+def test_detect_at_place_without_scans_closes_no_loop() -> None:
+    """The scanner was covered there; of the place before it hardly anything is within reach."""
+    frames = there_and_back(LAB, LAB)
+    back = (AWAY, rooms.scan_from(LAB, np.zeros(3), np.random.default_rng(4)))
+    frames = [*frames[:38], *[back] * 8]
+    assert detect(frames, np.array([pose for pose, _ in frames]), NEAR) == []
 
 
 @pytest.mark.parametrize("cov", [NEAR, WIDE])

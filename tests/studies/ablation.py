@@ -125,10 +125,12 @@ def _match_without_new_place(original: Callable[..., Any], self: ScanMatcher, *r
     return found
 
 
-def _detect_unconfirmed(original: Callable[..., Any], self: LoopDetector, poses: Callable[[], Any], marginal: Callable[[int], Any]) -> Any:
+def _detect_unconfirmed(
+    original: Callable[..., Any], self: LoopDetector, cell: float, poses: Callable[[], Any], marginal: Callable[[int], Any]
+) -> Any:
     """Every loop that fits is taken, without a second one that agrees."""
     k = len(self.keyframes) - 1
-    found = self._match(k, poses(), marginal(k)) if k > loop_detection._MIN_KEYFRAMES and len(self.keyframes[k].points) else None
+    found = self._match(k, cell, poses(), marginal(k)) if k > loop_detection._MIN_KEYFRAMES and len(self.keyframes[k].points) else None
     return [] if found is None else [found]
 
 
@@ -137,6 +139,7 @@ _NO_SEARCH = (
     _attribute(scan_matcher, "_BASIN_M", math.inf),
     _attribute(scan_matcher, "_BASIN_RAD", math.inf),
 )
+_ASSUMED_NOISE = (_attribute(ScanMatcher, "_residual_variance", 1.0), _attribute(ScanMatcher, "_block_variance", 1.0))
 PATCHES: Mapping[str, Patch] = {
     "old key scans that fit": _wrap(
         ScanMatcher, "_fitting_keys", lambda original, self, pose, points, map_cov: original(self, pose, points, None)
@@ -149,6 +152,11 @@ PATCHES: Mapping[str, Patch] = {
         lambda original, self, step, prior, cov, twist, jump: original(self, step, prior, cov, step.twist, jump),
     ),
     "correlative search": lambda: _together(*_NO_SEARCH),
+    "motion of the last step in the search": _wrap(
+        ScanMatchingSensor,
+        "measure",
+        lambda original, self, step, prior, cov, twist, jump: original(self, step, prior, cov, twist, np.zeros(3)),
+    ),
     "rival test of the search": _attribute(scan_matcher, "_MAX_RIVAL", math.inf),
     "total cost (more points fit, instead)": _attribute(
         scan_matcher, "_is_better", lambda found, fit, prior, cov: found.overlap > fit.overlap
@@ -156,17 +164,18 @@ PATCHES: Mapping[str, Patch] = {
     "prior as possible outlier": _attribute(scan_matcher, "_OUTLIER_COST", math.inf),
     "prior in the least squares": _wrap(ScanMatcher, "_align", _align_freely),
     "thickness of surfaces": _attribute(scan_matcher, "make_grid", _thin_grid),
-    "block variance ratio": _attribute(ScanMatcher, "_variance_ratio", lambda self, which: 1.0),
+    "size of the residuals": lambda: _together(*_ASSUMED_NOISE),
+    "correlation of neighbouring residuals": _attribute(ScanMatcher, "_block_variance", property(lambda self: self._residual_variance)),
     "submap's error": _attribute(Filter, "insert_key_scan", lambda self, error: None),
     "submap's error as consider state (independent noise, instead)": _wrap(Filter, "predict", _independent),
     "new surfaces' error of key scans": _wrap(Filter, "insert_key_scan", _without_new),
-    "scale of the wheel noise": _attribute(filter_module, "_MAX_WHEEL_SCALE", 1.0),
+    "scale of the wheel noise": _attribute(filter_module, "_MAX_NOISE_SCALE", 1.0),
     "excitation gate of corrections": _attribute(EkfFusion, "_is_turning", lambda self, motion: True),
     "noise of normals": _attribute(scan_matcher, "make_grid", _exact_normals),
     "key scans of new places at once": _wrap(ScanMatcher, "match", _match_without_new_place),
 }
 GRAPH_PATCHES: Mapping[str, Patch] = {
-    "loop closures": _attribute(LoopDetector, "detect", lambda self, poses, marginal: []),
+    "loop closures": _attribute(LoopDetector, "detect", lambda self, cell, poses, marginal: []),
     "second loop that confirms": _wrap(LoopDetector, "detect", _detect_unconfirmed),
     "robust loss of loops": _attribute(pose_graph, "_CAUCHY", _NO_LOSS),
     "robust loss of wheels": _attribute(pose_graph, "_HUBER", _NO_LOSS),
@@ -174,7 +183,7 @@ GRAPH_PATCHES: Mapping[str, Patch] = {
         graph_fusion.GraphFusion, "_is_matched", property(lambda self: False, lambda self, value: None), create=True
     ),
     "corrections of the graph in the filter": _attribute(Filter, "set_corrections", lambda self, mean, cov: None),
-    "radius of the wheels as a variable": _attribute(graph_fusion, "_WHEEL_SCALE_SIGMA", 1e-6),
+    "radius of the wheels as a variable": _attribute(graph_fusion, "_RADIUS_SIGMA", 1e-6),
     "random walk of the corrections": _attribute(graph_fusion, "_WALK_S", math.inf),
 }
 SETTINGS: Mapping[str, Mapping[str, Any]] = {

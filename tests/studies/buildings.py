@@ -146,7 +146,7 @@ def measure(drive: Drive, estimator: str, model: str, form: str, matcher: str) -
     lidar = "–" if run.lidar is None else f"{100.0 * (1.0 - run.lidar.matched / max(run.lidar.scans, 1)):.2f}"  # noqa: RUF001
     scans = sum(hasattr(event, "points") for event in drive.events)
     rest = f"{lidar} | {1e3 * seconds / scans:.2f}"
-    names = {"": run.trajectory} if run.moments is None else {" live": run.moments, " smoothed": run.trajectory}
+    names = {"": run.trajectory} if run.filtered is None else {" live": run.filtered, " smoothed": run.trajectory}
     for kind, trajectory in names.items():
         has_nees = trajectory.covariances is not None and isinstance(drive.reference, ReferenceTrack)
         consistency = "{:.1f} / {:.1f}".format(*nees_at_instants(trajectory, drive.reference)) if has_nees else "–"  # noqa: RUF001

@@ -39,7 +39,7 @@ def test_patch_of_graph_runs(name: str, drive: Drive) -> None:
     assert changed.counts["keyframes"] > 10
 
 
-@pytest.mark.parametrize("name", ["submap's error", "prior in the least squares", "thickness of surfaces", "block variance ratio"])
+@pytest.mark.parametrize("name", ["submap's error", "prior in the least squares", "thickness of surfaces", "size of the residuals"])
 def test_patch_of_matcher_changes_poses(name: str, drive: Drive, poses: np.ndarray) -> None:
     with PATCHES[name]():
         assert not np.array_equal(drive.run("ekf", "skid_steer").trajectory.poses, poses)
