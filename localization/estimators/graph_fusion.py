@@ -35,7 +35,8 @@ _MIN_POSITIONS, _MIN_BASELINE_M = 3, 5.0
 _ALIGNMENT_ITERATIONS = 30
 _RADIUS_SIGMA = 0.02
 """Relative error of the wheels' radius, both sides alike: wear and pressure of tyres. Positions and loops show it."""
-_KNOWN_RADIUS_SIGMA = 1e-6
+_CONSTANT_SIGMA = 1e-4
+"""Of what does not change: by far smaller ones GTSAM's marginals lose positive definiteness."""
 _WALK_S = 60.0
 """Corrections are constant for this long [s]; as a random walk of an hour they change by an eighth of their prior sigma meanwhile."""
 
@@ -61,7 +62,7 @@ class GraphFusion(Estimator):
         """``is_smoothing``: `finish` is to give the smoothed trajectory; memory then grows with the drive, 32 bytes a step."""
         self.odometry, self._corrections, self._config = odometry, corrections, config
         self._has_radius = "wheel_radius_scale" not in corrections.names  # else it is one of them
-        prior = block_diag(corrections.cov, (_RADIUS_SIGMA if self._has_radius else _KNOWN_RADIUS_SIGMA) ** 2)
+        prior = block_diag(corrections.cov, (_RADIUS_SIGMA if self._has_radius else _CONSTANT_SIGMA) ** 2)
         self.graph = PoseGraph(prior, np.array([config.antenna_x_m, config.antenna_y_m]))
         self._loops = LoopDetector(lidar)
         self._wheels = _KeyframeMotion(len(corrections.names))
@@ -154,7 +155,7 @@ class GraphFusion(Estimator):
             return None
         cov = block_diag(self._corrections.walk_cov * self._walked_s, 0.0)
         self._walked_s = 0.0
-        return np.asarray(cov + 1e-12 * np.eye(len(cov)))
+        return np.asarray(cov + _CONSTANT_SIGMA**2 * np.eye(len(cov)))
 
     def _close_loops(self, keyframe: Keyframe) -> None:
         self._loops.add(keyframe)

@@ -176,9 +176,9 @@ class PoseGraph:
             values = levenberg_marquardt(graph, values)
             linear = graph.linearize(values)
             marginals = gtsam.Marginals(linear, linear.optimize())
-        keys = [gtsam.symbol("x", k) for k in range(count)]
+            covs = np.array([marginals.marginalCovariance(gtsam.symbol("x", k)) for k in range(count)])
         self._values = values
-        return self.poses(), np.array([marginals.marginalCovariance(key) for key in keys])
+        return self.poses(), covs
 
     def _factors(self, update: Update) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()

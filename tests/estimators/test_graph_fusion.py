@@ -23,6 +23,7 @@ from motion_models import se2
 from motion_models.registry import make_model
 from motion_models.robot import WheelNoise
 from tests.helpers import rooms
+from tests.studies.buildings import BUILDINGS
 
 QUIET = WheelNoise(*[1e-8] * 8)
 SCANNER = rooms.Beams(beams=240, rate_hz=6.25, noise=0.03, longest=8.0)
@@ -111,6 +112,13 @@ def test_graph_around_building_closes_loop() -> None:
     assert live[-20:].mean() < 0.5 * odometry[-20:].mean()
     after = errors(drive, whole.stamps_ns.tolist(), whole.poses)
     assert np.sqrt(np.mean(after**2)) < 0.9 * np.sqrt(np.mean(odometry**2))
+
+
+def test_graph_with_corrections_that_hardly_change_is_solved() -> None:
+    """Five minutes of fr079, after each of which corrections may change: GTSAM's marginals were indefinite at a sigma of 1e-6."""
+    run = BUILDINGS["fr079"].open().until(300.0).run("graph", "skid_steer")
+    assert run.trajectory.covariances is not None
+    assert (np.linalg.eigvalsh(run.trajectory.covariances) > 0.0).all()
 
 
 def test_graph_with_loop_moves_map_and_not_odometry() -> None:
@@ -276,7 +284,7 @@ def test_graph_with_named_radius_has_it_once() -> None:
     size, sigma = pipeline.estimator.parameters()["wheel_radius_scale"]
     assert abs(size) < 0.1
     assert 0.0 < sigma < 0.03
-    assert pipeline.estimator.graph.corrections()[1][-1, -1] < 1e-10
+    assert pipeline.estimator.graph.corrections()[1][-1, -1] < 1e-6
 
 
 def test_graph_positions_wait_for_heading() -> None:

@@ -183,7 +183,7 @@ GRAPH_PATCHES: Mapping[str, Patch] = {
         graph_fusion.GraphFusion, "_is_matched", property(lambda self: False, lambda self, value: None), create=True
     ),
     "corrections of the graph in the filter": _attribute(Filter, "set_corrections", lambda self, mean, cov: None),
-    "radius of the wheels as a variable": _attribute(graph_fusion, "_RADIUS_SIGMA", 1e-6),
+    "radius of the wheels as a variable": _attribute(graph_fusion, "_RADIUS_SIGMA", 1e-4),
     "random walk of the corrections": _attribute(graph_fusion, "_WALK_S", math.inf),
 }
 SETTINGS: Mapping[str, Mapping[str, Any]] = {
