@@ -45,7 +45,7 @@ class Trial:
 
 
 class Pipeline:
-    """Synchronizer and estimator of one trial. Memory is bounded, unless it smooths: it stores no trajectory."""
+    """Synchronizer and estimator of one trial. No trajectory is stored: memory grows by keyframes of a graph and by smoothing alone."""
 
     def __init__(
         self,
@@ -74,8 +74,8 @@ class Pipeline:
     def process(self, event: Event) -> list[Estimate]:
         """Take ``event``; the estimates that it completes, none or several. Raises `EstimatorError`.
 
-        Stamps are trusted: after a wheel sample stamped an hour ahead, scans of before are late. Logs and topics are freed of such jumps
-        as they are read (`logs.clock_sync`); other sources of events must do it themselves.
+        Stamps are taken as they are: after a wheel sample stamped an hour ahead, scans of before are late. Logs and topics are freed of
+        such jumps as they are read (`logs.clock_sync`); other sources of events must do it themselves.
         """
         if isinstance(event, PositionSample):
             self.estimator.add_position(event)

@@ -208,7 +208,7 @@ def _log(p: FloatArray, out: FloatArray) -> None:
 
 
 def log(pose: ArrayLike) -> FloatArray:
-    """Tangent (..., 3) whose `exp` is ``pose`` (..., 3), with its angle in [-pi, pi) (Solà, eq. 158)."""
+    """Tangent (..., 3) whose `exp` is ``pose`` (..., 3), with its angle in [-pi, pi) (Solà, eq. 157)."""
     return np.asarray(_log(pose))
 
 

@@ -181,7 +181,7 @@ class Filter:
     def _adapt_wheel_noise_scale(self, innovation: FloatArray, S_inv: FloatArray, slip_cov: FloatArray) -> None:
         """One step of Fisher scoring for log a, where S = a dS/da + ..., ``slip_cov`` = a dS/da (maximum likelihood; Mehra 1970):
 
-        2 d log p / d log a = y^T S^-1 (a dS/da) S^-1 y - tr(S^-1 a dS/da), information tr((S^-1 a dS/da)^2), innovation y.
+        2 d log p / d log a = y^T S^-1 (a dS/da) S^-1 y - tr(S^-1 a dS/da), twice the information tr((S^-1 a dS/da)^2), innovation y.
 
         Where slip has little share in S (wide priors, directions that the scene leaves open), there is little information.
         """

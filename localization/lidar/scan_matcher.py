@@ -177,7 +177,7 @@ class ScanMatcher:
 
         Gauss-Newton starts from ``guess`` (3,), or from the prior. A pose is searched where the prior is wider than the basin of
         convergence, or where the result does not fit; one that fits far from the prior is aligned again with the prior as an outlier,
-        which the pose may be off by ``jump`` (3,), too.
+        which ``jump`` (3,) widens: where the robot would be if it had gone on as in the last step.
         """
         nothing = np.zeros((3, 3))
         fit = self._align(points, prior, cov, prior if guess is None else guess)
@@ -343,9 +343,8 @@ def choose_cell(config: LidarConfig, points: Points2) -> float:
 
 
 def _is_within_basin(fit: Fit, cov: Cov3) -> bool:
-    """Whether Gauss-Newton from a prior with ``cov`` (3, 3) may be trusted: what the scan takes off the prior is within its basin.
-
-    Along directions that the scene leaves open, a prior may be as wide as it likes.
+    """Whether Gauss-Newton from a prior with ``cov`` (3, 3) converges to the right pose: what the scan takes off the prior is within its
+    basin. Along directions that the scene leaves open, the prior may be of any width.
     """
     return is_narrow(cov - np.linalg.inv(np.linalg.inv(cov) + fit.information))
 

@@ -37,7 +37,7 @@ class _Scan:
 
 
 class ScanMatchingSensor:
-    """Give it each step with a scan: `measure`, perhaps `refine`, then `insert_key_scan` where `is_key`."""
+    """For each step with a scan: `measure`, perhaps `refine`, then `insert_key_scan` where `is_key`."""
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig) -> None:
         self._mounts, self._config = mounts, config
@@ -72,14 +72,14 @@ class ScanMatchingSensor:
             self.lost.add_matched(step.end_ns)
             return None
         found = self._match(self._matcher, self._scan, jump)
-        self._note_search(found is None and not is_narrow(cov), step.end_ns * 1e-9)
+        self._update_search_state(found is None and not is_narrow(cov), step.end_ns * 1e-9)
         if found is None:
             self.lost.add(step.end_ns, "lost")
         else:
             self.lost.add_matched(step.end_ns)
         return found
 
-    def _note_search(self, is_searching: bool, now_s: float) -> None:
+    def _update_search_state(self, is_searching: bool, now_s: float) -> None:
         """Scans that may be anywhere do not enter the submap for some seconds: drawn there, they compete with their true place."""
         if not is_searching:
             self._searching_since_s = None
@@ -97,7 +97,7 @@ class ScanMatchingSensor:
         return self._matcher.refine(self._scan.planar, self._prior, self._cov, match) or match
 
     def bend_cov(self, match: ScanMatch, slip_rate: Cov3) -> Cov3:
-        """(3, 3) by which slip within the sweep, white with ``slip_rate`` (3, 3) a second, puts off the ``match`` of the scan at hand."""
+        """(3, 3) of the ``match`` of the scan at hand by slip within the sweep, a random walk of ``slip_rate`` (3, 3) a second."""
         if self._scan is None or self._matcher is None or not len(self._scan.times) or not slip_rate.any():
             return np.zeros((3, 3))
         return self._matcher.bend_cov(self._scan.planar, self._scan.times, match.pose, slip_rate)

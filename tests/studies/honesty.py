@@ -1,4 +1,4 @@
-"""Covariances under noise that the filter does not know: mean NEES of its poses in simulated rooms, against the 95 % band.
+"""Covariances under noise that the filter does not model: mean NEES of its poses in simulated rooms, against the 95 % band.
 
 python -m tests.studies.honesty [--seeds 12] [--rooms 4] [--only NAME,...] [--estimator ekf]
 

@@ -1,4 +1,4 @@
-"""The study of honesty, in small: noise is drawn as described, and covariances hold under some that the filter does not know."""
+"""The study `honesty`, in small: noise is drawn as described, and covariances hold under some that the filter does not model."""
 
 from __future__ import annotations
 
