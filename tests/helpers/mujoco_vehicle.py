@@ -70,6 +70,7 @@ class MujocoSimulation(Simulation):
         substeps = round(config.step_s / _STEP_S)
         radii = np.array([self._body.radius_left, self._body.radius_right] * 2) * (1.0 + _FLATTENING)
         self._model.geom_size[self._geoms, 0] = self._model.geom_size[self._geoms, 2] = radii
+        self._model.geom_rbound[self._geoms] = radii  # else a wheel that has grown loses its contact
         ramp = config.acceleration_m_s2 / float(radii.mean()) * config.step_s
         for row, target in zip(rows, wheels, strict=True):
             self._set_points += np.clip(target - self._set_points, -ramp, ramp)

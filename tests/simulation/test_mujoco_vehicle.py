@@ -75,6 +75,13 @@ def test_mujoco_smaller_left_wheels_turn_left() -> None:
     assert turned == pytest.approx(predicted[2], rel=0.1)
 
 
+@pytest.mark.parametrize("drift", [0.03, -0.03])
+def test_mujoco_wheels_that_grow_roll_farther(drift: float) -> None:
+    """By the last phase they have grown by all of it."""
+    (wheels, moved), (grown_wheels, grown_moved) = _motion(_runs()[1]), _motion(_runs(wheel_radius_drift=drift)[1])
+    assert grown_moved[0] / grown_wheels.mean() == pytest.approx((1.0 + drift) * moved[0] / wheels.mean(), rel=0.003)
+
+
 def test_mujoco_fault_that_it_does_not_have_is_refused() -> None:
     assert "friction_anisotropy" not in EFFECTS
     with pytest.raises(SimulationError, match="no friction_anisotropy"):
