@@ -276,7 +276,7 @@ def _keep_useful(
 def _make_findings(
     predictor: DrivePredictor, linearization: Linearization, chosen: tuple[int, ...], gains: list[Gain], rng: np.random.Generator
 ) -> list[Finding]:
-    """Findings, by their held-out gain."""
+    """Findings, strongest evidence first; ``gains`` by windows that were held out."""
     problem, causes = linearization.problem, linearization.causes
     sizes, cov, _ = problem.fit(chosen)
     found, gained = [], []
