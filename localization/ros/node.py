@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import gc
+import queue
 import signal
-import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
@@ -337,7 +337,8 @@ class StopSignal:
     """SIGINT and SIGTERM, stored until the present event is processed: half an event is no state. The second one interrupts at once."""
 
     def __init__(self) -> None:
-        self._is_requested = threading.Event()
+        self._is_requested = False
+        self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()  # reentrant: an Event's `set` could wait for the `wait` it interrupts
         self._handlers_before: dict[int, Any] = {}
 
     def __enter__(self) -> StopSignal:
@@ -349,14 +350,17 @@ class StopSignal:
             signal.signal(number, handler)
 
     def _request(self, number: int, frame: FrameType | None) -> None:
-        if self._is_requested.is_set():
+        if self._is_requested:
             raise KeyboardInterrupt
-        self._is_requested.set()
+        self._is_requested = True
+        self._wake.put(None)
 
     def is_set(self) -> bool:
         """Whether a signal has come."""
-        return self._is_requested.is_set()
+        return self._is_requested
 
     def sleep(self, seconds: float) -> None:
         """Sleep, or until a signal comes."""
-        self._is_requested.wait(seconds)
+        if not self._is_requested:
+            with suppress(queue.Empty):
+                self._wake.get(timeout=max(seconds, 0.0))

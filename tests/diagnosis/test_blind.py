@@ -92,7 +92,7 @@ def test_diagnose_light_payload_names_its_alias(diagnosed: Diagnosed) -> None:
 
 
 def test_diagnose_weak_cause_is_suspected_but_not_named(diagnosed: Diagnosed) -> None:
-    found = diagnosed({"diagonal_load": 0.045}, 451)
+    found = diagnosed({"diagonal_load": 0.045}, 452)
     assert found.verdict == "consistent"
     assert not found.findings
     assert found.suspected is not None
