@@ -279,7 +279,7 @@ def _make_findings(
     """Findings, strongest evidence first; ``gains`` by windows that were held out."""
     problem, causes = linearization.problem, linearization.causes
     sizes, cov, _ = problem.fit(chosen)
-    found, gained = [], []
+    found: list[tuple[float, Finding]] = []
     for n, i in enumerate(chosen):
         cause, size = causes[i], float(sizes[n])
         sigma = math.hypot(math.sqrt(cov[n, n]), _SYSTEMATIC_SHARE * cause.negligible)
@@ -288,10 +288,10 @@ def _make_findings(
         others = tuple(j for j in chosen if j != i)
         p = _p_value(linearization, others, i, rng)
         aliases = aliases_of(predictor, linearization, chosen, i)
-        gained.append(problem.gain(chosen) - problem.gain(others))
-        text = evidence(cause, linearization.signatures[..., i] * size, linearization.noise, gained[-1])
-        found.append(Finding(cause, size, sigma, p, aliases, text, gains[n]))
-    return _merge_slopes([found[n] for n in np.argsort(-np.array(gained), kind="stable")])
+        gained = problem.gain(chosen) - problem.gain(others)
+        text = evidence(cause, linearization.signatures[..., i] * size, linearization.noise, gained)
+        found.append((gained, Finding(cause, size, sigma, p, aliases, text, gains[n])))
+    return _merge_slopes([finding for _, finding in sorted(found, key=lambda pair: pair[0], reverse=True)])
 
 
 def _suspect(predictor: DrivePredictor, linearization: Linearization, rng: np.random.Generator) -> tuple[Finding, str] | None:

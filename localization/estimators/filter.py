@@ -36,7 +36,7 @@ _MIN_VARIANCE = 1e-14
 _MAX_NUMBER = 1e12
 """No state or covariance of a robot on Earth is larger, in SI units."""
 _MIN_INFORMATION = 30.0
-"""Of the factor on the wheels' noise: that of ten scans, as the prior's."""
+"""Information about the factor on the wheels' noise, at least: that of ten scans."""
 _MAX_NOISE_SCALE = 20.0
 """As of `calibrate`. The least is 1: slip lasts, and what fits the innovation of one scan is too small for the sum of many (ACES with a
 least scale of 1/4 for each axis: 0.099 -> 0.138 m)."""

@@ -17,7 +17,7 @@ from localization.lidar.scan_matcher import (
     find_place,
     is_narrow,
     mahalanobis,
-    outlier_cov,
+    prior_outlier_cov,
     search_limit,
 )
 from localization.lidar.submap import make_grid, voxel_means
@@ -101,7 +101,7 @@ class LoopDetector:
             return None
         place = self._merge(range(max(0, j - _AROUND), min(k - _MIN_KEYFRAMES, j + _AROUND) + 1), poses, j)
         recent = voxel_means(self._merge(range(max(0, k - _RECENT + 1), k + 1), poses, k), 1.5 * cell)
-        wide = marginal + outlier_cov(marginal)
+        wide = marginal + prior_outlier_cov(marginal)
         reachable = _within_reach(place, recent, prior, wide, search_limit(marginal))
         found = find_place(draw_image(reachable, cell), recent, prior, wide, marginal)
         if found is None:

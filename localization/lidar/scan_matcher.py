@@ -176,8 +176,8 @@ class ScanMatcher:
         """The pose of ``points`` near ``prior`` (3,), whose error against the submap has covariance ``cov`` (3, 3); None where it is lost.
 
         Gauss-Newton starts from ``guess`` (3,), or from the prior. A pose is searched where the prior is wider than the basin of
-        convergence, or where the result does not fit; one that fits far from the prior is aligned again with the prior as an outlier,
-        which ``jump`` (3,) widens: where the robot would be if it had gone on as in the last step.
+        convergence, or where the result does not fit; one that fits far from the prior is aligned again with the prior as an outlier.
+        ``jump`` (3,), from the prior to where the motion of the last step would lead, widens the search.
         """
         nothing = np.zeros((3, 3))
         fit = self._align(points, prior, cov, prior if guess is None else guess)
@@ -186,7 +186,7 @@ class ScanMatcher:
         fits = is_near and fit.overlap >= self._config.search_below
         if fits and agrees:
             return self._result(fit, nothing)
-        added = outlier_cov(cov) + np.outer(jump, jump)
+        added = prior_outlier_cov(cov) + np.outer(jump, jump)
         best = fit.pose if fits else self._search(points, prior, cov + added, cov)
         if best is not None:
             if not is_near and mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:  # a wide prior has its covariance already
@@ -321,8 +321,9 @@ def _first_spread(points: Points2, cov: Cov3) -> float:
 def find_place(image: LikelihoodImage, points: Points2, prior: Pose2, wide: FloatArray, cov: Cov3) -> Pose2 | None:
     """The best pose (3,) of ``points`` (N, 2) within 3 sigma of ``wide`` (3, 3) from the ``prior`` (3,), limited by `search_limit`; None
     where it is ambiguous. ``cov`` (3, 3) of the prior itself."""
-    best = search(image, points, prior, wide, search_limit(cov))
-    if (3.0 * np.sqrt(np.diagonal(cov)) <= _SEARCH_LIMIT).all():
+    limit = search_limit(cov)
+    best = search(image, points, prior, wide, limit)
+    if (limit <= _SEARCH_LIMIT).all():
         return best.pose if best.rival_score < _MAX_RIVAL * best.score else None
     return best.pose if best.margin >= _OUTLIER_COST else None  # the place is unknown
 
@@ -332,7 +333,7 @@ def search_limit(cov: Cov3) -> FloatArray:
     return np.asarray(np.minimum(np.maximum(_SEARCH_LIMIT, 3.0 * np.sqrt(np.diagonal(cov))), _WIDEST_SEARCH))
 
 
-def outlier_cov(cov: Cov3) -> Cov3:
+def prior_outlier_cov(cov: Cov3) -> Cov3:
     """(3, 3) to be added to the covariance ``cov`` (3, 3) of a prior that may be an outlier."""
     return np.asarray((_SEARCH_FACTOR - 1.0) * cov + SEARCH_FLOOR)
 

@@ -29,7 +29,7 @@ def warm_up(run: LiveRun) -> None:
     """Process short synthetic drives with every kind of sensor that the robot may have, and discard the results.
 
     Once with planar scans, once with clouds and once without a LiDAR (where the estimator works without one), each with a push that
-    the wheels do not see, after which the matcher searches. The centre of gravity of the robot's arms first. A process does it once for
+    the wheels do not measure, after which the matcher searches. The centre of gravity of the robot's arms first. A process does it once for
     each model and estimator.
     """
     trial = run.make_trial(True)

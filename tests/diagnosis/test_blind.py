@@ -111,6 +111,11 @@ def test_diagnose_missing_messages_reports_their_share(diagnosed: Diagnosed) -> 
     assert "of the wheels' messages are missing" in found.sentence
 
 
+def test_diagnose_missing_messages_come_first(diagnosed: Diagnosed) -> None:
+    found = diagnosed({"missing_joint_messages": 0.2, "wheel_radius_scale": 0.02}, 507)
+    assert [f.cause for f in found.findings] == ["missing_joint_messages", "wheel_radius_scale"]
+
+
 def test_diagnose_inseparable_causes_are_one_finding(diagnosed: Diagnosed) -> None:
     """On a robot without arms a payload over the front edge is a shift of its centre of gravity, and nothing else."""
     found = diagnosed({"payload": 8.0}, 420, "husky_a200")
