@@ -29,7 +29,8 @@ _MIN_KEYFRAMES = 25
 _AROUND = 8
 """Keyframes before and after the old one whose scans make its submap."""
 _RECENT = 5
-"""Keyframes whose scans are matched together: one scan fits many places, five of them few."""
+"""Keyframes whose scans are matched together: one scan fits many places, five of them few. After a loop is closed, the next trial waits
+for as many: loops that share scans share their errors, and would count twice."""
 _FLOOR_COV = np.diag([0.02, 0.02, 0.005]) ** 2
 """Submaps bend: covariance of a loop, at least [m^2, m^2, rad^2]."""
 _AGREE_SQUARE = 9.0
@@ -67,6 +68,7 @@ class LoopDetector:
         self._config = config
         self.keyframes: list[Keyframe] = []
         self._pending: list[LoopClosure] = []
+        self._next_trial = 0
         self._closed: dict[tuple[int, int], None] = {}  # as checkpoints take it
 
     def add(self, keyframe: Keyframe) -> None:
@@ -77,7 +79,7 @@ class LoopDetector:
         """Loops that end at the newest keyframe, or shortly before. ``cell``: edge of voxels [m]; ``poses()`` (K, 3) are the graph's,
         ``marginal(k)`` (3, 3) is the covariance of one."""
         k = len(self.keyframes) - 1
-        if k <= _MIN_KEYFRAMES or not len(self.keyframes[k].points):
+        if k <= _MIN_KEYFRAMES or k < self._next_trial or not len(self.keyframes[k].points):
             return []
         found = self._match(k, cell, poses(), marginal(k))
         self._pending = [loop for loop in self._pending if k - loop.b <= _AROUND]
@@ -86,6 +88,8 @@ class LoopDetector:
         self._pending.append(found)
         agreeing = [loop for loop in self._pending if loop is not found and self._agree(loop, found)]
         new = [loop for loop in [*agreeing, found] if agreeing and (loop.a, loop.b) not in self._closed]
+        if new:
+            self._next_trial = k + _RECENT
         self._closed |= dict.fromkeys((loop.a, loop.b) for loop in new)
         return new
 

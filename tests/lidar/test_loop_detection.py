@@ -58,6 +58,14 @@ def test_detect_at_revisited_place_gives_its_pose(drift: np.ndarray) -> None:
     assert len({(loop.a, loop.b) for loop in found}) == len(found)
 
 
+def test_detect_after_closed_loop_waits_for_new_scans() -> None:
+    """The first two confirm each other; of the others none shares a scan with the one before."""
+    frames = there_and_back(LAB, LAB)[:38] + visit(LAB, 16, 2, (-0.9, 0.1))
+    ends = [loop.b for loop in detect(frames, np.array([pose for pose, _ in frames]), NEAR)]
+    assert len(ends) >= 4
+    assert np.diff(ends)[1:].min() >= 5
+
+
 def test_detect_without_confirmation_closes_no_loop() -> None:
     """A second one has to agree."""
     frames = there_and_back(LAB, LAB)[:39]
