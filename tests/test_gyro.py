@@ -101,6 +101,23 @@ def test_gyro_variance_grows_with_time_and_turn():
     )
 
 
+@pytest.mark.parametrize("white", [1e-5, 1e-3])
+def test_gyro_variance_covers_what_the_rate_does_between_samples(white):
+    """A yaw that moves at random, sampled at 50 Hz; with a gyro that hardly has noise, and one that has some."""
+    rng, hz = np.random.default_rng(4), 50
+    yaw = np.cumsum(rng.normal(0.0, 2e-3 / math.sqrt(10 * hz), 10 * hz * 400))[::10]
+    rates = np.gradient(yaw, 1.0 / hz) + white * math.sqrt(hz) * rng.normal(size=len(yaw))
+    stamps = [T0 + round(i / hz * S) for i in range(len(yaw))]
+    made = GyroBuffer(GyroNoise(white_rad_per_sqrt_s=white, scale_sigma=0.0), {}, keep_s=1e4)
+    for stamp, wz in zip(stamps, rates, strict=True):
+        made.insert(ImuSample(stamp, wz * UP, 9.81 * UP, "imu"))
+    squares = []
+    for a in range(10, len(yaw) - 20, 10):
+        turn = made.turn(stamps[a], stamps[a + 10], 0.0)
+        squares.append((turn.angle - (yaw[a + 10] - yaw[a])) ** 2 / turn.variance)
+    assert 0.8 < np.mean(squares) < 1.2
+
+
 def test_gyro_turn_outside_samples_is_none():
     past = history(samples(1.0, start_s=1.0))
     assert past.turn(T0 + 900 * MS, T0 + 1500 * MS, 0.0) is None
