@@ -129,12 +129,17 @@ def print_diagnosis(console: Console, d: Diagnosis) -> None:
     """Verdict and sentence first, then discrepancies and findings."""
     console.print(f"{d.verdict}: {d.sentence}", markup=False, soft_wrap=True)
     if d.discrepancy:
-        titles = "measured - predicted", "unit", "rms", "noise", "left", "p", "attributed to"
-        table = Table(*titles, box=None, header_style="bold", pad_edge=False)
+        table = Table("component", "unit", "rms", "corrected", "left", "noise", "p", "", box=None, header_style="bold", pad_edge=False)
         for name, c in d.discrepancy.items():
-            sizes = (f"{v:.4g}" for v in (c.rms, c.expected_rms, c.unattributed_rms))
-            table.add_row(name, c.unit, *sizes, f"{c.p_value:.2g}", describe_row(c))
+            sizes = (f"{v:.3g}" for v in (c.rms, c.corrected_rms, c.unattributed_rms, c.expected_rms))
+            table.add_row(name, c.unit, *sizes, f"{c.p_value:.2g}", c.status)
         console.print(table)
+        console.print(
+            "measured minus predicted; corrected: without the findings; left: without what is within tolerance as well", soft_wrap=True
+        )
+        for name, c in d.discrepancy.items():
+            if c.status != "noise":
+                console.print(f"{name}: {describe_row(c)}", markup=False, soft_wrap=True)
     for line in describe_tolerated(d):
         console.print(f"within tolerance: {line}", markup=False, soft_wrap=True)
     if d.findings:

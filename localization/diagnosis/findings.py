@@ -125,7 +125,7 @@ class Component:
     expected_rms: float
     """What noise alone makes of it, as estimated from this drive."""
     p_value: float
-    left_rms: float
+    corrected_rms: float
     """Once everything named is corrected."""
     unattributed_rms: float
     """Once what is within tolerance is taken off as well."""
@@ -147,7 +147,7 @@ class Component:
             "rms": self.rms,
             "expected_rms": self.expected_rms,
             "p_value": self.p_value,
-            "rms_explained": self.left_rms,
+            "rms_explained": self.corrected_rms,
             "rms_unattributed": self.unattributed_rms,
             "noise_over_reference": self.noise_over_reference,
             "status": self.status,
@@ -304,7 +304,8 @@ def describe_tolerated(d: Diagnosis) -> list[str]:
 
 def describe_row(row: Component) -> str:
     """The causes behind one row of the table of discrepancies, or that there are none."""
-    by = ", ".join(f"{a.cause} {100 * a.share:.0f} %" for a in row.attributions)
+    mixed = any(a.is_named for a in row.attributions)
+    by = ", ".join(f"{a.cause} {100 * a.share:.0f} %{' (tolerated)' * (mixed and not a.is_named)}" for a in row.attributions)
     if row.status == "unexplained" and row.noise_over_reference > MAX_NOISE_OVER_REFERENCE:
         return f"unexplained: the noise is {row.noise_over_reference:.1f} times the reference's own"
     if row.trend:

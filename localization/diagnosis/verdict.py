@@ -239,7 +239,7 @@ def attribute_rows(
         known = np.isfinite(first.rows[:, c]) & regular
         if not known.any():
             continue
-        rms, left_rms, rest_rms = (_rms(rows[known, c], c) for rows in (first.rows, named, weighed))
+        rms, corrected_rms, rest_rms = (_rms(rows[known, c], c) for rows in (first.rows, named, weighed))
         expected = float(np.sqrt(np.mean(linearization.noise.sigmas[known, c] ** 2)))
         squares = float(np.sum(white[known, c] ** 2))
         count = int(known.sum())
@@ -247,7 +247,7 @@ def attribute_rows(
         excess = noise_excess(linearization, reference_sigmas, known, c)
         if expected < _MODEL_ACCURACY * rms:
             excess = min(excess, MAX_NOISE_OVER_REFERENCE)
-        component = Component(CHANNEL_UNITS[c], rms, expected, p, left_rms, rest_rms, excess)
+        component = Component(CHANNEL_UNITS[c], rms, expected, p, corrected_rms, rest_rms, excess)
         if c < _TESTED_CHANNELS and (p < significance or excess > MAX_NOISE_OVER_REFERENCE):
             shares = parts[known, c].T @ scaled[known, c] / max(float(scaled[known, c] @ scaled[known, c]), 1e-12)
             whitened = float(np.sqrt(np.mean(white_rest[known, c] ** 2)))

@@ -41,6 +41,7 @@ _TERMS = {
     "Discrepancy": "What the reference measured in a window of the drive minus the model's prediction from the wheels in that window.",
     "Noise": "How large discrepancies without a cause are, estimated from this drive after everything that any cause could explain.",
     "p": "Probability that noise alone would make any of all causes look as strong as this one.",
+    "Corrected": "What is left once the findings are corrected: the blue points.",
     "Left": "What neither the findings nor causes within their tolerance account for.",
     "Gain": "How much smaller discrepancies become in windows that the cause's size was not fitted to.",
     "Or": "Causes that would explain the same drive about as well, each with the size that it would need.",
@@ -107,10 +108,10 @@ def _findings(d: Diagnosis) -> list[Block]:
 def _components(d: Diagnosis) -> list[Block]:
     rows = []
     for name, c in d.discrepancy.items():
-        numbers = (f"{c.rms:.4g}", f"{c.expected_rms:.4g}", f"{c.unattributed_rms:.4g}", f"{c.p_value:.2g}")
+        sizes = (f"{v:.3g}" for v in (c.rms, c.corrected_rms, c.unattributed_rms, c.expected_rms))
         status = Cell(c.status, describe_row(c).removeprefix(c.status).strip(": "))
-        rows.append([*(Cell(text) for text in (name, c.unit, *numbers)), status])
-    return [Table([Cell(title) for title in ("Component", "Unit", "RMS", "Noise", "Left", "p", "Attributed to")], rows)]
+        rows.append([*(Cell(text) for text in (name, c.unit, *sizes, f"{c.p_value:.2g}")), status])
+    return [Table([Cell(title) for title in ("Component", "Unit", "RMS", "Corrected", "Left", "Noise", "p", "Attributed to")], rows)]
 
 
 def _handover(d: Diagnosis) -> list[Block]:

@@ -5,9 +5,16 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+from rich.console import Console
 
 from localization.cli import main
+from localization.commands.diagnose import print_diagnosis
+from localization.diagnosis.diagnose import examine
+from localization.diagnosis.drive import drive_of_table
+from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
+from motion_models.registry import make_model
 from motion_models.robot import load_robot
 from tests.helpers.diagnosis_drives import bag
 
@@ -32,6 +39,21 @@ def test_diagnose_table_writes_findings_page_and_robot(tmp_path: Path, capsys: p
     assert main(["diagnose", str(GRID), "--robot", "vaultbot", "--out", str(again)]) == 0
     for name in ("diagnosis.json", "diagnosis.html", "robot.toml"):
         assert (out / name).read_bytes() == (again / name).read_bytes()
+
+
+def test_diagnose_table_shows_what_findings_and_tolerances_take_off(capsys: pytest.CaptureFixture[str]) -> None:
+    robot = load_robot("vaultbot")
+    maneuvers = rotations_as_maneuvers(read_rotation_table(GRID), robot)
+    found = examine(drive_of_table(GRID.name, robot, maneuvers, "rotations"), make_model("friction", robot))
+    assert found.residuals is not None
+    print_diagnosis(Console(width=80), found.diagnosis)
+    lines = capsys.readouterr().out.splitlines()
+    for channel, (name, row) in enumerate(found.diagnosis.discrepancy.items()):
+        sizes = [float(word) for word in next(line for line in lines if line.startswith(f"{name} ")).split()[2:6]]
+        rms = np.sqrt(np.nanmean(np.square([found.residuals.rows[:, channel], found.residuals.left[:, channel]]), axis=1))
+        assert sizes[:2] == pytest.approx(rms, rel=0.01)
+        assert sizes[2:] == pytest.approx([row.unattributed_rms, row.expected_rms], rel=0.01)
+    assert any(line.startswith("yaw: track_width") and "friction_anisotropy 23 % (tolerated)" in line for line in lines)
 
 
 def test_diagnose_corrected_robot_names_its_causes_no_more(tmp_path: Path) -> None:
