@@ -126,7 +126,7 @@ picture(*shown(left, "corrected"), columns=3, row_in=3.0, width_in=10.0)
 # %%
 table(
     ["component", "unit", "RMS before", "noise", "RMS left"],
-    *([name, c.unit, c.rms, c.expected_rms, c.left_rms] for name, c in d.discrepancy.items()),
+    *([name, c.unit, c.rms, c.expected_rms, c.corrected_rms] for name, c in d.discrepancy.items()),
 )
 
 # %% [markdown]
