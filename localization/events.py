@@ -165,7 +165,7 @@ class Step:
     start_ns: int
     end_ns: int
     predicted: Motion
-    """By the wheels and the motion model, at its nominal parameters."""
+    """By the wheels and the motion model, at its present parameters."""
     d_clock: FloatArray
     """(3,) change of the predicted motion (right perturbation) per second by which the wheels' clock is shifted [m/s, m/s, rad/s]."""
     twist: FloatArray

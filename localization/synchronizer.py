@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -44,6 +45,10 @@ class StepConfig(Settings):
     """Sigma of the unknown constant speed while wheel data are missing [m/s]."""
     lost_rate_rad_s: Positive = 0.5
     """Sigma of the unknown constant turn rate while wheel data are missing [rad/s]."""
+
+
+_UNKNOWN_YAW_VARIANCE = math.pi**2 / 3.0
+"""Of a heading that may be any [rad^2]: uniform from -pi to pi."""
 
 
 class Synchronizer:
@@ -112,7 +117,8 @@ class Synchronizer:
         """Problems of the sensors so far."""
         found = self._gyro.warnings()
         if self._empty_scans:
-            found.append(f"{self._empty_scans} scan{'s' * (self._empty_scans > 1)} without a usable point: the wheels carried on alone.")
+            scans = f"{self._empty_scans} scan{'s' * (self._empty_scans > 1)}"
+            found.append(f"{scans} without a usable point: the pose is by wheels and gyro there.")
         if self._late_scans:
             found.append(f"{self._late_scans} scan{'s' * (self._late_scans > 1)} came after later ones and could not be used.")
         if self._has_turned:
@@ -214,5 +220,6 @@ class Synchronizer:
         self._no_wheel_data_s += missing_s
         v = max(self.config.lost_speed_m_s, float(self._speed[0]))
         w = max(self.config.lost_rate_rad_s, float(self._speed[1]))
-        grown = np.diag([v, v, w]) ** 2 * ((before + missing_s) ** 2 - before**2)
-        return Motion(motion.delta, motion.cov + grown, motion.d_params)
+        until, since = (np.array([v, v, w]) ** 2 * time_s**2 for time_s in (before + missing_s, before))
+        until[2], since[2] = min(until[2], _UNKNOWN_YAW_VARIANCE), min(since[2], _UNKNOWN_YAW_VARIANCE)
+        return Motion(motion.delta, motion.cov + np.diag(until - since), motion.d_params)

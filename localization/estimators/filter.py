@@ -216,4 +216,6 @@ def _check(what: str, *arrays: FloatArray) -> None:
     """Raises `EstimatorError` for numbers that would spoil the state for good."""
     for array in arrays:
         if not (np.abs(array) < _MAX_NUMBER).all():
-            raise EstimatorError(f"{what} has numbers that are not finite, or too large to compute with. Look at its source in the log.")
+            raise EstimatorError(
+                f"{what} has numbers that are not finite, or too large to compute with. Check that sensor's messages in the log."
+            )

@@ -37,7 +37,7 @@ class EkfFusion(Estimator):
         self._is_slip_measured = self._has_gyro = self._is_scan_pending = False
         self.wheel_motion, self.is_turning = Motion(np.zeros(3), np.zeros((3, 3))), True
         """Motion of the last step by the wheels, with the covariance that the filter gave it in the end; whether it corrects the model."""
-        self.counts_by_name = dict.fromkeys(("scans", "matched", "standing", "searched"), 0)
+        self.counts_by_name = dict.fromkeys(("scans", "matched", "standing", "prior_outliers"), 0)
 
     @property
     def clock_offset_s(self) -> float:
@@ -76,9 +76,10 @@ class EkfFusion(Estimator):
             ekf.update_turn(step.turn)
         if self._sensor is not None:
             nis = self._update_scan(step, self._sensor)
-        delta, cov = ekf.motion_since(START)
-        twist, twist_cov = mean_twist(delta, cov, step.duration) if step.duration > 0.0 else (step.twist, None)
-        self._twist, self._slip, self._is_slip_measured = twist, twist - _mean_twist(step), nis is not None
+        twist, twist_cov = step.twist, None
+        if step.duration > 0.0:
+            twist, twist_cov = mean_twist(*ekf.motion_since(START), step.duration)
+            self._twist, self._slip, self._is_slip_measured = twist, twist - _mean_twist(step), nis is not None
         return Estimate(step.end_ns, ekf.pose, ekf.P[POSE, POSE].copy(), twist, twist_cov, nis)
 
     def run_deferred(self) -> None:
@@ -111,7 +112,7 @@ class EkfFusion(Estimator):
                 self._slip_changes.add(slip - self._slip, match.cov, step, sensor.sweep_s)
             R = match.cov + sensor.bend_cov(match, self._slip_changes.rate(step))
         self.counts_by_name["matched"] += 1
-        self.counts_by_name["searched"] += bool(match.outlier_cov.any())
+        self.counts_by_name["prior_outliers"] += bool(match.outlier_cov.any())
         self.wheel_motion = replace(self.wheel_motion, cov=self.wheel_motion.cov + match.outlier_cov)
         return ekf.update_scan(match.measured, R, match.outlier_cov)
 

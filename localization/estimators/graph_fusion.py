@@ -37,6 +37,8 @@ _RADIUS_SIGMA = 0.02
 """Relative error of the wheels' radius, both sides alike: wear and pressure of tyres. Positions and loops show it."""
 _CONSTANT_SIGMA = 1e-4
 """Of what does not change: by far smaller ones GTSAM's marginals lose positive definiteness."""
+_LONGEST_WAIT = 2.0
+"""Distances between keyframes after which the next one no longer waits for a scan: the LiDAR is silent."""
 _WALK_S = 60.0
 """Corrections are constant for this long [s]; as a random walk of an hour they change by an eighth of their prior sigma meanwhile."""
 
@@ -104,8 +106,9 @@ class GraphFusion(Estimator):
             self._steps.extend(ekf.pose)
             self._stamps_ns.append(step.end_ns)
         delta, cov = ekf.motion_since(KEY)
-        moved = math.hypot(delta[0], delta[1]) >= self._config.keyframe_distance_m or abs(delta[2]) >= self._config.keyframe_angle_rad
-        self._is_keyframe_due = not self.graph.count or (moved and (step.scan is not None or self.lost is None))
+        moved = max(math.hypot(delta[0], delta[1]) / self._config.keyframe_distance_m, abs(delta[2]) / self._config.keyframe_angle_rad)
+        waits_for_scan = step.scan is None and self.lost is not None and moved < _LONGEST_WAIT
+        self._is_keyframe_due = not self.graph.count or (moved >= 1.0 and not waits_for_scan)
         self._place_positions(step)
         A = se2.adjoint(se2.inverse(delta))
         pose = se2.compose(self._map_T_odom, ekf.pose)
@@ -137,17 +140,19 @@ class GraphFusion(Estimator):
         else:
             update = Update(ekf.pose)
         self.graph.apply(update)
-        self._nodes.append(len(self._stamps_ns) - 1)
+        if self._is_smoothing:
+            self._nodes.append(len(self._stamps_ns) - 1)
         ekf.start_key()
         self._wheels = _KeyframeMotion(len(self._corrections.names))
-        self._close_loops(Keyframe(ekf.pose, self.odometry.scan_points))
+        self._close_loop(Keyframe(ekf.pose, self.odometry.scan_points))
         self._align_positions()
         if len(self._corrections.names) and k:
             mean, cov = self.graph.corrections()
             ekf.set_corrections(mean[:-1], cov[:-1, :-1])
         self._map_T_odom = se2.compose(self.graph.pose(k), se2.inverse(ekf.pose))
         self._key_cov = self.graph.marginal(k)
-        self._key_covs.extend(self._key_cov.ravel())
+        if self._is_smoothing:
+            self._key_covs.extend(self._key_cov.ravel())
 
     def _walk(self) -> FloatArray | None:
         """(c, c) by which the corrections may have changed, once a minute; None meanwhile."""
@@ -157,13 +162,12 @@ class GraphFusion(Estimator):
         self._walked_s = 0.0
         return np.asarray(cov + _CONSTANT_SIGMA**2 * np.eye(len(cov)))
 
-    def _close_loops(self, keyframe: Keyframe) -> None:
+    def _close_loop(self, keyframe: Keyframe) -> None:
         self._loops.add(keyframe)
-        loops = self._loops.detect(self.odometry.cell, self.graph.poses, self.graph.marginal)
-        if loops:
-            self.n_loops += len(loops)
-            between = tuple(Between(loop.a, loop.b, loop.delta, np.asarray(np.linalg.inv(loop.cov)), is_loop=True) for loop in loops)
-            self.graph.apply(Update(betweens=between))
+        loop = self._loops.detect(self.odometry.cell, self.graph.poses, self.graph.marginal)
+        if loop is not None:
+            self.n_loops += 1
+            self.graph.apply(Update(betweens=(Between(loop.a, loop.b, loop.delta, np.asarray(np.linalg.inv(loop.cov)), is_loop=True),)))
 
     def _place_positions(self, step: Step) -> None:
         """Positions up to the end of ``step`` are taken from the newest keyframe."""
@@ -178,7 +182,8 @@ class GraphFusion(Estimator):
             part = (sample.stamp_ns - step.start_ns) / max(step.end_ns - step.start_ns, 1)
             pose = se2.interpolate(ekf.start, ekf.pose, np.array(part))
             offset = se2.between(ekf.key, pose)
-            self._positions.append((self.graph.count - 1, offset, sample.position, sample.covariance))
+            moved_cov = 0.5 * np.trace(ekf.motion_since(KEY)[1][:2, :2]) * np.eye(2)  # any heading: that of the map may not be known
+            self._positions.append((self.graph.count - 1, offset, sample.position, sample.covariance + moved_cov))
 
     def _align_positions(self) -> None:
         """Positions enter the graph, the first time together with the heading that they give to the map."""
@@ -202,9 +207,11 @@ class GraphFusion(Estimator):
         self.run_deferred()
         if not self._is_smoothing or filtered is None or self.graph.count < 2:
             return None
+        if self._nodes[-1] < len(self._stamps_ns) - 1:
+            self._add_keyframe()
         poses, covs = self.graph.smooth()
         if not (np.isfinite(poses).all() and np.isfinite(covs).all()):
-            raise EstimatorError("the pose graph has no finite solution. Look at the log.")
+            raise EstimatorError("the pose graph has no finite solution. Check the log with `skidloc info`, and the robot file's noise.")
         nodes, odom = np.array(self._nodes), np.array(self._steps).reshape(-1, 3)
         smoothed, smoothed_covs = _interpolate(nodes, poses, covs, odom)
         if filtered.covariances is not None:
@@ -230,7 +237,9 @@ class GraphFusion(Estimator):
         """Positions that could not be used, or contradict the other sensors."""
         found, n = [], len(self._positions) + len(self._waiting)
         if n and not self.n_positions:
-            found.append(f"{n} positions could not be used: they give the map its heading after {_MIN_BASELINE_M:g} m of way.")
+            found.append(
+                f"{n} positions could not be used: it takes {_MIN_POSITIONS} over {_MIN_BASELINE_M:g} m to give the map its heading."
+            )
         if self._n_late:
             late = "1 position" if self._n_late == 1 else f"{self._n_late} positions"
             found.append(f"{late} came after the estimate of a later stamp and had to be left out. Check the stamps.")
@@ -268,7 +277,7 @@ class _KeyframeMotion:
     def preintegrated(self, at: FloatArray) -> PreintegratedMotion:
         """All of it. ``at``: the corrections with which the last step was predicted; those of the others hardly differ."""
         cov = self._cov + self._straight @ self._prior @ self._straight.T + 1e-10 * np.eye(3)
-        by_scale = se2.log(self._delta) * [1.0, 1.0, 0.0]  # turns have a scale of their own: k
+        by_scale = np.append(-se2.inverse(self._delta)[:2], 0.0)  # R^T (x, y), yaw 0: turns have a scale of their own, k
         return PreintegratedMotion(self._delta, cov, np.column_stack([self._by_corrections, by_scale]), np.append(at, 0.0))
 
 

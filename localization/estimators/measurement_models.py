@@ -18,7 +18,8 @@ def predict_turn(
 
     Returns it with its Jacobians by the pose now (3,), by the start (3,), by the bias [s] and by the scale [rad].
     """
-    turned = float(se2.scalar_wrap(float(world_T_now[2] - world_T_start[2])))
+    measured = (turn.angle - bias * turn.duration) / (1.0 + scale)  # tells how often the robot turned in a gap
+    turned = measured + float(se2.scalar_wrap(float(world_T_now[2] - world_T_start[2]) - measured))
     return (1.0 + scale) * turned + bias * turn.duration, (1.0 + scale) * _YAW, -(1.0 + scale) * _YAW, turn.duration, turned
 
 

@@ -155,8 +155,9 @@ class PoseGraph:
 
     def position_errors(self) -> FloatArray:
         """(n,) normalised errors [sigma] of the positions by the present estimates."""
-        positions = [position_factor(position) for update in self.updates for position in update.positions]
-        return np.array([np.linalg.norm(factor.whitenedError(self._values)) for factor in positions])
+        positions = [position for update in self.updates for position in update.positions]
+        errors = [position_factor(position).unwhitenedError(self._values) for position in positions]  # whitened ones have the robust weight
+        return np.array([np.sqrt(e @ np.linalg.solve(position.cov, e)) for e, position in zip(errors, positions, strict=True)])
 
     def corrections(self) -> tuple[FloatArray, FloatArray]:
         """Mean (c,) and covariance (c, c) of the corrections."""

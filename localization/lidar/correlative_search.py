@@ -108,7 +108,9 @@ def _pick(prior: Pose2, shifts: FloatArray, scores: FloatArray, n: int, informat
     log_likelihood = n / CORRELATED_BEAMS * np.log(np.maximum(scores, 1e-6))
     best = int(np.argmax(log_likelihood - 0.5 * np.einsum("ki,ij,kj->k", shifts, information, shifts)))
     away = shifts - shifts[best]
-    is_elsewhere = (np.hypot(away[:, 0], away[:, 1]) > _APART_CELLS * step[0]) | (np.abs(away[:, 2]) > _APART_CELLS * step[2])
+    is_elsewhere = (np.hypot(away[:, 0], away[:, 1]) > _APART_CELLS * step[0]) | (
+        np.abs(se2.wrap_angle(away[:, 2])) > _APART_CELLS * step[2]
+    )
     rival = float(scores[is_elsewhere].max()) if is_elsewhere.any() else 0.0
     margin = n / CORRELATED_BEAMS * math.log(max(float(scores[best]), 1e-6) / max(rival, 1e-6))
     return SearchResult(prior + shifts[best], float(scores[best]), rival, margin)

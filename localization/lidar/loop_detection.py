@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,8 +25,8 @@ from localization.lidar.submap import make_grid, voxel_means
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
-_MIN_KEYFRAMES = 25
-"""Keyframes that must lie between both visits: what is nearer in time is in the filter's own submap."""
+_LEAST_TRAVEL = 1.25
+"""Travel between both visits, over that of the filter's own submap: what is nearer is in that submap already."""
 _AROUND = 8
 """Keyframes before and after the old one whose scans make its submap."""
 _RECENT = 5
@@ -62,51 +63,61 @@ class LoopClosure:
 
 
 class LoopDetector:
-    """`add` each keyframe, then `detect`: loops that two trials agree on."""
+    """`add` each keyframe, then `detect`: loops on which two trials agree."""
 
     def __init__(self, config: LidarConfig) -> None:
         self._config = config
+        self._least_travel_m = _LEAST_TRAVEL * config.key_scans * config.key_distance_m
         self.keyframes: list[Keyframe] = []
+        self._travelled_m: list[float] = []
         self._pending: list[LoopClosure] = []
         self._next_trial = 0
-        self._closed: dict[tuple[int, int], None] = {}  # as checkpoints take it
 
     def add(self, keyframe: Keyframe) -> None:
         """Append a keyframe."""
+        if self.keyframes:
+            x, y, _ = se2.between(self.keyframes[-1].odometry, keyframe.odometry)
+            self._travelled_m.append(self._travelled_m[-1] + math.hypot(x, y))
+        else:
+            self._travelled_m.append(0.0)
         self.keyframes.append(keyframe)
 
-    def detect(self, cell: float, poses: Callable[[], FloatArray], marginal: Callable[[int], FloatArray]) -> list[LoopClosure]:
-        """Loops that end at the newest keyframe, or shortly before. ``cell``: edge of voxels [m]; ``poses()`` (K, 3) are the graph's,
-        ``marginal(k)`` (3, 3) is the covariance of one."""
+    def detect(self, cell: float, poses: Callable[[], FloatArray], marginal: Callable[[int], FloatArray]) -> LoopClosure | None:
+        """The loop that ends at the newest keyframe, if one of the last trials confirms it.
+
+        ``cell``: edge of voxels [m]; ``poses()`` (K, 3) are the graph's, ``marginal(k)`` (3, 3) is the covariance of one."""
         k = len(self.keyframes) - 1
-        if k <= _MIN_KEYFRAMES or k < self._next_trial or not len(self.keyframes[k].points):
-            return []
-        found = self._match(k, cell, poses(), marginal(k))
+        old = bisect.bisect_right(self._travelled_m, self._travelled_m[k] - self._least_travel_m)
+        if not old or k < self._next_trial or not len(self.keyframes[k].points):
+            return None
+        found = self._match(k, old, cell, poses(), marginal(k))
         self._pending = [loop for loop in self._pending if k - loop.b <= _AROUND]
         if found is None:
-            return []
+            return None
+        is_confirmed = any(self._agree(loop, found) for loop in self._pending)
         self._pending.append(found)
-        agreeing = [loop for loop in self._pending if loop is not found and self._agree(loop, found)]
-        new = [loop for loop in [*agreeing, found] if agreeing and (loop.a, loop.b) not in self._closed]
-        if new:
-            self._next_trial = k + _RECENT
-        self._closed |= dict.fromkeys((loop.a, loop.b) for loop in new)
-        return new
+        if not is_confirmed:
+            return None
+        self._next_trial = k + _RECENT
+        return found
 
-    def _match(self, k: int, cell: float, poses: FloatArray, marginal: FloatArray) -> LoopClosure | None:
+    def _match(self, k: int, n_old: int, cell: float, poses: FloatArray, marginal: FloatArray) -> LoopClosure | None:
+        """Keyframe ``k`` where the nearest of the first ``n_old`` keyframes was."""
         points = self.keyframes[k].points
         median = float(np.median(np.hypot(points[:, 0], points[:, 1])))
-        old = poses[: k - _MIN_KEYFRAMES + 1]
+        old = poses[:n_old]
         has_points = [len(keyframe.points) > 0 for keyframe in self.keyframes[: len(old)]]
         distance = np.where(has_points, np.hypot(*(old[:, :2] - poses[k, :2]).T), math.inf)
         j = int(np.argmin(distance))
         prior = se2.between(poses[j], poses[k])
         if distance[j] > 3.0 * math.sqrt(float(np.linalg.eigvalsh(marginal[:2, :2])[-1])) + _REACH * median:
             return None
-        place = self._merge(range(max(0, j - _AROUND), min(k - _MIN_KEYFRAMES, j + _AROUND) + 1), poses, j)
+        place = self._merge(range(max(0, j - _AROUND), min(n_old, j + _AROUND + 1)), poses, j)
         recent = voxel_means(self._merge(range(max(0, k - _RECENT + 1), k + 1), poses, k), 1.5 * cell)
         wide = marginal + prior_outlier_cov(marginal)
         reachable = _within_reach(place, recent, prior, wide, search_limit(marginal))
+        if not len(reachable):
+            return None
         found = find_place(draw_image(reachable, cell), recent, prior, wide, marginal)
         if found is None:
             return None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
 from localization.events import Scan
@@ -11,7 +13,9 @@ _MAX_SCAN_GAP_S = 1.0
 """Time without a scan that counts as lost [s]: scanners give 5 to 40 scans a second, and in this time wheels alone err by the few
 centimetres of a voxel."""
 _MAX_SCAN_GAP_PERIODS = 4.0
-"""The same for logs with few scans, in mean times from scan to scan."""
+"""The same for logs with few scans, in median times from scan to scan."""
+_GAPS = 51
+"""Last gaps between scans of which the median is taken: silences among them do not count."""
 MAX_LOST_SHARE = 0.05
 """Share of the time without a matched scan, beyond which a run is not recommended: wheels alone err by 0.7 to 0.9 m in 10 m (fr079,
 MIT-CSAIL), matched scans by 0.05 to 0.09 m, so that from a twentieth of the way on the wheels' share is the larger one."""
@@ -20,21 +24,22 @@ MAX_LOST_S = 5.0
 
 
 class StaleScans:
-    """Recognizes a scanner that repeats its last scan."""
+    """Recognizes scanners that repeat their last scan."""
 
     def __init__(self) -> None:
-        self._points: FloatArray | None = None
-        self._is_frozen = False
+        self._points: dict[str, FloatArray] = {}  # of the last scan in each frame
+        self._is_frozen: dict[str, bool] = {}
 
     def is_stale(self, scan: Scan, is_standing: bool) -> bool:
         """The very same ranges as last time although the wheels turn: noise alone would have changed them.
 
         A scanner that froze while the robot drove stays stale until its ranges change, also where the robot stands.
         """
-        last, self._points = self._points, scan.points
+        last = self._points.get(scan.frame_id)
         is_same = last is not None and len(last) > 0 and np.array_equal(last, scan.points)
-        self._is_frozen = is_same and (self._is_frozen or not is_standing)
-        return self._is_frozen
+        is_frozen = is_same and (self._is_frozen.get(scan.frame_id, False) or not is_standing)
+        self._points[scan.frame_id], self._is_frozen[scan.frame_id] = scan.points, is_frozen
+        return is_frozen
 
 
 class LostScans:
@@ -50,6 +55,7 @@ class LostScans:
         self.silences = 0
         """Gaps between scans that count as lost."""
         self._is_silent = False
+        self._gaps_ns: deque[int] = deque(maxlen=_GAPS)
         self._lost_ns = 0
         self._longest: tuple[int, int] = (0, 0)  # length and start [ns]
 
@@ -71,7 +77,7 @@ class LostScans:
         than they are apart."""
         if self._first_ns is None:
             return
-        apart_ns = (self._scan_ns - self._first_ns) / max(self.scans - 1, 1)
+        apart_ns = sorted(self._gaps_ns)[(len(self._gaps_ns) - 1) // 2] if self._gaps_ns else 0
         if stamp_ns - self._scan_ns <= max(_MAX_SCAN_GAP_S * 1e9, _MAX_SCAN_GAP_PERIODS * apart_ns):
             return
         self.silences += not self._is_silent
@@ -102,6 +108,7 @@ class LostScans:
             self._first_ns = self._matched_ns = self._last_ns = stamp_ns
         else:
             self.add_no_scan(stamp_ns)
+            self._gaps_ns.append(stamp_ns - self._scan_ns)
         self.scans += 1
         self._scan_ns, self._is_silent = stamp_ns, False
 

@@ -38,7 +38,7 @@ _BLOCK = 30
 """Neighbouring beams whose residuals are summed, to measure how they err together [beams]: the residuals of real scans are correlated over
 10 to 20 beams, those of simulated rooms over 1 to 10."""
 FORGETTING = 0.98
-"""Of statistics of residuals, innovations and slip, per scan: they are means over the last 50."""
+"""Of statistics of residuals, innovations and slip, per measurement: they are means over the last 50."""
 OUTLIER_SIGMAS = 5.0
 """What is farther off is an outlier: scans, wheels that slip or count wrongly, positions."""
 _OUTLIER_COST = 0.5 * OUTLIER_SIGMAS**2
@@ -90,7 +90,7 @@ class LidarConfig(Settings):
     search_below: Share = 0.7
     """Share of points on the submap, below which a better pose is searched."""
     lost_below: Share = 0.4
-    """Share of points on the submap, below which a scan is lost and wheels carry on alone."""
+    """Share of points on the submap, below which a scan is lost and the pose is by wheels and gyro."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class KeyScanError:
     share: float
     """s, 0 to 1: the scan's share of its surroundings in the submap."""
     new_cov: Cov3
-    """(3, 3) of m: places that were not mapped before hang on this scan alone."""
+    """(3, 3) of m: places that were not mapped before have this scan alone."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -357,9 +357,9 @@ def _wide_covariance(estimate: Estimate) -> list[tuple[int, str]]:
 def _of_losses(losses: LidarLosses, values: Mapping[str, str]) -> Status | None:
     """ERROR while the LiDAR is lost for long, WARN while it is lost or was for long, else None."""
     if losses.ongoing_s > MAX_LOST_S:
-        return Status("lidar", ERROR, f"lost for {losses.ongoing_s:.0f} s: the wheels carry on alone. {losses.advice}", values)
+        return Status("lidar", ERROR, f"lost for {losses.ongoing_s:.0f} s: the pose is by wheels and gyro. {losses.advice}", values)
     if losses.ongoing_s > 0.0:
-        return Status("lidar", WARN, f"lost for {losses.ongoing_s:.1f} s: the wheels carry on alone. {losses.advice}", values)
+        return Status("lidar", WARN, f"lost for {losses.ongoing_s:.1f} s: the pose is by wheels and gyro. {losses.advice}", values)
     if losses.is_long:
         return Status("lidar", WARN, f"{losses.summary}. {losses.advice}", values)
     return None

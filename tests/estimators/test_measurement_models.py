@@ -32,6 +32,13 @@ def test_motion_residual_has_exact_jacobians(a, b, off):
     np.testing.assert_allclose(by_b, differences(lambda p: motion_residual(a, p, measured)[0], b), rtol=1e-5, atol=2e-6)
 
 
+def test_predict_turn_in_gap_counts_whole_turns():
+    """Poses tell the turn but for whole circles."""
+    value, _, _, _, by_scale = predict_turn(np.zeros(3), np.array([0.0, 0.0, 5.0 - 2.0 * math.pi]), Turn(5.12, 1.0, 10.0), 0.002, 0.02)
+    assert value == pytest.approx(5.1 + 0.02)
+    assert by_scale == pytest.approx(5.0)
+
+
 @given(POSES, st.floats(-1.5, 1.5), st.floats(-0.5, 0.5), st.floats(-0.1, 0.1), st.floats(0.01, 2.0))
 @settings(max_examples=60, deadline=None)
 def test_predict_turn_has_exact_jacobians(a, angle, bias, scale, duration):

@@ -221,6 +221,13 @@ def test_graph_with_outlier_position_keeps_poses() -> None:
     assert distances(poses, spoilt).max() < 0.1
 
 
+def test_position_errors_are_in_sigmas_without_robust_weight() -> None:
+    """Fixes have a sigma of 0.1 m."""
+    errors = with_positions(50.0)[0].position_errors()
+    assert errors[30] == pytest.approx(500.0, rel=0.01)
+    assert np.delete(errors, 30).max() < 5.0
+
+
 @pytest.mark.parametrize("given", [np.zeros(2), np.array([0.4, -0.3])])
 def test_pose_graph_with_positions_estimates_lever_arm(given: np.ndarray) -> None:
     """Turning tells it from the alignment."""

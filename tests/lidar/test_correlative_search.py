@@ -128,3 +128,12 @@ def test_draw_image_levels_are_maxima_of_neighbouring_blocks() -> None:
         blocks = np.pad(fine.reshape(fine.shape[0] // COARSE, COARSE, fine.shape[1] // COARSE, COARSE).max((1, 3)), 1)
         for i, j in np.ndindex(coarse.shape):
             assert coarse[i, j] == blocks[i : i + 3, j : j + 3].max()
+
+
+def test_search_of_any_heading_has_no_rival_in_itself() -> None:
+    """Turned by half a circle to either side the pose is the same."""
+    true = np.array([0.2, 0.1, math.pi])
+    points = voxel_means(rooms.scan_from(HALL, true, np.random.default_rng(0)), CELL)
+    found = search(image_of(HALL), points, np.array([0.2, 0.1, 0.0]), np.diag([0.5, 0.5, 2.0]) ** 2, np.array([1.0, 1.0, math.pi]))
+    assert abs(abs(found.pose[2]) - math.pi) < 0.05
+    assert found.rival_score < 0.9 * found.score

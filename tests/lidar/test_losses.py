@@ -55,8 +55,8 @@ def test_losses_of_a_lidar_that_dies_are_described_and_long() -> None:
     assert (losses.scans, losses.matched, losses.ongoing_s) == (10, 10, 6.0)
     assert losses.is_long
     assert losses.describe() == (
-        "LiDAR lost for 40 % of the drive, longest 6 s at t = 9 s (no scans came for a second or more). Wheels carried on alone. "
-        "Check the LiDAR's driver, cable and topic."
+        "LiDAR lost for 40 % of the drive, longest 6 s at t = 9 s (no scans came for a second or more). "
+        "The pose is by wheels and gyro there. Check the LiDAR's driver, cable and topic."
     )
     assert losses.numbers()["silences"] == 1
 

@@ -94,3 +94,20 @@ def test_lost_scans_count_gap_without_steps_between() -> None:
     for t in (0, 1, 2, 3, 9, 10):
         lost.add(t * S, "lost") if t == 9 else lost.add_matched(t * S)
     assert (lost.silences, lost.longest) == (1, (7.0, 3.0))
+
+
+def test_is_stale_tells_scanners_apart() -> None:
+    """Both are frozen, and their scans alternate."""
+    checks = StaleScans()
+    scans = [Scan(0, scan(k % 2).points, frame_id="ab"[k % 2]) for k in range(6)]
+    assert [checks.is_stale(s, False) for s in scans] == [False, False, True, True, True, True]
+
+
+def test_lost_scans_after_silence_count_the_next_one_alike() -> None:
+    """A silence does not make longer ones usual."""
+    lost = LostScans()
+    for t in (0.0, 0.1, 0.2, 100.1):
+        lost.add_matched(int(t * S))
+    lost.add_no_scan(280 * S)
+    assert lost.silences == 2
+    assert lost.longest == (pytest.approx(179.9), pytest.approx(100.1))

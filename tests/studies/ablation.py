@@ -34,7 +34,7 @@ from localization.estimators.fusion import EkfFusion
 from localization.evaluation.consistency import pose_consistency
 from localization.evaluation.metrics import evaluate
 from localization.evaluation.references import ReferenceTrack, reference_track
-from localization.lidar import loop_detection, scan_matcher
+from localization.lidar import scan_matcher
 from localization.lidar.loop_detection import LoopDetector
 from localization.lidar.scan_matcher import ScanMatcher
 from localization.lidar.scan_matching import ScanMatchingSensor
@@ -125,15 +125,6 @@ def _match_without_new_place(original: Callable[..., Any], self: ScanMatcher, *r
     return found
 
 
-def _detect_unconfirmed(
-    original: Callable[..., Any], self: LoopDetector, cell: float, poses: Callable[[], Any], marginal: Callable[[int], Any]
-) -> Any:
-    """Every loop that fits is taken, without a second one that agrees."""
-    k = len(self.keyframes) - 1
-    found = self._match(k, cell, poses(), marginal(k)) if k > loop_detection._MIN_KEYFRAMES and len(self.keyframes[k].points) else None
-    return [] if found is None else [found]
-
-
 _NO_SEARCH = (
     _attribute(ScanMatcher, "_search", lambda *a: None),
     _attribute(scan_matcher, "_BASIN_M", math.inf),
@@ -175,8 +166,8 @@ PATCHES: Mapping[str, Patch] = {
     "key scans of new places at once": _wrap(ScanMatcher, "match", _match_without_new_place),
 }
 GRAPH_PATCHES: Mapping[str, Patch] = {
-    "loop closures": _attribute(LoopDetector, "detect", lambda self, cell, poses, marginal: []),
-    "second loop that confirms": _wrap(LoopDetector, "detect", _detect_unconfirmed),
+    "loop closures": _attribute(LoopDetector, "detect", lambda self, cell, poses, marginal: None),
+    "agreement of a second loop": _attribute(LoopDetector, "_agree", lambda self, one, other: True),
     "robust loss of loops": _attribute(pose_graph, "_CAUCHY", _NO_LOSS),
     "robust loss of wheels": _attribute(pose_graph, "_HUBER", _NO_LOSS),
     "all of the filter's motion after a matched scan (less the wheels' share, instead)": lambda: mock.patch.object(
