@@ -18,6 +18,7 @@ _MIN_GRAVITY_M_S2, _MAX_GRAVITY_M_S2 = 8.0, 12.0  # m/s^2; drivers that publish 
 _MAX_TILT_RAD = math.radians(30.0)
 _JUMP_RAD_PER_S, _JUMP_RAD_PER_S2 = 2.0, 200.0  # noise and shaking, and how fast such a robot may begin to turn
 _MAX_JUMP_RAD_PER_S = 10.0  # at which none turns
+_FOREVER_S = 1e6
 _MAX_SPIKES = 2  # that agree, in a row; a third is accepted
 _MIN_TURN_RAD = 0.5  # rad of turning by the wheels, after which they show which way the gyro's axis points
 
@@ -193,6 +194,37 @@ class GyroBuffer:
             return self._angles[-1]
         part = (stamp_ns - self._stamps[i - 1]) / (self._stamps[i] - self._stamps[i - 1])
         return self._angles[i - 1] + part * (self._angles[i] - self._angles[i - 1])
+
+
+class GyroRecord:
+    """The whole record of a gyro: a `GyroBuffer` for each stretch without a gap."""
+
+    def __init__(self, noise: GyroNoise, mounts: Mapping[str, Mount]) -> None:
+        self._noise, self._mounts = noise, mounts
+        self._stretches: list[GyroBuffer] = []
+        self._starts: list[int] = []
+        self.silent_s = 0.0
+        """Length of all gaps [s]."""
+
+    def insert(self, sample: ImuSample) -> None:
+        """Take the next sample."""
+        newest = self._stretches[-1].newest_ns if self._stretches else None
+        if newest is None or sample.stamp_ns - newest > _MAX_GAP_NS:
+            if newest is not None:
+                self.silent_s += (sample.stamp_ns - newest) * _NS
+            self._stretches.append(GyroBuffer(self._noise, self._mounts, keep_s=_FOREVER_S))
+            self._starts.append(sample.stamp_ns)
+        self._stretches[-1].insert(sample)
+
+    @property
+    def gaps(self) -> int:
+        """Number of gaps."""
+        return max(len(self._stretches) - 1, 0)
+
+    def turn(self, start_ns: int, end_ns: int, by_wheels: float) -> Turn | None:
+        """As `GyroBuffer.turn`; None also where there is a gap between."""
+        i = bisect.bisect_right(self._starts, start_ns) - 1
+        return None if i < 0 else self._stretches[i].turn(start_ns, end_ns, by_wheels)
 
 
 def _may_follow(before: tuple[int, float], after: tuple[int, float]) -> bool:

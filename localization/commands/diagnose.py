@@ -17,7 +17,15 @@ from localization.diagnosis.baseline import estimate_baseline
 from localization.diagnosis.corrected_robot import correct_robot
 from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_runs, drive_of_table, read_runs
-from localization.diagnosis.findings import Diagnosis, describe_outliers, describe_row, describe_tolerated
+from localization.diagnosis.findings import (
+    Diagnosis,
+    correctable_findings,
+    describe_outliers,
+    describe_p,
+    describe_row,
+    describe_tolerated,
+    is_contesting,
+)
 from localization.diagnosis.linearization import default_model
 from localization.logs import TopicOverrides, open_log
 from localization.output import check_outputs, write_text_file
@@ -89,9 +97,13 @@ class Diagnose:
     def _drive(self, robot: Robot) -> Drive:
         name = self.source.name
         if self.source.suffix.lower() != ".csv":
+            if self.healthy is not None and self.reference is not None and self.reference.endswith(".tum"):
+                raise CalibrationError(f"--reference {self.reference} is of {name} alone: with --healthy name a topic that both logs have.")
             return self._drive_of_log(self.source, robot)
         if self.healthy is not None:
             raise CalibrationError(f"{name} is a table: --healthy takes the log of another drive to compare a log with.")
+        if self.reference is not None or self.motion_reference != "auto":
+            raise CalibrationError(f"{name} is a table, which has the measured motion: --reference and --motion-reference are for logs.")
         columns = table_columns(self.source)
         if "vision_error_m" in columns:
             return drive_of_runs(name, robot, read_runs(self.source))
@@ -108,15 +120,16 @@ class Diagnose:
         d = found.diagnosis
         new, manual_steps = robot, ()  # type: Robot, tuple[str, ...]
         is_worse = d.handover is not None and not d.handover.is_better
-        if is_worse:
-            manual_steps = (NOT_BETTER,)
-        elif found.predictor is not None and d.findings:
+        is_corrected = bool(correctable_findings(d)) and not is_worse
+        if found.predictor is not None and correctable_findings(d):
             patch = correct_robot(found.predictor, d.hypothesis)
-            new, manual_steps = patch.robot, patch.manual_steps
+            new, manual_steps = (patch.robot if is_corrected else robot), patch.manual_steps
+        if is_worse:
+            manual_steps = (NOT_BETTER, *manual_steps)
         named = (
             "; ".join(f"{f.cause} {f.size:+.4g} +- {f.sigma:.2g} {f.definition.unit}".removesuffix(" 1") for f in d.findings) or "nothing"
         )
-        title = "Found, not corrected" if is_worse else "Corrected here"
+        title = "Corrected here" if is_corrected else "Found, not corrected"
         remarks = [f"Diagnosed by skidloc: {d.model} on {d.log}, from {robot.name}.", f"{title}: {named}.", *manual_steps]
         if d.handover is not None:
             remarks.append(d.handover.describe())
@@ -132,7 +145,7 @@ def print_diagnosis(console: Console, d: Diagnosis) -> None:
         table = Table("component", "unit", "rms", "corrected", "left", "noise", "p", "", box=None, header_style="bold", pad_edge=False)
         for name, c in d.discrepancy.items():
             sizes = (f"{v:.3g}" for v in (c.rms, c.corrected_rms, c.unattributed_rms, c.expected_rms))
-            table.add_row(name, c.unit, *sizes, f"{c.p_value:.2g}", c.status)
+            table.add_row(name, c.unit, *sizes, describe_p(c.p_value), c.status)
         console.print(table)
         console.print(
             "measured minus predicted; corrected: without the findings; left: without what is within tolerance as well", soft_wrap=True
@@ -151,8 +164,8 @@ def print_diagnosis(console: Console, d: Diagnosis) -> None:
         console.print(table)
         for f in d.findings:
             console.print(f"{f.cause}: {f.description}", markup=False, soft_wrap=True)
-    label = "unexplained" if d.verdict == "unexplained" else "left, and less than the noise"
     for trend in d.trends:
+        label = "unexplained" if is_contesting(d, trend) else "left, and less than the noise"
         console.print(f"{label}: {trend.text}", markup=False, soft_wrap=True)
     if d.handover is not None:
         console.print(f"corrected robot, {d.handover.describe()}", markup=False, soft_wrap=True)

@@ -28,7 +28,7 @@ _TURN_M = 0.3  # one radian counts as so many metres in the match of twists
 _TWIST = 1e-4
 _MIN_HALF_WINDOWS = 8
 _CLOCKS = ("wheel_time_offset_s", "lidar_time_offset_s", "gyro_time_offset_s")
-_PASSING = ("slope", "encoder_loss", "friction_change", "wheel_radius_drift", "wheel_lag_s", *_CLOCKS)
+_PASSING = ("slope", "encoder_loss", "friction_change", "friction_change_at_s", "wheel_radius_drift", "wheel_lag_s", *_CLOCKS)
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ def correct_robot(predictor: DrivePredictor, hypothesis: Hypothesis) -> Correcte
 def check_handover(predictor: DrivePredictor, linearization: Linearization, named: Sequence[str]) -> HandoverCheck | None:
     """Correct the robot by the first half of the drive, and predict the second half with it; ``named`` are the keys of the findings.
 
-    What was measured is corrected by the same findings, as a corrected mount or clock would. None for drives of a table, or without
-    motion in either half.
+    What was measured is corrected by the same findings, as a corrected mount or clock would. None for drives of a table, without motion in
+    either half, and where all findings are of this drive alone.
     """
     drive = predictor.drive
     half = len(drive.maneuvers) // 2
@@ -90,6 +90,8 @@ def check_handover(predictor: DrivePredictor, linearization: Linearization, name
     problem = make_regression(first[0], first[1][..., chosen], first[2], linearization.noise, causes, linearization.tolerance)
     sizes = problem.fit(tuple(range(len(causes))))[0]
     hypothesis = with_sizes(dict(zip(causes, (float(v) for v in sizes), strict=True)))
+    if _lasting(hypothesis) == Hypothesis() == _of_sensors(hypothesis):
+        return None
     corrected = correct_robot(predictor, hypothesis)
     factors = corrected.robot.geometry.radius_multipliers / drive.robot.geometry.radius_multipliers
     maneuvers = tuple(dataclasses.replace(m, wheels=m.wheels * factors, cg=m.cg + corrected.cg_shift) for m in drive.maneuvers)

@@ -23,7 +23,14 @@ from localization.diagnosis.findings import (
     evidence,
     sentence,
 )
-from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, slow_turn_sigmas
+from localization.diagnosis.linearization import (
+    TOLERANCE,
+    Linearization,
+    candidate_causes,
+    linearize,
+    make_predictor,
+    slow_turn_sigmas,
+)
 from localization.diagnosis.prediction import Baseline, DrivePredictor, with_sizes
 from localization.diagnosis.selection import (
     aliases_of,
@@ -57,7 +64,6 @@ from motion_models.base import MotionModel
 from motion_models.se2 import FloatArray
 
 _ROUNDS = 5
-TOLERANCE = 0.35  # sigma of unnamed causes, over what is negligible: the spread of robots about their files
 _SYSTEMATIC_SHARE = 1.0 / 3.0  # systematic part of a size's sigma, over what is negligible: clocks, mounts and physics are no better
 _MIN_HELDOUT_GAIN = 0.003  # least held-out gain of a finding
 _SUSPICION = 0.2  # family-wise p of a cause that is mentioned, but not named
@@ -116,8 +122,7 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
     """The same, with what pictures, patches and other methods start from."""
     config = config or DiagnosisConfig()
     if len(drive.maneuvers) < config.fewest_windows:
-        why = f"only {len(drive.maneuvers)} windows of motion were measured; it takes {config.fewest_windows}."
-        return DiagnosisResult(_undecidable(drive, model, drive.warnings[0] if drive.motion_reference == "none" else why), None, None)
+        return DiagnosisResult(_with_data_errors(_undecidable(drive, model, config), drive), None, None)
     predictor = make_predictor(drive, model, baseline)
     causes = candidate_causes(predictor, config.moments)
     first = linearize(predictor, causes, {}, TOLERANCE)
@@ -216,19 +221,17 @@ def _conclude(
         tolerances={e.id: e.negligible for e in causes if e.id in within},
         detectable_sizes=detectable,
         gain=_heldout(linearization, chosen, (), config) if chosen else None,
-        contradictions=() if drive.standstill_turn is None else (describe_standstill_turn(drive.standstill_turn),),
         outliers_s=tuple(float(t) for t in drive.starts_s[predictor.batch.owner][find_outliers(linearization)]),
         windows=len(drive.maneuvers),
         warnings=drive.warnings,
         hypothesis=with_sizes({causes[i]: float(size) for i, size in zip(chosen, sizes, strict=True)}),
         suspected=None if suspected is None else suspected[0],
     )
-    result = _with_data_errors(result, drive)
     handover = check_handover(predictor, linearization, [causes[i].key for i in chosen])
-    result = dataclasses.replace(result, handover=handover)
+    result = _with_data_errors(dataclasses.replace(result, handover=handover), drive)
     scale = np.sqrt(np.diagonal(problem.gram) + 1e-12)
     residuals = Residuals(first.rows, left, linearization.noise.sigmas, tuple(e.key for e in causes), problem.gram / np.outer(scale, scale))
-    return DiagnosisResult(dataclasses.replace(result, sentence=sentence(result)), predictor, residuals, linearization)
+    return DiagnosisResult(result, predictor, residuals, linearization)
 
 
 def _reference_sigmas(predictor: DrivePredictor) -> FloatArray:
@@ -291,7 +294,7 @@ def _make_findings(
         gained = problem.gain(chosen) - problem.gain(others)
         text = evidence(cause, linearization.signatures[..., i] * size, linearization.noise, gained)
         found.append((gained, Finding(cause, size, sigma, p, aliases, text, gains[n])))
-    return _merge_slopes([finding for _, finding in sorted(found, key=lambda pair: pair[0], reverse=True)])
+    return [finding for _, finding in sorted(found, key=lambda pair: pair[0], reverse=True)]
 
 
 def _suspect(predictor: DrivePredictor, linearization: Linearization, rng: np.random.Generator) -> tuple[Finding, str] | None:
@@ -301,7 +304,8 @@ def _suspect(predictor: DrivePredictor, linearization: Linearization, rng: np.ra
     if p > _SUSPICION:
         return None
     found = _make_findings(predictor, linearization, (i,), [heldout_gain(linearization, (i,), (), rng)], rng)[0]
-    if not found.is_plausible or (found.definition.one_sided and found.size < 0.0):
+    is_tolerated = abs(found.size) < found.definition.negligible
+    if is_tolerated or not found.is_plausible or (found.definition.one_sided and found.size < 0.0):
         return None
     return dataclasses.replace(found, p_value=p), confirming_drive(predictor, linearization, i, found.size)
 
@@ -329,16 +333,22 @@ def _within_tolerance(
 
 
 def _with_data_errors(d: Diagnosis, drive: Drive) -> Diagnosis:
-    """``d`` with missing messages as a finding, and without a consistent verdict where measurements contradict each other."""
+    """``d`` with its sentence, with missing messages as a finding, and without a consistent verdict where measurements contradict each
+    other."""
     verdict, findings, loss = d.verdict, d.findings, drive.message_loss
+    contradictions = () if drive.standstill_turn is None else (describe_standstill_turn(drive.standstill_turn),)
     if loss is not None and loss.share > MISSING_MESSAGES.negligible and loss.gaps >= _MIN_GAPS:
         none = Gain(*(float("nan"),) * 2, 0.0, 0.0, 0.0) if d.gain is None else Gain(d.gain.after, d.gain.after, 0.0, 0.0, 0.0)
         sigma = loss.share * math.sqrt(2.0 / loss.gaps)
         findings = (Finding(MISSING_MESSAGES, loss.share, sigma, 0.0, (), describe_loss(loss), none), *findings)
-        verdict = "explained" if verdict in ("consistent", "undecidable") else verdict
-    if d.contradictions and verdict == "consistent":
+        verdict = "explained" if verdict == "consistent" else verdict
+    if contradictions and verdict == "consistent":
         verdict = "unexplained"
-    return dataclasses.replace(d, verdict=verdict, findings=findings)
+    suspected, next_drive = (d.suspected, d.next_drive) if verdict == d.verdict or d.suspected is None else (None, "")
+    d = dataclasses.replace(
+        d, verdict=verdict, findings=findings, contradictions=contradictions, suspected=suspected, next_drive=next_drive
+    )
+    return dataclasses.replace(d, sentence=sentence(d))
 
 
 def _is_gain_significant(gain: Gain) -> bool:
@@ -346,23 +356,14 @@ def _is_gain_significant(gain: Gain) -> bool:
     return gain.relative >= _MIN_HELDOUT_GAIN and gain.low > 0.0
 
 
-def _merge_slopes(findings: list[Finding]) -> list[Finding]:
-    """Both directions of a slope are one finding."""
-    slopes = [f for f in findings if f.cause == "slope"]
-    if len(slopes) < 2:
-        return findings
-    size = math.hypot(slopes[0].size, slopes[1].size)
-    whole = dataclasses.replace(slopes[0], size=math.copysign(size, slopes[0].size))
-    return [whole if f is slopes[0] else f for f in findings if f is not slopes[1]]
-
-
-def _undecidable(drive: Drive, model: MotionModel, why: str) -> Diagnosis:
-    advice = general_advice("undecidable", [])
+def _undecidable(drive: Drive, model: MotionModel, config: DiagnosisConfig) -> Diagnosis:
+    why = f"only {len(drive.maneuvers)} windows of motion were measured; it takes {config.fewest_windows}."
     return Diagnosis(
         *(drive.name, drive.robot.name, model.name, drive.motion_reference, "undecidable", {}, (), ()),
         left_share=0.0,
-        next_drive=advice,
-        sentence=f"{model.name} cannot be diagnosed on this drive: {why} {advice}",
+        next_drive=general_advice("undecidable", []),
+        sentence="",
         windows=len(drive.maneuvers),
         warnings=drive.warnings,
+        too_little=drive.warnings[0] if drive.motion_reference == "none" else why,
     )

@@ -20,7 +20,7 @@ from localization.calibration.calibrate import MotionReferenceName, make_motion_
 from localization.calibration.motion_references import GyroMotionReference, MotionReference, Span, Wheels
 from localization.calibration.windows import WindowConfig, Windows, cut
 from localization.events import Event, ImuSample, Scan, WheelSample
-from localization.gyro import GyroBuffer
+from localization.gyro import GyroRecord
 from localization.logs.reader import Log
 from localization.simulation.experiments import CONFIGURATION_CGS, CONTROLLERS, TRAJECTORIES
 from motion_models import se2
@@ -33,11 +33,13 @@ from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
 _NS = 1e-9
-_FOREVER_S = 1e6
 _GRIPPERS = ("left_gripper", "gripper", "tool0", "left_tool0")
 _MIN_GRAVITY, _MAX_GRAVITY = 8.0, 12.0
 _MAX_STANDSTILL_RATE = 0.05  # rad/s; five sigma of plausible gyro biases (`causes`): a robot that turns while its wheels stand
 _MIN_REGULAR_SHARE = 0.6  # of the intervals between messages that must be near their median for messages to have a period
+_FEWEST_GAPS = 50
+_SHORT_GAPS = 0.2  # quantile of the gaps that is the period where up to four fifths of the messages are missing at random
+_MULTIPLE, _MIN_MULTIPLES_SHARE = 0.15, 0.9  # a gap so near a multiple of the period fits it (of any gaps 30 % do); share that must
 _MAX_PAUSE_S = 5.0  # longer gaps are pauses of the driver, not lost messages
 
 COLUMNS = ("trajectory", "arm_configuration", "controller", "vision_error_m")
@@ -60,7 +62,7 @@ class StandstillTurn(NamedTuple):
     seconds: float
     angle_rad: float
     first_s: float
-    """Start of the first such window, since the first window."""
+    """Start of the first such window, after that of the first in which the robot moved."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +77,10 @@ class Drive:
     kind: str = "log"
     """log, windows, rotations or runs."""
     starts_s: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """(W,) when each maneuver began; for tables, how much was driven before."""
+    """(W,) when each maneuver began, after the first one [s]; for tables, how much was driven before."""
     spans_ns: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     """(W, 2) start and end stamps; (0, 2) for tables."""
-    gyro: GyroBuffer | None = None
+    gyro: GyroRecord | None = None
     """All of the gyro; None without one, or where it is itself the motion reference."""
     is_gyro_reference: bool = False
     forces: FloatArray | None = None
@@ -136,7 +138,7 @@ class _Imu:
 
     def __init__(self, robot: Robot, mounts: Any) -> None:
         self._mounts = mounts
-        self.gyro = GyroBuffer(robot.gyro_noise, mounts, keep_s=_FOREVER_S)
+        self.gyro = GyroRecord(robot.gyro_noise, mounts)
         self.stamps: list[int] = []
         self.forces: list[FloatArray] = []
 
@@ -240,11 +242,16 @@ def drive_of_events(
         payload_arms=_payload_arms(robot, windows.maneuvers, postures),
         range_slopes=recorder.range_slopes(),
         message_loss=find_message_loss(np.array(wheel_stamps, dtype=np.int64)),
-        standstill_turn=find_standstill_turn(imu.gyro, recorder.standing) if imu.stamps else None,
+        standstill_turn=find_standstill_turn(imu.gyro, recorder.standing, spans) if imu.stamps else None,
         lidar_frame=frame,
         lidar_at=(mount.x, mount.y),
-        warnings=(left, *windows.warnings),
+        warnings=(left, *([_describe_gaps(imu.gyro)] if imu.gyro.gaps else []), *windows.warnings),
     )
+
+
+def _describe_gaps(gyro: GyroRecord) -> str:
+    gaps = "a gap" if gyro.gaps == 1 else f"{gyro.gaps} gaps"
+    return f"the IMU has {gaps} of {gyro.silent_s:.2g} s in all: headings follow the motion reference there. Check its driver and cable."
 
 
 def _describe_windows(windows: Windows, spans: IntArray, config: WindowConfig) -> str:
@@ -260,23 +267,38 @@ def _describe_windows(windows: Windows, spans: IntArray, config: WindowConfig) -
 def find_message_loss(stamps: IntArray) -> MessageLoss | None:
     """Missing messages by gaps in ``stamps`` (n,) [ns]; None where messages come at no regular rate."""
     gaps = np.diff(stamps) * _NS
-    if len(gaps) < 50:
-        return None
-    period = float(np.median(gaps))
-    if period <= 0.0 or float(np.mean(np.abs(gaps - period) < 0.3 * period)) < _MIN_REGULAR_SHARE:
+    period = find_period(gaps)
+    if period is None:
         return None
     holes = gaps[(gaps > 1.6 * period) & (gaps < _MAX_PAUSE_S)]
     missing = float(np.sum(np.round(holes / period) - 1.0))
     return MessageLoss(missing / (missing + len(stamps)), len(holes), float(holes.max(initial=0.0)), period)
 
 
-def find_standstill_turn(gyro: GyroBuffer, standing: Sequence[Span]) -> StandstillTurn | None:
-    """Turning by ``gyro`` in the windows in which no wheel moved; None where it stood as well."""
+def find_period(gaps: FloatArray) -> float | None:
+    """The time from message to message, by the ``gaps`` (n,) between them [s]: their median where most are near it; where many messages are
+    missing, a shorter one of which nearly all are multiples; else None."""
+    if len(gaps) < _FEWEST_GAPS:
+        return None
+    period = float(np.median(gaps))
+    if period > 0.0 and float(np.mean(np.abs(gaps - period) < 0.3 * period)) >= _MIN_REGULAR_SHARE:
+        return period
+    short = float(np.quantile(gaps, _SHORT_GAPS))
+    if short <= 0.0:
+        return None
+    period = float(np.median(gaps[np.abs(gaps - short) < 0.3 * short]))
+    multiples = gaps / period
+    is_multiple = np.abs(multiples - np.maximum(np.round(multiples), 1.0)) < _MULTIPLE
+    return period if float(is_multiple.mean()) >= _MIN_MULTIPLES_SHARE else None
+
+
+def find_standstill_turn(gyro: GyroRecord, standing: Sequence[Span], moving: IntArray) -> StandstillTurn | None:
+    """Turning by ``gyro`` in the windows in which no wheel moved; None where it stood as well. ``moving`` (W, 2) are the others [ns]."""
     turns = [(s, gyro.turn(s.start_ns, s.end_ns, 0.0)) for s in standing]
     moved = [(s, t) for s, t in turns if t is not None and t.duration > 0.0 and abs(t.angle) > _MAX_STANDSTILL_RATE * t.duration]
     if not moved:
         return None
-    first = (moved[0][0].start_ns - standing[0].start_ns) * _NS
+    first = (moved[0][0].start_ns - (int(moving[0, 0]) if len(moving) else standing[0].start_ns)) * _NS
     return StandstillTurn(sum(t.duration for _, t in moved), sum(abs(t.angle) for _, t in moved), first)
 
 

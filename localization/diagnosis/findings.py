@@ -23,6 +23,9 @@ that no cause has (`tests.studies.unknown_effects --develop`)."""
 
 _SHOWN_GAIN = 0.01  # smallest gain that a sentence reports: in short drives tolerated differences mask it
 
+_NOT_SHOWN = "This drive cannot show what is wrong with {}."
+_MAX_SUSPECTED_ALIASES = 3  # that a sentence names
+
 _CHANNEL_WORDS = {
     "x": "along the drive",
     "y": "sideways",
@@ -146,7 +149,7 @@ class Component:
             "unit": self.unit,
             "rms": self.rms,
             "expected_rms": self.expected_rms,
-            "p_value": self.p_value,
+            "p_value": None if math.isnan(self.p_value) else self.p_value,
             "rms_explained": self.corrected_rms,
             "rms_unattributed": self.unattributed_rms,
             "noise_over_reference": self.noise_over_reference,
@@ -164,16 +167,23 @@ class Trend:
     along: str
     t: float
     p_value: float
+    """Probability that noise alone would follow any trend as well; for one in place of findings the ratio of the likelihoods, at most 1."""
     over_noise: float
     """Its root mean square over the noise of the component."""
     instead_of: str = ""
-    """The finding that it explains the drive better than; empty for a trend beside the findings."""
+    """The findings in whose place it explains the drive; empty for a trend beside the findings."""
+    lead: float = 0.0
+    """Log-likelihood by which it explains the drive better than these, below 0 where it is preferred as one number in place of several."""
 
     @property
     def text(self) -> str:
-        """The trend in a sentence, with t and p."""
+        """The trend in a sentence, with t and p or log-likelihood."""
+        if self.instead_of and self.lead > 0.0:
+            return (
+                f"{self.component} follows {self.along} better than {self.instead_of} (t = {self.t:+.1f}, log-likelihood +{self.lead:.0f})"
+            )
         if self.instead_of:
-            return f"{self.component} follows {self.along} better than {self.instead_of} (t = {self.t:+.1f}, p = {self.p_value:.2g})"
+            return f"{self.component} follows {self.along}, one trend in place of {self.instead_of} (log-likelihood {self.lead:+.0f})"
         size = f"{self.over_noise:.2g} times its noise"
         return f"the {self.component} left over follows {self.along} (t = {self.t:+.1f}, p = {self.p_value:.2g}, {size})"
 
@@ -232,6 +242,8 @@ class Diagnosis:
     """When windows began that no cause explains to eight sigma: jumps of the reference, or events on the floor."""
     windows: int = 0
     warnings: tuple[str, ...] = ()
+    too_little: str = ""
+    """Why the drive was not searched for causes: too little was measured."""
     hypothesis: Hypothesis = field(default_factory=Hypothesis)
     suspected: Finding | None = None
     """Where the verdict is consistent: the strongest cause, too weak to be named, but stronger than four in five healthy drives show."""
@@ -284,10 +296,12 @@ def describe_loss(loss: MessageLoss) -> str:
 
 def describe_standstill_turn(turn: StandstillTurn) -> str:
     """A gyro that turns while the wheels stand, and what to check."""
+    first = f"first at {turn.first_s:.0f} s" if turn.first_s >= 0.0 else f"first {-turn.first_s:.0f} s before it drove"
+    angle, rate = math.degrees(turn.angle_rad), math.degrees(turn.angle_rad / turn.seconds)
     return (
-        f"in {turn.seconds:.0f} s of standing by the wheels, first at {turn.first_s:.0f} s, the gyro turned "
-        f"{math.degrees(turn.angle_rad):.0f} deg: "
-        "the wheels' messages are wrong or belong to another time, or the robot was carried; check the joint states' topic and names."
+        f"in {turn.seconds:.0f} s of standing by the wheels, {first}, the gyro turned {angle:.0f} deg: its bias is {rate:.2g} deg/s, the "
+        "wheels' messages are wrong or belong to another time, or the robot was carried; check the joint states' topic and names, and the "
+        "gyro at rest."
     )
 
 
@@ -297,9 +311,14 @@ def describe_tolerated(d: Diagnosis) -> list[str]:
     for name, (size, sigma) in d.within.items():
         if d.suspected is not None and name == d.suspected.cause:
             continue
-        unit = _unit_of(name)
+        unit = unit_of(name)
         found.append(f"{name} {size:+.2g} +- {sigma:.1g}{unit} (tolerated {d.tolerances.get(name, math.nan):.2g}{unit})")
     return found
+
+
+def describe_p(p: float) -> str:
+    """The p of a row as tables show it."""
+    return "-" if math.isnan(p) else f"{p:.2g}"
 
 
 def describe_row(row: Component) -> str:
@@ -326,25 +345,33 @@ def describe_outliers(d: Diagnosis) -> list[str]:
     ]
 
 
-def _unit_of(name: str) -> str:
+def unit_of(name: str) -> str:
+    """The unit of a cause's size after a space; empty for ratios."""
     cause = CAUSES.get(name) or WINDOW_CAUSES.get(name)
     return "" if cause is None or cause.unit == "1" else f" {cause.unit}"
 
 
+def correctable_findings(d: Diagnosis) -> list[Finding]:
+    """Those that a robot is corrected by: none beside sizes that no robot has, or where a trend explains the drive in their place."""
+    estimated = [f for f in d.findings if f.cause != MISSING_MESSAGES.id]
+    is_contested = any(t.instead_of for t in d.trends) or not all(f.is_plausible for f in estimated)
+    return [] if is_contested else estimated
+
+
 def sentence(d: Diagnosis) -> str:
-    """What to do, in one or two sentences: nothing is corrected beside sizes that no robot has, or that a trend contests."""
+    """What to do, in one or two sentences."""
     contradiction = f" {d.contradictions[0][0].upper()}{d.contradictions[0][1:]}" if d.contradictions else ""
+    missing = [f"{f.description} ({f.evidence})" for f in d.findings if f.cause == MISSING_MESSAGES.id]
     if d.verdict == "undecidable":
-        return f"This drive cannot show what is wrong with {d.model}. {d.next_drive}{contradiction}"
+        cannot = f"{d.model} cannot be diagnosed on this drive: {d.too_little}" if d.too_little else _NOT_SHOWN.format(d.model)
+        found = "".join(f" {text[0].upper()}{text[1:]}." for text in missing)
+        return f"{cannot}{found}{contradiction} {d.next_drive}"
     if d.verdict == "consistent":
         text = f"Nothing beyond tolerances is wrong with {d.model} on this drive that {d.windows} windows could show"
         tolerated = describe_tolerated(d)
         text += f"; within tolerance: {', '.join(tolerated)}." if tolerated else "."
         return text if d.suspected is None else f"{text} {_suspicion(d.suspected)}"
-    estimated = [f for f in d.findings if f.cause != MISSING_MESSAGES.id]
-    if any(t.instead_of for t in d.trends) or not all(f.is_plausible for f in estimated):
-        estimated = []
-    missing = [f"{f.description} ({f.evidence})" for f in d.findings if f.cause == MISSING_MESSAGES.id]
+    estimated = correctable_findings(d)
     parts = [f"{part[0].upper()}{part[1:]}" for part in ([_correction(d, estimated)] if estimated else []) + missing]
     left = _left(d) if d.verdict == "unexplained" else ""
     if left:
@@ -356,28 +383,45 @@ def sentence(d: Diagnosis) -> str:
 def _correction(d: Diagnosis, findings: Sequence[Finding]) -> str:
     """What to correct, strongest finding first."""
     first = findings[0]
-    text = f"Correct {first.cause} by {first.size:+.3g}{_unit_of(first.cause)} (+- {first.sigma:.1g}): {first.description}"
+    text = f"Correct {first.cause}, off by {first.size:+.3g}{unit_of(first.cause)} (+- {first.sigma:.1g}): {first.description}"
     whole = d.gain or first.gain
     if whole.relative >= _SHOWN_GAIN:
         text += f"; held-out discrepancies fall by {100 * whole.relative:.0f} %"
     if first.aliases:
-        text += f". This drive cannot separate it from {', '.join(f'{name} {size:+.3g}' for name, size in first.aliases)}"
+        text += f". This drive cannot separate it from {_sizes(first.aliases)}"
     if len(findings) > 1:
-        text += f". Then {', '.join(f'{f.cause} by {f.size:+.3g} ({f.description})' for f in findings[1:])}"
+        text += f". Then {', '.join(_further(f) for f in findings[1:])}"
     return text
+
+
+def _further(f: Finding) -> str:
+    aliases = f", or {_sizes(f.aliases)}" if f.aliases else ""
+    return f"{f.cause}, off by {f.size:+.3g}{unit_of(f.cause)} ({f.description}{aliases})"
+
+
+def _sizes(aliases: Sequence[tuple[str, float]]) -> str:
+    return ", ".join(f"{name} {size:+.3g}{unit_of(name)}" for name, size in aliases)
 
 
 def _suspicion(f: Finding) -> str:
     """What shows, but may be noise."""
-    aliases = "".join(f" or {name} {size:+.3g}{_unit_of(name)}" for name, size in f.aliases)
-    size = f"{f.size:+.3g}{_unit_of(f.cause)} (+- {f.sigma:.1g}, tolerated {f.definition.negligible:.2g})"
-    return f"Too weak to be named is {f.cause} {size}{aliases}: up to {100 * f.p_value:.0f} % of healthy drives show as much."
+    aliases = "".join(f" or {name} {size:+.3g}{unit_of(name)}" for name, size in f.aliases[:_MAX_SUSPECTED_ALIASES])
+    size = f"{f.size:+.3g}{unit_of(f.cause)} (+- {f.sigma:.1g}, tolerated {f.definition.negligible:.2g})"
+    share = f"up to {100 * f.p_value:.0f} %" if f.p_value >= 0.005 else "less than 1 %"
+    return f"Too weak to be named is {f.cause} {size}{aliases}: {share} of healthy drives show as much."
+
+
+def is_contesting(d: Diagnosis, trend: Trend) -> bool:
+    """Whether ``trend`` makes a row of the table unexplained; others are less than the noise."""
+    row = d.discrepancy.get(trend.component)
+    return bool(trend.instead_of) or (row is not None and bool(row.trend))
 
 
 def _left(d: Diagnosis) -> str:
     """What no cause accounts for: trends, else rows of the table."""
-    if d.trends:
-        return d.trends[0].text
+    contesting = [trend for trend in d.trends if is_contesting(d, trend)]
+    if contesting:
+        return contesting[0].text
     implausible = [f"{f.cause} {f.size:+.2g}" for f in d.findings if not f.is_plausible]
     if implausible:
         return f"{' and '.join(implausible)} would fit, but are more than robots have"

@@ -30,8 +30,10 @@ from motion_models.friction import FrictionModel
 from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
 
-MAX_TOLERANCE_SIGMAS = 3.0
-"""Largest size of a cause that is not named, over the sigma of its tolerance: about what is negligible (see `diagnose.TOLERANCE`)."""
+TOLERANCE = 0.35
+"""Sigma of unnamed causes, over what is negligible: the spread of robots about their files."""
+MAX_TOLERANCE_SIGMAS = 1.0 / TOLERANCE
+"""Largest size of a cause that is not named, over the sigma of its tolerance: what is negligible."""
 _ROUNDS = 8
 _MOTION = 3  # channels of the motion itself
 _MIN_FREE_SHARE = 0.1  # of all numbers, however many causes there are
@@ -42,6 +44,7 @@ _TURN_ERROR_OVER_LOG_SPEED = 0.065
 """How far a robot turns for the same way of the wheels, over the logarithm of their speed: DRIVE's Husky, by its gyro, turns 0.42 of the
 geometry's angle where the sides' speeds differ from their mean by 0.4 to 0.8 m/s, and 0.49 where by 0.03 to 0.1 m/s; slower, there is
 no data of turns in place."""
+_FEWEST_FOR_NOISE = 4  # windows; of fewer the noise is the claimed one
 _NO_SIZE = 1e-6  # sigma of a size that is not there, in units of its prior's
 _CLIP = 9.0  # squares beyond this many variances are outliers, and count as this much
 
@@ -126,7 +129,8 @@ def estimate_noise(
     sigmas = np.ones_like(left)
     for channel in range(left.shape[1]):
         use = known[:, channel]
-        if use.sum() < 4:
+        if use.sum() < _FEWEST_FOR_NOISE:
+            sigmas[use, channel] = claimed_sigmas[use, channel]
             continue
         squares, by_model = left[use, channel] ** 2 * inflate[channel], creep[use, channel] ** 2
         f = features[use]

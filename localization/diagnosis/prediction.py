@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -185,9 +186,10 @@ class DrivePredictor:
                     prior = (0.0, _GYRO_TURN_SIGMA_RAD / _GYRO_SCALE_SIGMA, 0.0)  # of the scale, where the robot hardly turns
                     off, *columns = np.array([*known, prior]).T
                     (scale, bias), *_ = np.linalg.lstsq(np.column_stack(columns), off, rcond=None)
-                origin = int(drive.spans_ns[0, 0])
-                found = [drive.gyro.turn(origin, int(a), 0.0) for a in drive.spans_ns[:, 0]]
-                return np.array([0.0 if t is None else (t.angle - bias * t.duration) / (1.0 + scale) for t in found])
+                starts = drive.spans_ns[:, 0]
+                between = [drive.gyro.turn(int(a), int(b), 0.0) for a, b in itertools.pairwise(starts)]
+                turned = [y if t is None else (t.angle - bias * t.duration) / (1.0 + scale) for t, y in zip(between, yaw[:-1], strict=True)]
+                return np.array([0.0, *itertools.accumulate(turned)])
         return np.asarray(np.cumsum(yaw) - yaw)
 
     def _accelerations(self) -> FloatArray:
@@ -229,9 +231,10 @@ class DrivePredictor:
             late = round((hypothesis.lidar_time_offset_s - hypothesis.gyro_time_offset_s) * 1e9)
             for i, (a, b) in enumerate(drive.spans_ns):
                 turn = drive.gyro.turn(int(a) - late, int(b) - late, float(batch.measured[i, 2]))
-                if turn is not None:
-                    angle = turn.angle / (1.0 + hypothesis.gyro_scale)
-                    out[i, 3] = angle - batch.measured[i, 2] - hypothesis.gyro_bias * turn.duration
+                if turn is not None:  # times the predicted turn: the measured one's noise and bias would look like a scale
+                    out[i, 3] = (
+                        turn.angle - batch.measured[i, 2] - hypothesis.gyro_scale * poses[i, 2] - hypothesis.gyro_bias * turn.duration
+                    )
         if drive.forces is not None:
             middle = self.headings + 0.5 * batch.measured[:, 2]
             c, s = np.cos(middle), np.sin(middle)

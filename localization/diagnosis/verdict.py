@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 
 from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause, Hypothesis
 from localization.diagnosis.drive import drive_of_table
@@ -163,10 +163,9 @@ def find_better_trends(predictor: DrivePredictor, linearization: Linearization, 
         else:
             margin = price(problem.count, n, 1) - price(problem.count, groups, len(replaced))
         if lead > margin:
-            p = min(1.0, n * float(chi2.sf(max(lead, 0.0), 1)))
             names_replaced = " and ".join(dict.fromkeys(linearization.causes[i].id for i in replaced))
             over = math.sqrt(max(lead, 0.0) / len(linearization.rows))
-            found.append(Trend(*names[best], float(t[best]), p, over, names_replaced))
+            found.append(Trend(*names[best], float(t[best]), min(math.exp(-0.5 * lead), 1.0), over, names_replaced, 0.5 * lead))
     return tuple(found)
 
 
@@ -230,7 +229,8 @@ def attribute_rows(
     named = linearization.linear - linearization.signatures[..., list(chosen)] @ sizes
     rest = named - np.nan_to_num(linearization.signatures) @ every
     every[list(chosen)] = sizes
-    white, white_rest = linearization.noise.whiten(first.rows), linearization.noise.whiten(rest)
+    alone = dataclasses.replace(linearization.noise, mixing=np.eye(len(CHANNELS)))  # a row is tested by itself
+    white, white_rest = alone.whiten(first.rows), alone.whiten(rest)
     weighed = rest * linearization.noise.weights[:, None]  # as in the fit: a single window between four and eight sigma is no shape
     parts = np.nan_to_num(linearization.signatures) * every / linearization.noise.sigmas[..., None]
     scaled = np.nan_to_num(first.rows) / linearization.noise.sigmas
@@ -241,9 +241,7 @@ def attribute_rows(
             continue
         rms, corrected_rms, rest_rms = (_rms(rows[known, c], c) for rows in (first.rows, named, weighed))
         expected = float(np.sqrt(np.mean(linearization.noise.sigmas[known, c] ** 2)))
-        squares = float(np.sum(white[known, c] ** 2))
-        count = int(known.sum())
-        p = float(chi2.sf(squares if c < _TESTED_CHANNELS else count, count))
+        p = float(f_distribution.sf(np.mean(white[known, c] ** 2), int(known.sum()), alone.freedom)) if c < _TESTED_CHANNELS else math.nan
         excess = noise_excess(linearization, reference_sigmas, known, c)
         if expected < _MODEL_ACCURACY * rms:
             excess = min(excess, MAX_NOISE_OVER_REFERENCE)
@@ -322,9 +320,13 @@ def candidate_maneuvers(speed: float, radius: float, cg: FloatArray, has_arms: b
 
     def table(left: FloatArray, right: FloatArray, at: FloatArray) -> list[Maneuver]:
         wheels = np.column_stack([left, right])
-        ends = np.array([_WINDOW])
-        parts = [wheels[i : i + _WINDOW] for i in range(0, n, _WINDOW)]
-        return [Maneuver(np.full(_WINDOW, _DT), p, np.zeros((1, 3)), ends, at, np.diag(_SIGMA**2)) for p in parts]
+        found = []
+        for i in range(0, n, _WINDOW):  # with what came before: clocks show where the wheels' rates change
+            before = min(i, _WINDOW)
+            rates = wheels[i - before : i + _WINDOW]
+            motion = np.zeros((1, 3)), np.array([_WINDOW])
+            found.append(Maneuver(np.full(len(rates), _DT), rates, *motion, at, np.diag(_SIGMA**2), lead=before))
+        return found
 
     found = [
         ("straight driving, forwards and backwards", table(rate * wave, rate * wave, cg)),
@@ -354,23 +356,25 @@ def separating_drive(predictor: DrivePredictor, findings: Sequence[Finding]) -> 
     if not rivals:
         return ""
     finding = rivals[0]
+    listed = ", ".join([finding.cause, *(name for name, _ in finding.aliases[:3])]) + f" and {finding.aliases[:4][-1][0]}"
     named = [(CAUSES.get(name) or WINDOW_CAUSES.get(name), size) for name, size in finding.aliases[:4]]
     pairs = [(finding.definition, finding.size), *((cause, size) for cause, size in named if cause is not None)]
     base = with_sizes({f.definition: f.size for f in findings if f is not finding})
-    best = ("", 1e-3)
+    best, is_shown = ("", 1e-3), np.zeros(len(pairs), dtype=bool)
     for text, tried in _candidate_drives(predictor):
         start = tried.discrepancies(base)[:, :3]
         moved = [(start - tried.discrepancies(cause.inject(base, size))[:, :3]) / _SIGMA for cause, size in pairs]
+        is_shown |= [bool(np.any(change)) for change in moved]
         # a rival may take whatever size it likes in the new drive, but then it no longer fits the old one
         information = min((float(np.sum((moved[0] - other) ** 2)) for other in moved[1:]), default=0.0)
         if information > 1.05 * best[1]:
             best = text, information
-    *names, last = finding.cause, *(name for name, _ in finding.aliases[:4])
-    listed = f"{', '.join(names)} and {last}"
     seconds = max(_SECONDS, 5.0 * math.ceil(_SECONDS * _ENOUGH / best[1] / 5.0))
-    if not best[0] or seconds > _MAX_S:
-        return f"No drive of two minutes separates {listed}: measure one of them directly."
-    return f"To separate {listed}, record about {seconds:.0f} s of {best[0]}."
+    if best[0] and seconds <= _MAX_S:
+        return f"To separate {listed}, record about {seconds:.0f} s of {best[0]}."
+    if not is_shown.all() or len(pairs) < len(named) + 1:  # errors of gyro, ranges and encoders, changes on the way
+        return f"To separate {listed}, record two minutes: standing, turning in place to both sides, slow and fast, and straight driving."
+    return f"No drive of two minutes separates {listed}: measure one of them directly."
 
 
 def confirming_drive(predictor: DrivePredictor, linearization: Linearization, i: int, size: float) -> str:

@@ -7,7 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from localization.diagnosis.diagnose import DiagnosisResult
-from localization.diagnosis.findings import Diagnosis, describe_outliers, describe_row, describe_tolerated
+from localization.diagnosis.findings import (
+    Diagnosis,
+    describe_outliers,
+    describe_p,
+    describe_row,
+    describe_tolerated,
+    is_contesting,
+    unit_of,
+)
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS
 from localization.report.figures import Axes, svg
 from localization.report.figures import Figure as Canvas
@@ -64,7 +72,8 @@ def diagnosis_page(found: DiagnosisResult) -> str:
         Section("Corrected robot: before and after", _handover(d)),
         Section("Within tolerance", bullets(describe_tolerated(d))),
         Section("Contradictions", bullets(d.contradictions)),
-        Section("Left unexplained", bullets([s.text for s in d.trends])),
+        Section("Left unexplained", bullets([t.text for t in d.trends if is_contesting(d, t)])),
+        Section("Left, and less than the noise", bullets([t.text for t in d.trends if not is_contesting(d, t)])),
         Section("What this drive would show", _detectable(d)),
         Section("About the log", bullets([*describe_outliers(d), *d.warnings])),
         glossary(_TERMS),
@@ -110,7 +119,7 @@ def _components(d: Diagnosis) -> list[Block]:
     for name, c in d.discrepancy.items():
         sizes = (f"{v:.3g}" for v in (c.rms, c.corrected_rms, c.unattributed_rms, c.expected_rms))
         status = Cell(c.status, describe_row(c).removeprefix(c.status).strip(": "))
-        rows.append([*(Cell(text) for text in (name, c.unit, *sizes, f"{c.p_value:.2g}")), status])
+        rows.append([*(Cell(text) for text in (name, c.unit, *sizes, describe_p(c.p_value))), status])
     return [Table([Cell(title) for title in ("Component", "Unit", "RMS", "Corrected", "Left", "Noise", "p", "Attributed to")], rows)]
 
 
@@ -123,8 +132,10 @@ def _handover(d: Diagnosis) -> list[Block]:
 
 
 def _detectable(d: Diagnosis) -> list[Block]:
-    rows = [[Cell(name, is_code=True), Cell(f"{size:.3g}")] for name, size in d.detectable_sizes.items()]
-    return [Table([Cell("Cause"), Cell("Smallest size that this drive would show (3 sigma)")], rows)] if rows else []
+    rows = [[Cell(name, is_code=True), Cell(f"{size:.3g}{unit_of(name)}")] for name, size in d.detectable_sizes.items()]
+    return (
+        [Table([Cell("Cause"), Cell("Smallest size that this drive would show (3 sigma, nothing else deviating)")], rows)] if rows else []
+    )
 
 
 def _discrepancy_svg(found: DiagnosisResult) -> str:

@@ -7,8 +7,15 @@ from pathlib import Path
 
 import pytest
 
+from localization.calibration.calibrate import make_motion_reference
+from localization.calibration.windows import WindowConfig
+from localization.diagnosis.diagnose import examine
+from localization.diagnosis.drive import drive_of_events
 from localization.diagnosis.findings import Diagnosis
-from tests.helpers.diagnosis_drives import ONE_SIDED, TYPICAL, bag, diagnose_bag, drive
+from localization.events import ImuSample
+from localization.logs import open_log
+from motion_models.registry import make_model
+from tests.helpers.diagnosis_drives import ONE_SIDED, TYPICAL, bag, diagnose_bag, drive, robot_named
 
 CASES = [(cause, size if cause in ONE_SIDED or i % 2 == 0 else -size, 300 + i) for i, (cause, size) in enumerate(TYPICAL.items())]
 
@@ -173,3 +180,24 @@ def test_diagnose_minor_second_cause_keeps_the_first(diagnosed: Diagnosed) -> No
     assert found.verdict in ("explained", "ambiguous")
     assert [f.cause for f in found.findings] == ["diagonal_load"]
     assert found.findings[0].size == pytest.approx(0.15, abs=3.0 * found.findings[0].sigma)
+
+
+def test_diagnose_change_of_the_floor_has_no_handover(diagnosed: Diagnosed) -> None:
+    """No robot file holds it, so that there is nothing to compare."""
+    found = diagnosed({"friction_change": 0.3}, 312)
+    assert [f.cause for f in found.findings] == ["friction_change"]
+    assert found.handover is None
+
+
+def test_diagnose_slope_in_a_log_with_gap_of_the_imu(tmp_path: Path) -> None:
+    """Headings go on by scan matching; the gap is reported."""
+    robot, config = robot_named("vaultbot"), WindowConfig()
+    log = open_log(bag(tmp_path / "drive.mcap", {"slope": 0.05}, 318, "vaultbot", drive("tour")), robot)
+    events = list(log.events())
+    gap = events[0].stamp_ns + 20 * 10**9, events[0].stamp_ns + 21 * 10**9
+    kept = [e for e in events if not (isinstance(e, ImuSample) and gap[0] < e.stamp_ns < gap[1])]
+    reference = make_motion_reference(log, robot, "auto", None, config)
+    found = examine(drive_of_events(kept, "gap", robot, log.mounts, reference, config), make_model("friction", robot)).diagnosis
+    assert (found.verdict, found.findings[0].cause) == ("explained", "slope")
+    assert found.findings[0].size == pytest.approx(0.05, abs=3.0 * found.findings[0].sigma)
+    assert any("the IMU has a gap of 1" in warning for warning in found.warnings)

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from localization.calibration.motion_references import Span, TrackMotionReference, Wheels
-from localization.diagnosis.drive import MessageLoss, find_message_loss, find_standstill_turn
+from localization.diagnosis.diagnose import examine
+from localization.diagnosis.drive import Drive, MessageLoss, StandstillTurn, find_message_loss, find_standstill_turn
 from localization.evaluation.references import ReferenceTrack
 from localization.events import ImuSample, WheelSample
-from localization.gyro import GyroBuffer
+from localization.gyro import GyroRecord
 from localization.wheel_buffer import WheelBuffer
+from motion_models.calibration.maneuvers import Maneuver
 from motion_models.registry import make_model
 from motion_models.robot import GyroNoise, load_robot
 
@@ -32,13 +34,24 @@ def test_find_message_loss_pause_is_no_loss() -> None:
     assert loss.share == 0.0
 
 
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
+def test_find_message_loss_of_most_messages_is_counted(share: float) -> None:
+    """At random, with stamps that jitter by a twentieth of the period."""
+    rng = np.random.default_rng(1)
+    stamps = (np.arange(2000) + rng.normal(0.0, 0.05, 2000)) * PERIOD_NS
+    loss = find_message_loss(stamps[rng.random(2000) >= share].astype(np.int64))
+    assert loss is not None
+    assert loss.share == pytest.approx(share, abs=0.05)
+    assert loss.period_s == pytest.approx(0.02, rel=0.15)
+
+
 def test_find_message_loss_irregular_messages_have_no_period() -> None:
     stamps = np.cumsum(np.random.default_rng(0).exponential(0.02, 500) * 1e9).astype(np.int64)
     assert find_message_loss(stamps) is None
 
 
-def gyro(rate: float) -> GyroBuffer:
-    buffer = GyroBuffer(GyroNoise(), {}, keep_s=1e6)
+def gyro(rate: float) -> GyroRecord:
+    buffer = GyroRecord(GyroNoise(), {})
     for i in range(600):
         buffer.insert(ImuSample(i * PERIOD_NS, np.array([0.0, 0.0, rate]), np.array([0.0, 0.0, 9.81])))
     return buffer
@@ -47,10 +60,11 @@ def gyro(rate: float) -> GyroBuffer:
 @pytest.mark.parametrize(("rate", "is_contradiction"), [(0.3, True), (0.004, False)])
 def test_find_standstill_turn_needs_more_than_a_bias(rate: float, is_contradiction: bool) -> None:
     standing = [Span(i * 10**9, (i + 2) * 10**9, np.zeros(3), np.eye(3)) for i in range(2, 8, 2)]
-    turn = find_standstill_turn(gyro(rate), standing)
+    turn = find_standstill_turn(gyro(rate), standing, np.array([[10**9, 2 * 10**9]]))
     assert (turn is not None) == is_contradiction
     if turn is not None:
         assert turn.seconds == pytest.approx(6.0)
+        assert turn.first_s == pytest.approx(1.0)
         assert turn.angle_rad == pytest.approx(6.0 * rate, rel=0.01)
 
 
@@ -71,3 +85,30 @@ def test_track_reference_sparse_poses_give_windows_between_them() -> None:
     assert all(span.is_valid for span in found)
     assert {span.end_ns - span.start_ns for span in found} == {3_200_000_000}
     assert found[0].measured[0] == pytest.approx(1.6)
+
+
+def test_gyro_record_with_gap_gives_turns_on_either_side() -> None:
+    record = GyroRecord(GyroNoise(), {})
+    for i in (*range(200), *range(300, 500)):
+        record.insert(ImuSample(i * PERIOD_NS, np.array([0.0, 0.0, 0.2]), np.array([0.0, 0.0, 9.81])))
+    before, after = record.turn(0, 100 * PERIOD_NS, 0.0), record.turn(310 * PERIOD_NS, 410 * PERIOD_NS, 0.0)
+    assert before is not None
+    assert after is not None
+    assert [before.angle, after.angle] == pytest.approx([0.4, 0.4])
+    assert record.turn(100 * PERIOD_NS, 400 * PERIOD_NS, 0.0) is None
+    assert (record.gaps, record.silent_s) == (1, pytest.approx(2.02))
+
+
+@pytest.mark.parametrize("moving", [0, 3])
+def test_examine_of_standing_wheels_reports_the_turning_gyro(moving: int) -> None:
+    """Wheels' messages that are frozen leave nothing to diagnose but this."""
+    robot = load_robot("jackal")
+    maneuver = Maneuver(np.full(20, 0.1), np.ones((20, 2)), np.zeros((1, 3)), np.array([20]), np.zeros(2), 1e-6 * np.eye(3))
+    turn, loss = StandstillTurn(40.0, 12.0, 5.0), MessageLoss(0.2, 30, 0.5, 0.02)
+    drive = Drive("d", robot, (maneuver,) * moving, "scan matching", standstill_turn=turn, message_loss=loss)
+    found = examine(drive, make_model("friction", robot)).diagnosis
+    assert found.verdict == "undecidable"
+    assert f"only {moving} windows of motion" in found.sentence
+    assert "the gyro turned 688 deg" in found.sentence
+    assert [f.cause for f in found.findings] == ["missing_joint_messages"]
+    assert "30 gaps of up to 0.5 s" in found.sentence

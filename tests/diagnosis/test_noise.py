@@ -35,3 +35,9 @@ def test_noise_without_slow_turns_is_that_of_the_drive(factor: float) -> None:
     rng = np.random.default_rng(0)
     found = estimated(rng.normal(0.0, factor * SIGMA, WINDOWS), np.zeros(WINDOWS))
     np.testing.assert_allclose(found, factor * SIGMA, rtol=0.25)
+
+
+def test_noise_of_few_windows_is_the_claimed_one() -> None:
+    left = np.full(WINDOWS, np.nan)
+    left[[3, 20, 41]] = 0.001
+    assert (estimated(left, np.zeros(WINDOWS))[[3, 20, 41]] == SIGMA).all()

@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+import numpy as np
 import pytest
 
-from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES
-from localization.diagnosis.findings import Attribution, Component, Finding, Gain, RowStatus, Trend, describe_row
-from localization.diagnosis.verdict import decide, mark_trends
+from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Hypothesis
+from localization.diagnosis.drive import drive_of_table
+from localization.diagnosis.findings import (
+    Attribution,
+    Component,
+    Diagnosis,
+    Finding,
+    Gain,
+    RowStatus,
+    Trend,
+    correctable_findings,
+    describe_row,
+    sentence,
+)
+from localization.diagnosis.prediction import DrivePredictor, with_sizes
+from localization.diagnosis.verdict import candidate_maneuvers, decide, mark_trends
+from motion_models.registry import make_model
+from motion_models.robot import load_robot
 
 GAIN = Gain(2.0, 1.0, 0.5, 0.4, 0.6)
 
@@ -71,3 +89,48 @@ def test_describe_row_tolerated_names_cause_and_share() -> None:
 )
 def test_describe_size_has_its_direction_in_words(cause: str, size: float, words: str) -> None:
     assert {**CAUSES, **WINDOW_CAUSES}[cause].describe(size) == words
+
+
+def diagnosis(findings: tuple[Finding, ...], trends: tuple[Trend, ...], table: dict[str, Component]) -> Diagnosis:
+    marked = mark_trends(table, trends, 0.0, bool(findings))
+    return Diagnosis(
+        *("log", "robot", "friction", "scan matching", decide(findings, tuple(marked.values()), 0.0), marked, findings, trends),
+        left_share=0.0,
+        next_drive="",
+        sentence="",
+    )
+
+
+def test_sentence_names_the_row_that_is_unexplained_and_not_a_weak_trend() -> None:
+    """The trend of yaw is less than the noise; what has no cause is in x."""
+    noisy = dataclasses.replace(row("unexplained"), noise_over_reference=5.0, attributions=())
+    text = sentence(diagnosis((finding(),), (trend(0.2),), {"x": noisy, "yaw": row("attributed")}))
+    assert "x 0.001 rad, noise 0.001, the noise is 5.0 times the reference's own" in text
+    assert "turning" not in text
+
+
+def test_correctable_findings_are_none_beside_sizes_that_no_robot_has() -> None:
+    table = {"yaw": row("attributed")}
+    large = finding(size=0.25)
+    assert correctable_findings(diagnosis((large,), (), table)) == []
+    assert "would fit, but are more than robots have" in sentence(diagnosis((large,), (), table))
+    assert correctable_findings(diagnosis((finding(),), (trend(0.2, "track_width"),), table)) == []
+    assert correctable_findings(diagnosis((finding(),), (), table)) == [finding()]
+
+
+def test_trend_in_place_of_several_causes_reports_no_better_fit() -> None:
+    one = Trend("yaw", "distance x heading (sine)", 12.0, 1.0, 0.0, "scrub and track_width", -4.2)
+    assert one.text == "yaw follows distance x heading (sine), one trend in place of scrub and track_width (log-likelihood -4)"
+
+
+@pytest.mark.parametrize("kind", ["straight driving, forwards", "turning in place, both", "gentle arcs", "stop and go"])
+def test_candidate_drives_show_the_wheels_clock(kind: str) -> None:
+    """Where the rates change, also from one window to the next."""
+    robot = load_robot("husky_a200")
+    g = robot.geometry
+    drives = dict(candidate_maneuvers(0.5, g.wheel_radius_m, np.zeros(2), False, g.track_width_m))
+    (maneuvers,) = (maneuvers for name, maneuvers in drives.items() if name.startswith(kind))
+    predictor = DrivePredictor(drive_of_table("next", robot, maneuvers, "windows"), make_model("friction", robot), has_inertia=False)
+    late = with_sizes({CAUSES["wheel_time_offset"]: 0.05})
+    moved = predictor.discrepancies(late)[:, :3] - predictor.discrepancies(Hypothesis())[:, :3]
+    assert np.abs(moved).max() > 5e-3
