@@ -27,7 +27,7 @@ _SHAPES_OF_CAUSES = ("distance", "turning")  # trends that wheel_radius_scale an
 _MIN_VARIANCE = 0.01  # of what is left of a channel, over the noise's
 
 _SECONDS, _DT = 20.0, 0.1
-_WINDOW = 20  # intervals
+_WINDOW, _EDGE = 20, 5  # intervals of a window, and before and after it
 _SIGMA = np.array([0.004, 0.004, 0.003])
 _MAX_S = 120.0
 _ENOUGH = 9.0  # twice the log-likelihood that decides between causes
@@ -321,9 +321,9 @@ def candidate_maneuvers(speed: float, radius: float, cg: FloatArray, has_arms: b
     def table(left: FloatArray, right: FloatArray, at: FloatArray) -> list[Maneuver]:
         wheels = np.column_stack([left, right])
         found = []
-        for i in range(0, n, _WINDOW):  # with what came before: clocks show where the wheels' rates change
-            before = min(i, _WINDOW)
-            rates = wheels[i - before : i + _WINDOW]
+        for i in range(0, n, _WINDOW):  # with what comes before and after: clocks show where the wheels' rates change
+            before = min(i, _EDGE)
+            rates = wheels[i - before : i + _WINDOW + _EDGE]
             motion = np.zeros((1, 3)), np.array([_WINDOW])
             found.append(Maneuver(np.full(len(rates), _DT), rates, *motion, at, np.diag(_SIGMA**2), lead=before))
         return found
