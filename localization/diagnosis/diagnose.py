@@ -94,10 +94,6 @@ class Residuals:
     """(M, 6) once all findings are corrected."""
     sigmas: FloatArray
     """(M, 6) their noise."""
-    names: tuple[str, ...]
-    """Keys of the causes that were tried."""
-    alike: FloatArray
-    """(p, p) correlations of their signatures on this drive, in its noise."""
 
 
 @dataclass(frozen=True)
@@ -229,8 +225,7 @@ def _conclude(
     )
     handover = check_handover(predictor, linearization, [causes[i].key for i in chosen])
     result = _with_data_errors(dataclasses.replace(result, handover=handover), drive)
-    scale = np.sqrt(np.diagonal(problem.gram) + 1e-12)
-    residuals = Residuals(first.rows, left, linearization.noise.sigmas, tuple(e.key for e in causes), problem.gram / np.outer(scale, scale))
+    residuals = Residuals(first.rows, left, linearization.noise.sigmas)
     return DiagnosisResult(result, predictor, residuals, linearization)
 
 

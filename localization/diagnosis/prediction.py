@@ -169,8 +169,12 @@ class DrivePredictor:
 
     @property
     def dropout_count(self) -> int:
-        """Number of spells in which a side's counts drop to half."""
-        return int(np.count_nonzero(np.diff(self._lost, axis=0) > 0.0))
+        """Number of spells in which a side's counts drop to half. Windows share what comes before and after them with their neighbours."""
+        begins = np.diff(self._lost, axis=0, prepend=0.0) > 0.0
+        for w, m in enumerate(self.drive.maneuvers):
+            a, b = self.batch.first[w], self.batch.first[w + 1]
+            begins[a : a + m.lead] = begins[a + m.lead + int(m.ends[-1]) : b] = False
+        return int(np.count_nonzero(begins))
 
     def _headings(self) -> FloatArray:
         """By the gyro less its bias (and scale) against the motion reference; else by the reference's own turns, one after the other."""
