@@ -23,6 +23,7 @@ from localization.diagnosis.findings import (
     describe_outliers,
     describe_p,
     describe_row,
+    describe_sizes,
     describe_tolerated,
     is_contesting,
 )
@@ -156,14 +157,16 @@ def print_diagnosis(console: Console, d: Diagnosis) -> None:
     for line in describe_tolerated(d):
         console.print(f"within tolerance: {line}", markup=False, soft_wrap=True)
     if d.findings:
-        table = Table("cause", "size", "+-", "unit", "p", "gain", "or", box=None, header_style="bold", pad_edge=False)
+        table = Table(box=None, header_style="bold", pad_edge=False)
+        for head in ("cause", "size", "+-", "unit", "p", "gain"):
+            table.add_column(head, no_wrap=True)
         for f in d.findings:
-            others = ", ".join(f"{name} {size:+.3g}" for name, size in f.aliases)
             numbers = (f"{f.size:+.4g}", f"{f.sigma:.2g}", f.definition.unit, f"{f.p_value:.1g}", f"{100 * f.gain.relative:.1f} %")
-            table.add_row(f.cause, *numbers, others)
+            table.add_row(f.cause, *numbers)
         console.print(table)
         for f in d.findings:
-            console.print(f"{f.cause}: {f.description}", markup=False, soft_wrap=True)
+            aliases = f" (or {describe_sizes(f.aliases)})" if f.aliases else ""
+            console.print(f"{f.cause}: {f.description}{aliases}", markup=False, soft_wrap=True)
     for trend in d.trends:
         label = "unexplained" if is_contesting(d, trend) else "left, and less than the noise"
         console.print(f"{label}: {trend.text}", markup=False, soft_wrap=True)

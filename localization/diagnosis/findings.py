@@ -388,18 +388,19 @@ def _correction(d: Diagnosis, findings: Sequence[Finding]) -> str:
     if whole.relative >= _SHOWN_GAIN:
         text += f"; held-out discrepancies fall by {100 * whole.relative:.0f} %"
     if first.aliases:
-        text += f". This drive cannot separate it from {_sizes(first.aliases)}"
+        text += f". This drive cannot separate it from {describe_sizes(first.aliases)}"
     if len(findings) > 1:
         text += f". Then {', '.join(_further(f) for f in findings[1:])}"
     return text
 
 
 def _further(f: Finding) -> str:
-    aliases = f", or {_sizes(f.aliases)}" if f.aliases else ""
+    aliases = f", or {describe_sizes(f.aliases)}" if f.aliases else ""
     return f"{f.cause}, off by {f.size:+.3g}{unit_of(f.cause)} ({f.description}{aliases})"
 
 
-def _sizes(aliases: Sequence[tuple[str, float]]) -> str:
+def describe_sizes(aliases: Sequence[tuple[str, float]]) -> str:
+    """Causes with their sizes, in one line."""
     return ", ".join(f"{name} {size:+.3g}{unit_of(name)}" for name, size in aliases)
 
 

@@ -356,7 +356,8 @@ def separating_drive(predictor: DrivePredictor, findings: Sequence[Finding]) -> 
     if not rivals:
         return ""
     finding = rivals[0]
-    listed = ", ".join([finding.cause, *(name for name, _ in finding.aliases[:3])]) + f" and {finding.aliases[:4][-1][0]}"
+    *names, last = finding.cause, *(name for name, _ in finding.aliases[:4])
+    listed = f"{', '.join(names)} and {last}"
     named = [(CAUSES.get(name) or WINDOW_CAUSES.get(name), size) for name, size in finding.aliases[:4]]
     pairs = [(finding.definition, finding.size), *((cause, size) for cause, size in named if cause is not None)]
     base = with_sizes({f.definition: f.size for f in findings if f is not finding})
@@ -371,7 +372,7 @@ def separating_drive(predictor: DrivePredictor, findings: Sequence[Finding]) -> 
             best = text, information
     seconds = max(_SECONDS, 5.0 * math.ceil(_SECONDS * _ENOUGH / best[1] / 5.0))
     if best[0] and seconds <= _MAX_S:
-        return f"To separate {listed}, record about {seconds:.0f} s of {best[0]}."
+        return f"To separate {listed}, record about {seconds:.0f} s of {best[0]}{_with_lidar(predictor)}."
     if not is_shown.all() or len(pairs) < len(named) + 1:  # errors of gyro, ranges and encoders, changes on the way
         return f"To separate {listed}, record two minutes: standing, turning in place to both sides, slow and fast, and straight driving."
     return f"No drive of two minutes separates {listed}: measure one of them directly."
@@ -394,7 +395,12 @@ def confirming_drive(predictor: DrivePredictor, linearization: Linearization, i:
                 break
     if not best[0]:
         return f"No drive of two minutes would settle it: measure {causes[i].id} directly."
-    return f"To settle it, record about {best[1]:.0f} s of {best[0]}."
+    return f"To settle it, record about {best[1]:.0f} s of {best[0]}{_with_lidar(predictor)}."
+
+
+def _with_lidar(predictor: DrivePredictor) -> str:
+    """What the drive has to be recorded with, where the diagnosed one has headings alone."""
+    return "" if predictor.drive.has_positions else ", with a LiDAR or a reference"
 
 
 def _candidate_drives(predictor: DrivePredictor) -> Iterator[tuple[str, DrivePredictor]]:

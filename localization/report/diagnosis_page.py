@@ -12,6 +12,7 @@ from localization.diagnosis.findings import (
     describe_outliers,
     describe_p,
     describe_row,
+    describe_sizes,
     describe_tolerated,
     is_contesting,
     unit_of,
@@ -107,7 +108,7 @@ def _findings(d: Diagnosis) -> list[Block]:
     rows = []
     for f in d.findings:
         unit = "" if f.definition.unit == "1" else f" {f.definition.unit}"
-        others = ", ".join(f"{name} {size:+.3g}" for name, size in f.aliases) or "–"  # noqa: RUF001
+        others = describe_sizes(f.aliases) or "–"  # noqa: RUF001
         gain = f"{100 * f.gain.relative:.0f} % ({100 * f.gain.low:.0f} to {100 * f.gain.high:.0f})"
         cause = Cell(f.cause, f"{f.description}; {f.evidence}", is_code=True)
         rows.append([cause, Cell(f"{f.size:+.4g} ± {f.sigma:.2g}{unit}"), Cell(gain), Cell(f"{f.p_value:.1g}"), Cell(others)])

@@ -22,7 +22,8 @@ from localization.diagnosis.findings import (
     sentence,
 )
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
-from localization.diagnosis.verdict import candidate_maneuvers, decide, mark_trends
+from localization.diagnosis.verdict import candidate_maneuvers, decide, mark_trends, separating_drive
+from motion_models.calibration.maneuvers import Maneuver
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
 
@@ -134,3 +135,13 @@ def test_candidate_drives_show_the_wheels_clock(kind: str) -> None:
     late = with_sizes({CAUSES["wheel_time_offset"]: 0.05})
     moved = predictor.discrepancies(late)[:, :3] - predictor.discrepancies(Hypothesis())[:, :3]
     assert np.abs(moved).max() > 5e-3
+
+
+def test_separating_drive_lists_each_cause_once() -> None:
+    robot = load_robot("husky_a200")
+    rest = Maneuver(np.full(20, 0.1), np.ones((20, 2)), np.zeros((1, 3)), np.array([20]), np.zeros(2), 1e-6 * np.eye(3))
+    predictor = DrivePredictor(drive_of_table("log", robot, [rest], "windows"), make_model("friction", robot), has_inertia=False)
+    clocks = separating_drive(predictor, [finding("wheel_time_offset", -0.08, (("lidar_time_offset", 0.08),))])
+    assert clocks == "No drive of two minutes separates wheel_time_offset and lidar_time_offset: measure one of them directly."
+    gyro = separating_drive(predictor, [finding("gyro_scale", 0.02, (("gyro_bias", 0.01), ("track_width", 0.02)))])
+    assert gyro.startswith("To separate gyro_scale, gyro_bias and track_width, record ")
