@@ -224,7 +224,7 @@ class DrivePredictor:
             out[:, 0] = drive.path_errors - np.bincount(self._path_batch.owner, apart) / np.bincount(self._path_batch.owner)
             return out
         poses, _, _ = predict(changed, batch, changed.nominal, reference_params, _NO_COLUMNS, drive.robot.wheel_noise)
-        off = se2.between(poses, self._measured(hypothesis))
+        off = se2.between(poses, self._measured(hypothesis, poses))
         known = np.isfinite(np.diagonal(batch.cov, axis1=1, axis2=2))
         out[:, :3] = np.where(known, off, np.nan)
         if drive.is_gyro_reference:
@@ -252,17 +252,21 @@ class DrivePredictor:
         b = hypothesis
         return b.wheel_time_offset_s - (b.gyro_time_offset_s if self.drive.is_gyro_reference else b.lidar_time_offset_s)
 
-    def _measured(self, hypothesis: Hypothesis) -> FloatArray:
+    def _measured(self, hypothesis: Hypothesis, predicted: FloatArray) -> FloatArray:
         """(M, 3) measured poses without the ranging errors of ``hypothesis``: scan matching scales the LiDAR's own path, and a constant
-        error of all ranges acts by the scene's own derivative (`Drive.range_slopes`)."""
+        error of all ranges acts by the scene's own derivative (`Drive.range_slopes`).
+
+        Scaled is the ``predicted`` path (M, 3): as a multiple of the measured one the scale, together with one of the wheels, would
+        explain any discrepancy of the two.
+        """
         b, measured = hypothesis, self.batch.measured
         if self.drive.range_slopes is None or not (b.range_scale or b.range_bias_m):
             return measured
         found = measured - b.range_bias_m * self.drive.range_slopes
         x, y = self.drive.lidar_at
-        c, s = np.cos(found[:, 2]), np.sin(found[:, 2])
+        c, s = np.cos(predicted[:, 2]), np.sin(predicted[:, 2])
         lever = np.column_stack([(c - 1.0) * x - s * y, s * x + (c - 1.0) * y])
-        found[:, :2] = (found[:, :2] + lever) / (1.0 + b.range_scale) - lever
+        found[:, :2] -= b.range_scale * (predicted[:, :2] + lever)
         return found
 
     def _tracked(self, hypothesis: Hypothesis) -> tuple[float, float, float]:
