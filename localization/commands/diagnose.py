@@ -84,16 +84,17 @@ class Diagnose:
                 baseline = estimate_baseline(self._drive_of_log(self.healthy, robot), model)
         with console.status("searching for causes"):
             found = examine(drive, model, self.config, baseline)
-        print_diagnosis(console, found.diagnosis)
         content = found.diagnosis.to_dict()
         if self.out is not None:
             with new_folder(self.out) as folder:
                 write_json(folder / "diagnosis.json", content)
                 self._write_robot(folder, found, robot)
                 write_diagnosis_report(folder / "diagnosis.html", found)
-            console.print(f"report: {self.out / 'diagnosis.html'}", markup=False, soft_wrap=True)
         if self.json is not None:
             write_json(self.json, content)
+        print_diagnosis(console, found.diagnosis)
+        if self.out is not None:
+            console.print(f"report: {self.out / 'diagnosis.html'}", markup=False, soft_wrap=True)
 
     def _drive(self, robot: Robot) -> Drive:
         name = self.source.name

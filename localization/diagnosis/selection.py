@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from localization.diagnosis.causes import Cause, Hypothesis
+from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause, Hypothesis
 from localization.diagnosis.findings import Gain
 from localization.diagnosis.linearization import (
     Linearization,
@@ -181,6 +181,7 @@ def heldout_squares(linear: FloatArray, signatures: FloatArray, nuisances: Float
     return out
 
 
+_TIE_LOG_ODDS = 1.0  # difference of twice the log-odds that decides nothing
 _ALIAS_LOG_ODDS = 7.0  # twice the log-likelihood by which a rival may be worse: odds of 1 to 33
 _ALIAS_SHARE = 0.02  # or this share of what the cause explains: accuracy of the model
 _BASELINE_SHARE = 0.05  # the same for a robot that does not follow the friction model when nothing is wrong
@@ -261,11 +262,15 @@ def simplest_set(tried: Sequence[tuple[float, dict[Cause, float]]], nothing: flo
     """The set with the least of the costs ``tried``; of a robot that does not follow the friction model, the best one of the fewest causes
     that explain as much of ``nothing``, the cost of no cause, but for the model's accuracy.
 
-    By more causes a set would only repair how this robot responds to one of them.
+    By more causes a set would only repair how this robot responds to one of them. Among equally good sets of one number (two clocks that
+    differ, and nothing that shows which is wrong) the order of the catalogue decides, not rounding.
     """
     least = min(cost for cost, _ in tried)
     margin = max(_ALIAS_LOG_ODDS, _BASELINE_SHARE * (nothing - least)) if predictor.has_baseline else 0.0
-    return min(((len(sizes), cost, sizes) for cost, sizes in tried if cost <= least + margin), key=lambda s: s[:2])[2]
+    number, best = min((len(sizes), cost) for cost, sizes in tried if cost <= least + margin)
+    equal = [sizes for cost, sizes in tried if len(sizes) == number and cost <= best + _TIE_LOG_ODDS]
+    order = {name: i for i, name in enumerate((*CAUSES, *WINDOW_CAUSES))}
+    return min(equal, key=lambda sizes: sorted(order.get(cause.id, len(order)) for cause in sizes))
 
 
 def refined_cost(predictor: DrivePredictor, linearization: Linearization, sizes: dict[Cause, float]) -> float:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -10,7 +12,8 @@ from scipy.stats import multivariate_normal
 
 from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.linearization import Linearization, given_noise, make_regression
-from localization.diagnosis.selection import heldout_log_odds, problems_without_a_fold, strongest_beyond_tolerance
+from localization.diagnosis.prediction import DrivePredictor
+from localization.diagnosis.selection import heldout_log_odds, problems_without_a_fold, simplest_set, strongest_beyond_tolerance
 from motion_models.se2 import FloatArray
 
 WINDOWS, SIGMA, TOLERANCE = 40, 0.01, 0.35
@@ -81,3 +84,12 @@ def test_strongest_beyond_tolerance_is_the_hidden_cause(cause: int) -> None:
     assert p < 1e-3
     weak = dataclasses.replace(problem, moment=problem.moment * 0.3)
     assert strongest_beyond_tolerance(weak, rng, 1e6)[1] > 0.05
+
+
+def test_simplest_set_of_equally_good_clocks_takes_the_wheels() -> None:
+    """Whatever rounding says: the estimators' poses bear the stamps of the scans."""
+    wheels, lidar, other = ({CAUSES[name]: 0.1} for name in ("wheel_time_offset", "lidar_time_offset", "track_width"))
+    predictor = cast(DrivePredictor, SimpleNamespace(has_baseline=False))
+    for off in (-1e-9, 0.0, 1e-9):
+        assert simplest_set([(-50.0, lidar), (-50.0 + off, wheels), (-30.0, other)], 0.0, predictor) == wheels
+    assert simplest_set([(-50.0, lidar), (-40.0, wheels)], 0.0, predictor) == lidar
