@@ -220,11 +220,14 @@ class GraphFusion(Estimator):
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         """As `Estimator.parameters`."""
-        found = self.odometry.parameters()
-        if not self._has_radius:
-            return found
-        mean, cov = self.graph.corrections()
-        return {**found, "wheel_radius_scale": (1.0 + float(mean[-1]), math.sqrt(float(cov[-1, -1])))}
+        found = dict(self.odometry.parameters())
+        if self._has_radius:
+            mean, cov = self.graph.corrections()
+            found["wheel_radius_scale"] = 1.0 + float(mean[-1]), math.sqrt(float(cov[-1, -1]))
+        if self.n_positions:
+            lever, cov = self.graph.lever_arm()
+            found |= {f"antenna_{axis}_m": (float(lever[i]), math.sqrt(float(cov[i, i]))) for i, axis in enumerate("xy")}
+        return found
 
     def counts(self) -> Mapping[str, int]:
         """As `Estimator.counts`."""

@@ -149,9 +149,11 @@ class PoseGraph:
         """(3, 3) covariance of keyframe ``k``."""
         return np.asarray(self._isam.marginalCovariance(gtsam.symbol("x", k)))
 
-    def lever_arm(self) -> FloatArray:
-        """(2,) of the positions' antenna in the body frame [m]."""
-        return np.asarray(self._values.atPoint2(_LEVER)) if self._values.exists(_LEVER) else self.lever
+    def lever_arm(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (2,) and covariance (2, 2) of where the positions' antenna is in the body frame [m]."""
+        if not self._values.exists(_LEVER):
+            return self.lever, _LEVER_SIGMA_M**2 * np.eye(2)
+        return np.asarray(self._values.atPoint2(_LEVER)), np.asarray(self._isam.marginalCovariance(_LEVER))
 
     def position_errors(self) -> FloatArray:
         """(n,) normalised errors [sigma] of the positions by the present estimates."""

@@ -234,7 +234,10 @@ def test_pose_graph_with_positions_estimates_lever_arm(given: np.ndarray) -> Non
     lever = np.array([0.4, -0.3])
     graph = with_positions(lever=lever, given=given)[0]
     graph.smooth()
-    assert graph.lever_arm() == pytest.approx(lever, abs=0.1)
+    mean, cov = graph.lever_arm()
+    assert mean == pytest.approx(lever, abs=0.1)
+    assert (np.abs(mean - lever) < 4.0 * np.sqrt(np.diag(cov))).all()
+    assert np.sqrt(np.diag(cov)).max() < 0.1
 
 
 def test_pose_graph_with_singular_covariance_raises_estimator_error() -> None:
