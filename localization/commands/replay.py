@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -44,6 +45,10 @@ from motion_models.registry import make_model
 from motion_models.robot import load_robot
 
 _WHEELLESS = "lidar"
+_HELD_OUT = (
+    "{0} is fused and the reference: every second position is fused, and the others score. As positions by GPS err alike for minutes, the "
+    "score of the graph is still too small. To fuse all of them, name another --reference, or none."
+)
 _PROGRESS_NS = 500_000_000
 _FIRST_LEFT_OUT = ("RPE deg/m", "speed x", "drift %", "ATE deg", "end m", "NEES", "LiDAR lost %")
 """Titles of columns, in the order in which a narrow terminal leaves them out."""
@@ -73,7 +78,7 @@ class Replay:
     """Noise of the poses of a reference without covariances [m, deg], as 0.02 0.5: without it the NEES assumes an exact reference."""
     positions: str | None = None
     """Topic of positions (NavSatFix, poses) that `graph` is to fuse, as GPS: `/fix`. The lever arm of the antenna is
-    --config.estimator.graph.antenna-x-m and -y-m. Do not score against the same topic."""
+    --config.estimator.graph.antenna-x-m and -y-m. If they are the reference as well, every second one is fused, and the others score."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
     config: ReplayConfig = field(default_factory=ReplayConfig)
     timing: bool = False
@@ -96,6 +101,7 @@ class Replay:
             for form in check_forms(forms)[: None if estimator in CORRECTING else 1]
         ]
         reference, positions = self._reference(log), self._positions(log)
+        held_out = [_HELD_OUT.format(self.positions)] if self._is_held_out(log) else []
         # the LiDAR alone uses no motion model: it runs once, and counts for each
         once = [p for p in pairs if p.estimator != _WHEELLESS or p.model is models[0]]
         with _progress(console, log) as (events, on_event):
@@ -116,7 +122,12 @@ class Replay:
             warnings=[
                 as_text(note)
                 for note in dict.fromkeys(
-                    [*prior_notes(robot, [m.name for m in models]), *log.warnings(), *(note for run in runs for note in run.warnings)]
+                    [
+                        *prior_notes(robot, [m.name for m in models]),
+                        *held_out,
+                        *log.warnings(),
+                        *(note for run in runs for note in run.warnings),
+                    ]
                 )
             ],
             versions=versions(),
@@ -144,13 +155,14 @@ class Replay:
 
     def _reference(self, log: Log) -> ReferenceTrack | Relations | None:
         """The reference, by topic or file; read before the run, so that a wrong name is reported at once."""
-        name = self.reference if self.reference is not None else log.reference_topic
+        name = self._reference_name(log)
         if name is None or name == "none":
             if self.reference_sigma is not None:
                 raise EvaluationError("--reference-sigma is the noise of a reference, and there is none. Name one with --reference.")
             return None
         if name in log.types:
-            found: ReferenceTrack | Relations = reference_track(log.references(name), name)
+            samples = itertools.islice(log.references(name), 1, None, 2) if self._is_held_out(log) else log.references(name)
+            found: ReferenceTrack | Relations = reference_track(samples, name)
         elif Path(name).exists():
             found = read_reference_file(name)
         elif name.startswith("/") and not Path(name).parent.is_dir():
@@ -169,7 +181,15 @@ class Replay:
             return []
         if "graph" not in self.estimator.split(","):
             raise EstimatorError("--positions are fused by the graph alone. Add it: --estimator odometry,ekf,graph.")
-        return read_positions(log.references(self.positions), self.positions)
+        samples = log.references(self.positions)
+        return read_positions(itertools.islice(samples, 0, None, 2) if self._is_held_out(log) else samples, self.positions)
+
+    def _reference_name(self, log: Log) -> str | None:
+        return self.reference if self.reference is not None else log.reference_topic
+
+    def _is_held_out(self, log: Log) -> bool:
+        """Whether the positions that are fused are the reference as well."""
+        return self.positions is not None and self.positions == self._reference_name(log)
 
     def _metrics(self, head: ReportHead, results: Sequence[Result]) -> dict[str, Any]:
         prior = scaling_prior(load_robot(self.robot), names(self.model, "--model"))
