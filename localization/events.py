@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.errors import EventError
+from motion_models import se2
 from motion_models.base import Motion
 from motion_models.se2 import FloatArray
 
@@ -182,6 +183,11 @@ class Step:
     def duration(self) -> float:
         """[s]"""
         return (self.end_ns - self.start_ns) * _NS
+
+    @property
+    def mean_twist(self) -> FloatArray:
+        """(3,) by the wheels over the step; of one of no duration, that at its end."""
+        return se2.log(self.predicted.delta) / self.duration if self.duration > 0.0 else self.twist
 
 
 def _check_shape(event: Event, name: str, shape: tuple[int, ...]) -> None:

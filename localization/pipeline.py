@@ -19,7 +19,6 @@ from localization.lidar.losses import LidarLosses
 from localization.sensor_checks import SensorChecks
 from localization.synchronizer import StepConfig, Synchronizer
 from localization.trajectory import Trajectory
-from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.online_calibration import Form, correctable
 from motion_models.robot import Mount, Robot
@@ -97,7 +96,7 @@ class Pipeline:
         """Use the estimated corrections and clock offset from the next step on."""
         self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
         if step.duration > 0.0:
-            self.wheel_twist = se2.log(step.predicted.delta) / step.duration if step.has_wheels else None
+            self.wheel_twist = step.mean_twist if step.has_wheels else None
 
     def run_deferred(self) -> None:
         """Do the work that published estimates need not wait for. Left out, the next `process` does it first."""

@@ -79,7 +79,7 @@ class EkfFusion(Estimator):
         twist, twist_cov = step.twist, None
         if step.duration > 0.0:
             twist, twist_cov = mean_twist(*ekf.motion_since(START), step.duration)
-            self._twist, self._slip, self._is_slip_measured = twist, twist - _mean_twist(step), nis is not None
+            self._twist, self._slip, self._is_slip_measured = twist, twist - step.mean_twist, nis is not None
         return Estimate(step.end_ns, ekf.pose, ekf.P[POSE, POSE].copy(), twist, twist_cov, nis)
 
     def run_deferred(self) -> None:
@@ -106,7 +106,7 @@ class EkfFusion(Estimator):
             return None
         R = match.cov
         if duration > 0.0:
-            slip = se2.log(se2.between(ekf.start, match.pose)) / duration - _mean_twist(step)
+            slip = se2.log(se2.between(ekf.start, match.pose)) / duration - step.mean_twist
             match = sensor.refine(match, step.twist + slip)
             if self._is_slip_measured:
                 self._slip_changes.add(slip - self._slip, match.cov, step, sensor.sweep_s)
@@ -179,8 +179,3 @@ class _SlipChanges:
             return np.zeros((3, 3))
         root = np.sqrt(np.maximum(self._sum / self._weight, 0.0))
         return np.asarray(root[:, None] * step.predicted.cov * root / step.duration)
-
-
-def _mean_twist(step: Step) -> Twist2:
-    """(3,) of the wheels over the step."""
-    return se2.log(step.predicted.delta) / step.duration if step.duration > 0.0 else step.twist

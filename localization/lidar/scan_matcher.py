@@ -62,7 +62,8 @@ _SWEEP_PARTS = 8
 _MAX_OLD_SUBMAPS = 3
 """Key scans older than the last ones, at most, in units of their number."""
 _OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
-"""Added to the information of a match, so that an open direction has a sigma of 10 m or 1 rad [1/m^2, 1/m^2, 1/rad^2]."""
+"""Added to the information of a match, so that an open direction has a sigma of 10 m or 1 rad, times that of the residuals
+[1/m^2, 1/m^2, 1/rad^2]."""
 _MAPPED_INFORMATION = np.diag([1e2, 1e2, 1e2])
 """Information of a key scan along a direction, from which on its noise moves its surfaces along it [1/m^2, 1/m^2, 1/rad^2]."""
 
