@@ -1,0 +1,41 @@
+"""Scan matching as the reference of calibration and diagnosis."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from localization.calibration.motion_references import LidarMotionReference, Span, Wheels
+from localization.events import Scan, WheelSample
+from localization.simulation.world import WORLDS
+from localization.wheel_buffer import WheelBuffer
+from motion_models.registry import make_model
+from motion_models.robot import load_robot
+from tests.helpers.rooms import scan_from
+
+_NS = 1_000_000_000
+_START, _END = np.array([-1.0, 0.5, 0.2]), np.array([-0.6, 0.6, 0.5])
+
+
+def _span(seed: int, noise: float = 0.012, bias: float = 0.0) -> Span:
+    """One window of a second in the hall; all ranges have noise of their own, and are longer by ``bias`` [m]."""
+    rng = np.random.default_rng(seed)
+    robot = load_robot("vaultbot")
+    wheels = Wheels(WheelBuffer(np.zeros(2)), make_model("diff_drive", robot), robot.wheel_noise)
+    reference = LidarMotionReference({}, 0.9)
+    for i in range(56):
+        wheels.buffer.insert(WheelSample(i * _NS // 50, np.full(2, np.nan), 0.05 * i * np.array([0.8, 1.2])))
+    walls = WORLDS["hall"]().walls
+    for second, pose in ((0, _START), (1, _END)):
+        planar = scan_from(walls, pose, rng, noise, beams=180)
+        planar *= 1.0 + bias / np.linalg.norm(planar, axis=1, keepdims=True)
+        found = list(reference.spans(Scan(second * _NS, np.column_stack([planar, np.zeros(len(planar))])), wheels))
+    return found[0]
+
+
+def test_the_slope_of_ranges_is_what_longer_ranges_do_to_the_measured_motion():
+    true = (_span(0, 0.0, 0.1).measured - _span(0, 0.0, -0.1).measured) / 0.2
+    slopes = np.array([s.range_slope for s in map(_span, range(40)) if s.range_slope is not None])
+    assert len(slopes) == 40
+    assert np.abs(slopes[:, :2].mean(axis=0) - true[:2]).max() < 0.25 * np.linalg.norm(true[:2])
+    # noise of the slope would count as information about the bias, and make it look smaller
+    assert slopes[:, :2].std(axis=0).max() < 0.25 * np.linalg.norm(true[:2])
