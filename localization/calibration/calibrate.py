@@ -112,7 +112,7 @@ def cut_log(
     against it. Raises `CalibrationError` where nothing measures the motion, and what opening the log does.
     """
     config = config or WindowConfig()
-    log = open_log(path, robot, topics)
+    log = open_log(path, robot, topics.scored_against(reference))
     if log.sources.wheels is None and log.wheels_error is None:
         raise CalibrationError(
             f"{log.path.name} has no wheels: neither joint states ({robot.topics.joint_states}) nor the driver's odometry"

@@ -115,7 +115,7 @@ class Diagnose:
         return drive_of_table(name, robot, read_windows(self.source), "windows")
 
     def _drive_of_log(self, path: Path, robot: Robot) -> Drive:
-        log = open_log(path, robot, self.topic)
+        log = open_log(path, robot, self.topic.scored_against(self.reference))
         return drive_of_log(log, self.motion_reference, self.reference, WindowConfig(window_s=self.window_s))
 
     def _write_robot(self, folder: Path, found: DiagnosisResult, robot: Robot) -> None:

@@ -90,7 +90,7 @@ class Replay:
         """Run the command, with output on ``console``."""
         robot = load_robot(self.robot)
         check_outputs(self.out, self.json)
-        log = open_log(self.log, robot, self.topic)
+        log = open_log(self.log, robot, self.topic.scored_against(self.reference))
         has_lidar = log.sources.lidar is not None
         models = [make_model(name, robot) for name in names(self.model, "--model")]
         forms = names(self.corrections, "--corrections")

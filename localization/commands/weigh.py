@@ -53,7 +53,9 @@ class Weigh:
             raise CalibrationError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")
         robot = load_robot(self.robot)
         with console.status("reading"):
-            drive = drive_of_log(open_log(self.log, robot, self.topic), self.motion_reference, self.reference)
+            drive = drive_of_log(
+                open_log(self.log, robot, self.topic.scored_against(self.reference)), self.motion_reference, self.reference
+            )
         with console.status("weighing"):
             found, predictor = weigh(drive)
         print_weighing(console, found, self.at)

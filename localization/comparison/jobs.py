@@ -110,7 +110,7 @@ def failed_rows(job: Job, reason: str) -> list[Row]:
 
 
 def _run(job: Job) -> list[Row]:
-    log = open_log(job.folder / job.log, job.robot, job.topics)
+    log = open_log(job.folder / job.log, job.robot, job.topics.scored_against(job.reference))
     has_lidar = log.sources.lidar is not None
     rows, able = [], []
     for trial in job.trials:

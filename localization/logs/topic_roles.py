@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from localization.errors import TopicError
 from localization.logs.chunks import Channel
@@ -46,6 +46,10 @@ class TopicOverrides:
     """geometry_msgs/PointStamped in the body frame."""
     reference: str | None = None
     """What the result is scored against: a pose, odometry or GPS topic."""
+
+    def scored_against(self, reference: str | None) -> TopicOverrides:
+        """These with the ``reference`` of a command, if none is set: no sensor is taken from that topic by its type alone."""
+        return self if not reference or self.reference is not None else replace(self, reference=reference)
 
 
 @dataclass(frozen=True)

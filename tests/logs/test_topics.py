@@ -76,6 +76,15 @@ def test_topic_only_one_of_its_type_is_used_with_a_note(tmp_path: Path) -> None:
         assert any(topic in note and "only topic of its type" in note for note in log.warnings())
 
 
+def test_topic_of_the_reference_is_no_sensor(tmp_path: Path) -> None:
+    """What a command scores against, by its own option, must not be what the run is estimated from."""
+    topics = {"/odom": "odom", "/truth": "odom"}
+    log = log_of(tmp_path, topics, TopicOverrides().scored_against("/truth"), robot=load_robot("jackal"))
+    assert parts(log)["wheels"] == ("/odom", "only")
+    assert parts(log_of(tmp_path, {"/truth": "odom"}, TopicOverrides().scored_against("/truth"), load_robot("jackal")))["wheels"] is None
+    assert TopicOverrides(reference="/gps").scored_against("/truth") == TopicOverrides(reference="/gps")
+
+
 def test_topic_two_candidates_are_refused(tmp_path: Path) -> None:
     log = log_of(tmp_path, {"/joint_states": "joints", "/front": "scan", "/rear": "scan"})
     assert log.sources.lidar is None
