@@ -186,8 +186,8 @@ class Step:
 
     @property
     def mean_twist(self) -> FloatArray:
-        """(3,) by the wheels over the step; of one of no duration, that at its end."""
-        return se2.log(self.predicted.delta) / self.duration if self.duration > 0.0 else self.twist
+        """(3,) by the wheels over the step; of one of no duration, and without wheel data, that at its end."""
+        return se2.log(self.predicted.delta) / self.duration if self.has_wheels and self.duration > 0.0 else self.twist
 
 
 def _check_shape(event: Event, name: str, shape: tuple[int, ...]) -> None:

@@ -89,11 +89,13 @@ class Pipeline:
             step = self.synchronizer.preintegrate(interval)  # wheels through the motion model, gyro, scan
             step = self.checks.apply(step)  # without faulty sensors
             estimate = self.checks.widen(self.estimator.step(step))  # predict, match, update
-            self._feed_back(step)
+            self._feed_back(step, is_scan_matched=estimate.nis is not None)
             yield estimate  # publish
 
-    def _feed_back(self, step: Step) -> None:
-        """Use the estimated corrections and clock offset from the next step on."""
+    def _feed_back(self, step: Step, is_scan_matched: bool) -> None:
+        """Use the estimated corrections and clock offset from the next step on; a scan ends a gap in the wheel data."""
+        if is_scan_matched:
+            self.synchronizer.end_gap()
         self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
         if step.duration > 0.0:
             self.wheel_twist = step.mean_twist if step.has_wheels else None

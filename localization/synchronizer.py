@@ -85,6 +85,10 @@ class Synchronizer:
             self.params = params
         self._clock_offset_s = clock_offset_s
 
+    def end_gap(self) -> None:
+        """The pose was measured without the wheels: from here on, an unknown velocity moves the robot anew."""
+        self._gap_s = 0.0
+
     def insert(self, event: Event) -> None:
         """Store ``event`` in the buffer of its sensor."""
         self._now_ns = max(self._now_ns, event.stamp_ns)
@@ -181,8 +185,8 @@ class Synchronizer:
             last = self.model.twist(rates, cg, self.params).value.sum(axis=0)
         is_standing = bool(len(dt)) and missing == 0.0 and not rates.any()
         has_wheels = missing == 0.0 and bool(len(rates))
-        motion = self._widen(motion, missing, has_rates=bool(len(dt)))
         turn = self._gyro.turn(start_ns, end_ns, float(motion.delta[2])) if end_ns > start_ns else None
+        motion = self._widen(motion, missing, has_rates=bool(len(dt)), has_turn=turn is not None)
         if scan is not None and len(scan.points) and not len(scan.offsets):
             self._timeless += 1
             self._has_turned |= bool(motion.delta[2])
@@ -209,10 +213,11 @@ class Synchronizer:
         first, last = twist.value[0], twist.value[-1]
         return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last
 
-    def _widen(self, motion: Motion, missing_s: float, has_rates: bool) -> Motion:
+    def _widen(self, motion: Motion, missing_s: float, has_rates: bool, has_turn: bool) -> Motion:
         """``motion`` with the covariance of a velocity that is unknown for ``missing_s`` [s] of it, and lasts.
 
         Such a velocity takes the robot as far as the time, however that is cut into steps. It may be as large as the last measured one.
+        Where a gyro measures the turn of each step, that of the steps before is known.
         """
         before, self._gap_s = self._gap_s, missing_s + (0.0 if has_rates else self._gap_s)
         if not missing_s:
@@ -221,5 +226,7 @@ class Synchronizer:
         v = max(self.config.lost_speed_m_s, float(self._speed[0]))
         w = max(self.config.lost_rate_rad_s, float(self._speed[1]))
         until, since = (np.array([v, v, w]) ** 2 * time_s**2 for time_s in (before + missing_s, before))
+        if has_turn:
+            until[2], since[2] = (w * missing_s) ** 2, 0.0
         until[2], since[2] = min(until[2], _UNKNOWN_YAW_VARIANCE), min(since[2], _UNKNOWN_YAW_VARIANCE)
         return Motion(motion.delta, motion.cov + np.diag(until - since), motion.d_params)

@@ -328,12 +328,26 @@ def test_missing_wheels_covariance_grows_with_time_squared(scan_s):
 
 
 def test_missing_wheels_with_gyro_give_its_turn_rate():
-    imu = [ImuSample(T0 + 10 * MS * i, np.array([0.0, 0.0, 0.3]), np.array([0.0, 0.0, 9.81])) for i in range(600)]
-    found, _ = cut(in_order(wheels(2.0), imu, [scan(0.1 * i) for i in range(1, 55)]))
+    """However long: the wheels' heading stays so uncertain that the gyro's counts."""
+    imu = [ImuSample(T0 + 10 * MS * i, np.array([0.0, 0.0, 0.3]), np.array([0.0, 0.0, 9.81])) for i in range(2000)]
+    found, _ = cut(in_order(wheels(2.0), imu, [scan(0.1 * i) for i in range(1, 195)]))
     deaf = [s for s in found if s.start_ns >= T0 + 2500 * MS]
-    assert deaf
+    assert (deaf[-1].end_ns - deaf[0].start_ns) * 1e-9 * StepConfig().lost_rate_rad_s > 2.0 * np.pi
     for step in deaf:
         np.testing.assert_allclose(step.twist, [0.0, 0.0, 0.3], atol=1e-9)
+        assert np.sqrt(step.predicted.cov[2, 2]) == pytest.approx(StepConfig().lost_rate_rad_s * step.duration)
+
+
+def test_missing_wheels_after_the_end_of_a_gap_move_the_robot_anew():
+    cutter = stepper()
+    found = []
+    for event in in_order(wheels(2.0), [scan(0.1 * i) for i in range(1, 60)]):
+        found += steps_after(event, cutter)
+        cutter.end_gap()  # as if each scan was matched
+    deaf = [s for s in found if s.start_ns >= T0 + 2600 * MS]
+    assert len(deaf) > 20
+    for step in deaf:
+        np.testing.assert_allclose(np.sqrt(np.diag(step.predicted.cov)), 0.5 * step.duration, rtol=1e-6)
 
 
 def test_missing_wheels_covariance_covers_last_velocity():

@@ -106,9 +106,9 @@ class EkfFusion(Estimator):
             return None
         R = match.cov
         if duration > 0.0:
-            slip = se2.log(se2.between(ekf.start, match.pose)) / duration - step.mean_twist
-            match = sensor.refine(match, step.twist + slip)
-            if self._is_slip_measured:
+            if self._is_slip_measured:  # else the pose at the start was not measured: its error would look like motion
+                slip = se2.log(se2.between(ekf.start, match.pose)) / duration - step.mean_twist
+                match = sensor.refine(match, step.twist + slip)
                 self._slip_changes.add(slip - self._slip, match.cov, step, sensor.sweep_s)
             R = match.cov + sensor.bend_cov(match, self._slip_changes.rate(step))
         self.counts_by_name["matched"] += 1

@@ -198,6 +198,28 @@ def test_ekf_after_gap_of_8_s_is_within_5_sigma() -> None:
     assert np.hypot(*(poses[-1] - drive.poses[-1])[:2]) < 0.05
 
 
+def test_ekf_without_wheels_turns_by_the_gyro_where_the_lidar_is_blind() -> None:
+    drive = rooms.drive_through(HALL, rooms.path((2, 0, 0), (10, 0.3, 0.2), (4, 0.2, 0.6), (4, 0.3, -0.2)), 0)
+    begin, end = rooms.WALL_START_NS + 12 * S, rooms.WALL_START_NS + 16 * S
+    rates = np.diff(np.unwrap(drive.track[:, 2])) * 500.0
+    upright = np.array([0.0, 0.0, 9.81])
+    gyro = [ImuSample(rooms.WALL_START_NS + i * S // 500, np.array([0.0, 0.0, rates[i]]), upright) for i in range(0, len(rates), 5)]
+    events = [e for e in drive.events if not isinstance(e, WheelSample) or e.stamp_ns < rooms.WALL_START_NS + 3 * S]
+    events = [
+        replace(e, points=e.points[[0, -1]], offsets=e.offsets[[0, -1]]) if isinstance(e, Scan) and begin < e.stamp_ns < end else e
+        for e in events
+    ]
+    drive = replace(drive, events=sorted([*events, *gyro], key=lambda e: e.stamp_ns))
+    result = ekf(drive)
+    assert result.counts["matched"] > 0.7 * result.counts["scans"]
+    poses, covs = rooms.at_scans(drive, result)
+    assert covs is not None
+    errors = se2.log(se2.between(drive.poses, poses))
+    assert (np.abs(errors) < 5.0 * np.sqrt(covs.diagonal(axis1=1, axis2=2)) + 1e-3).all()
+    assert np.abs(errors[:, 2]).max() < 0.05
+    assert np.hypot(*errors[-1, :2]) < 0.05
+
+
 # --- spoilt scans
 
 
