@@ -213,6 +213,10 @@ def _consistency(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
         results_.append(_test("NEES", nees, mean_band(1, _DOF), "errors"))
         by_pose = results_[-1][0]
     found = {word: [text for verdict_, text in results_ if verdict_ == word] for word in ("over", "under", "fits")}
+    if found["over"] and by_pose in ("fits", "under"):
+        also = f"{whose} are not too small by the reference ({join_words([*found['fits'], *found['under']])})"
+        cause = "Wheels slip, or the mount, the stamps or the scale of a sensor is wrong: run `skidloc diagnose` on the log."
+        return [f"{also}, but wheels and scans differ more than their noise allows: {found['over'][0]}.", cause]
     if found["over"]:
         also = f" ({join_words([*found['under'], *found['fits']])})" if found["under"] or found["fits"] else ""
         return [f"{whose} are overconfident: {join_words(found['over'])}{also}. Enlarge them before fusing them elsewhere."]
@@ -253,6 +257,10 @@ def _advice(lines: Sequence[PlottedRun], best: PlottedRun, equals: Sequence[Plot
         return [f"To learn what {best.result.run.estimator} gains, run it beside {DEAD_RECKONING} and another model."]
     with_lidar = [line for line in lines if line.result.run.estimator != DEAD_RECKONING and len(line.result.run.map_points)]
     if best.result.run.estimator == DEAD_RECKONING and with_lidar and not any(line in equals for line in with_lidar):
+        better = [line for line in with_lidar if line.is_lost and line.error is not None and line.error < _error(best)]
+        if better:
+            least = min(better, key=_error)
+            return [f"Even with the LiDAR lost for so long, {least.words} has the smallest error: mend the LiDAR, and use it."]
         return ["The LiDAR made no run better than the wheels alone: check its mount, its stamps and its range in the robot file first."]
     base = baseline_run(lines)
     if base is not None and base in equals:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from localization.comparison.jobs import _scores
@@ -93,6 +94,14 @@ def test_verdict_with_lost_best_run_recommends_another(reference) -> None:
     assert "LiDAR lost for 60 % of the drive, longest 60 s at t = 7 s" in text
     assert "Check the LiDAR's mount" in text
     assert "Use ekf with skid_steer" not in text
+
+
+def test_verdict_with_lost_runs_better_than_dead_reckoning_asks_to_mend_the_lidar() -> None:
+    lost = replace(run("diff_drive", "ekf", 0.01), lidar=ALL_LOST, map_points=np.zeros((3, 2)))
+    text = verdict(score([run("diff_drive", "odometry", 0.5, seed=1), lost], track()), track())
+    assert "Not recommended is ekf with diff_drive" in text
+    assert text.endswith("ekf with diff_drive has the smallest error: mend the LiDAR, and use it.")
+    assert "no run better" not in text
 
 
 def test_verdict_with_all_runs_lost_recommends_none() -> None:

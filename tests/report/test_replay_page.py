@@ -159,6 +159,16 @@ def test_summary_nees_of_one_drive_fails_only_outside_its_band():
     assert "larger than need be" in summary_of_nees(0.2)
 
 
+def test_summary_large_innovations_with_honest_poses_are_no_overconfidence():
+    (result,) = score([run(nis=chi_square_nis(scale=4.0), noise=0.01)], track())
+    text = verdict([dataclasses.replace(result, nees_mean=1.5)], track())
+    assert "overconfident" not in text
+    assert "Its covariances are not too small by the reference (mean NEES 1.5, where 3 is expected)" in text
+    assert "differ more than their noise allows: mean NIS" in text
+    assert "`skidloc diagnose`" in text
+    assert "overconfident" in verdict([dataclasses.replace(result, nees_mean=20.0)], track())
+
+
 def test_summary_untestable_or_missing_covariances_are_reported():
     assert "could not be tested" in verdict(score([run(noise=0.1)], track(yaws=False)), track(yaws=False))
     assert "gives no covariance" in verdict(score([run(estimator="lidar", covariance=False, noise=0.1)], track()), track())
