@@ -108,6 +108,27 @@ class Trajectory:
             result[inside] = (1.0 - weight) * self.covariances[before] + weight * self.covariances[after]
         return result
 
+    def interpolation_errors_at(self, stamps_ns: ArrayLike) -> FloatArray:
+        """(M, 3) how far the poses of `at` may be off in their body frame, as the twist is not constant between poses; 0 outside the span.
+
+        An acceleration a that lasts for the gap h moves the pose by a h^2 f (1 - f) / 2 from the interpolated one, f the fraction of the
+        gap. a is the larger of those from the twist of this gap to the twists of its neighbours.
+        """
+        t = np.asarray(stamps_ns, dtype=np.int64)
+        errors = np.zeros((*t.shape, 3))
+        inside = self.covers(t)
+        if len(self) < 3 or not np.any(inside):
+            return errors
+        h = np.diff(self.stamps_ns)[:, None] * 1e-9
+        twists = se2.log(se2.between(self.poses[:-1], self.poses[1:])) / h
+        change = np.zeros((len(self), 3))  # of the twist at each pose, a second
+        change[1:-1] = np.abs(np.diff(twists, axis=0)) / (0.5 * (h[1:] + h[:-1]))
+        before, _, fraction = self._bracket(t[inside])
+        gap = np.minimum(before, len(h) - 1)
+        largest = np.maximum(change[gap], change[gap + 1])
+        errors[inside] = 0.5 * largest * (h[gap] ** 2) * (fraction * (1.0 - fraction))[:, None]
+        return errors
+
     def _bracket(self, t: IntArray) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
         """Indices of the poses before and after each stamp, and how far between them it lies (0 to 1 inside the span)."""
         before = np.clip(np.searchsorted(self.stamps_ns, t, side="right") - 1, 0, max(len(self) - 2, 0))

@@ -73,6 +73,23 @@ def test_covariances_between_poses_are_interpolated():
     assert Trajectory([0], np.zeros((1, 3))).covariances_at([0]) is None
 
 
+def test_interpolation_error_bounds_that_of_an_accelerating_robot():
+    """1 m/s^2 and 0.8 rad/s^2, poses every 0.1 s: up to 1.25 mm and 1 mrad off between them, nothing at them."""
+
+    def pose(t):
+        return np.column_stack([0.5 * t**2, 0.0 * t, 0.0 * t]), np.column_stack([0.0 * t, 0.0 * t, 0.4 * t**2])
+
+    poses_ns, between_ns = np.arange(11) * 100_000_000, np.arange(1001) * 1_000_000
+    for straight, turning in ([*zip(pose(poses_ns * 1e-9), pose(between_ns * 1e-9), strict=True)],):
+        for at, truth in (straight, turning):
+            trajectory = Trajectory(poses_ns, at)
+            error, bound = np.abs(trajectory.at(between_ns) - truth), trajectory.interpolation_errors_at(between_ns)
+            np.testing.assert_allclose(error, bound, atol=1e-6)
+            assert bound.max() == pytest.approx(1.25e-3 if truth[-1, 0] else 1e-3, rel=0.01)
+            assert not trajectory.interpolation_errors_at(poses_ns).any()
+    assert not trajectory.interpolation_errors_at([-1, 10**10]).any()
+
+
 @pytest.mark.parametrize(
     ("stamps", "poses", "covariances", "complaint"),
     [

@@ -185,7 +185,8 @@ def pose_errors(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: fl
 
     If the estimator was already uncertain at the first match, by ``P_0``, its increments since have ``P_k - A P_0 A^T`` with
     ``A = adjoint(inverse(d))``: exact to first order if increments are independent, as in odometry. Where that is no covariance they are
-    not, and the match is left out. Where the reference has a covariance, it is added, of this sample and of the first.
+    not, and the match is left out. Where the reference has a covariance, it is added, of this sample and of the first; so are the squared
+    errors of the interpolation to the reference's stamps, which are not the estimator's.
 
     Raises `EvaluationError` if the reference has no headings or too few samples match.
     """
@@ -199,6 +200,7 @@ def pose_errors(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: fl
     grown = known[1:] - _moved(known[0], d)
     stands = (np.abs(d).max(axis=1) < 1e-9) & (np.abs(grown).max(axis=(1, 2)) < 1e-15)
     use = is_covariance(grown) & ~stands
+    grown = grown + np.eye(3) * trajectory.interpolation_errors_at(stamps)[:, None, :] ** 2
     if part.covariances is not None:
         noise = _in_body(part.covariances, truth[:, 2])
         grown = grown + noise[1:] + _moved(noise[0], r)
