@@ -178,20 +178,22 @@ def drive_through(
         events.append(Scan(_ns(k / scanner.rate_hz), points, offsets[seen], "laser"))
         stamps.append(events[-1].middle_ns)
     events.sort(key=lambda e: e.stamp_ns)
-    at = np.round((np.array(stamps) - WALL_START_NS) * 1e-9 / _STEP_S).astype(int)
     track = se2.between(poses[0], poses)
-    return Drive(events, np.array(stamps), track[at], track, poses[0], scanner.mount)
+    return Drive(events, np.array(stamps), _at(track, (np.array(stamps) - WALL_START_NS) * 1e-9), track, poses[0], scanner.mount)
 
 
 def true_points(drive: Drive, scan: Scan) -> np.ndarray:
     """(N, 3) points of ``scan`` in the body frame at the middle of its sweep, moved there as the robot really moved."""
-    at = ((scan.middle_ns - WALL_START_NS) * 1e-9 + np.append(0.0, scan.times_from_middle)) / _STEP_S
-    i = np.minimum(at.astype(int), len(drive.track) - 2)
-    f = (at - i)[:, None]
-    poses = (1.0 - f) * drive.track[i] + f * drive.track[i + 1]
+    poses = _at(drive.track, (scan.middle_ns - WALL_START_NS) * 1e-9 + np.append(0.0, scan.times_from_middle))
     points = Sweep.from_scan(scan, drive.mount).points.copy()
     points[:, :2] = se2.transform(se2.between(poses[0], poses[1:]), points[:, :2])
     return points
+
+
+def _at(track: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """(n, 3) poses of ``track`` (m, 3) at ``times`` (n,) after its start [s]."""
+    i = np.minimum((times / _STEP_S).astype(int), len(track) - 2)
+    return se2.interpolate(track[i], track[i + 1], times / _STEP_S - i)
 
 
 def _ns(t: float) -> int:
