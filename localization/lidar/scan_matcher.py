@@ -160,6 +160,10 @@ class Fit:
     """How many points have a surface of the submap near them."""
 
 
+_SQUARES, _FITTING = 2, 4
+"""Where `linearize` has two of the numbers of `Fit`."""
+
+
 class ScanMatcher:
     """The submap of the last key scans, and where scans fit into it. Poses are ``odom_T_body``, points (N, 2) of the body frame."""
 
@@ -171,7 +175,7 @@ class ScanMatcher:
         self._image: LikelihoodImage | None = None
         self.is_new_place = False
         """Most of the last scan lies in unmapped space, the rest fits and the prior is narrow: it should be drawn at once."""
-        self._residuals = np.full(3, 1e-3)  # sums over the last scans: squares, squares of blocks, points
+        self._residuals = np.full(3, 1e-3)  # sums over the last scans: squares, squares of blocks, points that fit
 
     def match(self, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2 | None = None, jump: Tangent2 = _NO_JUMP) -> ScanMatch | None:
         """The pose of ``points`` near ``prior`` (3,), whose error against the submap has covariance ``cov`` (3, 3); None where it is lost.
@@ -234,11 +238,13 @@ class ScanMatcher:
         """Draw a scan from ``pose`` (3,). ``map_cov`` (3, 3) of the submap's error there: with it, old scans stay while they fit."""
         drawn = np.asarray(se2.transform(pose, points))
         scan = make_grid(drawn, self.cell, self._config.range_noise_m)
-        share, new = (1.0, 0.0) if self._grid is None else measure_shares(self._grid, scan)
+        share, new = (1.0, 1.0) if self._grid is None else measure_shares(self._grid, scan)
         self._keys = [*self._fitting_keys(pose, points, map_cov), KeyScan(drawn, pose, np.zeros((3, 3)) if map_cov is None else map_cov)]
         self._draw()
         assert self._grid is not None
-        H = linearize(self._grid, points, pose)[0]
+        H, _, found = linearize(self._grid, points, pose)
+        if len(self._keys) == 1:  # sums over neighbours cancel here: the surfaces are of the scan's own points
+            self._residuals = self._residuals + found[[_SQUARES, _SQUARES, _FITTING]]
         noise = np.asarray(np.linalg.inv(H + _OPEN_INFORMATION) * self._block_variance, dtype=float)
         W = np.linalg.inv(np.eye(3) + noise @ _MAPPED_INFORMATION)  # not along directions that the scene leaves open
         return KeyScanError(share, new * W @ noise @ W.T)

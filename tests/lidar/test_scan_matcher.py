@@ -273,8 +273,21 @@ def test_insert_key_scan_share_is_that_of_its_place(n: int) -> None:
         matcher.insert_key_scan(np.zeros(3), rooms.scan_from(LAB, np.zeros(3), rng))
     key = matcher.insert_key_scan(np.zeros(3), rooms.scan_from(LAB, np.zeros(3), rng))
     assert 0.95 / (n + 1) < key.share < 1.35 / (n + 1)
-    assert not first.new_cov.any()  # it defines the submap's frame
     assert 0.0 < np.sqrt(np.linalg.eigvalsh(key.new_cov).max()) < 0.01
+
+
+@pytest.mark.parametrize("noise", [0.006, 0.012, 0.024])
+def test_insert_key_scan_of_first_has_its_noise(noise: float) -> None:
+    """Scans that are matched to the first one share its noise, whatever the scanner's is: NEES of 30 rooms' worth of pairs, 3 expected."""
+    squares = []
+    for seed in range(30):
+        rng, matcher = np.random.default_rng(seed), ScanMatcher(LidarConfig(), CELL)
+        first = matcher.insert_key_scan(np.zeros(3), rooms.scan_from(LAB, np.zeros(3), rng, noise))
+        found = matcher.match(rooms.scan_from(LAB, np.zeros(3), rng, noise), np.zeros(3), NARROW)
+        assert found is not None
+        error = error_of(np.zeros(3), found.measured)
+        squares.append(error @ np.linalg.solve(found.cov + first.new_cov, error))
+    assert 1.5 < np.mean(squares) < 4.5
 
 
 def test_submap_holds_last_key_scans_only() -> None:
