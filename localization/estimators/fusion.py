@@ -16,7 +16,7 @@ from motion_models import se2
 from motion_models.base import Motion, MotionModel
 from motion_models.online_calibration import Corrections
 from motion_models.robot import Robot
-from motion_models.se2 import Cov3, FloatArray, Points2, Twist2
+from motion_models.se2 import Cov3, FloatArray, Points2, Tangent2, Twist2
 
 _PRIOR_SCANS = 0.2
 """Weight of white slip, as the wheels' noise model has it, in scans: the first key scans are drawn by then, and their error stays (NEES of
@@ -151,26 +151,34 @@ class EkfFusion(Estimator):
 
 
 class _SlipChanges:
-    """How much of the wheels' noise is new in every step, along each axis, by how far the slip of one scan is off that of the next.
+    """How much of the wheels' noise is white, along each axis, by the slip of successive scans.
 
-    Slip that lasts is in the twist that a sweep is deskewed with. What changes within the sweep is not: it bends the scan.
+    Slip that lasts is in the twist that a sweep is deskewed with. White slip is not: it bends the scan.
     """
 
     def __init__(self) -> None:
         self._sum, self._weight = np.full(3, _PRIOR_SCANS), np.full(3, _PRIOR_SCANS)  # white, until measured
+        self._last: Tangent2 | None = None  # change before the last scan [m, m, rad]
 
     def add(self, change: Twist2, scan_cov: Cov3, step: Step, sweep_s: float) -> None:
         """``change`` (3,) of the slip since the last scan [m/s, m/s, rad/s]; ``scan_cov`` (3, 3) of the scans that measured it.
 
-        A scan gives the mean over its sweep of T: second differences of a random walk's means have 2 - T / dt of its variance over dt.
+        Changes c of the motion's error from step to step have E[c_k c_k+1] = -q for white slip with variance q a step, and hardly any
+        covariance where slip lasts. Scans with noise n add -4 n. As a scan gives the mean over its sweep of T, it is -(1 - 2/3 T / dt) q.
         """
         if not step.has_wheels or step.is_standing:
+            self._last = None
             return
-        white = (2.0 - min(sweep_s / step.duration, 1.0)) * np.diagonal(step.predicted.cov)
-        scans = 6.0 * np.diagonal(scan_cov)  # 1 + 4 + 1
-        squares = (change * step.duration) ** 2
-        is_inlier = squares < OUTLIER_SIGMAS**2 * (white + scans)  # beyond, scans or wheels are outliers
-        self._sum = np.where(is_inlier, FORGETTING * self._sum + (squares - scans) / white, self._sum)
+        last, self._last = self._last, change * step.duration
+        if last is None:
+            return
+        white = (1.0 - min(sweep_s / step.duration, 1.0) * 2.0 / 3.0) * np.diagonal(step.predicted.cov)
+        scans = np.diagonal(scan_cov)
+        is_inlier = np.maximum(last**2, self._last**2) < OUTLIER_SIGMAS**2 * (
+            2.0 * white + 6.0 * scans
+        )  # else wheels or scans are outliers
+        excess = (-last * self._last - 4.0 * scans) / white
+        self._sum = np.where(is_inlier, FORGETTING * self._sum + excess, self._sum)
         self._weight = np.where(is_inlier, FORGETTING * self._weight + 1.0, self._weight)
 
     def rate(self, step: Step) -> Cov3:
