@@ -114,23 +114,23 @@ def errors_on_second_visit(drive: rooms.Drive, poses: np.ndarray) -> np.ndarray:
 
 
 def test_graph_around_building_closes_loop() -> None:
-    """After it, the live pose is nearer the place of the first visit than by the odometry, and the smoothed trajectory nearer the truth: of
-    four drives, in the one whose odometry drifts most."""
-
-    def odometry_errors(seed: int) -> np.ndarray:
-        estimates = estimated(seed)[0]
-        return errors(around(seed), [e.stamp_ns for e in estimates], np.array([e.odometry[0] for e in estimates]))
-
-    seed = max(range(4), key=lambda seed: odometry_errors(seed)[-20:].mean())
-    drive, (estimates, pipeline) = around(seed), estimated(seed)
-    stamps, odometry = [e.stamp_ns for e in estimates], odometry_errors(seed)
-    live, by_odometry = (at_scans(drive, stamps, [pose(e) for e in estimates]) for pose in (lambda e: e.pose, lambda e: e.odometry[0]))
-    whole = smoothed(estimates, pipeline)
-    assert pipeline.estimator.counts()["loops"] >= 2
-    assert odometry[-20:].mean() > 0.03
-    assert errors_on_second_visit(drive, live).mean() < 0.3 * errors_on_second_visit(drive, by_odometry).mean()
-    after = errors(drive, whole.stamps_ns.tolist(), whole.poses)
-    assert np.sqrt(np.mean(after**2)) < 0.9 * np.sqrt(np.mean(odometry**2))
+    """After it, live poses are nearer the place of the first visit than the odometry's, and smoothed trajectories nearer the truth: in the
+    mean of four drives, as drift differs by chance."""
+    rows = []
+    for seed in range(4):
+        drive, (estimates, pipeline) = around(seed), estimated(seed)
+        assert pipeline.estimator.counts()["loops"] >= 2
+        stamps, odometry = [e.stamp_ns for e in estimates], [e.odometry[0] for e in estimates]
+        live, by_odometry = (
+            errors_on_second_visit(drive, at_scans(drive, stamps, poses)).mean() for poses in ([e.pose for e in estimates], odometry)
+        )
+        whole = smoothed(estimates, pipeline)
+        after, before = errors(drive, whole.stamps_ns.tolist(), whole.poses), errors(drive, stamps, np.array(odometry))
+        rows.append([live, by_odometry, np.sqrt(np.mean(after**2)), np.sqrt(np.mean(before**2))])
+    live, by_odometry, after, before = np.mean(rows, axis=0)
+    assert before > 0.03
+    assert live < 0.8 * by_odometry
+    assert after < 0.8 * before
 
 
 def test_graph_with_corrections_that_hardly_change_is_solved() -> None:
@@ -142,10 +142,10 @@ def test_graph_with_corrections_that_hardly_change_is_solved() -> None:
 
 def test_graph_with_loop_moves_map_and_not_odometry() -> None:
     """The pose in the map jumps where the loop closes; odom -> base_link moves as the robot does (REP-105)."""
-    estimates, _ = estimated()
+    jumps = [np.hypot(*np.diff([e.map_T_odom for e in estimated(seed)[0]], axis=0)[:, :2].T).max() for seed in range(4)]
+    assert max(jumps) > 0.03
+    estimates, _ = estimated(int(np.argmax(jumps)))
     odometry = np.array([e.odometry[0] for e in estimates])
-    jumps = np.hypot(*np.diff([e.map_T_odom for e in estimates], axis=0)[:, :2].T)
-    assert jumps.max() > 0.01
     moved = se2.between(odometry[:-1], odometry[1:])
     assert np.hypot(moved[:, 0], moved[:, 1]).max() < 0.8 / SCANNER.rate_hz + 0.03  # 0.8 m/s
     chained = se2.compose(np.array([e.map_T_odom for e in estimates]), odometry)
