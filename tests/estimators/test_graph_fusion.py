@@ -119,7 +119,7 @@ def test_graph_around_building_closes_loop() -> None:
     rows = []
     for seed in range(4):
         drive, (estimates, pipeline) = around(seed), estimated(seed)
-        assert pipeline.estimator.counts()["loops"] >= 2
+        assert pipeline.estimator.counts()["loops"] >= 1
         stamps, odometry = [e.stamp_ns for e in estimates], [e.odometry[0] for e in estimates]
         live, by_odometry = (
             errors_on_second_visit(drive, at_scans(drive, stamps, poses)).mean() for poses in ([e.pose for e in estimates], odometry)
