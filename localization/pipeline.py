@@ -86,14 +86,20 @@ class Pipeline:
 
     def _estimates(self, is_last: bool) -> Iterator[Estimate]:
         while (interval := self.synchronizer.next_interval(is_last)) is not None:  # synchronize
+            self._calibrate()
             step = self.synchronizer.preintegrate(interval)  # wheels through the motion model, gyro, scan
             step = self.checks.apply(step)  # without faulty sensors
             estimate = self.checks.widen(self.estimator.step(step))  # predict, match, update
             self._feed_back(step, is_scan_matched=estimate.nis is not None)
             yield estimate  # publish
 
+    def _calibrate(self) -> None:
+        """Predict with the corrections and the clock offset that the estimator has, once its deferred work is done."""
+        self.run_deferred()
+        self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
+
     def _feed_back(self, step: Step, is_scan_matched: bool) -> None:
-        """Use the estimated corrections and clock offset from the next step on; a scan ends a gap in the wheel data."""
+        """Pass the estimated clock offset to the synchronizer, which waits for data by it; a scan ends a gap in the wheel data."""
         if is_scan_matched:
             self.synchronizer.end_gap()
         self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)

@@ -154,14 +154,14 @@ class Filter:
     def map_relative_cov(self) -> Cov3:
         """(3, 3) covariance of the pose against the submap around the robot: that of the prior of a match."""
         P = self.P
-        return positive(P[POSE, POSE] + P[MAP, MAP] - P[POSE, MAP] - P[MAP, POSE])
+        return _clip_eigenvalues(P[POSE, POSE] + P[MAP, MAP] - P[POSE, MAP] - P[MAP, POSE])
 
     def motion_since(self, clone: slice) -> tuple[Pose2, Cov3]:
         """Motion (3,) since the clone `START` or `KEY`, and its covariance (3, 3)."""
         delta = se2.between(self.start if clone == START else self.key, self.pose)
         A, P = se2.adjoint(se2.inverse(delta)), self.P
         cross = P[POSE, clone] @ A.T
-        return delta, positive(P[POSE, POSE] - cross - cross.T + A @ P[clone, clone] @ A.T)
+        return delta, _clip_eigenvalues(P[POSE, POSE] - cross - cross.T + A @ P[clone, clone] @ A.T)
 
     def _update(self, innovation: FloatArray, H: FloatArray, R: FloatArray) -> float:
         """Schmidt-Kalman update in Joseph's form; consider states have no gain. Returns the NIS. Raises `EstimatorError`."""
@@ -202,14 +202,14 @@ class Filter:
         self.corrections = self.corrections + error[PARAMS:]
 
 
-def positive(cov: FloatArray, least: float = _MIN_VARIANCE) -> FloatArray:
-    """``cov`` (..., n, n), a difference of large covariances, with eigenvalues of at ``least`` so much: rounding leaves negative ones."""
+def _clip_eigenvalues(cov: FloatArray) -> Cov3:
+    """``cov`` (n, n), a difference of large covariances, with eigenvalues of at least `_MIN_VARIANCE`: rounding leaves negative ones."""
     values, vectors = np.linalg.eigh(_symmetric(cov))
-    return np.asarray((vectors * np.maximum(values, least)[..., None, :]) @ vectors.swapaxes(-1, -2), dtype=float)
+    return np.asarray((vectors * np.maximum(values, _MIN_VARIANCE)) @ vectors.T, dtype=float)
 
 
 def _symmetric(P: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (P + P.swapaxes(-1, -2)))
+    return np.asarray(0.5 * (P + P.T))
 
 
 def _check(what: str, *arrays: FloatArray) -> None:

@@ -32,11 +32,13 @@ class EkfFusion(Estimator):
         self.filter = Filter(robot.gyro_noise, corrections, replace(config, clock_sigma_s=0.0) if sensor is None else config)
         self._sensor, self.model, self.corrections = sensor, model, corrections
         self._track_m = robot.geometry.track_width_m
-        self._twist, self._slip = np.zeros(3), np.zeros(3)  # of the last step; what the wheels missed of it
+        self._twist, self._slip = np.zeros(3), np.zeros(3)  # of the last step, and less that of the wheels
         self._slip_changes = _SlipChanges()
         self._is_slip_measured = self._has_gyro = self._is_scan_pending = False
         self.wheel_motion, self.is_turning = Motion(np.zeros(3), np.zeros((3, 3))), True
-        """Motion of the last step by the wheels, with the covariance that the filter gave it in the end; whether it corrects the model."""
+        """Motion of the last step by the wheels, with its scaled and outlier covariance; whether it excites the corrections."""
+        self.used_corrections = self.filter.corrections
+        """(k,) with which it was predicted."""
         self.counts_by_name = dict.fromkeys(("scans", "matched", "standing", "prior_outliers"), 0)
 
     @property
@@ -68,6 +70,7 @@ class EkfFusion(Estimator):
         """Predict, update by the gyro, update by the scan."""
         self.run_deferred()
         ekf, nis = self.filter, None
+        self.used_corrections = ekf.corrections
         self.counts_by_name["standing"] += step.is_standing
         self.wheel_motion, self.is_turning = replace(step.predicted, cov=ekf.wheel_cov(step)), self._is_turning(step.predicted)
         ekf.predict(step, self.is_turning)
@@ -94,7 +97,7 @@ class EkfFusion(Estimator):
     def _update_scan(self, step: Step, sensor: ScanMatchingSensor) -> float | None:
         """Match the scan of ``step`` and update by it; its NIS, or None where there is no scan or no match."""
         if step.scan is None:
-            sensor.lost.add_no_scan(step.end_ns)
+            sensor.add_no_scan(step.end_ns)
             return None
         ekf, duration = self.filter, step.duration
         self.counts_by_name["scans"] += 1

@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
 from localization.estimators.base import Estimate, Estimator
-from localization.estimators.filter import KEY, PARAMS, positive
+from localization.estimators.filter import KEY, PARAMS
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
 from localization.events import PositionSample, Step
@@ -61,7 +61,7 @@ class GraphFusion(Estimator):
     """`EkfFusion` with a `PoseGraph` behind it."""
 
     def __init__(self, odometry: EkfFusion, corrections: Corrections, lidar: LidarConfig, config: GraphConfig, is_smoothing: bool):
-        """``is_smoothing``: `finish` is to give the smoothed trajectory; memory then grows with the drive, 32 bytes a step."""
+        """``is_smoothing``: `finish` is to give the smoothed trajectory; memory then grows with the drive, 104 bytes a step."""
         self.odometry, self._corrections, self._config = odometry, corrections, config
         self._has_radius = "wheel_radius_scale" not in corrections.names  # else it is one of them
         prior = block_diag(corrections.cov, (_RADIUS_SIGMA if self._has_radius else _CONSTANT_SIGMA) ** 2)
@@ -69,7 +69,7 @@ class GraphFusion(Estimator):
         self._loops = LoopDetector(lidar)
         self._wheels = _KeyframeMotion(len(corrections.names))
         self._steps, self._stamps_ns = array("d"), array("q")  # the filter's poses, if they are to be smoothed
-        self._nodes, self._key_covs = array("q"), array("d")  # which of them are keyframes; their live covariances
+        self._nodes, self._since_key = array("q"), array("d")  # which of them are keyframes; covariances of the motion since the last one
         self._is_smoothing = is_smoothing
         self._is_keyframe_due = self._is_matched = False
         self._map_T_odom, self._key_cov = np.zeros(3), np.zeros((3, 3))
@@ -100,12 +100,13 @@ class GraphFusion(Estimator):
         ekf = self.odometry.filter
         estimate = self.odometry.step(step)
         self._is_matched = estimate.nis is not None
-        self._wheels.add(self.odometry.wheel_motion, self._corrections, self.odometry.is_turning)
+        self._wheels.add(self.odometry.wheel_motion, self._corrections, self.odometry.is_turning, self.odometry.used_corrections)
         self._walked_s += 0.0 if step.is_standing else step.duration
+        delta, cov = ekf.motion_since(KEY)
         if self._is_smoothing and (not self._stamps_ns or step.end_ns > self._stamps_ns[-1]):
             self._steps.extend(ekf.pose)
+            self._since_key.extend(cov.ravel())
             self._stamps_ns.append(step.end_ns)
-        delta, cov = ekf.motion_since(KEY)
         moved = max(math.hypot(delta[0], delta[1]) / self._config.keyframe_distance_m, abs(delta[2]) / self._config.keyframe_angle_rad)
         waits_for_scan = step.scan is None and self.lost is not None and moved < _LONGEST_WAIT
         self._is_keyframe_due = not self.graph.count or (moved >= 1.0 and not waits_for_scan)
@@ -151,8 +152,6 @@ class GraphFusion(Estimator):
             ekf.set_corrections(mean[:-1], cov[:-1, :-1])
         self._map_T_odom = se2.compose(self.graph.pose(k), se2.inverse(ekf.pose))
         self._key_cov = self.graph.marginal(k)
-        if self._is_smoothing:
-            self._key_covs.extend(self._key_cov.ravel())
 
     def _walk(self) -> FloatArray | None:
         """(c, c) by which the corrections may have changed, once a minute; None meanwhile."""
@@ -214,8 +213,7 @@ class GraphFusion(Estimator):
             raise EstimatorError("the pose graph has no finite solution. Check the log with `skidloc info`, and the robot file's noise.")
         nodes, odom = np.array(self._nodes), np.array(self._steps).reshape(-1, 3)
         smoothed, smoothed_covs = _interpolate(nodes, poses, covs, odom)
-        if filtered.covariances is not None:
-            smoothed_covs += _cov_between_nodes(nodes, odom, filtered.covariances, np.array(self._key_covs).reshape(-1, 3, 3))
+        smoothed_covs += _cov_between_nodes(nodes, odom, np.array(self._since_key).reshape(-1, 3, 3))
         return Trajectory(filtered.stamps_ns, smoothed, smoothed_covs)
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
@@ -265,23 +263,28 @@ class _KeyframeMotion:
     def __init__(self, n: int) -> None:
         self._delta, self._cov = np.zeros(3), np.zeros((3, 3))
         self._by_corrections, self._straight = np.zeros((3, n)), np.zeros((3, n))
+        self._corrected = np.zeros(3)  # share of the corrections in the motion
         self._prior = np.zeros((n, n))
 
-    def add(self, motion: Motion, corrections: Corrections, is_turning: bool) -> None:
-        """Add the next step. Nearly straight motion does not excite the corrections: there they are one error of the whole motion."""
+    def add(self, motion: Motion, corrections: Corrections, is_turning: bool, at: FloatArray) -> None:
+        """Add the next step, predicted with the corrections ``at`` (n,). Nearly straight motion does not excite the corrections: there they
+        are one error of the whole motion."""
         A = se2.adjoint(se2.inverse(motion.delta))
         self._delta = se2.compose(self._delta, motion.delta)
         self._cov = A @ self._cov @ A.T + motion.cov
         D = motion.d_params @ corrections.directions if motion.d_params.shape[1] else np.zeros_like(self._straight)
-        self._by_corrections = A @ self._by_corrections + (D if is_turning else 0.0)
-        self._straight = A @ self._straight + (0.0 if is_turning else D)
+        excited, straight = (D, np.zeros_like(D)) if is_turning else (np.zeros_like(D), D)
+        self._by_corrections = A @ self._by_corrections + excited
+        self._straight = A @ self._straight + straight
+        self._corrected = A @ self._corrected + excited @ at
         self._prior = corrections.cov
 
     def preintegrated(self, at: FloatArray) -> PreintegratedMotion:
-        """All of it. ``at``: the corrections with which the last step was predicted; those of the others hardly differ."""
+        """All of it, as predicted with the corrections ``at`` (n,)."""
         cov = self._cov + self._straight @ self._prior @ self._straight.T + 1e-10 * np.eye(3)
-        by_scale = np.append(-se2.inverse(self._delta)[:2], 0.0)  # R^T (x, y), yaw 0: turns have a scale of their own, k
-        return PreintegratedMotion(self._delta, cov, np.column_stack([self._by_corrections, by_scale]), np.append(at, 0.0))
+        delta = se2.compose(self._delta, se2.exp(self._by_corrections @ at - self._corrected))
+        by_scale = np.append(-se2.inverse(delta)[:2], 0.0)  # R^T (x, y), yaw 0: turns have a scale of their own, k
+        return PreintegratedMotion(delta, cov, np.column_stack([self._by_corrections, by_scale]), np.append(at, 0.0))
 
 
 def _subtract_information(delta: Pose2, cov: Cov3, prior: Pose2, prior_cov: Cov3) -> tuple[Pose2, Cov3]:
@@ -330,16 +333,13 @@ def _interpolate(nodes: FloatArray, poses: FloatArray, covs: FloatArray, odom: F
     return se2.compose(forward, se2.exp(part[:, None] * se2.log(se2.between(forward, backward)))), mixed
 
 
-def _cov_between_nodes(nodes: FloatArray, odom: FloatArray, live: FloatArray, key_covs: FloatArray) -> FloatArray:
-    """(N, 3, 3) noise of poses between keyframes: that of the motion since the last one, the less of it the nearer the next one is.
-
-    The motion's is the growth of the ``live`` covariances (N, 3, 3) since those of the keyframes (K, 3, 3), which smoothing replaces.
-    """
-    k, part = _shares(nodes, odom)
-    A = se2.adjoint(se2.inverse(se2.between(odom[nodes[k]], odom)))
-    grown = (1.0 - part)[:, None, None] * (live - A @ key_covs[k] @ A.swapaxes(-1, -2))
+def _cov_between_nodes(nodes: FloatArray, odom: FloatArray, since_key: FloatArray) -> FloatArray:
+    """(N, 3, 3) noise of poses between keyframes, which smoothing leaves: that of the motion since the last one, ``since_key`` (N, 3, 3),
+    the less of it the nearer the next one is."""
+    part = _shares(nodes, odom)[1]
+    grown = (1.0 - part)[:, None, None] * since_key
     grown[nodes] = 0.0
-    return positive(grown, least=0.0)
+    return grown
 
 
 def _shares(nodes: FloatArray, odom: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:

@@ -222,7 +222,7 @@ class PoseGraph:
     def _add_walk(self, cov: FloatArray, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
         before, after = gtsam.symbol("c", self._walks), gtsam.symbol("c", self._walks + 1)
         factors.add(gtsam.BetweenFactorVector(before, after, np.zeros(len(cov)), gtsam.noiseModel.Gaussian.Covariance(cov)))
-        values.insert(after, self.corrections()[0])
+        values.insert(after, self._values.atVector(before))
         self._walks += 1
 
 

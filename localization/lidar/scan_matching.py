@@ -79,6 +79,11 @@ class ScanMatchingSensor:
             self.lost.add_matched(step.end_ns)
         return found
 
+    def add_no_scan(self, stamp_ns: int) -> None:
+        """A step without a scan: none is at hand, and the LiDAR may be silent."""
+        self._scan = None
+        self.lost.add_no_scan(stamp_ns)
+
     def _update_search_state(self, is_searching: bool, now_s: float) -> None:
         """Scans that may be anywhere do not enter the submap for some seconds: drawn there, they compete with their true place."""
         if not is_searching:
@@ -163,5 +168,6 @@ class ScanMatchingSensor:
         mount = self._mounts.get(frame)
         if mount is not None and not self._is_placed:
             self._matcher, self._kiss, self._last_key = None, None, None
+            self._searching_since_s, self._is_searching = None, False
         self._is_placed = mount is not None
         return mount or Mount()

@@ -23,7 +23,7 @@ from localization.simulation import world
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion
-from motion_models.online_calibration import corrections
+from motion_models.online_calibration import correctable, corrections
 from motion_models.registry import make_model
 from motion_models.robot import WheelNoise
 from tests.helpers import rooms
@@ -185,6 +185,42 @@ def test_graph_corrections_hold_for_next_prediction() -> None:
     assert not np.allclose(pipeline.synchronizer.params, nominal)
 
 
+def test_graph_predicts_with_the_corrections_that_its_filter_has() -> None:
+    """Also where the graph has changed them after the last estimate."""
+    pipeline, used = make_pipeline(around()), []
+    estimator, step = pipeline.estimator, pipeline.estimator.odometry.step
+
+    def record(given):
+        used.append((pipeline.synchronizer.params, estimator.odometry.params))
+        return step(given)
+
+    estimator.odometry.step = record
+    run(pipeline, around().events[:400])
+    assert estimator.graph.count > 3
+    for of_prediction, of_filter in used[1:]:
+        np.testing.assert_array_equal(of_prediction, of_filter)
+
+
+def test_keyframe_motion_is_that_of_one_set_of_corrections() -> None:
+    """Ten steps predicted while corrections are learned equal ten that were predicted with those at the end."""
+    model = correctable(make_model("diff_drive", rooms.ROBOT), "constant")
+    correct, rates, no_cg = corrections(model, "constant"), np.array([1.0, 3.0]), np.zeros(2)
+    final = 0.2 * np.ones(len(correct.names))
+
+    def motion(at: np.ndarray) -> Motion:
+        twist = model.twist(rates, no_cg, model.nominal + correct.directions @ at)
+        return Motion(se2.exp(0.1 * twist.value), 1e-8 * np.eye(3), se2.right_jacobian(0.1 * twist.value) @ (0.1 * twist.d_params))
+
+    while_learning, at_once = _KeyframeMotion(len(correct.names)), _KeyframeMotion(len(correct.names))
+    for share in np.linspace(0.0, 1.0, 10):
+        while_learning.add(motion(share * final), correct, True, share * final)
+        at_once.add(motion(final), correct, True, final)
+    expected = at_once.preintegrated(final).delta
+    off = se2.log(se2.between(expected, while_learning.preintegrated(final).delta))
+    as_predicted = se2.log(se2.between(expected, while_learning._delta))
+    assert np.abs(off).max() < 0.1 * np.abs(as_predicted).max()
+
+
 def test_graph_smoothed_has_consistent_nees() -> None:
     """The middle and the end of five drives, of 3 degrees of freedom each."""
     found = []
@@ -341,7 +377,7 @@ def test_keyframe_motion_derivative_by_radius_is_numeric(x: float, y: float, yaw
     motion, h = _KeyframeMotion(0), 1e-6
     none = corrections(make_model("diff_drive", rooms.ROBOT), "none")
     delta = np.array([x, y, yaw])
-    motion.add(Motion(delta, 1e-6 * np.eye(3), np.zeros((3, 0))), none, True)
+    motion.add(Motion(delta, 1e-6 * np.eye(3), np.zeros((3, 0))), none, True, np.zeros(0))
     more, less = (delta * [1.0 + step, 1.0 + step, 1.0] for step in (h, -h))
     numeric = (se2.log(se2.between(delta, more)) - se2.log(se2.between(delta, less))) / (2.0 * h)
     np.testing.assert_allclose(motion.preintegrated(np.zeros(0)).by_corrections[:, -1], numeric, atol=1e-6)
@@ -419,11 +455,26 @@ def test_smoothed_poses_between_keyframes_have_the_noise_of_scans() -> None:
 
 def test_cov_between_nodes_is_that_of_the_motion_less_its_share() -> None:
     odom = np.column_stack([[0.0, 0.5, 1.0, 1.5, 2.0], np.zeros(5), np.zeros(5)])
-    key_covs, noise = np.array([0.01 * np.eye(3), 0.02 * np.eye(3)]), np.diag([1e-4, 2e-4, 3e-5])
-    A = se2.adjoint(se2.inverse(odom))
-    live = A @ key_covs[0] @ A.swapaxes(-1, -2) + noise
-    found = _cov_between_nodes(np.array([0, 4]), odom, live, key_covs)
+    noise = np.diag([1e-4, 2e-4, 3e-5])
+    found = _cov_between_nodes(np.array([0, 4]), odom, np.tile(noise, (5, 1, 1)))
     np.testing.assert_allclose(found, np.array([0.0, 0.75, 0.5, 0.25, 0.0])[:, None, None] * noise, atol=1e-12)
+
+
+def test_smoothed_covariance_has_what_widens_live_poses_not_between_keyframes() -> None:
+    """Sensor faults inflate live covariances; smoothed ones are inflated by the pipeline afterwards, alike at keyframes and between."""
+    estimates, pipeline = run(make_pipeline(around()), around().events[:600]), make_pipeline(around())
+    run(pipeline, around().events[:600])
+    wide = [replace(e, covariance=e.covariance + 0.1 * np.eye(3)) for e in estimates]
+    np.testing.assert_array_equal(smoothed(wide, pipeline).covariances, smoothed(estimates, pipeline).covariances)
+
+
+def test_graph_with_silent_lidar_has_keyframes_without_scan() -> None:
+    """The scan of before the silence was measured elsewhere."""
+    drive, pipeline = around(), make_pipeline(around())
+    silent = (rooms.WALL_START_NS + 5 * 10**9, rooms.WALL_START_NS + 16 * 10**9)
+    run(pipeline, [e for e in drive.events if isinstance(e, WheelSample) or not silent[0] < e.stamp_ns < silent[1]])
+    has_scan = [len(key.points) > 0 for key in pipeline.estimator._loops.keyframes]
+    assert (has_scan[0], all(has_scan), has_scan[-1]) == (True, False, True)
 
 
 def test_subtract_information_with_wheels_gives_filters_motion() -> None:

@@ -62,6 +62,9 @@ class PoseSensor:
     def bend_cov(self, match, slip_rate):
         return np.zeros((3, 3))
 
+    def add_no_scan(self, stamp_ns):
+        self.lost.add_no_scan(stamp_ns)
+
     def is_key(self, pose):
         return False
 

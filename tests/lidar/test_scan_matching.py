@@ -10,6 +10,7 @@ from localization.lidar import LidarConfig, ScanMatchingSensor
 from localization.lidar.scan_checks import MAX_LOST_S
 from localization.simulation import world
 from motion_models.base import Motion
+from motion_models.robot import Mount
 from tests.helpers import rooms
 
 LAB, HALL = world.lab().walls, world.hall().walls
@@ -59,3 +60,16 @@ def test_scan_that_is_found_again_is_a_key_scan(sensor: ScanMatchingSensor) -> N
     assert not measure(sensor, 1.0, HALL, WIDE)
     assert measure(sensor, 1.1, LAB, WIDE)
     assert sensor.is_key(AHEAD)
+
+
+def test_submap_begins_anew_where_the_mount_comes_while_a_place_is_searched() -> None:
+    mounts: dict[str, Mount] = {}
+    sensor = ScanMatchingSensor(mounts, LidarConfig())
+    sensor.measure(step_at(0.1, LAB, np.zeros(3)), np.zeros(3), NARROW, np.zeros(3), np.zeros(3))
+    sensor.insert_key_scan(np.zeros(3), np.zeros((3, 3)))
+    assert not measure(sensor, 1.0, HALL, WIDE)
+    mounts[""] = Mount()
+    assert not measure(sensor, 1.1, LAB, WIDE)
+    assert sensor.is_key(AHEAD)
+    sensor.insert_key_scan(AHEAD, np.zeros((3, 3)))
+    assert measure(sensor, 1.2, LAB, NARROW)
