@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from localization.errors import LogError
-from localization.estimators import CORRECTING, LOCALIZING, Estimate, Estimator, EstimatorConfig, make_estimator
+from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, Estimate, Estimator, EstimatorConfig, make_estimator
 from localization.estimators.base import NIS, TWIST, TWIST_COV, EstimateTable, trajectory
 from localization.events import Event, ImuSample, PositionSample, Step
 from localization.lidar.losses import LidarLosses
@@ -58,10 +58,10 @@ class Pipeline:
         """``is_smoothing``: the estimator shall give a smoothed trajectory at the end; it changes no estimate on the way."""
         config = config or ReplayConfig()
         self._name = f"{trial.estimator} ({trial.model.name})"
-        self.is_localizing = trial.estimator in LOCALIZING
+        self.is_localizing = trial.estimator in ESTIMATORS_WITH_MAP
         self.mounts = dict(mounts)
         """Known mounts by frame, shared with the synchronizer and the estimator."""
-        model = correctable(trial.model, trial.corrections) if trial.estimator in CORRECTING else trial.model
+        model = correctable(trial.model, trial.corrections) if trial.estimator in ESTIMATORS_WITH_CORRECTIONS else trial.model
         self.synchronizer = Synchronizer(model, robot, self.mounts, has_lidar, config.step)
         self.estimator: Estimator = make_estimator(
             trial.estimator, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing
@@ -225,7 +225,7 @@ class _Replay:
             estimator.map_points(),
             self._pipeline.warnings(),
             self._seconds,
-            self._trial.corrections if self._trial.estimator in CORRECTING else None,
+            self._trial.corrections if self._trial.estimator in ESTIMATORS_WITH_CORRECTIONS else None,
             None if smoothed is None else filtered,
             self._pipeline.lidar,
         )

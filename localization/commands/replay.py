@@ -20,7 +20,7 @@ from rich.table import Table
 
 from localization.commands.common import WIDE, names, new_folder, print_table, write_json
 from localization.errors import EstimatorError, EvaluationError
-from localization.estimators import CORRECTING, LOCALIZING, check_estimator
+from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, check_estimator
 from localization.evaluation.references import (
     ReferenceTrack,
     Relations,
@@ -98,7 +98,7 @@ class Replay:
             Trial(model, estimator, form)
             for estimator in self._estimators(has_lidar)
             for model in models
-            for form in check_forms(forms)[: None if estimator in CORRECTING else 1]
+            for form in check_forms(forms)[: None if estimator in ESTIMATORS_WITH_CORRECTIONS else 1]
         ]
         reference, positions = self._reference(log), self._positions(log)
         held_out = [_HELD_OUT.format(self.positions)] if self._is_held_out(log) else []
@@ -262,7 +262,7 @@ def _distance(results: Sequence[Result]) -> float | None:
 
 def _estimates(run: Run) -> Iterator[FusedEstimate]:
     t = run.trajectory if run.filtered is None else run.filtered  # what would have been published
-    parent = MAP_FRAME if run.estimator in LOCALIZING else PARENT_FRAME
+    parent = MAP_FRAME if run.estimator in ESTIMATORS_WITH_MAP else PARENT_FRAME
     for i in range(len(t)):
         twist_cov = run.twist_covariances[i]
         yield FusedEstimate(

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from localization.errors import EvaluationError, TransportError
-from localization.estimators import CORRECTING, check_estimator
+from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, check_estimator
 from localization.evaluation.references import ReferenceTrack, Relations, read_reference_file, reference_track
 from localization.evaluation.scores import score
 from localization.logs import Log, TopicOverrides, open_log
@@ -55,7 +55,7 @@ class TrialSpec:
     @property
     def name(self) -> str:
         """Model, estimator and corrections, as in tables."""
-        form = f" ({self.corrections})" if self.estimator in CORRECTING else ""
+        form = f" ({self.corrections})" if self.estimator in ESTIMATORS_WITH_CORRECTIONS else ""
         return f"{self.model} {self.estimator}{form}"
 
 
@@ -132,7 +132,7 @@ def _run(job: Job) -> list[Row]:
 
 
 def _head(job: Job, trial: TrialSpec) -> Row:
-    form = trial.corrections if trial.estimator in CORRECTING else ""
+    form = trial.corrections if trial.estimator in ESTIMATORS_WITH_CORRECTIONS else ""
     return {
         "log": job.log,
         "robot": job.robot.name,
@@ -174,7 +174,7 @@ def trials(models: Sequence[str], estimators: Sequence[str], forms: Sequence[For
         TrialSpec(model, estimator, form)
         for estimator in estimators
         for model in (models[:1] if estimator == "lidar" else models)
-        for form in forms[: None if estimator in CORRECTING else 1]
+        for form in forms[: None if estimator in ESTIMATORS_WITH_CORRECTIONS else 1]
     ]
 
 

@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 
 from localization.comparison.jobs import OK, Job, Row, TrialSpec
 from localization.errors import OutputError
-from localization.estimators import CORRECTING
+from localization.estimators import ESTIMATORS_WITH_CORRECTIONS
 from localization.output import output_errors, whole_file
 
 _HEAD = ("log", "robot", "model", "estimator", "corrections", "key", "status", "error")
@@ -82,7 +82,7 @@ def _name(row: Mapping[str, Any]) -> Name:
 
 
 def _name_of(job: Job, trial: TrialSpec) -> Name:
-    return job.log, trial.model, trial.estimator, trial.corrections if trial.estimator in CORRECTING else ""
+    return job.log, trial.model, trial.estimator, trial.corrections if trial.estimator in ESTIMATORS_WITH_CORRECTIONS else ""
 
 
 def _columns(rows: Sequence[Row]) -> list[str]:

@@ -16,7 +16,16 @@ from motion_models.base import MotionModel
 from motion_models.online_calibration import Form, corrections
 from motion_models.robot import Mount, Robot
 
-__all__ = ["CORRECTING", "ESTIMATORS", "LOCALIZING", "Estimate", "Estimator", "EstimatorConfig", "check_estimator", "make_estimator"]
+__all__ = [
+    "ESTIMATORS",
+    "ESTIMATORS_WITH_CORRECTIONS",
+    "ESTIMATORS_WITH_MAP",
+    "Estimate",
+    "Estimator",
+    "EstimatorConfig",
+    "check_estimator",
+    "make_estimator",
+]
 
 
 @dataclass(frozen=True)
@@ -29,9 +38,9 @@ class EstimatorConfig:
 
 
 ESTIMATORS = ("odometry", "lidar", "ekf", "graph")
-CORRECTING = ("ekf", "graph")
+ESTIMATORS_WITH_CORRECTIONS = ("ekf", "graph")
 """Those that correct the motion model on the way."""
-LOCALIZING = ("graph",)
+ESTIMATORS_WITH_MAP = ("graph",)
 """Those whose poses are ``map_T_body``; the others' are ``odom_T_body``."""
 
 

@@ -113,7 +113,7 @@ class EkfFusion(Estimator):
                 slip = se2.log(se2.between(ekf.start, match.pose)) / duration - step.mean_twist
                 match = sensor.refine(match, step.twist + slip)
                 self._slip_changes.add(slip - self._slip, match.cov, step, sensor.sweep_s)
-            R = match.cov + sensor.bend_cov(match, self._slip_changes.rate(step))
+            R = match.cov + sensor.intra_scan_slip_cov(match, self._slip_changes.rate(step))
         self.counts_by_name["matched"] += 1
         self.counts_by_name["prior_outliers"] += bool(match.outlier_cov.any())
         self.wheel_motion = replace(self.wheel_motion, cov=self.wheel_motion.cov + match.outlier_cov)

@@ -19,7 +19,7 @@ from localization.errors import EstimatorError
 from localization.estimators.base import Estimate, Estimator
 from localization.estimators.filter import KEY, PARAMS
 from localization.estimators.fusion import EkfFusion
-from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
+from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement, PreintegratedMotion
 from localization.events import PositionSample, Step
 from localization.lidar import OUTLIER_SIGMAS, LidarConfig, LostScans
 from localization.lidar.loop_detection import Keyframe, LoopDetector
@@ -39,7 +39,7 @@ _CONSTANT_SIGMA = 1e-4
 """Of what does not change: by far smaller ones GTSAM's marginals lose positive definiteness."""
 _LONGEST_WAIT = 2.0
 """Distances between keyframes after which the next one no longer waits for a scan: the LiDAR is silent."""
-_WALK_S = 60.0
+_CORRECTION_EPOCH_S = 60.0
 """Corrections are constant for this long [s]; as a random walk of an hour they change by an eighth of their prior sigma meanwhile."""
 
 
@@ -73,7 +73,7 @@ class GraphFusion(Estimator):
         self._is_smoothing = is_smoothing
         self._is_keyframe_due = self._is_matched = False
         self._map_T_odom, self._key_cov = np.zeros(3), np.zeros((3, 3))
-        self._walked_s = 0.0
+        self._moving_s = 0.0
         self._positions: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []  # keyframe, offset, position, cov: not aligned yet
         self._waiting: list[PositionSample] = []
         self._is_aligned = False
@@ -101,7 +101,7 @@ class GraphFusion(Estimator):
         estimate = self.odometry.step(step)
         self._is_matched = estimate.nis is not None
         self._wheels.add(self.odometry.wheel_motion, self._corrections, self.odometry.is_turning, self.odometry.used_corrections)
-        self._walked_s += 0.0 if step.is_standing else step.duration
+        self._moving_s += 0.0 if step.is_standing else step.duration
         delta, cov = ekf.motion_since(KEY)
         if self._is_smoothing and (not self._stamps_ns or step.end_ns > self._stamps_ns[-1]):
             self._steps.extend(ekf.pose)
@@ -137,9 +137,9 @@ class GraphFusion(Estimator):
                 D = wheels.by_corrections[:, :-1]
                 measured = _subtract_information(delta, cov, wheels.delta, wheels.cov + D @ ekf.P[PARAMS:, PARAMS:] @ D.T)
             pose = se2.compose(self.graph.pose(k - 1), delta)
-            update = Update(pose, wheels, self._walk(), (Between(k - 1, k, *measured),))
+            update = GraphUpdate(pose, wheels, self._epoch_cov(), (BetweenMeasurement(k - 1, k, *measured),))
         else:
-            update = Update(ekf.pose)
+            update = GraphUpdate(ekf.pose)
         self.graph.apply(update)
         if self._is_smoothing:
             self._nodes.append(len(self._stamps_ns) - 1)
@@ -153,12 +153,12 @@ class GraphFusion(Estimator):
         self._map_T_odom = se2.compose(self.graph.pose(k), se2.inverse(ekf.pose))
         self._key_cov = self.graph.marginal(k)
 
-    def _walk(self) -> FloatArray | None:
+    def _epoch_cov(self) -> FloatArray | None:
         """(c, c) by which the corrections may have changed, once a minute; None meanwhile."""
-        if self._walked_s < _WALK_S:
+        if self._moving_s < _CORRECTION_EPOCH_S:
             return None
-        cov = block_diag(self._corrections.walk_cov * self._walked_s, 0.0)
-        self._walked_s = 0.0
+        cov = block_diag(self._corrections.walk_cov * self._moving_s, 0.0)
+        self._moving_s = 0.0
         return np.asarray(cov + _CONSTANT_SIGMA**2 * np.eye(len(cov)))
 
     def _close_loop(self, keyframe: Keyframe) -> None:
@@ -166,7 +166,9 @@ class GraphFusion(Estimator):
         loop = self._loops.detect(self.odometry.cell, self.graph.poses, self.graph.marginal)
         if loop is not None:
             self.n_loops += 1
-            self.graph.apply(Update(betweens=(Between(loop.a, loop.b, loop.delta, np.asarray(np.linalg.inv(loop.cov)), is_loop=True),)))
+            self.graph.apply(
+                GraphUpdate(betweens=(BetweenMeasurement(loop.a, loop.b, loop.delta, np.asarray(np.linalg.inv(loop.cov)), is_loop=True),))
+            )
 
     def _place_positions(self, step: Step) -> None:
         """Positions up to the end of ``step`` are taken from the newest keyframe."""
@@ -196,9 +198,9 @@ class GraphFusion(Estimator):
             if len(ours) < _MIN_POSITIONS or np.hypot(*np.ptp(ours, axis=0)) < _MIN_BASELINE_M:
                 return
             alignment, self._is_aligned = _align(ours, theirs, sigmas), True
-        found = tuple(Position(*row) for row in self._positions)
+        found = tuple(PositionMeasurement(*row) for row in self._positions)
         self.n_positions += len(found)
-        self.graph.apply(Update(positions=found, alignment=alignment))
+        self.graph.apply(GraphUpdate(positions=found, alignment=alignment))
         self._positions = []
 
     def finish(self, filtered: Trajectory | None = None) -> Trajectory | None:

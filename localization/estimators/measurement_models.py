@@ -18,7 +18,7 @@ def predict_turn(
 
     Returns it with its Jacobians by the pose now (3,), by the start (3,), by the bias [s] and by the scale [rad].
     """
-    measured = (turn.angle - bias * turn.duration) / (1.0 + scale)  # tells how often the robot turned in a gap
+    measured = (turn.angle - bias * turn.duration) / (1.0 + scale)  # resolves full revolutions within a gap
     turned = measured + float(se2.scalar_wrap(float(world_T_now[2] - world_T_start[2]) - measured))
     return (1.0 + scale) * turned + bias * turn.duration, (1.0 + scale) * _YAW, -(1.0 + scale) * _YAW, turn.duration, turned
 
@@ -39,12 +39,8 @@ def motion_residual(world_T_a: Pose2, world_T_b: Pose2, measured: Pose2) -> tupl
     return error, -by_b @ se2.adjoint(se2.inverse(a_T_b)), by_b
 
 
-def position_residual(world_T_a: Pose2, lever: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """How far the point ``lever`` (2,) of the body at a is off a measured ``position`` (2,) [m].
-
-    Returns it with its Jacobians by a (2, 3) and by the lever (2, 2).
-    """
-    c, s = np.cos(world_T_a[2]), np.sin(world_T_a[2])
+def transform_point(a_T_b: Pose2, point: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """``point`` (2,) of frame b in frame a, with its Jacobians by the pose (2, 3) and by the point (2, 2)."""
+    c, s = np.cos(a_T_b[2]), np.sin(a_T_b[2])
     R = np.array([[c, -s], [s, c]])
-    sideways = np.array([-lever[1], lever[0]])
-    return se2.transform(world_T_a, lever) - position, np.column_stack([R, R @ sideways]), R
+    return se2.transform(a_T_b, point), np.column_stack([R, R @ [-point[1], point[0]]]), R

@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from localization.errors import EstimatorError
-from localization.estimators.measurement_models import motion_residual, position_residual
+from localization.estimators.measurement_models import motion_residual, transform_point
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Pose2
 
@@ -57,7 +57,7 @@ class PreintegratedMotion:
 
 
 @dataclass(frozen=True)
-class Between:
+class BetweenMeasurement:
     """A measured motion from keyframe ``a`` to keyframe ``b``, with the information (3, 3) of its right perturbation."""
 
     a: int
@@ -68,7 +68,7 @@ class Between:
 
 
 @dataclass(frozen=True)
-class Position:
+class PositionMeasurement:
     """A position by GPS, at ``offset`` (3,) from keyframe ``k``."""
 
     k: int
@@ -80,16 +80,16 @@ class Position:
 
 
 @dataclass(frozen=True)
-class Update:
+class GraphUpdate:
     """What enters the graph at once. Replayed in order, updates give the same graph to the last bit."""
 
     pose: Pose2 | None = None
     """(3,) initial value of the next keyframe, if there is one."""
     wheels: PreintegratedMotion | None = None
-    walk_cov: FloatArray | None = None
+    epoch_cov: FloatArray | None = None
     """(c, c) if the corrections go on as a new variable: how far they may have changed."""
-    betweens: tuple[Between, ...] = ()
-    positions: tuple[Position, ...] = ()
+    betweens: tuple[BetweenMeasurement, ...] = ()
+    positions: tuple[PositionMeasurement, ...] = ()
     alignment: Pose2 | None = None
     """(3,) initial value of ``enu_T_map``, with the first positions."""
 
@@ -102,14 +102,14 @@ class PoseGraph:
     """(c, c) of the corrections, around zero."""
     lever: FloatArray = field(default_factory=lambda: np.zeros(2))
     """(2,) of the positions' antenna in the body frame [m]."""
-    updates: list[Update] = field(default_factory=list)
+    updates: list[GraphUpdate] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         params = gtsam.ISAM2Params()
         params.relinearizeSkip = 1
         params.setRelinearizeThreshold(_RELINEARIZE)
         params.setFactorization("QR")  # CHOLESKY ended in IndeterminateLinearSystem after thousands of ordinary steps
-        self._isam, self.count, self._walks = gtsam.ISAM2(params), 0, 0
+        self._isam, self.count, self._epochs = gtsam.ISAM2(params), 0, 0
         updates, self.updates = self.updates, []
         for update in updates:
             self.apply(update)
@@ -120,7 +120,7 @@ class PoseGraph:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state)  # type: ignore[misc]
 
-    def apply(self, update: Update) -> None:
+    def apply(self, update: GraphUpdate) -> None:
         """Add ``update`` and solve."""
         self.updates.append(update)
         factors, values = self._factors(update)
@@ -165,13 +165,13 @@ class PoseGraph:
         """Mean (c,) and covariance (c, c) of the corrections."""
         if not len(self.prior_cov) or not self.count:
             return np.zeros(len(self.prior_cov)), self.prior_cov
-        key = gtsam.symbol("c", self._walks)
+        key = gtsam.symbol("c", self._epochs)
         return np.asarray(self._values.atVector(key)), np.asarray(self._isam.marginalCovariance(key))
 
     def smooth(self) -> tuple[FloatArray, FloatArray]:
         """Poses (count, 3) by all measurements, by Levenberg-Marquardt, and their covariances (count, 3, 3)."""
         graph, values = gtsam.NonlinearFactorGraph(), self._isam.calculateEstimate()
-        count, self.count, self._walks = self.count, 0, 0
+        count, self.count, self._epochs = self.count, 0, 0
         for update in self.updates:
             graph.push_back(self._factors(update)[0])
         assert self.count == count
@@ -183,15 +183,15 @@ class PoseGraph:
         self._values = values
         return self.poses(), covs
 
-    def _factors(self, update: Update) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    def _factors(self, update: GraphUpdate) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         if update.pose is not None:
             self._add_keyframe(update.pose, factors, values)
         k = self.count - 1
-        if update.walk_cov is not None:
-            self._add_walk(update.walk_cov, factors, values)
+        if update.epoch_cov is not None:
+            self._add_correction_epoch(update.epoch_cov, factors, values)
         if update.wheels is not None:
-            factors.add(wheel_factor(k - 1, k, gtsam.symbol("c", self._walks), update.wheels))
+            factors.add(wheel_factor(k - 1, k, gtsam.symbol("c", self._epochs), update.wheels))
         for between in update.betweens:
             noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Information(between.information)
             if between.is_loop:
@@ -219,11 +219,11 @@ class PoseGraph:
                 values.insert(gtsam.symbol("c", 0), prior)
         self.count += 1
 
-    def _add_walk(self, cov: FloatArray, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        before, after = gtsam.symbol("c", self._walks), gtsam.symbol("c", self._walks + 1)
+    def _add_correction_epoch(self, cov: FloatArray, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        before, after = gtsam.symbol("c", self._epochs), gtsam.symbol("c", self._epochs + 1)
         factors.add(gtsam.BetweenFactorVector(before, after, np.zeros(len(cov)), gtsam.noiseModel.Gaussian.Covariance(cov)))
         values.insert(after, self._values.atVector(before))
-        self._walks += 1
+        self._epochs += 1
 
 
 def wheel_factor(a: int, b: int, corrections: int, wheels: PreintegratedMotion) -> gtsam.CustomFactor:
@@ -248,21 +248,20 @@ def wheel_factor(a: int, b: int, corrections: int, wheels: PreintegratedMotion) 
     return _robust_factor(keys, wheels.cov, error)
 
 
-def position_factor(position: Position) -> gtsam.CustomFactor:
+def position_factor(position: PositionMeasurement) -> gtsam.CustomFactor:
     """t x_k (offset l) - p: where the antenna at lever arm l is, against the measured position."""
     key = gtsam.symbol("x", position.k)
 
     def error(this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None) -> FloatArray:
         enu_T_map, map_T_key, lever = _array(values.atPose2(_ALIGNMENT)), _array(values.atPose2(key)), np.asarray(values.atPoint2(_LEVER))
-        in_key = se2.transform(position.offset, lever)
-        _, _, by_lever = position_residual(position.offset, lever, in_key)
-        on_map, by_key, by_point = position_residual(map_T_key, in_key, np.zeros(2))
-        residual, by_alignment, by_map = position_residual(enu_T_map, on_map, position.position)
+        in_key, _, by_lever = transform_point(position.offset, lever)
+        in_map, by_key, in_map_by_point = transform_point(map_T_key, in_key)
+        in_enu, by_alignment, in_enu_by_point = transform_point(enu_T_map, in_map)
         if H is not None:
             H[0] = np.asfortranarray(by_alignment)
-            H[1] = np.asfortranarray(by_map @ by_key)
-            H[2] = np.asfortranarray(by_map @ by_point @ by_lever)
-        return np.asarray(residual)
+            H[1] = np.asfortranarray(in_enu_by_point @ by_key)
+            H[2] = np.asfortranarray(in_enu_by_point @ in_map_by_point @ by_lever)
+        return np.asarray(in_enu - position.position)
 
     return _robust_factor([_ALIGNMENT, key, _LEVER], position.cov, error)
 

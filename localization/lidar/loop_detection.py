@@ -25,18 +25,18 @@ from localization.lidar.submap import make_grid, voxel_means
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
-_LEAST_TRAVEL = 1.25
+_MIN_TRAVEL_SUBMAPS = 1.25
 """Travel between both visits, over that of the filter's own submap: what is nearer is in that submap already."""
-_AROUND = 8
+_OLD_KEYFRAMES = 8
 """Keyframes before and after the old one whose scans make its submap."""
-_RECENT = 5
+_NEW_KEYFRAMES = 5
 """Keyframes whose scans are matched together: one scan fits many places, five of them few. After a loop is closed, the next trial waits
 for as many: loops that share scans share their errors, and would count twice."""
 _FLOOR_COV = np.diag([0.02, 0.02, 0.005]) ** 2
 """Submaps bend: covariance of a loop, at least [m^2, m^2, rad^2]."""
 _AGREE_SQUARE = 9.0
 """Two loops agree where they and the odometry between them close within 3 sigma."""
-_REACH = 1.5
+_MAX_DISTANCE_RANGES = 1.5
 """How far from its place a scan still shows the same walls [median range]."""
 
 
@@ -67,7 +67,7 @@ class LoopDetector:
 
     def __init__(self, config: LidarConfig) -> None:
         self._config = config
-        self._least_travel_m = _LEAST_TRAVEL * config.key_scans * config.key_distance_m
+        self._least_travel_m = _MIN_TRAVEL_SUBMAPS * config.key_scans * config.key_distance_m
         self.keyframes: list[Keyframe] = []
         self._travelled_m: list[float] = []
         self._pending: list[LoopClosure] = []
@@ -91,14 +91,14 @@ class LoopDetector:
         if not old or k < self._next_trial or not len(self.keyframes[k].points):
             return None
         found = self._match(k, old, cell, poses(), marginal(k))
-        self._pending = [loop for loop in self._pending if k - loop.b <= _AROUND]
+        self._pending = [loop for loop in self._pending if k - loop.b <= _OLD_KEYFRAMES]
         if found is None:
             return None
         is_confirmed = any(self._agree(loop, found) for loop in self._pending)
         self._pending.append(found)
         if not is_confirmed:
             return None
-        self._next_trial = k + _RECENT
+        self._next_trial = k + _NEW_KEYFRAMES
         return found
 
     def _match(self, k: int, n_old: int, cell: float, poses: FloatArray, marginal: FloatArray) -> LoopClosure | None:
@@ -110,10 +110,10 @@ class LoopDetector:
         distance = np.where(has_points, np.hypot(*(old[:, :2] - poses[k, :2]).T), math.inf)
         j = int(np.argmin(distance))
         prior = se2.between(poses[j], poses[k])
-        if distance[j] > 3.0 * math.sqrt(float(np.linalg.eigvalsh(marginal[:2, :2])[-1])) + _REACH * median:
+        if distance[j] > 3.0 * math.sqrt(float(np.linalg.eigvalsh(marginal[:2, :2])[-1])) + _MAX_DISTANCE_RANGES * median:
             return None
-        place = self._merge(range(max(0, j - _AROUND), min(n_old, j + _AROUND + 1)), poses, j)
-        recent = voxel_means(self._merge(range(max(0, k - _RECENT + 1), k + 1), poses, k), 1.5 * cell)
+        place = self._merge(range(max(0, j - _OLD_KEYFRAMES), min(n_old, j + _OLD_KEYFRAMES + 1)), poses, j)
+        recent = voxel_means(self._merge(range(max(0, k - _NEW_KEYFRAMES + 1), k + 1), poses, k), 1.5 * cell)
         wide = marginal + prior_outlier_cov(marginal)
         reachable = _within_reach(place, recent, prior, wide, search_limit(marginal))
         if not len(reachable):

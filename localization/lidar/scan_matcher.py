@@ -9,7 +9,7 @@ stays quadratic: a robust loss on it lets the pose jump along directions that th
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -25,7 +25,7 @@ from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, Triple
 MIN_POINTS = 10
 """Points without which a scan is not matched."""
 _KERNEL = 3.0
-"""Scale of Geman-McClure's loss, and residuals that count as fitting, in sigmas."""
+"""Scale of Geman-McClure's loss, and residuals of inliers, in sigmas."""
 _REACH_CELLS = 2.5
 """How far a point may be from the voxel that it is associated with [cells]."""
 _MAX_ASSOCIATION_M = 3.0
@@ -46,7 +46,7 @@ _OUTLIER_COST = 0.5 * OUTLIER_SIGMAS**2
 _SEARCH_FACTOR = 9.0
 SEARCH_FLOOR = np.diag([0.1, 0.1, 0.03]) ** 2
 """The search covers 3 sigma of 9 P + this [m^2, m^2, rad^2] + j j^T, j from the prior to where the motion of the last step would lead."""
-_NO_JUMP = np.zeros(3)
+_NO_OFFSET = np.zeros(3)
 _SEARCH_LIMIT, _WIDEST_SEARCH = np.array([3.0, 3.0, 1.0]), np.array([15.0, 15.0, math.pi])
 """Half the window of a search at most, for a prior that may be an outlier, and for one that is wide itself [m, m, rad]."""
 _MAX_RIVAL = 0.9
@@ -140,7 +140,7 @@ class KeyScan:
 
 @dataclass(frozen=True)
 class Fit:
-    """A minimum of the cost above."""
+    """The cost above, linearized at a pose: as a rule its minimum."""
 
     pose: Pose2
     information: FloatArray
@@ -148,20 +148,16 @@ class Fit:
     gradient: Tangent2
     """(3,) of the points' cost, which the prior balances."""
     overlap: float
+    """Share of points that are inliers: within 3 sigma of a surface."""
     cost: float
     """-log likelihood of the points, those that err together counted once."""
-    squares: float
-    """Sum of e^2 over the points that fit."""
-    block_squares: float
-    """Sum of squares of the sums of e over blocks of `_BLOCK` neighbouring points that fit."""
-    fitting: float
-    """How many points fit."""
-    mapped: float
-    """How many points have a surface of the submap near them."""
-
-
-_SQUARES, _FITTING = 2, 4
-"""Where `linearize` has two of the numbers of `Fit`."""
+    n_inliers: int
+    n_associated: int
+    """Points with a surface of the submap near them."""
+    sum_squares: float
+    """Of e over the inliers."""
+    sum_block_squares: float
+    """Of the sums of e over blocks of `_BLOCK` neighbouring inliers."""
 
 
 class ScanMatcher:
@@ -174,40 +170,39 @@ class ScanMatcher:
         self._grid: VoxelGrid | None = None
         self._image: LikelihoodImage | None = None
         self.is_new_place = False
-        """Most of the last scan lies in unmapped space, the rest fits and the prior is narrow: it should be drawn at once."""
-        self._residuals = np.full(3, 1e-3)  # sums over the last scans: squares, squares of blocks, points that fit
+        """Most of the last scan lies in unmapped space, the rest are inliers and the prior is narrow: it is a key scan."""
+        self._residuals = np.full(3, 1e-3)  # sums over the last scans: squares, squares of blocks, inliers
 
-    def match(self, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2 | None = None, jump: Tangent2 = _NO_JUMP) -> ScanMatch | None:
+    def match(
+        self, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2 | None = None, offset: Tangent2 = _NO_OFFSET
+    ) -> ScanMatch | None:
         """The pose of ``points`` near ``prior`` (3,), whose error against the submap has covariance ``cov`` (3, 3); None where it is lost.
 
         Gauss-Newton starts from ``guess`` (3,), or from the prior. A pose is searched where the prior is wider than the basin of
         convergence, or where the result does not fit; one that fits far from the prior is aligned again with the prior as an outlier.
-        ``jump`` (3,), from the prior to where the motion of the last step would lead, widens the search.
+        ``offset`` (3,), from the prior to where the twist of the last step would lead, widens the search.
         """
-        nothing = np.zeros((3, 3))
         fit = self._align(points, prior, cov, prior if guess is None else guess)
-        self.is_new_place = fit.mapped < 0.5 * len(points) and fit.fitting >= 0.5 * fit.mapped and is_narrow(cov)
-        is_near, agrees = _is_within_basin(fit, cov), mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST
-        fits = is_near and fit.overlap >= self._config.search_below
-        if fits and agrees:
-            return self._result(fit, nothing)
-        added = prior_outlier_cov(cov) + np.outer(jump, jump)
-        best = fit.pose if fits else self._search(points, prior, cov + added, cov)
-        if best is not None:
-            if not is_near and mahalanobis(prior, best, cov) < 2.0 * _OUTLIER_COST:  # a wide prior has its covariance already
-                added = nothing
-            found = self._align(points, prior, cov + added, best, self.cell)
+        self.is_new_place = fit.n_associated < 0.5 * len(points) and fit.n_inliers >= 0.5 * fit.n_associated and is_narrow(cov)
+        converges, agrees = _is_within_basin(fit, cov), mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST
+        fits = converges and fit.overlap >= self._config.search_below
+        if not (fits and agrees):
+            added = prior_outlier_cov(cov) + np.outer(offset, offset)
+            start = fit.pose if fits else self._search(points, prior, cov + added, cov)
+            if start is not None and not converges and mahalanobis(prior, start, cov) < 2.0 * _OUTLIER_COST:
+                added = np.zeros((3, 3))  # within a prior that is wide itself
+            found = None if start is None else self._align(points, prior, cov + added, start, self.cell)
             least = self._config.lost_below if is_narrow(cov) else MIN_PLACE_OVERLAP  # the place may not be mapped
-            if found.overlap >= least and (not is_near or _is_better(found, fit, prior, cov)):
+            if found is not None and found.overlap >= least and (not converges or _is_better(found, fit, prior, cov)):
                 return self._result(found, added)
-        return self._result(fit, nothing) if is_near and fit.overlap >= self._config.lost_below else None
+        return self._result(fit, np.zeros((3, 3))) if converges and fit.overlap >= self._config.lost_below else None
 
     def refine(self, points: Points2, prior: Pose2, cov: Cov3, match: ScanMatch) -> ScanMatch | None:
         """``match`` again, for the same scan deskewed anew."""
         fit = self._align(points, prior, cov + match.outlier_cov, match.pose, 0.0)
         return None if fit.overlap < self._config.lost_below else self._result(fit, match.outlier_cov)
 
-    def bend_cov(self, points: Points2, times: FloatArray, pose: Pose2, slip_rate: Cov3) -> Cov3:
+    def intra_scan_slip_cov(self, points: Points2, times: FloatArray, pose: Pose2, slip_rate: Cov3) -> Cov3:
         """(3, 3) covariance of the match of a scan that is bent: it was deskewed with one twist, while the body's motion is a random walk w
         about it, of covariance ``slip_rate`` (3, 3) a second. ``times`` (N,) of the ``points`` are from the middle of the sweep, where w is
         zero and ``pose`` (3,) is matched. Part k of the sweep, with information H_k, pulls the pose by w(t_k):
@@ -222,17 +217,17 @@ class ScanMatcher:
         t = times[order[(np.arange(0.5, _SWEEP_PARTS) * len(points) / _SWEEP_PARTS).astype(np.intp)]]  # of the middle of each part
         later, earlier = H[::-1].cumsum(axis=0)[::-1][1:], H.cumsum(axis=0)[:-1]
         after, before = np.diff(np.maximum(t, 0.0)), np.diff(np.minimum(t, 0.0))  # how much of each gap is on either side of the middle
-        spread = sum(np.einsum("g,gij,jk,glk->il", gap, M, slip_rate, M) for gap, M in ((after, later), (before, earlier)))
+        pull = sum(np.einsum("g,gij,jk,glk->il", gap, M, slip_rate, M) for gap, M in ((after, later), (before, earlier)))
         R = np.linalg.inv(H.sum(axis=0) + _OPEN_INFORMATION)
-        return np.asarray(R @ spread @ R)
+        return np.asarray(R @ pull @ R)
 
     def evaluate(self, points: Points2, pose: Pose2) -> ScanMatch | None:
         """The match of ``points`` at ``pose`` (3,), which another method has found; None where too few of them fit there."""
         assert self._grid is not None
-        H, _, found = linearize(self._grid, points, pose)
-        if found[0] < self._config.lost_below:
+        fit = linearize(self._grid, points, pose)
+        if fit.overlap < self._config.lost_below:
             return None
-        return self._result(Fit(pose, H, np.zeros(3), *(float(value) for value in found)), np.zeros((3, 3)))
+        return self._result(replace(fit, gradient=np.zeros(3)), np.zeros((3, 3)))
 
     def insert_key_scan(self, pose: Pose2, points: Points2, map_cov: Cov3 | None = None) -> KeyScanError:
         """Draw a scan from ``pose`` (3,). ``map_cov`` (3, 3) of the submap's error there: with it, old scans stay while they fit."""
@@ -242,10 +237,10 @@ class ScanMatcher:
         self._keys = [*self._fitting_keys(pose, points, map_cov), KeyScan(drawn, pose, np.zeros((3, 3)) if map_cov is None else map_cov)]
         self._draw()
         assert self._grid is not None
-        H, _, found = linearize(self._grid, points, pose)
+        fit = linearize(self._grid, points, pose)
         if len(self._keys) == 1:  # sums over neighbours cancel here: the surfaces are of the scan's own points
-            self._residuals = self._residuals + found[[_SQUARES, _SQUARES, _FITTING]]
-        noise = np.asarray(np.linalg.inv(H + _OPEN_INFORMATION) * self._block_variance, dtype=float)
+            self._residuals += np.array([fit.sum_squares, fit.sum_squares, fit.n_inliers])
+        noise = np.asarray(np.linalg.inv(fit.information + _OPEN_INFORMATION) * self._block_variance, dtype=float)
         W = np.linalg.inv(np.eye(3) + noise @ _MAPPED_INFORMATION)  # not along directions that the scene leaves open
         return KeyScanError(share, new * W @ noise @ W.T)
 
@@ -288,9 +283,9 @@ class ScanMatcher:
     def _draw(self) -> None:
         self._grid, self._image = make_grid(self.points(), self.cell, self._config.range_noise_m), None
 
-    def _align(self, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2, spread: float | None = None) -> Fit:
+    def _align(self, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2, guess_error: float | None = None) -> Fit:
         assert self._grid is not None
-        return align_points(self._grid, points, prior, cov, guess, spread)
+        return align_points(self._grid, points, prior, cov, guess, guess_error)
 
     def _search(self, points: Points2, prior: Pose2, wide: FloatArray, cov: Cov3) -> Pose2 | None:
         """As `find_place`, in the submap."""
@@ -303,23 +298,21 @@ class ScanMatcher:
         """The match of the scan alone: one more Gauss-Newton step from the minimum, without the prior's pull."""
         R = np.asarray(np.linalg.inv(fit.information + _OPEN_INFORMATION), dtype=float)
         measured = se2.compose(fit.pose, se2.exp(-R @ fit.gradient))
-        self._residuals = FORGETTING * self._residuals + [fit.squares, fit.block_squares, fit.fitting]
+        self._residuals = FORGETTING * self._residuals + [fit.sum_squares, fit.sum_block_squares, fit.n_inliers]
         return ScanMatch(fit.pose, measured, R * self._residual_variance, fit.overlap, outlier_cov)
 
 
-def align_points(grid: VoxelGrid, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2, spread: float | None = None) -> Fit:
+def align_points(grid: VoxelGrid, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2, guess_error: float | None = None) -> Fit:
     """Gauss-Newton from ``guess`` (3,) for ``points`` (N, 2), with the ``prior`` (3,) of covariance ``cov`` (3, 3).
 
-    ``spread``: how far the guess may be off at a point [m]; None for a guess that is as uncertain as the prior.
+    ``guess_error``: how far the guess may be off at a point [m]; None for a guess that is as uncertain as the prior.
     """
     information = np.asarray(np.linalg.inv(cov), dtype=float)
-    first = _first_spread(points, cov) if spread is None else spread
-    pose = np.asarray(_align(grid, points, triple(prior), information, triple(guess), first), dtype=float)
-    H, g, found = linearize(grid, points, pose)
-    return Fit(pose, H, g, *(float(value) for value in found))
+    first = _prior_error_at_points(points, cov) if guess_error is None else guess_error
+    return linearize(grid, points, np.asarray(_align(grid, points, triple(prior), information, triple(guess), first), dtype=float))
 
 
-def _first_spread(points: Points2, cov: Cov3) -> float:
+def _prior_error_at_points(points: Points2, cov: Cov3) -> float:
     """How far a prior of ``cov`` (3, 3) may move a point of ``points`` (N, 2) [m]."""
     r2 = float(np.median(np.einsum("ij,ij->i", points, points)))
     return min(3.0 * math.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2] * r2), _MAX_ASSOCIATION_M)
@@ -377,28 +370,28 @@ def mahalanobis(prior: Pose2, pose: Pose2, cov: Cov3) -> float:
     return float(off @ np.linalg.solve(cov, off))
 
 
-def linearize(grid: VoxelGrid, points: Points2, x: Pose2) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Information (3, 3) and gradient (3,) of the points at ``x`` (3,), and the numbers of `Fit` from the overlap on."""
+def linearize(grid: VoxelGrid, points: Points2, x: Pose2) -> Fit:
+    """The cost of ``points`` (N, 2) at ``x`` (3,), with information and gradient."""
     H, g, n = np.zeros((3, 3)), np.zeros(3), max(len(points), 1)
-    fitting, mapped, cost, squares, block_squares = _linearize(grid, points, triple(x), 0.0, H, g)
-    return H, g, np.array([fitting / n, 0.5 * cost / CORRELATED_BEAMS, squares, block_squares, fitting, mapped])
+    inliers, associated, cost, squares, block_squares = _linearize(grid, points, triple(x), 0.0, H, g)
+    return Fit(x, H, g, inliers / n, 0.5 * cost / CORRELATED_BEAMS, inliers, associated, squares, block_squares)
 
 
 @kernel
-def _align(grid: VoxelGrid, points: Points2, prior: Triple, information: FloatArray, guess: Triple, spread: float) -> Triple:
+def _align(grid: VoxelGrid, points: Points2, prior: Triple, information: FloatArray, guess: Triple, guess_error: float) -> Triple:
     """The pose of least cost, from ``guess``; ``information`` (3, 3) of the prior, and how far it may move a point [m]."""
     least, x, jacobian = _REACH_CELLS * grid.cell, guess, np.empty((3, 3))
     H, g = np.empty((3, 3)), np.empty(3)
     for _ in range(_ITERATIONS):
-        _linearize(grid, points, x, spread, H, g)
+        _linearize(grid, points, x, guess_error, H, g)
         off = se2.scalar_log(se2.scalar_between(prior, x))
         se2.fill_right_jacobian_inverse(off, jacobian)
         _add_prior(information, off, jacobian, H, g)
         a, b, c = solve(H, g)
         x = se2.scalar_compose(x, se2.scalar_exp((-a, -b, -c)))
-        if a * g[0] + b * g[1] + c * g[2] < _MIN_STEP**2 and spread < least / 3.0:  # g^T H^-1 g
+        if a * g[0] + b * g[1] + c * g[2] < _MIN_STEP**2 and guess_error < least / 3.0:  # g^T H^-1 g
             break
-        spread = spread / 2.0 if spread > least / 4.0 else 0.0
+        guess_error = guess_error / 2.0 if guess_error > least / 4.0 else 0.0
     return x
 
 
@@ -417,16 +410,16 @@ def _add_prior(information: FloatArray, off: Triple, jacobian: FloatArray, H: Fl
 
 @kernel
 def _linearize(
-    grid: VoxelGrid, points: Points2, x: Triple, spread: float, H: FloatArray, g: FloatArray
+    grid: VoxelGrid, points: Points2, x: Triple, guess_error: float, H: FloatArray, g: FloatArray
 ) -> tuple[int, int, float, float, float]:
-    """Fill ``H`` (3, 3) and ``g`` (3,), and return fitting and mapped points, cost, squares and those of blocks.
+    """Fill ``H`` (3, 3) and ``g`` (3,), and return inliers, associated points, cost, squares and those of blocks.
 
-    While the pose may still be off by ``spread`` [m] at a point, points are associated from so far, and residuals are weighed by it.
+    While the pose may still be off by ``guess_error`` [m] at a point, points are associated from so far, and residuals are weighed by it.
     """
     spurious, c, s = np.empty((3, 3)), math.cos(x[2]), math.sin(x[2])
     H[:], g[:], spurious[:] = 0.0, 0.0, 0.0
-    reach, loose = max(_REACH_CELLS * grid.cell, spread), (spread / _KERNEL) ** 2
-    fitting, mapped, cost, block, squares, block_squares = 0, 0, 0.0, 0.0, 0.0, 0.0
+    reach, guess_variance = max(_REACH_CELLS * grid.cell, guess_error), (guess_error / _KERNEL) ** 2
+    inliers, associated, cost, block, squares, block_squares = 0, 0, 0.0, 0.0, 0.0, 0.0
     for i in range(points.shape[0]):
         px, py = points[i, 0], points[i, 1]
         wx, wy = x[0] + c * px - s * py - grid.origin[0], x[1] + s * px + c * py - grid.origin[1]
@@ -441,25 +434,25 @@ def _linearize(
         if math.isinf(var):
             cost += _KERNEL**2
             continue
-        mapped += 1
+        associated += 1
         e = surface[2] * (wx - surface[0]) + surface[3] * (wy - surface[1])
         square = e * e / var
         cost += min(square, _KERNEL**2)
         if square < _KERNEL**2:
             block += e / math.sqrt(var)
-            fitting += 1
+            inliers += 1
             squares += square
-            if fitting % _BLOCK == 0:
+            if inliers % _BLOCK == 0:
                 block_squares, block = block_squares + block * block, 0.0
-        scale = _KERNEL**2 * var + loose
-        weight = (scale / (scale + e * e)) ** 2 / (var + loose)
+        scale = _KERNEL**2 * var + guess_variance
+        weight = (scale / (scale + e * e)) ** 2 / (var + guess_variance)
         nx, ny = c * surface[2] + s * surface[3], -s * surface[2] + c * surface[3]  # the normal in the body frame
         across, along = (nx, ny, px * ny - py * nx), (-ny, nx, px * nx + py * ny)  # derivatives of the distances
         _add_outer(H, across, weight)
         _add_outer(spurious, along, weight * min(surface[5], 1.0))
         g[0], g[1], g[2] = g[0] + weight * nx * e, g[1] + weight * ny * e, g[2] + weight * across[2] * e
-    _discount(H, g, spurious)
-    return fitting, mapped, cost, squares, block_squares + block * block
+    _remove_spurious_information(H, g, spurious)
+    return inliers, associated, cost, squares, block_squares + block * block
 
 
 @kernel
@@ -471,7 +464,7 @@ def _fill_informations(grid: VoxelGrid, points: Points2, x: Triple, H: FloatArra
 
 
 @subroutine
-def _discount(H: FloatArray, g: FloatArray, spurious: FloatArray) -> None:
+def _remove_spurious_information(H: FloatArray, g: FloatArray, spurious: FloatArray) -> None:
     """Take off, in place, the information that comes from the noise of normals: along a bare wall it would hold the robot where it is.
 
     In the directions where the share m of ``spurious`` in ``H`` is largest, information is scaled by 1 - 2 m, at least 0: it is as likely

@@ -51,10 +51,10 @@ class ScanMatchingSensor:
         self._is_searching = False  # the scan at hand was not found from a wide prior: a place is still to be found
         self._stale, self.lost = StaleScans(), LostScans()
 
-    def measure(self, step: Step, prior: Pose2, cov: Cov3, twist: Twist2, jump: Tangent2) -> ScanMatch | None:
+    def measure(self, step: Step, prior: Pose2, cov: Cov3, twist: Twist2, offset: Tangent2) -> ScanMatch | None:
         """Match the scan of ``step`` near ``prior`` (3,) with its covariance (3, 3) against the submap; None where it is lost.
 
-        The sweep is deskewed with ``twist`` (3,), the body's at the middle of the sweep. ``jump`` (3,): see `ScanMatcher.match`.
+        The sweep is deskewed with ``twist`` (3,), the body's at the middle of the sweep. ``offset`` (3,): see `ScanMatcher.match`.
         """
         assert step.scan is not None
         self._scan, self._prior, self._cov = None, prior, cov
@@ -71,7 +71,7 @@ class ScanMatchingSensor:
             self._begin(self._scan)
             self.lost.add_matched(step.end_ns)
             return None
-        found = self._match(self._matcher, self._scan, jump)
+        found = self._match(self._matcher, self._scan, offset)
         self._update_search_state(found is None and not is_narrow(cov), step.end_ns * 1e-9)
         if found is None:
             self.lost.add(step.end_ns, "lost")
@@ -101,11 +101,11 @@ class ScanMatchingSensor:
         self._scan = self._deskew(self._scan.sweep, twist)
         return self._matcher.refine(self._scan.planar, self._prior, self._cov, match) or match
 
-    def bend_cov(self, match: ScanMatch, slip_rate: Cov3) -> Cov3:
+    def intra_scan_slip_cov(self, match: ScanMatch, slip_rate: Cov3) -> Cov3:
         """(3, 3) of the ``match`` of the scan at hand by slip within the sweep, a random walk of ``slip_rate`` (3, 3) a second."""
         if self._scan is None or self._matcher is None or not len(self._scan.times) or not slip_rate.any():
             return np.zeros((3, 3))
-        return self._matcher.bend_cov(self._scan.planar, self._scan.times, match.pose, slip_rate)
+        return self._matcher.intra_scan_slip_cov(self._scan.planar, self._scan.times, match.pose, slip_rate)
 
     def is_key(self, pose: Pose2) -> bool:
         """Whether the scan at hand, taken from ``pose`` (3,), is to enter the submap."""
@@ -155,13 +155,13 @@ class ScanMatchingSensor:
         if c.matcher == "kiss" or not scan.sweep.is_planar:
             self._kiss = KissIcp(c.voxel_size_m or choose_voxel_size(scan.points), c.max_range_m)
 
-    def _match(self, matcher: ScanMatcher, scan: _Scan, jump: Tangent2) -> ScanMatch | None:
+    def _match(self, matcher: ScanMatcher, scan: _Scan, offset: Tangent2) -> ScanMatch | None:
         if self._kiss is None:
-            return matcher.match(scan.planar, self._prior, self._cov, jump=jump)
+            return matcher.match(scan.planar, self._prior, self._cov, offset=offset)
         guess = self._kiss.align(scan.points, self._prior)
         if self._config.matcher == "kiss":
             return matcher.evaluate(scan.planar, guess)
-        return matcher.match(scan.planar, self._prior, self._cov, guess, jump)
+        return matcher.match(scan.planar, self._prior, self._cov, guess, offset)
 
     def _mount(self, frame: str) -> Mount:
         """Where ``frame`` is mounted. A submap that was drawn before its mount was given is dropped."""

@@ -29,7 +29,7 @@ from motion_models.se2 import FloatArray
 ODOMETRY, PREDICTED_ODOMETRY, POSE = "~/odometry", "~/odometry_predicted", "~/pose"
 CORRECTIONS, DIAGNOSTICS, PATH, MAP = "~/corrections", "/diagnostics", "~/path", "~/map"
 
-_RECENT = 500  # 10 s at 50 Hz: those of a start's backlog come back only after all of them
+_NEW_KEYFRAMES = 500  # 10 s at 50 Hz: those of a start's backlog come back only after all of them
 _TYPES = {
     ODOMETRY: "nav_msgs/msg/Odometry",
     PREDICTED_ODOMETRY: "nav_msgs/msg/Odometry",
@@ -65,7 +65,7 @@ class EstimatePublisher:
         self._transport, self._with_tf, self._frames = transport, with_tf, frames
         self._odometry = FusedWriter(is_ros1=transport.is_ros1, parent=frames.odom_frame, body=frames.base_link_frame)
         self._map_correction = FusedWriter(is_ros1=transport.is_ros1, parent=frames.map_frame, body=frames.odom_frame)
-        self.recent_transforms: deque[bytes] = deque(maxlen=_RECENT)
+        self.recent_transforms: deque[bytes] = deque(maxlen=_NEW_KEYFRAMES)
         """Transforms of the body, as they were published."""
         self._topics = {topic: names.resolve(topic) for topic in _TYPES}
         self._last_ns = -(1 << 63)

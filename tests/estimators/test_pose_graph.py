@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from localization.errors import EstimatorError
 from localization.estimators import pose_graph
-from localization.estimators.pose_graph import Between, PoseGraph, Position, PreintegratedMotion, Update
+from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement, PreintegratedMotion
 from localization.evaluation.consistency import nees
 from localization.ros.state_serialization import deserialize, serialize
 from motion_models import se2
@@ -32,18 +32,18 @@ def circles(n: int, rng: np.random.Generator | None = None, scale: float = 1.0) 
     """Graph and truth (n, 3) of a drive along ``ARC``, with noise of ``scale`` times that which the graph is given; loops are not closed.
     After 40 keyframes it turns the other way."""
     graph, truth = PoseGraph(NO_CORRECTIONS), [np.zeros(3)]
-    graph.apply(Update(truth[0]))
+    graph.apply(GraphUpdate(truth[0]))
     for k in range(1, n):
         noise = np.zeros(3) if rng is None else scale * rng.multivariate_normal(np.zeros(3), COV)
         arc = ARC if k <= 40 else ARC * [1.0, 1.0, -1.0]
         measured = se2.compose(arc, se2.exp(noise))
         truth.append(se2.compose(truth[-1], arc))
-        graph.apply(Update(se2.compose(graph.pose(k - 1), measured), betweens=(Between(k - 1, k, measured, inverse(COV)),)))
+        graph.apply(GraphUpdate(se2.compose(graph.pose(k - 1), measured), betweens=(BetweenMeasurement(k - 1, k, measured, inverse(COV)),)))
     return graph, np.array(truth)
 
 
-def loop(truth: np.ndarray, a: int, b: int, error: np.ndarray) -> Between:
-    return Between(a, b, se2.compose(se2.between(truth[a], truth[b]), se2.exp(error)), inverse(LOOP_COV), is_loop=True)
+def loop(truth: np.ndarray, a: int, b: int, error: np.ndarray) -> BetweenMeasurement:
+    return BetweenMeasurement(a, b, se2.compose(se2.between(truth[a], truth[b]), se2.exp(error)), inverse(LOOP_COV), is_loop=True)
 
 
 def distances(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -98,7 +98,7 @@ def test_position_factor_has_numeric_jacobians(seed: int) -> None:
     rng = np.random.default_rng(seed)
     enu_T_map, pose, offset, lever = 5.0 * rng.normal(size=3), 5.0 * rng.normal(size=3), rng.normal(size=3), rng.normal(size=2)
     antenna = se2.transform(se2.compose(enu_T_map, se2.compose(pose, offset)), lever)
-    factor = pose_graph.position_factor(Position(3, offset, antenna + np.array([0.2, -0.3]), np.eye(2)))
+    factor = pose_graph.position_factor(PositionMeasurement(3, offset, antenna + np.array([0.2, -0.3]), np.eye(2)))
     values = gtsam.Values()
     values.insert(gtsam.symbol("t", 0), gtsam.Pose2(*enu_T_map))
     values.insert(gtsam.symbol("x", 3), gtsam.Pose2(*pose))
@@ -131,7 +131,7 @@ def test_pose_graph_with_loop_spreads_the_drift() -> None:
     graph, truth = circles(41, np.random.default_rng(1))
     before = distances(graph.poses(), truth)
     sigma = np.sqrt(np.trace(graph.marginal(40)[:2, :2]))
-    graph.apply(Update(betweens=(loop(truth, 0, 40, np.zeros(3)), loop(truth, 1, 39, np.zeros(3)))))
+    graph.apply(GraphUpdate(betweens=(loop(truth, 0, 40, np.zeros(3)), loop(truth, 1, 39, np.zeros(3)))))
     live = distances(graph.poses(), truth)
     assert before[-1] > 0.1
     assert live[-1] < 0.3 * before[-1]
@@ -147,16 +147,16 @@ def test_pose_graph_with_loop_spreads_the_drift() -> None:
 def test_pose_graph_with_wrong_loop_keeps_poses() -> None:
     graph, truth = circles(41, np.random.default_rng(2))
     right = tuple(loop(truth, k, k + 20, np.zeros(3)) for k in range(10, 20))
-    graph.apply(Update(betweens=right))
+    graph.apply(GraphUpdate(betweens=right))
     alone = graph.smooth()[0]
-    graph.apply(Update(betweens=(loop(truth, 5, 30, np.array([4.0, -2.0, 0.5])),)))
+    graph.apply(GraphUpdate(betweens=(loop(truth, 5, 30, np.array([4.0, -2.0, 0.5])),)))
     assert distances(graph.smooth()[0], alone).max() < 0.02
 
 
 def test_pose_graph_on_turns_estimates_corrections() -> None:
     """Wheels turn by a tenth more than they say; k is a factor of turns, known to a tenth at first."""
     graph, pose = PoseGraph(np.diag([0.1, 0.02]) ** 2), np.zeros(3)
-    graph.apply(Update(pose))
+    graph.apply(GraphUpdate(pose))
     by = np.column_stack([[0.0, 0.0, ARC[2]], [1.0, 0.0, 0.0]])
     said = ARC * [1.0, 1.0, 1.0 / 1.1]
     rng, wheel_cov = np.random.default_rng(3), np.diag([0.01, 0.01, 0.01]) ** 2
@@ -165,7 +165,7 @@ def test_pose_graph_on_turns_estimates_corrections() -> None:
         wheels = PreintegratedMotion(said, wheel_cov, by / 1.1, np.zeros(2))
         walk = 1e-8 * np.eye(2) if k in (20, 40) else None
         pose = se2.compose(graph.pose(k - 1), measured)
-        graph.apply(Update(pose, wheels, walk, (Between(k - 1, k, measured, inverse(COV)),)))
+        graph.apply(GraphUpdate(pose, wheels, walk, (BetweenMeasurement(k - 1, k, measured, inverse(COV)),)))
     mean, cov = graph.corrections()
     sigma = np.sqrt(np.diag(cov))
     assert sigma[0] < 0.02
@@ -184,7 +184,7 @@ def test_pose_graph_over_fifty_drives_has_consistent_nees(is_smoothed: bool) -> 
         rng = np.random.default_rng(seed)
         graph, truth = circles(31, rng)
         ends = [(a, a + 20, rng.multivariate_normal(np.zeros(3), LOOP_COV)) for a in (2, 5, 8)]
-        graph.apply(Update(betweens=tuple(loop(truth, *end) for end in ends)))
+        graph.apply(GraphUpdate(betweens=tuple(loop(truth, *end) for end in ends)))
         pose, cov = (part[30] for part in graph.smooth()) if is_smoothed else (graph.pose(30), graph.marginal(30))
         found.append(nees(se2.log(se2.between(truth[30], pose))[None], cov[None])[0])
     assert 1.5 < np.mean(found) < chi2.ppf(0.995, 150) / 50
@@ -203,8 +203,8 @@ def with_positions(
     graph = PoseGraph(NO_CORRECTIONS, np.zeros(2) if given is None else given, graph.updates)
     fixes = se2.transform(se2.compose(enu_T_map, truth), lever) + rng.normal(0.0, 0.1, (61, 2))
     fixes[30, 0] += outlier_m
-    found = tuple(Position(k, np.zeros(3), fixes[k], 0.01 * np.eye(2)) for k in range(61))
-    graph.apply(Update(positions=found, alignment=enu_T_map + np.array([0.5, -0.5, 0.05])))
+    found = tuple(PositionMeasurement(k, np.zeros(3), fixes[k], 0.01 * np.eye(2)) for k in range(61))
+    graph.apply(GraphUpdate(positions=found, alignment=enu_T_map + np.array([0.5, -0.5, 0.05])))
     return graph, truth, enu_T_map
 
 
@@ -242,9 +242,9 @@ def test_pose_graph_with_positions_estimates_lever_arm(given: np.ndarray) -> Non
 
 def test_pose_graph_with_singular_covariance_raises_estimator_error() -> None:
     graph, truth, _ = with_positions()
-    exact = tuple(Position(k, np.zeros(3), truth[k, :2], 1e-24 * np.eye(2)) for k in range(5, 60, 5))
+    exact = tuple(PositionMeasurement(k, np.zeros(3), truth[k, :2], 1e-24 * np.eye(2)) for k in range(5, 60, 5))
     with pytest.raises(EstimatorError, match="cannot be solved"):  # noqa: PT012
-        graph.apply(Update(positions=exact))
+        graph.apply(GraphUpdate(positions=exact))
         graph.smooth()
 
 
@@ -253,11 +253,11 @@ def test_pose_graph_with_singular_covariance_raises_estimator_error() -> None:
 
 def test_pose_graph_deserialized_equals_original_bitwise() -> None:
     graph, truth = circles(30, np.random.default_rng(5))
-    graph.apply(Update(betweens=(loop(truth, 2, 22, np.zeros(3)),)))
+    graph.apply(GraphUpdate(betweens=(loop(truth, 2, 22, np.zeros(3)),)))
     resumed = deserialize(*serialize(graph))
     for one in (graph, resumed):
-        one.apply(Update(se2.compose(one.pose(29), ARC), betweens=(Between(29, 30, ARC, inverse(COV)),)))
-        one.apply(Update(betweens=(loop(truth, 5, 25, np.zeros(3)),)))
+        one.apply(GraphUpdate(se2.compose(one.pose(29), ARC), betweens=(BetweenMeasurement(29, 30, ARC, inverse(COV)),)))
+        one.apply(GraphUpdate(betweens=(loop(truth, 5, 25, np.zeros(3)),)))
     assert np.array_equal(graph.poses(), resumed.poses())
     assert np.array_equal(graph.marginal(30), resumed.marginal(30))
     assert all(np.array_equal(a, b) for a, b in zip(graph.smooth(), resumed.smooth(), strict=True))

@@ -53,13 +53,13 @@ class PoseSensor:
         self.next: ScanMatch | None = None
         self.lost = LostScans()
 
-    def measure(self, step, prior, cov, twist, jump):
+    def measure(self, step, prior, cov, twist, offset):
         return self.next
 
     def refine(self, match, twist):
         return match
 
-    def bend_cov(self, match, slip_rate):
+    def intra_scan_slip_cov(self, match, slip_rate):
         return np.zeros((3, 3))
 
     def add_no_scan(self, stamp_ns):

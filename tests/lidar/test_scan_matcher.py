@@ -71,13 +71,14 @@ def test_linearize_gradient_equals_cost_differences() -> None:
         u = residuals(d) ** 2
         return float(0.5 * np.sum(u * _KERNEL**2 / (_KERNEL**2 + u)))
 
-    H, g, found = linearize(grid, points, x)
+    found = linearize(grid, points, x)
+    H, g = found.information, found.gradient
     h = 1e-6
     np.testing.assert_allclose(g, [(cost(h * e) - cost(-h * e)) / (2 * h) for e in np.eye(3)], rtol=1e-5, atol=1e-4)
     J = np.stack([(residuals(h * e) - residuals(-h * e)) / (2 * h) for e in np.eye(3)], axis=-1)
     weights = (_KERNEL**2 / (_KERNEL**2 + residuals(np.zeros(3)) ** 2)) ** 2
     np.testing.assert_allclose(H, J.T @ (weights[:, None] * J), rtol=1e-5)
-    assert found[0] == pytest.approx(np.mean(residuals(np.zeros(3)) ** 2 < _KERNEL**2) * len(used) / len(points))
+    assert found.overlap == pytest.approx(np.mean(residuals(np.zeros(3)) ** 2 < _KERNEL**2) * len(used) / len(points))
 
 
 # --- poses
@@ -367,6 +368,6 @@ def test_bend_cov_equals_scatter_of_bent_scans(walls: np.ndarray, axes: list[flo
         match = matcher.match(np.ascontiguousarray(bent), pose, NARROW)
         assert match is not None
         found.append(error_of(straight.measured, match.measured))
-    cov = matcher.bend_cov(points, times, straight.pose, np.diag(sigmas**2))
+    cov = matcher.intra_scan_slip_cov(points, times, straight.pose, np.diag(sigmas**2))
     scatter = np.sqrt(np.mean(np.square(found), axis=0))
     np.testing.assert_allclose(scatter, np.sqrt(np.diagonal(cov)), rtol=0.2)

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from localization.errors import CheckpointError
-from localization.estimators import CORRECTING, ESTIMATORS
+from localization.estimators import ESTIMATORS, ESTIMATORS_WITH_CORRECTIONS
 from localization.events import StepInterval, WheelSample
 from localization.lidar import LidarConfig
 from localization.lidar.scan_matcher import ScanMatcher
@@ -28,7 +28,7 @@ from motion_models.registry import make_model
 from motion_models.robot import Mount, load_robot
 from tests.helpers.online import ROBOT, drive_events, new_core, numbers, reseal
 
-KINDS = [(name, "skid_steer", "cg_field" if name in CORRECTING else "none") for name in ESTIMATORS]
+KINDS = [(name, "skid_steer", "cg_field" if name in ESTIMATORS_WITH_CORRECTIONS else "none") for name in ESTIMATORS]
 AHEAD = 300  # events after a cut that are compared: some 30 scans
 
 

@@ -113,10 +113,9 @@ def _exact_normals(*arguments: Any) -> VoxelGrid:
 
 def _align_freely(original: Callable[..., Any], self: ScanMatcher, points: Any, prior: Any, cov: Any, guess: Any, first: Any = None) -> Any:
     """The prior sets the reach of associations but does not pull."""
-    spread = scan_matcher._first_spread(points, cov) if first is None else first
-    pose = np.array(scan_matcher._align(self._grid, points, triple(prior), np.linalg.inv(_NO_PRIOR), triple(guess), spread))
-    H, g, found = scan_matcher.linearize(self._grid, points, pose)
-    return scan_matcher.Fit(pose, H, g, *map(float, found))
+    error = scan_matcher._prior_error_at_points(points, cov) if first is None else first
+    pose = np.array(scan_matcher._align(self._grid, points, triple(prior), np.linalg.inv(_NO_PRIOR), triple(guess), error))
+    return scan_matcher.linearize(self._grid, points, pose)
 
 
 def _match_without_new_place(original: Callable[..., Any], self: ScanMatcher, *rest: Any, **named: Any) -> Any:
@@ -140,13 +139,13 @@ PATCHES: Mapping[str, Patch] = {
     "slip in the deskewing twist": _wrap(
         ScanMatchingSensor,
         "measure",
-        lambda original, self, step, prior, cov, twist, jump: original(self, step, prior, cov, step.twist, jump),
+        lambda original, self, step, prior, cov, twist, offset: original(self, step, prior, cov, step.twist, offset),
     ),
     "correlative search": lambda: _together(*_NO_SEARCH),
     "motion of the last step in the search": _wrap(
         ScanMatchingSensor,
         "measure",
-        lambda original, self, step, prior, cov, twist, jump: original(self, step, prior, cov, twist, np.zeros(3)),
+        lambda original, self, step, prior, cov, twist, offset: original(self, step, prior, cov, twist, np.zeros(3)),
     ),
     "rival test of the search": _attribute(scan_matcher, "_MAX_RIVAL", math.inf),
     "total cost (more points fit, instead)": _attribute(
@@ -175,7 +174,7 @@ GRAPH_PATCHES: Mapping[str, Patch] = {
     ),
     "corrections of the graph in the filter": _attribute(Filter, "set_corrections", lambda self, mean, cov: None),
     "radius of the wheels as a variable": _attribute(graph_fusion, "_RADIUS_SIGMA", 1e-4),
-    "random walk of the corrections": _attribute(graph_fusion, "_WALK_S", math.inf),
+    "random walk of the corrections": _attribute(graph_fusion, "_CORRECTION_EPOCH_S", math.inf),
 }
 SETTINGS: Mapping[str, Mapping[str, Any]] = {
     "clock offset": {"clock_sigma_s": 0.0, "clock_walk_s_per_sqrt_s": 0.0},

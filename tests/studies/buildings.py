@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from localization.estimators import CORRECTING, ESTIMATORS, EstimatorConfig
+from localization.estimators import ESTIMATORS, ESTIMATORS_WITH_CORRECTIONS, EstimatorConfig
 from localization.estimators.filter import FilterConfig
 from localization.evaluation.consistency import nees
 from localization.evaluation.metrics import align, relation_errors
@@ -157,10 +157,10 @@ def rows(drive: Drive, options: argparse.Namespace) -> Iterator[str]:
     """Lines of the table for one log."""
     for estimator in options.estimator:
         models = options.model if estimator != "lidar" else options.model[:1]
-        forms = options.corrections if estimator in CORRECTING else ["none"]
-        matchers = options.matcher if estimator in CORRECTING else ["submap"]
+        forms = options.corrections if estimator in ESTIMATORS_WITH_CORRECTIONS else ["none"]
+        matchers = options.matcher if estimator in ESTIMATORS_WITH_CORRECTIONS else ["submap"]
         for model, form, matcher in ((m, f, k) for m in models for f in forms for k in matchers):
-            parts = [model] * (estimator != "lidar") + ([form, matcher] if estimator in CORRECTING else [])
+            parts = [model] * (estimator != "lidar") + ([form, matcher] if estimator in ESTIMATORS_WITH_CORRECTIONS else [])
             for kind, cells in measure(drive, estimator, model, form, matcher):
                 yield f"{estimator}{kind}{' (' + ', '.join(parts) + ')' if parts else ''} | {cells}"
 
