@@ -13,6 +13,8 @@ from motion_models.robot import GyroNoise, Mount
 
 _NS = 1e-9
 _MAX_GAP_NS, _MAX_HOLD_NS = 500_000_000, 100_000_000
+_MAX_SILENCE_NS = 2_000_000_000
+"""After which another IMU of the topic is used: longer than a driver drops messages, for its bias and scale are others."""
 _FIRST_SAMPLES = 20
 _MIN_GRAVITY_M_S2, _MAX_GRAVITY_M_S2 = 8.0, 12.0  # m/s^2; drivers that publish none, or in other units, do not show the mount
 _MAX_TILT_RAD = math.radians(30.0)
@@ -30,8 +32,10 @@ class GyroBuffer:
     axis points up or down (some drivers publish gravity, not specific force) follows from the turns of the wheels; until these suffice,
     the gyro is not used.
 
-    A rate that no robot can have come to since the sample before is left out, unless it lasts: the third in a row is accepted, and with
-    it those before.
+    Spike filter: a sample that differs from the last accepted one by more than 2 rad/s + 200 rad/s^2 dt (at most 10 rad/s) is held; three
+    in a row that agree are accepted.
+
+    Of several IMUs on one topic the first is used, another one once it has been silent for 2 s.
     """
 
     def __init__(self, noise: GyroNoise, mounts: Mapping[str, Mount], keep_s: float = 10.0) -> None:
@@ -39,11 +43,13 @@ class GyroBuffer:
         self._keep_ns = int(keep_s / _NS)
         self._stamps: list[int] = []
         self._angles: list[float] = []
-        self._bends: list[float] = []  # sums of squared second differences of the rate
+        self._sum_squared_differences: list[float] = []  # second ones, of the rate
         self._rate = self._rate_before = 0.0
         self._pending: list[tuple[int, float]] = []
         self._spikes = 0
         self._frame: str | None = None
+        self._last_ns = 0  # stamp of the newest sample of that frame
+        self._unused: dict[str, int] = {}  # number of samples by frame of the other IMUs
         self._force = np.zeros(3)
         self._axis = np.array([0.0, 0.0, 1.0])
         self._contradicts, self._sign = False, 1.0
@@ -51,16 +57,21 @@ class GyroBuffer:
 
     def insert(self, sample: ImuSample) -> None:
         """Take the next sample; one that does not come after the newest changes nothing."""
-        if sample.frame_id != self._frame:
+        if self._frame is None:
             self._begin(sample)
+        elif sample.frame_id != self._frame:
+            if sample.stamp_ns - self._last_ns <= _MAX_SILENCE_NS:
+                self._unused[sample.frame_id] = self._unused.get(sample.frame_id, 0) + 1
+                return
+            self._begin(sample)
+        elif sample.stamp_ns <= self._last_ns:
+            return
+        self._last_ns = sample.stamp_ns
         self._check_mount(sample)
         self._filter_rate(sample.stamp_ns, float(self._axis @ sample.angular_velocity))
 
     def _filter_rate(self, stamp_ns: int, rate: float) -> None:
         """Append a rate, or keep it pending until later ones agree with it."""
-        last_ns = self._pending[-1][0] if self._pending else self._stamps[-1] if self._stamps else None
-        if last_ns is not None and stamp_ns <= last_ns:
-            return
         if self._stamps and stamp_ns - self._stamps[-1] > _MAX_GAP_NS:
             self._reset()
         if not self._stamps or _may_follow((self._stamps[-1], self._rate), (stamp_ns, rate)):
@@ -82,16 +93,16 @@ class GyroBuffer:
         if self._stamps:
             dt = (stamp_ns - self._stamps[-1]) * _NS
             self._angles.append(self._angles[-1] + 0.5 * (self._rate + rate) * dt)
-            bend = rate - 2.0 * self._rate + self._rate_before if len(self._stamps) > 1 else 0.0
-            self._bends.append(self._bends[-1] + bend**2)
+            difference = rate - 2.0 * self._rate + self._rate_before if len(self._stamps) > 1 else 0.0
+            self._sum_squared_differences.append(self._sum_squared_differences[-1] + difference**2)
         else:
             self._angles.append(0.0)
-            self._bends.append(0.0)
+            self._sum_squared_differences.append(0.0)
         self._rate_before, self._rate = self._rate, rate
         self._stamps.append(stamp_ns)
         if self._stamps[0] < stamp_ns - 2 * self._keep_ns:
             n = bisect.bisect_left(self._stamps, stamp_ns - self._keep_ns)
-            del self._stamps[:n], self._angles[:n], self._bends[:n]
+            del self._stamps[:n], self._angles[:n], self._sum_squared_differences[:n]
 
     def _reject(self) -> None:
         self._spikes += len(self._pending)
@@ -137,11 +148,15 @@ class GyroBuffer:
             return 0.0
         dt = (self._stamps[j] - self._stamps[i]) / (j - i) * _NS
         noise = 6.0 * self._noise.white_rad_per_sqrt_s**2 / dt
-        return 0.25 * dt**2 * max((self._bends[j] - self._bends[i]) / (j - i) - noise, 0.0)
+        squares = self._sum_squared_differences[j] - self._sum_squared_differences[i]
+        return 0.25 * dt**2 * max(squares / (j - i) - noise, 0.0)
 
     def warnings(self) -> list[str]:
         """Problems of the IMU and their remedy."""
         found = []
+        if self._unused:
+            frames = " and ".join(f"'{frame}'" for frame in (self._frame, *self._unused))
+            found.append(f"IMU frames {frames} on one topic: only '{self._frame}' is used.")
         if self._spikes:
             plural = "s" * (self._spikes > 1)
             found.append(f"IMU '{self._frame}': {self._spikes} reading{plural} dropped (the yaw rate jumped as no such robot's does).")
@@ -164,6 +179,8 @@ class GyroBuffer:
         self._frame, self._up = sample.frame_id, mount.rotation()[2]
         self._axis, self._force = self._up, np.zeros(3)
         self._contradicts, self._sign, self._n_force = False, 1.0, 0
+        self._agreement = self._turned = 0.0
+        self._unused.pop(sample.frame_id, None)
         self._reset()
 
     def _check_mount(self, sample: ImuSample) -> None:
@@ -183,7 +200,7 @@ class GyroBuffer:
         self._reject()
         self._stamps.clear()
         self._angles.clear()
-        self._bends.clear()
+        self._sum_squared_differences.clear()
 
     def _angle(self, stamp_ns: int) -> float:
         past = stamp_ns - self._stamps[-1]

@@ -281,3 +281,39 @@ def test_buffer_of_long_stream_is_bounded():
     assert len(past) <= 401
     turn = past.turn(T0 + 118_100 * MS, T0 + 119 * S, 0.0)
     assert turn.angle == pytest.approx(turned(119.0) - turned(118.1), abs=1e-4)
+
+
+def test_gyro_frame_change_measures_the_sign_anew():
+    """The axis of the first IMU was found by the wheels; that of the second one, upside down as well, is still unknown."""
+    upside_down = WRONG["upside down"][0]
+    found, past = turns(samples(12.0, upside_down))
+    assert found[-1][2] is not None
+    for sample in samples(2.0, upside_down, start_s=20.0, frame="other"):
+        past.insert(sample)
+    assert past.turn(T0 + 21 * S, T0 + 22 * S, 0.0) is None
+    assert "turned too little" in past.warnings()[-1]
+
+
+@pytest.mark.parametrize("apart_s", [0.0, 0.005])
+def test_gyro_two_imus_on_one_topic_use_the_first(apart_s):
+    mounts = {"a": Mount(), "b": Mount(roll=math.pi)}
+    a, b = samples(4.0, frame="a"), samples(4.0, np.diag([1.0, -1.0, -1.0]), start_s=apart_s, frame="b", wz=lambda t: rate(t) + 0.1)
+    past = history(sorted([*a, *b], key=lambda sample: sample.stamp_ns), mounts)
+    assert past.turn(T0 + S, T0 + 3 * S, 0.0) == history(a, mounts).turn(T0 + S, T0 + 3 * S, 0.0)
+    assert past.warnings() == ["IMU frames 'a' and 'b' on one topic: only 'a' is used."]
+
+
+def test_gyro_frame_that_replaces_a_silent_one_is_used():
+    a, b = samples(4.0, frame="a"), samples(6.0, start_s=4.1, frame="b")
+    past = history([*a, *b])
+    assert past.turn(T0 + 7 * S, T0 + 8 * S, 0.0).angle == pytest.approx(turned(8.0) - turned(7.0), abs=2e-5)
+    assert past.warnings() == []
+
+
+def test_gyro_late_samples_do_not_check_the_mount():
+    """Two samples upright, then eighteen times an old one with gravity along another axis, then on."""
+    events = samples(1.0)
+    tipped = ImuSample(events[0].stamp_ns, np.zeros(3), 9.81 * np.array([1.0, 0.0, 0.0]), "imu_link")
+    past = history([*events[:2], *[tipped] * 18, *events[2:]])
+    assert past.turn(T0, T0 + S, 0.0) == history(events).turn(T0, T0 + S, 0.0)
+    assert past.warnings() == []
