@@ -35,14 +35,15 @@ class Standstill(Check):
     """Such wheels count as unknown, for as long as that lasts."""
 
     def __init__(self, faults: FaultLog, window: Window) -> None:
-        self._faults, self._window, self._shaking = faults, window, ShakeDetector()
+        self._faults, self._window = faults, window
+        self._shaking: dict[str, ShakeDetector] = {}  # by the IMU's frame
         self._stood_s = 0.0  # time for which the wheels read zero
         self._turned_s = 0.0  # the same, while the gyro turns
         self._unknown_s = 0.0  # the same, while that is contradicted
 
     def insert_imu(self, sample: ImuSample) -> None:
         """Specific force shows whether the robot moves."""
-        self._shaking.insert(sample)
+        self._shaking.setdefault(sample.frame_id, ShakeDetector()).insert(sample)
 
     def apply(self, step: Step) -> Step:
         """``step`` with unknown wheels where another sensor shows motion."""
@@ -69,7 +70,8 @@ class Standstill(Check):
         travelled, lasted = sum(math.hypot(b.lidar[0], b.lidar[1]) for b in bins), sum(b.duration_s for b in bins)
         if lasted >= _MIN_LIDAR_S and travelled >= _STANDING_SPEED_M_S * lasted:
             return "the LiDAR moved"
-        is_shaking = not bins and min(self._shaking.lasted_s, self._stood_s) >= _SHAKE_S
+        shaken_s = max((detector.lasted_s for detector in self._shaking.values()), default=0.0)
+        is_shaking = not bins and min(shaken_s, self._stood_s) >= _SHAKE_S
         return "the IMU shakes as if it moved" if is_shaking else ""
 
 
@@ -80,7 +82,7 @@ def _is_turning(step: Step) -> bool:
 
 
 class ShakeDetector:
-    """How long the IMU's specific force has varied as it does on a robot that drives."""
+    """How long an IMU's specific force has varied as it does on a robot that drives."""
 
     def __init__(self) -> None:
         self._forces: deque[tuple[int, FloatArray]] = deque(maxlen=400)

@@ -65,3 +65,12 @@ def test_robot_that_brakes_is_not_taken_for_one_that_shakes() -> None:
     robot.wheels, robot.gyro = lambda v, w: (0.0, 0.0), lambda w: 0.0
     robot.drive(1.5)
     assert robot.checks.found == {}
+
+
+def test_two_imus_with_other_axes_are_not_taken_for_shaking() -> None:
+    """On one topic: gravity is along z of the one and along x of the other."""
+    robot = CheckedDrive(wheels=lambda v, w: (0.0, 0.0), gyro=lambda w: 0.0, has_scans=False)
+    for k in range(300):
+        robot.checks.insert_imu(ImuSample(k * S // 50, np.zeros(3), np.array([0.0, 0.0, 9.8]), "a"))
+        robot.checks.insert_imu(ImuSample(k * S // 50, np.zeros(3), np.array([9.8, 0.0, 0.0]), "b"))
+    assert robot.drive(6.0).found == {}
