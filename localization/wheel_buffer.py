@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 from math import isfinite
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,6 +12,22 @@ from localization.events import CgSample, WheelSample
 from motion_models.se2 import FloatArray
 
 _NS = 1e-9
+
+
+class WheelInterval(NamedTuple):
+    """Constant rates from one sample to the next."""
+
+    start_ns: int
+    left: float
+    """[rad/s]"""
+    right: float
+    """[rad/s]"""
+    x: float
+    """Of the centre of gravity [m]."""
+    y: float
+    """Of the centre of gravity [m]."""
+    has_angles: bool
+    """The rates are differences of angles, and give all of the motion in the interval."""
 
 
 class WheelBuffer:
@@ -24,7 +41,7 @@ class WheelBuffer:
         self._keep_ns = int(keep_s / _NS)
         self._last: WheelSample | None = None
         self._ends: list[int] = []
-        self._intervals: list[tuple[int, float, float, float, float, bool]] = []  # start_ns, q_l, q_r, x_G, y_G, by angles
+        self._intervals: list[WheelInterval] = []
 
     def __len__(self) -> int:
         """Stored intervals."""
@@ -64,22 +81,23 @@ class WheelBuffer:
         self._last = sample
         seconds = (sample.stamp_ns - last.stamp_ns) * _NS
         rates = [(p - before) / seconds for p, before in zip(position, last.position.tolist(), strict=True)]
-        by_angles = all(map(isfinite, rates))
-        if not by_angles:
+        has_angles = all(map(isfinite, rates))
+        if not has_angles:
             rates = [_mean_of_known(v, before) for v, before in zip(velocity, last.velocity.tolist(), strict=True)]
         if not all(map(isfinite, rates)):
             return
         self._ends.append(sample.stamp_ns)
-        self._intervals.append((last.stamp_ns, rates[0], rates[1], *self._cg.tolist(), by_angles))
+        (left, right), (x, y) = rates, self._cg.tolist()
+        self._intervals.append(WheelInterval(last.stamp_ns, left, right, x, y, has_angles))
         if self._ends[0] < sample.stamp_ns - 2 * self._keep_ns:
             n = bisect.bisect_left(self._ends, sample.stamp_ns - self._keep_ns)
             del self._ends[:n], self._intervals[:n]
 
     def at(self, stamp_ns: int, max_hold_s: float) -> tuple[FloatArray, FloatArray]:
-        """Rates (n, 2) and CG (n, 2) from a moment on, n = 1; by the nearest samples after it or before it, n = 0 if these are farther than
-        ``max_hold_s``."""
+        """Rates (n, 2) and CG (n, 2) of the interval at ``stamp_ns``, else of the next or the last one; n = 0 if it begins more than
+        ``max_hold_s`` away."""
         i = min(bisect.bisect_right(self._ends, stamp_ns), len(self._ends) - 1)
-        known = self._intervals[i : i + 1] if i >= 0 and abs(self._intervals[i][0] - stamp_ns) <= max_hold_s / _NS else []
+        known = self._intervals[i : i + 1] if i >= 0 and abs(self._intervals[i].start_ns - stamp_ns) <= max_hold_s / _NS else []
         table = np.array([row[1:5] for row in known]).reshape(-1, 4)
         return table[:, :2], table[:, 2:]
 
@@ -93,21 +111,21 @@ class WheelBuffer:
         rows: list[tuple[float, float, float, float, float]] = []
         known, covered = start_ns, 0.0
         for i in range(bisect.bisect_right(self._ends, start_ns), len(self._ends)):
-            began, q_l, q_r, x, y, by_angles = self._intervals[i]
-            if began >= end_ns:
+            interval, end = self._intervals[i], min(self._ends[i], end_ns)
+            if interval.start_ns >= end_ns:
                 break
-            held_until = min(self._ends[i], end_ns) if by_angles and q_l == q_r == 0.0 else min(self._ends[i], end_ns, began + hold_ns)
-            begin, end = max(began, known), min(self._ends[i], end_ns) if by_angles else held_until
+            is_at_rest = interval.has_angles and interval.left == interval.right == 0.0
+            held_until = end if is_at_rest else min(end, interval.start_ns + hold_ns)
+            begin, end = max(interval.start_ns, known), end if interval.has_angles else held_until
             if end <= begin:
                 continue
-            rows.append(((end - begin) * _NS, q_l, q_r, x, y))
+            rows.append(((end - begin) * _NS, *interval[1:5]))
             covered += max(held_until - begin, 0) * _NS
             known = end
         if known < end_ns and self._ends:
-            _, q_l, q_r, x, y, _ = self._intervals[-1]
             hold = min(end_ns, self._ends[-1] + hold_ns) - max(known, self._ends[-1])
             if hold > 0:
-                rows.append((hold * _NS, q_l, q_r, x, y))
+                rows.append((hold * _NS, *self._intervals[-1][1:5]))
                 covered += hold * _NS
         table = np.array(rows).reshape(-1, 5)
         missing = max((end_ns - start_ns) * _NS - covered, 0.0)

@@ -4,8 +4,9 @@ Understood are plain values, numpy arrays and numbers, the usual containers, and
 without calling them (``__setstate__`` where a class has one). What is held twice is written once and held twice again. Arrays keep their
 layout in memory, and a view of another array stays one: linear algebra rounds by layout, and results are to be the same to the last bit.
 
-Long lists of numbers, and of frozen dataclasses of numbers and arrays, are written as columns: hours of them must not take longer than
-a scan. Objects that the entries of such a list share become one copy for each entry; as none is ever changed, that makes no difference.
+Long lists of numbers, and of frozen dataclasses or named tuples of numbers and arrays, are written as columns: hours of them must not
+take longer than a scan. Objects that the entries of such a list share become one copy for each entry; as none is ever changed, that makes
+no difference.
 
 A pickle, read by an unpickler that allows these classes alone, was tried: 90 lines, and results the same to the last bit. It lost, for a
 crafted file of nine bytes takes 4 GB (an index of pickle's memo), others call constructors of the allowed classes, and 20,000 wheel samples
@@ -113,12 +114,13 @@ class _Writer:
         raise CheckpointError(f"the state holds a {kind.__module__}.{kind.__qualname__}, which cannot be written down")
 
     def _packed(self, values: list[Any]) -> list[Json] | None:
-        """A long list of numbers, of equal rows of numbers, or of frozen dataclasses: the last seconds of wheels are thousands."""
+        """A long list of numbers, of equal rows of numbers, or of frozen dataclasses or named tuples: the last seconds of wheels are
+        thousands."""
         if len(values) < _PACKED_AT_LEAST:
             return None
         kinds = set(map(type, values))
         if len(kinds) == 1 and (names := _frozen_fields(values[0])):
-            if any(len(vars(value)) != len(names) for value in values):  # something is cached in it
+            if not isinstance(values[0], tuple) and any(len(vars(value)) != len(names) for value in values):  # something is cached in it
                 return None
             columns = [self._column([getattr(value, name) for value in values]) for name in names]
             kind = type(values[0])
@@ -167,9 +169,13 @@ class _Writer:
 
 
 def _frozen_fields(value: Any) -> list[str]:
-    """Names of the fields of an instance of one of our frozen dataclasses without a state of its own; else none."""
+    """Names of the fields of an instance of one of our named tuples, or frozen dataclasses without a state of its own; else none."""
     kind = type(value)
-    if not kind.__module__.startswith(PACKAGES) or not dataclasses.is_dataclass(kind) or hasattr(kind, "__setstate__"):
+    if not kind.__module__.startswith(PACKAGES):
+        return []
+    if isinstance(value, tuple):
+        return list(getattr(kind, "_fields", ()))
+    if not dataclasses.is_dataclass(kind) or hasattr(kind, "__setstate__"):
         return []
     is_frozen = kind.__dataclass_params__.frozen  # type: ignore[attr-defined]
     return [f.name for f in dataclasses.fields(kind)] if is_frozen and hasattr(value, "__dict__") else []
@@ -248,8 +254,10 @@ class _Reader:
             columns = [self._column(*column) for column in rest]
             return list(zip(*columns, strict=True)) if kind == "rows" else columns[0]
         module, name, names, *coded = rest
-        found, made = _class(module, name), []
-        for values in zip(*(self._column(*column) for column in coded), strict=True):
+        found, made, rows = _class(module, name), [], zip(*(self._column(*column) for column in coded), strict=True)
+        if issubclass(found, tuple):  # a NamedTuple
+            return [found(*values) for values in rows]
+        for values in rows:
             value = object.__new__(found)
             vars(value).update(zip(names, values, strict=True))
             made.append(value)

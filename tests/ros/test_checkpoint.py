@@ -24,6 +24,7 @@ from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.checkpoint import CheckpointWriter, fingerprints, read_checkpoint, read_head, write_checkpoint
 from localization.ros.state_serialization import deserialize, serialize
 from localization.synchronizer import StepConfig
+from localization.wheel_buffer import WheelInterval
 from motion_models.registry import make_model
 from motion_models.robot import Mount, load_robot
 from tests.helpers.online import ROBOT, drive_events, new_core, numbers, reseal
@@ -235,6 +236,15 @@ def test_deserialize_of_a_foreign_class_is_refused(kind):
     text = json.dumps({"root": ["o", 0], "objects": [packed], "arrays": [["<i8", [1], "C", 0]]}).encode()
     with pytest.raises(CheckpointError, match="does not have"):
         deserialize(text, bytes(8))
+
+
+def test_serialize_of_named_tuples_writes_columns():
+    values = [WheelInterval(i, 0.1 * i, 0.2 * i, 0.0, 0.0, i % 2 == 0) for i in range(1000)]
+    text, blob = serialize(values)
+    assert len(text) < 1000
+    found = deserialize(text, blob)
+    assert found == values
+    assert {type(value) for value in found} == {WheelInterval}
 
 
 @given(st.binary(max_size=60), st.binary(max_size=20))
