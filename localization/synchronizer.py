@@ -22,7 +22,6 @@ from motion_models.preintegration import integrate_twists
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
-_NS = 1e-9
 _MIN_REPORTED_S = 0.05
 """Shorter times without wheel data are not reported: the first scan is often some milliseconds before the first wheel sample."""
 _SCAN_WAIT_NS = 1_000_000_000
@@ -150,34 +149,34 @@ class Synchronizer:
         """End of the next step and the scan there, or None."""
         if self._scans:
             middle_ns, _ = self._scans[0]
-            is_late = self._now_ns > middle_ns + self.config.wait_s / _NS
+            is_late = self._now_ns > middle_ns + _ns(self.config.wait_s)
             return self._scans.popleft() if is_last or is_late or self._has_rates_until(middle_ns) else None
         if self._start_ns is None and self._first_wheel_ns is not None and (is_last or self._now_ns > self._first_wheel_ns + _SCAN_WAIT_NS):
             self._start_ns = self._first_wheel_ns
         if self._start_ns is None or self._wheels.newest_ns is None:
             return None
-        end_ns = self._wheels.newest_ns - round(self._clock_offset_s / _NS)
+        end_ns = self._wheels.newest_ns - _ns(self._clock_offset_s)
         if self._has_lidar:
             end_ns = min(end_ns, self._now_ns)  # wheels stamped too early must not overtake a scan that is still to come
             least = self.config.max_step_s + (0.0 if is_last else self.config.wait_s)
-            return None if end_ns - self._start_ns < least / _NS else (self._start_ns + round(self.config.max_step_s / _NS), None)
+            return None if end_ns - self._start_ns < _ns(least) else (self._start_ns + _ns(self.config.max_step_s), None)
         # the gyro's clock may be ahead of the wheels': holding its last rate would hide the offset between the two clocks
         gyro_ns = self._gyro.newest_ns
-        if gyro_ns is not None and not is_last and self._now_ns <= gyro_ns + self.config.wait_s / _NS:
+        if gyro_ns is not None and not is_last and self._now_ns <= gyro_ns + _ns(self.config.wait_s):
             end_ns = min(end_ns, gyro_ns)
-        least = _NS if is_last else self.config.no_lidar_step_s
-        return None if end_ns - self._start_ns < least / _NS else (end_ns, None)
+        least_ns = 1 if is_last else _ns(self.config.no_lidar_step_s)
+        return None if end_ns - self._start_ns < least_ns else (end_ns, None)
 
     def _has_rates_until(self, stamp_ns: int) -> bool:
         """Of the wheels, and of a gyro that is not silent: which of them comes first must not matter."""
         known_ns, gyro_ns = self._wheels.rates_known_until_ns, self._gyro.newest_ns
-        is_gyro_known = gyro_ns is None or gyro_ns >= stamp_ns or self._now_ns > gyro_ns + self.config.wait_s / _NS
-        return is_gyro_known and known_ns is not None and known_ns >= stamp_ns + self._clock_offset_s / _NS
+        is_gyro_known = gyro_ns is None or gyro_ns >= stamp_ns or self._now_ns > gyro_ns + _ns(self.config.wait_s)
+        return is_gyro_known and known_ns is not None and known_ns >= stamp_ns + _ns(self._clock_offset_s)
 
     def preintegrate(self, interval: StepInterval) -> Step:
         """The wheels' motion, the gyro's turn and the scan of ``interval``."""
         start_ns, end_ns, scan = interval
-        shift = round(self._clock_offset_s / _NS)
+        shift = _ns(self._clock_offset_s)
         dt, rates, cg, missing = self._wheels.window(start_ns + shift, end_ns + shift, self.config.max_hold_s)
         motion, d_clock, last = self._integrate(start_ns + shift, dt, rates, cg)
         if start_ns == end_ns:  # the first scan of a drive: its sweep needs a twist
@@ -230,3 +229,8 @@ class Synchronizer:
             until[2], since[2] = (w * missing_s) ** 2, 0.0
         until[2], since[2] = min(until[2], _UNKNOWN_YAW_VARIANCE), min(since[2], _UNKNOWN_YAW_VARIANCE)
         return Motion(motion.delta, motion.cov + np.diag(until - since), motion.d_params)
+
+
+def _ns(seconds: float) -> int:
+    """Whole nanoseconds: a stamp plus a float would be rounded to 256 ns."""
+    return round(seconds * 1e9)

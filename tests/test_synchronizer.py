@@ -291,6 +291,16 @@ def test_scan_waits_for_late_wheels():
     np.testing.assert_allclose(composed(found), whole([s for s in samples if s.stamp_ns <= T0 + 300 * MS]).delta, atol=1e-9)
 
 
+@pytest.mark.parametrize("ns", range(1, 256, 50))
+def test_scan_at_the_stamp_of_a_wheel_sample_waits_for_no_later_one(ns):
+    """Stamps of today are beyond the whole numbers of a float."""
+    cutter, turned = stepper(), [WheelSample(T0 + i * 20 * MS + ns, NAN, np.full(2, 0.1 * i)) for i in range(6)]
+    found = [
+        step for event in [*turned, Scan(T0 + 100 * MS + ns, np.ones((1, 3)), frame_id="laser")] for step in steps_after(event, cutter)
+    ]
+    assert [step.end_ns for step in found] == [T0 + 100 * MS + ns]
+
+
 def test_missing_wheels_give_wide_covariance_and_warning():
     config = StepConfig()
     scans = [scan(0.1 * i) for i in range(1, 60)]
