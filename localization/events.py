@@ -141,12 +141,12 @@ Event = WheelSample | CgSample | Scan | ImuSample | PositionSample | Reference
 
 @dataclass(frozen=True)
 class Turn:
-    """Yaw about the body's z axis, summed up from a gyro; its bias is still in it."""
+    """Yaw about the body's z axis, integrated from a gyro's rate; bias and scale are still in it."""
 
     angle: float
     """[rad]"""
     variance: float
-    """[rad^2], of white noise and scale; without the bias."""
+    """[rad^2], of white noise; without bias and scale."""
     duration: float
     """Time that the bias acted [s]."""
 

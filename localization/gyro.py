@@ -132,8 +132,8 @@ class GyroBuffer:
                 return None
             self._sign = math.copysign(1.0, self._agreement)
         dt = (end_ns - start_ns) * _NS
-        noise = self._noise.white_rad_per_sqrt_s**2 * dt + (self._noise.scale_sigma * angle) ** 2
-        return Turn(self._sign * angle, noise + self._sampling_variance(start_ns, end_ns), dt)
+        variance = self._noise.white_rad_per_sqrt_s**2 * dt + self._sampling_variance(start_ns, end_ns)
+        return Turn(self._sign * angle, variance, dt)
 
     def _sampling_variance(self, start_ns: int, end_ns: int) -> float:
         """Of the turn [rad^2], by what the rate does between samples: shaking, wheels that slip by jerks.

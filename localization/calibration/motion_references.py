@@ -115,7 +115,9 @@ class GyroMotionReference:
         if min(newest, self._newest_ns) < end_ns:
             return
         turn = self._gyro.turn(self._start_ns, end_ns, float(wheels.motion(self._start_ns, end_ns).delta[2]))
-        angle, variance = (0.0, math.inf) if turn is None else (turn.angle, turn.variance)
+        angle, variance = 0.0, math.inf
+        if turn is not None:
+            angle, variance = turn.angle, turn.variance + (self._noise.scale_sigma * turn.angle) ** 2
         yield Span(self._start_ns, end_ns, np.array([0.0, 0.0, angle]), np.diag([math.inf, math.inf, variance]), is_valid=turn is not None)
         self._start_ns = end_ns
 

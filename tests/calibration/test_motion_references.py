@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from localization.calibration.motion_references import LidarMotionReference, Span, Wheels
-from localization.events import Scan, WheelSample
+from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, Span, Wheels
+from localization.events import ImuSample, Scan, WheelSample
 from localization.simulation.world import WORLDS
 from localization.wheel_buffer import WheelBuffer
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot import GyroNoise, load_robot
 from tests.helpers.rooms import scan_from
 
 _NS = 1_000_000_000
@@ -39,3 +40,15 @@ def test_the_slope_of_ranges_is_what_longer_ranges_do_to_the_measured_motion():
     assert np.abs(slopes[:, :2].mean(axis=0) - true[:2]).max() < 0.25 * np.linalg.norm(true[:2])
     # noise of the slope would count as information about the bias, and make it look smaller
     assert slopes[:, :2].std(axis=0).max() < 0.25 * np.linalg.norm(true[:2])
+
+
+def test_gyro_reference_variance_includes_the_scale():
+    """Calibration has no state for the gyro's scale: its error is part of each measured turn."""
+    robot, noise = load_robot("vaultbot"), GyroNoise(scale_sigma=0.01)
+    wheels = Wheels(WheelBuffer(np.zeros(2)), make_model("diff_drive", robot), robot.wheel_noise)
+    reference = GyroMotionReference(noise, {}, 1.0)
+    found = []
+    for i in range(120):
+        wheels.buffer.insert(WheelSample(i * _NS // 100, np.full(2, np.nan), np.zeros(2)))
+        found += list(reference.spans(ImuSample(i * _NS // 100, np.array([0.0, 0.0, 0.8]), np.array([0.0, 0.0, 9.81])), wheels))
+    assert found[0].cov[2, 2] == pytest.approx(noise.white_rad_per_sqrt_s**2 + (0.01 * 0.8) ** 2)
