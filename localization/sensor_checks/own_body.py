@@ -35,21 +35,24 @@ class OwnBody(Check):
     """Leaves out the points of the robot itself."""
 
     def __init__(self, faults: FaultLog) -> None:
-        self._faults, self._filter = faults, OwnBodyFilter()
+        self._faults = faults
+        self._filters: dict[str, OwnBodyFilter] = {}  # by the LiDAR's frame
 
     def prepare(self, step: Step) -> Step:
         """``step`` without these points."""
-        self._filter.add_motion(step.predicted.delta)
+        for each in self._filters.values():
+            each.add_motion(step.predicted.delta)
         if step.scan is None:
             return step
-        scan = self._filter.filter(step.scan)
-        if self._filter.share > _MIN_OWN_SHARE:
-            self._faults.declare(LIDAR_OWN_BODY, self._faults.now_s, {"percent": 100.0 * self._filter.share})
+        body = self._filters.setdefault(step.scan.frame_id, OwnBodyFilter())
+        scan = body.filter(step.scan)
+        if body.share > _MIN_OWN_SHARE:
+            self._faults.declare(LIDAR_OWN_BODY, self._faults.now_s, {"percent": 100.0 * body.share})
         return replace(step, scan=scan)
 
 
 class OwnBodyFilter:
-    """Removes points of the robot itself from scans: their beams have the same range while the robot drives and turns."""
+    """Removes points of the robot itself from the scans of one LiDAR: their beams have the same range while the robot drives and turns."""
 
     def __init__(self) -> None:
         self._range = np.full(_BODY_BEARINGS, np.nan)

@@ -58,13 +58,13 @@ class _Profile:
 
 
 class ScanOdometry:
-    """Give it each scan; it returns the motion since the scan before, where that can be measured."""
+    """Scan-to-scan odometry: `register` returns the motion since the scan before, or None."""
 
     def __init__(self) -> None:
         self._last: _Profile | None = None
 
     def register(self, points: FloatArray, center: FloatArray) -> ScanMotion | None:
-        """Motion since the last call; ``points`` (M, 2) and sensor position ``center`` (2,) in the body frame [m].
+        """Motion since the last call; ``points`` (M, 2) and sensor position ``center`` (2,) in the body frame [m]; of any of its LiDARs.
 
         None for the first scan, for scans with too few points and where the scans do not fit onto each other.
         """
@@ -118,17 +118,18 @@ def _correlate(a: FloatArray, b: FloatArray) -> float:
 
 def _refine(a: _Profile, b: _Profile, turn: float) -> ScanMotion | None:
     """a_T_b of the body by point-to-line Gauss-Newton from a pure ``turn`` [rad]; None where the scans do not fit."""
-    a_T_b, structure, inliers = _align_profiles(a.points, a.normals, b.points, turn)
+    a_T_b, structure, inliers = _align_profiles(a.points, a.normals, b.points, np.array([*(b.center - a.center), turn]))
     if inliers < max(_MIN_INLIERS * np.isfinite(b.ranges).sum(), 1) or not np.isfinite(a_T_b).all():
         return None
-    body_T_sensor = np.array([a.center[0], a.center[1], 0.0])
-    moved = se2.compose(se2.compose(body_T_sensor, a_T_b), se2.inverse(body_T_sensor))
+    body_T_a, body_T_b = (np.array([*profile.center, 0.0]) for profile in (a, b))
+    moved = se2.compose(se2.compose(body_T_a, a_T_b), se2.inverse(body_T_b))
     return ScanMotion(moved, float(np.linalg.eigvalsh(structure / inliers)[0]) >= _MIN_STRUCTURE)
 
 
-def _align_profiles(surface: FloatArray, normals: FloatArray, points: FloatArray, turn: float) -> tuple[FloatArray, FloatArray, int]:
-    """Motion (3,) of the sensor, sum of n n^T (2, 2) over the inliers, and their number: 0 where too few points are associated."""
-    a_T_b, structure, inliers = np.array([0.0, 0.0, turn]), np.zeros((2, 2)), 0
+def _align_profiles(surface: FloatArray, normals: FloatArray, points: FloatArray, a_T_b: Pose2) -> tuple[Pose2, FloatArray, int]:
+    """Motion (3,) of the sensor from a first ``a_T_b`` on, sum of n n^T (2, 2) over the inliers, and their number: 0 where too few points
+    are associated."""
+    structure, inliers = np.zeros((2, 2)), 0
     for k in range(_ITERATIONS):
         scale = _FIRST_SCALE_M * (_LAST_SCALE_M / _FIRST_SCALE_M) ** (k / (_ITERATIONS - 1))
         A, gradient, structure = np.zeros((3, 3)), np.zeros(3), np.zeros((2, 2))

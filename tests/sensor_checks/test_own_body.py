@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from localization.events import Scan
+from localization.events import Scan, Step
 from localization.sensor_checks.own_body import LIDAR_OWN_BODY, OwnBodyFilter
+from motion_models.base import Motion
 from tests.helpers import checked_drive, rooms
 
 ANGLES = np.linspace(-np.pi, np.pi, 360, endpoint=False)
@@ -51,3 +52,24 @@ def test_beams_on_the_robot_are_left_out_and_reported() -> None:
     last = robot.applied[-1].scan
     assert last is not None
     assert np.hypot(last.points[:, 0], last.points[:, 1]).min() > 0.5
+
+
+def test_beams_of_two_lidars_on_the_robot_are_left_out() -> None:
+    """Posts on the robot at other bearings of each LiDAR, whose scans come in turn; first 28 % of the points, at last none."""
+    rng = np.random.default_rng(0)
+    robot = checked_drive.CheckedDrive(has_scans=False)
+    is_own = []
+    for k in range(60):
+        frame, beams = ("front", slice(0, 100)) if k % 2 else ("rear", slice(200, 300))
+        ranges = rng.uniform(2.0, 8.0, len(ANGLES))
+        ranges[beams] = POST_RANGE_M
+        points = np.column_stack([ranges * np.cos(ANGLES), ranges * np.sin(ANGLES), np.zeros(len(ANGLES))])
+        motion = Motion(np.array([0.1, 0.0, 0.05]), 1e-6 * np.eye(3))
+        stamps = k * checked_drive.S // 10, (k + 1) * checked_drive.S // 10
+        step = Step(*stamps, motion, np.zeros(3), np.zeros(3), False, True, None, Scan(stamps[1], points, frame_id=frame))
+        applied = robot.checks.apply(step).scan
+        assert applied is not None
+        is_own.append((np.hypot(applied.points[:, 0], applied.points[:, 1]) < 1.0).mean())
+    assert is_own[0] == is_own[1] == 100 / 360
+    assert max(is_own[-10:]) == 0.0
+    assert "28 % of the LiDAR's points are the robot itself" in robot.checks.warnings()[0]

@@ -55,3 +55,16 @@ def test_register_of_another_place_gives_none() -> None:
     odometry.register(scan(np.zeros(3), np.zeros(3), rng), np.zeros(2))
     elsewhere = rng.uniform(-8.0, 8.0, (360, 2))
     assert odometry.register(elsewhere, np.zeros(2)) is None
+
+
+@pytest.mark.parametrize("motion", [(0.0, 0.0, 0.0), (0.05, 0.0, 0.05), (0.0, 0.0, -0.2)])
+def test_register_of_two_lidars_gives_body_motion(motion: tuple) -> None:
+    """One ahead, one behind, in turn."""
+    rng, odometry, pose = np.random.default_rng(0), ScanOdometry(), np.zeros(3)
+    for k in range(6):
+        mount = np.array([0.3 if k % 2 else -0.3, 0.0, 0.0])
+        found = odometry.register(scan(pose, mount, rng), mount[:2])
+        pose = se2.compose(pose, np.array(motion))
+        if k:
+            assert found is not None
+            np.testing.assert_allclose(found.delta, motion, atol=0.02)
