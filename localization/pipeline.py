@@ -89,7 +89,7 @@ class Pipeline:
             self._calibrate()
             step = self.synchronizer.preintegrate(interval)  # wheels through the motion model, gyro, scan
             step = self.checks.apply(step)  # without faulty sensors
-            estimate = self.checks.widen(self.estimator.step(step))  # predict, match, update
+            estimate = self.checks.inflate(self.estimator.step(step))  # predict, match, update
             self._feed_back(step, is_scan_matched=estimate.nis is not None)
             yield estimate  # publish
 
@@ -211,7 +211,7 @@ class _Replay:
             raise LogError("there are wheel samples and scans in the log, but no two that span an interval of time.")
         filtered, estimator = trajectory(stamps, table), self._pipeline.estimator
         smoothed = estimator.finish(filtered)
-        smoothed = None if smoothed is None else self._pipeline.checks.widen_trajectory(smoothed)
+        smoothed = None if smoothed is None else self._pipeline.checks.inflate_trajectory(smoothed)
         self._seconds += time.perf_counter() - begin
         return Run(
             self._trial.model.name,

@@ -11,14 +11,14 @@ from localization.events import ImuSample, Step
 from localization.lidar import LidarConfig
 from localization.sensor_checks.check import Check
 from localization.sensor_checks.disagreement import Disagreement
-from localization.sensor_checks.faults import Fault, FaultLog, Found
+from localization.sensor_checks.faults import DetectedFault, Fault, FaultLog
 from localization.sensor_checks.gyro_rate import GyroRate
+from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.lidar_tilt import LidarTilt
 from localization.sensor_checks.own_body import OwnBody
 from localization.sensor_checks.standstill import Standstill
 from localization.sensor_checks.travel_direction import TravelDirection
 from localization.sensor_checks.turn_rates import TurnRates
-from localization.sensor_checks.widening import Widening
 from localization.sensor_checks.window import Window
 from localization.trajectory import Trajectory
 from motion_models import se2
@@ -27,11 +27,11 @@ from motion_models.se2 import Pose2
 
 
 class SensorChecks:
-    """`apply` to each step before the estimator, `widen` its estimate afterwards."""
+    """`apply` to each step before the estimator, `inflate` its estimate afterwards."""
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig) -> None:
-        self._widening = Widening()
-        self._faults = faults = FaultLog(self._widening)
+        self._inflation = CovarianceInflation()
+        self._faults = faults = FaultLog(self._inflation)
         self._window = window = Window(mounts, config)
         self._checks: tuple[Check, ...] = (
             LidarTilt(mounts),
@@ -51,23 +51,23 @@ class SensorChecks:
             check.insert_imu(sample)
 
     def apply(self, step: Step) -> Step:
-        """``step`` without the sensors that are faulty, and with the motion of uncertain wheels widened."""
+        """``step`` without the sensors that are faulty, and with a wide covariance where the wheels are uncertain."""
         if not np.isfinite(step.predicted.delta).all():
             return step  # the estimator refuses it
         self._faults.start_step(step)
         for check in self._checks:
             step = check.prepare(step)
-        self._widening.add_step(step)
+        self._inflation.add_step(step)
         if self._window.add(step, self._faults.now_s):
             agreements = [check.compare(self._window) for check in self._checks]
             if all(agreements):
-                self._widening.restart()
+                self._inflation.restart()
         for check in self._checks:
             step = check.apply(step)
         self._step = step
         return step
 
-    def widen(self, estimate: Estimate) -> Estimate:
+    def inflate(self, estimate: Estimate) -> Estimate:
         """``estimate`` with the covariance of what faulty sensors have done to it; unchanged without one (LiDAR alone)."""
         if estimate.covariance is None:
             return estimate
@@ -76,17 +76,17 @@ class SensorChecks:
         if before is not None and self._step is not None:
             for check in self._checks:
                 check.compare_estimate(self._step, delta, estimate.nis)
-        return self._widening.widen(estimate, delta)
+        return self._inflation.inflate(estimate, delta)
 
-    def widen_trajectory(self, smoothed: Trajectory) -> Trajectory:
+    def inflate_trajectory(self, smoothed: Trajectory) -> Trajectory:
         """``smoothed`` with the same covariance at its end, from the first fault on."""
-        return self._widening.widen_trajectory(smoothed)
+        return self._inflation.inflate_trajectory(smoothed)
 
     def warnings(self) -> list[str]:
         """Problems so far."""
         return [*(warning for check in self._checks for warning in check.warnings()), *self._faults.warnings()]
 
     @property
-    def found(self) -> Mapping[Fault, Found]:
+    def found(self) -> Mapping[Fault, DetectedFault]:
         """Faults so far."""
         return self._faults.found

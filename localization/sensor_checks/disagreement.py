@@ -11,7 +11,7 @@ import numpy as np
 
 from localization.events import Step
 from localization.sensor_checks.check import Check
-from localization.sensor_checks.faults import Fault, FaultLog, Found
+from localization.sensor_checks.faults import DetectedFault, Fault, FaultLog
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
@@ -44,12 +44,12 @@ class Disagreement(Check):
             return
         self._distance.add(step, delta, nis)
         off = self._distance.difference
-        self._faults.widening.ongoing = off
+        self._faults.inflation.ongoing = off
         if off is not None:
             self._episode = _Episode(self._distance.began_s - self._faults.start_s, self._faults.now_s, off, self._distance.mean_square)
             self._faults.revise(_include(self._ended, self._episode).found())
         elif self._episode is not None:
-            self._faults.widening.add(self._episode.difference)
+            self._faults.inflation.add(self._episode.difference)
             self._ended, self._episode = _include(self._ended, self._episode), None
 
 
@@ -76,7 +76,7 @@ class _Episodes(NamedTuple):
     seconds: float
     largest: _Episode
 
-    def found(self) -> Found:
+    def found(self) -> DetectedFault:
         """The largest."""
         message = DISAGREEMENT.message.format(
             seconds=self.largest.end_s - self.largest.begin_s,
@@ -85,7 +85,7 @@ class _Episodes(NamedTuple):
             degrees=abs(math.degrees(self.largest.difference[2])),
             others=f"; the largest of {self.number} such times, {self.seconds:.0f} s in all" if self.number > 1 else "",
         )
-        return Found(DISAGREEMENT, self.largest.begin_s, message)
+        return DetectedFault(DISAGREEMENT, self.largest.begin_s, message)
 
 
 def _include(episodes: _Episodes | None, episode: _Episode) -> _Episodes:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from localization.events import Step
-from localization.sensor_checks.widening import DeadReckoning, Widening
+from localization.sensor_checks.inflation import CovarianceInflation, DeadReckoning
 
 MEMORY_S = 3.0
 """A sensor is left out while most comparisons of the last seconds contradict it. Signs and units are never off by chance for so long
@@ -26,13 +26,13 @@ class Fault(NamedTuple):
     message: str
     """What is wrong, and what to do, with places for numbers."""
     reference: DeadReckoning | None = None
-    """Its sensors are right: the estimate's distance from it widens the covariance when the fault is found."""
+    """Its sensors are right: the estimate's distance from it inflates the covariance when the fault is found."""
     explains: Fault | None = None
     """A fault that is no longer reported where this one is."""
 
 
 @dataclass(frozen=True)
-class Found:
+class DetectedFault:
     """A fault with its time and numbers."""
 
     fault: Fault
@@ -44,13 +44,13 @@ class Found:
 class FaultLog:
     """Faults so far. `start_step`, then the checks `declare` what they find."""
 
-    def __init__(self, widening: Widening) -> None:
-        self.widening = widening
+    def __init__(self, inflation: CovarianceInflation) -> None:
+        self.inflation = inflation
         self.start_s = self.now_s = 0.0
         """Stamp of the first step's begin [s], and end of the present one after it [s]."""
         self._start_ns: int | None = None
-        self._declared: dict[Fault, Found] = {}
-        self._revised: dict[Fault, Found] = {}
+        self._declared: dict[Fault, DetectedFault] = {}
+        self._revised: dict[Fault, DetectedFault] = {}
 
     def start_step(self, step: Step) -> None:
         """What is declared from now on is of ``step``."""
@@ -62,21 +62,21 @@ class FaultLog:
         return fault in self._declared
 
     def declare(self, fault: Fault, at_s: float, numbers: Mapping[str, float | str]) -> None:
-        """Report ``fault`` once, and widen the covariance by how far the estimate is from the other sensors' dead reckoning."""
+        """Report ``fault`` once, and inflate the covariance by how far the estimate is from the other sensors' dead reckoning."""
         if fault in self._declared or any(other.explains == fault for other in self._declared):
             return
-        self._declared[fault] = Found(fault, max(at_s, 0.0), fault.message.format(**numbers))
+        self._declared[fault] = DetectedFault(fault, max(at_s, 0.0), fault.message.format(**numbers))
         if fault.explains is not None:
             self._declared.pop(fault.explains, None)
         if fault.reference is not None:
-            self.widening.add_distance_from(fault.reference)
+            self.inflation.add_distance_from(fault.reference)
 
-    def revise(self, found: Found) -> None:
+    def revise(self, found: DetectedFault) -> None:
         """Report ``found`` in place of what was reported of the same fault."""
         self._revised[found.fault] = found
 
     @property
-    def found(self) -> dict[Fault, Found]:
+    def found(self) -> dict[Fault, DetectedFault]:
         """All so far, those last whose numbers change."""
         return {**self._declared, **self._revised}
 

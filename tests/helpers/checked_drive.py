@@ -55,7 +55,7 @@ class CheckedDrive:
                 scan,
             )
             self.applied.append(self.checks.apply(step))
-            self.estimates.append(self.checks.widen(Estimate(step.end_ns, pose, 1e-6 * np.eye(3), np.zeros(3), None)))
+            self.estimates.append(self.checks.inflate(Estimate(step.end_ns, pose, 1e-6 * np.eye(3), np.zeros(3), None)))
         return self.checks
 
     def _scan(self, pose: tuple[float, float, float], stamp_ns: int, rng: np.random.Generator) -> Scan:

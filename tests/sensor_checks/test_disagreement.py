@@ -17,7 +17,7 @@ from motion_models import se2
 from tests.helpers.checked_drive import CheckedDrive
 
 
-def test_wheels_far_from_the_estimate_are_reported_and_widen_it() -> None:
+def test_wheels_far_from_the_estimate_are_reported_and_inflate_it() -> None:
     """Wheels that count three times too far, by a metre a second: the covariance has the whole difference."""
     robot = CheckedDrive(wheels=lambda v, w: (3.0 * v, w))
     checks = robot.drive()
@@ -65,9 +65,9 @@ def test_memory_stays_flat_over_many_disagreements() -> None:
 def test_estimate_without_covariance_is_not_compared_with_the_wheels() -> None:
     """LiDAR alone, which may be lost."""
     robot = CheckedDrive(wheels=lambda v, w: (3.0 * v, w))
-    robot.checks.widen = functools.partial(_without_covariance, robot.checks.widen)  # type: ignore[method-assign]
+    robot.checks.inflate = functools.partial(_without_covariance, robot.checks.inflate)  # type: ignore[method-assign]
     assert robot.drive().found == {}
 
 
-def _without_covariance(widen, estimate: Estimate) -> Estimate:
-    return widen(dataclasses.replace(estimate, covariance=None))
+def _without_covariance(inflate, estimate: Estimate) -> Estimate:
+    return inflate(dataclasses.replace(estimate, covariance=None))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from localization.events import Step
-from localization.sensor_checks.faults import Evidence, Fault, FaultLog, Found
-from localization.sensor_checks.widening import Widening
+from localization.sensor_checks.faults import DetectedFault, Evidence, Fault, FaultLog
+from localization.sensor_checks.inflation import CovarianceInflation
 from motion_models.base import Motion
 
 S = 1_000_000_000
@@ -36,7 +36,7 @@ def test_evidence_lasts_from_the_last_comparison_that_did_not_show_it(between: b
 
 
 def test_fault_that_another_one_explains_is_reported_no_more() -> None:
-    log, rate = FaultLog(Widening()), Fault("by {rate} rad/s")
+    log, rate = FaultLog(CovarianceInflation()), Fault("by {rate} rad/s")
     unit = Fault("in deg/s", explains=rate)
     log.start_step(Step(5 * S, 7 * S, Motion(np.zeros(3), np.eye(3)), np.zeros(3), np.zeros(3), False, True))
     assert log.now_s == 2.0
@@ -49,9 +49,9 @@ def test_fault_that_another_one_explains_is_reported_no_more() -> None:
 
 
 def test_fault_whose_numbers_change_is_reported_last() -> None:
-    log = FaultLog(Widening())
+    log = FaultLog(CovarianceInflation())
     slip, other = Fault("slip"), Fault("other")
-    log.revise(Found(slip, 1.0, "for 1 s"))
+    log.revise(DetectedFault(slip, 1.0, "for 1 s"))
     log.declare(other, 2.0, {})
-    log.revise(Found(slip, 1.0, "for 2 s"))
+    log.revise(DetectedFault(slip, 1.0, "for 2 s"))
     assert log.warnings() == ["at t = 2.0 s: other", "at t = 1.0 s: for 2 s"]

@@ -14,12 +14,12 @@ from motion_models import se2
 from tests.helpers.checked_drive import SPEED, CheckedDrive, turned
 
 
-def test_fault_widens_the_covariance_by_what_it_has_done() -> None:
+def test_fault_inflates_the_covariance_by_what_it_has_done() -> None:
     """The estimate followed a LiDAR that is turned by 30 deg; wheels and gyro lead elsewhere."""
     robot = CheckedDrive(scan=lambda points: turned(points, 30.0))
     world_T_drive = np.array([0.0, 0.0, math.radians(30.0)])
-    own = robot.checks.widen
-    robot.checks.widen = lambda e: own(  # type: ignore[method-assign]
+    own = robot.checks.inflate
+    robot.checks.inflate = lambda e: own(  # type: ignore[method-assign]
         Estimate(e.stamp_ns, se2.compose(se2.compose(world_T_drive, e.pose), se2.inverse(world_T_drive)), e.covariance, e.twist, None)
     )
     robot.drive()
@@ -34,7 +34,7 @@ def test_fault_widens_the_covariance_by_what_it_has_done() -> None:
         np.array([e.pose for e in robot.estimates]),
         np.tile(1e-6 * np.eye(3), (len(robot.estimates), 1, 1)),
     )
-    widened = robot.checks.widen_trajectory(smooth)
-    assert widened.covariances is not None
-    np.testing.assert_allclose(widened.covariances[-1], end.covariance, atol=1e-9)
-    np.testing.assert_allclose(widened.covariances[0], 1e-6 * np.eye(3))
+    inflated = robot.checks.inflate_trajectory(smooth)
+    assert inflated.covariances is not None
+    np.testing.assert_allclose(inflated.covariances[-1], end.covariance, atol=1e-9)
+    np.testing.assert_allclose(inflated.covariances[0], 1e-6 * np.eye(3))

@@ -18,7 +18,7 @@ DeadReckoning = Literal["wheels", "wheels and gyro"]
 """Motion by the wheels alone, and that with the turns by the gyro."""
 
 
-class Widening:
+class CovarianceInflation:
     """Differences that were added, carried along with the body as the covariance of an estimate is."""
 
     def __init__(self) -> None:
@@ -41,14 +41,14 @@ class Widening:
         self._by_gyro = se2.compose(self._by_gyro, delta)
 
     def add_distance_from(self, reference: DeadReckoning) -> None:
-        """Widen by how far the estimate is from ``reference``."""
+        """Inflate by how far the estimate is from ``reference``."""
         self.add(se2.log(se2.between(self._estimated, self._by_wheels if reference == "wheels" else self._by_gyro)))
 
     def add(self, difference: FloatArray) -> None:
-        """Widen by ``difference`` (3,), of which the direction is known and the sign is not."""
+        """Inflate by ``difference`` (3,), of which the direction is known and the sign is not."""
         self._pending = self._pending + np.outer(difference, difference)
 
-    def widen(self, estimate: Estimate, delta: Pose2) -> Estimate:
+    def inflate(self, estimate: Estimate, delta: Pose2) -> Estimate:
         """``estimate``, which moved by ``delta`` (3,) in the last step, with the covariance of all differences so far."""
         self._estimated = se2.compose(self._estimated, delta)
         A = se2.adjoint(se2.inverse(delta))
@@ -64,7 +64,7 @@ class Widening:
             odometry = odometry[0], odometry[1] + spread
         return replace(estimate, covariance=estimate.covariance + spread, odometry=odometry)
 
-    def widen_trajectory(self, smoothed: Trajectory) -> Trajectory:
+    def inflate_trajectory(self, smoothed: Trajectory) -> Trajectory:
         """``smoothed`` with the same covariance at its end, from the first fault on, in the world's axes."""
         if self._since_ns is None or smoothed.covariances is None:
             return smoothed
