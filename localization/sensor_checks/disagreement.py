@@ -35,8 +35,9 @@ class Disagreement(Check):
 
     def __init__(self, faults: FaultLog) -> None:
         self._faults, self._distance = faults, MotionDistance()
-        self._ended: _Episodes | None = None
-        self._episode: _Episode | None = None
+        self._now: _Episode | None = None
+        self._largest: _Episode | None = None
+        self._ended, self._ended_s = 0, 0.0  # number of episodes, and their sum [s]
 
     def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
         """Report the largest disagreement so far, with how often there was one."""
@@ -46,11 +47,26 @@ class Disagreement(Check):
         off = self._distance.difference
         self._faults.inflation.ongoing = off
         if off is not None:
-            self._episode = _Episode(self._distance.began_s - self._faults.start_s, self._faults.now_s, off, self._distance.mean_square)
-            self._faults.revise(_include(self._ended, self._episode).found())
-        elif self._episode is not None:
-            self._faults.inflation.add(self._episode.difference)
-            self._ended, self._episode = _include(self._ended, self._episode), None
+            self._now = _Episode(self._distance.began_s - self._faults.start_s, self._faults.now_s, off, self._distance.mean_square)
+            self._faults.revise(self._describe(self._now))
+        elif self._now is not None:
+            self._faults.inflation.add(self._now.difference)
+            self._largest = self._larger(self._now)
+            self._ended, self._ended_s, self._now = self._ended + 1, self._ended_s + self._now.seconds, None
+
+    def _larger(self, now: _Episode) -> _Episode:
+        return now if self._largest is None or now.distance > self._largest.distance else self._largest
+
+    def _describe(self, now: _Episode) -> DetectedFault:
+        largest, seconds = self._larger(now), self._ended_s + now.seconds
+        message = DISAGREEMENT.message.format(
+            seconds=largest.seconds,
+            sigmas=math.sqrt(largest.mean_square),
+            metres=largest.distance,
+            degrees=abs(math.degrees(largest.difference[2])),
+            others=f"; the largest of {self._ended + 1} such times, {seconds:.0f} s in all" if self._ended else "",
+        )
+        return DetectedFault(DISAGREEMENT, largest.begin_s, message)
 
 
 class _Episode(NamedTuple):
@@ -64,36 +80,14 @@ class _Episode(NamedTuple):
     """Of the last 5 s, in sigmas."""
 
     @property
+    def seconds(self) -> float:
+        """[s]"""
+        return self.end_s - self.begin_s
+
+    @property
     def distance(self) -> float:
         """Length of the difference [m]."""
         return math.hypot(self.difference[0], self.difference[1])
-
-
-class _Episodes(NamedTuple):
-    """The largest of several times of disagreement, and their sum."""
-
-    number: int
-    seconds: float
-    largest: _Episode
-
-    def found(self) -> DetectedFault:
-        """The largest."""
-        message = DISAGREEMENT.message.format(
-            seconds=self.largest.end_s - self.largest.begin_s,
-            sigmas=math.sqrt(self.largest.mean_square),
-            metres=self.largest.distance,
-            degrees=abs(math.degrees(self.largest.difference[2])),
-            others=f"; the largest of {self.number} such times, {self.seconds:.0f} s in all" if self.number > 1 else "",
-        )
-        return DetectedFault(DISAGREEMENT, self.largest.begin_s, message)
-
-
-def _include(episodes: _Episodes | None, episode: _Episode) -> _Episodes:
-    """``episodes`` and ``episode``."""
-    if episodes is None:
-        return _Episodes(1, episode.end_s - episode.begin_s, episode)
-    larger = episode if episode.distance > episodes.largest.distance else episodes.largest
-    return _Episodes(episodes.number + 1, episodes.seconds + episode.end_s - episode.begin_s, larger)
 
 
 class MotionDistance:
