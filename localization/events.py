@@ -14,7 +14,7 @@ import numpy as np
 from localization.errors import EventError
 from motion_models import se2
 from motion_models.base import Motion
-from motion_models.se2 import FloatArray
+from motion_models.se2 import FloatArray, Twist2
 
 _NS = 1e-9
 _ROUNDING = 1e-9  # of a covariance, over its largest entry
@@ -151,6 +151,11 @@ class Turn:
     """Time that the bias acted [s]."""
 
 
+def turn_twist(turn: Turn | None) -> Twist2:
+    """(3,) mean twist of a step whose wheels are not used: zero but for the turn rate by the gyro."""
+    return np.array([0.0, 0.0, 0.0 if turn is None else turn.angle / turn.duration])
+
+
 class StepInterval(NamedTuple):
     """Time of one step, and the scan at its end."""
 
@@ -170,12 +175,12 @@ class Step:
     d_clock: FloatArray
     """(3,) change of the predicted motion (right perturbation) per second by which the wheels' clock is shifted [m/s, m/s, rad/s]."""
     twist: FloatArray
-    """(3,) body twist at the end, by the wheels; of a step of no duration, by the nearest wheel sample. Without wheel data zero, but for
-    the mean turn rate by the gyro."""
+    """(3,) body twist at the end, by the wheels; of a step of no duration, by the nearest wheel sample. Where wheels are not used zero, but
+    for the mean turn rate by the gyro."""
     is_standing: bool
     """No wheel moved during the step."""
     has_wheels: bool
-    """Wheel data cover all of the step; of no duration, they are near it."""
+    """Wheel data cover all of the step (of no duration: are near it), and are used."""
     turn: Turn | None = None
     scan: Scan | None = None
 

@@ -99,9 +99,9 @@ class Pipeline:
         self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
 
     def _feed_back(self, step: Step, is_scan_matched: bool) -> None:
-        """Pass the estimated clock offset to the synchronizer, which waits for data by it; a scan ends a gap in the wheel data."""
+        """Pass the estimated clock offset to the synchronizer, which waits for data by it; a matched scan restarts a wheel gap."""
         if is_scan_matched:
-            self.synchronizer.end_gap()
+            self.synchronizer.restart_gap()
         self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
         if step.duration > 0.0:
             self.wheel_twist = step.mean_twist if step.has_wheels else None

@@ -6,12 +6,12 @@ import bisect
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 
-from localization.events import CgSample, Event, ImuSample, Scan, Step, StepInterval, WheelSample
+from localization.events import CgSample, Event, ImuSample, Scan, Step, StepInterval, WheelSample, turn_twist
 from localization.gyro import GyroBuffer
 from localization.lidar.frames import LidarFrames
 from localization.settings import Positive, Settings, at_least
@@ -20,7 +20,7 @@ from motion_models import se2
 from motion_models.base import Motion, MotionModel, Twist
 from motion_models.preintegration import integrate_twists
 from motion_models.robot import Mount, Robot
-from motion_models.se2 import FloatArray
+from motion_models.se2 import Cov3, FloatArray, Twist2
 
 _MIN_REPORTED_S = 0.05
 """Shorter times without wheel data are not reported: the first scan is often some milliseconds before the first wheel sample."""
@@ -46,8 +46,42 @@ class StepConfig(Settings):
     """Sigma of the unknown constant turn rate while wheel data are missing [rad/s]."""
 
 
-_UNKNOWN_YAW_VARIANCE = math.pi**2 / 3.0
-"""Of a heading that may be any [rad^2]: uniform from -pi to pi."""
+_MAX_VARIANCE = np.array([math.inf, math.inf, math.pi**2 / 3.0])
+"""Yaw: of a heading that may be any, uniform from -pi to pi [rad^2]."""
+_MIN_KNOWN_S = 1e-6
+"""Of a step: less than a microsecond with wheel data is rounding."""
+
+
+class UnknownVelocity:
+    """A constant velocity that no sensor measures, as large as the settings have it, or as the last measured one where that is larger.
+
+    It moves the robot by v t, with the variance sigma^2 t^2: a step from t_0 to t_1 after the last measured pose adds
+    sigma^2 (t_1^2 - t_0^2), so that the sum does not depend on how the time is cut into steps.
+    """
+
+    def __init__(self, config: StepConfig) -> None:
+        self._least = np.array([config.lost_speed_m_s, config.lost_speed_m_s, config.lost_rate_rad_s])
+        self._sigma = self._least
+        self._lasted_s = np.zeros(3)  # for which the motion along x, along y and the turn are unknown
+
+    def set_measured(self, twist: Twist2) -> None:
+        """Set the last measured twist (3,): the next unknown velocity may be as large."""
+        speed = math.hypot(twist[0], twist[1])
+        self._sigma = np.maximum(self._least, [speed, speed, abs(twist[2])])
+
+    def restart(self, lasted_s: float = 0.0) -> None:
+        """The pose was measured ``lasted_s`` ago [s]: the velocity acts only from there on."""
+        self._lasted_s = np.full(3, lasted_s)
+
+    def increment(self, missing_s: float, has_turn: bool) -> Cov3:
+        """Covariance (3, 3) of the motion in the next ``missing_s`` [s]. ``has_turn``: a gyro measures the turn of each step, so that
+        the turn before is known."""
+        is_unknown = np.array([True, True, not has_turn])
+        since = self._lasted_s * is_unknown
+        until = since + missing_s
+        self._lasted_s = until * is_unknown
+        after, before = (np.minimum((self._sigma * t) ** 2, _MAX_VARIANCE) for t in (until, since))
+        return np.diag(after - before)
 
 
 class Synchronizer:
@@ -67,8 +101,7 @@ class Synchronizer:
         self._has_lidar = has_lidar
         self._scans: deque[tuple[int, Scan]] = deque()  # and the middle of its sweep
         self._empty_scans, self._late_scans, self._no_wheel_data_s = 0, 0, 0.0
-        self._gap_s = 0.0  # duration of the present gap in the wheel data
-        self._speed = np.zeros(2)  # the last that wheels gave [m/s, rad/s]
+        self._velocity = UnknownVelocity(self.config)  # in gaps of the wheel data
         self._timeless, self._has_turned = 0, False  # scans without the times of their points, and whether the robot turned at one
         self._start_ns: int | None = None
         self._first_wheel_ns: int | None = None
@@ -84,9 +117,9 @@ class Synchronizer:
             self.params = params
         self._clock_offset_s = clock_offset_s
 
-    def end_gap(self) -> None:
-        """The pose was measured without the wheels: from here on, an unknown velocity moves the robot anew."""
-        self._gap_s = 0.0
+    def restart_gap(self) -> None:
+        """Restart the gap in the wheel data: a matched scan measured the pose, so the unknown velocity acts only from here on."""
+        self._velocity.restart()
 
     def insert(self, event: Event) -> None:
         """Store ``event`` in the buffer of its sensor."""
@@ -185,15 +218,17 @@ class Synchronizer:
         is_standing = bool(len(dt)) and missing == 0.0 and not rates.any()
         has_wheels = missing == 0.0 and bool(len(rates))
         turn = self._gyro.turn(start_ns, end_ns, float(motion.delta[2])) if end_ns > start_ns else None
-        motion = self._widen(motion, missing, has_rates=bool(len(dt)), has_turn=turn is not None)
+        if missing:
+            self._no_wheel_data_s += missing
+            motion = replace(motion, cov=motion.cov + self._velocity.increment(missing, has_turn=turn is not None))
+        if missing < (end_ns - start_ns) * 1e-9 - _MIN_KNOWN_S:  # wheels measured the velocity in this step
+            self._velocity.restart(missing)
         if scan is not None and len(scan.points) and not len(scan.offsets):
             self._timeless += 1
             self._has_turned |= bool(motion.delta[2])
         if has_wheels:
-            self._speed = np.array([float(np.hypot(last[0], last[1])), abs(float(last[2]))])
-        else:
-            last = np.array([0.0, 0.0, 0.0 if turn is None else turn.angle / turn.duration])
-        return Step(start_ns, end_ns, motion, d_clock, last, is_standing, has_wheels, turn, scan)
+            self._velocity.set_measured(last)
+        return Step(start_ns, end_ns, motion, d_clock, last if has_wheels else turn_twist(turn), is_standing, has_wheels, turn, scan)
 
     def _integrate(self, start_ns: int, dt: FloatArray, rates: FloatArray, cg: FloatArray) -> tuple[Motion, FloatArray, FloatArray]:
         """Motion of the wheels over the intervals, its derivative by the wheels' clock (3,), and the twist (3,) at the end.
@@ -211,24 +246,6 @@ class Synchronizer:
         motion = integrate_twists(dt, inside, self._robot.wheel_noise, cg_cov if cg_cov.any() else None)
         first, last = twist.value[0], twist.value[-1]
         return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last
-
-    def _widen(self, motion: Motion, missing_s: float, has_rates: bool, has_turn: bool) -> Motion:
-        """``motion`` with the covariance of a velocity that is unknown for ``missing_s`` [s] of it, and lasts.
-
-        Such a velocity takes the robot as far as the time, however that is cut into steps. It may be as large as the last measured one.
-        Where a gyro measures the turn of each step, that of the steps before is known.
-        """
-        before, self._gap_s = self._gap_s, missing_s + (0.0 if has_rates else self._gap_s)
-        if not missing_s:
-            return motion
-        self._no_wheel_data_s += missing_s
-        v = max(self.config.lost_speed_m_s, float(self._speed[0]))
-        w = max(self.config.lost_rate_rad_s, float(self._speed[1]))
-        until, since = (np.array([v, v, w]) ** 2 * time_s**2 for time_s in (before + missing_s, before))
-        if has_turn:
-            until[2], since[2] = (w * missing_s) ** 2, 0.0
-        until[2], since[2] = min(until[2], _UNKNOWN_YAW_VARIANCE), min(since[2], _UNKNOWN_YAW_VARIANCE)
-        return Motion(motion.delta, motion.cov + np.diag(until - since), motion.d_params)
 
 
 def _ns(seconds: float) -> int:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from localization.errors import EventError
 from localization.events import CgSample, ImuSample, Scan, WheelSample
-from localization.synchronizer import StepConfig, Synchronizer
+from localization.synchronizer import StepConfig, Synchronizer, UnknownVelocity
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.preintegration import preintegrate
@@ -337,6 +337,26 @@ def test_missing_wheels_covariance_grows_with_time_squared(scan_s):
     assert np.diag(again.predicted.cov).max() < 1e-3
 
 
+@pytest.mark.parametrize("step_s", [0.05, 0.1, 0.15, 0.25, 0.5, 5.0])
+def test_missing_wheels_between_angles_give_one_covariance_however_cut(step_s):
+    """2 s without data between two samples that both have angles, known before the steps are cut."""
+    config = StepConfig(wait_s=10.0)
+    events = [w for w in wheels(5.0, turned=lambda t: (0.01 * t, 0.01 * t)) if not 1.0 < (w.stamp_ns - T0) * 1e-9 < 3.5]
+    found, _ = cut([*events, *[scan(step_s * i) for i in range(round(5.0 / step_s) + 1)]], config=config)
+    assert np.sqrt(sum(step.predicted.cov[0, 0] for step in found)) == pytest.approx(config.lost_speed_m_s * 2.0, rel=1e-3)
+
+
+def test_unknown_velocity_turns_from_the_last_turn_of_the_gyro_on():
+    """Ten seconds with a gyro, in which any turn is known, then one without: the limit of the yaw variance is not reached."""
+    velocity = UnknownVelocity(StepConfig())
+    for _ in range(100):
+        np.testing.assert_allclose(np.sqrt(velocity.increment(0.1, has_turn=True)[2, 2]), 0.05)
+    found = np.sum([velocity.increment(0.1, has_turn=False) for _ in range(10)], axis=0)
+    np.testing.assert_allclose(np.diag(found), [0.25 * (11.0**2 - 10.0**2)] * 2 + [0.25])
+    velocity.restart()
+    np.testing.assert_allclose(np.diag(velocity.increment(0.2, has_turn=False)), 0.01)
+
+
 def test_missing_wheels_with_gyro_give_its_turn_rate():
     """However long: the wheels' heading stays so uncertain that the gyro's counts."""
     imu = [ImuSample(T0 + 10 * MS * i, np.array([0.0, 0.0, 0.3]), np.array([0.0, 0.0, 9.81])) for i in range(2000)]
@@ -348,12 +368,12 @@ def test_missing_wheels_with_gyro_give_its_turn_rate():
         assert np.sqrt(step.predicted.cov[2, 2]) == pytest.approx(StepConfig().lost_rate_rad_s * step.duration)
 
 
-def test_missing_wheels_after_the_end_of_a_gap_move_the_robot_anew():
+def test_restart_gap_after_each_scan_makes_steps_independent():
     cutter = stepper()
     found = []
     for event in in_order(wheels(2.0), [scan(0.1 * i) for i in range(1, 60)]):
         found += steps_after(event, cutter)
-        cutter.end_gap()  # as if each scan was matched
+        cutter.restart_gap()  # as if each scan was matched
     deaf = [s for s in found if s.start_ns >= T0 + 2600 * MS]
     assert len(deaf) > 20
     for step in deaf:
