@@ -66,7 +66,7 @@ class Pipeline:
         self.estimator: Estimator = make_estimator(
             trial.estimator, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing
         )
-        self.checks = SensorChecks(self.mounts, config.estimator.lidar)
+        self.checks = SensorChecks(self.mounts, config.estimator.lidar, config.step)
         self.wheel_twist: FloatArray | None = None
         """(3,) mean twist of the last step by the wheels alone; None where wheel data were missing in it."""
 

@@ -4,15 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
-from localization.events import ImuSample, Step
+from localization.events import ImuSample, Step, turn_twist
 from localization.sensor_checks.window import Window
-from motion_models.base import Motion
-from motion_models.se2 import FloatArray
-
-_UNKNOWN_SPEED = np.array([0.5, 0.5, 0.5])
-"""Sigma of a twist that no sensor measures [m/s, m/s, rad/s], as `StepConfig.lost_speed_m_s`."""
+from motion_models.se2 import Cov3, FloatArray
 
 
 class Check:
@@ -41,8 +35,7 @@ class Check:
         return []
 
 
-def with_unknown_motion(step: Step, seconds2: float) -> Step:
-    """``step`` with the covariance of a lasting unknown twist, which grows by ``seconds2`` [s^2]."""
-    motion = step.predicted
-    cov = motion.cov + np.diag(_UNKNOWN_SPEED**2) * seconds2
-    return replace(step, predicted=Motion(motion.delta, cov, motion.d_params), is_standing=False, has_wheels=False)
+def without_wheels(step: Step, unknown: Cov3) -> Step:
+    """``step`` whose wheels are not used: the covariance of its motion has ``unknown`` (3, 3) besides, its twist is by the gyro alone."""
+    motion = replace(step.predicted, cov=step.predicted.cov + unknown)
+    return replace(step, predicted=motion, twist=turn_twist(step.turn), is_standing=False, has_wheels=False)

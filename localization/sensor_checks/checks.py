@@ -20,6 +20,7 @@ from localization.sensor_checks.standstill import Standstill
 from localization.sensor_checks.travel_direction import TravelDirection
 from localization.sensor_checks.turn_rates import TurnRates
 from localization.sensor_checks.window import Window
+from localization.synchronizer import StepConfig
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.robot import Mount
@@ -29,7 +30,7 @@ from motion_models.se2 import Pose2
 class SensorChecks:
     """`apply` to each step before the estimator, `inflate` its estimate afterwards."""
 
-    def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig) -> None:
+    def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig, step_config: StepConfig) -> None:
         self._inflation = CovarianceInflation()
         self._faults = faults = FaultLog(self._inflation)
         self._window = window = Window(mounts, config)
@@ -37,9 +38,9 @@ class SensorChecks:
             LidarTilt(mounts),
             OwnBody(faults),
             GyroRate(faults),
-            TurnRates(faults),
+            TurnRates(faults, step_config),
             TravelDirection(faults),
-            Standstill(faults, window),
+            Standstill(faults, window, step_config),
             Disagreement(faults),
         )
         self._step: Step | None = None

@@ -8,9 +8,10 @@ from collections import deque
 import numpy as np
 
 from localization.events import ImuSample, Step
-from localization.sensor_checks.check import Check, with_unknown_motion
+from localization.sensor_checks.check import Check, without_wheels
 from localization.sensor_checks.faults import Fault, FaultLog
 from localization.sensor_checks.window import Window
+from localization.synchronizer import StepConfig, UnknownVelocity
 from motion_models.se2 import FloatArray
 
 WHEELS_STANDING = Fault(
@@ -34,12 +35,12 @@ _NS = 1e-9
 class Standstill(Check):
     """Such wheels count as unknown, for as long as that lasts."""
 
-    def __init__(self, faults: FaultLog, window: Window) -> None:
-        self._faults, self._window = faults, window
+    def __init__(self, faults: FaultLog, window: Window, config: StepConfig) -> None:
+        self._faults, self._window, self._velocity = faults, window, UnknownVelocity(config)
         self._shaking: dict[str, ShakeDetector] = {}  # by the IMU's frame
         self._stood_s = 0.0  # time for which the wheels read zero
         self._turned_s = 0.0  # the same, while the gyro turns
-        self._unknown_s = 0.0  # the same, while that is contradicted
+        self._trusted_s = 0.0  # the same, as far as it counted as standing and no scan has measured the pose since
 
     def insert_imu(self, sample: ImuSample) -> None:
         """Specific force shows whether the robot moves."""
@@ -48,21 +49,31 @@ class Standstill(Check):
     def apply(self, step: Step) -> Step:
         """``step`` with unknown wheels where another sensor shows motion."""
         if not step.is_standing:
-            self._unknown_s = self._turned_s = self._stood_s = 0.0
+            self._turned_s = self._stood_s = self._trusted_s = 0.0
+            self._velocity.restart()
+            if step.has_wheels:
+                self._velocity.set_measured(step.twist)
             return step
         self._stood_s += step.duration
         self._turned_s = self._turned_s + step.duration if _is_turning(step) else 0.0
-        before, self._unknown_s = self._unknown_s, self._turned_s
-        others = self._moving()
-        if others:
-            self._unknown_s = self._stood_s
-        elif self._turned_s >= _MIN_TURNING_S:
-            others = "the gyro turned"
-        if others:
-            self._faults.declare(WHEELS_STANDING, self._faults.now_s - self._unknown_s, {"others": others})
-        if not self._unknown_s:
+        moving = self._moving()
+        contradicted_s = self._stood_s if moving else self._turned_s
+        if moving or self._turned_s >= _MIN_TURNING_S:
+            self._faults.declare(WHEELS_STANDING, self._faults.now_s - contradicted_s, {"others": moving or "the gyro turned"})
+        if not contradicted_s:
+            self._trusted_s += step.duration
+            self._velocity.restart()
             return step
-        return with_unknown_motion(step, max(self._unknown_s**2 - before**2, step.duration**2))
+        unknown_s = step.duration
+        if moving:
+            unknown_s, self._trusted_s = unknown_s + self._trusted_s, 0.0
+        return without_wheels(step, self._velocity.increment(unknown_s, has_turn=step.turn is not None))
+
+    def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
+        """A matched scan measured the pose."""
+        if nis is not None:
+            self._velocity.restart()
+            self._trusted_s = 0.0
 
     def _moving(self) -> str:
         """What shows that the robot drives; "" where nothing does."""

@@ -13,10 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import Step
-from localization.sensor_checks.check import Check, with_unknown_motion
+from localization.sensor_checks.check import Check, without_wheels
 from localization.sensor_checks.faults import Evidence, Fault, FaultLog
 from localization.sensor_checks.gyro_rate import GYRO_RATE
 from localization.sensor_checks.window import MIN_BINS, WINDOW_BINS, Window
+from localization.synchronizer import StepConfig, UnknownVelocity
 from motion_models.se2 import FloatArray
 
 GYRO_OPPOSITE = Fault(
@@ -65,8 +66,8 @@ Numbers = Mapping[str, float | str]
 class TurnRates(Check):
     """Leaves out what contradicts the other sensors in most comparisons of the last seconds."""
 
-    def __init__(self, faults: FaultLog) -> None:
-        self._faults = faults
+    def __init__(self, faults: FaultLog, config: StepConfig) -> None:
+        self._faults, self._velocity = faults, UnknownVelocity(config)
         self._evidence = {fault: Evidence() for fault in (GYRO_OPPOSITE, GYRO_UNIT, GYRO_STUCK, WHEELS_OPPOSITE, LIDAR_OPPOSITE)}
         self._is_gyro_stuck = False
 
@@ -94,9 +95,15 @@ class TurnRates(Check):
             step = replace(step, turn=None)
         if LIDAR_OPPOSITE in faults:
             step = replace(step, scan=None)
-        if WHEELS_OPPOSITE in faults:
-            step = with_unknown_motion(step, step.duration**2)
+        if WHEELS_OPPOSITE in faults and step.has_wheels and not step.is_standing:
+            return without_wheels(step, self._velocity.increment(step.duration, has_turn=step.turn is not None))
+        self._velocity.restart()
         return step
+
+    def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
+        """A matched scan measured the pose."""
+        if nis is not None:
+            self._velocity.restart()
 
 
 class _Relation(NamedTuple):

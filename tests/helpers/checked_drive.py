@@ -10,6 +10,7 @@ from localization.estimators import Estimate
 from localization.events import Scan, Step, Turn
 from localization.lidar import LidarConfig
 from localization.sensor_checks import SensorChecks
+from localization.synchronizer import StepConfig
 from motion_models import se2
 from motion_models.base import Motion
 from tests.helpers.rooms import ANGLES, ranges
@@ -24,11 +25,17 @@ def turn_rate(t: float) -> float:
 
 
 class CheckedDrive:
-    """A drive in a room, as steps; ``gyro`` and ``wheels`` change what these measure of the turn rate, ``scan`` the points."""
+    """A drive in a room, as steps; ``gyro`` and ``wheels`` change what these measure of the turn rate, ``scan`` the points.
 
-    def __init__(self, gyro=lambda w: w, wheels=lambda v, w: (v, w), scan=lambda points: points, has_scans: bool = True) -> None:
+    ``nis`` is that of each estimate; None where no scan is matched.
+    """
+
+    def __init__(
+        self, gyro=lambda w: w, wheels=lambda v, w: (v, w), scan=lambda points: points, has_scans: bool = True, nis: float | None = None
+    ) -> None:
         self.gyro, self.wheels, self.scan, self.has_scans = gyro, wheels, scan, has_scans
-        self.checks = SensorChecks({}, LidarConfig())
+        self.nis = nis
+        self.checks = SensorChecks({}, LidarConfig(), StepConfig())
         self.applied: list[Step] = []
         self.estimates: list[Estimate] = []
 
@@ -55,7 +62,7 @@ class CheckedDrive:
                 scan,
             )
             self.applied.append(self.checks.apply(step))
-            self.estimates.append(self.checks.inflate(Estimate(step.end_ns, pose, 1e-6 * np.eye(3), np.zeros(3), None)))
+            self.estimates.append(self.checks.inflate(Estimate(step.end_ns, pose, 1e-6 * np.eye(3), np.zeros(3), None, self.nis)))
         return self.checks
 
     def _scan(self, pose: tuple[float, float, float], stamp_ns: int, rng: np.random.Generator) -> Scan:

@@ -9,6 +9,8 @@ import pytest
 
 from localization.events import ImuSample
 from localization.sensor_checks.standstill import WHEELS_STANDING
+from localization.simulation import world
+from tests.helpers import rooms
 from tests.helpers.checked_drive import CheckedDrive, S
 
 
@@ -38,8 +40,11 @@ def test_wheels_that_read_zero_while_the_gyro_turns_are_unknown(rate: float, is_
     robot = CheckedDrive(wheels=lambda v, w: (0.0, 0.0), gyro=lambda w: rate, has_scans=False)
     checks = robot.drive(3.0)
     assert (WHEELS_STANDING in checks.found) == is_found
-    total = sum(step.predicted.cov[2, 2] for step in robot.applied)
+    total = sum(step.predicted.cov[0, 0] for step in robot.applied)
     assert (math.sqrt(total) == pytest.approx(0.5 * 3.0, rel=0.05)) == is_found
+    if is_found:  # the gyro measures the turn of each step
+        np.testing.assert_allclose([math.sqrt(step.predicted.cov[2, 2]) for step in robot.applied[1:]], 0.5 * 0.1, rtol=1e-3)
+        np.testing.assert_allclose([step.twist for step in robot.applied[1:]], [[0.0, 0.0, rate]] * 29, atol=1e-9)
 
 
 def test_gyro_that_turns_on_for_a_moment_is_not_reported() -> None:
@@ -74,3 +79,27 @@ def test_two_imus_with_other_axes_are_not_taken_for_shaking() -> None:
         robot.checks.insert_imu(ImuSample(k * S // 50, np.zeros(3), np.array([0.0, 0.0, 9.8]), "a"))
         robot.checks.insert_imu(ImuSample(k * S // 50, np.zeros(3), np.array([9.8, 0.0, 0.0]), "b"))
     assert robot.drive(6.0).found == {}
+
+
+def test_unknown_wheels_of_a_fast_robot_are_as_fast() -> None:
+    """1.5 m/s until the encoders fail: the unknown velocity may be as large."""
+    robot = CheckedDrive(wheels=lambda v, w: (3.0 * v, w), gyro=lambda w: w)
+    robot.drive(2.0)
+    robot.wheels, robot.gyro = lambda v, w: (0.0, 0.0), lambda w: 0.3
+    robot.drive(2.0)
+    total = sum(step.predicted.cov[0, 0] for step in robot.applied[20:])
+    assert math.sqrt(total) == pytest.approx(1.5 * 2.0, rel=0.05)
+
+
+@pytest.mark.parametrize("parked_s", [0.0, 30.0])
+def test_dead_encoders_lose_no_scan(parked_s: float) -> None:
+    """Wheels read zero from 5 s on, with or without a time in which the robot is parked: matched scans measure the pose all the while."""
+    walls = np.vstack([world.box(-4, -3, 6, 5), world.box(1.0, 1.5, 2.0, 2.2)])
+    twists = rooms.path((5, 0.4, 0.2), *[(parked_s, 0.0, 0.0)] * bool(parked_s), (25, 0.4, 0.2))
+    drive = rooms.drive_through(
+        walls, twists, 1, (0.0, -1.5, 0.0), rooms.Beams(360, 6.28, 10.0, fill=0.0), wheels=lambda t, w: np.where(t[:, None] < 5.0, w, 0.0)
+    )
+    run = rooms.results(drive, "ekf")["ekf"]
+    assert run.counts["matched"] == run.counts["scans"] - 1  # the first begins the submap
+    assert "the wheels read zero while the LiDAR moved" in run.warnings[0]
+    assert rooms.ate(drive, rooms.at_scans(drive, run)[0]) < 0.05

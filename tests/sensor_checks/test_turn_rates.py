@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
 from localization.sensor_checks.faults import Fault
@@ -52,6 +53,16 @@ def test_wheels_that_are_swapped_are_left_out_where_gyro_and_lidar_agree() -> No
     assert step.scan is not None
     assert not step.has_wheels
     assert step.predicted.cov[2, 2] > 1e-3
+    np.testing.assert_allclose(step.twist, [0.0, 0.0, step.turn.angle / step.turn.duration])
+
+
+@pytest.mark.parametrize(("nis", "sigma_m"), [(None, 0.5 * 10.0), (3.0, math.sqrt(100) * 0.5 * 0.1)])
+def test_unknown_motion_of_swapped_wheels_lasts_until_a_scan_is_matched(nis: float | None, sigma_m: float) -> None:
+    robot = CheckedDrive(wheels=lambda v, w: (v, -w), nis=nis)
+    robot.drive(16.0)
+    unknown = [step.predicted.cov[0, 0] for step in robot.applied if not step.has_wheels]
+    assert len(unknown) > 100
+    assert math.sqrt(sum(unknown[:100])) == pytest.approx(sigma_m, rel=1e-3)
 
 
 def test_gyro_in_degrees_from_half_way_on_is_left_out_within_five_seconds() -> None:
