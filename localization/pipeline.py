@@ -168,6 +168,17 @@ class Run:
     """How long the LiDAR was lost; None where no scans were matched to a map."""
 
 
+def warnings_of(runs: Iterable[Run]) -> list[str]:
+    """Problems of the sensors in all ``runs``, each once: what several trials report alike is given with the names of all of them."""
+    names: dict[str, list[str]] = {}
+    for run in runs:
+        name = f"{run.estimator} ({run.model})"
+        for warning in run.warnings:
+            text = warning.removeprefix(f"{name}: ")
+            names.setdefault(text, []).extend([name] if text != warning else [])
+    return [f"{', '.join(dict.fromkeys(found))}: {text}" if found else text for text, found in names.items()]
+
+
 def replay(
     events: Iterable[Event],
     trials: Sequence[Trial],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.stats import chi2
 
 from localization.cli import main
+from localization.pipeline import warnings_of
 from localization.trajectory import read_tum
 from tests.helpers import bags, rooms
 
@@ -96,6 +98,15 @@ def test_replay_husky_with_gyro_error_is_below_its_odometry(husky):
         assert -0.13 < offset < -0.07
         assert sigma < 0.03
         assert found[model, "ekf"]["parameters"]["gyro_bias_rad_per_s"][1] > 0.0
+
+
+def test_warnings_of_runs_name_all_trials_that_have_them():
+    def run(estimator, *warnings):
+        return SimpleNamespace(estimator=estimator, model="icr", warnings=[*warnings])
+
+    lost, slip = "LiDAR lost for 3 % of the drive.", "at t = 2 s: wheels slip."
+    runs = [run("odometry"), run("ekf", f"ekf (icr): {lost}", slip), run("graph", slip, f"graph (icr): {lost}", "graph (icr): late.")]
+    assert warnings_of(runs) == [f"ekf (icr), graph (icr): {lost}", slip, "graph (icr): late."]
 
 
 def test_replay_twice_gives_the_same_bytes(tmp_path):

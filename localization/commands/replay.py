@@ -36,7 +36,7 @@ from localization.logs import Log, TopicOverrides, open_log
 from localization.logs.references import merge_positions, read_positions
 from localization.logs.writer import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
 from localization.output import as_text, check_outputs, fingerprint, versions
-from localization.pipeline import ReplayConfig, Run, Trial, replay
+from localization.pipeline import ReplayConfig, Run, Trial, replay, warnings_of
 from localization.report.replay_page import COLUMNS, MISSING, Column, ReportHead, overview_png, verdict, with_values, write_report
 from localization.trajectory import write_tum
 from motion_models.online_calibration import check_forms
@@ -126,7 +126,7 @@ class Replay:
                         *prior_notes(robot, [m.name for m in models]),
                         *held_out,
                         *log.warnings(),
-                        *(note for run in runs for note in run.warnings),
+                        *warnings_of(found),
                     ]
                 )
             ],
