@@ -31,13 +31,15 @@ _NS = 1e-9
 
 
 class Disagreement(Check):
-    """Leaves out nothing, as either may be right; the covariance has the difference."""
+    """Leaves out nothing, as either may be right. While it lasts, the covariance has the difference, and afterwards if a scan was lost
+    meanwhile: else scans were matched all the way to a submap that is older, and it was the wheels."""
 
     def __init__(self, faults: FaultLog) -> None:
         self._faults, self._distance = faults, MotionDistance()
         self._now: _Episode | None = None
         self._largest: _Episode | None = None
         self._ended, self._ended_s = 0, 0.0  # number of episodes, and their sum [s]
+        self._has_lost_scan = False  # in this episode
 
     def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
         """Report the largest disagreement so far, with how often there was one."""
@@ -47,10 +49,13 @@ class Disagreement(Check):
         off = self._distance.difference
         self._faults.inflation.ongoing = off
         if off is not None:
+            self._has_lost_scan |= step.scan is not None and nis is None
             self._now = _Episode(self._distance.began_s - self._faults.start_s, self._faults.now_s, off, self._distance.mean_square)
             self._faults.revise(self._describe(self._now))
         elif self._now is not None:
-            self._faults.inflation.add(self._now.difference)
+            if self._has_lost_scan:
+                self._faults.inflation.add(self._now.difference)
+            self._has_lost_scan = False
             self._largest = self._larger(self._now)
             self._ended, self._ended_s, self._now = self._ended + 1, self._ended_s + self._now.seconds, None
 
