@@ -183,11 +183,20 @@ class Step:
     """Wheel data cover all of the step (of no duration: are near it), and are used."""
     turn: Turn | None = None
     scan: Scan | None = None
+    cg_cov: FloatArray = field(default_factory=lambda: np.zeros((2, 2)))
+    """(2, 2) covariance of the centre of gravity [m^2]."""
 
     @property
     def duration(self) -> float:
         """[s]"""
         return (self.end_ns - self.start_ns) * _NS
+
+    @property
+    def cov(self) -> FloatArray:
+        """(3, 3) of ``predicted`` by slip and CG error, for estimators that take steps as independent. A constant CG error is not; their
+        prior of k and the centre of rotation covers it."""
+        D = self.predicted.d_cg
+        return np.asarray(self.predicted.cov + D @ self.cg_cov @ D.T)
 
     @property
     def mean_twist(self) -> FloatArray:

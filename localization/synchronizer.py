@@ -228,7 +228,8 @@ class Synchronizer:
             self._has_turned |= bool(motion.delta[2])
         if has_wheels:
             self._velocity.set_measured(last)
-        return Step(start_ns, end_ns, motion, d_clock, last if has_wheels else turn_twist(turn), is_standing, has_wheels, turn, scan)
+        twist = last if has_wheels else turn_twist(turn)
+        return Step(start_ns, end_ns, motion, d_clock, twist, is_standing, has_wheels, turn, scan, self._wheels.cg_cov)
 
     def _integrate(self, start_ns: int, dt: FloatArray, rates: FloatArray, cg: FloatArray) -> tuple[Motion, FloatArray, FloatArray]:
         """Motion of the wheels over the intervals, its derivative by the wheels' clock (3,), and the twist (3,) at the end.
@@ -241,9 +242,8 @@ class Synchronizer:
         before, before_cg = self._wheels.at(start_ns - 1, self.config.max_hold_s)
         n = len(before)
         twist = self.model.twist(np.vstack([before, rates]), np.vstack([before_cg, cg]), self.params)
-        cg_cov = self._wheels.cg_cov
         inside = Twist(twist.value[n:], twist.d_wheels[n:], twist.d_cg[n:], twist.d_params[n:])
-        motion = integrate_twists(dt, inside, self._robot.wheel_noise, cg_cov if cg_cov.any() else None)
+        motion = integrate_twists(dt, inside, self._robot.wheel_noise)
         first, last = twist.value[0], twist.value[-1]
         return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last
 

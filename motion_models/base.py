@@ -53,9 +53,11 @@ class Motion:
     delta: FloatArray
     """(3,) pose of the end relative to the start [m, m, rad]."""
     cov: FloatArray
-    """(3, 3) of the right perturbation of ``delta``."""
+    """(3, 3) of the right perturbation of ``delta`` by slip."""
     d_params: FloatArray = field(default_factory=lambda: np.zeros((3, 0)))
     """(3, k) change of ``delta`` (right perturbation) by the model's parameters."""
+    d_cg: FloatArray = field(default_factory=lambda: np.zeros((3, 2)))
+    """(3, 2) change of ``delta`` (right perturbation) by a CG error that is the same over all of it."""
 
 
 class MotionModel(Protocol):

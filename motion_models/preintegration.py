@@ -35,27 +35,22 @@ def preintegrate(
     cg: FloatArray,
     params: FloatArray,
     noise: WheelNoise,
-    cg_cov: FloatArray | None = None,
 ) -> Motion:
     """The motion over n intervals of constant wheel rates and constant CG.
 
-    ``dt`` (n,) [s] lengths of the intervals; ``wheels`` (n, 2) [rad/s]; ``cg`` (n, 2) or (2,) [m]; ``params`` (k,). ``cg_cov``
-    (2, 2) [m^2] is the covariance of a CG error that is the same in all intervals. The error of the motion is a right
-    perturbation, as everywhere; on each interval it follows e' = Ad(exp(-xi dt)) e + J_r(xi dt) d(xi) dt.
+    ``dt`` (n,) [s] lengths of the intervals; ``wheels`` (n, 2) [rad/s]; ``cg`` (n, 2) or (2,) [m]; ``params`` (k,). The error of
+    the motion is a right perturbation, as everywhere; on each interval it follows e' = Ad(exp(-xi dt)) e + J_r(xi dt) d(xi) dt.
     """
-    twist = model.twist(wheels, cg, params)
-    return integrate_twists(dt, twist, noise, cg_cov)
+    return integrate_twists(dt, model.twist(wheels, cg, params), noise)
 
 
-def integrate_twists(dt: FloatArray, twist: Twist, noise: WheelNoise, cg_cov: FloatArray | None = None) -> Motion:
-    """`preintegrate` for twists (n, 3) that are already there."""
+def integrate_twists(dt: FloatArray, twist: Twist, noise: WheelNoise) -> Motion:
+    """`preintegrate` for given twists (n, 3)."""
     k = twist.d_params.shape[-1]
-    by = np.concatenate([twist.d_params, twist.d_cg], axis=-1) if cg_cov is not None else twist.d_params
+    by = np.concatenate([twist.d_params, twist.d_cg], axis=-1)
     delta, cov, d = np.zeros(3), np.zeros((3, 3)), np.zeros((3, by.shape[-1]))
-    _integrate(np.ascontiguousarray(dt), twist.value, np.ascontiguousarray(by), noise_vector(noise), delta, cov, d)
-    if cg_cov is not None:
-        cov = cov + d[:, k:] @ cg_cov @ d[:, k:].T
-    return Motion(delta, cov, d[:, :k])
+    _integrate(np.ascontiguousarray(dt), twist.value, by, noise_vector(noise), delta, cov, d)
+    return Motion(delta, cov, d[:, :k], d[:, k:])
 
 
 @kernel

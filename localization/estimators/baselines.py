@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -13,17 +14,22 @@ from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
 from localization.lidar.scan_matcher import MIN_POINTS
 from motion_models import se2
 from motion_models.robot import Mount
-from motion_models.se2 import Points2
+from motion_models.se2 import FloatArray, Points2
 
 _FALLBACK_VOXEL_M = 0.5
 """Voxel where the first scan has too few points to choose one."""
 
 
 class DeadReckoning(Estimator):
-    """Composes the predicted motions; the covariance follows P' = Ad(delta^-1) P Ad(delta^-1)^T + Q."""
+    """Composes the predicted motions. With A = Ad(delta^-1), slip of covariance Q and CG of covariance C in each step:
+
+    P' = A P A^T + Q     D' = A D + (d delta / d CG) C^(1/2)
+
+    The pose has covariance P + D D^T. The CG error lasts: sigma does not depend on how the drive is cut into steps.
+    """
 
     def __init__(self) -> None:
-        self._pose, self._cov = np.zeros(3), np.zeros((3, 3))
+        self._pose, self._cov, self._by_cg = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 2))
 
     def step(self, step: Step) -> Estimate:
         """As `Estimator.step`."""
@@ -31,8 +37,16 @@ class DeadReckoning(Estimator):
         A = se2.adjoint(se2.inverse(motion.delta))
         self._pose = se2.compose(self._pose, motion.delta)
         self._cov = A @ self._cov @ A.T + motion.cov
-        twist, twist_cov = mean_twist(motion.delta, motion.cov, step.duration) if step.duration > 0 else (step.twist, None)
-        return Estimate(step.end_ns, self._pose, self._cov, twist, twist_cov)
+        self._by_cg = A @ self._by_cg + motion.d_cg @ _square_root(step.cg_cov)
+        twist, twist_cov = mean_twist(motion.delta, step.cov, step.duration) if step.duration > 0 else (step.twist, None)
+        return Estimate(step.end_ns, self._pose, self._cov + self._by_cg @ self._by_cg.T, twist, twist_cov)
+
+
+def _square_root(cov: FloatArray) -> FloatArray:
+    """The symmetric root (2, 2) of a covariance (2, 2), which may be singular: (C + s I) / sqrt(tr C + 2 s), s^2 = det C."""
+    s = math.sqrt(max(float(np.linalg.det(cov)), 0.0))
+    norm = math.sqrt(float(np.trace(cov)) + 2.0 * s)
+    return (cov + s * np.eye(2)) / norm if norm else cov
 
 
 class LidarOdometry(Estimator):

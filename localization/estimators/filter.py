@@ -112,7 +112,7 @@ class Filter:
 
     def wheel_cov(self, step: Step) -> Cov3:
         """(3, 3) of the wheels' motion in ``step``, with the estimated scale."""
-        return step.predicted.cov * (self.wheel_noise_scale if step.has_wheels and not step.is_standing else 1.0)
+        return step.cov * (self.wheel_noise_scale if step.has_wheels and not step.is_standing else 1.0)
 
     def update_turn(self, turn: Turn) -> float:
         """The gyro's turn since the start of the step. Returns the normalised innovation squared (NIS, 1 degree of freedom)."""

@@ -175,7 +175,7 @@ class _SlipChanges:
         last, self._last = self._last, change * step.duration
         if last is None:
             return
-        white = (1.0 - min(sweep_s / step.duration, 1.0) * 2.0 / 3.0) * np.diagonal(step.predicted.cov)
+        white = (1.0 - min(sweep_s / step.duration, 1.0) * 2.0 / 3.0) * np.diagonal(step.cov)
         scans = np.diagonal(scan_cov)
         is_inlier = np.maximum(last**2, self._last**2) < OUTLIER_SIGMAS**2 * (
             2.0 * white + 6.0 * scans
@@ -189,4 +189,4 @@ class _SlipChanges:
         if not step.has_wheels or step.is_standing:
             return np.zeros((3, 3))
         root = np.sqrt(np.maximum(self._sum / self._weight, 0.0))
-        return np.asarray(root[:, None] * step.predicted.cov * root / step.duration)
+        return np.asarray(root[:, None] * step.cov * root / step.duration)

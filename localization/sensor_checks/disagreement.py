@@ -118,7 +118,7 @@ class MotionDistance:
         if step.scan is None or not step.has_wheels or step.is_standing:
             return
         off = se2.log(se2.between(wheels, delta))
-        square = max(float(off @ np.linalg.solve(step.predicted.cov + _SCAN_NOISE, off)), nis or 0.0)
+        square = max(float(off @ np.linalg.solve(step.cov + _SCAN_NOISE, off)), nis or 0.0)
         self._rows.append((step.end_ns * _NS, min(square, _MAX_SQUARE), wheels, delta))
         while self._rows[0][0] < self._rows[-1][0] - _DISAGREEMENT_S:
             self._rows.popleft()

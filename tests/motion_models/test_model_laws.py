@@ -109,6 +109,7 @@ def test_preintegrate_of_cut_intervals_is_that_of_whole_ones(name, seed):
     both = preintegrate(model, cut, wheels.repeat(2, axis=0), cg.repeat(2, axis=0), params, WheelNoise())
     np.testing.assert_allclose(both.delta, whole.delta, atol=1e-12)
     np.testing.assert_allclose(both.d_params, whole.d_params, atol=1e-9 * (1 + np.abs(whole.d_params).max()))
+    np.testing.assert_allclose(both.d_cg, whole.d_cg, atol=1e-9 * (1 + np.abs(whole.d_cg).max()))
 
 
 @drawn
