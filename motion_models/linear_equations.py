@@ -88,6 +88,12 @@ def multiply(a: FloatArray, v: Triple) -> Triple:
 
 
 @subroutine
+def multiply_affine(a: FloatArray, v: Triple) -> Triple:
+    """`multiply` for ``a`` whose last row is 0, 0, 1, as of adjoints and Jacobians of SE(2)."""
+    return a[0, 0] * v[0] + a[0, 1] * v[1] + a[0, 2] * v[2], a[1, 0] * v[0] + a[1, 1] * v[1] + a[1, 2] * v[2], v[2]
+
+
+@subroutine
 def transform_symmetric(a: FloatArray, s: FloatArray) -> FloatArray:
     """``a.T @ s @ a`` for the symmetric ``s`` (3, 3)."""
     out = np.empty((3, 3))

@@ -12,12 +12,13 @@ import numpy as np
 
 from motion_models.base import Motion, MotionModel, Twist
 from motion_models.compiled import kernel
+from motion_models.linear_equations import multiply_affine
 from motion_models.robot import WheelNoise
-from motion_models.se2 import FloatArray, scalar_exp
+from motion_models.se2 import FloatArray, fill_inverse_adjoint, fill_right_jacobian, scalar_exp, scalar_transform, triple
 
 
 def noise_vector(noise: WheelNoise) -> FloatArray:
-    """(8,) the numbers of ``noise`` in the order that `_integrate` reads them."""
+    """(8,) the numbers of ``noise`` in the order that `integrate` reads them."""
     return np.array(
         [
             *(noise.longitudinal_m2_per_m, noise.longitudinal_m2_per_rad),
@@ -49,58 +50,38 @@ def integrate_twists(dt: FloatArray, twist: Twist, noise: WheelNoise) -> Motion:
     k = twist.d_params.shape[-1]
     by = np.concatenate([twist.d_params, twist.d_cg], axis=-1)
     delta, cov, d = np.zeros(3), np.zeros((3, 3)), np.zeros((3, by.shape[-1]))
-    _integrate(np.ascontiguousarray(dt), twist.value, by, noise_vector(noise), delta, cov, d)
+    integrate(np.ascontiguousarray(dt), twist.value, by, noise_vector(noise), delta, cov, d)
     return Motion(delta, cov, d[:, :k], d[:, k:])
 
 
 @kernel
-def _integrate(
+def integrate(
     dt: FloatArray, twist: FloatArray, by: FloatArray, noise: FloatArray, delta: FloatArray, cov: FloatArray, d: FloatArray
 ) -> None:
     """Compose the intervals into ``delta`` (3,), ``cov`` (3, 3), ``d`` (3, m), which start at zero and are changed in place."""
-    m = by.shape[2]
-    moved = np.empty((3, 3))
+    A, J, half = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(dt.shape[0]):
         h = dt[i]
-        vx, vy, wz = twist[i, 0] * h, twist[i, 1] * h, twist[i, 2] * h
-        x, y, t = scalar_exp((vx, vy, wz))
-
-        # Adjoint of the inverse step: [[c, s, a], [-s, c, b], [0, 0, 1]]
-        c, s = math.cos(t), math.sin(t)
-        a, b = s * x - c * y, c * x + s * y
+        way = twist[i, 0] * h, twist[i, 1] * h, twist[i, 2] * h
+        step = scalar_exp(way)
+        fill_inverse_adjoint(step, A)
+        fill_right_jacobian(way, J)
         for j in range(3):
-            moved[0, j] = c * cov[0, j] + s * cov[1, j] + a * cov[2, j]
-            moved[1, j] = -s * cov[0, j] + c * cov[1, j] + b * cov[2, j]
-            moved[2, j] = cov[2, j]
+            half[j, 0], half[j, 1], half[j, 2] = multiply_affine(A, (cov[0, j], cov[1, j], cov[2, j]))  # (A P)^T = P A^T
         for j in range(3):
-            cov[j, 0] = c * moved[j, 0] + s * moved[j, 1] + a * moved[j, 2]
-            cov[j, 1] = -s * moved[j, 0] + c * moved[j, 1] + b * moved[j, 2]
-            cov[j, 2] = moved[j, 2]
+            cov[0, j], cov[1, j], cov[2, j] = multiply_affine(A, (half[0, j], half[1, j], half[2, j]))  # A P A^T
+        for j in range(by.shape[2]):
+            before = multiply_affine(A, (d[0, j], d[1, j], d[2, j]))
+            added = multiply_affine(J, (by[i, 0, j] * h, by[i, 1, j] * h, by[i, 2, j] * h))
+            d[0, j], d[1, j], d[2, j] = before[0] + added[0], before[1] + added[1], before[2] + added[2]
 
-        # Right Jacobian of the step (see se2.right_jacobian)
-        if abs(wz) < 1e-4:
-            ja, jb, jf, jg = 1.0 - wz * wz / 6.0, wz * (0.5 - wz * wz / 24.0), wz / 6.0, 0.5 - wz * wz / 24.0
-        else:
-            ja, jb, jf = s / wz, 2.0 * math.sin(0.5 * wz) ** 2 / wz, (wz - s) / (wz * wz)
-            jg = jb / wz
-        jx, jy = jf * vx - jg * vy, jg * vx + jf * vy
-        for j in range(m):
-            d0, d1, d2 = d[0, j], d[1, j], d[2, j]
-            e0, e1, e2 = by[i, 0, j] * h, by[i, 1, j] * h, by[i, 2, j] * h
-            d[0, j] = c * d0 + s * d1 + a * d2 + ja * e0 + jb * e1 + jx * e2
-            d[1, j] = -s * d0 + c * d1 + b * d2 - jb * e0 + ja * e1 + jy * e2
-            d[2, j] = d2 + e2
-
-        # Slip: variances that grow with what was driven and turned; nothing while standing still.
-        driven, turned = math.hypot(vx, vy), abs(wz)
+        # Slip: variances that grow with the distance driven and the angle turned; none at standstill.
+        driven, turned = math.hypot(way[0], way[1]), abs(way[2])
         if driven > 0.0 or turned > 0.0:
             floor_m, floor_rad = noise[6] * h, noise[7] * h
             cov[0, 0] += noise[0] * driven + noise[1] * turned + floor_m
             cov[1, 1] += noise[2] * driven + noise[3] * turned + floor_m
             cov[2, 2] += noise[4] * driven + noise[5] * turned + floor_rad
 
-        x0, y0, t0 = delta[0], delta[1], delta[2]
-        c0, s0 = math.cos(t0), math.sin(t0)
-        delta[0] = x0 + c0 * x - s0 * y
-        delta[1] = y0 + s0 * x + c0 * y
-        delta[2] = t0 + t
+        delta[0], delta[1] = scalar_transform(triple(delta), step[0], step[1])
+        delta[2] += step[2]  # not wrapped: it counts whole turns

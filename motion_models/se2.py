@@ -107,11 +107,11 @@ def _sinc_terms(theta: float) -> tuple[float, float]:
 
 
 @subroutine
-def _curl_terms(theta: float) -> tuple[float, float]:
-    """``(t - sin(t))/t^2`` and ``(1 - cos(t))/t^2``, smooth through t = 0."""
+def _curl_terms(theta: float, a: float, b: float) -> tuple[float, float]:
+    """``(t - sin(t))/t^2`` and ``(1 - cos(t))/t^2``, smooth through t = 0, by ``a, b`` of `_sinc_terms`."""
     if abs(theta) < _SMALL_ANGLE:
         return theta / 6.0, 0.5 - theta * theta / 24.0
-    return (theta - math.sin(theta)) / (theta * theta), _sinc_terms(theta)[1] / theta
+    return (1.0 - a) / theta, b / theta
 
 
 @subroutine
@@ -131,10 +131,17 @@ def scalar_log(p: Triple) -> Triple:
 
 
 @subroutine
+def scalar_transform(p: Triple, x: float, y: float) -> tuple[float, float]:
+    """`transform` of one point."""
+    c, s = math.cos(p[2]), math.sin(p[2])
+    return p[0] + c * x - s * y, p[1] + s * x + c * y
+
+
+@subroutine
 def scalar_compose(a: Triple, b: Triple) -> Triple:
     """`compose` of two poses."""
-    c, s = math.cos(a[2]), math.sin(a[2])
-    return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], scalar_wrap(a[2] + b[2])
+    x, y = scalar_transform(a, b[0], b[1])
+    return x, y, scalar_wrap(a[2] + b[2])
 
 
 @subroutine
@@ -160,10 +167,19 @@ def fill_adjoint(p: Triple, out: FloatArray) -> None:
 
 
 @subroutine
+def fill_inverse_adjoint(p: Triple, out: FloatArray) -> None:
+    """`adjoint` of the inverse of one pose into ``out`` (3, 3)."""
+    c, s = math.cos(p[2]), math.sin(p[2])
+    out[0, 0], out[0, 1], out[0, 2] = c, s, s * p[0] - c * p[1]
+    out[1, 0], out[1, 1], out[1, 2] = -s, c, c * p[0] + s * p[1]
+    out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
+
+
+@subroutine
 def fill_right_jacobian(v: Triple, out: FloatArray) -> None:
     """`right_jacobian` of one tangent vector into ``out`` (3, 3)."""
-    f, g = _curl_terms(v[2])
     a, b = _sinc_terms(v[2])
+    f, g = _curl_terms(v[2], a, b)
     out[0, 0], out[0, 1], out[0, 2] = a, b, f * v[0] - g * v[1]
     out[1, 0], out[1, 1], out[1, 2] = -b, a, g * v[0] + f * v[1]
     out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
@@ -172,8 +188,8 @@ def fill_right_jacobian(v: Triple, out: FloatArray) -> None:
 @subroutine
 def fill_right_jacobian_inverse(v: Triple, out: FloatArray) -> None:
     """`right_jacobian_inverse` of one tangent vector into ``out`` (3, 3)."""
-    f, g = _curl_terms(v[2])
     a, b = _sinc_terms(v[2])
+    f, g = _curl_terms(v[2], a, b)
     p, q = f * v[0] - g * v[1], g * v[0] + f * v[1]
     scale = 1.0 / (a * a + b * b)
     c, s = scale * a, scale * b
@@ -239,8 +255,7 @@ def between(world_T_a: ArrayLike, world_T_b: ArrayLike) -> FloatArray:
 
 @gufunc("(n),(m)->(m)")
 def _transform(p: FloatArray, q: FloatArray, out: FloatArray) -> None:
-    c, s = math.cos(p[2]), math.sin(p[2])
-    out[0], out[1] = p[0] + c * q[0] - s * q[1], p[1] + s * q[0] + c * q[1]
+    out[0], out[1] = scalar_transform(triple(p), q[0], q[1])
 
 
 def transform(a_T_b: ArrayLike, points_b: ArrayLike) -> FloatArray:

@@ -14,7 +14,7 @@ from motion_models import se2
 from motion_models.base import Twist
 from motion_models.calibration.maneuvers import Batch, IntArray
 from motion_models.compiled import kernel
-from motion_models.preintegration import _integrate, noise_vector
+from motion_models.preintegration import integrate, noise_vector
 from motion_models.robot import WheelNoise
 from motion_models.se2 import FloatArray
 
@@ -143,7 +143,7 @@ def _integrate_all(dt: FloatArray, twist: FloatArray, by: FloatArray, noise: Flo
         else:
             a = spans.ends[i - 1]
         b = spans.ends[i]
-        _integrate(dt[a:b], twist[a:b], by[a:b], noise, delta, cov, d)
+        integrate(dt[a:b], twist[a:b], by[a:b], noise, delta, cov, d)
         for j in range(3):  # by element: numba compiles an assignment of slices, with its messages, for seven seconds
             found.poses[i, j] = delta[j]
             for k in range(3):
