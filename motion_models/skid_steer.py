@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 
 from motion_models.base import Twist
-from motion_models.compiled import kernel
+from motion_models.compiled import kernel, subroutine
 from motion_models.prior import skid_prior
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
+_Number = TypeVar("_Number", float, FloatArray)
 YcrVariant = Literal["multivariate", "full", "symmetric"]
 
 # Ebersole 2016: 4.21 divided by its 1.875, 4.22; then y_CR as a polynomial in x_G (c) plus y_G times one (s).
@@ -38,7 +39,7 @@ class SkidSteer:
     x_CR = x_cr_0 + x_cr_1 x_G                                                         (4.22)
     y_CR = y_cr_0 + y_cr_1 x_G + y_cr_2 x_G^2 + (y_cr_s0 + y_cr_s1 x_G + y_cr_s2 x_G^2) y_G   (4.23-4.25)
 
-    The inverse takes two inputs, so the sideways speed is what it is: vy = -wz x_CR.
+    The inverse takes two inputs, vx and wz: vy = -wz x_CR follows and cannot be commanded.
     """
 
     wheel_radius: float
@@ -67,12 +68,7 @@ class SkidSteer:
 
     def rotation(self, cg: FloatArray, params: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """k [-], x_CR [m] and y_CR [m], each (...,), for ``cg`` (..., 2)."""
-        x, y = cg[..., 0], cg[..., 1]
-        k_0, k_1, k_2, x_cr_0, x_cr_1, c_0, c_1, c_2, s_0, s_1, s_2 = params
-        k = k_0 + (k_1 + k_2 * x) * x  # 4.21
-        x_cr = x_cr_0 + x_cr_1 * x  # 4.22
-        y_cr = c_0 + (c_1 + c_2 * x) * x + (s_0 + (s_1 + s_2 * x) * x) * y  # 4.23-4.25
-        return k, x_cr, y_cr
+        return _rotation(cg[..., 0], cg[..., 1], params)
 
     def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
         """See `MotionModel.twist`."""
@@ -88,6 +84,17 @@ class SkidSteer:
         return np.stack([forward - half, forward + half], axis=-1) / self.wheel_radius  # 4.17, 4.18
 
 
+@subroutine
+def _rotation(x: _Number, y: _Number, params: FloatArray) -> tuple[_Number, _Number, _Number]:
+    """k [-], x_CR [m] and y_CR [m] for the CG ``x, y``: numbers, or arrays of one shape."""
+    k_0, k_1, k_2, x_cr_0, x_cr_1 = params[0], params[1], params[2], params[3], params[4]
+    c_0, c_1, c_2, s_0, s_1, s_2 = params[5], params[6], params[7], params[8], params[9], params[10]
+    k = k_0 + (k_1 + k_2 * x) * x  # 4.21
+    x_cr = x_cr_0 + x_cr_1 * x  # 4.22
+    y_cr = c_0 + (c_1 + c_2 * x) * x + (s_0 + (s_1 + s_2 * x) * x) * y  # 4.23-4.25
+    return k, x_cr, y_cr
+
+
 @kernel
 def _twist(
     wheels: FloatArray,
@@ -101,13 +108,11 @@ def _twist(
 ) -> None:
     """See `Twist.from_kernel`; ``constants`` (2,) are the wheel radius and the track width."""
     r, d = constants[0], constants[1]
-    k_0, k_1, k_2, x_cr_0, x_cr_1 = params[0], params[1], params[2], params[3], params[4]
-    c_0, c_1, c_2, s_0, s_1, s_2 = params[5], params[6], params[7], params[8], params[9], params[10]
+    k_1, k_2, x_cr_1 = params[1], params[2], params[4]
+    c_1, c_2, s_0, s_1, s_2 = params[6], params[7], params[8], params[9], params[10]
     for i in range(wheels.shape[0]):
         q_l, q_r, x, y = wheels[i, 0], wheels[i, 1], cg[i, 0], cg[i, 1]
-        k = k_0 + (k_1 + k_2 * x) * x  # 4.21
-        x_cr = x_cr_0 + x_cr_1 * x  # 4.22
-        y_cr = c_0 + (c_1 + c_2 * x) * x + (s_0 + (s_1 + s_2 * x) * x) * y  # 4.23-4.25
+        k, x_cr, y_cr = _rotation(x, y, params)
         wz_per_k = r * (q_r - q_l) / d
         wz = k * wz_per_k  # 4.16
         value[i, 0] = r * (q_l + q_r) / 2.0 + wz * y_cr  # 4.14
