@@ -20,7 +20,7 @@ from localization.sensor_checks import SensorChecks
 from localization.synchronizer import StepConfig, Synchronizer
 from localization.trajectory import Trajectory
 from motion_models.base import MotionModel
-from motion_models.online_calibration import Form, correctable
+from motion_models.online_calibration import Form, add_correction_parameters
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
@@ -61,7 +61,7 @@ class Pipeline:
         self.is_localizing = trial.estimator in ESTIMATORS_WITH_MAP
         self.mounts = dict(mounts)
         """Known mounts by frame, shared with the synchronizer and the estimator."""
-        model = correctable(trial.model, trial.corrections) if trial.estimator in ESTIMATORS_WITH_CORRECTIONS else trial.model
+        model = add_correction_parameters(trial.model, trial.corrections) if trial.estimator in ESTIMATORS_WITH_CORRECTIONS else trial.model
         self.synchronizer = Synchronizer(model, robot, self.mounts, has_lidar, config.step)
         self.estimator: Estimator = make_estimator(
             trial.estimator, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing

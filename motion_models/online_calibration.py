@@ -1,7 +1,7 @@
-"""Which directions in a model's parameters an estimator may correct on the way, how far they may be off, and models with such parameters.
+"""Correction states: their directions in a model's parameters, prior and process noise; models with such parameters.
 
-What is corrected is named by a form: ``none``, ``constant``, ``cg_field``, or names of single corrections joined by ``+`` (where
-``constant`` may be one of them): ``mu_ratio+warp``, ``constant+cg_offset_x+cg_offset_y``.
+A form names them: ``none``, ``constant``, ``cg_field``, or names of single corrections joined by ``+`` (``constant`` may be one):
+``mu_ratio+warp``, ``constant+cg_offset_x+cg_offset_y``.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ from motion_models.se2 import FloatArray
 RADIUS_NAMES = ("wheel_radius_scale", "wheel_radius_difference")
 _N = len(FrictionModel.param_names)
 _MU_RATIO_INDEX = FrictionModel.param_names.index("mu_ratio")
-_LEAST_MU_RATIO = 0.05  # -; castors and free rollers
-_EDGE = 0.98  # of the way to where the robot tips over
+_MIN_MU_RATIO = 0.05  # -; castors and free rollers
+_MAX_CG = 0.98  # -; of half the wheelbase and half the track, where the robot tips over
 
 Form = str
 FORMS: tuple[Form, ...] = ("none", "constant", "cg_field")
 
-# How differently robots of one type turn on different floors and with other loads: relative for what scales a turn (Clearpath's own
-# multipliers for one Husky range from 1.5 to 1.9; terrains differ by a quarter), absolute [m] for where it turns about.
+# Prior sigmas, for robots of one type on different floors and with other loads: relative of the rotation scaling (Clearpath's own
+# multipliers for one Husky range from 1.5 to 1.9; terrains differ by a quarter), absolute of the centre of rotation [m].
 _TURNING, _CENTRE_X, _CENTRE_Y = 0.15, 0.05, 0.03
 _PRIOR_RETURNS_AFTER_S = 3600.0
-"""Time after which a correction's random walk has brought back its first standard deviation [s]: tyres and loads within an hour."""
+"""Time in which a correction's random walk grows to its prior standard deviation [s]: tyres and loads change within an hour."""
 _WARP = 0.15  # VaultBot's chassis, as its rotations show it, moves 13 % of m g / 4 to two opposite wheels
 _MU_RATIO = 0.3
 _RADIUS_SCALE, _RADIUS_DIFFERENCE = 0.03, 0.01
 """Relative, of all radii and of left against right: pneumatic tyres lose 3 % under load; unequal wheels of up to 1 % are Borenstein's and
 Feng's main systematic odometry error ("Measurement and correction of systematic odometry errors", IEEE T-RA 12(6), 1996; from memory)."""
 _LATERAL_SLIP_S, _ROTATION_SLIP_S_PER_M = 0.05, 0.01
-"""Where the robot gives no other (`motion_models.prior.slip_at_speed`: 0.02 to 0.09 s, and under 0.01 s/m)."""
+"""Without the robot's own prior (`motion_models.prior.slip_at_speed`: 0.02 to 0.09 s, and under 0.01 s/m)."""
 
-# Least turn with information, as track over radius. On gentler arcs tyres creep, which rotations in place do not cover; the friction
-# model does, but where a robot drives straight the two sides differ by their noise alone, and that would pass for information.
+# `Corrections.min_track_over_radius`. On gentler arcs tyres creep, which regressions of rotations in place do not cover. The friction
+# model covers it; but on straight motion the two sides differ by noise alone, which would be taken for information.
 _IN_PLACE, _NOT_STRAIGHT = 0.25, 0.02
 
-# The rotations of Ebersole 2016, Ch. 4, to which the coefficients of `SkidSteer` were fitted: where the CG was, and the scatter about the
-# fits of k, x_CR and y_CR (`regressions.skid_steer_fit`). The covariance of the fits needs no more.
+# The rotations of Ebersole 2016, Ch. 4, to which the coefficients of `SkidSteer` were fitted: positions of the CG [m], and the scatter
+# about the fits of k [-], x_CR and y_CR [m] (`regressions.skid_steer_fit`). They give the covariance of the fits.
 _GRID_X, _GRID_Y = np.arange(-3, 7) * 0.02, np.arange(-3, 4) * 0.01
 _SCATTER_K, _SCATTER_X_CR, _SCATTER_Y_CR = 0.014517, 0.011514, 0.0059057
 
@@ -63,29 +63,29 @@ class Correction:
 
     name: str
     sigma: float
-    """How far it may be off at first, in its own unit."""
+    """Prior standard deviation, in its own unit."""
     along: Mapping[str, float]
     """Change of each parameter per unit of the correction."""
 
 
 @dataclass(frozen=True)
 class Corrections:
-    """The corrections of one model: parameters = nominal + directions @ values, the values a random walk that begins at 0."""
+    """The corrections of one model: parameters = nominal + directions @ values, the values a random walk from 0."""
 
     names: tuple[str, ...]
     """(k,)"""
     directions: FloatArray
     """(n, k) by the model's n parameters."""
     cov: FloatArray
-    """(k, k) at first."""
-    walk_cov: FloatArray
-    """(k, k) process noise: growth per second of motion; it may be singular."""
-    least_turn: float = 0.0
-    """Track over radius below which a motion has no information on the corrections."""
+    """(k, k) prior."""
+    process_noise: FloatArray
+    """(k, k) covariance per second of motion; it may be singular."""
+    min_track_over_radius: float = 0.0
+    """Track over turning radius below which a motion does not excite the corrections."""
 
     @property
     def sigmas(self) -> FloatArray:
-        """(k,) at first."""
+        """(k,) prior standard deviations."""
         return np.asarray(np.sqrt(np.diagonal(self.cov)))
 
 
@@ -100,21 +100,21 @@ def check_forms(names: Sequence[str]) -> list[Form]:
     return list(dict.fromkeys(names))
 
 
-def correctable(model: MotionModel, form: Form) -> MotionModel:
-    """``model`` with all parameters that corrections of ``form`` may change: the friction model's CG, any model's wheel radii."""
+def add_correction_parameters(model: MotionModel, form: Form) -> MotionModel:
+    """``model`` with the parameters that corrections of ``form`` need besides its own: the friction model's CG, the wheels' radii."""
     corrected: MotionModel = CorrectedFriction(model) if isinstance(model, FrictionModel) and form != "none" else model
     return CorrectedWheels(corrected) if set(form.split("+")) & set(RADIUS_NAMES) else corrected
 
 
-def corrections(model: MotionModel, form: Form) -> Corrections:
-    """The corrections of ``form`` to ``model``: none, ``constant``, ``cg_field``, or names joined by ``+``.
+def make_corrections(model: MotionModel, form: Form) -> Corrections:
+    """The corrections of ``form`` to ``model``: ``none``, ``constant``, ``cg_field``, or names joined by ``+``.
 
-    ``constant``: rotation scaling and centre of rotation as numbers that slowly change. ``cg_field``: the coefficients of their regressions
-    on the CG; for the friction model, whose field is its physics, the chassis' warp besides; a model without such regressions has nothing
-    but its constants. Raises `ModelError` for a form that does not exist, or not for this model.
+    ``constant``: rotation scaling and centre of rotation, or the friction model's mu_ratio and tracked point. ``cg_field``: of skid_steer
+    all coefficients of the regressions on the CG; of friction, ``constant`` and the warp; of the others, ``constant``. Raises
+    `ModelError` for a form that does not exist, or not for this model.
 
     >>> from motion_models import load_robot, make_model
-    >>> found = corrections(make_model("skid_steer", load_robot("vaultbot")), "constant")
+    >>> found = make_corrections(make_model("skid_steer", load_robot("vaultbot")), "constant")
     >>> dict(zip(found.names, found.sigmas.round(3).tolist()))
     {'k_0': 0.076, 'x_cr_0': 0.05, 'y_cr_0': 0.03}
     """
@@ -127,14 +127,14 @@ def corrections(model: MotionModel, form: Form) -> Corrections:
         for name, rate in correction.along.items():
             directions[model.param_names.index(name), column] = rate
     sigmas = np.array([c.sigma for c in found])
-    walks = sigmas / np.sqrt(_PRIOR_RETURNS_AFTER_S)  # after an hour the first uncertainty has come back once more
     has_radii = any(c.name in RADIUS_NAMES for c in found)  # observed where the robot drives straight
-    least = 0.0 if has_radii else {"skid_steer": _IN_PLACE, "friction": _NOT_STRAIGHT}.get(model.name, 0.0)
-    return Corrections(tuple(c.name for c in found), directions, np.diag(sigmas**2), np.diag(walks**2), least)
+    minimum = 0.0 if has_radii else {"skid_steer": _IN_PLACE, "friction": _NOT_STRAIGHT}.get(model.name, 0.0)
+    prior = np.diag(sigmas**2)
+    return Corrections(tuple(c.name for c in found), directions, prior, prior / _PRIOR_RETURNS_AFTER_S, minimum)
 
 
 def _named(model: MotionModel, form: Form) -> tuple[Correction, ...]:
-    """The single corrections that ``form`` stands for."""
+    """The single corrections of ``form``."""
     available = {c.name: c for c in _singles(model)}
     constant = [name for name in available if name not in _ONLY_BY_NAME]
     whole = {"none": [], "constant": constant, "cg_field": [*constant, *(["warp"] if "warp" in available else [])]}
@@ -143,34 +143,31 @@ def _named(model: MotionModel, form: Form) -> tuple[Correction, ...]:
         if name not in available:
             raise ModelError(f"no correction '{name}' of {model.name}; there are {', '.join(available) or 'none'}.")
         if absent := [p for p in available[name].along if p not in model.param_names]:
-            raise ModelError(f"{model.name} has no parameter '{absent[0]}' as it is: pass it through `correctable` first.")
+            raise ModelError(f"{model.name} has no parameter '{absent[0]}' as it is: pass it through `add_correction_parameters` first.")
     return tuple(available[name] for name in dict.fromkeys(names))
 
 
-def regression_cov(with_misfit: bool = False) -> FloatArray:
-    """(11, 11) covariance of the coefficients of `SkidSteer` as the thesis's rotations give them: s^2 (X^T X)^-1 for each regression.
+def _regression_cov() -> FloatArray:
+    """(11, 11) covariance of the coefficients of `SkidSteer` by the thesis's rotations: s^2 (X^T X)^-1 n / p for each regression.
 
-    It is `regressions.skid_steer_fit(table).cov` of its table, of which only the grid of CGs and the scatter are needed.
-
-    ``with_misfit``: the scatter is no noise that more rotations would average out. A posture lies off the regression by so much, and
-    stays there; so each block grows by samples over coefficients, until on the mean over the grid a posture's value has that scatter.
+    A CG position is off its regression by the scatter s systematically, not by noise that more rotations average out. The n samples over
+    p coefficients give predictions that variance s^2, on the mean over the grid.
     """
     x, y = (a.ravel() for a in np.meshgrid(_GRID_X, _GRID_Y))
-    reached = ~((x > 0.11) & (np.abs(y) > 0.025))  # the arms did not reach the two outermost corners
+    reached = ~((x > 0.11) & (np.abs(y) > 0.025))  # without the two front corners, which the arms did not reach
     x, y = x[reached], y[reached]
     powers = np.stack([np.ones_like(x), x, x**2], axis=-1)
     designs = (_SCATTER_K, powers), (_SCATTER_X_CR, powers[:, :2]), (_SCATTER_Y_CR, np.hstack([powers, powers * y[:, None]]))
     cov, at = np.zeros((11, 11)), 0
     for scatter, design in designs:
         own = slice(at, at + design.shape[1])
-        misfit = len(x) / design.shape[1] if with_misfit else 1.0
-        cov[own, own] = misfit * scatter**2 * np.linalg.inv(design.T @ design)
+        cov[own, own] = len(x) / design.shape[1] * scatter**2 * np.linalg.inv(design.T @ design)
         at = own.stop
     return cov
 
 
 def _regressions(model: MotionModel) -> Corrections:
-    """Every coefficient on its own: what the rotations left open stays learned, what floors and loads change may change again."""
+    """Every coefficient on its own. Process noise is that of floors and loads alone: the misfit of the regressions does not change."""
     n = len(model.param_names)
     floor = np.zeros((n, 3))
     sigma_k = float(getattr(model, "sigmas", np.zeros(n))[0])
@@ -178,7 +175,7 @@ def _regressions(model: MotionModel) -> Corrections:
     floor[0:3, 0] = turning * model.nominal[0:3]  # another floor scales k at every CG
     floor[3, 1], floor[5, 2] = _CENTRE_X, _CENTRE_Y
     spread = floor @ floor.T
-    return Corrections(model.param_names, np.eye(n), regression_cov(with_misfit=True) + spread, spread / _PRIOR_RETURNS_AFTER_S, _IN_PLACE)
+    return Corrections(model.param_names, np.eye(n), _regression_cov() + spread, spread / _PRIOR_RETURNS_AFTER_S, _IN_PLACE)
 
 
 def _singles(model: MotionModel) -> tuple[Correction, ...]:
@@ -190,7 +187,6 @@ def _singles(model: MotionModel) -> tuple[Correction, ...]:
 def _own_singles(model: MotionModel) -> tuple[Correction, ...]:
     """Rotation scaling, the centre of rotation where the model has one; for the friction model its physics."""
     of = dict(zip(model.param_names, model.nominal, strict=True))
-
     uncalibrated = dict(zip(model.param_names, getattr(model, "sigmas", np.zeros(0)), strict=False))
 
     def own(name: str, sigma: float) -> Correction:
@@ -204,7 +200,7 @@ def _own_singles(model: MotionModel) -> tuple[Correction, ...]:
     if model.name == "icr":
         return own("y_icr_left", _TURNING * of["y_icr_left"]), own("y_icr_right", _TURNING * of["y_icr_left"]), own("x_icr", _CENTRE_X)
     if model.name == "full_linear":
-        # both columns by one factor: corrected apart they would turn a robot that drives straight, and pass for the gyro's bias
+        # both columns by one factor: separate ones would turn a robot that drives straight, as a gyro bias does
         turning = {name: of[name] for name in ("wz_left", "wz_right")}
         sideways = {name: -of["wz_" + name[3:]] for name in ("vy_left", "vy_right")}
         at_speed = own("lateral_slip_speed", _LATERAL_SLIP_S), own("rotation_slip_speed", _ROTATION_SLIP_S_PER_M)
@@ -247,7 +243,7 @@ class CorrectedWheels:
 
     @classmethod
     def from_robot(cls, robot: Robot) -> CorrectedWheels:
-        """Not of a robot alone: it wraps a model."""
+        """Raises `NotImplementedError`: it wraps a model, which a robot file does not name."""
         raise NotImplementedError("wrap the model of the robot: CorrectedWheels(make_model(name, robot)).")
 
     def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
@@ -273,9 +269,9 @@ class CorrectedWheels:
 
 @dataclass(frozen=True)
 class CorrectedFriction:
-    """`FrictionModel` with two more parameters, cg_offset_x and cg_offset_y [m]: how far the CG is from where it is given.
+    """`FrictionModel` with two more parameters, cg_offset_x and cg_offset_y [m]: the true CG less the given one.
 
-    An estimate may move to where no robot is: it is held at the edge, where its derivative is zero.
+    Values outside the valid range (CG beyond the wheels, mu_ratio < 0.05) are clipped; their derivative is zero.
     """
 
     inner: FrictionModel
@@ -284,7 +280,7 @@ class CorrectedFriction:
 
     @classmethod
     def from_robot(cls, robot: Robot) -> CorrectedFriction:
-        """`FrictionModel.from_robot`, the CG where it is given."""
+        """`FrictionModel.from_robot` with offsets 0."""
         return cls(FrictionModel.from_robot(robot))
 
     @property
@@ -294,25 +290,25 @@ class CorrectedFriction:
 
     def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
         """See `FrictionModel.twist`."""
-        held, shifted, is_free = _held(cg, params)
-        found = self.inner.twist(wheels, shifted, held)
+        clipped, shifted, is_free = _clip_to_valid(cg, params)
+        found = self.inner.twist(wheels, shifted, clipped)
         d_cg = found.d_cg * is_free[..., None, :]
         d_params = np.concatenate([found.d_params, d_cg], axis=-1)
-        if held[_MU_RATIO_INDEX] != params[_MU_RATIO_INDEX]:
+        if clipped[_MU_RATIO_INDEX] != params[_MU_RATIO_INDEX]:
             d_params[..., _MU_RATIO_INDEX] = 0.0
         return Twist(found.value, found.d_wheels, d_cg, d_params)
 
     def wheels(self, command: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
         """See `FrictionModel.wheels`."""
-        held, shifted, _ = _held(cg, params)
-        return self.inner.wheels(command, shifted, held)
+        clipped, shifted, _ = _clip_to_valid(cg, params)
+        return self.inner.wheels(command, shifted, clipped)
 
 
-def _held(cg: FloatArray, params: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Parameters (12,) and CG (..., 2) that a robot can have, and 1 where the CG (..., 2) is free to move, else 0."""
-    held = params[:_N].copy()
-    held[_MU_RATIO_INDEX] = max(held[_MU_RATIO_INDEX], _LEAST_MU_RATIO)
-    check_parameters(cg, held)
-    edge = 0.5 * _EDGE * held[[2, 1]]
+def _clip_to_valid(cg: FloatArray, params: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Parameters (12,) and CG (..., 2) within their valid ranges, and 1 where the CG (..., 2) is not clipped, else 0."""
+    clipped = params[:_N].copy()
+    clipped[_MU_RATIO_INDEX] = max(clipped[_MU_RATIO_INDEX], _MIN_MU_RATIO)
+    check_parameters(cg, clipped)
+    edge = 0.5 * _MAX_CG * clipped[[2, 1]]
     moved = cg + params[_N:]
-    return held, np.clip(moved, -edge, edge), (np.abs(moved) < edge).astype(float)
+    return clipped, np.clip(moved, -edge, edge), (np.abs(moved) < edge).astype(float)

@@ -13,7 +13,7 @@ from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.lidar import LidarConfig, ScanMatchingSensor
 from motion_models.base import MotionModel
-from motion_models.online_calibration import Form, corrections
+from motion_models.online_calibration import Form, make_corrections
 from motion_models.robot import Mount, Robot
 
 __all__ = [
@@ -72,6 +72,6 @@ def make_estimator(
         return DeadReckoning()
     if name == "lidar":
         return LidarOdometry(mounts, config.lidar)
-    corrected, sensor = corrections(model, form), ScanMatchingSensor(mounts, config.lidar) if has_lidar else None
+    corrected, sensor = make_corrections(model, form), ScanMatchingSensor(mounts, config.lidar) if has_lidar else None
     ekf = EkfFusion(model, corrected, robot, sensor, config.ekf)
     return ekf if name == "ekf" else GraphFusion(ekf, corrected, config.lidar, config.graph, is_smoothing)

@@ -103,7 +103,7 @@ class Filter:
             c = self._config
             Q[POSE, POSE] += np.diag([c.standstill_m2_per_s, c.standstill_m2_per_s, c.standstill_rad2_per_s]) * dt
         else:
-            Q[PARAMS:, PARAMS:] = self._corrections.walk_cov * dt
+            Q[PARAMS:, PARAMS:] = self._corrections.process_noise * dt
         _, P = predict_linear(np.zeros(len(F)), self.P, F=F, Q=Q)  # P = F P F^T + Q
         pose = se2.compose(self.pose, motion.delta)
         _check(f"the motion of the wheels until stamp {step.end_ns} ns", pose, P)

@@ -122,7 +122,7 @@ class EkfFusion(Estimator):
     def _is_turning(self, motion: Motion) -> bool:
         """Whether ``motion`` turns enough to excite the corrections."""
         d = motion.delta
-        return bool(abs(d[2]) * self._track_m >= self.corrections.least_turn * math.hypot(d[0], d[1]))
+        return bool(abs(d[2]) * self._track_m >= self.corrections.min_track_over_radius * math.hypot(d[0], d[1]))
 
     def _start_gyro(self) -> None:
         """With the gyro's first reading there is a second clock, from which the wheels' may be off."""

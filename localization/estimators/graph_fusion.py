@@ -157,7 +157,7 @@ class GraphFusion(Estimator):
         """(c, c) by which the corrections may have changed, once a minute; None meanwhile."""
         if self._moving_s < _CORRECTION_EPOCH_S:
             return None
-        cov = block_diag(self._corrections.walk_cov * self._moving_s, 0.0)
+        cov = block_diag(self._corrections.process_noise * self._moving_s, 0.0)
         self._moving_s = 0.0
         return np.asarray(cov + _CONSTANT_SIGMA**2 * np.eye(len(cov)))
 

@@ -17,7 +17,7 @@ from motion_models import se2
 from motion_models.base import Motion
 from motion_models.errors import CgError, ModelError
 from motion_models.friction import FrictionModel
-from motion_models.online_calibration import CorrectedFriction, check_forms, correctable, corrections
+from motion_models.online_calibration import CorrectedFriction, add_correction_parameters, check_forms, make_corrections
 from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import WheelNoise, load_robot
@@ -126,14 +126,14 @@ def test_measured_cg_outside_wheels_is_refused():
 
 
 def test_corrections_by_name_keep_their_order():
-    model = correctable(make_model("friction", ROBOT), ALL)
-    assert corrections(model, "constant").names == ("mu_ratio", "tracked_x", "tracked_y")
-    assert corrections(model, ALL).names == ("mu_ratio", "tracked_x", "tracked_y", "warp", "cg_offset_x", "cg_offset_y")
-    assert corrections(model, "warp+mu_ratio+warp").names == ("warp", "mu_ratio")
-    found = corrections(model, "cg_offset_y")
+    model = add_correction_parameters(make_model("friction", ROBOT), ALL)
+    assert make_corrections(model, "constant").names == ("mu_ratio", "tracked_x", "tracked_y")
+    assert make_corrections(model, ALL).names == ("mu_ratio", "tracked_x", "tracked_y", "warp", "cg_offset_x", "cg_offset_y")
+    assert make_corrections(model, "warp+mu_ratio+warp").names == ("warp", "mu_ratio")
+    found = make_corrections(model, "cg_offset_y")
     np.testing.assert_array_equal(found.directions.nonzero()[0], [model.param_names.index("cg_offset_y")])
-    assert corrections(make_model("skid_steer", ROBOT), "x_cr_0").names == ("x_cr_0",)
-    assert not corrections(model, "none").names
+    assert make_corrections(make_model("skid_steer", ROBOT), "x_cr_0").names == ("x_cr_0",)
+    assert not make_corrections(model, "none").names
     assert check_forms(["constant", OFFSET, "constant"]) == ["constant", OFFSET]
 
 
@@ -145,9 +145,9 @@ def test_corrections_of_unknown_form_are_refused(form):
 
 def test_corrections_of_missing_parameter_are_refused():
     with pytest.raises(ModelError, match="wheel_separation_multiplier"):
-        corrections(make_model("diff_drive", ROBOT), "warp")
-    with pytest.raises(ModelError, match="correctable"):
-        corrections(make_model("friction", ROBOT), "cg_offset_x")
+        make_corrections(make_model("diff_drive", ROBOT), "warp")
+    with pytest.raises(ModelError, match="add_correction_parameters"):
+        make_corrections(make_model("friction", ROBOT), "cg_offset_x")
     with pytest.raises(ModelError, match="warp"):
         Pipeline(Trial(make_model("icr", ROBOT), "ekf", "warp"), ROBOT, {}, True)
 
@@ -165,7 +165,7 @@ def test_pipeline_gives_synchronizer_the_filters_parameters():
 
 
 def make_physical(sensor, form, noise):
-    return make_filter(sensor, correctable(make_model("friction", ROBOT), form), form, noise, robot=ROBOT)
+    return make_filter(sensor, add_correction_parameters(make_model("friction", ROBOT), form), form, noise, robot=ROBOT)
 
 
 def learned(form, hidden, seed, wheels=weave, steps=150):
@@ -321,7 +321,7 @@ def round_trip(form, seed):
     """
     sensor, quiet = PoseSensor(), Noise().scaled(0.3)
     estimator = make_filter(sensor, "skid_steer", form, quiet)
-    model, field = estimator.model, corrections(estimator.model, "cg_field")
+    model, field = estimator.model, make_corrections(estimator.model, "cg_field")
     world = World(model, field, quiet, np.random.default_rng(seed), True, FilterConfig(), cg=posture)
     odometry, start, drifts, scalings = np.zeros(3), np.zeros(3), [], []
     estimator.step(world.first())

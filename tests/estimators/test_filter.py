@@ -24,7 +24,7 @@ from localization.lidar import KeyScanError
 from localization.synchronizer import Synchronizer
 from motion_models import se2
 from motion_models.base import Motion
-from motion_models.online_calibration import corrections
+from motion_models.online_calibration import make_corrections
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
 from tests.helpers import bags
@@ -34,7 +34,7 @@ S, T0 = bags.S, bags.START
 ROBOT = load_robot("vaultbot")
 GYRO = ROBOT.gyro_noise
 MODEL = make_model("skid_steer", ROBOT)
-CORRECTED = corrections(MODEL, "constant")
+CORRECTED = make_corrections(MODEL, "constant")
 LIDAR = np.diag([0.004, 0.006, 0.002]) ** 2
 
 
@@ -123,7 +123,7 @@ def test_predict_propagates_covariance_by_motion_derivatives():
         expected = F @ P0 @ F.T
         expected[POSE, POSE] += nominal.predicted.cov
         expected[BIAS, BIAS] += GYRO.bias_walk_rad_per_s_sqrt_s**2 * nominal.duration
-        expected[PARAMS:, PARAMS:] += CORRECTED.walk_cov * nominal.duration
+        expected[PARAMS:, PARAMS:] += CORRECTED.process_noise * nominal.duration
         np.testing.assert_allclose(ekf.P, expected, rtol=2e-4, atol=2e-4)
         np.testing.assert_allclose(ekf.pose, se2.compose(pose, nominal.predicted.delta))
         np.testing.assert_array_equal(ekf.start, pose)
@@ -418,7 +418,7 @@ class World:
             before, pose = pose, se2.compose(pose, se2.compose(step.predicted.delta, se2.exp(off + slip)))
             bias += GYRO.bias_walk_rad_per_s_sqrt_s * math.sqrt(dt) * rng.normal()
             clock += config.clock_walk_s_per_sqrt_s * math.sqrt(dt) * rng.normal()
-            params = params + np.sqrt(np.diag(CORRECTED.walk_cov) * dt) * rng.normal(size=len(params))
+            params = params + np.sqrt(np.diag(CORRECTED.process_noise) * dt) * rng.normal(size=len(params))
             ekf.predict(step)
             angle = float(se2.between(before, pose)[2])
             variance = GYRO.white_rad_per_sqrt_s**2 * dt

@@ -23,7 +23,7 @@ from localization.simulation import world
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion
-from motion_models.online_calibration import correctable, corrections
+from motion_models.online_calibration import add_correction_parameters, make_corrections
 from motion_models.registry import make_model
 from motion_models.robot import WheelNoise
 from tests.helpers import rooms
@@ -203,8 +203,8 @@ def test_graph_predicts_with_the_corrections_that_its_filter_has() -> None:
 
 def test_keyframe_motion_is_that_of_one_set_of_corrections() -> None:
     """Ten steps predicted while corrections are learned equal ten that were predicted with those at the end."""
-    model = correctable(make_model("diff_drive", rooms.ROBOT), "constant")
-    correct, rates, no_cg = corrections(model, "constant"), np.array([1.0, 3.0]), np.zeros(2)
+    model = add_correction_parameters(make_model("diff_drive", rooms.ROBOT), "constant")
+    correct, rates, no_cg = make_corrections(model, "constant"), np.array([1.0, 3.0]), np.zeros(2)
     final = 0.2 * np.ones(len(correct.names))
 
     def motion(at: np.ndarray) -> Motion:
@@ -375,7 +375,7 @@ def test_smoothed_after_the_lidars_end_is_as_uncertain_as_the_filter() -> None:
 def test_keyframe_motion_derivative_by_radius_is_numeric(x: float, y: float, yaw: float) -> None:
     """Ways scale, turns do not."""
     motion, h = _KeyframeMotion(0), 1e-6
-    none = corrections(make_model("diff_drive", rooms.ROBOT), "none")
+    none = make_corrections(make_model("diff_drive", rooms.ROBOT), "none")
     delta = np.array([x, y, yaw])
     motion.add(Motion(delta, 1e-6 * np.eye(3), np.zeros((3, 0))), none, True, np.zeros(0))
     more, less = (delta * [1.0 + step, 1.0 + step, 1.0] for step in (h, -h))

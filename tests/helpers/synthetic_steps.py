@@ -18,7 +18,7 @@ from localization.events import Scan, Step, Turn
 from localization.lidar import LostScans, ScanMatch
 from motion_models import se2
 from motion_models.base import Motion
-from motion_models.online_calibration import Corrections, corrections
+from motion_models.online_calibration import Corrections, make_corrections
 from motion_models.preintegration import integrate_twists
 from motion_models.registry import make_model
 from motion_models.robot import GyroNoise, Robot, WheelNoise, load_robot
@@ -112,7 +112,7 @@ class World:
         self.belief, self.scale = belief, rng.normal(0.0, noise.gyro.scale_sigma)
         k = len(corrected.names)
         self.correction = rng.multivariate_normal(np.zeros(k), corrected.cov) if k else np.zeros(0)
-        self._walk = np.linalg.cholesky(corrected.walk_cov + 1e-18 * np.eye(k))
+        self._walk = np.linalg.cholesky(corrected.process_noise + 1e-18 * np.eye(k))
 
     @property
     def slow(self) -> np.ndarray:
@@ -195,7 +195,7 @@ def make_filter(
     noise = noise or Noise()
     robot = replace(robot or load_robot("husky_a200"), wheel_noise=noise.wheels, gyro_noise=noise.gyro)
     made = make_model(model, robot) if isinstance(model, str) else model
-    return EkfFusion(made, corrections(made, form), robot, sensor if has_lidar else None, FilterConfig())
+    return EkfFusion(made, make_corrections(made, form), robot, sensor if has_lidar else None, FilterConfig())
 
 
 def make_world(estimator, seed, noise=None, has_lidar=True, wheels=weave, **more) -> World:

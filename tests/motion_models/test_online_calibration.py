@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from motion_models.errors import ModelError
-from motion_models.online_calibration import RADIUS_NAMES, CorrectedWheels, correctable, corrections
+from motion_models.online_calibration import RADIUS_NAMES, CorrectedWheels, add_correction_parameters, make_corrections
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import load_robot
 
@@ -49,16 +49,16 @@ def test_corrected_wheels_difference_turns_a_robot_that_drives_straight() -> Non
 @pytest.mark.parametrize("name", list(MODELS))
 def test_corrections_by_wheel_radius_difference_exist_for_every_model(name: str) -> None:
     form = "constant+wheel_radius_difference"
-    model = correctable(make_model(name, ROBOT), form)
-    found = corrections(model, form)
+    model = add_correction_parameters(make_model(name, ROBOT), form)
+    found = make_corrections(model, form)
     assert found.names[-1] == "wheel_radius_difference"
     assert found.sigmas[-1] == pytest.approx(0.01)
     assert found.directions[model.param_names.index("wheel_radius_difference"), -1] == 1.0
-    assert found.least_turn == 0.0
+    assert found.min_track_over_radius == 0.0
 
 
 def test_corrections_of_constant_leave_the_radii_out() -> None:
-    model = correctable(make_model("skid_steer", ROBOT), "constant")
-    assert not set(RADIUS_NAMES) & set(corrections(model, "constant").names)
-    with pytest.raises(ModelError, match="correctable"):
-        corrections(model, "wheel_radius_scale")
+    model = add_correction_parameters(make_model("skid_steer", ROBOT), "constant")
+    assert not set(RADIUS_NAMES) & set(make_corrections(model, "constant").names)
+    with pytest.raises(ModelError, match="add_correction_parameters"):
+        make_corrections(model, "wheel_radius_scale")

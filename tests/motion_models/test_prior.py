@@ -11,7 +11,7 @@ import pytest
 from motion_models.calibration.fit import FitConfig
 from motion_models.calibration.plan import calibrate, free_of
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
-from motion_models.online_calibration import corrections
+from motion_models.online_calibration import make_corrections
 from motion_models.prior import EVIDENCE, geometric_scaling, prior_notes, scaling_sigma, skid_prior, slip_at_speed
 from motion_models.registry import make_model
 from motion_models.robot import Driver, Geometry, Robot, load_robot, parse_robot, robot_names
@@ -81,17 +81,17 @@ def test_icr_without_coefficients_turns_as_skid_steer_does() -> None:
 
 def test_corrections_of_an_uncalibrated_robot_start_at_its_prior() -> None:
     robot = parse_robot(BARE, "bare.toml")
-    found = dict(zip((c := corrections(make_model("skid_steer", robot), "constant")).names, c.sigmas, strict=True))
+    found = dict(zip((c := make_corrections(make_model("skid_steer", robot), "constant")).names, c.sigmas, strict=True))
     prior = skid_prior(robot)
     assert found["k_0"] == pytest.approx(prior.sigmas[0])
     assert found["x_cr_0"] == pytest.approx(0.1 * robot.geometry.wheelbase_m)
-    icr = corrections(make_model("icr", robot), "constant")
+    icr = make_corrections(make_model("icr", robot), "constant")
     assert icr.sigmas[0] / make_model("icr", robot).nominal[0] == pytest.approx(scaling_sigma())
 
 
 def test_corrections_of_slip_at_speed_have_centripetal_size() -> None:
     robot = load_robot("husky_a200")
-    found = corrections(make_model("full_linear", robot), "lateral_slip_speed+rotation_slip_speed")
+    found = make_corrections(make_model("full_linear", robot), "lateral_slip_speed+rotation_slip_speed")
     np.testing.assert_allclose(found.sigmas, np.abs(slip_at_speed(robot)))
     assert 0.005 < found.sigmas[0] < 0.2
 

@@ -40,7 +40,7 @@ from localization.simulation.simulator import SimulationConfig, simulate, write_
 from localization.synchronizer import Synchronizer
 from localization.trajectory import Trajectory
 from motion_models import se2
-from motion_models.online_calibration import Form, correctable, corrections
+from motion_models.online_calibration import Form, add_correction_parameters, make_corrections
 from motion_models.registry import make_model
 from motion_models.robot import Mount, load_robot
 from motion_models.se2 import FloatArray
@@ -99,8 +99,8 @@ def laps(seed: int = 0, count: int = 2 * POSTURES, effects: Mapping[str, float] 
 def drift(drive: Laps, model_name: str, form: Form, kind: str = "ekf", seed: int = 0) -> Drift:
     """Odometry with the parameters that the estimator ``kind`` learns with corrections of ``form``."""
     robot, sensor, rng = load_robot("vaultbot"), PoseSensor(), np.random.default_rng(seed)
-    model = correctable(make_model(model_name, robot), form)
-    corrected = corrections(model, form)
+    model = add_correction_parameters(make_model(model_name, robot), form)
+    corrected = make_corrections(model, form)
     ekf = EkfFusion(model, corrected, robot, sensor, FilterConfig())
     estimator = ekf if kind == "ekf" else GraphFusion(ekf, corrected, LidarConfig(), GraphConfig(), is_smoothing=False)
     stepper, truth = Synchronizer(model, robot, drive.mounts, True), Trajectory(drive.truth.stamps_ns, drive.truth.poses)
