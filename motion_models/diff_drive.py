@@ -1,4 +1,4 @@
-"""Diff-drive: the baseline that today's drivers use for skid-steer robots too, with one hand-tuned multiplier."""
+"""Diff-drive: the model of common drivers, for skid-steer robots too, with one hand-tuned multiplier; the baseline."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class DiffDrive:
         vx, wz = np.moveaxis(np.broadcast_arrays(command, cg)[0], -1, 0)
         r, multiplier = params
         half = wz * multiplier * self.track_width / 2.0
-        return np.asarray(np.stack([vx - half, vx + half], axis=-1) / r)
+        return np.asarray(np.stack([vx - half, vx + half], axis=-1) / r)  # 1.4, 1.5
 
 
 @kernel
@@ -65,8 +65,8 @@ def _twist(
     for i in range(wheels.shape[0]):
         q_l, q_r = wheels[i, 0], wheels[i, 1]
         wz = turn * (q_r - q_l)  # 1.8
-        value[i, 0] = r * (q_l + q_r) / 2.0  # 1.4, 1.6
-        value[i, 2] = wz  # and 1.7: vy = 0
+        value[i, 0] = r * (q_l + q_r) / 2.0  # 1.6
+        value[i, 2] = wz  # vy = 0 by 1.7
 
         d_wheels[i, 0, 0] = d_wheels[i, 0, 1] = r / 2.0
         d_wheels[i, 2, 0], d_wheels[i, 2, 1] = -turn, turn

@@ -161,7 +161,7 @@ def _without(chain: Chain, load: FloatArray) -> FloatArray:
 def _poses_at(chain: Chain, posture: Mapping[str, float] | None) -> FloatArray:
     if posture is None:
         return np.empty((0, 3, 4))
-    # A joint that matters only since there is a payload stood wherever it stood.
+    # A joint that only the payload makes matter may have stood anywhere: it moved no mass.
     q = np.array([posture.get(name, 0.0) for name in chain.joint_names])
     rotations, translations = np.empty((len(chain.layout), 3, 3)), np.empty((len(chain.layout), 3))
     forward(chain.layout, chain.constants, q, rotations, translations)
@@ -289,7 +289,7 @@ class CgTracker:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Joints that no message has had yet."""
+        """Joints without a position so far."""
         return tuple(name for name, q in zip(self.model.chain.joint_names, self._positions, strict=True) if np.isnan(q))
 
     def update(self, names: Sequence[str], positions: ArrayLike) -> CgEstimate | None:
@@ -321,14 +321,6 @@ class CgTracker:
             return None
         return self.model.estimate(self._positions)
 
-    def require_all(self) -> None:
-        """Raises `CgError` where joints are `missing`; for the end of a log that gave no centre of gravity."""
-        if self.missing:
-            raise CgError(
-                f"the joint states never had {', '.join(self.missing)}, which the centre of gravity needs ({self.model.chain.source}); "
-                "name the arms' joints as the log does, or give the centre of gravity by topic."
-            )
-
 
 def parse_postures(text: str, source: str) -> dict[str, dict[str, float]]:
     """The <group_state> elements of an SRDF text, by name; states of several groups with one name are joined. Raises `RobotError`."""
@@ -358,8 +350,8 @@ def parse_postures(text: str, source: str) -> dict[str, dict[str, float]]:
 def posture_for(model: CgModel, cg: FloatArray, starts: Mapping[str, Posture]) -> dict[str, float]:
     """A posture whose centre of gravity is ``cg`` (2,) [m], near that of ``starts`` whose own CG is nearest to it.
 
-    The way there is the shortest in joint positions, step by step, and within the joints' limits. Collisions are not looked at: start
-    from postures with room around them. Where one start leads nowhere, the next nearest is tried. Raises `CgError` where none reaches.
+    The way there is the shortest in joint positions, step by step, and within the joints' limits. Collisions are not checked: start
+    from postures with room around them. Where one start fails, the next nearest is tried. Raises `CgError` where none reaches.
     """
     names = model.chain.joint_names
     if not starts or not names:
@@ -381,7 +373,7 @@ def posture_for(model: CgModel, cg: FloatArray, starts: Mapping[str, Posture]) -
 
 
 def _reach(model: CgModel, cg: FloatArray, start: FloatArray) -> FloatArray:
-    """(n,) positions from ``start`` (n,) by damped least-norm Newton steps; joints that stand at a limit and push against it rest."""
+    """(n,) positions from ``start`` (n,) by damped least-norm Newton steps; joints whose step leaves their limits stay there."""
     lower, upper = model.chain.lower, model.chain.upper
     q = np.clip(start, lower, upper)
     for _ in range(_STEPS):
