@@ -40,7 +40,7 @@ class Twist:
         value, d_params = np.zeros((n, 3)), np.zeros((n, 3, k))
         d_wheels, d_cg = np.zeros((n, 3, 2)), np.zeros((n, 3, 2))
         # Always copies: numba would compile the kernel once more for each kind of view, and round it differently.
-        full = [a if a.shape == (*lead, 2) else np.broadcast_to(a, (*lead, 2)) for a in (wheels, cg)]  # done for every step, and not quick
+        full = [a if a.shape == (*lead, 2) else np.broadcast_to(a, (*lead, 2)) for a in (wheels, cg)]  # broadcast_to takes microseconds
         flat = [np.array(a, dtype=np.float64, order="C").reshape(n, 2) for a in full]
         kernel(*flat, np.array(params, dtype=np.float64), constants, value, d_wheels, d_cg, d_params)
         return cls(value.reshape(*lead, 3), d_wheels.reshape(*lead, 3, 2), d_cg.reshape(*lead, 3, 2), d_params.reshape(*lead, 3, k))

@@ -18,4 +18,4 @@ class CalibrationError(SkidlocError):
 
 
 class CgError(SkidlocError):
-    """A centre of gravity that cannot be had from what was given, or that lies where the robot would tip over."""
+    """A centre of gravity that cannot be computed from its input, or with which the robot would tip over."""

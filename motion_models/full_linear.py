@@ -1,9 +1,10 @@
-"""The full linear model, and the few nonlinear terms that a real skid-steer robot on real ground asks for.
+"""The full linear model, with optional nonlinear slip terms.
 
 Sources of the linear part: G. Anousaki, K. J. Kyriakopoulos, "A dead-reckoning scheme for skid-steered vehicles in outdoor
 environments", ICRA 2004; T. Okawara et al., "Tightly-coupled LiDAR-IMU-wheel odometry with online calibration of a kinematic model for
 skid-steering robots", IEEE Access 2024. The lateral slip by v wz is that of D. Baril et al., "DRIVE: data-driven robot input vector
-exploration", ICRA 2024; the share of turning is this project's way to make a loss depend on the arc and not on the speed.
+exploration", ICRA 2024; the share of turning, with which a loss depends on the arc and not on
+the speed, is of this project.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class FullLinear:
     T  = (q_r - q_l)^2 / (2 (q_l^2 + q_r^2))
 
     T is the share of turning in the wheels' motion: 0 straight ahead, 1/2 with one side standing, 1 turning in place; it is free of
-    scale. So the `_curvature` losses are those of friction that does not care for speed, the others grow with speed. Units: m for
+    scale. So the `_curvature` losses do not depend on speed, as Coulomb friction; the others grow with it. Units: m for
     the rows of vx and vy, 1 for those of wz; s for `_turning`, `_rate` and lateral_slip_speed; s/m for rotation_slip_speed.
 
     |u| and |w| have no derivative at 0; the mean of both sides (0) is returned there. At standstill T = 0 and the derivative is
@@ -85,21 +86,21 @@ class FullLinear:
         if abs(np.linalg.det(matrix)) < 1e-12:
             raise ModelError("full_linear: the rows of vx and wz are the same direction, so that no wheel rates steer the robot.")
         rates: FloatArray = np.asarray(np.linalg.solve(matrix, wanted.T).T, dtype=np.float64)
-        error = self._off(rates, wanted, cgs, params)
+        error = self._residual(rates, wanted, cgs, params)
         for _ in range(_NEWTON_STEPS):
             if np.all(np.abs(error) <= _CONVERGED * (1.0 + np.abs(wanted))):
-                # Where a loss is beyond all there is, the formulas have the wheels run backwards to go forward.
+                # Losses beyond 100 %: by the formulas, wheels that turn backwards drive forward.
                 against = np.any((rates @ matrix.T) * wanted < -1e-9, axis=1)
                 if against.any():
                     raise self._no_rates(wanted[np.argmax(against)])
                 return rates.reshape(command.shape)
             jacobian = self.twist(rates, cgs, params).d_wheels[:, [0, 2], :]
             step = np.linalg.pinv(jacobian) @ error[..., None]
-            # Halve the step of each command until it helps: the losses bend the way.
+            # Halve the step of each command until its error shrinks.
             scale = np.ones((len(rates), 1))
             for _ in range(30):
                 tried = rates - scale * step[..., 0]
-                off = self._off(tried, wanted, cgs, params)
+                off = self._residual(tried, wanted, cgs, params)
                 worse = np.linalg.norm(off, axis=1) > np.linalg.norm(error, axis=1)
                 if not worse.any():
                     break
@@ -113,7 +114,7 @@ class FullLinear:
             f"full_linear: no wheel rates give vx = {wanted[0]:.4g} m/s with wz = {wanted[1]:.4g} rad/s; ask for a gentler arc."
         )
 
-    def _off(self, rates: FloatArray, wanted: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+    def _residual(self, rates: FloatArray, wanted: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
         return np.asarray(self.twist(rates, cg, params).value[:, [0, 2]] - wanted)
 
 

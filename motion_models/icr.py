@@ -22,14 +22,14 @@ from motion_models.skid_steer import SkidSteer
 
 @dataclass(frozen=True)
 class Icr:
-    """Five parameters: where the three ICRs lie in the body frame [m], and the share of its wheels' way that each side's tread runs [-].
+    """Five parameters: the three ICRs in the body frame [m], and the effectiveness alpha of each side: tread speed over r q [-].
 
     At its own ICR a side's tread does not slip lengthwise, so the body moves there as the tread does:
 
     alpha_s r q_s = vx - wz y_icr_s   for both sides s;   0 = vy + wz x_icr.
 
     ``y_icr_left`` is positive; the further the ICRs lie outside the wheels, the more the robot slips. A skid-steer robot with
-    rotation scaling k has y_icr_left - y_icr_right = track / k. The CG enters only through what the parameters were fitted at.
+    rotation scaling k has y_icr_left - y_icr_right = track / k. The CG does not enter: the parameters hold where they were fitted.
     """
 
     wheel_radius: float

@@ -1,4 +1,4 @@
-"""Equations and eigenvectors of matrices (3, 3) within compiled loops, where numpy's take longer to compile than all else, and to run."""
+"""Equations and eigenvectors of matrices (3, 3) within compiled loops, where numpy's compile and run more slowly."""
 
 from __future__ import annotations
 

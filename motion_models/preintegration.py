@@ -1,7 +1,7 @@
 """Preintegration: many wheel samples become one `Motion`, for any model, in compiled code.
 
-The model gives twists and their derivatives for all samples at once; what follows (composition on SE(2), growth of the covariance,
-propagation of the derivatives) is the same for every model and is written once, here.
+The model gives twists and their derivatives for all samples at once. Composition on SE(2) and propagation of covariance and derivatives
+are the same for every model.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ _GRID_X, _GRID_Y = 0.15, 0.05
 _POINTS_X, _POINTS_Y = 7, 5
 """Of that grid: twice as many as the polynomials have degrees."""
 _CENTER_X, _CENTER_Y = 0.10, 0.05
-"""Standard deviations of the CoR at the nominal CG, over wheelbase and track: where the CG and the tracked point really are. VaultBot's
+"""Standard deviations of the CoR at the nominal CG, over wheelbase and track: errors of CG and tracked point. VaultBot's
 rotations have their CoR 0.12 wheelbases behind its weighed CG (Ebersole 2016, 4.22)."""
 _CURVED, _SLOPE_SIGMA = [2, 4, 8, 10], 0.25
 """k_2, x_cr_1, y_cr_s0 and y_cr_s2: their relative standard deviation. VaultBot's are within 25 % of those by geometry (a test)."""
@@ -53,7 +53,7 @@ class Evidence:
 EVIDENCE = (
     Evidence("vaultbot", 0.9541 / 1.875, 0.5263, "68 rotations in place, Ebersole 2016, 4.21"),
     Evidence("husky_a200", 1.0 / 1.875, 0.5433, "Clearpath's wheel_separation_multiplier"),
-    Evidence("drive_husky", 0.43 / 0.928, 0.5433, "DRIVE windows: k 0.43 by the wheels, which drive 0.928 of their way straight on"),
+    Evidence("drive_husky", 0.43 / 0.928, 0.5433, "DRIVE windows: k 0.43 by the wheels, over their effectiveness of 0.928 straight ahead"),
     Evidence("borealtc_husky", 0.6764, 0.5433, "BorealTC, 75 runs: geometric mean of 0.768 (floor), 0.722, 0.722, 0.599, 0.590 (snow)"),
     Evidence("upenn_4wd", 0.525, 0.576, "a four-wheeled rover whose log is not shipped"),
     Evidence("jackal", 1.0 / 1.5, 0.6614, "Clearpath's wheel_separation_multiplier"),
@@ -63,14 +63,14 @@ EVIDENCE = (
     Evidence("rosbot_xl", 1.0 / 1.3, 0.6690, "Husarion's wheel_separation_multiplier, an office floor"),
     Evidence("warthog", 0.61, 0.5957, "middle of 0.59 to 0.63 by logs that are not shipped"),
 )
-"""All that was found; grounds from floor to snow are averaged for each robot, and differ by 12 % (BorealTC). The standard deviation was
-0.105 by the first eight, of which the last three were then a test: all three are inside the 90 % interval."""
+"""Grounds from floor to snow are averaged for each robot; they differ by 12 % (BorealTC). The last three were added as a test of the first
+eight, with a standard deviation of 0.105: all are inside its 90 % interval."""
 
 
 def scaling_sigma(evidence: tuple[Evidence, ...] = EVIDENCE) -> float:
     """Relative standard deviation of a predicted k: root mean square of log(measured / predicted) over robots.
 
-    The mean of the logarithms (0.014) is well inside its standard error (0.03), so no bias is taken off.
+    The mean of the logarithms (0.014) is well inside its standard error (0.03), so no bias is subtracted.
     """
     return math.sqrt(sum(math.log(e.measured / e.predicted) ** 2 for e in evidence) / len(evidence))
 
@@ -93,7 +93,7 @@ class SkidPrior:
     sigmas: FloatArray
     """(11,)"""
     source: str
-    """What the numbers come from, for messages."""
+    """Source of the numbers, for messages."""
 
 
 def skid_prior(robot: Robot) -> SkidPrior:
@@ -151,7 +151,7 @@ def slip_at_speed(robot: Robot, speed_m_per_s: float = 1.0, yaw_rate_rad_per_s: 
     """lateral_slip_speed [s] and rotation_slip_speed [s/m] (`FullLinear`) that the centripetal force causes on ``robot`` at a gentle arc.
 
     Differences of the friction model with and without m v wz on the lateral balance (`friction.equilibrium`), CG in the middle. They
-    are signs and sizes for priors: a robot's own values depend on its tyres.
+    give sign and size of a prior: a robot's own values depend on its tyres.
     """
     still = FrictionModel.from_robot(robot)
     moving = FrictionModel(still.nominal, still.saturation, centripetal=True)
@@ -172,11 +172,11 @@ class ScalingPrior(NamedTuple):
     sigma_after_turning: float
     """The same after `_CALIBRATION_TURN_S` of turning: k sqrt(yaw variance per radian / turned angle)."""
     source: str
-    """What k comes from."""
+    """Source of k."""
 
 
 def scaling_prior(robot: Robot, models: Sequence[str] = ("skid_steer",)) -> ScalingPrior | None:
-    """k of ``robot`` where it is no calibration and one of ``models`` uses it; else None."""
+    """Prior of k, where the file of ``robot`` has no k_0 and one of ``models`` uses it; else None."""
     if not {"skid_steer", "icr"} & set(models) or "k_0" in robot.models.get("skid_steer", {}):
         return None
     prior = skid_prior(robot)
@@ -187,7 +187,7 @@ def scaling_prior(robot: Robot, models: Sequence[str] = ("skid_steer",)) -> Scal
 
 
 def prior_notes(robot: Robot, models: Sequence[str] = ("skid_steer",)) -> list[str]:
-    """A sentence for the user where k of ``robot`` is no calibration and one of ``models`` uses it; else none.
+    """A sentence for the user where `scaling_prior` is not None; else none.
 
     >>> from motion_models import load_robot
     >>> prior_notes(load_robot("vaultbot"))

@@ -105,7 +105,7 @@ class Topics:
     center_of_gravity: str = "/center_of_gravity"
     """geometry_msgs/PointStamped in the body frame; goes before the arms."""
     reference: str = "/ground_truth/odom"
-    """What results are scored against, and never estimated from."""
+    """Results are scored against it; estimators do not use it."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class Mount:
 
 @dataclass(frozen=True)
 class WheelNoise:
-    """How wrong wheels are: variances that grow with the motion, as slip does, and a floor for what no model has.
+    """Noise of the wheels: variances of slip, which grow with the motion, and a floor for model discrepancy.
 
     The yaw's numbers are those of Huskies on floors, asphalt, ice and loam whose track was fitted to each ground (BorealTC's gyro and
     wheel speeds: 5e-4 to 2e-3 per metre, 2e-3 to 2e-2 per radian).
@@ -182,7 +182,7 @@ class GyroNoise:
     white_rad_per_sqrt_s: float = 2e-3
     """Angle random walk of the yaw gyro."""
     bias_sigma_rad_per_s: float = 1e-3
-    """How large the bias may be after the zeroing that drivers do at switch-on; a larger one shows when the robot stands."""
+    """Prior sigma of the bias, after drivers have zeroed it at switch-on; a larger one is measured at standstill."""
     bias_walk_rad_per_s_sqrt_s: float = 3e-5
     """Random walk of the bias."""
     scale_sigma: float = 5e-3

@@ -73,7 +73,7 @@ def _one_process_at_a_time() -> Iterator[None]:
     """Numba caches a gufunc in two files that name each other. Two processes that compile it at the same time leave one file of each, and
     whoever loads these crashes."""
     with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError):  # no place for a lock is no reason not to work
+        with contextlib.suppress(OSError):  # without a place for the lock: unprotected
             lock = stack.enter_context((Path(tempfile.gettempdir()) / f"skidloc-{os.getuid()}.lock").open("a"))
             fcntl.flock(lock, fcntl.LOCK_EX)
         yield

@@ -45,8 +45,8 @@ class Fit:
     reference_params: FloatArray
     """(5,) as `REFERENCE_PARAM_NAMES`."""
     cov: FloatArray
-    """(c, c) of the free parameters. With more than ten groups beyond c, the sandwich over groups (CR1), which stands residuals that
-    are correlated within a group and a noise model that is wrong; with fewer, the inverse information times the weighted mean square."""
+    """(c, c) of the free parameters. With more than ten groups beyond c, the sandwich over groups (CR1), which holds for residuals that
+    are correlated within a group and for a wrong noise model; with fewer, the inverse information times the weighted mean square."""
     is_sandwich: bool
     scale: float
     """Robust size of the whitened residuals: how many times larger than by the noise model the errors are."""
@@ -236,7 +236,7 @@ class Problem:
 
         full = self._full(self.start)
         k = len(start)
-        # Whitened once, at the start: weights that follow the fit would reward parameters that call everything noise.
+        # Whitened once, at the start: weights that follow the fit would favour parameters with much noise.
         _, _, slip = predict(model, batch, full[:k], full[k:], np.empty(0, dtype=np.int64), config.noise)
         twist = model.twist(batch.wheels, batch.cg, full[:k]).value
         driven = float(np.sum(np.hypot(twist[:, 0], twist[:, 1]) * batch.dt))
@@ -247,7 +247,7 @@ class Problem:
                 "drive a few metres and some turns."
             )
         both = measured[:, :, None] & measured[:, None, :]
-        # The last: a maneuver without motion and without noise, and what was not measured.
+        # The diagonal is for maneuvers without motion and noise, and for what was not measured.
         noise = np.where(both, slip + np.where(both, batch.cov, 0.0), 0.0) + np.eye(3) * np.where(measured, 1e-12, 1.0)[:, :, None]
         self.whiten = np.where(both, np.linalg.inv(np.linalg.cholesky(noise)), 0.0)
 
@@ -274,7 +274,7 @@ class Problem:
         """Whitened residuals (M, 3) and their derivatives (M, 3, c)."""
         poses, d, _ = predict(self.model, self.batch, self.params(x), self.reference_params(x), self.all_columns, self.config.noise)
         off = se2.between(self.batch.measured, poses)
-        # `off` moves by its own rotation of what its end moves.
+        # d is in the frame of the predicted pose, the derivative of `off` in that of the measured one.
         c, s = np.cos(off[:, 2]), np.sin(off[:, 2])
         d = d @ self.combine.T
         J = np.stack(

@@ -1,4 +1,4 @@
-"""What a drive reveals of a model's parameters, and which maneuver would reveal the rest."""
+"""Identifiability of a model's parameters by a drive, and the maneuver that would reveal the rest."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ def weaknesses(
 ) -> tuple[Weakness, ...]:
     """Eigenvectors of the scaled ``information`` (c, c) of the parameters ``names`` with a sigma above 1, weakest first.
 
-    Scaled means: in units of ``sizes`` (c,), what counts as large for each. Every weak one is held against `candidates` at wheel
-    rates around ``rate`` [rad/s] and ``cg`` (2,) [m], to find the maneuver with most information on it.
+    Scaled means: in units of ``sizes`` (c,), what counts as large for each. For each weak one, the maneuver with most
+    information on it is chosen of `candidates` at wheel rates around ``rate`` [rad/s] and ``cg`` (2,) [m].
     """
     values, vectors = np.linalg.eigh(information * np.outer(sizes, sizes))
-    # What double precision does not separate from zero.
-    unseen = values <= 1e-13 * max(float(values[-1]), 1.0)
-    poor = ~unseen & (values < 1.0)
-    weak = [(np.inf, vector) for vector in _sparse(vectors[:, unseen].T)]
+    # Zero in double precision.
+    unobservable = values <= 1e-13 * max(float(values[-1]), 1.0)
+    poor = ~unobservable & (values < 1.0)
+    weak = [(np.inf, vector) for vector in _sparse(vectors[:, unobservable].T)]
     weak += [(float(value) ** -0.5, vector) for value, vector in zip(values[poor], vectors[:, poor].T, strict=True)]
     found = []
     for spread, vector in weak:
@@ -74,7 +74,7 @@ def weaknesses(
 
 
 def _sparse(rows: FloatArray) -> FloatArray:
-    """The same row space (m, c) by Gauss-Jordan elimination: parameters that do not show each get a row of their own."""
+    """The same row space (m, c) by Gauss-Jordan elimination: each unobservable parameter gets a row of its own."""
     rows = rows.copy()
     for i in range(len(rows)):
         row, column = divmod(int(np.argmax(np.abs(rows[i:]))), rows.shape[1])
@@ -86,7 +86,7 @@ def _sparse(rows: FloatArray) -> FloatArray:
 
 
 def candidates(rate: float, cg: FloatArray, dt: float = 0.1) -> list[tuple[str, Maneuver]]:
-    """Maneuvers of 5 s at wheel rates around ``rate`` [rad/s], each with what to call it. ``cg`` (2,) [m]."""
+    """Maneuvers of 5 s at wheel rates around ``rate`` [rad/s], each with its name. ``cg`` (2,) [m]."""
     n = round(_SECONDS / dt)
     steady = np.ones((n, 1))
     wave = np.sin(2.0 * np.pi * np.arange(n) / n)[:, None]

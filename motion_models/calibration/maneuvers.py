@@ -42,7 +42,7 @@ NEEDED = ("window", "dt_s", "left_rad_per_s", "right_rad_per_s", "yaw_rad")
 POSE = ("x_m", "y_m", "yaw_rad")
 CG = ("cg_x_m", "cg_y_m")
 SIGMA = {"sigma_x_m": 0.02, "sigma_y_m": 0.02, "sigma_yaw_rad": 0.01}
-"""Defaults of a table without standard deviations: motion capture and LiDAR ICP (DRIVE) scatter so."""
+"""Defaults of a table without standard deviations: scatter of motion capture and of LiDAR ICP (DRIVE)."""
 
 _MIN_CHORD_M = 0.3
 """Displacement below which the direction of a window is too uncertain to be compared with that of its wheels [m]."""
@@ -239,7 +239,7 @@ def _direction_error(maneuver: Maneuver, wheel_radius_m: float) -> float:
 
 
 def windows_text(maneuvers: Sequence[Maneuver]) -> str:
-    """``maneuvers`` as such a table; what is read back is the same, but for lead-in intervals, which a table has not."""
+    """``maneuvers`` as such a table; what is read back is the same, but for lead-in intervals, which a table does not have."""
     measured = any(np.isfinite(m.cov[..., 0, 0]).any() for m in maneuvers)
     pose = POSE if measured else ("yaw_rad",)
     sigmas = tuple(SIGMA) if measured else ("sigma_yaw_rad",)

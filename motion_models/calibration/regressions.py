@@ -1,4 +1,4 @@
-"""Rotations in place: k and the centre of rotation (CoR) regressed on the CG, and the CoR of an arc by its poses (Ebersole 2016, 4.2).
+"""Rotations in place: k and the centre of rotation (CoR) regressed on the CG, and the CoR of an arc by its poses (Ebersole 2016, Sec. 4.2).
 
 Ebersole 2016, Sec. 4.2.3, fits k and x_CR to the means over y_G, and y_CR in three ways; each is here as it was done there.
 `skid_steer_fit` is the plain way: all rows, all eleven coefficients of `SkidSteer`, with their covariance.
@@ -9,8 +9,7 @@ world (w),
     p_k + R(theta_k) c = w        for every pose k of the arc.                                   (4.2, at any pair of poses)
 
 The thesis takes the first and the last pose (`center_from_end_poses`); `center_of_arc` takes all. Both divide by the turned
-angle, so the covariance grows as 1/angle^2: a CoR from a small turn is returned, but never as if it were certain. A turn of
-exactly zero has no CoR and is refused.
+angle, so the covariance grows as 1/angle^2 towards small turns. A turn of exactly zero has no CoR and is refused.
 """
 
 from __future__ import annotations
@@ -92,7 +91,7 @@ def _cell(text: str | None, column: str, line: int, path: str | Path) -> float:
 
 @dataclass(frozen=True)
 class Regression:
-    """A linear least squares fit, with what a statistician wants to see of it."""
+    """A linear least squares fit, with its statistics."""
 
     names: tuple[str, ...]
     """What each coefficient multiplies; "1" is the intercept."""

@@ -1,4 +1,4 @@
-"""A calibration put into the parameters of the software that robots already run: ros2_controllers and robot_localization.
+"""A calibration as parameters of ros2_controllers and robot_localization.
 
 Parameter names: github.com/ros-controls/ros2_controllers, diff_drive_controller/src/diff_drive_controller_parameter.yaml;
 github.com/cra-ros-pkg/robot_localization, params/ekf.yaml. Both exist in ROS 1 under the same names.
@@ -35,7 +35,7 @@ DEFAULT_NODES = {"diff_drive_controller": "diff_drive_controller", "robot_locali
 class Multipliers:
     """The diff-drive controller that drives straight on as the model does, and turns in place at its yaw rate.
 
-    It can follow the model no further: not on arcs, and not in the vx and vy of a centre of rotation that is not in the middle.
+    It differs from the model on arcs, and by the vx and vy of a centre of rotation that is not in the middle.
     """
 
     wheel_separation: float

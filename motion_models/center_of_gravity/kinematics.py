@@ -58,11 +58,11 @@ class Chain:
     links: Mapping[str, tuple[int, Pose]]
     """Body of each link, and the link's pose in the body's frame."""
     massless: tuple[str, ...]
-    """Moving links without mass: frames, or arms whose inertia nobody wrote down."""
+    """Moving links without mass: frames, or arms without an <inertial>."""
 
     @property
     def mass(self) -> float:
-        """All of it [kg]."""
+        """Total [kg]."""
         return float(self.constants[:, MASS].sum())
 
     def posture(self, positions: Mapping[str, float]) -> FloatArray:

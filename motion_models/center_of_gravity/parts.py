@@ -1,4 +1,4 @@
-"""What a centre of gravity is made of: static part, payload, tolerances; and whether the robot stands on its wheels with it."""
+"""Parts of a centre of gravity: static part, payload, tolerances; and whether it lies between the wheels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from motion_models.se2 import FloatArray
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Standard deviations of masses and joints. Bodies err independently."""
+    """Standard deviations of masses and joints. Errors of bodies are independent."""
 
     mass_fraction: float = 0.02
     """Relative error of the mass of each body in the URDF."""
@@ -37,8 +37,8 @@ class StaticPart:
     covariance: FloatArray
     """(3, 3) of mass, x, y [kg, m, m]."""
     weighed_at: Mapping[str, float] | None = None
-    """Joint positions at which the arms were subtracted from a weighing. What is wrong with the arms' masses then cancels at this
-    posture, and matters elsewhere by what has moved since. None: the static part was measured by itself."""
+    """Joint positions at which the arms were subtracted from a weighing. Errors of the arms' masses then cancel at
+    this posture; at others they count by how far the arms have moved. None: the static part was measured by itself."""
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,9 @@ class Scales:
     """Standard deviations of scales and wheels."""
 
     reading_sigma_kg: float = 0.1
-    """Noise of one reading: what lifting the robot off and putting it back changes. Repeating averages it."""
+    """Noise of one reading, as of lifting the robot off and putting it back; repeated weighings average it."""
     calibration_sigma: float = 0.002
-    """Relative error of each scale, the same in all readings. Repeating does not average it."""
+    """Relative error of each scale, the same in all readings; repeated weighings do not average it."""
     contact_sigma_m: float = 0.005
     """Error of where each wheel touches the ground, in x and in y, the same in all readings."""
 

@@ -1,4 +1,4 @@
-"""Forces at a wheel contact, per wheel and in compiled code: how the load is shared, and what the floor does to a wheel that slips.
+"""Forces at a wheel contact, compiled: shares of the load on the wheels, friction and rolling resistance of a slipping wheel.
 
 Everything here is per unit weight (forces divided by m g) and per unit speed (velocities divided by the wheels' own speed). `equilibrium`
 balances it, `dynamics` moves by it. Wheels come in the order front left, front right, rear left, rear right.
@@ -27,9 +27,9 @@ from typing import NamedTuple
 from motion_models.compiled import subroutine
 
 CREEP = 1e-3
-"""Slip, as a fraction of the wheels' speed, at which the thesis's friction is fully there. A tyre's own is larger."""
+"""Slip, as a fraction of the wheels' speed, at which the thesis's friction saturates. A tyre's own is larger."""
 ROLLING = 0.02
-"""Speed of a wheel, as a fraction of both wheels' root mean square, at which its rolling resistance is fully there."""
+"""Speed of a wheel, as a fraction of both wheels' root mean square, at which its rolling resistance saturates."""
 SATURATION: Mapping[str, float] = {"isotropic": 0.0, "thesis": 1.0}
 """Contact laws by name: share of the thesis's law in the force, the rest is isotropic."""
 
@@ -44,7 +44,7 @@ class Tyre(NamedTuple):
     mu_ratio: float
     """mu_y / mu_x [-]."""
     tread: float
-    """By what share a wheel that slides to the left grips more, and one that slides to the right less [-]."""
+    """Relative increase of the lateral force of a wheel that slides to the left, and decrease to the right [-]."""
     saturation: float
     """Share of the thesis's law."""
 
@@ -73,8 +73,8 @@ def loads(xi: float, eta: float, warp: float) -> tuple[float, float, float, floa
 
         n_i = (1 + sx_i xi + sy_i eta + sx_i sy_i t) / 4,    sx_i, sy_i = the wheel's signs
 
-    with t = ``warp``. All loads that balance weight and moments have this form, whatever t. Where a wheel would pull at the floor,
-    t moves just so far that it lifts off and the other three carry all: that *is* clipping at zero with the balance kept.
+    with t = ``warp``. All loads that balance weight and moments have this form, whatever t. Where a load would be negative, t is moved
+    until it is zero: clipping at zero that keeps the balance.
     """
     lowest, highest = abs(xi + eta) - 1.0, 1.0 - abs(xi - eta)
     t, t_xi, t_eta = warp, 0.0, 0.0
@@ -93,7 +93,7 @@ def loads(xi: float, eta: float, warp: float) -> tuple[float, float, float, floa
 
 @subroutine
 def tyre(stiffness: float, mu_ratio: float, tread: float, saturation: float) -> Tyre:
-    """A `Tyre` with its force at a locked wheel worked out."""
+    """A `Tyre`, with its force at a locked wheel computed once."""
     return Tyre(stiffness, 1.0 - math.exp(-stiffness), mu_ratio, tread, saturation)
 
 

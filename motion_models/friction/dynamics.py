@@ -1,8 +1,7 @@
 """The dynamic form of Ebersole 2016, Ch. 3 (eqs. 3.15-3.26, signs mended): accelerations of a skidding robot, for simulation.
 
-Where `model` asks which motion the wheels settle to, this asks how the robot gets there: with mass, inertia, a CG that arms move, load
-that shifts under acceleration, and a force from outside. Its resting point at constant wheel rates is the model's twist, with the
-centripetal force; for a CG on the floor it is so exactly.
+`model` gives the steady motion, this the transient: with mass, inertia, a CG that arms move, load that shifts under acceleration, and an
+external force. Its steady state at constant wheel rates is the model's twist with the centripetal force, exactly for z_G = 0.
 
 Mended against the thesis: (3.17, 3.24) rolling resistance opposes the wheel's rolling; (3.25) m a_y has the sign of (3.24)'s;
 Appendix A's y_ddot_G_B has the signs of (3.19), and its inertia squares 0.43.
@@ -42,7 +41,7 @@ class _Body(NamedTuple):
 
 @dataclass(frozen=True)
 class Influence:
-    """What acts on the robot besides its wheels."""
+    """CG and external force: inputs besides the wheels."""
 
     cg: FloatArray
     """(2,) CG in the body frame [m]."""
@@ -51,7 +50,7 @@ class Influence:
     cg_acceleration: FloatArray
     """(3,) its acceleration in the body frame, by the arms; z up [m/s^2]."""
     force: FloatArray
-    """(3,) force from outside, as on a gripper, in the body frame [N]."""
+    """(3,) external force, as on a gripper, in the body frame [N]."""
     at: FloatArray
     """(3,) where it acts, in the body frame, z above the floor [m]."""
 
@@ -66,7 +65,7 @@ class FrictionDynamics:
     """The robot as a rigid body on four skidding wheels whose rates are given."""
 
     params: FloatArray
-    """(12,) as `FrictionModel.param_names`; the tracked point plays no part here."""
+    """(12,) as `FrictionModel.param_names`; the tracked point is not used."""
     mass: float
     """[kg]"""
     inertia: float
@@ -78,7 +77,7 @@ class FrictionDynamics:
     gravity: float = GRAVITY
     """[m/s^2]"""
     creep: float = CREEP
-    """Slip at which friction is fully there, as a fraction of the wheels' speed. Ten times the creep allows ten times as long steps."""
+    """Slip at which friction saturates, as a fraction of the wheels' speed. Ten times the creep allows ten times as long steps."""
     rest_speed: float = 0.01
     """Speed that takes the place of the wheels' where they stand still [m/s]."""
 
@@ -104,7 +103,7 @@ class FrictionDynamics:
         """Rate of change (3,) of ``twist`` (3,), both of the wheelbase's centre in the body frame, at wheel rates ``wheels`` (2,).
 
         Also the tipping margin: how far the loads are from leaving all wheels of one side or axle, 1 for evenly loaded wheels. Where it
-        is negative the robot tips over and the accelerations, those of a robot held upright, are fiction. Raises what `FrictionModel` does.
+        is negative the robot tips over, and the accelerations are those of a robot held upright. Raises what `FrictionModel` does.
         """
         check_parameters(influence.cg, self.params)
         state = np.array([0.0, 0.0, 0.0, *twist])

@@ -1,10 +1,10 @@
 """The balance of forces on a skidding robot (Ebersole 2016, 3.24-3.26), and its solution: from wheel speeds to motion.
 
 In steady motion friction, rolling resistance and, where it is modelled, the centripetal force cancel. Newton's method with a line search
-solves the three equations, from the closed solution of tyres whose force grows in proportion to their slip, then from a robot that its
-loaded side holds. Where both fail (near a CG over an axle or a side, the floor holds and lets go within a thousandth of the wheels'
-speed), the friction is first rounded as wide as the wheels' speed itself, which makes it almost linear, and then narrowed step by step,
-from solution to solution; a centripetal force is then increased from zero in the same way.
+solves the three equations, from the closed solution of tyres whose force is proportional to slip, then from straight motion at the wheel
+speed that is weighted by load. Where both fail (near a CG over an axle or a side, friction turns from sticking to sliding within a
+thousandth of the wheels' speed), continuation follows: the friction is rounded as wide as the wheels' speed, which makes it almost
+linear, and narrowed step by step; a centripetal force is then increased from zero in the same way.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Floor(NamedTuple):
 
 
 class Loads(NamedTuple):
-    """Shares of the weight on front left, front right, rear left and rear right; and what inertia pulls at."""
+    """Shares of the weight on front left, front right, rear left and rear right; and the CG, for the centripetal force."""
 
     fl: float
     fr: float
@@ -45,7 +45,7 @@ class Loads(NamedTuple):
 
 
 class Balance(NamedTuple):
-    """What is left of the forces along x and y and of the yaw moment [m], per mu_x m g, with derivatives by vx, vy, wz and the rolls."""
+    """Residuals of the forces along x and y and of the yaw moment [m], per mu_x m g, with derivatives by vx, vy, wz and the rolls."""
 
     x: float
     y: float
@@ -70,13 +70,13 @@ class Balance(NamedTuple):
 COLUMNS = 18
 """Of `sensitivities`; the last three, from `_VX` on, are the balance's own derivatives by vx, vy, wz."""
 _VX = 15
-EFFORT = 30
+MAX_EVALUATIONS = 30
 """Evaluations of the balance from one start before another way is tried."""
 NARROWING = 0.3
 """Largest step of the rounding, as a factor."""
-_CLOSE = 1e-7
+_CONVERGED = 1e-7
 """Step of Newton's method, in units of the wheels' speed, after which one more changes nothing: it squares the error."""
-_FINEST = 1e-4
+_MIN_STEP = 1e-4
 """Least step of the centripetal force, as a share of it."""
 
 
@@ -135,11 +135,11 @@ def twist_change(b: Balance, x: float, y: float, m: float) -> tuple[float, float
 def newton(
     vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load: Loads, floor: Floor, creep: float
 ) -> tuple[float, float, float, bool]:
-    """The twist that balances, from the twist ``vx, vy, wz``, and whether it was found within `EFFORT` evaluations."""
+    """The twist that balances, from the twist ``vx, vy, wz``, and whether it was found within `MAX_EVALUATIONS` evaluations."""
     arm = floor.half_track
     dx = dy = dw = 0.0
     fraction, left = 1.0, math.inf
-    for _ in range(EFFORT):
+    for _ in range(MAX_EVALUATIONS):
         x, y, w = vx + fraction * dx, vy + fraction * dy, wz + fraction * dw
         b = balance(x, y, w, roll_l, roll_r, load, floor, creep)
         now = b.x * b.x + b.y * b.y + b.m * b.m / (arm * arm)
@@ -147,7 +147,7 @@ def newton(
             vx, vy, wz, left = x, y, w, now
             dx, dy, dw = twist_change(b, -b.x, -b.y, -b.m)
             size = max(abs(dx), abs(dy), abs(dw) * arm)
-            if size < _CLOSE:
+            if size < _CONVERGED:
                 return vx + dx, vy + dy, wz + dw, True
             fraction = min(1.0, 2.0 / size)
         else:
@@ -189,7 +189,7 @@ def motion(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[flo
 
 @subroutine
 def _narrowed(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:
-    """`motion` by friction that is rounded less and less."""
+    """`motion` by continuation: friction rounded less and less."""
     from_x, from_y, from_w = 0.5 * (roll_l + roll_r), 0.0, 0.0
     creep, reached, factor = 1.0, 1.0 / NARROWING, NARROWING
     while factor < 0.995:
@@ -207,7 +207,7 @@ def _narrowed(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[
 
 @subroutine
 def _pulled(vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:
-    """`motion` from the twist without a centripetal force, by one that grows."""
+    """`motion` by continuation, from the twist without a centripetal force."""
     share, step = 0.0, 1.0
     while share < 1.0:
         trial = min(share + step, 1.0)
@@ -218,7 +218,7 @@ def _pulled(vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load:
             step *= 2.0
         else:
             step *= 0.3
-            if step < _FINEST * max(share, _FINEST):
+            if step < _MIN_STEP * max(share, _MIN_STEP):
                 return vx, vy, wz, False
     return vx, vy, wz, True
 
@@ -236,7 +236,7 @@ class Steady(NamedTuple):
 
 @subroutine
 def sensitivities(at: Steady, load: Loads, tilt: tuple[float, float, float], floor: Floor, by: FloatArray) -> None:
-    """Derivatives of the solved twist, by the implicit function theorem: -(balance by twist)^-1 (balance by what moves it).
+    """Derivatives of the solved twist, by the implicit function theorem: -(d balance / d twist)^-1 (d balance / d parameter).
 
     ``tilt`` are the derivatives of the loads' diagonal term by xi, eta and warp (see `contact.loads`). Fills ``by`` (3, `COLUMNS`): columns
     roll_l, roll_r, xi, eta, warp, half_track, half_wheelbase, slip_stiffness, mu_ratio, drag, scrub, tread, pull, then cg_x and cg_y as

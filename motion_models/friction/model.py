@@ -1,13 +1,13 @@
 """The friction model: wheel rates and centre of gravity in, twist out, in microseconds (Ebersole 2016, Ch. 3, forward), and its inverse.
 
-The thesis asked for wheel rates and four loads at a wanted twist: six equations that took its solver 70 s, for three equations do not
-determine four loads. Here the chassis closes that gap (equally stiff wheels), and what is solved are the three balances of a steady
-motion. Without the centripetal force, twice the wheel rates are twice the twist: neither speed nor mass matters.
+The thesis solved for wheel rates and four loads at a wanted twist: six equations, 70 s, and underdetermined, as three equations do not
+determine four loads. Here equally stiff wheels determine the loads, and the three balances of a steady motion are solved. Without the
+centripetal force, twice the wheel rates are twice the twist: neither speed nor mass matters.
 
 For the inverse the balance is solved for the wheels' speeds and the sideways motion that go with a forward speed and a turn: three
-equations again, by Newton's method. Where it does not converge, the wheels' directions are enclosed: without a centripetal force the
-balance does not depend on speed, so the command is a direction (forward speed against turning) and the unknown is one too, how unlike the
-two sides roll. The first grows with the second, so it can be enclosed and cannot be missed; the speed follows by scale.
+equations again, by Newton's method. Where it does not converge, a root of one unknown is bracketed: without a centripetal force the
+balance does not depend on speed, so the command is an angle (turning against forward speed), and so are the wheels' speeds (difference
+against sum). The first increases with the second, so a bracket always exists; the speed follows by scale.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ CENTRIPETAL = False
 """Whether the centripetal force is modelled where a robot's file does not choose."""
 _POSITIVE = slice(0, 6)
 
-_EFFORT = 40
+_MAX_EVALUATIONS = 40
 """Evaluations of the balance before the angle is enclosed instead."""
-_CLOSE = 1e-7
+_CONVERGED = 1e-7
 """Step of Newton's method [1], after which one more changes nothing: it squares the error."""
 _BALANCED = 1e-9
 """Error of the angle [rad] up to which an enclosed solution counts."""
@@ -58,7 +58,7 @@ _CLOSING = 100
 """Of Chandrupatla's method, at worst halves: down to rounding from any interval."""
 _CLOSE_ANGLE = 1e-14
 """Rounding of an angle [rad]."""
-_FINEST = 1e-3
+_MIN_STEP = 1e-3
 """Least step of the centripetal force, as a share of it."""
 
 
@@ -125,10 +125,10 @@ class FrictionModel:
         return twist
 
     def wheels(self, command: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
-        """See `MotionModel.wheels`: what the thesis could not solve for.
+        """See `MotionModel.wheels`.
 
-        A robot that the floor holds still creeps around at absurdly high rates, and these are then returned. Raises what `twist` raises,
-        and `ModelError` for a command that no wheel rates lead to.
+        Where friction all but holds the robot, the rates are very high. Raises what `twist` raises, and `ModelError` for a command that
+        no wheel rates give.
         """
         check_parameters(cg, params)
         lead = np.broadcast_shapes(command.shape[:-1], cg.shape[:-1])
@@ -140,7 +140,7 @@ class FrictionModel:
             (vx, wz), (x, y) = flat[0][unsolved][0], flat[1][unsolved][0]
             raise ModelError(
                 f"no wheel rates found for vx = {vx:.3g} m/s, wz = {wz:.3g} rad/s with the centre of gravity at ({x:.3f}, {y:.3f}) m: "
-                "the floor holds this robot too firmly. Is rolling_resistance above mu, mu_ratio or scrub too large, the CG over a side?"
+                "friction holds this robot. Check for a rolling_resistance above mu, too large mu_ratio or scrub, a CG over a side."
             )
         return rates.reshape(*lead, 2)
 
@@ -314,7 +314,7 @@ def _solve(
     d_angle = d_drift = d_share = 0.0
     fraction, left = 1.0, math.inf
     arm = floor.half_track
-    for _ in range(_EFFORT):
+    for _ in range(_MAX_EVALUATIONS):
         a, v, r = angle + fraction * d_angle, drift + fraction * d_drift, share + fraction * d_share
         c, s = math.cos(a), math.sin(a)
         pulled = Loads(load.fl, load.fr, load.rl, load.rr, load.cg_x, load.cg_y, unit / (r * r))
@@ -324,7 +324,7 @@ def _solve(
             angle, drift, share, left = a, v, r, now
             d_angle, d_drift, d_share = _step(b, c, s, v, r, to_x, to_w, pulled)
             size = max(abs(d_angle), abs(d_drift), abs(d_share))
-            if size < _CLOSE:
+            if size < _CONVERGED:
                 return angle + d_angle, drift + d_drift, share + d_share, True
             fraction = min(1.0, 0.5 / size)
         else:
@@ -353,7 +353,7 @@ def _step(b: Balance, c: float, s: float, v: float, r: float, to_x: float, to_w:
 def _pulled(
     angle: float, drift: float, share: float, to_x: float, to_w: float, unit: float, load: Loads, floor: Floor
 ) -> tuple[float, float, float, bool]:
-    """`_solve` from the solution without a centripetal force, by one that grows."""
+    """`_solve` by continuation, from the solution without a centripetal force."""
     reached, step = 0.0, 0.3
     while reached < 1.0:
         trial = min(reached + step, 1.0)
@@ -363,7 +363,7 @@ def _pulled(
             step *= 2.0
         else:
             step *= 0.3
-            if step < _FINEST:
+            if step < _MIN_STEP:
                 return angle, drift, share, False
     return angle, drift, share, True
 
@@ -421,9 +421,9 @@ def _enclosed(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[floa
 
 @subroutine
 def _miss(angle: float, goal: float, x: float, y: float, w: float, load: Loads, floor: Floor) -> tuple[float, float, float, float]:
-    """By how much wheels at ``angle`` miss the ``goal``, and their twist.
+    """Angle of the motion of wheels at ``angle``, less ``goal``, and their twist.
 
-    The search starts at the twist ``x, y, w`` of an angle nearby, if it is one.
+    The search starts at the twist ``x, y, w`` of an angle nearby, unless it is NaN.
     """
     c, s = math.cos(angle), math.sin(angle)
     found = False

@@ -109,7 +109,7 @@ def study(case: Case, name: str) -> dict[str, Errors]:
     if lent is not None:
         found["another's"] = score(predicted(lent, maneuvers, robot), case.has_positions)
     model: MotionModel = make_model(name, robot)
-    found["zero-drive"] = score(predicted(model, maneuvers, robot), case.has_positions)
+    found["geometry"] = score(predicted(model, maneuvers, robot), case.has_positions)
     if name == "skid_steer" and not case.is_rotation:
         model = CorrectedWheels(model)
     config = FitConfig(noise=robot.wheel_noise)
@@ -129,8 +129,8 @@ def study(case: Case, name: str) -> dict[str, Errors]:
 
 def table() -> str:
     """The results as Markdown: heading [deg] / position [m]."""
-    columns = ("another's", "zero-drive", "20 s", "all")
-    lines = ["| robot | model | VaultBot's numbers | zero-drive | 20 s | all, held out |", "|---|---|---|---|---|---|"]
+    columns = ("another's", "geometry", "20 s", "all")
+    lines = ["| robot | model | VaultBot's coefficients | geometry | 20 s | all, held out |", "|---|---|---|---|---|---|"]
     for case in cases():
         for name in MODELS:
             found = study(case, name)

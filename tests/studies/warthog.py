@@ -142,7 +142,7 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=40)
     found = np.array([study(seed) for seed in range(parser.parse_args().robots)])
     print(f"ATE [m] over {LENGTH_M:g} m, {len(found)} robots\n\n| | median | 90 % | largest |\n|---|---|---|---|")
-    for name, column in zip(("k = 1", "zero-drive", "20 s", "true k", "best constant k"), found.T, strict=True):
+    for name, column in zip(("k = 1", "geometry", "20 s", "true k", "best constant k"), found.T, strict=True):
         print(f"| {name} | {np.median(column):.2f} | {np.quantile(column, 0.9):.2f} | {column.max():.2f} |")
 
 
