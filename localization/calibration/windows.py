@@ -30,7 +30,9 @@ class WindowConfig(Settings):
     around_s: float = 0.3
     """Wheel motion kept before and after each, in which a shift between the clocks is looked for [s]."""
     least_m: float = 0.02
-    """A window in which no wheel rolls as far as this counts as standing still and is left out [m]."""
+    """A window in which no wheel rolls as far as this has too little motion and is left out [m]."""
+    standing_m: float = 1e-3
+    """A window in which no wheel rolls as far as this, a few counts of an encoder, measures the gyro at rest [m]."""
     per_group: Count = 3
     """Neighbouring windows that share their errors, and are held out together."""
 
@@ -41,7 +43,7 @@ class Windows:
 
     maneuvers: tuple[Maneuver, ...]
     standing: int
-    """Windows that were left out because the robot stood still in them."""
+    """Windows that were left out because the robot stood still in them, or hardly moved."""
     unmeasured: int
     """Windows that were left out because wheels or reference had no data, or no valid measurement."""
     warnings: tuple[str, ...]
@@ -66,7 +68,8 @@ def cut(
     around = round(config.around_s / _NS)
     waiting: list[Span] = []
     found: list[tuple[Span, Maneuver]] = []
-    still: list[Span] = []
+    short: list[Span] = []
+    standing: list[Span] = []
     unmeasured = 0
 
     def take(until_ns: int | None) -> Iterator[Span]:
@@ -81,7 +84,9 @@ def cut(
         dt, rates, cg, lead, n = window
         rolled = robot.geometry.wheel_radius_m * np.abs(rates[lead : lead + n]).T @ dt[lead : lead + n]
         if np.max(rolled) < config.least_m:
-            still.append(span)
+            short.append(span)
+            if np.max(rolled) < config.standing_m:
+                standing.append(span)
         elif span.is_valid:
             end = np.array([n], dtype=np.int64)
             found.append((span, Maneuver(dt, rates, span.measured[None], end, cg, span.cov, lead=lead)))
@@ -100,14 +105,14 @@ def cut(
                 unmeasured += use(span)
     for span in take(None):
         unmeasured += use(span)
-    corrected = reference.correct([span for span, _ in found], still)
+    corrected = reference.correct([span for span, _ in found], standing)
     first = found[0][0].start_ns if found else 0
     maneuvers = []
     for (_, maneuver), span in zip(found, corrected, strict=True):
         number = int((span.start_ns - first) * _NS / (config.window_s * config.per_group))
         group = f"{name}, {number * config.window_s * config.per_group:g} s"
         maneuvers.append(dataclasses.replace(maneuver, measured=span.measured[None], cov=span.cov, group=group))
-    return Windows(tuple(maneuvers), len(still), unmeasured, tuple(reference.warnings()))
+    return Windows(tuple(maneuvers), len(short), unmeasured, tuple(reference.warnings()))
 
 
 def _window(history: WheelBuffer, span: Span, around: int) -> tuple[FloatArray, FloatArray, FloatArray, int, int] | None:

@@ -14,7 +14,7 @@ from localization.calibration.calibrate import MotionReferenceName
 from localization.calibration.windows import WindowConfig
 from localization.commands.common import new_folder, write_json
 from localization.diagnosis.baseline import estimate_baseline
-from localization.diagnosis.corrected_robot import correct_robot
+from localization.diagnosis.corrected_robot import correct_robot, is_held
 from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_runs, drive_of_table, read_runs
 from localization.diagnosis.findings import (
@@ -122,17 +122,21 @@ class Diagnose:
         d = found.diagnosis
         new, manual_steps = robot, ()  # type: Robot, tuple[str, ...]
         is_worse = d.handover is not None and not d.handover.is_better
-        is_corrected = bool(correctable_findings(d)) and not is_worse
+        corrected = [] if found.predictor is None or is_worse else [f for f in correctable_findings(d) if is_held(found.predictor, f)]
         if found.predictor is not None and correctable_findings(d):
             patch = correct_robot(found.predictor, d.hypothesis)
-            new, manual_steps = (patch.robot if is_corrected else robot), patch.manual_steps
+            new, manual_steps = (patch.robot if corrected else robot), patch.manual_steps
         if is_worse:
             manual_steps = (NOT_BETTER, *manual_steps)
-        named = (
-            "; ".join(f"{f.cause} {f.size:+.4g} +- {f.sigma:.2g} {f.definition.unit}".removesuffix(" 1") for f in d.findings) or "nothing"
-        )
-        title = "Corrected here" if is_corrected else "Found, not corrected"
-        remarks = [f"Diagnosed by skidloc: {d.model} on {d.log}, from {robot.name}.", f"{title}: {named}.", *manual_steps]
+        remarks = [f"Diagnosed by skidloc: {d.model} on {d.log}, from {robot.name}."]
+        for title, findings in (
+            ("Corrected here", corrected),
+            ("Found, not corrected here", [f for f in d.findings if f not in corrected]),
+        ):
+            named = (f"{f.cause} {f.size:+.4g} +- {f.sigma:.2g} {f.definition.unit}".removesuffix(" 1") for f in findings)
+            remarks += [f"{title}: {'; '.join(named)}."] if findings else []
+        remarks += ["Found: nothing."] if not d.findings else []
+        remarks += manual_steps
         if d.handover is not None:
             remarks.append(d.handover.describe())
         # in the folder's parent, paths start where they will start once it has its name

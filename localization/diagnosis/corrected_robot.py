@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from localization.diagnosis.causes import Hypothesis
-from localization.diagnosis.findings import HandoverCheck
+from localization.diagnosis.findings import Finding, HandoverCheck
 from localization.diagnosis.linearization import Linearization, make_regression
 from localization.diagnosis.prediction import CHANNELS, DrivePredictor, with_sizes
 from motion_models.base import MotionModel
@@ -31,6 +31,10 @@ _CLOCKS = ("wheel_time_offset_s", "lidar_time_offset_s", "gyro_time_offset_s")
 _PASSING = ("slope", "encoder_loss", "friction_change", "friction_change_at_s", "wheel_radius_drift", "wheel_lag_s", *_CLOCKS)
 
 
+_MEASURED = ("lidar_offset", "gyro_bias", "gyro_scale", "range_scale", "range_bias_m")
+"""What changes measurements, not the motion."""
+
+
 @dataclass(frozen=True)
 class CorrectedRobot:
     """A robot with the findings in it."""
@@ -47,9 +51,8 @@ def correct_robot(predictor: DrivePredictor, hypothesis: Hypothesis) -> Correcte
     robot = predictor.drive.robot
     shift = _shift(predictor, hypothesis)
     geometry, arms, note, shift = _with_cg(robot, _corrected_geometry(robot, hypothesis), shift)
-    mounts = dict(robot.mounts)
-    if any(hypothesis.lidar_offset):
-        frame = predictor.drive.lidar_frame or "laser"
+    mounts, frame = dict(robot.mounts), _lidar_frame(predictor)
+    if any(hypothesis.lidar_offset) and frame is not None:
         old = mounts.get(frame, Mount())
         x, y, yaw = hypothesis.lidar_offset
         mounts[frame] = dataclasses.replace(old, x=old.x + x, y=old.y + y, yaw=old.yaw + yaw)
@@ -58,7 +61,7 @@ def correct_robot(predictor: DrivePredictor, hypothesis: Hypothesis) -> Correcte
         law = _law(robot, hypothesis)
         options = {**options, FrictionModel.name: {**options.get(FrictionModel.name, {}), "contact": law}}
     new = dataclasses.replace(
-        robot, geometry=geometry, arms=arms, mounts=mounts, options=options, clock=_corrected_clock(robot.clock, hypothesis)
+        robot, geometry=geometry, arms=arms, mounts=mounts, options=options, clock=_corrected_clock(robot.clock, hypothesis, frame)
     )
     models = dict(robot.models)
     for name in MODELS:
@@ -69,15 +72,26 @@ def correct_robot(predictor: DrivePredictor, hypothesis: Hypothesis) -> Correcte
                 models[name] = _matched(predictor, _lasting(hypothesis), start, name, shift, ("track_width",))
         else:
             models[name] = _matched(predictor, _lasting(hypothesis), new, name, shift)
-    steps = (*note, *_manual_steps(robot, hypothesis, predictor.drive.lidar_frame or "laser"))
+    steps = (*note, *_manual_steps(robot, hypothesis, frame))
     return CorrectedRobot(dataclasses.replace(new, models=models), steps, shift)
+
+
+def is_held(predictor: DrivePredictor, finding: Finding) -> bool:
+    """Whether a robot file holds what corrects ``finding``; else it is to be corrected in a driver, or was of this drive alone."""
+    hypothesis = with_sizes({finding.definition: finding.size})
+    return Hypothesis() != _of_robot(hypothesis) or Hypothesis() != _of_sensors(hypothesis, predictor.drive.is_lidar_reference)
+
+
+def _lidar_frame(predictor: DrivePredictor) -> str | None:
+    """Frame of the LiDAR whose mount and clock were diagnosed; None where a reference measured the motion."""
+    return predictor.drive.lidar_frame or "laser" if predictor.drive.is_lidar_reference else None
 
 
 def check_handover(predictor: DrivePredictor, linearization: Linearization, named: Sequence[str]) -> HandoverCheck | None:
     """Correct the robot by the first half of the drive, and predict the second half with it; ``named`` are the keys of the findings.
 
-    What was measured is corrected by the same findings, as a corrected mount or clock would. None for drives of a table, without motion in
-    either half, and where all findings are of this drive alone.
+    What was measured is corrected by the mount and the clocks that the robot file holds, not by what is to be corrected in drivers. None for
+    drives of a table, without motion in either half, and where the robot file holds none of the findings.
     """
     drive = predictor.drive
     half = len(drive.maneuvers) // 2
@@ -90,7 +104,8 @@ def check_handover(predictor: DrivePredictor, linearization: Linearization, name
     problem = make_regression(first[0], first[1][..., chosen], first[2], linearization.noise, causes, linearization.tolerance)
     sizes = problem.fit(tuple(range(len(causes))))[0]
     hypothesis = with_sizes(dict(zip(causes, (float(v) for v in sizes), strict=True)))
-    if _lasting(hypothesis) == Hypothesis() == _of_sensors(hypothesis):
+    of_sensors = _of_sensors(hypothesis, predictor.drive.is_lidar_reference)
+    if _of_robot(hypothesis) == Hypothesis() == of_sensors:
         return None
     corrected = correct_robot(predictor, hypothesis)
     factors = corrected.robot.geometry.radius_multipliers / drive.robot.geometry.radius_multipliers
@@ -98,8 +113,8 @@ def check_handover(predictor: DrivePredictor, linearization: Linearization, name
     model = make_model(predictor.model.name, corrected.robot)
     corrected_drive = dataclasses.replace(drive, robot=corrected.robot, maneuvers=maneuvers)
     after = DrivePredictor(corrected_drive, model, has_inertia=predictor.has_inertia, baseline=predictor.baseline)
-    rows = predictor.discrepancies(Hypothesis()), after.discrepancies(_of_sensors(hypothesis))
-    shown = [c for c in range(3) if all(np.isfinite(r[half:, c]).any() for r in rows)]
+    rows = predictor.discrepancies(Hypothesis()), after.discrepancies(of_sensors)
+    shown = [c for c in range(4) if all(np.isfinite(r[half:, c]).any() for r in rows)]
     if not shown:
         return None
     before_rms, after_rms = ({CHANNELS[c]: float(np.sqrt(np.nanmean(r[half:, c] ** 2))) for c in shown} for r in rows)
@@ -110,10 +125,16 @@ def _arrays(linearization: Linearization) -> tuple[FloatArray, FloatArray, Float
     return linearization.linear, linearization.signatures, linearization.nuisances
 
 
-def _of_sensors(hypothesis: Hypothesis) -> Hypothesis:
-    """The part of ``hypothesis`` that changes measurements and clocks, not the motion of the robot."""
-    names = ("lidar_offset", "lidar_time_offset_s", "wheel_time_offset_s", "gyro_bias", "gyro_scale", "gyro_time_offset_s")
-    return Hypothesis(**{name: getattr(hypothesis, name) for name in (*names, "range_scale", "range_bias_m", "slope")})
+def _of_sensors(hypothesis: Hypothesis, is_lidar_reference: bool) -> Hypothesis:
+    """The part of ``hypothesis`` by which the robot file's mount and clocks change what was measured."""
+    names = ("wheel_time_offset_s", "gyro_time_offset_s", *(("lidar_offset", "lidar_time_offset_s") if is_lidar_reference else ()))
+    return Hypothesis(**{name: getattr(hypothesis, name) for name in names})
+
+
+def _of_robot(hypothesis: Hypothesis) -> Hypothesis:
+    """The part of ``hypothesis`` that changes the robot's motion."""
+    nothing, lasting = Hypothesis(), _lasting(hypothesis)
+    return dataclasses.replace(lasting, **{name: getattr(nothing, name) for name in _MEASURED})
 
 
 def _lasting(hypothesis: Hypothesis) -> Hypothesis:
@@ -160,26 +181,33 @@ def _with_cg(robot: Robot, geometry: Geometry, shift: FloatArray) -> tuple[Geome
     return geometry, arms, (note,), np.zeros(2)
 
 
-def _corrected_clock(clock: Clock, hypothesis: Hypothesis) -> Clock:
+def _corrected_clock(clock: Clock, hypothesis: Hypothesis, lidar_frame: str | None) -> Clock:
     return Clock(
         clock.wheel_time_offset_s + hypothesis.wheel_time_offset_s,
-        clock.lidar_time_offset_s + hypothesis.lidar_time_offset_s,
+        clock.lidar_time_offset_s + (0.0 if lidar_frame is None else hypothesis.lidar_time_offset_s),
         clock.gyro_time_offset_s + hypothesis.gyro_time_offset_s,
     )
 
 
-def _manual_steps(robot: Robot, h: Hypothesis, lidar_frame: str) -> list[str]:
-    """What to correct elsewhere, one sentence each."""
+def _manual_steps(robot: Robot, h: Hypothesis, lidar_frame: str | None) -> list[str]:
+    """What to correct elsewhere, one sentence each; ``lidar_frame`` is None where a reference measured the motion."""
     x, y, yaw = h.lidar_offset
-    clocks = "wheel", h.wheel_time_offset_s, "LiDAR", h.lidar_time_offset_s, "IMU", h.gyro_time_offset_s
-    late = ", ".join(f"{name} {1e3 * s:+.0f} ms" for name, s in zip(clocks[::2], clocks[1::2], strict=True) if s)
+    off = f"({x:+.4f} m, {y:+.4f} m, {yaw:+.4f} rad)"
+    lidar_s = 0.0 if lidar_frame is None else h.lidar_time_offset_s
+    reference_s = h.lidar_time_offset_s - lidar_s
+    clocks = ("wheel", h.wheel_time_offset_s), ("LiDAR", lidar_s), ("IMU", h.gyro_time_offset_s)
+    late = ", ".join(f"{name} {1e3 * s:+.0f} ms" for name, s in clocks if s)
     law = _law(robot, h)
     steps = (
         (
-            any(h.lidar_offset),
-            f"move {lidar_frame} by ({x:+.4f} m, {y:+.4f} m, {yaw:+.4f} rad) where /tf_static comes from: a log's "
-            "transforms go before [mounts].",
+            any(h.lidar_offset) and lidar_frame is not None,
+            f"move {lidar_frame} by {off} where /tf_static comes from: a log's transforms go before [mounts].",
         ),
+        (
+            any(h.lidar_offset) and lidar_frame is None,
+            f"the reference tracks a point that is {off} off the body's: give its poses of the body.",
+        ),
+        (reference_s, f"the reference's stamps are {1e3 * reference_s:+.0f} ms late: shift them, or synchronize its clock."),
         (late, f"stamps are late ({late}): [clock] corrects them; synchronize the clocks or correct the driver, and remove it."),
         (h.wheel_lag_s, f"the body follows the wheels {1e3 * h.wheel_lag_s:.0f} ms late."),
         (h.gyro_bias, f"the gyro's bias is {h.gyro_bias:+.5f} rad/s; let the driver zero it while the robot stands."),

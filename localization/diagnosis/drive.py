@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from localization.calibration.calibrate import MotionReferenceName, make_motion_reference
-from localization.calibration.motion_references import GyroMotionReference, MotionReference, Span, Wheels
+from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, MotionReference, Span, Wheels
 from localization.calibration.windows import WindowConfig, Windows, cut
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.gyro import GyroRecord
@@ -95,6 +95,8 @@ class Drive:
     """(W, 3) change of the measured motion per metre that is added to all ranges; None where no LiDAR measured it."""
     message_loss: MessageLoss | None = None
     standstill_turn: StandstillTurn | None = None
+    is_lidar_reference: bool = True
+    """Whether the LiDAR measured the motion: of tables, whose motion was measured by scan matching, too."""
     lidar_frame: str = ""
     """Frame of the scans that were matched."""
     lidar_at: tuple[float, float] = (0.0, 0.0)
@@ -243,6 +245,7 @@ def drive_of_events(
         range_slopes=recorder.range_slopes(),
         message_loss=find_message_loss(np.array(wheel_stamps, dtype=np.int64)),
         standstill_turn=find_standstill_turn(imu.gyro, recorder.standing, spans) if imu.stamps else None,
+        is_lidar_reference=isinstance(inner, LidarMotionReference),
         lidar_frame=frame,
         lidar_at=(mount.x, mount.y),
         warnings=(left, *([_describe_gaps(imu.gyro)] if imu.gyro.gaps else []), *windows.warnings),

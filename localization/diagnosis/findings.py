@@ -199,12 +199,12 @@ class HandoverCheck:
 
     @property
     def is_better(self) -> bool:
-        """Whether the product of all components' errors falls."""
-        return math.prod(self.after[c] / max(self.before[c], 1e-12) for c in self.before) < 1.0
+        """Whether the product of all components' errors does not grow."""
+        return math.prod(self.after[c] / max(self.before[c], 1e-12) for c in self.before) <= 1.0
 
     def describe(self) -> str:
         """Errors of the second half before and after, as a sentence without a stop."""
-        rows = ", ".join(f"{c} {self.before[c]:.3g} -> {self.after[c]:.3g} {'rad' if c == 'yaw' else 'm'}" for c in self.before)
+        rows = ", ".join(f"{c} {self.before[c]:.3g} -> {self.after[c]:.3g} {'rad' if c in ('yaw', 'gyro') else 'm'}" for c in self.before)
         return f"second half of the drive ({self.windows} windows), corrected by the first half alone: {rows} (root mean square)"
 
     def to_dict(self) -> dict[str, Any]:

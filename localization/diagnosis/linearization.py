@@ -17,6 +17,7 @@ from localization.diagnosis.causes import (
     Cause,
     Hypothesis,
     friction_change,
+    of_reference,
     payload,
     slope_across,
 )
@@ -161,16 +162,21 @@ def estimate_noise(
 
 
 def _mixing(z: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
-    """Inverse Cholesky factor of the channels' correlation, shrunk to the identity where few windows were measured."""
+    """Inverse Cholesky factor of the covariance of the channels' noise ``z`` (M, 6) in its sigmas, with variances of 1, shrunk to the
+    identity where few windows were measured.
+
+    A channel with less noise than its sigma, which has a lower bound, shares less of it with the others: by its correlation alone, what the
+    others measure would be taken for its own.
+    """
     n = known.astype(float).T @ known.astype(float)
     scale = np.sqrt(np.maximum(np.diag(z.T @ z) / np.maximum(np.diag(n), 1.0), 1e-12))
     scale = np.where(np.diag(n) > 0, scale, 1.0)
     correlation = (z.T @ z) / np.maximum(n, 1.0) / np.outer(scale, scale)
-    shrink = n / (n + 20.0)
-    correlation = np.where(np.eye(len(scale), dtype=bool), 1.0, correlation * shrink)
-    values, vectors = np.linalg.eigh(correlation)
-    correlation = (vectors * np.maximum(values, 0.05)) @ vectors.T
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(correlation)))
+    size = np.minimum(scale, 1.0)
+    cov = np.where(np.eye(len(scale), dtype=bool), 1.0, correlation * n / (n + 20.0) * np.outer(size, size))
+    values, vectors = np.linalg.eigh(cov)
+    cov = (vectors * np.maximum(values, 0.05)) @ vectors.T
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
 
 
 SKIDDING = frozenset(
@@ -376,7 +382,7 @@ def candidate_causes(predictor: DrivePredictor, moments: int) -> tuple[Cause, ..
     if drive.kind in ("rotations", "runs"):
         out |= {"lidar_time_offset", "wheel_time_offset", "slope", "lateral_slip_speed", "rotation_slip_speed", "longitudinal_slip_turning"}
     catalogue = {**CAUSES, "payload": payload(drive.robot.geometry.mass_kg)}
-    found = [e for e in catalogue.values() if e.id not in out]
+    found = [e if drive.is_lidar_reference else of_reference(e) for e in catalogue.values() if e.id not in out]
     if drive.kind == "log" and not drive.is_gyro_reference:
         found.append(slope_across())
         length = float(drive.starts_s[-1])

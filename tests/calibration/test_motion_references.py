@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, Span, Wheels
+from localization.calibration.windows import WindowConfig, cut
 from localization.events import ImuSample, Scan, WheelSample
 from localization.simulation.world import WORLDS
 from localization.wheel_buffer import WheelBuffer
@@ -52,3 +53,22 @@ def test_gyro_reference_variance_includes_the_scale():
         wheels.buffer.insert(WheelSample(i * _NS // 100, np.full(2, np.nan), np.zeros(2)))
         found += list(reference.spans(ImuSample(i * _NS // 100, np.array([0.0, 0.0, 0.8]), np.array([0.0, 0.0, 9.81])), wheels))
     assert found[0].cov[2, 2] == pytest.approx(noise.white_rad_per_sqrt_s**2 + (0.01 * 0.8) ** 2)
+
+
+def test_gyro_reference_measures_its_bias_where_no_wheel_turns() -> None:
+    """A small robot without a bias, which turns in place for 4 s and stops, at times of windows of 2 s or between: a wheel that rolls for a
+    part of a window by less than what counts as motion turns the robot by several degrees."""
+    robot = load_robot("turtlebot3_burger")
+    half, radius = 0.5 * robot.geometry.track_width_m, robot.geometry.wheel_radius_m
+    events: list[WheelSample | ImuSample] = []
+    angle, wheel = 0.0, np.zeros(2)
+    for i in range(3000):
+        t = i * 0.02
+        rate = 0.5 * float(t % 7.3 < 4.0) * (-1.0 if int(t / 7.3) % 2 else 1.0)
+        angle, wheel = angle + 0.02 * rate, wheel + 0.02 * rate * half / radius * np.array([-1.0, 1.0])
+        events.append(WheelSample(i * _NS // 50, np.full(2, np.nan), wheel.copy()))
+        events.append(ImuSample(i * _NS // 50, np.array([0.0, 0.0, rate]), np.array([0.0, 0.0, 9.81]), "base_link"))
+    reference = GyroMotionReference(robot.gyro_noise, {}, 2.0)
+    found = cut(events, reference, make_model("diff_drive", robot), robot, WindowConfig(window_s=2.0))
+    assert found.standing > 0
+    assert reference._bias is None or abs(reference._bias[0]) < 1e-3

@@ -13,6 +13,9 @@ from localization.cli import main
 from localization.commands.diagnose import print_diagnosis
 from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import drive_of_table
+from localization.logs import open_log
+from localization.trajectory import Trajectory, write_tum
+from motion_models import se2
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
@@ -140,3 +143,38 @@ def test_diagnose_existing_out_is_refused(tmp_path: Path, capsys: pytest.Capture
 def test_diagnose_invalid_window_length_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["diagnose", str(tmp_path / "table.csv"), "--robot", "vaultbot", "--window-s", "nan"]) == 2
     assert "--window-s is nan; windows of 0.5 to 20 s make sense" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("ahead_m", "late_s", "words"),
+    [(0.0, 0.08, "the reference's stamps are 80 ms late"), (0.12, 0.0, "the point that the reference tracks lies 120 mm ahead")],
+)
+def test_diagnose_reference_that_is_off_changes_no_lidar(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], ahead_m: float, late_s: float, words: str
+) -> None:
+    """A healthy robot with a LiDAR, against a motion capture whose clock or marker is off: nothing of it goes into the robot file."""
+    log, track = bag(tmp_path / "drive.mcap", {}, 34, "husky_a200"), tmp_path / "track.tum"
+    samples = list(open_log(log, load_robot("husky_a200")).references("/ground_truth/odom"))
+    poses = np.array([[*sample.position[:2], sample.yaw] for sample in samples])
+    write_tum(track, Trajectory(np.array([s.stamp_ns for s in samples]) + round(late_s * 1e9), se2.compose(poses, [ahead_m, 0.0, 0.0])))
+    assert main(["diagnose", str(log), "--robot", "husky_a200", "--reference", str(track), "--out", str(tmp_path / "out")]) == 0
+    assert words in capsys.readouterr().out
+    written, nominal = load_robot(str(tmp_path / "out" / "robot.toml")), load_robot("husky_a200")
+    assert written.mounts == nominal.mounts
+    assert written.clock == nominal.clock
+    assert "Corrected here" not in (tmp_path / "out" / "robot.toml").read_text()
+
+
+@pytest.mark.parametrize(("cause", "size", "is_corrected"), [("gyro_time_offset", 0.07, True), ("gyro_scale", 0.05, False)])
+def test_diagnose_gyro_is_corrected_where_the_robot_file_holds_it(tmp_path: Path, cause: str, size: float, is_corrected: bool) -> None:
+    """Its clock is in the robot file, its scale in the driver."""
+    log = bag(tmp_path / "drive.mcap", {cause: size}, 31, "husky_a200")
+    assert main(["diagnose", str(log), "--robot", "husky_a200", "--out", str(tmp_path / "out")]) == 0
+    text, robot = (tmp_path / "out" / "robot.toml").read_text(), load_robot(str(tmp_path / "out" / "robot.toml"))
+    found = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert (f"Corrected here: {cause}" in text) == is_corrected
+    assert (f"Found, not corrected here: {cause}" in text) != is_corrected
+    assert robot.clock.gyro_time_offset_s == pytest.approx(size if is_corrected else 0.0, abs=0.01)
+    assert (found["handover"] is None) != is_corrected
+    if is_corrected:
+        assert found["handover"]["rms_after"]["gyro"] < 0.6 * found["handover"]["rms_before"]["gyro"]

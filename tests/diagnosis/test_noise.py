@@ -9,7 +9,7 @@ from localization.diagnosis.linearization import CHANNELS, estimate_noise
 from motion_models.se2 import FloatArray
 
 WINDOWS, SIGMA, CREEP = 60, 3e-4, 6e-3
-YAW = CHANNELS.index("yaw")
+YAW, FORCE = CHANNELS.index("yaw"), CHANNELS.index("force_x")
 
 
 def estimated(left: FloatArray, creep: FloatArray) -> FloatArray:
@@ -41,3 +41,14 @@ def test_noise_of_few_windows_is_the_claimed_one() -> None:
     left = np.full(WINDOWS, np.nan)
     left[[3, 20, 41]] = 0.001
     assert (estimated(left, np.zeros(WINDOWS))[[3, 20, 41]] == SIGMA).all()
+
+
+def test_noise_below_its_sigma_takes_no_other_channel_for_its_own() -> None:
+    """A reference that is far better than it claims: its yaw and the force err alike, by a hundredth of their sigmas."""
+    left, claimed = np.full((WINDOWS, 6), np.nan), np.full((WINDOWS, 6), 0.01)
+    left[:, YAW] = left[:, FORCE] = np.random.default_rng(0).normal(0.0, 1e-4, WINDOWS)
+    features = np.column_stack([np.ones(WINDOWS), np.zeros((WINDOWS, 2))])
+    noise = estimate_noise(left, features, np.zeros(WINDOWS, dtype=bool), np.zeros(6), (claimed, 5.0), np.zeros((WINDOWS, 6)))
+    turn = np.zeros((WINDOWS, 6))
+    turn[:, YAW] = 0.01
+    assert np.abs(noise.whiten(turn)[:, FORCE]).max() < 0.01 * np.abs(noise.whiten(turn)[:, YAW]).min()
