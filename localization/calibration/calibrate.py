@@ -20,7 +20,7 @@ from motion_models.base import MotionModel
 from motion_models.calibration.cross_validation import HeldOut, LearnedNoise, cross_validate, learn_noise
 from motion_models.calibration.fit import Fit, FitConfig, fit
 from motion_models.calibration.maneuvers import IntArray, Maneuver
-from motion_models.calibration.plan import Calibration, calibrate, free_of
+from motion_models.calibration.plan import CLOCK, Calibration, calibrate, free_of
 from motion_models.errors import CalibrationError
 from motion_models.online_calibration import RADIUS_NAMES, CorrectedWheels
 from motion_models.registry import make_model
@@ -61,7 +61,7 @@ class Calibrated:
     heldout: HeldOut | None
     """The same by fits without the maneuver's group; None for too few groups to leave any out."""
     systematic: dict[str, float]
-    """Sigma by parameter that no number of maneuvers averages out: the gyro's scale; empty without a gyro."""
+    """Sigma by parameter that no number of maneuvers averages out: the gyro's scale, and how bodies follow their wheels."""
     noise: LearnedNoise
     """Factors on the robot file's wheel noise, by the errors on held-out maneuvers; 1 where none were held out."""
 
@@ -195,10 +195,22 @@ def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequ
     heldout = cross_validate(train, maneuvers, min(_FOLDS, len(names))) if len(names) >= _FEWEST_GROUPS else None
     before = dataclasses.replace(found.fit, params=model.nominal, reference_params=np.zeros(5)).residuals(maneuvers)
     inside = found.fit.residuals(maneuvers)
-    systematic = _gyro_scale(train, found.fit, maneuvers, cuts, robot)
+    systematic = {**_gyro_scale(train, found.fit, maneuvers, cuts, robot), CLOCK: _CLOCK_SIGMA_S}
     is_learned = heldout is not None and not of_rotations
     noise = learn_noise(found.fit, maneuvers, heldout.residuals) if heldout is not None and is_learned else LearnedNoise(1.0, 1.0)
     return Calibrated(model, found, before, inside, group, _position_known(maneuvers), heldout, systematic, noise)
+
+
+def with_clock(robot: Robot, found: Calibrated, cuts: Sequence[Cut]) -> Robot:
+    """``robot`` with the wheels' clock that was fitted, against LiDAR or gyro and twice its sigma or more; a reference is no sensor of the
+    robot, so that its clock may be the one that is off."""
+    if CLOCK not in found.fit.names or any(each.measured_by.startswith("reference") for each in cuts):
+        return robot
+    offset = float(found.fit.values[found.fit.names.index(CLOCK)])
+    if abs(offset) < 2.0 * found.sigmas[CLOCK]:
+        return robot
+    clock = dataclasses.replace(robot.clock, wheel_time_offset_s=robot.clock.wheel_time_offset_s + offset)
+    return dataclasses.replace(robot, clock=clock)
 
 
 def _least_error(residuals: FloatArray) -> float:
@@ -206,6 +218,8 @@ def _least_error(residuals: FloatArray) -> float:
     return float(np.mean(residuals**2)) + _FINEST_ERROR**2
 
 
+_CLOCK_SIGMA_S = 0.008
+"""Of the wheels' clock by models without inertia: a simulated Husky's is 9 ms off (`diagnose` tolerates as much)."""
 _FINEST_ERROR = 1e-4
 """Of a position [m] or heading [rad]; what the best references resolve."""
 _NO_SLIP = WheelNoise(*(0.0,) * 8)

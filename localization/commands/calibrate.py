@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from localization.calibration.calibrate import Calibrated, Cut, MotionReferenceName, Turning, calibrated, cut_log, turning
+from localization.calibration.calibrate import Calibrated, Cut, MotionReferenceName, Turning, calibrated, cut_log, turning, with_clock
 from localization.calibration.windows import WindowConfig
 from localization.commands.calibration_tables import (
     calibration_numbers,
@@ -128,6 +128,8 @@ class Calibrate:
         if not found.is_recommended:
             return robot, {}, numbers
         calibrated_robot = found.fit.robot(robot)
+        if kind == "log":
+            calibrated_robot = with_clock(calibrated_robot, found, cuts)
         return dataclasses.replace(calibrated_robot, wheel_noise=found.noise.scaled(robot.wheel_noise)), found.sigmas, numbers
 
     def _cut(self, path: Path, robot: Robot, kind: str) -> Cut:

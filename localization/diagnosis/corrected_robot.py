@@ -90,8 +90,8 @@ def _lidar_frame(predictor: DrivePredictor) -> str | None:
 def check_handover(predictor: DrivePredictor, linearization: Linearization, named: Sequence[str]) -> HandoverCheck | None:
     """Correct the robot by the first half of the drive, and predict the second half with it; ``named`` are the keys of the findings.
 
-    What was measured is corrected by the mount and the clocks that the robot file holds, not by what is to be corrected in drivers. None for
-    drives of a table, without motion in either half, and where the robot file holds none of the findings.
+    What was measured is corrected by the mount and the clocks that the robot file holds, not by what is to be corrected in drivers.
+    None for drives of a table, without motion in either half, and where the robot file holds none of the findings.
     """
     drive = predictor.drive
     half = len(drive.maneuvers) // 2

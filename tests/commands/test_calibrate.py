@@ -24,7 +24,7 @@ from motion_models.calibration.maneuvers import Maneuver, read_windows, windows_
 from motion_models.preintegration import integrate_twists
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import WheelNoise, load_robot
-from tests.helpers import bags
+from tests.helpers import bags, diagnosis_drives
 from tests.helpers.bags import START, WHEELS, Record, S
 from tests.studies import drive_husky, friction_grid, thesis_regressions
 
@@ -539,3 +539,19 @@ def test_calibrate_with_bad_options_is_refused(tmp_path: Path, capsys: pytest.Ca
     ):
         assert complaint in refused(capsys, *arguments), arguments
     assert list(tmp_path.iterdir()) == [there]
+
+
+def test_calibrate_writes_the_clock_that_its_errors_are_without(tmp_path: Path) -> None:
+    """Wheels stamped 90 ms early: calibrated again, the robot file has the errors that were promised for it."""
+    log, first, second = (
+        diagnosis_drives.bag(tmp_path / "drive.mcap", {"wheel_time_offset": -0.09}, 7, "husky_a200"),
+        tmp_path / "1.json",
+        tmp_path / "2.json",
+    )
+    command = ["calibrate", str(log), "--model", "diff_drive", "--robot"]
+    assert main([*command, "husky_a200", "--out", str(tmp_path / "robot.toml"), "--json", str(first)]) == 0
+    assert load_robot(str(tmp_path / "robot.toml")).clock.wheel_time_offset_s == pytest.approx(-0.09, abs=0.016)
+    assert main([*command, str(tmp_path / "robot.toml"), "--json", str(second)]) == 0
+    promised, kept = (json.loads(path.read_text())["errors"]["heading_deg"] for path in (first, second))
+    assert promised["after"][0] < 0.3 * promised["before"][0]
+    assert kept["before"][0] == pytest.approx(promised["after"][0], rel=0.2)
