@@ -361,13 +361,18 @@ def separating_drive(predictor: DrivePredictor, findings: Sequence[Finding]) -> 
     named = [(CAUSES.get(name) or WINDOW_CAUSES.get(name), size) for name, size in finding.aliases[:4]]
     pairs = [(finding.definition, finding.size), *((cause, size) for cause, size in named if cause is not None)]
     base = with_sizes({f.definition: f.size for f in findings if f is not finding})
+    if predictor.drive.gyro is None and {finding.cause, *(name for name, _ in finding.aliases)} == {
+        "wheel_time_offset",
+        "lidar_time_offset",
+    }:
+        return f"No drive separates {listed}: an IMU, as a third clock, does."
+    sharpness = (finding.size / finding.sigma) ** 2  # information of this drive about the relative size
     best, is_shown = ("", 1e-3), np.zeros(len(pairs), dtype=bool)
     for text, tried in _candidate_drives(predictor):
         start = tried.discrepancies(base)[:, :3]
         moved = [(start - tried.discrepancies(cause.inject(base, size))[:, :3]) / _SIGMA for cause, size in pairs]
         is_shown |= [bool(np.any(change)) for change in moved]
-        # a rival may take whatever size it likes in the new drive, but then it no longer fits the old one
-        information = min((float(np.sum((moved[0] - other) ** 2)) for other in moved[1:]), default=0.0)
+        information = min((_information_apart(moved[0], other, sharpness) for other in moved[1:]), default=0.0)
         if information > 1.05 * best[1]:
             best = text, information
     seconds = max(_SECONDS, 5.0 * math.ceil(_SECONDS * _ENOUGH / best[1] / 5.0))
@@ -376,6 +381,13 @@ def separating_drive(predictor: DrivePredictor, findings: Sequence[Finding]) -> 
     if not is_shown.all() or len(pairs) < len(named) + 1:  # errors of gyro, ranges and encoders, changes on the way
         return f"To separate {listed}, record two minutes: standing, turning in place to both sides, slow and fast, and straight driving."
     return f"No drive of two minutes separates {listed}: measure one of them directly."
+
+
+def _information_apart(change: FloatArray, other: FloatArray, sharpness: float) -> float:
+    """Squared distance, in sigmas, of a ``change`` (M, 3) from the ``other`` one at the size of the latter that fits best: it is known from
+    the drive that was diagnosed, with the information ``sharpness``."""
+    size = (float(np.sum(change * other)) + sharpness) / (float(np.sum(other**2)) + sharpness)
+    return float(np.sum((change - size * other) ** 2)) + sharpness * (size - 1.0) ** 2
 
 
 def confirming_drive(predictor: DrivePredictor, linearization: Linearization, i: int, size: float) -> str:

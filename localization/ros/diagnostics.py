@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,9 @@ from localization.pipeline import Pipeline
 from motion_models.errors import SkidlocError
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
+
+if TYPE_CHECKING:
+    from localization.diagnosis.diagnose import DiagnosisResult
 
 OK, WARN, ERROR = 0, 1, 2
 
@@ -418,21 +421,30 @@ def diagnose_events(events: Sequence[Event], request: Request) -> Status:
         found = examine(drive, make_model(request.model, robot))
     except SkidlocError as error:
         return Status(_NAME, OK, f"{name} cannot be diagnosed: {error}")
+    return _status_of(found, robot, name)
+
+
+def _status_of(found: DiagnosisResult, robot: Robot, name: str) -> Status:
+    """Each finding that is to be corrected with its remedy; with the whole sentence where the verdict is unexplained."""
+    from localization.diagnosis.causes import MISSING_MESSAGES
+    from localization.diagnosis.corrected_robot import correct_robot
+    from localization.diagnosis.findings import correctable_findings, describe_sizes
+
     d = found.diagnosis
     values = {"verdict": d.verdict, "windows": str(d.windows), "model": d.model}
-    if not d.findings:
-        is_good = d.verdict in ("consistent", "undecidable")
-        return Status(_NAME, OK if is_good else WARN, f"{d.verdict}, {name}: {d.sentence}", values)
-    from localization.diagnosis.corrected_robot import correct_robot
-
-    assert found.predictor is not None  # where there are findings
-    corrected = correct_robot(found.predictor, d.hypothesis).robot
+    if found.predictor is not None:
+        robot = correct_robot(found.predictor, d.hypothesis).robot
     texts = []
-    for i, finding in enumerate(d.findings, 1):
-        remedy = _REMEDIES.get(finding.cause, _OTHER_REMEDY).format(g=corrected.geometry, c=corrected.clock)
-        texts.append(f"{finding.definition.describe(finding.size, finding.sigma)}: {remedy}.")
+    corrected = correctable_findings(d)
+    for i, finding in enumerate((f for f in d.findings if f in corrected or f.cause == MISSING_MESSAGES.id), 1):
+        remedy = _REMEDIES.get(finding.cause, _OTHER_REMEDY).format(g=robot.geometry, c=robot.clock)
+        aliases = f" (or {describe_sizes(finding.aliases)})" if finding.aliases else ""
+        texts.append(f"{finding.definition.describe(finding.size, finding.sigma)}{aliases}: {remedy}.")
         values[f"finding_{i}"] = f"{finding.cause} {finding.size:+.4g} +- {finding.sigma:.2g} {finding.definition.unit}"
         values[f"remedy_{i}"] = remedy
         if finding.aliases:
-            values[f"or_{i}"] = ", ".join(f"{alias} {size:+.3g}" for alias, size in finding.aliases)
-    return Status(_NAME, WARN, f"{name}: {' '.join(texts)}", values)
+            values[f"or_{i}"] = describe_sizes(finding.aliases)
+    if texts and d.verdict in ("explained", "ambiguous"):
+        return Status(_NAME, WARN, f"{name}: {' '.join(texts)}", values)
+    is_good = d.verdict in ("consistent", "undecidable") and not texts
+    return Status(_NAME, OK if is_good else WARN, " ".join([f"{d.verdict}, {name}: {d.sentence}", *texts]), values)

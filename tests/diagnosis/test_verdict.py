@@ -22,7 +22,7 @@ from localization.diagnosis.findings import (
     sentence,
 )
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
-from localization.diagnosis.verdict import candidate_maneuvers, decide, mark_trends, separating_drive
+from localization.diagnosis.verdict import _information_apart, candidate_maneuvers, decide, mark_trends, separating_drive
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
@@ -141,7 +141,15 @@ def test_separating_drive_lists_each_cause_once() -> None:
     robot = load_robot("husky_a200")
     rest = Maneuver(np.full(20, 0.1), np.ones((20, 2)), np.zeros((1, 3)), np.array([20]), np.zeros(2), 1e-6 * np.eye(3))
     predictor = DrivePredictor(drive_of_table("log", robot, [rest], "windows"), make_model("friction", robot), has_inertia=False)
-    clocks = separating_drive(predictor, [finding("wheel_time_offset", -0.08, (("lidar_time_offset", 0.08),))])
-    assert clocks == "No drive of two minutes separates wheel_time_offset and lidar_time_offset: measure one of them directly."
+    clocks = separating_drive(predictor, [finding("wheel_time_offset", -0.0808, (("lidar_time_offset", 0.08),))])
+    assert clocks == "No drive separates wheel_time_offset and lidar_time_offset: an IMU, as a third clock, does."
     gyro = separating_drive(predictor, [finding("gyro_scale", 0.02, (("gyro_bias", 0.01), ("track_width", 0.02)))])
     assert gyro.startswith("To separate gyro_scale, gyro_bias and track_width, record ")
+
+
+def test_separating_drive_does_not_rest_on_how_sizes_were_rounded() -> None:
+    """A scale of ranges and one of the wheels act alike but for 1 % of their size, which the drive has measured to 5 %."""
+    change = np.random.default_rng(0).normal(size=(50, 3)) * 10.0
+    assert _information_apart(change, 1.01 * change, 20.0**2) < 0.05
+    assert 90.0 < _information_apart(change, 2.0 * change, 20.0**2) < 0.25 * 20.0**2 + 1.0
+    assert _information_apart(change, change[::-1], 20.0**2) > 200.0

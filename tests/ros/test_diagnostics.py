@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from localization.estimators import Estimate
-from localization.events import Scan, WheelSample
+from localization.events import ImuSample, Scan, WheelSample
 from localization.logs import open_log
 from localization.ros.diagnostics import ERROR, OK, WARN, Doctor, Health, Request, Status, diagnose_events
 from localization.ros.publisher import DIAGNOSTICS, ODOMETRY
@@ -23,7 +23,7 @@ from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from motion_models.robot import load_robot
-from tests.helpers.diagnosis_drives import drive
+from tests.helpers.diagnosis_drives import bag, drive
 from tests.helpers.online import ROBOT, LogTransport, drive_events, drive_log, new_core, published, run_node
 
 
@@ -99,6 +99,29 @@ def test_doctor_tyres_differ_reports_remedy(tmp_path: Path) -> None:
     multiplier = float(status.message.split("left_wheel_radius_multiplier = ")[1].split()[0])
     assert multiplier == pytest.approx(0.99, abs=0.003)
     assert status.values["finding_1"].startswith("wheel_radius_difference -0.0")
+
+
+def test_doctor_few_windows_without_messages_reports_the_loss(tmp_path: Path) -> None:
+    """Too short to be diagnosed, and every fifth message of the wheels in ten missing."""
+    robot = load_robot("husky_a200")
+    log = open_log(bag(tmp_path / "drive.mcap", {}, 7, "husky_a200", drive("20s")), robot)
+    events = [e for e in log.events() if e.stamp_ns < log.start_ns + 14 * 10**9]
+    wheels = [e for e in events if isinstance(e, WheelSample)]
+    lost = {id(e) for i, e in enumerate(wheels) if i // 10 % 5 == 0}
+    status = diagnose_events([e for e in events if id(e) not in lost], Request(robot, "friction", dict(log.mounts)))
+    assert status.level == WARN
+    assert status.message.startswith("undecidable")
+    assert "check the driver of the wheels and the network" in status.message
+
+
+def test_doctor_clock_names_its_alias_in_the_message(tmp_path: Path) -> None:
+    """Without a gyro, wheels that are early are a LiDAR that is late."""
+    robot = load_robot("husky_a200")
+    log = open_log(bag(tmp_path / "drive.mcap", {"wheel_time_offset": -0.09}, 7, "husky_a200"), robot)
+    events = [e for e in log.events() if not isinstance(e, ImuSample)]
+    status = diagnose_events(events, Request(robot, "friction", dict(log.mounts)))
+    assert "the wheels' stamps are 90" in status.message
+    assert "(or lidar_time_offset +0.0" in status.message
 
 
 def test_doctor_process_receives_thinned_events() -> None:
