@@ -30,7 +30,7 @@ FORMS: tuple[Form, ...] = ("none", "constant", "cg_field")
 # Prior sigmas, for robots of one type on different floors and with other loads: relative of the rotation scaling (Clearpath's own
 # multipliers for one Husky range from 1.5 to 1.9; terrains differ by a quarter), absolute of the centre of rotation [m].
 _TURNING, _CENTRE_X, _CENTRE_Y = 0.15, 0.05, 0.03
-_PRIOR_RETURNS_AFTER_S = 3600.0
+PRIOR_RETURNS_AFTER_S = 3600.0
 """Time in which a correction's random walk grows to its prior standard deviation [s]: tyres and loads change within an hour."""
 _WARP = 0.15  # VaultBot's chassis, as its rotations show it, moves 13 % of m g / 4 to two opposite wheels
 _MU_RATIO = 0.3
@@ -130,7 +130,7 @@ def make_corrections(model: MotionModel, form: Form) -> Corrections:
     has_radii = any(c.name in RADIUS_NAMES for c in found)  # observed where the robot drives straight
     minimum = 0.0 if has_radii else {"skid_steer": _IN_PLACE, "friction": _NOT_STRAIGHT}.get(model.name, 0.0)
     prior = np.diag(sigmas**2)
-    return Corrections(tuple(c.name for c in found), directions, prior, prior / _PRIOR_RETURNS_AFTER_S, minimum)
+    return Corrections(tuple(c.name for c in found), directions, prior, prior / PRIOR_RETURNS_AFTER_S, minimum)
 
 
 def _named(model: MotionModel, form: Form) -> tuple[Correction, ...]:
@@ -175,7 +175,7 @@ def _regressions(model: MotionModel) -> Corrections:
     floor[0:3, 0] = turning * model.nominal[0:3]  # another floor scales k at every CG
     floor[3, 1], floor[5, 2] = _CENTRE_X, _CENTRE_Y
     spread = floor @ floor.T
-    return Corrections(model.param_names, np.eye(n), _regression_cov() + spread, spread / _PRIOR_RETURNS_AFTER_S, _IN_PLACE)
+    return Corrections(model.param_names, np.eye(n), _regression_cov() + spread, spread / PRIOR_RETURNS_AFTER_S, _IN_PLACE)
 
 
 def _singles(model: MotionModel) -> tuple[Correction, ...]:

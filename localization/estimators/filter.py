@@ -3,7 +3,7 @@
 The mean pose lives on the manifold; the error state's mean is zero (Sola 2017, "Quaternion kinematics for the error-state Kalman filter"),
 with right perturbations: true pose = pose * exp(error).
 
-    e = [ pose, start, map, key, gyro bias, gyro scale, clock offset, corrections ]
+    e = [ pose, start, map, key, gyro bias, gyro scale, clock offset, wheel radius, corrections ]
 
 `start` and `key` are clones of the pose (Roumeliotis & Burdick 2002, stochastic cloning) at the start of the step and at the last
 keyframe. `map` is the error of the submap around the robot, as a right perturbation of the pose. Scans that are matched to one submap
@@ -25,12 +25,12 @@ from localization.events import Step, Turn
 from localization.lidar import FORGETTING, OUTLIER_SIGMAS, KeyScanError
 from localization.settings import Settings
 from motion_models import se2
-from motion_models.online_calibration import Corrections
+from motion_models.online_calibration import PRIOR_RETURNS_AFTER_S, Corrections
 from motion_models.robot import GyroNoise
 from motion_models.se2 import Cov3, FloatArray, Pose2
 
 POSE, START, MAP, KEY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-BIAS, SCALE, CLOCK, PARAMS = 12, 13, 14, 15
+BIAS, SCALE, CLOCK, RADIUS, PARAMS = 12, 13, 14, 15, 16
 _MIN_VARIANCE = 1e-14
 """Variance of a relative motion, at least: a tenth of a micrometre or microradian [m^2, rad^2]."""
 _MAX_NUMBER = 1e12
@@ -50,6 +50,8 @@ class FilterConfig(Settings):
     """Sigma of the offset between the clocks of the wheels and of LiDAR or gyro at first [s]; 0 takes them as one."""
     clock_walk_s_per_sqrt_s: float = 1e-4
     """Random walk of the clock offset."""
+    wheel_radius_sigma: float = 0.03
+    """Prior sigma of the radius of all wheels, relative: wear, pressure and load of tyres; 0 takes the robot file's. It takes a LiDAR."""
     standstill_m2_per_s: float = 1e-6
     """Variance of the position while no wheel moves, per second: a push, a slope [m^2/s]."""
     standstill_rad2_per_s: float = 1e-6
@@ -64,12 +66,13 @@ class Filter:
         n = PARAMS + len(corrections.names)
         self.pose, self.start, self.key = np.zeros(3), np.zeros(3), np.zeros(3)
         """(3,) estimates of the pose, and of its clones."""
-        self.bias, self.scale, self.clock_offset = 0.0, 0.0, 0.0
+        self.bias, self.scale, self.clock_offset, self.radius_scale = 0.0, 0.0, 0.0, 0.0
         self.corrections = np.zeros(len(corrections.names))
         """(k,) added to the motion model's parameters along the corrections' directions."""
         self.P = np.zeros((n, n))
         self.P[BIAS, BIAS], self.P[SCALE, SCALE] = gyro.bias_sigma_rad_per_s**2, gyro.scale_sigma**2
         self.P[CLOCK, CLOCK] = config.clock_sigma_s**2
+        self.P[RADIUS, RADIUS] = config.wheel_radius_sigma**2
         self.P[PARAMS:, PARAMS:] = corrections.cov
         self.is_considered = np.zeros(n, dtype=bool)
         """(n,) states that have no gain."""
@@ -81,15 +84,19 @@ class Filter:
     def predict(self, step: Step, is_turning: bool = True) -> None:
         """Move by the wheels' motion (delta, covariance, derivatives) of ``step``:
 
-        e_pose' = Ad(delta^-1) e_pose + (d delta / d clock) e_clock + (d delta / d params) e_params + slip.
+        e_pose' = Ad(delta^-1) e_pose + (d delta / d clock) e_clock + (d delta / d radius) e_radius + (d delta / d params) e_params + slip.
+
+        Ways scale with the wheels' radius; turns have a scale of their own among the parameters.
 
         Motion that is not ``is_turning`` does not excite the corrections: until the next step, they are consider states.
         """
         motion, dt = step.predicted, step.duration
-        A = se2.adjoint(se2.inverse(motion.delta))
+        delta = motion.delta * [1.0 + self.radius_scale, 1.0 + self.radius_scale, 1.0]
+        A = se2.adjoint(se2.inverse(delta))
         F = np.eye(len(self.P))
         F[POSE, POSE] = A
         F[POSE, CLOCK] = step.d_clock
+        F[POSE, RADIUS] = np.append(-se2.inverse(motion.delta)[:2], 0.0)  # R^T (x, y)
         F[POSE, PARAMS:] = motion.d_params @ self._corrections.directions
         F[START, START], F[START, POSE] = 0.0, np.eye(3)  # the clone of the pose as it was
         F[MAP, MAP] = A  # the same error of the submap, as a perturbation of the present pose
@@ -104,8 +111,9 @@ class Filter:
             Q[POSE, POSE] += np.diag([c.standstill_m2_per_s, c.standstill_m2_per_s, c.standstill_rad2_per_s]) * dt
         else:
             Q[PARAMS:, PARAMS:] = self._corrections.process_noise * dt
+            Q[RADIUS, RADIUS] = self._config.wheel_radius_sigma**2 / PRIOR_RETURNS_AFTER_S * dt
         _, P = predict_linear(np.zeros(len(F)), self.P, F=F, Q=Q)  # P = F P F^T + Q
-        pose = se2.compose(self.pose, motion.delta)
+        pose = se2.compose(self.pose, delta)
         _check(f"the motion of the wheels until stamp {step.end_ns} ns", pose, P)
         self.start, self.pose, self.P = self.pose, pose, P
         self.is_considered[PARAMS:] = not is_turning
@@ -199,6 +207,7 @@ class Filter:
         self.bias += float(error[BIAS])
         self.scale += float(error[SCALE])
         self.clock_offset += float(error[CLOCK])
+        self.radius_scale += float(error[RADIUS])
         self.corrections = self.corrections + error[PARAMS:]
 
 

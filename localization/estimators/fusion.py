@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from localization.estimators.base import NO_POINTS, Estimate, Estimator, mean_twist
-from localization.estimators.filter import BIAS, CLOCK, MAP, PARAMS, POSE, SCALE, START, Filter, FilterConfig
+from localization.estimators.filter import BIAS, CLOCK, MAP, PARAMS, POSE, RADIUS, SCALE, START, Filter, FilterConfig
 from localization.events import Step
 from localization.lidar import FORGETTING, OUTLIER_SIGMAS, LostScans, ScanMatchingSensor
 from motion_models import se2
@@ -22,6 +22,9 @@ _PRIOR_SCANS = 0.2
 """Weight of white slip, as the wheels' noise model has it, in scans: the first key scans are drawn by then, and their error stays (NEES of
 simulated rooms with weight 1: 1.6, with 0.2: 1.9; with white slip 4.7 and 4.8)."""
 
+_MIN_CLOCK_OFFSET_S = 0.05
+"""Of a warning: at 1 m/s and 1 rad/s, 5 cm and 3 deg."""
+
 
 class EkfFusion(Estimator):
     """`step` after `step`: predict by the wheels, update by the gyro, match the scan, update by it; the submap grows afterwards."""
@@ -29,7 +32,11 @@ class EkfFusion(Estimator):
     def __init__(self, model: MotionModel, corrections: Corrections, robot: Robot, sensor: ScanMatchingSensor | None, config: FilterConfig):
         """``sensor``: None without a LiDAR; then there is no second clock until the gyro's first reading."""
         self._clock_sigma_s = config.clock_sigma_s if sensor is None else 0.0
-        self.filter = Filter(robot.gyro_noise, corrections, replace(config, clock_sigma_s=0.0) if sensor is None else config)
+        if sensor is None:  # nothing measures ways
+            config = replace(config, clock_sigma_s=0.0, wheel_radius_sigma=0.0)
+        elif "wheel_radius_scale" in corrections.names:
+            config = replace(config, wheel_radius_sigma=0.0)
+        self.filter = Filter(robot.gyro_noise, corrections, config)
         self._sensor, self.model, self.corrections = sensor, model, corrections
         self._track_m = robot.geometry.track_width_m
         self._twist, self._slip = np.zeros(3), np.zeros(3)  # of the last step, and less that of the wheels
@@ -139,6 +146,8 @@ class EkfFusion(Estimator):
             found["gyro_scale"] = ekf.scale, float(sigmas[SCALE])
         if self._sensor is not None or self._has_gyro:
             found["wheel_clock_offset_s"] = ekf.clock_offset, float(sigmas[CLOCK])
+        if sigmas[RADIUS]:
+            found["wheel_radius_scale"] = 1.0 + ekf.radius_scale, float(sigmas[RADIUS])
         nominal = dict(zip(self.model.param_names, self.model.nominal, strict=True))
         for i, name in enumerate(self.corrections.names):
             found[name] = float(nominal.get(name, 0.0) + ekf.corrections[i]), float(sigmas[PARAMS + i])
@@ -147,6 +156,18 @@ class EkfFusion(Estimator):
     def counts(self) -> Mapping[str, int]:
         """As `Estimator.counts`."""
         return self.counts_by_name if self._sensor is None else {**self.counts_by_name, **self._sensor.lost.causes}
+
+    def warnings(self) -> list[str]:
+        """A clock offset that is large and certain."""
+        offset, sigma = self.filter.clock_offset, math.sqrt(self.filter.P[CLOCK, CLOCK])
+        if abs(offset) < max(_MIN_CLOCK_OFFSET_S, OUTLIER_SIGMAS * sigma):
+            return []
+        others = "LiDAR" if not self._has_gyro else "gyro" if self._sensor is None else "LiDAR or gyro"
+        direction = "later" if offset > 0.0 else "earlier"
+        return [
+            f"the wheels' stamps are {abs(offset):.2f} s {direction} than those of {others}, whose clock the poses have. Synchronize the"
+            " clocks, or correct them by [clock] in the robot file: `skidloc diagnose` estimates each."
+        ]
 
     def map_points(self) -> Points2:
         """As `Estimator.map_points`."""

@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
 from localization.estimators.base import Estimate, Estimator
-from localization.estimators.filter import KEY, PARAMS
+from localization.estimators.filter import KEY, PARAMS, RADIUS, FilterConfig
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement, PreintegratedMotion
 from localization.events import PositionSample, Step
@@ -33,10 +33,10 @@ from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 _MIN_POSITIONS, _MIN_BASELINE_M = 3, 5.0
 """Positions, and the distance between them [m], from which they give the heading of the map."""
 _ALIGNMENT_ITERATIONS = 30
-_RADIUS_SIGMA = 0.02
-"""Relative error of the wheels' radius, both sides alike: wear and pressure of tyres. Positions and loops show it."""
 _CONSTANT_SIGMA = 1e-4
 """Of what does not change: by far smaller ones GTSAM's marginals lose positive definiteness."""
+_MIN_RATIO = 1.1
+"""Information of a motion over that of the wheels alone, from which on scans have measured it: 1 in a bare corridor, along it."""
 _LONGEST_WAIT = 2.0
 """Distances between keyframes after which the next one no longer waits for a scan: the LiDAR is silent."""
 _CORRECTION_EPOCH_S = 60.0
@@ -64,7 +64,7 @@ class GraphFusion(Estimator):
         """``is_smoothing``: `finish` is to give the smoothed trajectory; memory then grows with the drive, 104 bytes a step."""
         self.odometry, self._corrections, self._config = odometry, corrections, config
         self._has_radius = "wheel_radius_scale" not in corrections.names  # else it is one of them
-        prior = block_diag(corrections.cov, (_RADIUS_SIGMA if self._has_radius else _CONSTANT_SIGMA) ** 2)
+        prior = block_diag(corrections.cov, (FilterConfig().wheel_radius_sigma if self._has_radius else _CONSTANT_SIGMA) ** 2)
         self.graph = PoseGraph(prior, np.array([config.antenna_x_m, config.antenna_y_m]))
         self._loops = LoopDetector(lidar)
         self._wheels = _KeyframeMotion(len(corrections.names))
@@ -132,10 +132,9 @@ class GraphFusion(Estimator):
         if k:
             delta, cov = ekf.motion_since(KEY)
             wheels = self._wheels.preintegrated(ekf.corrections)
-            measured = delta, np.asarray(np.linalg.inv(cov))
-            if not self._is_matched:
-                D = wheels.by_corrections[:, :-1]
-                measured = _subtract_information(delta, cov, wheels.delta, wheels.cov + D @ ekf.P[PARAMS:, PARAMS:] @ D.T)
+            D, states = wheels.by_corrections, np.r_[PARAMS : len(ekf.P), RADIUS]
+            by_wheels = wheels.delta * [1.0 + ekf.radius_scale, 1.0 + ekf.radius_scale, 1.0]
+            measured = _subtract_information(delta, cov, by_wheels, wheels.cov + D @ ekf.P[np.ix_(states, states)] @ D.T, self._is_matched)
             pose = se2.compose(self.graph.pose(k - 1), delta)
             update = GraphUpdate(pose, wheels, self._epoch_cov(), (BetweenMeasurement(k - 1, k, *measured),))
         else:
@@ -237,8 +236,8 @@ class GraphFusion(Estimator):
         return {**found, "positions": self.n_positions} if self.n_positions else found
 
     def warnings(self) -> list[str]:
-        """Positions that could not be used, or contradict the other sensors."""
-        found, n = [], len(self._positions) + len(self._waiting)
+        """As `EkfFusion.warnings`, and positions that could not be used, or contradict the other sensors."""
+        found, n = self.odometry.warnings(), len(self._positions) + len(self._waiting)
         if n and not self.n_positions:
             found.append(
                 f"{n} positions could not be used: it takes {_MIN_POSITIONS} over {_MIN_BASELINE_M:g} m to give the map its heading."
@@ -289,20 +288,22 @@ class _KeyframeMotion:
         return PreintegratedMotion(delta, cov, np.column_stack([self._by_corrections, by_scale]), np.append(at, 0.0))
 
 
-def _subtract_information(delta: Pose2, cov: Cov3, prior: Pose2, prior_cov: Cov3) -> tuple[Pose2, Cov3]:
+def _subtract_information(delta: Pose2, cov: Cov3, prior: Pose2, prior_cov: Cov3, is_matched: bool) -> tuple[Pose2, Cov3]:
     """Motion and information of gyro and scans alone, where they and the wheels' ``prior`` (3,) together give ``delta`` (3,).
 
-    The wheels have a factor of their own, and must not be counted twice where no scan was matched: information C^-1 - C_w^-1, where it is
-    positive. Along directions in which gyro and scans have less information than the wheels, their share of the motion is not observable:
-    there it is at most as far from ``delta`` as the wheels are. After a matched scan the whole motion counts: errors of scans are against
-    the submap, so that they do not add up from keyframe to keyframe as those of the wheels do.
+    The wheels have a factor of their own, and must not be counted twice: information C^-1 - C_w^-1, where it is positive. Along directions
+    in which gyro and scans have less information than the wheels, their share of the motion is not observable: there it is at most as far
+    from ``delta`` as the wheels are. Where a scan ``is_matched`` and adds information, the whole motion counts: errors
+    of scans are against the submap, so that they do not add up from keyframe to keyframe as those of the wheels do.
     """
     root = np.linalg.cholesky(np.linalg.inv(prior_cov))
     whiten = np.linalg.inv(root)
     ratios, axes = np.linalg.eigh(whiten @ np.linalg.inv(cov) @ whiten.T)  # information with gyro and scans, over that of the wheels
-    gained = np.maximum(ratios - 1.0, 1e-6)
+    keeps_all = (ratios > _MIN_RATIO) & is_matched
+    gained = np.where(keeps_all, ratios, np.maximum(ratios - 1.0, 1e-6))
     to_axes = axes.T @ root.T
-    shift = np.linalg.solve(to_axes, to_axes @ se2.log(se2.between(prior, delta)) / np.maximum(gained, 1.0))
+    off = to_axes @ se2.log(se2.between(prior, delta))
+    shift = np.linalg.solve(to_axes, np.where(keeps_all, 0.0, off / np.maximum(gained, 1.0)))
     return se2.compose(delta, se2.exp(shift)), (to_axes.T * gained) @ to_axes
 
 

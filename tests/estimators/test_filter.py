@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from localization.errors import EstimatorError
 from localization.estimators import filter as filter_module
-from localization.estimators.filter import BIAS, CLOCK, KEY, MAP, PARAMS, POSE, SCALE, START, Filter, FilterConfig
+from localization.estimators.filter import BIAS, CLOCK, KEY, MAP, PARAMS, POSE, RADIUS, SCALE, START, Filter, FilterConfig
 from localization.evaluation.consistency import lag1_whiteness, mean_band
 from localization.events import Scan, Step, Turn, WheelSample
 from localization.lidar import KeyScanError
@@ -106,10 +106,10 @@ def test_predict_propagates_covariance_by_motion_derivatives():
         def after(e, pose=pose, number=number, nominal=nominal):
             params = MODEL.nominal + CORRECTED.directions @ e[PARAMS:]
             delta = drive(2.0, winding, e[CLOCK], params)[number].predicted.delta if e[BIAS:].any() else nominal.predicted.delta
-            return se2.compose(se2.compose(pose, se2.exp(e[POSE])), delta)
+            return se2.compose(se2.compose(pose, se2.exp(e[POSE])), delta * [1.0 + e[RADIUS], 1.0 + e[RADIUS], 1.0])
 
         F = np.eye(SIZE)
-        for i in [*range(3), CLOCK, *range(PARAMS, SIZE)]:
+        for i in [*range(3), CLOCK, RADIUS, *range(PARAMS, SIZE)]:
             e = np.zeros(SIZE)
             e[i] = h
             F[POSE, i] = se2.log(se2.between(after(-e), after(e))) / (2 * h)
@@ -123,6 +123,7 @@ def test_predict_propagates_covariance_by_motion_derivatives():
         expected = F @ P0 @ F.T
         expected[POSE, POSE] += nominal.predicted.cov
         expected[BIAS, BIAS] += GYRO.bias_walk_rad_per_s_sqrt_s**2 * nominal.duration
+        expected[RADIUS, RADIUS] += config.wheel_radius_sigma**2 / 3600.0 * nominal.duration
         expected[PARAMS:, PARAMS:] += CORRECTED.process_noise * nominal.duration
         np.testing.assert_allclose(ekf.P, expected, rtol=2e-4, atol=2e-4)
         np.testing.assert_allclose(ekf.pose, se2.compose(pose, nominal.predicted.delta))
@@ -130,7 +131,7 @@ def test_predict_propagates_covariance_by_motion_derivatives():
 
 
 def test_predict_without_updates_equals_dead_reckoning():
-    ekf, cov = filter_at(config=FilterConfig(clock_sigma_s=0.0)), np.zeros((3, 3))
+    ekf, cov = filter_at(config=FilterConfig(clock_sigma_s=0.0, wheel_radius_sigma=0.0)), np.zeros((3, 3))
     ekf.P[PARAMS:, PARAMS:] = 0.0
     for step in winding_steps(10.0):
         quiet = dataclasses.replace(step, predicted=Motion(step.predicted.delta, step.predicted.cov, np.zeros((3, 11))))
@@ -201,7 +202,7 @@ CONSIDERED = np.r_[MAP, KEY]
 
 
 def states(ekf):
-    return np.concatenate([ekf.pose, ekf.start, ekf.key, [ekf.bias, ekf.scale, ekf.clock_offset], ekf.corrections])
+    return np.concatenate([ekf.pose, ekf.start, ekf.key, [ekf.bias, ekf.scale, ekf.clock_offset, ekf.radius_scale], ekf.corrections])
 
 
 def test_update_without_consider_states_equals_filterpy():
@@ -219,7 +220,7 @@ def test_update_without_consider_states_equals_filterpy():
     error = other.x.ravel()
     np.testing.assert_allclose(ekf.pose, se2.compose(pose, se2.exp(error[POSE])), atol=1e-12)
     np.testing.assert_allclose(ekf.start, se2.compose(start, se2.exp(error[START])), atol=1e-12)
-    np.testing.assert_allclose([ekf.bias, ekf.scale, ekf.clock_offset], error[BIAS:PARAMS], atol=1e-15)
+    np.testing.assert_allclose([ekf.bias, ekf.scale, ekf.clock_offset, ekf.radius_scale], error[BIAS:PARAMS], atol=1e-15)
     np.testing.assert_allclose(ekf.corrections, error[PARAMS:], atol=1e-15)
 
 
@@ -408,14 +409,17 @@ class World:
         rng, config = self.rng, FilterConfig()
         ekf, pose = filter_at(config=config), np.zeros(3)
         bias, scale = GYRO.bias_sigma_rad_per_s * rng.normal(), GYRO.scale_sigma * rng.normal()
-        clock = config.clock_sigma_s * rng.normal()
+        clock, radius = config.clock_sigma_s * rng.normal(), config.wheel_radius_sigma * rng.normal()
         params = CORRECTED.sigmas * rng.normal(size=len(CORRECTED.names))
         nis, turns, innovations = [], [], []
         for step in winding_steps(self.seconds):
             dt = step.duration
             off = step.d_clock * (clock - ekf.clock_offset) + step.predicted.d_params @ CORRECTED.directions @ (params - ekf.corrections)
             slip = rng.multivariate_normal(np.zeros(3), self.slip_variance * step.predicted.cov, method="cholesky")
-            before, pose = pose, se2.compose(pose, se2.compose(step.predicted.delta, se2.exp(off + slip)))
+            before, pose = (
+                pose,
+                se2.compose(pose, se2.compose(step.predicted.delta * [1.0 + radius, 1.0 + radius, 1.0], se2.exp(off + slip))),
+            )
             bias += GYRO.bias_walk_rad_per_s_sqrt_s * math.sqrt(dt) * rng.normal()
             clock += config.clock_walk_s_per_sqrt_s * math.sqrt(dt) * rng.normal()
             params = params + np.sqrt(np.diag(CORRECTED.process_noise) * dt) * rng.normal(size=len(params))
@@ -426,7 +430,7 @@ class World:
             measured = se2.compose(pose, se2.exp(np.sqrt(np.diag(LIDAR)) * rng.normal(size=3)))
             innovations.append(se2.log(se2.between(ekf.pose, measured)))
             nis.append(ekf.update_scan(measured, LIDAR, NOTHING))
-        off = [bias - ekf.bias, scale - ekf.scale, clock - ekf.clock_offset]
+        off = [bias - ekf.bias, scale - ekf.scale, clock - ekf.clock_offset, radius - ekf.radius_scale]
         self.wheel_noise_scale = ekf.wheel_noise_scale
         return np.concatenate([se2.log(se2.between(ekf.pose, pose)), off, params - ekf.corrections]), ekf.P, nis, turns, innovations
 
@@ -446,6 +450,7 @@ PARTS = {
     "gyro bias": [BIAS],
     "gyro scale": [SCALE],
     "clock": [CLOCK],
+    "wheel radius": [RADIUS],
     "k": [PARAMS],
     "centre of rotation": [PARAMS + 1, PARAMS + 2],
     "all": [0, 1, 2, *range(BIAS, PARAMS + 3)],

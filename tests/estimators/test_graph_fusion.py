@@ -222,7 +222,7 @@ def test_keyframe_motion_is_that_of_one_set_of_corrections() -> None:
 
 
 def test_graph_smoothed_has_consistent_nees() -> None:
-    """The middle and the end of five drives, of 3 degrees of freedom each."""
+    """The middle and the end of five drives, of 3 degrees of freedom each; slip is far less than assumed (`QUIET`)."""
     found = []
     for seed in range(5):
         drive, (estimates, pipeline) = around(seed), estimated(seed)
@@ -234,7 +234,7 @@ def test_graph_smoothed_has_consistent_nees() -> None:
             assert whole.stamps_ns[i] == drive.stamps[k]
             error = se2.log(se2.between(drive.poses[k], whole.poses[i]))
             found.append(nees(error[None], whole.covariances[i : i + 1])[0])
-    assert 0.3 < np.mean(found) < 6.0
+    assert 0.1 < np.mean(found) < 6.0
 
 
 # --- what may be missing
@@ -433,7 +433,7 @@ def test_graph_without_loops_is_as_certain_as_the_filter(has_lidar: bool) -> Non
         assert ekf.trajectory.covariances is not None
         assert found.covariances is not None
         certain, ours = (np.sqrt(np.diagonal(t.covariances[-1])) for t in (ekf.trajectory, found))
-        by_radius = 0.0 if has_lidar else 0.02 * np.hypot(*drive.poses[-1, :2])
+        by_radius = 0.0 if has_lidar else 0.03 * np.hypot(*drive.poses[-1, :2])
         expected = np.hypot(certain, [by_radius, 0.0, 0.0])
         assert (ours > 0.9 * expected).all()
         assert (ours < 1.7 * expected).all()
@@ -480,7 +480,7 @@ def test_graph_with_silent_lidar_has_keyframes_without_scan() -> None:
 def test_subtract_information_with_wheels_gives_filters_motion() -> None:
     wheels, wheel_cov = np.array([1.0, 0.0, 0.1]), np.diag([0.05, 0.05, 0.03]) ** 2
     delta, cov = np.array([1.01, 0.005, 0.11]), np.diag([0.01, 0.01, 0.002]) ** 2
-    measured, information = _subtract_information(delta, cov, wheels, wheel_cov)
+    measured, information = _subtract_information(delta, cov, wheels, wheel_cov, False)
     np.testing.assert_allclose(information + np.linalg.inv(wheel_cov), np.linalg.inv(cov), rtol=1e-9)
     by_scans, by_wheels = se2.log(se2.between(delta, measured)), se2.log(se2.between(delta, wheels))
     np.testing.assert_allclose(
@@ -493,7 +493,7 @@ def test_subtract_information_stays_within_wheels_distance(gain: float) -> None:
     """Also where scans say next to nothing along x: a difference is not divided by nothing."""
     wheels, wheel_cov = np.array([1.1, 0.0, 0.0]), np.diag([0.02, 0.02, 0.05]) ** 2
     delta, cov = np.array([1.0, 0.0, 0.0]), wheel_cov * [[1.0 / gain], [0.1], [0.1]]
-    measured, information = _subtract_information(delta, cov, wheels, wheel_cov)
+    measured, information = _subtract_information(delta, cov, wheels, wheel_cov, False)
     assert np.abs(measured - delta).max() <= 0.1 + 1e-9
     assert (np.linalg.eigvalsh(information) > 0.0).all()
 

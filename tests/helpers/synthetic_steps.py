@@ -110,14 +110,16 @@ class World:
         self.bias = rng.normal(0.0, noise.gyro.bias_sigma_rad_per_s)
         self.clock = rng.normal(0.0, belief.clock_sigma_s) if belief is not None else 0.0
         self.belief, self.scale = belief, rng.normal(0.0, noise.gyro.scale_sigma)
+        has_radius = belief is not None and has_lidar and "wheel_radius_scale" not in corrected.names
+        self.radius = rng.normal(0.0, belief.wheel_radius_sigma) if has_radius else 0.0
         k = len(corrected.names)
         self.correction = rng.multivariate_normal(np.zeros(k), corrected.cov) if k else np.zeros(0)
         self._walk = np.linalg.cholesky(corrected.process_noise + 1e-18 * np.eye(k))
 
     @property
     def slow(self) -> np.ndarray:
-        """(3 + k,) true gyro bias and scale, clock offset, corrections."""
-        return np.concatenate([[self.bias, self.scale, self.clock], self.correction])
+        """(4 + k,) true gyro bias and scale, clock offset, scale of the wheels' radius, corrections."""
+        return np.concatenate([[self.bias, self.scale, self.clock, self.radius], self.correction])
 
     def first(self) -> Step:
         none = Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, len(self.model.param_names))))
@@ -137,7 +139,7 @@ class World:
         # the wheels' stamps are early by the offset: what really happens at t stands in the log at t + clock (as Synchronizer reads it)
         dt, rates, cg = self._rates(self.t)
         true_params = self.model.nominal + self.corrected.directions @ self.correction
-        twists = self.model.twist(rates, cg, true_params).value
+        twists = self.model.twist(rates, cg, true_params).value * [1.0 + self.radius, 1.0 + self.radius, 1.0]
         delta = np.zeros(3)
         w = noise.wheels
         for h, xi in zip(dt, twists, strict=True):
@@ -214,10 +216,10 @@ def run(estimator, sensor, seed=0, steps=60, **world):
 
 
 def slow_states(estimator: EkfFusion) -> tuple[np.ndarray, np.ndarray]:
-    """Means (m,) of gyro bias and scale, clock offset and corrections, and the joint covariance (3 + m, 3 + m) of pose and these."""
+    """Means (m,) of gyro bias and scale, clock offset, radius, corrections, and the joint covariance (3 + m, 3 + m) of pose and these."""
     ekf = estimator.filter
     index = np.r_[POSE, BIAS : len(ekf.P)]
-    return np.concatenate([[ekf.bias, ekf.scale, ekf.clock_offset], ekf.corrections]), ekf.P[np.ix_(index, index)]
+    return np.concatenate([[ekf.bias, ekf.scale, ekf.clock_offset, ekf.radius_scale], ekf.corrections]), ekf.P[np.ix_(index, index)]
 
 
 def squared_errors(seed, steps, noise, model="skid_steer", form="constant"):

@@ -173,11 +173,11 @@ GRAPH_PATCHES: Mapping[str, Patch] = {
         graph_fusion.GraphFusion, "_is_matched", property(lambda self: False, lambda self, value: None), create=True
     ),
     "corrections of the graph in the filter": _attribute(Filter, "set_corrections", lambda self, mean, cov: None),
-    "radius of the wheels as a variable": _attribute(graph_fusion, "_RADIUS_SIGMA", 1e-4),
     "random walk of the corrections": _attribute(graph_fusion, "_CORRECTION_EPOCH_S", math.inf),
 }
 SETTINGS: Mapping[str, Mapping[str, Any]] = {
     "clock offset": {"clock_sigma_s": 0.0, "clock_walk_s_per_sqrt_s": 0.0},
+    "radius of the wheels": {"wheel_radius_sigma": 0.0},
     "corrections to the motion model": {"corrections": "none"},
 }
 MECHANISMS = (*PATCHES, *SETTINGS, *GRAPH_PATCHES)
