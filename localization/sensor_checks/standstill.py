@@ -16,14 +16,19 @@ from motion_models.se2 import FloatArray
 
 WHEELS_STANDING = Fault(
     "the wheels read zero while {others}. They count as unknown there. Check the encoders, the driver of the wheels and the"
-    " joints' names in the robot file's [joints]."
+    " joints' names in the robot file's [joints].{besides}"
 )
 
+_OR_OBJECTS = " The other explanation is objects that move in the scans around a standing robot: no gyro or IMU decides."
+
+_LIDAR_MOVED = "the LiDAR moved"
 _RECENT_BINS, _MIN_LIDAR_S = 8, 1.0
 """Bins in which the LiDAR's speed is measured while the wheels read zero, and the least time in them [s]."""
 _STANDING_SPEED_M_S = 0.1
 _MAX_STANDING_RATE_RAD_S, _SIGMAS = 0.1, 5.0
 """Rate of a gyro at rest at most, beside its noise: twenty times the prior sigma of the shipped robots' bias."""
+_MIN_RATE_SIGMA_RAD_S, _REPEATED_RAD_S = 0.02, 1e-7
+"""Standard deviation of a gyro's rates in the recent bins: at rest 0.004 for a cheap one (0.002 rad/s/sqrt(Hz)), and never zero."""
 _MIN_TURNING_S = 1.0
 """Time for which the gyro must turn to be reported: with clocks 0.1 s apart it does for a moment at the end of each turn."""
 _SHAKE_M_S2, _SHAKE_SAMPLES = 0.4, 20
@@ -33,13 +38,18 @@ _NS = 1e-9
 
 
 class Standstill(Check):
-    """Such wheels count as unknown, for as long as that lasts."""
+    """Such wheels count as unknown, for as long as that lasts.
+
+    Objects that move around a standing robot look like its own motion. Where there is a gyro or an IMU, one must confirm the LiDAR, once
+    until the wheels turn again.
+    """
 
     def __init__(self, faults: FaultLog, window: Window, config: StepConfig) -> None:
         self._faults, self._window, self._velocity = faults, window, UnknownVelocity(config)
         self._shaking: dict[str, ShakeDetector] = {}  # by the IMU's frame
         self._stood_s = 0.0  # time for which the wheels read zero
         self._turned_s = 0.0  # the same, while the gyro turns
+        self._is_confirmed = False  # that the robot moved meanwhile, by gyro or IMU
         self._trusted_s = 0.0  # the same, as far as it counted as standing and no scan has measured the pose since
 
     def insert_imu(self, sample: ImuSample) -> None:
@@ -50,6 +60,7 @@ class Standstill(Check):
         """``step`` with unknown wheels where another sensor shows motion."""
         if not step.is_standing:
             self._turned_s = self._stood_s = self._trusted_s = 0.0
+            self._is_confirmed = False
             self._velocity.restart()
             if step.has_wheels:
                 self._velocity.set_measured(step.twist)
@@ -59,7 +70,9 @@ class Standstill(Check):
         moving = self._moving()
         contradicted_s = self._stood_s if moving else self._turned_s
         if moving or self._turned_s >= _MIN_TURNING_S:
-            self._faults.declare(WHEELS_STANDING, self._faults.now_s - contradicted_s, {"others": moving or "the gyro turned"})
+            besides = _OR_OBJECTS if moving == _LIDAR_MOVED and not self._is_confirmed else ""
+            numbers = {"others": moving or "the gyro turned", "besides": besides}
+            self._faults.declare(WHEELS_STANDING, self._faults.now_s - contradicted_s, numbers)
         if not contradicted_s:
             self._trusted_s += step.duration
             self._velocity.restart()
@@ -79,17 +92,30 @@ class Standstill(Check):
         """What shows that the robot drives; "" where nothing does."""
         bins = [b for b in list(self._window.bins)[-_RECENT_BINS:] if b.is_standing and np.isfinite(b.lidar[0])]
         travelled, lasted = sum(math.hypot(b.lidar[0], b.lidar[1]) for b in bins), sum(b.duration_s for b in bins)
-        if lasted >= _MIN_LIDAR_S and travelled >= _STANDING_SPEED_M_S * lasted:
-            return "the LiDAR moved"
         shaken_s = max((detector.lasted_s for detector in self._shaking.values()), default=0.0)
-        is_shaking = not bins and min(shaken_s, self._stood_s) >= _SHAKE_S
-        return "the IMU shakes as if it moved" if is_shaking else ""
+        is_shaking = min(shaken_s, self._stood_s) >= _SHAKE_S
+        if lasted >= _MIN_LIDAR_S and travelled >= _STANDING_SPEED_M_S * lasted:
+            rates = np.array([b.gyro / b.duration_s for b in bins])
+            self._is_confirmed |= is_shaking or _has_turned(rates)
+            has_second = _is_working(rates) or any(detector.has_noise for detector in self._shaking.values())
+            return _LIDAR_MOVED if self._is_confirmed or not has_second else ""
+        return "the IMU shakes as if it moved" if is_shaking and not bins else ""
 
 
 def _is_turning(step: Step) -> bool:
     """Whether the gyro turns by more than its noise and bias."""
     turn = step.turn
     return turn is not None and abs(turn.angle) > _MAX_STANDING_RATE_RAD_S * turn.duration + _SIGMAS * math.sqrt(turn.variance)
+
+
+def _is_working(rates: FloatArray) -> bool:
+    """Whether a gyro measured ``rates`` (n,) [rad/s]: noise alone changes them."""
+    return bool(np.isfinite(rates).all() and np.ptp(rates) > _REPEATED_RAD_S)
+
+
+def _has_turned(rates: FloatArray) -> bool:
+    """Whether a gyro's ``rates`` (n,) [rad/s] are those of a robot that moves."""
+    return _is_working(rates) and bool(rates.std() > _MIN_RATE_SIGMA_RAD_S or abs(rates.mean()) > _MAX_STANDING_RATE_RAD_S)
 
 
 class ShakeDetector:
@@ -99,6 +125,8 @@ class ShakeDetector:
         self._forces: deque[tuple[int, FloatArray]] = deque(maxlen=400)
         self._since_ns: int | None = None
         self._now_ns = 0
+        self.has_noise = False
+        """Whether the specific force has ever changed: some drivers leave it at zero."""
 
     @property
     def lasted_s(self) -> float:
@@ -114,6 +142,7 @@ class ShakeDetector:
             return
         forces = np.array([force for _, force in self._forces])
         self._forces.clear()
+        self.has_noise |= bool(np.ptp(forces, axis=0).any())
         is_shaking = len(forces) >= _SHAKE_SAMPLES and float(np.linalg.norm(forces.std(axis=0))) > _SHAKE_M_S2
         if not is_shaking:
             self._since_ns = None

@@ -24,6 +24,46 @@ def test_wheels_that_read_zero_while_the_lidar_moves_are_unknown() -> None:
     assert math.sqrt(total) == pytest.approx(0.5 * 8.0, rel=0.05)  # 0.5 m/s for as long as they read zero
 
 
+@pytest.mark.parametrize(("rate_noise", "shake_m_s2"), [(0.003, None), (0.003, 0.05), (None, 0.05)], ids=["gyro", "gyro and IMU", "IMU"])
+def test_lidar_alone_is_outvoted_by_wheels_and_another_sensor(rate_noise: float | None, shake_m_s2: float | None) -> None:
+    """People walk around a standing robot: its scans look like motion."""
+    rng = np.random.default_rng(1)
+    robot = CheckedDrive(wheels=lambda v, w: (0.0, 0.0), gyro=None if rate_noise is None else lambda w: 0.01 + rate_noise * rng.normal())
+    for k in range(0 if shake_m_s2 is None else 400):
+        robot.checks.insert_imu(ImuSample(k * S // 50, np.zeros(3), np.array([0.0, 0.0, 9.8]) + shake_m_s2 * rng.normal(size=3)))
+    assert robot.drive(8.0).found == {}
+    assert all(step.is_standing for step in robot.applied)
+
+
+def test_lidar_is_confirmed_by_a_shaking_imu_beside_a_still_gyro() -> None:
+    """The robot drives straight on."""
+    rng = np.random.default_rng(1)
+    robot = CheckedDrive(wheels=lambda v, w: (0.0, 0.0), gyro=lambda w: 0.003 * rng.normal())
+    for k in range(400):
+        robot.checks.insert_imu(ImuSample(k * S // 50, np.zeros(3), 0.7 * rng.normal(size=3)))
+    checks = robot.drive(8.0)
+    assert "while the LiDAR moved" in checks.warnings()[0]
+    assert "other explanation" not in checks.warnings()[0]
+
+
+def test_lidar_stays_confirmed_until_the_wheels_turn() -> None:
+    """The robot turns, then drives straight on; its encoders are dead."""
+    rng = np.random.default_rng(1)
+    robot = CheckedDrive(wheels=lambda v, w: (0.0, 0.0), gyro=lambda w: w + 0.003 * rng.normal())
+    robot.drive(5.0)
+    robot.gyro = lambda w: 0.003 * rng.normal()
+    robot.drive(5.0)
+    assert not any(step.has_wheels for step in robot.applied[-40:])
+
+
+@pytest.mark.parametrize("gyro", [None, lambda w: 0.0], ids=["no gyro", "a gyro that repeats zero"])
+def test_lidar_without_another_sensor_has_both_explanations(gyro) -> None:
+    checks = CheckedDrive(wheels=lambda v, w: (0.0, 0.0), gyro=gyro).drive(8.0)
+    (warning,) = checks.warnings()
+    assert "the wheels read zero while the LiDAR moved." in warning
+    assert "objects that move in the scans around a standing robot" in warning
+
+
 @pytest.mark.parametrize(("shake_m_s2", "is_found"), [(0.7, True), (0.05, False)])
 def test_wheels_that_read_zero_while_the_imu_shakes_are_unknown(shake_m_s2: float, is_found: bool) -> None:
     robot = CheckedDrive(wheels=lambda v, w: (0.0, 0.0), gyro=lambda w: 0.0, has_scans=False)
