@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from localization.sensor_checks.faults import Fault
-from localization.sensor_checks.turn_rates import GYRO_OPPOSITE, GYRO_STUCK, GYRO_UNIT, LIDAR_OPPOSITE, WHEELS_OPPOSITE
+from localization.sensor_checks.turn_rates import GYRO_OPPOSITE, GYRO_STUCK, GYRO_UNIT, LIDAR_OPPOSITE, WHEELS_OPPOSITE, WHEELS_SPIN
 from tests.helpers.checked_drive import CheckedDrive
 
 
@@ -17,11 +17,10 @@ from tests.helpers.checked_drive import CheckedDrive
     [
         (lambda w: -w, GYRO_OPPOSITE),
         (lambda w: math.degrees(w), GYRO_UNIT),
-        (lambda w: math.radians(w), GYRO_UNIT),
         (lambda w: 0.0, GYRO_STUCK),
         (lambda w: 0.31, GYRO_STUCK),
     ],
-    ids=["flipped", "deg/s", "radians twice", "stuck at zero", "stuck at a turn"],
+    ids=["flipped", "deg/s", "stuck at zero", "stuck at a turn"],
 )
 @pytest.mark.parametrize("has_scans", [True, False])
 def test_gyro_that_contradicts_wheels_is_left_out(gyro, fault: Fault, has_scans: bool) -> None:
@@ -33,6 +32,28 @@ def test_gyro_that_contradicts_wheels_is_left_out(gyro, fault: Fault, has_scans:
     (warning,) = checks.warnings()
     assert warning.startswith("at t = ")
     assert "gyro" in warning
+
+
+def test_gyro_below_wheels_and_lidar_has_another_unit() -> None:
+    """Its driver converts to radians twice."""
+    robot = CheckedDrive(gyro=lambda w: math.radians(w))
+    assert list(robot.drive().found) == [GYRO_UNIT]
+    assert robot.applied[-1].turn is None
+
+
+@pytest.mark.parametrize(("has_scans", "others"), [(True, "gyro and LiDAR"), (False, "the gyro")])
+def test_wheels_that_spin_are_unknown_while_they_do(has_scans: bool, others: str) -> None:
+    """They turn 30 times as fast as the robot for some seconds: no unit of the gyro."""
+    spin = iter([*[1.0] * 60, *[30.0] * 60, *[1.0] * 120])
+    robot = CheckedDrive(wheels=lambda v, w: (v, next(spin) * w), has_scans=has_scans)
+    robot.drive(12.0)
+    assert WHEELS_SPIN in robot.checks.found
+    warning = robot.checks.warnings()[0]
+    assert f"times as fast as {others}: one side spins" in warning
+    assert not any(step.has_wheels for step in robot.applied[100:])
+    robot.drive(12.0)
+    assert all(step.has_wheels for step in robot.applied[-40:])
+    assert all(step.turn is not None for step in robot.applied)
 
 
 @pytest.mark.parametrize("gyro", [lambda w: w, None], ids=["gyro", "no gyro"])
