@@ -185,6 +185,8 @@ class Step:
     scan: Scan | None = None
     cg_cov: FloatArray = field(default_factory=lambda: np.zeros((2, 2)))
     """(2, 2) covariance of the centre of gravity [m^2]."""
+    is_scan_excluded: bool = False
+    """A scan came, and a sensor check left it out."""
 
     @property
     def duration(self) -> float:

@@ -104,7 +104,7 @@ class EkfFusion(Estimator):
     def _update_scan(self, step: Step, sensor: ScanMatchingSensor) -> float | None:
         """Match the scan of ``step`` and update by it; its NIS, or None where there is no scan or no match."""
         if step.scan is None:
-            sensor.add_no_scan(step.end_ns)
+            sensor.add_no_scan(step.end_ns, step.is_scan_excluded)
             return None
         ekf, duration = self.filter, step.duration
         self.counts_by_name["scans"] += 1

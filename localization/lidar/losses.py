@@ -21,6 +21,10 @@ _CAUSES: Mapping[str, tuple[str, str]] = {
         "repeated the ranges of the scan before while the robot drove",
         "Check the LiDAR's driver.",
     ),
+    "excluded": (
+        "were left out by a check",
+        "See the warning about the LiDAR above.",
+    ),
 }
 """What happened and what to do, by cause."""
 _SILENCE_ADVICE = "Check the LiDAR's driver, cable and topic."
@@ -42,7 +46,7 @@ class LidarLosses:
     ongoing_s: float
     """Time since the last match, up to the last scan [s]."""
     causes: Mapping[str, int]
-    """Scans that were not matched, by cause: lost, sparse, stale."""
+    """Scans that were not matched, by cause: lost, sparse, stale, excluded."""
     silences: int = 0
     """Times in which no scan came for a second or more."""
 

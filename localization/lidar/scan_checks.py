@@ -51,7 +51,8 @@ class LostScans:
         self.scans = 0
         """All scans so far."""
         self.causes: dict[str, int] = {}
-        """Scans that were not matched: `lost` (they fit nowhere, or in several places), `sparse`, `stale`."""
+        """Scans that were not matched: `lost` (they fit nowhere, or in several places), `sparse`, `stale`, `excluded` (left out by a sensor
+        check)."""
         self.silences = 0
         """Gaps between scans that count as lost."""
         self._is_silent = False

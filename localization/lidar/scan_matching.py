@@ -79,10 +79,10 @@ class ScanMatchingSensor:
             self.lost.add_matched(step.end_ns)
         return found
 
-    def add_no_scan(self, stamp_ns: int) -> None:
-        """A step without a scan: none is at hand, and the LiDAR may be silent."""
+    def add_no_scan(self, stamp_ns: int, is_excluded: bool) -> None:
+        """A step without a scan: none is at hand, and the LiDAR may be silent, or a check left the scan out."""
         self._scan = None
-        self.lost.add_no_scan(stamp_ns)
+        self.lost.add(stamp_ns, "excluded") if is_excluded else self.lost.add_no_scan(stamp_ns)
 
     def _update_search_state(self, is_searching: bool, now_s: float) -> None:
         """Scans that may be anywhere do not enter the submap for some seconds: drawn there, they compete with their true place."""

@@ -35,6 +35,11 @@ class Check:
         return []
 
 
+def without_scan(step: Step) -> Step:
+    """``step`` whose scan is not used."""
+    return step if step.scan is None else replace(step, scan=None, is_scan_excluded=True)
+
+
 def without_wheels(step: Step, unknown: Cov3) -> Step:
     """``step`` whose wheels are not used: the covariance of its motion has ``unknown`` (3, 3) besides, its twist is by the gyro alone."""
     motion = replace(step.predicted, cov=step.predicted.cov + unknown)

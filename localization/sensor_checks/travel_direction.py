@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 
 from localization.events import Step
-from localization.sensor_checks.check import Check
+from localization.sensor_checks.check import Check, without_scan
 from localization.sensor_checks.faults import Evidence, Fault, FaultLog
 from localization.sensor_checks.window import Bin, Window
 
@@ -56,7 +55,7 @@ class TravelDirection(Check):
 
     def apply(self, step: Step) -> Step:
         """``step`` without its scan."""
-        return replace(step, scan=None) if LIDAR_DIRECTION in self._faults and self._is_contradicted else step
+        return without_scan(step) if LIDAR_DIRECTION in self._faults and self._is_contradicted else step
 
     @property
     def _is_contradicted(self) -> bool:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import Step
-from localization.sensor_checks.check import Check, without_wheels
+from localization.sensor_checks.check import Check, without_scan, without_wheels
 from localization.sensor_checks.faults import Evidence, Fault, FaultLog
 from localization.sensor_checks.gyro_rate import GYRO_RATE
 from localization.sensor_checks.window import MIN_BINS, WINDOW_BINS, Window
@@ -101,7 +101,7 @@ class TurnRates(Check):
         if faults & {GYRO_OPPOSITE, GYRO_UNIT} or (self._is_gyro_stuck and GYRO_STUCK in faults):
             step = replace(step, turn=None)
         if LIDAR_OPPOSITE in faults:
-            step = replace(step, scan=None)
+            step = without_scan(step)
         is_unknown = WHEELS_OPPOSITE in faults or (self._is_spinning and WHEELS_SPIN in faults)
         if is_unknown and step.has_wheels and not step.is_standing:
             return without_wheels(step, self._velocity.increment(step.duration, has_turn=step.turn is not None))

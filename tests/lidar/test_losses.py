@@ -29,10 +29,10 @@ BRIEFLY = LidarLosses(1000, 998, 0.002, 0.2, 50.0, 0.0, {"sparse": 2})
 
 
 def counted(matched: str) -> LostScans:
-    """One scan a second: `m` matched, `l` lost, `s` stale."""
+    """One scan a second: `m` matched, `l` lost, `s` stale, `x` excluded."""
     lost = LostScans()
     for second, kind in enumerate(matched):
-        lost.add_matched(second * S) if kind == "m" else lost.add(second * S, {"l": "lost", "s": "stale"}[kind])
+        lost.add_matched(second * S) if kind == "m" else lost.add(second * S, {"l": "lost", "s": "stale", "x": "excluded"}[kind])
     return lost
 
 
@@ -60,6 +60,13 @@ def test_losses_of_a_lidar_that_dies_are_described_and_long() -> None:
         "The pose is by wheels and gyro there. Check the LiDAR's driver, cable and topic."
     )
     assert losses.numbers()["silences"] == 1
+
+
+def test_losses_of_scans_left_out_are_no_silence() -> None:
+    losses = LidarLosses.of(counted("mmmmxxxxxxmm"))
+    assert (losses.scans, losses.matched, losses.silences) == (12, 6, 0)
+    assert "6 of 12 scans: 6 were left out by a check" in losses.describe()
+    assert losses.advice == "See the warning about the LiDAR above."
 
 
 def test_describe_without_lost_scans_is_empty() -> None:

@@ -19,4 +19,5 @@ def test_lidar_whose_mount_is_turned_is_left_out(degrees: float, correction: flo
     assert found is not None
     assert float(found[1]) == pytest.approx(correction, abs=2.0)
     assert robot.applied[-1].scan is None
+    assert robot.applied[-1].is_scan_excluded
     assert robot.applied[-1].turn is not None

@@ -63,6 +63,7 @@ def test_lidar_that_is_upside_down_is_left_out(gyro) -> None:
     assert LIDAR_OPPOSITE in checks.found
     assert "upside down" in " ".join(checks.warnings())
     assert robot.applied[-1].scan is None
+    assert robot.applied[-1].is_scan_excluded
 
 
 def test_wheels_that_are_swapped_are_left_out_where_gyro_and_lidar_agree() -> None:
