@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from localization.lidar.scan_checks import MAX_LOST_S, MAX_LOST_SHARE, LostScans
+from localization.lidar.scan_checks import MAX_LOST_S, MAX_LOST_SHARE, MIN_LOST_S, LostScans
 
 _CAUSES: Mapping[str, tuple[str, str]] = {
     "lost": (
@@ -38,7 +38,7 @@ class LidarLosses:
     """All of them."""
     matched: int
     share: float
-    """Of the time from the first scan to the last without a matched scan, 0 to 1."""
+    """Of the time from the first scan to the last without a matched scan, 0 to 1; each loss is shorter by one period of the scans."""
     longest_s: float
     """The longest time without a match [s]."""
     since_s: float
@@ -103,7 +103,8 @@ def _seconds(value: float) -> str:
 
 def is_long(share: float | None, longest_s: float | None) -> bool:
     """Whether a run that lost the LiDAR for this ``share`` of the time, and ``longest_s`` [s] at once, is not to be recommended."""
-    return (share is not None and share > MAX_LOST_SHARE) or (longest_s is not None and longest_s > MAX_LOST_S)
+    is_stretch = longest_s is None or longest_s > MIN_LOST_S
+    return (share is not None and share > MAX_LOST_SHARE and is_stretch) or (longest_s is not None and longest_s > MAX_LOST_S)
 
 
 def per_cent(share: float) -> str:

@@ -20,7 +20,10 @@ MAX_LOST_SHARE = 0.05
 """Share of the time without a matched scan, beyond which a run is not recommended: wheels alone err by 0.7 to 0.9 m in 10 m (fr079,
 MIT-CSAIL), matched scans by 0.05 to 0.09 m, so that from a twentieth of the way on the wheels' share is the larger one."""
 MAX_LOST_S = 5.0
-"""The same for one stretch [s]: at 0.4 m/s those wheels err by 0.15 m in it, from where on Gauss-Newton alone may end in a wrong place."""
+"""The same for one stretch [s], whatever the share: at 0.4 m/s those wheels err by 0.15 m in it, from where on Gauss-Newton alone may
+end in a wrong place."""
+MIN_LOST_S = 1.0
+"""The share counts where one stretch at least is longer [s]: wheels carry the pose over single scans without a visible error (voxels)."""
 
 
 class StaleScans:
@@ -78,8 +81,7 @@ class LostScans:
         than they are apart."""
         if self._first_ns is None:
             return
-        apart_ns = sorted(self._gaps_ns)[(len(self._gaps_ns) - 1) // 2] if self._gaps_ns else 0
-        if stamp_ns - self._scan_ns <= max(_MAX_SCAN_GAP_S * 1e9, _MAX_SCAN_GAP_PERIODS * apart_ns):
+        if stamp_ns - self._scan_ns <= max(_MAX_SCAN_GAP_S * 1e9, _MAX_SCAN_GAP_PERIODS * self._period_ns):
             return
         self.silences += not self._is_silent
         self._is_silent, self._last_ns = True, max(stamp_ns, self._last_ns)
@@ -113,7 +115,14 @@ class LostScans:
         self.scans += 1
         self._scan_ns, self._is_silent = stamp_ns, False
 
+    @property
+    def _period_ns(self) -> int:
+        """Median time from scan to scan; 0 before the second."""
+        return sorted(self._gaps_ns)[(len(self._gaps_ns) - 1) // 2] if self._gaps_ns else 0
+
     def _close(self, stamp_ns: int) -> None:
+        """A match ends a loss. The time up to it counts but for one period, which is there between any two matches."""
         length = stamp_ns - self._matched_ns
+        length -= self._period_ns if self._period_ns < length else 0
         self._lost_ns += length
         self._longest = max(self._longest, (length, self._matched_ns))

@@ -37,13 +37,13 @@ def counted(matched: str) -> LostScans:
 
 
 def test_losses_of_scans_have_share_and_longest_gap() -> None:
-    """From the match at 2 s to that at 5 s, and from 6 s to the end at 8 s."""
+    """From the match at 2 s to one period before that at 5 s, and from 6 s to the end at 8 s."""
     losses = LidarLosses.of(counted("mmmllmmsl"))
     assert (losses.scans, losses.matched) == (9, 5)
-    assert losses.share == pytest.approx(5.0 / 8.0)
-    assert (losses.longest_s, losses.since_s, losses.ongoing_s) == (3.0, 2.0, 2.0)
+    assert losses.share == pytest.approx(4.0 / 8.0)
+    assert (losses.longest_s, losses.since_s, losses.ongoing_s) == (2.0, 6.0, 2.0)
     assert losses.causes == {"lost": 3, "stale": 1}
-    assert losses.describe().startswith("LiDAR lost for 62 % of the drive, longest 3 s at t = 2 s (4 of 9 scans: 3 fitted the map nowhere")
+    assert losses.describe().startswith("LiDAR lost for 50 % of the drive, longest 2 s at t = 6 s (4 of 9 scans: 3 fitted the map nowhere")
     assert losses.describe().endswith(losses.advice)
 
 
@@ -75,8 +75,18 @@ def test_describe_without_lost_scans_is_empty() -> None:
     assert not losses.is_long
 
 
+def test_isolated_lost_scans_are_not_long() -> None:
+    """One of 36 is empty."""
+    losses = LidarLosses.of(counted((35 * "m" + "l") * 36 + "m"))
+    assert losses.share == pytest.approx(1 / 36)
+    assert losses.longest_s == 1.0
+    assert not losses.is_long
+
+
 @pytest.mark.parametrize(
-    ("share", "longest_s", "expected"), [(0.049, 4.9, False), (0.051, 1.0, True), (0.01, 5.1, True)], ids=["brief", "often", "at once"]
+    ("share", "longest_s", "expected"),
+    [(0.049, 4.9, False), (0.051, 1.1, True), (0.2, 0.9, False), (0.01, 5.1, True)],
+    ids=["brief", "often", "single scans", "at once"],
 )
 def test_is_long_from_5_percent_or_5_s_on(share: float, longest_s: float, expected: bool) -> None:
     assert LidarLosses(100, 90, share, longest_s, 0.0, 0.0, {"lost": 10}).is_long == expected
@@ -186,7 +196,7 @@ def test_rows_of_a_comparison_are_numbers_that_the_table_reads_again(tmp_path) -
         ("m" * 100, OK, "ok"),
         ("m" * 100 + "l", WARN, "lost for 1.0 s"),
         ("m" * 100 + "l" * 6, ERROR, "lost for 6 s"),
-        ("m" * 10 + "l" * 6 + "m" * 100, WARN, "LiDAR lost for 6.1 % of the drive, longest 7 s at t = 9 s"),
+        ("m" * 10 + "l" * 6 + "m" * 100, WARN, "LiDAR lost for 5.2 % of the drive, longest 6 s at t = 9 s"),
     ],
     ids=["matched", "just lost", "lost", "was lost"],
 )
@@ -207,7 +217,7 @@ def test_pipeline_warnings_name_losses_and_remedy() -> None:
     vars(pipeline.estimator.lost).update(vars(counted("mmsm")))
     (note,) = pipeline.warnings()
     assert note.startswith(
-        "ekf (skid_steer): LiDAR lost for 67 % of the drive, longest 2 s at t = 1 s (1 of 4 scans: 1 repeated the ranges"
+        "ekf (skid_steer): LiDAR lost for 33 % of the drive, longest 1 s at t = 1 s (1 of 4 scans: 1 repeated the ranges"
     )
     assert note.endswith("Check the LiDAR's driver.")
 

@@ -41,7 +41,7 @@ def test_is_stale_with_empty_scans_is_false() -> None:
     assert not any(checks.is_stale(scan(0, 0), False) for _ in range(3))
 
 
-def test_lost_scans_time_runs_from_match_to_match() -> None:
+def test_lost_scans_time_is_between_matches_but_for_one_period() -> None:
     lost = LostScans()
     matched = [True, True, False, False, True, True, False, True, True, False, False, False]
     for t, is_matched in enumerate(matched):
@@ -51,8 +51,8 @@ def test_lost_scans_time_runs_from_match_to_match() -> None:
             lost.add(10 * S + t * S, "lost" if t < 6 else "sparse")
     assert lost.scans == len(matched)
     assert lost.causes == {"lost": 2, "sparse": 4}
-    assert lost.share == pytest.approx((3 + 2 + 3) / 11)
-    assert lost.longest == (3.0, 8.0)  # of two that are as long, the later
+    assert lost.share == pytest.approx((2 + 1 + 3) / 11)
+    assert lost.longest == (3.0, 8.0)
 
 
 def test_lost_scans_without_match_share_is_one() -> None:
@@ -83,8 +83,8 @@ def test_lost_scans_count_silence_until_next_scan() -> None:
             assert lost.ongoing_s == pytest.approx(4.0)
     assert lost.silences == 2
     assert lost.causes == {}
-    assert lost.share == pytest.approx((5.0 + 3.9) / 11.9)
-    assert lost.longest == pytest.approx((5.0, 2.0))
+    assert lost.share == pytest.approx((4.9 + 3.9) / 11.9)
+    assert lost.longest == pytest.approx((4.9, 2.0))
     assert lost.ongoing_s == pytest.approx(3.9)
 
 
@@ -93,7 +93,7 @@ def test_lost_scans_count_gap_without_steps_between() -> None:
     lost = LostScans()
     for t in (0, 1, 2, 3, 9, 10):
         lost.add(t * S, "lost") if t == 9 else lost.add_matched(t * S)
-    assert (lost.silences, lost.longest) == (1, (7.0, 3.0))
+    assert (lost.silences, lost.longest) == (1, (6.0, 3.0))
 
 
 def test_is_stale_tells_scanners_apart() -> None:
