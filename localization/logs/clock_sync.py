@@ -238,6 +238,7 @@ class Merger:
         self._held: list[tuple[int, int, int, Item]] = []
         self._held_weight = self._serial = self._now = 0
         self._emitted: dict[tuple[str, int], int] = {}  # two drivers may share a topic, as wheels and arms do, and a stamp
+        self._frames: dict[tuple[str, int], str] = {}  # of the last payload emitted
         self._newest = -(2**63)
 
     def insert(self, item: Item) -> Iterator[Any]:
@@ -279,10 +280,19 @@ class Merger:
             stamp, _, _, item = heapq.heappop(held)
             self._held_weight -= item.weight
             if self._emitted.get((item.topic, item.rank)) == stamp:
-                self._stats.count(item.topic, Oddity.REPEATED)
+                self._count_repeated(item)
                 continue
             self._emitted[item.topic, item.rank] = self._newest = stamp
+            self._frames[item.topic, item.rank] = _frame(item)
             yield item.payload
+
+    def _count_repeated(self, item: Item) -> None:
+        """An item with the stamp of the one before: sent twice, or of a second sensor."""
+        first, second = self._frames[item.topic, item.rank], _frame(item)
+        if first == second:
+            self._stats.count(item.topic, Oddity.REPEATED)
+        else:
+            self._stats.count(f"{item.topic}, frames '{min(first, second)}' and '{max(first, second)}'", Oddity.SECOND_FRAME)
 
 
 def merge(items: Iterable[Item], plan: ClockPlan, stats: MessageStats) -> Iterator[Any]:
@@ -297,6 +307,11 @@ def _restamped(item: Item, stamp_ns: int) -> Item:
     if stamp_ns == item.stamp_ns:
         return item
     return dataclasses.replace(item, stamp_ns=stamp_ns, payload=dataclasses.replace(item.payload, stamp_ns=stamp_ns))
+
+
+def _frame(item: Item) -> str:
+    """Frame of its sensor; "" where it has none."""
+    return str(getattr(item.payload, "frame_id", ""))
 
 
 def _agree(one: Item, other: Item) -> bool:

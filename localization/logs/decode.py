@@ -41,6 +41,7 @@ class Oddity(Enum):
     FOREIGN_CLOCK = "stamped by another clock than the other topics', moved to the time of recording"
     OUT_OF_ORDER = "recorded out of order, and sorted"
     REPEATED = "dropped (stamp repeated)"
+    SECOND_FRAME = "dropped (stamp repeated by another frame: two sensors share the topic); give each of them its own topic"
     LATE = "dropped (recorded more than a second after newer ones)"
     OUTLIER = "dropped (stamp that fits neither its neighbours nor the time of recording)"
     REBASED = "stamped after a jump of the clock, moved back by it"
@@ -76,6 +77,10 @@ class MessageStats:
     def of(self, topic: str, oddity: Oddity) -> int:
         """Count of ``topic`` and ``oddity``."""
         return self._counts[topic, oddity]
+
+    def parts(self, topic: str) -> list[str]:
+        """``topic`` and the parts of it that are counted apart (a joint, two frames)."""
+        return [topic, *sorted({name for name, _ in self._counts if name.startswith(f"{topic}, ")})]
 
     def describe(self) -> list[str]:
         """One sentence for each topic and oddity."""

@@ -105,11 +105,11 @@ class LiveStream:
     def dropped(self) -> list[str]:
         """Messages that were corrected or dropped, as sentences."""
         found = []
-        for topic in self._rates:
+        for name in (name for topic in self._rates for name in self._stats.parts(topic)):
             for oddity in Oddity:
-                if (count := self._stats.of(topic, oddity)) and oddity is not Oddity.OUT_OF_ORDER:
+                if (count := self._stats.of(name, oddity)) and oddity is not Oddity.OUT_OF_ORDER:
                     what = _LATE if oddity is Oddity.LATE else oddity.value
-                    found.append(f"{topic}: {count} message{'s' * (count > 1)} {what}.")
+                    found.append(f"{name}: {count} message{'s' * (count > 1)} {what}.")
         return found
 
 

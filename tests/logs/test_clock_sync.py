@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.logs import Log, inspect_log, open_log
-from localization.logs.clock_sync import Item, merge, plan_clocks
+from localization.logs.clock_sync import ClockPlan, Item, merge, plan_clocks
 from localization.logs.decode import MessageStats, Oddity
 from motion_models.robot import load_robot
 from tests.helpers import bags
@@ -225,6 +225,16 @@ def test_clock_sync_repeated_stamps_are_dropped_and_counted() -> None:
     check_order(marks)
     assert len(marks) == 600
     assert stats.of("/scan", Oddity.REPEATED) == 25
+
+
+def test_clock_sync_equal_stamps_of_two_frames_name_both() -> None:
+    """Two LiDARs on one topic: one of two scans is dropped."""
+    stats = MessageStats()
+    pairs = [(START + i * S // 10, frame) for i in range(50) for frame in ("front", "rear")]
+    items = [Item(stamp, stamp, "/scan", 3, 1, Scan(stamp, np.ones((1, 3)), frame_id=frame)) for stamp, frame in pairs]
+    assert len(list(merge(items, ClockPlan(latency_ns={"/scan": 0}), stats))) == 50
+    (sentence,) = stats.describe()
+    assert sentence.startswith("/scan, frames 'front' and 'rear': 50 messages dropped (stamp repeated by another frame")
 
 
 def test_clock_sync_frozen_clock_gives_one_event() -> None:
