@@ -168,14 +168,25 @@ class Run:
     """How long the LiDAR was lost; None where no scans were matched to a map."""
 
 
+_EQUAL_CHARACTERS = 60
+"""Of warnings of one fault: its time and kind, up to the numbers."""
+
+
 def warnings_of(runs: Iterable[Run]) -> list[str]:
-    """Problems of the sensors in all ``runs``, each once: what several trials report alike is given with the names of all of them."""
+    """Problems of the sensors in all ``runs``, each once: what several trials report alike is given with the names of all of them.
+
+    The sensor checks' warnings have no name, and their numbers depend on the estimate: of those of several runs that begin alike the first is kept.
+    """
     names: dict[str, list[str]] = {}
+    beginnings: set[str] = set()
     for run in runs:
         name = f"{run.estimator} ({run.model})"
         for warning in run.warnings:
             text = warning.removeprefix(f"{name}: ")
+            if text == warning and text not in names and warning[:_EQUAL_CHARACTERS] in beginnings:
+                continue
             names.setdefault(text, []).extend([name] if text != warning else [])
+        beginnings |= {warning[:_EQUAL_CHARACTERS] for warning in run.warnings}
     return [f"{', '.join(dict.fromkeys(found))}: {text}" if found else text for text, found in names.items()]
 
 

@@ -109,6 +109,17 @@ def test_warnings_of_runs_name_all_trials_that_have_them():
     assert warnings_of(runs) == [f"ekf (icr), graph (icr): {lost}", slip, "graph (icr): late."]
 
 
+def test_warnings_of_runs_that_begin_alike_are_given_once():
+    def differ(metres, t=302.2):
+        return f"at t = {t} s: for 10 s the motion by the scans and that by the wheels differ (3.2 sigma in the mean, {metres} m)."
+
+    runs = [
+        SimpleNamespace(estimator=name, model="icr", warnings=[differ(metres), differ(metres, 7.0)])
+        for name, metres in (("ekf", 6.24), ("graph", 6.25))
+    ]
+    assert warnings_of(runs) == [differ(6.24), differ(6.24, 7.0)]
+
+
 def test_replay_twice_gives_the_same_bytes(tmp_path):
     """Of the first half minute of the Husky's log, and of a room for the estimators that need a LiDAR."""
     begin = tmp_path / "begin.bag"
