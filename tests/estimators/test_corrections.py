@@ -344,7 +344,7 @@ def round_trip(form, seed):
 
 
 def test_cg_field_of_a_posture_returns_with_the_posture():
-    found = {form: [round_trip(form, seed) for seed in range(5)] for form in ("constant", "cg_field")}
+    found = {form: [round_trip(form, seed) for seed in range(10)] for form in ("constant", "cg_field")}
     drift = {form: np.array([d for d, _ in runs])[:, 3:] for form, runs in found.items()}
     metres = {form: np.hypot(d[..., 0], d[..., 1]).mean() for form, d in drift.items()}
     turns = {form: np.abs(d[..., 2]).mean() for form, d in drift.items()}
