@@ -175,7 +175,8 @@ _EQUAL_CHARACTERS = 60
 def warnings_of(runs: Iterable[Run]) -> list[str]:
     """Problems of the sensors in all ``runs``, each once: what several trials report alike is given with the names of all of them.
 
-    The sensor checks' warnings have no name, and their numbers depend on the estimate: of those of several runs that begin alike the first is kept.
+    The sensor checks' warnings have no name, and their numbers depend on the estimate: of those of several runs that begin alike the first
+    is kept.
     """
     names: dict[str, list[str]] = {}
     beginnings: set[str] = set()
