@@ -22,6 +22,8 @@ _PRIOR_SCANS = 0.2
 """Weight of white slip, as the wheels' noise model has it, in scans: the first key scans are drawn by then, and their error stays (NEES of
 simulated rooms with weight 1: 1.6, with 0.2: 1.9; with white slip 4.7 and 4.8)."""
 
+_MOVED_COV = np.diag([3.0, 3.0, 1.5]) ** 2
+"""Of a robot that was moved by other than its wheels: carried across a room, and turned to any side [m^2, m^2, rad^2]."""
 _MIN_CLOCK_OFFSET_S = 0.05
 """Of a warning: at 1 m/s and 1 rad/s, 5 cm and 3 deg."""
 
@@ -113,6 +115,9 @@ class EkfFusion(Estimator):
         match = sensor.measure(step, prior, cov, step.twist + self._slip, se2.log(se2.between(step.predicted.delta, as_before)))
         self._is_scan_pending = True
         if match is None:
+            if sensor.moved_at_s == step.end_ns * 1e-9:
+                ekf.P[POSE, POSE] += _MOVED_COV
+                self.wheel_motion = replace(self.wheel_motion, cov=self.wheel_motion.cov + _MOVED_COV)
             return None
         R = match.cov
         if duration > 0.0:

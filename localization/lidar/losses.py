@@ -21,6 +21,10 @@ _CAUSES: Mapping[str, tuple[str, str]] = {
         "repeated the ranges of the scan before while the robot drove",
         "Check the LiDAR's driver.",
     ),
+    "moved": (
+        "lost the map at once although the wheels hardly moved",
+        "The robot was moved by other than its wheels, or the LiDAR was turned: the pose is unknown until a mapped place is found.",
+    ),
     "excluded": (
         "were left out by a check",
         "See the warning about the LiDAR above.",
@@ -46,7 +50,7 @@ class LidarLosses:
     ongoing_s: float
     """Time since the last match, up to the last scan [s]."""
     causes: Mapping[str, int]
-    """Scans that were not matched, by cause: lost, sparse, stale, excluded."""
+    """Scans that were not matched, by cause: lost, sparse, stale, moved, excluded."""
     silences: int = 0
     """Times in which no scan came for a second or more."""
 
@@ -71,7 +75,7 @@ class LidarLosses:
         """What to do against missing scans, else against the most frequent cause; "" where nothing was lost."""
         if self.silences:
             return _SILENCE_ADVICE
-        return _CAUSES[max(self.causes, key=lambda name: self.causes[name])][1] if self.causes else ""
+        return _CAUSES[max(self.causes, key=lambda name: (name == "moved", self.causes[name]))][1] if self.causes else ""
 
     def describe(self) -> str:
         """What happened, where, why, and what to do; "" where every scan came and was matched."""

@@ -171,6 +171,8 @@ class ScanMatcher:
         self._image: LikelihoodImage | None = None
         self.is_new_place = False
         """Most of the last scan lies in unmapped space, the rest are inliers and the prior is narrow: it is a key scan."""
+        self.mapped_share = 1.0
+        """Share of the last scan's points with a surface of the submap near them."""
         self._residuals = np.full(3, 1e-3)  # sums over the last scans: squares, squares of blocks, inliers
 
     def match(
@@ -183,6 +185,7 @@ class ScanMatcher:
         ``offset`` (3,), from the prior to where the twist of the last step would lead, widens the search.
         """
         fit = self._align(points, prior, cov, prior if guess is None else guess)
+        self.mapped_share = fit.n_associated / len(points)
         self.is_new_place = fit.n_associated < 0.5 * len(points) and fit.n_inliers >= 0.5 * fit.n_associated and is_narrow(cov)
         converges, agrees = _is_within_basin(fit, cov), mahalanobis(prior, fit.pose, cov) < 2.0 * _OUTLIER_COST
         fits = converges and fit.overlap >= self._config.search_below

@@ -17,6 +17,9 @@ from motion_models import se2
 from motion_models.robot import Mount
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, Twist2
 
+_MAPPED, _UNMAPPED, _MAX_MOTION = 0.8, 0.3, 0.3
+"""The scene changed at once where the mapped share of scans fell from above the first to below the second while the wheels moved by less
+than the third [m, rad]. Within one scan it falls from 0.97 to 0.52 at most on fr079, MIT-CSAIL and ACES, to below 0.25 where a robot is carried."""
 _MIN_DISPLACEMENT_M = 1e-3
 """Points that another twist moves by less are not deskewed again [m]."""
 
@@ -50,6 +53,8 @@ class ScanMatchingSensor:
         self._searching_since_s: float | None = None
         self._is_searching = False  # the scan at hand was not found from a wide prior: a place is still to be found
         self._stale, self.lost = StaleScans(), LostScans()
+        self.moved_at_s: float | None = None
+        """Time at which the robot was last moved by other than its wheels [s]."""
 
     def measure(self, step: Step, prior: Pose2, cov: Cov3, twist: Twist2, offset: Tangent2) -> ScanMatch | None:
         """Match the scan of ``step`` near ``prior`` (3,) with its covariance (3, 3) against the submap; None where it is lost.
@@ -71,7 +76,13 @@ class ScanMatchingSensor:
             self._begin(self._scan)
             self.lost.add_matched(step.end_ns)
             return None
+        before = self._matcher.mapped_share
         found = self._match(self._matcher, self._scan, offset)
+        if found is None and _is_moved(before, self._matcher.mapped_share, step):
+            self._scan, self.moved_at_s = None, step.end_ns * 1e-9
+            self._matcher.is_new_place = False
+            self.lost.add(step.end_ns, "moved")
+            return None
         self._update_search_state(found is None and not is_narrow(cov), step.end_ns * 1e-9)
         if found is None:
             self.lost.add(step.end_ns, "lost")
@@ -171,3 +182,9 @@ class ScanMatchingSensor:
             self._searching_since_s, self._is_searching = None, False
         self._is_placed = mount is not None
         return mount or Mount()
+
+
+def _is_moved(before: float, now: float, step: Step) -> bool:
+    """Whether scans lose the map at once, from the mapped share ``before`` to that of ``now``, though the wheels hardly moved."""
+    x, y, yaw = step.predicted.delta
+    return before > _MAPPED and now < _UNMAPPED and math.hypot(x, y) < _MAX_MOTION and abs(yaw) < _MAX_MOTION

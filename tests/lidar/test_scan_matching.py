@@ -19,12 +19,12 @@ AHEAD = np.array([0.6, 0.0, 0.0])
 """Farther than key scans are apart."""
 
 
-def step_at(seconds: float, walls: np.ndarray, pose: np.ndarray) -> Step:
-    """A scan of ``walls`` from ``pose`` (3,)."""
+def step_at(seconds: float, walls: np.ndarray, pose: np.ndarray, delta: tuple[float, float, float] = (0.6, 0.0, 0.0)) -> Step:
+    """A scan of ``walls`` from ``pose`` (3,), after the wheels moved by ``delta``."""
     points = rooms.scan_from(walls, pose, np.random.default_rng(round(10 * seconds)))
     stamp_ns = round(seconds * 1e9)
     scan = Scan(stamp_ns, np.column_stack([points, np.zeros(len(points))]))
-    return Step(stamp_ns - 100_000_000, stamp_ns, Motion(np.zeros(3), 1e-6 * np.eye(3)), np.zeros(3), np.zeros(3), False, True, None, scan)
+    return Step(stamp_ns - 100_000_000, stamp_ns, Motion(np.array(delta), 1e-6 * np.eye(3)), np.zeros(3), np.zeros(3), False, True, None, scan)
 
 
 @pytest.fixture
@@ -73,3 +73,12 @@ def test_submap_begins_anew_where_the_mount_comes_while_a_place_is_searched() ->
     assert sensor.is_key(AHEAD)
     sensor.insert_key_scan(AHEAD, np.zeros((3, 3)))
     assert measure(sensor, 1.2, LAB, NARROW)
+
+
+def test_scene_that_changes_at_once_is_no_new_place(sensor: ScanMatchingSensor) -> None:
+    """The robot is carried to another room while its wheels stand: the scan is lost, and no key scan."""
+    step = step_at(1.0, HALL, AHEAD, (0.0, 0.0, 0.0))
+    assert sensor.measure(step, AHEAD, NARROW, np.zeros(3), np.zeros(3)) is None
+    assert sensor.moved_at_s == 1.0
+    assert sensor.lost.causes == {"moved": 1}
+    assert not sensor.is_key(AHEAD)
