@@ -19,7 +19,7 @@ from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, Twist2
 
 _MAPPED, _UNMAPPED, _MAX_MOTION = 0.8, 0.3, 0.3
 """The scene changed at once where the mapped share of scans fell from above the first to below the second while the wheels moved by less
-than the third [m, rad]. Within one scan it falls from 0.97 to 0.52 at most on fr079, MIT-CSAIL and ACES, to below 0.25 where a robot is carried."""
+than the third [m, rad]. It falls from 0.97 to 0.52 at most on fr079, MIT-CSAIL and ACES, and below 0.25 where a robot is carried."""
 _MIN_DISPLACEMENT_M = 1e-3
 """Points that another twist moves by less are not deskewed again [m]."""
 

@@ -24,7 +24,8 @@ def step_at(seconds: float, walls: np.ndarray, pose: np.ndarray, delta: tuple[fl
     points = rooms.scan_from(walls, pose, np.random.default_rng(round(10 * seconds)))
     stamp_ns = round(seconds * 1e9)
     scan = Scan(stamp_ns, np.column_stack([points, np.zeros(len(points))]))
-    return Step(stamp_ns - 100_000_000, stamp_ns, Motion(np.array(delta), 1e-6 * np.eye(3)), np.zeros(3), np.zeros(3), False, True, None, scan)
+    motion = Motion(np.array(delta), 1e-6 * np.eye(3))
+    return Step(stamp_ns - 100_000_000, stamp_ns, motion, np.zeros(3), np.zeros(3), False, True, None, scan)
 
 
 @pytest.fixture
