@@ -53,6 +53,7 @@ class ScanMatchingSensor:
         self._searching_since_s: float | None = None
         self._is_searching = False  # the scan at hand was not found from a wide prior: a place is still to be found
         self._stale, self.lost = StaleScans(), LostScans()
+        self._mapped_shares: dict[str, float] = {}  # of the last scan of each frame
         self.moved_at_s: float | None = None
         """Time at which the robot was last moved by other than its wheels [s]."""
 
@@ -74,10 +75,12 @@ class ScanMatchingSensor:
             return None
         if self._matcher is None:
             self._begin(self._scan)
+            self._mapped_shares = {step.scan.frame_id: 1.0}
             self.lost.add_matched(step.end_ns)
             return None
-        before = self._matcher.mapped_share
         found = self._match(self._matcher, self._scan, offset)
+        before = self._mapped_shares.get(step.scan.frame_id, 0.0)
+        self._mapped_shares[step.scan.frame_id] = self._matcher.mapped_share
         if found is None and _is_moved(before, self._matcher.mapped_share, step):
             self._scan, self.moved_at_s = None, step.end_ns * 1e-9
             self._matcher.is_new_place = False

@@ -129,7 +129,7 @@ def test_diagnose_inseparable_causes_are_one_finding(diagnosed: Diagnosed) -> No
     assert found.verdict == "ambiguous"
     first = found.findings[0]
     assert {first.cause, *dict(first.aliases)} >= {"payload", "cg_offset_x"}
-    assert {"payload", "cg_offset_x"} <= set(found.next_drive.replace(",", "").split())
+    assert {"payload", "cg_offset_x"} <= set(found.next_drive.replace(",", "").replace(":", "").split())
 
 
 def test_diagnose_without_gyro_shows_clock_difference(diagnosed: Diagnosed) -> None:

@@ -48,6 +48,7 @@ class PoseSensor:
 
     cell = 0.0  # no voxels, and so no loops
     sweep_s = 0.0  # poses at one instant
+    moved_at_s = None  # by its wheels alone
 
     def __init__(self) -> None:
         self.next: ScanMatch | None = None
