@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from motion_models.robot import DIFF_DRIVE, Robot
+
 
 @dataclass(frozen=True)
 class Hypothesis:
@@ -82,6 +84,8 @@ class Cause:
     """For a change: when."""
     prior_sigma: float = 0.0
     """How large the size may plausibly be, as a standard deviation; 0 for four times the typical size."""
+    limits: tuple[float, float] = (-math.inf, math.inf)
+    """Sizes beyond these are not considered, where that is not the same to both sides (see `bounds`)."""
 
     @property
     def key(self) -> str:
@@ -97,6 +101,11 @@ class Cause:
     def largest(self) -> float:
         """Magnitude beyond which a size is not considered: ten times the typical size, or five sigma of a physical prior."""
         return min(10.0 * self.typical, 5.0 * self.prior_sigma or math.inf)
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Sizes that are considered: up to `largest` to both sides, or to one, within `limits`."""
+        return max(0.0 if self.one_sided else -self.largest, self.limits[0]), min(self.largest, self.limits[1])
 
     @property
     def largest_plausible(self) -> float:
@@ -329,6 +338,8 @@ STIFFNESS_EXPONENT = "stiffness_exponent"
 """Of a healthy drive alone (`weigh.stiffness_exponent_cause`): how slow turns differ from fast ones."""
 
 
+_MAX_NARROWING = 0.8
+"""Of the track of a robot with casters, as a share of it."""
 _TOLERATED_LOAD = 0.01
 """Share of the robot's mass that is tolerated as payload: over the front edge it moves the centre of gravity of the robots that come with
 skidloc by 1 to 5 mm, and 3 mm are tolerated of `cg_offset_x` [-]."""
@@ -337,6 +348,23 @@ skidloc by 1 to 5 mm, and 3 mm are tolerated of `cg_offset_x` [-]."""
 def payload(mass_kg: float) -> Cause:
     """The payload of a robot of this mass."""
     return dataclasses.replace(CAUSES["payload"], negligible=_TOLERATED_LOAD * mass_kg)
+
+
+_TYPICAL_TRACKS = 2.0
+"""Errors of the track that are considered whatever the wheelbase, over the typical one."""
+
+
+def track_width(robot: Robot) -> Cause:
+    """The track width of ``robot``, where its twin cannot be found.
+
+    How far wheels that skid turn a robot, k r (q_r - q_l) / t with k = 1 / (1 + (W / t)^2), goes with t / (t^2 + W^2), which W^2 / t gives
+    as well as t: a track has to be on the same side of the wheelbase W as the file's, and positive where wheels do not skid.
+    """
+    g, cause = robot.geometry, CAUSES["track_width"]
+    if robot.drive == DIFF_DRIVE:
+        return dataclasses.replace(cause, limits=(-_MAX_NARROWING * g.track_width_m, math.inf))
+    middle, least = g.wheelbase_m - g.track_width_m, _TYPICAL_TRACKS * cause.typical
+    return dataclasses.replace(cause, limits=(min(middle, -least), math.inf) if middle < 0.0 else (-math.inf, max(middle, least)))
 
 
 def friction_change(at_s: float) -> Cause:

@@ -20,6 +20,7 @@ from localization.diagnosis.causes import (
     of_reference,
     payload,
     slope_across,
+    track_width,
 )
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.prediction import CHANNELS, Baseline, DrivePredictor, with_sizes
@@ -183,7 +184,7 @@ SKIDDING = frozenset(
     {"track_width", "payload", "cg_offset_x", "cg_offset_y", "friction_anisotropy", "friction_change", "split_friction", "scrub"}
     | {"lateral_force_law", "diagonal_load", "tread_asymmetry", "rolling_resistance", "slope", "rotation_slip_speed"}
 )
-"""Causes that act by the friction of wheels that skid: none of a robot with casters, whose track is a scale of its rotation."""
+"""Causes that act by the friction of wheels that skid: none of a robot with casters but the track, by which it turns."""
 _SHOWN_BY_HEADINGS = frozenset(
     {"rotation_scale", "rotation_slip_speed", "rotation_slip_rate", "rotation_slip_curvature", "wheel_radius_difference"}
     | {"wheel_time_offset", "gyro_time_offset", "gyro_bias", "gyro_scale", "encoder_dropout"}
@@ -365,6 +366,10 @@ def make_predictor(drive: Drive, model: MotionModel, baseline: Baseline | None =
     return with_inertia if better or model.name == "friction" else plain
 
 
+_TRACK, _SCALE = "track_width", "rotation_scale"
+"""One and the same for a robot with casters, which turns by its track; that is what one measures."""
+
+
 def candidate_causes(predictor: DrivePredictor, moments: int) -> tuple[Cause, ...]:
     """Causes that this drive could show; a change of the floor at so many ``moments``."""
     drive = predictor.drive
@@ -381,7 +386,7 @@ def candidate_causes(predictor: DrivePredictor, moments: int) -> tuple[Cause, ..
         out |= {"lidar_offset_x", "lidar_offset_y", "lidar_yaw", "lidar_time_offset", "lateral_slip_speed", "longitudinal_slip_turning"}
     if drive.kind in ("rotations", "runs"):
         out |= {"lidar_time_offset", "wheel_time_offset", "slope", "lateral_slip_speed", "rotation_slip_speed", "longitudinal_slip_turning"}
-    catalogue = {**CAUSES, "payload": payload(drive.robot.geometry.mass_kg)}
+    catalogue = {**CAUSES, "payload": payload(drive.robot.geometry.mass_kg), "track_width": track_width(drive.robot)}
     found = [e if drive.is_lidar_reference else of_reference(e) for e in catalogue.values() if e.id not in out]
     if drive.kind == "log" and not drive.is_gyro_reference:
         found.append(slope_across())
@@ -391,15 +396,15 @@ def candidate_causes(predictor: DrivePredictor, moments: int) -> tuple[Cause, ..
     if drive.kind == "runs":
         out = {"wheel_radius_difference", "tread_asymmetry", "lidar_yaw", "gyro_bias", "encoder_dropout"}
         return tuple(e for e in found if e.id not in out)
+    has_casters = not is_skid_steer(drive.robot)
     if not drive.has_positions:
-        return tuple(e for e in (*found, *WINDOW_CAUSES.values()) if e.id in _SHOWN_BY_HEADINGS)
-    if not is_skid_steer(drive.robot):
-        found = [e for e in found if e.id not in SKIDDING]
+        shown = [e for e in (*found, *WINDOW_CAUSES.values()) if e.id in _SHOWN_BY_HEADINGS or (has_casters and e.id == _TRACK)]
+        return tuple(e for e in shown if not (has_casters and e.id == _SCALE))
     if drive.kind == "windows":
         found += list(WINDOW_CAUSES.values())
     elif predictor.model.name != "friction":  # its own number for how far it turns is not the floor's
-        found.append(WINDOW_CAUSES["rotation_scale"])
-    return tuple(found)
+        found.append(WINDOW_CAUSES[_SCALE])
+    return tuple(e for e in found if not has_casters or (e.id not in {*SKIDDING, _SCALE} - {_TRACK}))
 
 
 def linearize(predictor: DrivePredictor, causes: tuple[Cause, ...], sizes: dict[Cause, float], tolerance: float) -> Linearization:

@@ -20,6 +20,7 @@ from motion_models.calibration.maneuvers import Batch, IntArray, Maneuver, make_
 from motion_models.calibration.prediction import predict
 from motion_models.compiled import kernel, subroutine
 from motion_models.friction import FrictionModel
+from motion_models.robot import DIFF_DRIVE
 from motion_models.se2 import FloatArray
 
 _DROP = (0.4, 0.62)  # one of two encoders silent; the rate of a side is their mean
@@ -312,6 +313,9 @@ class _HypothesisModel:
         if b.encoder_loss:
             rates = rates * (1.0 + b.encoder_loss / max(p._lost_time, 1e-9) * p._lost)
         value = self._of_model(rates, cg, params) + self._floor(rates, cg)
+        if p.drive.robot.drive == DIFF_DRIVE:
+            track = p.drive.robot.geometry.track_width_m
+            value = value * np.array([1.0, 1.0, track / (track + b.friction.get("track_width", 0.0))])
         if any(b.rotation_coefficients):
             energy = 2.0 * np.maximum(np.sum(rates**2, axis=-1), 1e-12)
             straight = 1.0 - (rates[:, 1] - rates[:, 0]) ** 2 / energy
@@ -344,7 +348,14 @@ class _HypothesisModel:
     def _floor(self, rates: FloatArray, cg: FloatArray) -> FloatArray:
         """(N, 3) change of the friction model's twists by causes of the floor, and by inertia."""
         p, b = self._p, self._b
-        is_changed = b.friction or any(b.cg) or b.payload_kg or b.friction_change or b.other_contact_law or b.split_friction
+        is_changed = (
+            (b.friction and p.drive.robot.drive != DIFF_DRIVE)
+            or any(b.cg)
+            or b.payload_kg
+            or b.friction_change
+            or b.other_contact_law
+            or b.split_friction
+        )
         is_changed = is_changed or b.stiffness_exponent
         if not (is_changed or any(b.slope) or p.has_inertia):
             return np.zeros((len(rates), 3))

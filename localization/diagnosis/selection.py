@@ -292,7 +292,7 @@ def aliases_of(predictor: DrivePredictor, linearization: Linearization, chosen: 
         subset = (*others, j)
         gain = problem.gain(subset)
         size = float(problem.fit(subset)[0][-1])
-        if own - gain > promised or (cause.one_sided and size < 0.0) or abs(size) > cause.largest:
+        if own - gain > promised or not cause.bounds[0] <= size <= cause.bounds[1]:
             continue
         if cause.id not in found or gain > found[cause.id][0]:
             found[cause.id] = gain, j
@@ -347,6 +347,8 @@ def _refined_cost(predictor: DrivePredictor, linearization: Linearization, start
     """Sizes by the predictor itself, and what they cost; inf for sizes that no robot can have."""
     try:
         sizes, rows = _refine_sizes(predictor, linearization, start)
+        if any(size in cause.limits for cause, size in sizes.items()):  # the drive asks for more than is considered
+            return sizes, math.inf
         return sizes, _cost(linearization, sizes, rows)
     except (CgError, ModelError):
         return start, math.inf
@@ -404,4 +406,4 @@ def _linear_sizes(linearization: Linearization, subset: tuple[int, ...]) -> dict
 
 
 def _bounds(causes: tuple[Cause, ...]) -> FloatArray:
-    return np.array([(0.0 if e.one_sided else -e.largest, e.largest) for e in causes])
+    return np.array([e.bounds for e in causes])
