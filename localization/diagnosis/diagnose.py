@@ -67,6 +67,7 @@ _ROUNDS = 5
 _SYSTEMATIC_SHARE = 1.0 / 3.0  # systematic part of a size's sigma, over what is negligible: clocks, mounts and physics are no better
 _MIN_HELDOUT_GAIN = 0.003  # least held-out gain of a finding
 _SUSPICION = 0.2  # family-wise p of a cause that is mentioned, but not named
+_DETECTABLE_SIGMAS = 3.0
 _MIN_GAPS = 3  # fewer gaps between messages are pauses
 
 
@@ -188,7 +189,7 @@ def _conclude(
     reference_sigmas = _reference_sigmas(predictor) if drive.kind == "log" else None
     excess = [noise_excess(linearization, reference_sigmas, np.isfinite(first.rows[:, c]), c) for c in range(3)]
     chosen, gains, dropped = _keep_useful(linearization, chosen, config, max(excess) <= MAX_NOISE_OVER_REFERENCE)
-    sizes, _, gained = problem.fit(chosen)
+    sizes, gained = problem.fit_by_likelihood(chosen)[0], problem.gain(chosen)
     findings = _make_findings(predictor, linearization, chosen, gains, rng)
     rows = attribute_rows(first, linearization, chosen, sizes, config.significance, reference_sigmas)
     left = linearization.linear - linearization.signatures[..., list(chosen)] @ sizes
@@ -276,7 +277,7 @@ def _make_findings(
 ) -> list[Finding]:
     """Findings, strongest evidence first; ``gains`` by windows that were held out."""
     problem, causes = linearization.problem, linearization.causes
-    sizes, cov, _ = problem.fit(chosen)
+    sizes, cov = problem.fit_by_likelihood(chosen)
     found: list[tuple[float, Finding]] = []
     for n, i in enumerate(chosen):
         cause, size = causes[i], float(sizes[n])
@@ -306,10 +307,8 @@ def _suspect(predictor: DrivePredictor, linearization: Linearization, rng: np.ra
 
 
 def _detectable_sizes(linearization: Linearization) -> dict[str, float]:
-    problem = linearization.problem
     found: dict[str, float] = {}
-    for i, cause in enumerate(linearization.causes):
-        size = 3.0 * problem.scale[i] / math.sqrt(problem.gram[i, i] + 1.0)
+    for cause, size in zip(linearization.causes, linearization.problem.detectable_sizes(_DETECTABLE_SIGMAS), strict=True):
         found[cause.id] = min(found.get(cause.id, math.inf), float(size))
     return found
 

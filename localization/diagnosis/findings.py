@@ -233,7 +233,7 @@ class Diagnosis:
     tolerances: Mapping[str, float] = field(default_factory=dict)
     """Tolerated size of each of them."""
     detectable_sizes: Mapping[str, float] = field(default_factory=dict)
-    """Smallest size of each cause that this drive would show (three sigma, alone)."""
+    """Smallest size of each cause that this drive would show (three sigma, beside all that is tolerated)."""
     gain: Gain | None = None
     """By all findings together."""
     contradictions: tuple[str, ...] = ()

@@ -48,6 +48,7 @@ geometry's angle where the sides' speeds differ from their mean by 0.4 to 0.8 m/
 no data of turns in place."""
 _FEWEST_FOR_NOISE = 4  # windows; of fewer the noise is the claimed one
 _NO_SIZE = 1e-6  # sigma of a size that is not there, in units of its prior's
+_FREE_VARIANCE = 1e6  # of a size that may be any, in squares of its prior's sigma
 _CLIP = 9.0  # squares beyond this many variances are outliers, and count as this much
 
 
@@ -242,6 +243,24 @@ class Regression:
         inverse = np.linalg.solve(factor, np.eye(len(factor))[:, i])
         scale = self.scale[i]
         return sizes * scale, (inverse.T @ inverse) * np.outer(scale, scale), twice - self._evidence_of_nothing
+
+    def fit_by_likelihood(self, subset: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
+        """Sizes in own units and their covariance by the drive alone, all other causes within tolerance: `fit` without the priors of
+        ``subset``, which hold a size that the drive hardly shows near zero and yet make its sigma small."""
+        i = list(subset)
+        variances = self._variances(subset)
+        variances[i] = _FREE_VARIANCE
+        cov = np.linalg.inv(self.gram + np.diag(1.0 / variances))
+        scale = self.scale[i]
+        return (cov @ self.moment)[i] * scale, cov[np.ix_(i, i)] * np.outer(scale, scale)
+
+    def detectable_sizes(self, sigmas: float) -> FloatArray:
+        """(p,) size of each cause, in its own unit, that the drive would show to so many ``sigmas`` beside all that is tolerated of the
+        others; at most so many sigmas of its prior."""
+        information = 1.0 / np.diagonal(np.linalg.inv(self.gram + np.diag(1.0 / np.square(self.tolerance)))) - 1.0 / np.square(
+            self.tolerance
+        )
+        return np.asarray(sigmas * self.scale / np.sqrt(np.maximum(information, 0.0) + 1.0))
 
     def posterior_sigmas(self, subset: tuple[int, ...]) -> FloatArray:
         """(p,) posterior sigmas of all sizes, in own units, with those outside of ``subset`` held to their tolerance."""

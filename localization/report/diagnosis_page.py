@@ -135,7 +135,9 @@ def _handover(d: Diagnosis) -> list[Block]:
 def _detectable(d: Diagnosis) -> list[Block]:
     rows = [[Cell(name, is_code=True), Cell(f"{size:.3g}{unit_of(name)}")] for name, size in d.detectable_sizes.items()]
     return (
-        [Table([Cell("Cause"), Cell("Smallest size that this drive would show (3 sigma, nothing else deviating)")], rows)] if rows else []
+        [Table([Cell("Cause"), Cell("Smallest size that this drive would show (3 sigma, all else within tolerance)")], rows)]
+        if rows
+        else []
     )
 
 

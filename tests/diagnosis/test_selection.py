@@ -93,3 +93,23 @@ def test_simplest_set_of_equally_good_clocks_takes_the_wheels() -> None:
     for off in (-1e-9, 0.0, 1e-9):
         assert simplest_set([(-50.0, lidar), (-50.0 + off, wheels), (-30.0, other)], 0.0, predictor) == wheels
     assert simplest_set([(-50.0, lidar), (-40.0, wheels)], 0.0, predictor) == lidar
+
+
+def test_fit_by_likelihood_weak_size_is_unbiased_with_its_sigma() -> None:
+    """A drive that shows a cause as well as its prior does: `fit` pulls the size halfway to zero."""
+    problem = made_up(np.zeros(4), np.random.default_rng(0)).problem
+    weak = dataclasses.replace(problem, gram=np.eye(4), moment=np.array([6.0, 0.0, 0.0, 0.0]))
+    sizes, cov = weak.fit_by_likelihood((0,))
+    assert sizes[0] == pytest.approx(6.0 * weak.scale[0], rel=1e-4)
+    assert np.sqrt(cov[0, 0]) == pytest.approx(weak.scale[0], rel=1e-4)
+    assert weak.fit((0,))[0][0] == pytest.approx(3.0 * weak.scale[0])
+
+
+def test_detectable_sizes_are_beside_what_is_tolerated() -> None:
+    """Where a second cause has nearly the signature of the first, its tolerance hides as much of it."""
+    problem = made_up(np.zeros(4), np.random.default_rng(0)).problem
+    alike = np.eye(4)
+    alike[0, 1] = alike[1, 0] = 0.99
+    alone, beside = (dataclasses.replace(problem, gram=1e6 * gram).detectable_sizes(3.0) for gram in (np.eye(4), alike))
+    assert beside[0] > 2.0 * alone[0]
+    assert beside[2] == pytest.approx(alone[2])
