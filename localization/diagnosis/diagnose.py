@@ -18,6 +18,7 @@ from localization.diagnosis.findings import (
     Diagnosis,
     Finding,
     Gain,
+    correctable_findings,
     describe_loss,
     describe_standstill_turn,
     evidence,
@@ -224,8 +225,10 @@ def _conclude(
         hypothesis=with_sizes({causes[i]: float(size) for i, size in zip(chosen, sizes, strict=True)}),
         suspected=None if suspected is None else suspected[0],
     )
-    handover = check_handover(predictor, linearization, [causes[i].key for i in chosen])
-    result = _with_data_errors(dataclasses.replace(result, handover=handover), drive)
+    correctable = {f.definition: f.size for f in correctable_findings(result)}
+    handover = check_handover(predictor, linearization, [cause.key for cause in correctable] or [causes[i].key for i in chosen])
+    result = dataclasses.replace(result, handover=handover, hypothesis=with_sizes(correctable) if correctable else result.hypothesis)
+    result = _with_data_errors(result, drive)
     residuals = Residuals(first.rows, left, linearization.noise.sigmas)
     return DiagnosisResult(result, predictor, residuals, linearization)
 
@@ -289,7 +292,8 @@ def _make_findings(
         aliases = aliases_of(predictor, linearization, chosen, i)
         gained = problem.gain(chosen) - problem.gain(others)
         text = evidence(cause, linearization.signatures[..., i] * size, linearization.noise, gained)
-        found.append((gained, Finding(cause, size, sigma, p, aliases, text, gains[n])))
+        moves = {causes[j].id: float(cov[n, m] / cov[m, m] * sizes[m]) for m, j in enumerate(chosen) if m != n}
+        found.append((gained, Finding(cause, size, sigma, p, aliases, text, gains[n], moves)))
     return [finding for _, finding in sorted(found, key=lambda pair: pair[0], reverse=True)]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
@@ -23,7 +23,11 @@ that no cause has (`tests.studies.unknown_effects --develop`)."""
 
 _SHOWN_GAIN = 0.01  # smallest gain that a sentence reports: in short drives tolerated differences mask it
 
+_AND = " and "
+"""Between the causes in whose place a trend explains a drive."""
 _NOT_SHOWN = "This drive cannot show what is wrong with {}."
+_TWO_SIDED_95 = 1.96
+_MAX_MOVED_SHARE = 0.1  # of a size that is right although another finding beside it is not: accuracy of signatures
 _MAX_SUSPECTED_ALIASES = 3  # that a sentence names
 
 _CHANNEL_WORDS = {
@@ -71,6 +75,8 @@ class Finding:
     """Causes that would explain the same drive about as well, each with its size."""
     evidence: str
     gain: Gain
+    moves: Mapping[str, float] = field(default_factory=dict)
+    """By how much the size would be less if another finding had none, by its cause: their covariance over its variance, times its size."""
 
     @property
     def cause(self) -> str:
@@ -79,8 +85,14 @@ class Finding:
 
     @property
     def is_plausible(self) -> bool:
-        """Whether robots have the cause at such a size."""
-        return abs(self.size) <= self.definition.largest_plausible
+        """Whether robots have the cause at a size in its 95 % interval."""
+        low, high = self.definition.limits
+        return abs(self.size) - _TWO_SIDED_95 * self.sigma <= self.definition.largest_plausible and low <= self.size <= high
+
+    def is_independent_of(self, causes: Collection[str]) -> bool:
+        """Whether the size stays within its sigma, or within a tenth of it, where none of these ``causes`` has a size."""
+        moved = sum(move for cause, move in self.moves.items() if cause in causes)
+        return abs(moved) <= max(self.sigma, _MAX_MOVED_SHARE * abs(self.size))
 
     @property
     def description(self) -> str:
@@ -352,10 +364,12 @@ def unit_of(name: str) -> str:
 
 
 def correctable_findings(d: Diagnosis) -> list[Finding]:
-    """Those that a robot is corrected by: none beside sizes that no robot has, or where a trend explains the drive in their place."""
+    """Those that a robot is corrected by: no sizes that no robot has, nothing in whose place a trend explains the drive, and nothing whose
+    size depends on one of these."""
     estimated = [f for f in d.findings if f.cause != MISSING_MESSAGES.id]
-    is_contested = any(t.instead_of for t in d.trends) or not all(f.is_plausible for f in estimated)
-    return [] if is_contested else estimated
+    contested = {name for t in d.trends if t.instead_of for name in t.instead_of.split(_AND)}
+    contested |= {f.cause for f in estimated if not f.is_plausible}
+    return [f for f in estimated if f.cause not in contested and f.is_independent_of(contested)]
 
 
 def sentence(d: Diagnosis) -> str:

@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Hypothesis
+from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Hypothesis, track_width
+from localization.diagnosis.diagnose import diagnose
 from localization.diagnosis.drive import drive_of_table
 from localization.diagnosis.findings import (
     Attribution,
@@ -153,3 +154,42 @@ def test_separating_drive_does_not_rest_on_how_sizes_were_rounded() -> None:
     assert _information_apart(change, 1.01 * change, 20.0**2) < 0.05
     assert 90.0 < _information_apart(change, 2.0 * change, 20.0**2) < 0.25 * 20.0**2 + 1.0
     assert _information_apart(change, change[::-1], 20.0**2) > 200.0
+
+
+def test_correctable_findings_keep_what_the_contested_one_hardly_moves() -> None:
+    large = finding(size=-0.25)
+    right = dataclasses.replace(finding("lidar_yaw", -0.029), moves={"track_width": 0.0005, "scrub": 0.02})
+    entangled = dataclasses.replace(finding("scrub", 0.02), moves={"track_width": 0.015})
+    d = diagnosis((large, right, entangled), (), {"yaw": row("attributed")})
+    assert correctable_findings(d) == [right]
+    assert sentence(d).startswith("Correct lidar_yaw")
+    assert "track_width -0.25 would fit, but are more than robots have" in sentence(d)
+
+
+@pytest.mark.parametrize(("robot", "twin_m"), [("jackal", -0.13), ("husky_a200", -0.1)], ids=["jackal", "husky_a200"])
+def test_track_width_twin_beyond_the_wheelbase_is_not_considered(robot: str, twin_m: float) -> None:
+    """k goes with t / (t^2 + W^2), which t and W^2 / t share."""
+    g, cause = load_robot(robot).geometry, track_width(load_robot(robot))
+    least, most = cause.bounds
+    assert least == pytest.approx(min(g.wheelbase_m - g.track_width_m, -2.0 * cause.typical))
+    assert twin_m < least
+    assert most == cause.largest
+    assert not dataclasses.replace(finding(size=twin_m), definition=cause).is_plausible
+
+
+def test_diagnose_casters_name_the_track_in_metres() -> None:
+    """A robot with casters turns by its track alone, which is what one measures."""
+    robot, rng = load_robot("pioneer_3dx"), np.random.default_rng(3)
+    radius, track = robot.geometry.wheel_radius_m, robot.geometry.track_width_m + 0.012
+    sigmas = np.array([2e-3, 2e-3, 1e-3])
+    maneuvers = []
+    for left, right in rng.uniform(-4.0, 4.0, (40, 2)):
+        v, w = 0.5 * radius * (left + right), radius * (right - left) / track
+        end = 2.0 * np.array([v * np.sinc(w / np.pi) * np.cos(w), v * np.sinc(w / np.pi) * np.sin(w), w]) + rng.normal(0.0, sigmas)
+        maneuvers.append(
+            Maneuver(np.full(20, 0.1), np.tile([left, right], (20, 1)), end[None], np.array([20]), np.zeros(2), np.diag(sigmas**2))
+        )
+    found = diagnose(drive_of_table("table", robot, maneuvers, "windows"), make_model("diff_drive", robot))
+    assert found.findings[0].cause == "track_width"
+    assert found.findings[0].size == pytest.approx(0.012, abs=3.0 * found.findings[0].sigma)
+    assert "rotation_scale" not in {name for f in found.findings for name in (f.cause, *dict(f.aliases))}
