@@ -435,7 +435,7 @@ def linearize(predictor: DrivePredictor, causes: tuple[Cause, ...], sizes: dict[
     for cause, size in sizes.items():
         linear += signatures[..., [e.key for e in causes].index(cause.key)] * size
     nuisances = _nuisances(rows)
-    noise = _estimate_drive_noise(predictor, linear, signatures, nuisances, causes)
+    noise = estimate_drive_noise(predictor, linear, signatures, nuisances, causes)
     problem = make_regression(linear, signatures, nuisances, noise, causes, tolerance)
     return Linearization(causes, rows, linear, signatures, nuisances, noise, tolerance, problem)
 
@@ -464,7 +464,7 @@ def _nuisances(rows: FloatArray) -> FloatArray:
     return np.where(np.isfinite(rows)[..., None], level, np.nan)
 
 
-def _estimate_drive_noise(
+def estimate_drive_noise(
     predictor: DrivePredictor, linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, causes: tuple[Cause, ...]
 ) -> Noise:
     """Estimated from what all causes together leave, in a few rounds, as sizes and noise depend on each other."""

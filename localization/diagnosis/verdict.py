@@ -44,7 +44,7 @@ def trend_motions(predictor: DrivePredictor) -> dict[str, FloatArray]:
         t, dt = twist[a:end], batch.dt[a:end]
         turned = np.cumsum(t[:, 2] * dt) - 0.5 * t[:, 2] * dt
         heading, clock = predictor.headings[owner] + turned, predictor.drive.starts_s[owner]
-        rows.append(_moved_by(t, dt, _increments(t, dt, batch.cg[a:end], heading, float(clock))))
+        rows.append(moved_by(t, dt, _increments(t, dt, batch.cg[a:end], heading, float(clock))))
     table = np.stack(rows)
     return {name: table[..., i] for i, name in enumerate(_TREND_NAMES) if np.ptp(table[:, 2, 2, i]) > 1e-9 or i == 0}
 
@@ -76,7 +76,7 @@ def _increments(twist: FloatArray, dt: FloatArray, cg: FloatArray, heading: Floa
     return np.column_stack([*(d * dt for d in density), *gains])
 
 
-def _moved_by(twist: FloatArray, dt: FloatArray, increments: FloatArray) -> FloatArray:
+def moved_by(twist: FloatArray, dt: FloatArray, increments: FloatArray) -> FloatArray:
     """(3, 3, K) change of a window's last pose, in its frame, by the ``increments`` (n, K) of each component (second axis) of the twist."""
     turned = np.cumsum(twist[:, 2] * dt)
     before = turned - 0.5 * twist[:, 2] * dt - turned[-1]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from localization.cli import main
+from localization.commands.weigh import describe
 from localization.diagnosis.weigh import DrivenWeighing
 from localization.simulation.experiments import Experiment, ExperimentConfig, OpenLoop, Phase, Rest, constant
 from localization.simulation.scanners import ScannerConfig
@@ -18,7 +19,7 @@ from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from motion_models.robot import DIFF_DRIVE, Robot, load_robot
 from motion_models.robot_file import robot_toml
-from tests.studies.weigh import left_out_cgs
+from tests.studies.weigh import left_out_cgs, weigh_simulated
 
 _PAYLOAD_KG = 8.0
 
@@ -94,3 +95,30 @@ def test_weigh_robot_with_casters_is_refused(tmp_path: Path, capsys: pytest.Capt
     robot.write_text(robot_toml(dataclasses.replace(load_robot("husky_a200"), drive=DIFF_DRIVE)))
     assert main(["weigh", str(_bag(tmp_path, _straight, {})), "--robot", str(robot)]) == 2
     assert "turns on casters" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("robot", "x", "y"), [("jackal", 0.015, -0.02), ("husky_a200", 0.04, 0.03)], ids=["jackal", "husky_a200"])
+def test_weigh_on_other_contacts_widens_interval_and_says_why(robot: str, x: float, y: float) -> None:
+    """MuJoCo's contacts turn a robot otherwise than the friction model: corrections absorb the load, and noise is hardly more."""
+    pytest.importorskip("mujoco", reason="needs the extra 'mujoco'")
+    found = weigh_simulated(robot, {"cg_offset_x": x, "cg_offset_y": y}, 422, "mujoco")
+    assert np.all(np.abs(found.offset - [x, y]) < 2.0 * found.sigmas)
+    assert found.model_errors
+    assert "that of the robot file" not in describe(found, None)
+
+
+def test_weigh_by_brush_tyres_of_other_law_holds_the_truth() -> None:
+    found = weigh_simulated("scout_2", {"cg_offset_x": -0.05, "cg_offset_y": 0.06}, 3, "brush")
+    assert np.all(np.abs(found.offset - [-0.05, 0.06]) < 2.0 * found.sigmas)
+
+
+def test_weigh_by_tyres_of_the_model_finds_no_model_error() -> None:
+    found = weigh_simulated("husky_a200", {"cg_offset_x": 0.04, "cg_offset_y": 0.03, "track_width": 0.03}, 5)
+    assert found.model_errors == ()
+    assert found.sigmas.max() < 0.01
+
+
+def test_describe_where_the_model_is_wrong_claims_no_file_value() -> None:
+    wrong = dataclasses.replace(_weighing((0.001, 0.0)), model_errors=("track_width -0.07 (-3.5 sigma): more than robots differ by.",))
+    assert "that of the robot file" in describe(_weighing((0.001, 0.0)), None)
+    assert "does not describe this drive" in describe(wrong, None)
