@@ -10,10 +10,10 @@ from typing import Protocol
 import numpy as np
 
 from localization.evaluation.references import ReferenceTrack
-from localization.events import Event, ImuSample, Scan
+from localization.events import Event, ImuSample, Scan, Turn
 from localization.gyro import GyroBuffer
 from localization.lidar import MIN_POINTS, LidarConfig, ScanMatch, ScanMatcher, Sweep, choose_cell
-from localization.trajectory import Trajectory
+from localization.trajectory import BoolArray, Trajectory
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.base import Motion, MotionModel
@@ -28,6 +28,9 @@ _MAX_GAP_OVER_PERIOD = 2.5  # for references that are sparser than that: one mis
 _MAX_GYRO_BIAS = 0.05  # rad/s; a robot that turns faster by the gyro than any bias does not stand, whatever its wheels report
 HOLD_S = 0.5
 """Without a new sample, the wheels' last rates hold for this time [s]."""
+_MAX_CLOCK_SHIFT_S = 0.3  # of IMU and LiDAR against the wheels; the largest of real logs is 0.16 s (MIT-CSAIL)
+_MIN_STANDSTILL_S = 0.3
+_ROUNDING_RAD_PER_S = 1e-6  # of rates from the poses of a driver's odometry: up to 1e-11 rad/s where MIT-CSAIL stands
 _PRIOR_SIGMA = np.array([0.1, 0.1, 0.1])
 """Sigma of a match's prior, beyond the wheels' slip [m, m, rad]."""
 _TURN_ERROR = 0.5
@@ -75,7 +78,34 @@ class Wheels:
     def is_standing(self, start_ns: int, end_ns: int) -> bool:
         """Whether no wheel moved."""
         dt, rates, _, _ = self.buffer.window(start_ns, end_ns, HOLD_S)
-        return len(dt) > 0 and not np.any(rates)
+        return len(dt) > 0 and bool(_stands(rates).all())
+
+    def standstill(self, start_ns: int, end_ns: int) -> tuple[int, int] | None:
+        """The longest part of a span in which no other clock has a wheel moving either; None where it is too short to measure in.
+
+        It may begin by `_MAX_CLOCK_SHIFT_S` earlier than the span, and ends as much before its end, so that those of neighbouring spans
+        adjoin.
+        """
+        shift = round(_MAX_CLOCK_SHIFT_S / _NS)
+        begin = start_ns - 2 * shift
+        if self.buffer.window(begin, start_ns, HOLD_S)[3]:
+            begin = start_ns
+        dt, rates, _, missing = self.buffer.window(begin, end_ns, HOLD_S)
+        if missing:
+            return None
+        stamps = begin + np.r_[0, np.round(np.cumsum(dt) / _NS)].astype(np.int64)
+        edges = np.diff(np.r_[0, _stands(rates).astype(int), 0])
+        starts, ends = stamps[edges == 1] + shift, stamps[edges == -1] - shift
+        if not len(starts):
+            return None
+        longest = int(np.argmax(ends - starts))
+        found = int(starts[longest]), int(ends[longest])
+        return found if found[1] - found[0] >= round(_MIN_STANDSTILL_S / _NS) else None
+
+
+def _stands(rates: FloatArray) -> BoolArray:
+    """(n,) whether no wheel turns by the ``rates`` (n, 2)."""
+    return np.asarray((np.abs(rates) < _ROUNDING_RAD_PER_S).all(axis=1))
 
 
 class MotionReference(Protocol):
@@ -84,8 +114,8 @@ class MotionReference(Protocol):
     def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
         """Spans that ``event`` completes, of the length that the reference was made for."""
 
-    def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
-        """``spans`` without errors that the whole log shows; ``standing``: those during which no wheel moved."""
+    def correct(self, spans: Sequence[Span]) -> list[Span]:
+        """``spans`` without errors that the whole log shows."""
 
     def warnings(self) -> list[str]:
         """Limits of what was measured, in sentences for the user."""
@@ -99,6 +129,7 @@ class GyroMotionReference:
         self._noise, self._window_ns = noise, round(window_s / _NS)
         self._gyro = GyroBuffer(noise, mounts, keep_s=2.0 * window_s + 10.0)
         self._start_ns = self._newest_ns = None  # type: int | None
+        self._standstills: list[Turn] = []
         self._bias: tuple[float, float] | None = None
 
     def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
@@ -114,6 +145,10 @@ class GyroMotionReference:
         end_ns = self._start_ns + self._window_ns
         if min(newest, self._newest_ns) < end_ns:
             return
+        standstill = wheels.standstill(self._start_ns, end_ns)
+        stood = None if standstill is None else self._gyro.turn(*standstill, 0.0)
+        if stood is not None:
+            self._standstills.append(stood)
         turn = self._gyro.turn(self._start_ns, end_ns, float(wheels.motion(self._start_ns, end_ns).delta[2]))
         angle, variance = 0.0, math.inf
         if turn is not None:
@@ -121,18 +156,9 @@ class GyroMotionReference:
         yield Span(self._start_ns, end_ns, np.array([0.0, 0.0, angle]), np.diag([math.inf, math.inf, variance]), is_valid=turn is not None)
         self._start_ns = end_ns
 
-    def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
+    def correct(self, spans: Sequence[Span]) -> list[Span]:
         """See `MotionReference.correct`."""
-        seconds_of = [(span.end_ns - span.start_ns) * _NS for span in standing]
-        valid = [s for s, t in zip(standing, seconds_of, strict=True) if s.is_valid and abs(float(s.measured[2])) < _MAX_GYRO_BIAS * t]
-        bias, sigma = 0.0, self._noise.bias_sigma_rad_per_s
-        if valid:
-            rates = np.array([span.measured[2] / ((span.end_ns - span.start_ns) * _NS) for span in valid])
-            seconds = sum((span.end_ns - span.start_ns) * _NS for span in valid)
-            # The scatter covers the noise, and the bias's walk between the stops.
-            scatter = float(rates.std(ddof=1)) / math.sqrt(len(rates)) if len(rates) > 1 else 0.0
-            bias, sigma = float(rates.mean()), max(scatter, self._noise.white_rad_per_sqrt_s / math.sqrt(seconds))
-            self._bias = bias, seconds
+        bias, sigma = self._measure_bias()
         corrected = []
         for span in spans:
             duration = (span.end_ns - span.start_ns) * _NS
@@ -141,11 +167,25 @@ class GyroMotionReference:
             corrected.append(replace(span, measured=np.array([0.0, 0.0, float(yaw)]), cov=cov))
         return corrected
 
+    def _measure_bias(self) -> tuple[float, float]:
+        """Bias and sigma by the standstills [rad/s]; those of the noise model where there are none."""
+        stood = [turn for turn in self._standstills if abs(turn.angle) < _MAX_GYRO_BIAS * turn.duration]
+        if not stood:
+            return 0.0, self._noise.bias_sigma_rad_per_s
+        angles, durations = np.array([turn.angle for turn in stood]), np.array([turn.duration for turn in stood])
+        seconds, n = float(durations.sum()), len(stood)
+        bias = float(angles.sum()) / seconds
+        # The scatter covers the noise, and the bias's walk between the stops.
+        scatter = float(np.linalg.norm(angles - bias * durations)) / seconds * math.sqrt(n / (n - 1)) if n > 1 else 0.0
+        self._bias = bias, seconds
+        return bias, max(scatter, self._noise.white_rad_per_sqrt_s / math.sqrt(seconds))
+
     def warnings(self) -> list[str]:
         """See `MotionReference.warnings`."""
         if self._bias is None:
             note = (
-                "the robot never stood still, so the gyro's bias could not be measured and counts as error; let it stand for a few seconds."
+                "the robot never stood still for a second, so the gyro's bias could not be measured and counts as error; "
+                "let it stand for a few seconds."
             )
         else:
             note = f"the gyro's bias is {self._bias[0]:+.5f} rad/s, by {self._bias[1]:.0f} s of standing still; it was taken off."
@@ -197,7 +237,7 @@ class LidarMotionReference:
             yield self._span(stamp_ns, match, self._range_slope(match, points, event.frame_id))
             self._begin(stamp_ns, points)
 
-    def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
+    def correct(self, spans: Sequence[Span]) -> list[Span]:
         """See `MotionReference.correct`."""
         return list(spans)
 
@@ -340,7 +380,7 @@ class TrackMotionReference:
         i = int(np.searchsorted(self._stamps, moment_ns))
         return int(self._stamps[i]) if self._is_sparse and i < len(self._stamps) else moment_ns
 
-    def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
+    def correct(self, spans: Sequence[Span]) -> list[Span]:
         """See `MotionReference.correct`."""
         return list(spans)
 

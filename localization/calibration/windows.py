@@ -31,8 +31,6 @@ class WindowConfig(Settings):
     """Wheel motion kept before and after each, in which a shift between the clocks is looked for [s]."""
     least_m: float = 0.02
     """A window in which no wheel rolls as far as this has too little motion and is left out [m]."""
-    standing_m: float = 1e-3
-    """A window in which no wheel rolls as far as this, a few counts of an encoder, measures the gyro at rest [m]."""
     per_group: Count = 3
     """Neighbouring windows that share their errors, and are held out together."""
 
@@ -68,9 +66,7 @@ def cut(
     around = round(config.around_s / _NS)
     waiting: list[Span] = []
     found: list[tuple[Span, Maneuver]] = []
-    short: list[Span] = []
-    standing: list[Span] = []
-    unmeasured = 0
+    short = unmeasured = 0
 
     def take(until_ns: int | None) -> Iterator[Span]:
         while waiting and (until_ns is None or waiting[0].end_ns + around <= until_ns):
@@ -78,15 +74,14 @@ def cut(
 
     def use(span: Span) -> int:
         """1 if the span was not measured."""
+        nonlocal short
         window = _window(history, span, around)
         if window is None:
             return 1
         dt, rates, cg, lead, n = window
         rolled = robot.geometry.wheel_radius_m * np.abs(rates[lead : lead + n]).T @ dt[lead : lead + n]
         if np.max(rolled) < config.least_m:
-            short.append(span)
-            if np.max(rolled) < config.standing_m:
-                standing.append(span)
+            short += 1
         elif span.is_valid:
             end = np.array([n], dtype=np.int64)
             found.append((span, Maneuver(dt, rates, span.measured[None], end, cg, span.cov, lead=lead)))
@@ -105,14 +100,14 @@ def cut(
                 unmeasured += use(span)
     for span in take(None):
         unmeasured += use(span)
-    corrected = reference.correct([span for span, _ in found], standing)
+    corrected = reference.correct([span for span, _ in found])
     first = found[0][0].start_ns if found else 0
     maneuvers = []
     for (_, maneuver), span in zip(found, corrected, strict=True):
         number = int((span.start_ns - first) * _NS / (config.window_s * config.per_group))
         group = f"{name}, {number * config.window_s * config.per_group:g} s"
         maneuvers.append(dataclasses.replace(maneuver, measured=span.measured[None], cov=span.cov, group=group))
-    return Windows(tuple(maneuvers), len(short), unmeasured, tuple(reference.warnings()))
+    return Windows(tuple(maneuvers), short, unmeasured, tuple(reference.warnings()))
 
 
 def _window(history: WheelBuffer, span: Span, around: int) -> tuple[FloatArray, FloatArray, FloatArray, int, int] | None:

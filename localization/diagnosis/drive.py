@@ -62,7 +62,7 @@ class StandstillTurn(NamedTuple):
     seconds: float
     angle_rad: float
     first_s: float
-    """Start of the first such window, after that of the first in which the robot moved."""
+    """Start of the first such standstill, after that of the first window in which the robot moved."""
 
 
 @dataclass(frozen=True)
@@ -110,19 +110,22 @@ class Drive:
 
 
 class _Recorder:
-    """A motion reference that records which spans became maneuvers, and during which the wheels stood."""
+    """A motion reference that records which spans became maneuvers, and when the wheels stood."""
 
     def __init__(self, inner: MotionReference) -> None:
         self._inner = inner
         self.used: list[Span] = []
-        self.standing: list[Span] = []
+        self.standstills: list[tuple[int, int]] = []
 
     def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
-        yield from self._inner.spans(event, wheels)
+        for span in self._inner.spans(event, wheels):
+            standstill = wheels.standstill(span.start_ns, span.end_ns)
+            self.standstills += [] if standstill is None else [standstill]
+            yield span
 
-    def correct(self, spans: Sequence[Span], standing: Sequence[Span]) -> list[Span]:
-        self.used, self.standing = list(spans), list(standing)
-        return self._inner.correct(spans, standing)
+    def correct(self, spans: Sequence[Span]) -> list[Span]:
+        self.used = list(spans)
+        return self._inner.correct(spans)
 
     def warnings(self) -> list[str]:
         return self._inner.warnings()
@@ -244,7 +247,7 @@ def drive_of_events(
         payload_arms=_payload_arms(robot, windows.maneuvers, postures),
         range_slopes=recorder.range_slopes(),
         message_loss=find_message_loss(np.array(wheel_stamps, dtype=np.int64)),
-        standstill_turn=find_standstill_turn(imu.gyro, recorder.standing, spans) if imu.stamps else None,
+        standstill_turn=find_standstill_turn(imu.gyro, recorder.standstills, spans) if imu.stamps else None,
         is_lidar_reference=isinstance(inner, LidarMotionReference),
         lidar_frame=frame,
         lidar_at=(mount.x, mount.y),
@@ -295,13 +298,14 @@ def find_period(gaps: FloatArray) -> float | None:
     return period if float(is_multiple.mean()) >= _MIN_MULTIPLES_SHARE else None
 
 
-def find_standstill_turn(gyro: GyroRecord, standing: Sequence[Span], moving: IntArray) -> StandstillTurn | None:
-    """Turning by ``gyro`` in the windows in which no wheel moved; None where it stood as well. ``moving`` (W, 2) are the others [ns]."""
-    turns = [(s, gyro.turn(s.start_ns, s.end_ns, 0.0)) for s in standing]
-    moved = [(s, t) for s, t in turns if t is not None and t.duration > 0.0 and abs(t.angle) > _MAX_STANDSTILL_RATE * t.duration]
+def find_standstill_turn(gyro: GyroRecord, standstills: Sequence[tuple[int, int]], moving: IntArray) -> StandstillTurn | None:
+    """Turning by ``gyro`` in ``standstills``, from start to end [ns], in which no wheel moved; None where it stood as well. ``moving``
+    (W, 2) are the windows in which the robot moved [ns]."""
+    turns = [(start_ns, gyro.turn(start_ns, end_ns, 0.0)) for start_ns, end_ns in standstills]
+    moved = [(start_ns, t) for start_ns, t in turns if t is not None and abs(t.angle) > _MAX_STANDSTILL_RATE * t.duration]
     if not moved:
         return None
-    first = (moved[0][0].start_ns - (int(moving[0, 0]) if len(moving) else standing[0].start_ns)) * _NS
+    first = (moved[0][0] - (int(moving[0, 0]) if len(moving) else standstills[0][0])) * _NS
     return StandstillTurn(sum(t.duration for _, t in moved), sum(abs(t.angle) for _, t in moved), first)
 
 

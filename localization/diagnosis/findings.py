@@ -311,7 +311,7 @@ def describe_standstill_turn(turn: StandstillTurn) -> str:
     first = f"first at {turn.first_s:.0f} s" if turn.first_s >= 0.0 else f"first {-turn.first_s:.0f} s before it drove"
     angle, rate = math.degrees(turn.angle_rad), math.degrees(turn.angle_rad / turn.seconds)
     return (
-        f"in {turn.seconds:.0f} s of standing by the wheels, {first}, the gyro turned {angle:.0f} deg: its bias is {rate:.2g} deg/s, the "
+        f"in {turn.seconds:.2g} s of standing by the wheels, {first}, the gyro turned {angle:.0f} deg: its bias is {rate:.2g} deg/s, the "
         "wheels' messages are wrong or belong to another time, or the robot was carried; check the joint states' topic and names, and the "
         "gyro at rest."
     )

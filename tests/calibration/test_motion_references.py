@@ -55,20 +55,33 @@ def test_gyro_reference_variance_includes_the_scale():
     assert found[0].cov[2, 2] == pytest.approx(noise.white_rad_per_sqrt_s**2 + (0.01 * 0.8) ** 2)
 
 
-def test_gyro_reference_measures_its_bias_where_no_wheel_turns() -> None:
-    """A small robot without a bias, which turns in place for 4 s and stops, at times of windows of 2 s or between: a wheel that rolls for a
-    part of a window by less than what counts as motion turns the robot by several degrees."""
-    robot = load_robot("turtlebot3_burger")
+@pytest.mark.parametrize(("stop_s", "acceleration"), [(3.3, 1e3), (1.4, 1e3), (3.3, 0.25)])
+def test_gyro_reference_measures_its_bias_where_no_wheel_turns(stop_s: float, acceleration: float) -> None:
+    """A small robot whose gyro is biased and 0.1 s late turns in place and stops, at times of windows of 2 s or between: a wheel that rolls
+    by less than a millimetre turns it by a degree, and no stop of 1.4 s fills a window."""
+    robot, bias = load_robot("turtlebot3_burger"), 0.01
     half, radius = 0.5 * robot.geometry.track_width_m, robot.geometry.wheel_radius_m
+    t, period = 0.02 * np.arange(3000), 4.0 + stop_s
+    wanted = np.where(t % period < 4.0, 0.5, 0.0) * np.where(t // period % 2, -1.0, 1.0)
+    rates = np.zeros(3000)
+    for k in range(1, 3000):
+        rates[k] = rates[k - 1] + np.clip(wanted[k] - rates[k - 1], -0.02 * acceleration, 0.02 * acceleration)
+    wheels = np.outer(np.cumsum(rates) * 0.02 * half / radius, [-1.0, 1.0])
     events: list[WheelSample | ImuSample] = []
-    angle, wheel = 0.0, np.zeros(2)
-    for i in range(3000):
-        t = i * 0.02
-        rate = 0.5 * float(t % 7.3 < 4.0) * (-1.0 if int(t / 7.3) % 2 else 1.0)
-        angle, wheel = angle + 0.02 * rate, wheel + 0.02 * rate * half / radius * np.array([-1.0, 1.0])
-        events.append(WheelSample(i * _NS // 50, np.full(2, np.nan), wheel.copy()))
-        events.append(ImuSample(i * _NS // 50, np.array([0.0, 0.0, rate]), np.array([0.0, 0.0, 9.81]), "base_link"))
+    for k in range(3000):
+        events.append(WheelSample(k * _NS // 50, np.full(2, np.nan), wheels[k]))
+        events.append(ImuSample(k * _NS // 50, np.array([0.0, 0.0, rates[max(k - 5, 0)] + bias]), np.array([0.0, 0.0, 9.81]), "base_link"))
     reference = GyroMotionReference(robot.gyro_noise, {}, 2.0)
     found = cut(events, reference, make_model("diff_drive", robot), robot, WindowConfig(window_s=2.0))
-    assert found.standing > 0
-    assert reference._bias is None or abs(reference._bias[0]) < 1e-3
+    assert "the gyro's bias is +0.01000 rad/s" in found.warnings[0]
+
+
+def test_wheels_standstill_leaves_out_how_far_clocks_may_differ() -> None:
+    """Wheels that stand from 4 s on: by a clock that is 0.3 s late they stand from 4.3 s on."""
+    robot = load_robot("husky_a200")
+    wheels = Wheels(WheelBuffer(np.zeros(2), keep_s=100.0), make_model("diff_drive", robot), robot.wheel_noise)
+    for i in range(1001):
+        wheels.buffer.insert(WheelSample(i * _NS // 100, np.full(2, np.nan), np.full(2, max(4.0 - 0.01 * i, 0.0))))
+    assert wheels.standstill(0, 4 * _NS) is None
+    assert wheels.standstill(3 * _NS, 5 * _NS) == pytest.approx((4.3 * _NS, 4.7 * _NS), abs=2e7)
+    assert wheels.standstill(5 * _NS, 7 * _NS) == pytest.approx((4.7 * _NS, 6.7 * _NS), abs=2e7)

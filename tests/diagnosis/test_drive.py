@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from localization.calibration.motion_references import Span, TrackMotionReference, Wheels
+from localization.calibration.motion_references import TrackMotionReference, Wheels
 from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import Drive, MessageLoss, StandstillTurn, find_message_loss, find_standstill_turn
 from localization.evaluation.references import ReferenceTrack
@@ -59,7 +59,7 @@ def gyro(rate: float) -> GyroRecord:
 
 @pytest.mark.parametrize(("rate", "is_contradiction"), [(0.3, True), (0.004, False)])
 def test_find_standstill_turn_needs_more_than_a_bias(rate: float, is_contradiction: bool) -> None:
-    standing = [Span(i * 10**9, (i + 2) * 10**9, np.zeros(3), np.eye(3)) for i in range(2, 8, 2)]
+    standing = [(i * 10**9, (i + 2) * 10**9) for i in range(2, 8, 2)]
     turn = find_standstill_turn(gyro(rate), standing, np.array([[10**9, 2 * 10**9]]))
     assert (turn is not None) == is_contradiction
     if turn is not None:
