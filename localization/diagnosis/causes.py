@@ -420,7 +420,7 @@ WINDOW_CAUSES: Mapping[str, Cause] = {cause.id: cause for cause in _WINDOW_CAUSE
 """Causes that recorded data of other robots needed, beyond those of the simulator; for tables of windows. T is the share of turning."""
 
 
-_REFERENCE_WORDS = {
+REFERENCE_WORDS = {
     "lidar_offset_x": (
         "the point that the reference tracks lies {} ahead of the body's",
         "the point that the reference tracks lies {} behind the body's",
@@ -432,11 +432,12 @@ _REFERENCE_WORDS = {
     "lidar_yaw": ("the reference's heading is turned {} to the left", "the reference's heading is turned {} to the right"),
     "lidar_time_offset": ("the reference's stamps are {} late", "the reference's stamps are {} early"),
 }
+"""Words for causes that are the reference's, where a reference measured the motion and not the LiDAR."""
 
 
 def of_reference(cause: Cause) -> Cause:
     """``cause`` where a reference measured the motion, not the LiDAR: mount and clock are then the reference's."""
-    return dataclasses.replace(cause, words=_REFERENCE_WORDS.get(cause.id, cause.words))
+    return dataclasses.replace(cause, words=REFERENCE_WORDS.get(cause.id, cause.words))
 
 
 def slope_across() -> Cause:

@@ -90,8 +90,9 @@ def _lidar_frame(predictor: DrivePredictor) -> str | None:
 def check_handover(predictor: DrivePredictor, linearization: Linearization, named: Sequence[str]) -> HandoverCheck | None:
     """Correct the robot by the first half of the drive, and predict the second half with it; ``named`` are the keys of the findings.
 
-    What was measured is corrected by the mount and the clocks that the robot file holds, not by what is to be corrected in drivers.
-    None for drives of a table, without motion in either half, and where the robot file holds none of the findings.
+    What was measured is corrected by the mount and the clocks that the robot file holds, not by what is to be corrected in drivers. Errors
+    of a reference are no part of the check, before or after. None for drives of a table, without motion in either half, and where the robot
+    file holds none of the findings.
     """
     drive = predictor.drive
     half = len(drive.maneuvers) // 2
@@ -104,8 +105,7 @@ def check_handover(predictor: DrivePredictor, linearization: Linearization, name
     problem = make_regression(first[0], first[1][..., chosen], first[2], linearization.noise, causes, linearization.tolerance)
     sizes = problem.fit(tuple(range(len(causes))))[0]
     hypothesis = with_sizes(dict(zip(causes, (float(v) for v in sizes), strict=True)))
-    of_sensors = _of_sensors(hypothesis, predictor.drive.is_lidar_reference)
-    if _of_robot(hypothesis) == Hypothesis() == of_sensors:
+    if _of_robot(hypothesis) == Hypothesis() == _of_sensors(hypothesis, drive.is_lidar_reference):
         return None
     corrected = correct_robot(predictor, hypothesis)
     factors = corrected.robot.geometry.radius_multipliers / drive.robot.geometry.radius_multipliers
@@ -113,7 +113,7 @@ def check_handover(predictor: DrivePredictor, linearization: Linearization, name
     model = make_model(predictor.model.name, corrected.robot)
     corrected_drive = dataclasses.replace(drive, robot=corrected.robot, maneuvers=maneuvers)
     after = DrivePredictor(corrected_drive, model, has_inertia=predictor.has_inertia, baseline=predictor.baseline)
-    rows = predictor.discrepancies(Hypothesis()), after.discrepancies(of_sensors)
+    rows = predictor.discrepancies(_of_reference(hypothesis, drive.is_lidar_reference)), after.discrepancies(_of_sensors(hypothesis))
     shown = [c for c in range(4) if all(np.isfinite(r[half:, c]).any() for r in rows)]
     if not shown:
         return None
@@ -125,10 +125,18 @@ def _arrays(linearization: Linearization) -> tuple[FloatArray, FloatArray, Float
     return linearization.linear, linearization.signatures, linearization.nuisances
 
 
-def _of_sensors(hypothesis: Hypothesis, is_lidar_reference: bool) -> Hypothesis:
-    """The part of ``hypothesis`` by which the robot file's mount and clocks change what was measured."""
+def _of_sensors(hypothesis: Hypothesis, is_lidar_reference: bool = True) -> Hypothesis:
+    """The part of ``hypothesis`` by which mount and clocks change what was measured; without those of a reference, which no robot file
+    holds."""
     names = ("wheel_time_offset_s", "gyro_time_offset_s", *(("lidar_offset", "lidar_time_offset_s") if is_lidar_reference else ()))
     return Hypothesis(**{name: getattr(hypothesis, name) for name in names})
+
+
+def _of_reference(hypothesis: Hypothesis, is_lidar_reference: bool) -> Hypothesis:
+    """The part of ``hypothesis`` that is a reference's, none where the LiDAR measured the motion."""
+    if is_lidar_reference:
+        return Hypothesis()
+    return Hypothesis(lidar_offset=hypothesis.lidar_offset, lidar_time_offset_s=hypothesis.lidar_time_offset_s)
 
 
 def _of_robot(hypothesis: Hypothesis) -> Hypothesis:
@@ -205,9 +213,9 @@ def _manual_steps(robot: Robot, h: Hypothesis, lidar_frame: str | None) -> list[
         ),
         (
             any(h.lidar_offset) and lidar_frame is None,
-            f"the reference tracks a point that is {off} off the body's: give its poses of the body.",
+            f"the reference tracks a frame at {off} of the body: move the marker by the opposite, or transform its poses.",
         ),
-        (reference_s, f"the reference's stamps are {1e3 * reference_s:+.0f} ms late: shift them, or synchronize its clock."),
+        (reference_s, f"shift the reference's stamps by {-1e3 * reference_s:+.0f} ms, or synchronize its clock."),
         (late, f"stamps are late ({late}): [clock] corrects them; synchronize the clocks or correct the driver, and remove it."),
         (h.wheel_lag_s, f"the body follows the wheels {1e3 * h.wheel_lag_s:.0f} ms late."),
         (h.gyro_bias, f"the gyro's bias is {h.gyro_bias:+.5f} rad/s; let the driver zero it while the robot stands."),

@@ -100,7 +100,7 @@ class Drive:
     lidar_frame: str = ""
     """Frame of the scans that were matched."""
     lidar_at: tuple[float, float] = (0.0, 0.0)
-    """Where it sits, by its transform [m]."""
+    """Where it sits, by its transform [m]; the body's origin where a reference measured the motion."""
     warnings: tuple[str, ...] = ()
 
     @property
@@ -231,8 +231,8 @@ def drive_of_events(
     windows = cut(record_events(), recorder, make_model("diff_drive", robot), robot, config, name)
     spans = np.array([(s.start_ns, s.end_ns) for s in recorder.used], dtype=np.int64).reshape(-1, 2)
     left = _describe_windows(windows, spans, config)
-    mount = mounts.get(frame, Mount())
-    by_gyro = isinstance(inner, GyroMotionReference)
+    by_gyro, by_lidar = isinstance(inner, GyroMotionReference), isinstance(inner, LidarMotionReference)
+    mount = mounts.get(frame, Mount()) if by_lidar else Mount()
     has_gyro = bool(imu.stamps) and not by_gyro
     return Drive(
         name=name,
@@ -248,7 +248,7 @@ def drive_of_events(
         range_slopes=recorder.range_slopes(),
         message_loss=find_message_loss(np.array(wheel_stamps, dtype=np.int64)),
         standstill_turn=find_standstill_turn(imu.gyro, recorder.standstills, spans) if imu.stamps else None,
-        is_lidar_reference=isinstance(inner, LidarMotionReference),
+        is_lidar_reference=by_lidar,
         lidar_frame=frame,
         lidar_at=(mount.x, mount.y),
         warnings=(left, *([_describe_gaps(imu.gyro)] if imu.gyro.gaps else []), *windows.warnings),

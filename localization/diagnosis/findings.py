@@ -34,7 +34,7 @@ _CHANNEL_WORDS = {
     "x": "along the drive",
     "y": "sideways",
     "yaw": "in heading",
-    "gyro": "between gyro and LiDAR",
+    "gyro": "between gyro and motion reference",
     "force_x": "in the accelerometers",
     "force_y": "in the accelerometers",
 }

@@ -271,7 +271,8 @@ class DrivePredictor:
         return found
 
     def _tracked(self, hypothesis: Hypothesis) -> tuple[float, float, float]:
-        """Real pose of the frame that the LiDAR's transform takes for the body's: it turns about the sensor, not about the body."""
+        """Real pose of the frame that the LiDAR's transform takes for the body's: it turns about the sensor, not about the body. Of a
+        reference it is the frame that this tracks."""
         (x, y), (dx, dy, yaw) = self.drive.lidar_at, hypothesis.lidar_offset
         c, s = math.cos(yaw), math.sin(yaw)
         return dx + x - (c * x - s * y), dy + y - (s * x + c * y), yaw

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause, Hypothesis
+from localization.diagnosis.causes import CAUSES, REFERENCE_WORDS, WINDOW_CAUSES, Cause, Hypothesis
 from localization.diagnosis.findings import Gain
 from localization.diagnosis.linearization import (
     Linearization,
@@ -263,13 +263,15 @@ def simplest_set(tried: Sequence[tuple[float, dict[Cause, float]]], nothing: flo
     that explain as much of ``nothing``, the cost of no cause, but for the model's accuracy.
 
     By more causes a set would only repair how this robot responds to one of them. Among equally good sets of one number (two clocks that
-    differ, and nothing that shows which is wrong) the order of the catalogue decides, not rounding.
+    differ, and nothing that shows which is wrong) the order of the catalogue decides, not rounding. Errors of a reference, which is no part
+    of the robot, come first.
     """
     least = min(cost for cost, _ in tried)
     margin = max(_ALIAS_LOG_ODDS, _BASELINE_SHARE * (nothing - least)) if predictor.has_baseline else 0.0
     number, best = min((len(sizes), cost) for cost, sizes in tried if cost <= least + margin)
     equal = [sizes for cost, sizes in tried if len(sizes) == number and cost <= best + _TIE_LOG_ODDS]
-    order = {name: i for i, name in enumerate((*CAUSES, *WINDOW_CAUSES))}
+    first = () if predictor.drive.is_lidar_reference else REFERENCE_WORDS
+    order = {name: i for i, name in enumerate(dict.fromkeys((*first, *CAUSES, *WINDOW_CAUSES)))}
     return min(equal, key=lambda sizes: sorted(order.get(cause.id, len(order)) for cause in sizes))
 
 

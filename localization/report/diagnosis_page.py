@@ -37,7 +37,7 @@ from localization.report.page import (
 )
 from motion_models.se2 import FloatArray
 
-_COMPONENTS = {"x": "along", "y": "sideways", "yaw": "heading", "gyro": "gyro - LiDAR"}
+_COMPONENTS = {"x": "along", "y": "sideways", "yaw": "heading", "gyro": "gyro - motion reference"}
 _MAX_PANELS = 4
 _VERDICTS = {
     "consistent": "No discrepancy exceeds noise and tolerances; the table shows each component.",

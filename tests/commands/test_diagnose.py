@@ -145,24 +145,55 @@ def test_diagnose_invalid_window_length_is_refused(tmp_path: Path, capsys: pytes
     assert "--window-s is nan; windows of 0.5 to 20 s make sense" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("ahead_m", "late_s", "words"),
-    [(0.0, 0.08, "the reference's stamps are 80 ms late"), (0.12, 0.0, "the point that the reference tracks lies 120 mm ahead")],
-)
-def test_diagnose_reference_that_is_off_changes_no_lidar(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], ahead_m: float, late_s: float, words: str
-) -> None:
-    """A healthy robot with a LiDAR, against a motion capture whose clock or marker is off: nothing of it goes into the robot file."""
-    log, track = bag(tmp_path / "drive.mcap", {}, 34, "husky_a200"), tmp_path / "track.tum"
+def _track_of(log: Path, track: Path, frame: tuple[float, float, float], late_s: float = 0.0) -> Path:
+    """The simulator's truth of a ``frame`` (x, y, yaw) on the body."""
     samples = list(open_log(log, load_robot("husky_a200")).references("/ground_truth/odom"))
     poses = np.array([[*sample.position[:2], sample.yaw] for sample in samples])
-    write_tum(track, Trajectory(np.array([s.stamp_ns for s in samples]) + round(late_s * 1e9), se2.compose(poses, [ahead_m, 0.0, 0.0])))
+    write_tum(track, Trajectory(np.array([s.stamp_ns for s in samples]) + round(late_s * 1e9), se2.compose(poses, frame)))
+    return track
+
+
+@pytest.mark.parametrize(
+    ("frame", "late_s", "imu_hz", "words", "step"),
+    [
+        ((0.0, 0.0, 0.0), 0.08, 50.0, "the reference's stamps are 80 ms late", "shift the reference's stamps by -80 ms"),
+        ((0.0, 0.0, 0.0), 0.08, 0.0, "the reference's stamps are 80 ms late", "shift the reference's stamps by -80 ms"),
+        ((0.12, 0.0, 0.0), 0.0, 50.0, "the point that the reference tracks lies 120 mm ahead", "move the marker"),
+        ((0.0, 0.0, 0.06), 0.0, 50.0, "the reference's heading is turned 3.4 deg to the left", "move the marker"),
+    ],
+)
+def test_diagnose_reference_that_is_off_changes_no_lidar(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    frame: tuple[float, float, float],
+    late_s: float,
+    imu_hz: float,
+    words: str,
+    step: str,
+) -> None:
+    """A healthy robot with a LiDAR, against a motion capture whose clock or marker is off: that alone is found, without an IMU as well, and
+    nothing of it goes into the robot file."""
+    log = bag(tmp_path / "drive.mcap", {}, 34, "husky_a200", imu_hz=imu_hz)
+    track = _track_of(log, tmp_path / "track.tum", frame, late_s)
     assert main(["diagnose", str(log), "--robot", "husky_a200", "--reference", str(track), "--out", str(tmp_path / "out")]) == 0
     assert words in capsys.readouterr().out
     written, nominal = load_robot(str(tmp_path / "out" / "robot.toml")), load_robot("husky_a200")
     assert written.mounts == nominal.mounts
     assert written.clock == nominal.clock
-    assert "Corrected here" not in (tmp_path / "out" / "robot.toml").read_text()
+    text = (tmp_path / "out" / "robot.toml").read_text()
+    assert "Corrected here" not in text
+    assert step in text
+    assert text.count("+-") == 1
+
+
+def test_diagnose_reference_that_is_off_is_no_part_of_the_check(tmp_path: Path) -> None:
+    """Wheels 4 % larger, a marker 0.12 m ahead: the corrected robot predicts what the reference would have measured without that."""
+    log = bag(tmp_path / "drive.mcap", {"wheel_radius_scale": 0.04}, 34, "husky_a200")
+    track = _track_of(log, tmp_path / "track.tum", (0.12, 0.0, 0.0))
+    assert main(["diagnose", str(log), "--robot", "husky_a200", "--reference", str(track), "--out", str(tmp_path / "out")]) == 0
+    assert "Corrected here: wheel_radius_scale" in (tmp_path / "out" / "robot.toml").read_text()
+    after = json.loads((tmp_path / "out" / "diagnosis.json").read_text())["handover"]["rms_after"]
+    assert max(after["x"], after["y"]) < 0.01
 
 
 @pytest.mark.parametrize(("cause", "size", "is_corrected"), [("gyro_time_offset", 0.07, True), ("gyro_scale", 0.05, False)])

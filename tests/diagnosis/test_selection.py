@@ -89,7 +89,7 @@ def test_strongest_beyond_tolerance_is_the_hidden_cause(cause: int) -> None:
 def test_simplest_set_of_equally_good_clocks_takes_the_wheels() -> None:
     """Whatever rounding says: the estimators' poses bear the stamps of the scans."""
     wheels, lidar, other = ({CAUSES[name]: 0.1} for name in ("wheel_time_offset", "lidar_time_offset", "track_width"))
-    predictor = cast(DrivePredictor, SimpleNamespace(has_baseline=False))
+    predictor = cast(DrivePredictor, SimpleNamespace(has_baseline=False, drive=SimpleNamespace(is_lidar_reference=True)))
     for off in (-1e-9, 0.0, 1e-9):
         assert simplest_set([(-50.0, lidar), (-50.0 + off, wheels), (-30.0, other)], 0.0, predictor) == wheels
     assert simplest_set([(-50.0, lidar), (-40.0, wheels)], 0.0, predictor) == lidar
@@ -113,3 +113,11 @@ def test_detectable_sizes_are_beside_what_is_tolerated() -> None:
     alone, beside = (dataclasses.replace(problem, gram=1e6 * gram).detectable_sizes(3.0) for gram in (np.eye(4), alike))
     assert beside[0] > 2.0 * alone[0]
     assert beside[2] == pytest.approx(alone[2])
+
+
+def test_simplest_set_of_equally_good_clocks_takes_that_of_a_reference() -> None:
+    """It is no part of the robot, whose file would put the wheels off against its LiDAR."""
+    wheels, reference = ({CAUSES[name]: 0.1} for name in ("wheel_time_offset", "lidar_time_offset"))
+    predictor = cast(DrivePredictor, SimpleNamespace(has_baseline=False, drive=SimpleNamespace(is_lidar_reference=False)))
+    for off in (-1e-9, 0.0, 1e-9):
+        assert simplest_set([(-50.0, reference), (-50.0 + off, wheels)], 0.0, predictor) == reference
