@@ -105,6 +105,7 @@ def cut_log(
     reference_name: MotionReferenceName,
     reference: str | None,
     config: WindowConfig | None = None,
+    reference_sigmas: tuple[float, float] | None = None,
 ) -> Cut:
     """The maneuvers of a log, as measured by ``reference_name``; "auto" is the reference if one is named, else the LiDAR, else the gyro.
 
@@ -118,7 +119,7 @@ def cut_log(
             f"{log.path.name} has no wheels: neither joint states ({robot.topics.joint_states}) nor the driver's odometry"
             f" ({robot.topics.odometry}); name them with --topic.joint-states or --topic.odometry. `skidloc info` lists the topics."
         )
-    motion_reference, words = make_motion_reference(log, robot, reference_name, reference, config)
+    motion_reference, words = make_motion_reference(log, robot, reference_name, reference, config, reference_sigmas)
     events = log.events()
     windows = cut(events, motion_reference, make_model("diff_drive", robot), robot, config, log.path.name)
     kept = f"{len(windows.maneuvers)} windows of {config.window_s:g} s"
@@ -127,12 +128,22 @@ def cut_log(
 
 
 def make_motion_reference(
-    log: Log, robot: Robot, name: MotionReferenceName, reference: str | None, config: WindowConfig
+    log: Log,
+    robot: Robot,
+    name: MotionReferenceName,
+    reference: str | None,
+    config: WindowConfig,
+    reference_sigmas: tuple[float, float] | None = None,
 ) -> tuple[MotionReference, str]:
-    """What measures the motion of ``log``, and its name in words. Raises `CalibrationError` where the log has none."""
+    """What measures the motion of ``log``, and its name in words; ``reference_sigmas`` as in `TrackMotionReference`.
+
+    Raises `CalibrationError` where the log has none.
+    """
     if name == "reference" or (name == "auto" and reference is not None):
         track = _track(log, reference)
-        return TrackMotionReference(track, config.window_s), f"reference {track.source}"
+        return TrackMotionReference(track, config.window_s, reference_sigmas), f"reference {track.source}"
+    if reference_sigmas is not None:
+        raise CalibrationError("--reference-sigma is the noise of a reference, and none measures the motion. Name one with --reference.")
     sources = log.sources
     if sources.lidar is not None and name in ("auto", "lidar"):
         return LidarMotionReference(log.mounts, config.window_s), f"scan matching of {sources.lidar.topic}"

@@ -9,7 +9,8 @@ from typing import Protocol
 
 import numpy as np
 
-from localization.evaluation.references import ReferenceTrack
+from localization.evaluation.consistency import covariances_in_body
+from localization.evaluation.references import ReferenceTrack, with_noise
 from localization.events import Event, ImuSample, Scan, Turn
 from localization.gyro import GyroBuffer
 from localization.lidar import MIN_POINTS, LidarConfig, ScanMatch, ScanMatcher, Sweep, choose_cell
@@ -43,6 +44,10 @@ _MAX_UNMATCHED_S, _MAX_UNMATCHED_M, _MAX_UNMATCHED_RAD = 0.3, 0.15, 0.15
 _RANGE_STEP_M = 0.2
 """Added to all ranges, and taken off, for the scene's derivative [m]. In a hall the derivative is 2 to 4 mm per metre, and its own noise
 3 mm at 0.05 m, 0.7 mm at 0.2 m and 0.6 mm at 0.4 m."""
+_REFERENCE_SIGMA_M, _REFERENCE_SIGMA_RAD = 0.02, 0.01
+"""Of poses of a reference without covariances: about those of RTK-GPS with two antennas; motion capture is better."""
+_FINEST_SIGMA = 1e-4
+"""Of a position [m] or heading [rad]: what the best references resolve, whatever their covariance."""
 _STANDSTILL_COV = np.diag([1e-12, 1e-12, 1e-12])
 """Of a robot whose wheels stand: a micrometre and a microradian [m^2, m^2, rad^2]."""
 
@@ -346,13 +351,17 @@ def _with_longer_ranges(points: FloatArray, sensor: FloatArray, step_m: float) -
 class TrackMotionReference:
     """A reference with headings that the user names: motion capture, a total station with a compass, another estimator."""
 
-    def __init__(self, track: ReferenceTrack, window_s: float, sigma_m: float = 0.02, sigma_rad: float = 0.01) -> None:
-        """Raises `EvaluationError` for a reference of positions only."""
-        self._track = Trajectory(track.stamps_ns, track.poses)
-        self._warnings = track.warnings
+    def __init__(self, track: ReferenceTrack, window_s: float, sigmas: tuple[float, float] | None = None) -> None:
+        """``sigmas``: noise of its poses [m, rad]; by default its covariances, or `_REFERENCE_SIGMA_M` and `_REFERENCE_SIGMA_RAD`.
+
+        Raises `EvaluationError` for a reference of positions only, and for negative ``sigmas``.
+        """
+        given = track if sigmas is None else replace(track, covariances=None)
+        noise = with_noise(given, *(sigmas or (_REFERENCE_SIGMA_M, _REFERENCE_SIGMA_RAD))).covariances
+        assert noise is not None
+        self._track = Trajectory(track.stamps_ns, track.poses, covariances_in_body(noise, track.poses[:, 2]))
+        self._warnings = (*track.warnings, *([] if sigmas is not None else [_describe_noise(track, noise)]))
         self._window_ns = round(window_s / _NS)
-        # Of the motion between two poses that err independently.
-        self._cov = 2.0 * np.diag([sigma_m**2, sigma_m**2, sigma_rad**2])
         self._start_ns: int | None = None
         self._stamps = track.stamps_ns
         period_s = float(np.median(np.diff(track.stamps_ns))) * _NS if len(track.stamps_ns) > 1 else 0.0
@@ -370,10 +379,20 @@ class TrackMotionReference:
         if newest < end_ns:
             return
         is_covered = bool(self._track.covers([self._start_ns, end_ns], self._max_gap_s).all())
-        start, end = self._track.at([self._start_ns, end_ns])
-        measured = se2.between(start, end) if is_covered else np.zeros(3)
-        yield Span(self._start_ns, end_ns, measured, self._cov, is_valid=is_covered)
+        if is_covered:
+            yield self._span(self._start_ns, end_ns)
+        else:
+            yield Span(self._start_ns, end_ns, np.zeros(3), np.eye(3), is_valid=False)
         self._start_ns = end_ns
+
+    def _span(self, start_ns: int, end_ns: int) -> Span:
+        """Motion between two poses that err independently: P = P_1 + A P_0 A^T with A the adjoint of the inverse motion."""
+        start, end = self._track.at([start_ns, end_ns])
+        noise = self._track.covariances_at([start_ns, end_ns])
+        assert noise is not None
+        measured = se2.between(start, end)
+        a = se2.adjoint(se2.inverse(measured))
+        return Span(start_ns, end_ns, measured, noise[1] + a @ noise[0] @ a.T + _FINEST_SIGMA**2 * np.eye(3))
 
     def _at_stamp(self, moment_ns: int) -> int:
         """``moment_ns``, or for a sparse reference the first of its stamps from then on: between them nothing was measured."""
@@ -387,3 +406,15 @@ class TrackMotionReference:
     def warnings(self) -> list[str]:
         """See `MotionReference.warnings`."""
         return list(self._warnings)
+
+
+def _describe_noise(track: ReferenceTrack, noise: FloatArray) -> str:
+    """Noise (N, 3, 3) of a reference's poses, and where it is from, in one sentence."""
+    x, y, yaw = np.sqrt(np.median(np.diagonal(noise, axis1=1, axis2=2), axis=0))
+    size = f"{1e3 * math.hypot(x, y) / math.sqrt(2.0):.2g} mm and {math.degrees(yaw):.2g} deg"
+    if track.covariances is None:
+        return f"{track.source} has no covariances: its poses count as good to {size}; give their noise with --reference-sigma."
+    return (
+        f"the covariances of {track.source} make its poses good to {size}, each by itself; where errors last from pose to pose, as an "
+        "estimator's, give the noise without them with --reference-sigma."
+    )

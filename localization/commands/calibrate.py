@@ -24,7 +24,7 @@ from localization.commands.calibration_tables import (
     print_rotation_errors,
     regression_numbers,
 )
-from localization.commands.common import write_json
+from localization.commands.common import in_radians, write_json
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from motion_models.base import MotionModel
@@ -61,6 +61,8 @@ class Calibrate:
     """What measured the real motion in logs: the reference if one is named, else the LiDAR, else the gyro (headings alone)."""
     reference: str | None = None
     """Topic or TUM file with positions and headings, as the motion reference. Never used unless named."""
+    reference_sigma: tuple[float, float] | None = None
+    """Noise of the reference's poses [m, deg], as 0.002 0.1; by default its covariances, and 0.02 m and 0.57 deg without any."""
     window_s: float = 2.0
     """Length of the maneuvers that logs are cut into [s]."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
@@ -134,7 +136,8 @@ class Calibrate:
 
     def _cut(self, path: Path, robot: Robot, kind: str) -> Cut:
         if kind == "log":
-            return cut_log(path, robot, self.topic, self.motion_reference, self.reference, WindowConfig(window_s=self.window_s))
+            config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
+            return cut_log(path, robot, self.topic, self.motion_reference, self.reference, config, sigmas)
         if kind == "rotations":
             table = read_rotation_table(path)
             return Cut(path.name, tuple(rotations_as_maneuvers(table, robot)), f"the table of {len(table.ratio)} rotations")

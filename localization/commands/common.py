@@ -102,3 +102,8 @@ def print_table(console: Console, table: Table) -> None:
 def print_line(console: Console, text: str) -> None:
     """Print one sentence without wrapping."""
     console.print(text, markup=False, soft_wrap=True)
+
+
+def in_radians(sigma: tuple[float, float] | None) -> tuple[float, float] | None:
+    """``--reference-sigma`` [m, deg] in SI units [m, rad]."""
+    return None if sigma is None else (sigma[0], math.radians(sigma[1]))

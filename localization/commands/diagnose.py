@@ -12,7 +12,7 @@ from rich.table import Table
 
 from localization.calibration.calibrate import MotionReferenceName
 from localization.calibration.windows import WindowConfig
-from localization.commands.common import new_folder, write_json
+from localization.commands.common import in_radians, new_folder, write_json
 from localization.diagnosis.baseline import estimate_baseline
 from localization.diagnosis.corrected_robot import correct_robot, is_held
 from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
@@ -59,6 +59,8 @@ class Diagnose:
     """What measured the real motion in logs: the reference if one is named, else the LiDAR, else the gyro (headings alone)."""
     reference: str | None = None
     """Topic or TUM file with positions and headings, as the motion reference. Never used unless named."""
+    reference_sigma: tuple[float, float] | None = None
+    """Noise of the reference's poses [m, deg], as 0.002 0.1; by default its covariances, and 0.02 m and 0.57 deg without any."""
     healthy: Annotated[Path | None, tyro.conf.arg(metavar="LOG")] = None
     """Log of the same robot without a fault, about two minutes of arcs and turns: causes then count from how it moved there, and not from
     the robot file."""
@@ -104,8 +106,10 @@ class Diagnose:
             return self._drive_of_log(self.source, robot)
         if self.healthy is not None:
             raise CalibrationError(f"{name} is a table: --healthy takes the log of another drive to compare a log with.")
-        if self.reference is not None or self.motion_reference != "auto":
-            raise CalibrationError(f"{name} is a table, which has the measured motion: --reference and --motion-reference are for logs.")
+        if self.reference is not None or self.reference_sigma is not None or self.motion_reference != "auto":
+            raise CalibrationError(
+                f"{name} is a table, which has the measured motion: --reference, --reference-sigma and --motion-reference are for logs."
+            )
         columns = table_columns(self.source)
         if "vision_error_m" in columns:
             return drive_of_runs(name, robot, read_runs(self.source))
@@ -116,7 +120,8 @@ class Diagnose:
 
     def _drive_of_log(self, path: Path, robot: Robot) -> Drive:
         log = open_log(path, robot, self.topic.scored_against(self.reference))
-        return drive_of_log(log, self.motion_reference, self.reference, WindowConfig(window_s=self.window_s))
+        config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
+        return drive_of_log(log, self.motion_reference, self.reference, config, sigmas)
 
     def _write_robot(self, folder: Path, found: DiagnosisResult, robot: Robot) -> None:
         d = found.diagnosis

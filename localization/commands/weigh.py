@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from localization.calibration.calibrate import MotionReferenceName
-from localization.commands.common import write_json
+from localization.commands.common import in_radians, write_json
 from localization.diagnosis.corrected_robot import correct_robot
 from localization.diagnosis.drive import drive_of_log
 from localization.diagnosis.weigh import DrivenWeighing, corrected_hypothesis, weigh
@@ -40,6 +40,8 @@ class Weigh:
     """What measured the real motion: the reference if one is named, else the LiDAR. A gyro alone does not show the centre of rotation."""
     reference: str | None = None
     """Topic or TUM file with positions and headings, as the motion reference. Never used unless named."""
+    reference_sigma: tuple[float, float] | None = None
+    """Noise of the reference's poses [m, deg], as 0.002 0.1; by default its covariances, and 0.02 m and 0.57 deg without any."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
     out: Annotated[Path | None, tyro.conf.arg(metavar="ROBOT.toml")] = None
     """Write the robot with this centre of gravity to this file; every command takes it as --robot."""
@@ -53,9 +55,8 @@ class Weigh:
             raise CalibrationError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")
         robot = load_robot(self.robot)
         with console.status("reading"):
-            drive = drive_of_log(
-                open_log(self.log, robot, self.topic.scored_against(self.reference)), self.motion_reference, self.reference
-            )
+            log = open_log(self.log, robot, self.topic.scored_against(self.reference))
+            drive = drive_of_log(log, self.motion_reference, self.reference, reference_sigmas=in_radians(self.reference_sigma))
         with console.status("weighing"):
             found, predictor = weigh(drive)
         print_weighing(console, found, self.at)

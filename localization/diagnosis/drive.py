@@ -183,9 +183,16 @@ class _Postures:
 
 
 def drive_of_log(
-    log: Log, motion_reference: MotionReferenceName = "auto", reference: str | None = None, config: WindowConfig | None = None
+    log: Log,
+    motion_reference: MotionReferenceName = "auto",
+    reference: str | None = None,
+    config: WindowConfig | None = None,
+    reference_sigmas: tuple[float, float] | None = None,
 ) -> Drive:
-    """Read ``log`` once. Raises `CalibrationError` where it has no wheels, and for a ``motion_reference`` that it does not have."""
+    """Read ``log`` once; ``reference_sigmas`` is the noise of the reference's poses [m, rad], by default what it gives itself.
+
+    Raises `CalibrationError` where it has no wheels, and for a ``motion_reference`` that it does not have.
+    """
     config = config or WindowConfig()
     robot = log.robot
     if log.sources.wheels is None and log.wheels_error is None:
@@ -193,7 +200,7 @@ def drive_of_log(
     if motion_reference == "auto" and reference is None and log.sources.lidar is None and log.sources.imu is None:
         alone = f"{log.path.name} has neither a LiDAR nor an IMU, and no reference was named: nothing measures what the wheels do."
         return Drive(log.path.name, robot, (), "none", warnings=(alone, *log.warnings()))
-    inner = make_motion_reference(log, robot, motion_reference, reference, config)
+    inner = make_motion_reference(log, robot, motion_reference, reference, config, reference_sigmas)
     postures = None
     if log._arms is not None:
         postures = _Postures(log._arms)

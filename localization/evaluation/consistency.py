@@ -202,7 +202,7 @@ def pose_errors(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: fl
     use = is_covariance(grown) & ~stands
     grown = grown + np.eye(3) * trajectory.interpolation_errors_at(stamps)[:, None, :] ** 2
     if part.covariances is not None:
-        noise = _in_body(part.covariances, truth[:, 2])
+        noise = covariances_in_body(part.covariances, truth[:, 2])
         grown = grown + noise[1:] + _moved(noise[0], r)
     return PoseErrors(stamps[use], errors[use], grown[use], int(np.count_nonzero(~use)))
 
@@ -226,7 +226,7 @@ def _moved(covariance: FloatArray, motions: FloatArray) -> FloatArray:
     return moved
 
 
-def _in_body(covariances: FloatArray, yaws: FloatArray) -> FloatArray:
+def covariances_in_body(covariances: FloatArray, yaws: FloatArray) -> FloatArray:
     """(N, 3, 3) covariances of x, y, yaw in the plane, turned into the body frame; zero where unknown."""
     c, s, o = np.cos(yaws), np.sin(yaws), np.zeros_like(yaws)
     plane_T_body = np.stack([np.stack([c, -s, o], -1), np.stack([s, c, o], -1), np.stack([o, o, o + 1.0], -1)], axis=-2)

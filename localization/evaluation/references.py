@@ -50,13 +50,13 @@ class ReferenceTrack:
 
 
 def with_noise(track: ReferenceTrack, sigma_m: float, sigma_rad: float) -> ReferenceTrack:
-    """``track`` with this noise of x, y and of the yaw, where it has no covariances. Raises `EvaluationError` for a negative sigma."""
+    """``track`` with this noise of x, y and of the yaw for poses without a covariance. Raises `EvaluationError` for a negative sigma."""
     if not (math.isfinite(sigma_m) and math.isfinite(sigma_rad) and min(sigma_m, sigma_rad) >= 0.0):
         raise EvaluationError(f"noise of the reference is {sigma_m} m, {math.degrees(sigma_rad):.4g} deg; both must be 0 or more.")
-    if track.covariances is not None:
-        return track
     noise = np.diag([sigma_m, sigma_m, sigma_rad]) ** 2
-    return replace(track, covariances=np.broadcast_to(noise, (len(track.stamps_ns), 3, 3)).copy())
+    given = np.full((len(track.stamps_ns), 3, 3), np.nan) if track.covariances is None else track.covariances
+    is_unknown = np.isnan(given).all(axis=(1, 2), keepdims=True)
+    return replace(track, covariances=np.where(is_unknown, noise, given))
 
 
 @dataclass(frozen=True, eq=False)

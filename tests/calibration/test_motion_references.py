@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, Span, Wheels
+from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, Span, TrackMotionReference, Wheels
 from localization.calibration.windows import WindowConfig, cut
+from localization.evaluation.references import ReferenceTrack
 from localization.events import ImuSample, Scan, WheelSample
 from localization.simulation.world import WORLDS
 from localization.wheel_buffer import WheelBuffer
+from motion_models import se2
 from motion_models.registry import make_model
 from motion_models.robot import GyroNoise, load_robot
 from tests.helpers.rooms import scan_from
@@ -85,3 +87,47 @@ def test_wheels_standstill_leaves_out_how_far_clocks_may_differ() -> None:
     assert wheels.standstill(0, 4 * _NS) is None
     assert wheels.standstill(3 * _NS, 5 * _NS) == pytest.approx((4.3 * _NS, 4.7 * _NS), abs=2e7)
     assert wheels.standstill(5 * _NS, 7 * _NS) == pytest.approx((4.7 * _NS, 6.7 * _NS), abs=2e7)
+
+
+def _spans_of(reference: TrackMotionReference, seconds: float) -> list[Span]:
+    robot = load_robot("husky_a200")
+    wheels = Wheels(WheelBuffer(np.zeros(2), keep_s=100.0), make_model("diff_drive", robot), robot.wheel_noise)
+    found = []
+    for i in range(round(50 * seconds) + 1):
+        sample = WheelSample(i * _NS // 50, np.ones(2), np.full(2, 0.02 * i))
+        wheels.buffer.insert(sample)
+        found += list(reference.spans(sample, wheels))
+    return found
+
+
+def test_track_reference_covariance_is_that_of_two_poses() -> None:
+    """A reference that drives along the plane's y, 2 m a window, with 3 mm of noise along it, 5 mm across and 2 mrad: by simulation."""
+    stamps = np.arange(101, dtype=np.int64) * (_NS // 10)
+    poses = np.column_stack([np.zeros(101), stamps / _NS, np.full(101, np.pi / 2.0)])
+    cov = np.diag([0.005, 0.003, 0.002]) ** 2
+    track = ReferenceTrack(stamps, poses[:, :2], poses[:, 2], np.broadcast_to(cov, (101, 3, 3)))
+    span = _spans_of(TrackMotionReference(track, 2.0), 4.5)[0]
+    rng = np.random.default_rng(0)
+    start, end = (poses[[0]] + rng.normal(0.0, np.sqrt(np.diag(cov)), (20_000, 3)) + [0.0, ahead, 0.0] for ahead in (0.0, 2.0))
+    errors = se2.between(span.measured, se2.between(start, end))
+    assert np.sqrt(np.diagonal(span.cov)) == pytest.approx(errors.std(axis=0), rel=0.03)
+
+
+@pytest.mark.parametrize("given", [None, (0.002, 0.001)])
+def test_track_reference_given_sigmas_go_before_its_covariances(given: tuple[float, float] | None) -> None:
+    """Covariances that are of some poses alone leave those of others to the default."""
+    stamps = np.arange(101, dtype=np.int64) * (_NS // 10)
+    covariances = np.full((101, 3, 3), np.nan)
+    covariances[:50] = np.eye(3)
+    track = ReferenceTrack(stamps, np.zeros((101, 2)), np.zeros(101), covariances)
+    first, *_, last = _spans_of(TrackMotionReference(track, 2.0, given), 9.5)
+    expected = (1.0, 0.01) if given is None else (given[1], given[1])
+    assert [first.cov[2, 2], last.cov[2, 2]] == pytest.approx([2.0 * sigma**2 for sigma in expected], rel=0.02)
+
+
+def test_track_reference_without_covariances_names_the_option() -> None:
+    stamps = np.arange(101, dtype=np.int64) * (_NS // 10)
+    track = ReferenceTrack(stamps, np.zeros((101, 2)), np.zeros(101), source="/mocap")
+    assert "/mocap has no covariances" in TrackMotionReference(track, 2.0).warnings()[0]
+    assert "20 mm and 0.57 deg; give their noise with --reference-sigma" in TrackMotionReference(track, 2.0).warnings()[0]
+    assert TrackMotionReference(track, 2.0, (0.02, 0.01)).warnings() == []

@@ -19,7 +19,7 @@ from motion_models import se2
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
-from tests.helpers.diagnosis_drives import bag
+from tests.helpers.diagnosis_drives import bag, drive
 
 DATA = Path(__file__).parents[1] / "data"
 GRID = DATA / "vaultbot" / "rotation_grid.csv"
@@ -145,10 +145,13 @@ def test_diagnose_invalid_window_length_is_refused(tmp_path: Path, capsys: pytes
     assert "--window-s is nan; windows of 0.5 to 20 s make sense" in capsys.readouterr().err
 
 
-def _track_of(log: Path, track: Path, frame: tuple[float, float, float], late_s: float = 0.0) -> Path:
-    """The simulator's truth of a ``frame`` (x, y, yaw) on the body."""
+def _track_of(
+    log: Path, track: Path, frame: tuple[float, float, float], late_s: float = 0.0, sigmas: tuple[float, float] = (0.0, 0.0)
+) -> Path:
+    """The simulator's truth of a ``frame`` (x, y, yaw) on the body, with noise of ``sigmas`` [m, rad]."""
     samples = list(open_log(log, load_robot("husky_a200")).references("/ground_truth/odom"))
     poses = np.array([[*sample.position[:2], sample.yaw] for sample in samples])
+    poses += np.random.default_rng(0).normal(0.0, [sigmas[0], sigmas[0], sigmas[1]], poses.shape)
     write_tum(track, Trajectory(np.array([s.stamp_ns for s in samples]) + round(late_s * 1e9), se2.compose(poses, frame)))
     return track
 
@@ -184,6 +187,23 @@ def test_diagnose_reference_that_is_off_changes_no_lidar(
     assert "Corrected here" not in text
     assert step in text
     assert text.count("+-") == 1
+
+
+@pytest.mark.parametrize(("options", "status"), [((), "unexplained"), (("--reference-sigma", "0.1", "1.7"), "noise")])
+def test_diagnose_reference_sigma_is_the_noise_of_the_reference(tmp_path: Path, options: tuple[str, ...], status: str) -> None:
+    """A healthy robot against a reference of 0.1 m, five times what one without covariances counts as."""
+    log = bag(tmp_path / "drive.mcap", {}, 34, "husky_a200")
+    track = _track_of(log, tmp_path / "track.tum", (0.0, 0.0, 0.0), sigmas=(0.1, 0.03))
+    command = ["diagnose", str(log), "--robot", "husky_a200", "--reference", str(track), "--json", str(tmp_path / "out.json")]
+    assert main([*command, *options]) == 0
+    rows = json.loads((tmp_path / "out.json").read_text())["discrepancy"]
+    assert [rows[name]["status"] for name in "xy"] == [status, status]
+
+
+def test_diagnose_reference_sigma_without_reference_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = bag(tmp_path / "drive.mcap", {}, 34, "husky_a200", drive("20s"))
+    assert main(["diagnose", str(log), "--robot", "husky_a200", "--reference-sigma", "0.1", "1.7"]) == 2
+    assert "--reference-sigma is the noise of a reference" in capsys.readouterr().err
 
 
 def test_diagnose_reference_that_is_off_is_no_part_of_the_check(tmp_path: Path) -> None:
