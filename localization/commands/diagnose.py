@@ -138,7 +138,7 @@ class Diagnose:
             ("Corrected here", corrected),
             ("Found, not corrected here", [f for f in d.findings if f not in corrected]),
         ):
-            named = (f"{f.cause} {f.size:+.4g} +- {f.sigma:.2g} {f.definition.unit}".removesuffix(" 1") for f in findings)
+            named = (f"{f.definition.label} {f.size:+.4g} +- {f.sigma:.2g} {f.definition.unit}".removesuffix(" 1") for f in findings)
             remarks += [f"{title}: {'; '.join(named)}."] if findings else []
         remarks += ["Found: nothing."] if not d.findings else []
         remarks += manual_steps
@@ -159,7 +159,9 @@ def print_diagnosis(console: Console, d: Diagnosis) -> None:
             table.add_row(name, c.unit, *sizes, describe_p(c.p_value), c.status)
         console.print(table)
         console.print(
-            "measured minus predicted; corrected: without the findings; left: without what is within tolerance as well", soft_wrap=True
+            "measured minus predicted, windows weighted by their noise; corrected: without the findings; left: without what is within "
+            "tolerance as well",
+            soft_wrap=True,
         )
         for name, c in d.discrepancy.items():
             if c.status != "noise":
@@ -172,11 +174,11 @@ def print_diagnosis(console: Console, d: Diagnosis) -> None:
             table.add_column(head, no_wrap=True)
         for f in d.findings:
             numbers = (f"{f.size:+.4g}", f"{f.sigma:.2g}", f.definition.unit, f"{f.p_value:.1g}", f"{100 * f.gain.relative:.1f} %")
-            table.add_row(f.cause, *numbers)
+            table.add_row(f.definition.label, *numbers)
         console.print(table)
         for f in d.findings:
             aliases = f" (or {describe_sizes(f.aliases)})" if f.aliases else ""
-            console.print(f"{f.cause}: {f.description}{aliases}", markup=False, soft_wrap=True)
+            console.print(f"{f.definition.label}: {f.description}{aliases}", markup=False, soft_wrap=True)
     for trend in d.trends:
         label = "unexplained" if is_contesting(d, trend) else "left, and less than the noise"
         console.print(f"{label}: {trend.text}", markup=False, soft_wrap=True)

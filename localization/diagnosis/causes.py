@@ -86,6 +86,13 @@ class Cause:
     """How large the size may plausibly be, as a standard deviation; 0 for four times the typical size."""
     limits: tuple[float, float] = (-math.inf, math.inf)
     """Sizes beyond these are not considered, where that is not the same to both sides (see `bounds`)."""
+    axis: str = ""
+    """Where two causes have one id: its axis, in words."""
+
+    @property
+    def label(self) -> str:
+        """The id as tables show it, with the axis where there are two."""
+        return f"{self.id} ({self.axis})" if self.axis else self.id
 
     @property
     def key(self) -> str:
@@ -280,6 +287,7 @@ _CAUSES = (
         "slope",
         *("rad", "the floor rises along the drive's first heading", 0.05, 0.005, _add_item("slope", 0)),
         ("the floor rises by {} along the drive's first heading", "the floor falls by {} along the drive's first heading"),
+        axis="along",
     ),
     Cause(
         "encoder_dropout",
@@ -447,4 +455,4 @@ def slope_across() -> Cause:
         "the floor rises by {} to the right of the drive's first heading",
     )
     meaning = "the floor rises to the left of the drive's first heading"
-    return Cause("slope", "rad", meaning, 0.05, 0.005, _add_item("slope", 1), words, at_s=-1.0)
+    return Cause("slope", "rad", meaning, 0.05, 0.005, _add_item("slope", 1), words, at_s=-1.0, axis="across")

@@ -343,6 +343,8 @@ def describe_row(row: Component) -> str:
         return f"unexplained: follows {row.trend}" + (f" beside {by}" if by else "")
     if row.status == "unexplained":
         return f"unexplained ({by} and no more)" if by else "unexplained"
+    if not by:
+        return "several causes together, none of them significant by itself (within tolerance)"
     return f"{by} (within tolerance)" if row.status == "within tolerance" else by
 
 
@@ -397,7 +399,7 @@ def sentence(d: Diagnosis) -> str:
 def _correction(d: Diagnosis, findings: Sequence[Finding]) -> str:
     """What to correct, strongest finding first."""
     first = findings[0]
-    text = f"Correct {first.cause}, off by {first.size:+.3g}{unit_of(first.cause)} (+- {first.sigma:.1g}): {first.description}"
+    text = f"Correct {first.definition.label}, off by {first.size:+.3g}{unit_of(first.cause)} (+- {first.sigma:.1g}): {first.description}"
     whole = d.gain or first.gain
     if whole.relative >= _SHOWN_GAIN:
         text += f"; held-out discrepancies fall by {100 * whole.relative:.0f} %"
@@ -410,7 +412,7 @@ def _correction(d: Diagnosis, findings: Sequence[Finding]) -> str:
 
 def _further(f: Finding) -> str:
     aliases = f", or {describe_sizes(f.aliases)}" if f.aliases else ""
-    return f"{f.cause}, off by {f.size:+.3g}{unit_of(f.cause)} ({f.description}{aliases})"
+    return f"{f.definition.label}, off by {f.size:+.3g}{unit_of(f.cause)} ({f.description}{aliases})"
 
 
 def describe_sizes(aliases: Sequence[tuple[str, float]]) -> str:

@@ -199,6 +199,7 @@ MAX_LEFT_OVER_NOISE = 1.5
 _MODEL_ACCURACY = 0.03  # of a row: what the signature of a named cause may be off, as at a slope of 0.05 rad
 _MAX_TREND_OVER_NOISE = 0.5  # a trend of half the noise adds 12 % to the root mean square of a row
 _MIN_ATTRIBUTED_SHARE = 0.1  # of a row's squares, for a cause to be listed beside it
+_MIN_LISTED_SIGMAS = 2.0  # of a cause that is tolerated, for it to be listed
 _MAX_ATTRIBUTIONS = 3
 _MAX_TREND_SHARE = 0.3  # of twice the log-likelihood of all that can be predicted
 _OUTLIER_WEIGHT = 0.5  # of a window whose largest discrepancy is eight sigma (see `linearization.estimate_noise`)
@@ -228,7 +229,8 @@ def attribute_rows(
     every = linearization.problem.tolerated(chosen, sizes)
     named = linearization.linear - linearization.signatures[..., list(chosen)] @ sizes
     rest = named - np.nan_to_num(linearization.signatures) @ every
-    every[list(chosen)] = sizes
+    is_significant = np.abs(every) >= _MIN_LISTED_SIGMAS * linearization.problem.posterior_sigmas(chosen)
+    every[list(chosen)], is_significant[list(chosen)] = sizes, True
     alone = dataclasses.replace(linearization.noise, mixing=np.eye(len(CHANNELS)))  # a row is tested by itself
     white, white_rest = alone.whiten(first.rows), alone.whiten(rest)
     weighed = rest * linearization.noise.weights[:, None]  # as in the fit: a single window between four and eight sigma is no shape
@@ -239,8 +241,9 @@ def attribute_rows(
         known = np.isfinite(first.rows[:, c]) & regular
         if not known.any():
             continue
-        rms, corrected_rms, rest_rms = (_rms(rows[known, c], c) for rows in (first.rows, named, weighed))
-        expected = float(np.sqrt(np.mean(linearization.noise.sigmas[known, c] ** 2)))
+        weights = linearization.noise.sigmas[known, c] ** -2.0
+        rms, corrected_rms, rest_rms = (_rms(rows[known, c], weights, c) for rows in (first.rows, named, weighed))
+        expected = float(np.mean(weights) ** -0.5)
         p = float(f_distribution.sf(np.mean(white[known, c] ** 2), int(known.sum()), alone.freedom)) if c < _TESTED_CHANNELS else math.nan
         excess = noise_excess(linearization, reference_sigmas, known, c)
         if expected < _MODEL_ACCURACY * rms:
@@ -249,7 +252,8 @@ def attribute_rows(
         if c < _TESTED_CHANNELS and (p < significance or excess > MAX_NOISE_OVER_REFERENCE):
             shares = parts[known, c].T @ scaled[known, c] / max(float(scaled[known, c] @ scaled[known, c]), 1e-12)
             whitened = float(np.sqrt(np.mean(white_rest[known, c] ** 2)))
-            component = _attributed(component, shares, every, linearization.causes, chosen, whitened)
+            listed = np.where(is_significant, shares, 0.0)
+            component = _attributed(component, listed, every, linearization.causes, chosen, whitened)
         found[name] = component
     return found
 
@@ -263,17 +267,21 @@ def noise_excess(linearization: Linearization, reference_sigmas: FloatArray | No
     return float(np.median(linearization.noise.sigmas[known, channel][usable] / given[usable])) if usable.any() else 1.0
 
 
-def _rms(values: FloatArray, channel: int) -> float:
-    return float(np.sqrt(np.mean(values**2))) if channel < _TESTED_CHANNELS else float(np.std(values))
+def _rms(values: FloatArray, weights: FloatArray, channel: int) -> float:
+    """Root mean square of ``values`` (m,), of accelerometers about their mean; with the ``weights`` of the noise, whose own is then that
+    of noise alone however unequal its sigmas are."""
+    mean = 0.0 if channel < _TESTED_CHANNELS else np.average(values, weights=weights)
+    return float(np.sqrt(np.average((values - mean) ** 2, weights=weights)))
 
 
 def _attributed(
     component: Component, shares: FloatArray, sizes: FloatArray, causes: Sequence[Cause], chosen: tuple[int, ...], whitened: float
 ) -> Component:
-    """A significant row with its causes, strongest first, and its status; ``whitened`` is what is left of it over its noise."""
+    """A significant row with its causes, strongest first, and its status; ``shares`` (p,) of its squares are 0 for causes that are not
+    significant, and ``whitened`` is what is left of it over its noise."""
     by: dict[str, Attribution] = {}
     for i in np.argsort(-shares):  # of the moments of a change the strongest one counts
-        is_listed = shares[i] >= _MIN_ATTRIBUTED_SHARE or not by
+        is_listed = shares[i] >= _MIN_ATTRIBUTED_SHARE or (shares[i] > 0.0 and not by)
         if is_listed and len(by) < _MAX_ATTRIBUTIONS:
             by.setdefault(causes[i].id, Attribution(causes[i].id, float(sizes[i]), float(shares[i]), int(i) in chosen))
     left = max(component.unattributed_rms / max(component.expected_rms, 1e-12), whitened)

@@ -52,6 +52,7 @@ _TERMS = {
     "p": "Probability that noise alone would make any of all causes look as strong as this one.",
     "Corrected": "What is left once the findings are corrected: the blue points.",
     "Left": "What neither the findings nor causes within their tolerance account for.",
+    "RMS": "Root mean square over the windows, weighted by their noise, as in the other columns.",
     "Gain": "How much smaller discrepancies become in windows that the cause's size was not fitted to.",
     "Or": "Causes that would explain the same drive about as well, each with the size that it would need.",
 }
@@ -110,7 +111,7 @@ def _findings(d: Diagnosis) -> list[Block]:
         unit = "" if f.definition.unit == "1" else f" {f.definition.unit}"
         others = describe_sizes(f.aliases) or "–"  # noqa: RUF001
         gain = f"{100 * f.gain.relative:.0f} % ({100 * f.gain.low:.0f} to {100 * f.gain.high:.0f})"
-        cause = Cell(f.cause, f"{f.description}; {f.evidence}", is_code=True)
+        cause = Cell(f.definition.label, f"{f.description}; {f.evidence}", is_code=True)
         rows.append([cause, Cell(f"{f.size:+.4g} ± {f.sigma:.2g}{unit}"), Cell(gain), Cell(f"{f.p_value:.1g}"), Cell(others)])
     return [Table([Cell(title) for title in ("Cause", "Size", "Held-out gain", "p", "Or")], rows)]
 
@@ -192,7 +193,9 @@ def _gain_svg(d: Diagnosis) -> str:
             gain, low, high = (100.0 * v for v in (f.gain.relative, f.gain.low, f.gain.high))
             axes.barh(row, gain, height=0.5, color=COLOURS["green"])
             axes.plot([low, high], [row, row], color=COLOURS["ink"], linewidth=1.0)
-        axes.set(yticks=range(len(d.findings)), yticklabels=[f.cause for f in d.findings], xlabel="held-out discrepancy taken off [%]")
+        axes.set(
+            yticks=range(len(d.findings)), yticklabels=[f.definition.label for f in d.findings], xlabel="held-out discrepancy taken off [%]"
+        )
         axes.invert_yaxis()
 
     return svg("gain", WIDTH_IN, 0.4 * len(d.findings) + 0.7, draw)

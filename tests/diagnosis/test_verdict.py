@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Hypothesis, track_width
-from localization.diagnosis.diagnose import diagnose
+from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Hypothesis, slope_across, track_width
+from localization.diagnosis.diagnose import TOLERANCE, diagnose
 from localization.diagnosis.drive import drive_of_table
 from localization.diagnosis.findings import (
     Attribution,
@@ -22,11 +23,23 @@ from localization.diagnosis.findings import (
     describe_row,
     sentence,
 )
-from localization.diagnosis.prediction import DrivePredictor, with_sizes
-from localization.diagnosis.verdict import _information_apart, candidate_maneuvers, decide, mark_trends, separating_drive
+from localization.diagnosis.linearization import Linearization, candidate_causes, given_noise, linearize, make_predictor, make_regression
+from localization.diagnosis.prediction import CHANNELS, DrivePredictor, with_sizes
+from localization.diagnosis.verdict import (
+    _information_apart,
+    attribute_rows,
+    candidate_maneuvers,
+    decide,
+    mark_trends,
+    separating_drive,
+)
 from motion_models.calibration.maneuvers import Maneuver
+from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.registry import make_model
 from motion_models.robot import load_robot
+from motion_models.se2 import FloatArray
+
+GRID = Path(__file__).parents[1] / "data" / "vaultbot" / "rotation_grid.csv"
 
 GAIN = Gain(2.0, 1.0, 0.5, 0.4, 0.6)
 
@@ -101,6 +114,54 @@ def diagnosis(findings: tuple[Finding, ...], trends: tuple[Trend, ...], table: d
         next_drive="",
         sentence="",
     )
+
+
+@pytest.fixture(scope="module")
+def rotations() -> Linearization:
+    """68 rotations in place, linearized about the robot file."""
+    robot = load_robot("vaultbot")
+    drive = drive_of_table(GRID.name, robot, rotations_as_maneuvers(read_rotation_table(GRID), robot), "rotations")
+    predictor = make_predictor(drive, make_model("friction", robot))
+    return linearize(predictor, candidate_causes(predictor, 3), {}, TOLERANCE)
+
+
+def measured(about: Linearization, rows: FloatArray, sigmas: FloatArray) -> Linearization:
+    """The same drive, had it these discrepancies (M, 6) and sigmas (M, 6) of its noise."""
+    noise = given_noise(rows, sigmas, np.zeros(len(rows), dtype=bool))
+    problem = make_regression(rows, about.signatures, about.nuisances, noise, about.causes, TOLERANCE)
+    return dataclasses.replace(about, rows=rows, linear=rows, noise=noise, problem=problem)
+
+
+def test_attribute_rows_unequal_noise_is_weighed_alike_in_all_columns(rotations: Linearization) -> None:
+    """Every third window is ten times noisier and follows its noise, the others have five times theirs: the row shows that."""
+    sigmas = np.where(np.arange(len(rotations.rows))[:, None] % 3 == 0, 0.05, 0.005) * np.ones((1, len(CHANNELS)))
+    factor = np.where(sigmas == 0.05, 1.0, 5.0)
+    drawn = np.random.default_rng(0).normal(0.0, factor * sigmas)
+    drive = measured(rotations, np.where(np.isfinite(rotations.rows), drawn, np.nan), sigmas)
+    yaw = attribute_rows(drive, drive, (), np.zeros(0), 0.01, None)["yaw"]
+    white = (drive.rows / sigmas)[:, CHANNELS.index("yaw")]
+    assert yaw.rms / yaw.expected_rms == pytest.approx(np.sqrt(np.mean(white**2)))
+    assert yaw.rms > 3.0 * yaw.expected_rms
+
+
+def test_attribute_rows_lists_no_tolerated_cause_that_is_not_significant(rotations: Linearization) -> None:
+    """Smaller wheels turn the robot less, as a narrower track and others do: each by itself at less than two sigma."""
+    causes = [cause.id for cause in rotations.causes]
+    i = causes.index("wheel_radius_scale")
+    rows = rotations.signatures[..., i] * 0.8 * rotations.causes[i].negligible
+    drive = measured(rotations, rows, np.full(rows.shape, np.sqrt(np.nanmean(rows**2))))
+    yaw = attribute_rows(drive, drive, (), np.zeros(0), 0.01, None)["yaw"]
+    assert yaw.status == "within tolerance"
+    assert not yaw.attributions
+    assert describe_row(yaw) == "several causes together, none of them significant by itself (within tolerance)"
+
+
+def test_sentence_slopes_along_and_across_are_told_apart() -> None:
+    along, across = finding("slope", 0.03), dataclasses.replace(finding("slope", -0.02), definition=slope_across())
+    text = sentence(diagnosis((along, across), (), {"yaw": row("attributed")}))
+    assert "Correct slope (along), off by +0.03 rad" in text
+    assert "slope (across), off by -0.02 rad" in text
+    assert [f.to_dict()["cause"] for f in (along, across)] == ["slope", "slope"]
 
 
 def test_sentence_names_the_row_that_is_unexplained_and_not_a_weak_trend() -> None:
