@@ -425,7 +425,7 @@ def diagnose_events(events: Sequence[Event], request: Request) -> Status:
 
 
 def _status_of(found: DiagnosisResult, robot: Robot, name: str) -> Status:
-    """Each finding that is to be corrected with its remedy; with the whole sentence where the verdict is unexplained."""
+    """Verdict and sentence, as the command prints them, then what to do about findings to be corrected and about missing messages."""
     from localization.diagnosis.causes import MISSING_MESSAGES
     from localization.diagnosis.corrected_robot import correct_robot
     from localization.diagnosis.findings import correctable_findings, describe_sizes
@@ -434,17 +434,15 @@ def _status_of(found: DiagnosisResult, robot: Robot, name: str) -> Status:
     values = {"verdict": d.verdict, "windows": str(d.windows), "model": d.model}
     if found.predictor is not None:
         robot = correct_robot(found.predictor, d.hypothesis).robot
-    texts = []
-    corrected = correctable_findings(d)
-    for i, finding in enumerate((f for f in d.findings if f in corrected or f.cause == MISSING_MESSAGES.id), 1):
-        remedy = _REMEDIES.get(finding.cause, _OTHER_REMEDY).format(g=robot.geometry, c=robot.clock)
-        aliases = f" (or {describe_sizes(finding.aliases)})" if finding.aliases else ""
-        texts.append(f"{finding.definition.describe(finding.size, finding.sigma)}{aliases}: {remedy}.")
+    is_worse = d.handover is not None and not d.handover.is_better
+    corrected = [] if is_worse else correctable_findings(d)
+    remedies = []
+    for i, finding in enumerate(d.findings, 1):
         values[f"finding_{i}"] = f"{finding.cause} {finding.size:+.4g} +- {finding.sigma:.2g} {finding.definition.unit}"
-        values[f"remedy_{i}"] = remedy
         if finding.aliases:
             values[f"or_{i}"] = describe_sizes(finding.aliases)
-    if texts and d.verdict in ("explained", "ambiguous"):
-        return Status(_NAME, WARN, f"{name}: {' '.join(texts)}", values)
-    is_good = d.verdict in ("consistent", "undecidable") and not texts
-    return Status(_NAME, OK if is_good else WARN, " ".join([f"{d.verdict}, {name}: {d.sentence}", *texts]), values)
+        if finding in corrected or finding.cause == MISSING_MESSAGES.id:
+            values[f"remedy_{i}"] = _REMEDIES.get(finding.cause, _OTHER_REMEDY).format(g=robot.geometry, c=robot.clock)
+            remedies.append(f"{finding.definition.label}: {values[f'remedy_{i}']}.")
+    is_good = d.verdict in ("consistent", "undecidable") and not d.findings
+    return Status(_NAME, OK if is_good else WARN, " ".join([f"{d.verdict}, {name}: {d.sentence}", *remedies]), values)
