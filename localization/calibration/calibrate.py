@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from motion_models.base import MotionModel
 from motion_models.calibration.cross_validation import HeldOut, LearnedNoise, cross_validate, learn_noise
 from motion_models.calibration.fit import Fit, FitConfig, fit
 from motion_models.calibration.maneuvers import IntArray, Maneuver
-from motion_models.calibration.plan import CLOCK, Calibration, calibrate, free_of
+from motion_models.calibration.plan import CLOCK, CLOCK_SIGMA_S, Calibration, calibrate, free_of
 from motion_models.errors import CalibrationError
 from motion_models.online_calibration import RADIUS_NAMES, CorrectedWheels
 from motion_models.registry import make_model
@@ -51,7 +52,8 @@ class Calibrated:
     model: MotionModel
     calibration: Calibration
     before: FloatArray
-    """(M, 3) predicted poses relative to the measured ones, by the robot file's own numbers [m, m, rad]."""
+    """(M, 3) predicted poses relative to the measured ones, by the robot file's own numbers [m, m, rad]; clock and mount that were fitted
+    and that the robot file will not have are taken off, as in the errors of the fit."""
     inside: FloatArray
     """(M, 3) the same by the fit, of the maneuvers that it was fitted to."""
     group: IntArray
@@ -64,6 +66,9 @@ class Calibrated:
     """Sigma by parameter that no number of maneuvers averages out: the gyro's scale, and how bodies follow their wheels."""
     noise: LearnedNoise
     """Factors on the robot file's wheel noise, by the errors on held-out maneuvers; 1 where none were held out."""
+    clock_offset_s: float = 0.0
+    """How much later the wheels' stamps are than by the robot file's clock, for the file; 0 where it is not significant, or where what
+    measured the motion is no sensor of the robot."""
 
     @property
     def measures_positions(self) -> bool:
@@ -204,24 +209,77 @@ def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequ
     counts = [len(m.ends) for m in maneuvers]
     group = np.repeat([names.index(m.group) for m in maneuvers], counts)
     heldout = cross_validate(train, maneuvers, min(_FOLDS, len(names))) if len(names) >= _FEWEST_GROUPS else None
-    before = dataclasses.replace(found.fit, params=model.nominal, reference_params=np.zeros(5)).residuals(maneuvers)
+    clock_offset_s = _significant_clock(found.fit, cuts)
+    unwritten = found.fit.reference_params - np.array([clock_offset_s, *(0.0,) * 4])
+    before = dataclasses.replace(found.fit, params=model.nominal, reference_params=unwritten).residuals(maneuvers)
     inside = found.fit.residuals(maneuvers)
     systematic = {**_gyro_scale(train, found.fit, maneuvers, cuts, robot), CLOCK: _CLOCK_SIGMA_S}
     is_learned = heldout is not None and not of_rotations
     noise = learn_noise(found.fit, maneuvers, heldout.residuals) if heldout is not None and is_learned else LearnedNoise(1.0, 1.0)
-    return Calibrated(model, found, before, inside, group, _position_known(maneuvers), heldout, systematic, noise)
+    return Calibrated(model, found, before, inside, group, _position_known(maneuvers), heldout, systematic, noise, clock_offset_s)
 
 
-def with_clock(robot: Robot, found: Calibrated, cuts: Sequence[Cut]) -> Robot:
-    """``robot`` with the wheels' clock that was fitted, against LiDAR or gyro and twice its sigma or more; a reference is no sensor of the
-    robot, so that its clock may be the one that is off."""
-    if CLOCK not in found.fit.names or any(each.measured_by.startswith("reference") for each in cuts):
-        return robot
-    offset = float(found.fit.values[found.fit.names.index(CLOCK)])
-    if abs(offset) < 2.0 * found.sigmas[CLOCK]:
-        return robot
-    clock = dataclasses.replace(robot.clock, wheel_time_offset_s=robot.clock.wheel_time_offset_s + offset)
-    return dataclasses.replace(robot, clock=clock)
+def _significant_clock(found: Fit, cuts: Sequence[Cut]) -> float:
+    """The wheels' clock of a fit, against LiDAR or gyro and twice its sigma or more, else 0; a reference is no sensor of the robot, so that
+    its clock may be the one that is off."""
+    if CLOCK not in found.names or not all(each.measured_by.startswith(("scan matching", "gyro")) for each in cuts):
+        return 0.0
+    offset = float(found.values[found.names.index(CLOCK)])
+    return offset if abs(offset) >= 2.0 * math.hypot(found.sigmas[CLOCK], _CLOCK_SIGMA_S) else 0.0
+
+
+def with_clock(robot: Robot, found: Calibrated) -> Robot:
+    """``robot`` with the wheels' clock that was fitted, where that is significant."""
+    offset = robot.clock.wheel_time_offset_s + found.clock_offset_s
+    return dataclasses.replace(robot, clock=dataclasses.replace(robot.clock, wheel_time_offset_s=offset))
+
+
+class ClockEstimate(NamedTuple):
+    """How late the wheels' stamps are against what measured the motion."""
+
+    by: str
+    offset_s: float
+    sigma_s: float
+
+
+def estimate_clocks(maneuvers: Sequence[Maneuver], robot: Robot) -> tuple[ClockEstimate, ...]:
+    """By headings alone and by positions alone, as far as they were measured; with turning and radius as diff_drive has them."""
+    found = []
+    config = FitConfig(noise=robot.wheel_noise, prior_sigma={CLOCK: CLOCK_SIGMA_S}, strict=False)
+    for by, others, free in (
+        ("headings", [0, 1], ("wheel_separation_multiplier", CLOCK)),
+        ("positions", [2], ("wheel_separation_multiplier", "wheel_radius", CLOCK)),
+    ):
+        some = [each for each in (_without(m, others) for m in maneuvers) if np.isfinite(np.diagonal(each.cov, axis1=1, axis2=2)).any()]
+        if not some:
+            continue
+        try:
+            result = fit(make_model("diff_drive", robot), some, free, config)
+        except CalibrationError:
+            continue
+        offset = float(result.values[result.names.index(CLOCK)])
+        found.append(ClockEstimate(by, offset, math.hypot(result.sigmas[CLOCK], _CLOCK_SIGMA_S)))
+    return tuple(found)
+
+
+def _without(maneuver: Maneuver, components: Sequence[int]) -> Maneuver:
+    """``maneuver`` as if the ``components`` of its poses had not been measured."""
+    cov = np.array(np.broadcast_to(maneuver.cov, (len(maneuver.ends), 3, 3)))
+    cov[:, components], cov[:, :, components] = 0.0, 0.0
+    cov[:, components, components] = np.inf
+    return dataclasses.replace(maneuver, cov=cov)
+
+
+def describe_clocks(offset_s: float, sigma_s: float, maneuvers: Sequence[Maneuver], robot: Robot) -> str:
+    """The wheels' clock as found beside those by headings and by positions alone, in a sentence; empty where they agree."""
+    others = estimate_clocks(maneuvers, robot)
+    if all(abs(each.offset_s - offset_s) <= 2.0 * math.hypot(each.sigma_s, sigma_s) for each in others):
+        return ""
+    listed = " and ".join(f"{1e3 * each.offset_s:+.0f} +- {1e3 * each.sigma_s:.0f} ms by {each.by} alone" for each in others)
+    return (
+        f"the wheels' clock is off by {1e3 * offset_s:+.0f} +- {1e3 * sigma_s:.0f} ms by all that was measured, {listed}: one offset does "
+        "not describe this drive, and the EKF's will differ too. Check the stamps of the wheels' driver: jitter, or rates that it smooths."
+    )
 
 
 def _least_error(residuals: FloatArray) -> float:

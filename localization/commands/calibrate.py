@@ -119,7 +119,7 @@ class Calibrate:
         found = calibrated(model, cuts, robot, free, of_rotations)
         about = turning(found, robot)
         print_cuts(console, robot, cuts)
-        print_fit(console, found, about, cuts)
+        print_fit(console, found, about, cuts, robot)
         if of_rotations:
             print_rotation_errors(console, found, _rotations(self.source), robot)
         by_source = _each(found, cuts, robot) if len(cuts) > 1 else []
@@ -129,9 +129,7 @@ class Calibrate:
         numbers = {"robot": robot.name, "model": model.name, **calibration_numbers(found, about, cuts, by_source)}
         if not found.is_recommended:
             return robot, {}, numbers
-        calibrated_robot = found.fit.robot(robot)
-        if kind == "log":
-            calibrated_robot = with_clock(calibrated_robot, found, cuts)
+        calibrated_robot = with_clock(found.fit.robot(robot), found)
         return dataclasses.replace(calibrated_robot, wheel_noise=found.noise.scaled(robot.wheel_noise)), found.sigmas, numbers
 
     def _cut(self, path: Path, robot: Robot, kind: str) -> Cut:

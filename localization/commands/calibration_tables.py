@@ -10,12 +10,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from localization.calibration.calibrate import Calibrated, Cut, Turning
+from localization.calibration.calibrate import Calibrated, Cut, Turning, describe_clocks
 from localization.calibration.windows import driven
 from localization.commands.common import add_row, plain_table, print_line, print_table
 from motion_models.base import MotionModel
 from motion_models.calibration.cross_validation import Interval, LearnedNoise, root_mean, root_mean_gain
-from motion_models.calibration.plan import MEANING
+from motion_models.calibration.plan import CLOCK, MEANING
 from motion_models.calibration.regressions import (
     COMMANDED_RAD_PER_S,
     Regression,
@@ -48,7 +48,7 @@ def print_cuts(console: Console, robot: Robot, cuts: Sequence[Cut]) -> None:
             print_line(console, f"  {note}")
 
 
-def print_fit(console: Console, found: Calibrated, about: Turning, cuts: Sequence[Cut]) -> None:
+def print_fit(console: Console, found: Calibrated, about: Turning, cuts: Sequence[Cut], robot: Robot) -> None:
     """Parameters, what is not revealed, what it means, and the errors that it leaves."""
     fit = found.fit
     table = plain_table(
@@ -62,6 +62,8 @@ def print_fit(console: Console, found: Calibrated, about: Turning, cuts: Sequenc
         print_line(console, "\nNot revealed by this drive, and held:")
         for name, why in found.calibration.held:
             print_line(console, f"  {name}: {why}")
+    for line in describe_clock(found, cuts, robot):
+        print_line(console, line)
     print_line(console, f"\nTurning in place it needs an effective track of {_pm(about.effective_track_m)} m.")
     if found.measures_positions:
         x, y, forward = _pm(about.x_cr_m), _pm(about.y_cr_m), _pm(about.forward_scale, 4)
@@ -95,6 +97,21 @@ def print_fit(console: Console, found: Calibrated, about: Turning, cuts: Sequenc
             f"What is left is {fit.scale:.1f} times what the robot file's wheel_noise and the reference's noise explain; `skidloc diagnose`"
             " finds what this model gets wrong.",
         )
+
+
+def describe_clock(found: Calibrated, cuts: Sequence[Cut], robot: Robot) -> list[str]:
+    """What becomes of the wheels' clock, and where one offset does not describe it; nothing where it was not fitted."""
+    if CLOCK not in found.fit.names:
+        return []
+    offset, sigma = float(found.fit.values[found.fit.names.index(CLOCK)]), found.sigmas[CLOCK]
+    clock = f"\nThe wheels' clock is off by {1e3 * offset:+.0f} ms"
+    if found.clock_offset_s:
+        lines = [f"{clock}, which goes into the robot file's [clock]."]
+    else:
+        why = "less than two sigma" if abs(offset) < 2.0 * sigma else "against no sensor of the robot"
+        lines = [f"{clock}, {why}: the robot file's [clock] stays, and errors before and after are both without it."]
+    note = describe_clocks(offset, sigma, [m for each in cuts for m in each.maneuvers], robot)
+    return [*lines, f"! {note}"] if note else lines
 
 
 def _parameters(found: Calibrated) -> dict[str, tuple[float, float, float]]:

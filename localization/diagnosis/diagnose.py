@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from localization.calibration.calibrate import describe_clocks
 from localization.diagnosis.causes import MISSING_MESSAGES, Cause
 from localization.diagnosis.corrected_robot import check_handover
 from localization.diagnosis.drive import Drive
@@ -221,7 +222,7 @@ def _conclude(
         gain=_heldout(linearization, chosen, (), config) if chosen else None,
         outliers_s=tuple(float(t) for t in drive.starts_s[predictor.batch.owner][find_outliers(linearization)]),
         windows=len(drive.maneuvers),
-        warnings=drive.warnings,
+        warnings=(*_clock_warnings(predictor, findings), *drive.warnings),
         hypothesis=with_sizes({causes[i]: float(size) for i, size in zip(chosen, sizes, strict=True)}),
         suspected=None if suspected is None else suspected[0],
     )
@@ -231,6 +232,16 @@ def _conclude(
     result = _with_data_errors(result, drive)
     residuals = Residuals(first.rows, left, linearization.noise.sigmas)
     return DiagnosisResult(result, predictor, residuals, linearization)
+
+
+def _clock_warnings(predictor: DrivePredictor, findings: Sequence[Finding]) -> tuple[str, ...]:
+    """Where headings or positions alone give the wheels another clock than ``findings`` do."""
+    shifts = [(predictor.wheel_shift(with_sizes({f.definition: f.size})), f.sigma) for f in findings if f.definition.is_clock]
+    offset, sigma = sum(shift for shift, _ in shifts), math.hypot(*(sigma for shift, sigma in shifts if shift))
+    if not offset or predictor.drive.kind != "log":
+        return ()
+    text = describe_clocks(offset, sigma, predictor.drive.maneuvers, predictor.drive.robot)
+    return (text,) if text else ()
 
 
 def _reference_sigmas(predictor: DrivePredictor) -> FloatArray:

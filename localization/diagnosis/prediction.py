@@ -215,7 +215,7 @@ class DrivePredictor:
         hypothesis = _added(self.baseline.hypothesis, hypothesis)
         batch, drive = self.batch, self.drive
         out = np.full((len(batch.ends), len(CHANNELS)), np.nan)
-        reference_params = np.array([self._wheel_shift(hypothesis), hypothesis.wheel_lag_s, *self._tracked(hypothesis)])
+        reference_params = np.array([self.wheel_shift(hypothesis), hypothesis.wheel_lag_s, *self._tracked(hypothesis)])
         if drive.is_gyro_reference:
             reference_params[2:] = 0.0
         changed = _HypothesisModel(self, hypothesis)
@@ -248,8 +248,8 @@ class DrivePredictor:
             out[:, 5] = drive.forces[:, 1] - self._kinematic_forces[:, 1] - (-s * sx + c * sy)
         return out
 
-    def _wheel_shift(self, hypothesis: Hypothesis) -> float:
-        """By how much the wheels' stamps are later than those of the motion reference [s]."""
+    def wheel_shift(self, hypothesis: Hypothesis) -> float:
+        """By how much the wheels' stamps are later than those of the motion reference under ``hypothesis`` [s]."""
         b = hypothesis
         return b.wheel_time_offset_s - (b.gyro_time_offset_s if self.drive.is_gyro_reference else b.lidar_time_offset_s)
 
@@ -417,7 +417,7 @@ class _HypothesisModel:
 
     def _rates_key(self) -> tuple[object, ...]:
         p, b = self._p, self._b
-        return b.left_radius_scale, b.right_radius_scale, b.encoder_loss, b.wheel_radius_drift, p._wheel_shift(b), b.wheel_lag_s
+        return b.left_radius_scale, b.right_radius_scale, b.encoder_loss, b.wheel_radius_drift, p.wheel_shift(b), b.wheel_lag_s
 
     def _with_inertia(
         self, law: FrictionModel, rates: FloatArray, centers: tuple[FloatArray, FloatArray], params: FloatArray

@@ -101,7 +101,7 @@ MEANING: Mapping[str, str] = {
     "scrub": "m: yaw moment of the contact patches over mu m g",
     "wheel_radius_scale": "radius of all wheels over the robot file's, less 1",
     "wheel_radius_difference": "radius of the left wheels less the right ones', over the mean",
-    CLOCK: "s: how late the wheels' stamps are against what measured the motion ([clock])",
+    CLOCK: "s: how late the wheels' stamps are against what measured the motion",
 }
 
 

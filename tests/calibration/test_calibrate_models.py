@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
+from localization.calibration.calibrate import describe_clocks, estimate_clocks
 from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.calibration.cross_validation import cross_validate, root_mean, root_mean_gain
@@ -355,3 +357,38 @@ def test_fit_of_reference_terms_beside_the_model_finds_both() -> None:
     found = dict(zip(REFERENCE_PARAM_NAMES, result.reference_params, strict=True))
     assert [found["lidar_offset_x"], found["lidar_offset_y"], found["lidar_yaw"]] == pytest.approx(mount.tolist(), abs=3e-3)
     assert result.params == pytest.approx(model.nominal, abs=3e-3)
+
+
+@pytest.mark.parametrize(("positions_s", "is_one_clock"), [(-0.1, True), (-0.2, False)])
+def test_describe_clocks_headings_and_positions_apart_are_both_named(positions_s: float, is_one_clock: bool) -> None:
+    """Windows of 2 s in which turns are 100 ms ahead of their stamps, and advances as much or twice as much."""
+    model, rng = make_model("diff_drive", ROBOT), np.random.default_rng(3)
+    h, lead, n = 0.05, 6, 40
+
+    def rates(at: FloatArray) -> FloatArray:
+        return np.stack([3.0 * np.sin(0.7 * at) + np.sin(2.1 * at), 3.0 * np.cos(0.9 * at) + np.sin(1.3 * at)], axis=-1)
+
+    def moved(begin: float, offset: float) -> FloatArray:
+        within = rates(begin + offset + (np.arange(n) + 0.5) * h)
+        return preintegrate(model, np.full(n, h), within, np.zeros(2), model.nominal, QUIET).delta
+
+    maneuvers = []
+    for i in range(60):
+        measured = np.r_[moved(2.0 * i, positions_s)[:2], moved(2.0 * i, -0.1)[2]] + NOISE * rng.normal(size=3)
+        logged = rates(2.0 * i + (np.arange(n + 2 * lead) - lead + 0.5) * h)
+        cov = NOISE**2 * np.eye(3)
+        maneuvers.append(Maneuver(np.full(len(logged), h), logged, measured[None], np.array([n]), cov=cov, group=str(i // 3), lead=lead))
+    by = {each.by: each for each in estimate_clocks(maneuvers, ROBOT)}
+    assert by["headings"].offset_s == pytest.approx(-0.1, abs=0.01)
+    assert by["positions"].offset_s == pytest.approx(positions_s, abs=0.03)
+    text = describe_clocks(-0.1, 0.004, maneuvers, ROBOT)
+    assert (text == "") == is_one_clock
+    if text:
+        assert "by headings alone" in text
+        assert "by positions alone: one offset does not describe this drive" in text
+
+
+def test_estimate_clocks_of_headings_gives_no_other() -> None:
+    maneuvers = drive(make_model("diff_drive", ROBOT), make_model("diff_drive", ROBOT).nominal, np.random.default_rng(0))
+    cov = np.diag([np.inf, np.inf, NOISE**2])
+    assert [each.by for each in estimate_clocks([dataclasses.replace(m, cov=cov) for m in maneuvers], ROBOT)] == ["headings"]

@@ -555,3 +555,15 @@ def test_calibrate_writes_the_clock_that_its_errors_are_without(tmp_path: Path) 
     promised, kept = (json.loads(path.read_text())["errors"]["heading_deg"] for path in (first, second))
     assert promised["after"][0] < 0.3 * promised["before"][0]
     assert kept["before"][0] == pytest.approx(promised["after"][0], rel=0.2)
+
+
+def test_calibrate_against_a_late_reference_promises_what_it_writes(tmp_path: Path) -> None:
+    """The reference's clock is not the robot's: [clock] stays, and what it explains is no gain of the robot file."""
+    log, first = diagnosis_drives.bag(tmp_path / "drive.mcap", {"wheel_time_offset": -0.09}, 7, "husky_a200"), tmp_path / "1.json"
+    command = ["calibrate", str(log), "--model", "diff_drive", "--reference", "/ground_truth/odom", "--robot"]
+    assert main([*command, "husky_a200", "--out", str(tmp_path / "robot.toml"), "--json", str(first)]) == 0
+    assert load_robot(str(tmp_path / "robot.toml")).clock == load_robot("husky_a200").clock
+    assert main([*command, str(tmp_path / "robot.toml"), "--json", str(tmp_path / "2.json")]) == 0
+    promised, kept = (json.loads((tmp_path / name).read_text())["errors"]["heading_deg"] for name in ("1.json", "2.json"))
+    assert promised["after"][0] < promised["before"][0] < 1.5
+    assert kept["before"][0] == pytest.approx(promised["after"][0], rel=0.2)
