@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -19,6 +21,7 @@ from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, ex
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_runs, drive_of_table, read_runs
 from localization.diagnosis.findings import (
     Diagnosis,
+    Finding,
     correctable_findings,
     describe_outliers,
     describe_p,
@@ -26,8 +29,10 @@ from localization.diagnosis.findings import (
     describe_sizes,
     describe_tolerated,
     is_contesting,
+    unit_of,
 )
 from localization.diagnosis.linearization import default_model
+from localization.diagnosis.prediction import with_sizes
 from localization.logs import TopicOverrides, open_log
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
@@ -86,16 +91,18 @@ class Diagnose:
                 baseline = estimate_baseline(self._drive_of_log(self.healthy, robot), model)
         with console.status("searching for causes"):
             found = examine(drive, model, self.config, baseline)
+            found = self._with_suited_model(found, drive)
         content = found.diagnosis.to_dict()
         if self.out is not None:
             with new_folder(self.out) as folder:
                 write_json(folder / "diagnosis.json", content)
-                self._write_robot(folder, found, robot)
+                corrected, manual_steps = self._write_robot(folder, found, robot)
                 write_diagnosis_report(folder / "diagnosis.html", found)
         if self.json is not None:
             write_json(self.json, content)
         print_diagnosis(console, found.diagnosis)
         if self.out is not None:
+            print_handover(console, corrected, manual_steps)
             console.print(f"report: {self.out / 'diagnosis.html'}", markup=False, soft_wrap=True)
 
     def _drive(self, robot: Robot) -> Drive:
@@ -123,13 +130,26 @@ class Diagnose:
         config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
         return drive_of_log(log, self.motion_reference, self.reference, config, sigmas)
 
-    def _write_robot(self, folder: Path, found: DiagnosisResult, robot: Robot) -> None:
-        d = found.diagnosis
+    def _with_suited_model(self, found: DiagnosisResult, drive: Drive) -> DiagnosisResult:
+        """``found`` with what the model that suits the robot would find, where a simpler one was chosen and differs from the drive."""
+        d, name = found.diagnosis, default_model(drive.robot)
+        if not self.model or self.model == name or not d.findings or self.healthy is not None:
+            return found
+        other = examine(drive, make_model(name, drive.robot), self.config).diagnosis
+        causes = ", ".join(f"{f.definition.label} {f.size:+.3g}{unit_of(f.cause)}" for f in other.findings) or "no cause"
+        note = f"{name}, which suits {drive.robot.name}, is {other.verdict} on this drive and names {causes}."
+        return dataclasses.replace(found, diagnosis=dataclasses.replace(d, warnings=(note, *d.warnings)))
+
+    def _write_robot(self, folder: Path, found: DiagnosisResult, robot: Robot) -> tuple[list[Finding], tuple[str, ...]]:
+        """Write robot.toml; returns the findings that it corrects, and what is to be done elsewhere."""
+        d, predictor = found.diagnosis, found.predictor
         new, manual_steps = robot, ()  # type: Robot, tuple[str, ...]
         is_worse = d.handover is not None and not d.handover.is_better
-        corrected = [] if found.predictor is None or is_worse else [f for f in correctable_findings(d) if is_held(found.predictor, f)]
-        if found.predictor is not None and correctable_findings(d):
-            patch = correct_robot(found.predictor, d.hypothesis)
+        correctable = [] if predictor is None else correctable_findings(d)
+        held = [f for f in correctable if predictor is not None and is_held(predictor, f)]
+        corrected = [] if is_worse else held
+        if predictor is not None and (sizes := {f.definition: f.size for f in correctable if f in corrected or f not in held}):
+            patch = correct_robot(predictor, with_sizes(sizes))
             new, manual_steps = (patch.robot if corrected else robot), patch.manual_steps
         if is_worse:
             manual_steps = (NOT_BETTER, *manual_steps)
@@ -147,6 +167,17 @@ class Diagnose:
         # in the folder's parent, paths start where they will start once it has its name
         text = robot_toml(relocated(new, folder), remarks="\n".join(remarks))
         write_text_file(folder / "robot.toml", text)
+        return corrected, tuple(manual_steps)
+
+
+def print_handover(console: Console, corrected: Sequence[Finding], manual_steps: Sequence[str]) -> None:
+    """What robot.toml corrects, and what is to be done in drivers and elsewhere."""
+    labels = ", ".join(f.definition.label for f in corrected)
+    if labels:
+        console.print(f"in robot.toml: {labels}", markup=False, soft_wrap=True)
+    for step in manual_steps:
+        if step != NOT_BETTER:
+            console.print(f"to do: {step}", markup=False, soft_wrap=True)
 
 
 def print_diagnosis(console: Console, d: Diagnosis) -> None:

@@ -217,7 +217,9 @@ def test_diagnose_reference_that_is_off_is_no_part_of_the_check(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(("cause", "size", "is_corrected"), [("gyro_time_offset", 0.07, True), ("gyro_scale", 0.05, False)])
-def test_diagnose_gyro_is_corrected_where_the_robot_file_holds_it(tmp_path: Path, cause: str, size: float, is_corrected: bool) -> None:
+def test_diagnose_gyro_is_corrected_where_the_robot_file_holds_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], cause: str, size: float, is_corrected: bool
+) -> None:
     """Its clock is in the robot file, its scale in the driver."""
     log = bag(tmp_path / "drive.mcap", {cause: size}, 31, "husky_a200")
     assert main(["diagnose", str(log), "--robot", "husky_a200", "--out", str(tmp_path / "out")]) == 0
@@ -226,6 +228,18 @@ def test_diagnose_gyro_is_corrected_where_the_robot_file_holds_it(tmp_path: Path
     assert (f"Corrected here: {cause}" in text) == is_corrected
     assert (f"Found, not corrected here: {cause}" in text) != is_corrected
     assert robot.clock.gyro_time_offset_s == pytest.approx(size if is_corrected else 0.0, abs=0.01)
+    printed = capsys.readouterr().out
+    assert (f"in robot.toml: {cause}" in printed) == is_corrected
+    assert ("to do: divide the gyro's rates by 1.05" in printed) != is_corrected
     assert (found["handover"] is None) != is_corrected
     if is_corrected:
         assert found["handover"]["rms_after"]["gyro"] < 0.6 * found["handover"]["rms_before"]["gyro"]
+
+
+def test_diagnose_by_a_simpler_model_names_what_the_suited_one_finds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A healthy robot that skids: what diff_drive lacks has names of causes, and the friction model finds nothing."""
+    log = bag(tmp_path / "drive.mcap", {}, 34, "husky_a200")
+    assert main(["diagnose", str(log), "--robot", "husky_a200", "--model", "diff_drive"]) == 0
+    assert "friction, which suits husky_a200, is consistent on this drive and names no cause." in capsys.readouterr().out
+    assert main(["diagnose", str(log), "--robot", "husky_a200"]) == 0
+    assert "which suits" not in capsys.readouterr().out
