@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from localization.errors import LogError
+from localization.estimate_table import NIS, TWIST, TWIST_COV, EstimateTable, trajectory
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, Estimate, Estimator, EstimatorConfig, make_estimator
-from localization.estimators.base import NIS, TWIST, TWIST_COV, EstimateTable, trajectory
 from localization.events import Event, ImuSample, PositionSample, Step
 from localization.lidar.losses import LidarLosses
 from localization.sensor_checks import SensorChecks

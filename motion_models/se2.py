@@ -263,6 +263,19 @@ def transform(a_T_b: ArrayLike, points_b: ArrayLike) -> FloatArray:
     return np.asarray(_transform(a_T_b, points_b))
 
 
+def align_points(points_b: Points2, points_a: Points2, weights: FloatArray | None = None) -> Pose2:
+    """``a_T_b`` (3,) that brings points (N, 2) of frame b nearest to ``points_a`` (N, 2), by least squares with ``weights`` (N,).
+
+    In closed form (Horn 1987; Umeyama 1991 without scale).
+    """
+    mean_b, mean_a = np.average(points_b, axis=0, weights=weights), np.average(points_a, axis=0, weights=weights)
+    b, a = points_b - mean_b, points_a - mean_a
+    if weights is not None:
+        b = weights[:, None] * b
+    yaw = math.atan2(float(np.sum(b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0])), float(np.sum(a * b)))
+    return np.array([*(mean_a - transform(np.array([0.0, 0.0, yaw]), mean_b)), yaw])
+
+
 @gufunc("(n)->(n,n)")
 def _adjoint(p: FloatArray, out: FloatArray) -> None:
     fill_adjoint(triple(p), out)

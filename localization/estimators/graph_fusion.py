@@ -19,15 +19,15 @@ from localization.errors import EstimatorError
 from localization.estimators.base import Estimate, Estimator
 from localization.estimators.filter import KEY, PARAMS, RADIUS, FilterConfig
 from localization.estimators.fusion import EkfFusion
-from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement, PreintegratedMotion
+from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement
 from localization.events import PositionSample, Step
 from localization.lidar import OUTLIER_SIGMAS, LidarConfig, LostScans
 from localization.lidar.loop_detection import Keyframe, LoopDetector
 from localization.settings import Positive, Settings, Signed
 from localization.trajectory import Trajectory
 from motion_models import se2
-from motion_models.base import Motion
 from motion_models.online_calibration import Corrections
+from motion_models.preintegration import MotionPreintegration
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 _MIN_POSITIONS, _MIN_BASELINE_M = 3, 5.0
@@ -67,7 +67,7 @@ class GraphFusion(Estimator):
         prior = block_diag(corrections.cov, (FilterConfig().wheel_radius_sigma if self._has_radius else _CONSTANT_SIGMA) ** 2)
         self.graph = PoseGraph(prior, np.array([config.antenna_x_m, config.antenna_y_m]))
         self._loops = LoopDetector(lidar)
-        self._wheels = _KeyframeMotion(len(corrections.names))
+        self._wheels = MotionPreintegration(len(corrections.names))
         self._steps, self._stamps_ns = array("d"), array("q")  # the filter's poses, if they are to be smoothed
         self._nodes, self._since_key = array("q"), array("d")  # which of them are keyframes; covariances of the motion since the last one
         self._is_smoothing = is_smoothing
@@ -131,7 +131,7 @@ class GraphFusion(Estimator):
         ekf, k = self.odometry.filter, self.graph.count
         if k:
             delta, cov = ekf.motion_since(KEY)
-            wheels = self._wheels.preintegrated(ekf.corrections)
+            wheels = self._wheels.with_corrections(ekf.corrections)
             D, states = wheels.by_corrections, np.r_[PARAMS : len(ekf.P), RADIUS]
             by_wheels = wheels.delta * [1.0 + ekf.radius_scale, 1.0 + ekf.radius_scale, 1.0]
             measured = _subtract_information(delta, cov, by_wheels, wheels.cov + D @ ekf.P[np.ix_(states, states)] @ D.T, self._is_matched)
@@ -143,7 +143,7 @@ class GraphFusion(Estimator):
         if self._is_smoothing:
             self._nodes.append(len(self._stamps_ns) - 1)
         ekf.start_key()
-        self._wheels = _KeyframeMotion(len(self._corrections.names))
+        self._wheels = MotionPreintegration(len(self._corrections.names))
         self._close_loop(Keyframe(ekf.pose, self.odometry.scan_points))
         self._align_positions()
         if len(self._corrections.names) and k:
@@ -258,36 +258,6 @@ class GraphFusion(Estimator):
         return np.vstack(drawn) if drawn else np.empty((0, 2))
 
 
-class _KeyframeMotion:
-    """Preintegrates steps from keyframe to keyframe."""
-
-    def __init__(self, n: int) -> None:
-        self._delta, self._cov = np.zeros(3), np.zeros((3, 3))
-        self._by_corrections, self._straight = np.zeros((3, n)), np.zeros((3, n))
-        self._corrected = np.zeros(3)  # share of the corrections in the motion
-        self._prior = np.zeros((n, n))
-
-    def add(self, motion: Motion, corrections: Corrections, is_turning: bool, at: FloatArray) -> None:
-        """Add the next step, predicted with the corrections ``at`` (n,). Nearly straight motion does not excite the corrections: there they
-        are one error of the whole motion."""
-        A = se2.adjoint(se2.inverse(motion.delta))
-        self._delta = se2.compose(self._delta, motion.delta)
-        self._cov = A @ self._cov @ A.T + motion.cov
-        D = motion.d_params @ corrections.directions if motion.d_params.shape[1] else np.zeros_like(self._straight)
-        excited, straight = (D, np.zeros_like(D)) if is_turning else (np.zeros_like(D), D)
-        self._by_corrections = A @ self._by_corrections + excited
-        self._straight = A @ self._straight + straight
-        self._corrected = A @ self._corrected + excited @ at
-        self._prior = corrections.cov
-
-    def preintegrated(self, at: FloatArray) -> PreintegratedMotion:
-        """All of it, as predicted with the corrections ``at`` (n,)."""
-        cov = self._cov + self._straight @ self._prior @ self._straight.T + 1e-10 * np.eye(3)
-        delta = se2.compose(self._delta, se2.exp(self._by_corrections @ at - self._corrected))
-        by_scale = np.append(-se2.inverse(delta)[:2], 0.0)  # R^T (x, y), yaw 0: turns have a scale of their own, k
-        return PreintegratedMotion(delta, cov, np.column_stack([self._by_corrections, by_scale]), np.append(at, 0.0))
-
-
 def _subtract_information(delta: Pose2, cov: Cov3, prior: Pose2, prior_cov: Cov3, is_matched: bool) -> tuple[Pose2, Cov3]:
     """Motion and information of gyro and scans alone, where they and the wheels' ``prior`` (3,) together give ``delta`` (3,).
 
@@ -308,18 +278,15 @@ def _subtract_information(delta: Pose2, cov: Cov3, prior: Pose2, prior_cov: Cov3
 
 
 def _align(ours: Points2, theirs: Points2, sigmas: FloatArray) -> Pose2:
-    """Pose (3,) that moves points ``ours`` (N, 2) onto ``theirs`` (N, 2) [m] (Umeyama 1991, without scale).
+    """Pose (3,) that moves points ``ours`` (N, 2) onto ``theirs`` (N, 2) [m].
 
     The sum of distances is minimised, not of their squares, by iterated weights 1 / distance: outliers among ``theirs`` do not pull.
     Distances below ``sigmas`` (N,) [m] count alike.
     """
-    weights, pose = 1.0 / sigmas, np.zeros(3)
+    distances, pose = sigmas, np.zeros(3)
     for _ in range(_ALIGNMENT_ITERATIONS):
-        mean_a, mean_b = np.average(ours, axis=0, weights=weights), np.average(theirs, axis=0, weights=weights)
-        a, b = weights[:, None] * (ours - mean_a), theirs - mean_b
-        yaw = math.atan2(float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), float(np.sum(a * b)))
-        pose = np.array([*(mean_b - se2.transform(np.array([0.0, 0.0, yaw]), mean_a)), yaw])
-        weights = 1.0 / np.maximum(np.hypot(*(se2.transform(pose, ours) - theirs).T), sigmas)
+        pose = se2.align_points(ours, theirs, 1.0 / distances)
+        distances = np.maximum(np.hypot(*(se2.transform(pose, ours) - theirs).T), sigmas)
     return pose
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from localization.errors import EstimatorError
 from localization.estimators.measurement_models import motion_residual, transform_point
 from motion_models import se2
+from motion_models.preintegration import PreintegratedMotion
 from motion_models.se2 import Cov3, FloatArray, Pose2
 
 _ALIGNMENT, _LEVER = gtsam.symbol("t", 0), gtsam.symbol("l", 0)
@@ -40,20 +41,6 @@ _MAX_UPDATES = 5
 _MAX_ITERATIONS = 50
 _CONVERGED = 1e-6
 """Relative change of the cost at which the optimization ends: a tenth of GTSAM's own default."""
-
-
-@dataclass(frozen=True)
-class PreintegratedMotion:
-    """The wheels' motion from keyframe to keyframe, by any motion model."""
-
-    delta: Pose2
-    """(3,) at the corrections ``at``."""
-    cov: FloatArray
-    """(3, 3)"""
-    by_corrections: FloatArray
-    """(3, c) its derivative (right perturbation)."""
-    at: FloatArray
-    """(c,)"""
 
 
 @dataclass(frozen=True)

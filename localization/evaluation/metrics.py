@@ -170,22 +170,15 @@ def match(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: float) -
 def align(estimate: FloatArray, positions: FloatArray, yaws: FloatArray | None = None) -> FloatArray:
     """``reference_T_world`` (3,): the rigid motion that brings the estimate (N, 3) nearest to the reference's positions (N, 2).
 
-    Least squares in closed form (Horn 1987, Umeyama 1991 without scale, in the plane): the rotation is the angle of the sum of
-    conj(estimate) * reference over centred positions as complex numbers. Where the reference stays within 10 cm RMS of one point its
-    positions do not determine the rotation: it is the mean difference of headings then, or zero if the reference has no headings
-    (which changes the position errors by no more than those 10 cm).
+    Where the reference stays within 10 cm RMS of one point its positions do not determine the rotation: it is the mean difference of
+    headings then, or zero if the reference has no headings (which changes the position errors by no more than those 10 cm).
     """
-    from_xy, to_xy = estimate[:, :2].mean(axis=0), positions.mean(axis=0)
-    p, q = estimate[:, :2] - from_xy, positions - to_xy
-    if math.sqrt(np.mean(np.sum(q * q, axis=1))) > 0.1:
-        theta = math.atan2(np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]), np.sum(p * q))
-    elif yaws is not None:
-        turn = yaws - estimate[:, 2]
-        theta = math.atan2(np.mean(np.sin(turn)), np.mean(np.cos(turn)))
-    else:
-        theta = 0.0
-    offset = to_xy - se2.transform([0.0, 0.0, theta], from_xy)
-    return np.array([offset[0], offset[1], theta])
+    centre = positions.mean(axis=0)
+    if math.sqrt(np.mean(np.sum((positions - centre) ** 2, axis=1))) > 0.1:
+        return se2.align_points(estimate[:, :2], positions)
+    turn = np.zeros(1) if yaws is None else yaws - estimate[:, 2]
+    theta = math.atan2(np.mean(np.sin(turn)), np.mean(np.cos(turn)))
+    return np.array([*(centre - se2.transform([0.0, 0.0, theta], estimate[:, :2].mean(axis=0))), theta])
 
 
 def relative_pose_errors(estimate: FloatArray, reference: FloatArray, config: EvaluateConfig) -> tuple[RpeAtLength, ...]:

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from localization.errors import CheckpointError, OutputError
+from localization.estimate_table import COLUMNS, COV, POSE, TWIST, TWIST_COV, row_of
 from localization.estimators import Estimate
-from localization.estimators.base import COLUMNS, COV, POSE, TWIST, TWIST_COV, row_of
 from localization.logs.writer import FusedEstimate
 from localization.trajectory import IntArray
 from motion_models.se2 import FloatArray

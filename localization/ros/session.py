@@ -15,8 +15,8 @@ from typing import Any, Protocol, TextIO
 import numpy as np
 
 from localization.errors import CheckpointError, OutputError
+from localization.estimate_table import trajectory
 from localization.estimators import Estimate
-from localization.estimators.base import trajectory
 from localization.events import Event
 from localization.logs.writer import MAP_FRAME, PARENT_FRAME, write_fused
 from localization.output import output_errors, refuse_existing

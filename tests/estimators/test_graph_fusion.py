@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from localization.estimate_table import EstimateTable, trajectory
 from localization.estimators import Estimate
-from localization.estimators.base import EstimateTable, trajectory
-from localization.estimators.graph_fusion import _cov_between_nodes, _interpolate, _KeyframeMotion, _subtract_information
+from localization.estimators.graph_fusion import _cov_between_nodes, _interpolate, _subtract_information
 from localization.evaluation.consistency import nees
 from localization.events import PositionSample, Scan, WheelSample
 from localization.logs.references import merge_positions
@@ -24,6 +24,7 @@ from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.online_calibration import add_correction_parameters, make_corrections
+from motion_models.preintegration import MotionPreintegration
 from motion_models.registry import make_model
 from motion_models.robot import WheelNoise
 from tests.helpers import rooms
@@ -211,12 +212,12 @@ def test_keyframe_motion_is_that_of_one_set_of_corrections() -> None:
         twist = model.twist(rates, no_cg, model.nominal + correct.directions @ at)
         return Motion(se2.exp(0.1 * twist.value), 1e-8 * np.eye(3), se2.right_jacobian(0.1 * twist.value) @ (0.1 * twist.d_params))
 
-    while_learning, at_once = _KeyframeMotion(len(correct.names)), _KeyframeMotion(len(correct.names))
+    while_learning, at_once = MotionPreintegration(len(correct.names)), MotionPreintegration(len(correct.names))
     for share in np.linspace(0.0, 1.0, 10):
         while_learning.add(motion(share * final), correct, True, share * final)
         at_once.add(motion(final), correct, True, final)
-    expected = at_once.preintegrated(final).delta
-    off = se2.log(se2.between(expected, while_learning.preintegrated(final).delta))
+    expected = at_once.with_corrections(final).delta
+    off = se2.log(se2.between(expected, while_learning.with_corrections(final).delta))
     as_predicted = se2.log(se2.between(expected, while_learning._delta))
     assert np.abs(off).max() < 0.1 * np.abs(as_predicted).max()
 
@@ -374,13 +375,13 @@ def test_smoothed_after_the_lidars_end_is_as_uncertain_as_the_filter() -> None:
 @settings(max_examples=30, deadline=None)
 def test_keyframe_motion_derivative_by_radius_is_numeric(x: float, y: float, yaw: float) -> None:
     """Ways scale, turns do not."""
-    motion, h = _KeyframeMotion(0), 1e-6
+    motion, h = MotionPreintegration(0), 1e-6
     none = make_corrections(make_model("diff_drive", rooms.ROBOT), "none")
     delta = np.array([x, y, yaw])
     motion.add(Motion(delta, 1e-6 * np.eye(3), np.zeros((3, 0))), none, True, np.zeros(0))
     more, less = (delta * [1.0 + step, 1.0 + step, 1.0] for step in (h, -h))
     numeric = (se2.log(se2.between(delta, more)) - se2.log(se2.between(delta, less))) / (2.0 * h)
-    np.testing.assert_allclose(motion.preintegrated(np.zeros(0)).by_corrections[:, -1], numeric, atol=1e-6)
+    np.testing.assert_allclose(motion.with_corrections(np.zeros(0)).by_corrections[:, -1], numeric, atol=1e-6)
 
 
 # --- checkpoints
