@@ -1,7 +1,7 @@
 """Estimators in buildings that nobody tuned them on: fr079, MIT-CSAIL and ACES, with default settings.
 
 python -m tests.studies.buildings [--log fr079,csail,aces] [--estimator ...] [--model diff_drive,skid_steer,icr]
-    [--corrections none,constant,cg_field] [--matcher submap,kiss]
+    [--corrections none,constant,cg_field] [--matcher submap,kiss] [--reference-noise]
 
 Absolute trajectory error (ATE) after one SE(2) alignment, and the median relative pose error over 10 m of the reference's path. Both use
 the reference at its own instants alone: MIT-CSAIL's holds at key scans only, so nothing is interpolated between its poses. ACES has
@@ -9,13 +9,16 @@ hand-verified relative poses instead: their mean translation error, over all of 
 NEES counts from the first instant of the reference, whose noise (tests/data/*/SOURCE.txt: 1.6 cm, 0.5 deg a pose) is added at both ends:
 mean over all instants, and over those at which the robot turns by less than 0.1 rad/s. The yaw of MIT-CSAIL's reference is off by up to
 0.35 rad at single instants of turning, for all estimators alike. 3 are expected; one drive is one sample.
-CPU is that of the whole replay in memory, after a first run of a few seconds that compiles.
+``--reference-noise`` compares the reference with the smoothed graphs by both matchers, and these with each other: of three tracks with
+independent errors, the differences give the error of each (Gray & Allan 1974, three-cornered hat). CPU is that of the whole replay in
+memory, after a first run of a few seconds that compiles.
 Where an estimator smooths at the end, its live poses have a row of their own.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -37,6 +40,7 @@ from localization.trajectory import IntArray, Trajectory
 from motion_models import se2
 from motion_models.registry import make_model
 from motion_models.robot import Mount, Robot, load_robot
+from motion_models.se2 import FloatArray
 
 DATA = Path(__file__).parents[1] / "data"
 _WARM_UP_S = 20.0
@@ -114,12 +118,12 @@ def _same_instants(trajectory: Trajectory, reference: ReferenceTrack) -> tuple[I
     return at[use], use
 
 
-def nees_at_instants(trajectory: Trajectory, reference: ReferenceTrack) -> tuple[float, float]:
-    """Mean NEES at the instants of ``reference``, with its noise: of all, and of those at which the robot hardly turns."""
+def nees_at_instants(trajectory: Trajectory, reference: ReferenceTrack, sigma: FloatArray = REFERENCE_SIGMA) -> tuple[float, float]:
+    """Mean NEES at the instants of ``reference``, with its noise ``sigma`` (3,): of all, and of those at which it hardly turns."""
     at, use = _same_instants(trajectory, reference)
     estimate, truth = trajectory.poses[at], reference.poses[use]
     assert trajectory.covariances is not None
-    moved, noise = se2.between(truth[0], truth), np.diag(REFERENCE_SIGMA**2)
+    moved, noise = se2.between(truth[0], truth), np.diag(sigma**2)
     A = se2.adjoint(se2.inverse(moved))
     errors = se2.log(se2.between(moved, se2.between(estimate[0], estimate)))
     found = nees(errors, trajectory.covariances[at] + noise + A @ noise @ A.swapaxes(-1, -2))
@@ -153,6 +157,26 @@ def measure(drive: Drive, estimator: str, model: str, form: str, matcher: str) -
         yield kind, "{:.3f} / {:.4f} | {} | {}".format(*errors_of(trajectory, drive.reference), consistency, rest)
 
 
+def reference_noise(drive: Drive, reference: ReferenceTrack) -> str:
+    """Errors of relations over `RPE_M` of the reference and of the smoothed graphs by both matchers, and NEES with such a reference."""
+    graph, kiss = drive.run("graph"), drive.run("graph", matcher="kiss").trajectory
+    at, _ = _same_instants(kiss, reference)
+    by_kiss = ReferenceTrack(kiss.stamps_ns[at], kiss.poses[at, :2], kiss.poses[at, 2])
+    pairs = {"submap": (graph.trajectory, reference), "kiss": (kiss, reference), "reference": (graph.trajectory, by_kiss)}
+    apart = {name: track_errors(*pair)[1] for name, pair in pairs.items()}  # "reference": of the other two
+    half = 0.5 * sum(value**2 for value in apart.values())
+    errors = {"submap": half - apart["kiss"] ** 2, "kiss": half - apart["submap"] ** 2, "reference": half - apart["reference"] ** 2}
+    sigma = math.sqrt(max(errors["reference"], 0.0) / 2.0)  # of one pose
+    tracks = {"ekf": drive.run("ekf").trajectory, "graph live": graph.filtered or graph.trajectory, "graph smoothed": graph.trajectory}
+    noise = np.array([sigma, sigma, REFERENCE_SIGMA[2]])
+    nees_of = ", ".join("{} {:.1f} / {:.1f}".format(name, *nees_at_instants(track, reference, noise)) for name, track in tracks.items())
+    error_of = ", ".join(f"{name} {math.sqrt(max(square, 0.0)):.3f}" for name, square in errors.items())
+    return (
+        f"submap and reference {apart['submap']:.3f}, kiss and reference {apart['kiss']:.3f}, submap and kiss {apart['reference']:.3f} m: "
+        f"errors of {error_of} m; NEES with {sigma:.3f} m a pose of the reference: {nees_of}"
+    )
+
+
 def rows(drive: Drive, options: argparse.Namespace) -> Iterator[str]:
     """Lines of the table for one log."""
     for estimator in options.estimator:
@@ -175,11 +199,18 @@ def _arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--model", type=split, default=["diff_drive"])
     parser.add_argument("--corrections", type=split, default=["constant"])
     parser.add_argument("--matcher", type=split, default=["submap"])
+    parser.add_argument("--reference-noise", action="store_true", help="compare the reference with both matchers, in place of the table")
     return parser.parse_args(words)
 
 
 def main(words: Sequence[str] | None = None) -> None:
     options = _arguments(words)
+    if options.reference_noise:
+        for name in options.log:
+            drive = BUILDINGS[name].open()
+            if isinstance(drive.reference, ReferenceTrack):
+                print(f"{name}: {reference_noise(drive, drive.reference)}", flush=True)
+        return
     print("| log | estimator | ATE / RPE 10 m, or relations all / < 20 s [m] | NEES all / slow turns | scans lost [%] | CPU ms a scan |")
     print("|---" * 6 + "|")
     for name in options.log:
