@@ -203,8 +203,8 @@ def _manual_steps(robot: Robot, h: Hypothesis, lidar_frame: str | None) -> list[
     off = f"({x:+.4f} m, {y:+.4f} m, {yaw:+.4f} rad)"
     lidar_s = 0.0 if lidar_frame is None else h.lidar_time_offset_s
     reference_s = h.lidar_time_offset_s - lidar_s
-    clocks = ("wheel", h.wheel_time_offset_s), ("LiDAR", lidar_s), ("IMU", h.gyro_time_offset_s)
-    late = ", ".join(f"{name} {1e3 * s:+.0f} ms" for name, s in clocks if s)
+    clocks = ("wheels", h.wheel_time_offset_s), ("LiDAR", lidar_s), ("IMU", h.gyro_time_offset_s)
+    off_clocks = ", ".join(f"{name} {1e3 * abs(s):.0f} ms {'late' if s > 0.0 else 'early'}" for name, s in clocks if s)
     law = _law(robot, h)
     steps = (
         (
@@ -216,7 +216,7 @@ def _manual_steps(robot: Robot, h: Hypothesis, lidar_frame: str | None) -> list[
             f"the reference tracks a frame at {off} of the body: move the marker by the opposite, or transform its poses.",
         ),
         (reference_s, f"shift the reference's stamps by {-1e3 * reference_s:+.0f} ms, or synchronize its clock."),
-        (late, f"stamps are late ({late}): [clock] corrects them; synchronize the clocks or correct the driver, and remove it."),
+        (off_clocks, f"stamps of {off_clocks}: [clock] corrects them; synchronize the clocks or correct the driver, and remove it."),
         (h.wheel_lag_s, f"the body follows the wheels {1e3 * h.wheel_lag_s:.0f} ms late."),
         (h.gyro_bias, f"the gyro's bias is {h.gyro_bias:+.5f} rad/s; let the driver zero it while the robot stands."),
         (h.gyro_scale, f"divide the gyro's rates by {1.0 + h.gyro_scale:.4f} in its driver."),
