@@ -33,8 +33,11 @@ from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 _MIN_POSITIONS, _MIN_BASELINE_M = 3, 5.0
 """Positions, and the distance between them [m], from which they give the heading of the map."""
 _ALIGNMENT_ITERATIONS = 30
-_CONSTANT_SIGMA = 1e-4
-"""Of what does not change: by far smaller ones GTSAM's marginals lose positive definiteness."""
+_CONSTANT_SHARE = 1e-3
+"""By which corrections that do not change may do so a minute, over the sigma of their prior: less than 1 % of it in an hour. With 1e-6
+GTSAM's Cholesky factors lose positive definiteness."""
+_NO_SIGMA = 1e-4
+"""Prior sigma of the wheels' radius where it is not a variable of its own."""
 _MIN_RATIO = 1.1
 """Information of a motion over that of the wheels alone, from which on scans have measured it: 1 in a bare corridor, along it."""
 _LONGEST_WAIT = 2.0
@@ -64,8 +67,8 @@ class GraphFusion(Estimator):
         """``is_smoothing``: `finish` is to give the smoothed trajectory; memory then grows with the drive, 104 bytes a step."""
         self.odometry, self._corrections, self._config = odometry, corrections, config
         self._has_radius = "wheel_radius_scale" not in corrections.names  # else it is one of them
-        prior = block_diag(corrections.cov, (FilterConfig().wheel_radius_sigma if self._has_radius else _CONSTANT_SIGMA) ** 2)
-        self.graph = PoseGraph(prior, np.array([config.antenna_x_m, config.antenna_y_m]))
+        radius_sigma = FilterConfig().wheel_radius_sigma if self._has_radius else _NO_SIGMA
+        self.graph = PoseGraph(block_diag(corrections.cov, radius_sigma**2), np.array([config.antenna_x_m, config.antenna_y_m]))
         self._loops = LoopDetector(lidar)
         self._wheels = MotionPreintegration(len(corrections.names))
         self._steps, self._stamps_ns = array("d"), array("q")  # the filter's poses, if they are to be smoothed
@@ -76,7 +79,7 @@ class GraphFusion(Estimator):
         self._moving_s = 0.0
         self._positions: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []  # keyframe, offset, position, cov: not aligned yet
         self._waiting: list[PositionSample] = []
-        self._is_aligned = False
+        self._is_aligned, self._failure = False, ""
         self.n_loops = self.n_positions = self._n_late = 0
 
     @property
@@ -158,7 +161,7 @@ class GraphFusion(Estimator):
             return None
         cov = block_diag(self._corrections.process_noise * self._moving_s, 0.0)
         self._moving_s = 0.0
-        return np.asarray(cov + _CONSTANT_SIGMA**2 * np.eye(len(cov)))
+        return np.asarray(cov + _CONSTANT_SHARE**2 * np.diag(np.diagonal(self.graph.prior_cov)))
 
     def _close_loop(self, keyframe: Keyframe) -> None:
         self._loops.add(keyframe)
@@ -209,9 +212,11 @@ class GraphFusion(Estimator):
             return None
         if self._nodes[-1] < len(self._stamps_ns) - 1:
             self._add_keyframe()
-        poses, covs = self.graph.smooth()
-        if not (np.isfinite(poses).all() and np.isfinite(covs).all()):
-            raise EstimatorError("the pose graph has no finite solution. Check the log with `skidloc info`, and the robot file's noise.")
+        try:
+            poses, covs = self.graph.smooth()
+        except EstimatorError as error:
+            self._failure = f"the trajectory could not be smoothed, and its poses are the live ones: {error}"
+            return None
         nodes, odom = np.array(self._nodes), np.array(self._steps).reshape(-1, 3)
         smoothed, smoothed_covs = _interpolate(nodes, poses, covs, odom)
         smoothed_covs += _cov_between_nodes(nodes, odom, np.array(self._since_key).reshape(-1, 3, 3))
@@ -237,7 +242,7 @@ class GraphFusion(Estimator):
 
     def warnings(self) -> list[str]:
         """As `EkfFusion.warnings`, and positions that could not be used, or contradict the other sensors."""
-        found, n = self.odometry.warnings(), len(self._positions) + len(self._waiting)
+        found, n = [*self.odometry.warnings(), *([self._failure] if self._failure else [])], len(self._positions) + len(self._waiting)
         if n and not self.n_positions:
             found.append(
                 f"{n} positions could not be used: it takes {_MIN_POSITIONS} over {_MIN_BASELINE_M:g} m to give the map its heading."

@@ -156,7 +156,7 @@ class PoseGraph:
         return np.asarray(self._values.atVector(key)), np.asarray(self._isam.marginalCovariance(key))
 
     def smooth(self) -> tuple[FloatArray, FloatArray]:
-        """Poses (count, 3) by all measurements, by Levenberg-Marquardt, and their covariances (count, 3, 3)."""
+        """Poses (count, 3) by all measurements, by Levenberg-Marquardt, and their covariances (count, 3, 3). Raises `EstimatorError`."""
         graph, values = gtsam.NonlinearFactorGraph(), self._isam.calculateEstimate()
         count, self.count, self._epochs = self.count, 0, 0
         for update in self.updates:
@@ -168,6 +168,8 @@ class PoseGraph:
             marginals = gtsam.Marginals(linear, linear.optimize())
             covs = np.array([marginals.marginalCovariance(gtsam.symbol("x", k)) for k in range(count)])
         self._values = values
+        if not (np.isfinite(self.poses()).all() and np.isfinite(covs).all()):
+            raise EstimatorError("the pose graph has no finite solution. Check the log with `skidloc info`, and the robot file's noise.")
         return self.poses(), covs
 
     def _factors(self, update: GraphUpdate) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:

@@ -11,9 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from localization.errors import EstimatorError
 from localization.estimate_table import EstimateTable, trajectory
 from localization.estimators import Estimate
 from localization.estimators.graph_fusion import _cov_between_nodes, _interpolate, _subtract_information
+from localization.estimators.pose_graph import PoseGraph
 from localization.evaluation.consistency import nees
 from localization.events import PositionSample, Scan, WheelSample
 from localization.logs.references import merge_positions
@@ -452,6 +454,25 @@ def test_smoothed_poses_between_keyframes_have_the_noise_of_scans() -> None:
     assert found.mean() < 8.0
     live = np.searchsorted(run.filtered.stamps_ns, drive.stamps)
     assert (np.sqrt(covs[early, 0, 0]) > 0.4 * np.sqrt(run.filtered.covariances[live][early, 0, 0])).all()
+
+
+def test_graph_with_a_field_of_corrections_can_be_smoothed() -> None:
+    """Prior sigmas of a field over the CG differ by a factor of 1,500, and corrections are 16 variables in a row."""
+    run = BUILDINGS["fr079"].open().run("graph", "skid_steer", "cg_field")
+    assert run.filtered is not None
+    assert not [warning for warning in run.warnings if "smoothed" in warning]
+
+
+def test_graph_that_cannot_be_smoothed_keeps_its_live_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(self: PoseGraph) -> None:
+        raise EstimatorError("the pose graph cannot be solved.")
+
+    drive = around()
+    monkeypatch.setattr(PoseGraph, "smooth", fail)
+    (run,) = replay(drive.events[:600], [Trial(make_model("diff_drive", rooms.ROBOT), "graph")], rooms.ROBOT, drive.mounts, True)
+    assert run.filtered is None
+    assert len(run.trajectory) > 50
+    assert [warning for warning in run.warnings if "could not be smoothed" in warning and "cannot be solved" in warning]
 
 
 def test_cov_between_nodes_is_that_of_the_motion_less_its_share() -> None:
