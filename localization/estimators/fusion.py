@@ -152,7 +152,7 @@ class EkfFusion(Estimator):
         if self._sensor is not None or self._has_gyro:
             found["wheel_clock_offset_s"] = ekf.clock_offset, float(sigmas[CLOCK])
         if sigmas[RADIUS]:
-            found["wheel_radius_scale"] = 1.0 + ekf.radius_scale, float(sigmas[RADIUS])
+            found["wheel_radius_scale"] = ekf.radius_scale, float(sigmas[RADIUS])
         nominal = dict(zip(self.model.param_names, self.model.nominal, strict=True))
         for i, name in enumerate(self.corrections.names):
             found[name] = float(nominal.get(name, 0.0) + ekf.corrections[i]), float(sigmas[PARAMS + i])

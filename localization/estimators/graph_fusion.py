@@ -227,7 +227,7 @@ class GraphFusion(Estimator):
         found = dict(self.odometry.parameters())
         if self._has_radius:
             mean, cov = self.graph.corrections()
-            found["wheel_radius_scale"] = 1.0 + float(mean[-1]), math.sqrt(float(cov[-1, -1]))
+            found["wheel_radius_scale"] = float(mean[-1]), math.sqrt(float(cov[-1, -1]))
         if self.n_positions:
             lever, cov = self.graph.lever_arm()
             found |= {f"antenna_{axis}_m": (float(lever[i]), math.sqrt(float(cov[i, i]))) for i, axis in enumerate("xy")}

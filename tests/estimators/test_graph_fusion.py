@@ -171,7 +171,7 @@ def test_graph_with_wrong_wheels_estimates_radius_scale() -> None:
     parameters = pipeline.estimator.parameters()
     mean, sigma = parameters["wheel_radius_scale"]
     assert sigma < 0.005
-    assert abs(mean - 1.0 / RADIUS_ERROR) < 3.0 * sigma
+    assert abs(1.0 + mean - 1.0 / RADIUS_ERROR) < 3.0 * sigma
     nominal = rooms.ROBOT.driver.wheel_separation_multiplier
     mean, sigma = parameters["wheel_separation_multiplier"]
     assert abs(mean - nominal * TURN_ERROR) < 3.0 * sigma
@@ -335,12 +335,14 @@ def test_graph_with_position_that_comes_late_reports_it() -> None:
 
 
 def test_graph_with_named_radius_has_it_once() -> None:
-    """`wheel_radius_scale` is a correction of the motion model here, around 0, and not a second time the graph's own, around 1."""
+    """`wheel_radius_scale` is a correction of the motion model here, with the size of the graph's own, and not there a second time."""
     trial = Trial(make_model("diff_drive", rooms.ROBOT), "graph", "constant+wheel_radius_scale")
     pipeline = Pipeline(trial, rooms.ROBOT, around().mounts, True)
     run(pipeline, around().events)
     size, sigma = pipeline.estimator.parameters()["wheel_radius_scale"]
-    assert abs(size) < 0.1
+    own, _ = estimated()[1].estimator.parameters()["wheel_radius_scale"]
+    assert size == pytest.approx(own, abs=0.01)
+    assert own == pytest.approx(1.0 / RADIUS_ERROR - 1.0, abs=0.01)
     assert 0.0 < sigma < 0.03
     assert pipeline.estimator.graph.corrections()[1][-1, -1] < 1e-6
 
