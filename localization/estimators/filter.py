@@ -8,7 +8,8 @@ with right perturbations: true pose = pose * exp(error).
 `start` and `key` are clones of the pose (Roumeliotis & Burdick 2002, stochastic cloning) at the start of the step and at the last
 keyframe. `map` is the error of the submap around the robot, as a right perturbation of the pose. Scans that are matched to one submap
 share that error, so it is a consider state (Schmidt 1966): its covariance and correlations count, its gain is zero, as the submap stays
-where it is drawn. So is `key`: motions from keyframe to keyframe then add up to the filter's own trajectory.
+where it is drawn. So is `key`: motions from keyframe to keyframe then add up to the filter's own trajectory. `wheel radius` is one while
+scans leave the way open, as along a bare corridor, where noise of normals would be taken for a measurement of it.
 """
 
 from __future__ import annotations
@@ -138,7 +139,8 @@ class Filter:
         innovation, by_pose, by_map = submap_residual(self.pose, measured)
         H = np.zeros((3, len(self.P)))
         H[:, POSE], H[:, MAP] = by_pose, by_map
-        return self._update(innovation, H, R)
+        self.is_considered[RADIUS] = R[0, 0] > self.map_relative_cov()[0, 0]  # the scene leaves the way open
+        return self._update(innovation, H, R, is_of_map=True)
 
     def insert_key_scan(self, error: KeyScanError) -> None:
         """The last scan is drawn into the submap from the pose as it is: e_map' = (1 - s) e_map + s e_pose + m."""
@@ -171,12 +173,19 @@ class Filter:
         cross = P[POSE, clone] @ A.T
         return delta, _clip_eigenvalues(P[POSE, POSE] - cross - cross.T + A @ P[clone, clone] @ A.T)
 
-    def _update(self, innovation: FloatArray, H: FloatArray, R: FloatArray) -> float:
-        """Schmidt-Kalman update in Joseph's form; consider states have no gain. Returns the NIS. Raises `EstimatorError`."""
+    def _update(self, innovation: FloatArray, H: FloatArray, R: FloatArray, is_of_map: bool = False) -> float:
+        """Schmidt-Kalman update in Joseph's form; consider states have no gain. Returns the NIS. Raises `EstimatorError`.
+
+        A measurement that ``is_of_map`` keeps the pose as near to the submap as the optimal gain does: what would move the submap, which
+        stays where it is drawn, moves the pose by the opposite. Else a pose that is better known than the submap stays off it, and later
+        scans are matched from a wide prior.
+        """
         P = self.P
         S = H @ P @ H.T + R
         _check("a measurement", innovation, S)
         K = np.asarray(np.linalg.solve(S, H @ P).T, dtype=float)
+        if is_of_map:
+            K[POSE] -= K[MAP]
         K[self.is_considered] = 0.0
         A = np.eye(len(P)) - K @ H
         self.P = _symmetric(A @ P @ A.T + K @ R @ K.T)

@@ -12,22 +12,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
 from localization.estimators.base import Estimate, Estimator
-from localization.estimators.filter import KEY, PARAMS, RADIUS, FilterConfig
+from localization.estimators.filter import KEY, PARAMS, RADIUS, START, FilterConfig
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement
 from localization.events import PositionSample, Step
 from localization.lidar import OUTLIER_SIGMAS, LidarConfig, LostScans
 from localization.lidar.loop_detection import Keyframe, LoopDetector
 from localization.settings import Positive, Settings, Signed
-from localization.trajectory import Trajectory
+from localization.trajectory import Trajectory, through_nodes
 from motion_models import se2
 from motion_models.online_calibration import Corrections
-from motion_models.preintegration import MotionPreintegration
+from motion_models.preintegration import MotionPreintegration, PreintegratedMotion
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 _MIN_POSITIONS, _MIN_BASELINE_M = 3, 5.0
@@ -40,6 +39,11 @@ _NO_SIGMA = 1e-4
 """Prior sigma of the wheels' radius where it is not a variable of its own."""
 _MIN_RATIO = 1.1
 """Information of a motion over that of the wheels alone, from which on scans have measured it: 1 in a bare corridor, along it."""
+_OPEN_SHARE, _NO_INFORMATION = 0.5, 1e-3
+"""Variance of a keyframe's way over that by the wheels, above which scans know less of it than the wheels do: the scene leaves it open.
+The information of scans along it then [1/m^2]: a sigma of 30 m."""
+_FOUND_SHARE = 0.5
+"""Variance of the position over that at the last keyframe, below which a scan has found the place of a robot that was lost."""
 _LONGEST_WAIT = 2.0
 """Distances between keyframes after which the next one no longer waits for a scan: the LiDAR is silent."""
 _CORRECTION_EPOCH_S = 60.0
@@ -72,9 +76,11 @@ class GraphFusion(Estimator):
         self._loops = LoopDetector(lidar)
         self._wheels = MotionPreintegration(len(corrections.names))
         self._steps, self._stamps_ns = array("d"), array("q")  # the filter's poses, if they are to be smoothed
-        self._nodes, self._since_key = array("q"), array("d")  # which of them are keyframes; covariances of the motion since the last one
+        self._nodes, self._covs_since = array("q"), array("d")  # which of them are keyframes; covariances of the motion since the last one
         self._is_smoothing = is_smoothing
         self._is_keyframe_due = self._is_matched = False
+        self._key, self._moved = 0, (np.zeros(3), np.zeros((3, 3)))  # last keyframe with a matched scan; motion since the last keyframe
+        self._lost_variance = 0.0  # of the position in the odometry's frame at the last keyframe, if that had no matched scan [m^2]
         self._map_T_odom, self._key_cov = np.zeros(3), np.zeros((3, 3))
         self._moving_s = 0.0
         self._positions: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []  # keyframe, offset, position, cov: not aligned yet
@@ -105,14 +111,14 @@ class GraphFusion(Estimator):
         self._is_matched = estimate.nis is not None
         self._wheels.add(self.odometry.wheel_motion, self._corrections, self.odometry.is_turning, self.odometry.used_corrections)
         self._moving_s += 0.0 if step.is_standing else step.duration
-        delta, cov = ekf.motion_since(KEY)
+        delta, cov = self._moved = self._motion_since_keyframe()
         if self._is_smoothing and (not self._stamps_ns or step.end_ns > self._stamps_ns[-1]):
             self._steps.extend(ekf.pose)
-            self._since_key.extend(cov.ravel())
+            self._covs_since.extend(cov.ravel())
             self._stamps_ns.append(step.end_ns)
         moved = max(math.hypot(delta[0], delta[1]) / self._config.keyframe_distance_m, abs(delta[2]) / self._config.keyframe_angle_rad)
         waits_for_scan = step.scan is None and self.lost is not None and moved < _LONGEST_WAIT
-        self._is_keyframe_due = not self.graph.count or (moved >= 1.0 and not waits_for_scan)
+        self._is_keyframe_due = not self.graph.count or (moved >= 1.0 and not waits_for_scan) or self._is_found_again()
         self._place_positions(step)
         A = se2.adjoint(se2.inverse(delta))
         pose = se2.compose(self._map_T_odom, ekf.pose)
@@ -130,22 +136,35 @@ class GraphFusion(Estimator):
         """A position by GPS. It is placed once the odometry has come to its stamp."""
         self._waiting.append(sample)
 
+    def _motion_since_keyframe(self) -> tuple[Pose2, Cov3]:
+        """Motion (3,) since the last keyframe, and its covariance (3, 3): by the sum of the steps, where that had no matched scan."""
+        ekf = self.odometry.filter
+        if self._key >= self.graph.count - 1:
+            return ekf.motion_since(KEY)
+        step, step_cov = ekf.motion_since(START)
+        A = se2.adjoint(se2.inverse(step))
+        return se2.between(self._loops.keyframes[-1].odometry, ekf.pose), A @ self._moved[1] @ A.T + step_cov
+
+    def _is_found_again(self) -> bool:
+        """Whether a scan has shown where the robot is on the map from before its LiDAR was lost."""
+        P = self.odometry.filter.P
+        return self._is_matched and float(P[0, 0] + P[1, 1]) < _FOUND_SHARE * self._lost_variance
+
     def _add_keyframe(self) -> None:
         ekf, k = self.odometry.filter, self.graph.count
+        update = GraphUpdate(ekf.pose)
         if k:
-            delta, cov = ekf.motion_since(KEY)
             wheels = self._wheels.with_corrections(ekf.corrections)
-            D, states = wheels.by_corrections, np.r_[PARAMS : len(ekf.P), RADIUS]
-            by_wheels = wheels.delta * [1.0 + ekf.radius_scale, 1.0 + ekf.radius_scale, 1.0]
-            measured = _subtract_information(delta, cov, by_wheels, wheels.cov + D @ ekf.P[np.ix_(states, states)] @ D.T, self._is_matched)
-            pose = se2.compose(self.graph.pose(k - 1), delta)
-            update = GraphUpdate(pose, wheels, self._epoch_cov(), (BetweenMeasurement(k - 1, k, *measured),))
-        else:
-            update = GraphUpdate(ekf.pose)
+            between = self._between(k, wheels)
+            update = GraphUpdate(se2.compose(self.graph.pose(between.a), between.delta), wheels, self._epoch_cov(), (between,))
         self.graph.apply(update)
         if self._is_smoothing:
             self._nodes.append(len(self._stamps_ns) - 1)
-        ekf.start_key()
+        self._lost_variance = float(ekf.P[0, 0] + ekf.P[1, 1])
+        if self._is_matched or self.lost is None or not k:
+            ekf.start_key()
+            self._key, self._lost_variance = k, 0.0
+        self._moved = np.zeros(3), np.zeros((3, 3))
         self._wheels = MotionPreintegration(len(self._corrections.names))
         self._close_loop(Keyframe(ekf.pose, self.odometry.scan_points))
         self._align_positions()
@@ -154,6 +173,21 @@ class GraphFusion(Estimator):
             ekf.set_corrections(mean[:-1], cov[:-1, :-1])
         self._map_T_odom = se2.compose(self.graph.pose(k), se2.inverse(ekf.pose))
         self._key_cov = self.graph.marginal(k)
+
+    def _between(self, k: int, wheels: PreintegratedMotion) -> BetweenMeasurement:
+        """Motion by gyro and scans to the next keyframe ``k``, from the one before; from the last with a matched scan, if a scan has shown
+        where the robot is after keyframes without: their poses are uncertain, and what it shows is not about them."""
+        ekf = self.odometry.filter
+        if self._is_found_again():
+            delta, cov = ekf.motion_since(KEY)
+            return BetweenMeasurement(self._key, k, delta, np.asarray(np.linalg.inv(cov)))
+        delta, cov = self._moved
+        D, states = wheels.by_corrections, np.r_[PARAMS : len(ekf.P), RADIUS]
+        by_wheels = wheels.delta * [1.0 + ekf.radius_scale, 1.0 + ekf.radius_scale, 1.0]
+        wheel_cov = wheels.cov + D @ ekf.P[np.ix_(states, states)] @ D.T
+        if self._is_matched and cov[0, 0] > _OPEN_SHARE * wheel_cov[0, 0]:  # the way is the wheels' alone: it does not show their radius
+            return BetweenMeasurement(k - 1, k, delta, block_diag(_NO_INFORMATION, np.linalg.inv(cov[1:, 1:])))
+        return BetweenMeasurement(k - 1, k, *_subtract_information(delta, cov, by_wheels, wheel_cov, self._is_matched))
 
     def _epoch_cov(self) -> FloatArray | None:
         """(c, c) by which the corrections may have changed, once a minute; None meanwhile."""
@@ -184,8 +218,8 @@ class GraphFusion(Estimator):
                 continue
             part = (sample.stamp_ns - step.start_ns) / max(step.end_ns - step.start_ns, 1)
             pose = se2.interpolate(ekf.start, ekf.pose, np.array(part))
-            offset = se2.between(ekf.key, pose)
-            moved_cov = 0.5 * np.trace(ekf.motion_since(KEY)[1][:2, :2]) * np.eye(2)  # any heading: that of the map may not be known
+            offset = se2.between(self._loops.keyframes[-1].odometry, pose)
+            moved_cov = 0.5 * np.trace(self._moved[1][:2, :2]) * np.eye(2)  # any heading: that of the map may not be known
             self._positions.append((self.graph.count - 1, offset, sample.position, sample.covariance + moved_cov))
 
     def _align_positions(self) -> None:
@@ -218,9 +252,7 @@ class GraphFusion(Estimator):
             self._failure = f"the trajectory could not be smoothed, and its poses are the live ones: {error}"
             return None
         nodes, odom = np.array(self._nodes), np.array(self._steps).reshape(-1, 3)
-        smoothed, smoothed_covs = _interpolate(nodes, poses, covs, odom)
-        smoothed_covs += _cov_between_nodes(nodes, odom, np.array(self._since_key).reshape(-1, 3, 3))
-        return Trajectory(filtered.stamps_ns, smoothed, smoothed_covs)
+        return Trajectory(filtered.stamps_ns, *through_nodes(odom, np.array(self._covs_since).reshape(-1, 3, 3), nodes, poses, covs))
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         """As `Estimator.parameters`."""
@@ -293,33 +325,3 @@ def _align(ours: Points2, theirs: Points2, sigmas: FloatArray) -> Pose2:
         pose = se2.align_points(ours, theirs, 1.0 / distances)
         distances = np.maximum(np.hypot(*(se2.transform(pose, ours) - theirs).T), sigmas)
     return pose
-
-
-def _interpolate(nodes: FloatArray, poses: FloatArray, covs: FloatArray, odom: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Poses (N, 3) and covariances of all steps, with odometry ``odom`` (N, 3), where the ``nodes`` (K,) of them are at ``poses`` (K, 3).
-
-    What the motion between two keyframes has changed by grows evenly along it, and not where the robot stands.
-    """
-    k, part = _shares(nodes, odom)
-    since, until = se2.between(odom[nodes[k]], odom), se2.between(odom, odom[nodes[k + 1]])
-    forward, backward = se2.compose(poses[k], since), se2.compose(poses[k + 1], se2.inverse(until))
-    A, B = se2.adjoint(se2.inverse(since)), se2.adjoint(until)
-    mixed = (1.0 - part)[:, None, None] * (A @ covs[k] @ A.swapaxes(-1, -2)) + part[:, None, None] * (B @ covs[k + 1] @ B.swapaxes(-1, -2))
-    return se2.compose(forward, se2.exp(part[:, None] * se2.log(se2.between(forward, backward)))), mixed
-
-
-def _cov_between_nodes(nodes: FloatArray, odom: FloatArray, since_key: FloatArray) -> FloatArray:
-    """(N, 3, 3) noise of poses between keyframes, which smoothing leaves: that of the motion since the last one, ``since_key`` (N, 3, 3),
-    the less of it the nearer the next one is."""
-    part = _shares(nodes, odom)[1]
-    grown = (1.0 - part)[:, None, None] * since_key
-    grown[nodes] = 0.0
-    return grown
-
-
-def _shares(nodes: FloatArray, odom: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
-    """The keyframe (N,) before each step, and the share (N,) of the way from there to the next one."""
-    steps = se2.between(odom[:-1], odom[1:])
-    travelled = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]) + np.abs(steps[:, 2]) + 1e-9)])
-    k = np.clip(np.searchsorted(nodes, np.arange(len(odom)), side="right") - 1, 0, len(nodes) - 2)
-    return k, np.clip((travelled - travelled[nodes[k]]) / (travelled[nodes[k + 1]] - travelled[nodes[k]]), 0.0, 1.0)

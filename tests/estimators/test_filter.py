@@ -214,7 +214,7 @@ def test_update_without_consider_states_equals_filterpy():
     other.P, other.H, other.R = ekf.P.copy(), H, LIDAR
     other.update(se2.log(se2.between(ekf.pose, measured)))
     pose, start = ekf.pose, ekf.start
-    nis = ekf.update_scan(measured, LIDAR, NOTHING)
+    nis = ekf._update(se2.log(se2.between(ekf.pose, measured)), H, LIDAR)
     np.testing.assert_allclose(ekf.P, other.P, rtol=1e-9, atol=1e-15)
     assert nis == pytest.approx(other.mahalanobis**2)
     error = other.x.ravel()
@@ -225,7 +225,7 @@ def test_update_without_consider_states_equals_filterpy():
 
 
 def test_update_with_consider_states_equals_schmidt():
-    """By his partitioned formulas (Schmidt 1966): no gain, the same covariance, correlations that shrink."""
+    """By his partitioned formulas (Schmidt 1966): no gain, the same covariance, correlations that shrink. Of a measurement in general."""
     ekf, measured = prepared(1)
     P, innovation = ekf.P.copy(), se2.log(se2.between(ekf.pose, measured))
     c = CONSIDERED
@@ -236,7 +236,9 @@ def test_update_with_consider_states_equals_schmidt():
     S = Hx @ Pxx @ Hx.T + Hx @ Pxc @ Hc.T + Hc @ Pxc.T @ Hx.T + Hc @ Pcc @ Hc.T + LIDAR
     K = (Pxx @ Hx.T + Pxc @ Hc.T) @ np.linalg.inv(S)
     before, key = ekf.bias, ekf.key
-    nis = ekf.update_scan(measured, LIDAR, NOTHING)
+    H = np.zeros((3, SIZE))
+    H[:, POSE], H[:, MAP] = np.eye(3), -np.eye(3)
+    nis = ekf._update(innovation, H, LIDAR)
     np.testing.assert_allclose(ekf.P[np.ix_(x, x)], Pxx - K @ (Hx @ Pxx + Hc @ Pxc.T), rtol=1e-7, atol=1e-14)
     np.testing.assert_allclose(ekf.P[np.ix_(x, c)], Pxc - K @ (Hx @ Pxc + Hc @ Pcc), rtol=1e-7, atol=1e-14)
     np.testing.assert_array_equal(ekf.P[np.ix_(c, c)], 0.5 * (Pcc + Pcc.T))
@@ -303,6 +305,7 @@ def test_covariance_equals_monte_carlo_scatter():
     H = np.zeros((3, SIZE))
     H[:, POSE], H[:, MAP] = np.eye(3), -np.eye(3)
     K = np.linalg.solve(H @ ekf.P @ H.T + LIDAR, H @ ekf.P).T
+    K[POSE] -= K[MAP]
     K[CONSIDERED] = 0.0
     e = e - (e @ H.T - n) @ K.T
     ekf.update_scan(measured, LIDAR, NOTHING)
@@ -311,6 +314,28 @@ def test_covariance_equals_monte_carlo_scatter():
     s, m = KEY_SCAN.share, rng.multivariate_normal(np.zeros(3), KEY_SCAN.new_cov, SAMPLES)
     e[:, MAP] = (1.0 - s) * e[:, MAP] + s * e[:, POSE] + m
     assert_scatter(e, ekf.P)
+
+
+def test_update_scan_keeps_a_pose_that_is_better_known_than_the_submap_on_it():
+    """By the gain of least variance it would stay off the submap by 0.3 m, and the next scan would be matched from there."""
+    ekf = filter_at()
+    ekf.P[POSE, POSE], ekf.P[MAP, MAP] = np.diag([0.1, 0.1, 0.01]) ** 2, np.diag([0.3, 0.3, 0.03]) ** 2
+    measured = np.array([0.3, 0.0, 0.0])
+    ekf.update_scan(measured, LIDAR, NOTHING)
+    assert np.abs(se2.between(measured, ekf.pose)).max() < 0.01
+    assert (np.diag(ekf.map_relative_cov()) <= np.diag(LIDAR)).all()
+    np.testing.assert_allclose(np.sqrt(np.diag(ekf.P))[POSE], [0.3, 0.3, 0.03], rtol=0.01)  # that of the submap, which it is now on
+
+
+def test_update_scan_that_leaves_the_way_open_leaves_the_wheel_radius():
+    ekf, _ = prepared(3)
+    before, P = ekf.radius_scale, ekf.P[RADIUS, RADIUS]
+    wide = np.diag([30.0, 1e-3, 1e-3]) ** 2
+    ekf.update_scan(se2.compose(ekf.pose, np.array([0.1, 1e-3, 1e-3])), wide, NOTHING)
+    assert ekf.radius_scale == before
+    assert ekf.P[RADIUS, RADIUS] == pytest.approx(P)
+    ekf.update_scan(se2.compose(ekf.pose, np.array([0.01, 1e-3, 1e-3])), 1e-6 * np.eye(3), NOTHING)
+    assert ekf.P[RADIUS, RADIUS] < 0.99 * P
 
 
 def test_map_relative_cov_equals_cov_of_difference():

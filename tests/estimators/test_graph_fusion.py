@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from localization.errors import EstimatorError
 from localization.estimate_table import EstimateTable, trajectory
 from localization.estimators import Estimate
-from localization.estimators.graph_fusion import _cov_between_nodes, _interpolate, _subtract_information
+from localization.estimators.graph_fusion import _subtract_information
 from localization.estimators.pose_graph import PoseGraph
 from localization.evaluation.consistency import nees
 from localization.events import PositionSample, Scan, WheelSample
@@ -477,19 +477,32 @@ def test_graph_that_cannot_be_smoothed_keeps_its_live_poses(monkeypatch: pytest.
     assert [warning for warning in run.warnings if "could not be smoothed" in warning and "cannot be solved" in warning]
 
 
-def test_cov_between_nodes_is_that_of_the_motion_less_its_share() -> None:
-    odom = np.column_stack([[0.0, 0.5, 1.0, 1.5, 2.0], np.zeros(5), np.zeros(5)])
-    noise = np.diag([1e-4, 2e-4, 3e-5])
-    found = _cov_between_nodes(np.array([0, 4]), odom, np.tile(noise, (5, 1, 1)))
-    np.testing.assert_allclose(found, np.array([0.0, 0.75, 0.5, 0.25, 0.0])[:, None, None] * noise, atol=1e-12)
-
-
 def test_smoothed_covariance_has_what_widens_live_poses_not_between_keyframes() -> None:
     """Sensor faults inflate live covariances; smoothed ones are inflated by the pipeline afterwards, alike at keyframes and between."""
     estimates, pipeline = run(make_pipeline(around()), around().events[:600]), make_pipeline(around())
     run(pipeline, around().events[:600])
     wide = [replace(e, covariance=e.covariance + 0.1 * np.eye(3)) for e in estimates]
     np.testing.assert_array_equal(smoothed(wide, pipeline).covariances, smoothed(estimates, pipeline).covariances)
+
+
+def test_graph_after_a_gap_of_all_sensors_is_where_the_scans_find_it() -> None:
+    """Its keyframes before that are uncertain by metres, and what a scan shows is not about them."""
+    circles = rooms.path((1, 0, 0), (60, 0.5, 0.4))
+    drive = rooms.drive_through(world.lab().walls, circles, 0, (-0.5, -1.5, 0.0))
+    gap, until_wheels, until_scans = rooms.WALL_START_NS + np.array([30, 34, 39]) * 10**9
+    events = [e for e in drive.events if not gap < e.stamp_ns < (until_wheels if isinstance(e, WheelSample) else until_scans)]
+    pipeline = make_pipeline(drive)
+    estimates = run(pipeline, events)
+    sigmas = np.array([np.sqrt(np.trace(e.covariance[:2, :2])) for e in estimates])
+    stamps = np.array([e.stamp_ns for e in estimates])
+    lost = (stamps > until_wheels) & (stamps < until_scans)
+    keyframes = np.array(pipeline.estimator._stamps_ns)[np.array(pipeline.estimator._nodes)]
+    assert ((keyframes > until_wheels) & (keyframes < until_scans)).sum() > 1
+    assert sigmas[lost].min() > 0.5
+    found = stamps > until_scans + 3 * 10**9
+    truth = drive.poses[np.searchsorted(drive.stamps, stamps[found])]
+    assert np.hypot(*(np.array([e.pose for e in estimates])[found] - truth)[:, :2].T).max() < 0.05
+    assert sigmas[found].max() < 0.1
 
 
 def test_graph_with_silent_lidar_has_keyframes_without_scan() -> None:
@@ -520,11 +533,3 @@ def test_subtract_information_stays_within_wheels_distance(gain: float) -> None:
     measured, information = _subtract_information(delta, cov, wheels, wheel_cov, False)
     assert np.abs(measured - delta).max() <= 0.1 + 1e-9
     assert (np.linalg.eigvalsh(information) > 0.0).all()
-
-
-def test_interpolate_moves_poses_by_travelled_share() -> None:
-    odom = np.column_stack([[0.0, 1.0, 1.0, 2.0], np.zeros(4), np.zeros(4)])  # it rests in between
-    poses, covs = np.array([[0.0, 0.0, 0.0], [2.2, 0.0, 0.0]]), np.array([0.01 * np.eye(3), 0.03 * np.eye(3)])
-    found, mixed = _interpolate(np.array([0, 3]), poses, covs, odom)
-    np.testing.assert_allclose(found[:, 0], [0.0, 1.1, 1.1, 2.2], atol=1e-6)
-    np.testing.assert_allclose(mixed[[0, 3]], covs, atol=1e-8)
