@@ -139,7 +139,7 @@ class Filter:
         innovation, by_pose, by_map = submap_residual(self.pose, measured)
         H = np.zeros((3, len(self.P)))
         H[:, POSE], H[:, MAP] = by_pose, by_map
-        self.is_considered[RADIUS] = R[0, 0] > self.map_relative_cov()[0, 0]  # the scene leaves the way open
+        self.is_considered[RADIUS] = R[0, 0] > H[0] @ self.P @ H[0]  # the scene leaves the way open
         return self._update(innovation, H, R, is_of_map=True)
 
     def insert_key_scan(self, error: KeyScanError) -> None:

@@ -158,6 +158,7 @@ PATCHES: Mapping[str, Patch] = {
     "correlation of neighbouring residuals": _attribute(ScanMatcher, "_block_variance", property(lambda self: self._residual_variance)),
     "submap's error": _attribute(Filter, "insert_key_scan", lambda self, error: None),
     "submap's error as consider state (independent noise, instead)": _wrap(Filter, "predict", _independent),
+    "pose kept on the submap": _wrap(Filter, "_update", lambda original, self, *measurement, **_: original(self, *measurement)),
     "new surfaces' error of key scans": _wrap(Filter, "insert_key_scan", _without_new),
     "scale of the wheel noise": _attribute(filter_module, "_MAX_NOISE_SCALE", 1.0),
     "excitation gate of corrections": _attribute(EkfFusion, "_is_turning", lambda self, motion: True),
@@ -169,9 +170,10 @@ GRAPH_PATCHES: Mapping[str, Patch] = {
     "agreement of a second loop": _attribute(LoopDetector, "_agree", lambda self, one, other: True),
     "robust loss of loops": _attribute(pose_graph, "_CAUCHY", _NO_LOSS),
     "robust loss of wheels": _attribute(pose_graph, "_HUBER", _NO_LOSS),
-    "all of the filter's motion after a matched scan (less the wheels' share, instead)": lambda: mock.patch.object(
-        graph_fusion.GraphFusion, "_is_matched", property(lambda self: False, lambda self, value: None), create=True
+    "all of the filter's motion after a matched scan (less the wheels' share, instead)": _wrap(
+        graph_fusion, "_subtract_information", lambda original, *motion: original(*motion[:4], False)
     ),
+    "ways that the scene leaves open as the wheels' alone": _attribute(graph_fusion, "_OPEN_SHARE", math.inf),
     "corrections of the graph in the filter": _attribute(Filter, "set_corrections", lambda self, mean, cov: None),
     "random walk of the corrections": _attribute(graph_fusion, "_CORRECTION_EPOCH_S", math.inf),
 }
