@@ -237,7 +237,7 @@ def test_diagnose_gyro_is_corrected_where_the_robot_file_holds_it(
 
 
 def test_diagnose_by_a_simpler_model_names_what_the_suited_one_finds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A healthy robot that skids: what diff_drive lacks has names of causes, and the friction model finds nothing."""
+    """A healthy robot that skids: effects that diff_drive does not have come out as causes, and the friction model finds nothing."""
     log = bag(tmp_path / "drive.mcap", {}, 34, "husky_a200")
     assert main(["diagnose", str(log), "--robot", "husky_a200", "--model", "diff_drive"]) == 0
     assert "friction, which suits husky_a200, is consistent on this drive and names no cause." in capsys.readouterr().out
