@@ -34,10 +34,11 @@ class EkfFusion(Estimator):
     def __init__(self, model: MotionModel, corrections: Corrections, robot: Robot, sensor: ScanMatchingSensor | None, config: FilterConfig):
         """``sensor``: None without a LiDAR; then there is no second clock until the gyro's first reading."""
         self._clock_sigma_s = config.clock_sigma_s if sensor is None else 0.0
+        self.wheel_radius_sigma = 0.0 if "wheel_radius_scale" in corrections.names else config.wheel_radius_sigma
+        """Prior sigma of the wheels' radius, which positions show to a graph without a LiDAR too; 0 where it is one of the corrections."""
+        config = replace(config, wheel_radius_sigma=self.wheel_radius_sigma)
         if sensor is None:  # nothing measures ways
             config = replace(config, clock_sigma_s=0.0, wheel_radius_sigma=0.0)
-        elif "wheel_radius_scale" in corrections.names:
-            config = replace(config, wheel_radius_sigma=0.0)
         self.filter = Filter(robot.gyro_noise, corrections, config)
         self._sensor, self.model, self.corrections = sensor, model, corrections
         self._track_m = robot.geometry.track_width_m

@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
 from localization.estimators.base import Estimate, Estimator
-from localization.estimators.filter import KEY, PARAMS, RADIUS, START, FilterConfig
+from localization.estimators.filter import KEY, PARAMS, RADIUS, START
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement
 from localization.events import PositionSample, Step
@@ -70,8 +70,7 @@ class GraphFusion(Estimator):
     def __init__(self, odometry: EkfFusion, corrections: Corrections, lidar: LidarConfig, config: GraphConfig, is_smoothing: bool):
         """``is_smoothing``: `finish` is to give the smoothed trajectory; memory then grows with the drive, 104 bytes a step."""
         self.odometry, self._corrections, self._config = odometry, corrections, config
-        self._has_radius = "wheel_radius_scale" not in corrections.names  # else it is one of them
-        radius_sigma = FilterConfig().wheel_radius_sigma if self._has_radius else _NO_SIGMA
+        radius_sigma = max(odometry.wheel_radius_sigma, _NO_SIGMA)
         self.graph = PoseGraph(block_diag(corrections.cov, radius_sigma**2), np.array([config.antenna_x_m, config.antenna_y_m]))
         self._loops = LoopDetector(lidar)
         self._wheels = MotionPreintegration(len(corrections.names))
@@ -257,7 +256,7 @@ class GraphFusion(Estimator):
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         """As `Estimator.parameters`."""
         found = dict(self.odometry.parameters())
-        if self._has_radius:
+        if self.odometry.wheel_radius_sigma:
             mean, cov = self.graph.corrections()
             found["wheel_radius_scale"] = float(mean[-1]), math.sqrt(float(cov[-1, -1]))
         if self.n_positions:

@@ -13,13 +13,14 @@ from hypothesis import strategies as st
 
 from localization.errors import EstimatorError
 from localization.estimate_table import EstimateTable, trajectory
-from localization.estimators import Estimate
+from localization.estimators import Estimate, EstimatorConfig
+from localization.estimators.filter import FilterConfig
 from localization.estimators.graph_fusion import _subtract_information
 from localization.estimators.pose_graph import PoseGraph
 from localization.evaluation.consistency import nees
 from localization.events import PositionSample, Scan, WheelSample
 from localization.logs.references import merge_positions
-from localization.pipeline import Pipeline, Trial, replay
+from localization.pipeline import Pipeline, ReplayConfig, Trial, replay
 from localization.ros.state_serialization import deserialize, serialize
 from localization.simulation import world
 from localization.trajectory import Trajectory
@@ -345,6 +346,16 @@ def test_graph_with_named_radius_has_it_once() -> None:
     assert own == pytest.approx(1.0 / RADIUS_ERROR - 1.0, abs=0.01)
     assert 0.0 < sigma < 0.03
     assert pipeline.estimator.graph.corrections()[1][-1, -1] < 1e-6
+
+
+def test_graph_takes_the_prior_of_the_radius_from_the_settings() -> None:
+    """0 is the robot file's radius: the graph has no variable for it either."""
+    config = ReplayConfig(estimator=EstimatorConfig(ekf=FilterConfig(wheel_radius_sigma=0.0)))
+    trial = Trial(make_model("diff_drive", rooms.ROBOT), "graph")
+    (fixed,) = replay(around().events[:600], [trial], rooms.ROBOT, around().mounts, True, config)
+    (free,) = replay(around().events[:600], [trial], rooms.ROBOT, around().mounts, True)
+    assert "wheel_radius_scale" not in fixed.parameters
+    assert free.parameters["wheel_radius_scale"][1] > 0.0
 
 
 def test_graph_positions_wait_for_heading() -> None:
