@@ -249,7 +249,7 @@ def _test(name: str, mean: float, band: tuple[float, float], what: str) -> tuple
         return "over", text if math.isinf(mean) else f"{text}, {what} {factor:.1f} times their sigma"
     if mean < band[0] and factor < 1.0 / _MIN_SIGMA_FACTOR:
         return "under", f"{text}, {what} {factor:.2g} times their sigma"
-    return "fits", text
+    return "fits", f"{text} (up to {band[1]:.1f} by chance)" if factor > _MIN_SIGMA_FACTOR else text
 
 
 def _advice(lines: Sequence[PlottedRun], best: PlottedRun, equals: Sequence[PlottedRun]) -> list[str]:

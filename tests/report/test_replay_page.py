@@ -141,6 +141,14 @@ def test_summary_overconfidence_factor_is_in_sigma():
     assert re.search(r"innovations (2\.9|3\.0|3\.1) times their sigma", text)
 
 
+def test_summary_of_one_drive_says_how_large_nees_may_be_by_chance():
+    """Errors of a drive are one sample: a mean of twice what is expected is no contradiction, and the sentence has the band."""
+    (result,) = score([run(nis=chi_square_nis(), noise=0.01)], track())
+    text = verdict([dataclasses.replace(result, nees_mean=6.4)], track())
+    assert "mean NEES 6.4, where 3 is expected (up to 9.3 by chance)" in text
+    assert "are consistent" in text
+
+
 def test_summary_few_outliers_are_no_overconfidence():
     nis = chi_square_nis()
     nis[::40] = 400.0
