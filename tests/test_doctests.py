@@ -13,17 +13,21 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 MODULES = sorted(
-    path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")
-    for package in ("motion_models", "localization")
+    path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".").removesuffix(".__init__")
+    for package in ("motion_models", "localization", "skidloc")
     for path in (ROOT / package).rglob("*.py")
     if ">>> " in path.read_text(encoding="utf-8")
 )
 
 
 def test_doctests_of_the_public_functions_exist():
-    assert {"motion_models.se2", "motion_models.registry", "localization.evaluation.scores", "localization.calibration.calibrate"} <= set(
-        MODULES
-    )
+    assert {
+        "motion_models.se2",
+        "motion_models.registry",
+        "localization.evaluation.scores",
+        "localization.calibration.calibrate",
+        "skidloc",
+    } <= set(MODULES)
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -1,0 +1,206 @@
+"""A robot's log as an object of a notebook: replay, scores, tables and pictures.
+
+The functions of `localization` stay the interface for programs; these classes hold their arguments together.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, overload
+
+import numpy as np
+
+from localization.errors import EvaluationError
+from localization.estimators import check_estimator
+from localization.evaluation.references import ReferenceTrack, Relations, read_reference_file, reference_track
+from localization.evaluation.scores import Result, score
+from localization.logs import Log, TopicOverrides, open_log
+from localization.pipeline import ReplayConfig, Trial, replay
+from localization.trajectory import Trajectory
+from motion_models.errors import ModelError
+from motion_models.registry import make_model
+from motion_models.robot import Robot, load_robot
+from motion_models.se2 import FloatArray
+
+if TYPE_CHECKING:
+    from localization.report.notebook import Picture
+
+DEFAULT_PAIRS = ("diff_drive/odometry", "skid_steer/odometry", "skid_steer/ekf")
+COLUMNS = ("seconds", "x", "y", "theta", "var_x", "var_y", "var_theta", "vx", "vy", "wz")
+"""Columns of `ScoredRun.to_numpy` [s, m, m, rad, m^2, m^2, rad^2, m/s, m/s, rad/s]; variances of the body-frame perturbation."""
+
+
+def open(path: str | Path, robot: str | Path | Robot, topics: TopicOverrides | None = None) -> RobotLog:
+    """Open a ROS 1 bag, a ROS 2 folder or a bare .mcap of ``robot``: a shipped robot's name, the path of a robot file, or a `Robot`.
+
+    Raises `LogError` for a log that cannot be read, `RobotError` for a robot that does not exist.
+    """
+    described = robot if isinstance(robot, Robot) else load_robot(str(robot))
+    return RobotLog(open_log(path, described, topics or TopicOverrides()), described)
+
+
+@dataclass(frozen=True, eq=False)
+class RobotLog:
+    """A log and the robot that recorded it."""
+
+    log: Log
+    robot: Robot
+
+    @property
+    def has_lidar(self) -> bool:
+        """Whether the log has scans of a planar or 3D LiDAR."""
+        return self.log.sources.lidar is not None
+
+    def replay(
+        self,
+        pairs: Sequence[str] = DEFAULT_PAIRS,
+        reference: str | Path | ReferenceTrack | Relations | None = None,
+        config: ReplayConfig | None = None,
+    ) -> Runs:
+        """Replay the log once for each MODEL/ESTIMATOR of ``pairs`` and score the runs.
+
+        ``reference`` is a topic of the log, a file (.tum, .relations) or a track; by default the robot file's topic, if the log has it.
+        Raises `ModelError` or `EstimatorError` for unknown names, `EvaluationError` for a reference that shares no time with the log.
+        """
+        trials = [self._trial(pair) for pair in pairs]
+        track = self._reference(reference)
+        runs = replay(self.log.events(), trials, self.robot, self.log.mounts, self.has_lidar, config)
+        return Runs(tuple(ScoredRun(result) for result in score(runs, track)), track)
+
+    def _trial(self, pair: str) -> Trial:
+        model, separator, estimator = pair.partition("/")
+        if not separator:
+            raise ModelError(f"'{pair}' is no pair of motion model and estimator. Write MODEL/ESTIMATOR, as skid_steer/ekf.")
+        check_estimator(estimator, self.has_lidar)
+        return Trial(make_model(model, self.robot), estimator)
+
+    def _reference(self, given: str | Path | ReferenceTrack | Relations | None) -> ReferenceTrack | Relations | None:
+        if isinstance(given, ReferenceTrack | Relations):
+            return given
+        name = self.log.reference_topic if given is None else str(given)
+        if name is None:
+            return None
+        if name in self.log.types:
+            return reference_track(self.log.references(name), name)
+        if not Path(name).exists():
+            raise EvaluationError(f"no reference '{name}': neither a topic of {self.log.path.name} nor a file.")
+        return read_reference_file(name)
+
+    def __repr__(self) -> str:
+        return f"<RobotLog {self.log.path.name}: {self.robot.name}, {self.log.duration_s:.0f} s{', LiDAR' if self.has_lidar else ''}>"
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredRun:
+    """One motion model and estimator on one log: its trajectory, and its errors where there is a reference."""
+
+    result: Result
+
+    @property
+    def name(self) -> str:
+        """MODEL_ESTIMATOR, as in names of files."""
+        return self.result.name
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Poses with their covariances; smoothed where the estimator smooths."""
+        return self.result.run.trajectory
+
+    @property
+    def ate_m(self) -> float | None:
+        """Root mean square position error after rigid alignment [m], or None without a reference of poses."""
+        return None if self.result.accuracy is None else self.result.accuracy.ate_rmse_m
+
+    @property
+    def nees(self) -> float | None:
+        """Mean normalised estimation error squared of the pose, 3 expected, or None without headings in the reference."""
+        return self.result.nees_mean
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Problems of the sensors during the run."""
+        return self.result.run.warnings
+
+    def to_numpy(self) -> FloatArray:
+        """(N, 10) array with the columns `COLUMNS`; variances are NaN where the estimator has no covariance."""
+        track = self.trajectory
+        n = len(track)
+        variances = np.full((n, 3), np.nan) if track.covariances is None else np.diagonal(track.covariances, axis1=1, axis2=2)
+        seconds = (track.stamps_ns - (track.stamps_ns[0] if n else 0)) * 1e-9
+        return np.column_stack([seconds, track.poses, variances, self.result.run.twists])
+
+    def to_pandas(self) -> Any:
+        """`pandas.DataFrame` of `to_numpy`, indexed by stamp [ns]. Raises `EvaluationError` where pandas is not installed."""
+        try:
+            import pandas as pd  # optional
+        except ImportError as error:
+            raise EvaluationError("to_pandas needs pandas: pip install 'skidloc[pandas]', or use to_numpy.") from error
+        return pd.DataFrame(self.to_numpy(), columns=list(COLUMNS), index=pd.Index(self.trajectory.stamps_ns, name="stamp_ns"))
+
+    def plot(self, reference: ReferenceTrack | Relations | None = None) -> Picture:
+        """Picture of the trajectory, aligned to the reference if there is one."""
+        return Runs((self,), reference).plot()
+
+    def __repr__(self) -> str:
+        error = "no reference" if self.ate_m is None else f"ATE {self.ate_m:.3f} m"
+        return f"<ScoredRun {self.name}: {len(self.trajectory)} poses, {error}>"
+
+
+@dataclass(frozen=True, eq=False)
+class Runs(Sequence[ScoredRun]):
+    """Runs over the same log, in the order of the pairs; printed as a table of errors in a notebook."""
+
+    runs: tuple[ScoredRun, ...]
+    reference: ReferenceTrack | Relations | None
+
+    @overload
+    def __getitem__(self, key: int | str) -> ScoredRun: ...
+    @overload
+    def __getitem__(self, key: slice) -> Runs: ...
+    def __getitem__(self, key: int | str | slice) -> ScoredRun | Runs:
+        """Get a run by number or by name (``skid_steer_ekf`` or ``skid_steer/ekf``). Raises `KeyError` for an unknown name."""
+        if isinstance(key, slice):
+            return Runs(self.runs[key], self.reference)
+        if isinstance(key, int):
+            return self.runs[key]
+        by_name = {run.name: run for run in self.runs}
+        if key.replace("/", "_") not in by_name:
+            raise KeyError(f"no run '{key}'; there are {', '.join(by_name)}")
+        return by_name[key.replace("/", "_")]
+
+    def __len__(self) -> int:
+        return len(self.runs)
+
+    def __iter__(self) -> Iterator[ScoredRun]:
+        return iter(self.runs)
+
+    @property
+    def warnings(self) -> list[str]:
+        """Problems of the sensors in any of the runs, each once."""
+        return list(dict.fromkeys(itertools.chain.from_iterable(run.warnings for run in self.runs)))
+
+    def plot(self, title: str = "") -> Picture:
+        """Picture of all trajectories over the map, aligned to the reference if there is one."""
+        from localization.report.notebook import trajectories  # imports matplotlib
+
+        return trajectories([run.result for run in self.runs], self.reference, title)
+
+    def __repr__(self) -> str:
+        return "\n".join(["  ".join(row) for row in self._cells()])
+
+    def _repr_html_(self) -> str:
+        header, *rows = [[escape(cell.strip()) for cell in row] for row in self._cells()]
+        body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
+        return f"<table><tr>{''.join(f'<th>{cell}</th>' for cell in header)}</tr>{body}</table>"
+
+    def _cells(self) -> list[list[str]]:
+        rows = [["run", "ATE m", "NEES", "poses"]]
+        for run in self.runs:
+            numbers = ["-" if value is None else f"{value:.{digits}f}" for value, digits in ((run.ate_m, 3), (run.nees, 2))]
+            rows.append([run.name, *numbers, str(len(run.trajectory))])
+        widths = [max(len(row[i]) for row in rows) for i in range(4)]
+        return [[row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))] for row in rows]

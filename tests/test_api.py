@@ -1,0 +1,93 @@
+"""The package `skidloc`: names of both packages, and logs as objects of a notebook."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import localization
+import motion_models
+import skidloc
+from localization.errors import EvaluationError
+from motion_models.errors import SkidlocError
+
+HUSKY = Path(__file__).parent / "data" / "husky-outdoor-gps" / "test1.bag"
+
+
+@pytest.fixture(scope="module")
+def log() -> skidloc.RobotLog:
+    return skidloc.open(HUSKY, "husky_a200")
+
+
+@pytest.fixture(scope="module")
+def runs(log: skidloc.RobotLog) -> skidloc.Runs:
+    return log.replay(["diff_drive/odometry", "diff_drive/ekf"])
+
+
+def test_api_has_every_public_name_of_both_packages() -> None:
+    for package in (localization, motion_models):
+        assert set(package.__all__) <= set(dir(skidloc))
+        assert all(getattr(skidloc, name) is getattr(package, name) for name in package.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'replya'"):
+        _ = skidloc.replya
+
+
+def test_import_of_skidloc_loads_no_numerical_library() -> None:
+    code = "import sys, skidloc; print([n for n in ('numpy', 'numba', 'gtsam', 'matplotlib', 'pandas') if n in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+
+
+def test_replay_by_api_equals_the_functions_of_localization(log: skidloc.RobotLog, runs: skidloc.Runs) -> None:
+    trial = skidloc.Trial(skidloc.make_model("diff_drive", log.robot), "ekf")
+    (run,) = skidloc.replay(log.log.events(), [trial], log.robot, log.log.mounts, has_lidar=False)
+    np.testing.assert_array_equal(runs["diff_drive/ekf"].trajectory.poses, run.trajectory.poses)
+    (result,) = skidloc.score([run], skidloc.reference_track(log.log.references("/fix"), "/fix"))
+    assert runs["diff_drive_ekf"].ate_m == result.accuracy.ate_rmse_m
+    assert runs[1] is runs["diff_drive_ekf"]
+    assert len(runs[:1]) == 1
+
+
+def test_tables_have_stamps_poses_variances_and_twists(runs: skidloc.Runs) -> None:
+    run = runs["diff_drive/ekf"]
+    array = run.to_numpy()
+    assert array.shape == (len(run.trajectory), 10)
+    np.testing.assert_array_equal(array[:, 1:4], run.trajectory.poses)
+    np.testing.assert_array_equal(array[:, 4], run.trajectory.covariances[:, 0, 0])
+    frame = run.to_pandas()
+    np.testing.assert_array_equal(frame["wz"], run.result.run.twists[:, 2])
+    np.testing.assert_array_equal(frame.index, run.trajectory.stamps_ns)
+    assert np.isnan(runs["diff_drive/odometry"].to_numpy()[:, 4]).all() == (runs["diff_drive/odometry"].trajectory.covariances is None)
+
+
+def test_pandas_missing_names_the_extra(runs: skidloc.Runs, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(EvaluationError, match=r"skidloc\[pandas\]"):
+        runs[0].to_pandas()
+
+
+def test_representations_are_short_and_have_the_errors(log: skidloc.RobotLog, runs: skidloc.Runs) -> None:
+    assert repr(log) == "<RobotLog test1.bag: husky_a200, " + repr(log).split(", ", 1)[1]
+    assert f"{runs[1].ate_m:.3f}" in repr(runs)
+    assert f"<td>{runs[1].ate_m:.3f}</td>" in runs._repr_html_()
+    assert "ATE 3.0" in repr(runs[1])
+    assert runs.plot().png.startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("pair", "text"),
+    [("ekf", "MODEL/ESTIMATOR"), ("skid/ekf", "skid_steer"), ("diff_drive/efk", "there are odometry"), ("diff_drive/lidar", "needs scans")],
+)
+def test_unknown_pair_is_refused_with_what_there_is(log: skidloc.RobotLog, pair: str, text: str) -> None:
+    with pytest.raises(SkidlocError, match=text):
+        log.replay([pair])
+
+
+def test_unknown_reference_and_run_are_refused(log: skidloc.RobotLog, runs: skidloc.Runs) -> None:
+    with pytest.raises(EvaluationError, match="neither a topic"):
+        log.replay(["diff_drive/odometry"], reference="nothing.tum")
+    with pytest.raises(KeyError, match="diff_drive_odometry, diff_drive_ekf"):
+        runs["graph"]
