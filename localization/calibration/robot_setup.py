@@ -12,17 +12,18 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
-
+from localization.calibration.controllers import read_controllers
+from localization.calibration.wheel_fit import MIN_R2, DriverFit, Motion, WheelSides, fit_wheels, is_moving, read_motion, wheel_sides
 from localization.logs.chunks import RawMessage, merge_channels
-from localization.logs.decode import UnusableError, frame_name, stamp_ns
+from localization.logs.decode import UnusableError, frame_name
 from localization.logs.reader import open_log, open_source
 from localization.logs.serialization import LogDeserializer
 from localization.logs.topic_roles import TYPES, TopicOverrides
-from motion_models.center_of_gravity.urdf import WheelGeometry, link_poses, parse_urdf, sides, wheel_geometry
+from motion_models.center_of_gravity.urdf import ControllerValues, WheelGeometry, is_wheel, link_poses, parse_urdf, sides, wheel_geometry
 from motion_models.errors import RobotError
+from motion_models.prior import geometric_scaling, scaling_sigma
 from motion_models.robot import DIFF_DRIVE, Driver, Geometry, Joints, Mount, Robot, Topics
 from motion_models.se2 import FloatArray
 from motion_models.text_files import read_text
@@ -33,15 +34,23 @@ DRIVE_60_S = (
 )
 _FIRST_JOINT_STATES = 200
 """Messages in which all joints have been named: wheels and arms often publish separately."""
-_PAIRS = 4000
-"""Joint states and odometry messages to which the driver's constants are fitted."""
 _NOT_THE_DRIVERS = re.compile(
     r"truth|reference|filter|fused|ekf|ukf|gps|gnss|slam|icp|lidar|laser|visual|vio|amcl|map|mocap|vicon", re.IGNORECASE
 )
+_KIND_NOTES = {
+    "mecanum wheels": "they move sideways by command, which no model here has; lateral motion will be taken for slip.",
+    "omnidirectional wheels": "they move sideways by command, which no model here has; lateral motion will be taken for slip.",
+    "tracks": "they have no wheelbase; the length of their contact stands for it, and their sprockets' rates for the wheels'.",
+    "steered wheels": "steering is not modelled; only the driven wheels of a body that turns by their difference are.",
+    "casters": "they are not driven and are left out of wheels, track and wheelbase.",
+}
 _REFERENCE = re.compile(r"ground_?truth|reference|mocap|vicon|optitrack", re.IGNORECASE)
 _RAW = re.compile(r"raw|mag", re.IGNORECASE)
-_MIN_MOTION = 0.05
-"""Least root mean square of the odometry's speed [m/s] and yaw rate [rad/s] by which the driver's constants are fitted."""
+_SAME_RADIUS, _SAME_TRACK = 0.1, 0.05
+"""Relative differences of two sources below which they agree. Tyres under load and slip straight ahead change a radius by up to 7 %
+(DRIVE's Husky); a track is a length of the body."""
+_OFF_MIDDLE = 0.05
+"""Distance of a symmetric robot's centre of gravity from its middle over the track from which it is doubted."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +71,19 @@ class Given:
     like: Robot | None = None
     """A robot whose geometry, driver and joints count where neither log nor URDF has any."""
     topics: TopicOverrides = field(default_factory=TopicOverrides)
+    controller: Path | None = None
+    """YAML with the parameters of the robot's drive controller."""
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """A source that differs from another, or from the log."""
+
+    quantity: str
+    source: str
+    value: str
+    by_log: str
+    """What the log measured of it."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +114,7 @@ class Draft:
     """One sentence for each choice."""
     missing: list[str] = field(default_factory=list)
     """What nothing gives, as sentences."""
+    contradictions: list[Contradiction] = field(default_factory=list)
 
     def choose(self, name: str, candidates: Iterable[tuple[float | None, str]]) -> None:
         """Take the first finite value of ``candidates`` (value, source) for the number ``name``."""
@@ -142,12 +165,56 @@ def draft_robot(survey: Survey, given: Given, path: Path) -> Draft:
     draft = Draft()
     text = None if given.urdf is None else _read_urdf(given.urdf)
     urdf = None if text is None else wheel_geometry(text, str(given.urdf), given.base_link)
+    controllers = (*(() if urdf is None else urdf.controllers), *(() if given.controller is None else read_controllers(given.controller)))
     _choose_topics(draft, survey, given.topics)
-    _choose_joints(draft, survey, given, urdf)
-    driver = fit_driver(path, draft)
-    _choose_geometry(draft, given, urdf, driver)
+    motion = _motion(path, draft, survey, _wheel_names(draft, survey, given, urdf, controllers))
+    measured = None if motion is None else wheel_sides(motion)
+    _choose_joints(draft, survey, given, _candidates(draft, survey, given, urdf, controllers), measured)
+    fit = None
+    if motion is not None and draft.joints is not None:
+        fit = fit_wheels(motion, draft.joints.left, draft.joints.right, () if measured is None else measured.reversed)
+        if fit is None and is_moving(motion):
+            draft.missing.append(
+                f"radius and track by the log: {_motion_topic(draft, survey)} does not follow the mean and the difference of the sides "
+                f"(R^2 below {MIN_R2:g} with every sign); neither is taken from it. Check units, --left and --right."
+            )
+    _choose_geometry(draft, given, urdf, controllers, fit)
+    if urdf is not None:
+        _check_urdf(draft, urdf)
     _choose_mounts(draft, survey, {} if text is None else _urdf_mounts(text, given))
     return draft
+
+
+def _motion_topic(draft: Draft, survey: Survey) -> str | None:
+    """The driver's odometry, else a reference that is an Odometry."""
+    if "odometry" in draft.topics:
+        return draft.topics["odometry"]
+    reference = draft.topics.get("reference", "")
+    return reference if survey.topics.get(reference, ("", 0))[0] == TYPES["odometry"] else None
+
+
+def _is_drivers(topic: str) -> bool:
+    return not _NOT_THE_DRIVERS.search(topic)
+
+
+def _wheel_names(
+    draft: Draft, survey: Survey, given: Given, urdf: WheelGeometry | None, controllers: Iterable[ControllerValues]
+) -> list[str]:
+    """Joints of the log that may be wheels."""
+    names = survey.joint_names.get(draft.topics.get("joint_states", ""), ())
+    if given.left and given.right:
+        return [name for name in names if name in (*given.left, *given.right)]
+    known = {*(() if urdf is None else urdf.positions), *(n for c in controllers for n in (*c.left, *c.right))}
+    return [n for n in names if n in known] or [n for n in names if is_wheel(n)]
+
+
+def _motion(path: Path, draft: Draft, survey: Survey, wheels: list[str]) -> Motion | None:
+    states, topic = draft.topics.get("joint_states"), _motion_topic(draft, survey)
+    if states is None or topic is None or not wheels:
+        return None
+    imu = draft.topics.get("imu")
+    mount = survey.mounts.get(survey.frames.get(imu or "", ""), Mount())
+    return read_motion(path, states, topic, None if imu is None else (imu, mount.rotation()[2]), wheels)
 
 
 def _read_urdf(path: Path) -> str:
@@ -202,60 +269,219 @@ def _take_topic(draft: Draft, survey: Survey, role: str, topic: str) -> None:
     draft.reasons.append(f"topics.{role} = {topic}: given.")
 
 
-def _choose_joints(draft: Draft, survey: Survey, given: Given, urdf: WheelGeometry | None) -> None:
+class Sides(NamedTuple):
+    """Joints of both sides, by one source."""
+
+    left: tuple[str, ...]
+    right: tuple[str, ...]
+    reason: str
+    is_of_log: bool = True
+    """Whether the joints are in the log's joint states."""
+
+
+def _candidates(
+    draft: Draft, survey: Survey, given: Given, urdf: WheelGeometry | None, controllers: Iterable[ControllerValues]
+) -> list[Sides]:
+    """Sides by each source that has both, the most trusted first."""
     names = survey.joint_names.get(draft.topics.get("joint_states", ""), ())
-    left, right = sides(names)
-    reason = "by the spelling of the log's joint names"
-    if given.left and given.right:
-        left, right, reason = given.left, given.right, "given"
-    elif urdf is not None and names and {*urdf.left, *urdf.right} <= set(names):
-        left, right, reason = urdf.left, urdf.right, "by the sides of the URDF's wheels"
-    elif not (left and right) and urdf is not None:
-        left, right, reason = urdf.left, urdf.right, "of the URDF; the log has no joint states of wheels"
-    elif not (left and right) and given.like is not None:
-        left, right, reason = given.like.joints.left, given.like.joints.right, f"those of {given.like.name}"
-    if left and right:
-        draft.joints = Joints(left, right)
-        draft.reasons.append(f"joints: left {', '.join(left)}; right {', '.join(right)}: {reason}.")
-    elif names:
-        draft.missing.append(f"wheel joints: none of {', '.join(names)} is a left or right wheel by name; give --left and --right.")
+    found = [Sides(given.left, given.right, "given")] if given.left and given.right else []
+    found += [Sides(c.left, c.right, f"by {c.source}") for c in controllers]
+    if urdf is not None:
+        found.append(Sides(*sides(tuple(urdf.positions)), "by the spelling of the URDF's joint names"))
+        found.append(Sides(urdf.left, urdf.right, "by the sides of the URDF's wheels"))
+    found.append(Sides(*sides(names), "by the spelling of the log's joint names"))
+    if urdf is not None:
+        found.append(Sides(urdf.left, urdf.right, "of the URDF; the log has no joint states of wheels", is_of_log=False))
+    if given.like is not None:
+        joints = given.like.joints
+        found.append(Sides(joints.left, joints.right, f"those of {given.like.name}", is_of_log=False))
+    is_known = [not s.is_of_log or s.reason == "given" or {*s.left, *s.right} <= set(names) for s in found]
+    return [s for s, known in zip(found, is_known, strict=True) if s.left and s.right and known]
 
 
-def _choose_geometry(draft: Draft, given: Given, urdf: WheelGeometry | None, driver: tuple[float, float] | None) -> None:
+def _same(a: Sides | WheelSides, b: Sides | WheelSides) -> bool:
+    return {*a.left} == {*b.left} and {*a.right} == {*b.right}
+
+
+def _choose_joints(draft: Draft, survey: Survey, given: Given, candidates: list[Sides], measured: WheelSides | None) -> None:
+    """Sides by names, positions and controllers; where they contradict each other, the log's motion decides."""
+    names = survey.joint_names.get(draft.topics.get("joint_states", ""), ())
+    chosen = candidates[0] if candidates else None
+    of_log = [c for c in candidates if c.is_of_log]
+    if measured is not None and not (given.left and given.right):
+        agreeing = [c for c in of_log if _same(c, measured)]
+        chosen = agreeing[-1] if agreeing else Sides(measured.left, measured.right, "by the log's motion alone")
+    elif of_log and all(_same(c, of_log[0]) for c in of_log):
+        chosen = of_log[0] if of_log[0].reason == "given" else next((c for c in of_log if c.reason.startswith("by the sides")), of_log[0])
+    if chosen is None:
+        if names:
+            draft.missing.append(f"wheel joints: none of {', '.join(names)} is a left or right wheel by name; give --left and --right.")
+        return
+    draft.joints = Joints(chosen.left, chosen.right)
+    draft.reasons.append(f"joints: left {', '.join(chosen.left)}; right {', '.join(chosen.right)}: {chosen.reason}.")
+    by_log = "cannot decide" if measured is None else f"left {', '.join(measured.left)}"
+    reference = chosen if measured is None else measured
+    wrong = [c for c in of_log if not _same(c, reference)]
+    draft.contradictions += [Contradiction("left wheels", c.reason, ", ".join(c.left), by_log) for c in wrong]
+    if wrong and measured is None:
+        draft.missing.append(
+            "sides: the sources contradict each other and the log does not decide; drive a turn, or give --left and --right."
+        )
+    if measured is not None and measured.reversed:
+        _name_reversed(draft, measured)
+
+
+def _name_reversed(draft: Draft, measured: WheelSides) -> None:
+    backwards = measured.reversed
+    side = next((name for name in ("left", "right") if {*backwards} == {*getattr(measured, name)}), "")
+    what = f"the {side} side ({', '.join(backwards)})" if side else ", ".join(backwards)
+    draft.contradictions.append(
+        Contradiction("sign", "joint states", f"{', '.join(backwards)}: forward is positive", "negative when driving forward")
+    )
+    draft.missing.append(
+        f"sign: {what} is inverted: its rates are negative when the robot drives forward, and turning follows the sum of both sides. "
+        "Negate it in the driver (a mirrored motor or an axis of 0 -1 0); radius and track below are with its sign changed."
+    )
+
+
+def _choose_geometry(
+    draft: Draft, given: Given, urdf: WheelGeometry | None, controllers: tuple[ControllerValues, ...], fit: DriverFit | None
+) -> None:
     like = None if given.like is None else given.like.geometry
-    of_urdf = "the URDF's wheels"
-    radius, product = driver if driver is not None else (None, None)
-    for name in ("wheel_radius_m", "track_width_m", "wheelbase_m", "mass_kg"):
+    of_like = f"that of {'' if given.like is None else given.like.name}"
+    is_drivers = _is_drivers(draft.topics.get("odometry", "reference"))
+    of_log = "the driver's odometry over the wheels' rates" if is_drivers else "the log's motion over the wheels' rates"
+    for name in ("wheelbase_m", "mass_kg"):
+        of_urdf = None if urdf is None else getattr(urdf, name)
         draft.choose(
             name,
-            [
-                (getattr(given, name), "given"),
-                (None if urdf is None else getattr(urdf, name), of_urdf),
-                (radius if name == "wheel_radius_m" else None, "the driver's odometry over the wheels' rates"),
-                (None if like is None else getattr(like, name), f"that of {'' if given.like is None else given.like.name}"),
-            ],
+            [(getattr(given, name), "given"), (of_urdf, "the URDF's wheels"), (None if like is None else getattr(like, name), of_like)],
         )
+    _choose_radius(draft, given.wheel_radius_m, _described(urdf, controllers, "wheel_radius_m"), fit, of_log)
+    _choose_track(draft, given.track_width_m, urdf, controllers, fit)
+    for name in ("wheel_radius_m", "track_width_m"):
+        if name not in draft.values:
+            draft.choose(name, [(None if like is None else getattr(like, name), of_like)])
     for name, flag in (("wheel_radius_m", "--wheel-radius-m"), ("track_width_m", "--track-width-m"), ("wheelbase_m", "--wheelbase-m")):
         if name not in draft.values:
             draft.missing.append(f"{name}: measure it (contact to contact) and give {flag}, or a URDF with --urdf.")
     if "mass_kg" not in draft.values:
         draft.missing.append("mass_kg: weigh the robot and give --mass-kg; 50 kg is written, which only CG and simulation use.")
-    draft.choose("driver_wheel_radius_m", [(radius, "the driver's odometry over the wheels' rates")])
-    track = draft.values.get("track_width_m")
-    by_log = None if product is None or not track else product / track
-    of_like = None if given.like is None else given.like.driver.wheel_separation_multiplier
+    _choose_driver(draft, given, controllers, fit if is_drivers else None)
+
+
+def _described(urdf: WheelGeometry | None, controllers: Iterable[ControllerValues], name: str) -> list[tuple[float, str]]:
+    """Finite values (value, source) of URDF and controllers, the most trusted first: joints of wheels without shapes come last."""
+    of_urdf = [] if urdf is None else [(float(getattr(urdf, name)), "the URDF's wheels" if urdf.has_shapes else "the URDF's wheel joints")]
+    of_controllers = [(float(getattr(c, name)), c.source) for c in controllers]
+    ordered = of_urdf + of_controllers if urdf is not None and urdf.has_shapes else of_controllers + of_urdf
+    return [(value, source) for value, source in ordered if math.isfinite(value) and value > 0.0]
+
+
+def _is_same(a: float, b: float, share: float) -> bool:
+    return abs(math.log(a / b)) <= share
+
+
+def _choose_radius(draft: Draft, given: float | None, described: list[tuple[float, str]], fit: DriverFit | None, of_log: str) -> None:
+    """The given radius, else the first description that the log confirms, else the log's."""
+    name = "wheel_radius_m"
+    measured = None if fit is None else fit.wheel_radius_m
+    confirmed = [d for d in described if measured is None or _is_same(d[0], measured, _SAME_RADIUS)]
+    draft.choose(name, [(given, "given"), *confirmed, (measured, of_log)])
+    if name in draft.values:
+        by_log = "no motion" if fit is None else f"{fit.wheel_radius_m:.4g} m (R^2 {fit.r2[0]:.3f}, residual {fit.residuals[0]:.2g} m/s)"
+        sources = [*described, *([] if given is None else [(given, "given")])]
+        _compare(draft, name, sources, measured or draft.values[name], by_log, _SAME_RADIUS)
+
+
+def _compare(draft: Draft, name: str, sources: list[tuple[float, str]], right: float, by_log: str, share: float) -> None:
+    """Every source as a contradiction where one of them differs from ``right``."""
+    if any(not _is_same(value, right, share) for value, _ in sources):
+        draft.contradictions += [Contradiction(name, source, f"{value:.4g} m", by_log) for value, source in sources]
+
+
+def _choose_track(
+    draft: Draft, given: float | None, urdf: WheelGeometry | None, controllers: tuple[ControllerValues, ...], fit: DriverFit | None
+) -> None:
+    """Where descriptions differ, the one whose k = track / effective track is nearest to that of its geometry."""
+    name = "track_width_m"
+    described = _described(urdf, controllers, name)
+    best = list(described)
+    by_log = "cannot decide"
+    if fit is not None and described:
+        wheelbase = draft.values.get("wheelbase_m")
+        is_skid = draft.joints is not None and len(draft.joints.left) > 1 and wheelbase is not None
+
+        def misfit(track: float) -> float:
+            expected = geometric_scaling(wheelbase, track) if is_skid and wheelbase is not None else 1.0
+            return abs(math.log(track / fit.effective_track_m / expected))
+
+        best = sorted(described, key=lambda d: misfit(d[0]))
+        by_log = f"turns by {fit.effective_track_m:.4g} m: k = " + ", ".join(
+            f"{track / fit.effective_track_m:.2f} by {track:.4g} m" for track in dict.fromkeys(value for value, _ in described)
+        )
+        best = best if misfit(described[0][0]) - misfit(best[0][0]) > scaling_sigma() else described
+    draft.choose(name, [(given, "given"), *best])
+    if name in draft.values:
+        _compare(draft, name, [*described, *([] if given is None else [(given, "given")])], draft.values[name], by_log, _SAME_TRACK)
+
+
+def _choose_driver(draft: Draft, given: Given, controllers: tuple[ControllerValues, ...], fit: DriverFit | None) -> None:
+    of_controllers = [(c.wheel_radius_m, c.source) for c in controllers]
     draft.choose(
-        "wheel_separation_multiplier",
+        "driver_wheel_radius_m",
+        [(None if fit is None else fit.wheel_radius_m, "the driver's odometry over the wheels' rates"), *of_controllers],
+    )
+    track = draft.values.get("track_width_m")
+    product = None if fit is None else fit.effective_track_m
+    by_log = None if product is None or not track else product / track
+    named = []
+    for c in controllers:
+        turns_by = c.track_width_m / track if track and math.isfinite(c.track_width_m) else 1.0
+        named.append((c.wheel_separation_multiplier * turns_by, c.source))
+    of_like = None if given.like is None else given.like.driver.wheel_separation_multiplier
+    name = "wheel_separation_multiplier"
+    draft.choose(
+        name,
         [
             (given.wheel_separation_multiplier, "given"),
             (by_log, f"the driver turns by a track of {product or 0.0:.4g} m, by its odometry and the wheels' rates"),
+            *named,
             (of_like, "that of the robot named by --like"),
         ],
     )
-    if "wheel_separation_multiplier" not in draft.values:
+    if by_log is not None:
+        draft.contradictions += [
+            Contradiction(name, source, f"{value:.4g}", f"{by_log:.4g} by the driver's odometry")
+            for value, source in named
+            if math.isfinite(value) and not _is_same(value, by_log, _SAME_TRACK)
+        ]
+    if name not in draft.values:
         draft.missing.append(
             "wheel_separation_multiplier: 1 is written. Where wheels come from the driver's odometry, look it up in the controller's "
             "parameters and give --wheel-separation-multiplier: the odometry is put backwards through it."
+        )
+
+
+def _check_urdf(draft: Draft, urdf: WheelGeometry) -> None:
+    """Name what is no differential drive of wheels, and masses off the middle of symmetric wheels."""
+    for kind in urdf.kinds:
+        draft.missing.append(f"{kind}: {_KIND_NOTES[kind]}")
+    track = draft.values.get("track_width_m", urdf.track_width_m)
+    ys = sorted(y for _, y in urdf.positions.values())
+    is_symmetric = all(abs(a + b) < 0.02 for a, b in zip(ys, reversed(ys), strict=True))
+    aside = urdf.cg[1]
+    if is_symmetric and math.isfinite(aside) and abs(aside) > _OFF_MIDDLE * track:
+        draft.contradictions.append(
+            Contradiction(
+                "centre of gravity, y", "the URDF's <inertial>s", f"{aside:+.3f} m", "cannot measure it; wheels are symmetric: 0 m"
+            )
+        )
+        side = "left" if aside > 0.0 else "right"
+        draft.missing.append(
+            f"centre of gravity: the URDF's masses have it {100.0 * abs(aside):.0f} cm off the middle of a symmetric robot "
+            f"(to the {side}): check <inertial> of the body (axes swapped?). "
+            f"cg_y_m = 0 +- {abs(aside):.2f} m is taken, instead of +- 0.005 m."
         )
 
 
@@ -285,49 +511,6 @@ def _mount(rotation: FloatArray, translation: FloatArray) -> Mount:
     x, y, z = (float(v) for v in translation)
     roll, pitch = math.atan2(rotation[2, 1], rotation[2, 2]), -math.asin(max(-1.0, min(1.0, float(rotation[2, 0]))))
     return Mount(x, y, z, roll, pitch, math.atan2(rotation[1, 0], rotation[0, 0]))
-
-
-def fit_driver(path: Path, draft: Draft) -> tuple[float, float] | None:
-    """Wheel radius [m] and effective track (track times multiplier) [m] by which a driver makes its odometry of the wheels' rates.
-
-    Least squares of the odometry's twists on the joint states' rates; None where the log has only one of them or does not move.
-    """
-    states, odometry = draft.topics.get("joint_states"), draft.topics.get("odometry")
-    if states is None or odometry is None or draft.joints is None:
-        return None
-    rates, twists = _rates_and_twists(path, states, odometry, draft.joints)
-    if len(rates) < 10 or len(twists) < 10:
-        return None
-    at = twists[(twists[:, 0] >= rates[0, 0]) & (twists[:, 0] <= rates[-1, 0])]
-    left, right = (np.interp(at[:, 0], rates[:, 0], rates[:, i]) for i in (1, 2))
-    mean, difference = (left + right) / 2.0, right - left
-    if min(np.sqrt(np.mean(at[:, 1:] ** 2, axis=0)), default=0.0) < _MIN_MOTION or not mean.any() or not difference.any():
-        return None
-    radius = float(mean @ at[:, 1] / (mean @ mean))
-    per_difference = float(difference @ at[:, 2] / (difference @ difference))
-    return (radius, radius / per_difference) if radius > 0.0 and per_difference > 0.0 else None
-
-
-def _rates_and_twists(path: Path, states: str, odometry: str, joints: Joints) -> tuple[FloatArray, FloatArray]:
-    """(n, 3) stamp [s], left and right rate [rad/s]; and (m, 3) stamp [s], vx [m/s], wz [rad/s]."""
-    source = open_source(path)
-    decode = LogDeserializer(merge_channels(source.channels), is_ros1=source.is_ros1)
-    rates: list[tuple[float, float, float]] = []
-    twists: list[tuple[float, float, float]] = []
-    for raw in source.messages([states, odometry]):
-        message = _decoded(decode, raw)
-        if message is None:
-            continue
-        stamp = (stamp_ns(message) - source.start_ns) * 1e-9
-        if raw.topic == odometry:
-            twists.append((stamp, message.twist.twist.linear.x, message.twist.twist.angular.z))
-        else:
-            by_name = dict(zip(message.name, message.velocity, strict=False))
-            if all(name in by_name for name in (*joints.left, *joints.right)):
-                rates.append((stamp, *(float(np.mean([by_name[n] for n in side])) for side in (joints.left, joints.right))))  # type: ignore[arg-type]
-        if len(rates) >= _PAIRS and len(twists) >= _PAIRS:
-            break
-    return np.array(rates).reshape(-1, 3), np.array(twists).reshape(-1, 3)
 
 
 def finish_robot(draft: Draft, given: Given, default_name: str) -> Robot:

@@ -15,7 +15,7 @@ from rich.prompt import Confirm, Prompt
 
 from localization.calibration.robot_setup import DRIVE_60_S, Draft, Given, Survey, draft_robot, finish_robot, survey_log
 from localization.commands.calibrate import Calibrate
-from localization.commands.common import print_line
+from localization.commands.common import add_row, plain_table, print_line, print_table
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from motion_models.errors import RobotError
@@ -52,6 +52,8 @@ class Init:
     """Robot file to write; every command takes it as --robot."""
     urdf: Path | None = None
     """URDF of the robot (expand xacro first): wheels, geometry, mass and mounts."""
+    controller: Path | None = None
+    """YAML of the robot's drive controller (diff_drive_controller, ros2_control): track, radius, multiplier and joints."""
     base_link: str = "base_link"
     """Link of --urdf whose frame is the body frame."""
     like: str | None = None
@@ -101,6 +103,11 @@ class Init:
             print_line(console, f"  {reason}")
         for gap in draft.missing:
             print_line(console, f"! {gap}")
+        if draft.contradictions:
+            table = plain_table("quantity", "source", "value", "what the log measured", title="Contradictions")
+            for c in draft.contradictions:
+                add_row(table, c.quantity, c.source, c.value, c.by_log)
+            print_table(console, table)
         robot = self._write(console, survey, draft, given)
         for note in prior_notes(robot):
             print_line(console, note)
@@ -119,6 +126,7 @@ class Init:
             raise RobotError(f"{survey.name} and the options have no {', '.join(absent)}; measure and give {options}, or name a --urdf.")
         robot = finish_robot(draft, given, self.out.stem)
         remarks = [f"Written by skidloc init from {survey.name}.", *draft.reasons, *(f"MISSING: {gap}" for gap in draft.missing)]
+        remarks += [f"CONTRADICTION: {c.quantity} = {c.value} ({c.source}); the log: {c.by_log}" for c in draft.contradictions]
         text = robot_toml(robot, remarks="\n".join(remarks))
         parse_robot(text, str(self.out))  # refuses what no robot can have before it is written
         write_text_file(self.out, text)
@@ -147,6 +155,7 @@ class Init:
             self.base_link,
             None if self.like is None else load_robot(self.like),
             self.topic,
+            self.controller,
         )
 
 

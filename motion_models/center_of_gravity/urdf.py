@@ -27,8 +27,18 @@ _XACRO = "it is a xacro file, not a URDF; expand it first: xacro FILE.xacro > FI
 
 _WHEEL = re.compile(r"wheel|tire|tyre", re.IGNORECASE)
 _PASSIVE = re.compile(r"caster|castor|swivel|steer", re.IGNORECASE)
-_LEFT = re.compile(r"left|(^|[_\-/])(l|fl|rl|bl|ml|lf|lr|lb)([_\-/]|$)", re.IGNORECASE)
-_RIGHT = re.compile(r"right|(^|[_\-/])(r|fr|rr|br|mr|rf|rb)([_\-/]|$)", re.IGNORECASE)
+_LEFT = re.compile(r"left|(^|[_\-/])(l|fl|rl|bl|ml|cl|lf|lr|lb|lm)([_\-/]|$)", re.IGNORECASE)
+_RIGHT = re.compile(r"right|(^|[_\-/])(r|fr|rr|br|mr|cr|rf|rb|rm)([_\-/]|$)", re.IGNORECASE)
+_LEFT_KEYS = ("left_wheel_names", "left_wheel", "left_joint", "leftjoint", "leftfrontjoint", "leftrearjoint")
+_RIGHT_KEYS = ("right_wheel_names", "right_wheel", "right_joint", "rightjoint", "rightfrontjoint", "rightrearjoint")
+"""Keys of controllers and plugins (lower case) that name the wheels' joints."""
+_KINDS = {
+    "mecanum wheels": re.compile(r"mecanum", re.IGNORECASE),
+    "omnidirectional wheels": re.compile(r"omni(?!v)|swerve|planar_move", re.IGNORECASE),
+    "tracks": re.compile(r"(^|[_\-/])(tracks?|crawlers?|tread)([_\-/.]|$)|track(ed|controller)", re.IGNORECASE),
+    "steered wheels": re.compile(r"steering|ackermann", re.IGNORECASE),
+    "casters": re.compile(r"caster|castor", re.IGNORECASE),
+}
 _SAME_M = 0.02
 """Wheels whose x differs by less stand on one axle [m]."""
 
@@ -259,6 +269,18 @@ def _numbers(element: ET.Element, attribute: str, count: int, default: str | Non
 
 
 @dataclass(frozen=True)
+class ControllerValues:
+    """What the parameters of one drive controller or simulator plugin contain; NaN and empty for what they do not."""
+
+    source: str
+    track_width_m: float = math.nan
+    wheel_radius_m: float = math.nan
+    wheel_separation_multiplier: float = math.nan
+    left: tuple[str, ...] = ()
+    right: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class WheelGeometry:
     """What a URDF has of its wheels; NaN for what it does not have."""
 
@@ -272,6 +294,19 @@ class WheelGeometry:
     """Of all links."""
     positions: Mapping[str, tuple[float, float]]
     """x, y of each wheel's joint in the body frame [m]."""
+    cg: tuple[float, float] = (math.nan, math.nan)
+    """x, y of the centre of gravity of all links from the middle of the wheels, joints at 0 [m]."""
+    controllers: tuple[ControllerValues, ...] = ()
+    """Of <plugin> and <ros2_control>."""
+    has_shapes: bool = True
+    """Whether the wheels' cylinders or spheres give radius and contacts; else both are of joints alone."""
+    kinds: tuple[str, ...] = ()
+    """Words for what no differential drive of wheels is: mecanum, omni, tracks, casters, steered wheels."""
+
+
+def is_wheel(name: str) -> bool:
+    """Whether a joint is a driven wheel by its spelling."""
+    return bool(_WHEEL.search(name)) and not _PASSIVE.search(name)
 
 
 def sides(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -280,7 +315,7 @@ def sides(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     >>> sides(["front_left_wheel", "rear_right_wheel", "arm_joint", "wheel_FL_joint"])
     (('front_left_wheel', 'wheel_FL_joint'), ('rear_right_wheel',))
     """
-    wheels = [name for name in names if _WHEEL.search(name) and not _PASSIVE.search(name)]
+    wheels = [name for name in names if is_wheel(name)]
     left = tuple(name for name in wheels if _LEFT.search(name) and not re.search("right", name, re.IGNORECASE))
     return left, tuple(name for name in wheels if name not in left and _RIGHT.search(name))
 
@@ -293,7 +328,8 @@ def wheel_geometry(text: str, source: str, base_link: str = "base_link") -> Whee
     urdf = parse_urdf(text, source)
     if base_link not in urdf.links:
         raise RobotError(f"{source}: no link '{base_link}'; links are {', '.join(urdf.links)}. Name the body's with --base-link.")
-    shapes = _shapes(ET.fromstring(text.encode()))
+    root = ET.fromstring(text.encode())
+    shapes = _shapes(root)
     poses = _poses(urdf)
     base_R, base_t = poses[base_link]
     wheels: dict[str, tuple[float, float]] = {}
@@ -320,7 +356,83 @@ def wheel_geometry(text: str, source: str, base_link: str = "base_link") -> Whee
         wheelbase_m=along if along > _SAME_M else math.nan,
         mass_kg=sum(link.mass for link in urdf.links.values()) or math.nan,
         positions=wheels,
+        cg=_center_of_gravity(urdf, poses, base_link, wheels),
+        controllers=_controllers(root, source),
+        has_shapes=bool(finite),
+        kinds=_kinds(urdf, root),
     )
+
+
+def _center_of_gravity(
+    urdf: Urdf, poses: Mapping[str, tuple[FloatArray, FloatArray]], base_link: str, wheels: Mapping[str, tuple[float, float]]
+) -> tuple[float, float]:
+    """x, y [m] of all links' masses in the body frame, from the middle of the wheels; NaN without masses."""
+    masses = {name: link.mass for name, link in urdf.links.items() if link.mass > 0.0}
+    if not masses:
+        return math.nan, math.nan
+    moment = sum((m * (poses[n][1] + poses[n][0] @ urdf.links[n].com) for n, m in masses.items()), start=np.zeros(3))
+    base_R, base_t = poses[base_link]
+    com = base_R.T @ (moment / sum(masses.values()) - base_t)
+    middle = np.mean([[min(v), max(v)] for v in zip(*wheels.values(), strict=True)], axis=1)
+    return float(com[0] - middle[0]), float(com[1] - middle[1])
+
+
+def _controllers(root: ET.Element, source: str) -> tuple[ControllerValues, ...]:
+    """Values of <plugin>s (Gazebo's of ROS 1, ROS 2 and gz) and <ros2_control> that have a track or a radius."""
+    found = []
+    for element in (*root.iter("plugin"), *root.iter("ros2_control")):
+        values = {(e.get("name", "") if e.tag == "param" else e.tag): (e.text or "").strip() for e in element.iter()}
+        where = f"<{element.tag}> {element.get('name', '')}".strip()
+        lists = {key: [e.text or "" for e in element.iter(key)] for key in (*_LEFT_KEYS, *_RIGHT_KEYS)}
+        controller = controller_values({**values, **{key: names for key, names in lists.items() if names}}, where)
+        if controller is not None:
+            found.append(controller)
+    return tuple(found)
+
+
+def controller_values(values: Mapping[str, object], source: str) -> ControllerValues | None:
+    """Track, radius, multiplier and joints among the parameters ``values`` of a controller or plugin; None where it has none of them.
+
+    Names: diff_drive_controller (ROS 1 and 2), libgazebo_ros_diff_drive, _skid_steer_drive, gz::sim::systems::DiffDrive.
+    """
+    by_key = {key.lower(): value for key, value in values.items()}
+
+    def number(*keys: str, scale: float = 1.0) -> float:
+        for key in keys:
+            try:
+                value = float(str(by_key[key])) * scale
+            except (KeyError, ValueError):
+                continue
+            if math.isfinite(value) and value > 0.0:
+                return value
+        return math.nan
+
+    def joints(keys: Sequence[str]) -> tuple[str, ...]:
+        names: list[str] = []
+        for key in keys:
+            value = by_key.get(key, ())
+            names += [str(v) for v in value] if isinstance(value, list | tuple) else re.split(r"[\s,]+", str(value))
+        return tuple(dict.fromkeys(name.strip() for name in names if name.strip()))
+
+    radius = number("wheel_radius", "wheelradius")
+    diameter = number("wheel_diameter", "wheeldiameter", scale=0.5)
+    found = ControllerValues(
+        source,
+        number("wheel_separation", "wheelseparation", "track_width", "trackwidth", "tracks_separation"),
+        radius if math.isfinite(radius) else diameter,
+        number("wheel_separation_multiplier"),
+        joints(_LEFT_KEYS),
+        joints(_RIGHT_KEYS),
+    )
+    has_any = math.isfinite(found.track_width_m) or math.isfinite(found.wheel_radius_m)
+    return found if has_any else None
+
+
+def _kinds(urdf: Urdf, root: ET.Element) -> tuple[str, ...]:
+    """Kinds of wheels and tracks by the names of links, joints and meshes."""
+    meshes = [e.get("filename", "").rsplit("/", 1)[-1] for e in root.iter("mesh")]
+    names = [*urdf.links, *(joint.name for joint in urdf.joints), *meshes, *(p.get("filename", "") for p in root.iter("plugin"))]
+    return tuple(kind for kind, pattern in _KINDS.items() if any(pattern.search(name) for name in names))
 
 
 def _wheel_joints(urdf: Urdf) -> list[Joint]:

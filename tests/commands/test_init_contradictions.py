@@ -1,0 +1,81 @@
+"""`skidloc init` where URDF, controller and log contradict each other: the log decides, and every source is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from localization.cli import main
+from motion_models.robot import Robot, load_robot
+
+CASES = Path(__file__).parents[1] / "data" / "cases"
+BASE_LOG = CASES / "base-log" / "log.mcap"
+
+
+def init(tmp_path: Path, log: Path, *options: str) -> Robot:
+    """The robot that `skidloc init` writes."""
+    assert main(["init", str(log), "--out", str(tmp_path / "r.toml"), *options]) == 0
+    return load_robot(tmp_path / "r.toml")
+
+
+def case(tmp_path: Path, name: str) -> Robot:
+    """The robot of a case's log and URDF."""
+    return init(tmp_path, CASES / name / "log.mcap", "--urdf", str(CASES / name / "robot.urdf"))
+
+
+def test_init_with_names_against_positions_takes_the_logs_sides(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    robot = case(tmp_path, "H01-urdf-names-against-sides")
+    assert {*robot.joints.left} == {"front_left_wheel", "rear_left_wheel"}
+    printed = capsys.readouterr().out
+    assert "Contradictions" in printed
+    assert "by the sides of the URDF's wheels" in printed
+    assert "CONTRADICTION: left wheels = front_right_wheel" in (tmp_path / "r.toml").read_text()
+
+
+def test_init_with_plugin_against_joints_takes_what_the_log_has(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    robot = case(tmp_path, "H02-urdf-plugin-contradicts-joints")
+    assert (robot.geometry.track_width_m, robot.geometry.wheel_radius_m) == (0.35, 0.12)
+    printed = capsys.readouterr().out
+    assert "0.22 m" in printed
+    assert "k = 0.43 by 0.35 m" in printed
+
+
+def test_init_with_an_inverted_side_names_it_and_fits_the_radius(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = CASES / "H06-right-side-inverted" / "log.mcap"
+    robot = init(tmp_path, log, "--track-width-m", "0.57", "--wheelbase-m", "0.51")
+    assert robot.geometry.wheel_radius_m == pytest.approx(0.165, rel=0.02)
+    assert robot.driver.wheel_separation_multiplier == pytest.approx(1.875, rel=0.02)
+    assert "the right side (front_right_wheel, rear_right_wheel) is inverted" in capsys.readouterr().out
+
+
+def test_init_with_a_cg_beside_a_symmetric_robot_doubts_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    init(tmp_path, BASE_LOG, "--urdf", str(CASES / "H10-urdf-base-inertial-axes-swapped" / "robot.urdf"))
+    printed = capsys.readouterr().out
+    assert "8 cm off the middle of a symmetric robot (to the right): check" in printed
+    assert "0.165 m (R^2" in printed  # the URDF has 0.1 m
+
+
+_CONTROLLER = """
+diff_drive_base_controller:
+  ros__parameters:
+    left_wheel_names: ["front_left_wheel", "rear_left_wheel"]
+    right_wheel_names: ["front_right_wheel", "rear_right_wheel"]
+    wheel_separation: 0.57
+    wheel_radius: 0.165
+    wheel_separation_multiplier: 1.8
+"""
+
+
+def test_init_with_a_controller_yaml_takes_its_parameters(tmp_path: Path) -> None:
+    (tmp_path / "control.yaml").write_text(_CONTROLLER)
+    robot = init(tmp_path, BASE_LOG, "--controller", str(tmp_path / "control.yaml"), "--wheelbase-m", "0.51")
+    assert (robot.geometry.track_width_m, robot.geometry.wheel_radius_m) == (0.57, 0.165)
+    assert (robot.driver.wheel_separation_multiplier, robot.joints.left) == (pytest.approx(1.8), ("front_left_wheel", "rear_left_wheel"))
+
+
+@pytest.mark.parametrize("text", ["", "a: [", "a: {b: 1}", "- 1", "wheel_separation: wide"])
+def test_init_with_a_yaml_without_controller_is_refused(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "c.yaml").write_text(text)
+    assert main(["init", str(BASE_LOG), "--out", str(tmp_path / "r.toml"), "--controller", str(tmp_path / "c.yaml")]) == 2
+    assert capsys.readouterr().err.count("--controller") == 1
