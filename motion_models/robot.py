@@ -358,8 +358,10 @@ def _models(tables: Mapping[str, Any], source: str) -> tuple[dict[str, dict[str,
 def _arms(data: Mapping[str, Any], source: str) -> Arms:
     arms = _section(Arms, data, "arms", source)
     for name, value in dataclasses.asdict(arms).items():
-        if ("sigma" in name or name == "static_mass_kg") and value < 0.0:
+        if ("sigma" in name or name in ("static_mass_kg", "payload_kg")) and value < 0.0:
             raise RobotError(f"{source}: arms.{name} is {value:g}; it must not be below 0.")
+    if arms.payload_kg > 0.0 and not arms.payload_link:
+        raise RobotError(f"{source}: arms.payload_kg is {arms.payload_kg:g}, but arms.payload_link names no link that holds it.")
     if arms.weighed_posture and not arms.postures:
         raise RobotError(f"{source}: arms.weighed_posture names '{arms.weighed_posture}', but arms.postures names no SRDF that has it.")
     return arms

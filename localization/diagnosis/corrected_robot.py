@@ -5,14 +5,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from localization.diagnosis.causes import Hypothesis
+from localization.diagnosis.drive import Drive
 from localization.diagnosis.findings import Finding, HandoverCheck
 from localization.diagnosis.linearization import Linearization, make_regression
 from localization.diagnosis.prediction import CHANNELS, DrivePredictor, with_sizes
 from motion_models.base import MotionModel
+from motion_models.center_of_gravity.files import arms_model
 from motion_models.center_of_gravity.parts import Arms
 from motion_models.errors import CgError, ModelError
 from motion_models.friction import FrictionModel
@@ -43,14 +46,13 @@ class CorrectedRobot:
     manual_steps: tuple[str, ...]
     """What a robot file cannot hold, and where to correct it instead."""
     cg_shift: FloatArray
-    """(2,) by which the new file moves the centre of gravity [m]."""
+    """(N, 2) by which the new file moves the centre of gravity in each interval of the drive [m]."""
 
 
 def correct_robot(predictor: DrivePredictor, hypothesis: Hypothesis) -> CorrectedRobot:
     """The drive's robot under ``hypothesis``; every model's coefficients are matched to the corrected motion on the drive's own wheels."""
     robot = predictor.drive.robot
-    shift = _shift(predictor, hypothesis)
-    geometry, arms, note, shift = _with_cg(robot, _corrected_geometry(robot, hypothesis), shift)
+    geometry, arms, note, shift = _with_cg(predictor.drive, hypothesis, _corrected_geometry(robot, hypothesis))
     mounts, frame = dict(robot.mounts), _lidar_frame(predictor)
     if any(hypothesis.lidar_offset) and frame is not None:
         old = mounts.get(frame, Mount())
@@ -109,7 +111,10 @@ def check_handover(predictor: DrivePredictor, linearization: Linearization, name
         return None
     corrected = correct_robot(predictor, hypothesis)
     factors = corrected.robot.geometry.radius_multipliers / drive.robot.geometry.radius_multipliers
-    maneuvers = tuple(dataclasses.replace(m, wheels=m.wheels * factors, cg=m.cg + corrected.cg_shift) for m in drive.maneuvers)
+    shifts = np.split(corrected.cg_shift, np.cumsum([len(m.wheels) for m in drive.maneuvers])[:-1])
+    maneuvers = tuple(
+        dataclasses.replace(m, wheels=m.wheels * factors, cg=m.cg + shift) for m, shift in zip(drive.maneuvers, shifts, strict=True)
+    )
     model = make_model(predictor.model.name, corrected.robot)
     corrected_drive = dataclasses.replace(drive, robot=corrected.robot, maneuvers=maneuvers)
     after = DrivePredictor(corrected_drive, model, has_inertia=predictor.has_inertia, baseline=predictor.baseline)
@@ -167,26 +172,47 @@ def _corrected_geometry(robot: Robot, hypothesis: Hypothesis) -> Geometry:
     )
 
 
-def _with_cg(robot: Robot, geometry: Geometry, shift: FloatArray) -> tuple[Geometry, Arms | None, tuple[str, ...], FloatArray]:
-    """Geometry and arms with the CG moved by ``shift`` (2,), a note where neither holds it, and the shift that is held."""
-    arms = robot.arms
-    if not np.any(shift):
+def _with_cg(drive: Drive, h: Hypothesis, geometry: Geometry) -> tuple[Geometry, Arms | None, tuple[str, ...], FloatArray]:
+    """Geometry and arms with the CG of ``h``, a note where neither holds it, and the shift that is held, (N, 2) in each interval [m].
+
+    A payload in the gripper moves with the arms: it becomes ``[arms] payload_kg``. What is constant belongs to everything but the arms,
+    whose CG moves by the shift times all mass over its own.
+    """
+    arms, mass = drive.robot.arms, drive.robot.geometry.mass_kg + h.payload_kg
+    constant = np.array(h.cg, dtype=float)
+    carried = drive.payload_arms * (h.payload_kg / mass) if h.payload_kg else np.zeros_like(drive.payload_arms)
+    if arms is not None and drive.payload_link and arms.payload_kg + h.payload_kg > 0.0 and h.payload_kg:
+        arms = dataclasses.replace(arms, payload_kg=arms.payload_kg + h.payload_kg, payload_link=drive.payload_link)
+    elif h.payload_kg:
+        constant, carried = constant + carried.mean(axis=0), np.zeros_like(carried)
+    shift = constant + carried
+    if not np.any(constant):
         return geometry, arms, (), shift
+    x, y = (float(v) for v in constant)
     if arms is None:
-        return (
-            dataclasses.replace(geometry, cg_x_m=geometry.cg_x_m + float(shift[0]), cg_y_m=geometry.cg_y_m + float(shift[1])),
-            None,
-            (),
-            shift,
-        )
-    if arms.static_mass_kg > 0.0:
-        x, y = (float(v) for v in shift * (robot.geometry.mass_kg / arms.static_mass_kg))
-        return geometry, dataclasses.replace(arms, static_x_m=arms.static_x_m + x, static_y_m=arms.static_y_m + y), (), shift
+        return dataclasses.replace(geometry, cg_x_m=geometry.cg_x_m + x, cg_y_m=geometry.cg_y_m + y), None, (), shift
+    if drive.kind == "log":
+        return geometry, _with_static_part(arms, drive.robot.folder, constant), (), shift
     note = (
-        f"the centre of gravity is off by ({shift[0]:+.4f}, {shift[1]:+.4f}) m, which belongs into the arms' URDF; "
-        "the models' coefficients hold it instead."
+        f"the centre of gravity is off by ({x:+.4f}, {y:+.4f}) m from that of the table; "
+        "the models' coefficients hold it, and the file's arms stay."
     )
-    return geometry, arms, (note,), np.zeros(2)
+    return geometry, arms, (note,), np.zeros_like(shift)
+
+
+def _with_static_part(arms: Arms, folder: Path | None, shift: FloatArray) -> Arms:
+    """``arms`` with everything but the arms moved so that the whole robot's CG moves by ``shift`` (2,) [m]."""
+    model = arms_model(arms, folder)
+    x, y = (float(v) for v in model.static.position + shift * (model.mass / model.static.mass))
+    sigmas = np.sqrt(np.diag(model.static.covariance))
+    return dataclasses.replace(
+        arms,
+        static_mass_kg=model.static.mass,
+        static_x_m=x,
+        static_y_m=y,
+        static_mass_sigma_kg=float(sigmas[0]),
+        static_sigma_m=float(sigmas[1]),
+    )
 
 
 def _corrected_clock(clock: Clock, hypothesis: Hypothesis, lidar_frame: str | None) -> Clock:
@@ -238,14 +264,6 @@ def _manual_steps(robot: Robot, h: Hypothesis, lidar_frame: str | None) -> list[
     return [text for is_found, text in steps if is_found]
 
 
-def _shift(predictor: DrivePredictor, hypothesis: Hypothesis) -> FloatArray:
-    shift = np.array(hypothesis.cg, dtype=float)
-    if hypothesis.payload_kg:
-        mass = predictor.drive.robot.geometry.mass_kg + hypothesis.payload_kg
-        shift = shift + predictor.drive.payload_arms.mean(axis=0) * hypothesis.payload_kg / mass
-    return shift
-
-
 def _friction(robot: Robot, hypothesis: Hypothesis) -> dict[str, float]:
     """The friction model takes the causes of the floor as they are."""
     model = FrictionModel.from_robot(robot)
@@ -287,7 +305,7 @@ def _matched(
     valid = params
     for _ in range(_ROUNDS):
         try:
-            twist = model.twist(rates, cg + shift, params)
+            twist = model.twist(rates, cg + shift[rows], params)
         except (CgError, ModelError):  # no coefficients that a robot can have give such twists
             return dict(zip(model.param_names, (float(v) for v in valid), strict=True))
         valid = params

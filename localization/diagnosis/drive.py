@@ -87,6 +87,8 @@ class Drive:
     """(W, 2) mean specific force along the body's x and y over each maneuver [m/s^2]; None without accelerometers."""
     payload_arms: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     """(N, 2) from the CG to where a payload would be held, in each interval of the maneuvers end to end [m]."""
+    payload_link: str = ""
+    """Link of the arms at which `payload_arms` puts it; empty where that is the front edge."""
     paths: tuple[FloatArray, ...] = ()
     """For runs: (n, 3) path of the controller's odometry in each, a pose at the end of each interval."""
     path_errors: FloatArray = field(default_factory=lambda: np.zeros(0))
@@ -252,6 +254,7 @@ def drive_of_events(
         is_gyro_reference=by_gyro,
         forces=imu.means(spans) if has_gyro and len(spans) else None,
         payload_arms=_payload_arms(robot, windows.maneuvers, postures),
+        payload_link=_gripper(postures),
         range_slopes=recorder.range_slopes(),
         message_loss=find_message_loss(np.array(wheel_stamps, dtype=np.int64)),
         standstill_turn=find_standstill_turn(imu.gyro, recorder.standstills, spans) if imu.stamps else None,
@@ -357,16 +360,19 @@ def _pieces(m: Maneuver) -> Iterator[Maneuver]:
         before, driven = pose, int(end)
 
 
+def _gripper(postures: _Postures | None) -> str:
+    """Link that holds a payload; empty for robots without arms."""
+    return "" if postures is None else next((name for name in _GRIPPERS if name in postures.chain.links), "")
+
+
 def _payload_arms(robot: Robot, maneuvers: Sequence[Maneuver], postures: _Postures | None) -> FloatArray:
     """(N, 2) lever of a payload about the CG: in the (left) gripper, or over the front edge of a robot without arms."""
     if not maneuvers:
         return np.zeros((0, 2))
     cg = np.concatenate([np.broadcast_to(m.cg, m.wheels.shape) for m in maneuvers])
     edge = np.array([robot.geometry.wheelbase_m / 2.0, 0.0])
-    if postures is None or robot.arms is None:
-        return np.asarray(edge - cg)
-    link = next((name for name in _GRIPPERS if name in postures.chain.links), None)
-    if link is None:
+    link = _gripper(postures)
+    if postures is None or robot.arms is None or not link:
         return np.asarray(edge - cg)
     try:
         loaded = arms_model(robot.arms, robot.folder, Payload(link, 1.0))

@@ -211,8 +211,8 @@ class HandoverCheck:
 
     @property
     def is_better(self) -> bool:
-        """Whether the product of all components' errors does not grow."""
-        return math.prod(self.after[c] / max(self.before[c], 1e-12) for c in self.before) <= 1.0
+        """Whether the product of all components' errors shrinks; a file that changes nothing is not better."""
+        return math.prod(self.after[c] / max(self.before[c], 1e-12) for c in self.before) < 1.0
 
     def describe(self) -> str:
         """Errors of the second half before and after, as a sentence without a stop."""

@@ -19,7 +19,7 @@ from motion_models.text_files import read_text
 def arms_model(arms: Arms, folder: Path | None = None, payload: Payload | None = None, static: StaticPart | None = None) -> CgModel:
     """The model that a robot file's ``arms`` describe. ``folder`` is where that file is; None for a robot that is shipped.
 
-    ``static`` replaces the masses that ``arms`` give to everything else.
+    ``static`` replaces the masses that ``arms`` give to everything else; ``payload`` comes in addition to that of ``arms``.
 
     A name that is not in the folder may be that of a file that is shipped: robots derived from one can be kept anywhere.
 
@@ -32,6 +32,8 @@ def arms_model(arms: Arms, folder: Path | None = None, payload: Payload | None =
     {'back_left': [-0.03, 0.02], 'back_right': [-0.03, -0.02]}
     """
     urdf = _urdf(arms, folder)
+    if arms.payload_kg > 0.0:
+        urdf = urdf.with_mass(arms.payload_link, arms.payload_kg, np.zeros(3))
     if static is None and arms.static_mass_kg > 0.0:
         sigmas = np.array([arms.static_mass_sigma_kg, arms.static_sigma_m, arms.static_sigma_m])
         weighed_at = _named(arms_postures(arms, folder), arms.weighed_posture) if arms.weighed_posture else None

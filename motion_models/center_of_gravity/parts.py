@@ -108,6 +108,10 @@ class Arms:
     """Standard deviation of its mass."""
     static_sigma_m: float = 0.005
     """Standard deviation of its centre of gravity, along x and along y."""
+    payload_kg: float = 0.0
+    """Mass that the robot carries besides what the URDF has, fixed at the origin of `payload_link`."""
+    payload_link: str = ""
+    """Link of the URDF that holds it, as a gripper."""
     weighed_posture: str = ""
     """Named posture in which the robot was weighed, where the static part comes from a weighing minus the arms: errors of the arms'
     masses cancel there."""
