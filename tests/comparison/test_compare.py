@@ -205,6 +205,7 @@ def test_compare_worker_in_another_folder_finds_the_given_paths(tmp_path, monkey
     assert [(row["log"], row["status"], row["n_reference"]) for (row,) in found] == [("run.mcap", "ok", 539), ("run.mcap", "ok", 18)]
 
 
+@pytest.mark.extended
 def test_compare_killed_process_loses_no_other_log(table):
     """The second log always kills its process, the third does it once."""
     found = {job.log: rows for job, rows in run_local(jobs(3), 1, killing)}
@@ -428,6 +429,7 @@ def compare_until_a_log_is_done(out, address):
     return running
 
 
+@pytest.mark.extended
 def test_dask_killed_worker_gives_the_same_table(table, tmp_path, cluster):
     out = tmp_path / "table.csv"
     address, _, workers = cluster
@@ -438,6 +440,7 @@ def test_dask_killed_worker_gives_the_same_table(table, tmp_path, cluster):
     assert out.read_bytes() == table.read_bytes()
 
 
+@pytest.mark.extended
 def test_dask_lost_scheduler_ends_the_comparison_and_keeps_results(table, tmp_path, asked, cluster):
     out = tmp_path / "table.csv"
     address, scheduler, workers = cluster

@@ -16,6 +16,7 @@ from localization.events import ImuSample
 from localization.logs import open_log
 from motion_models.registry import make_model
 from tests.helpers.diagnosis_drives import ONE_SIDED, TYPICAL, bag, diagnose_bag, drive, robot_named
+from tests.helpers.extended import cases
 
 CASES = [(cause, size if cause in ONE_SIDED or i % 2 == 0 else -size, 300 + i) for i, (cause, size) in enumerate(TYPICAL.items())]
 
@@ -34,7 +35,7 @@ def diagnosed(tmp_path: Path) -> Diagnosed:
 
 @pytest.mark.parametrize(
     ("cause", "size", "seed"),
-    [pytest.param(*case, id=case[0]) for case in CASES],
+    cases(CASES, ("payload", "track_width", "wheel_radius_difference", "lidar_yaw", "encoder_dropout", "friction_anisotropy")),
 )
 def test_diagnose_hidden_cause_is_named_with_its_size(diagnosed: Diagnosed, cause: str, size: float, seed: int) -> None:
     found = diagnosed({cause: size}, seed, "vaultbot")
@@ -60,9 +61,9 @@ def test_diagnose_nothing_hidden_finds_nothing(diagnosed: Diagnosed, robot: str,
     ("true", "file", "route"),
     [
         ("vaultbot", "vaultbot_thesis", "tour"),
-        ("vaultbot_thesis", "vaultbot", "tour"),
-        ("husky_a200", "husky_a200_thesis", "random_4"),
-        ("husky_a200_thesis", "husky_a200", "random_4"),
+        pytest.param("vaultbot_thesis", "vaultbot", "tour", marks=pytest.mark.extended),
+        pytest.param("husky_a200", "husky_a200_thesis", "random_4", marks=pytest.mark.extended),
+        pytest.param("husky_a200_thesis", "husky_a200", "random_4", marks=pytest.mark.extended),
     ],
 )
 def test_diagnose_other_contact_law_is_named(diagnosed: Diagnosed, true: str, file: str, route: str) -> None:
@@ -71,12 +72,14 @@ def test_diagnose_other_contact_law_is_named(diagnosed: Diagnosed, true: str, fi
     assert found.findings[0].size == pytest.approx(1.0, abs=max(0.15, 3.0 * found.findings[0].sigma))
 
 
+@pytest.mark.extended
 def test_diagnose_same_thesis_law_finds_nothing(diagnosed: Diagnosed) -> None:
     found = diagnosed({}, 441, "vaultbot_thesis")
     assert found.verdict == "consistent"
     assert not found.findings
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "effects",
     [{"cg_offset_x": 0.03, "lidar_yaw": -0.03}, {"wheel_radius_difference": 0.02, "friction_anisotropy": 0.2}],
@@ -90,6 +93,7 @@ def test_diagnose_two_causes_names_both(diagnosed: Diagnosed, effects: Mapping[s
         assert sizes[cause] == pytest.approx(size, rel=0.25)
 
 
+@pytest.mark.extended
 def test_diagnose_light_payload_names_its_alias(diagnosed: Diagnosed) -> None:
     """3 kg over the front edge of a small robot shift its CG by 17 mm."""
     found = diagnosed({"payload": 3.0}, 500, "jackal")
@@ -123,6 +127,7 @@ def test_diagnose_missing_messages_come_first(diagnosed: Diagnosed) -> None:
     assert [f.cause for f in found.findings] == ["missing_joint_messages", "wheel_radius_scale"]
 
 
+@pytest.mark.extended
 def test_diagnose_inseparable_causes_are_one_finding(diagnosed: Diagnosed) -> None:
     """On a robot without arms a payload over the front edge is a shift of its centre of gravity, and nothing else."""
     found = diagnosed({"payload": 8.0}, 420, "husky_a200")
@@ -157,6 +162,7 @@ def test_diagnose_turns_that_a_tolerated_floor_explains_are_consistent(diagnosed
     assert 0.005 < size < found.tolerances["friction_anisotropy"]
 
 
+@pytest.mark.extended
 def test_diagnose_nonlinear_cause_has_its_size(diagnosed: Diagnosed) -> None:
     """3 cm are a quarter of the way to a small robot's axle: how much it turns goes with the square of that."""
     found = diagnosed({"cg_offset_x": 0.03}, 432, "jackal")
@@ -174,6 +180,7 @@ def test_diagnose_wet_patch_is_unexplained(diagnosed: Diagnosed) -> None:
     assert "not in a way that has a name: " in found.sentence
 
 
+@pytest.mark.extended
 def test_diagnose_minor_second_cause_keeps_the_first(diagnosed: Diagnosed) -> None:
     """The second is no larger than robots ever differ from their files."""
     found = diagnosed({"diagonal_load": 0.15, "cg_offset_y": 0.003}, 434)
@@ -182,6 +189,7 @@ def test_diagnose_minor_second_cause_keeps_the_first(diagnosed: Diagnosed) -> No
     assert found.findings[0].size == pytest.approx(0.15, abs=3.0 * found.findings[0].sigma)
 
 
+@pytest.mark.extended
 def test_diagnose_change_of_the_floor_has_no_handover(diagnosed: Diagnosed) -> None:
     """No robot file holds it, so that there is nothing to compare."""
     found = diagnosed({"friction_change": 0.3}, 312)
@@ -189,6 +197,7 @@ def test_diagnose_change_of_the_floor_has_no_handover(diagnosed: Diagnosed) -> N
     assert found.handover is None
 
 
+@pytest.mark.extended
 def test_diagnose_slope_in_a_log_with_gap_of_the_imu(tmp_path: Path) -> None:
     """Headings go on by scan matching; the gap is reported."""
     robot, config = robot_named("vaultbot"), WindowConfig()

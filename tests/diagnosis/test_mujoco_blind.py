@@ -10,6 +10,7 @@ from tests.helpers.diagnosis_drives import drive
 from tests.studies.mujoco_blind import diagnose_mujoco, healthy
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("cause", "size"), [("wheel_radius_difference", -0.02), ("lidar_offset_x", 0.05)], ids=["wheel_radius_difference", "lidar_offset_x"]
 )

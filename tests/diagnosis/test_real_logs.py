@@ -102,6 +102,7 @@ def test_diagnose_drive_husky_turns_less_and_slips_on_arcs() -> None:
     assert found.gain.low > 0.6
 
 
+@pytest.mark.extended
 def test_diagnose_husky_with_gyro_names_wheel_clock() -> None:
     robot = load_robot("husky_a200")
     drive = drive_of_log(open_log(DATA / "husky-outdoor-gps" / "test1.bag", robot))
@@ -149,6 +150,7 @@ def test_diagnose_clockwise_rotations_separate_treads() -> None:
         assert {f.cause for f in table.diagnosis.findings} == {"lidar_offset_x", "diagonal_load", "track_width"}
 
 
+@pytest.mark.extended
 def test_diagnose_drive_husky_clock_agrees_with_gyro() -> None:
     """A clock between them is named; the gyro, which was no input, shows that both are late, the wheels more so."""
     robot = drive_husky.robot()

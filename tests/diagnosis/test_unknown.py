@@ -11,6 +11,7 @@ from motion_models.registry import make_model
 from motion_models.robot import load_robot
 from tests.helpers.diagnosis_drives import bag, drive
 from tests.helpers.diagnosis_unknown import UNKNOWN
+from tests.helpers.extended import cases
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +24,7 @@ def test_diagnose_nominal_drive_is_consistent(nominal: Drive) -> None:
     assert diagnose(nominal, make_model("friction", nominal.robot)).verdict == "consistent"
 
 
-@pytest.mark.parametrize("name", sorted(UNKNOWN))
+@pytest.mark.parametrize("name", cases(sorted(UNKNOWN), ("slip in left turns only",)))
 def test_diagnose_effect_outside_catalogue_is_unexplained(nominal: Drive, name: str) -> None:
     found = diagnose(UNKNOWN[name](nominal), make_model("friction", nominal.robot))
     assert found.verdict == "unexplained"

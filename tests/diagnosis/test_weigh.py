@@ -97,6 +97,7 @@ def test_weigh_robot_with_casters_is_refused(tmp_path: Path, capsys: pytest.Capt
     assert "turns on casters" in capsys.readouterr().err
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("robot", "x", "y"), [("jackal", 0.015, -0.02), ("husky_a200", 0.04, 0.03)], ids=["jackal", "husky_a200"])
 def test_weigh_on_other_contacts_widens_interval_and_says_why(robot: str, x: float, y: float) -> None:
     """MuJoCo's contacts turn a robot otherwise than the friction model: corrections absorb the load, and noise is hardly more."""
@@ -107,6 +108,7 @@ def test_weigh_on_other_contacts_widens_interval_and_says_why(robot: str, x: flo
     assert "that of the robot file" not in describe(found, None)
 
 
+@pytest.mark.extended
 def test_weigh_by_brush_tyres_of_other_law_holds_the_truth() -> None:
     found = weigh_simulated("scout_2", {"cg_offset_x": -0.05, "cg_offset_y": 0.06}, 3, "brush")
     assert np.all(np.abs(found.offset - [-0.05, 0.06]) < 2.0 * found.sigmas)

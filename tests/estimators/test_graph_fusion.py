@@ -137,6 +137,7 @@ def test_graph_around_building_closes_loop() -> None:
     assert after < 0.8 * before
 
 
+@pytest.mark.extended
 def test_graph_with_corrections_that_hardly_change_is_solved() -> None:
     """Five minutes of fr079, after each of which corrections may change: GTSAM's marginals were indefinite at a sigma of 1e-6."""
     run = BUILDINGS["fr079"].open().until(300.0).run("graph", "skid_steer")
@@ -469,6 +470,7 @@ def test_smoothed_poses_between_keyframes_have_the_noise_of_scans() -> None:
     assert (np.sqrt(covs[early, 0, 0]) > 0.4 * np.sqrt(run.filtered.covariances[live][early, 0, 0])).all()
 
 
+@pytest.mark.extended
 def test_graph_with_a_field_of_corrections_can_be_smoothed() -> None:
     """Prior sigmas of a field over the CG differ by a factor of 1,500, and corrections are 16 variables in a row."""
     run = BUILDINGS["fr079"].open().run("graph", "skid_steer", "cg_field")
@@ -516,6 +518,7 @@ def test_graph_after_a_gap_of_all_sensors_is_where_the_scans_find_it() -> None:
     assert sigmas[found].max() < 0.1
 
 
+@pytest.mark.extended
 def test_graph_with_silent_lidar_has_keyframes_without_scan() -> None:
     """The scan of before the silence was measured elsewhere."""
     drive, pipeline = around(), make_pipeline(around())

@@ -235,6 +235,7 @@ def rounded_balance(twist, roll, cg, p, law):
     return np.stack([f_x.sum(axis=1), f_y.sum(axis=1), moment], axis=-1)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("law", list(LAWS))
 def test_newton_from_any_start_finds_the_same_motion(law):
     """With Appendix A's constants the balance has one solution: searches from eight other twists end at the same."""

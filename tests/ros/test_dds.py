@@ -135,6 +135,7 @@ def followed(tmp_path_factory):
     return Followed(peer.report(), (stopped_s, resumed_s), (before, after), node.returncode, addresses, folder / "live.tum")
 
 
+@pytest.mark.extended
 def test_node_that_is_killed_resumes_and_answers_every_scan(followed):
     """But those that came while it was stopped, for which its queues are too short."""
     assert "resumed from" in followed.texts[1], followed.texts

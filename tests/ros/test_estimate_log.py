@@ -105,6 +105,7 @@ def test_state_on_disk_is_never_older_than_a_second(tmp_path, monkeypatch):
     session.close()
 
 
+@pytest.mark.extended
 def test_online_killed_twice_and_resumed_writes_the_same_bytes(replayed, killed, tmp_path, capsys):
     shutil.copytree(killed, tmp_path, dirs_exist_ok=True)
     kill_after(tmp_path, read_head(tmp_path / "state")["events"] + 50)  # written by this process, not left by the one before

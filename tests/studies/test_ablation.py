@@ -22,6 +22,7 @@ def poses(drive: Drive) -> np.ndarray:
     return drive.run("ekf", "skid_steer").trajectory.poses
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", PATCHES)
 def test_patch_runs_and_leaves_nothing_behind(name: str, drive: Drive, poses: np.ndarray) -> None:
     with PATCHES[name]():

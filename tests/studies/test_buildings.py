@@ -7,6 +7,7 @@ import pytest
 from tests.studies.buildings import BUILDINGS, track_errors
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("name", "seconds", "max_rpe_m"), [("fr079", 240.0, 0.10), ("csail", 1e6, 0.06)])
 def test_ekf_in_unknown_building_stays_within_30_cm(name: str, seconds: float, max_rpe_m: float) -> None:
     """fr079's first four minutes keep the suite quick; `python -m tests.studies.buildings` replays all of it."""

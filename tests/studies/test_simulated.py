@@ -21,6 +21,7 @@ def drives():
     return {row.trajectory: row for row in simulated_controllers.rows(simulated_controllers.scores())}
 
 
+@pytest.mark.extended
 @pytest.mark.xdist_group("simulated_grid")
 def test_rotations_by_scan_matching_reproduce_the_regressions(measured):
     """4.21, 4.22 and 4.25 through bag, scan matching and arcs: each coefficient within three of its stated sigmas."""
@@ -43,6 +44,7 @@ def test_rotations_by_scan_matching_are_within_their_sigmas(measured):
     assert (simulated_grid.sigmas(measured).mean(axis=0) < [0.001, 0.004, 0.004]).all()
 
 
+@pytest.mark.extended
 @pytest.mark.xdist_group("simulated_grid")
 def test_closed_model_differs_from_vehicle_by_less_than_a_percent(measured):
     """The closed model knows no inertia: at 0.3 rad/s that is worth some thousandths of k."""
