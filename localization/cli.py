@@ -24,6 +24,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "init": ("Init", "Write a robot file for a new robot from a log and a URDF."),
     "robots": ("Robots", "List the robots that are shipped, with the source of every number."),
     "cg": ("Cg", "Compute the centre of gravity from scales, arms and payload."),
+    "map": ("Map", "Show a saved map, or export it for planners and viewers."),
     "online": ("Online", "Run the estimator live on ROS topics, or on a log as it was recorded."),
     "simulate": ("Simulate", "Simulate a skid-steer robot and write a log."),
 }

@@ -35,6 +35,10 @@ class SimulationError(SkidlocError):
     """A simulation that does not exist or cannot be driven: an unknown experiment or effect, a robot that tips over or hits a wall."""
 
 
+class MapError(SkidlocError):
+    """A map that cannot be used: missing, foreign, newer or damaged; or one that cannot be made."""
+
+
 class CheckpointError(SkidlocError):
     """A state that cannot be written, or a file of one that is damaged, foreign, or of another robot, model or configuration."""
 

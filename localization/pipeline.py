@@ -16,6 +16,7 @@ from localization.estimate_table import NIS, TWIST, TWIST_COV, EstimateTable, tr
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, Estimate, Estimator, EstimatorConfig, make_estimator
 from localization.events import Event, ImuSample, PositionSample, Step
 from localization.lidar.losses import LidarLosses
+from localization.maps import KeyframeMap
 from localization.sensor_checks import SensorChecks
 from localization.synchronizer import StepConfig, Synchronizer
 from localization.trajectory import Trajectory
@@ -166,6 +167,8 @@ class Run:
     """Filtered poses, as they were estimated at each moment and published live, where ``trajectory`` is smoothed."""
     lidar: LidarLosses | None = None
     """How long the LiDAR was lost; None where no scans were matched to a map."""
+    keyframes: KeyframeMap | None = None
+    """The map as it can be saved, of an estimator with a map frame."""
 
 
 _EQUAL_CHARACTERS = 60
@@ -251,4 +254,5 @@ class _Replay:
             self._trial.corrections if self._trial.estimator in ESTIMATORS_WITH_CORRECTIONS else None,
             None if smoothed is None else filtered,
             self._pipeline.lidar,
+            estimator.keyframe_map(),
         )

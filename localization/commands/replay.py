@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -35,6 +35,7 @@ from localization.events import Event, PositionSample
 from localization.logs import Log, TopicOverrides, open_log
 from localization.logs.references import merge_positions, read_positions
 from localization.logs.writer import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
+from localization.maps import SavedMap, save_map
 from localization.output import as_text, check_outputs, fingerprint, versions
 from localization.pipeline import ReplayConfig, Run, Trial, replay, warnings_of
 from localization.report.replay_page import COLUMNS, MISSING, Column, ReportHead, overview_png, verdict, with_values, write_report
@@ -42,7 +43,7 @@ from localization.trajectory import write_tum
 from motion_models.online_calibration import check_forms
 from motion_models.prior import prior_notes, scaling_prior
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot import Mount, load_robot
 
 _WHEELLESS = "lidar"
 _HELD_OUT = (
@@ -79,6 +80,8 @@ class Replay:
     positions: str | None = None
     """Topic of positions (NavSatFix, poses) that `graph` is to fuse, as GPS: `/fix`. The lever arm of the antenna is
     --config.estimator.graph.antenna-x-m and -y-m. If they are the reference as well, every second one is fused, and the others score."""
+    save_map: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """New file for the map of the last `graph` pair: `office.skidmap`. `skidloc map` shows and exports it."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
     config: ReplayConfig = field(default_factory=ReplayConfig)
     timing: bool = False
@@ -89,7 +92,7 @@ class Replay:
     def run(self, console: Console) -> None:
         """Run the command, with output on ``console``."""
         robot = load_robot(self.robot)
-        check_outputs(self.out, self.json)
+        check_outputs(self.out, self.json, self.save_map)
         log = open_log(self.log, robot, self.topic.scored_against(self.reference))
         has_lidar = log.sources.lidar is not None
         models = [make_model(name, robot) for name in names(self.model, "--model")]
@@ -100,6 +103,7 @@ class Replay:
             for model in models
             for form in check_forms(forms)[: None if estimator in ESTIMATORS_WITH_CORRECTIONS else 1]
         ]
+        self._check_map(has_lidar)
         reference, positions = self._reference(log), self._positions(log)
         held_out = [_HELD_OUT.format(self.positions)] if self._is_held_out(log) else []
         # the LiDAR alone uses no motion model: it runs once, and counts for each
@@ -143,6 +147,8 @@ class Replay:
             overview_png(folder / "overview.png", head, results, reference)
         if self.json is not None:
             write_json(self.json, metrics)
+        if self.save_map is not None:
+            save_map(self.save_map, saved_map(runs, head, log.mounts, dataclasses.asdict(self.config)))
         self._print(console, head, results, reference)
 
     def _estimators(self, has_lidar: bool) -> list[str]:
@@ -152,6 +158,15 @@ class Replay:
         if self.estimator == type(self).estimator and not has_lidar:
             found.remove(_WHEELLESS)
         return found
+
+    def _check_map(self, has_lidar: bool) -> None:
+        """Refuse `--save-map` before the run, where there will be no map."""
+        if self.save_map is None:
+            return
+        if not set(ESTIMATORS_WITH_MAP) & set(names(self.estimator, "--estimator")):
+            raise EstimatorError("--save-map saves the map of the graph. Add it: --estimator odometry,ekf,graph.")
+        if not has_lidar:
+            raise EstimatorError("--save-map needs scans, and there are none in this log. Leave it out, or pass --topic.scan.")
 
     def _reference(self, log: Log) -> ReferenceTrack | Relations | None:
         """The reference, by topic or file; read before the run, so that a wrong name is reported at once."""
@@ -214,6 +229,22 @@ class Replay:
         print_table(console, accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
         console.print(verdict(results, reference), markup=False, soft_wrap=True)
         console.print(f"report: {self.out / 'report.html'}", markup=False, soft_wrap=True)
+
+
+def saved_map(runs: Sequence[Run], head: ReportHead, mounts: Mapping[str, Mount], config: Mapping[str, Any]) -> SavedMap:
+    """The map of the last of ``runs`` that has one, and where it comes from: ``mounts`` of sensors by frame, settings ``config``."""
+    run, keyframes = [(run, run.keyframes) for run in runs if run.keyframes is not None][-1]
+    provenance = {
+        "log": head.log,
+        "log_fingerprint": head.log_fingerprint,
+        "robot": head.robot,
+        "model": run.model,
+        "corrections": run.corrections,
+        "mounts": {frame: dataclasses.asdict(mounts[frame]) for frame in sorted(mounts)},
+        "config": config,
+        "versions": dict(head.versions),
+    }
+    return SavedMap(keyframes, provenance)
 
 
 def check_overlap(reference: ReferenceTrack | Relations, log: Log) -> None:

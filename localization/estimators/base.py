@@ -10,6 +10,7 @@ import numpy as np
 
 from localization.events import PositionSample, Step
 from localization.lidar import LostScans
+from localization.maps import KeyframeMap
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Twist2
@@ -86,6 +87,10 @@ class Estimator(ABC):
     def warnings(self) -> list[str]:
         """Problems of the measurements so far."""
         return []
+
+    def keyframe_map(self) -> KeyframeMap | None:
+        """Keyframes as they can be saved; None where the estimator has no map frame. Poses are smoothed after `finish`."""
+        return None
 
     def map_points(self) -> Points2:
         """(M, 2) points of the map in the world [m]."""

@@ -67,6 +67,11 @@ class EkfFusion(Estimator):
         return NO_POINTS if self._sensor is None else self._sensor.scan_points()
 
     @property
+    def lidar_position(self) -> FloatArray:
+        """(2,) where the LiDAR of the last scan is in the body frame [m]; zero without a LiDAR."""
+        return np.zeros(2) if self._sensor is None else self._sensor.lidar_position()
+
+    @property
     def cell(self) -> float:
         """Edge of the submap's voxels [m]; 0 before the first scan."""
         return 0.0 if self._sensor is None else self._sensor.cell

@@ -22,6 +22,7 @@ from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, 
 from localization.events import PositionSample, Step
 from localization.lidar import OUTLIER_SIGMAS, LidarConfig, LostScans
 from localization.lidar.loop_detection import Keyframe, LoopDetector
+from localization.maps import KeyframeMap
 from localization.settings import Positive, Settings, Signed
 from localization.trajectory import Trajectory, through_nodes
 from motion_models import se2
@@ -81,7 +82,8 @@ class GraphFusion(Estimator):
         self._key, self._moved = 0, (np.zeros(3), np.zeros((3, 3)))  # last keyframe with a matched scan; motion since the last keyframe
         self._lost_variance = 0.0  # of the position in the odometry's frame at the last keyframe, if that had no matched scan [m^2]
         self._map_T_odom, self._key_cov = np.zeros(3), np.zeros((3, 3))
-        self._moving_s = 0.0
+        self._moving_s, self._end_ns = 0.0, 0
+        self._smoothed_covs: FloatArray | None = None
         self._positions: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []  # keyframe, offset, position, cov: not aligned yet
         self._waiting: list[PositionSample] = []
         self._is_aligned, self._failure = False, ""
@@ -107,7 +109,7 @@ class GraphFusion(Estimator):
         self.run_deferred()
         ekf = self.odometry.filter
         estimate = self.odometry.step(step)
-        self._is_matched = estimate.nis is not None
+        self._is_matched, self._end_ns = estimate.nis is not None, step.end_ns
         self._wheels.add(self.odometry.wheel_motion, self._corrections, self.odometry.is_turning, self.odometry.used_corrections)
         self._moving_s += 0.0 if step.is_standing else step.duration
         delta, cov = self._moved = self._motion_since_keyframe()
@@ -165,7 +167,7 @@ class GraphFusion(Estimator):
             self._key, self._lost_variance = k, 0.0
         self._moved = np.zeros(3), np.zeros((3, 3))
         self._wheels = MotionPreintegration(len(self._corrections.names))
-        self._close_loop(Keyframe(ekf.pose, self.odometry.scan_points))
+        self._close_loop(Keyframe(ekf.pose, self.odometry.scan_points, self._end_ns, self.odometry.lidar_position))
         self._align_positions()
         if len(self._corrections.names) and k:
             mean, cov = self.graph.corrections()
@@ -250,6 +252,7 @@ class GraphFusion(Estimator):
         except EstimatorError as error:
             self._failure = f"the trajectory could not be smoothed, and its poses are the live ones: {error}"
             return None
+        self._smoothed_covs = covs
         nodes, odom = np.array(self._nodes), np.array(self._steps).reshape(-1, 3)
         return Trajectory(filtered.stamps_ns, *through_nodes(odom, np.array(self._covs_since).reshape(-1, 3, 3), nodes, poses, covs))
 
@@ -286,6 +289,25 @@ class GraphFusion(Estimator):
             contradicted = f"{n} of {self.n_positions} positions are more than {OUTLIER_SIGMAS:g} sigma off wheels, gyro and LiDAR"
             found.append(f"{contradicted}: they count little. Check the receiver, its covariance and the antenna's lever arm.")
         return found
+
+    def keyframe_map(self) -> KeyframeMap | None:
+        """As `Estimator.keyframe_map`."""
+        keys, edges = self._loops.keyframes, [between for update in self.graph.updates for between in update.betweens]
+        if not keys:
+            return None
+        covs = self._smoothed_covs
+        return KeyframeMap(
+            stamps_ns=np.array([key.stamp_ns for key in keys], dtype=np.int64),
+            poses=self.graph.poses(),
+            covariances=np.array([self.graph.marginal(k) for k in range(len(keys))]) if covs is None else covs,
+            points=np.vstack([key.points for key in keys]).astype(np.float32),
+            counts=np.array([len(key.points) for key in keys], dtype=np.int64),
+            sensors=np.array([key.lidar for key in keys]),
+            edges=np.array([(edge.a, edge.b) for edge in edges], dtype=np.int64).reshape(-1, 2),
+            edge_deltas=np.array([edge.delta for edge in edges]).reshape(-1, 3),
+            edge_information=np.array([edge.information for edge in edges]).reshape(-1, 3, 3),
+            edge_is_loop=np.array([edge.is_loop for edge in edges], dtype=bool),
+        )
 
     def map_points(self) -> Points2:
         """(M, 2) the scans of all keyframes, where the graph has them [m]."""

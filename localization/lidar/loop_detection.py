@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -48,6 +48,9 @@ class Keyframe:
     """(3,) ``odom_T_body`` of the filter."""
     points: Points2
     """(N, 2) of its scan, in the body frame [m]."""
+    stamp_ns: int = 0
+    lidar: FloatArray = field(default_factory=lambda: np.zeros(2))
+    """(2,) where the LiDAR of the scan is in the body frame [m]."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,6 +48,7 @@ class ScanMatchingSensor:
         self._matcher: ScanMatcher | None = None
         self._kiss: KissIcp | None = None
         self._scan: _Scan | None = None
+        self._frame = ""  # of the last scan
         self._prior, self._cov = np.zeros(3), np.eye(3)
         self._last_key: FloatArray | None = None
         self._searching_since_s: float | None = None
@@ -63,7 +64,7 @@ class ScanMatchingSensor:
         The sweep is deskewed with ``twist`` (3,), the body's at the middle of the sweep. ``offset`` (3,): see `ScanMatcher.match`.
         """
         assert step.scan is not None
-        self._scan, self._prior, self._cov = None, prior, cov
+        self._scan, self._prior, self._cov, self._frame = None, prior, cov, step.scan.frame_id
         if self._stale.is_stale(step.scan, step.is_standing):
             self.lost.add(step.end_ns, "stale")
             return None
@@ -143,6 +144,11 @@ class ScanMatchingSensor:
     def scan_points(self) -> Points2:
         """(M, 2) the scan at hand in the body frame, or (0, 2)."""
         return np.empty((0, 2)) if self._scan is None else self._scan.planar
+
+    def lidar_position(self) -> FloatArray:
+        """(2,) where the LiDAR of the last scan is in the body frame [m]."""
+        mount = self._mounts.get(self._frame, Mount())
+        return np.array([mount.x, mount.y])
 
     def map_points(self) -> Points2:
         """(M, 2) the submap in the odometry frame [m]."""

@@ -1,0 +1,110 @@
+"""`skidloc map`: what a saved map holds, and its export for planners and viewers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from localization.commands.common import new_folder, print_line, write_json
+from localization.maps import SavedMap, load_map
+from localization.output import check_outputs
+
+
+@dataclass(frozen=True)
+class MapInfo:
+    """Show what a map holds and where it comes from."""
+
+    file: tyro.conf.Positional[Path]
+    """Map written by `skidloc replay --save-map`."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write the same to this file as well."""
+
+    def run(self, console: Console) -> None:
+        """Run the command. Raises `SkidlocError` for input that cannot be used."""
+        check_outputs(self.json)
+        found = summary(load_map(self.file))
+        for line in _lines(found):
+            print_line(console, line)
+        if self.json is not None:
+            write_json(self.json, found)
+
+
+@dataclass(frozen=True)
+class MapExport:
+    """Write a map as map_server's .pgm and .yaml, as .png, and its points as .ply."""
+
+    file: tyro.conf.Positional[Path]
+    """Map written by `skidloc replay --save-map`."""
+    out: Path
+    """New folder for map.pgm, map.yaml (map_server, nav2), map.png and map.ply."""
+    resolution: float = 0.05
+    """Side of a cell [m]."""
+
+    def run(self, console: Console) -> None:
+        """Run the command. Raises `SkidlocError` for input that cannot be used."""
+        from localization.maps.export import exports
+        from localization.maps.grid import make_grid
+
+        check_outputs(self.out)
+        mapped = load_map(self.file).map
+        grid = make_grid(mapped, self.resolution)
+        with new_folder(self.out) as folder:
+            for name, content in exports(grid, mapped).items():
+                (folder / name).write_bytes(content)
+        height, width = grid.cells.shape
+        print_line(console, f"{width} x {height} cells of {self.resolution:g} m: {self.out / 'map.yaml'}")
+
+
+@dataclass(frozen=True)
+class Map:
+    """Show a saved map, or export it for planners and viewers."""
+
+    action: tyro.conf.OmitSubcommandPrefixes[
+        Annotated[MapInfo, tyro.conf.subcommand("info")] | Annotated[MapExport, tyro.conf.subcommand("export")]
+    ]
+
+    def run(self, console: Console) -> None:
+        """Run the command. Raises `SkidlocError` for input that cannot be used."""
+        self.action.run(console)
+
+
+def summary(saved: SavedMap) -> dict[str, Any]:
+    """Size, extent [m] and uncertainty of a map, and its provenance."""
+    mapped = saved.map
+    points = mapped.points_in_map()
+    size = np.ptp(points, axis=0) if len(points) else np.zeros(2)
+    sigma = np.sqrt(np.trace(mapped.covariances[:, :2, :2], axis1=1, axis2=2)).max()
+    return {
+        "keyframes": len(mapped.poses),
+        "points": len(mapped.points),
+        "loop_closures": int(mapped.edge_is_loop.sum()),
+        "size_m": size.round(2).tolist(),
+        "sigma_m": round(float(sigma), 4),
+        **saved.provenance,
+    }
+
+
+def _lines(found: Mapping[str, Any]) -> list[str]:
+    width, height = found["size_m"]
+    lines = [
+        f"{found['keyframes']} keyframes with {found['points']} points and {found['loop_closures']} loop closures",
+        f"{width:.1f} m x {height:.1f} m; positions of keyframes have a sigma of at most {found['sigma_m']:.3f} m against the first",
+    ]
+    named = [f"{key} {found[key]}" for key in ("log", "robot", "model", "corrections") if found.get(key)]
+    mounts = found.get("mounts")
+    sensors = [f"{name} at {_numbers(mount)}" for name, mount in mounts.items()] if isinstance(mounts, dict) else []
+    return [*lines, *(", ".join(part) for part in (named, sensors) if part)]
+
+
+def _numbers(mount: Any) -> str:
+    """x, y, z [m] and yaw [deg] of a mount, as far as it has them."""
+    values = mount if isinstance(mount, dict) else {}
+    x, y, z, yaw = (values[key] if isinstance(values.get(key), (int, float)) else math.nan for key in ("x", "y", "z", "yaw"))
+    return f"({x:g}, {y:g}, {z:g}) m, {math.degrees(yaw):g} deg"

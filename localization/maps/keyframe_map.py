@@ -1,0 +1,48 @@
+"""The map of a pose graph: keyframe poses, the scan of each, and the motions that were measured between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motion_models import se2
+from motion_models.se2 import FloatArray, Points2
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeMap:
+    """K keyframes with M scan points in all, and E measured motions."""
+
+    stamps_ns: IntArray
+    """(K,)"""
+    poses: FloatArray
+    """(K, 3) ``map_T_body`` [m, m, rad]."""
+    covariances: FloatArray
+    """(K, 3, 3) of their right perturbations."""
+    points: NDArray[np.float32]
+    """(M, 2) scan points of all keyframes, one after the other, each in the body frame of its keyframe [m]."""
+    counts: IntArray
+    """(K,) points of each keyframe; 0 where it has no scan."""
+    sensors: FloatArray
+    """(K, 2) where the LiDAR of the scan is in the body frame [m]: beams start there."""
+    edges: IntArray
+    """(E, 2) keyframes a and b of each motion measured by gyro and scans."""
+    edge_deltas: FloatArray
+    """(E, 3) ``a_T_b``."""
+    edge_information: FloatArray
+    """(E, 3, 3) of their right perturbations."""
+    edge_is_loop: NDArray[np.bool_]
+    """(E,) whether it is a loop closure."""
+
+    def scans(self) -> list[Points2]:
+        """The points (n, 2) of each keyframe in its body frame [m]."""
+        return np.split(self.points.astype(float), np.cumsum(self.counts)[:-1])
+
+    def points_in_map(self) -> Points2:
+        """(M, 2) all points in the map's frame [m]."""
+        moved = [se2.transform(pose, scan) for pose, scan in zip(self.poses, self.scans(), strict=True) if len(scan)]
+        return np.vstack(moved) if moved else np.empty((0, 2))

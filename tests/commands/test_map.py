@@ -1,0 +1,79 @@
+"""`replay --save-map`, `skidloc map info` and `skidloc map export` from end to end."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from localization.cli import main
+from localization.maps import load_map
+from tests.helpers import bags, rooms
+
+
+def replay(log: Path, out: Path, *more: object) -> int:
+    return main(["replay", str(log), "--robot", "vaultbot", "--model", "diff_drive", "--out", str(out), *map(str, more)])
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return bags.write_mcap(tmp_path_factory.mktemp("log") / "room.mcap", rooms.drive(15.0))
+
+
+@pytest.fixture(scope="module")
+def saved(log: Path) -> Path:
+    path = log.parent / "room.skidmap"
+    assert replay(log, log.parent / "first", "--estimator", "ekf,graph", "--save-map", path) == 0
+    return path
+
+
+def test_save_map_holds_the_rooms_walls_and_provenance(saved: Path) -> None:
+    found = load_map(saved)
+    x, y = found.map.points_in_map().T
+    off = np.min([np.abs(x - rooms.X[0]), np.abs(x - rooms.X[1]), np.abs(y - rooms.Y[0]), np.abs(y - rooms.Y[1])], axis=0)
+    assert np.quantile(off, 0.95) < 0.1
+    assert len(found.map.poses) >= 5
+    assert found.provenance["robot"] == "vaultbot"
+    assert found.provenance["log_fingerprint"]
+    assert (found.map.stamps_ns[1:] > found.map.stamps_ns[:-1]).all()
+
+
+def test_save_map_twice_gives_equal_bytes(log: Path, saved: Path, tmp_path: Path) -> None:
+    assert replay(log, tmp_path / "again", "--estimator", "graph", "--save-map", tmp_path / "again.skidmap") == 0
+    assert (tmp_path / "again.skidmap").read_bytes() == saved.read_bytes()
+
+
+def test_map_info_gives_size_and_source(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["map", "info", str(saved), "--json", str(tmp_path / "info.json")]) == 0
+    text = capsys.readouterr().out
+    assert "robot vaultbot" in text
+    found = json.loads((tmp_path / "info.json").read_text())
+    np.testing.assert_allclose(found["size_m"], [rooms.X[1] - rooms.X[0], rooms.Y[1] - rooms.Y[0]], atol=0.3)
+
+
+def test_map_export_writes_a_folder_once(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "exported"
+    assert main(["map", "export", str(saved), "--out", str(out)]) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["map.pgm", "map.ply", "map.png", "map.yaml"]
+    assert 0.5 < np.mean(np.asarray(Image.open(out / "map.pgm")) == 254) < 0.98
+    capsys.readouterr()
+    assert main(["map", "export", str(saved), "--out", str(out)]) == 2
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_map_of_a_truncated_file_exits_with_2(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cut = tmp_path / "cut.skidmap"
+    cut.write_bytes(saved.read_bytes()[:1000])
+    assert main(["map", "export", str(cut), "--out", str(tmp_path / "out")]) == 2
+    assert "truncated" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_save_map_without_a_graph_or_onto_a_file_is_refused(log: Path, saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert replay(log, log.parent / "other", "--estimator", "ekf", "--save-map", log.parent / "other.skidmap") == 2
+    assert "--estimator" in capsys.readouterr().err
+    assert replay(log, log.parent / "other", "--estimator", "graph", "--save-map", saved) == 2
+    assert "exists already" in capsys.readouterr().err

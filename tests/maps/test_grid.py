@@ -1,0 +1,106 @@
+"""Grids of a square room: walls where they are, free space inside, unknown outside; files as map_server reads them."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from localization.errors import MapError
+from localization.maps.export import exports
+from localization.maps.grid import make_grid
+from tests.helpers import square_room
+
+ROOM = square_room.make_map()
+CELL = 0.05
+
+
+def value_at(grid, x: float, y: float) -> int:
+    return int(grid.cells[int((y - grid.origin[1]) // grid.resolution), int((x - grid.origin[0]) // grid.resolution)])
+
+
+def test_grid_of_a_room_has_walls_free_and_unknown_cells() -> None:
+    grid = make_grid(ROOM, CELL)
+    for along in np.linspace(-1.9, 1.9, 39):
+        at_walls = [(along, square_room.HALF), (along, -square_room.HALF), (square_room.HALF, along), (-square_room.HALF, along)]
+        for x, y in at_walls:
+            near = [value_at(grid, x + dx, y + dy) for dx in (-0.01, 0.01) for dy in (-0.01, 0.01)]
+            assert 100 in near
+        assert value_at(grid, along, 0.0) == 0
+        assert value_at(grid, along, square_room.HALF + 0.12) == -1
+    inside = [value_at(grid, x, y) for x in np.arange(-1.85, 1.9, 0.1) for y in np.arange(-1.85, 1.9, 0.1)]
+    assert inside == [0] * len(inside)
+
+
+def test_grid_cells_seen_free_by_one_scan_alone_are_unknown() -> None:
+    """A single pass is no proof of free space: p = 0.35, above nav2's limit of 0.25."""
+    grid = make_grid(square_room.make_map(square_room.POSES[:1]), CELL)
+    assert value_at(grid, 1.0, 1.0) == -1
+    assert (grid.cells == 100).any()
+
+
+def test_grid_beams_start_at_the_lidar() -> None:
+    """A body whose LiDAR is 1 m ahead draws no free space through the wall between body and LiDAR's room."""
+    poses = np.tile([-2.5, 0.0, 0.0], (3, 1))
+    points = np.tile(np.array([[1.5, 0.0]], np.float32), (3, 1))  # one beam, of 0.5 m
+    moved = dataclasses.replace(
+        square_room.make_map(), poses=poses, points=points, counts=np.ones(3, np.int64), sensors=np.tile([1.0, 0.0], (3, 1))
+    )
+    grid = make_grid(moved, CELL)
+    assert value_at(grid, -1.3, 0.01) == 0
+    assert value_at(grid, -1.7, 0.01) == -1
+
+
+@pytest.mark.parametrize("resolution", [0.0, -1.0, float("nan"), 1e-5])
+def test_grid_of_a_resolution_without_sense_is_refused(resolution: float) -> None:
+    with pytest.raises(MapError, match="resolution"):
+        make_grid(ROOM, resolution)
+
+
+def test_grid_of_points_beyond_all_measure_is_refused() -> None:
+    with pytest.raises(MapError, match="million cells"):
+        make_grid(dataclasses.replace(ROOM, poses=ROOM.poses + [1e306, 0.0, 0.0] * (np.arange(3) % 2)[:, None]), CELL)
+
+
+def test_grid_of_a_map_without_scans_is_refused() -> None:
+    empty = dataclasses.replace(ROOM, points=np.empty((0, 2), np.float32), counts=np.zeros(3, np.int64))
+    with pytest.raises(MapError, match="no scan points"):
+        make_grid(empty, CELL)
+
+
+def read_as_map_server(files: dict[str, bytes]) -> tuple[np.ndarray, dict]:
+    """Occupancy by map_server's rules (trinary): (H, W), row 0 at the smallest y; and the YAML. PIL and PyYAML are independent readers."""
+    about = yaml.safe_load(files["map.yaml"])
+    image = np.asarray(Image.open(io.BytesIO(files[about["image"]])), dtype=float)
+    share = (255.0 - image) / 255.0
+    occupancy = np.where(share > about["occupied_thresh"], 100, np.where(share < about["free_thresh"], 0, -1))
+    return occupancy[::-1], about
+
+
+def test_export_read_by_map_servers_rules_is_the_grid() -> None:
+    grid = make_grid(ROOM, CELL)
+    occupancy, about = read_as_map_server(exports(grid, ROOM))
+    np.testing.assert_array_equal(occupancy, grid.cells)
+    assert about["resolution"] == CELL
+    assert about["origin"] == pytest.approx([*grid.origin, 0.0])
+    assert about["negate"] == 0
+    assert about["mode"] == "trinary"
+
+
+def test_export_png_and_pgm_are_the_same_picture() -> None:
+    files = exports(make_grid(ROOM, CELL), ROOM)
+    pictures = [np.asarray(Image.open(io.BytesIO(files[name]))) for name in ("map.pgm", "map.png")]
+    np.testing.assert_array_equal(*pictures)
+
+
+def test_export_ply_has_the_points() -> None:
+    head, body = exports(make_grid(ROOM, CELL), ROOM)["map.ply"].split(b"end_header\n", 1)
+    assert b"format binary_little_endian 1.0" in head
+    assert f"element vertex {len(ROOM.points)}".encode() in head
+    points = np.frombuffer(body, "<f4").reshape(-1, 3)
+    np.testing.assert_allclose(points[:, :2], ROOM.points_in_map(), atol=1e-6)
+    assert not points[:, 2].any()
