@@ -30,11 +30,11 @@ from localization.logs.decode import (
     decode_cloud,
     decode_imu,
     decode_odometry,
-    joint_decoder,
     scan_decoder,
     stamp_ns,
 )
 from localization.logs.topic_roles import Sources, TopicSource
+from localization.logs.wheel_messages import ODOMETRY_DECODERS, wheel_decoder
 from motion_models.center_of_gravity.model import CgModel, CgTracker
 from motion_models.center_of_gravity.parts import support_margin
 from motion_models.robot import Clock, Driver, Geometry, Robot
@@ -88,11 +88,13 @@ class EventDecoder:
         """``joints``: names of the left and of the right wheels' joints."""
         self._sources, self._joints, self._arms = sources, joints, arms
         wheels = "" if sources.wheels is None else sources.wheels.topic
+        odometry_type = "" if sources.wheels is None else sources.wheels.type
+        self._of_wheels = wheel_decoder((*joints[0], *joints[1]))
         left, right = joints
         self._multipliers = robot.geometry.radius_multipliers
         self._has_multipliers = bool((self._multipliers != 1.0).any())
         self.from_joints = JointsToWheels(left, right, robot.geometry.wheel_radius_m, wheels, stats)
-        self.from_odometry = OdometryToWheels(robot.driver, wheels, stats)
+        self.from_odometry = OdometryToWheels(robot.driver, wheels, stats, is_whole=odometry_type not in ODOMETRY_DECODERS)
         named = " and ".join(source.topic for source in sources.arms)
         self._from_arms = None if arms is None else make_arm_cg_converter(arms, robot.geometry, named, stats)
         cg_topic = "" if sources.center_of_gravity is None else sources.center_of_gravity.topic
@@ -127,15 +129,16 @@ class EventDecoder:
 
     def _decoder(self, source: TopicSource) -> MessageDecoder:
         if source.kind == "joint_states":
-            wheels = self._sources.wheels
-            is_wheels = wheels is not None and wheels.topic == source.topic
-            of_wheels = joint_decoder((*self._joints[0], *self._joints[1])) if is_wheels else None
+            is_wheels = any(wheels.topic == source.topic for wheels in self._sources.all_wheels)
+            of_wheels = self._of_wheels if is_wheels else None
             if self._arms is not None and any(arm.topic == source.topic for arm in self._sources.arms):
                 return arm_decoder(frozenset(self._arms.chain.joint_names), of_wheels)
             assert of_wheels is not None
             return of_wheels
         if source.kind == "scan":
             return scan_decoder()
+        if source.type in ODOMETRY_DECODERS:
+            return ODOMETRY_DECODERS[source.type]()
         decoders: dict[str, MessageDecoder] = {
             "odometry": decode_odometry,
             "imu": decode_imu,
@@ -161,7 +164,7 @@ def decode_item(topic: str, log_ns: int, read: Callable[[], Any], decoder: Topic
     rank, decode, late_ns = decoder
     try:
         message = read()
-        stamp = stamp_ns(message) - late_ns
+        stamp = (stamp_ns(message) if hasattr(message, "header") else 0) - late_ns
         payload = decode(message, stamp)
     except UnusableError as reason:
         stats.count(topic, reason.oddity)
@@ -173,7 +176,7 @@ def decode_item(topic: str, log_ns: int, read: Callable[[], Any], decoder: Topic
         return None
     if isinstance(payload, ArmReading) and payload.wheels is None:
         rank = _RANKS["center_of_gravity"]
-    return Item(log_ns, stamp, topic, rank, _SCAN_WEIGHT if rank == 3 else 1, payload)
+    return Item(log_ns, payload.stamp_ns, topic, rank, _SCAN_WEIGHT if rank == 3 else 1, payload)
 
 
 def make_arm_cg_converter(
@@ -383,7 +386,9 @@ class OdometryToWheels:
     one of the two.
     """
 
-    def __init__(self, driver: Driver, topic: str, stats: MessageStats) -> None:
+    def __init__(self, driver: Driver, topic: str, stats: MessageStats, *, is_whole: bool = True) -> None:
+        """``is_whole``: messages have a pose and a twist by their type; where they do not, its absence is not counted."""
+        self._is_whole = is_whole
         self._radius = driver.wheel_radius_m
         self._half_track = 0.5 * driver.wheel_separation_multiplier * driver.track_width_m
         self._topic, self._stats = topic, stats
@@ -406,6 +411,9 @@ class OdometryToWheels:
         twist_is_known = math.isfinite(vx) and math.isfinite(wz) and not is_out_of_range
         self._twist_has_moved |= twist_is_known and bool(vx != 0.0 or wz != 0.0)
         rate = self._wheels(vx, wz) if twist_is_known else np.full(2, np.nan)
+        if not self._is_whole and not math.isfinite(sum(reading.pose)):
+            yield WheelSample(reading.stamp_ns, rate, np.full(2, np.nan))
+            return
         previous = self._previous
         if previous is not None:
             dt = (reading.stamp_ns - previous.stamp_ns) * 1e-9
@@ -424,7 +432,8 @@ class OdometryToWheels:
                 forward, turn = from_twist
             increment = self._wheels(forward, turn)
             if not self._twist_has_moved and moved and dt > 0.0:
-                self._stats.count(self._topic, Oddity.NO_TWIST)
+                if self._is_whole:
+                    self._stats.count(self._topic, Oddity.NO_TWIST)
                 rate = increment / dt
             self._angle = self._angle + increment
         self._previous = reading

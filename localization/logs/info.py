@@ -136,6 +136,7 @@ def inspect_log(log: Log) -> LogInfo:
         "center_of_gravity": log.sources.center_of_gravity,
     }
     role_of = {source.topic: part for part, source in parts.items() if source is not None}
+    role_of.update((source.topic, "wheels") for source in log.sources.more_wheels)
     for source in log.sources.arms:
         role_of.setdefault(source.topic, "arms")
     if log.sources.arms:
@@ -172,12 +173,16 @@ def inspect_log(log: Log) -> LogInfo:
         log.duration_s,
         sum(channel.count for channel in log.channels),
         topics,
-        {part: None if source is None else dataclasses.asdict(source) for part, source in parts.items()},
+        {part: None if source is None else _description(source) for part, source in parts.items()},
         sorted(c.topic for c in log.channels if c.type in REFERENCE_TYPES and c.count and role_of.get(c.topic) != "wheels"),
         {frame: dataclasses.asdict(mount) for frame, mount in sorted(mounts.items())},
         _find_problems(log, topics),
         log.warnings(),
     )
+
+
+def _description(source: TopicSource) -> dict[str, str]:
+    return {"topic": source.topic, "kind": source.kind, "chosen_by": source.chosen_by}
 
 
 def header_stamp_ns(data: bytes, *, is_ros1: bool) -> int:

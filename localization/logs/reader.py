@@ -7,7 +7,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import cached_property, partial
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -24,12 +24,13 @@ from localization.logs.references import reference_decoder
 from localization.logs.serialization import LogDeserializer
 from localization.logs.topic_roles import REFERENCE_TYPES, TopicChooser, TopicOverrides, choose_roles
 from localization.logs.transforms import FixedTransforms
+from localization.logs.wheel_messages import TF_TYPES, odometry_edge
 from motion_models.robot import Mount, Robot
 from motion_models.text_files import check_file
 
 _GPS = "/fix"
-_TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _TF_READ_NS = 10_000_000_000  # of ROS 1, where static transforms are repeated every 0.1 to 1 s on /tf
+_TRANSFORMS_READ = 2000  # first messages of /tf that are searched for the odometry's
 _JOINT_STATES_READ = 500  # first messages that are searched for joint names
 
 _MAX_METADATA_BYTES = 4 << 20
@@ -73,7 +74,7 @@ class Log:
         self._stats_by_topic: dict[str, MessageStats] = {}
         self._overrides = topics
         self._chooser = TopicChooser(path.name, self.channels, robot, topics)
-        roles = choose_roles(path.name, self._chooser, robot, topics, self._joint_names)
+        roles = choose_roles(path.name, self._chooser, robot, topics, self._joint_names, self._odometry_edge)
         self.sources = roles.sources
         """Topic of each role."""
         self.wheels_error = roles.wheels_error
@@ -122,7 +123,7 @@ class Log:
     def mounts(self) -> Mapping[str, Mount]:
         """Pose of each sensor's frame in the body frame: the log's, and the robot file's for frames that are missing in the log."""
         transforms = FixedTransforms()
-        tf = [channel for channel in self.channels if channel.type in _TF_TYPES]
+        tf = [channel for channel in self.channels if channel.type in TF_TYPES]
         static = [channel for channel in tf if channel.topic.endswith("tf_static")]
         decode = LogDeserializer(tf, is_ros1=self.source.is_ros1)
         left = sum(channel.count for channel in static)
@@ -182,6 +183,12 @@ class Log:
 
     def _joint_names(self, topic: str) -> Iterator[list[str]]:
         return (message.name for _, message in self._first_messages(topic, _JOINT_STATES_READ))
+
+    def _odometry_edge(self, topic: str) -> tuple[str, str] | None:
+        decode = LogDeserializer([c for c in self.channels if c.topic == topic], is_ros1=self.source.is_ros1)
+        return odometry_edge(
+            message for raw in islice(self.source.messages([topic]), _TRANSFORMS_READ) if (message := _or_none(decode, raw))
+        )
 
     def _plan_event_clocks(self) -> ClockPlan:
         return self._clock_plan([source.topic for source in self.sources.used()])
@@ -264,6 +271,13 @@ class SplitSource:
         """As `Source.messages`."""
         for part in self._parts:
             yield from part.messages(topics)
+
+
+def _or_none(decode: Callable[[RawMessage], Any], raw: RawMessage) -> Any:
+    try:
+        return decode(raw)
+    except UnusableError:
+        return None
 
 
 def _try(action: Callable[[], None]) -> None:

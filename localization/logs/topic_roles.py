@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from localization.errors import TopicError
 from localization.logs.chunks import Channel
+from localization.logs.wheel_messages import TF_TYPES, TWIST_TYPES, is_measured_twist
 from motion_models.center_of_gravity.files import arms_model
 from motion_models.center_of_gravity.model import CgModel
 from motion_models.robot import Robot
@@ -61,6 +62,8 @@ class TopicSource:
     """Its entry in [topics] of the robot file, which sets the message type (`TYPES`)."""
     chosen_by: str
     """"option", "robot" or "only" (the only one of its type in the log)."""
+    type: str = ""
+    """Message type, where it is another than that of ``kind``."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +76,17 @@ class Sources:
     center_of_gravity: TopicSource | None
     arms: tuple[TopicSource, ...] = ()
     """Joint states of the arms, from which the centre of gravity is computed where no topic has it; one may be the wheels' too."""
+    more_wheels: tuple[TopicSource, ...] = ()
+    """Joint states of the other wheels, where ``wheels`` has some of them only."""
+
+    @property
+    def all_wheels(self) -> tuple[TopicSource, ...]:
+        """Topics of the wheels."""
+        return (*(() if self.wheels is None else (self.wheels,)), *self.more_wheels)
 
     def used(self) -> list[TopicSource]:
         """Each topic once."""
-        others = [s for s in (self.wheels, self.center_of_gravity, self.imu, self.lidar) if s is not None]
+        others = [*self.all_wheels, *(s for s in (self.center_of_gravity, self.imu, self.lidar) if s is not None)]
         return others + [arm for arm in self.arms if all(arm.topic != other.topic for other in others)]
 
 
@@ -98,12 +108,17 @@ class TopicChooser:
         """Topics of one of these types, sorted."""
         return sorted(topic for topic, kind in self._types.items() if kind in types)
 
+    def type_of(self, topic: str) -> str:
+        """Type of a topic's messages; "" where the log has none of it."""
+        return self._types.get(topic, "")
+
     def find_named(self, kind: str) -> TopicSource | None:
         """The topic that an option or the robot file names. Raises `TopicError` if an option names one that does not fit."""
         wanted = getattr(self._overrides, kind)
         if wanted:
-            self.require(wanted, (TYPES[kind],), f"--topic.{kind.replace('_', '-')}")
-            return TopicSource(wanted, kind, "option")
+            others = (*TWIST_TYPES, *TF_TYPES) if kind == "odometry" else ()
+            self.require(wanted, (TYPES[kind], *others), f"--topic.{kind.replace('_', '-')}")
+            return TopicSource(wanted, kind, "option", self.type_of(wanted) if self.type_of(wanted) in others else "")
         topic = getattr(self._robot.topics, kind)
         if wanted is None and self._types.get(topic) == TYPES[kind]:
             return TopicSource(topic, kind, "robot")
@@ -143,6 +158,9 @@ def short_type(name: str) -> str:
 JointNames = Callable[[str], Iterable[Iterable[str]]]
 """Names of the joints in each of the first messages of a topic."""
 
+OdometryEdge = Callable[[str], tuple[str, str] | None]
+"""Parent and child of the odometry's transform on a topic of /tf."""
+
 Sides = tuple[tuple[str, ...], tuple[str, ...]]
 """Joints of the left and of the right wheels."""
 
@@ -161,23 +179,34 @@ class TopicRoles:
     warnings: list[str]
 
 
-def choose_roles(log: str, chooser: TopicChooser, robot: Robot, overrides: TopicOverrides, joint_names: JointNames) -> TopicRoles:
+def choose_roles(
+    log: str,
+    chooser: TopicChooser,
+    robot: Robot,
+    overrides: TopicOverrides,
+    joint_names: JointNames,
+    odometry_edge: OdometryEdge = lambda topic: None,
+) -> TopicRoles:
     """Choose a topic for each role. Raises `TopicError` if an option names a topic that does not fit, and what `arms_model` does."""
-    return _RoleChooser(log, chooser, robot, overrides, joint_names).choose()
+    return _RoleChooser(log, chooser, robot, overrides, joint_names, odometry_edge).choose()
 
 
 class _RoleChooser:
-    def __init__(self, log: str, chooser: TopicChooser, robot: Robot, overrides: TopicOverrides, joint_names: JointNames) -> None:
+    def __init__(
+        self, log: str, chooser: TopicChooser, robot: Robot, overrides: TopicOverrides, joint_names: JointNames, odometry_edge: OdometryEdge
+    ) -> None:
+        self._odometry_edge = odometry_edge
         self._log, self._chooser, self._robot = log, chooser, robot
         self._overrides, self._joint_names = overrides, joint_names
         self._joints: Sides = ((), ())
+        self._more_wheels: tuple[TopicSource, ...] = ()
         self._error: TopicError | None = None
         self._warnings: list[str] = []
 
     def choose(self) -> TopicRoles:
         wheels, lidar, imu, center_of_gravity = self._wheels(), self._lidar(), self._choose("imu"), self._choose("center_of_gravity")
         arms, model = self._arms() if center_of_gravity is None else ((), None)
-        sources = Sources(wheels, lidar, imu, center_of_gravity, arms)
+        sources = Sources(wheels, lidar, imu, center_of_gravity, arms, self._more_wheels)
         return TopicRoles(sources, self._joints, self._error, model, [*self._chooser.warnings, *self._warnings])
 
     def _arms(self) -> tuple[tuple[TopicSource, ...], CgModel | None]:
@@ -233,8 +262,10 @@ class _RoleChooser:
             candidates = self._chooser.of_type(TYPES["joint_states"]) if self._overrides.joint_states is None else []
         known: set[str] = set()
         fitting = []
+        self._names: dict[str, set[str]] = {}
         for topic in candidates:
             names, joints = self._wheel_joints(topic)
+            self._names[topic] = names
             known |= names
             if joints is not None:
                 fitting.append((topic, joints))
@@ -248,7 +279,28 @@ class _RoleChooser:
         if len(fitting) > 1:
             topics = ", ".join(topic for topic, _ in fitting)
             self._warnings.append(f"{topics} all have the wheel joints; name one with --topic.joint-states.")
+        elif (parts := self._wheels_in_parts(candidates)) is not None:
+            return parts
         return self._odometry(named, known, bool(candidates) and not fitting)
+
+    def _wheels_in_parts(self, candidates: list[str]) -> TopicSource | None:
+        """Joint states of single wheels or sides, in messages or topics of their own; None where a side has none."""
+        wanted = self._robot.joints
+        topics, _ = cover_joints((*wanted.left, *wanted.right), {topic: self._names[topic] for topic in candidates})
+        names = set().union(*(self._names[topic] for topic in topics))
+        left, right = (tuple(joint for joint in side if joint in names) for side in (wanted.left, wanted.right))
+        if not left or not right:
+            return None
+        self._joints = left, right
+        found = [self._chooser.find_named("joint_states") or TopicSource(topic, "joint_states", "only") for topic in topics[:1]]
+        self._more_wheels = tuple(TopicSource(topic, "joint_states", "only") for topic in topics[1:])
+        absent = [joint for joint in (*wanted.left, *wanted.right) if joint not in names]
+        rest = f" None has {', '.join(absent)}; their sides are the mean of the others." if absent else ""
+        self._warnings.append(
+            f"{', '.join(topics)} has no message with the wheels of both sides: those of {', '.join((*left, *right))} are put together,"
+            f" each interpolated between its stamps.{rest}"
+        )
+        return found[0]
 
     def _odometry(self, joint_states: TopicSource | None, known: set[str], is_missing_joints: bool) -> TopicSource | None:
         """The odometry, where no joint states have the wheels."""
@@ -258,7 +310,7 @@ class _RoleChooser:
         )
         if joint_states is not None and joint_states.chosen_by == "option":
             raise TopicError(f"{missing_joints}. Name them in the robot file's [joints].")
-        odometry = self._choose("odometry")
+        odometry = self._choose("odometry") or self._other_odometry()
         if is_missing_joints and odometry is not None:
             self._warnings.append(f"{missing_joints}; the wheels are taken from {odometry.topic}.")
         elif is_missing_joints:
@@ -266,6 +318,31 @@ class _RoleChooser:
                 f"{missing_joints}. Name them in the robot file's [joints], or go without wheels by an empty --topic.joint-states."
             )
         return odometry
+
+    def _other_odometry(self) -> TopicSource | None:
+        """A measured velocity, else the odometry frame on /tf, where the log has neither joint states nor an Odometry of the driver."""
+        if self._overrides.odometry is not None or self._overrides.joint_states:
+            return None
+        twists = [topic for topic in self._chooser.of_type(*TWIST_TYPES) if is_measured_twist(topic)]
+        if len(twists) > 1:
+            self._warnings.append(f"{', '.join(twists)} could each be the wheels' velocity; name one with --topic.odometry.")
+        transforms = [topic for topic in self._chooser.of_type(*TF_TYPES) if not topic.endswith("_static")]
+        topics = twists or transforms
+        if len(topics) != 1:
+            return None
+        topic = topics[0]
+        source = TopicSource(topic, "odometry", "only", self._chooser.type_of(topic))
+        what = "velocity"
+        if source.type in TF_TYPES:
+            edge = self._odometry_edge(topic)
+            if edge is None:
+                return None
+            what = f"transform from '{edge[0]}' to '{edge[1]}'"
+        self._warnings.append(
+            f"{topic}: its {what} is used as the wheels' odometry: the log has neither joint states of wheels nor the driver's Odometry."
+            " If another node makes it (a command, a filter), record the wheels, or leave it out by an empty --topic.odometry."
+        )
+        return source
 
     def _wheel_joints(self, topic: str) -> tuple[set[str], Sides | None]:
         """All joint names of a topic's first messages, and the left and right wheels' among them if both sides have some."""

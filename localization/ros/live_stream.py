@@ -47,7 +47,7 @@ class LiveStream:
         self.sources: Sources = parts.sources
         self._event_decoder = EventDecoder(parts.sources, parts.joints, parts.arms, robot, stats)
         self._merger = Merger(discovered.plan, stats, wait_ns=None)
-        self._decoders = {source.topic: decoder(TYPES[source.kind], is_ros1=is_ros1) for source in parts.sources.used()}
+        self._decoders = {source.topic: decoder(source.type or TYPES[source.kind], is_ros1=is_ros1) for source in parts.sources.used()}
         self._rates = {source.topic: _TopicRate() for source in parts.sources.used()}
         self.payloads = Payloads(robot, parts.arms, discovered.mounts)
 
