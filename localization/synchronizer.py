@@ -92,7 +92,7 @@ class Synchronizer:
 
     def __init__(self, model: MotionModel, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: StepConfig | None = None):
         self.config = config or StepConfig()
-        self.model, self._robot = model, robot
+        self.model, self._wheel_noise = model, robot.wheel_noise
         self.params = model.nominal
         self._wheels = WheelBuffer(robot.center_of_gravity)
         self._gyro = GyroBuffer(robot.gyro_noise, mounts)
@@ -243,7 +243,7 @@ class Synchronizer:
         n = len(before)
         twist = self.model.twist(np.vstack([before, rates]), np.vstack([before_cg, cg]), self.params)
         inside = Twist(twist.value[n:], twist.d_wheels[n:], twist.d_cg[n:], twist.d_params[n:])
-        motion = integrate_twists(dt, inside, self._robot.wheel_noise)
+        motion = integrate_twists(dt, inside, self._wheel_noise)
         first, last = twist.value[0], twist.value[-1]
         return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last
 

@@ -7,8 +7,10 @@ import hashlib
 import json
 import os
 import pickle
+import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -326,3 +328,21 @@ def test_serialize_does_not_write_shared_objects():
     model = make_model("skid_steer", ROBOT)
     pair = Trial(model, "ekf")
     assert deserialize(*serialize([pair, model], {"model": model}), {"model": model})[1] is model
+
+
+def test_checkpoint_killed_at_any_moment_is_whole(tmp_path):
+    """kill -9, twenty times, while states of a megabyte are written one after another."""
+    path, rng = tmp_path / "state", np.random.default_rng(0)
+    write_checkpoint(path, [0], {"events": 0}, {}, {})
+    for _ in range(20):
+        events = read_head(path)["events"]
+        child = os.fork()
+        if child == 0:
+            for count in range(events + 1, events + 10**6):
+                write_checkpoint(path, np.full(2**17, count), {"events": count}, {}, {})
+        time.sleep(rng.uniform(0.0, 0.05))
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        found = read_checkpoint(path, {}, {})
+        assert np.all(np.asarray(found.value) == found.head["events"])
+    assert read_head(path)["events"] > 20
