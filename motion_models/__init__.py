@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from motion_models.robot import Robot, load_robot, parse_robot, robot_names
     from motion_models.robot_file import robot_toml
     from motion_models.skid_steer import SkidSteer, thesis_coefficients
+    from motion_models.slope import Slope, SlopeTwist
 
 __all__ = [
     "MODELS",
@@ -70,6 +71,8 @@ __all__ = [
     "SkidPrior",
     "SkidSteer",
     "SkidlocError",
+    "Slope",
+    "SlopeTwist",
     "StaticPart",
     "Tolerances",
     "Twist",
@@ -137,6 +140,7 @@ _MODULES = {
     "motion_models.robot": "Robot load_robot parse_robot robot_names",
     "motion_models.robot_file": "robot_toml",
     "motion_models.skid_steer": "SkidSteer thesis_coefficients",
+    "motion_models.slope": "Slope SlopeTwist",
 }
 
 

@@ -4,7 +4,7 @@ In steady motion friction, rolling resistance and, where it is modelled, the cen
 solves the three equations, from the closed solution of tyres whose force is proportional to slip, then from straight motion at the wheel
 speed that is weighted by load. Where both fail (near a CG over an axle or a side, friction turns from sticking to sliding within a
 thousandth of the wheels' speed), continuation follows: the friction is rounded as wide as the wheels' speed, which makes it almost
-linear, and narrowed step by step; a centripetal force is then increased from zero in the same way.
+linear, and narrowed step by step; a centripetal force and the pull of a slope are then increased from zero in the same way.
 """
 
 from __future__ import annotations
@@ -42,6 +42,10 @@ class Loads(NamedTuple):
     """[m]"""
     pull: float = 0.0
     """Square of the wheels' speed over mu g [m]: centripetal acceleration in units of friction's. 0 leaves inertia out."""
+    slope_x: float = 0.0
+    """Gravity along the ground ahead, over mu times that normal to it: the pull of a slope in units of friction's."""
+    slope_y: float = 0.0
+    """The same to the left."""
 
 
 class Balance(NamedTuple):
@@ -67,9 +71,9 @@ class Balance(NamedTuple):
     m_right: float
 
 
-COLUMNS = 18
+COLUMNS = 20
 """Of `sensitivities`; the last three, from `_VX` on, are the balance's own derivatives by vx, vy, wz."""
-_VX = 15
+_PULL, _SLOPE, _VX = 12, 15, 17
 MAX_EVALUATIONS = 30
 """Evaluations of the balance from one start before another way is tried."""
 NARROWING = 0.3
@@ -119,6 +123,9 @@ def balance(vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load:
         x_vy, x_wz = x_vy + p * wz, x_wz + p * (vy + 2.0 * gx * wz)
         y_vx, y_wz = y_vx - p * wz, y_wz - p * (vx - 2.0 * gy * wz)
         m_vx, m_vy, m_wz = m_vx - p * gx * wz, m_vy - p * gy * wz, m_wz - p * (gx * vx + gy * vy)
+    if load.slope_x != 0.0 or load.slope_y != 0.0:  # gravity along the ground, at the CG
+        bx, by = bx + load.slope_x, by + load.slope_y
+        bm += load.cg_x * load.slope_y - load.cg_y * load.slope_x
     return Balance(
         *(bx, by, bm, x_vx, x_vy, x_wz, y_vx, y_vy, y_wz, m_vx, m_vy, m_wz),
         *(x_left, y_left, m_left, x_right, y_right, m_right),
@@ -180,9 +187,9 @@ def motion(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[flo
         held = roll_l * (load.fl + load.rl) + roll_r * (load.fr + load.rr)
         vx, vy, wz, found = newton(held, 0.0, 0.0, roll_l, roll_r, load, floor, CREEP)
     if not found:
-        still = Loads(load.fl, load.fr, load.rl, load.rr, load.cg_x, load.cg_y, 0.0)
+        still = reduced(load, 0.0, 0.0)
         vx, vy, wz, found = _narrowed(roll_l, roll_r, still, floor)
-        if found and load.pull != 0.0:
+        if found and (load.pull != 0.0 or load.slope_x != 0.0 or load.slope_y != 0.0):
             vx, vy, wz, found = _pulled(vx, vy, wz, roll_l, roll_r, load, floor)
     return vx, vy, wz, found
 
@@ -207,11 +214,11 @@ def _narrowed(roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[
 
 @subroutine
 def _pulled(vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:
-    """`motion` by continuation, from the twist without a centripetal force."""
+    """`motion` by continuation, from the twist without a centripetal force and the pull of a slope."""
     share, step = 0.0, 1.0
     while share < 1.0:
         trial = min(share + step, 1.0)
-        pulled = Loads(load.fl, load.fr, load.rl, load.rr, load.cg_x, load.cg_y, trial * load.pull)
+        pulled = reduced(load, trial, load.pull)
         x, y, w, found = newton(vx, vy, wz, roll_l, roll_r, pulled, floor, CREEP)
         if found:
             vx, vy, wz, share = x, y, w, trial
@@ -221,6 +228,12 @@ def _pulled(vx: float, vy: float, wz: float, roll_l: float, roll_r: float, load:
             if step < _MIN_STEP * max(share, _MIN_STEP):
                 return vx, vy, wz, False
     return vx, vy, wz, True
+
+
+@subroutine
+def reduced(load: Loads, share: float, pull: float) -> Loads:
+    """``load`` with a ``share`` of the slope's pull and of ``pull`` instead of its own."""
+    return Loads(load.fl, load.fr, load.rl, load.rr, load.cg_x, load.cg_y, share * pull, share * load.slope_x, share * load.slope_y)
 
 
 class Steady(NamedTuple):
@@ -235,12 +248,12 @@ class Steady(NamedTuple):
 
 
 @subroutine
-def sensitivities(at: Steady, load: Loads, tilt: tuple[float, float, float], floor: Floor, by: FloatArray) -> None:
+def sensitivities(at: Steady, load: Loads, tilt: tuple[float, float, float], floor: Floor, by: FloatArray, has_slope: bool) -> None:
     """Derivatives of the solved twist, by the implicit function theorem: -(d balance / d twist)^-1 (d balance / d parameter).
 
     ``tilt`` are the derivatives of the loads' diagonal term by xi, eta and warp (see `contact.loads`). Fills ``by`` (3, `COLUMNS`): columns
     roll_l, roll_r, xi, eta, warp, half_track, half_wheelbase, slip_stiffness, mu_ratio, drag, scrub, tread, pull, then cg_x and cg_y as
-    far as inertia acts at them.
+    far as inertia and the pull of a slope act at them; with ``has_slope`` the slope's pull along x and y, too.
     """
     by[:] = 0.0
     _add_wheels(at, load, tilt, floor, by)
@@ -249,12 +262,19 @@ def sensitivities(at: Steady, load: Loads, tilt: tuple[float, float, float], flo
     by[2, 5] -= floor.scrub * at.wz * CREEP * CREEP * whole * whole * whole
     by[2, _VX + 2] -= floor.scrub * floor.half_track * CREEP * CREEP * whole * whole * whole
     by[2, 10] -= spin * whole
-    columns = 12
+    columns = _PULL
     if load.pull != 0.0:
-        columns = _VX
+        columns = _SLOPE
         _add_pull(at, load, by)
+    if has_slope:
+        columns = _VX
+        by[0, _SLOPE], by[2, _SLOPE] = 1.0, -load.cg_y
+        by[1, _SLOPE + 1], by[2, _SLOPE + 1] = 1.0, load.cg_x
+        by[2, 13] += load.slope_y
+        by[2, 14] -= load.slope_x
     b = Balance(
-        *(0.0, 0.0, 0.0, by[0, 15], by[0, 16], by[0, 17], by[1, 15], by[1, 16], by[1, 17], by[2, 15], by[2, 16], by[2, 17]),
+        *(0.0, 0.0, 0.0, by[0, _VX], by[0, _VX + 1], by[0, _VX + 2], by[1, _VX], by[1, _VX + 1], by[1, _VX + 2]),
+        *(by[2, _VX], by[2, _VX + 1], by[2, _VX + 2]),
         *(0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     )
     for j in range(columns):

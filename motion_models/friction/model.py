@@ -15,9 +15,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from motion_models.base import Twist
 from motion_models.compiled import kernel, subroutine
@@ -32,11 +33,13 @@ from motion_models.friction.equilibrium import (
     balance,
     motion,
     newton,
+    reduced,
     sensitivities,
 )
 from motion_models.linear_equations import Matrix3, solve_3x3
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
+from motion_models.slope import Slope, SlopeTwist
 
 GRAVITY = 9.81
 """[m/s^2]"""
@@ -44,7 +47,9 @@ STIFFNESS: Mapping[str, float] = {"isotropic": 10.0, "thesis": 13.333}
 """slip_stiffness by contact law where a robot's file names none: Appendix A's, and 10 from `tests.studies.contact_law`."""
 CENTRIPETAL = False
 """Whether the centripetal force is modelled where a robot's file does not choose."""
+BoolArray = NDArray[np.bool_]
 _POSITIVE = slice(0, 6)
+_FLAT = np.empty((0, 3))
 
 _MAX_EVALUATIONS = 40
 """Evaluations of the balance before the angle is enclosed instead."""
@@ -60,6 +65,18 @@ _CLOSE_ANGLE = 1e-14
 """Rounding of an angle [rad]."""
 _MIN_STEP = 1e-3
 """Least step of the centripetal force, as a share of it."""
+
+
+class _Constants(NamedTuple):
+    """What the loops read beside wheels, CG and parameters."""
+
+    saturation: float
+    centripetal: float
+    """0 or 1."""
+    slope: FloatArray
+    """(n, 3) `Slope.downhill` and the CG's height for each sample; (0, 3) on level ground."""
+    d_slope: FloatArray
+    """(n, 3, 3) to be filled with the twists' derivatives by them."""
 
 
 @dataclass(frozen=True)
@@ -106,23 +123,43 @@ class FrictionModel:
 
         Raises `CgError` for a CG that is not between the wheels and `ModelError` for parameters that no robot can have.
         """
-        return self._solve(_twist, wheels, cg, params)
+        return self._solve(_twist, wheels, cg, params).twist
+
+    def twist_on_slope(self, wheels: FloatArray, cg: FloatArray, params: FloatArray, slope: Slope) -> SlopeTwist:
+        """`twist` on tilted ground: gravity's part along the ground pulls at the CG, and the loads are those of the CG's projection along
+        gravity. Without a tilt it is `twist`.
+
+        Raises what `twist` does, `CgError` for a slope on which the robot tips over, `ModelError` for one that friction does not hold.
+        """
+        check_slope(cg, params, slope)
+        return self._solve(_twist, wheels, cg, params, slope)
 
     def interpret_twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
         """`twist` without compiled code, for a few samples once: 0.5 ms each, where compiling takes 8 s."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            return self._solve(_solve_samples, wheels, cg, params)
+            return self._solve(_solve_samples, wheels, cg, params).twist
 
-    def _solve(self, loop: Callable[..., None], wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
+    def _solve(
+        self, loop: Callable[..., None], wheels: FloatArray, cg: FloatArray, params: FloatArray, slope: Slope | None = None
+    ) -> SlopeTwist:
         check_parameters(cg, params)
-        twist = Twist.from_kernel(loop, self._constants(), wheels, cg, params)
+        lead = np.broadcast_shapes(wheels.shape[:-1], cg.shape[:-1])
+        on = _FLAT if slope is None else slope.samples(lead)
+        constants = _Constants(self.saturation, float(self.centripetal), on, np.zeros((len(on), 3, 3)))
+
+        def solve(wheels: FloatArray, cg: FloatArray, params: FloatArray, _: FloatArray, *out: FloatArray) -> None:
+            loop(wheels, cg, params, constants, *out)
+
+        twist = Twist.from_kernel(solve, np.empty(0), wheels, cg, params)
         unsolved = np.isnan(twist.value[..., 2]) & np.isfinite(np.asarray(wheels)).all(axis=-1)
         if np.any(unsolved):
             at = {name: float(value) for name, value in zip(self.param_names, params, strict=True)}
             raise ModelError(
                 f"no balance of forces found for {np.count_nonzero(unsolved)} of {unsolved.size} samples, with parameters {at}."
+                + (" The slope is at the limit of what friction holds." if slope is not None else "")
             )
-        return twist
+        by = constants.d_slope.reshape(*lead, 3, 3) if slope is not None else np.zeros((*lead, 3, 3))
+        return SlopeTwist(twist, by[..., :2], by[..., 2])
 
     def wheels(self, command: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
         """See `MotionModel.wheels`.
@@ -130,26 +167,33 @@ class FrictionModel:
         Where friction all but holds the robot, the rates are very high. Raises what `twist` raises, and `ModelError` for a command that
         no wheel rates give.
         """
+        return self._rates(command, cg, params, None)
+
+    def wheels_on_slope(self, command: FloatArray, cg: FloatArray, params: FloatArray, slope: Slope) -> FloatArray:
+        """`wheels` on tilted ground, see `twist_on_slope`; raises what that and `wheels` do."""
+        check_slope(cg, params, slope)
+        return self._rates(command, cg, params, slope)
+
+    def _rates(self, command: FloatArray, cg: FloatArray, params: FloatArray, slope: Slope | None) -> FloatArray:
         check_parameters(cg, params)
         lead = np.broadcast_shapes(command.shape[:-1], cg.shape[:-1])
         flat = [np.array(np.broadcast_to(a, (*lead, 2)), dtype=np.float64, order="C").reshape(-1, 2) for a in (command, cg)]
         rates = np.zeros((math.prod(lead), 2))
-        _wheels(flat[0], flat[1], np.array(params, dtype=np.float64), self._constants(), rates)
+        on = _FLAT if slope is None else slope.samples(lead)
+        constants = _Constants(self.saturation, float(self.centripetal), on, np.empty((0, 3, 3)))
+        _wheels(flat[0], flat[1], np.array(params, dtype=np.float64), constants, rates)
         unsolved = np.isnan(rates).any(axis=-1) & np.isfinite(flat[0]).all(axis=-1)
         if np.any(unsolved):
             (vx, wz), (x, y) = flat[0][unsolved][0], flat[1][unsolved][0]
             raise ModelError(
                 f"no wheel rates found for vx = {vx:.3g} m/s, wz = {wz:.3g} rad/s with the centre of gravity at ({x:.3f}, {y:.3f}) m: "
-                "friction holds this robot. Check for a rolling_resistance above mu, too large mu_ratio or scrub, a CG over a side."
+                "friction holds this robot. Check for a rolling_resistance above mu, too large mu_ratio or scrub, a CG at a side, a slope."
             )
         return rates.reshape(*lead, 2)
 
     def floor(self, params: FloatArray) -> Floor:
         """What the balance depends on, with ``params`` (12,)."""
         return floor_of(np.asarray(params, dtype=np.float64), self.saturation)
-
-    def _constants(self) -> FloatArray:
-        return np.array([self.saturation, float(self.centripetal)])
 
 
 def check_parameters(cg: FloatArray, params: FloatArray) -> None:
@@ -168,28 +212,62 @@ def check_parameters(cg: FloatArray, params: FloatArray) -> None:
         )
 
 
+def check_slope(cg: FloatArray, params: FloatArray, slope: Slope) -> None:
+    """Raises `CgError` where a robot with a CG in ``cg`` (..., 2) tips over on ``slope``, `ModelError` where it slides down by itself."""
+    tips, slides = slope_limits(cg, params, slope)
+    found = tips | slides
+    if not found.any():
+        return
+    down = np.broadcast_to(slope.downhill, (*found.shape, 2))[found].reshape(-1, 2)[0]
+    angle = f"a slope of {math.degrees(math.atan(math.hypot(*down))):.1f} deg (downhill {down[0]:+.3f} ahead, {down[1]:+.3f} to the left)"
+    if not np.isfinite(down).all():
+        raise ModelError(f"the slope is {down.tolist()}; it must be finite, with the vertical above the robot.")
+    if tips.any():
+        raise CgError(
+            f"{angle} takes the line of gravity of a CG {slope.cg_height:.2f} m high beyond the wheels: this robot tips over. "
+            "Check cg_height_m, the centre of gravity and the tilt."
+        )
+    raise ModelError(
+        f"{angle} is steeper than friction holds (mu {params[3]:.2f}: {math.degrees(math.atan(params[3])):.1f} deg): this robot slides "
+        "down without its wheels turning. Check mu and the tilt."
+    )
+
+
+def slope_limits(cg: FloatArray, params: FloatArray, slope: Slope) -> tuple[BoolArray, BoolArray]:
+    """Whether the robot tips over, and whether it slides down with still wheels, for each sample (...,) of CG and slope."""
+    down = np.asarray(slope.downhill, dtype=float)
+    stands = (np.abs(cg + slope.cg_height * down) < params[[2, 1]] / 2.0).all(axis=-1)
+    across = params[3] * params[4]
+    holds = np.hypot(down[..., 0] / params[3], down[..., 1] / across) < 1.0
+    tips = np.asarray(np.logical_not(stands))  # also if it is not a number
+    return tips, np.broadcast_to(np.logical_not(holds), tips.shape)
+
+
 def _solve_samples(
     wheels: FloatArray,
     cg: FloatArray,
     params: FloatArray,
-    constants: FloatArray,
+    constants: _Constants,
     value: FloatArray,
     d_wheels: FloatArray,
     d_cg: FloatArray,
     d_params: FloatArray,
 ) -> None:
-    """See `Twist.from_kernel`; ``constants`` (2,) are saturation and centripetal. A sample without a solution becomes NaN."""
+    """See `Twist.from_kernel`. A sample without a solution becomes NaN."""
+    slope, d_slope = constants.slope, constants.d_slope
+    has_slope = slope.shape[0] > 0
     radius, mu, warp, tracked_x, tracked_y = params[0], params[3], params[8], params[10], params[11]
-    floor = floor_of(params, constants[0])
+    floor = floor_of(params, constants.saturation)
     by = np.empty((3, COLUMNS))
     for i in range(wheels.shape[0]):
         speed, roll_l, roll_r = unit_rolls(radius, wheels[i, 0], wheels[i, 1])
-        load, tilt = loads_at(cg[i, 0], cg[i, 1], warp, floor, pull_of(speed, mu, constants[1]))
+        a_x, a_y, height = (slope[i, 0], slope[i, 1], slope[i, 2]) if has_slope else (0.0, 0.0, 0.0)
+        load, tilt = loads_at(cg[i, 0], cg[i, 1], warp, floor, pull_of(speed, mu, constants.centripetal), (a_x, a_y, height), mu)
         vx, vy, wz, found = motion(roll_l, roll_r, load, floor)
         if not found:
             value[i] = d_wheels[i] = d_cg[i] = d_params[i] = math.nan
             continue
-        sensitivities(Steady(vx, vy, wz, roll_l, roll_r), load, tilt, floor, by)
+        sensitivities(Steady(vx, vy, wz, roll_l, roll_r), load, tilt, floor, by, has_slope)
 
         # The tracked point moves with the body; so do the derivatives.
         for j in range(COLUMNS):
@@ -199,9 +277,9 @@ def _solve_samples(
         d_params[i, 1, 10], d_params[i, 0, 11] = wz * speed, -wz * speed
 
         # Back from unit speed, which is radius sqrt((q_l^2 + q_r^2) / 2) and so depends on the wheels too.
-        xi, eta = cg[i, 0] / floor.half_wheelbase, cg[i, 1] / floor.half_track
+        xi, eta = (cg[i, 0] + height * a_x) / floor.half_wheelbase, (cg[i, 1] + height * a_y) / floor.half_track
         for k in range(3):
-            pulled = by[k, 12] * load.pull
+            pulled, leaning = by[k, 12] * load.pull, by[k, 15] * load.slope_x + by[k, 16] * load.slope_y
             along = 0.5 * (point[k] - by[k, 0] * roll_l - by[k, 1] * roll_r) + pulled
             value[i, k] = point[k] * speed
             d_wheels[i, k, 0] = radius * (by[k, 0] + roll_l * along)
@@ -212,13 +290,18 @@ def _solve_samples(
             d_params[i, k, 0] = (point[k] + 2.0 * pulled) * speed / radius
             d_params[i, k, 1] = 0.5 * (by[k, 5] * speed - eta * by_eta)
             d_params[i, k, 2] = 0.5 * (by[k, 6] * speed - xi * by_xi)
-            d_params[i, k, 3] = -(by[k, 9] * floor.drag + pulled) / mu * speed
+            d_params[i, k, 3] = -(by[k, 9] * floor.drag + (pulled + leaning)) / mu * speed
             d_params[i, k, 4] = by[k, 8] * speed
             d_params[i, k, 5] = by[k, 7] * speed
             d_params[i, k, 6] = by[k, 9] / mu * speed
             d_params[i, k, 7] = by[k, 10] * speed
             d_params[i, k, 8] = by[k, 4] * speed
             d_params[i, k, 9] = by[k, 11] * speed
+            if has_slope:
+                steeper = pulled * speed / (1.0 + a_x * a_x + a_y * a_y)
+                d_slope[i, k, 0] = by_xi * height + by[k, 15] * speed / mu + steeper * a_x
+                d_slope[i, k, 1] = by_eta * height + by[k, 16] * speed / mu + steeper * a_y
+                d_slope[i, k, 2] = by_xi * a_x + by_eta * a_y
 
 
 _twist = kernel(_solve_samples)
@@ -247,20 +330,30 @@ def pull_of(speed: float, mu: float, centripetal: float) -> float:
 
 
 @subroutine
-def loads_at(x: float, y: float, warp: float, floor: Floor, pull: float) -> tuple[Loads, tuple[float, float, float]]:
-    """The loads with the CG at ``x, y`` [m], and the derivatives of their diagonal term by xi, eta and warp (see `contact.loads`)."""
-    fl, fr, rl, rr, t, t_xi, t_eta = loads(x / floor.half_wheelbase, y / floor.half_track, warp)
-    return Loads(fl, fr, rl, rr, x, y, pull), (t_xi, t_eta, 1.0 if t == warp else 0.0)
+def loads_at(
+    x: float, y: float, warp: float, floor: Floor, pull: float, slope: tuple[float, float, float] = (0.0, 0.0, 0.0), mu: float = 1.0
+) -> tuple[Loads, tuple[float, float, float]]:
+    """The loads with the CG at ``x, y`` [m], and the derivatives of their diagonal term by xi, eta and warp (see `contact.loads`).
+
+    On a ``slope``, `Slope.downhill` and the CG's height [m], the loads are those of the CG's projection along gravity, and gravity normal
+    to the ground, which friction is measured against, is less.
+    """
+    a_x, a_y, height = slope
+    fl, fr, rl, rr, t, t_xi, t_eta = loads((x + height * a_x) / floor.half_wheelbase, (y + height * a_y) / floor.half_track, warp)
+    pull *= math.sqrt(1.0 + a_x * a_x + a_y * a_y)
+    return Loads(fl, fr, rl, rr, x, y, pull, a_x / mu, a_y / mu), (t_xi, t_eta, 1.0 if t == warp else 0.0)
 
 
 @kernel
-def _wheels(command: FloatArray, cg: FloatArray, params: FloatArray, constants: FloatArray, rates: FloatArray) -> None:
+def _wheels(command: FloatArray, cg: FloatArray, params: FloatArray, constants: _Constants, rates: FloatArray) -> None:
     """Fill ``rates`` (n, 2) for ``command`` (n, 2) and ``cg`` (n, 2)."""
+    slope = constants.slope
     radius, mu, warp, tracked_y = params[0], params[3], params[8], params[11]
-    floor = floor_of(params, constants[0])
-    unit = pull_of(1.0, mu, constants[1])
+    floor = floor_of(params, constants.saturation)
+    unit = pull_of(1.0, mu, constants.centripetal)
     for i in range(command.shape[0]):
-        load, _ = loads_at(cg[i, 0], cg[i, 1], warp, floor, unit)
+        on = (slope[i, 0], slope[i, 1], slope[i, 2]) if slope.shape[0] > 0 else (0.0, 0.0, 0.0)
+        load, _ = loads_at(cg[i, 0], cg[i, 1], warp, floor, unit, on, mu)
         wz = command[i, 1]
         roll_l, roll_r = rolls_for(command[i, 0] + wz * tracked_y, wz, load, floor)
         rates[i, 0], rates[i, 1] = roll_l / radius, roll_r / radius
@@ -281,7 +374,7 @@ def rolls_for(vx: float, wz: float, load: Loads, floor: Floor) -> tuple[float, f
     angle, drift, share, found = _solve(angle, drift, share, to_x, to_w, unit, load, floor)
     if not found:
         angle, drift, share, found = _enclosed(to_x, to_w, load, floor)
-        if found and unit != 0.0:
+        if found and (unit != 0.0 or load.slope_x != 0.0 or load.slope_y != 0.0):
             angle, drift, share, found = _pulled(angle, drift, share, to_x, to_w, unit, load, floor)
     if not found:
         return math.nan, math.nan
@@ -317,7 +410,7 @@ def _solve(
     for _ in range(_MAX_EVALUATIONS):
         a, v, r = angle + fraction * d_angle, drift + fraction * d_drift, share + fraction * d_share
         c, s = math.cos(a), math.sin(a)
-        pulled = Loads(load.fl, load.fr, load.rl, load.rr, load.cg_x, load.cg_y, unit / (r * r))
+        pulled = reduced(load, 1.0, unit / (r * r))
         b = balance(r * to_x, v, r * to_w, c - s, c + s, pulled, floor, CREEP)
         now = b.x * b.x + b.y * b.y + b.m * b.m / (arm * arm)
         if r > 0.0 and (now < (1.0 - 1e-4 * fraction) * left or now < 1e-26):
@@ -353,11 +446,11 @@ def _step(b: Balance, c: float, s: float, v: float, r: float, to_x: float, to_w:
 def _pulled(
     angle: float, drift: float, share: float, to_x: float, to_w: float, unit: float, load: Loads, floor: Floor
 ) -> tuple[float, float, float, bool]:
-    """`_solve` by continuation, from the solution without a centripetal force."""
+    """`_solve` by continuation, from the solution without a centripetal force and the pull of a slope."""
     reached, step = 0.0, 0.3
     while reached < 1.0:
         trial = min(reached + step, 1.0)
-        a, v, r, found = _solve(angle, drift, share, to_x, to_w, trial * unit, load, floor)
+        a, v, r, found = _solve(angle, drift, share, to_x, to_w, trial * unit, reduced(load, trial, load.pull), floor)
         if found:
             angle, drift, share, reached = a, v, r, trial
             step *= 2.0
@@ -370,8 +463,8 @@ def _pulled(
 
 @subroutine
 def _enclosed(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:
-    """Angle, vy and share without a centripetal force, by enclosing the angle."""
-    still = Loads(load.fl, load.fr, load.rl, load.rr, load.cg_x, load.cg_y, 0.0)
+    """Angle, vy and share without a centripetal force and the pull of a slope, by enclosing the angle."""
+    still = reduced(load, 0.0, 0.0)
     goal = math.atan2(floor.half_track * to_w, to_x)
 
     # Enclose: from a robot whose wheels slip away half of the turn, towards the goal until beyond it.
