@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
+import io
 import os
 import sys
+import tempfile
+import traceback
 from collections.abc import Mapping, Sequence
 
 from localization.commands.common import PlainConsole
 from motion_models.errors import SkidlocError
 
 _BAD_INPUT = 2
+_DEFECT = 70
+"""EX_SOFTWARE of BSD's sysexits.h."""
 _INTERRUPTED = 130
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
@@ -51,8 +57,9 @@ def overview() -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0, 2 for bad input."""
+    """Run one command; returns the exit code: 0, 2 for bad input, 70 for a defect of skidloc."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    _prepare_streams()
     errors = PlainConsole(stderr=True, soft_wrap=True, highlight=False)
     try:
         if given and given[0] in ("-h", "--help"):
@@ -62,6 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _BAD_INPUT
         else:
             _run(given[0], given[1:])
+        sys.stdout.flush()  # here: what fails at the end of the interpreter has no message
     except SkidlocError as error:
         errors.print(f"skidloc: {error}", markup=False)
         return _BAD_INPUT
@@ -69,15 +77,50 @@ def main(arguments: Sequence[str] | None = None) -> int:
         errors.print("skidloc: interrupted.")
         return _INTERRUPTED
     except BrokenPipeError:  # `skidloc info LOG | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_output()
     except OSError as error:  # errors of the system that no command handles: names that are too long, folders without permission
         name = f"'{error.filename}': " if error.filename is not None else ""
         errors.print(f"skidloc: {name}{error.strerror or error}.", markup=False)
+        _discard_output()
         return _BAD_INPUT
     except MemoryError:
         errors.print("skidloc: there is not enough memory for this. Use a shorter log, or smaller settings.")
         return _BAD_INPUT
+    except Exception:  # whatever is left is no user's fault
+        errors.print(f"skidloc: a defect of skidloc, please report. {_write_trace(given)}", markup=False)
+        return _DEFECT
     return 0
+
+
+def _prepare_streams() -> None:
+    """Make output and errors writable whatever the locale's encoding is, and where the caller has closed them."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (as long as the process)
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
+def _discard_output() -> None:
+    """Send what is left in the buffer nowhere: the interpreter would try to write it again, and fail, at its end."""
+    with contextlib.suppress(OSError):
+        sys.stdout.flush()
+        return
+    with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _write_trace(arguments: Sequence[str]) -> str:
+    """Write the trace of the present exception to a new file; where it is, or the trace itself where no file can be written."""
+    text = f"skidloc {' '.join(arguments)}\n\n{traceback.format_exc()}"
+    try:
+        descriptor, name = tempfile.mkstemp(prefix="skidloc-", suffix=".txt")
+        with os.fdopen(descriptor, "w", encoding="utf-8", errors="backslashreplace") as file:
+            file.write(text)
+    except OSError:
+        return f"Add this to the report:\n{text}"
+    return f"Add to the report what is in {name}: command and trace."
 
 
 def _unknown(given: Sequence[str]) -> str:

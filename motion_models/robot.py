@@ -25,6 +25,10 @@ _LARGEST = 1e9
 """Of any number of a robot, in SI units; the largest that robots have are stiffnesses and inertias of 1e6."""
 _LONGEST_M = 100.0
 """Of a length of a robot [m]; the largest mining vehicles have 20."""
+_MOST_CHARACTERS = 1 << 20
+"""Of a robot file; the longest that is shipped has 1,200."""
+_MOST_DOTS = 200
+"""In one line of a robot file: the names of a dozen wheels with their namespaces have fewer."""
 _LARGEST_CLOCK_OFFSET_S = 10.0
 """Beyond it clocks are not synchronized, and no offset is constant [s]."""
 _LONGEST_SHOWN = 60  # characters of what a user wrote, in a message
@@ -273,6 +277,7 @@ def load_robot(robot: str | Path) -> Robot:
 
 def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
     """The robot of a TOML text; ``source`` names it in errors, ``folder`` is where paths in it start. Raises `RobotError`."""
+    _refuse_long_keys(text, source)
     try:
         data = tomllib.loads(text)
     except ValueError as error:  # what the parser raises, and for a number of thousands of digits
@@ -307,7 +312,7 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
         driver=driver,
         drive=drive,
         topics=_section(Topics, data, "topics", source),
-        joints=_section(Joints, data, "joints", source),
+        joints=_joints(data, source),
         mounts=mounts,
         wheel_noise=_noise(WheelNoise, data, "wheel_noise", source),
         gyro_noise=_noise(GyroNoise, data, "gyro_noise", source),
@@ -317,6 +322,26 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
         arms=_arms(data, source) if "arms" in data else None,
         folder=folder,
     )
+
+
+def _refuse_long_keys(text: str, source: str) -> None:
+    """Raises `RobotError` for lines with so many dots that they can only be a key of as many parts, or a file too long for a robot's.
+
+    The parser stores each beginning of a dotted key: a key of 20,000 parts takes 2.5 GB.
+    """
+    if len(text) > _MOST_CHARACTERS:
+        raise RobotError(f"{source}: has {len(text)} characters; a robot file has at most {_MOST_CHARACTERS}.")
+    for number, line in enumerate(text.splitlines(), 1):
+        dots = line.count(".")
+        if dots > _MOST_DOTS and not line.lstrip().startswith("#"):
+            raise RobotError(f"{source}: line {number} has {dots} dots; names of robot files have at most three.")
+
+
+def _joints(data: Mapping[str, Any], source: str) -> Joints:
+    joints = _section(Joints, data, "joints", source)
+    if shared := sorted(set(joints.left) & set(joints.right)):
+        raise RobotError(f"{source}: joints.left and joints.right both hold {', '.join(shared)}; a wheel is on one side.")
+    return joints
 
 
 def _clock(data: Mapping[str, Any], source: str) -> Clock:

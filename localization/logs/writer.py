@@ -14,9 +14,11 @@ Content of the messages, and where ROS's conventions differ from this library's:
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import math
 import re
+import sqlite3
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -91,6 +93,16 @@ def write_bag(path: str | Path, messages: Iterable[Message], on_message: Callabl
     return count
 
 
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Errors of the system and of SQLite inside become `OutputError`."""
+    try:
+        with output_errors(path):
+            yield
+    except sqlite3.Error as error:
+        raise OutputError(f"output '{path}' cannot be written: SQLite reports '{error}'. Is there room on the disk?") from error
+
+
 def _write_messages(inner: Path, path: Path, messages: Iterable[Message], on_message: Callable[[int], None] | None) -> int:
     is_ros1 = path.suffix == ".bag"
     writer: Any
@@ -99,8 +111,8 @@ def _write_messages(inner: Path, path: Path, messages: Iterable[Message], on_mes
     else:
         plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
         writer = Writer(inner, version=9, storage_plugin=plugin)
-    # Only the writing is inside `output_errors`: what a simulation raises meanwhile passes as it is.
-    with output_errors(path):
+    # Only the writing is inside `_writing`: what a simulation raises meanwhile passes as it is.
+    with _writing(path):
         writer.open()
     try:
         topics: dict[str, Any] = {}
@@ -112,21 +124,22 @@ def _write_messages(inner: Path, path: Path, messages: Iterable[Message], on_mes
                 templates[layout] = Template(layout, is_ros1=is_ros1)
                 topics[layout.topic] = topics.get(layout.topic) or _connect(writer, path, layout, is_ros1)
             data = templates[layout].fill(message)
-            with output_errors(path):
+            with _writing(path):
                 writer.write(topics[layout.topic], message.log_ns, data)
             count += 1
             if on_message is not None:
                 on_message(message.log_ns)
-        with output_errors(path):
+        with _writing(path):
             writer.close()
     except BaseException:
-        writer.abort()
+        with contextlib.suppress(OSError, sqlite3.Error):  # a full disk fails again
+            writer.abort()
         raise
     return count
 
 
 def _connect(writer: Any, path: Path, layout: MessageLayout, is_ros1: bool) -> Any:
-    with output_errors(path):
+    with _writing(path):
         if is_ros1:
             latched = 1 if layout.topic == _LATCHED_TOPIC else None
             return writer.add_connection(layout.topic, layout.type, typestore=STORE_ROS1, latching=latched)
@@ -181,8 +194,8 @@ def write_fused(path: str | Path, results: Mapping[str, Iterable[FusedEstimate]]
 def _write_bag(bag: Path, path: Path, results: Mapping[str, Iterable[FusedEstimate]], tf_of: str) -> None:
     writer = Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP)
     writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-    # Only the writing is inside `output_errors`: what a lazy result raises while it is computed passes as it is.
-    with output_errors(path):
+    # Only the writing is inside `_writing`: what a lazy result raises while it is computed passes as it is.
+    with _writing(path):
         writer.open()
     try:
         connections = {name: writer.add_connection(f"/{name}/odometry", _ODOMETRY, typestore=_STORE) for name in results}
@@ -197,15 +210,16 @@ def _write_bag(bag: Path, path: Path, results: Mapping[str, Iterable[FusedEstima
                 _write(writer, path, connection, estimate.stamp_ns, data)
         if not count:
             raise OutputError(f"output '{path}': there is nothing to write: no estimates in {', '.join(results)}.")
-        with output_errors(path):
+        with _writing(path):
             writer.close()
     except BaseException:
-        writer.abort()
+        with contextlib.suppress(OSError, sqlite3.Error):  # a full disk fails again
+            writer.abort()
         raise
 
 
 def _write(writer: Writer, path: Path, connection: Connection, stamp_ns: int, data: bytes | memoryview) -> None:
-    with output_errors(path):
+    with _writing(path):
         writer.write(connection, stamp_ns, data)
 
 

@@ -52,7 +52,12 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (f"[mounts.laser]\nx = {'9' * 400}", "found an integer of more than 20 digits"),
         (f"[mounts.laser]\nx = {'9' * 6000}", "not valid TOML"),
         (f"[mounts.laser]\nx = {'[' * 5000}", "nested too deeply"),
-        (f"[{'a.' * 5000}b]", "unknown entry a"),
+        (f"[{'a.' * 150}b]", "unknown entry a"),
+        (f"[{'a.' * 20_000}b]", "line 7 has 20000 dots"),
+        (f"[wheel_noise]\n{'a.' * 20_000}b = 1", "line 8 has 20000 dots"),
+        ("# " + 5000 * "." + "\n[models.skidsteer]", "unknown entry skidsteer"),
+        ("[x]\ny = 1\n" * 200_000, "a robot file has at most"),
+        ('[joints]\nleft = ["fl", "wheel"]\nright = ["wheel", "rr"]', "joints.left and joints.right both hold wheel;"),
         (f"{'n' * 3000} = 1", "unknown entry n{60}\\.\\.\\.;"),
     ],
 )
