@@ -120,6 +120,22 @@ class Joints:
     """Wheels of the left side."""
     right: tuple[str, ...] = ("front_right_wheel", "rear_right_wheel")
     """Wheels of the right side."""
+    reversed: tuple[str, ...] = ()
+    """Those of both whose angles and rates are negative when the robot drives forward: motors mounted in mirror image."""
+    angle_unit_rad: float = 1.0
+    """Radians per unit of the positions: 0.0174533 for degrees, 2 pi over the counts of a turn for ticks, 1 over the radius for metres."""
+    rate_unit_rad_s: float = 1.0
+    """The same of the velocities: 0.10472 for revolutions per minute, 0.0174533 for degrees per second."""
+    angle_range: float = 0.0
+    """Range after which the positions wrap, in their own unit: 65536 for counters of 16 bits. 0: a full turn of the wheel."""
+
+
+@dataclass(frozen=True)
+class Imu:
+    """How the IMU's driver publishes."""
+
+    rate_unit_rad_s: float = 1.0
+    """Rad/s per unit of its angular velocities: 0.0174533 for degrees per second; negative where they have the opposite sign."""
 
 
 @dataclass(frozen=True)
@@ -204,6 +220,7 @@ class Robot:
     """How it turns: "skid_steer" (four or more wheels, or tracks, that slide), or "diff_drive" (two driven wheels and casters)."""
     topics: Topics = Topics()
     joints: Joints = Joints()
+    imu: Imu = Imu()
     mounts: Mapping[str, Mount] = field(default_factory=dict)
     wheel_noise: WheelNoise = WheelNoise()
     gyro_noise: GyroNoise = GyroNoise()
@@ -313,6 +330,7 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
         drive=drive,
         topics=_section(Topics, data, "topics", source),
         joints=_joints(data, source),
+        imu=_imu(data, source),
         mounts=mounts,
         wheel_noise=_noise(WheelNoise, data, "wheel_noise", source),
         gyro_noise=_noise(GyroNoise, data, "gyro_noise", source),
@@ -341,7 +359,19 @@ def _joints(data: Mapping[str, Any], source: str) -> Joints:
     joints = _section(Joints, data, "joints", source)
     if shared := sorted(set(joints.left) & set(joints.right)):
         raise RobotError(f"{source}: joints.left and joints.right both hold {', '.join(shared)}; a wheel is on one side.")
+    unknown = sorted({*joints.reversed} - {*joints.left, *joints.right})
+    if unknown:
+        raise RobotError(f"{source}: joints.reversed names {', '.join(unknown)}, which is neither in joints.left nor in joints.right.")
+    if min(joints.angle_unit_rad, joints.rate_unit_rad_s) <= 0.0 or joints.angle_range < 0.0:
+        raise RobotError(f"{source}: units of [joints] must be positive; wheels that count backwards are named in joints.reversed.")
     return joints
+
+
+def _imu(data: Mapping[str, Any], source: str) -> Imu:
+    imu = _section(Imu, data, "imu", source)
+    if imu.rate_unit_rad_s == 0.0:
+        raise RobotError(f"{source}: imu.rate_unit_rad_s is 0; it is 1 for rad/s and 0.0174533 for degrees per second.")
+    return imu
 
 
 def _clock(data: Mapping[str, Any], source: str) -> Clock:

@@ -19,7 +19,7 @@ from typing import Any
 from motion_models.calibration.plan import MEANING
 from motion_models.center_of_gravity.parts import Arms
 from motion_models.registry import MODELS
-from motion_models.robot import DRIVES, MODEL_OPTIONS, Driver, Geometry, GyroNoise, Joints, Mount, Robot, Topics, WheelNoise
+from motion_models.robot import DRIVES, MODEL_OPTIONS, Driver, Geometry, GyroNoise, Imu, Joints, Mount, Robot, Topics, WheelNoise
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -28,6 +28,7 @@ _SECTIONS: tuple[tuple[str, type[Any]], ...] = (
     ("driver", Driver),
     ("topics", Topics),
     ("joints", Joints),
+    ("imu", Imu),
     ("mounts.FRAME", Mount),
     ("wheel_noise", WheelNoise),
     ("gyro_noise", GyroNoise),
@@ -56,7 +57,7 @@ def robot_toml(robot: Robot, sigmas: Mapping[str, Mapping[str, float]] | None = 
         lines.append(f"drive = {_value(robot.drive)}")
     for name in ("geometry", "driver"):
         lines += _table(name, _not_default(getattr(robot, name)))
-    for name in ("topics", "joints", "wheel_noise", "gyro_noise", "clock"):
+    for name in ("topics", "joints", "imu", "wheel_noise", "gyro_noise", "clock"):
         entries = _not_default(getattr(robot, name))
         lines += _table(name, entries) if entries else []
     if robot.arms is not None:

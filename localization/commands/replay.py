@@ -18,6 +18,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from localization.calibration.wheel_wiring import open_checked
 from localization.commands.common import WIDE, names, new_folder, print_table, write_json
 from localization.errors import EstimatorError, EvaluationError
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, check_estimator
@@ -32,7 +33,7 @@ from localization.evaluation.references import (
 )
 from localization.evaluation.scores import Result, score
 from localization.events import Event, PositionSample
-from localization.logs import Log, TopicOverrides, open_log
+from localization.logs import Log, TopicOverrides
 from localization.logs.references import merge_positions, read_positions
 from localization.logs.writer import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
 from localization.maps import SavedMap, save_map
@@ -93,7 +94,8 @@ class Replay:
         """Run the command, with output on ``console``."""
         robot = load_robot(self.robot)
         check_outputs(self.out, self.json, self.save_map)
-        log = open_log(self.log, robot, self.topic.scored_against(self.reference))
+        log, wiring = open_checked(self.log, robot, self.topic.scored_against(self.reference))
+        robot = log.robot
         has_lidar = log.sources.lidar is not None
         models = [make_model(name, robot) for name in names(self.model, "--model")]
         forms = names(self.corrections, "--corrections")
@@ -129,6 +131,7 @@ class Replay:
                     [
                         *prior_notes(robot, [m.name for m in models]),
                         *held_out,
+                        *wiring.findings,
                         *log.warnings(),
                         *warnings_of(found),
                     ]

@@ -133,14 +133,17 @@ def frame_name(frame_id: str) -> str:
     return frame_id.strip().lstrip("/")
 
 
-def decode_imu(message: Any, stamp: int) -> ImuSample:
-    """sensor_msgs/Imu. Raises `UnusableError`."""
+def decode_imu(message: Any, stamp: int, rate_unit_rad_s: float = 1.0) -> ImuSample:
+    """sensor_msgs/Imu, with its angular velocities in ``rate_unit_rad_s``. Raises `UnusableError`."""
     w, a = message.angular_velocity, message.linear_acceleration
     if not math.isfinite(w.x + w.y + w.z + a.x + a.y + a.z):  # faster than numpy on six numbers
         raise UnusableError(Oddity.NOT_FINITE)
-    if max(abs(w.x), abs(w.y), abs(w.z)) > _MAX_RATE_RAD_S or max(abs(a.x), abs(a.y), abs(a.z)) > _MAX_SPECIFIC_FORCE_M_S2:
+    if (
+        max(abs(w.x), abs(w.y), abs(w.z)) * abs(rate_unit_rad_s) > _MAX_RATE_RAD_S
+        or max(abs(a.x), abs(a.y), abs(a.z)) > _MAX_SPECIFIC_FORCE_M_S2
+    ):
         raise UnusableError(Oddity.BEYOND)
-    return ImuSample(stamp, np.array([w.x, w.y, w.z]), np.array([a.x, a.y, a.z]), frame_name(message.header.frame_id))
+    return ImuSample(stamp, rate_unit_rad_s * np.array([w.x, w.y, w.z]), np.array([a.x, a.y, a.z]), frame_name(message.header.frame_id))
 
 
 def decode_cg(message: Any, stamp: int) -> CgSample:

@@ -89,11 +89,13 @@ class EventDecoder:
         self._sources, self._joints, self._arms = sources, joints, arms
         wheels = "" if sources.wheels is None else sources.wheels.topic
         odometry_type = "" if sources.wheels is None else sources.wheels.type
-        self._of_wheels = wheel_decoder((*joints[0], *joints[1]))
+        self._of_wheels = wheel_decoder((*joints[0], *joints[1]), robot.joints)
+        self._imu_unit = robot.imu.rate_unit_rad_s
         left, right = joints
         self._multipliers = robot.geometry.radius_multipliers
         self._has_multipliers = bool((self._multipliers != 1.0).any())
         self.from_joints = JointsToWheels(left, right, robot.geometry.wheel_radius_m, wheels, stats)
+        self.from_joints.angle_period = robot.joints.angle_range * robot.joints.angle_unit_rad or math.tau
         self.from_odometry = OdometryToWheels(robot.driver, wheels, stats, is_whole=odometry_type not in ODOMETRY_DECODERS)
         named = " and ".join(source.topic for source in sources.arms)
         self._from_arms = None if arms is None else make_arm_cg_converter(arms, robot.geometry, named, stats)
@@ -141,7 +143,7 @@ class EventDecoder:
             return ODOMETRY_DECODERS[source.type]()
         decoders: dict[str, MessageDecoder] = {
             "odometry": decode_odometry,
-            "imu": decode_imu,
+            "imu": partial(decode_imu, rate_unit_rad_s=self._imu_unit),
             "center_of_gravity": decode_cg,
             "points": decode_cloud,
         }
@@ -289,6 +291,8 @@ class JointsToWheels:
         self._rates = PublisherSeparator()
         self._turned = np.zeros(len(self._names))  # by each joint so far [rad]
         self._is_working = np.ones(len(self._names), dtype=bool)
+        self.angle_period = math.tau
+        """After which angles wrap [rad]."""
 
     def __call__(self, reading: JointReading) -> Iterator[WheelSample]:
         """The wheel sample of the next reading; none where it is not used."""
@@ -367,7 +371,7 @@ class JointsToWheels:
         step = reading.position - known.position
         jumped = np.abs(step) * self._radius > _MAX_SPEED_M_S * max(dt, _MIN_INTERVAL_S)
         expected = np.nan_to_num(velocity) * dt
-        wrapped = np.remainder(step + math.pi, math.tau) - math.pi
+        wrapped = np.remainder(step + 0.5 * self.angle_period, self.angle_period) - 0.5 * self.angle_period
         is_wrap = np.abs(wrapped - expected) < np.where(np.isfinite(velocity), _MAX_WRAP_DEVIATION_RAD, _MAX_WRAPPED_STEP_WITHOUT_RATE_RAD)
         return np.where(jumped, np.where(is_wrap, wrapped, expected), step), bool((jumped & ~is_wrap).any())
 

@@ -22,7 +22,7 @@ from localization.logs.decode import MessageStats, UnusableError, frame_name, st
 from localization.logs.event_decoder import EventDecoder, TopicDecoder, decode_item
 from localization.logs.references import reference_decoder
 from localization.logs.serialization import LogDeserializer
-from localization.logs.topic_roles import REFERENCE_TYPES, TopicChooser, TopicOverrides, choose_roles
+from localization.logs.topic_roles import REFERENCE_TYPES, Sides, TopicChooser, TopicOverrides, choose_roles
 from localization.logs.transforms import FixedTransforms
 from localization.logs.wheel_messages import TF_TYPES, odometry_edge
 from motion_models.robot import Mount, Robot
@@ -107,6 +107,16 @@ class Log:
             raise TopicError(" ".join([str(self.wheels_error), *self.damage()]))  # what was lost may be why
         stats = self._stats_by_topic["events"] = MessageStats()
         return self._events(stats)
+
+    @property
+    def joints(self) -> Sides:
+        """Wheel joints of the left and of the right side that the log has; empty where the wheels are no joint states."""
+        return self._joints
+
+    def readings(self, decoders: Mapping[str, TopicDecoder]) -> Iterator[Any]:
+        """Payloads of ``decoders`` (by topic) as they are, in order of stamps, by the same clocks as `events`."""
+        stats = MessageStats()
+        return merge(self._items(decoders, stats), self._clock_plan(list(decoders)), stats)
 
     def references(self, topic: str) -> Iterator[Reference]:
         """Reference poses of a pose, odometry, transform or GPS topic, by header stamp. GPS: east and north of the first fix.

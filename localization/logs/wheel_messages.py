@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from localization.logs.decode import JointReading, Oddity, OdometryReading, UnusableError, frame_name, joint_decoder, stamp_ns, yaw_of
+from motion_models.robot import Joints
 
 TWIST_TYPES = (
     "geometry_msgs/msg/TwistWithCovarianceStamped",
@@ -37,20 +38,29 @@ def is_measured_twist(topic: str) -> bool:
     return bool(_MEASURED.search(topic)) and not _COMMAND.search(topic)
 
 
-def wheel_decoder(joints: tuple[str, ...]) -> Decoder:
-    """Decoder of joint states for all ``joints``, be they in one message or in several.
+def wheel_decoder(joints: tuple[str, ...], units: Joints = Joints()) -> Decoder:  # noqa: B008 (frozen)
+    """Decoder of joint states for all ``joints``, be they in one message or in several; signs and ``units`` are those of a robot file.
 
     Messages with some of the joints are put together while none has come that has all of them. Messages are decoded in the order of
     recording; the decoder keeps the last readings of each joint.
     """
     whole, parts, has_whole = joint_decoder(joints), PartialJoints(joints), False
 
+    signs = np.array([-1.0 if joint in units.reversed else 1.0 for joint in joints])
+    is_scaled = bool(units.reversed) or units.angle_unit_rad != 1.0 or units.rate_unit_rad_s != 1.0
+
     def decode(message: Any, stamp: int) -> JointReading | None:
         nonlocal has_whole
         reading = whole(message, stamp)
         if reading is not None:
             has_whole = True
-        return reading if has_whole else parts.insert(message, stamp)
+        elif not has_whole:
+            reading = parts.insert(message, stamp)
+        if reading is None or not is_scaled:
+            return reading
+        return JointReading(
+            reading.stamp_ns, signs * units.angle_unit_rad * reading.position, signs * units.rate_unit_rad_s * reading.velocity
+        )
 
     return decode
 

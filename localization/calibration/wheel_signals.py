@@ -1,0 +1,262 @@
+"""Rates of each wheel, as the log has them, and of every other sensor of the same motion, over the same intervals.
+
+Nothing is clipped and no side is averaged: signs, units and sides are what is in question.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from localization.events import ImuSample, Scan
+from localization.lidar import LidarConfig, Sweep
+from localization.logs import Log
+from localization.logs.decode import JointReading, OdometryReading, decode_cloud, decode_imu, decode_odometry, scan_decoder
+from localization.logs.event_decoder import TopicDecoder, arc
+from localization.logs.topic_roles import TYPES
+from localization.logs.wheel_messages import ODOMETRY_DECODERS, wheel_decoder
+from localization.sensor_checks.scan_motion import ScanOdometry
+from motion_models.robot import Mount
+from motion_models.se2 import FloatArray
+
+STEP_S = 0.5
+"""Of an interval: latencies of drivers (up to 0.1 s) are small against it."""
+_MAX_MOVING_S, _MAX_READ_S = 120.0, 900.0
+"""Time after the wheels' first motion, and in all, that is read [s]."""
+_MAX_LIDAR_S = 60.0
+"""Of scans [s]; registering one takes some milliseconds."""
+_NOT_THE_DRIVERS = re.compile(
+    r"truth|reference|filter|fused|ekf|ukf|gps|gnss|slam|icp|lidar|laser|visual|vio|amcl|map|mocap|vicon|optitrack|rtab|camera|zed", re.I
+)
+"""Names of odometry that is not made of wheels."""
+_GRAVITY_SAMPLES, _MIN_GRAVITY_M_S2, _MAX_GRAVITY_M_S2, _MAX_TILT_COSINE = 20, 8.0, 12.0, 0.87
+"""As in `localization.gyro`: where the mean specific force of the first samples shows that the mount is wrong."""
+_JUMP_FACTOR = 8.0
+"""Increment of a position over the 97th percentile of all, from which on it is a reset or a counter that wrapped."""
+
+
+@dataclass(frozen=True, eq=False)
+class WheelSignals:
+    """Signals over n intervals of `STEP_S`; NaN where unknown."""
+
+    joints: tuple[str, ...]
+    """Left wheels, then right ones; empty where the wheels are a driver's odometry."""
+    left: int
+    """How many of ``joints`` are left."""
+    rates: FloatArray
+    """(n, joints) mean of the velocities [rad/s by the robot file]."""
+    angle_rates: FloatArray
+    """(n, joints) by the positions [rad/s by the robot file]."""
+    turns: Mapping[str, FloatArray]
+    """(n,) yaw rates by source [rad/s]: "gyro", topics of odometry, "LiDAR"."""
+    speeds: Mapping[str, FloatArray]
+    """(n,) forward speeds by source [m/s]."""
+    is_gyro_upright: bool = True
+    """The IMU's mount agrees with gravity; else the sign of its yaw rate is unknown."""
+    jumps: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """Sizes of sudden changes of positions, in the unit of the log."""
+    first_ns: int = 0
+    start_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Tagged:
+    """A payload with its topic."""
+
+    stamp_ns: int
+    topic: str
+    reading: Any
+
+
+def read_signals(log: Log) -> WheelSignals | None:
+    """Signals of ``log`` besides its LiDAR; None where it has no wheels."""
+    wheels = log.sources.wheels
+    if wheels is None:
+        return None
+    sources = _decoders(log)
+    gathered: dict[str, list[Any]] = {}
+    first_ns = moving_ns = None
+    for payload in log.readings({topic: TopicDecoder(0, _tag(topic, decode)) for topic, decode in sources.items()}):
+        first_ns = payload.stamp_ns if first_ns is None else first_ns
+        gathered.setdefault(payload.topic, []).append(payload.reading)
+        if moving_ns is None and payload.topic == wheels.topic and _is_moving(payload.reading):
+            moving_ns = payload.stamp_ns
+        until = first_ns + _MAX_READ_S * 1e9 if moving_ns is None else moving_ns + _MAX_MOVING_S * 1e9
+        if payload.stamp_ns > until:
+            break
+    return None if first_ns is None else _signals(log, gathered, first_ns, first_ns if moving_ns is None else moving_ns)
+
+
+def _decoders(log: Log) -> dict[str, Callable[[Any, int], Any]]:
+    """By topic: wheels, IMU, and odometry of the driver that is not used."""
+    found: dict[str, Callable[[Any, int], Any]] = {}
+    of_wheels = wheel_decoder((*log.joints[0], *log.joints[1]), log.robot.joints)
+    for source in log.sources.all_wheels:
+        if source.kind == "joint_states":
+            found[source.topic] = of_wheels
+        else:
+            found[source.topic] = ODOMETRY_DECODERS[source.type]() if source.type else decode_odometry
+    if log.sources.imu is not None:
+        unit = log.robot.imu.rate_unit_rad_s
+        found[log.sources.imu.topic] = lambda message, stamp: decode_imu(message, stamp, unit)
+    reserved = {log.reference_topic, log.robot.topics.reference}
+    for topic, kind in log.types.items():
+        if kind == TYPES["odometry"] and topic not in reserved and not _NOT_THE_DRIVERS.search(topic):
+            found.setdefault(topic, decode_odometry)
+    return found
+
+
+def _tag(topic: str, decode: Callable[[Any, int], Any]) -> Callable[[Any, int], _Tagged | None]:
+    def tagged(message: Any, stamp: int) -> _Tagged | None:
+        reading = decode(message, stamp)
+        return None if reading is None else _Tagged(reading.stamp_ns, topic, reading)
+
+    return tagged
+
+
+def _is_moving(reading: Any) -> bool:
+    if isinstance(reading, JointReading):
+        return bool((np.abs(reading.velocity) > 0.05).any()) or not np.isfinite(reading.velocity).all()
+    return isinstance(reading, OdometryReading)
+
+
+def _signals(log: Log, gathered: Mapping[str, Sequence[Any]], first_ns: int, moving_ns: int) -> WheelSignals | None:
+    wheels = log.sources.wheels
+    assert wheels is not None
+    # readings of wheels on several topics come from the one that completes them
+    of_wheels = [r for source in log.sources.all_wheels for r in gathered.get(source.topic, ())]
+    of_wheels.sort(key=lambda reading: reading.stamp_ns)
+    if len(of_wheels) < 3:
+        return None
+    start, end = (moving_ns - first_ns) * 1e-9 - 1.0, (of_wheels[-1].stamp_ns - first_ns) * 1e-9
+    edges = np.arange(max(start, 0.0), end, STEP_S)
+    if len(edges) < 3:
+        return None
+    n = len(edges) - 1
+    turns: dict[str, FloatArray] = {}
+    speeds: dict[str, FloatArray] = {}
+    is_upright = True
+    for topic, readings in gathered.items():
+        if log.sources.imu is not None and topic == log.sources.imu.topic:
+            turns["gyro"], is_upright = _gyro(readings, log.mounts, edges, first_ns)
+        elif isinstance(readings[0], OdometryReading):
+            speeds[topic], turns[topic] = _odometry(readings, edges, first_ns)
+    joints, left = (*log.joints[0], *log.joints[1]), len(log.joints[0])
+    rates = angle_rates = np.full((n, len(joints)), np.nan)
+    jumps = np.zeros(0)
+    if joints:
+        t = _seconds(of_wheels, first_ns)
+        rates = _mean_rates(t, np.array([r.velocity for r in of_wheels]), edges)
+        angles, jumps = _continuous(np.array([r.position for r in of_wheels]))
+        angle_rates = _differences(t, angles, edges)
+        jumps = jumps / log.robot.joints.angle_unit_rad
+    return WheelSignals(joints, left, rates, angle_rates, turns, speeds, is_upright, jumps, first_ns, float(edges[0]))
+
+
+def _seconds(readings: Sequence[Any], first_ns: int) -> FloatArray:
+    return np.array([reading.stamp_ns - first_ns for reading in readings], dtype=float) * 1e-9
+
+
+def _differences(t: FloatArray, cumulative: FloatArray, edges: FloatArray) -> FloatArray:
+    """Mean rates (n, k) of what grows to ``cumulative`` (m, k) over the intervals; NaN outside of the data and in gaps."""
+    cumulative = cumulative.reshape(len(t), -1)
+    found = np.stack([np.diff(np.interp(edges, t, column)) for column in cumulative.T], axis=-1) / STEP_S
+    counts = np.diff(np.searchsorted(t, edges))
+    unknown = (counts == 0) | (edges[:-1] < t[0]) | (edges[1:] > t[-1])
+    found[unknown] = np.nan
+    return np.asarray(found)
+
+
+def _mean_rates(t: FloatArray, rates: FloatArray, edges: FloatArray) -> FloatArray:
+    """Means (n, k) over the intervals of ``rates`` (m, k) at times ``t`` (m,)."""
+    rates = rates.reshape(len(t), -1)
+    steps = np.diff(t)[:, None] * 0.5 * (rates[1:] + rates[:-1])
+    return _differences(t, np.vstack([np.zeros((1, rates.shape[1])), np.cumsum(steps, axis=0)]), edges)
+
+
+def _continuous(positions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """``positions`` (m, k) without jumps, over which the increment before holds; and the jumps' sizes."""
+    steps = np.diff(positions, axis=0)
+    sizes = np.abs(steps)
+    finite = sizes[np.isfinite(sizes) & (sizes > 0.0)]
+    if not len(finite):
+        return positions, np.zeros(0)
+    is_jump = sizes > _JUMP_FACTOR * float(np.percentile(finite, 97.0))
+    found = []
+    for i, j in zip(*np.nonzero(is_jump), strict=True):
+        before = steps[i - 1, j] if i else 0.0
+        found.append(steps[i, j] - before)
+        steps[i, j] = before
+    return np.vstack([positions[:1], positions[:1] + np.cumsum(steps, axis=0)]), np.array(found)
+
+
+def _gyro(samples: Sequence[ImuSample], mounts: Mapping[str, Mount], edges: FloatArray, first_ns: int) -> tuple[FloatArray, bool]:
+    """Yaw rate (n,) about the body's z axis, or about gravity where the mount contradicts it; whether it does not."""
+    frame = samples[0].frame_id
+    samples = [sample for sample in samples if sample.frame_id == frame]
+    up = mounts.get(frame, Mount()).rotation()[2]
+    force = np.mean([sample.linear_acceleration for sample in samples[:_GRAVITY_SAMPLES]], axis=0)
+    size = float(np.linalg.norm(force))
+    is_upright = not _MIN_GRAVITY_M_S2 < size < _MAX_GRAVITY_M_S2 or float(force @ up) / size >= _MAX_TILT_COSINE
+    axis = up if is_upright else force / size
+    rates = np.array([sample.angular_velocity for sample in samples]) @ axis
+    return _mean_rates(_seconds(samples, first_ns), rates, edges)[:, 0], is_upright
+
+
+def _odometry(readings: Sequence[OdometryReading], edges: FloatArray, first_ns: int) -> tuple[FloatArray, FloatArray]:
+    """Speed and yaw rate (n,) by the poses, else by the twists."""
+    t, poses = _seconds(readings, first_ns), np.array([reading.pose for reading in readings])
+    if np.isfinite(poses).all() and np.ptp(poses, axis=0).any():
+        steps = np.array([arc(a, b) for a, b in itertools.pairwise(poses)])
+        is_jump = np.abs(steps[:, 0]) > _JUMP_FACTOR * max(float(np.percentile(np.abs(steps[:, 0]), 97.0)), 1e-3)
+        steps[is_jump] = 0.0
+        found = _differences(t, np.vstack([np.zeros((1, 2)), np.cumsum(steps, axis=0)]), edges)
+    else:
+        found = _mean_rates(t, np.array([reading.twist for reading in readings])[:, [0, 2]], edges)
+    return found[:, 0], found[:, 1]
+
+
+def lidar_motion(log: Log, signals: WheelSignals) -> tuple[FloatArray, FloatArray] | None:
+    """Speed and yaw rate (n,) by consecutive scans, on the intervals of ``signals``; None without a LiDAR."""
+    if log.sources.lidar is None:
+        return None
+    n = len(signals.rates)
+    edges = signals.start_s + STEP_S * np.arange(n + 1)
+    rows = [row for row in _scan_steps(log, signals.first_ns, signals.start_s) if np.isfinite(row).all()]
+    if len(rows) < 3:
+        return None
+    begin, end, forward, turn = np.array(rows).T
+    middle, duration = 0.5 * (begin + end), end - begin
+    rates = np.full((n, 2), np.nan)
+    place = np.searchsorted(edges, middle) - 1
+    for i in range(n):
+        inside = place == i
+        if inside.any():
+            rates[i] = forward[inside].sum() / duration[inside].sum(), turn[inside].sum() / duration[inside].sum()
+    return rates[:, 0], rates[:, 1]
+
+
+def _scan_steps(log: Log, first_ns: int, start_s: float) -> Iterator[FloatArray]:
+    """Begin, end [s], way forward [m] and turn [rad] from scan to scan."""
+    source = log.sources.lidar
+    assert source is not None
+    decode = scan_decoder() if source.kind == "scan" else decode_cloud
+    odometry, config, last = ScanOdometry(), LidarConfig(), None
+    for scan in log.readings({source.topic: TopicDecoder(0, decode)}):
+        assert isinstance(scan, Scan)
+        at = (scan.middle_ns - first_ns) * 1e-9
+        if at < start_s:
+            continue
+        if at > start_s + _MAX_LIDAR_S:
+            return
+        mount = log.mounts.get(scan.frame_id, Mount())
+        sweep = Sweep.from_scan(scan, mount).within(config.min_range_m, config.max_range_m)
+        motion = odometry.register(sweep.project(sweep.points), np.array([mount.x, mount.y]))
+        if motion is not None and last is not None and motion.has_translation:
+            yield np.array([last, at, motion.delta[0], motion.delta[2]])
+        last = at

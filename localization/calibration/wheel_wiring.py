@@ -1,0 +1,284 @@
+"""Signs, sides and units of wheels and gyro, where a log's sensors contradict the robot file.
+
+Rolling wheels turn the robot by (right - left) and move it by their mean. Each way of wiring that practice has (a side that counts
+backwards, sides that are swapped, a gyro with the opposite sign) is tested against all other measurements of the same motion; the one
+with the fewest changes that all of them agree with is reported. Where several remain, all are, and none is corrected.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from localization.calibration.wheel_signals import WheelSignals, lidar_motion, read_signals
+from localization.logs import Log, TopicOverrides, open_log
+from motion_models.prior import skid_prior
+from motion_models.robot import DIFF_DRIVE, Robot
+from motion_models.se2 import FloatArray
+
+_MIN_CORRELATION = 0.6
+"""Correlation above which a source does not contradict the robot file, as in the sensor checks: no window of healthy logs is below."""
+_SURE_CORRELATION = 0.9
+"""What another wiring must reach; slip, latency and noise leave 0.95 and more over a drive."""
+_MIN_TURN_RAD_S, _MIN_SPEED_M_S = 0.03, 0.02
+"""Root mean square of motions that are compared."""
+_MIN_INTERVALS = 12
+"""Six seconds."""
+_MAX_BIAS_RAD_S = 0.05
+_UNKNOWN_YAW_RAD2_PER_RAD, _UNKNOWN_WAY_M2_PER_M = 4.0 * math.pi, 40.0
+"""Variance per radian turned and metre driven with an unknown sign: a heading of one radian, and a way of ten metres, may be the opposite
+(4 x^2)."""
+_MIN_AGREEMENT = 0.8
+"""Share of the mean square of a side's wheels that their mean has."""
+
+
+class Wiring(NamedTuple):
+    """One way in which wheels, gyro and LiDAR may be wired, relative to the robot file."""
+
+    left: tuple[int, ...]
+    """Columns of the left wheels."""
+    right: tuple[int, ...]
+    reversed: tuple[int, ...] = ()
+    """Columns with the opposite sign."""
+    gyro: float = 1.0
+    """Sign of the gyro."""
+    lidar: tuple[float, float] = (1.0, 1.0)
+    """Signs of the LiDAR's speed and yaw rate: mounted backwards, upside down."""
+    changes: int = 0
+    text: str = ""
+    """What it means."""
+
+    @property
+    def signature(self) -> tuple[object, ...]:
+        """Equal for ways that are corrected alike."""
+        return (set(self.left) == set(), *sorted(self.left), "|", *sorted(self.reversed), "|", self.gyro, self.lidar)
+
+
+@dataclass(frozen=True)
+class WiringReport:
+    """What was found, and the robot with which to go on."""
+
+    robot: Robot
+    """As in the file, with what is certain corrected, and a wide covariance for what is not."""
+    findings: tuple[str, ...] = ()
+    """One sentence for each contradiction."""
+    keys: Mapping[str, str] = field(default_factory=dict)
+    """Entries to write to the robot file, by their key: text of the value in TOML."""
+    is_ambiguous: bool = False
+    """Wheels and another sensor contradict each other, and nothing decides: the signs are unknown. ``robot``'s wheel noise covers
+    that, and the gyro is not to be used."""
+    correlations: Mapping[str, float] = field(default_factory=dict)
+    """Of the wheels' turn and speed with each source, as the robot file has them."""
+
+
+def open_checked(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> tuple[Log, WiringReport]:  # noqa: B008
+    """The log at ``path`` as `open_log` opens it, with signs and units of wheels and gyro that are certain corrected. Raises what that
+    does."""
+    log = open_log(path, robot, topics)
+    found = check_wiring(log)
+    if found.is_ambiguous:
+        topics = replace(topics, imu="")
+    return (open_log(path, found.robot, topics) if found.findings else log), found
+
+
+def check_wiring(log: Log) -> WiringReport:
+    """Compare wheels, gyro, LiDAR and the driver's odometry of ``log`` with its robot file."""
+    signals = read_signals(log)
+    if signals is None or not signals.joints:
+        return WiringReport(log.robot)
+    return _wiring_of(log, signals)
+
+
+def _wiring_of(log: Log, signals: WheelSignals) -> WiringReport:
+    base = Wiring(tuple(range(signals.left)), tuple(range(signals.left, len(signals.joints))))
+    rates = wheel_rates(signals)
+    if not (signals.turns or signals.speeds) or not _is_accepted(signals, rates, base):
+        signals = _with_lidar(log, signals)
+    measured = correlations(signals, rates, base)
+    if _is_accepted(signals, rates, base):
+        return WiringReport(log.robot, correlations=measured)
+    found = _best(signals, rates, _alternatives(signals, base))
+    if not found:
+        return WiringReport(log.robot, correlations=measured)
+    if len({w.signature for w in found}) > 1:
+        return _ambiguous(log, found, measured)
+    return _certain(log, signals, found[0], measured)
+
+
+def _with_lidar(log: Log, signals: WheelSignals) -> WheelSignals:
+    motion = lidar_motion(log, signals)
+    if motion is None:
+        return signals
+    return replace(signals, speeds={**signals.speeds, "LiDAR": motion[0]}, turns={**signals.turns, "LiDAR": motion[1]})
+
+
+def wheel_rates(signals: WheelSignals) -> FloatArray:
+    """(n, joints) by the velocities, else by the positions."""
+    return np.where(np.isfinite(signals.rates), signals.rates, signals.angle_rates)
+
+
+def _signed(rates: FloatArray, wiring: Wiring) -> tuple[FloatArray, FloatArray]:
+    """Mean and difference (n,) of the sides [rad/s]."""
+    signs = np.ones(rates.shape[1])
+    signs[list(wiring.reversed)] = -1.0
+    left, right = ((rates * signs)[:, list(side)].mean(axis=1) for side in (wiring.left, wiring.right))
+    return 0.5 * (left + right), right - left
+
+
+def correlation(a: FloatArray, b: FloatArray, least: float, max_bias: float) -> float | None:
+    """Correlation about zero of two rates (n,), up to a bias of ``b``; None where ``b``'s root mean square is below ``least``, or with too
+    few values."""
+    both = np.isfinite(a) & np.isfinite(b)
+    if both.sum() < _MIN_INTERVALS:
+        return None
+    a, b = a[both], b[both]
+    still = np.abs(a) <= 1e-3 * max(float(np.abs(a).max()), 1e-9)
+    bias = float(b[still].mean()) if still.sum() >= 3 else 0.0
+    b = b - min(max(bias, -max_bias), max_bias)
+    size_a, size_b = math.sqrt(float(a @ a)), math.sqrt(float(b @ b))
+    if size_b < least * math.sqrt(len(b)) or size_a == 0.0:
+        return None
+    return float(a @ b) / (size_a * size_b)
+
+
+def correlations(signals: WheelSignals, rates: FloatArray, wiring: Wiring) -> dict[str, float]:
+    """Of speed and yaw rate by the wheels with each source that moves enough."""
+    mean, difference = _signed(rates, wiring)
+    found: dict[str, float] = {}
+    for name, turn in signals.turns.items():
+        sign = wiring.gyro if name == "gyro" else wiring.lidar[1] if name == "LiDAR" else 1.0
+        r = correlation(difference, sign * turn, _MIN_TURN_RAD_S, _MAX_BIAS_RAD_S)
+        if r is not None:
+            found[f"turn by {_source(name)}"] = abs(r) if name == "gyro" and not signals.is_gyro_upright else r
+    for name, speed in signals.speeds.items():
+        sign = wiring.lidar[0] if name == "LiDAR" else 1.0
+        r = correlation(mean, sign * speed, _MIN_SPEED_M_S, 0.0)
+        if r is not None:
+            found[f"speed by {_source(name)}"] = r
+    return found
+
+
+def _source(name: str) -> str:
+    return f"the {name}" if name in ("gyro", "LiDAR") else name
+
+
+def _agreement(rates: FloatArray, wiring: Wiring) -> float:
+    """Least share, over the sides, of its wheels' mean square that is in their mean."""
+    signs = np.ones(rates.shape[1])
+    signs[list(wiring.reversed)] = -1.0
+    shares = []
+    for side in (wiring.left, wiring.right):
+        values = (rates * signs)[:, list(side)]
+        values = values[np.isfinite(values).all(axis=1)]
+        total = float((values**2).mean()) if len(values) else 0.0
+        shares.append(float((values.mean(axis=1) ** 2).mean()) / total if total > 0.0 else 1.0)
+    return min(shares)
+
+
+def _is_accepted(signals: WheelSignals, rates: FloatArray, wiring: Wiring) -> bool:
+    """Whether no source contradicts ``wiring``."""
+    return min(correlations(signals, rates, wiring).values(), default=1.0) >= _MIN_CORRELATION and _agreement(rates, wiring) > 0.5
+
+
+def _alternatives(signals: WheelSignals, base: Wiring) -> list[Wiring]:
+    """Ways of wiring that practice has, with what each means."""
+    names = signals.joints
+    left, right = base.left, base.right
+    of_left, of_right = (", ".join(names[i] for i in side) for side in (left, right))
+    everything = (*left, *right)
+    found = [
+        base._replace(reversed=left, changes=1, text=f"the left side counts backwards ({of_left})"),
+        base._replace(reversed=right, changes=1, text=f"the right side counts backwards ({of_right})"),
+        base._replace(reversed=everything, changes=1, text="all wheels count backwards"),
+        base._replace(left=right, right=left, changes=1, text="left and right wheels are swapped"),
+    ]
+    if len(names) > 2:
+        found += [base._replace(reversed=(i,), changes=1, text=f"{names[i]} counts backwards") for i in everything]
+    if len(names) == 4:
+        splits = [s for s in itertools.combinations(everything, 2) if {*s} not in ({*left}, {*right})]
+        for split in splits:
+            rest = tuple(i for i in everything if i not in split)
+            text = f"the left wheels are {', '.join(names[i] for i in split)}, the right ones {', '.join(names[i] for i in rest)}"
+            found.append(base._replace(left=split, right=rest, changes=1, text=text))
+    found += [w._replace(left=right, right=left, changes=2, text=f"{w.text}, and left and right are swapped") for w in found[:3]]
+    if "gyro" in signals.turns and signals.is_gyro_upright:
+        opposite = "the gyro's sign is reversed"
+        found += [w._replace(gyro=-1.0, changes=w.changes + 1, text=f"{w.text}, and {opposite}") for w in found[:3]]
+        found.append(base._replace(gyro=-1.0, changes=1, text=f"{opposite} (an IMU upside down)"))
+    if "LiDAR" in signals.turns:
+        found.append(base._replace(lidar=(1.0, -1.0), changes=1, text="the LiDAR is upside down"))
+        found.append(base._replace(lidar=(-1.0, 1.0), changes=1, text="the LiDAR is turned by 180 deg"))
+    return found
+
+
+def _best(signals: WheelSignals, rates: FloatArray, wirings: Sequence[Wiring]) -> list[Wiring]:
+    """Those of the fewest changes with which every source agrees."""
+    fitting = []
+    for wiring in wirings:
+        measured = correlations(signals, rates, wiring)
+        if measured and min(measured.values()) >= _SURE_CORRELATION and _agreement(rates, wiring) >= _MIN_AGREEMENT:
+            fitting.append(wiring)
+    fewest = min((wiring.changes for wiring in fitting), default=0)
+    return [wiring for wiring in fitting if wiring.changes == fewest]
+
+
+def _numbers(measured: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {value:+.2f}" for name, value in measured.items())
+
+
+def _ambiguous(log: Log, found: Sequence[Wiring], measured: Mapping[str, float]) -> WiringReport:
+    ways = [wiring.text for wiring in found]
+    wheels = " and ".join(source.topic for source in log.sources.all_wheels)
+    text = (
+        f"{wheels} contradicts the other sensors (correlation of the wheels with the {_numbers(measured)}): {', '.join(ways[:-1])},"
+        f" or {ways[-1]}. Nothing in the log decides, and nothing is corrected: record a LiDAR or the driver's odometry as well, or"
+        " watch one turn to the left: the right wheels' rates and the gyro's must be positive."
+    )
+    noise = replace(log.robot.wheel_noise, yaw_rad2_per_rad=_UNKNOWN_YAW_RAD2_PER_RAD, longitudinal_m2_per_m=_UNKNOWN_WAY_M2_PER_M)
+    return WiringReport(replace(log.robot, wheel_noise=noise), (text,), is_ambiguous=True, correlations=measured)
+
+
+def _certain(log: Log, signals: WheelSignals, wiring: Wiring, measured: Mapping[str, float]) -> WiringReport:
+    """Report with the robot corrected. A LiDAR's mount is left to the sensor checks, which measure its angle."""
+    if wiring.lidar != (1.0, 1.0):
+        return WiringReport(log.robot, correlations=measured)
+    robot, keys = log.robot, {}
+    names = signals.joints
+    if {*wiring.left} != {*range(signals.left)}:
+        left, right = (tuple(names[i] for i in side) for side in (wiring.left, wiring.right))
+        robot = replace(robot, joints=replace(robot.joints, left=left, right=right))
+        keys.update({"joints.left": _list(left), "joints.right": _list(right)})
+    if wiring.reversed:
+        turned = {names[i] for i in wiring.reversed} ^ {*robot.joints.reversed}
+        backwards = tuple(name for name in (*robot.joints.left, *robot.joints.right) if name in turned)
+        robot = replace(robot, joints=replace(robot.joints, reversed=backwards))
+        keys["joints.reversed"] = _list(backwards)
+    if wiring.gyro < 0.0:
+        robot = replace(robot, imu=replace(robot.imu, rate_unit_rad_s=-robot.imu.rate_unit_rad_s))
+        keys["imu.rate_unit_rad_s"] = f"{robot.imu.rate_unit_rad_s:g}"
+    wheels = " and ".join(source.topic for source in log.sources.all_wheels)
+    after = correlations(signals, wheel_rates(signals), wiring)
+    entries = "; ".join(f"{key} = {value}" for key, value in keys.items())
+    text = (
+        f"{wheels}: {wiring.text}: correlation of the wheels with the {_numbers(measured)} as the robot file has them, {_numbers(after)}"
+        f" so. Corrected in this run; write to the robot file: {entries}."
+    )
+    return WiringReport(robot, (text,), keys, correlations=measured)
+
+
+def _list(names: Iterable[str]) -> str:
+    return "[" + ", ".join(f'"{name}"' for name in names) + "]"
+
+
+def expected_scaling(robot: Robot) -> float:
+    """k of the robot: of its file, else by its geometry."""
+    if robot.drive == DIFF_DRIVE:
+        return 1.0
+    known = robot.models.get("skid_steer", {}).get("k_0")
+    return float(skid_prior(robot).coefficients[0]) if known is None else known

@@ -1,0 +1,103 @@
+"""Signs, sides and units of wheels and gyro that contradict the robot file: corrected by a third source, else named as alternatives."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from localization.calibration.wheel_wiring import WiringReport, check_wiring, open_checked
+from localization.cli import main
+from localization.logs import open_log
+from motion_models.robot import load_robot
+from motion_models.robot_file import robot_toml
+from tests.helpers.wiring import CASES, LEFT, RIGHT, ROBOT_TOML, Change, drive
+
+ROBOT = load_robot(ROBOT_TOML)
+SIGNS: dict[str, np.ndarray] = {
+    "left": np.array([-1.0, -1.0, 1.0, 1.0]),
+    "right": np.array([1.0, 1.0, -1.0, -1.0]),
+    "all": -np.ones(4),
+    "one": np.array([1.0, -1.0, 1.0, 1.0]),
+}
+
+
+def signs(kind: str) -> Change:
+    return lambda position, velocity: (SIGNS[kind] * position, SIGNS[kind] * velocity)
+
+
+def report_of(path: Path) -> WiringReport:
+    return check_wiring(open_log(path, ROBOT))
+
+
+@pytest.mark.parametrize("name", ["base-log", "H07-one-message-per-wheel"])
+def test_wiring_of_healthy_log_has_no_finding(name: str) -> None:
+    log, report = open_checked(CASES / name / "log.mcap", ROBOT)
+    assert (report.findings, report.keys, log.robot) == ((), {}, ROBOT)
+
+
+@pytest.mark.parametrize("has_odometry", [False, True])
+@pytest.mark.parametrize(("kind", "reversed_"), [("left", LEFT), ("right", RIGHT), ("one", ("rear_left_wheel",))])
+def test_wiring_with_reversed_wheels_is_corrected(tmp_path: Path, kind: str, reversed_: tuple[str, ...], has_odometry: bool) -> None:
+    report = report_of(drive(tmp_path / "log.mcap", signs(kind), has_odometry=has_odometry))
+    assert report.robot.joints.reversed == reversed_
+    assert "joints.reversed" in report.findings[0]
+    (tmp_path / "r.toml").write_text(robot_toml(report.robot))
+    corrected = check_wiring(open_log(tmp_path / "log.mcap", load_robot(tmp_path / "r.toml")))
+    assert corrected.findings == ()
+
+
+def test_wiring_with_all_reversed_needs_a_third_source(tmp_path: Path) -> None:
+    report = report_of(drive(tmp_path / "log.mcap", signs("all"), has_odometry=True))
+    assert set(report.robot.joints.reversed) == {*LEFT, *RIGHT}
+
+
+def test_wiring_with_sides_swapped_is_corrected_by_odometry(tmp_path: Path) -> None:
+    report = report_of(drive(tmp_path / "log.mcap", names=(*RIGHT, *LEFT), has_odometry=True))
+    assert (report.robot.joints.left, report.robot.joints.right) == (RIGHT, LEFT)
+
+
+def test_wiring_with_axles_for_sides_is_corrected(tmp_path: Path) -> None:
+    report = report_of(drive(tmp_path / "log.mcap", names=(LEFT[0], RIGHT[0], LEFT[1], RIGHT[1])))
+    assert {*report.robot.joints.left} == {LEFT[0], RIGHT[0]}
+
+
+def test_wiring_with_gyro_opposite_is_corrected_by_odometry(tmp_path: Path) -> None:
+    report = report_of(drive(tmp_path / "log.mcap", gyro=-1.0, has_odometry=True))
+    assert (report.robot.imu.rate_unit_rad_s, report.robot.joints) == (-1.0, ROBOT.joints)
+
+
+@pytest.mark.parametrize("is_gyro", [False, True])
+def test_wiring_of_two_sensors_that_contradict_blames_none(tmp_path: Path, is_gyro: bool) -> None:
+    names = (*LEFT, *RIGHT) if is_gyro else (*RIGHT, *LEFT)
+    report = report_of(drive(tmp_path / "log.mcap", gyro=-1.0 if is_gyro else 1.0, names=names))
+    assert report.is_ambiguous
+    assert report.keys == {}
+    assert "left and right wheels are swapped, or the gyro's sign is reversed" in report.findings[0]
+
+
+def replay_metrics(tmp_path: Path, log: Path) -> dict[str, object]:
+    options = ["--model", "skid_steer", "--estimator", "odometry,ekf", "--reference", str(CASES / "base-log" / "reference.tum")]
+    assert main(["replay", str(log), "--robot", str(ROBOT_TOML), *options, "--out", str(tmp_path / "out")]) == 0
+    found: dict[str, object] = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    return found
+
+
+def test_replay_with_the_right_side_inverted_is_as_the_healthy_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    metrics = replay_metrics(tmp_path, CASES / "H06-right-side-inverted" / "log.mcap")
+    for result in metrics["results"]:  # type: ignore[attr-defined]
+        assert result["ate_rmse_m"] < 0.02
+    text = "the right side counts backwards"
+    assert text in capsys.readouterr().out
+    assert text in " ".join(metrics["notes"])  # type: ignore[call-overload]
+    assert text in (tmp_path / "out" / "report.html").read_text()
+
+
+@pytest.mark.parametrize("is_gyro", [False, True])
+def test_replay_of_two_sensors_that_contradict_has_a_wide_covariance(tmp_path: Path, is_gyro: bool) -> None:
+    names = (*LEFT, *RIGHT) if is_gyro else (*RIGHT, *LEFT)
+    log = drive(tmp_path / "log.mcap", gyro=-1.0 if is_gyro else 1.0, names=names)
+    for result in replay_metrics(tmp_path, log)["results"]:  # type: ignore[attr-defined]
+        assert result["nees_mean"] < 6.0
