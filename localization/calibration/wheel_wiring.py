@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.calibration.wheel_signals import WheelSignals, lidar_motion, read_signals
+from localization.calibration.wheel_units import check_units, expected_scaling
 from localization.logs import Log, TopicOverrides, open_log
-from motion_models.prior import skid_prior
-from motion_models.robot import DIFF_DRIVE, Robot
+from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
 _MIN_CORRELATION = 0.6
@@ -34,6 +34,8 @@ _MAX_BIAS_RAD_S = 0.05
 _UNKNOWN_YAW_RAD2_PER_RAD, _UNKNOWN_WAY_M2_PER_M = 4.0 * math.pi, 40.0
 """Variance per radian turned and metre driven with an unknown sign: a heading of one radian, and a way of ten metres, may be the opposite
 (4 x^2)."""
+_SAME_TURN, _OTHER_TURN = 0.05, 0.3
+"""A driver's turn is the gyro's, and is not what the robot file's multiplier has: relative differences."""
 _MIN_AGREEMENT = 0.8
 """Share of the mean square of a side's wheels that their mean has."""
 
@@ -75,6 +77,8 @@ class WiringReport:
     that, and the gyro is not to be used."""
     correlations: Mapping[str, float] = field(default_factory=dict)
     """Of the wheels' turn and speed with each source, as the robot file has them."""
+    ratios: Mapping[str, float] = field(default_factory=dict)
+    """Measured over expected motion, by what was compared."""
 
 
 def open_checked(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> tuple[Log, WiringReport]:  # noqa: B008
@@ -90,25 +94,94 @@ def open_checked(path: Path | str, robot: Robot, topics: TopicOverrides = TopicO
 def check_wiring(log: Log) -> WiringReport:
     """Compare wheels, gyro, LiDAR and the driver's odometry of ``log`` with its robot file."""
     signals = read_signals(log)
-    if signals is None or not signals.joints:
+    if signals is None:
         return WiringReport(log.robot)
-    return _wiring_of(log, signals)
+    if not signals.joints:
+        return _check_odometry(log, signals)
+    signals, found = _wiring_of(log, signals)
+    if found.is_ambiguous:
+        return found
+    # as the corrected robot has them
+    if found.keys:
+        signals = read_signals(open_log(log.path, found.robot, log.overrides)) or signals
+    units = check_units(signals, found.robot)
+    if units.is_ambiguous or (units.findings and log.sources.lidar is not None and "LiDAR" not in signals.speeds):
+        signals = _with_lidar(log, signals)
+        units = check_units(signals, found.robot)
+    wheels = " and ".join(source.topic for source in log.sources.all_wheels)
+    sentences = (*found.findings, *(text if text.startswith("the gyro") else f"{wheels}: {text}" for text in units.findings))
+    robot = _with_unknown_signs(units.robot) if units.is_ambiguous else units.robot
+    return WiringReport(robot, sentences, {**found.keys, **units.keys}, units.is_ambiguous, {**found.correlations}, units.ratios)
 
 
-def _wiring_of(log: Log, signals: WheelSignals) -> WiringReport:
+def _with_unknown_signs(robot: Robot) -> Robot:
+    noise = replace(robot.wheel_noise, yaw_rad2_per_rad=_UNKNOWN_YAW_RAD2_PER_RAD, longitudinal_m2_per_m=_UNKNOWN_WAY_M2_PER_M)
+    return replace(robot, wheel_noise=noise)
+
+
+def _wiring_of(log: Log, signals: WheelSignals) -> tuple[WheelSignals, WiringReport]:
     base = Wiring(tuple(range(signals.left)), tuple(range(signals.left, len(signals.joints))))
     rates = wheel_rates(signals)
     if not (signals.turns or signals.speeds) or not _is_accepted(signals, rates, base):
         signals = _with_lidar(log, signals)
     measured = correlations(signals, rates, base)
     if _is_accepted(signals, rates, base):
-        return WiringReport(log.robot, correlations=measured)
+        return signals, WiringReport(log.robot, correlations=measured)
     found = _best(signals, rates, _alternatives(signals, base))
     if not found:
-        return WiringReport(log.robot, correlations=measured)
+        return signals, WiringReport(log.robot, correlations=measured)
     if len({w.signature for w in found}) > 1:
-        return _ambiguous(log, found, measured)
-    return _certain(log, signals, found[0], measured)
+        return signals, _ambiguous(log, [wiring.text for wiring in found], measured)
+    return signals, _certain(log, signals, found[0], measured)
+
+
+def _check_odometry(log: Log, signals: WheelSignals) -> WiringReport:
+    """Wheels that are a driver's odometry: its turns against the gyro's and the LiDAR's."""
+    assert log.sources.wheels is not None
+    topic = log.sources.wheels.topic
+    gyro, turn = signals.turns.get("gyro"), signals.turns.get(topic)
+    if gyro is None or turn is None or not signals.is_gyro_upright:
+        return WiringReport(log.robot)
+    r = correlation(turn, gyro, _MIN_TURN_RAD_S, _MAX_BIAS_RAD_S)
+    if r is None:
+        return WiringReport(log.robot)
+    measured = {f"turn of {topic} by the gyro": r}
+    if r > -_SURE_CORRELATION:
+        return _check_multiplier(log, float(np.nansum(turn * gyro) / max(np.nansum(turn**2), 1e-12)), measured)
+    signals = _with_lidar(log, signals)
+    third = None if "LiDAR" not in signals.turns else correlation(turn, signals.turns["LiDAR"], _MIN_TURN_RAD_S, _MAX_BIAS_RAD_S)
+    if third is None or abs(third) < _SURE_CORRELATION:
+        ways = [f"left and right are swapped in the driver of {topic}", "the gyro's sign is reversed (an IMU upside down)"]
+        return _ambiguous(log, ways, measured)
+    measured["turn by the LiDAR"] = third
+    if third < 0.0:
+        text = f"{topic} turns opposite to gyro and LiDAR ({_numbers(measured)}): left and right are swapped in its driver."
+        return WiringReport(log.robot, (text,), correlations=measured)
+    unit = -log.robot.imu.rate_unit_rad_s
+    text = (
+        f"the gyro's sign is reversed (correlation of {_numbers(measured)}). Corrected in this run; write to the robot file:"
+        f" imu.rate_unit_rad_s = {unit:g}."
+    )
+    robot = replace(log.robot, imu=replace(log.robot.imu, rate_unit_rad_s=unit))
+    return WiringReport(robot, (text,), {"imu.rate_unit_rad_s": f"{unit:g}"}, correlations=measured)
+
+
+def _check_multiplier(log: Log, ratio: float, measured: Mapping[str, float]) -> WiringReport:
+    """A driver that corrects for skidding turns as the gyro does; its multiplier is needed to invert its odometry."""
+    robot = log.robot
+    expected = expected_scaling(robot) * robot.driver.wheel_separation_multiplier
+    ratios = {"turn by the gyro over turn by the driver": ratio}
+    is_default = robot.driver.wheel_separation_multiplier == 1.0 and "k_0" not in robot.models.get("skid_steer", {})
+    if not is_default or abs(ratio - 1.0) > _SAME_TURN or abs(expected / ratio - 1.0) < _OTHER_TURN or min(measured.values()) < 0.95:
+        return WiringReport(robot, correlations=measured, ratios=ratios)
+    value = float(f"{1.0 / expected:.4g}")
+    topic = "" if log.sources.wheels is None else log.sources.wheels.topic
+    text = (
+        f"{topic} turns as the gyro does (ratio {ratio:.2f}): its driver corrects for skidding, but the robot file's multiplier is 1."
+        f" Corrected in this run; write to the robot file: driver.wheel_separation_multiplier = {value:g}, or its driver's own."
+    )
+    robot = replace(robot, driver=replace(robot.driver, wheel_separation_multiplier=value))
+    return WiringReport(robot, (text,), {"driver.wheel_separation_multiplier": f"{value:g}"}, correlations=measured, ratios=ratios)
 
 
 def _with_lidar(log: Log, signals: WheelSignals) -> WheelSignals:
@@ -232,16 +305,14 @@ def _numbers(measured: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {value:+.2f}" for name, value in measured.items())
 
 
-def _ambiguous(log: Log, found: Sequence[Wiring], measured: Mapping[str, float]) -> WiringReport:
-    ways = [wiring.text for wiring in found]
+def _ambiguous(log: Log, ways: Sequence[str], measured: Mapping[str, float]) -> WiringReport:
     wheels = " and ".join(source.topic for source in log.sources.all_wheels)
     text = (
         f"{wheels} contradicts the other sensors (correlation of the wheels with the {_numbers(measured)}): {', '.join(ways[:-1])},"
         f" or {ways[-1]}. Nothing in the log decides, and nothing is corrected: record a LiDAR or the driver's odometry as well, or"
         " watch one turn to the left: the right wheels' rates and the gyro's must be positive."
     )
-    noise = replace(log.robot.wheel_noise, yaw_rad2_per_rad=_UNKNOWN_YAW_RAD2_PER_RAD, longitudinal_m2_per_m=_UNKNOWN_WAY_M2_PER_M)
-    return WiringReport(replace(log.robot, wheel_noise=noise), (text,), is_ambiguous=True, correlations=measured)
+    return WiringReport(_with_unknown_signs(log.robot), (text,), is_ambiguous=True, correlations=measured)
 
 
 def _certain(log: Log, signals: WheelSignals, wiring: Wiring, measured: Mapping[str, float]) -> WiringReport:
@@ -274,11 +345,3 @@ def _certain(log: Log, signals: WheelSignals, wiring: Wiring, measured: Mapping[
 
 def _list(names: Iterable[str]) -> str:
     return "[" + ", ".join(f'"{name}"' for name in names) + "]"
-
-
-def expected_scaling(robot: Robot) -> float:
-    """k of the robot: of its file, else by its geometry."""
-    if robot.drive == DIFF_DRIVE:
-        return 1.0
-    known = robot.models.get("skid_steer", {}).get("k_0")
-    return float(skid_prior(robot).coefficients[0]) if known is None else known

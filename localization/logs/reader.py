@@ -109,6 +109,11 @@ class Log:
         return self._events(stats)
 
     @property
+    def overrides(self) -> TopicOverrides:
+        """Topics that were asked for."""
+        return self._overrides
+
+    @property
     def joints(self) -> Sides:
         """Wheel joints of the left and of the right side that the log has; empty where the wheels are no joint states."""
         return self._joints

@@ -1,6 +1,6 @@
 """Turn rates of wheels, gyro and LiDAR: opposite signs, wrong units, a gyro that is stuck, wheels that spin.
 
-Of three sensors the one that contradicts the two others is at fault, of two the gyro or the LiDAR.
+Of three sensors the one that contradicts the two others is at fault, of two either; the gyro or the LiDAR is left out then.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from localization.synchronizer import StepConfig, UnknownVelocity
 from motion_models.se2 import FloatArray
 
 GYRO_OPPOSITE = Fault(
-    "the gyro turns opposite to {others}. It is not used while that lasts. Correct the IMU's mount, or its driver's sign.",
+    "the gyro turns opposite to {others}. It is not used while that lasts. Correct the IMU's mount, or its driver's sign{or_wheels}.",
     reference="wheels",
 )
 GYRO_UNIT = Fault(
@@ -64,6 +64,8 @@ _DEG_PER_RAD_RANGE = (12.0, 130.0)
 fault."""
 _REPEATED_RAD_S, _MIN_STUCK_WHEELS_RAD_S = 1e-7, 0.002
 """A gyro's mean rates never repeat to the last digit, but for its noise; over a whole window it is stuck if the wheels turn at all."""
+
+_OR_WHEELS = ", or, as nothing else measures turns, the robot file's [joints]: left and right may be swapped, or all wheels count backwards"
 
 Numbers = Mapping[str, float | str]
 
@@ -172,7 +174,9 @@ def _find_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _R
     if wheels_gyro.is_opposite and lidar_gyro.is_equal:
         found[WHEELS_OPPOSITE] = {"others": "gyro and LiDAR"}
     elif wheels_gyro.is_opposite:
-        found[GYRO_OPPOSITE] = {"others": "wheels and LiDAR" if wheels_lidar.is_equal else "the wheels"}
+        is_proven = wheels_lidar.is_equal
+        others = {"others": "wheels and LiDAR" if is_proven else "the wheels", "or_wheels": "" if is_proven else _OR_WHEELS}
+        found[GYRO_OPPOSITE] = others
     elif wheels_lidar.is_opposite:
         found[LIDAR_OPPOSITE] = {"others": "wheels and gyro" if wheels_gyro.is_equal else "the wheels"}
     if wheels_gyro.unit_ratio > 1.0:

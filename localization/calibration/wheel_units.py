@@ -1,0 +1,201 @@
+"""Units of wheels and gyro: factors between the motion by the wheels and that by other sensors that only a unit explains."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from localization.calibration.wheel_signals import WheelSignals
+from motion_models.prior import skid_prior
+from motion_models.robot import DIFF_DRIVE, Joints, Robot
+from motion_models.se2 import FloatArray
+
+MAX_RATIO = 2.5
+"""Factor by which wheels may be off without a wrong unit: slip, a wrong radius or track, as in the sensor checks."""
+_DEG = math.pi / 180.0
+_GYRO_IN_DEGREES = (25.0, 130.0)
+"""Factor of a gyro in deg/s (57.3), with the factor of 2.3 by which wheels may be off on loose floor."""
+_SIGMA_BY_SPEED, _SIGMA_BY_TURN, _SIGMA_BY_MESSAGE = 0.1, 0.3, 0.03
+"""Of the logarithm of a unit: by a measured speed (radius), by the gyro (k, track), by positions of the same messages."""
+_SIGMAS = 1.5
+"""Of a unit's name: beyond, a gear is as likely."""
+_MIN_CORRELATION = 0.9
+_MIN_INTERVALS = 12
+_FASTEST_M_S = 3.0
+"""Speed of such robots; velocities that mean more are no rad/s."""
+_SCALE_UNKNOWN_M2_PER_M = 0.2
+"""Noise of the distance where its scale is known to 10 % alone: 1 m after 10 m is 0.1 x^2 / x."""
+_COUNTERS = (65536.0, 32768.0, 4294967296.0, 16777216.0)
+_SAME_JUMP = 0.02
+
+
+@dataclass(frozen=True)
+class UnitReport:
+    """Units that were found."""
+
+    robot: Robot
+    """With units that are certain."""
+    findings: tuple[str, ...] = ()
+    keys: Mapping[str, str] = field(default_factory=dict)
+    is_ambiguous: bool = False
+    ratios: Mapping[str, float] = field(default_factory=dict)
+    """Measured over expected motion, by what was compared."""
+
+
+@dataclass(frozen=True)
+class _Unit:
+    """Radians per unit, as measured."""
+
+    value: float
+    sigma: float
+    """Of its logarithm."""
+    source: str
+    by_gyro: bool
+
+
+def expected_scaling(robot: Robot) -> float:
+    """k of the robot: of its file, else by its geometry."""
+    if robot.drive == DIFF_DRIVE:
+        return 1.0
+    known = robot.models.get("skid_steer", {}).get("k_0")
+    return float(skid_prior(robot).coefficients[0]) if known is None else known
+
+
+def check_units(signals: WheelSignals, robot: Robot) -> UnitReport:
+    """Units of the joint states and of the gyro; ``signals`` have the signs of ``robot``."""
+    measured = {
+        "velocities": _measure(signals, signals.rates, robot),
+        "positions": _measure(signals, signals.angle_rates, robot),
+    }
+    ratios = {f"{what} by {unit.source}": unit.value for what, unit in measured.items() if unit is not None}
+    wrong = {what: unit for what, unit in measured.items() if unit is not None and not 1 / MAX_RATIO <= unit.value <= MAX_RATIO}
+    report = UnitReport(robot, ratios=ratios)
+    by_gyro = [unit for unit in wrong.values() if unit.by_gyro]
+    known = [unit for unit in measured.values() if unit is not None]
+    if by_gyro and len(by_gyro) == len(known) and all(_GYRO_IN_DEGREES[0] <= u.value <= _GYRO_IN_DEGREES[1] for u in by_gyro):
+        return _gyro_in_degrees(report, by_gyro[0].value)
+    right = next((what for what, unit in measured.items() if unit is not None and what not in wrong), None)
+    for what, unit in wrong.items():
+        report = _name_unit(report, signals, what, unit if right is None else _of_messages(signals, what) or unit)
+    return _name_range(report, signals)
+
+
+def _measure(signals: WheelSignals, rates: FloatArray, robot: Robot) -> _Unit | None:
+    """Radians per unit of ``rates`` (n, joints), by the best source; None where none moves with them."""
+    if not np.isfinite(rates).any():
+        return None
+    left, right = rates[:, : signals.left].mean(axis=1), rates[:, signals.left :].mean(axis=1)
+    radius, track = robot.geometry.wheel_radius_m, robot.geometry.track_width_m
+    for name in sorted(signals.speeds, key=lambda source: source != "LiDAR"):
+        ratio = _ratio(0.5 * radius * (left + right), signals.speeds[name])
+        if ratio is not None:
+            return _Unit(ratio, _SIGMA_BY_SPEED, f"the speed of {name}", by_gyro=False)
+    for name in ("gyro", "LiDAR"):
+        turn = signals.turns.get(name)
+        ratio = None if turn is None else _ratio(expected_scaling(robot) * radius / track * (right - left), turn)
+        if ratio is not None:
+            return _Unit(ratio, _SIGMA_BY_TURN, f"the {name}'s turns", by_gyro=name == "gyro")
+    return None
+
+
+def _ratio(wheels: FloatArray, other: FloatArray) -> float | None:
+    """Factor from ``wheels`` (n,) to ``other``; None where they do not follow each other."""
+    both = np.isfinite(wheels) & np.isfinite(other)
+    a, b = wheels[both], other[both]
+    size = math.sqrt(float(a @ a) * float(b @ b)) if both.sum() >= _MIN_INTERVALS else 0.0
+    if size == 0.0 or math.sqrt(float(b @ b) / len(b)) < 0.02 or float(a @ b) / size < _MIN_CORRELATION:
+        return None
+    return math.sqrt(float(b @ b) / float(a @ a))
+
+
+def _of_messages(signals: WheelSignals, what: str) -> _Unit | None:
+    """Unit of positions by the velocities of the same messages, or the other way round."""
+    ours, others = (signals.rates, signals.angle_rates) if what == "velocities" else (signals.angle_rates, signals.rates)
+    ratio = _ratio(ours.ravel(), others.ravel())
+    other = "positions" if what == "velocities" else "velocities"
+    return None if ratio is None else _Unit(ratio, _SIGMA_BY_MESSAGE, f"the {other} of the same messages", by_gyro=False)
+
+
+def _names(what: str, radius: float) -> dict[str, float]:
+    """Radians per unit, by the unit's name."""
+    if what == "velocities":
+        return {
+            "revolutions per minute": math.tau / 60.0,
+            "degrees per second": _DEG,
+            "turns per second": math.tau,
+            "metres per second": 1.0 / radius,
+            "millimetres per second": 1e-3 / radius,
+        }
+    return {"degrees": _DEG, "turns": math.tau, "metres": 1.0 / radius, "millimetres": 1e-3 / radius}
+
+
+def _name_unit(report: UnitReport, signals: WheelSignals, what: str, unit: _Unit) -> UnitReport:
+    robot, before = report.robot, _unit_of(report.robot.joints, what)
+    value = unit.value * before
+    distance = {name: abs(math.log(value / known)) for name, known in _names(what, robot.geometry.wheel_radius_m).items()}
+    near = sorted((name for name in distance if distance[name] <= _SIGMAS * unit.sigma), key=distance.__getitem__)
+    exact = _names(what, robot.geometry.wheel_radius_m)[near[0]] if near else value
+    text = f"{what} of the wheels are {1.0 / unit.value:.3g} times too large" if unit.value < 1.0 else ""
+    text = text or f"{what} of the wheels are {unit.value:.3g} times too small"
+    text = f"{text} for rad{'/s' if what == 'velocities' else ''}, by {unit.source}"
+    if near:
+        text += f": they are {' or '.join(near)} ({exact:.6g} rad each; 1 over that is {1.0 / exact:.4g})"
+    elif value < 1.0:
+        text += f": counts, about {math.tau / value:.0f} for a turn of the wheel, or a gear of {1.0 / value:.3g}"
+    key = "rate_unit_rad_s" if what == "velocities" else "angle_unit_rad"
+    if unit.by_gyro and near[:1] == ["degrees per second"] and _is_plausible(signals, robot):
+        other = f"{text}, or the gyro's rates are 57.3 times too small. Nothing in the log decides, and nothing is corrected."
+        return replace(report, findings=(*report.findings, other), is_ambiguous=True)
+    if not near and unit.by_gyro:
+        text += ". Distances are uncertain by a tenth: turn one wheel once by hand for the exact number"
+        noise = replace(robot.wheel_noise, longitudinal_m2_per_m=max(robot.wheel_noise.longitudinal_m2_per_m, _SCALE_UNKNOWN_M2_PER_M))
+        robot = replace(robot, wheel_noise=noise)
+    exact = float(f"{exact:.6g}")
+    joints = replace(robot.joints, rate_unit_rad_s=exact) if what == "velocities" else replace(robot.joints, angle_unit_rad=exact)
+    text += f". Corrected in this run; write to the robot file: joints.{key} = {exact:g}."
+    keys = {**report.keys, f"joints.{key}": f"{exact:g}"}
+    return replace(report, robot=replace(robot, joints=joints), findings=(*report.findings, text), keys=keys)
+
+
+def _unit_of(joints: Joints, what: str) -> float:
+    return joints.rate_unit_rad_s if what == "velocities" else joints.angle_unit_rad
+
+
+def _is_plausible(signals: WheelSignals, robot: Robot) -> bool:
+    """Whether the velocities can be rad/s by their size."""
+    rates = signals.rates[np.isfinite(signals.rates)]
+    return not len(rates) or float(np.abs(rates).max()) * robot.geometry.wheel_radius_m <= _FASTEST_M_S
+
+
+def _gyro_in_degrees(report: UnitReport, ratio: float) -> UnitReport:
+    unit = float(f"{_DEG * report.robot.imu.rate_unit_rad_s:.6g}")
+    text = (
+        f"the gyro's rates are {ratio:.3g} times what the wheels' turns allow: it publishes deg/s (57.3). Corrected in this run; write to"
+        f" the robot file: imu.rate_unit_rad_s = {unit:g}, or let its driver publish rad/s."
+    )
+    robot = replace(report.robot, imu=replace(report.robot.imu, rate_unit_rad_s=unit))
+    return replace(report, robot=robot, findings=(*report.findings, text), keys={**report.keys, "imu.rate_unit_rad_s": f"{unit:g}"})
+
+
+def _name_range(report: UnitReport, signals: WheelSignals) -> UnitReport:
+    """Counters that wrap: jumps of positions that all have one size."""
+    sizes, joints = np.abs(signals.jumps), report.robot.joints
+    if not len(sizes) or joints.angle_range:
+        return report
+    size = float(np.median(sizes))
+    counter = next((c for c in _COUNTERS if abs(size / c - 1.0) <= _SAME_JUMP), None)
+    is_one_size = float(np.abs(sizes / size - 1.0).max()) <= _SAME_JUMP and (counter is not None or len(sizes) >= 2)
+    if not is_one_size or abs(size * joints.angle_unit_rad / math.tau - 1.0) <= _SAME_JUMP:
+        return report
+    value = float(f"{size if counter is None else counter:.6g}")
+    what = f"a counter of {math.log2(counter):.0f} bits" if counter is not None else "a counter that wraps"
+    times = f"{len(sizes)} time{'s' * (len(sizes) > 1)}"
+    text = (
+        f"positions of the wheels jump by {value:g} ({times}): {what}. Corrected in this run; write to the robot file: joints.angle_range ="
+        f" {value:.0f}."
+    )
+    robot = replace(report.robot, joints=replace(joints, angle_range=value))
+    return replace(report, robot=robot, findings=(*report.findings, text), keys={**report.keys, "joints.angle_range": f"{value:.10g}"})

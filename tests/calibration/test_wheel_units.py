@@ -1,0 +1,90 @@
+"""Units of wheels and gyro: what each of a healthy drive's rates and angles becomes in the units that drivers publish."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from localization.calibration.wheel_wiring import WiringReport, check_wiring, open_checked
+from localization.events import WheelSample
+from localization.logs import open_log
+from motion_models.robot import load_robot
+from motion_models.robot_file import robot_toml
+from tests.helpers.wiring import CASES, ROBOT_TOML, Change, drive
+
+ROBOT = load_robot(ROBOT_TOML)
+RADIUS = 0.165
+NOTHING = np.zeros(0)
+DEG, TICKS = math.pi / 180.0, math.tau / 2048.0
+
+
+def scaled(angle: float | None, rate: float | None) -> Change:
+    """Positions and velocities in units of ``angle`` [rad] and ``rate`` [rad/s]; None where the driver has none."""
+    return lambda position, velocity: (NOTHING if angle is None else position / angle, NOTHING if rate is None else velocity / rate)
+
+
+def report_of(path: Path) -> WiringReport:
+    return check_wiring(open_log(path, ROBOT))
+
+
+@pytest.mark.parametrize(
+    ("unit", "name"),
+    [(math.tau / 60.0, "revolutions per minute"), (DEG, "degrees per second"), (1.0 / RADIUS, "metres per second")],
+)
+@pytest.mark.parametrize("has_odometry", [False, True])
+def test_units_of_velocities_alone_are_named_and_corrected(tmp_path: Path, unit: float, name: str, has_odometry: bool) -> None:
+    report = report_of(drive(tmp_path / "log.mcap", scaled(None, unit), has_odometry=has_odometry))
+    assert name in report.findings[0]
+    assert report.robot.joints.rate_unit_rad_s == pytest.approx(unit, rel=0.05)
+    assert load_toml(tmp_path, report).findings == ()
+
+
+def load_toml(tmp_path: Path, report: WiringReport) -> WiringReport:
+    """What is found with the corrected robot's file."""
+    (tmp_path / "r.toml").write_text(robot_toml(report.robot))
+    return check_wiring(open_log(tmp_path / "log.mcap", load_robot(tmp_path / "r.toml")))
+
+
+@pytest.mark.parametrize(("unit", "name"), [(DEG, "degrees"), (1.0 / RADIUS, "metres"), (TICKS, "counts, about 2")])
+def test_units_of_positions_alone_are_named_and_corrected(tmp_path: Path, unit: float, name: str) -> None:
+    report = report_of(drive(tmp_path / "log.mcap", scaled(unit, None)))
+    assert name in report.findings[0]
+    assert report.robot.joints.angle_unit_rad == pytest.approx(unit, rel=0.1)
+
+
+def test_units_of_positions_with_right_velocities_are_exact(tmp_path: Path) -> None:
+    report = report_of(drive(tmp_path / "log.mcap", scaled(TICKS, 1.0)))
+    assert report.robot.joints.angle_unit_rad == pytest.approx(TICKS, rel=0.01)
+    assert report.robot.joints.rate_unit_rad_s == 1.0
+
+
+def test_units_of_counters_of_16_bits_lose_no_motion(tmp_path: Path) -> None:
+    def wrapped(position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.mod(position / (TICKS / 16.0) + 60000.0, 65536.0), NOTHING
+
+    log, report = open_checked(drive(tmp_path / "log.mcap", wrapped), ROBOT)
+    assert report.robot.joints.angle_range == 65536.0
+    turned = [event.position for event in log.events() if isinstance(event, WheelSample)]
+    whole = [event.position for event in open_log(CASES / "base-log" / "log.mcap", ROBOT).events() if isinstance(event, WheelSample)]
+    np.testing.assert_allclose(turned[-1] - turned[0], whole[-1] - whole[0], rtol=0.1)
+
+
+def test_units_of_gyro_in_degrees_are_corrected(tmp_path: Path) -> None:
+    report = report_of(drive(tmp_path / "log.mcap", gyro=1.0 / DEG))
+    assert report.robot.imu.rate_unit_rad_s == pytest.approx(DEG, rel=1e-4)
+    assert "deg/s" in report.findings[0]
+    assert load_toml(tmp_path, report).findings == ()
+
+
+def test_driver_that_corrects_for_skidding_has_its_multiplier_found() -> None:
+    report = check_wiring(open_log(CASES / "H12-odometry-in-tf-only" / "log.mcap", ROBOT))
+    assert report.robot.driver.wheel_separation_multiplier == pytest.approx(1.0 / 0.55, rel=0.05)
+
+
+def test_driver_odometry_opposite_to_the_gyro_blames_none(tmp_path: Path) -> None:
+    report = report_of(drive(tmp_path / "log.mcap", gyro=-1.0, has_odometry=True, has_joints=False))
+    assert report.is_ambiguous
+    assert "or the gyro's sign is reversed" in report.findings[0]
