@@ -174,16 +174,19 @@ class Filter:
         return delta, _clip_eigenvalues(P[POSE, POSE] - cross - cross.T + A @ P[clone, clone] @ A.T)
 
     def _update(self, innovation: FloatArray, H: FloatArray, R: FloatArray, is_of_map: bool = False) -> float:
-        """Schmidt-Kalman update in Joseph's form; consider states have no gain. Returns the NIS. Raises `EstimatorError`.
+        """Kalman update with consider states, in Joseph's form. Returns the NIS. Raises `EstimatorError`.
 
-        A measurement that ``is_of_map`` keeps the pose as near to the submap as the optimal gain does: what would move the submap, which
-        stays where it is drawn, moves the pose by the opposite. Else a pose that is better known than the submap stays off it, and later
-        scans are matched from a wide prior.
+        Joseph's form is the covariance for any gain, and each row of K has an aim of its own: K_i = P_i H^T S^-1 minimises E (e_i - K_i
+        y)^2 for innovation y, whatever the other rows are (bias, clock, clone `start`, radius, corrections). Consider states have K_i = 0
+        (Schmidt 1966). For a measurement that ``is_of_map`` the pose's rows minimise the covariance of the pose relative to the submap,
+        which has no gain: E |e_pose - e_map - K y|^2 is least at K = (P_pose - P_map) H^T S^-1, the difference of both optimal gains.
+        With the pose's own optimal gain, a pose that is better known than the submap would stay off it, and later scans be matched from a
+        wide prior.
         """
         P = self.P
         S = H @ P @ H.T + R
         _check("a measurement", innovation, S)
-        K = np.asarray(np.linalg.solve(S, H @ P).T, dtype=float)
+        K = np.asarray(np.linalg.solve(S, H @ P).T, dtype=float)  # P H^T S^-1
         if is_of_map:
             K[POSE] -= K[MAP]
         K[self.is_considered] = 0.0

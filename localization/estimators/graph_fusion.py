@@ -38,8 +38,6 @@ _CONSTANT_SHARE = 1e-3
 GTSAM's Cholesky factors lose positive definiteness."""
 _NO_SIGMA = 1e-4
 """Prior sigma of the wheels' radius where it is not a variable of its own."""
-_MIN_RATIO = 1.1
-"""Information of a motion over that of the wheels alone, from which on scans have measured it: 1 in a bare corridor, along it."""
 _OPEN_SHARE, _NO_INFORMATION = 0.5, 1e-3
 """Variance of a keyframe's way over that by the wheels, above which scans know less of it than the wheels do: the scene leaves it open.
 The information of scans along it then [1/m^2]: a sigma of 30 m."""
@@ -188,7 +186,7 @@ class GraphFusion(Estimator):
         wheel_cov = wheels.cov + D @ ekf.P[np.ix_(states, states)] @ D.T
         if self._is_matched and cov[0, 0] > _OPEN_SHARE * wheel_cov[0, 0]:  # the way is the wheels' alone: it does not show their radius
             return BetweenMeasurement(k - 1, k, delta, block_diag(_NO_INFORMATION, np.linalg.inv(cov[1:, 1:])))
-        return BetweenMeasurement(k - 1, k, *_subtract_information(delta, cov, by_wheels, wheel_cov, self._is_matched))
+        return BetweenMeasurement(k - 1, k, *subtract_information(delta, cov, by_wheels, wheel_cov))
 
     def _epoch_cov(self) -> FloatArray | None:
         """(c, c) by which the corrections may have changed, once a minute; None meanwhile."""
@@ -316,22 +314,20 @@ class GraphFusion(Estimator):
         return np.vstack(drawn) if drawn else np.empty((0, 2))
 
 
-def _subtract_information(delta: Pose2, cov: Cov3, prior: Pose2, prior_cov: Cov3, is_matched: bool) -> tuple[Pose2, Cov3]:
+def subtract_information(delta: Pose2, cov: Cov3, prior: Pose2, prior_cov: Cov3) -> tuple[Pose2, Cov3]:
     """Motion and information of gyro and scans alone, where they and the wheels' ``prior`` (3,) together give ``delta`` (3,).
 
-    The wheels have a factor of their own, and must not be counted twice: information C^-1 - C_w^-1, where it is positive. Along directions
-    in which gyro and scans have less information than the wheels, their share of the motion is not observable: there it is at most as far
-    from ``delta`` as the wheels are. Where a scan ``is_matched`` and adds information, the whole motion counts: errors
-    of scans are against the submap, so that they do not add up from keyframe to keyframe as those of the wheels do.
+    The wheels have a factor of their own, and each measurement counts once: information C^-1 - C_w^-1, where it is positive. Along
+    directions in which gyro and scans have less information than the wheels, their share of the motion is not observable: there it is at
+    most as far from ``delta`` as the wheels are.
     """
     root = np.linalg.cholesky(np.linalg.inv(prior_cov))
     whiten = np.linalg.inv(root)
     ratios, axes = np.linalg.eigh(whiten @ np.linalg.inv(cov) @ whiten.T)  # information with gyro and scans, over that of the wheels
-    keeps_all = (ratios > _MIN_RATIO) & is_matched
-    gained = np.where(keeps_all, ratios, np.maximum(ratios - 1.0, 1e-6))
+    gained = np.maximum(ratios - 1.0, 1e-6)
     to_axes = axes.T @ root.T
     off = to_axes @ se2.log(se2.between(prior, delta))
-    shift = np.linalg.solve(to_axes, np.where(keeps_all, 0.0, off / np.maximum(gained, 1.0)))
+    shift = np.linalg.solve(to_axes, off / np.maximum(gained, 1.0))
     return se2.compose(delta, se2.exp(shift)), (to_axes.T * gained) @ to_axes
 
 

@@ -327,6 +327,15 @@ def test_update_scan_keeps_a_pose_that_is_better_known_than_the_submap_on_it():
     np.testing.assert_allclose(np.sqrt(np.diag(ekf.P))[POSE], [0.3, 0.3, 0.03], rtol=0.01)  # that of the submap, which it is now on
 
 
+def test_update_scan_is_optimal_for_the_pose_relative_to_the_submap():
+    """What a scan measures is that pose: its information adds up, as in a filter of it alone."""
+    ekf, _ = prepared(2)
+    before = ekf.map_relative_cov()
+    ekf.update_scan(ekf.pose, LIDAR, NOTHING)
+    expected = np.linalg.inv(np.linalg.inv(before) + np.linalg.inv(LIDAR))
+    np.testing.assert_allclose(ekf.map_relative_cov(), expected, rtol=1e-6, atol=1e-14)
+
+
 def test_update_scan_that_leaves_the_way_open_leaves_the_wheel_radius():
     ekf, _ = prepared(3)
     before, P = ekf.radius_scale, ekf.P[RADIUS, RADIUS]

@@ -170,9 +170,6 @@ GRAPH_PATCHES: Mapping[str, Patch] = {
     "agreement of a second loop": _attribute(LoopDetector, "_agree", lambda self, one, other: True),
     "robust loss of loops": _attribute(pose_graph, "_CAUCHY", _NO_LOSS),
     "robust loss of wheels": _attribute(pose_graph, "_HUBER", _NO_LOSS),
-    "all of the filter's motion after a matched scan (less the wheels' share, instead)": _wrap(
-        graph_fusion, "_subtract_information", lambda original, *motion: original(*motion[:4], False)
-    ),
     "ways that the scene leaves open as the wheels' alone": _attribute(graph_fusion, "_OPEN_SHARE", math.inf),
     "corrections of the graph in the filter": _attribute(Filter, "set_corrections", lambda self, mean, cov: None),
     "random walk of the corrections": _attribute(graph_fusion, "_CORRECTION_EPOCH_S", math.inf),
