@@ -9,6 +9,8 @@ wrong. Three steps:
   two implausible stamps are outliers, and dropped; three in a row that agree are a clock that was set, and from there on the topic is
   shifted back by the jump. A burst gives no information about clocks and is held until the next message: if that is plausible and
   continues it, the burst was late.
+- How far a topic's clock is from the recorder's is taken from its first eleven messages: one that lies behind them (a latched message, a
+  buffer of the driver) is dropped as old. Where fewer than three are known, the clock may still be replaced by the next three.
 - A topic without stamps gets the time of recording; one whose clock is far from all others is shifted by a constant.
 - Plausible messages are held in a heap until nothing older can come: one second after the slowest topic's usual latency. Live they are
   passed on at once.
@@ -20,7 +22,7 @@ import dataclasses
 import heapq
 import statistics
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +34,8 @@ _REORDER_WAIT_NS = _SECOND
 _MAX_CLOCK_OFFSET_NS = 10 * _SECOND  # more is another clock, not latency
 _EQUAL_JUMP_NS = _SECOND // 4  # jumps of two topics that differ by less have one cause
 _MIN_JUMPED_MESSAGES = 3
+FIRST_MESSAGES = 11
+"""Messages of a topic from which its latency is taken: three that agree outweigh any number of old ones."""
 _MIN_JUMP_NS = 3 * _SECOND // 10
 """A stamp that deviates from the even pace of its topic by more than this [ns], while the times of recording are even, is no latency but a
 clock that was set. Smaller jumps move a robot by less than 0.3 m at 1 m/s; estimators reject these."""
@@ -67,21 +71,53 @@ class ClockPlan:
     shifts_ns: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """Shift of the stamps of each topic whose clock is far from the others'."""
     latency_ns: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    """First header stamp, shifted, minus its time of recording."""
+    """Header stamp, shifted, minus time of recording, of each topic's first messages."""
+    unsure: frozenset[str] = frozenset()
+    """Topics of which too few messages are known for that."""
+
+    def first_stamps(self, first: Mapping[str, Sequence[tuple[int, int]]]) -> Iterator[int]:
+        """Shifted header stamps of those of the ``first`` messages, from which the plan was made, that are not old."""
+        for topic, pairs in first.items():
+            for log, stamp in pairs:
+                shifted = stamp + self.shifts_ns.get(topic, 0)
+                if stamp and shifted - log >= self.latency_ns[topic] - _MAX_STEP_NS:
+                    yield shifted
 
 
-def plan_clocks(first: Mapping[str, tuple[int, int]]) -> ClockPlan:
-    """Clocks by the first (log stamp, header stamp) of each topic; topics with a zero stamp are left out.
+def plan_clocks(first: Mapping[str, Sequence[tuple[int, int]]]) -> ClockPlan:
+    """Clocks by the (log stamp, header stamp) of the first messages of each topic; zero stamps are left out.
 
     If any topic agrees with the recorder to 10 s, that is the common clock; else the median of all.
     """
-    offsets = {topic: stamp - log for topic, (log, stamp) in first.items() if stamp != 0}
+    stamped = {topic: [pair for pair in pairs if pair[1] != 0] for topic, pairs in first.items()}
+    offsets = {topic: _usual_offset(pairs) for topic, pairs in stamped.items() if pairs}
     if not offsets or any(abs(offset) <= _MAX_CLOCK_OFFSET_NS for offset in offsets.values()):
         common = 0
     else:
         common = statistics.median_low(sorted(offsets.values()))
-    shifts = {topic: common - offset for topic, offset in offsets.items() if abs(offset - common) > _MAX_CLOCK_OFFSET_NS}
-    return ClockPlan(common, shifts, {topic: offset + shifts.get(topic, 0) for topic, offset in offsets.items()})
+    shifts = {topic: _shift_to(common, offset) for topic, offset in offsets.items() if _shift_to(common, offset)}
+    unsure = frozenset(topic for topic in offsets if len(stamped[topic]) < _MIN_JUMPED_MESSAGES)
+    return ClockPlan(common, shifts, {topic: offset + shifts.get(topic, 0) for topic, offset in offsets.items()}, unsure)
+
+
+def _shift_to(common: int, offset: int) -> int:
+    """Shift of a clock that is ``offset`` from the recorder's; 0 where that is the common one's and latency."""
+    return common - offset if abs(offset - common) > _MAX_CLOCK_OFFSET_NS else 0
+
+
+def _usual_offset(first: Sequence[tuple[int, int]]) -> int:
+    """Header stamp minus time of recording: the greatest on which several messages agree to a second.
+
+    Messages come late, never early: what a buffer or a latched topic adds lies below it, and a single stamp ahead has no second.
+    """
+    logs, stamps = zip(*first, strict=True)
+    offsets = sorted((stamp - log for log, stamp in first), reverse=True)
+    several = min(_MIN_JUMPED_MESSAGES, 1 + len(first) // 3)
+    for offset, other in zip(offsets, offsets[several - 1 :], strict=False):
+        if offset - other <= _MAX_STEP_NS:
+            return offset
+    is_batch = 2 * (logs[-1] - logs[0]) < stamps[-1] - stamps[0]  # written at once: the times of recording show nothing
+    return stamps[0] - logs[0] if is_batch else offsets[0]
 
 
 class TopicClock:
@@ -94,6 +130,7 @@ class TopicClock:
         self._foreign = self._shift != 0
         self._jumps = jumps
         self._rebased = False
+        self._is_sure, self._accepted = topic in plan.latency_ns and topic not in plan.unsure, 0
         self._last: int | None = None
         self._newest: int | None = None
         self.offset_ns = plan.latency_ns.get(topic, plan.offset_ns)
@@ -150,17 +187,17 @@ class TopicClock:
         return self._release()
 
     def drop_pending(self) -> None:
-        """Drop the pending messages as outliers."""
-        if self._pending:
-            self._stats.count(self._topic, Oddity.OUTLIER, len(self._pending))
-            self._pending = []
+        """Drop the pending messages as outliers, or as old where they lie behind all that follow."""
+        for item in self._pending:
+            is_old = self._last is None and item.stamp_ns + self._shift < item.log_ns + self.offset_ns
+            self._stats.count(self._topic, Oddity.OLD if is_old else Oddity.OUTLIER)
+        self._pending = []
 
     def _is_plausible(self, item: Item) -> bool:
         stamp = item.stamp_ns + self._shift
         offsets = (self.offset_ns, self._min_latency_offset_ns)  # after a burst, messages are no longer late
         return not self._is_sudden(item) and (
-            self._last is None
-            or abs(stamp - self._last) <= _MAX_STEP_NS
+            (self._last is not None and abs(stamp - self._last) <= _MAX_STEP_NS)
             or any(abs(stamp - item.log_ns - offset) <= _MAX_STEP_NS for offset in offsets)
         )
 
@@ -181,8 +218,8 @@ class TopicClock:
         return [self._accept(i) for i in released]
 
     def _may_be_late(self) -> bool:
-        """Whether the pending messages are stamped after the last plausible one."""
-        return bool(self._pending) and self._last is not None and self._last <= self._pending[0].stamp_ns + self._shift
+        """Whether the pending messages are stamped after the last plausible one, if there was one."""
+        return bool(self._pending) and (self._last is None or self._last <= self._pending[0].stamp_ns + self._shift)
 
     def _is_continued_by(self, item: Item) -> bool:
         """Whether the plausible ``item`` is stamped soon after the pending messages, and these after the last plausible one."""
@@ -202,6 +239,8 @@ class TopicClock:
             self._pace.append((step, item.log_ns - self._last_log - step))
         self._last, self._last_log, self.offset_ns = stamp, item.log_ns, stamp - item.log_ns
         self._min_latency_offset_ns = max(self._min_latency_offset_ns, self.offset_ns)
+        self._accepted += 1
+        self._is_sure |= self._accepted >= _MIN_JUMPED_MESSAGES
         if self._rebased:
             self._stats.count(self._topic, Oddity.REBASED)
         elif self._foreign:
@@ -214,6 +253,9 @@ class TopicClock:
     def _set_clock(self) -> None:
         """The clock was set: shift the topic so that it is as far from the time of recording as it was before."""
         first = self._pending[:_MIN_JUMPED_MESSAGES]  # in a burst, they are as late as the message before them
+        if not self._is_sure:
+            self._replace_clock(statistics.median_low([i.stamp_ns - i.log_ns for i in first]))
+            return
         deviation = statistics.median_low([i.stamp_ns + self._shift - i.log_ns - self.offset_ns for i in first])
         shift = self._shift - deviation
         # The latency jitters. Where another topic made the same jump, or this one a jump back, the same shift keeps them aligned.
@@ -222,6 +264,12 @@ class TopicClock:
         self._rebased = self._shift != 0
         if not same:
             self._jumps.append(shift)
+
+    def _replace_clock(self, offset: int) -> None:
+        """The pending messages, at ``offset`` from the time of recording, are the first that show the topic's clock."""
+        self._shift, self._is_sure = _shift_to(self._common, offset), True
+        self._foreign = self._shift != 0
+        self.offset_ns = self._min_latency_offset_ns = offset + self._shift
 
 
 class Merger:

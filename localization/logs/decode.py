@@ -43,6 +43,7 @@ class Oddity(Enum):
     REPEATED = "dropped (stamp repeated)"
     SECOND_FRAME = "dropped (stamp repeated by another frame: two sensors share the topic); give each of them its own topic"
     LATE = "dropped (recorded more than a second after newer ones)"
+    OLD = "dropped (stamped seconds before the topic's others: latched, or left in a buffer)"
     OUTLIER = "dropped (stamp that fits neither its neighbours nor the time of recording)"
     REBASED = "stamped after a jump of the clock, moved back by it"
     POSE_JUMP = "with a pose that wheels cannot reach (a reset); the increment was taken from the rates"
@@ -54,6 +55,10 @@ class Oddity(Enum):
     SECOND_PUBLISHER = "of a second publisher whose wheels turn less, left out; stop one of the two (`ros2 topic info --verbose`)"
     FROZEN_WHEEL = "with an angle that never changes while another wheel of its side turns; it was left out (check its encoder)"
     WHEEL_JUMP = "with a wheel angle that wheels cannot reach (a reset); the increment was taken from the rates"
+
+    def sentence(self, topic: str, n: int) -> str:
+        """``n`` messages of ``topic`` with this defect."""
+        return f"{topic}: {n} {'old ' if self is Oddity.OLD else ''}message{'s' if n > 1 else ''} {self.value}."
 
 
 class UnusableError(Exception):
@@ -85,7 +90,7 @@ class MessageStats:
     def describe(self) -> list[str]:
         """One sentence for each topic and oddity."""
         ordered = sorted(self._counts.items(), key=lambda entry: (entry[0][0], list(Oddity).index(entry[0][1])))
-        return [f"{topic}: {n} message{'s' if n > 1 else ''} {oddity.value}." for (topic, oddity), n in ordered if n]
+        return [oddity.sentence(topic, n) for (topic, oddity), n in ordered if n]
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from localization.errors import LogError, TopicError
 from localization.events import Event, Reference
 from localization.logs import mcap, ros1, sqlite
 from localization.logs.chunks import DamagedError, RawMessage, Source, decompress_file, merge_channels
-from localization.logs.clock_sync import ClockPlan, Item, merge, plan_clocks
+from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, Item, merge, plan_clocks
 from localization.logs.decode import MessageStats, UnusableError, frame_name, stamp_ns
 from localization.logs.event_decoder import EventDecoder, TopicDecoder, decode_item
 from localization.logs.references import reference_decoder
@@ -31,6 +31,7 @@ from motion_models.text_files import check_file
 _GPS = "/fix"
 _TF_READ_NS = 10_000_000_000  # of ROS 1, where static transforms are repeated every 0.1 to 1 s on /tf
 _TRANSFORMS_READ = 2000  # first messages of /tf that are searched for the odometry's
+_FIRST_READ_NS = 20_000_000_000  # of a topic, for its latency; a long log is not read to its end for one that is slow
 _JOINT_STATES_READ = 500  # first messages that are searched for joint names
 
 _MAX_METADATA_BYTES = 4 << 20
@@ -209,12 +210,14 @@ class Log:
         return self._clock_plan([source.topic for source in self.sources.used()])
 
     def _clock_plan(self, topics: list[str]) -> ClockPlan:
-        first: dict[str, tuple[int, int]] = {}
+        first: dict[str, list[tuple[int, int]]] = {}
         for topic in topics:
-            for log_ns, message in self._first_messages(topic, 10):
+            found = first[topic] = []
+            for log_ns, message in self._first_messages(topic, 2 * FIRST_MESSAGES):
                 self.frames.setdefault(topic, frame_name(message.header.frame_id))
                 if stamp_ns(message):
-                    first[topic] = log_ns, stamp_ns(message)
+                    found.append((log_ns, stamp_ns(message)))
+                if len(found) >= FIRST_MESSAGES or (len(found) > 2 and log_ns - found[0][0] > _FIRST_READ_NS):
                     break
         return plan_clocks(first)
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 import difflib
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from localization.errors import TransportError
-from localization.logs.clock_sync import ClockPlan, plan_clocks
+from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, plan_clocks
 from localization.logs.decode import UnusableError, frame_name, stamp_ns
 from localization.logs.serialization import decoder, live_channel
 from localization.logs.topic_roles import TYPES, TopicChooser, TopicOverrides, TopicRoles, choose_roles, short_type
@@ -65,7 +65,7 @@ class TopicDiscovery:
         self._transforms = LiveTransforms(body, is_ros1=transport.is_ros1)
         self._backlog: list[Received] = []
         self._counts: Counter[str] = Counter()
-        self._first: dict[str, tuple[int, int]] = {}
+        self._first: dict[str, list[tuple[int, int]]] = defaultdict(list)
 
     def discover(
         self, wait_s: float, needed: Iterable[str], report: Callable[[str], None], is_over: Callable[[], bool]
@@ -110,8 +110,8 @@ class TopicDiscovery:
             message = self._decoders[received.topic](received.data)
         except UnusableError:
             return
-        if stamp_ns(message):
-            self._first.setdefault(received.topic, (received.received_ns + self._transport.epoch_ns, stamp_ns(message)))
+        if stamp_ns(message) and len(self._first[received.topic]) < FIRST_MESSAGES:
+            self._first[received.topic].append((received.received_ns + self._transport.epoch_ns, stamp_ns(message)))
         self._counts[received.topic] += 1
         self._backlog.append(received)
         if len(self._backlog) > _MAX_BACKLOG:
@@ -156,8 +156,7 @@ class TopicDiscovery:
         used = {source.topic for source in parts.sources.used()}
         first = {topic: stamps for topic, stamps in self._first.items() if topic in used}
         plan = plan_clocks(first)
-        stamps_ns = [stamp + plan.shifts_ns.get(topic, 0) for topic, (_, stamp) in first.items()]
-        start_ns = min(stamps_ns, default=self._transport.epoch_ns + self._transport.now_ns())
+        start_ns = min(plan.first_stamps(first), default=self._transport.epoch_ns + self._transport.now_ns())
         mounts = {"base_link": Mount(), **self._robot.mounts, **self._transforms.mounts()}
         return DiscoveredTopics(parts, mounts, self._transforms, plan, start_ns, self._backlog)
 

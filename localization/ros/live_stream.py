@@ -108,8 +108,8 @@ class LiveStream:
         for name in (name for topic in self._rates for name in self._stats.parts(topic)):
             for oddity in Oddity:
                 if (count := self._stats.of(name, oddity)) and oddity is not Oddity.OUT_OF_ORDER:
-                    what = _LATE if oddity is Oddity.LATE else oddity.value
-                    found.append(f"{name}: {count} message{'s' * (count > 1)} {what}.")
+                    sentence = oddity.sentence(name, count)
+                    found.append(sentence.replace(oddity.value, _LATE) if oddity is Oddity.LATE else sentence)
         return found
 
 

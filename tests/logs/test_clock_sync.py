@@ -40,14 +40,13 @@ def mark(topic: str, true_ns: int, log_ns: int, stamp_ns: int | None = None) -> 
 
 
 def run(items: Iterable[Item]) -> tuple[list[Mark], MessageStats]:
-    """Merge items after bringing them into the order of recording, with clocks planned by each topic's first."""
+    """Merge items after bringing them into the order of recording, with clocks planned by each topic's first eleven."""
     ordered = sorted(items, key=lambda item: item.log_ns)
-    first: dict[str, tuple[int, int]] = {}
+    first: dict[str, list[tuple[int, int]]] = {}
     for item in ordered:
-        if item.stamp_ns:
-            first.setdefault(item.topic, (item.log_ns, item.stamp_ns))
+        first.setdefault(item.topic, []).append((item.log_ns, item.stamp_ns))
     stats = MessageStats()
-    return list(merge(ordered, plan_clocks(first), stats)), stats
+    return list(merge(ordered, plan_clocks({topic: pairs[:11] for topic, pairs in first.items()}), stats)), stats
 
 
 def check_order(marks: list[Mark]) -> None:
@@ -212,10 +211,45 @@ def test_clock_sync_single_outlier_stamps_are_dropped_and_counted() -> None:
 
 def test_clock_sync_outlier_first_stamp_does_not_shift_the_rest() -> None:
     items = [mark("/scan", t, t + 20 * MS, t + (HOUR if i == 0 else 0)) for i, t in ((i, START + i * S // 10) for i in range(100))]
-    marks, _ = run([*ticks("/wheels", 10, 50), *items])
+    marks, stats = run([*ticks("/wheels", 10, 50), *items])
     check_order(marks)
-    assert len(marks) == 600
-    assert all(m.stamp_ns == m.true_ns for m in marks if m.true_ns > START)
+    assert len(marks) == 599
+    assert all(m.stamp_ns == m.true_ns for m in marks)
+    assert stats.of("/scan", Oddity.OUTLIER) == 1
+
+
+@pytest.mark.parametrize("old_s", [[4.0], [3600.0], [40.0, 20.0], [3.0, 2.9, 2.8]])
+@pytest.mark.parametrize(("rate", "n"), [(50, 300), (2, 40), (0.2, 8), (5, 4)])
+def test_clock_sync_old_first_messages_are_dropped(old_s: list[float], rate: float, n: int) -> None:
+    """As those of a latched topic, which arrive at once when the recorder subscribes, or of a driver's buffer."""
+    old = [mark("/pose", START - int(s * S), START + i * MS) for i, s in enumerate(old_s)]
+    good = [mark("/pose", t, t + 20 * MS) for t in (START + int(i * S / rate) + S // 2 for i in range(n))]
+    marks, stats = run([*old, *good, *ticks("/wheels", 40, 50)])
+    check_order(marks)
+    assert [m.true_ns for m in marks if m.topic == "/pose"] == [m.stamp_ns for m in good]
+    assert all(m.stamp_ns == m.true_ns for m in marks)
+    assert stats.of("/pose", Oddity.OLD) == len(old)
+    assert stats.describe()[0].startswith(f"/pose: {len(old)} old message{'s' * (len(old) > 1)} dropped (")
+
+
+@pytest.mark.parametrize("before", [3, 6, 9])
+def test_clock_sync_jump_soon_after_the_start_is_corrected(before: int) -> None:
+    """Several messages on both sides, at their pace: a clock that was set, not a buffer."""
+    scans = [mark("/scan", t, t + 20 * MS, t - (5 * S if i < before else 0)) for i, t in ((i, START + i * S // 10) for i in range(100))]
+    marks, stats = run([*ticks("/wheels", 10, 50), *scans])
+    check_order(marks)
+    assert len([m for m in marks if m.topic == "/scan"]) == 100
+    assert len({m.stamp_ns - m.true_ns for m in marks if m.topic == "/scan"}) == 1
+    assert stats.of("/scan", Oddity.OLD) == 0
+
+
+def test_clock_sync_clock_of_few_messages_is_replaced() -> None:
+    """Live, a topic may have sent nothing but its latched message before the start."""
+    old, items = mark("/pose", START - 5 * S, START), ticks("/pose", 5, 10, start=START + S)
+    stats = MessageStats()
+    marks = list(merge([old, *items], plan_clocks({"/pose": [(START, START - 5 * S)]}), stats))
+    assert all(m.stamp_ns == m.true_ns for m in marks)
+    assert len(marks) == 51
 
 
 def test_clock_sync_repeated_stamps_are_dropped_and_counted() -> None:
@@ -330,7 +364,7 @@ def test_clock_sync_any_input_uses_bounded_memory(case: str, monkeypatch: pytest
     def peak(n: int) -> int:
         tracemalloc.start()
         last = 0
-        for event in merge(items(n), plan_clocks({"/a": (START, START)}), MessageStats()):
+        for event in merge(items(n), plan_clocks({"/a": [(START, START)]}), MessageStats()):
             assert event.stamp_ns >= last
             last = event.stamp_ns
         most = tracemalloc.get_traced_memory()[1]
@@ -354,7 +388,7 @@ def test_clock_sync_any_stamps_are_ordered_and_counted(entries: list[tuple[str, 
     items = [mark(topic, START + at, START + at, 0 if late is None else START + at - late) for topic, at, late in entries]
     marks, stats = run(items)
     check_order(marks)
-    dropped = sum(stats.of(t, o) for t in ("/a", "/b", "/c") for o in (Oddity.REPEATED, Oddity.LATE, Oddity.OUTLIER))
+    dropped = sum(stats.of(t, o) for t in ("/a", "/b", "/c") for o in (Oddity.REPEATED, Oddity.LATE, Oddity.OUTLIER, Oddity.OLD))
     assert len(marks) + dropped == len(items)
 
 

@@ -32,6 +32,16 @@ def references_of(tmp_path: Path, messages: list[Any]) -> tuple[list[Reference],
     return list(log.references("/ref")), log
 
 
+def test_references_latched_first_pose_is_old_and_named() -> None:
+    """It is 4.6 s old; the poses after it keep their stamps."""
+    folder = Path(__file__).parents[1] / "data" / "cases" / "H03-first-reference-latched"
+    log = open_log(folder / "log.mcap", load_robot(folder / "robot.toml"))
+    references = list(log.references("/mocap_pose"))
+    assert len(references) == 114
+    assert references[0].stamp_ns - log.start_ns == S // 2
+    assert log.warnings()[-1].startswith("/mocap_pose: 1 old message dropped")
+
+
 COVARIANCE = np.arange(36.0).reshape(6, 6)
 COVARIANCE = COVARIANCE @ COVARIANCE.T + np.eye(6)
 

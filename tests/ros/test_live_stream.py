@@ -81,6 +81,29 @@ def test_live_node_gives_the_numbers_of_a_replay(calm):
     assert node.warnings() == []
 
 
+@pytest.mark.parametrize("topic", ["/scan", "/joint_states", "/imu/data"])
+def test_live_node_old_first_message_is_as_a_lost_one(topic):
+    """As a latched topic or a driver's buffer sends it."""
+
+    def first(messages):
+        return next(i for i, m in enumerate(messages) if m.topic == topic)
+
+    def lose(messages):
+        return messages[: first(messages)] + messages[first(messages) + 1 :]
+
+    def make_old(messages):
+        at, data = first(messages), bytearray(messages[first(messages)].data)
+        sec = int.from_bytes(data[4:8], "little", signed=True)  # of the stamp, behind the encapsulation
+        data[4:8] = (sec - 4).to_bytes(4, "little", signed=True)
+        return [*messages[:at], messages[at]._replace(data=bytes(data)), *messages[at + 1 :]]
+
+    lost, old = (LogTransport(drive_log(), spoil) for spoil in (lose, make_old))
+    run_node(lost)
+    node, _ = run_node(old)
+    np.testing.assert_equal(track(old), track(lost))
+    assert next(w for w in node.warnings() if "dropped" in w).startswith(f"{topic}: 1 old message dropped")
+
+
 def test_node_publishes_odometry_transforms_and_diagnostics(calm):
     transport, node, _ = calm
     odometry, tf = published(transport, ODOMETRY), published(transport, TF)
