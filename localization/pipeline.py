@@ -10,10 +10,20 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from localization.errors import LogError
 from localization.estimate_table import NIS, TWIST, TWIST_COV, EstimateTable, trajectory
-from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, Estimate, Estimator, EstimatorConfig, make_estimator
+from localization.estimators import (
+    ESTIMATORS_WITH_CORRECTIONS,
+    ESTIMATORS_WITH_MAP,
+    Estimate,
+    Estimator,
+    EstimatorConfig,
+    MapFusion,
+    PriorMap,
+    make_estimator,
+)
 from localization.events import Event, ImuSample, PositionSample, Step
 from localization.lidar.losses import LidarLosses
 from localization.maps import KeyframeMap
@@ -42,6 +52,8 @@ class Trial:
     estimator: str
     corrections: Form = "constant"
     """What a fusing estimator corrects of the motion model: a form of `motion_models.online_calibration`."""
+    prior: PriorMap | None = None
+    """A saved map, for the estimator that localizes in it."""
 
 
 class Pipeline:
@@ -64,9 +76,12 @@ class Pipeline:
         """Known mounts by frame, shared with the synchronizer and the estimator."""
         model = add_correction_parameters(trial.model, trial.corrections) if trial.estimator in ESTIMATORS_WITH_CORRECTIONS else trial.model
         self.synchronizer = Synchronizer(model, robot, self.mounts, has_lidar, config.step)
+        name = trial.estimator if trial.prior is None else "ekf"
         self.estimator: Estimator = make_estimator(
-            trial.estimator, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing
+            name, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing
         )
+        if trial.prior is not None:
+            self.estimator = MapFusion(self.estimator, trial.prior)
         self.checks = SensorChecks(self.mounts, config.estimator.lidar, config.step)
         self.wheel_twist: FloatArray | None = None
         """(3,) mean twist of the last step by the wheels alone; None where wheel data were missing in it."""
@@ -169,6 +184,8 @@ class Run:
     """How long the LiDAR was lost; None where no scans were matched to a map."""
     keyframes: KeyframeMap | None = None
     """The map as it can be saved, of an estimator with a map frame."""
+    localization: Mapping[str, Any] | None = None
+    """State, probability and times of the estimator that localizes in a saved map."""
 
 
 _EQUAL_CHARACTERS = 60
@@ -255,4 +272,5 @@ class _Replay:
             None if smoothed is None else filtered,
             self._pipeline.lidar,
             estimator.keyframe_map(),
+            estimator.localization(),
         )

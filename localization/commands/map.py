@@ -50,11 +50,11 @@ class MapExport:
     def run(self, console: Console) -> None:
         """Run the command. Raises `SkidlocError` for input that cannot be used."""
         from localization.maps.export import exports
-        from localization.maps.grid import make_grid
+        from localization.maps.grid import draw_grid
 
         check_outputs(self.out)
         mapped = load_map(self.file).map
-        grid = make_grid(mapped, self.resolution)
+        grid = draw_grid(mapped, self.resolution)
         with new_folder(self.out) as folder:
             for name, content in exports(grid, mapped).items():
                 (folder / name).write_bytes(content)

@@ -21,7 +21,7 @@ from rich.table import Table
 from localization.calibration.wheel_wiring import open_checked
 from localization.commands.common import WIDE, names, new_folder, print_table, write_json
 from localization.errors import EstimatorError, EvaluationError
-from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, check_estimator
+from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, LOCALIZER, PriorMap, check_estimator
 from localization.evaluation.references import (
     ReferenceTrack,
     Relations,
@@ -36,7 +36,8 @@ from localization.events import Event, PositionSample
 from localization.logs import Log, TopicOverrides
 from localization.logs.references import merge_positions, read_positions
 from localization.logs.writer import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
-from localization.maps import SavedMap, save_map
+from localization.maps import SavedMap, load_map, save_map
+from localization.maps.place_search import PlaceMap
 from localization.output import as_text, check_outputs, fingerprint, versions
 from localization.pipeline import ReplayConfig, Run, Trial, replay, warnings_of
 from localization.report.replay_page import COLUMNS, MISSING, Column, ReportHead, overview_png, verdict, with_values, write_report
@@ -81,6 +82,10 @@ class Replay:
     positions: str | None = None
     """Topic of positions (NavSatFix, poses) that `graph` is to fuse, as GPS: `/fix`. The lever arm of the antenna is
     --config.estimator.graph.antenna-x-m and -y-m. If they are the reference as well, every second one is fused, and the others score."""
+    map: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Map of an earlier drive, by `--save-map`: the estimator `map` is added, whose poses are in that map's frame."""
+    initial_pose: tuple[float, float, float] | None = None
+    """About where the drive begins in `--map` [m, m, deg], as 3.5 -1.2 90; without it the whole map is searched."""
     save_map: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """New file for the map of the last `graph` pair: `office.skidmap`. `skidloc map` shows and exports it."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
@@ -97,10 +102,11 @@ class Replay:
         log, wiring = open_checked(self.log, robot, self.topic.scored_against(self.reference))
         robot = log.robot
         has_lidar = log.sources.lidar is not None
+        prior = self._prior()
         models = [make_model(name, robot) for name in names(self.model, "--model")]
         forms = names(self.corrections, "--corrections")
         pairs = [
-            Trial(model, estimator, form)
+            Trial(model, estimator, form, prior if estimator == LOCALIZER else None)
             for estimator in self._estimators(has_lidar)
             for model in models
             for form in check_forms(forms)[: None if estimator in ESTIMATORS_WITH_CORRECTIONS else 1]
@@ -156,17 +162,28 @@ class Replay:
 
     def _estimators(self, has_lidar: bool) -> list[str]:
         found = names(self.estimator, "--estimator")
+        found += [LOCALIZER] if self.map is not None and LOCALIZER not in found else []
         for name in found:
-            check_estimator(name, has_lidar or self.estimator == type(self).estimator)
+            check_estimator(name, has_lidar or (self.estimator == type(self).estimator and name != LOCALIZER), self.map is not None)
         if self.estimator == type(self).estimator and not has_lidar:
             found.remove(_WHEELLESS)
         return found
+
+    def _prior(self) -> PriorMap | None:
+        """The saved map. Raises `MapError` where it cannot be read."""
+        pose = self.initial_pose
+        if pose is not None and (self.map is None or not all(map(math.isfinite, pose))):
+            raise EstimatorError("--initial-pose is three numbers x y yaw [m, m, deg] in a saved map. Name the map by --map.")
+        if self.map is None:
+            return None
+        initial = None if pose is None else np.array([pose[0], pose[1], math.radians(pose[2])])
+        return PriorMap(PlaceMap(load_map(self.map).map, self.config.estimator.lidar.range_noise_m), initial)
 
     def _check_map(self, has_lidar: bool) -> None:
         """Refuse `--save-map` before the run, where there will be no map."""
         if self.save_map is None:
             return
-        if not set(ESTIMATORS_WITH_MAP) & set(names(self.estimator, "--estimator")):
+        if "graph" not in names(self.estimator, "--estimator"):
             raise EstimatorError("--save-map saves the map of the graph. Add it: --estimator odometry,ekf,graph.")
         if not has_lidar:
             raise EstimatorError("--save-map needs scans, and there are none in this log. Leave it out, or pass --topic.scan.")

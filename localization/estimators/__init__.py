@@ -11,6 +11,7 @@ from localization.estimators.baselines import DeadReckoning, LidarOdometry
 from localization.estimators.filter import FilterConfig
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
+from localization.estimators.map_fusion import MapFusion, PriorMap
 from localization.lidar import LidarConfig, ScanMatchingSensor
 from motion_models.base import MotionModel
 from motion_models.online_calibration import Form, make_corrections
@@ -20,9 +21,12 @@ __all__ = [
     "ESTIMATORS",
     "ESTIMATORS_WITH_CORRECTIONS",
     "ESTIMATORS_WITH_MAP",
+    "LOCALIZER",
     "Estimate",
     "Estimator",
     "EstimatorConfig",
+    "MapFusion",
+    "PriorMap",
     "check_estimator",
     "make_estimator",
 ]
@@ -38,19 +42,23 @@ class EstimatorConfig:
 
 
 ESTIMATORS = ("odometry", "lidar", "ekf", "graph")
-ESTIMATORS_WITH_CORRECTIONS = ("ekf", "graph")
+LOCALIZER = "map"
+"""The estimator that needs a saved map: the filter localized in it."""
+ESTIMATORS_WITH_CORRECTIONS = ("ekf", "graph", LOCALIZER)
 """Those that correct the motion model on the way."""
-ESTIMATORS_WITH_MAP = ("graph",)
+ESTIMATORS_WITH_MAP = ("graph", LOCALIZER)
 """Those whose poses are ``map_T_body``; the others' are ``odom_T_body``."""
 
 
-def check_estimator(name: str, has_lidar: bool) -> None:
-    """Raises `EstimatorError` for a name that does not exist, or for one that needs a LiDAR without one."""
-    if name not in ESTIMATORS:
+def check_estimator(name: str, has_lidar: bool, has_map: bool = False) -> None:
+    """Raises `EstimatorError` for a name that does not exist, or for one that needs a LiDAR or a saved map without one."""
+    if name == LOCALIZER and not has_map:
+        raise EstimatorError(f"the estimator '{LOCALIZER}' needs a saved map. Name one by --map, or use graph.")
+    if name not in (*ESTIMATORS, LOCALIZER):
         raise EstimatorError(f"no estimator '{name}'; there are {', '.join(ESTIMATORS)}.")
-    if name == "lidar" and not has_lidar:
+    if name in ("lidar", LOCALIZER) and not has_lidar:
         raise EstimatorError(
-            "the estimator 'lidar' needs scans, and there are none in this log. Use odometry, ekf or graph, or pass --topic.scan."
+            f"the estimator '{name}' needs scans, and there are none in this log. Use odometry, ekf or graph, or pass --topic.scan."
         )
 
 

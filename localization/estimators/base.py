@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -90,6 +91,10 @@ class Estimator(ABC):
 
     def keyframe_map(self) -> KeyframeMap | None:
         """Keyframes as they can be saved; None where the estimator has no map frame. Poses are smoothed after `finish`."""
+        return None
+
+    def localization(self) -> Mapping[str, Any] | None:
+        """State, probability and places in a saved map so far, as JSON holds them; None where there is none."""
         return None
 
     def map_points(self) -> Points2:

@@ -60,8 +60,8 @@ def draw_image(points: Points2, cell: float) -> LikelihoodImage:
     shape = np.ceil((points.max(axis=0) + margin - origin) / cell).astype(int) + 8
     fine = np.zeros(tuple((shape + step - 1) // step * step), np.float32)
     _draw(points, fine, origin, cell)
-    middle = _reduce(fine)
-    return LikelihoodImage((fine, middle, _reduce(middle)), origin, cell)
+    middle = reduce_image(fine)
+    return LikelihoodImage((fine, middle, reduce_image(middle)), origin, cell)
 
 
 def search(image: LikelihoodImage, points: Points2, prior: Pose2, cov: Cov3, limit: FloatArray) -> SearchResult:
@@ -144,7 +144,7 @@ def _draw(points: Points2, image: FloatArray, origin: FloatArray, cell: float) -
 
 
 @kernel
-def _reduce(image: FloatArray) -> FloatArray:
+def reduce_image(image: FloatArray) -> FloatArray:
     """The maxima of blocks of `COARSE` x `COARSE` cells, and of their neighbours."""
     rows, columns = image.shape[0] // COARSE, image.shape[1] // COARSE
     out = np.zeros((rows, columns), image.dtype)

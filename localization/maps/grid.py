@@ -37,7 +37,7 @@ class Grid:
     """Side of a cell [m]."""
 
 
-def make_grid(mapped: KeyframeMap, resolution: float) -> Grid:
+def draw_grid(mapped: KeyframeMap, resolution: float) -> Grid:
     """The grid of ``mapped`` with cells of ``resolution`` [m]. Raises `MapError` if there are no points, or too many cells."""
     if not (math.isfinite(resolution) and resolution > 0.0):
         raise MapError(f"a resolution of {resolution} m is none. Give the side of a cell in metres, as 0.05.")

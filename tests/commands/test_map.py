@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from localization.cli import main
-from localization.maps import load_map
-from tests.helpers import bags, rooms
+from localization.maps import SavedMap, load_map, save_map
+from localization.trajectory import read_tum
+from tests.helpers import bags, floor_plan, rooms
 
 
 def replay(log: Path, out: Path, *more: object) -> int:
@@ -77,3 +79,48 @@ def test_save_map_without_a_graph_or_onto_a_file_is_refused(log: Path, saved: Pa
     assert "--estimator" in capsys.readouterr().err
     assert replay(log, log.parent / "other", "--estimator", "graph", "--save-map", saved) == 2
     assert "exists already" in capsys.readouterr().err
+
+
+def localization(out: Path) -> dict[str, Any]:
+    results = json.loads((out / "metrics.json").read_text())["results"]
+    (found,) = [result["localization"] for result in results if result["estimator"] == "map"]
+    return found
+
+
+def test_replay_in_its_own_map_near_a_pose_is_localized(log: Path, saved: Path, tmp_path: Path) -> None:
+    """The room is nearly symmetric; the pose is off by 0.3 m and 6 degrees, and its poses are then those of the map."""
+    assert replay(log, tmp_path / "out", "--estimator", "ekf", "--map", saved, "--initial-pose", 0.3, 0.1, 6) == 0
+    found = localization(tmp_path / "out")
+    assert found["state"] == "localized"
+    assert found["probability"] > 0.9
+    assert found["first_localized_s"] < 6.0
+    last = read_tum(tmp_path / "out" / "diff_drive_map.tum").poses[-1]
+    expected = load_map(saved).map
+    assert np.hypot(*(last[:2] - expected.poses[-1, :2])) < 0.6  # of the keyframe before
+    assert found["places"] == []
+    (estimator,) = [r for r in json.loads((tmp_path / "out" / "metrics.json").read_text())["results"] if r["estimator"] == "ekf"]
+    assert "localization" not in estimator
+
+
+def test_replay_in_another_buildings_map_is_never_localized(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_map(tmp_path / "office.skidmap", SavedMap(floor_plan.make_map(), {}))
+    assert replay(log, tmp_path / "out", "--estimator", "ekf", "--map", tmp_path / "office.skidmap") == 0
+    found = localization(tmp_path / "out")
+    assert found["localized_s"] == 0.0
+    assert found["probability"] < 0.9
+    assert "never localized" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--estimator", "map"], "--map"),
+        (["--initial-pose", "1", "2", "3"], "--map"),
+        (["--map", "missing.skidmap"], "no map 'missing.skidmap'"),
+    ],
+)
+def test_replay_without_a_map_to_localize_in_exits_with_2(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert replay(log, tmp_path / "out", *arguments) == 2
+    assert message in capsys.readouterr().err

@@ -12,7 +12,7 @@ from PIL import Image
 
 from localization.errors import MapError
 from localization.maps.export import exports
-from localization.maps.grid import make_grid
+from localization.maps.grid import draw_grid
 from tests.helpers import square_room
 
 ROOM = square_room.make_map()
@@ -24,7 +24,7 @@ def value_at(grid, x: float, y: float) -> int:
 
 
 def test_grid_of_a_room_has_walls_free_and_unknown_cells() -> None:
-    grid = make_grid(ROOM, CELL)
+    grid = draw_grid(ROOM, CELL)
     for along in np.linspace(-1.9, 1.9, 39):
         at_walls = [(along, square_room.HALF), (along, -square_room.HALF), (square_room.HALF, along), (-square_room.HALF, along)]
         for x, y in at_walls:
@@ -38,7 +38,7 @@ def test_grid_of_a_room_has_walls_free_and_unknown_cells() -> None:
 
 def test_grid_cells_seen_free_by_one_scan_alone_are_unknown() -> None:
     """A single pass is no proof of free space: p = 0.35, above nav2's limit of 0.25."""
-    grid = make_grid(square_room.make_map(square_room.POSES[:1]), CELL)
+    grid = draw_grid(square_room.make_map(square_room.POSES[:1]), CELL)
     assert value_at(grid, 1.0, 1.0) == -1
     assert (grid.cells == 100).any()
 
@@ -50,7 +50,7 @@ def test_grid_beams_start_at_the_lidar() -> None:
     moved = dataclasses.replace(
         square_room.make_map(), poses=poses, points=points, counts=np.ones(3, np.int64), sensors=np.tile([1.0, 0.0], (3, 1))
     )
-    grid = make_grid(moved, CELL)
+    grid = draw_grid(moved, CELL)
     assert value_at(grid, -1.3, 0.01) == 0
     assert value_at(grid, -1.7, 0.01) == -1
 
@@ -58,18 +58,18 @@ def test_grid_beams_start_at_the_lidar() -> None:
 @pytest.mark.parametrize("resolution", [0.0, -1.0, float("nan"), 1e-5])
 def test_grid_of_a_resolution_without_sense_is_refused(resolution: float) -> None:
     with pytest.raises(MapError, match="resolution"):
-        make_grid(ROOM, resolution)
+        draw_grid(ROOM, resolution)
 
 
 def test_grid_of_points_beyond_all_measure_is_refused() -> None:
     with pytest.raises(MapError, match="million cells"):
-        make_grid(dataclasses.replace(ROOM, poses=ROOM.poses + [1e306, 0.0, 0.0] * (np.arange(3) % 2)[:, None]), CELL)
+        draw_grid(dataclasses.replace(ROOM, poses=ROOM.poses + [1e306, 0.0, 0.0] * (np.arange(3) % 2)[:, None]), CELL)
 
 
 def test_grid_of_a_map_without_scans_is_refused() -> None:
     empty = dataclasses.replace(ROOM, points=np.empty((0, 2), np.float32), counts=np.zeros(3, np.int64))
     with pytest.raises(MapError, match="no scan points"):
-        make_grid(empty, CELL)
+        draw_grid(empty, CELL)
 
 
 def read_as_map_server(files: dict[str, bytes]) -> tuple[np.ndarray, dict]:
@@ -82,7 +82,7 @@ def read_as_map_server(files: dict[str, bytes]) -> tuple[np.ndarray, dict]:
 
 
 def test_export_read_by_map_servers_rules_is_the_grid() -> None:
-    grid = make_grid(ROOM, CELL)
+    grid = draw_grid(ROOM, CELL)
     occupancy, about = read_as_map_server(exports(grid, ROOM))
     np.testing.assert_array_equal(occupancy, grid.cells)
     assert about["resolution"] == CELL
@@ -92,13 +92,13 @@ def test_export_read_by_map_servers_rules_is_the_grid() -> None:
 
 
 def test_export_png_and_pgm_are_the_same_picture() -> None:
-    files = exports(make_grid(ROOM, CELL), ROOM)
+    files = exports(draw_grid(ROOM, CELL), ROOM)
     pictures = [np.asarray(Image.open(io.BytesIO(files[name]))) for name in ("map.pgm", "map.png")]
     np.testing.assert_array_equal(*pictures)
 
 
 def test_export_ply_has_the_points() -> None:
-    head, body = exports(make_grid(ROOM, CELL), ROOM)["map.ply"].split(b"end_header\n", 1)
+    head, body = exports(draw_grid(ROOM, CELL), ROOM)["map.ply"].split(b"end_header\n", 1)
     assert b"format binary_little_endian 1.0" in head
     assert f"element vertex {len(ROOM.points)}".encode() in head
     points = np.frombuffer(body, "<f4").reshape(-1, 3)

@@ -1,0 +1,140 @@
+"""Localization in a saved map: the filter's odometry, and where its keyframes are in the map. Poses are ``map_T_body``.
+
+As with the graph, the filter never depends on the map: ``odom_T_body`` is continuous, and the map moves ``map_T_odom`` (REP-105).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from localization.estimators.base import Estimate, Estimator
+from localization.estimators.filter import KEY
+from localization.estimators.fusion import EkfFusion
+from localization.events import Step
+from localization.lidar import LostScans
+from localization.maps.localizer import Localizer
+from localization.maps.place_search import PlaceMap
+from motion_models import se2
+from motion_models.se2 import FloatArray, Points2, Pose2
+
+_KEYFRAME_DISTANCE_M, _KEYFRAME_ANGLE_RAD = 0.5, 0.3
+"""A keyframe follows when the robot has moved this far: scans of less are nearly the same evidence."""
+_LISTED_PLACES = 5
+
+
+@dataclass(frozen=True, eq=False)
+class PriorMap:
+    """A map that exists before the drive, and about where the drive begins in it."""
+
+    places: PlaceMap
+    initial: Pose2 | None = None
+    """(3,) ``map_T_body`` [m, m, rad]; None for anywhere."""
+
+
+class MapFusion(Estimator):
+    """`EkfFusion` with a `Localizer` behind it."""
+
+    def __init__(self, odometry: Estimator, prior: PriorMap) -> None:
+        """``odometry``: an `EkfFusion` with a LiDAR."""
+        assert isinstance(odometry, EkfFusion)
+        self.odometry, self.localizer = odometry, Localizer(prior.places, prior.initial)
+        self._is_keyframe_due, self._has_key = False, False
+        self._map_T_odom, self._key_cov = self.localizer.pose, self.localizer.covariance
+        self._seconds = dict.fromkeys(("searching", "localized", "lost"), 0.0)
+        self._first_s: float | None = None
+        self._n_losses = 0
+
+    @property
+    def clock_offset_s(self) -> float:
+        """Estimated offset of the wheels' clock [s]."""
+        return self.odometry.clock_offset_s
+
+    @property
+    def params(self) -> FloatArray:
+        """Parameters of the motion model with their corrections."""
+        return self.odometry.params
+
+    @property
+    def lost(self) -> LostScans | None:
+        """See `EkfFusion.lost`."""
+        return self.odometry.lost
+
+    def step(self, step: Step) -> Estimate:
+        """The filter's estimate in the frame of the map."""
+        self.run_deferred()
+        ekf = self.odometry.filter
+        estimate = self.odometry.step(step)
+        self._count(step.duration)
+        delta, cov = ekf.motion_since(KEY)
+        is_far = math.hypot(delta[0], delta[1]) >= _KEYFRAME_DISTANCE_M or abs(delta[2]) >= _KEYFRAME_ANGLE_RAD
+        self._is_keyframe_due = (is_far or not self._has_key) and len(self.odometry.scan_points) > 0
+        A = se2.adjoint(se2.inverse(delta))
+        pose, covariance = se2.compose(self._map_T_odom, ekf.pose), A @ self._key_cov @ A.T + cov
+        return replace(
+            estimate, pose=pose, covariance=covariance, odometry=(estimate.pose, estimate.covariance), map_T_odom=self._map_T_odom
+        )
+
+    def run_deferred(self) -> None:
+        """What the last estimate need not wait for: the submap, and the place in the map."""
+        self.odometry.run_deferred()
+        if self._is_keyframe_due:
+            self._is_keyframe_due, self._has_key = False, True
+            ekf, was_localized = self.odometry.filter, self.localizer.state == "localized"
+            self.localizer.add(ekf.pose, self.odometry.scan_points, *ekf.motion_since(KEY))
+            ekf.start_key()
+            self._n_losses += was_localized and self.localizer.state == "lost"
+            self._map_T_odom = se2.compose(self.localizer.pose, se2.inverse(ekf.pose))
+            self._key_cov = self.localizer.covariance
+
+    def _count(self, duration_s: float) -> None:
+        if self.localizer.state == "localized" and self._first_s is None:
+            self._first_s = sum(self._seconds.values())
+        self._seconds[self.localizer.state] += duration_s
+
+    def finish(self, filtered: Any = None) -> None:
+        """The trajectory stays as it was published: nothing is smoothed."""
+        self.run_deferred()
+
+    def localization(self) -> Mapping[str, Any]:
+        """As `Estimator.localization`."""
+        places = [] if self.localizer.state == "localized" else self.localizer.hypotheses[:_LISTED_PLACES]
+        return {
+            "state": self.localizer.state,
+            "probability": self.localizer.probability,
+            "pose": self.localizer.pose.tolist(),
+            **{f"{state}_s": seconds for state, seconds in self._seconds.items()},
+            "first_localized_s": self._first_s,
+            "losses": self._n_losses,
+            "places": [{"pose": place.pose.tolist(), "probability": place.probability} for place in places],
+        }
+
+    def parameters(self) -> Mapping[str, tuple[float, float]]:
+        """As `Estimator.parameters`."""
+        return self.odometry.parameters()
+
+    def counts(self) -> Mapping[str, int]:
+        """As `Estimator.counts`."""
+        return self.odometry.counts()
+
+    def warnings(self) -> list[str]:
+        """As `EkfFusion.warnings`, and for how long the place in the map was not known."""
+        found, total = list(self.odometry.warnings()), sum(self._seconds.values())
+        state, unknown = self.localizer.state, self._seconds["lost"]
+        if self._first_s is None and self._has_key:
+            found.append(
+                "the robot was never localized in the map. It may be another building's, or much may have changed: check --map, or give "
+                "--initial-pose."
+            )
+        elif self._n_losses:
+            found.append(
+                f"the place in the map was lost {self._n_losses} times, for {unknown:.0f} of {total:.0f} s, and is {state} at the end: "
+                "poses of that time are by odometry alone. The robot was carried, or the map is out of date."
+            )
+        return found
+
+    def map_points(self) -> Points2:
+        """(M, 2) points of the saved map [m]."""
+        return self.localizer.map_points()

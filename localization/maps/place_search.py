@@ -1,0 +1,227 @@
+"""Where scans fit into a whole map: branch and bound over positions in free space and all headings (Olson 2009, Hess et al. 2016)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localization.lidar.correlative_search import COARSE, draw_image, reduce_image
+from localization.lidar.scan_matcher import Fit, align_points
+from localization.lidar.submap import VoxelGrid, make_grid, voxel_means
+from localization.maps.grid import Grid, draw_grid
+from localization.maps.keyframe_map import KeyframeMap
+from localization.trajectory import IntArray
+from motion_models import se2
+from motion_models.compiled import kernel, subroutine
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
+
+CELL_M = 0.1
+"""Of the search's image and of the grid that divides space into walls, free and unknown [m]."""
+_SURFACE_CELL_M = 0.08
+"""Voxel of the surfaces that scans are aligned with [m]."""
+_SEARCH_POINTS = 150
+"""Points of a search: what is aligned afterwards has all."""
+_UNKNOWN_SCORE = 0.4
+"""What a point in unknown space counts, where one on a wall counts 1 and one in free space 0."""
+_CHUNK, _MAX_COARSE = 1000, 12_000
+"""Coarse poses that are refined at once, and at most."""
+_SHARE_OF_BEST = 0.85
+"""A place is a candidate where its score is above this share of the best."""
+_APART_M, _APART_RAD = 0.6, 0.3
+"""Poses nearer than both are one place."""
+_MAX_PLACES = 12
+_NEAR = math.exp(-0.5 * 1.5**2)
+"""Likelihood from which on a point lies on a wall: within 1.5 cells of a point of the map."""
+_ALIGN_COV = np.diag([0.1, 0.1, 0.03]) ** 2
+"""Of a searched pose, from which scans are aligned [m^2, m^2, rad^2]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A pose in the map, and how scans agree with it."""
+
+    pose: Pose2
+    """(3,) ``map_T_body``."""
+    fit: Fit
+    on_walls: float
+    """Share of the points that lie on walls of the map."""
+    in_free: float
+    """Share of the points that lie in space that is free in the map; the others are where the map is unknown."""
+
+    @property
+    def residual_variance(self) -> float:
+        """Mean square of the residuals of the inliers, in units of the assumed noise."""
+        return self.fit.sum_squares / max(self.fit.n_inliers, 1)
+
+    @property
+    def score(self) -> float:
+        """By which places compete: points in free space contradict the map, those in unknown space do not."""
+        return self.on_walls - 2.0 * self.in_free
+
+
+class PlaceMap:
+    """The walls of a map as scans are matched to them, and its free space."""
+
+    def __init__(self, keyframes: KeyframeMap, range_noise_m: float) -> None:
+        """``range_noise_m``: sigma of a range, added to the thickness of surfaces [m]. Raises `MapError` without points."""
+        self.grid: Grid = draw_grid(keyframes, CELL_M)
+        points = keyframes.points_in_map()
+        index = np.floor((points - self.grid.origin) / CELL_M).astype(np.int64)
+        walls = points[self.grid.cells[index[:, 1], index[:, 0]] == 100]  # without what moved
+        walls = points if not len(walls) else walls
+        self.surfaces: VoxelGrid = make_grid(walls, _SURFACE_CELL_M, range_noise_m)
+        self._walls = draw_image(self.surfaces.means, CELL_M)
+        self._scores, self._bounds = self._score_images()
+        self._starts = self._free_blocks(keyframes)
+        self._poses, self._covs = keyframes.poses, keyframes.covariances
+        low, high = points.min(axis=0), points.max(axis=0)
+        self.centre: Pose2 = np.array([*(0.5 * (low + high)), 0.0])
+        """(3,) the middle of the map."""
+        self.extent_cov: Cov3 = np.diag(np.array([*np.full(2, 0.5 * np.hypot(*(high - low))), math.pi]) ** 2)
+        """(3, 3) of a pose that may be anywhere in it."""
+
+    def map_cov(self, pose: Pose2) -> Cov3:
+        """(3, 3) the map's own covariance at ``pose`` (3,), a right perturbation of it: that of the nearest keyframe."""
+        k = int(np.argmin(np.hypot(*(self._poses[:, :2] - pose[:2]).T)))
+        A = se2.adjoint(se2.inverse(se2.between(self._poses[k], pose)))
+        return np.asarray(A @ self._covs[k] @ A.T)
+
+    def _score_images(self) -> tuple[FloatArray, FloatArray]:
+        """What a point counts in each cell, 1 on walls, `_UNKNOWN_SCORE` in unknown space and 0 in free space; and its upper bounds."""
+        fine = self._walls.levels[0]
+        rows, columns = fine.shape
+        x, y = (self._walls.origin[0] + CELL_M * (np.arange(rows) + 0.5), self._walls.origin[1] + CELL_M * (np.arange(columns) + 0.5))
+        centres = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+        is_free = self._grid_values(centres).reshape(rows, columns) == 0
+        scores = np.maximum(fine, np.where(is_free, 0.0, _UNKNOWN_SCORE).astype(fine.dtype))
+        return scores, reduce_image(scores)
+
+    def _grid_values(self, points: Points2) -> FloatArray:
+        return _look_up(self.grid.cells.T, points - self.grid.origin, -1)
+
+    def _free_blocks(self, keyframes: KeyframeMap) -> FloatArray:
+        """(C, 2) centres of the blocks of `COARSE` cells that hold free space or a keyframe [m]."""
+        rows, columns = np.nonzero(self.grid.cells == 0)
+        free = np.vstack([self.grid.origin + CELL_M * (np.column_stack([columns, rows]) + 0.5), keyframes.poses[:, :2]])
+        step = CELL_M * COARSE
+        return np.asarray((np.unique(np.floor(free / step), axis=0) + 0.5) * step)
+
+    def search(self, points: Points2, near: Pose2 | None = None, half: FloatArray | None = None) -> list[Place]:
+        """Places where ``points`` (N, 2) of the body frame [m] fit best, the best first; with ``near`` (3,), within
+        ``half`` (3,) [m, m, rad] of it. None where no free space is."""
+        some = voxel_means(points, 2.0 * CELL_M)
+        some = np.ascontiguousarray(some[np.linspace(0, len(some) - 1, min(len(some), _SEARCH_POINTS)).astype(np.intp)])
+        reach = float(np.quantile(np.hypot(some[:, 0], some[:, 1]), 0.8))
+        n_yaws = COARSE * max(math.ceil(2.0 * math.pi * reach / CELL_M / COARSE), 8)
+        yaws = 2.0 * math.pi * np.arange(n_yaws) / n_yaws
+        turned = np.ascontiguousarray(se2.transform(np.column_stack([np.zeros((n_yaws, 2)), yaws])[:, None, :], some))
+        coarse_rows = np.arange(COARSE // 2, n_yaws, COARSE)
+        starts = self._starts
+        if near is not None and half is not None:
+            starts = starts[(np.abs(starts - near[:2]) <= half[:2] + CELL_M * COARSE).all(axis=1)]
+            off = np.abs(se2.wrap_angle(yaws[coarse_rows] - near[2]))
+            coarse_rows = coarse_rows[off <= half[2] + 2.0 * math.pi * COARSE / n_yaws]
+        if not len(starts) or not len(coarse_rows):
+            return []
+        starts = starts - self._walls.origin
+        coarse = _score_blocks(self._bounds, turned[coarse_rows] / (CELL_M * COARSE), starts / (CELL_M * COARSE))
+        poses, scores = self._refine(turned / CELL_M, starts / CELL_M, coarse, coarse_rows - COARSE // 2)
+        found = np.column_stack([CELL_M * poses[:, :2] + self._walls.origin, yaws[poses[:, 2].astype(np.intp)]])
+        places = [self.align(points, pose) for pose in _distinct(found, scores)]
+        return sorted(places, key=lambda place: -place.score)
+
+    def _refine(self, turned: FloatArray, starts: FloatArray, coarse: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Fine poses (K, 3) as x, y [cells] and row of the yaw, and their scores (K,), by the bounds ``coarse`` (Y, C) of
+        blocks whose first rows are ``rows`` (Y,)."""
+        bounds, n = coarse.ravel(), coarse.shape[1]
+        order = np.argpartition(-bounds, min(_MAX_COARSE, len(bounds) - 1))[:_MAX_COARSE]
+        order = order[np.argsort(-bounds[order], kind="stable")]
+        poses, scores, best = [], [], 0.0
+        for begin in range(0, len(order), _CHUNK):
+            chunk = order[begin : begin + _CHUNK]
+            if bounds[chunk[0]] < _SHARE_OF_BEST * best:
+                break
+            one, score = _refine_blocks(self._scores, turned, starts[chunk % n], rows[chunk // n], best)
+            poses.append(one)
+            scores.append(score)
+            best = max(best, float(score.max()))
+        return np.vstack(poses), np.concatenate(scores)
+
+    def align(self, points: Points2, pose: Pose2, cov: FloatArray = _ALIGN_COV) -> Place:
+        """The place of ``points`` (N, 2) of the body frame near ``pose`` (3,), uncertain by ``cov`` (3, 3)."""
+        fit = align_points(self.surfaces, points, pose, cov, pose)
+        return self.compare(points, fit)
+
+    def compare(self, points: Points2, fit: Fit) -> Place:
+        """How ``points`` (N, 2) agree with walls and free space at the pose of ``fit``."""
+        moved = np.asarray(se2.transform(fit.pose, points))
+        is_near = _look_up(self._walls.levels[0], moved - self._walls.origin) >= _NEAR
+        values = self._grid_values(moved)
+        return Place(fit.pose, fit, float(is_near.mean()), float((~is_near & (values == 0)).mean()))
+
+
+def _look_up(image: NDArray[Any], points: Points2, outside: float = 0.0) -> FloatArray:
+    """(N,) values of the cells of ``image``, of `CELL_M`, where ``points`` (N, 2) from its origin lie."""
+    index = np.floor(points / CELL_M).astype(np.int64)
+    is_inside = ((index >= 0) & (index < image.shape)).all(axis=1)
+    found = np.full(len(points), outside)
+    found[is_inside] = image[index[is_inside, 0], index[is_inside, 1]]
+    return found
+
+
+def _distinct(poses: FloatArray, scores: FloatArray) -> list[Pose2]:
+    """The best pose of each place, the best first, of all that score almost as well."""
+    order = np.argsort(-scores, kind="stable")
+    order = order[scores[order] >= _SHARE_OF_BEST * scores[order[0]]]
+    found: list[Pose2] = []
+    rest = poses[order]
+    while len(rest) and len(found) < _MAX_PLACES:
+        found.append(rest[0])
+        off = rest - rest[0]
+        is_same = (np.hypot(off[:, 0], off[:, 1]) < _APART_M) & (np.abs(se2.wrap_angle(off[:, 2])) < _APART_RAD)
+        rest = rest[~is_same]
+    return found
+
+
+@subroutine
+def _mean(image: FloatArray, points: Points2, x: float, y: float, spare: float) -> float:
+    """Mean of ``image`` where ``points`` (N, 2) lie, moved by ``x`` and ``y`` [cells]; -1 where N less the sum exceeds ``spare``."""
+    total = 0.0
+    for i in range(points.shape[0]):
+        u, v = points[i, 0] + x, points[i, 1] + y
+        is_inside = u >= 0.0 and v >= 0.0 and u < image.shape[0] and v < image.shape[1]
+        total += image[int(u), int(v)] if is_inside else _UNKNOWN_SCORE
+        if i + 1 - total > spare:
+            return -1.0
+    return total / points.shape[0]  # type: ignore[no-any-return]
+
+
+@kernel
+def _score_blocks(image: FloatArray, turned: FloatArray, starts: FloatArray) -> FloatArray:
+    """(Y, C) mean of the coarse ``image`` where points ``turned`` (Y, N, 2) lie, moved by ``starts`` (C, 2) [its cells]."""
+    out = np.empty((turned.shape[0], starts.shape[0]))
+    for y in range(turned.shape[0]):
+        for c in range(starts.shape[0]):
+            out[y, c] = _mean(image, turned[y], starts[c, 0], starts[c, 1], np.inf)
+    return out
+
+
+@kernel
+def _refine_blocks(image: FloatArray, turned: FloatArray, starts: FloatArray, rows: IntArray, best: float) -> tuple[FloatArray, FloatArray]:
+    """The best pose (K, 3) within each block of `COARSE` cells about ``starts`` (K, 2) [cells] and as many rows of ``turned`` (Y, N, 2),
+    and its score (K,); -1 for what cannot come to a share of the ``best``.
+    """
+    poses, scores, n = np.zeros((starts.shape[0], 3)), np.full(starts.shape[0], -1.0), turned.shape[1]
+    for k in range(starts.shape[0]):
+        for j in range(COARSE**3):
+            row, a, b = rows[k] + j // COARSE**2, j // COARSE % COARSE, j % COARSE
+            x, y = starts[k, 0] + a + 0.5 * (1 - COARSE), starts[k, 1] + b + 0.5 * (1 - COARSE)
+            score = _mean(image, turned[row], x, y, n * (1.0 - _SHARE_OF_BEST * best))
+            if score > scores[k]:
+                scores[k], best = score, max(best, score)
+                poses[k, 0], poses[k, 1], poses[k, 2] = x, y, row
+    return poses, scores

@@ -1,0 +1,113 @@
+"""Localization in maps of floor plans: from nothing, near a given pose, in another building, carried, through changes and symmetry."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from localization.maps.localizer import LIKELY, Localizer
+from localization.maps.place_search import PlaceMap
+from motion_models import se2
+from tests.helpers import floor_plan
+from tests.helpers.floor_plan import HALL, OFFICE, path
+
+COV = np.diag([0.01, 0.01, 0.005]) ** 2
+CARRIED = np.diag([3.0, 3.0, 1.5]) ** 2
+WAY = path((7, 4), (10.5, 4), (10.5, 6.5), (7, 6.5), (7, 4), (3.5, 3.6), (3.5, 1), (1, 1))
+
+
+@pytest.fixture(scope="module")
+def office() -> PlaceMap:
+    return PlaceMap(floor_plan.make_map(), 0.02)
+
+
+def drive(localizer: Localizer, walls: np.ndarray, poses: np.ndarray, first_cov: np.ndarray = COV) -> list[tuple[str, float]]:
+    """State and error [m] after each of ``poses`` (K, 3); odometry drifts by 1 % and 0.2 degrees a step."""
+    odometry, found = np.zeros(3), []
+    for k, delta in enumerate(floor_plan.moves(poses)):
+        delta = delta * 1.01 + np.array([0.0, 0.0, math.radians(0.2)]) * (k > 0)
+        odometry = se2.compose(odometry, delta)
+        localizer.add(odometry, floor_plan.scan(walls, poses[k], seed=100 + k), delta, first_cov if k == 0 else COV)
+        found.append((localizer.state, float(math.hypot(*(localizer.pose[:2] - poses[k, :2])))))
+    return found
+
+
+def test_localizer_from_nothing_finds_the_place_and_keeps_it(office: PlaceMap) -> None:
+    localizer = Localizer(office)
+    assert localizer.state == "searching"
+    assert localizer.covariance[0, 0] > 9.0
+    found = drive(localizer, OFFICE, WAY)
+    first = [state for state, _ in found].index("localized")
+    assert first <= 5
+    assert all(state == "localized" for state, _ in found[first:])
+    errors = [error for _, error in found[first:]]
+    assert np.median(errors) < 0.03
+    assert max(errors) < 0.1
+    assert localizer.probability > 0.95
+    assert abs(se2.wrap_angle(localizer.pose[2] - WAY[-1, 2])) < 0.02
+    assert 0.02 < math.sqrt(localizer.covariance[0, 0]) < 0.1
+
+
+def test_localizer_in_another_buildings_map_is_never_localized(office: PlaceMap) -> None:
+    """Nor does it give any place a probability above 0.9."""
+    localizer, way = Localizer(office), path((1, 1), (12, 1), (13, 4), step=1.0)
+    for k, delta in enumerate(floor_plan.moves(way)):
+        localizer.add(way[k], floor_plan.scan(HALL, way[k], seed=k), delta, COV)
+        assert localizer.state == "searching"
+        assert localizer.probability < LIKELY
+
+
+def test_localizer_carried_is_lost_and_found_again(office: PlaceMap) -> None:
+    localizer = Localizer(office)
+    assert drive(localizer, OFFICE, WAY[:8])[-1][0] == "localized"
+    elsewhere = path((3.5, 1), (1, 1), (1, 1.5))
+    localizer.add(np.zeros(3), floor_plan.scan(OFFICE, elsewhere[0]), np.zeros(3), CARRIED)
+    assert localizer.state == "lost"
+    found = drive(localizer, OFFICE, path((3.5, 1), (3.5, 3.6), (7, 3.8), (10, 4.1)))
+    assert found[-1][0] == "localized"
+    assert found[-1][1] < 0.1
+
+
+def test_localizer_carried_unnoticed_is_lost_within_metres(office: PlaceMap) -> None:
+    """The odometry goes on as if nothing had happened."""
+    localizer = Localizer(office)
+    assert drive(localizer, OFFICE, WAY[:8])[-1][0] == "localized"
+    states = [state for state, _ in drive(localizer, OFFICE, path((3.5, 1), (3.5, 3.6), (7, 3.8), (10, 4.1)))]
+    assert states.index("lost") <= 4
+    assert states[-1] == "localized"
+
+
+def test_localizer_with_moved_furniture_stays_localized(office: PlaceMap) -> None:
+    changed = np.vstack([OFFICE[:-4], floor_plan.box(5.4, 5.0, 6.2, 5.6)])
+    found = drive(Localizer(office), changed, WAY)
+    assert [state for state, _ in found[6:]] == ["localized"] * len(found[6:])
+    assert max(error for _, error in found[6:]) < 0.15
+
+
+def test_localizer_in_a_square_room_lists_four_places_unless_a_pose_is_given() -> None:
+    walls = np.array(floor_plan.box(0, 0, 6, 6), dtype=float)
+    way = path((1, 1), (4, 1), (4, 3))
+    places = PlaceMap(floor_plan.make_map(walls, path((1, 1), (5, 1), (5, 5), (1, 5), (1, 1))), 0.02)
+    localizer = Localizer(places)
+    assert {state for state, _ in drive(localizer, walls, way)} == {"searching"}
+    assert len(localizer.hypotheses) == 4
+    assert localizer.hypotheses[0].probability < 0.5
+    near = Localizer(places, np.array([1.3, 0.7, 0.1]))
+    state, error = drive(near, walls, way)[-1]
+    assert state == "localized"
+    assert error < 0.05
+
+
+def test_localizer_with_a_wrong_given_pose_searches_everywhere(office: PlaceMap) -> None:
+    state, error = drive(Localizer(office, np.array([1.0, 7.0, 1.0])), OFFICE, WAY)[-1]
+    assert state == "localized"
+    assert error < 0.1
+
+
+def test_localizer_without_scans_keeps_searching(office: PlaceMap) -> None:
+    localizer = Localizer(office)
+    for _ in range(3):
+        localizer.add(np.zeros(3), np.empty((0, 2)), np.zeros(3), COV)
+    assert localizer.state == "searching"

@@ -1,0 +1,205 @@
+"""Localization in saved maps: maps of one half of a log, starts in the other half, and in maps of other buildings.
+
+``python -m tests.studies.localization`` prints three tables. *Starts*: the robot is put down at random moments of one half, the map is of
+the other half, and it drives for ``--seconds``; keyframes and truth are those of the smoothed graph of the whole log. A start is
+mapped where, at its end, the scan at the true pose has a score of at least 0.5. Right is within 0.5 m and 0.2 rad. *Reliability*: of all,
+by the probability that they gave. *Drives*: the second half of each log, replayed in the map of the first, and the reverse.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from localization.estimators import EstimatorConfig, MapFusion, PriorMap
+from localization.estimators.graph_fusion import GraphConfig
+from localization.maps import KeyframeMap
+from localization.maps.localizer import LIKELY, Localizer
+from localization.maps.place_search import PlaceMap
+from localization.pipeline import Pipeline, ReplayConfig, Trial, replay
+from motion_models import se2
+from motion_models.registry import make_model
+from tests.studies.buildings import BUILDINGS, Drive
+
+_DENSE = ReplayConfig(estimator=EstimatorConfig(graph=GraphConfig(keyframe_distance_m=0.3, keyframe_angle_rad=0.2)))
+_MAP_STRIDE = 3
+"""Of dense keyframes in a map: about 1 m, as by default."""
+_STEP_M, _STEP_RAD = 0.5, 0.3
+_COV = np.diag([0.01, 0.01, 0.005]) ** 2
+_RIGHT_M, _RIGHT_RAD = 0.5, 0.2
+_MAPPED_SCORE = 0.5
+
+
+@dataclass(frozen=True)
+class Start:
+    """One start: state and probability at its end, and whether the place is right."""
+
+    is_mapped: bool
+    is_same: bool
+    state: str
+    probability: float
+    is_right: bool
+    error_m: float
+    localized_after_s: float
+    search_s: float
+
+
+def part(keyframes: KeyframeMap, ids: np.ndarray) -> KeyframeMap:
+    """The keyframes ``ids`` of a map, without edges."""
+    scans = keyframes.scans()
+    rows = {name: getattr(keyframes, name)[ids] for name in ("stamps_ns", "poses", "covariances", "counts", "sensors")}
+    edges = {"edges": np.empty((0, 2), np.int64), "edge_deltas": np.empty((0, 3)), "edge_information": np.empty((0, 3, 3))}
+    points = np.vstack([scans[i] for i in ids]).astype(np.float32)
+    return KeyframeMap(**rows, **edges, points=points, edge_is_loop=np.empty(0, bool))
+
+
+def dense_map(drive: Drive) -> KeyframeMap:
+    """Keyframes every 0.3 m of the smoothed graph of the whole log."""
+    pair = Trial(make_model("diff_drive", drive.robot), "graph")
+    keyframes = replay(drive.events, [pair], drive.robot, drive.mounts, True, _DENSE)[0].keyframes
+    assert keyframes is not None
+    return keyframes
+
+
+def halves(keyframes: KeyframeMap) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the first and of the second half."""
+    n = len(keyframes.poses)
+    return np.arange(n // 2), np.arange(n // 2, n)
+
+
+def run_start(places: PlaceMap, keyframes: KeyframeMap, scans: Sequence[np.ndarray], ids: np.ndarray, is_same: bool) -> Start:
+    """Keyframes ``ids`` in a row, from an unknown place."""
+    localizer, last, after, spent = Localizer(places), None, math.nan, 0.0
+    truth = keyframes.poses[ids[0]]
+    for k in ids:
+        pose = keyframes.poses[k]
+        delta = np.zeros(3) if last is None else se2.between(last, pose)
+        if last is not None and math.hypot(delta[0], delta[1]) < _STEP_M and abs(delta[2]) < _STEP_RAD:
+            continue
+        begin = time.process_time()
+        localizer.add(pose, scans[k], delta, np.zeros((3, 3)) if last is None else _COV)
+        spent, last, truth = max(spent, time.process_time() - begin), pose, pose
+        if localizer.state == "localized" and math.isnan(after):
+            after = (keyframes.stamps_ns[k] - keyframes.stamps_ns[ids[0]]) * 1e-9
+    found = localizer.pose if localizer.state == "localized" or not localizer.hypotheses else localizer.hypotheses[0].pose
+    off = se2.between(truth, found)
+    error = math.hypot(off[0], off[1])
+    is_right = is_same and error < _RIGHT_M and abs(off[2]) < _RIGHT_RAD
+    at_truth = places.align(scans[ids[-1]], truth)
+    return Start(
+        is_same and at_truth.score >= _MAPPED_SCORE, is_same, localizer.state, localizer.probability, is_right, error, after, spent
+    )
+
+
+def starts(maps: dict[str, KeyframeMap], map_name: str, name: str, n: int, seconds: float) -> list[Start]:
+    """``n`` starts in each half of building ``name``, in the map of the other half of ``map_name``."""
+    found, rng = [], np.random.default_rng(1)
+    for i in (0, 1):
+        places = PlaceMap(part(maps[map_name], halves(maps[map_name])[i][::_MAP_STRIDE]), 0.02)
+        keyframes, scans = maps[name], maps[name].scans()
+        ids = halves(keyframes)[1 - i]
+        for k in rng.integers(ids[0], ids[-1] - 20, size=n):
+            until = keyframes.stamps_ns[k] + seconds * 1e9
+            found.append(
+                run_start(
+                    places, keyframes, scans, np.array([j for j in ids if j >= k and keyframes.stamps_ns[j] <= until]), name == map_name
+                )
+            )
+    return found
+
+
+def table(title: str, found: Sequence[Start]) -> str:
+    """One row of the table of starts."""
+    mapped = [s for s in found if s.is_mapped]
+    localized = [s for s in found if s.state == "localized"]
+    wrong = sum(not s.is_right and s.probability > LIKELY for s in found)
+    times = [s.localized_after_s for s in mapped if not math.isnan(s.localized_after_s)]
+    cells = [
+        title,
+        f"{len(found)} / {len(mapped)}",
+        f"{100 * np.mean([s.is_right for s in mapped]):.0f}" if mapped else "-",
+        f"{100 * np.mean([s.state == 'localized' for s in mapped]):.0f}" if mapped else "-",
+        f"{len(localized)} / {sum(not s.is_right for s in localized)}",
+        str(wrong),
+        f"{np.median(times):.1f}" if times else "-",
+        f"{np.median([s.search_s for s in found]):.2f}",
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def reliability(found: Sequence[Start]) -> str:
+    """Rows of probability, number and share that is right; and the Brier score."""
+    p, right = np.array([s.probability for s in found]), np.array([s.is_right for s in found])
+    lines = ["| probability | starts | right [%] |", "|---|---|---|"]
+    for low, high in ((0.0, 0.1), (0.1, 0.3), (0.3, 0.5), (0.5, 0.7), (0.7, 0.9), (0.9, 1.0)):
+        is_in = (p >= low) & (p < high)
+        if is_in.any():
+            lines.append(f"| {low:.1f} to {high:.1f} | {is_in.sum()} | {100 * right[is_in].mean():.0f} |")
+    return "\n".join([*lines, f"Brier score {np.mean((p - right) ** 2):.3f}"])
+
+
+def drive_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> str:
+    """Half 1 - i of the log in the map of half i: errors while localized, and times."""
+    places = PlaceMap(part(keyframes, halves(keyframes)[i][::_MAP_STRIDE]), 0.02)
+    ids = halves(keyframes)[1 - i]
+    begin, end = keyframes.stamps_ns[ids[0]], keyframes.stamps_ns[ids[-1]]
+    trial = Trial(make_model("diff_drive", drive.robot), "map", prior=PriorMap(places))
+    pipeline = Pipeline(trial, drive.robot, drive.mounts, True)
+    assert isinstance(pipeline.estimator, MapFusion)
+    errors, spent = [], time.process_time()
+    for event in drive.events:
+        if not begin <= event.stamp_ns <= end:
+            continue
+        for estimate in pipeline.process(event):
+            k = int(np.searchsorted(keyframes.stamps_ns, estimate.stamp_ns))
+            is_at = k < len(keyframes.stamps_ns) and keyframes.stamps_ns[k] == estimate.stamp_ns
+            if is_at and pipeline.estimator.localizer.state == "localized":
+                errors.append(math.hypot(*(estimate.pose[:2] - keyframes.poses[k, :2])))
+    spent = time.process_time() - spent
+    found = pipeline.estimator.localization()
+    e = np.array(errors) if errors else np.array([math.nan])
+    cells = [
+        f"{name}, map of half {i + 1}",
+        f"{np.median(e):.3f} / {np.quantile(e, 0.95):.3f} / {e.max():.2f}",
+        " / ".join(f"{found[key]:.0f}" for key in ("localized_s", "searching_s", "lost_s")),
+        "-" if found["first_localized_s"] is None else f"{found['first_localized_s']:.1f}",
+        str(found["losses"]),
+        f"{spent:.0f}",
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--log", default=",".join(BUILDINGS))
+    parser.add_argument("--starts", type=int, default=100, help="in each half")
+    parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--no-drives", action="store_true")
+    options = parser.parse_args(words)
+    drives = {name: BUILDINGS[name].open() for name in options.log.split(",")}
+    maps = {name: dense_map(drive) for name, drive in drives.items()}
+    print("| map, starts | starts / mapped | right [%] | localized [%] | localized / wrong | wrong above 0.9 | after [s] | CPU [s] |")
+    print("|---" * 8 + "|")
+    every: list[Start] = []
+    for map_name in maps:
+        for name in maps:
+            found = starts(maps, map_name, name, options.starts if name == map_name else options.starts // 4, options.seconds)
+            every += found
+            print(table(f"{map_name}, {name}", found), flush=True)
+    print("\n" + reliability(every))
+    if not options.no_drives:
+        print("\n| drive | error median / p95 / max [m] | localized / searching / lost [s] | first after [s] | losses | CPU [s] |")
+        print("|---" * 6 + "|")
+        for name, drive in drives.items():
+            for i in (0, 1):
+                print(drive_row(name, drive, maps[name], i), flush=True)
+
+
+if __name__ == "__main__":
+    main()
