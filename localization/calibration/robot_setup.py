@@ -49,6 +49,8 @@ _RAW = re.compile(r"raw|mag", re.IGNORECASE)
 _SAME_RADIUS, _SAME_TRACK = 0.1, 0.05
 """Relative differences of two sources below which they agree. Tyres under load and slip straight ahead change a radius by up to 7 %
 (DRIVE's Husky); a track is a length of the body."""
+_LATERAL = 0.7
+"""Least component along y of a wheel's axis."""
 _OFF_MIDDLE = 0.05
 """Distance of a symmetric robot's centre of gravity from its middle over the track from which it is doubted."""
 
@@ -180,7 +182,7 @@ def draft_robot(survey: Survey, given: Given, path: Path) -> Draft:
             )
     _choose_geometry(draft, given, urdf, controllers, fit)
     if urdf is not None:
-        _check_urdf(draft, urdf)
+        _check_urdf(draft, urdf, measured)
     _choose_mounts(draft, survey, {} if text is None else _urdf_mounts(text, given))
     return draft
 
@@ -463,13 +465,37 @@ def _choose_driver(draft: Draft, given: Given, controllers: tuple[ControllerValu
         )
 
 
-def _check_urdf(draft: Draft, urdf: WheelGeometry) -> None:
+def _check_axes(draft: Draft, urdf: WheelGeometry, measured: WheelSides | None) -> None:
+    """Name wheels whose axes are not to the left, as REP 103 has it: their rates may have the other sign, or the body frame is turned."""
+    across = [name for name, axis in urdf.axes.items() if abs(axis[1]) < _LATERAL]
+    if across:
+        draft.missing.append(
+            f"wheel axes: {', '.join(across)} do not turn about the y axis of the body frame; if its x axis does not point forward, "
+            "left, right, track and wheelbase are mixed up. Check <axis> and rpy, or name another link with --base-link."
+        )
+        return
+    opposite = [name for name, axis in urdf.axes.items() if axis[1] < 0.0]
+    if not opposite or len(opposite) == len(urdf.axes):
+        return
+    by_log = "cannot decide"
+    if measured is not None:
+        backwards = [name for name in opposite if name in measured.reversed]
+        by_log = "negative when driving forward" if len(backwards) == len(opposite) else "positive when driving forward"
+    draft.contradictions.append(Contradiction("sign", "the URDF's <axis>", f"{', '.join(opposite)}: to the right (0 -1 0)", by_log))
+
+
+def _check_urdf(draft: Draft, urdf: WheelGeometry, measured: WheelSides | None) -> None:
     """Name what is no differential drive of wheels, and masses off the middle of symmetric wheels."""
     for kind in urdf.kinds:
-        draft.missing.append(f"{kind}: {_KIND_NOTES[kind]}")
+        (draft.reasons if kind == "casters" else draft.missing).append(f"{kind}: {_KIND_NOTES[kind]}")
+    _check_axes(draft, urdf, measured)
+    if urdf.radii and not _is_same(urdf.radii[0], urdf.radii[-1], _SAME_RADIUS):
+        values = ", ".join(f"{radius:.4g} m" for radius in urdf.radii)
+        used = draft.values.get("wheel_radius_m", math.nan)
+        draft.contradictions.append(Contradiction("wheel_radius_m", "the URDF's wheels differ", values, f"{used:.4g} m is taken"))
     track = draft.values.get("track_width_m", urdf.track_width_m)
     ys = sorted(y for _, y in urdf.positions.values())
-    is_symmetric = all(abs(a + b) < 0.02 for a, b in zip(ys, reversed(ys), strict=True))
+    is_symmetric = bool(ys) and all(abs(a + b - ys[0] - ys[-1]) < 0.02 for a, b in zip(ys, reversed(ys), strict=True))
     aside = urdf.cg[1]
     if is_symmetric and math.isfinite(aside) and abs(aside) > _OFF_MIDDLE * track:
         draft.contradictions.append(

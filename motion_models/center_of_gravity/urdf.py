@@ -11,7 +11,7 @@ import math
 import re
 import statistics
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -25,7 +25,7 @@ from motion_models.text_files import read_text
 _MOVING = ("revolute", "continuous", "prismatic")
 _XACRO = "it is a xacro file, not a URDF; expand it first: xacro FILE.xacro > FILE.urdf"
 
-_WHEEL = re.compile(r"wheel|tire|tyre", re.IGNORECASE)
+_WHEEL = re.compile(r"wheel|tire|tyre|whl|sprocket", re.IGNORECASE)
 _PASSIVE = re.compile(r"caster|castor|swivel|steer", re.IGNORECASE)
 _LEFT = re.compile(r"left|(^|[_\-/])(l|fl|rl|bl|ml|cl|lf|lr|lb|lm)([_\-/]|$)", re.IGNORECASE)
 _RIGHT = re.compile(r"right|(^|[_\-/])(r|fr|rr|br|mr|cr|rf|rb|rm)([_\-/]|$)", re.IGNORECASE)
@@ -34,11 +34,18 @@ _RIGHT_KEYS = ("right_wheel_names", "right_wheel", "right_joint", "rightjoint", 
 """Keys of controllers and plugins (lower case) that name the wheels' joints."""
 _KINDS = {
     "mecanum wheels": re.compile(r"mecanum", re.IGNORECASE),
-    "omnidirectional wheels": re.compile(r"omni(?!v)|swerve|planar_move", re.IGNORECASE),
-    "tracks": re.compile(r"(^|[_\-/])(tracks?|crawlers?|tread)([_\-/.]|$)|track(ed|controller)", re.IGNORECASE),
-    "steered wheels": re.compile(r"steering|ackermann", re.IGNORECASE),
+    "omnidirectional wheels": re.compile(r"omni.*(wheel|roller)|(wheel|roller).*omni|swerve|planar_move", re.IGNORECASE),
+    "tracks": re.compile(
+        r"(^|[_\-/])(l|r|left|right)_?(track|crawler|tread|belt)s?([_\-/.]|$)|(^|[_\-/])(track|crawler|tread|belt)s?_?(l|r|left|right)([_\-/.]|$)"
+        r"|track(ed_?vehicle|_?controller)|sprocket",
+        re.IGNORECASE,
+    ),
+    "steered wheels": re.compile(r"steer(ing)?|ackermann", re.IGNORECASE),
     "casters": re.compile(r"caster|castor", re.IGNORECASE),
 }
+_TURNING = ("revolute", "continuous")
+_ALONG = 0.9
+"""Component of a unit axis from which it lies along a coordinate axis (25 degrees: cambered wheels count)."""
 _SAME_M = 0.02
 """Wheels whose x differs by less stand on one axle [m]."""
 
@@ -300,6 +307,10 @@ class WheelGeometry:
     """Of <plugin> and <ros2_control>."""
     has_shapes: bool = True
     """Whether the wheels' cylinders or spheres give radius and contacts; else both are of joints alone."""
+    radii: tuple[float, ...] = ()
+    """Different radii of the wheels' shapes [m]."""
+    axes: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Axis of each wheel in the body frame."""
     kinds: tuple[str, ...] = ()
     """Words for what no differential drive of wheels is: mecanum, omni, tracks, casters, steered wheels."""
 
@@ -323,44 +334,84 @@ def sides(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
 def wheel_geometry(text: str, source: str, base_link: str = "base_link") -> WheelGeometry:
     """Wheels of a URDF ``text``; ``source`` names it in errors. Contacts are taken below the wheels' shapes, or their joints.
 
-    Raises `RobotError` for a text that is no URDF, a missing ``base_link``, and for one without wheels on both sides.
+    Without wheels on both sides, a controller or plugin with a track counts alone (tracked vehicles). Raises `RobotError` for a text that
+    is no URDF, a missing ``base_link``, and for one with neither.
     """
     urdf = parse_urdf(text, source)
-    if base_link not in urdf.links:
-        raise RobotError(f"{source}: no link '{base_link}'; links are {', '.join(urdf.links)}. Name the body's with --base-link.")
+    base_link = _body(urdf, base_link)
     root = ET.fromstring(text.encode())
     shapes = _shapes(root)
     poses = _poses(urdf)
     base_R, base_t = poses[base_link]
     wheels: dict[str, tuple[float, float]] = {}
+    axes: dict[str, FloatArray] = {}
     radii = []
-    for joint in _wheel_joints(urdf):
+    for joint in _wheel_joints(urdf, poses, base_R):
         rotation, translation = poses[joint.child]
         radius, center = shapes.get(joint.child, (math.nan, np.zeros(3)))
         x, y, _ = base_R.T @ (translation + rotation @ center - base_t)
         wheels[joint.name] = (float(x), float(y))
+        axes[joint.name] = base_R.T @ rotation @ joint.axis
         radii.append(radius)
-    left = tuple(name for name, (_, y) in wheels.items() if y > 0.0)
-    right = tuple(name for name, (_, y) in wheels.items() if y < 0.0)
+    finite = [radius for radius in radii if math.isfinite(radius) and radius > 0.0]
+    # A body frame may lie at a corner: then the middle of the wheels divides the sides.
+    ys = [y for _, y in wheels.values()]
+    middle = 0.0 if not ys or (min(ys) < -_SAME_M / 2 and max(ys) > _SAME_M / 2) else (min(ys) + max(ys)) / 2.0
+    left = tuple(name for name, (_, y) in wheels.items() if y - middle > _SAME_M / 2)
+    right = tuple(name for name, (_, y) in wheels.items() if y - middle < -_SAME_M / 2)
+    wheels = {name: wheels[name] for name in wheels if name in (*left, *right)}
+    controllers, kinds = _controllers(root), _kinds(urdf, root)
     if not left or not right:
-        found = ", ".join(wheels) or "none"
-        raise RobotError(f"{source}: no driven wheels on both sides (continuous joints with 'wheel' in their names: {found}).")
-    across = statistics.mean(wheels[name][1] for name in left) - statistics.mean(wheels[name][1] for name in right)
+        known = next((c for c in controllers if math.isfinite(c.track_width_m)), None)
+        if known is None:
+            raise RobotError(
+                f"{source}: no driven wheels on both sides{_instead(urdf, kinds)}; give lengths and joints by options instead."
+            )
+        return WheelGeometry((), (), math.nan, math.nan, math.nan, _mass(urdf), {}, controllers=controllers, has_shapes=False, kinds=kinds)
     along = max(x for x, _ in wheels.values()) - min(x for x, _ in wheels.values())
-    finite = [radius for radius in radii if math.isfinite(radius)]
     return WheelGeometry(
         left=left,
         right=right,
         wheel_radius_m=statistics.median(finite) if finite else math.nan,
-        track_width_m=across,
+        track_width_m=statistics.mean(wheels[name][1] for name in left) - statistics.mean(wheels[name][1] for name in right),
         wheelbase_m=along if along > _SAME_M else math.nan,
-        mass_kg=sum(link.mass for link in urdf.links.values()) or math.nan,
+        mass_kg=_mass(urdf),
         positions=wheels,
         cg=_center_of_gravity(urdf, poses, base_link, wheels),
-        controllers=_controllers(root, source),
+        controllers=controllers,
         has_shapes=bool(finite),
-        kinds=_kinds(urdf, root),
+        kinds=kinds,
+        radii=tuple(sorted(set(finite))),
+        axes={name: (float(a[0]), float(a[1]), float(a[2])) for name, a in axes.items() if name in wheels},
     )
+
+
+def _body(urdf: Urdf, base_link: str) -> str:
+    """The link ``base_link``, or the only one whose name is a prefix and it (xacro's prefixes). Raises `RobotError`."""
+    if base_link in urdf.links:
+        return base_link
+    ends = [name for name in urdf.links if re.search(rf"[_/\-]{re.escape(base_link)}$", name)]
+    if len(ends) == 1:
+        return ends[0]
+    raise RobotError(f"{urdf.source}: no link '{base_link}'; links are {_first(urdf.links)}. Name the body's with --base-link.")
+
+
+def _first(names: Iterable[str], count: int = 12) -> str:
+    """At most ``count`` names, and how many more there are."""
+    names = list(names)
+    more = f" and {len(names) - count} more" if len(names) > count else ""
+    return ", ".join(names[:count]) + more
+
+
+def _instead(urdf: Urdf, kinds: Sequence[str]) -> str:
+    """What a URDF has instead of wheels, for an error."""
+    moving = [joint.name for joint in urdf.joints if joint.moves]
+    has = f"; it has {', '.join(kinds)}" if kinds else ""
+    return f"{has}; its moving joints are {_first(moving) or 'none'}"
+
+
+def _mass(urdf: Urdf) -> float:
+    return sum(link.mass for link in urdf.links.values()) or math.nan
 
 
 def _center_of_gravity(
@@ -377,7 +428,7 @@ def _center_of_gravity(
     return float(com[0] - middle[0]), float(com[1] - middle[1])
 
 
-def _controllers(root: ET.Element, source: str) -> tuple[ControllerValues, ...]:
+def _controllers(root: ET.Element) -> tuple[ControllerValues, ...]:
     """Values of <plugin>s (Gazebo's of ROS 1, ROS 2 and gz) and <ros2_control> that have a track or a radius."""
     found = []
     for element in (*root.iter("plugin"), *root.iter("ros2_control")):
@@ -435,18 +486,39 @@ def _kinds(urdf: Urdf, root: ET.Element) -> tuple[str, ...]:
     return tuple(kind for kind, pattern in _KINDS.items() if any(pattern.search(name) for name in names))
 
 
-def _wheel_joints(urdf: Urdf) -> list[Joint]:
-    return [
-        joint
-        for joint in urdf.joints
-        if joint.kind == "continuous" and _WHEEL.search(joint.name + joint.child) and not _PASSIVE.search(joint.name + joint.child)
+def _wheel_joints(urdf: Urdf, poses: Mapping[str, tuple[FloatArray, FloatArray]], base_R: FloatArray) -> list[Joint]:
+    """Joints of driven wheels: continuous ones (or of more than a turn) by name; where no name has a wheel in it, by a lateral axis.
+
+    What hangs on a joint that turns about the vertical is a caster or is steered; both are left out, as are such joints themselves.
+    """
+    by_child = {joint.child: joint for joint in urdf.joints}
+
+    def axis(joint: Joint) -> FloatArray:
+        return np.abs(base_R.T @ poses[joint.child][0] @ joint.axis)
+
+    def is_steered(joint: Joint) -> bool:
+        above: Joint | None = joint
+        while above is not None:
+            if above.kind in _TURNING and axis(above)[2] > _ALONG:
+                return True
+            above = by_child.get(above.parent)
+        return False
+
+    turning = [
+        j
+        for j in urdf.joints
+        if (j.kind == "continuous" or (j.kind == "revolute" and not j.upper - j.lower < 2.0 * math.pi))
+        and j.mimic is None
+        and not _PASSIVE.search(j.name + j.child)
+        and not is_steered(j)
     ]
+    return [j for j in turning if _WHEEL.search(j.name + j.child)] or [j for j in turning if axis(j)[1] > _ALONG]
 
 
 def link_poses(urdf: Urdf, base_link: str = "base_link") -> dict[str, tuple[FloatArray, FloatArray]]:
     """Rotation (3, 3) and translation (3,) of each link in ``base_link``, all joints at 0."""
     poses = _poses(urdf)
-    base_R, base_t = poses[base_link]
+    base_R, base_t = poses[_body(urdf, base_link)]
     return {name: (base_R.T @ rotation, base_R.T @ (translation - base_t)) for name, (rotation, translation) in poses.items()}
 
 
