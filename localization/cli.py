@@ -28,6 +28,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "diagnose": ("Diagnose", "Find what a motion model gets wrong on a log, its cause, and the gain of correcting it."),
     "weigh": ("Weigh", "Estimate the centre of gravity and an unknown load from how the robot turns."),
     "init": ("Init", "Write a robot file for a new robot from a log and a URDF."),
+    "check": ("Check", "Check whether a robot is wired and described right, by a minute of driving."),
     "robots": ("Robots", "List the robots that are shipped, with the source of every number."),
     "cg": ("Cg", "Compute the centre of gravity from scales, arms and payload."),
     "map": ("Map", "Show a saved map, or export it for planners and viewers."),

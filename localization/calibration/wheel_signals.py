@@ -9,7 +9,7 @@ import itertools
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,8 @@ STEP_S = 0.5
 """Of an interval: latencies of drivers (up to 0.1 s) are small against it."""
 _MAX_MOVING_S, _MAX_READ_S = 120.0, 900.0
 """Time after the wheels' first motion, and in all, that is read [s]."""
+_MOVED = 0.02
+"""Of an angle or rate, in any unit that practice has: above the noise of rates at standstill."""
 _MAX_LIDAR_S = 60.0
 """Of scans [s]; registering one takes some milliseconds."""
 _NOT_THE_DRIVERS = re.compile(
@@ -80,12 +82,13 @@ def read_signals(log: Log) -> WheelSignals | None:
         return None
     sources = _decoders(log)
     gathered: dict[str, list[Any]] = {}
-    first_ns = moving_ns = None
+    first_ns = moving_ns = first = None
     for payload in log.readings({topic: TopicDecoder(0, _tag(topic, decode)) for topic, decode in sources.items()}):
         first_ns = payload.stamp_ns if first_ns is None else first_ns
         gathered.setdefault(payload.topic, []).append(payload.reading)
-        if moving_ns is None and payload.topic == wheels.topic and _is_moving(payload.reading):
-            moving_ns = payload.stamp_ns
+        if moving_ns is None and payload.topic == wheels.topic:
+            first = payload.reading if first is None else first
+            moving_ns = payload.stamp_ns if _has_moved(first, payload.reading) else None
         until = first_ns + _MAX_READ_S * 1e9 if moving_ns is None else moving_ns + _MAX_MOVING_S * 1e9
         if payload.stamp_ns > until:
             break
@@ -119,10 +122,11 @@ def _tag(topic: str, decode: Callable[[Any, int], Any]) -> Callable[[Any, int], 
     return tagged
 
 
-def _is_moving(reading: Any) -> bool:
+def _has_moved(first: Any, reading: Any) -> bool:
+    """Whether the wheels have turned since their ``first`` reading, in any unit."""
     if isinstance(reading, JointReading):
-        return bool((np.abs(reading.velocity) > 0.05).any()) or not np.isfinite(reading.velocity).all()
-    return isinstance(reading, OdometryReading)
+        return bool((np.abs(reading.velocity) > _MOVED).any() or (np.abs(reading.position - first.position) > _MOVED).any())
+    return bool((np.abs(reading.twist) > _MOVED).any() or (np.abs(reading.pose - first.pose) > _MOVED).any())
 
 
 def _signals(log: Log, gathered: Mapping[str, Sequence[Any]], first_ns: int, moving_ns: int) -> WheelSignals | None:
@@ -221,8 +225,19 @@ def _odometry(readings: Sequence[OdometryReading], edges: FloatArray, first_ns: 
     return found[:, 0], found[:, 1]
 
 
-def lidar_motion(log: Log, signals: WheelSignals) -> tuple[FloatArray, FloatArray] | None:
-    """Speed and yaw rate (n,) by consecutive scans, on the intervals of ``signals``; None without a LiDAR."""
+class LidarMotion(NamedTuple):
+    """Motion by consecutive scans over n intervals; NaN where unknown."""
+
+    speed: FloatArray
+    """(n,) forward [m/s]."""
+    turn: FloatArray
+    """(n,) [rad/s]"""
+    side: FloatArray
+    """(n,) to the left [m/s]."""
+
+
+def lidar_motion(log: Log, signals: WheelSignals) -> LidarMotion | None:
+    """Motion by consecutive scans, on the intervals of ``signals``; None without a LiDAR whose scans can be matched."""
     if log.sources.lidar is None:
         return None
     n = len(signals.rates)
@@ -230,19 +245,17 @@ def lidar_motion(log: Log, signals: WheelSignals) -> tuple[FloatArray, FloatArra
     rows = [row for row in _scan_steps(log, signals.first_ns, signals.start_s) if np.isfinite(row).all()]
     if len(rows) < 3:
         return None
-    begin, end, forward, turn = np.array(rows).T
-    middle, duration = 0.5 * (begin + end), end - begin
-    rates = np.full((n, 2), np.nan)
-    place = np.searchsorted(edges, middle) - 1
-    for i in range(n):
-        inside = place == i
-        if inside.any():
-            rates[i] = forward[inside].sum() / duration[inside].sum(), turn[inside].sum() / duration[inside].sum()
-    return rates[:, 0], rates[:, 1]
+    table = np.array(rows)
+    place = np.searchsorted(edges, 0.5 * (table[:, 0] + table[:, 1])) - 1
+    rates = np.full((n, 3), np.nan)
+    for i in np.unique(place[(place >= 0) & (place < n)]):
+        inside = table[place == i]
+        rates[i] = inside[:, 2:].sum(axis=0) / (inside[:, 1] - inside[:, 0]).sum()
+    return LidarMotion(rates[:, 0], rates[:, 1], rates[:, 2])
 
 
 def _scan_steps(log: Log, first_ns: int, start_s: float) -> Iterator[FloatArray]:
-    """Begin, end [s], way forward [m] and turn [rad] from scan to scan."""
+    """Begin, end [s], way forward [m], turn [rad] and way to the left [m] from scan to scan."""
     source = log.sources.lidar
     assert source is not None
     decode = scan_decoder() if source.kind == "scan" else decode_cloud
@@ -258,5 +271,5 @@ def _scan_steps(log: Log, first_ns: int, start_s: float) -> Iterator[FloatArray]
         sweep = Sweep.from_scan(scan, mount).within(config.min_range_m, config.max_range_m)
         motion = odometry.register(sweep.project(sweep.points), np.array([mount.x, mount.y]))
         if motion is not None and last is not None and motion.has_translation:
-            yield np.array([last, at, motion.delta[0], motion.delta[2]])
+            yield np.array([last, at, motion.delta[0], motion.delta[2], motion.delta[1]])
         last = at

@@ -106,7 +106,7 @@ def check_wiring(log: Log) -> WiringReport:
         signals = read_signals(open_log(log.path, found.robot, log.overrides)) or signals
     units = check_units(signals, found.robot)
     if units.is_ambiguous or (units.findings and log.sources.lidar is not None and "LiDAR" not in signals.speeds):
-        signals = _with_lidar(log, signals)
+        signals = with_lidar(log, signals)
         units = check_units(signals, found.robot)
     wheels = " and ".join(source.topic for source in log.sources.all_wheels)
     sentences = (*found.findings, *(text if text.startswith("the gyro") else f"{wheels}: {text}" for text in units.findings))
@@ -123,7 +123,7 @@ def _wiring_of(log: Log, signals: WheelSignals) -> tuple[WheelSignals, WiringRep
     base = Wiring(tuple(range(signals.left)), tuple(range(signals.left, len(signals.joints))))
     rates = wheel_rates(signals)
     if not (signals.turns or signals.speeds) or not _is_accepted(signals, rates, base):
-        signals = _with_lidar(log, signals)
+        signals = with_lidar(log, signals)
     measured = correlations(signals, rates, base)
     if _is_accepted(signals, rates, base):
         return signals, WiringReport(log.robot, correlations=measured)
@@ -148,7 +148,7 @@ def _check_odometry(log: Log, signals: WheelSignals) -> WiringReport:
     measured = {f"turn of {topic} by the gyro": r}
     if r > -_SURE_CORRELATION:
         return _check_multiplier(log, float(np.nansum(turn * gyro) / max(np.nansum(turn**2), 1e-12)), measured)
-    signals = _with_lidar(log, signals)
+    signals = with_lidar(log, signals)
     third = None if "LiDAR" not in signals.turns else correlation(turn, signals.turns["LiDAR"], _MIN_TURN_RAD_S, _MAX_BIAS_RAD_S)
     if third is None or abs(third) < _SURE_CORRELATION:
         ways = [f"left and right are swapped in the driver of {topic}", "the gyro's sign is reversed (an IMU upside down)"]
@@ -184,11 +184,12 @@ def _check_multiplier(log: Log, ratio: float, measured: Mapping[str, float]) -> 
     return WiringReport(robot, (text,), {"driver.wheel_separation_multiplier": f"{value:g}"}, correlations=measured, ratios=ratios)
 
 
-def _with_lidar(log: Log, signals: WheelSignals) -> WheelSignals:
+def with_lidar(log: Log, signals: WheelSignals) -> WheelSignals:
+    """``signals`` with the motion by scans, where there are any."""
     motion = lidar_motion(log, signals)
     if motion is None:
         return signals
-    return replace(signals, speeds={**signals.speeds, "LiDAR": motion[0]}, turns={**signals.turns, "LiDAR": motion[1]})
+    return replace(signals, speeds={**signals.speeds, "LiDAR": motion.speed}, turns={**signals.turns, "LiDAR": motion.turn})
 
 
 def wheel_rates(signals: WheelSignals) -> FloatArray:

@@ -27,7 +27,7 @@ _PUBLISH_RATE_HZ = 50.0
 """Default of ros2_controllers' diff_drive_controller."""
 _DIGITS = 6
 """Decimals of multipliers at most: a micrometre per metre."""
-DEFAULT_NODES = {"diff_drive_controller": "diff_drive_controller", "robot_localization": "ekf_filter_node"}
+DEFAULT_NODES = {"diff_drive_controller": "diff_drive_controller", "robot_localization": "ekf_filter_node", "slam_toolbox": "slam_toolbox"}
 """Name of the node by package, as its own examples have it."""
 
 
@@ -167,6 +167,31 @@ def robot_localization_yaml(
         rows = [", ".join(_float(noise[i] if i == j else 0.0) for j in range(15)) for i in range(15)]
         lines.append("    # The filter's own defaults, but for vy: how fast it sets in when the robot starts to turn.")
         lines.append(f"    process_noise_covariance: [{(',' + chr(10) + ' ' * 31).join(rows)}]")
+    return "\n".join(lines) + "\n"
+
+
+def slam_toolbox_yaml(robot: Robot, scan_topic: str, node: str = "") -> str:
+    """Parameters of slam_toolbox (config/mapper_params_online_async.yaml) that the robot decides: frames, topic, and when to take a scan.
+
+    A skid-steer robot's heading by the wheels is worst after turns: a scan is taken at each sixth of a radian, and searched for as far as
+    the wheels' noise over one step allows.
+    """
+    n = robot.wheel_noise
+    travel, heading = 0.3, 0.17
+    yaw = 3.0 * math.sqrt(n.yaw_rad2_per_rad * heading + n.yaw_rad2_per_m * travel)
+    lines = [
+        f"# {robot.name}: parameters of slam_toolbox; keep its others.",
+        f"{node or DEFAULT_NODES['slam_toolbox']}:",
+        "  ros__parameters:",
+        "    odom_frame: odom",
+        "    map_frame: map",
+        "    base_frame: base_link",
+        f"    scan_topic: {scan_topic}",
+        "    mode: mapping",
+        f"    minimum_travel_distance: {_float(travel)}",
+        f"    minimum_travel_heading: {_float(heading)}",
+        f"    coarse_search_angle_offset: {_float(max(yaw, 0.349))}",
+    ]
     return "\n".join(lines) + "\n"
 
 

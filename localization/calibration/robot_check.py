@@ -1,0 +1,444 @@
+"""Is a robot wired and described right? Each quantity of a robot file with its second source in a log, and a verdict."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import takewhile
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from localization.calibration.robot_setup import DRIVE_60_S, Draft, Given, draft_robot, finish_robot, survey_log
+from localization.calibration.wheel_signals import STEP_S, LidarMotion, WheelSignals, lidar_motion, read_signals
+from localization.calibration.wheel_units import expected_scaling
+from localization.calibration.wheel_wiring import WiringReport, open_checked
+from localization.errors import LogError
+from localization.events import Event, ImuSample
+from localization.logs import Log, inspect_log
+from localization.logs.info import LogInfo
+from localization.pipeline import Run, Trial, replay, warnings_of
+from motion_models import se2
+from motion_models.errors import RobotError
+from motion_models.prior import scaling_sigma
+from motion_models.registry import make_model
+from motion_models.robot import DIFF_DRIVE, Mount, Robot
+from motion_models.se2 import FloatArray
+
+Verdict = Literal["ok", "contradiction", "cannot be seen"]
+
+_STANDING_S = 3.0
+"""Before the first motion, for the gyro's bias [s]."""
+_REPLAYED_S = 75.0
+"""Of the drive that the filter is run on [s]: a minute of driving and what stands before it."""
+_SAME_SCALE = 0.15
+"""Relative difference of a radius from the measured one: tyres under load and slip straight ahead change it by up to 7 %, and motion from
+scan to scan errs by some percent."""
+_MIN_SCALE_INTERVALS, _MIN_LIKENESS = 12, 0.97
+"""Intervals of 0.5 s, and cosine between the ways, from which on a scale is measured: of scans that slide along a corridor it is lower."""
+_MAX_YAW_RAD = math.radians(5.0)
+"""Of a LiDAR against the direction of travel; robots slide by a few degrees."""
+_MAX_TILT_RAD = math.radians(10.0)
+"""Of gravity against the IMU's mount: floors and ramps."""
+_MAX_BIAS_RAD_S = 0.02
+_MAX_CLOCK_S, _MAX_CLOCK_SIGMA_S = 0.1, 0.1
+"""Offset that is named, and sigma at which none can be seen [s]; drivers and radios have latencies of up to 0.1 s."""
+_SIGMAS = 3.0
+_MIN_TURNING_RAD_S = 0.05
+_MIN_SPEED_M_S, _MAX_TURN_RAD_S, _MIN_TRAVEL_INTERVALS, _MIN_COHERENCE = 0.05, 0.1, 6, 0.9
+_GRAVITY_SAMPLES, _MIN_GRAVITY_M_S2, _MAX_GRAVITY_M_S2 = 20, 8.0, 12.0
+_MAX_ODD_SHARE = 0.02
+"""Of a topic's messages or time."""
+_CHORD_STEPS = 10
+"""Intervals (5 s) over which a reference's displacement is compared: GPS errs by decimetres from fix to fix."""
+_TURN_AND_STRAIGHT = "drive straight on for 10 s and turn in place both ways for 10 s each"
+
+
+@dataclass(frozen=True)
+class CheckRow:
+    """One quantity."""
+
+    quantity: str
+    value: str
+    """As robot file or log have it."""
+    second_source: str
+    """What it was compared with, and what that measured."""
+    verdict: Verdict
+    advice: str = ""
+    """What to correct, or to drive."""
+
+
+@dataclass(frozen=True)
+class RobotCheck:
+    """All rows of a log, and the robot as the log corrects it."""
+
+    log: str
+    robot: Robot
+    duration_s: float
+    rows: tuple[CheckRow, ...]
+    params: tuple[float, ...]
+    """Of the model `model_of`, as the log measured them."""
+    sigmas: dict[str, float]
+    """By parameter."""
+    scan_topic: str = ""
+
+    def count(self, verdict: Verdict) -> int:
+        """Rows of this verdict."""
+        return sum(row.verdict == verdict for row in self.rows)
+
+    @property
+    def sentence(self) -> str:
+        """What was found, in one sentence."""
+        wrong = [row.quantity for row in self.rows if row.verdict == "contradiction"]
+        unseen = [row.quantity for row in self.rows if row.verdict == "cannot be seen"]
+        text = f"{self.count('ok')} of {len(self.rows)} quantities agree with their second source"
+        text += f"; contradictions: {', '.join(dict.fromkeys(wrong))}" if wrong else "; no contradiction"
+        return f"{text}; cannot be seen: {', '.join(dict.fromkeys(unseen))}." if unseen else f"{text}."
+
+
+def model_of(robot: Robot) -> str:
+    """Name of the motion model of its drive."""
+    return "diff_drive" if robot.drive == DIFF_DRIVE else "skid_steer"
+
+
+def check_robot(path: Path, robot: Robot | None, given: Given) -> RobotCheck:
+    """Check the robot of the log at ``path``: ``robot``, else as the log and ``given`` describe it. Raises what opening the log does, and
+    `RobotError` for lengths that nothing gives."""
+    draft = None
+    if robot is None or given.urdf is not None or given.controller is not None:
+        draft = draft_robot(survey_log(path), replace(given, like=robot), path)
+    if robot is None:
+        assert draft is not None
+        robot = _drafted(draft, given, path)
+    log, wiring = open_checked(path, robot, given.topics)
+    if log.sources.wheels is None:
+        raise log.wheels_error or LogError(f"{path.name} has no wheels: neither joint states nor a driver's odometry; record one of them.")
+    info = inspect_log(log)
+    signals = read_signals(log)
+    rows, mounts = [*_topic_rows(info), *_stamp_rows(info)], dict(log.mounts)
+    motion = None if signals is None else lidar_motion(log, signals)
+    rows += _wiring_rows(wiring, {} if signals is None else _by_lidar(log, signals, motion))
+    if signals is not None:
+        rows += [*_scale_rows(log, wiring, signals, motion), *_lidar_rows(log, signals, motion, mounts)]
+    run = _replayed(log, mounts, "ekf", signals)
+    rows += [*_filter_rows(log, run), *_imu_rows(log), *_reference_rows(log, signals)]
+    rows += [] if draft is None else _draft_rows(draft, is_known=log.sources.wheels.kind == "joint_states")
+    model = make_model(model_of(log.robot), log.robot)
+    measured = {} if run is None else {name: run.parameters[name] for name in model.param_names if name in run.parameters}
+    params = tuple(measured[name][0] if name in measured else float(v) for name, v in zip(model.param_names, model.nominal, strict=True))
+    sigmas = {name: sigma for name, (_, sigma) in measured.items()}
+    corrected = _with_scaling(log.robot, params, sigmas) if not wiring.is_ambiguous else robot
+    topic = log.sources.lidar.topic if log.sources.lidar is not None and log.sources.lidar.kind == "scan" else ""
+    return RobotCheck(path.name, corrected, log.duration_s, tuple(rows), params, sigmas, topic)
+
+
+def _drafted(draft: Draft, given: Given, path: Path) -> Robot:
+    absent = [name for name in ("wheel_radius_m", "track_width_m", "wheelbase_m") if name not in draft.values]
+    if absent:
+        raise RobotError(
+            f"{path.name} has no {', '.join(absent)}; give --robot (a robot file, or a shipped robot's name), or --urdf and --controller."
+        )
+    return finish_robot(draft, given, path.stem)
+
+
+def _with_scaling(robot: Robot, params: Sequence[float], sigmas: dict[str, float]) -> Robot:
+    """``robot`` with the measured k, where the drive has measured it better than its geometry does."""
+    if robot.drive == DIFF_DRIVE or sigmas.get("k_0", math.inf) > 0.5 * scaling_sigma() * expected_scaling(robot):
+        return robot
+    return replace(robot, models={**robot.models, "skid_steer": {**robot.models.get("skid_steer", {}), "k_0": float(f"{params[0]:.4g}")}})
+
+
+def _replayed(log: Log, mounts: Mapping[str, Mount], estimator: str, signals: WheelSignals | None) -> Run | None:
+    """Result of ``estimator`` on the first minute of driving; None where nothing corrects the wheels."""
+    if signals is None or (log.sources.lidar is None and log.sources.imu is None):
+        return None
+    start_ns = signals.first_ns + int((signals.start_s - _STANDING_S) * 1e9)
+    trial = Trial(make_model(model_of(log.robot), log.robot), estimator)
+    try:
+        return replay(_first_minute(log, start_ns), [trial], log.robot, mounts, log.sources.lidar is not None)[0]
+    except LogError:
+        return None
+
+
+def _sparse_motion(log: Log, signals: WheelSignals) -> LidarMotion | None:
+    """Motion by KISS-ICP, whose map takes scans of few beams; good for directions, not for scales."""
+    run = _replayed(log, log.mounts, "lidar", signals)
+    if run is None or len(run.trajectory) < _MIN_TRAVEL_INTERVALS:
+        return None
+    t = (run.trajectory.stamps_ns - signals.first_ns) * 1e-9
+    edges = signals.start_s + STEP_S * np.arange(len(signals.rates) + 1)
+    poses = np.stack(
+        [np.interp(edges, t, column) for column in (*run.trajectory.poses.T[:2], np.unwrap(run.trajectory.poses[:, 2]))], axis=1
+    )
+    steps = np.array([se2.between(a, b) for a, b in itertools.pairwise(poses)]) / STEP_S
+    steps[(edges[:-1] < t[0]) | (edges[1:] > t[-1])] = np.nan
+    return LidarMotion(steps[:, 0], steps[:, 2], steps[:, 1])
+
+
+def _first_minute(log: Log, start_ns: int) -> Iterator[Event]:
+    end_ns = start_ns + int(_REPLAYED_S * 1e9)
+    return (event for event in takewhile(lambda event: event.stamp_ns <= end_ns, log.events()) if event.stamp_ns >= start_ns)
+
+
+def _topic_rows(info: LogInfo) -> list[CheckRow]:
+    rates = {topic.topic: topic.rate_hz for topic in info.topics}
+    chosen = {"option": "given", "robot": "named in the robot file", "only": "the only one of its type", "arms": "the arms' joints"}
+    rows = []
+    for role in ("wheels", "lidar", "imu"):
+        used, name = info.parts[role], {"wheels": "wheels", "lidar": "LiDAR", "imu": "IMU"}[role]
+        if used is None:
+            advice = next((text for text in info.problems if text.startswith(f"no {name}")), f"record the {name}.")
+            rows.append(CheckRow(f"topic of {name}", "none", "", "cannot be seen", advice))
+            continue
+        rate = rates.get(used["topic"])
+        text = used["topic"] if rate is None else f"{used['topic']}, {rate:.0f} Hz"
+        rows.append(CheckRow(f"topic of {name}", text, chosen.get(used["chosen_by"], used["chosen_by"]), "ok"))
+    return rows
+
+
+def _stamp_rows(info: LogInfo) -> list[CheckRow]:
+    """Stamps of the topics in use; a few messages in a hundred may be odd."""
+    used = {part["topic"] for part in info.parts.values() if part is not None}
+    wrong = [
+        text for text in info.problems if " begins " in text or " ends " in text or "frame '" in text or "the time of recording" in text
+    ]
+    for topic in (topic for topic in info.topics if topic.topic in used):
+        odd = topic.zero_stamps + topic.repeated_stamps + topic.backward_stamps
+        if odd > _MAX_ODD_SHARE * topic.count:
+            wrong.append(
+                f"{topic.topic}: of {topic.count} messages {topic.zero_stamps} have no stamp, {topic.repeated_stamps} repeat one and"
+                f" {topic.backward_stamps} go back: let the driver stamp each measurement once."
+            )
+        silent = sum(gap.duration_s for gap in topic.gaps)
+        if silent > _MAX_ODD_SHARE * info.duration_s:
+            wrong.append(f"{topic.topic}: {len(topic.gaps)} gaps of {silent:.1f} s in all: check cables, CPU load and the recorder.")
+    if not wrong:
+        return [CheckRow("stamps", "even", "time of recording", "ok")]
+    return [CheckRow("stamps", text.split(":")[0], "time of recording", "contradiction", text) for text in dict.fromkeys(wrong)]
+
+
+def _by_lidar(log: Log, signals: WheelSignals, motion: LidarMotion | None) -> dict[str, float]:
+    """Correlation of the wheels' turn with that by scans."""
+    if motion is None:
+        return {}
+    if signals.joints:
+        rates, left = np.where(np.isfinite(signals.rates), signals.rates, signals.angle_rates), signals.left
+        turn = rates[:, left:].mean(axis=1) - rates[:, :left].mean(axis=1)
+    else:
+        assert log.sources.wheels is not None
+        turn = signals.turns[log.sources.wheels.topic]
+    both = np.isfinite(turn) & np.isfinite(motion.turn)
+    is_turning = both.sum() >= _MIN_SCALE_INTERVALS and float(np.sqrt(np.mean(motion.turn[both] ** 2))) > _MIN_TURNING_RAD_S
+    return {"turn by the LiDAR": _cosine(turn[both], motion.turn[both])} if is_turning else {}
+
+
+def _cosine(a: FloatArray, b: FloatArray) -> float:
+    return float(a @ b) / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-12)
+
+
+def _wiring_rows(wiring: WiringReport, by_lidar: Mapping[str, float]) -> list[CheckRow]:
+    rows = [CheckRow("wheels and gyro", "as in the robot file", "", "contradiction", text) for text in wiring.findings]
+    if rows:
+        return rows
+    found = [
+        CheckRow("signs and sides", "as in the robot file", f"{name}: correlation {value:+.2f}", "ok" if value > 0.6 else "contradiction")
+        for name, value in {**by_lidar, **wiring.correlations}.items()
+    ]
+    found += [CheckRow("units", "as in the robot file", f"{name}: factor {value:.2f}", "ok") for name, value in wiring.ratios.items()]
+    missing = CheckRow("signs and sides", "as in the robot file", "", "cannot be seen", f"{_TURN_AND_STRAIGHT}, with gyro or LiDAR.")
+    return found or [missing]
+
+
+def _scale_rows(log: Log, wiring: WiringReport, signals: WheelSignals, motion: LidarMotion | None) -> list[CheckRow]:
+    """Radius by measured speeds."""
+    radius = log.robot.geometry.wheel_radius_m if signals.joints else log.robot.driver.wheel_radius_m
+    ratios = {name: value for name, value in wiring.ratios.items() if " by the speed of " in name}
+    if motion is not None and not ratios:
+        wheels = np.abs(_forward(log, signals)) * (radius if signals.joints else 1.0)
+        way = np.hypot(motion.speed, motion.side)
+        both = np.isfinite(wheels) & (way > _MIN_SPEED_M_S) & (wheels > _MIN_SPEED_M_S) & (np.abs(motion.turn) < _MAX_TURN_RAD_S)
+        if both.sum() >= _MIN_SCALE_INTERVALS and _cosine(way[both], wheels[both]) >= _MIN_LIKENESS:
+            ratios = {"way by the LiDAR": float(np.median(way[both] / wheels[both]))}
+    if not ratios:
+        advice = "drive straight on for 10 s with a LiDAR, or record the driver's odometry."
+        return [CheckRow("wheel radius", f"{radius:.4g} m", "", "cannot be seen", advice)]
+    name, ratio = next(iter(ratios.items()))
+    is_same = abs(math.log(ratio)) <= _SAME_SCALE or bool(wiring.findings)
+    advice = (
+        ""
+        if is_same
+        else f"write {'geometry' if signals.joints else 'driver'}.wheel_radius_m = {radius * ratio:.4g}, or check units and gear."
+    )
+    verdict: Verdict = "ok" if is_same else "contradiction"
+    return [CheckRow("wheel radius", f"{radius:.4g} m", f"{radius * ratio:.4g} m, {name}", verdict, advice)]
+
+
+def _lidar_rows(log: Log, signals: WheelSignals, motion: LidarMotion | None, mounts: dict[str, Mount]) -> list[CheckRow]:
+    """Yaw of the LiDAR by the direction of travel; ``mounts`` are corrected, so that what follows is not blamed on other sensors."""
+    if log.sources.lidar is None:
+        return []
+    name, frame = "mount of LiDAR", log.frames.get(log.sources.lidar.topic, "")
+    mount = log.mounts.get(frame)
+    if mount is None:
+        return [CheckRow(name, f"frame '{frame}' unknown", "", "cannot be seen", f"publish it on /tf_static, or write [mounts.{frame}].")]
+    value = f"{frame}: yaw {math.degrees(mount.yaw):.0f} deg"
+    forward = _forward(log, signals)
+    direction = None if motion is None else _direction(motion, forward)
+    if direction is None and (motion := _sparse_motion(log, signals)) is not None:
+        direction = _direction(motion, forward)
+    if direction is None:
+        return [CheckRow(name, value, "", "cannot be seen", "drive straight on for 10 s where walls are in reach.")]
+    degrees = math.degrees(direction)
+    second = (
+        f"travel is {abs(degrees):.0f} deg to the {'left' if degrees > 0 else 'right'} of it" if abs(degrees) >= 1.0 else "travel agrees"
+    )
+    if abs(direction) <= _MAX_YAW_RAD:
+        return [CheckRow(name, value, second, "ok")]
+    yaw = math.remainder(mount.yaw - direction, math.tau)
+    mounts[frame] = replace(mount, yaw=yaw)
+    advice = f"turn its yaw by {-degrees:+.0f} deg: {yaw:.4f} rad in /tf_static, or in [mounts.{frame}] where the log has none."
+    return [CheckRow(name, value, second, "contradiction", advice)]
+
+
+def _forward(log: Log, signals: WheelSignals) -> FloatArray:
+    """Speed (n,) by the wheels, up to its scale."""
+    if signals.joints:
+        return np.asarray(np.where(np.isfinite(signals.rates), signals.rates, signals.angle_rates).mean(axis=1))
+    assert log.sources.wheels is not None
+    return signals.speeds[log.sources.wheels.topic]
+
+
+def _direction(motion: LidarMotion, forward: FloatArray) -> float | None:
+    """Direction of the LiDAR's travel against the wheels' [rad]; None where the drive is too short or directions differ."""
+    travel = (motion.speed + 1j * motion.side) * np.sign(forward)
+    use = np.isfinite(travel) & (np.abs(travel) > _MIN_SPEED_M_S) & (np.abs(motion.turn) < _MAX_TURN_RAD_S) & (forward != 0.0)
+    if use.sum() < _MIN_TRAVEL_INTERVALS:
+        return None
+    unit = travel[use] / np.abs(travel[use])
+    return float(np.angle(travel[use].sum())) if abs(unit.mean()) >= _MIN_COHERENCE else None
+
+
+def _filter_rows(log: Log, run: Run | None) -> list[CheckRow]:
+    """k, track and clock by the filter, and what its sensor checks found."""
+    if run is None:
+        return [CheckRow("track and multiplier", "", "", "cannot be seen", f"record a gyro or LiDAR and {_TURN_AND_STRAIGHT}.")]
+    rows = [
+        CheckRow("sensors against each other", "", "", "contradiction", text) for text in warnings_of([run]) if text.startswith("at t = ")
+    ]
+    source = "LiDAR and gyro" if log.sources.lidar is not None and log.sources.imu is not None else "LiDAR" if log.sources.lidar else "gyro"
+    if "k_0" in run.parameters and log.robot.drive != DIFF_DRIVE:
+        rows.append(_scaling_row(log.robot, run, source))
+    offset, sigma = run.parameters.get("wheel_clock_offset_s", (0.0, math.inf))
+    clock = f"{1e3 * offset:+.0f} +- {1e3 * sigma:.0f} ms against {source}" if math.isfinite(sigma) else ""
+    if sigma > _MAX_CLOCK_SIGMA_S:
+        rows.append(CheckRow("clock of wheels", "0", clock, "cannot be seen", "start, stop and turn quickly a few times."))
+    else:
+        is_same = abs(offset) <= max(_MAX_CLOCK_S, _SIGMAS * sigma)
+        advice = "" if is_same else f"write clock.wheel_time_offset_s = {offset:.3f}, or let its driver stamp the time of measurement."
+        rows.append(CheckRow("clock of wheels", "0", clock, "ok" if is_same else "contradiction", advice))
+    return rows
+
+
+def _scaling_row(robot: Robot, run: Run, source: str) -> CheckRow:
+    expected, (k, sigma) = expected_scaling(robot), run.parameters["k_0"]
+    is_known = "k_0" in robot.models.get("skid_steer", {})
+    spread = scaling_sigma() * expected
+    value = f"k {expected:.3f}" + ("" if is_known else f" +- {spread:.2f} by geometry")
+    if sigma > 0.5 * spread:
+        advice = f"turn in place for 20 s; until then: wheel_separation_multiplier {1.0 / expected:.2f}."
+        return CheckRow("track and multiplier", value, f"k {k:.3f} +- {sigma:.3f} by {source}", "cannot be seen", advice)
+    is_same = abs(k - expected) <= _SIGMAS * math.hypot(sigma, spread)
+    measured = f"k {k:.3f} +- {sigma:.3f} by {source}: wheel_separation_multiplier {1.0 / k:.2f}" if k > 0.0 else f"k {k:.3f}"
+    advice = "" if is_same else "check track_width_m and wheel_radius_m: k of such a geometry is another."
+    return CheckRow("track and multiplier", value, measured, "ok" if is_same else "contradiction", advice)
+
+
+def _imu_rows(log: Log) -> list[CheckRow]:
+    if log.sources.imu is None:
+        return []
+    frame = log.frames.get(log.sources.imu.topic, "")
+    mount = log.mounts.get(frame, Mount())
+    samples = []
+    for event in log.events():
+        if isinstance(event, ImuSample) and event.frame_id == frame:
+            samples.append(event)
+        if len(samples) >= _GRAVITY_SAMPLES:
+            break
+    if not samples:
+        return []
+    force = mount.rotation() @ np.mean([sample.linear_acceleration for sample in samples], axis=0)
+    size = float(np.linalg.norm(force))
+    value = f"{frame}: roll {math.degrees(mount.roll):.0f}, pitch {math.degrees(mount.pitch):.0f} deg"
+    if not _MIN_GRAVITY_M_S2 < size < _MAX_GRAVITY_M_S2:
+        advice = "the driver publishes no gravity in m/s^2: its axes show only in turns."
+        return [CheckRow("axes of IMU", value, f"{size:.1f} m/s^2 at the start", "cannot be seen", advice)]
+    tilt = math.acos(max(-1.0, min(1.0, float(force[2]) / size)))
+    second = f"gravity is {math.degrees(tilt):.0f} deg off its z axis"
+    if tilt <= _MAX_TILT_RAD:
+        return [CheckRow("axes of IMU", value, second, "ok")]
+    what = "it is upside down, or publishes gravity with the opposite sign" if tilt > math.pi - _MAX_TILT_RAD else "it is mounted otherwise"
+    return [CheckRow("axes of IMU", value, second, "contradiction", f"{what}: correct roll and pitch of '{frame}' in /tf_static.")]
+
+
+def _reference_rows(log: Log, signals: WheelSignals | None) -> list[CheckRow]:
+    """Way and turn of the reference over those of wheels and gyro."""
+    topic = log.reference_topic
+    if topic is None:
+        return [CheckRow("reference", "none", "", "cannot be seen", "none is needed; with one (mocap, GPS, map) errors can be measured.")]
+    track = [(r.stamp_ns, *r.position.tolist()) for r in log.references(topic) if np.isfinite(r.position).all()]
+    if signals is None or len(track) < 10:
+        return [CheckRow("reference", topic, f"{len(track)} poses", "cannot be seen", "its poses are too few.")]
+    t, x, y = np.array(track).T
+    edges = signals.first_ns + (signals.start_s + STEP_S * np.arange(len(signals.rates) + 1)) * 1e9
+    inside = (edges >= t[0]) & (edges <= t[-1])
+    wheels = _dead_reckoned(log, signals)
+    a, b = inside[:-_CHORD_STEPS] & inside[_CHORD_STEPS:], slice(None, -_CHORD_STEPS)
+    paths = np.stack([np.interp(edges, t, v) for v in (x, y)], axis=1), wheels
+    chords = [(path[_CHORD_STEPS:] - path[b])[a] @ [1.0, 1.0j] for path in paths]
+    if len(chords[0]) <= 2 * _CHORD_STEPS or float(np.abs(chords[1]).max()) < 1.0:
+        return [CheckRow("reference", topic, "no common motion", "cannot be seen", "another time, or the robot hardly moves in it.")]
+    ratio = float(np.abs(chords[0]).sum() / np.abs(chords[1]).sum())
+    turns = [chord[_CHORD_STEPS:] * np.conj(chord[:-_CHORD_STEPS]) for chord in chords]
+    together = float(np.real(np.vdot(turns[1], turns[0])) / max(np.linalg.norm(turns[0]) * np.linalg.norm(turns[1]), 1e-12))
+    second = f"way {ratio:.3g} times the wheels', likeness of turns {together:.2f}"
+    if 1.0 / 1.4 <= ratio <= 1.4 and together > 0.7:
+        return [CheckRow("reference", topic, second, "ok")]
+    advice = "its unit is another (millimetres?)." if together > 0.7 else "its stamps, axes or run are others."
+    return [CheckRow("reference", topic, second, "contradiction", advice)]
+
+
+def _dead_reckoned(log: Log, signals: WheelSignals) -> FloatArray:
+    """Positions (n + 1, 2) at the edges of the intervals, by wheels and the best yaw rate [m]."""
+    speed = np.nan_to_num(_forward(log, signals)) * (log.robot.geometry.wheel_radius_m if signals.joints else 1.0)
+    turns = next((signals.turns[name] for name in ("gyro", *signals.turns) if name in signals.turns), None)
+    if turns is None:
+        rates, left = np.where(np.isfinite(signals.rates), signals.rates, signals.angle_rates), signals.left
+        scale = expected_scaling(log.robot) * log.robot.geometry.wheel_radius_m / log.robot.geometry.track_width_m
+        turns = scale * (rates[:, left:].mean(axis=1) - rates[:, :left].mean(axis=1))
+    yaw = np.cumsum(np.nan_to_num(turns)) * STEP_S
+    steps = speed * STEP_S * np.exp(1j * yaw)
+    path = np.concatenate([[0.0], np.cumsum(steps)])
+    return np.stack([path.real, path.imag], axis=1)
+
+
+def _draft_rows(draft: Draft, is_known: bool) -> list[CheckRow]:
+    """What URDF and controller contradict, and what neither has. Signs are checked by more sources above, and the driver's multiplier is of
+    no use where the wheels' joints are there (``is_known``)."""
+    elsewhere = {"sign", "LiDAR", "IMU", "wheels", *(["wheel_separation_multiplier"] if is_known else [])}
+    rows = [
+        CheckRow(c.quantity, f"{c.value} ({c.source})", c.by_log, "contradiction", "correct the source that differs from the log.")
+        for c in draft.contradictions
+        if c.quantity != "sign"
+    ]
+    for text in draft.missing:
+        quantity, _, advice = text.partition(": ")
+        if quantity not in elsewhere:
+            rows.append(CheckRow(quantity.split(" (")[0], "", "", "cannot be seen", advice))
+    return rows
+
+
+NEXT_DRIVE = DRIVE_60_S
+"""What to drive where something cannot be seen."""

@@ -1,0 +1,51 @@
+"""Page of `skidloc check`: each quantity with its second source and a verdict, what to correct, and what to drive."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from localization.calibration.robot_check import NEXT_DRIVE, CheckRow, RobotCheck
+from localization.report.page import Block, Cell, Page, Paragraph, Section, Table, bullets, glossary, render, write_new
+
+_MARKS = {"ok": "green", "contradiction": "red", "cannot be seen": "grey"}
+_TERMS = {
+    "Value": "What the robot file, the URDF or the log has, and with which skidloc runs where nothing contradicts it.",
+    "Second source": "Another measurement of the same quantity, and what it measured.",
+    "Contradiction": "The two differ by more than noise and slip explain; what to correct stands beside it.",
+    "Cannot be seen": "The log does not show it: what to record or to drive stands beside it.",
+}
+
+
+def write_check_page(path: str | Path, found: RobotCheck, files: dict[str, str]) -> None:
+    """Write the page; ``files``: text of the files that stand beside it, by name. Raises `OutputError`."""
+    write_new(path, check_page(found, files).encode())
+
+
+def check_page(found: RobotCheck, files: dict[str, str]) -> str:
+    """HTML of the whole page."""
+    wrong = [row for row in found.rows if row.verdict == "contradiction"]
+    unseen = [row for row in found.rows if row.verdict == "cannot be seen"]
+    sections = [
+        Section("Contradictions", bullets([f"{row.quantity}: {row.advice}" for row in wrong])),
+        Section("All quantities", _table(found.rows)),
+        Section("To record or to drive", _to_drive(unseen)),
+        *(Section(name, [Paragraph(line, is_small=True) for line in text.splitlines() if line.strip()]) for name, text in files.items()),
+        glossary(_TERMS),
+    ]
+    facts = f"{found.robot.name} · {found.duration_s:.0f} s · {len(found.rows)} quantities"
+    return render(Page(f"Check of {found.log}", facts, [found.sentence], sections))
+
+
+def _table(rows: tuple[CheckRow, ...]) -> list[Block]:
+    header = [Cell(title) for title in ("Quantity", "Value", "Second source", "Verdict")]
+    cells = []
+    for row in rows:
+        verdict = Cell(row.verdict, row.advice, mark=_MARKS[row.verdict])
+        cells.append([Cell(row.quantity), Cell(row.value), Cell(row.second_source), verdict])
+    return [Table(header, cells)]
+
+
+def _to_drive(unseen: list[CheckRow]) -> list[Block]:
+    if not unseen:
+        return []
+    return [*bullets([f"{row.quantity}: {row.advice}" for row in unseen]), Paragraph(NEXT_DRIVE)]

@@ -1,0 +1,76 @@
+"""`skidloc check`: verdicts of a healthy robot and of robots that are wired or described wrong."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from localization.cli import main
+from localization.logs import open_log
+from motion_models.robot import load_robot
+from tests.helpers.wiring import CASES, LEFT, RIGHT, ROBOT_TOML, drive
+
+
+def check(tmp_path: Path, log: Path, *options: str) -> dict[str, Any]:
+    """The JSON of a check."""
+    given = options or ("--robot", str(ROBOT_TOML))
+    assert main(["check", str(log), *given, "--out", str(tmp_path / "out")]) == 0
+    found: dict[str, Any] = json.loads((tmp_path / "out" / "check.json").read_text())
+    return found
+
+
+def quantities(found: dict[str, Any], verdict: str) -> set[str]:
+    return {row["quantity"] for row in found["rows"] if row["verdict"] == verdict}
+
+
+def test_check_of_healthy_robot_has_no_contradiction(tmp_path: Path) -> None:
+    found = check(tmp_path, CASES / "base-log" / "log.mcap")
+    assert quantities(found, "contradiction") == set()
+    assert {"signs and sides", "units", "track and multiplier", "axes of IMU", "stamps", "reference"} <= quantities(found, "ok")
+    assert quantities(found, "cannot be seen") == {"topic of LiDAR", "wheel radius"}
+    robot = load_robot(tmp_path / "out" / "robot.toml")
+    assert robot.models["skid_steer"]["k_0"] == pytest.approx(0.55, abs=0.01)
+    assert "wheel_separation_multiplier: 1.8" in (tmp_path / "out" / "diff_drive_controller.yaml").read_text()
+    assert "vyaw" in (tmp_path / "out" / "robot_localization.yaml").read_text()
+
+
+def test_check_with_inverted_side_writes_the_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = check(tmp_path, CASES / "H06-right-side-inverted" / "log.mcap")
+    assert quantities(found, "contradiction") == {"wheels and gyro"}
+    assert load_robot(tmp_path / "out" / "robot.toml").joints.reversed == RIGHT
+    assert "the right side counts backwards" in capsys.readouterr().out
+    assert "the right side counts backwards" in (tmp_path / "out" / "check.html").read_text()
+
+
+def test_check_of_two_sensors_that_contradict_corrects_none(tmp_path: Path) -> None:
+    found = check(tmp_path, drive(tmp_path / "log.mcap", names=(*RIGHT, *LEFT)))
+    assert "wheels and gyro" in quantities(found, "contradiction")
+    robot = load_robot(tmp_path / "out" / "robot.toml")
+    assert (robot.joints, robot.wheel_noise) == (load_robot(ROBOT_TOML).joints, load_robot(ROBOT_TOML).wheel_noise)
+
+
+def test_check_with_urdf_names_what_the_log_contradicts(tmp_path: Path) -> None:
+    case = CASES / "H02-urdf-plugin-contradicts-joints"
+    found = check(tmp_path, case / "log.mcap", "--urdf", str(case / "robot.urdf"))
+    assert quantities(found, "contradiction") == {"track_width_m"}
+
+
+def test_check_without_any_length_asks_for_a_robot(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(CASES / "base-log" / "log.mcap")]) == 2
+    assert "give --robot" in capsys.readouterr().err
+
+
+def test_check_without_wheels_ends_with_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = drive(tmp_path / "log.mcap", has_joints=False)
+    assert main(["check", str(log), "--robot", str(ROBOT_TOML)]) == 2
+    assert "has no wheels" in capsys.readouterr().err
+
+
+def test_check_without_gyro_has_no_sentence_about_it(tmp_path: Path) -> None:
+    found = check(tmp_path, CASES / "base-log" / "log.mcap", "--robot", str(ROBOT_TOML), "--topic.imu", "")
+    texts = [row for row in found["rows"] if "by the gyro" in row["second_source"] or row["quantity"] == "axes of IMU"]
+    assert texts == []
+    assert open_log(CASES / "base-log" / "log.mcap", load_robot(ROBOT_TOML)).sources.imu is not None
