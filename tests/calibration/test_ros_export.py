@@ -42,7 +42,7 @@ def test_robot_toml_of_any_robot_is_read_back(
         name=name,
         mounts={frame: Mount(*numbers) for frame, numbers in mounts.items()},
         models=models,
-        joints=Joints((joint,), (joint, "other")),
+        joints=Joints((joint,), (f"{joint}, right", "other"), reversed=(joint,)),
     )
     sigmas = {model: dict.fromkeys(table, 0.1) for model, table in models.items()}
     assert parse_robot(robot_toml(robot, sigmas), "test") == robot
