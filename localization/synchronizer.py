@@ -11,6 +11,7 @@ from typing import Annotated
 
 import numpy as np
 
+from localization.attitude import AttitudeFilter, Tilt
 from localization.events import CgSample, Event, ImuSample, Scan, Step, StepInterval, WheelSample, turn_twist
 from localization.gyro import GyroBuffer
 from localization.lidar.frames import LidarFrames
@@ -18,6 +19,8 @@ from localization.settings import Positive, Settings, at_least
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.base import Motion, MotionModel, Twist
+from motion_models.friction.slope_effect import SLIDING_MODELS, SlopeEffect
+from motion_models.online_calibration import CorrectedWheels
 from motion_models.preintegration import integrate_twists
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import Cov3, FloatArray, Twist2
@@ -44,10 +47,14 @@ class StepConfig(Settings):
     """Sigma of the unknown constant speed while wheel data are missing [m/s]."""
     lost_rate_rad_s: Positive = 0.5
     """Sigma of the unknown constant turn rate while wheel data are missing [rad/s]."""
+    slopes: bool = True
+    """Model gravity on slopes where the IMU's accelerometer shows that the ground tilts; false takes all ground as level."""
 
 
 _MAX_VARIANCE = np.array([math.inf, math.inf, math.pi**2 / 3.0])
 """Yaw: of a heading that may be any, uniform from -pi to pi [rad^2]."""
+_SLOPE_ERROR_S = 5.0
+"""For which errors of a slope's effect last [s]."""
 _MIN_KNOWN_S = 1e-6
 """Of a step: less than a microsecond with wheel data is rounding."""
 
@@ -96,6 +103,12 @@ class Synchronizer:
         self.params = model.nominal
         self._wheels = WheelBuffer(robot.center_of_gravity)
         self._gyro = GyroBuffer(robot.gyro_noise, mounts)
+        inner = model.inner if isinstance(model, CorrectedWheels) else model
+        self.attitude: AttitudeFilter | None = None
+        """The vertical; None for models of robots that do not skid, and where `StepConfig.slopes` is off."""
+        if self.config.slopes and inner.name in SLIDING_MODELS:
+            self.attitude = AttitudeFilter(robot.gyro_noise, mounts, robot.geometry.wheel_radius_m)
+            self._slope_effect = SlopeEffect.from_robot(robot)
         self.frames = LidarFrames(mounts)
         """Of the scans."""
         self._has_lidar = has_lidar
@@ -132,6 +145,8 @@ class Synchronizer:
                 self._start_ns = event.stamp_ns
         elif isinstance(event, ImuSample):
             self._gyro.insert(event)
+            if self.attitude is not None:
+                self.attitude.insert(event)
         elif isinstance(event, CgSample):
             self._wheels.set_cg(event)
         elif isinstance(event, Scan) and self.frames.admit(event):
@@ -152,6 +167,8 @@ class Synchronizer:
     def warnings(self) -> list[str]:
         """Problems of the sensors so far."""
         found = self._gyro.warnings()
+        if self.attitude is not None:
+            found += self.attitude.warnings()
         if self._empty_scans:
             scans = f"{self._empty_scans} scan{'s' * (self._empty_scans > 1)}"
             found.append(f"{scans} without a usable point: the pose is by wheels and gyro there.")
@@ -211,7 +228,8 @@ class Synchronizer:
         start_ns, end_ns, scan = interval
         shift = _ns(self._clock_offset_s)
         dt, rates, cg, missing = self._wheels.window(start_ns + shift, end_ns + shift, self.config.max_hold_s)
-        motion, d_clock, last = self._integrate(start_ns + shift, dt, rates, cg)
+        tilt = None if self.attitude is None else self.attitude.advance(end_ns, dt, rates)
+        motion, d_clock, last = self._integrate(start_ns + shift, dt, rates, cg, tilt)
         if start_ns == end_ns:  # the first scan of a drive: its sweep needs a twist
             rates, cg = self._wheels.at(end_ns + shift, self.config.max_hold_s)
             last = self.model.twist(rates, cg, self.params).value.sum(axis=0)
@@ -231,7 +249,9 @@ class Synchronizer:
         twist = last if has_wheels else turn_twist(turn)
         return Step(start_ns, end_ns, motion, d_clock, twist, is_standing, has_wheels, turn, scan, self._wheels.cg_cov)
 
-    def _integrate(self, start_ns: int, dt: FloatArray, rates: FloatArray, cg: FloatArray) -> tuple[Motion, FloatArray, FloatArray]:
+    def _integrate(
+        self, start_ns: int, dt: FloatArray, rates: FloatArray, cg: FloatArray, tilt: Tilt | None
+    ) -> tuple[Motion, FloatArray, FloatArray]:
         """Motion of the wheels over the intervals, its derivative by the wheels' clock (3,), and the twist (3,) at the end.
 
         A window that is late by c has motion exp(-c twist_before) delta exp(c twist_end): the derivative is the twist just before the end
@@ -241,11 +261,32 @@ class Synchronizer:
             return Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, len(self.params)))), np.zeros(3), np.zeros(3)
         before, before_cg = self._wheels.at(start_ns - 1, self.config.max_hold_s)
         n = len(before)
-        twist = self.model.twist(np.vstack([before, rates]), np.vstack([before_cg, cg]), self.params)
-        inside = Twist(twist.value[n:], twist.d_wheels[n:], twist.d_cg[n:], twist.d_params[n:])
-        motion = integrate_twists(dt, inside, self._wheel_noise)
+        rates, cg = np.vstack([before, rates]), np.vstack([before_cg, cg])
+        if tilt is None:
+            twist = self.model.twist(rates, cg, self.params)
+            inside = Twist(twist.value[n:], twist.d_wheels[n:], twist.d_cg[n:], twist.d_params[n:])
+            motion = integrate_twists(dt, inside, self._wheel_noise)
+        else:
+            twist, motion = self._integrate_on_slope(dt, rates, cg, tilt)
         first, last = twist.value[0], twist.value[-1]
         return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last
+
+    def _integrate_on_slope(self, dt: FloatArray, rates: FloatArray, cg: FloatArray, tilt: Tilt) -> tuple[Twist, Motion]:
+        """Twists at ``rates`` (m + n, 2), and the motion over the n intervals, with what is uncertain about the slope in its covariance."""
+        m, whole, k = len(rates) - len(dt), float(dt.sum()), len(self.params)
+        downhill = np.vstack([np.tile(tilt.before, (m, 1)), tilt.at((np.cumsum(dt) - 0.5 * dt) / whole)])
+        found, is_limited = self._slope_effect.twist(self.model, rates, cg, self.params, downhill)
+        twist = found.twist
+        by = np.concatenate([twist.d_params, found.d_downhill], axis=-1)
+        motion = integrate_twists(dt, Twist(twist.value[m:], twist.d_wheels[m:], twist.d_cg[m:], by[m:]), self._wheel_noise)
+        D = motion.d_params[:, k:]
+        cov = motion.cov + max(1.0, _SLOPE_ERROR_S / whole) * (D @ tilt.cov @ D.T)
+        limited_s = float(dt[is_limited[m:]].sum())
+        if limited_s:  # tipping or sliding by itself: no wheel shows the motion
+            c = self.config
+            unknown = np.array([c.lost_speed_m_s, c.lost_speed_m_s, c.lost_rate_rad_s]) ** 2
+            cov = cov + np.diag(unknown) * limited_s * max(1.0, limited_s)
+        return twist, Motion(motion.delta, cov, motion.d_params[:, :k], motion.d_cg)
 
 
 def _ns(seconds: float) -> int:

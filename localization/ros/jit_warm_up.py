@@ -14,6 +14,7 @@ from localization.pipeline import Pipeline
 from localization.ros.publisher import Predictor
 from localization.ros.settings import LiveRun
 from motion_models.center_of_gravity.files import arms_model
+from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
 _compiled: set[tuple[str, ...]] = set()
@@ -21,6 +22,8 @@ _compiled: set[tuple[str, ...]] = set()
 _ROOM_M, _SPEED_M_S = 8.0, 0.5
 _PUSH = np.array([0.6, 0.4, 0.2])
 """Far enough that scans do not fit until they are searched [m, m, rad]."""
+_GRAVITY = np.array([-2.0, 0.0, 9.6])
+"""On a slope [m/s^2]: what models it is compiled, too."""
 _PERIOD_NS = 10_000_000
 _EVENTS_PER_SCAN = 10
 
@@ -43,7 +46,7 @@ def warm_up(run: LiveRun) -> None:
     for has_lidar, is_planar in ((True, True), (True, False), (False, True)):
         try:
             trial = run.make_trial(has_lidar)
-            pipeline = Pipeline(trial, run.robot, run.robot.mounts, has_lidar, run.config)
+            pipeline = Pipeline(trial, run.robot, {"base_link": Mount(), **run.robot.mounts}, has_lidar, run.config)
         except EstimatorError:
             if has_lidar:
                 raise
@@ -70,7 +73,7 @@ def synthetic_drive(has_lidar: bool, is_planar: bool) -> Iterator[Event]:
         pose = pose + _PERIOD_NS * 1e-9 * np.array([speed * math.cos(pose[2]), speed * math.sin(pose[2]), 0.3 * speed])
         stamp, turned = stamp + _PERIOD_NS, turned + rates * _PERIOD_NS * 1e-9
         yield WheelSample(stamp, rates, turned)
-        yield ImuSample(stamp, np.array([0.0, 0.0, 0.3 * speed]), np.array([0.0, 0.0, 9.81]), "imu_link")
+        yield ImuSample(stamp, np.array([0.0, 0.0, 0.3 * speed]), _GRAVITY, "base_link")
         if i == 300:
             pose = pose + _PUSH
         if has_lidar and i % _EVENTS_PER_SCAN == 9:
