@@ -16,7 +16,8 @@ import numpy as np
 from localization.events import ImuSample, Scan
 from localization.lidar import LidarConfig, Sweep
 from localization.logs import Log
-from localization.logs.decode import JointReading, OdometryReading, decode_cloud, decode_imu, decode_odometry, scan_decoder
+from localization.logs.clouds import cloud_decoder
+from localization.logs.decode import JointReading, OdometryReading, decode_imu, decode_odometry, scan_decoder
 from localization.logs.event_decoder import TopicDecoder, arc
 from localization.logs.topic_roles import TYPES
 from localization.logs.wheel_messages import ODOMETRY_DECODERS, wheel_decoder
@@ -258,7 +259,7 @@ def _scan_steps(log: Log, first_ns: int, start_s: float) -> Iterator[FloatArray]
     """Begin, end [s], way forward [m], turn [rad] and way to the left [m] from scan to scan."""
     source = log.sources.lidar
     assert source is not None
-    decode = scan_decoder() if source.kind == "scan" else decode_cloud
+    decode = scan_decoder() if source.kind == "scan" else cloud_decoder(log.period_s.get(source.topic))
     odometry, config, last = ScanOdometry(), LidarConfig(), None
     for scan in log.readings({source.topic: TopicDecoder(0, decode)}):
         assert isinstance(scan, Scan)

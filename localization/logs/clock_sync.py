@@ -20,11 +20,12 @@ from __future__ import annotations
 
 import dataclasses
 import heapq
+import itertools
 import statistics
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from localization.logs.decode import MessageStats, Oddity
 
@@ -62,6 +63,15 @@ class Item:
     """An event, or a reading that becomes one; a dataclass with the field `stamp_ns`."""
 
 
+class FirstMessage(NamedTuple):
+    """One of the first messages of a topic."""
+
+    log_ns: int
+    stamp_ns: int
+    """Header stamp; 0 where there is none."""
+    frame: str = ""
+
+
 @dataclass(frozen=True)
 class ClockPlan:
     """How far the headers' clock is from the recorder's, and which topics have another one."""
@@ -74,22 +84,24 @@ class ClockPlan:
     """Header stamp, shifted, minus time of recording, of each topic's first messages."""
     unsure: frozenset[str] = frozenset()
     """Topics of which too few messages are known for that."""
+    period_s: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Median time from message to message of a topic's first frame [s], where its first messages show it."""
 
-    def first_stamps(self, first: Mapping[str, Sequence[tuple[int, int]]]) -> Iterator[int]:
+    def first_stamps(self, first: Mapping[str, Sequence[FirstMessage]]) -> Iterator[int]:
         """Shifted header stamps of those of the ``first`` messages, from which the plan was made, that are not old."""
         for topic, pairs in first.items():
-            for log, stamp in pairs:
+            for log, stamp, _ in pairs:
                 shifted = stamp + self.shifts_ns.get(topic, 0)
                 if stamp and shifted - log >= self.latency_ns[topic] - _MAX_STEP_NS:
                     yield shifted
 
 
-def plan_clocks(first: Mapping[str, Sequence[tuple[int, int]]]) -> ClockPlan:
-    """Clocks by the (log stamp, header stamp) of the first messages of each topic; zero stamps are left out.
+def plan_clocks(first: Mapping[str, Sequence[FirstMessage]]) -> ClockPlan:
+    """Clocks by the first messages of each topic; those without a stamp are left out.
 
     If any topic agrees with the recorder to 10 s, that is the common clock; else the median of all.
     """
-    stamped = {topic: [pair for pair in pairs if pair[1] != 0] for topic, pairs in first.items()}
+    stamped = {topic: [pair for pair in pairs if pair.stamp_ns != 0] for topic, pairs in first.items()}
     offsets = {topic: _usual_offset(pairs) for topic, pairs in stamped.items() if pairs}
     if not offsets or any(abs(offset) <= _MAX_CLOCK_OFFSET_NS for offset in offsets.values()):
         common = 0
@@ -97,7 +109,8 @@ def plan_clocks(first: Mapping[str, Sequence[tuple[int, int]]]) -> ClockPlan:
         common = statistics.median_low(sorted(offsets.values()))
     shifts = {topic: _shift_to(common, offset) for topic, offset in offsets.items() if _shift_to(common, offset)}
     unsure = frozenset(topic for topic in offsets if len(stamped[topic]) < _MIN_JUMPED_MESSAGES)
-    return ClockPlan(common, shifts, {topic: offset + shifts.get(topic, 0) for topic, offset in offsets.items()}, unsure)
+    periods = {topic: period for topic, pairs in stamped.items() if (period := _period_s(pairs)) is not None}
+    return ClockPlan(common, shifts, {topic: offset + shifts.get(topic, 0) for topic, offset in offsets.items()}, unsure, periods)
 
 
 def _shift_to(common: int, offset: int) -> int:
@@ -105,13 +118,19 @@ def _shift_to(common: int, offset: int) -> int:
     return common - offset if abs(offset - common) > _MAX_CLOCK_OFFSET_NS else 0
 
 
-def _usual_offset(first: Sequence[tuple[int, int]]) -> int:
+def _period_s(first: Sequence[FirstMessage]) -> float | None:
+    stamps = [message.stamp_ns for message in first if message.frame == first[0].frame]
+    steps = [after - before for before, after in itertools.pairwise(stamps) if after > before]
+    return statistics.median(steps) * 1e-9 if steps else None
+
+
+def _usual_offset(first: Sequence[FirstMessage]) -> int:
     """Header stamp minus time of recording: the greatest on which several messages agree to a second.
 
     Messages come late, never early: what a buffer or a latched topic adds lies below it, and a single stamp ahead has no second.
     """
-    logs, stamps = zip(*first, strict=True)
-    offsets = sorted((stamp - log for log, stamp in first), reverse=True)
+    logs, stamps, _ = zip(*first, strict=True)
+    offsets = sorted((stamp - log for log, stamp, _ in first), reverse=True)
     several = min(_MIN_JUMPED_MESSAGES, 1 + len(first) // 3)
     for offset, other in zip(offsets, offsets[several - 1 :], strict=False):
         if offset - other <= _MAX_STEP_NS:

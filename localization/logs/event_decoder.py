@@ -18,6 +18,7 @@ import numpy as np
 
 from localization.events import CgSample, Event, WheelSample
 from localization.logs.clock_sync import Item
+from localization.logs.clouds import cloud_decoder
 from localization.logs.decode import (
     ArmReading,
     JointReading,
@@ -27,7 +28,6 @@ from localization.logs.decode import (
     UnusableError,
     arm_decoder,
     decode_cg,
-    decode_cloud,
     decode_imu,
     decode_odometry,
     scan_decoder,
@@ -84,13 +84,14 @@ class EventDecoder:
         arms: CgModel | None,
         robot: Robot,
         stats: MessageStats,
+        period_s: Mapping[str, float],
     ) -> None:
-        """``joints``: names of the left and of the right wheels' joints."""
+        """``joints``: names of the left and of the right wheels' joints. ``period_s``: from message to message, by topic [s]."""
         self._sources, self._joints, self._arms = sources, joints, arms
         wheels = "" if sources.wheels is None else sources.wheels.topic
         odometry_type = "" if sources.wheels is None else sources.wheels.type
         self._of_wheels = wheel_decoder((*joints[0], *joints[1]), robot.joints)
-        self._imu_unit = robot.imu.rate_unit_rad_s
+        self._period_s, self._imu_unit = period_s, robot.imu.rate_unit_rad_s
         left, right = joints
         self._multipliers = robot.geometry.radius_multipliers
         self._has_multipliers = bool((self._multipliers != 1.0).any())
@@ -145,7 +146,7 @@ class EventDecoder:
             "odometry": decode_odometry,
             "imu": partial(decode_imu, rate_unit_rad_s=self._imu_unit),
             "center_of_gravity": decode_cg,
-            "points": decode_cloud,
+            "points": cloud_decoder(self._period_s.get(source.topic)),
         }
         return decoders[source.kind]
 

@@ -17,7 +17,7 @@ from localization.errors import LogError, TopicError
 from localization.events import Event, Reference
 from localization.logs import mcap, ros1, sqlite
 from localization.logs.chunks import DamagedError, RawMessage, Source, decompress_file, merge_channels
-from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, Item, merge, plan_clocks
+from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, FirstMessage, Item, merge, plan_clocks
 from localization.logs.decode import MessageStats, UnusableError, frame_name, stamp_ns
 from localization.logs.event_decoder import EventDecoder, TopicDecoder, decode_item
 from localization.logs.references import reference_decoder
@@ -90,6 +90,11 @@ class Log:
     def duration_s(self) -> float:
         """From the first to the last message, by the time of recording [s]."""
         return (self.end_ns - self.start_ns) * 1e-9
+
+    @property
+    def period_s(self) -> Mapping[str, float]:
+        """Median time from message to message, by stamp, of each topic that is used [s], where its first messages show it."""
+        return self._clocks.period_s
 
     @property
     def reference_topic(self) -> str | None:
@@ -172,7 +177,7 @@ class Log:
         return list(dict.fromkeys(found))
 
     def _events(self, stats: MessageStats) -> Iterator[Event]:
-        decoder = EventDecoder(self.sources, self._joints, self._arms, self.robot, stats)
+        decoder = EventDecoder(self.sources, self._joints, self._arms, self.robot, stats, self.period_s)
         for payload in merge(self._items(decoder.decoders, stats), self._clocks, stats):
             yield from decoder.events(payload)
 
@@ -210,14 +215,15 @@ class Log:
         return self._clock_plan([source.topic for source in self.sources.used()])
 
     def _clock_plan(self, topics: list[str]) -> ClockPlan:
-        first: dict[str, list[tuple[int, int]]] = {}
+        first: dict[str, list[FirstMessage]] = {}
         for topic in topics:
             found = first[topic] = []
             for log_ns, message in self._first_messages(topic, 2 * FIRST_MESSAGES):
-                self.frames.setdefault(topic, frame_name(message.header.frame_id))
+                frame = frame_name(message.header.frame_id)
+                self.frames.setdefault(topic, frame)
                 if stamp_ns(message):
-                    found.append((log_ns, stamp_ns(message)))
-                if len(found) >= FIRST_MESSAGES or (len(found) > 2 and log_ns - found[0][0] > _FIRST_READ_NS):
+                    found.append(FirstMessage(log_ns, stamp_ns(message), frame))
+                if len(found) >= FIRST_MESSAGES or (len(found) > 2 and log_ns - found[0].log_ns > _FIRST_READ_NS):
                     break
         return plan_clocks(first)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from localization.errors import TransportError
-from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, plan_clocks
+from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, FirstMessage, plan_clocks
 from localization.logs.decode import UnusableError, frame_name, stamp_ns
 from localization.logs.serialization import decoder, live_channel
 from localization.logs.topic_roles import TYPES, TopicChooser, TopicOverrides, TopicRoles, choose_roles, short_type
@@ -65,7 +65,7 @@ class TopicDiscovery:
         self._transforms = LiveTransforms(body, is_ros1=transport.is_ros1)
         self._backlog: list[Received] = []
         self._counts: Counter[str] = Counter()
-        self._first: dict[str, list[tuple[int, int]]] = defaultdict(list)
+        self._first: dict[str, list[FirstMessage]] = defaultdict(list)
 
     def discover(
         self, wait_s: float, needed: Iterable[str], report: Callable[[str], None], is_over: Callable[[], bool]
@@ -111,7 +111,8 @@ class TopicDiscovery:
         except UnusableError:
             return
         if stamp_ns(message) and len(self._first[received.topic]) < FIRST_MESSAGES:
-            self._first[received.topic].append((received.received_ns + self._transport.epoch_ns, stamp_ns(message)))
+            wall_ns = received.received_ns + self._transport.epoch_ns
+            self._first[received.topic].append(FirstMessage(wall_ns, stamp_ns(message), frame_name(message.header.frame_id)))
         self._counts[received.topic] += 1
         self._backlog.append(received)
         if len(self._backlog) > _MAX_BACKLOG:

@@ -45,7 +45,7 @@ class LiveStream:
         """``epoch_ns``: what turns times of receiving into the time of ROS."""
         parts, self._stats, self._epoch_ns = discovered.parts, stats, epoch_ns
         self.sources: Sources = parts.sources
-        self._event_decoder = EventDecoder(parts.sources, parts.joints, parts.arms, robot, stats)
+        self._event_decoder = EventDecoder(parts.sources, parts.joints, parts.arms, robot, stats, discovered.plan.period_s)
         self._merger = Merger(discovered.plan, stats, wait_ns=None)
         self._decoders = {source.topic: decoder(source.type or TYPES[source.kind], is_ros1=is_ros1) for source in parts.sources.used()}
         self._rates = {source.topic: _TopicRate() for source in parts.sources.used()}

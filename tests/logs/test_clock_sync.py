@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.logs import Log, inspect_log, open_log
-from localization.logs.clock_sync import ClockPlan, Item, merge, plan_clocks
+from localization.logs.clock_sync import ClockPlan, FirstMessage, Item, merge, plan_clocks
 from localization.logs.decode import MessageStats, Oddity
 from motion_models.robot import load_robot
 from tests.helpers import bags
@@ -42,9 +42,9 @@ def mark(topic: str, true_ns: int, log_ns: int, stamp_ns: int | None = None) -> 
 def run(items: Iterable[Item]) -> tuple[list[Mark], MessageStats]:
     """Merge items after bringing them into the order of recording, with clocks planned by each topic's first eleven."""
     ordered = sorted(items, key=lambda item: item.log_ns)
-    first: dict[str, list[tuple[int, int]]] = {}
+    first: dict[str, list[FirstMessage]] = {}
     for item in ordered:
-        first.setdefault(item.topic, []).append((item.log_ns, item.stamp_ns))
+        first.setdefault(item.topic, []).append(FirstMessage(item.log_ns, item.stamp_ns))
     stats = MessageStats()
     return list(merge(ordered, plan_clocks({topic: pairs[:11] for topic, pairs in first.items()}), stats)), stats
 
@@ -247,7 +247,7 @@ def test_clock_sync_clock_of_few_messages_is_replaced() -> None:
     """Live, a topic may have sent nothing but its latched message before the start."""
     old, items = mark("/pose", START - 5 * S, START), ticks("/pose", 5, 10, start=START + S)
     stats = MessageStats()
-    marks = list(merge([old, *items], plan_clocks({"/pose": [(START, START - 5 * S)]}), stats))
+    marks = list(merge([old, *items], plan_clocks({"/pose": [FirstMessage(START, START - 5 * S)]}), stats))
     assert all(m.stamp_ns == m.true_ns for m in marks)
     assert len(marks) == 51
 
@@ -364,7 +364,7 @@ def test_clock_sync_any_input_uses_bounded_memory(case: str, monkeypatch: pytest
     def peak(n: int) -> int:
         tracemalloc.start()
         last = 0
-        for event in merge(items(n), plan_clocks({"/a": [(START, START)]}), MessageStats()):
+        for event in merge(items(n), plan_clocks({"/a": [FirstMessage(START, START)]}), MessageStats()):
             assert event.stamp_ns >= last
             last = event.stamp_ns
         most = tracemalloc.get_traced_memory()[1]

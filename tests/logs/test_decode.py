@@ -128,10 +128,10 @@ def test_cloud_other_fields_padding_and_order_are_ignored(tmp_path: Path) -> Non
 
 
 def test_cloud_points_without_hit_are_dropped_with_their_times(tmp_path: Path) -> None:
-    rows = [(1, 2, 3, 10), (np.nan, 2, 3, 20), (0, 0, 0, 30), (1, np.inf, 3, 40), (4, 5, 6, 50)]
+    rows = [(1, 2, 3, 10e6), (np.nan, 2, 3, 20e6), (0, 0, 0, 30e6), (1, np.inf, 3, 40e6), (4, 5, 6, 50e6)]
     (scan,), _ = scans_of(tmp_path, [bags.cloud(START, table(rows, [("t", "<u4")]))], "/points")
     np.testing.assert_array_equal(scan.points, [(1, 2, 3), (4, 5, 6)])
-    np.testing.assert_allclose(scan.offsets, [10e-9, 50e-9])
+    np.testing.assert_allclose(scan.offsets, [0.01, 0.05])
 
 
 SWEEP = np.array([0.0, 0.03, 0.0999])
@@ -150,12 +150,39 @@ UPTIME = 512.25
         ("time", "<f4", SWEEP * 1e9),
         ("timestamp", "<f8", UPTIME + SWEEP),  # an unknown clock: the scan begins at the header's stamp
         ("t", "<u4", UPTIME * 1e9 % 2**32 + SWEEP * 1e9),
+        ("time_stamp", "<u4", SWEEP * 1e9),  # Autoware, PointXYZIRCAEDT
+        ("time_stamp", "<f8", START * 1e-9 + SWEEP),  # Autoware, PointXYZIRADRT
+        ("t", "<u4", SWEEP * 1e6),
+        ("t", "<u2", SWEEP * 1e3),
+        ("time", "<f4", SWEEP * 1e3),
+        ("timestamp", "<f8", START * 1e-3 + SWEEP * 1e6),
+        ("time", "<f4", SWEEP * 10.0),  # the part of the sweep that has passed
     ],
 )
 def test_cloud_times_of_each_driver_are_seconds_from_the_header(tmp_path: Path, field: str, kind: str, values: Any) -> None:
     rows = [(*row, value) for row, value in zip(ROWS, values, strict=True)]
     (scan,), _ = scans_of(tmp_path, [bags.cloud(START, table(rows, [(field, kind)]))], "/points")
-    np.testing.assert_allclose(scan.offsets, SWEEP, atol=2e-6)
+    np.testing.assert_allclose(scan.offsets, SWEEP, atol=1e-3 if kind == "<u2" else 2e-6)
+
+
+@pytest.mark.parametrize("hz", [4, 10, 20, 100])
+@pytest.mark.parametrize("unit", [1.0, 1e3, 1e6, 1e9])
+@pytest.mark.parametrize("part", [1.0, 0.1, 0.01])
+def test_cloud_times_units_follow_the_scan_period(tmp_path: Path, hz: int, unit: float, part: float) -> None:
+    """Also of scans that fill a part of the turn."""
+    seconds = [np.array([0.0, 0.5, 1.0]) / hz * share for share in (1.0, part, part, 0.5)]
+    rows = [[(*row, value * unit) for row, value in zip(ROWS, times, strict=True)] for times in seconds]
+    clouds = [bags.cloud(START + i * S // hz, table(rows[i], [("time", "<f8")])) for i in range(4)]
+    for scan, times in zip(log_of(tmp_path, "/points", clouds, period=S // hz).events(), seconds, strict=True):
+        np.testing.assert_allclose(scan.offsets, times, rtol=1e-9)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.05, START * 1e-9])
+def test_cloud_times_all_equal_are_no_times(tmp_path: Path, value: float) -> None:
+    rows = [(*row, value) for row in ROWS]
+    (scan,), _ = scans_of(tmp_path, [bags.cloud(START, table(rows, [("time", "<f8")]))], "/points")
+    assert scan.points.shape == (3, 3)
+    assert scan.offsets.shape == (0,)
 
 
 def test_cloud_times_before_the_header_are_negative(tmp_path: Path) -> None:

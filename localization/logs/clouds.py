@@ -1,0 +1,132 @@
+"""Point clouds to scans: sensor_msgs/PointCloud2 of any layout, and the times of its points in whatever unit and from whatever origin.
+
+ROS has no convention for these times: drivers publish seconds, milliseconds, microseconds or nanoseconds, or the part of the sweep that has
+passed, since the header's stamp, since 1970, or since the sensor was switched on. Two second sources decide: the header's stamp, which
+absolute times are near in one unit only, and the period of the scans, which a sweep fills and does not exceed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from localization.events import Scan
+from localization.logs.decode import MAX_SCAN_DURATION_S, Oddity, UnusableError, frame_name
+from motion_models.se2 import FloatArray
+
+# sensor_msgs/PointField: datatype 1..8
+_DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "offset_time", "time_offset", "stamp", "stamps")
+_TIME_NAME = re.compile("time|stamp|^(ts|dt|t_.*)$")
+_MAX_POINTS = 10_000_000  # points; LiDARs have up to 300,000 a scan, and this many take 1 GB as float64
+_MAX_START_OFFSET_S = 0.5  # a scan begins at the stamp of its header, or ends there
+_UNITS_NS = (1_000_000_000, 1_000_000, 1_000, 1)
+_USUAL_PERIOD_S = 0.1  # of LiDARs that turn, for a log with one cloud
+_MAX_PERIODS = 1.5
+"""Length of a sweep in periods: some overlap a little, and drivers join packets by whole ones. Units are a factor of 1000 apart, so that a
+sweep of a thousandth of its turn on is taken in the right one."""
+
+
+def cloud_decoder(period_s: float | None) -> Callable[[Any, int], Scan]:
+    """Decoder of PointCloud2 whose scans are ``period_s`` apart [s] (None: unknown).
+
+    It raises `UnusableError` for a message that has no x, y, z, whose sizes contradict each other, or whose points' times span more than
+    one scan. Times that are all equal are none.
+    """
+    convert = _PointTimes(period_s or _USUAL_PERIOD_S)
+
+    def decode(message: Any, stamp: int) -> Scan:
+        table = _table(message)
+        with np.errstate(invalid="ignore"):  # signalling NaNs
+            points = np.stack([table[name].astype(float).ravel() for name in ("x", "y", "z")], axis=1)
+        good = np.isfinite(points).all(axis=1) & points.any(axis=1)  # drivers mark beams without a return by the origin
+        offsets: FloatArray = np.empty(0)
+        time_fields = [name for name in table.dtype.names or () if name not in ("x", "y", "z")]
+        if time_fields:
+            times = convert(table[time_fields[0]].ravel(), good, stamp)
+            if np.isfinite(times[good]).any():
+                good &= np.isfinite(times)
+                offsets = times[good]
+                duration = np.ptp(offsets)
+                if duration > MAX_SCAN_DURATION_S:
+                    raise UnusableError(Oddity.MALFORMED)
+                if duration == 0.0 and len(offsets) > 1:
+                    offsets = np.empty(0)
+        return Scan(stamp, np.ascontiguousarray(points[good]), offsets, frame_name(message.header.frame_id), is_planar=False)
+
+    return decode
+
+
+def _table(message: Any) -> Any:
+    """(height, width) structured view of the message's bytes: x, y, z and the time, if any."""
+    fields = {f.name.lower(): f for f in message.fields if int(f.datatype) in _DTYPES and int(f.count) <= 1}
+    times = [*(name for name in _TIME_FIELDS if name in fields), *(name for name in fields if _TIME_NAME.search(name))]
+    wanted = ["x", "y", "z", *times[:1]]
+    height, width = int(message.height), int(message.width)
+    step, row_step = int(message.point_step), int(message.row_step)
+    order = ">" if message.is_bigendian else "<"
+    data = np.ascontiguousarray(message.data, dtype=np.uint8)
+    if height * width > _MAX_POINTS:
+        raise UnusableError(Oddity.MALFORMED)
+    if height * width == 0:
+        return np.empty((0, 0), dtype=[(name, "f8") for name in "xyz"])
+    if height == 1:
+        row_step = width * step  # drivers of unorganised clouds leave it unset
+    if not {"x", "y", "z"} <= fields.keys() or step <= 0 or row_step < width * step or len(data) < (height - 1) * row_step + width * step:
+        raise UnusableError(Oddity.MALFORMED)
+    try:
+        dtype = np.dtype(
+            {
+                "names": wanted,
+                "formats": [order + _DTYPES[int(fields[name].datatype)] for name in wanted],
+                "offsets": [int(fields[name].offset) for name in wanted],
+                "itemsize": step,
+            }
+        )
+    except ValueError as error:  # a field outside of the point
+        raise UnusableError(Oddity.MALFORMED) from error
+    return np.ndarray((height, width), dtype=dtype, buffer=data.data, strides=(row_step, step))
+
+
+class _PointTimes:
+    """Times of the points of one topic to seconds after the header's stamp."""
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self._largest = 0.0
+        """Of the times so far, in the unit of the field: parts of a sweep never exceed 1."""
+
+    def __call__(self, times: Any, good: Any, stamp: int) -> FloatArray:
+        """Seconds after ``stamp`` [ns] of each of ``times`` (N,), of which ``good`` (N,) belong to points; NaN where it has none."""
+        is_whole = np.issubdtype(times.dtype, np.integer)
+        values = times.astype(np.int64 if is_whole else float)
+        known = values[good] if is_whole else values[good & np.isfinite(values)]
+        if len(known) == 0:
+            return np.full(len(values), 0.0 if is_whole else np.nan)
+        first, spread, longest = known.min(), float(np.ptp(known)), _MAX_PERIODS * self._period_s
+        start_s = max(_MAX_START_OFFSET_S, longest)
+        for unit_ns in _UNITS_NS:
+            begin = float(first) * unit_ns * 1e-9
+            if abs(begin - stamp * 1e-9) <= min(start_s, abs(begin)):
+                return _seconds(values, unit_ns, stamp)
+        self._largest = max(self._largest, float(np.abs(known).max()))
+        if not is_whole and longest < self._largest <= 1.0:
+            return np.asarray(values * self._period_s, dtype=float)  # parts of the sweep
+        unit_ns = next((unit for unit in _UNITS_NS if spread * unit * 1e-9 <= longest), 1)
+        if abs(float(first) * unit_ns * 1e-9) <= start_s:
+            return _seconds(values, unit_ns, 0)
+        return _seconds(values - first, unit_ns, 0)  # an unknown clock: the scan begins at the header's stamp
+
+
+def _seconds(values: Any, unit_ns: int, origin_ns: int) -> FloatArray:
+    """``values`` (N,) in units of ``unit_ns`` [ns] after ``origin_ns`` [s].
+
+    A double resolves the seconds since 1970 to a quarter of a microsecond, integers are exact.
+    """
+    if np.issubdtype(values.dtype, np.integer):
+        whole, rest = divmod(origin_ns, unit_ns)
+        return np.asarray((values - whole) * (unit_ns * 1e-9) - rest * 1e-9, dtype=float)
+    return np.asarray(values * (unit_ns * 1e-9) - origin_ns * 1e-9, dtype=float)
