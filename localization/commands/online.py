@@ -25,7 +25,7 @@ from localization.output import fingerprint
 from localization.pipeline import Pipeline
 from localization.ros.diagnostics import ERROR, OK, WARN, Status
 from localization.ros.node import Node, StopSignal
-from localization.ros.session import Session, SessionState, View, made_by
+from localization.ros.session import Session, SessionState, View, made_by, shared_of
 from localization.ros.settings import LiveRun, OnlineSettings
 from localization.ros.transports import TransportName, open_transport
 from localization.ros.transports.base import SimTimeTransport
@@ -83,7 +83,7 @@ class Online(OnlineSettings):
         trial = self.make_trial(has_lidar)
         made = made_by(trial, robot, log.mounts, has_lidar, self.config, f"log {fingerprint(path)[:12]}")
         pipeline = Pipeline(trial, robot, log.mounts, has_lidar, self.config)
-        session = Session.start(files, SessionState(pipeline), f"{trial.model.name}_{trial.estimator}", made)
+        session = Session.start(files, SessionState(pipeline), f"{trial.model.name}_{trial.estimator}", made, shared_of(trial))
         is_done = False
         try:
             if view is not None:

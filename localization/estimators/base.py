@@ -12,6 +12,7 @@ import numpy as np
 from localization.events import PositionSample, Step
 from localization.lidar import LostScans
 from localization.maps import KeyframeMap
+from localization.maps.grid import Grid
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Twist2
@@ -95,6 +96,10 @@ class Estimator(ABC):
 
     def localization(self) -> Mapping[str, Any] | None:
         """State, probability and places in a saved map so far, as JSON holds them; None where there is none."""
+        return None
+
+    def occupancy(self) -> Grid | None:
+        """The map as a grid with free space, in the frame of the poses; None where there are points alone."""
         return None
 
     def map_points(self) -> Points2:

@@ -15,10 +15,11 @@ from localization.estimators.filter import KEY
 from localization.estimators.fusion import EkfFusion
 from localization.events import Step
 from localization.lidar import LostScans
+from localization.maps.grid import Grid
 from localization.maps.localizer import Localizer
 from localization.maps.place_search import PlaceMap
 from motion_models import se2
-from motion_models.se2 import FloatArray, Points2, Pose2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 _KEYFRAME_DISTANCE_M, _KEYFRAME_ANGLE_RAD = 0.5, 0.3
 """A keyframe follows when the robot has moved this far: scans of less are nearly the same evidence."""
@@ -86,8 +87,19 @@ class MapFusion(Estimator):
             self.localizer.add(ekf.pose, self.odometry.scan_points, *ekf.motion_since(KEY))
             ekf.start_key()
             self._n_losses += was_localized and self.localizer.state == "lost"
-            self._map_T_odom = se2.compose(self.localizer.pose, se2.inverse(ekf.pose))
-            self._key_cov = self.localizer.covariance
+            self._take_pose()
+
+    def set_pose(self, pose: Pose2, cov: Cov3) -> None:
+        """Search near the present ``pose`` (3,) in the map, with covariance ``cov`` (3, 3), as a person gives it. Odometry goes on."""
+        ekf = self.odometry.filter
+        delta, _ = ekf.motion_since(KEY)
+        self.localizer.set_pose(se2.compose(pose, se2.inverse(delta)), cov)
+        self._take_pose()
+
+    def _take_pose(self) -> None:
+        """The map's frame is where the localizer has the last keyframe."""
+        self._map_T_odom = se2.compose(self.localizer.pose, se2.inverse(self.odometry.filter.key))
+        self._key_cov = self.localizer.covariance
 
     def _count(self, duration_s: float) -> None:
         if self.localizer.state == "localized" and self._first_s is None:
@@ -134,6 +146,10 @@ class MapFusion(Estimator):
                 "poses of that time are by odometry alone. The robot was carried, or the map is out of date."
             )
         return found
+
+    def occupancy(self) -> Grid:
+        """The saved map."""
+        return self.localizer.grid
 
     def map_points(self) -> Points2:
         """(M, 2) points of the saved map [m]."""

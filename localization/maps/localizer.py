@@ -16,6 +16,7 @@ import numpy as np
 
 from localization.lidar.scan_matcher import MIN_POINTS, OUTLIER_SIGMAS, is_narrow, mahalanobis
 from localization.lidar.submap import voxel_means
+from localization.maps.grid import Grid
 from localization.maps.place_search import CELL_M, Place, PlaceMap
 from motion_models import se2
 from motion_models.se2 import Cov3, Points2, Pose2
@@ -41,10 +42,10 @@ _MAX_MARGIN, _POINTS = 0.5, 200.0
 _TRACK_GAIN, _CONTRADICTION = 3.0, 5.0
 """Log-odds of a keyframe that is tracked: the first times (share on walls - the second times share in free space). Right places have 0.86
 and 0.04 in the median, 0.69 and 0.13 at the ends of 90 %; the best of wrong ones 0.6 and 0.12."""
-_KNOWN_SHARE = 0.3
-"""Share of points in mapped space, below which a scan is no evidence for or against the place."""
-_MAX_LOG_ODDS = 5.0
-"""So that a few contradictions are enough to be lost."""
+_KNOWN_SHARE, _CONTRADICTING_SHARE = 0.5, 0.2
+"""Share of points in mapped space, below which a scan is no evidence for or against the place, unless the second share is in free space."""
+_MAX_SEARCH_ODDS, _MAX_LOG_ODDS = 5.0, 8.0
+"""Log-odds of a search, and of a place that is tracked, at most: a few scans from elsewhere are enough to be lost."""
 _PATIENCE, _MAX_WAIT = 6, 3
 """After each so many searches in vain, one more keyframe is left out between them, at most the second number."""
 _INITIAL_KEYFRAMES = 10
@@ -73,10 +74,10 @@ class Localizer:
 
     def __init__(self, place_map: PlaceMap, initial: Pose2 | None = None, initial_cov: Cov3 = INITIAL_COV) -> None:
         """``initial`` (3,): about where the robot is in the map, with covariance ``initial_cov`` (3, 3)."""
-        self._map = place_map
+        self.places = place_map
         self.state: State = "searching"
         self.pose, self._cov = place_map.centre, place_map.extent_cov
-        self._log_odds = -_MAX_LOG_ODDS
+        self._log_odds = -_MAX_SEARCH_ODDS
         self._is_tracking = False
         self._recent: deque[_Keyframe] = deque(maxlen=_SEARCH_KEYFRAMES)
         self.hypotheses: Sequence[Hypothesis] = ()
@@ -101,7 +102,7 @@ class Localizer:
     @property
     def covariance(self) -> Cov3:
         """(3, 3) of the right perturbation of `pose`, with the map's own."""
-        return np.asarray(self._cov + self._map.map_cov(self.pose)) if self._is_tracking else self._cov
+        return np.asarray(self._cov + self.places.map_cov(self.pose)) if self._is_tracking else self._cov
 
     def add(self, odometry: Pose2, points: Points2, delta: Pose2, cov: Cov3) -> None:
         """A keyframe at ``odometry`` (3,) with the scan ``points`` (N, 2) of the body frame [m]: moved by ``delta`` (3,) with covariance
@@ -118,14 +119,18 @@ class Localizer:
         else:
             self._search()
 
+    @property
+    def grid(self) -> Grid:
+        """The map's walls and free space."""
+        return self.places.grid
+
     def map_points(self) -> Points2:
         """(M, 2) points of the map [m]."""
-        return self._map.surfaces.means
+        return self.places.surfaces.means
 
     def _track(self, points: Points2) -> None:
-        place = self._map.align(points, self.pose, self._cov)
-        known = place.on_walls + place.in_free
-        if known < _KNOWN_SHARE:
+        place = self.places.align(points, self.pose, self._cov)
+        if place.on_walls + place.in_free < _KNOWN_SHARE and place.in_free < _CONTRADICTING_SHARE:
             return
         R = np.asarray(np.linalg.inv(place.fit.information + _OPEN)) * max(place.residual_variance, 1.0) + _BEND
         measured = se2.compose(place.pose, se2.exp(-np.linalg.solve(place.fit.information + _OPEN, place.fit.gradient)))
@@ -142,7 +147,7 @@ class Localizer:
     def _lose(self) -> None:
         """The place was wrong, or the map is: search anywhere, by the scans from now on."""
         self.state, self._is_tracking, self.hypotheses = "lost", False, ()
-        self._cov = self._cov + self._map.extent_cov
+        self._cov = self._cov + self.places.extent_cov
         last = self._recent[-1]
         self._recent.clear()
         self._recent.append(last)
@@ -162,15 +167,15 @@ class Localizer:
         if self._initial_left:
             self._initial_left -= 1
             half = 3.0 * np.sqrt([np.trace(self._cov[:2, :2]), np.trace(self._cov[:2, :2]), self._cov[2, 2]])
-            places = self._map.search(points, self.pose, half)
+            places = self.places.search(points, self.pose, half)
             if not self._initial_left:
-                self._cov = self._map.extent_cov
+                self._cov = self.places.extent_cov
         else:
-            places = self._map.search(points)
+            places = self.places.search(points)
         before, moved = self.hypotheses, se2.between(self._searched_at, here)
         self._searched_at = here
         self.hypotheses = _weigh(places, len(points))
-        self._log_odds = _log_odds(self.hypotheses[0].probability) if places else -_MAX_LOG_ODDS
+        self._log_odds = _log_odds(self.hypotheses[0].probability) if places else -_MAX_SEARCH_ODDS
         if self.probability < LIKELY or not self._is_continued(before, moved):
             return
         cov = np.asarray(np.linalg.inv(places[0].fit.information + _OPEN)) * max(places[0].residual_variance, 1.0)
@@ -197,7 +202,7 @@ def _weigh(places: Sequence[Place], n_points: int) -> list[Hypothesis]:
     odds = _BY_WALLS * best.on_walls + _BY_FREE * best.in_free + _BY_MARGIN * margin + by_points + _OFFSET
     weights = np.exp([-_RIVALRY * (best.score - place.score) for place in places[1:]])
     share = 1.0 / (1.0 + weights.sum())  # places that fit equally are equally probable
-    probability = min(1.0 / (1.0 + math.exp(-min(max(odds, -_MAX_LOG_ODDS), _MAX_LOG_ODDS))), share)
+    probability = min(1.0 / (1.0 + math.exp(-min(max(odds, -_MAX_SEARCH_ODDS), _MAX_SEARCH_ODDS))), share)
     shares = probability * weights
     return [Hypothesis(best.pose, probability), *(Hypothesis(place.pose, float(p)) for place, p in zip(places[1:], shares, strict=True))]
 

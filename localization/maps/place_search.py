@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -68,6 +69,8 @@ class PlaceMap:
 
     def __init__(self, keyframes: KeyframeMap, range_noise_m: float) -> None:
         """``range_noise_m``: sigma of a range, added to the thickness of surfaces [m]. Raises `MapError` without points."""
+        arrays = (keyframes.poses, keyframes.covariances, keyframes.points)
+        self.fingerprint = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:12]
         self.grid: Grid = draw_grid(keyframes, CELL_M)
         points = keyframes.points_in_map()
         index = np.floor((points - self.grid.origin) / CELL_M).astype(np.int64)

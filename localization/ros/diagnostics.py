@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -169,6 +169,7 @@ class Health:
         """Of the estimate, the LiDAR, the wheels, the files and the messages. ``silent``: seconds since the last message of
         topics; ``troubles``: what cannot be written, and why."""
         of_sensors = [self._of_estimate(), self._of_lidar(pipeline), self._of_wheels(pipeline)]
+        of_sensors += [_of_place(found)] if (found := pipeline.estimator.localization()) is not None else []
         return [*of_sensors, _of_files(troubles or {}), _of_messages(dropped, silent or {})]
 
     def _of_estimate(self) -> Status:
@@ -234,6 +235,18 @@ class Health:
         if math.hypot(vx, vy) > _SLIP_M_S or abs(wz) > _SLIP_RAD_S:
             return Status("wheels", WARN, _SLIP, values)
         return Status("wheels", values=values)
+
+
+def _of_place(found: Mapping[str, Any]) -> Status:
+    """Whether the place in a saved map is known."""
+    values = {"state": found["state"], "probability": f"{found['probability']:.3f}", "losses": str(found["losses"])}
+    for i, place in enumerate(found["places"]):
+        x, y, yaw = place["pose"]
+        values[f"place_{i + 1}"] = f"x {x:.2f} m, y {y:.2f} m, yaw {math.degrees(yaw):.0f} deg: {place['probability']:.2f}"
+    if found["state"] == "localized":
+        return Status("map", values=values)
+    text = "the place in the map is searched: drive some metres, or publish it on /initialpose"
+    return Status("map", WARN, text if found["state"] == "searching" else f"lost: {text}", values)
 
 
 def degeneracy(points: FloatArray) -> float | None:

@@ -8,9 +8,12 @@ import signal
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from functools import partial
 from types import FrameType
 from typing import Any
+
+import numpy as np
 
 from localization.errors import CheckpointError
 from localization.estimators import Estimate
@@ -25,7 +28,7 @@ from localization.ros.live_stream import LiveStream, WheelAngles, check_age
 from localization.ros.operator_commands import OperatorCommands
 from localization.ros.payloads import Payloads
 from localization.ros.publisher import EstimatePublisher, Predictor
-from localization.ros.session import Session, SessionState, StartPose, View, made_by
+from localization.ros.session import Session, SessionState, StartPose, View, made_by, shared_of
 from localization.ros.settings import LiveRun
 from localization.ros.transports.base import Received, Transport
 from motion_models.errors import RobotError
@@ -114,7 +117,9 @@ class Node:
         self._subscribe()
         state = SessionState(pipeline, StartPose(), self._stream.wheel_angles, self.payloads.loads)
         name = f"{self._trial.model.name}_{self._trial.estimator}"
-        self.session = Session.start(self._run.files, state, name, self._made, {"stats": self._stats}, self._report)
+        self.session = Session.start(
+            self._run.files, state, name, self._made, {"stats": self._stats, **shared_of(self._trial)}, self._report
+        )
         self.session.health = Health(config.max_latency_s)
         self._doctor = Doctor(self._run.robot, self._trial.model.name, mounts, 60.0 * config.diagnose_every_min)
         with ExitStack() as failing:
@@ -180,6 +185,8 @@ class Node:
     def restart(self, start: StartPose) -> None:
         """Begin anew at ``start``: with a new map, and nothing learned of the motion model."""
         pipeline = Pipeline(self._trial, self._run.robot, self.session.pipeline.mounts, self.has_lidar, self._run.config)
+        if self._trial.prior is not None:  # the saved map stays where it is
+            start = replace(start, map_T_start=np.zeros(3), map_cov=np.zeros((3, 3)))
         self.session.restart(pipeline, start)
         self.insert_present_cg()
         self._publisher.restart()
@@ -330,7 +337,11 @@ class Node:
             self._publisher.publish_path(stamp_ns)
         if config.map_period_s and self.has_lidar and now >= self._next_map:
             self._next_map = now + config.map_period_s
-            self._publisher.publish_map(self.session.pipeline.estimator.map_points(), stamp_ns)
+            grid = self.session.pipeline.estimator.occupancy()
+            if grid is None:
+                self._publisher.publish_map(self.session.pipeline.estimator.map_points(), stamp_ns)
+            else:
+                self._publisher.publish_grid(grid, stamp_ns)
 
 
 class StopSignal:

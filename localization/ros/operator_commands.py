@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from localization.estimators import MapFusion
 from localization.logs.decode import UnusableError, frame_name
 from localization.logs.serialization import decoder
 from localization.logs.writer import odom_axes
@@ -117,7 +118,10 @@ class OperatorCommands:
         A pose in `map` leaves `odom` as it is, without a jump (REP-105); one in `odom` moves that.
         """
         frames, (odom, odom_cov) = self._node.frames, self._present_odometry()
-        has_map = self._node.session.pipeline.is_localizing
+        has_map, estimator = self._node.session.pipeline.is_localizing, self._node.session.pipeline.estimator
+        if frame == frames.map_frame and isinstance(estimator, MapFusion):
+            estimator.set_pose(pose, cov)
+            return ServiceReply(True, f"the place in the map is searched near x {pose[0]:.3f} m, y {pose[1]:.3f} m.")
         if frame == frames.map_frame and has_map:
             start = StartPose(odom, odom_cov, pose, cov)
         elif frame == frames.odom_frame:

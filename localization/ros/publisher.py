@@ -15,6 +15,7 @@ from localization.estimators.base import mean_twist
 from localization.events import CgSample, Event, WheelSample
 from localization.logs.serialization import FusedWriter, encode, make
 from localization.logs.writer import FusedEstimate, odom_axes, six_by_six
+from localization.maps.grid import Grid
 from localization.ros.diagnostics import Status
 from localization.ros.discovery import TF, TF_TYPE
 from localization.ros.settings import Frames, Names
@@ -139,18 +140,22 @@ class EstimatePublisher:
         """nav_msgs/OccupancyGrid of the LiDAR's map ``points`` (N, 2) [m]: 100 where there are points, else -1 (unknown)."""
         if not len(points):
             return
-        origin, cell, grid = occupancy_grid(points)
+        origin, cell, cells = occupancy_grid(points)
+        self.publish_grid(Grid(cells, (float(origin[0]), float(origin[1])), cell), stamp_ns)
+
+    def publish_grid(self, grid: Grid, stamp_ns: int) -> None:
+        """nav_msgs/OccupancyGrid with free space."""
         frame = self._frames.map_frame if self._path.is_in_map else self._frames.odom_frame
-        height, width = grid.shape
+        height, width = grid.cells.shape
         info = make(
             "nav_msgs/msg/MapMetaData",
             map_load_time=_time(stamp_ns),
-            resolution=cell,
+            resolution=grid.resolution,
             width=width,
             height=height,
-            origin=_pose(np.array([*origin, 0.0])),
+            origin=_pose(np.array([*grid.origin, 0.0])),
         )
-        self._publish(MAP, make(_TYPES[MAP], header=self._header(stamp_ns, frame), info=info, data=grid.ravel()))
+        self._publish(MAP, make(_TYPES[MAP], header=self._header(stamp_ns, frame), info=info, data=grid.cells.ravel()))
 
     def publish_corrections(self, parameters: Mapping[str, tuple[float, float]], stamp_ns: int) -> None:
         """Named numbers as sensor_msgs/JointState: ``position`` is the mean, ``effort`` its sigma."""

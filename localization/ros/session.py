@@ -48,6 +48,11 @@ class View(Protocol):
         """No more will come."""
 
 
+def shared_of(trial: Trial) -> dict[str, Any]:
+    """Objects of ``trial`` that a checkpoint does not hold: a saved map, which whoever resumes it reads again."""
+    return {} if trial.prior is None else {"map": trial.prior.places}
+
+
 def made_by(trial: Trial, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: ReplayConfig, source: str) -> dict[str, str]:
     """Fingerprints of what must be the same where a state is resumed."""
     return fingerprints(
@@ -55,6 +60,7 @@ def made_by(trial: Trial, robot: Robot, mounts: Mapping[str, Mount], has_lidar: 
         model=trial.model,
         estimator=trial.estimator,
         corrections=trial.corrections,
+        map="none" if trial.prior is None else trial.prior.places.fingerprint,
         configuration=config,
         mounts=dict(mounts),
         LiDAR="used" if has_lidar else "not used",

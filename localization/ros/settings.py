@@ -21,8 +21,10 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 import tyro
 
 from localization.errors import SettingError
-from localization.estimators import check_estimator
+from localization.estimators import LOCALIZER, PriorMap, check_estimator
 from localization.logs.topic_roles import TopicOverrides
+from localization.maps import load_map
+from localization.maps.place_search import PlaceMap
 from localization.pipeline import ReplayConfig, Trial
 from localization.ros.session import Files
 from localization.settings import Allowed, Positive, Settings, rules_of
@@ -173,6 +175,8 @@ class OnlineSettings:
     """Estimator."""
     corrections: str = "constant"
     """What ekf and graph learn of the motion model: none, constant or cg_field."""
+    map: Path | None = None
+    """Map of an earlier drive, by `skidloc replay --save-map`: the estimator is then `map`, whose poses are in that map's frame."""
     out: Path | None = None
     """New trajectory file, .tum, or .mcap with Odometry, TF and covariances. It gets its name at the end."""
     state: Path | None = None
@@ -186,10 +190,12 @@ class OnlineSettings:
         return Files(self.out, self.state)
 
     def make_trial(self, has_lidar: bool) -> Trial:
-        """Motion model and estimator. Raises `EstimatorError`, `ModelError` and `RobotError`."""
-        check_estimator(self.estimator, has_lidar)
+        """Motion model, estimator and saved map. Raises `EstimatorError`, `MapError`, `ModelError` and `RobotError`."""
+        name = self.estimator if self.map is None else LOCALIZER
+        check_estimator(name, has_lidar, self.map is not None)
         (form,) = check_forms([self.corrections])
-        return Trial(make_model(self.model, load_robot(self.robot)), self.estimator, form)
+        prior = None if self.map is None else PriorMap(PlaceMap(load_map(self.map).map, self.config.estimator.lidar.range_noise_m))
+        return Trial(make_model(self.model, load_robot(self.robot)), name, form, prior)
 
     def live_run(self) -> LiveRun:
         """Raises `OutputError`, `RobotError`."""
@@ -312,7 +318,7 @@ def _convert(parameter: Parameter, value: Any) -> Any:
         raise SettingError(f"parameter '{parameter.name}' is {value!r}; {known}")
     if parameter.path[0] == "topic":
         return None if value == "" else "" if value == _LEFT_OUT else value
-    if parameter.path[0] in ("out", "state"):
+    if parameter.path[0] in ("map", "out", "state"):
         return Path(str(value)) if value else None
     return value
 

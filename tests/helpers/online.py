@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
-from localization.estimators import Estimate
+from localization.estimators import Estimate, PriorMap
 from localization.logs import open_log
 from localization.logs.reader import open_source
 from localization.logs.topic_roles import TopicOverrides
@@ -143,12 +143,13 @@ def run_node(
     config: NodeConfig | None = None,
     topics: TopicOverrides | None = None,
     view: View | None = None,
+    prior: PriorMap | None = None,
 ) -> tuple[Node, list[str]]:
     """A node over all that ``transport`` holds, and what it reported. It publishes no predictions unless ``config`` has it so."""
     reports: list[str] = []
     run = LiveRun(
         ROBOT,
-        lambda has_lidar: Trial(make_model("skid_steer", ROBOT), estimator),
+        lambda has_lidar: Trial(make_model("skid_steer", ROBOT), estimator, prior=prior),
         files or Files(),
         topics or TopicOverrides(),
         node=config or NodeConfig(wait_s=0.0, predict=False),

@@ -1,0 +1,93 @@
+"""The filter localized in a saved map: frames, checkpoints, poses given by a person."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+
+from localization.estimators import MapFusion, PriorMap
+from localization.estimators.filter import KEY
+from localization.logs import open_log
+from localization.maps.place_search import PlaceMap
+from localization.pipeline import Pipeline, Trial, replay
+from localization.ros.state_serialization import deserialize, serialize
+from motion_models import se2
+from motion_models.registry import make_model
+from tests.helpers.online import ROBOT, drive_log
+
+MODEL = make_model("diff_drive", ROBOT)
+
+
+@functools.cache
+def drive():
+    return list(open_log(drive_log(), ROBOT).events())
+
+
+@functools.cache
+def keyframes():
+    found = replay(drive(), [Trial(MODEL, "graph")], ROBOT, ROBOT.mounts, True)[0].keyframes
+    assert found is not None
+    return found
+
+
+@functools.cache
+def places() -> PlaceMap:
+    return PlaceMap(keyframes(), 0.02)
+
+
+def start(initial=None) -> Pipeline:
+    return Pipeline(Trial(MODEL, "map", prior=PriorMap(places(), initial)), ROBOT, ROBOT.mounts, True)
+
+
+def test_map_fusion_odometry_is_the_filters_own():
+    ekf = Pipeline(Trial(MODEL, "ekf"), ROBOT, ROBOT.mounts, True)
+    located, poses = start(np.array([0.2, -0.2, 0.1])), {}
+    for event in drive():
+        for one, other in zip(ekf.process(event), located.process(event), strict=True):
+            assert other.odometry is not None
+            np.testing.assert_array_equal(one.pose, other.odometry[0])
+            poses[other.stamp_ns] = other.pose
+            np.testing.assert_allclose(se2.compose(other.map_T_odom, one.pose), other.pose, atol=1e-12)
+    assert located.estimator.localization()["state"] == "localized"
+    errors = [np.hypot(*(poses[stamp][:2] - pose[:2])) for stamp, pose in zip(keyframes().stamps_ns, keyframes().poses, strict=True)]
+    assert np.max(errors[len(errors) // 2 :]) < 0.05
+
+
+def test_map_fusion_before_it_is_localized_has_the_maps_extent_as_sigma():
+    """The robot stands: a place needs the agreement of two searches."""
+    pipeline = start()
+    estimates = [estimate for event in drive()[:100] for estimate in pipeline.process(event)]
+    assert pipeline.estimator.localization()["state"] == "searching"
+    assert np.sqrt(estimates[-1].covariance[0, 0]) > 4.0
+    assert any("never localized" in text for text in pipeline.warnings())
+
+
+def test_map_fusion_state_written_and_read_gives_the_same_estimates():
+    """The map itself is not in the state."""
+    pipeline = start(np.array([0.2, -0.2, 0.1]))
+    half = len(drive()) // 2
+    for event in drive()[:half]:
+        pipeline.process(event)
+    shared = {"map": pipeline.estimator.localizer.places}
+    text, blob = serialize(pipeline, shared)
+    assert len(text) + len(blob) < 1_500_000
+    again = deserialize(text, blob, shared)
+    for event in drive()[half:]:
+        for one, other in zip(pipeline.process(event), again.process(event), strict=True):
+            np.testing.assert_array_equal(one.pose, other.pose)
+            np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+def test_map_fusion_pose_given_between_keyframes_is_of_that_moment():
+    pipeline = start()
+    for event in drive()[:1000]:
+        pipeline.process(event)
+    assert isinstance(pipeline.estimator, MapFusion)
+    pose = np.array([1.0, 2.0, 0.5])
+    pipeline.estimator.set_pose(pose, 0.01 * np.eye(3))
+    delta, _ = pipeline.estimator.odometry.filter.motion_since(KEY)
+    assert np.abs(delta).max() > 0.01
+    estimates = [estimate for event in drive()[1000:1100] for estimate in pipeline.process(event)]
+    assert estimates[0].pose == pytest.approx(pose, abs=0.1)

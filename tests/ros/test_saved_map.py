@@ -1,0 +1,62 @@
+"""A node in a saved map: searching until a pose is given on /initialpose, then localized; diagnostics, and the map with free space."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from localization.estimators import PriorMap
+from localization.logs import open_log
+from localization.maps.place_search import PlaceMap
+from localization.pipeline import Trial, replay
+from localization.ros.diagnostics import OK, WARN
+from localization.ros.publisher import DIAGNOSTICS, MAP
+from localization.ros.settings import NodeConfig, OnlineSettings
+from localization.ros.transports.base import Received
+from motion_models.registry import make_model
+from tests.helpers.online import ROBOT, LogTransport, drive_log, published, run_node, track
+from tests.ros.test_operator_commands import pose_message
+
+S = 1_000_000_000
+pytestmark = pytest.mark.xdist_group("online")
+
+
+@pytest.fixture(scope="module")
+def places() -> PlaceMap:
+    log = open_log(drive_log(), ROBOT)
+    keyframes = replay(log.events(), [Trial(make_model("skid_steer", ROBOT), "graph")], ROBOT, log.mounts, True)[0].keyframes
+    assert keyframes is not None
+    return PlaceMap(keyframes, 0.02)
+
+
+def test_node_in_a_saved_map_is_localized_after_initialpose(places: PlaceMap) -> None:
+
+    def spoil(messages):
+        at = messages[0].received_ns + 2 * S
+        pose = pose_message([1.0, 0.1, 0.2], "map", np.diag([0.25, 0.25, 0.07]))
+        return sorted([*messages, Received("/initialpose", at, pose)], key=lambda m: m.received_ns)
+
+    transport = LogTransport(drive_log(), spoil)
+    node, reports = run_node(transport, "map", config=NodeConfig(wait_s=0.0), prior=PriorMap(places))
+    assert any("the place in the map is searched near x 1.000 m" in text for text in reports)
+    found = node.session.pipeline.estimator.localization()
+    assert found["state"] == "localized"
+    assert found["probability"] > 0.95
+    poses = np.array([pose for pose, _ in track(transport).values()])
+    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() < 0.05  # odom has no jump
+    levels = {status.name: status.level for status in node.statuses}
+    assert levels["map"] == OK
+    first = [status for status in published(transport, DIAGNOSTICS)[0].status if status.name == "skidloc: map"]
+    assert [status.level for status in first] == [WARN]
+    grid = published(transport, MAP)[-1]
+    cells = np.asarray(grid.data)
+    assert {-1, 0, 100} == set(cells.tolist())
+    assert (cells == 0).mean() > 0.5
+    assert cells.size == grid.info.width * grid.info.height
+
+
+def test_online_settings_with_a_missing_map_are_refused(tmp_path) -> None:
+    from localization.errors import MapError
+
+    with pytest.raises(MapError, match="no map"):
+        OnlineSettings("vaultbot", map=tmp_path / "none.skidmap").make_trial(has_lidar=True)
