@@ -31,8 +31,8 @@ from localization.diagnosis.linearization import (
     candidate_causes,
     linearize,
     make_predictor,
-    slow_turn_sigmas,
 )
+from localization.diagnosis.noise import slow_turn_sigmas
 from localization.diagnosis.prediction import Baseline, DrivePredictor, with_sizes
 from localization.diagnosis.selection import (
     aliases_of,

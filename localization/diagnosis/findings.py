@@ -12,7 +12,7 @@ import numpy as np
 
 from localization.diagnosis.causes import CAUSES, MISSING_MESSAGES, WINDOW_CAUSES, Cause, Hypothesis
 from localization.diagnosis.drive import MessageLoss, StandstillTurn
-from localization.diagnosis.linearization import Noise
+from localization.diagnosis.noise import Noise
 from localization.diagnosis.prediction import CHANNELS
 from motion_models.se2 import FloatArray
 

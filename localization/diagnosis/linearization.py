@@ -7,12 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from localization.diagnosis.causes import (
     CAUSES,
-    STIFFNESS_EXPONENT,
     WINDOW_CAUSES,
     Cause,
     Hypothesis,
@@ -23,9 +20,9 @@ from localization.diagnosis.causes import (
     track_width,
 )
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.prediction import CHANNELS, Baseline, DrivePredictor, with_sizes
+from localization.diagnosis.noise import Noise, estimate_drive_noise
+from localization.diagnosis.prediction import Baseline, DrivePredictor, with_sizes
 from motion_models.base import MotionModel
-from motion_models.calibration.maneuvers import Batch
 from motion_models.compiled import kernel
 from motion_models.diff_drive import DiffDrive
 from motion_models.friction import FrictionModel
@@ -36,149 +33,9 @@ TOLERANCE = 0.35
 """Sigma of unnamed causes, over what is negligible: the spread of robots about their files."""
 MAX_TOLERANCE_SIGMAS = 1.0 / TOLERANCE
 """Largest size of a cause that is not named, over the sigma of its tolerance: what is negligible."""
-_ROUNDS = 8
-_MOTION = 3  # channels of the motion itself
-_MIN_FREE_SHARE = 0.1  # of all numbers, however many causes there are
-_MIN_SIGMA_OVER_CLAIMED = 0.5  # least sigma, as a share of the one that the motion reference gives
 _MAX_SWEEPS, _MAX_LAST_GAIN = 2000, 1e-8  # of the search for tolerated sizes, the latter in squares of whitened numbers
-_MEASURED_SPEED_M_PER_S = 0.05
-_TURN_ERROR_OVER_LOG_SPEED = 0.065
-"""How far a robot turns for the same way of the wheels, over the logarithm of their speed: DRIVE's Husky, by its gyro, turns 0.42 of the
-geometry's angle where the sides' speeds differ from their mean by 0.4 to 0.8 m/s, and 0.49 where by 0.03 to 0.1 m/s; slower, there is
-no data of turns in place."""
-_FEWEST_FOR_NOISE = 4  # windows; of fewer the noise is the claimed one
 _NO_SIZE = 1e-6  # sigma of a size that is not there, in units of its prior's
 _FREE_VARIANCE = 1e6  # of a size that may be any, in squares of its prior's sigma
-_CLIP = 9.0  # squares beyond this many variances are outliers, and count as this much
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Whitens rows of discrepancies, channel by channel: by size, by correlation between channels, and from window to window."""
-
-    sigmas: FloatArray
-    """(M, 6) standard deviation of each number; 1 where nothing was measured."""
-    mixing: FloatArray
-    """(6, 6) lower triangular: makes the channels of one window independent."""
-    autocorrelation: FloatArray
-    """(6,) share of the error of the window before that is still in the next."""
-    follows: NDArray[np.bool_]
-    """(M,) whether a window begins where the one before ended."""
-    weights: FloatArray
-    """(M,) below 1 for windows with outliers."""
-    freedom: float = 1e6
-    """Degrees of freedom of the noise estimate, in that channel of the motion which has fewest."""
-
-    def whiten(self, rows: FloatArray) -> FloatArray:
-        """(M, 6, ...) rows as independent numbers of unit variance; 0 where they are NaN."""
-        shape = (slice(None), slice(None)) + (None,) * (rows.ndim - 2)
-        scaled = np.nan_to_num(rows / self.sigmas[shape], nan=0.0)
-        mixed = np.einsum("ij,nj...->ni...", self.mixing, scaled)
-        before = np.zeros_like(mixed)
-        before[1:] = mixed[:-1] * self.follows[1:].reshape(-1, *(1,) * (rows.ndim - 1))
-        autocorrelation = self.autocorrelation.reshape(1, -1, *(1,) * (rows.ndim - 2))
-        unmixed = (mixed - autocorrelation * before) / np.sqrt(1.0 - autocorrelation**2)
-        return np.asarray(unmixed * self.weights.reshape(-1, *(1,) * (rows.ndim - 1)))
-
-
-def variance_regressors(batch: Batch, wheel_radius: float, track: float) -> FloatArray:
-    """(M, 3) what variances may grow with: constant, metres driven, radians by the wheels' difference."""
-    driven, turned = np.zeros(len(batch.ends)), np.zeros(len(batch.ends))
-    for i, (end, owner) in enumerate(zip(batch.ends, batch.owner, strict=True)):
-        a = batch.first[owner] + batch.lead[owner]
-        ways = batch.wheels[a:end] * batch.dt[a:end, None] * wheel_radius
-        driven[i] = np.abs(ways.mean(axis=1)).sum()
-        turned[i] = np.abs(ways[:, 1] - ways[:, 0]).sum() / track
-    return np.column_stack([np.ones(len(driven)), driven, turned])
-
-
-def slow_turn_sigmas(predictor: DrivePredictor) -> FloatArray:
-    """(M,) error of the predicted turn where wheels roll more slowly than the friction model was ever measured, and than the drive does
-    else [rad]: by the model a robot turns as far by slow wheels as by fast ones, but contacts creep."""
-    batch = predictor.batch
-    speeds = predictor.drive.robot.geometry.wheel_radius_m * np.sqrt(np.mean(np.square(batch.wheels), axis=1))
-    turned = np.abs(predictor.nominal_twist[:, 2]) * batch.dt
-    order = np.argsort(speeds)
-    middle = speeds[order][np.searchsorted(np.cumsum(turned[order]), 0.5 * turned.sum())] if turned.any() else 0.0
-    slower = np.log(np.maximum(min(_MEASURED_SPEED_M_PER_S, middle) / np.maximum(speeds, 1e-9), 1.0))
-    total = np.r_[0.0, np.cumsum(turned * slower)]
-    return np.asarray(_TURN_ERROR_OVER_LOG_SPEED * (total[batch.ends] - total[batch.first[batch.owner] + batch.lead[batch.owner]]))
-
-
-def given_noise(rows: FloatArray, sigmas: FloatArray, follows: NDArray[np.bool_]) -> Noise:
-    """Independent numbers with the given ``sigmas`` (M, 6)."""
-    return Noise(np.where(np.isfinite(rows), sigmas, 1.0), np.eye(rows.shape[1]), np.zeros(rows.shape[1]), follows, np.ones(len(rows)))
-
-
-def estimate_noise(
-    left: FloatArray,
-    features: FloatArray,
-    follows: NDArray[np.bool_],
-    spent: FloatArray,
-    claimed: tuple[FloatArray, float],
-    creep: FloatArray,
-) -> Noise:
-    """By ``left`` (M, 6), what the richest explanation leaves, which has used up ``spent`` (6,) degrees of freedom in each channel; errors
-    of the model with the sigmas ``creep`` (M, 6) come on top.
-
-    The sigmas ``claimed`` (M, 6), which the motion references give or a drive without faults had, count for so many windows: short drives
-    show little of their noise. The estimate may be smaller than they are, but not by much.
-    """
-    claimed_sigmas, windows = claimed
-    known = np.isfinite(left)
-    counts = known.sum(axis=0)
-    free = np.maximum(counts - spent, np.maximum(_MIN_FREE_SHARE * counts, 1.0))
-    inflate = np.where(counts > 0, counts / free, 1.0)
-    sigmas = np.ones_like(left)
-    for channel in range(left.shape[1]):
-        use = known[:, channel]
-        if use.sum() < _FEWEST_FOR_NOISE:
-            sigmas[use, channel] = claimed_sigmas[use, channel]
-            continue
-        squares, by_model = left[use, channel] ** 2 * inflate[channel], creep[use, channel] ** 2
-        f = features[use]
-        variance = np.full(len(squares), max(float(np.median(squares)) / 0.455, 1e-14))
-        for _ in range(_ROUNDS):
-            total = variance + by_model
-            clipped = np.minimum(squares, _CLIP * total)
-            found = nnls(f / total[:, None], (clipped - by_model) / total)[0]
-            variance = np.maximum(f @ found, 0.2 * float(np.median(variance)))
-        given = claimed_sigmas[use, channel]
-        pooled = (free[channel] * variance + windows * given**2) / (free[channel] + windows)
-        sigmas[use, channel] = np.hypot(np.maximum(np.sqrt(pooled), _MIN_SIGMA_OVER_CLAIMED * given), creep[use, channel])
-    z = np.nan_to_num(left * np.sqrt(inflate) / sigmas, nan=0.0)
-    lengths = np.abs(z).max(axis=1)
-    weights = np.minimum(1.0, 4.0 / np.maximum(lengths, 1e-9))
-    z = z * weights[:, None]
-    mixing = _mixing(z, known)
-    z = z @ mixing.T
-    autocorrelation = np.zeros(left.shape[1])
-    for channel in range(left.shape[1]):
-        pairs = follows[1:] & known[1:, channel] & known[:-1, channel]
-        if pairs.sum() > 20:
-            a, b = z[1:, channel][pairs], z[:-1, channel][pairs]
-            rho = float(a @ b / max(np.sqrt((a @ a) * (b @ b)), 1e-12))
-            autocorrelation[channel] = min(max(rho - 1.0 / np.sqrt(pairs.sum()), 0.0), 0.8)
-    motion = [float(free[c]) for c in range(_MOTION) if counts[c]]
-    return Noise(sigmas, mixing, autocorrelation, follows, weights, min(motion, default=1.0) + windows)
-
-
-def _mixing(z: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
-    """Inverse Cholesky factor of the covariance of the channels' noise ``z`` (M, 6) in its sigmas, with variances of 1, shrunk to the
-    identity where few windows were measured.
-
-    A channel with less noise than its sigma, which has a lower bound, shares less of it with the others: by its correlation alone, what the
-    others measure would be taken for its own.
-    """
-    n = known.astype(float).T @ known.astype(float)
-    scale = np.sqrt(np.maximum(np.diag(z.T @ z) / np.maximum(np.diag(n), 1.0), 1e-12))
-    scale = np.where(np.diag(n) > 0, scale, 1.0)
-    correlation = (z.T @ z) / np.maximum(n, 1.0) / np.outer(scale, scale)
-    size = np.minimum(scale, 1.0)
-    cov = np.where(np.eye(len(scale), dtype=bool), 1.0, correlation * n / (n + 20.0) * np.outer(size, size))
-    values, vectors = np.linalg.eigh(cov)
-    cov = (vectors * np.maximum(values, 0.05)) @ vectors.T
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
 
 
 SKIDDING = frozenset(
@@ -462,40 +319,6 @@ def _nuisances(rows: FloatArray) -> FloatArray:
     level = np.zeros((*rows.shape, 2))
     level[:, 4, 0] = level[:, 5, 1] = 1.0
     return np.where(np.isfinite(rows)[..., None], level, np.nan)
-
-
-def estimate_drive_noise(
-    predictor: DrivePredictor, linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, causes: tuple[Cause, ...]
-) -> Noise:
-    """Estimated from what all causes together leave, in a few rounds, as sizes and noise depend on each other."""
-    batch, drive = predictor.batch, predictor.drive
-    g = drive.robot.geometry
-    features = variance_regressors(batch, g.wheel_radius_m, g.track_width_m)
-    starts = np.r_[True, batch.owner[1:] != batch.owner[:-1]]
-    follows = ~starts
-    if len(drive.spans_ns):
-        follows = np.r_[False, drive.spans_ns[1:, 0] - drive.spans_ns[:-1, 1] < 10_000_000]
-    given = np.sqrt(np.where(np.isfinite(np.diagonal(batch.cov, axis1=1, axis2=2)), np.diagonal(batch.cov, axis1=1, axis2=2), 1.0))
-    sigmas = np.ones_like(linear)
-    sigmas[:, :3] = given * np.array(predictor.baseline.noise_over_reference)
-    sigmas[:, 3] = np.hypot(given[:, 2], 1e-3)
-    sigmas[:, 4:] = 0.05
-    creep = np.zeros_like(linear)
-    if not any(cause.id == STIFFNESS_EXPONENT for cause in causes):  # else slow turns are part of the model
-        creep[:, CHANNELS.index("yaw")] = slow_turn_sigmas(predictor)
-    noise = given_noise(linear, np.hypot(sigmas, creep), follows)
-    scale = np.array([e.plausible for e in causes])
-    known = np.isfinite(linear)
-    for _ in range(3):
-        y = noise.whiten(linear).ravel()
-        design = np.hstack([noise.whiten(signatures).reshape(len(y), -1) * scale, noise.whiten(nuisances).reshape(len(y), -1) * 1e3])
-        inverse = np.linalg.inv(design.T @ design + np.eye(design.shape[1]))
-        x = inverse @ (design.T @ y)
-        spent = np.sum((design @ inverse) * design, axis=1).reshape(linear.shape).sum(axis=0)
-        p = len(causes)
-        left = linear - signatures @ (x[:p] * scale) - nuisances @ (x[p:] * 1e3)
-        noise = estimate_noise(np.where(known, left, np.nan), features, follows, spent, (sigmas, predictor.baseline.windows), creep)
-    return noise
 
 
 def group_of(cause: Cause) -> str:

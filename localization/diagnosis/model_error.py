@@ -15,7 +15,8 @@ import math
 
 import numpy as np
 
-from localization.diagnosis.linearization import Linearization, estimate_drive_noise
+from localization.diagnosis.linearization import Linearization
+from localization.diagnosis.noise import estimate_drive_noise
 from localization.diagnosis.prediction import DrivePredictor
 from localization.diagnosis.verdict import moved_by
 from motion_models.se2 import FloatArray

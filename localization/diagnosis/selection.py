@@ -13,12 +13,12 @@ from localization.diagnosis.causes import CAUSES, REFERENCE_WORDS, WINDOW_CAUSES
 from localization.diagnosis.findings import Gain
 from localization.diagnosis.linearization import (
     Linearization,
-    Noise,
     Regression,
     group_of,
     make_regression,
     regression,
 )
+from localization.diagnosis.noise import Noise
 from localization.diagnosis.prediction import DrivePredictor, with_sizes
 from motion_models.errors import CgError, ModelError
 from motion_models.se2 import FloatArray

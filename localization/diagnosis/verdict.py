@@ -13,7 +13,8 @@ from scipy.stats import f as f_distribution
 from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause, Hypothesis
 from localization.diagnosis.drive import drive_of_table
 from localization.diagnosis.findings import MAX_NOISE_OVER_REFERENCE, Attribution, Component, Finding, Trend, Verdict
-from localization.diagnosis.linearization import Linearization, Noise, group_of, regression
+from localization.diagnosis.linearization import Linearization, group_of, regression
+from localization.diagnosis.noise import Noise
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, DrivePredictor, with_sizes
 from localization.diagnosis.selection import max_statistic, p_value, price, statistics
 from motion_models.calibration.maneuvers import IntArray, Maneuver
@@ -231,7 +232,7 @@ def attribute_rows(
     rest = named - np.nan_to_num(linearization.signatures) @ every
     is_significant = np.abs(every) >= _MIN_LISTED_SIGMAS * linearization.problem.posterior_sigmas(chosen)
     every[list(chosen)], is_significant[list(chosen)] = sizes, True
-    alone = dataclasses.replace(linearization.noise, mixing=np.eye(len(CHANNELS)))  # a row is tested by itself
+    alone = dataclasses.replace(linearization.noise, correlation=np.eye(len(CHANNELS)))  # a row is tested by itself
     white, white_rest = alone.whiten(first.rows), alone.whiten(rest)
     weighed = rest * linearization.noise.weights[:, None]  # as in the fit: a single window between four and eight sigma is no shape
     parts = np.nan_to_num(linearization.signatures) * every / linearization.noise.sigmas[..., None]

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from localization.diagnosis.linearization import CHANNELS, estimate_noise
+from localization.diagnosis.noise import Noise, estimate_noise, given_noise
+from localization.diagnosis.prediction import CHANNELS
 from motion_models.se2 import FloatArray
 
 WINDOWS, SIGMA, CREEP = 60, 3e-4, 6e-3
@@ -52,3 +56,62 @@ def test_noise_below_its_sigma_takes_no_other_channel_for_its_own() -> None:
     turn = np.zeros((WINDOWS, 6))
     turn[:, YAW] = 0.01
     assert np.abs(noise.whiten(turn)[:, FORCE]).max() < 0.01 * np.abs(noise.whiten(turn)[:, YAW]).min()
+
+
+CHAIN = 0.7  # share of the error of the window before
+MIXED = np.eye(6) + 0.6 * (np.eye(6, k=1) + np.eye(6, k=-1))
+
+
+def correlated_noise(rng: np.random.Generator, drives: int, length: int) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """(M, 6) stationary AR(1) errors with the covariance `MIXED` in each window, in ``drives`` parts, and what follows what."""
+    root = np.linalg.cholesky(MIXED + 0.3 * np.eye(6))
+    root /= np.linalg.norm(root, axis=1, keepdims=True)
+    white = rng.standard_normal((drives, length, 6))
+    white[:, 1:] *= np.sqrt(1.0 - CHAIN**2)
+    for i in range(1, length):
+        white[:, i] += CHAIN * white[:, i - 1]
+    follows = np.arange(drives * length) % length > 0
+    return white.reshape(-1, 6) @ root.T, follows
+
+
+def exact_noise(rows: FloatArray, follows: NDArray[np.bool_]) -> Noise:
+    root = np.linalg.cholesky(MIXED + 0.3 * np.eye(6))
+    root /= np.linalg.norm(root, axis=1, keepdims=True)
+    given = given_noise(rows, np.full(rows.shape, SIGMA), follows)
+    return replace(given, correlation=root @ root.T, autocorrelation=np.full(6, CHAIN))
+
+
+def test_whitened_noise_has_unit_variance_at_each_place_of_a_drive() -> None:
+    """Monte Carlo: windows without a predecessor have the process's variance, not 1 / (1 - rho^2) of it."""
+    rows, follows = correlated_noise(np.random.default_rng(0), 2000, 6)
+    white = exact_noise(rows, follows).whiten(SIGMA * rows).reshape(2000, 6, 6)
+    np.testing.assert_allclose(white.var(axis=0), 1.0, atol=0.13)  # four sigma of a variance by 2,000 numbers
+    numbers = white.reshape(2000, -1)
+    off = np.corrcoef(numbers.T) - np.eye(36)
+    assert np.abs(off).max() < 5.0 / np.sqrt(2000)
+
+
+def test_whitened_noise_with_a_silent_channel_has_unit_variance() -> None:
+    """Monte Carlo: what a window did not measure is 0, and takes no part in the others."""
+    rng = np.random.default_rng(1)
+    rows, follows = correlated_noise(rng, 2000, 2)
+    rows[rng.random(rows.shape) < 0.3] = np.nan
+    exact = replace(exact_noise(rows, follows), autocorrelation=np.zeros(6))
+    white = exact.whiten(SIGMA * rows)
+    assert (white[np.isnan(rows)] == 0.0).all()
+    for channel in range(6):
+        assert white[np.isfinite(rows[:, channel]), channel].var() == pytest.approx(1.0, abs=0.11)
+
+
+def test_estimated_noise_whitens_what_it_was_estimated_by() -> None:
+    """Monte Carlo over drives of 120 windows: mean square within 15 % of 1, as correlations are shrunk; no correlation along windows."""
+    variances, correlations = [], []
+    for seed in range(40):
+        rows, follows = correlated_noise(np.random.default_rng(seed), 1, 120)
+        claimed, features = np.full(rows.shape, SIGMA), np.column_stack([np.ones(120), np.zeros((120, 2))])
+        noise = estimate_noise(SIGMA * rows, features, follows, np.zeros(6), (claimed, 5.0), np.zeros(rows.shape))
+        white = noise.whiten(SIGMA * rows)
+        variances.append(np.square(white).mean(axis=0))
+        correlations.append((white[1:] * white[:-1]).mean(axis=0))
+    assert np.mean(variances) == pytest.approx(1.0, abs=0.15)
+    assert abs(np.mean(correlations)) < 0.05

@@ -23,7 +23,8 @@ from localization.diagnosis.findings import (
     describe_row,
     sentence,
 )
-from localization.diagnosis.linearization import Linearization, candidate_causes, given_noise, linearize, make_predictor, make_regression
+from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, make_regression
+from localization.diagnosis.noise import given_noise
 from localization.diagnosis.prediction import CHANNELS, DrivePredictor, with_sizes
 from localization.diagnosis.verdict import (
     _information_apart,
