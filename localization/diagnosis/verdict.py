@@ -24,6 +24,8 @@ _SIGNIFICANT = 0.01
 _COMPONENTS = 3
 _LEAD_LOG_ODDS = 7.0  # twice the log-likelihood by which a trend must be better than a cause, beside the choice among trends: odds of 33
 _LEAD_SHARE = 0.05  # or this share of what the cause explains: accuracy of its signature
+_NO_TREND = 1e-9  # length of a shape that this drive does not have
+_SAME_SHAPE = 0.9999  # cosine of two trends of which one has all but 0.02 % of the other's squares
 _SHAPES_OF_CAUSES = ("distance", "turning")  # trends that wheel_radius_scale and rotation_scale follow
 _MIN_VARIANCE = 0.01  # of what is left of a channel, over the noise's
 
@@ -47,7 +49,18 @@ def trend_motions(predictor: DrivePredictor) -> dict[str, FloatArray]:
         heading, clock = predictor.headings[owner] + turned, predictor.drive.starts_s[owner]
         rows.append(moved_by(t, dt, _increments(t, dt, batch.cg[a:end], heading, float(clock))))
     table = np.stack(rows)
-    return {name: table[..., i] for i, name in enumerate(_TREND_NAMES) if np.ptp(table[:, 2, 2, i]) > 1e-9 or i == 0}
+    return {_TREND_NAMES[i]: table[..., i] for i in _distinct(table.reshape(-1, len(_TREND_NAMES)))}
+
+
+def _distinct(columns: FloatArray) -> list[int]:
+    """Which of ``columns`` (N, K) this drive can separate from the ones before: with a constant CG "distance x CG x" is "distance"."""
+    lengths = np.linalg.norm(columns, axis=0)
+    unit = columns / np.maximum(lengths, 1e-12)
+    kept = [0]
+    for i in range(1, columns.shape[1]):
+        if lengths[i] > _NO_TREND and np.abs(unit[:, kept].T @ unit[:, i]).max() < _SAME_SHAPE:
+            kept.append(i)
+    return kept
 
 
 _TREND_NAMES = (

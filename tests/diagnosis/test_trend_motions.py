@@ -63,3 +63,17 @@ def test_stiffness_by_power_of_speed_equals_stiffness_at_that_speed() -> None:
     by_rate = quasi_static_twists(model, model.nominal, wheels, cg, stiffness_exponent=1.0)
     assert by_rate == pytest.approx(quasi_static_twists(model, halved, wheels, cg), rel=1e-9)
     assert by_rate[0, 2] != pytest.approx(quasi_static_twists(model, model.nominal, wheels, cg)[0, 2], rel=0.01)
+
+
+@pytest.mark.parametrize(("cg_x", "is_separable"), [((0.05, 0.05, 0.05, 0.05), False), ((0.05, -0.02, 0.0, 0.05), True)])
+def test_trend_of_cg_is_one_only_where_the_cg_moves(cg_x: tuple[float, ...], is_separable: bool) -> None:
+    """With a constant centre of gravity "distance x CG x" is "distance", and would take the wheels' radius its name."""
+    robot, end, cov = load_robot("husky_a200"), np.array([len(_DT)]), np.diag([0.004, 0.004, 0.003]) ** 2
+    rates = np.array([[3.0, 3.0], [-2.0, 2.0], [2.0, 4.0], [-3.0, -3.0]])
+    drives = [
+        Maneuver(_DT, np.tile(rate, (len(_DT), 1)), np.zeros((1, 3)), end, np.array([x, 0.0]), cov)
+        for rate, x in zip(rates, cg_x, strict=True)
+    ]
+    found = trend_motions(make_predictor(drive_of_table("drives", robot, drives, "windows"), make_model("friction", robot)))
+    assert "distance" in found
+    assert ("distance x CG x" in found) == is_separable
