@@ -9,7 +9,7 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from motion_models.center_of_gravity.urdf import ControllerValues, controller_values
+from motion_models.center_of_gravity.drive_controllers import ControllerValues, controller_values
 from motion_models.errors import RobotError
 from motion_models.text_files import read_text
 

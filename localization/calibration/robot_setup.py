@@ -15,13 +15,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from localization.calibration.controllers import read_controllers
+from localization.calibration.urdf_checks import Contradiction, check_urdf
 from localization.calibration.wheel_fit import MIN_R2, DriverFit, Motion, WheelSides, fit_wheels, is_moving, read_motion, wheel_sides
 from localization.logs.chunks import RawMessage, merge_channels
 from localization.logs.decode import UnusableError, frame_name
 from localization.logs.reader import open_log, open_source
 from localization.logs.serialization import LogDeserializer
 from localization.logs.topic_roles import TYPES, TopicOverrides
-from motion_models.center_of_gravity.urdf import ControllerValues, WheelGeometry, is_wheel, link_poses, parse_urdf, sides, wheel_geometry
+from motion_models.center_of_gravity.drive_controllers import ControllerValues
+from motion_models.center_of_gravity.urdf import link_poses, parse_urdf
+from motion_models.center_of_gravity.urdf_wheels import WheelGeometry, is_wheel, sides, wheel_geometry
 from motion_models.errors import RobotError
 from motion_models.prior import geometric_scaling, scaling_sigma
 from motion_models.robot import DIFF_DRIVE, Driver, Geometry, Joints, Mount, Robot, Topics
@@ -37,22 +40,11 @@ _FIRST_JOINT_STATES = 200
 _NOT_THE_DRIVERS = re.compile(
     r"truth|reference|filter|fused|ekf|ukf|gps|gnss|slam|icp|lidar|laser|visual|vio|amcl|map|mocap|vicon", re.IGNORECASE
 )
-_KIND_NOTES = {
-    "mecanum wheels": "they move sideways by command, which no model here has; lateral motion will be taken for slip.",
-    "omnidirectional wheels": "they move sideways by command, which no model here has; lateral motion will be taken for slip.",
-    "tracks": "they have no wheelbase; the length of their contact stands for it, and their sprockets' rates for the wheels'.",
-    "steered wheels": "steering is not modelled; only the driven wheels of a body that turns by their difference are.",
-    "casters": "they are not driven and are left out of wheels, track and wheelbase.",
-}
 _REFERENCE = re.compile(r"ground_?truth|reference|mocap|vicon|optitrack", re.IGNORECASE)
 _RAW = re.compile(r"raw|mag", re.IGNORECASE)
 _SAME_RADIUS, _SAME_TRACK = 0.1, 0.05
 """Relative differences of two sources below which they agree. Tyres under load and slip straight ahead change a radius by up to 7 %
 (DRIVE's Husky); a track is a length of the body."""
-_LATERAL = 0.7
-"""Least component along y of a wheel's axis."""
-_OFF_MIDDLE = 0.05
-"""Distance of a symmetric robot's centre of gravity from its middle over the track from which it is doubted."""
 
 
 @dataclass(frozen=True)
@@ -75,17 +67,6 @@ class Given:
     topics: TopicOverrides = field(default_factory=TopicOverrides)
     controller: Path | None = None
     """YAML with the parameters of the robot's drive controller."""
-
-
-@dataclass(frozen=True)
-class Contradiction:
-    """A source that differs from another, or from the log."""
-
-    quantity: str
-    source: str
-    value: str
-    by_log: str
-    """What the log measured of it."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +97,8 @@ class Draft:
     """One sentence for each choice."""
     missing: list[str] = field(default_factory=list)
     """What nothing gives, as sentences."""
+    is_diff_drive: bool = False
+    """Whether one axle is driven: by the URDF, else by the number of joints."""
     contradictions: list[Contradiction] = field(default_factory=list)
 
     def choose(self, name: str, candidates: Iterable[tuple[float | None, str]]) -> None:
@@ -180,9 +163,13 @@ def draft_robot(survey: Survey, given: Given, path: Path) -> Draft:
                 f"radius and track by the log: {_motion_topic(draft, survey)} does not follow the mean and the difference of the sides "
                 f"(R^2 below {MIN_R2:g} with every sign); neither is taken from it. Check units, --left and --right."
             )
+    draft.is_diff_drive = _is_diff_drive(draft.joints) if urdf is None else urdf.has_one_axle
     _choose_geometry(draft, given, urdf, controllers, fit)
     if urdf is not None:
-        _check_urdf(draft, urdf, measured)
+        findings = check_urdf(urdf, draft.values, measured)
+        draft.reasons += findings.reasons
+        draft.missing += findings.missing
+        draft.contradictions += findings.contradictions
     _choose_mounts(draft, survey, {} if text is None else _urdf_mounts(text, given))
     return draft
 
@@ -301,6 +288,10 @@ def _candidates(
     return [s for s, known in zip(found, is_known, strict=True) if s.left and s.right and known]
 
 
+def _is_diff_drive(joints: Joints | None) -> bool:
+    return joints is not None and len(joints.left) == len(joints.right) == 1
+
+
 def _same(a: Sides | WheelSides, b: Sides | WheelSides) -> bool:
     return {*a.left} == {*b.left} and {*a.right} == {*b.right}
 
@@ -353,11 +344,11 @@ def _choose_geometry(
     of_like = f"that of {'' if given.like is None else given.like.name}"
     is_drivers = _is_drivers(draft.topics.get("odometry", "reference"))
     of_log = "the driver's odometry over the wheels' rates" if is_drivers else "the log's motion over the wheels' rates"
-    for name in ("wheelbase_m", "mass_kg"):
+    for name, of in (("wheelbase_m", "the URDF's wheels"), ("mass_kg", "the URDF's <inertial>s")):
         of_urdf = None if urdf is None else getattr(urdf, name)
         draft.choose(
             name,
-            [(getattr(given, name), "given"), (of_urdf, "the URDF's wheels"), (None if like is None else getattr(like, name), of_like)],
+            [(getattr(given, name), "given"), (of_urdf, of), (None if like is None else getattr(like, name), of_like)],
         )
     _choose_radius(draft, given.wheel_radius_m, _described(urdf, controllers, "wheel_radius_m"), fit, of_log)
     _choose_track(draft, given.track_width_m, urdf, controllers, fit)
@@ -412,7 +403,7 @@ def _choose_track(
     by_log = "cannot decide"
     if fit is not None and described:
         wheelbase = draft.values.get("wheelbase_m")
-        is_skid = draft.joints is not None and len(draft.joints.left) > 1 and wheelbase is not None
+        is_skid = not draft.is_diff_drive and wheelbase is not None
 
         def misfit(track: float) -> float:
             expected = geometric_scaling(wheelbase, track) if is_skid and wheelbase is not None else 1.0
@@ -465,52 +456,6 @@ def _choose_driver(draft: Draft, given: Given, controllers: tuple[ControllerValu
         )
 
 
-def _check_axes(draft: Draft, urdf: WheelGeometry, measured: WheelSides | None) -> None:
-    """Name wheels whose axes are not to the left, as REP 103 has it: their rates may have the other sign, or the body frame is turned."""
-    across = [name for name, axis in urdf.axes.items() if abs(axis[1]) < _LATERAL]
-    if across:
-        draft.missing.append(
-            f"wheel axes: {', '.join(across)} do not turn about the y axis of the body frame; if its x axis does not point forward, "
-            "left, right, track and wheelbase are mixed up. Check <axis> and rpy, or name another link with --base-link."
-        )
-        return
-    opposite = [name for name, axis in urdf.axes.items() if axis[1] < 0.0]
-    if not opposite or len(opposite) == len(urdf.axes):
-        return
-    by_log = "cannot decide"
-    if measured is not None:
-        backwards = [name for name in opposite if name in measured.reversed]
-        by_log = "negative when driving forward" if len(backwards) == len(opposite) else "positive when driving forward"
-    draft.contradictions.append(Contradiction("sign", "the URDF's <axis>", f"{', '.join(opposite)}: to the right (0 -1 0)", by_log))
-
-
-def _check_urdf(draft: Draft, urdf: WheelGeometry, measured: WheelSides | None) -> None:
-    """Name what is no differential drive of wheels, and masses off the middle of symmetric wheels."""
-    for kind in urdf.kinds:
-        (draft.reasons if kind == "casters" else draft.missing).append(f"{kind}: {_KIND_NOTES[kind]}")
-    _check_axes(draft, urdf, measured)
-    if urdf.radii and not _is_same(urdf.radii[0], urdf.radii[-1], _SAME_RADIUS):
-        values = ", ".join(f"{radius:.4g} m" for radius in urdf.radii)
-        used = draft.values.get("wheel_radius_m", math.nan)
-        draft.contradictions.append(Contradiction("wheel_radius_m", "the URDF's wheels differ", values, f"{used:.4g} m is taken"))
-    track = draft.values.get("track_width_m", urdf.track_width_m)
-    ys = sorted(y for _, y in urdf.positions.values())
-    is_symmetric = bool(ys) and all(abs(a + b - ys[0] - ys[-1]) < 0.02 for a, b in zip(ys, reversed(ys), strict=True))
-    aside = urdf.cg[1]
-    if is_symmetric and math.isfinite(aside) and abs(aside) > _OFF_MIDDLE * track:
-        draft.contradictions.append(
-            Contradiction(
-                "centre of gravity, y", "the URDF's <inertial>s", f"{aside:+.3f} m", "cannot measure it; wheels are symmetric: 0 m"
-            )
-        )
-        side = "left" if aside > 0.0 else "right"
-        draft.missing.append(
-            f"centre of gravity: the URDF's masses have it {100.0 * abs(aside):.0f} cm off the middle of a symmetric robot "
-            f"(to the {side}): check <inertial> of the body (axes swapped?). "
-            f"cg_y_m = 0 +- {abs(aside):.2f} m is taken, instead of +- 0.005 m."
-        )
-
-
 def _choose_mounts(draft: Draft, survey: Survey, of_urdf: Mapping[str, Mount]) -> None:
     for kind in ("scan", "points", "imu"):
         topic = draft.topics.get(kind)
@@ -544,8 +489,7 @@ def finish_robot(draft: Draft, given: Given, default_name: str) -> Robot:
     v = draft.values
     geometry = Geometry(v["wheel_radius_m"], v["track_width_m"], v["wheelbase_m"], v.get("mass_kg", 50.0))
     driver = Driver(v.get("driver_wheel_radius_m", v["wheel_radius_m"]), v["track_width_m"], v.get("wheel_separation_multiplier", 1.0))
-    has_one_axle = draft.joints is not None and len(draft.joints.left) == len(draft.joints.right) == 1
-    drive = given.drive or (given.like.drive if given.like is not None else (DIFF_DRIVE if has_one_axle else "skid_steer"))
+    drive = given.drive or (given.like.drive if given.like is not None else (DIFF_DRIVE if draft.is_diff_drive else "skid_steer"))
     robot = Robot(given.name or default_name, geometry, driver, drive, mounts=draft.mounts)
     joints = robot.joints if draft.joints is None else draft.joints
     return dataclasses.replace(robot, topics=dataclasses.replace(Topics(), **draft.topics), joints=joints)

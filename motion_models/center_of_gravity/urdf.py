@@ -1,4 +1,4 @@
-"""URDFs: links with mass and centre of mass, the joints between them, and the wheels: which joints drive, their radius and distances.
+"""URDFs: links with mass and centre of mass, and the joints between them.
 
 Read with the standard library: of a URDF's content only names, origins, axes, limits, mimics and masses matter here, and the readers
 that there are bring mesh loaders with them. Format: http://wiki.ros.org/urdf/XML. Errors are `RobotError`s that name file and element.
@@ -9,9 +9,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-import statistics
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,30 +23,6 @@ from motion_models.text_files import read_text
 
 _MOVING = ("revolute", "continuous", "prismatic")
 _XACRO = "it is a xacro file, not a URDF; expand it first: xacro FILE.xacro > FILE.urdf"
-
-_WHEEL = re.compile(r"wheel|tire|tyre|whl|sprocket", re.IGNORECASE)
-_PASSIVE = re.compile(r"caster|castor|swivel|steer", re.IGNORECASE)
-_LEFT = re.compile(r"left|(^|[_\-/])(l|fl|rl|bl|ml|cl|lf|lr|lb|lm)([_\-/]|$)", re.IGNORECASE)
-_RIGHT = re.compile(r"right|(^|[_\-/])(r|fr|rr|br|mr|cr|rf|rb|rm)([_\-/]|$)", re.IGNORECASE)
-_LEFT_KEYS = ("left_wheel_names", "left_wheel", "left_joint", "leftjoint", "leftfrontjoint", "leftrearjoint")
-_RIGHT_KEYS = ("right_wheel_names", "right_wheel", "right_joint", "rightjoint", "rightfrontjoint", "rightrearjoint")
-"""Keys of controllers and plugins (lower case) that name the wheels' joints."""
-_KINDS = {
-    "mecanum wheels": re.compile(r"mecanum", re.IGNORECASE),
-    "omnidirectional wheels": re.compile(r"omni.*(wheel|roller)|(wheel|roller).*omni|swerve|planar_move", re.IGNORECASE),
-    "tracks": re.compile(
-        r"(^|[_\-/])(l|r|left|right)_?(track|crawler|tread|belt)s?([_\-/.]|$)|(^|[_\-/])(track|crawler|tread|belt)s?_?(l|r|left|right)([_\-/.]|$)"
-        r"|track(ed_?vehicle|_?controller)|sprocket",
-        re.IGNORECASE,
-    ),
-    "steered wheels": re.compile(r"steer(ing)?|ackermann", re.IGNORECASE),
-    "casters": re.compile(r"caster|castor", re.IGNORECASE),
-}
-_TURNING = ("revolute", "continuous")
-_ALONG = 0.9
-"""Component of a unit axis from which it lies along a coordinate axis (25 degrees: cambered wheels count)."""
-_SAME_M = 0.02
-"""Wheels whose x differs by less stand on one axle [m]."""
 
 
 @dataclass(frozen=True)
@@ -275,275 +250,48 @@ def _numbers(element: ET.Element, attribute: str, count: int, default: str | Non
     return numbers
 
 
-@dataclass(frozen=True)
-class ControllerValues:
-    """What the parameters of one drive controller or simulator plugin contain; NaN and empty for what they do not."""
-
-    source: str
-    track_width_m: float = math.nan
-    wheel_radius_m: float = math.nan
-    wheel_separation_multiplier: float = math.nan
-    left: tuple[str, ...] = ()
-    right: tuple[str, ...] = ()
+def link_poses(urdf: Urdf, base_link: str = "base_link") -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Rotation (3, 3) and translation (3,) of each link in ``base_link``, all joints at 0. Raises `RobotError` without such a link."""
+    poses: dict[str, tuple[FloatArray, FloatArray]] = {urdf.root: (np.eye(3), np.zeros(3))}
+    for joint in urdf.joints:
+        rotation, translation = poses[joint.parent]
+        poses[joint.child] = rotation @ joint.rotation, translation + rotation @ joint.translation
+    base_R, base_t = poses[_body_link(urdf, base_link)]
+    return {name: (base_R.T @ rotation, base_R.T @ (translation - base_t)) for name, (rotation, translation) in poses.items()}
 
 
-@dataclass(frozen=True)
-class WheelGeometry:
-    """What a URDF has of its wheels; NaN for what it does not have."""
+def round_shapes(text: str, source: str) -> dict[str, tuple[float, FloatArray]]:
+    """Largest radius [m] of the cylinders or spheres of each link of a URDF ``text``, and their centre (3,) in the link's frame.
 
-    left: tuple[str, ...]
-    """Joints of the left wheels."""
-    right: tuple[str, ...]
-    wheel_radius_m: float
-    track_width_m: float
-    wheelbase_m: float
-    mass_kg: float
-    """Of all links."""
-    positions: Mapping[str, tuple[float, float]]
-    """x, y of each wheel's joint in the body frame [m]."""
-    cg: tuple[float, float] = (math.nan, math.nan)
-    """x, y of the centre of gravity of all links from the middle of the wheels, joints at 0 [m]."""
-    controllers: tuple[ControllerValues, ...] = ()
-    """Of <plugin> and <ros2_control>."""
-    has_shapes: bool = True
-    """Whether the wheels' cylinders or spheres give radius and contacts; else both are of joints alone."""
-    radii: tuple[float, ...] = ()
-    """Different radii of the wheels' shapes [m]."""
-    axes: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
-    """Axis of each wheel in the body frame."""
-    kinds: tuple[str, ...] = ()
-    """Words for what no differential drive of wheels is: mecanum, omni, tracks, casters, steered wheels."""
-
-
-def is_wheel(name: str) -> bool:
-    """Whether a joint is a driven wheel by its spelling."""
-    return bool(_WHEEL.search(name)) and not _PASSIVE.search(name)
-
-
-def sides(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the left and right wheels among joint ``names``, by their spelling. Either may be empty.
-
-    >>> sides(["front_left_wheel", "rear_right_wheel", "arm_joint", "wheel_FL_joint"])
-    (('front_left_wheel', 'wheel_FL_joint'), ('rear_right_wheel',))
+    Raises `RobotError` for lengths that are no numbers; ``source`` names the text.
     """
-    wheels = [name for name in names if is_wheel(name)]
-    left = tuple(name for name in wheels if _LEFT.search(name) and not re.search("right", name, re.IGNORECASE))
-    return left, tuple(name for name in wheels if name not in left and _RIGHT.search(name))
+    found: dict[str, tuple[float, FloatArray]] = {}
+    for link in ET.fromstring(text.encode()).findall("link"):
+        name = link.get("name", "")
+        for shape in (*link.findall("collision"), *link.findall("visual")):
+            cylinder, sphere = shape.find("geometry/cylinder"), shape.find("geometry/sphere")
+            round_shape = sphere if cylinder is None else cylinder
+            if round_shape is None:
+                continue
+            where = f"{source}: link '{name}'"
+            radius = _numbers(round_shape, "radius", 1, None, where)[0]
+            if radius > found.get(name, (0.0, None))[0]:
+                found[name] = radius, _origin(shape, where)[1]
+    return found
 
 
-def wheel_geometry(text: str, source: str, base_link: str = "base_link") -> WheelGeometry:
-    """Wheels of a URDF ``text``; ``source`` names it in errors. Contacts are taken below the wheels' shapes, or their joints.
-
-    Without wheels on both sides, a controller or plugin with a track counts alone (tracked vehicles). Raises `RobotError` for a text that
-    is no URDF, a missing ``base_link``, and for one with neither.
-    """
-    urdf = parse_urdf(text, source)
-    base_link = _body(urdf, base_link)
-    root = ET.fromstring(text.encode())
-    shapes = _shapes(root)
-    poses = _poses(urdf)
-    base_R, base_t = poses[base_link]
-    wheels: dict[str, tuple[float, float]] = {}
-    axes: dict[str, FloatArray] = {}
-    radii = []
-    for joint in _wheel_joints(urdf, poses, base_R):
-        rotation, translation = poses[joint.child]
-        radius, center = shapes.get(joint.child, (math.nan, np.zeros(3)))
-        x, y, _ = base_R.T @ (translation + rotation @ center - base_t)
-        wheels[joint.name] = (float(x), float(y))
-        axes[joint.name] = base_R.T @ rotation @ joint.axis
-        radii.append(radius)
-    finite = [radius for radius in radii if math.isfinite(radius) and radius > 0.0]
-    # A body frame may lie at a corner: then the middle of the wheels divides the sides.
-    ys = [y for _, y in wheels.values()]
-    middle = 0.0 if not ys or (min(ys) < -_SAME_M / 2 and max(ys) > _SAME_M / 2) else (min(ys) + max(ys)) / 2.0
-    left = tuple(name for name, (_, y) in wheels.items() if y - middle > _SAME_M / 2)
-    right = tuple(name for name, (_, y) in wheels.items() if y - middle < -_SAME_M / 2)
-    wheels = {name: wheels[name] for name in wheels if name in (*left, *right)}
-    controllers, kinds = _controllers(root), _kinds(urdf, root)
-    if not left or not right:
-        known = next((c for c in controllers if math.isfinite(c.track_width_m)), None)
-        if known is None:
-            raise RobotError(
-                f"{source}: no driven wheels on both sides{_instead(urdf, kinds)}; give lengths and joints by options instead."
-            )
-        return WheelGeometry((), (), math.nan, math.nan, math.nan, _mass(urdf), {}, controllers=controllers, has_shapes=False, kinds=kinds)
-    along = max(x for x, _ in wheels.values()) - min(x for x, _ in wheels.values())
-    return WheelGeometry(
-        left=left,
-        right=right,
-        wheel_radius_m=statistics.median(finite) if finite else math.nan,
-        track_width_m=statistics.mean(wheels[name][1] for name in left) - statistics.mean(wheels[name][1] for name in right),
-        wheelbase_m=along if along > _SAME_M else math.nan,
-        mass_kg=_mass(urdf),
-        positions=wheels,
-        cg=_center_of_gravity(urdf, poses, base_link, wheels),
-        controllers=controllers,
-        has_shapes=bool(finite),
-        kinds=kinds,
-        radii=tuple(sorted(set(finite))),
-        axes={name: (float(a[0]), float(a[1]), float(a[2])) for name, a in axes.items() if name in wheels},
-    )
-
-
-def _body(urdf: Urdf, base_link: str) -> str:
+def _body_link(urdf: Urdf, base_link: str) -> str:
     """The link ``base_link``, or the only one whose name is a prefix and it (xacro's prefixes). Raises `RobotError`."""
     if base_link in urdf.links:
         return base_link
     ends = [name for name in urdf.links if re.search(rf"[_/\-]{re.escape(base_link)}$", name)]
     if len(ends) == 1:
         return ends[0]
-    raise RobotError(f"{urdf.source}: no link '{base_link}'; links are {_first(urdf.links)}. Name the body's with --base-link.")
+    raise RobotError(f"{urdf.source}: no link '{base_link}'; links are {first_names(urdf.links)}. Name the body's with --base-link.")
 
 
-def _first(names: Iterable[str], count: int = 12) -> str:
+def first_names(names: Iterable[str], count: int = 12) -> str:
     """At most ``count`` names, and how many more there are."""
     names = list(names)
     more = f" and {len(names) - count} more" if len(names) > count else ""
     return ", ".join(names[:count]) + more
-
-
-def _instead(urdf: Urdf, kinds: Sequence[str]) -> str:
-    """What a URDF has instead of wheels, for an error."""
-    moving = [joint.name for joint in urdf.joints if joint.moves]
-    has = f"; it has {', '.join(kinds)}" if kinds else ""
-    return f"{has}; its moving joints are {_first(moving) or 'none'}"
-
-
-def _mass(urdf: Urdf) -> float:
-    return sum(link.mass for link in urdf.links.values()) or math.nan
-
-
-def _center_of_gravity(
-    urdf: Urdf, poses: Mapping[str, tuple[FloatArray, FloatArray]], base_link: str, wheels: Mapping[str, tuple[float, float]]
-) -> tuple[float, float]:
-    """x, y [m] of all links' masses in the body frame, from the middle of the wheels; NaN without masses."""
-    masses = {name: link.mass for name, link in urdf.links.items() if link.mass > 0.0}
-    if not masses:
-        return math.nan, math.nan
-    moment = sum((m * (poses[n][1] + poses[n][0] @ urdf.links[n].com) for n, m in masses.items()), start=np.zeros(3))
-    base_R, base_t = poses[base_link]
-    com = base_R.T @ (moment / sum(masses.values()) - base_t)
-    middle = np.mean([[min(v), max(v)] for v in zip(*wheels.values(), strict=True)], axis=1)
-    return float(com[0] - middle[0]), float(com[1] - middle[1])
-
-
-def _controllers(root: ET.Element) -> tuple[ControllerValues, ...]:
-    """Values of <plugin>s (Gazebo's of ROS 1, ROS 2 and gz) and <ros2_control> that have a track or a radius."""
-    found = []
-    for element in (*root.iter("plugin"), *root.iter("ros2_control")):
-        values = {(e.get("name", "") if e.tag == "param" else e.tag): (e.text or "").strip() for e in element.iter()}
-        where = f"<{element.tag}> {element.get('name', '')}".strip()
-        lists = {key: [e.text or "" for e in element.iter(key)] for key in (*_LEFT_KEYS, *_RIGHT_KEYS)}
-        controller = controller_values({**values, **{key: names for key, names in lists.items() if names}}, where)
-        if controller is not None:
-            found.append(controller)
-    return tuple(found)
-
-
-def controller_values(values: Mapping[str, object], source: str) -> ControllerValues | None:
-    """Track, radius, multiplier and joints among the parameters ``values`` of a controller or plugin; None where it has none of them.
-
-    Names: diff_drive_controller (ROS 1 and 2), libgazebo_ros_diff_drive, _skid_steer_drive, gz::sim::systems::DiffDrive.
-    """
-    by_key = {key.lower(): value for key, value in values.items()}
-
-    def number(*keys: str, scale: float = 1.0) -> float:
-        for key in keys:
-            try:
-                value = float(str(by_key[key])) * scale
-            except (KeyError, ValueError):
-                continue
-            if math.isfinite(value) and value > 0.0:
-                return value
-        return math.nan
-
-    def joints(keys: Sequence[str]) -> tuple[str, ...]:
-        names: list[str] = []
-        for key in keys:
-            value = by_key.get(key, ())
-            names += [str(v) for v in value] if isinstance(value, list | tuple) else re.split(r"[\s,]+", str(value))
-        return tuple(dict.fromkeys(name.strip() for name in names if name.strip()))
-
-    radius = number("wheel_radius", "wheelradius")
-    diameter = number("wheel_diameter", "wheeldiameter", scale=0.5)
-    found = ControllerValues(
-        source,
-        number("wheel_separation", "wheelseparation", "track_width", "trackwidth", "tracks_separation"),
-        radius if math.isfinite(radius) else diameter,
-        number("wheel_separation_multiplier"),
-        joints(_LEFT_KEYS),
-        joints(_RIGHT_KEYS),
-    )
-    has_any = math.isfinite(found.track_width_m) or math.isfinite(found.wheel_radius_m)
-    return found if has_any else None
-
-
-def _kinds(urdf: Urdf, root: ET.Element) -> tuple[str, ...]:
-    """Kinds of wheels and tracks by the names of links, joints and meshes."""
-    meshes = [e.get("filename", "").rsplit("/", 1)[-1] for e in root.iter("mesh")]
-    names = [*urdf.links, *(joint.name for joint in urdf.joints), *meshes, *(p.get("filename", "") for p in root.iter("plugin"))]
-    return tuple(kind for kind, pattern in _KINDS.items() if any(pattern.search(name) for name in names))
-
-
-def _wheel_joints(urdf: Urdf, poses: Mapping[str, tuple[FloatArray, FloatArray]], base_R: FloatArray) -> list[Joint]:
-    """Joints of driven wheels: continuous ones (or of more than a turn) by name; where no name has a wheel in it, by a lateral axis.
-
-    What hangs on a joint that turns about the vertical is a caster or is steered; both are left out, as are such joints themselves.
-    """
-    by_child = {joint.child: joint for joint in urdf.joints}
-
-    def axis(joint: Joint) -> FloatArray:
-        return np.abs(base_R.T @ poses[joint.child][0] @ joint.axis)
-
-    def is_steered(joint: Joint) -> bool:
-        above: Joint | None = joint
-        while above is not None:
-            if above.kind in _TURNING and axis(above)[2] > _ALONG:
-                return True
-            above = by_child.get(above.parent)
-        return False
-
-    turning = [
-        j
-        for j in urdf.joints
-        if (j.kind == "continuous" or (j.kind == "revolute" and not j.upper - j.lower < 2.0 * math.pi))
-        and j.mimic is None
-        and not _PASSIVE.search(j.name + j.child)
-        and not is_steered(j)
-    ]
-    return [j for j in turning if _WHEEL.search(j.name + j.child)] or [j for j in turning if axis(j)[1] > _ALONG]
-
-
-def link_poses(urdf: Urdf, base_link: str = "base_link") -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Rotation (3, 3) and translation (3,) of each link in ``base_link``, all joints at 0."""
-    poses = _poses(urdf)
-    base_R, base_t = poses[_body(urdf, base_link)]
-    return {name: (base_R.T @ rotation, base_R.T @ (translation - base_t)) for name, (rotation, translation) in poses.items()}
-
-
-def _poses(urdf: Urdf) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """The same in the root's frame."""
-    poses: dict[str, tuple[FloatArray, FloatArray]] = {urdf.root: (np.eye(3), np.zeros(3))}
-    for joint in urdf.joints:
-        rotation, translation = poses[joint.parent]
-        poses[joint.child] = rotation @ joint.rotation, translation + rotation @ joint.translation
-    return poses
-
-
-def _shapes(root: ET.Element) -> dict[str, tuple[float, FloatArray]]:
-    """Largest radius [m] of the cylinders or spheres of each link, and their centre (3,) in the link's frame."""
-    found: dict[str, tuple[float, FloatArray]] = {}
-    for link in root.findall("link"):
-        for shape in (*link.findall("collision"), *link.findall("visual")):
-            round_shape = shape.find("geometry/cylinder")
-            round_shape = shape.find("geometry/sphere") if round_shape is None else round_shape
-            if round_shape is None:
-                continue
-            origin = shape.find("origin")
-            xyz = "0 0 0" if origin is None else origin.get("xyz", "0 0 0")
-            radius = float(round_shape.get("radius", "nan"))
-            name = link.get("name", "")
-            if radius > found.get(name, (0.0, None))[0]:
-                found[name] = radius, np.array([float(word) for word in xyz.split()])
-    return found

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from localization.cli import main
-from motion_models.center_of_gravity.urdf import sides, wheel_geometry
+from motion_models.center_of_gravity.urdf_wheels import sides, wheel_geometry
 from motion_models.robot import load_robot
 
 DATA = Path(__file__).parents[1] / "data"
