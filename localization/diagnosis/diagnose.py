@@ -23,6 +23,7 @@ from localization.diagnosis.findings import (
     describe_loss,
     describe_standstill_turn,
     evidence,
+    noise_notes,
     sentence,
 )
 from localization.diagnosis.linearization import (
@@ -222,7 +223,7 @@ def _conclude(
         gain=_heldout(linearization, chosen, (), config) if chosen else None,
         outliers_s=tuple(float(t) for t in drive.starts_s[predictor.batch.owner][find_outliers(linearization)]),
         windows=len(drive.maneuvers),
-        warnings=(*_clock_warnings(predictor, findings), *drive.warnings),
+        warnings=(*_clock_warnings(predictor, findings), *noise_notes(rows), *drive.warnings),
         hypothesis=with_sizes({causes[i]: float(size) for i, size in zip(chosen, sizes, strict=True)}),
         suspected=None if suspected is None else suspected[0],
     )

@@ -328,6 +328,16 @@ def describe_tolerated(d: Diagnosis) -> list[str]:
     return found
 
 
+def noise_notes(rows: Mapping[str, Component]) -> tuple[str, ...]:
+    """Rows in which nothing is significant, and whose noise is more than the motion reference states: it is the reference's."""
+    return tuple(
+        f"{name} scatters by {row.expected_rms:.2g} {row.unit}, {row.noise_over_reference:.1f} times what the motion reference states, "
+        "without a pattern that a cause has: its stated noise is too small for this drive."
+        for name, row in rows.items()
+        if row.status != "unexplained" and row.noise_over_reference > MAX_NOISE_OVER_REFERENCE
+    )
+
+
 def describe_p(p: float) -> str:
     """The p of a row as tables show it."""
     return "-" if math.isnan(p) else f"{p:.2g}"

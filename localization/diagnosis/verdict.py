@@ -263,7 +263,7 @@ def attribute_rows(
         if expected < _MODEL_ACCURACY * rms:
             excess = min(excess, MAX_NOISE_OVER_REFERENCE)
         component = Component(CHANNEL_UNITS[c], rms, expected, p, corrected_rms, rest_rms, excess)
-        if c < _TESTED_CHANNELS and (p < significance or excess > MAX_NOISE_OVER_REFERENCE):
+        if c < _TESTED_CHANNELS and p < significance:
             shares = parts[known, c].T @ scaled[known, c] / max(float(scaled[known, c] @ scaled[known, c]), 1e-12)
             whitened = float(np.sqrt(np.mean(white_rest[known, c] ** 2)))
             listed = np.where(is_significant, shares, 0.0)

@@ -24,7 +24,18 @@ def test_diagnose_nominal_drive_is_consistent(nominal: Drive) -> None:
     assert diagnose(nominal, make_model("friction", nominal.robot)).verdict == "consistent"
 
 
-@pytest.mark.parametrize("name", cases(sorted(UNKNOWN), ("slip in left turns only",)))
+OF_REFERENCE = ("reference is longer in one quarter", "reference turns with its range")
+
+
+@pytest.mark.parametrize("name", OF_REFERENCE)
+def test_diagnose_reference_that_scatters_is_named_in_a_note(nominal: Drive, name: str) -> None:
+    """Nothing follows a cause or a trend: no cause is named, and the noise is the reference's."""
+    found = diagnose(UNKNOWN[name](nominal), make_model("friction", nominal.robot))
+    assert not found.findings
+    assert found.verdict == "unexplained" or any("motion reference states" in note for note in found.warnings)
+
+
+@pytest.mark.parametrize("name", cases(sorted(set(UNKNOWN) - set(OF_REFERENCE)), ("slip in left turns only",)))
 def test_diagnose_effect_outside_catalogue_is_unexplained(nominal: Drive, name: str) -> None:
     found = diagnose(UNKNOWN[name](nominal), make_model("friction", nominal.robot))
     assert found.verdict == "unexplained"
