@@ -18,6 +18,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from localization.calibration.lidar_yaw import check_lidar_yaw, corrected
 from localization.calibration.wheel_wiring import open_checked
 from localization.commands.common import WIDE, names, new_folder, print_table, write_json
 from localization.errors import EstimatorError, EvaluationError
@@ -102,6 +103,8 @@ class Replay:
         log, wiring = open_checked(self.log, robot, self.topic.scored_against(self.reference))
         robot = log.robot
         has_lidar = log.sources.lidar is not None
+        yaw = None if wiring.is_ambiguous else check_lidar_yaw(log)
+        mounts = corrected(log.mounts, yaw)
         prior = self._prior()
         models = [make_model(name, robot) for name in names(self.model, "--model")]
         forms = names(self.corrections, "--corrections")
@@ -117,7 +120,7 @@ class Replay:
         # the LiDAR alone uses no motion model: it runs once, and counts for each
         once = [p for p in pairs if p.estimator != _WHEELLESS or p.model is models[0]]
         with _progress(console, log) as (events, on_event):
-            found = replay(merge_positions(events, positions), once, robot, log.mounts, has_lidar, self.config, on_event)
+            found = replay(merge_positions(events, positions), once, robot, mounts, has_lidar, self.config, on_event)
         by_pair = {(p.model.name, p.estimator, p.corrections): run for p, run in zip(once, found, strict=True)}
         runs = []
         for p in pairs:
@@ -138,6 +141,7 @@ class Replay:
                         *prior_notes(robot, [m.name for m in models]),
                         *held_out,
                         *wiring.findings,
+                        *([] if yaw is None else [yaw.text]),
                         *log.warnings(),
                         *warnings_of(found),
                     ]
@@ -157,7 +161,7 @@ class Replay:
         if self.json is not None:
             write_json(self.json, metrics)
         if self.save_map is not None:
-            save_map(self.save_map, saved_map(runs, head, log.mounts, dataclasses.asdict(self.config)))
+            save_map(self.save_map, saved_map(runs, head, mounts, dataclasses.asdict(self.config)))
         self._print(console, head, results, reference)
 
     def _estimators(self, has_lidar: bool) -> list[str]:

@@ -22,6 +22,9 @@ _BEARINGS = 180
 _BIN_RAD = 2.0 * np.pi / _BEARINGS
 _MIN_BEARINGS = 30
 """Filled bearings of a profile, of `_BEARINGS`; fewer leave the turn ambiguous."""
+_MAX_ALONE, _MAX_GAP = 0.7, 5
+"""Share of the filled bearings without a neighbour on both sides, from where on a scan is sparse; and the widest gap, in bearings (10 deg),
+across which its beams are connected."""
 _MAX_TURN_BINS = 30
 _ITERATIONS = 8
 _FIRST_SCALE_M, _LAST_SCALE_M = 0.5, 0.05
@@ -92,12 +95,36 @@ def _fill_profile(points: Points2, surface: FloatArray, ranges: FloatArray, norm
         k = math.floor(math.atan2(y, x) / _BIN_RAD) % _BEARINGS
         if r > 1e-3 and not r >= ranges[k]:
             surface[k, 0], surface[k, 1], ranges[k] = x, y, r
+    _connect(surface, ranges)
     for k in range(_BEARINGS):
         before, after = surface[k - 1], surface[(k + 1) % _BEARINGS]
         dx, dy = after[0] - before[0], after[1] - before[1]
         length = math.hypot(dx, dy)
         if length < 0.1 + 0.5 * ranges[k]:  # else from one surface to another, or unknown
             normals[k, 0], normals[k, 1] = -dy / max(length, 1e-6), dx / max(length, 1e-6)
+
+
+@kernel
+def _connect(surface: FloatArray, ranges: FloatArray) -> None:
+    """Fill the bearings between the beams of a sparse scan (three degrees and more apart) where neighbours are of one surface."""
+    filled, alone = 0, 0
+    for k in range(_BEARINGS):
+        if not math.isnan(ranges[k]):
+            filled += 1
+            alone += math.isnan(ranges[k - 1]) or math.isnan(ranges[(k + 1) % _BEARINGS])
+    if alone <= _MAX_ALONE * filled:
+        return
+    is_beam = ~np.isnan(ranges)
+    for k in range(_BEARINGS):
+        gap = 1
+        while gap < _MAX_GAP and not is_beam[(k + gap) % _BEARINGS]:
+            gap += 1
+        step = surface[(k + gap) % _BEARINGS] - surface[k]  # NaN where one of them is no beam
+        if math.hypot(step[0], step[1]) < 0.1 + 0.5 * ranges[k]:
+            for i in range(1, gap):
+                middle = (k + i) % _BEARINGS
+                surface[middle] = surface[k] + i / gap * step
+                ranges[middle] = math.hypot(surface[middle, 0], surface[middle, 1])
 
 
 @kernel
