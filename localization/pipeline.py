@@ -105,7 +105,9 @@ class Pipeline:
             self._calibrate()
             step = self.synchronizer.preintegrate(interval)  # wheels through the motion model, gyro, scan
             step = self.checks.apply(step)  # without faulty sensors
-            estimate = self.checks.inflate(self.estimator.step(step))  # predict, match, update
+            estimate = self.estimator.step(step)  # predict, match, update
+            self.checks.compare_residuals(self.estimator)
+            estimate = self.checks.inflate(estimate)
             self._feed_back(step, is_scan_matched=estimate.nis is not None)
             yield estimate  # publish
 

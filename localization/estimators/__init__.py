@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from localization.errors import EstimatorError
-from localization.estimators.base import Estimate, Estimator
+from localization.estimators.base import Estimate, Estimator, LearnedParameter, Residuals
 from localization.estimators.baselines import DeadReckoning, LidarOdometry
 from localization.estimators.filter import FilterConfig
 from localization.estimators.fusion import EkfFusion
@@ -25,8 +25,10 @@ __all__ = [
     "Estimate",
     "Estimator",
     "EstimatorConfig",
+    "LearnedParameter",
     "MapFusion",
     "PriorMap",
+    "Residuals",
     "check_estimator",
     "make_estimator",
 ]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,6 +39,26 @@ class Estimate:
     """``odom_T_body`` (3,) and its covariance (3, 3), where ``pose`` is ``map_T_body``: it never jumps."""
     map_T_odom: Pose2 | None = None
     """(3,) what loop closures and positions have corrected; None where ``pose`` is in the odometry frame."""
+
+
+class LearnedParameter(NamedTuple):
+    """A parameter of the motion model that an estimator has learned, and the robot file's value of it."""
+
+    name: str
+    value: float
+    sigma: float
+    file_value: float
+    prior_sigma: float
+    """Standard deviation of the true value from the robot file's."""
+
+
+class Residuals(NamedTuple):
+    """How far the measurements of the last step are from each other."""
+
+    turn: tuple[float, float] | None
+    """Innovation of the gyro by what wheels and all measurements so far predict, and its variance [rad, rad^2]; None without a gyro."""
+    file_delta: Pose2
+    """(3,) motion by the wheels with the robot file's parameters."""
 
 
 class Estimator(ABC):
@@ -77,6 +97,15 @@ class Estimator(ABC):
     def lost(self) -> LostScans | None:
         """Scans that could not be matched to a map; None where the estimator matches none."""
         return None
+
+    @property
+    def residuals(self) -> Residuals | None:
+        """Those of the last step; None where measurements are not fused."""
+        return None
+
+    def learned_parameters(self) -> Sequence[LearnedParameter]:
+        """The motion model's parameters that are corrected, against the robot file."""
+        return ()
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         """Mean and sigma of what was estimated besides the pose, by name."""

@@ -78,6 +78,8 @@ class Filter:
         self.is_considered = np.zeros(n, dtype=bool)
         """(n,) states that have no gain."""
         self.is_considered[MAP] = self.is_considered[KEY] = True
+        self.turn_innovation: tuple[float, float] | None = None
+        """Innovation of the gyro in the last step and its variance [rad, rad^2]; None without a gyro."""
         self.wheel_noise_scale = 1.0
         """Factor on the robot file's wheel noise, estimated from the innovations."""
         self._scale_information, self._slip_cov = 0.0, np.zeros((n, n))  # Fisher information; the part of P that is this step's slip
@@ -116,7 +118,7 @@ class Filter:
         _, P = predict_linear(np.zeros(len(F)), self.P, F=F, Q=Q)  # P = F P F^T + Q
         pose = se2.compose(self.pose, delta)
         _check(f"the motion of the wheels until stamp {step.end_ns} ns", pose, P)
-        self.start, self.pose, self.P = self.pose, pose, P
+        self.start, self.pose, self.P, self.turn_innovation = self.pose, pose, P, None
         self.is_considered[PARAMS:] = not is_turning
 
     def wheel_cov(self, step: Step) -> Cov3:
@@ -128,7 +130,9 @@ class Filter:
         predicted, by_pose, by_start, by_bias, by_scale = predict_turn(self.start, self.pose, turn, self.bias, self.scale)
         H = np.zeros((1, len(self.P)))
         H[:, POSE], H[:, START], H[0, BIAS], H[0, SCALE] = by_pose, by_start, by_bias, by_scale
-        return self._update(se2.wrap_angle(np.array([turn.angle - predicted])), H, np.array([[turn.variance]]))
+        innovation = se2.wrap_angle(np.array([turn.angle - predicted]))
+        self.turn_innovation = float(innovation[0]), float((H @ self.P @ H.T)[0, 0]) + turn.variance
+        return self._update(innovation, H, np.array([[turn.variance]]))
 
     def update_scan(self, measured: Pose2, R: Cov3, outlier_cov: Cov3) -> float:
         """The pose (3,) that a scan has in the submap, with the scan's covariance ``R`` (3, 3). Returns its NIS (3 degrees of freedom).

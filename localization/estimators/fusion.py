@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from localization.estimators.base import NO_POINTS, Estimate, Estimator, mean_twist
+from localization.estimators.base import NO_POINTS, Estimate, Estimator, LearnedParameter, Residuals, mean_twist
 from localization.estimators.filter import BIAS, CLOCK, MAP, PARAMS, POSE, RADIUS, SCALE, START, Filter, FilterConfig
 from localization.events import Step
 from localization.lidar import FORGETTING, OUTLIER_SIGMAS, LostScans, ScanMatchingSensor
@@ -43,7 +43,7 @@ class EkfFusion(Estimator):
         self._sensor, self.model, self.corrections = sensor, model, corrections
         self._track_m = robot.geometry.track_width_m
         self._twist, self._slip = np.zeros(3), np.zeros(3)  # of the last step, and less that of the wheels
-        self._slip_changes = _SlipChanges()
+        self._slip_changes, self._file_delta = _SlipChanges(), np.zeros(3)
         self._is_slip_measured = self._has_gyro = self._is_scan_pending = False
         self.wheel_motion, self.is_turning = Motion(np.zeros(3), np.zeros((3, 3))), True
         """Motion of the last step by the wheels, with its scaled and outlier covariance; whether it excites the corrections."""
@@ -88,6 +88,8 @@ class EkfFusion(Estimator):
         self.used_corrections = ekf.corrections
         self.counts_by_name["standing"] += step.is_standing
         self.wheel_motion, self.is_turning = replace(step.predicted, cov=ekf.wheel_cov(step)), self._is_turning(step.predicted)
+        by_corrections = step.predicted.d_params @ self.corrections.directions @ ekf.corrections
+        self._file_delta = se2.compose(step.predicted.delta, se2.exp(-by_corrections))
         ekf.predict(step, self.is_turning)
         if step.turn is not None:
             self._start_gyro()
@@ -147,6 +149,22 @@ class EkfFusion(Estimator):
         if not self._has_gyro:
             self._has_gyro = True
             self.filter.P[CLOCK, CLOCK] += self._clock_sigma_s**2
+
+    @property
+    def residuals(self) -> Residuals:
+        """As `Estimator.residuals`."""
+        return Residuals(self.filter.turn_innovation, self._file_delta)
+
+    def learned_parameters(self) -> Sequence[LearnedParameter]:
+        """As `Estimator.learned_parameters`."""
+        ekf, nominal = self.filter, dict(zip(self.model.param_names, self.model.nominal, strict=True))
+        sigmas, priors = np.sqrt(np.diagonal(ekf.P)[PARAMS:]), self.corrections.sigmas
+        return [
+            LearnedParameter(name, nominal.get(name, 0.0) + change, sigma, nominal.get(name, 0.0), prior)
+            for name, change, sigma, prior in zip(
+                self.corrections.names, ekf.corrections.tolist(), sigmas.tolist(), priors.tolist(), strict=True
+            )
+        ]
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         """As `Estimator.parameters`."""

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
-from localization.estimators.base import Estimate, Estimator
+from localization.estimators.base import Estimate, Estimator, LearnedParameter, Residuals
 from localization.estimators.filter import KEY, PARAMS, RADIUS, START
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement
@@ -101,6 +101,15 @@ class GraphFusion(Estimator):
     def lost(self) -> LostScans | None:
         """See `EkfFusion.lost`."""
         return self.odometry.lost
+
+    @property
+    def residuals(self) -> Residuals:
+        """See `EkfFusion.residuals`."""
+        return self.odometry.residuals
+
+    def learned_parameters(self) -> Sequence[LearnedParameter]:
+        """See `EkfFusion.learned_parameters`."""
+        return self.odometry.learned_parameters()
 
     def step(self, step: Step) -> Estimate:
         """The filter's estimate in the frame of the map."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from localization.estimators import Estimate
+from localization.estimators import Estimate, Estimator
 from localization.events import ImuSample, Step
 from localization.lidar import LidarConfig
 from localization.sensor_checks.check import Check
@@ -18,6 +18,7 @@ from localization.sensor_checks.lidar_tilt import LidarTilt
 from localization.sensor_checks.own_body import OwnBody
 from localization.sensor_checks.standstill import Standstill
 from localization.sensor_checks.travel_direction import TravelDirection
+from localization.sensor_checks.turn_consistency import TurnConsistency
 from localization.sensor_checks.turn_rates import TurnRates
 from localization.sensor_checks.window import Window
 from localization.synchronizer import StepConfig
@@ -43,6 +44,7 @@ class SensorChecks:
             Standstill(faults, window, step_config),
             Disagreement(faults),
         )
+        self._turns = TurnConsistency(faults)
         self._step: Step | None = None
         self._pose: Pose2 | None = None
 
@@ -68,6 +70,12 @@ class SensorChecks:
         self._step = step
         return step
 
+    def compare_residuals(self, estimator: Estimator) -> None:
+        """Compare the innovations of the last step, and the learned parameters, with their covariances."""
+        residuals = estimator.residuals
+        if self._step is not None and residuals is not None:
+            self._turns.add(self._step, residuals, estimator.learned_parameters)
+
     def inflate(self, estimate: Estimate) -> Estimate:
         """``estimate`` with the covariance of what faulty sensors have done to it; unchanged without one (LiDAR alone)."""
         if estimate.covariance is None:
@@ -77,6 +85,7 @@ class SensorChecks:
         if before is not None and self._step is not None:
             for check in self._checks:
                 check.compare_estimate(self._step, delta, estimate.nis)
+            self._turns.compare_estimate(delta, estimate.nis)
         return self._inflation.inflate(estimate, delta)
 
     def inflate_trajectory(self, smoothed: Trajectory) -> Trajectory:

@@ -75,6 +75,10 @@ class FaultLog:
         """Report ``found`` in place of what was reported of the same fault."""
         self._revised[found.fault] = found
 
+    def retract(self, fault: Fault) -> None:
+        """Report ``fault`` no more: another one explains it."""
+        self._revised.pop(fault, None)
+
     @property
     def found(self) -> dict[Fault, DetectedFault]:
         """All so far, those last whose numbers change."""

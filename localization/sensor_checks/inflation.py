@@ -26,7 +26,9 @@ class CovarianceInflation:
         self._pending, self._spread = np.zeros((3, 3)), np.zeros((3, 3))
         self._since_ns: int | None = None
         self.ongoing: FloatArray | None = None
-        """(3,) difference of a disagreement that lasts."""
+        """(3,) difference of a disagreement that lasts, of wheels and scans."""
+        self.ongoing_turn: FloatArray | None = None
+        """(3,) the same of wheels and gyro."""
 
     def restart(self) -> None:
         """All sensors agree: measure from here on how far faults lead the estimate away."""
@@ -76,7 +78,7 @@ class CovarianceInflation:
 
     def _total(self) -> Cov3:
         """Covariance (3, 3) of what past faults have done to the pose, and of how far a lasting disagreement has taken it."""
-        return self._spread if self.ongoing is None else self._spread + np.outer(self.ongoing, self.ongoing)
+        return self._spread + sum((np.outer(d, d) for d in (self.ongoing, self.ongoing_turn) if d is not None), np.zeros((3, 3)))
 
 
 def _turn(cov: Cov3, angle: float) -> Cov3:

@@ -1,0 +1,58 @@
+"""Faults of a gyro and of encoders, put into the events of a drive."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from localization.events import Event, ImuSample, WheelSample
+
+EventFault = Callable[[list[Event]], Iterable[Event]]
+
+_RANGE_RAD_S, _BIAS_RAD_S = math.radians(20.0), math.radians(2.6)
+
+
+def change_gyro(change: Callable[[float, float], float], axis: int = 2) -> EventFault:
+    """``change`` of the rate [rad/s] about ``axis``, which is upright, and the part of the drive (0 to 1)."""
+
+    def apply(events: list[Event]) -> Iterator[Event]:
+        begin, end = events[0].stamp_ns, events[-1].stamp_ns
+        for event in events:
+            if isinstance(event, ImuSample):
+                rates = event.angular_velocity.copy()
+                rates[axis] = change(float(rates[axis]), (event.stamp_ns - begin) / (end - begin))
+                event = replace(event, angular_velocity=rates)
+            yield event
+
+    return apply
+
+
+def lose_ticks(left: float, right: float, seed: int = 0) -> EventFault:
+    """Each step of a wheel's angle is lost with this probability."""
+
+    def apply(events: list[Event]) -> Iterator[Event]:
+        rng, last, counted = np.random.default_rng(seed), None, np.zeros(2)
+        for event in events:
+            if isinstance(event, WheelSample):
+                step = event.position - (event.position if last is None else last)
+                last, counted = event.position, counted + step * (rng.random(2) >= [left, right])
+                event = replace(event, position=counted.copy(), velocity=np.full(2, np.nan))
+            yield event
+
+    return apply
+
+
+def faults_of_turns(axis: int = 2) -> dict[str, EventFault]:
+    """By name; the gyro's ``axis`` is upright."""
+    return {
+        "gyro saturated at 20 deg/s": change_gyro(lambda w, part: min(max(w, -_RANGE_RAD_S), _RANGE_RAD_S), axis),
+        "gyro scale 30 % high": change_gyro(lambda w, part: 1.3 * w, axis),
+        "gyro scale 30 % low": change_gyro(lambda w, part: 0.7 * w, axis),
+        "gyro bias steps by 2.6 deg/s": change_gyro(lambda w, part: w + _BIAS_RAD_S * (part > 0.5), axis),
+        "gyro bias rises by 2.6 deg/s": change_gyro(lambda w, part: w + _BIAS_RAD_S * part, axis),
+        "left ticks lost": lose_ticks(0.3, 0.0),
+        "ticks lost": lose_ticks(0.3, 0.3),
+    }
