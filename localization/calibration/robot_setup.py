@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from localization.calibration.controllers import read_controllers
-from localization.calibration.urdf_checks import Contradiction, check_urdf
+from localization.calibration.urdf_checks import Contradiction, check_urdf, is_tipping
 from localization.calibration.wheel_fit import MIN_R2, DriverFit, Motion, WheelSides, fit_wheels, is_moving, read_motion, wheel_sides
 from localization.logs.chunks import RawMessage, merge_channels
 from localization.logs.decode import UnusableError, frame_name
@@ -23,6 +23,7 @@ from localization.logs.reader import open_log, open_source
 from localization.logs.serialization import LogDeserializer
 from localization.logs.topic_roles import TYPES, TopicOverrides
 from motion_models.center_of_gravity.drive_controllers import ControllerValues
+from motion_models.center_of_gravity.parts import TYPICAL
 from motion_models.center_of_gravity.urdf import link_poses, parse_urdf
 from motion_models.center_of_gravity.urdf_wheels import WheelGeometry, is_wheel, sides, wheel_geometry
 from motion_models.errors import RobotError
@@ -42,6 +43,8 @@ _NOT_THE_DRIVERS = re.compile(
 )
 _REFERENCE = re.compile(r"ground_?truth|reference|mocap|vicon|optitrack", re.IGNORECASE)
 _RAW = re.compile(r"raw|mag", re.IGNORECASE)
+_LIGHT_ARMS = 0.02
+"""Share of the mass in moving parts up to which the centre of gravity is the body's; a spinning LiDAR's."""
 _SAME_RADIUS, _SAME_TRACK = 0.1, 0.05
 """Relative differences of two sources below which they agree. Tyres under load and slip straight ahead change a radius by up to 7 %
 (DRIVE's Husky); a track is a length of the body."""
@@ -175,11 +178,9 @@ def draft_robot(survey: Survey, given: Given, path: Path) -> Draft:
 
 
 def _motion_topic(draft: Draft, survey: Survey) -> str | None:
-    """The driver's odometry, else a reference that is an Odometry."""
-    if "odometry" in draft.topics:
-        return draft.topics["odometry"]
-    reference = draft.topics.get("reference", "")
-    return reference if survey.topics.get(reference, ("", 0))[0] == TYPES["odometry"] else None
+    """The driver's odometry, else a reference that is an Odometry, else any other Odometry."""
+    known = [draft.topics[role] for role in ("odometry", "reference") if role in draft.topics]
+    return next((topic for topic in (*known, *survey.topics) if survey.topics.get(topic, ("", 0))[0] == TYPES["odometry"]), None)
 
 
 def _is_drivers(topic: str) -> bool:
@@ -223,7 +224,7 @@ def _choose_topics(draft: Draft, survey: Survey, given: TopicOverrides) -> None:
         if role == "joint_states":
             found = [topic for topic in found if all(sides(survey.joint_names.get(topic, ())))] or found
         if role == "odometry":
-            found = [topic for topic in found if not _NOT_THE_DRIVERS.search(topic)] or found
+            found = [topic for topic in found if _is_drivers(topic)]
         if role == "imu":
             found = [topic for topic in found if not _RAW.search(topic)] or found
         if not found:
@@ -240,7 +241,13 @@ def _choose_topics(draft: Draft, survey: Survey, given: TopicOverrides) -> None:
         draft.topics["reference"] = references[-1]
         draft.reasons.append(f"topics.reference = {references[-1]}: by its name; results are scored against it, never estimated from it.")
     if not {"joint_states", "odometry"} & draft.topics.keys():
-        draft.missing.append("wheels: the log has neither joint states nor the driver's odometry. Record one of them.")
+        odometries = ", ".join(topic for topic, (type_, _) in survey.topics.items() if type_ == TYPES["odometry"])
+        why = (
+            f" ({odometries}: by the names references or filters, not the driver's; else name it with --topic.odometry)"
+            if odometries
+            else ""
+        )
+        draft.missing.append(f"wheels: the log has neither joint states nor the driver's odometry{why}. Record one of them.")
     if not {"scan", "points"} & draft.topics.keys():
         draft.missing.append("LiDAR: none in the log; without it or a gyro nothing measures slip.")
     if "imu" not in draft.topics:
@@ -350,6 +357,11 @@ def _choose_geometry(
             name,
             [(getattr(given, name), "given"), (of_urdf, of), (None if like is None else getattr(like, name), of_like)],
         )
+    if urdf is not None and not urdf.has_one_axle and urdf.arms_kg < _LIGHT_ARMS * urdf.mass_kg:
+        x, y = urdf.cg
+        reason = f"the URDF's <inertial>s, from the middle of the wheels, +- {TYPICAL.com_m:g} m"
+        draft.choose("cg_x_m", [(None if is_tipping(urdf) else x, reason)])
+        draft.choose("cg_y_m", [(None if urdf.cg_doubt_m else y, reason)])
     _choose_radius(draft, given.wheel_radius_m, _described(urdf, controllers, "wheel_radius_m"), fit, of_log)
     _choose_track(draft, given.track_width_m, urdf, controllers, fit)
     for name in ("wheel_radius_m", "track_width_m"):
@@ -487,7 +499,8 @@ def _mount(rotation: FloatArray, translation: FloatArray) -> Mount:
 def finish_robot(draft: Draft, given: Given, default_name: str) -> Robot:
     """The robot of a ``draft`` that has radius, track and wheelbase."""
     v = draft.values
-    geometry = Geometry(v["wheel_radius_m"], v["track_width_m"], v["wheelbase_m"], v.get("mass_kg", 50.0))
+    lengths = v["wheel_radius_m"], v["track_width_m"], v["wheelbase_m"]
+    geometry = Geometry(*lengths, v.get("mass_kg", 50.0), cg_x_m=v.get("cg_x_m", 0.0), cg_y_m=v.get("cg_y_m", 0.0))
     driver = Driver(v.get("driver_wheel_radius_m", v["wheel_radius_m"]), v["track_width_m"], v.get("wheel_separation_multiplier", 1.0))
     drive = given.drive or (given.like.drive if given.like is not None else (DIFF_DRIVE if draft.is_diff_drive else "skid_steer"))
     robot = Robot(given.name or default_name, geometry, driver, drive, mounts=draft.mounts)

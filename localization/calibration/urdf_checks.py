@@ -20,10 +20,6 @@ KIND_NOTES = {
 }
 _LATERAL = 0.7
 """Least component along y of a wheel's axis."""
-_SYMMETRIC_M = 0.02
-"""Difference of the sides' distances from the middle up to which a robot is symmetric [m]."""
-_OFF_MIDDLE = 0.05
-"""Distance of a symmetric robot's centre of gravity from its middle over the track from which it is doubted."""
 _OFF_BODY = 0.1
 """Distance of the wheels' middle from the body frame over track or wheelbase from which it is named."""
 
@@ -65,7 +61,7 @@ def check_urdf(urdf: WheelGeometry, values: Mapping[str, float], measured: Wheel
     _check_axes(found, urdf, measured)
     _check_radii(found, urdf, values)
     _check_body_frame(found, urdf)
-    _check_center_of_gravity(found, urdf, values.get("track_width_m", urdf.track_width_m))
+    _check_center_of_gravity(found, urdf)
     return found
 
 
@@ -106,27 +102,29 @@ def _check_body_frame(found: Findings, urdf: WheelGeometry) -> None:
         )
 
 
-def _check_center_of_gravity(found: Findings, urdf: WheelGeometry, track: float) -> None:
+def _check_center_of_gravity(found: Findings, urdf: WheelGeometry) -> None:
     """Doubt masses off the middle of symmetric wheels, or outside of the wheels."""
     ahead, aside = urdf.cg
-    if not math.isfinite(aside):
-        return
-    ys = sorted(y for _, y in urdf.positions.values())
-    is_symmetric = all(abs(a + b - ys[0] - ys[-1]) < _SYMMETRIC_M for a, b in zip(ys, reversed(ys), strict=True))
-    if is_symmetric and abs(aside) > _OFF_MIDDLE * track:
-        quantity, value = "centre of gravity, y", f"{aside:+.3f} m"
+    if urdf.cg_doubt_m > 0.0:
         found.contradictions.append(
-            Contradiction(quantity, "the URDF's <inertial>s", value, "cannot measure it; wheels are symmetric: 0 m")
+            Contradiction(
+                "centre of gravity, y", "the URDF's <inertial>s", f"{aside:+.3f} m", "cannot measure it; wheels are symmetric: 0 m"
+            )
         )
         side = "left" if aside > 0.0 else "right"
         found.missing.append(
             f"centre of gravity: the URDF's masses have it {100.0 * abs(aside):.0f} cm off the middle of a symmetric robot "
-            f"(to the {side}): check <inertial> of the body (axes swapped?). "
-            f"cg_y_m = 0 +- {abs(aside):.2f} m is taken, instead of +- 0.005 m."
+            f"(to the {side}): check <inertial> of the body (axes swapped?). cg_y_m = 0 is written, which is +- {abs(aside):.2f} m "
+            "until the robot is weighed (`skidloc cg`), not +- 0.005 m."
         )
-    if not urdf.has_one_axle and abs(ahead) > urdf.wheelbase_m / 2.0:
+    if is_tipping(urdf):
         where = "ahead of the front" if ahead > 0.0 else "behind the rear"
         found.missing.append(
             f"centre of gravity: the URDF's masses have it {100.0 * abs(ahead):.0f} cm from the middle of the wheels, {where} axle, "
-            "where the robot tips over: check <inertial>. cg_x_m = 0 is taken."
+            "where the robot tips over: check <inertial>. cg_x_m = 0 is written."
         )
+
+
+def is_tipping(urdf: WheelGeometry) -> bool:
+    """Whether the centre of gravity of a robot of several axles is not between them."""
+    return not urdf.has_one_axle and abs(urdf.cg[0]) > urdf.wheelbase_m / 2.0

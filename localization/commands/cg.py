@@ -16,8 +16,9 @@ from localization.output import check_outputs
 from motion_models.center_of_gravity.files import arms_model, arms_postures, weighed_cg
 from motion_models.center_of_gravity.model import Posture, parse_postures, static_part_from_weighing
 from motion_models.center_of_gravity.parts import Arms, CgEstimate, Payload, StaticPart, require_support
+from motion_models.center_of_gravity.urdf_wheels import wheel_geometry
 from motion_models.center_of_gravity.weighing import WHEELS, WeighedCg, read_weighings
-from motion_models.errors import CgError
+from motion_models.errors import CgError, RobotError
 from motion_models.friction import FrictionModel
 from motion_models.friction.contact import loads
 from motion_models.robot import Robot, load_robot
@@ -74,6 +75,14 @@ class Cg:
         else:
             estimate, static, steps = self._with_arms(robot, weighed)
             source += steps
+        doubt = 0.0 if weighed is not None or self.urdf is None else _doubt(self.urdf, self.base_link)
+        if doubt:
+            estimate = CgEstimate(estimate.position, estimate.covariance + np.diag([0.0, doubt**2]), estimate.mass)
+            print_line(
+                console,
+                f"! {self.urdf}: its masses have the body {100.0 * doubt:.0f} cm off the middle of a symmetric robot: check its <inertial> "
+                "(axes swapped?), or weigh it; +- of y is as large.",
+            )
         require_support(estimate.position, g.wheelbase_m, g.track_width_m)
         numbers = self._numbers(robot, estimate, weighed, static, source)
         _print(console, robot, estimate, weighed, static, numbers)
@@ -191,6 +200,14 @@ def _by_cg(model: SkidSteer, cg: FloatArray) -> FloatArray:
     _, k_1, k_2, _, x_cr_1, _, c_1, c_2, s_0, s_1, s_2 = model.nominal
     x, y = cg
     return np.array([[k_1 + 2 * k_2 * x, 0.0], [x_cr_1, 0.0], [c_1 + 2 * c_2 * x + (s_1 + 2 * s_2 * x) * y, s_0 + (s_1 + s_2 * x) * x]])
+
+
+def _doubt(urdf: Path, base_link: str) -> float:
+    """By how much the masses of a URDF are beside the middle of its symmetric wheels [m]; 0 where they are not, or wheels are not known."""
+    try:
+        return wheel_geometry(read_text(urdf), str(urdf), base_link).cg_doubt_m
+    except RobotError:
+        return 0.0
 
 
 def _named(postures: dict[str, Posture], name: str) -> Posture:

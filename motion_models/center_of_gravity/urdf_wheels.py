@@ -6,6 +6,7 @@ is: a joint that turns without end about the lateral axis, at the ground, with n
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 import statistics
@@ -47,6 +48,8 @@ _SAME_RADIUS = 1.1
 """Ratio of radii up to which wheels are alike."""
 _ROLLERS = 3
 """Least number of turning joints behind a wheel that are its rollers, not a wheel behind its suspension."""
+_OFF_MIDDLE = 0.05
+"""Distance of a centre of gravity from the middle over the track from which it is doubted: a battery on one side reaches 0.03."""
 _LONGEST_M = 20.0
 """Lengths above are not metres: the largest mining trucks are 15 m long."""
 
@@ -80,7 +83,9 @@ class WheelGeometry:
     positions: Mapping[str, tuple[float, float]]
     """x, y of each wheel's contact in the body frame [m]."""
     cg: tuple[float, float] = (math.nan, math.nan)
-    """x, y of the centre of gravity of all links from the middle of the wheels, joints at 0 [m]."""
+    """x, y of the body's centre of gravity, wheels included and arms not, from the middle of the wheels [m]."""
+    arms_kg: float = 0.0
+    """Mass of links that move and are no wheels, which are not in ``cg``."""
     controllers: tuple[ControllerValues, ...] = ()
     """Of <plugin> and <ros2_control>."""
     has_shapes: bool = True
@@ -107,6 +112,13 @@ class WheelGeometry:
         """x, y of the middle of the driven wheels in the body frame [m]."""
         x, y = zip(*self.positions.values(), strict=True)
         return (min(x) + max(x)) / 2.0, (min(y) + max(y)) / 2.0
+
+    @property
+    def cg_doubt_m(self) -> float:
+        """Distance of the centre of gravity from the middle of symmetric wheels where its masses are doubted, else 0."""
+        ys = sorted(y for _, y in self.positions.values())
+        is_symmetric = bool(ys) and all(abs(a + b - ys[0] - ys[-1]) < _SAME_M for a, b in zip(ys, reversed(ys), strict=True))
+        return abs(self.cg[1]) if is_symmetric and abs(self.cg[1]) > _OFF_MIDDLE * self.track_width_m else 0.0
 
 
 def is_wheel(name: str) -> bool:
@@ -158,7 +170,6 @@ def wheel_geometry(text: str, source: str, base_link: str = "base_link") -> Whee
         wheelbase_m=wheelbase if wheelbase > _SAME_M else math.nan,
         mass_kg=mass,
         positions=positions,
-        cg=_center_of_gravity(urdf, poses, positions) if math.isfinite(mass) else (math.nan, math.nan),
         controllers=controllers,
         has_shapes=bool(radii),
         radii=tuple(sorted(set(radii))),
@@ -168,7 +179,11 @@ def wheel_geometry(text: str, source: str, base_link: str = "base_link") -> Whee
         has_names=found.has_names,
     )
     _check_metres(geometry, source)
-    return geometry
+    if not math.isfinite(mass):
+        return geometry
+    body = _body_links(urdf, [wheel.name for wheel in (*driven, *passive)])
+    arms = sum(link.mass for name, link in urdf.links.items() if name not in body)
+    return dataclasses.replace(geometry, cg=_center_of_gravity(urdf, poses, body, geometry.middle), arms_kg=arms)
 
 
 def _check_metres(geometry: WheelGeometry, source: str) -> None:
@@ -335,12 +350,23 @@ def _mass(urdf: Urdf) -> float:
     return sum(link.mass for link in urdf.links.values())
 
 
+def _body_links(urdf: Urdf, wheels: Sequence[str]) -> set[str]:
+    """Links that are the body's: fixed to it, its ``wheels`` (joints), and what carries them."""
+    above = {joint.child: joint for joint in urdf.joints}
+    own = {*wheels}
+    for joint in reversed(urdf.joints):  # children come before their parents
+        if joint.name in own and joint.parent in above:
+            own.add(above[joint.parent].name)
+    links = {urdf.root}
+    links.update(joint.child for joint in urdf.joints if joint.parent in links and (not joint.moves or joint.name in own))
+    return links
+
+
 def _center_of_gravity(
-    urdf: Urdf, poses: Mapping[str, tuple[FloatArray, FloatArray]], wheels: Mapping[str, tuple[float, float]]
+    urdf: Urdf, poses: Mapping[str, tuple[FloatArray, FloatArray]], body: set[str], middle: tuple[float, float]
 ) -> tuple[float, float]:
-    """x, y [m] of all links' masses in the body frame, from the middle of the wheels."""
-    masses = {name: link.mass for name, link in urdf.links.items() if link.mass > 0.0}
+    """x, y [m] of the masses of the ``body``'s links, from the ``middle`` (x, y in the body frame)."""
+    masses = {name: urdf.links[name].mass for name in body if urdf.links[name].mass > 0.0}
     moment = sum((m * (poses[n][1] + poses[n][0] @ urdf.links[n].com) for n, m in masses.items()), start=np.zeros(3))
-    com = moment / sum(masses.values())
-    middle = np.mean([[min(v), max(v)] for v in zip(*wheels.values(), strict=True)], axis=1)
-    return float(com[0] - middle[0]), float(com[1] - middle[1])
+    x, y, _ = moment / sum(masses.values())
+    return float(x - middle[0]), float(y - middle[1])

@@ -105,6 +105,7 @@ class Kind:
     radius: float | None = 0.1
     wheelbase: float | None = 0.4
     drive: str = "skid_steer"
+    cg: tuple[float, float] = (0.0, 0.0)
     named: tuple[str, ...] = ()
     """Parts of the sentences and of the table of contradictions."""
 
@@ -326,6 +327,11 @@ KINDS = {
         ),
         ("roue_avg", "roue_arg"),
     ),
+    "body behind the middle": Kind(urdf(wheels(), base=link("base_link", 20.0, "-0.06 0.01 0")), cg=(-0.05, 0.0083)),
+    "arm of a heavy robot": Kind(
+        urdf(wheels(), link("arm", 15.0, "0 0.3 0"), joint("shoulder", "arm", kind="revolute"), base=link("base_link", 20.0, "-0.06 0 0")),
+    ),
+    "body ahead of the front axle": Kind(urdf(wheels(), base=link("base_link", 90.0, "0.3 0 0")), named=("the robot tips over",)),
     "inertial in a turned child": Kind(
         urdf(wheels(), link("body", 30.0, "0.05 0 0"), joint("turned", "body", rpy="0 0 1.5708")), named=("off the middle",)
     ),
@@ -410,7 +416,9 @@ def test_init_of_a_kind_of_urdf_is_right_or_named(kind: Kind, tmp_path: Path) ->
     for name, value in expected.items():
         assert found.values.get(name) == (None if value is None else pytest.approx(value, abs=1e-3)), name
     if None not in expected.values():
-        assert finish_robot(found, Given(), "r").drive == kind.drive
+        robot = finish_robot(found, Given(), "r")
+        assert robot.drive == kind.drive
+        assert robot.center_of_gravity == pytest.approx(kind.cg, abs=1e-3)
     named = "\n".join((*found.reasons, *found.missing, *map(str, found.contradictions)))
     assert [part for part in kind.named if part not in named] == []
     assert kind.named or (gaps(found), found.contradictions) == ([], [])

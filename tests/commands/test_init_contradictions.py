@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 from localization.cli import main
-from motion_models.robot import Robot, load_robot
+from motion_models.robot import Robot, Topics, load_robot
 
 CASES = Path(__file__).parents[1] / "data" / "cases"
 BASE_LOG = CASES / "base-log" / "log.mcap"
@@ -52,6 +53,7 @@ def test_init_with_an_inverted_side_names_it_and_fits_the_radius(tmp_path: Path,
 def test_init_with_a_cg_beside_a_symmetric_robot_doubts_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     init(tmp_path, BASE_LOG, "--urdf", str(CASES / "H10-urdf-base-inertial-axes-swapped" / "robot.urdf"))
     printed = capsys.readouterr().out
+    assert load_robot(tmp_path / "r.toml").geometry.cg_y_m == 0.0
     assert "8 cm off the middle of a symmetric robot (to the right): check" in printed
     assert "0.165 m (R^2" in printed  # the URDF has 0.1 m
 
@@ -79,3 +81,16 @@ def test_init_with_a_yaml_without_controller_is_refused(text: str, tmp_path: Pat
     (tmp_path / "c.yaml").write_text(text)
     assert main(["init", str(BASE_LOG), "--out", str(tmp_path / "r.toml"), "--controller", str(tmp_path / "c.yaml")]) == 2
     assert capsys.readouterr().err.count("--controller") == 1
+
+
+def test_cg_of_a_urdf_with_swapped_axes_has_a_wide_sigma(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    urdf = CASES / "H10-urdf-base-inertial-axes-swapped" / "robot.urdf"
+    assert main(["cg", "--robot", "husky_a200", "--urdf", str(urdf), "--json", str(tmp_path / "cg.json")]) == 0
+    assert json.loads((tmp_path / "cg.json").read_text())["sigma_m"] == pytest.approx([0.005, 0.078], abs=1e-3)
+    assert "8 cm off the middle of a symmetric robot" in capsys.readouterr().out
+
+
+def test_init_of_a_log_with_ground_truth_alone_takes_no_wheels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    robot = init(tmp_path, BASE_LOG, "--track-width-m", "0.57", "--wheelbase-m", "0.51")
+    assert (robot.topics.reference, robot.topics.odometry) == ("/ground_truth/odom", Topics().odometry)
+    assert "topics.odometry" not in capsys.readouterr().out
