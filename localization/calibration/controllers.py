@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from motion_models.center_of_gravity.drive_controllers import ControllerValues, controller_values
+from motion_models.center_of_gravity.drive_controllers import ControllerValues, controller_values, drive_kinds
 from motion_models.errors import RobotError
 from motion_models.text_files import read_text
 
@@ -23,10 +24,18 @@ def read_controllers(path: Path) -> tuple[ControllerValues, ...]:
         raise RobotError(f"--controller '{path}' cannot be read as YAML: {first}.") from error
     found = tuple(_controllers(content, path.name, 0))
     if not found:
+        kinds = controller_kinds(path)
+        of = f" (it is of {', '.join(kinds)})" if kinds else ""
         raise RobotError(
-            f"--controller '{path}' has no wheel_separation and no wheel_radius; give the parameters of diff_drive_controller or the like."
+            f"--controller '{path}' has no wheel_separation and no wheel_radius{of}; give those of diff_drive_controller or the like."
         )
     return found
+
+
+def controller_kinds(path: Path) -> tuple[str, ...]:
+    """Kinds of wheels that no differential drive has, by the names of controllers and types in a YAML file that can be read."""
+    lines = (line.partition("#")[0] for line in read_text(path).splitlines())
+    return drive_kinds(line for line in lines if re.search("controller|drive|plugin|type", line, re.IGNORECASE))
 
 
 def _controllers(content: Any, where: str, depth: int) -> Iterator[ControllerValues]:

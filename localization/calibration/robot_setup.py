@@ -14,15 +14,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from localization.calibration.controllers import read_controllers
-from localization.calibration.urdf_checks import Contradiction, check_urdf, is_tipping
+from localization.calibration.controllers import controller_kinds, read_controllers
+from localization.calibration.urdf_checks import KIND_NOTES, Contradiction, check_urdf, is_tipping
 from localization.calibration.wheel_fit import MIN_R2, DriverFit, Motion, WheelSides, fit_wheels, is_moving, read_motion, wheel_sides
 from localization.logs.chunks import RawMessage, merge_channels
 from localization.logs.decode import UnusableError, frame_name
 from localization.logs.reader import open_log, open_source
 from localization.logs.serialization import LogDeserializer
 from localization.logs.topic_roles import TYPES, TopicOverrides
-from motion_models.center_of_gravity.drive_controllers import ControllerValues
+from motion_models.center_of_gravity.drive_controllers import TRACKS, ControllerValues
 from motion_models.center_of_gravity.parts import TYPICAL
 from motion_models.center_of_gravity.urdf import link_poses, parse_urdf
 from motion_models.center_of_gravity.urdf_wheels import WheelGeometry, is_wheel, sides, wheel_geometry
@@ -173,6 +173,9 @@ def draft_robot(survey: Survey, given: Given, path: Path) -> Draft:
         draft.reasons += findings.reasons
         draft.missing += findings.missing
         draft.contradictions += findings.contradictions
+    if given.controller is not None:
+        kinds = [kind for kind in controller_kinds(given.controller) if urdf is None or kind not in urdf.kinds]
+        draft.missing += [f"{kind}, by {given.controller.name}: {KIND_NOTES[kind]}" for kind in kinds]
     _choose_mounts(draft, survey, {} if text is None else _urdf_mounts(text, given))
     return draft
 
@@ -311,8 +314,9 @@ def _choose_joints(draft: Draft, survey: Survey, given: Given, candidates: list[
     if measured is not None and not (given.left and given.right):
         agreeing = [c for c in of_log if _same(c, measured)]
         chosen = agreeing[-1] if agreeing else Sides(measured.left, measured.right, "by the log's motion alone")
-    elif of_log and all(_same(c, of_log[0]) for c in of_log):
-        chosen = of_log[0] if of_log[0].reason == "given" else next((c for c in of_log if c.reason.startswith("by the sides")), of_log[0])
+    elif of_log and of_log[0].reason != "given":
+        # What most sources have; of those that agree, the positions explain more than names.
+        chosen = max(of_log, key=lambda c: (sum(_same(c, other) for other in of_log), c.reason.startswith("by the sides")))
     if chosen is None:
         if names:
             draft.missing.append(f"wheel joints: none of {', '.join(names)} is a left or right wheel by name; give --left and --right.")
@@ -320,10 +324,9 @@ def _choose_joints(draft: Draft, survey: Survey, given: Given, candidates: list[
     draft.joints = Joints(chosen.left, chosen.right)
     draft.reasons.append(f"joints: left {', '.join(chosen.left)}; right {', '.join(chosen.right)}: {chosen.reason}.")
     by_log = "cannot decide" if measured is None else f"left {', '.join(measured.left)}"
-    reference = chosen if measured is None else measured
-    wrong = [c for c in of_log if not _same(c, reference)]
+    wrong = [c for c in of_log if not _same(c, chosen if measured is None else measured)]
     draft.contradictions += [Contradiction("left wheels", c.reason, ", ".join(c.left), by_log) for c in wrong]
-    if wrong and measured is None:
+    if wrong and measured is None and chosen.reason != "given":
         draft.missing.append(
             "sides: the sources contradict each other and the log does not decide; drive a turn, or give --left and --right."
         )
@@ -357,7 +360,8 @@ def _choose_geometry(
             name,
             [(getattr(given, name), "given"), (of_urdf, of), (None if like is None else getattr(like, name), of_like)],
         )
-    if urdf is not None and not urdf.has_one_axle and urdf.arms_kg < _LIGHT_ARMS * urdf.mass_kg:
+    has_axles = urdf is not None and not urdf.has_one_axle and TRACKS not in urdf.kinds  # of tracks no wheel is in the middle
+    if urdf is not None and has_axles and urdf.arms_kg < _LIGHT_ARMS * urdf.mass_kg:
         x, y = urdf.cg
         reason = f"the URDF's <inertial>s, from the middle of the wheels, +- {TYPICAL.com_m:g} m"
         draft.choose("cg_x_m", [(None if is_tipping(urdf) else x, reason)])

@@ -60,7 +60,9 @@ def check_urdf(urdf: WheelGeometry, values: Mapping[str, float], measured: Wheel
         found.missing.append(f"wheels: {left} on the left, but {right} on the right; the models here have as many on both sides.")
     _check_axes(found, urdf, measured)
     _check_radii(found, urdf, values)
-    _check_body_frame(found, urdf)
+    if TRACKS not in urdf.kinds:  # of tracks no sprocket need be in the middle
+        _check_body_frame(found, urdf)
+    _check_controllers(found, urdf)
     _check_center_of_gravity(found, urdf)
     return found
 
@@ -89,6 +91,14 @@ def _check_radii(found: Findings, urdf: WheelGeometry, values: Mapping[str, floa
         radii, used = (", ".join(f"{radius:.4g} m" for radius in urdf.radii)), values.get("wheel_radius_m")
         taken = "none is taken" if used is None else f"{used:.4g} m is taken"
         found.contradictions.append(Contradiction("wheel_radius_m", "the URDF's wheels differ", radii, taken))
+
+
+def _check_controllers(found: Findings, urdf: WheelGeometry) -> None:
+    """Name joints that a <plugin> drives and that are no wheels of the URDF."""
+    for controller in urdf.controllers:
+        others = [name for name in (*controller.left, *controller.right) if name not in urdf.positions]
+        if others and TRACKS not in urdf.kinds:
+            found.contradictions.append(Contradiction("wheels", controller.source, first_names(others), "no wheels of the URDF"))
 
 
 def _check_body_frame(found: Findings, urdf: WheelGeometry) -> None:
@@ -127,4 +137,4 @@ def _check_center_of_gravity(found: Findings, urdf: WheelGeometry) -> None:
 
 def is_tipping(urdf: WheelGeometry) -> bool:
     """Whether the centre of gravity of a robot of several axles is not between them."""
-    return not urdf.has_one_axle and abs(urdf.cg[0]) > urdf.wheelbase_m / 2.0
+    return not urdf.has_one_axle and TRACKS not in urdf.kinds and abs(urdf.cg[0]) > urdf.wheelbase_m / 2.0

@@ -14,7 +14,7 @@ _RIGHT_KEYS = ("right_wheel_names", "right_wheel", "right_joint", "rightjoint", 
 MECANUM, OMNI, TRACKS, STEERED, CASTERS = "mecanum wheels", "omnidirectional wheels", "tracks", "steered wheels", "casters"
 _KINDS = {
     MECANUM: re.compile(r"mecanum", re.IGNORECASE),
-    OMNI: re.compile(r"omni.*(wheel|roller)|(wheel|roller).*omni|swerve|planar_move", re.IGNORECASE),
+    OMNI: re.compile(r"omni.*(wheel|roller|drive|direction)|(wheel|roller).*omni|swerve|planar_move", re.IGNORECASE),
     TRACKS: re.compile(
         r"(^|[_\-/])(l|r|left|right)_?(track|crawler|tread|belt)s?([_\-/.]|$)|(^|[_\-/])(track|crawler|tread|belt)s?_?(l|r|left|right)([_\-/.]|$)"
         r"|track(ed_?vehicle|_?controller)|sprocket",

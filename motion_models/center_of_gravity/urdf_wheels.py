@@ -35,6 +35,8 @@ from motion_models.se2 import FloatArray
 _WHEEL = re.compile(r"wheel|tire|tyre|whl|sprocket", re.IGNORECASE)
 _CASTER = re.compile(r"caster|castor|swivel|ball_?wheel", re.IGNORECASE)
 _PASSIVE = re.compile(rf"{_CASTER.pattern}|roller|(?<!skid)(?<!skid[_\-])steer", re.IGNORECASE)
+_LIMB = re.compile(r"shoulder|elbow|wrist|ankle|flipper|gripper|finger|propell|(^|[_\-/])(arm|hip|knee|leg|head|neck)", re.IGNORECASE)
+"""Joints that turn about lateral axes and are no wheels."""
 _LEFT = re.compile(r"left|(^|[_\-/])(l|fl|rl|bl|ml|cl|lf|lr|lb|lm)([_\-/]|$)", re.IGNORECASE)
 _RIGHT = re.compile(r"right|(^|[_\-/])(r|fr|rr|br|mr|cr|rf|rb|rm)([_\-/]|$)", re.IGNORECASE)
 _TURNING = ("revolute", "continuous")
@@ -50,6 +52,8 @@ _ROLLERS = 3
 """Least number of turning joints behind a wheel that are its rollers, not a wheel behind its suspension."""
 _OFF_MIDDLE = 0.05
 """Distance of a centre of gravity from the middle over the track from which it is doubted: a battery on one side reaches 0.03."""
+_FULL_TURN = 6.2
+"""Range [rad] from which a joint turns without end: 3.14 to each side is meant so."""
 _LONGEST_M = 20.0
 """Lengths above are not metres: the largest mining trucks are 15 m long."""
 
@@ -271,9 +275,8 @@ class _Finder:
             return named, True
         driven = [j for j in turning if j.name in commanded]
         if not driven:
-            driven = [
-                j for j in turning if abs(self._axis(j)[1]) > _ALONG and not any(map(self._is_part_of_arm, (j, *self._above[j.name])))
-            ]
+            lateral = [j for j in turning if abs(self._axis(j)[1]) > _ALONG and not _LIMB.search(f"{j.name}/{j.child}")]
+            driven = [j for j in lateral if not any(map(self._is_part_of_arm, (j, *self._above[j.name])))]
         if driven:
             return driven, False
         return [
@@ -312,8 +315,8 @@ class _Finder:
 
 
 def _turns(joint: Joint) -> bool:
-    """Whether a joint turns by more than a full turn."""
-    return joint.kind == "continuous" or (joint.kind == "revolute" and not joint.upper - joint.lower < 2.0 * math.pi)
+    """Whether a joint turns by a full turn or more."""
+    return joint.kind == "continuous" or (joint.kind == "revolute" and joint.upper - joint.lower >= _FULL_TURN)
 
 
 def _on_ground(wheels: list[_Wheel]) -> list[_Wheel]:

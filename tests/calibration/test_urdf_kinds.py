@@ -169,6 +169,27 @@ KINDS = {
         urdf(wheels(), plugin("gz-sim-diff-drive-system", left_joint=LEFT, right_joint=RIGHT, wheel_separation="0.6", wheel_radius="0.1")),
         named=("track_width_m", "0.6 m"),
     ),
+    "plugin with sides swapped": Kind(
+        urdf(wheels(), plugin("gz-sim-diff-drive-system", left_joint=RIGHT, right_joint=LEFT, wheel_separation="0.5", wheel_radius="0.1")),
+        named=("left wheels",),
+    ),
+    "plugin of another robot": Kind(
+        urdf(wheels(), plugin("gz-sim-diff-drive-system", left_joint="a", right_joint="b", wheel_separation="0.5", wheel_radius="0.1")),
+        named=("no wheels of the URDF",),
+    ),
+    "revolute by 3.14 to each side": Kind(
+        urdf(wheels(kind="revolute", more='<limit lower="-3.14" upper="3.14" effort="1" velocity="1"/>')),
+    ),
+    "sprockets and idlers": Kind(
+        urdf(
+            wheels({"left_sprocket": (0.3, 0.2), "right_sprocket": (0.3, -0.2)}),
+            wheels({f"{s}_idler_{i}": (-0.1 * i, y) for s, y in (("left", 0.2), ("right", -0.2)) for i in range(4)}, radius=0.05),
+        ),
+        ("left_sprocket",),
+        track=0.4,
+        wheelbase=None,
+        named=("tracks",),
+    ),
     "mecanum plugin": Kind(
         urdf(
             wheels(),
@@ -377,6 +398,22 @@ KINDS = {
 }
 
 REFUSED = {
+    "two arms": (
+        urdf(*(link(f"{s}_arm") + joint(f"{s}_shoulder", f"{s}_arm", f"0 {y} 0", "continuous") for s, y in (("l", 0.2), ("r", -0.2)))),
+        "moving joints are l_shoulder, r_shoulder",
+    ),
+    "swerve": (
+        urdf(
+            *(
+                link(f"{n}_module")
+                + joint(f"{n}_azimuth", f"{n}_module", f"{x} {y} 0", "continuous", "0 0 1")
+                + wheel(n, 0.0, 0.0, parent=f"{n}_module")
+                for n, (x, y) in FOUR.items()
+            )
+        ),
+        "omnidirectional wheels",
+    ),
+    "radius with a unit": (urdf(wheels(shape=CYLINDER.replace("{radius}", "0.1m"))), "must be a finite number, found '0.1m'"),
     "tracks without plugin": (
         urdf(link("left_track"), joint("lt", "left_track", "0 0.3 0"), link("right_track"), joint("rt", "right_track", "0 -0.3 0")),
         "tracks",

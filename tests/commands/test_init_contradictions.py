@@ -94,3 +94,19 @@ def test_init_of_a_log_with_ground_truth_alone_takes_no_wheels(tmp_path: Path, c
     robot = init(tmp_path, BASE_LOG, "--track-width-m", "0.57", "--wheelbase-m", "0.51")
     assert (robot.topics.reference, robot.topics.odometry) == ("/ground_truth/odom", Topics().odometry)
     assert "topics.odometry" not in capsys.readouterr().out
+
+
+_STEERING = "type: ackermann_steering_controller/AckermannSteeringController\n"
+_MECANUM = "mecanum_drive_controller: {ros__parameters: {kinematics: {wheels_radius: 0.1}}}\n"
+
+
+def test_init_with_a_steering_controller_names_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "control.yaml").write_text(_STEERING + _CONTROLLER)
+    init(tmp_path, BASE_LOG, "--controller", str(tmp_path / "control.yaml"), "--wheelbase-m", "0.51")
+    assert "steered wheels, by control.yaml: steering is not modelled" in capsys.readouterr().out
+
+
+def test_init_with_a_mecanum_controller_is_refused_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "control.yaml").write_text(_MECANUM)
+    assert main(["init", str(BASE_LOG), "--out", str(tmp_path / "r.toml"), "--controller", str(tmp_path / "control.yaml")]) == 2
+    assert "it is of mecanum wheels" in " ".join(capsys.readouterr().err.split())
