@@ -7,7 +7,8 @@ from motion_models import exports
 if TYPE_CHECKING:
     from localization.estimators import ESTIMATORS, EstimatorConfig
     from localization.evaluation.metrics import Accuracy, evaluate
-    from localization.evaluation.references import read_reference_file, reference_track
+    from localization.evaluation.reference_files import read_reference_file
+    from localization.evaluation.references import reference_track
     from localization.evaluation.scores import Result, score
     from localization.logs import Log, TopicOverrides, open_log
     from localization.pipeline import ReplayConfig, Run, Trial, replay
@@ -37,7 +38,8 @@ __all__ = [
 _MODULES = {
     "localization.estimators": "ESTIMATORS EstimatorConfig",
     "localization.evaluation.metrics": "Accuracy evaluate",
-    "localization.evaluation.references": "read_reference_file reference_track",
+    "localization.evaluation.reference_files": "read_reference_file",
+    "localization.evaluation.references": "reference_track",
     "localization.evaluation.scores": "Result score",
     "localization.logs": "Log TopicOverrides open_log",
     "localization.pipeline": "ReplayConfig Run Trial replay",

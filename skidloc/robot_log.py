@@ -16,7 +16,8 @@ import numpy as np
 
 from localization.errors import EvaluationError
 from localization.estimators import check_estimator
-from localization.evaluation.references import ReferenceTrack, Relations, read_reference_file, reference_track
+from localization.evaluation.reference_files import load_reference
+from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result, score
 from localization.logs import Log, TopicOverrides, open_log
 from localization.pipeline import ReplayConfig, Trial, replay
@@ -63,7 +64,8 @@ class RobotLog:
     ) -> Runs:
         """Replay the log once for each MODEL/ESTIMATOR of ``pairs`` and score the runs.
 
-        ``reference`` is a topic of the log, a file (.tum, .relations) or a track; by default the robot file's topic, if the log has it.
+        ``reference`` is a topic of the log, a file (as for `skidloc replay`) or a track; by default the robot
+        file's topic, if the log has it.
         Raises `ModelError` or `EstimatorError` for unknown names, `EvaluationError` for a reference that shares no time with the log.
         """
         trials = [self._trial(pair) for pair in pairs]
@@ -82,13 +84,7 @@ class RobotLog:
         if isinstance(given, ReferenceTrack | Relations):
             return given
         name = self.log.reference_topic if given is None else str(given)
-        if name is None:
-            return None
-        if name in self.log.types:
-            return reference_track(self.log.references(name), name)
-        if not Path(name).exists():
-            raise EvaluationError(f"no reference '{name}': neither a topic of {self.log.path.name} nor a file.")
-        return read_reference_file(name)
+        return None if name is None else load_reference(self.log, name)
 
     def __repr__(self) -> str:
         return f"<RobotLog {self.log.path.name}: {self.robot.name}, {self.log.duration_s:.0f} s{', LiDAR' if self.has_lidar else ''}>"

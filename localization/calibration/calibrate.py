@@ -14,7 +14,8 @@ import numpy as np
 from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, MotionReference, TrackMotionReference
 from localization.calibration.windows import WindowConfig, cut
 from localization.errors import EvaluationError
-from localization.evaluation.references import ReferenceTrack, read_reference_file, reference_track
+from localization.evaluation.reference_files import load_reference
+from localization.evaluation.references import ReferenceTrack
 from localization.logs import Log, TopicOverrides, open_log
 from localization.trajectory import BoolArray
 from motion_models.base import MotionModel
@@ -165,12 +166,10 @@ def _track(log: Log, reference: str | None) -> ReferenceTrack:
     name = reference if reference is not None else log.reference_topic
     if name is None:
         raise CalibrationError(f"{log.path.name} has no reference topic {log.robot.topics.reference}; name one with --reference.")
-    if name not in log.types and Path(name).is_file():
-        found = read_reference_file(name)
-        if not isinstance(found, ReferenceTrack):
-            raise EvaluationError(f"'{name}' holds relations; calibration needs a trajectory with headings (TUM) or a topic.")
-        return found
-    return reference_track(log.references(name), name)
+    found = load_reference(log, name)
+    if not isinstance(found, ReferenceTrack):
+        raise EvaluationError(f"'{name}' holds relations; calibration needs a trajectory with headings (TUM) or a topic.")
+    return found
 
 
 def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequence[str] = (), of_rotations: bool = False) -> Calibrated:

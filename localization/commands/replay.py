@@ -23,12 +23,12 @@ from localization.calibration.wheel_wiring import open_checked
 from localization.commands.common import WIDE, names, new_folder, print_table, write_json
 from localization.errors import EstimatorError, EvaluationError
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, LOCALIZER, PriorMap, check_estimator
+from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import (
     ReferenceTrack,
     Relations,
     describe_instant,
     no_overlap_message,
-    read_reference_file,
     reference_track,
     with_noise,
 )
@@ -77,7 +77,8 @@ class Replay:
     changing constants), cg_field (their regressions on the centre of gravity, kept from posture to posture), or single ones by name,
     joined by + (the friction model's: mu_ratio, tracked_x, tracked_y, warp, cg_offset_x, cg_offset_y; as constant+cg_offset_x)."""
     reference: str | None = None
-    """Topic of the log, or file (.tum, .relations), to score against; `none` for no score. Default: the robot file's topic, if any."""
+    """Topic of the log, or file (TUM, EuRoC, KITTI, CSV with a header, g2o, GPX, NMEA, .relations), to score against; `none` for no
+    score. Default: the robot file's topic, if any."""
     reference_sigma: tuple[float, float] | None = None
     """Noise of the poses of a reference without covariances [m, deg], as 0.02 0.5: without it the NEES assumes an exact reference."""
     positions: str | None = None
@@ -199,15 +200,10 @@ class Replay:
             if self.reference_sigma is not None:
                 raise EvaluationError("--reference-sigma is the noise of a reference, and there is none. Name one with --reference.")
             return None
-        if name in log.types:
-            samples = itertools.islice(log.references(name), 1, None, 2) if self._is_held_out(log) else log.references(name)
-            found: ReferenceTrack | Relations = reference_track(samples, name)
-        elif Path(name).exists():
-            found = read_reference_file(name)
-        elif name.startswith("/") and not Path(name).parent.is_dir():
-            found = reference_track(log.references(name), name)  # raises, and lists what there is
+        if self._is_held_out(log) and name in log.types:
+            found: ReferenceTrack | Relations = reference_track(itertools.islice(log.references(name), 1, None, 2), name)
         else:
-            raise EvaluationError(f"no reference '{name}': neither a topic of {log.path.name} nor a file. `skidloc info` lists the topics.")
+            found = load_reference(log, name)
         check_overlap(found, log)
         if self.reference_sigma is None:
             return found
@@ -248,7 +244,8 @@ class Replay:
         }
 
     def _print(self, console: Console, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
-        for note in head.warnings:
+        of_reference = reference.warnings if isinstance(reference, ReferenceTrack) else ()
+        for note in dict.fromkeys([*head.warnings, *map(as_text, of_reference)]):
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         print_table(console, accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
         console.print(verdict(results, reference), markup=False, soft_wrap=True)

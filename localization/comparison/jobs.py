@@ -21,7 +21,8 @@ from typing import Any, NamedTuple
 
 from localization.errors import EvaluationError, TransportError
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, check_estimator
-from localization.evaluation.references import ReferenceTrack, Relations, read_reference_file, reference_track
+from localization.evaluation.reference_files import load_reference
+from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import score
 from localization.logs import Log, TopicOverrides, open_log
 from localization.output import fingerprint, versions
@@ -152,13 +153,10 @@ def _scores(metrics: Mapping[str, Any]) -> Row:
 
 def _reference(log: Log, job: Job) -> ReferenceTrack | Relations:
     """Raises `EvaluationError` where there is none: without, there is nothing to compare."""
-    file = _reference_file(log.path, job.reference, job.folder)
-    if file is not None:
-        return read_reference_file(file)
-    topic = job.reference or log.reference_topic
-    if topic is None:
+    name = job.reference or log.reference_topic
+    if name is None:
         raise EvaluationError(f"{log.path.name} has no reference by the robot file's name; pass --reference.")
-    return reference_track(log.references(topic), topic)
+    return load_reference(log, name, _reference_file(log.path, job.reference, job.folder))
 
 
 def _reference_file(log: Path, name: str | None, folder: Path = Path()) -> Path | None:

@@ -7,7 +7,7 @@ the reference (a GPS antenna) and the robot's base is unknown and not removed; i
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -155,14 +155,12 @@ def match(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: float) -
             f"{inside} samples of {reference.source} lie within the trajectory's time, but only {np.count_nonzero(use)} of them between "
             f"poses at most {max_gap_s:g} s apart; {_MIN_MATCHES} are needed. Allow larger gaps if interpolation over them is good enough."
         )
-    part = ReferenceTrack(
-        reference.stamps_ns[use],
-        reference.positions[use],
-        None if reference.yaws is None else reference.yaws[use],
-        None if reference.covariances is None else reference.covariances[use],
-        reference.source,
-        reference.n_dropped,
-        reference.warnings,
+    part = replace(
+        reference,
+        stamps_ns=reference.stamps_ns[use],
+        positions=reference.positions[use],
+        yaws=None if reference.yaws is None else reference.yaws[use],
+        covariances=None if reference.covariances is None else reference.covariances[use],
     )
     return trajectory.at(part.stamps_ns), part
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -13,10 +12,10 @@ import numpy as np
 
 from localization.errors import EvaluationError
 from localization.events import Reference
-from localization.trajectory import IntArray, number_rows, parse_float, parse_seconds, tum_rows, yaw_of_quaternion
+from localization.trajectory import IntArray, number_rows, parse_float, parse_seconds
 from motion_models.se2 import FloatArray
 
-_RELATION_COLUMNS = ("t1", "t2", "dx", "dy", "dz", "droll", "dpitch", "dyaw")
+RELATION_COLUMNS = ("t1", "t2", "dx", "dy", "dz", "droll", "dpitch", "dyaw")
 
 
 _EPOCH_BEGINS_S = 1e8  # clocks below this (March 1973) count from the start of a run, not from 1970
@@ -40,6 +39,8 @@ class ReferenceTrack:
     """Samples left out because they were not finite or repeated a stamp."""
     warnings: tuple[str, ...] = ()
     """Remarks on this reference."""
+    has_times: bool = True
+    """False where the source has none, and the poses were spread over the log's scans."""
 
     @property
     def poses(self) -> FloatArray:
@@ -85,21 +86,7 @@ def reference_track(references: Iterable[Reference], source: str = "reference") 
     yaws = np.array([math.nan if r.yaw is None else r.yaw for r in samples])
     covariances = np.array([r.covariance for r in samples], dtype=float).reshape(-1, 3, 3)
     has_yaw = any(r.yaw is not None for r in samples)
-    return _track(stamps, positions, yaws if has_yaw else None, covariances, source)
-
-
-def read_reference_file(path: str | Path) -> ReferenceTrack | Relations:
-    """A reference from a text file: relations (.relations) or a TUM trajectory (.tum); any other name by its content.
-
-    Both have eight columns. A TUM line ends in a unit quaternion; a relation begins with two times. A TUM file whose quaternions are all
-    zero, or all the same though the path turns, is a reference of positions only. Raises `EvaluationError` with file and line.
-    """
-    suffix = Path(path).suffix.lower()
-    if suffix == ".relations":
-        return read_relations(path)
-    if suffix == ".tum" or _looks_like_tum(path):
-        return _read_tum_reference(path)
-    return read_relations(path)
+    return make_track(stamps, positions, yaws if has_yaw else None, covariances, source)
 
 
 def read_relations(path: str | Path) -> Relations:
@@ -110,7 +97,7 @@ def read_relations(path: str | Path) -> Relations:
     starts: list[int] = []
     ends: list[int] = []
     motions: list[tuple[float, float, float]] = []
-    for line, words in number_rows(path, _RELATION_COLUMNS):
+    for line, words in number_rows(path, RELATION_COLUMNS):
         where = f"{path}, line {line}"
         dx, dy, *_, dyaw = (parse_float(word, where) for word in words[2:])
         if not (math.isfinite(dx) and math.isfinite(dy) and math.isfinite(dyaw)):
@@ -133,7 +120,10 @@ def frozen_yaw(positions: FloatArray, yaws: FloatArray) -> bool:
     return bool(across > max(0.1, 0.05 * along))
 
 
-def _track(stamps: IntArray, positions: FloatArray, yaws: FloatArray | None, covariances: FloatArray | None, source: str) -> ReferenceTrack:
+def make_track(
+    stamps: IntArray, positions: FloatArray, yaws: FloatArray | None, covariances: FloatArray | None, source: str
+) -> ReferenceTrack:
+    """A track of stamps (N,), positions (N, 2), yaws (N,), covariances (N, 3, 3) in any order, as `reference_track` takes them."""
     finite = np.isfinite(positions).all(axis=1) & (np.isfinite(yaws) if yaws is not None else True)
     order = np.flatnonzero(finite)[np.argsort(stamps[finite], kind="stable")]
     order = order[np.append(True, np.diff(stamps[order]) > 0)] if order.size else order
@@ -157,27 +147,6 @@ def _track(stamps: IntArray, positions: FloatArray, yaws: FloatArray | None, cov
         dropped,
         warnings,
     )
-
-
-def _read_tum_reference(path: str | Path) -> ReferenceTrack:
-    rows = list(tum_rows(path))
-    stamps = np.array([stamp for _, stamp, _ in rows], dtype=np.int64)
-    positions = np.array([values[:2] for _, _, values in rows])
-    yaws = np.array([yaw_of_quaternion(*values[3:]) for _, _, values in rows])
-    has_yaw = any(any(values[3:]) for _, _, values in rows)
-    return _track(stamps, positions, yaws if has_yaw else None, None, str(path))
-
-
-def _looks_like_tum(path: str | Path) -> bool:
-    """By the first hundred lines: the last four columns are a unit quaternion, or zero, or not finite."""
-    for line, words in itertools.islice(number_rows(path, _RELATION_COLUMNS), 100):
-        norm = math.hypot(*(parse_float(word, f"{path}, line {line}") for word in words[4:]))
-        if norm > 0.0 and abs(norm - 1.0) > 0.01:
-            return False
-        first, second = (parse_float(word, f"{path}, line {line}") for word in words[:2])
-        if norm == 0.0 and second >= first:
-            return False  # a relation without rotation: the second column is a time too
-    return True
 
 
 def describe_span(stamps_ns: IntArray) -> str:

@@ -18,7 +18,8 @@ from scipy.optimize import minimize
 
 from localization.errors import EvaluationError
 from localization.evaluation.metrics import Accuracy, EvaluateConfig, align, evaluate, score_relations
-from localization.evaluation.references import ReferenceTrack, Relations, read_reference_file, read_relations, reference_track
+from localization.evaluation.reference_files import read_reference_file
+from localization.evaluation.references import ReferenceTrack, Relations, read_relations, reference_track
 from localization.events import Reference
 from localization.trajectory import Trajectory, write_tum
 from motion_models import se2

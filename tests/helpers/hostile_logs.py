@@ -22,7 +22,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from localization.cli import main
-from localization.evaluation.references import read_reference_file, reference_track
+from localization.evaluation.reference_files import read_reference_file
+from localization.evaluation.references import reference_track
 from localization.logs import open_log
 from localization.logs.reader import open_source
 from localization.logs.serialization import LogDeserializer

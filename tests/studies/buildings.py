@@ -31,7 +31,8 @@ from localization.estimators import ESTIMATORS, ESTIMATORS_WITH_CORRECTIONS, Est
 from localization.estimators.filter import FilterConfig
 from localization.evaluation.consistency import nees
 from localization.evaluation.metrics import align, relation_errors
-from localization.evaluation.references import ReferenceTrack, Relations, read_reference_file
+from localization.evaluation.reference_files import read_reference_file
+from localization.evaluation.references import ReferenceTrack, Relations
 from localization.events import Event
 from localization.lidar import LidarConfig
 from localization.logs import open_log

@@ -1,0 +1,154 @@
+"""Files of references by their formats, and what is in none."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from localization.errors import EvaluationError
+from localization.evaluation.reference_files import read_reference_file
+from localization.evaluation.references import ReferenceTrack
+
+T0 = 1_700_000_000
+TURN = np.linspace(0.0, 2.0, 21)
+TRUTH = np.column_stack([5.0 * np.sin(TURN), 5.0 * (1.0 - np.cos(TURN)), TURN])
+"""(21, 3) an arc to the left."""
+STAMPS = T0 * 10**9 + 100_000_000 * np.arange(21)
+
+
+def _track(path: Path, lines: list[str], **more: object) -> ReferenceTrack:
+    path.write_text("\n".join(lines) + "\n")
+    found = read_reference_file(path, **more)  # type: ignore[arg-type]
+    assert isinstance(found, ReferenceTrack)
+    return found
+
+
+def _check(found: ReferenceTrack, atol: float = 1e-6) -> None:
+    np.testing.assert_allclose(found.poses, TRUTH, atol=atol)
+    np.testing.assert_array_equal(found.stamps_ns, STAMPS)
+
+
+def test_reference_euroc_is_read_by_its_header(tmp_path):
+    head = (
+        "#timestamp,p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z [],v_RS_R_x [m s^-1],b_w_RS_S_x [rad s^-1]"
+    )
+    rows = [f"{t},{x},{y},0.1,{math.cos(a / 2)},0,0,{math.sin(a / 2)},9,9" for t, (x, y, a) in zip(STAMPS, TRUTH, strict=True)]
+    _check(_track(tmp_path / "data.csv", [head, *rows]))
+    _check(_track(tmp_path / "bare.csv", [",".join(row.split(",")[:8]) for row in rows]))
+
+
+def test_reference_tum_with_commas_is_read(tmp_path):
+    rows = [f"{t / 1e9:.3f},{x},{y},0,0,0,{math.sin(a / 2)},{math.cos(a / 2)}" for t, (x, y, a) in zip(STAMPS, TRUTH, strict=True)]
+    _check(_track(tmp_path / "a.tum", rows))
+    _check(_track(tmp_path / "a.csv", rows))
+
+
+def _kitti(truth: np.ndarray) -> list[str]:
+    """Of cameras: x to the right, y down, z ahead."""
+    return [f"{math.cos(a)} 0 {-math.sin(a)} {-y} 0 1 0 0.01 {math.sin(a)} 0 {math.cos(a)} {x}" for x, y, a in truth]
+
+
+def test_reference_kitti_takes_times_beside_it_else_the_scans(tmp_path):
+    found = _track(tmp_path / "00.txt", _kitti(TRUTH), log_stamps=lambda: STAMPS[[0, 10, 20]])
+    _check(found)
+    assert not found.has_times
+    assert "has no times" in found.warnings[0]
+    (tmp_path / "times.txt").write_text("".join(f"{t / 1e9:.1f}\n" for t in STAMPS))
+    found = _track(tmp_path / "00.txt", _kitti(TRUTH))
+    _check(found)
+    assert found.has_times
+
+
+def test_reference_kitti_of_a_body_with_z_up_is_read(tmp_path):
+    rows = [f"{math.cos(a)} {-math.sin(a)} 0 {x} {math.sin(a)} {math.cos(a)} 0 {y} 0 0 1 0" for x, y, a in TRUTH]
+    _check(_track(tmp_path / "a.txt", rows, log_stamps=lambda: STAMPS))
+
+
+@pytest.mark.parametrize(
+    ("head", "row"),
+    [
+        ("time,x,y,yaw", "{s:.1f},{x},{y},{a}"),
+        ("t;pos_x [mm];pos_y [mm];heading_deg", "{s:.1f};{mm_x};{mm_y};{deg}"),
+        (
+            "%time,field.header.seq,field.header.stamp,field.pose.position.x,field.pose.position.y,field.pose.position.z,"
+            "field.pose.orientation.x,field.pose.orientation.y,field.pose.orientation.z,field.pose.orientation.w",
+            "1,7,{t},{x},{y},0,0,0,{sin},{cos}",
+        ),
+        (
+            "header.stamp.sec,header.stamp.nanosec,twist.linear.x,pose.pose.position.x,pose.pose.position.y,theta",
+            "{sec},{nsec},3.0,{x},{y},{a}",
+        ),
+    ],
+)
+def test_reference_csv_is_read_by_names_of_columns(tmp_path, head, row):
+    rows = []
+    for t, (x, y, a) in zip(STAMPS.tolist(), TRUTH.tolist(), strict=True):
+        numbers = {"mm_x": 1000 * x, "mm_y": 1000 * y, "deg": math.degrees(a), "sin": math.sin(a / 2), "cos": math.cos(a / 2)}
+        rows.append(row.format(t=t, s=t / 1e9, sec=t // 10**9, nsec=t % 10**9, x=x, y=y, a=a, **numbers))
+    _check(_track(tmp_path / "a.csv", [head, *rows]))
+
+
+def test_reference_with_y_as_height_takes_the_plane_of_z_and_x(tmp_path):
+    rows = [f"{t / 1e9:.1f} {y} 0.8 {x} 0 {math.sin(a / 2)} 0 {math.cos(a / 2)}" for t, (x, y, a) in zip(STAMPS, TRUTH, strict=True)]
+    found = _track(tmp_path / "mocap.tum", rows)
+    _check(found)
+    assert "height" in found.warnings[0]
+
+
+def test_reference_g2o_is_spread_over_the_scans(tmp_path):
+    lines = [f"VERTEX_SE2 {i} {x} {y} {a}" for i, (x, y, a) in enumerate(TRUTH)] + ["EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1"]
+    found = _track(tmp_path / "a.g2o", lines, log_stamps=lambda: STAMPS)
+    _check(found)
+    with pytest.raises(EvaluationError, match="has no times"):
+        read_reference_file(tmp_path / "a.g2o")
+
+
+def _degrees(x: float, y: float) -> tuple[float, float]:
+    """Latitude and longitude near 48 N, 11 E, on the sphere of the ellipsoid's curvatures there."""
+    return 48.0 + y / 111_200.0, 11.0 + x / (111_320.0 * math.cos(math.radians(48.0)) * 1.00185)
+
+
+def test_reference_gpx_gives_positions_in_metres(tmp_path):
+    points = []
+    for i, (x, y, _) in enumerate(TRUTH):
+        lat, lon = _degrees(x, y)
+        points.append(f'<trkpt lat="{lat:.9f}" lon="{lon:.9f}"><ele>500</ele><time>2023-11-14T22:13:{20 + i * 0.1:04.1f}Z</time></trkpt>')
+    text = ['<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>', *points, "</trkseg></trk></gpx>"]
+    found = _track(tmp_path / "a.gpx", text)
+    assert found.yaws is None
+    np.testing.assert_allclose(found.positions, TRUTH[:, :2], atol=0.02)
+    np.testing.assert_array_equal(found.stamps_ns, STAMPS)
+
+
+def test_reference_nmea_takes_the_date_of_rmc_else_the_logs(tmp_path):
+    def words(x: float, y: float) -> str:
+        lat, lon = _degrees(x, y)
+        return f"48{60 * (lat - 48):010.7f},N,011{60 * (lon - 11):010.7f},E"
+
+    gga = [f"$GNGGA,2213{20 + i * 0.1:04.1f},{words(x, y)},4,12,0.7,500.0,M,47.0,M,,*00" for i, (x, y, _) in enumerate(TRUTH)]
+    rmc = "$GNRMC,221320.0,A,4800.0,N,01100.0,E,0.1,0.0,141123,,,A*00"
+    found = _track(tmp_path / "a.nmea", [rmc, *gga])
+    np.testing.assert_allclose(found.positions, TRUTH[:, :2], atol=0.02)
+    np.testing.assert_array_equal(found.stamps_ns, STAMPS)
+    found = _track(tmp_path / "b.txt", gga, log_stamps=lambda: STAMPS)
+    np.testing.assert_array_equal(found.stamps_ns, STAMPS)
+    assert "without a date" in found.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("", "holds no data"),
+        ("a note on the drive\nof yesterday\n", "holds no data"),
+        ("1 2 3 4 5\n", "5 columns and no header"),
+        ("time,speed\n1,2\n", "2 columns and no header"),
+        ("1 0 0 0 0 1 0 0 0 0 5 0\n", "no poses of KITTI"),
+    ],
+)
+def test_reference_of_no_format_is_refused_with_what_works(tmp_path, text, found):
+    (tmp_path / "a.txt").write_text(text)
+    with pytest.raises(EvaluationError, match=f"{found}.*KITTI"):
+        read_reference_file(tmp_path / "a.txt")
