@@ -37,8 +37,11 @@ class Grid:
     """Side of a cell [m]."""
 
 
-def draw_grid(mapped: KeyframeMap, resolution: float) -> Grid:
-    """The grid of ``mapped`` with cells of ``resolution`` [m]. Raises `MapError` if there are no points, or too many cells."""
+def draw_grid(mapped: KeyframeMap, resolution: float, free: float = FREE) -> Grid:
+    """The grid of ``mapped`` with cells of ``resolution`` [m], free below a probability of ``free``.
+
+    Raises `MapError` if there are no points, or too many cells.
+    """
     if not (math.isfinite(resolution) and resolution > 0.0):
         raise MapError(f"a resolution of {resolution} m is none. Give the side of a cell in metres, as 0.05.")
     ends = mapped.points_in_map()
@@ -56,7 +59,7 @@ def draw_grid(mapped: KeyframeMap, resolution: float) -> Grid:
     _cast(log_odds, starts.astype(np.int64), ends.astype(np.int64), np.repeat(np.arange(len(starts)), mapped.counts))
     cells = np.full(log_odds.shape, -1, np.int8)
     cells[log_odds > math.log(OCCUPIED / (1.0 - OCCUPIED))] = 100
-    cells[log_odds < math.log(FREE / (1.0 - FREE))] = 0
+    cells[log_odds < math.log(free / (1.0 - free))] = 0
     return Grid(cells, (float(low[0] * resolution), float(low[1] * resolution)), resolution)
 
 

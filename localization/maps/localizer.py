@@ -19,7 +19,7 @@ from localization.lidar.submap import voxel_means
 from localization.maps.grid import Grid
 from localization.maps.place_search import CELL_M, Place, PlaceMap
 from motion_models import se2
-from motion_models.se2 import Cov3, Points2, Pose2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 State = Literal["searching", "localized", "lost"]
 
@@ -48,6 +48,9 @@ _MAX_SEARCH_ODDS, _MAX_LOG_ODDS = 5.0, 8.0
 """Log-odds of a search, and of a place that is tracked, at most: a few scans from elsewhere are enough to be lost."""
 _PATIENCE, _MAX_WAIT = 6, 3
 """After each so many searches in vain, one more keyframe is left out between them, at most the second number."""
+_TRACKED_M, _TRACKED_RAD, _LEAST_MARGIN = 0.5, 0.3, 0.1
+"""Sigma of a pose that is tracked, at most, through places that the map does not have; margin of the score over the next place, by which
+it is found again where the map goes on."""
 _INITIAL_KEYFRAMES = 10
 """Keyframes after which a given pose that no scan confirms is dropped."""
 INITIAL_COV = np.diag([0.5, 0.5, 0.26]) ** 2
@@ -76,9 +79,8 @@ class Localizer:
         """``initial`` (3,): about where the robot is in the map, with covariance ``initial_cov`` (3, 3)."""
         self.places = place_map
         self.state: State = "searching"
-        self.pose, self._cov = place_map.centre, place_map.extent_cov
-        self._log_odds = -_MAX_SEARCH_ODDS
-        self._is_tracking = False
+        self.pose, self._cov = place_map.centre, np.zeros((3, 3))
+        self._is_tracking, self._track_odds, self._search_odds = False, 0.0, -_MAX_SEARCH_ODDS
         self._recent: deque[_Keyframe] = deque(maxlen=_SEARCH_KEYFRAMES)
         self.hypotheses: Sequence[Hypothesis] = ()
         """Places that a search found, the most probable first."""
@@ -90,19 +92,21 @@ class Localizer:
     def set_pose(self, pose: Pose2, cov: Cov3 = INITIAL_COV) -> None:
         """Search near ``pose`` (3,) with covariance ``cov`` (3, 3), as a person gives it."""
         self.state, self._is_tracking, self.hypotheses = "searching", False, ()
-        self.pose, self._cov, self._log_odds = np.asarray(pose, dtype=float), cov, 0.0
+        self.pose, self._cov, self._search_odds = np.asarray(pose, dtype=float), cov, 0.0
         self._initial_left, self._failures, self._wait = _INITIAL_KEYFRAMES, 0, 0
         self._recent.clear()
 
     @property
     def probability(self) -> float:
         """That the robot is where `pose` has it; while it is searched, that it is at the first of `hypotheses`."""
-        return 1.0 / (1.0 + math.exp(-self._log_odds))
+        return _sigmoid(self._track_odds if self.state == "localized" else self._search_odds)
 
     @property
     def covariance(self) -> Cov3:
-        """(3, 3) of the right perturbation of `pose`, with the map's own."""
-        return np.asarray(self._cov + self.places.map_cov(self.pose)) if self._is_tracking else self._cov
+        """(3, 3) of the right perturbation of `pose`, with the map's own; of a place that is not known, with the extent of the map."""
+        if self.state == "localized":
+            return np.asarray(self._cov + self.places.map_cov(self.pose))
+        return self._cov if self._initial_left else np.asarray(self._cov + self.places.extent_cov)
 
     def add(self, odometry: Pose2, points: Points2, delta: Pose2, cov: Cov3) -> None:
         """A keyframe at ``odometry`` (3,) with the scan ``points`` (N, 2) of the body frame [m]: moved by ``delta`` (3,) with covariance
@@ -114,9 +118,11 @@ class Localizer:
         if len(points) < MIN_POINTS:
             return
         self._recent.append(_Keyframe(odometry, points))
-        if self._is_tracking and is_narrow(self._cov):
+        if self._is_tracking and _is_trackable(self._cov):
             self._track(points)
-        else:
+        elif self._is_tracking:
+            self._is_tracking, self.state = False, "lost"
+        if self.state != "localized":
             self._search()
 
     @property
@@ -129,33 +135,42 @@ class Localizer:
         return self.places.surfaces.means
 
     def _track(self, points: Points2) -> None:
-        place = self.places.align(points, self.pose, self._cov)
-        if place.on_walls + place.in_free < _KNOWN_SHARE and place.in_free < _CONTRADICTING_SHARE:
+        """Align with the map near the pose. Where that contradicts, the place stays a hypothesis beside the search until it is refuted."""
+        place = self._align(points)
+        if place is None or (place.on_walls + place.in_free < _KNOWN_SHARE and place.in_free < _CONTRADICTING_SHARE):
             return
         R = np.asarray(np.linalg.inv(place.fit.information + _OPEN)) * max(place.residual_variance, 1.0) + _BEND
         measured = se2.compose(place.pose, se2.exp(-np.linalg.solve(place.fit.information + _OPEN, place.fit.gradient)))
         is_outlier = mahalanobis(self.pose, measured, self._cov + R) > OUTLIER_SIGMAS**2
         evidence = _TRACK_GAIN * (place.on_walls - _CONTRADICTION * place.in_free)
-        self._log_odds = min(self._log_odds + (-_TRACK_GAIN if is_outlier else evidence), _MAX_LOG_ODDS)
-        if self.probability < _LOST:
+        self._track_odds = min(self._track_odds + (-_TRACK_GAIN if is_outlier else evidence), _MAX_LOG_ODDS)
+        self._is_tracking = self._track_odds > -_MAX_LOG_ODDS
+        if self.state == "localized" and _sigmoid(self._track_odds) < _LOST:
             self._lose()
-        elif not is_outlier:
+        elif self.state == "lost" and _sigmoid(self._track_odds) >= LIKELY:
+            self.state = "localized"
+        if not is_outlier:
             K = np.linalg.solve(self._cov + R, self._cov).T
             self.pose = se2.compose(self.pose, se2.exp(K @ se2.log(se2.between(self.pose, measured))))
             self._cov = np.asarray((np.eye(3) - K) @ self._cov @ (np.eye(3) - K).T + K @ R @ K.T)
 
+    def _align(self, points: Points2) -> Place | None:
+        """Near the pose; searched within 3 sigma where that is wider than the basin of an alignment, and None where that is ambiguous."""
+        if is_narrow(self._cov):
+            return self.places.align(points, self.pose, self._cov)
+        found = self.places.search(points, self.pose, _three_sigma(self._cov))
+        return found[0] if found and (len(found) == 1 or found[0].score - found[1].score > _LEAST_MARGIN) else None
+
     def _lose(self) -> None:
         """The place was wrong, or the map is: search anywhere, by the scans from now on."""
-        self.state, self._is_tracking, self.hypotheses = "lost", False, ()
-        self._cov = self._cov + self.places.extent_cov
+        self.state, self.hypotheses, self._search_odds = "lost", (), -_MAX_SEARCH_ODDS
+        self._failures = self._wait = 0
         last = self._recent[-1]
         self._recent.clear()
         self._recent.append(last)
 
     def _search(self) -> None:
         """Search the merged scans of the last keyframes, and take the best place if it is probable and the search before agrees."""
-        if self._is_tracking:
-            self.state = "lost"
         self._wait -= 1
         if self._wait > 0:
             return
@@ -166,23 +181,22 @@ class Localizer:
         points = voxel_means(merged, 0.8 * CELL_M)
         if self._initial_left:
             self._initial_left -= 1
-            half = 3.0 * np.sqrt([np.trace(self._cov[:2, :2]), np.trace(self._cov[:2, :2]), self._cov[2, 2]])
-            places = self.places.search(points, self.pose, half)
+            places = self.places.search(points, self.pose, _three_sigma(self._cov))
             if not self._initial_left:
-                self._cov = self.places.extent_cov
+                self._cov = np.zeros((3, 3))
         else:
             places = self.places.search(points)
         before, moved = self.hypotheses, se2.between(self._searched_at, here)
         self._searched_at = here
         self.hypotheses = _weigh(places, len(points))
-        self._log_odds = _log_odds(self.hypotheses[0].probability) if places else -_MAX_SEARCH_ODDS
+        self._search_odds = _log_odds(self.hypotheses[0].probability) if places else -_MAX_SEARCH_ODDS
         if self.probability < LIKELY or not self._is_continued(before, moved):
             return
         cov = np.asarray(np.linalg.inv(places[0].fit.information + _OPEN)) * max(places[0].residual_variance, 1.0)
         if not is_narrow(cov):
             return
         self.pose, self._cov, self._is_tracking, self.state = places[0].pose, cov + _BEND, True, "localized"
-        self._initial_left, self._failures, self._wait = 0, 0, 0
+        self._track_odds, self._initial_left, self._failures, self._wait = self._search_odds, 0, 0, 0
 
     def _is_continued(self, before: Sequence[Hypothesis], moved: Pose2) -> bool:
         """Whether the best place is where one of the search ``before`` leads to by the odometry, ``moved`` (3,) since then."""
@@ -202,9 +216,23 @@ def _weigh(places: Sequence[Place], n_points: int) -> list[Hypothesis]:
     odds = _BY_WALLS * best.on_walls + _BY_FREE * best.in_free + _BY_MARGIN * margin + by_points + _OFFSET
     weights = np.exp([-_RIVALRY * (best.score - place.score) for place in places[1:]])
     share = 1.0 / (1.0 + weights.sum())  # places that fit equally are equally probable
-    probability = min(1.0 / (1.0 + math.exp(-min(max(odds, -_MAX_SEARCH_ODDS), _MAX_SEARCH_ODDS))), share)
+    probability = min(_sigmoid(min(max(odds, -_MAX_SEARCH_ODDS), _MAX_SEARCH_ODDS)), share)
     shares = probability * weights
     return [Hypothesis(best.pose, probability), *(Hypothesis(place.pose, float(p)) for place, p in zip(places[1:], shares, strict=True))]
+
+
+def _is_trackable(cov: Cov3) -> bool:
+    return bool(np.trace(cov[:2, :2]) < _TRACKED_M**2 and cov[2, 2] < _TRACKED_RAD**2)
+
+
+def _three_sigma(cov: Cov3) -> FloatArray:
+    """(3,) half the window of a search [m, m, rad], along any axes."""
+    radius = math.sqrt(float(np.trace(cov[:2, :2])))
+    return 3.0 * np.array([radius, radius, math.sqrt(cov[2, 2])])
+
+
+def _sigmoid(log_odds: float) -> float:
+    return 1.0 / (1.0 + math.exp(-log_odds))
 
 
 def _log_odds(probability: float) -> float:
