@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from localization.commands.common import new_folder, print_line, write_json
-from localization.maps import SavedMap, load_map
+from localization.maps import SavedMap, load_map, save_map
 from localization.output import check_outputs
 
 
@@ -63,11 +63,38 @@ class MapExport:
 
 
 @dataclass(frozen=True)
+class MapMerge:
+    """Join the map of a second drive to that of a first one, in whose frame it then is, and show how well both agree."""
+
+    first: tyro.conf.Positional[Path]
+    """Map written by `skidloc replay --save-map`."""
+    second: tyro.conf.Positional[Path]
+    """Another map of the same building."""
+    out: Path
+    """New file for the merged map."""
+
+    def run(self, console: Console) -> None:
+        """Run the command. Raises `SkidlocError` for input that cannot be used."""
+        from localization.estimators.map_merge import merge
+        from localization.lidar import LidarConfig
+
+        check_outputs(self.out)
+        first, second = load_map(self.first), load_map(self.second)
+        found = merge(first.map, second.map, LidarConfig().range_noise_m)
+        save_map(self.out, SavedMap(found.map, {"merged_from": [dict(first.provenance), dict(second.provenance)]}))
+        print_line(console, f"{found.closed} of {len(second.map.poses)} keyframes of '{self.second}' were found in '{self.first}'")
+        for name, values in (("their scans are off the merged map by", found.errors), ("the second map was bent by", found.bent)):
+            print_line(console, f"{name} {np.median(values):.3f} m in the median, {np.quantile(values, 0.95):.3f} m at 95 %")
+
+
+@dataclass(frozen=True)
 class Map:
-    """Show a saved map, or export it for planners and viewers."""
+    """Show a saved map, export it for planners and viewers, or join two."""
 
     action: tyro.conf.OmitSubcommandPrefixes[
-        Annotated[MapInfo, tyro.conf.subcommand("info")] | Annotated[MapExport, tyro.conf.subcommand("export")]
+        Annotated[MapInfo, tyro.conf.subcommand("info")]
+        | Annotated[MapExport, tyro.conf.subcommand("export")]
+        | Annotated[MapMerge, tyro.conf.subcommand("merge")]
     ]
 
     def run(self, console: Console) -> None:

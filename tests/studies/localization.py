@@ -33,6 +33,7 @@ _STEP_M, _STEP_RAD = 0.5, 0.3
 _COV = np.diag([0.01, 0.01, 0.005]) ** 2
 _RIGHT_M, _RIGHT_RAD = 0.5, 0.2
 _MAPPED_SCORE = 0.5
+_CYCLE_S, _KEPT_S = 70.0, 40.0
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,43 @@ def reliability(found: Sequence[Start]) -> str:
     return "\n".join([*lines, f"Brier score {np.mean((p - right) ** 2):.3f}"])
 
 
+def kidnappings_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> str:
+    """Half 1 - i of the log in the map of half i, of which every 40 s the next 30 s are cut out: the robot is carried on meanwhile."""
+    places = PlaceMap(part(keyframes, halves(keyframes)[i][::_MAP_STRIDE]), 0.02)
+    ids = halves(keyframes)[1 - i]
+    begin, end = keyframes.stamps_ns[ids[0]], keyframes.stamps_ns[ids[-1]]
+    pipeline = Pipeline(Trial(make_model("diff_drive", drive.robot), "map", prior=PriorMap(places)), drive.robot, drive.mounts, True)
+    estimator = pipeline.estimator
+    assert isinstance(estimator, MapFusion)
+    cut_at, found_after, wrong_s, n, cycle = None, [], 0.0, 0, -1
+    for event in drive.events:
+        since = (event.stamp_ns - begin) * 1e-9
+        if not begin <= event.stamp_ns <= end or since % _CYCLE_S > _KEPT_S:
+            continue
+        if since // _CYCLE_S != cycle:
+            cycle = since // _CYCLE_S
+            cut_at, n = (since, n + 1) if cycle > 0 else (None, 0)
+        for estimate in pipeline.process(event):
+            k = int(np.searchsorted(keyframes.stamps_ns, estimate.stamp_ns))
+            if k >= len(keyframes.stamps_ns) or keyframes.stamps_ns[k] != estimate.stamp_ns or estimator.localizer.state != "localized":
+                continue
+            is_right = math.hypot(*(estimate.pose[:2] - keyframes.poses[k, :2])) < _RIGHT_M
+            wrong_s = max(wrong_s, 0.0 if is_right or cut_at is None else since - cut_at)
+            if is_right and cut_at is not None:
+                found_after.append(since - cut_at)
+                cut_at = None
+    quantiles = np.quantile(found_after, [0.5, 0.9]) if found_after else np.full(2, math.nan)
+    times = f"{quantiles[0]:.1f} / {quantiles[1]:.1f}"
+    cells = [
+        f"{name}, map of half {i + 1}",
+        f"{len(found_after)} of {n}",
+        times,
+        f"{wrong_s:.1f}",
+        str(sum(t <= 10.0 for t in found_after)),
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
 def drive_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> str:
     """Half 1 - i of the log in the map of half i: errors while localized, and times."""
     places = PlaceMap(part(keyframes, halves(keyframes)[i][::_MAP_STRIDE]), 0.02)
@@ -199,6 +237,11 @@ def main(words: Sequence[str] | None = None) -> None:
         for name, drive in drives.items():
             for i in (0, 1):
                 print(drive_row(name, drive, maps[name], i), flush=True)
+        print("\n| carried | found again | median / p90 [s] | wrong, longest [s] | within 10 s |")
+        print("|---" * 5 + "|")
+        for name, drive in drives.items():
+            for i in (0, 1):
+                print(kidnappings_row(name, drive, maps[name], i), flush=True)
 
 
 if __name__ == "__main__":

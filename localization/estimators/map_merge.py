@@ -1,0 +1,123 @@
+"""Join the map of a second drive to that of a first one: its keyframes are localized in the first map, and a graph ties them to it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from localization.errors import MapError
+from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph
+from localization.maps import KeyframeMap
+from localization.maps.localizer import Localizer
+from localization.maps.place_search import PlaceMap
+from motion_models import se2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
+
+_RELATIVE_COV = np.diag([0.02, 0.02, 0.005]) ** 2
+"""Covariance of the motion between two keyframes of a smoothed map, as of loop closures [m^2, m^2, rad^2]."""
+_START_COV = np.diag([10.0, 10.0, 1.0]) ** 2
+_LEAST_SCORE, _LEAST_CLOSURES = 0.5, 3
+"""Score of a scan in the other map, from which on it ties its keyframe to that; and how many such keyframes a merge takes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Merged:
+    """Both maps as one, in the frame of the first."""
+
+    map: KeyframeMap
+    closed: int
+    """Keyframes of the second map that are tied to the first."""
+    errors: FloatArray
+    """(closed,) how far their scans are from the first map, where the merged map has them [m]."""
+    bent: FloatArray
+    """(closed,) how far the second map, moved as a whole, is from where the merged one has these keyframes [m]."""
+
+
+def merge(first: KeyframeMap, second: KeyframeMap, range_noise_m: float) -> Merged:
+    """``second`` in the frame of ``first``. ``range_noise_m``: sigma of a range [m]. Raises `MapError` if they share no place."""
+    closures = _closures(PlaceMap(first, range_noise_m), second)
+    if len(closures) < _LEAST_CLOSURES:
+        raise MapError(
+            f"the second map could not be joined to the first: {len(closures)} of its {len(second.poses)} keyframes were found there, and "
+            f"it takes {_LEAST_CLOSURES}. They are maps of two buildings, share no rooms, or much has changed."
+        )
+    poses, covs = _solve(second, closures)
+    keys = list(closures)
+    measured = np.array([closures[k][0] for k in keys])
+    moved = se2.align_points(second.poses[keys, :2], poses[keys, :2])
+    errors = np.hypot(*(poses[keys, :2] - measured[:, :2]).T)
+    bent = np.hypot(*(se2.transform(moved, second.poses[keys, :2]) - poses[keys, :2]).T)
+    return Merged(_join(first, second, poses, covs, closures), len(keys), errors, bent)
+
+
+def _closures(places: PlaceMap, second: KeyframeMap) -> dict[int, tuple[Pose2, Cov3]]:
+    """Pose (3,) in the first map and covariance (3, 3), by keyframe of the ``second``: forwards, and for its beginning backwards."""
+    scans, found = second.scans(), {}
+    for order in (range(len(scans)), range(len(scans) - 1, -1, -1)):
+        localizer, before = Localizer(places), second.poses[order[0]]
+        for k in order:
+            localizer.add(second.poses[k], scans[k], se2.between(before, second.poses[k]), _RELATIVE_COV)
+            before = second.poses[k]
+            if k not in found and localizer.state == "localized" and (closure := _closure(places, scans[k], localizer)) is not None:
+                found[k] = closure
+    return dict(sorted(found.items()))
+
+
+def _closure(places: PlaceMap, points: Points2, localizer: Localizer) -> tuple[Pose2, Cov3] | None:
+    if not len(points):
+        return None
+    place = places.align(points, localizer.pose)
+    if place.score < _LEAST_SCORE or math.hypot(*(place.pose[:2] - localizer.pose[:2])) > 0.3:
+        return None
+    return place.pose, np.asarray(np.linalg.inv(place.fit.information + np.diag([1e-2, 1e-2, 1.0]))) + _RELATIVE_COV
+
+
+def _solve(second: KeyframeMap, closures: dict[int, tuple[Pose2, Cov3]]) -> tuple[FloatArray, FloatArray]:
+    """Poses (K, 3) of the ``second`` map in the first, and covariances (K, 3, 3). Node 0 of the graph is the first map's frame."""
+    k, (pose, _) = next(iter(closures.items()))
+    first_T_second = se2.compose(pose, se2.inverse(second.poses[k]))
+    graph = PoseGraph(np.zeros((0, 0)))
+    graph.apply(GraphUpdate(np.zeros(3)))
+    for k, own in enumerate(second.poses):
+        start = se2.compose(first_T_second, own)
+        delta, cov = (start, _START_COV) if k == 0 else (se2.between(second.poses[k - 1], own), _RELATIVE_COV)
+        ties = [BetweenMeasurement(k, k + 1, delta, np.asarray(np.linalg.inv(cov)))]
+        if k in closures:
+            ties.append(BetweenMeasurement(0, k + 1, closures[k][0], np.asarray(np.linalg.inv(closures[k][1])), is_loop=True))
+        graph.apply(GraphUpdate(start, betweens=tuple(ties)))
+    poses, covs = graph.smooth()
+    return poses[1:], covs[1:]
+
+
+def _join(
+    first: KeyframeMap, second: KeyframeMap, poses: FloatArray, covs: FloatArray, closures: dict[int, tuple[Pose2, Cov3]]
+) -> KeyframeMap:
+    """Both as one, tied by ``closures`` to the nearest keyframes of the first."""
+    n = len(first.poses)
+    nearest = [int(np.argmin(np.hypot(*(first.poses[:, :2] - pose[:2]).T))) for pose, _ in closures.values()]
+    ties = [se2.between(first.poses[j], pose) for j, (pose, _) in zip(nearest, closures.values(), strict=True)]
+    map_covs = np.array([_at(first.poses[j], first.covariances[j], pose) for j, pose in zip(_nearest(first, poses), poses, strict=True)])
+    return KeyframeMap(
+        stamps_ns=np.r_[first.stamps_ns, second.stamps_ns],
+        poses=np.vstack([first.poses, poses]),
+        covariances=np.vstack([first.covariances, covs + map_covs]),
+        points=np.vstack([first.points, second.points]),
+        counts=np.r_[first.counts, second.counts],
+        sensors=np.vstack([first.sensors, second.sensors]),
+        edges=np.vstack([first.edges, second.edges + n, np.column_stack([nearest, np.array(list(closures)) + n])]),
+        edge_deltas=np.vstack([first.edge_deltas, second.edge_deltas, ties]),
+        edge_information=np.vstack([first.edge_information, second.edge_information, [np.linalg.inv(cov) for _, cov in closures.values()]]),
+        edge_is_loop=np.r_[first.edge_is_loop, second.edge_is_loop, np.ones(len(closures), dtype=bool)],
+    )
+
+
+def _nearest(mapped: KeyframeMap, poses: FloatArray) -> list[int]:
+    return [int(np.argmin(np.hypot(*(mapped.poses[:, :2] - pose[:2]).T))) for pose in poses]
+
+
+def _at(key: Pose2, cov: Cov3, pose: Pose2) -> Cov3:
+    """``cov`` (3, 3) of ``key`` (3,) as a perturbation of ``pose`` (3,)."""
+    A = se2.adjoint(se2.inverse(se2.between(key, pose)))
+    return np.asarray(A @ cov @ A.T)
