@@ -10,8 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from localization.estimators.base import Estimate, Estimator
-from localization.estimators.filter import KEY
+from localization.estimators.filter import KEY, START
 from localization.estimators.fusion import EkfFusion
 from localization.events import Step
 from localization.lidar import LostScans
@@ -42,7 +44,7 @@ class MapFusion(Estimator):
         """``odometry``: an `EkfFusion` with a LiDAR."""
         assert isinstance(odometry, EkfFusion)
         self.odometry, self.localizer = odometry, Localizer(prior.places, prior.initial)
-        self._is_keyframe_due, self._has_key = False, False
+        self._is_keyframe_due, self._has_key, self._summed_cov = False, False, np.zeros((3, 3))
         self._map_T_odom, self._key_cov = self.localizer.pose, self.localizer.covariance
         self._seconds = dict.fromkeys(("searching", "localized", "lost"), 0.0)
         self._first_s: float | None = None
@@ -69,7 +71,8 @@ class MapFusion(Estimator):
         ekf = self.odometry.filter
         estimate = self.odometry.step(step)
         self._count(step.duration)
-        delta, cov = ekf.motion_since(KEY)
+        self._add_step()
+        delta, cov = self._motion_since_keyframe()
         is_far = math.hypot(delta[0], delta[1]) >= _KEYFRAME_DISTANCE_M or abs(delta[2]) >= _KEYFRAME_ANGLE_RAD
         self._is_keyframe_due = (is_far or not self._has_key) and len(self.odometry.scan_points) > 0
         A = se2.adjoint(se2.inverse(delta))
@@ -84,15 +87,30 @@ class MapFusion(Estimator):
         if self._is_keyframe_due:
             self._is_keyframe_due, self._has_key = False, True
             ekf, was_localized = self.odometry.filter, self.localizer.state == "localized"
-            self.localizer.add(ekf.pose, self.odometry.scan_points, *ekf.motion_since(KEY))
+            self.localizer.add(ekf.pose, self.odometry.scan_points, *self._motion_since_keyframe())
             ekf.start_key()
+            self._summed_cov = np.zeros((3, 3))
             self._n_losses += was_localized and self.localizer.state == "lost"
             self._take_pose()
+
+    def _add_step(self) -> None:
+        """Sum the covariance of the motion, step by step: the filter's, or that of the wheels where that is smaller."""
+        step, cov = self.odometry.filter.motion_since(START)
+        by_wheels = self.odometry.wheel_motion.cov
+        cov = by_wheels if np.trace(by_wheels) < np.trace(cov) else cov
+        A = se2.adjoint(se2.inverse(step))
+        self._summed_cov = A @ self._summed_cov @ A.T + cov
+
+    def _motion_since_keyframe(self) -> tuple[Pose2, Cov3]:
+        """Motion (3,) since the last keyframe and its covariance (3, 3): by the sum of the steps where that is smaller: after the
+        filter has lost its place, its clones are as uncertain as the place."""
+        delta, cov = self.odometry.filter.motion_since(KEY)
+        return delta, cov if np.trace(cov) <= np.trace(self._summed_cov) else self._summed_cov
 
     def set_pose(self, pose: Pose2, cov: Cov3) -> None:
         """Search near the present ``pose`` (3,) in the map, with covariance ``cov`` (3, 3), as a person gives it. Odometry goes on."""
         ekf = self.odometry.filter
-        delta, _ = ekf.motion_since(KEY)
+        delta = se2.between(ekf.key, ekf.pose)
         self.localizer.set_pose(se2.compose(pose, se2.inverse(delta)), cov)
         self._take_pose()
 

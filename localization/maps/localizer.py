@@ -35,7 +35,8 @@ _OPEN = np.diag([1e-2, 1e-2, 1.0])
 """Information of a scan along directions that the scene leaves open, at least [1/m^2, 1/m^2, 1/rad^2]."""
 _BY_WALLS, _BY_FREE, _BY_MARGIN, _BY_POINTS, _OFFSET = 7.2, -5.3, 11.2, 1.7, -7.8
 """Log-odds that the best place of a search is the right one, by its shares on walls and in free space, its margin over the next place (at
-most 0.5) and log(points / 200): logistic regression of 700 searches in halves of three buildings, half of them of another building."""
+most 0.5) and log(points / 200): logistic regression of 640 searches in halves of three buildings, most of them of another building. Of 400
+others, 40 had more than 0.9, and all of these were right."""
 _RIVALRY = 20.0
 """By which the probability of a place falls with its score: a place that scores 0.11 less than the best is one tenth as probable."""
 _MAX_MARGIN, _POINTS = 0.5, 200.0
