@@ -193,7 +193,7 @@ class Findings:
         return {row["log"]: row["damage"] for row in self.rows if row.get("damage")}
 
     def lost(self, name: str) -> list[Row]:
-        """Runs of a combination whose LiDAR was lost for so long that they cannot be recommended."""
+        """Runs of a combination whose LiDAR was lost for long."""
         return [
             row for row in self.rows if combination(row) == name and is_long(row.get("lidar_lost_share"), row.get("lidar_longest_lost_s"))
         ]
@@ -298,22 +298,18 @@ def _losses(found: Findings) -> list[str]:
             worst = max(rows, key=lambda row: row["lidar_longest_lost_s"])
             where = f"{per_cent(worst['lidar_lost_share'])} of {worst['log']}, longest {worst['lidar_longest_lost_s']:.2g} s"
             since = f"at t = {worst['lidar_longest_lost_since_s']:.0f} s"
-            sentences.append(f"Not recommended is {found.words[mean.name]}: LiDAR lost for long on {_logs(len(rows))} ({where} {since}).")
+            name = found.words[mean.name]
+            sentences.append(
+                f"{capitalize(name)} lost the LiDAR for long on {_logs(len(rows))} ({where} {since}); the errors include that."
+            )
     if sentences:
         sentences.append("`skidloc replay` on those logs reports the causes.")
     return sentences
 
 
 def _advice(found: Findings) -> str:
-    usable = [mean for mean in found.means if not found.lost(mean.name)]
-    if not usable:
-        return "No combination can be recommended."
-    if usable[0] is not found.best:
-        return f"Of the others, {found.words[usable[0].name]} has the smallest mean: {_amount(usable[0], found)}."
-    best, pairs = found.best, [(mean, found.against_best(mean.name)) for mean in usable[1:]]
+    best, pairs = found.best, [(mean, found.against_best(mean.name)) for mean in found.means[1:]]
     equal = [found.words[mean.name] for mean, d in pairs if d is None or not found.is_shown(d)]
-    if not pairs and len(found.means) > 1:
-        return f"Use {found.words[best.name]}."
     if not pairs:
         return "Name another model or estimator to have it compared."
     if not equal:

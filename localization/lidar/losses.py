@@ -62,7 +62,7 @@ class LidarLosses:
 
     @property
     def is_long(self) -> bool:
-        """Whether so much is missing that the run is not to be recommended."""
+        """Whether so much is missing that the run is not to be recommended without a measured error."""
         return is_long(self.share, self.longest_s)
 
     @property
@@ -106,7 +106,8 @@ def _seconds(value: float) -> str:
 
 
 def is_long(share: float | None, longest_s: float | None) -> bool:
-    """Whether a run that lost the LiDAR for this ``share`` of the time, and ``longest_s`` [s] at once, is not to be recommended."""
+    """Whether a run that lost the LiDAR for this ``share`` of the time, and ``longest_s`` [s] at once, is not to be recommended without a
+    measured error."""
     is_stretch = longest_s is None or longest_s > MIN_LOST_S
     return (share is not None and share > MAX_LOST_SHARE and is_stretch) or (longest_s is not None and longest_s > MAX_LOST_S)
 

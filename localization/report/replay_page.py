@@ -117,9 +117,7 @@ def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack 
 def _sections(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> list[Section]:
     """Numbers and figures."""
     best = best_run(runs) if reference is not None else None
-    near = [
-        run for run in runs if best is not None and run is not best and run.error is not None and not run.is_lost and is_close(run, best)
-    ]
+    near = [run for run in runs if best is not None and run is not best and run.error is not None and is_close(run, best)]
     notes = " ".join(_about_reference(runs, reference))
     return [
         Section("Accuracy" if reference is not None else "Runs", [*accuracy_tables(runs, best, near), Paragraph(notes, is_small=True)]),
@@ -316,7 +314,7 @@ def accuracy_tables(runs: Sequence[PlottedRun], best: PlottedRun | None, near: S
     columns = with_values(COLUMNS, [run.result for run in runs])
     if not any(c.is_error for c in columns):
         columns = [_DRIVEN, *columns]
-    badges = {run.number: _LOST for run in runs if run.is_lost} | {run.number: _NEAR for run in near}
+    badges = {run.number: _NEAR for run in near} | {run.number: _LOST for run in runs if run.is_lost}
     if best is not None:
         badges[best.number] = _BEST
     squares = with_values(_SQUARES, [run.result for run in runs])

@@ -69,7 +69,7 @@ class PlottedRun:
 
     @property
     def is_lost(self) -> bool:
-        """Whether the LiDAR was lost for so long that the run is not to be recommended."""
+        """Whether the LiDAR was lost for so long that the run is not to be recommended without a measured error."""
         losses = self.result.run.lidar
         return losses is not None and losses.is_long
 
@@ -135,8 +135,11 @@ def plotted_runs(results: Sequence[Result]) -> list[PlottedRun]:
 
 
 def best_run(lines: Sequence[PlottedRun]) -> PlottedRun | None:
-    """The one of the smallest headline error that can be recommended; None without scores."""
-    scored = [line for line in lines if line.error is not None and not line.is_lost]
+    """The one of the smallest headline error; None without scores.
+
+    How long the LiDAR was lost does not count: not all runs measure it, and the error includes it.
+    """
+    scored = [line for line in lines if line.error is not None]
     return min(scored, key=lambda line: (line.error, line.number)) if scored else None
 
 

@@ -49,11 +49,9 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
     if not lines:
         return ["Nothing was run."]
     best, losses = best_run(lines), _losses(lines)
-    if reference is None or all(line.error is None for line in lines):
+    if reference is None or best is None:
         line = _most_informed(lines)
         return [*_unscored(lines), *losses, *_consistency(line, f"The covariances of {line.words}")]
-    if best is None:
-        return [*losses, "No run can be recommended."]
     equals = equally_good(lines, best, reference)
     ranking = _ranking(lines, best, equals, reference)
     return [
@@ -68,11 +66,8 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
 
 
 def equally_good(lines: Sequence[PlottedRun], best: PlottedRun, reference: ReferenceTrack | Relations) -> list[PlottedRun]:
-    """The scored runs but ``best`` that are not significantly worse on this log, or differ by less than 2 %.
-
-    Runs that lost the LiDAR for long are not among them.
-    """
-    others = [line for line in lines if line is not best and line.error is not None and not line.is_lost]
+    """The scored runs but ``best`` that are not significantly worse on this log, or differ by less than 2 %."""
+    others = [line for line in lines if line is not best and line.error is not None]
     return [line for line in others if is_close(line, best) or not _is_worse(line, best, reference)]
 
 
@@ -130,8 +125,6 @@ def _ranking(
         return [f"{capitalize(best.words)}: {metres(best.error)} {measure}.", alone]
     near, unproven = [x for x in equals if is_close(x, best)], [x for x in equals if not is_close(x, best)]
     found = "has the smallest error" if equals else "is best"
-    if any(line.is_lost and line.error is not None and line.error < best.error for line in lines):
-        found += " of the runs that can be recommended"
     sentences = [f"{capitalize(best.words)} {found}: {metres(best.error)} {measure}{_gains(lines, best)}."]
     if near:
         sentences.append(f"Within 2 % of it: {_listed(near)}.")
@@ -167,16 +160,15 @@ def _gains(lines: Sequence[PlottedRun], best: PlottedRun) -> str:
 
 
 def _losses(lines: Sequence[PlottedRun]) -> list[str]:
-    """Runs without LiDAR for so long that they are not recommended, and what to do."""
+    """Runs without LiDAR for long, and what to do: without scores they are not recommended, while a measured error includes those times."""
     lost = [(line, line.result.run.lidar) for line in lines if line.is_lost]
     if not lost:
         return []
-    parts = [
-        f"{line.words}{'' if line.error is None else f' ({metres(line.error)})'}: {losses.summary}"
-        for line, losses in lost
-        if losses is not None
-    ]
     advice = dict.fromkeys(losses.advice for _, losses in lost if losses is not None)
+    if any(line.error is not None for line in lines):
+        parts = [f"{line.words} ({losses.summary})" for line, losses in lost if losses is not None]
+        return [f"Part of the way is by wheels and gyro alone in {join_words(parts)}; the errors include that.", *advice]
+    parts = [f"{line.words}: {losses.summary}" for line, losses in lost if losses is not None]
     return [f"Not recommended are {'; '.join(parts)}." if len(parts) > 1 else f"Not recommended is {parts[0]}.", *advice]
 
 
@@ -257,10 +249,6 @@ def _advice(lines: Sequence[PlottedRun], best: PlottedRun, equals: Sequence[Plot
         return [f"To learn what {best.result.run.estimator} gains, run it beside {DEAD_RECKONING} and another model."]
     with_lidar = [line for line in lines if line.result.run.estimator != DEAD_RECKONING and len(line.result.run.map_points)]
     if best.result.run.estimator == DEAD_RECKONING and with_lidar and not any(line in equals for line in with_lidar):
-        better = [line for line in with_lidar if line.is_lost and line.error is not None and line.error < _error(best)]
-        if better:
-            least = min(better, key=_error)
-            return [f"Even with the LiDAR lost for so long, {least.words} has the smallest error: mend the LiDAR, and use it."]
         return ["The LiDAR made no run better than the wheels alone: check its mount, its stamps and its range in the robot file first."]
     base = baseline_run(lines)
     if base is not None and base in equals:
