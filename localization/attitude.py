@@ -35,9 +35,9 @@ _MIN_TURN_RAD = 3.0
 """Of turning by the wheels, difference of the sides' angles, after which it shows whether the gyro's axis points up."""
 _LEVEL = math.tan(math.radians(3.0))
 """Tilt up to which the ground counts as level: a Husky outdoors is level within 1.8 deg, and mounts are known to a degree or two."""
-_CERTAIN = 4.0
+_CERTAIN = 3.5
 """Sigmas at which the ground counts as tilted."""
-_MOUNT_SIGMA, _GROUND_SIGMA = math.radians(1.5), math.radians(6.0)
+_MOUNT_SIGMA, _GROUND_SIGMA = math.radians(1.2), math.radians(6.0)
 """Of mounts in robot files, and of hills (median 5.8 deg, 95 % below 10.7)."""
 _HILL_M = 5.0
 """Way over which a slope changes."""
@@ -113,6 +113,21 @@ class AttitudeFilter:
     def up(self) -> FloatArray:
         """(3,) the vertical in body axes; the body's z axis where it is not known."""
         return self._state[:3].copy() if self._has_started else np.array([0.0, 0.0, 1.0])
+
+    @property
+    def ground_up(self) -> FloatArray:
+        """(3,) the vertical in the axes of the robot as it stands on the ground: without the mount's error."""
+        x, y, z = self.up.tolist()
+        down_x, down_y = -x / max(z, _MIN_UP) - self._split[0], -y / max(z, _MIN_UP) - self._split[1]
+        whole = 1.0 / math.sqrt(1.0 + down_x * down_x + down_y * down_y)
+        return np.array([-down_x * whole, -down_y * whole, whole])
+
+    @property
+    def tilt_variances(self) -> tuple[float, float]:
+        """Of roll and pitch [rad^2]: by the attitude, and by the mount, which stays."""
+        return 0.5 * float(self._cov[0, 0] + self._cov[1, 1]) + _ACCELEROMETER_RAD**2, 0.5 * float(
+            self._split_cov[0, 0] + self._split_cov[1, 1]
+        )
 
     @property
     def cov(self) -> FloatArray:

@@ -26,6 +26,7 @@ from localization.estimators import (
 )
 from localization.events import Event, ImuSample, PositionSample, Step
 from localization.lidar.losses import LidarLosses
+from localization.lifting import Lifting, Pose3, Trajectory3, Trajectory3Table
 from localization.maps import KeyframeMap
 from localization.sensor_checks import SensorChecks
 from localization.synchronizer import StepConfig, Synchronizer
@@ -83,8 +84,17 @@ class Pipeline:
         if trial.prior is not None:
             self.estimator = MapFusion(self.estimator, trial.prior)
         self.checks = SensorChecks(self.mounts, config.estimator.lidar, config.step)
+        self._lifting = Lifting()
+        self.pose3: Pose3 | None = None
+        """The last estimate in space; None without an attitude."""
         self.wheel_twist: FloatArray | None = None
         """(3,) mean twist of the last step by the wheels alone; None where wheel data were missing in it."""
+
+    @property
+    def is_tilting(self) -> bool:
+        """Whether the ground has been found to tilt."""
+        attitude = self.synchronizer.attitude
+        return attitude is not None and attitude.is_tilting
 
     def process(self, event: Event) -> list[Estimate]:
         """Take ``event``; the estimates that it completes, none or several. Raises `EstimatorError`.
@@ -92,13 +102,17 @@ class Pipeline:
         Stamps are taken as they are: after a wheel sample stamped an hour ahead, scans of before are late. Logs and topics are freed of
         such jumps as they are read (`logs.clock_sync`); other sources of events must do it themselves.
         """
+        return list(self.stream(event))
+
+    def stream(self, event: Event) -> Iterator[Estimate]:
+        """`process`, one estimate at a time: what else is known of each (`pose3`) holds until the next is taken."""
         if isinstance(event, PositionSample):
             self.estimator.add_position(event)
-            return []
+            return
         if isinstance(event, ImuSample):
             self.checks.insert_imu(event)
         self.synchronizer.insert(event)
-        return list(self._estimates(is_last=False))
+        yield from self._estimates(is_last=False)
 
     def _estimates(self, is_last: bool) -> Iterator[Estimate]:
         while (interval := self.synchronizer.next_interval(is_last)) is not None:  # synchronize
@@ -109,6 +123,9 @@ class Pipeline:
             self.checks.compare_residuals(self.estimator)
             estimate = self.checks.inflate(estimate)
             self._feed_back(step, is_scan_matched=estimate.nis is not None)
+            attitude = self.synchronizer.attitude
+            if attitude is not None and attitude.has_attitude:
+                self.pose3 = self._lifting.add(estimate.stamp_ns, estimate.pose, estimate.covariance, attitude)
             yield estimate  # publish
 
     def _calibrate(self) -> None:
@@ -130,9 +147,12 @@ class Pipeline:
 
     def finish(self) -> list[Estimate]:
         """The estimates that still waited for events when these ended."""
-        estimates = list(self._estimates(is_last=True))
+        return list(self.stream_rest())
+
+    def stream_rest(self) -> Iterator[Estimate]:
+        """`finish`, one estimate at a time."""
+        yield from self._estimates(is_last=True)
         self.run_deferred()
-        return estimates
 
     @property
     def lidar(self) -> LidarLosses | None:
@@ -188,6 +208,8 @@ class Run:
     """The map as it can be saved, of an estimator with a map frame."""
     localization: Mapping[str, Any] | None = None
     """State, probability and times of the estimator that localizes in a saved map."""
+    in_space: Trajectory3 | None = None
+    """Filtered poses in space, with height, roll and pitch, where an IMU shows that the ground tilts."""
 
 
 _EQUAL_CHARACTERS = 60
@@ -240,17 +262,22 @@ class _Replay:
 
     def __init__(self, trial: Trial, pipeline: Pipeline) -> None:
         self._trial, self._pipeline, self._table, self._seconds = trial, pipeline, EstimateTable(), 0.0
+        self._table3 = Trajectory3Table()
 
     def process(self, event: Event) -> None:
         begin = time.perf_counter()
-        for estimate in self._pipeline.process(event):
-            self._table.add(estimate)
+        self._add(self._pipeline.stream(event))
         self._seconds += time.perf_counter() - begin
+
+    def _add(self, estimates: Iterator[Estimate]) -> None:
+        for estimate in estimates:
+            self._table.add(estimate)
+            if self._pipeline.pose3 is not None:
+                self._table3.add(self._pipeline.pose3)
 
     def finish(self) -> Run:
         begin = time.perf_counter()
-        for estimate in self._pipeline.finish():
-            self._table.add(estimate)
+        self._add(self._pipeline.stream_rest())
         stamps, table = self._table.stamps(), self._table.rows()
         if not len(stamps):
             raise LogError("there are wheel samples and scans in the log, but no two that span an interval of time.")
@@ -275,4 +302,5 @@ class _Replay:
             self._pipeline.lidar,
             estimator.keyframe_map(),
             estimator.localization(),
+            self._table3.trajectory() if self._pipeline.is_tilting else None,
         )

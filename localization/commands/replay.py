@@ -34,6 +34,7 @@ from localization.evaluation.references import (
 )
 from localization.evaluation.scores import Result, score
 from localization.events import Event, PositionSample
+from localization.lifting import write_tum3
 from localization.logs import Log, TopicOverrides
 from localization.logs.references import merge_positions, read_positions
 from localization.logs.writer import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
@@ -156,6 +157,7 @@ class Replay:
             write_json(folder / "metrics.json", metrics)
             for result in results:
                 write_tum(folder / f"{result.name}.tum", result.run.trajectory)
+                write_tum3(folder / f"{result.name}_3d.tum", result.run.in_space)
             write_fused(folder / "fused.mcap", {r.name: _estimates(r.run) for r in results}, results[-1].name)
             write_report(folder / "report.html", head, results, reference)
             overview_png(folder / "overview.png", head, results, reference)

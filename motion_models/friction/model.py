@@ -123,7 +123,7 @@ class FrictionModel:
 
         Raises `CgError` for a CG that is not between the wheels and `ModelError` for parameters that no robot can have.
         """
-        return self._solve(_twist, wheels, cg, params).twist
+        return self._solved(_twist, wheels, cg, params).twist
 
     def twist_on_slope(self, wheels: FloatArray, cg: FloatArray, params: FloatArray, slope: Slope) -> SlopeTwist:
         """`twist` on tilted ground: gravity's part along the ground pulls at the CG, and the loads are those of the CG's projection along
@@ -132,12 +132,34 @@ class FrictionModel:
         Raises what `twist` does, `CgError` for a slope on which the robot tips over, `ModelError` for one that friction does not hold.
         """
         check_slope(cg, params, slope)
-        return self._solve(_twist, wheels, cg, params, slope)
+        return self._solved(_twist, wheels, cg, params, slope)
+
+    def find_on_slope(self, wheels: FloatArray, cg: FloatArray, params: FloatArray, slope: Slope) -> SlopeTwist:
+        """`twist_on_slope` without its errors: samples at or beyond the limits of slopes are NaN."""
+        beyond = np.logical_or(*slope_limits(cg, params, slope))
+        down = np.where(beyond[..., None], 0.0, slope.downhill)
+        found = self._solve(_twist, wheels, cg, params, Slope(down, slope.cg_height))
+        found.twist.value[np.broadcast_to(beyond, found.twist.value.shape[:-1])] = math.nan
+        return found
 
     def interpret_twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
         """`twist` without compiled code, for a few samples once: 0.5 ms each, where compiling takes 8 s."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            return self._solve(_solve_samples, wheels, cg, params).twist
+            return self._solved(_solve_samples, wheels, cg, params).twist
+
+    def _solved(
+        self, loop: Callable[..., None], wheels: FloatArray, cg: FloatArray, params: FloatArray, slope: Slope | None = None
+    ) -> SlopeTwist:
+        """`_solve`. Raises `ModelError` where a sample has no solution."""
+        found = self._solve(loop, wheels, cg, params, slope)
+        unsolved = np.isnan(found.twist.value[..., 2]) & np.isfinite(np.asarray(wheels)).all(axis=-1)
+        if np.any(unsolved):
+            at = {name: float(value) for name, value in zip(self.param_names, params, strict=True)}
+            raise ModelError(
+                f"no balance of forces found for {np.count_nonzero(unsolved)} of {unsolved.size} samples, with parameters {at}."
+                + (" The slope is at the limit of what friction holds." if slope is not None else "")
+            )
+        return found
 
     def _solve(
         self, loop: Callable[..., None], wheels: FloatArray, cg: FloatArray, params: FloatArray, slope: Slope | None = None
@@ -151,13 +173,6 @@ class FrictionModel:
             loop(wheels, cg, params, constants, *out)
 
         twist = Twist.from_kernel(solve, np.empty(0), wheels, cg, params)
-        unsolved = np.isnan(twist.value[..., 2]) & np.isfinite(np.asarray(wheels)).all(axis=-1)
-        if np.any(unsolved):
-            at = {name: float(value) for name, value in zip(self.param_names, params, strict=True)}
-            raise ModelError(
-                f"no balance of forces found for {np.count_nonzero(unsolved)} of {unsolved.size} samples, with parameters {at}."
-                + (" The slope is at the limit of what friction holds." if slope is not None else "")
-            )
         by = constants.d_slope.reshape(*lead, 3, 3) if slope is not None else np.zeros((*lead, 3, 3))
         return SlopeTwist(twist, by[..., :2], by[..., 2])
 

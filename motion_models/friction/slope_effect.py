@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from motion_models.base import MotionModel, Twist
-from motion_models.friction.model import BoolArray, FrictionModel, slope_limits
+from motion_models.friction.model import BoolArray, FrictionModel
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 from motion_models.slope import Slope, SlopeTwist
@@ -36,17 +36,27 @@ class SlopeEffect:
 
         Also the samples (n,) whose slope tips the robot over or lets it slide by itself: their twist is that of level ground.
         """
-        own = self.friction.nominal
-        limited = np.logical_or(*slope_limits(cg, own, Slope(downhill, self.cg_height)))
-        slope = Slope(np.where(limited[:, None], 0.0, downhill), self.cg_height)
+        slope, level = Slope(downhill, self.cg_height), model.twist(wheels, cg, params)
         if isinstance(model, FrictionModel):
-            return model.twist_on_slope(wheels, cg, params, slope), limited
-        level, tilted = model.twist(wheels, cg, params), self.friction.twist_on_slope(wheels, cg, own, slope)
-        flat = self.friction.twist(wheels, cg, own)
-        changed = Twist(
-            level.value + (tilted.twist.value - flat.value),
-            level.d_wheels + (tilted.twist.d_wheels - flat.d_wheels),
-            level.d_cg + (tilted.twist.d_cg - flat.d_cg),
-            level.d_params,
+            found = model.find_on_slope(wheels, cg, params, slope)
+            twist = found.twist
+        else:
+            own = self.friction.nominal
+            found, flat = self.friction.find_on_slope(wheels, cg, own, slope), self.friction.twist(wheels, cg, own)
+            twist = Twist(
+                level.value + (found.twist.value - flat.value),
+                level.d_wheels + (found.twist.d_wheels - flat.d_wheels),
+                level.d_cg + (found.twist.d_cg - flat.d_cg),
+                level.d_params,
+            )
+        limited = np.asarray(np.isnan(twist.value).any(axis=-1))
+        if not limited.any():
+            return SlopeTwist(twist, found.d_downhill, found.d_cg_height), limited
+        at = limited[:, None, None]
+        twist = Twist(
+            np.where(limited[:, None], level.value, twist.value),
+            np.where(at, level.d_wheels, twist.d_wheels),
+            np.where(at, level.d_cg, twist.d_cg),
+            np.where(at, level.d_params, twist.d_params),
         )
-        return SlopeTwist(changed, tilted.d_downhill, tilted.d_cg_height), limited
+        return SlopeTwist(twist, np.where(at, 0.0, found.d_downhill), np.where(limited[:, None], 0.0, found.d_cg_height)), limited

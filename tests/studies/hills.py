@@ -4,7 +4,9 @@ python -m tests.studies.hills
 
 The measurements are two independent sets, turning in place on inclined planes, with soft contacts (ellipsoid wheels, solref .01 to .1,
 elliptic cones, steps of 1 ms or less); nothing of the law is fitted to them. The first is of a robot of a Husky's size, 10 s, about 540
-degrees; the second gives k and the centre of rotation over all headings, mu 0.6 and contacts that slide (slip_stiffness 100).
+degrees; the second gives k and the centre of rotation over all headings, mu 0.6 and contacts that slide (slip_stiffness 100). The third
+table replays wheels and IMU of drives in MuJoCo (`tests.helpers.mujoco_hills`): turns in place, and 2 min over hills; some minutes of
+computing. Needs the extra `mujoco`.
 """
 
 from __future__ import annotations
@@ -13,11 +15,16 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from localization.pipeline import ReplayConfig, Trial, replay
+from localization.synchronizer import StepConfig
 from motion_models.friction import FrictionModel
+from motion_models.registry import make_model
 from motion_models.robot import load_robot
 from motion_models.se2 import FloatArray
 from motion_models.slope import Slope
+from tests.helpers.mujoco_hills import HillDrive, Wander, drive, turn_in_place
 
 _RADIUS_M, _STEP_S = 0.165, 0.02
 _MODEL = FrictionModel.from_robot(load_robot("husky_a200"))
@@ -99,6 +106,58 @@ def over_headings(of: Headings, n: int = 72) -> Headings:
     return Headings(of.robot, of.wheelbase_m, of.track_m, of.cg_height_m, of.slope_deg, *found)
 
 
+def errors(drive: HillDrive, estimator: str, slopes: bool, model: str = "skid_steer") -> tuple[float, float, float, float]:
+    """Errors of a replay [m]: of the position at the end and RMS, of the displacement over 10 s (RMS), and of the height at the end.
+
+    With ``slopes`` in space, else in the plane with a height that stays; both from the true first pose.
+    """
+    config = ReplayConfig(step=StepConfig(slopes=slopes))
+    trial = Trial(make_model(model, drive.robot), estimator)
+    (run,) = replay(drive.events, [trial], drive.robot, drive.mounts, False, config)
+    if run.in_space is not None:
+        stamps, found, yaw = run.in_space.stamps_ns, run.in_space.positions, _yaws(Rotation.from_quat(run.in_space.quaternions).as_matrix())
+    else:
+        stamps, yaw = run.trajectory.stamps_ns, run.trajectory.poses[:, 2]
+        found = np.column_stack([run.trajectory.poses[:, :2], np.zeros(len(stamps))])
+    at = np.searchsorted(drive.stamps_ns, stamps).clip(0, len(drive.stamps_ns) - 1)
+    true, true_yaw = drive.positions[at], _yaws(drive.rotations[at])
+    off = _level(yaw[0], found - found[0]) - _level(true_yaw[0], true - true[0])
+    error = np.linalg.norm(off, axis=1)
+    until = np.searchsorted(stamps, stamps + 10_000_000_000)
+    starts = np.flatnonzero(until < len(stamps))[::20]
+    apart = [
+        np.linalg.norm(_level(yaw[i], found[until[i]] - found[i]) - _level(true_yaw[i], true[until[i]] - true[i])) for i in starts.tolist()
+    ]
+    return float(error[-1]), float(np.sqrt(np.mean(error**2))), float(np.sqrt(np.mean(np.square(apart)))), float(off[-1, 2])
+
+
+def _yaws(rotations: FloatArray) -> FloatArray:
+    return np.asarray(np.unwrap(np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])))
+
+
+def _level(yaw: float, ways: FloatArray) -> FloatArray:
+    """``ways`` (..., 3) in axes that point along a heading."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.asarray(ways @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
+
+
+def print_replays() -> None:
+    """Replays of drives in MuJoCo: wheels and IMU in, poses out."""
+    print("\n| MuJoCo, replayed | estimator | model | end [m] | RMS [m] | over 10 s [m] | height at the end [m] |\n" + "|---" * 7 + "|")
+    drives = {
+        f"in place, {deg:.0f} deg, mu {mu}": (turn_in_place, 12.0, mu, deg)
+        for deg, mu in ((5.0, 0.8), (10.0, 0.8), (5.0, 0.5), (10.0, 0.5))
+    }
+    drives |= {f"hills, seed {seed}": (Wander(seed), 120.0, 0.8, None) for seed in (1, 2)}
+    for name, how in drives.items():
+        made = drive(*how)
+        for estimator in ("odometry", "ekf"):
+            for slopes in (False, True):
+                end, rms, apart, height = errors(made, estimator, slopes)
+                kind = "slopes" if slopes else "flat"
+                print(f"| {name} | {estimator} | {kind} | {end:.2f} | {rms:.2f} | {apart:.2f} | {height:+.3f} |", flush=True)
+
+
 def main() -> None:
     """Print the tables."""
     print(
@@ -120,6 +179,7 @@ def main() -> None:
             f"| {seen.robot} | {seen.slope_deg:.0f} deg | {law.k[0]:.3f} to {law.k[1]:.3f} | {seen.k[0]:.3f} to {seen.k[1]:.3f} "
             f"| {law.x_m:.3f} / {seen.x_m:.3f} | {law.y_m:.3f} / {seen.y_m:.3f} |"
         )
+    print_replays()
 
 
 if __name__ == "__main__":

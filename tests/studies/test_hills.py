@@ -4,6 +4,8 @@ import math
 
 import pytest
 
+pytest.importorskip("mujoco", reason="needs the extra 'mujoco'")
+
 from tests.studies.hills import HEADINGS, TURNINGS, over_headings, turn
 
 _TO_15_DEG = [row for row in TURNINGS if row.slope_deg < 15.0]

@@ -1,0 +1,154 @@
+"""Poses in three dimensions: planar motions lifted into the body's plane, which the attitude tilts.
+
+An estimator in the plane measures the motion along the ground and the turn about the body's z axis. With roll and pitch by the attitude
+filter these are motions in space: each goes along the tilted body, and the next vertical is that of the attitude.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from localization.attitude import AttitudeFilter
+from localization.output import whole_file
+from localization.trajectory import IntArray
+from motion_models import se2
+from motion_models.se2 import Cov3, FloatArray, Pose2
+
+_LASTING_M = 2.0
+"""Way over which errors of roll and pitch last, beside those of the mount, which stay."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pose3:
+    """A pose ``world_T_body`` in space, z up."""
+
+    stamp_ns: int
+    position: FloatArray
+    """(3,) [m]."""
+    rotation: FloatArray
+    """(3, 3) from the body's axes into the world's."""
+    covariance: FloatArray
+    """(6, 6) of x, y, z, roll, pitch, yaw in the world's axes [m, rad], as in nav_msgs/Odometry."""
+
+
+class Lifting:
+    """`add` each planar estimate, in order of time; the pose in space starts level at the first planar one."""
+
+    def __init__(self) -> None:
+        self._planar: Pose2 | None = None
+        self._position, self._rotation = np.zeros(3), np.eye(3)
+        self._way = 0.0
+
+    def add(self, stamp_ns: int, planar: Pose2, cov: Cov3 | None, attitude: AttitudeFilter) -> Pose3:
+        """The pose in space at the planar pose (3,), whose right perturbation has the covariance ``cov`` (3, 3)."""
+        if self._planar is None:
+            self._position[:2], self._rotation = planar[:2], _yaw(float(planar[2]))
+            self._rotation = self._rotation @ _aligning(attitude.ground_up, np.array([0.0, 0.0, 1.0]))
+        else:
+            dx, dy, turn = se2.between(self._planar, planar).tolist()
+            before, turned = self._rotation, self._rotation @ _yaw(turn)
+            self._rotation = turned @ _aligning(attitude.ground_up, turned[2])
+            along = np.array([dx, dy, 0.0])
+            self._position = self._position + 0.5 * (before @ along + self._rotation @ (_yaw(-turn) @ along))
+            self._way += math.hypot(dx, dy)
+        self._planar = planar
+        return Pose3(stamp_ns, self._position, self._rotation, self._covariance(np.zeros((3, 3)) if cov is None else cov, attitude))
+
+    def _covariance(self, cov: Cov3, attitude: AttitudeFilter) -> FloatArray:
+        """(6, 6): the planar covariance in the body's plane, and height, roll and pitch by the attitude's."""
+        tilt, mount = attitude.tilt_variances
+        net = float(self._position[:2] @ self._position[:2])
+        body = np.zeros((3, 3))
+        body[:2, :2], body[2, 2] = cov[:2, :2], mount * net + tilt * self._way * min(self._way, _LASTING_M)
+        full = np.zeros((6, 6))
+        full[:3, :3] = self._rotation @ body @ self._rotation.T
+        full[3, 3] = full[4, 4] = tilt + mount
+        full[5, 5] = cov[2, 2]
+        full[:2, 5] = full[5, :2] = self._rotation[:2, :2] @ cov[:2, 2]
+        return full
+
+
+def _yaw(angle: float) -> FloatArray:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _aligning(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(3, 3) the smallest rotation that turns the unit vector ``a`` into ``b``, not its opposite (Rodrigues)."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    w = 1.0 / (1.0 + ax * bx + ay * by + az * bz)
+    return np.array(
+        [
+            [1.0 - w * (y * y + z * z), w * x * y - z, w * x * z + y],
+            [w * x * y + z, 1.0 - w * (x * x + z * z), w * y * z - x],
+            [w * x * z - y, w * y * z + x, 1.0 - w * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
+    """x, y, z, w of a rotation (3, 3), w >= 0 (Shepperd 1978)."""
+    r = rotation
+    squares = [1.0 + r[0, 0] - r[1, 1] - r[2, 2], 1.0 - r[0, 0] + r[1, 1] - r[2, 2], 1.0 - r[0, 0] - r[1, 1] + r[2, 2], 1.0 + np.trace(r)]
+    k = int(np.argmax(squares))
+    twice = 2.0 * math.sqrt(squares[k])
+    rows = (
+        (squares[0], r[0, 1] + r[1, 0], r[2, 0] + r[0, 2], r[2, 1] - r[1, 2]),
+        (r[0, 1] + r[1, 0], squares[1], r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]),
+        (r[2, 0] + r[0, 2], r[1, 2] + r[2, 1], squares[2], r[1, 0] - r[0, 1]),
+        (r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], squares[3]),
+    )
+    found = np.array(rows[k]) / twice * (-1.0 if rows[k][3] < 0.0 else 1.0)
+    return float(found[0]), float(found[1]), float(found[2]), float(found[3])
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory3:
+    """Poses ``world_T_body`` in space, in order of time."""
+
+    stamps_ns: IntArray
+    """(N,)"""
+    positions: FloatArray
+    """(N, 3) [m]."""
+    quaternions: FloatArray
+    """(N, 4) x, y, z, w."""
+    sigmas: FloatArray
+    """(N, 6) of x, y, z, roll, pitch, yaw [m, rad]."""
+
+
+class Trajectory3Table:
+    """Poses in space in memory, 112 bytes each; one that is not later than the last is left out."""
+
+    def __init__(self) -> None:
+        self._stamps, self._numbers = array("q"), array("d")
+
+    def add(self, pose: Pose3) -> None:
+        """Append a pose."""
+        if self._stamps and pose.stamp_ns <= self._stamps[-1]:
+            return
+        self._stamps.append(pose.stamp_ns)
+        sigmas = np.sqrt(np.maximum(np.diagonal(pose.covariance), 0.0))
+        self._numbers.extend([*pose.position.tolist(), *quaternion(pose.rotation), *sigmas.tolist()])
+
+    def trajectory(self) -> Trajectory3:
+        """All poses so far."""
+        rows = np.array(self._numbers).reshape(-1, 13)
+        return Trajectory3(np.array(self._stamps, dtype=np.int64), rows[:, :3], rows[:, 3:7], rows[:, 7:])
+
+
+def write_tum3(path: Path, trajectory: Trajectory3 | None) -> None:
+    """Write a TUM file of poses in space; none where there is no ``trajectory``. Raises `OutputError` as `trajectory.write_tum`."""
+    if trajectory is None:
+        return
+    lines = ["# timestamp tx ty tz qx qy qz qw\n"]
+    for stamp, row in zip(trajectory.stamps_ns.tolist(), np.hstack([trajectory.positions, trajectory.quaternions]).tolist(), strict=True):
+        sign, (seconds, nanoseconds) = "-" if stamp < 0 else "", divmod(abs(stamp), 10**9)
+        lines.append(f"{sign}{seconds}.{nanoseconds:09d} {' '.join(map(repr, row))}\n")
+    with whole_file(path) as file:
+        file.write("".join(lines).encode("ascii"))
