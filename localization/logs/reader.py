@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tempfile
 import warnings
@@ -11,6 +12,7 @@ from itertools import chain, islice
 from pathlib import Path, PurePath
 from typing import Any
 
+import numpy as np
 from ruamel.yaml import YAML
 
 from localization.errors import LogError, TopicError
@@ -26,12 +28,14 @@ from localization.logs.topic_roles import REFERENCE_TYPES, Sides, TopicChooser, 
 from localization.logs.transforms import FixedTransforms
 from localization.logs.wheel_messages import TF_TYPES, odometry_edge
 from motion_models.robot import Mount, Robot
+from motion_models.se2 import FloatArray
 from motion_models.text_files import check_file
 
 _GPS = "/fix"
 _TF_READ_NS = 10_000_000_000  # of ROS 1, where static transforms are repeated every 0.1 to 1 s on /tf
 _TRANSFORMS_READ = 2000  # first messages of /tf that are searched for the odometry's
 _FIRST_READ_NS = 20_000_000_000  # of a topic, for its latency; a long log is not read to its end for one that is slow
+_POINTS_READ = 100  # first messages of a point that may be the centre of gravity
 _JOINT_STATES_READ = 500  # first messages that are searched for joint names
 
 _MAX_METADATA_BYTES = 4 << 20
@@ -75,7 +79,7 @@ class Log:
         self._stats_by_topic: dict[str, MessageStats] = {}
         self._overrides = topics
         self._chooser = TopicChooser(path.name, self.channels, robot, topics)
-        roles = choose_roles(path.name, self._chooser, robot, topics, self._joint_names, self._odometry_edge)
+        roles = choose_roles(path.name, self._chooser, robot, topics, self._joint_names, self._odometry_edge, self._mean_point)
         self.sources = roles.sources
         """Topic of each role."""
         self.wheels_error = roles.wheels_error
@@ -204,6 +208,11 @@ class Log:
 
     def _joint_names(self, topic: str) -> Iterator[list[str]]:
         return (message.name for _, message in self._first_messages(topic, _JOINT_STATES_READ))
+
+    def _mean_point(self, topic: str) -> FloatArray | None:
+        points = [(message.point.x, message.point.y) for _, message in self._first_messages(topic, _POINTS_READ)]
+        points = [point for point in points if math.isfinite(sum(point))]
+        return np.median(points, axis=0) if points else None
 
     def _odometry_edge(self, topic: str) -> tuple[str, str] | None:
         decode = LogDeserializer([c for c in self.channels if c.topic == topic], is_ros1=self.source.is_ros1)

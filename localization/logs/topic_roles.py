@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from localization.errors import TopicError
+from localization.logs.cg_topic import MeanPoint, choose_cg_topic
 from localization.logs.chunks import Channel
 from localization.logs.wheel_messages import TF_TYPES, TWIST_TYPES, is_measured_twist
 from motion_models.center_of_gravity.files import arms_model
@@ -61,7 +62,7 @@ class TopicSource:
     kind: str
     """Its entry in [topics] of the robot file, which sets the message type (`TYPES`)."""
     chosen_by: str
-    """"option", "robot" or "only" (the only one of its type in the log)."""
+    """"option", "robot", "only" (the only one of its type in the log) or "points" (by names and places of several)."""
     type: str = ""
     """Message type, where it is another than that of ``kind``."""
 
@@ -128,13 +129,16 @@ class TopicChooser:
         """The only topic of the matching type, if no option sets the role."""
         if getattr(self._overrides, kind) is not None:
             return None
-        # What the run is scored against must not be what it is estimated from.
-        kept_out = {self._robot.topics.reference, self._overrides.reference}
-        topics = [topic for topic in self.of_type(TYPES[kind]) if topic not in kept_out]
+        topics = self.candidates(kind)
         if len(topics) > 1:
             option = f"--topic.{kind.replace('_', '-')}"
             self.warnings.append(f"{', '.join(topics)} could each be the {kind.replace('_', ' ')}; name one with {option}.")
         return TopicSource(topics[0], kind, "only") if len(topics) == 1 else None
+
+    def candidates(self, kind: str) -> list[str]:
+        """Topics of the matching type. What the run is scored against must not be what it is estimated from."""
+        kept_out = {self._robot.topics.reference, self._overrides.reference}
+        return [topic for topic in self.of_type(TYPES[kind]) if topic not in kept_out]
 
     def require(self, topic: str, types: tuple[str, ...], option: str) -> None:
         """Raises `TopicError` unless the log has ``topic`` with one of these types."""
@@ -186,16 +190,24 @@ def choose_roles(
     overrides: TopicOverrides,
     joint_names: JointNames,
     odometry_edge: OdometryEdge = lambda topic: None,
+    mean_point: MeanPoint = lambda topic: None,
 ) -> TopicRoles:
     """Choose a topic for each role. Raises `TopicError` if an option names a topic that does not fit, and what `arms_model` does."""
-    return _RoleChooser(log, chooser, robot, overrides, joint_names, odometry_edge).choose()
+    return _RoleChooser(log, chooser, robot, overrides, joint_names, odometry_edge, mean_point).choose()
 
 
 class _RoleChooser:
     def __init__(
-        self, log: str, chooser: TopicChooser, robot: Robot, overrides: TopicOverrides, joint_names: JointNames, odometry_edge: OdometryEdge
+        self,
+        log: str,
+        chooser: TopicChooser,
+        robot: Robot,
+        overrides: TopicOverrides,
+        joint_names: JointNames,
+        odometry_edge: OdometryEdge,
+        mean_point: MeanPoint,
     ) -> None:
-        self._odometry_edge = odometry_edge
+        self._odometry_edge, self._mean_point = odometry_edge, mean_point
         self._log, self._chooser, self._robot = log, chooser, robot
         self._overrides, self._joint_names = overrides, joint_names
         self._joints: Sides = ((), ())
@@ -204,7 +216,7 @@ class _RoleChooser:
         self._warnings: list[str] = []
 
     def choose(self) -> TopicRoles:
-        wheels, lidar, imu, center_of_gravity = self._wheels(), self._lidar(), self._choose("imu"), self._choose("center_of_gravity")
+        wheels, lidar, imu, center_of_gravity = self._wheels(), self._lidar(), self._choose("imu"), self._center_of_gravity()
         arms, model = self._arms() if center_of_gravity is None else ((), None)
         sources = Sources(wheels, lidar, imu, center_of_gravity, arms, self._more_wheels)
         return TopicRoles(sources, self._joints, self._error, model, [*self._chooser.warnings, *self._warnings])
@@ -232,6 +244,17 @@ class _RoleChooser:
         if not topics:
             return (), None
         return tuple(TopicSource(topic, "joint_states", "robot") for topic in topics), model
+
+    def _center_of_gravity(self) -> TopicSource | None:
+        kind = "center_of_gravity"
+        topics = self._chooser.candidates(kind)
+        if not topics or self._overrides.center_of_gravity is not None or self._chooser.find_named(kind) is not None:
+            return self._choose(kind)
+        choice = choose_cg_topic(topics, self._robot, self._mean_point)
+        if choice is None:
+            return self._choose(kind)
+        self._warnings.append(choice.text)
+        return None if choice.topic is None else TopicSource(choice.topic, kind, "points")
 
     def _choose(self, kind: str) -> TopicSource | None:
         named = self._chooser.find_named(kind)
