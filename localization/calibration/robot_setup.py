@@ -16,7 +16,19 @@ from typing import Any, NamedTuple
 
 from localization.calibration.controllers import controller_kinds, read_controllers
 from localization.calibration.urdf_checks import KIND_NOTES, Contradiction, check_urdf, is_tipping
-from localization.calibration.wheel_fit import MIN_R2, DriverFit, Motion, WheelSides, fit_wheels, is_moving, read_motion, wheel_sides
+from localization.calibration.wheel_fit import (
+    MIN_R2,
+    RATE_UNITS,
+    DriverFit,
+    Motion,
+    WheelSides,
+    fit_wheels,
+    is_moving,
+    is_plausible,
+    rate_unit,
+    read_motion,
+    wheel_sides,
+)
 from localization.logs.chunks import RawMessage, merge_channels
 from localization.logs.decode import UnusableError, frame_name
 from localization.logs.reader import open_log, open_source
@@ -167,6 +179,7 @@ def draft_robot(survey: Survey, given: Given, path: Path) -> Draft:
                 f"(R^2 below {MIN_R2:g} with every sign); neither is taken from it. Check units, --left and --right."
             )
     draft.is_diff_drive = _is_diff_drive(draft.joints) if urdf is None else urdf.has_one_axle
+    fit = _fit_in_radians(draft, given, urdf, controllers, fit)
     _choose_geometry(draft, given, urdf, controllers, fit)
     if urdf is not None:
         findings = check_urdf(urdf, draft.values, measured)
@@ -321,7 +334,8 @@ def _choose_joints(draft: Draft, survey: Survey, given: Given, candidates: list[
         if names:
             draft.missing.append(f"wheel joints: none of {', '.join(names)} is a left or right wheel by name; give --left and --right.")
         return
-    draft.joints = Joints(chosen.left, chosen.right)
+    backwards = () if measured is None else tuple(n for n in measured.reversed if n in (*chosen.left, *chosen.right))
+    draft.joints = Joints(chosen.left, chosen.right, backwards)
     draft.reasons.append(f"joints: left {', '.join(chosen.left)}; right {', '.join(chosen.right)}: {chosen.reason}.")
     by_log = "cannot decide" if measured is None else f"left {', '.join(measured.left)}"
     wrong = [c for c in of_log if not _same(c, chosen if measured is None else measured)]
@@ -343,8 +357,39 @@ def _name_reversed(draft: Draft, measured: WheelSides) -> None:
     )
     draft.missing.append(
         f"sign: {what} is inverted: its rates are negative when the robot drives forward, and turning follows the sum of both sides. "
-        "Negate it in the driver (a mirrored motor or an axis of 0 -1 0); radius and track below are with its sign changed."
+        "joints.reversed in the robot file undoes it, and must go when the driver does (a mirrored motor, or an axis of 0 -1 0)."
     )
+
+
+def _fit_in_radians(
+    draft: Draft, given: Given, urdf: WheelGeometry | None, controllers: tuple[ControllerValues, ...], fit: DriverFit | None
+) -> DriverFit | None:
+    """``fit`` with the unit of rates that a known radius gives, which goes to the robot file; without a radius that no such robot has."""
+    described = _described(urdf, controllers, "wheel_radius_m")
+    known = given.wheel_radius_m or (described[0][0] if described else None)
+    if fit is None or draft.joints is None:
+        return fit
+    track = given.track_width_m or next((value for value, _ in _described(urdf, controllers, "track_width_m")), fit.effective_track_m)
+    unit = None if known is None else rate_unit(fit.wheel_radius_m, known, track)
+    if unit is not None:
+        name, radians = unit
+        draft.joints = dataclasses.replace(draft.joints, rate_unit_rad_s=radians)
+        draft.contradictions.append(
+            Contradiction("unit", "joint states", f"rad/s: a radius of {fit.wheel_radius_m:.4g} m for {known:.4g} m", name)
+        )
+        draft.missing.append(
+            f"unit: the wheels' velocities are {name}, by the radius that is known; joints.rate_unit_rad_s = {radians:.6g} is written. "
+            "Positions are not compared: run `skidloc check`."
+        )
+        return dataclasses.replace(fit, wheel_radius_m=fit.wheel_radius_m / radians)
+    if is_plausible(fit.wheel_radius_m, track):
+        return fit
+    radii = ", ".join(f"{fit.wheel_radius_m / radians:.4g} m by {name}" for name, radians in RATE_UNITS.items())
+    draft.missing.append(
+        f"unit: wheels of {fit.wheel_radius_m:.4g} m, which the log gives by rad/s, carry no robot of a track of {track:.3g} m; "
+        f"they are {radii}. Measure them and give --wheel-radius-m: the unit is found by it."
+    )
+    return dataclasses.replace(fit, wheel_radius_m=math.nan)
 
 
 def _choose_geometry(
@@ -394,11 +439,15 @@ def _is_same(a: float, b: float, share: float) -> bool:
 def _choose_radius(draft: Draft, given: float | None, described: list[tuple[float, str]], fit: DriverFit | None, of_log: str) -> None:
     """The given radius, else the first description that the log confirms, else the log's."""
     name = "wheel_radius_m"
-    measured = None if fit is None else fit.wheel_radius_m
+    measured = None if fit is None or math.isnan(fit.wheel_radius_m) else fit.wheel_radius_m
     confirmed = [d for d in described if measured is None or _is_same(d[0], measured, _SAME_RADIUS)]
     draft.choose(name, [(given, "given"), *confirmed, (measured, of_log)])
     if name in draft.values:
-        by_log = "no motion" if fit is None else f"{fit.wheel_radius_m:.4g} m (R^2 {fit.r2[0]:.3f}, residual {fit.residuals[0]:.2g} m/s)"
+        by_log = (
+            "no motion"
+            if fit is None or measured is None
+            else f"{fit.wheel_radius_m:.4g} m (R^2 {fit.r2[0]:.3f}, residual {fit.residuals[0]:.2g} m/s)"
+        )
         sources = [*described, *([] if given is None else [(given, "given")])]
         _compare(draft, name, sources, measured or draft.values[name], by_log, _SAME_RADIUS)
 

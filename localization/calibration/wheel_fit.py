@@ -23,6 +23,12 @@ from motion_models.se2 import FloatArray
 
 MIN_R2 = 0.9
 """Least share of a motion's mean square that a fit must explain; drivers' own odometry reaches 0.99, a wrong side or sign less than 0.5."""
+RATE_UNITS = {"revolutions per minute": math.pi / 30.0, "degrees per second": math.pi / 180.0, "revolutions per second": 2.0 * math.pi}
+"""Rad/s per unit of wheel rates in which drivers report besides."""
+_SAME_UNIT, _NEAREST_UNIT = 0.1, 0.8
+"""Largest logarithm of a measured unit over one of these: for a radius that could be, and for one that cannot (units differ by 1.8)."""
+_RADII_PER_TRACK = (0.06, 0.9)
+"""Wheels' radius over the track: from robots with a wide body (Roomba, 0.15; half of it by k) to monster trucks."""
 _PAIRS = 4000
 """Joint states and odometry messages that are used."""
 _MIN_MESSAGES = 10
@@ -121,6 +127,22 @@ def is_moving(motion: Motion) -> bool:
     """Whether speed and yaw rate are large enough, and different enough, to fit constants to them."""
     moves = len(motion.vx) >= _MIN_MESSAGES and min(math.sqrt(np.mean(v**2)) for v in (motion.vx, motion.wz)) >= _MIN_MOTION
     return bool(moves and np.linalg.matrix_rank(np.stack([motion.vx, motion.wz])) == 2)
+
+
+def rate_unit(measured: float, known: float, track: float) -> tuple[str, float] | None:
+    """Name and rad/s of the unit of rates by which a ``measured`` radius [m] is the ``known`` one; None for rad/s or no unit at all.
+
+    ``track`` [m] decides how near the two must be: wheels of a few millimetres carry no robot, whatever a description has.
+    """
+    if not is_plausible(known, track):
+        return None
+    limit = _SAME_UNIT if is_plausible(measured, track) else _NEAREST_UNIT
+    return next((unit for unit in RATE_UNITS.items() if abs(math.log(measured / known / unit[1])) <= limit), None)
+
+
+def is_plausible(radius: float, track: float) -> bool:
+    """Whether wheels of such a ``radius`` [m] can carry a robot of such a ``track`` [m]."""
+    return _RADII_PER_TRACK[0] * track <= radius <= _RADII_PER_TRACK[1] * track
 
 
 def wheel_sides(motion: Motion) -> WheelSides | None:

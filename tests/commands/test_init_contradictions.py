@@ -47,6 +47,7 @@ def test_init_with_an_inverted_side_names_it_and_fits_the_radius(tmp_path: Path,
     robot = init(tmp_path, log, "--track-width-m", "0.57", "--wheelbase-m", "0.51")
     assert robot.geometry.wheel_radius_m == pytest.approx(0.165, rel=0.02)
     assert robot.driver.wheel_separation_multiplier == pytest.approx(1.875, rel=0.02)
+    assert robot.joints.reversed == ("front_right_wheel", "rear_right_wheel")
     assert "the right side (front_right_wheel, rear_right_wheel) is inverted" in capsys.readouterr().out
 
 
@@ -110,3 +111,24 @@ def test_init_with_a_mecanum_controller_is_refused_by_name(tmp_path: Path, capsy
     (tmp_path / "control.yaml").write_text(_MECANUM)
     assert main(["init", str(BASE_LOG), "--out", str(tmp_path / "r.toml"), "--controller", str(tmp_path / "control.yaml")]) == 2
     assert "it is of mecanum wheels" in " ".join(capsys.readouterr().err.split())
+
+
+_RPM_LOG = CASES / "H13-wheel-rates-in-rpm" / "log.mcap"
+
+
+@pytest.mark.parametrize(("known", "radius"), [("0.165", 0.165), ("0.15", 0.15)])
+def test_init_with_rates_in_rpm_writes_their_unit(known: str, radius: float, tmp_path: Path) -> None:
+    robot = init(tmp_path, _RPM_LOG, "--wheel-radius-m", known, "--track-width-m", "0.57", "--wheelbase-m", "0.51")
+    assert (robot.joints.rate_unit_rad_s, robot.geometry.wheel_radius_m) == (pytest.approx(0.10472, rel=1e-4), radius)
+
+
+def test_init_with_rates_in_rpm_and_a_wrong_urdf_has_both(tmp_path: Path) -> None:
+    robot = init(tmp_path, _RPM_LOG, "--urdf", str(CASES / "H10-urdf-base-inertial-axes-swapped" / "robot.urdf"))
+    assert robot.joints.rate_unit_rad_s == pytest.approx(0.10472, rel=1e-4)
+    assert robot.geometry.wheel_radius_m == pytest.approx(0.165, rel=0.01)
+
+
+def test_init_with_rates_in_rpm_alone_asks_for_the_radius(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lengths = ("--track-width-m", "0.57", "--wheelbase-m", "0.51")
+    assert main(["init", str(_RPM_LOG), "--out", str(tmp_path / "r.toml"), *lengths]) == 2
+    assert "0.165 m by revolutions per minute" in " ".join(capsys.readouterr().out.split())
