@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.resources import files
 from pathlib import Path
 from typing import ClassVar
 
@@ -166,7 +167,26 @@ class Figure:
         return Markup(self.svg.replace("<svg", f'<svg class="picture" role="img" aria-label="{title}"', 1))
 
 
-Block = Table | Bullets | Paragraph | Definitions | Figure
+@dataclass(frozen=True)
+class Explorer:
+    """Map and time series that one can zoom, hover over, and walk through by a time slider, drawn by Plotly in the browser."""
+
+    kind: ClassVar[str] = "explorer"
+    json: str
+
+    @property
+    def data(self) -> Markup:
+        """The JSON, safe inside a script element."""
+        return Markup(self.json.replace("<", "\\u003c"))
+
+    @property
+    def scripts(self) -> Markup:
+        """Plotly's basic bundle (MIT) and what draws with it: the page needs no network."""
+        folder = files("localization.report") / "templates"
+        return Markup("\n".join((folder / name).read_text(encoding="utf-8") for name in ("plotly-basic.min.js", "explore.js")))
+
+
+Block = Table | Bullets | Paragraph | Definitions | Figure | Explorer
 
 
 @dataclass(frozen=True)
@@ -175,6 +195,8 @@ class Section:
 
     title: str
     blocks: Sequence[Block]
+    is_static: bool = False
+    """For paper and browsers without scripts: an `Explorer` shows the same."""
 
 
 @dataclass(frozen=True)
@@ -189,6 +211,11 @@ class Page:
     sections: Sequence[Section]
     hideable: Sequence[int] = field(default=())
     """Numbers of runs that a box in a legend can hide."""
+
+    @property
+    def has_script(self) -> bool:
+        """Whether a part of the page is drawn in the browser."""
+        return any(block.kind == Explorer.kind for section in self.sections for block in section.blocks)
 
 
 def glossary(terms: Mapping[str, str]) -> Section:

@@ -15,6 +15,7 @@ from scipy.stats import chi2
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result
 from localization.report import figures
+from localization.report.interactive import explorer
 from localization.report.page import (
     Block,
     Cell,
@@ -87,9 +88,11 @@ class ReportHead:
     """Hash of the log."""
 
 
-def write_report(path: str | Path, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
+def write_report(
+    path: str | Path, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None, is_interactive: bool = True
+) -> None:
     """Write the page. Raises `OutputError` if there is such a file already or it cannot be written."""
-    write_new(path, page(head, results, reference).encode())
+    write_new(path, page(head, results, reference, is_interactive).encode())
 
 
 def overview_png(path: str | Path, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
@@ -99,12 +102,12 @@ def overview_png(path: str | Path, head: ReportHead, results: Sequence[Result], 
     write_new(path, figures.overview(runs, map_view(runs, reference), measure, head.log))
 
 
-def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> str:
-    """HTML of the whole page."""
+def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None, is_interactive: bool = True) -> str:
+    """HTML of the whole page; unless it ``is_interactive``, without scripts."""
     runs = plotted_runs(results)
     sentences = verdict_sentences(results, reference)
     sections = [
-        *(_sections(runs, reference) if runs else []),
+        *(_sections(runs, reference, is_interactive) if runs else []),
         Section("About the log", bullets(head.warnings) or [Paragraph("No problem was found in it.")]),
         glossary(_TERMS),
         Section("Sources and versions", [Definitions(_provenance(head, reference))]),
@@ -114,16 +117,18 @@ def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack 
     return render(Page(f"Replay of {head.log}", facts, sentences, sections, [run.number for run in runs]))
 
 
-def _sections(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> list[Section]:
+def _sections(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None, is_interactive: bool) -> list[Section]:
     """Numbers and figures."""
     best = best_run(runs) if reference is not None else None
     near = [run for run in runs if best is not None and run is not best and run.error is not None and is_close(run, best)]
     notes = " ".join(_about_reference(runs, reference))
+    explore = [explorer(runs, reference)] if is_interactive and any(len(run.result.run.trajectory) for run in runs) else []
     return [
         Section("Accuracy" if reference is not None else "Runs", [*accuracy_tables(runs, best, near), Paragraph(notes, is_small=True)]),
-        Section("Trajectories", [_map_figure(runs, map_view(runs, reference))]),
-        Section("Errors", _error_figure(runs, reference)),
-        Section("Innovations: are the covariances consistent?", _nis_figure(runs)),
+        Section("Explore", explore),
+        Section("Trajectories", [_map_figure(runs, map_view(runs, reference))], is_static=bool(explore)),
+        Section("Errors", _error_figure(runs, reference), is_static=bool(explore) and not isinstance(reference, Relations)),
+        Section("Innovations: are the covariances consistent?", _nis_figure(runs), is_static=bool(explore)),
         Section("Estimated parameters", _with_note(parameter_table(runs), "Mean ± sigma at the end of the drive.")),
         Section("Counts", _with_note(count_table(runs), "")),
     ]

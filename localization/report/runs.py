@@ -180,7 +180,7 @@ def ellipse(pose: FloatArray, covariance: FloatArray, sigmas: float = 2.0) -> El
     return Ellipse((float(pose[0]), float(pose[1])), (float(large), float(small)), angle)
 
 
-def thin_path(positions: FloatArray, resolution_m: float, most: int = 2500) -> IntArray:
+def thin_path(positions: FloatArray, resolution_m: float, most: int = 1000) -> IntArray:
     """Indices of enough of a path's positions (N, 2) to draw it at a resolution: first and last, and at most ``most`` in all.
 
     Unlike in `path_nodes` a sample is kept by the length of the path so far, which is one pass over an array of any length.

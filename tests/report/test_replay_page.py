@@ -285,8 +285,8 @@ def test_thinned_paths_keep_ends_and_shape():
     kept = thin_path(path, resolution_m=0.04)
     assert kept[0] == 0
     assert kept[-1] == 99_999
-    assert len(kept) <= 2500
-    assert np.hypot(*np.diff(path[kept], axis=0).T).max() < 2.0  # 30 laps in 2,500 pieces
+    assert len(kept) <= 1000
+    assert np.hypot(*np.diff(path[kept], axis=0).T).max() < 5.0  # 30 laps in 1,000 pieces
     assert thin_path(np.zeros((10_000, 2)), 0.1).tolist() == [0, 9_999]  # a robot that stands
 
 
@@ -415,7 +415,9 @@ def page_of(case):
 
 @pytest.mark.parametrize("case", list(cases()))
 def test_page_is_well_formed_and_loads_nothing(case):
-    first = page_of(case)
+    whole = page_of(case)
+    assert "default-src 'none'" in whole  # Plotly's links to its homepage are never followed
+    first = without_scripts(whole)
     text = PageText(first)  # fails on unclosed tags
     assert not re.search(r"https?://|xlink|url\((?!#)|@import|\son\w+=", first)
     assert not [tag for tag, _ in text.tags if tag in ("script", "link", "iframe", "object")]
@@ -427,7 +429,12 @@ def test_page_is_well_formed_and_loads_nothing(case):
     wanted = set(re.findall(r'(?:url\(#|href="#)([^")]+)', first))
     assert wanted <= set(ids)
     assert "nan" not in re.sub(r"base64,[^\"]*", "", first).lower().replace("finance", "")
-    assert len(first) < 2_000_000
+    assert len(whole) < 2_000_000
+
+
+def without_scripts(made: str) -> str:
+    """The page as it is without what a browser runs."""
+    return re.sub(r"<script.*?</script>", "", made, flags=re.DOTALL)
 
 
 def test_page_starts_and_ends_with_the_summary():
@@ -445,6 +452,8 @@ def test_page_escapes_text_of_the_log():
     reference = dataclasses.replace(track(), source=evil, warnings=(evil,))
     mapped = dataclasses.replace(bad, map_points=np.ones((4, 2)), nis=chi_square_nis())
     made = page(head, score([mapped, run(noise=0.2, seed=1)], reference), reference)
+    assert "<script>alert" not in made
+    made = without_scripts(made)
     assert "<script" not in made
     assert PageText(made).words.count(evil) >= 5
 
@@ -460,7 +469,7 @@ def test_figures_axes_have_units_and_each_run_a_line():
 
 
 def test_figures_have_the_colours_of_the_page_in_dark_mode():
-    made = page_of("track")
+    made = without_scripts(page_of("track"))
     assert "prefers-color-scheme:dark" in made
     assert not re.findall(r"(?:fill|stroke): ?#(?!f{6}|f{3}\b)[0-9a-f]{3,6}", made)  # every colour is the page's to change
 

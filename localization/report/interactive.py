@@ -1,0 +1,138 @@
+"""Data of the interactive part of a replay's page: trajectories, errors, sigmas, innovations and events over time.
+
+`templates/explore.js` draws everything in the browser from one JSON object.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from localization.evaluation.references import ReferenceTrack, Relations
+from localization.report.page import Explorer
+from localization.report.runs import PlottedRun, run_with_map, thin_series, timeline
+from motion_models.se2 import FloatArray
+
+_MOST_POINTS = 3_200
+"""Points of all paths together, of all errors, and of all innovations: 80 bytes in all, so that a page stays below 2 MB."""
+_MOST_MAP_POINTS = 5_000
+_MOST_LOOPS = 400
+_MOST_MEANS = 300
+_LOST_AFTER_S = 1.0
+"""A time without a matched scan that is shown as lost [s]: ten scans of a usual LiDAR."""
+_MILLIMETRES, _TENTHS = 3, 1
+
+
+def explorer(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> Explorer:
+    """The block of ``runs``, thinned."""
+    return Explorer(json.dumps(explorer_data(runs, reference), separators=(",", ":"), allow_nan=False))
+
+
+def explorer_data(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> dict[str, Any]:
+    """What the page draws: times in seconds since the first run's first pose, metres, degrees."""
+    start_ns = int(min(run.result.run.trajectory.stamps_ns[0] for run in runs if len(run.result.run.trajectory)))
+    most = max(_MOST_POINTS // max(len(runs), 1), 100)
+    drawn = run_with_map(runs)
+    points = drawn.placed_points(drawn.result.run.map_points) if drawn is not None else np.empty((0, 2))
+    points = points[:: max(-(-len(points) // _MOST_MAP_POINTS), 1)]
+    track = reference if isinstance(reference, ReferenceTrack) else None
+    return {
+        "runs": [_run(run, start_ns, most) for run in runs if len(run.result.run.trajectory)],
+        "reference": None if track is None else _reference(track, start_ns),
+        "map": {"x": _numbers(points[:, 0], 2), "y": _numbers(points[:, 1], 2), "run": "" if drawn is None else drawn.label},
+    }
+
+
+def _run(run: PlottedRun, start_ns: int, most: int) -> dict[str, Any]:
+    """One run: path with sigma, errors, innovations, loops, and times without a matched scan."""
+    trajectory = run.result.run.trajectory
+    t = np.asarray((trajectory.stamps_ns - start_ns) * 1e-9, dtype=np.float64)
+    poses = run.placed(trajectory.poses)
+    keep = np.unique(np.linspace(0, len(poses) - 1, min(most, len(poses))).astype(int))
+    way = np.r_[0.0, np.cumsum(np.hypot(*np.diff(trajectory.poses[:, :2], axis=0).T))]
+    sigma = None if trajectory.covariances is None else np.sqrt(np.trace(trajectory.covariances[:, :2, :2], axis1=1, axis2=2))
+    return {
+        "label": run.label,
+        "number": run.number,
+        "colour": run.colour,
+        "dash": ",".join(f"{1.8 * d:g}px" for d in run.dashes) or "solid",
+        "t": _numbers(t[keep], 2),
+        "x": _numbers(poses[keep, 0], _MILLIMETRES),
+        "y": _numbers(poses[keep, 1], _MILLIMETRES),
+        "heading": _numbers(np.degrees(poses[keep, 2]), _TENTHS),
+        "way": _numbers(way[keep], 2),
+        "sigma": None if sigma is None else _numbers(sigma[keep], 4),
+        "errors": _errors(run, t, way, most),
+        "nis": _innovations(run, t),
+        "loops": _loops(run),
+        "lost": _lost(run, t),
+    }
+
+
+def _errors(run: PlottedRun, t: FloatArray, way: FloatArray, most: int) -> dict[str, Any] | None:
+    """Errors against the reference, aligned as a whole."""
+    line = timeline(run)
+    if line is None:
+        return None
+    keep = np.unique(np.r_[thin_series(line.position_m, most), len(line.seconds) - 1])
+    seconds = line.seconds + t[0]
+    return {
+        "t": _numbers(seconds[keep], 2),
+        "way": _numbers(np.interp(seconds[keep], t, way), 2),
+        "position": _numbers(line.position_m[keep], 4),
+        "heading": None if line.heading_deg is None else _numbers(np.abs(line.heading_deg[keep]), 3),
+    }
+
+
+def _innovations(run: PlottedRun, t: FloatArray) -> dict[str, Any] | None:
+    """Means of successive NIS values: single ones scatter by a factor of ten."""
+    nis = run.result.run.nis
+    use = np.flatnonzero(np.isfinite(nis))
+    if not len(use):
+        return None
+    groups = np.array_split(use, min(_MOST_MEANS, len(use)))
+    return {"t": _numbers([t[g].mean() for g in groups], 2), "nis": _numbers([nis[g].mean() for g in groups], 3)}
+
+
+def _loops(run: PlottedRun) -> list[list[float | None]]:
+    """Loop closures: both poses' x and y, and the time of the later one."""
+    found = run.result.run.keyframes
+    if found is None:
+        return []
+    start_ns = run.result.run.trajectory.stamps_ns[0]
+    edges = found.edges[found.edge_is_loop][:_MOST_LOOPS]
+    poses = run.placed(found.poses)
+    return [
+        [*_numbers(np.r_[poses[a, :2], poses[b, :2]], 2), round(float(found.stamps_ns[max(a, b)] - start_ns) * 1e-9, 2)] for a, b in edges
+    ]
+
+
+def _lost(run: PlottedRun, t: FloatArray) -> list[list[float | None]]:
+    """Intervals without a matched scan, [from, to] in seconds."""
+    matched = t[np.isfinite(run.result.run.nis)]
+    if not len(matched):
+        return []
+    gaps = np.flatnonzero(np.diff(matched) > _LOST_AFTER_S)
+    found = [[float(matched[i]), float(matched[i + 1])] for i in gaps]
+    if t[-1] - matched[-1] > _LOST_AFTER_S:
+        found.append([float(matched[-1]), float(t[-1])])
+    return [_numbers(np.array(pair), 2) for pair in found]
+
+
+def _reference(track: ReferenceTrack, start_ns: int) -> dict[str, Any]:
+    keep = np.unique(np.linspace(0, len(track.stamps_ns) - 1, min(_MOST_POINTS // 2, len(track.stamps_ns))).astype(int))
+    return {
+        "t": _numbers((track.stamps_ns[keep] - start_ns) * 1e-9, 2),
+        "x": _numbers(track.positions[keep, 0], _MILLIMETRES),
+        "y": _numbers(track.positions[keep, 1], _MILLIMETRES),
+    }
+
+
+def _numbers(values: ArrayLike, digits: int) -> list[float | None]:
+    """Rounded; what is not finite is null."""
+    rounded = np.round(np.asarray(values, dtype=float), digits)
+    return [float(v) if np.isfinite(v) else None for v in rounded]

@@ -1,0 +1,137 @@
+// Draws the interactive part of a replay's page with Plotly from the JSON of localization/report/interactive.py.
+(() => {
+  const data = JSON.parse(document.getElementById("explore-data").textContent);
+  const box = id => document.getElementById("explore-" + id);
+  const root = document.documentElement;
+  root.classList.add("has-script");
+  const colour = name => getComputedStyle(root).getPropertyValue("--" + name).trim();
+  const runs = data.runs;
+  const end = Math.max(...runs.map(run => run.t[run.t.length - 1]));
+  const config = {responsive: true, displaylogo: false, scrollZoom: true, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"]};
+  let now = end;
+
+  // Index of the last number of sorted `t` that is not after `value`.
+  const before = (t, value) => {
+    let low = 0, high = t.length - 1;
+    while (low < high) {
+      const middle = (low + high + 1) >> 1;
+      if (t[middle] <= value) low = middle; else high = middle - 1;
+    }
+    return low;
+  };
+  const layout = more => ({
+    paper_bgcolor: colour("paper"), plot_bgcolor: colour("paper"), font: {color: colour("ink"), family: "inherit", size: 12},
+    margin: {l: 58, r: 12, t: 8, b: 42}, legend: {orientation: "h", y: 1.06, yanchor: "bottom"}, hovermode: "closest", ...more,
+  });
+  const axis = (title, more) => ({title: {text: title}, gridcolor: colour("rule"), linecolor: colour("rule"), zeroline: false, ...more});
+  const style = run => ({color: colour(run.colour), width: 2, dash: run.dash});
+  const isWay = () => box("axis").value === "way";
+  const along = (run, part) => isWay() ? (part ? part.way : run.way) : (part || run).t;
+  const wayAt = run => run.way[before(run.t, now)];
+
+  const mapTraces = () => {
+    const traces = [{x: data.map.x, y: data.map.y, mode: "markers", type: "scatter", name: "scans", hoverinfo: "skip",
+                     marker: {size: 2, color: colour("grey"), opacity: .6}, visible: data.map.x.length ? true : "legendonly"}];
+    if (data.reference) traces.push({x: data.reference.x, y: data.reference.y, customdata: data.reference.t, mode: "lines", name: "reference",
+      line: {color: colour("ink"), width: 1.5, dash: "dot"}, hovertemplate: "reference<br>%{customdata:.1f} s<br>%{x:.2f}, %{y:.2f} m<extra></extra>"});
+    runs.forEach(run => {
+      traces.push({x: run.x, y: run.y, customdata: run.t.map((t, i) => [t, run.heading[i], run.sigma ? run.sigma[i] : NaN]), mode: "lines",
+        name: run.label, legendgroup: run.label, line: style(run),
+        hovertemplate: run.label + "<br>%{customdata[0]:.1f} s<br>%{x:.2f}, %{y:.2f} m, %{customdata[1]:.0f}°<br>sigma %{customdata[2]:.3g} m<extra></extra>"});
+      if (run.loops.length) traces.push({x: run.loops.flatMap(l => [l[0], l[2], null]), y: run.loops.flatMap(l => [l[1], l[3], null]),
+        mode: "lines", name: run.loops.length + " loops, " + run.label, hoverinfo: "skip", visible: "legendonly",
+        line: {color: colour("accent"), width: 1}});
+    });
+    traces.push({x: [], y: [], mode: "markers", name: "now", hoverinfo: "skip", showlegend: false,
+                 marker: {size: 11, color: [], line: {color: colour("paper"), width: 2}}});
+    return traces;
+  };
+
+  // Rows of the time series: title, unit, and the series of one run or null.
+  const rows = () => [
+    ["position error [m]", "log", run => run.errors && [along(run, run.errors), run.errors.position]],
+    ["heading error [deg]", "log", run => run.errors && run.errors.heading && [along(run, run.errors), run.errors.heading]],
+    ["position sigma [m]", "log", run => run.sigma && [along(run), run.sigma]],
+    ["NIS (3 expected)", "log", run => run.nis && [run.nis.t.map(t => isWay() ? run.way[before(run.t, t)] : t), run.nis.nis]],
+  ].concat(difference()).filter(row => runs.some(run => row[2](run)));
+
+  const difference = () => {
+    const [a, b] = ["a", "b"].map(name => runs[+box(name).value]);
+    if (!a || !b || a === b) return [];
+    const apart = a.t.map((t, i) => {
+      const k = before(b.t, t);
+      return Math.hypot(a.x[i] - b.x[k], a.y[i] - b.y[k]);
+    });
+    return [["A to B [m]", "linear", run => run === a && [along(a), apart]]];
+  };
+
+  const timeFigure = () => {
+    const found = rows(), gap = .07, height = (1 - gap * (found.length - 1)) / Math.max(found.length, 1);
+    const traces = [], more = {hovermode: "x unified", height: 150 * found.length + 100, xaxis: axis(isWay() ? "way [m]" : "time [s]", {anchor: "y" + (found.length > 1 ? found.length : "")})};
+    found.forEach(([title, type, series], i) => {
+      const name = i ? String(i + 1) : "", top = 1 - i * (height + gap);
+      more["yaxis" + name] = axis("", {type, domain: [Math.max(top - height, 0), top], exponentformat: "power", automargin: true});
+      runs.forEach(run => {
+        const s = series(run);
+        if (s) traces.push({x: s[0], y: s[1], yaxis: "y" + name, mode: "lines", name: run.label, legendgroup: run.label,
+          showlegend: !traces.some(t => t.legendgroup === run.label), line: {...style(run), width: 1.4}, hovertemplate: "%{y:.3g}"});
+      });
+    });
+    more.annotations = found.map(([title], i) => ({text: title, xref: "paper", yref: "paper", x: 0, y: 1 - i * (height + gap), showarrow: false,
+      xanchor: "left", yanchor: "bottom", font: {size: 12, color: colour("soft")}}));
+    more.shapes = shapes();
+    return [traces, layout(more)];
+  };
+  const shapes = () => {
+    const line = isWay() ? wayAt(runs[0]) : now;
+    const bands = runs.flatMap(run => run.lost.map(([from, to]) => {
+      const at = t => isWay() ? run.way[before(run.t, t)] : t;
+      return {type: "rect", xref: "x", yref: "paper", x0: at(from), x1: at(to), y0: 0, y1: 1, line: {width: 0},
+              fillcolor: colour(run.colour), opacity: .18, layer: "below"};
+    }));
+    return [...bands, {type: "line", xref: "x", yref: "paper", x0: line, x1: line, y0: 0, y1: 1, line: {color: colour("accent"), width: 1.5}}];
+  };
+
+  const show = t => {
+    now = Math.min(Math.max(t, 0), end);
+    box("slider").value = now;
+    const at = runs.map(run => before(run.t, now));
+    const track = data.reference ? before(data.reference.t, now) : 0;
+    const points = {x: runs.map((run, i) => run.x[at[i]]), y: runs.map((run, i) => run.y[at[i]]), c: runs.map(run => colour(run.colour))};
+    if (data.reference) points.x.push(data.reference.x[track]), points.y.push(data.reference.y[track]), points.c.push(colour("ink"));
+    Plotly.restyle(box("map"), {x: [points.x], y: [points.y], "marker.color": [points.c]}, [box("map").data.length - 1]);
+    Plotly.relayout(box("time"), {shapes: shapes()});
+    box("now").textContent = now.toFixed(1) + " s";
+  };
+  const draw = () => {
+    const size = Math.min(Math.max(box("map").clientWidth * .62, 300), 620);
+    Plotly.react(box("map"), mapTraces(), layout({height: size, dragmode: "pan", uirevision: "map", xaxis: axis("x [m]"),
+      yaxis: axis("y [m]", {scaleanchor: "x", scaleratio: 1})}), config);
+    const [traces, more] = timeFigure();
+    Plotly.react(box("time"), traces, more, {...config, scrollZoom: false});
+    show(now);
+  };
+
+  for (const name of ["a", "b"]) {
+    box(name).add(new Option("–", "-1"));
+    runs.forEach((run, i) => box(name).add(new Option(run.label, i)));
+  }
+  const events = [...runs.flatMap(run => run.lost.map(l => [l[0], "no scan matched for " + (l[1] - l[0]).toFixed(1) + " s, " + run.label])),
+                  ...runs.flatMap(run => run.loops.map(l => [l[4], "loop closed, " + run.label]))].sort((p, q) => p[0] - q[0]);
+  events.forEach(([t, text]) => box("event").add(new Option(t.toFixed(1) + " s: " + text, t)));
+  box("event").parentElement.hidden = !events.length;
+  box("slider").max = end;
+  draw();
+  box("slider").addEventListener("input", event => show(+event.target.value));
+  box("event").addEventListener("change", event => event.target.value && show(+event.target.value));
+  ["axis", "a", "b"].forEach(name => box(name).addEventListener("change", draw));
+  box("time").on("plotly_click", event => {
+    const x = event.points[0].x;
+    show(isWay() ? runs[0].t[before(runs[0].way, x)] : x);
+  });
+  box("map").on("plotly_click", event => {
+    const t = event.points[0].customdata;
+    if (t !== undefined) show(Array.isArray(t) ? t[0] : t);
+  });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+})();

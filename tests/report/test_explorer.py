@@ -1,0 +1,98 @@
+"""The interactive part of a replay's page, in a real browser where there is one (Debian: chromium)."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from localization.evaluation.references import ReferenceTrack
+from localization.evaluation.scores import score
+from localization.pipeline import Run
+from localization.report.interactive import explorer_data
+from localization.report.replay_page import ReportHead, page
+from localization.report.runs import plotted_runs
+from localization.trajectory import Trajectory
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+HEAD = ReportHead("drive.mcap", "husky_a200", "2026-01-02 03:04:05 UTC", 40.0, [], {}, "c0ffee")
+STAMPS = np.arange(401, dtype=np.int64) * 100_000_000
+POSES = np.column_stack([0.5 * STAMPS * 1e-9, np.zeros(401), np.zeros(401)])
+PROBE = """<script>
+const box = id => document.getElementById("explore-" + id);
+const change = (id, value, kind) => {box(id).value = value; box(id).dispatchEvent(new Event(kind));};
+const now = () => {const d = box("map").data; return d[d.length - 1].x.slice();};
+const found = {}, titles = () => (box("time").layout.annotations || []).map(a => a.text);
+change("slider", 20, "input"); found.at20 = now(); found.text = box("now").textContent;
+found.log = box("time").layout.yaxis.type; found.titles = titles();
+change("a", 0, "change"); change("b", 1, "change"); found.difference = titles().includes("A to B [m]");
+change("axis", "way", "change"); found.way = box("time").layout.xaxis.title.text;
+found.bands = box("time").layout.shapes.filter(s => s.type === "rect").length;
+found.isStaticHidden = getComputedStyle(document.querySelector("section.static")).display === "none";
+document.body.innerHTML = "<pre id=out>" + JSON.stringify(found) + "</pre>";
+</script></body>"""
+
+
+def results():
+    nis = np.full(401, 3.0)
+    nis[100:200] = np.nan
+    cov = np.tile(np.diag([0.01, 0.01, 0.001]), (401, 1, 1))
+    zeros = np.zeros((401, 3)), np.zeros((401, 3, 3))
+    plain = Run(
+        "diff_drive",
+        "odometry",
+        Trajectory(STAMPS, POSES * [1.1, 1, 1], cov),
+        *zeros,
+        np.full(401, np.nan),
+        {},
+        {},
+        np.empty((0, 2)),
+        (),
+        1.0,
+    )
+    fused = dataclasses.replace(plain, estimator="ekf", trajectory=Trajectory(STAMPS, POSES, cov), nis=nis, map_points=np.ones((9, 2)))
+    reference = ReferenceTrack(STAMPS[::4], POSES[::4, :2], POSES[::4, 2])
+    return score([plain, fused], reference), reference
+
+
+def test_explorer_data_has_times_without_a_matched_scan():
+    found, reference = results()
+    data = explorer_data(plotted_runs(found), reference)
+    assert [run["lost"] for run in data["runs"]] == [[], [[9.9, 20.0]]]
+    assert data["runs"][1]["way"][-1] == pytest.approx(20.0)
+    assert data["reference"]["t"][-1] == pytest.approx(40.0)
+
+
+def test_static_page_has_no_script():
+    found, reference = results()
+    assert "<script" not in page(HEAD, found, reference, is_interactive=False)
+    assert 'class="static"' not in page(HEAD, found, reference, is_interactive=False)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_explorer_in_a_browser_moves_with_its_slider(tmp_path: Path):
+    found, reference = results()
+    (tmp_path / "report.html").write_text(page(HEAD, found, reference).replace("</body>", PROBE), encoding="utf-8")
+    options = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+    ]
+    command = [str(CHROMIUM), *options, f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=5000", "--dump-dom"]
+    shown = subprocess.run([*command, f"file://{tmp_path}/report.html"], capture_output=True, text=True, timeout=120, check=True).stdout
+    seen = json.loads(re.search(r'<pre id="out">(.*?)</pre>', shown)[1])
+    assert seen["at20"][1] == pytest.approx(10.0, abs=0.1)
+    assert (seen["text"], seen["log"], seen["way"]) == ("20.0 s", "log", "way [m]")
+    assert {"position error [m]", "heading error [deg]", "position sigma [m]", "NIS (3 expected)"} == set(seen["titles"])
+    assert seen["difference"]
+    assert seen["isStaticHidden"]
+    assert seen["bands"] == 1
