@@ -36,7 +36,7 @@ from localization.logs.serialization import LogDeserializer
 from localization.logs.topic_roles import TYPES, TopicOverrides
 from motion_models.center_of_gravity.drive_controllers import TRACKS, ControllerValues
 from motion_models.center_of_gravity.parts import TYPICAL
-from motion_models.center_of_gravity.urdf import link_poses, parse_urdf
+from motion_models.center_of_gravity.urdf import first_names, link_poses, parse_urdf
 from motion_models.center_of_gravity.urdf_wheels import WheelGeometry, is_wheel, sides, wheel_geometry
 from motion_models.errors import RobotError
 from motion_models.prior import geometric_scaling, scaling_sigma
@@ -57,6 +57,8 @@ _REFERENCE = re.compile(r"ground_?truth|reference|mocap|vicon|optitrack", re.IGN
 _RAW = re.compile(r"raw|mag", re.IGNORECASE)
 _LIGHT_ARMS = 0.02
 """Share of the mass in moving parts up to which the centre of gravity is the body's; a spinning LiDAR's."""
+_LEAST_DRIVEN_K = 0.8
+"""k = track / effective track of two driven wheels and a caster is 1 within 2 %; of four wheels 0.43 to 0.77."""
 _SAME_RADIUS, _SAME_TRACK = 0.1, 0.05
 """Relative differences of two sources below which they agree. Tyres under load and slip straight ahead change a radius by up to 7 %
 (DRIVE's Husky); a track is a length of the body."""
@@ -97,6 +99,8 @@ class Survey:
     """Frame of the first message of each sensor's topic."""
     mounts: Mapping[str, Mount]
     """Of the log's fixed transforms."""
+    other_wheels: str | None = None
+    """Topic of a Twist or of /tf that has the wheels' motion."""
 
 
 @dataclass
@@ -143,8 +147,10 @@ def survey_log(path: Path) -> Survey:
         if is_joints:
             names[topic] = dict.fromkeys(name for message in messages for name in message.name)
     placeholder = Robot("new", Geometry(0.1, 0.5, 0.5, 50.0), Driver(0.1, 0.5))
-    mounts = open_log(path, placeholder).mounts
-    return Survey(path.name, topics, {topic: tuple(found) for topic, found in names.items()}, frames, mounts)
+    log = open_log(path, placeholder)
+    wheels = log.sources.wheels
+    other = wheels.topic if wheels is not None and wheels.type not in ("", *TYPES.values()) else None
+    return Survey(path.name, topics, {topic: tuple(found) for topic, found in names.items()}, frames, log.mounts, other)
 
 
 def _first_messages(raws: Iterable[RawMessage], decode: LogDeserializer, count: int) -> list[Any]:
@@ -178,10 +184,13 @@ def draft_robot(survey: Survey, given: Given, path: Path) -> Draft:
                 f"radius and track by the log: {_motion_topic(draft, survey)} does not follow the mean and the difference of the sides "
                 f"(R^2 below {MIN_R2:g} with every sign); neither is taken from it. Check units, --left and --right."
             )
-    draft.is_diff_drive = _is_diff_drive(draft.joints) if urdf is None else urdf.has_one_axle
+    draft.is_diff_drive = _is_diff_drive(draft.joints) if urdf is None or _has_pairs(draft.joints) else urdf.has_one_axle
     fit = _fit_in_radians(draft, given, urdf, controllers, fit)
     _choose_geometry(draft, given, urdf, controllers, fit)
+    if given.drive is None and given.like is None:
+        _check_drive(draft, urdf, fit)
     if urdf is not None:
+        _compare_joints(draft, survey, urdf)
         findings = check_urdf(urdf, draft.values, measured)
         draft.reasons += findings.reasons
         draft.missing += findings.missing
@@ -256,7 +265,11 @@ def _choose_topics(draft: Draft, survey: Survey, given: TopicOverrides) -> None:
     if references and given.reference is None:
         draft.topics["reference"] = references[-1]
         draft.reasons.append(f"topics.reference = {references[-1]}: by its name; results are scored against it, never estimated from it.")
-    if not {"joint_states", "odometry"} & draft.topics.keys():
+    if not {"joint_states", "odometry"} & draft.topics.keys() and survey.other_wheels is not None:
+        draft.reasons.append(
+            f"wheels: the motion on {survey.other_wheels}, which every command finds by its type; the robot file names none."
+        )
+    elif not {"joint_states", "odometry"} & draft.topics.keys():
         odometries = ", ".join(topic for topic, (type_, _) in survey.topics.items() if type_ == TYPES["odometry"])
         why = (
             f" ({odometries}: by the names references or filters, not the driver's; else name it with --topic.odometry)"
@@ -313,6 +326,36 @@ def _candidates(
 
 def _is_diff_drive(joints: Joints | None) -> bool:
     return joints is not None and len(joints.left) == len(joints.right) == 1
+
+
+def _compare_joints(draft: Draft, survey: Survey, urdf: WheelGeometry) -> None:
+    """Name a URDF whose wheels have other names than the log's, so that its positions decide nothing."""
+    names = survey.joint_names.get(draft.topics.get("joint_states", ""), ())
+    if draft.joints is not None and urdf.positions and names and not {*urdf.positions} & {*names}:
+        of_log = first_names((*draft.joints.left, *draft.joints.right))
+        draft.contradictions.append(Contradiction("joints", "the URDF's wheels", first_names(urdf.positions), f"has {of_log}"))
+
+
+def _has_pairs(joints: Joints | None) -> bool:
+    return joints is not None and min(len(joints.left), len(joints.right)) > 1
+
+
+def _check_drive(draft: Draft, urdf: WheelGeometry | None, fit: DriverFit | None) -> None:
+    """Name a robot of two wheels that turns like one of four: drivers may have one joint for both wheels of a side."""
+    track = draft.values.get("track_width_m")
+    if not draft.is_diff_drive or fit is None or track is None or track / fit.effective_track_m > _LEAST_DRIVEN_K:
+        return
+    source = "two wheels' joints" if urdf is None else "the URDF's one driven axle"
+    draft.is_diff_drive = urdf is not None
+    draft.contradictions.append(
+        Contradiction(
+            "drive",
+            source,
+            DIFF_DRIVE,
+            f"turns by {fit.effective_track_m:.4g} m, k = {track / fit.effective_track_m:.2f}: "
+            + ("check the track, or give --drive skid_steer" if draft.is_diff_drive else "skid_steer is written"),
+        )
+    )
 
 
 def _same(a: Sides | WheelSides, b: Sides | WheelSides) -> bool:

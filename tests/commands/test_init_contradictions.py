@@ -132,3 +132,24 @@ def test_init_with_rates_in_rpm_alone_asks_for_the_radius(tmp_path: Path, capsys
     lengths = ("--track-width-m", "0.57", "--wheelbase-m", "0.51")
     assert main(["init", str(_RPM_LOG), "--out", str(tmp_path / "r.toml"), *lengths]) == 2
     assert "0.165 m by revolutions per minute" in " ".join(capsys.readouterr().out.split())
+
+
+def test_init_of_a_log_with_odometry_on_tf_names_its_wheels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lengths = ("--wheel-radius-m", "0.165", "--track-width-m", "0.57", "--wheelbase-m", "0.51")
+    init(tmp_path, CASES / "H12-odometry-in-tf-only" / "log.mcap", *lengths)
+    printed = capsys.readouterr().out
+    assert "wheels: the motion on /tf" in printed
+    assert "! wheels" not in printed
+
+
+def test_init_of_two_joints_that_turn_like_four_is_skid_steer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sides = ("--left", "front_left_wheel", "--right", "front_right_wheel", "--track-width-m", "0.57", "--wheelbase-m", "0.51")
+    assert init(tmp_path, BASE_LOG, *sides).drive == "skid_steer"
+    assert "k = 0.55: skid_steer is written" in capsys.readouterr().out
+
+
+def test_init_with_a_urdf_of_other_joint_names_names_both(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (CASES / "H10-urdf-base-inertial-axes-swapped" / "robot.urdf").read_text()
+    (tmp_path / "r.urdf").write_text(text.replace("_wheel", "_tyre_wheel"))
+    init(tmp_path, BASE_LOG, "--urdf", str(tmp_path / "r.urdf"))
+    assert "CONTRADICTION: joints = front_left_tyre_wheel" in " ".join((tmp_path / "r.toml").read_text().split())
